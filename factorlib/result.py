@@ -66,17 +66,12 @@ def load_result(folder: str | Path) -> Result:
         cure = f"make export DATASET={found.name}"
         raise InputError(f"the result is not whole: {missing[0]} is missing", file=found, cure=cure)
     dataset = read_dataset(_dataset_of(found))
-    solved = SolvedSet(_inputs(found, dataset))
-    _check_names(dataset, solved, found)
-    return Result(found, solved)
-
-
-def _inputs(found: Path, dataset: Dataset) -> Inputs:
-    """What the stage `recipes` is handed."""
-    slices = {name: dataset_slice(dataset, name) for name in SLICES}
+    slices = {name: dataset_slice(dataset, name) for name in SLICES}  # what the stage `recipes` is handed
     files = {file: dataset.folder / file for each in slices.values() for file in each.files}
     folders = {stage: (found / stage).resolve() for stage in STAGES}
-    return Inputs(folders, {f"dataset.{name}": each.facts for name, each in slices.items()}, files)
+    solved = SolvedSet(Inputs(folders, {f"dataset.{name}": each.facts for name, each in slices.items()}, files))
+    _check_names(dataset, solved, found)
+    return Result(found, solved)
 
 
 def _dataset_of(folder: Path) -> Path:
@@ -92,12 +87,10 @@ def _dataset_of(folder: Path) -> Path:
 def _check_names(dataset: Dataset, solved: SolvedSet, folder: Path) -> None:
     """InputError where dataset.yaml names a material, photo or object that was not there when the result was made."""
     missing = [f"material {name!r}" for name in solved.names if name not in solved.table.materials]
-    for photo, each in solved.objects.items():
-        if photo not in solved.poses:
-            missing.append(f"photo {photo!r}")
-        else:
-            posed = solved.poses[photo].objects
-            missing += [f"object '{photo}/{obj.name}'" for obj in each.objects if obj.name not in posed]
+    missing += [f"photo {photo!r}" for photo in solved.objects if photo not in solved.poses]
+    for photo in [photo for photo in solved.objects if photo in solved.poses]:
+        posed, objects = solved.poses[photo].objects, solved.objects[photo].objects
+        missing += [f"object '{photo}/{obj.name}'" for obj in objects if obj.name not in posed]
     if missing:
         found = f"the result is of an earlier {FILE}: it has no {', no '.join(missing)}"
         raise InputError(found, file=folder, cure=f"make all DATASET={dataset.folder.name}")
@@ -215,25 +208,21 @@ class Result:
         return f"{self.folder}: {len(self.photos)} photos, {self.materials!r}"
 
     def _repr_html_(self) -> str:
-        rows = "".join(_row(name, material) for name, material in self.materials.items())
-        head = "".join(f"<th>{word}</th>" for word in ("material", "diffuse", "specular", "roughness"))
-        return f"<p>{html.escape(str(self.folder))}: photos {html.escape(', '.join(self.photos))}</p><table><tr>{head}</tr>{rows}</table>"
+        parts, rows = ("diffuse", "specular", "roughness"), []
+        for name, material in self.materials.items():
+            of = [(np.atleast_1d(getattr(each, part)) for each in (material, material.stderr)) for part in parts]
+            cells = [", ".join(f"{value:.3f} ± {error:.3f}" for value, error in zip(*pair, strict=True)) for pair in of]
+            rows.append((html.escape(name), *cells))
+        lines = [("th", ("material", *parts)), *(("td", row) for row in rows)]
+        table = "".join(f"<tr>{''.join(f'<{tag}>{cell}</{tag}>' for cell in cells)}</tr>" for tag, cells in lines)
+        about = html.escape(f"{self.folder}: photos {', '.join(self.photos)}")
+        return f"<p>{about}</p><table>{table}</table>"
 
 
 def _check(kind: type, **numbers: float | None) -> None:
     """Of arguments, by the bounds of the recipes that have the same: InputError for one out of range."""
     plain = {key: value.item() if isinstance(value, np.generic) else value for key, value in numbers.items()}
     convert(plain, kind, kind.__name__.lower())
-
-
-def _row(name: str, material: Solved) -> str:
-    def numbers(values: tuple[float, ...], errors: tuple[float, ...]) -> str:
-        return ", ".join(f"{value:.3f} ± {error:.3f}" for value, error in zip(values, errors, strict=True))
-
-    of, stderr = material, material.stderr
-    colours = numbers(of.diffuse, stderr.diffuse), numbers(of.specular, stderr.specular)
-    cells = html.escape(name), *colours, numbers((of.roughness,), (stderr.roughness,))
-    return "<tr>" + "".join(f"<td>{cell}</td>" for cell in cells) + "</tr>"
 
 
 class Environment(msgspec.Struct, frozen=True):

@@ -38,7 +38,7 @@ from factorlib.stage import Inputs, Progress
 
 log = logging.getLogger("factorlib.align")
 CURE = "look at its overlay; give the object's keypoints or pose, or the photo's camera.focal_px, in dataset.yaml"
-CURE_OF_EXTERNAL = (
+EXTERNAL = (
     "look at its overlay; does the source show this photo, and is the mesh where world_from_object or obj_ids say?"
 )
 
@@ -148,23 +148,16 @@ def entry(obj: ObjectToPlace, k: int, result: Placed, maps: Maps, params: Params
         if other := found.runner_up:
             pose = entry_of(other.state.pose(obj.caster))
             runner_up = RunnerUp(**pose, score=other.score, normal_difference_deg=other.normal_difference_deg)
-    return ObjectEntry(
-        **entry_of(result.poses[k]),
-        scale=obj.scale,
-        silhouette_iou=iou,
-        label_agreement=agreement,
-        source=source,
-        score=found.score if found else None,
-        runner_up=runner_up,
-        **msgspec.structs.asdict(trust),
-        doubts=reasons,
-        left_out=bool(reasons) and found is not None and not params.keep_doubtful,
-    )
+    measured = {"silhouette_iou": iou, "label_agreement": agreement, "score": found.score if found else None}
+    left_out = bool(reasons) and found is not None and not params.keep_doubtful
+    believed = {**msgspec.structs.asdict(trust), "doubts": reasons, "left_out": left_out}
+    place = {**entry_of(result.poses[k]), "scale": obj.scale}
+    return ObjectEntry(**place, **measured, source=source, runner_up=runner_up, **believed)
 
 
 def complain(photo: str, name: str, entry: ObjectEntry, strict: bool) -> None:
     """Warn of a pose's doubts; `strict`: raise InputError for the first instead."""
-    cure = CURE_OF_EXTERNAL if entry.source in SOURCES else CURE
+    cure = EXTERNAL if entry.source in SOURCES else CURE
     for reason in entry.doubts:
         if strict:
             raise InputError(reason, file="dataset.yaml", key=f"{photo}.{name}", cure=cure)

@@ -4,16 +4,13 @@ Writes metrics.json; its keys are documented in `factorlib.results.metrics`.  On
 the report can show it, it also writes illumination/<light>.exr (the true map) and spheres/<light>_{truth,estimate}.exr.
 """
 
-from __future__ import annotations
-
-import logging
 from pathlib import Path
 
 import msgspec
 import numpy as np
 
 from factorlib.dataset.schema import LightSlice, TruthFile
-from factorlib.evaluate.ball import light_of_lat_long
+from factorlib.evaluate.ball import Light, light_of_lat_long
 from factorlib.evaluate.gauge import connected_components
 from factorlib.evaluate.geometry import averaged_normals, normal_error, pose_error
 from factorlib.evaluate.lights import compare_lights, mirrored_directions, sphere_row
@@ -30,9 +27,7 @@ from factorlib.results.poses import read_poses
 from factorlib.stage import Inputs, Progress
 from factorlib.urm.extract import observed_pixels
 
-log = logging.getLogger("factorlib.evaluate")
 NO_TRUTH = "the dataset names no truth"
-SECTIONS = ("materials", "relighting", "relit_set", "light", "normals", "poses")
 MISSING = {
     "materials": "the truth says nothing about materials that were seen",
     "relighting": "the truth lacks materials or lights",
@@ -52,63 +47,54 @@ def main(params: Params, inputs: Inputs, out: Path, progress: Progress) -> None:
     lights = msgspec.convert(inputs.facts["dataset.light"], dict[str, LightSlice])
     truth = msgspec.convert(inputs.facts["dataset.truth"], TruthFile | None)
     materials = inputs.facts["dataset.materials"]
+
+    def shot(name: str) -> Shot:
+        """A photo beside its re-synthesis."""
+        photo, geometry = (read_exr(inputs[stage] / f"{name}.exr") for stage in ("masks", "align"))
+        return shot_of(photo, geometry, read_rgb_exr(inputs["render"] / "resynthesis" / f"{name}.exr"))
+
     progress(0, 3, "re-synthesis")
-    resynthesis = compare_photos(lights, materials, lambda name: _shot(inputs, name))
-    shown: dict[str, list[str]] = {slice_.illumination: [] for slice_ in lights.values()}  # materials in each light
+    resynthesis = compare_photos(lights, materials, shot)
+    seen: dict[str, list[str]] = {slice_.illumination: [] for slice_ in lights.values()}  # materials in each light
     for name, photo in resynthesis.photos.items():
-        row = shown[lights[name].illumination]
+        row = seen[lights[name].illumination]
         row.extend(m for m in photo.materials if m not in row)
-    component = connected_components({light: names for light, names in shown.items() if names})
+    component = connected_components({light: names for light, names in seen.items() if names})
     progress(1, 3, "materials, light and relighting")
-    sections = _against_truth(inputs, out, truth, lights, shown, component) if truth else dict.fromkeys(SECTIONS)
-    counts = Counts(len(lights), len(materials), len(shown), len(set(component.values())))
-    reasons = reasons_of(sections, truth is not None)
+    sections = dict.fromkeys(MISSING)
+    if truth:
+        true = {n: Reflectance(m.diffuse, m.specular, m.roughness) for n, m in truth.materials.items()}
+        estimates = reflectances(
+            read_materials(inputs["export"] / "materials.json")
+        )  # in the gauge of the exported lights
+        true_lights, estimated_lights = _lights(inputs, truth, out)
+        sections = {
+            "materials": compare_materials(estimates, true, component),
+            "relighting": compare_relighting(estimates, true, estimated_lights, true_lights, seen),
+            "relit_set": compare_relit_set(estimates, true, estimated_lights, true_lights),
+            "light": compare_lights(estimated_lights, true_lights, _mirrored(inputs, lights)),
+            "normals": _normals(inputs, truth, lights),
+            "poses": _poses(inputs, truth),
+        }
+    counts = Counts(len(lights), len(materials), len(seen), len(set(component.values())))
+    reasons = {name: why if truth else NO_TRUTH for name, why in MISSING.items() if not sections[name]}
     write_json(out / "metrics.json", Metrics(set=counts, resynthesis=resynthesis, **sections, reasons=reasons))
     progress(3, 3)
 
 
-def reasons_of(sections: dict[str, object], has_truth: bool) -> dict[str, str]:
-    """Why each section that is None is.
-
-    >>> reasons_of({"materials": None, "relighting": 1, "relit_set": 1, "light": 1, "normals": 1, "poses": 1}, False)
-    {'materials': 'the dataset names no truth'}
-    """
-    return {name: MISSING[name] if has_truth else NO_TRUTH for name in SECTIONS if not sections[name]}
-
-
-def _against_truth(
-    inputs: Inputs,
-    out: Path,
-    truth: TruthFile,
-    lights: dict[str, LightSlice],
-    shown: dict[str, list[str]],
-    component: dict[str, int],
-) -> dict:
-    true = {n: Reflectance(m.diffuse, m.specular, m.roughness) for n, m in truth.materials.items()}
-    estimates = reflectances(read_materials(inputs["export"] / "materials.json"))  # in the gauge of the exported lights
-    true_lights, estimated_lights = {}, {}
+def _lights(inputs: Inputs, truth: TruthFile, out: Path) -> tuple[dict[str, Light], dict[str, Light]]:
+    """The true lights, and the estimated ones of these; writes the maps and spheres of those that are estimated."""
+    true, estimated = {}, {}
     for name, path in truth.illumination.items():
-        true_lights[name] = light_of_lat_long(read_true_light(inputs.file(path), name))
+        true[name] = light_of_lat_long(read_true_light(inputs.file(path), name))
         if (file := inputs["export"] / "illumination" / f"{name}.exr").exists():
-            estimated_lights[name] = light_of_lat_long(read_rgb_exr(file))
+            estimated[name] = light_of_lat_long(read_rgb_exr(file))
             for kind in ("illumination", "spheres"):
                 (out / kind).mkdir(exist_ok=True)
             write_rgb_exr(out / "illumination" / f"{name}.exr", read_rgb_exr(inputs.file(path)), LAT_LONG)
-            for which, light in (("truth", true_lights[name]), ("estimate", estimated_lights[name])):
+            for which, light in (("truth", true[name]), ("estimate", estimated[name])):
                 write_rgb_exr(out / "spheres" / f"{name}_{which}.exr", sphere_row(light))
-    return {
-        "materials": compare_materials(estimates, true, component),
-        "relighting": compare_relighting(estimates, true, estimated_lights, true_lights, shown),
-        "relit_set": compare_relit_set(estimates, true, estimated_lights, true_lights),
-        "light": compare_lights(estimated_lights, true_lights, _mirrored(inputs, lights)),
-        "normals": _normals(inputs, truth, lights),
-        "poses": _poses(inputs, truth),
-    }
-
-
-def _shot(inputs: Inputs, name: str) -> Shot:
-    photo, geometry = (read_exr(inputs[stage] / f"{name}.exr") for stage in ("masks", "align"))
-    return shot_of(photo, geometry, read_rgb_exr(inputs["render"] / "resynthesis" / f"{name}.exr"))
+    return true, estimated
 
 
 def _geometry(inputs: Inputs, name: str) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

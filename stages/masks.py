@@ -1,7 +1,5 @@
 """Photo and masks to one EXR of linear radiance, labels, and which pixels can be used, no larger than is useful."""
 
-from __future__ import annotations
-
 import logging
 from pathlib import Path
 from typing import Annotated

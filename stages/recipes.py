@@ -20,7 +20,7 @@ from factorlib.images.write import write_gif
 from factorlib.meshes.read import CREASE_DEG
 from factorlib.recipe import schema
 from factorlib.recipe.schema import is_light_file, recipe_of
-from factorlib.render.insertion import NEW, STEPS, Backdrop, inserted, spot_at, spot_beside, stood
+from factorlib.render.insertion import NEW, STEPS, inserted, spot_at, spot_beside, stood
 from factorlib.render.photo_scene import lit_ball, orbit, resized, traced_photo, turned_light
 from factorlib.render.solved_set import SolvedSet
 from factorlib.render.traced import Traced
@@ -46,7 +46,8 @@ def main(params: Params, inputs: Inputs, out: Path, progress: Progress) -> None:
     photos, refusals = recipe.photos or results.photos, []
     for done, photo in enumerate(photos):
         try:
-            DRAWN[type(recipe)](recipe, results, photo, out, partial(_report, progress, done, len(photos), photo))
+            report = partial(_report, progress, done, len(photos), photo)
+            DRAWN[type(recipe)](recipe, results, photo, out, report)
         except InputError as error:
             if recipe.photos:
                 raise
@@ -65,22 +66,16 @@ def _report(progress: Progress, done: int, total: int, photo: str, share: float)
 Report = Callable[[float], None]
 
 
-# ── the photo's own pixels and path-traced objects ───────────────────────────────────────────────────────────────────
-
-
-def resynthesis(recipe: schema.Resynthesis, results: SolvedSet, photo: str, out: Path, report: Report) -> None:
-    """Path-traced objects over the photo's background."""
+def resynthesis(
+    recipe: schema.Resynthesis | schema.Transfer, results: SolvedSet, photo: str, out: Path, report: Report
+) -> None:
+    """Path-traced objects, of other materials where the recipe says so, over the photo's background."""
     report(0)
-    traced = Traced(traced_photo(results.scene(photo), recipe.samples), results.tone(photo))
-    _write(out / photo, traced.over(results.photo(photo)))
-
-
-def transfer(recipe: schema.Transfer, results: SolvedSet, photo: str, out: Path, report: Report) -> None:
-    """The same with other materials."""
-    report(0)
-    known, scene = results.known(recipe.table), results.scene(photo)
-    other = {name: known[recipe.materials[name]] for name in scene.materials if name in recipe.materials}
-    scene = msgspec.structs.replace(scene, materials=scene.materials | other)
+    scene = results.scene(photo)
+    if isinstance(recipe, schema.Transfer):
+        known, other = results.known(recipe.table), recipe.materials
+        materials = {name: known[other[name]] if name in other else own for name, own in scene.materials.items()}
+        scene = msgspec.structs.replace(scene, materials=materials)
     traced = Traced(traced_photo(scene, recipe.samples), results.tone(photo))
     _write(out / photo, traced.over(results.photo(photo)))
 
@@ -106,45 +101,40 @@ def insertion(recipe: schema.Insert, results: SolvedSet, photo: str, out: Path, 
         spot = spot_beside(scene, ground.plane, neighbour, recipe.size, wide / tall)
     new = stood(NEW, mesh, tuple(f"{NEW}{name}" for name in names), up, recipe.turn, spot)
     scene = msgspec.structs.replace(scene, materials={**scene.materials, **own})
-    backdrop = Backdrop(scene, results.straightened(photo), results.covered(photo))
-    found = inserted(backdrop, new, spot, ground, recipe.samples, lambda done: report(done / STEPS))
+    seen = results.straightened(photo), results.covered(photo)
+    found = inserted(scene, *seen, new, spot, ground, recipe.samples, lambda done: report(done / STEPS))
     same = (found.coverage[..., None] == 0) & (found.shadow == 1) & (polish is None)
     _write(out / photo, np.where(same, results.photo(photo), results.tone(photo)(found.composite)))
 
 
-# ── pictures of the objects alone ────────────────────────────────────────────────────────────────────────────────────
-
-
 def view(recipe: schema.View, results: SolvedSet, photo: str, out: Path, report: Report) -> None:
-    """From another side."""
+    """The objects alone, from another side."""
     report(0)
     scene = resized(results.scene(photo), recipe.width)
     camera = orbit(scene, recipe.azimuth, recipe.elevation, recipe.zoom)
-    traced = traced_photo(scene, recipe.samples, world_from_camera=camera, with_light=recipe.background == "light")
+    traced = traced_photo(scene, recipe.samples, camera, with_light=recipe.background == "light")
     _write_alone(out / photo, Traced(traced, results.tone(photo)))
 
 
-def turntable(recipe: schema.Turntable, results: SolvedSet, photo: str, out: Path, report: Report) -> None:
-    """Once around."""
-    scene, lit = resized(results.scene(photo), recipe.width), recipe.background == "light"
-
-    def frame(degrees: float) -> np.ndarray:
-        """From a camera that was carried around by so much."""
-        return traced_photo(scene, recipe.samples, world_from_camera=orbit(scene, degrees), with_light=lit)
-
-    _write_animation(recipe, results, photo, out, report, frame)
-
-
-def moving_light(recipe: schema.MovingLight, results: SolvedSet, photo: str, out: Path, report: Report) -> None:
-    """The light turns once."""
-    scene = resized(results.scene(photo), recipe.width)
-
-    def frame(degrees: float) -> np.ndarray:
-        """In the light turned by so much."""
-        turned = msgspec.structs.replace(scene, light=turned_light(scene.light, degrees))
-        return traced_photo(turned, recipe.samples)
-
-    _write_animation(recipe, results, photo, out, report, frame)
+def animation(
+    recipe: schema.Turntable | schema.MovingLight, results: SolvedSet, photo: str, out: Path, report: Report
+) -> None:
+    """The camera or the light turns once: every frame as a PNG, and all as a GIF, which has no half-transparent pixels, on white."""
+    scene, pixels = resized(results.scene(photo), recipe.width), []
+    for k in range(recipe.frames):
+        report(k / recipe.frames)
+        degrees = 360 * k / recipe.frames
+        if isinstance(recipe, schema.Turntable):
+            lit = recipe.background == "light"
+            traced = traced_photo(scene, recipe.samples, orbit(scene, degrees), with_light=lit)
+        else:
+            turned = msgspec.structs.replace(scene, light=turned_light(scene.light, degrees))
+            traced = traced_photo(turned, recipe.samples)
+        pixels.append(Traced(traced, results.tone(photo)).rgba())
+    (out / photo).mkdir(parents=True)
+    for k, each in enumerate(pixels):
+        write_png(out / photo / f"{k:03}.png", each)
+    write_gif(out / f"{photo}.gif", pixels, recipe.seconds)
 
 
 def relight(recipe: schema.Relight, results: SolvedSet, photo: str, out: Path, report: Report) -> None:
@@ -161,11 +151,11 @@ def relight(recipe: schema.Relight, results: SolvedSet, photo: str, out: Path, r
 
 DRAWN = {
     schema.Resynthesis: resynthesis,
-    schema.Transfer: transfer,
+    schema.Transfer: resynthesis,
     schema.Insert: insertion,
     schema.View: view,
-    schema.Turntable: turntable,
-    schema.MovingLight: moving_light,
+    schema.Turntable: animation,
+    schema.MovingLight: animation,
     schema.Relight: relight,
 }
 
@@ -186,9 +176,6 @@ def write_grid(recipe: schema.Grid, results: SolvedSet, out: Path, progress: Pro
     progress(total, total)
 
 
-# ── files ────────────────────────────────────────────────────────────────────────────────────────────────────────────
-
-
 def _write(stem: Path, radiance: np.ndarray) -> None:
     """At the photo's own exposure."""
     stem.parent.mkdir(parents=True, exist_ok=True)
@@ -201,25 +188,3 @@ def _write_alone(stem: Path, traced: Traced) -> None:
     stem.parent.mkdir(parents=True, exist_ok=True)
     traced.to_exr(stem.with_name(stem.name + ".exr"))
     traced.to_png(stem.with_name(stem.name + ".png"))
-
-
-def _write_animation(
-    recipe: schema.Turntable | schema.MovingLight,
-    results: SolvedSet,
-    photo: str,
-    out: Path,
-    report: Report,
-    frame: Callable[[float], np.ndarray],
-) -> None:
-    """Every frame as a PNG, and all as a GIF, which has no half-transparent pixels, on white.
-
-    frame: what is traced at so many degrees of a whole turn
-    """
-    pixels = []
-    for k in range(recipe.frames):
-        report(k / recipe.frames)
-        pixels.append(Traced(frame(360 * k / recipe.frames), results.tone(photo)).rgba())
-    (out / photo).mkdir(parents=True)
-    for k, each in enumerate(pixels):
-        write_png(out / photo / f"{k:03}.png", each)
-    write_gif(out / f"{photo}.gif", pixels, recipe.seconds)

@@ -61,22 +61,12 @@ def main(params: Params, inputs: Inputs, out: Path, progress: Progress) -> None:
     channels = aligned.channels
     if tone := table.model.tone.get(name):
         channels = channels | {c: straightened(channels[c], tone.exponent, tone.pivot) for c in "RGB"}
-    scene = Scene(
-        aligned.camera,
-        [
-            PosedObject(
-                own.caster(),
-                own.silhouette,
-                own.entry.pose,
-                own.entry.runner_up.pose if own.entry.runner_up else None,
-                own.moves,
-                not own.entry.left_out,
-            )
-            for own in aligned.objects.values()
-        ],
-        aligned.prior,
-        params.directions if table.model.self_shadowing else 0,
-    )
+    posed = []
+    for own in aligned.objects.values():
+        rival = own.entry.runner_up.pose if own.entry.runner_up else None
+        seen = own.caster(), own.silhouette, own.entry.pose, rival
+        posed.append(PosedObject(*seen, own.moves, not own.entry.left_out))
+    scene = Scene(aligned.camera, posed, aligned.prior, params.directions if table.model.self_shadowing else 0)
     pixels = pixels_of(channels, known, params.pixels, params.seed)
     if pixels is None:
         log.warning("%s: too few pixels of known materials to tell poses by: they stay as they were found", name)

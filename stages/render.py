@@ -4,7 +4,6 @@ Writes resynthesis/<photo>, materials/<photo>/<material> (balls) and reflectance
 `observed`: 1 where the photo shows that normal), each as linear EXR and as PNG at the photo's own exposure.
 """
 
-import logging
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -19,16 +18,13 @@ from factorlib.images.picture import exposure_of, picture, write_png
 from factorlib.images.tone import shown
 from factorlib.model.interreflection import bounced_light
 from factorlib.reflection import reflection_operator
-from factorlib.render.ball import ball, observed_cells
-from factorlib.render.photo_light import light_of
 from factorlib.render.reflect import TAIL, Reflector
-from factorlib.render.resynthesis import Surroundings, resynthesised
+from factorlib.render.resynthesis import Surroundings, ball, light_of, observed_cells, resynthesised
 from factorlib.results.materials import Gauge, Model, in_order, read_materials
 from factorlib.stage import Inputs, Progress
 from factorlib.urm.extract import observed_pixels
 from factorlib.urm.observations import read_observations
 
-log = logging.getLogger("factorlib.render")
 Size = Annotated[int, msgspec.Meta(ge=8, le=2048)]
 RING = (255, 255, 255)
 
@@ -64,18 +60,16 @@ def main(params: Params, inputs: Inputs, out: Path, progress: Progress) -> None:
     radiance = resynthesised(reflector, materials, photo, geometry, report, around)
     if tone := model.tone.get(name):
         radiance = shown(radiance, tone.exponent, tone.pivot)
-    _write(out / "resynthesis" / name, {}, radiance, picture(radiance, exposure))
+    _write(out / "resynthesis" / name, radiance, exposure, ball=False)
     observed = observed_pixels(photo, geometry)
     for k, (label, material) in enumerate(zip(names, materials, strict=True), start=1):
         progress(9 + k, total, f"{name}: {label}")
-        radiance = ball(reflector, material, params.ball_size)
-        _write(out / "materials" / name / label, {}, radiance, _on_disc(picture(radiance, exposure)))
+        shaded = ball(reflector, material, params.ball_size)
+        _write(out / "materials" / name / label, shaded, exposure, ball=True)
         pixels = observed & (np.rint(photo["label"]) == k)
         cells = observed_cells(np.stack([geometry[f"normal.{a}"][pixels] for a in "xyz"], axis=-1), params.map_size)
-        radiance = ball(reflector, material, params.map_size)
-        ringed = picture(radiance, exposure)
-        ringed[cells & ~binary_erosion(cells)] = RING
-        _write(out / "reflectance_maps" / name / label, {"observed": cells}, radiance, _on_disc(ringed))
+        shaded = ball(reflector, material, params.map_size)
+        _write(out / "reflectance_maps" / name / label, shaded, exposure, ball=True, observed=cells)
     progress(total, total, name)
 
 
@@ -91,14 +85,15 @@ def surroundings(inputs: Inputs, model: Model, gauge: Gauge) -> Surroundings | N
     return Surroundings(seen, None if sent is None else sent / (gauge.export_factor or 1.0))
 
 
-def _write(stem: Path, further: dict[str, np.ndarray], radiance: np.ndarray, pixels: np.ndarray) -> None:
-    """An EXR of the radiance and of further channels, and a PNG of the pixels."""
+def _write(stem: Path, radiance: np.ndarray, exposure: float, ball: bool, observed: np.ndarray | None = None) -> None:
+    """An EXR of the radiance and of what is observed, and a PNG, transparent beside a ball, with a ring about what is observed."""
     stem.parent.mkdir(parents=True, exist_ok=True)
-    write_exr(stem.with_name(stem.name + ".exr"), dict(zip("RGB", np.moveaxis(radiance, -1, 0))) | further)
+    channels, pixels = dict(zip("RGB", np.moveaxis(radiance, -1, 0))), picture(radiance, exposure)
+    if observed is not None:
+        channels["observed"] = observed
+        pixels[observed & ~binary_erosion(observed)] = RING
+    if ball:
+        alpha = 255 * ball_normals(len(pixels))[1][..., None].astype(np.uint8)
+        pixels = np.concatenate([pixels, alpha], axis=-1)
+    write_exr(stem.with_name(stem.name + ".exr"), channels)
     write_png(stem.with_name(stem.name + ".png"), pixels)
-
-
-def _on_disc(pixels: np.ndarray) -> np.ndarray:
-    """Transparent beside the ball."""
-    _, inside = ball_normals(len(pixels))
-    return np.concatenate([pixels, 255 * inside[..., None].astype(np.uint8)], axis=-1)

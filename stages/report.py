@@ -5,8 +5,6 @@ figures/photos/<photo>.png: photo, materials, re-synthesis and difference side b
 to run but for its section on cost.
 """
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import msgspec
@@ -29,7 +27,7 @@ class Params(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 def main(params: Params, inputs: Inputs, out: Path, progress: Progress) -> None:
     """Write the page and its figures."""
     run = Artifacts(inputs.folders, msgspec.convert(inputs.facts["dataset.set"], SetSlice), inputs.log)
-    errors = run.metrics().resynthesis.photos
+    errors = run.metrics.resynthesis.photos
     rows, tags = [], material_tags(run)
     (out / "figures" / "photos").mkdir(parents=True)
     for done, name in enumerate(run.set.photos):

@@ -97,7 +97,7 @@ def main(params: Params, inputs: Inputs, out: Path, progress: Progress) -> None:
     _warn(before_solving(names, seen.photos, problem.blocks))
     solution = _solved(params, problem, earlier, inputs, progress)
     answer = Answer(names, problem, solution, relative, params.solver, earlier)
-    errors, coverages = _uncertainty(answer, solution.shown(problem), params)
+    errors, coverages = _uncertainty(solution, solution.shown(problem), params)
     _warn(after_solving(answer, errors))
     write_json(out / "materials.json", answer.material_table(errors))
     write_json(out / "uncertainty.json", answer.uncertainty(errors))
@@ -113,10 +113,11 @@ def _problem(params: Params, inputs: Inputs, seen: Observations) -> JointProblem
     lights = msgspec.convert(inputs.facts["dataset.light"], dict[str, LightSlice])
     worlds = {photo: light.world_from_camera for photo, light in lights.items()}
     rotations = {photo: np.array(world) for photo, world in worlds.items() if world is not None}
-    noise = Noise(params.noise_absolute, params.noise_relative)
-    blocks = blocks_of_observations(
-        seen, noise, held_out=params.held_out, world_from_camera=rotations, seed=params.seed
+    noise, given = (
+        Noise(params.noise_absolute, params.noise_relative),
+        {"held_out": params.held_out, "seed": params.seed},
     )
+    blocks = blocks_of_observations(seen, noise, world_from_camera=rotations, **given)
     automatic = "paper_network" if params.solver == "paper" else "network"
     operator = automatic if params.operator == "auto" else params.operator
     reflection = reflection_operator(operator, weights=inputs["train"])
@@ -156,10 +157,9 @@ def _own(params: Params, struct: type[msgspec.Struct]) -> dict[str, Any]:
 
 
 def _uncertainty(
-    answer: Answer, problem: JointProblem, params: Params
+    solution: Solution, problem: JointProblem, params: Params
 ) -> tuple[StandardErrors, dict[str, Float[np.ndarray, "h w 3"]]]:
     """Standard errors of the materials, and relative ones of each light."""
-    solution = answer.solution
     if solution.materials:
         of_materials, of_lights = (
             Posterior(of.sampled(params.observations, params.seed), fit, read_light_prior())

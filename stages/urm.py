@@ -66,8 +66,6 @@ def occluders_of(inputs: Inputs, poses: dict[str, ObjectEntry]) -> Occluders:
     """Every object of the photo where `align` put it."""
     slice_ = msgspec.convert(inputs.facts["dataset.objects"], ObjectsSlice)
     read = MeshesOnce(inputs.file, inputs.facts["dataset.materials"], CREASE_DEG)
-    meshes = [
-        scaled(read.mesh(own.mesh, slice_.meshes[own.mesh], own.materials), poses[own.name].scale)
-        for own in slice_.objects
-    ]
-    return Occluders(meshes, [poses[own.name].pose for own in slice_.objects])
+    meshes = [read.mesh(own.mesh, slice_.meshes[own.mesh], own.materials) for own in slice_.objects]
+    placed = [poses[own.name] for own in slice_.objects]
+    return Occluders([scaled(mesh, at.scale) for mesh, at in zip(meshes, placed)], [at.pose for at in placed])

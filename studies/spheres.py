@@ -22,7 +22,8 @@ from jaxtyping import Float, Int
 
 from factorlib.conventions import FRONT, YUP_FROM_CAMERA
 from factorlib.evaluate.ball import Light, ball, light_of_lat_long
-from factorlib.generate.lights import random_light, random_materials
+from factorlib.generate.lights import random_materials
+from factorlib.generate.synthetic import light_of
 from factorlib.geometry.sphere import ball_normals
 from factorlib.images.exr import read_rgb_exr
 from factorlib.results.materials import Reflectance
@@ -63,7 +64,7 @@ def light_map(seed: int, light: int, rows: int, spp: int) -> Float[np.ndarray, "
     rng = np.random.default_rng([12, seed, light])
     world_from_camera = look(rng.uniform(-14, -6), rng.uniform(0, 360))
     lamps = 1 + light % 2 if light else 0  # none: by day
-    radiance = random_light(lamps, world_from_camera, [], rng, rows, spp)
+    radiance = light_of(lamps, world_from_camera, [], rng, rows, spp)
     return (radiance / radiance.mean()).astype(np.float32)
 
 

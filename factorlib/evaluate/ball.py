@@ -14,15 +14,15 @@ Glossy    ∫ L(i) D G / (4 n·o) di                  a wide lobe (α > 0.2) as 
 Mirror    L(2(n·o)n − o)                           averaged over the solid angle that a pixel of the ball sees
 """
 
-from __future__ import annotations
-
-from typing import Protocol, runtime_checkable
+from collections.abc import Callable
+from functools import partial
 
 import msgspec
 import numpy as np
 from jaxtyping import Float, Int
 
 from factorlib.conventions import lat_long_directions, lat_long_solid_angles
+from factorlib.results.materials import Reflectance
 
 SIDE = 128  # texels of the finest octahedral level: 1.6° across
 WIDE_SIDE = 64  # of the level that wide lobes are summed over
@@ -30,15 +30,6 @@ WIDE_ALPHA = 0.2
 SAMPLES = 384  # of a narrow lobe
 GOLDEN = (np.sqrt(5) - 1) / 2
 VIEW = np.array([0.0, 0.0, 1.0])
-
-
-@runtime_checkable
-class Material(Protocol):
-    """Lambert k_d, GGX k_s (linear Rec. 709) and roughness in [0, 1]."""
-
-    diffuse: Float[np.ndarray, "3"]
-    specular: Float[np.ndarray, "3"]
-    roughness: float
 
 
 class Light(msgspec.Struct, frozen=True):
@@ -51,13 +42,23 @@ class Light(msgspec.Struct, frozen=True):
         """Mean radiance over the sphere, RGB."""
         return self.levels[-1][0, 0]
 
+    @property
+    def wide(self) -> Float[np.ndarray, "t 3"]:
+        """The level of `WIDE_SIDE`, row by row: texels of equal solid angle about 3° across."""
+        return self.levels[(SIDE // WIDE_SIDE).bit_length() - 1].reshape(-1, 3)
+
+
+Reflected = Callable[[Light], Float[np.ndarray, "*n 3"]]  # radiance of points, of any light
+
 
 def light_of_lat_long(radiance: Float[np.ndarray, "h w 3"]) -> Light:
     """The pyramid of a lat-long map (layout of `factorlib.conventions`)."""
-    fine = _subdivided(radiance)
+    # texels repeated until there are at least 1024 columns, so that every octahedral texel receives several
+    times = max(1, -(-1024 // radiance.shape[1]), -(-512 // radiance.shape[0]))
+    fine = np.repeat(np.repeat(np.asarray(radiance, np.float64), times, axis=0), times, axis=1)
     height, width = fine.shape[:2]
     area = np.repeat(lat_long_solid_angles(height, width), width)
-    texel = np.ravel_multi_index(_texel(lat_long_directions(height, width).reshape(-1, 3), SIDE), (SIDE, SIDE))
+    texel = np.ravel_multi_index(_texel(lat_long_directions(height, width).reshape(-1, 3)), (SIDE, SIDE))
     total = np.bincount(texel, area, SIDE * SIDE)
     sums = [np.bincount(texel, area * channel, SIDE * SIDE) for channel in fine.reshape(-1, 3).T]
     return Light(_pyramid(np.stack([s / total for s in sums], axis=-1).reshape(SIDE, SIDE, 3).astype(np.float32)))
@@ -68,89 +69,52 @@ def constant_light(colour: Float[np.ndarray, "3"]) -> Light:
     return Light(_pyramid(np.broadcast_to(np.asarray(colour, np.float32), (SIDE, SIDE, 3))))
 
 
-class Lookup(msgspec.Struct, frozen=True):
-    """Which texels of any light's pyramid each direction reads, numbered over all levels, the finest first; share: the coarser one's."""
-
-    finer: Int[np.ndarray, "*n"]
-    coarser: Int[np.ndarray, "*n"]
-    share: Float[np.ndarray, "*n"]
-
-    def of(self, light: Light) -> Float[np.ndarray, "*n 3"]:
-        """The light's radiance there."""
-        texels = np.concatenate([level.reshape(-1, 3) for level in light.levels])
-        return texels[self.finer] * (1 - self.share)[..., None] + texels[self.coarser] * self.share[..., None]
-
-
-def lookup_toward(direction: Float[np.ndarray, "*n 3"], solid_angle: Float[np.ndarray, "*n"]) -> Lookup:
-    """The look-up of unit directions, each the mean of about so many steradians around it: between the two nearest levels."""
+def radiance_toward(direction: Float[np.ndarray, "*n 3"], solid_angle: Float[np.ndarray, "*n"]) -> Reflected:
+    """Of any light, its radiance averaged over about `solid_angle` steradians around unit `direction`: between the two nearest levels."""
     finest, last = 4 * np.pi / SIDE**2, SIDE.bit_length() - 1
     level = np.clip(0.5 * np.log2(np.maximum(solid_angle, 1e-12) / finest), 0, last)
     below = np.minimum(level.astype(int), last - 1)
-    row, column = _texel(direction, SIDE)
+    row, column = _texel(direction)
     offsets = np.cumsum([0] + [(SIDE >> k) ** 2 for k in range(last)])
+    # numbers of texels over all levels, the finest first; share: the coarser one's
+    at = [(offsets[k] + (row >> k) * (SIDE >> k) + (column >> k)).astype(np.int32) for k in (below, below + 1)]
+    share = (level - below)[..., None]
 
-    def at(k: Int[np.ndarray, "*n"]) -> Int[np.ndarray, "*n"]:
-        return (offsets[k] + (row >> k) * (SIDE >> k) + (column >> k)).astype(np.int32)
+    def seen(light: Light) -> Float[np.ndarray, "*n 3"]:
+        texels = np.concatenate([level.reshape(-1, 3) for level in light.levels])
+        return texels[at[0]] * (1 - share) + texels[at[1]] * share
 
-    return Lookup(at(below), at(below + 1), level - below)
-
-
-def radiance_toward(
-    light: Light, direction: Float[np.ndarray, "*n 3"], solid_angle: Float[np.ndarray, "*n"]
-) -> Float[np.ndarray, "*n 3"]:
-    """Radiance averaged over about `solid_angle` steradians around unit `direction`."""
-    return lookup_toward(direction, solid_angle).of(light)
+    return seen
 
 
 def diffuse_ball(light: Light, normals: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
     """Reflected radiance of a white Lambert surface, E(n)/π."""
     cosine = np.maximum(normals.astype(np.float32) @ octahedral_directions(WIDE_SIDE).T.astype(np.float32), 0)
-    return _summed(light, cosine / np.float32(np.pi))
+    return _summed(cosine / np.float32(np.pi), light)
 
 
 def glossy_ball(light: Light, normals: Float[np.ndarray, "n 3"], roughness: float) -> Float[np.ndarray, "n 3"]:
     """Reflected radiance of GGX with k_s = 1, seen from `VIEW`."""
-    return glossy_lobe(normals, roughness).in_light(light)
+    return glossy_lobe(normals, roughness)(light)
 
 
-class WideLobe(msgspec.Struct, frozen=True):
-    """What each normal reflects of each texel of the level of `WIDE_SIDE`, per steradian."""
-
-    response: Float[np.ndarray, "n t"]
-
-    def in_light(self, light: Light) -> Float[np.ndarray, "n 3"]:
-        """Reflected radiance."""
-        return _summed(light, self.response)
-
-
-class NarrowLobe(msgspec.Struct, frozen=True):
-    """Where each normal's samples look, and what they count."""
-
-    sample: Lookup
-    weight: Float[np.ndarray, "n k"]
-
-    def in_light(self, light: Light) -> Float[np.ndarray, "n 3"]:
-        """Reflected radiance."""
-        return np.einsum("nk,nkc->nc", self.weight, self.sample.of(light)) / SAMPLES
-
-
-def glossy_lobe(normals: Float[np.ndarray, "n 3"], roughness: float) -> WideLobe | NarrowLobe:
-    """What `glossy_ball` computes alike for every light, which is most of its work."""
+def glossy_lobe(normals: Float[np.ndarray, "n 3"], roughness: float) -> Reflected:
+    """`glossy_ball` of any light: what is alike for every light, which is most of its work, is computed here."""
     alpha = max(float(roughness**2), 1e-3)
     return (_wide_lobe if alpha > WIDE_ALPHA else _narrow_lobe)(normals, alpha)
 
 
-def _wide_lobe(normals: Float[np.ndarray, "n 3"], alpha: float) -> WideLobe:
+def _wide_lobe(normals: Float[np.ndarray, "n 3"], alpha: float) -> Reflected:
     directions = octahedral_directions(WIDE_SIDE)
     half = directions + VIEW
     half /= np.maximum(np.linalg.norm(half, axis=-1, keepdims=True), 1e-9)
     cos_o = np.maximum(normals @ VIEW, 1e-3).astype(np.float32)[:, None]
     cos_i, cos_h = (normals.astype(np.float32) @ d.T.astype(np.float32) for d in (directions, half))
     shadowing = _g1(np.maximum(cos_i, 1e-6), alpha) * _g1(cos_o, alpha)
-    return WideLobe(np.where(cos_i > 0, _ggx(cos_h, alpha) * shadowing / (4 * cos_o), 0))
+    return partial(_summed, np.where(cos_i > 0, _ggx(cos_h, alpha) * shadowing / (4 * cos_o), 0))
 
 
-def _narrow_lobe(normals: Float[np.ndarray, "n 3"], alpha: float) -> NarrowLobe:
+def _narrow_lobe(normals: Float[np.ndarray, "n 3"], alpha: float) -> Reflected:
     cos_o = np.clip(normals @ VIEW, 1e-3, 1.0).astype(np.float32)[:, None]
     half = _visible_normals(cos_o, alpha)
     view = np.concatenate([np.sqrt(1 - cos_o**2), np.zeros_like(cos_o), cos_o], axis=-1)[:, None, :]
@@ -158,26 +122,26 @@ def _narrow_lobe(normals: Float[np.ndarray, "n 3"], alpha: float) -> NarrowLobe:
     density = _g1(cos_o, alpha) * _ggx(half[..., 2], alpha) / (4 * cos_o)  # of the incoming direction, per steradian
     frame = _frames(normals).astype(np.float32)  # rows: tangent toward the viewer, bitangent, normal
     weight = np.where(incoming[..., 2] > 0, _g1(np.maximum(incoming[..., 2], 1e-6), alpha), 0.0)
-    return NarrowLobe(lookup_toward(incoming @ frame, 1 / (SAMPLES * density)), weight)
+    seen = radiance_toward(incoming @ frame, 1 / (SAMPLES * density))
+    return lambda light: np.einsum("nk,nkc->nc", weight, seen(light)) / SAMPLES
 
 
 def mirror_ball(light: Light, normals: Float[np.ndarray, "n 3"], size: int) -> Float[np.ndarray, "n 3"]:
     """A perfect mirror: a pixel of a ball `size` pixels across sees 16 / size² steradians wherever it is."""
     mirrored = 2 * normals[:, 2:] * normals - VIEW
-    return radiance_toward(light, mirrored, np.full(len(normals), 16 / size**2))
+    return radiance_toward(mirrored, np.full(len(normals), 16 / size**2))(light)
 
 
-def ball(light: Light, material: Material, normals: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
+def ball(light: Light, material: Reflectance, normals: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
     """Reflected radiance of k_d/π + k_s · D G / (4 (n·i)(n·o)) in `light`."""
     diffuse, specular = np.asarray(material.diffuse, float), np.asarray(material.specular, float)
     value = diffuse * diffuse_ball(light, normals)
     return value + specular * glossy_ball(light, normals, material.roughness) if specular.any() else value
 
 
-def _summed(light: Light, response: Float[np.ndarray, "n t"]) -> Float[np.ndarray, "n 3"]:
+def _summed(response: Float[np.ndarray, "n t"], light: Light) -> Float[np.ndarray, "n 3"]:
     """∫ L · response over the texels of the level of `WIDE_SIDE`."""
-    level = next(lv for lv in light.levels if len(lv) == WIDE_SIDE)
-    return response @ level.reshape(-1, 3).astype(response.dtype) * (4 * np.pi / WIDE_SIDE**2)
+    return response @ light.wide.astype(response.dtype) * (4 * np.pi / WIDE_SIDE**2)
 
 
 def _g1(cosine: np.ndarray, alpha: float) -> np.ndarray:
@@ -212,12 +176,6 @@ def _frames(normals: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3 3"]:
     return np.stack([tangent, np.cross(normals, tangent), normals], axis=1)
 
 
-def _subdivided(radiance: Float[np.ndarray, "h w 3"]) -> Float[np.ndarray, "H W 3"]:
-    """Texels repeated until there are at least 1024 columns, so that every octahedral texel receives several."""
-    times = max(1, -(-1024 // radiance.shape[1]), -(-512 // radiance.shape[0]))
-    return np.repeat(np.repeat(np.asarray(radiance, np.float64), times, axis=0), times, axis=1)
-
-
 def _pyramid(finest: Float[np.ndarray, "s s 3"]) -> tuple[np.ndarray, ...]:
     levels = [finest]
     while len(levels[-1]) > 1:
@@ -226,15 +184,15 @@ def _pyramid(finest: Float[np.ndarray, "s s 3"]) -> tuple[np.ndarray, ...]:
     return tuple(levels)
 
 
-def _texel(direction: Float[np.ndarray, "*n 3"], side: int) -> tuple[Int[np.ndarray, "*n"], Int[np.ndarray, "*n"]]:
-    """Row and column of unit directions on the equal-area octahedral square."""
+def _texel(direction: Float[np.ndarray, "*n 3"]) -> tuple[Int[np.ndarray, "*n"], Int[np.ndarray, "*n"]]:
+    """Row and column of unit directions on the finest equal-area octahedral square."""
     x, y, z = np.moveaxis(direction, -1, 0)
     radius = np.sqrt(np.maximum(1 - np.abs(z), 0))
     v = radius * np.arctan2(np.abs(y), np.abs(x)) * (2 / np.pi)
     u = radius - v
     u, v = np.where(z < 0, 1 - v, u), np.where(z < 0, 1 - u, v)
     column, row = np.copysign(u, x), np.copysign(v, y)
-    return tuple(np.clip(((t + 1) / 2 * side).astype(int), 0, side - 1) for t in (row, column))
+    return tuple(np.clip(((t + 1) / 2 * SIDE).astype(int), 0, SIDE - 1) for t in (row, column))
 
 
 def octahedral_directions(side: int) -> Float[np.ndarray, "t 3"]:

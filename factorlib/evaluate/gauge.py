@@ -13,8 +13,6 @@ not drown a dark one.  For pictures, samples brighter than white are left out, e
 them, and one wrong highlight would decide.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 
 import numpy as np

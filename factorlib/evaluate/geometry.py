@@ -6,25 +6,16 @@ Poses    geodesic angle of rotation_estimateᵀ · rotation_truth, and the dista
          a symmetry can be far off in rotation and right in every pixel: normals tell.
 """
 
-from __future__ import annotations
-
-from typing import Any, Protocol
-
 import numpy as np
 from jaxtyping import Bool, Float
 
 from factorlib.conventions import FRONT
+from factorlib.dataset.schema import Pose
 from factorlib.images.boxes import box_sum
 from factorlib.results.metrics import AngleError, NormalError, PoseError
+from factorlib.results.poses import PoseEntry
 
 RANDOM_ROTATION_DEG = float(np.degrees(np.pi / 2 + 2 / np.pi))
-
-
-class RigidLike(Protocol):
-    """A rigid transform: a rotation matrix [3, 3] and a translation [3], as arrays or as rows of numbers."""
-
-    rotation: Any
-    translation: Any
 
 
 def normal_error(
@@ -55,24 +46,19 @@ def angles_deg(a: Float[np.ndarray, "n 3"], b: Float[np.ndarray, "n 3"]) -> Floa
     >>> angles_deg(np.array([[1.0, 0, 0]]), np.array([[0, 2.0, 0]])).tolist()
     [90.0]
     """
-    a, b = (v / np.linalg.norm(v, axis=-1, keepdims=True) for v in (np.asarray(a, float), np.asarray(b, float)))
+    a, b = (v / np.linalg.norm(v, axis=-1, keepdims=True) for v in (a, b))
     return np.degrees(2 * np.arctan2(np.linalg.norm(a - b, axis=-1), np.linalg.norm(a + b, axis=-1)))
 
 
-def rotation_angle_deg(a: Float[np.ndarray, "3 3"], b: Float[np.ndarray, "3 3"]) -> float:
-    """Geodesic distance of two rotations, degrees in [0, 180]."""
-    chord = np.linalg.norm(np.asarray(a, float) - np.asarray(b, float))  # 2√2 sin(angle / 2)
-    return float(np.degrees(2 * np.arcsin(min(1.0, chord / (2 * np.sqrt(2))))))
-
-
-def pose_error(estimate: RigidLike, truth: RigidLike) -> PoseError:
-    """Of two cam_from_object, as `Pose` of the dataset's schema; the translations in one unit."""
+def pose_error(estimate: PoseEntry | Pose, truth: Pose) -> PoseError:
+    """Of two cam_from_object; the translations in one unit."""
     moved = np.linalg.norm(np.subtract(estimate.translation, truth.translation))
     distance = float(np.linalg.norm(truth.translation)) or 1.0
-    turned = rotation_angle_deg(np.array(estimate.rotation, float), np.array(truth.rotation, float))
-    return PoseError(turned, float(moved) / distance, RANDOM_ROTATION_DEG)
+    chord = np.linalg.norm(np.subtract(estimate.rotation, truth.rotation))  # 2√2 sin(angle / 2)
+    turned = np.degrees(2 * np.arcsin(min(1.0, chord / (2 * np.sqrt(2)))))
+    return PoseError(float(turned), float(moved) / distance, RANDOM_ROTATION_DEG)
 
 
 def _summary(a: np.ndarray, b: np.ndarray) -> AngleError:
-    angles = angles_deg(a, b)
+    angles = angles_deg(a.astype(float), b.astype(float))
     return AngleError(*(round(float(np.percentile(angles, q)), 6) for q in (50, 90)))

@@ -9,11 +9,8 @@ Errors         rmse: √mean (e − t)² over √mean t²; 1 is what black score
 Null           a constant light of the true map's mean colour: a generous null, for no method knows that colour.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping
 
-import msgspec
 import numpy as np
 from jaxtyping import Bool, Float
 from scipy.ndimage import binary_dilation
@@ -29,16 +26,24 @@ from factorlib.evaluate.ball import (
     octahedral_directions,
 )
 from factorlib.evaluate.gauge import GAUGES, gauge_factors
+from factorlib.evaluate.geometry import angles_deg
+from factorlib.evaluate.picture import mean_error
 from factorlib.geometry.sphere import ball_normals, mirror_directions
 from factorlib.results.metrics import LightError, LightErrors, ScoredLight
 
 GLOSSY_ROUGHNESS = 0.4
-SPHERE_SIZE = 32
-SPHERES = ("mirror", "glossy", "lambertian")
-MAPS = ("all", "mirrored", "unmirrored")
 COVERAGE_ROWS, COVERAGE_DILATION = 32, 1
+SPHERE_SIZE = 32
+NORMALS, INSIDE = ball_normals(SPHERE_SIZE)
 
 Samples = Float[np.ndarray, "_ 3"]
+SPHERES = ("mirror", "glossy", "lambertian")
+VIEWS: dict[str, Callable[[Light], Samples]] = {
+    "mirror": lambda light: mirror_ball(light, NORMALS, SPHERE_SIZE),
+    "glossy": lambda light: glossy_ball(light, NORMALS, GLOSSY_ROUGHNESS),
+    "lambertian": lambda light: diffuse_ball(light, NORMALS),
+    **dict.fromkeys(("map_all", "map_mirrored", "map_unmirrored"), lambda light: light.wide),
+}
 
 
 def light_error(estimate: Samples, truth: Samples) -> LightError:
@@ -55,12 +60,8 @@ def light_error(estimate: Samples, truth: Samples) -> LightError:
 
 def rgb_angle(estimate: Samples, truth: Samples) -> float:
     """Mean angle between RGB vectors, degrees; samples where either is black are left out, 90 where all are."""
-    lengths = np.linalg.norm(estimate, axis=-1), np.linalg.norm(truth, axis=-1)
-    lit = (lengths[0] > 0) & (lengths[1] > 0)
-    if not lit.any():
-        return 90.0
-    a, b = (v[lit] / n[lit][:, None] for v, n in zip((estimate, truth), lengths))
-    return float(np.degrees(2 * np.arctan2(np.linalg.norm(a - b, axis=-1), np.linalg.norm(a + b, axis=-1))).mean())
+    lit = (np.linalg.norm(estimate, axis=-1) > 0) & (np.linalg.norm(truth, axis=-1) > 0)
+    return float(angles_deg(estimate[lit], truth[lit]).mean()) if lit.any() else 90.0
 
 
 def compare_lights(
@@ -72,8 +73,10 @@ def compare_lights(
         return None
     lights = {n: {gauge: {} for gauge in GAUGES} for n in names}
     seen = {n: mirrored[n][_at(mirrored[n])] for n in names if n in mirrored}
-    for view, render in _views().items():
-        for name, scored in _scored_view(view, render, estimates, truths, names, seen).items():
+    parts = {"map_mirrored": seen, "map_unmirrored": {n: ~hit for n, hit in seen.items()}}
+    for view, render in VIEWS.items():
+        shown = {n: part for n, part in parts.get(view, dict.fromkeys(names, np.True_)).items() if part.any()}
+        for name, scored in _scored_view(render, estimates, truths, shown).items():
             for gauge, score in scored.items():
                 lights[name][gauge][view] = score
     mean = {g: _mean([lights[n][g] for n in names]) for g in GAUGES}
@@ -99,25 +102,10 @@ def mirrored_directions(
 
 def sphere_row(light: Light) -> Float[np.ndarray, "s w 3"]:
     """The three spheres side by side, black around them."""
-    _, inside = ball_normals(SPHERE_SIZE)
-    row = np.zeros((len(SPHERES), *inside.shape, 3))
+    row = np.zeros((len(SPHERES), *INSIDE.shape, 3))
     for picture, name in zip(row, SPHERES, strict=True):
-        picture[inside] = _views()[name](light)
+        picture[INSIDE] = VIEWS[name](light)
     return np.concatenate(list(row), axis=1)
-
-
-def _views() -> dict[str, Callable[[Light], Samples]]:
-    normals, _ = ball_normals(SPHERE_SIZE)
-    return {
-        "mirror": lambda light: mirror_ball(light, normals, SPHERE_SIZE),
-        "glossy": lambda light: glossy_ball(light, normals, GLOSSY_ROUGHNESS),
-        "lambertian": lambda light: diffuse_ball(light, normals),
-        **{f"map_{part}": _map for part in MAPS},
-    }
-
-
-def _map(light: Light) -> Samples:
-    return next(lv for lv in light.levels if len(lv) == WIDE_SIDE).reshape(-1, 3)
 
 
 def _at(mask: Bool[np.ndarray, "h w"]) -> tuple[np.ndarray, np.ndarray]:
@@ -127,45 +115,28 @@ def _at(mask: Bool[np.ndarray, "h w"]) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _scored_view(
-    view: str,
     render: Callable[[Light], Samples],
     estimates: Mapping[str, Light],
     truths: Mapping[str, Light],
-    names: list[str],
-    seen: Mapping[str, np.ndarray],
+    shown: Mapping[str, Bool[np.ndarray, "*t"]],
 ) -> dict[str, dict[str, ScoredLight]]:
-    kept = {n: _part(view, seen.get(n)) for n in names}
-    names = [n for n in names if kept[n] is not None]
-    true = [render(truths[n])[kept[n]] for n in names]
-    found = [render(estimates[n])[kept[n]] for n in names]
-    constant = [render(constant_light(truths[n].mean))[kept[n]] for n in names]
+    """shown: by light, which of the samples count."""
+    true = [render(truths[n])[part].reshape(-1, 3) for n, part in shown.items()]
+    found = [render(estimates[n])[part].reshape(-1, 3) for n, part in shown.items()]
+    constant = [render(constant_light(truths[n].mean))[part].reshape(-1, 3) for n, part in shown.items()]
     whites = [float(np.sqrt(np.mean(t**2))) or 1.0 for t in true]
     factors = [gauge_factors(pictures, true, whites) for pictures in (found, constant)]
 
     def scored(i: int, g: str) -> ScoredLight:
         return ScoredLight(*(light_error(p[i] * f[g][i], true[i]) for p, f in zip((found, constant), factors)))
 
-    return {n: {g: scored(i, g) for g in GAUGES} for i, n in enumerate(names)}
-
-
-def _part(view: str, seen: Bool[np.ndarray, " t"] | None) -> slice | np.ndarray | None:
-    """The texels of a view: all of a sphere and of the whole map; None where a part of the map is empty or unknown."""
-    if view not in ("map_mirrored", "map_unmirrored"):
-        return slice(None)
-    if seen is None:
-        return None
-    part = seen if view == "map_mirrored" else ~seen
-    return part if part.any() else None
+    return {n: {g: scored(i, g) for g in GAUGES} for i, n in enumerate(shown)}
 
 
 def _mean(scored: list[dict[str, ScoredLight]]) -> dict[str, ScoredLight]:
-    by_view = {v: [s[v] for s in scored if v in s] for v in _views()}
-    parts = ("estimate", "null")
+    by_view = {v: [s[v] for s in scored if v in s] for v in VIEWS}
     return {
-        v: ScoredLight(*(_mean_error([getattr(s, k) for s in of]) for k in parts)) for v, of in by_view.items() if of
+        v: ScoredLight(*(mean_error([getattr(s, k) for s in of], 9) for k in ("estimate", "null")))
+        for v, of in by_view.items()
+        if of
     }
-
-
-def _mean_error(errors: list[LightError]) -> LightError:
-    values = np.array([msgspec.structs.astuple(e) for e in errors])
-    return LightError(*(round(float(np.mean(column)), 9) for column in values.T))

@@ -9,8 +9,6 @@ Colours       diffuse and specular, relative to the truth, after one factor per 
 Null          a grey ball: diffuse 0.5, specular 0.05, roughness 0.5 for every material, scaled by its own factor.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 
 import numpy as np
@@ -20,8 +18,6 @@ from factorlib.results.materials import Reflectance, Vec3
 from factorlib.results.metrics import ComparedMaterial, MaterialError, MaterialErrors
 
 DARKEST = 0.01
-
-
 GREY = Reflectance(diffuse=(0.5, 0.5, 0.5), specular=(0.05, 0.05, 0.05), roughness=0.5)
 
 
@@ -63,12 +59,8 @@ def _albedos(material: Reflectance) -> Float[np.ndarray, "2 3"]:
     return np.array([material.diffuse, material.specular], float)
 
 
-def _floored(material: Reflectance) -> Float[np.ndarray, "2 3"]:
-    return np.maximum(_albedos(material), DARKEST)
-
-
 def _error(estimate: Reflectance, truth: Reflectance, factor: Vec3) -> MaterialError:
-    relative = (_albedos(estimate) * factor - _albedos(truth)) / _floored(truth)
+    relative = (_albedos(estimate) * factor - _albedos(truth)) / np.maximum(_albedos(truth), DARKEST)
     diffuse, specular = (tuple(float(v) for v in row) for row in relative)
     return MaterialError(roughness=abs(estimate.roughness - truth.roughness), diffuse=diffuse, specular=specular)
 

@@ -8,19 +8,20 @@ Tone map   clip(exposure · radiance, 0, 1)^(1/2.2) with exposure = 1 / white: l
 White      the 99th percentile, over the mask, of the truth's brightest channel.
 """
 
-from __future__ import annotations
-
 import math
+from collections.abc import Sequence
+from typing import TypeVar
 
 import msgspec
 import numpy as np
 from jaxtyping import Bool, Float
-from scipy.ndimage import correlate1d
+from scipy.ndimage import correlate1d, find_objects
 
-from factorlib.results.metrics import PictureError
+from factorlib.results.metrics import LightError, PictureError
 
 Picture = Float[np.ndarray, "h w 3"]
 Mask = Bool[np.ndarray, "h w"]
+Error = TypeVar("Error", PictureError, LightError)
 
 HIGHEST_PSNR = 120.0
 WHITE_PERCENTILE = 99.0
@@ -80,7 +81,7 @@ def picture_errors(
     if not regions:
         return {}
     union = np.logical_or.reduce(list(regions.values()))
-    box = _box(union)
+    (box,) = find_objects(union.astype(np.uint8))
     estimate, truth, union = estimate[box], truth[box], union[box]
     shown = [tone_mapped(np.where(union[..., None], p, 0.0), 1 / white) for p in (estimate, truth)]
     ssim = ssim_map(*shown, union)
@@ -98,20 +99,15 @@ def picture_error(estimate: Picture, truth: Picture, mask: Mask, white: float) -
     return picture_errors(estimate, truth, {"": mask}, white).get("")
 
 
-def mean_error(errors: list[PictureError]) -> PictureError | None:
-    """The mean of each number (of dB, for PSNR); None of none."""
+def mean_error(errors: Sequence[Error], digits: int = 6) -> Error | None:
+    """The mean of each number of errors of one kind (of dB, for PSNR), rounded; None of none."""
     if not errors:
         return None
     values = np.array([msgspec.structs.astuple(e) for e in errors])
-    return PictureError(*(round(float(np.mean(column)), 6) for column in values.T))
+    return type(errors[0])(*(round(float(np.mean(column)), digits) for column in values.T))
 
 
 def _blurred(values: Float[np.ndarray, "h w c"]) -> Float[np.ndarray, "h w c"]:
     for axis in (0, 1):
         values = correlate1d(values, WINDOW, axis=axis, mode="constant")
     return values
-
-
-def _box(mask: Mask) -> tuple[slice, slice]:
-    rows, columns = np.nonzero(mask.any(axis=1))[0], np.nonzero(mask.any(axis=0))[0]
-    return slice(rows[0], rows[-1] + 1), slice(columns[0], columns[-1] + 1)

@@ -21,15 +21,13 @@ A pair's radiance is linear in its reflectances and in its light, so the factor 
 So balls are made without it, and it is stated for what is compared apart: materials × factor, lights / factor.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Mapping, Sequence
 from functools import lru_cache
 
 import numpy as np
 from jaxtyping import Float
 
-from factorlib.evaluate.ball import Light, NarrowLobe, WideLobe, diffuse_ball, glossy_lobe
+from factorlib.evaluate.ball import Light, Reflected, diffuse_ball, glossy_lobe
 from factorlib.evaluate.gauge import GAUGES, gauge_factors
 from factorlib.evaluate.picture import mean_error, picture_error, psnr, tone_mapped, white_of
 from factorlib.geometry.sphere import ball_normals
@@ -46,7 +44,7 @@ Samples = Float[np.ndarray, "_ 3"]
 
 
 @lru_cache(maxsize=16)
-def lobe_of(roughness: float) -> WideLobe | NarrowLobe:
+def lobe_of(roughness: float) -> Reflected:
     """The lobe of a ball, cached, for materials are shown in many lights.  16 take 200 MB at most."""
     return glossy_lobe(NORMALS, roughness)
 
@@ -64,7 +62,7 @@ class Appearances:
         if not any(material.specular):
             return value
         if material.roughness not in self.glossy:
-            self.glossy[material.roughness] = lobe_of(material.roughness).in_light(self.light)
+            self.glossy[material.roughness] = lobe_of(material.roughness)(self.light)
         return value + np.asarray(material.specular) * self.glossy[material.roughness]
 
 
@@ -154,9 +152,7 @@ def set_factor(pairs: Iterable[tuple[Reflectance, Reflectance]]) -> Vec3:
     >>> set_factor([(Reflectance((0.2, 0.4, 0.1), (0.1, 0.1, 0.1), 0.3), true)])
     (2.0, 1.0, 1.0)
     """
-    both = np.array(
-        [[(m.diffuse, m.specular) for m in pair] for pair in pairs], float
-    )  # [m, pair, k_d or k_s, channel]
+    both = np.array([[(m.diffuse, m.specular) for m in pair] for pair in pairs], float)
     recovered, true = (both[:, k].reshape(-1, 3).T for k in (0, 1))
     logs = [np.log(t[k]) - np.log(r[k]) for r, t in zip(recovered, true) for k in [(r > 0) & (t > 0)]]
     return tuple(round(float(np.exp(np.median(values))), 9) if values.size else 1.0 for values in logs)

@@ -9,8 +9,6 @@ is at least what was clipped, up to 2 %.
 Null: each material in each photo is one flat colour, its own mean over the counted pixels.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterable, Mapping
 
 import msgspec

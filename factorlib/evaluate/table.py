@@ -1,16 +1,6 @@
-"""Metrics against bounds, as a table a person can read when a regression test fails.
-
-python -m factorlib.evaluate.table build/synthetic/evaluate/metrics.json
-"""
-
-from __future__ import annotations
-
-import sys
-from collections.abc import Iterable
+"""How good the metrics of data/synthetic must be at worst, and how numbers in metrics.json are named: by dotted paths."""
 
 import msgspec
-
-from factorlib.results.metrics import read_metrics
 
 
 class Bound(msgspec.Struct, frozen=True):
@@ -22,18 +12,9 @@ class Bound(msgspec.Struct, frozen=True):
     unit: str
     meaning: str
 
-
-class Row(msgspec.Struct, frozen=True):
-    """A bound and its value: None where the path leads nowhere, which is not ok."""
-
-    bound: Bound
-    value: float | None
-
-    @property
-    def ok(self) -> bool:
-        """Whether the value is there and within its bound."""
-        sign = 1 if self.bound.sense == "≤" else -1
-        return self.value is not None and sign * self.value <= sign * self.bound.limit
+    def holds(self, value: float | None) -> bool:
+        """Whether the value is there, and within the bound."""
+        return value is not None and (value <= self.limit if self.sense == "≤" else value >= self.limit)
 
 
 # A quarter beyond the worst of five trained networks × two seeds of the solve.
@@ -63,37 +44,3 @@ def value_at(metrics: object, path: str) -> float | None:
         except (LookupError, TypeError, ValueError):
             return None
     return metrics
-
-
-def rows_of(metrics: object, bounds: Iterable[Bound]) -> list[Row]:
-    """The value of every bound, looked up in `metrics` by the bound's dotted path."""
-    return [Row(bound, value_at(metrics, bound.path)) for bound in bounds]
-
-
-def table_text(rows: list[Row]) -> str:
-    """metric, value, bound, ok: one line each, in columns.
-
-    >>> print(table_text([Row(Bound("a", "≤", 0.05, "", "roughness"), 0.0123)]))
-    metric     value   bound   ok   path
-    roughness  0.0123  ≤ 0.05  yes  a
-    """
-    cells = [("metric", "value", "bound", "ok", "path"), *(_cells(row.bound, row) for row in rows)]
-    widths = [max(len(c[k]) for c in cells) for k in range(4)]
-    return "\n".join("  ".join([c.ljust(w) for c, w in zip(line, widths, strict=False)] + [line[4]]) for line in cells)
-
-
-def _cells(bound: Bound, row: Row) -> tuple[str, str, str, str, str]:
-    unit = f" {bound.unit}" if bound.unit else ""
-    value = "missing" if row.value is None else f"{row.value:.4g}{unit}"
-    return bound.meaning, value, f"{bound.sense} {bound.limit:g}{unit}", "yes" if row.ok else "NO", bound.path
-
-
-def main(path: str) -> int:
-    """Print the table of the bounds of data/synthetic; 1 if any is broken."""
-    rows = rows_of(msgspec.to_builtins(read_metrics(path)), SYNTHETIC)
-    print(table_text(rows))
-    return 0 if all(row.ok for row in rows) else 1
-
-
-if __name__ == "__main__":
-    sys.exit(main(sys.argv[1]))

@@ -1,7 +1,5 @@
 """The maps of a truth, read and checked against what they describe: a true light is radiance, true normals have the photo's pixels."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

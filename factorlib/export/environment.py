@@ -6,8 +6,6 @@ lobe by a triangle of the node spacing h, of variance h²/6 along each axis; a l
 the lobes are first sharpened by as much, at the same energy: what Mitsuba interpolates has their energy and width.
 """
 
-from __future__ import annotations
-
 import numpy as np
 from jaxtyping import Float
 

@@ -9,8 +9,6 @@ gives a reflectance at normal incidence of k_d and k_s exactly, and no Fresnel w
 show the default F0 of 0.04.  baseColor stays within one because max k_d + max k_s does.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from functools import partial
 from pathlib import Path

@@ -7,8 +7,6 @@ Difference |shown − solved| / max(solved, 0.001), per channel; in the sky a wh
            all lit pixels, channels and lights.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from pathlib import Path
 
@@ -16,7 +14,8 @@ import msgspec
 import numpy as np
 from jaxtyping import Float
 
-from factorlib.export.viewers import MODELS, Angles, Model, distribution, filed, mirrored, solved, spread
+from factorlib.export.usd import with_roughness_of_file
+from factorlib.export.viewers import MODELS, Angles, Model, distribution, mirrored, solved, spread
 from factorlib.geometry.sphere import ball_normals
 from factorlib.jsonfile import write_json
 from factorlib.results.materials import Reflectance
@@ -42,18 +41,14 @@ def write_losses(path: str | Path, materials: Mapping[str, Reflectance]) -> None
 def losses(material: Reflectance) -> dict[str, Loss]:
     """Of each of `viewers.MODELS` against the model of the solve, rounded to 5 digits; a black material loses nothing."""
     material = msgspec.structs.replace(material, roughness=max(material.roughness, LEAST_ROUGHNESS))
-    true = ball(material, solved)
-    return {name: _loss(ball(filed(name, material), model), true) for name, model in MODELS.items()}
+    filed = {name: with_roughness_of_file(material) if name == "usd" else material for name in MODELS}
+    true = np.concatenate(ball(material, solved))
+    return {name: _loss(np.concatenate(ball(filed[name], model)), true) for name, model in MODELS.items()}
 
 
-def _loss(shown: list[np.ndarray], true: list[np.ndarray]) -> Loss:
-    relative = np.concatenate([_differences(*pair) for pair in zip(shown, true, strict=True)])
+def _loss(shown: Float[np.ndarray, "n 3"], true: Float[np.ndarray, "n 3"]) -> Loss:
+    relative = (np.abs(shown - true) / np.maximum(true, FLOOR))[(true > 0) | (shown > 0)]
     return Loss(round(float(relative.mean()), 5), round(float(relative.max()), 5)) if relative.size else Loss(0.0, 0.0)
-
-
-def _differences(shown: Float[np.ndarray, "n 3"], true: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, " k"]:
-    lit = (true > 0) | (shown > 0)
-    return (np.abs(shown - true) / np.maximum(true, FLOOR))[lit]
 
 
 def ball(material: Reflectance, model: Model) -> list[Float[np.ndarray, "n 3"]]:
@@ -82,14 +77,9 @@ def in_sky(material: Reflectance, model: Model, no: Float[np.ndarray, " n"]) -> 
     """∫ f n·i di by n·o: the specular part over directions spread by the GGX, the diffuse part over ones spread by n·i."""
     angles, weight = mirrored(material.alpha, no, SKY_SAMPLES)
     specular = (weight[..., None] * model(material, angles).lobe).mean(axis=1)
-    return specular + np.pi * model(material, _by_cosine(no)).diffuse.mean(axis=1)
-
-
-def _by_cosine(no: Float[np.ndarray, " n"]) -> Angles:
-    """Directions i with density n·i/π."""
     square, phi = spread(SKY_SAMPLES)
     ni = np.broadcast_to(np.sqrt(square), (len(no), square.size))
     no = np.broadcast_to(no[:, None], ni.shape)
     io = ni * no + np.sqrt((1 - ni**2) * (1 - no**2)) * np.cos(phi)
     oh = np.sqrt((1 + io) / 2)
-    return Angles(ni, no, (ni + no) / (2 * oh), oh)
+    return specular + np.pi * model(material, Angles(ni, no, (ni + no) / (2 * oh), oh)).diffuse.mean(axis=1)

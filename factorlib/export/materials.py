@@ -6,13 +6,11 @@ material exceeds that, one factor for the whole set moves from all reflectances 
 every light keeps its radiance, also across photos that share nothing.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 
 import msgspec
 
-from factorlib.results.materials import Channels, MaterialTable, Reflectance, Solved, StandardErrors
+from factorlib.results.materials import MaterialTable, Reflectance, Solved, StandardErrors
 
 HEADROOM = 1e-5
 RULE = "where max diffuse + max specular of a material exceeds 1 - 1e-5, one factor moves from all reflectances to all lights"
@@ -32,14 +30,10 @@ def headroom_factor(materials: Mapping[str, Reflectance]) -> float:
 def table_in_gauge(table: MaterialTable, factor: float) -> MaterialTable:
     """The table with reflectances and their standard errors times `factor`, which `gauge` then tells."""
     gauge = msgspec.structs.replace(table.gauge, export_factor=factor, export_rule=RULE)
-    materials = {name: _scaled(one, factor) for name, one in table.materials.items()}
+
+    def scaled(of: Solved | StandardErrors) -> Solved | StandardErrors:
+        diffuse, specular = (tuple(factor * value for value in colour) for colour in (of.diffuse, of.specular))
+        return msgspec.structs.replace(of, diffuse=diffuse, specular=specular)
+
+    materials = {n: msgspec.structs.replace(scaled(m), stderr=scaled(m.stderr)) for n, m in table.materials.items()}
     return msgspec.structs.replace(table, materials=materials, gauge=gauge)
-
-
-def _scaled(material: Solved, factor: float) -> Solved:
-    stderr = msgspec.structs.replace(material.stderr, **_colours(material.stderr, factor))
-    return msgspec.structs.replace(material, stderr=stderr, **_colours(material, factor))
-
-
-def _colours(of: Solved | StandardErrors, factor: float) -> dict[str, Channels]:
-    return {name: tuple(factor * value for value in getattr(of, name)) for name in ("diffuse", "specular")}

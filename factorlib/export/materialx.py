@@ -12,23 +12,14 @@ Different from what was solved: MaterialX's renderers shadow with the height-cor
 energy of multiple scattering (`factorlib.export.viewers`, measured by `factorlib.export.loss`).
 """
 
-from __future__ import annotations
-
 import xml.etree.ElementTree as ET
 from collections.abc import Mapping
-from pathlib import Path
 
 import numpy as np
 
 from factorlib.results.materials import Reflectance
-from factorlib.wholefile import write_text
 
 NO_FRESNEL = 1e4  # index of refraction: F0 = 0.9996
-
-
-def write_materialx(path: str | Path, materials: Mapping[str, Reflectance]) -> None:
-    """Write the text of `materialx`."""
-    write_text(path, materialx(materials))
 
 
 def materialx(materials: Mapping[str, Reflectance]) -> str:
@@ -36,8 +27,14 @@ def materialx(materials: Mapping[str, Reflectance]) -> str:
     document = ET.Element("materialx", version="1.39", colorspace="lin_rec709")
     for name, material in materials.items():
         prefix = f"m_{name.replace('-', '_')}"
-        _add_material(document, prefix, name, material)
-        _add_standard_surface(document, f"{prefix}_standard_surface", f"{name}, standard surface", material)
+        for add, end, shown in (
+            (_add_nodes, "", name),
+            (_add_standard, "_standard_surface", f"{name}, standard surface"),
+        ):
+            add(document, prefix + end, material)
+            shader = _add(document, "surfacematerial", prefix + end, "material")
+            shader.set("uiname", shown)
+            _input(shader, "surfaceshader", "surfaceshader", nodename=f"{prefix}{end}_surface")
     ET.indent(document, " ")
     return '<?xml version="1.0"?>\n' + ET.tostring(document, encoding="unicode") + "\n"
 
@@ -49,7 +46,7 @@ def mixture(material: Reflectance) -> tuple[float, np.ndarray, np.ndarray]:
     return weight, np.array(diffuse), np.array([v / weight if weight > 0 else 0.0 for v in material.specular])
 
 
-def _add_material(document: ET.Element, prefix: str, name: str, material: Reflectance) -> None:
+def _add_nodes(document: ET.Element, prefix: str, material: Reflectance) -> None:
     weight, diffuse, specular = mixture(material)
     _add(document, "oren_nayar_diffuse_bsdf", f"{prefix}_diffuse", "BSDF", color=diffuse, roughness=0.0)
     colours = {"color0": specular, "color90": specular}
@@ -60,22 +57,14 @@ def _add_material(document: ET.Element, prefix: str, name: str, material: Reflec
     _input(mix, "fg", "BSDF", nodename=f"{prefix}_specular")
     _input(mix, "bg", "BSDF", nodename=f"{prefix}_diffuse")
     _input(_add(document, "surface", f"{prefix}_surface", "surfaceshader"), "bsdf", "BSDF", nodename=f"{prefix}_bsdf")
-    _add_surface_material(document, prefix, name)
 
 
-def _add_standard_surface(document: ET.Element, prefix: str, name: str, material: Reflectance) -> None:
+def _add_standard(document: ET.Element, prefix: str, material: Reflectance) -> None:
     brightest = max(material.specular)
     base, tint = np.array(material.diffuse) / (1 - brightest), np.array(material.specular) / (brightest or 1)
     numbers = {"specular": brightest, "specular_roughness": material.roughness, "specular_IOR": NO_FRESNEL}
     inputs = {"base": 1.0, "base_color": base, "specular_color": tint, **numbers}
     _add(document, "standard_surface", f"{prefix}_surface", "surfaceshader", **inputs)
-    _add_surface_material(document, prefix, name)
-
-
-def _add_surface_material(document: ET.Element, prefix: str, name: str) -> None:
-    shader = _add(document, "surfacematerial", prefix, "material")
-    shader.set("uiname", name)
-    _input(shader, "surfaceshader", "surfaceshader", nodename=f"{prefix}_surface")
 
 
 def _add(document: ET.Element, category: str, name: str, kind: str, **inputs: float | np.ndarray) -> ET.Element:

@@ -2,28 +2,25 @@
 
     /scene/camera, light, materials/<material>, objects/<object>/<material>;  /Render/photo: the size in pixels
 
-Frame     The camera frame turned y-up (x right, y up, z toward the viewer), in the poses' units; the camera stands at the origin and
-          looks along −z, as every USD camera does.  USD multiplies rows from the left: matrices are written transposed.
+Frame     As of `factorlib.export.scene`, in the poses' units; the camera looks along −z, as every USD camera does.  USD multiplies
+          rows from the left: matrices are written transposed.
 Camera    Apertures are fractions of FILM wide; their offset is where the picture's middle is, right of and above the principal point.
-Light     A dome light's map has OpenEXR's layout, top +y, middle +z, as the exported maps have it: only a light fixed to the world turns.
+Light     A dome light's map has OpenEXR's layout, as the exported maps have it.
 Material  UsdPreviewSurface: GGX of α = roughness², Schlick's F from F0 to F90, diffuseColor × (1 − F) per channel (`shader_inputs`).
 Meshes    A file for each part of one material, beside the PLY file, to which scenes refer.
 Names     Every prim bears the name of the data set as displayName; its identifier is that name where USD allows it (`identifiers`).
 """
 
-from __future__ import annotations
-
 import re
 from collections.abc import Iterable, Mapping, Sequence
+from itertools import chain, count
 from pathlib import Path, PurePosixPath
 
 import msgspec
 import numpy as np
 from jaxtyping import Float
 
-from factorlib.conventions import YUP_FROM_CAMERA
-from factorlib.export.blender import ExposedMap
-from factorlib.export.mitsuba import Shape, View, clip_distances
+from factorlib.export.scene import ExposedMap, Scene, Shape
 from factorlib.meshes.mesh import Mesh
 from factorlib.results.materials import Reflectance
 from factorlib.wholefile import write_text
@@ -35,21 +32,14 @@ UP_AXIS = ["metersPerUnit = 1", 'upAxis = "Y"']  # what a unit of the poses is i
 ESCAPES = {"\\": "\\\\", '"': '\\"', "\n": "\\n", "\r": "\\r", "\t": "\\t"}
 
 
-def write_usd_scene(
-    path: str | Path, view: View, shapes: Sequence[Shape], materials: Mapping[str, Reflectance], light: ExposedMap
-) -> None:
-    """Write a photo's scene; of `materials` those that shapes name.  A shape's file has a twin by `write_usd_mesh`."""
-    write_text(path, scene_text(view, shapes, materials, light))
-
-
-def scene_text(view: View, shapes: Sequence[Shape], materials: Mapping[str, Reflectance], light: ExposedMap) -> str:
-    """What `write_usd_scene` writes."""
-    named = identifiers(sorted({shape.material for shape in shapes}))
-    scene = [*_camera(view, shapes), *_light(light), *_materials(materials, named), *_objects(shapes, named)]
-    film = ["rel camera = </scene/camera>", f"uniform int2 resolution = ({view.width}, {view.height})"]
+def write_usd_scene(path: str | Path, scene: Scene) -> None:
+    """Write a photo's scene; of its materials those that shapes name.  A shape's file has a twin by `write_usd_mesh`."""
+    named = identifiers(sorted({shape.material for shape in scene.shapes}))
+    parts = [*_camera(scene), *_light(scene.light), *_materials(scene, named), *_objects(scene.shapes, named)]
+    size = f"uniform int2 resolution = ({scene.camera.width}, {scene.camera.height})"
+    settings = _prim('RenderSettings "photo"', ["rel camera = </scene/camera>", size])
     about = ['defaultPrim = "scene"', UP_AXIS[0], 'renderSettingsPrimPath = "/Render/photo"', UP_AXIS[1]]
-    render = _prim('Scope "Render"', _prim('RenderSettings "photo"', film))
-    return _layer(about, [*_prim('Xform "scene"', scene), *render])
+    write_text(path, _layer(about, [*_prim('Xform "scene"', parts), *_prim('Scope "Render"', settings)]))
 
 
 def write_usd_mesh(path: str | Path, mesh: Mesh) -> None:
@@ -94,35 +84,28 @@ def identifiers(names: Iterable[str]) -> dict[str, str]:
     >>> identifiers(["red-1", "red_1", "2", ""])
     {'red_1': 'red_1', 'red-1': 'red_1_2', '2': '_2', '': '_'}
     """
+    plain = {name: re.sub(r"^(?=[0-9]|$)", "_", re.sub(r"[^A-Za-z0-9_]", "_", name)) for name in names}
     found: dict[str, str] = {}
-    for name in sorted(dict.fromkeys(names), key=lambda name: _identifier(name) != name):
-        number, first = 1, _identifier(name)
-        found_name = first
-        while found_name in found.values():
-            number += 1
-            found_name = f"{first}_{number}"
-        found[name] = found_name
+    for name in sorted(plain, key=lambda name: plain[name] != name):
+        choices = chain([plain[name]], (f"{plain[name]}_{number}" for number in count(2)))
+        found[name] = next(each for each in choices if each not in found.values())
     return found
-
-
-def _identifier(name: str) -> str:
-    plain = re.sub(r"[^A-Za-z0-9_]", "_", name)
-    return plain if plain and not plain[0].isdigit() else f"_{plain}"
 
 
 # parts of a scene ----------------------------------------------------------------------------------------------------
 
 
-def _camera(view: View, shapes: Sequence[Shape]) -> list[str]:
-    (cx, cy), (w, h), pixel = view.principal_point, (view.width, view.height), FILM / view.width
+def _camera(scene: Scene) -> list[str]:
+    camera, pixel = scene.camera, FILM / scene.camera.width
+    (cx, cy), (w, h) = camera.centre, (camera.width, camera.height)
     numbers = {
-        "focalLength": view.focal_px * pixel,
+        "focalLength": camera.focal * pixel,
         "horizontalAperture": w * pixel,
         "horizontalApertureOffset": (w / 2 - cx) * pixel,
         "verticalAperture": h * pixel,
         "verticalApertureOffset": (cy - h / 2) * pixel,
     }
-    lines = [f"float2 clippingRange = {_tuple(clip_distances(shapes))}", 'token projection = "perspective"']
+    lines = [f"float2 clippingRange = {_tuple(scene.clip_distances)}", 'token projection = "perspective"']
     return _prim('Camera "camera"', [*lines, *(f"float {name} = {_number(value)}" for name, value in numbers.items())])
 
 
@@ -130,31 +113,27 @@ def _light(light: ExposedMap) -> list[str]:
     """exposure = intensity · color."""
     intensity = float(light.exposure.max())
     colour = light.exposure / intensity if intensity > 0 else np.ones(3)
-    turn = np.eye(4)
-    turn[:3, :3] = YUP_FROM_CAMERA @ light.camera_from_light @ YUP_FROM_CAMERA
     lines = [
         f"color3f inputs:color = {_tuple(colour)}",
         f"float inputs:intensity = {_number(intensity)}",
         f"asset inputs:texture:file = {_asset(light.file)}",
         'token inputs:texture:format = "latlong"',
     ]
-    return _prim('DomeLight "light"', [*lines, *_transform(turn)])
+    return _prim('DomeLight "light"', [*lines, *_transform(light.world_from_light)])
 
 
-def _materials(materials: Mapping[str, Reflectance], named: Mapping[str, str]) -> list[str]:
-    lines = [line for name, identifier in named.items() for line in _material(name, identifier, materials[name])]
+def _materials(scene: Scene, named: Mapping[str, str]) -> list[str]:
+    lines = []
+    for name, identifier in named.items():
+        shader = ['uniform token info:id = "UsdPreviewSurface"']
+        for key, value in shader_inputs(scene.materials[name]).items():
+            kind = "color3f" if np.ndim(value) else "int" if isinstance(value, int) else "float"
+            words = {"color3f": _tuple, "int": str, "float": _number}[kind](value)
+            shader.append(f"{kind} inputs:{key} = {words}")
+        surface = f"token outputs:surface.connect = </scene/materials/{identifier}/surface.outputs:surface>"
+        about = [surface, *_prim('Shader "surface"', [*shader, "token outputs:surface"])]
+        lines += _prim(f'Material "{identifier}"', about, _shown(name))
     return _prim('Scope "materials"', lines)
-
-
-def _material(name: str, identifier: str, material: Reflectance) -> list[str]:
-    shader = ['uniform token info:id = "UsdPreviewSurface"']
-    for key, value in shader_inputs(material).items():
-        kind = "color3f" if np.ndim(value) else "int" if isinstance(value, int) else "float"
-        words = {"color3f": _tuple, "int": str, "float": _number}[kind](value)
-        shader.append(f"{kind} inputs:{key} = {words}")
-    surface = f"token outputs:surface.connect = </scene/materials/{identifier}/surface.outputs:surface>"
-    lines = [surface, *_prim('Shader "surface"', [*shader, "token outputs:surface"])]
-    return _prim(f'Material "{identifier}"', lines, _shown(name))
 
 
 def _objects(shapes: Sequence[Shape], materials: Mapping[str, str]) -> list[str]:
@@ -164,19 +143,14 @@ def _objects(shapes: Sequence[Shape], materials: Mapping[str, str]) -> list[str]
         objects.setdefault(shape.name.removesuffix(f".{shape.material}"), []).append(shape)
     lines = []
     for name, identifier in identifiers(objects).items():
-        place = np.eye(4)
-        place[:3, :3] = YUP_FROM_CAMERA
-        parts = [line for shape in objects[name] for line in _part(shape, materials[shape.material])]
-        about = [*_transform(place @ objects[name][0].cam_from_object), *parts]
+        about = _transform(objects[name][0].world_from_object)
+        for shape in objects[name]:
+            file, material = PurePosixPath(shape.file).with_suffix(SUFFIX), materials[shape.material]
+            references = f"prepend references = {_asset(f'./{file}')}"
+            head = ['prepend apiSchemas = ["MaterialBindingAPI"]', *_shown(shape.material), references]
+            about += _prim(f'Mesh "{material}"', [f"rel material:binding = </scene/materials/{material}>"], head)
         lines += _prim(f'Xform "{identifier}"', about, _shown(name))
     return _prim('Scope "objects"', lines)
-
-
-def _part(shape: Shape, material: str) -> list[str]:
-    file = f"./{PurePosixPath(shape.file).with_suffix(SUFFIX)}"
-    binding, references = 'prepend apiSchemas = ["MaterialBindingAPI"]', f"prepend references = {_asset(file)}"
-    about = [binding, *_shown(shape.material), references]
-    return _prim(f'Mesh "{material}"', [f"rel material:binding = </scene/materials/{material}>"], about)
 
 
 def _transform(matrix: Float[np.ndarray, "4 4"]) -> list[str]:
@@ -202,12 +176,8 @@ def _indented(lines: Sequence[str]) -> list[str]:
 
 
 def _shown(name: str) -> list[str]:
-    return [f"displayName = {_string(name)}"]
-
-
-def _string(text: str) -> str:
-    plain = {c: c if c.isprintable() or ord(c) >= 128 else f"\\x{ord(c):02x}" for c in text} | ESCAPES
-    return '"' + "".join(plain[c] for c in text) + '"'
+    plain = {c: c if c.isprintable() or ord(c) >= 128 else f"\\x{ord(c):02x}" for c in name} | ESCAPES
+    return ['displayName = "' + "".join(plain[c] for c in name) + '"']
 
 
 def _asset(path: str) -> str:

@@ -12,10 +12,8 @@ All are Lambert plus GGX of the same α; they differ in shadowing, in Fresnel, a
     usd                  UsdPreviewSurface: Schlick's F to F90 = 1, diffuse × (1 − F) as OpenUSD's shader; V, not specified, as solved
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
-from functools import cache
+from functools import cache, partial
 
 import msgspec
 import numpy as np
@@ -23,7 +21,7 @@ from jaxtyping import Float
 
 from factorlib.export.gltf import DIELECTRIC, EXTENSION, gltf_material
 from factorlib.export.materialx import mixture
-from factorlib.export.usd import shader_inputs, with_roughness_of_file
+from factorlib.export.usd import shader_inputs
 from factorlib.results.materials import Reflectance
 
 ALBEDO_NODES, ALBEDO_SAMPLES = 64, 4096  # cosines of the albedo's table; half vectors
@@ -47,6 +45,7 @@ class Parts(msgspec.Struct, frozen=True):
 
 
 Model = Callable[[Reflectance, Angles], Parts]
+Shadowing = Callable[[float, Angles], Float[np.ndarray, "*n"]]
 
 
 def distribution(alpha: float, nh: Float[np.ndarray, "*n"]) -> Float[np.ndarray, "*n"]:
@@ -57,26 +56,6 @@ def distribution(alpha: float, nh: Float[np.ndarray, "*n"]) -> Float[np.ndarray,
 def solved(material: Reflectance, angles: Angles) -> Parts:
     """The model of the solve."""
     return _parts(angles, material.diffuse, material.specular, separable(material.alpha, angles))
-
-
-def blender(material: Reflectance, angles: Angles) -> Parts:
-    """Diffuse BSDF + Glossy BSDF in Cycles."""
-    return _parts(angles, material.diffuse, material.specular, correlated(material.alpha, angles))
-
-
-def glb(material: Reflectance, angles: Angles) -> Parts:
-    """glTF's reference BRDF."""
-    return _gltf(material, angles, separable(material.alpha, angles))
-
-
-def glb_correlated(material: Reflectance, angles: Angles) -> Parts:
-    """glTF with the height-correlated shadowing term."""
-    return _gltf(material, angles, correlated(material.alpha, angles))
-
-
-def glb_plain(material: Reflectance, angles: Angles) -> Parts:
-    """glTF's reference BRDF where the extension is not known."""
-    return _gltf(material, angles, separable(material.alpha, angles), extension=False)
 
 
 def mtlx(material: Reflectance, angles: Angles) -> Parts:
@@ -95,7 +74,7 @@ def mtlx_standard_surface(material: Reflectance, angles: Angles) -> Parts:
 
 
 def usd(material: Reflectance, angles: Angles) -> Parts:
-    """UsdPreviewSurface, from the numbers in the file; roughness: the material's, which `filed` has made the file's."""
+    """UsdPreviewSurface, from the numbers in the file; of the material's own roughness, which `factorlib.export.loss` makes the file's."""
     inputs = shader_inputs(material)
     base = inputs["diffuseColor"]
     if not inputs["useSpecularWorkflow"]:  # a metal
@@ -103,15 +82,6 @@ def usd(material: Reflectance, angles: Angles) -> Parts:
     f0 = inputs["specularColor"]
     fresnel = f0 + np.multiply.outer((1 - angles.oh) ** 5, 1 - f0)
     return _parts(angles, base * (1 - fresnel), fresnel, separable(material.alpha, angles))
-
-
-_ALL = (blender, glb, glb_correlated, glb_plain, mtlx, mtlx_standard_surface, usd)
-MODELS: dict[str, Model] = {model.__name__: model for model in _ALL}
-
-
-def filed(name: str, material: Reflectance) -> Reflectance:
-    """The material with the roughness that the file of a model of `MODELS` gives it."""
-    return with_roughness_of_file(material) if name == usd.__name__ else material
 
 
 # terms ---------------------------------------------------------------------------------------------------------------
@@ -163,7 +133,7 @@ def mirrored(alpha: float, no: Float[np.ndarray, " n"], count: int) -> tuple[Ang
     return Angles(ni.clip(0), np.broadcast_to(no[:, None], shape), np.broadcast_to(nh, shape), oh.clip(0)), weight
 
 
-def _gltf(material: Reflectance, angles: Angles, visibility: Float[np.ndarray, "*n"], extension: bool = True) -> Parts:
+def _gltf(material: Reflectance, angles: Angles, shadowing: Shadowing, extension: bool = True) -> Parts:
     """From the numbers in the file."""
     entry = gltf_material(material)
     base = np.array(entry["pbrMetallicRoughness"]["baseColorFactor"][:3])
@@ -172,7 +142,8 @@ def _gltf(material: Reflectance, angles: Angles, visibility: Float[np.ndarray, "
     f90 = specular["specularFactor"]
     f0 = f90 * np.minimum(DIELECTRIC * np.array(specular["specularColorFactor"]), 1)
     fresnel = f0 + np.multiply.outer((1 - angles.oh) ** 5, f90 - f0)
-    return _parts(angles, base * (1 - fresnel.max(axis=-1, keepdims=True)), fresnel, visibility)
+    diffuse = base * (1 - fresnel.max(axis=-1, keepdims=True))
+    return _parts(angles, diffuse, fresnel, shadowing(material.alpha, angles))
 
 
 def _parts(
@@ -181,3 +152,14 @@ def _parts(
     """diffuse: an albedo;  specular: F."""
     shape = (*angles.no.shape, 3)
     return Parts(np.broadcast_to(np.asarray(diffuse) / np.pi, shape), visibility[..., None] * np.asarray(specular))
+
+
+MODELS: dict[str, Model] = {
+    "blender": lambda m, angles: _parts(angles, m.diffuse, m.specular, correlated(m.alpha, angles)),
+    "glb": partial(_gltf, shadowing=separable),
+    "glb_correlated": partial(_gltf, shadowing=correlated),
+    "glb_plain": partial(_gltf, shadowing=separable, extension=False),
+    "mtlx": mtlx,
+    "mtlx_standard_surface": mtlx_standard_surface,
+    "usd": usd,
+}

@@ -109,7 +109,7 @@ def generate(out: Path, seed: int, lat_longs: Sequence[Path], parameters: Parame
     for number, shot in enumerate(SHOTS):
         progress(2 * number, 2 * len(SHOTS), f"light of {shot.name}")
         world_from_camera = look(rng.uniform(-14, -6), rng.uniform(0, 360))
-        light = light_of(number, world_from_camera, lat_longs, rng, parameters)
+        light = light_of(number, world_from_camera, lat_longs, rng, parameters.light_rows, parameters.light_spp)
         progress(2 * number + 1, 2 * len(SHOTS), f"photo {shot.name}")
         poses[shot.name] = placements(shot, world_from_camera, rng, spread)
         photos.append(write_shot(out, Scene(shot, light, materials, meshes, poses[shot.name]), parameters, seed))
@@ -121,12 +121,11 @@ def generate(out: Path, seed: int, lat_longs: Sequence[Path], parameters: Parame
 
 
 def light_of(
-    number: int, world_from_camera: Rotation, lat_longs: Sequence[Path], rng: Rng, parameters: Parameters
+    number: int, world_from_camera: Rotation, lat_longs: Sequence[Path], rng: Rng, rows: int, spp: int
 ) -> Float[np.ndarray, "h w 3"]:
     """The light of photo `number`, in the camera's y-up frame: one of `lat_longs`, or daylight for photo 0, the sun behind the camera
-    to its left or right, and for the others rooms with as many lamps as their number.
+    to its left or right, and for the others rooms with as many lamps as their number.  rows, spp: of the map, and samples a pixel
     """
-    rows = parameters.light_rows
     if lat_longs:
         return captured(lat_longs[number % len(lat_longs)], rows)
     seed = int(rng.integers(1 << 24))
@@ -136,7 +135,7 @@ def light_of(
         forward = np.degrees(np.arctan2(world_from_camera[0, 2], world_from_camera[2, 2]))
         up, turn = rng.uniform(30, 50), rng.choice([-1, 1]) * rng.uniform(35, 70)
         scene = daylight(rng, up, forward + 180 + turn, rows=2 * rows)
-    return light_seen(scene, rigid(world_from_camera @ YUP_FROM_CAMERA, (0, 0, 0)), rows, parameters.light_spp, seed)
+    return light_seen(scene, rigid(world_from_camera @ YUP_FROM_CAMERA, (0, 0, 0)), rows, spp, seed)
 
 
 def placements(shot: Shot, world_from_camera: Rotation, rng: np.random.Generator, spread: float) -> dict[str, Pose]:

@@ -5,8 +5,6 @@ likely each is from a random drop).  Of the facets that look down in the photos 
 taken: people photograph things upright, a tall one from below and a low one from above.
 """
 
-from __future__ import annotations
-
 import msgspec
 import numpy as np
 import trimesh

@@ -18,8 +18,6 @@ The ground is a disc about the object, its diffuse reflectance that which makes 
 the photo shows, and shadows fade out toward its rim.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from typing import Any
 
@@ -31,7 +29,7 @@ from scipy.spatial.transform import Rotation
 
 from factorlib.conventions import YUP_FROM_CAMERA
 from factorlib.errors import InputError
-from factorlib.export.mitsuba import ALL_BOUNCES
+from factorlib.export.scene import ALL_BOUNCES
 from factorlib.geometry.camera import Camera, rotation_of_vector
 from factorlib.meshes.mesh import Mesh
 from factorlib.meshes.ply import submesh
@@ -49,18 +47,6 @@ GROUND, STEPS = "+ground", 5
 NEW = "+"  # what the new object and its materials are called: no name in dataset.yaml has it
 
 Picture = Float[np.ndarray, "h w 3"]
-
-
-class Backdrop(msgspec.Struct, frozen=True):
-    """What a new object is put into: a photo, and the scene that was solved of it.
-
-    photo:   linear radiance, its tone curve undone
-    covered: pixels that show something else than the ground
-    """
-
-    scene: PhotoScene
-    photo: Picture
-    covered: Bool[np.ndarray, "h w"]
 
 
 class Ground(msgspec.Struct, frozen=True):
@@ -99,8 +85,9 @@ def spot_beside(scene: PhotoScene, plane: Plane, neighbour: Placed, relative_hei
 
     def room(point: Float[np.ndarray, "3"]) -> float:
         """Pixels to the picture's border, or to another object's middle, whichever is less."""
-        (x, y), width = _pixel(scene.camera, point), scene.camera.width
-        taken = [abs(_pixel(scene.camera, each.vertices.mean(axis=0))[0] - x) for each in others]
+        (x, y), width = scene.camera.project(point @ YUP_FROM_CAMERA), scene.camera.width
+        middles = [each.vertices.mean(axis=0) @ YUP_FROM_CAMERA for each in others]
+        taken = [abs(scene.camera.project(middle)[0] - x) for middle in middles]
         return min([x, width - x, scene.camera.height - y, *taken])
 
     return Spot(plane, max(spots, key=room), height)
@@ -144,18 +131,20 @@ class Inserted(msgspec.Struct, frozen=True):
 
 
 def inserted(
-    backdrop: Backdrop,
+    scene: PhotoScene,
+    photo: Picture,
+    covered: Bool[np.ndarray, "h w"],
     new: Placed,
     spot: Spot,
     ground: Ground,
     samples: int,
     report: Callable[[int], None] = lambda done: None,
 ) -> Inserted:
-    """The photo with the new object; report: how many of STEPS are done.
+    """The photo of the scene with the new object.  Raises InputError where that is not seen.
 
-    Raises InputError where the new object is not seen.
+    photo: linear radiance, its tone curve undone;  covered: pixels that show something else than the ground
+    report: how many of STEPS are done
     """
-    scene, photo = backdrop.scene, backdrop.photo
     camera = sensor(scene.camera, rigid(YUP_FROM_CAMERA, np.zeros(3)), near=scene.near)
     there = {"light": light_entry(scene.light), **shapes(scene.objects, scene.materials)}
     more = shapes([new], scene.materials)
@@ -165,7 +154,9 @@ def inserted(
         return rendered({**there, **entries}, camera, samples, 1, ALL_BOUNCES, hide_emitters=True)
 
     distance = _distance(scene.camera, spot)
-    near, shows_ground = _fading(distance)[..., None], (distance < 1) & ~backdrop.covered
+    # 1 near the spot, falling smoothly to 0 at the rim of the disc; 1 above the horizon, where only objects are seen
+    t = np.clip((1 - np.where(np.isinf(distance), 0, distance)) / (1 - FADE), 0, 1)
+    near, shows_ground = (t * t * (3 - 2 * t))[..., None], (distance < 1) & ~covered
     coverage = _coverage(scene, new, camera, samples)
     if not coverage.any():
         found = "the new object is not seen: it stands outside the picture, or something hides it"
@@ -173,10 +164,10 @@ def inserted(
     report(1)
     diffuse = ground.diffuse
     if diffuse is None:
-        grey = traced(_disc(spot, _lambertian((GREY,) * 3)), FIT_SAMPLES)
+        grey = traced(_disc(spot, Reflectance((GREY,) * 3, (0.0,) * 3, 1.0)), FIT_SAMPLES)
         diffuse = _ground_colour(grey, photo, shows_ground)
     report(2)
-    disc = _disc(spot, _lambertian(diffuse))
+    disc = _disc(spot, Reflectance(diffuse, (0.0,) * 3, 1.0))
     without = traced(disc)
     report(3)
     with_ = traced({**disc, **more})
@@ -191,10 +182,6 @@ def inserted(
         composite = np.maximum(composite + mirrored * shows_ground[..., None] * beside * near, 0)
     report(STEPS)
     return Inserted(composite, coverage, shadow, np.asarray(diffuse))
-
-
-def _lambertian(diffuse: tuple[float, float, float]) -> Reflectance:
-    return Reflectance(diffuse, (0.0,) * 3, 1.0)
 
 
 def _ground_colour(lit: Picture, photo: Picture, shows_ground: Bool[np.ndarray, "h w"]) -> tuple[float, float, float]:
@@ -248,23 +235,9 @@ def _shadow(
 
 def _distance(camera: Camera, spot: Spot) -> Float[np.ndarray, "h w"]:
     """Of the point of the ground behind each pixel from the spot, in radii of the disc; infinite above the horizon."""
-    distance = np.linalg.norm(_ground_points(camera, spot) - spot.point, axis=-1) / (RADIUS * spot.height)
-    return np.nan_to_num(distance, nan=np.inf)
-
-
-def _fading(distance: Float[np.ndarray, "h w"]) -> Float[np.ndarray, "h w"]:
-    """1 near the spot, falling smoothly to 0 at the rim of the disc; 1 above the horizon, where only objects are seen."""
-    t = np.clip((1 - np.where(np.isinf(distance), 0, distance)) / (1 - FADE), 0, 1)
-    return t * t * (3 - 2 * t)
-
-
-def _ground_points(camera: Camera, spot: Spot) -> Float[np.ndarray, "h w 3"]:
     rays = camera.rays() @ YUP_FROM_CAMERA
-    return spot.plane.hit(rays.reshape(-1, 3)).reshape(rays.shape)
-
-
-def _pixel(camera: Camera, point: Float[np.ndarray, "3"]) -> Float[np.ndarray, "2"]:
-    return camera.project(point @ YUP_FROM_CAMERA)
+    points = spot.plane.hit(rays.reshape(-1, 3)).reshape(rays.shape)
+    return np.nan_to_num(np.linalg.norm(points - spot.point, axis=-1) / (RADIUS * spot.height), nan=np.inf)
 
 
 def _rotation_between(first: Float[np.ndarray, "3"], second: Float[np.ndarray, "3"]) -> Float[np.ndarray, "3 3"]:

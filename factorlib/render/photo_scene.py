@@ -5,8 +5,6 @@ Light    infinitely far, given in the photo's camera axes (lobes) or in the worl
 Upright  the camera's own y.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from typing import Any
 
@@ -16,7 +14,7 @@ from jaxtyping import Float
 
 from factorlib.conventions import YUP_FROM_CAMERA
 from factorlib.export.environment import mitsuba_map
-from factorlib.export.mitsuba import ALL_BOUNCES, DIRECT
+from factorlib.export.scene import ALL_BOUNCES, DIRECT
 from factorlib.geometry.camera import Camera, rotation_of_vector
 from factorlib.light.latlong import turned_map
 from factorlib.light.lobes import Lobes
@@ -65,13 +63,6 @@ class PhotoScene(msgspec.Struct, frozen=True):
     def near(self) -> float:
         """From which distance on things are seen."""
         return NEAR * float(np.linalg.norm(self.middle))
-
-
-def world_from_camera_frame(matrix: Float[np.ndarray, "4 4"]) -> Float[np.ndarray, "4 4"]:
-    """world_from_object of cam_from_object."""
-    turn = np.eye(4)
-    turn[:3, :3] = YUP_FROM_CAMERA
-    return turn @ matrix
 
 
 def light_entry(light: Light) -> dict[str, Any]:

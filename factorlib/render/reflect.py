@@ -30,7 +30,11 @@ TAIL = 0.005
 NODES = 1024  # of n·z in a lobe's table
 PAIRS_AT_ONCE = 1 << 17  # of a point and a lobe: about 200 MB in the networks
 
-Report = Callable[[float, float], None]
+Report = Callable[[float, float], None]  # of points done, of how many
+
+
+def silently(done: float, total: float) -> None:
+    """The report to nobody."""
 
 
 class Shadows(msgspec.Struct, frozen=True):
@@ -63,7 +67,7 @@ class Reflector:
         material: MaterialLike,
         normals: Float[np.ndarray, "n 3"],
         views: Float[np.ndarray, "n 3"],
-        report: Report = lambda done, total: None,
+        report: Report = silently,
         shadows: Shadows | None = None,
     ) -> Float[np.ndarray, "n 3"]:
         """Radiance toward unit `views` of points with unit `normals`; float64, zero where a normal faces away."""

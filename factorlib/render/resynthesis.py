@@ -1,20 +1,45 @@
-"""A photo synthesised again from what was solved: light and materials, on the normals and views of its aligned meshes."""
+"""What was solved, as the reflection operator shows it: a photo again, on the normals and views of its aligned meshes, and balls.
 
-from __future__ import annotations
+A ball is seen from the front, orthographically: every normal that faces the viewer, once; the same picture is a reflectance map.
+Frame: the photo's camera (x right, y down, z forward); a ball's view is (0, 0, −1).
+"""
 
-from collections.abc import Callable, Mapping, Sequence
+import logging
+from collections.abc import Mapping, Sequence
+from pathlib import Path
 
 import msgspec
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
+from scipy.ndimage import binary_closing
 from scipy.spatial import cKDTree
 
-from factorlib.geometry.sphere import fibonacci_sphere
-from factorlib.render.reflect import Reflector, Shadows
+from factorlib.conventions import FRONT
+from factorlib.dataset.schema import LightSlice
+from factorlib.geometry.sphere import ball_normals, fibonacci_sphere
+from factorlib.light.lobes import Lobes
+from factorlib.reflection.operator import MaterialLike
+from factorlib.render.reflect import Reflector, Report, Shadows, silently
+from factorlib.results.lobes import read_lobes
+from factorlib.results.materials import read_exposures
 from factorlib.urm.observations import Observations
 
+log = logging.getLogger("factorlib.render")
 Channels = Mapping[str, Float[np.ndarray, "h w"]]
-Report = Callable[[float, float], None]
+GAP = 6  # cells: the widest gap between observed normals that counts as observed
+
+
+def light_of(exported: Path, photo: str, light: LightSlice) -> Lobes:
+    """The light of a photo as pictures are made in it: lobes in the photo's own camera axes, its exposure included.
+
+    exported: the folder of `export`'s result, whose gauge the light is in
+    """
+    lobes = read_lobes(exported / "lobes.parquet")[light.illumination]
+    if len(lobes) == 0:
+        log.warning("%s: nothing is known of its light: its pictures are black", photo)
+    if light.world_from_camera is not None:
+        lobes = lobes.turned(np.array(light.world_from_camera).T)
+    return lobes.scaled(np.array(read_exposures(exported / "exposures.json").get(photo, 1.0)))
 
 
 class Surroundings(msgspec.Struct, frozen=True):
@@ -29,10 +54,10 @@ class Surroundings(msgspec.Struct, frozen=True):
 
 def resynthesised(
     reflector: Reflector,
-    materials: Sequence,
+    materials: Sequence[MaterialLike],
     photo: Channels,
     geometry: Channels,
-    report: Report = lambda done, total: None,
+    report: Report = silently,
     around: Surroundings | None = None,
 ) -> Float[np.ndarray, "h w 3"]:
     """Linear radiance; zero outside the mask, and where no mesh lies under it.
@@ -46,12 +71,13 @@ def resynthesised(
     picture, total, before = np.zeros((*label.shape, 3)), int((label > 0).sum()), 0
     for k, material in enumerate(materials, start=1):
         pixels = label == k
-        unit_normal, unit_view = _unit(normal[pixels]), _unit(view[pixels])
+        unit = [of[pixels].astype(float) for of in (normal, view)]
+        unit = [of / np.linalg.norm(of, axis=-1, keepdims=True) for of in unit]
         shadows, sent = (None, None) if around is None else around_pixels(around, k - 1, *np.nonzero(pixels))
-        shown = reflector(material, unit_normal, unit_view, _onward(report, before, total), shadows)
+        shown = reflector(material, *unit, lambda done, _, before=before: report(before + done, total), shadows)
         if sent is not None:
             bounced = np.array(material.diffuse) * sent[:, :3] + np.array(material.specular) * sent[:, 3:]
-            shown += bounced * (np.sum(unit_normal * unit_view, 1, keepdims=True) > 0)
+            shown += bounced * (np.sum(unit[0] * unit[1], 1, keepdims=True) > 0)
         picture[pixels] = shown
         before += int(pixels.sum())
     return picture
@@ -70,11 +96,22 @@ def around_pixels(
     return Shadows(of.visibility, fibonacci_sphere(of.visibility.shape[1]), nearest), sent
 
 
-def _onward(report: Report, before: int, total: int) -> Report:
-    """Of the whole picture, from a material's own count."""
-    return lambda done, _: report(before + done, total)
+def ball(reflector: Reflector, material: MaterialLike, size: int) -> Float[np.ndarray, "size size 3"]:
+    """Radiance; zero beside the ball."""
+    normals, inside = ball_normals(size)
+    normals = normals * (1, -1, -1)  # in the camera's frame
+    picture = np.zeros((size, size, 3))
+    picture[inside] = reflector(material, normals, np.broadcast_to(FRONT, normals.shape))
+    return picture
 
 
-def _unit(vectors: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
-    vectors = np.asarray(vectors, dtype=float)
-    return vectors / np.linalg.norm(vectors, axis=-1, keepdims=True)
+def observed_cells(normals: Float[np.ndarray, "n 3"], size: int) -> Bool[np.ndarray, "size size"]:
+    """Pixels of a ball where a normal was seen; gaps as wide as the spacing of so few normals are closed."""
+    cells = np.zeros((size, size), bool)
+    if len(normals) == 0:
+        return cells
+    column, row = (np.clip(((normals[:, k] + 1) / 2 * size).astype(int), 0, size - 1) for k in (0, 1))
+    cells[row, column] = True
+    gap = int(np.clip(np.ceil(size / np.sqrt(len(normals))), 1, GAP))
+    closed = binary_closing(np.pad(cells, gap), np.ones((3, 3)), iterations=gap)[gap:-gap, gap:-gap]
+    return closed & ball_normals(size)[1]

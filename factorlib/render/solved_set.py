@@ -1,7 +1,5 @@
 """A solved data set as pictures are made of it: scenes of its photos, their lights, grounds and materials."""
 
-from __future__ import annotations
-
 import logging
 
 import msgspec
@@ -10,8 +8,8 @@ from jaxtyping import Bool, Float
 
 from factorlib.conventions import YUP_FROM_CAMERA
 from factorlib.dataset.schema import GroundSlice, LightSlice, MeshEntry, ObjectEntry, ObjectsSlice
-from factorlib.errors import InputError
-from factorlib.export.mitsuba import ALL_BOUNCES, DIRECT
+from factorlib.errors import InputError, did_you_mean
+from factorlib.export.scene import ALL_BOUNCES, DIRECT
 from factorlib.generate.shapes import sphere
 from factorlib.images.exr import read_exr
 from factorlib.images.light_map import read_light_map
@@ -22,12 +20,13 @@ from factorlib.reading import check_plain
 from factorlib.recipe.schema import BALL, is_light_file, is_mesh_file, read_table
 from factorlib.render.ground import Plane, resting_plane
 from factorlib.render.insertion import Ground
-from factorlib.render.photo_light import light_of
-from factorlib.render.photo_scene import Light, PhotoScene, Placed, world_from_camera_frame
+from factorlib.render.photo_scene import Light, PhotoScene, Placed
+from factorlib.render.resynthesis import light_of
 from factorlib.render.traced import Tone, as_it_is
 from factorlib.results.materials import MaterialTable, Reflectance, read_materials, reflectances
 from factorlib.results.poses import PhotoPoses, read_poses
 from factorlib.stage import Inputs
+from factorlib.tracing.scene import rigid
 
 LEAST_HEIGHT = 1e-6  # of a mesh to insert, in its radii
 
@@ -128,39 +127,41 @@ class SolvedSet:
     def mesh(self, name: str, material: str | None, up: str) -> tuple[Mesh, tuple[str, ...], np.ndarray]:
         """A mesh to insert, its materials by label, and which way is up in its own frame: of the data set's, as it stands in a photo.
 
-        Raises InputError for a mesh without height.
+        Raises InputError for a mesh that is not there, and for one without height.
         """
-        mesh, materials, upward = self._mesh(name, material, up)
+        upward, wanted = np.eye(3)["xyz".index(up)], material or self.names[0]
+        if name == BALL:
+            mesh, materials = sphere(1.0), (wanted,)
+        elif is_mesh_file(name):
+            file = self.inputs.file(f"recipe file:{name}")
+            mesh, materials = read_mesh(file, [wanted], wanted, {}, self._meshes.crease_deg), (wanted,)
+        elif not (shown := self._objects_of(name)):
+            known = [BALL, *sorted({obj.mesh for each in self.objects.values() for obj in each.objects})]
+            raise InputError(f"there is no mesh {name!r}", key="mesh", cure=did_you_mean(name, known))
+        else:
+            photo, obj = shown[0]
+            placed = self._placed(obj, self.objects[photo].meshes[name], self.poses[photo])
+            upward = placed.world_from_object[:3, :3].T @ self.ground(photo, placed).plane.normal
+            mesh, materials = placed.mesh, (material,) * len(self.names) if material else placed.materials
         if np.ptp(mesh.vertices @ upward) < LEAST_HEIGHT * mesh.radius:
             cure = "say which axis of the file points upward, as in `up: z`, or name a mesh that is not flat"
             raise InputError(f"the mesh {name!r} has no height", key="mesh", cure=cure)
         return mesh, materials, upward
 
-    def _mesh(self, name: str, material: str | None, up: str) -> tuple[Mesh, tuple[str, ...], np.ndarray]:
-        axis = np.eye(3)["xyz".index(up)]
-        if name == BALL:
-            return sphere(1.0), (material or self.names[0],), axis
-        if is_mesh_file(name):
-            wanted, file = material or self.names[0], self.inputs.file(f"recipe file:{name}")
-            return read_mesh(file, [wanted], wanted, {}, self._meshes.crease_deg), (wanted,), axis
-        photo, obj = next((photo, obj) for photo, o in self.objects.items() for obj in o.objects if obj.mesh == name)
-        placed = self._placed(obj, self.objects[photo].meshes[name], self.poses[photo])
-        upright = placed.world_from_object[:3, :3].T @ self.ground(photo, placed).plane.normal
-        return placed.mesh, tuple([material] * len(self.names)) if material else placed.materials, upright
+    def _objects_of(self, mesh: str) -> list[tuple[str, ObjectEntry]]:
+        """All objects of that mesh, and the photos that show them."""
+        return [(photo, obj) for photo, each in self.objects.items() for obj in each.objects if obj.mesh == mesh]
 
     def _uprights(self, mesh: str) -> Float[np.ndarray, "k 3"]:
         """The upward axes of the cameras of all objects of that mesh, in its frame."""
-        objects = [(photo, obj) for photo, each in self.objects.items() for obj in each.objects if obj.mesh == mesh]
-        poses = [self.poses[photo].objects[obj.name] for photo, obj in objects]
+        poses = [self.poses[photo].objects[obj.name] for photo, obj in self._objects_of(mesh)]
         trusted = [pose for pose in poses if not pose.left_out] or poses
         return np.stack([np.array(pose.rotation).T @ YUP_FROM_CAMERA[1] for pose in trusted])
 
     def _placed(self, obj: ObjectEntry, entry: MeshEntry, poses: PhotoPoses) -> Placed:
-        pose = poses.objects[obj.name]
-        matrix = np.eye(4)
-        matrix[:3, :3], matrix[:3, 3] = np.array(pose.rotation), pose.translation
-        mesh = scaled(self._meshes.mesh(obj.mesh, entry, obj.materials), pose.scale)
-        return Placed(obj.name, mesh, tuple(self.names), world_from_camera_frame(matrix))
+        pose, mesh = poses.objects[obj.name], self._meshes.mesh(obj.mesh, entry, obj.materials)
+        place = rigid(YUP_FROM_CAMERA @ np.array(pose.rotation), YUP_FROM_CAMERA @ np.array(pose.translation))
+        return Placed(obj.name, scaled(mesh, pose.scale), tuple(self.names), place)
 
     def _masks(self, photo: str) -> dict[str, np.ndarray]:
         if photo not in self._pixels:

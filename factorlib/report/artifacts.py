@@ -1,9 +1,8 @@
 """What the other stages wrote, read when it is asked for, one photo at a time; a file that is not there reads as None."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Callable, Mapping
+from functools import cached_property
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -19,7 +18,6 @@ from factorlib.results.materials import MaterialTable, Solved, read_exposures, r
 from factorlib.results.metrics import Metrics, read_metrics
 from factorlib.results.photos import PhotoFacts, read_photos
 from factorlib.results.poses import PhotoPoses, read_poses
-from factorlib.urm.observations import Observations, read_observations
 
 STAGES = ["masks", "align", "urm", "train", "solve", "export", "render", "evaluate"]
 
@@ -28,7 +26,7 @@ Channels = dict[str, Float[np.ndarray, "h w"]]
 Picture = Float[np.ndarray, "h w 3"]
 
 
-class Artifacts(msgspec.Struct, frozen=True):
+class Artifacts(msgspec.Struct, frozen=True, dict=True):
     """folders: of the stages, by name;  set: `SetSlice` of the dataset's schema, in the order of dataset.yaml;  log: of the run"""
 
     folders: Mapping[str, Path]
@@ -55,37 +53,39 @@ class Artifacts(msgspec.Struct, frozen=True):
         """<name>.parquet as columns; none where there is no file."""
         return self.read(lambda path: pq.read_table(path).to_pydict(), stage, f"{name}.parquet") or {}
 
+    @cached_property
     def photo_facts(self) -> dict[str, PhotoFacts]:
         """What `masks` says of each photo."""
         return self.read(read_photos, "masks", "photos.json") or {}
 
+    @cached_property
     def poses(self) -> dict[str, PhotoPoses]:
         """What `align` says of each photo."""
         return self.read(read_poses, "align", "poses.json") or {}
 
+    @cached_property
     def solved(self) -> MaterialTable:
         """The materials, their gauge and model as solved; without materials where there is no solve."""
         return self.read(read_materials, "solve", "materials.json") or MaterialTable({})
 
+    @cached_property
     def exported(self) -> dict[str, Solved]:
         """The materials in the gauge of the exported lights."""
         return (self.read(read_materials, "export", "materials.json") or MaterialTable({})).materials
 
+    @cached_property
     def exposures(self) -> dict[str, Factors]:
         """Factors of photos on their lights."""
         return self.read(read_exposures, "solve", "exposures.json") or {}
 
+    @cached_property
     def metrics(self) -> Metrics | None:
         """What `evaluate` measured."""
         return self.read(read_metrics, "evaluate", "metrics.json")
 
-    def observations(self, photo: str) -> Observations | None:
-        """The photo's observations."""
-        return self.read(read_observations, "urm", f"{photo}.parquet")
-
     def illumination_of(self, photo: str) -> str:
         """The light's name: the photo's own where nothing is known of the photo."""
-        facts = self.photo_facts().get(photo)
+        facts = self.photo_facts.get(photo)
         return facts.illumination if facts else photo
 
     def illuminations(self) -> dict[str, list[str]]:

@@ -1,7 +1,5 @@
 """Two runs side by side: parameters, numbers, materials in standard errors, lights and re-syntheses."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from pathlib import Path
 from types import SimpleNamespace
@@ -13,9 +11,8 @@ from jaxtyping import Float
 from factorlib.errors import InputError
 from factorlib.images.picture import exposure_of, picture
 from factorlib.report.artifacts import STAGES, Artifacts, Picture
-from factorlib.report.headlines import headlines
 from factorlib.report.pictures import data_uri, reduced
-from factorlib.report.template import DASH, number, percent, rendered
+from factorlib.report.template import DASH, headlines, number, percent, rendered
 from factorlib.results.materials import MaterialTable, Solved, read_materials
 from factorlib.results.photos import read_photos
 
@@ -71,7 +68,7 @@ def _dataset_of(folder: Path) -> str:
 
 def _numbers(runs: list[Artifacts]) -> list[tuple[str, list[str]]]:
     """Headlines of both, by label; a dash where one has none."""
-    metrics = [run.metrics() for run in runs]
+    metrics = [run.metrics for run in runs]
     both = [{h.label: f"{h.value} {h.unit}".strip() for h in headlines(m)} if m else {} for m in metrics]
     return [(label, [each.get(label, DASH) for each in both]) for label in dict.fromkeys([*both[0], *both[1]])]
 
@@ -82,15 +79,13 @@ def _rows(tables: list[MaterialTable], names: list[str]) -> list[dict[str, Any]]
     groups: dict[tuple[int, ...], list[str]] = {}
     for name in names:
         groups.setdefault(tuple(table.gauge.component.get(name, 0) for table in tables), []).append(name)
-    factor = {name: _factor(tables, group) for group in groups.values() for name in group}
+    factor = {}
+    for group in groups.values():
+        both = ([table.materials[name] for name in group] for table in tables)
+        sums = [np.sum([np.add(m.diffuse, m.specular) for m in each], axis=0) for each in both]
+        factor |= dict.fromkeys(group, np.divide(sums[0], sums[1], out=np.ones(3), where=sums[1] > 0))
     parts = ("diffuse", "specular", "roughness")
     return [_row(name, part, *(t.materials[name] for t in tables), factor[name]) for name in names for part in parts]
-
-
-def _factor(tables: list[MaterialTable], group: list[str]) -> Float[np.ndarray, "3"]:
-    materials = [[table.materials[name] for name in group] for table in tables]
-    sums = [np.sum([np.add(m.diffuse, m.specular) for m in each], axis=0) for each in materials]
-    return np.divide(sums[0], sums[1], out=np.ones(3), where=sums[1] > 0)
 
 
 def _row(name: str, part: str, first: Solved, second: Solved, factor: Float[np.ndarray, "3"]) -> dict[str, Any]:

@@ -1,7 +1,5 @@
 """Everything on the page, gathered and set into the template."""
 
-from __future__ import annotations
-
 import json
 import math
 import re
@@ -18,9 +16,8 @@ from factorlib.images.picture import read_png
 from factorlib.jsonfile import read_json
 from factorlib.report import pictures
 from factorlib.report.artifacts import STAGES, Artifacts
-from factorlib.report.headlines import headlines
 from factorlib.report.plot import line_plot
-from factorlib.report.template import rendered, sentences
+from factorlib.report.template import headlines, rendered, sentences
 from factorlib.results.materials import Reflectance
 from factorlib.results.metrics import Metrics
 from factorlib.results.poses import AS_IT_IS
@@ -34,12 +31,9 @@ Plot = tuple[str, list[str]]  # an SVG, and the names of its lines
 
 def page(run: Artifacts, rows: list[pictures.PhotoRow], tags: dict[str, str], viewed: dict[str, Any] | None) -> str:
     """The page as HTML, from the artifacts, the photos' rows, the materials' colours and what can be relit."""
-    metrics, exposure, facts, solved = run.metrics(), pictures.exposures(run), run.photo_facts(), run.solved()
-    photos, poses = run.set.photos, run.poses()
-    pixels = {p: fact.pixels for p, fact in facts.items()}
-    cells = [
-        [pictures.ball_cell(run, m, p, pixels[p].get(m, 0) > 0, exposure[p]) for p in photos] for m in run.set.materials
-    ]
+    metrics, exposure, facts, solved = run.metrics, pictures.exposures(run), run.photo_facts, run.solved
+    photos, poses = run.set.photos, run.poses
+    cells = [[pictures.ball_cell(run, m, p, exposure[p]) for p in photos] for m in run.set.materials]
     errors = metrics.light.lights if metrics.light else {}
     lights = [pictures.light_row(run, name, photos, errors.get(name)) for name, photos in run.illuminations().items()]
     reasons = sorted((why, section) for section, why in metrics.reasons.items())
@@ -60,7 +54,7 @@ def page(run: Artifacts, rows: list[pictures.PhotoRow], tags: dict[str, str], vi
         gauge=msgspec.to_builtins(solved.gauge, order="sorted"),
         choices=sentences("choices.txt", model=solved.model),
         model=msgspec.to_builtins(solved.model, order="sorted"),
-        exposures={p: f for p, f in run.exposures().items() if any(abs(c - 1) > 1e-9 for c in f)},
+        exposures={p: f for p, f in run.exposures.items() if any(abs(c - 1) > 1e-9 for c in f)},
         plots=_plots(run.table("solve", "convergence")),
         poses=[(p, _overlay(run, p), poses[p], facts.get(p)) for p in photos if p in poses],
         low_iou=LOW_IOU,
@@ -73,7 +67,7 @@ def page(run: Artifacts, rows: list[pictures.PhotoRow], tags: dict[str, str], vi
 
 def cautions(run: Artifacts, metrics: Metrics) -> list[str]:
     """Sentences about what should be distrusted, and about what is no better than a guess."""
-    errors, poses, facts = metrics.resynthesis.photos, run.poses(), run.photo_facts().values()
+    errors, poses, facts = metrics.resynthesis.photos, run.poses, run.photo_facts.values()
     return sentences(
         "cautions.txt",
         metrics=metrics,
@@ -103,7 +97,7 @@ def forms(name: str, material: Reflectance) -> dict[str, str]:
 
 def _materials(run: Artifacts, cells: list[list[pictures.Cell]]) -> list[dict[str, Any]]:
     """What the table says of each material that was solved; ball: in the light of the photo that shows it most."""
-    solved, exported, facts = run.solved().materials, run.exported(), run.photo_facts()
+    solved, exported, facts = run.solved.materials, run.exported, run.photo_facts
     rows = []
     for name, row in zip(run.set.materials, cells, strict=True):
         if name in solved:
@@ -119,11 +113,8 @@ def _overlay(run: Artifacts, photo: str) -> str | None:
     pixels = run.read(read_png, "align", f"{photo}_overlay.png")
     if pixels is None:
         return None
-    label = run.exr("masks", photo)["label"] > 0.5
-    crop = pixels[pictures.box_of(label, 0.15)] if label.shape == pixels.shape[:2] else pixels
-    return pictures.data_uri(
-        pictures.reduced(crop.astype("f4"), pictures.longest_side(len(run.set.photos))).round().astype("u1")
-    )
+    crop = pixels[pictures.box_of(run.exr("masks", photo)["label"] > 0.5, 0.15)].astype("f4")
+    return pictures.data_uri(pictures.reduced(crop, pictures.longest_side(len(run.set.photos))).round().astype("u1"))
 
 
 def _plots(history: dict[str, list]) -> list[Plot]:
@@ -213,13 +204,10 @@ def cost_of(events: list[dict], order: list[str]) -> dict[str, list]:
 def _stage_cost(stage: str, steps: list[dict]) -> dict[str, Any]:
     names = ("seconds", "cpu_seconds", "memory_mb")
     seconds, cpu, memory = ([float(e[name]) for e in steps if e.get(name) is not None] for name in names)
-    peak, busy = max(memory, default=None), sum(cpu) if cpu else None
-    return {
-        "stage": stage, "steps": len(steps), "seconds": sum(seconds), "longest": max(seconds), "cpu_seconds": busy, "memory_mb": peak
-    }  # fmt: skip
+    sums = {"seconds": sum(seconds), "longest": max(seconds), "cpu_seconds": sum(cpu) if cpu else None}
+    return {"stage": stage, "steps": len(steps), **sums, "memory_mb": max(memory, default=None)}
 
 
 def _machine(machine: dict) -> str:
-    cores, python = machine.get("cores"), machine.get("python")
-    words = [machine.get("system"), machine.get("processor"), cores and f"{cores} cores", python and f"Python {python}"]
-    return ", ".join(word for word in words if word)
+    words = {"system": "{}", "processor": "{}", "cores": "{} cores", "python": "Python {}"}
+    return ", ".join(text.format(machine[key]) for key, text in words.items() if machine.get(key))

@@ -1,7 +1,5 @@
 """Pictures inside the page: each photo beside its re-synthesis, balls, reflectance maps, lights, and one of the whole run."""
 
-from __future__ import annotations
-
 import base64
 from collections.abc import Sequence
 from typing import Any
@@ -9,6 +7,7 @@ from typing import Any
 import msgspec
 import numpy as np
 from jaxtyping import Bool, Float, UInt8
+from scipy.ndimage import binary_erosion
 
 from factorlib.conventions import lat_long_solid_angles
 from factorlib.evaluate.resynthesis import agreeing_pixels
@@ -18,7 +17,7 @@ from factorlib.images.transfer import srgb_encode
 from factorlib.report.artifacts import Artifacts, Channels, Picture
 from factorlib.results.materials import Reflectance
 from factorlib.results.metrics import PhotoErrors, ScoredLight
-from factorlib.urm.observations import Observations
+from factorlib.urm.observations import Observations, read_observations
 
 AMPLIFICATION = 4  # of the difference between photo and re-synthesis
 UNCOUNTED = np.array([0.45, 0.38, 0.62])  # sRGB: in the mask, but not compared
@@ -43,15 +42,16 @@ def reduced(picture: Float[np.ndarray, "h w c"], longest: int) -> Float[np.ndarr
     scale = min(1.0, longest / max(height, width))
     if scale == 1.0:
         return picture
-    rows, columns = (_averaging(n, max(1, round(n * scale))) for n in (height, width))
-    return np.einsum("Hh,hwc->Hwc", rows, np.einsum("Ww,hwc->hWc", columns, picture, optimize=True), optimize=True)
 
+    def averaging(source: int) -> Float[np.ndarray, "target source"]:
+        """Row t holds the share of each source cell in target cell t."""
+        target = max(1, round(source * scale))
+        edges, cells = np.arange(target + 1) * (source / target), np.arange(source)
+        overlap = np.minimum(edges[1:, None], cells + 1) - np.maximum(edges[:-1, None], cells)
+        return (np.maximum(overlap, 0) * (target / source)).astype(np.float32)
 
-def _averaging(source: int, target: int) -> Float[np.ndarray, "target source"]:
-    """Row t holds the share of each source cell in target cell t."""
-    edges, cells = np.arange(target + 1) * (source / target), np.arange(source)
-    overlap = np.minimum(edges[1:, None], cells + 1) - np.maximum(edges[:-1, None], cells)
-    return (np.maximum(overlap, 0) * (target / source)).astype(np.float32)
+    narrow = np.einsum("Ww,hwc->hWc", averaging(width), picture, optimize=True)
+    return np.einsum("Hh,hwc->Hwc", averaging(height), narrow, optimize=True)
 
 
 def box_of(mask: Bool[np.ndarray, "h w"], margin: float = 0.06) -> tuple[slice, slice]:
@@ -65,8 +65,7 @@ def box_of(mask: Bool[np.ndarray, "h w"], margin: float = 0.06) -> tuple[slice, 
 
 def outline(mask: Bool[np.ndarray, "h w"]) -> Bool[np.ndarray, "h w"]:
     """Pixels of the mask that touch its outside; the picture's border is not outside."""
-    p = np.pad(mask, 1, mode="edge")
-    return mask & ~(p[:-2, 1:-1] & p[2:, 1:-1] & p[1:-1, :-2] & p[1:-1, 2:])
+    return mask & ~binary_erosion(mask, border_value=1)
 
 
 def disc(radiance: Float[np.ndarray, "n n 3"], exposure: float) -> UInt8[np.ndarray, "n n 4"]:
@@ -79,7 +78,7 @@ def disc(radiance: Float[np.ndarray, "n n 3"], exposure: float) -> UInt8[np.ndar
 
 def exposures(run: Artifacts) -> dict[str, float]:
     """One exposure per photo for all balls and reflectance maps in its light: the one its own picture is shown with."""
-    photos = metrics.resynthesis.photos if (metrics := run.metrics()) else {}
+    photos = metrics.resynthesis.photos if (metrics := run.metrics) else {}
     return {name: photos[name].exposure if name in photos else 1.0 for name in run.set.photos}
 
 
@@ -98,7 +97,7 @@ class PhotoRow(msgspec.Struct, frozen=True):
 
 def material_tags(run: Artifacts) -> dict[str, str]:
     """A colour "#rrggbb" of each material of the set, near to its diffuse one (to its specular one, for a metal)."""
-    reflectances = [run.solved().materials.get(name, UNKNOWN) for name in run.set.materials]
+    reflectances = [run.solved.materials.get(name, UNKNOWN) for name in run.set.materials]
     colours = [np.add(m.diffuse, np.multiply(0.15, m.specular)) for m in reflectances]
     return nearest_tags(run.set.materials, np.array(colours))
 
@@ -203,8 +202,9 @@ class Cell(msgspec.Struct, frozen=True):
     measured: str | None = None
 
 
-def ball_cell(run: Artifacts, material: str, photo: str, observed: bool, exposure: float) -> Cell:
-    """The ball of a material in a photo's light; observed: whether the photo shows the material."""
+def ball_cell(run: Artifacts, material: str, photo: str, exposure: float) -> Cell:
+    """The ball of a material in a photo's light."""
+    observed = photo in run.photo_facts and run.photo_facts[photo].pixels.get(material, 0) > 0
     radiance = run.rgb("render", f"materials/{photo}/{material}")
     uri = None if radiance is None else data_uri(disc(reduced(radiance, 96), exposure))
     return Cell(material, photo, observed, uri)
@@ -212,7 +212,7 @@ def ball_cell(run: Artifacts, material: str, photo: str, observed: bool, exposur
 
 def reflectance_maps(run: Artifacts, photo: str, exposure: float) -> list[Cell]:
     """One cell per material: solved, with the observed normals ringed, and beside it what the photo measured."""
-    cells, observations = [], run.observations(photo)
+    cells, observations = [], run.read(read_observations, "urm", f"{photo}.parquet")
     for index, name in enumerate(run.set.materials):
         channels = run.exr("render", f"reflectance_maps/{photo}/{name}")
         rows = observations.material == index if observations is not None else np.zeros(0, bool)
@@ -269,11 +269,11 @@ def light_row(
     true, known = run.rgb("evaluate", f"illumination/{name}"), run.rgb("export", f"coverage/{name}")
     row = {
         "name": name, "photos": photos, "errors": errors, "white": 1 / exposure, "peak": float(brightest.max()),
-        "uri": data_uri(_outlined(picture(radiance, exposure), over)),
+        "uri": _outlined(radiance, exposure),
         "dark_uri": data_uri(picture(radiance, exposure / 16)),
         "overflow": float((over * area).sum() / (4 * np.pi)),
         "energy": float((energy * over).sum() / max(energy.sum(), 1e-30)),
-        "true_uri": None if true is None else data_uri(_true_map(true, radiance, exposure)),
+        "true_uri": None if true is None else _true_map(true, radiance, exposure),
         "known_uri": None, "known": None, "spheres": _spheres(run, name),
     }  # fmt: skip
     if known is not None:
@@ -288,16 +288,16 @@ def _areas(lat_long: Picture) -> Float[np.ndarray, "h 1"]:
     return lat_long_solid_angles(*lat_long.shape[:2])[:, None]
 
 
-def _outlined(pixels: Pixels, over: Bool[np.ndarray, "h w"]) -> Pixels:
-    pixels[outline(over)] = MAGENTA
-    return pixels
+def _outlined(radiance: Picture, exposure: float) -> str:
+    pixels = picture(radiance, exposure)
+    pixels[outline((radiance * exposure).max(axis=-1) > 1)] = MAGENTA
+    return data_uri(pixels)
 
 
-def _true_map(true: Picture, estimate: Picture, exposure: float) -> Pixels:
+def _true_map(true: Picture, estimate: Picture, exposure: float) -> str:
     """The true map, scaled to the mean of the estimate: the overall scale is a matter of gauge."""
     means = [float((m * (_areas(m)[..., None] / m.shape[1])).sum()) for m in (true, estimate)]
-    small = reduced(true, max(estimate.shape[:2])) * (means[1] / max(means[0], 1e-30))
-    return _outlined(picture(small, exposure), (small * exposure).max(axis=-1) > 1)
+    return _outlined(reduced(true, max(estimate.shape[:2])) * (means[1] / max(means[0], 1e-30)), exposure)
 
 
 def _spheres(run: Artifacts, name: str) -> str | None:

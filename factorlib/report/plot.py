@@ -1,7 +1,5 @@
 """Line plots as SVG: thin axes, few ticks, colours of the page's own style (classes s0, s1, …)."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Mapping, Sequence
 

@@ -1,7 +1,5 @@
 """Templates of this package: they hold the words of the pages, and this module prints numbers into them."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping, Sequence
 from importlib.resources import files
@@ -12,6 +10,7 @@ import msgspec
 import numpy as np
 
 from factorlib.images.transfer import srgb_encode
+from factorlib.results.metrics import Metrics
 
 MINUS, DASH = "\u2212", "\u2013"
 
@@ -37,6 +36,21 @@ def rendered(template: str, **context: Any) -> str:
 def sentences(template: str, **context: Any) -> list[str]:
     """The lines of a template of sentences that are not empty."""
     return list(filter(None, rendered(template, **context).split("\n")))
+
+
+class Headline(msgspec.Struct, frozen=True):
+    """A number in words; beside: what it is compared with; meaning: a sentence for who does not know the measure."""
+
+    label: str
+    value: str
+    unit: str
+    beside: str
+    meaning: str
+
+
+def headlines(metrics: Metrics) -> list[Headline]:
+    """Re-synthesis where a pixel counts; materials and relighting where there is a truth."""
+    return [Headline(*line.split(" | ")) for line in sentences("headlines.txt", metrics=metrics)]
 
 
 def _in_script(value: Mapping) -> str:

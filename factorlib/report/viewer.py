@@ -5,8 +5,6 @@ The viewer evaluates the same integral as the pipeline, Lambert + GGX without sh
 interpolated linearly, which widens a lobe, so lobes are handed over sharpened by as much.
 """
 
-from __future__ import annotations
-
 import base64
 from collections.abc import Mapping
 from typing import Any
@@ -41,31 +39,18 @@ def viewed(
                sharpness, weight
     photos     name, light, rotation: y-up light from y-up camera, row by row; gain on the light, per channel; exposure
     """
-    lobes, table = run.read(read_lobes, "export", "lobes.parquet"), run.exported()
+    lobes, table = run.read(read_lobes, "export", "lobes.parquet"), run.exported
     materials = {name: table[name].reflectance for name in run.set.materials if name in table}
     if not lobes or not materials:
         return None
-    photos, gains = [name for name in run.set.photos if lights[name].illumination in lobes], run.exposures()
-    return {
-        "meshes": _meshes(run, objects),
-        "materials": materials,
-        "lights": {name: _light(each) for name, each in lobes.items()},
-        "photos": [
-            {
-                "name": name,
-                "light": lights[name].illumination,
-                "rotation": _turn(lights[name]),
-                "gain": gains.get(name, (1.0,) * 3),
-                "exposure": exposure[name],
-            }
-            for name in photos
-        ],
-    }
-
-
-def _turn(light: LightSlice) -> list[float]:
-    world_from_camera = np.eye(3) if light.world_from_camera is None else np.array(light.world_from_camera)
-    return (YUP_FROM_CAMERA @ world_from_camera @ YUP_FROM_CAMERA.T).ravel().tolist()
+    photos = []
+    for name in [name for name in run.set.photos if lights[name].illumination in lobes]:
+        world = lights[name].world_from_camera
+        turn = YUP_FROM_CAMERA @ (np.eye(3) if world is None else np.array(world)) @ YUP_FROM_CAMERA.T
+        photo = {"name": name, "light": lights[name].illumination, "rotation": turn.ravel().tolist()}
+        photos.append(photo | {"gain": run.exposures.get(name, (1.0,) * 3), "exposure": exposure[name]})
+    drawn = {name: _light(each) for name, each in lobes.items()}
+    return {"meshes": _meshes(run, objects), "materials": materials, "lights": drawn, "photos": photos}
 
 
 def _light(lobes: Lobes) -> dict[str, Any]:
@@ -124,22 +109,16 @@ def _mesh(
             "normals": _base64(np.rint(32767 * normal), "<i2"),
             "triangles": _base64(faces, "<u4"),
         })  # fmt: skip
-    return {
-        "name": name,
-        "photo": photo,
-        "rotation": (YUP_FROM_CAMERA @ rotation).ravel().tolist(),
-        "eye": eye.tolist(),
-        "parts": packed,
-        "simplified_from": count if share < 1 else None,
-    }
+    turn = (YUP_FROM_CAMERA @ rotation).ravel().tolist()
+    shown = {"name": name, "photo": photo, "rotation": turn, "eye": eye.tolist(), "parts": packed}
+    return shown | {"simplified_from": count if share < 1 else None}
 
 
 def _pose(run: Artifacts, mesh: str, objects: Mapping[str, ObjectsSlice]) -> tuple:
     """(photo, rotation, translation, scale) of the first photo that shows the mesh in a pose that is trusted."""
-    poses = run.poses()
     for photo in run.set.photos:
         for obj in objects[photo].objects:
-            entry = poses[photo].objects.get(obj.name) if photo in poses else None
+            entry = run.poses[photo].objects.get(obj.name) if photo in run.poses else None
             if obj.mesh == mesh and entry is not None and not entry.left_out:
                 return photo, np.array(entry.rotation), np.array(entry.translation), np.broadcast_to(entry.scale, 3)
     return None, YUP_FROM_CAMERA.T, np.zeros(3), np.ones(3)

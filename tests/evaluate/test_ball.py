@@ -52,8 +52,7 @@ def test_a_constant_light_is_reflected_whole_by_matte_and_mirror():
 @pytest.mark.parametrize("sharpness", [5, 60])
 @pytest.mark.parametrize("roughness", [0.25, 0.4, 0.5, 0.9])
 def test_the_glossy_ball_is_the_plain_quadrature(sharpness, roughness):
-    radiance = lobe_map(sharpness)
-    some = NORMALS[::9]
+    radiance, some = lobe_map(sharpness), NORMALS[::9]
     expected = plain_quadrature(radiance, some, roughness)
     found = glossy_ball(light_of_lat_long(radiance), some, roughness)
     assert np.median(np.abs(found / expected - 1)) < 0.01
@@ -61,12 +60,10 @@ def test_the_glossy_ball_is_the_plain_quadrature(sharpness, roughness):
 
 
 def test_the_matte_ball_is_the_plain_quadrature():
-    radiance = lobe_map(20)
-    incoming = lat_long_directions(128, 256).reshape(-1, 3)
+    radiance, incoming = lobe_map(20), lat_long_directions(128, 256).reshape(-1, 3)
     weight = np.maximum(NORMALS @ incoming.T, 0) * np.repeat(lat_long_solid_angles(128, 256), 256)
-    assert diffuse_ball(light_of_lat_long(radiance), NORMALS) == pytest.approx(
-        weight @ radiance.reshape(-1, 3) / np.pi, rel=5e-3
-    )
+    expected = weight @ radiance.reshape(-1, 3) / np.pi
+    assert diffuse_ball(light_of_lat_long(radiance), NORMALS) == pytest.approx(expected, rel=5e-3)
 
 
 def test_the_octahedral_square_keeps_energy_and_directions():
@@ -84,9 +81,8 @@ def test_one_bright_texel_comes_back_from_its_direction(texel):
     radiance = np.zeros((128, 256, 3))
     radiance[texel] = 1.0
     light = light_of_lat_long(radiance)
-    direction = lat_long_directions(128, 256)[texel]
-    every = octahedral_directions(128)
-    brightest = every[radiance_toward(light, every, np.full(len(every), 1e-4))[:, 0].argmax()]
+    direction, every = lat_long_directions(128, 256)[texel], octahedral_directions(128)
+    brightest = every[radiance_toward(every, np.full(len(every), 1e-4))(light)[:, 0].argmax()]
     assert np.degrees(np.arccos(min(1.0, brightest @ direction))) < 2.0
 
 

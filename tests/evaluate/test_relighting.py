@@ -1,23 +1,39 @@
-"""Relit balls: the truth is perfect, a wrong material shows in the true light, a wrong light only in the estimated one."""
+"""Relit balls and their score over the set: the truth is perfect, the gauge no error, and what is wrong shows where it is wrong."""
 
+import math
+
+import numpy as np
 import pytest
 
-from factorlib.evaluate.ball import light_of_lat_long
-from factorlib.evaluate.relighting import compare_relighting
+from factorlib.evaluate.ball import Light, constant_light, light_of_lat_long
+from factorlib.evaluate.relighting import Appearances, compare_relighting, compare_relit_set, shown_psnr
+from factorlib.results.materials import Reflectance
 from tests.evaluate.made_artifacts import TRUE as ALL
-from tests.evaluate.made_artifacts import light_map
+from tests.evaluate.made_artifacts import light_map, perturbed, scaled
 
-TRUE = {name: ALL[name] for name in ("red", "white")}
+TRUE = {name: ALL[name] for name in ("red", "brass")}
 LIGHTS = {name: light_of_lat_long(light_map(seed)) for seed, name in enumerate("ab")}
 SWAPPED = {"a": LIGHTS["b"], "b": LIGHTS["a"]}
-SEEN = {"a": ["red"], "b": ["red", "white"]}
+SEEN = {"a": ["red"], "b": ["red", "brass"]}
+WRONG = {n: perturbed(m, 3) for n, m in TRUE.items()}
+BLACK = Reflectance((0.0,) * 3, (0.0,) * 3, 0.5)
 
 
-def test_the_truth_is_perfect_and_beats_its_nulls():
+def lit(factor):
+    """The lights times a factor."""
+    return {n: Light(tuple(v * np.asarray(factor, v.dtype) for v in light.levels)) for n, light in LIGHTS.items()}
+
+
+def test_the_truth_is_perfect_and_beats_its_nulls_and_unseen_pairs_are_told_apart():
     found = compare_relighting(TRUE, TRUE, LIGHTS, LIGHTS, SEEN)
     for kinds in found.mean.values():
         assert kinds["in_true_light"].psnr_linear_db == kinds["in_estimated_light"].psnr_linear_db == 120
         assert kinds["null_grey"].psnr_tonemapped_db < 40 and kinds["null_mean_colour"].psnr_tonemapped_db < 40
+    assert found.balls["a"]["red"].observed and not found.balls["a"]["brass"].observed and found.mean_unobserved
+    assert compare_relighting(TRUE, TRUE, LIGHTS, LIGHTS, dict.fromkeys(LIGHTS, tuple(TRUE))).mean_unobserved is None
+    scored = compare_relit_set(TRUE, TRUE, LIGHTS, LIGHTS)
+    assert scored.mean_psnr_db == scored.worst_psnr_db == 120 and scored.pairs == 4 and scored.factor == (1, 1, 1)
+    assert 10 < scored.null_mean_psnr_db < 30
 
 
 def test_a_wrong_light_shows_only_in_the_estimated_light():
@@ -25,18 +41,40 @@ def test_a_wrong_light_shows_only_in_the_estimated_light():
     assert kinds["in_true_light"].psnr_linear_db == 120 and kinds["in_estimated_light"].psnr_linear_db < 30
 
 
-def test_pairs_that_no_photo_shows_are_told_apart():
-    found = compare_relighting(TRUE, TRUE, LIGHTS, LIGHTS, SEEN)
-    assert found.balls["a"]["red"].observed and not found.balls["a"]["white"].observed
-    assert found.mean_unobserved is not None
-    assert compare_relighting(TRUE, TRUE, LIGHTS, LIGHTS, dict.fromkeys(LIGHTS, tuple(TRUE))).mean_unobserved is None
+def test_a_factor_between_materials_and_lights_changes_nothing_but_itself_and_an_exposure_is_none():
+    factor = np.array([2.0, 0.5, 3.0])
+    materials, lights = {n: scaled(m, factor) for n, m in WRONG.items()}, lit(1 / factor)
+    plain, found = compare_relit_set(WRONG, TRUE, LIGHTS, LIGHTS), compare_relit_set(materials, TRUE, lights, LIGHTS)
+    assert found.factor == pytest.approx(tuple(np.array(plain.factor) / factor), rel=1e-6)
+    scores = [(f.mean_psnr_db, f.worst_psnr_db, f.null_mean_psnr_db) for f in (found, plain)]
+    assert scores[0] == pytest.approx(scores[1], abs=1e-3) and found.worst_material == plain.worst_material
+    assert compare_relit_set(TRUE, TRUE, lit(1.2), LIGHTS).mean_psnr_db < 35
 
 
-@pytest.mark.parametrize("missing", ["materials", "lights"])
+def test_the_pair_is_shown_with_the_true_ball_at_half():
+    true = np.full((5, 3), 7.0)  # shown as .5: 10 % more radiance is .5^(1/2.2) (1.1^(1/2.2) − 1) more
+    expected = -20 * math.log10(0.5 ** (1 / 2.2) * (1.1 ** (1 / 2.2) - 1))
+    assert shown_psnr(1.1 * true, true) == pytest.approx(expected, abs=1e-5)
+
+
+def test_a_disc_of_the_true_mean_colour_scores_the_null():
+    colour = Appearances(LIGHTS["a"]).ball(TRUE["red"]).mean(axis=0)
+    white = Reflectance((1.0,) * 3, (0.0,) * 3, 0.5)  # in constant light a flat disc
+    found = compare_relit_set({"red": white}, {"red": TRUE["red"]}, {"a": constant_light(colour)}, {"a": LIGHTS["a"]})
+    assert found.mean_psnr_db == pytest.approx(found.null_mean_psnr_db, abs=0.01)
+
+
+@pytest.mark.parametrize("estimate", [BLACK, TRUE["red"]])
+@pytest.mark.parametrize("truth", [BLACK, TRUE["red"]])
+@pytest.mark.parametrize("estimated, true", [("dark", "a"), ("a", "dark"), ("dark", "dark"), ("a", "a")])
+def test_black_materials_and_lights_give_numbers(estimate, truth, estimated, true):
+    lights = {"a": LIGHTS["a"], "dark": constant_light(np.zeros(3))}
+    found = compare_relit_set({"m": estimate}, {"m": truth}, {"l": lights[estimated]}, {"l": lights[true]})
+    numbers = (found.mean_psnr_db, found.worst_psnr_db, found.null_mean_psnr_db, *found.factor)
+    assert all(math.isfinite(v) for v in numbers) and found.factor == (1, 1, 1)
+
+
+@pytest.mark.parametrize("missing", range(4))
 def test_without_a_pair_there_is_nothing(missing):
-    assert (
-        compare_relighting(
-            TRUE, {} if missing == "materials" else TRUE, LIGHTS, {} if missing == "lights" else LIGHTS, {}
-        )
-        is None
-    )
+    given = [{} if k == missing else of for k, of in enumerate((TRUE, TRUE, LIGHTS, LIGHTS))]
+    assert compare_relit_set(*given) is None and compare_relighting(*given, {}) is None

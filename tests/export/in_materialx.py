@@ -5,8 +5,6 @@
 reads m.mtlx and ball.obj in the folder and writes <surface>.npy: [size, size, 3], rows from the bottom; the ball fills it.
 """
 
-from __future__ import annotations
-
 import sys
 from pathlib import Path
 

@@ -4,9 +4,11 @@ The first photo shows a ball, principal point off centre; the second an ellipsoi
 axis, turned, in a light fixed to the world.  The meshes are fine enough that their facets do not show.
 """
 
-from __future__ import annotations
-
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from functools import cache
 from pathlib import Path
+from tempfile import TemporaryDirectory
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -34,7 +36,8 @@ POSES = {
     "front": Pose(np.eye(3), np.array([-0.2, 0.15, 4.0])),
     "side": Pose(Rotation.from_euler("xyz", [30, -50, 70], degrees=True).as_matrix(), np.array([1.1, -0.7, 4.0])),
 }
-MESHES = {"front": "ball", "side": "egg"}
+MESHES, LIGHTS = {"front": "ball", "side": "egg"}, {"front": "front", "side": "room"}
+PARTS = {"ball": {"upper": "red", "lower": "red"}, "egg": {"upper": "red", "lower": "brass"}}
 WORLD_FROM_CAMERA = {"front": None, "side": Rotation.from_euler("xyz", [-25, 60, 15], degrees=True).as_matrix()}
 EXPOSURES = {"front": [1.0] * 3, "side": [0.5] * 3}
 
@@ -75,27 +78,30 @@ def make(folder: Path) -> Inputs:
     files = {"ball.obj": folder / "meshes" / "ball.obj", "egg.obj": folder / "meshes" / "egg.obj"}
     write_obj(files["ball.obj"], (1, 1, 1))
     write_obj(files["egg.obj"], (0.8, 1.1, 0.6))
-    parts = {"ball": {"upper": "red", "lower": "red"}, "egg": {"upper": "red", "lower": "brass"}}
-    meshes = {name: {"file": f"{name}.obj", "parts": parts[name], "material": None} for name in parts}
-    for photo, name in MESHES.items():
-        _write_photo(
-            folder, photo, rasterise(read_mesh(files[f"{name}.obj"], NAMES, parts[name]), CAMERAS[photo], POSES[photo])
-        )
-    write_json(folder / "align" / "poses.json", {photo: _pose_entry(photo) for photo in MESHES})
+    facts, poses = {"dataset.materials": NAMES, "dataset.light": {}, "dataset.ground": {}, "dataset.objects": {}}, {}
+    for photo, mesh in MESHES.items():
+        world, camera, pose = WORLD_FROM_CAMERA[photo], CAMERAS[photo], POSES[photo]
+        light = {"illumination": LIGHTS[photo], "world_from_camera": None if world is None else world.tolist()}
+        meshes = {mesh: {"file": f"{mesh}.obj", "parts": PARTS[mesh]}}
+        facts["dataset.light"][photo], facts["dataset.ground"][photo] = light, {"ground": None}
+        chair = {"camera": {}, "objects": [{"name": "chair", "mesh": mesh}], "meshes": meshes}
+        facts["dataset.objects"][photo] = chair
+        place = {"rotation": pose.rotation.tolist(), "translation": pose.translation.tolist(), "silhouette_iou": 1.0}
+        lens = {"focal_px": camera.focal, "principal_point": list(camera.centre)}
+        poses[photo] = {"camera": lens, "objects": {"chair": place}}
+        maps = rasterise(read_mesh(files[f"{mesh}.obj"], NAMES, PARTS[mesh]), camera, pose)
+        inside, each = maps.label > 0, [(kind, a, k) for kind in ("normal", "view") for k, a in enumerate("xyz")]
+        channels = {f"{kind}.{a}": getattr(maps, kind)[..., k] for kind, a, k in each}
+        channels |= {"depth": maps.depth, "label": maps.label, "object": maps.object, "confidence": inside}
+        write_exr(folder / "align" / f"{photo}.exr", channels)
+        grey = {c: 0.3 * inside for c in "RGB"} | {"label": maps.label, "valid": inside, "left_out": 0 * inside}
+        write_exr(folder / "masks" / f"{photo}.exr", grey)
+    write_json(folder / "align" / "poses.json", poses)
     stderr = {"diffuse": [0.1] * 3, "specular": [0.1] * 3, "roughness": 0.1}
     table = {n: {**m, "alpha": m["roughness"] ** 2, "stderr": stderr} for n, m in MATERIALS.items()}
     write_json(folder / "solve" / "materials.json", {"materials": table, "gauge": {"rule": "by hand"}, "model": {}})
     write_json(folder / "solve" / "exposures.json", EXPOSURES)
     write_lobes(folder / "solve" / "lobes.parquet", lights())
-    facts = {
-        "dataset.materials": NAMES,
-        "dataset.light": {p: _light_facts(p) for p in MESHES},
-        "dataset.ground": {p: {"ground": None} for p in MESHES},
-        "dataset.objects": {
-            p: {"camera": {}, "objects": [{"name": "chair", "mesh": m}], "meshes": {m: meshes[m]}}
-            for p, m in MESHES.items()
-        },
-    }
     return Inputs({stage: folder / stage for stage in ("align", "masks", "solve")}, facts, files)
 
 
@@ -107,31 +113,39 @@ def make_exported(folder: Path) -> Inputs:
     return Inputs({**inputs.folders, "export": folder / "export"}, inputs.facts, inputs.files)
 
 
+@cache
+def shared() -> tuple[Inputs, TemporaryDirectory]:
+    """What `make_exported` returns, once for all tests of a session; who changes a file puts it back (`instead`)."""
+    folder = TemporaryDirectory()
+    return make_exported(Path(folder.name) / "set"), folder
+
+
+@contextmanager
+def instead(file: Path, write: Callable[[Path], object]) -> Iterator[None]:
+    """The file is written anew, and put back afterwards."""
+    before = file.read_bytes()
+    try:
+        write(file)
+        yield
+    finally:
+        file.write_bytes(before)
+
+
 def make_result(root: Path, name: str = "set") -> Path:
     """build/<name> of a checkout at `root` as the runner leaves it, beside its data set data/<name>."""
-    build, dataset = root / "build" / name, root / "data" / name
+    build, dataset, photos = root / "build" / name, root / "data" / name, []
     inputs = make_exported(build)
     dataset.mkdir(parents=True)
     (build / "dataset.txt").write_text(f"data/{name}\n")
-    meshes = {}
-    for photo in MESHES:
-        meshes |= inputs.facts["dataset.objects"][photo]["meshes"]
     for file, path in inputs.files.items():
         (dataset / file).write_bytes(path.read_bytes())
-    photos = [
-        {
-            "name": photo,
-            "image": f"{photo}.png",
-            "masks": f"{photo}_mask.png",
-            "objects": [{"name": "chair", "mesh": mesh}],
-        }
-        for photo, mesh in MESHES.items()
-    ]
+    for photo, mesh in MESHES.items():
+        files = {"image": f"{photo}.png", "masks": f"{photo}_mask.png"}
+        for file in files.values():
+            (dataset / file).write_bytes(b"")
+        photos.append({"name": photo, **files, "objects": [{"name": "chair", "mesh": mesh}]})
     photos[1] |= {"illumination": "room", "world_from_camera": WORLD_FROM_CAMERA["side"].tolist()}
-    for photo in photos:
-        for key in ("image", "masks"):
-            (dataset / photo[key]).write_bytes(b"")
-    meshes = {mesh: {k: v for k, v in entry.items() if v is not None} for mesh, entry in meshes.items()}
+    meshes = {mesh: {"file": f"{mesh}.obj", "parts": PARTS[mesh]} for mesh in MESHES.values()}
     write_json(dataset / "dataset.yaml", {"format": 1, "materials": NAMES, "meshes": meshes, "photos": photos})
     return build
 
@@ -140,35 +154,3 @@ def of_photo(inputs: Inputs, photo: str) -> Inputs:
     """Of what `make_exported` returns, the inputs of `render` for one photo; the networks are the shipped ones."""
     facts = {**inputs.facts, "dataset.light": inputs.facts["dataset.light"][photo]}
     return Inputs({**inputs.folders, "train": SHIPPED}, facts, inputs.files, photo)
-
-
-def _light_facts(photo: str) -> dict:
-    world = WORLD_FROM_CAMERA[photo]
-    return {
-        "illumination": "front" if world is None else "room",
-        "world_from_camera": None if world is None else world.tolist(),
-    }
-
-
-def _pose_entry(photo: str) -> dict:
-    camera, pose = CAMERAS[photo], POSES[photo]
-    return {
-        "camera": {"focal_px": camera.focal, "principal_point": list(camera.centre)},
-        "objects": {
-            "chair": {
-                "rotation": pose.rotation.tolist(),
-                "translation": pose.translation.tolist(),
-                "silhouette_iou": 1.0,
-            }
-        },
-    }
-
-
-def _write_photo(folder: Path, photo: str, maps) -> None:
-    inside = maps.label > 0
-    channels = {f"normal.{a}": maps.normal[..., k] for k, a in enumerate("xyz")}
-    channels |= {f"view.{a}": maps.view[..., k] for k, a in enumerate("xyz")}
-    channels |= {"depth": maps.depth, "label": maps.label, "object": maps.object, "confidence": inside}
-    write_exr(folder / "align" / f"{photo}.exr", channels)
-    grey = {c: 0.3 * inside for c in "RGB"}
-    write_exr(folder / "masks" / f"{photo}.exr", {**grey, "label": maps.label, "valid": inside, "left_out": 0 * inside})

@@ -1,5 +1,14 @@
-"""Exported scenes rendered in Blender: frames, light and materials against closed forms and Mitsuba's picture."""
+"""Exported scenes in Blender, by its script and as USD: frames, light and materials against closed forms and Mitsuba's picture.
 
+Blender runs in a process of its own: its libraries do not get on with others of the same names.
+"""
+
+import importlib.util
+import json
+import shutil
+import subprocess
+import sys
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -7,21 +16,101 @@ import pytest
 from scipy.ndimage import binary_erosion
 
 from factorlib.conventions import YUP_FROM_CAMERA, lat_long_directions, lat_long_of_direction, lat_long_solid_angles
-from factorlib.export import viewers
-from factorlib.export.blender import ExposedMap, write_scene_json, write_script
-from factorlib.export.mitsuba import DIRECT, Shape, View
-from factorlib.export.viewers import Angles, distribution
+from factorlib.export.blender import write_scene_json, write_script
+from factorlib.export.scene import ExposedMap, Scene, Shape
+from factorlib.export.usd import write_usd_mesh, write_usd_scene
+from factorlib.export.viewers import MODELS, Angles, distribution, solved
+from factorlib.geometry.camera import Camera
 from factorlib.images.exr import LAT_LONG, read_exr, write_rgb_exr
 from factorlib.jsonfile import read_json
 from factorlib.meshes.ply import write_ply
 from factorlib.meshes.read import read_mesh
 from factorlib.results.materials import Reflectance
 from factorlib.tracing.variant import mitsuba
-from tests.export import in_blender, made_export
+from tests.export import made_export
+
+MISSING = 'Blender is not installed: make setup EXTRAS="blender", or put `blender` on the PATH'
+BLENDER_FROM_YUP = np.array([[1, 0, 0], [0, 0, -1], [0, 1, 0]])  # Blender turns scenes z-up
+OPEN = """
+import bpy, json
+def opened(file):
+    bpy.ops.wm.read_factory_settings(use_empty=True)
+    bpy.context.scene.world = bpy.data.worlds.new("world")
+    bpy.ops.wm.usd_import(filepath=file)
+    bpy.context.scene.camera, = (found for found in bpy.data.objects if found.type == "CAMERA")
+    return bpy.context.scene
+"""
+DUMP = """
+told = {}
+for file in FILES:
+    camera = opened(file).camera
+    lens = camera.data
+    meshes = [found for found in bpy.data.objects if found.type == "MESH"]
+    told[file] = {
+        "lens": [lens.lens, lens.sensor_width, lens.shift_x, lens.shift_y],
+        "camera": [list(row) for row in camera.matrix_world],
+        "vertices": {m.name: [list(m.matrix_world @ v.co) for v in m.data.vertices] for m in meshes},
+        "bound": {m.name: [slot.material.name for slot in m.material_slots] for m in meshes},
+        "materials": len(bpy.data.materials),
+    }
+open(OUT, "w").write(json.dumps(told))
+"""
+RENDER = """
+for file in FILES:
+    scene = opened(file)
+    scene.render.engine, scene.render.film_transparent = "CYCLES", True
+    scene.render.resolution_x, scene.render.resolution_y = SIZE
+    scene.cycles.samples, scene.cycles.pixel_filter_type, scene.cycles.max_bounces = 128, "BOX", 0
+    scene.cycles.use_adaptive_sampling = scene.cycles.use_denoising = False
+    scene.cycles.sample_clamp_direct = scene.cycles.light_sampling_threshold = 0
+    scene.render.image_settings.file_format, scene.render.image_settings.color_depth = "OPEN_EXR", "32"
+    scene.render.image_settings.color_mode = "RGBA"
+    scene.view_settings.view_transform = "Standard"
+    scene.render.filepath = file + ".exr"
+    bpy.ops.render.render(write_still=True)
+"""
+
+
+def rendered(scenes: Path, photos: Sequence[str], samples: int, *words: str) -> dict[str, np.ndarray]:
+    """RGBA of the photos, by the script beside them, all in one process; skips the test where there is no Blender."""
+    jobs = [
+        [photo, "--render", str(scenes / f"{photo}.blender.exr"), "--samples", str(samples), *words] for photo in photos
+    ]
+    code = (
+        f"import sys; sys.path.insert(0, {str(scenes)!r})\nimport blender\nfor words in {jobs!r}: blender.main(words)"
+    )
+    run(code)
+    return {photo: rgba(scenes / f"{photo}.blender.exr") for photo in photos}
+
+
+def run(code: str) -> None:
+    """Python in Blender; skips the test where there is none."""
+    done = subprocess.run(_command(code), capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr[-2000:]
+
+
+def _command(code: str) -> list[str]:
+    if importlib.util.find_spec("bpy"):
+        return [sys.executable, "-W", "ignore", "-c", code]
+    if program := shutil.which("blender"):
+        return [program, "--background", "--python-exit-code", "1", "--python-expr", code]
+    pytest.skip(MISSING)
+
+
+def rgba(path: Path) -> np.ndarray:
+    """[rows, columns, 4] of an EXR."""
+    channels = read_exr(path)
+    return np.stack([channels[name] for name in "RGBA"], axis=-1)
+
+
+def run_usd(body, files, **names):
+    told = {"FILES": [str(file) for file in files], **names}
+    run(OPEN + "".join(f"{name} = {value!r}\n" for name, value in told.items()) + body)
+
 
 # a ball under one bright texel: radiance in closed form --------------------------------------------------------------
 
-VIEW = View(40, 32, 90.0, (24.0, 13.0))
+CAMERA = Camera(40, 32, 90.0, (24.0, 13.0))
 DISTANCE, ROWS, EXPOSURE = 5.0, 64, np.array([2.0, 1.0, 0.5])
 LAMBERTIAN = Reflectance((0.5, 0.4, 0.3), (0, 0, 0), 0.5)
 ROUGH_METAL = Reflectance((0, 0, 0), (0.8, 0.6, 0.4), 0.7)
@@ -37,6 +126,7 @@ SIDES = {  # material, direction to the light (camera frame), camera_from_light
     "glossy": (GLOSSY, (-0.5, -0.6, -0.8), np.eye(3)),
     "grazing": (ROUGH_METAL, (0.9, -0.2, 0.6), np.eye(3)),
 }
+LIT = [name for name, (material, *_) in SIDES.items() if material is LAMBERTIAN]
 
 
 def texel_of(direction: tuple[float, float, float], camera_from_light: np.ndarray) -> tuple[int, int]:
@@ -46,28 +136,13 @@ def texel_of(direction: tuple[float, float, float], camera_from_light: np.ndarra
     return int(row * ROWS), int(column * 2 * ROWS)
 
 
-def write_ball(folder: Path, name: str) -> None:
-    material, direction, camera_from_light = SIDES[name]
-    light = np.zeros((ROWS, 2 * ROWS, 3))
-    light[texel_of(direction, camera_from_light)] = 1000.0
-    write_rgb_exr(folder / f"{name}.light.exr", light, LAT_LONG)
-    place = np.eye(4)
-    place[2, 3] = DISTANCE
-    shape = Shape("ball", "ball.ply", "red", place, False)
-    exposed = ExposedMap(f"{name}.light.exr", EXPOSURE, camera_from_light)
-    write_scene_json(folder / f"{name}.json", VIEW, [shape], {"red": material}, exposed, DIRECT)
-
-
 def closed_form(name: str, model) -> tuple[np.ndarray, np.ndarray]:
     """Radiance of each pixel's middle, by a model of reflection, and n·i where the ball is met (0 elsewhere)."""
     material, direction, camera_from_light = SIDES[name]
     i, j = texel_of(direction, camera_from_light)
     light = camera_from_light @ YUP_FROM_CAMERA @ lat_long_directions(ROWS, 2 * ROWS)[i, j]
     energy = 1000.0 * EXPOSURE * lat_long_solid_angles(ROWS, 2 * ROWS)[i]
-    x, y = np.meshgrid(
-        np.arange(VIEW.width) + 0.5 - VIEW.principal_point[0], np.arange(VIEW.height) + 0.5 - VIEW.principal_point[1]
-    )
-    ray = np.stack([x, y, np.full_like(x, VIEW.focal_px)], axis=-1)
+    ray = CAMERA.rays()
     ray /= np.linalg.norm(ray, axis=-1, keepdims=True)
     along, inside = DISTANCE * ray[..., 2], DISTANCE**2 * (ray[..., 2] ** 2 - 1) + 1
     normal = (along - np.sqrt(inside.clip(0)))[..., None] * ray - [0, 0, DISTANCE]
@@ -76,53 +151,69 @@ def closed_form(name: str, model) -> tuple[np.ndarray, np.ndarray]:
     ni, no = (normal @ light).clip(0) * (inside > 0), -(normal * ray).sum(axis=-1).clip(max=-0.01)
     angles = Angles(ni, no, (normal * half).sum(axis=-1).clip(0, 1), -(ray * half).sum(axis=-1))
     parts = model(material, angles)
-    return (parts.diffuse + distribution(material.alpha, angles.nh)[..., None] * parts.lobe) * ni[
-        ..., None
-    ] * energy, ni
+    brdf = parts.diffuse + distribution(material.alpha, angles.nh)[..., None] * parts.lobe
+    return brdf * ni[..., None] * energy, ni
 
 
 @pytest.fixture(scope="module")
 def balls(tmp_path_factory):
+    """RGBA of every ball by the script, and of the Lambertian ones as USD."""
     folder = tmp_path_factory.mktemp("balls")
     made_export.write_obj(folder / "ball.obj", (1, 1, 1), rows=96)
-    write_ply(folder / "ball.ply", read_mesh(folder / "ball.obj", ["red"], "red"))
+    mesh = read_mesh(folder / "ball.obj", ["red"], "red")
+    write_ply(folder / "ball.ply", mesh)
+    write_usd_mesh(folder / "ball.usda", mesh)
     write_script(folder)
-    for name in SIDES:
-        write_ball(folder, name)
-    return in_blender.rendered(folder, list(SIDES), 128)
+    place = np.eye(4)
+    place[2, 3] = DISTANCE
+    for name, (material, direction, camera_from_light) in SIDES.items():
+        light = np.zeros((ROWS, 2 * ROWS, 3))
+        light[texel_of(direction, camera_from_light)] = 1000.0
+        write_rgb_exr(folder / f"{name}.light.exr", light, LAT_LONG)
+        exposed = ExposedMap(f"./{name}.light.exr", EXPOSURE, camera_from_light)
+        scene = Scene(CAMERA, [Shape("ball.red", "ball.ply", "red", place, False)], {"red": material}, exposed)
+        write_scene_json(folder / f"{name}.json", scene)
+        write_usd_scene(folder / f"{name}.usda", scene)
+    pictures = rendered(folder, list(SIDES), 128)
+    run_usd(RENDER, [folder / f"{name}.usda" for name in LIT], SIZE=(CAMERA.width, CAMERA.height))
+    return pictures, {name: rgba(folder / f"{name}.usda.exr") for name in LIT}
+
+
+CASES = [(0, name, MODELS["blender"]) for name in SIDES] + [(1, name, solved) for name in LIT]
 
 
 @pytest.mark.long
-@pytest.mark.parametrize("name", SIDES)
-def test_light_of_one_texel_gives_the_radiance_it_should(balls, name):
-    expected, ni = closed_form(name, viewers.blender)
-    found, alpha = balls[name][..., :3], balls[name][..., 3]
-    lit = (ni > 0.3) & (alpha == 1)
-    assert lit.sum() >= 15
-    error = np.abs(found[lit] / expected[lit] - 1)
-    assert np.median(error) < 0.01 and np.percentile(error, 90) < 0.05
-    assert found[binary_erosion(ni == 0, np.ones((5, 5)))].max() < 0.01 * found.max()  # nor is the light itself shown
+@pytest.mark.parametrize(
+    "form, name, model", CASES, ids=[f"{['script', 'usd'][form]}-{name}" for form, name, _ in CASES]
+)
+def test_light_of_one_texel_gives_the_radiance_it_should(balls, form, name, model):
+    (expected, ni), picture = closed_form(name, model), balls[form][name]
+    lit = (ni > 0.3) & (picture[..., 3] == 1)
+    error = np.abs(picture[lit][:, :3] / expected[lit] - 1)
+    print(f"{name}: difference {np.median(error):.2%} (median), {np.percentile(error, 90):.2%} (90th percentile)")
+    assert lit.sum() >= 15 and np.median(error) < 0.01 and np.percentile(error, 90) < 0.05
+    dark = binary_erosion(ni == 0, np.ones((5, 5)))
+    assert form or picture[dark][:, :3].max() < 0.01 * picture[..., :3].max()  # nor is the light itself shown
 
 
 @pytest.mark.long
 def test_what_differs_from_the_solved_model_is_the_shadowing(balls):
     """Light that grazes a rough metal: Cycles shows the height-correlated Smith term, not the separable one."""
-    found, alpha = balls["grazing"][..., :3], balls["grazing"][..., 3]
-    (separable, ni), (correlated, _) = (closed_form("grazing", model) for model in (viewers.solved, viewers.blender))
+    found, alpha = balls[0]["grazing"][..., :3], balls[0]["grazing"][..., 3]
+    (separable, ni), (correlated, _) = (closed_form("grazing", model) for model in (solved, MODELS["blender"]))
     lit = (ni > 0.3) & (alpha == 1)
     assert np.median(found[lit] / separable[lit] - 1) > 0.03
     assert abs(np.median(found[lit] / correlated[lit] - 1)) < 0.01
 
 
-# photos ----------------------------------------------------------------------------------------------------------------
+# photos --------------------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.long
 def test_round_trip_shows_what_mitsuba_shows(exported):
     inputs, out = exported
-    photos = list(made_export.MESHES)
-    found = in_blender.rendered(out / "scenes", photos, 256)
-    module = mitsuba()
+    photos, module = list(made_export.MESHES), mitsuba()
+    found = rendered(out / "scenes", photos, 256)
     for photo in photos:
         expected = np.array(module.render(module.load_file(str(out / "scenes" / f"{photo}.xml")), spp=512))
         mask = binary_erosion(read_exr(inputs["align"] / f"{photo}.exr")["label"] > 0, np.ones((3, 3)))
@@ -132,30 +223,47 @@ def test_round_trip_shows_what_mitsuba_shows(exported):
         assert found[photo][mask][:, 3].min() == 1.0
 
 
-def test_json_holds_the_scene_as_it_was_exported(exported):
+def test_json_holds_the_scene_as_it_was_exported_and_the_script_is_python(exported):
     _, out = exported
-    scene = read_json(out / "scenes" / "side.json")
-    camera, pose = made_export.CAMERAS["side"], made_export.POSES["side"]
-    assert scene["camera"] == {
-        "width": 64,
-        "height": 56,
-        "focal_px": camera.focal,
-        "principal_point": list(camera.centre),
-    }
-    assert [shape["name"] for shape in scene["shapes"]] == ["chair.red", "chair.brass"]
-    np.testing.assert_allclose(
-        np.array(scene["shapes"][0]["cam_from_object"])[:3], np.c_[pose.rotation, pose.translation]
+    scene, camera, pose = (
+        read_json(out / "scenes" / "side.json"),
+        made_export.CAMERAS["side"],
+        made_export.POSES["side"],
     )
+    lens = {"focal_px": camera.focal, "principal_point": list(camera.centre)}
+    assert scene["camera"] == {"width": 64, "height": 56, **lens}
+    assert [shape["name"] for shape in scene["shapes"]] == ["chair.red", "chair.brass"]
+    place = np.array(scene["shapes"][0]["cam_from_object"])[:3]
+    np.testing.assert_allclose(place, np.c_[pose.rotation, pose.translation])
     assert scene["light"]["exposure"] == [0.5] * 3 and scene["max_depth"] == 2
     np.testing.assert_allclose(scene["light"]["camera_from_light"], made_export.WORLD_FROM_CAMERA["side"].T)
-    assert set(scene["materials"]) == {"red", "brass"} and set(scene["materials"]["red"]) == {
-        "diffuse",
-        "specular",
-        "roughness",
-    }
+    assert set(scene["materials"]) == {"red", "brass"}
+    assert set(scene["materials"]["red"]) == {"diffuse", "specular", "roughness"}
     files = [scene["light"]["file"], *(shape["file"] for shape in scene["shapes"])]
     assert all((out / "scenes" / file).is_file() for file in files)
+    compile((out / "scenes" / "blender.py").read_text(), "blender.py", "exec")
 
 
-def test_script_is_python(exported):
-    compile((exported[1] / "scenes" / "blender.py").read_text(), "blender.py", "exec")
+@pytest.mark.long
+def test_camera_vertices_and_materials_arrive_as_usd(exported, tmp_path):
+    inputs, out = exported
+    files = {photo: out / "scenes" / f"{photo}.usda" for photo in made_export.MESHES}
+    run_usd(DUMP, files.values(), OUT=str(tmp_path / "told.json"))
+    told = json.loads((tmp_path / "told.json").read_text())
+    for photo, file in files.items():
+        found, camera = told[str(file)], made_export.CAMERAS[photo]
+        lens, sensor, *shift = found["lens"]
+        assert lens / sensor * camera.width == pytest.approx(camera.focal, rel=1e-6) and sensor == pytest.approx(36)
+        middle = (np.array([camera.width, camera.height]) / 2 - camera.centre) * [1, -1] / camera.width
+        np.testing.assert_allclose(shift, middle, atol=1e-6)
+        expected = np.eye(4)
+        expected[:3, :3] = BLENDER_FROM_YUP
+        np.testing.assert_allclose(found["camera"], expected, atol=1e-6)
+        parts = {"front": ["red"], "side": ["brass", "red"]}[photo]
+        assert found["bound"] == {name: [name] for name in parts} and found["materials"] == len(parts)
+        entry = inputs.facts["dataset.objects"][photo]["meshes"][made_export.MESHES[photo]]
+        mesh = read_mesh(inputs.files[entry["file"]], made_export.NAMES, entry["parts"])
+        placed = made_export.POSES[photo].apply(mesh.vertices) @ YUP_FROM_CAMERA @ BLENDER_FROM_YUP.T
+        for name, vertices in found["vertices"].items():
+            used = np.unique(mesh.faces[mesh.face_label == made_export.NAMES.index(name) + 1])
+            np.testing.assert_allclose(vertices, placed[used], atol=2e-6)

@@ -51,13 +51,13 @@ def test_exported_materials_in_exported_lights_are_the_solved_ones(inputs, tmp_p
 def test_files_are_all_there_and_the_same_bytes_again(inputs, tmp_path):
     first, second = (files_of(run(inputs, tmp_path / name)) for name in ("one", "two"))
     expected = {
-        "materials.json",
         "exposures.json",
         "lobes.parquet",
-        "materials.mtlx",
         "losses.json",
         "ball.glb",
         "egg.glb",
+        "materials.json",
+        "materials.mtlx",
     }
     expected |= {f"illumination/{name}.{kind}" for name in ("front", "room") for kind in ("exr", "hdr")}
     expected |= {f"scenes/{name}.{kind}" for name in ("front", "side") for kind in ("xml", "json", "usda")}

@@ -10,7 +10,7 @@ import trimesh
 
 from factorlib.export.gltf import write_glb
 from factorlib.export.materials import headroom_factor, table_in_gauge
-from factorlib.export.materialx import write_materialx
+from factorlib.export.materialx import materialx
 from factorlib.meshes.mesh import Mesh
 from factorlib.results.materials import Gauge, MaterialTable, Reflectance, StandardErrors, solved
 
@@ -20,8 +20,7 @@ def bright(scale: float) -> Reflectance:
 
 
 CASES = {"bright": bright(0.8), "lambertian": Reflectance((0.2, 0.3, 0.4), (0, 0, 0), 0.9),
-"metal": Reflectance((0, 0, 0), (0.5, 0.4, 0.3), 0.2),
-         "black": Reflectance((0, 0, 0), (0, 0, 0), 0.5)}  # fmt: skip
+         "metal": Reflectance((0, 0, 0), (0.5, 0.4, 0.3), 0.2), "black": Reflectance((0, 0, 0), (0, 0, 0), 0.5)}  # fmt: skip
 
 
 @pytest.mark.parametrize("scale", [0.1, 0.8, 1.0, 30.0])
@@ -34,89 +33,57 @@ def test_factor_leaves_headroom_and_touches_nothing_that_has_it(scale):
 
 def test_gauge_scales_reflectances_and_their_errors_only_and_says_so():
     before = solved(Reflectance((0.8,) * 3, (0.4,) * 3, 0.3), StandardErrors((0.1,) * 3, (0.2,) * 3, 0.05))
-    table = MaterialTable({"a": before}, Gauge(rule="x"))
-    found = table_in_gauge(table, 0.5)
-    assert found.materials == {
-        "a": solved(Reflectance((0.4,) * 3, (0.2,) * 3, 0.3), StandardErrors((0.05,) * 3, (0.1,) * 3, 0.05))
-    }
-    assert found.gauge.rule == "x" and found.gauge.export_factor == 0.5
-    assert table.materials["a"] == before
-
-
-def test_materialx_mixes_to_the_solved_reflectances(tmp_path):
-    write_materialx(tmp_path / "m.mtlx", CASES)
-    root = ET.parse(tmp_path / "m.mtlx").getroot()
-    for name, material in CASES.items():
-        value = {(n.get("name"), i.get("name")): i.get("value") for n in root for i in n}
-        weight = float(value[f"m_{name}_bsdf", "mix"])
-        diffuse, specular = (
-            numbers(value[key]) for key in ((f"m_{name}_diffuse", "color"), (f"m_{name}_specular", "color0"))
-        )
-        np.testing.assert_allclose((1 - weight) * diffuse, material.diffuse, atol=1e-12)
-        np.testing.assert_allclose(weight * specular, material.specular, atol=1e-12)
-        assert numbers(value[f"m_{name}_specular", "roughness"]).tolist() == [material.alpha] * 2
-
-
-def test_standard_surface_has_the_solved_reflectances_under_no_fresnel(tmp_path):
-    write_materialx(tmp_path / "m.mtlx", CASES)
-    root = ET.parse(tmp_path / "m.mtlx").getroot()
-    for name, material in CASES.items():
-        value = {
-            i.get("name"): i.get("value")
-            for i in root.find(f"standard_surface[@name='m_{name}_standard_surface_surface']")
-        }
-        specular, ior = float(value["specular"]), float(value["specular_IOR"])
-        assert ((ior - 1) / (ior + 1)) ** 2 > 1 - 5e-4
-        np.testing.assert_allclose(specular * numbers(value["specular_color"]), material.specular, atol=1e-12)
-        np.testing.assert_allclose((1 - specular) * numbers(value["base_color"]), material.diffuse, atol=1e-12)
-        assert float(value["specular_roughness"]) == material.roughness
-    named = {node.get("name") for node in root.iter("surfacematerial")}
-    assert named == {f"m_{name}{more}" for name in CASES for more in ("", "_standard_surface")}
+    half = solved(Reflectance((0.4,) * 3, (0.2,) * 3, 0.3), StandardErrors((0.05,) * 3, (0.1,) * 3, 0.05))
+    found = table_in_gauge(MaterialTable({"a": before}, Gauge(rule="x")), 0.5)
+    assert found.materials == {"a": half} and found.gauge.rule == "x" and found.gauge.export_factor == 0.5
 
 
 def numbers(text: str) -> np.ndarray:
     return np.array([float(word) for word in text.split(",")])
 
 
-def test_materialx_is_valid_where_its_library_is_there(tmp_path):
+def test_materialx_mixes_to_the_solved_reflectances_and_its_standard_surface_has_them_under_no_fresnel():
+    root = ET.fromstring(materialx(CASES))
+    value = {(n.get("name"), i.get("name")): i.get("value") for n in root for i in n}
+    for name, material in CASES.items():
+        weight, parts = float(value[f"m_{name}_bsdf", "mix"]), (("diffuse", "color"), ("specular", "color0"))
+        diffuse, specular = (numbers(value[f"m_{name}_{part}", key]) for part, key in parts)
+        np.testing.assert_allclose((1 - weight) * diffuse, material.diffuse, atol=1e-12)
+        np.testing.assert_allclose(weight * specular, material.specular, atol=1e-12)
+        assert numbers(value[f"m_{name}_specular", "roughness"]).tolist() == [material.alpha] * 2
+        standard = {key: numbers(v) for (node, key), v in value.items() if node == f"m_{name}_standard_surface_surface"}
+        specular, ior = standard["specular"], standard["specular_IOR"]
+        assert ((ior - 1) / (ior + 1)) ** 2 > 1 - 5e-4 and standard["specular_roughness"] == material.roughness
+        np.testing.assert_allclose(specular * standard["specular_color"], material.specular, atol=1e-12)
+        np.testing.assert_allclose((1 - specular) * standard["base_color"], material.diffuse, atol=1e-12)
+    named = {node.get("name") for node in root.iter("surfacematerial")}
+    assert named == {f"m_{name}{more}" for name in CASES for more in ("", "_standard_surface")}
+
+
+def test_materialx_is_valid_where_its_library_is_there():
     library = pytest.importorskip("MaterialX", reason='MaterialX is not installed: make setup EXTRAS="interchange"')
-    write_materialx(tmp_path / "m.mtlx", CASES)
     document, standard = library.createDocument(), library.createDocument()
     library.loadLibraries(library.getDefaultDataLibraryFolders(), library.getDefaultDataSearchPath(), standard)
     document.importLibrary(standard)
-    library.readFromXmlFile(document, str(tmp_path / "m.mtlx"))
+    library.readFromXmlString(document, materialx(CASES))
     assert document.validate() == (True, "")
 
 
 def test_glb_keeps_the_mesh_and_gives_exact_reflectances(tmp_path):
     square = np.array([[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]], float)
-    mesh = Mesh(
-        square,
-        np.array([[0, 1, 2], [0, 2, 3]], np.int32),
-        np.tile([0.0, 0, 1], (4, 1)),
-        np.array([1, 3], np.int16),
-        open=True,
-    )
-    write_glb(tmp_path / "m.glb", mesh, ["bright", "unused", "metal"], CASES)
-    write_glb(tmp_path / "n.glb", mesh, ["bright", "unused", "metal"], CASES)
-    assert (tmp_path / "m.glb").read_bytes() == (tmp_path / "n.glb").read_bytes()
-    found = trimesh.load(tmp_path / "m.glb")
+    faces, normals = np.array([[0, 1, 2], [0, 2, 3]], np.int32), np.tile([0.0, 0, 1], (4, 1))
+    for name in "ab":
+        mesh = Mesh(square, faces, normals, np.array([1, 3], np.int16), open=True)
+        write_glb(tmp_path / f"{name}.glb", mesh, ["bright", "unused", "metal"], CASES)
+    data = (tmp_path / "a.glb").read_bytes()
+    assert data == (tmp_path / "b.glb").read_bytes()
+    found = trimesh.load(tmp_path / "a.glb")
     assert set(found.geometry) == {"bright", "metal"} and found.area == pytest.approx(1.0)
-    tree = _gltf(tmp_path / "m.glb")
+    tree = json.loads(data[20 : 20 + struct.unpack("<I", data[12:16])[0]])  # the JSON chunk
     for entry in tree["materials"]:
-        material, core, more = (
-            CASES[entry["name"]],
-            entry["pbrMetallicRoughness"],
-            entry["extensions"]["KHR_materials_specular"],
-        )
+        material, core = CASES[entry["name"]], entry["pbrMetallicRoughness"]
+        more = entry["extensions"]["KHR_materials_specular"]
         f0 = 0.04 * np.array(more["specularColorFactor"]) * more["specularFactor"]
         np.testing.assert_allclose(f0, material.specular, atol=1e-12)
         np.testing.assert_allclose(np.array(core["baseColorFactor"][:3]) * (1 - f0.max()), material.diffuse, atol=1e-12)
         assert core["roughnessFactor"] == material.roughness and entry["doubleSided"]
-
-
-def _gltf(path) -> dict:
-    """The JSON chunk of a GLB."""
-    data = path.read_bytes()
-    length = struct.unpack("<I", data[12:16])[0]
-    return json.loads(data[20 : 20 + length])

@@ -63,33 +63,29 @@ def test_without_specular_part_nothing_is_lost_but_by_viewers_that_add_one(mater
     assert 0 < found["usd"].mean < (0.005 if material is LAMBERTIAN else 2)
 
 
-def test_usd_bends_what_has_both_parts_and_neither_metals_nor_what_is_seen_along_the_light():
+def test_usd_bends_what_has_both_parts_and_no_metals():
     assert loss.losses(Reflectance((0, 0, 0), (0.8, 0.6, 0.4), 0.7))["usd"] == loss.Loss(0.0, 0.0)
     assert loss.losses(GREY)["usd"].worst > 0.05
-    along = Angles(np.array([0.7]), np.array([0.7]), np.array([0.7]), np.ones(1))  # h = i = o: no Fresnel
-    found, expected = viewers.usd(COLOURED, along), viewers.solved(COLOURED, along)
-    np.testing.assert_allclose(found.diffuse, expected.diffuse, rtol=1e-9)
-    np.testing.assert_allclose(found.lobe, expected.lobe, rtol=1e-9)
 
 
-def test_a_grey_specular_part_has_no_fresnel_in_gltf():
-    assert loss.losses(GREY)["glb"].worst < 1e-5
-    assert loss.losses(COLOURED)["glb"].worst > 0.02
-
-
-def test_mirrors_lose_nothing_by_shadowing_and_break_nothing():
+def test_a_grey_specular_part_has_no_fresnel_in_gltf_and_mirrors_lose_nothing_by_shadowing():
+    assert loss.losses(GREY)["glb"].worst < 1e-5 and loss.losses(COLOURED)["glb"].worst > 0.02
     found = loss.losses(MIRROR)
     assert found["blender"].worst < 1e-4 and found["mtlx"].worst < 1e-3
     assert all(np.isfinite([each.mean, each.worst]).all() for each in found.values())
 
 
-def test_models_agree_in_the_mirror_direction_of_a_smooth_surface_seen_from_the_front():
-    front = Angles(*(np.ones(1) for _ in range(4)))
-    expected = viewers.solved(COLOURED, front)
-    for name in ("blender", "glb", "glb_correlated"):
-        parts = MODELS[name](COLOURED, front)
-        np.testing.assert_allclose(parts.diffuse, expected.diffuse, rtol=1e-9)
-        np.testing.assert_allclose(parts.lobe, expected.lobe, rtol=1e-9)
+FRONT, ALONG = (Angles(*(np.array([v]) for v in (*[cosine] * 3, 1.0))) for cosine in (1.0, 0.7))
+
+
+@pytest.mark.parametrize(
+    "name, angles", [("blender", FRONT), ("glb", FRONT), ("glb_correlated", FRONT), ("usd", ALONG)]
+)
+def test_models_agree_where_shadowing_and_fresnel_are_nil(name, angles):
+    """The mirror direction seen from the front; h = i = o, where there is no Fresnel."""
+    found, expected = (model(COLOURED, angles) for model in (MODELS[name], viewers.solved))
+    np.testing.assert_allclose(found.diffuse, expected.diffuse, rtol=1e-9)
+    np.testing.assert_allclose(found.lobe, expected.lobe, rtol=1e-9)
 
 
 def test_a_white_surface_that_gives_back_all_energy_is_white_in_the_sky():

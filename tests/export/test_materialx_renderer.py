@@ -9,9 +9,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from factorlib.export import viewers
 from factorlib.export.loss import in_lamp
-from factorlib.export.materialx import write_materialx
+from factorlib.export.materialx import materialx
+from factorlib.export.viewers import MODELS
 from factorlib.results.materials import Reflectance
 from tests.export import made_export
 
@@ -22,7 +22,7 @@ MATERIALS = {
     "metal": Reflectance((0, 0, 0), (0.8, 0.6, 0.4), 0.7),
     "lambertian": Reflectance((0.5, 0.4, 0.3), (0, 0, 0), 0.5),
 }
-SURFACES = {"surface": viewers.mtlx, "standard_surface_surface": viewers.mtlx_standard_surface}
+SURFACES = {"surface": MODELS["mtlx"], "standard_surface_surface": MODELS["mtlx_standard_surface"]}
 
 
 @pytest.fixture(scope="module")
@@ -32,8 +32,12 @@ def pictures(tmp_path_factory):
     if screen and not shutil.which(screen[0]):
         pytest.skip("MaterialX draws on a screen alone: install xvfb and libgl1-mesa-dri")
     folder = tmp_path_factory.mktemp("materialx")
-    write_materialx(folder / "m.mtlx", MATERIALS)
-    _write_ball(folder)
+    (folder / "m.mtlx").write_text(materialx(MATERIALS))
+    made_export.write_obj(folder / "points.obj", (1, 1, 1))  # the unit ball's points are its normals
+    lines = (folder / "points.obj").read_text().splitlines()
+    points, faces = ([line for line in lines if line.startswith(letter)] for letter in "vf")
+    corners = ["f " + " ".join(f"{k}//{k}" for k in face.split()[1:]) for face in faces]
+    (folder / "ball.obj").write_text("\n".join([*points, *("vn" + point[1:] for point in points), *corners]) + "\n")
     names = [f"m_{material}_{surface}" for material in MATERIALS for surface in SURFACES]
     script = [
         sys.executable, str(Path(__file__).with_name("in_materialx.py")), str(folder), str(SIZE),
@@ -42,15 +46,6 @@ def pictures(tmp_path_factory):
     done = subprocess.run([*screen, *script], capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stdout[-2000:] + done.stderr[-2000:]
     return {name: np.load(folder / f"{name}.npy") for name in names}
-
-
-def _write_ball(folder: Path) -> None:
-    """The unit ball's points are its normals."""
-    made_export.write_obj(folder / "points.obj", (1, 1, 1))
-    lines = (folder / "points.obj").read_text().splitlines()
-    points, faces = ([line for line in lines if line.startswith(letter)] for letter in "vf")
-    corners = ["f " + " ".join(f"{k}//{k}" for k in face.split()[1:]) for face in faces]
-    (folder / "ball.obj").write_text("\n".join([*points, *("vn" + point[1:] for point in points), *corners]) + "\n")
 
 
 @pytest.mark.long
@@ -63,7 +58,5 @@ def test_shaders_show_what_the_model_says(pictures, material, surface):
     lit = (normal[..., 2] > 0.15) & (normal @ LAMP > 0.1)
     expected = in_lamp(MATERIALS[material], SURFACES[surface], normal[lit], LAMP)
     error = np.abs(pictures[f"m_{material}_{surface}"][lit] / expected - 1)
-    assert lit.sum() > 200
-    assert (
-        np.median(error) < 0.015 and np.percentile(error, 95) < 0.06
-    )  # MaterialX fits its albedo E by a rational function
+    assert lit.sum() > 200  # MaterialX fits its albedo E by a rational function
+    assert np.median(error) < 0.015 and np.percentile(error, 95) < 0.06

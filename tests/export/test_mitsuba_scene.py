@@ -1,7 +1,5 @@
 """Exported scenes, rendered by Mitsuba, are the pipeline's own pictures: camera, poses, materials and light."""
 
-from functools import cache
-
 import msgspec
 import numpy as np
 import pytest
@@ -10,15 +8,16 @@ from scipy.ndimage import binary_erosion
 from factorlib.conventions import YUP_FROM_CAMERA
 from factorlib.dataset.schema import LightSlice
 from factorlib.export.environment import mitsuba_map, node_directions, sharpened
-from factorlib.export.mitsuba import Environment, Shape, View, write_scene
+from factorlib.export.mitsuba import write_scene
+from factorlib.export.scene import ExposedMap, Scene, Shape
+from factorlib.geometry.camera import Camera
 from factorlib.images.exr import LAT_LONG, read_exr, write_rgb_exr
 from factorlib.light.lobes import Lobes
 from factorlib.meshes.ply import write_ply
 from factorlib.meshes.read import read_mesh
 from factorlib.reflection.reference import Reference
-from factorlib.render.photo_light import light_of
 from factorlib.render.reflect import Reflector
-from factorlib.render.resynthesis import resynthesised
+from factorlib.render.resynthesis import light_of, resynthesised
 from factorlib.results.materials import Reflectance, read_materials
 from factorlib.tracing.variant import mitsuba
 from tests.export import made_export
@@ -55,10 +54,8 @@ def test_scene_equals_resynthesis(exported, photo):
     light = light_of(out, photo, msgspec.convert(inputs.facts["dataset.light"][photo], LightSlice))
     table = read_materials(out / "materials.json").materials
     pixels = whole_pixels(geometry["label"])
-    reflector = Reflector(Reference(tolerance=1e-3), light)
-    expected = resynthesised(
-        reflector, [table[n] for n in made_export.NAMES], {"label": masks["label"] * pixels}, geometry
-    )
+    reflector, materials = Reflector(Reference(tolerance=1e-3), light), [table[n] for n in made_export.NAMES]
+    expected = resynthesised(reflector, materials, {"label": masks["label"] * pixels}, geometry)
     found = rendered(out / "scenes" / f"{photo}.xml", spp=SPP)
     error = block_means(found, pixels) / block_means(expected, pixels) - 1
     assert len(error) >= 15
@@ -68,37 +65,28 @@ def test_scene_equals_resynthesis(exported, photo):
 
 # one texel, one side ------------------------------------------------------------------------------------------------
 
-SIDES = {
-    "right": (1, 0, 0),
-    "left": (-1, 0, 0),
-    "above": (0, -1, 0),
-    "below": (0, 1, 0),
-    "viewer": (0, 0, -1),
-}  # camera frame
+# in the camera frame
+SIDES = {"right": (1, 0, 0), "left": (-1, 0, 0), "above": (0, -1, 0), "below": (0, 1, 0), "viewer": (0, 0, -1)}
+MATT = Reflectance((0.5, 0.5, 0.5), (0, 0, 0), 0.5)
 
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory):
-    return tmp_path_factory.mktemp("ball")
+    """With a mesh file of a ball."""
+    made = tmp_path_factory.mktemp("ball")
+    made_export.write_obj(made / "ball.obj", (1, 1, 1))
+    write_ply(made / "ball.red.ply", read_mesh(made / "ball.obj", ["red"], "red"))
+    return made
 
 
 def ball_scene(folder, material: Reflectance, lobes: Lobes, two_sided: bool = False, camera_from_light=np.eye(3)):
-    """A ball in front of a square camera, through a scene file and a mesh file."""
-    if not (folder / "ball.red.ply").exists():
-        made_export.write_obj(folder / "ball.obj", (1, 1, 1))
-        mesh = read_mesh(folder / "ball.obj", ["red"], "red")
-        write_ply(folder / "ball.red.ply", mesh)
+    """A ball in front of a square camera, through a scene file."""
     write_rgb_exr(folder / "light.exr", mitsuba_map(lobes, 64, 128), LAT_LONG)
     place = np.eye(4)
     place[2, 3] = 5.0
     shape = Shape("ball", "ball.red.ply", "red", place, two_sided)
-    write_scene(
-        folder / "scene.xml",
-        View(32, 32, 70.0, (16.0, 16.0)),
-        [shape],
-        {"red": material},
-        Environment("light.exr", 1.0, camera_from_light),
-    )
+    light = ExposedMap("light.exr", np.ones(3), camera_from_light)
+    write_scene(folder / "scene.xml", Scene(Camera(32, 32, 70.0, (16.0, 16.0)), [shape], {"red": material}, light))
     return folder / "scene.xml"
 
 
@@ -115,18 +103,14 @@ def centroid(picture: np.ndarray) -> np.ndarray:
 
 @pytest.mark.parametrize("side", SIDES)
 def test_light_of_one_texel_comes_back_from_its_side(folder, side):
-    lambertian = Reflectance((0.5, 0.5, 0.5), (0, 0, 0), 0.5)
-    path = ball_scene(folder, lambertian, one_lobe(SIDES[side]))
+    path = ball_scene(folder, MATT, one_lobe(SIDES[side]))
     np.testing.assert_allclose(np.sign(np.round(centroid(rendered(path, spp=32)), 1)), SIDES[side][:2])
 
 
 def test_light_fixed_to_the_world_turns_with_the_camera(folder):
-    turn = made_export.WORLD_FROM_CAMERA["side"]
-    lambertian = Reflectance((0.5, 0.5, 0.5), (0, 0, 0), 0.5)
-    still = rendered(ball_scene(folder, lambertian, one_lobe((0.6, 0.0, -0.8), 20.0)), spp=64)
-    turned = rendered(
-        ball_scene(folder, lambertian, one_lobe((0.6, 0.0, -0.8), 20.0).turned(turn), camera_from_light=turn.T), spp=64
-    )
+    turn, lobe = made_export.WORLD_FROM_CAMERA["side"], one_lobe((0.6, 0.0, -0.8), 20.0)
+    still = rendered(ball_scene(folder, MATT, lobe), spp=64)
+    turned = rendered(ball_scene(folder, MATT, lobe.turned(turn), camera_from_light=turn.T), spp=64)
     np.testing.assert_allclose(centroid(turned), centroid(still), atol=0.01)
     assert turned.mean() == pytest.approx(still.mean(), rel=0.01)
 
@@ -155,23 +139,18 @@ def test_each_kind_of_material_loads_and_reflects_as_solved(folder, case, two_si
 # the map ---------------------------------------------------------------------------------------------------------------
 
 
-@cache
-def interpolation_nodes(height: int) -> tuple[np.ndarray, np.ndarray]:
-    """Directions and solid angles of the nodes: what a sum over them weighs."""
-    tall = np.pi / (height - 1)
-    theta = np.arange(height) * tall
-    edges = np.cos(np.clip(np.stack([theta - tall / 2, theta + tall / 2]), 0, np.pi))
-    return node_directions(height, 2 * height), (edges[0] - edges[1]) * np.pi / height
-
-
 @pytest.mark.parametrize("sharpness", [0.1, 30.0, 2000.0, 1e5])
 def test_map_for_mitsuba_keeps_energy_and_direction(sharpness):
     axis = np.array([0.48, -0.36, 0.8])
-    lobe = Lobes(axis[None], np.array([sharpness]), np.ones((1, 3)))
-    directions, area = interpolation_nodes(256)
+    lobe, theta, half = (
+        Lobes(axis[None], np.array([sharpness]), np.ones((1, 3))),
+        np.linspace(0, np.pi, 256),
+        np.pi / 510,
+    )
+    area = -np.diff(np.cos(np.clip([theta - half, theta + half], 0, np.pi)), axis=0)[0] * np.pi / 256  # of the nodes
     values = mitsuba_map(lobe, 256, 512)[..., 0] * area[:, None]
     assert values.sum() == pytest.approx(lobe.energy[0], rel=2e-3)
-    mean = np.einsum("hw,hwk->k", values, directions)
+    mean = np.einsum("hw,hwk->k", values, node_directions(256, 512))
     np.testing.assert_allclose(mean / np.linalg.norm(mean), YUP_FROM_CAMERA @ axis, atol=2e-3)
 
 

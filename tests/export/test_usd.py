@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 
 from factorlib.conventions import YUP_FROM_CAMERA, lat_long_directions
-from factorlib.export.blender import ExposedMap
-from factorlib.export.mitsuba import Shape, View
-from factorlib.export.usd import identifiers, scene_text, shader_inputs, write_usd_mesh
+from factorlib.export.scene import ExposedMap, Scene, Shape
+from factorlib.export.usd import identifiers, shader_inputs, write_usd_mesh, write_usd_scene
+from factorlib.geometry.camera import Camera
 from factorlib.images.exr import read_rgb_exr
 from factorlib.meshes.mesh import Mesh
 from factorlib.meshes.ply import submesh
@@ -31,47 +31,40 @@ MISSING = 'OpenUSD is not installed: make setup EXTRAS="interchange"'
 ODD = ["3 chairs", "a-b", "a_b", 'say "hi"\\\n', "стул"]
 
 
-def text_of(objects, materials, file="meshes/a.ply", exposure=(2.0, 1.0, 0.5)) -> str:
-    """A scene in which every object has every material."""
-    place = np.arange(16.0).reshape(4, 4)
-    place[3] = [0, 0, 0, 1]
-    shapes = [Shape(f"{name}.{material}", file, material, place, False) for name in objects for material in materials]
-    light = ExposedMap("../illumination/a.exr", np.array(exposure), np.eye(3))
-    return scene_text(View(64, 48, 100.0, (30.0, 20.0)), shapes, dict.fromkeys(materials, GLOSSY), light)
+@pytest.fixture
+def text_of(tmp_path):
+    """The text of a scene in which every object has every material."""
+
+    def written(objects=("chair",), materials=("red",), file="meshes/a.ply", exposure=(2.0, 1.0, 0.5)) -> str:
+        place = np.arange(16.0).reshape(4, 4)
+        place[3] = [0, 0, 0, 1]
+        shapes = [Shape(f"{name}.{each}", file, each, place, False) for name in objects for each in materials]
+        light = ExposedMap("../illumination/a.exr", np.array(exposure), np.eye(3))
+        scene = Scene(Camera(64, 48, 100.0, (30.0, 20.0)), shapes, dict.fromkeys(materials, GLOSSY), light)
+        write_usd_scene(tmp_path / "scene.usda", scene)
+        return (tmp_path / "scene.usda").read_text()
+
+    return written
 
 
-def test_names_that_are_no_identifiers_are_shown_and_get_one_of_their_own():
+def test_names_that_are_no_identifiers_are_shown_and_get_one_of_their_own(text_of):
     text = text_of(ODD, ["red-1", "red_1", "2"])
     objects = re.findall(r'def Xform "([^"]*)" \(\n +displayName = (.*)\n', text)
     assert [json.loads(shown) for _, shown in objects] == ["a_b", "3 chairs", "a-b", 'say "hi"\\\n', "стул"]
     assert all(re.fullmatch(r"[A-Za-z_]\w*", name, re.ASCII) for name in re.findall(r'def \w+ "([^"\n]*)"', text))
     assert len({name for name, _ in objects}) == len(ODD)
-    assert set(re.findall(r"binding = </scene/materials/(\w+)>", text)) == set(
-        re.findall(r'def Material "(\w+)"', text)
-    )
-
-
-def test_a_name_that_is_an_identifier_is_kept_whatever_stands_before_it():
+    bound = set(re.findall(r"binding = </scene/materials/(\w+)>", text))
+    assert bound == set(re.findall(r'def Material "(\w+)"', text))  # a name that is an identifier is kept
     assert identifiers(["a b", "a-b", "a_b", "a b"]) == {"a_b": "a_b", "a b": "a_b_2", "a-b": "a_b_3"}
 
 
-def test_the_same_scene_is_the_same_text_and_a_file_may_have_the_sign_that_quotes_files():
-    assert text_of(["chair"], ["red"]) == text_of(["chair"], ["red"])
-    assert "references = @./meshes/a.usda@" in text_of(["chair"], ["red"])
-    assert "references = @@@./meshes/a@b.usda@@@" in text_of(["chair"], ["red"], "meshes/a@b.ply")
-
-
-def test_matrices_are_written_for_rows_and_turned_y_up():
+def test_files_are_quoted_matrices_written_for_rows_and_exposure_is_intensity_times_colour(text_of):
+    text, dark = text_of(), text_of(file="meshes/a@b.ply", exposure=(0, 0, 0))
+    assert "references = @./meshes/a.usda@" in text and "references = @@@./meshes/a@b.usda@@@" in dark
     turned = "((0.0, -4.0, -8.0, 0.0), (1.0, -5.0, -9.0, 0.0), (2.0, -6.0, -10.0, 0.0), (3.0, -7.0, -11.0, 1.0))"
-    assert f"matrix4d xformOp:transform = {turned}" in text_of(["chair"], ["red"])
-
-
-def test_exposure_is_intensity_times_colour_and_no_light_has_a_colour_too():
-    assert "inputs:color = (1.0, 0.5, 0.25)" in (text := text_of(["a"], ["red"])) and "inputs:intensity = 2.0" in text
-    assert (
-        "inputs:color = (1.0, 1.0, 1.0)" in (text := text_of(["a"], ["red"], exposure=(0, 0, 0)))
-        and "inputs:intensity = 0.0" in text
-    )
+    assert f"matrix4d xformOp:transform = {turned}" in text
+    assert "inputs:color = (1.0, 0.5, 0.25)" in text and "inputs:intensity = 2.0" in text
+    assert "inputs:color = (1.0, 1.0, 1.0)" in dark and "inputs:intensity = 0.0" in dark
 
 
 @pytest.mark.parametrize("material", [GLOSSY, METAL, LAMBERTIAN], ids=["glossy", "metal", "lambertian"])
@@ -193,14 +186,11 @@ def test_dome_shows_the_light_from_where_it_came(pxr, exported, photo):
     assert dome.GetTextureFormatAttr().Get() == "latlong" and file
     found = read_rgb_exr(file) * dome.GetIntensityAttr().Get() * np.array(dome.GetColorAttr().Get())
     name, world = ("front", np.eye(3)) if photo == "front" else ("room", made_export.WORLD_FROM_CAMERA["side"])
-    light = (
-        read_lobes(exported[1] / "lobes.parquet")[name].scaled(made_export.EXPOSURES[photo][0]).turned(world.T)
-    )  # camera frame
+    light = read_lobes(exported[1] / "lobes.parquet")[name].scaled(made_export.EXPOSURES[photo][0]).turned(world.T)
     directions = lat_long_directions(8, 16).reshape(-1, 3)[16:-16] @ YUP_FROM_CAMERA
     x, y, z = (directions @ YUP_FROM_CAMERA @ world_of(dome.GetPrim())[:3, :3]).T
     rows, columns = (np.pi / 2 - np.arcsin(y)) / np.pi * ROWS, (np.pi - np.arctan2(x, z)) / (2 * np.pi) * 2 * ROWS
     expected = light.radiance(directions)
     assert expected.max() > 3 * np.median(expected)
-    np.testing.assert_allclose(
-        found[rows.astype(int), columns.astype(int)], expected, rtol=0.25, atol=0.01 * expected.max()
-    )
+    texels = found[rows.astype(int), columns.astype(int)]
+    np.testing.assert_allclose(texels, expected, rtol=0.25, atol=0.01 * expected.max())

@@ -16,7 +16,7 @@ from factorlib.checkpoint import Checkpoint
 from factorlib.disk import disk_error
 from factorlib.errors import InputError
 from factorlib.export.gltf import write_glb
-from factorlib.export.materialx import write_materialx
+from factorlib.export.materialx import materialx
 from factorlib.export.usd import write_usd_mesh
 from factorlib.generate.folder import write_codes, write_obj, write_yaml
 from factorlib.images.exr import LAT_LONG, write_exr, write_rgb_exr
@@ -57,7 +57,7 @@ WRITERS = {  # file -> who writes it; what stands after a blank tells those of o
     "a.safetensors": lambda path: write_layers(path, LAYERS),
     "a.pt": lambda path: Checkpoint(path).save({"a": torch.arange(3000.0)}),
     "a.ply": lambda path: write_ply(path, MESH), "a.glb": lambda path: write_glb(path, MESH, ["red", "wood"], GLOSS),
-    "a.mtlx": lambda path: write_materialx(path, GLOSS), "a.usda": lambda path: write_usd_mesh(path, MESH),
+    "a.mtlx": lambda path: write_text(path, materialx(GLOSS)), "a.usda": lambda path: write_usd_mesh(path, MESH),
     "a.obj": lambda path: write_obj(path, {"a": (MESH.vertices, MESH.faces)}),
     "a.yaml": lambda path: write_yaml(path, {"a": list(range(2000))}, "numbers"),
     "a.html": lambda path: write_text(path, "a page " * 500),

@@ -9,7 +9,7 @@ from factorlib.geometry.camera import Camera
 from factorlib.light.lobes import Lobes
 from factorlib.meshes.mesh import Mesh
 from factorlib.render.ground import Plane
-from factorlib.render.insertion import NEW, Backdrop, Ground, Spot, inserted, stood
+from factorlib.render.insertion import NEW, Ground, Spot, inserted, stood
 from factorlib.render.photo_scene import ALL_BOUNCES, PhotoScene, Placed, light_entry, shapes
 from factorlib.results.materials import Reflectance
 from factorlib.tracing.scene import bsdf, rendered, rigid, sensor, transform
@@ -22,33 +22,22 @@ STRIPES = (0.2, 0.5)
 
 
 def light() -> Lobes:
-    axis = np.array([[0.2, -0.95, 0.1], [0.75, -0.6, 0.2]])
-    return Lobes(
-        axis / np.linalg.norm(axis, axis=1, keepdims=True),
-        np.array([1.0, 80.0]),
-        np.array([[0.5, 0.6, 0.8], [20.0, 18.0, 15.0]]),
-    )
+    axis, weight = np.array([[0.2, -0.95, 0.1], [0.75, -0.6, 0.2]]), np.array([[0.5, 0.6, 0.8], [20.0, 18.0, 15.0]])
+    return Lobes(axis / np.linalg.norm(axis, axis=1, keepdims=True), np.array([1.0, 80.0]), weight)
 
 
-def there() -> Placed:
-    matrix = np.eye(4)
-    matrix[:3, 3] = (0.9, 0, -6.5)
-    return Placed("there", sphere(1.0), ("grey",), matrix)
+THERE = Placed("there", sphere(1.0), ("grey",), rigid(np.eye(3), (0.9, 0, -6.5)))
+SCENE = PhotoScene(CAMERA, (THERE,), light(), MATERIALS)
+OPEN = np.zeros((CAMERA.height, CAMERA.width), bool)  # nothing covers the ground
 
 
 def true_photo(objects, samples=1024):
     """Striped ground, which the insertion knows nothing of, beyond the disc too."""
     entries = {"light": light_entry(light()), **shapes(objects, MATERIALS)}
     for k in range(-8, 8):
-        frame = np.eye(4)
-        frame[:3, :3] = np.stack([[0.5, 0, 0], [0, 0, -40.0], [0, 1.0, 0]], axis=1)
-        frame[:3, 3] = (k + 0.5, -1.0, -6)
-        grey = STRIPES[k % 2]
-        entries[f"stripe{k + 8}"] = {
-            "type": "rectangle",
-            "to_world": transform(frame),
-            "bsdf": bsdf(Reflectance((grey,) * 3, (0.0,) * 3, 1.0)),
-        }
+        frame = rigid(np.stack([[0.5, 0, 0], [0, 0, -40.0], [0, 1.0, 0]], axis=1), (k + 0.5, -1.0, -6))
+        stripe = {"type": "rectangle", "to_world": transform(frame)}
+        entries[f"stripe{k + 8}"] = stripe | {"bsdf": bsdf(Reflectance((STRIPES[k % 2],) * 3, (0.0,) * 3, 1.0))}
     return rendered(entries, sensor(CAMERA, rigid(YUP_FROM_CAMERA, np.zeros(3))), samples, 7, ALL_BOUNCES)
 
 
@@ -58,9 +47,8 @@ def new(material="red") -> Placed:
 
 @pytest.fixture(scope="module")
 def made():
-    photo = true_photo([there()])
-    backdrop = Backdrop(PhotoScene(CAMERA, (there(),), light(), MATERIALS), photo, np.zeros(photo.shape[:2], bool))
-    return backdrop, inserted(backdrop, new(), SPOT, Ground(GROUND), 512)
+    photo = true_photo([THERE])
+    return photo, inserted(SCENE, photo, OPEN, new(), SPOT, Ground(GROUND), 512)
 
 
 def blocks(picture):
@@ -69,37 +57,23 @@ def blocks(picture):
 
 def test_the_composite_is_the_photo_of_the_scene_with_the_object(made):
     """Shadow on a ground of unknown texture, the object itself, its light on its neighbour: within the noise and the ground's mean colour."""
-    backdrop, found = made
-    photo = backdrop.photo
-    truth = true_photo([there(), new()])
+    photo, found = made
+    truth = true_photo([THERE, new()])
     error, change = np.abs(blocks(found.composite) - blocks(truth)), np.abs(blocks(photo) - blocks(truth))
     assert error.mean() < 0.08 * change.mean()
     assert np.sqrt((error**2).mean()) < 0.1 * np.sqrt((change**2).mean())
 
-
-def test_what_no_path_joins_to_the_object_stays_as_it_was(made):
-    backdrop, found = made
-    photo = backdrop.photo
-    sky = photo[0]
-    assert np.array_equal(found.composite[0], sky) and (found.shadow[0] == 1).all()
+    assert np.array_equal(found.composite[0], photo[0]) and (found.shadow[0] == 1).all()  # no path joins the sky to it
+    assert STRIPES[0] < found.ground.mean() < STRIPES[1]
 
 
-def test_the_ground_looks_as_in_the_photo(made):
-    """The stripes' reflectances are .2 and .5."""
-    assert 0.2 < made[1].ground.mean() < 0.5
-
-
-def test_twice_the_light_is_twice_the_picture(made):
-    backdrop, found = made
-    brighter = PhotoScene(CAMERA, backdrop.scene.objects, backdrop.scene.light.scaled(2.0), MATERIALS)
-    again = inserted(Backdrop(brighter, 2 * backdrop.photo, backdrop.covered), new(), SPOT, Ground(GROUND), 512)
-    assert np.allclose(again.composite, 2 * found.composite, rtol=1e-4, atol=1e-6)
-
-
-def test_a_polished_ground_shows_the_object_and_only_there(made):
-    backdrop, found = made
+def test_twice_the_light_is_twice_the_picture_and_a_polished_ground_shows_the_object_and_only_there(made):
+    photo, found = made
+    brighter = PhotoScene(CAMERA, (THERE,), light().scaled(2.0), MATERIALS)
     polish = Reflectance((0.0,) * 3, (0.5,) * 3, 0.05)
-    polished, matt = (inserted(backdrop, new(), SPOT, Ground(GROUND, polish=p), 256) for p in (polish, None))
+    matt, polished = (inserted(SCENE, photo, OPEN, new(), SPOT, Ground(GROUND, polish=p), 64) for p in (None, polish))
+    again = inserted(brighter, 2 * photo, OPEN, new(), SPOT, Ground(GROUND), 64)
+    assert np.allclose(again.composite, 2 * matt.composite, rtol=1e-4, atol=1e-6)
     difference = np.abs(polished.composite - matt.composite).max(axis=-1)
     rows, columns = np.nonzero(found.coverage > 0)
     below = difference[rows.max() + 1 : rows.max() + 8, columns.min() : columns.max()]
@@ -109,14 +83,11 @@ def test_a_polished_ground_shows_the_object_and_only_there(made):
 @pytest.mark.parametrize("turn", [0, 180])
 def test_an_open_mesh_is_seen_from_either_side_and_hidden_by_what_stands_before_it(turn):
     """Whatever the objects of the photo are called."""
-    corners = np.array([[-1, 0, 0], [1, 0, 0], [1, 2, 0], [-1, 2, 0]], float)
-    quad = Mesh(
-        corners,
+    corners, faces = (
+        np.array([[-1, 0, 0], [1, 0, 0], [1, 2, 0], [-1, 2, 0]], float),
         np.array([[0, 1, 2], [0, 2, 3]], np.int32),
-        np.tile([0, 0, 1.0], (4, 1)),
-        np.ones(2, np.int16),
-        open=True,
     )
+    quad = Mesh(corners, faces, np.tile([0, 0, 1.0], (4, 1)), np.ones(2, np.int16), open=True)
     seen = []
     for where in (-8.0, -4.0):
         matrix = 0.3 * np.eye(4)
@@ -125,6 +96,5 @@ def test_an_open_mesh_is_seen_from_either_side_and_hidden_by_what_stands_before_
         scene = PhotoScene(CAMERA, (before,), light(), MATERIALS)
         placed = stood(NEW, quad, ("red",), np.array([0, 1.0, 0]), turn, SPOT)
         photo = np.ones((CAMERA.height, CAMERA.width, 3))
-        backdrop = Backdrop(scene, photo, np.zeros(photo.shape[:2], bool))
-        seen.append(inserted(backdrop, placed, SPOT, Ground(GROUND), 16).coverage.sum())
+        seen.append(inserted(scene, photo, OPEN, placed, SPOT, Ground(GROUND), 16).coverage.sum())
     assert seen[0] > 100 and seen[1] < 0.9 * seen[0]

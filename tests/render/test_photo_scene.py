@@ -3,6 +3,7 @@
 import msgspec
 import numpy as np
 import pytest
+import trimesh
 
 from factorlib.errors import InputError
 from factorlib.generate.shapes import sphere
@@ -14,6 +15,7 @@ from factorlib.render.ground import Plane, resting_plane
 from factorlib.render.insertion import spot_at, spot_beside, stood
 from factorlib.render.photo_scene import PhotoScene, Placed, lit_ball, orbit, resized, traced_photo, turned_light
 from factorlib.results.materials import Reflectance
+from factorlib.tracing.scene import rigid
 
 CAMERA = Camera(48, 40, 60.0, (26.0, 18.0))
 MATERIALS = {
@@ -23,23 +25,15 @@ MATERIALS = {
 
 
 def lobes() -> Lobes:
-    axis = np.array([[0.3, -0.9, -0.2], [-0.7, -0.2, -0.6]])
-    return Lobes(
-        axis / np.linalg.norm(axis, axis=1, keepdims=True),
-        np.array([2.0, 20.0]),
-        np.array([[0.5, 0.6, 0.9], [4.0, 3.0, 2.0]]),
-    )
+    axis, weight = np.array([[0.3, -0.9, -0.2], [-0.7, -0.2, -0.6]]), np.array([[0.5, 0.6, 0.9], [4.0, 3.0, 2.0]])
+    return Lobes(axis / np.linalg.norm(axis, axis=1, keepdims=True), np.array([2.0, 20.0]), weight)
 
 
-def placed(name, mesh, where, material="red", rotation=np.eye(3)) -> Placed:
-    matrix = np.eye(4)
-    matrix[:3, :3], matrix[:3, 3] = rotation, where
-    return Placed(name, mesh, (material,), matrix)
+def placed(name, mesh, where, rotation=np.eye(3)) -> Placed:
+    return Placed(name, mesh, ("red",), rigid(rotation, where))
 
 
 def box(width: float, height: float, depth: float) -> Mesh:
-    import trimesh
-
     solid = trimesh.creation.box((width, height, depth))
     faces = np.arange(36, dtype=np.int32).reshape(12, 3)
     return Mesh(solid.triangles.reshape(-1, 3), faces, np.repeat(solid.face_normals, 3, axis=0), np.ones(12, np.int16))
@@ -57,29 +51,26 @@ def differ(a, b):
     return np.abs(means[0] - means[1]).max() / means[0].max()
 
 
-def test_no_turn_is_the_photo_itself(scene):
+def about(axis, degrees):
+    return rotation_of_vector(np.radians(degrees) * np.array(axis, float))
+
+
+def test_the_camera_goes_right_and_up_and_keeps_its_distance_and_no_turn_is_the_photo_itself(scene):
+    moved, near = orbit(scene, 30, 20)[:3, 3], orbit(scene, 0, zoom=2)[:3, 3]
+    far = np.linalg.norm(scene.middle)
+    assert moved[0] > 0 and moved[1] > 0 and np.linalg.norm(moved - scene.middle) == pytest.approx(far)
+    assert np.linalg.norm(near - scene.middle) == pytest.approx(far / 2)
     assert np.allclose(orbit(scene, 0), orbit(scene, 360), atol=1e-9)
     assert np.array_equal(traced_photo(scene, 4), traced_photo(scene, 4, world_from_camera=orbit(scene, 0)))
 
 
-def test_the_camera_goes_right_and_up_and_keeps_its_distance(scene):
-    moved = orbit(scene, 30, 20)[:3, 3]
-    assert moved[0] > 0 and moved[1] > 0
-    assert np.linalg.norm(moved - scene.middle) == pytest.approx(np.linalg.norm(scene.middle))
-    assert np.linalg.norm(orbit(scene, 0, zoom=2)[:3, 3] - scene.middle) == pytest.approx(
-        np.linalg.norm(scene.middle) / 2
-    )
-
-
 def test_turning_camera_objects_and_light_together_changes_nothing(scene):
     """About the upright axis through the camera."""
-    turn = rotation_of_vector(np.radians(50) * np.array([0, 1.0, 0]))
-    whole = np.eye(4)
-    whole[:3, :3] = turn
-    objects = tuple(
+    whole = rigid(about((0, 1, 0), 50), np.zeros(3))
+    objects = [
         msgspec.structs.replace(each, world_from_object=whole @ each.world_from_object) for each in scene.objects
-    )
-    other = msgspec.structs.replace(scene, objects=objects, light=turned_light(scene.light, 50))
+    ]
+    other = msgspec.structs.replace(scene, objects=tuple(objects), light=turned_light(scene.light, 50))
     assert differ(traced_photo(scene, 256), traced_photo(other, 256, world_from_camera=whole @ orbit(scene, 0))) < 0.02
 
 
@@ -104,22 +95,19 @@ def test_a_ball_fills_its_picture():
 
 
 def test_a_box_stands_on_its_largest_side_that_looks_down():
-    tilted = rotation_of_vector(np.radians(25) * np.array([1.0, 0, 0]))
+    tilted = about((1, 0, 0), 25)
     plane = resting_plane(placed("box", box(2, 1, 1.5), (0, 0, -5), rotation=tilted))
     assert np.allclose(plane.normal, tilted @ [0, 1, 0], atol=1e-6)
     assert (plane.point - np.array([0, 0, -5])) @ plane.normal == pytest.approx(-0.5)
 
 
 def test_what_a_steep_photo_leaves_open_other_photos_of_the_object_decide():
-    steep = rotation_of_vector(np.radians(60) * np.array([1.0, 0, 0]))
+    steep = about((1, 0, 0), 60)
     tower = placed("tower", box(1, 4, 1), (0, 0, -9), rotation=steep)
     assert np.allclose(resting_plane(tower).normal, steep @ [0, 0, -1], atol=1e-6)  # as if it lay
-    uprights = np.stack([rotation_of_vector(np.radians(d) * np.array([1.0, 0, 0])).T @ [0, 1, 0] for d in (60, 0, 10)])
+    uprights = np.stack([about((1, 0, 0), degrees).T @ [0, 1, 0] for degrees in (60, 0, 10)])
     assert np.allclose(resting_plane(tower, uprights).normal, steep @ [0, 1, 0], atol=1e-6)
-
-
-def test_an_object_that_stands_on_no_side_is_refused():
-    askew = rotation_of_vector(np.radians(54.7) * np.array([1.0, 0, -1.0]) / 2**0.5)  # a cube on its corner
+    askew = about((2**-0.5, 0, -(2**-0.5)), 54.7)  # a cube on its corner
     with pytest.raises(InputError, match="rests on no side"):
         resting_plane(placed("cube", box(1, 1, 1), (0, 0, -5), rotation=askew))
 

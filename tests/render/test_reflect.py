@@ -1,4 +1,4 @@
-"""Reflectors: the same radiance as quadrature over the exported map, and as the operator without short cuts."""
+"""Reflectors: the same radiance as quadrature over the exported map, and as the operator without short cuts; balls of them."""
 
 import numpy as np
 import pytest
@@ -6,12 +6,13 @@ import torch
 from scipy.spatial.transform import Rotation
 
 from factorlib.conventions import YUP_FROM_CAMERA, lat_long_directions, lat_long_solid_angles
-from factorlib.geometry.sphere import fibonacci_sphere
+from factorlib.geometry.sphere import ball_normals, fibonacci_sphere
 from factorlib.light.latlong import lat_long_of_lobes
 from factorlib.light.lobes import Lobes, no_lobes
 from factorlib.reflection import reflection_operator
 from factorlib.reflection.reference import Reference
 from factorlib.render.reflect import Reflector, Shadows
+from factorlib.render.resynthesis import ball, observed_cells
 from factorlib.results.materials import Reflectance
 
 GLOSSY = Reflectance((0.4, 0.2, 0.1), (0.1, 0.2, 0.3), 0.4)
@@ -23,11 +24,8 @@ def unit(count: int, seed: int) -> np.ndarray:
 
 
 def light(count: int = 5) -> Lobes:
-    return Lobes(
-        unit(count, 0),
-        np.geomspace(1, 150, count),
-        np.random.default_rng(1).uniform(0.2, 2, (count, 3)) * np.geomspace(1, 20, count)[:, None],
-    )
+    weight = np.random.default_rng(1).uniform(0.2, 2, (count, 3)) * np.geomspace(1, 20, count)[:, None]
+    return Lobes(unit(count, 0), np.geomspace(1, 150, count), weight)
 
 
 def points(count: int) -> tuple[np.ndarray, np.ndarray]:
@@ -52,17 +50,14 @@ def by_quadrature(lat_long: np.ndarray, material: Reflectance, normals: np.ndarr
     d = a2 / (np.pi * (nh**2 * (a2 - 1) + 1) ** 2)
     specular = np.where(n @ i.T > 0, d * g1(ni) * g1(no) / (4 * no), 0)
     incoming = lat_long.reshape(-1, 3) * np.repeat(lat_long_solid_angles(height, width), width)[:, None]
-    return np.array(material.diffuse) / np.pi * (np.maximum(n @ i.T, 0) @ incoming) + np.array(material.specular) * (
-        specular @ incoming
-    )
+    diffuse = np.array(material.diffuse) / np.pi * (np.maximum(n @ i.T, 0) @ incoming)
+    return diffuse + np.array(material.specular) * (specular @ incoming)
 
 
 def test_radiance_is_the_integral_over_the_exported_map():
-    normals, views = points(12)
-    found = Reflector(Reference(tolerance=1e-4), light())(GLOSSY, normals, views)
-    np.testing.assert_allclose(
-        found, by_quadrature(lat_long_of_lobes(light(), 128, 256), GLOSSY, normals, views), rtol=2e-3
-    )
+    expected = by_quadrature(lat_long_of_lobes(light(), 128, 256), GLOSSY, *points(12))
+    found = Reflector(Reference(tolerance=1e-4), light())(GLOSSY, *points(12))
+    np.testing.assert_allclose(found, expected, rtol=2e-3)
 
 
 def test_short_cuts_keep_to_the_operator():
@@ -74,17 +69,14 @@ def test_short_cuts_keep_to_the_operator():
     assert np.median(error) < 1e-3 and error.max() < 0.02
 
 
-def test_turning_light_and_object_together_changes_nothing():
+def test_turning_light_and_object_together_changes_nothing_and_scaling_the_light_scales():
     rotation, (normals, views) = Rotation.random(random_state=4).as_matrix(), points(50)
-    operator = reflection_operator("closed_form", dtype="float64")
-    turned = Reflector(operator, light().turned(rotation))(GLOSSY, normals @ rotation.T, views @ rotation.T)
-    np.testing.assert_allclose(turned, Reflector(operator, light())(GLOSSY, normals, views), rtol=1e-6)
-
-
-def test_scaling_a_channel_of_the_light_scales_the_channel():
     operator, factor = reflection_operator("closed_form", dtype="float64"), np.array([2.0, 0.5, 3.0])
-    scaled = Reflector(operator, light().scaled(factor))(GLOSSY, *points(50))
-    np.testing.assert_allclose(scaled, Reflector(operator, light())(GLOSSY, *points(50)) * factor, rtol=1e-9)
+    expected = Reflector(operator, light())(GLOSSY, normals, views)
+    turned = Reflector(operator, light().turned(rotation))(GLOSSY, normals @ rotation.T, views @ rotation.T)
+    np.testing.assert_allclose(turned, expected, rtol=1e-6)
+    scaled = Reflector(operator, light().scaled(factor))(GLOSSY, normals, views)
+    np.testing.assert_allclose(scaled, expected * factor, rtol=1e-9)
 
 
 def test_chunks_do_not_show(monkeypatch):
@@ -96,14 +88,10 @@ def test_chunks_do_not_show(monkeypatch):
     assert seen[0] == (7, 50) and seen[-1] == (50, 50)
 
 
-@pytest.mark.parametrize("dark", [no_lobes(), light().scaled(0.0)])
-def test_darkness_is_black(dark):
-    assert not Reflector(reflection_operator("closed_form"), dark)(GLOSSY, *points(5)).any()
-
-
-def test_surfaces_that_face_away_are_black():
+@pytest.mark.parametrize("lit, facing", [(no_lobes(), 1), (light().scaled(0.0), 1), (light(), -1)])
+def test_darkness_is_black_and_so_is_what_faces_away(lit, facing):
     normals, views = points(20)
-    assert not Reflector(reflection_operator("closed_form"), light())(GLOSSY, normals, -views).any()
+    assert not Reflector(reflection_operator("closed_form"), lit)(GLOSSY, normals, facing * views).any()
 
 
 def test_shadows_that_hide_nothing_change_nothing_and_those_that_hide_all_leave_darkness():
@@ -123,3 +111,22 @@ def test_points_that_share_a_row_of_visibility_are_shadowed_as_with_rows_of_thei
     for rows in (slice(3, 20), np.array([5, 1, 39])):
         np.testing.assert_array_equal(shared.take(rows).visibility, own.take(rows).visibility)
         assert shared.take(rows).which is None
+
+
+@pytest.mark.parametrize(
+    "axis, side", [((1.0, 0.0, -1.0), (0, 1)), ((0.0, -1.0, -1.0), (-1, 0))], ids=["right", "above"]
+)
+def test_light_comes_from_the_side_it_is_on(axis, side):
+    """In the camera's frame, from the viewer's side; the brightest pixel of a ball, from −1 to 1."""
+    lobe = Lobes(np.array([axis]) / np.linalg.norm(axis), np.array([50.0]), np.ones((1, 3)))
+    matt = Reflectance((0.5,) * 3, (0.0,) * 3, 0.5)
+    picture = ball(Reflector(reflection_operator("closed_form"), lobe), matt, 32)[..., 0]
+    at = np.array(np.unravel_index(picture.argmax(), (32, 32))) / 16 - 1
+    assert np.abs(at - 0.7 * np.array(side)).max() < 0.2
+
+
+def test_observed_cells_are_where_the_normals_are_without_holes():
+    normals = ball_normals(20)[0] * (1, -1, -1)  # in the camera's frame
+    right = normals[normals[:, 0] > 0.1]
+    cells = observed_cells(right, 64)
+    assert not cells[:, :32].any() and cells[24:40, 38:60].all() and not observed_cells(right[:0], 64).any()

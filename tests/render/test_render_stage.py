@@ -1,5 +1,6 @@
 """The stage `render`: its files, masks, frames and bytes."""
 
+import msgspec
 import numpy as np
 import pytest
 import torch
@@ -15,17 +16,18 @@ from factorlib.model.interreflection import bounced_light
 from factorlib.reflection import reflection_operator
 from factorlib.results.lobes import write_lobes
 from factorlib.results.materials import read_materials
-from factorlib.stage import Inputs, silent
+from factorlib.stage import silent
 from factorlib.urm.observations import Observations, write_observations
 from stages import render
 from tests.export import made_export
+from tests.export.made_export import instead
 
 FAST = render.Params(operator="closed_form", ball_size=33, map_size=32)
 
 
-@pytest.fixture(scope="module")
-def made(tmp_path_factory):
-    return made_export.make_exported(tmp_path_factory.mktemp("made"))
+@pytest.fixture
+def made():
+    return made_export.shared()[0]
 
 
 def run(made, photo, out):
@@ -35,41 +37,30 @@ def run(made, photo, out):
 
 
 def test_pictures_are_all_there_and_the_same_bytes_again(made, tmp_path):
-    first, second = (
-        {str(p.relative_to(o)): p.read_bytes() for p in o.rglob("*.*")}
-        for o in (run(made, "side", tmp_path / n) for n in "ab")
-    )
-    stems = ["resynthesis/side"] + [
-        f"{kind}/side/{m}" for kind in ("materials", "reflectance_maps") for m in made_export.NAMES
-    ]
-    assert set(first) == {f"{stem}.{suffix}" for stem in stems for suffix in ("exr", "png")}
+    outs = [run(made, "side", tmp_path / name) for name in "ab"]
+    first, second = ({str(p.relative_to(out)): p.read_bytes() for p in out.rglob("*.*")} for out in outs)
+    stems = [f"{kind}/side/{m}" for kind in ("materials", "reflectance_maps") for m in made_export.NAMES]
+    assert set(first) == {f"{stem}.{suffix}" for stem in ["resynthesis/side", *stems] for suffix in ("exr", "png")}
     assert first == second
 
 
 @pytest.mark.parametrize("photo", ["front", "side"])
 def test_ball_is_the_solved_material_in_the_solved_light_at_the_photos_exposure(made, tmp_path, photo):
-    world, light = made_export.WORLD_FROM_CAMERA[photo], made_export.lights()["front" if photo == "front" else "room"]
-    normal = (
-        torch.tensor(FRONT[None]) if world is None else torch.tensor((world @ FRONT)[None])
-    )  # in the light's own frame
-    solved = read_materials(made["solve"] / "materials.json").materials
+    world, light = made_export.WORLD_FROM_CAMERA[photo], made_export.lights()[made_export.LIGHTS[photo]]
+    normal = torch.tensor((FRONT if world is None else world @ FRONT)[None])  # in the light's own frame
+    solved, operator = read_materials(made["solve"] / "materials.json").materials, reflection_operator("closed_form")
     out = run(made, photo, tmp_path / "out")
     for name in made_export.NAMES:
-        expected = (
-            reflection_operator("closed_form")(light, solved[name], normal, normal)[0] * made_export.EXPOSURES[photo][0]
-        )
+        expected = operator(light, solved[name], normal, normal)[0] * made_export.EXPOSURES[photo][0]
         np.testing.assert_allclose(read_rgb_exr(out / "materials" / photo / f"{name}.exr")[16, 16], expected, rtol=2e-3)
 
 
-def test_resynthesis_is_black_outside_the_mask_and_lit_inside(made, tmp_path):
-    picture = read_rgb_exr(run(made, "front", tmp_path / "out") / "resynthesis" / "front.exr")
-    inside = read_exr(made["masks"] / "front.exr")["label"] > 0
+def test_resynthesis_is_lit_inside_the_mask_alone_and_observed_normals_are_those_of_the_photo(made, tmp_path):
+    out = run(made, "front", tmp_path / "out")
+    picture = read_rgb_exr(out / "resynthesis" / "front.exr")
     assert picture.shape == (made_export.HEIGHT, made_export.WIDTH, 3)
-    np.testing.assert_array_equal(picture.max(-1) > 0, inside)
-
-
-def test_observed_normals_are_those_of_the_photo(made, tmp_path):
-    folder = run(made, "front", tmp_path / "out") / "reflectance_maps" / "front"
+    np.testing.assert_array_equal(picture.max(-1) > 0, read_exr(made["masks"] / "front.exr")["label"] > 0)
+    folder = out / "reflectance_maps" / "front"
     disc = np.hypot(*np.meshgrid(*[np.linspace(-1, 1, 32)] * 2)) < 0.9
     assert read_exr(folder / "red.exr")["observed"][disc].mean() > 0.95  # the photo shows a whole ball of it
     assert not read_exr(folder / "brass.exr")["observed"].any()
@@ -77,30 +68,22 @@ def test_observed_normals_are_those_of_the_photo(made, tmp_path):
 
 
 def test_unknown_light_is_black_and_said(made, tmp_path, caplog):
-    lobes = made["export"] / "lobes.parquet"
-    before = lobes.read_bytes()
-    try:
-        write_lobes(lobes, {"front": no_lobes()})
+    with instead(made["export"] / "lobes.parquet", lambda file: write_lobes(file, {"front": no_lobes()})):
         out = run(made, "front", tmp_path / "out")
-    finally:
-        lobes.write_bytes(before)
     assert "nothing is known of its light" in caplog.text
     assert not read_rgb_exr(out / "resynthesis" / "front.exr").any()
 
 
-def test_resynthesis_goes_through_the_photos_tone_curve_and_nothing_else_does(made, tmp_path):
-    straight = run(made, "front", tmp_path / "straight")
+def with_model(made, **model):
     file = made["solve"] / "materials.json"
-    before, solved = file.read_bytes(), read_json(file)
-    try:
-        write_json(
-            file,
-            solved
-            | {"model": {"tone": {"front": {"exponent": 1.5, "pivot": 0.3}, "side": {"exponent": 2.0, "pivot": 1.0}}}},
-        )
+    table = read_json(file) | {"model": model}
+    return instead(file, lambda file: write_json(file, table))
+
+
+def test_resynthesis_goes_through_the_photos_tone_curve_and_nothing_else_does(made, tmp_path):
+    straight, tone = run(made, "front", tmp_path / "straight"), {"side": {"exponent": 2.0, "pivot": 1.0}}
+    with with_model(made, tone=tone | {"front": {"exponent": 1.5, "pivot": 0.3}}):
         curved = run(made, "front", tmp_path / "curved")
-    finally:
-        file.write_bytes(before)
     linear, shown = (read_rgb_exr(of / "resynthesis" / "front.exr") for of in (straight, curved))
     np.testing.assert_allclose(shown, 0.3 * curve(linear / 0.3, 1.5), rtol=1e-4, atol=1e-6)
     other = [p for p in straight.rglob("*.exr") if "resynthesis" not in p.parts]
@@ -109,13 +92,11 @@ def test_resynthesis_goes_through_the_photos_tone_curve_and_nothing_else_does(ma
 
 def test_what_is_hidden_is_lit_by_what_the_photo_shows_there(made, tmp_path):
     """In the gauge of the solve: the factor that `export` took from the reflectances does not weaken it."""
-    label = read_exr(made["masks"] / "front.exr")["label"]
-    y, x = np.nonzero(label > 0)
-    n = len(x)
+    y, x = np.nonzero(read_exr(made["masks"] / "front.exr")["label"] > 0)
+    n, geometry = len(x), read_exr(made["align"] / "front.exr")
     visibility = np.where(fibonacci_sphere(64)[:, 1] > 0, 0, 255).astype(
         np.uint8
     )  # the lower half is hidden, by nothing known
-    geometry = read_exr(made["align"] / "front.exr")
     normal, view = (np.stack([geometry[f"{kind}.{a}"][y, x] for a in "xyz"], axis=-1) for kind in ("normal", "view"))
     seen = Observations(
         normal=normal, view=view, radiance=np.full((n, 3), 0.3), clipped=np.zeros((n, 3), bool), material=np.zeros(n, int),
@@ -124,24 +105,13 @@ def test_what_is_hidden_is_lit_by_what_the_photo_shows_there(made, tmp_path):
     )  # fmt: skip
     (tmp_path / "urm").mkdir()
     write_observations(tmp_path / "urm" / "front.parquet", seen)
-    file, pictures = made["solve"] / "materials.json", {}
-    before, solved = file.read_bytes(), read_json(file)
-    try:
-        for bounces in (True, False):
-            write_json(file, solved | {"model": {"self_shadowing": True, "interreflection": bounces}})
-            of = made_export.of_photo(made, "front")
-            (tmp_path / str(bounces)).mkdir()
-            render.main(
-                FAST,
-                Inputs({**of.folders, "urm": tmp_path / "urm"}, of.facts, of.files, "front"),
-                tmp_path / str(bounces),
-                silent,
-            )
-            pictures[bounces] = read_rgb_exr(tmp_path / str(bounces) / "resynthesis" / "front.exr")[y, x]
-    finally:
-        file.write_bytes(before)
+    pictures, hidden = [], msgspec.structs.replace(made, folders={**made.folders, "urm": tmp_path / "urm"})
+    for bounces in (True, False):
+        with with_model(made, self_shadowing=True, interreflection=bounces):
+            out = run(hidden, "front", tmp_path / str(bounces))
+        pictures.append(read_rgb_exr(out / "resynthesis" / "front.exr")[y, x])
     assert read_materials(made["export"] / "materials.json").gauge.export_factor < 1
     red, sent = made_export.MATERIALS["red"], bounced_light(seen, seen.radiance)
     expected = np.array(red["diffuse"]) * sent[:, :3] + np.array(red["specular"]) * sent[:, 3:]
-    np.testing.assert_allclose(pictures[True] - pictures[False], expected, rtol=1e-3, atol=1e-4)
+    np.testing.assert_allclose(pictures[0] - pictures[1], expected, rtol=1e-3, atol=1e-4)
     assert expected.max() > 0.1

@@ -1,7 +1,5 @@
 """The relighting viewer and the page's controls: what they are handed, and what a browser makes of it."""
 
-from __future__ import annotations
-
 import base64
 import io
 import json
@@ -14,7 +12,7 @@ import pytest
 from PIL import Image
 
 from factorlib.conventions import YUP_FROM_CAMERA, lat_long_solid_angles
-from factorlib.dataset.schema import LightSlice, ObjectsSlice
+from factorlib.dataset.schema import SetSlice
 from factorlib.export.gltf import write_glb
 from factorlib.generate.shapes import sphere
 from factorlib.images.exr import write_rgb_exr
@@ -23,37 +21,23 @@ from factorlib.report import viewer
 from factorlib.report.artifacts import Artifacts
 from factorlib.report.page import forms
 from factorlib.report.pictures import light_row
+from stages import report
 from studies.measured.viewer import CHROMIUM, ball_seen, error, opened, rendered, shown
 from tests.evaluate.made_artifacts import TRUE, lobes_of, perturbed
-from tests.report.test_page import page_of, run
+from tests.report.test_page import LINKED, page_of
 
 SIZE = 64
-needs_chromium = pytest.mark.skipif(
-    CHROMIUM is None, reason="no Chromium on this machine (Debian: apt-get install chromium): no browser opens the page"
-)
+WHY = "no Chromium on this machine (Debian: apt-get install chromium): no browser opens the page"
+needs_chromium = pytest.mark.skipif(CHROMIUM is None, reason=WHY)
 
 
-@pytest.fixture(scope="module")
-def made(tmp_path_factory):
-    folder = tmp_path_factory.mktemp("viewer")
-    inputs, html = run(folder, seen={"day": ["red", "white"], "noon": ["white", "brass"]})
-    return inputs, html, folder / "report" / "index.html"
+def artifacts(inputs) -> Artifacts:
+    return Artifacts(inputs.folders, msgspec.convert(inputs.facts["dataset.set"], SetSlice))
 
 
-def artifacts(inputs) -> tuple[Artifacts, dict, dict]:
-    facts = inputs.facts
-    lights, objects = (
-        msgspec.convert(facts[f"dataset.{n}"], dict[str, k])
-        for n, k in {"light": LightSlice, "objects": ObjectsSlice}.items()
-    )
-    return Artifacts(inputs.folders, msgspec.convert(facts["dataset.set"], Set), None), lights, objects
-
-
-class Set(msgspec.Struct):
-    name: str
-    materials: list[str]
-    meshes: dict
-    photos: list[str]
+def mesh_viewed(inputs) -> dict:
+    lights, objects = (msgspec.convert(inputs.facts[name], dict[str, kind]) for name, kind in report.SLICES.items())
+    return viewer.viewed(artifacts(inputs), lights, objects, dict.fromkeys(LINKED, 1.0))["meshes"][0]
 
 
 # ── What is handed over ──────────────────────────────────────────────────────────────────────────────────────────────
@@ -64,7 +48,7 @@ def numbers(text: str, kind: str, columns: int) -> np.ndarray:
 
 
 def test_meshes_keep_their_shape_and_stand_as_in_the_photo(made):
-    found = viewer.viewed(*artifacts(made[0]), {"day": 1.0, "noon": 1.0})["meshes"][0]
+    found = mesh_viewed(made[1])
     assert (found["name"], found["photo"], found["simplified_from"]) == ("ball", "day", None)
     assert np.allclose(np.reshape(found["rotation"], (3, 3)), YUP_FROM_CAMERA) and np.allclose(found["eye"], [0, 0, 1])
     assert sum(len(numbers(part["triangles"], "<u4", 3)) for part in found["parts"]) == len(sphere().faces)
@@ -86,32 +70,22 @@ def test_lights_are_sharpened_by_what_the_cube_map_widens_them():
 
 def test_large_meshes_are_simplified_and_the_page_says_so(made, tmp_path, monkeypatch):
     monkeypatch.setattr(viewer, "MOST_TRIANGLES", 2000)
-    found = viewer.viewed(*artifacts(made[0]), {"day": 1.0, "noon": 1.0})["meshes"][0]
+    found = mesh_viewed(made[1])
     triangles = sum(len(numbers(part["triangles"], "<u4", 3)) for part in found["parts"])
     assert found["simplified_from"] == len(sphere().faces) and triangles <= 2100
-    assert "is simplified for this page" in page_of(made[0], tmp_path / "simplified")
+    assert "is simplified for this page" in page_of(made[1], tmp_path / "simplified")
 
 
 def test_a_name_cannot_end_the_script(made, tmp_path):
     evil = "</script><script>alert(1)</script>"
-    inputs = made[0]
-    text = (inputs["export"] / "materials.json").read_text()
-    (tmp_path / "export").mkdir()
-    for file in inputs["export"].iterdir():
-        if file.is_file():
-            (tmp_path / "export" / file.name).write_bytes(file.read_bytes())
-    (tmp_path / "export" / "materials.json").write_text(text.replace('"red"', json.dumps(evil)))
-    solved = tmp_path / "solve"
-    solved.mkdir()
-    for file in inputs["solve"].iterdir():
-        (solved / file.name).write_bytes(file.read_bytes().replace(b'"red"', json.dumps(evil).encode()))
-    facts = {**inputs.facts, "dataset.set": {**inputs.facts["dataset.set"], "materials": ["brass", evil, "white"]}}
-    names = ["brass", evil, "white"]
+    inputs, names, folders = made[1], ["brass", evil, "white"], {}
+    for stage in ("export", "solve"):
+        folders[stage] = shutil.copytree(inputs[stage], tmp_path / stage)
+        table = folders[stage] / "materials.json"
+        table.write_text(table.read_text().replace('"red"', json.dumps(evil)))
+    facts = {**inputs.facts, "dataset.set": {**inputs.facts["dataset.set"], "materials": names}}
     write_glb(tmp_path / "export" / "ball.glb", sphere(0.5), names, dict.fromkeys(names, TRUE["red"]))
-    renamed = msgspec.structs.replace(
-        inputs, folders=inputs.folders | {"export": tmp_path / "export", "solve": solved}, facts=facts
-    )
-    html = page_of(renamed, tmp_path / "report")
+    html = page_of(msgspec.structs.replace(inputs, folders=inputs.folders | folders, facts=facts), tmp_path / "report")
     assert html.count("<script") == 2 and "alert(1)</" not in html
     data = re.search(r'id="viewer-data">(.*?)</script>', html, re.DOTALL).group(1)
     assert evil in json.loads(data)["materials"]
@@ -122,10 +96,8 @@ def test_forms_hold_the_numbers():
     found = forms("brass", material)
     assert json.loads(found["numbers"])["brass"]["roughness"] == 0.25
     assert json.loads(found["glTF"])["pbrMetallicRoughness"]["roughnessFactor"] == 0.25
-    assert (
-        found["Mitsuba"].startswith('<bsdf type="blendbsdf" id="brass">')
-        and "MeshPhysicalMaterial" in found["three.js"]
-    )
+    assert found["Mitsuba"].startswith('<bsdf type="blendbsdf" id="brass">')
+    assert "MeshPhysicalMaterial" in found["three.js"]
     compile(found["Blender"], "console", "exec")
     assert "0.05, 0.04, 0.02, 1" in found["Blender"] and 'name="m_brass"' in found["MaterialX"]
 
@@ -136,9 +108,8 @@ def test_forms_hold_the_numbers():
 @pytest.fixture(scope="module")
 def browser(made):
     """Not across processes: Playwright's loop lives in this one."""
-    with opened(
-        made[2], viewport={"width": 1440, "height": 900}, permissions=["clipboard-read", "clipboard-write"]
-    ) as (page, complaints):
+    size, allowed = {"width": 1440, "height": 900}, ["clipboard-read", "clipboard-write"]
+    with opened(made[0] / "report" / "index.html", viewport=size, permissions=allowed) as (page, complaints):
         page.evaluate(f"viewer.canvas.style.width = '{SIZE}px'")  # software draws slowly
         yield page, complaints
 
@@ -174,25 +145,22 @@ def test_controls_work_by_mouse_and_keys(browser):
     page.select_option("[data-control=object]", label="a ball")
     page.select_option("[data-control=material]", label="brass")
     page.select_option("[data-control=light]", label="noon")
-    page.wait_for_function(
-        "document.querySelector('#viewer canvas').ariaLabel.startsWith('ball of brass in the light of noon')"
-    )
+    label = "document.querySelector('#viewer canvas').ariaLabel"
+    page.wait_for_function(f"{label}.startsWith('ball of brass in the light of noon')")
     page.focus("#viewer canvas")
     page.keyboard.press("ArrowRight")
     page.keyboard.press("ArrowUp")
-    page.wait_for_function(
-        "document.querySelector('#viewer canvas').ariaLabel.includes('from 5° to the right and 5° above')"
-    )
+    page.wait_for_function(f"{label}.includes('from 5° to the right and 5° above')")
     box = page.locator("#viewer canvas").bounding_box()
     page.mouse.move(box["x"] + 20, box["y"] + 20)
     page.mouse.down()
     page.mouse.move(box["x"] + 30, box["y"] + 20, steps=3)
     page.mouse.up()
-    page.wait_for_function("!document.querySelector('#viewer canvas').ariaLabel.includes('from 5°')")
+    page.wait_for_function(f"!{label}.includes('from 5°')")
     page.fill("[data-control=turn]", "90")
-    page.wait_for_function("document.querySelector('#viewer canvas').ariaLabel.endsWith('turned by 90°')")
+    page.wait_for_function(f"{label}.endsWith('turned by 90°')")
     page.click("[data-control=reset]")
-    page.wait_for_function("document.querySelector('#viewer canvas').ariaLabel.endsWith('turned by 0°')")
+    page.wait_for_function(f"{label}.endsWith('turned by 0°')")
     assert "from 0° to the right" in page.get_attribute("#viewer canvas", "aria-label")
 
 
@@ -212,19 +180,15 @@ def test_the_picture_on_the_screen_is_the_radiance_exposed(browser):
 
 
 @needs_chromium
-def test_the_photo_is_laid_over_its_resynthesis_from_the_left(browser):
+def test_other_controls_of_the_page(browser):
+    """The photo over its re-synthesis from the left; maps exposed anew; a material's numbers copied."""
     page, _ = browser
     slider = page.locator(".panels input[type=range]").first
     assert "day" in slider.get_attribute("aria-label")
     slider.fill("40")
     assert page.locator(".cut img + img").first.evaluate("(e) => e.style.clipPath") == "inset(0px 60% 0px 0px)"
-
-
-@needs_chromium
-def test_maps_are_exposed_anew(browser):
-    page, _ = browser
     page.fill("#maps-stops", "-3")
-    page.wait_for_function("document.querySelectorAll('.map canvas').length === 2")
+    page.wait_for_function("document.querySelectorAll('.map canvas').length === 3")
 
     def mean() -> float:
         page.wait_for_timeout(500)
@@ -233,28 +197,17 @@ def test_maps_are_exposed_anew(browser):
     dark = mean()
     page.fill("#maps-stops", "0")
     assert mean() > dark + 5
-
-
-@needs_chromium
-def test_a_materials_numbers_are_copied(browser):
-    page, _ = browser
     page.click('button[aria-label="copy brass as glTF"]')
     page.wait_for_function("document.getElementById('copied').textContent === 'Copied brass as glTF.'")
     assert json.loads(page.evaluate("navigator.clipboard.readText()"))["name"] == "brass"
-
-
-@needs_chromium
-def test_the_browser_has_nothing_to_complain_of(browser):
-    """Last: after everything above."""
-    assert browser[1] == []
+    assert browser[1] == []  # last, after everything above
 
 
 @needs_chromium
 @pytest.mark.parametrize("scheme", ["light", "dark"])
 def test_a_phone_needs_no_scrolling_sideways(made, scheme):
-    with opened(
-        made[2], viewport={"width": 390, "height": 844}, color_scheme=scheme, has_touch=True, is_mobile=True
-    ) as (page, complaints):
+    phone = {"viewport": {"width": 390, "height": 844}, "has_touch": True, "is_mobile": True}
+    with opened(made[0] / "report" / "index.html", color_scheme=scheme, **phone) as (page, complaints):
         page.evaluate("viewer.canvas.scrollIntoView()")
         page.wait_for_function("viewer.pass > 0", timeout=120000)
         assert page.evaluate("document.documentElement.scrollWidth") <= 390
@@ -263,8 +216,7 @@ def test_a_phone_needs_no_scrolling_sideways(made, scheme):
 
 @needs_chromium
 def test_without_webgl_it_says_so(made, tmp_path):
-    text = made[2].read_text()
-    (tmp_path / "index.html").write_text(text.replace('canvas.getContext("webgl2"', 'null && ("webgl2"'))
+    (tmp_path / "index.html").write_text(made[2].replace('canvas.getContext("webgl2"', 'null && ("webgl2"'))
     with opened(tmp_path / "index.html") as (page, complaints):
         assert "this browser offers no WebGL 2" in page.inner_text("#viewer-missing")
         assert not page.is_visible("#viewer") and complaints == []
@@ -272,16 +224,14 @@ def test_without_webgl_it_says_so(made, tmp_path):
 
 def test_what_is_known_of_a_lamp_is_measured_by_the_lamp(made, tmp_path):
     """An error of twice the mean radiance is small where the light is brighter than that."""
-    run_, _, _ = artifacts(made[0])
-    shutil.copytree(made[0]["export"], tmp_path / "export")
-    run_ = msgspec.structs.replace(run_, folders={**run_.folders, "export": tmp_path / "export"})
-    light = run_.rgb("export", "illumination/day")
-    (tmp_path / "export" / "coverage").mkdir()
+    run = artifacts(made[1])
+    export = shutil.copytree(made[1]["export"], tmp_path / "export")
+    run = msgspec.structs.replace(run, folders={**run.folders, "export": export})
+    light = run.rgb("export", "illumination/day")
+    (export / "coverage").mkdir()
     write_rgb_exr(tmp_path / "export" / "coverage" / "day.exr", np.full_like(light, 2.0))
     area = lat_long_solid_angles(*light.shape[:2])[:, None] * np.ones(light.shape[1])
     grey = light.mean(axis=-1)
     bright = grey > 2 * (grey * area).sum() / (4 * np.pi)
-    assert (
-        light_row(run_, "day", ["day"], None)["known"] == pytest.approx((bright * area).sum() / (4 * np.pi), abs=1e-3)
-        and bright.any()
-    )
+    known = light_row(run, "day", ["day"], None)["known"]
+    assert known == pytest.approx((bright * area).sum() / (4 * np.pi), abs=1e-3) and bright.any()

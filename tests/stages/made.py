@@ -1,7 +1,5 @@
 """What `masks` and a data set hand to the stages after them, of photos of one chair, for tests."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

@@ -1,7 +1,5 @@
 """The align stage from masks and dataset slices to its files."""
 
-from __future__ import annotations
-
 import json
 import logging
 import warnings

@@ -1,7 +1,5 @@
 """The fit_mesh stage from masks and poses to factors, and what align, urm and export make of them."""
 
-from __future__ import annotations
-
 import json
 
 import msgspec

@@ -1,7 +1,5 @@
 """A scene whose cameras stand in a COLMAP model, a transforms.json or a BOP scene, through `masks` and `align`."""
 
-from __future__ import annotations
-
 import json
 import logging
 

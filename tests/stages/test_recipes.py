@@ -18,9 +18,9 @@ from tests.export import made_export
 ERROR = StandardErrors((0.0,) * 3, (0.0,) * 3, 0.0)
 
 
-@pytest.fixture(scope="module")
-def made(tmp_path_factory):
-    return made_export.make_exported(tmp_path_factory.mktemp("made"))
+@pytest.fixture
+def made():
+    return made_export.shared()[0]
 
 
 def changed(made, fact, value):
@@ -35,6 +35,7 @@ def drawn(made, out, recipe, **files):
     return {str(path.relative_to(out)): path.read_bytes() for path in sorted(out.rglob("*")) if path.is_file()}
 
 
+GROUND = {"ground": {"point": [0, 1.2, 4], "normal": [0, -1, -0.2], "diffuse": None}}
 PICTURES = {"front": ["front.exr", "front.png"], "side": ["side.exr", "side.png"]}
 FRONT = {"photos": ["front"], "samples": 1}
 KINDS = [
@@ -42,8 +43,7 @@ KINDS = [
     (schema.View(photos=["side"], samples=1, width=32, background="light"), PICTURES["side"]),
     (schema.Turntable(**FRONT, frames=3), ["front.gif", *(f"front/00{k}.png" for k in range(3))]),
     (schema.MovingLight(**FRONT, frames=2, width=16), ["front.gif", "front/000.png", "front/001.png"]),
-    (schema.Relight(samples=1, rotate=30.0), [*(f"front/{name}" for name in PICTURES["side"]),
-    *(f"side/{name}" for name in PICTURES["front"])]),
+    (schema.Relight(samples=1, rotate=30.0, photos=["side"]), [f"side/{name}" for name in PICTURES["front"]]),
     (schema.Transfer(materials={"red": "unseen"}, **FRONT), PICTURES["front"]),
     (schema.Insert(**FRONT), PICTURES["front"]),
     (schema.Insert(**FRONT, mesh="egg", material="brass", at=(40.0, 50.0)), PICTURES["front"]),
@@ -53,8 +53,7 @@ KINDS = [
 
 @pytest.mark.parametrize("recipe, files", KINDS, ids=lambda value: type(value).__name__)
 def test_files_of_every_kind_and_the_same_bytes_again(made, tmp_path, recipe, files):
-    ground = {"ground": {"point": [0, 1.2, 4], "normal": [0, -1, -0.2], "diffuse": None}}
-    made = changed(made, "dataset.ground", dict.fromkeys(made_export.MESHES, ground))
+    made = changed(made, "dataset.ground", dict.fromkeys(made_export.MESHES, GROUND))
     first, second = (drawn(made, tmp_path / name, recipe) for name in "ab")
     assert sorted(first) == sorted(files) and first == second
 
@@ -119,15 +118,17 @@ def test_a_photo_without_objects_is_refused_or_left_out_with_a_warning_where_nob
 
 
 def test_nothing_is_put_on_a_ground_that_is_seen_from_below(made, tmp_path):
-    below = {
-        **made.facts["dataset.ground"],
-        "front": {"ground": {"point": [0, -1, 4], "normal": [0, -1, 0]}},
-    }  # y is down
+    above = {"ground": {"point": [0, -1, 4], "normal": [0, -1, 0]}}  # y is down
+    below = {**made.facts["dataset.ground"], "front": above}
     with pytest.raises(InputError, match="'front' was taken from below"):
         drawn(changed(made, "dataset.ground", below), tmp_path / "out", schema.Insert(photos=["front"], samples=1))
 
 
-def test_a_mesh_without_height_is_refused(made, tmp_path):
+def test_a_mesh_without_height_or_that_is_not_there_is_refused(made, tmp_path):
+    made = changed(made, "dataset.ground", dict.fromkeys(made_export.MESHES, GROUND))
+    with pytest.raises(InputError, match="there is no mesh 'egf'") as error:
+        drawn(made, tmp_path / "none", schema.Insert(photos=["front"], mesh="egf", samples=1))
+    assert error.value.cure == "did you mean 'egg'?" and error.value.key == "mesh"
     (tmp_path / "flat.obj").write_text("v 0 0 0\nv 1 0 0\nv 1 0 1\nv 0 0 1\nf 1 2 3 4\n")
     recipe = schema.Insert(photos=["front"], mesh="flat.obj", samples=1)
     with pytest.raises(InputError, match="'flat.obj' has no height") as error:

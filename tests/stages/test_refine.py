@@ -1,7 +1,5 @@
 """The refine stage from masks, poses and a solve to poses.json, and what align makes of that."""
 
-from __future__ import annotations
-
 import json
 
 import msgspec

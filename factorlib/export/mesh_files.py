@@ -1,0 +1,41 @@
+"""The mesh files that scenes refer to: PLY and OpenUSD, a file for each part of one material."""
+
+from collections.abc import Mapping
+from pathlib import Path
+
+import numpy as np
+
+from factorlib.dataset import schema
+from factorlib.dataset.schema import MeshEntry
+from factorlib.export.scene import Shape
+from factorlib.export.usd import SUFFIX, write_usd_mesh
+from factorlib.meshes.ply import submesh, write_ply
+from factorlib.meshes.read import MeshesOnce
+from factorlib.results.poses import ObjectEntry
+from factorlib.stage import Inputs
+
+
+class MeshFiles:
+    """Meshes read once and written once, split by material, per choice of materials for their parts."""
+
+    def __init__(self, inputs: Inputs, scenes: Path, materials: list[str], crease_deg: float):
+        self.scenes, self.materials = scenes, materials
+        self.read = MeshesOnce(inputs.file, materials, crease_deg)
+        self._stems: dict[tuple, str] = {}  # what files are called before the material, relative to the scenes
+
+    def shapes(
+        self, obj: schema.ObjectEntry, meshes: Mapping[str, MeshEntry], poses: Mapping[str, ObjectEntry]
+    ) -> list[Shape]:
+        """One per material of the object; a second choice of materials is in files called <mesh>.2."""
+        mesh, pose, place = self.read.mesh(obj.mesh, meshes[obj.mesh], obj.materials), poses[obj.name], np.eye(4)
+        place[:3, :3], place[:3, 3] = np.array(pose.rotation) * pose.scale, pose.translation
+        names = {label: self.materials[label - 1] for label in mesh.labels}
+        key = (obj.mesh, *sorted(obj.materials.items()))
+        if key not in self._stems:
+            number = 1 + sum(other[0] == obj.mesh for other in self._stems)
+            self._stems[key] = f"meshes/{obj.mesh}" + (f".{number}" if number > 1 else "")
+            for label, name in names.items():
+                part, file = submesh(mesh, label), self.scenes / f"{self._stems[key]}.{name}"
+                write_ply(f"{file}.ply", part)
+                write_usd_mesh(f"{file}{SUFFIX}", part)
+        return [Shape(f"{obj.name}.{m}", f"{self._stems[key]}.{m}.ply", m, place, mesh.open) for m in names.values()]

@@ -1,0 +1,238 @@
+"""Errors of poses, normals, materials, lights, pictures and re-syntheses: by hand, blind to what the gauge allows, beside their nulls."""
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from factorlib.conventions import lat_long_directions
+from factorlib.dataset.schema import Pose
+from factorlib.evaluate.ball import light_of_lat_long
+from factorlib.evaluate.geometry import RANDOM_ROTATION_DEG, averaged_normals, normal_error, pose_error
+from factorlib.evaluate.lights import compare_lights, light_error, mirrored_directions, rgb_angle
+from factorlib.evaluate.materials import compare_materials
+from factorlib.evaluate.picture import WINDOW, picture_error, picture_errors, psnr, ssim_map, tone_mapped, white_of
+from factorlib.evaluate.resynthesis import compare_photos, flat_materials, shot_of
+from factorlib.results.materials import Reflectance
+from tests.evaluate.made_artifacts import TRUE, light_map, perturbed, scaled
+
+# ── poses and normals ────────────────────────────────────────────────────────────────────────────────────────────────
+
+
+@pytest.mark.parametrize("degrees", [0, 1e-3, 30, 90, 179])
+def test_the_error_of_a_pose_is_its_turn_and_its_shift_over_the_true_distance(degrees):
+    base = Rotation.random(rng=np.random.default_rng(0)).as_matrix()
+    turn = Rotation.from_rotvec(np.radians(degrees) * np.array([0.6, 0.0, 0.8])).as_matrix()
+    error = pose_error(Pose(turn @ base, (0, 0, 4.4)), Pose(base, (0, 0, 4.0)))
+    assert error.rotation_deg == pytest.approx(degrees, abs=1e-5) and error.translation_relative == pytest.approx(0.1)
+
+
+def test_random_rotations_are_as_far_as_the_null_says():
+    turns = Rotation.random(20000, rng=np.random.default_rng(1))
+    assert np.degrees(turns.magnitude()).mean() == pytest.approx(RANDOM_ROTATION_DEG, abs=0.6)
+
+
+def test_normals_by_hand_and_only_where_both_are_known():
+    truth = np.zeros((2, 2, 3))
+    truth[..., 2] = -1.0
+    estimate = truth.copy()
+    estimate[0, 0], estimate[1, 1] = [0.0, np.sin(0.1), -np.cos(0.1)], 0.0
+    found = normal_error(estimate, truth, np.ones((2, 2), bool))
+    assert found.pixels == 3 and found.estimate.median_deg == 0
+    assert found.estimate.p90_deg == pytest.approx(0.8 * np.degrees(0.1))  # linear between the 2nd and the 3rd of three
+    assert normal_error(estimate * 0, truth, np.ones((2, 2), bool)) is None
+
+
+def test_true_normals_are_averaged_as_the_photo_was():
+    normal = np.zeros((5, 8, 3))
+    normal[:, :5] = [0.0, 0.0, -1.0]
+    normal[0, 0], normal[1, 0] = [0.6, 0.0, -0.8], [-0.6, 0.0, -0.8]
+    small = averaged_normals(normal, 2)
+    assert small.shape == (2, 4, 3) and (small[:, 3] == 0).all()  # half of a box is enough
+    np.testing.assert_allclose(small[:, :3], np.broadcast_to([0, 0, -1], (2, 3, 3)), atol=1e-12)
+    assert averaged_normals(normal, 1) is normal
+
+
+# ── materials ────────────────────────────────────────────────────────────────────────────────────────────────────────
+
+ONE = dict.fromkeys(TRUE, 0)
+
+
+def test_a_factor_per_channel_and_component_is_no_error():
+    found = compare_materials({n: scaled(m, (2.0, 0.5, 3.0)) for n, m in TRUE.items()}, TRUE, ONE)
+    assert found.factor["0"] == pytest.approx((0.5, 2.0, 1 / 3))
+    assert found.worst_diffuse == pytest.approx(0, abs=1e-12) and found.worst_specular == pytest.approx(0, abs=1e-12)
+    component = {"red": 0, "white": 0, "brass": 1, "black": 1}
+    estimates = {n: scaled(m, 1.0 + component[n]) for n, m in TRUE.items()}
+    assert compare_materials(estimates, TRUE, component).worst_diffuse == pytest.approx(0, abs=1e-12)
+    assert compare_materials(estimates, TRUE, ONE).worst_diffuse > 0.2
+
+
+def test_errors_are_the_perturbation_and_the_null_is_what_a_grey_ball_would_score():
+    found = compare_materials({n: perturbed(m, 1.0) for n, m in TRUE.items()}, TRUE, ONE)
+    # diffuse ×1.04, specular ×0.95: the common factor cannot take away the ratio 1.04 / 0.95
+    red = found.materials["red"].error
+    assert red.roughness == pytest.approx(0.02) and found.mean_diffuse < found.null_mean_diffuse
+    assert (1 + red.diffuse[0]) / (1 + red.specular[0]) == pytest.approx(1.04 / 0.95)
+    null = compare_materials(TRUE, TRUE, ONE).materials["black"].null
+    # red channel: true diffuse + specular .56 .65 .55 .06, grey's .55: the median ratio is .555 / .55
+    assert null.roughness == pytest.approx(0.3) and null.diffuse[0] == pytest.approx((0.5 * 0.555 / 0.55 - 0.02) / 0.02)
+    assert null.specular[0] == pytest.approx((0.05 * 0.555 / 0.55 - 0.04) / 0.04)
+
+
+def test_unseen_and_untold_materials_are_left_out_and_black_has_no_infinite_error():
+    assert set(compare_materials(TRUE, TRUE, {"red": 0}).materials) == {"red"} and not compare_materials(TRUE, {}, ONE)
+    estimate, truth = (Reflectance((0.5,) * 3, (specular, 0.0, 0.0), 0.5) for specular in (0.005, 0.0))
+    found = compare_materials({"chalk": estimate}, {"chalk": truth}, {"chalk": 0})
+    assert found.materials["chalk"].error.specular[0] == pytest.approx(0.5, rel=0.3)
+
+
+# ── lights ───────────────────────────────────────────────────────────────────────────────────────────────────────────
+
+MAPS = {"a": light_map(1), "b": light_map(2)}
+TRUTHS = {name: light_of_lat_long(value) for name, value in MAPS.items()}
+HALF = lat_long_directions(32, 64)[..., 1] > 0
+FRONT = np.array([[0.0, 0.0, -1.0]])
+
+
+def compared(transform, mirrored=None):
+    estimates = {name: light_of_lat_long(transform(name, value)) for name, value in MAPS.items()}
+    return compare_lights(estimates, TRUTHS, mirrored or {})
+
+
+def test_the_true_light_is_perfect_and_the_null_is_not():
+    every = [scored for views in compared(lambda n, v: v).mean.values() for scored in views.values()]
+    assert max(scored.estimate.rmse for scored in every) < 1e-6 and min(scored.null.rmse for scored in every) > 0.1
+
+
+def test_gauges_forgive_what_they_name():
+    tinted = compared(lambda n, v: v * ([2.0, 1.0, 0.5] if n == "a" else [1.0, 1.0, 1.0])).mean
+    assert tinted["none"]["mirror"].estimate.rmse > 0.2
+    assert tinted["scalar_per_set"]["mirror"].estimate.rmse > 0.1
+    assert tinted["channel_per_photo"]["mirror"].estimate.rmse < 1e-6
+    assert compared(lambda n, v: 3 * v).mean["scalar_per_set"]["mirror"].estimate.rmse < 1e-6
+
+
+def test_an_error_in_the_unseen_half_shows_there_only():
+    mirrored = {name: HALF for name in MAPS}
+    found = compared(lambda n, v: np.where(HALF[..., None], v, 0.0), mirrored).mean["none"]
+    assert found["map_unmirrored"].estimate.rmse > 0.5 > 0.1 > found["map_mirrored"].estimate.rmse
+    assert compared(lambda n, v: v, mirrored).mirrored_fraction["a"] == pytest.approx(0.5, abs=0.05)
+
+
+def test_light_error_by_hand_and_of_black():
+    truth, turned = np.array([[1.0, 0, 0], [1.0, 0, 0]]), np.array([[0, 1.0, 0], [1.0, 0, 0]])
+    assert rgb_angle(turned, truth) == pytest.approx(45)
+    assert light_error(0.5 * truth, truth).rmse == pytest.approx(0.5)
+    assert light_error(0.5 * truth, truth).rmse_scale_invariant == pytest.approx(0)
+    scored = compared(lambda n, v: 0 * v).mean["channel_per_photo"]["mirror"].estimate
+    assert (scored.rmse, scored.rgb_angle_deg) == (pytest.approx(1), 90)
+
+
+def test_a_facing_normal_mirrors_the_viewer_in_the_lights_own_frame():
+    quarter = np.array([[0.0, 0, -1], [0, 1, 0], [1, 0, 0]])  # takes the camera's −z (the viewer) to the world's +x
+    for frame, toward in ((np.eye(3), [0, 0, 1]), (quarter, [1, 0, 0])):
+        mask, beside = mirrored_directions(FRONT, FRONT, frame), lat_long_directions(32, 64) @ toward > 0.997
+        assert beside.sum() == 4 and mask[beside].all() and mask.mean() < 0.01
+
+
+# ── pictures ─────────────────────────────────────────────────────────────────────────────────────────────────────────
+
+
+@pytest.fixture
+def pictures():
+    rng = np.random.default_rng(1)
+    truth = rng.uniform(0, 1, (30, 40, 3))
+    return truth, np.clip(truth + rng.normal(0, 0.05, truth.shape), 0, 1)
+
+
+def test_psnr_and_dssim_by_hand(pictures):
+    # an error of 0.1 everywhere against a peak of 1 is 10 log10(1 / 0.01) = 20 dB; of peak 10: 40 dB
+    truth, whole = np.ones((7, 3)), np.ones((30, 40), bool)
+    assert psnr(truth - 0.1, truth, 1.0) == pytest.approx(20) and psnr(truth - 0.1, truth, 10.0) == pytest.approx(40)
+    # black against white: both variances are 0, so SSIM = C1 / (1 + C1) = 1e-4 / 1.0001, and DSSIM is 0.49995
+    black = np.zeros((30, 40, 3))
+    assert picture_error(black, black + 1, whole, 1.0).dssim == pytest.approx(0.49995, abs=1e-5)
+    error = picture_error(pictures[0], pictures[0], whole, 1.0)
+    assert error.psnr_linear_db == error.psnr_tonemapped_db == 120.0 and error.dssim == pytest.approx(0, abs=1e-6)
+    assert white_of(black, whole) == 1.0 and np.isfinite(tone_mapped(black, 1.0)).all()
+
+
+def test_ssim_is_its_definition_where_the_window_is_whole(pictures):
+    y, x, c = 15, 20, 1
+    weight = np.outer(WINDOW, WINDOW)
+    pa, pb = (p[y - 5 : y + 6, x - 5 : x + 6, c] for p in pictures)
+    ma, mb = (weight * pa).sum(), (weight * pb).sum()
+    va, vb = (weight * (pa - ma) ** 2).sum(), (weight * (pb - mb) ** 2).sum()
+    cov = (weight * (pa - ma) * (pb - mb)).sum()
+    expected = (2 * ma * mb + 1e-4) * (2 * cov + 9e-4) / ((ma**2 + mb**2 + 1e-4) * (va + vb + 9e-4))
+    grey = [np.repeat(p[..., c : c + 1], 3, -1) for p in pictures]
+    assert ssim_map(*grey, np.ones((30, 40), bool))[y, x] == pytest.approx(expected, rel=1e-4)
+
+
+def test_only_the_mask_counts_and_not_the_unit(pictures):
+    truth, estimate = pictures
+    mask = np.zeros(truth.shape[:2], bool)
+    mask[5:20, 8:30] = True
+    elsewhere = np.where(mask[..., None], estimate, 37.0)
+    assert picture_error(elsewhere, truth, mask, 1.0) == picture_error(estimate, truth, mask, 1.0)
+    a, b = (picture_error(estimate * k, truth * k, mask, white_of(truth * k, mask)) for k in (1, 8))
+    assert a.psnr_linear_db == pytest.approx(b.psnr_linear_db) and a.dssim == pytest.approx(b.dssim, abs=1e-6)
+
+
+def test_regions_are_scored_apart_and_empty_ones_left_out(pictures):
+    truth, estimate = pictures
+    left = np.zeros(truth.shape[:2], bool)
+    left[:, :20] = True
+    estimate = np.where(left[..., None], truth, estimate)
+    found = picture_errors(estimate, truth, {"left": left, "right": ~left, "none": left & ~left}, 1.0)
+    assert set(found) == {"left", "right"} and found["left"].psnr_linear_db == 120 > found["right"].psnr_linear_db
+
+
+# ── re-synthesis ─────────────────────────────────────────────────────────────────────────────────────────────────────
+
+
+@pytest.fixture
+def channels():
+    """Two materials side by side, every normal facing the camera; and the photo's radiance."""
+    one, none, radiance = np.ones((20, 30)), np.zeros((20, 30)), np.random.default_rng(5).uniform(0.2, 0.8, (20, 30, 3))
+    label = np.where(np.arange(30) < 15, 1.0, 2.0) * one
+    photo = {c: radiance[..., k] for k, c in enumerate("RGB")} | {"label": label, "valid": one.copy(), "left_out": none}
+    photo |= {f"clipped.{c}": none.copy() for c in "RGB"}
+    vectors = {f"{kind}.{a}": (-one if a == "z" else none) for kind in ("normal", "view") for a in "xyz"}
+    return photo, vectors | {"label": label.copy(), "confidence": one.copy()}, radiance
+
+
+def errors_of(photo, geometry, estimate):
+    return compare_photos(["p"], ["m", "n"], lambda _: shot_of(photo, geometry, estimate))
+
+
+def test_what_is_left_out_is_counted_and_clipped_pixels_are_bounds(channels):
+    photo, geometry, radiance = channels
+    photo["clipped.R"][0, :4], photo["valid"][1, :3] = 1, 0
+    geometry["label"][2, :2], geometry["confidence"][3, :7] = 0, 0
+    shot = shot_of(photo, geometry, radiance)
+    assert shot.counts == {"pixels": 600 - 9, "unused": 7, "clipped": 4, "invalid": 3, "uncovered": 2}
+    satisfied = [shot_of(photo, geometry, factor * radiance).clipped_satisfied for factor in (1.5, 0.5)]
+    assert satisfied == [1.0, 0.0]
+
+
+def test_neither_clipped_nor_invalid_pixels_touch_the_score(channels):
+    photo, geometry, radiance = channels
+    photo["clipped.G"][3, 3], photo["valid"][4, 4] = 1, 0
+    spoiled = radiance * 0.9
+    spoiled[3, 3], spoiled[4, 4] = 1e3, np.nan
+    a, b = (errors_of(photo, geometry, estimate).photos["p"] for estimate in (radiance * 0.9, spoiled))
+    assert a.gauges == b.gauges
+
+
+def test_gauges_and_the_flat_null_of_a_photo(channels):
+    photo, geometry, radiance = channels
+    found = errors_of(photo, geometry, 0.5 * radiance).photos["p"]
+    scores = {gauge: scored.estimate.psnr_linear_db for gauge, scored in found.gauges.items()}
+    assert scores["none"] < 15 < 119 < scores["scalar_per_set"]
+    assert found.factor["channel_per_photo"] == pytest.approx((2, 2, 2))
+    flat = errors_of(photo, geometry, flat_materials(shot_of(photo, geometry, radiance))).photos["p"]
+    assert flat.gauges["none"].estimate == flat.gauges["none"].null
+    geometry["label"][:] = 0  # a photo that shows nothing
+    found = errors_of(photo, geometry, radiance)
+    assert found.photos["p"].gauges is None and found.mean is None and found.photos["p"].materials == {}
