@@ -20,10 +20,7 @@ from factorlib.runner.stop import heed_stops
 from studies.run import STUDIES, collect, forget, make, studies
 from studies.study import FULL, QUICK
 
-app = typer.Typer(add_completion=False, pretty_exceptions_enable=False, rich_markup_mode=None)
 
-
-@app.command()
 def run(
     names: Annotated[list[str] | None, typer.Argument(help="studies; all without it; else STUDY")] = None,
     quick: Annotated[bool, typer.Option("--quick", help="one seed, smallest sets; as QUICK=1")] = False,
@@ -52,8 +49,9 @@ def run(
     raise typer.Exit(code)
 
 
-def main() -> None:
-    """An error of the input ends the program with its message and exit code 1."""
+if __name__ == "__main__":
+    app = typer.Typer(add_completion=False, pretty_exceptions_enable=False, rich_markup_mode=None)
+    app.command()(run)
     try:
         with heed_stops():
             app(prog_name="python -m studies")
@@ -63,7 +61,3 @@ def main() -> None:
         if (known := disk_error(error, studies().build)) is None:
             raise
         sys.exit(f"error: {known}")
-
-
-if __name__ == "__main__":
-    main()

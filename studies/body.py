@@ -1,7 +1,7 @@
-"""The object of the comparison of methods: a rounded, convex body, its radiance, and the photos of it that all methods see.
+"""The object of the comparison of methods: an ellipsoid, its radiance, and the photos of it that all methods see.
 
-Body    |x/a|^p + |y/b|^p + |z/c|^p = 1 (superquadric, Barr 1981), turned at random, another way for each seed.  It is convex, so
-        that no part shades or hides another one, and a point is seen exactly where its normal is turned toward the camera.
+Body    |x/a|² + |y/b|² + |z/c|² = 1, turned at random, another way for each seed.  It is convex, so that no part shades or hides
+        another one, and a point is seen exactly where its normal is turned toward the camera.
 Frames  Points and normals are in the photo's light frame (x right, y up, z toward the viewer).  A camera that went around the
         body is given by `turn`, view_from_photo, a rotation; the body and its light, a lat-long map, stay where they are.
 Photo   one a light, its bodies side by side, all turned alike.  Noise: each radiance times 1 + .01 · normal.
@@ -10,28 +10,25 @@ Photo   one a light, its bodies side by side, all turned alike.  Noise: each rad
 from __future__ import annotations
 
 from collections.abc import Mapping
-from functools import cached_property
-from pathlib import Path
 
 import msgspec
 import numpy as np
+import trimesh
 from jaxtyping import Bool, Float
 from scipy.spatial.transform import Rotation
 
-from factorlib.evaluate.ball import diffuse_ball, glossy_ball, light_of_lat_long
-from factorlib.generate.shapes import star
+from factorlib.evaluate.ball import ball, light_of_lat_long
 from factorlib.light.latlong import turned_map
 from factorlib.meshes.mesh import Mesh
 from factorlib.results.materials import Reflectance
-from factorlib.urm.observations import Observations, read_observations
+from factorlib.urm.observations import Observations
+from studies.errors import Map
 from studies.spheres import GRAZING, NOISE, in_camera, table_of
 from studies.study import Comparison, light_name
 
-RADII, POWER = np.array([0.9, 0.66, 0.76]), 2.7
+RADII = np.array([0.9, 0.66, 0.76])
 REACH = 1.05  # half the width that a picture shows
-HALVINGS = 60  # of an interval in search of a root
 FINER = 2  # samples along a texel's side where a map is turned
-Map = Float[np.ndarray, "h w 3"]
 Radiance = Float[np.ndarray, "n 3"]
 
 
@@ -45,11 +42,6 @@ class View(msgspec.Struct, frozen=True):
     points: Float[np.ndarray, "n 3"]
     normals: Float[np.ndarray, "n 3"]
     turn: Float[np.ndarray, "3 3"]
-
-    @property
-    def normals_in_view(self) -> Float[np.ndarray, "n 3"]:
-        """Normals in the camera's own light frame."""
-        return self.normals @ self.turn.T
 
     def picture(self, radiance: Radiance) -> Float[np.ndarray, "h w 3"]:
         """The points' radiance in their pixels, 0 elsewhere."""
@@ -69,10 +61,7 @@ def turn(azimuth_deg: float, elevation_deg: float) -> Float[np.ndarray, "3 3"]:
     >>> turn(90, 0).round(6).tolist()[2]
     [1.0, 0.0, 0.0]
     """
-    a, e = np.radians([azimuth_deg, elevation_deg])
-    toward = np.array([np.cos(e) * np.sin(a), np.sin(e), np.cos(e) * np.cos(a)])
-    right = np.array([np.cos(a), 0.0, -np.sin(a)])
-    return np.stack([right, np.cross(toward, right), toward])
+    return Rotation.from_euler("yx", [-azimuth_deg, elevation_deg], degrees=True).as_matrix()
 
 
 def view(seed: int, size: int, view_from_photo: Float[np.ndarray, "3 3"] = np.eye(3)) -> View:
@@ -80,83 +69,36 @@ def view(seed: int, size: int, view_from_photo: Float[np.ndarray, "3 3"] = np.ey
     at, photo_from_body = ((np.arange(size) + 0.5) / size * 2 - 1) * REACH, pose(seed)
     x, y = (v.reshape(-1) for v in np.meshgrid(at, -at))
     body_from_view = (view_from_photo @ photo_from_body).T
-    z = _front(np.stack([x, y], axis=-1), body_from_view)
-    hit = np.flatnonzero(np.isfinite(z))
-    points = np.stack([x, y, z], axis=-1)[hit] @ body_from_view.T
-    normals = gradient(points)
-    seen = (normals @ body_from_view)[:, 2] > GRAZING
-    inside = np.zeros(size * size, bool)
-    inside[hit[seen]] = True
-    points, normals = (v[seen] @ photo_from_body.T for v in (points, normals))
+    scaled = body_from_view / RADII[:, None]  # to a ball of radius 1: a quadratic equation in z
+    start, along = np.stack([x, y], axis=-1) @ scaled[:, :2].T, scaled[:, 2]
+    a, b = along @ along, start @ along
+    under = b**2 - a * ((start**2).sum(axis=1) - 1)
+    z = (-b + np.sqrt(np.maximum(under, 0))) / a
+    points = np.stack([x, y, z], axis=-1) @ body_from_view.T
+    normals = points / RADII**2
+    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
+    inside = (under > 0) & ((normals @ body_from_view)[:, 2] > GRAZING)
+    points, normals = (v[inside] @ photo_from_body.T for v in (points, normals))
     return View(inside.reshape(size, size), points, normals, view_from_photo)
-
-
-def level(points: Float[np.ndarray, "*n 3"]) -> Float[np.ndarray, "*n"]:
-    """1 on the surface, less inside; points in the body's frame."""
-    return (np.abs(points / RADII) ** POWER).sum(axis=-1)
-
-
-def gradient(points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
-    """Unit normals, body's frame."""
-    normals = np.sign(points) * np.abs(points / RADII) ** (POWER - 1) / RADII
-    return normals / np.linalg.norm(normals, axis=-1, keepdims=True)
-
-
-def _front(at: Float[np.ndarray, "n 2"], body_from_view: Float[np.ndarray, "3 3"]) -> Float[np.ndarray, " n"]:
-    """Largest z, view's frame, at which the lines along z meet the body; NaN where they do not."""
-
-    def along(z: Float[np.ndarray, " n"]) -> Float[np.ndarray, " n"]:
-        """The level on the lines, convex in z."""
-        return level(np.column_stack([at, z]) @ body_from_view.T)
-
-    low, high = np.full(len(at), -2.0), np.full(len(at), 2.0)
-    for _ in range(HALVINGS):  # thirds: the lowest level lies between
-        a, b = low + (high - low) / 3, high - (high - low) / 3
-        left = along(a) < along(b)
-        low, high = np.where(left, low, a), np.where(left, b, high)
-    deepest = low = (low + high) / 2
-    high = np.full(len(at), 2.0)
-    for _ in range(HALVINGS):
-        middle = (low + high) / 2
-        within = along(middle) < 1
-        low, high = np.where(within, middle, low), np.where(within, high, middle)
-    return np.where(along(deepest) < 1, low, np.nan)
 
 
 def mesh(seed: int) -> Mesh:
     """The same body as triangles, in the photo's light frame, with its own normals."""
-    own, photo_from_body = star(lambda direction: level(direction) ** (-1 / POWER)), pose(seed)
-    vertices, normals = (v @ photo_from_body.T for v in (own.vertices, gradient(own.vertices)))
-    return Mesh(vertices, own.faces, normals, own.face_label)
+    ball, photo_from_body = trimesh.creation.icosphere(subdivisions=5), pose(seed)
+    corners, faces = np.asarray(ball.vertices), np.asarray(ball.faces, np.int32)
+    normals = corners / RADII / np.linalg.norm(corners / RADII, axis=1, keepdims=True)
+    vertices, normals = (v @ photo_from_body.T for v in (corners * RADII, normals))
+    return Mesh(vertices, faces, normals, np.ones(len(faces), np.int16))
 
 
-# ── radiance and photos ──────────────────────────────────────────────────────────────────────────────────────────────
-
-
-class Scene:
-    """The body in one light, seen by one camera: by quadrature of the light's map, as spheres are in other studies, each part once.
+def shown(material: Reflectance, light: Map, view: View) -> Radiance:
+    """The body in a light, seen by a camera: by quadrature of the light's map, as spheres are in other studies.
 
     For a camera that went around both, the map is turned into the camera's own frame.  Truth and answers go through the same turn.
     """
-
-    def __init__(self, light: Map, view: View):
-        ahead = np.array_equal(view.turn, np.eye(3))
-        self.view, self.light = view, light_of_lat_long(light if ahead else turned_map(light, view.turn, FINER))
-        self._glossy: dict[float, Radiance] = {}
-
-    @cached_property
-    def diffuse(self) -> Radiance:
-        """Of white Lambert."""
-        return diffuse_ball(self.light, self.view.normals_in_view)
-
-    def of(self, material: Reflectance) -> Radiance:
-        """Of a material; its specular part is GGX."""
-        radiance, rough = np.asarray(material.diffuse) * self.diffuse, material.roughness
-        if not any(material.specular):
-            return radiance
-        if rough not in self._glossy:
-            self._glossy[rough] = glossy_ball(self.light, self.view.normals_in_view, rough)
-        return radiance + np.asarray(material.specular) * self._glossy[rough]
+    ahead = np.array_equal(view.turn, np.eye(3))
+    light = light if ahead else turned_map(light, view.turn, FINER)
+    return ball(light_of_lat_long(light), material, view.normals @ view.turn.T)
 
 
 class Photos(msgspec.Struct, frozen=True):
@@ -179,17 +121,15 @@ class Photos(msgspec.Struct, frozen=True):
 def photographed(case: Comparison, materials: Mapping[str, Reflectance], lights: Mapping[int, Map]) -> Photos:
     """Render the entries of a case, with noise."""
     camera, radiance = view(case.seed, case.size), {}
-    scenes = {li: Scene(lights[li], camera) for li in case.lights}
     for m, li in case.entries:
-        name = case.names[m]
-        exact = scenes[li].of(materials[name])
+        exact = shown(materials[case.names[m]], lights[li], camera)
         noise = np.random.default_rng([15, case.seed, li, m]).standard_normal(exact.shape)
-        radiance[name, li] = exact * (1 + NOISE * noise)
+        radiance[case.names[m], li] = exact * (1 + NOISE * noise)
     return Photos(camera, radiance)
 
 
 def observations_of(case: Comparison, photos: Photos) -> dict[str, Observations]:
-    """The photos as the stage `urm` writes them, a table a light, by the photo's name."""
+    """The photos as the stage `urm` hands them to `solve`, a table a light, by the photo's name."""
     tables, (y, x), normals = {}, np.nonzero(photos.view.inside), in_camera(photos.view.normals)
     for li in case.lights:
         names = case.names_in(li)
@@ -199,13 +139,3 @@ def observations_of(case: Comparison, photos: Photos) -> dict[str, Observations]
         turned = np.tile(normals, (len(names), 1))
         tables[light_name(li)] = table_of(case, li, turned, radiance, labels, columns, np.tile(y, len(names)))
     return tables
-
-
-def read_photos(case: Comparison, folder: Path) -> Photos:
-    """What `observations_of` was written to, a file a light."""
-    radiance = {}
-    for li in case.lights:
-        table = read_observations(folder / f"{light_name(li)}.parquet")
-        for number in np.unique(table.material):
-            radiance[table.materials[number], li] = table.radiance[table.material == number].astype(float)
-    return Photos(view(case.seed, case.size), radiance)

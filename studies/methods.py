@@ -31,8 +31,8 @@ from scipy.spatial import cKDTree
 
 from factorlib.conventions import lat_long_directions, lat_long_solid_angles
 from factorlib.results.materials import Reflectance
-from studies.body import Map, Photos, Radiance, Scene, View
-from studies.errors import factor_of, times
+from studies.body import Map, Photos, Radiance, View, shown
+from studies.errors import factor_of, in_gauge, times
 
 BETWEEN, NEAREST = (
     4,
@@ -50,44 +50,31 @@ Truths = Mapping[str, Reflectance]
 class Prediction(msgspec.Struct, frozen=True):
     """A method's answer.
 
-    materials:    reflectances that it states, by name, in the truth's gauge;  lights: maps that it states, by number, in that gauge
-    lambertian:   that it states no specular part, rather than none being there
-    new_view:     radiance of a material that was photographed in the light of that number, by another camera
-    new_light:    of a material that was photographed, in another light, which is given
-    new_material: of another material, which is given, in the light of a photo; None where the method has nothing to say
+    materials:  reflectances that it states, by name, in the truth's gauge;  lights: maps that it states, by number, in that gauge
+    lambertian: that it states no specular part, rather than none being there
+    of:         radiance of a material in a light as a camera sees it, one of which was not photographed: a photographed material by its name
+                or another one, the light of a photo by its number or another one; None where the method has nothing to say
     """
 
     materials: dict[str, Reflectance]
     lights: dict[int, Map]
     lambertian: bool
-    new_view: Callable[[str, int, View], Radiance]
-    new_light: Callable[[str, Map, View], Radiance]
-    new_material: Callable[[Reflectance, int, View], Radiance | None]
+    of: Callable[[str | Reflectance, int | Map, View], Radiance | None]
 
 
-def in_gauge(
-    materials: Mapping[str, Reflectance], lights: Mapping[int, Map], truths: Truths
-) -> tuple[dict[str, Reflectance], dict[int, Map]]:
-    """Materials times the factor to the truth, lights divided by it: what they show together stays as it is."""
-    factor = factor_of(materials, truths)
-    return {name: times(m, factor) for name, m in materials.items()}, {li: of / factor for li, of in lights.items()}
-
-
-def lambertian_part(materials: Mapping[str, Reflectance]) -> dict[str, Reflectance]:
+def lambertian_part(materials: Truths) -> dict[str, Reflectance]:
     """Without specular parts."""
     return {name: Reflectance(m.diffuse, (0.0, 0.0, 0.0), m.roughness) for name, m in materials.items()}
 
 
 def rendered(materials: dict[str, Reflectance], lights: dict[int, Map], lambertian: bool = False) -> Prediction:
     """The answer of a method that finds a reflectance for each material and a map for each light."""
-    return Prediction(
-        materials,
-        lights,
-        lambertian,
-        lambda material, light, view: Scene(lights[light], view).of(materials[material]),
-        lambda material, light, view: Scene(light, view).of(materials[material]),
-        lambda material, light, view: Scene(lights[light], view).of(material),
-    )
+
+    def of(material: str | Reflectance, light: int | Map, view: View) -> Radiance:
+        material = materials[material] if isinstance(material, str) else material
+        return shown(material, lights[light] if isinstance(light, int) else light, view)
+
+    return Prediction(materials, lights, lambertian, of)
 
 
 def grey(photos: Photos, truths: Truths) -> Prediction:
@@ -131,18 +118,14 @@ def projective(photos: Photos, truths: Truths) -> Prediction:
     """The photos as textures; a texture knows no light apart from its material."""
     texture, radiance = Texture(photos.view), photos.radiance
 
-    def mean(material: str) -> Radiance:
-        """Of the material's photos, whatever the light."""
-        return np.mean([of for (name, _), of in radiance.items() if name == material], axis=0)
+    def of(material: str | Reflectance, light: int | Map, view: View) -> Radiance | None:
+        if isinstance(material, Reflectance):
+            return None
+        if isinstance(light, int):
+            return texture.at(view, radiance[material, light])
+        return texture.at(view, np.mean([of for (name, _), of in radiance.items() if name == material], axis=0))
 
-    return Prediction(
-        {},
-        {},
-        False,
-        lambda material, light, view: texture.at(view, radiance[material, light]),
-        lambda material, light, view: texture.at(view, mean(material)),
-        lambda material, light, view: None,
-    )
+    return Prediction({}, {}, False, of)
 
 
 # ── intrinsic decomposition ──────────────────────────────────────────────────────────────────────────────────────────
@@ -223,26 +206,18 @@ def intrinsic(photos: Photos, truths: Truths) -> Prediction:
     relative = {n: Reflectance(tuple(albedo[n].tolist()), (0.0,) * 3, 1.0) for n in photos.materials}
     factor = factor_of(relative, lambertian_part(truths))
     shading = {li: part.shading * scale[li] / factor for li, part in parts.items()}
-    materials, lights = (
-        {n: times(m, factor) for n, m in relative.items()},
-        {li: light_map(e) for li, e in shading.items()},
-    )
+    materials = {n: times(m, factor) for n, m in relative.items()}
+    lights = {li: light_map(e) for li, e in shading.items()}
 
-    def shaded(material: str, coefficients: Coefficients, highlight: Radiance, view: View) -> Radiance:
-        """Albedo × shading + highlight."""
+    def of(material: str | Reflectance, light: int | Map, view: View) -> Radiance:
+        if isinstance(material, Reflectance):
+            return shown(material, lights[light], view)
+        if isinstance(light, int):
+            coefficients, highlight = shading[light], parts[light].highlight[material]
+        else:
+            highlight = np.mean([p.highlight[material] for p in parts.values() if material in p.highlight], axis=0)
+            coefficients = LAMBERT[:, None] * light_coefficients(light)
         lit = np.maximum(harmonics(view.normals) @ coefficients, 0)
         return np.array(materials[material].diffuse) * lit + texture.at(view, highlight, unseen=False)
 
-    def new_light(material: str, light: Map, view: View) -> Radiance:
-        """In a given light."""
-        highlight = np.mean([p.highlight[material] for p in parts.values() if material in p.highlight], axis=0)
-        return shaded(material, LAMBERT[:, None] * light_coefficients(light), highlight, view)
-
-    return Prediction(
-        materials,
-        lights,
-        True,
-        lambda material, light, view: shaded(material, shading[light], parts[light].highlight[material], view),
-        new_light,
-        lambda material, light, view: Scene(lights[light], view).of(material),
-    )
+    return Prediction(materials, lights, True, of)

@@ -10,6 +10,7 @@ Noise      each radiance times 1 + .01 · normal, drawn for each entry by itself
 Normals    perturbed after rendering: the solve gets a normal that is not the pixel's.
 Labels     likewise: the pixel is of one material, its label names another one of the same photo.
 Facets     rendered so: a flat-sided object, whose normals are true but few.
+Rounding   each radiance times 1 + 10⁻⁷ · normal, which is less than a photograph's last bit.
 """
 
 from __future__ import annotations
@@ -21,7 +22,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from factorlib.conventions import FRONT, YUP_FROM_CAMERA
-from factorlib.evaluate.ball import Light, ball, light_of_lat_long
+from factorlib.evaluate.ball import Light, ball
 from factorlib.generate.lights import random_light, random_materials
 from factorlib.geometry.sphere import ball_normals
 from factorlib.images.exr import read_rgb_exr
@@ -46,6 +47,7 @@ ABOUT = dict(
     )
 )
 SPREAD = 0.15
+ROUNDING = 1e-7  # of a radiance
 GRAZING = 0.15  # n·o below which no pixel is observed
 NOISE = 0.01  # of a radiance
 STEEPEST = 0.25  # n·o of the faces that are observed at the flattest angle
@@ -67,19 +69,9 @@ def light_map(seed: int, light: int, rows: int, spp: int) -> Float[np.ndarray, "
     return (radiance / radiance.mean()).astype(np.float32)
 
 
-def light_file(seed: int, light: int) -> str:
-    """The name of a light's map in the folder of the step `worlds`."""
-    return f"{seed}-{light}.exr"
-
-
 def read_maps(worlds: Path, seed: int, lights: Iterable[int]) -> dict[int, Float[np.ndarray, "h w 3"]]:
-    """The maps of lights of a world by number."""
-    return {li: read_rgb_exr(worlds / light_file(seed, li)) for li in lights}
-
-
-def read_lights(worlds: Path, seed: int, lights: Iterable[int]) -> dict[int, Light]:
-    """The same, ready to be reflected."""
-    return {li: light_of_lat_long(radiance) for li, radiance in read_maps(worlds, seed, lights).items()}
+    """The maps of lights of a world by number, from the folder of the step `worlds`."""
+    return {li: read_rgb_exr(worlds / f"{seed}-{li}.exr") for li in lights}
 
 
 def sphere_normals(size: int) -> Float[np.ndarray, "n 3"]:
@@ -108,11 +100,13 @@ def _photo(case: Case, number: int, materials: Sequence[Reflectance], light: Lig
     normals, index = faceted(sphere_normals(case.size), case.facets), case.materials.index
 
     def rng(m: int, what: str) -> np.random.Generator:
-        """The random numbers of an entry."""
         return np.random.default_rng([13, case.seed, number, m, ("noise", "normals", "labels").index(what)])
 
     exact = [ball(light, materials[m], normals) for m in rows]
     noisy = [r * (1 + NOISE * rng(m, "noise").standard_normal(r.shape)) for m, r in zip(rows, exact, strict=True)]
+    if case.rounding:
+        again = np.random.default_rng([14, case.seed, number, case.rounding])
+        noisy = [r * (1 + ROUNDING * again.standard_normal(r.shape)) for r in noisy]
     turned = [tilted(in_camera(normals), case.normal_deg, rng(m, "normals")) for m in rows]
     others = [index(m) for m in rows]
     labels = [mislabelled(len(normals), index(m), others, case.wrong_labels, rng(m, "labels")) for m in rows]

@@ -12,7 +12,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from studies.study import Claim, Scale, Setting, Study, own
+from studies.study import Scale, Setting, Study, own
 
 WITHOUT: dict[str, tuple[str, str, dict[str, Any]]] = {  # label, what is off, options of the solver of few lobes
     "as-it-is": ("as it is", "", {}),
@@ -34,12 +34,6 @@ def settings(scale: Scale) -> list[Setting]:
     return [Setting(n, WITHOUT[n][0], lambda seed, n=n: {"seed": seed, "solve": hows[n]}) for n in names]
 
 
-def claims(scale: Scale) -> list[Claim]:
-    """Unseen cells, materials and lights with each part against without it."""
-    names = [setting.name for setting in settings(scale)][1:]
-    return [own(measure, "as-it-is", n, f"{WITHOUT[n][1]} {does}") for measure, does in DO.items() for n in names]
-
-
 def sets(scale: Scale) -> dict[str, Any]:
     """The rendered sets of chairs, one a seed: so many shots of so many pixels; small ones, since a study is of many solves."""
     size = (2, 120, 90, 16, 32) if scale.quick else (4, 240, 180, 64, 64)
@@ -54,7 +48,9 @@ STUDY = Study(
     varied="what is switched off",
     measures=("unseen", "diffuse", "specular", "glossy", "roughness", "mirror"),
     settings=settings,
-    claims=claims,
-    steps=("sets", "photos", "parts"),
+    claims=tuple(
+        own(m, "as-it-is", n, f"{WITHOUT[n][1]} {does}") for m, does in DO.items() for n in WITHOUT if n != "as-it-is"
+    ),
+    steps=("photos", "parts"),
     sets=sets,
 )

@@ -7,14 +7,14 @@ other noise, and so other worlds.
 from __future__ import annotations
 
 import os
+import shutil
 from pathlib import Path
 
 import msgspec
 
 from factorlib.images.exr import LAT_LONG, write_rgb_exr
 from factorlib.stage import Inputs, Progress
-from factorlib.wholefile import replace_file
-from studies.spheres import light_file, light_map
+from studies.spheres import light_map
 from studies.steps import Params
 from studies.study import World
 
@@ -24,13 +24,12 @@ def main(params: Params, inputs: Inputs, out: Path, progress: Progress) -> None:
     os.environ["FACTORLIB_MITSUBA"] = "scalar_rgb"  # read where Mitsuba is first used
     world = msgspec.convert(inputs.facts["dataset.worlds"], World)
     wanted = [(seed, light) for seed in world.seeds for light in range(world.lights)]
-    kept = inputs.unfinished or out
+    kept = inputs.unfinished or out / "draft"
     kept.mkdir(parents=True, exist_ok=True)
     for number, (seed, light) in enumerate(wanted):
         progress(number, len(wanted), f"light {light} of seed {seed}")
-        file = kept / light_file(seed, light)
-        if not file.exists():
+        if not (file := kept / f"{seed}-{light}.exr").exists():
             write_rgb_exr(draft := kept / "draft.exr", light_map(seed, light, world.rows, world.spp), LAT_LONG)
             draft.rename(file)
-        if kept != out:
-            replace_file(out / file.name, file.read_bytes())
+        shutil.copy(file, out)
+    shutil.rmtree(out / "draft", ignore_errors=True)
