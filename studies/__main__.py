@@ -26,7 +26,9 @@ def run(
     quick: Annotated[bool, typer.Option("--quick", help="one seed, smallest sets; as QUICK=1")] = False,
     one: Annotated[bool, typer.Option("--one", help="a study must be named")] = False,
     force: Annotated[bool, typer.Option("--force", help="run again, whatever the store holds; as FORCE=1")] = False,
-    docs: Annotated[bool, typer.Option("--docs", help="also write the tables of docs/studies.md anew")] = False,
+    docs: Annotated[
+        bool, typer.Option("--docs", help="also write the tables of docs/studies.md anew, of full studies")
+    ] = False,
     clean: Annotated[bool, typer.Option("--clean", help="forget results instead")] = False,
     gc: Annotated[bool, typer.Option("--gc", help="delete results that no study names any more instead")] = False,
 ) -> None:
@@ -42,10 +44,10 @@ def run(
     if clean:
         raise typer.Exit(forget(scale, named or list(STUDIES)))
     code = make(scale, named or list(STUDIES), forced(force), executor_words(chosen(None)))
-    if docs and code == 0:
+    if docs and code == 0 and not scale.quick:
         from studies.run.page import refresh_docs
 
-        refresh_docs(named or list(STUDIES), scale.quick)
+        refresh_docs(named or list(STUDIES))
     raise typer.Exit(code)
 
 

@@ -60,8 +60,6 @@ MEASURES = {  # label, and the unit where there is one; lower is better where th
     "error_worst": "error of a reflection, worst",
     "rendering": "DSSIM, a rendered sphere",
     "microseconds": "processor time an evaluation|µs",
-    "unseen": "error of unseen cells|RMSE over the peak",
-    "kept_parts": "parts that the solve took, of two",
     "of_bound": "solve: largest error over its bound",
     "hard_k": "solve: error of reflectances|relative to the truth",
     "hard_roughness": "solve: error of roughness",

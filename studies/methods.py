@@ -1,8 +1,8 @@
 """What methods answer in the comparison, as predictions of photos that were not taken.
 
-Projective   Texturing: the photo's pixels are stuck on the body and carried to the new view.  It knows the body and the camera.  A point
+Projective   Texturing: the photo's pixels are stuck on the sphere and carried to the new view.  It knows the sphere and the camera.  A point
              that the photo saw has the photo's colour there, between pixels by inverse distance; one that it did not see that of the seen
-             points whose normals are nearest.  A new light changes nothing: the colours are the mean of all photos of the material.
+             points that are nearest.  A new light changes nothing: the colours are the mean of all photos of the material.
 Intrinsic    A decomposition in the spirit of SIRFS (Barron and Malik 2015): albedo × shading + highlight, albedos averaged over photos.
              It knows the normals, and which pixels are of which material; each photo is decomposed by itself.
    shading     S(n) = Σ e_lm Y_lm(n), nine spherical harmonics: what Lambert reflects of a distant light to within a few per cent
@@ -31,8 +31,8 @@ from scipy.spatial import cKDTree
 
 from factorlib.conventions import lat_long_directions, lat_long_solid_angles
 from factorlib.results.materials import Reflectance
-from studies.body import Map, Photos, Radiance, View, shown
-from studies.errors import factor_of, in_gauge, times
+from studies.body import Photos, Radiance, View, shown
+from studies.errors import Map, factor_of, in_gauge, times
 
 BETWEEN, NEAREST = (
     4,
@@ -92,26 +92,20 @@ class Texture:
     """Values at the points that a photo sees, to be read from other views."""
 
     def __init__(self, photo: View):
-        self.photo = photo
-        self._points, self._normals = cKDTree(photo.points), cKDTree(photo.normals)
+        self._tree, self._least = cKDTree(photo.normals), photo.normals[:, 2].min()
 
     def seen(self, view: View) -> Bool[np.ndarray, " n"]:
-        """Which of a view's points the photo sees: those whose normals are turned toward it (the body is convex)."""
-        return view.normals[:, 2] >= self.photo.normals[:, 2].min()
+        """Which of a view's points the photo sees: those whose normals are turned toward it."""
+        return view.normals[:, 2] >= self._least
 
     def at(self, view: View, values: Radiance, unseen: bool = True) -> Radiance:
         """values: of the photo's points;  unseen: whether points that it does not see are filled, else they are 0."""
-        there, colours = self.seen(view), np.zeros((len(view.points), 3))
-        colours[there] = _weighted(self._points, view.points[there], values, BETWEEN)
-        if unseen and not there.all():
-            colours[~there] = _weighted(self._normals, view.normals[~there], values, NEAREST)
+        there, colours = self.seen(view), np.zeros((len(view.normals), 3))
+        for some, count in ((there, BETWEEN), (~there & unseen, NEAREST)):
+            distance, index = self._tree.query(view.normals[some], count)
+            weight = 1 / (distance + 1e-9)
+            colours[some] = np.einsum("nk,nkc->nc", weight / weight.sum(axis=1, keepdims=True), values[index])
         return colours
-
-
-def _weighted(tree: cKDTree, at: np.ndarray, values: Radiance, count: int) -> Radiance:
-    distance, index = tree.query(at, count)
-    weight = 1 / (distance + 1e-9)
-    return np.einsum("nk,nkc->nc", weight / weight.sum(axis=1, keepdims=True), values[index])
 
 
 def projective(photos: Photos, truths: Truths) -> Prediction:

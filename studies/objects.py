@@ -31,7 +31,7 @@ from factorlib.meshes.mesh import scaled
 from factorlib.results.materials import Reflectance
 from factorlib.urm.observations import Observations, concatenate
 from studies.scenes import shapes
-from studies.spheres import GRAZING, NOISE, table_of
+from studies.spheres import GRAZING, table_of
 from studies.study import Case, Objects, light_name
 
 BODIES = ("blob", "jug", "hook")
@@ -94,7 +94,9 @@ def _entry(case: Case, m: int, li: int, material: Reflectance, light: Light) -> 
     noise = np.random.default_rng([13, case.seed, li, m, 0]).standard_normal((maps.label.size, 3))[pixels]
     labels = np.full(len(pixels), case.materials.index(m))
     zero = np.zeros(len(pixels), int)
-    table = table_of(case, li, given, radiance * (1 + NOISE * noise), labels, pixels, zero, sure.reshape(-1)[pixels])
+    table = table_of(
+        case, li, given, radiance * (1 + case.noise * noise), labels, pixels, zero, sure.reshape(-1)[pixels]
+    )
     return table, angle_deg(true, given)
 
 

@@ -5,7 +5,7 @@ Lights     by the project's own generator (`factorlib.generate`): the first of a
            Mean radiance 1.
 Radiance   by quadrature of the lights' maps (`factorlib.evaluate.ball`), not by the operator that solves: what a solve
            is judged on is not made by its own approximations.
-Noise      each radiance times 1 + .01 · normal, drawn for each entry by itself, so that an entry that two cases show has
+Noise      each radiance times 1 + noise · normal, .01 as a rule, drawn for each entry by itself, so that an entry that two cases show has
            the same noise in both.
 Normals    perturbed after rendering: the solve gets a normal that is not the pixel's.
 Labels     likewise: the pixel is of one material, its label names another one of the same photo.
@@ -49,7 +49,6 @@ ABOUT = dict(
 SPREAD = 0.15
 ROUNDING = 1e-7  # of a radiance
 GRAZING = 0.15  # n·o below which no pixel is observed
-NOISE = 0.01  # of a radiance
 STEEPEST = 0.25  # n·o of the faces that are observed at the flattest angle
 CURVED = 0.1  # share of a face's normals that is the sphere's: no real face is exactly flat
 
@@ -103,7 +102,7 @@ def _photo(case: Case, number: int, materials: Sequence[Reflectance], light: Lig
         return np.random.default_rng([13, case.seed, number, m, ("noise", "normals", "labels").index(what)])
 
     exact = [ball(light, materials[m], normals) for m in rows]
-    noisy = [r * (1 + NOISE * rng(m, "noise").standard_normal(r.shape)) for m, r in zip(rows, exact, strict=True)]
+    noisy = [r * (1 + case.noise * rng(m, "noise").standard_normal(r.shape)) for m, r in zip(rows, exact, strict=True)]
     if case.rounding:
         again = np.random.default_rng([14, case.seed, number, case.rounding])
         noisy = [r * (1 + ROUNDING * again.standard_normal(r.shape)) for r in noisy]

@@ -47,6 +47,7 @@ class Case(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     normal_deg:    normals are turned by |N(0, normal_deg)| degrees toward random sides
     wrong_labels:  share of the pixels whose label names another material of the same photo
     facets:        faces that an object shows instead of a sphere; None: a sphere
+    noise:         of each radiance, as a share of it
     rounding:      number of the perturbation of all radiances by less than a photograph's last bit; 0: none
     objects:       bodies in place of spheres
     """
@@ -58,6 +59,7 @@ class Case(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     normal_deg: float = 0.0
     wrong_labels: float = 0.0
     facets: int | None = None
+    noise: float = 0.01
     rounding: int = 0
     objects: Objects | None = None
 

@@ -1,7 +1,7 @@
 """Comparison: does a joint solve predict photos that were not taken better than methods that do less, or do the same by other means?
 
 Varied     the method: the stage `solve`, Mitsuba's joint optimisation, an intrinsic decomposition, projective texturing, a grey ball.
-           All see the same photos, of n materials in n lights on one convex body, its normals and the camera.
+           All see the same photos, of spheres of n materials in n lights, the normals and the camera.
 Measured   pictures from another side, in lights and of materials that no photo shows, each in three gauges; errors of the materials
            and lights that a method states; the processor's time.
 """

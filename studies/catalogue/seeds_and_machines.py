@@ -94,6 +94,7 @@ def main(params: Params, inputs: Inputs, out: Path, progress: Progress) -> None:
 
 def measured(case: dict[str, Any]) -> dict[str, float]:
     """The numbers by their path in metrics.json, in this process."""
+    from factorlib.dataset.read import read_dataset
     from factorlib.evaluate.table import value_at
     from factorlib.jsonfile import read_json
     from stages import align, evaluate, export, masks, render, solve, urm
@@ -102,7 +103,9 @@ def measured(case: dict[str, Any]) -> dict[str, float]:
 
     stages = (masks, align, urm, solve, export, render, evaluate)
     with tempfile.TemporaryDirectory() as folder:
-        run_stages(CHECKOUT / FOLDER, Path(folder), stages, {"solve": {**case["solve"], "seed": case["seed"]}})
+        run_stages(
+            read_dataset(CHECKOUT / FOLDER), Path(folder), stages, {"solve": {**case["solve"], "seed": case["seed"]}}
+        )
         metrics = read_json(Path(folder) / "evaluate" / "metrics.json")
     return {path: value_at(metrics, path) for path in NUMBERS}
 

@@ -18,7 +18,7 @@ from studies.conclusion import Conclusion, concluded, csv_text, head, paragraph
 from studies.figures import figure
 from studies.measured.tools import refresh, table
 from studies.run import STUDIES, studies
-from studies.study import FULL, QUICK, Scale, Score, Study, case_name
+from studies.study import FULL, Scale, Score, Study, case_name
 
 DOCS = LIBRARY / "docs" / "studies.md"
 COLUMNS = 4  # measures of a study that the documentation has
@@ -76,48 +76,27 @@ def done_of(project: Project) -> dict[str, Conclusion]:
 # ── docs/studies.md ──────────────────────────────────────────────────────────────────────────────────────────────────
 
 
-def refresh_docs(names: Sequence[str], quick: bool) -> None:
-    """Write the tables of studies, and that of all answers to the paper, into docs/studies.md.
-
-    What the page has of a full study stays until there is a full one to replace it: a quick one says less.
-    """
-    small, full = (done_of(studies(scale)) for scale in (QUICK, FULL))
-    text, new = DOCS.read_text(encoding="utf-8"), small if quick else full
-    parts = {name: numbers(new[name]) for name in names if name in new and not (quick and is_full(text, name))}
-    refresh(DOCS, {"conclusions": against_the_paper(small | full, text)} | parts)
+def refresh_docs(names: Sequence[str]) -> None:
+    """Write the tables of full studies, and that of all answers to the paper, into docs/studies.md."""
+    done, text = done_of(studies(FULL)), DOCS.read_text(encoding="utf-8")
+    parts = {name: numbers(done[name]) for name in names if name in done}
+    refresh(DOCS, {"conclusions": against_the_paper({name: c.answer for name, c in done.items()}, text)} | parts)
 
 
-def against_the_paper(done: Mapping[str, Conclusion], text: str = "") -> str:
-    """The table of the answers of all studies; where `done` has none, or a quick one and the page a full one, that of the page's text."""
-    rows, before = [], [line.split(" | ") for line in part_of(text, "conclusions").splitlines()]
+def against_the_paper(answers: Mapping[str, str], text: str = "") -> str:
+    """The table of the answers of all studies; of those that are not here, what the page's text has."""
+    rows = []
     for name, study in STUDIES.items():
         title = f"[{study.title}](#{study.title.lower().replace(' ', '-')})"
-        answer = next((row[-1].removesuffix(" |") for row in before if row[0] == f"| {title}"), "not run")
-        if name in done and not (done[name].quick and is_full(text, name)):
-            answer = done[name].answer
-        rows.append([title, study.paper, answer])
+        line = re.search(rf"^\| {re.escape(title)} \|.* \| (.*) \|$", text, re.MULTILINE)
+        rows.append([title, study.paper, answers.get(name, line[1] if line else "not run")])
     return table(["study", "the paper", "here"], rows)
 
 
-def part_of(text: str, name: str) -> str:
-    """What a page has between the marks of `name`; nothing where there are none.
-
-    >>> part_of("<!-- begin a -->\\nten\\n<!-- end a -->", "a")
-    'ten\\n'
-    """
-    match = re.search(rf"<!-- begin {re.escape(name)} -->\n(.*?)<!-- end {re.escape(name)} -->", text, re.DOTALL)
-    return match[1] if match else ""
-
-
-def is_full(text: str, name: str) -> bool:
-    """Whether a page has a full study's table of that name."""
-    return "|" in part_of(text, name) and "(quick" not in part_of(text, name)
-
-
 def numbers(c: Conclusion) -> str:
-    """The first measures of a study, and its sentences; a quick one says in its head that it is."""
+    """The first measures of a study, and its sentences."""
     measures = c.measures[:COLUMNS]
-    first = f"{c.varied} ({c.quick})" if c.quick else c.varied
     rows = [[row.label, *(str(row.cells.get(m, "–")) for m in measures)] for row in c.rows]
-    sentences = [] if c.quick else ["\n" + "\n".join(f"- {sentence}" for sentence in c.sentences)]
-    return "\n".join([table([first, *map(head, measures)], rows), *sentences])
+    return "\n".join(
+        [table([c.varied, *map(head, measures)], rows), "", *(f"- {sentence}" for sentence in c.sentences)]
+    )

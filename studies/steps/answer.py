@@ -3,12 +3,12 @@
 Ours     the stage `solve`.
 Mitsuba  joint optimisation by differentiable rendering: Adam on the texels of an `envmap` of 16 × 32 for each light, not negative, and on
          k_d, k_s and roughness of each material, in the blend of `diffuse` and `roughconductor` that this project exports, its weight one
-         half.  It knows the body's mesh and place, the camera, which pixels are of which material, and that there is no light that bounces.
+         half.  It knows the sphere and its place, the camera, which pixels are of which material, and that there is no light that bounces.
          Its pictures are means of the photos over squares of pixels; integrator `prb`, direct light alone, `SPP` samples a pixel in each pass,
          forward and backward with seeds of their own.  Loss: mean squared difference over the picture's peak, all pairs together; one
          step of Adam after all of them.
 
-Rate     of .003, .01, .03 and .1 the one that reached the lowest loss on a seed that is not reported: `python -m studies.steps.answer`.
+Rate     of .003, .01, .03 and .1 the one that reached the lowest loss on a seed that is not reported.
 End      flat: the mean loss of the last `FLAT` steps is not 1 % below that of as many before.
 Process  its own, for the variant of Mitsuba is the process' own affair, with one thread, so that sums are the same in every run.
 """
@@ -20,7 +20,6 @@ import os
 import subprocess
 import sys
 import time
-from multiprocessing import get_context
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
@@ -32,24 +31,22 @@ from factorlib.conventions import YUP_FROM_CAMERA, lat_long_directions
 from factorlib.errors import InputError
 from factorlib.images.exr import LAT_LONG, write_rgb_exr
 from factorlib.jsonfile import json_text, write_json
-from factorlib.meshes.ply import write_ply
 from factorlib.model.bounds import ROUGHNESS
 from factorlib.results.materials import Reflectance, read_materials
 from factorlib.stage import Inputs, Progress
 from factorlib.tracing.scene import MITSUBA_FROM_CAMERA, rgb, rigid, transform
 from factorlib.tracing.variant import mitsuba
-from studies.body import REACH, Map, Photos, mesh, observations_of, photographed
-from studies.errors import maps_of
-from studies.measured.tools import table
-from studies.spheres import light_map, materials_of, read_maps
+from studies.body import Photos, photographed
+from studies.errors import Map, maps_of
+from studies.spheres import materials_of, read_maps
 from studies.steps import Params
 from studies.steps.solve import solved
-from studies.study import FULL, Comparison
+from studies.study import Comparison
 
 log = logging.getLogger("factorlib.studies.answer")
 ROWS, SPP, FLAT, RATE = 16, 16, 60, 0.03
 PEAK = 99.9  # percentile of a picture
-AWAY = 5.0  # of the camera from the body's middle
+AWAY = 5.0  # of the camera from the sphere's middle
 MAP_ROWS = 64  # of the lights that are written
 
 
@@ -59,9 +56,9 @@ def main(params: Params, inputs: Inputs, out: Path, progress: Progress) -> None:
     home.mkdir()
     write_json(home / "seconds.json", 0)
     if case.method == "ours":
-        photos = photographed(case, materials_of(case.seed), read_maps(inputs["worlds"], case.seed, case.lights))
+        _, tables = photographed(case, materials_of(case.seed), read_maps(inputs["worlds"], case.seed, case.lights))
         with TemporaryDirectory() as folder:
-            seconds = solved(observations_of(case, photos), case.solve, inputs, Path(folder), progress)
+            seconds = solved(tables, case.solve, inputs, Path(folder), progress)
             table = read_materials(Path(folder) / "materials.json").materials
             written(home, {n: m.reflectance for n, m in table.items()}, maps_of(Path(folder), case.lights), seconds)
     if case.method == "mitsuba":
@@ -78,21 +75,20 @@ def written(home: Path, materials: dict[str, Reflectance], lights: dict[int, Map
 
 
 class Joint:
-    """The unknowns that all pairs of a material and a light share, and the scene of each pair: the body, seen by an orthographic camera."""
+    """The unknowns that all pairs of a material and a light share, and the scene of each pair: the sphere, seen by an orthographic camera."""
 
-    def __init__(self, seed: int, photos: Photos, pixels: int, folder: Path):
+    def __init__(self, photos: Photos, pixels: int):
         self.mi, self.materials, self.lights = mitsuba(), photos.materials, photos.lights
-        write_ply(folder / "body.ply", mesh(seed))
         self.mask = _squares(photos.view.inside, pixels).all(axis=(1, 3))
         pictures = {pair: _squares(photos.view.picture(of), pixels) for pair, of in photos.radiance.items()}
         self.shown = {pair: of.mean(axis=(1, 3)).astype(np.float32) for pair, of in pictures.items()}
-        self.scenes = {pair: self._scene(pixels, folder / "body.ply") for pair in self.shown}
+        self.scenes = {pair: self._scene(pixels) for pair in self.shown}
         self.parameters = {pair: self.mi.traverse(scene) for pair, scene in self.scenes.items()}
         self.integrator = self.mi.load_dict({"type": "prb", "max_depth": 2})
 
-    def _scene(self, pixels: int, body: Path) -> Any:
+    def _scene(self, pixels: int) -> Any:
         film = {"type": "hdrfilm", "width": pixels, "height": pixels, "rfilter": {"type": "box"}, "pixel_format": "rgb"}
-        ahead = rigid(YUP_FROM_CAMERA, (0.0, 0.0, AWAY)) @ MITSUBA_FROM_CAMERA @ np.diag([REACH, REACH, 1.0, 1.0])
+        ahead = rigid(YUP_FROM_CAMERA, (0.0, 0.0, AWAY)) @ MITSUBA_FROM_CAMERA
         gloss = {
             "type": "roughconductor",
             "material": "none",
@@ -104,7 +100,7 @@ class Joint:
         return self.mi.load_dict({
             "type": "scene", "integrator": {"type": "prb", "max_depth": 2},
             "sensor": {"type": "orthographic", "to_world": transform(ahead), "sampler": {"type": "independent"}, "film": film},
-            "ball": {"type": "ply", "filename": str(body), "bsdf": {"type": "blendbsdf", "weight": 0.5, "bsdf_0": matt, "bsdf_1": gloss}},
+            "ball": {"type": "sphere", "bsdf": {"type": "blendbsdf", "weight": 0.5, "bsdf_0": matt, "bsdf_1": gloss}},
             "light": {"type": "envmap", "bitmap": self.mi.Bitmap(np.ones((ROWS, 2 * ROWS, 3), np.float32))},
         })  # fmt: skip
 
@@ -185,14 +181,13 @@ def flat(losses: list[float]) -> bool:
     return len(losses) >= 2 * FLAT and bool(np.mean(losses[-FLAT:]) > 0.99 * np.mean(losses[-2 * FLAT : -FLAT]))
 
 
-def optimised(case: Comparison, photos: Photos, rate: float = RATE) -> tuple[list[float], Joint]:
+def optimised(case: Comparison, photos: Photos) -> tuple[list[float], Joint]:
     """The losses of all steps, and where they ended; in a process of its own."""
     one_thread_with_derivatives()
-    with TemporaryDirectory() as folder:
-        joint, losses = Joint(case.seed, photos, case.pixels, Path(folder)), []
-        joint.begin(rate)
-        while not flat(losses) and len(losses) < case.steps:
-            losses.append(joint.step(len(losses)))
+    joint, losses = Joint(photos, case.pixels), []
+    joint.begin()
+    while not flat(losses) and len(losses) < case.steps:
+        losses.append(joint.step(len(losses)))
     return losses, joint
 
 
@@ -211,7 +206,7 @@ def one_thread_with_derivatives() -> None:
 
 def optimise(case: Comparison, worlds: Path, home: Path) -> None:
     """Photograph, optimise, and write the answer into the folder `home`."""
-    photos = photographed(case, materials_of(case.seed), read_maps(worlds, case.seed, case.lights))
+    photos, _ = photographed(case, materials_of(case.seed), read_maps(worlds, case.seed, case.lights))
     start = time.process_time()
     losses, joint = optimised(case, photos)
     seconds = round(time.process_time() - start, 3)
@@ -222,30 +217,8 @@ def optimise(case: Comparison, worlds: Path, home: Path) -> None:
     )
 
 
-def traced(seed: int, light: int) -> Map:
-    """A light as full studies have it."""
-    os.environ["FACTORLIB_MITSUBA"] = "scalar_rgb"
-    return light_map(seed, light, FULL.light_rows, FULL.light_spp)
-
-
-def try_rates(seed: int = 100) -> None:
-    """Print where each rate ends, on pictures as large as the full study's."""
-    case, rows = Comparison(seed, ((0, 0), (0, 1), (1, 0), (1, 1)), 96, method="mitsuba"), []
-    with get_context("spawn").Pool(1) as pool:  # Mitsuba's scalar variant makes the lights, as in studies
-        maps = pool.starmap(traced, [(seed, li) for li in case.lights])
-    photos = photographed(case, materials_of(seed), dict(enumerate(maps)))
-    for rate in (0.003, 0.01, 0.03, 0.1):
-        start = time.process_time()
-        losses, _ = optimised(case, photos, rate)
-        seconds, ended = f"{time.process_time() - start:.0f}", "yes" if flat(losses) else "no"
-        rows.append([f"{rate:g}", f"{np.mean(losses[-FLAT:]):.3g}", str(len(losses)), ended, seconds])
-    print(table(["rate", "loss at the end", "steps", "flat", "processor, s"], rows))
-
-
 if __name__ == "__main__":
     try:
-        optimise(msgspec.json.decode(sys.argv[1], type=Comparison), *map(Path, sys.argv[2:])) if sys.argv[
-            1:
-        ] else try_rates()
+        optimise(msgspec.json.decode(sys.argv[1], type=Comparison), *map(Path, sys.argv[2:]))
     except InputError as error:
         sys.exit(f"error: {error}")

@@ -1,6 +1,6 @@
 """How far a method's predictions are from photos that were not taken: writes <case>.json, and into <case>/ pictures and shots.json.
 
-Three kinds of pictures of the body, each compared with the truth by DSSIM inside the body's outline, after the tone map of
+Three kinds of pictures of the sphere, each compared with the truth by DSSIM inside the sphere's outline, after the tone map of
 `factorlib.evaluate.picture` at an exposure that takes the truth's white to 1:
 
     novel_view      every photographed entry, from `VIEWS`: the first shares a part of what it sees with the photo, the second little
@@ -31,8 +31,8 @@ from factorlib.images.picture import picture, write_png
 from factorlib.jsonfile import read_json, write_json
 from factorlib.results.materials import Reflectance
 from factorlib.stage import Inputs, Progress
-from studies.body import Map, Photos, Radiance, View, photographed, shown, turn, view
-from studies.errors import PARTS, in_gauge, light_errors, material_errors
+from studies.body import Photos, Radiance, View, photographed, shown, turn, view
+from studies.errors import PARTS, Map, in_gauge, light_errors, material_errors
 from studies.methods import Prediction, grey, intrinsic, lambertian_part, projective, rendered
 from studies.spheres import materials_of, read_maps
 from studies.steps import Params
@@ -76,7 +76,7 @@ class Taken(msgspec.Struct, frozen=True):
         return picture_error(*pictures, self.view.inside, self.white).dssim
 
     def picture(self, radiance: Radiance) -> np.ndarray:
-        """8-bit sRGB, white where there is no body."""
+        """8-bit sRGB, white where there is nothing."""
         pixels = picture(self.view.picture(np.maximum(radiance, 0)), 1 / self.white)
         pixels[~self.view.inside] = 255
         return pixels
@@ -94,7 +94,7 @@ def main(params: Params, inputs: Inputs, out: Path, progress: Progress) -> None:
     case = msgspec.convert(inputs.facts["dataset.case"], Comparison)
     numbers = range(msgspec.convert(inputs.facts["dataset.worlds"], Lights).lights)
     world, home = World(materials_of(case.seed), read_maps(inputs["worlds"], case.seed, numbers)), out / inputs.photo
-    photos = photographed(case, world.materials, world.lights)
+    photos, _ = photographed(case, world.materials, world.lights)
     prediction, seconds = answer(case, photos, inputs["answer"] / inputs.photo, world.materials)
     taken = shots(case, world, prediction)
     write_json(out / f"{inputs.photo}.json", score_of(world, prediction, taken, seconds))
@@ -127,7 +127,7 @@ def answer(
 
 def shots(case: Comparison, world: World, prediction: Prediction) -> list[Taken]:
     """All that is asked, and answered."""
-    cameras, taken = {name: view(case.seed, case.size, turn(*at)) for name, at in (VIEWS | FRONT).items()}, []
+    cameras, taken = {name: view(case.size, turn(*at)) for name, at in (VIEWS | FRONT).items()}, []
     for shot in asked(case, world):
         camera, material, light = cameras[shot.view], world.materials[shot.material], world.lights[shot.light]
         truth = shown(material, light, camera)

@@ -18,6 +18,7 @@ import msgspec
 import yaml
 
 from factorlib.dataset.read import read_dataset
+from factorlib.dataset.schema import Dataset
 from factorlib.dataset.slices import dataset_slice
 from factorlib.generate.eames import SET, Parameters, generate
 from factorlib.jsonfile import read_json, write_json
@@ -34,7 +35,7 @@ def main(params: Params, inputs: Inputs, out: Path, progress: Progress) -> None:
     facts, kept = inputs.facts["dataset.sets"], inputs.unfinished or out / "draft"
     if "folder" in facts:
         folder = CHECKOUT / facts["folder"]
-        return run_stages(folder, out / folder.name, (masks, align, urm), photos=facts["photos"])
+        return run_stages(read_dataset(folder), out / folder.name, (masks, align, urm), photos=facts["photos"])
     os.environ["FACTORLIB_MITSUBA"] = "scalar_rgb"  # read where Mitsuba is first used
     size = Parameters(**{field: facts[field] for field in ("width", "height", "light_rows", "spp")})
     for number, seed in enumerate(facts["seeds"]):
@@ -44,19 +45,19 @@ def main(params: Params, inputs: Inputs, out: Path, progress: Progress) -> None:
             draft.mkdir(parents=True)
             generate(draft, seed, [], size, silent, SET.shots[: facts["shots"]])
             draft.rename(done)
-        run_stages(done, out / str(seed), (masks, align, urm))
+        run_stages(read_dataset(done), out / str(seed), (masks, align, urm))
         shutil.copytree(done, out / str(seed) / "data")
     return shutil.rmtree(out / "draft", ignore_errors=True)
 
 
 def run_stages(
-    folder: Path, out: Path, stages: Sequence[ModuleType], params: Mapping[str, dict[str, Any]] = {}, photos: Sequence[str] | None = None
+    dataset: Dataset, out: Path, stages: Sequence[ModuleType], params: Mapping[str, dict[str, Any]] = {}, photos: Sequence[str] | None = None
 ) -> None:  # fmt: skip
-    """Run stages, of which the first is `masks`, on the data set in `folder`, each into out/<stage>/, without the runner.
+    """Run stages, of which the first is `masks`, on a data set, each into out/<stage>/, without the runner.
 
     What each takes is read in pipeline.yaml.  params: by stage, those that differ from their defaults;  photos: None for all of the set
     """
-    dataset, said = read_dataset(folder), yaml.safe_load((CHECKOUT / "pipeline.yaml").read_text(encoding="utf-8"))
+    said = yaml.safe_load((CHECKOUT / "pipeline.yaml").read_text(encoding="utf-8"))
     photos = [photo.name for photo in dataset.spec.photos] if photos is None else photos
     done = {"train": SHIPPED}
     for stage in stages:

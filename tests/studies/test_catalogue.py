@@ -13,7 +13,7 @@ from factorlib.evaluate.gauge import connected_components
 from factorlib.runner.closure import Sources
 from factorlib.runner.filehash import FileHashes
 from factorlib.runner.project import LIBRARY
-from factorlib.solve.few_lobes.options import FewLobes
+from stages.solve import Params
 from studies.catalogue import comparison, cost, hard_cases, leave_one_out, network_evaluation, parts, seeds_and_machines
 from studies.catalogue.paper_sets import patterns
 from studies.catalogue.structure import PATTERNS
@@ -108,9 +108,8 @@ def test_every_shell_is_in_another_photo_too_and_keys_have_what_photos_contain()
 
 
 def test_options_of_parts_are_options():
-    known = {*FewLobes.__struct_fields__, "robust_scale", "seen", "shadows", "bounces"}
-    for _, _, how in parts.WITHOUT.values():
-        assert how.keys() <= known and how.get("seen", "sure") in CHANGES
+    for _, _, change, how in parts.WITHOUT.values():
+        assert change in CHANGES and msgspec.convert(how, Params)
 
 
 def test_hard_cases_are_those_of_the_tests_and_instructions_those_that_every_run_fixes():
