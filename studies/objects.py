@@ -51,18 +51,6 @@ def body(name: str, triangles: int | None = None) -> Caster:
     return Caster(shapes.mesh_of(parts, name))
 
 
-def body_of(material: int, light: int) -> str:
-    """The name of the body that stands for an entry."""
-    return BODIES[(material + light) % len(BODIES)]
-
-
-def pose_of(whole: Caster, rng: np.random.Generator) -> Pose:
-    """Turned at random, its middle in the middle of the picture, which it fills."""
-    rotation = Rotation.random(rng=rng).as_matrix()
-    middle = np.array([0.0, 0.0, 2 * CAMERA.focal * whole.radius / (FILL * SIDE)])
-    return Pose(rotation, middle - rotation @ whole.centre)
-
-
 def observed(
     case: Case, materials: Mapping[str, Reflectance], lights: Mapping[int, Light]
 ) -> tuple[dict[str, Observations], float]:
@@ -80,9 +68,14 @@ def observed(
 
 
 def _entry(case: Case, m: int, li: int, material: Reflectance, light: Light) -> tuple[Observations, float]:
-    how, rng, name = case.objects, np.random.default_rng([14, case.seed, m, li]), body_of(m, li)
-    truth = pose_of(body(name), rng)
-    true_maps, (mesh, pose) = rasterise(body(name), CAMERA, truth), perturbed(name, truth, how, rng)
+    how, rng, name = case.objects, np.random.default_rng([14, case.seed, m, li]), BODIES[(m + li) % len(BODIES)]
+    whole, rotation = (
+        body(name),
+        Rotation.random(rng=rng).as_matrix(),
+    )  # its middle in the middle of the picture, which it fills
+    middle = np.array([0.0, 0.0, 2 * CAMERA.focal * whole.radius / (FILL * SIDE)])
+    truth = Pose(rotation, middle - rotation @ whole.centre)
+    true_maps, (mesh, pose) = rasterise(whole, CAMERA, truth), perturbed(name, truth, how, rng)
     outline = Silhouette(true_maps.label.astype(np.int16))
     maps = rasterise(mesh, CAMERA, fitted(mesh, pose, outline) if how.refined else pose)
     sure = confidence(maps, outline) if how.confidence else np.ones(maps.label.shape)

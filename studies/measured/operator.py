@@ -140,12 +140,14 @@ def gradient(operator: Operator, *inputs: Tensor) -> None:
     operator.response(*inputs)
 
 
-def microseconds(operators: dict[str, Operator]) -> dict[str, list[list[float]]]:
+def microseconds(
+    operators: dict[str, Operator], rows: int = 1024, repeats: int = REPEATS
+) -> dict[str, list[list[float]]]:
     """Of all repeats, of values alone and of values with all derivatives, by operator."""
-    counts = {label: 8 if label in TOLERANCES else 1024 for label in operators}
+    counts = {label: 8 if label in TOLERANCES else rows for label in operators}
     inputs = {label: point(operator, counts[label]) for label, operator in operators.items()}
     taken: dict[str, list[list[float]]] = {label: [[], []] for label in operators}
-    for _ in range(REPEATS + 1):
+    for _ in range(repeats + 1):
         for label, operator in operators.items():
             for of, measure in zip(taken[label], (values, gradient), strict=True):
                 start = time.process_time()

@@ -1,4 +1,4 @@
-"""What measurements and studies share: numbers and tables as text, text between marks of a page, time, threads."""
+"""What measurements and studies share: numbers and tables as text, text between marks of a page, time, processes."""
 
 from __future__ import annotations
 
@@ -8,8 +8,7 @@ import re
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Iterable, Mapping, Sequence
-from concurrent.futures import ThreadPoolExecutor
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -107,9 +106,3 @@ class Clock:
     def taken(self) -> Taken:
         """The time until now."""
         return Taken(round(time.perf_counter() - self._wall, 3), round(time.process_time() - self._processor, 3))
-
-
-def threaded(function: Callable, items: Iterable) -> list:
-    """The map that solvers are handed: as many threads as the machine has processors, as in `make all`."""
-    with ThreadPoolExecutor(os.cpu_count()) as pool:
-        return list(pool.map(function, items))

@@ -1,14 +1,13 @@
 """What photos of data sets show, by the stages `masks`, `align` and `urm` themselves: writes <set>/ with a folder for each stage.
 
 Sets are one of this checkout, or rendered sets of chairs of all seeds, as `factorlib.generate` makes them, which <set>/data keeps: photographs
-have all bounces, a mesh coarser than what was photographed, clipped pixels.  A rendered set that is done outlives a kill of the step.
+have all bounces, a mesh coarser than what was photographed, clipped pixels.
 Mitsuba's scalar variant traces, which every machine has.
 """
 
 from __future__ import annotations
 
 import os
-import shutil
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from types import ModuleType
@@ -32,7 +31,7 @@ CHECKOUT = Path(__file__).resolve().parents[2]
 
 def main(params: Params, inputs: Inputs, out: Path, progress: Progress) -> None:
     """All rendered sets, or some photos of a data set of this checkout; poses are searched as in every run."""
-    facts, kept = inputs.facts["dataset.sets"], inputs.unfinished or out / "draft"
+    facts = inputs.facts["dataset.sets"]
     if "folder" in facts:
         folder = CHECKOUT / facts["folder"]
         return run_stages(read_dataset(folder), out / folder.name, (masks, align, urm), photos=facts["photos"])
@@ -40,14 +39,10 @@ def main(params: Params, inputs: Inputs, out: Path, progress: Progress) -> None:
     size = Parameters(**{field: facts[field] for field in ("width", "height", "light_rows", "spp")})
     for number, seed in enumerate(facts["seeds"]):
         progress(number, len(facts["seeds"]), f"set {seed}")
-        if not (done := kept / str(seed)).exists():
-            shutil.rmtree(draft := kept / "draft", ignore_errors=True)
-            draft.mkdir(parents=True)
-            generate(draft, seed, [], size, silent, SET.shots[: facts["shots"]])
-            draft.rename(done)
-        run_stages(read_dataset(done), out / str(seed), (masks, align, urm))
-        shutil.copytree(done, out / str(seed) / "data")
-    return shutil.rmtree(out / "draft", ignore_errors=True)
+        (data := out / str(seed) / "data").mkdir(parents=True)
+        generate(data, seed, [], size, silent, SET.shots[: facts["shots"]])
+        run_stages(read_dataset(data), out / str(seed), (masks, align, urm))
+    return None
 
 
 def run_stages(

@@ -1,13 +1,11 @@
 """The lights of all worlds that a study shows: writes <seed>-<light>.exr, lat-long, mean radiance 1.
 
-A light that is done outlives a kill of the step.  Mitsuba's scalar variant traces, which every machine has: the faster one gives
-other noise, and so other worlds.
+Mitsuba's scalar variant traces, which every machine has: the faster one gives other noise, and so other worlds.
 """
 
 from __future__ import annotations
 
 import os
-import shutil
 from pathlib import Path
 
 import msgspec
@@ -20,16 +18,10 @@ from studies.study import World
 
 
 def main(params: Params, inputs: Inputs, out: Path, progress: Progress) -> None:
-    """Trace every light that is not there yet."""
+    """Trace every light."""
     os.environ["FACTORLIB_MITSUBA"] = "scalar_rgb"  # read where Mitsuba is first used
     world = msgspec.convert(inputs.facts["dataset.worlds"], World)
     wanted = [(seed, light) for seed in world.seeds for light in range(world.lights)]
-    kept = inputs.unfinished or out / "draft"
-    kept.mkdir(parents=True, exist_ok=True)
     for number, (seed, light) in enumerate(wanted):
         progress(number, len(wanted), f"light {light} of seed {seed}")
-        if not (file := kept / f"{seed}-{light}.exr").exists():
-            write_rgb_exr(draft := kept / "draft.exr", light_map(seed, light, world.rows, world.spp), LAT_LONG)
-            draft.rename(file)
-        shutil.copy(file, out)
-    shutil.rmtree(out / "draft", ignore_errors=True)
+        write_rgb_exr(out / f"{seed}-{light}.exr", light_map(seed, light, world.rows, world.spp), LAT_LONG)
