@@ -20,16 +20,15 @@ from factorlib.runner.stop import heed_stops
 from studies.run import STUDIES, collect, forget, make, studies
 from studies.study import FULL, QUICK
 
-app = typer.Typer(add_completion=False, pretty_exceptions_enable=False, rich_markup_mode=None)
 
-
-@app.command()
 def run(
     names: Annotated[list[str] | None, typer.Argument(help="studies; all without it; else STUDY")] = None,
     quick: Annotated[bool, typer.Option("--quick", help="one seed, smallest sets; as QUICK=1")] = False,
     one: Annotated[bool, typer.Option("--one", help="a study must be named")] = False,
     force: Annotated[bool, typer.Option("--force", help="run again, whatever the store holds; as FORCE=1")] = False,
-    docs: Annotated[bool, typer.Option("--docs", help="also write the tables of docs/studies.md anew")] = False,
+    docs: Annotated[
+        bool, typer.Option("--docs", help="also write the tables of docs/studies.md anew, of full studies")
+    ] = False,
     clean: Annotated[bool, typer.Option("--clean", help="forget results instead")] = False,
     gc: Annotated[bool, typer.Option("--gc", help="delete results that no study names any more instead")] = False,
 ) -> None:
@@ -45,15 +44,16 @@ def run(
     if clean:
         raise typer.Exit(forget(scale, named or list(STUDIES)))
     code = make(scale, named or list(STUDIES), switched_on("FORCE", force), executor_words([os.environ.get("SET", "")]))
-    if docs and code == 0:
+    if docs and code == 0 and not scale.quick:
         from studies.run.page import refresh_docs
 
-        refresh_docs(named or list(STUDIES), scale.quick)
+        refresh_docs(named or list(STUDIES))
     raise typer.Exit(code)
 
 
-def main() -> None:
-    """An error of the input ends the program with its message and exit code 1."""
+if __name__ == "__main__":
+    app = typer.Typer(add_completion=False, pretty_exceptions_enable=False, rich_markup_mode=None)
+    app.command()(run)
     try:
         with heed_stops():
             app(prog_name="python -m studies")
@@ -63,7 +63,3 @@ def main() -> None:
         if (known := disk_error(error, studies().build)) is None:
             raise
         sys.exit(f"error: {known}")
-
-
-if __name__ == "__main__":
-    main()

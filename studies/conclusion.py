@@ -11,102 +11,88 @@ from __future__ import annotations
 import csv
 import io
 from collections.abc import Mapping, Sequence
-from typing import Literal
 
 import msgspec
 import numpy as np
 from scipy.stats import t as student
 
 from studies.measured.tools import exact
-from studies.study import Claim, Guess, Rise, Scale, Score, Side, Study, case_name, settings_of
+from studies.study import Claim, Scale, Score, Side, Study, case_name, settings_of
 
 # ── measures ─────────────────────────────────────────────────────────────────────────────────────────────────────────
 
-
-class Measure(msgspec.Struct, frozen=True):
-    """A measure's name in tables and on axes, and its unit, 1 for a ratio.  Lower is better where the name does not say otherwise."""
-
-    label: str
-    unit: str = "1"
-
-    @property
-    def head(self) -> str:
-        """The label, and the unit where there is one.
-
-        >>> MEASURES["peak"].head, MEASURES["roughness"].head
-        ('largest memory of the process (GB)', 'error of roughness')
-        """
-        return self.label if self.unit == "1" else f"{self.label} ({self.unit})"
-
-    @property
-    def words(self) -> str:
-        """The label as the subject of a sentence.
-
-        >>> MEASURES["entries"].words, MEASURES["roughness"].words
-        ('DSSIM of all entries', 'the error of roughness')
-        """
-        return self.label.replace("DSSIM, ", "DSSIM of ") if self.label.startswith("DSSIM") else f"the {self.label}"
-
-
-OF_TRUTH, OF_RMS = "relative to the truth", "RMSE over the truth's RMS"
 IN_GAUGE = {"": "", "_scaled": ", all scaled by one number", "_balanced": ", each channel scaled"}
-MEASURES = {
-    "entries": Measure("DSSIM, all entries"),
-    "observed": Measure("DSSIM, observed entries"),
-    "unobserved": Measure("DSSIM, unobserved entries"),
-    "new_light": Measure("DSSIM, recovered materials, in every light"),
-    "new_material": Measure("DSSIM, every material, in recovered lights"),
-    "first_material": Measure("DSSIM, material 0 in every light"),
-    "first_light": Measure("DSSIM, every material in light 0"),
-    "diffuse": Measure("error of k_d", OF_TRUTH),
-    "specular": Measure("error of k_s", OF_TRUTH),
-    "roughness": Measure("error of roughness"),
-    "mirror": Measure("error of a mirror sphere", OF_RMS),
-    "glossy": Measure("error of a glossy sphere", OF_RMS),
-    "lambertian": Measure("error of a Lambertian sphere", OF_RMS),
-    "chair": Measure("DSSIM of a chair"),
-    "chair_scaled": Measure("DSSIM of a chair, a factor per channel taken out"),
-    "normals": Measure("median error of the normals given", "degrees"),
-    "seconds": Measure("processor time of a solve", "s"),
-    "stated_roughness": Measure("stated standard error of roughness"),
-    "stated_reflectance": Measure("stated standard error of k_d and k_s", "relative to k_d + k_s"),
+MEASURES = {  # label, and the unit where there is one; lower is better where the label does not say otherwise
+    "entries": "DSSIM, all entries",
+    "observed": "DSSIM, observed entries",
+    "unobserved": "DSSIM, unobserved entries",
+    "new_light": "DSSIM, recovered materials, in every light",
+    "new_material": "DSSIM, every material, in recovered lights",
+    "first_material": "DSSIM, material 0 in every light",
+    "first_light": "DSSIM, every material in light 0",
+    "diffuse": "error of k_d|relative to the truth",
+    "specular": "error of k_s|relative to the truth",
+    "roughness": "error of roughness",
+    "mirror": "error of a mirror sphere|RMSE over the truth's RMS",
+    "glossy": "error of a glossy sphere|RMSE over the truth's RMS",
+    "lambertian": "error of a Lambertian sphere|RMSE over the truth's RMS",
+    "chair": "DSSIM of a chair",
+    "chair_scaled": "DSSIM of a chair, a factor per channel taken out",
+    "normals": "median error of the normals given|degrees",
+    "seconds": "processor time of a solve|s",
+    "stated_roughness": "stated standard error of roughness",
+    "stated_reflectance": "stated standard error of k_d and k_s|relative to k_d + k_s",
     **{
-        f"novel_{kind}{gauge}": Measure(f"DSSIM, new {kind}{words}")
+        f"novel_{kind}{gauge}": f"DSSIM, new {kind}{words}"
         for kind in ("view", "light", "material")
         for gauge, words in IN_GAUGE.items()
     },
-    "processor": Measure("time of the processor", "s"),
-    "chromaticity": Measure("chromaticity of the lights", "deviation over mean"),
-    "true_chromaticity": Measure("chromaticity of the true lights", "deviation over mean"),
-    "colour": Measure("angle of a mirror sphere's colour", "degrees"),
-    "tint": Measure("tint of all reflectances", "deviation of the log over channels"),
-    "seconds_an_entry": Measure("processor time of the solve, an entry", "s"),
-    "peak": Measure("largest memory of the process", "GB"),
-    "grown": Measure("memory beyond that before the solve", "GB"),
-    "error_median": Measure("error of a reflection, median"),
-    "error_p95": Measure("error of a reflection, 95th percentile"),
-    "error_worst": Measure("error of a reflection, worst"),
-    "rendering": Measure("DSSIM, a rendered sphere"),
-    "microseconds": Measure("processor time an evaluation", "µs"),
-    "unseen": Measure("error of unseen cells", "RMSE over the peak"),
-    "kept_parts": Measure("parts that the solve took, of two"),
-    "of_bound": Measure("solve: largest error over its bound"),
-    "hard_k": Measure("solve: error of reflectances", OF_TRUTH),
-    "hard_roughness": Measure("solve: error of roughness"),
-    "hard_radiance": Measure("solve: error of re-synthesis", "relative"),
-    "value_error": Measure("operator: worst error of values"),
-    "gradient_rounding": Measure("operator: worst rounding of derivatives"),
-    "not_finite": Measure("operator: a value is not finite"),
-    "wrong_poses": Measure("align: wrong poses", "share"),
-    "normal_error": Measure("align: error of normals, median", "degrees"),
-    "undoubted": Measure("align: wrong without a doubt", "share"),
-    "materials.worst_roughness": Measure("roughness, worst material"),
-    "materials.worst_diffuse": Measure("diffuse, worst", OF_TRUTH),
-    "materials.worst_specular": Measure("specular, worst", OF_TRUTH),
-    "resynthesis.worst_psnr_linear_db": Measure("re-synthesis, worst photo, linear (higher is better)", "dB"),
-    "relighting.mean.scalar_per_set.in_true_light.psnr_tonemapped_db": Measure("relit balls (higher is better)", "dB"),
-    "light.mean.channel_per_photo.glossy.estimate.rmse": Measure("glossy sphere", OF_RMS),
+    "processor": "time of the processor|s",
+    "chromaticity": "chromaticity of the lights|deviation over mean",
+    "true_chromaticity": "chromaticity of the true lights|deviation over mean",
+    "colour": "angle of a mirror sphere's colour|degrees",
+    "tint": "tint of all reflectances|deviation of the log over channels",
+    "seconds_an_entry": "processor time of the solve, an entry|s",
+    "peak": "largest memory of the process|GB",
+    "grown": "memory beyond that before the solve|GB",
+    "error_median": "error of a reflection, median",
+    "error_p95": "error of a reflection, 95th percentile",
+    "error_worst": "error of a reflection, worst",
+    "rendering": "DSSIM, a rendered sphere",
+    "microseconds": "processor time an evaluation|µs",
+    "of_bound": "solve: largest error over its bound",
+    "hard_k": "solve: error of reflectances|relative to the truth",
+    "hard_roughness": "solve: error of roughness",
+    "hard_radiance": "solve: error of re-synthesis|relative",
+    "value_error": "operator: worst error of values",
+    "gradient_rounding": "operator: worst rounding of derivatives",
+    "not_finite": "operator: a value is not finite",
+    "wrong_poses": "align: wrong poses|share",
+    "normal_error": "align: error of normals, median|degrees",
+    "undoubted": "align: wrong without a doubt|share",
+    "materials.worst_roughness": "roughness, worst material",
+    "materials.worst_diffuse": "diffuse, worst|relative to the truth",
+    "materials.worst_specular": "specular, worst|relative to the truth",
+    "resynthesis.worst_psnr_linear_db": "re-synthesis, worst photo, linear (higher is better)|dB",
+    "relighting.mean.scalar_per_set.in_true_light.psnr_tonemapped_db": "relit balls (higher is better)|dB",
+    "light.mean.channel_per_photo.glossy.estimate.rmse": "glossy sphere|RMSE over the truth's RMS",
 }
+
+
+def label(measure: str) -> str:
+    """The name of a measure, without its unit."""
+    return MEASURES[measure].partition("|")[0]
+
+
+def head(measure: str) -> str:
+    """The name of a measure and its unit, of tables and axes.
+
+    >>> head("peak"), head("roughness")
+    ('largest memory of the process (GB)', 'error of roughness')
+    """
+    words, _, unit = MEASURES[measure].partition("|")
+    return f"{words} ({unit})" if unit else words
+
 
 # ── numbers over seeds ───────────────────────────────────────────────────────────────────────────────────────────────
 
@@ -131,13 +117,6 @@ class Spread(msgspec.Struct, frozen=True):
     high: float | None = None
 
 
-class Difference(msgspec.Struct, frozen=True):
-    """The first setting minus the second over the seeds that both have, and what it shows of the first."""
-
-    spread: Spread
-    verdict: Literal["lower", "higher", "not shown", "too few seeds"]
-
-
 def spread(values: Sequence[float], doubt: float = DOUBT) -> Spread:
     """The mean and its interval of 1 − doubt.
 
@@ -153,11 +132,13 @@ def spread(values: Sequence[float], doubt: float = DOUBT) -> Spread:
     return Spread(mean, n, deviation, mean - half, mean + half)
 
 
-def difference(first: Mapping[int, float], second: Mapping[int, float], comparisons: int = 1) -> Difference:
-    """Compare a measure by seed in two settings; comparisons: how many the study makes.  Raises ValueError where no seed has both.
+def difference(first: Mapping[int, float], second: Mapping[int, float], comparisons: int = 1) -> tuple[Spread, str]:
+    """The first setting minus the second over the seeds that both have, and what it shows of the first: lower, higher, …
+
+    comparisons: how many the study makes.  Raises ValueError where no seed has both.
 
     >>> better = {seed: 0.1 + 0.001 * seed for seed in range(5)}
-    >>> difference(better, {seed: 0.2 for seed in range(5)}).verdict
+    >>> difference(better, {seed: 0.2 for seed in range(5)})[1]
     'lower'
     """
     seeds = sorted(first.keys() & second.keys())
@@ -165,10 +146,10 @@ def difference(first: Mapping[int, float], second: Mapping[int, float], comparis
         raise ValueError("no seed has both")
     apart = spread([first[seed] - second[seed] for seed in seeds], DOUBT / comparisons)
     if apart.seeds < LEAST_SEEDS:
-        return Difference(apart, "too few seeds")
+        return apart, "too few seeds"
     if apart.low <= 0 <= apart.high:
-        return Difference(apart, "not shown")
-    return Difference(apart, "lower" if apart.mean < 0 else "higher")
+        return apart, "not shown"
+    return apart, "lower" if apart.mean < 0 else "higher"
 
 
 # ── a study's table ──────────────────────────────────────────────────────────────────────────────────────────────────
@@ -205,18 +186,18 @@ class Row(msgspec.Struct, frozen=True):
 
 
 class Outcome(msgspec.Struct, frozen=True):
-    """A claim, what the seeds say of it, and that as a sentence."""
+    """What the seeds say of a claim, and that as a sentence; difference: of its two sides;  paper: whether the paper makes it."""
 
-    claim: Claim
-    difference: Difference
     answer: str
     sentence: str
+    difference: Spread
+    paper: bool
 
 
 class Conclusion(msgspec.Struct, frozen=True):
     """All of a study's table.json.
 
-    label:    what stands beside everything that is shown of a quick study; empty of a full one
+    quick:    what stands beside everything that is shown of a quick study; empty of a full one
     pictures: captions of the PNG files in the study's folder pictures/, by file
     over:     what intervals are over;  notes: sentences that are no claims;  own_answer: to the paper, where it is not that of the claims
     """
@@ -226,12 +207,11 @@ class Conclusion(msgspec.Struct, frozen=True):
     question: str
     paper: str
     varied: str
-    scale: str
-    label: str
+    quick: str
     seeds: tuple[int, ...]
     measures: tuple[str, ...]
     rows: list[Row]
-    claims: list[Outcome]
+    claims: list[Outcome] = []
     over: str = "seeds"
     pictures: dict[str, str] = {}
     notes: list[str] = []
@@ -245,71 +225,57 @@ class Conclusion(msgspec.Struct, frozen=True):
     @property
     def answer(self) -> str:
         """Agrees where all claims of the paper are shown, in part where some are, disagrees where the opposite of one is."""
-        answers = [tested.answer for tested in self.claims if tested.claim.paper]
-        if self.label:
-            return f"not tested ({self.label})"
+        answers = [tested.answer for tested in self.claims if tested.paper]
+        if self.quick:
+            return f"not tested ({self.quick})"
         if self.own_answer or not answers:
             return self.own_answer or "the paper claims nothing that is tested here"
-        if "disagrees" in answers:
-            return "disagrees"
         shown = answers.count("agrees")
-        part = f"agrees in part: {shown} of {len(answers)} claims are shown"
-        return part if 0 < shown < len(answers) else answers[0]
+        if "disagrees" in answers or not 0 < shown < len(answers):
+            return "disagrees" if "disagrees" in answers else answers[0]
+        return f"agrees in part: {shown} of {len(answers)} claims are shown"
 
 
 def concluded(study: Study, scale: Scale, scores: Mapping[str, Score]) -> Conclusion:
     """The table of a study and what its claims come to; scores: by the names of its cases."""
-    seeds, claims = study.numbers(scale), study.claims(scale)
-    rows = [
-        Row(s.name, s.label, _cells({n: scores[case_name(s.name, n)] for n in seeds})) for s in study.settings(scale)
-    ]
-    by_name = {row.name: row for row in rows}
-    tested = [_outcome(claim, by_name, len(claims), study.over) for claim in claims if _testable(claim, by_name)]
+    seeds, rows = study.numbers(scale), {}
+    for s in study.settings(scale):
+        of, cells = {n: scores[case_name(s.name, n)] for n in seeds}, {}
+        for m in MEASURES:
+            values = {n: score.values[m] for n, score in of.items() if m in score.values}
+            nulls = {n: score.nulls[m] for n, score in of.items() if m in score.nulls}
+            cells |= {m: Cell(spread(list(values.values())), values, nulls)} if values else {}
+        rows[s.name] = Row(s.name, s.label, cells)
+    tested = [] if scale.quick else [_outcome(c, rows, len(study.claims), study.over) for c in study.claims]
     table = Conclusion(
-        study.name, study.title, study.question, study.paper, study.varied, scale.name, NO_CONCLUSION if scale.quick else "",
-        seeds, study.measures, rows, tested, study.over,
+        study.name, study.title, study.question, study.paper, study.varied, NO_CONCLUSION if scale.quick else "",
+        seeds, study.measures, list(rows.values()), tested, study.over,
     )  # fmt: skip
     return msgspec.structs.replace(table, notes=study.notes(table), own_answer=study.answer(table))
 
 
-def _cells(scores: Mapping[int, Score]) -> dict[str, Cell]:
-    cells = {}
-    for m in MEASURES:
-        values = {seed: score.values[m] for seed, score in scores.items() if m in score.values}
-        nulls = {seed: score.nulls[m] for seed, score in scores.items() if m in score.nulls}
-        cells |= {m: Cell(spread(list(values.values())), values, nulls)} if values else {}
-    return cells
-
-
-def _testable(claim: Claim, rows: Mapping[str, Row]) -> bool:
-    """Whether all settings have the measure, and its null where that is compared: small sets lack some."""
-    have_it = all(name in rows and claim.measure in rows[name].cells for name in claim.settings)
-    sides = (claim.lower, claim.higher)
-    return have_it and claim.lower != claim.higher and all(_by_seed(side, claim.measure, rows) for side in sides)
-
-
 def _by_seed(side: Side, measure: str, rows: Mapping[str, Row]) -> dict[int, float]:
-    cells = [rows[name].cells[measure] for name in settings_of(side)]
-    if not isinstance(side, Rise):
-        return cells[0].nulls if isinstance(side, Guess) else cells[0].values
-    start, end = (cell.values for cell in cells)
-    return {seed: (end[seed] - value) / side.per for seed, value in start.items() if seed in end}
+    first, *last = (rows[name].cells[measure] for name in settings_of(side))
+    if isinstance(side, str) or side[0] == "guess":
+        return first.values if isinstance(side, str) else first.nulls
+    return {seed: (last[0].values[seed] - value) / side[3] for seed, value in first.values.items()}
 
 
 def _outcome(claim: Claim, rows: Mapping[str, Row], comparisons: int, over: str) -> Outcome:
     """What the seeds say of a claim, as a sentence too."""
     sides = (claim.lower, claim.higher)
-    result = difference(*(_by_seed(side, claim.measure, rows) for side in sides), comparisons)
+    s, verdict = difference(*(_by_seed(side, claim.measure, rows) for side in sides), comparisons)
     labels = [" to ".join(f"“{rows[name].label}”" for name in settings_of(side)) for side in sides]
-    first, second = ("a guess" if isinstance(s, Guess) else label for s, label in zip(sides, labels, strict=True))
-    s, rise = result.spread, "the rise of " if isinstance(claim.lower, Rise) else ""
-    if result.verdict == "too few seeds":
+    first, second = ("a guess" if side[0] == "guess" else words for side, words in zip(sides, labels, strict=True))
+    if verdict == "too few seeds":
         words = f"not tested: {s.seeds} of at least {LEAST_SEEDS} {over} were run"
     else:
-        said = {"lower": "shown", "higher": "the opposite is shown", "not shown": "no difference is shown"}
-        words = f"{said[result.verdict]} ({rise}{MEASURES[claim.measure].words} in {first} against {second}: "
+        said = {"lower": "shown", "higher": "the opposite is shown", "not shown": "no difference is shown"}[verdict]
+        name, rise = label(claim.measure), "the rise of " if claim.lower[0] == "rise" else ""
+        subject = name.replace("DSSIM, ", "DSSIM of ") if name.startswith("DSSIM") else f"the {name}"
+        words = f"{said} ({rise}{subject} in {first} against {second}: "
         words += f"{s.mean:+.2g}, {s.low:+.2g} to {s.high:+.2g} over {s.seeds} {over})"
-    return Outcome(claim, result, ANSWERS[result.verdict], f"{claim.words}: {words}.")
+    return Outcome(ANSWERS[verdict], f"{claim.words}: {words}.", s, claim.paper)
 
 
 def best(table: Conclusion, measure: str) -> str:
@@ -317,23 +283,29 @@ def best(table: Conclusion, measure: str) -> str:
 
     The best was picked from what it is compared with, so that the sentence is weaker than a claim.
     """
-    rows = [row for row in table.rows if measure in row.cells]
-    least = min(rows, key=lambda row: row.cells[measure].spread.mean)
-    others = [row for row in rows if row is not least]
-    verdicts = {
-        row.label: difference(least.cells[measure].values, row.cells[measure].values, len(others)).verdict
-        for row in others
-    }
-    start = f"Least mean of {MEASURES[measure].label}: “{least.label}”"
+    cells = {row.label: row.cells[measure] for row in table.rows if measure in row.cells}
+    least = min(cells, key=lambda name: cells[name].spread.mean)
+    others = [name for name in cells if name != least]
+    verdicts = {n: difference(cells[least].values, cells[n].values, len(others))[1] for n in others}
+    start = f"Least mean of {label(measure)}: “{least}”"
     if "too few seeds" in verdicts.values():
         return f"{start}; of too few seeds to say whether any other is worse."
-    alike = ", ".join(f"“{label}”" for label, verdict in verdicts.items() if verdict == "not shown")
+    alike = ", ".join(f"“{name}”" for name, verdict in verdicts.items() if verdict == "not shown")
     return f"{start}; not shown to be worse: {alike}." if alike else f"{start}; all others are shown to be worse."
+
+
+def farthest(*solves: Mapping[str, Mapping[int, float]]) -> str:
+    """How far numbers of the same seed lie apart at most, as a clause; each of them by measure, then by seed."""
+    apart = {m: max(np.ptp([of[m][seed] for of in solves]) for seed in solves[0][m]) for m in solves[0]}
+    most = "; ".join(f"{label(m)} by {v:.2g}" for m, v in apart.items() if v)
+    return (
+        f"numbers of the same seed differ at most so: {most}" if most else "every number is the same to the last digit"
+    )
 
 
 # ── as text ──────────────────────────────────────────────────────────────────────────────────────────────────────────
 
-HEAD = ("study", "scale", "setting", "label", "measure", "unit", "seeds", "mean", "deviation", "low_95", "high_95", "null_mean")  # fmt: skip
+HEAD = ("study", "setting", "label", "measure", "unit", "seeds", "mean", "deviation", "low_95", "high_95", "null_mean")
 
 
 def csv_text(table: Conclusion) -> str:
@@ -343,15 +315,14 @@ def csv_text(table: Conclusion) -> str:
     writer.writerow(HEAD)
     for row in table.rows:
         for measure, cell in row.cells.items():
-            s = cell.spread
+            s, unit = cell.spread, MEASURES[measure].partition("|")[2]
             numbers = ("" if v is None else f"{v:.6g}" for v in (s.mean, s.deviation, s.low, s.high, cell.null))
-            unit = MEASURES[measure].unit
-            writer.writerow([table.study, table.scale, row.name, row.label, measure, unit, s.seeds, *numbers])
+            writer.writerow([table.study, row.name, row.label, measure, unit, s.seeds, *numbers])
     return out.getvalue()
 
 
 def paragraph(table: Conclusion) -> str:
     """Markdown: the question, what the paper says, and what the seeds say of each claim."""
-    label = f" *{table.label}.*" if table.label else ""
-    start = f"**{table.title}.** {table.question}{label} The paper: {table.paper}"
+    quick = f" *{table.quick}.*" if table.quick else ""
+    start = f"**{table.title}.** {table.question}{quick} The paper: {table.paper}"
     return "\n".join([start, "", *(f"- {sentence}" for sentence in table.sentences)]) + "\n"

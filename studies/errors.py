@@ -9,43 +9,26 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 
-import msgspec
 import numpy as np
 from jaxtyping import Float
 
-from factorlib.evaluate.ball import Light, light_of_lat_long
+from factorlib.evaluate.ball import light_of_lat_long
 from factorlib.evaluate.lights import SPHERES, compare_lights
 from factorlib.evaluate.materials import common_factor, compare_materials
 from factorlib.light.latlong import lat_long_of_lobes
-from factorlib.results.lobes import Lobes, read_lobes
+from factorlib.results.lobes import read_lobes
 from factorlib.results.materials import Reflectance
-from studies.study import Case, Score, light_name
+from studies.study import Score, light_name
 
 PARTS = ("diffuse", "specular", "roughness")
 ROWS = 128  # of the maps of recovered lights, as the stage `export` writes them
+Map = Float[np.ndarray, "h w 3"]
 
 
-class Answer(msgspec.Struct, frozen=True):
-    """What was solved, in the truth's gauge: materials by name, lights by number."""
-
-    materials: dict[str, Reflectance]
-    lights: dict[int, Light]
-
-
-def map_of(lobes: Lobes) -> Float[np.ndarray, "h w 3"]:
-    """Radiance of a recovered light, lat-long."""
-    return lat_long_of_lobes(lobes, ROWS, 2 * ROWS)
-
-
-def maps_of(solved: Path, numbers: Iterable[int]) -> dict[int, Float[np.ndarray, "h w 3"]]:
-    """The recovered lights of these numbers as maps, in the solve's own gauge; solved: the folder that `solve` wrote."""
+def maps_of(solved: Path, numbers: Iterable[int]) -> dict[int, Map]:
+    """The recovered lights of these numbers, in the solve's own gauge; solved: the folder that `solve` wrote."""
     lobes = read_lobes(solved / "lobes.parquet")
-    return {li: map_of(lobes[light_name(li)]) for li in numbers}
-
-
-def lights_of(solved: Path, numbers: Iterable[int]) -> dict[int, Light]:
-    """The same, ready to be reflected."""
-    return {li: light_of_lat_long(radiance) for li, radiance in maps_of(solved, numbers).items()}
+    return {li: lat_long_of_lobes(lobes[light_name(li)], ROWS, 2 * ROWS) for li in numbers}
 
 
 def factor_of(materials: Mapping[str, Reflectance], truths: Mapping[str, Reflectance]) -> Float[np.ndarray, "3"]:
@@ -59,19 +42,12 @@ def times(material: Reflectance, factor: Float[np.ndarray, "3"]) -> Reflectance:
     return Reflectance(diffuse, specular, material.roughness)
 
 
-def in_true_gauge(
-    case: Case, table: Mapping[str, Reflectance], lights: Mapping[int, Light], truths: Mapping[str, Reflectance], component: Mapping[str, int]
-) -> Answer:  # fmt: skip
-    """Each component's materials times its factor per channel, its lights divided by it.
-
-    component: of each material by name, as `connected_components` numbers them
-    """
-    names = {number: [n for n in case.material_names if component[n] == number] for number in component.values()}
-    factor = {number: factor_of({n: table[n] for n in of}, truths) for number, of in names.items()}
-    of_light = {li: factor[component[case.names_in(li)[0]]] for li in case.lights}
-    scaled = {li: tuple((level / f).astype(np.float32) for level in lights[li].levels) for li, f in of_light.items()}
-    materials = {n: times(table[n], factor[component[n]]) for n in case.material_names}
-    return Answer(materials, {li: Light(levels) for li, levels in scaled.items()})
+def in_gauge(
+    materials: Mapping[str, Reflectance], lights: Mapping[int, Map], truths: Mapping[str, Reflectance]
+) -> tuple[dict[str, Reflectance], dict[int, Map]]:
+    """Materials times the factor to the truth, lights divided by it: what they show together stays as it is."""
+    factor = factor_of(materials, truths)
+    return {name: times(m, factor) for name, m in materials.items()}, {li: of / factor for li, of in lights.items()}
 
 
 def material_errors(
@@ -83,11 +59,14 @@ def material_errors(
 
 
 def light_errors(
-    lights: Mapping[str, Light], truths: Mapping[str, Light], gauge: str = "none", spheres: Sequence[str] = SPHERES
+    lights: Mapping[str, Map], truths: Mapping[str, Map], gauge: str = "none", spheres: Sequence[str] = SPHERES
 ) -> Score:
     """RMSE of white spheres over the truth's RMS, means over the recovered lights; the null is constant light of the true mean.
 
-    gauge: of `factorlib.evaluate.gauge`
+    gauge: of `factorlib.evaluate.gauge`;  to these a mirror sphere's angle between true and recovered colours: `colour`
     """
-    errors = compare_lights(lights, truths, {}).mean[gauge]
-    return Score(*({s: getattr(errors[s], which).rmse for s in spheres} for which in ("estimate", "null")))
+    both = ({str(name): light_of_lat_long(of[name]) for name in lights} for of in (lights, truths))
+    errors = compare_lights(*both, {}).mean[gauge]
+    scores = ({s: getattr(errors[s], w).rmse for s in spheres} for w in ("estimate", "null"))
+    colours = ({"colour": getattr(errors["mirror"], w).rgb_angle_deg} for w in ("estimate", "null"))
+    return Score(*scores) | Score(*colours)

@@ -1,8 +1,8 @@
 """What methods answer in the comparison, as predictions of photos that were not taken.
 
-Projective   Texturing: the photo's pixels are stuck on the body and carried to the new view.  It knows the body and the camera.  A point
+Projective   Texturing: the photo's pixels are stuck on the sphere and carried to the new view.  It knows the sphere and the camera.  A point
              that the photo saw has the photo's colour there, between pixels by inverse distance; one that it did not see that of the seen
-             points whose normals are nearest.  A new light changes nothing: the colours are the mean of all photos of the material.
+             points that are nearest.  A new light changes nothing: the colours are the mean of all photos of the material.
 Intrinsic    A decomposition in the spirit of SIRFS (Barron and Malik 2015): albedo × shading + highlight, albedos averaged over photos.
              It knows the normals, and which pixels are of which material; each photo is decomposed by itself.
    shading     S(n) = Σ e_lm Y_lm(n), nine spherical harmonics: what Lambert reflects of a distant light to within a few per cent
@@ -31,8 +31,8 @@ from scipy.spatial import cKDTree
 
 from factorlib.conventions import lat_long_directions, lat_long_solid_angles
 from factorlib.results.materials import Reflectance
-from studies.body import Map, Photos, Radiance, Scene, View
-from studies.errors import factor_of, times
+from studies.body import Photos, Radiance, View, shown
+from studies.errors import Map, factor_of, in_gauge, times
 
 BETWEEN, NEAREST = (
     4,
@@ -50,44 +50,31 @@ Truths = Mapping[str, Reflectance]
 class Prediction(msgspec.Struct, frozen=True):
     """A method's answer.
 
-    materials:    reflectances that it states, by name, in the truth's gauge;  lights: maps that it states, by number, in that gauge
-    lambertian:   that it states no specular part, rather than none being there
-    new_view:     radiance of a material that was photographed in the light of that number, by another camera
-    new_light:    of a material that was photographed, in another light, which is given
-    new_material: of another material, which is given, in the light of a photo; None where the method has nothing to say
+    materials:  reflectances that it states, by name, in the truth's gauge;  lights: maps that it states, by number, in that gauge
+    lambertian: that it states no specular part, rather than none being there
+    of:         radiance of a material in a light as a camera sees it, one of which was not photographed: a photographed material by its name
+                or another one, the light of a photo by its number or another one; None where the method has nothing to say
     """
 
     materials: dict[str, Reflectance]
     lights: dict[int, Map]
     lambertian: bool
-    new_view: Callable[[str, int, View], Radiance]
-    new_light: Callable[[str, Map, View], Radiance]
-    new_material: Callable[[Reflectance, int, View], Radiance | None]
+    of: Callable[[str | Reflectance, int | Map, View], Radiance | None]
 
 
-def in_gauge(
-    materials: Mapping[str, Reflectance], lights: Mapping[int, Map], truths: Truths
-) -> tuple[dict[str, Reflectance], dict[int, Map]]:
-    """Materials times the factor to the truth, lights divided by it: what they show together stays as it is."""
-    factor = factor_of(materials, truths)
-    return {name: times(m, factor) for name, m in materials.items()}, {li: of / factor for li, of in lights.items()}
-
-
-def lambertian_part(materials: Mapping[str, Reflectance]) -> dict[str, Reflectance]:
+def lambertian_part(materials: Truths) -> dict[str, Reflectance]:
     """Without specular parts."""
     return {name: Reflectance(m.diffuse, (0.0, 0.0, 0.0), m.roughness) for name, m in materials.items()}
 
 
 def rendered(materials: dict[str, Reflectance], lights: dict[int, Map], lambertian: bool = False) -> Prediction:
     """The answer of a method that finds a reflectance for each material and a map for each light."""
-    return Prediction(
-        materials,
-        lights,
-        lambertian,
-        lambda material, light, view: Scene(lights[light], view).of(materials[material]),
-        lambda material, light, view: Scene(light, view).of(materials[material]),
-        lambda material, light, view: Scene(lights[light], view).of(material),
-    )
+
+    def of(material: str | Reflectance, light: int | Map, view: View) -> Radiance:
+        material = materials[material] if isinstance(material, str) else material
+        return shown(material, lights[light] if isinstance(light, int) else light, view)
+
+    return Prediction(materials, lights, lambertian, of)
 
 
 def grey(photos: Photos, truths: Truths) -> Prediction:
@@ -105,44 +92,34 @@ class Texture:
     """Values at the points that a photo sees, to be read from other views."""
 
     def __init__(self, photo: View):
-        self.photo = photo
-        self._points, self._normals = cKDTree(photo.points), cKDTree(photo.normals)
+        self._tree, self._least = cKDTree(photo.normals), photo.normals[:, 2].min()
 
     def seen(self, view: View) -> Bool[np.ndarray, " n"]:
-        """Which of a view's points the photo sees: those whose normals are turned toward it (the body is convex)."""
-        return view.normals[:, 2] >= self.photo.normals[:, 2].min()
+        """Which of a view's points the photo sees: those whose normals are turned toward it."""
+        return view.normals[:, 2] >= self._least
 
     def at(self, view: View, values: Radiance, unseen: bool = True) -> Radiance:
         """values: of the photo's points;  unseen: whether points that it does not see are filled, else they are 0."""
-        there, colours = self.seen(view), np.zeros((len(view.points), 3))
-        colours[there] = _weighted(self._points, view.points[there], values, BETWEEN)
-        if unseen and not there.all():
-            colours[~there] = _weighted(self._normals, view.normals[~there], values, NEAREST)
+        there, colours = self.seen(view), np.zeros((len(view.normals), 3))
+        for some, count in ((there, BETWEEN), (~there & unseen, NEAREST)):
+            distance, index = self._tree.query(view.normals[some], count)
+            weight = 1 / (distance + 1e-9)
+            colours[some] = np.einsum("nk,nkc->nc", weight / weight.sum(axis=1, keepdims=True), values[index])
         return colours
-
-
-def _weighted(tree: cKDTree, at: np.ndarray, values: Radiance, count: int) -> Radiance:
-    distance, index = tree.query(at, count)
-    weight = 1 / (distance + 1e-9)
-    return np.einsum("nk,nkc->nc", weight / weight.sum(axis=1, keepdims=True), values[index])
 
 
 def projective(photos: Photos, truths: Truths) -> Prediction:
     """The photos as textures; a texture knows no light apart from its material."""
     texture, radiance = Texture(photos.view), photos.radiance
 
-    def mean(material: str) -> Radiance:
-        """Of the material's photos, whatever the light."""
-        return np.mean([of for (name, _), of in radiance.items() if name == material], axis=0)
+    def of(material: str | Reflectance, light: int | Map, view: View) -> Radiance | None:
+        if isinstance(material, Reflectance):
+            return None
+        if isinstance(light, int):
+            return texture.at(view, radiance[material, light])
+        return texture.at(view, np.mean([of for (name, _), of in radiance.items() if name == material], axis=0))
 
-    return Prediction(
-        {},
-        {},
-        False,
-        lambda material, light, view: texture.at(view, radiance[material, light]),
-        lambda material, light, view: texture.at(view, mean(material)),
-        lambda material, light, view: None,
-    )
+    return Prediction({}, {}, False, of)
 
 
 # ── intrinsic decomposition ──────────────────────────────────────────────────────────────────────────────────────────
@@ -223,26 +200,18 @@ def intrinsic(photos: Photos, truths: Truths) -> Prediction:
     relative = {n: Reflectance(tuple(albedo[n].tolist()), (0.0,) * 3, 1.0) for n in photos.materials}
     factor = factor_of(relative, lambertian_part(truths))
     shading = {li: part.shading * scale[li] / factor for li, part in parts.items()}
-    materials, lights = (
-        {n: times(m, factor) for n, m in relative.items()},
-        {li: light_map(e) for li, e in shading.items()},
-    )
+    materials = {n: times(m, factor) for n, m in relative.items()}
+    lights = {li: light_map(e) for li, e in shading.items()}
 
-    def shaded(material: str, coefficients: Coefficients, highlight: Radiance, view: View) -> Radiance:
-        """Albedo × shading + highlight."""
+    def of(material: str | Reflectance, light: int | Map, view: View) -> Radiance:
+        if isinstance(material, Reflectance):
+            return shown(material, lights[light], view)
+        if isinstance(light, int):
+            coefficients, highlight = shading[light], parts[light].highlight[material]
+        else:
+            highlight = np.mean([p.highlight[material] for p in parts.values() if material in p.highlight], axis=0)
+            coefficients = LAMBERT[:, None] * light_coefficients(light)
         lit = np.maximum(harmonics(view.normals) @ coefficients, 0)
         return np.array(materials[material].diffuse) * lit + texture.at(view, highlight, unseen=False)
 
-    def new_light(material: str, light: Map, view: View) -> Radiance:
-        """In a given light."""
-        highlight = np.mean([p.highlight[material] for p in parts.values() if material in p.highlight], axis=0)
-        return shaded(material, LAMBERT[:, None] * light_coefficients(light), highlight, view)
-
-    return Prediction(
-        materials,
-        lights,
-        True,
-        lambda material, light, view: shaded(material, shading[light], parts[light].highlight[material], view),
-        new_light,
-        lambda material, light, view: Scene(lights[light], view).of(material),
-    )
+    return Prediction(materials, lights, True, of)

@@ -31,25 +31,14 @@ from factorlib.meshes.mesh import scaled
 from factorlib.results.materials import Reflectance
 from factorlib.urm.observations import Observations, concatenate
 from studies.scenes import shapes
-from studies.spheres import GRAZING, NOISE, table_of
+from studies.spheres import GRAZING, table_of
 from studies.study import Case, Objects, light_name
 
 BODIES = ("blob", "jug", "hook")
-SIDE, FILL, FAR = (
-    160,
-    0.9,
-    100.0,
-)  # pixels of a picture; of it, the mesh's diameter; focal length over the picture's side
+SIDE, FILL, FAR = 160, 0.9, 100.0  # pixels of a picture; the mesh's diameter, the focal length over that
 CAMERA = Camera(SIDE, SIDE, FAR * SIDE, (SIDE / 2, SIDE / 2))
 STEPS = 12  # of the fit to the outline
 WINDOW, MARGIN = 200, 0.1  # as the stage `refine` takes them
-
-
-class Observed(msgspec.Struct, frozen=True):
-    """An entry's observations, and the median angle between the normals given and the true ones, degrees."""
-
-    observations: Observations
-    normal_error_deg: float
 
 
 @cache
@@ -62,37 +51,31 @@ def body(name: str, triangles: int | None = None) -> Caster:
     return Caster(shapes.mesh_of(parts, name))
 
 
-def body_of(material: int, light: int) -> str:
-    """The name of the body that stands for an entry."""
-    return BODIES[(material + light) % len(BODIES)]
-
-
-def pose_of(whole: Caster, rng: np.random.Generator) -> Pose:
-    """Turned at random, its middle in the middle of the picture, which it fills."""
-    rotation = Rotation.random(rng=rng).as_matrix()
-    middle = np.array([0.0, 0.0, 2 * CAMERA.focal * whole.radius / (FILL * SIDE)])
-    return Pose(rotation, middle - rotation @ whole.centre)
-
-
 def observed(
     case: Case, materials: Mapping[str, Reflectance], lights: Mapping[int, Light]
-) -> dict[str, list[Observed]]:
-    """The entries of each photo, one photo a light, by name."""
-    table = list(materials.values())
-    return {light_name(li): [_entry(case, m, li, table[m], lights[li]) for m, at in case.entries if at == li] for li in case.lights}  # fmt: skip
+) -> tuple[dict[str, Observations], float]:
+    """One photo a light, by name, pixels of its entries numbered on; and the mean error of the normals given, degrees.
+
+    That of an entry is the median angle to the true ones.
+    """
+    table, photos, errors = list(materials.values()), {}, []
+    for li in case.lights:
+        parts = [_entry(case, m, li, table[m], lights[li]) for m, at in case.entries if at == li]
+        y = np.repeat(np.arange(len(parts)), [len(part) for part, _ in parts])
+        photos[light_name(li)] = msgspec.structs.replace(concatenate([part for part, _ in parts]), y=y)
+        errors += [error for _, error in parts]
+    return photos, float(np.mean(errors))
 
 
-def together(entries: list[Observed]) -> Observations:
-    """A photo's observations.  Pixels of different entries are numbered on."""
-    parts = [each.observations for each in entries]
-    y = np.repeat(np.arange(len(parts)), [len(part) for part in parts])
-    return msgspec.structs.replace(concatenate(parts), y=y)
-
-
-def _entry(case: Case, m: int, li: int, material: Reflectance, light: Light) -> Observed:
-    how, rng, name = case.objects, np.random.default_rng([14, case.seed, m, li]), body_of(m, li)
-    truth = pose_of(body(name), rng)
-    true_maps, (mesh, pose) = rasterise(body(name), CAMERA, truth), perturbed(name, truth, how, rng)
+def _entry(case: Case, m: int, li: int, material: Reflectance, light: Light) -> tuple[Observations, float]:
+    how, rng, name = case.objects, np.random.default_rng([14, case.seed, m, li]), BODIES[(m + li) % len(BODIES)]
+    whole, rotation = (
+        body(name),
+        Rotation.random(rng=rng).as_matrix(),
+    )  # its middle in the middle of the picture, which it fills
+    middle = np.array([0.0, 0.0, 2 * CAMERA.focal * whole.radius / (FILL * SIDE)])
+    truth = Pose(rotation, middle - rotation @ whole.centre)
+    true_maps, (mesh, pose) = rasterise(whole, CAMERA, truth), perturbed(name, truth, how, rng)
     outline = Silhouette(true_maps.label.astype(np.int16))
     maps = rasterise(mesh, CAMERA, fitted(mesh, pose, outline) if how.refined else pose)
     sure = confidence(maps, outline) if how.confidence else np.ones(maps.label.shape)
@@ -104,8 +87,10 @@ def _entry(case: Case, m: int, li: int, material: Reflectance, light: Light) -> 
     noise = np.random.default_rng([13, case.seed, li, m, 0]).standard_normal((maps.label.size, 3))[pixels]
     labels = np.full(len(pixels), case.materials.index(m))
     zero = np.zeros(len(pixels), int)
-    table = table_of(case, li, given, radiance * (1 + NOISE * noise), labels, pixels, zero, sure.reshape(-1)[pixels])
-    return Observed(table, angle_deg(true, given))
+    table = table_of(
+        case, li, given, radiance * (1 + case.noise * noise), labels, pixels, zero, sure.reshape(-1)[pixels]
+    )
+    return table, angle_deg(true, given)
 
 
 def perturbed(name: str, truth: Pose, how: Objects, rng: np.random.Generator) -> tuple[Caster, Pose]:

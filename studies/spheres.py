@@ -5,11 +5,12 @@ Lights     by the project's own generator (`factorlib.generate`): the first of a
            Mean radiance 1.
 Radiance   by quadrature of the lights' maps (`factorlib.evaluate.ball`), not by the operator that solves: what a solve
            is judged on is not made by its own approximations.
-Noise      each radiance times 1 + .01 · normal, drawn for each entry by itself, so that an entry that two cases show has
+Noise      each radiance times 1 + noise · normal, .01 as a rule, drawn for each entry by itself, so that an entry that two cases show has
            the same noise in both.
 Normals    perturbed after rendering: the solve gets a normal that is not the pixel's.
 Labels     likewise: the pixel is of one material, its label names another one of the same photo.
 Facets     rendered so: a flat-sided object, whose normals are true but few.
+Rounding   each radiance times 1 + 10⁻⁷ · normal, which is less than a photograph's last bit.
 """
 
 from __future__ import annotations
@@ -21,7 +22,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from factorlib.conventions import FRONT, YUP_FROM_CAMERA
-from factorlib.evaluate.ball import Light, ball, light_of_lat_long
+from factorlib.evaluate.ball import Light, ball
 from factorlib.generate.lights import random_materials
 from factorlib.generate.synthetic import light_of
 from factorlib.geometry.sphere import ball_normals
@@ -47,8 +48,8 @@ ABOUT = dict(
     )
 )
 SPREAD = 0.15
+ROUNDING = 1e-7  # of a radiance
 GRAZING = 0.15  # n·o below which no pixel is observed
-NOISE = 0.01  # of a radiance
 STEEPEST = 0.25  # n·o of the faces that are observed at the flattest angle
 CURVED = 0.1  # share of a face's normals that is the sphere's: no real face is exactly flat
 
@@ -68,19 +69,9 @@ def light_map(seed: int, light: int, rows: int, spp: int) -> Float[np.ndarray, "
     return (radiance / radiance.mean()).astype(np.float32)
 
 
-def light_file(seed: int, light: int) -> str:
-    """The name of a light's map in the folder of the step `worlds`."""
-    return f"{seed}-{light}.exr"
-
-
 def read_maps(worlds: Path, seed: int, lights: Iterable[int]) -> dict[int, Float[np.ndarray, "h w 3"]]:
-    """The maps of lights of a world by number."""
-    return {li: read_rgb_exr(worlds / light_file(seed, li)) for li in lights}
-
-
-def read_lights(worlds: Path, seed: int, lights: Iterable[int]) -> dict[int, Light]:
-    """The same, ready to be reflected."""
-    return {li: light_of_lat_long(radiance) for li, radiance in read_maps(worlds, seed, lights).items()}
+    """The maps of lights of a world by number, from the folder of the step `worlds`."""
+    return {li: read_rgb_exr(worlds / f"{seed}-{li}.exr") for li in lights}
 
 
 def sphere_normals(size: int) -> Float[np.ndarray, "n 3"]:
@@ -109,11 +100,13 @@ def _photo(case: Case, number: int, materials: Sequence[Reflectance], light: Lig
     normals, index = faceted(sphere_normals(case.size), case.facets), case.materials.index
 
     def rng(m: int, what: str) -> np.random.Generator:
-        """The random numbers of an entry."""
         return np.random.default_rng([13, case.seed, number, m, ("noise", "normals", "labels").index(what)])
 
     exact = [ball(light, materials[m], normals) for m in rows]
-    noisy = [r * (1 + NOISE * rng(m, "noise").standard_normal(r.shape)) for m, r in zip(rows, exact, strict=True)]
+    noisy = [r * (1 + case.noise * rng(m, "noise").standard_normal(r.shape)) for m, r in zip(rows, exact, strict=True)]
+    if case.rounding:
+        again = np.random.default_rng([14, case.seed, number, case.rounding])
+        noisy = [r * (1 + ROUNDING * again.standard_normal(r.shape)) for r in noisy]
     turned = [tilted(in_camera(normals), case.normal_deg, rng(m, "normals")) for m in rows]
     others = [index(m) for m in rows]
     labels = [mislabelled(len(normals), index(m), others, case.wrong_labels, rng(m, "labels")) for m in rows]

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from typing import Any, Literal
 
 import msgspec
@@ -23,10 +23,9 @@ class Objects(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     shifted:     shift in a random direction of the image, as a share of the mesh's diameter
     larger:      how much larger the mesh is, as a share of its size
     triangles:   triangles of the mesh that stands for the body; None: all of its 20,000
-    robust:      whether the solve has its robust loss
     confidence:  whether the solve gets the confidence of each normal, as the stage `align` writes it
     refined:     whether every pose is first fitted to the outline of its mask, from the perturbed pose
-    start:       nothing, or the solution of all photos but the last (the parameter `start` of the stage `solve`)
+    warm:        whether it starts from the solution of all photos but the last (the parameter `start` of the stage `solve`)
     """
 
     pixels: int
@@ -34,10 +33,9 @@ class Objects(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     shifted: float = 0.0
     larger: float = 0.0
     triangles: int | None = None
-    robust: bool = True
     confidence: bool = True
     refined: bool = False
-    start: Literal["nothing", "earlier"] = "nothing"
+    warm: bool = False
 
 
 class Case(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -49,6 +47,8 @@ class Case(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     normal_deg:    normals are turned by |N(0, normal_deg)| degrees toward random sides
     wrong_labels:  share of the pixels whose label names another material of the same photo
     facets:        faces that an object shows instead of a sphere; None: a sphere
+    noise:         of each radiance, as a share of it
+    rounding:      number of the perturbation of all radiances by less than a photograph's last bit; 0: none
     objects:       bodies in place of spheres
     """
 
@@ -59,6 +59,8 @@ class Case(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     normal_deg: float = 0.0
     wrong_labels: float = 0.0
     facets: int | None = None
+    noise: float = 0.01
+    rounding: int = 0
     objects: Objects | None = None
 
     @property
@@ -122,11 +124,6 @@ def light_name(light: int) -> str:
     return f"light{light}"
 
 
-def named(lights: Mapping[int, Any]) -> dict[str, Any]:
-    """Lights by their names instead of their numbers."""
-    return {light_name(li): of for li, of in lights.items()}
-
-
 def case_name(setting: str, seed: int) -> str:
     """The name of a case's files.
 
@@ -177,14 +174,9 @@ class Scale(msgspec.Struct, frozen=True):
         """Whether it is the quick scale, which concludes nothing."""
         return self.name == "quick"
 
-    @property
-    def square(self) -> str:
-        """The name of the setting of all entries of `side` materials in as many lights, unperturbed."""
-        return f"{self.side}x{self.side}"
-
     def case(self, seed: int, entries: Sequence[Entry], **fields: Any) -> Case:
         """A case of this size with further `fields` of it."""
-        return Case(seed, tuple(sorted(entries)), self.size, {**self.solve, **fields.pop("solve", {})}, **fields)
+        return Case(seed, tuple(sorted(entries)), self.size, **fields | {"solve": self.solve | fields.get("solve", {})})
 
     def setting(self, name: str, label: str, entries: Sequence[Entry] | None = None, **fields: Any) -> Setting:
         """A setting of equal entries for all seeds; None: of `side` materials in as many lights."""
@@ -195,10 +187,11 @@ class Scale(msgspec.Struct, frozen=True):
         """All entries of so many materials in so many lights."""
         return self.setting(f"{materials}x{lights}", f"{materials} × {lights}", full_matrix(materials, lights))
 
-    def of_objects(self, name: str, label: str, entries: Sequence[Entry], **fields: Any) -> Setting:
+    def of_objects(self, name: str, label: str, entries: Sequence[Entry], solve: Any = None, **fields: Any) -> Setting:
         """A setting of bodies, about as many observations of each as a sphere has; `fields` of `Objects`."""
-        objects = Objects(round(0.77 * self.size**2), **fields)
-        return Setting(name, label, lambda seed: self.case(seed, entries, objects=objects))
+        return self.setting(
+            name, label, entries, solve=solve or {}, objects=Objects(round(0.77 * self.size**2), **fields)
+        )
 
 
 FEW_LOBES = {"solver": "few_lobes", "lobes": 16, "insert": 8, "rounds": 2, "iterations": 6, "polish": 6}
@@ -208,26 +201,13 @@ QUICK = Scale("quick", seeds=(0,), largest=3, side=2, size=16, solve=FEW_LOBES, 
 
 # ── claims ───────────────────────────────────────────────────────────────────────────────────────────────────────────
 
-
-class Rise(msgspec.Struct, frozen=True, tag=True):
-    """How much a measure rises from one setting to another, for each of the `per` units that they are apart."""
-
-    start: str
-    end: str
-    per: float
-
-
-class Guess(msgspec.Struct, frozen=True, tag=True):
-    """What a guess that knows mean colours alone scores in a setting: the null of its measure."""
-
-    setting: str
-
-
-Side = str | Rise | Guess  # one side of a comparison; str: a setting
+# One side of a comparison: a setting; ("guess", setting): what a guess that knows mean colours alone scores in it; or
+# ("rise", start, end, per): how much the measure rises from one setting to another, for each of the `per` units between them.
+Side = str | tuple
 
 
 class Claim(msgspec.Struct, frozen=True):
-    """A comparison that the study makes: the measure, or its rise, is lower on the side `lower` than on `higher`.
+    """A comparison that a full study makes: the measure, or its rise, is lower on the side `lower` than on `higher`.
 
     words: the claim as a sentence's subject;  paper: whether the paper says so, rather than this project
     """
@@ -238,11 +218,6 @@ class Claim(msgspec.Struct, frozen=True):
     words: str
     paper: bool = True
 
-    @property
-    def settings(self) -> list[str]:
-        """The names of all settings that are compared."""
-        return [name for side in (self.lower, self.higher) for name in settings_of(side)]
-
 
 def own(measure: str, lower: Side, higher: Side, words: str) -> Claim:
     """A claim of this project, which the paper does not make."""
@@ -251,21 +226,20 @@ def own(measure: str, lower: Side, higher: Side, words: str) -> Claim:
 
 def settings_of(side: Side) -> list[str]:
     """The names of the settings of one side of a claim."""
-    return [side.start, side.end] if isinstance(side, Rise) else [side.setting if isinstance(side, Guess) else side]
+    return [side] if isinstance(side, str) else list(side[1:3])
 
 
-class Study(msgspec.Struct, frozen=True):
+class Study(msgspec.Struct, frozen=True, kw_only=True):
     """What is varied and measured.
 
     paper:     the paper's conclusion;  varied: what is varied, with its unit
     measures:  those of the figure and the page, the first the main one
+    claims:    what a full study tests
     steps:     stages of studies/run/pipeline.yaml in `studies.steps`, the last one scores; none: the study's own module has its `main`
     lights:    lights that each of its worlds has beyond those of the scale
     sets:      the data sets that its cases are photos of, as facts of the slice `sets`
     numbers:   what stands in the place of seeds, where intervals are over something else, which `over` names
-    across:    the measure that stands across in the figure; none: a row for each setting
     notes:     sentences of a conclusion that are no claims;  answer: to the paper, where no claim can give it
-    pictures:  the function that makes its pictures by name, captions and PNG files, of settings, seeds and the folder of the scores
     """
 
     name: str
@@ -275,21 +249,14 @@ class Study(msgspec.Struct, frozen=True):
     varied: str
     measures: tuple[str, ...]
     settings: Callable[[Scale], list[Setting]]
-    claims: Callable[[Scale], list[Claim]] = lambda scale: []
-    steps: tuple[str, ...] = ("worlds", "observe", "solve", "score")
+    claims: tuple[Claim, ...] = ()
+    steps: tuple[str, ...] = ("worlds", "solve", "score")
     lights: int = 0
     sets: Callable[[Scale], dict[str, Any]] = lambda scale: {}
     numbers: Callable[[Scale], tuple[int, ...]] = lambda scale: scale.seeds
     over: str = "seeds"
-    across: str = ""
     notes: Callable[[Any], list[str]] = lambda conclusion: []
     answer: Callable[[Any], str] = lambda conclusion: ""
-    pictures: str = ""
-
-    @property
-    def module(self) -> str:
-        """The name of the study's own module in `studies.catalogue`."""
-        return self.name.replace("-", "_")
 
     def worlds(self, scale: Scale) -> World:
         """The worlds that its cases show, equal for most studies of a scale, so that they are made once."""

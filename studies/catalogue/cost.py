@@ -14,7 +14,6 @@ from __future__ import annotations
 
 import json
 import resource
-import subprocess
 import sys
 import time
 from collections.abc import Mapping, Sequence
@@ -23,8 +22,9 @@ from typing import Any
 
 from factorlib.jsonfile import write_json
 from factorlib.stage import Inputs, Progress
+from studies.measured.tools import apart
 from studies.steps import Params
-from studies.study import Claim, Scale, Score, Setting, Study, own
+from studies.study import Scale, Score, Setting, Study, own
 
 SIDES = {"full": (3, 5, 10, 20, 40), "quick": (3, 5)}
 BY_DEFAULT = {"full": (3, 5, 10), "quick": (3,)}
@@ -38,19 +38,9 @@ def settings(scale: Scale) -> list[Setting]:
     """By entries, with 6 lobes; then as the solver is by default."""
     sizes = [("", n, SHORT) for n in SIDES[scale.name]] + [("default-", n, {}) for n in BY_DEFAULT[scale.name]]
     return [
-        Setting(
-            f"{kind}{n * n}",
-            f"{KINDS[kind][0]}, {n * n:,}",
-            lambda seed, n=n, how=how: {"seed": seed, "side": n, "solve": how},
-        )
-        for kind, n, how in sizes
-    ]
-
-
-def claims(scale: Scale) -> list[Claim]:
-    """Whether an entry of the largest costs less or more."""
-    least, most = (SIDES[scale.name][k] ** 2 for k in (0, -1))
-    return [own("seconds_an_entry", f"{most}", f"{least}", f"an entry of {most:,} costs less than one of {least}")]
+        Setting(f"{k}{n * n}", f"{KINDS[k][0]}, {n * n:,}", lambda seed, n=n, how=how: {"seed": seed, "side": n, "solve": how})
+        for k, n, how in sizes
+    ]  # fmt: skip
 
 
 def exponents(costs: Mapping[float, Mapping[int, float]], seeds: Sequence[int]) -> Any:
@@ -80,15 +70,14 @@ def growth(table: Any, kind: str, measure: str) -> tuple[list[int], Any]:
 
 def notes(table: Any) -> list[str]:
     """The exponents, and what is not compared."""
-    words = {"seconds": "Processor time of the solve", "grown": "Memory beyond that before the solve"}
     sentences = []
-    for kind, (_, setting) in KINDS.items():
-        for measure, what in words.items():
-            sizes, e = growth(table, kind, measure)
-            between = f"{sizes[0]:,} to {sizes[-1]:,} entries, {setting}"
-            over = "one seed, no interval" if e.low is None else f"{e.low:.2f} to {e.high:.2f} over {e.seeds} seeds"
-            if len(sizes) > 1:
-                sentences.append(f"{what} grows as entries to the power {e.mean:.2f} ({over}; {between}): {called(e)}.")
+    for kind, measure in ((kind, measure) for kind in KINDS for measure in ("seconds", "grown")):
+        sizes, e = growth(table, kind, measure)
+        over = "one seed, no interval" if e.low is None else f"{e.low:.2f} to {e.high:.2f} over {e.seeds} seeds"
+        what = "Processor time of the solve" if measure == "seconds" else "Memory beyond that before the solve"
+        between = f"{sizes[0]:,} to {sizes[-1]:,} entries, {KINDS[kind][1]}"
+        if len(sizes) > 1:
+            sentences.append(f"{what} grows as entries to the power {e.mean:.2f} ({over}; {between}): {called(e)}.")
     return [*sentences, "The paper's 30 minutes are of other pictures, another machine and a GPU: no ratio is drawn."]
 
 
@@ -106,7 +95,7 @@ STUDY = Study(
     varied="most lobes of a light, entries of the matrix",
     measures=("seconds", "seconds_an_entry", "peak", "grown"),
     settings=settings,
-    claims=claims,
+    claims=(own("seconds_an_entry", "1600", "9", "an entry of 1,600 costs less than one of 9"),),
     steps=(),
     notes=notes,
     answer=answer,
@@ -120,8 +109,7 @@ def main(params: Params, inputs: Inputs, out: Path, progress: Progress) -> None:
 
 def cost_of(case: dict[str, Any]) -> dict[str, float]:
     """Measured in a fresh process of this interpreter.  Raises CalledProcessError where it fails; its words go to this one's."""
-    command = [sys.executable, "-m", __spec__.name, json.dumps(case)]
-    return json.loads(subprocess.run(command, stdout=subprocess.PIPE, check=True).stdout)
+    return apart(__spec__.name, case)
 
 
 def measured(seed: int, side: int, solve: dict[str, Any]) -> dict[str, float]:

@@ -50,14 +50,14 @@ def settings(scale: Scale) -> list[Setting]:
 
 def worst(table: Any) -> list[str]:
     """Of each measure, the cases whose worst seed is worst, as a sentence."""
-    from studies.conclusion import MEASURES
+    from studies.conclusion import label as label_of
 
     sentences = []
     for m in table.measures:
         values = {row.label: max(row.cells[m].values.values()) for row in table.rows if m in row.cells}
         ranked = sorted(values, key=values.get, reverse=True)[:WORST]
         cases = "; ".join(f"{label.partition(': ')[2]} {values[label]:.3g}" for label in ranked)
-        sentences += [f"{MEASURES[m].label}, worst of all seeds: {cases}."] if cases else []
+        sentences += [f"{label_of(m)}, worst of all seeds: {cases}."] if cases else []
     return sentences
 
 

@@ -19,7 +19,6 @@ import msgspec
 
 from studies.study import Claim, Scale, Setting, Study, own
 
-FOLDER = "data/eames"
 SHELLS = {  # of the chairs, by photo
     "terrace": ("red", "white"),
     "kitchen": ("yellow",),
@@ -29,48 +28,30 @@ SHELLS = {  # of the chairs, by photo
     "patio": ("black",),
 }
 PHOTOS = {"full": tuple(SHELLS), "quick": ("kitchen", "hall")}
-PREDICTIONS = ("left out", "observed", "flat")
 
 
 class LeftOut(msgspec.Struct, frozen=True):
-    """The shells of a photo that are predicted one at a time, and from what."""
+    """The shells of a photo that are predicted one at a time, and from what; solve: parameters of the stage."""
 
     photo: str
     shells: tuple[str, ...]
     prediction: str
+    solve: dict[str, Any] = {}
 
 
-def case(photos: tuple[str, ...], number: int, prediction: str) -> LeftOut:
+def case(scale: Scale, number: int, prediction: str) -> LeftOut:
     """Of a photo by its number; a shell that no other photo shows is not asked for."""
-    others = {shell for k, photo in enumerate(photos) if k != number for shell in SHELLS[photo]}
-    return LeftOut(photos[number], tuple(s for s in SHELLS[photos[number]] if s in others), prediction)
-
-
-def settings(scale: Scale) -> list[Setting]:
-    """Ways to predict; what stands in a seed's place is the number of a photo."""
     photos = PHOTOS[scale.name]
-    return [Setting(f"chair-{p.replace(' ', '-')}", p, lambda k, p=p: case(photos, k, p)) for p in PREDICTIONS]
-
-
-def numbers(scale: Scale) -> tuple[int, ...]:
-    """The numbers of the photos whose chairs are predicted; of a quick study the first alone."""
-    return (0,) if scale.quick else tuple(range(len(SHELLS)))
-
-
-def claims(scale: Scale) -> list[Claim]:
-    """Better than without light; worse than with the chair."""
-    left_out, observed, flat = (setting.name for setting in settings(scale))
-    return [
-        Claim("chair", left_out, flat, "a chair that was left out is predicted better than by a flat colour"),
-        own("chair_scaled", left_out, flat, "the same with brightness and tint given"),
-        own("chair", observed, left_out, "a chair that was observed is shown better than one that was left out"),
-    ]
+    others = {shell for k, photo in enumerate(photos) if k != number for shell in SHELLS[photo]}
+    return LeftOut(photos[number], tuple(s for s in SHELLS[photos[number]] if s in others), prediction, scale.solve)
 
 
 def by_photo(table: Any) -> list[str]:
     """Each photo's values, as a sentence: six photos are few, and one that is unlike the others decides a mean."""
-    values = {row.label: row.cells["chair"].values for row in table.rows}
-    photos = dict(enumerate(PHOTOS[table.scale]))
+    values, photos = (
+        {row.label: row.cells["chair"].values for row in table.rows},
+        PHOTOS["quick" if table.quick else "full"],
+    )
     each = (f"{photos[k]} {', '.join(f'{of[k]:.2g}' for of in values.values())}" for k in table.seeds)
     return [f"DSSIM of a chair, photo by photo ({', '.join(values)}): {'; '.join(each)}."]
 
@@ -82,12 +63,17 @@ STUDY = Study(
     paper="A chair of the eames photos that took no part in the solve can be predicted. (Its photos and numbers cannot be had.)",
     varied="where the chair is predicted from",
     measures=("chair", "chair_scaled"),
-    settings=settings,
-    claims=claims,
-    steps=("sets", "photos", "whole", "leave_out", "chairs"),
-    sets=lambda scale: {"folder": FOLDER, "photos": PHOTOS[scale.name], "solve": scale.solve},
-    numbers=numbers,
+    settings=lambda scale: [
+        Setting(f"chair-{p.replace(' ', '-')}", p, lambda k, p=p: case(scale, k, p)) for p in ("left out", "observed", "flat")
+    ],
+    claims=(
+        Claim("chair", "chair-left-out", "chair-flat", "a chair that was left out is predicted better than by a flat colour"),
+        own("chair_scaled", "chair-left-out", "chair-flat", "the same with brightness and tint given"),
+        own("chair", "chair-observed", "chair-left-out", "a chair that was observed is shown better than one that was left out"),
+    ),
+    steps=("photos", "chairs"),
+    sets=lambda scale: {"folder": "data/eames", "photos": PHOTOS[scale.name]},
+    numbers=lambda scale: (0,) if scale.quick else tuple(range(len(SHELLS))),
     over="photos",
     notes=by_photo,
-    pictures="studies.steps.chairs.shells_of_photos",
-)
+)  # fmt: skip

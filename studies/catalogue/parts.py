@@ -1,43 +1,39 @@
 """Parts: what is each part of the model worth?
 
-Varied     one part is switched off: shadows (and with them bounces, which need them), bounces of light, how sure normals are, the
-           robust loss, and clipping (clipped values taken as they are, or their pixels left out).  Lights are few lobes.
+Varied     one part is switched off: shadows (and with them bounces, which need them), bounces of light, tone curves, natural light's prior
+           (by lights of few lobes), how sure normals are, and clipping (clipped values taken as they are, or their pixels left out).
            Sets of chairs as data/eames, smaller and of other seeds.
-Measured   a tenth of the sphere's width of mirror cells that no solve has seen, the same whatever is off; materials and lights against
-           the truth.
-What cannot be switched off: the gauge.
+Measured   materials and lights against the truth.
+What cannot be switched off: the gauge, and the robust loss.
 """
 
 from __future__ import annotations
 
 from typing import Any
 
-from studies.study import Claim, Scale, Setting, Study, own
+from studies.study import Scale, Setting, Study, own
 
-WITHOUT: dict[str, tuple[str, str, dict[str, Any]]] = {  # label, what is off, options of the solver of few lobes
-    "as-it-is": ("as it is", "", {}),
-    "shadows": ("no shadows", "shadows", {"shadows": False, "bounces": False}),
-    "bounce": ("no bounce", "bounces", {"bounces": False}),
-    "normals": ("all normals sure", "confidences of normals", {"seen": "sure"}),
-    "robust": ("squares", "pseudo-Huber residuals", {"robust_scale": 1e6}),
-    "clipped-as-data": ("clipped as data", "bounds for clipped values", {"seen": "unclipped"}),
-    "clipped-left-out": ("clipped left out", "clipped pixels, as bounds,", {"seen": "dropped"}),
+WITHOUT: dict[
+    str, tuple[str, str, str, dict[str, Any]]
+] = {  # label, what is off, of `CHANGES`, parameters of the stage
+    "as-it-is": ("as it is", "", "", {}),
+    "shadows": ("no shadows", "shadows", "", {"self_shadowing": "off", "interreflection": "off"}),
+    "bounce": ("no bounce", "bounces", "", {"interreflection": "off"}),
+    "tone": ("no tone curve", "tone curves", "", {"tone": "off"}),
+    "few-lobes": ("few lobes", "natural light's prior", "", {"solver": "few_lobes"}),
+    "normals": ("all normals sure", "confidences of normals", "sure", {}),
+    "clipped-as-data": ("clipped as data", "bounds for clipped values", "unclipped", {}),
+    "clipped-left-out": ("clipped left out", "clipped pixels, as bounds,", "dropped", {}),
 }
-QUICK = ("as-it-is", "bounce", "robust")
-DO = {"unseen": "explain unseen observations better", "diffuse": "make k_d truer", "glossy": "make lights truer"}
+QUICK = ("as-it-is", "bounce", "clipped-left-out")
 
 
 def settings(scale: Scale) -> list[Setting]:
     """As it is, then without each part."""
-    names = QUICK if scale.quick else tuple(WITHOUT)
-    hows = {name: {**scale.solve, **WITHOUT[name][2]} for name in names}
-    return [Setting(n, WITHOUT[n][0], lambda seed, n=n: {"seed": seed, "solve": hows[n]}) for n in names]
-
-
-def claims(scale: Scale) -> list[Claim]:
-    """Unseen cells, materials and lights with each part against without it."""
-    names = [setting.name for setting in settings(scale)][1:]
-    return [own(measure, "as-it-is", n, f"{WITHOUT[n][1]} {does}") for measure, does in DO.items() for n in names]
+    cases = {
+        n: {"change": WITHOUT[n][2], "solve": scale.solve | WITHOUT[n][3]} for n in (QUICK if scale.quick else WITHOUT)
+    }
+    return [Setting(n, WITHOUT[n][0], lambda seed, c=c: {"seed": seed, **c}) for n, c in cases.items()]
 
 
 def sets(scale: Scale) -> dict[str, Any]:
@@ -52,9 +48,14 @@ STUDY = Study(
     question="What is each part of the model worth?",
     paper="Nothing: the paper's model has none of these parts.",
     varied="what is switched off",
-    measures=("unseen", "diffuse", "specular", "glossy", "roughness", "mirror"),
+    measures=("diffuse", "specular", "glossy", "roughness", "mirror"),
     settings=settings,
-    claims=claims,
-    steps=("sets", "photos", "parts"),
+    claims=tuple(
+        own(m, "as-it-is", n, f"{WITHOUT[n][1]} {does}")
+        for m, does in {"diffuse": "make k_d truer", "glossy": "make lights truer"}.items()
+        for n in WITHOUT
+        if n != "as-it-is"
+    ),
+    steps=("photos", "parts"),
     sets=sets,
 )

@@ -12,10 +12,8 @@ they are loaded, so that each case needs a process.
 
 from __future__ import annotations
 
-import hashlib
 import json
 import os
-import subprocess
 import sys
 import tempfile
 from pathlib import Path
@@ -24,10 +22,11 @@ from typing import Any
 from factorlib.arithmetic import VARIABLES
 from factorlib.jsonfile import write_json
 from factorlib.stage import Inputs, Progress
+from studies.measured.tools import apart
 from studies.steps import Params
 from studies.study import Scale, Score, Setting, Study
 
-DATA = Path(__file__).resolve().parents[2] / "data" / "synthetic"
+FOLDER = "data/synthetic"
 INSTRUCTIONS = {
     "fixed": VARIABLES,
     "all": {},
@@ -44,46 +43,27 @@ RUNS = {  # instructions and the first seed by label: as they are with seeds of 
 }  # fmt: skip
 
 
-def hash_of_data() -> str:
-    """Of all files of data/synthetic."""
-    files = sorted(file for file in DATA.rglob("*") if file.is_file())
-    listed = [(file.relative_to(DATA).as_posix(), hashlib.sha256(file.read_bytes()).hexdigest()) for file in files]
-    return hashlib.sha256(repr(listed).encode()).hexdigest()[:16]
-
-
 def settings(scale: Scale) -> list[Setting]:
     """Of the scale's runs."""
-    fields = {"data": hash_of_data(), "solve": scale.solve}
     return [
-        Setting(
-            f"{which}-{first}",
-            label,
-            lambda k, which=which, first=first: {"seed": first + k, "instructions": which, **fields},
-        )
+        Setting(f"{which}-{first}", label, lambda k, of=(which, first): {"seed": of[1] + k, "instructions": of[0], "solve": scale.solve})
         for label, (which, first) in RUNS[scale.name].items()
-    ]
+    ]  # fmt: skip
 
 
 def notes(table: Any) -> list[str]:
     """The spread over all seeds as runs are, then what other instructions change of the same seeds."""
-    from studies.conclusion import MEASURES, spread
+    from studies.conclusion import farthest, label, spread
 
     fixed, sentences = [row for row in table.rows if row.name.startswith("fixed")], []
     for m in table.measures:
         values = [v for row in fixed for v in row.cells[m].values.values()]
-        s, start = spread(values), f"{MEASURES[m].label}: "
+        s = spread(values)
         apart = "" if s.deviation is None else f", deviation {s.deviation:.2g}, {min(values):.4g} to {max(values):.4g}"
-        sentences.append(f"{start}{s.mean:.4g} on average over {s.seeds} seed{'s' * (s.seeds > 1)}{apart}.")
+        sentences.append(f"{label(m)}: {s.mean:.4g} on average over {s.seeds} seed{'s' * (s.seeds > 1)}{apart}.")
     for row in (row for row in table.rows if row not in fixed):
-        pairs = {m: (row.cells[m].values, fixed[0].cells[m].values) for m in table.measures}
-        apart = {m: max(abs(v - before[seed]) for seed, v in now.items()) for m, (now, before) in pairs.items()}
-        most = "; ".join(f"{MEASURES[m].label} by {v:.2g}" for m, v in apart.items() if v)
-        differ = (
-            f"numbers of the same seed differ at most so: {most}"
-            if most
-            else "every number is the same to the last digit"
-        )
-        sentences.append(f"{row.label}: {differ}.")
+        both = ({m: of.cells[m].values for m in table.measures} for of in (row, fixed[0]))
+        sentences.append(f"{row.label}: {farthest(*both)}.")
     return sentences
 
 
@@ -99,6 +79,7 @@ STUDY = Study(
     ),
     settings=settings,
     steps=(),
+    sets=lambda scale: {"folder": FOLDER},
     notes=notes,
 )  # fmt: skip
 
@@ -107,23 +88,24 @@ def main(params: Params, inputs: Inputs, out: Path, progress: Progress) -> None:
     """Measure a case in another process: writes <case>.json.  Raises CalledProcessError where that fails."""
     case = inputs.facts["dataset.case"]
     free = {name: value for name, value in os.environ.items() if name not in VARIABLES}
-    command = [sys.executable, "-m", __spec__.name, json.dumps(case)]
-    environment = free | INSTRUCTIONS[case["instructions"]]
-    done = subprocess.run(command, env=environment, stdout=subprocess.PIPE, check=True)
-    write_json(out / f"{inputs.photo}.json", Score(json.loads(done.stdout.splitlines()[-1])))
+    values = apart(__spec__.name, case, free | INSTRUCTIONS[case["instructions"]])
+    write_json(out / f"{inputs.photo}.json", Score(values))
 
 
 def measured(case: dict[str, Any]) -> dict[str, float]:
     """The numbers by their path in metrics.json, in this process."""
+    from factorlib.dataset.read import read_dataset
     from factorlib.evaluate.table import value_at
     from factorlib.jsonfile import read_json
     from stages import align, evaluate, export, masks, render, solve, urm
     from studies.measured.reference import NUMBERS
-    from studies.steps.photos import run_stages
+    from studies.steps.photos import CHECKOUT, run_stages
 
     stages = (masks, align, urm, solve, export, render, evaluate)
     with tempfile.TemporaryDirectory() as folder:
-        run_stages(DATA, Path(folder), stages, {"solve": {**case["solve"], "seed": case["seed"]}})
+        run_stages(
+            read_dataset(CHECKOUT / FOLDER), Path(folder), stages, {"solve": {**case["solve"], "seed": case["seed"]}}
+        )
         metrics = read_json(Path(folder) / "evaluate" / "metrics.json")
     return {path: value_at(metrics, path) for path in NUMBERS}
 

@@ -8,8 +8,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from factorlib.conventions import FRONT
-from factorlib.evaluate.ball import ball, light_of_lat_long
+from factorlib.evaluate.ball import light_of_lat_long
 from factorlib.evaluate.materials import common_factor
 from factorlib.model.blocks import Block
 from factorlib.model.illumination import Illumination
@@ -23,9 +22,10 @@ from factorlib.solve.history import Solution
 from factorlib.solve.solve import solve
 from factorlib.solve.start import from_nothing
 from factorlib.urm.merge import merge
-from factorlib.urm.observations import Observations, concatenate
+from factorlib.urm.observations import concatenate
 from studies.measured.tools import Clock, Tables, exact
-from studies.spheres import in_camera, light_map, materials_of, sphere_normals
+from studies.spheres import light_map, materials_of, observations_of
+from studies.study import Case
 
 SEED, SIZE, NOISE, MERGE_DEGREES = 31, 72, 0.002, 2.0
 MISSING = np.random.default_rng(SEED).random((5, 5)) < 0.4  # [material, light]
@@ -49,40 +49,21 @@ HEAD = [
 
 def rows() -> Tables:
     """The errors of both solvers on each set: materials after one factor a channel, pictures of all pixels without any."""
-    materials = list(materials_of(SEED).values())
-    table = [HEAD]
-    for name, entries in SETS.items():
-        used = sorted({m for shown in entries.values() for m in shown})
-        photos = [
-            _photo(k, [materials[m] for m in shown], [used.index(m) for m in shown]) for k, shown in entries.items()
-        ]
-        whole = blocks_of_observations(concatenate(photos), Noise())
+    materials, table, operator = materials_of(SEED), [HEAD], reflection_operator("network")
+    lights = {li: light_of_lat_long(light_map(SEED, li, 128, 64)) for li in range(5)}
+    for name, shown in SETS.items():
+        case = Case(SEED, tuple((m, li) for li, some in shown.items() for m in some), SIZE, noise=NOISE)
+        photos, truth = observations_of(case, materials, lights).values(), [materials[n] for n in case.material_names]
+        whole = blocks_of_observations(concatenate(list(photos)), Noise())
         blocks = blocks_of_observations(concatenate([merge(photo, MERGE_DEGREES) for photo in photos]), Noise())
-        problem = JointProblem(
-            blocks, reflection_operator("network")
-        )  # one thread: seconds are those of the work itself
+        problem = JointProblem(blocks, operator)  # one thread: seconds are those of the work itself
         for solver in ("cells", "few lobes"):
             clock = Clock()
-            cells = solver == "cells"
-            solution = solve(problem, from_nothing(len(used))) if cells else few_lobes(problem, len(used))
+            solution = solve(problem, from_nothing(len(truth))) if solver == "cells" else few_lobes(problem, len(truth))
             seconds = f"{clock.taken().processor:.0f}"
-            table.append([name, solver, seconds, *_errors(solution, [materials[m] for m in used], problem, whole)])
+            table.append([name, solver, seconds, *_errors(solution, truth, problem, whole)])
             print(*table[-1], sep="; ", flush=True)
     return {"Cells and few lobes on exact sets": table}
-
-
-def _photo(number: int, materials: list[Reflectance], labels: list[int]) -> Observations:
-    normals, photo = sphere_normals(SIZE), (f"light_{number}",)
-    light = light_of_lat_long(light_map(SEED, number, 128, 64))
-    radiance = np.concatenate([ball(light, material, normals) for material in materials])
-    radiance *= 1 + NOISE * np.random.default_rng([SEED, number]).standard_normal(radiance.shape)
-    n = len(radiance)
-    zero = np.zeros(n, int)
-    return Observations(
-        normal=np.tile(in_camera(normals), (len(materials), 1)), view=np.tile(FRONT, (n, 1)), radiance=radiance,
-        clipped=np.zeros((n, 3), bool), material=np.repeat(labels, len(normals)), photo=zero, illumination=zero,
-        x=np.arange(n), y=zero, weight=np.ones(n), materials=tuple("abcde"), photos=photo, illuminations=photo,
-    )  # fmt: skip
 
 
 def _errors(solution: Solution, truth: list[Reflectance], problem: JointProblem, whole: list[Block]) -> list[str]:
@@ -90,14 +71,14 @@ def _errors(solution: Solution, truth: list[Reflectance], problem: JointProblem,
     values = zip(of.diffuse.tolist(), of.specular.tolist(), of.roughness.tolist(), strict=True)
     own = [Reflectance(tuple(diffuse), tuple(specular), roughness) for diffuse, specular, roughness in values]
     factor = np.array(common_factor(own, truth))
-    pairs = list(zip(own, truth, strict=True))
-    kd, ks = (
-        [
-            np.abs(np.array(getattr(a, part)) * factor - getattr(b, part)).mean() / np.mean(getattr(b, part))
-            for a, b in pairs
+    pairs, shares = list(zip(own, truth, strict=True)), []
+    for part in ("diffuse", "specular"):
+        true = [np.array(getattr(b, part)) for _, b in pairs]
+        off = [
+            np.abs(np.array(getattr(a, part)) * factor - t).mean() / t.mean()
+            for (a, _), t in zip(pairs, true, strict=True)
         ]
-        for part in ("diffuse", "specular")
-    )
+        shares.append(f"{100 * np.mean(off):.2g} %, {100 * max(off):.2g} %")
     rough = [abs(a.roughness - b.roughness) for a, b in pairs]
     decibels = []
     for block, solved, own_light in zip(whole, problem.blocks, solution.point.lights, strict=True):
@@ -105,5 +86,4 @@ def _errors(solution: Solution, truth: list[Reflectance], problem: JointProblem,
         for m in np.unique(block.material):
             shown, expected = radiance[block.material == m], block.radiance[block.material == m]
             decibels.append(10 * np.log10(np.quantile(expected, 0.999) ** 2 / np.mean((shown - expected) ** 2)))
-    shares = [f"{100 * np.mean(e):.2g} %, {100 * max(e):.2g} %" for e in (kd, ks)]
     return [*shares, f"{exact(np.mean(rough))}, {exact(max(rough))}", f"{np.mean(decibels):.1f}, {min(decibels):.1f}"]

@@ -16,6 +16,7 @@ from unittest.mock import patch
 
 import torch
 from torch import Tensor
+from torch.nn.functional import normalize
 
 from factorlib.errors import InputError
 from factorlib.reflection import Operator, reflection_operator
@@ -110,11 +111,9 @@ def _of_finite(table: Callable[[Tensor], dict], value: Tensor) -> dict:
 def gradient_errors(operator: Operator, true: list[Tensor]) -> dict:
     """Quantiles of the error by input; true: `gradients` of the reference."""
     scale = true[0] + lobe_integral(specular_inputs(GRADIENTS, 5)[1]) / 100
-    errors = [(a - b) / (b.abs() + scale) for a, b in zip(gradients(operator)[1:], true[1:], strict=True)]
-    return {
-        name: _of_finite(lambda some, e=error: quantiles(e[some]), error)
-        for name, error in zip(SLOPES, errors, strict=True)
-    }
+    pairs = zip(SLOPES, gradients(operator)[1:], true[1:], strict=True)
+    errors = {name: (a - b) / (b.abs() + scale) for name, a, b in pairs}
+    return {name: _of_finite(lambda some, e=e: quantiles(e[some]), e) for name, e in errors.items()}
 
 
 def gradients(operator: Operator) -> list[Tensor]:
@@ -132,10 +131,7 @@ def gradients(operator: Operator) -> list[Tensor]:
 def point(operator: Operator, count: int) -> tuple[Tensor, ...]:
     """Roughness, λ, n·o, n·z, o·z of random points under `LOBES` lobes of sharpness .3 to 3000."""
     g = torch.Generator().manual_seed(0)
-    n, o, z = (
-        torch.nn.functional.normalize(torch.randn(k, 3, generator=g, dtype=torch.float64), dim=1)
-        for k in (count, count, LOBES)
-    )
+    n, o, z = (normalize(torch.randn(k, 3, generator=g, dtype=torch.float64), dim=1) for k in (count, count, LOBES))
     o = torch.where(((n * o).sum(1) > 0)[:, None], o, -o)
     inputs = (torch.tensor(0.4), torch.logspace(-0.5, 3.5, LOBES), (n * o).sum(1), n @ z.T, o @ z.T)
     return tuple(t.to(operator.dtype) for t in inputs)
@@ -148,26 +144,25 @@ def values(operator: Operator, roughness: Tensor, sharpness: Tensor, no: Tensor,
         operator.specular(roughness, sharpness, no, nz, oz)
 
 
-def values_and_gradients(operator: Operator, *inputs: Tensor) -> None:
+def gradient(operator: Operator, *inputs: Tensor) -> None:
     """Compute values and all derivatives."""
     operator.response(*inputs)
 
 
-def microseconds(operators: dict[str, Operator]) -> dict[str, list[tuple[float, float]]]:
-    """(least, median) of the repeats, of values alone and of values with gradients, by operator."""
-    counts = {label: 8 if label in TOLERANCES else 1024 for label in operators}
+def microseconds(
+    operators: dict[str, Operator], rows: int = 1024, repeats: int = REPEATS
+) -> dict[str, list[list[float]]]:
+    """Of all repeats, of values alone and of values with all derivatives, by operator."""
+    counts = {label: 8 if label in TOLERANCES else rows for label in operators}
     inputs = {label: point(operator, counts[label]) for label, operator in operators.items()}
-    taken: dict[tuple[str, Callable], list[float]] = {}
-    for repeat in range(REPEATS + 1):  # the first one compiles
+    taken: dict[str, list[list[float]]] = {label: [[], []] for label in operators}
+    for _ in range(repeats + 1):
         for label, operator in operators.items():
-            for measure in (values, values_and_gradients):
+            for of, measure in zip(taken[label], (values, gradient), strict=True):
                 start = time.process_time()
                 measure(operator, *inputs[label])
-                seconds = time.process_time() - start
-                if repeat:
-                    taken.setdefault((label, measure), []).append(seconds / (counts[label] * LOBES) * 1e6)
-    pairs = [[taken[label, measure] for measure in (values, values_and_gradients)] for label in operators]
-    return {k: [(min(t), statistics.median(t)) for t in pair] for k, pair in zip(operators, pairs, strict=True)}
+                of.append((time.process_time() - start) / (counts[label] * LOBES) * 1e6)
+    return {label: [of[1:] for of in pair] for label, pair in taken.items()}  # the first one compiles
 
 
 # ── Special cases and laws of `studies/scenes/operators.py`, which `tests/reflection/test_stability.py` has bounds for ─────────────────────
@@ -232,31 +227,32 @@ def rows() -> Tables:
     glossy = {label: specular_errors(o, specular) for label, o in (fast | references).items() if label != REFERENCE}
     matte = {label: diffuse_errors(operator, diffuse) for label, operator in fast.items()}
     true, single = gradients(references[REFERENCE]), [label for label in fast if label.endswith("float32")]
-    slopes = {label: gradient_errors(fast[label], true) for label in single}
     coarse = {name: in_bfloat16(name) for name in FAST}
-    rounded = {f"{name}, specular": specular_errors(o, specular) for name, o in coarse.items()}
-    rounded |= {f"{name}, diffuse": diffuse_errors(o, diffuse) for name, o in coarse.items()}
-    errors = {f"{k}, specular": e for k, e in glossy.items()} | {f"{k}, diffuse": e for k, e in matte.items()}
-    fastest = min(pair[1][1] for pair in times.values())
-    by_input = [
-        [f"{quantity} {part}", *(f"{_percent(e, 'median')}, {_percent(e, 'p95')}" for e in (glossy[k][quantity][part] for k in single))]
-        for quantity in INPUTS
-        for part in glossy[single[0]][quantity]
-    ]  # fmt: skip
+    rounded = [[f"{name}, specular", specular_errors(o, specular)] for name, o in coarse.items()]
+    rounded += [[f"{name}, diffuse", diffuse_errors(o, diffuse)] for name, o in coarse.items()]
+    fastest, costs, slopes, by_input = min(statistics.median(pair[1]) for pair in times.values()), [], [], []
+    for label, pair in times.items():
+        cells = [f"{exact(min(of))}, {exact(statistics.median(of))}" for of in pair]
+        costs.append([label_of(label), *cells, f"{exact(statistics.median(pair[1]) / fastest)} ×"])
+    for label in single:
+        errors = gradient_errors(fast[label], true)
+        slopes += [[f"{label_of(label)}, by {word}", *_percents(errors[slope])] for slope, word in SLOPES.items()]
+    for quantity, part in ((q, part) for q in INPUTS for part in glossy[single[0]][q]):
+        asked = (glossy[label][quantity][part] for label in single)
+        by_input.append([f"{quantity} {part}", *(f"{_percent(e, 'median')}, {_percent(e, 'p95')}" for e in asked)])
+    whole = [
+        [f"{label_of(k)}, {kind}", *_percents(e)]
+        for kind, of in (("specular", glossy), ("diffuse", matte))
+        for k, e in of.items()
+    ]
     return {
-        "µs per evaluation: least, median": [
-            ["operator", "values", "values and gradients", "of the fastest"],
-            *([label_of(k), *(", ".join(map(exact, p)) for p in pair), f"{exact(pair[1][1] / fastest)} ×"] for k, pair in times.items()),
-        ],
-        "Errors of values": [["operator", *QUANTILES], *([label_of(k), *_percents(e)] for k, e in errors.items())],
-        "Errors of derivatives": [
-            ["operator", *QUANTILES],
-            *([f"{label_of(k)}, by {word}", *_percents(e[slope])] for k, e in slopes.items() for slope, word in SLOPES.items()),
-        ],
+        "µs per evaluation: least, median": [["operator", "values", "values and gradients", "of the fastest"], *costs],
+        "Errors of values": [["operator", *QUANTILES], *whole],
+        "Errors of derivatives": [["operator", *QUANTILES], *slopes],
         "Specular errors by what is asked: median, p95": [["asked", *map(label_of, single)], *by_input],
         "Errors of values in bfloat16": [
             ["operator", *QUANTILES, "not finite"],
-            *([label_of(k), *_percents(e), str(e.get("not finite", 0))] for k, e in rounded.items()),
+            *([label_of(k), *_percents(e), str(e.get("not finite", 0))] for k, e in rounded),
         ],
     } | special(fast)  # fmt: skip
 

@@ -23,7 +23,6 @@ from scipy.spatial.transform import Rotation
 from factorlib.align.coarse import toward
 from factorlib.dataset.read import read_dataset
 from factorlib.dataset.schema import Dataset
-from factorlib.dataset.slices import dataset_slice
 from factorlib.errors import InputError
 from factorlib.geometry.camera import Pose, angle_between
 from factorlib.geometry.raster import Caster, rasterise
@@ -31,10 +30,10 @@ from factorlib.jsonfile import read_result
 from factorlib.meshes.read import read_mesh
 from factorlib.results.photos import read_photo_facts
 from factorlib.results.poses import PhotoPoses, read_photo_poses
-from factorlib.stage import Inputs, silent
 from stages import align, masks
 from studies.measured.align import normal_error_deg, share
 from studies.measured.tools import Clock, Tables, needed
+from studies.steps.photos import run_stages
 
 REFERENCE = "reference_poses.json"
 CURE = "name a dataset whose poses are known, as align's poses.json has them"
@@ -61,27 +60,19 @@ def references(folder: Path) -> dict[str, Reference]:
 def withheld(dataset: Dataset) -> Dataset:
     """The dataset without cameras, poses, keypoints and what a source of cameras says."""
     replace = msgspec.structs.replace
-    photos = [
-        replace(photo, camera=None, objects=[replace(obj, pose=None, keypoints=[]) for obj in photo.objects])
-        for photo in dataset.spec.photos
-    ]
+    bare = [[replace(obj, pose=None, keypoints=[]) for obj in photo.objects] for photo in dataset.spec.photos]
+    photos = [replace(p, camera=None, objects=of) for p, of in zip(dataset.spec.photos, bare, strict=True)]
     return replace(dataset, spec=replace(dataset.spec, photos=photos), external={})
 
 
 def measured(folder: Path, photo: str) -> list[dict]:
     """One row per object of the photo: errors against the reference, and what the stage itself says of the pose."""
     dataset, reference = withheld(read_dataset(folder)), references(folder)[photo]
-    slices = {name: dataset_slice(dataset, name, photo) for name in ("photo", "materials", "objects")}
-    facts = {f"dataset.{name}": part.facts for name, part in slices.items()}
-    files = {path: dataset.folder / path for part in slices.values() for path in part.files}
     with TemporaryDirectory() as made:
-        clock, folders = Clock(), {name: Path(made) / name for name in ("masks", "align")}
-        inputs = Inputs(folders, facts, files, photo)
-        for stage, out in zip((masks, align), folders.values(), strict=True):
-            out.mkdir()
-            stage.main(stage.Params(), inputs, out, silent)
-        picture = read_photo_facts(folders["masks"] / f"{photo}.json")
-        answer, taken = read_photo_poses(folders["align"] / f"{photo}.json"), clock.taken()
+        clock = Clock()
+        run_stages(dataset, Path(made), (masks, align), photos=[photo])
+        picture = read_photo_facts(Path(made) / "masks" / f"{photo}.json")
+        answer, taken = read_photo_poses(Path(made) / "align" / f"{photo}.json"), clock.taken()
     rows = []
     for obj in dataset.photo(photo).objects:
         file, said = dataset.spec.meshes[obj.mesh], answer.objects[obj.name]

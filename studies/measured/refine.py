@@ -46,14 +46,8 @@ HEAD = [
     "s",
 ]
 POSED_HEAD = [
-    "case",
-    "photos",
-    "changed: better, worse",
-    "normal error before: median, worst (°)",
-    "after (°)",
-    "of the mesh alone (°)",
-    "s",
-]
+    "case", "photos", "changed: better, worse", "normal error before: median, worst (°)", "after (°)", "of the mesh alone (°)", "s",
+]  # fmt: skip
 
 
 def measured(shape: str, axis: int, off: float, rough: bool) -> list[str]:

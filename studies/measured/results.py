@@ -29,6 +29,7 @@ SECTIONS = {  # module -> title
     "operator": "Reflection operators",
     "align": "Poses",
     "real_poses": "Poses of real photographs",
+    "real_sets": "Re-synthesis of real photographs",
     "refine": "Poses by shading, and proportions of meshes",
     "faults": "Faults, reruns and fuzz",
     "scale": "Large sets on a cluster",

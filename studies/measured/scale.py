@@ -17,7 +17,6 @@ import re
 import shutil
 import subprocess
 import sys
-import threading
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -58,34 +57,21 @@ class Cost(msgspec.Struct):
     processes: int = 0
 
 
-class Watch:
-    """What this process's offspring costs, by role: read from /proc twice a second until it is closed."""
-
-    def __init__(self) -> None:
-        self._looks: dict[int, tuple[str, float, float]] = {}
-        self._over = threading.Event()
-        self._thread = threading.Thread(target=self._look_often, daemon=True)
-        self._thread.start()
-
-    def close(self) -> dict[str, Cost]:
-        """Stop looking; the cost by role."""
-        self._over.set()
-        self._thread.join()
-        costs: dict[str, Cost] = {}
-        for role, cpu, peak in self._looks.values():
-            cost = costs.get(role, Cost())
-            costs[role] = Cost(cost.cpu_seconds + cpu, max(cost.peak_mb, peak), cost.processes + 1)
-        return costs
-
-    def _look_often(self) -> None:
-        while not self._over.wait(0.5):
-            for process in psutil.Process().children(recursive=True):
-                with contextlib.suppress(psutil.Error, OSError, LookupError):
-                    command, cpu = " ".join(process.cmdline()), process.cpu_times()
-                    status = Path(f"/proc/{process.pid}/status").read_text()
-                    role = next((role for word, role in ROLES.items() if word in command), "other")
-                    peak = int(status.partition("VmHWM:")[2].split()[0]) / 1024
-                    self._looks[process.pid] = role, cpu.user + cpu.system, peak
+def watched(command: list[str]) -> tuple[int, dict[str, Cost]]:
+    """Run a command; its exit code, and what it and this process's other offspring cost by role: read from /proc twice a second."""
+    run, looks, costs = subprocess.Popen(command, cwd=ROOT), {}, {}
+    while run.poll() is None:
+        for process in psutil.Process().children(recursive=True):
+            with contextlib.suppress(psutil.Error, OSError, LookupError):
+                words, cpu = " ".join(process.cmdline()), process.cpu_times()
+                peak = Path(f"/proc/{process.pid}/status").read_text().partition("VmHWM:")[2].split()[0]
+                role = next((role for word, role in ROLES.items() if word in words), "other")
+                looks[process.pid] = role, cpu.user + cpu.system, int(peak) / 1024
+        time.sleep(0.5)
+    for role, cpu, peak in looks.values():
+        cost = costs.get(role, Cost())
+        costs[role] = Cost(cost.cpu_seconds + cpu, max(cost.peak_mb, peak), cost.processes + 1)
+    return run.returncode, costs
 
 
 class Measured(msgspec.Struct):
@@ -103,19 +89,18 @@ class Measured(msgspec.Struct):
 def measured(folder: Path, build: Path, settings: list[str]) -> Measured:
     """A run from nothing, and what it cost.  InputError where it fails."""
     shutil.rmtree(build, ignore_errors=True)
-    watch = Watch()
     command = [sys.executable, "-m", "studies.measured.scale", str(folder), str(build), SETTINGS, *settings]
-    code, costs = subprocess.run(command, cwd=ROOT, check=False).returncode, watch.close()
+    code, costs = watched(command)
     if code:
         raise InputError("the run failed: see above", file=folder)
     events = [json.loads(line) for line in (build / folder.name / "log.jsonl").read_text().splitlines()]
     done: dict[str, list[dict[str, Any]]] = {}
     for event in (event for event in events if event["event"] == "done"):
         done.setdefault(event["stage"], []).append(event)
-    stages = {
-        name: Cost(sum(one["cpu_seconds"] for one in of), max(one["memory_mb"] for one in of), len(of))
-        for name, of in done.items()
-    }
+    stages = {}
+    for name, of in done.items():
+        cpu, memory = zip(*((one["cpu_seconds"], one["memory_mb"]) for one in of), strict=True)
+        stages[name] = Cost(sum(cpu), max(memory), len(of))
     sizes = [path.stat().st_size for path in (build / "store").rglob("*") if path.is_file()]
     spread = done["solve"][0].get("spread", {"tasks": 0})
     return Measured(len(done["urm"]), costs, stages, spread, sum(sizes) / 2**20, len(sizes))

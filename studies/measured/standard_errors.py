@@ -8,10 +8,11 @@ Of a normal distribution it is 68 %.  With `--other FOLDER`, the results of anot
 
 from __future__ import annotations
 
-from argparse import ArgumentParser
 from pathlib import Path
+from typing import Annotated
 
 import numpy as np
+import typer
 from jaxtyping import Float
 
 from factorlib.errors import InputError
@@ -20,6 +21,7 @@ from factorlib.images.exr import read_rgb_exr
 from factorlib.light.prior_fit import cell_means
 from factorlib.results.materials import in_order, read_materials
 from factorlib.results.metrics import read_metrics
+from studies.measured.tools import table
 
 CELLS = 500  # of equal area, 9° apart
 PARTS = ("diffuse", "specular", "roughness")
@@ -30,11 +32,11 @@ def material_deviations(build: Path, other: Path | None) -> dict[str, Float[np.n
 
     other: results that stand in for the truth, of a data set of one connected component.  InputError where there is no truth
     """
-    table = read_materials(build / "export/materials.json").materials
+    solved = read_materials(build / "export/materials.json").materials
     if other:
         path = other / "export/materials.json"
-        true = dict(zip(table, in_order(read_materials(path), list(table), path), strict=True))
-        sums = (np.sum([[m.diffuse, m.specular] for m in of.values()], axis=(0, 1)) for of in (true, table))
+        true = dict(zip(solved, in_order(read_materials(path), list(solved), path), strict=True))
+        sums = (np.sum([[m.diffuse, m.specular] for m in of.values()], axis=(0, 1)) for of in (true, solved))
         factors = dict.fromkeys(true, np.divide(*sums))
     else:
         file = build / "evaluate/metrics.json"
@@ -44,7 +46,7 @@ def material_deviations(build: Path, other: Path | None) -> dict[str, Float[np.n
         factors = {n: np.array(compared.factor[str(one.component)]) for n, one in compared.materials.items()}
     off: dict[str, list] = {part: [] for part in PARTS}
     for part, name in ((part, name) for part in PARTS for name in true):
-        materials = (table[name], true[name], table[name].stderr)
+        materials = (solved[name], true[name], solved[name].stderr)
         value, expected, error = (np.atleast_1d(np.array(getattr(m, part), float)) for m in materials)
         by = 1.0 if part == "roughness" else factors[name]
         off[part].append(np.abs(by * value - expected) / np.maximum(by * error, 1e-12))
@@ -63,22 +65,20 @@ def light_deviations(build: Path, other: Path | None) -> Float[np.ndarray, " n"]
     return np.concatenate(off)
 
 
-def main(builds: list[Path], other: Path | None) -> None:
+def main(
+    builds: Annotated[list[Path], typer.Argument(help="folders of results, such as build/eames")],
+    other: Annotated[Path | None, typer.Option(help="another run of the same data set, instead of the truth")] = None,
+) -> None:
     """Print the shares within one standard error, and the median deviation in standard errors."""
-    parts = "".join(part.rjust(13) for part in ("k_d", "k_s", "roughness", "light"))
-    print(f"{'within one standard error (median deviation)':45}{parts}")
+    rows = []
     for build in builds:
         try:
             off = [*material_deviations(build, other).values(), light_deviations(build, other)]
         except InputError as error:
             raise SystemExit(f"{error}\nrun `make evaluate` first, and name folders of one data set") from None
-        cells = (f"{100 * np.mean(d < 1):5.0f} % ({np.median(d):.2f})" for d in off)
-        print(f"{build!s:45}" + "".join(cell.rjust(13) for cell in cells))
+        rows.append([str(build), *(f"{100 * np.mean(d < 1):.0f} % ({np.median(d):.2f})" for d in off)])
+    print(table(["within one standard error (median deviation)", "k_d", "k_s", "roughness", "light"], rows))
 
 
 if __name__ == "__main__":
-    parser = ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("builds", nargs="+", type=Path, help="folders of results, such as build/eames")
-    parser.add_argument("--other", type=Path, help="another run of the same data set, instead of the truth")
-    given = parser.parse_args()
-    main(given.builds, given.other)
+    typer.run(main)

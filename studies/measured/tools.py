@@ -1,14 +1,14 @@
-"""What measurements and studies share: numbers and tables as text, text between marks of a page, time, threads."""
+"""What measurements and studies share: numbers and tables as text, text between marks of a page, time, processes."""
 
 from __future__ import annotations
 
+import json
 import os
 import re
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Iterable, Sequence
-from concurrent.futures import ThreadPoolExecutor
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -83,6 +83,13 @@ def evaluated(dataset: Path | str, root: Path = ROOT, **variables: str) -> dict[
     return msgspec.to_builtins(read_metrics(root / "build" / Path(dataset).name / "evaluate/metrics.json"))
 
 
+def apart(module: str, facts: Any, environment: Mapping[str, str] | None = None) -> Any:
+    """What `python -m module <facts as JSON>` prints last, as JSON, in a process of its own.  Raises CalledProcessError where it fails."""
+    command = [sys.executable, "-m", module, json.dumps(facts)]
+    done = subprocess.run(command, cwd=ROOT, env=environment, stdout=subprocess.PIPE, check=True)
+    return json.loads(done.stdout.splitlines()[-1])
+
+
 class Taken(NamedTuple):
     """Seconds since the start: of the wall clock, and of the processor for all threads of the process."""
 
@@ -99,9 +106,3 @@ class Clock:
     def taken(self) -> Taken:
         """The time until now."""
         return Taken(round(time.perf_counter() - self._wall, 3), round(time.process_time() - self._processor, 3))
-
-
-def threaded(function: Callable, items: Iterable) -> list:
-    """The map that solvers are handed: as many threads as the machine has processors, as in `make all`."""
-    with ThreadPoolExecutor(os.cpu_count()) as pool:
-        return list(pool.map(function, items))

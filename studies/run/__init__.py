@@ -3,7 +3,7 @@
 Nothing is declared anew: steps, keys, the store, locks, resuming, progress and the pool of processes are the runner's
 (`factorlib.runner`).  Results of studies have a store of their own in build/studies, those of quick ones in
 build/studies/quick, so that neither `make gc` nor a reader takes one for the other.  What the cases come to is no step: it is
-written anew after each run, for it takes a second.
+written anew after each run (`studies.run.page`), for it takes a second.
 """
 
 from __future__ import annotations
@@ -17,21 +17,18 @@ from typing import Any
 import msgspec
 
 from factorlib.errors import InputError, did_you_mean
-from factorlib.jsonfile import json_text, read_json
 from factorlib.runner import verbs
 from factorlib.runner.filehash import FileHashes
 from factorlib.runner.project import LIBRARY, Data, Project, Provider
-from factorlib.wholefile import replace_file
-from studies.study import FULL, QUICK, Scale, Score, Study
+from studies.study import FULL, QUICK, Scale, Study
 
 ORDER = (  # of the page
     "matrix-size row-and-column structure label-quality alignment-error progressive leave-one-out paper-sets gauss-sphere comparison "
-    "prior network-evaluation cost speed parts hard-cases seeds-and-machines"
+    "prior network-evaluation cost speed parts hard-cases rounding seeds-and-machines"
 )
 CATALOGUE = "studies.catalogue"
 STUDIES: dict[str, Study] = {n: import_module(f"{CATALOGUE}.{n.replace('-', '_')}").STUDY for n in ORDER.split()}
 SLICES = ("case", "worlds", "sets")
-FINISHED = ("figure.svg", "table.csv", "table.json", "paragraph.md")
 
 
 class Slice(msgspec.Struct, frozen=True):
@@ -88,13 +85,13 @@ def data_of(folder: Path, scale: Scale) -> Data:
 
 
 def sets_of(study: Study, scale: Scale) -> dict[str, Any]:
-    """The data sets of a study, and what one of this checkout contains besides its truth, so that a step's key has it."""
+    """The data sets of a study, and what one of this checkout contains, so that a step's key has it."""
     facts = study.sets(scale)
     if "folder" not in facts:
         return facts
     hashes, folder = FileHashes(None), LIBRARY / facts["folder"]
-    files = {file.relative_to(folder): file for file in sorted(folder.rglob("*")) if file.is_file()}
-    return facts | {"content": {str(name): hashes.content(f) for name, f in files.items() if name.parts[0] != "truth"}}
+    files = [file for file in sorted(folder.rglob("*")) if file.is_file()]
+    return facts | {"content": {str(file.relative_to(folder)): hashes.content(file) for file in files}}
 
 
 def make(
@@ -111,50 +108,21 @@ def make(
         project, study = studies(scale, root, name), STUDIES[name]
         if scale.quick:
             print(f"{name}: quick: one seed, smallest sets: no conclusion")
-        targets = list(study.steps or (study.module,))
+        targets = list(study.steps or (name.replace("-", "_"),))
         codes.append(verbs.make(project, verbs.Wish(name, targets=targets, settings=settings or [], force=force)))
         if codes[-1] == 0:
+            from studies.run.page import conclude, write_page  # here: a plan must not pay for science
+
             conclude(study, scale, project.build / name / targets[-1], project.build / name)
             print(f"  study: {project.shown(project.build / name / 'figure.svg')}")
             print(f"  page: {project.shown(write_page(project))}")
     return next((code for code in codes if code), 0)
 
 
-def conclude(study: Study, scale: Scale, scores: Path, home: Path) -> None:
-    """Write what a study comes to into the folder `home`: table.json and .csv, figure.svg, paragraph.md and pictures/.
-
-    scores: the folder of its last step, with scores.json
-    """
-    from studies.conclusion import concluded, csv_text, paragraph  # here: a plan must not pay for science
-    from studies.figures import figure
-
-    table = concluded(study, scale, msgspec.convert(read_json(scores / "scores.json"), dict[str, Score]))
-    module, _, function = study.pictures.rpartition(".")
-    drawn = getattr(import_module(module), function) if function else lambda *of: {}
-    pictures = drawn(study.settings(scale), study.numbers(scale), scores)
-    table = msgspec.structs.replace(table, pictures={name: caption for name, (caption, _) in pictures.items()})
-    texts = (figure(table, study.across), csv_text(table), json_text(table), paragraph(table))
-    for file, words in zip(FINISHED, texts, strict=True):
-        replace_file(home / file, words.encode())
-    shutil.rmtree(home / "pictures", ignore_errors=True)
-    for name, (_, data) in pictures.items():
-        (home / "pictures").mkdir(exist_ok=True)
-        replace_file(home / "pictures" / name, data)
-
-
-def write_page(project: Studies) -> Path:
-    """index.html of all studies of this scale that are done."""
-    from studies.run.page import page
-
-    folders = [folder for name in STUDIES if (folder := project.build / name) and (folder / "table.json").is_file()]
-    replace_file(
-        project.build / "index.html", page([(read_json(folder / "table.json"), folder) for folder in folders]).encode()
-    )
-    return project.build / "index.html"
-
-
 def forget(scale: Scale, names: list[str], root: Path = LIBRARY) -> int:
     """Forget the results of studies; `collect` frees what they took.  Returns 0."""
+    from studies.run.page import FINISHED, write_page
+
     project = studies(scale, root)
     for name in names:
         shutil.rmtree(project.build / name / "pictures", ignore_errors=True)

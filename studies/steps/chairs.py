@@ -1,5 +1,6 @@
-"""How far the predicted chairs of a photo are from the photo: writes <case>.json and chairs-<case>.png, the photo's above the predicted.
+"""How far the predicted chairs of a photo are from the photo: writes <case>.json and <case>.png, the photo's chairs above the predicted.
 
+A chair is left out as the pixels of its shell in one photo; the rest of all photos is solved by the stage `solve`, for each shell anew.
 Nothing is scaled in `chair`: the photo's exposure has to follow from the rest of it.  `chair_scaled` takes one factor per channel
 out first.  The null is the shell's own mean colour, which nobody knows who has not seen it; scaled or not, it is the same picture.
 Predicted pixels have the photo's shadows of meshes, but no light from other surfaces where the chair is left out, for that light is read
@@ -10,6 +11,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any
 
 import msgspec
@@ -18,7 +20,7 @@ from jaxtyping import Bool, Float, UInt8
 
 from factorlib.evaluate.picture import picture_error, white_of
 from factorlib.images.exr import read_exr
-from factorlib.images.picture import picture, png_bytes, read_png, write_png
+from factorlib.images.picture import picture, write_png
 from factorlib.images.tone import shown
 from factorlib.jsonfile import write_json
 from factorlib.model.interreflection import bounced_light
@@ -30,7 +32,8 @@ from factorlib.results.materials import in_order, read_exposures, read_materials
 from factorlib.stage import Inputs, Progress
 from factorlib.urm.observations import Observations, read_observations
 from studies.steps import Params
-from studies.study import Score, Setting, case_name
+from studies.steps.solve import solved
+from studies.study import Score
 
 LEGS = "wood"  # in all photos
 MARGIN = 8  # pixels about a chair, in pictures
@@ -40,7 +43,6 @@ Image = Float[np.ndarray, "h w 3"]
 class Chair(msgspec.Struct, frozen=True):
     """The photo, and which of its pixels show a shell with a mesh below it."""
 
-    photo: str
     truth: Image
     mask: Bool[np.ndarray, "h w"]
 
@@ -49,41 +51,49 @@ class Chair(msgspec.Struct, frozen=True):
         """The radiance that is shown as white."""
         return white_of(self.truth, self.mask)
 
-    def cut_out(self, image: Image) -> UInt8[np.ndarray, "h w 3"]:
-        """A picture of the shell alone, exposed as the photo's."""
+    def beside(self, image: Image) -> UInt8[np.ndarray, "h w 3"]:
+        """A picture of the photo's shell above that of another image, exposed alike."""
         rows, columns = (slice(max(at.min() - MARGIN, 0), at.max() + MARGIN) for at in np.nonzero(self.mask))
-        colours = picture(image[rows, columns], 1 / self.white)
-        return np.where(self.mask[rows, columns][..., None], colours, np.uint8(255))
+        pair = (picture(of[rows, columns], 1 / self.white) for of in (self.truth, image))
+        return np.concatenate([np.where(self.mask[rows, columns][..., None], of, np.uint8(255)) for of in pair])
 
 
 def main(params: Params, inputs: Inputs, out: Path, progress: Progress) -> None:
-    """Predict, compare, and lay side by side."""
+    """Solve, predict, compare, and lay side by side."""
     case = inputs.facts["dataset.case"]
     (photos,) = inputs["photos"].iterdir()
     tables = {file.stem: read_observations(file) for file in sorted((photos / "urm").glob("*.parquet"))}
-    materials = list(tables[case["photo"]].materials)
     channels, geometry = (read_exr(photos / stage / f"{case['photo']}.exr") for stage in ("masks", "align"))
-    chairs = {shell: chair_of(case["photo"], materials.index(shell), channels, geometry) for shell in case["shells"]}
+    materials = list(tables[case["photo"]].materials)
+    chairs = {shell: chair_of(materials.index(shell), channels, geometry) for shell in case["shells"]}
+    alone = msgspec.structs.replace(inputs, unfinished=None)  # solves must not resume each other's
+    images, folder = [], Path()
+    with TemporaryDirectory() as solves:
+        for number, (shell, chair) in enumerate(chairs.items()):
+            if case["prediction"] == "flat":
+                colour = flat_colour(tables, case["photo"], shell, LEGS)
+                images.append(np.broadcast_to(colour, chair.truth.shape))
+                continue
+            observed = case["prediction"] == "observed"
+            if not (observed and number):  # what is observed is solved once
+                seen = tables if observed else tables | {case["photo"]: without(tables[case["photo"]], shell)}
+                (folder := Path(solves) / shell).mkdir()
+                solved(seen, case["solve"], alone, folder, progress)
+            images.append(predicted(folder, chair, case["photo"], channels, geometry, tables[case["photo"]], observed))
+    write_json(out / f"{inputs.photo}.json", score_of(list(chairs.values()), images))
+    write_png(out / f"{inputs.photo}.png", side_by_side([c.beside(of) for c, of in zip(chairs.values(), images, strict=True)]))  # fmt: skip
 
-    def image(shell: str) -> Image:
-        """What the case predicts."""
-        if case["prediction"] == "flat":
-            return np.broadcast_to(flat_colour(tables, case["photo"], shell, LEGS), chairs[shell].truth.shape)
-        observed = case["prediction"] == "observed"
-        solved = inputs["whole"] if observed else inputs["leave_out"] / inputs.photo / shell
-        return predicted(solved, chairs[shell], materials, channels, geometry, tables[case["photo"]], observed)
 
-    images = {shell: image(shell) for shell in chairs}
-    write_json(out / f"{inputs.photo}.json", score_of(list(chairs.values()), list(images.values())))
-    pairs = [np.concatenate([c.cut_out(c.truth), c.cut_out(images[shell])]) for shell, c in chairs.items()]
-    write_png(out / f"chairs-{inputs.photo}.png", np.concatenate(level(pairs), axis=1))
+def without(table: Observations, material: str) -> Observations:
+    """A photo's observations but for those of a material."""
+    return table.take(table.material != table.materials.index(material))
 
 
-def chair_of(photo: str, label: int, channels: Mapping[str, Any], geometry: Mapping[str, Any]) -> Chair:
+def chair_of(label: int, channels: Mapping[str, Any], geometry: Mapping[str, Any]) -> Chair:
     """channels, geometry: as the stages `masks` and `align` write them."""
     mesh = np.abs(np.stack([geometry[f"normal.{a}"] for a in "xyz"])).max(axis=0) > 0
     mask = (np.rint(channels["label"]) == label + 1) & (channels["valid"] > 0.5) & mesh
-    return Chair(photo, np.stack([channels[c] for c in "RGB"], axis=-1).astype(float), mask)
+    return Chair(np.stack([channels[c] for c in "RGB"], axis=-1).astype(float), mask)
 
 
 def flat_colour(tables: dict[str, Observations], photo: str, shell: str, beside: str) -> Float[np.ndarray, "3"]:
@@ -102,24 +112,23 @@ def flat_colour(tables: dict[str, Observations], photo: str, shell: str, beside:
 
 
 def predicted(
-    solved: Path, chair: Chair, materials: list[str], channels: Mapping[str, Any], geometry: Mapping[str, Any],
-    table: Observations, bounces: bool,
+    folder: Path, chair: Chair, photo: str, channels: Mapping[str, Any], geometry: Mapping[str, Any], table: Observations, bounces: bool
 ) -> Image:  # fmt: skip
     """The shell's pixels by the materials, the photo's light, its exposure and its tone curve of a solve; zero elsewhere.
 
     bounces: whether light that surfaces send each other is added, if the solve had it: it is read off the photo
     """
-    answer, around = read_materials(solved / "materials.json"), None
-    exposure = np.array(read_exposures(solved / "exposures.json").get(chair.photo, 1.0))
-    lobes = read_lobes(solved / "lobes.parquet")[chair.photo].scaled(exposure)
+    answer, around = read_materials(folder / "materials.json"), None
+    exposure = np.array(read_exposures(folder / "exposures.json").get(photo, 1.0))
+    lobes = read_lobes(folder / "lobes.parquet")[photo].scaled(exposure)
     if answer.model.self_shadowing:
         with_bounces = bounces and answer.model.interreflection
         around = Surroundings(table, bounced_light(table, table.radiance.astype(float)) if with_bounces else None)
-    reflectances = in_order(answer, materials, solved / "materials.json")
+    reflectances = in_order(answer, list(table.materials), folder / "materials.json")
     alone = {**channels, "label": np.where(chair.mask, channels["label"], 0.0)}
     reflector = Reflector(reflection_operator("network"), lobes)
     image = resynthesised(reflector, reflectances, alone, geometry, around=around)
-    tone = answer.model.tone.get(chair.photo)
+    tone = answer.model.tone.get(photo)
     return shown(image, tone.exponent, tone.pivot) if tone else image
 
 
@@ -141,29 +150,8 @@ def _factor(chair: Chair, image: Image) -> Float[np.ndarray, "3"]:
     return (image[kept] * chair.truth[kept]).sum(0) / np.maximum((image[kept] ** 2).sum(0), 1e-30)
 
 
-def level(pictures: Sequence[np.ndarray], above: bool = False) -> list[np.ndarray]:
-    """Pictures padded with white to the height of the highest, below or `above`."""
-    height = max(len(p) for p in pictures)
-    sides = [(height - len(p), 0) if above else (0, height - len(p)) for p in pictures]
-    return [np.pad(p, (side, (0, 0), (0, 0)), constant_values=255) for p, side in zip(pictures, sides, strict=True)]
-
-
 def side_by_side(pictures: Sequence[np.ndarray]) -> UInt8[np.ndarray, "h w 3"]:
-    """Pairs of equally high halves in a row, so that the lower halves begin at the same height."""
-    spaced = [np.pad(p, ((0, 0), (4, 4), (0, 0)), constant_values=255) for p in pictures]
-    halves = [
-        level([half(p) for p in spaced], above=True)
-        for half in (lambda p: p[: len(p) // 2], lambda p: p[len(p) // 2 :])
-    ]
-    return np.concatenate([np.concatenate(row, axis=1) for row in halves])
-
-
-def shells_of_photos(settings: Sequence[Setting], numbers: Sequence[int], scores: Path) -> dict[str, tuple[str, bytes]]:
-    """PNG files by name, with captions: the photos' shells above the predicted ones, a file for each setting."""
-    files = {}
-    for s in settings:
-        shells = ", ".join(f"{s.case(k).photo} ({', '.join(s.case(k).shells)})" for k in numbers)
-        caption = f"{s.label}: the chairs' shells in the photos (above) and predicted (below), exposed alike: {shells}."
-        pictures = [read_png(scores / f"chairs-{case_name(s.name, k)}.png") for k in numbers]
-        files[f"{s.name}.png"] = (caption, png_bytes(side_by_side(pictures)))
-    return files
+    """Pictures in a row, white below the lower ones."""
+    height = max(len(p) for p in pictures)
+    padded = [np.pad(p, ((0, height - len(p)), (4, 4), (0, 0)), constant_values=255) for p in pictures]
+    return np.concatenate(padded, axis=1)

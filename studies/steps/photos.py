@@ -1,10 +1,13 @@
 """What photos of data sets show, by the stages `masks`, `align` and `urm` themselves: writes <set>/ with a folder for each stage.
 
-`run_stages` calls stages one after another without the runner, as a case's own process does; what each takes is read in pipeline.yaml.
+Sets are one of this checkout, or rendered sets of chairs of all seeds, as `factorlib.generate` makes them, which <set>/data keeps: photographs
+have all bounces, a mesh coarser than what was photographed, clipped pixels.
+Mitsuba's scalar variant traces, which every machine has.
 """
 
 from __future__ import annotations
 
+import os
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from types import ModuleType
@@ -14,7 +17,9 @@ import msgspec
 import yaml
 
 from factorlib.dataset.read import read_dataset
+from factorlib.dataset.schema import Dataset
 from factorlib.dataset.slices import dataset_slice
+from factorlib.generate.eames import SET, Parameters, generate
 from factorlib.jsonfile import read_json, write_json
 from factorlib.reflection.network import SHIPPED
 from factorlib.stage import Inputs, Progress, silent
@@ -27,20 +32,27 @@ CHECKOUT = Path(__file__).resolve().parents[2]
 def main(params: Params, inputs: Inputs, out: Path, progress: Progress) -> None:
     """All rendered sets, or some photos of a data set of this checkout; poses are searched as in every run."""
     facts = inputs.facts["dataset.sets"]
-    folders = [CHECKOUT / facts["folder"]] if "folder" in facts else sorted(inputs["sets"].iterdir())
-    for number, folder in enumerate(folders):
-        progress(number, len(folders), f"set {folder.name}")
-        run_stages(folder, out / folder.name, (masks, align, urm), photos=facts.get("photos"))
+    if "folder" in facts:
+        folder = CHECKOUT / facts["folder"]
+        return run_stages(read_dataset(folder), out / folder.name, (masks, align, urm), photos=facts["photos"])
+    os.environ["FACTORLIB_MITSUBA"] = "scalar_rgb"  # read where Mitsuba is first used
+    size = Parameters(**{field: facts[field] for field in ("width", "height", "light_rows", "spp")})
+    for number, seed in enumerate(facts["seeds"]):
+        progress(number, len(facts["seeds"]), f"set {seed}")
+        (data := out / str(seed) / "data").mkdir(parents=True)
+        generate(data, seed, [], size, silent, SET.shots[: facts["shots"]])
+        run_stages(read_dataset(data), out / str(seed), (masks, align, urm))
+    return None
 
 
 def run_stages(
-    folder: Path, out: Path, stages: Sequence[ModuleType], params: Mapping[str, dict[str, Any]] = {}, photos: Sequence[str] | None = None
+    dataset: Dataset, out: Path, stages: Sequence[ModuleType], params: Mapping[str, dict[str, Any]] = {}, photos: Sequence[str] | None = None
 ) -> None:  # fmt: skip
-    """Run stages, of which the first is `masks`, on the data set in `folder`, each into out/<stage>/.
+    """Run stages, of which the first is `masks`, on a data set, each into out/<stage>/, without the runner.
 
-    params: by stage, those that differ from their defaults;  photos: None for all of the set
+    What each takes is read in pipeline.yaml.  params: by stage, those that differ from their defaults;  photos: None for all of the set
     """
-    dataset, said = read_dataset(folder), yaml.safe_load((CHECKOUT / "pipeline.yaml").read_text(encoding="utf-8"))
+    said = yaml.safe_load((CHECKOUT / "pipeline.yaml").read_text(encoding="utf-8"))
     photos = [photo.name for photo in dataset.spec.photos] if photos is None else photos
     done = {"train": SHIPPED}
     for stage in stages:

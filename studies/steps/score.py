@@ -17,106 +17,89 @@ seconds that it took, and how coloured lights are, which is what the paper's pri
     colour         mean angle between the colours of a mirror sphere in the recovered and in the true light
     tint           deviation over channels of the log of the factor that takes recovered reflectances to true ones
 
-Nulls: what a guess scores that knows nothing but mean colours.  Of objects, for the first seed, pictures are written beside:
-balls-<case>.png and matrix-<case>.png.
+Nulls: what a guess scores that knows nothing but mean colours.  Of objects, for the first seed, <case>.png shows all materials (rows) in all
+lights, the truth and, right of it, what was recovered; entries that were observed have a bright frame.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 
 import msgspec
 import numpy as np
 from jaxtyping import Float, UInt8
 
-from factorlib.evaluate.ball import Light, constant_light
+from factorlib.evaluate.ball import constant_light, light_of_lat_long
 from factorlib.evaluate.gauge import connected_components
-from factorlib.evaluate.lights import compare_lights
 from factorlib.evaluate.materials import GREY
 from factorlib.evaluate.picture import picture_error, white_of
 from factorlib.evaluate.relighting import INSIDE, Appearances
-from factorlib.images.picture import picture, png_bytes, read_png, write_png
+from factorlib.images.picture import picture, write_png
 from factorlib.jsonfile import read_json, write_json
 from factorlib.results.materials import Reflectance, Solved, read_materials
 from factorlib.stage import Inputs, Progress
-from studies.errors import Answer, factor_of, in_true_gauge, light_errors, lights_of, material_errors, times
-from studies.spheres import materials_of, read_lights
+from studies.errors import Map, factor_of, in_gauge, light_errors, maps_of, material_errors, times
+from studies.spheres import materials_of, read_maps
 from studies.steps import Params
-from studies.study import Case, Score, Setting, World, case_name, light_name, named
+from studies.study import Case, Score, World, light_name
 
 LEAST = 1e-3  # of a reflectance, below which a relative standard error means nothing
-LARGER, RIM, MOST, GAP = 2, 3, 14, 10  # of pictures: pixels of a pixel, of a rim; settings side by side; pixels between
-
-Pixels = UInt8[np.ndarray, "h w 3"]
+Table = Mapping[str, Reflectance]
+Maps = Mapping[int, Map]
 
 
 def main(params: Params, inputs: Inputs, out: Path, progress: Progress) -> None:
     """Compare with all lights of the world."""
     case, world = (msgspec.convert(inputs.facts[f"dataset.{n}"], t) for n, t in (("case", Case), ("worlds", World)))
-    observed, solved = (inputs[step] / inputs.photo for step in ("observe", "solve"))
-    lights = read_lights(inputs["worlds"], case.seed, range(world.lights))
-    score, spheres = scored(case, materials_of(case.seed, case.names), solved, lights)
-    values = {"seconds": read_json(solved / "seconds.json")}
-    if case.objects:
-        values["normals"] = read_json(observed / "normals.json")
-        if case.seed == world.seeds[0]:
-            last = world.lights - 1  # a light that hardly any case has seen
-            columns = [spheres.column(last, true) for true in (True, False)]
-            write_png(out / f"balls-{inputs.photo}.png", np.concatenate(columns, axis=1))
-            both = [spheres.matrix(true) for true in (True, False)]
-            gap = np.zeros((len(both[0]), 24, 3), np.uint8)
-            write_png(out / f"matrix-{inputs.photo}.png", np.concatenate([both[0], gap, both[1]], axis=1))
-    write_json(out / f"{inputs.photo}.json", score | Score(values))
+    truths, solved = materials_of(case.seed, case.names), inputs["solve"] / inputs.photo
+    maps, table = read_maps(inputs["worlds"], case.seed, range(world.lights)), read_materials(solved / "materials.json")
+    spheres, score = scored(case, truths, maps, table.materials, maps_of(solved, case.lights))
+    write_json(out / f"{inputs.photo}.json", score | Score(read_json(solved / "measured.json")))
+    if case.objects and case.seed == world.seeds[0]:
+        write_png(out / f"{inputs.photo}.png", np.concatenate([spheres.matrix(true=True), spheres.matrix()], axis=1))
 
 
 def scored(
-    case: Case, truths: Mapping[str, Reflectance], solved: Path, lights: Mapping[int, Light]
-) -> tuple[Score, Spheres]:
-    """The scores of the files that `solve` wrote, and the spheres that they compare; truths, lights: all true ones of the world."""
-    table, own_lights = read_materials(solved / "materials.json").materials, lights_of(solved, case.lights)
+    case: Case, truths: Table, maps: Maps, table: Mapping[str, Solved], own: Maps
+) -> tuple[Spheres, Score]:  # fmt: skip
+    """The spheres that are compared, and all scores.
+
+    truths, maps: all true materials and lights of the world;  table, own: those that were solved, in the solve's own gauge
+    """
     component = connected_components({light_name(li): case.names_in(li) for li in case.lights})
-    table = {n: table[n] for n in component}
-    spheres = Spheres(case, in_true_gauge(case, table, own_lights, truths, component), truths, lights)
-    reflectances = {n: m.reflectance for n, m in table.items()}
-    score = spheres.score() | material_errors(reflectances, truths, component) | stated_errors(table)
-    score |= light_errors(named(spheres.answer.lights), named(lights))
-    if len(set(component.values())) == 1:  # else each component has a tint of its own
-        score |= tints(reflectances, truths, own_lights, spheres.answer.lights, lights)
-    return score, spheres
+    solved = {n: table[n].reflectance for n in component}
+    materials, lights = {}, {}
+    for number in set(component.values()):  # each in the truth's gauge
+        names = [n for n in case.material_names if component[n] == number]
+        of = {li: own[li] for li in case.lights if component[case.names_in(li)[0]] == number}
+        some, few = in_gauge({n: solved[n] for n in names}, of, truths)
+        materials, lights = materials | some, lights | few
+    spheres = Spheres(case, materials, lights, truths, maps)
+    score = spheres.score() | material_errors(solved, truths, component) | stated_errors([table[n] for n in component])
+    errors = light_errors(lights, maps)
+    if len(set(component.values())) > 1:  # each component has a tint of its own
+        return spheres, score | Score(*({k: v for k, v in of.items() if k != "colour"} for of in (errors.values, errors.nulls)))  # fmt: skip
+    colours = {"chromaticity": chromaticity(own), "true_chromaticity": chromaticity({li: maps[li] for li in own})}
+    tint = float(np.std(np.log(factor_of(solved, truths))))
+    return spheres, score | errors | Score({**colours, "tint": tint})
 
 
-def stated_errors(table: Mapping[str, Solved]) -> Score:
+def stated_errors(table: Iterable[Solved]) -> Score:
     """Means over materials of the standard errors that the solve states: of roughness, and of k_d + k_s relative to it."""
-    sums = {n: np.maximum(np.add(m.diffuse, m.specular), LEAST) for n, m in table.items()}
-    relative = [np.mean(np.hypot(m.stderr.diffuse, m.stderr.specular) / sums[n]) for n, m in table.items()]
-    roughness = [m.stderr.roughness for m in table.values()]
-    return Score({"stated_roughness": float(np.mean(roughness)), "stated_reflectance": float(np.mean(relative))})
+    sums = [(np.maximum(np.add(m.diffuse, m.specular), LEAST), m.stderr) for m in table]
+    relative = [np.mean(np.hypot(stderr.diffuse, stderr.specular) / whole) for whole, stderr in sums]
+    return Score({"stated_roughness": _mean(e.roughness for _, e in sums), "stated_reflectance": _mean(relative)})
 
 
-def tints(
-    materials: Mapping[str, Reflectance], truths: Mapping[str, Reflectance], own: Mapping[int, Light], scaled: Mapping[int, Light],
-    true: Mapping[int, Light],
-) -> Score:  # fmt: skip
-    """How coloured lights are; own: recovered lights in the solve's gauge, scaled: in the truth's."""
-    mirror = compare_lights(named(scaled), named(true), {}).mean["none"]["mirror"]
-    values = {
-        "chromaticity": chromaticity(list(own.values())),
-        "true_chromaticity": chromaticity([true[li] for li in own]),
-        "colour": mirror.estimate.rgb_angle_deg,
-        "tint": float(np.std(np.log(factor_of(materials, truths)))),
-    }
-    return Score(values, {"colour": mirror.null.rgb_angle_deg})
-
-
-def chromaticity(lights: Sequence[Light]) -> float:
+def chromaticity(lights: Maps) -> float:
     """Of lights that share materials; 0 where all have one colour.
 
-    >>> one = chromaticity([constant_light(np.array(c)) for c in ((1.0, 2.0, 3.0), (2.0, 4.0, 6.0))])
-    >>> round(one, 6), round(chromaticity([constant_light(np.array(c)) for c in ((4.0, 1.0, 1.0), (1.0, 1.0, 1.0))]), 3)
-    (0.0, 0.318)
+    >>> one = {k: np.full((8, 16, 3), c) for k, c in enumerate(((1.0, 2.0, 3.0), (2.0, 4.0, 6.0)))}
+    >>> round(chromaticity(one), 6)
+    0.0
     """
-    means = np.stack([light.mean for light in lights]).clip(1e-9)
+    means = np.stack([light_of_lat_long(light).mean for light in lights.values()]).clip(1e-9)
     free = means / np.exp(np.log(means).mean(axis=0))
     return float(np.mean(free.std(axis=1) / free.mean(axis=1)))
 
@@ -124,107 +107,58 @@ def chromaticity(lights: Sequence[Light]) -> float:
 class Spheres:
     """Spheres of true and recovered materials in true and recovered lights, each rendered once."""
 
-    def __init__(self, case: Case, answer: Answer, truths: Mapping[str, Reflectance], lights: Mapping[int, Light]):
-        self.case, self.answer, self.truths = case, answer, truths
-        self.true = {li: Appearances(light) for li, light in lights.items()}
-        self.recovered = {li: Appearances(light) for li, light in answer.lights.items()}
-        self.inside = INSIDE
-
-    def truth(self, name: str, light: int) -> Float[np.ndarray, "n 3"]:
-        """Radiance of a true material in a true light, a row for each pixel inside the disc."""
-        return self.true[light].ball(self.truths[name])
-
-    def answered(self, name: str, light: int) -> Float[np.ndarray, "n 3"]:
-        """Likewise of a recovered material in a recovered light."""
-        return self.recovered[light].ball(self.answer.materials[name])
+    def __init__(self, case: Case, materials: Table, lights: Maps, truths: Table, maps: Maps):
+        self.case, self.materials, self.truths = case, materials, truths
+        self.true = {li: Appearances(light_of_lat_long(light)) for li, light in maps.items()}
+        self.own = {li: Appearances(light_of_lat_long(light)) for li, light in lights.items()}
 
     def score(self) -> Score:
-        """DSSIM of what is predicted, and of what nulls predict."""
-        return self._of_entries() | self._of_all()
-
-    def _of_entries(self) -> Score:
-        """Recovered materials in recovered lights; the null knows each true sphere's mean colour."""
-        entries = {(n, li) for n in self.case.material_names for li in self.case.lights}
-        observed = {(self.case.names[m], li) for m, li in self.case.entries}
-        parts = {"entries": entries, "observed": observed, "unobserved": entries - observed}
-        errors = {e: self._dssim(self.answered(*e), *e) for e in entries}
-        flat = {e: self._dssim(self.truth(*e).mean(axis=0, keepdims=True), *e) for e in entries}
-        return Score(*({p: _mean(of[e] for e in sorted(es)) for p, es in parts.items() if es} for of in (errors, flat)))
-
-    def _of_all(self) -> Score:
-        """Recovered materials in all true lights, and all true materials in the recovered lights."""
-        names, lights, white = self.case.material_names, self.case.lights, Appearances(constant_light(np.ones(3)))
-        grey, recovered = times(GREY, factor_of(dict.fromkeys(names, GREY), self.truths)), self.answer.materials
-        true, every = self.true, self.truths.items()
-        of_names = {n: _mean(self._dssim(true[li].ball(recovered[n]), n, li) for li in true) for n in names}
-        of_lights = {li: _mean(self._dssim(self.recovered[li].ball(m), n, li) for n, m in every) for li in lights}
+        """DSSIM of what is predicted, and of what nulls predict: mean colours, grey materials, constant lights."""
+        names, every, own, true = self.case.material_names, self.truths.items(), self.own, self.true
+        pairs = [(n, li) for n in names for li in own]
+        seen = {(self.case.names[m], li) for m, li in self.case.entries}
+        parts = {"entries": pairs, "observed": seen, "unobserved": [e for e in pairs if e not in seen]}
+        errors = {(n, li): self._dssim(own[li].ball(self.materials[n]), n, li) for n, li in pairs}
+        flat = {
+            (n, li): self._dssim(true[li].ball(self.truths[n]).mean(axis=0, keepdims=True), n, li) for n, li in pairs
+        }
+        score = Score(*({p: _mean(of[e] for e in es) for p, es in parts.items() if es} for of in (errors, flat)))
+        of_names = {n: _mean(self._dssim(true[li].ball(self.materials[n]), n, li) for li in true) for n in names}
+        of_lights = {li: _mean(self._dssim(own[li].ball(m), n, li) for n, m in every) for li in own}
         values = {"new_light": _mean(of_names.values()), "new_material": _mean(of_lights.values())}
         values |= {"first_material": of_names[first]} if (first := self.case.names[0]) in of_names else {}
         values |= {"first_light": of_lights[0]} if 0 in of_lights else {}
+        grey = times(GREY, factor_of(dict.fromkeys(names, GREY), self.truths))
+        white = Appearances(constant_light(np.ones(3)))
         greys = (self._dssim(true[li].ball(grey), n, li) for n in names for li in true)
-        constants = (self._dssim(white.ball(m) * true[li].light.mean, n, li) for n, m in every for li in lights)
-        return Score(values, {"new_light": _mean(greys), "new_material": _mean(constants)})
+        constants = (self._dssim(white.ball(m) * true[li].light.mean, n, li) for n, m in every for li in own)
+        return score | Score(values, {"new_light": _mean(greys), "new_material": _mean(constants)})
 
     def _dssim(self, predicted: Float[np.ndarray, "_ 3"], name: str, light: int) -> float:
-        truth = self._disc(self.truth(name, light))
-        return picture_error(self._disc(predicted), truth, self.inside, white_of(truth, self.inside)).dssim
+        truth = _disc(self.true[light].ball(self.truths[name]))
+        return picture_error(_disc(predicted), truth, INSIDE, white_of(truth, INSIDE)).dssim
 
-    def _disc(self, samples: Float[np.ndarray, "_ 3"]) -> Float[np.ndarray, "h w 3"]:
-        disc = np.zeros((*self.inside.shape, 3))
-        disc[self.inside] = samples
-        return disc
+    def matrix(self, true: bool = False) -> UInt8[np.ndarray, "h w 3"]:
+        """All materials (rows) in all lights, recovered or true, each exposed for its truth."""
+        rows = []
+        for m in self.case.materials:
+            name, row = self.case.names[m], []
+            for li in self.case.lights:
+                truth = self.true[li].ball(self.truths[name])
+                shown = _disc(truth if true else self.own[li].ball(self.materials[name]))
+                cell = np.pad(picture(shown, 1 / white_of(_disc(truth), INSIDE)), ((3, 3), (3, 3), (0, 0)))
+                if (m, li) in self.case.entries:
+                    cell[:2], cell[-2:], cell[:, :2], cell[:, -2:] = 200, 200, 200, 200
+                row.append(cell)
+            rows.append(np.concatenate(row, axis=1))
+        return np.concatenate(rows)
 
-    # pictures for people: 8-bit sRGB, each exposed for its truth, with a rim of black
 
-    def column(self, light: int, true: bool = False) -> Pixels:
-        """Spheres of the recovered materials, or of the true ones, one below the other, in a true light."""
-        of, names = self.truths if true else self.answer.materials, self.case.material_names
-        return np.concatenate([self._shown(self.true[light].ball(of[n]), n, light) for n in names])
-
-    def matrix(self, true: bool = False) -> Pixels:
-        """All materials in all lights, recovered or true; entries that were observed have a bright frame."""
-        rows = [[self._cell(m, li, true) for li in self.case.lights] for m in self.case.materials]
-        return np.concatenate([np.concatenate(row, axis=1) for row in rows])
-
-    def _cell(self, material: int, light: int, true: bool) -> Pixels:
-        name = self.case.names[material]
-        cell = self._shown((self.truth if true else self.answered)(name, light), name, light)
-        if (material, light) in self.case.entries:
-            cell[:2], cell[-2:], cell[:, :2], cell[:, -2:] = 200, 200, 200, 200
-        return cell
-
-    def _shown(self, samples: Float[np.ndarray, "n 3"], name: str, light: int) -> Pixels:
-        white = white_of(self._disc(self.truth(name, light)), self.inside)
-        sphere = picture(self._disc(samples), 1 / white)
-        return np.pad(sphere.repeat(LARGER, axis=0).repeat(LARGER, axis=1), ((RIM, RIM), (RIM, RIM), (0, 0)))
+def _disc(samples: Float[np.ndarray, "_ 3"]) -> Float[np.ndarray, "h w 3"]:
+    disc = np.zeros((*INSIDE.shape, 3))
+    disc[INSIDE] = samples
+    return disc
 
 
 def _mean(values: Iterable[float]) -> float:
     return float(np.mean(list(values)))
-
-
-def spheres_by_setting(settings: Sequence[Setting], seeds: Sequence[int], scores: Path) -> dict[str, tuple[str, bytes]]:
-    """PNG files by name, with captions: recovered spheres, a column for each setting, the truth first; as many files as it takes."""
-    files, seed = {}, seeds[0]
-    rows = ", ".join(settings[0].case(seed).material_names)
-    for number in range(0, len(settings), MOST):
-        some = settings[number : number + MOST]
-        pairs = [read_png(scores / f"balls-{case_name(s.name, seed)}.png") for s in some]
-        half, gap = pairs[0].shape[1] // 2, np.full((len(pairs[0]), GAP, 3), 255, np.uint8)
-        whole = np.concatenate([pairs[0][:, :half], gap, *(pair[:, half:] for pair in pairs)], axis=1)
-        caption = (
-            f"Seed {seed}: {rows} (rows), each a sphere in a light that is in few photos; truth, then recovered from: "
-        )
-        caption += ", ".join(s.label for s in some) + "."
-        files[f"spheres-{number // MOST + 1}.png"] = (caption, png_bytes(whole))
-    return files
-
-
-def matrices(settings: Sequence[Setting], seeds: Sequence[int], scores: Path) -> dict[str, tuple[str, bytes]]:
-    """PNG files by name, with captions: each setting's materials (rows) in its lights (columns), true and recovered."""
-    files, seed = {}, seeds[0]
-    for s in settings:
-        caption = f"{s.label}, seed {seed}: {', '.join(s.case(seed).material_names)} (rows) in the set's lights (columns); left the truth, "
-        caption += "right recovered materials in recovered lights.  Frames: observed entries."
-        files[f"{s.name}.png"] = (caption, (scores / f"matrix-{case_name(s.name, seed)}.png").read_bytes())
-    return files

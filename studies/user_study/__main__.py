@@ -22,7 +22,7 @@ import msgspec
 import typer
 
 from factorlib.errors import InputError
-from factorlib.jsonfile import json_text, write_json
+from factorlib.jsonfile import json_text
 from factorlib.wholefile import write_text
 from studies.conclusion import NO_CONCLUSION
 from studies.run import make, studies
@@ -46,11 +46,10 @@ def trials(scores: Path, scale: Scale, most: int) -> list[Trial]:
     every = []
     for seed in scale.seeds:
         ours, other = (scores / case_name(method, seed) for method in ("ours", "intrinsic"))
-        errors = {shot.asked.name: shot.dssim for shot in read_shots(other)}
-        for shot in (s for s in read_shots(ours) if s.asked.kind != "novel_material"):
-            name = shot.asked.name
+        errors = {shot.name: dssim for shot, dssim in read_shots(other)}
+        for name, dssim in ((shot.name, dssim) for shot, dssim in read_shots(ours) if shot.kind != "novel_material"):
             files = (ours / f"{name}-truth.png", ours / f"{name}.png", other / f"{name}.png")
-            every.append(Trial(f"{name}-seed{seed}", files, (shot.dssim, errors[name])))
+            every.append(Trial(f"{name}-seed{seed}", files, (dssim, errors[name])))
     count = min(most, len(every))
     return [every[(2 * k + 1) * len(every) // (2 * count)] for k in range(count)]
 
@@ -100,24 +99,18 @@ def analyse(
     files: Annotated[list[Path], typer.Argument(help="answers-*.json, a file a participant")],
     out: Annotated[Path, typer.Option(help="folder of the results")] = Path("build/studies/user-study/analysis"),
 ) -> None:
-    """Shares of preference, with standard errors: shares.csv, analysis.json, figure.svg, paragraph.md."""
+    """Shares of preference, with standard errors: shares.csv, figure.svg, paragraph.md."""
     shares = analysis.analysed(analysis.read_answers(files))
     out.mkdir(parents=True, exist_ok=True)
     write_text(out / "shares.csv", analysis.csv_text(shares))
-    write_json(out / "analysis.json", shares)
     write_text(out / "figure.svg", analysis.figure(shares))
     write_text(out / "paragraph.md", analysis.paragraph(shares))
     print(analysis.paragraph(shares), end="")
     print(f"  {out / 'shares.csv'}, {out / 'figure.svg'}")
 
 
-def main() -> None:
-    """An error of the input ends the program with its message and exit code 1."""
+if __name__ == "__main__":
     try:
         app(prog_name="python -m studies.user_study")
     except InputError as error:
         sys.exit(f"error: {error}")
-
-
-if __name__ == "__main__":
-    main()

@@ -19,8 +19,7 @@ import numpy as np
 
 from factorlib.errors import InputError
 from factorlib.reading import read_text
-from studies.figures import Mark, rows_of_marks
-from studies.svg import page
+from studies.figures import Mark, drawn
 
 FORMAT = 1
 CURE = "give files as the page saved them (the button “Save answers (JSON)”), or leave this one out"
@@ -62,39 +61,28 @@ class Answers(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 def read_answers(files: Sequence[Path]) -> list[Answers]:
     """One a participant.
 
-    Raises InputError for no file, one that is not the page's, one that is cut short or changed, the same participant twice, files of
+    Raises InputError for one that is not the page's, one that is cut short or changed, the same participant twice, files of
     different pages, and simulated answers beside people's.
     """
-    if not files:
-        cure = "name the files that participants saved: answers-*.json"
-        raise InputError("no file of answers is named", key="FILE", cure=cure)
-    read = [_read(file) for file in files]
-    for k, (file, answers) in enumerate(zip(files, read, strict=True)):
-        same = next((f for f, a in zip(files[:k], read, strict=False) if a.participant == answers.participant), None)
-        for field, wrong, words, cure in (
-            ("participant", same, f"the same participant as in {same}", "name each file once"),
-            ("page", answers.page != read[0].page, f"other pictures than in {files[0]}", "analyse the files of each page by themselves"),
-            ("simulated", answers.simulated != read[0].simulated, f"who answered differs from {files[0]}",
+    read: list[Answers] = []
+    for file in files:
+        try:
+            one = msgspec.json.decode(read_text(file, "JSON"), type=Answers)
+        except msgspec.DecodeError as error:  # also a ValidationError, which says the field
+            raise InputError(f"not a file of answers: {error}", file=file, cure=CURE) from None
+        names, first = [answer.picture for answer in one.answers], [*read, one][0]
+        for key, wrong, words, cure in (
+            ("format", one.format != FORMAT, f"format {one.format} is not known", f"this version reads format {FORMAT}"),
+            ("answers", len(set(names)) != len(names), "two answers to one picture", CURE),
+            ("answers", len(names) != one.asked, f"{len(names)} answers to {one.asked} questions", CURE),
+            ("participant", one.participant in {of.participant for of in read}, "the same participant as before", "name each file once"),
+            ("page", one.page != first.page, f"other pictures than in {files[0]}", "analyse the files of each page by themselves"),
+            ("simulated", one.simulated != first.simulated, f"who answered differs from {files[0]}",
              "analyse people's answers, and those of each simulation, by themselves"),
         ):  # fmt: skip
             if wrong:
-                raise InputError(words, file=file, key=field, cure=cure)
-    return read
-
-
-def _read(file: Path) -> Answers:
-    try:
-        read = msgspec.json.decode(read_text(file, "JSON"), type=Answers)
-    except msgspec.DecodeError as error:  # also a ValidationError, which says the field
-        raise InputError(f"not a file of answers: {error}", file=file, cure=CURE) from None
-    if read.format != FORMAT:
-        cure = f"this version reads format {FORMAT}"
-        raise InputError(f"format {read.format} is not known", file=file, key="format", cure=cure)
-    names = [answer.picture for answer in read.answers]
-    if twice := next((name for k, name in enumerate(names) if name in names[:k]), None):
-        raise InputError(f"two answers to '{twice}'", file=file, key="answers", cure=CURE)
-    if len(names) != read.asked:
-        raise InputError(f"{len(names)} answers to {read.asked} questions", file=file, key="answers", cure=CURE)
+                raise InputError(words, file=file, key=key, cure=cure)
+        read.append(one)
     return read
 
 
@@ -116,16 +104,11 @@ class Share(msgspec.Struct, frozen=True):
 
 
 class Analysis(msgspec.Struct, frozen=True):
-    """Of one page's answers; simulated: empty for people's."""
+    """Of one page's answers; simulated: who answered, empty for people, and what stands on all that is made of them."""
 
     overall: Share
     pictures: list[Share]
     simulated: str
-
-    @property
-    def label(self) -> str:
-        """What stands on all that is made of simulated answers; empty of people's."""
-        return f"simulated: {self.simulated}" if self.simulated else ""
 
 
 def analysed(everyone: Sequence[Answers]) -> Analysis:
@@ -160,7 +143,8 @@ def paragraph(analysis: Analysis) -> str:
     people = f"{s.participants} participant{'s' * (s.participants != 1)}, {pictures} pictures"
     share = f"Ours is preferred to the intrinsic decomposition in {s} of answers ({people})."
     if analysis.simulated:
-        return f"**{analysis.label}** {share} No person was asked: nothing is to be set against the paper.\n"
+        nobody = "No person was asked: nothing is to be set against the paper."
+        return f"**simulated: {analysis.simulated}** {share} {nobody}\n"
     against = "One participant has no standard error: no conclusion."
     if s.error is not None:
         distance = (s.share - PAPER) / np.hypot(s.error, PAPER_ERROR)
@@ -174,6 +158,5 @@ def figure(analysis: Analysis) -> str:
     rows, title = [*analysis.pictures, analysis.overall], f"Preference for ours: {analysis.overall}"
     ends = [(None, None) if s.error is None else (s.share - s.error, s.share + s.error) for s in rows]
     marks = {k: Mark(s.share, *ends[k], null=0.5) for k, s in enumerate(rows)}
-    head = analysis.label or f"{analysis.overall.participants} participants"
-    parts, width, height = rows_of_marks(title, [s.picture for s in rows], {head: marks}, words="{:.0%}".format)
-    return page(width + 100, height, parts)
+    head = f"simulated: {analysis.simulated}" if analysis.simulated else f"{analysis.overall.participants} participants"
+    return drawn(title, [s.picture for s in rows], {head: marks}, form="{:.0%}")

@@ -13,8 +13,9 @@ import pytest
 from factorlib.runner.project import LIBRARY
 from factorlib.runner.survey import survey
 from factorlib.stage import Inputs, silent
-from studies.run import STUDIES, conclude, data_of, forget, make, studies, write_page
-from studies.steps import observe, score, solve, worlds
+from studies.run import STUDIES, data_of, forget, make, studies
+from studies.run.page import conclude, write_page
+from studies.steps import score, solve, worlds
 from studies.study import FULL, QUICK
 
 SOLVE = {"solver": "few_lobes", "lobes": 4, "insert": 4, "rounds": 1, "iterations": 2, "polish": 1, "settle": 1}
@@ -22,32 +23,27 @@ TINY = msgspec.structs.replace(QUICK, largest=2, side=1, size=8, solve=SOLVE, li
 NAME = "matrix-size"
 
 
-def cli(*words, **environment):
-    return subprocess.run(
-        [sys.executable, "-m", "studies", *words], cwd=LIBRARY, env={**os.environ, **environment}, capture_output=True, text=True, check=False
-    )  # fmt: skip
-
-
-def test_wrong_names_and_words_are_answered():
-    done = cli("--one", STUDY="matrix-sise")
-    assert done.returncode == 1 and "did you mean 'matrix-size'?" in done.stderr and "Traceback" not in done.stderr
-    assert "structure" in cli("--one", STUDY="").stderr
-    assert "QUICK: 'yes' is neither 1 nor 0" in cli(QUICK="yes").stderr
-
-
-def test_quick_results_lie_apart_from_full_ones(tmp_path):
-    full, quick = (studies(scale, tmp_path).build for scale in (FULL, QUICK))
-    assert full == tmp_path / "build/studies" and quick == tmp_path / "build/studies/quick"
+@pytest.mark.parametrize(
+    "words, environment, said",
+    [
+        (["--one"], {"STUDY": "matrix-sise"}, "did you mean 'matrix-size'?"),
+        (["--one"], {"STUDY": ""}, "structure"),
+        ([], {"QUICK": "yes"}, "QUICK: 'yes' is neither 1 nor 0"),
+    ],
+)
+def test_wrong_names_and_words_are_answered(words, environment, said):
+    command, environment = [sys.executable, "-m", "studies", *words], {**os.environ, **environment}
+    done = subprocess.run(command, cwd=LIBRARY, env=environment, capture_output=True, text=True, check=False)
+    assert done.returncode == 1 and said in done.stderr and "Traceback" not in done.stderr
 
 
 @pytest.mark.parametrize(
     "name, step, there, absent",
     [
-        (NAME, "solve", ["stages.solve", "factorlib.solve.solve"], ["errors", "study", "spheres", "steps.score", "catalogue.matrix_size"]),
-        ("comparison", "solve", ["stages.solve"], ["steps.optimise", "steps.compare", "methods"]),
-        ("comparison", "optimise", ["studies.steps.optimise"], ["steps.solve", "steps.compare", "methods"]),
+        (NAME, "solve", ["stages.solve", "factorlib.solve.solve"], ["errors", "steps.score", "catalogue.matrix_size"]),
+        ("comparison", "answer", ["stages.solve"], ["steps.compare", "methods"]),
     ],
-)  # fmt: skip
+)
 def test_a_change_of_the_scores_or_the_claims_solves_nothing_again(tmp_path, name, step, there, absent):
     """Neither what a study says nor how it is scored is in the key of a solve."""
     records = survey(studies(TINY, tmp_path, name), name, list(STUDIES[name].steps), []).records
@@ -57,23 +53,19 @@ def test_a_change_of_the_scores_or_the_claims_solves_nothing_again(tmp_path, nam
     assert not any(field.endswith((".html", ".yaml")) for field in record if field.startswith("data:studies"))
 
 
-def by_steps(folder, name, data, steps):
-    """A case by its steps, without a runner."""
-    facts = {f"dataset.{slice_}": data.slice(slice_, name).facts for slice_ in ("case", "worlds")}
-    folders = {stage: folder / stage for stage in ("worlds", "observe", "solve", "optimise")}
-    for stage in steps:
-        (out := folder / stage.__name__.rpartition(".")[2]).mkdir(exist_ok=True)
-        stage.main(stage.Params(), Inputs(folders, facts, photo=name), out, silent)
-
-
 def concluded(folder, name, data, scale, steps):
     """What a study comes to, worlds to conclusion, without a runner."""
-    (folder / "worlds").mkdir()
+    names = [step.__name__.rpartition(".")[2] for step in (worlds, *steps)]
+    folders = {stage: folder / stage for stage in names}
+    for stage in names:
+        folders[stage].mkdir(exist_ok=True)
     facts = {"dataset.worlds": data.slice("worlds", None).facts}
     worlds.main(worlds.Params(), Inputs({}, facts), folder / "worlds", silent)
     for case in data.photos:
-        by_steps(folder, case, data, steps)
-    last = folder / steps[-1].__name__.rpartition(".")[2]
+        given = Inputs(folders, facts | {"dataset.case": data.slice("case", case).facts}, photo=case)
+        for stage, step in zip(names[1:], steps, strict=True):
+            step.main(step.Params(), given, folder / stage, silent)
+    last = folder / names[-1]
     gathered = {case: json.loads((last / f"{case}.json").read_text()) for case in data.photos}
     (last / "scores.json").write_text(json.dumps(gathered))
     (home := folder / "build/studies/quick" / name).mkdir(parents=True)
@@ -83,8 +75,8 @@ def concluded(folder, name, data, scale, steps):
 
 def test_a_tiny_study_from_worlds_to_the_page(tmp_path):
     scale = msgspec.structs.replace(TINY, largest=1)
-    table, home = concluded(tmp_path, NAME, data_of(tmp_path / NAME, scale), scale, [observe, solve, score])
-    assert [row["label"] for row in table["rows"]] == ["1 × 1"] and table["label"] and not table["claims"]
+    table, home = concluded(tmp_path, NAME, data_of(tmp_path / NAME, scale), scale, [solve, score])
+    assert [row["label"] for row in table["rows"]] == ["1 × 1"] and table["quick"] and not table["claims"]
     assert all(0 < row["cells"]["entries"]["spread"]["mean"] < 0.5 for row in table["rows"])
     figure = (home / "figure.svg").read_text()
     assert figure.startswith("<svg") and "no conclusion" in figure and "materials × lights" in figure
@@ -92,18 +84,19 @@ def test_a_tiny_study_from_worlds_to_the_page(tmp_path):
     assert "no conclusion" in text and "http" not in text.replace("http://www.w3.org/2000/svg", ""), "it stands alone"
 
 
-def pictures_of(settings, seeds, scores):
-    return {f"{len(list(scores.glob('*.json')))}.png": ("caption", b"data")}
-
-
 def test_a_run_takes_the_pictures_of_the_last_away(tmp_path):
-    study = msgspec.structs.replace(
-        STUDIES[NAME], settings=lambda s: [s.setting("a", "a")], measures=(), pictures=f"{__name__}.pictures_of"
+    study, home = (
+        msgspec.structs.replace(STUDIES[NAME], settings=lambda s: [s.matrix(1, 1)], measures=()),
+        tmp_path / "out",
     )
-    (tmp_path / "scores.json").write_text('{"a-seed0": {"values": {}}}')
-    for name in ("1.png", "2.png"):  # the second time table.json lies beside the scores
-        conclude(study, QUICK, tmp_path, tmp_path)
-        assert [path.name for path in (tmp_path / "pictures").iterdir()] == [name]
+    (tmp_path / "scores.json").write_text('{"1x1-seed0": {"values": {}}}')
+    (picture := tmp_path / "1x1-seed0.png").write_bytes(b"data")
+    home.mkdir()
+    conclude(study, QUICK, tmp_path, home)
+    assert json.loads((home / "table.json").read_text())["pictures"] == {picture.name: "1 × 1, seed 0"}
+    picture.unlink()
+    conclude(study, QUICK, tmp_path, home)
+    assert not (home / "pictures").exists()
 
 
 def finished(project):
@@ -140,8 +133,7 @@ def test_a_killed_study_goes_on_from_there_and_ends_with_the_page(tmp_path):
     assert make(TINY, [NAME], root=tmp_path) == 0
     done = finished(project)
     assert len(done) == len(set(done)) and set(before) < set(done), "what was done is done again"
-    text = (project.build / "index.html").read_text()
-    assert "no conclusion" in text and STUDIES[NAME].title in text
+    assert STUDIES[NAME].title in (project.build / "index.html").read_text()
     assert make(TINY, [NAME], root=tmp_path) == 0 and finished(project) == done, "there was nothing to do"
     forget(TINY, [NAME], tmp_path)
     assert sorted(path.name for path in project.build.iterdir()) == ["index.html", "store"]
@@ -151,3 +143,4 @@ def test_a_killed_study_goes_on_from_there_and_ends_with_the_page(tmp_path):
 def test_to_forget_what_was_not_run_is_no_error(tmp_path, capsys):
     assert forget(TINY, [NAME], tmp_path) == 0
     assert "has no results" in capsys.readouterr().out
+    assert studies(QUICK, tmp_path).build == studies(FULL, tmp_path).build / "quick"
