@@ -387,7 +387,8 @@ def test_what_changes_while_a_step_runs_is_named_and_costs_that_step(fresh, made
     doing(fresh, stage, code.format(root=str(fresh.root)), before)
     assert make(fresh) == 1
     assert is_said(capfd.readouterr().err, *words)
-    assert not [step for step in kept(fresh).values() if step in (stage, f"{stage}/a")]
+    step = f"{stage}/a" if stage in ("upper", "count") else stage  # the view of a stage over photos holds the others'
+    assert step not in kept(fresh).values()
     for path, text in usual.items():
         write(path, text)
     made = make(fresh) == 0 and is_sound(fresh) and results(fresh) == results(made_once)

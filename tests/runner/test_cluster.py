@@ -9,6 +9,7 @@ import signal
 import socket
 import threading
 import time
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import msgspec
@@ -378,7 +379,8 @@ def test_a_scheduler_out_of_reach_is_named_and_no_worker_is_started_for_it(
     async def notebook():
         refuse(project, address, words, cure, capfd)
 
-    asyncio.run(notebook())
+    with ThreadPoolExecutor(1) as thread:  # in which no loop of another test runs
+        thread.submit(asyncio.run, notebook()).result()
     if not address.startswith("tcp"):
         with pytest.raises(InputError, match=f"worker: {words[:20]}"):
             cluster.start_worker(address, None, [])
