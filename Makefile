@@ -9,7 +9,7 @@ override PY := .venv/bin/python
 override STAGES := $(shell sed -n '/^stages:/,$$s/^  \([a-z_]*\):.*/\1/p' pipeline.yaml)
 MAKEFLAGS += --no-print-directory
 
-.PHONY: all plan why status graph logs params new compare validate verify clean gc setup lock test test-long size results study studies data help $(STAGES)
+.PHONY: all plan why status graph logs params new compare validate verify clean gc setup lock test test-long size docs results study studies data help $(STAGES)
 
 # each reads DATASET, SET and FORCE from the environment
 all plan why status graph logs params new compare validate verify $(STAGES): .venv/ready
@@ -40,10 +40,14 @@ test: .venv/ready
 test-long: .venv/ready
 	@OMP_NUM_THREADS=1 PYTHONDONTWRITEBYTECODE=1 $(PY) -m pytest -n 2 -p no:cacheprovider -m long
 
-# reads ONLY, LIGHTS and REAL from the environment
+docs: .venv/ready
+	@test -x .venv/bin/mkdocs || EXTRAS=docs $(PY) -I factorlib/setup.py extras
+	@NO_MKDOCS_2_WARNING=1 .venv/bin/mkdocs build -q && echo 'build/docs/index.html'
+
 size: .venv/ready
 	@$(PY) -m studies.measured.size
 
+# reads ONLY, LIGHTS and REAL from the environment
 results: .venv/ready
 	@OMP_NUM_THREADS=1 $(PY) -m studies.measured.results
 
@@ -78,6 +82,7 @@ help:
 	@echo 'make test                            lint, layers, tests'
 	@echo 'make test-long                       the tests that take long, which make test leaves out'
 	@echo 'make size                            how long each part is, beside its budget'
+	@echo 'make docs                            docs/ and the library as a site, to build/docs/index.html'
 	@echo 'make results [ONLY=operator]          measure what docs/results.md shows, all of it (hours) or one section, and write it there'
 	@echo 'make study STUDY=matrix-size         an experiment: figure, table and conclusion, to build/studies/<name>; QUICK=1: one seed, small sets'
 	@echo 'make studies                         all experiments, and one page of them: build/studies/index.html (docs/studies.md)'
