@@ -21,7 +21,7 @@ from factorlib.reading import check_plain, path_inside, reading
 from factorlib.yamlfile import read_yaml
 
 FILE = "dataset.yaml"
-RESERVED = ("studies", "bench", "store")  # folders of build/ that are no datasets
+RESERVED = ("studies", "bench", "store", "docs")  # folders of build/ that are no datasets
 MTLLIB = re.compile(rb"^mtllib[ \t]+([^\r\n]+)", re.MULTILINE)
 log = logging.getLogger("factorlib.dataset")
 
