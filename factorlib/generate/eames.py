@@ -27,7 +27,8 @@ from factorlib.meshes.ply import submesh
 from factorlib.tracing.scene import Material, bsdf, envmap, light_seen, look, rigid, shape, traced, transform
 from factorlib.yamlfile import read_yaml
 
-Progress, Maps = Callable[[int, int, str], None], Sequence[Path]
+Progress = Callable[[int, int, str], None]
+Maps = Sequence[Path]
 
 
 class Parameters(msgspec.Struct, frozen=True):

@@ -25,7 +25,8 @@ Y_UP_FROM_Z_UP = np.array([[1.0, 0, 0, 0], [0, 0, 1, 0], [0, -1, 0, 0], [0, 0, 0
 SUN_SCALE, SUN_APERTURE_DEG = 0.12, 3.0  # radiance of the sun against the real one's; its diameter
 GROUND = (0.32, 0.3, 0.26)  # reflectance
 Colour = float | Sequence[float] | Float[np.ndarray, "3"]  # linear Rec. 709; a number is grey
-Rotation, Rng = Float[np.ndarray, "3 3"], np.random.Generator
+Rotation = Float[np.ndarray, "3 3"]
+Rng = np.random.Generator
 SceneDict = dict[str, Any]  # shapes and emitters by name, as Mitsuba's `load_dict` takes them
 # about x, about y, of +z
 TURNS = {"+x": (0, 90), "-x": (0, -90), "+z": (0, 0), "-z": (0, 180), "+y": (-90, 0), "-y": (90, 0)}

@@ -12,7 +12,9 @@ from torch import Tensor
 Name = Literal["reference", "closed_form", "network", "paper_network"]
 NAMES = get_args(Name)
 MOST = 1.0  # what a unit lobe reflects at most: its radiance is nowhere above 1, nor the albedo
-PerLobe, PerPoint, PerPair = Float[Tensor, "*p"], Float[Tensor, "*n"], Float[Tensor, "n p"]
+PerLobe = Float[Tensor, "*p"]
+PerPoint = Float[Tensor, "*n"]
+PerPair = Float[Tensor, "n p"]
 CHUNK = 1 << 14  # evaluations whose intermediate results are in memory at once
 
 

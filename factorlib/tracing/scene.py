@@ -28,7 +28,9 @@ from factorlib.tracing.variant import mitsuba
 SAMPLER, SAMPLES_PER_PASS = "multijitter", 1 << 23
 ENVMAP_FINER = 8  # rows of the lattice handed to Mitsuba, per row of a map
 MITSUBA_FROM_CAMERA = np.diag([-1.0, -1.0, 1.0, 1.0])  # Mitsuba's sensors: x left, y up, z forward
-Entry, Matrix, Image = dict[str, Any], Float[np.ndarray, "4 4"], Float[np.ndarray, "h w c"]
+Entry = dict[str, Any]
+Matrix = Float[np.ndarray, "4 4"]
+Image = Float[np.ndarray, "h w c"]
 FACE_LOOKS = {"+x": (0, 90), "-x": (0, -90), "+y": (90, 0), "-y": (-90, 0), "+z": (0, 0), "-z": (0, 180)}
 
 
