@@ -23,6 +23,7 @@ from factorlib.geometry.camera import Camera
 from factorlib.light.latlong import sampled
 from factorlib.meshes.mesh import Mesh
 from factorlib.meshes.ply import write_ply
+from factorlib.results.materials import Reflectance
 from factorlib.tracing.variant import mitsuba
 
 SAMPLER, SAMPLES_PER_PASS = "multijitter", 1 << 23
@@ -42,7 +43,7 @@ class Material(msgspec.Struct, frozen=True):
     roughness: float
 
 
-def bsdf(material: Material) -> dict[str, Any]:
+def bsdf(material: Material | Reflectance) -> dict[str, Any]:
     """Mitsuba's `blendbsdf` that evaluates to k_d/π + k_s D G / (4 (n·i)(n·o)), without Fresnel."""
     diffuse, specular = np.array(material.diffuse), np.array(material.specular)
     if not diffuse.any() and not specular.any():
