@@ -135,7 +135,7 @@ def _templates(
     pose = State(turn, 0.0, 0.0, np.log(distance), 0.0).pose(caster)
     focal = 0.48 * GRID * distance / caster.radius
     image = caster.labels(caster.cast(Camera(GRID, GRID, focal, (GRID / 2, GRID / 2)), pose))
-    own = np.count_nonzero(image)
+    own = int(np.count_nonzero(image))
     for size in sizes:
         zoom = np.sqrt(area / max(own, 1)) * size
         if zoom < 4:  # else seen edge-on: nothing like the mask

@@ -94,13 +94,13 @@ def focal_and_centre(external: ExternalCamera, width: int, height: int, photo: s
 
     # photo pixels per image pixel: one number, but for the rounding of the photo's shorter side
     across = down = 1.0 if size is None else width / size[0]
-    if size is not None and size[1] is not None:
-        down = height / size[1]
-        sizes = f"the photo has {width}×{height} pixels, its image in the source {size[0]:g}×{size[1]:g}"
-        if not is_resized(size):
+    if size is not None and (tall := size[1]) is not None:
+        down, image = height / tall, (size[0], tall)
+        sizes = f"the photo has {width}×{height} pixels, its image in the source {size[0]:g}×{tall:g}"
+        if not is_resized(image):
             cure = "give the image itself, or the same at another size, and masks of it"
             fault = f"{sizes}: it was cropped or squeezed"
-            if is_resized(size[::-1]):
+            if is_resized(image[::-1]):
                 fault = f"{sizes}: it was made of the photo before its EXIF orientation was applied"
                 cure = "turn the photo's own pixels upright (ImageMagick: mogrify -auto-orient) and make the source of those"
     centre = (width / 2, height / 2) if point is None else (point[0] * across, point[1] * down)

@@ -99,9 +99,10 @@ def placed(
             start, other = state_of(obj.earlier.pose, camera, obj.caster), obj.earlier.runner_up
             known_camera = FocalPrior(camera.focal, 0.0)
             score = refined_finest(obj.caster, obj.silhouette, camera, start, known_camera, search, 0).score
+            second = None
             if other is not None:
-                other = RunnerUp(state_of(other.pose, camera, obj.caster), other.score, other.normal_difference_deg)
-            found[k] = Found(start, score, sigma, other, earlier=True)
+                second = RunnerUp(state_of(other.pose, camera, obj.caster), other.score, other.normal_difference_deg)
+            found[k] = Found(start, score, sigma, second, earlier=True)
         elif obj.keypoints is None:
             found[k] = find(obj.caster, obj.silhouette, camera, prior, search)
         else:
@@ -114,10 +115,10 @@ def placed(
                 source = "estimated"
             sigma, camera = found[k].log_focal_sigma, found[k].state.camera(camera)
             prior = FocalPrior(camera.focal, 0.0)
-    answers = [found.get(k) for k in range(len(objects))]
-    known = [obj.pose or (obj.earlier and obj.earlier.pose) for obj in objects]  # used to the last digit
-    poses = [pose or one.state.pose(obj.caster) for pose, one, obj in zip(known, answers, objects, strict=True)]
-    return Placed(camera, source or "estimated", sigma, poses, answers, beforehand)
+    poses = [  # known ones are used to the last digit
+        obj.pose or (obj.earlier.pose if obj.earlier else found[k].state.pose(obj.caster)) for k, obj in enumerate(objects)
+    ]  # fmt: skip
+    return Placed(camera, source or "estimated", sigma, poses, [found.get(k) for k in range(len(objects))], beforehand)
 
 
 def state_of_keypoints(obj: ObjectToPlace, camera: Camera, prior: FocalPrior, photo: str) -> State:
@@ -128,6 +129,7 @@ def state_of_keypoints(obj: ObjectToPlace, camera: Camera, prior: FocalPrior, ph
     camera: its focal length is the prior's; it is replaced only where nothing was known and LEAST_FOR_FOCAL are given.
     """
     keypoints, caster = obj.keypoints, obj.caster
+    assert keypoints is not None
     side, points = max(camera.width, camera.height), (keypoints.point - caster.centre) / caster.radius
     estimation, refinement = pycolmap.AbsolutePoseEstimationOptions(), pycolmap.AbsolutePoseRefinementOptions()
     estimation.ransac.max_error, estimation.ransac.random_seed = MOST_ERROR * side, 0
@@ -137,7 +139,7 @@ def state_of_keypoints(obj: ObjectToPlace, camera: Camera, prior: FocalPrior, ph
         colmap = camera.colmap()  # gets the focal length
         found = pycolmap.estimate_and_refine_absolute_pose(keypoints.pixel, points, colmap, estimation, refinement)
         agreeing = found["num_inliers"] if found else 0
-        if agreeing >= LEAST_AGREEING and FOCALS[0] * side <= colmap.focal_length <= FOCALS[1] * side:
+        if found and agreeing >= LEAST_AGREEING and FOCALS[0] * side <= colmap.focal_length <= FOCALS[1] * side:
             rotation = found["cam_from_world"].rotation.matrix()
             pose = Pose(rotation, caster.radius * found["cam_from_world"].translation - rotation @ caster.centre)
             return state_of(pose, msgspec.structs.replace(camera, focal=float(colmap.focal_length)), caster)
@@ -152,8 +154,8 @@ def _judged(obj: ObjectToPlace, camera: Camera, found: Found, photo: str, search
     broad = focal_prior(None, None, camera.width, camera.height)
     if found.score >= WELL_FOUND:
         steps = 2 * search.steps[-1]
-        free = refined_finest(obj.caster, obj.silhouette, camera, found.state, broad, search, steps)
-        free = Found(free.state, free.score, free.log_focal_sigma(), found.runner_up, found.by_keypoints)
+        best = refined_finest(obj.caster, obj.silhouette, camera, found.state, broad, search, steps)
+        free = Found(best.state, best.score, best.log_focal_sigma(), found.runner_up, found.by_keypoints)
     else:
         free = find(obj.caster, obj.silhouette, camera, broad, search)
     if free.score < found.score + CLEARLY_BETTER:
@@ -167,8 +169,11 @@ def _judged(obj: ObjectToPlace, camera: Camera, found: Found, photo: str, search
 
 def _focal_of_given(objects: Sequence[ObjectToPlace], camera: Camera) -> Camera:
     """The focal length at which given poses fit their masks best."""
-    shown = [t for t in objects if t.pose and t.silhouette.inside.any()]
-    fixed = [(t.caster, t.pose, target_of(t.silhouette, t.caster.mesh.labels, 200)) for t in shown]
+    fixed = [
+        (t.caster, t.pose, target_of(t.silhouette, t.caster.mesh.labels, 200))
+        for t in objects
+        if t.pose and t.silhouette.inside.any()
+    ]
 
     def at(log_focal: float) -> Camera:
         return msgspec.structs.replace(camera, focal=float(np.exp(log_focal)))

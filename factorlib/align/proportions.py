@@ -94,16 +94,18 @@ def proportions(sightings: Sequence[Sighting], standards: Standards = Standards(
 
 def unexplained(one: Sighting, factors: Factors, steps: int) -> float:
     """The share of the mask at the best pose of the mesh with these factors."""
-    return 1 - refined(Caster(scaled(one.mesh, factors)), one.target, one.camera, one.state, one.prior, steps).score
+    caster = Caster(scaled(one.mesh, tuple(factors)))
+    return 1 - refined(caster, one.target, one.camera, one.state, one.prior, steps).score
 
 
 def fitted(sightings: Sequence[Sighting], steps: int) -> tuple[Factors, list[State]]:
     """Factors, of product 1, and states together, by Gauss-Newton from the mesh as it is; the best met."""
-    shape, states, best, most = np.zeros(2), [one.state for one in sightings], None, -np.inf
+    shape, states, most = np.zeros(2), [one.state for one in sightings], -np.inf
+    best = np.ones(3), states
     for k in range(steps + 1):
         equations, scores, factors = [], [], np.exp(SHAPES @ shape)
         for one, state in zip(sightings, states, strict=True):
-            seen = rendered(Caster(scaled(one.mesh, factors)), one.target, one.camera, state)
+            seen = rendered(Caster(scaled(one.mesh, tuple(factors))), one.target, one.camera, state)
             equations.append(normal_equations(seen, one.target, one.prior, jacobian_with_shape))
             scores.append(seen.score(one.target))
         if (score := float(np.mean(scores))) > most:

@@ -102,6 +102,7 @@ def refined(caster: Caster, target: Target, camera: Camera, start: State, prior:
         state = state.moved(step)
         if np.abs(step).max() < 2e-5:
             break
+    assert best is not None
     return best
 
 

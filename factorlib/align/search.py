@@ -94,9 +94,9 @@ def find(caster: Caster, silhouette: Silhouette, camera: Camera, prior: FocalPri
     effort = search.cut_effort if is_cut(silhouette) else 1
     density = effort * search.views, search.rolls, effort * search.keep[0], search.apart_deg
     states, others = candidates(caster, silhouette, camera, *density), []
-    for keep, steps, *window in zip(search.keep, search.steps, search.resolution, search.margin):
+    for keep, steps, size, margin in zip(search.keep, search.steps, search.resolution, search.margin):
         states = states[: keep if others else effort * keep]
-        target = target_of(silhouette, caster.mesh.labels, *window)
+        target = target_of(silhouette, caster.mesh.labels, size, margin)
         ranked = _distinct([refined(caster, target, camera, state, prior, steps) for state in states], prior)
         most = max(GIVEN_UP_RATIO * (1 - ranked[0].score), GIVEN_UP_UNEXPLAINED)
         states = [result.state for result in ranked if 1 - result.score <= most]
@@ -108,10 +108,10 @@ def find(caster: Caster, silhouette: Silhouette, camera: Camera, prior: FocalPri
     # refined anew: scores of different resolutions do not compare
     again = [refined(caster, target, camera, rival.state, prior, search.steps[-1]) for rival in rivals]
     best, *others = _distinct(ranked + again, prior)
-    second = next((other for other in others if _is_apart(other, [best], DISTINCT_DEG)), None)
-    if second is not None:
-        away = normal_difference(caster, target, camera, best.state, second.state)
-        second = RunnerUp(second.state, second.score, away)
+    away, second = next((other for other in others if _is_apart(other, [best], DISTINCT_DEG)), None), None
+    if away is not None:
+        normals_deg = normal_difference(caster, target, camera, best.state, away.state)
+        second = RunnerUp(away.state, away.score, normals_deg)
     return Found(best.state, best.score, best.log_focal_sigma(), second)
 
 
@@ -120,8 +120,8 @@ def found_near(
 ) -> Found:
     """The pose refined from `start`, at the two finest resolutions; `start` itself where that leads far off."""
     camera, state = msgspec.structs.replace(camera, focal=prior.focal), start
-    for steps, *window in zip(search.steps[-2:], search.resolution[-2:], search.margin[-2:]):
-        target = target_of(silhouette, caster.mesh.labels, *window)
+    for steps, size, margin in zip(search.steps[-2:], search.resolution[-2:], search.margin[-2:]):
+        target = target_of(silhouette, caster.mesh.labels, size, margin)
         result = refined(caster, target, camera, state, prior, steps)
         if angle_between(result.state.rotation, start.rotation) > DISTINCT_DEG:
             result = refined(caster, target, camera, start, prior, 0)

@@ -10,7 +10,8 @@ from jaxtyping import Bool, Float, Int
 
 UNKNOWN = -1
 Channels = Mapping[str, Float[np.ndarray, "h w"]]  # of the stage `masks`
-Labels, Mask = Int[np.ndarray, "h w"], Bool[np.ndarray, "h w"]
+Labels = Int[np.ndarray, "h w"]
+Mask = Bool[np.ndarray, "h w"]
 
 
 class Silhouette(msgspec.Struct, frozen=True):

@@ -74,9 +74,9 @@ def target_of(silhouette: Silhouette, labels: tuple[int, ...], resolution: int, 
     window = silhouette.label[np.ix_(y, x)]
     padded = np.pad(window, 1, mode="edge")
     at_frame = low[1] == 0, high[1] == height, low[0] == 0, high[0] == width
-    for touches, edge in zip(at_frame, (np.s_[0, :], np.s_[-1, :], np.s_[:, 0], np.s_[:, -1]), strict=True):
+    for touches, edge in zip(at_frame, (padded[0], padded[-1], padded[:, 0], padded[:, -1]), strict=True):
         if touches:
-            padded[edge] = UNKNOWN
+            edge[:] = UNKNOWN
     regions = {label: _region(padded == label, padded != UNKNOWN) for label in labels}
     return Target(float(low[0]), float(low[1]), pixel, Silhouette(window), regions)
 
@@ -89,7 +89,8 @@ def _region(inside: Mask, known: Mask) -> Region:
 
     distance = np.where(inside, 0.5 - distance_to(~inside), distance_to(inside | ~known) - 0.5)
     distance[~known] = 0.0
-    slope = np.stack(np.gradient(distance)[::-1], axis=-1)
+    by_y, by_x = np.gradient(distance)
+    slope = np.stack([by_x, by_y], axis=-1)
     a, b = border_pairs(inside, known & ~inside)
     normal = slope[a[:, 0], a[:, 1]] + slope[b[:, 0], b[:, 1]]
     length = np.linalg.norm(normal, axis=1)

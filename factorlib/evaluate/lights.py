@@ -54,8 +54,8 @@ def light_error(estimate: Samples, truth: Samples) -> LightError:
     """
     scale = np.sqrt(np.mean(truth**2)) or 1.0
     best = float((estimate * truth).sum() / ((estimate**2).sum() or 1.0))
-    rmse = [float(np.sqrt(np.mean((f * estimate - truth) ** 2)) / scale) for f in (1.0, best)]
-    return LightError(*(round(v, 9) for v in rmse), rgb_angle_deg=round(rgb_angle(estimate, truth), 6))
+    rmse, scaled = (round(float(np.sqrt(np.mean((f * estimate - truth) ** 2)) / scale), 9) for f in (1.0, best))
+    return LightError(rmse, scaled, round(rgb_angle(estimate, truth), 6))
 
 
 def rgb_angle(estimate: Samples, truth: Samples) -> float:
@@ -136,7 +136,7 @@ def _scored_view(
 def _mean(scored: list[dict[str, ScoredLight]]) -> dict[str, ScoredLight]:
     by_view = {v: [s[v] for s in scored if v in s] for v in VIEWS}
     return {
-        v: ScoredLight(*(mean_error([getattr(s, k) for s in of], 9) for k in ("estimate", "null")))
+        v: ScoredLight(mean_error([s.estimate for s in of], 9), mean_error([s.null for s in of], 9))
         for v, of in by_view.items()
         if of
     }

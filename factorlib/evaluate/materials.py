@@ -14,7 +14,7 @@ from collections.abc import Mapping
 import numpy as np
 from jaxtyping import Float
 
-from factorlib.results.materials import Reflectance, Vec3
+from factorlib.results.materials import Reflectance, Vec3, vec3
 from factorlib.results.metrics import ComparedMaterial, MaterialError, MaterialErrors
 
 DARKEST = 0.01
@@ -52,7 +52,7 @@ def common_factor(estimates: list[Reflectance], truths: list[Reflectance]) -> Ve
     """
     estimated, true = (np.array([_albedos(m).sum(axis=0) for m in group]) for group in (estimates, truths))
     ratio = np.where(estimated > 0, true / np.maximum(estimated, 1e-30), 1.0)
-    return tuple(float(v) for v in np.median(ratio, axis=0))
+    return vec3(np.median(ratio, axis=0))
 
 
 def _albedos(material: Reflectance) -> Float[np.ndarray, "2 3"]:
@@ -61,7 +61,7 @@ def _albedos(material: Reflectance) -> Float[np.ndarray, "2 3"]:
 
 def _error(estimate: Reflectance, truth: Reflectance, factor: Vec3) -> MaterialError:
     relative = (_albedos(estimate) * factor - _albedos(truth)) / np.maximum(_albedos(truth), DARKEST)
-    diffuse, specular = (tuple(float(v) for v in row) for row in relative)
+    diffuse, specular = (vec3(row) for row in relative)
     return MaterialError(roughness=abs(estimate.roughness - truth.roughness), diffuse=diffuse, specular=specular)
 
 

@@ -84,7 +84,7 @@ def picture_errors(
     (box,) = find_objects(union.astype(np.uint8))
     estimate, truth, union = estimate[box], truth[box], union[box]
     shown = [tone_mapped(np.where(union[..., None], p, 0.0), 1 / white) for p in (estimate, truth)]
-    ssim = ssim_map(*shown, union)
+    ssim = ssim_map(shown[0], shown[1], union)
 
     def error(region: Mask) -> PictureError:
         psnr_linear = psnr(estimate[region], truth[region], white)
@@ -94,15 +94,13 @@ def picture_errors(
     return {name: error(region[box]) for name, region in regions.items()}
 
 
-def picture_error(estimate: Picture, truth: Picture, mask: Mask, white: float) -> PictureError | None:
-    """The errors inside one mask; None where it is empty."""
-    return picture_errors(estimate, truth, {"": mask}, white).get("")
+def picture_error(estimate: Picture, truth: Picture, mask: Mask, white: float) -> PictureError:
+    """The errors inside one mask, which is not empty."""
+    return picture_errors(estimate, truth, {"": mask}, white)[""]
 
 
-def mean_error(errors: Sequence[Error], digits: int = 6) -> Error | None:
-    """The mean of each number of errors of one kind (of dB, for PSNR), rounded; None of none."""
-    if not errors:
-        return None
+def mean_error(errors: Sequence[Error], digits: int = 6) -> Error:
+    """The mean of each number of errors of one kind (of dB, for PSNR), rounded; there must be some."""
     values = np.array([msgspec.structs.astuple(e) for e in errors])
     return type(errors[0])(*(round(float(np.mean(column)), digits) for column in values.T))
 

@@ -31,8 +31,8 @@ from factorlib.evaluate.ball import Light, Reflected, diffuse_ball, glossy_lobe
 from factorlib.evaluate.gauge import GAUGES, gauge_factors
 from factorlib.evaluate.picture import mean_error, picture_error, psnr, tone_mapped, white_of
 from factorlib.geometry.sphere import ball_normals
-from factorlib.results.materials import Reflectance, Vec3
-from factorlib.results.metrics import Kinds, Relighting, RelitBall, RelitSet
+from factorlib.results.materials import Reflectance, Vec3, vec3
+from factorlib.results.metrics import Kinds, PictureError, Relighting, RelitBall, RelitSet
 
 BALL_SIZE = 32
 NORMALS, INSIDE = ball_normals(BALL_SIZE)
@@ -100,7 +100,7 @@ def _relit(true: list[Samples], kinds: list[list[Samples]], observed: list[bool]
     whites = [white_of(t[None], np.ones((1, len(t)), bool)) for t in true]
     factors = [gauge_factors(pictures, true, whites, below_white=True) for pictures in kinds]
 
-    def error(i: int, gauge: str, kind: int) -> Kinds:
+    def error(i: int, gauge: str, kind: int) -> PictureError:
         pictures = _disc(kinds[kind][i] * factors[kind][gauge][i]), _disc(true[i])
         return picture_error(*pictures, INSIDE, whites[i])
 
@@ -155,7 +155,7 @@ def set_factor(pairs: Iterable[tuple[Reflectance, Reflectance]]) -> Vec3:
     both = np.array([[(m.diffuse, m.specular) for m in pair] for pair in pairs], float)
     recovered, true = (both[:, k].reshape(-1, 3).T for k in (0, 1))
     logs = [np.log(t[k]) - np.log(r[k]) for r, t in zip(recovered, true) for k in [(r > 0) & (t > 0)]]
-    return tuple(round(float(np.exp(np.median(values))), 9) if values.size else 1.0 for values in logs)
+    return vec3(round(float(np.exp(np.median(values))), 9) if values.size else 1.0 for values in logs)
 
 
 def shown_psnr(recovered: Samples, true: Samples) -> float:

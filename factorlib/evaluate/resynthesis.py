@@ -17,6 +17,7 @@ from jaxtyping import Bool, Float
 
 from factorlib.evaluate.gauge import GAUGES, gauge_factors
 from factorlib.evaluate.picture import mean_error, picture_errors, white_of
+from factorlib.results.materials import vec3
 from factorlib.results.metrics import PhotoErrors, PictureError, Resynthesis, ScoredPicture
 from factorlib.urm.extract import observed_pixels
 
@@ -69,8 +70,8 @@ def compare_photos(names: Iterable[str], materials: list[str], shot: Callable[[s
     scored = [p.gauges for p in photos.values() if p.gauges]
     if not scored:
         return Resynthesis(photos, None, None, None)
-    parts = ("estimate", "null")
-    mean = {g: ScoredPicture(*(mean_error([getattr(s[g], k) for s in scored]) for k in parts)) for g in GAUGES}
+    of = {g: ([s[g].estimate for s in scored], [s[g].null for s in scored]) for g in GAUGES}
+    mean = {g: ScoredPicture(mean_error(estimates), mean_error(nulls)) for g, (estimates, nulls) in of.items()}
     worst = [min(getattr(s["none"].estimate, f"psnr_{kind}_db") for s in scored) for kind in ("linear", "tonemapped")]
     return Resynthesis(photos, mean, *worst)
 
@@ -88,7 +89,9 @@ def _factors(names: list[str], shot: Callable[[str], Shot]) -> dict[str, dict[st
     estimates, truths, whites = [], [], []
     for name in names:
         s = shot(name)
-        estimates.append(s.resynthesis[s.pixels]), truths.append(s.photo[s.pixels]), whites.append(s.white)
+        estimates.append(s.resynthesis[s.pixels])
+        truths.append(s.photo[s.pixels])
+        whites.append(s.white)
     factors = gauge_factors(estimates, truths, whites, below_white=True)
     return {name: {g: factors[g][i] for g in GAUGES} for i, name in enumerate(names)}
 
@@ -105,7 +108,7 @@ def _photo_errors(shot: Shot, materials: list[str], factor: dict[str, Float[np.n
         exposure=1 / shot.white,
         **shot.counts,
         clipped_satisfied=shot.clipped_satisfied,
-        factor={g: tuple(float(v) for v in f) for g, f in factor.items()},
+        factor={g: vec3(f) for g, f in factor.items()},
         gauges=scores("") if shot.pixels.any() else None,
         materials={m: scores(m) for m in materials if regions[m].any()},
     )

@@ -1,5 +1,7 @@
 """How good the metrics of data/synthetic must be at worst, and how numbers in metrics.json are named: by dotted paths."""
 
+from typing import Any
+
 import msgspec
 
 
@@ -32,7 +34,7 @@ SYNTHETIC = (
 )  # fmt: skip
 
 
-def value_at(metrics: object, path: str) -> float | None:
+def value_at(metrics: Any, path: str) -> float | None:
     """What stands at a dotted path; None where there is nothing.
 
     >>> value_at({"a": {"b": [1.5]}}, "a.b.0"), value_at({"a": None}, "a.b")

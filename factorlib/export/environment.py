@@ -20,7 +20,7 @@ ROWS_AT_ONCE = 16
 def sharpened(lobes: Lobes, spacing: float) -> Lobes:
     """Lobes that, interpolated linearly between nodes `spacing` radians apart, are as wide as `lobes`; energy kept."""
     variance = np.maximum(1 / lobes.sharpness - spacing**2 / 6, NARROWEST * spacing**2)
-    kept = lobe_integral(lobes.sharpness) / lobe_integral(1 / variance)
+    kept = np.asarray(lobe_integral(lobes.sharpness) / lobe_integral(1 / variance))
     return Lobes(lobes.axis, 1 / variance, lobes.weight * kept[:, None])
 
 

@@ -63,19 +63,19 @@ def _add_standard(document: ET.Element, prefix: str, material: Reflectance) -> N
     brightest = max(material.specular)
     base, tint = np.array(material.diffuse) / (1 - brightest), np.array(material.specular) / (brightest or 1)
     numbers = {"specular": brightest, "specular_roughness": material.roughness, "specular_IOR": NO_FRESNEL}
-    inputs = {"base": 1.0, "base_color": base, "specular_color": tint, **numbers}
-    _add(document, "standard_surface", f"{prefix}_surface", "surfaceshader", **inputs)
+    colours = {"base_color": base, "specular_color": tint}
+    _add(document, "standard_surface", f"{prefix}_surface", "surfaceshader", base=1.0, **colours, **numbers)
 
 
 def _add(document: ET.Element, category: str, name: str, kind: str, **inputs: float | np.ndarray) -> ET.Element:
     node = ET.SubElement(document, category, name=name, type=kind)
     for key, value in inputs.items():
-        if np.ndim(value) == 0:
-            _input(node, key, "float", value=repr(float(value)))
-        else:
+        if isinstance(value, np.ndarray):
             _input(node, key, "color3", value=", ".join(repr(float(v)) for v in value))
+        else:
+            _input(node, key, "float", value=repr(float(value)))
     return node
 
 
 def _input(node: ET.Element, name: str, kind: str, **source: str) -> None:
-    ET.SubElement(node, "input", name=name, type=kind, **source)
+    ET.SubElement(node, "input", {"name": name, "type": kind, **source})

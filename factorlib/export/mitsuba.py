@@ -77,7 +77,7 @@ def _matrix(matrix: np.ndarray) -> tuple[str, dict[str, str]]:
 
 def _add(parent: ET.Element, kind: str, entry: dict[str, Any], **attributes: str) -> ET.Element:
     """Mitsuba's dictionary of a plugin as an element, with a child for each value; "$…" stands for a default, a whole number."""
-    element = ET.SubElement(parent, kind, type=entry["type"], **attributes)
+    element = ET.SubElement(parent, kind, {"type": entry["type"], **attributes})
     for name, value in entry.items():
         if isinstance(value, tuple):
             ET.SubElement(ET.SubElement(element, "transform", name=name), *value)

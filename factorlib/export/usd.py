@@ -59,7 +59,7 @@ def write_usd_mesh(path: str | Path, mesh: Mesh) -> None:
     write_text(path, _layer(['defaultPrim = "mesh"', *UP_AXIS], _prim('Mesh "mesh"', lines)))
 
 
-def shader_inputs(material: Reflectance) -> dict[str, object]:
+def shader_inputs(material: Reflectance) -> dict[str, float | np.ndarray]:
     """Inputs of UsdPreviewSurface.
 
     Specular workflow: F0 = specularColor = k_s, F90 = 1, diffuseColor = k_d / (1 − k_s): k_d and k_s at normal incidence.
@@ -127,9 +127,12 @@ def _materials(scene: Scene, named: Mapping[str, str]) -> list[str]:
     for name, identifier in named.items():
         shader = ['uniform token info:id = "UsdPreviewSurface"']
         for key, value in shader_inputs(scene.materials[name]).items():
-            kind = "color3f" if np.ndim(value) else "int" if isinstance(value, int) else "float"
-            words = {"color3f": _tuple, "int": str, "float": _number}[kind](value)
-            shader.append(f"{kind} inputs:{key} = {words}")
+            if isinstance(value, np.ndarray):
+                shader.append(f"color3f inputs:{key} = {_tuple(value)}")
+            elif isinstance(value, int):
+                shader.append(f"int inputs:{key} = {value}")
+            else:
+                shader.append(f"float inputs:{key} = {_number(value)}")
         surface = f"token outputs:surface.connect = </scene/materials/{identifier}/surface.outputs:surface>"
         about = [surface, *_prim('Shader "surface"', [*shader, "token outputs:surface"])]
         lines += _prim(f'Material "{identifier}"', about, _shown(name))

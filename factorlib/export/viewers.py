@@ -76,10 +76,10 @@ def mtlx_standard_surface(material: Reflectance, angles: Angles) -> Parts:
 def usd(material: Reflectance, angles: Angles) -> Parts:
     """UsdPreviewSurface, from the numbers in the file; of the material's own roughness, which `factorlib.export.loss` makes the file's."""
     inputs = shader_inputs(material)
-    base = inputs["diffuseColor"]
+    base = np.asarray(inputs["diffuseColor"])
     if not inputs["useSpecularWorkflow"]:  # a metal
         return _parts(angles, np.zeros(3), base, separable(material.alpha, angles))
-    f0 = inputs["specularColor"]
+    f0 = np.asarray(inputs["specularColor"])
     fresnel = f0 + np.multiply.outer((1 - angles.oh) ** 5, 1 - f0)
     return _parts(angles, base * (1 - fresnel), fresnel, separable(material.alpha, angles))
 

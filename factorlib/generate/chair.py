@@ -21,7 +21,8 @@ from factorlib.yamlfile import read_yaml
 
 Part = tuple[np.ndarray, np.ndarray]  # vertices [V, 3], faces [F, 3]
 
-Pair, Radii = tuple[float, float], tuple[float, float, float]
+Pair = tuple[float, float]
+Radii = tuple[float, float, float]
 
 
 class Shape(msgspec.Struct, frozen=True, forbid_unknown_fields=True):

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from pathlib import Path
+from typing import Any
 
 import msgspec
 import numpy as np
@@ -27,7 +28,8 @@ from factorlib.meshes.ply import submesh
 from factorlib.tracing.scene import Material, bsdf, envmap, light_seen, look, rigid, shape, traced, transform
 from factorlib.yamlfile import read_yaml
 
-Progress, Maps = Callable[[int, int, str], None], Sequence[Path]
+Progress = Callable[[int, int, str], None]
+Maps = Sequence[Path]
 
 
 class Parameters(msgspec.Struct, frozen=True):
@@ -180,7 +182,7 @@ def write_shot(out: Path, scene: Scene, materials: dict[str, Material], paramete
     exif = shot.focal_35mm if shot.focal_known_from == "exif" else None
     folder.write_photo(out / f"photos/{shot.name}.jpg", radiance * exposure, exif)
     folder.write_shot(out, shot.name, labels, light * exposure, rasterise(meshes, camera, poses))
-    objects = [
+    objects: list[dict[str, Any]] = [
         {"name": name, "mesh": "chair", "materials": {"shell": colour}}
         for name, colour in zip(scene.chairs, shot.chairs, strict=True)
     ]
@@ -190,7 +192,7 @@ def write_shot(out: Path, scene: Scene, materials: dict[str, Material], paramete
             folder.write_labels(out / own["mask"], np.where(mask, 255, 0))
     if parameters.exact:
         objects = [own | {"pose": folder.pose_entry(pose)} for own, pose in zip(objects, poses, strict=True)]
-    entry = {"name": shot.name, "image": f"photos/{shot.name}.jpg", "masks": f"masks/{shot.name}.png"}
+    entry: dict[str, Any] = {"name": shot.name, "image": f"photos/{shot.name}.jpg", "masks": f"masks/{shot.name}.png"}
     if parameters.exact or shot.focal_known_from == "given":
         entry["camera"] = {"focal_px": round(camera.focal, 2)}
     return entry | {"objects": objects}

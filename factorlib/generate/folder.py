@@ -76,7 +76,7 @@ def write_shot(out: Path, name: str, labels: Int[np.ndarray, "h w"], light: Imag
     write_normals(out / f"truth/{name}_normal.exr", maps.normal)
 
 
-def write_obj(path: Path, parts: dict[str, tuple[np.ndarray, ...]]) -> None:
+def write_obj(path: Path, parts: Mapping[str, tuple[np.ndarray, ...]]) -> None:
     """Parts as groups of a Wavefront OBJ: name -> vertices [V, 3], faces [F, 3] and, where they are written to nine digits,
     normals [V, 3].
     """

@@ -7,7 +7,7 @@ Radiance is in arbitrary units: a data set scales each light by its photo's expo
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -16,6 +16,7 @@ from jaxtyping import Float
 
 from factorlib.errors import InputError
 from factorlib.images.photo import read_photo
+from factorlib.results.materials import vec3
 from factorlib.tracing.scene import Material, envmap, light_seen, rgb, transform
 from factorlib.tracing.variant import mitsuba
 
@@ -25,7 +26,8 @@ Y_UP_FROM_Z_UP = np.array([[1.0, 0, 0, 0], [0, 0, 1, 0], [0, -1, 0, 0], [0, 0, 0
 SUN_SCALE, SUN_APERTURE_DEG = 0.12, 3.0  # radiance of the sun against the real one's; its diameter
 GROUND = (0.32, 0.3, 0.26)  # reflectance
 Colour = float | Sequence[float] | Float[np.ndarray, "3"]  # linear Rec. 709; a number is grey
-Rotation, Rng = Float[np.ndarray, "3 3"], np.random.Generator
+Rotation = Float[np.ndarray, "3 3"]
+Rng = np.random.Generator
 SceneDict = dict[str, Any]  # shapes and emitters by name, as Mitsuba's `load_dict` takes them
 # about x, about y, of +z
 TURNS = {"+x": (0, 90), "-x": (0, -90), "+z": (0, 0), "-z": (0, 180), "+y": (-90, 0), "-y": (90, 0)}
@@ -39,8 +41,8 @@ def random_materials(rng: np.random.Generator, spread: float, about: dict[str, M
         colours = np.array([np.array(material.diffuse) * factor[:3], np.array(material.specular) * factor[3]])
         colours *= min(1.0, 0.95 / (colours[0].max() + colours[1].max()))
         roughness = float(np.clip(material.roughness * factor[4], 0.15, 0.8))
-        rounded = (tuple(round(float(v), 4) for v in colour) for colour in colours)
-        result[name] = Material(*rounded, round(roughness, 4))
+        diffuse, specular = (vec3(round(float(v), 4) for v in colour) for colour in colours)
+        result[name] = Material(diffuse, specular, round(roughness, 4))
     return result
 
 
@@ -86,8 +88,8 @@ def room(rng: Rng, windows: int, lamps: int, clear_deg: float = 0.0, clear_half_
     for k, side in enumerate(rng.permutation(sides)[:windows]):
         distance = (half[0] if side[1] == "x" else half[2]) - 0.03
         day = rng.uniform(9, 16) * np.array([0.85, 1.0, 1.15])
-        size, shift = (rng.uniform(0.5, 0.9), 0.7), (rng.uniform(-1, 1), 0.45)
-        scene[f"window_{k}"] = wall(side, distance, size, 0, shift, glow=day)
+        pane, shift = (rng.uniform(0.5, 0.9), 0.7), (rng.uniform(-1, 1), 0.45)
+        scene[f"window_{k}"] = wall(side, distance, pane, 0, shift, glow=day)
     for k in range(lamps):
         across = rng.uniform(0.5, 0.8) * half[0] * rng.choice([-1, 1])
         place = [across, rng.uniform(0.4, 1.2), rng.uniform(0.4, 0.8) * half[2] * rng.choice([-1, 1])]
@@ -107,7 +109,7 @@ def _vivid(rng: np.random.Generator) -> Float[np.ndarray, "3"]:
 
 
 def wall(
-    side: str, distance: float, half: Sequence[float], colour: Colour, shift: Sequence[float] = (0.0, 0.0), glow: Colour | None = None
+    side: str, distance: float, half: Iterable[float], colour: Colour, shift: Sequence[float] = (0.0, 0.0), glow: Colour | None = None
 ) -> SceneDict:  # fmt: skip
     """A rectangle of half sizes `half` (width, height), `distance` from the origin toward `side`, that faces the origin.
 

@@ -47,7 +47,7 @@ class Pixels(msgspec.Struct, frozen=True):
 def random_spheres(rng: np.random.Generator, count: int) -> Spheres:
     """Axes uniform on the sphere, α and λ log-uniform."""
     axis = unit(rng.standard_normal((count, 3)))
-    alpha, sharpness = (np.exp(rng.uniform(*np.log(limits), count)) for limits in (ALPHA, SHARPNESS))
+    alpha, sharpness = (np.exp(rng.uniform(low, high, count)) for low, high in np.log([ALPHA, SHARPNESS]))
     return Spheres(axis, sharpness, np.sqrt(alpha))
 
 

@@ -86,6 +86,6 @@ def smooth(vertices: Float[np.ndarray, "v 3"], faces: np.ndarray, label: np.ndar
     return Mesh(vertices, faces.astype(np.int32), normals, np.broadcast_to(label, len(faces)).astype(np.int16))
 
 
-SHAPES = {
+SHAPES: dict[str, Callable[[], Mesh]] = {
     "sphere": sphere, "vase": partial(revolved, np.array(VASE)), "bottle": partial(revolved, np.array(BOTTLE)), "blob": blob,
 }  # fmt: skip

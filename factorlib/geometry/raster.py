@@ -85,15 +85,15 @@ class Caster:
 
 def rasterise(meshes: Mesh | Caster | Sequence, camera: Camera, poses: Pose | Sequence[Pose]) -> Maps:
     """Maps of one mesh or several, each at its pose (cam_from_object); the nearest wins."""
-    if isinstance(meshes, (Mesh, Caster)):
-        meshes, poses = [meshes], [poses]
+    solids = [meshes] if isinstance(meshes, (Mesh, Caster)) else meshes
+    places = [poses] if isinstance(poses, Pose) else poses
     shape = camera.height, camera.width
     maps = Maps(
         np.zeros((*shape, 3)), np.zeros((*shape, 3)), np.zeros(shape), np.zeros(shape, np.int32),
         np.zeros(shape, np.int32), np.zeros(shape, bool), np.zeros(shape, bool), np.zeros(shape), np.zeros(shape),
     )  # fmt: skip
     nearest, view = np.full(shape, np.inf), -unit(camera.rays())
-    for number, (mesh, pose) in enumerate(zip(meshes, poses, strict=True), start=1):
+    for number, (mesh, pose) in enumerate(zip(solids, places, strict=True), start=1):
         caster = mesh if isinstance(mesh, Caster) else Caster(mesh)
         hits = caster.cast(camera, pose)
         wins = (hits.face >= 0) & (hits.depth < nearest)

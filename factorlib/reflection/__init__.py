@@ -21,6 +21,7 @@ One lobe from straight above, on a white Lambertian surface that faces the viewe
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import torch
 
@@ -41,7 +42,8 @@ def reflection_operator(name: Name, weights: str | Path | None = None, *, dtype:
         raise InputError(f"no reflection operator '{name}'", cure=did_you_mean(name, NAMES))
     if dtype is not None and dtype not in DTYPES:
         raise InputError(f"no dtype '{dtype}'", cure=did_you_mean(dtype, DTYPES))
-    options = {"dtype": DTYPES[dtype]} if dtype else {}
+    options: dict[str, Any] = {"dtype": DTYPES[dtype]} if dtype else {}
+    Kind: type[Operator]
     if name == "reference":
         from factorlib.reflection.reference import Reference as Kind
     elif name == "closed_form":

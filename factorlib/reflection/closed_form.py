@@ -46,10 +46,10 @@ def diffuse_of_moments(lam: Tensor, mean: Tensor, along: Tensor, across: Tensor,
     inside = 0.5 * m * torch.special.erfc(u * -math.sqrt(0.5))
     normal = inside + deviation * torch.exp(-0.5 * u * u) / math.sqrt(2 * math.pi)  # (1)
     x, square = 2 * mean - 1, c * c
-    chebyshev = [1.0, x]
+    chebyshev: list[Tensor | float] = [1.0, x]
     for _ in range(len(REMAINDER) - 2):
         chebyshev.append(2 * x * chebyshev[-1] - chebyshev[-2])
-    value = 0.0
+    value: Tensor | float = 0.0
     for column in reversed(REMAINDER.T.tolist()):
         value = value * square + sum(t * a for a, t in zip(column, chebyshev, strict=True))
     return 2 / lam * (normal + (1 - mean) * (1 - mean) * value).clamp_min(0)

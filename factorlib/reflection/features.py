@@ -51,8 +51,9 @@ def specular_columns(alpha: Tensor, no: Tensor, nz: Tensor, oz: Tensor, form: Fi
     of_density = torch.log(form.density + 1e-5), torch.log1p(form.spread), torch.log1p(torch.log1p(form.distance))
     of_light = form.ni, torch.log(form.deviation + 1e-3), u * torch.rsqrt(4 + u * u), u * torch.rsqrt(0.2 + u * u)
     of_horizon = form.cosine / (form.cosine + alpha), form.lit, no / (no + alpha)
-    of_horizon += height * torch.rsqrt(1 + height * height), height * torch.rsqrt(16 + height * height)
-    return *of_inputs, *of_place, *of_density, *of_light, *of_horizon, mirror / (1 + mirror), mirror / (16 + mirror)
+    of_height = height * torch.rsqrt(1 + height * height), height * torch.rsqrt(16 + height * height)
+    of_mirror = mirror / (1 + mirror), mirror / (16 + mirror)
+    return *of_inputs, *of_place, *of_density, *of_light, *of_horizon, *of_height, *of_mirror
 
 
 def diffuse_columns(lam: Tensor, mean: Tensor, along: Tensor, across: Tensor, nz: Tensor) -> tuple[Tensor, ...]:

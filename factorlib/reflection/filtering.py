@@ -172,12 +172,12 @@ def _student(k: Tensor, lam: Tensor, at: Expansion, ratio: Tensor, misfit: Tenso
     determinant = 1 / (volume * lam)
     square = cx * cx + cy * cy
     across = (at.yy * cx * cx + at.xx * cy * cy - 2 * at.xy * cx * cy) / volume  # cᵀVc
-    density = 0
+    density: Tensor | int = 0
     for rate, weight in GAUSSIANS:
         f = 2 * rate * k
         inflation = 1 + f * (trace + f * determinant)
         exponent = 0.5 * f * (square + f * (trace * square - across)) / inflation
         density = density + weight * torch.exp(-(ratio * exponent + misfit).clamp_max(60)) * torch.rsqrt(inflation)
     x = 1 + k * (square + trace)
-    density = density + torch.exp(-misfit.clamp_max(60)) / (x * x + TAIL * TAIL)
-    return density, torch.log1p(2 * k * (trace + 2 * k * determinant))
+    tail = torch.exp(-misfit.clamp_max(60)) / (x * x + TAIL * TAIL)
+    return density + tail, torch.log1p(2 * k * (trace + 2 * k * determinant))

@@ -21,6 +21,7 @@ import tempfile
 from collections.abc import Callable
 from functools import lru_cache
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
@@ -32,7 +33,7 @@ from factorlib.reflection.features import LARGEST, Layers, diffuse_columns, fadi
 from factorlib.reflection.filtering import filtered
 from factorlib.reflection.lobe import gaussian_sharpness, lobe_moments
 from factorlib.reflection.operator import MOST
-from factorlib.reflection.tape import Tape, Value
+from factorlib.reflection.tape import Tape
 from factorlib.wholefile import sync
 
 log = logging.getLogger("factorlib.reflection")
@@ -82,20 +83,20 @@ def _lobe_table_of(sharpness: bytes) -> Tensor:
     """MOMENTS and their derivatives by log λ, [10, p], of float64 λ."""
     with torch.enable_grad():
         log_sharpness = torch.from_numpy(np.frombuffer(sharpness).copy()).log().requires_grad_()
-        sharpness = log_sharpness.exp()
-        moments = [sharpness, gaussian_sharpness(sharpness), *lobe_moments(sharpness)]
+        lam = log_sharpness.exp()
+        moments = [lam, gaussian_sharpness(lam), *lobe_moments(lam)]
         slopes = [torch.autograd.grad(t.sum(), log_sharpness, retain_graph=True)[0] for t in moments]
     return torch.stack([*(t.detach() for t in moments), *slopes]).float().contiguous()
 
 
-def recorded(part: str, tape: Tape) -> tuple[Value, tuple]:
+def recorded(part: str, tape: Tape) -> tuple[Any, tuple]:
     """The formula and the features of `part`, of inputs named as in PLACES."""
     if part == "diffuse":
         inputs = [tape.input(name) for name in ("lam", "mean", "along", "across", "nz")]
         return diffuse_of_moments(*inputs), diffuse_columns(*inputs)
     inputs = [tape.input(name) for name in ("alpha", "sharpness", "lam", "along", "no", "nz", "oz")]
-    form = filtered(*inputs)
-    return form.value, specular_columns(inputs[0], *inputs[4:], form)
+    form, (alpha, *_, no, nz, oz) = filtered(*inputs), inputs
+    return form.value, specular_columns(alpha, no, nz, oz, form)
 
 
 def source(part: str, features: int, width: int, depth: int) -> str:
@@ -109,7 +110,7 @@ def source(part: str, features: int, width: int, depth: int) -> str:
     result = formula * grown
     inside = tape.apply("above", MOST, result)  # beyond, the result is MOST and its derivatives are nil
     by_net = inside * result * fade * (1 - t * t)
-    seeds = [(formula, inside * grown), (fade, inside * result * LARGEST * t)]
+    seeds: list[tuple[Any, Any]] = [(formula, inside * grown), (fade, inside * result * LARGEST * t)]
     seeds += [(c, by_net * tape.input(f"slope{k}")) for k, c in enumerate(columns)]
     inputs = [tape.input(name) for name in ("alpha", "no", "nz", "oz", *MOMENTS)]
     by_alpha, by_no, by_nz, by_oz, *by_moments = tape.gradient(seeds, inputs)
@@ -141,7 +142,7 @@ def compiled(part: str, features: int, width: int, depth: int) -> Callable:
         with tempfile.TemporaryDirectory(dir=library.parent) as folder:
             made, code = Path(folder) / "kernel.so", Path(folder) / "kernel.c"
             code.write_text(text)
-            command = [*compiler, *FLAGS.split(), "-o", made, code, "-lm"]
+            command = [*compiler, *FLAGS.split(), "-o", str(made), str(code), "-lm"]
             subprocess.run(command, check=True, capture_output=True, text=True)
             sync(made)
             os.replace(made, library)

@@ -57,14 +57,14 @@ class Network(Operator):
         folder = Path(weights) if weights is not None else SHIPPED
         self.layers = {part: read_layers(folder / f"{part}.safetensors", FEATURES[part]).to(dtype) for part in FEATURES}
         compiled = self.layers if dtype == torch.float32 else {}
-        self.fused = {part: fused(part, layers) for part, layers in compiled.items()}
+        self.fused = {part: code for part, layers in compiled.items() if (code := fused(part, layers))}
 
     def _compiled(self, sharpness: Tensor, *others: Tensor) -> bool:
         """Whether compiled code can answer: it is there, a lobe a column, on the CPU, finite, and autograd does not listen.
 
         Compiled code takes NaN for a number; torch hands it on.
         """
-        if not self.fused or not all(self.fused.values()) or sharpness.ndim != 1:
+        if len(self.fused) < len(FEATURES) or sharpness.ndim != 1:
             return False
         listening = torch.is_grad_enabled() and any(t.requires_grad for t in (sharpness, *others))
         return not listening and all(t.device.type == "cpu" and math.isfinite(t.sum()) for t in (sharpness, *others))

@@ -12,7 +12,9 @@ from torch import Tensor
 Name = Literal["reference", "closed_form", "network", "paper_network"]
 NAMES = get_args(Name)
 MOST = 1.0  # what a unit lobe reflects at most: its radiance is nowhere above 1, nor the albedo
-PerLobe, PerPoint, PerPair = Float[Tensor, "*p"], Float[Tensor, "*n"], Float[Tensor, "n p"]
+PerLobe = Float[Tensor, "*p"]
+PerPoint = Float[Tensor, "*n"]
+PerPair = Float[Tensor, "n p"]
 CHUNK = 1 << 14  # evaluations whose intermediate results are in memory at once
 
 
@@ -79,7 +81,7 @@ class Operator:
             specular = self.specular(r, log_sharpness.exp(), views, nz, oz)
             by_diffuse = torch.autograd.grad(diffuse.sum(), [log_sharpness, nz])
             by_specular = torch.autograd.grad(specular.sum(), [r, log_sharpness, views, nz, oz])
-        return Response(diffuse.detach(), *by_diffuse, specular.detach(), *by_specular)
+        return Response(*[diffuse.detach(), *by_diffuse, specular.detach(), *by_specular])
 
     def __call__(
         self, lobes: LobesLike, material: MaterialLike, normals: Float[Tensor, "n 3"], views: Float[Tensor, "n 3"]
@@ -89,8 +91,8 @@ class Operator:
         normals, views: unit, any common frame; surfaces that face away reflect nothing; NaN anywhere is NaN in what depends on it
         """
         given = lobes.axis, lobes.sharpness, lobes.weight, material.diffuse, material.specular, material.roughness
-        given = (torch.as_tensor(t).to(self.dtype) for t in (*given, normals, views))
-        axis, sharpness, weight, kd, ks, roughness, normals, views = given
+        tensors = (torch.as_tensor(t).to(self.dtype) for t in (*given, normals, views))
+        axis, sharpness, weight, kd, ks, roughness, normals, views = tensors
         no, nz, oz = (normals * views).sum(-1), normals @ axis.T, views @ axis.T
         diffuse, specular = self.diffuse(sharpness, nz), self.specular(roughness, sharpness, no, nz, oz)
         radiance = kd * (diffuse @ weight) + ks * (specular @ weight)

@@ -191,7 +191,7 @@ def diffuse_quadrature(sharpness: Tensor, nz: Tensor, nodes: int = 48) -> Tensor
     reach = reach_of(lam)
     low = torch.zeros_like(a)
     x, w = gauss(nodes, c.dtype)
-    total = 0
+    total = torch.zeros((), dtype=c.dtype)
     for first, last in ((low, a), (a, math.pi - a), (math.pi - a, low + math.pi)):
         first, last = first.minimum(reach), last.minimum(reach)
         theta = first + (last - first) * torch.sin(math.pi / 2 * x) ** 2

@@ -33,14 +33,14 @@ class Tape:
         self.ops: list[tuple[str, tuple]] = []
         self.known: dict[tuple, int] = {}
 
-    def input(self, name: str) -> Value:
-        """The input of that name, on the tape once however often it is asked for."""
+    def input(self, name: str) -> Any:
+        """The input of that name, a `Value` that stands for a tensor; on the tape once however often it is asked for."""
         return self._record("input", (name,))
 
     def apply(self, name: str, *arguments: Value | float) -> Value | float:
         """Record operation `name` of C on values or numbers; a number where all arguments are."""
-        arguments = tuple(a.index if isinstance(a, Value) else float(a) for a in arguments)
-        a, b = (*arguments, None)[:2]
+        given: tuple[Any, ...] = tuple(a.index if isinstance(a, Value) else float(a) for a in arguments)
+        a, b = given if len(given) == 2 else (*given, None)
         numbers = [v if isinstance(v, float) else None for v in (a, b)]  # an index is not a number
         if None not in numbers and name in ARITHMETIC:
             return ARITHMETIC[name](a, b)
@@ -50,7 +50,7 @@ class Tape:
             return Value(self, a)
         if numbers[0] is not None and numbers[0] == {"add": 0.0, "mul": 1.0}.get(name):
             return Value(self, b)
-        return self._record(name, arguments)
+        return self._record(name, given)
 
     def _record(self, name: str, arguments: tuple) -> Value:
         key = name, tuple((type(a), a) for a in arguments)
@@ -73,7 +73,8 @@ class Tape:
         return [slope.get(v.index, 0.0) for v in inputs]
 
     def _slopes(self, name: str, arguments: tuple, y: Value) -> tuple:
-        a, b = (*(v if isinstance(v, float) else Value(self, v) for v in arguments), None)[:2]
+        operands: list[Any] = [*(v if isinstance(v, float) else Value(self, v) for v in arguments), None]
+        a, b = operands[:2]
         if name in ("max", "min"):
             second = self.apply("above", b, a) if name == "max" else self.apply("above", a, b)
             return 1.0 - second, second  # on the limit as inside it, as torch has it
@@ -103,18 +104,19 @@ def _c(argument: int | float) -> str:
     return f"v{argument}" if isinstance(argument, int) else f"{argument!r}f"
 
 
+def _op(name: str, swap: bool = False) -> Callable[[Any, Any], Any]:
+    return lambda self, other: self.tape.apply(name, *((other, self) if swap else (self, other)))
+
+
 class Value:
     """A number on a tape; understands the arithmetic and the torch functions that the formulas use."""
 
     def __init__(self, tape: Tape, index: int):
         self.tape, self.index = tape, index
 
-    def _(name: str, swap: bool = False) -> Callable[[Any, Any], Any]:
-        return lambda self, other: self.tape.apply(name, *((other, self) if swap else (self, other)))
-
-    __add__, __radd__, __sub__, __rsub__ = _("add"), _("add", True), _("sub"), _("sub", True)
-    __mul__, __rmul__, __truediv__, __rtruediv__ = _("mul"), _("mul", True), _("div"), _("div", True)
-    clamp_min, clamp_max = _("max"), _("min")
+    __add__, __radd__, __sub__, __rsub__ = _op("add"), _op("add", True), _op("sub"), _op("sub", True)
+    __mul__, __rmul__, __truediv__, __rtruediv__ = _op("mul"), _op("mul", True), _op("div"), _op("div", True)
+    clamp_min, clamp_max = _op("max"), _op("min")
 
     def __neg__(self) -> Value:
         return 0.0 - self

@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from operator import itemgetter
 
 import msgspec
 import torch
@@ -117,7 +118,7 @@ def train(
             if len(order) < schedule.batch:
                 order = hard_ones_often(problem, layers if curve else None, generator)
             rows, order = order[: schedule.batch], order[schedule.batch :]
-            error = problem.each(lambda field, rows=rows: field[rows]).errors(layers)
+            error = problem.each(itemgetter(rows)).errors(layers)
             # about |e|, smooth at 0, plus 2e², so that single large errors count more
             loss = (torch.sqrt(error * error + 1e-6) + 2 * error * error).mean()
             total += descended(optimiser, loss, step, schedule)
@@ -199,7 +200,7 @@ def trained_plainly(problem: Problem, schedule: Schedule, report: Callable[[int,
         if len(order) < schedule.batch:
             order = torch.randperm(len(problem.exact), generator=generator)
         rows, order = order[: schedule.batch], order[schedule.batch :]
-        error = problem.each(lambda field, rows=rows: field[rows]).errors(layers)
+        error = problem.each(itemgetter(rows)).errors(layers)
         total += descended(optimiser, torch.sqrt(error * error + 1e-6).mean(), step, schedule)
         if (step + 1) % every == 0:
             report(step + 1, total / every)

@@ -35,7 +35,7 @@ from factorlib.meshes.mesh import Mesh
 from factorlib.meshes.ply import submesh
 from factorlib.render.ground import Plane, height_over
 from factorlib.render.photo_scene import PhotoScene, Placed, light_entry, shapes
-from factorlib.results.materials import Reflectance
+from factorlib.results.materials import Reflectance, vec3
 from factorlib.tracing.scene import bsdf, rendered, rgb, rigid, sensor, shape, transform
 
 RADIUS, FADE = 8.0, 0.5  # of the disc, in sizes of the object; share of it from which on shadows fade
@@ -190,7 +190,7 @@ def _ground_colour(lit: Picture, photo: Picture, shows_ground: Bool[np.ndarray, 
     if not usable.any():
         return (GREY,) * 3
     found = GREY * np.median(photo[usable] / lit[usable], axis=0)
-    return tuple(float(c) for c in np.clip(found, DARKEST, BRIGHTEST))
+    return vec3(np.clip(found, DARKEST, BRIGHTEST))
 
 
 def _disc(spot: Spot, material: Reflectance) -> dict[str, Any]:

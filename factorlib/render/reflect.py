@@ -75,8 +75,9 @@ class Reflector:
         with torch.no_grad():
             for i in range(0, len(normals) if len(self.sharpness) else 0, step):
                 rows = slice(i, i + step)
-                some, geometry = None if shadows is None else shadows.take(rows), (normals[rows], views[rows])
-                result[rows] = self._radiance(material, *map(self._tensor, geometry), some).double().numpy()
+                some = None if shadows is None else shadows.take(rows)
+                geometry = self._tensor(normals[rows]), self._tensor(views[rows])
+                result[rows] = self._radiance(material, *geometry, some).double().numpy()
                 report(min(i + step, len(normals)), len(normals))
         return result
 
@@ -104,7 +105,8 @@ class Reflector:
         visibility, normals, views = visibility / 255, normals.float(), views.float()
         lobes = kernel(directions, self.axis.float(), self.sharpness.float())
         weights = cosine_weights(normals, directions), highlight_weights(normals, views, directions, roughness)
-        return tuple(seen_share(visibility, weight, lobes).to(self.operator.dtype) for weight in weights)
+        diffuse, specular = (seen_share(visibility, weight, lobes).to(self.operator.dtype) for weight in weights)
+        return diffuse, specular
 
     # diffuse ----------------------------------------------------------------------------------------------------------
 

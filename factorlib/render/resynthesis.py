@@ -69,12 +69,16 @@ def resynthesised(
     normal, view = (np.stack([geometry[f"{kind}.{a}"] for a in "xyz"], axis=-1) for kind in ("normal", "view"))
     label[~(np.abs(normal).max(axis=-1) > 0)] = 0
     picture, total, before = np.zeros((*label.shape, 3)), int((label > 0).sum()), 0
+
+    def of_all(done: float, _: float) -> None:
+        report(before + done, total)
+
     for k, material in enumerate(materials, start=1):
         pixels = label == k
         unit = [of[pixels].astype(float) for of in (normal, view)]
         unit = [of / np.linalg.norm(of, axis=-1, keepdims=True) for of in unit]
         shadows, sent = (None, None) if around is None else around_pixels(around, k - 1, *np.nonzero(pixels))
-        shown = reflector(material, *unit, lambda done, _, before=before: report(before + done, total), shadows)
+        shown = reflector(material, unit[0], unit[1], of_all, shadows)
         if sent is not None:
             bounced = np.array(material.diffuse) * sent[:, :3] + np.array(material.specular) * sent[:, 3:]
             shown += bounced * (np.sum(unit[0] * unit[1], 1, keepdims=True) > 0)

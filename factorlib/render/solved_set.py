@@ -130,11 +130,12 @@ class SolvedSet:
         Raises InputError for a mesh that is not there, and for one without height.
         """
         upward, wanted = np.eye(3)["xyz".index(up)], material or self.names[0]
+        materials: tuple[str, ...] = (wanted,)
         if name == BALL:
-            mesh, materials = sphere(1.0), (wanted,)
+            mesh = sphere(1.0)
         elif is_mesh_file(name):
             file = self.inputs.file(f"recipe file:{name}")
-            mesh, materials = read_mesh(file, [wanted], wanted, {}, self._meshes.crease_deg), (wanted,)
+            mesh = read_mesh(file, [wanted], wanted, {}, self._meshes.crease_deg)
         elif not (shown := self._objects_of(name)):
             known = [BALL, *sorted({obj.mesh for each in self.objects.values() for obj in each.objects})]
             raise InputError(f"there is no mesh {name!r}", key="mesh", cure=did_you_mean(name, known))

@@ -49,6 +49,12 @@ class Artifacts(msgspec.Struct, frozen=True, dict=True):
         """All channels of <name>.exr."""
         return self.read(read_exr, stage, f"{name}.exr")
 
+    def channels(self, stage: str, name: str) -> Channels:
+        """As `exr`, of a file that is there."""
+        channels = self.exr(stage, name)
+        assert channels is not None
+        return channels
+
     def table(self, stage: str, name: str) -> dict[str, list]:
         """<name>.parquet as columns; none where there is no file."""
         return self.read(lambda path: pq.read_table(path).to_pydict(), stage, f"{name}.parquet") or {}

@@ -79,13 +79,13 @@ def _rows(tables: list[MaterialTable], names: list[str]) -> list[dict[str, Any]]
     groups: dict[tuple[int, ...], list[str]] = {}
     for name in names:
         groups.setdefault(tuple(table.gauge.component.get(name, 0) for table in tables), []).append(name)
-    factor = {}
+    factor, (first, second) = {}, (table.materials for table in tables)
     for group in groups.values():
         both = ([table.materials[name] for name in group] for table in tables)
         sums = [np.sum([np.add(m.diffuse, m.specular) for m in each], axis=0) for each in both]
         factor |= dict.fromkeys(group, np.divide(sums[0], sums[1], out=np.ones(3), where=sums[1] > 0))
     parts = ("diffuse", "specular", "roughness")
-    return [_row(name, part, *(t.materials[name] for t in tables), factor[name]) for name in names for part in parts]
+    return [_row(name, part, first[name], second[name], factor[name]) for name in names for part in parts]
 
 
 def _row(name: str, part: str, first: Solved, second: Solved, factor: Float[np.ndarray, "3"]) -> dict[str, Any]:
@@ -103,11 +103,13 @@ def _row(name: str, part: str, first: Solved, second: Solved, factor: Float[np.n
 def _pair(name: str, first: Picture | None, second: Picture | None) -> dict[str, str | None]:
     """Two pictures of one thing, where they are there, at one exposure, and how far they are apart, in words."""
     present = [each for each in (first, second) if each is not None]
-    exposure, apart = exposure_of(present[0]) if present else 1.0, ""
+    exposure = exposure_of(present[0]) if present else 1.0
     uris = [None if each is None else data_uri(picture(reduced(each, WIDTH), exposure)) for each in (first, second)]
-    if len(present) == 2 and first.shape != second.shape:
+    if first is None or second is None:
+        apart = ""
+    elif first.shape != second.shape:
         apart = "of different sizes"
-    elif len(present) == 2:
+    else:
         relative = float(np.sqrt(np.mean((second - first) ** 2)) / (np.sqrt(np.mean(first**2)) or 1.0))
         apart = f"RMS difference {percent(relative)} of the first's RMS"
     return {"name": name, "first": uris[0], "second": uris[1], "apart": apart}

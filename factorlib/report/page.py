@@ -32,6 +32,7 @@ Plot = tuple[str, list[str]]  # an SVG, and the names of its lines
 def page(run: Artifacts, rows: list[pictures.PhotoRow], tags: dict[str, str], viewed: dict[str, Any] | None) -> str:
     """The page as HTML, from the artifacts, the photos' rows, the materials' colours and what can be relit."""
     metrics, exposure, facts, solved = run.metrics, pictures.exposures(run), run.photo_facts, run.solved
+    assert metrics is not None
     photos, poses = run.set.photos, run.poses
     cells = [[pictures.ball_cell(run, m, p, exposure[p]) for p in photos] for m in run.set.materials]
     errors = metrics.light.lights if metrics.light else {}
@@ -113,7 +114,7 @@ def _overlay(run: Artifacts, photo: str) -> str | None:
     pixels = run.read(read_png, "align", f"{photo}_overlay.png")
     if pixels is None:
         return None
-    crop = pixels[pictures.box_of(run.exr("masks", photo)["label"] > 0.5, 0.15)].astype("f4")
+    crop = pixels[pictures.box_of(run.channels("masks", photo)["label"] > 0.5, 0.15)].astype("f4")
     return pictures.data_uri(pictures.reduced(crop, pictures.longest_side(len(run.set.photos))).round().astype("u1"))
 
 

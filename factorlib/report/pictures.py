@@ -60,7 +60,8 @@ def box_of(mask: Bool[np.ndarray, "h w"], margin: float = 0.06) -> tuple[slice, 
         return slice(0, mask.shape[0]), slice(0, mask.shape[1])
     spans = [np.nonzero(mask.any(axis=1 - axis))[0][[0, -1]] for axis in (0, 1)]
     extra = int(np.ceil(margin * max(b - a + 1 for a, b in spans)))
-    return tuple(slice(max(0, a - extra), min(n, b + 1 + extra)) for (a, b), n in zip(spans, mask.shape, strict=True))
+    rows, columns = (slice(max(0, a - extra), min(n, b + 1 + extra)) for (a, b), n in zip(spans, mask.shape))
+    return rows, columns
 
 
 def outline(mask: Bool[np.ndarray, "h w"]) -> Bool[np.ndarray, "h w"]:
@@ -109,7 +110,7 @@ def longest_side(photos: int) -> int:
 
 def photo_row(run: Artifacts, name: str, tags: dict[str, str], errors: PhotoErrors | None) -> PhotoRow:
     """`tags`: the colour of each material in masks; `errors`: the photo's entry of the metrics."""
-    masks, geometry = run.exr("masks", name), run.exr("align", name)
+    masks, geometry = run.channels("masks", name), run.channels("align", name)
     again, exposure = run.rgb("render", f"resynthesis/{name}"), errors.exposure if errors else 1.0
     box = box_of(np.rint(masks["label"]) > 0)
     masks, geometry = ({k: v[box] for k, v in channels.items()} for channels in (masks, geometry))
@@ -167,9 +168,9 @@ def _column(run: Artifacts, row: PhotoRow, exposure: float, height: int) -> Pixe
     light = run.rgb("export", f"illumination/{row.illumination}")
     if light is not None:
         cells.append(_fitted(picture(light, exposure_of(light, percentile=95.0)), COLUMN // 2, COLUMN))
-    balls = [run.rgb("render", f"materials/{row.name}/{material}") for material in run.set.materials]
+    found = [run.rgb("render", f"materials/{row.name}/{material}") for material in run.set.materials]
     size = COLUMN // 2 - GAP, COLUMN // 2 - GAP // 2
-    balls = [_fitted(disc(ball, exposure), *size) for ball in balls if ball is not None]
+    balls = [_fitted(disc(ball, exposure), *size) for ball in found if ball is not None]
     for k in range(0, len(balls), 2):
         pair = np.concatenate(balls[k : k + 2], axis=1)
         cells.append(_whitened(pair, 0, COLUMN - pair.shape[1]))
@@ -215,10 +216,10 @@ def reflectance_maps(run: Artifacts, photo: str, exposure: float) -> list[Cell]:
     cells, observations = [], run.read(read_observations, "urm", f"{photo}.parquet")
     for index, name in enumerate(run.set.materials):
         channels = run.exr("render", f"reflectance_maps/{photo}/{name}")
-        rows = observations.material == index if observations is not None else np.zeros(0, bool)
-        measured = data_uri(measured_map(observations.take(rows), exposure)) if rows.any() else None
+        seen = observations and observations.take(observations.material == index)
+        measured = data_uri(measured_map(seen, exposure)) if seen else None
         uri = None if channels is None else data_uri(_ringed(channels, exposure))
-        cells.append(Cell(name, photo, bool(rows.any()), uri, measured))
+        cells.append(Cell(name, photo, bool(seen), uri, measured))
     return cells
 
 

@@ -40,8 +40,8 @@ def read_lobes(path: str | Path, cure: str = CURE) -> dict[str, Lobes]:
     columns, about = read_columns(path, WHAT, ("illumination", *COLUMNS), cure=cure)
     with reading(WHAT, path, cure=cure):
         names = msgspec.convert(about["illuminations"], list[str])
-        values = [columns[c].cast(pa.float64()).to_numpy(zero_copy_only=False) for c in COLUMNS]
-        values = np.column_stack(values).reshape(-1, len(COLUMNS))
+        numbers = [columns[c].cast(pa.float64()).to_numpy(zero_copy_only=False) for c in COLUMNS]
+        values = np.column_stack(numbers).reshape(-1, len(COLUMNS))
         illumination = np.array(columns["illumination"].to_pylist(), dtype=object)
         if not set(illumination) <= set(names):
             raise ValueError("a lobe of an illumination that its metadata do not name")

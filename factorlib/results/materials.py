@@ -3,7 +3,7 @@ exposures.json what each photo's light is multiplied by, per channel; uncertaint
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -17,6 +17,12 @@ Vec3 = tuple[float, float, float]
 AtLeast0 = Annotated[float, msgspec.Meta(ge=0)]
 Channels = tuple[AtLeast0, AtLeast0, AtLeast0]  # linear Rec. 709
 Positive = Annotated[float, msgspec.Meta(gt=0)]
+
+
+def vec3(values: Iterable[float]) -> Vec3:
+    """Three numbers as plain floats."""
+    x, y, z = map(float, values)
+    return x, y, z
 
 
 class Reflectance(msgspec.Struct, frozen=True):

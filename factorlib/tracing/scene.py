@@ -23,12 +23,15 @@ from factorlib.geometry.camera import Camera
 from factorlib.light.latlong import sampled
 from factorlib.meshes.mesh import Mesh
 from factorlib.meshes.ply import write_ply
+from factorlib.results.materials import Reflectance
 from factorlib.tracing.variant import mitsuba
 
 SAMPLER, SAMPLES_PER_PASS = "multijitter", 1 << 23
 ENVMAP_FINER = 8  # rows of the lattice handed to Mitsuba, per row of a map
 MITSUBA_FROM_CAMERA = np.diag([-1.0, -1.0, 1.0, 1.0])  # Mitsuba's sensors: x left, y up, z forward
-Entry, Matrix, Image = dict[str, Any], Float[np.ndarray, "4 4"], Float[np.ndarray, "h w c"]
+Entry = dict[str, Any]
+Matrix = Float[np.ndarray, "4 4"]
+Image = Float[np.ndarray, "h w c"]
 FACE_LOOKS = {"+x": (0, 90), "-x": (0, -90), "+y": (90, 0), "-y": (-90, 0), "+z": (0, 0), "-z": (0, 180)}
 
 
@@ -40,7 +43,7 @@ class Material(msgspec.Struct, frozen=True):
     roughness: float
 
 
-def bsdf(material: Material) -> dict[str, Any]:
+def bsdf(material: Material | Reflectance) -> dict[str, Any]:
     """Mitsuba's `blendbsdf` that evaluates to k_d/π + k_s D G / (4 (n·i)(n·o)), without Fresnel."""
     diffuse, specular = np.array(material.diffuse), np.array(material.specular)
     if not diffuse.any() and not specular.any():

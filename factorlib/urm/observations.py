@@ -13,6 +13,7 @@ from __future__ import annotations
 import json
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 import msgspec
 import numpy as np
@@ -88,7 +89,10 @@ NAMES = {
     "illuminations": "illumination",
 }  # and the columns that number them
 # K values a row, where there are any: type, value where everything is seen, meaning
-WIDE = {"visibility": (np.dtype("u1"), 255, VISIBILITY), "met": (np.dtype("<u2"), UNMET, MET)}
+WIDE: dict[str, tuple[np.dtype, int, str]] = {
+    "visibility": (np.dtype("u1"), 255, VISIBILITY),
+    "met": (np.dtype("<u2"), UNMET, MET),
+}
 
 
 def write_observations(path: str | Path, observations: Observations) -> None:
@@ -102,10 +106,10 @@ def write_observations(path: str | Path, observations: Observations) -> None:
     about = {**UNITS, **{kind: getattr(observations, kind) for kind in NAMES}}
     if any(exposure is not None for exposure in observations.exposures):
         about["exposures"] = observations.exposures
-    for name, (dtype, _, meaning) in WIDE.items():
+    for name, (wide, _, meaning) in WIDE.items():
         if (values := getattr(observations, name)) is not None:
-            data = pa.py_buffer(np.ascontiguousarray(values, dtype=dtype))
-            type_ = pa.binary(values.shape[1] * dtype.itemsize)  # a row's values as one binary of fixed size
+            data = pa.py_buffer(np.ascontiguousarray(values, dtype=wide))
+            type_ = pa.binary(values.shape[1] * wide.itemsize)  # a row's values as one binary of fixed size
             columns[name] = pa.FixedSizeBinaryArray.from_buffers(type_, len(values), [None, data])
             about[name] = meaning
     metadata = {"factorlib": json.dumps(about, sort_keys=True, ensure_ascii=False)}
@@ -118,11 +122,11 @@ def read_observations(path: str | Path) -> Observations:
     parts, about = read_columns(path, WHAT, COLUMNS, (*OPTIONAL, *WIDE), CURE)
     with reading(WHAT, path, cure=CURE):
         narrow = {name: dtype for name, dtype in (COLUMNS | OPTIONAL).items() if name in parts}
-        columns = {name: _array(parts[name], dtype, name in VECTORS) for name, dtype in narrow.items()}
-        columns |= {name: _of_bytes(parts[name], dtype) for name, (dtype, *_) in WIDE.items() if name in parts}
-        named = {kind: tuple(msgspec.convert(about[kind], list[str])) for kind in NAMES}
+        fields: dict[str, Any] = {name: _array(parts[name], dtype, name in VECTORS) for name, dtype in narrow.items()}
+        fields |= {name: _of_bytes(parts[name], wide) for name, (wide, *_) in WIDE.items() if name in parts}
+        fields |= {kind: tuple(msgspec.convert(about[kind], list[str])) for kind in NAMES}
         exposures = tuple(msgspec.convert(about.get("exposures", []), list[float | None]))
-        observations = Observations(**columns, **named, exposures=exposures)
+        observations = Observations(**fields, exposures=exposures)
         _check(observations)
     return observations
 
@@ -151,13 +155,13 @@ def concatenate(parts: Sequence[Observations]) -> Observations:
     materials = parts[0].materials
     if any(part.materials != materials for part in parts):
         raise InputError("reflectance maps of different material lists", cure=cure)
-    columns, names = {name: np.concatenate([getattr(part, name) for part in parts]) for name in COLUMNS}, {}
+    fields: dict[str, Any] = {name: np.concatenate([getattr(part, name) for part in parts]) for name in COLUMNS}
     for kind, column in (("photos", "photo"), ("illuminations", "illumination")):
-        names[kind] = tuple(sorted({name for part in parts for name in getattr(part, kind)}))
-        numbers = [np.array([names[kind].index(name) for name in getattr(part, kind)], "i4") for part in parts]
+        fields[kind] = tuple(sorted({name for part in parts for name in getattr(part, kind)}))
+        numbers = [np.array([fields[kind].index(name) for name in getattr(part, kind)], "i4") for part in parts]
         own = [getattr(part, column) for part in parts]
         renumbered = [number[index] if len(number) else index for number, index in zip(numbers, own, strict=True)]
-        columns[column] = np.concatenate(renumbered).astype("i4")
+        fields[column] = np.concatenate(renumbered).astype("i4")
     exposures = {photo: exposure for part in parts for photo, exposure in zip(part.photos, part.exposures)}
     fills = {name: (dtype, nothing) for name, (dtype, nothing, _) in WIDE.items()} | {"confidence": (np.dtype("f4"), 1)}
     for name, (dtype, fill) in fills.items():  # parts without see everything, and are sure
@@ -170,9 +174,9 @@ def concatenate(parts: Sequence[Observations]) -> Observations:
             filled = [
                 np.full((len(part), *shape), fill, dtype) if own is None else own for part, own in zip(parts, given)
             ]
-            columns[name] = np.concatenate(filled)
-    of_photos = tuple(exposures.get(photo) for photo in names["photos"])
-    return Observations(**columns, materials=materials, **names, exposures=of_photos)
+            fields[name] = np.concatenate(filled)
+    of_photos = tuple(exposures.get(photo) for photo in fields["photos"])
+    return Observations(**fields, materials=materials, exposures=of_photos)
 
 
 def relative_exposures(observations: Observations) -> dict[str, float]:
@@ -187,9 +191,9 @@ def relative_exposures(observations: Observations) -> dict[str, float]:
     for light in np.unique(observations.illumination):
         of_light = np.unique(observations.photo[observations.illumination == light])
         photos = sorted(observations.photos[k] for k in of_light)
-        exposures = [known.get(photo) for photo in photos]
-        first = exposures[0] if None not in exposures else None
-        relative |= {photo: exposure / first if first else 1.0 for photo, exposure in zip(photos, exposures)}
+        said = [exposure for photo in photos if (exposure := known.get(photo)) is not None]
+        all_say = len(said) == len(photos) and said[0]
+        relative |= dict(zip(photos, [exposure / said[0] for exposure in said] if all_say else [1.0] * len(photos)))
     return relative
 
 
