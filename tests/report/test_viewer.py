@@ -167,9 +167,12 @@ def test_controls_work_by_mouse_and_keys(browser):
 @needs_chromium
 def test_the_picture_on_the_screen_is_the_radiance_exposed(browser):
     page, _ = browser
+    frames = "() => new Promise((done) => requestAnimationFrame(() => requestAnimationFrame(done)))"
     page.click("[data-control=reset]")
     page.evaluate("viewer.canvas.scrollIntoView()")
+    page.evaluate(frames)  # a busy machine has the passes of the picture before until then
     page.wait_for_function(f"viewer.canvas.width === {SIZE} && viewer.pass >= 128", timeout=120000)  # all passes
+    page.evaluate(frames)  # what is drawn is on the screen
     exposure = page.evaluate("viewer.state().photo.exposure")
     box = page.locator("#viewer canvas").bounding_box()
     clip = {"x": round(box["x"]), "y": round(box["y"]), "width": SIZE, "height": SIZE}
