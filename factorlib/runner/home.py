@@ -211,7 +211,7 @@ def view_of(outputs: Inspector, stage: str, keys: dict[str, str], gather: str | 
     record |= {"stage": stage, "photo": None, "view": gather}
     if outputs.get(key := key_of(record)) is not None:
         return key
-    draft, files = store.tmp / f"view-{os.getpid()}-{key}", {}
+    draft, files, right = store.tmp / f"view-{os.getpid()}-{key}", {}, {}
     shutil.rmtree(draft, ignore_errors=True)
     draft.mkdir(parents=True)
     try:
@@ -225,7 +225,11 @@ def view_of(outputs: Inspector, stage: str, keys: dict[str, str], gather: str | 
                     os.link(store.tree(entry.output) / name, draft / name)
                 except OSError:  # no hard links on this file system
                     shutil.copy2(store.tree(entry.output) / name, draft / name)
-            files |= entry.files
+            files, right = files | entry.files, right | outputs.known.get(entry.output, {})
+        if damage := damage_of(draft, files, right):  # a result that was spoilt since it was looked at
+            raise InputError(
+                f"a result was spoilt meanwhile: {damage[0]}", key=stage, cure="run again: it is made anew"
+            )
         if gather:
             table = {photo: read_json(draft / f"{photo}.json") for photo in entries}
             write_text(draft / gather, json_text(table))

@@ -171,6 +171,8 @@ class Project(msgspec.Struct, frozen=True):
             if name in recipes:
                 said = f"two recipes are called {name!r}: their pictures would lie in one folder"
                 raise InputError(said, file=path, cure="rename one of them")
+            if data.recipe is None:
+                raise InputError("there are no recipes of such a dataset", key="RECIPE", cure="leave RECIPE out")
             recipes[name] = data.recipe(path)
         if not recipes and ALL in words:
             raise InputError("there is none in recipes/", key="RECIPE", cure="name a file: RECIPE=<path>.yaml")

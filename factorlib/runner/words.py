@@ -176,8 +176,9 @@ def parameters(params: type) -> list[tuple[str, str, str, str]]:
         if issubclass(cls, msgspec.Struct) and cls is not msgspec.Struct:
             body = ast.parse(textwrap.dedent(inspect.getsource(cls))).body[0].body
             for field, text in zip(body, body[1:]):
-                if isinstance(field, ast.AnnAssign) and isinstance(getattr(text, "value", None), ast.Constant):
-                    texts[field.target.id] = " ".join(str(text.value.value).split())
+                match field, text:
+                    case ast.AnnAssign(ast.Name(name)), ast.Expr(ast.Constant(said)):
+                        texts[name] = " ".join(str(said).split())
     for field in types.type_info(params).fields:
         if isinstance(field.type, types.StructType):
             table += [(f"{field.name}.{name}", *rest) for name, *rest in parameters(field.type.cls)]

@@ -23,10 +23,13 @@ from pathlib import Path
 import pytest
 
 from factorlib.disk import disk_error
+from factorlib.errors import InputError
 from factorlib.runner import verbs
 from factorlib.runner.gc import collect
+from factorlib.runner.home import view_of
 from factorlib.runner.project import LIBRARY
 from factorlib.runner.store import Inspector
+from factorlib.runner.survey import survey
 from tests.faults.battered import call, make, note, real_project
 from tests.runner import toy
 from tests.runner.toy import files_of, reasons, state, write
@@ -393,6 +396,16 @@ def test_what_changes_while_a_step_runs_is_named_and_costs_that_step(fresh, made
         write(path, text)
     made = make(fresh) == 0 and is_sound(fresh) and results(fresh) == results(made_once)
     no_loss("what changes while a step runs", [[] if made else [what]])
+
+
+def test_no_view_takes_a_result_for_right_that_is_spoilt_after_it_was_looked_at(project):
+    found = survey(project, "set", None, [])
+    steps = {p.step.photo: p for p in found.planned() if p.step.stage == "count"}
+    keys = {photo: p.key for photo, p in steps.items()}
+    overwrite(found.store.tree(steps["a"].output) / "a.json", '{"letters": 100}')
+    with pytest.raises(InputError, match="a.json: other content"):
+        view_of(found.outputs, "count", keys, "others.json")
+    assert not list(found.store.tmp.glob("view-*"))
 
 
 def test_edited_code_runs_for_no_further_photo_and_a_remark_stops_nothing(fresh, capsys, monkeypatch):

@@ -94,11 +94,16 @@ class Base(msgspec.Struct):
 class Outer(Base):
     inner: Inner = Inner()
     mute: bool = False
+    quick: bool = True
 
 
 def test_parameters_are_shown_with_those_of_bases_and_of_fields(capsys):
     share, size = ("share", "number > 0 and < 1", "0.5", "A share."), ("inner.size", "1 … 9", "3", "Of what is inside.")
-    assert parameters(Outer) == [share, size, ("mute", "true, false", "false", "")]
+    mute, quick = (
+        ("mute", "true, false", "false", ""),
+        ("quick", "true, false", "true", ""),
+    )  # the next value is no meaning
+    assert parameters(Outer) == [share, size, mute, quick]
     assert verbs.show_params(Project(LIBRARY, photo_sets()), ["urm"]) == 0
     assert "urm.directions = 512    (0 … 4,096)\n    Directions of the sphere" in capsys.readouterr().out
 

@@ -146,3 +146,9 @@ def test_looking_at_recipes_shows_what_they_need_alone_and_the_whole_pipeline_wh
     assert not (project.build / "set" / "shout" / "bye").exists()
     named = [line.strip() for line in capsys.readouterr().out.splitlines() if line.startswith("  ")]
     assert named == [f"shout: {project.build / 'set' / 'shout' / 'hello'}"]  # the toy has no other results to name
+
+
+def test_of_datasets_without_recipes_a_recipe_is_refused(tmp_path):
+    toy.write(tmp_path / "recipes" / "hello.yaml", '{"word": "hello"}')
+    with pytest.raises(InputError, match="no recipes of such a dataset"):
+        survey(toy.make_project(tmp_path), "set", None, [], recipes=["hello"])
