@@ -22,7 +22,7 @@ from factorlib.reflection.filtering import filtered_specular
 from factorlib.reflection.lobe import gaussian_sharpness, lobe_moments
 from factorlib.reflection.operator import MOST, Operator, columns
 
-# `python -m studies.measured.operator_fit` fits these
+# studies/measured/operator_fit.py of version 0.1.0 fitted these
 REMAINDER = torch.tensor(
     [
         [0.117057442, 0.883729683, -4.79232173, 6.88170859, -3.04039177],
