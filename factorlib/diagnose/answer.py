@@ -101,6 +101,7 @@ class Answer(msgspec.Struct, frozen=True):
             interreflection_chosen_by=_losses(solution.interreflection),
             light_prior=self.solver == "bundle",
             splitting_chosen_by=[_decision(one) for one in solution.splitting],
+            suns_chosen_by=_by_name([block.name for block, _ in lit], solution.suns),
             tone={
                 photo: table.Tone(float(np.exp(log_tone)), block.unit * self.relative[photo])
                 for block, light in lit

@@ -23,6 +23,7 @@ from factorlib.light.lobes import lobe_integral
 
 WIDTH = 0.5  # of a cell, in spacings: equal weights are a constant light to 2 % (RMS); wider ones blur a sun more than materials do
 PEAK = 1 / (2 * np.pi * WIDTH**2)
+SUN = 4 / np.radians(0.53 / 2) ** 2  # λ of the lobe that is as wide (RMS) as the sun's disc
 SCALINGS = 5  # iterations for peaks: five make split cells constant to 3 % (RMS), more of them reach 2.7 % at best
 DARKEST = 1e-12  # weight below which a lobe counts as dark, for its logarithm
 TONE = (0.6, 1.7)  # range of the exponents of tone curves
@@ -68,6 +69,11 @@ class Light(msgspec.Struct, frozen=True):
         return np.exp(self.log_sharpness)
 
     @property
+    def suns(self) -> Bool[np.ndarray, " p"]:
+        """Which lobes are no cells but suns: those that are as narrow as one."""
+        return self.sharpness > 0.9 * SUN
+
+    @property
     def spacing(self) -> Float[np.ndarray, " p"]:
         """Radians between a cell and its neighbours: the first of (1)."""
         return 1 / (WIDTH * np.sqrt(self.sharpness))
@@ -84,12 +90,13 @@ class Light(msgspec.Struct, frozen=True):
 
     @property
     def peaks(self) -> Float[np.ndarray, " p"]:
-        """Each cell's weight where radiance is 1: the last of (1), by iterating peak ← peak/√(Σ peak·overlap)."""
-        overlap = np.exp(self.sharpness * (self.axis @ self.axis.T - 1))
-        peaks = np.full(len(self), PEAK)
+        """Each cell's weight where radiance is 1: the last of (1), by iterating peak ← peak/√(Σ peak·overlap); 1 of a sun."""
+        axis, peaks, all_ = self.axis[~self.suns], np.full(len(self), PEAK)[~self.suns], np.ones(len(self))
+        overlap = np.exp(self.sharpness[~self.suns] * (axis @ axis.T - 1))
         for _ in range(SCALINGS):
             peaks /= np.sqrt(overlap @ peaks)
-        return peaks
+        all_[~self.suns] = peaks
+        return all_
 
     @property
     def energy(self) -> Float[np.ndarray, "p 3"]:
@@ -104,6 +111,12 @@ class Light(msgspec.Struct, frozen=True):
     def with_log_radiance(self, u: Float[np.ndarray, "3 p"]) -> Light:
         """Return the same cells with other radiances."""
         return msgspec.structs.replace(self, weight=(self.peaks * np.exp(u)).T)
+
+    def with_lobe(self, axis: Float[np.ndarray, "3"], sharpness: float, weight: Float[np.ndarray, "3"]) -> Light:
+        """Return the light with one more lobe, the last."""
+        log_sharpness = np.append(self.log_sharpness, np.log(sharpness))
+        rows = np.vstack([self.axis, axis]), log_sharpness, np.vstack([self.weight, weight])
+        return msgspec.structs.replace(self, axis=rows[0], log_sharpness=rows[1], weight=rows[2])
 
     def split(self, which: Bool[np.ndarray, " p"]) -> Light:
         """The light with each cell of `which` replaced by smaller ones of its radiance, which follow all others: see the head of the module."""

@@ -112,6 +112,7 @@ class Model(msgspec.Struct, frozen=True):
     light_prior:     whether lights are cells that follow the statistics of natural light
     self_shadowing_chosen_by, interreflection_chosen_by: the held-out loss of each model that was tried, and the margin in standard errors
     splitting_chosen_by: of each time that cells were split
+    suns_chosen_by: of a sun in each illumination
     tone:            curves of the photos that have one;  tone_chosen_by: by illumination
     """
 
@@ -127,6 +128,7 @@ class Model(msgspec.Struct, frozen=True):
     interreflection_chosen_by: dict[str, float] = {}
     light_prior: bool = False
     splitting_chosen_by: list[Decision] = []
+    suns_chosen_by: dict[str, Decision] = {}
     tone: dict[str, Tone] = {}
     tone_chosen_by: dict[str, Decision] = {}
     started_from: Started | UnsetType = UNSET

@@ -38,6 +38,7 @@ SURE = 0.6  # times the typical confidence of a material's normals: what is less
 DARK = 0.2  # of the noise model's absolute part is left where normals are sure
 ROBUST = Loss(3.0)  # beyond 3 σ of the noise model a residual is an outlier
 START_TEMPERATURE = 10.0
+SUNS = 10.0  # standard deviation of a sun's log weight, in the unit of its light, about 0: next to nothing is known
 LEAST_AT_START = (
     0.01  # of reflectances: by its logarithm the derivative of a smaller one is nearly zero, and no step would move it
 )
@@ -123,16 +124,22 @@ def field_of(
 
 def recounted(field: Field, one: Hyperparameters, prior: LightPrior) -> Field:
     """Return the field as other hyperparameters weight it."""
-    Q, log_determinant = prior.precision(field.illumination.light.axis, one.factors)
+    light = field.illumination.light
+    Q, log_determinant = prior.precision(light.axis[~light.suns], one.factors)
+    if light.suns.any():  # of which the prior on cells knows nothing
+        own, cells = np.tile(light.suns, 3), Q
+        Q = np.diag(np.where(own, SUNS**-2.0, 0.0))
+        Q[np.ix_(~own, ~own)] = cells
     return msgspec.structs.replace(field, precision=Q, log_determinant=log_determinant, temperature=one.temperature)
 
 
 def estimated(field: Field, part: Marginal, prior: LightPrior, least: float) -> Hyperparameters:
     """The hyperparameters by the residuals and the light that a descent ended with; part: its system there."""
     light = field.illumination.light
-    cells = 3 * len(light)
-    covariance = positive_definite_inverse(part.light_hessian[:cells, :cells]).matrix
-    factors = prior.likeliest_factors(light.axis, light.log_radiance, covariance)
+    cells = np.flatnonzero(np.tile(~light.suns, 3))
+    covariance = positive_definite_inverse(part.light_hessian[: 3 * len(light), : 3 * len(light)]).matrix
+    covariance = covariance[np.ix_(cells, cells)]
+    factors = prior.likeliest_factors(light.axis[~light.suns], light.log_radiance[:, ~light.suns], covariance)
     return Hyperparameters(temperature(field.illumination.block, field.illumination.residuals(), least), factors)
 
 

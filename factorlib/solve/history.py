@@ -53,6 +53,7 @@ class Solution(msgspec.Struct, frozen=True):
     shadows     whether visibility was used, with its evidence;  interreflection: whether surfaces light each other
     specular    the evidence for each material's specular part, tone: for each light's tone curves; empty where nothing was tried
     splitting   the evidence for each splitting of the lights' cells
+    suns        the evidence for each light's sun
     materials   where lights are cells: the fit of the sure observations, whose materials the answer has;  lights: that of all
     """
 
@@ -65,6 +66,7 @@ class Solution(msgspec.Struct, frozen=True):
     specular: list[Evidence] = []
     tone: list[Evidence] = []
     splitting: list[Evidence] = []
+    suns: list[Evidence] = []
     materials: Fit | None = None
     lights: Fit | None = None
 
@@ -86,7 +88,7 @@ def of_rounds(progress: Progress, rounds: int) -> Report:
 
 def of_parts(progress: Progress, choices: Choices) -> Report:
     """The progress of the joint solve, which never goes back: where there are several starts, a phase is entered several times."""
-    phases = (*PHASES, *(f"splitting {k + 1}" for k in range(choices.splittings)), "lights")
+    phases = (*PHASES, *(f"splitting {k + 1}" for k in range(choices.splittings)), "lights", "suns")
     furthest = 0.0
 
     def report(event: Event) -> None:
