@@ -7,19 +7,21 @@ from typing import Literal
 
 import msgspec
 import numpy as np
+from msgspec import UNSET, UnsetType
 
 from factorlib.diagnose.uncertainty import ABSOLUTE, GAUGE, StandardErrors
 from factorlib.light.lobes import Lobes
 from factorlib.model.blocks import Block
 from factorlib.model.gauge import DETERMINED, RULE, connected_components
 from factorlib.model.lights import Light
-from factorlib.model.materials import Materials
+from factorlib.model.materials import LEAST_REFLECTANCE, Materials
 from factorlib.model.problem import JointProblem
 from factorlib.results import materials as table
 from factorlib.results.materials import Uncertainty
 from factorlib.results.solution import Earlier
 from factorlib.solve.evidence import Evidence
 from factorlib.solve.history import Solution
+from factorlib.solve.material_prior import class_of
 
 LOBES_CHOSEN_BY = {
     "bundle": "cells of the light prior, of which the brightest split while held-out observations gain",
@@ -45,16 +47,26 @@ class Answer(msgspec.Struct, frozen=True):
 
     def material_table(self, errors: StandardErrors) -> table.MaterialTable:
         """The content of materials.json."""
-        rows, stderr = _rows(self.solution.point.materials), self._errors(errors)
+        rows, stderr, kinds = _rows(self.solution.point.materials), self._errors(errors), self._kinds(errors.materials)
         solved = {
-            name: table.solved(table.Reflectance(*row), stderr[name])
-            for name, row in zip(self.names, rows, strict=True)
+            name: table.solved(table.Reflectance(*row), stderr[name], kind)
+            for name, row, kind in zip(self.names, rows, kinds, strict=True)
         }
         components = connected_components(self.problem.blocks, len(self.names))
         component = {self.names[m]: k for k, (members, _) in enumerate(components) for m in members}
         absolute = self.solution.interreflection.kept
         gauge = table.Gauge(RULE + DETERMINED * absolute, component, GAUGE + ABSOLUTE * absolute)
         return table.MaterialTable(solved, gauge, self.model())
+
+    def _kinds(self, errors: Materials) -> list[table.Kind | UnsetType]:
+        """Of each material, where materials were fitted under a prior of classes; in the gauge of that fit."""
+        if self.solution.materials is None:
+            return [UNSET] * len(self.names)
+        materials, relative = self.solution.point.materials, errors.specular.mean(1)
+        relative = relative / np.maximum(materials.specular.mean(1), LEAST_REFLECTANCE)
+        specular = self.solution.materials.point.materials.specular
+        rows = zip(specular, materials.roughness.tolist(), relative.tolist(), errors.roughness.tolist(), strict=True)
+        return [table.Kind(*class_of(*row)) for row in rows]
 
     def uncertainty(self, errors: StandardErrors) -> Uncertainty:
         """The content of uncertainty.json."""

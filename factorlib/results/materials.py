@@ -51,11 +51,19 @@ class StandardErrors(msgspec.Struct, frozen=True):
     roughness: AtLeast0
 
 
+class Kind(msgspec.Struct, frozen=True):
+    """The likeliest class of a material, dielectric, metal or fabric, by its specular part, and the probability of it."""
+
+    name: str
+    probability: Annotated[float, Meta(ge=0, le=1)]
+
+
 class Solved(Reflectance, frozen=True):
-    """A solved material; alpha, α = roughness², stands in the file for other programs."""
+    """A solved material; alpha, α = roughness², stands in the file for other programs; kind: where the solver has classes."""
 
     alpha: AtLeast0
     stderr: StandardErrors
+    kind: Kind | UnsetType = UNSET
 
     @property
     def reflectance(self) -> Reflectance:
@@ -150,9 +158,10 @@ class Uncertainty(msgspec.Struct, frozen=True):
     gauge: str
 
 
-def solved(reflectance: Reflectance, stderr: StandardErrors) -> Solved:
-    """A reflectance with its standard errors and α."""
-    return Solved(reflectance.diffuse, reflectance.specular, reflectance.roughness, reflectance.roughness**2, stderr)
+def solved(reflectance: Reflectance, stderr: StandardErrors, kind: Kind | UnsetType = UNSET) -> Solved:
+    """A reflectance with its standard errors, α and kind."""
+    rows = reflectance.diffuse, reflectance.specular, reflectance.roughness
+    return Solved(*rows, reflectance.roughness**2, stderr, kind)
 
 
 def read_materials(path: str | Path, cure: str = "") -> MaterialTable:

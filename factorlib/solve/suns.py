@@ -26,10 +26,17 @@ from factorlib.model.loss import Loss
 from factorlib.solve.evidence import Evidence, Losses, compare
 from factorlib.solve.fit import ROBUST
 
-DISC, SURROUNDINGS = np.radians(14), np.radians(28)  # about the brightest direction: what a sun replaces, and what is seen in its place
+DISC, SURROUNDINGS = (
+    np.radians(14),
+    np.radians(28),
+)  # about the brightest direction: what a sun replaces, and what is seen in its place
 WIDE = 1 / np.radians(4) ** 2  # λ of a lobe of 8° between its inflections
 BLUR = 1 / np.radians(5) ** 2  # λ: the brightest direction is that of the light so blurred
-GRIDS = ((15.0, 3.0), (4.0, 0.8), (1.0, 0.2))  # degrees: radius and step of the searches, each about the best of the one before
+GRIDS = (
+    (15.0, 3.0),
+    (4.0, 0.8),
+    (1.0, 0.2),
+)  # degrees: radius and step of the searches, each about the best of the one before
 AGAINST_SUN, SHARE = -1.0, 0.05
 
 

@@ -1,0 +1,87 @@
+"""python -m factorlib.material_classes FILE: the classes of the prior on materials, fitted to a table of measured materials.
+
+FILE is a .csv with a row a material: its name in `material`, and the Lambert + GGX that was fitted to it: `k_s` and `roughness`, and `k_s_r`, `k_s_g`
+and `k_s_b`, whose ratios are the tint.
+The class of a row is that whose words its name has: METALS, FIBROUS, or else dielectric.
+"""
+
+from __future__ import annotations
+
+import csv
+import hashlib
+import io
+import re
+from pathlib import Path
+from typing import Annotated
+
+import numpy as np
+import typer
+
+from factorlib.errors import InputError
+from factorlib.jsonfile import json_text, write_json
+from factorlib.reading import read_bytes
+from factorlib.solve.material_prior import Classes, MaterialClass
+
+# Effect paints, satins with metallic threads and iridescent foils have flakes or wires that reflect as metal does.
+METALS = (
+    r"metal(?!$)|steel|ss440|chrom|brass|bronze|aluminium|nickel|gold|silver|tungsten|hematite|flake|chm_|vch_|cc_|color-chang"
+    r"|satin|aurora|pearl|solo_m"
+)
+# Of fibres or powder: rough all through, which GGX imitates by a specular part of roughness .6 to 1.
+FIBROUS = r"(?<!specular-)fabric|felt|cloth|foam|paper_|cardboard_rgb|latex|ceiling|spectralon|colodur_(azure|napoli)|polyethylene"
+LEAST = 1e-3  # of k_s: what a fit calls nil
+RAYLEIGH = np.sqrt(2 * np.log(2))  # the median length of a Gaussian vector of two dimensions, in standard deviations
+COLUMNS = ("material", "k_s_r", "k_s_g", "k_s_b", "k_s", "roughness")
+
+
+def classes_of(path: Path) -> Classes:
+    """Means and covariances of the three classes; InputError where the file has not the columns, or a class no four rows."""
+    content = read_bytes(path, "a table of materials")
+    rows = list(csv.DictReader(io.StringIO(content.decode("utf-8", "replace"))))
+    if not rows or (missing := [name for name in COLUMNS if rows[0].get(name) is None]):
+        raise InputError("it lacks columns", file=path, key=", ".join(missing if rows else COLUMNS), cure="see --help")
+    by_class: dict[str, list[list[float]]] = {"dielectric": [], "metal": [], "fabric": []}
+    for row in rows:
+        name = row["material"].split("/")[-1]
+        kind = "fabric" if re.search(FIBROUS, name) else "metal" if re.search(METALS, name) else "dielectric"
+        by_class[kind].append([float(row[column]) for column in COLUMNS[1:]])
+    if few := [name for name, values in by_class.items() if len(values) < 4]:
+        raise InputError(
+            f"only few rows are of the class {few[0]}", file=path, cure="name the materials by what they are"
+        )
+    classes = tuple(_fitted(name, np.array(values), len(rows)) for name, values in by_class.items())
+    return Classes(classes, made_from=path.name, sha256=hashlib.sha256(content).hexdigest())
+
+
+def _fitted(name: str, values: np.ndarray, total: int) -> MaterialClass:
+    log = np.log(np.maximum(values[:, :3], LEAST))
+    tint = np.median(np.linalg.norm(log - log.mean(1, keepdims=True), axis=1)) / RAYLEIGH
+    x = np.column_stack([np.log(np.maximum(values[:, 3], LEAST)), values[:, 4]])
+    mean, covariance = x.mean(0), np.cov(x.T)
+    return MaterialClass(
+        name,
+        round(len(values) / total, 3),
+        tuple(np.round(mean, 3).tolist()),
+        tuple(map(tuple, np.round(covariance, 4).tolist())),
+        round(float(tint), 3),
+    )
+
+
+def main(
+    file: Annotated[Path, typer.Argument(help="A .csv of measured materials, see above.", metavar="FILE")],
+    out: Annotated[Path | None, typer.Option(help="File to write to; without it the classes are printed.")] = None,
+) -> None:
+    """Fit the classes of materials to a table of measured ones."""
+    try:
+        classes = classes_of(file)
+    except InputError as error:
+        typer.echo(f"error: {error}", err=True)
+        raise typer.Exit(2) from None
+    if out is None:
+        typer.echo(json_text(classes))
+    else:
+        write_json(out, classes)
+
+
+if __name__ == "__main__":
+    typer.run(main)
