@@ -55,7 +55,7 @@ class Kind(msgspec.Struct, frozen=True):
     """The likeliest class of a material, dielectric, metal or fabric, by its specular part, and the probability of it."""
 
     name: str
-    probability: Annotated[float, Meta(ge=0, le=1)]
+    probability: Annotated[float, msgspec.Meta(ge=0, le=1)]
 
 
 class Solved(Reflectance, frozen=True):
