@@ -8,14 +8,15 @@ and losses.json: what is lost on the way to other programs.
 import logging
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import msgspec
 import numpy as np
 import OpenImageIO as oiio
 
-from factorlib.conventions import lat_long_directions
+from factorlib.conventions import YUP_FROM_CAMERA, lat_long_directions
 from factorlib.dataset.schema import LightSlice, ObjectsSlice
+from factorlib.errors import InputError
 from factorlib.export.blender import write_scene_json, write_script
 from factorlib.export.environment import mitsuba_map
 from factorlib.export.gltf import write_glb
@@ -24,7 +25,7 @@ from factorlib.export.materials import headroom_factor, table_in_gauge
 from factorlib.export.materialx import materialx
 from factorlib.export.mesh_files import MeshFiles
 from factorlib.export.mitsuba import write_scene
-from factorlib.export.scene import ALL_BOUNCES, DIRECT, ExposedMap, Scene
+from factorlib.export.scene import ALL_BOUNCES, DIRECT, ExposedMap, Scene, Sun, suns_of
 from factorlib.export.usd import SUFFIX, write_usd_scene
 from factorlib.images.exr import LAT_LONG, read_rgb_exr, write_rgb_exr
 from factorlib.images.write import write_hdr
@@ -39,6 +40,7 @@ from factorlib.stage import Inputs, Progress
 from factorlib.wholefile import write_text
 
 log = logging.getLogger("factorlib.export")
+SKY = "_sky"  # ends the name of a map without its suns
 Rows = Annotated[int, msgspec.Meta(ge=8, le=4096)]
 
 
@@ -73,6 +75,12 @@ def main(params: Params, inputs: Inputs, out: Path, progress: Progress) -> None:
     progress(1, 4, "lights")
     for folder in ("illumination", "coverage", "scenes/light", "scenes/meshes"):
         (out / folder).mkdir(parents=True)
+    suns = {name: [_sun(one) for one in suns_of(light, YUP_FROM_CAMERA)] for name, light in lobes.items()}
+    if clash := [name for name in lobes if name.endswith(SKY) and suns.get(name.removesuffix(SKY))]:
+        raise InputError(
+            f"'{clash[0]}' is the name of another illumination's sky", key="illumination", cure="call it otherwise"
+        )
+    write_json(out / "lights.json", suns)
     for name, light in lobes.items():
         _write_light(out, name, light, solved / "coverage" / f"{name}.exr", params)
     progress(2, 4, "meshes")
@@ -89,17 +97,23 @@ def main(params: Params, inputs: Inputs, out: Path, progress: Progress) -> None:
             np.array(exposures.get(photo, [1.0] * 3)),
         )
         camera_from_light = np.eye(3) if light.world_from_camera is None else np.array(light.world_from_camera).T
+        own_lobes = lobes[light.illumination]
+        suns = suns_of(own_lobes.scaled(exposure), YUP_FROM_CAMERA @ camera_from_light)
         exposed = ExposedMap(f"../illumination/{light.illumination}.exr", exposure, camera_from_light)
+        sky = (
+            msgspec.structs.replace(exposed, file=f"../illumination/{light.illumination}{SKY}.exr") if suns else exposed
+        )
         meshes = objects[photo].meshes
         shapes = [s for own in objects[photo].objects for s in files.shapes(own, meshes, poses[photo].objects)]
         scene = Scene(camera, shapes, materials, exposed, ALL_BOUNCES if table.model.interreflection else DIRECT)
-        write_scene_json(out / "scenes" / f"{photo}.json", scene)
         write_usd_scene(out / "scenes" / f"{photo}{SUFFIX}", scene)
+        scene = msgspec.structs.replace(scene, light=sky, suns=suns)
+        write_scene_json(out / "scenes" / f"{photo}.json", scene)
         if np.ptp(exposure) == 0:
             own = msgspec.structs.replace(exposed, file=f"light/{light.illumination}.exr")
         else:  # Mitsuba's scale is grey: a map of the photo's own; a dot is in no illumination's name
             own = ExposedMap(f"light/{photo}.exposed.exr", np.ones(3), camera_from_light)
-            _write_mitsuba_map(out / "scenes" / own.file, lobes[light.illumination].scaled(exposure), params)
+            _write_mitsuba_map(out / "scenes" / own.file, own_lobes.take(~own_lobes.suns).scaled(exposure), params)
         write_scene(out / "scenes" / f"{photo}.xml", msgspec.structs.replace(scene, light=own))
     progress(4, 4)
 
@@ -120,10 +134,20 @@ def _write_light(out: Path, name: str, light: Lobes, coverage: Path, params: Par
     lat_long = lat_long_of_lobes(light, params.height, 2 * params.height)
     write_rgb_exr(out / "illumination" / f"{name}.exr", lat_long, LAT_LONG)
     write_hdr(out / "illumination" / f"{name}.hdr", lat_long)
-    _write_mitsuba_map(out / "scenes" / "light" / f"{name}.exr", light, params)
+    sky = light.take(~light.suns)
+    if light.suns.any():
+        write_rgb_exr(out / "illumination" / f"{name}{SKY}.exr", lat_long_of_lobes(sky, *lat_long.shape[:2]), LAT_LONG)
+    _write_mitsuba_map(out / "scenes" / "light" / f"{name}.exr", sky, params)
     if coverage.exists():
         directions = lat_long_directions(params.height, 2 * params.height)
         write_rgb_exr(out / "coverage" / f"{name}.exr", sampled(read_rgb_exr(coverage), directions), LAT_LONG)
+
+
+def _sun(sun: Sun) -> dict[str, Any]:
+    return {
+        **{name: getattr(sun, name).tolist() for name in ("direction", "irradiance")},
+        "angular_diameter_deg": sun.angular_diameter_deg,
+    }
 
 
 def _write_mitsuba_map(path: Path, light: Lobes, params: Params) -> None:

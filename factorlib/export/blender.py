@@ -7,6 +7,7 @@ be written and would not be the same bytes twice.  The JSON is a `factorlib.expo
     shapes     name, file (relative), material, cam_from_object: 4 × 4, rows, mesh units, OpenCV's camera axes
     materials  diffuse k_d, specular k_s (linear Rec. 709), roughness
     light      file (relative): lat-long map of texel means, exposure: factor per channel, camera_from_light: 3 × 3
+    suns       beside the map: direction (toward it, y-up turn of the camera frame), irradiance (RGB), angular_diameter_deg
     max_depth  2 direct light alone, −1 all bounces
 """
 
@@ -16,7 +17,7 @@ from typing import Any
 
 import numpy as np
 
-from factorlib.export.scene import ExposedMap, Scene, Shape
+from factorlib.export.scene import ExposedMap, Scene, Shape, Sun
 from factorlib.jsonfile import write_json
 from factorlib.wholefile import write_text
 
@@ -35,10 +36,11 @@ def write_scene_json(path: str | Path, scene: Scene) -> None:
         "shapes": [_plain(shape, "name", "file", "material", "cam_from_object") for shape in scene.shapes],
         "materials": {shape.material: scene.materials[shape.material] for shape in scene.shapes},
         "light": _plain(scene.light, "file", "exposure", "camera_from_light"),
+        "suns": [_plain(sun, "direction", "irradiance", "angular_diameter_deg") for sun in scene.suns],
         "max_depth": scene.max_depth,
     })  # fmt: skip
 
 
-def _plain(of: Shape | ExposedMap, *names: str) -> dict[str, Any]:
+def _plain(of: Shape | ExposedMap | Sun, *names: str) -> dict[str, Any]:
     values = {name: getattr(of, name) for name in names}
     return {name: value.tolist() if isinstance(value, np.ndarray) else value for name, value in values.items()}

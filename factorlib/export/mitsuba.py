@@ -2,7 +2,7 @@
 
 Camera     Mitsuba's principal point offset counts against the axes of the picture: (W/2 − c_x)/W, (H/2 − c_y)/H.
 Material   `factorlib.tracing.scene.bsdf`, in whose words all of the scene is said before it is written as XML.
-Light      As it was solved for: seen directly, without bounces between objects (`max_depth` 2), or with all of them (−1).
+Light      A map, and beside it a directional emitter for each sun.  As it was solved for: seen directly, without bounces between objects (`max_depth` 2), or with all of them (−1).
            `mitsuba -D max_depth=-1 scene.xml` traces them in any case; `-D spp=…` sets the samples per pixel.
 """
 
@@ -31,6 +31,9 @@ def write_scene(path: str | Path, scene: Scene) -> None:
     _add(root, "sensor", _sensor(scene))
     light = {"type": "envmap", "filename": scene.light.file, "scale": float(scene.light.exposure[0])}
     _add(root, "emitter", {**light, "to_world": _matrix(scene.light.world_from_light)})
+    for sun in scene.suns:
+        shines = {"type": "directional", "direction": -sun.direction}
+        _add(root, "emitter", {**shines, "irradiance": {"type": "rgb", "value": sun.irradiance}})
     for name, two_sided in sorted({(shape.material, shape.two_sided) for shape in scene.shapes}):
         surface = bsdf(scene.materials[name])
         surface = {"type": "twosided", "bsdf": surface} if two_sided else surface
@@ -83,6 +86,8 @@ def _add(parent: ET.Element, kind: str, entry: dict[str, Any], **attributes: str
             ET.SubElement(ET.SubElement(element, "transform", name=name), *value)
         elif isinstance(value, dict) and value["type"] == "rgb":
             ET.SubElement(element, "rgb", name=name, value=_numbers(value["value"]))
+        elif isinstance(value, np.ndarray):
+            ET.SubElement(element, "vector", name=name, value=_numbers(value))
         elif isinstance(value, dict):
             _add(element, name.partition("_")[0], value)
         elif name != "type":

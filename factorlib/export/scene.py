@@ -12,6 +12,7 @@ from jaxtyping import Float
 
 from factorlib.conventions import YUP_FROM_CAMERA
 from factorlib.geometry.camera import Camera
+from factorlib.light.lobes import SUN_DEG, Lobes, lobe_integral
 from factorlib.results.materials import Reflectance
 
 DIRECT, ALL_BOUNCES = 2, -1
@@ -45,14 +46,33 @@ class ExposedMap(msgspec.Struct, frozen=True):
         return _turn(YUP_FROM_CAMERA @ self.camera_from_light @ YUP_FROM_CAMERA)
 
 
+class Sun(msgspec.Struct, frozen=True):
+    """Light from one direction, which the map of a scene does not hold.
+
+    direction: toward it, unit, in the y-up turn of the camera frame;  irradiance: of a surface that faces it, radiance × steradian
+    """
+
+    direction: Float[np.ndarray, "3"]
+    irradiance: Float[np.ndarray, "3"]
+    angular_diameter_deg: float = SUN_DEG
+
+
+def suns_of(lobes: Lobes, rotation: Float[np.ndarray, "3 3"]) -> list[Sun]:
+    """The suns of a light, turned by a rotation from the lobes' frame."""
+    suns = lobes.take(lobes.suns)
+    energies = suns.weight * lobe_integral(suns.sharpness)[:, None]
+    return [Sun(axis, energy) for axis, energy in zip(suns.axis @ rotation.T, energies, strict=True)]
+
+
 class Scene(msgspec.Struct, frozen=True):
-    """materials: by name, at least those that shapes name;  max_depth: DIRECT or ALL_BOUNCES, as the light was solved for"""
+    """materials: by name, at least those that shapes name;  max_depth: DIRECT or ALL_BOUNCES, as the light was solved for;  suns: beside the map"""
 
     camera: Camera
     shapes: Sequence[Shape]
     materials: Mapping[str, Reflectance]
     light: ExposedMap
     max_depth: int = DIRECT
+    suns: Sequence[Sun] = ()
 
     @property
     def clip_distances(self) -> tuple[float, float]:

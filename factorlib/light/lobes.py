@@ -8,9 +8,11 @@ from __future__ import annotations
 
 import msgspec
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 
 SMALL_SHARPNESS = 1e-3
+SUN_DEG = 0.53  # diameter of the sun's disc
+SUN = 4 / np.radians(SUN_DEG / 2) ** 2  # λ of the lobe that is as wide (RMS) as the disc
 
 
 class Lobes(msgspec.Struct, frozen=True):
@@ -39,6 +41,15 @@ class Lobes(msgspec.Struct, frozen=True):
     def radiance(self, directions: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
         """Sum of the lobes in unit `directions`."""
         return np.exp(-0.5 * self.sharpness * squared_distances(directions, self.axis)) @ self.weight
+
+    @property
+    def suns(self) -> Bool[np.ndarray, " p"]:
+        """Which lobes are as narrow as the sun."""
+        return self.sharpness > 0.9 * SUN
+
+    def take(self, which: Bool[np.ndarray, " p"]) -> Lobes:
+        """Return the light of some of its lobes."""
+        return Lobes(self.axis[which], self.sharpness[which], self.weight[which])
 
     @property
     def energy(self) -> Float[np.ndarray, "3"]:

@@ -19,11 +19,10 @@ from jaxtyping import Bool, Float, Int
 
 from factorlib.geometry.sphere import fibonacci_sphere
 from factorlib.images import tone
-from factorlib.light.lobes import lobe_integral
+from factorlib.light.lobes import SUN, lobe_integral
 
 WIDTH = 0.5  # of a cell, in spacings: equal weights are a constant light to 2 % (RMS); wider ones blur a sun more than materials do
 PEAK = 1 / (2 * np.pi * WIDTH**2)
-SUN = 4 / np.radians(0.53 / 2) ** 2  # λ of the lobe that is as wide (RMS) as the sun's disc
 SCALINGS = 5  # iterations for peaks: five make split cells constant to 3 % (RMS), more of them reach 2.7 % at best
 DARKEST = 1e-12  # weight below which a lobe counts as dark, for its logarithm
 TONE = (0.6, 1.7)  # range of the exponents of tone curves

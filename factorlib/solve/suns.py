@@ -7,8 +7,8 @@ surrounds them, and one lobe is added, as narrow as the sun or as WIDE as a wind
 
     Σ_i t_i² (r_i + A_i(z) w)²        channel by channel;  t² the trust of the robust loss,  A the whitened response                (1)
 
-which is linear in w and searched over a grid of z, coarse and then fine.  The narrow lobe is kept unless its loss is higher by more than
-`AGAINST_SUN` standard errors, and where it sends at least `SHARE` of the light.  Cells are fitted once more around it.
+which is linear in w and searched over a grid of z, coarse and then fine.  The narrow lobe is kept where it explains the observations
+no worse (by more than `FOR_SUN` standard errors), and sends at least `SHARE` of the light.  Cells are fitted once more around it.
 """
 
 from __future__ import annotations
@@ -20,8 +20,9 @@ import numpy as np
 from jaxtyping import Float
 
 from factorlib.geometry.sphere import fibonacci_sphere
+from factorlib.light.lobes import SUN
 from factorlib.model.illumination import Illumination
-from factorlib.model.lights import SUN, Light, UnitLobes
+from factorlib.model.lights import Light, UnitLobes
 from factorlib.model.loss import Loss
 from factorlib.solve.evidence import Evidence, Losses, compare
 from factorlib.solve.fit import ROBUST
@@ -37,7 +38,7 @@ GRIDS = (
     (4.0, 0.8),
     (1.0, 0.2),
 )  # degrees: radius and step of the searches, each about the best of the one before
-AGAINST_SUN, SHARE = -1.0, 0.05
+FOR_SUN, SHARE = 0.0, 0.05
 
 
 class Candidate(NamedTuple):
@@ -61,7 +62,7 @@ def with_sun(illumination: Illumination) -> tuple[Light, Evidence]:
     trust = np.sqrt(ROBUST.trust(illumination.residuals()) * ~(block.clipped & (illumination.residuals() >= 0)))
     narrow, wide = (_candidate(without, z, sharpness, trust) for sharpness in (SUN, WIDE))
     number = block.clusters()
-    evidence = compare(Losses([wide.losses], [number]), Losses([narrow.losses], [number]), AGAINST_SUN)
+    evidence = compare(Losses([wide.losses], [number]), Losses([narrow.losses], [number]), FOR_SUN)
     share = narrow.light.energy[-1].sum() / narrow.light.energy.sum()
     kept = evidence.kept and bool(share >= SHARE)
     return narrow.light if kept else light, msgspec.structs.replace(evidence, kept=kept)
