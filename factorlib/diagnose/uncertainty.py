@@ -18,7 +18,7 @@ Materials   With all lights eliminated, S is the materials' information and s_k 
 
 Of a joint solve (`Posterior`), S is that of φ's system (`factorlib.solve.marginal`), by reflectances, for by their logarithms a nil reflectance
 would look exactly known.  The prior on materials is left out.  More observations do not remove errors of the model itself, mostly of the
-mesh: MODEL_ERROR is added in quadrature, in proportion to the residuals up to those of the noise model.  Given the materials, log radiance
+mesh: MODEL_ERROR is added in quadrature, in proportion to the residuals.  Given the materials, log radiance
 of a light has covariance Σ = H⁻¹.  A map's radiance in direction d is Σ_p φ_p(d) w_p with w_p = peak_p exp(u_p), so its variance is gᵀ Σ g with
 g_p = φ_p(d) w_p.  Where no observation tells anything, Σ is the prior's covariance.
 
@@ -117,7 +117,7 @@ class Posterior:
             scores.append(np.zeros((len(system.scores), len(widths))))
             scores[-1][:, places] = (system.scores[:, :k] - system.scores[:, k:] @ taken_up) * by_log[places]
         deviation = residual_deviation(self.problem, self.fit.point)
-        model_error = (min(1.0, deviation) * MODEL_ERROR * values).reshape(-1)
+        model_error = (deviation * MODEL_ERROR * values).reshape(-1)
         variance = largest_variance(information, scores, 1.0, materials, self.problem.blocks) + model_error**2
         return _errors(variance, deviation)
 
