@@ -105,7 +105,7 @@ def _of_answer(name: str, found: Float[np.ndarray, "7"], error: Float[np.ndarray
         )
     if not (error[6] <= ROUGHNESS_ERROR and (found[3:6] > 2 * error[3:6]).any()):
         yield (
-            f"the roughness of material '{name}' is not known (±{error[6]:.2g}): no highlight stands out, or shape and photos "
+            f"the roughness of material '{name}' cannot be determined (±{error[6]:.2g}): no highlight stands out, or shape and photos "
             "disagree too much. A photo in light with a small bright source, or a better mesh, would help"
         )
     elif found[6] <= ROUGHNESS[0] + 1e-9:

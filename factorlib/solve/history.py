@@ -37,7 +37,7 @@ PHASES = (
     "shadows and bounces",
     "tone curves",
     "materials and lights",
-)  # then splittings, and lights
+)  # then splittings, and lights, which also stands for the suns that few lights have
 POINTS = 30  # of a phase: about as many as are tried
 
 
@@ -88,14 +88,15 @@ def of_rounds(progress: Progress, rounds: int) -> Report:
 
 def of_parts(progress: Progress, choices: Choices) -> Report:
     """The progress of the joint solve, which never goes back: where there are several starts, a phase is entered several times."""
-    phases = (*PHASES, *(f"splitting {k + 1}" for k in range(choices.splittings)), "lights", "suns")
+    phases = (*PHASES, *(f"splitting {k + 1}" for k in range(choices.splittings)), "lights")
     furthest = 0.0
 
     def report(event: Event) -> None:
         """Say how many of all phases are done."""
         nonlocal furthest
         within = 1.0 if event.iteration < 0 else min(event.iteration / POINTS, 1.0)
-        furthest = min(max(furthest, phases.index(event.phase) + within), len(phases) - 0.01)
+        phase = "lights" if event.phase == "suns" else event.phase
+        furthest = min(max(furthest, phases.index(phase) + within), len(phases) - 0.01)
         progress(furthest, len(phases), f"{event.phase} {event.iteration}: loss {event.loss:.3g}")
 
     return report

@@ -44,7 +44,7 @@ from factorlib.reading import reading
 
 SHIPPED = Path(__file__).with_name("material_classes.json")
 DIFFUSE, ROUGH = 3.0, 1.0  # standard deviations of log k_d and of roughness about the start
-SCALE, ROUGHNESS_SLACK, WHITE = 0.5, 0.1, 0.1  # standard deviations added in squares to those of l̄, roughness, l − l̄
+SCALE, ROUGHNESS_SLACK, WHITE = 0.5, 0.2, 0.1  # standard deviations added in squares to those of l̄, roughness, l − l̄
 BRIGHTEST, BRIGHTNESS = 0.69, 0.16  # of (2)
 MEAN, TINTS = np.full((3, 3), 1 / 3), np.eye(3) - 1 / 3  # projections of l on its mean and on what differs from it
 
@@ -75,13 +75,13 @@ def shipped_classes() -> Classes:
 
 
 class Mixture:
-    """Equation (1).  wider: variances of l̄ and of roughness that are added, for a material that is not known better."""
+    """Equation (1).  relative, rough: standard deviations that are added to those of l and of roughness."""
 
-    def __init__(self, classes: Sequence[MaterialClass], wider: tuple[float, float] = (0.0, 0.0)):
+    def __init__(self, classes: Sequence[MaterialClass], relative: float = 0.0, rough: float = ROUGHNESS_SLACK):
         self.names = [one.name for one in classes]
-        slack = np.diag([SCALE**2 + wider[0], ROUGHNESS_SLACK**2 + wider[1]])
+        slack = np.diag([SCALE**2 + relative**2, rough**2])
         covariances = [np.array(one.covariance) + slack for one in classes]
-        tints = np.array([one.tint**2 + WHITE**2 for one in classes])
+        tints = np.array([one.tint**2 + WHITE**2 + relative**2 for one in classes])
         self.mean = np.array([[one.mean[0]] * 3 + [one.mean[1]] for one in classes])
         self.precision = np.zeros((len(classes), 4, 4))
         for P, covariance, variance in zip(self.precision, covariances, tints, strict=True):
@@ -151,7 +151,7 @@ class MaterialPrior:
 
 def class_of(specular: Float[np.ndarray, "3"], roughness: float, relative: float, rough: float) -> tuple[str, float]:
     """The likeliest class of a material and its probability.  relative, rough: standard errors of log k_s and of roughness."""
-    mixture = Mixture(shipped_classes().classes, (relative**2, rough**2))
+    mixture = Mixture(shipped_classes().classes, relative, rough)
     x = np.append(np.log(np.maximum(specular, LEAST_REFLECTANCE)), roughness)
     probability = mixture.at(x)[3]
     best = int(probability.argmax())

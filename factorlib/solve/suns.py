@@ -57,6 +57,8 @@ def with_sun(illumination: Illumination) -> tuple[Light, Evidence]:
     z = light.axis[int(np.argmax(overlap @ light.energy.sum(1)))]
     away = np.arccos(np.clip(light.axis @ z, -1, 1))
     u, ring = light.log_radiance, (away >= DISC) & (away < SURROUNDINGS)
+    if not ring.any():  # cells are larger than that
+        return light, Evidence(False)
     u[:, away < DISC] = np.median(u[:, ring], axis=1)[:, None]
     without = msgspec.structs.replace(illumination, light=light.with_log_radiance(u))
     trust = np.sqrt(ROBUST.trust(illumination.residuals()) * ~(block.clipped & (illumination.residuals() >= 0)))

@@ -52,6 +52,8 @@ def test_files_are_all_there_and_the_same_bytes_again(inputs, tmp_path):
     first, second = (files_of(run(inputs, tmp_path / name)) for name in ("one", "two"))
     expected = {
         "exposures.json",
+        "lights.json",
+        "illumination/room_sky.exr",
         "lobes.parquet",
         "losses.json",
         "ball.glb",

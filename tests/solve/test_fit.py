@@ -11,7 +11,7 @@ from factorlib.model.noise import Noise
 from factorlib.model.problem import JointProblem
 from factorlib.solve.fit import DARK, Fit, Hyperparameters, Schedule, fitted, start_of, sure_ones, temperature
 from factorlib.solve.marginal import marginal, positive_definite_inverse
-from factorlib.solve.material_prior import BRIGHTEST, BRIGHTNESS, DIFFUSE, LEVEL, TINT, MaterialPrior, unknowns_of
+from factorlib.solve.material_prior import BRIGHTEST, BRIGHTNESS
 from studies.scenes.problems import MATERIALS, factor_between
 from tests.solve.made import (
     FEW,
@@ -182,40 +182,6 @@ def test_what_is_alike_unsure_is_used():
     rated = msgspec.structs.replace(one, confidence=np.where(one.material == 1, 0.1, 0.9))
     for given in (rated, one):
         assert len(sure_ones(JointProblem([given], OPERATOR)).blocks[0]) == len(one)
-
-
-# ── the prior on materials ───────────────────────────────────────────────────────────────────────────────────────────
-
-
-def test_the_brightest_material_holds_the_gauge():
-    problem, _ = photographed(6, 1, cells=50, size=10)
-    lambertian = Materials(MATERIALS.diffuse, np.zeros((3, 3)), MATERIALS.roughness)
-    matt, theta = MaterialPrior(lambertian, problem.blocks), unknowns_of(lambertian)
-    brightest, level = int(MATERIALS.diffuse.sum(1).argmax()), float(MATERIALS.diffuse.sum(1).max() / 3)
-    for factor in (1.0, 2.0):
-        shifted = theta.copy()
-        shifted[brightest, :3] += np.log(factor)
-        expected = (np.log(factor * level / BRIGHTEST) / BRIGHTNESS) ** 2 + 3 * (np.log(factor) / DIFFUSE) ** 2
-        assert matt.at(shifted).value == pytest.approx(expected, rel=1e-3)
-    prior, theta, rng = MaterialPrior(MATERIALS, problem.blocks), unknowns_of(MATERIALS), np.random.default_rng(0)
-    at, change = theta + 0.01 * rng.normal(size=theta.shape), rng.normal(size=theta.shape) * 1e-4
-    difference = (prior.at(at + change).value - prior.at(at - change).value) / 4
-    assert prior.at(at).gradient @ change.reshape(-1) == pytest.approx(difference, rel=1e-2)
-    assert np.linalg.eigvalsh(prior.at(at).hessian).min() > 0
-
-
-def test_a_grey_specular_part_of_a_few_hundredths_is_expected():
-    """A dielectric costs nothing, twice its reflectance little, gold less than a few hundred observations say; a Lambertian material nothing."""
-
-    def costs(specular):
-        diffuse = max(BRIGHTEST - float(np.mean(specular)), 0.01)  # so that it is as bright as is expected
-        materials = Materials(np.full((1, 3), diffuse), np.array([specular]), np.array([0.3]))
-        return MaterialPrior(materials, []).at(unknowns_of(materials)).value
-
-    assert costs([0.05] * 3) == pytest.approx(0, abs=1e-12) and costs([0.0] * 3) == pytest.approx(0, abs=1e-3)
-    assert costs([0.1] * 3) == pytest.approx((np.log(2) / LEVEL) ** 2)
-    assert costs([0.05 * np.exp(0.1), 0.05, 0.05 * np.exp(-0.1)]) == pytest.approx(2 * (0.1 / TINT) ** 2)
-    assert 30 < costs([1, 0.8, 0.3]) < 60
 
 
 # ── lights unlike most: a fit says what the photographs say, not what is usual ───────────────────────────────────────

@@ -20,7 +20,7 @@ from studies.scenes.problems import MATERIALS, block, random_light
 from tests.solve.made import OPERATOR, PRIOR
 
 CHOICES = Choices(cells=24, splittings=1, observations=100)
-PARTS = ("effects", "tone", "materials", "splitting", "lights")
+PARTS = ("effects", "tone", "materials", "splitting", "lights", "suns")
 ALL = (*PHASES, "splitting 1", "lights")
 
 
@@ -121,7 +121,7 @@ def test_what_was_done_is_not_done_again_but_a_file_that_cannot_be_read_starts_t
     """Killed after the last part, nothing of a descent is computed again."""
     path, work = tmp_path / "solve.pt", []
     with pytest.raises(Killed):
-        answer(blocks, Journal(Fragile(path, "lights")))
+        answer(blocks, Journal(Fragile(path, "suns")))
 
     def counted(function, items):
         work.append(len(items))

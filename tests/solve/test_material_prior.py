@@ -1,0 +1,126 @@
+"""The prior on materials: what classes it knows, what they cost, and the command that fits them."""
+
+import csv
+
+import numpy as np
+import pytest
+import typer
+from typer.testing import CliRunner
+
+from factorlib import material_classes
+from factorlib.model.materials import Materials
+from factorlib.solve.material_prior import (
+    BRIGHTEST,
+    BRIGHTNESS,
+    DIFFUSE,
+    MaterialPrior,
+    Mixture,
+    class_of,
+    shipped_classes,
+    unknowns_of,
+)
+from studies.scenes.problems import MATERIALS
+from tests.solve.made import photographed
+
+PLASTIC, GOLD, FELT = ([0.03] * 3, 0.2), ([0.3, 0.21, 0.09], 0.2), ([0.22] * 3, 0.9)
+
+
+def test_the_brightest_material_holds_the_gauge():
+    problem, _ = photographed(6, 1, cells=50, size=10)
+    lambertian = Materials(MATERIALS.diffuse, np.zeros((3, 3)), MATERIALS.roughness)
+    matt, theta = MaterialPrior(lambertian, problem.blocks), unknowns_of(lambertian)
+    brightest, level = int(MATERIALS.diffuse.sum(1).argmax()), float(MATERIALS.diffuse.sum(1).max() / 3)
+    for factor in (1.0, 2.0):
+        shifted = theta.copy()
+        shifted[brightest, :3] += np.log(factor)
+        expected = (np.log(factor * level / BRIGHTEST) / BRIGHTNESS) ** 2 + 3 * (np.log(factor) / DIFFUSE) ** 2
+        assert matt.at(shifted).value == pytest.approx(expected, rel=1e-3)
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_the_gradient_is_the_finite_difference_of_the_value(seed):
+    problem, rng = photographed(6, 1, cells=50, size=10)[0], np.random.default_rng(seed)
+    prior, theta = MaterialPrior(MATERIALS, problem.blocks), unknowns_of(MATERIALS)
+    at = theta + np.array([0.3] * 6 + [0.1]) * rng.normal(size=theta.shape)
+    change = rng.normal(size=theta.shape) * 1e-4
+    difference = (prior.at(at + change).value - prior.at(at - change).value) / 4
+    assert prior.at(at).gradient @ change.reshape(-1) == pytest.approx(difference, rel=1e-4)
+    assert np.linalg.eigvalsh(prior.at(at).hessian).min() > 0
+
+
+def test_the_density_is_one_altogether():
+    """Over the level of k_s, its tint and the roughness: the sum on a grid."""
+    level, roughness, tint = np.arange(-9, 4, 0.8), np.arange(-2.5, 4, 0.3), np.arange(-1.6, 1.61, 0.2)
+    mixture, across = Mixture(shipped_classes().classes), np.array([[1, -1, 0], [1, 1, -2]]) / np.sqrt([[2], [6]])
+    grid = np.array(np.meshgrid(level, tint, tint, roughness)).reshape(4, -1).T
+    points = np.column_stack([grid[:, :1] + grid[:, 1:3] @ across, grid[:, 3]])
+    total = sum(np.exp(-mixture.at(point)[0] / 2) for point in points)
+    assert total * 0.8 * 0.3 * 0.2**2 / (2 * np.pi) ** 2 == pytest.approx(1, rel=0.02)
+
+
+@pytest.mark.parametrize("material, name", [(PLASTIC, "dielectric"), (GOLD, "metal"), (FELT, "fabric")])
+def test_materials_are_of_the_class_that_they_look_like(material, name):
+    found, probability = class_of(np.array(material[0]), material[1], 0.05, 0.02)
+    assert found == name and probability > 0.8
+
+
+def test_what_is_not_known_is_of_no_class_for_sure():
+    """With wide errors the classes' shares are left."""
+    shares = {one.name: one.share for one in shipped_classes().classes}
+    name, probability = class_of(np.array([0.06] * 3), 0.5, 50.0, 50.0)
+    assert name == "dielectric" and probability == pytest.approx(shares[name], abs=0.1)
+
+
+def test_gloss_ten_times_too_strong_at_roughness_1_is_not_expected():
+    """It is possible, for fabrics look so, but evidence has to pay for it; and a smooth surface with a strong highlight is metal or nothing."""
+
+    def cost(specular, roughness):
+        materials = Materials(np.full((1, 3), 0.3), np.array([specular]), np.array([roughness]))
+        return MaterialPrior(materials, []).at(unknowns_of(materials)).value
+
+    assert cost([0.3] * 3, 1.0) > cost(*PLASTIC) + 6
+    assert cost([0.03] * 3, 1.0) > cost(*PLASTIC) + 6
+    assert cost(*PLASTIC) + 3 < cost([0.3] * 3, 0.2) < cost([0.3] * 3, 1.0)
+
+
+# ── the command ──────────────────────────────────────────────────────────────────────────────────────────────────────
+
+
+@pytest.fixture
+def table(tmp_path):
+    """Five plastics, five steels, five felts."""
+    rng, file = np.random.default_rng(0), tmp_path / "measured.csv"
+    with file.open("w", newline="") as written:
+        rows = csv.writer(written)
+        rows.writerow(material_classes.COLUMNS)
+        for name, level, roughness in (("plastic", 0.03, 0.3), ("steel", 0.1, 0.2), ("felt", 0.2, 0.8)):
+            for k in range(5):
+                factor = np.exp(0.1 * rng.normal())
+                rows.writerow([f"{name}-{k}", *[level * factor] * 4, roughness + 0.01 * k])
+    return file
+
+
+def run(*words):
+    app = typer.Typer()
+    app.command()(material_classes.main)
+    return CliRunner().invoke(app, list(map(str, words)))
+
+
+def test_classes_are_fitted_to_a_table(table):
+    classes = material_classes.classes_of(table)
+    assert [(one.name, one.share) for one in classes.classes] == [(n, 0.333) for n in ("dielectric", "metal", "fabric")]
+    for one, level, roughness in zip(classes.classes, (0.03, 0.1, 0.2), (0.32, 0.22, 0.82), strict=True):
+        assert one.mean == pytest.approx((np.log(level), roughness), abs=0.15)
+        assert one.tint == 0
+    done = run(table, "--out", table.with_suffix(".json"))
+    assert done.exit_code == 0 and classes.sha256 in table.with_suffix(".json").read_text()
+
+
+def test_a_table_that_will_not_do_is_refused(table, tmp_path):
+    table.write_text(table.read_text().replace("felt", "plastic"))
+    done = run(table)
+    assert done.exit_code == 2 and "class fabric" in done.output and "measured.csv" in done.output
+    table.write_text(table.read_text().replace("roughness", "smoothness"))
+    assert "roughness" in run(table).output
+    (tmp_path / "empty.csv").write_text("")
+    assert run(tmp_path / "empty.csv").exit_code == 2

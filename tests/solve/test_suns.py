@@ -1,0 +1,65 @@
+"""Suns: found where they shine, not found where none does, and apart from the prior on cells."""
+
+import msgspec
+import numpy as np
+import pytest
+
+from factorlib.light.lobes import SUN, lobe_integral
+from factorlib.model.problem import JointProblem
+from factorlib.solve.fit import Hyperparameters, Schedule, field_of, fitted
+from factorlib.solve.solve import brightest
+from factorlib.solve.suns import with_sun
+from studies.scenes.problems import MATERIALS
+from tests.solve.made import FEW, PRIOR, begun, drawn, on_even_cells, spheres
+
+TOWARDS = np.array([0.36, -0.48, -0.8])
+LIGHTS, AROUND = (Schedule(together=together, least=0.1, given=True) for together in ((0, 8, 6), (0, 8)))
+
+
+def photographed(irradiance: float, seed: int):
+    """A problem of spheres under a sky drawn from the prior and a sun, and the true irradiance by the sun in the blocks' unit."""
+    sky = on_even_cells(drawn(seed, FEW))
+    energy = irradiance * sky.energy.sum(0) * 2 * np.pi / lobe_integral(np.array([SUN]))
+    light = sky.with_lobe(TOWARDS, SUN, energy) if irradiance else sky
+    problem = spheres([light], size=24, seed=seed)
+    return problem, energy * lobe_integral(np.array([SUN])) / problem.blocks[0].unit
+
+
+def solved(problem: JointProblem):
+    """The illumination that a solve without suns ends with, materials as they are."""
+    fit = fitted(problem, begun(problem, 2 * FEW, MATERIALS), PRIOR, LIGHTS)
+    (one,) = problem.illuminations(fit.point)
+    return one, fit
+
+
+@pytest.mark.parametrize("seed", [1, 2, 3])
+def test_a_sun_is_found_with_its_direction_and_its_irradiance(seed):
+    problem, irradiance = photographed(0.5, seed)
+    one, fit = solved(problem)
+    light, evidence = with_sun(one)
+    assert evidence.kept and light.suns.sum() == 1
+    assert np.degrees(np.arccos(light.axis[light.suns][0] @ TOWARDS)) < 3
+    around = fitted(problem, fit.with_lights([light]), PRIOR, AROUND)
+    (light,) = around.point.lights
+    np.testing.assert_allclose(2 * np.pi * light.energy[light.suns][0], irradiance, rtol=0.3)
+
+
+@pytest.mark.parametrize("seed", range(1, 9))
+def test_no_sun_is_found_in_a_sky_without_one(seed):
+    one, _ = solved(photographed(0.0, seed)[0])
+    light, evidence = with_sun(one)
+    assert not evidence.kept and light is one.light
+
+
+def test_the_prior_on_cells_does_not_know_of_suns():
+    problem, _ = photographed(0.5, 1)
+    one, _ = solved(problem)
+    sky = one.light
+    lit = sky.with_lobe(TOWARDS, SUN, np.ones(3))
+    np.testing.assert_allclose(lit.log_radiance[:, :-1], sky.log_radiance)
+    plain = field_of(one, Hyperparameters(), PRIOR)
+    field = field_of(msgspec.structs.replace(one, light=lit), Hyperparameters(), PRIOR)
+    own = np.tile(lit.suns, 3)
+    np.testing.assert_array_equal(field.precision[np.ix_(~own, ~own)], plain.precision)
+    assert not field.precision[np.ix_(own, ~own)].any() and (np.diag(field.precision)[own] == 0.01).all()
+    assert not brightest(lit)[lit.suns].any()
