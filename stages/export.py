@@ -19,7 +19,7 @@ from factorlib.dataset.schema import LightSlice, ObjectsSlice
 from factorlib.errors import InputError
 from factorlib.export.blender import write_scene_json, write_script
 from factorlib.export.environment import mitsuba_map
-from factorlib.export.gltf import write_glb
+from factorlib.export.gltf import write_glb, write_suns
 from factorlib.export.loss import write_losses
 from factorlib.export.materials import headroom_factor, table_in_gauge
 from factorlib.export.materialx import materialx
@@ -137,6 +137,7 @@ def _write_light(out: Path, name: str, light: Lobes, coverage: Path, params: Par
     sky = light.take(~light.suns)
     if light.suns.any():
         write_rgb_exr(out / "illumination" / f"{name}{SKY}.exr", lat_long_of_lobes(sky, *lat_long.shape[:2]), LAT_LONG)
+        write_suns(out / "illumination" / f"{name}_suns.gltf", suns_of(light, YUP_FROM_CAMERA))
     _write_mitsuba_map(out / "scenes" / "light" / f"{name}.exr", sky, params)
     if coverage.exists():
         directions = lat_long_directions(params.height, 2 * params.height)

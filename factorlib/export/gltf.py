@@ -1,4 +1,4 @@
-"""Meshes as binary glTF with their materials.
+"""Meshes as binary glTF with their materials, and suns as glTF's directional lights.
 
 glTF's metallic-roughness model has GGX of the same α = roughness².  A dielectric with KHR_materials_specular has
 F0 = 0.04 · specularFactor · specularColor and F90 = specularFactor, over a diffuse part times 1 − max F.  So
@@ -7,6 +7,9 @@ F0 = 0.04 · specularFactor · specularColor and F90 = specularFactor, over a di
 
 gives a reflectance at normal incidence of k_d and k_s exactly, and no Fresnel where k_s is grey.  Viewers without the extension
 show the default F0 of 0.04.  baseColor stays within one because max k_d + max k_s does.
+
+A directional light of KHR_lights_punctual shines along its node's −z with an illuminance in lux.  Written is the irradiance of the map's
+radiance, in whose unit a program that also shows the map wants it.
 """
 
 from collections.abc import Mapping, Sequence
@@ -19,13 +22,15 @@ import trimesh
 from trimesh.visual.material import PBRMaterial
 from trimesh.visual.texture import TextureVisuals
 
+from factorlib.export.scene import Sun
+from factorlib.jsonfile import write_json
 from factorlib.meshes.mesh import Mesh
 from factorlib.meshes.ply import submesh
 from factorlib.results.materials import Reflectance
 from factorlib.wholefile import write_bytes
 
 DIELECTRIC = 0.04
-EXTENSION = "KHR_materials_specular"
+EXTENSION, LIGHTS = "KHR_materials_specular", "KHR_lights_punctual"
 
 
 def write_glb(path: str | Path, mesh: Mesh, names: Sequence[str], materials: Mapping[str, Reflectance]) -> None:
@@ -55,3 +60,18 @@ def gltf_material(material: Reflectance) -> dict[str, Any]:
     plain = {"baseColorFactor": [*base.tolist(), 1.0], "metallicFactor": 0.0, "roughnessFactor": material.roughness}
     specular = {"specularFactor": brightest, "specularColorFactor": colour.tolist()}
     return {"pbrMetallicRoughness": plain, "extensions": {EXTENSION: specular}}
+
+
+def write_suns(path: str | Path, suns: Sequence[Sun]) -> None:
+    """Write suns as a glTF scene of directional lights, in the frame of the maps: y up."""
+    lights, nodes = [], []
+    for number, sun in enumerate(suns):
+        intensity, (x, y, z) = float(max(sun.irradiance)), sun.direction
+        turn = np.array([-y, x, 0.0, 1 + z]) if z > -1 + 1e-9 else np.array([1.0, 0.0, 0.0, 0.0])  # of +z to the sun
+        colour = (sun.irradiance / intensity).tolist()
+        lights.append({"type": "directional", "color": colour, "intensity": intensity, "name": f"sun {number}"})
+        rotation = (turn / np.linalg.norm(turn)).tolist()
+        nodes.append({"rotation": rotation, "extensions": {LIGHTS: {"light": number}}, "name": f"sun {number}"})
+    scenes = [{"nodes": list(range(len(suns)))}]
+    content = {"asset": {"version": "2.0"}, "extensionsUsed": [LIGHTS], "extensions": {LIGHTS: {"lights": lights}}}
+    write_json(path, {**content, "nodes": nodes, "scenes": scenes, "scene": 0})

@@ -39,6 +39,7 @@ POSES = {
 MESHES, LIGHTS = {"front": "ball", "side": "egg"}, {"front": "front", "side": "room"}
 PARTS = {"ball": {"upper": "red", "lower": "red"}, "egg": {"upper": "red", "lower": "brass"}}
 WORLD_FROM_CAMERA = {"front": None, "side": Rotation.from_euler("xyz", [-25, 60, 15], degrees=True).as_matrix()}
+SUN_DIRECTION = (0.6, -0.64, -0.48)  # in the camera frame
 EXPOSURES = {"front": [1.0] * 3, "side": [0.5] * 3}
 
 
@@ -58,7 +59,7 @@ def with_sun(lobes: Lobes, axis: tuple[float, float, float], irradiance: tuple[f
 
 def lights() -> dict[str, Lobes]:
     """By illumination, each in its own frame; a sun shines into the room."""
-    room = with_sun(light(1), (0.6, -0.64, -0.48), (1.2, 1.0, 0.7))
+    room = with_sun(light(1), SUN_DIRECTION, (1.2, 1.0, 0.7))
     return {"front": light(0), "room": room.turned(WORLD_FROM_CAMERA["side"])}
 
 

@@ -4,8 +4,10 @@ import msgspec
 import numpy as np
 import pytest
 import torch
+from scipy.spatial.transform import Rotation
 
-from factorlib.conventions import FRONT
+from factorlib.conventions import FRONT, YUP_FROM_CAMERA
+from factorlib.errors import InputError
 from factorlib.images.exr import read_rgb_exr
 from factorlib.jsonfile import read_json, write_json
 from factorlib.light.latlong import map_energy
@@ -54,6 +56,7 @@ def test_files_are_all_there_and_the_same_bytes_again(inputs, tmp_path):
         "exposures.json",
         "lights.json",
         "illumination/room_sky.exr",
+        "illumination/room_suns.gltf",
         "lobes.parquet",
         "losses.json",
         "ball.glb",
@@ -105,3 +108,26 @@ def test_a_light_that_was_not_solved_for_is_black_and_said(inputs, tmp_path, cap
     out = run(inputs, tmp_path / "out")
     assert "'room' was not solved for" in caplog.text
     assert not read_rgb_exr(out / "illumination" / "room.exr").any()
+
+
+def test_suns_are_said_once_in_every_form(inputs, tmp_path):
+    """The sky and the sun together are the map; glTF's light shines where lights.json says."""
+    out = run(inputs, tmp_path / "out")
+    lights, tree = read_json(out / "lights.json"), read_json(out / "illumination/room_suns.gltf")
+    assert lights["front"] == [] and not (out / "illumination/front_sky.exr").exists()
+    (sun,), (light,), (node,) = lights["room"], tree["extensions"]["KHR_lights_punctual"]["lights"], tree["nodes"]
+    whole, sky = (map_energy(read_rgb_exr(out / f"illumination/room{kind}.exr")) for kind in ("", "_sky"))
+    np.testing.assert_allclose(whole - sky, sun["irradiance"], rtol=1e-3)
+    np.testing.assert_allclose(Rotation.from_quat(node["rotation"]).apply([0, 0, 1]), sun["direction"], atol=1e-6)
+    np.testing.assert_allclose(np.array(light["color"]) * light["intensity"], sun["irradiance"], rtol=1e-6)
+    expected = YUP_FROM_CAMERA @ made_export.WORLD_FROM_CAMERA["side"] @ made_export.SUN_DIRECTION
+    np.testing.assert_allclose(sun["direction"], expected, atol=1e-6)
+
+
+def test_a_light_that_is_called_as_the_sky_of_another_is_refused(inputs, tmp_path):
+    lobes = made_export.lights()
+    write_lobes(inputs["solve"] / "lobes.parquet", lobes | {"room_sky": lobes["front"]})
+    facts = msgspec.to_builtins(inputs.facts)
+    facts["dataset.light"]["front"]["illumination"] = "room_sky"
+    with pytest.raises(InputError, match="room_sky"):
+        run(msgspec.structs.replace(inputs, facts=facts), tmp_path / "out")
