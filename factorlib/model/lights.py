@@ -9,6 +9,8 @@ With n cells on the sphere the spacing is √(4π/n), and n/(2λ) = 2π WIDTH² 
 1/(2π WIDTH²) for n of any size; where larger cells meet smaller ones it differs.  So u is the log radiance of a cell of any size.  A cell
 splits into about four: those of the 4n even cells that lie nearer to it than to others, distances counted in spacings.  So neighbours
 that split leave no gaps, and splitting changes a light only by what the larger cells had blurred.
+
+A sun is a lobe as narrow as its disc.  Its peak is that of a sun which lights a surface that faces it as much as a sky of radiance 1 does.
 """
 
 from __future__ import annotations
@@ -24,6 +26,7 @@ from factorlib.light.lobes import SUN, lobe_integral
 WIDTH = 0.5  # of a cell, in spacings: equal weights are a constant light to 2 % (RMS); wider ones blur a sun more than materials do
 PEAK = 1 / (2 * np.pi * WIDTH**2)
 SCALINGS = 5  # iterations for peaks: five make split cells constant to 3 % (RMS), more of them reach 2.7 % at best
+SUN_PEAK = np.pi / float(lobe_integral(np.array([SUN]))[0])
 DARKEST = 1e-12  # weight below which a lobe counts as dark, for its logarithm
 TONE = (0.6, 1.7)  # range of the exponents of tone curves
 NEAR_BOUNDS = 0.8  # of the logarithms of that range: the exponents of cameras lie well within
@@ -89,8 +92,8 @@ class Light(msgspec.Struct, frozen=True):
 
     @property
     def peaks(self) -> Float[np.ndarray, " p"]:
-        """Each cell's weight where radiance is 1: the last of (1), by iterating peak ← peak/√(Σ peak·overlap); 1 of a sun."""
-        axis, peaks, all_ = self.axis[~self.suns], np.full(len(self), PEAK)[~self.suns], np.ones(len(self))
+        """Each cell's weight where radiance is 1: the last of (1), by iterating peak ← peak/√(Σ peak·overlap); SUN_PEAK of a sun."""
+        axis, peaks, all_ = self.axis[~self.suns], np.full(len(self), PEAK)[~self.suns], np.full(len(self), SUN_PEAK)
         overlap = np.exp(self.sharpness[~self.suns] * (axis @ axis.T - 1))
         for _ in range(SCALINGS):
             peaks /= np.sqrt(overlap @ peaks)

@@ -38,7 +38,7 @@ SURE = 0.6  # times the typical confidence of a material's normals: what is less
 DARK = 0.2  # of the noise model's absolute part is left where normals are sure
 ROBUST = Loss(3.0)  # beyond 3 σ of the noise model a residual is an outlier
 START_TEMPERATURE = 10.0
-SUNS = 10.0  # standard deviation of a sun's log weight, in the unit of its light, about 0: next to nothing is known
+SUNS = 1.0  # standard deviation of a sun's log radiance: outdoors, captured lights send a third to twice as much by it as by the sky
 LEAST_AT_START = (
     0.01  # of reflectances: by its logarithm the derivative of a smaller one is nearly zero, and no step would move it
 )

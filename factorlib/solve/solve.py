@@ -5,7 +5,7 @@
     splitting   the cells that hold most of each light's energy split in four, while held-out observations gain: what is sharper than a cell
                 looks as if materials were smoother.  Suns and lamps are cells split deep
     lights      given the materials, lights are fitted to observations of any confidence
-    suns        what lights hold in one direction is narrowed to a sun where observations allow it (`factorlib.solve.suns`)
+    suns        each light is tried with a sun in place of its brightest cells (`factorlib.solve.suns`)
 
 Every part is a function of the one before it, and the journal keeps what is done.
 """
@@ -28,7 +28,7 @@ from factorlib.solve.history import Report, Solution, unreported
 from factorlib.solve.options import Choices
 from factorlib.solve.resume import Journal, Parts
 from factorlib.solve.start import Start
-from factorlib.solve.suns import with_sun
+from factorlib.solve.suns import clearly_better, with_sun
 
 MATERIALS = Schedule(lights=4, together=(10, 8))
 AFTER_SPLITTING = Schedule(lights=2, together=(6, 4), estimate=False)
@@ -97,12 +97,20 @@ def solve(problem: JointProblem, start: Start, run: Run | None = None) -> Soluti
 
 
 def suns_chosen(problem: JointProblem, fit: Fit, parts: Parts) -> Suns:
-    """Suns in the lights that have one (`factorlib.solve.suns`), cells fitted once more around them."""
-    found = list(problem.spread(with_sun, problem.illuminations(fit.point)))
-    lights, evidence = [light for light, _ in found], [one for _, one in found]
+    """Suns in the lights that have one (`factorlib.solve.suns`); the other lights stay as they are."""
+    before = problem.illuminations(fit.point)
+    tried, evidence = map(list, zip(*problem.spread(with_sun, before), strict=True))
     if not any(one.kept for one in evidence):
         return Suns(fit, evidence)
-    return Suns(parts.judged("suns", problem, fit.with_lights(lights), AROUND_SUNS), evidence)
+    trial = parts.judged("suns", problem, fit.with_lights(tried), AROUND_SUNS)
+    for k, (cells, sun) in enumerate(zip(before, problem.illuminations(trial.point), strict=True)):
+        if evidence[k].kept and not cells.light.suns.any():
+            evidence[k] = clearly_better(cells, sun)
+    lights, hyperparameters = (
+        [new if one.kept else old for one, new, old in zip(evidence, *both, strict=True)]
+        for both in ((trial.point.lights, fit.point.lights), (trial.hyperparameters, fit.hyperparameters))
+    )
+    return Suns(msgspec.structs.replace(fit.with_lights(lights), hyperparameters=hyperparameters), evidence)
 
 
 def split_while_gaining(problem: JointProblem, fit: Fit, choices: Choices, parts: Parts) -> Split:

@@ -6,9 +6,9 @@ import pytest
 
 from factorlib.light.lobes import SUN, lobe_integral
 from factorlib.model.problem import JointProblem
-from factorlib.solve.fit import Hyperparameters, Schedule, field_of, fitted
+from factorlib.solve.fit import SUNS, Hyperparameters, Schedule, field_of, fitted
 from factorlib.solve.solve import brightest
-from factorlib.solve.suns import with_sun
+from factorlib.solve.suns import clearly_better, with_sun
 from studies.scenes.problems import MATERIALS
 from tests.solve.made import FEW, PRIOR, begun, drawn, on_even_cells, spheres
 
@@ -36,12 +36,13 @@ def solved(problem: JointProblem):
 def test_a_sun_is_found_with_its_direction_and_its_irradiance(seed):
     problem, irradiance = photographed(0.5, seed)
     one, fit = solved(problem)
-    light, evidence = with_sun(one)
-    assert evidence.kept and light.suns.sum() == 1
-    assert np.degrees(np.arccos(light.axis[light.suns][0] @ TOWARDS)) < 3
-    around = fitted(problem, fit.with_lights([light]), PRIOR, AROUND)
-    (light,) = around.point.lights
-    np.testing.assert_allclose(2 * np.pi * light.energy[light.suns][0], irradiance, rtol=0.3)
+    lit, evidence = with_sun(one)
+    assert evidence.kept and lit.suns.sum() == 1
+    assert np.degrees(np.arccos(lit.axis[lit.suns][0] @ TOWARDS)) < 3
+    around = fitted(problem, fit.with_lights([lit]), PRIOR, AROUND)
+    (other,) = problem.illuminations(around.point)
+    assert clearly_better(one, other).kept and not clearly_better(other, one).kept
+    np.testing.assert_allclose(2 * np.pi * other.light.energy[lit.suns][0], irradiance, rtol=0.3)
 
 
 @pytest.mark.parametrize("seed", range(1, 9))
@@ -49,6 +50,19 @@ def test_no_sun_is_found_in_a_sky_without_one(seed):
     one, _ = solved(photographed(0.0, seed)[0])
     light, evidence = with_sun(one)
     assert not evidence.kept and light is one.light
+
+
+def test_a_sun_that_hardly_shines_is_not_kept():
+    """Narrow and wide are then the same, and so are the light with it and the light without."""
+    one, _ = solved(photographed(0.0, 1)[0])
+    faint = msgspec.structs.replace(one, light=one.light.with_lobe(TOWARDS, SUN, np.full(3, 1e-3)))
+    assert not clearly_better(one, faint).kept
+
+
+def test_a_light_has_one_sun():
+    one, _ = solved(photographed(0.5, 1)[0])
+    lit = msgspec.structs.replace(one, light=with_sun(one)[0])
+    assert with_sun(lit)[0] is lit.light and with_sun(lit)[1].kept
 
 
 def test_the_prior_on_cells_does_not_know_of_suns():
@@ -61,5 +75,5 @@ def test_the_prior_on_cells_does_not_know_of_suns():
     field = field_of(msgspec.structs.replace(one, light=lit), Hyperparameters(), PRIOR)
     own = np.tile(lit.suns, 3)
     np.testing.assert_array_equal(field.precision[np.ix_(~own, ~own)], plain.precision)
-    assert not field.precision[np.ix_(own, ~own)].any() and (np.diag(field.precision)[own] == 0.01).all()
+    assert not field.precision[np.ix_(own, ~own)].any() and (np.diag(field.precision)[own] == SUNS**-2.0).all()
     assert not brightest(lit)[lit.suns].any()
