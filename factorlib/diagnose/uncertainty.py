@@ -69,11 +69,11 @@ GAUGE = "standard errors hold the sum of diffuse + specular over a component's m
 ABSOLUTE = "; where surfaces light each other, that sum is known too, but to about a quarter of itself only"
 WIDTHS = (*[1.0] * 6, ROUGHNESS[1] - ROUGHNESS[0])  # of the ranges of a material's unknowns
 LEAST_DEVIATION = 1e-4  # of the noise model: what a single observation is explained to says nothing
-# Standard deviations, relative of k_d, k_s and lights, absolute of roughness, for residuals of one σ of the noise model: with them 68 % of true values
-# lie within one standard error on sets that settings were chosen on (data/eames and the made sets of seeds 11, 12 and 13; without, 67, 50,
-# 45 and 58 %).
-MODEL_ERROR = np.array([0.04] * 3 + [0.2] * 3 + [0.07])
-LIGHT_ERROR = 0.55
+# Standard deviations, relative of k_d, k_s and lights, absolute of roughness, for residuals of one σ of the noise model: with them about 68 % of true
+# values lie within one standard error on sets that settings were chosen on (data/eames and the made sets of seeds 11, 12 and 13; without, 35,
+# 32, 45 and 57 %).
+MODEL_ERROR = np.array([0.09] * 3 + [0.25] * 3 + [0.07])
+LIGHT_ERROR = 0.7
 ROWS, LARGEST = 32, 1000.0  # of the maps of a light's relative standard errors
 PROBE_SHARPNESS = 100.0  # λ of the lobes whose weight's error is computed: such a lobe has fallen to 1/e at 8°
 SAMPLE = 1000  # observations used for these; the information is scaled to all of them
