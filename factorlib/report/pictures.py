@@ -258,7 +258,7 @@ def light_row(
 
     uri, dark_uri, true_uri, spheres: the map, 4 stops darker, the true one, three spheres;  white: the radiance shown as white
     peak: the brightest texel in units of it;  overflow: share of the sphere that is brighter, outlined;  energy: its share of the light
-    known: share of the sphere where the standard error is below the radiance, or below the mean radiance where that is larger
+    known: share of the sphere where the standard error is below the radiance
     known_uri: that error as grey: white where it is nil, mid-grey where it is as large, black where it is many times that
     """
     radiance = run.rgb("export", f"illumination/{name}")
@@ -279,7 +279,7 @@ def light_row(
     }  # fmt: skip
     if known is not None:
         mean = float((radiance * area[..., None]).sum() / (3 * area.sum() * radiance.shape[1]))
-        error = known.mean(axis=-1) / np.maximum(1, radiance.mean(axis=-1) / max(mean, 1e-30))
+        error = known.mean(axis=-1) * mean / np.maximum(radiance.mean(axis=-1), 1e-30)
         row["known"] = float(((error < 1) * area).sum() / (4 * np.pi))
         row["known_uri"] = data_uri(np.rint(255 / (1 + np.repeat(error[..., None], 3, -1))).astype(np.uint8))
     return row
