@@ -12,14 +12,17 @@ Every part is a function of the one before it, and the journal keeps what is don
 
 from __future__ import annotations
 
+from functools import partial
+
 import msgspec
 import numpy as np
 from jaxtyping import Bool
 
-from factorlib.light.lobes import Lobes
+from factorlib.light.lobes import SUN, Lobes
 from factorlib.light.prior import LightPrior, read_light_prior
 from factorlib.model.gauge import in_gauge
 from factorlib.model.lights import Light, even_cells
+from factorlib.model.materials import Point
 from factorlib.model.problem import JointProblem
 from factorlib.solve.choices import TRIAL_CELLS, Curves, Effects, curves_chosen, effects_chosen
 from factorlib.solve.evidence import FINER, Evidence, compare, losses_of
@@ -28,7 +31,7 @@ from factorlib.solve.history import Report, Solution, unreported
 from factorlib.solve.options import Choices
 from factorlib.solve.resume import Journal, Parts
 from factorlib.solve.start import Start
-from factorlib.solve.suns import clearly_better, with_sun
+from factorlib.solve.suns import NO_WORSE, WIDE, candidate, clearly_better, compared
 
 MATERIALS = Schedule(lights=4, together=(10, 8))
 AFTER_SPLITTING = Schedule(lights=2, together=(6, 4), estimate=False)
@@ -99,13 +102,24 @@ def solve(problem: JointProblem, start: Start, run: Run | None = None) -> Soluti
 def suns_chosen(problem: JointProblem, fit: Fit, parts: Parts) -> Suns:
     """Suns in the lights that have one (`factorlib.solve.suns`); the other lights stay as they are."""
     before = problem.illuminations(fit.point)
-    tried, evidence = map(list, zip(*problem.spread(with_sun, before), strict=True))
-    if not any(one.kept for one in evidence):
+    tried = list(problem.spread(partial(candidate, sharpness=SUN), before))
+    evidence = [Evidence(bool(one.light.suns.any())) for one in before]
+    if all(light is one.light for light, one in zip(tried, before, strict=True)):
         return Suns(fit, evidence)
     trial = parts.judged("suns", problem, fit.with_lights(tried), AROUND_SUNS)
-    for k, (cells, sun) in enumerate(zip(before, problem.illuminations(trial.point), strict=True)):
-        if evidence[k].kept and not cells.light.suns.any():
+    after = problem.illuminations(trial.point)
+    for k, (cells, sun) in enumerate(zip(before, after, strict=True)):
+        if tried[k] is not cells.light:
             evidence[k] = clearly_better(cells, sun)
+    asked = [k for k, one in enumerate(evidence) if one.kept and one.margin is not None]
+    if asked:
+        wide = list(problem.spread(partial(candidate, sharpness=WIDE), [before[k] for k in asked]))
+        begun = Fit(Point(fit.point.materials, wide), [fit.hyperparameters[k] for k in asked])
+        problem = problem.restricted(asked)
+        other = problem.illuminations(parts.judged("suns", problem, begun, AROUND_SUNS).point)
+        for k, one in zip(asked, other, strict=True):
+            narrow = compared(one, after[k], NO_WORSE)
+            evidence[k] = evidence[k] if narrow.kept else narrow
     lights, hyperparameters = (
         [new if one.kept else old for one, new, old in zip(evidence, *both, strict=True)]
         for both in ((trial.point.lights, fit.point.lights), (trial.hyperparameters, fit.hyperparameters))

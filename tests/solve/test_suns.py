@@ -7,8 +7,10 @@ import pytest
 from factorlib.light.lobes import SUN, lobe_integral
 from factorlib.model.problem import JointProblem
 from factorlib.solve.fit import SUNS, Hyperparameters, Schedule, field_of, fitted
-from factorlib.solve.solve import brightest
-from factorlib.solve.suns import clearly_better, with_sun
+from factorlib.solve.history import unreported
+from factorlib.solve.resume import Journal, Parts
+from factorlib.solve.solve import brightest, suns_chosen
+from factorlib.solve.suns import NO_WORSE, WIDE, candidate, clearly_better, compared
 from studies.scenes.problems import MATERIALS
 from tests.solve.made import FEW, PRIOR, begun, drawn, on_even_cells, spheres
 
@@ -32,24 +34,40 @@ def solved(problem: JointProblem):
     return one, fit
 
 
+def tried(problem: JointProblem):
+    """The fits in cells alone, with a sun, and with a wide lobe."""
+    one, fit = solved(problem)
+    fits = [fitted(problem, fit.with_lights([candidate(one, of)]), PRIOR, AROUND) for of in (SUN, WIDE)]
+    return [one, *(problem.illuminations(around.point)[0] for around in fits)]
+
+
 @pytest.mark.parametrize("seed", [1, 2, 3])
 def test_a_sun_is_found_with_its_direction_and_its_irradiance(seed):
     problem, irradiance = photographed(0.5, seed)
-    one, fit = solved(problem)
-    lit, evidence = with_sun(one)
-    assert evidence.kept and lit.suns.sum() == 1
-    assert np.degrees(np.arccos(lit.axis[lit.suns][0] @ TOWARDS)) < 3
-    around = fitted(problem, fit.with_lights([lit]), PRIOR, AROUND)
-    (other,) = problem.illuminations(around.point)
-    assert clearly_better(one, other).kept and not clearly_better(other, one).kept
-    np.testing.assert_allclose(2 * np.pi * other.light.energy[lit.suns][0], irradiance, rtol=0.3)
+    cells, sun, wide = tried(problem)
+    light = sun.light
+    assert clearly_better(cells, sun).kept and compared(wide, sun, NO_WORSE).kept
+    assert light.suns.sum() == 1 and np.degrees(np.arccos(light.axis[light.suns][0] @ TOWARDS)) < 3
+    np.testing.assert_allclose(2 * np.pi * light.energy[light.suns][0], irradiance, rtol=0.3)
 
 
 @pytest.mark.parametrize("seed", range(1, 9))
 def test_no_sun_is_found_in_a_sky_without_one(seed):
-    one, _ = solved(photographed(0.0, seed)[0])
-    light, evidence = with_sun(one)
-    assert not evidence.kept and light is one.light
+    cells, sun, wide = tried(photographed(0.0, seed)[0])
+    assert not (clearly_better(cells, sun).kept and compared(wide, sun, NO_WORSE).kept)
+
+
+def test_the_solve_keeps_suns_of_lights_that_have_one():
+    problem, _ = photographed(0.5, 1)
+    _, fit = solved(problem)
+    found = suns_chosen(problem, fit, Parts(Journal(), unreported, PRIOR))
+    assert found.evidence[0].kept and found.fit.point.lights[0].suns.any()
+    again = suns_chosen(problem, found.fit, Parts(Journal(), unreported, PRIOR))
+    assert again.fit is found.fit and again.evidence[0].kept
+    cloudy, _ = photographed(0.0, 1)
+    _, fit = solved(cloudy)
+    none = suns_chosen(cloudy, fit, Parts(Journal(), unreported, PRIOR))
+    assert not none.evidence[0].kept and none.fit.point.lights[0] is fit.point.lights[0]
 
 
 def test_a_sun_that_hardly_shines_is_not_kept():
@@ -57,12 +75,6 @@ def test_a_sun_that_hardly_shines_is_not_kept():
     one, _ = solved(photographed(0.0, 1)[0])
     faint = msgspec.structs.replace(one, light=one.light.with_lobe(TOWARDS, SUN, np.full(3, 1e-3)))
     assert not clearly_better(one, faint).kept
-
-
-def test_a_light_has_one_sun():
-    one, _ = solved(photographed(0.5, 1)[0])
-    lit = msgspec.structs.replace(one, light=with_sun(one)[0])
-    assert with_sun(lit)[0] is lit.light and with_sun(lit)[1].kept
 
 
 def test_the_prior_on_cells_does_not_know_of_suns():
