@@ -21,6 +21,11 @@ Seed = Annotated[
 ]
 EXACT = typer.Option("--exact", help="Give the photographed mesh, its poses and focal lengths.")
 DISTANT = typer.Option("--distant", help="Light the chairs by the light's map alone, infinitely far away.")
+ROUGH = typer.Option(
+    "--rough",
+    metavar="TRIANGLES,WARP",
+    help="Give a worse mesh: triangles a part, and a bend as a share of its extent.",
+)
 DIRECT = typer.Option("--direct", help="No bounces: only what shines by itself lights the chairs.")
 Out = Annotated[Path | None, typer.Option(help="Folder to write; default data/<set>. It is replaced.")]
 Lights = Annotated[Path | None, typer.Option(help="Folder of lat-long .hdr or .exr maps to light the set with.")]
@@ -42,16 +47,35 @@ def eames(
     exact: Annotated[bool, EXACT] = False,
     distant: Annotated[bool, DISTANT] = False,
     direct: Annotated[bool, DIRECT] = False,
+    rough: Annotated[str | None, ROUGH] = None,
 ) -> None:
     """Six photos of moulded side chairs, path traced with all bounces, on a mesh of less quality."""
     from factorlib.generate import eames as set_
 
-    if (exact or distant or direct) and out is None:
-        fault = "data/eames is the set without --exact, --distant and --direct"
+    if (exact or distant or direct or rough) and out is None:
+        fault = "data/eames is the set without --exact, --distant, --direct and --rough"
         typer.echo(f"error: {fault}\n  name another folder by --out", err=True)
         raise typer.Exit(2)
-    parameters = set_.Parameters(exact=exact, distant=distant, direct=direct)
+    parameters = set_.Parameters(exact=exact, distant=distant, direct=direct, rough=_rough(rough, exact))
     _write(set_, out or Path("data/eames"), seed, lights, parameters)
+
+
+def _rough(words: str | None, exact: bool) -> tuple[int, float] | None:
+    """TRIANGLES,WARP as numbers; says what is wrong and ends the program where they are none."""
+    if words is None:
+        return None
+    try:
+        triangles, warp = words.split(",")
+        numbers = int(triangles), float(warp)
+    except ValueError:
+        numbers = 0, 0.0
+    if exact or not (numbers[0] >= 20 and 0 <= numbers[1] <= 0.2):
+        typer.echo(
+            f"error: --rough {words}\n  without --exact, 20 triangles or more and 0 to .2, as in --rough 500,.02",
+            err=True,
+        )
+        raise typer.Exit(2)
+    return numbers
 
 
 def _write(set_: ModuleType, out: Path, seed: int, lights: Path | None, parameters: msgspec.Struct) -> None:

@@ -2,7 +2,7 @@
 
 Object frame: metres, y up, the floor at y = 0, the sitter looks along +z; made after the proportions of the well-known
 chair (47 cm wide at the feet, 52 cm deep, 82 cm high) by formulas of our own.  `chair` is the one that is photographed;
-`rough_chair` what a user might have of it: fewer, flatter faces, thicker legs, and a few millimetres off everywhere.
+`rough_chair` what a user might have of it: fewer, flatter faces, thicker legs, and a few millimetres off everywhere; `bent_chair` a worse one.
 """
 
 from __future__ import annotations
@@ -12,6 +12,7 @@ from pathlib import Path
 
 import msgspec
 import numpy as np
+import open3d as o3d
 from jaxtyping import Float
 from scipy.interpolate import CubicSpline, PchipInterpolator
 
@@ -57,6 +58,28 @@ def rough_chair(rng: np.random.Generator) -> dict[str, Part]:
 
     parts = {"shell": shell(14, 22), "legs": legs(7, 3, radii=SHAPE.rough_leg_radii)}
     return {name: (v + np.sin(v @ axes.T + phases.T) @ shifts, faces) for name, (v, faces) in parts.items()}
+
+
+def bent_chair(rng: np.random.Generator, triangles: int, warp: float) -> dict[str, Part]:
+    """shell and legs of `triangles` each, bent by four waves, of about a chair's length, whose largest displacement is about `warp` of its extent."""
+    parts = chair()
+    points = np.concatenate([vertices for vertices, _ in parts.values()])
+    extent = float(np.linalg.norm(np.ptp(points, axis=0)))
+    axes, phases, shifts = (
+        rng.normal(0, 5 / extent, (4, 3)),
+        rng.uniform(0, 2 * np.pi, (4, 1)),
+        rng.normal(0, 1, (4, 3)),
+    )
+    waves = np.sin(points @ axes.T + phases.T) @ shifts
+    middle, deviation = waves.mean(axis=0), float(np.sqrt(np.square(waves - waves.mean(axis=0)).sum(axis=1).mean()))
+    bent = {}
+    for name, (vertices, faces) in parts.items():
+        mesh = o3d.geometry.TriangleMesh(o3d.utility.Vector3dVector(vertices), o3d.utility.Vector3iVector(faces))
+        fewer = mesh.remove_duplicated_vertices().simplify_quadric_decimation(triangles)
+        places = np.asarray(fewer.vertices)
+        shift = (np.sin(places @ axes.T + phases.T) @ shifts - middle) * warp * extent / (2 * deviation)
+        bent[name] = places + shift, np.asarray(fewer.triangles)
+    return bent
 
 
 def labelled(parts: dict[str, Part], labels: dict[str, int]) -> Mesh:

@@ -19,7 +19,7 @@ from jaxtyping import Float
 from factorlib.conventions import YUP_FROM_CAMERA
 from factorlib.dataset.schema import LEFT_OUT
 from factorlib.generate import folder, lights
-from factorlib.generate.chair import chair, labelled, rough_chair
+from factorlib.generate.chair import bent_chair, chair, labelled, rough_chair
 from factorlib.generate.lights import EYE, Rng, SceneDict, random_materials
 from factorlib.generate.shapes import smooth
 from factorlib.geometry.camera import Camera, Pose
@@ -38,6 +38,7 @@ class Parameters(msgspec.Struct, frozen=True):
     exact:    the data set's mesh is the one that was photographed, and poses and focal lengths are given
     distant:  nothing lights or surrounds the chairs but the light's map, infinitely far away
     direct:   light is not reflected on its way: only what shines by itself lights the chairs
+    rough:    the data set's mesh has so many triangles a part and is bent by this share of its extent: worse than it is without
     """
 
     width: int = 480
@@ -48,6 +49,7 @@ class Parameters(msgspec.Struct, frozen=True):
     exact: bool = False
     distant: bool = False
     direct: bool = False
+    rough: tuple[int, float] | None = None
 
 
 class Shot(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -93,6 +95,8 @@ def generate(
     rng, spread = np.random.default_rng([11, seed]), 0.0 if seed == 0 else 1.0
     materials, rough = random_materials(rng, 0.2 * spread, SET.materials), rough_chair(rng)
     exact = {name: smooth(*part) for name, part in chair().items()} if parameters.exact else {}
+    if parameters.rough:
+        rough = bent_chair(np.random.default_rng([13, seed]), *parameters.rough)
     parts = {name: (mesh.vertices, mesh.faces, mesh.normals) for name, mesh in exact.items()} or rough
     folder.write_obj(out / "meshes/chair.obj", parts)
     photos, poses = [], {}
@@ -102,8 +106,9 @@ def generate(
         poses[shot.name] = scene.poses
         photos.append(write_shot(out, scene, materials, parameters, 1000 * seed + number))
     meshes = {"chair": {"file": "meshes/chair.obj", "parts": {"shell": "red", "legs": "wood"}}}
-    easier = "".join(f" --{name}" for name in ("exact", "distant", "direct") if getattr(parameters, name))
-    comment = f"Generated (rendered, not photographed): python -m factorlib.generate eames{easier}"
+    options = "".join(f" --{name}" for name in ("exact", "distant", "direct") if getattr(parameters, name))
+    options += " --rough {},{}".format(*parameters.rough) if parameters.rough else ""
+    comment = f"Generated (rendered, not photographed): python -m factorlib.generate eames{options}"
     folder.write_records(out, comment, materials, meshes, photos, poses)
     progress(len(shots), len(shots), "done")
 

@@ -1,5 +1,5 @@
 """The generated sets: the same seed is the same bytes, what is written is what the format asks for, and what is taken away of the
-chair set (exact geometry, distant light, direct light) is taken away by itself."""
+chair set (exact geometry, distant light, direct light) is taken away by itself; a rougher mesh changes nothing else."""
 
 from pathlib import Path
 
@@ -170,6 +170,25 @@ def test_a_users_lights_replace_the_made_ones(tmp_path):
     write_rgb_exr(tmp_path / "square.exr", np.ones((8, 8, 3)))
     with pytest.raises(InputError, match="no lat-long"):
         lights.captured(tmp_path / "square.exr", 8)
+
+
+def test_a_rough_mesh_changes_no_photo_and_is_as_rough_as_was_asked_for(plain, tmp_path):
+    rough = made_chairs(tmp_path / "rough", rough=(500, 0.02))
+    before, after = files(plain), files(rough)
+    changed = {name for name in before if before[name] != after[name]}
+    assert before.keys() == after.keys() and changed == {"meshes/chair.obj", "dataset.yaml"}
+    mesh = read_mesh(rough / "meshes/chair.obj", ["red", "wood"], {"shell": "red", "legs": "wood"})
+    assert 900 <= len(mesh.faces) <= 1000
+    true = np.concatenate([vertices for vertices, _ in chair().values()])
+    off = cKDTree(true).query(mesh.vertices)[0] / np.linalg.norm(np.ptp(true, axis=0))
+    assert 0.002 < np.median(off) < 0.02 and off.max() < 0.05
+    assert "--rough 500,0.02" in (rough / "dataset.yaml").read_text()
+
+
+@pytest.mark.parametrize("words", ["500", "500,x", "5,.02", "500,.5"])
+def test_a_roughness_of_meshes_that_is_none_is_named(words, tmp_path):
+    done = CliRunner().invoke(app, ["eames", "--rough", words, "--out", str(tmp_path / "set")])
+    assert done.exit_code == 2 and "500,.02" in done.output
 
 
 def test_exact_geometry_changes_no_photo(plain, exact):
