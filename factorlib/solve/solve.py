@@ -25,13 +25,13 @@ from factorlib.model.lights import Light, even_cells
 from factorlib.model.materials import Point
 from factorlib.model.problem import JointProblem
 from factorlib.solve.choices import TRIAL_CELLS, Curves, Effects, curves_chosen, effects_chosen
-from factorlib.solve.evidence import FINER, Evidence, compare, losses_of
+from factorlib.solve.evidence import AGAINST, FINER, Evidence, compare, losses_of
 from factorlib.solve.fit import Fit, Schedule, sure_ones
 from factorlib.solve.history import Report, Solution, unreported
 from factorlib.solve.options import Choices
 from factorlib.solve.resume import Journal, Parts
 from factorlib.solve.start import Start
-from factorlib.solve.suns import NO_WORSE, WIDE, candidate, clearly_better, compared
+from factorlib.solve.suns import WIDE, candidate, clearly_better, compared
 
 MATERIALS = Schedule(lights=4, together=(10, 8))
 AFTER_SPLITTING = Schedule(lights=2, together=(6, 4), estimate=False)
@@ -118,7 +118,7 @@ def suns_chosen(problem: JointProblem, fit: Fit, parts: Parts) -> Suns:
         problem = problem.restricted(asked)
         other = problem.illuminations(parts.judged("suns", problem, begun, AROUND_SUNS).point)
         for k, one in zip(asked, other, strict=True):
-            narrow = compared(one, after[k], NO_WORSE)
+            narrow = compared(one, after[k], AGAINST)
             evidence[k] = evidence[k] if narrow.kept else narrow
     lights, hyperparameters = (
         [new if one.kept else old for one, new, old in zip(evidence, *both, strict=True)]

@@ -6,11 +6,12 @@ import pytest
 
 from factorlib.light.lobes import SUN, lobe_integral
 from factorlib.model.problem import JointProblem
+from factorlib.solve.evidence import AGAINST
 from factorlib.solve.fit import SUNS, Hyperparameters, Schedule, field_of, fitted
 from factorlib.solve.history import unreported
 from factorlib.solve.resume import Journal, Parts
 from factorlib.solve.solve import brightest, suns_chosen
-from factorlib.solve.suns import NO_WORSE, WIDE, candidate, clearly_better, compared
+from factorlib.solve.suns import WIDE, candidate, clearly_better, compared
 from studies.scenes.problems import MATERIALS
 from tests.solve.made import FEW, PRIOR, begun, drawn, on_even_cells, spheres
 
@@ -46,7 +47,7 @@ def test_a_sun_is_found_with_its_direction_and_its_irradiance(seed):
     problem, irradiance = photographed(0.5, seed)
     cells, sun, wide = tried(problem)
     light = sun.light
-    assert clearly_better(cells, sun).kept and compared(wide, sun, NO_WORSE).kept
+    assert clearly_better(cells, sun).kept and compared(wide, sun, AGAINST).kept
     assert light.suns.sum() == 1 and np.degrees(np.arccos(light.axis[light.suns][0] @ TOWARDS)) < 3
     np.testing.assert_allclose(2 * np.pi * light.energy[light.suns][0], irradiance, rtol=0.3)
 
@@ -54,7 +55,7 @@ def test_a_sun_is_found_with_its_direction_and_its_irradiance(seed):
 @pytest.mark.parametrize("seed", range(1, 9))
 def test_no_sun_is_found_in_a_sky_without_one(seed):
     cells, sun, wide = tried(photographed(0.0, seed)[0])
-    assert not (clearly_better(cells, sun).kept and compared(wide, sun, NO_WORSE).kept)
+    assert not (clearly_better(cells, sun).kept and compared(wide, sun, AGAINST).kept)
 
 
 def test_the_solve_keeps_suns_of_lights_that_have_one():
@@ -75,6 +76,17 @@ def test_a_sun_that_hardly_shines_is_not_kept():
     one, _ = solved(photographed(0.0, 1)[0])
     faint = msgspec.structs.replace(one, light=one.light.with_lobe(TOWARDS, SUN, np.full(3, 1e-3)))
     assert not clearly_better(one, faint).kept
+
+
+def test_a_sun_is_no_bluer_than_its_light():
+    problem, _ = photographed(0.5, 1)
+    cells, sun, _ = tried(problem)
+    tint = np.where(sun.light.suns[:, None], [0.2, 1.0, 3.0], 1.0)
+    blue = msgspec.structs.replace(sun, light=msgspec.structs.replace(sun.light, weight=sun.light.weight * tint))
+    losses = compared(cells, blue, -np.inf)
+    assert losses.kept and not clearly_better(blue, blue).kept
+    by_losses_alone = msgspec.structs.replace(cells, light=sun.light)
+    assert clearly_better(cells, by_losses_alone).kept and not clearly_better(cells, blue).kept
 
 
 def test_the_prior_on_cells_does_not_know_of_suns():
