@@ -10,19 +10,23 @@ listed; so is what must be renamed.
 
 from __future__ import annotations
 
+import os
 import re
 import shutil
-from collections.abc import Callable
+from collections.abc import Iterable
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
 import msgspec
 import numpy as np
 import yaml
+from PIL import Image
 
 from factorlib.dataset.check import IMAGES, MESHES, RESERVED_PHOTOS
 from factorlib.dataset.schema import LEFT_OUT, LONGEST_NAME, MAX_MATERIALS
+from factorlib.disk import disk_error
 from factorlib.errors import InputError
+from factorlib.images.limits import MOST_MEGAPIXELS, check_pixels
 from factorlib.labels.coco import Category
 from factorlib.labels.png import read_values
 from factorlib.meshes.read import read_parts
@@ -60,10 +64,13 @@ _Dumper.add_representer(str, _Dumper.represent_str)
 def new_dataset(target: Path, photos: Path, masks: Path | None, meshes: Path | None) -> list[str]:
     """Copy the files, write target/dataset.yaml, and return what is still missing, in words.
 
-    Raises InputError where the folder is there already, one of the others is not, or there are no photos.
+    Raises InputError where the folder is there already or cannot be made, one of the others is not, there are no photos, or a file is a link, has
+    a name that cannot be printed, or more pixels than are read.
     """
-    if target.exists():
+    if os.path.lexists(target):
         raise InputError("is there already", file=target, key="DATASET", cure="choose another name, or delete it")
+    if not (above := next(path for path in target.absolute().parents if os.path.lexists(path))).is_dir():
+        raise InputError("is no folder", file=above, key="DATASET", cure="name a folder that can be made")
     named = _by_name(_files(photos, IMAGES, "PHOTOS"), "PHOTOS")
     if not named:
         fault = f"there are no photos ({', '.join(IMAGES[:6])}, …) in it"
@@ -90,24 +97,30 @@ def new_dataset(target: Path, photos: Path, masks: Path | None, meshes: Path | N
             objects = [{"name": name, "mesh": mesh, "mask": mask} for name, mask in silhouettes[photo].items()]
         image, mask = f"photos/{path.relative_to(photos)}", of_photos.get(photo, UNKNOWN)
         spec["photos"].append({"name": photo, "image": image, "masks": mask, "objects": objects})
-    target.parent.mkdir(parents=True, exist_ok=True)
+    try:
+        target.parent.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        cure = "name a folder that can be made"
+        known = disk_error(error, above)
+        raise known or InputError("no folder can be made here", file=above, key="DATASET", cure=cure) from error
     with TemporaryDirectory(dir=target.parent, prefix=f".{target.name}.") as folder:
         draft, chosen = Path(folder) / target.name, set(named.values())
-        _copy(photos, draft / "photos", lambda path: path in chosen)
-        _copy(masks, draft / "masks", lambda path: path.suffix.lower() in (".png", ".json"))
-        _copy(meshes, draft / "meshes", Path.is_file)  # with .mtl, buffers
+        _copy(photos, draft / "photos", chosen)
+        _copy(masks, draft / "masks", _files(masks, (".png", ".json"), "MASKS", deep=True) if masks else ())
+        _copy(
+            meshes, draft / "meshes", _files(meshes, None, "MESHES", deep=True) if meshes else ()
+        )  # with .mtl, buffers
         text = yaml.dump(spec, Dumper=_Dumper, sort_keys=False, allow_unicode=True, width=10**6)
         write_text(draft / "dataset.yaml", REMARK + text)
         draft.rename(target)
     return missing
 
 
-def _copy(source: Path | None, target: Path, wanted: Callable[[Path], bool]) -> None:
-    for path in source.rglob("*") if source is not None else ():
-        if wanted(path):
-            place = target / path.relative_to(source)
-            place.parent.mkdir(parents=True, exist_ok=True)
-            shutil.copyfile(path, place)
+def _copy(source: Path | None, target: Path, files: Iterable[Path]) -> None:
+    for path in files:
+        place = target / path.relative_to(source)
+        place.parent.mkdir(parents=True, exist_ok=True)
+        shutil.copyfile(path, place)
 
 
 def _masks(folder: Path, photos: list[str], missing: list[str]) -> tuple[list[str], dict, dict[str, dict[str, str]]]:
@@ -126,26 +139,34 @@ def _masks(folder: Path, photos: list[str], missing: list[str]) -> tuple[list[st
         missing += [f"{file[path]}: a second COCO file is not used" for path in coco[1:]]
         return list(names), dict.fromkeys(photos, file[coco[0]]), {}
     labels, of_photos, silhouettes = 0, {}, {}
+    known, own, further = set(photos), {}, {photo: {} for photo in photos}
+    for path in paths:
+        name = _word(path.stem)
+        if name in known:  # kitchen_2.png may be a photo's own
+            if path.parent == folder:
+                own.setdefault(name, path)
+        elif path.parent == folder:
+            for cut in (k for k, letter in enumerate(name) if letter == "_"):
+                if name[:cut] in known:
+                    further[name[:cut]][name[cut + 1 :]] = file[path]
+        elif path.parent.parent == folder and path.parent.name in known:
+            further[path.parent.name][name] = file[path]
     for photo in photos:
-        whole = [path for path in paths if path.parent == folder and _word(path.stem) == photo]
-        each = {}
-        for path in paths:
-            name = _word(path.stem)
-            if name in photos:  # kitchen_2.png may be a photo's own
-                continue
-            if path.parent == folder / photo:
-                each[name] = file[path]
-            elif path.parent == folder and name.startswith(f"{photo}_"):
-                each[name.removeprefix(f"{photo}_")] = file[path]
-        each = dict(sorted(each.items()))
-        if whole:
-            values = set(np.unique(read_values(whole[0], photo)).tolist())
+        each = dict(sorted(further[photo].items()))
+        if whole := own.get(photo):
+            with (
+                reading("a PNG", whole, photo, "save the mask again, as PNG"),
+                Image.open(whole, formats=["PNG"]) as header,
+            ):
+                size = header.size
+            check_pixels(size, MOST_MEGAPIXELS, whole, photo)
+            values = set(np.unique(read_values(whole, photo)).tolist())
             labels = max([labels, *(value for value in values if value <= MAX_MATERIALS)])
             if values <= {0, LEFT_OUT}:
                 cure = f"the mask of one material is called {photo}_<material>.png"
-                fault = f"{whole[0].name} has no label, for {LEFT_OUT} means left out"
+                fault = f"{whole.name} has no label, for {LEFT_OUT} means left out"
                 missing.append(f"photo {photo}: {fault}; {cure}")
-            of_photos[photo], silhouettes[photo] = file[whole[0]], each
+            of_photos[photo], silhouettes[photo] = file[whole], each
         elif each:
             of_photos[photo] = each
             names |= dict.fromkeys(each)
@@ -174,11 +195,22 @@ def _shown_in(photo: str, meshes: list[str]) -> list[str]:
     return [mesh for mesh in meshes if len(meshes) == 1 or re.search(word.format(re.escape(mesh)), photo)]
 
 
-def _files(folder: Path, suffixes: tuple[str, ...], key: str, deep: bool = False) -> list[Path]:
+def _files(folder: Path, suffixes: tuple[str, ...] | None, key: str, deep: bool = False) -> list[Path]:
+    """The files of a folder, or of those in it, too; suffixes: None for any.  What macOS keeps beside a file (`._name`) is none of them."""
     if not folder.is_dir():
         raise InputError("there is no such folder", file=folder, key=key, cure="name one")
-    paths = folder.rglob("*") if deep else folder.iterdir()
-    return sorted(path for path in paths if path.suffix.lower() in suffixes and path.is_file())
+    paths = []
+    for path in folder.rglob("*") if deep else folder.iterdir():
+        if path.name.startswith("._") or (suffixes is not None and path.suffix.lower() not in suffixes):
+            continue
+        if path.is_symlink() or not (path.is_file() or path.is_dir()):
+            cure = "put the file itself there, or take it away"
+            raise InputError("is a link, or no file of this folder's own", file=path, key=key, cure=cure)
+        if not path.name.isprintable():
+            raise InputError(f"{path.name!a} cannot be printed", file=folder, key=key, cure="rename that file")
+        if path.is_file():
+            paths.append(path)
+    return sorted(paths)
 
 
 def _by_name(paths: list[Path], key: str) -> dict[str, Path]:

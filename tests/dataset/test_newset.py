@@ -1,6 +1,8 @@
 """`make new`: a dataset.yaml of folders of files, that says what it does not know instead of guessing."""
 
 import json
+import zlib
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -133,6 +135,71 @@ def test_a_folder_that_is_not_there_and_two_photos_of_one_name_are_refused(folde
     Image.fromarray(np.zeros((4, 4, 3), np.uint8)).save(folder / "photos" / "kitchen.png")
     with pytest.raises(InputError, match="would both be called 'kitchen'"):
         made(folder)
+
+
+@pytest.mark.parametrize("kind", ["photos", "masks", "meshes"])
+def test_a_link_is_refused_for_it_may_lead_to_what_is_not_to_be_copied(folder, kind):
+    masks(folder, kitchen=LABEL)
+    file = next(path for path in sorted((folder / kind).iterdir()) if path.suffix != ".mtl")
+    file.rename(folder / "secret")
+    file.symlink_to(folder / "secret")
+    with pytest.raises(InputError, match="is a link") as error:
+        made(folder)
+    assert error.value.file == file and not (folder / "data" / "mine").exists()
+
+
+@pytest.mark.parametrize("name", ["a\x7f.jpg", "a\x85.jpg", "a\udcff.jpg"])
+def test_a_name_that_cannot_be_printed_is_said_in_letters_that_can(folder, name):
+    (folder / "photos" / "kitchen.jpg").rename(folder / "photos" / name)
+    with pytest.raises(InputError, match="cannot be printed") as error:
+        made(folder)
+    str(error.value).encode()
+
+
+def test_what_macos_keeps_beside_files_is_no_photo(folder):
+    masks(folder, kitchen=LABEL)
+    for kind in ("photos", "masks", "meshes"):
+        for path in list((folder / kind).iterdir()):
+            (folder / kind / f"._{path.name}").write_bytes(b"Mac OS X")
+    _, spec = made(folder)
+    assert [photo["name"] for photo in spec["photos"]] == ["IMG_0412", "kitchen"] and list(spec["meshes"]) == ["chair"]
+    assert not list((folder / "data" / "mine").rglob("._*"))
+
+
+@pytest.mark.parametrize("place", ["photos/kitchen.jpg/x", "photos/kitchen.jpg/x/y"])
+def test_a_place_where_no_folder_can_be_is_named(folder, place):
+    with pytest.raises(InputError, match="is no folder") as error:
+        new_dataset(folder / place, folder / "photos", None, None)
+    assert error.value.key == "DATASET" and error.value.file == folder / "photos/kitchen.jpg"
+
+
+def test_a_folder_that_the_system_makes_none_in_is_named(folder):
+    with pytest.raises(InputError) as error:
+        new_dataset(Path("/proc/x/y"), folder / "photos", None, None)
+    assert "/proc" in str(error.value)
+
+
+def test_a_mask_of_more_pixels_than_are_read_is_refused_by_its_header(folder):
+    def chunk(kind, data):
+        return len(data).to_bytes(4, "big") + kind + data + zlib.crc32(kind + data).to_bytes(4, "big")
+
+    size = (40_000).to_bytes(4, "big")
+    header = b"\x89PNG\r\n\x1a\n" + chunk(b"IHDR", size + size + bytes([8, 0, 0, 0, 0])) + chunk(b"IEND", b"")
+    (folder / "masks" / "kitchen.png").write_bytes(header)
+    with pytest.raises(InputError, match="1600 megapixels"):
+        made(folder)
+
+
+def test_masks_are_matched_in_one_look_at_each(folder):
+    """A mask belongs to every photo whose name it begins with, as photos and masks come."""
+    for path in (folder / "photos").iterdir():
+        path.unlink()
+    for photo in ("a", "a_b"):
+        Image.fromarray(np.full((8, 10, 3), 90, np.uint8)).save(folder / "photos" / f"{photo}.png")
+    masks(folder, a_b_red=SHELL, a__blue=LEGS, a_b_c_red=LEGS)
+    _, spec = made(folder)
+    of = {photo["name"]: set(photo["masks"]) for photo in spec["photos"]}
+    assert of == {"a": {"b_red", "b_c_red", "blue"}, "a_b": {"red", "c_red"}}
 
 
 def test_a_photo_whose_name_the_results_take_is_listed_and_names_that_yaml_takes_for_numbers_are_quoted(folder):

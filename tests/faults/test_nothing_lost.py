@@ -7,6 +7,7 @@ of each fault, `make test-long` all of them, which are the numbers of docs/relia
 from __future__ import annotations
 
 import contextlib
+import errno
 import json
 import os
 import random
@@ -740,6 +741,15 @@ def test_a_file_that_may_not_be_read_is_no_full_folder_and_a_defect_stays_a_defe
     defect = KeyError("a defect while another error was handled")
     defect.__context__ = PermissionError(13, "Permission denied", "x")
     assert not [e for e in (ValueError("x"), FileNotFoundError(2, "", "x"), defect) if disk_error(e, tmp_path)]
+
+
+def test_a_disk_that_is_full_while_a_file_is_copied_is_that_of_the_copy(tmp_path):
+    source, copy = (tmp_path / name / "file" for name in ("from", "to"))
+    for path in (source, copy):
+        path.parent.mkdir()
+        path.write_text("")
+    error = OSError(errno.ENOSPC, "No space left on device", str(source), None, str(copy))
+    assert disk_error(error, tmp_path).file == copy.parent
 
 
 def test_the_traceback_of_a_failure_goes_once_its_step_succeeds_even_by_code_of_before(project):
