@@ -23,6 +23,7 @@ import yaml
 from PIL import Image
 
 from factorlib.dataset.check import IMAGES, MESHES, RESERVED_PHOTOS
+from factorlib.dataset.read import UNKNOWN
 from factorlib.dataset.schema import LEFT_OUT, LONGEST_NAME, MAX_MATERIALS
 from factorlib.disk import disk_error
 from factorlib.errors import InputError
@@ -33,7 +34,6 @@ from factorlib.meshes.read import read_parts
 from factorlib.reading import read_bytes, reading
 from factorlib.wholefile import write_text
 
-UNKNOWN = "?"
 REMARK = """\
 # What the files say; `?` is for you to write.  Every key: docs/dataset.md
 # materials: label k of a mask is the k-th, from 1;  parts: part of a mesh -> material
@@ -89,7 +89,7 @@ def new_dataset(target: Path, photos: Path, masks: Path | None, meshes: Path | N
         missing.append("there is no mesh: give MESHES=<folder>; rough ones will do")
     if not materials:
         missing.append("no mask names a material: write the names in `materials`, label k of a mask the k-th")
-    spec = {"format": 1, "materials": materials, "meshes": entries, "photos": []}
+    spec = {"format": 1, "materials": materials or [UNKNOWN], "meshes": entries, "photos": []}
     for photo, path in named.items():
         objects = [{"name": mesh, "mesh": mesh} for mesh in shown[photo] or [UNKNOWN] * bool(entries)]
         if objects and silhouettes.get(photo):

@@ -10,20 +10,24 @@ import logging
 import mmap
 import os
 import re
+from collections.abc import Iterator
 from pathlib import Path, PurePosixPath
+from typing import Any
 
 from factorlib.dataset.check import check_dataset, check_lights, check_truth
 from factorlib.dataset.gltf import buffer_path, read_header
 from factorlib.dataset.paths import Refusal, is_there
 from factorlib.dataset.schema import Dataset, DatasetFile, TruthFile
 from factorlib.errors import InputError
-from factorlib.reading import check_plain, path_inside, reading
-from factorlib.yamlfile import read_yaml
+from factorlib.reading import check_plain, path_inside, read_text, reading
+from factorlib.yamlfile import MOST_BYTES, load_yaml, read_yaml
 
 FILE = "dataset.yaml"
 RESERVED = ("studies", "bench", "store", "docs")  # folders of build/ that are no datasets
 MTLLIB = re.compile(rb"^mtllib[ \t]+([^\r\n]+)", re.MULTILINE)
 log = logging.getLogger("factorlib.dataset")
+UNKNOWN = "?"
+MOST_NAMED = 20  # of the places that are left open
 
 
 def read_dataset(path: str | Path) -> Dataset:
@@ -40,6 +44,14 @@ def read_dataset(path: str | Path) -> Dataset:
     if folder.name in RESERVED:
         cure = "rename its folder: build/ uses that name"
         raise InputError(f"a dataset cannot be called {folder.name!r}", file=file, cure=cure)
+    if UNKNOWN in read_text(file, "a YAML file", most_bytes=MOST_BYTES) and (
+        places := list(_left_open(load_yaml(file)))
+    ):
+        named = ", ".join(places[:MOST_NAMED]) + f" and {len(places) - MOST_NAMED} more" * (len(places) > MOST_NAMED)
+        found = f"{len(places)} places are left open" if len(places) > 1 else "one place is left open"
+        raise InputError(
+            f"{found}: {named}", file=file, key=places[0], cure="write what belongs there, in place of `?`"
+        )
     spec, external = read_yaml(file, DatasetFile), {}
     check_dataset(spec, file)
     refuse = Refusal(file, file.parent)
@@ -50,6 +62,18 @@ def read_dataset(path: str | Path) -> Dataset:
         spec, external = external_cameras(spec, file)
     check_lights(spec.photos, file)
     return Dataset(folder=folder, spec=spec, companions=companions, external=external, truth=_read_truth(spec, file))
+
+
+def _left_open(value: Any, key: str = "") -> Iterator[str]:
+    """The keys of all values that are `?`, as `make new` leaves what no file says."""
+    if value == UNKNOWN:
+        yield key
+    elif isinstance(value, dict):
+        for name, item in value.items():
+            yield from _left_open(item, f"{key}.{name}" if key else str(name))
+    elif isinstance(value, list):
+        for index, item in enumerate(value):
+            yield from _left_open(item, f"{key}[{index}]")
 
 
 def _read_truth(spec: DatasetFile, file: Path) -> TruthFile | None:

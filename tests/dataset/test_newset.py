@@ -59,6 +59,23 @@ def test_labels_become_materials_parts_are_left_open_and_a_further_mask_is_the_s
         read_dataset(folder / "data" / "mine")
 
 
+def test_all_places_that_are_left_open_are_named_at_once(folder):
+    """Of photos and meshes alone, too: what to write next is one list."""
+    made(folder, masks=None)
+    with pytest.raises(InputError) as error:
+        read_dataset(folder / "data" / "mine")
+    said = str(error.value)
+    for place in (
+        "5 places",
+        "materials[0]",
+        "meshes.chair.parts.shell",
+        "meshes.chair.parts.legs",
+        "photos[0].masks",
+        "photos[1].masks",
+    ):
+        assert place in said, place
+
+
 def test_a_mask_for_each_material_names_the_parts_and_nothing_is_missing(folder):
     masks(folder, kitchen_shell=SHELL, IMG_0412_shell=SHELL, kitchen__legs=LEGS, IMG_0412__legs=LEGS)
     missing, spec = made(folder)
@@ -100,7 +117,7 @@ def test_what_is_missing_is_listed(folder):
         "no mask names a material: write the names in `materials`, label k of a mask the k-th",
     ]
     assert spec["photos"][0]["masks"] == "?" and spec["photos"][1]["objects"] == []
-    with pytest.raises(InputError, match="1 to 254"):
+    with pytest.raises(InputError, match=r"materials\[0\]"):
         read_dataset(folder / "data" / "mine")
 
 
