@@ -59,7 +59,7 @@ class Answer(msgspec.Struct, frozen=True):
         return table.MaterialTable(solved, gauge, self.model())
 
     def _kinds(self, errors: Materials) -> list[table.Kind | UnsetType]:
-        """Of each material, where materials were fitted under a prior of classes; in the gauge of that fit."""
+        """Return the likeliest class of each material, in the gauge of the fit; none where the solver has no classes."""
         if self.solution.materials is None:
             return [UNSET] * len(self.names)
         materials, relative = self.solution.point.materials, errors.specular.mean(1)

@@ -46,8 +46,8 @@ class Effects(msgspec.Struct, frozen=True):
         return problem.with_effects(self.shadows.kept, self.bounces.kept)
 
 
-class Curves(msgspec.Struct, frozen=True):
-    """The fit with the tone curves that are kept, and the evidence for each light's."""
+class Chosen(msgspec.Struct, frozen=True):
+    """The fit that a choice ends with, and the evidence for each thing that was asked: for each light, or for each splitting."""
 
     fit: Fit
     evidence: list[Evidence]
@@ -91,12 +91,12 @@ def _geometric_mean(losses: Losses) -> float:
     return round(float(np.dot(counts, logs)) / max(sum(counts), 1), 6)
 
 
-def curves_chosen(problem: JointProblem, before: Fit, choices: Choices, fit: Fitting) -> Curves:
+def curves_chosen(problem: JointProblem, before: Fit, choices: Choices, fit: Fitting) -> Chosen:
     """Tone curves; problem: sure observations, with the effects that were chosen;  before: the fit of few of them."""
     lights = before.point.lights
     had = [len(light.log_tone) > 0 for light in lights]
     if choices.tone == "off" or problem.none_held_out:
-        return Curves(before, [Evidence(has) for has in had])
+        return Chosen(before, [Evidence(has) for has in had])
     sample = sample_of(problem, choices)
     freed = [light if has else light.with_curves() for light, has in zip(lights, had, strict=True)]
     curved = fit("tone curves", sample, before.with_lights(freed), CURVED)
@@ -107,8 +107,8 @@ def curves_chosen(problem: JointProblem, before: Fit, choices: Choices, fit: Fit
         kept = one.kept and gain > CURVED_GAIN and not light.beyond_cameras
         evidence.append(Evidence(True) if had[k] else msgspec.structs.replace(one, kept=kept))
     if all(one.kept for one in evidence):
-        return Curves(curved, evidence)
+        return Chosen(curved, evidence)
     if not any(one.kept and not has for one, has in zip(evidence, had, strict=True)):
-        return Curves(before, evidence)
+        return Chosen(before, evidence)
     kept = [new if one.kept else old for new, old, one in zip(curved.point.lights, lights, evidence, strict=True)]
-    return Curves(fit("tone curves", sample, before.with_lights(kept), CURVED), evidence)
+    return Chosen(fit("tone curves", sample, before.with_lights(kept), CURVED), evidence)

@@ -24,7 +24,7 @@ from factorlib.model.gauge import in_gauge
 from factorlib.model.lights import Light, even_cells
 from factorlib.model.materials import Point
 from factorlib.model.problem import JointProblem
-from factorlib.solve.choices import TRIAL_CELLS, Curves, Effects, curves_chosen, effects_chosen
+from factorlib.solve.choices import TRIAL_CELLS, Chosen, Effects, curves_chosen, effects_chosen
 from factorlib.solve.evidence import AGAINST, FINER, Evidence, compare, losses_of
 from factorlib.solve.fit import Fit, Schedule, sure_ones
 from factorlib.solve.history import Report, Solution, unreported
@@ -53,20 +53,6 @@ class Run(msgspec.Struct, frozen=True):
     prior: LightPrior = msgspec.field(default_factory=read_light_prior)
 
 
-class Split(msgspec.Struct, frozen=True):
-    """What splitting led to: the fit, and the evidence for each splitting."""
-
-    fit: Fit
-    evidence: list[Evidence]
-
-
-class Suns(msgspec.Struct, frozen=True):
-    """The lights with suns, and the evidence for each light's."""
-
-    fit: Fit
-    evidence: list[Evidence]
-
-
 def solve(problem: JointProblem, start: Start, run: Run | None = None) -> Solution:
     """The answer, in the gauge of `factorlib.model.gauge`; problem: all observations, its loss judges those that are held out."""
     run = run or Run()
@@ -75,14 +61,14 @@ def solve(problem: JointProblem, start: Start, run: Run | None = None) -> Soluti
     points = start(sure, few)
     effects = parts.part("effects", Effects, lambda: effects_chosen(sure, points, choices, parts.fit))
     problem, sure = effects.of(problem), effects.of(sure)
-    curves = parts.part("tone", Curves, lambda: curves_chosen(sure, effects.fit, choices, parts.fit))
+    curves = parts.part("tone", Chosen, lambda: curves_chosen(sure, effects.fit, choices, parts.fit))
     some, all_ = (of.sampled(choices.observations, choices.seed) for of in (sure, problem))
     lights = curves.fit.point.lights  # of which an earlier solution's keep their cells
     begun = curves.fit.with_lights([on_cells(one, choices.cells) if len(one) == few else one for one in lights])
     fit = parts.part("materials", Fit, lambda: parts.judged("materials and lights", some, begun, MATERIALS))
-    split = parts.part("splitting", Split, lambda: split_while_gaining(some, fit, choices, parts))
+    split = parts.part("splitting", Chosen, lambda: split_while_gaining(some, fit, choices, parts))
     smooth = parts.part("lights", Fit, lambda: parts.judged("lights", all_, split.fit, LIGHTS))
-    suns = parts.part("suns", Suns, lambda: suns_chosen(all_, smooth, parts))
+    suns = parts.part("suns", Chosen, lambda: suns_chosen(all_, smooth, parts))
     lights = suns.fit
     return Solution(
         in_gauge(lights.point, problem.blocks),
@@ -99,13 +85,13 @@ def solve(problem: JointProblem, start: Start, run: Run | None = None) -> Soluti
     )
 
 
-def suns_chosen(problem: JointProblem, fit: Fit, parts: Parts) -> Suns:
+def suns_chosen(problem: JointProblem, fit: Fit, parts: Parts) -> Chosen:
     """Suns in the lights that have one (`factorlib.solve.suns`); the other lights stay as they are."""
     before = problem.illuminations(fit.point)
     tried = list(problem.spread(partial(candidate, sharpness=SUN), before))
     evidence = [Evidence(bool(one.light.suns.any())) for one in before]
     if all(light is one.light for light, one in zip(tried, before, strict=True)):
-        return Suns(fit, evidence)
+        return Chosen(fit, evidence)
     trial = parts.judged("suns", problem, fit.with_lights(tried), AROUND_SUNS)
     after = problem.illuminations(trial.point)
     for k, (cells, sun) in enumerate(zip(before, after, strict=True)):
@@ -124,10 +110,10 @@ def suns_chosen(problem: JointProblem, fit: Fit, parts: Parts) -> Suns:
         [new if one.kept else old for one, new, old in zip(evidence, *both, strict=True)]
         for both in ((trial.point.lights, fit.point.lights), (trial.hyperparameters, fit.hyperparameters))
     )
-    return Suns(msgspec.structs.replace(fit.with_lights(lights), hyperparameters=hyperparameters), evidence)
+    return Chosen(msgspec.structs.replace(fit.with_lights(lights), hyperparameters=hyperparameters), evidence)
 
 
-def split_while_gaining(problem: JointProblem, fit: Fit, choices: Choices, parts: Parts) -> Split:
+def split_while_gaining(problem: JointProblem, fit: Fit, choices: Choices, parts: Parts) -> Chosen:
     """Splitting after splitting, until there were `Choices.splittings`.  One that does not explain held-out observations better by more than
     FINER standard errors is undone and the last; one that lowers their loss by less than WORTH is kept and the last."""
     evidence, before = [], losses_of(problem, fit.point)
@@ -140,7 +126,7 @@ def split_while_gaining(problem: JointProblem, fit: Fit, choices: Choices, parts
             fit, before = trial, after
         if not one.kept or one.held_out_loss_without < (1 + WORTH) * one.held_out_loss_with:
             break
-    return Split(fit, evidence)
+    return Chosen(fit, evidence)
 
 
 def brightest(light: Light) -> Bool[np.ndarray, " p"]:

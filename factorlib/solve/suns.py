@@ -1,6 +1,6 @@
 """Suns: light that comes from one direction, where photographs ask for it.
 
-The sun's disc is half a degree wide and holds a fifth to two thirds of the light outdoors.  Cells share that energy out among all directions which
+The sun's disc is half a degree wide and holds a quarter to two thirds of the light where it shines.  Cells share that energy out among all directions which
 the observations cannot tell apart, ten degrees and more, and what is lit by such a light has no crisp shadow.  Direction and energy are known far
 better than width, and natural light knows the width.  So two lights are tried (`candidate`).  In both, cells within `DISC` of the brightest
 direction show what surrounds them, and one lobe is added, as narrow as the sun or as `WIDE` as a window or a lamp.  Its direction z and its weight
@@ -10,7 +10,8 @@ w ≥ 0 are those of least
 
 which is linear in w and searched over a grid of z, coarse and then fine.  Then cells are fitted anew around either lobe.  The sun is kept if the light
 with it explains the observations better than cells alone (`clearly_better`), unless they speak against it beside the wide lobe (`AGAINST`),
-for natural light has suns.  Air scatters blue out of the sun's light into the sky's, so that no sun is bluer than the light as a whole.  All observations decide: a sun has five unknowns and takes those of dozens of cells, so that it cannot overfit.
+for natural light has suns.  Air scatters blue out of the sun's light into the sky's, so that no sun is
+bluer than the light as a whole.  All observations decide: a sun has five unknowns and takes those of dozens of cells, so that it cannot overfit.
 """
 
 from __future__ import annotations
