@@ -19,7 +19,7 @@ import typer
 
 from factorlib.errors import InputError
 from factorlib.jsonfile import json_text, write_json
-from factorlib.reading import read_bytes
+from factorlib.reading import read_bytes, reading
 from factorlib.solve.material_prior import Classes, MaterialClass
 
 # Effect paints, satins with metallic threads and iridescent foils have flakes or wires that reflect as metal does.
@@ -44,7 +44,10 @@ def classes_of(path: Path) -> Classes:
     for row in rows:
         name = row["material"].split("/")[-1]
         kind = "fabric" if re.search(FIBROUS, name) else "metal" if re.search(METALS, name) else "dielectric"
-        by_class[kind].append([float(row[column]) for column in COLUMNS[1:]])
+        with reading("a table of materials", path, f"the row of {name}", "give numbers there"):
+            by_class[kind].append([float(row[column]) for column in COLUMNS[1:]])
+            if not np.isfinite(by_class[kind][-1]).all():
+                raise ValueError("a value is not finite")
     if few := [name for name, values in by_class.items() if len(values) < 4]:
         raise InputError(
             f"only few rows are of the class {few[0]}", file=path, cure="name the materials by what they are"
