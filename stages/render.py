@@ -47,8 +47,12 @@ def main(params: Params, inputs: Inputs, out: Path, progress: Progress) -> None:
     name, names, file = inputs.photo, inputs.facts["dataset.materials"], inputs["export"] / "materials.json"
     exported, model = read_materials(file), read_materials(inputs["solve"] / "materials.json").model
     photo, geometry = (read_exr(inputs[stage] / f"{name}.exr") for stage in ("masks", "align"))
-    light = light_of(inputs["export"], name, msgspec.convert(inputs.facts["dataset.light"], LightSlice))
-    reflector = Reflector(reflection_operator(params.operator, weights=inputs["train"]), light, params.tail)
+    slice_ = msgspec.convert(inputs.facts["dataset.light"], LightSlice)
+    light, operator = (
+        light_of(inputs["export"], name, slice_),
+        reflection_operator(params.operator, weights=inputs["train"]),
+    )
+    reflector = Reflector(operator, light, params.tail, model.curvature(slice_.illumination))
     exposure = exposure_of(np.stack([photo[c] for c in "RGB"], axis=-1), photo["valid"] > 0.5)
     total, materials = 10 + len(names), in_order(exported, names, file)
 
@@ -74,13 +78,15 @@ def main(params: Params, inputs: Inputs, out: Path, progress: Progress) -> None:
 
 
 def surroundings(inputs: Inputs, model: Model, gauge: Gauge) -> Surroundings | None:
-    """What the solve took into account of the photo's visibility, and of what its surfaces send to each other.
+    """What the solve took into account of the photo's visibility, of what its surfaces send to each other, and of where they lie.
 
     gauge: of the materials that are rendered; its factor went out of the lights, but not out of what the photo shows
     """
-    if not model.self_shadowing:
+    if not (model.self_shadowing or model.distance):
         return None
     seen = read_observations(inputs["urm"] / f"{inputs.photo}.parquet")
+    if not model.self_shadowing:
+        seen = msgspec.structs.replace(seen, visibility=None, met=None)
     sent = bounced_light(seen, seen.radiance.astype(float)) if model.interreflection else None
     return Surroundings(seen, None if sent is None else sent / (gauge.export_factor or 1.0))
 

@@ -120,6 +120,8 @@ class Answer(msgspec.Struct, frozen=True):
                 for photo, log_tone in zip(block.photos, light.log_tone, strict=False)
             },
             tone_chosen_by=_by_name([block.name for block, _ in lit], solution.tone),
+            distance={block.name: 1 / light.curvature for block, light in lit if light.curvature > 0},
+            distance_chosen_by=_by_name([block.name for block, _ in lit], solution.distances),
             started_from=started,
         )
 

@@ -231,7 +231,9 @@ def relative_standard_errors(illumination: Illumination, loss: Loss, sigma: floa
     light, count, directions = illumination.light, len(illumination.block), map_directions()
     rows = np.sort(np.random.default_rng(0).permutation(count)[:SAMPLE])
     sample = msgspec.structs.replace(illumination, block=illumination.block.take(rows).with_none_held_out())
-    atoms = sample.atoms(np.arange(len(rows)), UnitLobes(directions, np.full(len(directions), PROBE_SHARPNESS)))
+    atoms = sample.atoms(
+        np.arange(len(rows)), UnitLobes(directions, np.full(len(directions), PROBE_SHARPNESS), light.curvature)
+    )
     every = places_of(sample)  # materials that the block does not show have no columns
     first = len(every) - unknowns(light)
     others = np.r_[0:first, first + 6 * len(light) : len(every)]

@@ -35,11 +35,12 @@ NEAR_BOUNDS = 0.8  # of the logarithms of that range: the exponents of cameras l
 class UnitLobes(msgspec.Struct, frozen=True):
     """p lobes exp(λ(ω·z − 1)) of weight one.
 
-    axis: z, unit, in the frame of the illumination;  sharpness: λ > 0
+    axis: z, unit, in the frame of the illumination;  sharpness: λ > 0;  curvature: of `factorlib.light.distance`, one over their distance
     """
 
     axis: Float[np.ndarray, "p 3"]
     sharpness: Float[np.ndarray, " p"]
+    curvature: float = 0.0
 
     def __len__(self) -> int:
         return len(self.sharpness)
@@ -54,6 +55,7 @@ class Light(msgspec.Struct, frozen=True):
     """p lobes w·exp(λ(ω·z − 1)) of one illumination and the log exposures of its f photos (the first is 0).
 
     log_tone: log exponents of the photos' tone curves (`images.tone`); none where the photos are taken to be linear
+    curvature: one over the light's distance (`factorlib.light.distance`); 0: infinitely far away
     """
 
     axis: Float[np.ndarray, "p 3"]  # unit, in the illumination's frame
@@ -61,6 +63,7 @@ class Light(msgspec.Struct, frozen=True):
     weight: Float[np.ndarray, "p 3"]  # in the illumination's own radiance unit
     log_exposure: Float[np.ndarray, " f"]
     log_tone: Float[np.ndarray, " f"] = msgspec.field(default_factory=lambda: np.zeros(0))
+    curvature: float = 0.0
 
     def __len__(self) -> int:
         return len(self.log_sharpness)
@@ -83,7 +86,7 @@ class Light(msgspec.Struct, frozen=True):
     @property
     def unit_lobes(self) -> UnitLobes:
         """Return the lobes without their weights."""
-        return UnitLobes(self.axis, self.sharpness)
+        return UnitLobes(self.axis, self.sharpness, self.curvature)
 
     @property
     def log_radiance(self) -> Float[np.ndarray, "3 p"]:

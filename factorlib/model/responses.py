@@ -27,6 +27,7 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
+from factorlib.light.distance import met_from
 from factorlib.light.visibility import cosine_weights, highlight_weights, kernel, seen_share
 from factorlib.model.blocks import Block
 from factorlib.model.lights import UnitLobes
@@ -49,19 +50,29 @@ def radiance_of(exposure: A, diffuse: A, specular: A, by_diffuse: A, by_specular
 
 def diffuse_response(block: Block, rows: Rows, lobes: UnitLobes, operator: Operator) -> Float[np.ndarray, "n p"]:
     """D at `rows`; float64."""
-    sharpness, nz = (_tensor(v, operator) for v in (lobes.sharpness, block.normal[rows] @ lobes.axis.T))
+    nz, _, larger = met_cosines(block, rows, lobes)
     with torch.no_grad():
-        return shadowed(operator.diffuse(sharpness, nz), block, rows, lobes).double().numpy()
+        response = operator.diffuse(_tensor(lobes.sharpness, operator), _tensor(nz, operator))
+        return larger * shadowed(response, block, rows, lobes).double().numpy()
 
 
 def specular_response(
     block: Block, rows: Rows, lobes: UnitLobes, roughness: float, operator: Operator
 ) -> Float[np.ndarray, "n p"]:
     """S at `rows`, for a material of that roughness; float64."""
-    no, nz, oz = cosines(block.normal[rows], block.view[rows], lobes.axis)
+    nz, oz, larger = met_cosines(block, rows, lobes)
+    no = (block.normal[rows] * block.view[rows]).sum(1)
     inputs = (_tensor(v, operator) for v in (np.float64(roughness), lobes.sharpness, no, nz, oz))
     with torch.no_grad():
-        return shadowed(operator.specular(*inputs), block, rows, lobes, roughness).double().numpy()
+        return larger * shadowed(operator.specular(*inputs), block, rows, lobes, roughness).double().numpy()
+
+
+def met_cosines(block: Block, rows: Rows, lobes: UnitLobes) -> tuple[np.ndarray, np.ndarray, np.ndarray | float]:
+    """n·z', o·z' and w'/w of (1) of `factorlib.light.distance` [n, p]; for shadows alone the light is far away."""
+    normal, view = block.normal[rows], block.view[rows]
+    if lobes.curvature == 0 or block.place is None:
+        return normal @ lobes.axis.T, view @ lobes.axis.T, 1.0
+    return met_from(block.place[rows], normal, view, lobes.axis, lobes.curvature)
 
 
 def cosines(normal: A, view: A, axis: A) -> tuple[A, A, A]:

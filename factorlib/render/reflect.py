@@ -8,7 +8,8 @@ Specular   At each point a few lobes make up nearly all of the radiance.  The op
            of the point's radiance in every channel, and the closed form errs by about a fifth of that.
            tail = 0: the operator throughout.
 
-Points that do not see every direction (`Shadows`) reflect of each lobe what they see, as in the solve.
+Points that do not see every direction (`Shadows`) reflect of each lobe what they see, and points beside the middle meet a light of
+finite distance as `factorlib.light.distance` says, as in the solve.
 """
 
 from __future__ import annotations
@@ -21,6 +22,7 @@ import torch
 from jaxtyping import Bool, Float, Int, UInt8
 from torch import Tensor
 
+from factorlib.light.distance import met_from
 from factorlib.light.lobes import Lobes
 from factorlib.light.visibility import cosine_weights, highlight_weights, kernel, seen_share
 from factorlib.reflection import Operator, reflection_operator
@@ -55,8 +57,9 @@ class Shadows(msgspec.Struct, frozen=True):
 class Reflector:
     """One light, seen by any number of materials and points; `lobes` in the frame of the normals and views."""
 
-    def __init__(self, operator: Operator, lobes: Lobes, tail: float = TAIL):
+    def __init__(self, operator: Operator, lobes: Lobes, tail: float = TAIL, curvature: float = 0.0):
         lit = lobes.weight.max(axis=1) > 0
+        self.curvature = curvature
         self.operator, self.cheap, self.tail = operator, reflection_operator("closed_form"), tail
         self.axis, self.weight = (self._tensor(field[lit]) for field in (lobes.axis, lobes.weight))
         self.sharpness = self._tensor(lobes.sharpness[lit])
@@ -69,14 +72,16 @@ class Reflector:
         views: Float[np.ndarray, "n 3"],
         report: Report = silently,
         shadows: Shadows | None = None,
+        place: Float[np.ndarray, "n 3"] | None = None,
     ) -> Float[np.ndarray, "n 3"]:
-        """Radiance toward unit `views` of points with unit `normals`; float64, zero where a normal faces away."""
+        """Radiance toward unit `views` of points with unit `normals`; float64, zero where a normal faces away.  place: None is the middle."""
         result, step = np.zeros((len(normals), 3)), max(1, PAIRS_AT_ONCE // max(len(self.sharpness), 1))
         with torch.no_grad():
             for i in range(0, len(normals) if len(self.sharpness) else 0, step):
                 rows = slice(i, i + step)
                 some = None if shadows is None else shadows.take(rows)
-                geometry = self._tensor(normals[rows]), self._tensor(views[rows])
+                x = None if place is None or self.curvature == 0 else self._tensor(place[rows])
+                geometry = self._tensor(normals[rows]), self._tensor(views[rows]), x
                 result[rows] = self._radiance(material, *geometry, some).double().numpy()
                 report(min(i + step, len(normals)), len(normals))
         return result
@@ -85,13 +90,16 @@ class Reflector:
         return torch.as_tensor(np.ascontiguousarray(values), dtype=self.operator.dtype)
 
     def _radiance(
-        self, material: MaterialLike, normals: Tensor, views: Tensor, shadows: Shadows | None
+        self, material: MaterialLike, normals: Tensor, views: Tensor, place: Tensor | None, shadows: Shadows | None
     ) -> Float[Tensor, "n 3"]:
         kd, ks = (torch.tensor(k, dtype=self.operator.dtype) for k in (material.diffuse, material.specular))
         no, nz, oz = (normals * views).sum(-1), (normals @ self.axis.T).clamp(-1, 1), (views @ self.axis.T).clamp(-1, 1)
         diffuse_seen, specular_seen = (
             (1.0, 1.0) if shadows is None else self._seen(shadows, normals, views, float(material.roughness))
         )
+        if place is not None:
+            nz, oz, larger = met_from(place, normals, views, self.axis, self.curvature)
+            diffuse_seen, specular_seen = larger * diffuse_seen, larger * specular_seen
         radiance = kd * ((diffuse_seen * self._diffuse(nz)) @ self.weight)
         if bool(ks.any()):
             roughness = torch.tensor(material.roughness, dtype=self.operator.dtype)

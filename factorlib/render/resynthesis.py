@@ -77,8 +77,8 @@ def resynthesised(
         pixels = label == k
         unit = [of[pixels].astype(float) for of in (normal, view)]
         unit = [of / np.linalg.norm(of, axis=-1, keepdims=True) for of in unit]
-        shadows, sent = (None, None) if around is None else around_pixels(around, k - 1, *np.nonzero(pixels))
-        shown = reflector(material, unit[0], unit[1], of_all, shadows)
+        shadows, sent, place = (None,) * 3 if around is None else around_pixels(around, k - 1, *np.nonzero(pixels))
+        shown = reflector(material, unit[0], unit[1], of_all, shadows, place)
         if sent is not None:
             bounced = np.array(material.diffuse) * sent[:, :3] + np.array(material.specular) * sent[:, 3:]
             shown += bounced * (np.sum(unit[0] * unit[1], 1, keepdims=True) > 0)
@@ -89,15 +89,18 @@ def resynthesised(
 
 def around_pixels(
     around: Surroundings, material: int, y: Int[np.ndarray, " n"], x: Int[np.ndarray, " n"]
-) -> tuple[Shadows | None, Float[np.ndarray, "n 6"] | None]:
-    """What pixels of a material see and are sent: what the nearest observed pixel of it is; None for all and for nothing."""
+) -> tuple[Shadows | None, Float[np.ndarray, "n 6"] | None, Float[np.ndarray, "n 3"] | None]:
+    """What pixels of a material see and are sent, and where they lie: as the nearest observed pixel of it; None for all, nothing, the middle."""
     rows = np.flatnonzero(around.seen.material == material)
     of = around.seen.take(rows)
-    if of.visibility is None or len(of) == 0 or len(x) == 0:
-        return None, None
+    if len(of) == 0 or len(x) == 0:
+        return None, None, None
     nearest = cKDTree(np.column_stack([of.x, of.y])).query(np.column_stack([x, y]))[1]
     sent = None if around.sent is None else around.sent[rows[nearest]]
-    return Shadows(of.visibility, fibonacci_sphere(of.visibility.shape[1]), nearest), sent
+    place = None if of.place is None else of.place[nearest]
+    if of.visibility is None:
+        return None, sent, place
+    return Shadows(of.visibility, fibonacci_sphere(of.visibility.shape[1]), nearest), sent, place
 
 
 def ball(reflector: Reflector, material: MaterialLike, size: int) -> Float[np.ndarray, "size size 3"]:

@@ -122,6 +122,7 @@ class Model(msgspec.Struct, frozen=True):
     splitting_chosen_by: of each time that cells were split
     suns_chosen_by: of a sun in each illumination
     tone:            curves of the photos that have one;  tone_chosen_by: by illumination
+    distance:        of lights that are not infinitely far away, in RMS distances of what a photo shows from its middle;  distance_chosen_by: by illumination
     """
 
     solver: Literal["bundle", "few_lobes", "paper"] = "bundle"
@@ -139,7 +140,13 @@ class Model(msgspec.Struct, frozen=True):
     suns_chosen_by: dict[str, Decision] = {}
     tone: dict[str, Tone] = {}
     tone_chosen_by: dict[str, Decision] = {}
+    distance: dict[str, Positive] = {}
+    distance_chosen_by: dict[str, Decision] = {}
     started_from: Started | UnsetType = UNSET
+
+    def curvature(self, illumination: str) -> float:
+        """One over the distance of a light; 0 where it is infinitely far away."""
+        return 1 / self.distance[illumination] if illumination in self.distance else 0.0
 
 
 class MaterialTable(msgspec.Struct, frozen=True):

@@ -5,6 +5,8 @@
     tone      exponents of tone curves are freed for all photos, and kept where evidence is for them, where the loss without them is more
               than `CURVED_GAIN` higher, and where they end within what cameras do: an exponent also fits some errors of the rest of
               the model, such as normals
+    distance  of `CURVATURES` the one with which held-out observations are explained best, where evidence is for it; else a light is
+              infinitely far away
     roughness where there are few materials, the start decides in which local minimum a fit ends: a smooth surface in a soft light looks like a
               rough one in a sharp light.  Of the fits from several starts, the one of least held-out loss goes on
 
@@ -30,6 +32,13 @@ CURVED = Schedule(together=(8,), estimate=False)
 # Of the held-out loss.  By two standard errors alone a photo whose pose is wrong got a curve (margin 3.0, captured set of seed 7), and k_d was
 # 30 % wrong instead of 13 %.
 CURVED_GAIN = 0.25
+CURVATURES = (
+    0.05,
+    0.1,
+    0.2,
+)  # a chair in a room: its points are .4 m from their middle (RMS), walls and lamps 2 to 8 m
+NEARER = Schedule(lights=3, together=(6,), estimate=False)
+GIVEN = Schedule(lights=6, estimate=False, given=True)
 
 Fitting = Callable[[str, JointProblem, Fit, Schedule], Fit]  # what is fitted, to what, from where, by how many steps
 
@@ -112,3 +121,47 @@ def curves_chosen(problem: JointProblem, before: Fit, choices: Choices, fit: Fit
         return Chosen(before, evidence)
     kept = [new if one.kept else old for new, old, one in zip(curved.point.lights, lights, evidence, strict=True)]
     return Chosen(fit("tone curves", sample, before.with_lights(kept), CURVED), evidence)
+
+
+def distances_chosen(problem: JointProblem, before: Fit, choices: Choices, fit: Fitting) -> Chosen:
+    """Distances of lights; problem: sure observations, with the effects that were chosen;  before: the fit of few of them.
+
+    First materials and all lights are fitted at each distance: materials that were fitted in far lights make up for what is wrong with those.
+    But materials that are better in near lights explain every light better, so a light stays near only if, given these materials, it also
+    explains its observations better than a far one.
+    """
+    lights = before.point.lights
+    known = [light.curvature > 0 or block.place is None for light, block in zip(lights, problem.blocks, strict=True)]
+    evidence = [Evidence(light.curvature > 0) for light in lights]
+    if choices.distance == "off" or problem.none_held_out or all(known):
+        return Chosen(before, evidence)
+    sample, asked = sample_of(problem, choices), np.flatnonzero(~np.array(known)).tolist()
+
+    def fit_at(curvatures: dict[int, float], start: Fit = before, schedule: Schedule = NEARER) -> Fit:
+        """The fit in lights of these curvatures, by number."""
+        placed = list(start.point.lights)
+        for k, c in curvatures.items():
+            placed[k] = msgspec.structs.replace(placed[k], curvature=c)
+        return fit("distances", sample, start.with_lights(placed), schedule)
+
+    def judged(far: Fit, near: Fit, k: int) -> Evidence:
+        """The evidence of light k."""
+        both = (losses_of(sample, one.point) for one in (far, near))
+        return compare(*(Losses([of.values[k]], [of.clusters[k]]) for of in both), FOR)
+
+    far, *near = (fit_at(dict.fromkeys(asked, c)) for c in (0.0, *CURVATURES))
+    curvature = {}
+    for k in asked:
+        tried = [judged(far, one, k) for one in near]
+        best = min(range(len(near)), key=lambda i: (not tried[i].kept, tried[i].held_out_loss_with or 0.0))
+        evidence[k] = tried[best]
+        if tried[best].kept:
+            curvature[k] = CURVATURES[best]
+    if not curvature:
+        return Chosen(before, evidence)
+    chosen = fit_at(curvature)
+    there, away = (fit_at(of, chosen, GIVEN) for of in (curvature, dict.fromkeys(curvature, 0.0)))
+    for k in curvature:
+        evidence[k] = judged(away, there, k)
+    kept = {k: c for k, c in curvature.items() if evidence[k].kept}
+    return Chosen((chosen if kept == curvature else fit_at(kept)) if kept else before, evidence)

@@ -36,6 +36,7 @@ PHASES = (
     "shadows",
     "shadows and bounces",
     "tone curves",
+    "distances",
     "materials and lights",
 )  # then splittings, and lights, which also stands for the suns that few lights have
 POINTS = 30  # of a phase: about as many as are tried
@@ -51,7 +52,7 @@ class Solution(msgspec.Struct, frozen=True):
     history     every point that was tried;  loss: the loss function that judges held-out observations
     lambertian  materials without specular part
     shadows     whether visibility was used, with its evidence;  interreflection: whether surfaces light each other
-    specular    the evidence for each material's specular part, tone: for each light's tone curves; empty where nothing was tried
+    specular    the evidence for each material's specular part, tone, distances: for each light's tone curves and distance; empty where nothing was tried
     splitting   the evidence for each splitting of the lights' cells
     suns        the evidence for each light's sun
     materials   where lights are cells: the fit of the sure observations, whose materials the answer has;  lights: that of all
@@ -65,6 +66,7 @@ class Solution(msgspec.Struct, frozen=True):
     interreflection: Evidence = Evidence(False)
     specular: list[Evidence] = []
     tone: list[Evidence] = []
+    distances: list[Evidence] = []
     splitting: list[Evidence] = []
     suns: list[Evidence] = []
     materials: Fit | None = None

@@ -1,6 +1,6 @@
 """The joint solve: one reflectance per material and one light per illumination, from all photos at once.
 
-    effects     shadows and bounces, and tone curves, are chosen by held-out observations (`factorlib.solve.choices`)
+    effects     shadows and bounces, tone curves and distances of lights are chosen by held-out observations (`factorlib.solve.choices`)
     materials   materials and lights are fitted together, to observations whose normals are sure (`factorlib.solve.fit`)
     splitting   the cells that hold most of each light's energy split in four, while held-out observations gain: what is sharper than a cell
                 looks as if materials were smoother.  Suns and lamps are cells split deep
@@ -24,7 +24,7 @@ from factorlib.model.gauge import in_gauge
 from factorlib.model.lights import Light, even_cells
 from factorlib.model.materials import Point
 from factorlib.model.problem import JointProblem
-from factorlib.solve.choices import TRIAL_CELLS, Chosen, Effects, curves_chosen, effects_chosen
+from factorlib.solve.choices import TRIAL_CELLS, Chosen, Effects, curves_chosen, distances_chosen, effects_chosen
 from factorlib.solve.evidence import AGAINST, FINER, Evidence, compare, losses_of
 from factorlib.solve.fit import Fit, Schedule, sure_ones
 from factorlib.solve.history import Report, Solution, unreported
@@ -62,9 +62,10 @@ def solve(problem: JointProblem, start: Start, run: Run | None = None) -> Soluti
     effects = parts.part("effects", Effects, lambda: effects_chosen(sure, points, choices, parts.fit))
     problem, sure = effects.of(problem), effects.of(sure)
     curves = parts.part("tone", Chosen, lambda: curves_chosen(sure, effects.fit, choices, parts.fit))
+    distances = parts.part("distances", Chosen, lambda: distances_chosen(sure, curves.fit, choices, parts.fit))
     some, all_ = (of.sampled(choices.observations, choices.seed) for of in (sure, problem))
-    lights = curves.fit.point.lights  # of which an earlier solution's keep their cells
-    begun = curves.fit.with_lights([on_cells(one, choices.cells) if len(one) == few else one for one in lights])
+    lights = distances.fit.point.lights  # of which an earlier solution's keep their cells
+    begun = distances.fit.with_lights([on_cells(one, choices.cells) if len(one) == few else one for one in lights])
     fit = parts.part("materials", Fit, lambda: parts.judged("materials and lights", some, begun, MATERIALS))
     split = parts.part("splitting", Chosen, lambda: split_while_gaining(some, fit, choices, parts))
     smooth = parts.part("lights", Fit, lambda: parts.judged("lights", all_, split.fit, LIGHTS))
@@ -78,6 +79,7 @@ def solve(problem: JointProblem, start: Start, run: Run | None = None) -> Soluti
         shadows=effects.shadows,
         interreflection=effects.bounces,
         tone=curves.evidence,
+        distances=distances.evidence,
         splitting=split.evidence,
         suns=suns.evidence,
         materials=split.fit,

@@ -166,6 +166,7 @@ def known_light(block: Block, constant: Light, earlier: Earlier, factor: Float[n
         np.maximum(lobes.weight, 0) / block.unit / factor * np.exp(exposure[0]),
         exposure - exposure[0],
         np.log(np.clip(tone, *TONE)) if len(tone) == len(block.photos) else np.zeros(0),
+        earlier.table.model.curvature(block.name),
     )
 
 

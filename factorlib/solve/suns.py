@@ -54,7 +54,7 @@ def candidate(illumination: Illumination, sharpness: float) -> Light:
     residual = without.residuals()
     trust = np.sqrt(ROBUST.trust(illumination.residuals()) * ~(block.clipped & (illumination.residuals() >= 0)))
     for radius, step in GRIDS:
-        grid = UnitLobes(axes := _near(z, radius, step), np.full(len(axes), sharpness))
+        grid = UnitLobes(axes := _near(z, radius, step), np.full(len(axes), sharpness), light.curvature)
         A = without.atoms(np.arange(len(block)), grid) * trust.T[:, :, None]  # [3, n, q]
         along, size = np.einsum("cnq,nc->cq", A, trust * residual), np.einsum("cnq,cnq->cq", A, A)
         weight = np.maximum(-along, 0) / np.maximum(size, 1e-30)

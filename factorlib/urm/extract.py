@@ -12,6 +12,7 @@ import msgspec
 import numpy as np
 from jaxtyping import Bool, Float
 
+from factorlib.light.distance import places_of
 from factorlib.urm.observations import Observations
 
 Channels = Mapping[str, Float[np.ndarray, "h w"]]
@@ -40,7 +41,7 @@ def observations_of_photo(
     """One observation per observed pixel, in row order; `weight` and `confidence` are the confidence of its normal, 0 to 1.
 
     photo:     channels R, G, B, label, valid, clipped.R/G/B of the stage `masks`
-    geometry:  channels normal.x/y/z, view.x/y/z, label, confidence of the stage `align`
+    geometry:  channels normal.x/y/z, view.x/y/z, depth, label, confidence of the stage `align`
     least_confidence: 0 to 1; pixels whose normals are less certain are left out
     """
     seen = observed_pixels(photo, geometry, least_confidence)
@@ -53,9 +54,10 @@ def observations_of_photo(
 
     normal, view = (gather(geometry, [f"{name}.{axis}" for axis in "xyz"]) for name in ("normal", "view"))
     normal, view = (v / np.maximum(np.linalg.norm(v, axis=-1, keepdims=True), 1e-12) for v in (normal, view))
+    place = places_of(view, geometry["depth"][seen].astype(float), sure)
     return Observations(
         normal, view, np.maximum(gather(photo, "RGB"), 0.0), gather(photo, [f"clipped.{c}" for c in "RGB"]) > 0.5,
         material=np.rint(photo["label"][seen]).astype("i2") - 1, photo=none, illumination=none, x=x.astype("i4"), y=y.astype("i4"),
-        weight=sure, confidence=sure, materials=tuple(materials),
+        weight=sure, confidence=sure, place=place.astype("f4"), materials=tuple(materials),
         photos=(taken.photo,), illuminations=(taken.illumination,), exposures=(taken.exposure,),
     )  # fmt: skip

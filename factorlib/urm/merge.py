@@ -2,7 +2,7 @@
 
 Radiance depends on a pixel through its normal and its mirror direction (twice the URM's `half`, less the front).
 Pixels of one photo, material and clipping state that fall into one cell of both are replaced by their weighted
-mean: normal, view, radiance and confidence alike, so that what is lost is second order in the cell's size.
+mean: normal, view, radiance, place and confidence alike, so that what is lost is second order in the cell's size.
 
 Radiance is linear in visibility, whose mean is thus what the mean radiance shows.  But on a flat seat all points would
 become one, and what their shadows tell of the light be lost: points merge only where what is hidden from them lies
@@ -44,9 +44,11 @@ def merge(observations: Observations, degrees: float) -> Observations:
     total = np.bincount(group, weight)
 
     changed = {"weight": total.astype("f4")}
-    for name in ("normal", "view", "radiance"):
-        mean = np.column_stack([np.bincount(group, weight * v) / total for v in getattr(seen, name).T])
-        length = 1 if name == "radiance" else np.linalg.norm(mean, axis=-1, keepdims=True)
+    for name in ("normal", "view", "radiance", "place"):
+        if (values := getattr(seen, name)) is None:
+            continue
+        mean = np.column_stack([np.bincount(group, weight * v) / total for v in values.T])
+        length = 1 if name in ("radiance", "place") else np.linalg.norm(mean, axis=-1, keepdims=True)
         changed[name] = (mean / length).astype("f4")
     if visibility is not None:
         averaging = csr_array(((weight / total[group]).astype("f4"), (group, np.arange(len(group)))))

@@ -5,7 +5,8 @@ indices and the units in the schema metadata under the key `factorlib`.
 
 `visibility`, where some observation does not see every direction, is a further column of K bytes: the share of each
 direction of `fibonacci_sphere(K)` that is seen, 0 to 255.  `met`, beside it, says which surface hides a direction.  `confidence`, which a file
-need not have, says how sure each normal is; `weight` is the same until observations are sampled or merged.
+need not have, says how sure each normal is; `weight` is the same until observations are sampled or merged.  Nor need it have `place`, where the
+point lies, as `factorlib.light.distance` has it.
 """
 
 from __future__ import annotations
@@ -63,6 +64,7 @@ class Observations(msgspec.Struct, frozen=True):
     met: UInt16[np.ndarray, "n k"] | None = None  # codes of what hides them (geometry.met); not without `visibility`
     exposures: tuple[float | None, ...] = ()  # of `photos`, t·S/N² from EXIF, None where unknown; empty: all are
     confidence: Float[np.ndarray, " n"] | None = None  # of the normal, 0 to 1; None: all are as sure
+    place: Float[np.ndarray, "n 3"] | None = None  # camera frame, about the photo's middle, RMS 1 (light.distance)
 
     def __len__(self) -> int:
         return len(self.weight)
@@ -81,8 +83,8 @@ class Observations(msgspec.Struct, frozen=True):
 
 COLUMNS = {"normal": "f4", "view": "f4", "radiance": "f4", "clipped": "?", "material": "i2", "photo": "i4", "illumination": "i4",
            "x": "i4", "y": "i4", "weight": "f4"}  # and their types  # fmt: skip
-VECTORS = ("normal", "view", "radiance", "clipped")
-OPTIONAL = {"confidence": "f4"}  # columns that need not be there
+VECTORS = ("normal", "view", "radiance", "clipped", "place")
+OPTIONAL = {"confidence": "f4", "place": "f4"}  # columns that need not be there
 NAMES = {
     "materials": "material",
     "photos": "photo",
@@ -96,7 +98,7 @@ WIDE: dict[str, tuple[np.dtype, int, str]] = {
 
 
 def write_observations(path: str | Path, observations: Observations) -> None:
-    """Write the fixed Parquet columns, and `confidence`, `visibility` and `met`, where there is one."""
+    """Write the fixed Parquet columns, and `confidence`, `place`, `visibility` and `met`, where there is one."""
     columns, types = {}, {"normal": "f4", "half": "f4", **COLUMNS, **OPTIONAL}
     for name, dtype in types.items():
         if (values := getattr(observations, name)) is not None:
@@ -141,6 +143,8 @@ def _check(seen: Observations) -> None:
         raise ValueError("its exposures are not one a photo")
     if seen.confidence is not None and not ((seen.confidence >= 0) & (seen.confidence <= 1)).all():
         raise ValueError("column 'confidence' is not between 0 and 1")
+    if seen.place is not None and not np.isfinite(seen.place).all():
+        raise ValueError("column 'place' is not finite")
     if seen.met is not None:
         if seen.visibility is None or seen.visibility.shape != seen.met.shape:
             raise ValueError("column 'met' has not the directions of a column 'visibility'")
@@ -164,7 +168,8 @@ def concatenate(parts: Sequence[Observations]) -> Observations:
         fields[column] = np.concatenate(renumbered).astype("i4")
     exposures = {photo: exposure for part in parts for photo, exposure in zip(part.photos, part.exposures)}
     fills = {name: (dtype, nothing) for name, (dtype, nothing, _) in WIDE.items()} | {"confidence": (np.dtype("f4"), 1)}
-    for name, (dtype, fill) in fills.items():  # parts without see everything, and are sure
+    fills["place"] = np.dtype("f4"), 0
+    for name, (dtype, fill) in fills.items():  # parts without see everything, are sure, and lie in the middle
         given = [getattr(part, name) for part in parts]
         shapes = {values.shape[1:] for values in given if values is not None}
         if len(shapes) > 1:

@@ -126,7 +126,7 @@ def predicted(
         around = Surroundings(table, bounced_light(table, table.radiance.astype(float)) if with_bounces else None)
     reflectances = in_order(answer, list(table.materials), folder / "materials.json")
     alone = {**channels, "label": np.where(chair.mask, channels["label"], 0.0)}
-    reflector = Reflector(reflection_operator("network"), lobes)
+    reflector = Reflector(reflection_operator("network"), lobes, curvature=answer.model.curvature(photo))
     image = resynthesised(reflector, reflectances, alone, geometry, around=around)
     tone = answer.model.tone.get(photo)
     return shown(image, tone.exponent, tone.pivot) if tone else image

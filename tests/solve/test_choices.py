@@ -1,4 +1,4 @@
-"""What is in the model is decided by what is held out: shadows, bounces, tone curves, the start."""
+"""What is in the model is decided by what is held out: shadows, bounces, tone curves, distances of lights, the start."""
 
 from functools import cache
 
@@ -10,6 +10,7 @@ from factorlib.diagnose.identifiability import unlikely_curves
 from factorlib.geometry.met import UNMET, met_codes
 from factorlib.geometry.sphere import fibonacci_sphere
 from factorlib.images.tone import curve
+from factorlib.model.illumination import Illumination
 from factorlib.model.interreflection import bounced_light
 from factorlib.model.noise import Noise
 from factorlib.model.observed import blocks_of_observations
@@ -266,3 +267,32 @@ def test_few_materials_start_from_several_roughnesses_and_many_from_one():
     assert [len(from_nothing(n)(problem, 30)) for n in (3, 40)] == [1, 1]
     points = from_nothing(2)(problem.of([block.take(block.material < 2) for block in problem.blocks]), 30)
     assert len({float(p.materials.roughness[0]) for p in points}) == 3 and {len(p.lights[0]) for p in points} == {30}
+
+
+# ── distances of lights ──────────────────────────────────────────────────────────────────────────────────────────────
+
+
+def photographed_at(*curvatures):
+    """Spheres as far apart as they are large, in lights of these curvatures."""
+    rng, blocks = np.random.default_rng(5), []
+    lights = [on_even_cells(drawn(50 + k, 60)) for k in range(len(curvatures))]
+    for data, light, c in zip(spheres(lights, size=16).blocks, lights, curvatures, strict=True):
+        middle = np.array([[-1.2, 0, 0], [0.6, 0, 1], [0.6, 0, -1]])[data.material]
+        data = msgspec.structs.replace(data, place=middle + 0.6 * data.normal)
+        clean = (
+            Illumination(data, msgspec.structs.replace(light, curvature=c), MATERIALS, OPERATOR).radiance() / data.unit
+        )
+        precision = 1 / np.hypot(0.02, 0.02 * clean)
+        noisy = clean + 0.3 * rng.normal(size=clean.shape) / precision
+        blocks.append(msgspec.structs.replace(data, radiance=np.maximum(noisy, 0), precision=precision))
+    return blocks
+
+
+def test_near_lights_are_found_and_spare_the_materials_and_far_ones_stay_far():
+    blocks = photographed_at(0.2, 0.0, 0.2)
+    found, far = (solved(blocks, MORE, tone="off", distance=distance) for distance in ("auto", "off"))
+    assert [one.kept for one in found.distances] == [True, False, True]
+    assert [light.curvature for light in found.point.lights] == [0.2, 0, 0.2]
+    assert all(one.margin > FOR for one in found.distances if one.kept)
+    assert [light.curvature for light in far.point.lights] == [0, 0, 0]
+    assert error_of(found) < 0.5 * error_of(far), (error_of(found), error_of(far))
