@@ -13,7 +13,7 @@ from jaxtyping import Bool, Float, Int
 from factorlib.errors import InputError
 from factorlib.geometry.sphere import fibonacci_sphere, mirror_cells
 from factorlib.model.blocks import Block
-from factorlib.model.interreflection import bounced_light, unit
+from factorlib.model.interreflection import bounced_light
 from factorlib.model.noise import Noise
 from factorlib.model.problem import Spread
 from factorlib.urm.merge import merge
@@ -88,7 +88,7 @@ def _block(seen: Observations, name: str, noise: Noise, share: float, rotations:
     order = np.lexsort((seen.x, seen.y, local, seen.material))
     seen, local = seen.take(order), local[order]
     turned = {photo: np.asarray(of, dtype=float) for photo, of in rotations.items() if of is not None}
-    normal, view = (unit(_in_frame(vectors, seen, turned)) for vectors in (seen.normal, seen.view))
+    normal, view = (_in_frame(vectors, seen, turned) for vectors in (seen.normal, seen.view))
     radiance = seen.radiance.astype(float)
     unit = max(float(np.average(radiance.mean(1), weights=seen.weight)), 1e-30)
     scaled = radiance / unit
@@ -103,11 +103,16 @@ def _block(seen: Observations, name: str, noise: Noise, share: float, rotations:
         seen.material.astype(np.int64), local, held_out, visibility, directions,
         bounced if bounced is not None and bounced.any() else None, noise,
         None if seen.confidence is None else seen.confidence.astype(float),
-        None if seen.place is None else _in_frame(seen.place, seen, turned),
+        None if seen.place is None else _turned(seen.place, seen, turned),
     )  # fmt: skip
 
 
 def _in_frame(vectors: Float[np.ndarray, "n 3"], seen: Observations, rotations: Rotations) -> Float[np.ndarray, "n 3"]:
+    turned = _turned(vectors, seen, rotations)
+    return turned / np.linalg.norm(turned, axis=1, keepdims=True)
+
+
+def _turned(vectors: Float[np.ndarray, "n 3"], seen: Observations, rotations: Rotations) -> Float[np.ndarray, "n 3"]:
     turned = vectors.astype(float)
     for i, photo in enumerate(seen.photos):
         if photo in rotations:
