@@ -86,7 +86,7 @@ def solved_materials(photos: list[posed.Photo], operator: Operator) -> Materials
         maps = rasterise(photo.given, photo.camera, photo.pose)
         vectors = {"normal": maps.normal, "view": maps.view}
         geometry = {f"{name}.{a}": v[..., i] for name, v in vectors.items() for i, a in enumerate("xyz")}
-        geometry |= {"label": maps.label, "confidence": (maps.label > 0) * ~maps.bent * 1.0}
+        geometry |= {"label": maps.label, "depth": maps.depth, "confidence": (maps.label > 0) * ~maps.bent * 1.0}
         name = f"photo{k}"
         seen.append(merge(observations_of_photo(photo.channels, geometry, Taken(name, name), ["a", "b", "c"]), 2.0))
     blocks = blocks_of_observations(concatenate(seen), Noise())

@@ -25,7 +25,7 @@ def guessed(rng: np.random.Generator, data, curves: bool) -> Illumination:
 
 def photos_in_a_wrong_light(kind: str, curves: bool = False) -> Illumination:
     """Observations of two photos: `clipped`, the brightest tenth of them; `bounced`, half of them reached by light from other surfaces;
-    `near`, in a light at five times the points' distance from their middle;  `hidden`, in a light fixed to the world, each photo hiding other directions."""
+    `hidden`, in a light fixed to the world, each photo hiding other directions."""
     rng = np.random.default_rng(1)
     size = 16 if kind == "clipped" else 14
     data = block("room", random_light(rng, 5, photos=2), MATERIALS, [0, 1, 2], OPERATOR, size=size)
@@ -37,9 +37,6 @@ def photos_in_a_wrong_light(kind: str, curves: bool = False) -> Illumination:
     if kind == "bounced":
         bounced = rng.random((len(data), 6)) * (rng.random((len(data), 1)) < 0.5)
         return guessed(rng, msgspec.structs.replace(data, bounced=bounced), curves)
-    if kind == "near":
-        one = guessed(rng, msgspec.structs.replace(data, place=rng.normal(size=(len(data), 3)) / 3**0.5), curves)
-        return msgspec.structs.replace(one, light=msgspec.structs.replace(one.light, curvature=0.2))
     turn = np.linalg.qr(rng.normal(size=(3, 3)))[0]
     directions = np.stack([fibonacci_sphere(96), fibonacci_sphere(96) @ turn.T])
     visibility = (rng.random((len(data), 96)) * 255).astype(np.uint8)

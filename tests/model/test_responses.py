@@ -19,7 +19,13 @@ CELLS, ALL = 60, Loss(1e6)  # no outliers
 
 
 def made(
-    seed: int, photos: int = 1, toned: bool = False, hidden: bool = False, bounced: bool = False, clipped: bool = False
+    seed: int,
+    photos: int = 1,
+    toned: bool = False,
+    hidden: bool = False,
+    bounced: bool = False,
+    clipped: bool = False,
+    near: bool = False,
 ) -> Illumination:
     """Two materials of random reflectances in one light of several photos, with its table; what the photos show is of another light."""
     rng = np.random.default_rng(seed)
@@ -35,6 +41,9 @@ def made(
         data = msgspec.structs.replace(data, visibility=seen, directions=np.stack(turned))
     if bounced:
         data = msgspec.structs.replace(data, bounced=rng.random((n, 6)) * (rng.random((n, 1)) < 0.5))
+    if near:
+        data = msgspec.structs.replace(data, place=rng.normal(size=(n, 3)) / 3**0.5)
+        light = msgspec.structs.replace(light, curvature=0.2)
     if clipped:
         data = msgspec.structs.replace(data, clipped=rng.random((n, 3)) < 0.3)
     off = np.exp(rng.normal(0, 0.2, data.radiance.shape))
@@ -48,6 +57,7 @@ ANY = {
     "toned": st.booleans(),
     "hidden": st.booleans(),
     "bounced": st.booleans(),
+    "near": st.booleans(),
 }
 FEW_EXAMPLES = settings(max_examples=8, deadline=None, derandomize=True)
 

@@ -33,7 +33,7 @@ def photo_and_geometry(size=64):
         {"normal": (x * one, y * one, z * one), "view": (0 * one, 0 * one, -one)},
     )
     geometry = {f"{name}.{axis}": v for name, vector in vectors.items() for axis, v in zip("xyz", vector)}
-    geometry |= {"label": label, "confidence": one}
+    geometry |= {"label": label, "depth": (4 + z) * one, "confidence": one}
     photo = {"R": 1 + x, "G": 1 + y, "B": np.ones_like(x), "label": label, "valid": one}
     photo |= {f"clipped.{c}": (y < -0.8) * one for c in "RGB"}
     return photo, geometry
@@ -98,6 +98,7 @@ def test_a_file_that_is_no_reflectance_map_is_refused(tmp_path):
 @pytest.mark.parametrize("key, change", [
     ("'confidence' is not between 0 and 1", lambda seen: {"confidence": seen.confidence + 0.5}),
     ("'confidence' is not between 0 and 1", lambda seen: {"confidence": seen.confidence * np.nan}),
+    ("'place' is not finite", lambda seen: {"place": seen.place * np.nan}),
     ("met", lambda seen: {"met": seen.met * 0 + 2 * BINS}), ("met", lambda seen: {"met": seen.met[:, :32]}),
 ])  # fmt: skip
 def test_values_that_mean_nothing_are_refused(tmp_path, key, change):
