@@ -20,7 +20,7 @@ from studies.scenes.problems import MATERIALS, block, random_light
 from tests.solve.made import OPERATOR, PRIOR
 
 CHOICES = Choices(cells=24, splittings=1, observations=100)
-PARTS = ("effects", "tone", "materials", "splitting", "lights", "suns")
+PARTS = ("effects", "tone", "distances", "materials", "splitting", "lights", "suns")
 ALL = (*PHASES, "splitting 1", "lights")
 
 
@@ -33,6 +33,7 @@ def short():
     """Where a descent ends does not matter here."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(choices, "TRIAL", Schedule(2, (3,)))
+        patch.setattr(choices, "NEARER", Schedule(together=(2,), estimate=False))
         patch.setattr(choices, "CURVED", Schedule(together=(2,), estimate=False))
         patch.setattr(solving, "MATERIALS", Schedule(2, (2,)))
         patch.setattr(solving, "AFTER_SPLITTING", Schedule(1, (2,)))
@@ -48,7 +49,8 @@ def blocks():
     made = [block(f"room{i}", li, MATERIALS, [0, 1, 2], OPERATOR, size=6, seed=i) for i, li in enumerate(lights)]
     seen = [(255 * (rng.random((len(b), 96)) < 0.95)).astype(np.uint8) for b in made]
     hidden = [msgspec.structs.replace(b, visibility=v, directions=directions) for b, v in zip(made, seen)]
-    return [msgspec.structs.replace(b, bounced=0.01 * rng.random((len(b), 6))) for b in hidden]
+    bounced = [msgspec.structs.replace(b, bounced=0.01 * rng.random((len(b), 6))) for b in hidden]
+    return [msgspec.structs.replace(b, place=rng.normal(size=(len(b), 3))) for b in bounced]
 
 
 def answer(blocks, journal=None, stop=lambda event: False, spread=serial_map):
@@ -63,8 +65,16 @@ def answer(blocks, journal=None, stop=lambda event: False, spread=serial_map):
     run = Run(CHOICES, report, journal or Journal(), PRIOR)
     found = solve(JointProblem(blocks, OPERATOR, spread=spread), from_nothing(3), run)
     p = found.point
-    parts = [p.materials.vector(), *(getattr(li, f).reshape(-1) for li in p.lights for f in li.__struct_fields__)]
-    decided = [found.history, found.shadows, found.interreflection, found.tone, found.splitting, found.loss]
+    parts = [p.materials.vector(), *(np.ravel(getattr(li, f)) for li in p.lights for f in li.__struct_fields__)]
+    decided = [
+        found.history,
+        found.shadows,
+        found.interreflection,
+        found.tone,
+        found.distances,
+        found.splitting,
+        found.loss,
+    ]
     hyper = [[one.value, one.hyperparameters] for one in (found.materials, found.lights)]
     return np.concatenate(parts).tobytes() + msgspec.json.encode([decided, hyper]), events
 
