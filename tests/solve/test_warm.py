@@ -186,6 +186,15 @@ def test_tone_curves_are_taken_over_where_all_photos_of_a_light_have_one():
     assert len(point.lights[1].log_tone) == 0
 
 
+def test_a_light_at_a_finite_distance_stays_there():
+    blocks, lights = truth(0, 1)
+    earlier = written(blocks, MATERIALS, lights)
+    model = msgspec.structs.replace(earlier.table.model, distance={blocks[1].name: 8.0})
+    earlier = msgspec.structs.replace(earlier, table=msgspec.structs.replace(earlier.table, model=model))
+    _, found = start_from(earlier, blocks)
+    assert [light.curvature for light in found] == [0, 1 / 8]
+
+
 @pytest.mark.parametrize(("kept", "tried"), [(True, True), (False, True), (True, False)])
 def test_shadows_and_bounces_stay_as_they_were_decided_where_both_were_tried(kept, tried):
     losses = {"held_out_loss_with": 1.0} | ({"held_out_loss_without": 2.0, "margin": 3.0} if tried else {})
