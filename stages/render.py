@@ -48,10 +48,8 @@ def main(params: Params, inputs: Inputs, out: Path, progress: Progress) -> None:
     exported, model = read_materials(file), read_materials(inputs["solve"] / "materials.json").model
     photo, geometry = (read_exr(inputs[stage] / f"{name}.exr") for stage in ("masks", "align"))
     slice_ = msgspec.convert(inputs.facts["dataset.light"], LightSlice)
-    light, operator = (
-        light_of(inputs["export"], name, slice_),
-        reflection_operator(params.operator, weights=inputs["train"]),
-    )
+    light = light_of(inputs["export"], name, slice_)
+    operator = reflection_operator(params.operator, weights=inputs["train"])
     reflector = Reflector(operator, light, params.tail, model.curvature(slice_.illumination))
     exposure = exposure_of(np.stack([photo[c] for c in "RGB"], axis=-1), photo["valid"] > 0.5)
     total, materials = 10 + len(names), in_order(exported, names, file)

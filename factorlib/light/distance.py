@@ -1,7 +1,8 @@
 """Light at a finite distance, as a point beside the middle of what a photo shows meets it.
 
 A light of curvature c lies on a sphere of radius 1/c about that middle, in units of the RMS distance of the photo's points from it.  To a point at
-x in these units, with X = c x, what lies in direction z from the middle lies along (z − X)/d, d = |z − X|, and is seen (1 − X·z)/d³ times as large:
+x in these units, with X = c x, what lies in direction z from the middle lies along (z − X)/d, d = |z − X|, and is seen as
+(1 − X·z)/d³ times the solid angle that it has from the middle:
 
     n·z' = (n·z − n·X)/d,      o·z' = (o·z − o·X)/d,      w' = w (1 − X·z)/d³                                                            (1)
 
@@ -16,12 +17,15 @@ import numpy as np
 from jaxtyping import Float
 from torch import Tensor
 
-LONGEST = 0.5  # of |X|: a point that is nearer to the light than halfway meets it as one halfway does
+LONGEST = 0.5  # of |X|: a point that lies more than halfway to the light is taken to lie halfway
 A = TypeVar("A", np.ndarray, Tensor)
 
 
 def met_from(place: A, normal: A, view: A, axis: A, curvature: float) -> tuple[A, A, A]:
-    """n·z', o·z' and w'/w [n, p] of (1); place: x [n, 3], in the frame of normals and views [n, 3] and of lobes' axes z [p, 3], all unit."""
+    """Return n·z', o·z' and w'/w of (1), each [n, p].
+
+    place: x [n, 3], the points;  normal, view: n and o [n, 3];  axis: z of the lobes [p, 3].  All in one frame; n, o and z are unit.
+    """
     X = curvature * place
     X = X / (((X * X).sum(1)[:, None] ** 0.5) / LONGEST).clip(1.0)
     along = X @ axis.T
@@ -33,7 +37,10 @@ def met_from(place: A, normal: A, view: A, axis: A, curvature: float) -> tuple[A
 def places_of(
     view: Float[np.ndarray, "n 3"], depth: Float[np.ndarray, " n"], weight: Float[np.ndarray, " n"]
 ) -> Float[np.ndarray, "n 3"]:
-    """x of n points of a photo, camera frame; view: unit, toward the camera;  depth: z in any unit;  weight: of each in the middle and the RMS."""
+    """Return x of the n points that a photo shows, in the camera frame.
+
+    view: unit, toward the camera;  depth: z of the points, in any unit;  weight: how much each point counts in the middle and in the RMS
+    """
     if not weight.sum() > 0:
         return np.zeros((len(depth), 3))
     place = view * (depth / view[:, 2])[:, None]

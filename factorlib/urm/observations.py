@@ -167,8 +167,8 @@ def concatenate(parts: Sequence[Observations]) -> Observations:
         renumbered = [number[index] if len(number) else index for number, index in zip(numbers, own, strict=True)]
         fields[column] = np.concatenate(renumbered).astype("i4")
     exposures = {photo: exposure for part in parts for photo, exposure in zip(part.photos, part.exposures)}
-    fills = {name: (dtype, nothing) for name, (dtype, nothing, _) in WIDE.items()} | {"confidence": (np.dtype("f4"), 1)}
-    fills["place"] = np.dtype("f4"), 0
+    fills = {name: (dtype, nothing) for name, (dtype, nothing, _) in WIDE.items()}
+    fills |= {"confidence": (np.dtype("f4"), 1), "place": (np.dtype("f4"), 0)}
     for name, (dtype, fill) in fills.items():  # parts without see everything, are sure, and lie in the middle
         given = [getattr(part, name) for part in parts]
         shapes = {values.shape[1:] for values in given if values is not None}

@@ -64,6 +64,15 @@ def test_where_none_is_held_out_all_are_judged(rooms):
     assert len(np.concatenate(problem.held_out_losses(point))) == sum(int(b.held_out.sum()) for b in problem.blocks)
 
 
+def test_places_turn_into_the_frame_of_the_light_as_normals_do():
+    seen, turn = bowls("room", rough_light(20)), np.linalg.qr(np.random.default_rng(0).normal(size=(3, 3)))[0]
+    seen = msgspec.structs.replace(seen, place=2 * seen.normal)
+    (data,) = blocks_of_observations(seen, Noise(), world_from_camera={seen.photos[0]: turn})
+    (camera,) = blocks_of_observations(seen, Noise())
+    np.testing.assert_allclose(data.place, camera.place @ turn.T, atol=1e-6)
+    np.testing.assert_allclose(data.place, 2 * data.normal, atol=1e-6)
+
+
 @pytest.mark.parametrize("seed", [20, 21])
 def test_model_in_shadow_is_the_radiance_traced_in_bowls_by_brute_force(seed):
     """Whose visibility is known by hand."""

@@ -130,3 +130,18 @@ def test_observed_cells_are_where_the_normals_are_without_holes():
     right = normals[normals[:, 0] > 0.1]
     cells = observed_cells(right, 64)
     assert not cells[:, :32].any() and cells[24:40, 38:60].all() and not observed_cells(right[:0], 64).any()
+
+
+def test_a_near_light_is_to_each_point_a_far_one_of_moved_lobes():
+    operator, lobes, (normals, views) = reflection_operator("closed_form", dtype="float64"), light(), points(20)
+    place, curvature = 1.5 * unit(20, 5), 0.2
+    near = Reflector(operator, lobes, 0.0, curvature)(GLOSSY, normals, views, place=place)
+    for k, x in enumerate(curvature * place):
+        to = lobes.axis - x
+        d = np.linalg.norm(to, axis=1, keepdims=True)
+        moved = Lobes(to / d, lobes.sharpness, lobes.weight * (1 - lobes.axis @ x)[:, None] / d**3)
+        far = Reflector(operator, moved, 0.0)(GLOSSY, normals[k : k + 1], views[k : k + 1])[0]
+        np.testing.assert_allclose(near[k], far, rtol=1e-4)
+    middle = Reflector(operator, lobes, 0.0, curvature)(GLOSSY, normals, views, place=0 * place)
+    np.testing.assert_allclose(middle, Reflector(operator, lobes, 0.0)(GLOSSY, normals, views), rtol=1e-9)
+    assert np.abs(near / middle - 1).max() > 0.1
