@@ -122,7 +122,8 @@ class Model(msgspec.Struct, frozen=True):
     splitting_chosen_by: of each time that cells were split
     suns_chosen_by: of a sun in each illumination
     tone:            curves of the photos that have one;  tone_chosen_by: by illumination
-    distance:        of lights that are not infinitely far away, in RMS distances of what a photo shows from its middle;  distance_chosen_by: by illumination
+    distance:        of lights that are not infinitely far away, in RMS distances of a photo's points from their middle;
+                     distance_chosen_by: by illumination
     """
 
     solver: Literal["bundle", "few_lobes", "paper"] = "bundle"

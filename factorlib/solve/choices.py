@@ -32,11 +32,8 @@ CURVED = Schedule(together=(8,), estimate=False)
 # Of the held-out loss.  By two standard errors alone a photo whose pose is wrong got a curve (margin 3.0, captured set of seed 7), and k_d was
 # 30 % wrong instead of 13 %.
 CURVED_GAIN = 0.25
-CURVATURES = (
-    0.05,
-    0.1,
-    0.2,
-)  # a chair in a room: its points are .4 m from their middle (RMS), walls and lamps 2 to 8 m
+# Of lights that are 20, 10 and 5 RMS distances away: a chair's points are .4 m from their middle, a room's walls and lamps 2 to 8 m.
+CURVATURES = (0.05, 0.1, 0.2)
 NEARER = Schedule(lights=3, together=(6,), estimate=False)
 GIVEN = Schedule(lights=6, estimate=False, given=True)
 
@@ -111,7 +108,7 @@ def curves_chosen(problem: JointProblem, before: Fit, choices: Choices, fit: Fit
     curved = fit("tone curves", sample, before.with_lights(freed), CURVED)
     losses, evidence = [losses_of(sample, one.point) for one in (before, curved)], []
     for k, light in enumerate(curved.point.lights):
-        one = compare(*(Losses([of.values[k]], [of.clusters[k]]) for of in losses), FOR)
+        one = _evidence_of_light(k, *losses)
         gain = (one.held_out_loss_without or 0.0) / max(one.held_out_loss_with or 1.0, 1e-12) - 1
         kept = one.kept and gain > CURVED_GAIN and not light.beyond_cameras
         evidence.append(Evidence(True) if had[k] else msgspec.structs.replace(one, kept=kept))
@@ -144,15 +141,10 @@ def distances_chosen(problem: JointProblem, before: Fit, choices: Choices, fit: 
             placed[k] = msgspec.structs.replace(placed[k], curvature=c)
         return fit("distances", sample, start.with_lights(placed), schedule)
 
-    def judged(far: Fit, near: Fit, k: int) -> Evidence:
-        """The evidence of light k."""
-        both = (losses_of(sample, one.point) for one in (far, near))
-        return compare(*(Losses([of.values[k]], [of.clusters[k]]) for of in both), FOR)
-
-    far, *near = (fit_at(dict.fromkeys(asked, c)) for c in (0.0, *CURVATURES))
+    far, *near = (losses_of(sample, fit_at(dict.fromkeys(asked, c)).point) for c in (0.0, *CURVATURES))
     curvature = {}
     for k in asked:
-        tried = [judged(far, one, k) for one in near]
+        tried = [_evidence_of_light(k, far, one) for one in near]
         best = min(range(len(near)), key=lambda i: (not tried[i].kept, tried[i].held_out_loss_with or 0.0))
         evidence[k] = tried[best]
         if tried[best].kept:
@@ -160,8 +152,14 @@ def distances_chosen(problem: JointProblem, before: Fit, choices: Choices, fit: 
     if not curvature:
         return Chosen(before, evidence)
     chosen = fit_at(curvature)
-    there, away = (fit_at(of, chosen, GIVEN) for of in (curvature, dict.fromkeys(curvature, 0.0)))
+    curvatures = (dict.fromkeys(curvature, 0.0), curvature)
+    far, there = (losses_of(sample, fit_at(of, chosen, GIVEN).point) for of in curvatures)
     for k in curvature:
-        evidence[k] = judged(away, there, k)
+        evidence[k] = _evidence_of_light(k, far, there)
     kept = {k: c for k, c in curvature.items() if evidence[k].kept}
     return Chosen((chosen if kept == curvature else fit_at(kept)) if kept else before, evidence)
+
+
+def _evidence_of_light(k: int, without: Losses, richer: Losses) -> Evidence:
+    """Return the evidence that light k alone gives for the richer model."""
+    return compare(*(Losses([of.values[k]], [of.clusters[k]]) for of in (without, richer)), FOR)

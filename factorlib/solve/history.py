@@ -52,7 +52,8 @@ class Solution(msgspec.Struct, frozen=True):
     history     every point that was tried;  loss: the loss function that judges held-out observations
     lambertian  materials without specular part
     shadows     whether visibility was used, with its evidence;  interreflection: whether surfaces light each other
-    specular    the evidence for each material's specular part, tone, distances: for each light's tone curves and distance; empty where nothing was tried
+    specular    the evidence for each material's specular part; empty where nothing was tried, as the next two are
+    tone        the evidence for each light's tone curves;  distances: for each light's distance
     splitting   the evidence for each splitting of the lights' cells
     suns        the evidence for each light's sun
     materials   where lights are cells: the fit of the sure observations, whose materials the answer has;  lights: that of all
