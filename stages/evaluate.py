@@ -26,6 +26,7 @@ from factorlib.results.photos import read_photos
 from factorlib.results.poses import read_poses
 from factorlib.stage import Inputs, Progress
 from factorlib.urm.extract import observed_pixels
+from factorlib.urm.geometry import read_geometry
 
 NO_TRUTH = "the dataset names no truth"
 MISSING = {
@@ -50,7 +51,10 @@ def main(params: Params, inputs: Inputs, out: Path, progress: Progress) -> None:
 
     def shot(name: str) -> Shot:
         """A photo beside its re-synthesis."""
-        photo, geometry = (read_exr(inputs[stage] / f"{name}.exr") for stage in ("masks", "align"))
+        photo, geometry = (
+            read_exr(inputs["masks"] / f"{name}.exr"),
+            read_geometry(inputs["align"], inputs["surface"], name),
+        )
         return shot_of(photo, geometry, read_rgb_exr(inputs["render"] / "resynthesis" / f"{name}.exr"))
 
     progress(0, 3, "re-synthesis")
@@ -99,7 +103,7 @@ def _lights(inputs: Inputs, truth: TruthFile, out: Path) -> tuple[dict[str, Ligh
 
 def _geometry(inputs: Inputs, name: str) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Normals and views [h w 3] of a photo and its observed pixels."""
-    geometry = read_exr(inputs["align"] / f"{name}.exr")
+    geometry = read_geometry(inputs["align"], inputs["surface"], name)
     normal, view = (np.stack([geometry[f"{kind}.{a}"] for a in "xyz"], axis=-1) for kind in ("normal", "view"))
     return normal, view, observed_pixels(read_exr(inputs["masks"] / f"{name}.exr"), geometry)
 

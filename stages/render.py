@@ -23,6 +23,7 @@ from factorlib.render.resynthesis import Surroundings, ball, light_of, observed_
 from factorlib.results.materials import Gauge, Model, in_order, read_materials
 from factorlib.stage import Inputs, Progress
 from factorlib.urm.extract import observed_pixels
+from factorlib.urm.geometry import on_surface, read_geometry
 from factorlib.urm.observations import read_observations
 
 Size = Annotated[int, msgspec.Meta(ge=8, le=2048)]
@@ -46,7 +47,7 @@ def main(params: Params, inputs: Inputs, out: Path, progress: Progress) -> None:
     """Render a photo again, and balls and reflectance maps of every material in its light."""
     name, names, file = inputs.photo, inputs.facts["dataset.materials"], inputs["export"] / "materials.json"
     exported, model = read_materials(file), read_materials(inputs["solve"] / "materials.json").model
-    photo, geometry = (read_exr(inputs[stage] / f"{name}.exr") for stage in ("masks", "align"))
+    photo, geometry = read_exr(inputs["masks"] / f"{name}.exr"), read_geometry(inputs["align"], inputs["surface"], name)
     slice_ = msgspec.convert(inputs.facts["dataset.light"], LightSlice)
     light = light_of(inputs["export"], name, slice_)
     operator = reflection_operator(params.operator, weights=inputs["train"])
@@ -82,7 +83,7 @@ def surroundings(inputs: Inputs, model: Model, gauge: Gauge) -> Surroundings | N
     """
     if not (model.self_shadowing or model.distance):
         return None
-    seen = read_observations(inputs["urm"] / f"{inputs.photo}.parquet")
+    seen = on_surface(read_observations(inputs["urm"] / f"{inputs.photo}.parquet"), inputs["surface"])
     if not model.self_shadowing:
         seen = msgspec.structs.replace(seen, visibility=None, met=None)
     sent = bounced_light(seen, seen.radiance.astype(float)) if model.interreflection else None

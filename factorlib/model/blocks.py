@@ -11,7 +11,7 @@ from factorlib.model.noise import Noise
 
 PER_OBSERVATION = (
     *("normal", "view", "radiance", "clipped", "precision", "material", "photo", "held_out"),
-    *("visibility", "bounced", "confidence", "place"),  # where the block has them
+    *("visibility", "bounced", "confidence", "place", "row"),  # where the block has them
 )
 CLUSTER = 0.35  # size of a cluster's cell of mirror directions: 20°
 
@@ -26,6 +26,7 @@ class Block(msgspec.Struct, frozen=True):
     directions  the k directions of `visibility`, in the block's frame, for each of the f photos
     noise       of which `precision` is the reciprocal
     confidence  how sure normals are, 0 to 1; None: all are as sure
+    row         the observation's number among all usable ones
     place       x of `factorlib.light.distance`, in the block's frame; None: all lie in the middle
     bounced     what hidden directions send, by the cosine (RGB) and by a highlight (RGB): G_d and G_s of `factorlib.model.interreflection`,
                 in the block's unit; None: nothing
@@ -48,6 +49,7 @@ class Block(msgspec.Struct, frozen=True):
     noise: Noise = Noise()
     confidence: Float[np.ndarray, " n"] | None = None
     place: Float[np.ndarray, "n 3"] | None = None
+    row: Int[np.ndarray, " n"] | None = None
 
     def __len__(self) -> int:
         return len(self.material)

@@ -133,12 +133,18 @@ class Illumination(msgspec.Struct, frozen=True):
             [scale[:, c, None] * (kd[:, c, None] * response[0] + ks[:, c, None] * response[1]) for c in range(3)]
         )
 
+    def pull(
+        self, residual: Float[np.ndarray, "n 3"], loss: Loss, temperature: float = 1.0
+    ) -> Float[np.ndarray, "n 3"]:
+        """The root of how much each residual counts; 0 for one that is held out, and for a clipped one that is bright enough."""
+        counts = ~self.block.held_out[:, None] & ~(self.block.clipped & (residual >= 0))
+        return np.sqrt(counts * loss.trust(residual) / temperature)
+
     def linearise(self, shown: Shown, loss: Loss, temperature: float = 1.0) -> Iterator[Linearised]:
         """Residuals and derivatives; `shown` is what this illumination shows by its table.  Held-out observations have weight 0."""
         block, light, materials = self.block, self.light, self.materials
         residual = block.residuals(shown.radiance)
-        counts = ~block.held_out[:, None] & ~(block.clipped & (residual >= 0))
-        pull = np.sqrt(counts * loss.trust(residual) / temperature)
+        pull = self.pull(residual, loss, temperature)
         scale = pull * block.precision
         rising = scale * light.slope_at(shown.radiance, block.photo)  # ∂r/∂ℓ
         lit = shown.linear

@@ -16,6 +16,7 @@ from factorlib.model.blocks import Block
 from factorlib.model.interreflection import bounced_light
 from factorlib.model.noise import Noise
 from factorlib.model.problem import Spread
+from factorlib.urm.geometry import on_surface
 from factorlib.urm.merge import merge
 from factorlib.urm.observations import Observations, read_observations
 
@@ -33,13 +34,18 @@ class PhotoObservations(msgspec.Struct, frozen=True):
     unusable: int
 
 
-def gathered(files: Sequence[Path], degrees: float, spread: Spread) -> list[PhotoObservations]:
-    """Of each file, in this order; observations that are within `degrees` of each other are merged (`factorlib.urm.merge`)."""
-    return spread(partial(_of_file, degrees=degrees), files)
+def gathered(
+    files: Sequence[Path], degrees: float, spread: Spread, surface: Path | None = None
+) -> list[PhotoObservations]:
+    """Of each file, in this order; observations that are within `degrees` of each other are merged (`factorlib.urm.merge`).
+
+    surface: the folder of the stage `surface`, whose normals are used where it has some
+    """
+    return spread(partial(_of_file, degrees=degrees, surface=surface), files)
 
 
-def _of_file(path: Path, degrees: float) -> PhotoObservations:
-    read = read_observations(path)
+def _of_file(path: Path, degrees: float, surface: Path | None) -> PhotoObservations:
+    read = on_surface(read_observations(path), surface)
     seen = usable(read)
     return PhotoObservations(merge(seen, degrees), len(read), len(read) - len(seen))
 
@@ -69,8 +75,9 @@ def blocks_of_observations(
             cure="look at the photos that `masks` wrote: exposure, `encoding`, label masks",
         )
     block = partial(_block, noise=noise, share=held_out, rotations=world_from_camera or {}, seed=seed)
-    shown = [(name, seen.illumination == i) for i, name in enumerate(seen.illuminations)]
-    return sorted((block(seen.take(rows), name) for name, rows in shown if rows.any()), key=lambda block: block.name)
+    shown = [(name, np.flatnonzero(seen.illumination == i)) for i, name in enumerate(seen.illuminations)]
+    blocks = [block(seen.take(rows), rows, name) for name, rows in shown if len(rows)]
+    return sorted(blocks, key=lambda block: block.name)
 
 
 def usable(observations: Observations) -> Observations:
@@ -82,7 +89,15 @@ def usable(observations: Observations) -> Observations:
     )
 
 
-def _block(seen: Observations, name: str, noise: Noise, share: float, rotations: Rotations, seed: int) -> Block:
+def _block(
+    seen: Observations,
+    rows: Int[np.ndarray, " n"],
+    name: str,
+    noise: Noise,
+    share: float,
+    rotations: Rotations,
+    seed: int,
+) -> Block:
     photos = sorted({seen.photos[i] for i in np.unique(seen.photo)})
     local = np.array([photos.index(p) if p in photos else -1 for p in seen.photos])[seen.photo]
     order = np.lexsort((seen.x, seen.y, local, seen.material))
@@ -103,7 +118,7 @@ def _block(seen: Observations, name: str, noise: Noise, share: float, rotations:
         seen.material.astype(np.int64), local, held_out, visibility, directions,
         bounced if bounced is not None and bounced.any() else None, noise,
         None if seen.confidence is None else seen.confidence.astype(float),
-        None if seen.place is None else _turned(seen.place, seen, turned),
+        None if seen.place is None else _turned(seen.place, seen, turned), rows[order],
     )  # fmt: skip
 
 

@@ -1,0 +1,41 @@
+"""What every pixel of a photo shows of the meshes: as `align` has it, with the normals of `surface` where it turned them."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import msgspec
+import numpy as np
+from jaxtyping import Float
+
+from factorlib.errors import InputError
+from factorlib.images.exr import read_exr
+from factorlib.urm.observations import Observations
+
+
+def read_geometry(align: Path, surface: Path, photo: str) -> dict[str, Float[np.ndarray, "h w"]]:
+    """The maps that `align` wrote of a photo, with the normals of the folder of `surface` where there are any."""
+    return {**read_exr(align / f"{photo}.exr"), **_normals(surface, photo)}
+
+
+def on_surface(seen: Observations, surface: Path | None) -> Observations:
+    """The observations of one photo with the normals of its turned surface, where the folder of `surface` has them.
+
+    Merged observations have the normal of the pixel that their group is called by.  Raises InputError where the maps are of another photo's size.
+    """
+    if surface is None or not seen.photos or not (maps := _normals(surface, seen.photos[0])):
+        return seen
+    height, width = maps["normal.x"].shape
+    if len(seen) and (seen.x.max() >= width or seen.y.max() >= height):
+        cure = "run the stage `surface` again"
+        raise InputError(
+            f"its normals are of a picture of {width} × {height}", file=surface, key=seen.photos[0], cure=cure
+        )
+    normal = np.stack([maps[f"normal.{axis}"][seen.y, seen.x] for axis in "xyz"], axis=-1)
+    known = (normal != 0).any(1, keepdims=True)
+    return msgspec.structs.replace(seen, normal=np.where(known, normal, seen.normal).astype(np.float32))
+
+
+def _normals(surface: Path, photo: str) -> dict[str, Float[np.ndarray, "h w"]]:
+    file = surface / "normals" / f"{photo}.exr"
+    return read_exr(file) if file.exists() else {}

@@ -1,0 +1,161 @@
+"""Normals by shading: all photos together say how the meshes' surfaces differ from the given ones.
+
+Materials and lights are fitted as the solve begins; then normals turn until they explain all photos best, and stay so only where lights that had no
+part in it gain (`factorlib.surface.choice`).  Writes surface.json, and where surfaces are turned normals/<photo>.exr, the normals that
+every later stage uses in place of those of `align`.
+"""
+
+import logging
+from pathlib import Path
+from typing import Annotated, Literal
+
+import msgspec
+import numpy as np
+from jaxtyping import Float, Int
+
+from factorlib.dataset.schema import LightSlice, ObjectsSlice
+from factorlib.images.exr import read_exr, write_exr
+from factorlib.jsonfile import write_json
+from factorlib.light.prior import read_light_prior
+from factorlib.meshes.fine import fine
+from factorlib.meshes.read import CREASE_DEG, MeshesOnce
+from factorlib.model.noise import Noise
+from factorlib.model.observed import blocks_of_observations, usable
+from factorlib.model.problem import JointProblem
+from factorlib.reflection import reflection_operator
+from factorlib.results.poses import FILE as POSES
+from factorlib.results.poses import PhotoPoses, read_poses
+from factorlib.results.surface import FILE, SurfaceTable
+from factorlib.solve.options import Choices
+from factorlib.solve.start import from_nothing
+from factorlib.stage import Inputs, Progress
+from factorlib.surface.attach import attached_pixels
+from factorlib.surface.choice import Found, Surfaces, found
+from factorlib.surface.turns import Attached, joined
+from factorlib.urm.extract import Channels
+from factorlib.urm.observations import (
+    Observations,
+    at_one_exposure,
+    concatenate,
+    read_observations,
+    relative_exposures,
+)
+
+log = logging.getLogger("factorlib.surface")
+
+
+class Params(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """Whether surfaces are turned, and by how many observations."""
+
+    shape: Literal["auto", "off"] = "auto"
+    """Whether normals are turned by shading; auto: where lights that had no part in it gain."""
+    observations: Annotated[int, msgspec.Meta(ge=200)] = 2000
+    """Observations of a photo, drawn from all, that turns are found from."""
+    seed: Annotated[int, msgspec.Meta(ge=0)] = 0
+    """Seed of the draw, and of what is held out."""
+
+
+def main(params: Params, inputs: Inputs, out: Path, progress: Progress) -> None:
+    """Find the surfaces of all meshes, and write them where they are kept."""
+    if params.shape == "off":
+        write_json(out / FILE, SurfaceTable())
+        return
+    slices = msgspec.convert(inputs.facts["dataset.objects"], dict[str, ObjectsSlice])
+    photos, surfaces = _photos(inputs, slices), surfaces_of(inputs, slices)
+    seen = {name: drawn(inputs["urm"] / f"{name}.parquet", params) for name in photos}
+    attached = {name: photos[name].attached(np.column_stack([of.x, of.y]), surfaces) for name, of in seen.items()}
+    result = _found(params, inputs, seen, attached, surfaces, progress)
+    displacements = {name: values.astype("f4") for name, values in result.displacements.items()}
+    if result.evidence.kept:
+        turn = surfaces.turns_of(displacements)
+        (out / "normals").mkdir()
+        for name, photo in photos.items():
+            write_exr(out / "normals" / f"{name}.exr", photo.turned(surfaces, turn))
+    by_mesh = {name: values.tolist() for name, values in displacements.items()}
+    write_json(
+        out / FILE,
+        SurfaceTable(
+            **msgspec.structs.asdict(result.evidence),
+            stiffness=result.stiffness,
+            gains=result.gains,
+            displacements=by_mesh,
+        ),
+    )
+    progress(1, 1, "kept" if result.evidence.kept else "not kept")
+
+
+class Photo(msgspec.Struct, frozen=True):
+    """A photo as `align` left it: its maps, its objects and where they are."""
+
+    geometry: Channels
+    objects: ObjectsSlice
+    poses: PhotoPoses
+
+    def attached(self, pixels: Int[np.ndarray, "n 2"], surfaces: Surfaces) -> Attached:
+        """The nodes under pixels (x, y)."""
+        height, width = self.geometry["object"].shape
+        objects = {own.name: (own.mesh, self.poses.objects[own.name]) for own in self.objects.objects}
+        shown = np.rint(self.geometry["object"][pixels[:, 1], pixels[:, 0]]).astype(int)
+        return attached_pixels(pixels, shown, self.poses.camera.camera(width, height), objects, surfaces)
+
+    def turned(self, surfaces: Surfaces, turn: Float[np.ndarray, "v 3"]) -> Channels:
+        """The channels normal.x/y/z of turned surfaces, 0 where no mesh is seen."""
+        y, x = np.nonzero(self.geometry["object"] > 0.5)
+        normal, view = (
+            np.stack([self.geometry[f"{kind}.{a}"][y, x] for a in "xyz"], axis=-1).astype(float)
+            for kind in ("normal", "view")
+        )
+        picture = np.zeros((*self.geometry["object"].shape, 3), np.float32)
+        picture[y, x] = self.attached(np.column_stack([x, y]), surfaces).turned(normal, view, turn)
+        return {f"normal.{a}": picture[..., k] for k, a in enumerate("xyz")}
+
+
+def _photos(inputs: Inputs, slices: dict[str, ObjectsSlice]) -> dict[str, Photo]:
+    poses = read_poses(inputs["align"] / POSES)
+    return {
+        name: Photo(read_exr(inputs["align"] / f"{name}.exr"), slices[name], poses[name]) for name in sorted(slices)
+    }
+
+
+def surfaces_of(inputs: Inputs, slices: dict[str, ObjectsSlice]) -> Surfaces:
+    """Every mesh that a photo shows, subdivided; parts may be of several materials, which changes no vertex."""
+    read, meshes = MeshesOnce(inputs.file, inputs.facts["dataset.materials"], CREASE_DEG), {}
+    for slice_ in slices.values():
+        for own in slice_.objects:
+            if own.mesh not in meshes:
+                meshes[own.mesh] = fine(read.mesh(own.mesh, slice_.meshes[own.mesh], own.materials))
+    return Surfaces(dict(sorted(meshes.items())))
+
+
+def drawn(file: Path, params: Params) -> Observations:
+    """At most so many usable observations of a photo, in their order."""
+    seen = usable(read_observations(file))
+    chosen = np.random.default_rng(params.seed).permutation(len(seen))[: params.observations]
+    return seen.take(np.sort(chosen))
+
+
+def _found(
+    params: Params,
+    inputs: Inputs,
+    seen: dict[str, Observations],
+    attached: dict[str, Attached],
+    surfaces: Surfaces,
+    progress: Progress,
+) -> Found:
+    """What all photos say of the surfaces."""
+    lights = msgspec.convert(inputs.facts["dataset.light"], dict[str, LightSlice])
+    worlds = {name: np.array(of.world_from_camera) for name, of in lights.items() if of.world_from_camera is not None}
+    every = concatenate(list(seen.values()))
+    every = at_one_exposure(every, relative_exposures(every))
+    blocks = blocks_of_observations(every, Noise(), world_from_camera=worlds, seed=params.seed)
+    in_frame = [of.in_frame(worlds.get(name, np.eye(3))) for name, of in attached.items()]
+    problem = JointProblem(blocks, reflection_operator("network", weights=inputs["train"]), spread=inputs.map)
+    return found(
+        problem,
+        surfaces,
+        [joined(in_frame).take(block.row) for block in blocks],
+        from_nothing(len(inputs.facts["dataset.materials"])),
+        Choices(seed=params.seed),
+        read_light_prior(),
+        lambda share, what: progress(share, 1, what),
+    )
