@@ -53,7 +53,7 @@ def main(params: Params, inputs: Inputs, out: Path, progress: Progress) -> None:
         """A photo beside its re-synthesis."""
         photo, geometry = (
             read_exr(inputs["masks"] / f"{name}.exr"),
-            read_geometry(inputs["align"], inputs["surface"], name),
+            read_geometry(inputs["align"], inputs.folders.get("surface"), name),
         )
         return shot_of(photo, geometry, read_rgb_exr(inputs["render"] / "resynthesis" / f"{name}.exr"))
 
@@ -103,7 +103,7 @@ def _lights(inputs: Inputs, truth: TruthFile, out: Path) -> tuple[dict[str, Ligh
 
 def _geometry(inputs: Inputs, name: str) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Normals and views [h w 3] of a photo and its observed pixels."""
-    geometry = read_geometry(inputs["align"], inputs["surface"], name)
+    geometry = read_geometry(inputs["align"], inputs.folders.get("surface"), name)
     normal, view = (np.stack([geometry[f"{kind}.{a}"] for a in "xyz"], axis=-1) for kind in ("normal", "view"))
     return normal, view, observed_pixels(read_exr(inputs["masks"] / f"{name}.exr"), geometry)
 

@@ -1,7 +1,7 @@
 """What was solved, in the forms that other programs read.
 
 Writes illumination/<light>.exr and .hdr, coverage/<light>.exr, materials.json, lobes.parquet and exposures.json in the gauge that
-Mitsuba needs, scenes/<photo>.xml with their meshes and lights, the same scenes for Blender and as OpenUSD, materials.mtlx and <mesh>.glb,
+Mitsuba needs, scenes/<photo>.xml with their meshes and lights, the same scenes for Blender and as OpenUSD, materials.mtlx, <mesh>.glb and meshes/<mesh>.ply,
 and losses.json: what is lost on the way to other programs.
 """
 
@@ -32,6 +32,7 @@ from factorlib.images.write import write_hdr
 from factorlib.jsonfile import write_json
 from factorlib.light.latlong import lat_long_of_lobes, sampled
 from factorlib.light.lobes import Lobes, no_lobes
+from factorlib.meshes.ply import write_ply
 from factorlib.meshes.read import CREASE_DEG
 from factorlib.results.lobes import read_lobes, write_lobes
 from factorlib.results.materials import read_exposures, read_materials, reflectances
@@ -73,7 +74,7 @@ def main(params: Params, inputs: Inputs, out: Path, progress: Progress) -> None:
     write_text(out / "materials.mtlx", materialx(materials))
     write_losses(out / "losses.json", materials)
     progress(1, 4, "lights")
-    for folder in ("illumination", "coverage", "scenes/light", "scenes/meshes"):
+    for folder in ("illumination", "coverage", "meshes", "scenes/light", "scenes/meshes"):
         (out / folder).mkdir(parents=True)
     suns = {name: [_sun(one) for one in suns_of(light, YUP_FROM_CAMERA)] for name, light in lobes.items()}
     if clash := [name for name in lobes if name.endswith(SKY) and suns.get(name.removesuffix(SKY))]:
@@ -86,7 +87,9 @@ def main(params: Params, inputs: Inputs, out: Path, progress: Progress) -> None:
     progress(2, 4, "meshes")
     files = MeshFiles(inputs, out / "scenes", names, params.crease_deg)
     for name, mesh in sorted({n: m for each in objects.values() for n, m in each.meshes.items()}.items()):
-        write_glb(out / f"{name}.glb", files.read.mesh(name, mesh), names, materials)
+        whole = files.read.mesh(name, mesh)
+        write_glb(out / f"{name}.glb", whole, names, materials)
+        write_ply(out / "meshes" / f"{name}.ply", whole)
     progress(3, 4, "scenes")
     write_script(out / "scenes")
     poses = read_poses(inputs["align"] / "poses.json")

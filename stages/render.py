@@ -47,7 +47,10 @@ def main(params: Params, inputs: Inputs, out: Path, progress: Progress) -> None:
     """Render a photo again, and balls and reflectance maps of every material in its light."""
     name, names, file = inputs.photo, inputs.facts["dataset.materials"], inputs["export"] / "materials.json"
     exported, model = read_materials(file), read_materials(inputs["solve"] / "materials.json").model
-    photo, geometry = read_exr(inputs["masks"] / f"{name}.exr"), read_geometry(inputs["align"], inputs["surface"], name)
+    photo, geometry = (
+        read_exr(inputs["masks"] / f"{name}.exr"),
+        read_geometry(inputs["align"], inputs.folders.get("surface"), name),
+    )
     slice_ = msgspec.convert(inputs.facts["dataset.light"], LightSlice)
     light = light_of(inputs["export"], name, slice_)
     operator = reflection_operator(params.operator, weights=inputs["train"])
@@ -83,7 +86,7 @@ def surroundings(inputs: Inputs, model: Model, gauge: Gauge) -> Surroundings | N
     """
     if not (model.self_shadowing or model.distance):
         return None
-    seen = on_surface(read_observations(inputs["urm"] / f"{inputs.photo}.parquet"), inputs["surface"])
+    seen = on_surface(read_observations(inputs["urm"] / f"{inputs.photo}.parquet"), inputs.folders.get("surface"))
     if not model.self_shadowing:
         seen = msgspec.structs.replace(seen, visibility=None, met=None)
     sent = bounced_light(seen, seen.radiance.astype(float)) if model.interreflection else None

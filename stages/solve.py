@@ -88,7 +88,9 @@ class Params(LobeChoices, frozen=True, forbid_unknown_fields=True):
 def main(params: Params, inputs: Inputs, out: Path, progress: Progress) -> None:
     """Read the observations, solve, say what is uncertain, write."""
     names: list[str] = inputs.facts["dataset.materials"]
-    photos = gathered(sorted(inputs["urm"].glob("*.parquet")), params.merge_degrees, inputs.map, inputs["surface"])
+    photos = gathered(
+        sorted(inputs["urm"].glob("*.parquet")), params.merge_degrees, inputs.map, inputs.folders.get("surface")
+    )
     _warn(unusable_observations(photos))
     seen = concatenate([photo.merged for photo in photos])
     relative = relative_exposures(seen)

@@ -26,7 +26,6 @@ from factorlib.reflection import reflection_operator
 from factorlib.results.poses import FILE as POSES
 from factorlib.results.poses import PhotoPoses, read_poses
 from factorlib.results.surface import FILE, SurfaceTable
-from factorlib.solve.options import Choices
 from factorlib.solve.start import from_nothing
 from factorlib.stage import Inputs, Progress
 from factorlib.surface.attach import attached_pixels
@@ -155,7 +154,7 @@ def _found(
         surfaces,
         [joined(in_frame).take(block.row) for block in blocks],
         from_nothing(len(inputs.facts["dataset.materials"])),
-        Choices(seed=params.seed),
         read_light_prior(),
+        params.seed,
         lambda share, what: progress(share, 1, what),
     )

@@ -12,15 +12,17 @@ from factorlib.export.usd import SUFFIX, write_usd_mesh
 from factorlib.meshes.ply import submesh, write_ply
 from factorlib.meshes.read import MeshesOnce
 from factorlib.results.poses import ObjectEntry
+from factorlib.results.surface import read_surface
 from factorlib.stage import Inputs
 
 
 class MeshFiles:
-    """Meshes read once and written once, split by material, per choice of materials for their parts."""
+    """Meshes, on the surfaces that shading found, read once and written once, split by material, per choice of materials for their parts."""
 
     def __init__(self, inputs: Inputs, scenes: Path, materials: list[str], crease_deg: float):
         self.scenes, self.materials = scenes, materials
-        self.read = MeshesOnce(inputs.file, materials, crease_deg)
+        moved = read_surface(inputs.folders.get("surface")).displacements
+        self.read = MeshesOnce(inputs.file, materials, crease_deg, moved)
         self._stems: dict[tuple, str] = {}  # what files are called before the material, relative to the scenes
 
     def shapes(

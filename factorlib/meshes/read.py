@@ -15,6 +15,7 @@ import numpy as np
 
 from factorlib.dataset.schema import MeshEntry
 from factorlib.errors import InputError, did_you_mean
+from factorlib.meshes.fine import fine
 from factorlib.meshes.gltf import check_count, read_gltf
 from factorlib.meshes.limits import NO_LIMITS, Limits
 from factorlib.meshes.mesh import Mesh, area_vectors
@@ -66,10 +67,18 @@ class MeshesOnce:
     """Meshes of a data set, each read once for each choice of materials for its parts; sizes were limited by an earlier stage.
 
     file: the path of a file that dataset.yaml names;  materials: the data set's;  crease_deg: as of `read_mesh`
+    displacements: by mesh, those that `surface` found at its nodes: such a mesh is subdivided and moved
     """
 
-    def __init__(self, file: Callable[[str], Path], materials: Sequence[str], crease_deg: float):
+    def __init__(
+        self,
+        file: Callable[[str], Path],
+        materials: Sequence[str],
+        crease_deg: float,
+        displacements: Mapping[str, Sequence[float]] = {},
+    ):
         self.file, self.materials, self.crease_deg = file, materials, crease_deg
+        self.displacements = displacements
         self._meshes: dict[tuple, Mesh] = {}
 
     def mesh(self, name: str, entry: MeshEntry, overrides: Mapping[str, str] = {}) -> Mesh:
@@ -77,7 +86,14 @@ class MeshesOnce:
         key = (name, *sorted(overrides.items()))
         if key not in self._meshes:
             file = self.file(entry.file)
-            self._meshes[key] = read_mesh(file, self.materials, entry.made_of, overrides, self.crease_deg, NO_LIMITS)
+            mesh = read_mesh(file, self.materials, entry.made_of, overrides, self.crease_deg, NO_LIMITS)
+            if (displacement := self.displacements.get(name)) is not None:
+                dense = fine(mesh)
+                if dense.nodes != len(displacement):
+                    found, cure = "it is not the mesh that the stage `surface` moved", "run `surface` again"
+                    raise InputError(found, file=file, cure=cure)
+                mesh = dense.moved(np.array(displacement))
+            self._meshes[key] = mesh
         return self._meshes[key]
 
 

@@ -25,6 +25,7 @@ from factorlib.render.resynthesis import light_of
 from factorlib.render.traced import Tone, as_it_is
 from factorlib.results.materials import MaterialTable, Reflectance, read_materials, reflectances
 from factorlib.results.poses import PhotoPoses, read_poses
+from factorlib.results.surface import read_surface
 from factorlib.stage import Inputs
 from factorlib.tracing.scene import rigid
 
@@ -36,7 +37,7 @@ log = logging.getLogger("factorlib.render")
 class SolvedSet:
     """The solved materials, lights and poses, and the photos; each is read when first asked for.
 
-    inputs: with the slices materials, objects, light and ground of the data set, and the folders of `masks`, `align` and `export`
+    inputs: with the slices materials, objects, light and ground of the data set, and the folders of `masks`, `align`, `surface` and `export`
     """
 
     def __init__(self, inputs: Inputs, crease_deg: float = CREASE_DEG):
@@ -54,7 +55,8 @@ class SolvedSet:
                 raise InputError(found, file=file, key=f"materials.{name}", cure="run the stage `export` again")
         self.materials = reflectances(self.table)
         self.photos = list(self.objects)
-        self._meshes = MeshesOnce(inputs.file, self.names, crease_deg)
+        moved = read_surface(inputs.folders.get("surface")).displacements
+        self._meshes = MeshesOnce(inputs.file, self.names, crease_deg, moved)
         self._pixels: dict[str, dict[str, np.ndarray]] = {}
 
     def scene(self, photo: str) -> PhotoScene:

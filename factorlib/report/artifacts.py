@@ -19,7 +19,7 @@ from factorlib.results.metrics import Metrics, read_metrics
 from factorlib.results.photos import PhotoFacts, read_photos
 from factorlib.results.poses import PhotoPoses, read_poses
 
-STAGES = ["masks", "align", "urm", "train", "solve", "export", "render", "evaluate"]
+STAGES = ["masks", "align", "urm", "surface", "train", "solve", "export", "render", "evaluate"]
 
 T = TypeVar("T")
 Channels = dict[str, Float[np.ndarray, "h w"]]

@@ -31,6 +31,8 @@ class SurfaceTable(msgspec.Struct, frozen=True):
     displacements: dict[str, list[float]] = {}
 
 
-def read_surface(folder: str | Path) -> SurfaceTable:
-    """The table in the folder of a result of `surface`; raises InputError for a file that is none."""
+def read_surface(folder: str | Path | None) -> SurfaceTable:
+    """The table in the folder of a result of `surface`; without a folder, meshes are as given.  Raises InputError for a file that is none."""
+    if folder is None:
+        return SurfaceTable()
     return read_result(Path(folder) / FILE, SurfaceTable, "surface")

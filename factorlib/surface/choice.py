@@ -129,16 +129,17 @@ def found(
     surfaces: Surfaces,
     attached: list[Attached],
     start: Start,
-    choices: Choices,
     prior: LightPrior,
+    seed: int = 0,
     report: Report = lambda share, what: None,
 ) -> Found:
     """The displacements of the meshes, if lights that had no part in them gain.
 
-    problem: all observations;  attached: where each block's lie;  start: where materials and lights begin
+    problem: all observations;  attached: where each block's lie;  start: where materials and lights begin;  seed: of what is drawn
     """
     report(0.0, "materials and lights")
     sure = sure_ones(problem)
+    choices = Choices(self_shadowing="on", interreflection="on", seed=seed)
     effects = effects_chosen(sure, start(sure, CELLS), choices, lambda _, *of: fitted(of[0], of[1], prior, of[2]))
     fit = fitted(effects.of(problem), effects.fit, prior, SETTLE)
     trial = _Trial(effects.of(problem), fit, surfaces, attached, prior)

@@ -13,7 +13,7 @@ from factorlib.images.exr import read_exr
 from factorlib.urm.observations import Observations
 
 
-def read_geometry(align: Path, surface: Path, photo: str) -> dict[str, Float[np.ndarray, "h w"]]:
+def read_geometry(align: Path, surface: Path | None, photo: str) -> dict[str, Float[np.ndarray, "h w"]]:
     """The maps that `align` wrote of a photo, with the normals of the folder of `surface` where there are any."""
     return {**read_exr(align / f"{photo}.exr"), **_normals(surface, photo)}
 
@@ -23,7 +23,7 @@ def on_surface(seen: Observations, surface: Path | None) -> Observations:
 
     Merged observations have the normal of the pixel that their group is called by.  Raises InputError where the maps are of another photo's size.
     """
-    if surface is None or not seen.photos or not (maps := _normals(surface, seen.photos[0])):
+    if not seen.photos or not (maps := _normals(surface, seen.photos[0])):
         return seen
     height, width = maps["normal.x"].shape
     if len(seen) and (seen.x.max() >= width or seen.y.max() >= height):
@@ -36,6 +36,8 @@ def on_surface(seen: Observations, surface: Path | None) -> Observations:
     return msgspec.structs.replace(seen, normal=np.where(known, normal, seen.normal).astype(np.float32))
 
 
-def _normals(surface: Path, photo: str) -> dict[str, Float[np.ndarray, "h w"]]:
+def _normals(surface: Path | None, photo: str) -> dict[str, Float[np.ndarray, "h w"]]:
+    if surface is None:
+        return {}
     file = surface / "normals" / f"{photo}.exr"
     return read_exr(file) if file.exists() else {}

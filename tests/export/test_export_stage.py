@@ -61,6 +61,8 @@ def test_files_are_all_there_and_the_same_bytes_again(inputs, tmp_path):
         "losses.json",
         "ball.glb",
         "egg.glb",
+        "meshes/ball.ply",
+        "meshes/egg.ply",
         "materials.json",
         "materials.mtlx",
     }

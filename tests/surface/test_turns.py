@@ -1,0 +1,178 @@
+"""Turns of normals: derivatives against differences, the step against a dense system, and what is found or refused on spheres in natural light."""
+
+import msgspec
+import numpy as np
+import pytest
+import trimesh
+
+from factorlib.meshes.fine import Fine
+from factorlib.meshes.mesh import Mesh
+from factorlib.model.problem import JointProblem
+from factorlib.solve.fit import ROBUST, Hyperparameters, field_of
+from factorlib.solve.start import from_nothing
+from factorlib.surface import turns
+from factorlib.surface.choice import Found, Surfaces, found
+from factorlib.surface.turns import GRAZING, MOST, PULL, Attached, joined, part_of, step
+from tests.model.made import photos_in_a_wrong_light
+from tests.solve.made import PRIOR, begun, drawn, on_even_cells, photographed, spheres
+
+TURN = np.linalg.qr(np.random.default_rng(3).normal(size=(3, 3)))[0]  # the object's axes in the camera's frame
+COUNTS = Hyperparameters(2.0)
+
+
+def surfaces(subdivisions: int = 3) -> Surfaces:
+    """A ball of radius 1, no finer than the icosphere."""
+    solid = trimesh.creation.icosphere(subdivisions)
+    vertices, faces, label = np.array(solid.vertices), np.array(solid.faces), np.ones(len(solid.faces), np.int16)
+    return Surfaces({"ball": Fine(Mesh(vertices, faces, vertices, label), np.arange(len(vertices)), faces, 2.0)})
+
+
+def attached_to(normal: np.ndarray, body: Surfaces) -> Attached:
+    """Points of the ball by their normals: at each the nearest triangle, whose corners count by their nearness."""
+    (one,) = body.meshes.values()
+    place, rotation = np.zeros((one.nodes, 3)), TURN
+    place[one.node] = one.mesh.vertices
+    middles = place[one.faces].mean(1)
+    face = ((normal @ rotation) @ middles.T).argmax(1)
+    share = np.exp(30 * (np.einsum("nd,nkd->nk", normal @ rotation, place[one.faces[face]]) - 1))
+    return Attached(one.faces[face], share / share.sum(1, keepdims=True), np.tile(rotation, (len(normal), 1, 1)))
+
+
+def wrong(normal: np.ndarray, size: float) -> np.ndarray:
+    """Normals of a ball with dents: turned by the gradient of a function of the place."""
+    x = normal @ TURN
+    slope = np.stack([np.cos(4 * x[:, 0] + 1), np.sin(5 * x[:, 1]), np.cos(3 * x[:, 2] - 2 * x[:, 0])], 1) @ TURN.T
+    moved = normal + size * (slope - normal * np.sum(slope * normal, 1, keepdims=True))
+    return moved / np.linalg.norm(moved, axis=1, keepdims=True)
+
+
+def with_wrong_normals(problem: JointProblem, size: float) -> JointProblem:
+    """What the photos show is as it was; the mesh has dents that the object has not."""
+    return problem.of([msgspec.structs.replace(b, normal=wrong(b.normal, size)) for b in problem.blocks])
+
+
+@pytest.mark.parametrize("kind", ["clipped", "bounced", "hidden"])
+def test_slopes_are_those_of_the_forward_model(kind, monkeypatch):
+    monkeypatch.setattr(turns, "STEP", 1e-3)  # the step in use smooths what is sharper than a degree
+    one, body = photos_in_a_wrong_light(kind), surfaces()
+    at, random = attached_to(one.block.normal, body), np.random.default_rng(0)
+    turn = random.normal(size=(body.nodes, 3))
+    part = part_of(one, COUNTS, PRIOR, at.operator(body.nodes))
+    own = field_of(one, COUNTS, PRIOR, True).illumination
+    residual = own.block.residuals(own.shown().radiance)
+    weight = one.pull(residual, ROBUST, COUNTS.temperature)
+    after, before = (
+        msgspec.structs.replace(one, block=msgspec.structs.replace(one.block, normal=n)).residuals()
+        for n in (at.turned(one.block.normal, one.block.view, s * turn) for s in (1e-3, -1e-3))
+    )
+    inside = np.sum(one.block.normal * one.block.view, 1) > 0.2
+    expected, given = weight * (after - before) / 2e-3, (part.slopes @ turn.reshape(-1)).reshape(-1, 3)
+    assert np.abs(expected).max() > 1  # there is something to compare
+    error = np.linalg.norm((given - expected)[inside]) / np.linalg.norm(expected[inside])
+    assert error < 0.03, error
+
+
+def test_a_step_is_that_of_the_dense_system_of_turns_and_lights():
+    problem, _, body = *photographed(2, 2, size=9), surfaces(1)
+    problem = with_wrong_normals(problem, 0.1)
+    fit, turn = begun(problem), 0.02 * np.random.default_rng(1).normal(size=(body.nodes, 3))
+    parts = [
+        part_of(one, COUNTS, PRIOR, attached_to(one.block.normal, body).operator(body.nodes))
+        for one in problem.illuminations(fit.point)
+    ]
+    (mesh,), stiffness, v = body.meshes.values(), 50.0, 3 * body.nodes
+    prior = stiffness * np.kron(mesh.laplacian().toarray() + PULL * np.eye(body.nodes), np.eye(3))
+    sizes = [part.by_light.shape[1] for part in parts]
+    system, gradient = np.zeros((v + sum(sizes),) * 2), np.zeros(v + sum(sizes))
+    system[:v, :v], gradient[:v] = prior, prior @ turn.reshape(-1)
+    start = v
+    for part, one, size in zip(parts, problem.illuminations(fit.point), sizes, strict=True):
+        own, J, U = slice(start, start + size), part.slopes.toarray(), part.by_light.astype(float)
+        field = field_of(one, COUNTS, PRIOR, True)
+        residual = field.illumination.block.residuals(field.illumination.shown().radiance)
+        r = (residual * one.pull(residual, ROBUST, COUNTS.temperature)).reshape(-1)
+        Q, u = field.precision, one.light.log_radiance.reshape(-1)
+        system[:v, :v] += J.T @ J
+        system[:v, own], system[own, :v], system[own, own] = J.T @ U, U.T @ J, U.T @ U + Q
+        gradient[:v] += J.T @ r
+        gradient[own] = U.T @ r + Q @ u
+        start += size
+    expected = turn - np.linalg.solve(system, gradient)[:v].reshape(-1, 3)
+    given = step(parts, body.laplacian(), stiffness, turn)
+    assert np.linalg.norm(given - expected) < 0.02 * np.linalg.norm(expected - turn)
+
+
+def test_turned_normals_are_unit_bounded_and_never_leave_the_viewer():
+    random, body = np.random.default_rng(0), surfaces()
+    normal = random.normal(size=(500, 3))
+    normal /= np.linalg.norm(normal, axis=1, keepdims=True)
+    view = np.tile([0.0, 0.0, 1.0], (500, 1))
+    normal[:, 2] = np.abs(normal[:, 2]) + GRAZING
+    normal /= np.linalg.norm(normal, axis=1, keepdims=True)
+    at = attached_to(normal, body)
+    after = at.turned(normal, view, random.normal(size=(body.nodes, 3)))
+    np.testing.assert_allclose(np.linalg.norm(after, axis=1), 1)
+    assert (np.sum(after * normal, 1) > 1 / np.hypot(1, MOST) - 1e-9).all() and (after[:, 2] >= GRAZING).all()
+    np.testing.assert_allclose(at.turned(normal, view, np.zeros((body.nodes, 3))), normal)
+    nowhere = msgspec.structs.replace(at, share=np.zeros_like(at.share))
+    np.testing.assert_allclose(nowhere.turned(normal, view, np.ones((body.nodes, 3))), normal)
+
+
+def test_turns_do_not_depend_on_the_frame():
+    random, body = np.random.default_rng(1), surfaces()
+    normal = random.normal(size=(50, 3))
+    normal /= np.linalg.norm(normal, axis=1, keepdims=True)
+    at, turn = attached_to(normal, body), 0.1 * random.normal(size=(body.nodes, 3))
+    R = np.linalg.qr(random.normal(size=(3, 3)))[0]
+    after = at.in_frame(R).turned(normal @ R.T, normal @ R.T, turn)
+    np.testing.assert_allclose(after, at.turned(normal, normal, turn) @ R.T, atol=1e-12)
+
+
+def on_spheres(lights: int, size: float, seed: int = 0) -> tuple[Found, Surfaces, JointProblem, JointProblem]:
+    """What is found of a ball whose mesh has dents of that size, in so many lights."""
+    true = [on_even_cells(drawn(100 * seed + k, 120)) for k in range(lights)]
+    problem, body = spheres(true, size=18, seed=seed), surfaces()
+    given = with_wrong_normals(problem, size)
+    at = [attached_to(block.normal, body) for block in problem.blocks]
+    return found(given, body, at, from_nothing(3), PRIOR), body, given, problem
+
+
+def errors(normals: np.ndarray, true: np.ndarray) -> float:
+    """Median angle in degrees."""
+    return float(np.median(np.degrees(np.arccos(np.clip(np.sum(normals * true, 1), -1, 1)))))
+
+
+def test_dents_that_the_object_has_not_are_found_in_three_lights():
+    what, body, given, true = on_spheres(3, 0.15, 1)
+    assert what.evidence.kept and sum(what.gains.values()) > 0
+    turn = body.turns_of(what.displacements)
+    for block, exact in zip(given.blocks, true.blocks, strict=True):
+        at = attached_to(exact.normal, body)
+        before, after = (
+            errors(block.normal, exact.normal),
+            errors(at.turned(block.normal, block.view, turn), exact.normal),
+        )
+        assert after < 0.6 * before, (before, after)
+
+
+def test_one_light_alone_decides_nothing():
+    what = on_spheres(1, 0.15)[0]
+    assert not what.evidence.kept and not what.displacements
+
+
+def test_an_exact_mesh_stays_as_it_is_or_nearly():
+    what, body, given, true = on_spheres(3, 0.0)
+    if what.evidence.kept:
+        turn = body.turns_of(what.displacements)
+        for block in given.blocks:
+            after = attached_to(block.normal, body).turned(block.normal, block.view, turn)
+            assert errors(after, block.normal) < 0.5
+
+
+def test_observations_of_several_photos_are_joined_in_order():
+    body = surfaces()
+    normal = np.eye(3)
+    one, other = attached_to(normal[:1], body), attached_to(normal[1:], body)
+    both = joined([one, other])
+    assert np.array_equal(both.node, attached_to(normal, body).node)
+    assert np.array_equal(both.take(np.array([2])).frame, other.frame[1:])
