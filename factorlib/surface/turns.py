@@ -84,16 +84,33 @@ def joined(parts: Sequence[Attached]) -> Attached:
 
 
 class Part(NamedTuple):
-    """One light's part of (2): J, r with the light's own optimum taken out, U, and the Cholesky factor of H."""
+    """One light's part of (2): J, r with the light's own optimum taken out, and what tells U and H⁻¹.
+
+    by_light  U by channel: a channel's residuals depend on its own p cells, and on q exposures and tone exponents that all channels share
+    factor    of H, by Cholesky
+    """
 
     slopes: csr_array
-    residual: Float[np.ndarray, " m"]
-    by_light: Float[np.ndarray, "m l"]
+    residual: Float[np.ndarray, " 3n"]
+    by_light: Float[np.ndarray, "3 n p+q"]
     factor: tuple[np.ndarray, bool]
+    cells: int
 
-    def without_light(self, change: Float[np.ndarray, " m"]) -> Float[np.ndarray, " m"]:
+    def of_light(self, unknowns: Float[np.ndarray, " l"]) -> Float[np.ndarray, " 3n"]:
+        """U times a change of the light."""
+        own, shared = unknowns[: 3 * self.cells].reshape(3, -1), unknowns[3 * self.cells :]
+        each = [U @ np.append(u, shared).astype(np.float32) for U, u in zip(self.by_light, own, strict=True)]
+        return np.stack(each, axis=1).reshape(-1).astype(float)
+
+    def to_light(self, change: Float[np.ndarray, " 3n"]) -> Float[np.ndarray, " l"]:
+        """Uᵀ times a change of the residuals."""
+        each = [U.T @ r.astype(np.float32) for U, r in zip(self.by_light, change.reshape(-1, 3).T, strict=True)]
+        own = [of[: self.cells] for of in each]
+        return np.concatenate([*own, np.sum([of[self.cells :] for of in each], axis=0)]).astype(float)
+
+    def without_light(self, change: Float[np.ndarray, " 3n"]) -> Float[np.ndarray, " 3n"]:
         """(1 − U H⁻¹ Uᵀ) of a change of the residuals."""
-        return change - self.by_light @ cho_solve(self.factor, self.by_light.T @ change)
+        return change - self.of_light(cho_solve(self.factor, self.to_light(change)))
 
 
 def part_of(illumination: Illumination, counts: Hyperparameters, prior: LightPrior, operator: csr_array) -> Part:
@@ -101,19 +118,16 @@ def part_of(illumination: Illumination, counts: Hyperparameters, prior: LightPri
     field = field_of(illumination, counts, prior, materials_given=True)
     own, block = field.illumination, illumination.block
     n, p, shown = len(block), len(own.light), own.shown()
-    residual, by_light = np.zeros((n, 3)), np.zeros((n, 3, own.light.unknowns), np.float32)
+    residual, by_light = np.zeros((n, 3)), np.zeros((3, n, own.light.unknowns - 2 * p), np.float32)
     for line in own.linearise(shown, ROBUST, counts.temperature):
-        c = line.channel
-        residual[line.rows, c] = line.residual
-        by_light[line.rows, c, c * p : (c + 1) * p] = line.diffuse + line.specular
-        by_light[line.rows, c, 3 * p :] = line.by_photo
-    by_light = by_light.reshape(3 * n, -1)
+        residual[line.rows, line.channel] = line.residual
+        by_light[line.channel, line.rows] = np.hstack([line.diffuse + line.specular, line.by_photo])
     system = marginal(field, materials_given=True)
     factor = cho_factor(system.light_hessian)
     weight = own.pull(block.residuals(shown.radiance), ROBUST, counts.temperature)
     slopes = (_by_normal(illumination) * weight[:, :, None]).reshape(3 * n, 3)
-    moved = residual.reshape(-1) - by_light @ cho_solve(factor, system.light_gradient)
-    return Part(csr_array(_rows(slopes) @ operator), moved, by_light, factor)
+    part = Part(csr_array(_rows(slopes) @ operator), residual.reshape(-1), by_light, factor, p)
+    return part._replace(residual=part.residual - part.of_light(cho_solve(factor, system.light_gradient)))
 
 
 def _rows(slopes: Float[np.ndarray, "3n 3"]) -> csr_array:

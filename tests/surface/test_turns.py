@@ -82,12 +82,16 @@ def test_a_step_is_that_of_the_dense_system_of_turns_and_lights():
     ]
     (mesh,), stiffness, v = body.meshes.values(), 50.0, 3 * body.nodes
     prior = stiffness * np.kron(mesh.laplacian().toarray() + PULL * np.eye(body.nodes), np.eye(3))
-    sizes = [part.by_light.shape[1] for part in parts]
+    sizes = [one.light.unknowns for one in problem.illuminations(fit.point)]
     system, gradient = np.zeros((v + sum(sizes),) * 2), np.zeros(v + sum(sizes))
     system[:v, :v], gradient[:v] = prior, prior @ turn.reshape(-1)
     start = v
     for part, one, size in zip(parts, problem.illuminations(fit.point), sizes, strict=True):
-        own, J, U = slice(start, start + size), part.slopes.toarray(), part.by_light.astype(float)
+        own, J, U = (
+            slice(start, start + size),
+            part.slopes.toarray(),
+            np.stack([part.of_light(e) for e in np.eye(size)], axis=1),
+        )
         field = field_of(one, COUNTS, PRIOR, True)
         residual = field.illumination.block.residuals(field.illumination.shown().radiance)
         r = (residual * one.pull(residual, ROBUST, COUNTS.temperature)).reshape(-1)
