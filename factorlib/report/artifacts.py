@@ -18,6 +18,7 @@ from factorlib.results.materials import MaterialTable, Solved, read_exposures, r
 from factorlib.results.metrics import Metrics, read_metrics
 from factorlib.results.photos import PhotoFacts, read_photos
 from factorlib.results.poses import PhotoPoses, read_poses
+from factorlib.results.surface import SurfaceTable, read_surface
 
 STAGES = ["masks", "align", "urm", "surface", "train", "solve", "export", "render", "evaluate"]
 
@@ -68,6 +69,11 @@ class Artifacts(msgspec.Struct, frozen=True, dict=True):
     def poses(self) -> dict[str, PhotoPoses]:
         """What `align` says of each photo."""
         return self.read(read_poses, "align", "poses.json") or {}
+
+    @cached_property
+    def surface(self) -> SurfaceTable:
+        """What shading says of the meshes; as given, where there is no such result."""
+        return read_surface(self.folders.get("surface"))
 
     @cached_property
     def solved(self) -> MaterialTable:

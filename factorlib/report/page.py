@@ -3,7 +3,7 @@
 import json
 import math
 import re
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from itertools import groupby
 from typing import Any
 
@@ -29,8 +29,14 @@ ERROR = "relative error, %"
 Plot = tuple[str, list[str]]  # an SVG, and the names of its lines
 
 
-def page(run: Artifacts, rows: list[pictures.PhotoRow], tags: dict[str, str], viewed: dict[str, Any] | None) -> str:
-    """The page as HTML, from the artifacts, the photos' rows, the materials' colours and what can be relit."""
+def page(
+    run: Artifacts,
+    rows: list[pictures.PhotoRow],
+    tags: dict[str, str],
+    viewed: dict[str, Any] | None,
+    surfaces: Sequence[pictures.SurfaceRow] = (),
+) -> str:
+    """The page as HTML, from the artifacts, the photos' rows, the materials' colours, what can be relit, and the meshes that were moved."""
     metrics, exposure, facts, solved = run.metrics, pictures.exposures(run), run.photo_facts, run.solved
     assert metrics is not None
     photos, poses = run.set.photos, run.poses
@@ -58,6 +64,8 @@ def page(run: Artifacts, rows: list[pictures.PhotoRow], tags: dict[str, str], vi
         exposures={p: f for p, f in run.exposures.items() if any(abs(c - 1) > 1e-9 for c in f)},
         plots=_plots(run.table("solve", "convergence")),
         poses=[(p, _overlay(run, p), poses[p], facts.get(p)) for p in photos if p in poses],
+        surface=run.surface,
+        surfaces=surfaces,
         low_iou=LOW_IOU,
         as_it_is=AS_IT_IS,
         training=_training(run),

@@ -1,7 +1,7 @@
 """Pictures inside the page: each photo beside its re-synthesis, balls, reflectance maps, lights, and one of the whole run."""
 
 import base64
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import msgspec
@@ -10,6 +10,7 @@ from jaxtyping import Bool, Float, UInt8
 from scipy.ndimage import binary_erosion
 
 from factorlib.conventions import lat_long_solid_angles
+from factorlib.dataset.schema import ObjectsSlice
 from factorlib.evaluate.resynthesis import agreeing_pixels
 from factorlib.images.palette import nearest_tags, rgb_of
 from factorlib.images.picture import exposure_of, picture, png_bytes
@@ -17,6 +18,7 @@ from factorlib.images.transfer import srgb_encode
 from factorlib.report.artifacts import Artifacts, Channels, Picture
 from factorlib.results.materials import Reflectance
 from factorlib.results.metrics import PhotoErrors, ScoredLight
+from factorlib.urm.geometry import on_surface
 from factorlib.urm.observations import Observations, read_observations
 
 AMPLIFICATION = 4  # of the difference between photo and re-synthesis
@@ -26,6 +28,7 @@ MAGENTA = (214, 40, 120)
 COLUMN, GAP, MOST_PHOTOS = 200, 8, 8  # of the overview: pixels, pixels, photos
 UNKNOWN = Reflectance((0.2,) * 3, (0.0,) * 3, 1.0)  # of a material that was not solved
 MAP_SIZE = 64
+CLAY_LIGHT = np.array([-0.5, -0.6, -0.6245])  # camera frame, unit: from above, left of the camera
 LEAST_OBSERVED = 0.002  # of a disc: fewer normals than this are not ringed
 
 Pixels = UInt8[np.ndarray, "h w c"]
@@ -140,6 +143,47 @@ def _labels(masks: Channels, geometry: Channels, photo: Picture, tags: list[str]
     return display
 
 
+class SurfaceRow(msgspec.Struct, frozen=True):
+    """A mesh in the photo that shows most of it, as given and as shading has it: pictures by title, and the displacement over the extent."""
+
+    mesh: str
+    photo: str
+    uris: dict[str, str]
+    typical: float
+    largest: float
+
+
+def surface_rows(run: Artifacts, objects: Mapping[str, ObjectsSlice]) -> list[SurfaceRow]:
+    """Every mesh that was moved, in the order of their names."""
+    rows = []
+    for mesh, values in run.surface.displacements.items():
+        shown = {}
+        for photo, slice_ in objects.items():
+            numbers = [number for number, own in enumerate(slice_.objects, start=1) if own.mesh == mesh]
+            seen = (
+                np.isin(np.rint(run.channels("align", photo)["object"]), numbers) if numbers else np.zeros((1, 1), bool)
+            )
+            shown[photo] = seen
+        photo = max(shown, key=lambda name: int(shown[name].sum()))
+        box, uris = box_of(shown[photo]), {}
+        for which, channels in (
+            ("as given", run.channels("align", photo)),
+            ("by shading", run.channels("surface", f"normals/{photo}")),
+        ):
+            normal = np.stack([channels[f"normal.{a}"] for a in "xyz"], axis=-1) * shown[photo][..., None]
+            clay = srgb_encode(0.1 + 0.8 * np.maximum(normal @ CLAY_LIGHT, 0))[..., None] * np.ones(3)
+            for what, pixels in (("normals", 0.5 + 0.5 * normal * (1, -1, -1)), ("clay", clay)):
+                pixels = np.where(shown[photo][..., None], pixels, 1.0)[box].astype(np.float32)
+                small = reduced(pixels, longest_side(len(run.set.photos)))
+                uris[f"{what}, {which}"] = data_uri(np.rint(255 * np.clip(small, 0, 1)).astype(np.uint8))
+        size = np.abs(np.array(values))
+        order = ("clay, as given", "clay, by shading", "normals, as given", "normals, by shading")
+        rows.append(
+            SurfaceRow(mesh, photo, {k: uris[k] for k in order}, float(np.sqrt(np.mean(size**2))), float(size.max()))
+        )
+    return rows
+
+
 def strip(row: PhotoRow) -> bytes:
     """A row's panels side by side on white, as a PNG."""
     return png_bytes(np.concatenate([_on_white(pixels) for pixels in row.panels.values()], axis=1))
@@ -214,6 +258,7 @@ def ball_cell(run: Artifacts, material: str, photo: str, exposure: float) -> Cel
 def reflectance_maps(run: Artifacts, photo: str, exposure: float) -> list[Cell]:
     """One cell per material: solved, with the observed normals ringed, and beside it what the photo measured."""
     cells, observations = [], run.read(read_observations, "urm", f"{photo}.parquet")
+    observations = observations and on_surface(observations, run.folders.get("surface"))
     for index, name in enumerate(run.set.materials):
         channels = run.exr("render", f"reflectance_maps/{photo}/{name}")
         seen = observations and observations.take(observations.material == index)
