@@ -1,6 +1,6 @@
 """Normals by shading: all photos together say how the meshes' surfaces differ from the given ones.
 
-Materials and lights are fitted as the solve begins; then normals turn until they explain all photos best, and stay so only where lights that had no
+Materials and lights are fitted as the solve begins; then normals turn until they explain all photos best, and stay so only where photos that had no
 part in it gain (`factorlib.surface.choice`).  Writes surface.json, and where surfaces are turned normals/<photo>.exr, the normals that
 every later stage uses in place of those of `align`.
 """
@@ -47,7 +47,7 @@ class Params(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """Whether surfaces are turned, and by how many observations."""
 
     shape: Literal["auto", "off"] = "auto"
-    """Whether normals are turned by shading; auto: where lights that had no part in it gain."""
+    """Whether normals are turned by shading; auto: where photos that had no part in it gain."""
     observations: Annotated[int, msgspec.Meta(ge=200)] = 2000
     """Observations of a photo, drawn from all, that turns are found from."""
     seed: Annotated[int, msgspec.Meta(ge=0)] = 0

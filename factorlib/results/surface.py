@@ -15,10 +15,10 @@ class SurfaceTable(msgspec.Struct, frozen=True):
     """What was found.
 
     kept           whether surfaces differ from the given meshes
-    held_out_loss_with, held_out_loss_without, margin   of held-out observations of lights that had no part in the surface, and their difference in
+    held_out_loss_with, held_out_loss_without, margin   of held-out observations of photos that had no part in the surface, and their difference in
                    standard errors; None where nothing was tried
     stiffness      of the surface, the best of those that were tried
-    gains          by illumination: how much minus twice the log marginal likelihood of its observations fell, while it had no part in the surface
+    gains          by photo: how much minus twice the log marginal likelihood of its observations fell, while it had no part in the surface
     displacements  by mesh: along the normal of each node of the subdivided mesh (`factorlib.meshes.fine`), over the mesh's extent; none where not kept
     """
 

@@ -1,10 +1,10 @@
 """Whether a set's surfaces are turned by shading, how stiff they are, and the displacement that they end with.
 
 start      materials and lights are fitted on few cells, as the solve begins
-stiffness  of each of `STIFFNESS`, from stiff to soft, turns are found from all lights but one, for every light in turn; that light is then fitted
-           with the materials given, and what counts is minus twice the log marginal likelihood of its observations
-           (`factorlib.solve.marginal`), without turns and with them.  The stiffness that all lights together gain most by is used
-whether    turns are kept where that gain is above zero and the held-out observations of lights that had no part in the turns are explained better
+stiffness  of each of `STIFFNESS`, from stiff to soft, turns are found from all photos but one, for every photo in turn; that photo then gets a light of its
+           own, with the materials given, and what counts is minus twice the log marginal likelihood of its observations
+           (`factorlib.solve.marginal`), without turns and with them.  The stiffness that all photos together gain most by is used
+whether    turns are kept where that gain is above zero and the held-out observations of photos that had no part in the turns are explained better
            by more than `FOR` standard errors (`factorlib.solve.evidence`)
 rounds     turns from all lights, materials and lights fitted again, `ROUNDS` times
 surface    at last the displacement whose normals come nearest to the turned ones: what no displacement explains (a wrong pose turns all normals
@@ -81,8 +81,8 @@ class Surfaces(msgspec.Struct, frozen=True):
 class Found(msgspec.Struct, frozen=True):
     """What was found.
 
-    evidence  whether surfaces are turned, by held-out observations of lights that had no part in the turns
-    stiffness that was best;  gains: of it, by light: how much −2 log marginal likelihood fell in a light that had no part in the turns
+    evidence  whether surfaces are turned, by held-out observations of photos that had no part in the turns
+    stiffness that was best;  gains: of it, by photo: how much −2 log marginal likelihood fell while the photo had no part in the turns
     displacements  by mesh, at nodes, in extents; none where surfaces stay
     """
 
@@ -115,9 +115,16 @@ class _Trial(msgspec.Struct, frozen=True):
         each = zip(self.turned(turn).illuminations(fit.point), fit.hyperparameters, operators, strict=True)
         return list(self.problem.spread(lambda one: part_of(one[0], one[1], self.prior, one[2]), list(each)))
 
-    def alone(self, k: int, turn: Float[np.ndarray, "v 3"]) -> tuple[float, Losses]:
-        """Light k fitted with the materials given: −2 log marginal likelihood, and the losses of its held-out observations."""
-        problem, counts = self.turned(turn).restricted([k]), [self.fit.hyperparameters[k]]
+    @property
+    def photos(self) -> list[tuple[int, int]]:
+        """Each photo that has observations: its block and its number there."""
+        return [(k, int(j)) for k, block in enumerate(self.problem.blocks) for j in np.unique(block.photo)]
+
+    def alone(self, photo: tuple[int, int], turn: Float[np.ndarray, "v 3"]) -> tuple[float, Losses]:
+        """A light for this photo alone, with the materials given: −2 log marginal likelihood, and the losses of its held-out observations."""
+        k, number = photo
+        (block,), counts = self.turned(turn).restricted([k]).blocks, [self.fit.hyperparameters[k]]
+        problem = self.problem.of([block.take(block.photo == number)])
         begun = Fit(Point(self.fit.point.materials, [self.fit.point.lights[k]]), counts)
         point = fitted(problem, begun, self.prior, OWN_LIGHT).point
         (own,) = problem.fitted().illuminations(point)
@@ -133,7 +140,7 @@ def found(
     seed: int = 0,
     report: Report = lambda share, what: None,
 ) -> Found:
-    """The displacements of the meshes, if lights that had no part in them gain.
+    """The displacements of the meshes, if photos that had no part in them gain.
 
     problem: all observations;  attached: where each block's lie;  start: where materials and lights begin;  seed: of what is drawn
     """
@@ -143,31 +150,34 @@ def found(
     effects = effects_chosen(sure, start(sure, CELLS), choices, lambda _, *of: fitted(of[0], of[1], prior, of[2]))
     fit = fitted(effects.of(problem), effects.fit, prior, SETTLE)
     trial = _Trial(effects.of(problem), fit, surfaces, attached, prior)
-    laplacian, still, lights = surfaces.laplacian(), np.zeros((surfaces.nodes, 3)), range(len(problem.blocks))
-    if len(problem.blocks) < 2 or problem.none_held_out:
+    laplacian, still, photos = surfaces.laplacian(), np.zeros((surfaces.nodes, 3)), trial.photos
+    if len(photos) < 2 or problem.none_held_out:
         return Found(Evidence(False))
     parts = trial.parts(still, fit)
-    plain = list(problem.spread(partial(trial.alone, turn=still), lights))
+    plain = list(problem.spread(partial(trial.alone, turn=still), photos))
 
-    def left_out(k: int, stiffness: float) -> tuple[float, Losses]:
-        """Light k on the surface that all others ask for."""
-        turn = step([part for j, part in enumerate(parts) if j != k], laplacian, stiffness, still)
-        others = [of for j, of in enumerate(attached) if j != k]
-        return trial.alone(k, surfaces.turns_of(surfaces.displacements(turn, others)))
+    def left_out(photo: tuple[int, int], stiffness: float) -> tuple[float, Losses]:
+        """A photo on the surface that all others ask for."""
+        gone = [(problem.blocks[k].photo == photo[1]) & (k == photo[0]) for k in range(len(parts))]
+        others = [part.without(rows) if rows.any() else part for part, rows in zip(parts, gone, strict=True)]
+        turn = step([part for part in others if len(part.residual)], laplacian, stiffness, still)
+        seen = [of.take(~rows) for of, rows in zip(attached, gone, strict=True)]
+        return trial.alone(photo, surfaces.turns_of(surfaces.displacements(turn, seen)))
 
     best = None
     for number, stiffness in enumerate(STIFFNESS):
-        report(0.3 + 0.1 * number, f"left-out lights, stiffness {stiffness:g}")
-        tried = list(problem.spread(partial(left_out, stiffness=stiffness), lights))
+        report(0.3 + 0.1 * number, f"left-out photos, stiffness {stiffness:g}")
+        tried = list(problem.spread(partial(left_out, stiffness=stiffness), photos))
         gains = np.array([before - after for (before, _), (after, _) in zip(plain, tried, strict=True)])
         if best is None or gains.sum() > best[0].sum():
             best = gains, stiffness, tried
     gains, stiffness, tried = best
     evidence = compare(*(_joined([losses for _, losses in of]) for of in (plain, tried)), FOR)
     evidence = msgspec.structs.replace(evidence, kept=evidence.kept and bool(gains.sum() > 0))
-    by_light = {block.name: float(gain) for block, gain in zip(problem.blocks, gains, strict=True)}
+    names = [problem.blocks[k].photos[number] for k, number in photos]
+    by_photo = {name: float(gain) for name, gain in zip(names, gains, strict=True)}
     if not evidence.kept:
-        return Found(evidence, stiffness, by_light)
+        return Found(evidence, stiffness, by_photo)
     turn = still
     for number in range(ROUNDS):
         report(0.7 + 0.1 * number, f"normals, round {number + 1}")
@@ -175,9 +185,9 @@ def found(
             fit = fitted(trial.turned(turn), fit, prior, BETWEEN)
             parts = trial.parts(turn, fit)
         turn = step(parts, laplacian, stiffness, turn)
-    return Found(evidence, stiffness, by_light, surfaces.displacements(turn, attached))
+    return Found(evidence, stiffness, by_photo, surfaces.displacements(turn, attached))
 
 
 def _joined(losses: Sequence[Losses]) -> Losses:
-    """The losses of lights that were judged one by one."""
+    """The losses of photos that were judged one by one."""
     return Losses([one.values[0] for one in losses], [one.clusters[0] for one in losses])

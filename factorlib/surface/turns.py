@@ -17,11 +17,11 @@ is added.  Lights must move along: with lights given, what they had taken up of 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import NamedTuple
+from functools import cached_property
 
 import msgspec
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 from scipy.linalg import cho_factor, cho_solve
 from scipy.sparse import csr_array, diags_array, eye_array, kron
 from scipy.sparse.linalg import LinearOperator, cg
@@ -83,18 +83,41 @@ def joined(parts: Sequence[Attached]) -> Attached:
     return Attached(*(np.concatenate([getattr(part, name) for part in parts]) for name in Attached.__struct_fields__))
 
 
-class Part(NamedTuple):
-    """One light's part of (2): J, r with the light's own optimum taken out, and what tells U and H⁻¹.
+class Part(msgspec.Struct, frozen=True, dict=True):
+    """One light's part of (2): J, r, U, H and g.
 
     by_light  U by channel: a channel's residuals depend on its own p cells, and on q exposures and tone exponents that all channels share
-    factor    of H, by Cholesky
+    cells     p
     """
 
     slopes: csr_array
     residual: Float[np.ndarray, " 3n"]
     by_light: Float[np.ndarray, "3 n p+q"]
-    factor: tuple[np.ndarray, bool]
+    hessian: Float[np.ndarray, "l l"]
+    gradient: Float[np.ndarray, " l"]
     cells: int
+
+    @cached_property
+    def factor(self) -> tuple[np.ndarray, bool]:
+        """H by Cholesky."""
+        return cho_factor(self.hessian)
+
+    @property
+    def unexplained(self) -> Float[np.ndarray, " 3n"]:
+        """r − U H⁻¹ g: what is left where the light is at its own optimum."""
+        return self.residual - self.of_light(cho_solve(self.factor, self.gradient))
+
+    def without(self, gone: Bool[np.ndarray, " n"]) -> Part:
+        """The same light, seen by the other observations alone."""
+        rest = np.repeat(~gone, 3)
+        hessian, p = self.hessian.copy(), self.cells
+        for c, U in enumerate(self.by_light[:, gone].astype(float)):
+            places = np.concatenate([np.arange(c * p, (c + 1) * p), np.arange(3 * p, len(hessian))])
+            hessian[np.ix_(places, places)] -= U.T @ U
+        gradient = self.gradient - self.to_light(np.where(rest, 0.0, self.residual))
+        return Part(
+            self.slopes[np.flatnonzero(rest)], self.residual[rest], self.by_light[:, ~gone], hessian, gradient, p
+        )
 
     def of_light(self, unknowns: Float[np.ndarray, " l"]) -> Float[np.ndarray, " 3n"]:
         """U times a change of the light."""
@@ -123,11 +146,10 @@ def part_of(illumination: Illumination, counts: Hyperparameters, prior: LightPri
         residual[line.rows, line.channel] = line.residual
         by_light[line.channel, line.rows] = np.hstack([line.diffuse + line.specular, line.by_photo])
     system = marginal(field, materials_given=True)
-    factor = cho_factor(system.light_hessian)
     weight = own.pull(block.residuals(shown.radiance), ROBUST, counts.temperature)
     slopes = (_by_normal(illumination) * weight[:, :, None]).reshape(3 * n, 3)
-    part = Part(csr_array(_rows(slopes) @ operator), residual.reshape(-1), by_light, factor, p)
-    return part._replace(residual=part.residual - part.of_light(cho_solve(factor, system.light_gradient)))
+    turning = csr_array(_rows(slopes) @ operator)
+    return Part(turning, residual.reshape(-1), by_light, system.light_hessian, system.light_gradient, p)
 
 
 def _rows(slopes: Float[np.ndarray, "3n 3"]) -> csr_array:
@@ -164,7 +186,7 @@ def step(
     prior = kron(stiffness * (laplacian + PULL * eye_array(len(turn))), np.eye(3)).tocsr()
     right, diagonal = -(prior @ turn.reshape(-1)), prior.diagonal()
     for part in parts:
-        right -= part.slopes.T @ part.residual
+        right -= part.slopes.T @ part.unexplained
         diagonal = diagonal + part.slopes.multiply(part.slopes).sum(0)
 
     def system(x: Float[np.ndarray, " 3v"]) -> Float[np.ndarray, " 3v"]:

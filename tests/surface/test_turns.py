@@ -106,6 +106,18 @@ def test_a_step_is_that_of_the_dense_system_of_turns_and_lights():
     assert np.linalg.norm(given - expected) < 0.02 * np.linalg.norm(expected - turn)
 
 
+def test_a_light_without_some_observations_is_that_light_linearised_without_them():
+    one, body = photos_in_a_wrong_light("bounced", curves=True), surfaces(1)
+    at, gone = attached_to(one.block.normal, body), one.block.photo == 1
+    given = part_of(one, COUNTS, PRIOR, at.operator(body.nodes)).without(gone)
+    rest = msgspec.structs.replace(one, block=one.block.take(~gone))
+    expected = part_of(rest, COUNTS, PRIOR, at.take(~gone).operator(body.nodes))
+    np.testing.assert_allclose(given.slopes.toarray(), expected.slopes.toarray(), atol=1e-5)
+    scale = np.abs(expected.hessian).max()
+    np.testing.assert_allclose(given.hessian / scale, expected.hessian / scale, atol=1e-5)
+    np.testing.assert_allclose(given.unexplained, expected.unexplained, atol=1e-2 * np.abs(expected.unexplained).max())
+
+
 def test_turned_normals_are_unit_bounded_and_never_leave_the_viewer():
     random, body = np.random.default_rng(0), surfaces()
     normal = random.normal(size=(500, 3))
@@ -159,7 +171,7 @@ def test_dents_that_the_object_has_not_are_found_in_three_lights():
         assert after < 0.6 * before, (before, after)
 
 
-def test_one_light_alone_decides_nothing():
+def test_one_photo_alone_decides_nothing():
     what = on_spheres(1, 0.15)[0]
     assert not what.evidence.kept and not what.displacements
 
