@@ -93,6 +93,8 @@ def main(params: Params, inputs: Inputs, out: Path, progress: Progress) -> None:
     )
     _warn(unusable_observations(photos))
     seen = concatenate([photo.merged for photo in photos])
+    if params.solver != "bundle":  # the others know no detail of reflectance
+        seen = msgspec.structs.replace(seen, detail=None)
     relative = relative_exposures(seen)
     earlier = _earlier(params, inputs, relative)
     problem = _problem(params, inputs, at_one_exposure(seen, relative))

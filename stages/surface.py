@@ -1,8 +1,8 @@
 """Normals by shading: all photos together say how the meshes' surfaces differ from the given ones.
 
 Materials and lights are fitted as the solve begins; then normals turn until they explain all photos best, and stay so only where photos that had no
-part in it gain (`factorlib.surface.choice`).  Writes surface.json, and where surfaces are turned normals/<photo>.exr, the normals that
-every later stage uses in place of those of `align`.
+part in it gain (`factorlib.surface.choice`).  Then detail of reflectance likewise, over what shape explains.
+Writes surface.json, and where surfaces differ photos/<photo>.exr: the normals that every later stage uses in place of those of `align`, and detail.
 """
 
 import logging
@@ -11,7 +11,7 @@ from typing import Annotated, Literal
 
 import msgspec
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Int
 
 from factorlib.dataset.schema import LightSlice, ObjectsSlice
 from factorlib.images.exr import read_exr, write_exr
@@ -25,12 +25,12 @@ from factorlib.model.problem import JointProblem
 from factorlib.reflection import reflection_operator
 from factorlib.results.poses import FILE as POSES
 from factorlib.results.poses import PhotoPoses, read_poses
-from factorlib.results.surface import FILE, SurfaceTable
+from factorlib.results.surface import FILE, SurfaceTable, Tried
 from factorlib.solve.start import from_nothing
 from factorlib.stage import Inputs, Progress
 from factorlib.surface.attach import attached_pixels
 from factorlib.surface.choice import Found, Surfaces, found
-from factorlib.surface.turns import Attached, joined
+from factorlib.surface.turns import Attached, Detail, joined, none
 from factorlib.urm.extract import Channels
 from factorlib.urm.observations import (
     Observations,
@@ -64,23 +64,25 @@ def main(params: Params, inputs: Inputs, out: Path, progress: Progress) -> None:
     seen = {name: drawn(inputs["urm"] / f"{name}.parquet", params) for name in photos}
     attached = {name: photos[name].attached(np.column_stack([of.x, of.y]), surfaces) for name, of in seen.items()}
     result = _found(params, inputs, seen, attached, surfaces, progress)
-    displacements = {name: values.astype("f4") for name, values in result.displacements.items()}
-    if result.evidence.kept:
-        turn = surfaces.turns_of(displacements)
-        (out / "normals").mkdir()
-        for name, photo in photos.items():
-            write_exr(out / "normals" / f"{name}.exr", photo.turned(surfaces, turn))
-    by_mesh = {name: values.tolist() for name, values in displacements.items()}
-    write_json(
-        out / FILE,
-        SurfaceTable(
-            **msgspec.structs.asdict(result.evidence),
-            stiffness=result.stiffness,
-            gains=result.gains,
-            displacements=by_mesh,
-        ),
+    displacements, factors = (
+        {name: values.astype("f4") for name, values in of.items()} for of in (result.displacements, result.log_factors)
     )
-    progress(1, 1, "kept" if result.evidence.kept else "not kept")
+    detail = none(surfaces.nodes)
+    if displacements:
+        detail = msgspec.structs.replace(detail, turn=surfaces.turns_of(displacements))
+    if factors:
+        detail = msgspec.structs.replace(detail, log_factor=np.concatenate([factors[name] for name in surfaces.meshes]))
+    if displacements or factors:
+        (out / "photos").mkdir()
+        for name, photo in photos.items():
+            write_exr(out / "photos" / f"{name}.exr", photo.detailed(surfaces, detail))
+    by_mesh = [{name: values.tolist() for name, values in of.items()} for of in (displacements, factors)]
+    table = SurfaceTable(
+        bool(displacements), Tried.of(result.evidence, result.stiffness.turn),
+        bool(factors), Tried.of(result.painted, result.stiffness.factor), result.gains, *by_mesh,
+    )  # fmt: skip
+    write_json(out / FILE, table)
+    progress(1, 1)
 
 
 class Photo(msgspec.Struct, frozen=True):
@@ -97,16 +99,22 @@ class Photo(msgspec.Struct, frozen=True):
         shown = np.rint(self.geometry["object"][pixels[:, 1], pixels[:, 0]]).astype(int)
         return attached_pixels(pixels, shown, self.poses.camera.camera(width, height), objects, surfaces)
 
-    def turned(self, surfaces: Surfaces, turn: Float[np.ndarray, "v 3"]) -> Channels:
-        """The channels normal.x/y/z of turned surfaces, 0 where no mesh is seen."""
+    def detailed(self, surfaces: Surfaces, detail: Detail) -> Channels:
+        """The channels normal.x/y/z and detail (the factor on diffuse reflectance) of the surfaces, 0 where no mesh is seen."""
         y, x = np.nonzero(self.geometry["object"] > 0.5)
         normal, view = (
             np.stack([self.geometry[f"{kind}.{a}"][y, x] for a in "xyz"], axis=-1).astype(float)
             for kind in ("normal", "view")
         )
-        picture = np.zeros((*self.geometry["object"].shape, 3), np.float32)
-        picture[y, x] = self.attached(np.column_stack([x, y]), surfaces).turned(normal, view, turn)
-        return {f"normal.{a}": picture[..., k] for k, a in enumerate("xyz")}
+        picture, attached = (
+            np.zeros((*self.geometry["object"].shape, 4), np.float32),
+            self.attached(np.column_stack([x, y]), surfaces),
+        )
+        picture[y, x, :3], picture[y, x, 3] = (
+            attached.turned(normal, view, detail.turn),
+            attached.factor(detail.log_factor),
+        )
+        return dict(zip(("normal.x", "normal.y", "normal.z", "detail"), np.moveaxis(picture, -1, 0)))
 
 
 def _photos(inputs: Inputs, slices: dict[str, ObjectsSlice]) -> dict[str, Photo]:

@@ -11,7 +11,7 @@ from factorlib.model.noise import Noise
 
 PER_OBSERVATION = (
     *("normal", "view", "radiance", "clipped", "precision", "material", "photo", "held_out"),
-    *("visibility", "bounced", "confidence", "place", "row"),  # where the block has them
+    *("visibility", "bounced", "confidence", "place", "row", "detail"),  # where the block has them
 )
 CLUSTER = 0.35  # size of a cluster's cell of mirror directions: 20°
 
@@ -27,6 +27,7 @@ class Block(msgspec.Struct, frozen=True):
     noise       of which `precision` is the reciprocal
     confidence  how sure normals are, 0 to 1; None: all are as sure
     row         the observation's number among all usable ones
+    detail      factor on the diffuse reflectance of each observation's material; None: 1
     place       x of `factorlib.light.distance`, in the block's frame; None: all lie in the middle
     bounced     what hidden directions send, by the cosine (RGB) and by a highlight (RGB): G_d and G_s of `factorlib.model.interreflection`,
                 in the block's unit; None: nothing
@@ -50,6 +51,7 @@ class Block(msgspec.Struct, frozen=True):
     confidence: Float[np.ndarray, " n"] | None = None
     place: Float[np.ndarray, "n 3"] | None = None
     row: Int[np.ndarray, " n"] | None = None
+    detail: Float[np.ndarray, " n"] | None = None
 
     def __len__(self) -> int:
         return len(self.material)
@@ -86,6 +88,11 @@ class Block(msgspec.Struct, frozen=True):
         return msgspec.structs.replace(
             self, precision=self.precision * self.noise.sigma(self.radiance) / noise.sigma(self.radiance), noise=noise
         )
+
+    def on_surface(self, normal: Float[np.ndarray, "n 3"], detail: Float[np.ndarray, " n"]) -> Block:
+        """The same observations of a surface with other normals and with that detail of reflectance, of which the block has none."""
+        bounced = None if self.bounced is None else self.bounced * np.where(np.arange(6) < 3, detail[:, None], 1.0)
+        return msgspec.structs.replace(self, normal=normal, detail=detail, bounced=bounced)
 
     def residuals(self, radiance: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
         """By how much `radiance`, in the block's unit, is too bright, in σ.  A clipped pixel says "at least": only too dark counts."""

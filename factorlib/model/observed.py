@@ -113,13 +113,16 @@ def _block(
         every = fibonacci_sphere(seen.visibility.shape[1])
         visibility, directions = seen.visibility, np.stack([every @ turned.get(p, np.eye(3)).T for p in photos])
     bounced = bounced_light(seen, scaled)
-    return Block(
+    block = Block(
         name, tuple(photos), unit, normal, view, scaled, seen.clipped.astype(bool), noise.precision(scaled, seen.weight),
         seen.material.astype(np.int64), local, held_out, visibility, directions,
         bounced if bounced is not None and bounced.any() else None, noise,
         None if seen.confidence is None else seen.confidence.astype(float),
         None if seen.place is None else _turned(seen.place, seen, turned), rows[order],
     )  # fmt: skip
+    if seen.detail is None or (seen.detail == 1).all():
+        return block
+    return block.on_surface(block.normal, seen.detail.astype(float))
 
 
 def _in_frame(vectors: Float[np.ndarray, "n 3"], seen: Observations, rotations: Rotations) -> Float[np.ndarray, "n 3"]:

@@ -1,6 +1,6 @@
 """What rows of observations reflect of lobes of weight one: where the main solver calls the reflection operator.
 
-    D_ip → v_ip D_ip   diffuse response of observation i to lobe p, for k_d = 1
+    D_ip → a_i v_ip D_ip   diffuse response of observation i to lobe p, for k_d = 1, times the block's detail of reflectance a, where it has some
     S_ip → u_ip S_ip   specular response, for k_s = 1, times the shares v and u of each lobe's reflection that shadows leave:
                        (1) and (2) of `factorlib.light.visibility`, 1 where a block has no visibility
 
@@ -53,7 +53,8 @@ def diffuse_response(block: Block, rows: Rows, lobes: UnitLobes, operator: Opera
     nz, _, larger = met_cosines(block, rows, lobes)
     with torch.no_grad():
         response = operator.diffuse(_tensor(lobes.sharpness, operator), _tensor(nz, operator))
-        return larger * shadowed(response, block, rows, lobes).double().numpy()
+        seen = larger * shadowed(response, block, rows, lobes).double().numpy()
+        return seen if block.detail is None else seen * block.detail[rows][:, None]
 
 
 def specular_response(

@@ -73,8 +73,12 @@ class Reflector:
         report: Report = silently,
         shadows: Shadows | None = None,
         place: Float[np.ndarray, "n 3"] | None = None,
+        detail: Float[np.ndarray, " n"] | None = None,
     ) -> Float[np.ndarray, "n 3"]:
-        """Radiance toward unit `views` of points with unit `normals`; float64, zero where a normal faces away.  place: None is the middle."""
+        """Radiance toward unit `views` of points with unit `normals`; float64, zero where a normal faces away.
+
+        place: None is the middle;  detail: factor on the diffuse reflectance, None is 1
+        """
         result, step = np.zeros((len(normals), 3)), max(1, PAIRS_AT_ONCE // max(len(self.sharpness), 1))
         with torch.no_grad():
             for i in range(0, len(normals) if len(self.sharpness) else 0, step):
@@ -82,7 +86,8 @@ class Reflector:
                 some = None if shadows is None else shadows.take(rows)
                 x = None if place is None or self.curvature == 0 else self._tensor(place[rows])
                 geometry = self._tensor(normals[rows]), self._tensor(views[rows]), x
-                result[rows] = self._radiance(material, *geometry, some).double().numpy()
+                factor = None if detail is None else self._tensor(detail[rows])
+                result[rows] = self._radiance(material, *geometry, some, factor).double().numpy()
                 report(min(i + step, len(normals)), len(normals))
         return result
 
@@ -90,7 +95,13 @@ class Reflector:
         return torch.as_tensor(np.ascontiguousarray(values), dtype=self.operator.dtype)
 
     def _radiance(
-        self, material: MaterialLike, normals: Tensor, views: Tensor, place: Tensor | None, shadows: Shadows | None
+        self,
+        material: MaterialLike,
+        normals: Tensor,
+        views: Tensor,
+        place: Tensor | None,
+        shadows: Shadows | None,
+        detail: Tensor | None,
     ) -> Float[Tensor, "n 3"]:
         kd, ks = (torch.tensor(k, dtype=self.operator.dtype) for k in (material.diffuse, material.specular))
         no, nz, oz = (normals * views).sum(-1), (normals @ self.axis.T).clamp(-1, 1), (views @ self.axis.T).clamp(-1, 1)
@@ -101,6 +112,8 @@ class Reflector:
             nz, oz, larger = met_from(place, normals, views, self.axis, self.curvature)
             diffuse_seen, specular_seen = larger * diffuse_seen, larger * specular_seen
         radiance = kd * ((diffuse_seen * self._diffuse(nz)) @ self.weight)
+        if detail is not None:
+            radiance = radiance * detail[:, None]
         if bool(ks.any()):
             roughness = torch.tensor(material.roughness, dtype=self.operator.dtype)
             specular = specular_seen * self._specular(roughness, ks, no, nz, oz, radiance)

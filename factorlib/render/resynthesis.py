@@ -62,7 +62,7 @@ def resynthesised(
 ) -> Float[np.ndarray, "h w 3"]:
     """Linear radiance; zero outside the mask, and where no mesh lies under it.
 
-    materials: label k is materials[k − 1];  photo: channel label;  geometry: channels normal.x/y/z, view.x/y/z
+    materials: label k is materials[k − 1];  photo: channel label;  geometry: channels normal.x/y/z, view.x/y/z, and detail, where diffuse reflectance has some
     around:    shadows the picture, and lights what is in shadow
     """
     label = np.rint(photo["label"]).astype(int)
@@ -78,9 +78,12 @@ def resynthesised(
         unit = [of[pixels].astype(float) for of in (normal, view)]
         unit = [of / np.linalg.norm(of, axis=-1, keepdims=True) for of in unit]
         shadows, sent, place = (None,) * 3 if around is None else around_pixels(around, k - 1, *np.nonzero(pixels))
-        shown = reflector(material, unit[0], unit[1], of_all, shadows, place)
+        detail = geometry["detail"][pixels].astype(float) if "detail" in geometry else np.ones(len(unit[0]))
+        shown = reflector(material, unit[0], unit[1], of_all, shadows, place, detail)
         if sent is not None:
-            bounced = np.array(material.diffuse) * sent[:, :3] + np.array(material.specular) * sent[:, 3:]
+            bounced = (
+                np.array(material.diffuse) * detail[:, None] * sent[:, :3] + np.array(material.specular) * sent[:, 3:]
+            )
             shown += bounced * (np.sum(unit[0] * unit[1], 1, keepdims=True) > 0)
         picture[pixels] = shown
         before += int(pixels.sum())

@@ -168,7 +168,7 @@ def surface_rows(run: Artifacts, objects: Mapping[str, ObjectsSlice]) -> list[Su
         box, uris = box_of(shown[photo]), {}
         for which, channels in (
             ("as given", run.channels("align", photo)),
-            ("by shading", run.channels("surface", f"normals/{photo}")),
+            ("by shading", run.channels("surface", f"photos/{photo}")),
         ):
             normal = np.stack([channels[f"normal.{a}"] for a in "xyz"], axis=-1) * shown[photo][..., None]
             clay = srgb_encode(0.1 + 0.8 * np.maximum(normal @ CLAY_LIGHT, 0))[..., None] * np.ones(3)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import msgspec
 
@@ -11,24 +12,41 @@ from factorlib.jsonfile import read_result
 FILE = "surface.json"
 
 
-class SurfaceTable(msgspec.Struct, frozen=True):
-    """What was found.
+class Tried(msgspec.Struct, frozen=True):
+    """What decided, of photos that had no part in the surface; None where nothing was tried.
 
-    kept           whether surfaces differ from the given meshes
-    held_out_loss_with, held_out_loss_without, margin   of held-out observations of photos that had no part in the surface, and their difference in
-                   standard errors; None where nothing was tried
-    stiffness      of the surface, the best of those that were tried
-    gains          by photo: how much minus twice the log marginal likelihood of its observations fell, while it had no part in the surface
-    displacements  by mesh: along the normal of each node of the subdivided mesh (`factorlib.meshes.fine`), over the mesh's extent; none where not kept
+    held_out_loss_with, held_out_loss_without   of their held-out observations;  margin: of the difference of the logarithms, in standard errors
+    stiffness   of what is kept: the best of those that were tried
     """
 
-    kept: bool = False
     held_out_loss_with: float | None = None
     held_out_loss_without: float | None = None
     margin: float | None = None
     stiffness: float | None = None
+
+    @classmethod
+    def of(cls, evidence: Any, stiffness: float | None) -> Tried:
+        """From the solver's evidence."""
+        return cls(evidence.held_out_loss_with, evidence.held_out_loss_without, evidence.margin, stiffness)
+
+
+class SurfaceTable(msgspec.Struct, frozen=True):
+    """What was found.
+
+    moved, moved_by      whether surfaces differ from the given meshes, and what decided
+    painted, painted_by  whether diffuse reflectance has detail, over what moved surfaces explain
+    gains          by photo: how much minus twice the log marginal likelihood of its observations fell, while it had no part in the surface
+    displacements  by mesh: along the normal of each node of the subdivided mesh (`factorlib.meshes.fine`), over the mesh's extent; none where not moved
+    log_factors    by mesh: of the diffuse reflectance at each node; none where not painted
+    """
+
+    moved: bool = False
+    moved_by: Tried = Tried()
+    painted: bool = False
+    painted_by: Tried = Tried()
     gains: dict[str, float] = {}
     displacements: dict[str, list[float]] = {}
+    log_factors: dict[str, list[float]] = {}
 
 
 def read_surface(folder: str | Path | None) -> SurfaceTable:

@@ -1,11 +1,12 @@
 """Whether a set's surfaces are turned by shading, how stiff they are, and the displacement that they end with.
 
 start      materials and lights are fitted on few cells, as the solve begins
-stiffness  of each of `STIFFNESS`, from stiff to soft, turns are found from all photos but one, for every photo in turn; that photo then gets a light of its
+stiffness  of each of `TURNS`, from stiff to soft, turns are found from all photos but one, for every photo in turn; that photo then gets a light of its
            own, with the materials given, and what counts is minus twice the log marginal likelihood of its observations
            (`factorlib.solve.marginal`), without turns and with them.  The stiffness that all photos together gain most by is used
 whether    turns are kept where that gain is above zero and the held-out observations of photos that had no part in the turns are explained better
            by more than `FOR` standard errors (`factorlib.solve.evidence`)
+paint      factors on the diffuse reflectance likewise, of a stiffness of `FACTORS`, beside the turns and over what these explain
 rounds     turns from all lights, materials and lights fitted again, `ROUNDS` times
 surface    at last the displacement whose normals come nearest to the turned ones: what no displacement explains (a wrong pose turns all normals
            of a photo) is left out
@@ -14,7 +15,6 @@ surface    at last the displacement whose normals come nearest to the turned one
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from functools import partial
 
 import msgspec
 import numpy as np
@@ -31,9 +31,10 @@ from factorlib.solve.fit import Fit, Schedule, field_of, fitted, sure_ones
 from factorlib.solve.marginal import marginal
 from factorlib.solve.options import Choices
 from factorlib.solve.start import Start
-from factorlib.surface.turns import Attached, Part, part_of, step, with_normals
+from factorlib.surface.turns import Attached, Detail, Part, Stiffness, none, part_of, step
 
-STIFFNESS = (1000.0, 300.0, 100.0, 30.0)  # a of `factorlib.surface.turns`; b is a share of it
+TURNS = (1000.0, 300.0, 100.0, 30.0)  # stiffness of turns: a of `factorlib.surface.turns`; b is a share of it
+FACTORS = (300.0, 100.0, 30.0)  # of log factors
 ROUNDS = 3
 CELLS = 250  # of a light
 SETTLE = Schedule(together=(6, 4))
@@ -66,12 +67,12 @@ class Surfaces(msgspec.Struct, frozen=True):
     ) -> dict[str, Float[np.ndarray, " n"]]:
         """By mesh, in its extents: what `Fine.displacement` finds for the turns of its nodes, as far as observations are attached to them."""
         weight = sum(np.bincount(of.node.reshape(-1), of.share.reshape(-1), self.nodes) for of in attached)
-        seen = np.minimum(weight, 1.0)
-        return {
-            name: mesh.displacement(turn[own], seen[own])
-            for name, mesh in self.meshes.items()
-            for own in [slice(self.first[name], self.first[name] + mesh.nodes)]
-        }
+        turns, seen = self.by_mesh(turn), self.by_mesh(np.minimum(weight, 1.0))
+        return {name: mesh.displacement(turns[name], seen[name]) for name, mesh in self.meshes.items()}
+
+    def by_mesh(self, values: np.ndarray) -> dict[str, np.ndarray]:
+        """What belongs to each mesh's nodes."""
+        return {name: values[k : k + self.meshes[name].nodes] for name, k in self.first.items()}
 
     def turns_of(self, displacements: dict[str, Float[np.ndarray, " n"]]) -> Float[np.ndarray, "v 3"]:
         """The turns that displacements mean."""
@@ -81,22 +82,35 @@ class Surfaces(msgspec.Struct, frozen=True):
 class Found(msgspec.Struct, frozen=True):
     """What was found.
 
-    evidence  whether surfaces are turned, by held-out observations of photos that had no part in the turns
-    stiffness that was best;  gains: of it, by photo: how much −2 log marginal likelihood fell while the photo had no part in the turns
-    displacements  by mesh, at nodes, in extents; none where surfaces stay
+    evidence  whether surfaces are moved, by held-out observations of photos that had no part in that;  painted: whether reflectance has detail, likewise
+    stiffness that was best;  gains: by photo, of all that is kept: how much −2 log marginal likelihood fell while the photo had no part in it
+    displacements  by mesh, at nodes, in extents; none where surfaces stay;  log_factors: by mesh, likewise
     """
 
     evidence: Evidence
-    stiffness: float | None = None
+    painted: Evidence = Evidence(False)
+    stiffness: Stiffness = Stiffness(None)
     gains: dict[str, float] = {}
     displacements: dict[str, Float[np.ndarray, " n"]] = {}
+    log_factors: dict[str, Float[np.ndarray, " n"]] = {}
 
 
 Report = Callable[[float, str], None]  # the share that is done, and what is being done
 
 
-class _Trial(msgspec.Struct, frozen=True):
-    """A problem, its fit and what its blocks are attached to."""
+class Judged(msgspec.Struct, frozen=True):
+    """Of each photo: −2 log marginal likelihood and held-out losses, with detail in which it had no part."""
+
+    values: Float[np.ndarray, " f"]
+    losses: Losses
+
+    def gain_over(self, other: Judged) -> float:
+        """By how much all values together are less."""
+        return float((other.values - self.values).sum())
+
+
+class Trial(msgspec.Struct, frozen=True):
+    """A problem without detail, its fit, and what its blocks are attached to."""
 
     problem: JointProblem
     fit: Fit
@@ -104,31 +118,57 @@ class _Trial(msgspec.Struct, frozen=True):
     attached: list[Attached]
     prior: LightPrior
 
-    def turned(self, turn: Float[np.ndarray, "v 3"]) -> JointProblem:
-        """The problem on turned normals."""
+    def with_(self, detail: Detail) -> JointProblem:
+        """The problem on a surface with detail."""
         pairs = zip(self.problem.blocks, self.attached, strict=True)
-        return self.problem.of([with_normals(b, at.turned(b.normal, b.view, turn)) for b, at in pairs])
+        return self.problem.of([detail.on(block, at) for block, at in pairs])
 
-    def parts(self, turn: Float[np.ndarray, "v 3"], fit: Fit) -> list[Part]:
-        """Every light linearised on turned normals."""
-        operators = [of.operator(self.surfaces.nodes) for of in self.attached]
-        each = zip(self.turned(turn).illuminations(fit.point), fit.hyperparameters, operators, strict=True)
-        return list(self.problem.spread(lambda one: part_of(one[0], one[1], self.prior, one[2]), list(each)))
+    def parts(self, detail: Detail, fit: Fit) -> list[Part]:
+        """Every light linearised on a surface with detail."""
+        each = zip(self.with_(detail).illuminations(fit.point), fit.hyperparameters, self.attached, strict=True)
+        nodes = self.surfaces.nodes
+        return list(self.problem.spread(lambda one: part_of(*one[:2], self.prior, one[2], nodes), list(each)))
 
     @property
     def photos(self) -> list[tuple[int, int]]:
         """Each photo that has observations: its block and its number there."""
         return [(k, int(j)) for k, block in enumerate(self.problem.blocks) for j in np.unique(block.photo)]
 
-    def alone(self, photo: tuple[int, int], turn: Float[np.ndarray, "v 3"]) -> tuple[float, Losses]:
-        """A light for this photo alone, with the materials given: −2 log marginal likelihood, and the losses of its held-out observations."""
-        k, number = photo
-        (block,), counts = self.turned(turn).restricted([k]).blocks, [self.fit.hyperparameters[k]]
-        problem = self.problem.of([block.take(block.photo == number)])
-        begun = Fit(Point(self.fit.point.materials, [self.fit.point.lights[k]]), counts)
-        point = fitted(problem, begun, self.prior, OWN_LIGHT).point
-        (own,) = problem.fitted().illuminations(point)
-        return marginal(field_of(own, counts[0], self.prior)).value, losses_of(problem, point)
+    @property
+    def names(self) -> list[str]:
+        """Of these photos."""
+        return [self.problem.blocks[k].photos[j] for k, j in self.photos]
+
+    def judged(self, detail: Callable[[int, int], Detail]) -> Judged:
+        """Every photo by itself, on the surface that `detail` has for it, in a light of its own, with the materials given."""
+
+        def alone(photo: tuple[int, int]) -> tuple[float, Losses]:
+            """One photo's value and losses."""
+            k, number = photo
+            own, counts = self.problem.blocks[k].photo == number, [self.fit.hyperparameters[k]]
+            block = detail(k, number).on(self.problem.blocks[k].take(own), self.attached[k].take(own))
+            problem = self.problem.of([block])
+            begun = Fit(Point(self.fit.point.materials, [self.fit.point.lights[k]]), counts)
+            point = fitted(problem, begun, self.prior, OWN_LIGHT).point
+            (one,) = problem.fitted().illuminations(point)
+            return marginal(field_of(one, counts[0], self.prior)).value, losses_of(problem, point)
+
+        values, losses = zip(*self.problem.spread(alone, self.photos), strict=True)
+        return Judged(np.array(values), Losses(*([of[i][0] for of in losses] for i in (0, 1))))
+
+    def left_out(self, parts: list[Part], laplacian: csr_array, stiffness: Stiffness) -> Judged:
+        """Every photo on the surface that all others ask for; parts: of the mesh itself."""
+
+        def others(k: int, number: int) -> Detail:
+            """The detail that one photo has no part in."""
+            gone = [(block.photo == number) & (j == k) for j, block in enumerate(self.problem.blocks)]
+            rest = [part.without(rows) if rows.any() else part for part, rows in zip(parts, gone, strict=True)]
+            found = step([part for part in rest if len(part.residual)], laplacian, stiffness, none(self.surfaces.nodes))
+            seen = [of.take(~rows) for of, rows in zip(self.attached, gone, strict=True)]
+            moved = self.surfaces.displacements(found.turn, seen)
+            return Detail(self.surfaces.turns_of(moved), found.log_factor)
+
+        return self.judged(others)
 
 
 def found(
@@ -140,7 +180,7 @@ def found(
     seed: int = 0,
     report: Report = lambda share, what: None,
 ) -> Found:
-    """The displacements of the meshes, if photos that had no part in them gain.
+    """The detail of the meshes, if photos that had no part in it gain.
 
     problem: all observations;  attached: where each block's lie;  start: where materials and lights begin;  seed: of what is drawn
     """
@@ -149,45 +189,37 @@ def found(
     choices = Choices(self_shadowing="on", interreflection="on", seed=seed)
     effects = effects_chosen(sure, start(sure, CELLS), choices, lambda _, *of: fitted(of[0], of[1], prior, of[2]))
     fit = fitted(effects.of(problem), effects.fit, prior, SETTLE)
-    trial = _Trial(effects.of(problem), fit, surfaces, attached, prior)
-    laplacian, still, photos = surfaces.laplacian(), np.zeros((surfaces.nodes, 3)), trial.photos
-    if len(photos) < 2 or problem.none_held_out:
+    trial, plain = Trial(effects.of(problem), fit, surfaces, attached, prior), none(surfaces.nodes)
+    if len(trial.photos) < 2 or problem.none_held_out:
         return Found(Evidence(False))
-    parts = trial.parts(still, fit)
-    plain = list(problem.spread(partial(trial.alone, turn=still), photos))
+    laplacian, parts, given = surfaces.laplacian(), trial.parts(plain, fit), trial.judged(lambda k, number: plain)
 
-    def left_out(photo: tuple[int, int], stiffness: float) -> tuple[float, Losses]:
-        """A photo on the surface that all others ask for."""
-        gone = [(problem.blocks[k].photo == photo[1]) & (k == photo[0]) for k in range(len(parts))]
-        others = [part.without(rows) if rows.any() else part for part, rows in zip(parts, gone, strict=True)]
-        turn = step([part for part in others if len(part.residual)], laplacian, stiffness, still)
-        seen = [of.take(~rows) for of, rows in zip(attached, gone, strict=True)]
-        return trial.alone(photo, surfaces.turns_of(surfaces.displacements(turn, seen)))
+    def best(tried: list[Stiffness], before: Judged, done: float) -> tuple[Stiffness, Judged, Evidence]:
+        """Of several stiffnesses the one that photos gain most by, and whether they gain over what was there before."""
+        judged = []
+        for number, one in enumerate(tried):
+            report(done + 0.3 * number / len(tried), f"left-out photos, stiffness {one.factor or one.turn:g}")
+            judged.append(trial.left_out(parts, laplacian, one))
+        k = max(range(len(tried)), key=lambda i: judged[i].gain_over(before))
+        evidence = compare(before.losses, judged[k].losses, FOR)
+        kept = evidence.kept and judged[k].gain_over(before) > 0
+        return tried[k], judged[k], msgspec.structs.replace(evidence, kept=kept)
 
-    best = None
-    for number, stiffness in enumerate(STIFFNESS):
-        report(0.3 + 0.1 * number, f"left-out photos, stiffness {stiffness:g}")
-        tried = list(problem.spread(partial(left_out, stiffness=stiffness), photos))
-        gains = np.array([before - after for (before, _), (after, _) in zip(plain, tried, strict=True)])
-        if best is None or gains.sum() > best[0].sum():
-            best = gains, stiffness, tried
-    gains, stiffness, tried = best
-    evidence = compare(*(_joined([losses for _, losses in of]) for of in (plain, tried)), FOR)
-    evidence = msgspec.structs.replace(evidence, kept=evidence.kept and bool(gains.sum() > 0))
-    names = [problem.blocks[k].photos[number] for k, number in photos]
-    by_photo = {name: float(gain) for name, gain in zip(names, gains, strict=True)}
-    if not evidence.kept:
-        return Found(evidence, stiffness, by_photo)
-    turn = still
+    stiffness, moved, evidence = best([Stiffness(a) for a in TURNS], given, 0.2)
+    now = (stiffness, moved) if evidence.kept else (Stiffness(None), given)
+    tried = [Stiffness(now[0].turn, a) for a in FACTORS]
+    both, paint, painted = best(tried, now[1], 0.5)
+    stiffness, judged = (both, paint) if painted.kept else now
+    gains = dict(zip(trial.names, (given.values - judged.values).tolist(), strict=True))
+    if not (evidence.kept or painted.kept):
+        return Found(evidence, painted)
+    detail = plain
     for number in range(ROUNDS):
-        report(0.7 + 0.1 * number, f"normals, round {number + 1}")
+        report(0.8 + 0.06 * number, f"all photos, round {number + 1}")
         if number:
-            fit = fitted(trial.turned(turn), fit, prior, BETWEEN)
-            parts = trial.parts(turn, fit)
-        turn = step(parts, laplacian, stiffness, turn)
-    return Found(evidence, stiffness, by_photo, surfaces.displacements(turn, attached))
-
-
-def _joined(losses: Sequence[Losses]) -> Losses:
-    """The losses of photos that were judged one by one."""
-    return Losses([one.values[0] for one in losses], [one.clusters[0] for one in losses])
+            fit = fitted(trial.with_(detail), fit, prior, BETWEEN)
+            parts = trial.parts(detail, fit)
+        detail = step(parts, laplacian, stiffness, detail)
+    displacements = surfaces.displacements(detail.turn, attached) if evidence.kept else {}
+    factors = surfaces.by_mesh(detail.log_factor) if painted.kept else {}
+    return Found(evidence, painted, stiffness, gains, displacements, factors)

@@ -5,10 +5,12 @@ barycentric coordinates b_k has the normal
 
     n' = unit(n + P R Σ_k b_k δ_{v_k}),     R: light's frame from object's, P = 1 − n nᵀ                                (1)
 
-With r the residuals of one light (in σ, weighted by the robust loss and divided by √T), J = ∂r/∂δ, U = ∂r/∂u and H = UᵀU + Q_u the Hessian of that
-light, the light that goes along with a step dδ changes r by −U H⁻¹(Uᵀ J dδ + g).  What is left to explain is
+and it may have a log factor on its diffuse reflectance: patina, grain, dirt.  Both are unknowns x of a node.
 
-    Σ_lights ‖(1 − U H⁻¹ Uᵀ)(r + J dδ)‖²,  to which the prior  a Σ_edges |δ_i − δ_j|² + b Σ_v |δ_v|²                     (2)
+With r the residuals of one light (in σ, weighted by the robust loss and divided by √T), J = ∂r/∂x, U = ∂r/∂u and H = UᵀU + Q_u the Hessian of that
+light, the light that goes along with a step dx changes r by −U H⁻¹(Uᵀ J dx + g).  What is left to explain is
+
+    Σ_lights ‖(1 − U H⁻¹ Uᵀ)(r + J dx)‖²,  to which the prior  a Σ_edges |x_i − x_j|² + b Σ_v |x_v|²                     (2)
 
 is added.  Lights must move along: with lights given, what they had taken up of wrong normals stays in them, and normals stay wrong (measured: median error
 4.3° → 3.9° instead of 3.1°).  ∂r/∂n is a difference of the forward model along two tangents.  The system is solved by conjugate gradients.
@@ -23,7 +25,7 @@ import msgspec
 import numpy as np
 from jaxtyping import Bool, Float, Int
 from scipy.linalg import cho_factor, cho_solve
-from scipy.sparse import csr_array, diags_array, eye_array, kron
+from scipy.sparse import block_diag, csr_array, diags_array, eye_array, hstack, kron
 from scipy.sparse.linalg import LinearOperator, cg
 
 from factorlib.light.prior import LightPrior
@@ -66,6 +68,10 @@ class Attached(msgspec.Struct, frozen=True):
         rows, columns = (np.broadcast_to(of, values.shape).reshape(-1) for of in (rows, columns))
         return csr_array((values.reshape(-1), (rows, columns)), (3 * len(self.node), 3 * nodes))
 
+    def factor(self, log_factor: Float[np.ndarray, " v"]) -> Float[np.ndarray, " n"]:
+        """The factors on diffuse reflectance."""
+        return np.exp(np.sum(self.share * log_factor[self.node], axis=1))
+
     def turned(
         self, normal: Float[np.ndarray, "n 3"], view: Float[np.ndarray, "n 3"], turn: Float[np.ndarray, "v 3"]
     ) -> Float[np.ndarray, "n 3"]:
@@ -83,6 +89,23 @@ def joined(parts: Sequence[Attached]) -> Attached:
     return Attached(*(np.concatenate([getattr(part, name) for part in parts]) for name in Attached.__struct_fields__))
 
 
+class Detail(msgspec.Struct, frozen=True):
+    """What a surface has beyond its mesh and its materials, at v nodes: turns δ of normals and logarithms of a factor on diffuse reflectance."""
+
+    turn: Float[np.ndarray, "v 3"]
+    log_factor: Float[np.ndarray, " v"]
+
+    def on(self, block: Block, attached: Attached) -> Block:
+        """The block, which has none, with this detail."""
+        normal = attached.turned(block.normal, block.view, self.turn)
+        return block.on_surface(normal, attached.factor(self.log_factor))
+
+
+def none(nodes: int) -> Detail:
+    """The surface of the mesh itself."""
+    return Detail(np.zeros((nodes, 3)), np.zeros(nodes))
+
+
 class Part(msgspec.Struct, frozen=True, dict=True):
     """One light's part of (2): J, r, U, H and g.
 
@@ -90,7 +113,7 @@ class Part(msgspec.Struct, frozen=True, dict=True):
     cells     p
     """
 
-    slopes: csr_array
+    slopes: csr_array  # [3n, 4v], by turns and by log factors
     residual: Float[np.ndarray, " 3n"]
     by_light: Float[np.ndarray, "3 n p+q"]
     hessian: Float[np.ndarray, "l l"]
@@ -136,19 +159,26 @@ class Part(msgspec.Struct, frozen=True, dict=True):
         return change - self.of_light(cho_solve(self.factor, self.to_light(change)))
 
 
-def part_of(illumination: Illumination, counts: Hyperparameters, prior: LightPrior, operator: csr_array) -> Part:
-    """Linearise one light at its block's normals; operator: of the block's `Attached`.  Held-out observations have no say."""
+def part_of(
+    illumination: Illumination, counts: Hyperparameters, prior: LightPrior, attached: Attached, nodes: int
+) -> Part:
+    """Linearise one light at its block's normals and detail; attached: of the block.  Held-out observations have no say."""
     field = field_of(illumination, counts, prior, materials_given=True)
     own, block = field.illumination, illumination.block
     n, p, shown = len(block), len(own.light), own.shown()
     residual, by_light = np.zeros((n, 3)), np.zeros((3, n, own.light.unknowns - 2 * p), np.float32)
+    by_factor = np.zeros((n, 3))
     for line in own.linearise(shown, ROBUST, counts.temperature):
         residual[line.rows, line.channel] = line.residual
+        by_factor[line.rows, line.channel] = line.by_material[:, 0]  # ∂r/∂log k_d
         by_light[line.channel, line.rows] = np.hstack([line.diffuse + line.specular, line.by_photo])
     system = marginal(field, materials_given=True)
     weight = own.pull(block.residuals(shown.radiance), ROBUST, counts.temperature)
     slopes = (_by_normal(illumination) * weight[:, :, None]).reshape(3 * n, 3)
-    turning = csr_array(_rows(slopes) @ operator)
+    factors = np.repeat(attached.share, 3, axis=0) * by_factor.reshape(-1, 1)
+    rows = (np.arange(3 * n).repeat(3), attached.node.repeat(3, axis=0).reshape(-1))
+    painted = csr_array((factors.reshape(-1), rows), (3 * n, nodes))
+    turning = csr_array(hstack([_rows(slopes) @ attached.operator(nodes), painted]))
     return Part(turning, residual.reshape(-1), by_light, system.light_hessian, system.light_gradient, p)
 
 
@@ -169,31 +199,36 @@ def _by_normal(illumination: Illumination) -> Float[np.ndarray, "n 3 3"]:
     for tangent in (first, np.cross(normal, first)):
         moved = normal + STEP * tangent
         moved /= np.linalg.norm(moved, axis=1, keepdims=True)
-        after = msgspec.structs.replace(illumination, block=with_normals(block, moved)).residuals()
+        after = msgspec.structs.replace(illumination, block=msgspec.structs.replace(block, normal=moved)).residuals()
         result += ((after - before) / STEP)[:, :, None] * tangent[:, None, :]
     return result
 
 
-def with_normals(block: Block, normal: Float[np.ndarray, "n 3"]) -> Block:
-    """The same observations, of a surface with other normals."""
-    return msgspec.structs.replace(block, normal=normal)
+class Stiffness(msgspec.Struct, frozen=True):
+    """a of (2): of turns, and of log factors; None: they stay."""
+
+    turn: float | None
+    factor: float | None = None
 
 
-def step(
-    parts: Sequence[Part], laplacian: csr_array, stiffness: float, turn: Float[np.ndarray, "v 3"]
-) -> Float[np.ndarray, "v 3"]:
-    """The turns that minimise (2), where the parts were linearised at `turn`; stiffness: a."""
-    prior = kron(stiffness * (laplacian + PULL * eye_array(len(turn))), np.eye(3)).tocsr()
-    right, diagonal = -(prior @ turn.reshape(-1)), prior.diagonal()
-    for part in parts:
-        right -= part.slopes.T @ part.unexplained
-        diagonal = diagonal + part.slopes.multiply(part.slopes).sum(0)
+def step(parts: Sequence[Part], laplacian: csr_array, stiffness: Stiffness, at: Detail) -> Detail:
+    """The detail that minimises (2), where the parts were linearised `at` one."""
+    v, both = len(at.log_factor), np.concatenate([at.turn.reshape(-1), at.log_factor])
+    roughness = csr_array(laplacian + PULL * eye_array(v))
+    prior = block_diag([kron((stiffness.turn or 0) * roughness, np.eye(3)), (stiffness.factor or 0) * roughness])
+    free = np.repeat([stiffness.turn is not None, stiffness.factor is not None], [3 * v, v])
+    slopes, prior = [part.slopes[:, free] for part in parts], prior.tocsr()[free][:, free]
+    right, diagonal = -(prior @ both[free]), prior.diagonal()
+    for part, J in zip(parts, slopes, strict=True):
+        right -= J.T @ part.unexplained
+        diagonal = diagonal + J.multiply(J).sum(0)
 
-    def system(x: Float[np.ndarray, " 3v"]) -> Float[np.ndarray, " 3v"]:
+    def system(x: Float[np.ndarray, " k"]) -> Float[np.ndarray, " k"]:
         """The Hessian times a step."""
-        return prior @ x + sum(part.slopes.T @ part.without_light(part.slopes @ x) for part in parts)
+        return prior @ x + sum(J.T @ part.without_light(J @ x) for part, J in zip(parts, slopes, strict=True))
 
     size = 2 * (len(right),)
     preconditioner = diags_array(1 / diagonal)
     found, _ = cg(LinearOperator(size, system, dtype=float), right, rtol=ACCURACY, maxiter=ITERATIONS, M=preconditioner)
-    return turn + found.reshape(-1, 3)
+    both[free] += found
+    return Detail(both[: 3 * v].reshape(-1, 3), both[3 * v :])

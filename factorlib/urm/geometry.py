@@ -1,4 +1,4 @@
-"""What every pixel of a photo shows of the meshes: as `align` has it, with the normals of `surface` where it turned them."""
+"""What every pixel of a photo shows of the meshes: as `align` has it, with the normals and the detail of reflectance of `surface` where it found some."""
 
 from __future__ import annotations
 
@@ -14,12 +14,12 @@ from factorlib.urm.observations import Observations
 
 
 def read_geometry(align: Path, surface: Path | None, photo: str) -> dict[str, Float[np.ndarray, "h w"]]:
-    """The maps that `align` wrote of a photo, with the normals of the folder of `surface` where there are any."""
+    """The maps that `align` wrote of a photo, with the normals and the channel `detail` of the folder of `surface` where there are any."""
     return {**read_exr(align / f"{photo}.exr"), **_normals(surface, photo)}
 
 
 def on_surface(seen: Observations, surface: Path | None) -> Observations:
-    """The observations of one photo with the normals of its turned surface, where the folder of `surface` has them.
+    """The observations of one photo with the normals and the detail of its surface, where the folder of `surface` has them.
 
     Merged observations have the normal of the pixel that their group is called by.  Raises InputError where the maps are of another photo's size.
     """
@@ -33,11 +33,13 @@ def on_surface(seen: Observations, surface: Path | None) -> Observations:
         )
     normal = np.stack([maps[f"normal.{axis}"][seen.y, seen.x] for axis in "xyz"], axis=-1)
     known = (normal != 0).any(1, keepdims=True)
-    return msgspec.structs.replace(seen, normal=np.where(known, normal, seen.normal).astype(np.float32))
+    detail = np.where(known[:, 0], maps["detail"][seen.y, seen.x], 1.0).astype(np.float32)
+    normal = np.where(known, normal, seen.normal).astype(np.float32)
+    return msgspec.structs.replace(seen, normal=normal, detail=detail)
 
 
 def _normals(surface: Path | None, photo: str) -> dict[str, Float[np.ndarray, "h w"]]:
     if surface is None:
         return {}
-    file = surface / "normals" / f"{photo}.exr"
+    file = surface / "photos" / f"{photo}.exr"
     return read_exr(file) if file.exists() else {}

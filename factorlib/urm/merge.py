@@ -2,7 +2,7 @@
 
 Radiance depends on a pixel through its normal and its mirror direction (twice the URM's `half`, less the front).
 Pixels of one photo, material and clipping state that fall into one cell of both are replaced by their weighted
-mean: normal, view, radiance, place and confidence alike, so that what is lost is second order in the cell's size.
+mean: normal, view, radiance, place, confidence and detail alike, so that what is lost is second order in the cell's size.
 
 Radiance is linear in visibility, whose mean is thus what the mean radiance shows.  But on a flat seat all points would
 become one, and what their shadows tell of the light be lost: points merge only where what is hidden from them lies
@@ -19,6 +19,7 @@ from scipy.sparse import csr_array
 from factorlib.geometry.sphere import direction_cells, fibonacci_sphere, mirror_directions
 from factorlib.urm.observations import Observations
 
+DETAIL_CELL = 0.1  # of the logarithm of the detail of reflectance
 HIDDEN_CELL = 0.05  # of the mean of hidden × direction, which is 1/4 where a whole hemisphere is hidden
 ROWS = 1 << 16  # observations whose visibility is in memory as floats
 
@@ -34,6 +35,8 @@ def merge(observations: Observations, degrees: float) -> Observations:
     cell, mirror = np.radians(degrees), mirror_directions(seen.normal, seen.view)
     flags = seen.clipped @ np.array([1, 2, 4])
     cells = [direction_cells(seen.normal, cell), direction_cells(mirror, 2 * cell)]
+    if seen.detail is not None:
+        cells.append(np.rint(np.log(np.maximum(seen.detail, 1e-3)) / DETAIL_CELL).astype(np.int64)[:, None])
     if (visibility := seen.visibility) is not None:  # where the hidden directions lie
         directions = fibonacci_sphere(visibility.shape[1]).astype("f4") / visibility.shape[1]
         chunks = (visibility[i : i + ROWS] for i in range(0, len(visibility), ROWS))
@@ -54,8 +57,9 @@ def merge(observations: Observations, degrees: float) -> Observations:
         averaging = csr_array(((weight / total[group]).astype("f4"), (group, np.arange(len(group)))))
         columns = [averaging @ visibility[:, i : i + 32].astype("f4") for i in range(0, visibility.shape[1], 32)]
         changed["visibility"] = np.rint(np.clip(np.hstack(columns), 0, 255)).astype("u1")
-    if seen.confidence is not None:
-        changed["confidence"] = (np.bincount(group, weight * seen.confidence) / total).astype("f4")
+    for name in ("confidence", "detail"):
+        if (values := getattr(seen, name)) is not None:
+            changed[name] = (np.bincount(group, weight * values) / total).astype("f4")
     return msgspec.structs.replace(seen.take(first), **changed)
 
 

@@ -65,6 +65,9 @@ class Observations(msgspec.Struct, frozen=True):
     exposures: tuple[float | None, ...] = ()  # of `photos`, t·S/N² from EXIF, None where unknown; empty: all are
     confidence: Float[np.ndarray, " n"] | None = None  # of the normal, 0 to 1; None: all are as sure
     place: Float[np.ndarray, "n 3"] | None = None  # camera frame, about the photo's middle, RMS 1 (light.distance)
+    detail: Float[np.ndarray, " n"] | None = (
+        None  # factor on the diffuse reflectance; None: 1.  In no file: of `surface`
+    )
 
     def __len__(self) -> int:
         return len(self.weight)
@@ -76,7 +79,7 @@ class Observations(msgspec.Struct, frozen=True):
 
     def take(self, rows: np.ndarray) -> Observations:
         """The observations of `rows` (indices or a mask), with the same names."""
-        columns = {name: getattr(self, name) for name in (*COLUMNS, *WIDE, *OPTIONAL)}
+        columns = {name: getattr(self, name) for name in (*COLUMNS, *WIDE, *OPTIONAL, "detail")}
         taken = {name: values[rows] for name, values in columns.items() if values is not None}
         return msgspec.structs.replace(self, **taken)
 
@@ -168,7 +171,7 @@ def concatenate(parts: Sequence[Observations]) -> Observations:
         fields[column] = np.concatenate(renumbered).astype("i4")
     exposures = {photo: exposure for part in parts for photo, exposure in zip(part.photos, part.exposures)}
     fills = {name: (dtype, nothing) for name, (dtype, nothing, _) in WIDE.items()}
-    fills |= {"confidence": (np.dtype("f4"), 1), "place": (np.dtype("f4"), 0)}
+    fills |= {"confidence": (np.dtype("f4"), 1), "place": (np.dtype("f4"), 0), "detail": (np.dtype("f4"), 1)}
     for name, (dtype, fill) in fills.items():  # parts without see everything, are sure, and lie in the middle
         given = [getattr(part, name) for part in parts]
         shapes = {values.shape[1:] for values in given if values is not None}

@@ -127,7 +127,7 @@ def test_observations_and_photos_in_another_order_are_the_same_blocks():
     turned = msgspec.structs.replace(shared, photo=1 - shared.photo, photos=shared.photos[::-1])
     for pair in ((seen, other), (shared, turned)):
         for a, b in zip(*(blocks_of_observations(of, Noise()) for of in pair), strict=True):
-            for field in a.__struct_fields__:
+            for field in set(a.__struct_fields__) - {"row"}:  # the number in the order that was given
                 np.testing.assert_array_equal(getattr(a, field), getattr(b, field))
 
 
