@@ -2,10 +2,11 @@
 
 start      materials and lights are fitted on few cells, as the solve begins
 stiffness  of each of `TURNS`, from stiff to soft, turns are found from all photos but one, for every photo in turn; that photo then gets a light of its
-           own, with the materials given, and what counts is minus twice the log marginal likelihood of its observations
-           (`factorlib.solve.marginal`), without turns and with them.  The stiffness that all photos together gain most by is used
-whether    turns are kept where that gain is above zero and the held-out observations of photos that had no part in the turns are explained better
-           by more than `FOR` standard errors (`factorlib.solve.evidence`)
+           own, with the materials given.  The stiffness is used with which its held-out observations are explained best (equation (1) of
+           `factorlib.solve.evidence`)
+whether    turns are kept where that is better than without turns, where the likelihood of the photos is higher too (minus twice its logarithm, lights
+           integrated out: `factorlib.solve.marginal`), and where one of the two is by more than `FOR` standard errors, over clusters of observations or over
+           photos.  The likelihood is the finer measure, but by itself it takes too soft a surface: a fitted light makes up for what is too soft
 paint      factors on the diffuse reflectance likewise, of a stiffness of `FACTORS`, beside the turns and over what these explain
 rounds     turns from all lights, materials and lights fitted again, `ROUNDS` times
 surface    at last the displacement whose normals come nearest to the turned ones: what no displacement explains (a wrong pose turns all normals
@@ -34,7 +35,7 @@ from factorlib.solve.start import Start
 from factorlib.surface.turns import Attached, Detail, Part, Stiffness, none, part_of, step
 
 TURNS = (1000.0, 300.0, 100.0, 30.0)  # stiffness of turns: a of `factorlib.surface.turns`; b is a share of it
-FACTORS = (300.0, 100.0, 30.0)  # of log factors
+FACTORS = (300.0, 100.0, 30.0, 10.0)  # of log factors
 ROUNDS = 3
 CELLS = 250  # of a light
 SETTLE = Schedule(together=(6, 4))
@@ -105,8 +106,9 @@ class Judged(msgspec.Struct, frozen=True):
     losses: Losses
 
     def gain_over(self, other: Judged) -> float:
-        """By how much all values together are less."""
-        return float((other.values - self.values).sum())
+        """By how many standard errors over photos the values are less."""
+        gains = other.values - self.values
+        return float(gains.mean() / max(gains.std(ddof=1) / np.sqrt(len(gains)), 1e-12))
 
 
 class Trial(msgspec.Struct, frozen=True):
@@ -195,15 +197,16 @@ def found(
     laplacian, parts, given = surfaces.laplacian(), trial.parts(plain, fit), trial.judged(lambda k, number: plain)
 
     def best(tried: list[Stiffness], before: Judged, done: float) -> tuple[Stiffness, Judged, Evidence]:
-        """Of several stiffnesses the one that photos gain most by, and whether they gain over what was there before."""
+        """The best of several stiffnesses, and whether photos gain by it over what was there before."""
         judged = []
         for number, one in enumerate(tried):
             report(done + 0.3 * number / len(tried), f"left-out photos, stiffness {one.factor or one.turn:g}")
             judged.append(trial.left_out(parts, laplacian, one))
-        k = max(range(len(tried)), key=lambda i: judged[i].gain_over(before))
-        evidence = compare(before.losses, judged[k].losses, FOR)
-        kept = evidence.kept and judged[k].gain_over(before) > 0
-        return tried[k], judged[k], msgspec.structs.replace(evidence, kept=kept)
+        evidence = [compare(before.losses, one.losses, FOR) for one in judged]
+        k = min(range(len(tried)), key=lambda i: round(evidence[i].held_out_loss_with or 0.0, 6))
+        gain = judged[k].gain_over(before)
+        kept = evidence[k].margin > 0 and gain > 0 and max(evidence[k].margin, gain) > FOR
+        return tried[k], judged[k], msgspec.structs.replace(evidence[k], kept=bool(kept))
 
     stiffness, moved, evidence = best([Stiffness(a) for a in TURNS], given, 0.2)
     now = (stiffness, moved) if evidence.kept else (Stiffness(None), given)
