@@ -34,21 +34,31 @@ EXTENSION, LIGHTS = "KHR_materials_specular", "KHR_lights_punctual"
 
 
 def write_glb(path: str | Path, mesh: Mesh, names: Sequence[str], materials: Mapping[str, Reflectance]) -> None:
-    """Write `mesh` in its own frame and units, one primitive per material; label k is names[k − 1]."""
-    scene = trimesh.Scene()
+    """Write `mesh` in its own frame and units, one primitive per material; label k is names[k − 1].
+
+    Detail of reflectance is in vertex colours, by which glTF multiplies the base colour, so they are at most 1 and the base colours larger by as much.
+    """
+    scene, most = trimesh.Scene(), {}
     for label in mesh.labels:
         part, name = submesh(mesh, label), names[label - 1]
         visual = TextureVisuals(material=PBRMaterial(name=name, doubleSided=mesh.open))
+        if part.detail is not None:
+            most[name] = float(part.detail.max())
+            shade = np.rint(255 * part.detail / most[name]).astype(np.uint8)
+            visual.vertex_attributes["color"] = np.column_stack([shade, shade, shade, np.full_like(shade, 255)])
         geometry = trimesh.Trimesh(part.vertices, part.faces, vertex_normals=part.normals, visual=visual, process=False)
         scene.add_geometry(geometry, geom_name=name, node_name=name)
-    exact = partial(_set_materials, materials=materials)
+    exact = partial(_set_materials, materials=materials, most=most)
     write_bytes(path, scene.export(file_type="glb", include_normals=True, tree_postprocessor=exact))
 
 
-def _set_materials(tree: dict[str, Any], materials: Mapping[str, Reflectance]) -> None:
-    """Exact numbers, which the mesh library would round to eight bits."""
+def _set_materials(tree: dict[str, Any], materials: Mapping[str, Reflectance], most: Mapping[str, float]) -> None:
+    """Exact numbers, which the mesh library would round to eight bits; most: what base colours are times."""
     for entry in tree["materials"]:
-        entry.update(gltf_material(materials[entry["name"]]))
+        exact = gltf_material(materials[entry["name"]])
+        base, factor = exact["pbrMetallicRoughness"]["baseColorFactor"], most.get(entry["name"], 1.0)
+        exact["pbrMetallicRoughness"]["baseColorFactor"] = [*(min(c * factor, 1.0) for c in base[:3]), base[3]]
+        entry.update(exact)
     tree["extensionsUsed"] = sorted({*tree.get("extensionsUsed", []), EXTENSION})
 
 

@@ -17,6 +17,7 @@ class Mesh(msgspec.Struct, frozen=True):
     normals     [V, 3] float64, unit, smooth
     face_label  [F] int16, material label k = position in the dataset's `materials`, from 1
     open        True where the surface has a border, so that its inside can be seen
+    detail      [V] factor on the diffuse reflectance of the material; None: 1
     """
 
     vertices: Float[np.ndarray, "v 3"]
@@ -24,6 +25,7 @@ class Mesh(msgspec.Struct, frozen=True):
     normals: Float[np.ndarray, "v 3"]
     face_label: Int[np.ndarray, " f"]
     open: bool = False
+    detail: Float[np.ndarray, " v"] | None = None
 
     @property
     def labels(self) -> tuple[int, ...]:

@@ -134,11 +134,16 @@ def _columns(content: bytes, at: int, order: str, count: int, properties: Proper
 
 
 def write_ply(path: str | Path, mesh: Mesh) -> None:
-    """Write vertices (float64 as float32), normals and faces, with `label` per face: what Mitsuba and other readers read."""
+    """Write vertices (float64 as float32), normals and faces, with `label` per face: what Mitsuba and other readers read.
+
+    A mesh with detail has a further property `detail` per vertex.
+    """
     lines = ["ply", "format binary_little_endian 1.0", f"element vertex {len(mesh.vertices)}"]
-    lines += [f"property float {name}" for name in ("x", "y", "z", "nx", "ny", "nz")]
+    columns = [mesh.vertices, mesh.normals] + ([] if mesh.detail is None else [mesh.detail[:, None]])
+    names = ("x", "y", "z", "nx", "ny", "nz", "detail")
+    lines += [f"property float {name}" for name in names[: 6 + (mesh.detail is not None)]]
     lines += [f"element face {len(mesh.faces)}", "property list uchar int vertex_indices", "property int label"]
-    vertices = np.concatenate([mesh.vertices, mesh.normals], axis=1).astype("<f4")
+    vertices = np.concatenate(columns, axis=1).astype("<f4")
     faces = np.empty(len(mesh.faces), dtype=[("count", "u1"), ("index", "<i4", 3), ("label", "<i4")])
     faces["count"], faces["index"], faces["label"] = 3, mesh.faces, mesh.face_label
     header = "\n".join([*lines, "end_header", ""]).encode("ascii")
@@ -150,4 +155,5 @@ def submesh(mesh: Mesh, label: int) -> Mesh:
     keep = mesh.face_label == label
     used, index = np.unique(mesh.faces[keep], return_inverse=True)
     faces = index.reshape(-1, 3).astype(np.int32)
-    return Mesh(mesh.vertices[used], faces, mesh.normals[used], mesh.face_label[keep], mesh.open)
+    detail = None if mesh.detail is None else mesh.detail[used]
+    return Mesh(mesh.vertices[used], faces, mesh.normals[used], mesh.face_label[keep], mesh.open, detail)

@@ -11,6 +11,7 @@ import logging
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 
+import msgspec
 import numpy as np
 
 from factorlib.dataset.schema import MeshEntry
@@ -67,7 +68,7 @@ class MeshesOnce:
     """Meshes of a data set, each read once for each choice of materials for its parts; sizes were limited by an earlier stage.
 
     file: the path of a file that dataset.yaml names;  materials: the data set's;  crease_deg: as of `read_mesh`
-    displacements: by mesh, those that `surface` found at its nodes: such a mesh is subdivided and moved
+    displacements, log_factors: by mesh, those that `surface` found at its nodes: such a mesh is subdivided, moved and given detail
     """
 
     def __init__(
@@ -76,9 +77,10 @@ class MeshesOnce:
         materials: Sequence[str],
         crease_deg: float,
         displacements: Mapping[str, Sequence[float]] = {},
+        log_factors: Mapping[str, Sequence[float]] = {},
     ):
         self.file, self.materials, self.crease_deg = file, materials, crease_deg
-        self.displacements = displacements
+        self.displacements, self.log_factors = displacements, log_factors
         self._meshes: dict[tuple, Mesh] = {}
 
     def mesh(self, name: str, entry: MeshEntry, overrides: Mapping[str, str] = {}) -> Mesh:
@@ -87,12 +89,15 @@ class MeshesOnce:
         if key not in self._meshes:
             file = self.file(entry.file)
             mesh = read_mesh(file, self.materials, entry.made_of, overrides, self.crease_deg, NO_LIMITS)
-            if (displacement := self.displacements.get(name)) is not None:
+            if name in self.displacements or name in self.log_factors:
                 dense = fine(mesh)
-                if dense.nodes != len(displacement):
+                still = np.zeros(dense.nodes)
+                moves, factors = (np.array(of.get(name, still)) for of in (self.displacements, self.log_factors))
+                if not len(moves) == len(factors) == dense.nodes:
                     found, cure = "it is not the mesh that the stage `surface` moved", "run `surface` again"
                     raise InputError(found, file=file, cure=cure)
-                mesh = dense.moved(np.array(displacement))
+                detail = np.exp(factors)[dense.node] if name in self.log_factors else None
+                mesh = msgspec.structs.replace(dense.moved(moves), detail=detail)
             self._meshes[key] = mesh
         return self._meshes[key]
 

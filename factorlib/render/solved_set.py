@@ -55,8 +55,8 @@ class SolvedSet:
                 raise InputError(found, file=file, key=f"materials.{name}", cure="run the stage `export` again")
         self.materials = reflectances(self.table)
         self.photos = list(self.objects)
-        moved = read_surface(inputs.folders.get("surface")).displacements
-        self._meshes = MeshesOnce(inputs.file, self.names, crease_deg, moved)
+        own = read_surface(inputs.folders.get("surface"))
+        self._meshes = MeshesOnce(inputs.file, self.names, crease_deg, own.displacements, own.log_factors)
         self._pixels: dict[str, dict[str, np.ndarray]] = {}
 
     def scene(self, photo: str) -> PhotoScene:

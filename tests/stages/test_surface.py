@@ -1,0 +1,119 @@
+"""The files of `surface`, and what later stages make of them."""
+
+import json
+
+import msgspec
+import numpy as np
+import pytest
+import trimesh
+
+from factorlib.dataset.schema import MeshEntry
+from factorlib.errors import InputError
+from factorlib.export.gltf import write_glb
+from factorlib.images.exr import write_exr
+from factorlib.jsonfile import write_json
+from factorlib.meshes.fine import fine
+from factorlib.meshes.mesh import Mesh
+from factorlib.meshes.ply import write_ply
+from factorlib.meshes.read import CREASE_DEG, MeshesOnce, read_mesh
+from factorlib.model.noise import Noise
+from factorlib.model.observed import blocks_of_observations, gathered
+from factorlib.results.materials import Reflectance
+from factorlib.results.surface import SurfaceTable, read_surface
+from factorlib.stage import Inputs, serial_map, silent
+from factorlib.urm.geometry import on_surface, read_geometry
+from factorlib.urm.observations import Observations, write_observations
+from stages import surface
+
+SIZE = 12
+
+
+def observations() -> Observations:
+    """A pixel each of two rows, normals toward the camera."""
+    x, y = (of.reshape(-1).astype("i4") for of in np.meshgrid(np.arange(SIZE), np.arange(SIZE)))
+    n, front = len(x), np.tile([0.0, 0.0, -1.0], (SIZE * SIZE, 1)).astype("f4")
+    zero = np.zeros(n, "i4")
+    return Observations(
+        front, front, np.full((n, 3), 0.5, "f4"), np.zeros((n, 3), bool), zero.astype("i2"), zero, zero, x, y,
+        np.ones(n, "f4"), ("red",), ("a",), ("a",),
+    )  # fmt: skip
+
+
+def written(folder) -> None:
+    """A surface that leans to the right and is half as bright on its left half; its first row shows no mesh."""
+    normal = np.tile([0.6, 0.0, -0.8], (SIZE, SIZE, 1))
+    normal[0] = 0
+    detail = np.where(np.arange(SIZE) < SIZE // 2, 0.5, 1.0) * np.ones((SIZE, 1))
+    channels = {f"normal.{a}": normal[..., k] for k, a in enumerate("xyz")} | {"detail": detail}
+    (folder / "photos").mkdir(parents=True)
+    write_exr(folder / "photos" / "a.exr", channels)
+
+
+def test_observations_and_maps_have_the_normals_and_the_detail_of_the_surface(tmp_path):
+    written(tmp_path / "surface")
+    seen = on_surface(observations(), tmp_path / "surface")
+    first = seen.y == 0
+    np.testing.assert_allclose(seen.normal[~first], np.tile([0.6, 0, -0.8], ((~first).sum(), 1)), atol=1e-6)
+    assert (seen.normal[first] == [0, 0, -1]).all() and (seen.detail[first] == 1).all()
+    assert (seen.detail[~first & (seen.x < 6)] == 0.5).all() and (seen.detail[seen.x >= 6] == 1).all()
+    (tmp_path / "align").mkdir()
+    write_exr(
+        tmp_path / "align" / "a.exr",
+        {f"normal.{a}": np.ones((SIZE, SIZE)) for a in "xyz"} | {"depth": np.ones((SIZE, SIZE))},
+    )
+    maps = read_geometry(tmp_path / "align", tmp_path / "surface", "a")
+    assert set(maps) == {"normal.x", "normal.y", "normal.z", "depth", "detail"} and maps["normal.x"][
+        3, 3
+    ] == np.float32(0.6)
+    assert "detail" not in read_geometry(tmp_path / "align", None, "a")
+    assert on_surface(observations(), None) is not None and on_surface(observations(), None).detail is None
+    wide = msgspec.structs.replace(observations(), x=observations().x + 1)
+    with pytest.raises(InputError, match="12 × 12"):
+        on_surface(wide, tmp_path / "surface")
+
+
+def test_the_solve_merges_only_what_has_one_detail_and_its_blocks_reflect_by_it(tmp_path):
+    written(tmp_path / "surface")
+    write_observations(tmp_path / "a.parquet", observations())
+    (photo,) = gathered([tmp_path / "a.parquet"], 2.0, serial_map, tmp_path / "surface")
+    assert sorted(set(photo.merged.detail.tolist())) == [0.5, 1.0]
+    (block,) = blocks_of_observations(photo.merged, Noise())
+    assert np.array_equal(np.sort(block.detail), np.sort(photo.merged.detail))
+    plain = msgspec.structs.replace(photo.merged, detail=None)
+    assert blocks_of_observations(plain, Noise())[0].detail is None
+
+
+def test_off_writes_a_table_of_nothing_and_needs_nothing(tmp_path):
+    surface.main(surface.Params(shape="off"), Inputs({}), tmp_path, silent)
+    assert read_surface(tmp_path) == SurfaceTable() == read_surface(None)
+    assert [path.name for path in tmp_path.iterdir()] == ["surface.json"]
+
+
+def test_meshes_are_moved_and_painted_wherever_they_are_read(tmp_path):
+    solid = trimesh.creation.icosphere(2)
+    ball = Mesh(np.array(solid.vertices), solid.faces, np.array(solid.vertices), np.ones(len(solid.faces), np.int16))
+    write_ply(tmp_path / "ball.ply", ball)
+    dense = fine(read_mesh(tmp_path / "ball.ply", ["red"], "red"))
+    table = {"ball": np.full(dense.nodes, 0.05).tolist()}
+    once = MeshesOnce(lambda name: tmp_path / name, ["red"], CREASE_DEG, table, table)
+    mesh = once.mesh("ball", MeshEntry("ball.ply", material="red"))
+    radius = np.linalg.norm(mesh.vertices, axis=1).max()
+    assert abs(radius - 1 - 0.05 * dense.extent) < 1e-3 and np.allclose(mesh.detail, np.exp(0.05))
+    write_ply(tmp_path / "moved.ply", mesh)
+    again = read_mesh(tmp_path / "moved.ply", ["red"], "red")
+    assert np.isclose(np.linalg.norm(again.vertices, axis=1).max(), radius)
+    write_glb(tmp_path / "moved.glb", mesh, ["red"], {"red": Reflectance([0.2, 0.1, 0.1], [0.0] * 3, 0.5)})
+    data = (tmp_path / "moved.glb").read_bytes()
+    tree = json.loads(data[20 : 20 + int.from_bytes(data[12:16], "little")])
+    assert "COLOR_0" in tree["meshes"][0]["primitives"][0]["attributes"]
+    base = tree["materials"][0]["pbrMetallicRoughness"]["baseColorFactor"]
+    np.testing.assert_allclose(base[:3], np.exp(0.05) * np.array([0.2, 0.1, 0.1]), rtol=1e-6)
+    other = MeshesOnce(lambda name: tmp_path / name, ["red"], CREASE_DEG, {"ball": [0.0] * 7})
+    with pytest.raises(InputError, match="surface"):
+        other.mesh("ball", MeshEntry("ball.ply", material="red"))
+
+
+def test_a_table_that_is_none_is_refused_with_its_name(tmp_path):
+    write_json(tmp_path / "surface.json", {"moved": "perhaps"})
+    with pytest.raises(InputError, match=r"surface\.json"):
+        read_surface(tmp_path)
