@@ -406,7 +406,7 @@ def test_each_parameter_reruns_its_stage_and_what_is_below_its_default_nothing_a
 
 def test_a_parameter_taken_out_of_pipeline_yaml_is_noticed(real):
     text = (real.root / "pipeline.yaml").read_text()
-    more = text.replace("    cores: all\n", "    cores: all\n    params: {lobes: 48}\n", 1)
+    more = text.replace("  solve:\n", "  solve:\n    params: {lobes: 48}\n", 1)
     with edited(real, {"pipeline.yaml": more}):
         assert other_keys(real) == below(real, steps_of(real, {"solve"}))
     assert other_keys(real) == set()
