@@ -5,10 +5,11 @@ start      materials and lights are fitted on few cells, with the shadows and bo
 stiffness  of each of `TURNS`, from stiff to soft, turns are found from all photos but one, for every photo in turn; that photo then gets a light of its
            own, with the materials given.  The stiffness is used with which its held-out observations are explained best (equation (1) of
            `factorlib.solve.evidence`)
-whether    turns are kept where that is better than without turns, where the likelihood of the photos is higher too (minus twice its logarithm, lights
-           integrated out: `factorlib.solve.marginal`), and where one of the two is by more than `FOR` standard errors, over clusters of observations or over
-           photos.  The likelihood is the finer measure, but by itself it takes too soft a surface: a fitted light makes up for what is too soft
-paint      factors on the diffuse reflectance likewise, of a stiffness of `FACTORS`, beside the turns and over what these explain
+whether    turns are kept where that is better than without turns by more than `FOR` standard errors over clusters of observations, and the likelihood of
+           the photos is higher too (minus twice its logarithm, lights integrated out: `factorlib.solve.marginal`)
+paint      factors on the diffuse reflectance likewise, of a stiffness of `FACTORS`, beside the turns and over what these explain; they are kept where the
+           likelihood is higher by more than `FOR` standard errors over photos, and held-out observations are explained better too.  The likelihood is the
+           finer measure.  Of turns it takes too many: a light that is fitted makes up for a wrong normal, but not for dirt
 rounds     turns from all lights, materials and lights fitted again, `ROUNDS` times
 surface    at last the displacement whose normals come nearest to the turned ones: what no displacement explains (a wrong pose turns all normals
            of a photo) is left out
@@ -204,8 +205,10 @@ def found(
         return Found(Evidence(False))
     laplacian, parts, given = surfaces.laplacian(), trial.parts(plain, fit), trial.judged(lambda k, number: plain)
 
-    def best(tried: list[Stiffness], before: Judged, done: float) -> tuple[Stiffness, Judged, Evidence]:
-        """The best of several stiffnesses, and whether photos gain by it over what was there before."""
+    def best(
+        tried: list[Stiffness], before: Judged, done: float, held_out: float, likelihood: float
+    ) -> tuple[Stiffness, Judged, Evidence]:
+        """The best of several stiffnesses, and whether photos gain by it over what was there before: both measures by so many standard errors."""
         judged = []
         for number, one in enumerate(tried):
             report(done + 0.3 * number / len(tried), f"left-out photos, stiffness {one.factor or one.turn:g}")
@@ -213,13 +216,13 @@ def found(
         evidence = [compare(before.losses, one.losses, FOR) for one in judged]
         k = min(range(len(tried)), key=lambda i: round(evidence[i].held_out_loss_with or 0.0, 6))
         gain = judged[k].gain_over(before)
-        kept = evidence[k].margin > 0 and gain > 0 and max(evidence[k].margin, gain) > FOR
+        kept = evidence[k].margin > held_out and gain > likelihood
         return tried[k], judged[k], msgspec.structs.replace(evidence[k], kept=bool(kept))
 
-    stiffness, moved, evidence = best([Stiffness(a) for a in TURNS], given, 0.2)
+    stiffness, moved, evidence = best([Stiffness(a) for a in TURNS], given, 0.2, FOR, 0.0)
     now = (stiffness, moved) if evidence.kept else (Stiffness(None), given)
     tried = [Stiffness(now[0].turn, a) for a in FACTORS]
-    both, paint, painted = best(tried, now[1], 0.5)
+    both, paint, painted = best(tried, now[1], 0.5, 0.0, FOR)
     stiffness, judged = (both, paint) if painted.kept else now
     gains = dict(zip(trial.names, (given.values - judged.values).tolist(), strict=True))
     if not (evidence.kept or painted.kept):
