@@ -154,33 +154,29 @@ class SurfaceRow(msgspec.Struct, frozen=True):
 
 
 def surface_rows(run: Artifacts, objects: Mapping[str, ObjectsSlice]) -> list[SurfaceRow]:
-    """Every mesh that was moved, in the order of their names."""
-    rows = []
-    for mesh, values in run.surface.displacements.items():
+    """Every mesh that was moved or has detail of reflectance, in the order of their names."""
+    rows, table = [], run.surface
+    for mesh in sorted(table.displacements | table.log_factors):
         shown = {}
         for photo, slice_ in objects.items():
             numbers = [number for number, own in enumerate(slice_.objects, start=1) if own.mesh == mesh]
-            seen = (
-                np.isin(np.rint(run.channels("align", photo)["object"]), numbers) if numbers else np.zeros((1, 1), bool)
-            )
-            shown[photo] = seen
+            shown[photo] = np.isin(np.rint(run.channels("align", photo)["object"]), numbers or [-1])
         photo = max(shown, key=lambda name: int(shown[name].sum()))
-        box, uris = box_of(shown[photo]), {}
-        for which, channels in (
-            ("as given", run.channels("align", photo)),
-            ("by shading", run.channels("surface", f"photos/{photo}")),
-        ):
-            normal = np.stack([channels[f"normal.{a}"] for a in "xyz"], axis=-1) * shown[photo][..., None]
-            clay = srgb_encode(0.1 + 0.8 * np.maximum(normal @ CLAY_LIGHT, 0))[..., None] * np.ones(3)
-            for what, pixels in (("normals", 0.5 + 0.5 * normal * (1, -1, -1)), ("clay", clay)):
-                pixels = np.where(shown[photo][..., None], pixels, 1.0)[box].astype(np.float32)
-                small = reduced(pixels, longest_side(len(run.set.photos)))
-                uris[f"{what}, {which}"] = data_uri(np.rint(255 * np.clip(small, 0, 1)).astype(np.uint8))
-        size = np.abs(np.array(values))
-        order = ("clay, as given", "clay, by shading", "normals, as given", "normals, by shading")
-        rows.append(
-            SurfaceRow(mesh, photo, {k: uris[k] for k in order}, float(np.sqrt(np.mean(size**2))), float(size.max()))
-        )
+        maps = {"as given": run.channels("align", photo), "by shading": run.channels("surface", f"photos/{photo}")}
+        normals = {which: np.stack([of[f"normal.{a}"] for a in "xyz"], axis=-1) for which, of in maps.items()}
+        panels = {
+            f"clay, {which}": srgb_encode(0.03 + 0.5 * np.maximum(n @ CLAY_LIGHT, 0)) for which, n in normals.items()
+        }
+        panels |= {f"normals, {which}": 0.5 + 0.5 * n * (1, -1, -1) for which, n in normals.items()}
+        if mesh in table.log_factors:
+            panels["detail of reflectance"] = srgb_encode(np.clip(0.4 * maps["by shading"]["detail"], 0, 1))
+        uris, box, longest = {}, box_of(shown[photo]), longest_side(len(run.set.photos))
+        for title, panel in panels.items():
+            colour = panel if panel.ndim == 3 else panel[..., None].repeat(3, 2)
+            small = reduced(np.where(shown[photo][..., None], colour, 1.0)[box].astype(np.float32), longest)
+            uris[title] = data_uri(np.rint(255 * np.clip(small, 0, 1)).astype(np.uint8))
+        size = np.abs(table.displacements.get(mesh, [0.0]))
+        rows.append(SurfaceRow(mesh, photo, uris, float(np.sqrt(np.mean(size**2))), float(size.max())))
     return rows
 
 
