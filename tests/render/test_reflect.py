@@ -145,3 +145,13 @@ def test_a_near_light_is_to_each_point_a_far_one_of_moved_lobes():
     middle = Reflector(operator, lobes, 0.0, curvature)(GLOSSY, normals, views, place=0 * place)
     np.testing.assert_allclose(middle, Reflector(operator, lobes, 0.0)(GLOSSY, normals, views), rtol=1e-9)
     assert np.abs(near / middle - 1).max() > 0.1
+
+
+def test_detail_is_a_factor_on_the_diffuse_part_alone():
+    reflector, (normals, views) = Reflector(reflection_operator("network"), light()), points(40)
+    detail, black = np.linspace(0.2, 2.0, 40), (0.0, 0.0, 0.0)
+    diffuse, specular = (Reflectance(kd, ks, 0.4) for kd, ks in ((GLOSSY.diffuse, black), (black, GLOSSY.specular)))
+    parts = [reflector(of, normals, views) for of in (diffuse, specular)]
+    expected = detail[:, None] * parts[0] + parts[1]
+    np.testing.assert_allclose(reflector(GLOSSY, normals, views, detail=detail), expected, rtol=0.03, atol=1e-3)
+    np.testing.assert_allclose(reflector(diffuse, normals, views, detail=detail), detail[:, None] * parts[0], rtol=1e-5)

@@ -8,7 +8,7 @@ import torch
 from factorlib.conventions import FRONT
 from factorlib.geometry.met import UNMET
 from factorlib.geometry.sphere import fibonacci_sphere
-from factorlib.images.exr import read_exr, read_rgb_exr
+from factorlib.images.exr import read_exr, read_rgb_exr, write_exr
 from factorlib.images.tone import curve
 from factorlib.jsonfile import read_json, write_json
 from factorlib.light.lobes import no_lobes
@@ -115,3 +115,18 @@ def test_what_is_hidden_is_lit_by_what_the_photo_shows_there(made, tmp_path):
     expected = np.array(red["diffuse"]) * sent[:, :3] + np.array(red["specular"]) * sent[:, 3:]
     np.testing.assert_allclose(pictures[0] - pictures[1], expected, rtol=1e-3, atol=1e-4)
     assert expected.max() > 0.1
+
+
+def test_a_surface_with_other_normals_and_detail_is_rendered_as_it_is(made, tmp_path):
+    geometry = read_exr(made["align"] / "front.exr")
+    normal, inside = np.stack([geometry[f"normal.{a}"] for a in "xyz"], axis=-1), geometry["object"] > 0
+    pictures = []
+    for name, detail in (("plain", 1.0), ("painted", 0.5)):
+        (tmp_path / name / "photos").mkdir(parents=True)
+        channels = {f"normal.{a}": normal[..., k] for k, a in enumerate("xyz")} | {"detail": detail * inside}
+        write_exr(tmp_path / name / "photos" / "front.exr", channels)
+        on = msgspec.structs.replace(made, folders={**made.folders, "surface": tmp_path / name})
+        pictures.append(read_rgb_exr(run(on, "front", tmp_path / f"out {name}") / "resynthesis" / "front.exr"))
+    given = read_rgb_exr(run(made, "front", tmp_path / "given") / "resynthesis" / "front.exr")
+    np.testing.assert_allclose(pictures[0], given, rtol=1e-5, atol=1e-6)
+    assert (pictures[1] <= given + 1e-6).all() and pictures[1].sum() < 0.9 * given.sum()
