@@ -3,10 +3,9 @@
 start      materials and lights are fitted on few cells, with the shadows and bounces of the given meshes, at the distances that held-out observations ask for:
            turned normals would explain a near light as well
 stiffness  of each of `TURNS`, from stiff to soft, turns are found from all photos but one, for every photo in turn; that photo then gets a light of its
-           own, with the materials given.  The stiffness is used with which its held-out observations are explained best (equation (1) of
-           `factorlib.solve.evidence`)
-whether    turns are kept where that is better than without turns by more than `FOR` standard errors over clusters of observations, and the likelihood of
-           the photos is higher too (minus twice its logarithm, lights integrated out: `factorlib.solve.marginal`)
+           own, with the materials given.  The stiffness is used with which the photos are likeliest, lights integrated out (`factorlib.solve.marginal`)
+whether    turns are kept where the likelihood is higher than without turns, and the photos' held-out observations are explained better by more than `FOR`
+           standard errors over clusters (`factorlib.solve.evidence`)
 paint      factors on the diffuse reflectance likewise, of a stiffness of `FACTORS`, beside the turns and over what these explain; they are kept where the
            likelihood is higher by more than `FOR` standard errors over photos, and held-out observations are explained better too.  The likelihood is the
            finer measure.  Of turns it takes too many: a light that is fitted makes up for a wrong normal, but not for dirt
@@ -214,7 +213,7 @@ def found(
             report(done + 0.3 * number / len(tried), f"left-out photos, stiffness {one.factor or one.turn:g}")
             judged.append(trial.left_out(parts, laplacian, one))
         evidence = [compare(before.losses, one.losses, FOR) for one in judged]
-        k = min(range(len(tried)), key=lambda i: round(evidence[i].held_out_loss_with or 0.0, 6))
+        k = max(range(len(tried)), key=lambda i: round(float((before.values - judged[i].values).sum()), 3))
         gain = judged[k].gain_over(before)
         kept = evidence[k].margin > held_out and gain > likelihood
         return tried[k], judged[k], msgspec.structs.replace(evidence[k], kept=bool(kept))
