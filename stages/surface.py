@@ -5,7 +5,6 @@ part in it gain (`factorlib.surface.choice`).  Then detail of reflectance likewi
 Writes surface.json, and where surfaces differ photos/<photo>.exr: the normals that every later stage uses in place of those of `align`, and detail.
 """
 
-import logging
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -30,7 +29,7 @@ from factorlib.solve.start import from_nothing
 from factorlib.stage import Inputs, Progress
 from factorlib.surface.attach import attached_pixels
 from factorlib.surface.choice import Found, Surfaces, found
-from factorlib.surface.turns import Attached, Detail, joined, none
+from factorlib.surface.turns import Attached, Detail, joined, no_detail
 from factorlib.urm.extract import Channels
 from factorlib.urm.observations import (
     Observations,
@@ -39,8 +38,6 @@ from factorlib.urm.observations import (
     read_observations,
     relative_exposures,
 )
-
-log = logging.getLogger("factorlib.surface")
 
 
 class Params(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -67,7 +64,7 @@ def main(params: Params, inputs: Inputs, out: Path, progress: Progress) -> None:
     displacements, factors = (
         {name: values.astype("f4") for name, values in of.items()} for of in (result.displacements, result.log_factors)
     )
-    detail = none(surfaces.nodes)
+    detail = no_detail(surfaces.nodes)
     if displacements:
         detail = msgspec.structs.replace(detail, turn=surfaces.turns_of(displacements))
     if factors:
@@ -106,14 +103,10 @@ class Photo(msgspec.Struct, frozen=True):
             np.stack([self.geometry[f"{kind}.{a}"][y, x] for a in "xyz"], axis=-1).astype(float)
             for kind in ("normal", "view")
         )
-        picture, attached = (
-            np.zeros((*self.geometry["object"].shape, 4), np.float32),
-            self.attached(np.column_stack([x, y]), surfaces),
-        )
-        picture[y, x, :3], picture[y, x, 3] = (
-            attached.turned(normal, view, detail.turn),
-            attached.factor(detail.log_factor),
-        )
+        attached = self.attached(np.column_stack([x, y]), surfaces)
+        picture = np.zeros((*self.geometry["object"].shape, 4), np.float32)
+        picture[y, x, :3] = attached.turned(normal, view, detail.turn)
+        picture[y, x, 3] = attached.factor(detail.log_factor)
         return dict(zip(("normal.x", "normal.y", "normal.z", "detail"), np.moveaxis(picture, -1, 0)))
 
 

@@ -36,15 +36,17 @@ EXTENSION, LIGHTS = "KHR_materials_specular", "KHR_lights_punctual"
 def write_glb(path: str | Path, mesh: Mesh, names: Sequence[str], materials: Mapping[str, Reflectance]) -> None:
     """Write `mesh` in its own frame and units, one primitive per material; label k is names[k − 1].
 
-    Detail of reflectance is in vertex colours, by which glTF multiplies the base colour, so they are at most 1 and the base colours larger by as much.
+    Detail of reflectance is in vertex colours, by which glTF multiplies the base colour.  Neither may be above 1: the base colour takes the largest
+    factor, as far as it can, and vertices that would be brighter still are as bright as that.
     """
     scene, most = trimesh.Scene(), {}
     for label in mesh.labels:
         part, name = submesh(mesh, label), names[label - 1]
         visual = TextureVisuals(material=PBRMaterial(name=name, doubleSided=mesh.open))
         if part.detail is not None:
-            most[name] = float(part.detail.max())
-            shade = np.rint(255 * part.detail / most[name]).astype(np.uint8)
+            brightest = max(gltf_material(materials[name])["pbrMetallicRoughness"]["baseColorFactor"][:3])
+            most[name] = min(float(part.detail.max()), 1 / max(brightest, 1e-9))
+            shade = np.rint(255 * np.minimum(part.detail / most[name], 1)).astype(np.uint8)
             visual.vertex_attributes["color"] = np.column_stack([shade, shade, shade, np.full_like(shade, 255)])
         geometry = trimesh.Trimesh(part.vertices, part.faces, vertex_normals=part.normals, visual=visual, process=False)
         scene.add_geometry(geometry, geom_name=name, node_name=name)

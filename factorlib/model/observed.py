@@ -75,8 +75,8 @@ def blocks_of_observations(
             cure="look at the photos that `masks` wrote: exposure, `encoding`, label masks",
         )
     block = partial(_block, noise=noise, share=held_out, rotations=world_from_camera or {}, seed=seed)
-    shown = [(name, np.flatnonzero(seen.illumination == i)) for i, name in enumerate(seen.illuminations)]
-    blocks = [block(seen.take(rows), rows, name) for name, rows in shown if len(rows)]
+    shown = [np.flatnonzero(seen.illumination == i) for i in range(len(seen.illuminations))]
+    blocks = [block(seen, rows) for rows in shown if len(rows)]
     return sorted(blocks, key=lambda block: block.name)
 
 
@@ -90,14 +90,10 @@ def usable(observations: Observations) -> Observations:
 
 
 def _block(
-    seen: Observations,
-    rows: Int[np.ndarray, " n"],
-    name: str,
-    noise: Noise,
-    share: float,
-    rotations: Rotations,
-    seed: int,
+    every: Observations, rows: Int[np.ndarray, " n"], noise: Noise, share: float, rotations: Rotations, seed: int
 ) -> Block:
+    """The block of the observations `rows`, which are those of one illumination."""
+    seen, name = every.take(rows), every.illuminations[every.illumination[rows[0]]]
     photos = sorted({seen.photos[i] for i in np.unique(seen.photo)})
     local = np.array([photos.index(p) if p in photos else -1 for p in seen.photos])[seen.photo]
     order = np.lexsort((seen.x, seen.y, local, seen.material))
@@ -110,8 +106,8 @@ def _block(
     held_out = held_out_by_cells(mirror_cells(normal, view, HELD_OUT_CELL), seen.material, share, seed)
     visibility = directions = None
     if seen.visibility is not None and (seen.visibility < 255).any():
-        every = fibonacci_sphere(seen.visibility.shape[1])
-        visibility, directions = seen.visibility, np.stack([every @ turned.get(p, np.eye(3)).T for p in photos])
+        sphere = fibonacci_sphere(seen.visibility.shape[1])
+        visibility, directions = seen.visibility, np.stack([sphere @ turned.get(p, np.eye(3)).T for p in photos])
     bounced = bounced_light(seen, scaled)
     block = Block(
         name, tuple(photos), unit, normal, view, scaled, seen.clipped.astype(bool), noise.precision(scaled, seen.weight),

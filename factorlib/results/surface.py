@@ -31,7 +31,7 @@ class Tried(msgspec.Struct, frozen=True):
 
 
 class SurfaceTable(msgspec.Struct, frozen=True):
-    """What was found.
+    """How the surfaces of a set differ from its meshes.
 
     moved, moved_by      whether surfaces differ from the given meshes, and what decided
     painted, painted_by  whether diffuse reflectance has detail, over what moved surfaces explain

@@ -1,4 +1,4 @@
-"""Whether a set's surfaces are turned by shading, how stiff they are, and the displacement that they end with.
+"""Whether the surfaces of a set are moved by shading, and painted, how stiff both are, and what they end with.
 
 start      materials and lights are fitted on few cells, with the shadows and bounces of the given meshes.  Lights are far away: where normals are wrong, near
            ones take up what turns should explain (rough set of seed 0: 3.5 instead of 3.1 degrees)
@@ -33,7 +33,7 @@ from factorlib.solve.fit import Fit, Schedule, field_of, fitted, sure_ones
 from factorlib.solve.marginal import marginal
 from factorlib.solve.options import Choices
 from factorlib.solve.start import Start
-from factorlib.surface.turns import Attached, Detail, Part, Stiffness, none, part_of, step
+from factorlib.surface.turns import Attached, Detail, Part, Stiffness, no_detail, part_of, step
 
 TURNS = (1000.0, 300.0, 100.0, 30.0)  # stiffness of turns: a of `factorlib.surface.turns`; b is a share of it
 FACTORS = (300.0, 100.0, 30.0, 10.0)  # of log factors
@@ -82,7 +82,7 @@ class Surfaces(msgspec.Struct, frozen=True):
 
 
 class Found(msgspec.Struct, frozen=True):
-    """What was found.
+    """The answer for all meshes of a set.
 
     evidence  whether surfaces are moved, by held-out observations of photos that had no part in that;  painted: whether reflectance has detail, likewise
     stiffness that was best;  gains: by photo, of all that is kept: how much −2 log marginal likelihood fell while the photo had no part in it
@@ -121,14 +121,14 @@ class Trial(msgspec.Struct, frozen=True):
     attached: list[Attached]
     prior: LightPrior
 
-    def with_(self, detail: Detail) -> JointProblem:
+    def on(self, detail: Detail) -> JointProblem:
         """The problem on a surface with detail."""
         pairs = zip(self.problem.blocks, self.attached, strict=True)
         return self.problem.of([detail.on(block, at) for block, at in pairs])
 
     def parts(self, detail: Detail, fit: Fit) -> list[Part]:
         """Every light linearised on a surface with detail."""
-        each = zip(self.with_(detail).illuminations(fit.point), fit.hyperparameters, self.attached, strict=True)
+        each = zip(self.on(detail).illuminations(fit.point), fit.hyperparameters, self.attached, strict=True)
         nodes = self.surfaces.nodes
         return list(self.problem.spread(lambda one: part_of(*one[:2], self.prior, one[2], nodes), list(each)))
 
@@ -166,7 +166,9 @@ class Trial(msgspec.Struct, frozen=True):
             """The detail that one photo has no part in."""
             gone = [(block.photo == number) & (j == k) for j, block in enumerate(self.problem.blocks)]
             rest = [part.without(rows) if rows.any() else part for part, rows in zip(parts, gone, strict=True)]
-            found = step([part for part in rest if len(part.residual)], laplacian, stiffness, none(self.surfaces.nodes))
+            found = step(
+                [part for part in rest if len(part.residual)], laplacian, stiffness, no_detail(self.surfaces.nodes)
+            )
             seen = [of.take(~rows) for of, rows in zip(self.attached, gone, strict=True)]
             moved = self.surfaces.displacements(found.turn, seen)
             return Detail(self.surfaces.turns_of(moved), found.log_factor)
@@ -197,7 +199,7 @@ def found(
 
     effects = effects_chosen(sure, start(sure, CELLS), choices, fitting)
     fit = fitted(effects.of(problem), effects.fit, prior, SETTLE)
-    trial, plain = Trial(effects.of(problem), fit, surfaces, attached, prior), none(surfaces.nodes)
+    trial, plain = Trial(effects.of(problem), fit, surfaces, attached, prior), no_detail(surfaces.nodes)
     if len(trial.photos) < 2 or problem.none_held_out:
         return Found(Evidence(False))
     laplacian, parts, given = surfaces.laplacian(), trial.parts(plain, fit), trial.judged(lambda k, number: plain)
@@ -205,16 +207,18 @@ def found(
     def best(
         tried: list[Stiffness], before: Judged, done: float, held_out: float, likelihood: float
     ) -> tuple[Stiffness, Judged, Evidence]:
-        """The best of several stiffnesses, and whether photos gain by it over what was there before: both measures by so many standard errors."""
+        """The likeliest of several stiffnesses, what photos say of it, and whether it is kept.
+
+        before: what photos say without it;  held_out, likelihood: by how many standard errors it must be better, in each of the two measures
+        """
         judged = []
         for number, one in enumerate(tried):
             report(done + 0.3 * number / len(tried), f"left-out photos, stiffness {one.factor or one.turn:g}")
             judged.append(trial.left_out(parts, laplacian, one))
-        evidence = [compare(before.losses, one.losses, FOR) for one in judged]
-        k = max(range(len(tried)), key=lambda i: round(float((before.values - judged[i].values).sum()), 3))
-        gain = judged[k].gain_over(before)
-        kept = evidence[k].margin > held_out and gain > likelihood
-        return tried[k], judged[k], msgspec.structs.replace(evidence[k], kept=bool(kept))
+        k = min(range(len(tried)), key=lambda i: round(float(judged[i].values.sum()), 3))
+        evidence = compare(before.losses, judged[k].losses, held_out)
+        kept = evidence.kept and judged[k].gain_over(before) > likelihood
+        return tried[k], judged[k], msgspec.structs.replace(evidence, kept=kept)
 
     stiffness, moved, evidence = best([Stiffness(a) for a in TURNS], given, 0.2, FOR, 0.0)
     now = (stiffness, moved) if evidence.kept else (Stiffness(None), given)
@@ -228,7 +232,7 @@ def found(
     for number in range(ROUNDS):
         report(0.8 + 0.06 * number, f"all photos, round {number + 1}")
         if number:
-            fit = fitted(trial.with_(detail), fit, prior, BETWEEN)
+            fit = fitted(trial.on(detail), fit, prior, BETWEEN)
             parts = trial.parts(detail, fit)
         detail = step(parts, laplacian, stiffness, detail)
     displacements = surfaces.displacements(detail.turn, attached) if evidence.kept else {}

@@ -101,7 +101,7 @@ class Detail(msgspec.Struct, frozen=True):
         return block.on_surface(normal, attached.factor(self.log_factor))
 
 
-def none(nodes: int) -> Detail:
+def no_detail(nodes: int) -> Detail:
     """The surface of the mesh itself."""
     return Detail(np.zeros((nodes, 3)), np.zeros(nodes))
 

@@ -65,9 +65,7 @@ class Observations(msgspec.Struct, frozen=True):
     exposures: tuple[float | None, ...] = ()  # of `photos`, t·S/N² from EXIF, None where unknown; empty: all are
     confidence: Float[np.ndarray, " n"] | None = None  # of the normal, 0 to 1; None: all are as sure
     place: Float[np.ndarray, "n 3"] | None = None  # camera frame, about the photo's middle, RMS 1 (light.distance)
-    detail: Float[np.ndarray, " n"] | None = (
-        None  # factor on the diffuse reflectance; None: 1.  In no file: of `surface`
-    )
+    detail: Float[np.ndarray, " n"] | None = None  # factor on diffuse reflectance, of `surface`, in no file; None: 1
 
     def __len__(self) -> int:
         return len(self.weight)
