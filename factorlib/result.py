@@ -68,7 +68,7 @@ def load_result(folder: str | Path) -> Result:
     dataset = read_dataset(_dataset_of(found))
     slices = {name: dataset_slice(dataset, name) for name in SLICES}  # what the stage `recipes` is handed
     files = {file: dataset.folder / file for each in slices.values() for file in each.files}
-    folders = {stage: (found / stage).resolve() for stage in (*STAGES, "surface") if (found / stage).is_dir()}
+    folders = {stage: (found / stage).resolve() for stage in (*STAGES, "shapes", "surface") if (found / stage).is_dir()}
     solved = SolvedSet(Inputs(folders, {f"dataset.{name}": each.facts for name, each in slices.items()}, files))
     _check_names(dataset, solved, found)
     return Result(found, solved)

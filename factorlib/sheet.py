@@ -48,6 +48,8 @@ def write_sheet(folder: Path, path: Path, report: Callable[[int, int], None] = l
         named = [(photo.name, image), ("labels", _coloured(image, labels, colours))]
         for obj in photo.objects:
             entry = dataset.spec.meshes[obj.mesh]
+            if entry.file is None:  # it is found from the masks
+                continue
             mesh = read_mesh(dataset.folder / entry.file, materials, entry.made_of, obj.materials)
             named.append((obj.name, drawn(mesh, colours)))
         titled = []

@@ -56,3 +56,7 @@ class Inputs(msgspec.Struct, frozen=True):
     def file(self, relative: str) -> Path:
         """Absolute path of a file that dataset.yaml names; KeyError for one that this step did not declare."""
         return self.files[relative]
+
+    def mesh(self, name: str, file: str | None) -> Path:
+        """Absolute path of a mesh: of its file in dataset.yaml, or where it has none, of what the stage `shapes` found."""
+        return self.file(file) if file else self.folders["shapes"] / "meshes" / f"{name}.obj"

@@ -61,7 +61,8 @@ class Validation:
         elif slice_ == "objects":
             limits = convert(params.get("limits", {}), Limits, settings, "limits")
             for obj in (obj for entry in entries for obj in entry.objects):
-                mesh = self.spec.meshes[obj.mesh]
+                if (mesh := self.spec.meshes[obj.mesh]).file is None:
+                    continue
                 yield f"mesh {obj.mesh} {obj.materials}", partial(self._object, obj, mesh, limits)
         elif slice_ == "truth" and self.dataset.truth is not None:
             for name, path in self.dataset.truth.illumination.items():

@@ -8,14 +8,14 @@ import msgspec
 import numpy as np
 
 from factorlib.align.confidence import confidence, overlay
-from factorlib.align.given import check_before_camera, focal_and_centre, warn_of_camera, warn_of_materials
-from factorlib.align.place import Keypoints, KnownFocal, ObjectToPlace, Placed, placed
+from factorlib.align.given import camera_of, check_before_camera, warn_of_camera, warn_of_materials
+from factorlib.align.place import Keypoints, ObjectToPlace, Placed, placed
 from factorlib.align.search import Search
 from factorlib.align.silhouette import label_agreement, silhouette_iou, silhouette_of_object, silhouette_of_photo
 from factorlib.align.trust import Standards, doubts, trust_in
 from factorlib.dataset.schema import SOURCES, ObjectsSlice
 from factorlib.errors import InputError
-from factorlib.geometry.camera import Camera, Pose
+from factorlib.geometry.camera import Pose
 from factorlib.geometry.raster import Caster, Maps, rasterise
 from factorlib.images.exr import read_exr, write_exr
 from factorlib.images.picture import write_png
@@ -23,7 +23,7 @@ from factorlib.jsonfile import write_json
 from factorlib.meshes.limits import Limits
 from factorlib.meshes.mesh import scaled
 from factorlib.meshes.read import CREASE_DEG, read_mesh
-from factorlib.results.photos import PhotoFacts, read_photo_facts
+from factorlib.results.photos import read_photo_facts
 from factorlib.results.poses import (
     AS_IT_IS,
     FILE,
@@ -34,6 +34,7 @@ from factorlib.results.poses import (
     entry_of,
     read_poses,
 )
+from factorlib.results.shapes import read_shapes
 from factorlib.stage import Inputs, Progress
 
 log = logging.getLogger("factorlib.align")
@@ -60,6 +61,8 @@ def main(params: Params, inputs: Inputs, out: Path, progress: Progress) -> None:
     """Align the meshes of one photo and write its maps, its poses and the overlay."""
     name, materials = inputs.photo, inputs.facts["dataset.materials"]
     slice_ = msgspec.convert(inputs.facts["dataset.objects"], ObjectsSlice)
+    if camera := read_shapes(inputs.folders.get("shapes")).cameras.get(name):
+        slice_ = msgspec.structs.replace(slice_, external=camera)
     channels, facts = read_exr(inputs["masks"] / f"{name}.exr"), read_photo_facts(inputs["masks"] / f"{name}.json")
     earlier = read_poses(inputs["poses"] / FILE).get(name) if "poses" in inputs.folders else None
     objects = objects_of(slice_, channels, inputs, params, facts.factor, earlier)
@@ -105,7 +108,7 @@ def objects_of(
         if pose is None and slice_.external:
             pose = slice_.external.poses.get(own.name)
         before = earlier.objects.get(own.name) if earlier and pose is None else None
-        file, scale = inputs.file(mesh.file), before.scale if before else AS_IT_IS
+        file, scale = inputs.mesh(own.mesh, mesh.file), before.scale if before else AS_IT_IS
         read = read_mesh(file, materials, mesh.made_of, own.materials, params.crease_deg, params.limits)
         silhouette = silhouette_of_object(channels, number, read.labels, own.mask is not None)
         if pose is not None:
@@ -116,22 +119,6 @@ def objects_of(
         caster = Caster(scaled(read, scale))
         objects.append(ObjectToPlace(own.name, caster, silhouette, pose, keypoints, before, scale))
     return objects
-
-
-def camera_of(slice_: ObjectsSlice, facts: PhotoFacts, photo: str) -> tuple[Camera, KnownFocal]:
-    """The photo's camera, its focal length to be found later, and what is known of that length.
-
-    What dataset.yaml gives goes before what its source of cameras gives, and that before EXIF and the middle of the photo.
-    Both say so in pixels of the photo's file, of which `masks` made a box one pixel.
-    """
-    factor, (width, height) = facts.factor, facts.original_size
-    focal, source, centre = facts.focal_px, facts.focal_source, (width / 2, height / 2)
-    if slice_.external is not None and (source != "dataset" or slice_.camera.principal_point is None):
-        external_focal, centre = focal_and_centre(slice_.external, width, height, photo)
-        if source != "dataset":
-            focal, source = external_focal / factor, slice_.external.source
-    across, down = slice_.camera.principal_point or centre
-    return Camera(facts.width, facts.height, 1.0, (across / factor, down / factor)), KnownFocal(focal, source)
 
 
 def entry(obj: ObjectToPlace, k: int, result: Placed, maps: Maps, params: Params, source: str | None) -> ObjectEntry:
@@ -157,7 +144,7 @@ def entry(obj: ObjectToPlace, k: int, result: Placed, maps: Maps, params: Params
 
 def complain(photo: str, name: str, entry: ObjectEntry, strict: bool) -> None:
     """Warn of a pose's doubts; `strict`: raise InputError for the first instead."""
-    cure = EXTERNAL if entry.source in SOURCES else CURE
+    cure = EXTERNAL if entry.source in (*SOURCES, "sfm") else CURE
     for reason in entry.doubts:
         if strict:
             raise InputError(reason, file="dataset.yaml", key=f"{photo}.{name}", cure=cure)

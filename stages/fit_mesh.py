@@ -41,7 +41,7 @@ class Params(Standards, frozen=True, forbid_unknown_fields=True):
 def main(params: Params, inputs: Inputs, out: Path, progress: Progress) -> None:
     """Fit the proportions of every mesh, and write meshes.json and poses.json."""
     poses, sightings = read_poses(inputs["align"] / FILE), {}  # mesh -> (photo, object) -> the object, its sighting
-    meshes = MeshesOnce(inputs.file, inputs.facts["dataset.materials"], CREASE_DEG)
+    meshes = MeshesOnce(inputs.mesh, inputs.facts["dataset.materials"], CREASE_DEG)
     for photo in sorted(poses):
         slice_ = msgspec.convert(inputs.facts["dataset.objects"][photo], ObjectsSlice)
         aligned = aligned_photo(inputs["masks"], photo, slice_, poses[photo], meshes)

@@ -56,7 +56,7 @@ def main(params: Params, inputs: Inputs, out: Path, progress: Progress) -> None:
     name, names, file = inputs.photo, inputs.facts["dataset.materials"], inputs["solve"] / "materials.json"
     entry, table = read_photo_poses(inputs["align"] / f"{name}.json"), read_materials(file)
     slice_ = msgspec.convert(inputs.facts["dataset.objects"], ObjectsSlice)
-    aligned = aligned_photo(inputs["masks"], name, slice_, entry, MeshesOnce(inputs.file, names, CREASE_DEG))
+    aligned = aligned_photo(inputs["masks"], name, slice_, entry, MeshesOnce(inputs.mesh, names, CREASE_DEG))
     materials, known = known_materials(in_order(table, names, file))
     channels = aligned.channels
     if tone := table.model.tone.get(name):

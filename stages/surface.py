@@ -58,6 +58,9 @@ def main(params: Params, inputs: Inputs, out: Path, progress: Progress) -> None:
         return
     slices = msgspec.convert(inputs.facts["dataset.objects"], dict[str, ObjectsSlice])
     photos, surfaces = _photos(inputs, slices), surfaces_of(inputs, slices)
+    if not surfaces.meshes:
+        write_json(out / FILE, SurfaceTable())
+        return
     seen = {name: drawn(inputs["urm"] / f"{name}.parquet", params) for name in photos}
     attached = {name: photos[name].attached(np.column_stack([of.x, of.y]), surfaces) for name, of in seen.items()}
     result = _found(params, inputs, seen, attached, surfaces, progress)
@@ -118,11 +121,11 @@ def _photos(inputs: Inputs, slices: dict[str, ObjectsSlice]) -> dict[str, Photo]
 
 
 def surfaces_of(inputs: Inputs, slices: dict[str, ObjectsSlice]) -> Surfaces:
-    """Every mesh that a photo shows, subdivided; parts may be of several materials, which changes no vertex."""
-    read, meshes = MeshesOnce(inputs.file, inputs.facts["dataset.materials"], CREASE_DEG), {}
+    """Every mesh that a photo shows, subdivided, but for bodies of revolution found from outlines, of which no photo says what side it shows; parts may be of several materials, which changes no vertex."""
+    read, meshes = MeshesOnce(inputs.mesh, inputs.facts["dataset.materials"], CREASE_DEG), {}
     for slice_ in slices.values():
         for own in slice_.objects:
-            if own.mesh not in meshes:
+            if own.mesh not in meshes and not slice_.meshes[own.mesh].revolved:
                 meshes[own.mesh] = fine(read.mesh(own.mesh, slice_.meshes[own.mesh], own.materials))
     return Surfaces(dict(sorted(meshes.items())))
 

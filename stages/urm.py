@@ -65,7 +65,7 @@ def main(params: Params, inputs: Inputs, out: Path, progress: Progress) -> None:
 def occluders_of(inputs: Inputs, poses: dict[str, ObjectEntry]) -> Occluders:
     """Every object of the photo where `align` put it."""
     slice_ = msgspec.convert(inputs.facts["dataset.objects"], ObjectsSlice)
-    read = MeshesOnce(inputs.file, inputs.facts["dataset.materials"], CREASE_DEG)
+    read = MeshesOnce(inputs.mesh, inputs.facts["dataset.materials"], CREASE_DEG)
     meshes = [read.mesh(own.mesh, slice_.meshes[own.mesh], own.materials) for own in slice_.objects]
     placed = [poses[own.name] for own in slice_.objects]
     return Occluders([scaled(mesh, at.scale) for mesh, at in zip(meshes, placed)], [at.pose for at in placed])

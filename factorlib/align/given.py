@@ -9,10 +9,12 @@ from collections.abc import Iterable, Sequence
 import numpy as np
 from jaxtyping import Float
 
-from factorlib.dataset.schema import ExternalCamera, Vec2
+from factorlib.align.place import KnownFocal
+from factorlib.dataset.schema import ExternalCamera, ObjectsSlice, Vec2
 from factorlib.errors import InputError
-from factorlib.geometry.camera import Pose
+from factorlib.geometry.camera import Camera, Pose
 from factorlib.meshes.mesh import Mesh
+from factorlib.results.photos import PhotoFacts
 
 FIELD_DEG = 1.0, 150.0  # of view, across the longer side, that cameras have
 MOST_ROUNDED_PX = 1.0  # a side of a picture made smaller is a whole number: its middle is off by half of this
@@ -111,3 +113,19 @@ def focal_and_centre(external: ExternalCamera, width: int, height: int, photo: s
     if fault:
         raise InputError(fault, file="dataset.yaml", key=f"cameras.{external.source}: {photo}", cure=cure)
     return external.focal_px * (across if width >= height else down), centre
+
+
+def camera_of(slice_: ObjectsSlice, facts: PhotoFacts, photo: str) -> tuple[Camera, KnownFocal]:
+    """The photo's camera, its focal length to be found later, and what is known of that length.
+
+    What dataset.yaml gives goes before what its source of cameras gives, and that before EXIF and the middle of the photo.
+    Both say so in pixels of the photo's file, of which `masks` made a box one pixel.
+    """
+    factor, (width, height) = facts.factor, facts.original_size
+    focal, source, centre = facts.focal_px, facts.focal_source, (width / 2, height / 2)
+    if slice_.external is not None and (source != "dataset" or slice_.camera.principal_point is None):
+        external_focal, centre = focal_and_centre(slice_.external, width, height, photo)
+        if source != "dataset":
+            focal, source = external_focal / factor, slice_.external.source
+    across, down = slice_.camera.principal_point or centre
+    return Camera(facts.width, facts.height, 1.0, (across / factor, down / factor)), KnownFocal(focal, source)

@@ -13,6 +13,7 @@ them: each part of the sightings in turn is left out, the factors are fitted to 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from functools import partial
 from typing import Annotated
 
 import msgspec
@@ -27,8 +28,9 @@ from factorlib.geometry.camera import Camera
 from factorlib.geometry.raster import Caster
 from factorlib.meshes.mesh import Mesh, scaled
 
-SHAPES = np.array([[2, -1, -1], [0, 1, -1]]).T / np.sqrt([6.0, 2.0])  # log s = SHAPES · d
-DAMPING = np.append(OF_POSES, np.array([0.1, 0.1]) ** -2.0)  # of d, too
+BOX = np.array([[2, -1, -1], [0, 1, -1]]).T / np.sqrt([6.0, 2.0])  # log s = BOX · d, all factors of product 1
+ROUND = np.array([[-1, 2, -1]]).T / 6.0**0.5  # those that leave a body of revolution about y one
+OF_FACTORS = 0.1**-2.0  # damping of d, as OF_POSES
 LARGEST_STEP = 0.15  # of the logarithms d; of other unknowns twice as much
 STILL = 1e-4  # a step of d that ends the descent
 PARTS = 4  # that are left out in turn, at most
@@ -81,7 +83,7 @@ def proportions(sightings: Sequence[Sighting], standards: Standards = Standards(
     count = len(sightings)
     for part in ([*range(first, count, PARTS)] for first in range(min(count, PARTS))):  # left out together
         others = [one for k, one in enumerate(sightings) if k not in part]
-        factors, _ = fitted(others, standards.steps)
+        factors, _, _ = fitted(others, standards.steps)
         for k in part:
             before.append(unexplained(sightings[k], np.ones(3), standards.steps))
             after.append(unexplained(sightings[k], factors, standards.steps))
@@ -89,7 +91,7 @@ def proportions(sightings: Sequence[Sighting], standards: Standards = Standards(
     gain = losses[0] - losses[1]
     if gain < max(standards.least_gain * losses[0], standards.least_share):
         return Verdict(False, "photos left out are explained no better", *as_it_is, *losses)
-    return Verdict(True, "photos left out are explained better", *fitted(sightings, standards.steps), *losses)
+    return Verdict(True, "photos left out are explained better", *fitted(sightings, standards.steps)[:2], *losses)
 
 
 def unexplained(one: Sighting, factors: Factors, steps: int) -> float:
@@ -98,15 +100,21 @@ def unexplained(one: Sighting, factors: Factors, steps: int) -> float:
     return 1 - refined(caster, one.target, one.camera, one.state, one.prior, steps).score
 
 
-def fitted(sightings: Sequence[Sighting], steps: int) -> tuple[Factors, list[State]]:
-    """Factors, of product 1, and states together, by Gauss-Newton from the mesh as it is; the best met."""
-    shape, states, most = np.zeros(2), [one.state for one in sightings], -np.inf
+def fitted(
+    sightings: Sequence[Sighting], steps: int, free: Float[np.ndarray, "3 k"] = BOX
+) -> tuple[Factors, list[State], float]:
+    """Factors, of product 1, and states together, by Gauss-Newton from the mesh as it is; the best met, and their mean score.
+
+    free: directions in which the logarithms of the factors may go
+    """
+    shape, states, most = np.zeros(free.shape[1]), [one.state for one in sightings], -np.inf
     best = np.ones(3), states
     for k in range(steps + 1):
-        equations, scores, factors = [], [], np.exp(SHAPES @ shape)
+        equations, scores, factors = [], [], np.exp(free @ shape)
         for one, state in zip(sightings, states, strict=True):
             seen = rendered(Caster(scaled(one.mesh, tuple(factors))), one.target, one.camera, state)
-            equations.append(normal_equations(seen, one.target, one.prior, jacobian_with_shape))
+            jacobian = partial(jacobian_with_shape, free=free)
+            equations.append(normal_equations(seen, one.target, one.prior, jacobian))
             scores.append(seen.score(one.target))
         if (score := float(np.mean(scores))) > most:
             best, most = (factors, states), score
@@ -114,15 +122,17 @@ def fitted(sightings: Sequence[Sighting], steps: int) -> tuple[Factors, list[Sta
             break
         by_shape, moves = _joint_step(equations, [one.prior.free for one in sightings])
         shape, states = shape + by_shape, [state.moved(move) for state, move in zip(states, moves, strict=True)]
-        if np.abs(by_shape).max() < STILL:
+        if np.abs(by_shape).max(initial=0.0) < STILL:
             break
-    return best
+    return *best, most
 
 
-def jacobian_with_shape(state: State, arms: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 2 9"]:
+def jacobian_with_shape(
+    state: State, arms: Float[np.ndarray, "n 3"], free: Float[np.ndarray, "3 k"] = BOX
+) -> Float[np.ndarray, "n 2 m"]:
     """∂ image point / ∂ (the seven unknowns of `State.moved`, d), photo pixels."""
     along = arms @ state.rotation  # the arm in the object's axes, as it is scaled
-    moves = np.einsum("dk,nk,kj->ndj", state.rotation, along, SHAPES)
+    moves = np.einsum("dk,nk,kj->ndj", state.rotation, along, free)
     point = arms + state.middle()
     slope, scale = point[:, :2] / point[:, 2:], (np.exp(state.log_focal) / point[:, 2])[:, None, None]
     by_shape = (moves[:, :2] - slope[:, :, None] * moves[:, 2:]) * scale
@@ -131,16 +141,17 @@ def jacobian_with_shape(state: State, arms: Float[np.ndarray, "n 3"]) -> Float[n
 
 def _joint_step(
     equations: Sequence[tuple[np.ndarray, np.ndarray]], free: Sequence[int]
-) -> tuple[Float[np.ndarray, "2"], list[Float[np.ndarray, "7"]]]:
+) -> tuple[Float[np.ndarray, " k"], list[Float[np.ndarray, "7"]]]:
     """The damped step of d, and the sightings' own steps, in which the first `free` unknowns move."""
-    shared, pull, own = np.diag(DAMPING[7:]), np.zeros(2), []
+    count = len(equations[0][1]) - 7
+    shared, pull, own = OF_FACTORS * np.eye(count), np.zeros(count), []
     for (information, gradient), k in zip(equations, free, strict=True):
-        matrix = information + np.diag(DAMPING * (np.arange(9) < 7))
+        matrix = information + np.diag(np.append(OF_POSES, np.zeros(count)))
         cross = matrix[:k, 7:]
         away = np.linalg.solve(matrix[:k, :k], np.column_stack([cross, gradient[:k]]))
-        shared = shared + information[7:, 7:] - cross.T @ away[:, :2]
-        pull = pull + gradient[7:] - cross.T @ away[:, 2]
+        shared = shared + information[7:, 7:] - cross.T @ away[:, :count]
+        pull = pull + gradient[7:] - cross.T @ away[:, count]
         own.append(away)
     by_shape = np.clip(-np.linalg.solve(shared, pull), -LARGEST_STEP, LARGEST_STEP)
-    steps = [np.clip(-away[:, 2] - away[:, :2] @ by_shape, -2 * LARGEST_STEP, 2 * LARGEST_STEP) for away in own]
+    steps = [np.clip(-away[:, count] - away[:, :count] @ by_shape, -2 * LARGEST_STEP, 2 * LARGEST_STEP) for away in own]
     return by_shape, [np.append(step, np.zeros(7 - len(step))) for step in steps]

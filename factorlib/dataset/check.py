@@ -28,6 +28,7 @@ ONE_PART = (".ply", ".stl", ".off")  # their one part goes by the file's own nam
 MESHES = (".obj", ".gltf", ".glb", *ONE_PART)
 MAPS = (".exr", ".hdr")
 RESERVED_PHOTOS = ("photos", "poses")  # `<photo>.json` would be the gathered photos.json, poses.json
+ALL_OF_IT = "all"  # the one part of a shape that is found
 LEAST_KEYPOINTS, GOOD_KEYPOINTS = 4, 6
 LEAST_OFF_LINE = 1e-3  # of the keypoints' extent
 
@@ -81,7 +82,16 @@ def check_lights(photos: list[PhotoEntry], file: Path) -> None:
 
 
 def _check_mesh(key: str, mesh: MeshEntry, materials: list[str], refuse: Refusal) -> None:
-    refuse.path(f"{key}.file", mesh.file, MESHES)
+    kinds = [kind for kind in ("file", "hull", "lathe", "primitive") if getattr(mesh, kind)]
+    if len(kinds) != 1:
+        cure = "give exactly one of file: <path>, hull: true, lathe: true, primitive: ball | box | cylinder"
+        refuse(key, f"has {' and '.join(kinds) or 'neither a file nor a shape to be found'}", cure)
+    if mesh.file:
+        refuse.path(f"{key}.file", mesh.file, MESHES)
+    if mesh.size != 1.0 and kinds[0] in ("file", "hull"):
+        refuse(f"{key}.size", f"does not go with {kinds[0]}", "leave it out: its own numbers say how large it is")
+    if mesh.parts and kinds[0] in ("lathe", "primitive"):
+        refuse(f"{key}.parts", f"does not go with {kinds[0]}, which has one part", "write `material: …`")
     if mesh.parts and mesh.material is not None:
         cure = "keep `parts: {part: material, …}`, or `material:` for a mesh of one"
         refuse(key, "has both parts and a material", cure)
@@ -94,8 +104,10 @@ def _check_mesh(key: str, mesh: MeshEntry, materials: list[str], refuse: Refusal
 
 def _check_parts(key: str, parts: dict[str, str], mesh: MeshEntry, materials: list[str], refuse: Refusal) -> None:
     """A file of one part has no other; which parts the others have, only reading them shows."""
-    file = Path(mesh.file)
+    file = Path(mesh.file or "")
     for part, material in parts.items():
+        if not mesh.file and not mesh.parts and part != ALL_OF_IT:
+            refuse(f"{key}.{part}", f"it has no part {part!r}", f"it has one, {ALL_OF_IT!r}")
         if file.suffix.lower() in ONE_PART and part != file.stem:
             fault = f"{file.name} has no part {part!r}"
             refuse(f"{key}.{part}", fault, f"it has one, {file.stem!r}; for several, save the mesh as OBJ or glTF")
@@ -132,6 +144,18 @@ def _check_photo(key: str, photo: PhotoEntry, spec: DatasetFile, refuse: Refusal
             refuse.path(f"{of}.mask", obj.mask, (".png",))
         if obj.pose is not None:
             refuse.rotation(f"{of}.pose.rotation", obj.pose.rotation)
+            if spec.meshes[obj.mesh].primitive:
+                refuse(
+                    f"{of}.pose",
+                    "does not go with a primitive, whose size it would have to fit",
+                    "leave it out: it is found",
+                )
+        if obj.keypoints and not spec.meshes[obj.mesh].file:
+            refuse(
+                f"{of}.keypoints",
+                "its mesh has no file, so no points are known on it",
+                "leave them out, or give the mesh's file",
+            )
         if obj.keypoints:
             _check_keypoints(f"{of}.keypoints", obj, refuse)
 
@@ -169,9 +193,18 @@ def _check_keypoints(key: str, obj: ObjectEntry, refuse: Refusal) -> None:
 
 def _check_source(source: CameraSource, spec: DatasetFile, refuse: Refusal) -> None:
     """One source, its path inside the folder, and every photo, object and mesh it names one of the dataset's."""
-    named = [kind for kind in SOURCES if getattr(source, kind) is not None]
+    named = [kind for kind in (*SOURCES, "sfm") if getattr(source, kind)]
     if len(named) != 1:
-        refuse("cameras", f"names {' and '.join(named) or 'no source'}", f"name one of {', '.join(SOURCES)}")
+        refuse(
+            "cameras",
+            f"names {' and '.join(named) or 'no source'}",
+            f"name one of {', '.join(SOURCES)}, or `sfm: true`",
+        )
+    if source.sfm:
+        for key in ("images", "world_from_object", "world_from_camera", "obj_ids", "mesh_unit_mm"):
+            if getattr(source, key) != getattr(CameraSource(), key):
+                refuse(f"cameras.{key}", "does not go with sfm, whose world is not known beforehand", "leave it out")
+        return
     kind, path = named[0], getattr(source, named[0])
     if kind == "transforms":
         refuse.path("cameras.transforms", path, (".json",))

@@ -55,8 +55,10 @@ def read_dataset(path: str | Path) -> Dataset:
     spec, external = read_yaml(file, DatasetFile), {}
     check_dataset(spec, file)
     refuse = Refusal(file, file.parent)
-    companions = {name: _companions(mesh.file, f"meshes.{name}.file", refuse) for name, mesh in spec.meshes.items()}
-    if spec.cameras is not None:
+    companions = {
+        name: _companions(mesh.file, f"meshes.{name}.file", refuse) for name, mesh in spec.meshes.items() if mesh.file
+    }
+    if spec.cameras is not None and not spec.cameras.sfm:
         from factorlib.dataset.sources.external import external_cameras
 
         spec, external = external_cameras(spec, file)

@@ -28,6 +28,7 @@ Number = Annotated[float, Meta(ge=-LARGEST, le=LARGEST, description="give a fini
 Share = Annotated[float, Meta(ge=0, le=1, description="give a fraction, 0 to 1: reflectance is linear, not 0 to 255")]
 Focal = Annotated[float, Meta(ge=FOCAL_PX[0], le=FOCAL_PX[1], description="give finite pixels, 1 to 1e+07, or none")]
 Centre = Annotated[float, Meta(ge=-CENTRE_PX, le=CENTRE_PX, description="give finite pixels, up to 1e+06, or none")]
+Size = Annotated[float, Meta(gt=0, le=1e9, description="give its extent in the unit of the set's meshes, more than 0")]
 Unit = Annotated[float, Meta(ge=1e-9, le=1e9, description="give the ratio of two units, more than 0: 1e-09 to 1e+09")]
 NAMES = "names have 1 to 100 of the characters A-Z a-z 0-9 _ and -, for they name files"
 Name = Annotated[str, Meta(pattern=r"^[A-Za-z0-9_-]+\Z", max_length=LONGEST_NAME, description=NAMES)]
@@ -45,9 +46,18 @@ class _Format(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class MeshEntry(_Format):
-    """A mesh of several parts (OBJ group or usemtl, glTF primitive or material -> material), or of one material."""
+    """A mesh of several parts (OBJ group or usemtl, glTF primitive or material -> material), or of one material.
 
-    file: str
+    Exactly one of: file;  hull: the visual hull of the masks, where cameras are known (its parts are named here and seen in the masks);
+    lathe: a body of revolution from its outlines, about y;  primitive: one whose proportions the outlines say, about y.
+    size: the longest side of a lathe's or primitive's bounding box, in the unit of the set's meshes
+    """
+
+    file: str | None = None
+    hull: bool = False
+    lathe: bool = False
+    primitive: Literal["ball", "box", "cylinder"] | None = None
+    size: Size = 1.0
     parts: dict[str, str] | None = None
     material: str | None = None
 
@@ -55,6 +65,11 @@ class MeshEntry(_Format):
     def made_of(self) -> dict[str, str] | str | None:
         """The material of each part, or that of all; None where the entry names none, which the reader refuses."""
         return self.parts or self.material
+
+    @property
+    def revolved(self) -> bool:
+        """Whether it looks the same however it is turned about its axis, so that photos do not say which of its sides they show."""
+        return self.lathe or self.primitive in ("ball", "cylinder")
 
 
 class Camera(_Format):
@@ -128,9 +143,9 @@ class Similarity(_Format):
 
 
 class CameraSource(_Format):
-    """Where cameras, and perhaps poses, are known from: exactly one of colmap, transforms, bop.
+    """Where cameras, and perhaps poses, are known from: exactly one of colmap, transforms, bop, sfm.
 
-    colmap, bop: a folder; transforms: a json.  images: photo -> its image in the source (BOP: its id), where the file's
+    colmap, bop: a folder; transforms: a json; sfm: they are found from the photos by structure from motion.  images: photo -> its image in the source (BOP: its id), where the file's
     name does not tell.  world_from_object: object -> where it lies in the source's world; its pose is the source's then.
     world_from_camera: the source's rotations fix lights to its world.  obj_ids: mesh -> BOP's obj_id.
     """
@@ -138,6 +153,7 @@ class CameraSource(_Format):
     colmap: str | None = None
     transforms: str | None = None
     bop: str | None = None
+    sfm: bool = False
     images: dict[str, str | int] = {}
     world_from_object: dict[str, Similarity] = {}
     world_from_camera: bool = False
@@ -185,7 +201,7 @@ class ExternalCamera(msgspec.Struct, frozen=True):
     principal_point: None where the source does not say it; poses: object -> cam_from_object, in the mesh's units
     """
 
-    source: Literal["colmap", "transforms", "bop"]
+    source: Literal["colmap", "transforms", "bop", "sfm"]
     focal_px: float
     principal_point: Vec2 | None
     size: tuple[float, float | None] | None
@@ -244,6 +260,17 @@ class ObjectsSlice(msgspec.Struct, frozen=True):
     objects: list[ObjectEntry]
     meshes: dict[str, MeshEntry]
     external: ExternalCamera | None = None
+
+
+class ShapesSlice(msgspec.Struct, frozen=True):
+    """The slice needed to find cameras and shapes from masks: the meshes that have no file, and the photos with their objects.
+
+    sfm: whether cameras are found from the photos
+    """
+
+    meshes: dict[str, MeshEntry]
+    photos: dict[str, ObjectsSlice]
+    sfm: bool = False
 
 
 class LightSlice(msgspec.Struct, frozen=True):

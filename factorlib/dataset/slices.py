@@ -71,8 +71,20 @@ def _objects(dataset: Dataset, photo: PhotoEntry) -> tuple[schema.ObjectsSlice, 
     meshes = {obj.mesh: dataset.spec.meshes[obj.mesh] for obj in photo.objects}
     external = dataset.external.get(photo.name)
     facts = schema.ObjectsSlice(photo.camera or schema.Camera(), photo.objects, meshes, external)
-    files = [path for name, mesh in meshes.items() for path in (mesh.file, *dataset.companions.get(name, ()))]
+    files = [
+        path for name, mesh in meshes.items() if mesh.file for path in (mesh.file, *dataset.companions.get(name, ()))
+    ]
     return facts, files + _object_masks(photo)
+
+
+def _shapes(dataset: Dataset) -> tuple[schema.ShapesSlice | None, list[str]]:
+    """None where every mesh has a file and no camera is to be found."""
+    meshes = {name: mesh for name, mesh in dataset.spec.meshes.items() if not mesh.file}
+    sfm = dataset.spec.cameras is not None and dataset.spec.cameras.sfm
+    if not meshes and not sfm:
+        return None, []
+    shows = [photo for photo in dataset.spec.photos if sfm or any(obj.mesh in meshes for obj in photo.objects)]
+    return schema.ShapesSlice(meshes, {photo.name: _objects(dataset, photo)[0] for photo in shows}, sfm), []
 
 
 def _object_masks(photo: PhotoEntry) -> list[str]:
@@ -111,6 +123,7 @@ _OF_SET: dict[str, Callable[[Dataset], tuple[Any, list[str]]]] = {
         ),
         [],
     ),
+    "shapes": _shapes,
     "truth": lambda dataset: (dataset.truth, dataset.truth.maps if dataset.truth else []),
 }
 SLICES = (*_OF_PHOTO, *_OF_SET)

@@ -22,7 +22,7 @@ class MeshFiles:
     def __init__(self, inputs: Inputs, scenes: Path, materials: list[str], crease_deg: float):
         self.scenes, self.materials = scenes, materials
         own = read_surface(inputs.folders.get("surface"))
-        self.read = MeshesOnce(inputs.file, materials, crease_deg, own.displacements, own.log_factors)
+        self.read = MeshesOnce(inputs.mesh, materials, crease_deg, own.displacements, own.log_factors)
         self._stems: dict[tuple, str] = {}  # what files are called before the material, relative to the scenes
 
     def shapes(

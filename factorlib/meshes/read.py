@@ -67,19 +67,19 @@ def read_parts(path: str | Path, limits: Limits | None = None) -> list[tuple[str
 class MeshesOnce:
     """Meshes of a data set, each read once for each choice of materials for its parts; sizes were limited by an earlier stage.
 
-    file: the path of a file that dataset.yaml names;  materials: the data set's;  crease_deg: as of `read_mesh`
+    path: of a mesh by its name and, where it has one, its file in dataset.yaml (`Inputs.mesh`);  materials: the data set's;  crease_deg: as of `read_mesh`
     displacements, log_factors: by mesh, those that `surface` found at its nodes: such a mesh is subdivided, moved and given detail
     """
 
     def __init__(
         self,
-        file: Callable[[str], Path],
+        path: Callable[[str, str | None], Path],
         materials: Sequence[str],
         crease_deg: float,
         displacements: Mapping[str, Sequence[float]] = {},
         log_factors: Mapping[str, Sequence[float]] = {},
     ):
-        self.file, self.materials, self.crease_deg = file, materials, crease_deg
+        self.path, self.materials, self.crease_deg = path, materials, crease_deg
         self.displacements, self.log_factors = displacements, log_factors
         self._meshes: dict[tuple, Mesh] = {}
 
@@ -87,7 +87,7 @@ class MeshesOnce:
         """The mesh `name` with `overrides` of its parts' materials, read when first asked for."""
         key = (name, *sorted(overrides.items()))
         if key not in self._meshes:
-            file = self.file(entry.file)
+            file = self.path(name, entry.file)
             mesh = read_mesh(file, self.materials, entry.made_of, overrides, self.crease_deg, NO_LIMITS)
             if name in self.displacements or name in self.log_factors:
                 dense = fine(mesh)

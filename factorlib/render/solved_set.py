@@ -56,7 +56,7 @@ class SolvedSet:
         self.materials = reflectances(self.table)
         self.photos = list(self.objects)
         own = read_surface(inputs.folders.get("surface"))
-        self._meshes = MeshesOnce(inputs.file, self.names, crease_deg, own.displacements, own.log_factors)
+        self._meshes = MeshesOnce(inputs.mesh, self.names, crease_deg, own.displacements, own.log_factors)
         self._pixels: dict[str, dict[str, np.ndarray]] = {}
 
     def scene(self, photo: str) -> PhotoScene:

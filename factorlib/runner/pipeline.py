@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import re
 import shlex
+from collections.abc import Callable
 from graphlib import CycleError, TopologicalSorter
 from pathlib import Path
 from typing import Annotated, Any, Literal, NoReturn
@@ -43,6 +44,7 @@ class Stage(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     threads: threads of its libraries' numerics, part of what is computed (a sum depends on them), never the machine's
     cores:   that it spreads independent work over by `Inputs.map`, `all` for those of the machine: they change no bit and no key
     logs:    hand it the log of the steps above it (not part of its key)
+    when:    a slice of the set: where that says nothing, the stage is not there, and none takes its results
     optional: run it only where it is asked for, or something that is asked for takes its results
     given:   parameters that name a folder outside the dataset, and the files of it that the stage reads; the stage is handed
              the folder among its inputs, and the key has the files' contents, not where they lie
@@ -56,6 +58,7 @@ class Stage(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     threads: Annotated[int, msgspec.Meta(ge=1, le=64)] = 1
     cores: Annotated[int, msgspec.Meta(ge=1, le=1024)] | Literal["all"] = 1
     logs: bool = False
+    when: str | None = None
     optional: bool = False
     given: dict[str, list[str]] = {}
     shipped: Shipping | None = None
@@ -107,6 +110,16 @@ class Pipeline(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         """Stages, each after what it takes; otherwise as they stand in the file."""
         return list(TopologicalSorter({name: stage.upstream for name, stage in self.stages.items()}).static_order())
 
+    def for_data(self, says_nothing: Callable[[str], bool]) -> Pipeline:
+        """The stages that a data set has, by which slices of it say nothing (`Stage.when`)."""
+        gone = {name for name, stage in self.stages.items() if stage.when and says_nothing(stage.when)}
+        kept = {
+            name: msgspec.structs.replace(stage, inputs=[each for each in stage.inputs if each not in gone])
+            for name, stage in self.stages.items()
+            if name not in gone
+        }
+        return msgspec.structs.replace(self, stages=kept)
+
     def needed(self, targets: list[str] | None) -> list[str]:
         """The targets and everything above them, in order; for None all stages but the optional ones that none of them takes."""
         usual = [name for name, stage in self.stages.items() if not stage.optional]
@@ -141,6 +154,8 @@ def read_pipeline(path: Path, known_slices: tuple[str, ...]) -> Pipeline:
                 refuse("only what is made per photo can be gathered", f"{key}.gather", "add over: photo")
         for entry in (entry for entry in stage.inputs if entry not in known):
             refuse(f"there is no {entry!r}", f"{key}.inputs", did_you_mean(entry, known))
+        if stage.when is not None and stage.when not in known_slices:
+            refuse(f"there is no slice {stage.when!r}", f"{key}.when", did_you_mean(stage.when, known_slices))
         for param in (param for param in stage.given if param in stage.inputs):
             refuse(f"{param!r} is a stage already", f"{key}.given", "call the parameter something else")
     try:

@@ -24,11 +24,13 @@ def attached_pixels(
 ) -> Attached:
     """The nodes under pixels (x, y), in the camera's frame.
 
-    shown: the object that each pixel shows, a number from 1 as `align` counts them, 0 for none;  objects: the mesh and the pose of each, in that order
+    shown: the object that each pixel shows, a number from 1 as `align` counts them, 0 for none;  objects: the mesh and the pose of each, in that order; a mesh that has no nodes stays as it is
     """
     along, count = camera.rays_through(pixels + 0.5), len(pixels)
     node, share, frame = np.zeros((count, 3), np.int64), np.zeros((count, 3)), np.zeros((count, 3, 3))
     for number, (mesh, entry) in enumerate(objects.values(), start=1):
+        if mesh not in surfaces.meshes:
+            continue
         rows, fine, scale = np.flatnonzero(shown == number), surfaces.meshes[mesh], np.array(entry.scale)
         solid = scaled(fine.mesh, entry.scale)
         hits = Caster(solid).cast_along(along[rows], entry.pose)

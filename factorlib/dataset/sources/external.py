@@ -12,7 +12,7 @@ import msgspec
 
 from factorlib.dataset.check import IMAGES
 from factorlib.dataset.paths import Refusal
-from factorlib.dataset.schema import SOURCES, CameraSource, DatasetFile, ExternalCamera, PhotoEntry, Pose
+from factorlib.dataset.schema import SOURCES, CameraSource, DatasetFile, ExternalCamera, PhotoEntry, Pose, Similarity
 from factorlib.dataset.sources.bop import bop_shots
 from factorlib.dataset.sources.colmap import colmap_shots
 from factorlib.dataset.sources.shot import Shot, as_rows, pinhole, rigid
@@ -39,7 +39,8 @@ def external_cameras(spec: DatasetFile, file: Path) -> tuple[DatasetFile, dict[s
             log.warning("%s: cameras.%s has no image of photo %r: it is aligned as if there were none; if it has one, name "
                         "it: cameras.images: {%s: …}", file, kind, photo.name, photo.name)  # fmt: skip
         else:
-            poses, given = _poses(photo, shot, source, refuse), photo.camera
+            hulls = {obj.name for obj in photo.objects if spec.meshes[obj.mesh].hull}
+            poses, given = _poses(photo, shot, source, hulls, refuse), photo.camera
             if given is not None and given.focal_px is not None and given.principal_point is not None:
                 camera = ExternalCamera(kind, given.focal_px, given.principal_point, None, poses)
             else:
@@ -86,8 +87,8 @@ def matched(spec: DatasetFile, kind: str, shots: list[Shot], refuse: Refusal) ->
     return result
 
 
-def _poses(photo: PhotoEntry, shot: Shot, source: CameraSource, refuse: Refusal) -> dict[str, Pose]:
-    """object -> pose, of those whose place the source gives and dataset.yaml does not."""
+def _poses(photo: PhotoEntry, shot: Shot, source: CameraSource, hulls: set[str], refuse: Refusal) -> dict[str, Pose]:
+    """object -> pose, of those whose place the source gives and dataset.yaml does not; `hulls` lie in the source's frame where it does not say."""
     objects = [obj for obj in photo.objects if obj.pose is None and not obj.keypoints]
     poses = {}
     if source.bop is not None:  # the one instance of the object's mesh, in units of the mesh
@@ -104,7 +105,8 @@ def _poses(photo: PhotoEntry, shot: Shot, source: CameraSource, refuse: Refusal)
             for pose in instances:
                 poses[obj.name] = Pose(pose.rotation, tuple(x / source.mesh_unit_mm for x in pose.translation))
         return poses
-    placed = {obj.name: source.world_from_object[obj.name] for obj in objects if obj.name in source.world_from_object}
+    here = {name: Similarity() for name in hulls} | source.world_from_object
+    placed = {obj.name: here[obj.name] for obj in objects if obj.name in here}
     scales = sorted({similarity.scale for similarity in placed.values()})
     if len(scales) > 1:
         fault = f"photo {photo.name!r} shows objects of different scales, {', '.join(f'{s:g}' for s in scales)}"

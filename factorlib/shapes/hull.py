@@ -1,0 +1,223 @@
+"""The visual hull: the largest body that fits into all outlines (Laurentini 1994), where the cameras are known.
+
+    f(x) = min over photos of (pixels that x lies inside the outline) · (its depth / focal length)
+
+is negative outside.  It is sampled on a grid; the surface f = 0 is meshed by surface nets (Gibson 1998: in each cell that the surface
+crosses, a vertex in the middle of where it crosses the cell's edges), which close wherever f is negative on the grid's border, and
+smoothed without shrinking (Taubin 1995).  Faces take the part that most photos show them as.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+
+import msgspec
+import numpy as np
+import trimesh
+from jaxtyping import Float, Int
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
+from scipy.spatial import cKDTree
+
+from factorlib.align.silhouette import Silhouette, labelled_iou
+from factorlib.align.target import extent_of, target_of
+from factorlib.errors import InputError
+from factorlib.geometry.raster import Caster, rasterise
+from factorlib.meshes.mesh import area_vectors
+from factorlib.shapes.outline import FREE, Outline, Triangles, of_one_part
+
+FIRST = 32  # cells of the longest side, to find where the body is
+LEAST_SHARE = 0.02  # of the largest piece's faces: what is smaller is left away
+SMOOTHINGS = 10
+SLAB = 1 << 18  # points at a time
+LEAST_Z = 1e-6
+
+Points = Float[np.ndarray, "n 3"]
+
+
+def visual_hull(
+    outlines: Sequence[Outline],
+    cells: int,
+    parts: int = 1,
+    report: Callable[[float], None] = lambda share: None,
+) -> Triangles:
+    """The hull of outlines with poses, in the object's frame.  cells: of the grid, along its longest side;  parts: of the object.
+
+    report: the share that is done.  Raises InputError where fewer than two outlines have a pose, or nothing fits into all of them.
+    """
+    outlines = [outline for outline in outlines if outline.pose is not None and outline.is_seen]
+    if len(outlines) < 2:
+        fault = f"{len(outlines)} photo{'s' * (len(outlines) != 1)} with a known camera show it"
+        cure = "a hull needs two at least, better ten: `cameras: {sfm: true}` finds them where photos overlap, or use lathe or primitive"
+        raise InputError(fault, cure=cure)
+    middle, radius = _about(outlines)
+    low, high = middle - radius, middle + radius
+    for count in (FIRST, cells):
+        step = float((high - low).max()) / count
+        shape = np.ceil((high - low) / step).astype(int) + 3
+        origin = (low + high) / 2 - step * (shape - 1) / 2
+        field = _sampled(outlines, origin, step, shape, report)
+        inside = np.argwhere(field > 0)
+        if not len(inside):
+            cure = "are masks and cameras of the same photos, and does each photo show the whole object or say by 255 what hides it?"
+            raise InputError("no body fits into the outlines of all photos", cure=cure)
+        low, high = origin + step * (inside.min(axis=0) - 1), origin + step * (inside.max(axis=0) + 1)
+    vertices, faces = surface_nets(unambiguous(np.pad(field, 1, constant_values=-step)))
+    vertices, faces = _largest(vertices, faces)
+    mesh = trimesh.Trimesh(vertices, faces, process=False)
+    trimesh.smoothing.filter_taubin(mesh, iterations=SMOOTHINGS)
+    vertices = origin + step * (np.asarray(mesh.vertices) - 1)
+    shape = Triangles(vertices, faces, _parts_of(vertices, faces, outlines, parts))
+    return msgspec.structs.replace(shape, overlap=overlap(shape, outlines))
+
+
+def overlap(shape: Triangles, outlines: Sequence[Outline]) -> float:
+    """The mean IoU of a shape with the outlines that have a pose."""
+    caster, overlaps = Caster(shape.as_mesh()), []
+    for one in outlines:
+        target = target_of(one.silhouette, (1,), 200)
+        whole = Silhouette(np.where(target.silhouette.label > 0, 1, target.silhouette.label))
+        overlaps.append(labelled_iou(whole, rasterise(caster, target.camera(one.camera), one.pose).label))
+    return float(np.mean(overlaps))
+
+
+def agreement(outlines: Sequence[Outline]) -> float:
+    """The overlap of a coarse hull with its outlines: whether cameras move with what the outlines show; 0 where nothing fits."""
+    try:
+        return visual_hull(outlines, FIRST).overlap
+    except InputError:
+        return 0.0
+
+
+def _about(outlines: Sequence[Outline]) -> tuple[Float[np.ndarray, "3"], float]:
+    """The point nearest to the rays through the outlines' middles, and a radius about it that holds the smallest cone's outline."""
+    left, right, places = np.zeros((3, 3)), np.zeros(3), []
+    for outline in outlines:
+        rotation, centre = outline.pose.rotation, -outline.pose.rotation.T @ outline.pose.translation
+        ray = rotation.T @ outline.camera.rays_through(outline.middle[None])[0]
+        ray /= np.linalg.norm(ray)
+        across = np.eye(3) - np.outer(ray, ray)
+        left, right = left + across, right + across @ centre
+        places.append((centre, ray))
+    if np.linalg.cond(left) > 1e8:
+        cure = "a hull needs photos from different sides"
+        raise InputError("all photos see it from the same side", cure=cure)
+    middle, radii = np.linalg.solve(left, right), []
+    for outline, (centre, ray) in zip(outlines, places, strict=True):
+        depth = float((middle - centre) @ ray)
+        if depth <= 0:
+            cure = "are its masks and cameras of the same photos?"
+            raise InputError(f"what the photos look at lies behind the camera of '{outline.photo}'", cure=cure)
+        radii.append(depth * extent_of(outline.silhouette)[2] / outline.camera.focal)
+    return middle, min(radii)
+
+
+def inside_all(outlines: Sequence[Outline], points: Points) -> Float[np.ndarray, " n"]:
+    """f at points of the object's frame, in its units; outside at a camera's back."""
+    least = np.full(len(points), np.inf)
+    for outline in outlines:
+        seen = outline.pose.apply(points)
+        depth = np.maximum(seen[:, 2], LEAST_Z)
+        inner = outline.inner(outline.camera.project(np.column_stack([seen[:, :2], depth])))
+        least = np.minimum(
+            least, np.where(seen[:, 2] > LEAST_Z, np.minimum(inner, FREE) * depth / outline.camera.focal, -1.0)
+        )
+    return least
+
+
+def _sampled(
+    outlines: Sequence[Outline], origin: np.ndarray, step: float, shape: np.ndarray, report: Callable[[float], None]
+) -> Float[np.ndarray, "x y z"]:
+    field = np.empty(int(np.prod(shape)))
+    for start in range(0, len(field), SLAB):
+        index = np.stack(np.unravel_index(np.arange(start, min(start + SLAB, len(field))), shape), axis=-1)
+        field[start : start + SLAB] = inside_all(outlines, origin + step * index)
+        report(start / len(field))
+    return field.reshape(shape)
+
+
+def surface_nets(field: Float[np.ndarray, "x y z"]) -> tuple[Points, Int[np.ndarray, "f 3"]]:
+    """The surface field = 0 in grid units, closed where the field is not positive on the grid's border; faces look toward less of it."""
+    shape = np.array(field.shape)
+    cells, inside = shape - 1, field > 0
+    total, count = np.zeros((*cells, 3)), np.zeros(cells)
+    quads = []
+    for axis in range(3):
+        other = [k for k in range(3) if k != axis]
+        first = tuple(slice(0, -1) if k == axis else slice(None) for k in range(3))
+        second = tuple(slice(1, None) if k == axis else slice(None) for k in range(3))
+        crossed = np.argwhere(inside[first] != inside[second])
+        a, b = field[first][tuple(crossed.T)], field[second][tuple(crossed.T)]
+        place = crossed.astype(float)
+        place[:, axis] += a / (a - b)
+        around = []  # the four cells about an edge, in turn
+        for down in ((0, 0), (1, 0), (1, 1), (0, 1)):
+            cell = crossed.copy()
+            cell[:, other] -= down
+            held = ((cell >= 0) & (cell < cells)).all(axis=1)
+            np.add.at(total, tuple(cell[held].T), place[held])
+            np.add.at(count, tuple(cell[held].T), 1)
+            around.append(np.where(held, np.ravel_multi_index(np.clip(cell, 0, cells - 1).T, cells), -1))
+        corner = np.stack(around, axis=1)
+        turned = (a > 0) == (axis == 1)  # the other axes of y are x, z: left-handed
+        corner = np.where(turned[:, None], corner[:, ::-1], corner)
+        quads.append(corner[(corner >= 0).all(axis=1)])
+    quad = np.concatenate(quads)
+    used, index = np.unique(quad, return_inverse=True)
+    quad = index.reshape(-1, 4)
+    at = tuple(np.array(np.unravel_index(used, cells)))
+    vertices = total[at] / count[at][:, None]
+    return vertices, np.concatenate([quad[:, [0, 1, 2]], quad[:, [0, 2, 3]]])
+
+
+def unambiguous(field: Float[np.ndarray, "x y z"]) -> Float[np.ndarray, "x y z"]:
+    """The field with points filled where two opposite corners of a square are inside and the others not: there an edge of the net would
+    have four faces."""
+    field = field.copy()
+    least = np.abs(field[field > 0]).min()
+    while True:
+        filled = False
+        for axis in range(3):
+            of = np.moveaxis(field, axis, 0)
+            inside = of > 0
+            a, b, c, d = inside[:, :-1, :-1], inside[:, 1:, :-1], inside[:, 1:, 1:], inside[:, :-1, 1:]
+            of[:, 1:, :-1][a & c & ~b & ~d] = least
+            of[:, :-1, :-1][b & d & ~a & ~c] = least
+            filled |= bool(((a & c & ~b & ~d) | (b & d & ~a & ~c)).any())
+        if not filled:
+            return field
+
+
+def _largest(vertices: Points, faces: Int[np.ndarray, "f 3"]) -> tuple[Points, Int[np.ndarray, "f 3"]]:
+    """Without small pieces beside the largest."""
+    edges = np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]]])
+    graph = coo_array((np.ones(len(edges)), edges.T), shape=(len(vertices), len(vertices)))
+    piece = connected_components(graph, directed=False)[1][faces[:, 0]]
+    sizes = np.bincount(piece)
+    used, index = np.unique(faces[sizes[piece] >= LEAST_SHARE * sizes.max()], return_inverse=True)
+    return vertices[used], index.reshape(-1, 3)
+
+
+def _parts_of(
+    vertices: Points, faces: Int[np.ndarray, "f 3"], outlines: Sequence[Outline], parts: int
+) -> Int[np.ndarray, " f"]:
+    """The part that most photos which see a face show there; of the nearest face that is seen, where none does."""
+    votes = np.zeros((len(faces), parts), int)
+    if parts > 1:
+        area = area_vectors(vertices, faces)
+        caster, centre = Caster(of_one_part(vertices, faces).as_mesh()), vertices[faces].mean(axis=1)
+        for outline in outlines:
+            hits = caster.cast(outline.camera, outline.pose)
+            seen = outline.pose.apply(centre)
+            facing = np.einsum("nd,nd->n", area @ outline.pose.rotation.T, seen) < 0
+            x, y = np.floor(outline.camera.project(np.where(seen[:, 2:] > LEAST_Z, seen, 1.0))).astype(int).T
+            height, width = outline.part.shape
+            near = np.flatnonzero(facing & (seen[:, 2] > LEAST_Z) & (x >= 0) & (x < width) & (y >= 0) & (y < height))
+            pixel = y[near], x[near]
+            reach = 2 * np.sqrt(np.linalg.norm(area[near], axis=1))
+            there = (np.abs(hits.depth[pixel] - seen[near, 2]) <= reach) & (outline.part[pixel] > 0)
+            np.add.at(votes, (near[there], outline.part[pixel][there] - 1), 1)
+        told = votes.any(axis=1)
+        if told.any():
+            votes[~told] = votes[told][cKDTree(centre[told]).query(centre[~told])[1]]
+    return votes.argmax(axis=1)

@@ -1,0 +1,282 @@
+"""A body of revolution from its outlines.
+
+The plane through the camera and the body's axis mirrors the body onto itself, so it mirrors the outline's rays onto themselves: two
+numbers, found where they do.  In that plane the axis is tilted by an angle θ that one outline does not say.  Given θ, the body is the
+largest that fits: at each height the largest disc about the axis whose image lies inside the outline,
+
+    r(z) = max { r : the image of the disc (z, r) ⊂ outline },
+
+a visual hull among bodies of revolution.  Which θ, the other photos say: with each, the body is laid on their outlines, and the one that
+agrees best is kept; of those that agree equally, as all do with one photo, the one tilted most, for ends of real bodies are flat more
+often than round.  Then the radii are carved again from all outlines.  The axis is the shape's y.
+"""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Callable, Iterator, Sequence
+
+import msgspec
+import numpy as np
+from jaxtyping import Float
+from scipy.optimize import minimize
+
+from factorlib.align.refine import FocalPrior
+from factorlib.align.search import Search, find, found_near
+from factorlib.align.state import state_of
+from factorlib.align.target import target_of
+from factorlib.errors import InputError
+from factorlib.geometry.camera import Camera, Pose
+from factorlib.geometry.raster import Caster
+from factorlib.shapes.hull import overlap
+from factorlib.shapes.outline import Outline, Triangles, of_one_part
+
+HEIGHTS, AROUND, RADII = 96, 48, 80  # discs, points of each, and radii tried
+TILTS_DEG = np.arange(-75.0, 76.0, 5.0)
+MIRRORS = 36  # directions of the mirror plane tried
+MIRRORED_PX = 1.5  # that mirrored points of an outline may lie outside it, as a share of 200 pixels of extent
+AS_GOOD = 0.006  # overlap (IoU) by which two tilts are told apart
+REFERENCES, TRIED, JUDGES = (
+    2,
+    5,
+    4,
+)  # photos that a body is begun from, tilts of each that are tried, and photos that they are laid on
+FINER_DEG = (-7.5, -5.0, -2.5, 2.5, 5.0, 7.5)  # from the best of these, to be tried too
+ROUNDS = 2
+COLUMNS = 96  # corners about the axis of the mesh
+RIM = 0.02  # of the largest radius: a thinner end is no part of the body
+SEARCH = Search(views=200, keep=(24, 8, 4, 2))
+log = logging.getLogger("factorlib.shapes")
+
+Profile = Float[np.ndarray, "n 2"]  # (height, radius) from one end to the other
+
+
+class Turned(msgspec.Struct, frozen=True):
+    """A body of revolution in a photo: profile, cam_from_body, the camera it was found with, the overlap (IoU) with the outline."""
+
+    profile: Profile
+    pose: Pose
+    camera: Camera
+    overlap: float
+    tilt_deg: float = 0.0
+
+
+def body_of_revolution(outlines: Sequence[Outline], report: Callable[[float], None] = lambda share: None) -> Triangles:
+    """The body that all outlines show, in the frame of its poses where they are given, else with its middle in the origin.
+
+    report: the share that is done.  Raises InputError where no photo shows it whole enough to tell its axis.
+    """
+    outlines = sorted((one for one in outlines if one.is_seen), key=lambda one: -int((one.part > 0).sum()))
+    if not outlines:
+        raise InputError("no photo's mask shows it", cure="give it a mask, or take it out")
+    given = [Turned(np.zeros((0, 2)), one.pose, one.camera, 0.0) for one in outlines if one.pose is not None]
+    if given:
+        known = [one for one in outlines if one.pose is not None]
+        shape = mesh_of(carved_by_all(known, given, _span(known, given)))
+        return msgspec.structs.replace(shape, overlap=overlap(shape, known))
+    begun = []
+    for one in outlines[:REFERENCES]:
+        turned = sorted(tilted(one), key=lambda each: -each.overlap)
+        if turned:
+            good = [each for each in turned if each.overlap >= turned[0].overlap - AS_GOOD]
+            begun.append((one, _spread(good)))
+    if not begun:
+        cure = "does a photo show the whole outline, from the side, cut by nothing? Leave out by 255 what is in front of it"
+        raise InputError("no outline is mirrored onto itself, as that of a body of revolution is", cure=cure)
+    if len(outlines) == 1:
+        one, turned = begun[0]
+        log.warning("%s: one outline does not say how the axis is tilted: the strongest tilt that explains it is taken; "
+                    "a second photo from another height says it", one.photo)  # fmt: skip
+        best = max(turned, key=lambda each: abs(each.tilt_deg))
+        return msgspec.structs.replace(mesh_of(best.profile).of_size(1.0), overlap=best.overlap)
+    tried, judges = [(one, each) for one, turned in begun for each in turned], outlines[:JUDGES]
+    laid: list[tuple[float, Outline, list[Turned]]] = []
+    for done, (one, each) in enumerate(tried):
+        report(0.7 * done / len(tried))
+        poses = [each if other is one else laid_on(other, each.profile) for other in judges]
+        laid.append((_agreement(poses), one, poses))
+    best = max(laid, key=lambda of: of[0])
+    for turn in FINER_DEG:
+        of, near = best[1], best[2]
+        own = next(pose for one, pose in zip(judges, near) if one is of)
+        if each := _at_tilt(of, own.camera, own.pose.rotation[:, 0], own.pose.translation, own.tilt_deg + turn):
+            finer = [each if one is of else laid_on(one, each.profile, pose) for one, pose in zip(judges, near)]
+            laid.append((_agreement(finer), of, finer))
+    _, _, poses = max(laid, key=lambda of: of[0])
+    profile = poses[0].profile
+    poses += [laid_on(one, profile) for one in outlines[JUDGES:]]
+    for k in range(ROUNDS):
+        report(0.8 + 0.2 * k / ROUNDS)
+        profile = carved_by_all(outlines, poses, (profile[0, 0], profile[-1, 0]))
+        poses = [laid_on(one, profile, pose) for one, pose in zip(outlines, poses, strict=True)]
+    return msgspec.structs.replace(
+        mesh_of(profile).of_size(1.0), overlap=float(np.mean([pose.overlap for pose in poses]))
+    )
+
+
+def _agreement(poses: Sequence[Turned]) -> float:
+    """The mean overlap; of equal ones, that of the strongest tilt."""
+    return float(np.mean([pose.overlap for pose in poses])) + 1e-4 * max(abs(pose.tilt_deg) for pose in poses) / 90
+
+
+def _spread(turned: Sequence[Turned]) -> list[Turned]:
+    """At most TRIED of them, evenly over their tilts."""
+    ordered = sorted(turned, key=lambda each: each.tilt_deg)
+    return [ordered[k] for k in np.unique(np.linspace(0, len(ordered) - 1, TRIED).round().astype(int))]
+
+
+def tilted(one: Outline) -> Iterator[Turned]:
+    """For each mirror plane of the outline and each tilt in it, the largest body that fits."""
+    camera = msgspec.structs.replace(one.camera, focal=one.prior.focal)
+    for normal in mirrors(one, camera):
+        ray = camera.rays_through(one.middle[None])[0]
+        ahead = ray - (ray @ normal) * normal
+        yield from filter(None, (_at_tilt(one, camera, normal, ahead, float(tilt)) for tilt in TILTS_DEG))
+
+
+def _at_tilt(
+    one: Outline, camera: Camera, normal: Float[np.ndarray, "3"], ahead: Float[np.ndarray, "3"], tilt_deg: float
+) -> Turned | None:
+    """The largest body about an axis through the point `ahead` in the plane of that normal; None where none fits."""
+    ahead, tilt = ahead / np.linalg.norm(ahead), np.deg2rad(tilt_deg)
+    axis = np.cos(tilt) * np.cross(normal, ahead) + np.sin(tilt) * ahead
+    pose = Pose(np.stack([normal, axis, np.cross(normal, axis)], axis=1), ahead)
+    view = Turned(np.zeros((0, 2)), pose, camera, 0.0, tilt_deg)
+    profile = carved_by_all([one], [view], _span([one], [view]))
+    if len(profile) < 3:
+        return None
+    return msgspec.structs.replace(view, profile=profile, overlap=overlap(mesh_of(profile), [at(one, view)]))
+
+
+def mirrors(one: Outline, camera: Camera) -> list[Float[np.ndarray, "3"]]:
+    """Normals of planes through the camera that mirror the outline onto itself, best first."""
+    target = target_of(one.silhouette, (1,), 200)
+    rows, columns = np.nonzero(one.part > 0)
+    some = np.random.default_rng(0).permutation(len(rows))[:3000]
+    rays = camera.rays_through(np.column_stack([columns[some], rows[some]]) + 0.5)
+    rays /= np.linalg.norm(rays, axis=1, keepdims=True)
+    ray = rays.mean(axis=0) / np.linalg.norm(rays.mean(axis=0))
+    x = np.cross([0.0, 1.0, 0.0], ray)
+    x /= np.linalg.norm(x)
+    y = np.cross(ray, x)
+    spread = np.arctan(target.extent * target.pixel / 2 / camera.focal)
+
+    def normal(angle: float, offset: float) -> np.ndarray:
+        """Of the plane through the middle ray, moved aside by `offset` half extents."""
+        across = np.cos(angle) * x + np.sin(angle) * y
+        return across * np.cos(offset * spread) + ray * np.sin(offset * spread)
+
+    def outside(plane: np.ndarray) -> float:
+        """Mean of the squares of pixels by which mirrored rays leave the outline, in pixels of a window of 200."""
+        n = normal(*plane)
+        mirrored = rays - 2 * (rays @ n)[:, None] * n
+        if (mirrored[:, 2] <= 0).any():
+            return 1e6
+        return float(np.mean(np.minimum(one.inner(camera.project(mirrored)), 0.0) ** 2)) / target.pixel**2
+
+    angles = np.arange(MIRRORS) * np.pi / MIRRORS
+    least = [min((outside(np.array([angle, off])), off) for off in np.linspace(-0.3, 0.3, 7)) for angle in angles]
+    cost = np.array([value for value, _ in least])
+    minima = [k for k in range(MIRRORS) if cost[k] <= min(cost[k - 1], cost[(k + 1) % MIRRORS])]
+    found = [
+        minimize(outside, [angles[k], least[k][1]], method="Nelder-Mead", options={"xatol": 1e-4, "fatol": 1e-5})
+        for k in sorted(minima, key=lambda k: cost[k])[:4]
+    ]
+    good = [each for each in found if each.fun <= max(MIRRORED_PX**2, 4 * min(each.fun for each in found))]
+    if not good or min(each.fun for each in good) > 4 * MIRRORED_PX**2:
+        return []
+    return [normal(*each.x) for each in sorted(good, key=lambda each: each.fun)[:2]]
+
+
+def _span(outlines: Sequence[Outline], poses: Sequence[Turned]) -> tuple[float, float]:
+    """Heights on the axis that surely hold the body: from where the axis leaves the outlines, with room for discs that reach farther."""
+    lows, highs = [], []
+    for one, view in zip(outlines, poses, strict=True):
+        distance = float(np.linalg.norm(view.pose.translation))
+        half = distance * 4 * one.silhouette.inside.sum() ** 0.5 / view.camera.focal
+        heights = np.linspace(-half, half, 1001)
+        points = view.pose.apply(np.column_stack([0 * heights, heights, 0 * heights]))
+        ahead = points[:, 2] > 1e-3 * distance
+        inner = one.inner(view.camera.project(np.where(ahead[:, None], points, [0.0, 0.0, 1.0])))
+        held = heights[ahead & (inner > 0) & (inner < 1e8)]
+        if len(held):
+            lows, highs = [*lows, held.min()], [*highs, held.max()]
+    return (max(lows), min(highs)) if lows else (0.0, 0.0)
+
+
+def carved_by_all(outlines: Sequence[Outline], poses: Sequence[Turned], span: tuple[float, float]) -> Profile:
+    """At each height the largest disc that fits into every outline; ends that are as thin as nothing are cut."""
+    low, high = span
+    if not high > low:
+        return np.zeros((0, 2))
+    heights = low + (np.arange(HEIGHTS) + 0.5) / HEIGHTS * (high - low)
+    radius = np.min([largest_discs(one, view, heights) for one, view in zip(outlines, poses, strict=True)], axis=0)
+    used = np.flatnonzero(radius > RIM * radius.max())
+    if len(used) < 3:
+        return np.zeros((0, 2))
+    part = slice(used[0], used[-1] + 1)
+    return np.column_stack([heights[part], np.maximum(radius[part], RIM * radius.max())])
+
+
+def largest_discs(one: Outline, view: Turned, heights: Float[np.ndarray, " n"]) -> Float[np.ndarray, " n"]:
+    """r(z) by one outline, in the body's units."""
+    pose, camera = view.pose, view.camera
+    distance, angle = float(np.linalg.norm(pose.translation)), np.arange(AROUND) * 2 * np.pi / AROUND
+    most = distance * 2 * one.silhouette.inside.sum() ** 0.5 / camera.focal + 1e-9
+    around = np.column_stack([np.cos(angle), 0 * angle, np.sin(angle)])
+    low, high = np.zeros(len(heights)), np.full(len(heights), most)
+    centres = np.column_stack([0 * heights, heights, 0 * heights])
+    for _ in range(2):  # the first radius at which a point leaves, on a grid, then on a finer one within its cell
+        share = np.arange(RADII + 1) / RADII
+        radii = low[:, None] + share * (high - low)[:, None]
+        points = centres[:, None, None] + radii[..., None, None] * around
+        seen = points @ pose.rotation.T + pose.translation
+        ahead = seen[..., 2] > 1e-3 * distance
+        pixels = camera.project(np.where(ahead[..., None], seen, [0.0, 0.0, 1.0]))
+        left = ((one.inner(pixels) < 0) | ~ahead).any(axis=-1)
+        left[:, -1] = True
+        first = left.argmax(axis=1)
+        rows = np.arange(len(heights))
+        low, high = radii[rows, np.maximum(first - 1, 0)], radii[rows, first]
+    return np.where(first == 0, 0.0, low)
+
+
+def mesh_of(profile: Profile) -> Triangles:
+    """Closed by a disc at each end."""
+    if len(profile) < 3:
+        cure = "are its masks and poses of the same object, and is it turned about the y of its poses?"
+        raise InputError("no body of revolution fits into its outlines", cure=cure)
+    half = np.diff(profile[:, 0]).mean() / 2
+    ends = profile[[0, -1]] + np.array([[-half, 0.0], [half, 0.0]])
+    rings = np.concatenate([ends[:1], profile, ends[1:]])
+    angle = np.arange(COLUMNS) * 2 * np.pi / COLUMNS
+    z, x = np.cos(angle), np.sin(angle)
+    points = np.stack(
+        [np.outer(rings[:, 1], x), np.repeat(rings[:, :1], COLUMNS, axis=1), np.outer(rings[:, 1], z)], axis=-1
+    )
+    index = np.arange(points[..., 0].size).reshape(len(rings), COLUMNS)
+    right = np.roll(index, -1, axis=1)
+    a, b, c, d = index[:-1].ravel(), right[:-1].ravel(), index[1:].ravel(), right[1:].ravel()
+    bottom, top = index.size, index.size + 1
+    caps = np.concatenate([
+        np.column_stack([right[0], index[0], np.full(COLUMNS, bottom)]),
+        np.column_stack([index[-1], right[-1], np.full(COLUMNS, top)]),
+    ])  # fmt: skip
+    vertices = np.concatenate([points.reshape(-1, 3), [[0, rings[0, 0], 0], [0, rings[-1, 0], 0]]])
+    return of_one_part(vertices, np.concatenate([np.column_stack([a, b, d]), np.column_stack([a, d, c]), caps]))
+
+
+def at(one: Outline, view: Turned) -> Outline:
+    """The outline with the camera and the pose that a body was found in."""
+    return msgspec.structs.replace(one, camera=view.camera, pose=view.pose)
+
+
+def laid_on(one: Outline, profile: Profile, near: Turned | None = None) -> Turned:
+    """The body in the pose that agrees best with the outline: of all, or beginning with that of `near`."""
+    caster, camera, prior = Caster(mesh_of(profile).as_mesh()), one.camera, one.prior
+    if near is None:
+        found = find(caster, one.silhouette, camera, prior, SEARCH)
+    else:
+        known = FocalPrior(near.camera.focal, prior.sigma)
+        found = found_near(caster, one.silhouette, near.camera, state_of(near.pose, near.camera, caster), known, SEARCH)
+    return Turned(profile, found.state.pose(caster), found.state.camera(camera), found.score)

@@ -1,0 +1,147 @@
+"""Cameras by structure from motion (COLMAP, Schönberger and Frahm 2016), on the CPU: SIFT, exhaustive matching, incremental mapping.
+
+Photos may show things at rest seen by a camera that moves, or a thing that turns before a camera at rest.  So features are matched twice,
+those on the objects and all others.  A model is believed where a hull of the objects' masks fits into all of them: beside a thing that
+turns, the background gives cameras that stand still.  Of those believed, the one that places more photos is kept.  Seeds are fixed and one thread is used: the same
+photos give the same cameras.
+"""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from tempfile import TemporaryDirectory
+
+import msgspec
+import numpy as np
+import pycolmap
+from jaxtyping import Bool, UInt8
+from PIL import Image
+
+from factorlib.align.refine import FocalPrior
+from factorlib.align.silhouette import UNKNOWN
+from factorlib.errors import InputError
+from factorlib.geometry.camera import Camera, Pose
+from factorlib.shapes.hull import agreement
+from factorlib.shapes.outline import Outline
+
+LEAST_PHOTOS = 3
+LEAST_POINTS = 30  # of a model that is believed
+LEAST_AGREEMENT = 0.75  # overlap (IoU) of a coarse hull with the masks, of a model that is believed
+MOST_SIDE, MOST_FEATURES = 1600, 4000
+SEED = 0
+log = logging.getLogger("factorlib.shapes")
+
+
+class View(msgspec.Struct, frozen=True):
+    """A photo as displayed, 8 bits of grey; the pixels that show objects; the focal length in its pixels, where it is known."""
+
+    grey: UInt8[np.ndarray, "h w"]
+    objects: Bool[np.ndarray, "h w"]
+    left_out: Bool[np.ndarray, "h w"]
+    focal: float | None
+
+
+class Placed(msgspec.Struct, frozen=True):
+    """A photo's focal length in its pixels, about its middle, and cam_from_world, the world of no known scale."""
+
+    focal: float
+    pose: Pose
+
+
+def cameras_by_motion(
+    views: Mapping[str, View], report: Callable[[float, str], None] = lambda share, what: None
+) -> dict[str, Placed]:
+    """The cameras of the photos that overlap, by name; the others are named in a warning.
+
+    Raises InputError where fewer than three do.
+    """
+    models = {}
+    for done, (where, pixels) in enumerate((("on the objects", True), ("beside them", False))):
+        kept = {name: (view.objects if pixels else ~view.objects) & ~view.left_out for name, view in views.items()}
+        models[where] = _mapped(
+            views, kept, lambda share, what, d=done, w=where: report((d + share) / 2, f"{what} {w}")
+        )
+    where, (placed, points) = max(models.items(), key=lambda item: (len(item[1][0]), item[1][1]))
+    if len(placed) < LEAST_PHOTOS:
+        found = f"cameras of {len(placed)} of {len(views)} photos are found: too few of their features match"
+        cure = (
+            "structure from motion needs photos of one scene, each 10 to 20° from the next, with texture on the object or around it; "
+            "without, give `file`, `lathe` or `primitive` meshes"
+        )
+        raise InputError(found, file="dataset.yaml", key="cameras.sfm", cure=cure)
+    log.info("cameras of %d of %d photos by %d points %s", len(placed), len(views), points, where)
+    if missing := [name for name in views if name not in placed]:
+        log.warning("structure from motion does not place %s: nothing overlaps with them; they are aligned by masks alone",
+                    ", ".join(missing))  # fmt: skip
+    return placed
+
+
+def _mapped(
+    views: Mapping[str, View], kept: Mapping[str, Bool[np.ndarray, "h w"]], report: Callable[[float, str], None]
+) -> tuple[dict[str, Placed], int]:
+    """The largest model of features at the pixels that are `kept`, and how many points it has."""
+    pycolmap.set_random_seed(SEED)
+    pycolmap.logging.minloglevel = pycolmap.logging.FATAL.value  # what goes wrong is said below
+    with TemporaryDirectory() as folder:
+        root = Path(folder)
+        database, images, masks = root / "features.db", root / "images", root / "masks"
+        for each in (images, masks):
+            each.mkdir()
+        extraction = pycolmap.FeatureExtractionOptions(num_threads=1, use_gpu=False, max_image_size=MOST_SIDE)
+        extraction.sift.max_num_features = MOST_FEATURES
+        groups: dict[tuple, list[str]] = {}
+        for name, view in views.items():
+            Image.fromarray(view.grey).save(images / f"{name}.png")
+            Image.fromarray(kept[name].astype(np.uint8) * 255).save(masks / f"{name}.png.png")
+            groups.setdefault((*view.grey.shape, view.focal), []).append(name)
+        for done, ((height, width, focal), names) in enumerate(
+            groups.items()
+        ):  # one camera each: of one size and one focal length
+            report(0.2 * done / len(groups), "features")
+            reader = pycolmap.ImageReaderOptions(camera_model="SIMPLE_PINHOLE", mask_path=str(masks))
+            if focal:
+                reader.camera_params = f"{focal},{width / 2},{height / 2}"
+            pycolmap.extract_features(
+                database, images, [f"{name}.png" for name in names], pycolmap.CameraMode.SINGLE, reader, extraction, pycolmap.Device.cpu
+            )  # fmt: skip
+        report(0.2, "matches")
+        matching = pycolmap.FeatureMatchingOptions(num_threads=1, use_gpu=False)
+        verification = pycolmap.TwoViewGeometryOptions()
+        verification.ransac.random_seed = SEED
+        pycolmap.match_exhaustive(
+            database, matching, pycolmap.ExhaustivePairingOptions(), verification, pycolmap.Device.cpu
+        )
+        report(0.6, "cameras")
+        options = pycolmap.IncrementalPipelineOptions(
+            num_threads=1, random_seed=SEED, multiple_models=False, min_model_size=LEAST_PHOTOS, extract_colors=False,
+            ba_refine_focal_length=True, ba_refine_principal_point=False,
+        )  # fmt: skip
+        options.mapper.num_threads, options.mapper.random_seed, options.triangulation.random_seed = 1, SEED, SEED
+        models = pycolmap.incremental_mapping(database, images, root / "models", options)
+        best = max(models.values(), key=lambda model: (model.num_reg_images(), model.num_points3D()), default=None)
+        if best is None or best.num_points3D() < LEAST_POINTS:
+            return {}, 0
+        report(0.9, "hull of the masks")
+        placed = {}
+        for image in best.images.values():
+            if image.has_pose:
+                motion = image.cam_from_world()
+                pose = Pose(motion.rotation.matrix(), np.array(motion.translation))
+                placed[Path(image.name).stem] = Placed(float(best.cameras[image.camera_id].focal_length), pose)
+    outlines = [outline_of(name, views[name], camera) for name, camera in sorted(placed.items())]
+    if (overlap := agreement(outlines)) < LEAST_AGREEMENT:
+        log.info(
+            "cameras by %d points do not move with the objects (hull against masks: %.2f)", best.num_points3D(), overlap
+        )
+        return {}, 0
+    return {name: placed[name] for name in views if name in placed}, best.num_points3D()
+
+
+def outline_of(name: str, view: View, placed: Placed) -> Outline:
+    """What is seen of all objects together, by the camera that was found."""
+    height, width = view.grey.shape
+    part = np.where(view.left_out, UNKNOWN, view.objects.astype(int))
+    camera = Camera(width, height, placed.focal, (width / 2, height / 2))
+    return Outline(name, part, camera, FocalPrior(placed.focal, 0.0), placed.pose)

@@ -1,0 +1,102 @@
+"""An object's outline in a photo, as shapes are found from it, and triangles as they are written."""
+
+from __future__ import annotations
+
+from functools import cached_property
+from pathlib import Path
+
+import msgspec
+import numpy as np
+from jaxtyping import Float, Int
+from scipy.ndimage import distance_transform_edt, map_coordinates
+
+from factorlib.align.refine import FocalPrior
+from factorlib.align.silhouette import Silhouette
+from factorlib.align.target import extent_of
+from factorlib.geometry.camera import Camera, Pose
+from factorlib.meshes.mesh import Mesh
+from factorlib.wholefile import write_text
+
+FREE = 1e9  # pixels: farther inside than any outline; of places that no photo shows
+
+
+class Outline(msgspec.Struct, frozen=True, dict=True):
+    """An object in a photo.
+
+    part   [h, w] number of the object's part that a pixel shows, from 1; 0 background, −1 where the photo does not say
+    prior  what is known of the focal length;  pose  cam_from_object, where it is known
+    """
+
+    photo: str
+    part: Int[np.ndarray, "h w"]
+    camera: Camera
+    prior: FocalPrior
+    pose: Pose | None = None
+
+    @property
+    def silhouette(self) -> Silhouette:
+        """Its parts as labels."""
+        return Silhouette(self.part)
+
+    @property
+    def middle(self) -> Float[np.ndarray, "2"]:
+        """Middle of the bounding box (x, y)."""
+        low, high, _ = extent_of(self.silhouette)
+        return (low + high) / 2
+
+    @property
+    def is_seen(self) -> bool:
+        """Whether the photo shows any of it."""
+        return bool((self.part > 0).any())
+
+    def inner(self, pixels: Float[np.ndarray, "*n 2"]) -> Float[np.ndarray, "*n"]:
+        """How many pixels inside the outline points (x, y) lie, negative outside; FREE outside the frame, and where nothing is known it
+        counts as inside: only background says that there is no object."""
+        x, y = pixels[..., 0], pixels[..., 1]
+        values = map_coordinates(self._distance, np.stack([y, x]) - 0.5, order=1, mode="nearest")
+        height, width = self.part.shape
+        inside = (x >= 0) & (x <= width) & (y >= 0) & (y <= height)
+        return np.where(inside, values, FREE)
+
+    @cached_property
+    def _distance(self) -> Float[np.ndarray, "h w"]:
+        empty = self.part == 0
+        far = distance_transform_edt(~empty) if empty.any() else np.full(empty.shape, float(sum(empty.shape)))
+        return np.where(empty, 0.5 - distance_transform_edt(empty), far - 0.5)
+
+
+class Triangles(msgspec.Struct, frozen=True):
+    """A shape: vertices [V, 3] in its own frame, faces [F, 3] counter-clockwise from outside, the part of each face, from 0.
+
+    overlap: with the outlines it was found from, mean IoU
+    """
+
+    vertices: Float[np.ndarray, "v 3"]
+    faces: Int[np.ndarray, "f 3"]
+    part: Int[np.ndarray, " f"]
+    overlap: float = 1.0
+
+    def as_mesh(self) -> Mesh:
+        """For outlines: label 1 all over, its normals of no account."""
+        label = np.ones(len(self.faces), np.int16)
+        return Mesh(self.vertices, self.faces.astype(np.int32), np.ones_like(self.vertices), label)
+
+    def of_size(self, size: float) -> Triangles:
+        """The middle of its bounding box in the origin, and the longest side of that `size`."""
+        low, high = self.vertices.min(axis=0), self.vertices.max(axis=0)
+        return msgspec.structs.replace(self, vertices=(self.vertices - (low + high) / 2) * (size / (high - low).max()))
+
+
+def of_one_part(vertices: Float[np.ndarray, "v 3"], faces: Int[np.ndarray, "f 3"]) -> Triangles:
+    """All faces of the part 0."""
+    return Triangles(vertices, faces, np.zeros(len(faces), int))
+
+
+def write_obj(path: Path, shape: Triangles, parts: list[str]) -> None:
+    """An OBJ file with a group for each part that has faces."""
+    lines = [f"v {x:.7g} {y:.7g} {z:.7g}" for x, y, z in shape.vertices.tolist()]
+    for number, name in enumerate(parts):
+        if (shape.part == number).any():
+            lines.append(f"g {name}")
+            lines += [f"f {a} {b} {c}" for a, b, c in (shape.faces[shape.part == number] + 1).tolist()]
+    write_text(path, "\n".join(lines) + "\n")

@@ -1,0 +1,167 @@
+"""Cameras that no file gives, by structure from motion, and meshes that no file gives: hulls, bodies of revolution, primitives, from masks.
+
+There only where dataset.yaml asks for such.  Writes shapes.json, and meshes/<mesh>.obj, which every later stage reads in place of a file.
+"""
+
+import logging
+from collections.abc import Callable
+from pathlib import Path
+from typing import Annotated
+
+import msgspec
+import numpy as np
+
+from factorlib.align.given import camera_of
+from factorlib.align.search import focal_prior
+from factorlib.align.silhouette import UNKNOWN, silhouette_of_object
+from factorlib.dataset.check import ALL_OF_IT
+from factorlib.dataset.schema import ExternalCamera, MeshEntry, ObjectEntry, ObjectsSlice, Pose, ShapesSlice
+from factorlib.errors import InputError
+from factorlib.geometry.camera import Pose as PoseArrays
+from factorlib.images.exr import read_exr
+from factorlib.images.transfer import srgb_encode
+from factorlib.jsonfile import write_json
+from factorlib.results.photos import read_photo_facts
+from factorlib.results.shapes import FILE, ShapeEntry, ShapesTable
+from factorlib.shapes.hull import visual_hull
+from factorlib.shapes.lathe import body_of_revolution
+from factorlib.shapes.motion import Placed, View, cameras_by_motion
+from factorlib.shapes.outline import Outline, Triangles, write_obj
+from factorlib.shapes.primitive import primitive
+from factorlib.stage import Inputs, Progress
+
+log = logging.getLogger("factorlib.shapes")
+GOOD = 0.9  # overlap (IoU) below which a shape does not look like its outlines
+FEW = 6  # outlines of a hull: with fewer, what they do not show is filled
+
+
+class Params(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """How fine hulls are."""
+
+    cells: Annotated[int, msgspec.Meta(ge=16, le=400)] = 80
+    """Cells of the grid along a hull's longest side."""
+
+
+def main(params: Params, inputs: Inputs, out: Path, progress: Progress) -> None:
+    """Find cameras, then shapes, and write both."""
+    slice_ = msgspec.convert(inputs.facts["dataset.shapes"], ShapesSlice)
+    photos = {name: Photo(inputs, name, own) for name, own in sorted(slice_.photos.items())}
+    cameras: dict[str, ExternalCamera] = {}
+    if slice_.sfm:
+        views = {name: photo.view() for name, photo in photos.items()}
+        placed = cameras_by_motion(views, lambda share, what: progress(0.5 * share, 1, what))
+        cameras = {name: photos[name].external(camera, slice_.meshes) for name, camera in placed.items()}
+    begun, found = 0.5 if slice_.sfm else 0.0, {}
+    (out / "meshes").mkdir()
+    for done, (name, entry) in enumerate(sorted(slice_.meshes.items())):
+        outlines = [
+            one
+            for photo in photos.values()
+            for one in photo.outlines(name, entry, cameras.get(photo.name))
+            if one.is_seen
+        ]
+        at = begun + (1 - begun) * done / len(slice_.meshes)
+        part = (1 - begun) / len(slice_.meshes)
+        try:
+            shape = shape_of(entry, outlines, params, lambda share, a=at, p=part, n=name: progress(a + p * share, 1, n))
+        except InputError as error:
+            raise InputError(error.found, file="dataset.yaml", key=f"meshes.{name}", cure=error.cure) from error
+        write_obj(out / "meshes" / f"{name}.obj", shape, parts_of(entry))
+        extent = tuple(np.ptp(shape.vertices, axis=0).tolist())
+        found[name] = ShapeEntry(
+            kind_of(entry), extent, len(shape.faces), sorted({one.photo for one in outlines}), shape.overlap
+        )
+        if shape.overlap < GOOD:
+            log.warning("mesh '%s': the %s covers its outlines by %.0f %% only (IoU): is it of that kind, and are its masks whole?",
+                        name, kind_of(entry), 100 * shape.overlap)  # fmt: skip
+    write_json(out / FILE, ShapesTable(cameras, found))
+    progress(1, 1)
+
+
+def kind_of(entry: MeshEntry) -> str:
+    """hull, lathe, ball, box or cylinder."""
+    return entry.primitive or ("hull" if entry.hull else "lathe")
+
+
+def parts_of(entry: MeshEntry) -> list[str]:
+    """The names of the shape's parts."""
+    return list(entry.parts or {ALL_OF_IT: entry.material})
+
+
+def shape_of(entry: MeshEntry, outlines: list[Outline], params: Params, report: Callable[[float], None]) -> Triangles:
+    """What the outlines say of a mesh's shape."""
+    if not outlines:
+        raise InputError(
+            "no photo's mask shows it", cure="is its material the one of the mask's label? Else take it out"
+        )
+    if entry.hull:
+        known = [one for one in outlines if one.pose is not None]
+        if 2 <= len(known) < FEW:
+            log.warning(
+                "a hull of %d outlines is larger than the body wherever they do not show it: more photos, from more sides",
+                len(known),
+            )
+        return visual_hull(known, params.cells, len(parts_of(entry)), report)
+    if entry.lathe:
+        shape = body_of_revolution(outlines, report)
+        given = any(one.pose is not None for one in outlines)
+        return shape if given else msgspec.structs.replace(shape, vertices=shape.vertices * entry.size)
+    return primitive(entry.primitive, outlines, report).of_size(entry.size)
+
+
+class Photo:
+    """A photo as `masks` left it, and its objects."""
+
+    def __init__(self, inputs: Inputs, name: str, own: ObjectsSlice):
+        self.name, self.own, self.materials = name, own, inputs.facts["dataset.materials"]
+        self.path, self.facts = inputs["masks"] / f"{name}.exr", read_photo_facts(inputs["masks"] / f"{name}.json")
+
+    def view(self) -> View:
+        """What structure from motion sees of it."""
+        channels = read_exr(self.path)
+        radiance = np.stack([channels[c] for c in "RGB"], axis=-1).mean(axis=-1)
+        white = max(float(np.quantile(radiance[np.isfinite(radiance)], 0.99)), 1e-12)
+        grey = srgb_encode(np.clip(np.nan_to_num(radiance) / white, 0, 1))
+        return View(
+            np.round(grey * 255).astype(np.uint8),
+            channels["label"] > 0.5,
+            channels["left_out"] > 0.5,
+            self.facts.focal_px,
+        )
+
+    def external(self, placed: Placed, meshes: dict[str, MeshEntry]) -> ExternalCamera:
+        """The camera in pixels of the photo's file; hulls are made in the world's frame."""
+        rotation, translation = (
+            tuple(map(tuple, placed.pose.rotation.tolist())),
+            tuple(placed.pose.translation.tolist()),
+        )
+        hulls = [obj.name for obj in self.own.objects if obj.mesh in meshes and meshes[obj.mesh].hull]
+        poses = {name: Pose(rotation, translation) for name in hulls}
+        return ExternalCamera("sfm", placed.focal * self.facts.factor, None, None, poses)
+
+    def outlines(self, mesh: str, entry: MeshEntry, by_motion: ExternalCamera | None) -> list[Outline]:
+        """Of each object of that mesh."""
+        outlines, channels = [], None
+        for number, obj in enumerate(self.own.objects, start=1):
+            if obj.mesh == mesh:
+                channels = channels or read_exr(self.path)
+                labels = self._labels(obj, entry)
+                external = by_motion or self.own.external
+                label = silhouette_of_object(channels, number, sorted(set(labels)), obj.mask is not None).label
+                part = np.where(label == UNKNOWN, UNKNOWN, 0)
+                for k, own in reversed(list(enumerate(labels, start=1))):
+                    part[label == own] = k
+                part[(label > 0) & (part == 0)] = UNKNOWN
+                pose = obj.pose or (external.poses.get(obj.name) if external else None)
+                arrays = PoseArrays(np.array(pose.rotation), np.array(pose.translation)) if pose else None
+                camera, known = camera_of(msgspec.structs.replace(self.own, external=external), self.facts, self.name)
+                prior = focal_prior(known.focal, known.source, camera.width, camera.height)
+                outlines.append(
+                    Outline(self.name, part, msgspec.structs.replace(camera, focal=prior.focal), prior, arrays)
+                )
+        return outlines
+
+    def _labels(self, obj: ObjectEntry, entry: MeshEntry) -> list[int]:
+        """The label of each part of the shape in this photo."""
+        made_of = entry.parts or {ALL_OF_IT: entry.material}
+        return [self.materials.index((made_of | obj.materials)[part]) + 1 for part in parts_of(entry)]

@@ -1,0 +1,46 @@
+"""Cameras by structure from motion: a body at rest, one that turns before a camera at rest, and photos that do not overlap."""
+
+import numpy as np
+import pytest
+
+from factorlib.errors import InputError
+from factorlib.generate.shapes import SHAPES
+from factorlib.geometry.camera import angle_between
+from factorlib.shapes.motion import cameras_by_motion
+from tests.shapes.made import looking_from, views_of
+
+BLOB = SHAPES["blob"]()
+POSES = [looking_from(20 + 15 * (k % 2), 18.0 * k) for k in range(5)]
+
+
+def turns_off(found):
+    """Degrees by which the turn from the first photo to each other one is off."""
+    poses = {name: POSES[int(name[1:])] for name in found}
+    first = next(iter(found))
+    return [
+        angle_between(
+            poses[n].rotation @ poses[first].rotation.T, found[n].pose.rotation @ found[first].pose.rotation.T
+        )
+        for n in found
+    ]
+
+
+def test_cameras_about_a_body_at_rest_are_found_and_are_the_same_each_time():
+    views = views_of(BLOB, POSES, POSES)
+    found = cameras_by_motion(views)
+    assert list(found) == list(views) and max(turns_off(found)) < 0.5
+    assert all(each.focal == pytest.approx(1.3 * 320, rel=0.02) for each in found.values())
+    again = cameras_by_motion(views)
+    assert all(np.array_equal(found[n].pose.rotation, again[n].pose.rotation) for n in found)
+
+
+def test_of_a_body_that_turns_before_a_camera_at_rest_the_ground_that_stands_still_is_not_believed():
+    found = cameras_by_motion(views_of(BLOB, POSES, [POSES[0]] * len(POSES), 480))
+    assert len(found) >= 3 and max(turns_off(found)) < 3.0
+
+
+def test_photos_that_do_not_overlap_are_refused():
+    apart = [looking_from(20, 90.0 * k) for k in range(4)]
+    with pytest.raises(InputError, match="of 4 photos are found") as error:
+        cameras_by_motion(views_of(BLOB, apart, [looking_from(20, 40 + 90.0 * k) for k in range(4)]))
+    assert "each 10 to 20° from the next" in error.value.cure
