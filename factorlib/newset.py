@@ -39,6 +39,11 @@ REMARK = """\
 # materials: label k of a mask is the k-th, from 1;  parts: part of a mesh -> material
 # objects: of each the mesh; another material for a part by `materials: {part: material}`
 """
+HULL = "thing"  # the mesh where none is given
+NO_MESH = (
+    "there is no mesh: `hull: true` and `cameras: {sfm: true}` are written, which need photos that overlap, each 10 to 20° from the next; "
+    "else write `lathe: true` or `primitive: ball | box | cylinder`, or give MESHES=<folder>: rough ones will do"
+)
 
 
 class Categories(msgspec.Struct):
@@ -85,11 +90,17 @@ def new_dataset(target: Path, photos: Path, masks: Path | None, meshes: Path | N
                 for photo in named if photo not in of_photos]  # fmt: skip
     missing += [f"photo {photo}: write another `name`: a file of the results is called {photo}"
                 for photo in named if photo in RESERVED_PHOTOS]  # fmt: skip
-    if not entries:
+    spec: dict = {"format": 1, "materials": materials or [UNKNOWN]}
+    if not entries and materials:
+        made_of = {"material": materials[0]} if len(materials) == 1 else {"parts": {name: name for name in materials}}
+        entries, spec["cameras"] = {HULL: {"hull": True, **made_of}}, {"sfm": True}
+        shown = {photo: [HULL] for photo in named}
+        missing.append(NO_MESH)
+    elif not entries:
         missing.append("there is no mesh: give MESHES=<folder>; rough ones will do")
     if not materials:
         missing.append("no mask names a material: write the names in `materials`, label k of a mask the k-th")
-    spec = {"format": 1, "materials": materials or [UNKNOWN], "meshes": entries, "photos": []}
+    spec |= {"meshes": entries, "photos": []}
     for photo, path in named.items():
         objects = [{"name": mesh, "mesh": mesh} for mesh in shown[photo] or [UNKNOWN] * bool(entries)]
         if objects and silhouettes.get(photo):

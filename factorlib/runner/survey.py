@@ -139,8 +139,8 @@ def survey(
         data = project.provider.read(project.dataset_folder(dataset))
         whole, pipeline = pipeline, pipeline.for_data(lambda name: data.slice(name, None).facts is None)
         for name in (name for name in targets or [] if name not in pipeline.stages):
-            words = f"the stage {name!r} has nothing to do for this data set"
-            raise InputError(words, key=f"dataset.{whole.stages[name].when}", cure="leave it out")
+            found = f"the stage {name!r} has nothing to do for this data set"
+            raise InputError(found, file=data.folder, key=whole.stages[name].when, cure="leave it out")
         home, store = home_of(project, data.folder), Store(project.build / "store")
         asked = project.recipes(data, recipes or [])
         spec = Spec(pipeline, data.photos, targets, recipes=list(asked))

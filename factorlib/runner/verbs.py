@@ -239,7 +239,7 @@ def begin(project: Project, dataset: str, photos: Path | None, masks: Path | Non
     folder = Path(os.path.abspath(dataset)) if "/" in dataset else project.root / "data" / dataset
     check_name(folder.name, "a dataset", key="DATASET", reserved=RESERVED)
     missing = import_module("factorlib.newset").new_dataset(folder, photos, masks, meshes)
-    where = ", with `?` where you must say more:" if missing else ""
+    where = "; what it lacks, or leaves as `?`:" if missing else ""
     print(f"{project.shown(folder)}/dataset.yaml is written{where}")
     print("\n".join([*(f"  {line}" for line in missing), f"next: make validate DATASET={shlex.quote(dataset)}"]))
     return 0

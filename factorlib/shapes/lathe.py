@@ -19,6 +19,7 @@ from collections.abc import Callable, Iterator, Sequence
 import msgspec
 import numpy as np
 from jaxtyping import Float
+from scipy.interpolate import UnivariateSpline
 from scipy.optimize import minimize
 
 from factorlib.align.refine import FocalPrior
@@ -42,6 +43,8 @@ REFERENCES, TRIED, JUDGES = (
     4,
 )  # photos that a body is begun from, tilts of each that are tried, and photos that they are laid on
 FINER_DEG = (-7.5, -5.0, -2.5, 2.5, 5.0, 7.5)  # from the best of these, to be tried too
+UNTOLD_DEG = 12.0  # range of tilts that explain the outlines alike, from which it is said
+MASK_ERROR = 0.2  # pixels that the contour of a mask of whole pixels is off, by one photo
 ROUNDS = 2
 COLUMNS = 96  # corners about the axis of the mesh
 RIM = 0.02  # of the largest radius: a thinner end is no part of the body
@@ -102,7 +105,17 @@ def body_of_revolution(outlines: Sequence[Outline], report: Callable[[float], No
         if each := _at_tilt(of, own.camera, own.pose.rotation[:, 0], own.pose.translation, own.tilt_deg + turn):
             finer = [each if one is of else laid_on(one, each.profile, pose) for one, pose in zip(judges, near)]
             laid.append((_agreement(finer), of, finer))
-    _, _, poses = max(laid, key=lambda of: of[0])
+    most, of, poses = max(laid, key=lambda of: of[0])
+    like = [
+        pose.tilt_deg
+        for good, one, each in laid
+        if one is of and good >= most - AS_GOOD
+        for pose in each[:REFERENCES]
+        if pose.tilt_deg
+    ]
+    if like and max(like) - min(like) > UNTOLD_DEG:
+        log.warning("%s: tilts of the axis from %.0f to %.0f° explain the outlines alike, so its profile is not sure: a photo from higher "
+                    "up, or from lower down, says it", of.photo, min(like), max(like))  # fmt: skip
     profile = poses[0].profile
     poses += [laid_on(one, profile) for one in outlines[JUDGES:]]
     for k in range(ROUNDS):
@@ -205,17 +218,21 @@ def _span(outlines: Sequence[Outline], poses: Sequence[Turned]) -> tuple[float, 
 
 
 def carved_by_all(outlines: Sequence[Outline], poses: Sequence[Turned], span: tuple[float, float]) -> Profile:
-    """At each height the largest disc that fits into every outline; ends that are as thin as nothing are cut."""
+    """At each height the largest disc that fits into every outline, as smooth as pixels allow; ends as thin as nothing are cut."""
     low, high = span
     if not high > low:
         return np.zeros((0, 2))
     heights = low + (np.arange(HEIGHTS) + 0.5) / HEIGHTS * (high - low)
     radius = np.min([largest_discs(one, view, heights) for one, view in zip(outlines, poses, strict=True)], axis=0)
     used = np.flatnonzero(radius > RIM * radius.max())
-    if len(used) < 3:
+    if len(used) < 5:
         return np.zeros((0, 2))
     part = slice(used[0], used[-1] + 1)
-    return np.column_stack([heights[part], np.maximum(radius[part], RIM * radius.max())])
+    pixel = min(float(np.linalg.norm(view.pose.translation)) / view.camera.focal for view in poses)
+    smooth = UnivariateSpline(heights[part], radius[part], s=len(used) / len(poses) * (MASK_ERROR * pixel) ** 2)(
+        heights[part]
+    )
+    return np.column_stack([heights[part], np.maximum(smooth, RIM * radius.max())])
 
 
 def largest_discs(one: Outline, view: Turned, heights: Float[np.ndarray, " n"]) -> Float[np.ndarray, " n"]:

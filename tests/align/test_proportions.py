@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from factorlib.align.proportions import SHAPES, Sighting, jacobian_with_shape, proportions
+from factorlib.align.proportions import BOX, Sighting, jacobian_with_shape, proportions
 from factorlib.align.refine import FocalPrior
 from factorlib.align.state import state_of
 from factorlib.align.target import target_of
@@ -74,7 +74,7 @@ def test_image_points_move_by_the_derivative():
 
     def image(step, shape):
         moved = state.moved(step)
-        return moved.camera(camera).project(points * np.exp(SHAPES @ shape) @ moved.rotation.T + moved.middle())
+        return moved.camera(camera).project(points * np.exp(BOX @ shape) @ moved.rotation.T + moved.middle())
 
     numeric, h = np.empty((30, 2, 9)), 1e-6
     for k, step in enumerate(h * np.eye(9)):

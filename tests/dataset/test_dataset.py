@@ -112,10 +112,13 @@ def test_a_slice_is_json_converts_to_its_type_and_names_the_files_it_needs(folde
     slices = {name: dataset_slice(dataset, name, "kitchen") for name in SLICES}
     for name, one in slices.items():
         assert json.loads(json.dumps(one.facts)) == one.facts
-        assert msgspec.to_builtins(msgspec.convert(one.facts, types.get(name, object))) is not None or name == "truth"
+        assert msgspec.to_builtins(msgspec.convert(one.facts, types.get(name, object))) is not None or name in (
+            "truth",
+            "shapes",
+        )
     assert slices["photo"].files == ["kitchen.jpg", "kitchen.png", "own.png"]
     assert slices["objects"].files == ["chair.mtl", "chair.obj", "own.png", "vase.ply"]
-    assert not any(slices[name].files for name in ("materials", "light", "set", "truth"))
+    assert not any(slices[name].files for name in ("materials", "light", "set", "shapes", "truth"))
     assert dataset_slice(dataset, "objects", "hall").files == ["box 1.bin", "box.gltf"]
     all_files = ["coco.json", "garden.exr", "kitchen.jpg", "kitchen.png", "own.png", "red.png"]
     assert dataset_slice(dataset, "photo").files == all_files
@@ -231,6 +234,14 @@ BAD = [
     ("meshes.vase.file", "notes.txt", ".obj"),
     ("meshes.chair > ", {"file": "chair.obj", "material": "red", "parts": {"shell": "red"}}, "both"),
     ("meshes.vase > ", {"file": "vase.ply"}, "neither"),
+    ("meshes.vase > ", {"material": "red"}, "exactly one of file"),
+    ("meshes.vase > ", {"file": "vase.ply", "hull": True, "material": "red"}, "file and hull"),
+    ("meshes.vase > .size", {"hull": True, "material": "red", "size": 2.0}, "leave it out"),
+    ("meshes.vase > .size", {"lathe": True, "material": "red", "size": 0.0}, "more than 0"),
+    ("meshes.vase > .primitive", {"primitive": "cone", "material": "red"}, "cone"),
+    ("meshes.chair > .parts", {"lathe": True, "parts": {"shell": "red"}}, "one part"),
+    ("cameras > ", {"sfm": True, "colmap": "sparse"}, "colmap and sfm"),
+    ("cameras > .world_from_camera", {"sfm": True, "world_from_camera": True}, "not known beforehand"),
     ("meshes.vase.material", "wite", "did you mean 'white'"),
     ("meshes.chair.parts.legs", "woof", "did you mean 'wood'"),
     ("truth", "../truth.yaml", "outside the dataset"),

@@ -121,6 +121,16 @@ def test_what_is_missing_is_listed(folder):
         read_dataset(folder / "data" / "mine")
 
 
+def test_without_a_mesh_a_hull_by_structure_from_motion_is_written_and_that_is_said(folder):
+    masks(folder, kitchen=[0, 1, 2], IMG_0412=[0, 1])
+    missing, spec = made(folder, meshes=None)
+    assert [line.split(":")[0] for line in missing] == ["there is no mesh"] and "lathe: true" in missing[0]
+    dataset = read_dataset(folder / "data" / "mine")
+    assert dataset.spec.cameras.sfm and dataset.spec.meshes["thing"].hull
+    assert dataset.spec.meshes["thing"].parts == {"label_1": "label_1", "label_2": "label_2"}
+    assert [[obj.mesh for obj in photo.objects] for photo in dataset.spec.photos] == [["thing"], ["thing"]]
+
+
 def test_of_several_meshes_a_photo_shows_those_whose_names_are_whole_words_of_its_own(folder):
     masks(folder, kitchen=[0, 1], IMG_0412=[0, 1])
     for photo in ("armchair.jpg", "red_chair-2.jpg"):

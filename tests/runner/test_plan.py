@@ -132,6 +132,13 @@ def test_a_stage_runs_after_what_it_takes_and_an_optional_one_only_where_it_is_a
     assert set(taken.needed(None)) == {"one", "two", "three", "four"}
 
 
+def test_a_stage_whose_slice_says_nothing_is_not_there_and_none_takes_its_results(tmp_path):
+    pipeline = read(tmp_path, GOOD + "  three: {inputs: [two], when: set}\n  four: {inputs: [three, one]}\n")
+    assert pipeline.for_data(lambda _: False) == pipeline
+    without = pipeline.for_data(lambda name: name == "set")
+    assert without.order() == ["one", "two", "four"] and without.stages["four"].inputs == ["one"]
+
+
 @pytest.mark.parametrize(
     "old, new, words",
     [
@@ -142,6 +149,7 @@ def test_a_stage_runs_after_what_it_takes_and_an_optional_one_only_where_it_is_a
         ("over: photo, ", "", ["stages.one.gather", "over: photo"]),
         ("over: photo", "over: mesh", ["stages.one.over"]),
         ("[dataset.photo]", "[two]", ["need each other", "one"]),
+        ("threads: 2", "when: sett", ["stages.two.when", "did you mean 'set'"]),
         ("format: 1", "format: 2", ["format 2"]),
     ],
 )

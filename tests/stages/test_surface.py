@@ -95,7 +95,7 @@ def test_meshes_are_moved_and_painted_wherever_they_are_read(tmp_path):
     write_ply(tmp_path / "ball.ply", ball)
     dense = fine(read_mesh(tmp_path / "ball.ply", ["red"], "red"))
     table = {"ball": np.full(dense.nodes, 0.05).tolist()}
-    once = MeshesOnce(lambda name: tmp_path / name, ["red"], CREASE_DEG, table, table)
+    once = MeshesOnce(lambda _, file: tmp_path / file, ["red"], CREASE_DEG, table, table)
     mesh = once.mesh("ball", MeshEntry("ball.ply", material="red"))
     radius = np.linalg.norm(mesh.vertices, axis=1).max()
     assert abs(radius - 1 - 0.05 * dense.extent) < 1e-3 and np.allclose(mesh.detail, np.exp(0.05))
@@ -108,7 +108,7 @@ def test_meshes_are_moved_and_painted_wherever_they_are_read(tmp_path):
     assert "COLOR_0" in tree["meshes"][0]["primitives"][0]["attributes"]
     base = tree["materials"][0]["pbrMetallicRoughness"]["baseColorFactor"]
     np.testing.assert_allclose(base[:3], np.exp(0.05) * np.array([0.2, 0.1, 0.1]), rtol=1e-6)
-    other = MeshesOnce(lambda name: tmp_path / name, ["red"], CREASE_DEG, {"ball": [0.0] * 7})
+    other = MeshesOnce(lambda _, file: tmp_path / file, ["red"], CREASE_DEG, {"ball": [0.0] * 7})
     with pytest.raises(InputError, match="surface"):
         other.mesh("ball", MeshEntry("ball.ply", material="red"))
 

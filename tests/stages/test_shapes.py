@@ -1,0 +1,121 @@
+"""From photos and masks alone: cameras, a hull, bodies of revolution, and the poses of all, through `masks`, `shapes` and `align`."""
+
+import json
+import logging
+
+import msgspec
+import numpy as np
+import pytest
+import yaml
+
+from factorlib.dataset.read import read_dataset
+from factorlib.dataset.schema import ObjectsSlice
+from factorlib.dataset.slices import dataset_slice
+from factorlib.errors import InputError
+from factorlib.generate.folder import write_labels, write_photo
+from factorlib.generate.shapes import SHAPES
+from factorlib.geometry.camera import Camera
+from factorlib.geometry.raster import rasterise
+from factorlib.images.exr import read_exr
+from factorlib.meshes.read import read_mesh
+from factorlib.stage import Inputs
+from stages import align, masks, shapes, surface
+from tests.shapes.made import CAMERA, looking_from, views_of
+
+AROUND = [looking_from(20 + 15 * (k % 2), 18.0 * k) for k in range(8)]
+
+
+def write_set(folder, meshes, photos, **more):
+    """photos: name -> (grey [h, w], label [h, w], objects, focal length)"""
+    for name in ("photos", "masks"):
+        (folder / name).mkdir(parents=True)
+    entries = []
+    for name, (grey, label, objects, focal) in photos.items():
+        write_photo(folder / f"photos/{name}.png", np.repeat(grey[..., None], 3, axis=-1))
+        write_labels(folder / f"masks/{name}.png", label)
+        files = {"image": f"photos/{name}.png", "masks": f"masks/{name}.png"}
+        entries.append({"name": name, **files, "objects": objects, "camera": {"focal_px": focal} if focal else None})
+    spec = {"format": 1, "materials": ["red", "blue"], "meshes": meshes, "photos": entries, **more}
+    (folder / "dataset.yaml").write_text(yaml.safe_dump(spec))
+    return read_dataset(folder)
+
+
+def run(dataset, into, photos=None):
+    """The folders of `masks`, `shapes` and `align`, of all photos or those named."""
+    folders = {stage: into / stage for stage in ("masks", "shapes", "align")}
+    for made in folders.values():
+        made.mkdir(parents=True)
+    names = [photo.name for photo in dataset.spec.photos]
+
+    def inputs(photo, *slices):
+        parts = {name: dataset_slice(dataset, name, photo) for name in slices}
+        files = {path: dataset.folder / path for part in parts.values() for path in part.files}
+        return Inputs(folders, {f"dataset.{name}": part.facts for name, part in parts.items()}, files, photo)
+
+    for name in names:
+        masks.main(masks.Params(), inputs(name, "materials", "photo"), folders["masks"])
+    shapes.main(shapes.Params(cells=48), inputs(None, "materials", "shapes"), folders["shapes"], lambda *_: None)
+    for name in names if photos is None else photos:
+        align.main(align.Params(), inputs(name, "materials", "objects"), folders["align"], lambda *_: None)
+    return folders
+
+
+def test_photos_and_masks_of_a_body_at_rest_give_cameras_a_hull_and_normals(tmp_path):
+    body, photos = SHAPES["blob"](), {}
+    for name, view in views_of(body, AROUND, AROUND, 320).items():
+        photos[name] = view.grey / 255, view.objects.astype(int), [{"name": "thing", "mesh": "thing"}], None
+    meshes = {"thing": {"hull": True, "material": "red"}}
+    folders = run(write_set(tmp_path / "set", meshes, photos, cameras={"sfm": True}), tmp_path / "out", ["p0", "p5"])
+    table = json.loads((folders["shapes"] / "shapes.json").read_text())
+    assert sorted(table["cameras"]) == sorted(photos) and table["meshes"]["thing"]["overlap"] > 0.97
+    for number in (0, 5):
+        entry = json.loads((folders["align"] / f"p{number}.json").read_text())
+        obj = entry["objects"]["thing"]
+        assert (entry["camera"]["focal_source"], obj["source"], obj["doubts"]) == ("sfm", "sfm", [])
+        assert entry["camera"]["focal_px"] == pytest.approx(1.3 * 320, rel=0.03) and obj["silhouette_iou"] > 0.96
+        found = read_exr(folders["align"] / f"p{number}.exr")
+        true = rasterise(body, Camera(320, 320, 1.3 * 320, (160.0, 160.0)), AROUND[number])
+        both = (true.label > 0) & (found["label"] > 0)
+        normal = np.stack([found[f"normal.{a}"] for a in "xyz"], axis=-1)
+        assert np.median(np.rad2deg(np.arccos(np.clip(np.sum(normal * true.normal, axis=-1)[both], -1, 1)))) < 12
+
+
+def test_a_ball_and_a_vase_need_no_file_and_get_poses_as_meshes_do(tmp_path):
+    vase, ball, photos = SHAPES["vase"](), SHAPES["sphere"](), {}
+    for name, elevation in (("low", -5), ("high", 35)):
+        for what, mesh, label in (("vase", vase, 1), ("ball", ball, 2)):
+            part = (rasterise(mesh, CAMERA, looking_from(elevation, 40)).label > 0) * label
+            photos[f"{name}_{what}"] = part * 0.3, part, [{"name": what, "mesh": what}], 400.0
+    meshes = {
+        "vase": {"lathe": True, "material": "red", "size": 0.5},
+        "ball": {"primitive": "ball", "material": "blue"},
+    }
+    dataset = write_set(tmp_path / "set", meshes, photos)
+    folders = run(dataset, tmp_path / "out", ["high_vase", "high_ball"])
+    mesh = read_mesh(folders["shapes"] / "meshes/vase.obj", ["red"], "red")
+    assert np.ptp(mesh.vertices, axis=0).max() == pytest.approx(0.5, rel=1e-4) and not mesh.open
+    for name, limit in (("high_vase", 4.0), ("high_ball", 1.5)):
+        true = rasterise(vase if "vase" in name else ball, CAMERA, looking_from(35, 40))
+        found = read_exr(folders["align"] / f"{name}.exr")
+        both = (true.label > 0) & (found["label"] > 0)
+        normal = np.stack([found[f"normal.{a}"] for a in "xyz"], axis=-1)
+        assert np.median(np.rad2deg(np.arccos(np.clip(np.sum(normal * true.normal, axis=-1)[both], -1, 1)))) < limit
+    objects = {name: dataset_slice(dataset, "objects", name).facts for name in photos}
+    inputs = Inputs(folders, {"dataset.objects": objects, "dataset.materials": ["red", "blue"]})
+    assert surface.surfaces_of(inputs, {n: msgspec.convert(o, ObjectsSlice) for n, o in objects.items()}).meshes == {}
+
+
+def test_a_shape_that_does_not_look_like_its_outlines_is_named_and_one_that_cannot_be_made_is_refused(tmp_path, caplog):
+    label = np.zeros((120, 160), int)
+    label[20:100, 30:45] = label[85:100, 30:130] = 1
+    photos = {name: (label * 0.3, label, [{"name": "thing", "mesh": "thing"}], 200.0) for name in ("one", "two")}
+    with caplog.at_level(logging.WARNING):
+        run(
+            write_set(tmp_path / "set", {"thing": {"primitive": "box", "material": "red"}}, photos),
+            tmp_path / "out",
+            [],
+        )
+    assert "mesh 'thing': the box covers its outlines by" in caplog.text
+    with pytest.raises(InputError, match="0 photos with a known camera") as error:
+        run(write_set(tmp_path / "hull", {"thing": {"hull": True, "material": "red"}}, photos), tmp_path / "none", [])
+    assert error.value.key == "meshes.thing" and "sfm: true" in error.value.cure
