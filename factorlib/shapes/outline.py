@@ -50,13 +50,13 @@ class Outline(msgspec.Struct, frozen=True, dict=True):
         return bool((self.part > 0).any())
 
     def inner(self, pixels: Float[np.ndarray, "*n 2"]) -> Float[np.ndarray, "*n"]:
-        """How many pixels inside the outline points (x, y) lie, negative outside; FREE outside the frame, and where nothing is known it
-        counts as inside: only background says that there is no object."""
+        """How many pixels inside the outline points (x, y) lie, negative outside.  Only background says that there is no object: where nothing
+        is known counts as inside, and a point beyond the frame is as far outside as background at the frame is, else FREE."""
         x, y = pixels[..., 0], pixels[..., 1]
         values = map_coordinates(self._distance, np.stack([y, x]) - 0.5, order=1, mode="nearest")
         height, width = self.part.shape
-        inside = (x >= 0) & (x <= width) & (y >= 0) & (y <= height)
-        return np.where(inside, values, FREE)
+        beyond = np.hypot(np.maximum(np.maximum(-x, x - width), 0), np.maximum(np.maximum(-y, y - height), 0))
+        return np.where(beyond == 0, values, np.where(values < 0, values - beyond, FREE))
 
     @cached_property
     def _distance(self) -> Float[np.ndarray, "h w"]:

@@ -14,7 +14,7 @@ from factorlib.generate.shapes import SHAPES
 from factorlib.meshes.read import read_mesh
 from factorlib.shapes.hull import surface_nets, unambiguous, visual_hull
 from factorlib.shapes.lathe import Turned, body_of_revolution, largest_discs
-from factorlib.shapes.outline import Triangles, write_obj
+from factorlib.shapes.outline import FREE, Triangles, write_obj
 from factorlib.shapes.primitive import primitive, unit
 from tests.shapes.made import CAMERA, looking_from, outline
 
@@ -165,3 +165,12 @@ def test_a_shape_is_written_with_its_parts_and_read_as_any_mesh(tmp_path):
     assert not mesh.open and mesh.labels == (1, 2) and len(mesh.faces) == len(shape.faces)
     y = mesh.vertices[mesh.faces].mean(axis=1)[:, 1]
     assert ((mesh.face_label == 2) == (y > 0)).mean() > 0.999
+
+
+def test_beyond_the_frame_is_outside_where_the_frame_shows_background_and_unknown_where_it_cuts_the_body():
+    part = np.zeros((20, 30), int)
+    part[5:15, 20:] = 1
+    one = msgspec.structs.replace(outline(BLOB, AROUND[0], True), part=part)
+    inside, outside, left, right = one.inner(np.array([[26.0, 10.0], [10.0, 10.0], [-4.0, 10.0], [34.0, 10.0]]))
+    assert inside == pytest.approx(4.5, abs=0.6) and outside == pytest.approx(-10, abs=0.6)
+    assert left < outside - 8 and right == FREE
