@@ -4,7 +4,7 @@
 
 is negative outside.  It is sampled on a grid; the surface f = 0 is meshed by surface nets (Gibson 1998: in each cell that the surface
 crosses, a vertex in the middle of where it crosses the cell's edges), which close wherever f is negative on the grid's border, and
-smoothed without shrinking (Taubin 1995).  Faces take the part that most photos show them as.
+smoothed without shrinking (Taubin 1995) as far as its outlines allow: between them a hull has ridges, which bodies seldom have.  Faces take the part that most photos show them as.
 """
 
 from __future__ import annotations
@@ -28,7 +28,8 @@ from factorlib.shapes.outline import FREE, Outline, Triangles, of_one_part
 
 FIRST = 32  # cells of the longest side, to find where the body is
 LEAST_SHARE = 0.02  # of the largest piece's faces: what is smaller is left away
-SMOOTHINGS = 10
+SMOOTHINGS = (10, 40, 160, 640)  # rounds, of which the most are taken that leave the outlines as they are:
+SMOOTHED_AWAY = 0.004  # overlap (IoU) that smoothing may cost
 SLAB = 1 << 18  # points at a time
 LEAST_Z = 1e-6
 
@@ -64,11 +65,13 @@ def visual_hull(
         low, high = origin + step * (inside.min(axis=0) - 1), origin + step * (inside.max(axis=0) + 1)
     vertices, faces = surface_nets(unambiguous(np.pad(field, 1, constant_values=-step)))
     vertices, faces = _largest(vertices, faces)
-    mesh = trimesh.Trimesh(vertices, faces, process=False)
-    trimesh.smoothing.filter_taubin(mesh, iterations=SMOOTHINGS)
-    vertices = origin + step * (np.asarray(mesh.vertices) - 1)
-    shape = Triangles(vertices, faces, _parts_of(vertices, faces, outlines, parts))
-    return msgspec.structs.replace(shape, overlap=overlap(shape, outlines))
+    mesh, smoothed = trimesh.Trimesh(origin + step * (vertices - 1), faces, process=False), []
+    for more in np.diff(SMOOTHINGS, prepend=0):
+        trimesh.smoothing.filter_taubin(mesh, iterations=int(more))
+        shape = of_one_part(np.array(mesh.vertices), faces)
+        smoothed.append(msgspec.structs.replace(shape, overlap=overlap(shape, outlines)))
+    shape = [each for each in smoothed if each.overlap >= smoothed[0].overlap - SMOOTHED_AWAY][-1]
+    return msgspec.structs.replace(shape, part=_parts_of(shape.vertices, faces, outlines, parts))
 
 
 def overlap(shape: Triangles, outlines: Sequence[Outline]) -> float:
