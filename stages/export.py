@@ -85,7 +85,7 @@ def main(params: Params, inputs: Inputs, out: Path, progress: Progress) -> None:
     for name, light in lobes.items():
         _write_light(out, name, light, solved / "coverage" / f"{name}.exr", params)
     progress(2, 4, "meshes")
-    files = MeshFiles(inputs, out / "scenes", names, params.crease_deg)
+    files = MeshFiles(inputs, out / "scenes", names, params.crease_deg, materials)
     for name, mesh in sorted({n: m for each in objects.values() for n, m in each.meshes.items()}.items()):
         whole = files.read.mesh(name, mesh)
         write_glb(out / f"{name}.glb", whole, names, materials)

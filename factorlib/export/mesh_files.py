@@ -8,19 +8,31 @@ import numpy as np
 from factorlib.dataset import schema
 from factorlib.dataset.schema import MeshEntry
 from factorlib.export.scene import Shape
-from factorlib.export.usd import SUFFIX, write_usd_mesh
+from factorlib.export.usd import SUFFIX, colours, write_usd_mesh
 from factorlib.meshes.ply import submesh, write_ply
 from factorlib.meshes.read import MeshesOnce
+from factorlib.results.materials import Reflectance
 from factorlib.results.poses import ObjectEntry
 from factorlib.results.surface import read_surface
 from factorlib.stage import Inputs
+from factorlib.tracing.scene import paint
 
 
 class MeshFiles:
-    """Meshes, on the surfaces that shading found, read once and written once, split by material, per choice of materials for their parts."""
+    """Meshes, on the surfaces that shading found, read once and written once, split by material, per choice of materials for their parts.
 
-    def __init__(self, inputs: Inputs, scenes: Path, materials: list[str], crease_deg: float):
-        self.scenes, self.materials = scenes, materials
+    solved: the materials, whose colours meshes with detail of reflectance are painted with
+    """
+
+    def __init__(
+        self,
+        inputs: Inputs,
+        scenes: Path,
+        materials: list[str],
+        crease_deg: float,
+        solved: Mapping[str, Reflectance] = {},
+    ):
+        self.scenes, self.materials, self.solved = scenes, materials, solved
         own = read_surface(inputs.folders.get("surface"))
         self.read = MeshesOnce(inputs.mesh, materials, crease_deg, own.displacements, own.log_factors)
         self._stems: dict[tuple, str] = {}  # what files are called before the material, relative to the scenes
@@ -38,6 +50,8 @@ class MeshFiles:
             self._stems[key] = f"meshes/{obj.mesh}" + (f".{number}" if number > 1 else "")
             for label, name in names.items():
                 part, file = submesh(mesh, label), self.scenes / f"{self._stems[key]}.{name}"
-                write_ply(f"{file}.ply", part)
-                write_usd_mesh(f"{file}{SUFFIX}", part)
-        return [Shape(f"{obj.name}.{m}", f"{self._stems[key]}.{m}.ply", m, place, mesh.open) for m in names.values()]
+                painted = part.detail is not None
+                write_ply(f"{file}.ply", part, paint(self.solved[name], part.detail) if painted else None)
+                write_usd_mesh(f"{file}{SUFFIX}", part, colours(self.solved[name], part.detail) if painted else None)
+        stem, painted = self._stems[key], mesh.detail is not None
+        return [Shape(f"{obj.name}.{m}", f"{stem}.{m}.ply", m, place, mesh.open, painted) for m in names.values()]

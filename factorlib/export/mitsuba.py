@@ -34,14 +34,14 @@ def write_scene(path: str | Path, scene: Scene) -> None:
     for sun in scene.suns:
         shines = {"type": "directional", "direction": -sun.direction}
         _add(root, "emitter", {**shines, "irradiance": {"type": "rgb", "value": sun.irradiance}})
-    for name, two_sided in sorted({(shape.material, shape.two_sided) for shape in scene.shapes}):
-        surface = bsdf(scene.materials[name])
+    for name, two_sided, painted in sorted({(s.material, s.two_sided, s.painted) for s in scene.shapes}):
+        surface = bsdf(scene.materials[name], painted)
         surface = {"type": "twosided", "bsdf": surface} if two_sided else surface
-        _add(root, "bsdf", surface, id=_id(name, two_sided))
+        _add(root, "bsdf", surface, id=_id(name, two_sided, painted))
     for shape in scene.shapes:
         file, place = {"type": "ply", "filename": shape.file}, _matrix(shape.world_from_object)
         element = _add(root, "shape", {**file, "to_world": place}, id=shape.name)
-        ET.SubElement(element, "ref", id=_id(shape.material, shape.two_sided))
+        ET.SubElement(element, "ref", id=_id(shape.material, shape.two_sided, shape.painted))
     ET.indent(root, " ")
     write_text(path, ET.tostring(root, encoding="unicode") + "\n")
 
@@ -70,8 +70,8 @@ def _sensor(scene: Scene) -> dict[str, Any]:
     }
 
 
-def _id(material: str, two_sided: bool) -> str:
-    return f"material.{material}.two_sided" if two_sided else f"material.{material}"
+def _id(material: str, two_sided: bool, painted: bool) -> str:
+    return f"material.{material}" + ".two_sided" * two_sided + ".painted" * painted
 
 
 def _matrix(matrix: np.ndarray) -> tuple[str, dict[str, str]]:
@@ -86,6 +86,10 @@ def _add(parent: ET.Element, kind: str, entry: dict[str, Any], **attributes: str
             ET.SubElement(ET.SubElement(element, "transform", name=name), *value)
         elif isinstance(value, dict) and value["type"] == "rgb":
             ET.SubElement(element, "rgb", name=name, value=_numbers(value["value"]))
+        elif isinstance(value, dict) and value["type"] == "mesh_attribute":
+            ET.SubElement(
+                _add(element, "texture", {"type": value["type"]}, name=name), "string", name="name", value=value["name"]
+            )
         elif isinstance(value, np.ndarray):
             ET.SubElement(element, "vector", name=name, value=_numbers(value))
         elif isinstance(value, dict):

@@ -19,13 +19,17 @@ DIRECT, ALL_BOUNCES = 2, -1
 
 
 class Shape(msgspec.Struct, frozen=True):
-    """A PLY file (relative to the scene) of one material, and where it stands;  two_sided: the inside can be seen"""
+    """A PLY file (relative to the scene) of one material, and where it stands;  two_sided: the inside can be seen
+
+    painted: its diffuse part has the colours of the file's vertices
+    """
 
     name: str
     file: str
     material: str
     cam_from_object: Float[np.ndarray, "4 4"]
     two_sided: bool
+    painted: bool = False
 
     @property
     def world_from_object(self) -> Float[np.ndarray, "4 4"]:

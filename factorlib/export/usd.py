@@ -27,6 +27,7 @@ from factorlib.wholefile import write_text
 
 FILM = 0.36  # width of the film in tenths of a unit: 36 mm where a unit is a metre; only its ratio to the focal length counts
 SUFFIX = ".usda"
+PAINTED = " (painted)"  # of the name of a material whose diffuse part has the colours of vertices
 INDENT = "    "
 UP_AXIS = ["metersPerUnit = 1", 'upAxis = "Y"']  # what a unit of the poses is in metres is not known
 ESCAPES = {"\\": "\\\\", '"': '\\"', "\n": "\\n", "\r": "\\r", "\t": "\\t"}
@@ -34,7 +35,7 @@ ESCAPES = {"\\": "\\\\", '"': '\\"', "\n": "\\n", "\r": "\\r", "\t": "\\t"}
 
 def write_usd_scene(path: str | Path, scene: Scene) -> None:
     """Write a photo's scene; of its materials those that shapes name.  A shape's file has a twin by `write_usd_mesh`."""
-    named = identifiers(sorted({shape.material for shape in scene.shapes}))
+    named = identifiers(sorted({shape.material + PAINTED * shape.painted for shape in scene.shapes}))
     parts = [*_camera(scene), *_light(scene.light), *_materials(scene, named), *_objects(scene.shapes, named)]
     size = f"uniform int2 resolution = ({scene.camera.width}, {scene.camera.height})"
     settings = _prim('RenderSettings "photo"', ["rel camera = </scene/camera>", size])
@@ -42,8 +43,8 @@ def write_usd_scene(path: str | Path, scene: Scene) -> None:
     write_text(path, _layer(about, [*_prim('Xform "scene"', parts), *_prim('Scope "Render"', settings)]))
 
 
-def write_usd_mesh(path: str | Path, mesh: Mesh) -> None:
-    """Write a mesh in its own frame and units, as float32; /mesh, without a material."""
+def write_usd_mesh(path: str | Path, mesh: Mesh, colours: Float[np.ndarray, "v 3"] | None = None) -> None:
+    """Write a mesh in its own frame and units, as float32; /mesh, without a material.  colours: of its vertices, as `displayColor`."""
     points, normals = (array.astype(np.float32).astype(float) + 0.0 for array in (mesh.vertices, mesh.normals))
     lines = [
         f"uniform bool doubleSided = {int(mesh.open)}",
@@ -56,6 +57,8 @@ def write_usd_mesh(path: str | Path, mesh: Mesh) -> None:
         f"point3f[] points = [{_tuples(points)}]",
         'uniform token subdivisionScheme = "none"',
     ]
+    if colours is not None:
+        lines += [f"color3f[] primvars:displayColor = [{_tuples(colours)}] (", f'{INDENT}interpolation = "vertex"', ")"]
     write_text(path, _layer(['defaultPrim = "mesh"', *UP_AXIS], _prim('Mesh "mesh"', lines)))
 
 
@@ -71,6 +74,11 @@ def shader_inputs(material: Reflectance) -> dict[str, float | np.ndarray]:
         return {"diffuseColor": specular, "metallic": 1.0, "roughness": roughness, "useSpecularWorkflow": 0}
     base = np.divide(diffuse, 1 - specular, out=np.zeros(3), where=specular < 1)
     return {"diffuseColor": base, "roughness": roughness, "specularColor": specular, "useSpecularWorkflow": 1}
+
+
+def colours(material: Reflectance, detail: Float[np.ndarray, " v"]) -> Float[np.ndarray, "v 3"]:
+    """diffuseColor at the vertices of a mesh with detail."""
+    return np.minimum(detail[:, None] * shader_inputs(material)["diffuseColor"], 1.0)
 
 
 def with_roughness_of_file(material: Reflectance) -> Reflectance:
@@ -126,8 +134,10 @@ def _materials(scene: Scene, named: Mapping[str, str]) -> list[str]:
     lines = []
     for name, identifier in named.items():
         shader = ['uniform token info:id = "UsdPreviewSurface"']
-        for key, value in shader_inputs(scene.materials[name]).items():
-            if isinstance(value, np.ndarray):
+        for key, value in shader_inputs(scene.materials[name.removesuffix(PAINTED)]).items():
+            if key == "diffuseColor" and name.endswith(PAINTED):
+                shader.append(f"color3f inputs:{key}.connect = </scene/materials/{identifier}/colours.outputs:result>")
+            elif isinstance(value, np.ndarray):
                 shader.append(f"color3f inputs:{key} = {_tuple(value)}")
             elif isinstance(value, int):
                 shader.append(f"int inputs:{key} = {value}")
@@ -135,6 +145,9 @@ def _materials(scene: Scene, named: Mapping[str, str]) -> list[str]:
                 shader.append(f"float inputs:{key} = {_number(value)}")
         surface = f"token outputs:surface.connect = </scene/materials/{identifier}/surface.outputs:surface>"
         about = [surface, *_prim('Shader "surface"', [*shader, "token outputs:surface"])]
+        if name.endswith(PAINTED):
+            read = ['uniform token info:id = "UsdPrimvarReader_float3"', 'string inputs:varname = "displayColor"']
+            about += _prim('Shader "colours"', [*read, "float3 outputs:result"])
         lines += _prim(f'Material "{identifier}"', about, _shown(name))
     return _prim('Scope "materials"', lines)
 
@@ -148,7 +161,8 @@ def _objects(shapes: Sequence[Shape], materials: Mapping[str, str]) -> list[str]
     for name, identifier in identifiers(objects).items():
         about = _transform(objects[name][0].world_from_object)
         for shape in objects[name]:
-            file, material = PurePosixPath(shape.file).with_suffix(SUFFIX), materials[shape.material]
+            material = materials[shape.material + PAINTED * shape.painted]
+            file = PurePosixPath(shape.file).with_suffix(SUFFIX)
             references = f"prepend references = {_asset(f'./{file}')}"
             head = ['prepend apiSchemas = ["MaterialBindingAPI"]', *_shown(shape.material), references]
             about += _prim(f'Mesh "{material}"', [f"rel material:binding = </scene/materials/{material}>"], head)

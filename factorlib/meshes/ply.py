@@ -133,15 +133,17 @@ def _columns(content: bytes, at: int, order: str, count: int, properties: Proper
     return dict(zip(properties, joined)), at
 
 
-def write_ply(path: str | Path, mesh: Mesh) -> None:
+def write_ply(path: str | Path, mesh: Mesh, colours: np.ndarray | None = None) -> None:
     """Write vertices (float64 as float32), normals and faces, with `label` per face: what Mitsuba and other readers read.
 
-    A mesh with detail has a further property `detail` per vertex.
+    A mesh with detail has a further property `detail` per vertex, or in its place the vertices' linear `colours` [v, 3] (red, green, blue).
     """
     lines = ["ply", "format binary_little_endian 1.0", f"element vertex {len(mesh.vertices)}"]
-    columns = [mesh.vertices, mesh.normals] + ([] if mesh.detail is None else [mesh.detail[:, None]])
-    names = ("x", "y", "z", "nx", "ny", "nz", "detail")
-    lines += [f"property float {name}" for name in names[: 6 + (mesh.detail is not None)]]
+    further = {"red green blue": colours} if colours is not None else {"detail": mesh.detail}
+    further = {name: values.reshape(len(values), -1) for name, values in further.items() if values is not None}
+    columns = [mesh.vertices, mesh.normals, *further.values()]
+    names = " ".join(["x y z nx ny nz", *further]).split()
+    lines += [f"property float {name}" for name in names]
     lines += [f"element face {len(mesh.faces)}", "property list uchar int vertex_indices", "property int label"]
     vertices = np.concatenate(columns, axis=1).astype("<f4")
     faces = np.empty(len(mesh.faces), dtype=[("count", "u1"), ("index", "<i4", 3), ("label", "<i4")])

@@ -21,7 +21,7 @@ from factorlib.light.lobes import Lobes
 from factorlib.meshes.mesh import Mesh
 from factorlib.meshes.ply import submesh
 from factorlib.results.materials import Reflectance
-from factorlib.tracing.scene import bsdf, envmap, envmap_of_nodes, rendered, rigid, sensor, shape
+from factorlib.tracing.scene import bsdf, envmap, envmap_of_nodes, paint, rendered, rigid, sensor, shape
 
 UP = np.array([0.0, 1.0, 0.0])
 NEAR = 1e-3  # of the objects' distance
@@ -80,9 +80,12 @@ def shapes(
     for each in objects:
         for label in each.mesh.labels:
             name = each.materials[label - 1]
-            surface = bsdf(Reflectance((0.0,) * 3, (0.0,) * 3, 1.0) if each.name in black else materials[name])
+            material = Reflectance((0.0,) * 3, (0.0,) * 3, 1.0) if each.name in black else materials[name]
+            part = submesh(each.mesh, label)
+            colours = None if part.detail is None else paint(material, part.detail)
+            surface = bsdf(material, painted=colours is not None)
             surface = {"type": "twosided", "bsdf": surface} if each.mesh.open else surface
-            found[f"{each.name}_{label}"] = shape(submesh(each.mesh, label), surface, each.world_from_object)
+            found[f"{each.name}_{label}"] = shape(part, surface, each.world_from_object, colours=colours)
     return found
 
 

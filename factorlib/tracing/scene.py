@@ -43,19 +43,36 @@ class Material(msgspec.Struct, frozen=True):
     roughness: float
 
 
-def bsdf(material: Material | Reflectance) -> dict[str, Any]:
-    """Mitsuba's `blendbsdf` that evaluates to k_d/π + k_s D G / (4 (n·i)(n·o)), without Fresnel."""
+def bsdf(material: Material | Reflectance, painted: bool = False) -> dict[str, Any]:
+    """Mitsuba's `blendbsdf` that evaluates to k_d/π + k_s D G / (4 (n·i)(n·o)), without Fresnel.
+
+    painted: the diffuse part has the colours of the mesh's vertices, which are those of `paint`
+    """
     diffuse, specular = np.array(material.diffuse), np.array(material.specular)
     if not diffuse.any() and not specular.any():
         return {"type": "diffuse", "reflectance": rgb(0.0)}
-    share = specular.max() / (diffuse.max() + specular.max())
+    share = _share(material)
     if share == 1:
         return _conductor(specular, material.roughness)
-    lambertian = {"type": "diffuse", "reflectance": rgb(diffuse / (1 - share))}
+    colour = {"type": "mesh_attribute", "name": "vertex_color"} if painted else rgb(diffuse / (1 - share))
+    lambertian = {"type": "diffuse", "reflectance": colour}
     if share == 0:
         return lambertian
     conductor = _conductor(specular / share, material.roughness)
     return {"type": "blendbsdf", "weight": float(share), "bsdf_0": lambertian, "bsdf_1": conductor}
+
+
+def paint(material: Material | Reflectance, detail: Float[np.ndarray, " v"]) -> Float[np.ndarray, "v 3"]:
+    """Colours of the vertices of a mesh with `detail` for `bsdf`; a reflectance above 1, which Mitsuba's diffuse part has not, is 1."""
+    share = _share(material)
+    colour = np.array(material.diffuse) / (1 - share) if share < 1 else np.zeros(3)
+    return np.minimum(detail[:, None] * colour, 1.0)
+
+
+def _share(material: Material | Reflectance) -> float:
+    """Of the specular part in the mixture; 0 where nothing is reflected."""
+    diffuse, specular = max(material.diffuse), max(material.specular)
+    return specular / (diffuse + specular) if diffuse + specular > 0 else 0.0
 
 
 def _conductor(reflectance: Float[np.ndarray, "3"], roughness: float) -> dict[str, Any]:
@@ -80,11 +97,17 @@ def rigid(rotation: Float[np.ndarray, "3 3"], translation: Sequence[float] | Flo
     return matrix
 
 
-def shape(mesh: Mesh, material: Entry, world_from_object: Matrix = np.eye(4), emitter: Entry | None = None) -> Any:
-    """A mesh as a Mitsuba shape, with its own vertex normals; `material` is a BSDF."""
+def shape(
+    mesh: Mesh,
+    material: Entry,
+    world_from_object: Matrix = np.eye(4),
+    emitter: Entry | None = None,
+    colours: Float[np.ndarray, "v 3"] | None = None,
+) -> Any:
+    """A mesh as a Mitsuba shape, with its own vertex normals; `material` is a BSDF, colours those of the vertices."""
     with TemporaryDirectory() as folder:
         path = Path(folder) / "mesh.ply"
-        write_ply(path, mesh)
+        write_ply(path, mesh, colours)
         entry = {"type": "ply", "filename": str(path), "to_world": transform(world_from_object), "bsdf": material}
         return mitsuba().load_dict(entry | ({"emitter": emitter} if emitter else {}))
 

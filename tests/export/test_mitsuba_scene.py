@@ -9,16 +9,18 @@ from factorlib.conventions import YUP_FROM_CAMERA
 from factorlib.dataset.schema import LightSlice
 from factorlib.export.environment import mitsuba_map, node_directions, sharpened
 from factorlib.export.mitsuba import write_scene
-from factorlib.export.scene import ExposedMap, Scene, Shape
+from factorlib.export.scene import DIRECT, ExposedMap, Scene, Shape
 from factorlib.geometry.camera import Camera
 from factorlib.images.exr import LAT_LONG, read_exr, write_rgb_exr
 from factorlib.light.lobes import Lobes
 from factorlib.meshes.ply import write_ply
 from factorlib.meshes.read import read_mesh
 from factorlib.reflection.reference import Reference
+from factorlib.render.photo_scene import PhotoScene, Placed, traced_photo
 from factorlib.render.reflect import Reflector
 from factorlib.render.resynthesis import light_of, resynthesised
 from factorlib.results.materials import Reflectance, read_materials
+from factorlib.tracing.scene import paint, rigid
 from factorlib.tracing.variant import mitsuba
 from tests.export import made_export
 
@@ -67,6 +69,8 @@ def test_scene_equals_resynthesis(exported, photo):
 
 # in the camera frame
 SIDES = {"right": (1, 0, 0), "left": (-1, 0, 0), "above": (0, -1, 0), "below": (0, 1, 0), "viewer": (0, 0, -1)}
+SQUARE = Camera(32, 32, 70.0, (16.0, 16.0))
+PLACE = rigid(np.eye(3), np.array([0.0, 0.0, 5.0]))  # of the ball before the camera
 MATT = Reflectance((0.5, 0.5, 0.5), (0, 0, 0), 0.5)
 
 
@@ -82,11 +86,9 @@ def folder(tmp_path_factory):
 def ball_scene(folder, material: Reflectance, lobes: Lobes, two_sided: bool = False, camera_from_light=np.eye(3)):
     """A ball in front of a square camera, through a scene file."""
     write_rgb_exr(folder / "light.exr", mitsuba_map(lobes, 64, 128), LAT_LONG)
-    place = np.eye(4)
-    place[2, 3] = 5.0
-    shape = Shape("ball", "ball.red.ply", "red", place, two_sided)
+    shape = Shape("ball", "ball.red.ply", "red", PLACE, two_sided)
     light = ExposedMap("light.exr", np.ones(3), camera_from_light)
-    write_scene(folder / "scene.xml", Scene(Camera(32, 32, 70.0, (16.0, 16.0)), [shape], {"red": material}, light))
+    write_scene(folder / "scene.xml", Scene(SQUARE, [shape], {"red": material}, light))
     return folder / "scene.xml"
 
 
@@ -134,6 +136,33 @@ def test_each_kind_of_material_loads_and_reflects_as_solved(folder, case, two_si
     expected = Reflector(Reference(tolerance=1e-3), constant)(CASES[case], middle, middle)[0]
     np.testing.assert_allclose(picture, expected, rtol=0.02)  # the ball's middle against its very centre
     assert (picture > 0).all() == (case != "black")
+
+
+def test_detail_of_reflectance_is_a_factor_on_the_diffuse_part_in_scenes_that_are_written_and_that_are_traced(folder):
+    """The upper half of a ball at half its diffuse reflectance: pictures of it are halves of those of both materials."""
+    material, light = CASES["all of it"], Lobes(np.array([[0.0, 0.0, -1.0]]), np.array([0.1]), np.ones((1, 3)))
+    ball = read_mesh(folder / "ball.obj", ["red"], "red")
+    detail = np.where(ball.vertices[:, 1] > 0, 0.5, 1.0)
+    whole = rendered(ball_scene(folder, material, light), spp=256)
+    halved = msgspec.structs.replace(material, diffuse=tuple(k / 2 for k in material.diffuse))
+    half = rendered(ball_scene(folder, halved, light), spp=256)
+    path = ball_scene(folder, material, light)
+    write_ply(folder / "painted.ply", ball, paint(material, detail))
+    path.write_text(path.read_text().replace("ball.red.ply", "painted.ply"))
+    plain = rendered(path, spp=256)  # colours that no material asks for change nothing
+    np.testing.assert_allclose(plain[10:22, 10:22].mean((0, 1)), whole[10:22, 10:22].mean((0, 1)), rtol=0.01)
+    shape = Shape("ball", "painted.ply", "red", PLACE, False, painted=True)
+    write_scene(path, Scene(SQUARE, [shape], {"red": material}, ExposedMap("light.exr", np.ones(3), np.eye(3))))
+    written = rendered(path, spp=256)
+    placed = Placed(
+        "ball", msgspec.structs.replace(ball, detail=detail), ("red",), rigid(YUP_FROM_CAMERA, [0.0, 0.0, -5.0])
+    )
+    traced = traced_photo(PhotoScene(SQUARE, (placed,), light, {"red": material}, DIRECT), 256)[..., :3]
+    upper, lower = slice(20, 24), slice(8, 12)  # the object's y is the camera's, which points down
+    for picture in (written, traced):
+        np.testing.assert_allclose(picture[upper, 12:20].mean((0, 1)), half[upper, 12:20].mean((0, 1)), rtol=0.02)
+        np.testing.assert_allclose(picture[lower, 12:20].mean((0, 1)), whole[lower, 12:20].mean((0, 1)), rtol=0.02)
+    assert (whole[upper, 12:20] > 1.1 * half[upper, 12:20]).all()
 
 
 # the map ---------------------------------------------------------------------------------------------------------------

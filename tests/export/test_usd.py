@@ -8,7 +8,7 @@ import pytest
 
 from factorlib.conventions import YUP_FROM_CAMERA, lat_long_directions
 from factorlib.export.scene import ExposedMap, Scene, Shape
-from factorlib.export.usd import identifiers, shader_inputs, write_usd_mesh, write_usd_scene
+from factorlib.export.usd import colours, identifiers, shader_inputs, write_usd_mesh, write_usd_scene
 from factorlib.geometry.camera import Camera
 from factorlib.images.exr import read_rgb_exr
 from factorlib.meshes.mesh import Mesh
@@ -79,6 +79,21 @@ def test_shader_reflects_what_was_solved_at_normal_incidence(material):
     np.testing.assert_allclose(f0, material.specular)
     np.testing.assert_allclose(diffuse, material.diffuse)
     assert found["roughness"] == (material.roughness if any(material.specular) else 1.0)
+
+
+def test_painted_shapes_read_their_colours_and_others_of_the_material_do_not(tmp_path):
+    shapes = [Shape(f"{name}.red", "a.ply", "red", np.eye(4), False, name == "old") for name in ("new", "old")]
+    light = ExposedMap("a.exr", np.ones(3), np.eye(3))
+    write_usd_scene(tmp_path / "s.usda", Scene(Camera(64, 48, 100.0, (30.0, 20.0)), shapes, {"red": GLOSSY}, light))
+    text = (tmp_path / "s.usda").read_text()
+    assert text.count("UsdPrimvarReader_float3") == 1 and text.count("inputs:diffuseColor.connect") == 1
+    assert set(re.findall(r"binding = </scene/materials/(\w+)>", text)) == {"red", "red__painted_"}
+    mesh = Mesh(np.eye(3), np.array([[0, 1, 2]], np.int32), np.eye(3), np.ones(1, np.int16))
+    write_usd_mesh(tmp_path / "m.usda", mesh, colours(GLOSSY, np.array([1.0, 0.5, 9.0])))
+    found = re.search(r"displayColor = \[(.*)\]", (tmp_path / "m.usda").read_text())[1]
+    found = np.array(json.loads(f"[{found}]".replace("(", "[").replace(")", "]")))
+    base = shader_inputs(GLOSSY)["diffuseColor"]
+    np.testing.assert_allclose(found, [base, base / 2, np.minimum(9 * base, 1)], rtol=1e-6)
 
 
 def test_numbers_of_a_mesh_are_those_of_float32(tmp_path):
