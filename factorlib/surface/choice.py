@@ -5,7 +5,7 @@ start      materials and lights are fitted on few cells, with the shadows and bo
 stiffness  of each of `TURNS`, from stiff to soft, turns are found from all photos but one, for every photo in turn; that photo then gets a light of its
            own, with the materials given.  The stiffness is used with which the photos are likeliest, lights integrated out (`factorlib.solve.marginal`)
 whether    turns are kept where the likelihood is higher than without turns, and the photos' held-out observations are explained better by more than `FOR`
-           standard errors over clusters (`factorlib.solve.evidence`)
+           standard errors over clusters (`factorlib.solve.evidence`).  Of several meshes, those stay with which alone neither is better
 paint      factors on the diffuse reflectance likewise, of a stiffness of `FACTORS`, beside the turns and over what these explain; they are kept where the
            likelihood is higher by more than `FOR` standard errors over photos, and held-out observations are explained better too.  The likelihood is the
            finer measure.  Of turns it takes too many: a light that is fitted makes up for a wrong normal, but not for dirt
@@ -16,11 +16,11 @@ surface    at last the displacement whose normals come nearest to the turned one
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 
 import msgspec
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from scipy.sparse import block_diag, csr_array
 
 from factorlib.light.prior import LightPrior
@@ -77,8 +77,14 @@ class Surfaces(msgspec.Struct, frozen=True):
         return {name: values[k : k + self.meshes[name].nodes] for name, k in self.first.items()}
 
     def turns_of(self, displacements: dict[str, Float[np.ndarray, " n"]]) -> Float[np.ndarray, "v 3"]:
-        """The turns that displacements mean."""
-        return np.vstack([mesh.turn_of(displacements[name]) for name, mesh in self.meshes.items()])
+        """The turns that displacements mean; a mesh without any stays."""
+        still = {name: np.zeros((mesh.nodes, 3)) for name, mesh in self.meshes.items()}
+        moved = {name: self.meshes[name].turn_of(of) for name, of in displacements.items()}
+        return np.vstack(list((still | moved).values()))
+
+    def nodes_of(self, names: Iterable[str]) -> Bool[np.ndarray, " v"]:
+        """Which nodes are of these meshes."""
+        return np.concatenate([np.full(mesh.nodes, name in names) for name, mesh in self.meshes.items()])
 
 
 class Found(msgspec.Struct, frozen=True):
@@ -112,6 +118,12 @@ class Judged(msgspec.Struct, frozen=True):
         return float(gains.mean() / max(gains.std(ddof=1) / np.sqrt(len(gains)), 1e-12))
 
 
+def evidence_of(after: Judged, before: Judged, held_out: float, likelihood: float) -> Evidence:
+    """Whether detail is kept: better by more than so many standard errors in each of the two measures."""
+    evidence = compare(before.losses, after.losses, held_out)
+    return msgspec.structs.replace(evidence, kept=evidence.kept and after.gain_over(before) > likelihood)
+
+
 class Trial(msgspec.Struct, frozen=True):
     """A problem without detail, its fit, and what its blocks are attached to."""
 
@@ -132,6 +144,11 @@ class Trial(msgspec.Struct, frozen=True):
         nodes = self.surfaces.nodes
         return list(self.problem.spread(lambda one: part_of(*one[:2], self.prior, one[2], nodes), list(each)))
 
+    def moving(self, detail: Detail, meshes: set[str]) -> Detail:
+        """The detail with the turns of these meshes alone."""
+        turn = np.where(self.surfaces.nodes_of(meshes)[:, None], detail.turn, 0.0)
+        return msgspec.structs.replace(detail, turn=turn)
+
     @property
     def photos(self) -> list[tuple[int, int]]:
         """Each photo that has observations: its block and its number there."""
@@ -142,28 +159,29 @@ class Trial(msgspec.Struct, frozen=True):
         """Of these photos."""
         return [self.problem.blocks[k].photos[j] for k, j in self.photos]
 
-    def judged(self, detail: Callable[[int, int], Detail]) -> Judged:
-        """Every photo by itself, on the surface that `detail` has for it, in a light of its own, with the materials given."""
+    def judged(self, details: Sequence[Detail]) -> Judged:
+        """Every photo by itself, on the surface that `details` has for it, in a light of its own, with the materials given."""
 
-        def alone(photo: tuple[int, int]) -> tuple[float, Losses]:
+        def alone(of: tuple[tuple[int, int], Detail]) -> tuple[float, Losses]:
             """One photo's value and losses."""
-            k, number = photo
+            (k, number), detail = of
             own, counts = self.problem.blocks[k].photo == number, [self.fit.hyperparameters[k]]
-            block = detail(k, number).on(self.problem.blocks[k].take(own), self.attached[k].take(own))
+            block = detail.on(self.problem.blocks[k].take(own), self.attached[k].take(own))
             problem = self.problem.of([block])
             begun = Fit(Point(self.fit.point.materials, [self.fit.point.lights[k]]), counts)
             point = fitted(problem, begun, self.prior, OWN_LIGHT).point
             (one,) = problem.fitted().illuminations(point)
             return marginal(field_of(one, counts[0], self.prior)).value, losses_of(problem, point)
 
-        values, losses = zip(*self.problem.spread(alone, self.photos), strict=True)
+        values, losses = zip(*self.problem.spread(alone, list(zip(self.photos, details, strict=True))), strict=True)
         return Judged(np.array(values), Losses(*([of[i][0] for of in losses] for i in (0, 1))))
 
-    def left_out(self, parts: list[Part], laplacian: csr_array, stiffness: Stiffness) -> Judged:
-        """Every photo on the surface that all others ask for; parts: of the mesh itself."""
+    def left_out(self, parts: list[Part], laplacian: csr_array, stiffness: Stiffness) -> list[Detail]:
+        """For every photo the surface that all others ask for; parts: of the mesh itself."""
 
-        def others(k: int, number: int) -> Detail:
+        def others(photo: tuple[int, int]) -> Detail:
             """The detail that one photo has no part in."""
+            k, number = photo
             gone = [(block.photo == number) & (j == k) for j, block in enumerate(self.problem.blocks)]
             rest = [part.without(rows) if rows.any() else part for part, rows in zip(parts, gone, strict=True)]
             found = step(
@@ -173,7 +191,7 @@ class Trial(msgspec.Struct, frozen=True):
             moved = self.surfaces.displacements(found.turn, seen)
             return Detail(self.surfaces.turns_of(moved), found.log_factor)
 
-        return self.judged(others)
+        return list(self.problem.spread(others, self.photos))
 
 
 def found(
@@ -202,28 +220,35 @@ def found(
     trial, plain = Trial(effects.of(problem), fit, surfaces, attached, prior), no_detail(surfaces.nodes)
     if len(trial.photos) < 2 or problem.none_held_out:
         return Found(Evidence(False))
-    laplacian, parts, given = surfaces.laplacian(), trial.parts(plain, fit), trial.judged(lambda k, number: plain)
+    laplacian, parts, given = surfaces.laplacian(), trial.parts(plain, fit), trial.judged([plain] * len(trial.photos))
 
     def best(
         tried: list[Stiffness], before: Judged, done: float, held_out: float, likelihood: float
-    ) -> tuple[Stiffness, Judged, Evidence]:
-        """The likeliest of several stiffnesses, what photos say of it, and whether it is kept.
+    ) -> tuple[Stiffness, list[Detail], Judged, Evidence]:
+        """The likeliest of several stiffnesses, the surfaces it gives each photo, what photos say of them, and whether they are kept.
 
         before: what photos say without it;  held_out, likelihood: by how many standard errors it must be better, in each of the two measures
         """
-        judged = []
+        details, judged = [], []
         for number, one in enumerate(tried):
             report(done + 0.3 * number / len(tried), f"left-out photos, stiffness {one.factor or one.turn:g}")
-            judged.append(trial.left_out(parts, laplacian, one))
+            details.append(trial.left_out(parts, laplacian, one))
+            judged.append(trial.judged(details[-1]))
         k = min(range(len(tried)), key=lambda i: round(float(judged[i].values.sum()), 3))
-        evidence = compare(before.losses, judged[k].losses, held_out)
-        kept = evidence.kept and judged[k].gain_over(before) > likelihood
-        return tried[k], judged[k], msgspec.structs.replace(evidence, kept=kept)
+        return tried[k], details[k], judged[k], evidence_of(judged[k], before, held_out, likelihood)
 
-    stiffness, moved, evidence = best([Stiffness(a) for a in TURNS], given, 0.2, FOR, 0.0)
+    stiffness, turned, moved, evidence = best([Stiffness(a) for a in TURNS], given, 0.2, FOR, 0.0)
+    moving = set(surfaces.meshes)
+    if len(surfaces.meshes) > 1:  # those stay that, moved alone, are against it
+        report(0.48, "mesh by mesh")
+        alone = {name: trial.judged([trial.moving(of, {name}) for of in turned]) for name in surfaces.meshes}
+        moving = {name for name, judged in alone.items() if evidence_of(judged, given, 0.0, 0.0).kept}
+        if 0 < len(moving) < len(surfaces.meshes):
+            moved = trial.judged([trial.moving(of, moving) for of in turned])
+            evidence = evidence_of(moved, given, FOR, 0.0)
     now = (stiffness, moved) if evidence.kept else (Stiffness(None), given)
     tried = [Stiffness(now[0].turn, a) for a in FACTORS]
-    both, paint, painted = best(tried, now[1], 0.5, 0.0, FOR)
+    both, _, paint, painted = best(tried, now[1], 0.5, 0.0, FOR)
     stiffness, judged = (both, paint) if painted.kept else now
     gains = dict(zip(trial.names, (given.values - judged.values).tolist(), strict=True))
     if not (evidence.kept or painted.kept):
@@ -234,7 +259,8 @@ def found(
         if number:
             fit = fitted(trial.on(detail), fit, prior, BETWEEN)
             parts = trial.parts(detail, fit)
-        detail = step(parts, laplacian, stiffness, detail)
+        detail = step(parts, laplacian, stiffness, detail, surfaces.nodes_of(moving))
     displacements = surfaces.displacements(detail.turn, attached) if evidence.kept else {}
+    displacements = {name: of for name, of in displacements.items() if name in moving}
     factors = surfaces.by_mesh(detail.log_factor) if painted.kept else {}
     return Found(evidence, painted, stiffness, gains, displacements, factors)

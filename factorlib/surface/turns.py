@@ -211,12 +211,19 @@ class Stiffness(msgspec.Struct, frozen=True):
     factor: float | None = None
 
 
-def step(parts: Sequence[Part], laplacian: csr_array, stiffness: Stiffness, at: Detail) -> Detail:
-    """The detail that minimises (2), where the parts were linearised `at` one."""
+def step(
+    parts: Sequence[Part],
+    laplacian: csr_array,
+    stiffness: Stiffness,
+    at: Detail,
+    moving: Bool[np.ndarray, " v"] | None = None,
+) -> Detail:
+    """The detail that minimises (2), where the parts were linearised `at` one; moving: nodes whose normals may turn, None for all."""
     v, both = len(at.log_factor), np.concatenate([at.turn.reshape(-1), at.log_factor])
     roughness = csr_array(laplacian + PULL * eye_array(v))
     prior = block_diag([kron((stiffness.turn or 0) * roughness, np.eye(3)), (stiffness.factor or 0) * roughness])
-    free = np.repeat([stiffness.turn is not None, stiffness.factor is not None], [3 * v, v])
+    turning = np.repeat(np.ones(v, bool) if moving is None else moving, 3) & (stiffness.turn is not None)
+    free = np.append(turning, np.full(v, stiffness.factor is not None))
     slopes, prior = [part.slopes[:, free] for part in parts], prior.tocsr()[free][:, free]
     right, diagonal = -(prior @ both[free]), prior.diagonal()
     for part, J in zip(parts, slopes, strict=True):

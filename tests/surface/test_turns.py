@@ -185,6 +185,29 @@ def test_dents_that_the_object_has_not_are_found_in_three_lights():
         assert after < 0.6 * before, (before, after)
 
 
+def test_of_two_meshes_the_one_with_dents_is_moved_and_the_exact_one_stays():
+    true = [on_even_cells(drawn(100 + k, 120)) for k in range(3)]
+    problem, (one,) = spheres(true, size=18, seed=1), surfaces().meshes.values()
+    body, given, at = Surfaces({"dented": one, "exact": one}), [], []
+    for block in problem.blocks:
+        exact = block.material == block.material.max()
+        assert 0 < exact.sum() < len(block)
+        given.append(
+            msgspec.structs.replace(block, normal=np.where(exact[:, None], block.normal, wrong(block.normal, 0.15)))
+        )
+        own = attached_to(block.normal, surfaces())
+        at.append(msgspec.structs.replace(own, node=own.node + one.nodes * exact[:, None]))
+    what = found(problem.of(given), body, at, from_nothing(3), PRIOR)
+    assert what.evidence.kept and set(what.displacements) == {"dented"}
+    turn = body.turns_of(what.displacements)
+    assert turn[body.nodes_of({"dented"})].any() and not turn[body.nodes_of({"exact"})].any()
+    for block, shown, own in zip(problem.blocks, given, at, strict=True):
+        dented = block.material < block.material.max()
+        after = own.turned(shown.normal, shown.view, turn)
+        assert errors(after[dented], block.normal[dented]) < 0.7 * errors(shown.normal[dented], block.normal[dented])
+        np.testing.assert_allclose(after[~dented], shown.normal[~dented], atol=1e-12)
+
+
 def test_patina_is_found_in_three_lights_and_is_not_taken_for_dents():
     true = [on_even_cells(drawn(k, 120)) for k in range(3)]
     body, problem = surfaces(), spheres(true, size=18)
