@@ -1,13 +1,16 @@
 """Cameras by structure from motion: a body at rest, one that turns before a camera at rest, and photos that do not overlap."""
 
+import msgspec
 import numpy as np
 import pytest
 
 from factorlib.errors import InputError
 from factorlib.generate.shapes import SHAPES
 from factorlib.geometry.camera import angle_between
-from factorlib.shapes.motion import cameras_by_motion
-from tests.shapes.made import looking_from, views_of
+from factorlib.shapes.hull import agreement
+from factorlib.shapes.motion import LEAST_AGREEMENT, cameras_by_motion
+from factorlib.shapes.primitive import unit
+from tests.shapes.made import looking_from, outline, views_of
 
 BLOB = SHAPES["blob"]()
 POSES = [looking_from(20 + 15 * (k % 2), 18.0 * k) for k in range(5)]
@@ -37,6 +40,15 @@ def test_cameras_about_a_body_at_rest_are_found_and_are_the_same_each_time():
 def test_of_a_body_that_turns_before_a_camera_at_rest_the_ground_that_stands_still_is_not_believed():
     found = cameras_by_motion(views_of(BLOB, POSES, [POSES[0]] * len(POSES), 480))
     assert len(found) >= 3 and max(turns_off(found)) < 3.0
+
+
+def test_a_hull_agrees_with_its_masks_where_cameras_move_with_the_body_alone():
+    bar = unit("box", np.array([1.0, 0.3, 0.3])).as_mesh()
+    moving = [outline(bar, pose, True) for pose in POSES]
+    still = [msgspec.structs.replace(one, pose=POSES[0]) for one in moving]
+    barely = [msgspec.structs.replace(one, pose=looking_from(20, 0.2 * k)) for k, one in enumerate(moving)]
+    assert agreement(moving) > 0.9 and agreement(still) == 0.0  # all from the same side
+    assert agreement(barely) < LEAST_AGREEMENT
 
 
 def test_photos_that_do_not_overlap_are_refused():
