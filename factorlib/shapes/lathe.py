@@ -263,15 +263,12 @@ def mesh_of(profile: Profile) -> Triangles:
     if len(profile) < 3:
         cure = "are its masks and poses of the same object, and is it turned about the y of its poses?"
         raise InputError("no body of revolution fits into its outlines", cure=cure)
-    half = np.diff(profile[:, 0]).mean() / 2
-    ends = profile[[0, -1]] + np.array([[-half, 0.0], [half, 0.0]])
-    rings = np.concatenate([ends[:1], profile, ends[1:]])
     angle = np.arange(COLUMNS) * 2 * np.pi / COLUMNS
     z, x = np.cos(angle), np.sin(angle)
     points = np.stack(
-        [np.outer(rings[:, 1], x), np.repeat(rings[:, :1], COLUMNS, axis=1), np.outer(rings[:, 1], z)], axis=-1
+        [np.outer(profile[:, 1], x), np.repeat(profile[:, :1], COLUMNS, axis=1), np.outer(profile[:, 1], z)], axis=-1
     )
-    index = np.arange(points[..., 0].size).reshape(len(rings), COLUMNS)
+    index = np.arange(points[..., 0].size).reshape(len(profile), COLUMNS)
     right = np.roll(index, -1, axis=1)
     a, b, c, d = index[:-1].ravel(), right[:-1].ravel(), index[1:].ravel(), right[1:].ravel()
     bottom, top = index.size, index.size + 1
@@ -279,7 +276,7 @@ def mesh_of(profile: Profile) -> Triangles:
         np.column_stack([right[0], index[0], np.full(COLUMNS, bottom)]),
         np.column_stack([index[-1], right[-1], np.full(COLUMNS, top)]),
     ])  # fmt: skip
-    vertices = np.concatenate([points.reshape(-1, 3), [[0, rings[0, 0], 0], [0, rings[-1, 0], 0]]])
+    vertices = np.concatenate([points.reshape(-1, 3), [[0, profile[0, 0], 0], [0, profile[-1, 0], 0]]])
     return of_one_part(vertices, np.concatenate([np.column_stack([a, b, d]), np.column_stack([a, d, c]), caps]))
 
 
