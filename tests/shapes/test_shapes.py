@@ -98,6 +98,7 @@ def profile(vertices, flip=False):
     return (height[order] - height.min()) / np.ptp(height), radius[order] / np.ptp(height)
 
 
+@pytest.mark.long
 def test_a_vase_by_lathe_has_the_vase_s_profile():
     shape = body_of_revolution([outline(VASE, looking_from(e, a), False) for e, a in ((5, 0), (45, 50))])
     assert shape.overlap > 0.98 and solid(shape).is_watertight and solid(shape).volume > 0

@@ -14,7 +14,7 @@ from factorlib.solve.fit import ROBUST, Hyperparameters, field_of
 from factorlib.solve.start import from_nothing
 from factorlib.surface import turns
 from factorlib.surface.choice import Found, Surfaces, found
-from factorlib.surface.turns import GRAZING, MOST, PULL, Attached, Detail, Stiffness, joined, part_of, step
+from factorlib.surface.turns import GRAZING, MOST, PULL, Attached, Detail, Stiffness, joined, no_detail, part_of, step
 from studies.scenes.problems import MATERIALS
 from tests.model.made import photos_in_a_wrong_light
 from tests.solve.made import PRIOR, begun, drawn, on_even_cells, photographed, spheres
@@ -120,6 +120,18 @@ def test_a_step_is_that_of_the_dense_system_of_detail_and_lights(stiffness, monk
     assert np.array_equal(given[~free], before[~free])
 
 
+def test_nodes_that_may_not_move_keep_their_turn():
+    problem, _, body = *photographed(2, 2, size=9), surfaces(1)
+    problem = with_wrong_normals(problem, 0.1)
+    parts = [
+        part_of(one, COUNTS, PRIOR, attached_to(one.block.normal, body), body.nodes)
+        for one in problem.illuminations(begun(problem).point)
+    ]
+    moving = np.arange(body.nodes) % 2 == 0
+    after = step(parts, body.laplacian(), Stiffness(50.0), no_detail(body.nodes), moving)
+    assert after.turn[moving].any(axis=1).all() and not after.turn[~moving].any()
+
+
 def test_a_light_without_some_observations_is_that_light_linearised_without_them():
     one, body = photos_in_a_wrong_light("bounced", curves=True), surfaces(1)
     at, gone = attached_to(one.block.normal, body), one.block.photo == 1
@@ -185,6 +197,7 @@ def test_dents_that_the_object_has_not_are_found_in_three_lights():
         assert after < 0.6 * before, (before, after)
 
 
+@pytest.mark.long
 def test_of_two_meshes_the_one_with_dents_is_moved_and_the_exact_one_stays():
     true = [on_even_cells(drawn(100 + k, 120)) for k in range(3)]
     problem, (one,) = spheres(true, size=18, seed=1), surfaces().meshes.values()
