@@ -12,11 +12,13 @@ import msgspec
 import numpy as np
 
 from factorlib.align.given import camera_of
+from factorlib.align.refine import FocalPrior
 from factorlib.align.search import focal_prior
 from factorlib.align.silhouette import UNKNOWN, silhouette_of_object
 from factorlib.dataset.check import ALL_OF_IT
 from factorlib.dataset.schema import ExternalCamera, MeshEntry, ObjectEntry, ObjectsSlice, Pose, ShapesSlice
 from factorlib.errors import InputError
+from factorlib.geometry.camera import Camera
 from factorlib.geometry.camera import Pose as PoseArrays
 from factorlib.images.exr import read_exr
 from factorlib.images.transfer import srgb_encode
@@ -25,7 +27,7 @@ from factorlib.results.photos import read_photo_facts
 from factorlib.results.shapes import FILE, ShapeEntry, ShapesTable
 from factorlib.shapes.hull import visual_hull
 from factorlib.shapes.lathe import body_of_revolution
-from factorlib.shapes.motion import Placed, View, cameras_by_motion
+from factorlib.shapes.motion import Registered, View, cameras_by_motion
 from factorlib.shapes.outline import Outline, Triangles, write_obj
 from factorlib.shapes.primitive import primitive
 from factorlib.stage import Inputs, Progress
@@ -92,7 +94,7 @@ def shape_of(entry: MeshEntry, outlines: list[Outline], params: Params, report: 
     """What the outlines say of a mesh's shape."""
     if not outlines:
         raise InputError(
-            "no photo's mask shows it", cure="is its material the one of the mask's label? Else take it out"
+            "no photo's mask shows it", cure="is its material that of a label in the masks? Else take it out"
         )
     if entry.hull:
         known = [one for one in outlines if one.pose is not None]
@@ -122,25 +124,27 @@ class Photo:
         radiance = np.stack([channels[c] for c in "RGB"], axis=-1).mean(axis=-1)
         white = max(float(np.quantile(radiance[np.isfinite(radiance)], 0.99)), 1e-12)
         grey = srgb_encode(np.clip(np.nan_to_num(radiance) / white, 0, 1))
-        return View(
+        pixels, objects, left_out = (
             np.round(grey * 255).astype(np.uint8),
             channels["label"] > 0.5,
             channels["left_out"] > 0.5,
-            self.facts.focal_px,
         )
+        return View(pixels, objects, left_out, *self.camera(None))
 
-    def external(self, placed: Placed, meshes: dict[str, MeshEntry]) -> ExternalCamera:
+    def camera(self, external: ExternalCamera | None) -> tuple[Camera, FocalPrior]:
+        """The camera at the likeliest focal length, and what is known of that."""
+        camera, known = camera_of(msgspec.structs.replace(self.own, external=external), self.facts, self.name)
+        prior = focal_prior(known.focal, known.source, camera.width, camera.height)
+        return msgspec.structs.replace(camera, focal=prior.focal), prior
+
+    def external(self, placed: Registered, meshes: dict[str, MeshEntry]) -> ExternalCamera:
         """The camera in pixels of the photo's file; hulls are made in the world's frame."""
-        rotation, translation = (
-            tuple(map(tuple, placed.pose.rotation.tolist())),
-            tuple(placed.pose.translation.tolist()),
-        )
-        hulls = [obj.name for obj in self.own.objects if obj.mesh in meshes and meshes[obj.mesh].hull]
-        poses = {name: Pose(rotation, translation) for name in hulls}
+        pose = Pose(tuple(map(tuple, placed.pose.rotation.tolist())), tuple(placed.pose.translation.tolist()))
+        poses = {obj.name: pose for obj in self.own.objects if obj.mesh in meshes and meshes[obj.mesh].hull}
         return ExternalCamera("sfm", placed.focal * self.facts.factor, None, None, poses)
 
     def outlines(self, mesh: str, entry: MeshEntry, by_motion: ExternalCamera | None) -> list[Outline]:
-        """Of each object of that mesh."""
+        """The outline of each object of that mesh."""
         outlines, channels = [], None
         for number, obj in enumerate(self.own.objects, start=1):
             if obj.mesh == mesh:
@@ -154,11 +158,7 @@ class Photo:
                 part[(label > 0) & (part == 0)] = UNKNOWN
                 pose = obj.pose or (external.poses.get(obj.name) if external else None)
                 arrays = PoseArrays(np.array(pose.rotation), np.array(pose.translation)) if pose else None
-                camera, known = camera_of(msgspec.structs.replace(self.own, external=external), self.facts, self.name)
-                prior = focal_prior(known.focal, known.source, camera.width, camera.height)
-                outlines.append(
-                    Outline(self.name, part, msgspec.structs.replace(camera, focal=prior.focal), prior, arrays)
-                )
+                outlines.append(Outline(self.name, part, *self.camera(external), arrays))
         return outlines
 
     def _labels(self, obj: ObjectEntry, entry: MeshEntry) -> list[int]:

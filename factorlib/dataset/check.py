@@ -150,6 +150,8 @@ def _check_photo(key: str, photo: PhotoEntry, spec: DatasetFile, refuse: Refusal
                     "does not go with a primitive, whose size it would have to fit",
                     "leave it out: it is found",
                 )
+        if obj.pose is not None and spec.meshes[obj.mesh].lathe and spec.meshes[obj.mesh].size != 1.0:
+            refuse(f"{of}.pose", f"does not go with meshes.{obj.mesh}.size: poses say how large it is", "keep one")
         if obj.keypoints and not spec.meshes[obj.mesh].file:
             refuse(
                 f"{of}.keypoints",

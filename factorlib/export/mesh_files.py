@@ -30,7 +30,7 @@ class MeshFiles:
         scenes: Path,
         materials: list[str],
         crease_deg: float,
-        solved: Mapping[str, Reflectance] = {},
+        solved: Mapping[str, Reflectance],
     ):
         self.scenes, self.materials, self.solved = scenes, materials, solved
         own = read_surface(inputs.folders.get("surface"))

@@ -16,8 +16,7 @@ import open3d as o3d
 from jaxtyping import Float
 from scipy.interpolate import CubicSpline, PchipInterpolator
 
-from factorlib.generate.shapes import smooth
-from factorlib.meshes.mesh import Mesh
+from factorlib.meshes.mesh import Mesh, smooth
 from factorlib.yamlfile import read_yaml
 
 Part = tuple[np.ndarray, np.ndarray]  # vertices [V, 3], faces [F, 3]

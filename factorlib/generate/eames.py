@@ -21,9 +21,9 @@ from factorlib.dataset.schema import LEFT_OUT
 from factorlib.generate import folder, lights
 from factorlib.generate.chair import bent_chair, chair, labelled, rough_chair
 from factorlib.generate.lights import EYE, Rng, SceneDict, random_materials
-from factorlib.generate.shapes import smooth
 from factorlib.geometry.camera import Camera, Pose
 from factorlib.geometry.raster import rasterise
+from factorlib.meshes.mesh import smooth
 from factorlib.meshes.ply import submesh
 from factorlib.tracing.scene import Material, bsdf, envmap, light_seen, look, rigid, shape, traced, transform
 from factorlib.yamlfile import read_yaml

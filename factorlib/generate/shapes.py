@@ -13,7 +13,7 @@ import numpy as np
 from jaxtyping import Float
 from scipy.interpolate import PchipInterpolator
 
-from factorlib.meshes.mesh import Mesh, area_vectors
+from factorlib.meshes.mesh import Mesh, closed_grid
 
 ROWS, COLUMNS = 60, 96
 
@@ -61,29 +61,6 @@ def revolved(profile: Float[np.ndarray, "n 2"]) -> Mesh:
     radius, y = curve[:, :1], curve[:, 1:]
     points = np.stack(np.broadcast_arrays(radius * np.sin(phi), y, radius * np.cos(phi)), axis=-1)
     return closed_grid(points, np.array([0.0, profile[0, 1], 0.0]), np.array([0.0, profile[-1, 1], 0.0]))
-
-
-def closed_grid(points: Float[np.ndarray, "r c 3"], top: np.ndarray, bottom: np.ndarray) -> Mesh:
-    """Triangles of rows of points that run about y from +z toward +x, first row at the top, closed by two poles."""
-    rows, columns = points.shape[:2]
-    index = np.arange(rows * columns).reshape(rows, columns)
-    right = np.roll(index, -1, axis=1)
-    a, b, c, d = index[:-1], right[:-1], index[1:], right[1:]
-    last = rows * columns
-    cap = np.stack([right[0], np.full(columns, last), index[0]], axis=-1)
-    base = np.stack([index[-1], np.full(columns, last + 1), right[-1]], axis=-1)
-    sides = np.concatenate([np.stack([a, c, d], axis=-1), np.stack([a, d, b], axis=-1)]).reshape(-1, 3)
-    vertices = np.concatenate([points.reshape(-1, 3), [top, bottom]])
-    return smooth(vertices, np.concatenate([sides, cap, base]))
-
-
-def smooth(vertices: Float[np.ndarray, "v 3"], faces: np.ndarray, label: np.ndarray | int = 1) -> Mesh:
-    """A mesh with normals averaged over the faces about each vertex, weighted by area."""
-    normals = np.zeros_like(vertices)
-    for corner in range(3):
-        np.add.at(normals, faces[:, corner], area_vectors(vertices, faces))
-    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
-    return Mesh(vertices, faces.astype(np.int32), normals, np.broadcast_to(label, len(faces)).astype(np.int16))
 
 
 SHAPES: dict[str, Callable[[], Mesh]] = {

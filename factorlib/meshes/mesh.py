@@ -65,3 +65,26 @@ def area_vectors(vertices: Float[np.ndarray, "v 3"], faces: Int[np.ndarray, "f 3
     """
     a, b, c = (vertices[faces[:, k]] for k in range(3))
     return np.cross(b - a, c - a) / 2
+
+
+def closed_grid(points: Float[np.ndarray, "r c 3"], top: np.ndarray, bottom: np.ndarray) -> Mesh:
+    """Triangles of rows of points that run about y from +z toward +x, first row at the top, closed by two poles."""
+    rows, columns = points.shape[:2]
+    index = np.arange(rows * columns).reshape(rows, columns)
+    right = np.roll(index, -1, axis=1)
+    a, b, c, d = index[:-1], right[:-1], index[1:], right[1:]
+    last = rows * columns
+    cap = np.stack([right[0], np.full(columns, last), index[0]], axis=-1)
+    base = np.stack([index[-1], np.full(columns, last + 1), right[-1]], axis=-1)
+    sides = np.concatenate([np.stack([a, c, d], axis=-1), np.stack([a, d, b], axis=-1)]).reshape(-1, 3)
+    vertices = np.concatenate([points.reshape(-1, 3), [top, bottom]])
+    return smooth(vertices, np.concatenate([sides, cap, base]))
+
+
+def smooth(vertices: Float[np.ndarray, "v 3"], faces: np.ndarray, label: np.ndarray | int = 1) -> Mesh:
+    """A mesh with normals averaged over the faces about each vertex, weighted by area."""
+    normals = np.zeros_like(vertices)
+    for corner in range(3):
+        np.add.at(normals, faces[:, corner], area_vectors(vertices, faces))
+    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
+    return Mesh(vertices, faces.astype(np.int32), normals, np.broadcast_to(label, len(faces)).astype(np.int16))

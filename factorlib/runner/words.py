@@ -87,7 +87,9 @@ def graph_lines(pipeline: Pipeline, mermaid: bool = False) -> list[str]:
     lines = []
     for name, stage in stages.items():
         over, inputs = f"per {stage.over}" if stage.over else "whole set", ", ".join(stage.inputs)
-        optional = "   (only when asked for)" if stage.optional else ""
+        optional = (
+            "   (only when asked for)" if stage.optional else "   (only for sets that need it)" if stage.when else ""
+        )
         lines.append(f"{name:<10} {over:<10} <- {inputs or '(parameters only)'}{optional}")
     return lines
 

@@ -3,8 +3,9 @@
     f(x) = min over photos of (pixels that x lies inside the outline) · (its depth / focal length)
 
 is negative outside.  It is sampled on a grid; the surface f = 0 is meshed by surface nets (Gibson 1998: in each cell that the surface
-crosses, a vertex in the middle of where it crosses the cell's edges), which close wherever f is negative on the grid's border, and
-smoothed without shrinking (Taubin 1995) as far as its outlines allow: between them a hull has ridges, which bodies seldom have.  Faces take the part that most photos show them as.
+crosses, a vertex in the middle of where it crosses the cell's edges), which close where f is negative on the grid's border.  Then it is
+smoothed without shrinking (Taubin 1995), as far as its outlines allow: where they meet, a hull has ridges, which bodies seldom have.  A
+face belongs to the part that most photos show there.
 """
 
 from __future__ import annotations
@@ -42,13 +43,16 @@ def visual_hull(
     parts: int = 1,
     report: Callable[[float], None] = lambda share: None,
 ) -> Triangles:
-    """The hull of outlines with poses, in the object's frame.  cells: of the grid, along its longest side;  parts: of the object.
+    """The hull in the object's frame.  outlines: all with poses;  cells: of the grid, along its longest side;  parts: of the object.
 
-    report: the share that is done.  Raises InputError where fewer than two outlines have a pose, or nothing fits into all of them.
+    report: the share that is done.  Raises InputError where there are fewer than two outlines, or nothing fits into all of them.
     """
-    outlines = [outline for outline in outlines if outline.pose is not None and outline.is_seen]
     if len(outlines) < 2:
-        fault = f"{len(outlines)} photo{'s' * (len(outlines) != 1)} with a known camera show it"
+        fault = (
+            f"{len(outlines)} photos with a known camera show it"
+            if not outlines
+            else "only one photo with a known camera shows it"
+        )
         cure = "a hull needs two at least, better ten: `cameras: {sfm: true}` finds them where photos overlap, or use lathe or primitive"
         raise InputError(fault, cure=cure)
     middle, radius = _about(outlines)
@@ -58,7 +62,9 @@ def visual_hull(
         shape = np.ceil((high - low) / step).astype(int) + 3
         origin = (low + high) / 2 - step * (shape - 1) / 2
         field = _sampled(outlines, origin, step, shape, report)
-        inside = np.argwhere(field > 0)
+        inside = np.argwhere(
+            field > (-step if count == FIRST != cells else 0)
+        )  # at first, what is thinner than a cell too
         if not len(inside):
             cure = "are masks and cameras of the same photos, and does each photo show the whole object or say by 255 what hides it?"
             raise InputError("no body fits into the outlines of all photos", cure=cure)

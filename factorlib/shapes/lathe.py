@@ -7,8 +7,8 @@ largest that fits: at each height the largest disc about the axis whose image li
     r(z) = max { r : the image of the disc (z, r) ⊂ outline },
 
 a visual hull among bodies of revolution.  Which θ, the other photos say: with each, the body is laid on their outlines, and the one that
-agrees best is kept; of those that agree equally, as all do with one photo, the one tilted most, for ends of real bodies are flat more
-often than round.  Then the radii are carved again from all outlines.  The axis is the shape's y.
+agrees best is kept.  With one photo, which does not say it, the strongest tilt that explains its outline is taken, for ends of real bodies
+are flat more often than round.  Then the radii are carved again from all outlines.  The axis is the shape's y.
 """
 
 from __future__ import annotations
@@ -29,19 +29,18 @@ from factorlib.align.target import target_of
 from factorlib.errors import InputError
 from factorlib.geometry.camera import Camera, Pose
 from factorlib.geometry.raster import Caster
+from factorlib.meshes.mesh import closed_grid
 from factorlib.shapes.hull import overlap
 from factorlib.shapes.outline import Outline, Triangles, of_one_part
 
 HEIGHTS, AROUND, RADII = 96, 48, 80  # discs, points of each, and radii tried
 TILTS_DEG = np.arange(-75.0, 76.0, 5.0)
 MIRRORS = 36  # directions of the mirror plane tried
-MIRRORED_PX = 1.5  # that mirrored points of an outline may lie outside it, as a share of 200 pixels of extent
+MIRRORED_PX = 1.5  # by which mirrored points may lie outside an outline of 200 pixels
 AS_GOOD = 0.006  # overlap (IoU) by which two tilts are told apart
-REFERENCES, TRIED, JUDGES = (
-    2,
-    5,
-    4,
-)  # photos that a body is begun from, tilts of each that are tried, and photos that they are laid on
+REFERENCES = 2  # photos that a body is begun from
+TRIED = 5  # tilts of each that are tried
+JUDGES = 4  # photos that a body of each tilt is laid on
 FINER_DEG = (-7.5, -5.0, -2.5, 2.5, 5.0, 7.5)  # from the best of these, to be tried too
 UNTOLD_DEG = 12.0  # range of tilts that explain the outlines alike, from which it is said
 MASK_ERROR = 0.2  # pixels that the contour of a mask of whole pixels is off, by one photo
@@ -69,9 +68,7 @@ def body_of_revolution(outlines: Sequence[Outline], report: Callable[[float], No
 
     report: the share that is done.  Raises InputError where no photo shows it whole enough to tell its axis.
     """
-    outlines = sorted((one for one in outlines if one.is_seen), key=lambda one: -int((one.part > 0).sum()))
-    if not outlines:
-        raise InputError("no photo's mask shows it", cure="give it a mask, or take it out")
+    outlines = sorted(outlines, key=lambda one: -int((one.part > 0).sum()))
     given = [Turned(np.zeros((0, 2)), one.pose, one.camera, 0.0) for one in outlines if one.pose is not None]
     if given:
         known = [one for one in outlines if one.pose is not None]
@@ -92,30 +89,7 @@ def body_of_revolution(outlines: Sequence[Outline], report: Callable[[float], No
                     "a second photo from another height says it", one.photo)  # fmt: skip
         best = max(turned, key=lambda each: abs(each.tilt_deg))
         return msgspec.structs.replace(mesh_of(best.profile).of_size(1.0), overlap=best.overlap)
-    tried, judges = [(one, each) for one, turned in begun for each in turned], outlines[:JUDGES]
-    laid: list[tuple[float, Outline, list[Turned]]] = []
-    for done, (one, each) in enumerate(tried):
-        report(0.7 * done / len(tried))
-        poses = [each if other is one else laid_on(other, each.profile) for other in judges]
-        laid.append((_agreement(poses), one, poses))
-    best = max(laid, key=lambda of: of[0])
-    for turn in FINER_DEG:
-        of, near = best[1], best[2]
-        own = next(pose for one, pose in zip(judges, near) if one is of)
-        if each := _at_tilt(of, own.camera, own.pose.rotation[:, 0], own.pose.translation, own.tilt_deg + turn):
-            finer = [each if one is of else laid_on(one, each.profile, pose) for one, pose in zip(judges, near)]
-            laid.append((_agreement(finer), of, finer))
-    most, of, poses = max(laid, key=lambda of: of[0])
-    like = [
-        pose.tilt_deg
-        for good, one, each in laid
-        if one is of and good >= most - AS_GOOD
-        for pose in each[:REFERENCES]
-        if pose.tilt_deg
-    ]
-    if like and max(like) - min(like) > UNTOLD_DEG:
-        log.warning("%s: tilts of the axis from %.0f to %.0f° explain the outlines alike, so its profile is not sure: a photo from higher "
-                    "up, or from lower down, says it", of.photo, min(like), max(like))  # fmt: skip
+    poses = _tilt_chosen(begun, outlines[:JUDGES], report)
     profile = poses[0].profile
     poses += [laid_on(one, profile) for one in outlines[JUDGES:]]
     for k in range(ROUNDS):
@@ -127,9 +101,44 @@ def body_of_revolution(outlines: Sequence[Outline], report: Callable[[float], No
     )
 
 
-def _agreement(poses: Sequence[Turned]) -> float:
-    """The mean overlap; of equal ones, that of the strongest tilt."""
-    return float(np.mean([pose.overlap for pose in poses])) + 1e-4 * max(abs(pose.tilt_deg) for pose in poses) / 90
+class Laid(msgspec.Struct, frozen=True):
+    """A body that was begun from the outline `of` at a tilt, laid on all judges: its mean overlap (IoU), its pose in each."""
+
+    of: Outline
+    begun: Turned
+    poses: list[Turned]
+
+    @property
+    def overlap(self) -> float:
+        """The mean IoU."""
+        return float(np.mean([pose.overlap for pose in self.poses]))
+
+
+def _tilt_chosen(
+    begun: Sequence[tuple[Outline, Sequence[Turned]]], judges: Sequence[Outline], report: Callable[[float], None]
+) -> list[Turned]:
+    """The poses, in the judges, of the body whose tilt explains their outlines best; a warning where several do so alike.
+
+    begun: outlines, and bodies of different tilts that explain each
+    """
+    tried, laid = [(one, each) for one, turned in begun for each in turned], []
+    for done, (one, each) in enumerate(tried):
+        report(0.7 * done / len(tried))
+        laid.append(Laid(one, each, [each if other is one else laid_on(other, each.profile) for other in judges]))
+    best = max(laid, key=lambda each: each.overlap)
+    for turn in FINER_DEG:
+        pose = best.begun.pose
+        each = _at_tilt(best.of, best.begun.camera, pose.rotation[:, 0], pose.translation, best.begun.tilt_deg + turn)
+        if each is not None:
+            near = zip(judges, best.poses, strict=True)
+            poses = [each if one is best.of else laid_on(one, each.profile, pose) for one, pose in near]
+            laid.append(Laid(best.of, each, poses))
+    best = max(laid, key=lambda each: each.overlap)
+    alike = [e.begun.tilt_deg for e in laid if e.of is best.of and e.overlap >= best.overlap - AS_GOOD]
+    if max(alike) - min(alike) > UNTOLD_DEG:
+        log.warning("%s: tilts of the axis from %.0f to %.0f° explain the outlines alike, so its profile is not sure: a photo from higher "
+                    "up, or from lower down, says it", best.of.photo, min(alike), max(alike))  # fmt: skip
+    return best.poses
 
 
 def _spread(turned: Sequence[Turned]) -> list[Turned]:
@@ -264,20 +273,10 @@ def mesh_of(profile: Profile) -> Triangles:
         cure = "are its masks and poses of the same object, and is it turned about the y of its poses?"
         raise InputError("no body of revolution fits into its outlines", cure=cure)
     angle = np.arange(COLUMNS) * 2 * np.pi / COLUMNS
-    z, x = np.cos(angle), np.sin(angle)
-    points = np.stack(
-        [np.outer(profile[:, 1], x), np.repeat(profile[:, :1], COLUMNS, axis=1), np.outer(profile[:, 1], z)], axis=-1
-    )
-    index = np.arange(points[..., 0].size).reshape(len(profile), COLUMNS)
-    right = np.roll(index, -1, axis=1)
-    a, b, c, d = index[:-1].ravel(), right[:-1].ravel(), index[1:].ravel(), right[1:].ravel()
-    bottom, top = index.size, index.size + 1
-    caps = np.concatenate([
-        np.column_stack([right[0], index[0], np.full(COLUMNS, bottom)]),
-        np.column_stack([index[-1], right[-1], np.full(COLUMNS, top)]),
-    ])  # fmt: skip
-    vertices = np.concatenate([points.reshape(-1, 3), [[0, profile[0, 0], 0], [0, profile[-1, 0], 0]]])
-    return of_one_part(vertices, np.concatenate([np.column_stack([a, b, d]), np.column_stack([a, d, c]), caps]))
+    height, radius = profile[::-1, :1], profile[::-1, 1:]  # from the top
+    points = np.stack(np.broadcast_arrays(radius * np.sin(angle), height, radius * np.cos(angle)), axis=-1)
+    mesh = closed_grid(points, np.array([0, height[0, 0], 0]), np.array([0, height[-1, 0], 0]))
+    return of_one_part(mesh.vertices, mesh.faces)
 
 
 def at(one: Outline, view: Turned) -> Outline:

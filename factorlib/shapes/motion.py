@@ -20,6 +20,7 @@ from jaxtyping import Bool, UInt8
 from PIL import Image
 
 from factorlib.align.refine import FocalPrior
+from factorlib.align.search import UNKNOWN_FOCAL
 from factorlib.align.silhouette import UNKNOWN
 from factorlib.errors import InputError
 from factorlib.geometry.camera import Camera, Pose
@@ -35,16 +36,21 @@ log = logging.getLogger("factorlib.shapes")
 
 
 class View(msgspec.Struct, frozen=True):
-    """A photo as displayed, 8 bits of grey; the pixels that show objects; the focal length in its pixels, where it is known."""
+    """A photo as displayed, in 8 bits of grey, and what is known of it.
+
+    objects   pixels that show objects;  left_out: pixels that are not to be used
+    camera    its principal point is used;  prior: of the focal length, in pixels of the photo; of sigma 0, it is kept
+    """
 
     grey: UInt8[np.ndarray, "h w"]
     objects: Bool[np.ndarray, "h w"]
     left_out: Bool[np.ndarray, "h w"]
-    focal: float | None
+    camera: Camera
+    prior: FocalPrior
 
 
-class Placed(msgspec.Struct, frozen=True):
-    """A photo's focal length in its pixels, about its middle, and cam_from_world, the world of no known scale."""
+class Registered(msgspec.Struct, frozen=True):
+    """A photo that has a place in the model: its focal length in its pixels, and cam_from_world, the world being of no known scale."""
 
     focal: float
     pose: Pose
@@ -52,7 +58,7 @@ class Placed(msgspec.Struct, frozen=True):
 
 def cameras_by_motion(
     views: Mapping[str, View], report: Callable[[float, str], None] = lambda share, what: None
-) -> dict[str, Placed]:
+) -> dict[str, Registered]:
     """The cameras of the photos that overlap, by name; the others are named in a warning.
 
     Raises InputError where fewer than three do.
@@ -80,7 +86,7 @@ def cameras_by_motion(
 
 def _mapped(
     views: Mapping[str, View], kept: Mapping[str, Bool[np.ndarray, "h w"]], report: Callable[[float, str], None]
-) -> tuple[dict[str, Placed], int]:
+) -> tuple[dict[str, Registered], int]:
     """The largest model of features at the pixels that are `kept`, and how many points it has."""
     pycolmap.set_random_seed(SEED)
     pycolmap.logging.minloglevel = pycolmap.logging.FATAL.value  # what goes wrong is said below
@@ -95,14 +101,16 @@ def _mapped(
         for name, view in views.items():
             Image.fromarray(view.grey).save(images / f"{name}.png")
             Image.fromarray(kept[name].astype(np.uint8) * 255).save(masks / f"{name}.png.png")
-            groups.setdefault((*view.grey.shape, view.focal), []).append(name)
-        for done, ((height, width, focal), names) in enumerate(
-            groups.items()
-        ):  # one camera each: of one size and one focal length
-            report(0.2 * done / len(groups), "features")
+            groups.setdefault((view.grey.shape, view.camera.centre, view.prior), []).append(name)
+        kept_focals = set()
+        # one camera for all photos of one size, principal point and focal length; COLMAP numbers them from 1
+        for number, (((height, width), centre, prior), names) in enumerate(groups.items(), start=1):
+            report(0.2 * (number - 1) / len(groups), "features")
             reader = pycolmap.ImageReaderOptions(camera_model="SIMPLE_PINHOLE", mask_path=str(masks))
-            if focal:
-                reader.camera_params = f"{focal},{width / 2},{height / 2}"
+            if prior.sigma < UNKNOWN_FOCAL.sigma or centre != (width / 2, height / 2):
+                reader.camera_params = f"{prior.focal},{centre[0]},{centre[1]}"
+            if prior.sigma == 0:
+                kept_focals.add(number)
             pycolmap.extract_features(
                 database, images, [f"{name}.png" for name in names], pycolmap.CameraMode.SINGLE, reader, extraction, pycolmap.Device.cpu
             )  # fmt: skip
@@ -116,7 +124,7 @@ def _mapped(
         report(0.6, "cameras")
         options = pycolmap.IncrementalPipelineOptions(
             num_threads=1, random_seed=SEED, multiple_models=False, min_model_size=LEAST_PHOTOS, extract_colors=False,
-            ba_refine_focal_length=True, ba_refine_principal_point=False,
+            ba_refine_focal_length=True, ba_refine_principal_point=False, constant_cameras=kept_focals,
         )  # fmt: skip
         options.mapper.num_threads, options.mapper.random_seed, options.triangulation.random_seed = 1, SEED, SEED
         models = pycolmap.incremental_mapping(database, images, root / "models", options)
@@ -129,9 +137,9 @@ def _mapped(
             if image.has_pose:
                 motion = image.cam_from_world()
                 pose = Pose(motion.rotation.matrix(), np.array(motion.translation))
-                placed[Path(image.name).stem] = Placed(float(best.cameras[image.camera_id].focal_length), pose)
+                placed[Path(image.name).stem] = Registered(float(best.cameras[image.camera_id].focal_length), pose)
     outlines = [outline_of(name, views[name], camera) for name, camera in sorted(placed.items())]
-    if (overlap := agreement(outlines)) < LEAST_AGREEMENT:
+    if (overlap := agreement([one for one in outlines if one.is_seen])) < LEAST_AGREEMENT:
         log.info(
             "cameras by %d points do not move with the objects (hull against masks: %.2f)", best.num_points3D(), overlap
         )
@@ -139,9 +147,8 @@ def _mapped(
     return {name: placed[name] for name in views if name in placed}, best.num_points3D()
 
 
-def outline_of(name: str, view: View, placed: Placed) -> Outline:
+def outline_of(name: str, view: View, placed: Registered) -> Outline:
     """What is seen of all objects together, by the camera that was found."""
-    height, width = view.grey.shape
     part = np.where(view.left_out, UNKNOWN, view.objects.astype(int))
-    camera = Camera(width, height, placed.focal, (width / 2, height / 2))
+    camera = msgspec.structs.replace(view.camera, focal=placed.focal)
     return Outline(name, part, camera, FocalPrior(placed.focal, 0.0), placed.pose)

@@ -1,7 +1,7 @@
 """Balls, boxes and cylinders, their proportions fitted to outlines.
 
 A ball has none.  A box has two, a cylinder (about y) one: the factors of its axes that `align.proportions` fits, with the poses of all
-photos, to the outlines.  The descent begins from several shapes, each laid on the photo that shows most; the best in all photos is kept.
+photos, to the outlines.  The descent begins from several shapes, each laid on the `PHOTOS` photos that show most; the shape that overlaps most is kept.
 """
 
 from __future__ import annotations
@@ -16,7 +16,6 @@ from jaxtyping import Float
 from factorlib.align.proportions import BOX, ROUND, Sighting, fitted
 from factorlib.align.search import Search, find
 from factorlib.align.target import target_of
-from factorlib.errors import InputError
 from factorlib.geometry.raster import Caster
 from factorlib.shapes.outline import Outline, Triangles, of_one_part
 
@@ -25,6 +24,7 @@ BEGUN = {
     "cylinder": ((1, 0.3, 1), (1, 1, 1), (1, 3, 1)),
 }
 FREE_FACTORS = {"box": BOX, "cylinder": ROUND}
+PHOTOS = 6
 STEPS = 20
 RESOLUTION = 200
 SEARCH = Search(views=150, keep=(20, 8, 4, 2))
@@ -33,10 +33,8 @@ SEARCH = Search(views=150, keep=(20, 8, 4, 2))
 def primitive(
     kind: str, outlines: Sequence[Outline], report: Callable[[float], None] = lambda share: None
 ) -> Triangles:
-    """The shape of unit size.  kind: ball, box or cylinder.  Raises InputError where no photo shows it."""
-    outlines = sorted((one for one in outlines if one.is_seen), key=lambda one: -int((one.part > 0).sum()))
-    if not outlines:
-        raise InputError("no photo's mask shows it", cure="give it a mask, or take it out")
+    """The shape of unit size.  kind: ball, box or cylinder;  outlines: one at least, which all show some of it"""
+    outlines = sorted(outlines, key=lambda one: -int((one.part > 0).sum()))[:PHOTOS]
     best: tuple[float, Float[np.ndarray, "3"]] = -1.0, np.ones(3)
     for done, begun in enumerate(starts := BEGUN.get(kind, ((1, 1, 1),))):
         report(done / len(starts))

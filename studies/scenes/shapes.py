@@ -18,8 +18,8 @@ import open3d as o3d
 from jaxtyping import Float
 
 from factorlib.generate.chair import dowel, legs, shell
-from factorlib.generate.shapes import BUMPS, closed_grid, revolved
-from factorlib.meshes.mesh import Mesh
+from factorlib.generate.shapes import BUMPS, revolved
+from factorlib.meshes.mesh import Mesh, closed_grid
 from factorlib.meshes.read import CREASE_DEG, usable
 from factorlib.meshes.soup import Soup, no_normals
 

@@ -239,6 +239,7 @@ BAD = [
     ("meshes.vase > .size", {"hull": True, "material": "red", "size": 2.0}, "leave it out"),
     ("meshes.vase > .size", {"lathe": True, "material": "red", "size": 0.0}, "more than 0"),
     ("meshes.vase > .primitive", {"primitive": "cone", "material": "red"}, "cone"),
+    ("meshes.vase > ", {"lathe": True, "hull": True, "material": "red"}, "hull and lathe"),
     ("meshes.chair > .parts", {"lathe": True, "parts": {"shell": "red"}}, "one part"),
     ("cameras > ", {"sfm": True, "colmap": "sparse"}, "colmap and sfm"),
     ("cameras > .world_from_camera", {"sfm": True, "world_from_camera": True}, "not known beforehand"),

@@ -4,13 +4,14 @@ import msgspec
 import numpy as np
 import pytest
 
+from factorlib.align.refine import FocalPrior
 from factorlib.errors import InputError
 from factorlib.generate.shapes import SHAPES
 from factorlib.geometry.camera import angle_between
 from factorlib.shapes.hull import agreement
 from factorlib.shapes.motion import LEAST_AGREEMENT, cameras_by_motion
 from factorlib.shapes.primitive import unit
-from tests.shapes.made import looking_from, outline, views_of
+from studies.scenes.outlines import looking_from, outline, views_of
 
 BLOB = SHAPES["blob"]()
 POSES = [looking_from(20 + 15 * (k % 2), 18.0 * k) for k in range(5)]
@@ -33,6 +34,8 @@ def test_cameras_about_a_body_at_rest_are_found_and_are_the_same_each_time():
     found = cameras_by_motion(views)
     assert list(found) == list(views) and max(turns_off(found)) < 0.5
     assert all(each.focal == pytest.approx(1.3 * 320, rel=0.02) for each in found.values())
+    kept = {name: msgspec.structs.replace(view, prior=FocalPrior(430.0, 0.0)) for name, view in views.items()}
+    assert {each.focal for each in cameras_by_motion(kept).values()} == {430.0}  # what is given is not moved
     again = cameras_by_motion(views)
     assert all(np.array_equal(found[n].pose.rotation, again[n].pose.rotation) for n in found)
 

@@ -16,7 +16,7 @@ from factorlib.shapes.hull import surface_nets, unambiguous, visual_hull
 from factorlib.shapes.lathe import Turned, body_of_revolution, largest_discs
 from factorlib.shapes.outline import FREE, Triangles, write_obj
 from factorlib.shapes.primitive import primitive, unit
-from tests.shapes.made import CAMERA, looking_from, outline
+from studies.scenes.outlines import CAMERA, looking_from, outline
 
 AROUND = [
     looking_from(elevation, 30 * k) for k, elevation in enumerate([10, 20, -10, 30, 50, 0, 15, -25, 40, 5, -40, 25])
@@ -77,7 +77,7 @@ def test_what_hides_the_body_carves_nothing():
 
 
 @pytest.mark.parametrize("poses, said", [
-    (AROUND[:1], "1 photo with a known camera"), ([AROUND[0]] * 3, "from the same side"),
+    (AROUND[:1], "only one photo with a known camera shows it"), ([AROUND[0]] * 3, "from the same side"),
 ])  # fmt: skip
 def test_a_hull_that_cannot_be_made_is_refused(poses, said):
     with pytest.raises(InputError, match=said):
@@ -175,3 +175,10 @@ def test_beyond_the_frame_is_outside_where_the_frame_shows_background_and_unknow
     inside, outside, left, right = one.inner(np.array([[26.0, 10.0], [10.0, 10.0], [-4.0, 10.0], [34.0, 10.0]]))
     assert inside == pytest.approx(4.5, abs=0.6) and outside == pytest.approx(-10, abs=0.6)
     assert left < outside - 8 and right == FREE
+
+
+def test_parts_thinner_than_a_cell_of_the_first_grid_are_not_cut_off():
+    rod = trimesh.creation.box((0.5, 0.5, 0.5)) + trimesh.creation.box((0.05, 1.0, 0.05)).apply_translation((0, 0.7, 0))
+    mesh = Triangles(np.asarray(rod.vertices), np.asarray(rod.faces), np.zeros(len(rod.faces), int)).as_mesh()
+    hull = visual_hull([outline(mesh, pose, True) for pose in AROUND], 80)
+    assert np.ptp(hull.vertices, axis=0)[1] == pytest.approx(1.45, abs=0.06)

@@ -98,7 +98,7 @@ def test_urm_and_export_place_the_fitted_mesh_alike(fitted, tmp_path):
     assert np.allclose(occluders.centre, (there.min(0) + there.max(0)) / 2, atol=1e-4)
     (tmp_path / "meshes").mkdir()
     slice_ = msgspec.convert(inputs.facts["dataset.objects"]["a"], ObjectsSlice)
-    shape = export.MeshFiles(inputs, tmp_path, ["white"], 60.0).shapes(slice_.objects[0], slice_.meshes, objects)[0]
+    shape = export.MeshFiles(inputs, tmp_path, ["white"], 60.0, {}).shapes(slice_.objects[0], slice_.meshes, objects)[0]
     placed = given.vertices @ shape.cam_from_object[:3, :3].T + shape.cam_from_object[:3, 3]
     assert np.allclose(placed, there, atol=1e-4)
 

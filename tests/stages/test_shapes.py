@@ -20,7 +20,7 @@ from factorlib.images.exr import read_exr
 from factorlib.meshes.read import read_mesh
 from factorlib.stage import Inputs
 from stages import align, masks, shapes, surface
-from tests.shapes.made import CAMERA, looking_from, views_of
+from studies.scenes.outlines import CAMERA, looking_from, views_of
 
 AROUND = [looking_from(20 + 15 * (k % 2), 18.0 * k) for k in range(8)]
 

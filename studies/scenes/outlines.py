@@ -1,9 +1,10 @@
-"""Outlines of made bodies, seen from known cameras."""
+"""Outlines and photos of made bodies, seen from known cameras."""
 
 import numpy as np
 from scipy.ndimage import map_coordinates
 
 from factorlib.align.refine import FocalPrior
+from factorlib.align.search import UNKNOWN_FOCAL
 from factorlib.geometry.camera import Camera, Pose, rotation_of_vector
 from factorlib.geometry.raster import rasterise
 from factorlib.meshes.mesh import Mesh
@@ -55,5 +56,6 @@ def views_of(mesh, poses, ground, size=320) -> dict[str, View]:
             seen = maps.label == label
             grey[seen] = grained(scale * (places[seen] - own.translation) @ own.rotation)
         pixels = (np.clip(grey, 0, 1) * 255).astype(np.uint8)
-        views[f"p{number}"] = View(pixels, maps.label == 1, np.zeros((size, size), bool), None)
+        unknown = FocalPrior(UNKNOWN_FOCAL.focal * size, UNKNOWN_FOCAL.sigma)
+        views[f"p{number}"] = View(pixels, maps.label == 1, np.zeros((size, size), bool), camera, unknown)
     return views
