@@ -178,7 +178,7 @@ def test_beyond_the_frame_is_outside_where_the_frame_shows_background_and_unknow
 
 
 def test_parts_thinner_than_a_cell_of_the_first_grid_are_not_cut_off():
-    rod = trimesh.creation.box((0.5, 0.5, 0.5)) + trimesh.creation.box((0.05, 1.0, 0.05)).apply_translation((0, 0.7, 0))
+    rod = trimesh.creation.box((0.5, 0.5, 0.5)) + trimesh.creation.box((0.035, 1.0, 0.035)).apply_translation((0.13, 0.7, 0.08))
     mesh = Triangles(np.asarray(rod.vertices), np.asarray(rod.faces), np.zeros(len(rod.faces), int)).as_mesh()
     hull = visual_hull([outline(mesh, pose, True) for pose in AROUND], 80)
     assert np.ptp(hull.vertices, axis=0)[1] == pytest.approx(1.45, abs=0.06)
