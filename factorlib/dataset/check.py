@@ -29,6 +29,7 @@ MESHES = (".obj", ".gltf", ".glb", *ONE_PART)
 MAPS = (".exr", ".hdr")
 RESERVED_PHOTOS = ("photos", "poses")  # `<photo>.json` would be the gathered photos.json, poses.json
 ALL_OF_IT = "all"  # the one part of a shape that is found
+LEAST_OUTLINES = 2  # of a hull, with known cameras
 LEAST_KEYPOINTS, GOOD_KEYPOINTS = 4, 6
 LEAST_OFF_LINE = 1e-3  # of the keypoints' extent
 
@@ -42,6 +43,8 @@ def check_dataset(spec: DatasetFile, file: Path) -> None:
             refuse(f"materials[{index}]", f"material {name!r} is named twice", cure)
     for name, mesh in spec.meshes.items():
         _check_mesh(f"meshes.{name}", mesh, spec.materials, refuse)
+        if mesh.hull and spec.cameras is None:
+            _check_hull(name, spec, refuse)
     refuse.once("photos", (photo.name for photo in spec.photos), "photo")
     for index, photo in enumerate(spec.photos):
         _check_photo(f"photos[{index}]", photo, spec, refuse)
@@ -100,6 +103,18 @@ def _check_mesh(key: str, mesh: MeshEntry, materials: list[str], refuse: Refusal
     if mesh.material is not None:
         refuse.known(f"{key}.material", mesh.material, materials, "material")
     _check_parts(f"{key}.parts", mesh.parts or {}, mesh, materials, refuse)
+
+
+def _check_hull(name: str, spec: DatasetFile, refuse: Refusal) -> None:
+    shown = [obj for photo in spec.photos for obj in photo.objects if obj.mesh == name]
+    known = sum(obj.pose is not None for obj in shown)
+    if known < LEAST_OUTLINES:
+        cure = (
+            "add `cameras: {sfm: true}`, another source of cameras, or each object's `pose`; or use lathe or primitive"
+        )
+        refuse(
+            f"meshes.{name}.hull", f"of {len(shown)} photos of it {known} have a known camera, a hull needs two", cure
+        )
 
 
 def _check_parts(key: str, parts: dict[str, str], mesh: MeshEntry, materials: list[str], refuse: Refusal) -> None:

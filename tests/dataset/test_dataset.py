@@ -237,6 +237,7 @@ BAD = [
     ("meshes.vase > ", {"material": "red"}, "exactly one of file"),
     ("meshes.vase > ", {"file": "vase.ply", "hull": True, "material": "red"}, "file and hull"),
     ("meshes.vase > .size", {"hull": True, "material": "red", "size": 2.0}, "leave it out"),
+    ("meshes.vase > .hull", {"hull": True, "material": "red"}, "a hull needs two"),
     ("meshes.vase > .size", {"lathe": True, "material": "red", "size": 0.0}, "more than 0"),
     ("meshes.vase > .primitive", {"primitive": "cone", "material": "red"}, "cone"),
     ("meshes.vase > ", {"lathe": True, "hull": True, "material": "red"}, "hull and lathe"),
