@@ -1,0 +1,185 @@
+"""Made sets of very different quality, from good to hopeless: a set of chairs, of which photos, mesh, masks or links are spoilt.
+
+What is spoilt, and by how much, is drawn by the set's number.  The truth stays with the set.
+"""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import yaml
+from jaxtyping import Float
+from PIL import Image, ImageFilter
+
+from factorlib.generate.chair import bent_chair, chair
+from factorlib.generate.folder import write_obj, write_yaml
+from factorlib.images.transfer import srgb_decode, srgb_encode
+from factorlib.meshes.mesh import smooth
+
+Rng = np.random.Generator
+Spec = dict[str, Any]  # the content of dataset.yaml
+MESH, TRUTH = "meshes/chair.obj", "truth/truth.yaml"
+
+
+def keep(spec: Spec, names: list[str]) -> None:
+    """Leave these photos alone in the set."""
+    spec["photos"] = [photo for photo in spec["photos"] if photo["name"] in names]
+
+
+def exact(folder: Path, spec: Spec, rng: Rng) -> None:
+    """Give the true mesh, its poses and focal lengths of the photos."""
+    solid = {name: smooth(*part) for name, part in chair().items()}
+    write_obj(folder / MESH, {name: (mesh.vertices, mesh.faces, mesh.normals) for name, mesh in solid.items()})
+    poses = yaml.safe_load((folder / TRUTH).read_text())["poses"]
+    for photo in spec["photos"]:
+        for own in photo["objects"]:
+            own["pose"] = poses[photo["name"]][own["name"]]
+
+
+def rough(folder: Path, spec: Spec, rng: Rng) -> None:
+    """Give a mesh of 500 triangles a part, bent by 2 % of its extent."""
+    write_obj(folder / MESH, bent_chair(rng, 500, 0.02))
+
+
+def rougher(folder: Path, spec: Spec, rng: Rng) -> None:
+    """Give a mesh of 200 triangles a part, bent by 5 %."""
+    write_obj(folder / MESH, bent_chair(rng, 200, 0.05))
+
+
+def another_chair(folder: Path, spec: Spec, rng: Rng) -> None:
+    """Give a mesh of 80 triangles a part, bent by 10 % and stretched: another chair."""
+    axes = np.exp(rng.normal(0, 0.25, 3))
+    write_obj(folder / MESH, {name: (v * axes, faces) for name, (v, faces) in bent_chair(rng, 80, 0.1).items()})
+
+
+def few(folder: Path, spec: Spec, rng: Rng) -> None:
+    """Leave two to four photos."""
+    names = [photo["name"] for photo in spec["photos"]]
+    keep(spec, list(rng.permutation(names)[: rng.integers(2, 5)]))
+
+
+def one_photo(folder: Path, spec: Spec, rng: Rng) -> None:
+    """Leave one photo of one chair."""
+    keep(spec, [str(rng.choice([photo["name"] for photo in spec["photos"] if len(photo["objects"]) == 1]))])
+
+
+def unlinked(folder: Path, spec: Spec, rng: Rng) -> None:
+    """Leave two photos of one chair each, of different colours, whose wood has two names: nothing links them."""
+    names = [("garden", "office"), ("office", "patio"), ("kitchen", "garden"), ("kitchen", "office")][rng.integers(4)]
+    keep(spec, list(names))
+    spec["materials"].append("wood_2")
+    photo = spec["photos"][1]
+    photo["objects"][0]["materials"]["legs"] = "wood_2"
+    relabelled(folder, photo, {spec["materials"].index("wood") + 1: len(spec["materials"])})
+
+
+def miscalled(folder: Path, spec: Spec, rng: Rng) -> None:
+    """Give the shells of two photos, of one chair each, the other's material."""
+    single = [photo for photo in spec["photos"] if len(photo["objects"]) == 1]
+    if len(single) < 2:
+        return
+    pair = [single[k] for k in rng.permutation(len(single))[:2]]
+    shells = [photo["objects"][0]["materials"]["shell"] for photo in pair]
+    for photo, old, new in zip(pair, shells, shells[::-1], strict=True):
+        photo["objects"][0]["materials"]["shell"] = new
+        relabelled(folder, photo, {spec["materials"].index(old) + 1: spec["materials"].index(new) + 1})
+
+
+def clipped(folder: Path, spec: Spec, rng: Rng) -> None:
+    """Expose all photos two to three stops more."""
+    factor = 2 ** rng.uniform(2, 3)
+    each_photo(folder, spec, lambda linear: linear * factor)
+
+
+def dark(folder: Path, spec: Spec, rng: Rng) -> None:
+    """Expose all photos four to six stops less: few codes are left."""
+    factor = 2 ** -rng.uniform(4, 6)
+    each_photo(folder, spec, lambda linear: linear * factor)
+
+
+def noisy(folder: Path, spec: Spec, rng: Rng) -> None:
+    """Add noise of 5 to 15 % of white."""
+    sigma = rng.uniform(0.05, 0.15)
+    each_photo(folder, spec, lambda linear: linear + rng.normal(0, sigma, linear.shape))
+
+
+def developed(folder: Path, spec: Spec, rng: Rng) -> None:
+    """Give every photo another contrast and tint, and sharpen it: what phones and programs do."""
+
+    def change(linear: Float[np.ndarray, "h w 3"]) -> Float[np.ndarray, "h w 3"]:
+        """One photo."""
+        return np.maximum(linear, 0) ** rng.uniform(0.5, 1.8) * np.exp(rng.normal(0, 0.2, 3))
+
+    each_photo(folder, spec, change, ImageFilter.UnsharpMask(8, 150))
+
+
+def tiny(folder: Path, spec: Spec, rng: Rng) -> None:
+    """Make all pictures six times smaller."""
+    for photo in spec["photos"]:
+        for file in [photo["image"], photo["masks"], *(own["mask"] for own in photo["objects"] if "mask" in own)]:
+            with Image.open(folder / file) as picture:
+                size, exif = (picture.width // 6, picture.height // 6), picture.getexif()
+                how = Image.Resampling.BOX if file == photo["image"] else Image.Resampling.NEAREST
+                picture.resize(size, how).save(folder / file, exif=exif, **QUALITY[Path(file).suffix])
+        if "camera" in photo:
+            photo["camera"] = {"focal_px": photo["camera"]["focal_px"] / 6}
+
+
+QUALITY: dict[str, Any] = {".jpg": {"quality": 95, "subsampling": 0}, ".png": {}}
+KINDS: dict[str, Callable[[Path, Spec, Rng], None]] = {
+    of.__name__: of
+    for of in (exact, rough, rougher, another_chair, few, one_photo, unlinked, miscalled, clipped, dark, noisy, developed, tiny)
+}  # fmt: skip
+# What a set is spoilt by, drawn with equal chances; links are cut first, for the others go by the photos that are left.
+MIXED = (
+    [], [], ["exact"], ["exact"], ["few"], ["exact", "few"], ["rough"], ["rough", "few"], ["rougher"], ["another_chair"], ["one_photo"],
+    ["one_photo", "exact"], ["unlinked"], ["miscalled"], ["clipped"], ["exact", "dark"], ["noisy"], ["developed"], ["tiny"], ["few", "tiny", "rougher"],
+)  # fmt: skip
+
+
+def spoilt(base: Path, folder: Path, kinds: list[str], seed: int) -> None:
+    """Write the set in `base`, spoilt, into the folder, which is replaced."""
+    shutil.rmtree(folder, ignore_errors=True)
+    shutil.copytree(base, folder)
+    spec, rng = yaml.safe_load((folder / "dataset.yaml").read_text()), np.random.default_rng([17, seed])
+    for kind in kinds:
+        KINDS[kind](folder, spec, rng)
+    write_yaml(folder / "dataset.yaml", spec, f"spoilt: {', '.join(kinds) or 'nothing'}")
+    write_yaml(
+        folder / TRUTH, truth_of(spec, yaml.safe_load((folder / TRUTH).read_text())), "the truth of what is left"
+    )
+
+
+def truth_of(spec: Spec, truth: Spec) -> Spec:
+    """The truth of the photos and materials that are left: what no photo shows is not to be scored."""
+    names = [photo["name"] for photo in spec["photos"]]
+    shown = {m for photo in spec["photos"] for own in photo["objects"] for m in ("wood", *own["materials"].values())}
+    materials = {
+        name: truth["materials"]["wood" if name == "wood_2" else name] for name in spec["materials"] if name in shown
+    }
+    by_photo = {key: {name: truth[key][name] for name in names} for key in ("illumination", "normals", "poses")}
+    return {"materials": materials, **by_photo}
+
+
+def relabelled(folder: Path, photo: Spec, new: dict[int, int]) -> None:
+    """Change labels in the photo's mask."""
+    with Image.open(folder / photo["masks"]) as picture:
+        labels = np.asarray(picture)
+    table = np.arange(256, dtype=np.uint8)
+    table[list(new)] = list(new.values())
+    Image.fromarray(table[labels]).save(folder / photo["masks"])
+
+
+def each_photo(folder: Path, spec: Spec, change: Callable, filtered: ImageFilter.Filter | None = None) -> None:
+    """Change the linear radiance of every photo, then its picture."""
+    for photo in spec["photos"]:
+        with Image.open(folder / photo["image"]) as picture:
+            exif, codes = picture.getexif(), np.asarray(picture)
+        linear = np.clip(change(srgb_decode(codes / 255.0)), 0, 1)
+        made = Image.fromarray((srgb_encode(linear) * 255 + 0.5).astype(np.uint8))
+        made = made.filter(filtered) if filtered else made
+        made.save(folder / photo["image"], exif=exif, **QUALITY[".jpg"])
