@@ -66,6 +66,7 @@ help:
 	@echo 'make all DATASET=eames               the whole pipeline; DATASET is a name in data/ or a path to a folder'
 	@echo 'make <stage> DATASET=…               one stage and what it needs: $(STAGES)'
 	@echo '     SET="solve.cells=800 …"         with other parameters      FORCE=1   run again, whatever is there'
+	@echo '     STRICT=1                         exit code 3 (2 of make) where the verdict is "do not trust" (docs/verdict.md)'
 	@echo '     FACTORLIB_STORE=<folder>         share results with other checkouts (docs/runner.md)'
 	@echo 'make fit_mesh | refine DATASET=…      only when asked for: proportions of meshes, poses by shading; SET="align.poses=build/…/refine" uses them'
 	@echo 'make render DATASET=… RECIPE=insert   pictures of the result: a name in recipes/, a path to a recipe, or all (docs/recipes.md)'

@@ -55,6 +55,7 @@ OPTIONS = {  # as `ArgumentParser.add_argument` takes them; key: of the environm
     "dataset": _option("--dataset", "-d", help="its name in data/, or a path to its folder; else DATASET"),
     "set": _option("--set", dest="settings", metavar="X.Y=Z", help="stage.parameter=value; else SET", **MANY),
     "force": _option("--force", help="whatever the store holds, or without asking; as FORCE=1", **ON),
+    "strict": _option("--strict", help="exit code 3 where the result is not to be trusted; as STRICT=1", **ON),
     "recipe": _option("--recipe", dest="recipes", help="a path, a name in recipes/, or all; else RECIPE", **MANY),
     "stages": _option("stages", help="stages; all without it", **FEW),
     "mermaid": _option("--mermaid", help="as a Mermaid diagram", **ON),
@@ -134,7 +135,7 @@ def _worker(asked: Namespace) -> int:
 
 ASKED = "dataset set force recipe"
 VERBS: dict[str, tuple[str, Callable[[Namespace], int], str]] = {  # in the order of `--help`: options, what it does, help
-    "all": (ASKED, lambda a: verbs.make(project(), wish(a)),
+    "all": (f"{ASKED} strict", lambda a: verbs.make(project(), wish(a), switched_on("STRICT", a.strict)),
             "Run the whole pipeline, as far as anything must run, and make the pictures of named recipes."),
     "stage": (f"name {ASKED}", _stage,
               "Run one stage and what it needs; `render` with a recipe makes its pictures alone."),

@@ -1,6 +1,6 @@
 """How good the result is: re-synthesis against the photos, everything else against the truth where there is one.
 
-Writes metrics.json; its keys are documented in `factorlib.results.metrics`.  Only this stage reads the truth: so that
+Writes metrics.json, whose keys are documented in `factorlib.results.metrics`, and verdict.txt.  Only this stage reads the truth: so that
 the report can show it, it also writes illumination/<light>.exr (the true map) and spheres/<light>_{truth,estimate}.exr.
 """
 
@@ -18,17 +18,20 @@ from factorlib.evaluate.materials import compare_materials
 from factorlib.evaluate.relighting import compare_relighting, compare_relit_set
 from factorlib.evaluate.resynthesis import Shot, compare_photos, shot_of
 from factorlib.evaluate.truth import read_true_light, read_true_normals
+from factorlib.evaluate.verdict import Signs, material_errors, text_of, verdict
 from factorlib.images.exr import LAT_LONG, read_exr, read_rgb_exr, write_rgb_exr
 from factorlib.jsonfile import write_json
-from factorlib.results.materials import Reflectance, read_materials, reflectances
-from factorlib.results.metrics import Counts, Metrics, NormalError, PoseError
+from factorlib.results.materials import Reflectance, read_materials, read_uncertainty, reflectances
+from factorlib.results.metrics import Counts, Metrics, NormalError, PoseError, Verdict
 from factorlib.results.photos import read_photos
 from factorlib.results.poses import read_poses
 from factorlib.stage import Inputs, Progress
 from factorlib.urm.extract import observed_pixels
 from factorlib.urm.geometry import read_geometry
+from factorlib.wholefile import write_text
 
 NO_TRUTH = "the dataset names no truth"
+NOTHING_SHOWN = "no photo shows a material"
 MISSING = {
     "materials": "the truth says nothing about materials that were seen",
     "relighting": "the truth lacks materials or lights",
@@ -80,10 +83,33 @@ def main(params: Params, inputs: Inputs, out: Path, progress: Progress) -> None:
             "normals": _normals(inputs, truth, lights),
             "poses": _poses(inputs, truth),
         }
+    sections["verdict"] = _verdict(inputs, seen)
     counts = Counts(len(lights), len(materials), len(seen), len(set(component.values())))
     reasons = {name: why if truth else NO_TRUTH for name, why in MISSING.items() if not sections[name]}
+    if not sections["verdict"]:
+        reasons["verdict"] = NOTHING_SHOWN
     write_json(out / "metrics.json", Metrics(set=counts, resynthesis=resynthesis, **sections, reasons=reasons))
+    if sections["verdict"]:
+        write_text(out / "verdict.txt", text_of(sections["verdict"]))
     progress(3, 3)
+
+
+def _verdict(inputs: Inputs, seen: dict[str, list[str]]) -> Verdict | None:
+    """How far the result can be trusted; seen: by light, the materials of which a pixel counts."""
+    table, uncertainty = (
+        read_materials(inputs["export"] / "materials.json"),
+        read_uncertainty(inputs["solve"] / "uncertainty.json"),
+    )
+    shown, files = {m for names in seen.values() for m in names}, inputs["export"] / "illumination"
+    materials = {name: solved for name, solved in table.materials.items() if name in shown}
+    lights = {name: light_of_lat_long(read_rgb_exr(files / f"{name}.exr")) for name, names in seen.items() if names}
+    if not (materials and uncertainty.photos):
+        return None
+    contours = {
+        photo: {name: own.contour_error for name, own in entry.objects.items() if own.contour_error is not None}
+        for photo, entry in read_poses(inputs["align"] / "poses.json").items()
+    }
+    return verdict(Signs(material_errors(materials, lights), uncertainty.unexplained, uncertainty.photos, contours))
 
 
 def _lights(inputs: Inputs, truth: TruthFile, out: Path) -> tuple[dict[str, Light], dict[str, Light]]:

@@ -9,6 +9,7 @@ import msgspec
 import numpy as np
 from msgspec import UNSET, UnsetType
 
+from factorlib.diagnose.misfit import misfit
 from factorlib.diagnose.uncertainty import ABSOLUTE, GAUGE, StandardErrors
 from factorlib.light.lobes import Lobes
 from factorlib.model.blocks import Block
@@ -71,7 +72,8 @@ class Answer(msgspec.Struct, frozen=True):
     def uncertainty(self, errors: StandardErrors) -> Uncertainty:
         """The content of uncertainty.json."""
         gauge = GAUGE + ABSOLUTE * self.solution.interreflection.kept
-        return Uncertainty(errors.deviation, self._errors(errors), gauge)
+        unexplained = misfit(self.solution.shown(self.problem), self.solution.point)
+        return Uncertainty(errors.deviation, self._errors(errors), gauge, *unexplained)
 
     def _errors(self, errors: StandardErrors) -> dict[str, table.StandardErrors]:
         rows = zip(self.names, _rows(errors.materials), strict=True)

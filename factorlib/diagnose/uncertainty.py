@@ -154,8 +154,10 @@ def map_directions() -> Float[np.ndarray, "d 3"]:
 
 
 def residual_deviation(problem: JointProblem, point: Point) -> float:
-    """Robust standard deviation of the whitened residuals."""
-    return robust_deviation(np.concatenate(problem.residuals(point)))
+    """Robust standard deviation of the whitened residuals of what is not clipped: a bound that holds leaves no residual."""
+    pairs = list(zip(problem.residuals(point), problem.blocks, strict=True))
+    whole = np.concatenate([residual[~block.clipped] for residual, block in pairs])
+    return robust_deviation(whole if len(whole) else np.concatenate([residual for residual, _ in pairs]))
 
 
 def largest_variance(

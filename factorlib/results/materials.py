@@ -158,18 +158,35 @@ class MaterialTable(msgspec.Struct, frozen=True):
     model: Model = Model()
 
 
+class Misfit(msgspec.Struct, frozen=True):
+    """Of a photo: the share of its shading that is not explained (`factorlib.diagnose.misfit`), and of its values that are clipped."""
+
+    unexplained: AtLeast0
+    clipped: AtLeast0
+
+
 class Uncertainty(msgspec.Struct, frozen=True):
-    """residual_sigma: deviation of the residuals in units of the noise model;  materials: by name;  gauge: of the standard errors."""
+    """residual_sigma: deviation of the residuals in units of the noise model;  materials: by name;  gauge: of the standard errors.
+
+    unexplained: share of the shading of all photos that the answer does not explain;  photos: misfit of each
+    """
 
     residual_sigma: AtLeast0
     materials: dict[str, StandardErrors]
     gauge: str
+    unexplained: AtLeast0 = 0.0
+    photos: dict[str, Misfit] = {}
 
 
 def solved(reflectance: Reflectance, stderr: StandardErrors, kind: Kind | UnsetType = UNSET) -> Solved:
     """A reflectance with its standard errors, α and kind."""
     rows = reflectance.diffuse, reflectance.specular, reflectance.roughness
     return Solved(*rows, reflectance.roughness**2, stderr, kind)
+
+
+def read_uncertainty(path: str | Path) -> Uncertainty:
+    """Raises InputError for a file that is none."""
+    return read_result(path, Uncertainty, "solve")
 
 
 def read_materials(path: str | Path, cure: str = "") -> MaterialTable:

@@ -10,6 +10,7 @@ relit_set    `factorlib.evaluate.relighting`: the relit set score
 light        `factorlib.evaluate.lights`
 normals      photo -> `NormalError`; see `factorlib.evaluate.geometry`
 poses        photo -> object -> `PoseError`
+verdict      how far the result can be trusted, truth or not; null where no photo shows a material
 
 Wherever there are gauges: none, scalar_per_set, channel_per_photo (`factorlib.evaluate.gauge`).  PSNR in dB, linear
 relative to the white of the truth and after the tone map; DSSIM after the tone map (`factorlib.evaluate.picture`).
@@ -18,6 +19,7 @@ relative to the white of the truth and after the tone map; DSSIM after the tone 
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Literal
 
 import msgspec
 
@@ -194,6 +196,20 @@ class PoseError(msgspec.Struct, frozen=True):
     null_rotation_deg: float
 
 
+class Verdict(msgspec.Struct, frozen=True):
+    """How far a result can be trusted, from what is known without truth (`factorlib.evaluate.verdict`).
+
+    expected_relit_db, deviation_db: the relit set score that is expected, and how far scores of made sets lie from that
+    reasons: what speaks against the result, the weightiest first;  next: what would help most
+    """
+
+    trust: Literal["good", "usable with care", "do not trust"]
+    expected_relit_db: float
+    deviation_db: float
+    reasons: list[str]
+    next: str
+
+
 class Metrics(msgspec.Struct, frozen=True):
     """Everything that `evaluate` says of a set."""
 
@@ -206,6 +222,7 @@ class Metrics(msgspec.Struct, frozen=True):
     poses: dict[str, dict[str, PoseError]] | None
     reasons: dict[str, str]
     relit_set: RelitSet | None = None
+    verdict: Verdict | None = None
 
 
 def read_metrics(path: str | Path) -> Metrics:

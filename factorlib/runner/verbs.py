@@ -28,6 +28,8 @@ from factorlib.runner.survey import Survey, survey
 from factorlib.runner.worker import Code, load_stage
 from factorlib.wholefile import write_text
 
+VERDICT = "evaluate/verdict.txt"  # whose first line says whether the result is to be trusted
+UNTRUSTED, NO_TRUST = 3, "do not trust"  # the exit code under STRICT=1, and how that line begins then
 RESULTS = {  # what a user looks at first
     "report": "report/index.html",
     "materials": "export/materials.json",
@@ -66,8 +68,8 @@ def _say(seen: Survey, text: str) -> None:
     print(f"{seen.data.folder.name}: {text}")
 
 
-def make(project: Project, wish: Wish) -> int:
-    """Run the stages that are wanted and what they need, as far as anything must run."""
+def make(project: Project, wish: Wish, strict: bool = False) -> int:
+    """Run the stages that are wanted and what they need, as far as anything must run; strict: return UNTRUSTED for a result not to be trusted."""
     with heed_stops():
         started, seen = time.perf_counter(), survey(project, *wish)
         planned = seen.planned()
@@ -80,6 +82,9 @@ def make(project: Project, wish: Wish) -> int:
         elif code := _run(seen, started):
             return code
         home, whole = seen.home.folder, wish.targets is None  # of the whole pipeline, name what a user looks at first
+        judged = (home / VERDICT).read_text(encoding="utf-8") if whole and (home / VERDICT).exists() else ""
+        for number, line in enumerate(judged.splitlines()):
+            print(f"  verdict: {line}" if number == 0 else f"    {line}")
         for what, path in RESULTS.items() if whole else ():
             if (home / path).exists():
                 print(f"  {what}: {project.shown(home / path)}" + ("/*.exr" if (home / path).is_dir() else ""))
@@ -88,7 +93,7 @@ def make(project: Project, wish: Wish) -> int:
             if over_recipes or not whole:
                 one = next(iter(seen.recipes)) if over_recipes and len(seen.recipes) == 1 else ""
                 print(f"  {name}: {project.shown(home / name / one)}")
-        return 0
+        return UNTRUSTED if strict and judged.startswith(NO_TRUST) else 0
 
 
 def _run(seen: Survey, started: float) -> int:

@@ -16,7 +16,8 @@ from jaxtyping import Float
 from PIL import Image, ImageFilter
 
 from factorlib.generate.chair import bent_chair, chair
-from factorlib.generate.folder import write_obj, write_yaml
+from factorlib.generate.folder import write_light, write_obj, write_yaml
+from factorlib.images.exr import read_rgb_exr
 from factorlib.images.transfer import srgb_decode, srgb_encode
 from factorlib.meshes.mesh import smooth
 
@@ -91,14 +92,12 @@ def miscalled(folder: Path, spec: Spec, rng: Rng) -> None:
 
 def clipped(folder: Path, spec: Spec, rng: Rng) -> None:
     """Expose all photos two to three stops more."""
-    factor = 2 ** rng.uniform(2, 3)
-    each_photo(folder, spec, lambda linear: linear * factor)
+    exposed(folder, spec, 2 ** rng.uniform(2, 3))
 
 
 def dark(folder: Path, spec: Spec, rng: Rng) -> None:
     """Expose all photos four to six stops less: few codes are left."""
-    factor = 2 ** -rng.uniform(4, 6)
-    each_photo(folder, spec, lambda linear: linear * factor)
+    exposed(folder, spec, 2 ** -rng.uniform(4, 6))
 
 
 def noisy(folder: Path, spec: Spec, rng: Rng) -> None:
@@ -172,6 +171,14 @@ def relabelled(folder: Path, photo: Spec, new: dict[int, int]) -> None:
     table = np.arange(256, dtype=np.uint8)
     table[list(new)] = list(new.values())
     Image.fromarray(table[labels]).save(folder / photo["masks"])
+
+
+def exposed(folder: Path, spec: Spec, factor: float) -> None:
+    """Expose all photos by a factor more; true lights are in the units of their photos."""
+    each_photo(folder, spec, lambda linear: linear * factor)
+    for photo in spec["photos"]:
+        file = folder / f"truth/{photo['name']}_light.exr"
+        write_light(file, read_rgb_exr(file) * factor)
 
 
 def each_photo(folder: Path, spec: Spec, change: Callable, filtered: ImageFilter.Filter | None = None) -> None:

@@ -1,0 +1,145 @@
+"""Whether a result can be trusted, from what is known without any truth.
+
+The mean square error of balls of the recovered materials in the recovered lights, shown as for the relit set score (`factorlib.evaluate.relighting`), is
+expected to be
+
+    e² = FLOOR + MATERIALS m² + CLIPPED c² + UNEXPLAINED √u + CONTOUR d                                                 (1)
+
+m²  by how much a ball changes where each reflectance and each roughness is wrong by one standard error: squares summed over these, mean over balls
+c   share of values that are clipped, mean over photos;  u: share of the shading that is not explained (`factorlib.diagnose.misfit`)
+d   how far meshes' outlines lie from their masks' (`contour_error` of poses.json), mean over objects
+
+and −10 log₁₀ e² is the expected score in dB.  The weights were fitted to 44 made sets of very different quality, and `GOOD` and `POOR` chosen on them, so that none
+that scores less than 18 dB, as a flat disc of the mean colour does, is called good, and none that scores 24 dB or more is not to be trusted.  docs/verdict.md
+shows both on sets that had no part in this (`python -m studies.measured.verdict`).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+
+import msgspec
+import numpy as np
+
+from factorlib.evaluate.ball import Light
+from factorlib.evaluate.picture import tone_mapped
+from factorlib.evaluate.relighting import MEAN_SHOWN, Appearances
+from factorlib.results.materials import Misfit, Reflectance, Solved
+from factorlib.results.metrics import Verdict
+
+FLOOR, MATERIALS, CLIPPED, UNEXPLAINED, CONTOUR = 1e-5, 0.28, 0.19, 0.0186, 1.38
+DEVIATION = 3.0  # dB, of the scores from what is expected
+GOOD, POOR = 24.0, 19.0  # dB
+TELLING = 0.2  # least share of e² that is a reason
+ROUGHNESS = (0.1, 1.0)
+
+
+def material_errors(materials: Mapping[str, Solved], lights: Mapping[str, Light]) -> dict[str, float]:
+    """m² of each material, mean over lights.
+
+    materials, lights: as they were recovered, in one gauge, the former with standard errors
+    """
+    lit = [Appearances(light) for light in lights.values()]
+    return {name: float(np.mean([_change(solved, own) for own in lit])) for name, solved in materials.items()}
+
+
+def _change(solved: Solved, lit: Appearances) -> float:
+    """The mean square by which a ball changes in a light, summed over diffuse and specular reflectance and roughness."""
+    ball = lit.ball(solved.reflectance)
+    exposure = MEAN_SHOWN / max(float(ball.mean()), 1e-30)
+    shown = tone_mapped(ball, exposure)
+    squares = [np.mean((tone_mapped(lit.ball(other), exposure) - shown) ** 2) for other in _others(solved)]
+    return float(np.sum(squares)) / 2
+
+
+def _others(solved: Solved) -> Iterator[Reflectance]:
+    """The reflectance with each of its parts a standard error lower and higher."""
+    own, errors = solved.reflectance, solved.stderr
+    for sign in (-1, 1):
+        for part in ("diffuse", "specular"):
+            moved = np.clip(np.array(getattr(own, part)) + sign * np.array(getattr(errors, part)), 0, 1)
+            yield msgspec.structs.replace(own, **{part: tuple(moved.tolist())})
+        yield msgspec.structs.replace(
+            own, roughness=float(np.clip(own.roughness + sign * errors.roughness, *ROUGHNESS))
+        )
+
+
+class Signs(msgspec.Struct, frozen=True):
+    """What is known without truth.
+
+    materials    m² of each that a photo shows (`material_errors`)
+    unexplained  u of the set;  photos: its share in each, and that of clipped values
+    contours     d of each object whose outline was compared, by photo and object
+    """
+
+    materials: dict[str, float]
+    unexplained: float
+    photos: dict[str, Misfit]
+    contours: dict[str, dict[str, float]]
+
+    def terms(self) -> dict[str, float]:
+        """The terms of (1) but for the first."""
+        contours = [error for own in self.contours.values() for error in own.values()]
+        return {
+            "materials": MATERIALS * float(np.mean(list(self.materials.values()))),
+            "clipped": CLIPPED * float(np.mean([photo.clipped for photo in self.photos.values()])) ** 2,
+            "unexplained": UNEXPLAINED * float(np.sqrt(self.unexplained)),
+            "contour": CONTOUR * float(np.mean(contours or [0.0])),
+        }
+
+
+def verdict(signs: Signs) -> Verdict:
+    """What (1) says, why, and what to do next."""
+    terms = signs.terms()
+    whole = FLOOR + sum(terms.values())
+    expected = round(float(-10 * np.log10(whole)), 3)
+    trust = "good" if expected >= GOOD else "usable with care" if expected >= POOR else "do not trust"
+    telling = [name for name in sorted(terms, key=terms.__getitem__, reverse=True) if terms[name] >= TELLING * whole]
+    said = [SENTENCES[name](signs) for name in telling]
+    return Verdict(trust, expected, DEVIATION, [why for why, _ in said], said[0][1])
+
+
+def text_of(verdict: Verdict) -> str:
+    """The verdict as lines for a terminal, what it comes to first."""
+    head = f"{verdict.trust}: relit pictures are expected to reach {verdict.expected_relit_db:.0f} ± {verdict.deviation_db:.0f} dB"
+    return "\n".join([head, *(f"because {why}" for why in verdict.reasons), f"next: {verdict.next}", ""])
+
+
+def _of_materials(signs: Signs) -> tuple[str, str]:
+    """Why, and what to do."""
+    name = max(signs.materials, key=signs.materials.__getitem__)
+    return (
+        f"reflectances are uncertain, most of all that of '{name}'",
+        f"add a photo of '{name}' in light with a small bright source, or in which it stands beside a material that is surer",
+    )
+
+
+def _of_clipped(signs: Signs) -> tuple[str, str]:
+    """Why, and what to do."""
+    name, photos = max(signs.photos, key=lambda photo: signs.photos[photo].clipped), signs.photos
+    return (
+        f"much is clipped, in '{name}' {photos[name].clipped:.0%} of the values: there the photos say 'at least' only",
+        f"expose '{name}' less, or give the camera's raw file",
+    )
+
+
+def _of_contour(signs: Signs) -> tuple[str, str]:
+    """Why, and what to do."""
+    each = {(photo, name): error for photo, own in signs.contours.items() for name, error in own.items()}
+    photo, name = max(each, key=each.__getitem__)
+    return (
+        f"outlines of meshes and masks differ, most of all those of '{name}' in '{photo}'",
+        f"give a mesh that is nearer to '{name}', or a larger photo; if its pose in the overlay of '{photo}' is wrong, give keypoints",
+    )
+
+
+def _of_unexplained(signs: Signs) -> tuple[str, str]:
+    """Why, and what to do."""
+    name = max(signs.photos, key=lambda photo: signs.photos[photo].unexplained)
+    return (
+        f"shading stays unexplained, in '{name}' {min(signs.photos[name].unexplained, 1):.0%} of it",
+        f"look at the overlay of '{name}' in the report: its mesh, pose, masks or the names of its materials are wrong, or a program has changed the picture",
+    )
+
+
+SENTENCES = {"materials": _of_materials, "clipped": _of_clipped, "unexplained": _of_unexplained, "contour": _of_contour}
