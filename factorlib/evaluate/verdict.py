@@ -96,7 +96,8 @@ def verdict(signs: Signs) -> Verdict:
     trust = "good" if expected >= GOOD else "usable with care" if expected >= POOR else "do not trust"
     telling = [name for name in sorted(terms, key=terms.__getitem__, reverse=True) if terms[name] >= TELLING * whole]
     said = [SENTENCES[name](signs) for name in telling]
-    return Verdict(trust, expected, DEVIATION, [why for why, _ in said], said[0][1])
+    rounded = {name: float(f"{term:.6g}") for name, term in terms.items()}
+    return Verdict(trust, expected, DEVIATION, [why for why, _ in said], said[0][1], rounded)
 
 
 def text_of(verdict: Verdict) -> str:

@@ -201,6 +201,7 @@ class Verdict(msgspec.Struct, frozen=True):
 
     expected_relit_db, deviation_db: the relit set score that is expected, and how far scores of made sets lie from that
     reasons: what speaks against the result, the weightiest first;  next: what would help most
+    terms: what each sign adds to the mean square error that is expected of shown balls
     """
 
     trust: Literal["good", "usable with care", "do not trust"]
@@ -208,6 +209,7 @@ class Verdict(msgspec.Struct, frozen=True):
     deviation_db: float
     reasons: list[str]
     next: str
+    terms: dict[str, float]
 
 
 class Metrics(msgspec.Struct, frozen=True):

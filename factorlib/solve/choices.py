@@ -32,6 +32,7 @@ CURVED = Schedule(together=(8,), estimate=False)
 # Of the held-out loss.  By two standard errors alone a photo whose pose is wrong got a curve (margin 3.0, captured set of seed 7), and k_d was
 # 30 % wrong instead of 13 %.
 CURVED_GAIN = 0.25
+NEARER_FROM = 1.0  # standard errors: from here on a light comes nearer, and at `FOR` it is as near as was found
 # Of lights that are 20, 10 and 5 RMS distances away: a chair's points are .4 m from their middle, a room's walls and lamps 2 to 8 m.
 CURVATURES = (0.05, 0.1, 0.2)
 NEARER = Schedule(lights=3, together=(6,), estimate=False)
@@ -125,7 +126,7 @@ def distances_chosen(problem: JointProblem, before: Fit, choices: Choices, fit: 
 
     First materials and all lights are fitted at each distance: materials that were fitted in far lights make up for what is wrong with those.
     But materials that are better in near lights explain every light better, so a light stays near only if, given these materials, it also
-    explains its observations better than a far one.
+    explains its observations better than a far one.  The weaker of the two answers decides how near it comes.
     """
     lights = before.point.lights
     known = [light.curvature > 0 or block.place is None for light, block in zip(lights, problem.blocks, strict=True)]
@@ -144,7 +145,7 @@ def distances_chosen(problem: JointProblem, before: Fit, choices: Choices, fit: 
     far, *near = (losses_of(sample, fit_at(dict.fromkeys(asked, c)).point) for c in (0.0, *CURVATURES))
     curvature = {}
     for k in asked:
-        tried = [_evidence_of_light(k, far, one) for one in near]
+        tried = [_evidence_of_light(k, far, one, NEARER_FROM) for one in near]
         best = min(range(len(near)), key=lambda i: (not tried[i].kept, tried[i].held_out_loss_with or 0.0))
         evidence[k] = tried[best]
         if tried[best].kept:
@@ -155,11 +156,17 @@ def distances_chosen(problem: JointProblem, before: Fit, choices: Choices, fit: 
     curvatures = (dict.fromkeys(curvature, 0.0), curvature)
     far, there = (losses_of(sample, fit_at(of, chosen, GIVEN).point) for of in curvatures)
     for k in curvature:
-        evidence[k] = _evidence_of_light(k, far, there)
-    kept = {k: c for k, c in curvature.items() if evidence[k].kept}
-    return Chosen((chosen if kept == curvature else fit_at(kept)) if kept else before, evidence)
+        given = _evidence_of_light(k, far, there, NEARER_FROM)
+        evidence[k] = min(evidence[k], given, key=lambda one: one.margin or 0.0)
+    kept = {k: c * believed(evidence[k]) for k, c in curvature.items() if evidence[k].kept}
+    return Chosen(fit_at(kept) if kept else before, evidence)
 
 
-def _evidence_of_light(k: int, without: Losses, richer: Losses) -> Evidence:
+def believed(evidence: Evidence) -> float:
+    """How far the richer model is believed: from 0 at `NEARER_FROM` standard errors to 1 at `FOR`, so that rounding does not decide."""
+    return float(np.clip(((evidence.margin or 0.0) - NEARER_FROM) / (FOR - NEARER_FROM), 0.0, 1.0))
+
+
+def _evidence_of_light(k: int, without: Losses, richer: Losses, least: float = FOR) -> Evidence:
     """Return the evidence that light k alone gives for the richer model."""
-    return compare(*(Losses([of.values[k]], [of.clusters[k]]) for of in (without, richer)), FOR)
+    return compare(*(Losses([of.values[k]], [of.clusters[k]]) for of in (without, richer)), least)

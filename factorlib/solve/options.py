@@ -28,6 +28,7 @@ class Choices(Struct, frozen=True):
     """Whether a photo may have a tone curve beyond its encoding; auto: where held-out observations are two standard errors for one, and their
     loss is a quarter higher without."""
     distance: Literal["auto", "off"] = "auto"
-    """Whether a light may be at a finite distance; auto: where held-out observations are two standard errors for one."""
+    """Whether a light may be at a finite distance; auto: where held-out observations are for one, by two standard errors
+    or, in part, by more than one."""
     seed: Seed = 0
     """Seed of what is held out, and of the observations that are drawn."""

@@ -23,9 +23,11 @@ from factorlib.results.lobes import write_lobes
 from factorlib.results.materials import (
     Gauge,
     MaterialTable,
+    Misfit,
     Model,
     Reflectance,
     StandardErrors,
+    Uncertainty,
     solved,
 )
 from factorlib.stage import Inputs
@@ -177,6 +179,9 @@ def _whole(made: Made, folders: dict, materials: list[str]) -> None:
         table = MaterialTable({m: solved(each, errors) for m, each in estimates.items()}, gauge, model)
         write_json(folders[stage] / "materials.json", table)
         write_json(folders[stage] / "exposures.json", {p: [1.0, 1.0, 1.0] for p in made.seen})
+    misfits = {photo: Misfit(0.001, 0.01) for photo in made.seen}
+    uncertainty = Uncertainty(1.0, dict.fromkeys(materials, errors), "by hand", 0.001, misfits)
+    write_json(folders["solve"] / "uncertainty.json", uncertainty)
     steps = np.arange(30)
     history = {"iteration": steps, "round": steps // 10, "lobes": 4 * (1 + steps // 10), "phase": ["joint"] * 30}
     history |= {"loss": np.exp(-steps / 5.0) + 0.01, "held_out": np.exp(-steps / 6.0) + 0.02}

@@ -56,6 +56,8 @@ def test_without_truth_re_synthesis_remains_and_the_rest_says_why(tmp_path):
     assert found["materials"] is found["light"] is found["relighting"] is found["relit_set"] is None
     assert set(found["reasons"].values()) == {evaluate.NO_TRUTH}
     assert found["resynthesis"]["mean"]["none"]["estimate"]["psnr_linear_db"] > 20
+    assert found["verdict"]["trust"] == "good"
+    assert (tmp_path / "out" / "verdict.txt").read_text().startswith("good: relit pictures are expected to reach ")
 
 
 def test_true_normals_in_the_photos_own_pixels_are_averaged_as_the_photo_was(tmp_path):

@@ -119,6 +119,17 @@ def test_another_directory_gives_the_same_bytes_and_datasets_share_what_is_the_s
     assert (project.build / "again" / "total" / "total.txt").exists()
 
 
+def test_the_verdict_of_a_result_is_shown_and_only_when_asked_for_decides_the_exit_code(project, capsys):
+    assert make(project) == 0
+    for text, code in (("good: indeed\n", 0), ("do not trust: 9 dB\nbecause of that\n", verbs.UNTRUSTED)):
+        write(project.build / "set" / verbs.VERDICT, text)
+        assert verbs.make(project, verbs.Wish("set")) == 0
+        assert verbs.make(project, verbs.Wish("set"), strict=True) == code
+        said = capsys.readouterr().out
+        assert all(said.count(line) == 2 for line in text.splitlines())
+    assert verbs.make(project, verbs.Wish("set", ["upper"]), strict=True) == 0  # not of the whole
+
+
 def test_plan_why_and_graph_show_the_same_plan(project, capsys):
     write(project.root / "data" / "set" / "a.txt", "Alphabet")
     for show, said in (

@@ -15,8 +15,8 @@ from factorlib.model.interreflection import bounced_light
 from factorlib.model.noise import Noise
 from factorlib.model.observed import blocks_of_observations
 from factorlib.model.problem import JointProblem
-from factorlib.solve.choices import CURVED_GAIN
-from factorlib.solve.evidence import AGAINST, FOR
+from factorlib.solve.choices import CURVED_GAIN, NEARER_FROM, believed
+from factorlib.solve.evidence import AGAINST, FOR, Evidence
 from factorlib.solve.options import Choices
 from factorlib.solve.solve import Run, solve
 from factorlib.solve.start import from_nothing
@@ -296,3 +296,8 @@ def test_near_lights_are_found_and_spare_the_materials_and_far_ones_stay_far():
     assert all(one.margin > FOR for one in found.distances if one.kept)
     assert [light.curvature for light in far.point.lights] == [0, 0, 0]
     assert error_of(found) < 0.5 * error_of(far), (error_of(found), error_of(far))
+
+
+def test_how_near_a_light_comes_follows_the_evidence_without_a_jump():
+    shares = [believed(Evidence(True, margin=m)) for m in (-3, NEARER_FROM, 1.25, 1.5, FOR, 9)]
+    assert shares == [0, 0, 0.25, 0.5, 1, 1] and believed(Evidence(False)) == 0
