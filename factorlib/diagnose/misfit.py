@@ -73,4 +73,4 @@ def energy(values: Float[np.ndarray, "n 3"], group: Int[np.ndarray, " n"]) -> fl
 
 
 def _share(left: float, whole: float) -> float:
-    return round(min(left / max(whole, 1e-12), MOST), 9) if left > 0 else 0.0
+    return round(float(min(left / max(whole, 1e-12), MOST)), 9) if left > 0 else 0.0

@@ -36,6 +36,7 @@ def changed(exact, **columns):
 def test_the_truth_leaves_nothing_and_noise_next_to_nothing(exact):
     whole, photos = misfit(*exact)
     assert whole < 1e-6 and set(photos) == {"room0_0", "room1_0", "room1_1"}
+    assert {type(whole), *(type(photo.unexplained) for photo in photos.values())} == {float}  # as JSON takes it
     radiance = exact[0].blocks[0].radiance
     noisy = radiance + 0.1 * np.random.default_rng(0).normal(size=radiance.shape)
     assert misfit(*changed(exact, radiance=noisy))[0] < 0.01
