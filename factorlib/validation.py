@@ -19,7 +19,7 @@ from factorlib.evaluate.truth import read_true_light, read_true_normals
 from factorlib.images.light_map import read_light_map
 from factorlib.images.limits import MOST_MEGAPIXELS, check_pixels, check_values
 from factorlib.images.photo import open_photo
-from factorlib.labels import read_labels, read_objects
+from factorlib.labels import check_materials, read_labels, read_objects
 from factorlib.meshes.limits import Limits
 from factorlib.meshes.read import part_labels, read_parts
 from factorlib.recipe.schema import is_light_file
@@ -80,8 +80,18 @@ class Validation:
         size = open_photo(path, f"{key}.image").size
         check_pixels(size, most_megapixels, path, f"{key}.image")
         check_values(path, most_megapixels, f"{key}.image")
-        read_labels(entry.masks, self.file, self.spec.materials, size, entry.image, f"{key}.masks")
-        read_objects([(obj.name, obj.mask) for obj in entry.objects], self.file, size, f"{key}.objects")
+        labels = read_labels(entry.masks, self.file, self.spec.materials, size, entry.image, f"{key}.masks")
+        objects = read_objects([(obj.name, obj.mask) for obj in entry.objects], self.file, size, f"{key}.objects")
+        made_of = [(obj.name, self._materials_of(obj)) for obj in entry.objects]
+        masks = entry.masks if isinstance(entry.masks, str) else next(iter(entry.masks.values()))
+        check_materials(labels, objects, made_of, self.spec.materials, self.file(masks), f"{key}.objects")
+
+    def _materials_of(self, obj: ObjectEntry) -> set[str]:
+        """The materials of an object's parts."""
+        made_of = self.spec.meshes[obj.mesh].made_of
+        return set(
+            (made_of | obj.materials).values() if isinstance(made_of, dict) else obj.materials.values() or [made_of]
+        )
 
     def _object(self, obj: ObjectEntry, mesh: MeshEntry, limits: Limits) -> None:
         """The parts of a mesh file are read once; if they cannot be, that is said again for every object."""

@@ -30,6 +30,7 @@ from factorlib.results.metrics import Verdict
 FLOOR, MATERIALS, CLIPPED, UNEXPLAINED, CONTOUR = 1e-5, 0.28, 0.19, 0.0186, 1.38
 DEVIATION = 3.0  # dB, of the scores from what is expected
 GOOD, POOR = 24.0, 19.0  # dB
+MUCH = 0.1  # unexplained: something is wrong, not only rough
 TELLING = 0.2  # least share of e² that is a reason
 ROUGHNESS = (0.1, 1.0)
 
@@ -94,7 +95,8 @@ def verdict(signs: Signs) -> Verdict:
     whole = FLOOR + sum(terms.values())
     expected = round(float(-10 * np.log10(whole)), 3)
     trust = "good" if expected >= GOOD else "usable with care" if expected >= POOR else "do not trust"
-    telling = [name for name in sorted(terms, key=terms.__getitem__, reverse=True) if terms[name] >= TELLING * whole]
+    ranked = sorted(terms, key=terms.__getitem__, reverse=True)
+    telling = [name for name in ranked if terms[name] >= TELLING * whole] or ranked[:1]
     said = [SENTENCES[name](signs) for name in telling]
     rounded = {name: float(f"{term:.6g}") for name, term in terms.items()}
     return Verdict(trust, expected, DEVIATION, [why for why, _ in said], said[0][1], rounded)
@@ -103,14 +105,14 @@ def verdict(signs: Signs) -> Verdict:
 def text_of(verdict: Verdict) -> str:
     """The verdict as lines for a terminal, what it comes to first."""
     head = f"{verdict.trust}: relit pictures are expected to reach {verdict.expected_relit_db:.0f} ± {verdict.deviation_db:.0f} dB"
-    return "\n".join([head, *(f"because {why}" for why in verdict.reasons), f"next: {verdict.next}", ""])
+    return "\n".join([head, *(f"limited by: {why}" for why in verdict.reasons), f"next: {verdict.next}", ""])
 
 
 def _of_materials(signs: Signs) -> tuple[str, str]:
     """Why, and what to do."""
     name = max(signs.materials, key=signs.materials.__getitem__)
     return (
-        f"reflectances are uncertain, most of all that of '{name}'",
+        f"uncertain reflectances, most of all that of '{name}'",
         f"add a photo of '{name}' in light with a small bright source, or in which it stands beside a material that is surer",
     )
 
@@ -119,7 +121,7 @@ def _of_clipped(signs: Signs) -> tuple[str, str]:
     """Why, and what to do."""
     name, photos = max(signs.photos, key=lambda photo: signs.photos[photo].clipped), signs.photos
     return (
-        f"much is clipped, in '{name}' {photos[name].clipped:.0%} of the values: there the photos say 'at least' only",
+        f"clipped values, in '{name}' {photos[name].clipped:.0%} of all: they say 'at least' only",
         f"expose '{name}' less, or give the camera's raw file",
     )
 
@@ -129,7 +131,7 @@ def _of_contour(signs: Signs) -> tuple[str, str]:
     each = {(photo, name): error for photo, own in signs.contours.items() for name, error in own.items()}
     photo, name = max(each, key=each.__getitem__)
     return (
-        f"outlines of meshes and masks differ, most of all those of '{name}' in '{photo}'",
+        f"outlines of meshes and masks that differ, most of all those of '{name}' in '{photo}'",
         f"give a mesh that is nearer to '{name}', or a larger photo; if its pose in the overlay of '{photo}' is wrong, give keypoints",
     )
 
@@ -137,8 +139,11 @@ def _of_contour(signs: Signs) -> tuple[str, str]:
 def _of_unexplained(signs: Signs) -> tuple[str, str]:
     """Why, and what to do."""
     name = max(signs.photos, key=lambda photo: signs.photos[photo].unexplained)
+    share = min(signs.photos[name].unexplained, 1)
+    if share < MUCH:
+        return f"shading that stays unexplained, in '{name}' {share:.0%} of it", "a mesh that is nearer to the objects"
     return (
-        f"shading stays unexplained, in '{name}' {min(signs.photos[name].unexplained, 1):.0%} of it",
+        f"shading that stays unexplained, in '{name}' {share:.0%} of it",
         f"look at the overlay of '{name}' in the report: its mesh, pose, masks or the names of its materials are wrong, or a program has changed the picture",
     )
 

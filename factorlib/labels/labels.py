@@ -20,6 +20,7 @@ from factorlib.errors import InputError
 from factorlib.labels.coco import read_coco
 from factorlib.labels.png import read_inside, read_values
 
+MUCH = 0.1  # of an object's pixels: more than a slip of the brush
 DRAWN_EDGE = 2  # outlines drawn side by side share edge pixels: what is no wider is left out, not refused
 log = logging.getLogger("factorlib.labels")
 
@@ -81,6 +82,34 @@ def read_objects(
             raise InputError(fault, file=file(path), key=where, cure=cure)
         objects[inside] = index + 1
     return objects
+
+
+def check_materials(
+    labels: Labels,
+    objects: UInt16[np.ndarray, "h w"],
+    made_of: list[tuple[str, set[str]]],
+    materials: list[str],
+    path: Path,
+    key: str = "objects",
+) -> None:
+    """Raise InputError where the mask shows a material that no object there is made of, and not one that they are made of: a wrong name.
+
+    objects: as `read_objects` has it; objects without a mask of their own share the rest of the photo
+    made_of: name and materials of each object;  path: of the mask, for messages
+    Either alone is no contradiction: a part may be hidden, and a mask may show what has no mesh.
+    """
+    groups = [([k], objects == k + 1) for k in range(len(made_of)) if (objects == k + 1).any()]
+    alone = [k for k in range(len(made_of)) if not (objects == k + 1).any()]
+    for members, region in [*groups, (alone, objects == 0)] if alone else groups:
+        counts = np.bincount(labels.label[region], minlength=len(materials) + 1)[1:]
+        own = set().union(*(made_of[k][1] for k in members))
+        strange = [k for k, count in enumerate(counts) if count >= MUCH * counts.sum() > 0 and materials[k] not in own]
+        missing = [name for name in materials if name in own and not counts[materials.index(name)]]
+        if strange and missing:
+            names, most = ", ".join(repr(made_of[k][0]) for k in members), max(strange, key=counts.__getitem__)
+            fault = f"the mask shows {materials[most]!r} in {counts[most] / counts.sum():.0%} of the pixels of {names}, but no {missing[0]!r}"
+            cure = f"correct their materials, {', '.join(sorted(own))} by dataset.yaml, or the labels"
+            raise InputError(fault, file=path, key=f"{key}[{members[0]}].materials", cure=cure)
 
 
 def _of_values(values: UInt16[np.ndarray, "h w"], path: Path, materials: list[str], key: str) -> Labels:

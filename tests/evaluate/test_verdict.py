@@ -24,15 +24,22 @@ WORSE = {
     "unexplained": 2.0,
     "contours": {"day": {"chair": 1e-4}, "dusk": {"stool": 0.04}},
 }
+UNEXPLAINED = {"day": Misfit(0.2, 0.01), "dusk": Misfit(0.5, 0.0)}
 BLAMED = {"materials": "'wood'", "photos": "'dusk'", "unexplained": "'dusk'", "contours": "'stool' in 'dusk'"}
 
 
 def test_clean_signs_are_good_and_each_sign_alone_can_spoil_the_trust_and_is_the_first_reason():
     assert verdict(CLEAN).trust == "good" and verdict(CLEAN).expected_relit_db > GOOD
     for name, worse in WORSE.items():
-        spoilt = verdict(msgspec.structs.replace(CLEAN, **{name: worse}))
+        photos = {"photos": UNEXPLAINED} if name == "unexplained" else {}
+        spoilt = verdict(msgspec.structs.replace(CLEAN, **{name: worse, **photos}))
         assert spoilt.trust == NO_TRUST and spoilt.expected_relit_db < POOR, name
         assert BLAMED[name] in spoilt.reasons[0] and "'" in spoilt.next, name
+
+
+def test_where_nothing_is_wrong_at_all_it_still_says_what_to_do_next():
+    nothing = verdict(Signs({"red": 0.0}, 0.0, {"day": Misfit(0.0, 0.0)}, {}))
+    assert nothing.trust == "good" and nothing.next and len(nothing.reasons) == 1
 
 
 def test_a_worse_sign_never_raises_what_is_expected():
@@ -78,4 +85,4 @@ def test_the_text_begins_with_the_word_that_the_runner_looks_for():
     spoilt = msgspec.structs.replace(CLEAN, unexplained=2.0)
     first, *others = text_of(verdict(spoilt)).splitlines()
     assert first.startswith(NO_TRUST) and NO_TRUST in get_args(get_type_hints(Verdict)["trust"])
-    assert others[0].startswith("because ") and others[-1].startswith("next: ")
+    assert others[0].startswith("limited by: ") and others[-1].startswith("next: ")

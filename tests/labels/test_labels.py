@@ -10,7 +10,7 @@ from PIL import Image
 from pycocotools import mask as pycocomask
 
 from factorlib.errors import InputError
-from factorlib.labels import read_labels, read_objects
+from factorlib.labels import Labels, check_materials, read_labels, read_objects
 from factorlib.labels.coco import runs_of
 from factorlib.labels.png import read_values
 
@@ -198,6 +198,25 @@ def test_objects_are_numbered_in_their_order_and_bad_masks_of_them_are_refused(t
         with pytest.raises(InputError, match=said) as caught:
             objects(("a", one), ("b", save(tmp_path / "bad.png", bad)))
         assert "bad.png: photos[kitchen].objects[1].mask" in str(caught.value) and caught.value.cure
+
+
+def test_objects_of_other_materials_than_the_mask_shows_are_refused_and_what_is_hidden_or_has_no_mesh_is_not(tmp_path):
+    shown, none = Labels(LABEL, LABEL > 9), np.zeros((H, W), np.uint16)
+
+    def check(objects, *made_of):
+        check_materials(shown, objects, list(made_of), MATERIALS, tmp_path / "m.png", "photos[x].objects")
+
+    for fine in ({"red", "wood"}, {"wood"}, {"red", "white", "wood"}):
+        check(none, ("chair", fine))
+    with pytest.raises(
+        InputError, match="the mask shows 'red' in 28% of the pixels of 'chair', but no 'white'"
+    ) as caught:
+        check(none, ("chair", {"white", "wood"}))
+    assert caught.value.key == "photos[x].objects[0].materials" and "white, wood" in caught.value.cure
+    each = np.select([LABEL == 1, LABEL == 3], [1, 2], 0)
+    check(each, ("a", {"red"}), ("b", {"wood"}))
+    with pytest.raises(InputError, match="'red' in 100% of the pixels of 'a', but no 'wood'"):
+        check(each, ("a", {"wood"}), ("b", {"red"}))
 
 
 def test_a_mask_as_large_as_a_large_photo_is_no_bomb(tmp_path, recwarn):
