@@ -15,6 +15,7 @@ from typing import Any
 from factorlib.dataset.check import MESHES
 from factorlib.dataset.schema import Dataset, MeshEntry, ObjectEntry, PhotoEntry
 from factorlib.errors import InputError
+from factorlib.evaluate.gauge import connected_components
 from factorlib.evaluate.truth import read_true_light, read_true_normals
 from factorlib.images.light_map import read_light_map
 from factorlib.images.limits import MOST_MEGAPIXELS, check_pixels, check_values
@@ -50,6 +51,23 @@ class Validation:
         """What is wrong with the lights and meshes that a recipe names: files by how it writes them; tables were read with it."""
         lights = [partial(read_light_map, path) for path in files.values() if is_light_file(path.name)]
         return _faults([*lights, *(partial(read_parts, p) for p in files.values() if p.suffix.lower() in MESHES)])
+
+    def cautions(self) -> list[str]:
+        """What no photo will tell, by the materials that dataset.yaml names."""
+        together: dict[str, set[str]] = {}
+        for photo in self.spec.photos:
+            together.setdefault(photo.light, set()).update(*(self._materials_of(obj) for obj in photo.objects))
+        component = connected_components({light: sorted(names) for light, names in together.items() if names})
+        if (groups := len(set(component.values()))) < 2:
+            return []
+        lights = [
+            sorted(li for li, names in together.items() if names and component[min(names)] == k) for k in range(groups)
+        ]
+        said = "; ".join(", ".join(own) for own in lights)
+        return [
+            f"the lights fall into {groups} groups that share no material ({said}): brightness and colour cannot be compared between them. "
+            "A photo that shows a material of each would link them"
+        ]
 
     def _checks(
         self, slice_: str, photo: str | None, params: dict[str, Any], settings: Path

@@ -45,7 +45,7 @@ class Data(msgspec.Struct, frozen=True):
     recipe: reads a recipe for this data set; InputError where it asks for what is not there
     faults: of the files that a slice names, as far as looking at headers tells, by the parameters of the stage that takes
             it and the file in which these stand
-    recipe_faults: of the files that a recipe names
+    recipe_faults: of the files that a recipe names;  cautions: what will run, but leave the answer open, as sentences
     """
 
     folder: Path
@@ -54,6 +54,7 @@ class Data(msgspec.Struct, frozen=True):
     faults: Callable[[str, str | None, dict[str, Any], Path], list[InputError]] = lambda *_: []
     recipe: Callable[[Path], Recipe] | None = None
     recipe_faults: Callable[[dict[str, Path]], list[InputError]] = lambda _: []
+    cautions: Callable[[], list[str]] = list
 
 
 class Provider(NamedTuple):
@@ -90,7 +91,7 @@ def photo_sets() -> Provider:
 
         photos, faults = [photo.name for photo in dataset.spec.photos], lambda *of: look().faults(*of)
         slice_, recipe_faults = partial(dataset_slice, dataset), lambda files: look().recipe_faults(files)
-        return Data(dataset.folder, photos, slice_, faults, recipe, recipe_faults)
+        return Data(dataset.folder, photos, slice_, faults, recipe, recipe_faults, lambda: look().cautions())
 
     return Provider(SLICES, read)
 

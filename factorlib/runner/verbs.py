@@ -220,6 +220,8 @@ def validate(project: Project, dataset: str, settings: list[str], sheet: bool = 
         return _refused(seen, faults)
     counts = f"{len(seen.data.photos)} photos, {len(seen.records)} steps"
     _say(seen, f"pipeline.yaml, dataset.yaml and the files it names are good: {counts}")
+    for caution in seen.data.cautions():
+        print(f"  warning: {caution}")
     if sheet:
         from factorlib.runner.display import display_for
 

@@ -15,6 +15,7 @@ from factorlib.dataset import schema
 from factorlib.dataset.read import read_dataset
 from factorlib.dataset.slices import SLICES, dataset_slice
 from factorlib.errors import InputError
+from factorlib.validation import Validation
 
 TURN = [[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]]
 MIRROR = [[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, -1.0]]
@@ -150,6 +151,17 @@ def write_truth(folder, truth):
     (folder / "truth" / "truth.yaml").write_text(yaml.safe_dump(truth))
     (folder / "truth" / "garden.exr").write_text("")
     return write(folder, {**SPEC, "truth": "truth/truth.yaml"})
+
+
+def test_lights_that_no_material_links_are_named_before_anything_runs(folder):
+    assert Validation(read_dataset(write(folder))).cautions() == []  # wood links them
+    spec = changed("photos[1].objects[0].materials", {"shell": "red", "legs": "red"})
+    (said,) = Validation(read_dataset(write(folder, spec))).cautions()
+    assert "2 groups" in said and "(garden; hall, kitchen)" in said.replace(
+        "hall, kitchen; garden", "garden; hall, kitchen"
+    )
+    spec["photos"][1]["illumination"] = "kitchen"  # one light links whatever stands in it
+    assert Validation(read_dataset(write(folder, spec))).cautions() == []
 
 
 def test_truth_is_its_own_slice_and_a_warning_where_it_is_missing(folder, caplog):
