@@ -9,10 +9,10 @@ override PY := .venv/bin/python
 override STAGES := $(shell sed -n '/^stages:/,$$s/^  \([a-z_]*\):.*/\1/p' pipeline.yaml)
 MAKEFLAGS += --no-print-directory
 
-.PHONY: all plan why status graph logs params new compare validate verify clean gc setup lock test test-long size docs results study studies data help $(STAGES)
+.PHONY: all plan why status graph logs params new compare validate verify clean gc pack setup lock test test-long size docs results study studies data help $(STAGES)
 
 # each reads DATASET, SET and FORCE from the environment
-all plan why status graph logs params new compare validate verify $(STAGES): .venv/ready
+all plan why status graph logs params new compare validate verify pack $(STAGES): .venv/ready
 	@$(PY) -m factorlib "$$GOAL"
 
 clean: .venv/ready
@@ -77,6 +77,7 @@ help:
 	@echo 'make graph                           the stages and what they take; $(PY) -m factorlib graph --mermaid: as a diagram'
 	@echo 'make params [STAGE=solve]            every parameter: default, range, meaning'
 	@echo 'make compare A=build/eames B=…        two results side by side, to build/compare'
+	@echo 'make pack DATASET=… OUT=x.zip         a result as one file that travels: report, exports, meshes, lights, frames and units'
 	@echo 'make verify [DATASET=…]              read every kept result and name what is damaged (FORCE=1 replaces it, whatever it is)'
 	@echo 'make clean [DATASET=… | STUDY=…]     forget the results of a dataset, of all datasets, or of a study (QUICK=1: its quick ones)'
 	@echo 'make gc                              show results that no dataset or study names any more, and delete them (FORCE=1: without asking)'

@@ -30,6 +30,7 @@ from factorlib.images.exr import LAT_LONG, read_rgb_exr, write_rgb_exr
 from factorlib.images.light_map import read_light_map
 from factorlib.images.picture import picture
 from factorlib.images.write import write_hdr
+from factorlib.jsonfile import read_json
 from factorlib.light.latlong import turned_map
 from factorlib.reading import check_plain
 from factorlib.recipe import schema
@@ -51,7 +52,8 @@ SAMPLES = 64
 def load_result(folder: str | Path) -> Result:
     """The result in a folder such as build/eames, or called eames in build/; from the current folder, or else from one above it.
 
-    Raises InputError where there is none, it is not whole, or its data set is no longer where it was or has other names in it.
+    The folder may have been copied elsewhere (`cp -rL build/eames …`), without its data set.
+    Raises InputError where there is none, it is not whole, or its data set has other names in it by now.
     """
     places = [Path(*k * [".."]) for k in range(len(Path.cwd().parts))]  # a notebook runs in its own folder
     candidates = [path for place in places for path in (place / folder, place / "build" / folder)]
@@ -65,21 +67,27 @@ def load_result(folder: str | Path) -> Result:
     if missing:
         cure = f"make export DATASET={found.name}"
         raise InputError(f"the result is not whole: {missing[0]} is missing", file=found, cure=cure)
-    dataset = read_dataset(_dataset_of(found))
+    folders = {stage: (found / stage).resolve() for stage in (*STAGES, "shapes", "surface") if (found / stage).is_dir()}
+    if (place := _dataset_of(found)) is None:  # the folder was taken elsewhere: it has what is needed
+        facts, source = read_json(found / "export" / "dataset.json"), found / "export" / "source"
+        files = {path.relative_to(source).as_posix(): path for path in sorted(source.rglob("*")) if path.is_file()}
+        return Result(found, SolvedSet(Inputs(folders, facts, files)))
+    dataset = read_dataset(place)
     slices = {name: dataset_slice(dataset, name) for name in SLICES}  # what the stage `recipes` is handed
     files = {file: dataset.folder / file for each in slices.values() for file in each.files}
-    folders = {stage: (found / stage).resolve() for stage in (*STAGES, "shapes", "surface") if (found / stage).is_dir()}
     solved = SolvedSet(Inputs(folders, {f"dataset.{name}": each.facts for name, each in slices.items()}, files))
     _check_names(dataset, solved, found)
     return Result(found, solved)
 
 
-def _dataset_of(folder: Path) -> Path:
-    """dataset.txt is relative to the checkout that the folder lies in, where the data set lies in it."""
+def _dataset_of(folder: Path) -> Path | None:
+    """dataset.txt is relative to the checkout that the folder lies in, where the data set lies in it; None where it is gone, and not needed."""
     words = (folder / MARK).read_text(encoding="utf-8", errors="surrogateescape").removesuffix("\n")
     for parent in folder.resolve().parents:
         if os.path.isfile(parent / words / FILE):
             return parent / words
+    if (folder / "export" / "dataset.json").is_file():
+        return None
     cure = "put it back; or run it again from where it is: make all DATASET=<its folder>"
     raise InputError(f"its data set {words!r} is not there any more", file=folder / MARK, cure=cure)
 

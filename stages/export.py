@@ -38,7 +38,7 @@ from factorlib.results.lobes import read_lobes, write_lobes
 from factorlib.results.materials import read_exposures, read_materials, reflectances
 from factorlib.results.poses import read_poses
 from factorlib.stage import Inputs, Progress
-from factorlib.wholefile import write_text
+from factorlib.wholefile import write_bytes, write_text
 
 log = logging.getLogger("factorlib.export")
 SKY = "_sky"  # ends the name of a map without its suns
@@ -73,6 +73,7 @@ def main(params: Params, inputs: Inputs, out: Path, progress: Progress) -> None:
     write_lobes(out / "lobes.parquet", lobes)
     write_text(out / "materials.mtlx", materialx(materials))
     write_losses(out / "losses.json", materials)
+    _write_dataset(out, inputs)
     progress(1, 4, "lights")
     for folder in ("illumination", "coverage", "meshes", "scenes/light", "scenes/meshes"):
         (out / folder).mkdir(parents=True)
@@ -130,6 +131,15 @@ def _solved_lights(file: Path, lights: Mapping[str, LightSlice]) -> dict[str, Lo
             why = "no pixel in it was observed: it is written as black"
             log.warning("illumination '%s' was not solved for, because %s", name, why)
     return {name: solved.get(name, no_lobes()) for name in names}
+
+
+def _write_dataset(out: Path, inputs: Inputs) -> None:
+    """What pictures of the result need of its data set: the facts, and under source/ the files, of meshes, by their paths there."""
+    write_json(out / "dataset.json", {name: inputs.facts[name] for name in sorted(inputs.facts)})
+    for relative, file in sorted(inputs.files.items()):
+        copy = out / "source" / relative
+        copy.parent.mkdir(parents=True, exist_ok=True)
+        write_bytes(copy, file.read_bytes())
 
 
 def _write_light(out: Path, name: str, light: Lobes, coverage: Path, params: Params) -> None:

@@ -17,6 +17,7 @@ from factorlib.images.exr import read_exr, read_rgb_exr, write_exr
 from factorlib.images.light_map import read_light_map
 from factorlib.images.picture import read_png
 from factorlib.jsonfile import read_json, write_json
+from factorlib.pack import pack
 from factorlib.runner.project import LIBRARY
 from tests.export import made_export
 
@@ -100,6 +101,53 @@ def test_a_copy_of_a_result_is_one(copy):
     assert factorlib.load_result(copy / "before").photos == ["front", "side"]
 
 
+def test_a_copy_that_lies_far_from_its_data_set_makes_the_same_pictures(copy, result, tmp_path):
+    shutil.copytree(copy / "before", tmp_path / "far" / "taken")
+    shutil.rmtree(copy)
+    taken = factorlib.load_result(tmp_path / "far" / "taken")
+    assert (
+        taken.photos == result.photos
+        and taken.objects == result.objects
+        and list(taken.materials) == list(result.materials)
+    )
+    pictures = [of.relight("front/chair", "side", width=32, samples=2).pixels for of in (taken, result)]
+    np.testing.assert_array_equal(*pictures)
+
+
+def test_a_packed_result_is_the_same_file_twice_and_loads_where_it_is_unpacked(copy, result, tmp_path):
+    home, files = copy / "build" / "set", [tmp_path / f"{k}.zip" for k in range(2)]
+    with pytest.raises(InputError, match="report is missing"):
+        pack(home, files[0])
+    (home / "report").mkdir()
+    (home / "report" / "index.html").write_text("<html>")
+    shutil.move(home / "export", copy / "kept")
+    (home / "export").symlink_to(copy / "kept")  # as the runner leaves them
+    counts = [pack(home, file) for file in files]
+    assert files[0].read_bytes() == files[1].read_bytes() and counts[0] == counts[1] > 10
+    shutil.unpack_archive(files[0], tmp_path / "far")
+    shutil.rmtree(copy)
+    assert factorlib.load_result(tmp_path / "far" / "set").materials["red"] == result.materials["red"]
+    assert (tmp_path / "far" / "set" / "READ_ME.txt").exists() and (
+        tmp_path / "far" / "set" / "report" / "index.html"
+    ).exists()
+
+
+def test_a_pack_is_whole_or_not_there_and_replaces_nothing_unasked(copy, tmp_path, monkeypatch):
+    home, file = copy / "build" / "set", tmp_path / "a.zip"
+    (home / "report").mkdir()
+    for name, words in (("a.tar", "no name for a zip"), ("none/a.zip", "no name for a zip")):
+        with pytest.raises(InputError, match=words):
+            pack(home, tmp_path / name)
+    pack(home, file)
+    before = file.read_bytes()
+    with pytest.raises(InputError, match="FORCE=1"):
+        pack(home, file)
+    monkeypatch.setattr("zipfile.ZipFile.writestr", lambda *_: (_ for _ in ()).throw(OSError("full")))
+    with pytest.raises(OSError, match="full"):
+        pack(home, file, replace=True)
+    assert file.read_bytes() == before and [path.name for path in tmp_path.iterdir() if "zip" in path.name] == ["a.zip"]
+
+
 def renamed(file, old, new):
     file.write_text(file.read_text().replace(old, new))
 
@@ -109,10 +157,15 @@ def renamed(file, old, new):
     [
         (lambda root: shutil.rmtree(root / "build/set/export"), ["export is missing", "make export DATASET=set"]),
         (
-            lambda root: (root / "data/set").rename(root / "data/moved"),
+            lambda root: [shutil.rmtree(root / "data/set"), (root / "build/set/export/dataset.json").unlink()],
             ["data set 'data/set' is not there any more", "make all DATASET="],
         ),
-        (lambda root: (root / "build/set/dataset.txt").write_text(""), ["dataset.txt", "is not there any more"]),
+        (
+            lambda root: [
+                (root / f"build/set/{gone}").write_text("") for gone in ("dataset.txt", "export/dataset.json")
+            ],
+            ["dataset.json", "run its stage again"],
+        ),
         (
             lambda root: renamed(root / "data/set/dataset.yaml", '"unseen"', '"new"'),
             ["earlier dataset.yaml", "no material 'new'", "make all DATASET=set"],

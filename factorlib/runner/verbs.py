@@ -328,6 +328,18 @@ def verify(project: Project, dataset: str | None) -> int:
     return 1 if damaged else 0
 
 
+def pack(project: Project, dataset: str, out: Path | None, replace: bool) -> int:
+    """Put a dataset's results into one zip file, which needs neither this checkout nor the dataset."""
+    from factorlib.pack import pack as pack_all
+
+    if not (homes := _homes(project, dataset, "pack")):
+        return 1
+    out = Path(f"{homes[0].folder.name}.zip") if out is None else out
+    count = pack_all(homes[0].folder, out, replace)
+    print(f"{homes[0].folder.name}: {count} files, {out.stat().st_size / 1e6:.1f} MB\n  {out}")
+    return 0
+
+
 def ship(project: Project, stage: str, dataset: str) -> int:
     """Put the current result of a stage into the package, where pipeline.yaml says that it ships with the source."""
     known = {name: found.shipped for name, found in _pipeline(project).stages.items() if found.shipped}

@@ -1,0 +1,71 @@
+"""A result as one file that travels: what people and programs read of it, and what `factorlib.load_result` needs, without the data set."""
+
+from __future__ import annotations
+
+import os
+import zipfile
+from pathlib import Path
+
+from factorlib.errors import InputError
+from factorlib.wholefile import writing
+
+NEEDED = ("report", "export", "masks", "align")
+STAGES = (*NEEDED, "evaluate", "render", "shapes", "solve", "surface")
+FIRST = (1980, 1, 1, 0, 0, 0)  # the date of every file, so that equal results are equal files
+READ_ME = """\
+report/index.html              everything on one page: open this first
+export/materials.json          diffuse and specular reflectance (linear Rec. 709), roughness r (GGX with alpha = r * r), standard errors
+export/illumination/*.exr      environment maps, lat-long, linear radiance in the units of their photos: top row +y, centre +z toward the
+                               viewer, +x a quarter of the width from the left edge
+export/*.glb, *.mtlx, scenes/  meshes, materials and scenes for other programs; the camera's frame of scenes is x right, y up, z toward the viewer
+export/meshes/*.ply            meshes in their own frames; align/poses.json: cam_from_object, OpenCV (x right, y down, z forward), lengths as in the meshes
+render/resynthesis/*.exr       photographs rendered again, linear
+evaluate/metrics.json          errors, and how far to trust the result
+
+In Python: factorlib.load_result("<this folder>")
+"""
+
+
+def pack(home: Path, out: Path, replace: bool = False) -> int:
+    """Write the results in `home` (build/<dataset>) into the zip file `out`, in a folder of the data set's name; the number of files.
+
+    Raises InputError where a needed stage has no result, `out` is no name of a zip file, or it is there and not to be replaced.
+    """
+    if missing := [stage for stage in NEEDED if not (home / stage).is_dir()]:
+        raise InputError(
+            f"the result is not whole: {missing[0]} is missing", file=home, cure=f"make all DATASET={home.name}"
+        )
+    if out.suffix != ".zip" or out.is_dir() or not out.absolute().parent.is_dir():
+        raise InputError(
+            "is no name for a zip file",
+            file=out,
+            key="OUT",
+            cure="name a file in a folder that is there: OUT=<name>.zip",
+        )
+    if out.exists() and not replace:
+        raise InputError("is there already", file=out, key="OUT", cure="name another, or add FORCE=1")
+    found = {
+        f"{home.name}/{path.relative_to(home).as_posix()}": path
+        for stage in STAGES
+        for path in files_below(home / stage)
+    }
+    found[f"{home.name}/dataset.txt"] = home / "dataset.txt"
+    draft = out.with_name(f".{out.name}.{os.getpid()}")
+    with writing(draft):
+        with zipfile.ZipFile(draft, "w", zipfile.ZIP_DEFLATED) as archive:
+            archive.writestr(_entry(f"{home.name}/READ_ME.txt"), READ_ME)
+            for name, path in sorted(found.items()):
+                archive.writestr(_entry(name), path.read_bytes())
+        os.replace(draft, out)
+    return len(found) + 1
+
+
+def files_below(folder: Path) -> list[Path]:
+    """Every file below a folder, links to folders of the store included."""
+    return sorted(Path(place) / name for place, _, names in os.walk(folder, followlinks=True) for name in names)
+
+
+def _entry(name: str) -> zipfile.ZipInfo:
+    entry = zipfile.ZipInfo(name, FIRST)
+    entry.compress_type, entry.external_attr = zipfile.ZIP_DEFLATED, 0o644 << 16
+    return entry
