@@ -117,6 +117,6 @@ def test_a_shape_that_does_not_look_like_its_outlines_is_named_and_one_that_cann
             [],
         )
     assert "mesh 'thing': the cylinder covers its outlines by" in caplog.text
-    with pytest.raises(InputError, match="0 photos with a known camera") as error:
+    with pytest.raises(InputError, match="a hull needs two") as error:
         run(write_set(tmp_path / "hull", {"thing": {"hull": True, "material": "red"}}, photos), tmp_path / "none", [])
-    assert error.value.key == "meshes.thing" and "sfm: true" in error.value.cure
+    assert error.value.key == "meshes.thing.hull" and "sfm: true" in error.value.cure
