@@ -11,7 +11,6 @@ from factorlib.wholefile import writing
 
 NEEDED = ("report", "export", "masks", "align")
 STAGES = (*NEEDED, "evaluate", "render", "shapes", "solve", "surface")
-FIRST = (1980, 1, 1, 0, 0, 0)  # the date of every file, so that equal results are equal files
 READ_ME = """\
 report/index.html              everything on one page: open this first
 export/materials.json          diffuse and specular reflectance (linear Rec. 709), roughness r (GGX with alpha = r * r), standard errors
@@ -61,11 +60,11 @@ def pack(home: Path, out: Path, replace: bool = False) -> int:
 
 
 def files_below(folder: Path) -> list[Path]:
-    """Every file below a folder, links to folders of the store included."""
-    return sorted(Path(place) / name for place, _, names in os.walk(folder, followlinks=True) for name in names)
+    """Every file below a folder, which may be a link into the store."""
+    return sorted(Path(place) / name for place, _, names in os.walk(folder) for name in names)
 
 
 def _entry(name: str) -> zipfile.ZipInfo:
-    entry = zipfile.ZipInfo(name, FIRST)
+    entry = zipfile.ZipInfo(name)  # of its own fixed date, so that equal results are equal files
     entry.compress_type, entry.external_attr = zipfile.ZIP_DEFLATED, 0o644 << 16
     return entry

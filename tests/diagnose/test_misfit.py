@@ -74,6 +74,9 @@ def test_energy_is_that_of_the_groups_means_where_every_value_of_a_group_is_the_
     assert energy(of_group[group], group) == pytest.approx(float((of_group[group] ** 2).sum()))
     noise = rng.normal(size=(1000, 3))
     assert energy(of_group[group] + noise, group) < 1.3 * energy(of_group[group], group)
+    count = np.bincount(group)
+    plain = sum((count * (np.bincount(group, of) / count) ** 2).sum() for of in noise.T)  # with what varies
+    assert energy(noise, group) < 0.6 * plain
     assert energy(np.ones((3, 3)), np.zeros(3, int)) == 0  # too few
 
 
