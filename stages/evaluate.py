@@ -109,7 +109,8 @@ def _verdict(inputs: Inputs, seen: dict[str, list[str]]) -> Verdict | None:
         photo: {name: own.contour_error for name, own in entry.objects.items() if own.contour_error is not None}
         for photo, entry in read_poses(inputs["align"] / "poses.json").items()
     }
-    return verdict(Signs(material_errors(materials, lights), uncertainty.unexplained, uncertainty.photos, contours))
+    errors, misfit = material_errors(materials, lights), (uncertainty.unexplained, uncertainty.photos)
+    return verdict(Signs(errors, *misfit, contours, uncertainty.residual_sigma))
 
 
 def _lights(inputs: Inputs, truth: TruthFile, out: Path) -> tuple[dict[str, Light], dict[str, Light]]:

@@ -30,6 +30,7 @@ from factorlib.results.metrics import Verdict
 FLOOR, MATERIALS, CLIPPED, UNEXPLAINED, CONTOUR = 1e-5, 0.28, 0.19, 0.0186, 1.38
 DEVIATION = 3.0  # dB, of the scores from what is expected
 GOOD, POOR = 24.0, 19.0  # dB
+DISAGREES = 3.0  # residuals, in units of their noise
 MUCH = 0.1  # unexplained: something is wrong, not only rough
 TELLING = 0.2  # least share of e² that is a reason
 ROUGHNESS = (0.1, 1.0)
@@ -71,12 +72,14 @@ class Signs(msgspec.Struct, frozen=True):
     materials    m² of each that a photo shows (`material_errors`)
     unexplained  u of the set;  photos: its share in each, and that of clipped values
     contours     d of each object whose outline was compared, by photo and object
+    deviation    of the residuals, in units of their noise: standard errors of materials grow with it
     """
 
     materials: dict[str, float]
     unexplained: float
     photos: dict[str, Misfit]
     contours: dict[str, dict[str, float]]
+    deviation: float = 1.0
 
     def terms(self) -> dict[str, float]:
         """The terms of (1) but for the first."""
@@ -111,6 +114,9 @@ def text_of(verdict: Verdict) -> str:
 def _of_materials(signs: Signs) -> tuple[str, str]:
     """Why, and what to do."""
     name = max(signs.materials, key=signs.materials.__getitem__)
+    if signs.deviation > DISAGREES:
+        why = f"uncertain reflectances, most of all that of '{name}', for shapes and photos disagree by {signs.deviation:.0f} times their noise"
+        return why, _of_unexplained(signs)[1]
     return (
         f"uncertain reflectances, most of all that of '{name}'",
         f"add a photo of '{name}' in light with a small bright source, or in which it stands beside a material that is surer",

@@ -44,6 +44,14 @@ def test_the_weightiest_reason_comes_first_and_says_what_to_do():
         assert (both.terms["materials"] > both.terms["contour"]) == (level > 0.5)
 
 
+def test_reflectances_that_are_uncertain_for_the_photos_fit_badly_ask_for_a_better_mesh_not_for_another_photo():
+    unsure = msgspec.structs.replace(CLEAN, materials={"wood": 0.2}, photos=UNEXPLAINED, deviation=12.0)
+    assert (
+        "12 times" in verdict(unsure).reasons[0] and "mesh" in verdict(unsure).next and "'dusk'" in verdict(unsure).next
+    )
+    assert "mesh" not in verdict(msgspec.structs.replace(unsure, deviation=1.0)).next
+
+
 def test_where_nothing_is_wrong_at_all_it_still_says_what_to_do_next():
     nothing = verdict(Signs({"red": 0.0}, 0.0, {"day": Misfit(0.0, 0.0)}, {}))
     assert nothing.trust == "good" and nothing.next and len(nothing.reasons) == 1
