@@ -53,6 +53,7 @@ def test_exported_materials_in_exported_lights_are_the_solved_ones(inputs, tmp_p
 def test_files_are_all_there_and_the_same_bytes_again(inputs, tmp_path):
     first, second = (files_of(run(inputs, tmp_path / name)) for name in ("one", "two"))
     expected = {
+        "dataset.json",
         "exposures.json",
         "lights.json",
         "illumination/room_sky.exr",
@@ -65,6 +66,8 @@ def test_files_are_all_there_and_the_same_bytes_again(inputs, tmp_path):
         "meshes/egg.ply",
         "materials.json",
         "materials.mtlx",
+        "source/ball.obj",
+        "source/egg.obj",
     }
     expected |= {f"illumination/{name}.{kind}" for name in ("front", "room") for kind in ("exr", "hdr")}
     expected |= {f"scenes/{name}.{kind}" for name in ("front", "side") for kind in ("xml", "json", "usda")}
