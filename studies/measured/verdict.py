@@ -18,8 +18,10 @@ from jaxtyping import Float
 from scipy.optimize import least_squares
 from scipy.stats import spearmanr
 
-from factorlib.evaluate.verdict import CLIPPED, CONTOUR, FLOOR, MATERIALS, UNEXPLAINED
+from factorlib.evaluate.verdict import CLIPPED, CONTOUR, FLOOR, GOOD, MATERIALS, POOR, UNEXPLAINED
 from factorlib.light_prior import maps_in
+from factorlib.wholefile import write_text
+from studies.figures import STYLE
 from studies.measured.eames_like import drawn, folder_of, made
 from studies.measured.tools import ROOT, evaluated, needed, table
 from studies.scenes.spoilt import MIXED, spoilt
@@ -30,6 +32,7 @@ SEEDS = {"fit": (None, *range(111, 121)), "test": tuple(range(201, 206))}  # Non
 FIRST = {"fit": 0, "test": 1000}  # number of the first set
 ORDER = {"fit": 5, "test": 6}  # seeds of the order in which ways to spoil are dealt
 TIMES = 4  # a base
+LEAST, MOST = 10, 35  # dB, of the figure
 HOPELESS = 18.0  # dB: a flat disc of the true ball's mean colour scores 17.6 to 18.6
 WEIGHTS = {"materials": MATERIALS, "clipped": CLIPPED, "unexplained": UNEXPLAINED, "contour": CONTOUR}
 
@@ -84,9 +87,38 @@ def fitted(sets: list[Judged]) -> Float[np.ndarray, " 4"]:
     return np.exp(least_squares(lambda w: expected(np.exp(w), signs) - scores, start, loss="soft_l1").x)
 
 
+def scatter(sets: dict[str, list[tuple[float, float]]]) -> str:
+    """An SVG of (expected, true) scores in dB by kind: hollow dots of the first, full ones of the others; the diagonal, and the verdict's bounds."""
+
+    def across(db: float) -> float:
+        return 50 + 12 * (db - LEAST)
+
+    def up(db: float) -> float:
+        return 330 - 12 * (db - LEAST)
+
+    ends = across(LEAST), across(MOST), up(LEAST), up(MOST)
+    parts = [f'<line x1="{ends[0]}" y1="{ends[2]}" x2="{ends[1]}" y2="{ends[3]}"/>']
+    parts += [
+        f'<line class="grid" x1="{across(db)}" x2="{across(db)}" y1="{ends[2]}" y2="{ends[3]}"/>' for db in (POOR, GOOD)
+    ]
+    for db in range(LEAST, MOST + 1, 5):
+        parts += [f'<text x="{across(db)}" y="346" text-anchor="middle">{db}</text>', f'<text x="44" y="{up(db) + 4}" text-anchor="end">{db}</text>']  # fmt: skip
+    for k, points in enumerate(sets.values()):
+        fill = "#2b5c9e" if k else "none"
+        parts += [
+            f'<circle cx="{across(x):.1f}" cy="{up(y):.1f}" r="3.5" stroke="#2b5c9e" fill="{fill}"/>' for x, y in points
+        ]
+    words = "; ".join(f"{'full' if k else 'hollow'}: {name}" for k, name in enumerate(sets))
+    parts.append(f'<text x="50" y="366">expected, dB; upward: true relit set score, dB ({words})</text>')
+    return (
+        f'<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 420 376"><style>{STYLE}</style>{"".join(parts)}</svg>\n'
+    )
+
+
 def main() -> None:
-    """Print every set, and what they come to."""
+    """Print every set, and what they come to; write their figure beside them."""
     sets = judged(sys.argv[1])
+    write_text(PLACE / f"{sys.argv[1]}.svg", scatter({sys.argv[1]: [(one.expected, one.score) for one in sets]}))
     rows = [[one.spoilt_by, f"{one.score:.1f}", f"{one.expected:.1f}", one.trust] for one in sorted(sets, key=lambda s: -s.expected)]  # fmt: skip
     print(table(["spoilt by", "relit, dB", "expected", "verdict"], rows))
     score, foreseen = (np.array([getattr(one, name) for one in sets]) for name in ("score", "expected"))
