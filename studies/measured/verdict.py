@@ -109,10 +109,10 @@ def scatter(sets: dict[str, list[tuple[float, float]]]) -> str:
             f'<circle cx="{across(x):.1f}" cy="{up(y):.1f}" r="3.5" stroke="#2b5c9e" fill="{fill}"/>' for x, y in points
         ]
     words = "; ".join(f"{'full' if k else 'hollow'}: {name}" for k, name in enumerate(sets))
-    captions = f"expected score, dB ({words})", "true relit set score, dB"
-    parts += [f'<text x="50" y="{y}">{text}</text>' for y, text in zip((366, 20), captions, strict=True)]
+    captions = "expected score, dB", words, "true relit set score, dB"
+    parts += [f'<text x="50" y="{y}">{text}</text>' for y, text in zip((366, 384, 20), captions, strict=True)]
     return (
-        f'<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 420 376"><style>{STYLE}</style>{"".join(parts)}</svg>\n'
+        f'<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 420 394"><style>{STYLE}</style>{"".join(parts)}</svg>\n'
     )
 
 
