@@ -30,7 +30,7 @@ def pack(home: Path, out: Path, replace: bool = False) -> int:
 
     Raises InputError where a needed stage has no result, `out` is no name of a zip file, or it is there and not to be replaced.
     """
-    if missing := [stage for stage in NEEDED if not (home / stage).is_dir()]:
+    if missing := [path for path in (*NEEDED, "export/dataset.json") if not (home / path).exists()]:
         raise InputError(
             f"the result is not whole: {missing[0]} is missing", file=home, cure=f"make all DATASET={home.name}"
         )

@@ -21,9 +21,6 @@ import msgspec
 import numpy as np
 from jaxtyping import Float
 
-from factorlib.dataset.read import FILE, read_dataset
-from factorlib.dataset.schema import Dataset
-from factorlib.dataset.slices import dataset_slice
 from factorlib.errors import InputError, did_you_mean
 from factorlib.geometry.camera import rotation_of_vector
 from factorlib.images.exr import LAT_LONG, read_rgb_exr, write_rgb_exr
@@ -44,7 +41,13 @@ from factorlib.stage import Inputs
 from factorlib.yamlfile import convert
 
 T = TypeVar("T")
-STAGES, SLICES = ("masks", "align", "export"), ("materials", "objects", "light", "ground")
+STAGES = "masks", "align", "export"
+SLICES = {
+    "dataset.materials",
+    "dataset.objects",
+    "dataset.light",
+    "dataset.ground",
+}  # what the stage `recipes` is handed
 MARK = "dataset.txt"
 SAMPLES = 64
 
@@ -52,8 +55,8 @@ SAMPLES = 64
 def load_result(folder: str | Path) -> Result:
     """The result in a folder such as build/eames, or called eames in build/; from the current folder, or else from one above it.
 
-    The folder may have been copied elsewhere (`cp -rL build/eames …`), without its data set.
-    Raises InputError where there is none, it is not whole, or its data set has other names in it by now.
+    It is as it was solved: the data set is not read, may have changed, or be gone, and the folder may be a copy (`cp -rL build/eames …`).
+    Raises InputError where there is none, or it is not whole.
     """
     places = [Path(*k * [".."]) for k in range(len(Path.cwd().parts))]  # a notebook runs in its own folder
     candidates = [path for place in places for path in (place / folder, place / "build" / folder)]
@@ -68,40 +71,13 @@ def load_result(folder: str | Path) -> Result:
         cure = f"make export DATASET={found.name}"
         raise InputError(f"the result is not whole: {missing[0]} is missing", file=found, cure=cure)
     folders = {stage: (found / stage).resolve() for stage in (*STAGES, "shapes", "surface") if (found / stage).is_dir()}
-    if (place := _dataset_of(found)) is None:  # the folder was taken elsewhere: it has what is needed
-        facts, source = read_json(found / "export" / "dataset.json"), found / "export" / "source"
-        files = {path.relative_to(source).as_posix(): path for path in sorted(source.rglob("*")) if path.is_file()}
-        return Result(found, SolvedSet(Inputs(folders, facts, files)))
-    dataset = read_dataset(place)
-    slices = {name: dataset_slice(dataset, name) for name in SLICES}  # what the stage `recipes` is handed
-    files = {file: dataset.folder / file for each in slices.values() for file in each.files}
-    solved = SolvedSet(Inputs(folders, {f"dataset.{name}": each.facts for name, each in slices.items()}, files))
-    _check_names(dataset, solved, found)
-    return Result(found, solved)
-
-
-def _dataset_of(folder: Path) -> Path | None:
-    """dataset.txt is relative to the checkout that the folder lies in, where the data set lies in it; None where it is gone, and not needed."""
-    words = (folder / MARK).read_text(encoding="utf-8", errors="surrogateescape").removesuffix("\n")
-    for parent in folder.resolve().parents:
-        if os.path.isfile(parent / words / FILE):
-            return parent / words
-    if (folder / "export" / "dataset.json").is_file():
-        return None
-    cure = "put it back; or run it again from where it is: make all DATASET=<its folder>"
-    raise InputError(f"its data set {words!r} is not there any more", file=folder / MARK, cure=cure)
-
-
-def _check_names(dataset: Dataset, solved: SolvedSet, folder: Path) -> None:
-    """InputError where dataset.yaml names a material, photo or object that was not there when the result was made."""
-    missing = [f"material {name!r}" for name in solved.names if name not in solved.table.materials]
-    missing += [f"photo {photo!r}" for photo in solved.objects if photo not in solved.poses]
-    for photo in [photo for photo in solved.objects if photo in solved.poses]:
-        posed, objects = solved.poses[photo].objects, solved.objects[photo].objects
-        missing += [f"object '{photo}/{obj.name}'" for obj in objects if obj.name not in posed]
-    if missing:
-        found = f"the result is of an earlier {FILE}: it has no {', no '.join(missing)}"
-        raise InputError(found, file=folder, cure=f"make all DATASET={dataset.folder.name}")
+    file, source = found / "export" / "dataset.json", found / "export" / "source"
+    facts = read_json(file) if file.is_file() else {}
+    if not (isinstance(facts, dict) and facts.keys() >= SLICES):
+        cure = f"make export DATASET={found.name}"
+        raise InputError("the result does not say what its data set was", file=file, cure=cure)
+    files = {path.relative_to(source).as_posix(): path for path in sorted(source.rglob("*")) if path.is_file()}
+    return Result(found, SolvedSet(Inputs(folders, facts, files)))
 
 
 class UnknownName(InputError, KeyError):
