@@ -1,6 +1,7 @@
 """What can be said of files before anything runs: photos against their masks, meshes against their parts, what recipes name.
 
-These are the checks that the stages make of what they read first, by the same functions; of photos only headers are read.
+These are the checks that the stages make of what they read first, by the same functions, and that masks and dataset.yaml name the same materials;
+of photos only headers are read.
 The runner loads this module by its name, as it loads stages: it knows no science, and a run with nothing to do must not
 pay for any.
 """
@@ -105,7 +106,7 @@ class Validation:
         check_materials(labels, objects, made_of, self.spec.materials, self.file(masks), f"{key}.objects")
 
     def _materials_of(self, obj: ObjectEntry) -> set[str]:
-        """The materials of an object's parts."""
+        """Return the materials of an object's parts."""
         made_of = self.spec.meshes[obj.mesh].made_of
         return set(
             (made_of | obj.materials).values() if isinstance(made_of, dict) else obj.materials.values() or [made_of]

@@ -24,6 +24,7 @@ import numpy as np
 from factorlib.evaluate.ball import Light
 from factorlib.evaluate.picture import tone_mapped
 from factorlib.evaluate.relighting import MEAN_SHOWN, Appearances
+from factorlib.model.materials import ROUGHNESS
 from factorlib.results.materials import Misfit, Reflectance, Solved
 from factorlib.results.metrics import Verdict
 
@@ -33,7 +34,6 @@ GOOD, POOR = 24.0, 19.0  # dB
 DISAGREES = 3.0  # residuals, in units of their noise
 MUCH = 0.1  # unexplained: something is wrong, not only rough
 TELLING = 0.2  # least share of e² that is a reason
-ROUGHNESS = (0.1, 1.0)
 
 
 def material_errors(materials: Mapping[str, Solved], lights: Mapping[str, Light]) -> dict[str, float]:
@@ -67,10 +67,10 @@ def _others(solved: Solved) -> Iterator[Reflectance]:
 
 
 class Signs(msgspec.Struct, frozen=True):
-    """What is known without truth.
+    """The signs of (1), as far as they are measured.
 
-    materials    m² of each that a photo shows (`material_errors`)
-    unexplained  u of the set;  photos: its share in each, and that of clipped values
+    materials    m² of each material that a photo shows (`material_errors`)
+    unexplained  u of the set;  photos: the unexplained share of each photo, and its share of clipped values
     contours     d of each object whose outline was compared, by photo and object
     deviation    of the residuals, in units of their noise: standard errors of materials grow with it
     """
@@ -112,7 +112,7 @@ def text_of(verdict: Verdict) -> str:
 
 
 def _of_materials(signs: Signs) -> tuple[str, str]:
-    """Why, and what to do."""
+    """Return why, and what to do next."""
     name = max(signs.materials, key=signs.materials.__getitem__)
     if signs.deviation > DISAGREES:
         why = f"uncertain reflectances, most of all that of '{name}', for shapes and photos disagree by {signs.deviation:.0f} times their noise"
@@ -124,7 +124,7 @@ def _of_materials(signs: Signs) -> tuple[str, str]:
 
 
 def _of_clipped(signs: Signs) -> tuple[str, str]:
-    """Why, and what to do."""
+    """Return why, and what to do next."""
     name, photos = max(signs.photos, key=lambda photo: signs.photos[photo].clipped), signs.photos
     return (
         f"clipped values, in '{name}' {photos[name].clipped:.0%} of all: they say 'at least' only",
@@ -133,7 +133,7 @@ def _of_clipped(signs: Signs) -> tuple[str, str]:
 
 
 def _of_contour(signs: Signs) -> tuple[str, str]:
-    """Why, and what to do."""
+    """Return why, and what to do next."""
     each = {(photo, name): error for photo, own in signs.contours.items() for name, error in own.items()}
     photo, name = max(each, key=each.__getitem__)
     return (
@@ -143,7 +143,7 @@ def _of_contour(signs: Signs) -> tuple[str, str]:
 
 
 def _of_unexplained(signs: Signs) -> tuple[str, str]:
-    """Why, and what to do."""
+    """Return why, and what to do next."""
     name = max(signs.photos, key=lambda photo: signs.photos[photo].unexplained)
     share = min(signs.photos[name].unexplained, 1)
     if share < MUCH:

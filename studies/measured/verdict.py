@@ -1,10 +1,11 @@
-"""What the verdict says, beside the truth it does not know: `python -m studies.measured.verdict fit|test`, with LIGHTS="FOLDER …" of captured maps.
+"""What the verdict says, beside the truth it does not know: `python -m studies.measured.verdict fit test`, with LIGHTS="FOLDER …" of captured maps.
 
 fit    44 sets: data/eames and seeds 111 to 120 of `studies.measured.eames_like`, from 116 on in captured light, four times each, spoilt in ways of
        `studies.scenes.spoilt`.  The weights of `factorlib.evaluate.verdict` are fitted to them anew, and printed
 test   20 others of seeds 201 to 205, the last two in captured light, each way once: what is expected with the weights as they stand
 
-Sets lie in build/bench/verdict, results in build/.  Printed: every set, rank correlations (Spearman), and the deviation.
+Sets lie in build/bench/verdict, results in build/.  Printed of each that is named: every set, rank correlations (Spearman), and the deviation; of `fit` also
+with each set left out of the fit.  The figure of all that are named is build/bench/verdict/calibration.svg.
 """
 
 from __future__ import annotations
@@ -88,7 +89,7 @@ def fitted(sets: list[Judged]) -> Float[np.ndarray, " 4"]:
 
 
 def scatter(sets: dict[str, list[tuple[float, float]]]) -> str:
-    """An SVG of (expected, true) scores in dB by kind: hollow dots of the first, full ones of the others; the diagonal, and the verdict's bounds."""
+    """Return an SVG of (expected, true) scores in dB by kind: hollow dots for the first, full ones for the others; the diagonal, and the verdict's bounds."""
 
     def across(db: float) -> float:
         return 50 + 12 * (db - LEAST)
@@ -116,18 +117,33 @@ def scatter(sets: dict[str, list[tuple[float, float]]]) -> str:
     )
 
 
-def main() -> None:
-    """Print every set, and what they come to; write their figure beside them."""
-    sets = judged(sys.argv[1])
-    write_text(PLACE / f"{sys.argv[1]}.svg", scatter({sys.argv[1]: [(one.expected, one.score) for one in sets]}))
+def told(sets: list[Judged]) -> str:
+    """Every set in a table, and how well scores are foreseen."""
     rows = [[one.spoilt_by, f"{one.score:.1f}", f"{one.expected:.1f}", one.trust] for one in sorted(sets, key=lambda s: -s.expected)]  # fmt: skip
-    print(table(["spoilt by", "relit, dB", "expected", "verdict"], rows))
-    score, foreseen = (np.array([getattr(one, name) for one in sets]) for name in ("score", "expected"))
+    foreseen = np.array([one.expected for one in sets])
+    return f"{table(['spoilt by', 'relit, dB', 'expected', 'verdict'], rows)}\n{agreement(foreseen, sets)}"
+
+
+def agreement(foreseen: Float[np.ndarray, " n"], sets: list[Judged]) -> str:
+    """Rank correlations of foreseen and true scores, of all sets and of those that are not hopeless, and the deviation."""
+    score = np.array([one.score for one in sets])
     some = score >= HOPELESS
-    print(f"Spearman {spearmanr(foreseen, score)[0]:.2f}, of those that are not hopeless {spearmanr(foreseen[some], score[some])[0]:.2f}, "
-          f"deviation {np.sqrt(np.mean((foreseen - score) ** 2)):.1f} dB")  # fmt: skip
-    if sys.argv[1] == "fit":
+    ranks = spearmanr(foreseen, score)[0], spearmanr(foreseen[some], score[some])[0]
+    deviation = np.sqrt(np.mean((foreseen - score) ** 2))
+    return f"Spearman {ranks[0]:.2f}, from {HOPELESS:g} dB on {ranks[1]:.2f}, deviation {deviation:.1f} dB"
+
+
+def main() -> None:
+    """Print what came out of each kind of sets that is named, and draw all."""
+    kinds = {name: judged(name) for name in sys.argv[1:] or SEEDS}
+    for name, sets in kinds.items():
+        print(f"{name}\n{told(sets)}")
+    if sets := kinds.get("fit"):
         print("weights:", dict(zip(WEIGHTS, np.round(fitted(sets), 4).tolist(), strict=True)))
+        rest = [expected(fitted([*sets[:k], *sets[k + 1 :]]), np.array([one.signs]))[0] for k, one in enumerate(sets)]
+        print("each set left out of the fit:", agreement(np.array(rest), sets))
+    points = {f"{len(sets)} sets, {name}": [(one.expected, one.score) for one in sets] for name, sets in kinds.items()}
+    write_text(PLACE / "calibration.svg", scatter(points))
 
 
 if __name__ == "__main__":

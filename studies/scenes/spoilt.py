@@ -32,7 +32,7 @@ def keep(spec: Spec, names: list[str]) -> None:
 
 
 def exact(folder: Path, spec: Spec, rng: Rng) -> None:
-    """Give the true mesh, its poses and focal lengths of the photos."""
+    """Give the true mesh and its poses."""
     solid = {name: smooth(*part) for name, part in chair().items()}
     write_obj(folder / MESH, {name: (mesh.vertices, mesh.faces, mesh.normals) for name, mesh in solid.items()})
     poses = yaml.safe_load((folder / TRUTH).read_text())["poses"]
@@ -133,7 +133,7 @@ KINDS: dict[str, Callable[[Path, Spec, Rng], None]] = {
     of.__name__: of
     for of in (exact, rough, rougher, another_chair, few, one_photo, unlinked, miscalled, clipped, dark, noisy, developed, tiny)
 }  # fmt: skip
-# What a set is spoilt by, drawn with equal chances; links are cut first, for the others go by the photos that are left.
+# What a set is spoilt by, one way after the other; each is dealt equally often.
 MIXED = (
     [], [], ["exact"], ["exact"], ["few"], ["exact", "few"], ["rough"], ["rough", "few"], ["rougher"], ["another_chair"], ["one_photo"],
     ["one_photo", "exact"], ["unlinked"], ["miscalled"], ["clipped"], ["exact", "dark"], ["noisy"], ["developed"], ["tiny"], ["few", "tiny", "rougher"],
@@ -141,7 +141,8 @@ MIXED = (
 
 
 def spoilt(base: Path, folder: Path, kinds: list[str], seed: int) -> None:
-    """Write the set in `base`, spoilt, into the folder, which is replaced."""
+    """Write the set in `base`, spoilt, as the folder, which is there when all of it is."""
+    whole, folder = folder, folder.with_name(f"{folder.name}.new")
     shutil.rmtree(folder, ignore_errors=True)
     shutil.copytree(base, folder)
     spec, rng = yaml.safe_load((folder / "dataset.yaml").read_text()), np.random.default_rng([17, seed])
@@ -151,6 +152,7 @@ def spoilt(base: Path, folder: Path, kinds: list[str], seed: int) -> None:
     write_yaml(
         folder / TRUTH, truth_of(spec, yaml.safe_load((folder / TRUTH).read_text())), "the truth of what is left"
     )
+    folder.rename(whole)
 
 
 def truth_of(spec: Spec, truth: Spec) -> Spec:
