@@ -108,7 +108,7 @@ def check_materials(
         if strange and missing:
             names, most = ", ".join(repr(made_of[k][0]) for k in members), max(strange, key=counts.__getitem__)
             fault = f"the mask shows {materials[most]!r} in {counts[most] / counts.sum():.0%} of the pixels of {names}, but no {missing[0]!r}"
-            cure = f"correct their materials, {', '.join(sorted(own))} by dataset.yaml, or the labels"
+            cure = f"correct the materials in dataset.yaml (there {', '.join(sorted(own))}), or the labels of the mask"
             raise InputError(fault, file=path, key=f"{key}[{members[0]}].materials", cure=cure)
 
 
