@@ -18,6 +18,7 @@ from factorlib.errors import InputError
 from factorlib.geometry.camera import Pose
 from factorlib.geometry.raster import Caster, Maps, rasterise
 from factorlib.images.exr import read_exr, write_exr
+from factorlib.images.lens import lens_of
 from factorlib.images.picture import write_png
 from factorlib.jsonfile import write_json
 from factorlib.meshes.limits import Limits
@@ -115,7 +116,9 @@ def objects_of(
             pose = Pose(np.array(pose.rotation), np.array(pose.translation))
         if own.keypoints:
             pixels, points = (np.array([getattr(k, of) for k in own.keypoints]) for of in ("pixel", "point"))
-            keypoints = Keypoints(pixels / factor, points)
+            pixels = pixels / factor
+            lens = lens_of(slice_.camera, factor, *channels["label"].shape[::-1])
+            keypoints = Keypoints(lens.undistorted(pixels) if lens else pixels, points)
         caster = Caster(scaled(read, scale))
         objects.append(ObjectToPlace(own.name, caster, silhouette, pose, keypoints, before, scale))
     return objects

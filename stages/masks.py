@@ -1,8 +1,9 @@
 """Photo and masks to one EXR of linear radiance, labels, and which pixels can be used, no larger than is useful."""
 
 import logging
+from collections.abc import Mapping
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import msgspec
 import numpy as np
@@ -11,14 +12,20 @@ from factorlib.dataset.schema import LEFT_OUT, PhotoSlice
 from factorlib.errors import InputError
 from factorlib.images.boxes import box_majority, least_factor
 from factorlib.images.exr import write_exr
+from factorlib.images.lens import Undistorted, lens_of
 from factorlib.images.limits import MOST_MEGAPIXELS, check_pixels
 from factorlib.images.photo import Photo, check_bright, decoded, open_photo
+from factorlib.images.processing import HALO, camera_says, halo
+from factorlib.images.raw import is_raw
 from factorlib.jsonfile import write_json
 from factorlib.labels import Labels, read_labels, read_objects
 from factorlib.results.photos import PhotoFacts
 from factorlib.stage import Inputs, Progress, silent
 
 log = logging.getLogger("factorlib.masks")
+UNPROCESSED = (
+    "materials and lights take it for shading; use the raw file, or take it again with HDR, portrait and sharpening off"
+)
 
 
 class Params(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -52,7 +59,13 @@ def main(params: Params, inputs: Inputs, out: Path, progress: Progress = silent)
     labels, objects = reduced(labels, factor, path, key), box_majority(objects, factor)
     progress(1, 3, f"{name}: photo")
     photo = decoded(stored, facts.encoding, factor, path)
+    if lens := lens_of(facts.camera, photo.factor, photo.width, photo.height):
+        lens.check(photo.width, photo.height, "dataset.yaml", f"{entry}.camera.distortion")
+        straight = Undistorted(lens, photo.height, photo.width)
+        photo, objects = straight.photo(photo), straight.nearest(objects)
+        labels = Labels(straight.nearest(labels.label), straight.nearest(labels.left_out) | ~straight.inside)
     valid = valid_pixels(photo, labels, path, f"{entry}.image")
+    warn_of_processing(stored.exif, photo, labels, path)
     progress(2, 3, f"{name}: writing")
     colours = {c: photo.radiance[..., k] for k, c in enumerate("RGB")}
     clipped = {f"clipped.{c}": photo.clipped[..., k] for k, c in enumerate("RGB")}
@@ -87,6 +100,15 @@ def reduced(labels: Labels, factor: int, path: Path, key: str) -> Labels:
         cure = 'SET="masks.frame=…" with more pixels, or a mask of whole objects'
         raise InputError(fault, file=path, key=key, cure=cure)
     return Labels(label, left_out)
+
+
+def warn_of_processing(exif: Mapping[str, Any], photo: Photo, labels: Labels, path: Path) -> None:
+    """Warn of processing that no tone curve undoes, by what the camera wrote and by halos about the masks."""
+    if (says := camera_says(exif)) and not is_raw(path):
+        log.warning("%s: the camera processed it (%s): %s", path, says, UNPROCESSED)
+    if (overshoot := halo(photo.radiance, labels.label > 0, ~labels.left_out)) > HALO:
+        words = "beside contours the background overshoots by %.0f %% of the step across them, as after sharpening or local tone mapping"
+        log.warning("%s: " + words + ": %s", path, 100 * overshoot, UNPROCESSED)
 
 
 def valid_pixels(photo: Photo, labels: Labels, path: Path, key: str) -> np.ndarray:

@@ -139,6 +139,10 @@ def _check_photo(key: str, photo: PhotoEntry, spec: DatasetFile, refuse: Refusal
         refuse.rotation(f"{key}.world_from_camera", photo.world_from_camera)
     if photo.ground is not None:
         _check_ground(f"{key}.ground.normal", photo.ground, refuse)
+    if photo.camera and photo.camera.distortion and photo.camera.focal_px is None:
+        refuse(
+            f"{key}.camera.distortion", "its unit is the focal length, which is not given", "give focal_px beside it"
+        )
     if isinstance(photo.masks, str):
         refuse.path(f"{key}.masks", photo.masks, MASKS)
     elif not photo.masks:

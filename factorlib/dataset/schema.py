@@ -28,6 +28,7 @@ Number = Annotated[float, Meta(ge=-LARGEST, le=LARGEST, description="give a fini
 Share = Annotated[float, Meta(ge=0, le=1, description="give a fraction, 0 to 1: reflectance is linear, not 0 to 255")]
 Focal = Annotated[float, Meta(ge=FOCAL_PX[0], le=FOCAL_PX[1], description="give finite pixels, 1 to 1e+07, or none")]
 Centre = Annotated[float, Meta(ge=-CENTRE_PX, le=CENTRE_PX, description="give finite pixels, up to 1e+06, or none")]
+Bend = Annotated[float, Meta(ge=-10, le=10, description="give k1 and k2 of COLMAP's RADIAL model")]
 Size = Annotated[float, Meta(gt=0, le=1e9, description="give its extent in the unit of the set's meshes, more than 0")]
 Unit = Annotated[float, Meta(ge=1e-9, le=1e9, description="give the ratio of two units, more than 0: 1e-09 to 1e+09")]
 NAMES = "names have 1 to 100 of the characters A-Z a-z 0-9 _ and -, for they name files"
@@ -73,10 +74,14 @@ class MeshEntry(_Format):
 
 
 class Camera(_Format):
-    """Intrinsics in pixels of the photo as displayed, pixel centres at 0.5; what is not given is sought."""
+    """Intrinsics in pixels of the photo as displayed, pixel centres at 0.5; what is not given is sought.
+
+    distortion: k1 and k2 of COLMAP's RADIAL model, which `masks` undoes
+    """
 
     focal_px: Focal | None = None
     principal_point: tuple[Centre, Centre] | None = None
+    distortion: tuple[Bend, Bend] | None = None
 
 
 class Pose(_Format):
@@ -251,6 +256,7 @@ class PhotoSlice(msgspec.Struct, frozen=True):
     focal_px: float | None
     illumination: str
     objects: list[ObjectMask]
+    camera: Camera | None = None  # where its lens distorts
 
 
 class ObjectsSlice(msgspec.Struct, frozen=True):

@@ -62,6 +62,7 @@ def _photo(dataset: Dataset, photo: PhotoEntry) -> tuple[schema.PhotoSlice, list
         focal_px=photo.camera.focal_px if photo.camera else None,
         illumination=photo.light,
         objects=[schema.ObjectMask(obj.name, obj.mask) for obj in photo.objects],
+        camera=photo.camera if photo.camera and photo.camera.distortion else None,
     )
     masks = [photo.masks] if isinstance(photo.masks, str) else list(photo.masks.values())
     return facts, [photo.image, *masks, *_object_masks(photo)]

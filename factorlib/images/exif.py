@@ -18,9 +18,10 @@ EXIF_IFD = 0x8769
 NAMES = {
     0x829A: "ExposureTime", 0x829D: "FNumber", 0x8827: "Exif:PhotographicSensitivity", 0x920A: "Exif:FocalLength",
     0xA002: "Exif:PixelXDimension", 0xA003: "Exif:PixelYDimension", 0xA20E: "Exif:FocalPlaneXResolution",
-    0xA210: "Exif:FocalPlaneResolutionUnit", 0xA405: "Exif:FocalLengthIn35mmFilm",
+    0xA210: "Exif:FocalPlaneResolutionUnit", 0xA405: "Exif:FocalLengthIn35mmFilm", 0xA401: "Exif:CustomRendered",
+    0xA40A: "Exif:Sharpness",
 }  # fmt: skip
-WHOLE = (0x8827, 0xA002, 0xA003, 0xA210, 0xA405)
+WHOLE = (0x8827, 0xA002, 0xA003, 0xA210, 0xA401, 0xA405, 0xA40A)
 DNG_VERSION = 0xC612  # a tag that every DNG has
 ISO_UNSAID = 65535  # what the tag holds for all that does not fit into it
 DAMAGED = (OSError, ValueError, SyntaxError, TypeError, KeyError, IndexError, struct.error)  # what Pillow makes of it

@@ -211,3 +211,28 @@ def test_a_photo_of_48_megapixels_is_read_in_strips_within_the_memory_of_a_step(
     summary = json.loads((tmp_path / "a.json").read_text())
     assert summary["factor"] == 4 and sum(summary["pixels"].values()) == 1_000_000
     assert (summary["width"], summary["height"]) == (2000, 1500) and cost["memory_mb"] < MOST_MB
+
+
+def test_a_lens_is_undone_in_photo_and_masks_alike(folder):
+    camera = {"focal_px": 20.0, "principal_point": None, "distortion": [0.6, 0.0]}
+    plain, _ = run(folder)
+    bent, summary = run(folder, camera=camera, focal_px=20.0)
+    middle = np.s_[H // 2 - 1 : H // 2 + 1, W // 2 - 1 : W // 2 + 1]
+    np.testing.assert_array_equal(bent["label"][middle], plain["label"][middle])
+    assert bent["left_out"][0, 0] == 1 and bent["valid"][0, 0] == 0 and bent["label"][0, 0] == 0
+    assert 0 < bent["valid"].sum() < plain["valid"].sum() and summary["focal_px"] == 20
+    assert "fold" in refusal_of_lens(folder, camera | {"distortion": [-5.0, 0.0]})
+
+
+def refusal_of_lens(folder, camera):
+    [path.unlink() for path in (folder / "out").iterdir()]
+    return refusal(folder, camera=camera, focal_px=20.0)
+
+
+def test_what_a_phone_did_is_said(folder, caplog):
+    exif = Image.Exif()
+    exif.get_ifd(0x8769)[0xA401] = 3
+    codes = np.rint(255 * srgb_encode(RADIANCE)).astype(np.uint8)
+    Image.fromarray(codes).save(folder / "in" / "photo.jpg", exif=exif)
+    run(folder, image="photo.jpg")
+    assert "processed it (HDR)" in caplog.text and "take it again" in caplog.text

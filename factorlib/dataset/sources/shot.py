@@ -87,8 +87,8 @@ def pinhole(camera: pycolmap.Camera, key: str, refuse: Refusal) -> tuple[float, 
         off = float((((places - focal * slopes) ** 2).sum(axis=1) ** 0.5).max())
     if not off <= MOST_OFF_PX:  # NaN where a pixel has no ray
         far = f"by {off:.1f} px" if off == off else "so much that some pixels have no ray"
-        how, cure = "the camera's lens distorts", "undistort by `colmap image_undistorter` and use its images and its " \
-            "model; masks belong to the undistorted images"  # fmt: skip
+        how, cure = "the camera's lens distorts", "give the photo's camera.focal_px, principal_point and distortion: [k1, k2] in " \
+            "dataset.yaml; or undistort by `colmap image_undistorter` and use its images, its model, and masks of them"  # fmt: skip
         if camera.is_undistorted():
             how, cure = "the camera's pixels are not square", "calibrate with one focal length (COLMAP's SIMPLE_PINHOLE or " \
                 "SIMPLE_RADIAL), or resample photos and masks to square pixels"  # fmt: skip

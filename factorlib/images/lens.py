@@ -1,0 +1,93 @@
+"""Undoing a lens's radial distortion: every later stage sees the picture that a pinhole camera would have taken.
+
+A ray of slopes (a, b) = (x, y)/z meets the photo at centre + focal · (1 + k₁r² + k₂r⁴) (a, b), with r² = a² + b²: COLMAP's RADIAL model, and OpenCV's with
+two coefficients.  The picture keeps its size, focal length and principal point.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import msgspec
+import numpy as np
+import pycolmap
+from jaxtyping import Bool, Float, Shaped
+from scipy.ndimage import map_coordinates
+
+from factorlib.dataset.schema import Camera
+from factorlib.errors import InputError
+from factorlib.images.photo import Photo
+
+
+class Lens(msgspec.Struct, frozen=True):
+    """A lens of one focal length, in pixels whose centres lie at 0.5; coefficients: k₁ and k₂."""
+
+    focal: float
+    centre: tuple[float, float]
+    coefficients: tuple[float, float]
+
+    @property
+    def colmap(self) -> pycolmap.Camera:
+        """The same camera as pycolmap's."""
+        width, height = (max(1, round(2 * c)) for c in self.centre)
+        return pycolmap.Camera(
+            model="RADIAL", width=width, height=height, params=[self.focal, *self.centre, *self.coefficients]
+        )
+
+    def distorted(self, points: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, "n 2"]:
+        """Where the photo shows what a pinhole shows at these points."""
+        slopes = (points - np.array(self.centre)) / self.focal
+        return self.colmap.img_from_cam(np.column_stack([slopes, np.ones(len(slopes))]))
+
+    def undistorted(self, points: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, "n 2"]:
+        """Where a pinhole shows what the photo shows at these points."""
+        return self.focal * self.colmap.cam_from_img(points) + np.array(self.centre)
+
+    def check(self, width: int, height: int, file: str | Path, key: str) -> None:
+        """Raise InputError where two rays within the picture meet the photo at one place: such coefficients are of no lens."""
+        corners = np.array([[x, y] for x in (0, width) for y in (0, height)])
+        r2 = np.square((corners - self.centre) / self.focal).sum(1).max() * np.linspace(0, 1, 100)
+        k1, k2 = self.coefficients
+        if (1 + 3 * k1 * r2 + 5 * k2 * r2**2 <= 0).any():
+            found = f"k1 = {k1:g}, k2 = {k2:g} fold the picture before its corner"
+            cure = "give the coefficients of COLMAP's RADIAL or OpenCV's model for this focal length"
+            raise InputError(found, file=file, key=key, cure=cure)
+
+
+def lens_of(camera: Camera | None, factor: int, width: int, height: int) -> Lens | None:
+    """The lens of a photo that was averaged down by `factor` to width × height pixels; None where dataset.yaml gives no distortion."""
+    if camera is None or camera.distortion is None:
+        return None
+    centre = camera.principal_point or (factor * width / 2, factor * height / 2)
+    return Lens(camera.focal_px / factor, (centre[0] / factor, centre[1] / factor), camera.distortion)
+
+
+class Undistorted:
+    """The picture of a pinhole of height × width pixels, from a photo of the same size that the lens took.
+
+    inside: pixels that the photo shows
+    """
+
+    def __init__(self, lens: Lens, height: int, width: int):
+        x, y = np.meshgrid(np.arange(width) + 0.5, np.arange(height) + 0.5)
+        place = lens.distorted(np.stack([x, y], axis=-1).reshape(-1, 2)).reshape(height, width, 2) - 0.5
+        self.rows, self.columns = place[..., 1], place[..., 0]
+        ends = ((self.rows, height), (self.columns, width))
+        self.inside: Bool[np.ndarray, "h w"] = np.logical_and.reduce([(of >= 0) & (of <= n - 1) for of, n in ends])
+
+    def nearest(self, picture: Shaped[np.ndarray, "h w"]) -> Shaped[np.ndarray, "h w"]:
+        """The values of the nearest pixels, 0 outside the photo."""
+        y, x = (np.clip(np.rint(of), 0, n - 1).astype(int) for of, n in zip((self.rows, self.columns), picture.shape))
+        return np.where(self.inside, picture[y, x], np.zeros((), picture.dtype))
+
+    def between(self, picture: Shaped[np.ndarray, "h w"]) -> Float[np.ndarray, "h w"]:
+        """The values between pixels, bilinear, 0 outside the photo."""
+        return map_coordinates(picture.astype(np.float32), (self.rows, self.columns), order=1, cval=0.0)
+
+    def photo(self, photo: Photo) -> Photo:
+        """The photo: a pixel is clipped where any of the four it lies between is, and finite where all are."""
+        channels = range(3)
+        radiance = np.stack([self.between(photo.radiance[..., c]) for c in channels], axis=-1)
+        clipped = np.stack([self.between(photo.clipped[..., c]) > 1e-6 for c in channels], axis=-1)
+        finite = self.inside & (self.between(~photo.finite) < 1e-6)
+        return msgspec.structs.replace(photo, radiance=radiance, clipped=clipped & finite[..., None], finite=finite)
