@@ -53,6 +53,11 @@ def main(params: Params, inputs: Inputs, out: Path, progress: Progress) -> None:
         views = {name: photo.view() for name, photo in photos.items()}
         placed = cameras_by_motion(views, lambda share, what: progress(0.5 * share, 1, what))
         cameras = {name: photos[name].external(camera, slice_.meshes) for name, camera in placed.items()}
+        for name, camera in placed.items():
+            if camera.bent:
+                focal, k = camera.bent[0] * photos[name].facts.factor, camera.bent[1]
+                log.warning("%s: its lens bends straight lines; give the photo `camera: {focal_px: %.0f, distortion: [%.4f, 0]}` and the "
+                            "picture is straightened", name, focal, k)  # fmt: skip
     begun, found = 0.5 if slice_.sfm else 0.0, {}
     (out / "meshes").mkdir()
     for done, (name, entry) in enumerate(sorted(slice_.meshes.items())):

@@ -31,6 +31,7 @@ LEAST_PHOTOS = 3
 LEAST_POINTS = 30  # of a model that is believed
 LEAST_AGREEMENT = 0.75  # overlap (IoU) of a coarse hull with the masks, of a model that is believed
 MOST_SIDE, MOST_FEATURES = 1600, 4000
+BENT = 2.0  # pixels
 SEED = 0
 log = logging.getLogger("factorlib.shapes")
 
@@ -50,10 +51,14 @@ class View(msgspec.Struct, frozen=True):
 
 
 class Registered(msgspec.Struct, frozen=True):
-    """A photo that has a place in the model: its focal length in its pixels, and cam_from_world, the world being of no known scale."""
+    """A photo that has a place in the model: its focal length in its pixels, and cam_from_world, the world being of no known scale.
+
+    bent: focal length and k1 of `bent_lenses`, where the lens distorts
+    """
 
     focal: float
     pose: Pose
+    bent: tuple[float, float] | None = None
 
 
 def cameras_by_motion(
@@ -132,12 +137,13 @@ def _mapped(
         if best is None or best.num_points3D() < LEAST_POINTS:
             return {}, 0
         report(0.9, "hull of the masks")
-        placed = {}
+        placed, bent = {}, bent_lenses(best)
         for image in best.images.values():
             if image.has_pose:
                 motion = image.cam_from_world()
                 pose = Pose(motion.rotation.matrix(), np.array(motion.translation))
-                placed[Path(image.name).stem] = Registered(float(best.cameras[image.camera_id].focal_length), pose)
+                focal = float(best.cameras[image.camera_id].focal_length)
+                placed[Path(image.name).stem] = Registered(focal, pose, bent.get(image.camera_id))
     outlines = [outline_of(name, views[name], camera) for name, camera in sorted(placed.items())]
     if (overlap := agreement([one for one in outlines if one.is_seen])) < LEAST_AGREEMENT:
         log.info(
@@ -145,6 +151,28 @@ def _mapped(
         )
         return {}, 0
     return {name: placed[name] for name in views if name in placed}, best.num_points3D()
+
+
+def bent_lenses(model: pycolmap.Reconstruction) -> dict[int, tuple[float, float]]:
+    """Focal length and k1 of the cameras, by number, whose lens moves an observed point by more than `BENT` pixels.
+
+    The model of pinholes is left as it is; its bundle is adjusted once more with one coefficient a camera.
+    """
+    free = pycolmap.Reconstruction(model)
+    for camera in free.cameras.values():
+        pinhole = camera.params.tolist()
+        camera.model, camera.params = pycolmap.CameraModelId.SIMPLE_RADIAL, [*pinhole, 0.0]
+    options = pycolmap.BundleAdjustmentOptions(print_summary=False, refine_principal_point=False)
+    options.ceres.solver_options.num_threads = 1
+    pycolmap.bundle_adjustment(free, options)
+    bent = {}
+    for image in free.images.values():
+        places = np.array([point.xy for point in image.points2D if point.has_point3D()]).reshape(-1, 2)
+        focal, x, y, k = free.cameras[image.camera_id].params.tolist()
+        radius = np.hypot(*(places - (x, y)).T).max(initial=0.0) / focal
+        if focal * abs(k) * radius**3 > BENT:
+            bent[image.camera_id] = (focal, k)
+    return bent
 
 
 def outline_of(name: str, view: View, placed: Registered) -> Outline:
