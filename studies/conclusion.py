@@ -55,27 +55,6 @@ MEASURES = {  # label, and the unit where there is one; lower is better where th
     "seconds_an_entry": "processor time of the solve, an entry|s",
     "peak": "largest memory of the process|GB",
     "grown": "memory beyond that before the solve|GB",
-    "error_median": "error of a reflection, median",
-    "error_p95": "error of a reflection, 95th percentile",
-    "error_worst": "error of a reflection, worst",
-    "rendering": "DSSIM, a rendered sphere",
-    "microseconds": "processor time an evaluation|µs",
-    "of_bound": "solve: largest error over its bound",
-    "hard_k": "solve: error of reflectances|relative to the truth",
-    "hard_roughness": "solve: error of roughness",
-    "hard_radiance": "solve: error of re-synthesis|relative",
-    "value_error": "operator: worst error of values",
-    "gradient_rounding": "operator: worst rounding of derivatives",
-    "not_finite": "operator: a value is not finite",
-    "wrong_poses": "align: wrong poses|share",
-    "normal_error": "align: error of normals, median|degrees",
-    "undoubted": "align: wrong without a doubt|share",
-    "materials.worst_roughness": "roughness, worst material",
-    "materials.worst_diffuse": "diffuse, worst|relative to the truth",
-    "materials.worst_specular": "specular, worst|relative to the truth",
-    "resynthesis.worst_psnr_linear_db": "re-synthesis, worst photo, linear (higher is better)|dB",
-    "relighting.mean.scalar_per_set.in_true_light.psnr_tonemapped_db": "relit balls (higher is better)|dB",
-    "light.mean.channel_per_photo.glossy.estimate.rmse": "glossy sphere|RMSE over the truth's RMS",
 }
 
 
@@ -276,31 +255,6 @@ def _outcome(claim: Claim, rows: Mapping[str, Row], comparisons: int, over: str)
         words = f"{said} ({rise}{subject} in {first} against {second}: "
         words += f"{s.mean:+.2g}, {s.low:+.2g} to {s.high:+.2g} over {s.seeds} {over})"
     return Outcome(ANSWERS[verdict], f"{claim.words}: {words}.", s, claim.paper)
-
-
-def best(table: Conclusion, measure: str) -> str:
-    """A sentence: the setting of the least mean, and those from which no difference is shown, all of them compared with it.
-
-    The best was picked from what it is compared with, so that the sentence is weaker than a claim.
-    """
-    cells = {row.label: row.cells[measure] for row in table.rows if measure in row.cells}
-    least = min(cells, key=lambda name: cells[name].spread.mean)
-    others = [name for name in cells if name != least]
-    verdicts = {n: difference(cells[least].values, cells[n].values, len(others))[1] for n in others}
-    start = f"Least mean of {label(measure)}: “{least}”"
-    if "too few seeds" in verdicts.values():
-        return f"{start}; of too few seeds to say whether any other is worse."
-    alike = ", ".join(f"“{name}”" for name, verdict in verdicts.items() if verdict == "not shown")
-    return f"{start}; not shown to be worse: {alike}." if alike else f"{start}; all others are shown to be worse."
-
-
-def farthest(*solves: Mapping[str, Mapping[int, float]]) -> str:
-    """How far numbers of the same seed lie apart at most, as a clause; each of them by measure, then by seed."""
-    apart = {m: max(np.ptp([of[m][seed] for of in solves]) for seed in solves[0][m]) for m in solves[0]}
-    most = "; ".join(f"{label(m)} by {v:.2g}" for m, v in apart.items() if v)
-    return (
-        f"numbers of the same seed differ at most so: {most}" if most else "every number is the same to the last digit"
-    )
 
 
 # ── as text ──────────────────────────────────────────────────────────────────────────────────────────────────────────

@@ -10,7 +10,6 @@ Noise      each radiance times 1 + noise · normal, .01 as a rule, drawn for eac
 Normals    perturbed after rendering: the solve gets a normal that is not the pixel's.
 Labels     likewise: the pixel is of one material, its label names another one of the same photo.
 Facets     rendered so: a flat-sided object, whose normals are true but few.
-Rounding   each radiance times 1 + 10⁻⁷ · normal, which is less than a photograph's last bit.
 """
 
 from __future__ import annotations
@@ -48,7 +47,6 @@ ABOUT = dict(
     )
 )
 SPREAD = 0.15
-ROUNDING = 1e-7  # of a radiance
 GRAZING = 0.15  # n·o below which no pixel is observed
 STEEPEST = 0.25  # n·o of the faces that are observed at the flattest angle
 CURVED = 0.1  # share of a face's normals that is the sphere's: no real face is exactly flat
@@ -104,9 +102,6 @@ def _photo(case: Case, number: int, materials: Sequence[Reflectance], light: Lig
 
     exact = [ball(light, materials[m], normals) for m in rows]
     noisy = [r * (1 + case.noise * rng(m, "noise").standard_normal(r.shape)) for m, r in zip(rows, exact, strict=True)]
-    if case.rounding:
-        again = np.random.default_rng([14, case.seed, number, case.rounding])
-        noisy = [r * (1 + ROUNDING * again.standard_normal(r.shape)) for r in noisy]
     turned = [tilted(in_camera(normals), case.normal_deg, rng(m, "normals")) for m in rows]
     others = [index(m) for m in rows]
     labels = [mislabelled(len(normals), index(m), others, case.wrong_labels, rng(m, "labels")) for m in rows]

@@ -48,7 +48,6 @@ class Case(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     wrong_labels:  share of the pixels whose label names another material of the same photo
     facets:        faces that an object shows instead of a sphere; None: a sphere
     noise:         of each radiance, as a share of it
-    rounding:      number of the perturbation of all radiances by less than a photograph's last bit; 0: none
     objects:       bodies in place of spheres
     """
 
@@ -60,7 +59,6 @@ class Case(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     wrong_labels: float = 0.0
     facets: int | None = None
     noise: float = 0.01
-    rounding: int = 0
     objects: Objects | None = None
 
     @property

@@ -22,9 +22,14 @@ import hashlib, msgspec, torch
 torch.set_num_threads(1)
 from factorlib.reflection import fused
 fused.FLAGS = fused.FLAGS.replace("-march=native", "-march=x86-64-v3")  # an emulated processor's compiler is this one's
-from studies.scenes.hard_cases import CASES, QUICK, answered
-brief = msgspec.structs.replace(QUICK, rounds=1, iterations=3, polish=2, lobes=4, insert=4)
-solution = answered(CASES["1 material × 1 light"](0), brief).solution
+from factorlib.model.problem import JointProblem
+from factorlib.reflection import reflection_operator
+from factorlib.solve.few_lobes.options import FewLobes, Run
+from factorlib.solve.few_lobes.solve import few_lobes
+from studies.scenes.problems import square
+operator = reflection_operator("network")
+brief = FewLobes(rounds=1, iterations=3, polish=2, lobes=4, insert=4)
+solution = few_lobes(JointProblem(square(1, operator, 0), operator), 1, Run(brief))
 point = solution.point
 parts = [point.materials.vector(), *(part for light in point.lights for part in (light.axis, light.log_sharpness, light.weight))]
 print(hashlib.sha256(b"".join(part.tobytes() for part in parts)).hexdigest())

@@ -9,8 +9,6 @@ Measured   how coloured the lights are beside the true ones, what they and the m
 
 from __future__ import annotations
 
-from typing import Any
-
 from studies.study import Claim, Scale, Setting, Study, own
 
 WEIGHTS = {"full": (0.0, 0.001, 0.01, 0.1, 1.0, 10.0), "quick": (0.0, 0.1, 10.0)}
@@ -32,13 +30,6 @@ def settings(scale: Scale) -> list[Setting]:
     ]
 
 
-def notes(table: Any) -> list[str]:
-    """The best setting by three measures."""
-    from studies.conclusion import best
-
-    return [best(table, measure) for measure in ("entries", "new_light", "diffuse")]
-
-
 STUDY = Study(
     name="prior",
     title="Prior on lights",
@@ -58,5 +49,4 @@ STUDY = Study(
         Claim("chromaticity", "paper-10", "paper-0", "in the paper's solver lights are less coloured at 10 than at 0"),
         Claim("entries", "paper-0p1", "paper-10", "in the paper's solver .1 predicts better than 10"),
     ),
-    notes=notes,
 )  # fmt: skip

@@ -67,15 +67,6 @@ def variants() -> dict[str, Operator]:
     return {label: operator for label, operator in operators.items() if operator is not None}
 
 
-def in_bfloat16(name: str) -> Operator:
-    """The operator in bfloat16, which `reflection_operator` does not offer: formulas in torch, weights and inputs rounded to it."""
-    operator = made(name, "float64")
-    operator.dtype = torch.bfloat16
-    if hasattr(operator, "layers"):
-        operator.layers = {part: layers.to(torch.bfloat16) for part, layers in operator.layers.items()}
-    return operator
-
-
 def label_of(label: str) -> str:
     """The label as tables have it."""
     return label.replace("_", " ").replace("float", "f")
@@ -220,16 +211,13 @@ def special(fast: dict[str, Operator]) -> Tables:
 
 
 def rows() -> Tables:
-    """Time of all operators, errors of their values and derivatives, of values by what is asked, and in bfloat16."""
+    """Time of all operators, errors of their values and derivatives, of values by what is asked."""
     fast, references = variants(), {label: Reference(tolerance=tolerance) for label, tolerance in TOLERANCES.items()}
     times = microseconds(fast | references)
     specular, diffuse = specular_samples(SAMPLES, 99, tolerance=1e-7), diffuse_samples(SAMPLES, 98)
     glossy = {label: specular_errors(o, specular) for label, o in (fast | references).items() if label != REFERENCE}
     matte = {label: diffuse_errors(operator, diffuse) for label, operator in fast.items()}
     true, single = gradients(references[REFERENCE]), [label for label in fast if label.endswith("float32")]
-    coarse = {name: in_bfloat16(name) for name in FAST}
-    rounded = [[f"{name}, specular", specular_errors(o, specular)] for name, o in coarse.items()]
-    rounded += [[f"{name}, diffuse", diffuse_errors(o, diffuse)] for name, o in coarse.items()]
     fastest, costs, slopes, by_input = min(statistics.median(pair[1]) for pair in times.values()), [], [], []
     for label, pair in times.items():
         cells = [f"{exact(min(of))}, {exact(statistics.median(of))}" for of in pair]
@@ -250,10 +238,6 @@ def rows() -> Tables:
         "Errors of values": [["operator", *QUANTILES], *whole],
         "Errors of derivatives": [["operator", *QUANTILES], *slopes],
         "Specular errors by what is asked: median, p95": [["asked", *map(label_of, single)], *by_input],
-        "Errors of values in bfloat16": [
-            ["operator", *QUANTILES, "not finite"],
-            *([label_of(k), *_percents(e), str(e.get("not finite", 0))] for k, e in rounded),
-        ],
     } | special(fast)  # fmt: skip
 
 

@@ -31,8 +31,6 @@ SECTIONS = {  # module -> title
     "real_poses": "Poses of real photographs",
     "real_sets": "Re-synthesis of real photographs",
     "refine": "Poses by shading, and proportions of meshes",
-    "faults": "Faults, reruns and fuzz",
-    "scale": "Large sets on a cluster",
     "viewer": "The viewer of the report",
 }
 

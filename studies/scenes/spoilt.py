@@ -16,8 +16,8 @@ from jaxtyping import Float
 from PIL import Image, ImageFilter
 
 from factorlib.generate.chair import bent_chair, chair
-from factorlib.generate.folder import write_light, write_obj, write_yaml
-from factorlib.images.exr import read_rgb_exr
+from factorlib.generate.folder import write_labels, write_light, write_normals, write_obj, write_photo, write_yaml
+from factorlib.images.exr import read_exr, read_rgb_exr
 from factorlib.images.transfer import srgb_decode, srgb_encode
 from factorlib.meshes.mesh import smooth
 
@@ -120,15 +120,23 @@ def tiny(folder: Path, spec: Spec, rng: Rng) -> None:
     """Make all pictures six times smaller."""
     for photo in spec["photos"]:
         for file in [photo["image"], photo["masks"], *(own["mask"] for own in photo["objects"] if "mask" in own)]:
+            is_photo = file == photo["image"]
             with Image.open(folder / file) as picture:
-                size, exif = (picture.width // 6, picture.height // 6), picture.getexif()
-                how = Image.Resampling.BOX if file == photo["image"] else Image.Resampling.NEAREST
-                picture.resize(size, how).save(folder / file, exif=exif, **QUALITY[Path(file).suffix])
+                how = Image.Resampling.BOX if is_photo else Image.Resampling.NEAREST
+                small, focal = (
+                    np.asarray(picture.resize((picture.width // 6, picture.height // 6), how)),
+                    focal_of(picture),
+                )
+            write_photo(folder / file, srgb_decode(small / 255.0), focal) if is_photo else write_labels(
+                folder / file, small
+            )
+        file = folder / f"truth/{photo['name']}_normal.exr"
+        channels = read_exr(file)
+        write_normals(file, np.stack([channels[f"normal.{axis}"][3::6, 3::6] for axis in "xyz"], axis=-1))
         if "camera" in photo:
             photo["camera"] = {"focal_px": photo["camera"]["focal_px"] / 6}
 
 
-QUALITY: dict[str, Any] = {".jpg": {"quality": 95, "subsampling": 0}, ".png": {}}
 KINDS: dict[str, Callable[[Path, Spec, Rng], None]] = {
     of.__name__: of
     for of in (exact, rough, rougher, another_chair, few, one_photo, unlinked, miscalled, clipped, dark, noisy, developed, tiny)
@@ -172,7 +180,7 @@ def relabelled(folder: Path, photo: Spec, new: dict[int, int]) -> None:
         labels = np.asarray(picture)
     table = np.arange(256, dtype=np.uint8)
     table[list(new)] = list(new.values())
-    Image.fromarray(table[labels]).save(folder / photo["masks"])
+    write_labels(folder / photo["masks"], table[labels])
 
 
 def exposed(folder: Path, spec: Spec, factor: float) -> None:
@@ -183,12 +191,17 @@ def exposed(folder: Path, spec: Spec, factor: float) -> None:
         write_light(file, read_rgb_exr(file) * factor)
 
 
+def focal_of(picture: Image.Image) -> int | None:
+    """The focal length that the picture's EXIF gives, of 35 mm film; None where it gives none."""
+    return picture.getexif().get_ifd(0x8769).get(0xA405)
+
+
 def each_photo(folder: Path, spec: Spec, change: Callable, filtered: ImageFilter.Filter | None = None) -> None:
     """Change the linear radiance of every photo, then its picture."""
     for photo in spec["photos"]:
         with Image.open(folder / photo["image"]) as picture:
-            exif, codes = picture.getexif(), np.asarray(picture)
-        linear = np.clip(change(srgb_decode(codes / 255.0)), 0, 1)
-        made = Image.fromarray((srgb_encode(linear) * 255 + 0.5).astype(np.uint8))
-        made = made.filter(filtered) if filtered else made
-        made.save(folder / photo["image"], exif=exif, **QUALITY[".jpg"])
+            focal, linear = focal_of(picture), np.clip(change(srgb_decode(np.asarray(picture) / 255.0)), 0, 1)
+        if filtered:
+            made = Image.fromarray((srgb_encode(linear) * 255 + 0.5).astype(np.uint8)).filter(filtered)
+            linear = srgb_decode(np.asarray(made) / 255.0)
+        write_photo(folder / photo["image"], linear, focal)

@@ -1,10 +1,7 @@
-"""What tests of faults share: this project in a folder, ways to call it, notes of what was tried."""
+"""What tests of faults share: this project in a folder, ways to call it."""
 
 from __future__ import annotations
 
-import contextlib
-import json
-import os
 import shutil
 import sys
 from pathlib import Path
@@ -14,13 +11,6 @@ import pytest
 from factorlib import __main__ as command_line
 from factorlib.runner import verbs
 from factorlib.runner.project import LIBRARY, Project, photo_sets
-from factorlib.wholefile import append_text
-
-
-def note(table: str, name: str, tries: int = 1, lost: int = 0, **more: object) -> None:
-    """Add a line to the file that FAULTS_LOG names (`make results ONLY=faults`); without it, nothing is written."""
-    if path := os.environ.get("FAULTS_LOG"):
-        append_text(Path(path), json.dumps({"table": table, "name": name, "tries": tries, "lost": lost, **more}) + "\n")
 
 
 def real_project(root: Path, *copied: str) -> Project:
@@ -47,21 +37,3 @@ def call(project: Project, *words: str) -> int | str:
         patch.setattr(sys, "argv", ["factorlib", *words])
         command_line.main()
     return caught.value.code
-
-
-@contextlib.contextmanager
-def own_modules(*packages: str):
-    """Whatever of these packages is imported within is forgotten, and what was there before is there again."""
-    of_these = lambda: {name: module for name, module in sys.modules.items() if name.split(".")[0] in packages}  # noqa: E731
-    before, path, environment = of_these(), list(sys.path), dict(os.environ)
-    for name in before:
-        del sys.modules[name]
-    try:
-        yield
-    finally:
-        for name in of_these():
-            del sys.modules[name]
-        sys.modules.update(before)
-        sys.path[:] = path
-        os.environ.clear()
-        os.environ.update(environment)

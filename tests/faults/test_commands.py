@@ -92,18 +92,6 @@ def test_clean_deletes_nobody_elses_what_a_user_put_beside_the_results_stays_and
     assert files_of(precious.parent) == {"photo.txt": b"p"}
 
 
-def test_a_data_set_that_is_gone_is_cleaned_by_its_path_and_a_home_that_is_a_link_is_not_taken(checkout, tmp_path):
-    (checkout.build / "set").rename(tmp_path / "moved")
-    (checkout.build / "set").symlink_to(tmp_path / "moved")
-    before = files_of(tmp_path / "moved")
-    assert "is a link" in clean(checkout, "set") and clean(checkout, None) == 0
-    assert files_of(tmp_path / "moved") == before
-    (checkout.build / "set").unlink()
-    (tmp_path / "moved").rename(checkout.build / "set")
-    shutil.rmtree(checkout.root / "data" / "set")
-    assert clean(checkout, str(checkout.root / "data" / "set")) == 0 and not (checkout.build / "set").exists()
-
-
 # ── pipeline.yaml and SET ────────────────────────────────────────────────────────────────────────────────────────────
 
 
@@ -161,23 +149,6 @@ def test_damaged_files_of_the_runner_lose_nothing_and_are_made_anew(project, cap
         for content in contents:
             path.write_bytes(content)
             assert set(state(project).values()) == {"current"}, (path, content)
-
-
-LINES = [b"", b"{", b"[]", b"5", b"\xff", b'{"no": "event"}', b'{"event": 5}', b"[" * 5000]
-
-
-def test_a_damaged_line_of_a_log_costs_that_line(project, caplog, capsys):
-    write(project.root / "data" / "set" / "a.txt", "odd")
-    assert make(project) == 0
-    logs = {path: path.read_bytes() for path in (project.build / "store" / "logs").glob("*.jsonl")}
-    for line in [b'{"event": "warning", "text": [1]}', *LINES]:
-        for log, content in logs.items():
-            log.write_bytes(line + b"\n" + content + line)
-        assert verbs.show_status(project, verbs.Wish("set")) == 0 and "a is odd" in capsys.readouterr().out, line
-    for log, content in logs.items():
-        log.write_bytes(b"\n".join([*LINES, content, *LINES]))
-    assert make(project, targets=["total"], force=True) == 0 and "damaged line" in caplog.text
-    assert (project.build / "set" / "total" / "log.txt").read_text() == "6", "what the report is handed"
 
 
 # ── rights ───────────────────────────────────────────────────────────────────────────────────────────────────────────
@@ -256,35 +227,3 @@ def test_no_variable_is_expanded_on_its_way(made):
         arguments, environment = json.loads(done.stdout)
         assert arguments == ["-m", "factorlib", "plan"] and environment["GOAL"] == "plan"
         assert {name: environment[name] for name in VARIABLES} == {name: given[name] for name in VARIABLES}
-
-
-def test_no_goal_and_no_path_to_python_is_a_command(made):
-    goals = ["x;touch pwned", "$(shell touch pwned)", "`touch pwned`", "x\ntouch pwned", '"$(touch pwned)"']
-    spy = made / ".venv" / "bin" / "python"
-    write(spy, "#!/bin/sh\nexit 1\n")
-    assert by_make(made, "--keep-going", *goals).returncode != 0
-    shutil.rmtree(made / ".venv")
-    (made / "factorlib").unlink()
-    write(made / "factorlib" / "setup.py", "print('set up')")
-    assert "set up" in by_make(made, "setup", f"PYTHON={TRIES[4]}").stdout
-
-
-def test_the_program_refuses_what_is_no_dataset_and_what_is_neither_0_nor_1(project, monkeypatch):
-    for words, verb, given in (
-        ("error: ", "plan", {"DATASET": TRIES[0], "SET": TRIES[1], "FORCE": "0"}),
-        ("FORCE: 'yes' is neither 1 nor 0", "plan", {"DATASET": "set", "FORCE": "yes"}),
-        ("DATASET", "clean", {"DATASET": ""}),  # an empty name is not none
-    ):
-        with monkeypatch.context() as patch:
-            for name, value in given.items():
-                patch.setenv(name, value)
-            assert words in str(call(project, verb))
-    assert (project.build / "set").exists() and not (project.root / PWNED).exists()
-
-
-def test_who_reads_no_further_gets_no_traceback():
-    """As `make params | head -1` does."""
-    pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE}
-    process = subprocess.Popen([sys.executable, "-m", "factorlib", "params"], cwd=LIBRARY, **pipes)
-    process.stdout.close()
-    assert process.stderr.read() == b"" and process.wait() == 1

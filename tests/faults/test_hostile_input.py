@@ -10,7 +10,6 @@ import time
 import tracemalloc
 import warnings
 import zlib
-from typing import Annotated
 
 import msgspec
 import numpy as np
@@ -24,13 +23,10 @@ from factorlib.images.exr import write_exr, write_rgb_exr
 from factorlib.light.lobes import Lobes
 from factorlib.results.lobes import write_lobes
 from factorlib.runner import verbs
-from factorlib.runner.project import Project, Provider, photo_sets
+from factorlib.runner.project import photo_sets
 from factorlib.urm.observations import write_observations
-from factorlib.yamlfile import parse_yaml, read_yaml
 from tests.faults import good
-from tests.faults.battered import make
 from tests.faults.good import DATA, OBJ, OFF, PLY, PLY_TEXT, STL, STL_TEXT, H, W, coco, glb
-from tests.runner import toy
 
 MOST_MEMORY = 60_000_000  # bytes: what a file of some kB may take
 MOST_SECONDS = 10.0  # of processor time
@@ -495,39 +491,3 @@ def test_a_file_of_a_recipe_is_refused_before_anything_runs(linked, tmp_path, ca
         text = refusal(lambda wish=wish: verbs.make(linked, wish), capsys)
         assert re.search(words, text, re.DOTALL) and str(folder / name) in text and "\n  " in text, text
     assert not list((linked.root / "build").glob("set/*")), "something was run"
-
-
-def test_a_run_looks_at_what_is_new_and_no_more(fresh, capsys):
-    asked = []
-
-    def read(folder):
-        def faults(slice_, photo, params, settings):
-            asked.append((slice_, photo))
-            faulty = "fault" in (folder / f"{photo}.txt").read_text()
-            return [InputError("a fault", file=f"{photo}.txt")] if faulty else []
-
-        return msgspec.structs.replace(toy.read(folder), faults=faults)
-
-    project = Project(fresh.root, Provider(("photo",), read))
-    assert make(project) == 0 and asked == [("photo", "a"), ("photo", "b")]
-    assert make(project) == 0 and make(project, "upper.times=2") == 0 and len(asked) == 2
-    toy.write(fresh.root / "data/set/c.txt", "a fault")
-    assert make(project) == 1 and asked[2:] == [("photo", "c")] and "a fault" in capsys.readouterr().err
-
-
-class Numbered(msgspec.Struct):
-    table: dict[str, Annotated[float, msgspec.Meta(ge=0)]] = {}
-
-
-GOOD_YAML = ["a: &x 1\nb: [*x, *x]", "a: !!str 5\nb: !!float 5", "", "---\na: 1\n...\n", "{a: &b {c: 1}, d: {e: *b}}"]
-
-
-def test_yaml_is_read_as_by_pyyaml_and_a_wrong_value_among_thousands_is_named_in_a_moment(tmp_path):
-    """msgspec does not say which key of a table is wrong."""
-    assert all(parse_yaml(text, "x.yaml") == yaml.safe_load(text) for text in GOOD_YAML)
-    rows = "".join(f"  k{i}: {'one' if i == 3000 else i}\n" for i in range(4_000))
-    began, file = time.process_time(), good.put(tmp_path / "x.yaml", f"table:\n{rows}")
-    with pytest.raises(InputError) as caught:
-        read_yaml(file, Numbered)
-    assert caught.value.key == "table.k3000" and caught.value.file == f"{file}:3002"
-    assert time.process_time() - began < 4

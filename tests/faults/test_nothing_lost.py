@@ -1,13 +1,11 @@
 """Whatever befalls a run or its results, what was finished is kept and the next run ends in the same bytes.
 
-Kills, runs at once, clocks and places are tried with real processes and a seed for each try.  `make test` makes a few tries
-of each fault, `make test-long` all of them, which are the numbers of docs/reliability.md (`make results ONLY=faults`).
+Kills, clocks and places are tried with real processes and a seed for each try; `make test-long` kills a hundred times.
 """
 
 from __future__ import annotations
 
 import contextlib
-import errno
 import json
 import os
 import random
@@ -23,15 +21,10 @@ from pathlib import Path
 
 import pytest
 
-from factorlib.disk import disk_error
-from factorlib.errors import InputError
 from factorlib.runner import verbs
 from factorlib.runner.gc import collect
-from factorlib.runner.home import view_of
 from factorlib.runner.project import LIBRARY
-from factorlib.runner.store import Inspector
-from factorlib.runner.survey import survey
-from tests.faults.battered import call, make, note, real_project
+from tests.faults.battered import make
 from tests.runner import toy
 from tests.runner.toy import files_of, reasons, state, write
 
@@ -55,10 +48,6 @@ COMMAND = (  # `python -m factorlib` on the toy in the folder that is the first 
 pytestmark = pytest.mark.skipif(not Path("/proc/self/stat").exists(), reason="looks for processes in /proc")
 WHOM = ("all of its processes", "the run", "one that is at work")
 LONG = pytest.mark.long
-some_of = lambda every, *short: [pytest.param(one, marks=() if one in short else LONG) for one in every]  # noqa: E731
-few = lambda some, most: pytest.mark.parametrize(  # noqa: E731
-    "seeds", [range(some), pytest.param(range(some, most), marks=LONG)], ids=str
-)
 
 
 # ── runs of the toy, and what is left of them ─────────────────────────────────────────────────────────────────────────
@@ -69,12 +58,6 @@ def again(tmp_path):
     """A project of the same content in a folder of its own, for each try."""
     count = iter(range(1000))
     return lambda project: toy.copy(project, tmp_path / f"try {next(count)}" / "root")
-
-
-def no_loss(fault, losses, **more):
-    """Every try lost nothing; all of them are noted."""
-    note("faults", fault, len(losses), sum(map(bool, losses)), **more)
-    assert not any(losses), [(number, lost) for number, lost in enumerate(losses) if lost]
 
 
 def edit(project, stage, old, new):
@@ -207,19 +190,16 @@ def lost_in(project, wanted, *settings):
 # ── SIGKILL and SIGTERM ──────────────────────────────────────────────────────────────────────────────────────────────
 
 
-@few(3, 100)
+@pytest.mark.parametrize("seeds", [range(3), pytest.param(range(3, 100), marks=LONG)], ids=str)
 def test_a_kill_at_any_moment_loses_nothing_that_was_finished(fresh, made_once, again, seeds):
     """Two of three tries wait until a stage is writing, and strike in that time; the third strikes at any time."""
-    wanted, hits, losses = results(made_once), dict.fromkeys(STAGES, 0), {whom: [] for whom in WHOM}
+    wanted, hits = results(made_once), dict.fromkeys(STAGES, 0)
     for seed in seeds:
         project = again(fresh)
         for stage in struck(project, seed, WHOM[seed % 3]):
             hits[stage] += 1
-        losses[WHOM[seed % 3]].append(lost_in(project, wanted))
+        assert lost_in(project, wanted) == [], seed
         shutil.rmtree(project.root)
-    for whom, each in losses.items():
-        no_loss(f"SIGKILL to {whom}", each)
-    note("hits", "mid-write", sum(hits.values()), stages=hits)
     assert len(seeds) < 50 or min(hits.values()) >= 5, hits
 
 
@@ -249,26 +229,13 @@ def test_a_killed_worker_does_not_fail_the_step_beside_it(fresh, tmp_path):
     assert len([step for step in done(fresh) if step.startswith("upper")]) == 1, "the step beside it ran again"
 
 
-C_STACK = """
-import ctypes, os, signal
-libc = ctypes.CDLL(None)
-@ctypes.CFUNCTYPE(None, ctypes.c_int)
-def _c_stack(number):
-    os.write(2, b"*** SIGTERM received by PID 1; stack trace: ***\\n")
-    os._exit(1)
-libc.signal(signal.SIGTERM, _c_stack)  # what pycolmap does where it is imported
-"""
-
-
-@pytest.mark.parametrize("whom", some_of(WHOM[:2], "the run"))
-def test_sigterm_ends_a_run_as_an_interrupt_does_and_no_library_that_takes_it_prints_a_stack(fresh, whom):
-    edit(fresh, "upper", "class Params", C_STACK + "class Params")
+def test_sigterm_ends_a_run_as_an_interrupt_does(fresh):
     process = start(fresh, "upper.sleep=30")
     assert wait_until(lambda: at_work(fresh, "upper-a"))
-    os.kill(process.pid if whom == "the run" else -process.pid, signal.SIGTERM)
+    os.kill(process.pid, signal.SIGTERM)
     code, text = end(process)
     assert code == 143 and "stopped; what was finished is kept" in text
-    assert not any(words in text for words in ("Traceback", "process died", "stack trace"))
+    assert "Traceback" not in text and "process died" not in text
     assert not list((fresh.build / "store" / "tmp").iterdir())
 
 
@@ -283,83 +250,7 @@ def test_a_reader_that_takes_sigterm_prints_no_c_stack():
     assert ended.returncode == 143 and not ended.stderr
 
 
-def test_drafts_of_killed_writers_go_once_they_are_old_and_those_of_others_stay(project):
-    gone = subprocess.Popen(["true"])
-    gone.wait()
-    folders = [project.build / "set", *(project.build / "store" / name for name in ("keys", "logs", "cache"))]
-    pids = {"old": gone.pid, "new": gone.pid, "own": os.getpid()}
-    drafts = [folder / f".{name}.json.{pid}" for folder in folders for name, pid in pids.items()]
-    for path in drafts:
-        write(path, "{")
-        os.utime(path, (time.time() - 7200 * (".new." not in path.name),) * 2)
-    link = project.build / "set" / f".upper.{os.getppid()}"  # that another run is about to rename
-    link.symlink_to("../store", target_is_directory=True)
-    write(project.root / "data" / "set" / "c.txt", "Gamma")
-    assert make(project) == 0 and link.is_symlink()
-    assert [path for path in drafts if path.exists()] == [path for path in drafts if ".old." not in path.name]
-
-
-REAL = ("masks", "align", "urm", "train", "solve", "export", "render", "evaluate", "report")
-EACH = 5  # kills of each stage
-QUICK = [
-    "masks.pixels=3000", "urm.most=5000", "urm.directions=0", "solve.solver=few_lobes", "solve.rounds=1",
-    "solve.lobes=12", "solve.iterations=2", "solve.polish=1", "export.height=32", "export.mitsuba_height=32",
-]  # fmt: skip
-
-
-@pytest.fixture(scope="module")
-def whole(tmp_path_factory):
-    """data/synthetic, everything made; a copy of the source, which nobody edits meanwhile."""
-    project = real_project(tmp_path_factory.mktemp("real"), "pipeline.yaml", "stages", "factorlib")
-    assert verbs.make(project, verbs.Wish("synthetic", settings=QUICK)) == 0
-    return project
-
-
-@pytest.mark.long
-@pytest.mark.parametrize("stage", REAL)
-def test_a_stage_of_the_real_pipeline_that_is_killed_while_it_writes_ends_in_the_same_bytes(whole, stage):
-    store, below = whole.build / "store", REAL[REAL.index(stage) :]
-    command = [sys.executable, "-m", "factorlib", stage, "--dataset", "synthetic", *(f"--set={word}" for word in QUICK)]
-    options = {"stdout": subprocess.PIPE, "stderr": subprocess.STDOUT, "text": True, "start_new_session": True}
-    options["env"] = {**os.environ, "FACTORLIB_ROOT": str(whole.root), "PYTHONPATH": str(LIBRARY)}
-    wanted, hits = files_of((whole.build / "synthetic" / stage).resolve()), 0
-    for number in range(4 * EACH):
-        for key, entry in entries(whole).items():
-            if entry["record"]["stage"] in below:
-                (store / "keys" / f"{key}.json").unlink()
-                shutil.rmtree(store / "trees" / entry["output"], ignore_errors=True)
-        process = subprocess.Popen(command, **options)
-        begun = partial(at_work, whole, stage)
-        wait_until(lambda begun=begun, it=process: begun() or it.poll() is not None, seconds=300, every=0.0005)
-        time.sleep(0.003 * (number % 3))
-        hits += bool(begun())
-        os.killpg(process.pid, signal.SIGKILL)
-        end(process)
-        assert verbs.make(whole, verbs.Wish("synthetic", [stage], QUICK)) == 0
-        assert files_of((whole.build / "synthetic" / stage).resolve()) == wanted
-        if hits == EACH:
-            break
-    no_loss("SIGKILL, the real pipeline", [[]] * hits)
-    note("hits", "mid-write", hits, stages={f"{stage} (real)": hits})
-    assert hits == EACH
-    assert verbs.make(whole, verbs.Wish("synthetic", settings=QUICK)) == 0
-
-
 # ── two runs, inputs, clocks, places ─────────────────────────────────────────────────────────────────────────────────
-
-
-@few(1, 12)
-def test_runs_at_the_same_time_do_the_work_once(fresh, made_once, again, seeds):
-    losses = []
-    for seed in seeds:
-        chance, project, runs = random.Random(seed), again(fresh), []
-        for _ in range(2 + seed % 2):
-            runs.append(start(project))
-            time.sleep(chance.uniform(0, 0.8))
-        codes = [end(run)[0] for run in runs]
-        twice = sorted(step for step in set(done(project)) if done(project).count(step) > 1)
-        losses.append([*([f"ended with {codes}"] if any(codes) else []), *twice, *lost_in(project, results(made_once))])
-    no_loss("two or three runs at once", losses)
 
 
 SPOIL = "p = {0} / 'a.json'; p.chmod(0o644); p.write_text('{{{{\"letters\": 100}}}}')"
@@ -378,10 +269,7 @@ MEANWHILE = {  # what changes while a step runs -> that stage, the line before w
 }  # fmt: skip
 
 
-@pytest.mark.parametrize(
-    "what",
-    some_of(MEANWHILE, "a photo goes", "a result is spoilt", "the code is another", "a file of its package is another"),
-)
+@pytest.mark.parametrize("what", MEANWHILE)
 def test_what_changes_while_a_step_runs_is_named_and_costs_that_step(fresh, made_once, capfd, what):
     """Nothing is kept under a key that says something else, and once it is as it was the run goes on."""
     stage, before, code, words = MEANWHILE[what]
@@ -395,38 +283,15 @@ def test_what_changes_while_a_step_runs_is_named_and_costs_that_step(fresh, made
     assert step not in kept(fresh).values()
     for path, text in usual.items():
         write(path, text)
-    made = make(fresh) == 0 and is_sound(fresh) and results(fresh) == results(made_once)
-    no_loss("what changes while a step runs", [[] if made else [what]])
-
-
-def test_no_view_takes_a_result_for_right_that_is_spoilt_after_it_was_looked_at(project):
-    found = survey(project, "set", None, [])
-    steps = {p.step.photo: p for p in found.planned() if p.step.stage == "count"}
-    keys = {photo: p.key for photo, p in steps.items()}
-    overwrite(found.store.tree(steps["a"].output) / "a.json", '{"letters": 100}')
-    with pytest.raises(InputError, match="a.json: other content"):
-        view_of(found.outputs, "count", keys, "others.json")
-    assert not list(found.store.tmp.glob("view-*"))
-
-
-def test_edited_code_runs_for_no_further_photo_and_a_remark_stops_nothing(fresh, capsys, monkeypatch):
-    monkeypatch.setattr("factorlib.runner.child.machine_cores", lambda: 1)
-    doing(fresh, "table", "f = Path(__file__); f.write_text('# a remark\\n' + f.read_text())")
-    assert make(fresh, targets=["table"]) == 0
-    doing(fresh, "count", "f = Path(__file__); f.write_text(f.read_text() + 'MORE = 1\\n')")
-    assert make(fresh) == 1
-    text = capsys.readouterr()
-    assert text.err.count("changed while the run went on") == 1 and "stages/count.py" in text.err
-    assert "1 step failed: count/a" in text.out and "not run for that: count" in text.out
+    assert make(fresh) == 0 and is_sound(fresh) and results(fresh) == results(made_once)
 
 
 CLOCK = "import time\n_now, _now_ns = time.time, time.time_ns\ntime.time = lambda: _now() - {0}\ntime.time_ns = lambda: _now_ns() - {0} * 10**9\n"
 
 
-@pytest.mark.parametrize("days", some_of([1, 400, -1, -4000], 1))
-def test_a_clock_that_goes_back_loses_nothing_and_hides_no_edit(made_once, project, days):
+def test_a_clock_that_goes_back_loses_nothing_and_hides_no_edit(made_once, project):
     """All files are from the future, and what is edited now is older than what is remembered."""
-    seconds, before = days * 86400, len(done(project))
+    seconds, before = 86400, len(done(project))
     clock = CLOCK.format(seconds)
     assert end(start(project, python=clock))[0] == 0 and len(done(project)) == before, "nothing to do"
     photo, more = (project.root / "data" / "set" / f"{name}.txt" for name in "ac")
@@ -437,39 +302,32 @@ def test_a_clock_that_goes_back_loses_nothing_and_hides_no_edit(made_once, proje
     ran = sorted(done(project)[before:])
     write(photo, photo.read_text().swapcase())
     more.unlink()
-    wrong = [] if ran == ["count/c", "total", "upper/a", "upper/c"] else ran
-    no_loss("a clock that goes back", [wrong + lost_in(project, results(made_once))])
+    assert ran == ["count/c", "total", "upper/a", "upper/c"] and lost_in(project, results(made_once)) == []
 
 
-@pytest.mark.parametrize("link", some_of(["build", "build/store"], "build"))
-def test_a_checkout_that_is_moved_and_its_store_on_another_file_system_change_nothing(fresh, made_once, tmp_path, link):
+def test_a_checkout_that_is_moved_and_its_store_on_another_file_system_change_nothing(fresh, made_once, tmp_path):
     """Killed here, moved, and finished there."""
     if not Path("/dev/shm").is_dir() or Path("/dev/shm").stat().st_dev == fresh.root.stat().st_dev:
         pytest.skip("there is no second file system")
     place, moved = Path(tempfile.mkdtemp(dir="/dev/shm")), toy.toy(tmp_path / "moved")
     try:
-        (fresh.root / link).parent.mkdir(exist_ok=True)
-        (fresh.root / link).symlink_to(place)
+        fresh.build.symlink_to(place)
         struck(fresh, 5)
         shutil.move(fresh.root, moved.root)
-        losses = lost_in(moved, results(made_once)) + sorted(set(kept(moved)) ^ set(kept(made_once)))
+        assert lost_in(moved, results(made_once)) == [] and set(kept(moved)) == set(kept(made_once))
         assert (moved.build / "store").resolve().is_relative_to(place)
-        no_loss("a checkout that is moved, its store on another file system", [losses])
     finally:
         shutil.rmtree(place)
 
 
-GONE = (".", "set", *(f"store/{name}" for name in ("trees", "keys", "views", "logs", "locks", "cache", "tmp")), "store")
+GONE = (".", "set", *(f"store/{name}" for name in ("trees", "keys", "views", "cache")))
 
 
-@pytest.mark.parametrize("folders", [GONE[:4], pytest.param(GONE[4:], marks=LONG)], ids=["results", "the rest"])
-def test_a_folder_of_results_that_is_deleted_is_made_again(project, folders):
+def test_a_folder_of_results_that_is_deleted_is_made_again(project):
     wanted = results(project)
-    for gone in (gone for gone in folders if (project.build / gone).exists()):
+    for gone in (gone for gone in GONE if (project.build / gone).exists()):
         shutil.rmtree(project.build / gone)
-        verbs.show_status(project, verbs.Wish("set"))
-        again = make(project) == 0 and is_sound(project)
-        no_loss("a deleted folder of build/", [[] if again and results(project) == wanted else [gone]])
+        assert make(project) == 0 and is_sound(project) and results(project) == wanted, gone
 
 
 # ── gc ───────────────────────────────────────────────────────────────────────────────────────────────────────────────
@@ -481,40 +339,31 @@ from tests.runner import toy
 from factorlib.runner.gc import collect
 def slow(function):
     def wrapped(*words, **more):
-        time.sleep(0.01)
+        time.sleep(0.02)
         return function(*words, **more)
     return wrapped
-os.unlink, os.rmdir, os.rename = map(fresh, (os.unlink, os.rmdir, os.rename))
-print("begun", flush=True)
+os.unlink, os.rmdir, os.rename = map(slow, (os.unlink, os.rmdir, os.rename))
 collect(toy.toy(Path(sys.argv[1])))
 """
 
 
-@few(1, 25)
-def test_gc_that_is_killed_leaves_what_is_current_and_is_finished_by_the_next(made_once, again, capfd, seeds):
-    losses, half, several, more = [], 0, again(made_once), ("table.scale=5", "upper.times=5")
+def test_gc_that_is_killed_leaves_what_is_current_and_is_finished_by_the_next(made_once, again, capfd):
+    several, more = again(made_once), ("table.scale=5", "upper.times=5")
     assert make(several, "table.scale=3", "upper.times=3") == 0 and make(several, *more) == 0
     other = results(several)
     assert make(several) == 0
-    for seed in seeds:
-        project = again(several)
-        keys, command = len(kept(project)), [sys.executable, "-c", SLOW_GC, str(project.root)]
-        process = subprocess.Popen(command, env={**os.environ, "PYTHONPATH": str(LIBRARY)}, stdout=subprocess.PIPE)
-        process.stdout.readline()
-        time.sleep(random.Random(seed).uniform(0, 1.0))
-        process.kill()
-        process.communicate()
-        half += 0 < keys - len(kept(project))
-        lost = lost_in(project, results(made_once))
-        collect(project)
-        if sorted(kept(project)) != sorted(kept(made_once)) or list((project.build / "store/tmp").glob("gc-*")):
-            lost.append("gc left something")
-        capfd.readouterr()
-        if make(project, *more) or results(project) != other or "damaged" in capfd.readouterr().err:
-            lost.append("what was freed cannot be made again, or what gc left was taken for damage")
-        losses.append(lost)
-    no_loss("gc killed in the middle", losses)
-    assert half or len(seeds) == 1
+    project = again(several)
+    keys, command = len(kept(project)), [sys.executable, "-c", SLOW_GC, str(project.root)]
+    process = subprocess.Popen(command, env={**os.environ, "PYTHONPATH": str(LIBRARY)})
+    assert wait_until(lambda: len(kept(project)) < keys)
+    process.kill()
+    process.wait()
+    assert len(kept(project)) > len(kept(made_once)), "it was to be killed before its end"
+    assert lost_in(project, results(made_once)) == []
+    collect(project)
+    assert sorted(kept(project)) == sorted(kept(made_once)) and not list((project.build / "store/tmp").glob("gc-*"))
+    capfd.readouterr()
+    assert make(project, *more) == 0 and results(project) == other and "damaged" not in capfd.readouterr().err
 
 
 def test_gc_keeps_what_a_current_result_was_made_from(project):
@@ -566,14 +415,12 @@ def in_set(project, name):
 
 
 DAMAGES = {
-    "other content": lambda path: overwrite(path, "OTHER"), "another file": lambda path: replace(path, "OTHER"),
-    "one too many": lambda path: write(path.with_name("more.txt"), "1"), "cut": lambda path: os.truncate(path, 2),
-    "missing": lambda path: path.unlink(), "a link": link_elsewhere,
-    "all gone": lambda path: shutil.rmtree(path.parent),
+    "other content": lambda path: overwrite(path, "OTHER"), "one too many": lambda path: write(path.with_name("more.txt"), "1"),
+    "a link": link_elsewhere, "all gone": lambda path: shutil.rmtree(path.parent),
 }  # fmt: skip
 
 
-@pytest.mark.parametrize("damage", some_of(DAMAGES, "other content", "one too many", "all gone"))
+@pytest.mark.parametrize("damage", DAMAGES)
 def test_a_damaged_result_is_made_again_and_nothing_else_is_and_a_damaged_view_too(project, damage):
     before = results(project)
     DAMAGES[damage](tree_of(project, "total", "total.txt"))
@@ -584,21 +431,6 @@ def test_a_damaged_result_is_made_again_and_nothing_else_is_and_a_damaged_view_t
     assert make(project) == 0 and new_runs(project) == [] and results(project) == before and is_sound(project)
 
 
-def test_a_stage_over_the_set_reads_no_damaged_view_and_verify_names_it(project, capsys):
-    """The view alone is damaged: nothing is made again, for its tree is right, but the total is to read what is right."""
-    replace(in_set(project, "count/counts.json"), '{"a": {"letters": 100}}')
-    replace(in_set(project, "count/a.json"), '{"letters": 100}')
-    assert not is_sound(project, "set")
-    text = capsys.readouterr().out
-    assert all(words in text for words in ("count (set)", "counts.json: other content", "a.json: other content"))
-    assert new_runs(project, "table.scale=3") == ["table", "total"]
-    assert in_set(project, "total/total.txt").read_text() == "total: 27"
-    overwrite(tree_of(project, "total", "total.txt"), "4")
-    assert make(project) == 0 and is_sound(project, "set"), "what is damaged is not current"
-    next((project.build / "store" / "keys").glob("*.json")).write_text("{")
-    assert not is_sound(project) and "not readable" in capsys.readouterr().out
-
-
 def test_what_stood_in_the_place_of_a_result_is_kept_until_gc(project, capsys):
     overwrite(tree_of(project, "total", "total.txt"), "a user's own words")
     assert make(project) == 0
@@ -607,16 +439,6 @@ def test_what_stood_in_the_place_of_a_result_is_kept_until_gc(project, capsys):
     assert [path.read_text() for path in damaged.rglob("total.txt")] == ["a user's own words"]
     collect(project)
     assert not list(damaged.iterdir())
-
-
-def test_touched_copied_or_left_by_desktops_and_editors_is_no_damage(project, tmp_path):
-    tree_of(project, "total", "total.txt").touch()
-    shutil.copytree(project.root, tmp_path / "copy", symlinks=True, copy_function=shutil.copyfile)
-    assert set(state(toy.toy(tmp_path / "copy")).values()) == {"current"}
-    for name in (".DS_Store", ".total.txt.swp", "total.txt~", ".ipynb_checkpoints/x"):
-        for stage in ("total", "upper"):
-            write((project.build / "set" / stage).resolve() / name, "1")
-    assert new_runs(project) == [] and is_sound(project)
 
 
 def test_damage_under_the_same_size_and_time_is_found_by_verify_or_replaced_by_force(project, capsys):
@@ -631,27 +453,13 @@ def test_damage_under_the_same_size_and_time_is_found_by_verify_or_replaced_by_f
     assert make(project, force=True) == 0 and results(project) == before and is_sound(project)
 
 
-def test_damage_that_comes_after_a_step_and_before_it_is_read_is_noticed(project):
-    path = f"Path({str(project.build / 'set' / 'count')!r})"
-    doing(project, "table", SPOIL.format(path).format())
-    assert make(project, "table.scale=3") == 0 and is_sound(project)
-    assert in_set(project, "total/total.txt").read_text() == "total: 27"
-
-
-def test_a_disk_that_gives_back_something_else_does_not_loop(project, monkeypatch, capsys):
-    wrong = lambda self, output, files: ["total.txt: other content"] if "total.txt" in files else []  # noqa: E731
-    monkeypatch.setattr(Inspector, "damage", wrong)
-    assert make(project) == 1 and "is the disk failing" in capsys.readouterr().err
-
-
 # ── no room ──────────────────────────────────────────────────────────────────────────────────────────────────────────
 
 SIZE = 100_000  # bytes that a heavy stage writes beside its result
 HEAVY = f"(out / f'large-{{inputs.photo}}.bin').write_bytes(bytes({SIZE}))"
-ABOVE = {"upper": ["table"], "count": ["upper", "table"], "table": ["count"], "total": ["count", "table"]}
 QUOTA = "raise OSError(__import__('errno').EDQUOT, 'Disk quota exceeded', str(out))"
 LIBRARYS = "raise RuntimeError('a library: I/O error: No space left on device (os error 28)')"
-NO_ROOM = {  # name in the table -> words of the error, and what is raised where it is not the system that says so
+NO_ROOM = {  # words of the error, and what is raised where it is not the system that says so
     "a disk that is full": ("the disk is full", None),
     "a limit on the size of files": ("no file may become that large", None),
     "a quota that is used up": ("the disk quota is used up", QUOTA),
@@ -685,17 +493,16 @@ def limited():
     resource.setrlimit(resource.RLIMIT_FSIZE, (SIZE // 2, SIZE // 2))
 
 
-@pytest.mark.parametrize("stage", some_of(STAGES, "table"))
-@pytest.mark.parametrize("kind", some_of(NO_ROOM, *list(NO_ROOM)[:3]))
-def test_no_room_is_said_as_what_it_is_and_with_room_the_run_goes_on(fresh, again, request, stage, kind):
+@pytest.mark.parametrize("kind", NO_ROOM)
+def test_no_room_is_said_as_what_it_is_and_with_room_the_run_goes_on(fresh, again, request, kind):
     """Without root's rights, which pass limits."""
-    (words, raised), project = NO_ROOM[kind], again(fresh)
+    (words, raised), project, stage = NO_ROOM[kind], again(fresh), "table"
     doing(project, stage, HEAVY)
     usual = again(project)
     assert make(usual) == 0
     if kind == "a disk that is full":
         project.build.symlink_to(request.getfixturevalue("disk"))
-    assert make(project, targets=ABOVE[stage]) == 0
+    assert make(project, targets=["count"]) == 0
     before, source = set(kept(project).values()), (project.root / "stages" / f"{stage}.py")
     if raised:
         text = source.read_text()
@@ -708,48 +515,7 @@ def test_no_room_is_said_as_what_it_is_and_with_room_the_run_goes_on(fresh, agai
     assert not any((project.build / "store" / "tmp").iterdir()) and not list((project.build / "set").glob("errors/*"))
     if raised:
         write(source, text)
-    no_loss(kind.partition(",")[0], [lost_in(project, results(usual))])
-
-
-@pytest.mark.parametrize("free", some_of(range(0, 400_000, 40_000), 0))
-def test_wherever_the_disk_becomes_full_the_next_run_ends_in_the_same_bytes(fresh, made_once, again, disk, free):
-    """In results, keys, logs, links and caches: of all that a run writes."""
-    project = again(fresh)
-    project.build.symlink_to(disk)
-    with full(disk, free):
-        last = str(call(project, "all", "--dataset", "set"))
-    assert last in ("0", "1") or is_said(last, "disk", "MB are free")
-    assert free or (last.startswith("error: ") and "the disk is full" in last)
-    no_loss("a disk that becomes full anywhere", [lost_in(project, results(made_once))])
-
-
-def test_a_read_only_build_shows_everything_and_runs_nothing(fresh, disk):
-    fresh.build.symlink_to(disk)
-    assert make(fresh) == 0
-    subprocess.run(["mount", "-o", "remount,ro", disk], check=True, capture_output=True)
-    for verb in ("all", "plan", "why", "status", "validate", "verify"):
-        assert call(fresh, verb, "--dataset", "set") == 0, verb
-    write(fresh.root / "data" / "set" / "a.txt", "another")
-    last = call(fresh, "all", "--dataset", "set")
-    assert last.startswith("error: ") and is_said(last, "read-only", "MB are free", str(disk))
-
-
-def test_a_file_that_may_not_be_read_is_no_full_folder_and_a_defect_stays_a_defect(tmp_path, monkeypatch):
-    write(path := tmp_path / "photo.txt", "1")
-    monkeypatch.setattr(os, "access", lambda *_: False)
-    assert is_said(str(disk_error(PermissionError(13, "", str(path)), tmp_path)), "it may not be read", "photo.txt")
-    defect = KeyError("a defect while another error was handled")
-    defect.__context__ = PermissionError(13, "Permission denied", "x")
-    assert not [e for e in (ValueError("x"), FileNotFoundError(2, "", "x"), defect) if disk_error(e, tmp_path)]
-
-
-def test_a_disk_that_is_full_while_a_file_is_copied_is_that_of_the_copy(tmp_path):
-    source, copy = (tmp_path / name / "file" for name in ("from", "to"))
-    for path in (source, copy):
-        path.parent.mkdir()
-        path.write_text("")
-    error = OSError(errno.ENOSPC, "No space left on device", str(source), None, str(copy))
-    assert disk_error(error, tmp_path).file == copy.parent
+    assert lost_in(project, results(usual)) == []
 
 
 def test_the_traceback_of_a_failure_goes_once_its_step_succeeds_even_by_code_of_before(project):

@@ -21,11 +21,9 @@ from factorlib.dataset.read import read_dataset
 from factorlib.errors import InputError
 from factorlib.recipe.read import read_recipe
 from factorlib.runner import verbs
-from factorlib.runner.display import printable
 from factorlib.runner.project import LIBRARY, Project, photo_sets
 from factorlib.runner.survey import survey
 from factorlib.validation import Validation
-from factorlib.yamlfile import load_yaml
 from tests.faults.battered import call
 from tests.faults.good import DATASET, TRUTH, edited, make_set, put
 from tests.report.test_page import page_of, run
@@ -90,20 +88,6 @@ def test_no_path_leads_out_or_nowhere(good):
         assert re.search(words, error.found), (place, way, error)
 
 
-def test_a_link_within_the_dataset_is_no_way_out_and_one_out_shows_nothing_of_its_target(tmp_path):
-    folder = make_set(tmp_path / "set")
-    (folder / "again.png").symlink_to(folder / "7.png")
-    put(folder / "dataset.yaml", yaml.safe_dump(edited(DATASET, "photos", 0, "image", value="again.png")))
-    assert read_dataset(folder).spec.photos[0].image == "again.png"
-    (folder / "dataset.yaml").rename(tmp_path / "dataset.yaml")
-    for target in (tmp_path / "dataset.yaml", "/etc/passwd"):
-        (folder / "dataset.yaml").symlink_to(target)
-        with pytest.raises(InputError, match=OUT) as caught:
-            photo_sets().read(folder)
-        assert "root:" not in str(caught.value)
-        (folder / "dataset.yaml").unlink()
-
-
 def test_a_given_folder_and_a_recipe_open_no_pipe_and_no_device(tmp_path):
     dataset = read_dataset(make_set(tmp_path / "set"))
     for kind in ("pipe", "device"):
@@ -144,7 +128,6 @@ def test_a_run_writes_nothing_but_results(linked, tmp_path):
 
 # ── it runs no code ──────────────────────────────────────────────────────────────────────────────────────────────────
 
-RUNS = ["!!python/object/apply:os.system ['touch {0}']", "!!python/name:os.system", "!!python/module:os", "!code 'x'"]
 FORBIDDEN = {"eval", "exec", "compile", "__import__", "system", "popen", "spawnl", "execv", "unsafe_load", "full_load"}
 ALLOWED = {"re.compile", "torch.compile", "platform.system"}
 MODULES = {"pickle", "marshal", "shelve", "dill", "joblib", "cloudpickle"}
@@ -152,13 +135,6 @@ EXCEPTIONS = {
     "factorlib/checkpoint.py": {"pickle"},  # names the exception of what refuses to run code; torch.load is below
     "factorlib/parcel.py": {"pickle", "cloudpickle"},  # what the processes of one run send each other over a cluster
 }
-
-
-def test_no_tag_of_yaml_runs(tmp_path):
-    for text in RUNS:
-        with pytest.raises(InputError):
-            load_yaml(put(tmp_path / "x.yaml", f"format: 1\nmaterials: {text.format(tmp_path / 'pwned')}\n"))
-    assert not (tmp_path / "pwned").exists()
 
 
 def dangers(node: ast.AST) -> list[str]:
@@ -211,12 +187,6 @@ def test_no_name_of_a_file_and_no_key_moves_the_cursor_or_sets_a_colour(linked, 
     last = call(linked, verb, "--dataset", str(folder))
     text = f"{last}{''.join(capfd.readouterr())}"
     assert not CONTROL.search(text) and "Traceback" not in text and "\\x1b[31mall is well" in text
-
-
-def test_text_that_a_terminal_may_be_shown_stays_as_it_is():
-    for text in ("kitchen: µ σ² ≥ 1 …\n  ┃ 40 %", "日本 é ñ 🙂", ""):
-        assert printable(text) == text
-    assert not CONTROL.search(printable(EVIL_ANSI)) and printable(printable(EVIL_ANSI)) == printable(EVIL_ANSI)
 
 
 def test_names_and_warnings_are_text_in_the_report(tmp_path):

@@ -6,14 +6,11 @@ import xml.etree.ElementTree as tree
 import msgspec
 import numpy as np
 import pytest
-from scipy.stats import ttest_1samp
 
-from studies.catalogue import cost, leave_one_out, seeds_and_machines
 from studies.conclusion import (
     Cell,
     Conclusion,
     Row,
-    best,
     concluded,
     csv_text,
     difference,
@@ -22,7 +19,7 @@ from studies.conclusion import (
 )
 from studies.figures import figure
 from studies.run import studies
-from studies.run.page import against_the_paper, write_page
+from studies.run.page import write_page
 from studies.study import FULL, QUICK, Claim, Score, Setting, Study, case_name
 
 
@@ -31,14 +28,6 @@ def by_seed(*values):
 
 
 # ── statistics ───────────────────────────────────────────────────────────────────────────────────────────────────────
-
-
-def test_the_interval_of_a_mean_is_that_of_the_t_test():
-    values = [0.3, 0.5, 0.45, 0.6, 0.35]
-    s, expected = spread(values), ttest_1samp(values, 0).confidence_interval(0.95)
-    assert (s.low, s.high) == pytest.approx(tuple(expected))
-    assert s.mean == pytest.approx(0.44) and s.deviation == pytest.approx(np.std(values, ddof=1))
-    assert spread([1.0]).low is spread([1.0]).deviation is None, "one seed has no interval"
 
 
 WORSE, SAME, NONE = by_seed(1.0, 11.0, 5.0, 7.0, 3.0), by_seed(*[0.1] * 5), by_seed(*[0.0] * 5)
@@ -62,12 +51,6 @@ THREE = by_seed(*(-THREE / THREE.std(ddof=1) * 5**0.5 - 3))
 )
 def test_a_difference_is_shown_where_seeds_leave_no_doubt(first, second, comparisons, verdict):
     assert difference(first, second, comparisons)[1] == verdict
-
-
-def test_only_seeds_that_both_have_are_compared():
-    with pytest.raises(ValueError, match="no seed"):
-        difference({0: 1.0}, {1: 1.0})
-    assert difference({0: 1.0, 1: 2.0}, {1: 1.0, 2: 3.0})[0].mean == 1.0
 
 
 # ── claims ───────────────────────────────────────────────────────────────────────────────────────────────────────────
@@ -107,25 +90,6 @@ def test_the_sentence_says_what_was_found(a, b, answer, words):
     assert msgspec.convert(json.loads(msgspec.json.encode(table)), Conclusion, str_keys=True) == table
 
 
-@pytest.mark.parametrize("b, c, answer", [(0.5, 0.6, "agrees"), (0.5, 1.9, "disagrees")])
-def test_rises_are_compared_per_unit(b, c, answer):
-    """From a to b one unit, from b to c two: .4 and .05 or .7 a unit."""
-    claim = Claim("entries", ("rise", "b", "c", 2), ("rise", "a", "b", 1), "it saturates")
-    values, noise = {"a": 0.1, "b": b, "c": c}, {"a": 0, "b": 1e-6, "c": 5e-6}
-    given = {case_name(n, s): Score({"entries": v + s**2 * noise[n]}) for n, v in values.items() for s in FULL.seeds}
-    (tested,) = concluded(study(claim, names="abc"), FULL, given).claims
-    assert tested.answer == answer and "the rise of DSSIM" in tested.sentence
-    assert tested.difference.mean == pytest.approx((c - b) / 2 - (b - 0.1), abs=1e-4)
-
-
-@pytest.mark.parametrize("a, answer", [(0.1, "agrees"), (0.9, "disagrees")])
-def test_a_guess_is_compared_seed_by_seed(a, answer):
-    claim = Claim("entries", "a", ("guess", "a"), "a beats a guess")
-    (tested,) = concluded(study(claim), FULL, scores(FULL, a=a, b=0.3)).claims
-    assert tested.answer == answer and "in “a” against a guess" in tested.sentence
-    assert tested.difference.mean == pytest.approx(0.8 * (a + 0.002) - 0.5)
-
-
 def test_an_answer_in_part_says_of_how_many_and_a_quick_study_concludes_nothing():
     given = scores(FULL, a=0.1, b=0.2)
     answers = [concluded(study(*of), FULL, given).answer for of in ((CLAIM, OTHER), (OTHER,), ())]
@@ -153,35 +117,6 @@ def steps(*starts):
     return {name: ([a + 0.01 * s for s in range(5)], [b + s for s in range(5)]) for name, (a, b) in values.items()}
 
 
-def test_the_best_is_named_with_those_that_are_not_shown_to_be_worse():
-    noisy = {name: (np.random.default_rng(k).normal(size=5),) for k, name in enumerate("ab")}
-    start = "Least mean of DSSIM, all entries: “s0”"
-    assert best(made(steps(1, 1)), "entries") == f"{start}; all others are shown to be worse."
-    assert "not shown to be worse: “" in best(made(noisy), "entries")
-    assert "too few seeds" in best(made({"a": ([1.0],), "b": ([2.0],)}), "entries")
-
-
-@pytest.mark.parametrize("power, word", [(1.0, "linear"), (1.4, "more than linear"), (0.5, "less than linear")])
-def test_an_exponent_has_an_interval(power, word):
-    rng = np.random.default_rng(0)
-    costs = {n: by_seed(*(0.1 * n**power * np.exp(0.02 * rng.normal(size=5)))) for n in (9, 100, 1600)}
-    e = cost.exponents(costs, range(5))
-    assert e.low < power < e.high and e.high - e.low < 0.05 and cost.called(e) == word
-    assert cost.called(cost.exponents({9: {0: 1.0}, 25: {0: 2.0}}, [0])) == "not decided"
-
-
-def test_notes_give_photos_seeds_and_instructions_one_by_one():
-    table = made({"left out": ([0.1, 0.2],), "flat": ([0.15, 0.123],)}, ("chair",), "quick")
-    (said,) = leave_one_out.by_photo(table)
-    assert said == "DSSIM of a chair, photo by photo (left out, flat): kitchen 0.1, 0.15; hall 0.2, 0.12."
-    runs = {"fixed-0": [0.01, 0.02], "fixed-5": [0.03, 0.04], "all-0": [0.01, 0.02], "least-0": [0.01, 0.025]}
-    runs = made({n: (v,) for n, v in runs.items()}, ("materials.worst_roughness",))
-    apart, same, other = seeds_and_machines.notes(runs)
-    assert "0.025 on average over 4 seeds" in apart and "0.01 to 0.04" in apart
-    assert same == "all-0: every number is the same to the last digit."
-    assert other == "least-0: numbers of the same seed differ at most so: roughness, worst material by 0.005."
-
-
 def test_figures_stand_alone_and_show_every_setting():
     table = made(steps(0, 1, 100))
     root = tree.fromstring(figure(table))
@@ -199,11 +134,3 @@ def test_the_page_escapes_what_it_shows_and_leaves_tables_of_another_version_out
     text = write_page(project).read_text()
     assert text.count("<section") == 1 and "Title &lt;&amp;&gt;" in text and "STUDY=cost" in capsys.readouterr().out
     assert "of a solve (s)</th>" in text and "<th>DSSIM, all entries</th>" in text
-
-
-def test_what_docs_have_stays_until_there_is_a_study():
-    text = "| [Prior on lights](#prior-on-lights) | It falls. | agrees |\n"
-    for done, answer in (({}, "agrees"), ({"prior": "disagrees"}, "disagrees")):
-        lines = against_the_paper(done, text).splitlines()
-        (row,) = [line for line in lines if line.startswith("| [Prior on")]
-        assert row.endswith(f"| {answer} |") and lines[2].endswith("| not run |")

@@ -2,9 +2,7 @@
 
 from importlib.util import find_spec
 from pathlib import Path
-from types import SimpleNamespace
 
-import msgspec
 import numpy as np
 import pytest
 
@@ -12,8 +10,7 @@ from factorlib.errors import InputError
 from factorlib.images.exr import LAT_LONG, write_rgb_exr
 from factorlib.jsonfile import write_json
 from factorlib.results.materials import MaterialTable, Reflectance, StandardErrors, solved
-from factorlib.results.metrics import PhotoErrors, PictureError, Resynthesis, ScoredPicture
-from studies.measured import real_sets, results
+from studies.measured import results
 from studies.measured.eames_like import MAPS, drawn, folder_of
 from studies.measured.standard_errors import light_deviations, material_deviations
 from studies.measured.tools import refresh
@@ -36,16 +33,6 @@ def test_a_section_is_replaced_and_the_rest_of_the_page_stays(tmp_path):
         refresh(page, {"other": ""})
 
 
-def test_what_is_not_here_is_left_as_it_was_and_a_wrong_name_is_refused(tmp_path, monkeypatch, capsys):
-    monkeypatch.setattr(results, "PAGE", tmp_path / "none.md")
-    monkeypatch.delenv("REAL", raising=False)
-    monkeypatch.setenv("ONLY", "real_poses")
-    assert results.main() == 1 and "no folders of photographs with known poses" in capsys.readouterr().err
-    monkeypatch.setenv("ONLY", "aling")
-    with pytest.raises(InputError, match="did you mean 'align'"):
-        results.main()
-
-
 def test_a_prior_is_fitted_to_the_maps_that_light_no_photo(tmp_path):
     maps = [Path(f"maps/{name}.exr") for name in "abcdefghijkl"]
     lit, others = drawn(maps, 6)
@@ -58,15 +45,6 @@ def test_a_prior_is_fitted_to_the_maps_that_light_no_photo(tmp_path):
         (tmp_path / folder / "sky.exr").write_text(folder)
     both = folder_of([tmp_path / "b/sky.exr", tmp_path / "a/sky.exr"], tmp_path / "both")
     assert [path.read_text() for path in sorted(both.iterdir())] == ["b", "a"]
-
-
-def test_a_real_sets_rows_give_photos_and_the_mean_beside_flat_colours():
-    scored = ScoredPicture(PictureError(1.0, 15.47, 0.34357), PictureError(1.0, 13.39, 0.347734))
-    seen = PhotoErrors(1.0, 4, 0, 0, 0, 0, None, {}, {"none": scored}, {})
-    nothing_counts = msgspec.structs.replace(seen, gauges=None)
-    metrics = SimpleNamespace(resynthesis=Resynthesis({"a": seen, "b": nothing_counts}, {"none": scored}, 1.0, 1.0))
-    cells = [".344", ".348", "15.5", "13.4"]
-    assert real_sets.rows_of("x", metrics) == [["x: a", *cells], ["x: mean", *cells]]
 
 
 def written(folder, roughness, scale, light, names=("one", "two")):

@@ -5,26 +5,21 @@ import numpy as np
 import pytest
 
 from factorlib.model.illumination import Illumination
-from factorlib.model.lights import Light
 from factorlib.model.loss import Loss
 from factorlib.model.materials import Materials, Point
-from factorlib.model.noise import Noise
-from factorlib.model.observed import blocks_of_observations
 from factorlib.model.problem import JointProblem
-from factorlib.solve.few_lobes import equations, unknowns
+from factorlib.solve.few_lobes import unknowns
 from factorlib.solve.few_lobes.equations import (
     energy_equations,
-    linearise,
     nonnegative_minimum,
     normal_equations,
     responses,
     tint_prior,
     with_weights_fitted,
 )
-from factorlib.solve.few_lobes.insertion import candidates, lobes_inserted
-from factorlib.solve.few_lobes.roughness import materials_of_best_roughness, reflectances
+from factorlib.solve.few_lobes.roughness import materials_of_best_roughness
 from studies.scenes.problems import MATERIALS, block, random_light
-from tests.model.made import OPERATOR, bowls, photos_in_a_wrong_light, rough_light
+from tests.model.made import OPERATOR, photos_in_a_wrong_light
 from tests.solve.made import OPERATOR as NETWORK
 
 LOSS = Loss(robust_scale=3.0, prior=0.05)
@@ -75,22 +70,6 @@ def test_gradients_are_finite_differences_of_the_loss(kind, moved):
     np.testing.assert_allclose(gradient[which], expected, rtol=rtol, atol=atol * np.abs(expected).max())
 
 
-@pytest.mark.parametrize("moved", [moved_light, moved_materials])
-def test_the_jacobian_is_the_finite_difference_of_the_one_forward_model(clipped, moved):
-    """Row by row, of whitened residuals that nothing weighs down."""
-    plain, first = Loss(robust_scale=1e9, prior=0.0), 7 * len(MATERIALS)
-    whole = np.zeros((*clipped.block.radiance.shape, first + unknowns.unknowns(clipped.light)))
-    for part in linearise(clipped, plain):
-        of_channel = whole[part.rows, part.channel]
-        of_channel[:, part.places] = part.jacobian.numpy()
-    jacobian = whole[..., first:] if moved is moved_light else whole[..., :first]
-    expected = np.moveaxis(derivative(lambda d: moved(clipped, d).residuals(), jacobian.shape[-1]), 0, -1)
-    compared = ~clipped.block.held_out[:, None] & (
-        np.abs(clipped.residuals()) > 1e-3
-    )  # a clipped channel just satisfied has two slopes
-    np.testing.assert_allclose(jacobian[compared], expected[compared], atol=1e-5 * np.abs(expected).max())
-
-
 def test_loss_of_the_normal_equations_is_the_loss_and_held_out_observations_do_not_pull(clipped):
     np.testing.assert_allclose(normal_equations(clipped, LOSS).loss, fit_loss(clipped, LOSS))
     radiance = np.where(clipped.block.held_out[:, None], clipped.block.radiance + 1, clipped.block.radiance)
@@ -119,10 +98,6 @@ def data():
     noisy = shown.radiance * (1 + 0.05 * np.random.default_rng(4).normal(size=shown.radiance.shape))
     guess = random_light(np.random.default_rng(5), 9)
     return Illumination(msgspec.structs.replace(shown, radiance=noisy), guess, MATERIALS, OPERATOR)
-
-
-def changed(one, **block):
-    return msgspec.structs.replace(one, block=msgspec.structs.replace(one.block, **block))
 
 
 def by_energy(light, gradient):
@@ -160,42 +135,6 @@ def test_fitted_weights_are_the_optimum_and_everything_else_stays(data):
         np.testing.assert_array_equal(getattr(found, name), getattr(data.light, name))
     again = normal_equations(with_light(data, found), SQUARES).light_hessian
     np.testing.assert_allclose(at.light_hessian, again, rtol=1e-12, atol=1e-12 * again.max())
-
-
-def test_fitted_weights_never_raise_a_robust_loss_with_clipped_channels(data):
-    rng, radiance = np.random.default_rng(6), data.block.radiance
-    wrong = radiance * np.where(rng.random(radiance.shape) < 0.2, 20.0, 1.0)
-    harmed = changed(data, radiance=wrong, clipped=wrong > np.quantile(wrong, 0.6))
-    for scale in (0.1, 1.0, 10.0):
-        loss = Loss(robust_scale=scale, prior=0.0)
-        found, at = with_weights_fitted(harmed, loss)
-        assert at.loss <= fit_loss(harmed, loss) * (1 + 1e-12)
-        np.testing.assert_allclose(at.loss, fit_loss(with_light(harmed, found), loss), rtol=1e-5)
-
-
-def test_weights_that_would_raise_the_loss_are_not_taken(data, monkeypatch):
-    nine = lambda light, _: msgspec.structs.replace(light, weight=9 * light.weight)  # noqa: E731
-    monkeypatch.setattr(equations, "of_least_loss", nine)
-    found, at = with_weights_fitted(data, SQUARES)
-    np.testing.assert_array_equal(found.weight, data.light.weight)
-    assert at.loss == normal_equations(data, SQUARES).loss
-
-
-def test_responses_computed_twice_give_the_same_bits(data, monkeypatch):
-    kept, at = with_weights_fitted(data, SQUARES)
-    monkeypatch.setattr(equations, "KEPT", 0)
-    again, other = with_weights_fitted(data, SQUARES)
-    np.testing.assert_array_equal(kept.weight, again.weight)
-    np.testing.assert_array_equal(at.light_hessian, other.light_hessian)
-
-
-def test_weights_are_fitted_to_what_bounces_leave():
-    """Observations of a light and of bounces give that light back."""
-    given = photos_in_a_wrong_light("bounced")
-    exact = changed(given, radiance=given.radiance(), precision=np.ones_like(given.block.precision))
-    dark = msgspec.structs.replace(given.light, weight=given.light.weight / 3)
-    found, _ = with_weights_fitted(with_light(exact, dark), SQUARES)
-    np.testing.assert_allclose(found.weight, given.light.weight, rtol=1e-5, atol=1e-6 * given.light.weight.max())
 
 
 def test_nonnegative_minimum_against_every_active_set():
@@ -236,33 +175,3 @@ def test_a_roughness_far_off_is_found_again():
     found = searched(blocks, wrong, lights)
     assert abs(found.roughness[0] - truth.roughness[0]) < 0.1  # the grid's own spacing
     np.testing.assert_array_equal(found.roughness[1:], wrong.roughness[1:])  # what is right stays
-
-
-def test_a_material_that_nothing_shows_stays_and_clipped_channels_do_not_vote():
-    blocks, truth, lights = shown(2)
-    more = Materials.of_rows(truth.rows()[[0, 1, 0]])
-    np.testing.assert_array_equal(searched(blocks, more, lights).vector()[14:], more.vector()[14:])
-    half = [(np.arange(len(b)) % 2 == 0)[:, None] for b in blocks]
-    dark = [
-        msgspec.structs.replace(b, clipped=b.clipped | h, radiance=np.where(h, 0.01, b.radiance))
-        for b, h in zip(blocks, half)
-    ]
-    wrong = Materials(truth.diffuse, truth.specular, np.array([1.0, truth.roughness[1]]))
-    assert abs(searched(dark, wrong, lights).roughness[0] - truth.roughness[0]) < 0.1
-
-
-def test_reflectances_are_those_that_made_the_radiance():
-    diffuse, specular = np.random.default_rng(0).uniform(0.1, 1, (2, 50, 3))
-    kd, ks = np.array([0.3, 0.2, 0.1]), np.array([0.05, 0.1, 0.2])
-    loss, found_kd, found_ks = reflectances(diffuse, specular, kd * diffuse + ks * specular, np.ones((50, 3)))
-    assert loss == pytest.approx(0, abs=1e-12)
-    np.testing.assert_allclose([found_kd, found_ks], [kd, ks], rtol=1e-6)
-
-
-def test_no_lobe_is_inserted_where_its_light_cannot_arrive():
-    """One observation's worth of light from the side that everything is hidden from explains nothing."""
-    data = blocks_of_observations(bowls("room", rough_light(3), size=8), Noise())[0]
-    visibility = np.where(data.directions[0, :, 0] > 0.2, 0, data.visibility).astype(np.uint8)
-    dark = Light(np.array([[0.0, 0.0, -1.0]]), np.zeros(1), np.full((1, 3), 1e-6), np.zeros(1))
-    illumination = Illumination(msgspec.structs.replace(data, visibility=visibility), dark, MATERIALS, OPERATOR)
-    assert (lobes_inserted(illumination, 8, candidates(illumination, 0)).axis[1:, 0] < 0.35).all()
