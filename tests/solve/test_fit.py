@@ -9,7 +9,7 @@ from factorlib.model.lights import Light, even_cells
 from factorlib.model.materials import Materials
 from factorlib.model.noise import Noise
 from factorlib.model.problem import JointProblem
-from factorlib.solve.fit import DARK, Fit, Hyperparameters, Schedule, fitted, start_of, sure_ones, temperature
+from factorlib.solve.fit import DARK, Fit, Schedule, fitted, sure_ones, temperature
 from factorlib.solve.marginal import marginal, positive_definite_inverse
 from factorlib.solve.material_prior import BRIGHTEST, BRIGHTNESS
 from studies.scenes.problems import MATERIALS, factor_between
@@ -68,34 +68,6 @@ def test_a_fit_lowers_its_value(solved):
         assert fitted(problem, found, PRIOR, step).value <= before + 1e-9 * abs(before)
 
 
-def test_what_starts_nil_is_found_too():
-    """By logarithms nothing would move it."""
-    problem, _ = photographed(8, 2, size=12)
-    nil = Materials(np.full((3, 3), 1e-5), np.full((3, 3), 0.1), np.full(3, 0.4))
-    nil.diffuse[0] = 0.5
-    found = materials_in(problem, start=nil).point.materials
-    assert (found.diffuse[1] / found.diffuse[0] > 0.2 * MATERIALS.diffuse[1] / MATERIALS.diffuse[0]).all()
-
-
-def test_order_of_lights_changes_nothing():
-    problem, _ = photographed(7, 2, cells=40, size=10)
-    turned = JointProblem(problem.blocks[::-1], OPERATOR)
-    one, other = (materials_in(p, 40, schedule=QUICK).point.materials.vector() for p in (problem, turned))
-    assert np.allclose(one, other, rtol=1e-3, atol=1e-4)
-
-
-def test_gold_among_paints_is_not_taken_for_a_paint():
-    """Up to the factor per channel that is free."""
-    gold = Materials(
-        np.vstack([MATERIALS.diffuse[:2], [0.01] * 3]),
-        np.array([[0.05] * 3, [0.04] * 3, [0.7, 0.55, 0.25]]),
-        MATERIALS.roughness,
-    )
-    problem, _ = photographed(10, 2, materials=gold)
-    found = materials_in(problem).point.materials
-    assert found.specular[2] * factor_between(found, gold) == pytest.approx(gold.specular[2], rel=0.15)
-
-
 def test_lights_from_the_observations_that_they_were_found_from_stay(solved):
     problem, _, found = solved
     again = fitted(problem, found, PRIOR, LIGHTS)
@@ -106,18 +78,6 @@ def test_lights_from_the_observations_that_they_were_found_from_stay(solved):
         alone = field(JointProblem([one], OPERATOR), light, found.point.materials, how.temperature)
         deviation = np.sqrt(np.diag(np.linalg.inv(marginal(alone, materials_given=True).light_hessian))).reshape(3, -1)
         assert np.mean(np.abs(after.log_radiance - light.log_radiance) < deviation) > 0.95
-
-
-def test_lights_from_all_show_what_the_others_alone_see(solved):
-    """Found from a half of the observations, given the true materials, lights explain the other half better afterwards."""
-    problem, _, found = solved
-    half = [msgspec.structs.replace(b, confidence=np.where(b.normal[:, 0] > 0, 0.9, 0.1)) for b in problem.blocks]
-    of_half = fitted(sure_ones(msgspec.structs.replace(problem, blocks=half)), start_of(found.point), PRIOR, WHOLE)
-    others = msgspec.structs.replace(
-        problem, blocks=[b.take(b.normal[:, 0] <= 0).with_none_held_out() for b in problem.blocks]
-    )
-    after = fitted(problem, of_half, PRIOR, LIGHTS)
-    assert others.held_out_loss(after.point) < 0.5 * others.held_out_loss(of_half.point)
 
 
 def test_the_gauge_of_an_answer_shows_the_same(solved):
@@ -153,15 +113,6 @@ def test_the_contrast_of_a_light_is_found(solved):
         assert Schedule().least <= one.temperature < 3  # noise is less than the noise model says
 
 
-def test_a_start_has_hyperparameters_for_each_light_which_stay_where_they_are_not_estimated():
-    problem, _ = photographed(4, 2, cells=40, size=8)
-    start = begun(problem, 40)
-    assert start.hyperparameters == [Hyperparameters()] * 2 and start.value == float("inf")
-    kept = msgspec.structs.replace(start, hyperparameters=[Hyperparameters(3.0), Hyperparameters(7.0)])
-    for schedule in (Schedule(lights=1), Schedule(together=(1,), estimate=False)):
-        assert fitted(problem, kept, PRIOR, schedule).hyperparameters == kept.hyperparameters
-
-
 # ── sure normals ─────────────────────────────────────────────────────────────────────────────────────────────────────
 
 
@@ -174,14 +125,6 @@ def test_materials_are_found_from_sure_normals_with_less_noise_in_the_dark():
     assert np.array_equal(kept.normal, one.normal[~unsure]) and np.array_equal(kept.radiance, one.radiance[~unsure])
     noise = Noise(DARK * one.noise.absolute, one.noise.relative)
     assert kept.precision == pytest.approx(noise.precision(kept.radiance, np.ones(len(kept))))
-
-
-def test_what_is_alike_unsure_is_used():
-    """Legs of few pixels are all a material has: sure is what is as sure as the rest of the same material."""
-    one = photographed(9, 1, cells=40, size=10)[0].blocks[0]
-    rated = msgspec.structs.replace(one, confidence=np.where(one.material == 1, 0.1, 0.9))
-    for given in (rated, one):
-        assert len(sure_ones(JointProblem([given], OPERATOR)).blocks[0]) == len(one)
 
 
 # ── lights unlike most: a fit says what the photographs say, not what is usual ───────────────────────────────────────
@@ -200,31 +143,6 @@ def contrast(light: Light) -> float:
 def test_a_constant_light_stays_nearly_constant():
     constant = light_of([[0, 0, 1.0]], 1e-4, [[1.0, 1.0, 1.0]])
     assert contrast(found_in([constant]).point.lights[0]) < 0.3  # natural light has 1.2
-
-
-def test_a_light_of_one_colour():
-    """A channel without light says nothing, and spoils nothing."""
-    rng, lights = np.random.default_rng(1), []
-    for _ in range(2):
-        lights.append(light_of(rng.normal(size=(15, 3)), 12.0, rng.exponential(size=(15, 1)) * [1.0, 0.02, 0.005]))
-    found = found_in(lights).point.materials
-    assert np.abs(found.roughness - MATERIALS.roughness).max() < 0.15
-    whole = [(m.diffuse + m.specular)[:, 0] for m in (found, MATERIALS)]
-    assert np.allclose(whole[0] / whole[0].mean(), whole[1] / whole[1].mean(), rtol=0.15)
-
-
-def test_lamps_at_night_are_found_where_they_are():
-    axes = np.array([[0.6, -0.5, -0.6], [-0.7, -0.3, -0.6], [0.1, 0.6, -0.8]])
-    lamps = light_of(
-        np.vstack([axes, [0, 0, 1.0]]), [60, 60, 60, 1e-4], np.array([8.0, 6.0, 7.0, 0.02])[:, None] * np.ones(3)
-    )
-    light = found_in([lamps]).point.lights[0]
-    radiance = np.exp(light.log_radiance).mean(0)
-    near = np.degrees(np.arccos(np.clip(light.axis @ (axes / np.linalg.norm(axes, axis=1, keepdims=True)).T, -1, 1)))
-    assert radiance[near.min(1) < 25].sum() > 0.6 * radiance.sum()
-    for lamp in near.T:
-        around = lamp < 30
-        assert lamp[around][radiance[around].argmax()] < 19  # cells are 18° apart
 
 
 @pytest.mark.parametrize("shown", [(0,), (2,)])

@@ -108,30 +108,6 @@ def test_darker_materials_in_a_brighter_light_are_as_likely_but_for_the_prior(he
     assert alone > 10 and whole < 0.02 * alone, (alone, whole)
 
 
-@pytest.mark.parametrize("clustered", [False, True])
-def test_given_materials_the_system_of_the_light_is_the_same(here, clustered):
-    clusters = here.illumination.block.clusters() if clustered else None
-    one, other = (marginal(here, clusters, materials_given=given) for given in (False, True))
-    for name in ("loss", "light_gradient", "light_hessian", "cross_hessian"):
-        np.testing.assert_array_equal(getattr(one, name), getattr(other, name))
-    cells = 3 * len(here.illumination.light)
-    determinants = np.linalg.slogdet(one.light_hessian[:cells, :cells])[1] - here.log_determinant
-    assert one.value - other.value == pytest.approx(determinants, rel=1e-6)
-    assert not other.determinant_by_light.any() and (one.scores is None) != clustered
-
-
-def test_scores_of_clusters_add_up_to_the_gradient_of_the_loss(here):
-    part = marginal(here, here.illumination.block.clusters(), materials_given=True)
-    k = len(part.places)
-    np.testing.assert_allclose(
-        part.scores[:, :k].sum(0), part.material_gradient, rtol=1e-3, atol=1e-3 * np.abs(part.material_gradient).max()
-    )
-    light = here.illumination.light
-    prior = np.concatenate([here.precision @ light.log_radiance.reshape(-1), light.log_exposure[1:] / EXPOSURE**2])
-    expected = part.light_gradient - prior
-    np.testing.assert_allclose(part.scores[:, k:].sum(0), expected, rtol=1e-3, atol=1e-3 * np.abs(expected).max())
-
-
 def settled(one, steps=15):
     """The field at the light that lowers φ."""
     for _ in range(steps):

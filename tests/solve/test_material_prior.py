@@ -64,13 +64,6 @@ def test_materials_are_of_the_class_that_they_look_like(material, name):
     assert found == name and probability > 0.8
 
 
-def test_what_is_not_known_is_of_no_class_for_sure():
-    """With wide errors the classes' shares are left."""
-    shares = {one.name: one.share for one in shipped_classes().classes}
-    name, probability = class_of(np.array([0.06] * 3), 0.5, 50.0, 50.0)
-    assert name == "dielectric" and probability == pytest.approx(shares[name], abs=0.1)
-
-
 def test_gloss_ten_times_too_strong_at_roughness_1_is_not_expected():
     """It is possible, for fabrics look so, but evidence has to pay for it; and a smooth surface with a strong highlight is metal or nothing."""
 

@@ -5,7 +5,7 @@ import torch
 
 from factorlib.model.problem import JointProblem
 from factorlib.reflection import reflection_operator
-from factorlib.solve.paper import Paper, PaperObjective, drawn, inverse_hessian_times, solve
+from factorlib.solve.paper import Paper, PaperObjective, drawn, solve
 from studies.scenes.problems import MATERIALS, block, factor_between, random_light
 
 OPERATOR = reflection_operator("network")
@@ -65,21 +65,3 @@ def test_gradient_is_the_finite_difference():
     for move in torch.randn(6, len(start), generator=random, dtype=torch.float64):
         slope = (objective.at(x + 1e-6 * move, subset)[0] - objective.at(x - 1e-6 * move, subset)[0]) / 2e-6
         assert float(gradient @ move) == pytest.approx(float(slope), rel=1e-4)
-
-
-def test_each_observation_is_drawn_as_often_as_asked():
-    rows, random = [np.arange(40), np.arange(10, 70)], np.random.default_rng(0)
-    counts = np.zeros(70)
-    for _ in range(100):
-        parts = drawn(rows, 20, random)
-        assert sum(map(len, parts)) == 20
-        np.add.at(counts, parts[1], 1)
-    assert counts[:10].sum() == 0
-    np.testing.assert_allclose(counts[10:].mean(), 20, rtol=0.1)
-
-
-def test_pairs_of_a_quadratic_give_its_newton_step():
-    hessian = torch.diag(torch.tensor([1.0, 4.0, 9.0], dtype=torch.float64))
-    pairs = [(step, hessian @ step) for step in torch.eye(3, dtype=torch.float64)]
-    gradient = torch.tensor([1.0, 1.0, 1.0], dtype=torch.float64)
-    torch.testing.assert_close(inverse_hessian_times(gradient, pairs), torch.linalg.solve(hessian, gradient))

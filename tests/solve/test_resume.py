@@ -10,7 +10,7 @@ from factorlib.model.problem import JointProblem
 from factorlib.solve import choices
 from factorlib.solve import solve as solving
 from factorlib.solve.fit import Schedule
-from factorlib.solve.history import PHASES, Event, of_parts
+from factorlib.solve.history import PHASES
 from factorlib.solve.options import Choices
 from factorlib.solve.resume import Journal
 from factorlib.solve.solve import Run, solve
@@ -115,18 +115,6 @@ def test_every_part_reports_what_it_does(whole):
     assert [event.round for event in events] == sorted(event.round for event in events)
 
 
-@pytest.mark.parametrize("phase", ["shadows", "lights"])
-def test_a_solve_killed_in_the_midst_of_a_part_goes_on_to_the_same_bits(blocks, whole, tmp_path, phase):
-    path, seen = tmp_path / "solve.pt", []
-
-    def second(event):
-        return event.phase == phase and (seen.append(event) or len(seen) == 2)
-
-    with pytest.raises(Killed):
-        answer(blocks, Journal(Checkpoint(path)), second)
-    assert answer(blocks, Journal(Checkpoint(path)))[0] == whole[0]
-
-
 def test_what_was_done_is_not_done_again_but_a_file_that_cannot_be_read_starts_the_solve_again(blocks, whole, tmp_path):
     """Killed after the last part, nothing of a descent is computed again."""
     path, work = tmp_path / "solve.pt", []
@@ -141,15 +129,3 @@ def test_what_was_done_is_not_done_again_but_a_file_that_cannot_be_read_starts_t
     assert not work
     path.write_bytes(path.read_bytes()[:1000])
     assert answer(blocks, Journal(Checkpoint(path)))[0] == whole[0]
-
-
-def test_progress_never_goes_back_and_is_whole_only_at_the_end():
-    """With three starts each model is fitted three times: the first phases are entered anew."""
-    said = []
-    report = of_parts(lambda done, total, text: said.append(done / total), Choices(splittings=2))
-    for phase in [*(one for one in PHASES[:3] for _ in range(3)), *PHASES[3:], "splitting 1", "splitting 2", "lights"]:
-        for iteration in (0, 10, 40, -1):
-            report(Event(0, phase, iteration, 1.0, float("nan"), 400))
-        if phase == PHASES[-1]:
-            assert 0.5 < said[-1] < 0.7
-    assert said == sorted(said) and 0 < said[1] < 0.1 and 0.99 < said[-1] < 1

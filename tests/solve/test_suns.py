@@ -8,10 +8,10 @@ from factorlib.light.lobes import SUN, lobe_integral
 from factorlib.model.problem import JointProblem
 from factorlib.solve import suns
 from factorlib.solve.evidence import AGAINST, Evidence
-from factorlib.solve.fit import SUNS, Hyperparameters, Schedule, field_of, fitted
+from factorlib.solve.fit import Schedule, fitted
 from factorlib.solve.history import unreported
 from factorlib.solve.resume import Journal, Parts
-from factorlib.solve.solve import brightest, suns_chosen
+from factorlib.solve.solve import suns_chosen
 from factorlib.solve.suns import WIDE, candidate, clearly_better, compared
 from studies.scenes.problems import MATERIALS
 from tests.solve.made import FEW, PRIOR, begun, drawn, on_even_cells, spheres
@@ -72,13 +72,6 @@ def test_the_solve_keeps_suns_of_lights_that_have_one():
     assert not none.evidence[0].kept and none.fit.point.lights[0] is fit.point.lights[0]
 
 
-def test_a_sun_that_hardly_shines_is_not_kept():
-    """Narrow and wide are then the same, and so are the light with it and the light without."""
-    one, _ = solved(photographed(0.0, 1)[0])
-    faint = msgspec.structs.replace(one, light=one.light.with_lobe(TOWARDS, SUN, np.full(3, 1e-3)))
-    assert not clearly_better(one, faint).kept
-
-
 @pytest.mark.parametrize(
     "colour, share, kept", [((3, 2, 1), 0.2, True), ((1, 2, 3), 0.2, False), ((3, 2, 1), 0.02, False)]
 )
@@ -90,17 +83,3 @@ def test_a_sun_is_strong_and_no_bluer_than_its_light(monkeypatch, colour, share,
     weight = total * share * np.array(colour) / sum(colour)
     lit = msgspec.structs.replace(one, light=one.light.with_lobe(TOWARDS, SUN, weight))
     assert clearly_better(one, lit).kept == kept
-
-
-def test_the_prior_on_cells_does_not_know_of_suns():
-    problem, _ = photographed(0.5, 1)
-    one, _ = solved(problem)
-    sky = one.light
-    lit = sky.with_lobe(TOWARDS, SUN, np.ones(3))
-    np.testing.assert_allclose(lit.log_radiance[:, :-1], sky.log_radiance)
-    plain = field_of(one, Hyperparameters(), PRIOR)
-    field = field_of(msgspec.structs.replace(one, light=lit), Hyperparameters(), PRIOR)
-    own = np.tile(lit.suns, 3)
-    np.testing.assert_array_equal(field.precision[np.ix_(~own, ~own)], plain.precision)
-    assert not field.precision[np.ix_(own, ~own)].any() and (np.diag(field.precision)[own] == SUNS**-2.0).all()
-    assert not brightest(lit)[lit.suns].any()

@@ -91,13 +91,6 @@ def test_cells_that_split_stay_as_small_as_they_are():
     np.testing.assert_allclose(found.sharpness, light.sharpness, rtol=1e-12)
 
 
-def test_materials_go_by_their_names():
-    blocks, lights = truth(0)
-    swapped = Materials.of_rows(MATERIALS.rows()[[2, 0, 1]])
-    materials, _ = start_from(written(blocks, swapped, lights, ["blue", "red", "green"]), blocks)
-    check_same_but_for_the_gauge(materials)
-
-
 def test_a_light_nobody_knows_is_constant_and_the_known_ones_stay():
     blocks, lights = truth(0, 1)
     materials, found = start_from(written(blocks[:1], MATERIALS, lights[:1]), blocks)
@@ -120,35 +113,6 @@ def test_a_material_nobody_knows_stands_beside_the_known_ones():
     explained(known, materials, found)
 
 
-def test_a_photo_new_to_a_light_gets_its_exposure_even_where_it_comes_first():
-    blocks, lights = truth(0, photos=3)
-    earlier = written(blocks, MATERIALS, lights)
-    new, *others = blocks[0].photos
-    factor = earlier.exposures[others[0]][0]
-    relative = {photo: tuple(np.array(earlier.exposures[photo]) / factor) for photo in others}
-    lobes = {name: light.scaled(factor) for name, light in earlier.lights.items()}  # as it was without `new`
-    earlier = msgspec.structs.replace(earlier, exposures=relative, lights=lobes)
-    materials, (light,) = start_from(earlier, blocks)
-    np.testing.assert_allclose(light.log_exposure, lights[0].log_exposure, atol=0.02)
-    explained(blocks, materials, [light], atol=0.02)
-
-
-def test_groups_that_a_new_photo_links_come_into_one_gauge():
-    (one, of_one), (other, of_other) = truth(0, shown=(0, 1)), truth(1, shown=(2,))
-    factor = np.array([3.0, 0.5, 1.5])
-    apart = Materials(MATERIALS.diffuse.copy(), MATERIALS.specular.copy(), MATERIALS.roughness)
-    apart.diffuse[2] *= factor
-    apart.specular[2] *= factor
-    own = [of_one[0], msgspec.structs.replace(of_other[0], weight=of_other[0].weight / factor)]
-    earlier = written([*one, *other], apart, own, component=(0, 0, 1))
-    linking, _ = truth(2)
-    materials, found = start_from(earlier, [*one, *other, *linking])
-    explained([*one, *other], materials, found[:2])
-    whole, true = (m.diffuse + m.specular for m in (materials, MATERIALS))
-    off = np.log((whole[2] / whole[:2].mean(0)) / (true[2] / true[:2].mean(0)))
-    assert np.abs(off).max() < 0.5 * np.abs(np.log(factor)).max()  # as far as mean radiances say
-
-
 def test_a_light_that_is_no_longer_so_starts_anew_and_is_named(caplog):
     blocks, lights = truth(0, 1)
     turned = [msgspec.structs.replace(lights[0], axis=-lights[0].axis, weight=lights[0].weight ** 2), lights[1]]
@@ -159,23 +123,6 @@ def test_a_light_that_is_no_longer_so_starts_anew_and_is_named(caplog):
     explained(blocks[1:], materials, found[1:])
 
 
-@pytest.mark.parametrize("known", [(), (0, 1)])
-def test_what_nothing_known_leads_to_starts_as_from_nothing(known):
-    blocks, lights = truth(0, shown=(0, 1))
-    blocks += truth(1, shown=(2,))[0]
-    earlier = written(blocks[:1], first(MATERIALS, 2), lights, NAMES[:2], (0, 0))
-    if not known:
-        earlier = msgspec.structs.replace(earlier, table=MaterialTable({}))
-    materials, found = start_from(earlier, blocks)
-    problem = JointProblem(blocks, OPERATOR)
-    (nothing,) = from_nothing(3)(problem, CELLS)
-    np.testing.assert_array_equal(materials.rows()[2], nothing.materials.rows()[2])
-    np.testing.assert_allclose(found[1].weight, nothing.lights[1].weight)
-    if not known:
-        np.testing.assert_array_equal(materials.vector(), nothing.materials.vector())
-        np.testing.assert_allclose(found[0].weight, nothing.lights[0].weight)
-
-
 def test_tone_curves_are_taken_over_where_all_photos_of_a_light_have_one():
     blocks, lights = truth(0, 1)
     earlier = written(blocks, MATERIALS, lights)
@@ -184,15 +131,6 @@ def test_tone_curves_are_taken_over_where_all_photos_of_a_light_have_one():
     point = known_point(JointProblem(blocks, OPERATOR), earlier, NAMES, CELLS)
     np.testing.assert_allclose(np.exp(point.lights[0].log_tone), [1.1])
     assert len(point.lights[1].log_tone) == 0
-
-
-def test_a_light_at_a_finite_distance_stays_there():
-    blocks, lights = truth(0, 1)
-    earlier = written(blocks, MATERIALS, lights)
-    model = msgspec.structs.replace(earlier.table.model, distance={blocks[1].name: 8.0})
-    earlier = msgspec.structs.replace(earlier, table=msgspec.structs.replace(earlier.table, model=model))
-    _, found = start_from(earlier, blocks)
-    assert [light.curvature for light in found] == [0, 1 / 8]
 
 
 @pytest.mark.parametrize(("kept", "tried"), [(True, True), (False, True), (True, False)])
