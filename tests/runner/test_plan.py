@@ -5,7 +5,7 @@ import pytest
 from hypothesis import given
 
 from factorlib.errors import InputError
-from factorlib.runner.pipeline import Pipeline, Stage, read_pipeline, with_settings
+from factorlib.runner.pipeline import Pipeline, Stage, read_pipeline
 from factorlib.runner.plan import Listing, Spec, Step, difference, key_of, plan
 
 PIPELINE = Pipeline(
@@ -157,9 +157,3 @@ def test_what_is_refused(tmp_path, old, new, words):
     with pytest.raises(InputError) as caught:
         read(tmp_path, GOOD.replace(old, new))
     assert all(word in str(caught.value) for word in words), str(caught.value)
-
-
-def test_settings_reach_into_nested_parameters_and_leave_the_rest():
-    stage = Stage(params={"a": 1, "search": {"x": 1, "y": 2}})
-    pipeline = with_settings(Pipeline(1, {"s": stage}), ["s.search.x=3", "s.b=no s.c=1e2"])
-    assert pipeline.stages["s"].params == {"a": 1, "search": {"x": 3, "y": 2}, "b": "no", "c": 100.0}

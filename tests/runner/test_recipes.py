@@ -131,24 +131,3 @@ def test_a_recipe_that_is_not_there_or_can_have_no_folder_is_refused(project, tm
     with pytest.raises(InputError) as error:
         project.recipes(project.provider.read(project.root / "data" / "set"), [w.format(tmp_path) for w in words])
     assert wrong in str(error.value)
-
-
-def test_looking_at_recipes_shows_what_they_need_alone_and_the_whole_pipeline_where_both_are_asked_for(project, capsys):
-    for show in (verbs.show_plan, verbs.show_why, verbs.show_status):
-        show(project, verbs.Wish("set", recipes=["hello"]))
-        shown = capsys.readouterr().out
-        assert "shout" in shown and "upper" in shown and "total" not in shown and "bye" not in shown
-        show(project, verbs.Wish("set"))
-        shown = capsys.readouterr().out
-        assert "total" in shown and "shout" not in shown
-    assert make(project, "hello", targets=None) == 0
-    assert said(project, "hello") and (project.build / "set" / "total" / "total.txt").is_file()
-    assert not (project.build / "set" / "shout" / "bye").exists()
-    named = [line.strip() for line in capsys.readouterr().out.splitlines() if line.startswith("  ")]
-    assert named == [f"shout: {project.build / 'set' / 'shout' / 'hello'}"]  # the toy has no other results to name
-
-
-def test_of_datasets_without_recipes_a_recipe_is_refused(tmp_path):
-    toy.write(tmp_path / "recipes" / "hello.yaml", '{"word": "hello"}')
-    with pytest.raises(InputError, match="no recipes of such a dataset"):
-        survey(toy.make_project(tmp_path), "set", None, [], recipes=["hello"])

@@ -4,15 +4,12 @@ import json
 import os
 import re
 import shutil
-import signal
-import threading
 import time
 
 import pytest
 
 from factorlib.errors import InputError
 from factorlib.runner import verbs
-from factorlib.runner.child import Pools
 from factorlib.runner.gc import collect
 from tests.faults.battered import make
 from tests.faults.test_nothing_lost import done, start, wait_until
@@ -107,16 +104,6 @@ def test_a_parameter_reruns_its_stage_and_the_old_result_is_still_there_and_forc
     assert new_runs(project, "table.scale=3") == ["table", "total"] and total(project) == "total: 27"
     assert new_runs(project) == [] and total(project) == "total: 18"
     assert new_runs(project, targets=["upper"], force=True) == ["upper/a", "upper/b"]
-
-
-def test_another_directory_gives_the_same_bytes_and_datasets_share_what_is_the_same(project, tmp_path):
-    other = make_project(tmp_path / "other")
-    assert make(other) == 0
-    trees = [{p.name for p in (each.build / "store" / "trees").iterdir()} for each in (project, other)]
-    assert trees[0] == trees[1]
-    shutil.copytree(project.root / "data" / "set", project.root / "data" / "again")
-    assert set(state(project, "again").values()) == {"current"} and verbs.make(project, verbs.Wish("again")) == 0
-    assert (project.build / "again" / "total" / "total.txt").exists()
 
 
 def test_the_verdict_of_a_result_is_shown_and_only_when_asked_for_decides_the_exit_code(project, capsys):
@@ -222,50 +209,6 @@ def test_what_goes_wrong_in_a_stage_fails_its_step_and_the_next_run_resumes(
     assert new_runs(project) == []
 
 
-class Unpicklable(Exception):
-    """An error that pickle takes apart and cannot make again."""
-
-    def __init__(self, one, other):
-        super().__init__(f"{one} and {other}")
-
-
-class Holding(Exception):
-    """An error that pickle cannot take apart."""
-
-
-def fail(how):
-    error = {"made again": Unpicklable("salt", "pepper"), "taken apart": Holding("a lock")}[how]
-    error.lock = threading.Lock() if how == "taken apart" else None
-    raise error
-
-
-@pytest.mark.parametrize(
-    "how, words", [("made again", "Unpicklable: salt and pepper"), ("taken apart", "Holding: a lock")]
-)
-def test_an_error_of_a_child_that_cannot_be_pickled_says_its_type_and_text_and_the_child_lives(how, words):
-    pools = Pools(1)
-    try:
-        with pytest.raises(RuntimeError, match=words):
-            pools.submit(1, 1, fail, how).result(30)
-        (child,) = pools.children
-        assert pools.submit(1, 1, abs, -1).result(30) == 1 and pools.children == [child]
-    finally:
-        pools.close(kill=True)
-
-
-def test_a_name_as_long_as_the_file_system_allows_is_as_good_as_a_short_one(tmp_path, capsys):
-    long = ["k" * 239 + end for end in "ab"]
-    project = make_project(tmp_path, **{long[0]: "Alpha", long[1]: "1/0"})
-    text = edit(project, "stages/count.py", "    (out", "    assert not inputs.photo.endswith('b')\n    (out")
-    assert make(project) == 1
-    assert (project.build / "set" / "upper" / f"{long[0]}.txt").read_text() == "ALPHA"
-    assert state(project)[f"count/{long[0]}"] == "current" and "AssertionError" in capsys.readouterr().err
-    assert len(list((project.build / "set" / "errors").iterdir())) == 1
-    write(project.root / "stages" / "count.py", text)
-    assert make(project) == 0 and not (project.build / "set" / "errors").exists()
-    assert not [p for p in (project.build / "store").rglob("*") if "kkk" in p.name and not p.name.startswith("k")]
-
-
 # ── what is told ─────────────────────────────────────────────────────────────────────────────────────────────────────
 
 
@@ -343,46 +286,11 @@ def test_the_second_of_two_runs_waits_and_takes_the_firsts_result(project, capsy
     assert sorted(done(project)).count("upper/a") == 2  # once in the fixture, once for both
 
 
-def test_a_run_that_is_interrupted_stops_its_workers(project):
-    before = signal.signal(signal.SIGINT, signal.default_int_handler)  # a shell may have handed it down as ignored
-    process = start(project, "upper.sleep=30")
-    signal.signal(signal.SIGINT, before)
-    assert wait_until(lambda: sleeping(project))
-    process.send_signal(signal.SIGINT)
-    said = process.communicate(timeout=20)[0]
-    assert process.returncode == 130 and "stopped" in said and "Traceback" not in said
-    assert not list((project.build / "store" / "tmp").iterdir())
-
-
-@pytest.mark.parametrize("kill", [False, True])
-def test_pools_that_are_closed_have_no_threads_left(kill):
-    before = set(threading.enumerate())
-    pools = Pools()
-    futures = [pools.submit(1, 1, time.sleep, 60 if kill else 0) for _ in range(2)]
-    for future in [] if kill else futures:
-        future.result()
-    pools.close(kill)
-    assert set(threading.enumerate()) == before  # one that closes while Python ends is a traceback after "stopped"
-
-
 def test_threads_are_those_of_the_stage_and_hashes_are_fixed_whatever_the_machine(project):
     names = ("OMP_NUM_THREADS", "PYTHONHASHSEED")
     edit(project, "stages/table.py", WRITES, f"str([__import__('os').environ[name] for name in {names}])")
     edit(project, "pipeline.yaml", "table: {}", "table: {threads: 3}")
     assert make(project, targets=["table"]) == 0 and table(project) == "['3', '0']"
-
-
-@pytest.mark.parametrize("cores, expected", [("all", 2), ("1", 1), ("64", 2)])
-def test_a_step_has_the_cores_it_asks_for_as_far_as_the_machine_goes_and_they_are_in_no_key(
-    project, monkeypatch, cores, expected
-):
-    monkeypatch.setattr("factorlib.runner.child.machine_cores", lambda: 2)
-    thread = "(__import__('time').sleep(0.1), __import__('threading').get_ident())[1]"
-    edit(project, "stages/table.py", WRITES, f"str(len(set(inputs.map(lambda _: {thread}, range(6)))))")
-    edit(project, "pipeline.yaml", "table: {}", f"table: {{cores: {cores}}}")
-    assert make(project, targets=["table"]) == 0 and table(project) == str(expected)
-    write(project.root / "pipeline.yaml", toy.PIPELINE)
-    assert new_runs(project, targets=["table"]) == []
 
 
 def test_what_a_killed_step_left_to_go_on_from_outlives_it_and_goes_with_success(project):
@@ -424,13 +332,3 @@ def test_a_given_folder_is_read_and_counts_by_content_not_by_place(giving, tmp_p
     assert str(tmp_path) not in "".join(path.read_text() for path in (giving.build / "store" / "keys").iterdir())
     edit(giving, "stages/table.py", "    (out", "    (inputs['start'] / 'seed.txt').write_text('9')\n    (out")
     assert make(giving, one) == 1, "what changes while it is read is no result"
-
-
-@pytest.mark.parametrize(
-    "folder, words", [("nowhere", "no such folder"), (".", "no readable 'seed.txt'"), ("3", "no such folder")]
-)
-def test_a_given_folder_that_is_not_there_is_refused_before_anything_runs(giving, tmp_path, folder, words):
-    with pytest.raises(InputError) as caught:
-        make(giving, f"table.start={folder if folder == '3' else tmp_path / folder}")
-    said = str(caught.value)
-    assert words in said and "table.start" in said and "name a folder with seed.txt" in said

@@ -14,11 +14,9 @@ import pytest
 from factorlib.errors import InputError
 from factorlib.runner import verbs
 from factorlib.runner.filehash import hash_of_file
-from factorlib.runner.gc import collect, forget_all
 from factorlib.runner.project import LIBRARY
 from factorlib.runner.shared import MADE_FROM
-from factorlib.runner.store import Store, output_of
-from factorlib.runner.survey import survey
+from factorlib.runner.store import output_of
 from tests.faults.battered import make
 from tests.runner import toy
 from tests.runner.toy import files_of, make_project, state, write
@@ -74,24 +72,6 @@ def test_what_one_checkout_makes_the_other_copies_with_its_log(tmp_path, one, ca
     assert len((other.build / "set" / "log.jsonl").read_text().splitlines()) == 6, "what it cost is known here too"
 
 
-def test_both_give_and_take_warnings_too(tmp_path, shared, capsys):
-    first, other = checkout(tmp_path / "first", a="odd", b="Beta"), checkout(tmp_path / "other", a="odd", c="Gamma")
-    assert make(first) == 0 and "a is odd" in capsys.readouterr().err
-    assert make(other) == 0 and computed(other) == 3  # upper/c, count/c, total
-    assert "a is odd" in capsys.readouterr().err
-    verbs.show_status(other, verbs.Wish("set"))
-    assert "a is odd" in capsys.readouterr().out
-    write(first.root / "data" / "set" / "c.txt", "Gamma")
-    assert make(first) == 0 and computed(first) == 6 + 1  # total alone
-
-
-def test_nothing_is_copied_where_it_is_forced_or_no_store_is_named(tmp_path, one, monkeypatch):
-    forced, other = checkout(tmp_path / "forced"), checkout(tmp_path / "other")
-    assert make(forced, force=True) == 0 and computed(forced) == 6
-    monkeypatch.delenv("FACTORLIB_STORE")
-    assert make(other) == 0 and computed(other) == 6
-
-
 @pytest.mark.parametrize("damage", ["other content", "missing", "a link", "no tree"])
 def test_a_damaged_result_is_made_here_and_mended_there(tmp_path, one, shared, capsys, damage):
     sound, other = trees(shared), checkout(tmp_path / "other")
@@ -120,27 +100,6 @@ def test_a_forged_result_writes_nothing_outside(tmp_path, one, shared):
     assert not list(tmp_path.rglob("*escaped*")) and not os.path.exists("/tmp/escaped")
 
 
-def test_a_record_of_another_key_is_not_taken(tmp_path, one, shared):
-    assert make(one, "table.scale=3") == 0
-    other = checkout(tmp_path / "other")
-    key = next(p.key for p in survey(other, "set", None, []).planned() if p.step.stage == "table")
-    records = {path: json.loads(path.read_text())["record"] for path in (shared / "keys").iterdir()}
-    forged = next(path for path, record in records.items() if record.get("param:scale") == 3)
-    shutil.copyfile(forged, shared / "keys" / f"{key}.json")
-    assert make(other) == 0 and (other.build / "set" / "table" / "table.json").read_text() == "2"
-
-
-def test_one_that_vanishes_costs_nothing(tmp_path, shared, capsys, monkeypatch):
-    monkeypatch.setattr("factorlib.runner.child.machine_cores", lambda: 1)  # no step offers its result at that moment
-    project = checkout(tmp_path / "one")
-    path = project.root / "stages" / "table.py"
-    vanishes = "    import shutil, os; shutil.rmtree(os.environ['FACTORLIB_STORE'])\n    (out"
-    write(path, path.read_text().replace("    (out", vanishes, 1))
-    assert make(project) == 0
-    assert not shared.exists() and "the shared store took nothing (it is gone)" in capsys.readouterr().err
-    assert (project.build / "set" / "total" / "total.txt").read_text() == "total: 18"
-
-
 def test_one_that_is_not_there_is_said_before_anything_runs(tmp_path, monkeypatch):
     monkeypatch.setenv("FACTORLIB_STORE", str(tmp_path / "shared"))
     project = checkout(tmp_path / "one")
@@ -166,18 +125,6 @@ def test_one_that_may_only_be_read_is_read(tmp_path, one, shared):
         folder.chmod(0o755)
     assert done.returncode == 0 and "warning" not in done.stderr, done.stderr
     assert computed(other) == 3 and files_of(shared) == before  # upper/c, count/c, total
-
-
-def test_gc_and_clean_leave_it_alone_and_a_store_of_ones_own_is_no_other(tmp_path, one, shared, monkeypatch):
-    assert make(one, "table.scale=3") == 0
-    before = files_of(shared)
-    collect(one)
-    forget_all(one)
-    assert files_of(shared) == before
-    assert make(one) == 0 and computed(one) == 6 + 2
-    monkeypatch.setenv("FACTORLIB_STORE", str(one.build / "store"))
-    assert make(one, "table.scale=4") == 0 and verbs.verify(one, None) == 0
-    assert len(list(Store(one.build / "store").logs.iterdir())) == 8
 
 
 # ── shipped with the source ──────────────────────────────────────────────────────────────────────────────────────────
