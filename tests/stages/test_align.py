@@ -11,7 +11,7 @@ import pytest
 from factorlib.align.given import check_before_camera, warn_of_camera
 from factorlib.align.search import Search
 from factorlib.errors import InputError
-from factorlib.geometry.camera import Pose, rotation_of_vector
+from factorlib.geometry.camera import Pose
 from factorlib.geometry.raster import rasterise
 from factorlib.images.exr import read_exr
 from factorlib.jsonfile import read_json, write_json
@@ -64,12 +64,6 @@ def test_given_pose_and_focal_length_are_used_as_they_are(tmp_path):
     assert set(maps) >= {"depth", "label", "object", "confidence"} and (out / "a_overlay.png").stat().st_size > 0
 
 
-def test_focal_length_of_a_given_pose_is_found(tmp_path):
-    inputs, _, camera, _ = step(tmp_path, chair(), chair(), pose_given=True)
-    entry = run(tmp_path, inputs)[1]["camera"]
-    assert entry["focal_px"] == pytest.approx(camera.focal, rel=0.01) and entry["focal_source"] == "estimated"
-
-
 def test_a_pose_is_found_from_nothing_and_the_same_bytes_twice(tmp_path):
     inputs, _, _, _ = step(tmp_path, chair(), chair())
     (first, entry), (second, _) = (run(tmp_path, inputs, name) for name in ("first", "second"))
@@ -100,12 +94,6 @@ def test_a_wrong_mesh_is_doubted_and_left_out_and_stops_a_strict_run(tmp_path, c
         run(tmp_path, inputs, "strict", strict=True)
 
 
-def test_a_given_pose_is_doubted_but_never_left_out(tmp_path):
-    out, entry = run(tmp_path, step(tmp_path, chair(), blob(), **KNOWN)[0])
-    obj = entry["objects"]["chair"]
-    assert obj["doubts"] and not obj["left_out"] and read_exr(out / "a.exr")["confidence"].any()
-
-
 def test_object_without_a_pixel_is_refused(tmp_path):
     inputs, _, _, _ = step(tmp_path, chair(), chair(), edit=lambda label: label * 0)
     with pytest.raises(InputError, match="no pixel of the mask shows object 'chair'"):
@@ -130,20 +118,6 @@ def test_a_pose_behind_the_camera_is_refused_without_raw_warnings(tmp_path, z, k
     with pytest.raises(InputError) as caught:
         check_before_camera(blob(), Pose(np.eye(3), np.array([0, 0, -9.0])), "hall", "vase", "colmap")
     assert caught.value.key == "cameras.colmap: hall: vase"
-
-
-def test_a_pose_around_the_camera_and_a_material_that_no_object_has_are_warned_of(tmp_path, caplog):
-    inputs = moved(tmp_path, (0.0, 0.0, 0.5))
-    inputs.facts["dataset.materials"].append("wood")
-    label = read_exr(inputs["masks"] / "a.exr")["label"].copy()
-    label[:20, :30] = 2
-    write_masks(inputs["masks"], "a", label, 300.0, "dataset")
-    with warnings.catch_warnings():
-        warnings.simplefilter("error")
-        run(tmp_path, inputs)
-    assert "vertices behind the camera" in caplog.text and "a: chair: its pose (dataset)" in caplog.text
-    assert "material 'wood' has 600 pixels in the mask, but no object of the photo has it" in caplog.text
-    assert "material 'white'" not in caplog.text
 
 
 @pytest.mark.parametrize("focal, centre, words", [
@@ -182,20 +156,6 @@ def test_an_earlier_pose_and_focal_length_are_used_as_they_are_unless_the_datase
     other = earlier(tmp_path / "given", inputs, Pose(np.eye(3), pose.translation), camera)
     obj = run(tmp_path / "given", other)[1]["objects"]["chair"]
     assert obj["source"] == "given" and np.allclose(obj["rotation"], pose.rotation)
-
-
-def test_an_earlier_pose_is_judged_like_any_other(tmp_path):
-    """A rival that nobody ruled out is still a doubt, and so is a pose that misses the mask."""
-    inputs, _, camera, pose = step(tmp_path, chair(), chair())
-    turned = Pose(rotation_of_vector(np.array([0.0, 2.0, 0.0])) @ pose.rotation, pose.translation)
-    rival = entry_of(turned, score=1.0, normal_difference_deg=60.0)
-    obj = run(tmp_path, earlier(tmp_path, inputs, pose, camera, rival), "rival")[1]["objects"]["chair"]
-    assert obj["left_out"] and "another pose" in obj["doubts"][0]
-    assert np.allclose(obj["runner_up"]["rotation"], turned.rotation, atol=1e-9)
-    wrong = tmp_path / "wrong"
-    wrong.mkdir()
-    obj = run(wrong, earlier(wrong, inputs, turned, camera))[1]["objects"]["chair"]
-    assert obj["left_out"] and obj["silhouette_iou"] < 0.9
 
 
 def in_a_file_twice_as_large(inputs, **camera):

@@ -1,20 +1,17 @@
 """The fit_mesh stage from masks and poses to factors, and what align, urm and export make of them."""
 
-import json
-
 import msgspec
 import numpy as np
 import pytest
 
 from factorlib.dataset.schema import ObjectsSlice
 from factorlib.geometry.raster import rasterise
-from factorlib.images.exr import read_exr
 from factorlib.jsonfile import read_json, write_json
 from factorlib.meshes import write_ply
 from factorlib.meshes.mesh import scaled
 from factorlib.results.poses import PhotoPoses
 from factorlib.stage import Inputs, silent
-from stages import align, export, fit_mesh, urm
+from stages import export, fit_mesh, urm
 from tests.align.scenes import chair, photo_of
 from tests.stages.made import chair_facts, entry_of, write_masks
 
@@ -69,23 +66,6 @@ def test_the_factors_undo_what_the_mesh_has_wrong(fitted):
     for photo in PHOTOS:
         obj = poses[photo]["objects"]["chair"]
         assert obj["scale"] == mesh["factors"] and obj["silhouette_iou"] > 0.97
-
-
-def test_align_uses_the_fitted_mesh(fitted):
-    folder, inputs, truth, mesh, _ = fitted
-    caster, camera, pose = truth["a"]
-    true, share = rasterise(caster, camera, pose), {}
-    for name, poses in (("with", "fit_mesh"), ("without", "align")):
-        out = folder / name
-        out.mkdir()
-        align.main(align.Params(), of_photo(inputs, "a", poses=folder / poses), out, silent)
-        maps = read_exr(out / "a.exr")
-        both = (maps["label"] > 0) & (true.label > 0)
-        cosine = np.sum(np.stack([maps[f"normal.{c}"] for c in "xyz"], -1)[both] * true.normal[both], axis=1)
-        share[name] = np.mean(cosine > np.cos(0.03))
-    entry = json.loads((folder / "with" / "a.json").read_text())["objects"]["chair"]
-    assert entry["scale"] == mesh["factors"] and entry["silhouette_iou"] > 0.97 and entry["doubts"] == []
-    assert share["with"] > share["without"]
 
 
 def test_urm_and_export_place_the_fitted_mesh_alike(fitted, tmp_path):

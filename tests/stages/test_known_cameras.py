@@ -1,4 +1,4 @@
-"""A scene whose cameras stand in a COLMAP model, a transforms.json or a BOP scene, through `masks` and `align`."""
+"""A scene whose cameras stand in a COLMAP model, through `masks` and `align`; `tests/dataset/test_sources.py` reads the other sources."""
 
 import json
 import logging
@@ -29,8 +29,8 @@ WORLD = {
 CASTER = Caster(chair())
 
 
-def scene(folder, source, *, scale=1, photo=None, mesh=None, posed=True):
-    """A dataset of a photo of a chair, `scale` times as large as the source's, which has poses or cameras alone."""
+def scene(folder, *, scale=1, photo=None, mesh=None, posed=True):
+    """A dataset of a photo of a chair, `scale` times as large as the model's, which has poses or cameras alone."""
     for name in ("photos", "masks"):
         (folder / name).mkdir(parents=True)
     camera = Camera(200 * scale, 150 * scale, 300.0 * scale, (104.0 * scale, 71.0 * scale))
@@ -38,8 +38,8 @@ def scene(folder, source, *, scale=1, photo=None, mesh=None, posed=True):
     write_ply(folder / "chair.ply", mesh or chair())
     entry = {"name": "hall", "image": "photos/000003.png", "masks": "masks/000003.png"} | (photo or {})
     entry["objects"] = [{"name": "chair", "mesh": "chair"}]
-    meshes, cameras = {"chair": {"file": "chair.ply", "material": "white"}}, SOURCES[source](folder)
-    cameras = cameras if posed else {source: cameras[source]}
+    meshes, cameras = {"chair": {"file": "chair.ply", "material": "white"}}, colmap(folder)
+    cameras = cameras if posed else {"colmap": "sparse"}
     spec = {"format": 1, "materials": ["white"], "meshes": meshes, "photos": [entry], "cameras": cameras}
     (folder / "dataset.yaml").write_text(yaml.safe_dump(spec))
     return folder
@@ -70,29 +70,6 @@ def colmap(folder):
     return {"colmap": "sparse", "world_from_object": {"chair": WORLD}}
 
 
-def transforms(folder):
-    rotation, translation = cam_from_world()
-    world_from_camera = np.eye(4)
-    world_from_camera[:3, :3], world_from_camera[:3, 3] = rotation.T @ np.diag([1, -1, -1]), -rotation.T @ translation
-    frame = {"file_path": "./images/000003.png", "transform_matrix": world_from_camera.tolist()}
-    (cx, cy), f = CAMERA.centre, CAMERA.focal
-    lens = {"fl_x": f, "fl_y": f, "cx": cx, "cy": cy, "w": 200, "h": 150}
-    (folder / "transforms.json").write_text(json.dumps({**lens, "frames": [frame]}))
-    return {"transforms": "transforms.json", "world_from_object": {"chair": WORLD}}
-
-
-def bop(folder):
-    (folder / "scene").mkdir()
-    matrix = [CAMERA.focal, 0, CAMERA.centre[0] - 0.5, 0, CAMERA.focal, CAMERA.centre[1] - 0.5, 0, 0, 1]
-    obj = {"obj_id": 4, "cam_R_m2c": POSE.rotation.ravel().tolist(), "cam_t_m2c": (1000 * POSE.translation).tolist()}
-    (folder / "scene/scene_camera.json").write_text(json.dumps({"3": {"cam_K": matrix}}))
-    (folder / "scene/scene_gt.json").write_text(json.dumps({"3": [obj]}))
-    return {"bop": "scene", "obj_ids": {"chair": 4}, "mesh_unit_mm": 1000}
-
-
-SOURCES = {"colmap": colmap, "transforms": transforms, "bop": bop}
-
-
 def aligned(folder, averaged=masks.Params(), name="usual"):
     dataset = read_dataset(folder)
     parts = {name: dataset_slice(dataset, name, "hall") for name in ("materials", "photo", "objects")}
@@ -106,26 +83,24 @@ def aligned(folder, averaged=masks.Params(), name="usual"):
     return json.loads((folders["align"] / "hall.json").read_text())
 
 
-@pytest.mark.parametrize("source", SOURCES)
-def test_the_poses_of_the_scene_come_out_of_a_photo_of_any_size(tmp_path, source):
+def test_the_poses_of_the_scene_come_out_of_a_photo_of_any_size(tmp_path):
     """Of the source's size, averaged down, and twice as large."""
-    entry = aligned(scene(tmp_path / "same" / "set", source))
+    entry = aligned(scene(tmp_path / "same" / "set"))
     camera, obj = entry["camera"], entry["objects"]["chair"]
-    assert (camera["focal_source"], obj["source"]) == (source, source) and obj["doubts"] == []
+    assert (camera["focal_source"], obj["source"]) == ("colmap", "colmap") and obj["doubts"] == []
     assert camera["focal_px"] == 300.0 and np.allclose(camera["principal_point"], CAMERA.centre, atol=1e-12)
     assert np.allclose(obj["rotation"], POSE.rotation, atol=1e-12) and obj["silhouette_iou"] > 0.995
     assert np.allclose(obj["translation"], POSE.translation, atol=1e-12)
     entry = aligned(tmp_path / "same" / "set", averaged=masks.Params(frame=200 * 150 // 4), name="half")
     assert entry["camera"]["focal_px"] == 150.0 and entry["objects"]["chair"]["silhouette_iou"] > 0.98
     assert np.allclose(entry["camera"]["principal_point"], [52.0, 35.5], atol=1e-12)
-    if source != "bop":  # which says nothing of sizes
-        entry = aligned(scene(tmp_path / "large" / "set", source, scale=2))
-        assert entry["camera"]["focal_px"] == 600.0 and entry["camera"]["principal_point"] == [208.0, 142.0]
-        assert entry["objects"]["chair"]["silhouette_iou"] > 0.995
+    entry = aligned(scene(tmp_path / "large" / "set", scale=2))
+    assert entry["camera"]["focal_px"] == 600.0 and entry["camera"]["principal_point"] == [208.0, 142.0]
+    assert entry["objects"]["chair"]["silhouette_iou"] > 0.995
 
 
 def test_where_only_the_camera_is_known_the_pose_is_searched(tmp_path):
-    entry = aligned(scene(tmp_path / "set", "colmap", posed=False))
+    entry = aligned(scene(tmp_path / "set", posed=False))
     camera, obj = entry["camera"], entry["objects"]["chair"]
     assert (camera["focal_source"], obj["source"], camera["focal_px"]) == ("colmap", "found", 300.0)
     assert camera["principal_point"] == list(CAMERA.centre)
@@ -134,19 +109,19 @@ def test_where_only_the_camera_is_known_the_pose_is_searched(tmp_path):
 
 
 def test_what_dataset_yaml_says_of_the_camera_wins(tmp_path):
-    camera = aligned(scene(tmp_path / "set", "colmap", photo={"camera": {"focal_px": 310.0}}))["camera"]
+    camera = aligned(scene(tmp_path / "set", photo={"camera": {"focal_px": 310.0}}))["camera"]
     assert (camera["focal_px"], camera["focal_source"]) == (310.0, "dataset")
     assert camera["principal_point"] == list(CAMERA.centre)
 
 
 def test_a_known_pose_that_does_not_fit_is_doubted_with_its_own_cure_and_kept(tmp_path, caplog):
     with caplog.at_level(logging.WARNING, "factorlib.align"):
-        obj = aligned(scene(tmp_path / "set", "transforms", mesh=blob()))["objects"]["chair"]
+        obj = aligned(scene(tmp_path / "set", mesh=blob()))["objects"]["chair"]
     assert obj["doubts"] and not obj["left_out"] and "world_from_object" in caplog.text
 
 
 def test_a_photo_that_was_cropped_is_refused(tmp_path):
-    folder = scene(tmp_path / "set", "colmap")
+    folder = scene(tmp_path / "set")
     write_pixels(folder, np.ones((120, 200), int))
     with pytest.raises(InputError, match="the photo has 200×120 pixels, its image in the source 200×150") as caught:
         aligned(folder)

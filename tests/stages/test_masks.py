@@ -149,20 +149,6 @@ def test_a_photo_of_many_pixels_is_averaged_down_and_says_so(folder):
     assert summary["pixels"] == {"red": int((label == 1).sum()), "wood": int((label == 2).sum())}
 
 
-FACTORS = [
-    ({"pixels": 152}, 1),
-    ({"pixels": 151}, 2),
-    ({"frame": H * W}, 1),
-    ({"frame": 100}, 2),
-    ({"frame": 100, "pixels": 100}, 2),
-]
-
-
-def test_the_factor_is_the_least_that_fits_both_bounds(folder):
-    for params, factor in FACTORS:
-        assert run(folder, params=masks.Params(**params))[1]["factor"] == factor
-
-
 def test_averaging_says_where_a_part_is_clipped_or_not_finite(folder):
     radiance = RADIANCE.copy()
     radiance[2, 3], radiance[4:6, 4:6] = np.nan, np.inf

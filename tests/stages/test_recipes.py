@@ -3,7 +3,6 @@
 import msgspec
 import numpy as np
 import pytest
-from PIL import Image
 
 from factorlib.errors import InputError
 from factorlib.images.exr import read_exr, write_rgb_exr
@@ -95,14 +94,6 @@ def test_the_light_of_a_file_is_used_as_it_lies(made, tmp_path):
     columns = np.nonzero(picture["A"].max(axis=0))[0]
     left, right = np.array_split(columns, 2)
     assert picture["R"][:, right].sum() > 3 * picture["R"][:, left].sum()
-
-
-def test_frames_of_an_animation_turn_once(made, tmp_path):
-    drawn(made, tmp_path / "out", schema.Turntable(photos=["side"], samples=4, frames=4, seconds=2.0))
-    with Image.open(tmp_path / "out" / "side.gif") as film:
-        assert film.n_frames == 4 and film.info["duration"] == 500
-    frames = [read_png(tmp_path / "out" / "side" / f"{k:03}.png").astype(float) for k in range(4)]
-    assert min(np.abs(frames[0] - other).mean() for other in frames[1:]) > 1
 
 
 def test_a_photo_without_objects_is_refused_or_left_out_with_a_warning_where_nobody_named_it(made, tmp_path, caplog):

@@ -6,13 +6,10 @@ import msgspec
 import numpy as np
 import pytest
 
-from factorlib.errors import InputError
-from factorlib.images.tone import shown
-from factorlib.jsonfile import read_json, write_json
+from factorlib.jsonfile import write_json
 from factorlib.meshes import write_ply
 from factorlib.reflection import reflection_operator
 from factorlib.reflection.network import SHIPPED
-from factorlib.results.poses import read_poses
 from factorlib.stage import Inputs, silent
 from stages import align, refine
 from studies.scenes.posed import TRUE, photographed
@@ -76,17 +73,6 @@ def test_a_wrong_pose_is_mended_and_comes_back_into_align(tmp_path, turned, refi
     assert aligned["source"] == "refined" and not aligned["left_out"]
 
 
-def test_a_photo_with_a_tone_curve_is_straightened_first(tmp_path, turned, refined):
-    tone = {"exponent": 1.6, "pivot": 0.4}
-    channels = {name: shown(of, **tone) if name in "RGB" else of for name, of in turned.channels.items()}
-    inputs = inputs_of(tmp_path, msgspec.structs.replace(turned, channels=channels))
-    table = inputs["solve"] / "materials.json"
-    write_json(table, read_json(table) | {"model": {"tone": {"a": tone}}})
-    entries = run(refine, inputs, tmp_path / "again"), refined[2]
-    loss, expected = (e["objects"]["chair"]["refined"]["candidates"]["found"]["held_out_loss"] for e in entries)
-    assert loss == pytest.approx(expected, rel=1e-2)
-
-
 def test_what_shading_cannot_tell_stays_to_the_last_digit(tmp_path, turned, caplog):
     """A given pose, and materials that no photo showed."""
     for name, more in (("given", {"source": "given"}), ("unknown", {"stderr": 0.8})):
@@ -94,21 +80,3 @@ def test_what_shading_cannot_tell_stays_to_the_last_digit(tmp_path, turned, capl
         assert obj["refined"] is None
         assert {name: obj[name] for name in ("rotation", "translation")} == entry_of(turned.pose)
     assert "too few pixels of known materials" in caplog.text
-
-
-CAMERA = '{"focal_px": 1, "principal_point": [0, 0]}'
-MIRRORED = '{"rotation": [[1,0,0],[0,1,0],[0,0,-1]], "translation": [0,0,1]}'
-
-
-@pytest.mark.parametrize("text, words", [
-    ("[]", "Expected `object`"),
-    ('{"a": {"camera": {"focal_px": -1, "principal_point": [0, 0]}, "objects": {}}}', "focal_px"),
-    (f'{{"a": {{"camera": {CAMERA}, "objects": {{"t": {MIRRORED}}}}}}}', "a.objects.t"),
-    (f'{{"a": {{"camera": {CAMERA}, "objects": {{"t": {{"translation": [0,0,1]}}}}}}}}', "rotation"),
-])  # fmt: skip
-def test_a_folder_without_poses_is_refused(tmp_path, text, words):
-    (tmp_path / "poses.json").write_text(text)
-    with pytest.raises(InputError) as caught:
-        read_poses(tmp_path / "poses.json")
-    for part in (words, "poses.json", "result of `align`, `fit_mesh` or `refine`"):
-        assert part in str(caught.value)

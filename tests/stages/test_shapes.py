@@ -3,13 +3,11 @@
 import json
 import logging
 
-import msgspec
 import numpy as np
 import pytest
 import yaml
 
 from factorlib.dataset.read import read_dataset
-from factorlib.dataset.schema import ObjectsSlice
 from factorlib.dataset.slices import dataset_slice
 from factorlib.errors import InputError
 from factorlib.generate.folder import write_labels, write_photo
@@ -17,10 +15,9 @@ from factorlib.generate.shapes import SHAPES
 from factorlib.geometry.camera import Camera
 from factorlib.geometry.raster import rasterise
 from factorlib.images.exr import read_exr
-from factorlib.meshes.read import read_mesh
 from factorlib.stage import Inputs
-from stages import align, masks, shapes, surface
-from studies.scenes.outlines import CAMERA, looking_from, views_of
+from stages import align, masks, shapes
+from studies.scenes.outlines import looking_from, views_of
 
 AROUND = [looking_from(20 + 15 * (k % 2), 18.0 * k) for k in range(8)]
 
@@ -78,32 +75,6 @@ def test_photos_and_masks_of_a_body_at_rest_give_cameras_a_hull_and_normals(tmp_
         both = (true.label > 0) & (found["label"] > 0)
         normal = np.stack([found[f"normal.{a}"] for a in "xyz"], axis=-1)
         assert np.median(np.rad2deg(np.arccos(np.clip(np.sum(normal * true.normal, axis=-1)[both], -1, 1)))) < 12
-
-
-@pytest.mark.long
-def test_a_ball_and_a_vase_need_no_file_and_get_poses_as_meshes_do(tmp_path):
-    vase, ball, photos = SHAPES["vase"](), SHAPES["sphere"](), {}
-    for name, elevation in (("low", -5), ("high", 35)):
-        for what, mesh, label in (("vase", vase, 1), ("ball", ball, 2)):
-            part = (rasterise(mesh, CAMERA, looking_from(elevation, 40)).label > 0) * label
-            photos[f"{name}_{what}"] = part * 0.3, part, [{"name": what, "mesh": what}], 400.0
-    meshes = {
-        "vase": {"lathe": True, "material": "red", "size": 0.5},
-        "ball": {"primitive": "ball", "material": "blue"},
-    }
-    dataset = write_set(tmp_path / "set", meshes, photos)
-    folders = run(dataset, tmp_path / "out", ["high_vase", "high_ball"])
-    mesh = read_mesh(folders["shapes"] / "meshes/vase.obj", ["red"], "red")
-    assert np.ptp(mesh.vertices, axis=0).max() == pytest.approx(0.5, rel=1e-4) and not mesh.open
-    for name, limit in (("high_vase", 4.0), ("high_ball", 1.5)):
-        true = rasterise(vase if "vase" in name else ball, CAMERA, looking_from(35, 40))
-        found = read_exr(folders["align"] / f"{name}.exr")
-        both = (true.label > 0) & (found["label"] > 0)
-        normal = np.stack([found[f"normal.{a}"] for a in "xyz"], axis=-1)
-        assert np.median(np.rad2deg(np.arccos(np.clip(np.sum(normal * true.normal, axis=-1)[both], -1, 1)))) < limit
-    objects = {name: dataset_slice(dataset, "objects", name).facts for name in photos}
-    inputs = Inputs(folders, {"dataset.objects": objects, "dataset.materials": ["red", "blue"]})
-    assert surface.surfaces_of(inputs, {n: msgspec.convert(o, ObjectsSlice) for n, o in objects.items()}).meshes == {}
 
 
 def test_a_shape_that_does_not_look_like_its_outlines_is_named_and_one_that_cannot_be_made_is_refused(tmp_path, caplog):

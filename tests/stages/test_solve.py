@@ -8,7 +8,6 @@ import pyarrow.parquet as pq
 import pytest
 
 from factorlib.errors import InputError
-from factorlib.geometry.met import BINS, UNMET
 from factorlib.jsonfile import read_json
 from factorlib.model.illumination import Illumination
 from factorlib.model.noise import Noise
@@ -16,7 +15,6 @@ from factorlib.model.observed import blocks_of_observations
 from factorlib.reflection import reflection_operator
 from factorlib.reflection.network import SHIPPED
 from factorlib.results.solution import FILES
-from factorlib.solve.evidence import FOR
 from factorlib.stage import Inputs, silent
 from factorlib.urm.observations import Observations, write_observations
 from stages import solve
@@ -127,25 +125,6 @@ def test_self_shadowing_is_chosen_by_held_out_observations_and_said(tmp_path, li
     for file in ("lobes.parquet", "uncertainty.json"):
         assert (outs["auto"] / file).read_bytes() == (outs["off"] / file).read_bytes(), file
     assert models["on"]["self_shadowing_chosen_by"] == {}
-
-
-def test_interreflection_is_chosen_by_held_out_observations_said_and_kept_by_a_start(tmp_path, linked):
-    def lit(part):
-        hidden = np.random.default_rng(0).random((len(part), 64)) < 0.3
-        met = np.where(hidden, part.material[:, None] * BINS, UNMET).astype(np.uint16)
-        return msgspec.structs.replace(part, visibility=np.where(hidden, 0, 255).astype(np.uint8), met=met)
-
-    photos = {k: lit(v) for k, v in linked.items()}
-    outs = {c: run(tmp_path / c, photos, interreflection=c, self_shadowing="on") for c in ("auto", "on", "off")}
-    models = {c: table(out)["model"] for c, out in outs.items()}
-    assert models["on"]["interreflection"] and not models["off"]["interreflection"]
-    evidence = models["auto"]["interreflection_chosen_by"]
-    assert models["auto"]["interreflection"] == (evidence["margin"] > FOR)
-    assert [("no free factor" in table(outs[c])["gauge"]["rule"]) for c in ("on", "off")] == [True, False]
-    assert models["off"]["interreflection_chosen_by"] == {}
-    again = table(run(tmp_path / "again", photos, start=outs["auto"], self_shadowing="on"))["model"]
-    assert again["interreflection"] == models["auto"]["interreflection"]
-    assert len(again["interreflection_chosen_by"]) < 2  # as it was decided
 
 
 class Killed(Exception):

@@ -11,7 +11,6 @@ from factorlib.dataset.schema import MeshEntry
 from factorlib.errors import InputError
 from factorlib.export.gltf import write_glb
 from factorlib.images.exr import write_exr
-from factorlib.jsonfile import write_json
 from factorlib.meshes.fine import fine
 from factorlib.meshes.mesh import Mesh
 from factorlib.meshes.ply import write_ply
@@ -111,9 +110,3 @@ def test_meshes_are_moved_and_painted_wherever_they_are_read(tmp_path):
     other = MeshesOnce(lambda _, file: tmp_path / file, ["red"], CREASE_DEG, {"ball": [0.0] * 7})
     with pytest.raises(InputError, match="surface"):
         other.mesh("ball", MeshEntry("ball.ply", material="red"))
-
-
-def test_a_table_that_is_none_is_refused_with_its_name(tmp_path):
-    write_json(tmp_path / "surface.json", {"moved": "perhaps"})
-    with pytest.raises(InputError, match=r"surface\.json"):
-        read_surface(tmp_path)
