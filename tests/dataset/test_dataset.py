@@ -84,13 +84,6 @@ def changed(key, value):
     return spec
 
 
-def test_folder_and_file_are_the_same_dataset(folder):
-    write(folder)
-    dataset = read_dataset(folder)
-    assert dataset == read_dataset(folder / "dataset.yaml") == read_dataset(str(folder) + "/")
-    assert dataset.name == "set" and [photo.name for photo in dataset.spec.photos] == ["kitchen", "garden", "hall"]
-
-
 def test_reading_costs_no_numpy(folder):
     write(folder)
     code = (

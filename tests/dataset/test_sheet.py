@@ -6,7 +6,7 @@ from factorlib.images.picture import read_png
 from factorlib.meshes.mesh import Mesh
 from factorlib.runner import verbs
 from factorlib.runner.project import LIBRARY, Project, photo_sets
-from factorlib.sheet import HEAD, MARGIN, MESH_SIDE, drawn, legend, write_sheet
+from factorlib.sheet import HEAD, MARGIN, MESH_SIDE, drawn, write_sheet
 from tests.faults import good
 
 
@@ -20,16 +20,6 @@ def test_a_mesh_is_drawn_upright_in_the_colours_of_its_labels():
     above, below = picture[middle - 20, middle], picture[middle + 20, middle]
     assert above[0] > 150 > above[2] and below[2] > 150 > below[0]
     assert (picture[0, 0] == 255).all()
-
-
-def test_a_legend_of_254_long_names_is_no_wider_than_its_sheet():
-    """Each name beside its colour, in lines: in one, every row of the sheet would be as long, which took 3 GB."""
-    colours = np.random.default_rng(0).integers(0, 255, (255, 3), dtype=np.uint8)
-    lines = legend([f"m{k:03}" * 20 for k in range(254)], colours, 1000)
-    assert lines.shape[1] <= 1000 and lines.shape[0] < 300 * HEAD
-    beside = lines[:, MARGIN + 2]
-    assert all((beside == colour).all(axis=-1).any() for colour in colours[1:])
-    assert legend(["a" * 100], colours, 10).shape[1] > 500
 
 
 def test_validate_writes_a_row_for_each_photo_with_its_labels_and_meshes_always_the_same(tmp_path, capsys):

@@ -3,7 +3,6 @@
 import json
 import logging
 import math
-import time
 
 import numpy as np
 import pycolmap
@@ -13,10 +12,8 @@ from scipy.spatial.transform import Rotation
 
 from factorlib.align.given import focal_and_centre
 from factorlib.dataset.read import read_dataset
-from factorlib.dataset.schema import CameraSource, DatasetFile, ExternalCamera, PhotoEntry
+from factorlib.dataset.schema import ExternalCamera
 from factorlib.dataset.slices import dataset_slice
-from factorlib.dataset.sources.external import matched
-from factorlib.dataset.sources.shot import Shot
 from factorlib.errors import InputError
 from factorlib.geometry.camera import Camera, Pose
 
@@ -148,20 +145,6 @@ def test_a_photo_that_is_not_in_the_model_or_has_no_pose_there_is_warned_of_and_
         caplog.clear()
 
 
-def test_what_dataset_yaml_gives_for_a_photo_wins(folder):
-    colmap(folder, model="SIMPLE_RADIAL", params=(300.0, 104.0, 71.0, -0.3))
-    given = {"rotation": TURN.tolist(), "translation": [0, 0, 3]}
-    own = {"camera": {"focal_px": 99.0, "principal_point": [100, 75]}, "objects": [CHAIR | {"pose": given}]}
-    external = read(folder, PLACED, names=("hall",), photo=own).external["hall"]  # its lens is not even looked at
-    assert external.poses == {} and external.focal_px == 99.0
-    colmap(folder)
-    corners = ([0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1])
-    keypoints = [{"pixel": [10.0 * k, 5.0 * k * k], "point": point} for k, point in enumerate(corners)]
-    objects, cameras = (CHAIR | {"keypoints": keypoints}, CHAIR | {"name": "other"}), {"chair": {}, "other": {}}
-    external = read(folder, {"colmap": "sparse/0", "world_from_object": cameras}, objects).external
-    assert set(external["hall"].poses) == {"other"}
-
-
 def test_a_camera_that_is_no_pinhole_of_one_focal_length_is_refused_unless_it_is_so_within_half_a_pixel(folder):
     for model, params, fault, cure in (
         ("SIMPLE_RADIAL", (300.0, 100.0, 75.0, -0.1), "distorts", "image_undistorter"),
@@ -257,15 +240,6 @@ def test_bop_millimetres_become_the_meshs_units_and_whole_pixels_half_ones(folde
     assert np.allclose(place, [[104 + 300 * x / z, 71 + 300 * y / z]])
 
 
-def test_a_scene_without_poses_or_without_this_one_is_searched_and_ids_can_be_said(folder, caplog):
-    bop(folder, poses={"7": [GT | {"obj_id": 1}]})
-    with caplog.at_level(logging.WARNING):
-        external = read(folder, OF_BOP, names=("000007",)).external["seven"]
-    assert external.poses == {} and external.focal_px == 300.0 and "no obj_id 5 in image 7" in caplog.text
-    (folder / "scene/scene_gt.json").unlink()
-    assert read(folder, OF_BOP | {"images": {"hall": 7}}).external["hall"].poses == {}
-
-
 @pytest.mark.parametrize("cameras, poses, key, words", [
     ({"7": {"cam_K": [300.0, 5.0, 103.5, 0, 300.0, 70.5, 0, 0, 1.0]}}, None, "7.cam_K", "square axes"),
     ({"7": {"cam_K": [300.0, 0, 103.5, 0, 320.0, 70.5, 0, 0, 1.0]}}, None, "scene_camera.json: 7", "not square"),
@@ -301,15 +275,6 @@ def test_a_wrong_key_is_refused_with_a_cure(folder, cameras, key, words):
     assert "dataset.yaml" in str(refusal(folder, cameras, f"cameras{key}", words).file)
 
 
-def test_objects_of_one_photo_share_a_scale(folder):
-    colmap(folder)
-    cameras, objects = (
-        PLACED | {"world_from_object": {"chair": {}, "other": {"scale": 2}}},
-        [CHAIR, CHAIR | {"name": "other"}],
-    )
-    refusal(folder, cameras, "cameras.world_from_object", "different scales", objects=objects)
-
-
 EXTERNAL = ExternalCamera("colmap", 300.0, (104.0, 71.0), (200, 150), {})
 
 
@@ -327,12 +292,3 @@ def test_the_same_picture_at_another_size_shows_a_point_at_the_same_place_and_an
         with pytest.raises(InputError, match=words) as caught:
             focal_and_centre(external, width, height, "hall")
         assert caught.value.key == f"cameras.{external.source}: hall" and caught.value.cure
-
-
-def test_thousands_of_photos_find_their_images_in_a_moment():
-    photos = [PhotoEntry(name=f"p{i}", image=f"photos/p{i}.png", masks="m.png") for i in range(5000)]
-    shots = [Shot(image=f"images/p{i}.jpg", camera=None, size=None, key="") for i in range(5000)]
-    began = time.process_time()
-    matches = matched(DatasetFile(1, [], photos, cameras=CameraSource()), "colmap", shots, None)
-    assert [shot.image for shot in matches.values()] == [shot.image for shot in shots]
-    assert time.process_time() - began < 5
