@@ -51,13 +51,6 @@ def test_any_view_arrives_with_its_bits_and_strides(data):
     assert_same(unpack(pack(sent)), sent)
 
 
-def test_sums_come_out_with_the_same_bits():
-    """The order of a sum depends on the layout: this is what layouts are kept for."""
-    sent = RNG(0).normal(size=(1000, 33)).astype(np.float32)[:, ::4]
-    assert unpack(pack(sent)).sum(0).tobytes() == sent.sum(0).tobytes()
-    assert np.ascontiguousarray(sent.T).sum(1).tobytes() != sent.sum(0).tobytes(), "another layout gives other bits"
-
-
 def test_what_is_sent_again_is_not_written_again_until_it_was_not_used_for_long(tmp_path):
     shelf, arrays = Shelf(tmp_path), [RNG(k).normal(size=5000) for k in range(3)]
     first = shelf.pack([(one, 0) for one in arrays])

@@ -1,7 +1,5 @@
 """Set-up: which commands it gives to package clients, and what it says where something is missing."""
 
-import sys
-
 import pytest
 
 from factorlib import setup
@@ -66,12 +64,6 @@ def test_extras_are_installed_alone_or_move_nothing_of_the_lock(called, monkeypa
     assert not others or bare[1][-len(others) - 2 :] == ["-c", str(setup.LOCK), *others]
 
 
-def test_an_extra_that_is_not_there_is_refused_with_those_that_are(monkeypatch):
-    monkeypatch.setenv("EXTRAS", "blunder")
-    with pytest.raises(SystemExit, match=r"'blunder'.*blender, interchange"):
-        setup.install_extras()
-
-
 def test_the_lock_is_installed_by_pip_where_uv_cannot_be_had_and_torch_apart_which_may_need_more(
     called, monkeypatch, tmp_path
 ):
@@ -95,14 +87,3 @@ def test_uv_is_used_where_it_is_there_and_pip_where_it_fails(called, monkeypatch
     (locked, torch), by_pip = called[:2]
     assert locked[0] == "/bin/uv" and torch_by in torch and setup.TORCH in torch
     assert all(command[1:3] == ["-m", "pip"] for command in by_pip)
-
-
-def test_commands_run_at_once_show_that_they_live_and_say_how_they_ended(monkeypatch, capfd, tmp_path):
-    monkeypatch.setattr(setup, "site_packages", lambda: tmp_path)
-    monkeypatch.setattr(setup, "BEAT", 0.2)
-    met = "import pathlib, time\n(pathlib.Path({0!r}) / {1!r}).touch()\nwhile not (pathlib.Path({0!r}) / {2!r}).exists(): time.sleep(.05)\ntime.sleep(.5)"
-    commands = [[sys.executable, "-c", met.format(str(tmp_path), *names)] for names in ("ab", "ba")]
-    assert setup.run(commands, "working")
-    assert "set-up: working: 0 s, 0 packages are there" in capfd.readouterr().out
-    assert not setup.run([[sys.executable, "-c", "raise SystemExit('ERROR: no such package')"]], "working")
-    assert "ERROR: no such package" in capfd.readouterr().err

@@ -8,11 +8,11 @@ import trimesh
 
 from factorlib.align import silhouette as masks
 from factorlib.align.coarse import is_cut
-from factorlib.align.confidence import FACET, TURN, confidence, overlay, turns
+from factorlib.align.confidence import FACET, TURN, confidence, turns
 from factorlib.align.silhouette import UNKNOWN, Silhouette
 from factorlib.align.target import target_of
 from factorlib.geometry.raster import rasterise
-from tests.align.scenes import at, ball, chair, dumbbell, mesh_of, photo_of, true_silhouette
+from tests.align.scenes import at, ball, dumbbell, mesh_of, photo_of, true_silhouette
 
 
 def label_of(number, labels, own_mask, label, owner=None, left_out=None):
@@ -67,12 +67,6 @@ def test_distance_to_a_straight_border_is_exact():
     assert np.allclose(region.outward[region.contour[:, 0] == 8 - target.left][3], (-1, 0))
 
 
-def test_beyond_the_frame_nothing_is_known():
-    label = np.ones((10, 10), np.int16)
-    region = target_of(Silhouette(label), (1,), 1000).regions[1]
-    assert len(region.contour) == 0 and region.distance[5, 0] == -0.5
-
-
 def test_confidence_grows_from_contour_inward_and_is_zero_where_labels_differ():
     caster, camera, pose = photo_of(mesh_of([ball(), at(ball(0.6), 1.2, 0, 0)], [1, 2]), 6)
     maps = rasterise(caster, camera, pose)
@@ -116,12 +110,3 @@ def test_normals_turn_by_the_angle_that_a_pixel_spans_and_are_believed_less(heig
     assert turns(maps)[middle] == pytest.approx(expected, rel=0.1)
     believed = 1 / (1 + (maps.facet[middle] / FACET) ** 2 + (expected / TURN) ** 2)
     assert sure[middle] == pytest.approx(believed, rel=0.02)
-
-
-def test_overlay_draws_both_contours():
-    caster, camera, pose = photo_of(chair(), 7, width=80, height=60)
-    maps, silhouette = rasterise(caster, camera, pose), true_silhouette(caster, camera, pose)
-    picture = overlay(np.full((60, 80, 3), 0.2), maps, Silhouette(np.roll(silhouette.label, 5, axis=1)))
-    assert picture.dtype == np.uint8 and picture.shape == (60, 80, 3)
-    for colour in ([255, 38, 191], [51, 255, 51]):  # mesh, mask
-        assert (picture == colour).all(axis=-1).sum() > 50

@@ -4,8 +4,7 @@ import msgspec
 import numpy as np
 import pytest
 
-from factorlib.diagnose.misfit import energy, misfit
-from factorlib.diagnose.uncertainty import residual_deviation
+from factorlib.diagnose.misfit import misfit
 from factorlib.model.materials import Point
 from factorlib.model.problem import JointProblem
 from factorlib.reflection import reflection_operator
@@ -53,45 +52,3 @@ def test_what_neighbours_leave_alike_is_the_share_of_the_shading_that_it_is(exac
         photos["room0_0"].unexplained == pytest.approx((0.3 / 0.7) ** 2, rel=0.02)
         and photos["room1_1"].unexplained < 1e-6
     )
-
-
-def test_a_material_called_by_anothers_name_is_unexplained_and_clipped_or_unsure_values_have_no_say(exact):
-    block = exact[0].blocks[0]
-    whole, photos = misfit(*changed(exact, material=2 - block.material))
-    assert photos["room0_0"].unexplained > 0.1 and whole > 0.03
-    wrong = {"radiance": block.radiance * 3, "clipped": np.ones_like(block.clipped)}
-    assert misfit(*changed(exact, **wrong))[1]["room0_0"] == msgspec.convert(
-        {"unexplained": 0.0, "clipped": 1.0}, type(photos["room0_0"])
-    )
-    unsure = {"radiance": block.radiance * 3, "confidence": np.full(len(block), 0.1)}
-    assert misfit(*changed(exact, **unsure))[0] < 1e-6
-
-
-def test_energy_is_that_of_the_groups_means_where_every_value_of_a_group_is_the_same():
-    rng = np.random.default_rng(1)
-    group = rng.integers(0, 30, 1000)
-    of_group = rng.normal(size=(30, 3))
-    assert energy(of_group[group], group) == pytest.approx(float((of_group[group] ** 2).sum()))
-    noise = rng.normal(size=(1000, 3))
-    assert energy(of_group[group] + noise, group) < 1.3 * energy(of_group[group], group)
-    count = np.bincount(group)
-    plain = sum((count * (np.bincount(group, of) / count) ** 2).sum() for of in noise.T)  # with what varies
-    assert energy(noise, group) < 0.6 * plain
-    assert energy(np.ones((3, 3)), np.zeros(3, int)) == 0  # too few
-
-
-def test_bounds_that_hold_do_not_make_residuals_small(exact):
-    problem, point = exact
-    radiance = problem.blocks[0].radiance + 0.2
-    half = np.zeros_like(problem.blocks[0].clipped)
-    half[::2] = True
-    low = np.where(half, 0.0, radiance)  # clipped below what the model says: no residual
-    whole = residual_deviation(
-        JointProblem([msgspec.structs.replace(problem.blocks[0], radiance=radiance)], OPERATOR),
-        Point(MATERIALS, point.lights[:1]),
-    )
-    bounds = residual_deviation(
-        JointProblem([msgspec.structs.replace(problem.blocks[0], radiance=low, clipped=half)], OPERATOR),
-        Point(MATERIALS, point.lights[:1]),
-    )
-    assert bounds == pytest.approx(whole, rel=0.1)

@@ -9,9 +9,7 @@ from factorlib.diagnose import uncertainty
 from factorlib.diagnose.identifiability import tinted_alike
 from factorlib.diagnose.uncertainty import (
     LARGEST,
-    MODEL_ERROR,
     Posterior,
-    in_gauge_of,
     relative_standard_errors,
     standard_errors,
 )
@@ -21,13 +19,10 @@ from factorlib.model.problem import JointProblem
 from factorlib.reflection import reflection_operator
 from factorlib.solve.few_lobes.descent import Iterate, descend, evaluate
 from factorlib.solve.few_lobes.equations import normal_equations
-from factorlib.solve.few_lobes.options import FewLobes, Run
-from factorlib.solve.few_lobes.solve import few_lobes
 from studies.scenes.problems import MATERIALS, block, factor_between, random_light
 from tests.solve.made import PRIOR, natural
 
 OPERATOR, LOSS = reflection_operator("network"), Loss()
-FEW_LOBES = FewLobes(lobes=16, insert=8, rounds=4, specular="on")
 NOISE = 0.5
 
 
@@ -81,32 +76,6 @@ def test_with_independent_noise_two_thirds_of_true_values_lie_within_one_standar
     assert 0.58 < np.mean(within) < 0.85, np.mean(within)
 
 
-@pytest.mark.long
-def test_where_lights_have_more_features_than_lobes_true_values_still_lie_within_the_errors():
-    """No noise: all error is the lobes' own bias.  Of narrow residuals about .46 lie within.  Errors of one scene go together: eight."""
-    within = []
-    for seed in range(8):
-        rng = np.random.default_rng(seed)
-        lights = [random_light(rng, 120) for _ in range(4)]
-        blocks = [block(f"room{i}", li, MATERIALS, [0, 1, 2], OPERATOR, 16, i) for i, li in enumerate(lights)]
-        problem = JointProblem(blocks, OPERATOR)
-        solution = few_lobes(problem, 3, Run(FEW_LOBES))
-        errors = standard_errors(problem.with_loss(solution.loss), solution.point).materials
-        within += inside(solution.point.materials, errors)
-    assert 0.58 < np.mean(within) < 0.82, np.mean(within)
-
-
-def test_noise_twice_as_large_doubles_the_errors(solved):
-    problem, point = solved
-    louder = [
-        msgspec.structs.replace(b, radiance=b.radiance + (b.radiance - predicted))
-        for b, predicted in zip(problem.blocks, problem.radiance(point), strict=True)
-    ]
-    plain = problem.with_loss(Loss(robust_scale=1e3))
-    once, twice = (standard_errors(p, point).materials for p in (plain, msgspec.structs.replace(plain, blocks=louder)))
-    np.testing.assert_allclose(twice.roughness, 2 * once.roughness, rtol=0.05)
-
-
 def test_directions_that_no_observation_mirrors_are_known_less(solved):
     problem, point = solved
     given = problem.illuminations(point)[0]
@@ -126,23 +95,6 @@ def fit():
     """The problem, the true lights, the fit, and the errors of its materials."""
     problem, true, found = natural()
     return problem, true, found, Posterior(problem, found, PRIOR).standard_errors()
-
-
-def test_a_nil_reflectance_is_not_known_for_sure(fit):
-    problem, _, found, errors = fit
-    nil = np.where([[False], [False], [True]], 0.0, found.point.materials.diffuse)
-    there = Point(msgspec.structs.replace(found.point.materials, diffuse=nil), found.point.lights)
-    at_nil = Posterior(problem, msgspec.structs.replace(found, point=there), PRIOR).standard_errors().materials
-    assert (at_nil.diffuse[2] > 0.3 * errors.materials.diffuse[2]).all()
-    assert (errors.materials.vector() > 0).all()
-
-
-def test_no_observation_mends_what_the_model_has_wrong(fit):
-    """k_s and roughness are never known better than the model is right, as far as residuals say that it is wrong."""
-    values = fit[2].point.materials.rows()
-    values[:, 6] = 1
-    wrong = min(1.0, fit[3].deviation) * MODEL_ERROR * values
-    assert (fit[3].materials.rows() >= wrong).all() and (MODEL_ERROR > 0).all()
 
 
 def test_materials_lie_within_a_few_standard_errors(fit):
@@ -178,14 +130,6 @@ def test_fewer_observations_tell_less_and_cells_that_have_split_have_maps_too(fi
     one, of_few, other = (p.relative_standard_errors()["room0"] for p in (Posterior(problem, found, PRIOR), few, split))
     assert of_few.mean() > one.mean()
     assert other.shape == one.shape and np.isfinite(other).all() and 0.7 < other.mean() / one.mean() < 1.5
-
-
-def test_errors_go_with_the_gauge(fit):
-    m, errors, factor = fit[2].point.materials, fit[3], np.array([2.0, 1.0, 0.5])
-    there = in_gauge_of(errors, m, Materials(m.diffuse * factor, m.specular * factor, m.roughness)).materials
-    np.testing.assert_allclose(there.diffuse, errors.materials.diffuse * factor)
-    np.testing.assert_allclose(there.specular, errors.materials.specular * factor)
-    np.testing.assert_array_equal(there.roughness, errors.materials.roughness)
 
 
 # ── what is said of the lights' colour ──────────────────────────────────────────────────────────────────────────────

@@ -1,17 +1,13 @@
 """Scenes as OpenUSD: text that is checked as text, and what the USD library reads of it."""
 
-import json
-import re
-
 import numpy as np
 import pytest
 
 from factorlib.conventions import YUP_FROM_CAMERA, lat_long_directions
 from factorlib.export.scene import ExposedMap, Scene, Shape
-from factorlib.export.usd import colours, identifiers, shader_inputs, write_usd_mesh, write_usd_scene
+from factorlib.export.usd import shader_inputs, write_usd_scene
 from factorlib.geometry.camera import Camera
 from factorlib.images.exr import read_rgb_exr
-from factorlib.meshes.mesh import Mesh
 from factorlib.meshes.ply import submesh
 from factorlib.meshes.read import read_mesh
 from factorlib.results.lobes import read_lobes
@@ -28,8 +24,6 @@ MISSING = 'OpenUSD is not installed: make setup EXTRAS="interchange"'
 
 # as text -------------------------------------------------------------------------------------------------------------
 
-ODD = ["3 chairs", "a-b", "a_b", 'say "hi"\\\n', "стул"]
-
 
 @pytest.fixture
 def text_of(tmp_path):
@@ -45,17 +39,6 @@ def text_of(tmp_path):
         return (tmp_path / "scene.usda").read_text()
 
     return written
-
-
-def test_names_that_are_no_identifiers_are_shown_and_get_one_of_their_own(text_of):
-    text = text_of(ODD, ["red-1", "red_1", "2"])
-    objects = re.findall(r'def Xform "([^"]*)" \(\n +displayName = (.*)\n', text)
-    assert [json.loads(shown) for _, shown in objects] == ["a_b", "3 chairs", "a-b", 'say "hi"\\\n', "стул"]
-    assert all(re.fullmatch(r"[A-Za-z_]\w*", name, re.ASCII) for name in re.findall(r'def \w+ "([^"\n]*)"', text))
-    assert len({name for name, _ in objects}) == len(ODD)
-    bound = set(re.findall(r"binding = </scene/materials/(\w+)>", text))
-    assert bound == set(re.findall(r'def Material "(\w+)"', text))  # a name that is an identifier is kept
-    assert identifiers(["a b", "a-b", "a_b", "a b"]) == {"a_b": "a_b", "a b": "a_b_2", "a-b": "a_b_3"}
 
 
 def test_files_are_quoted_matrices_written_for_rows_and_exposure_is_intensity_times_colour(text_of):
@@ -79,32 +62,6 @@ def test_shader_reflects_what_was_solved_at_normal_incidence(material):
     np.testing.assert_allclose(f0, material.specular)
     np.testing.assert_allclose(diffuse, material.diffuse)
     assert found["roughness"] == (material.roughness if any(material.specular) else 1.0)
-
-
-def test_painted_shapes_read_their_colours_and_others_of_the_material_do_not(tmp_path):
-    shapes = [Shape(f"{name}.red", "a.ply", "red", np.eye(4), False, name == "old") for name in ("new", "old")]
-    light = ExposedMap("a.exr", np.ones(3), np.eye(3))
-    write_usd_scene(tmp_path / "s.usda", Scene(Camera(64, 48, 100.0, (30.0, 20.0)), shapes, {"red": GLOSSY}, light))
-    text = (tmp_path / "s.usda").read_text()
-    assert text.count("UsdPrimvarReader_float3") == 1 and text.count("inputs:diffuseColor.connect") == 1
-    assert set(re.findall(r"binding = </scene/materials/(\w+)>", text)) == {"red", "red__painted_"}
-    mesh = Mesh(np.eye(3), np.array([[0, 1, 2]], np.int32), np.eye(3), np.ones(1, np.int16))
-    write_usd_mesh(tmp_path / "m.usda", mesh, colours(GLOSSY, np.array([1.0, 0.5, 9.0])))
-    found = re.search(r"displayColor = \[(.*)\]", (tmp_path / "m.usda").read_text())[1]
-    found = np.array(json.loads(f"[{found}]".replace("(", "[").replace(")", "]")))
-    base = shader_inputs(GLOSSY)["diffuseColor"]
-    np.testing.assert_allclose(found, [base, base / 2, np.minimum(9 * base, 1)], rtol=1e-6)
-
-
-def test_numbers_of_a_mesh_are_those_of_float32(tmp_path):
-    rng = np.random.default_rng(0)
-    faces = np.arange(9, dtype=np.int32).reshape(3, 3)
-    mesh = Mesh(rng.normal(size=(9, 3)) * 1e3, faces, rng.normal(size=(9, 3)), np.ones(3, np.int16), open=True)
-    write_usd_mesh(tmp_path / "m.usda", mesh)
-    text = (tmp_path / "m.usda").read_text()
-    points = np.array(json.loads(re.search(r"points = (.*)", text)[1].replace("(", "[").replace(")", "]")))
-    np.testing.assert_array_equal(points.astype(np.float32), mesh.vertices.astype(np.float32))
-    assert "faceVertexIndices = [0, 1, 2, 3, 4, 5, 6, 7, 8]" in text and "doubleSided = 1" in text
 
 
 # as the USD library reads it -----------------------------------------------------------------------------------------

@@ -14,12 +14,10 @@ from factorlib.errors import InputError
 from factorlib.generate import eames, folder, lights, synthetic
 from factorlib.generate.__main__ import app
 from factorlib.generate.chair import chair, labelled, rough_chair, shell
-from factorlib.generate.shapes import SHAPES
 from factorlib.images.exr import read_exr, read_rgb_exr, write_rgb_exr
 from factorlib.images.photo import read_photo
 from factorlib.images.picture import read_png
 from factorlib.light.latlong import sampled
-from factorlib.meshes.mesh import area_vectors
 from factorlib.meshes.read import read_mesh
 
 pytest.importorskip("mitsuba")
@@ -64,19 +62,8 @@ def files(out: Path) -> dict[str, bytes]:
     return {str(path.relative_to(out)): path.read_bytes() for path in out.rglob("*") if path.is_file()}
 
 
-def photo_and_light(out: Path):
-    """The photo of the kitchen, and the true light as a map in the camera's frame turned y-up; in the photo's unit."""
-    return read_photo(out / "photos/kitchen.jpg"), read_rgb_exr(out / "truth/kitchen_light.exr")
-
-
 def test_the_same_seed_is_the_same_bytes(small, tmp_path):
     assert files(made(tmp_path / "again", seed=0)) == files(small)
-
-
-def test_another_seed_is_another_set(small, tmp_path):
-    first, other = read_dataset(small).truth, read_dataset(made(tmp_path / "other", seed=1, spp=1)).truth
-    assert all(first.materials[name] != other.materials[name] for name in first.materials)
-    assert all(max(m.diffuse) + max(m.specular) < 1 for m in other.materials.values())
 
 
 def test_the_synthetic_set_holds_one_photo_of_each_kind_and_hides_one_pose(small):
@@ -85,14 +72,6 @@ def test_the_synthetic_set_holds_one_photo_of_each_kind_and_hides_one_pose(small
     hidden = [obj.name for photo in dataset.spec.photos for obj in photo.objects if obj.pose is None]
     assert hidden == ["red_blob"]
     assert set(dataset.truth.poses["study"]) == {obj.name for obj in dataset.photo("study").objects}
-
-
-def test_only_the_jpeg_clips(small):
-    for name, suffix in (("garden", "exr"), ("parlour", "png"), ("study", "jpg")):
-        labels = read_png(small / f"masks/{name}.png")[..., 0]
-        clipped = read_photo(small / f"photos/{name}.{suffix}").clipped[(labels > 0) & (labels < 255)]
-        assert clipped.any() == (suffix == "jpg")
-        assert clipped.mean() < 0.1
 
 
 def test_a_matte_pixel_is_its_irradiance(small):
@@ -135,30 +114,6 @@ def test_the_mesh_given_is_coarser_and_a_few_millimetres_off(chairs):
     assert np.abs(np.ptp(rough, axis=0) - np.ptp(fine, axis=0)).max() < 0.02
 
 
-@pytest.mark.parametrize("vertices_and_faces", [*chair().values(), *rough_chair(np.random.default_rng(1)).values()])
-def test_parts_are_closed_and_face_outward(vertices_and_faces):
-    vertices, faces = vertices_and_faces
-    edges = np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]])
-    assert {tuple(edge) for edge in edges} == {tuple(edge[::-1]) for edge in edges}
-    assert np.einsum("nd,nd->", area_vectors(vertices, faces), vertices[faces].mean(axis=1)) > 0
-
-
-@pytest.mark.parametrize("name", SHAPES)
-def test_normals_of_shapes_are_those_of_their_faces(name):
-    mesh = SHAPES[name]()
-    flat = area_vectors(mesh.vertices, mesh.faces)
-    flat /= np.linalg.norm(flat, axis=1, keepdims=True)
-    assert (np.einsum("fd,fkd->fk", flat, mesh.normals[mesh.faces]) > 0.7).all()
-
-
-def test_borders_are_left_out_on_either_side():
-    fine = np.zeros((4 * 6, 4 * 8), dtype=int)
-    fine[:, 4 + 8 :] = 2  # a straight edge between the photo's columns 1 and 2
-    labels = folder.whole_pixels(fine)
-    assert labels.shape == (4, 6)
-    assert labels[0].tolist() == [0, 255, 255, 2, 2, 2]
-
-
 def test_a_users_lights_replace_the_made_ones(tmp_path):
     light = np.ones((32, 64, 3)) * [1.0, 2.0, 3.0]
     light[3, 7] = 100
@@ -170,31 +125,6 @@ def test_a_users_lights_replace_the_made_ones(tmp_path):
     write_rgb_exr(tmp_path / "square.exr", np.ones((8, 8, 3)))
     with pytest.raises(InputError, match="no lat-long"):
         lights.captured(tmp_path / "square.exr", 8)
-
-
-def test_a_rough_mesh_changes_no_photo_and_is_as_rough_as_was_asked_for(plain, tmp_path):
-    rough = made_chairs(tmp_path / "rough", rough=(500, 0.02))
-    before, after = files(plain), files(rough)
-    changed = {name for name in before if before[name] != after[name]}
-    assert before.keys() == after.keys() and changed == {"meshes/chair.obj", "dataset.yaml"}
-    mesh = read_mesh(rough / "meshes/chair.obj", ["red", "wood"], {"shell": "red", "legs": "wood"})
-    assert 900 <= len(mesh.faces) <= 1000
-    true = np.concatenate([vertices for vertices, _ in chair().values()])
-    off = cKDTree(true).query(mesh.vertices)[0] / np.linalg.norm(np.ptp(true, axis=0))
-    assert 0.002 < np.median(off) < 0.02 and off.max() < 0.05
-    assert "--rough 500,0.02" in (rough / "dataset.yaml").read_text()
-
-
-@pytest.mark.parametrize("words", ["500", "500,x", "5,.02", "500,.5"])
-def test_a_roughness_of_meshes_that_is_none_is_named(words, tmp_path):
-    done = CliRunner().invoke(app, ["eames", "--rough", words, "--out", str(tmp_path / "set")])
-    assert done.exit_code == 2 and "500,.02" in done.output
-
-
-def test_exact_geometry_changes_no_photo(plain, exact):
-    before, after = files(plain), files(exact)
-    assert before.keys() == after.keys()
-    assert {name for name in before if before[name] != after[name]} == {"dataset.yaml", "meshes/chair.obj"}
 
 
 def test_exact_geometry_is_the_photographed_mesh_at_its_pose(exact):
@@ -213,44 +143,6 @@ def test_exact_geometry_is_the_photographed_mesh_at_its_pose(exact):
     assert alike.mean() > 0.97, (
         "of flat ends of legs, which stand on the floor or in the seat, the reader takes its own"
     )
-
-
-def test_behind_the_chairs_a_distant_light_is_its_map(tmp_path):
-    """Light, camera and exposure belong together: each pixel beside the chairs is the map in the pixel's direction."""
-    photo, light = photo_and_light(made_chairs(tmp_path / "set", distant=True, direct=True))
-    focal = folder.focal_px_of_35mm(45, 96, 72)
-    column, row = np.meshgrid(np.arange(96) + 0.5 - 48, np.arange(72) + 0.5 - 36)
-    ray = np.stack([column, row, np.full(row.shape, focal)], axis=-1)
-    expected = sampled(light, ray / np.linalg.norm(ray, axis=-1, keepdims=True) @ YUP_FROM_CAMERA)
-    beside = (read_png(tmp_path / "set/masks/kitchen.png")[..., 0] == 0) & ~photo.clipped.any(axis=-1)
-    off = photo.radiance[beside] - expected[beside]
-    assert beside.mean() > 0.3 and np.abs(off).mean() < 0.03 * expected[beside].mean()
-
-
-def test_without_bounces_chairs_are_darker(tmp_path):
-    """In one light, against that light's unit, in which exposure is gone."""
-    brightness = []
-    for direct in (True, False):
-        out = made_chairs(tmp_path / str(direct), spp=32, distant=True, direct=direct)
-        photo, light = photo_and_light(out)
-        on_chair = np.isin(read_png(out / "masks/kitchen.png")[..., 0], [1, 2, 3, 4, 5])
-        brightness.append(np.minimum(photo.radiance[on_chair], 0.9).mean() / light.mean())
-    assert brightness[0] < 0.97 * brightness[1]
-
-
-def test_the_light_of_a_direct_set_is_what_shines_by_itself(tmp_path, plain):
-    _, all_of_it = photo_and_light(plain)
-    _, direct = photo_and_light(made_chairs(tmp_path / "set", direct=True))
-    assert (all_of_it > 0).all() and (direct == 0).all(axis=-1).mean() > 0.8 and direct.max() > 1
-
-
-def test_a_users_distant_light_has_no_ground(tmp_path):
-    write_rgb_exr(tmp_path / "constant.exr", np.ones((16, 32, 3)))
-    maps = [tmp_path / "constant.exr"]
-    _, light = photo_and_light(made_chairs(tmp_path / "distant", lights=maps, distant=True))
-    np.testing.assert_allclose(light, light[0, 0, 0], rtol=1e-3)
-    _, light = photo_and_light(made_chairs(tmp_path / "near", lights=maps))
-    assert light.min() < 0.5 * light.max()
 
 
 def test_an_easier_set_does_not_replace_the_one_the_project_carries(tmp_path, monkeypatch):

@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from PIL import Image, ImageCms
+from PIL import Image
 from PIL.TiffImagePlugin import IFDRational
 
 from factorlib.errors import InputError
@@ -61,14 +61,6 @@ def test_orientation_is_applied_once_and_what_the_camera_wrote_is_read(tmp_path,
     assert read_photo(save(path, SMOOTH, exif=exif.tobytes())).focal_px == pytest.approx(5 * 1000 / 10)
 
 
-def test_the_kind_is_told_by_the_content(tmp_path):
-    save(tmp_path / "a.heic", SMOOTH).rename(tmp_path / "a.jpg")
-    assert read_photo(tmp_path / "a.jpg").width == W
-    (tmp_path / "b.heic").write_bytes(b"no picture")
-    with pytest.raises(InputError, match="not readable as an image"):
-        read_photo(tmp_path / "b.heic")
-
-
 def test_a_damaged_file_and_one_of_another_size_than_its_header_says_are_refused(tmp_path):
     noise = save(tmp_path / "a.heic", np.random.default_rng(0).random((H, W, 3))).read_bytes()
     smooth = save(tmp_path / "a.heic", SMOOTH).read_bytes()
@@ -82,12 +74,3 @@ def test_a_damaged_file_and_one_of_another_size_than_its_header_says_are_refused
         with pytest.raises(InputError, match=words) as caught:
             read_photo(tmp_path / "a.heic", key="photos[0].image")
         assert "photos[0].image" in str(caught.value) and caught.value.cure
-
-
-def test_a_curve_of_hdr_video_is_refused_and_a_wider_colour_profile_is_told(tmp_path, caplog):
-    video = {"save_nclx_profile": True, "transfer_characteristics": 18, "color_primaries": 9}
-    with pytest.raises(InputError, match="HLG"):
-        read_photo(save(tmp_path / "a.heic", SMOOTH, deep=True, **video))
-    profile = ImageCms.ImageCmsProfile(ImageCms.createProfile("LAB"))
-    read_photo(save(tmp_path / "a.heic", SMOOTH, icc_profile=profile.tobytes()))
-    assert "its colour profile is" in caplog.text

@@ -1,18 +1,14 @@
 """Reading photos: the same scene is the same radiance whatever file it came in."""
 
-import itertools
 import os
-import tracemalloc
 
 import numpy as np
 import OpenImageIO as oiio
 import pytest
 
 from factorlib.errors import InputError
-from factorlib.images import light_map
-from factorlib.images import photo as photo_module
 from factorlib.images.boxes import box_mean
-from factorlib.images.exif import FILM_DIAGONAL, focal_px_of_exif
+from factorlib.images.exif import FILM_DIAGONAL
 from factorlib.images.exr import read_exr
 from factorlib.images.light_map import read_light_map
 from factorlib.images.photo import check_bright, decoded, open_photo, read_photo
@@ -85,41 +81,6 @@ def test_orientation_is_applied_and_averaging_down_is_that_of_the_photo_as_displ
     np.testing.assert_allclose(small.radiance, box_mean(whole.radiance, whole.finite, 3)[0], rtol=1e-6)
 
 
-@pytest.mark.parametrize("factor", [1, 2, 3, 5])
-@pytest.mark.parametrize("file, pixels", [
-    ("a.jpg", codes(RADIANCE)), ("a.png", codes(RADIANCE, np.uint16)), ("a.exr", RADIANCE),
-])  # fmt: skip
-def test_how_many_rows_are_read_at_once_changes_no_bit(tmp_path, monkeypatch, factor, file, pixels):
-    path, seen = save(tmp_path / file, pixels), set()
-    for rows in (100, 1, 2, 7):
-        monkeypatch.setattr(photo_module, "READ_AT_ONCE", rows * 18)
-        photo = decoded(open_photo(path), None, factor, path)
-        seen.add(b"".join(getattr(photo, name).tobytes() for name in ("radiance", "clipped", "finite")))
-    assert len(seen) == 1
-
-
-def test_no_more_than_some_rows_of_a_large_photo_are_held(tmp_path):
-    path = save(tmp_path / "a.tif", np.zeros((1500, 4000, 3), np.uint16), Compression="zip")
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(photo_module, "READ_AT_ONCE", 1 << 17)
-        tracemalloc.start()
-        decoded(open_photo(path), None, 8, path)
-        peak = tracemalloc.get_traced_memory()[1]
-        tracemalloc.stop()
-    assert peak < 1500 * 4000 * 3 * 4 / 4, "a quarter of the photo as floats"
-
-
-def test_tiles_are_read_as_scanlines_are(tmp_path):
-    pixels = RNG.uniform(0, 1, (70, 90, 3)).astype(np.float32)
-    spec = oiio.ImageSpec(90, 70, 3, oiio.FLOAT)
-    spec.tile_width = spec.tile_height = 32
-    output = oiio.ImageOutput.create("a.exr")
-    assert output.open(str(tmp_path / "a.exr"), spec) and output.write_image(pixels)
-    output.close()
-    del output
-    np.testing.assert_array_equal(read_photo(tmp_path / "a.exr").radiance, pixels)
-
-
 @pytest.mark.parametrize("aperture, iso, expected", [
     (1.8, 125, 125 / 60 / 1.8**2), (1.8, None, None), (0.0, 125, None), (1.8, 65535, None),  # a lens that says nothing; "more than fits"
 ])  # fmt: skip
@@ -127,17 +88,6 @@ def test_the_exposure_is_what_the_camera_wrote(tmp_path, aperture, iso, expected
     tags = {"ExposureTime": 1 / 60, "FNumber": aperture} | ({"Exif__PhotographicSensitivity": iso} if iso else {})
     exposure = read_photo(save(tmp_path / "a.jpg", np.zeros((40, 60, 3), dtype=np.uint8), **tags)).exposure
     assert exposure == (None if expected is None else pytest.approx(expected, rel=1e-3))
-
-
-@pytest.mark.parametrize("channels, names", [(1, ["Y"]), (2, ["Y", "A"]), (4, ["R", "G", "B", "A"])])
-@pytest.mark.parametrize("suffix", [".png", ".tif"])
-def test_grey_becomes_rgb_and_alpha_is_dropped_without_darkening(tmp_path, channels, names, suffix):
-    pixels = np.full((4, 6, channels), 100, dtype=np.uint8)
-    if "A" in names:
-        pixels[..., -1] = 40
-    photo = read_photo(save(tmp_path / f"a{suffix}", pixels, names))
-    assert photo.radiance.shape == (4, 6, 3)
-    assert codes(srgb_encode(photo.radiance)).tolist() == np.full((4, 6, 3), 100).tolist()
 
 
 def test_exr_channels_go_by_name_and_without_colours_it_is_refused(tmp_path):
@@ -178,34 +128,6 @@ def test_a_photo_that_is_black_or_negative_wherever_it_is_used_and_a_pipe_are_re
             read(tmp_path / "pipe.exr")
 
 
-@pytest.mark.parametrize("suffix", ["exr", "hdr"])
-def test_a_large_light_is_averaged_down_while_it_is_read(tmp_path, monkeypatch, suffix):
-    """A file of kilobytes that stands for many pixels; what is held is some rows of it and the smaller map."""
-    monkeypatch.setattr(light_map, "MOST_TEXELS", 256 * 128)
-    monkeypatch.setattr(photo_module, "READ_AT_ONCE", 1 << 16)
-    pixels = np.broadcast_to(np.linspace(1, 2, 1250, dtype=np.float32)[:, None, None], (1250, 2500, 3))
-    path = save(tmp_path / f"a.{suffix}", pixels)
-    tracemalloc.start()
-    light = read_light_map(path)
-    peak = tracemalloc.get_traced_memory()[1]
-    tracemalloc.stop()
-    assert light.shape == (125, 250, 3) and peak < pixels.size * 4 / 3
-    assert light[:, 0, 0] == pytest.approx(pixels[:, 0, 0].reshape(125, 10).mean(axis=1), rel=5e-3)
-
-
-def test_a_light_of_the_usual_size_is_read_as_it_is_and_one_texel_that_is_no_radiance_is_enough(tmp_path, monkeypatch):
-    pixels = RNG.uniform(0, 5, (16, 32, 3)).astype(np.float32)
-    pixels[3, 4, 1] = -1e-4  # as resampling leaves it
-    assert np.array_equal(read_light_map(save(tmp_path / "a.exr", pixels)), pixels)
-    for most, value in itertools.product((1 << 23, 8), (-70.0, np.inf, 3e38, np.nan)):  # averaged down, too
-        monkeypatch.setattr(light_map, "MOST_TEXELS", most)
-        pixels[1, 2, 0] = value
-        words = "a radiance of -70 is less than 0" if value == -70 else "no numbers, or infinite"
-        with pytest.raises(InputError, match=words) as caught:
-            read_light_map(save(tmp_path / "a.exr", pixels), "illumination.hall")
-        assert "a.exr: illumination.hall" in str(caught.value) and caught.value.cure
-
-
 @pytest.mark.parametrize("file", ["a.jpg", "a.png", "a.tif", "a.exr", "a.hdr"])
 @pytest.mark.parametrize("part", [0.0, 0.5, 0.97])
 def test_truncated_files_are_refused_where_averaging_drops_the_rows_too(tmp_path, file, part):
@@ -227,21 +149,3 @@ def test_focal_of_35mm_film_is_the_same_for_any_size_orientation_and_average(tmp
         half = np.hypot(photo.width, photo.height) / 2
         assert np.arctan(half / photo.focal_px) == pytest.approx(np.arctan(FILM_DIAGONAL / 2 / 50))
         assert decoded(open_photo(path), None, 4, path).focal_px == pytest.approx(photo.focal_px / 4)
-
-
-def test_focal_of_the_focal_plane_follows_a_resize_and_is_none_where_exif_cannot_tell():
-    exif = {"Exif:FocalLength": 18.0, "Exif:FocalPlaneXResolution": 10000.0, "Exif:FocalPlaneResolutionUnit": 2}
-    exif |= {"Exif:PixelXDimension": 5472, "Exif:PixelYDimension": 3648}
-    full = focal_px_of_exif(exif, 5472, 3648)
-    assert full == pytest.approx(18 * 10000 / 25.4)
-    assert focal_px_of_exif(exif, 1368, 912) == pytest.approx(full / 4)
-    assert focal_px_of_exif(exif | {"Exif:FocalPlaneResolutionUnit": 3}, 5472, 3648) == pytest.approx(18 * 10000 / 10)
-    film, taken = {"Exif:FocalLengthIn35mmFilm": 50}, {"Exif:PixelXDimension": 6000, "Exif:PixelYDimension": 4000}
-    for exif, size in (
-        ({}, (600, 400)),
-        ({"Exif:FocalLength": 18.0}, (600, 400)),  # of a sensor of unknown size
-        ({"Exif:FocalLengthIn35mmFilm": 0}, (600, 400)),  # "unknown" by the standard
-        (film, (500, 500)),  # cropped: no camera's proportions
-        (film | taken, (400, 300)),
-    ):
-        assert focal_px_of_exif(exif, *size) is None

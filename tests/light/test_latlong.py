@@ -2,10 +2,9 @@
 
 import numpy as np
 import pytest
-from scipy.spatial.transform import Rotation
 
 from factorlib.conventions import YUP_FROM_CAMERA, lat_long_directions, lat_long_solid_angles
-from factorlib.light.latlong import lat_long_of_lobes, map_energy, sampled, turned_map
+from factorlib.light.latlong import lat_long_of_lobes, map_energy, sampled
 from factorlib.light.lobes import Lobes
 
 AXES = {
@@ -60,15 +59,6 @@ def test_lobe_lies_where_the_fixed_layout_says(camera_axis, row, column):
         lat_long_of_lobes(lobe(camera_axis, 2000.0), height, width)[..., 0].argmax(), (height, width)
     )
     assert abs((i + 0.5) / height - row) <= 1 / height and abs((j + 0.5) / width - column) <= 1 / width
-
-
-def test_turning_the_lobes_turns_the_map():
-    light = lobe((0.3, 0.5, -0.8), 30.0)
-    rotation = Rotation.from_euler("xyz", [40, 65, -20], degrees=True).as_matrix()  # of the camera frame
-    expected = lat_long_of_lobes(light.turned(rotation), 64, 128)
-    found = turned_map(lat_long_of_lobes(light, 64, 128), YUP_FROM_CAMERA @ rotation @ YUP_FROM_CAMERA)
-    np.testing.assert_allclose(found, expected, atol=0.02 * expected.max())
-    np.testing.assert_allclose(map_energy(found), map_energy(expected), rtol=2e-3)
 
 
 def test_sampling_at_texel_centres_gives_the_texels_also_beyond_the_poles():

@@ -46,28 +46,10 @@ def test_the_table_says_what_it_was_made_from_and_how_good_it_is(folder, run, tm
     assert '"decay_deg"' in run(folder).output
 
 
-def test_one_map_cannot_be_checked_and_that_is_said(folder, run, tmp_path):
-    for name in "bc":
-        (folder / f"{name}.exr").unlink()
-    done = run(folder, "--out", tmp_path / "table.json")
-    assert done.exit_code == 0 and "one map" in done.output
-    assert read_light_prior(tmp_path / "table.json").leave_one_out is None
-
-
 def test_folders_that_hold_no_map_are_named(tmp_path, run):
     for place, said in ((tmp_path / "nowhere", "no such folder"), (tmp_path, "no .hdr or .exr")):
         done = run(place)
         assert done.exit_code == 2 and said in done.output and place.name in done.output
-
-
-@pytest.mark.parametrize("value, said", [(0, "black"), (np.nan, "1 pixels are no numbers")])
-def test_maps_that_tell_nothing_are_named(folder, value, said):
-    light = np.ones((16, 32, 3))
-    light[(3, 4, 1) if np.isnan(value) else ...] = value
-    write_rgb_exr(folder / "b.exr", light)
-    with pytest.raises(InputError, match=said) as error:
-        light_prior.prior_of(light_prior.maps_in([folder]), COUNT)
-    assert error.value.file == folder / "b.exr"
 
 
 def test_files_that_are_no_map_are_named(folder):

@@ -5,12 +5,11 @@ import numpy as np
 import pytest
 from scipy.optimize import approx_fprime
 from scipy.spatial.transform import Rotation
-from scipy.stats import multivariate_normal
 
 from factorlib.errors import InputError
 from factorlib.geometry.sphere import fibonacci_sphere
 from factorlib.light.prior import MIX, LightPrior, angles, read_light_prior
-from factorlib.light.prior_fit import _cost, cell_means, fitted, leave_one_out, log_cells, log_likelihood, rounded
+from factorlib.light.prior_fit import _cost, cell_means, fitted, log_cells, rounded
 
 KNOWN = LightPrior(
     variance=(1.5, 0.05, 0.1), decay_deg=(40.0, 30.0, 60.0), level=(100.0, 0.1, 0.04), nugget=(0.2, 0.01, 0.01),
@@ -74,56 +73,11 @@ def test_a_fit_finds_the_prior_that_maps_were_drawn_from():
     np.testing.assert_allclose(found.profile, KNOWN.profile, atol=0.15)
 
 
-def test_leave_one_out_prefers_the_true_kind_of_prior():
-    cells = fibonacci_sphere(40)
-    scores = leave_one_out(drawn(KNOWN, cells, 8), cells)
-    assert scores.prior > scores.white_noise + 10 and scores.prior > scores.no_profile
-
-
 def test_the_gradient_is_the_finite_difference():
     cells, t = fibonacci_sphere(30), np.log([0.5, 0.4, 0.3, 0.2, 3.0])
     design, values = np.ones((30, 1)), np.random.default_rng(0).standard_t(3, size=(6, 30))
     slope = approx_fprime(t, lambda t: _cost(t, angles(cells), design, values)[0], 1e-6)
     np.testing.assert_allclose(_cost(t, angles(cells), design, values)[1], slope, atol=1e-5)
-
-
-def test_the_likelihood_without_bounds_of_freedom_is_the_gaussian():
-    cells = fibonacci_sphere(20)
-    gaussian = msgspec.structs.replace(KNOWN, freedom=(1e9,) * 3)
-    logs = drawn(gaussian, cells, 4)
-    expected = sum(
-        multivariate_normal(gaussian.mean(cells, UP)[k], gaussian.covariance(k, cells)).logpdf(logs[k])
-        for k in range(3)
-    )
-    np.testing.assert_allclose(log_likelihood(gaussian, logs, cells, UP), expected, rtol=1e-5)
-
-
-def test_a_map_of_much_contrast_has_little_weight():
-    cells = fibonacci_sphere(40)
-    logs = drawn(msgspec.structs.replace(KNOWN, freedom=(1e4,) * 3), cells, 12)
-    before, logs[1:, 0] = fitted(logs, cells), 30 * logs[1:, 0]
-    after = fitted(logs, cells)
-    assert all(
-        after.variance[k] < 3 * before.variance[k] and after.freedom[k] < 0.1 * before.freedom[k] for k in (1, 2)
-    )
-
-
-def test_the_likelihood_is_highest_at_the_truth():
-    cells = fibonacci_sphere(60)
-    logs, changes = drawn(KNOWN, cells, 60), ({"variance": (3.0, 0.1, 0.2)}, {"decay_deg": (15.0,) * 3})
-    wrong = [(msgspec.structs.replace(KNOWN, **change), UP) for change in changes]
-    truth, *others = (log_likelihood(of, logs, cells, up).mean() for of, up in [(KNOWN, UP), *wrong, (KNOWN, None)])
-    assert all(other < truth for other in others)
-
-
-def test_brighter_maps_give_the_same_prior():
-    cells, rng = fibonacci_sphere(40), np.random.default_rng(0)
-    maps = np.exp(rng.normal(size=(4, 16, 32, 3)))
-    dim, bright = (
-        fitted(log_cells(np.stack([cell_means(scale * one, cells) for one in maps])), cells) for scale in (1e-4, 1e4)
-    )
-    for name in ("variance", "decay_deg", "level", "nugget", "profile"):
-        np.testing.assert_allclose(getattr(dim, name), getattr(bright, name), rtol=1e-3, atol=1e-4)
 
 
 def test_cells_hold_the_energy_of_the_map_and_dark_ones_are_floored():
@@ -152,14 +106,3 @@ def test_a_file_that_is_no_prior_says_so(tmp_path, text):
     (tmp_path / "table.json").write_text(text)
     with pytest.raises(InputError, match="table.json"):
         read_light_prior(tmp_path / "table.json")
-
-
-def test_a_light_of_twice_the_contrast_gets_four_times_the_covariance():
-    directions = fibonacci_sphere(150)
-    rng, fields = np.random.default_rng(3), []
-    for k in range(3):
-        root = np.linalg.cholesky(KNOWN.covariance(k, directions) + 1e-9 * np.eye(150))
-        fields.append((2.0 if k == 0 else 1.0) * root @ rng.normal(size=150))
-    prior = msgspec.structs.replace(KNOWN, freedom=(3.0, 3.0, 3.0))
-    factors = prior.likeliest_factors(directions, np.linalg.solve(MIX, fields), np.zeros((450, 450)))
-    assert factors[0] == pytest.approx(4, rel=0.3) and factors[1:] == pytest.approx([1, 1], rel=0.3)

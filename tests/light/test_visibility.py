@@ -61,20 +61,6 @@ def test_constant_light_is_seen_through_the_cosine_weighted_open_part_of_the_hem
 
 
 @PARTS
-@pytest.mark.parametrize("sharpness", [2.0, 20.0, 100.0])
-def test_few_directions_give_what_many_do(part, sharpness):
-    (normals, views), axis = points(), unit(25)
-    edge, found = unit(30) + normals, {}
-    for count in (512, 32768):
-        d = directions(count)
-        lobes = kernel(d, axis, torch.full((25,), sharpness).double())
-        weights = weights_of(part, normals, views, d)
-        found[count] = seen_share(behind(edge, d), weights, lobes), weights @ lobes
-    error, light = (found[512][0] - found[32768][0]).abs(), found[32768][1]
-    assert float((error * light).sum() / light.sum()) < 0.03
-
-
-@PARTS
 def test_turning_everything_changes_nothing(part):
     (normals, views), d, axis = points(), directions(), unit(9)
     sharpness, visibility = torch.full((9,), 30.0).double(), torch.from_numpy(RNG.random((30, 256)))

@@ -49,18 +49,6 @@ def test_flipped_faces_are_turned_back_unless_most_of_an_open_patch_is():
     assert is_open and not flip.any()
 
 
-def test_a_moebius_strip_is_left_as_it_is():
-    t = np.linspace(0, 2 * np.pi, 21)[:-1]
-    rim = [
-        np.stack([(2 + s * np.cos(t / 2)) * np.cos(t), (2 + s * np.cos(t / 2)) * np.sin(t), s * np.sin(t / 2)], axis=1)
-        for s in (-0.5, 0.5)
-    ]
-    a, b = np.arange(20), np.arange(20) + 20
-    a_next, b_next = np.r_[a[1:], b[0]], np.r_[b[1:], a[0]]
-    faces = np.concatenate([np.stack([a, a_next, b], axis=1), np.stack([b, a_next, b_next], axis=1)])
-    assert not consistently_wound(np.concatenate(rim), faces)[0].any()
-
-
 def test_supplied_normals_are_used_where_sane():
     ball = trimesh.creation.icosphere(subdivisions=1)
     exact = ball.vertices[ball.faces]
@@ -69,12 +57,3 @@ def test_supplied_normals_are_used_where_sane():
     own = corner_normals(ball.vertices, ball.faces, 60.0)
     merged = merged_normals(own, spoilt, ball.face_normals)
     assert np.allclose(merged[2:], exact[2:]) and np.allclose(merged[:2], own[:2])
-
-
-def test_many_faces_about_one_vertex():
-    n = 1500
-    angle = np.arange(n) * 2 * np.pi / n
-    vertices = np.concatenate([[[0, 0, 0.1]], np.stack([np.cos(angle), np.sin(angle), 0 * angle], axis=1)])
-    faces = np.stack([np.zeros(n, int), 1 + np.arange(n), 1 + (np.arange(n) + 1) % n], axis=1)
-    mesh = mesh_of(vertices, faces)
-    assert np.allclose(mesh.normals[np.argmax(mesh.vertices[:, 2])], (0, 0, 1), atol=1e-9)

@@ -13,7 +13,7 @@ from factorlib.model.materials import Point
 from factorlib.model.noise import Noise
 from factorlib.model.observed import blocks_of_observations
 from factorlib.model.problem import JointProblem
-from factorlib.urm.observations import Observations, concatenate
+from factorlib.urm.observations import Observations
 from studies.scenes.problems import MATERIALS
 from tests.model.made import OPERATOR, photos_in_a_wrong_light, seen_from_the_front
 
@@ -62,25 +62,6 @@ def test_a_bowl_in_constant_light_has_the_analytic_radiosity(albedo, depth):
     np.testing.assert_allclose(albedo * (open_share[:, None] + sent), seen.radiance, rtol=0.03)
 
 
-def test_facing_plates_of_red_and_white_bleed_and_keep_their_colours():
-    """Two plates that hide three quarters of the light from each other, in constant light 1, with all bounces."""
-    albedo, count, each = np.array([[0.8, 0.8, 0.8], [0.8, 0.1, 0.05]]), 1024, 30
-    open_, hidden = 0.25, 0.75  # of the cosine-weighted hemisphere: within 60° of a plate's normal lies the other plate
-    pairs = [([[1, -hidden * w], [-hidden * r, 1]], [w * open_, r * open_]) for w, r in albedo.T]
-    radiance = np.stack([np.linalg.solve(*pair) for pair in pairs], axis=1)
-    material, normal = np.repeat([0, 1], each), np.repeat([[1.0, 0, 0], [-1.0, 0, 0]], each, axis=0)
-    facing = normal @ fibonacci_sphere(count).T > 0.5
-    codes = np.repeat(met_codes(np.array([1, 0]), np.array([[-1.0, 0, 0], [1.0, 0, 0]])), each)[:, None]
-    how = {
-        "visibility": np.where(facing, 0, 255).astype(np.uint8),
-        "met": np.where(facing, codes, UNMET).astype(np.uint16),
-    }
-    seen = seen_from_the_front(normal, radiance[material], material, ("white", "red"), **how)
-    assert radiance[0, 0] > 1.2 * radiance[0, 1]  # the white plate looks red
-    sent = bounced_light(seen, seen.radiance)[:, :3]
-    np.testing.assert_allclose(seen.radiance / (open_ + sent), albedo[material], rtol=0.05)
-
-
 def test_nothing_hidden_sends_nothing_and_brighter_photos_send_more_in_their_own_unit_alike():
     seen, factor = bowl(0.5, size=20, count=256), 1e4
     open_ = msgspec.structs.replace(seen, visibility=np.full_like(seen.visibility, 255))
@@ -91,13 +72,6 @@ def test_nothing_hidden_sends_nothing_and_brighter_photos_send_more_in_their_own
     np.testing.assert_allclose(more, factor * sent, rtol=1e-5)
     one, other = (blocks_of_observations(photo, Noise())[0].bounced for photo in (seen, brighter))
     np.testing.assert_allclose(one, other, rtol=1e-5)
-
-
-def test_the_order_of_photos_changes_nothing():
-    photos = [bowl(albedo, size=20, count=256, name=name) for albedo, name in ((0.3, "a"), (0.8, "b"))]
-    one, other = (blocks_of_observations(concatenate(order), Noise()) for order in (photos, photos[::-1]))
-    for a, b in zip(one, other, strict=True):
-        np.testing.assert_array_equal(a.bounced, b.bounced)
 
 
 def test_what_interreflection_determines_the_gauge_leaves(given):

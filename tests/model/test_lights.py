@@ -6,7 +6,7 @@ import pytest
 from factorlib.light.lobes import Lobes
 from factorlib.model.illumination import Illumination
 from factorlib.model.lights import Light, even_cells
-from factorlib.solve.solve import SMALLEST, SPLIT, brightest, on_cells
+from factorlib.solve.solve import SMALLEST, SPLIT, brightest
 from studies.scenes.problems import MATERIALS, block
 from tests.solve.made import OPERATOR, drawn, on_even_cells
 
@@ -48,33 +48,6 @@ def test_a_smooth_light_stays_when_cells_split_and_when_theirs_split_again(share
         assert off[rough].std() < 0.01 and off[~rough].std() < ripple, (off[rough].std(), off[~rough].std())
 
 
-@pytest.mark.parametrize("scattered", [False, True])
-def test_split_cells_leave_no_dark_or_bright_spots(scattered):
-    """Of a constant light, at the most unfavourable direction and on average, split three times around one direction or here and there."""
-    light, rng = on_even_cells(np.zeros((3, 400))), np.random.default_rng(0)
-    for _ in range(3):
-        near = np.argsort(-light.axis @ [0.6, 0.0, 0.8])[: 100 if scattered else 24]
-        light = light.split(np.isin(np.arange(len(light)), rng.permutation(near)[:24]))
-        light = light.with_log_radiance(np.zeros((3, len(light))))
-    there = np.array([0.6, 0.0, 0.8]) + 0.4 * DIRECTIONS
-    radiance = shown(light, there / np.linalg.norm(there, axis=1, keepdims=True))
-    assert radiance.std() < 0.1 and radiance.min() > 0.45 and radiance.max() < 1.3
-
-
-def test_small_cells_stand_where_a_large_one_stood_with_its_radiance():
-    light, which = on_even_cells(drawn(0, 60)), np.arange(60) % 7 == 3
-    split, kept = light.split(which), (~which).sum()
-    for now, before in (([li.axis.T, li.sharpness, li.log_radiance] for li in (split, light)),):
-        for one, other in zip(now, before, strict=True):
-            np.testing.assert_allclose(one[..., :kept], other[..., ~which], rtol=1e-12)
-    parent = np.argmax(split.axis[kept:] @ light.axis.T, axis=1)
-    children = np.bincount(parent)[which]
-    assert set(parent) == set(np.flatnonzero(which)) and 3 <= children.min() and children.max() <= 5
-    np.testing.assert_allclose(split.sharpness[kept:], 4 * light.sharpness[parent], rtol=0.01)
-    np.testing.assert_allclose(split.log_radiance[:, kept:], light.log_radiance[:, parent], rtol=1e-12)
-    np.testing.assert_array_equal(split.axis, light.split(which).axis)
-
-
 def test_the_brightest_split_but_none_that_is_too_small():
     light = on_even_cells(drawn(1, 200))
     which = brightest(light)
@@ -83,11 +56,3 @@ def test_the_brightest_split_but_none_that_is_too_small():
         light = light.split(brightest(light))
     assert np.degrees(2 / np.sqrt(light.sharpness)).min() > SMALLEST
     assert brightest(on_even_cells(np.zeros((3, 12)))).all()
-
-
-@pytest.mark.parametrize("cells", [120, 200, 400])
-def test_other_cells_show_the_same_smooth_light(cells):
-    light = smooth(200)
-    other = on_cells(light, cells)
-    assert len(other) == cells and np.abs(np.log(shown(other) / shown(light))).mean() < 0.05
-    np.testing.assert_allclose(light.with_log_radiance(light.log_radiance).weight, light.weight, rtol=1e-12)

@@ -49,21 +49,6 @@ def test_a_clipped_channel_pulls_only_from_below(clipped):
     assert (above[block.clipped] == 0).all() and (below[block.clipped] < 0).all()
 
 
-def test_a_point_has_one_light_per_block(rooms):
-    problem, point = rooms
-    with pytest.raises(ValueError):
-        problem.radiance(point.restricted([0, 1]))
-
-
-def test_where_none_is_held_out_all_are_judged(rooms):
-    problem, point = rooms
-    everything = problem.with_none_held_out()
-    losses = np.concatenate(everything.held_out_losses(point))
-    assert len(losses) == sum(map(len, problem.blocks))
-    assert everything.held_out_loss(point) == pytest.approx(losses.mean())
-    assert len(np.concatenate(problem.held_out_losses(point))) == sum(int(b.held_out.sum()) for b in problem.blocks)
-
-
 def test_places_turn_into_the_frame_of_the_light_as_normals_do():
     seen, turn = bowls("room", rough_light(20)), np.linalg.qr(np.random.default_rng(0).normal(size=(3, 3)))[0]
     seen = msgspec.structs.replace(seen, place=2 * seen.normal)
@@ -83,12 +68,6 @@ def test_model_in_shadow_is_the_radiance_traced_in_bowls_by_brute_force(seed):
     both = (Illumination(b, light, MATERIALS, network).radiance() for b in (data, data.with_effects(False, False)))
     error, ignored = (np.sqrt(np.mean((found - data.radiance) ** 2)) for found in both)
     assert ignored > 0.15 * data.radiance.mean() and error < 0.2 * ignored
-
-
-def test_nothing_hidden_is_nothing_computed():
-    seen = bowls("room", rough_light(3), size=8)
-    open_ = msgspec.structs.replace(seen, visibility=np.full_like(seen.visibility, 255))
-    assert blocks_of_observations(open_, Noise())[0].visibility is None
 
 
 # ── what is linked, and the gauge ────────────────────────────────────────────────────────────────────────────────────

@@ -11,7 +11,7 @@ from factorlib.model.illumination import Illumination
 from factorlib.model.lights import UnitLobes, even_cells
 from factorlib.model.loss import Loss
 from factorlib.model.materials import Materials
-from factorlib.model.responses import NODES, Reflections, diffuse_response, lagrange, specular_response
+from factorlib.model.responses import NODES, Reflections, diffuse_response, specular_response
 from studies.scenes.problems import MATERIALS, block
 from tests.solve.made import OPERATOR, drawn, on_even_cells
 
@@ -149,14 +149,6 @@ def test_outliers_and_temperature_are_factors_on_residual_and_derivatives():
         np.testing.assert_allclose(b.residual, factor * a.residual, rtol=1e-4, atol=1e-6)
 
 
-def test_roughness_moves_residuals_by_the_sum_over_cells():
-    one = made(5)
-    for part in one.linearise(one.shown(), ALL):
-        np.testing.assert_allclose(
-            part.by_roughness.sum(1), part.by_material[:, 2], rtol=1e-3, atol=1e-4 * np.abs(part.by_material).max()
-        )
-
-
 @pytest.mark.parametrize("sharpness", [None, 500.0])  # None: of the cells; 500: every node is needed
 def test_responses_between_nodes_are_those_of_the_operator(sharpness):
     data = block("room", on_even_cells(drawn(0, CELLS)), MATERIALS, [0, 1, 2], OPERATOR, size=10)
@@ -173,19 +165,3 @@ def test_responses_between_nodes_are_those_of_the_operator(sharpness):
     step = 1e-3
     slope = (table.at(1, 0.28 + step).specular - table.at(1, 0.28 - step).specular) / (2 * step)
     assert np.allclose(table.at(1, 0.28).by_roughness, slope, rtol=0.02, atol=1e-3 * np.abs(slope).max())
-
-
-def test_a_cubic_is_interpolated_exactly():
-    nodes, x = np.array([-1.0, 0.3, 0.9, 2.0]), 0.55
-    value, slope = lagrange(nodes, x)
-    cubic = np.polynomial.Polynomial([1.0, -2.0, 0.5, 0.7])
-    assert value @ cubic(nodes) == pytest.approx(cubic(x)) and slope @ cubic(nodes) == pytest.approx(cubic.deriv()(x))
-
-
-def test_what_the_table_has_forgotten_it_computes_again():
-    data = block("room", on_even_cells(drawn(0, CELLS)), MATERIALS, [0, 1, 2], OPERATOR, size=8)
-    table = Reflections(data, even_cells(CELLS), OPERATOR)
-    first = table.at(1, 0.12).specular
-    for roughness in np.linspace(0.1, 1, 15):
-        table.at(1, float(roughness))
-    np.testing.assert_array_equal(table.at(1, 0.12).specular, first)

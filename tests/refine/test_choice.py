@@ -42,12 +42,6 @@ def test_a_pose_gives_way_only_to_one_that_is_surely_better(others, chosen, rule
     assert settled.chosen == chosen and settled.ruled_out is ruled_out
 
 
-def test_the_order_of_candidates_is_no_matter():
-    others = [one("moved", 0.1), one("runner_up", 0.3)]
-    chosen = [choice_of([FOUND, *each], STANDARDS).chosen for each in (others, others[::-1])]
-    assert chosen == ["runner_up", "runner_up"]
-
-
 def test_a_gain_is_as_sure_as_its_cells_agree_in_both_directions():
     before = np.full(20, 20.0)
     assert gain_of(before, 0.7 * before) == pytest.approx((0.3, 0.0), abs=1e-12)

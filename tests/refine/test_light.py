@@ -6,7 +6,7 @@ import msgspec
 import numpy as np
 
 from factorlib.refine.descent import projected_equations
-from factorlib.refine.light import Surfaces, pursued_light, together, with_weights
+from factorlib.refine.light import Surfaces, pursued_light, with_weights
 from factorlib.reflection import reflection_operator
 from studies.scenes.problems import MATERIALS, block, random_light
 
@@ -36,10 +36,6 @@ def test_a_pursued_light_explains_a_light_it_knows_nothing_of_and_what_is_held_o
     assert np.array_equal(lights[0].weight, lights[1].weight)
     fitted, held_out = (residuals(lights[0])[rows] for rows in (~SHOWN.held_out, SHOWN.held_out))
     assert np.sqrt(np.mean(fitted**2)) < 1 and np.sqrt(np.mean(held_out**2)) < 1.5
-
-
-def test_together_holds_every_lobe():
-    assert len(together([LIGHT, LIGHT])) == 2 * len(LIGHT)
 
 
 def test_a_pose_sees_nothing_that_the_light_explains():

@@ -10,7 +10,7 @@ from factorlib.align.refine import FocalPrior
 from factorlib.align.silhouette import Silhouette
 from factorlib.refine.light import Surfaces
 from factorlib.refine.photo import PosedObject, Scene, refined_photo
-from factorlib.refine.pixels import View, pixels_of
+from factorlib.refine.pixels import pixels_of
 from factorlib.reflection import reflection_operator
 from studies.scenes.posed import KINDS, TRUE, normal_error, photographed, refined_of
 
@@ -65,11 +65,3 @@ def test_pixels_are_of_known_materials_and_held_out_by_whole_cells():
     assert 0.1 < pixels.held_out.mean() < 0.5 and pixels_of(photo.channels, [False] * 3, 500) is None
     clipped = {**photo.channels, "clipped.G": np.ones(label.shape)}
     assert (pixels_of(clipped, [True] * 3, 500).precision[:, 1] == 0).all()
-
-
-def test_pixels_show_the_true_mesh_at_the_true_pose():
-    photo = photo_of("as found", 1)
-    pixels = pixels_of(photo.channels, [True] * 3, 500)
-    seen = View(pixels, [photo.caster], [True]).seen(photo.camera, [photo.truth])
-    assert seen.agrees.mean() > 0.95
-    assert not View(pixels, [photo.caster], [False]).seen(photo.camera, [photo.truth]).agrees.any()

@@ -1,6 +1,5 @@
 """Laws that every operator obeys, errors of the fast ones against the reference, and the compiled networks against torch."""
 
-import math
 import os
 import platform
 import shutil
@@ -11,7 +10,7 @@ import torch
 
 from factorlib.errors import InputError
 from factorlib.reflection import fused, reflection_operator
-from factorlib.reflection.lobe import lobe_integral, lobe_moments
+from factorlib.reflection.lobe import lobe_integral
 from factorlib.reflection.network import FEATURES, SHIPPED, Layers, read_layers, write_layers
 from factorlib.reflection.operator import Operator
 from factorlib.reflection.reference import diffuse_quadrature
@@ -107,19 +106,6 @@ def test_gradients_are_those_of_the_reference(name):
 
 
 @own
-@pytest.mark.parametrize("dtype", ["float32", "float64"])
-def test_response_of_many_is_that_of_each(name, dtype):
-    operator, g = FAST[name, dtype], torch.Generator().manual_seed(1)
-    no, lam = torch.rand(3000, generator=g).to(operator.dtype), torch.logspace(-1, 3, 9, dtype=operator.dtype)
-    nz, oz = (2 * torch.rand(3000, 9, generator=g).to(operator.dtype) - 1 for _ in range(2))
-    roughness, last = torch.tensor(0.4, dtype=operator.dtype), slice(-7, None)
-    whole = operator.response(roughness, lam, no, nz, oz)
-    part = operator.response(roughness, lam, no[last], nz[last], oz[last])
-    for name in whole.__struct_fields__:
-        torch.testing.assert_close(getattr(whole, name)[-7:], getattr(part, name), rtol=2e-3, atol=1e-4)
-
-
-@own
 def test_diffuse_is_exact_to_a_thousandth_of_the_peak_in_float32(name):
     """Half the 0.15 % that Tokuyoshi et al. (2024) reach."""
     lam, nz = torch.logspace(-3, 6, 40).double(), torch.linspace(-1, 1, 101).double()
@@ -144,27 +130,6 @@ def test_errors_of_the_closed_form_and_the_shipped_networks():
     # on 16,384 others: specular 1.3 % (median), 9.2 % (95th percentile); diffuse 1.0 %, 7.1 %
     assert glossy["paper_network"]["median"] < 0.018 and glossy["paper_network"]["p95"] < 0.14
     assert matte["paper_network"]["median"] < 0.014 and matte["paper_network"]["p95"] < 0.1
-
-
-def test_moments_of_a_lobe():
-    lam = torch.tensor([0.01, 1.0, 30.0, 1e4], dtype=torch.float64)
-    t = torch.cos(torch.linspace(0, math.pi, 2_000_001, dtype=torch.float64))
-    for k, sharpness in enumerate(lam):
-        weight = torch.exp(sharpness * (t - 1)) * torch.sqrt(1 - t * t)
-        mean = (weight * t).sum() / weight.sum()
-        mean_square = (weight * t * t).sum() / weight.sum()
-        expected = mean, (weight * (t - mean) ** 2).sum() / weight.sum(), (1 - mean_square) / 2
-        assert [m[k].item() for m in lobe_moments(lam)] == pytest.approx([e.item() for e in expected], rel=1e-4)
-        assert lobe_integral(lam)[k].item() == pytest.approx(
-            2 * math.pi * (weight.sum() * math.pi / 2_000_000).item(), rel=1e-4
-        )
-
-
-def test_unknown_names_say_what_is_known_and_weights_that_are_not_there_are_named(tmp_path):
-    with pytest.raises(InputError, match="no reflection operator 'netwrok'"):
-        reflection_operator("netwrok")
-    with pytest.raises(InputError, match="no weights"):
-        reflection_operator("network", weights=tmp_path)
 
 
 def test_weights_of_another_version_are_refused(tmp_path):
@@ -194,37 +159,11 @@ def test_compiled_response_is_that_of_torch(roughness):
         assert error.max() < 1e-2, field
 
 
-@compiler
-def test_the_value_alone_is_that_of_the_response_and_without_lobes_or_points_there_is_nothing():
-    operator, point = reflection_operator("network"), grid(0.3, torch.float32, rows=77)
-    response = operator.response(*point)
-    torch.testing.assert_close(operator.specular(*point), response.specular, rtol=1e-4, atol=1e-7)
-    torch.testing.assert_close(operator.diffuse(point[1], point[3]), response.diffuse, rtol=1e-4, atol=1e-7)
-    for lobes, points in ((0, 3), (2, 0)):
-        none = torch.ones(points, lobes)
-        response = operator.response(torch.tensor(0.5), torch.ones(lobes), torch.ones(points), none, none)
-        assert response.specular.shape == response.diffuse.shape == (points, lobes)
-
-
 def test_without_a_compiler_torch_computes_the_same(monkeypatch):
     monkeypatch.setenv("FACTORLIB_FUSED", "0")
     operator = reflection_operator("network")
     assert not operator.fused
     assert operator.response(*grid(0.5, torch.float32)).specular.isfinite().all()
-
-
-def test_a_compiler_that_fails_is_said_and_torch_is_not_taken_instead(monkeypatch, tmp_path):
-    """Which form runs is in the keys of steps: a form that nobody asked for would be kept as the other."""
-    compiler = tmp_path / "cc"
-    compiler.write_text('#!/bin/sh\ntest "$1" = --version || { echo out of order >&2; exit 1; }\n')
-    compiler.chmod(0o755)
-    monkeypatch.setenv("CC", str(compiler))
-    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
-    fused.compiled.cache_clear()
-    with pytest.raises(InputError, match="out of order") as caught:
-        reflection_operator("network")
-    assert "FACTORLIB_FUSED=0" in caught.value.cure
-    fused.compiled.cache_clear()
 
 
 @compiler

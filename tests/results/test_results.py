@@ -58,11 +58,6 @@ def test_what_is_written_is_read_back_and_another_version_or_what_is_none_is_ref
         assert caught.value.key == "version" or words == name
 
 
-def test_a_photo_may_be_called_version(tmp_path):
-    write_json(tmp_path / "poses.json", {"version": HALL})
-    assert read_poses(tmp_path / "poses.json") == {"version": HALL}
-
-
 @pytest.mark.parametrize("old, new, words, key", [
     ('"roughness": 0.3', '"roughness": 1.3', "<= 1", "roughness"),
     ('"roughness": 0.3', '"rough": 0.3', "missing required field `roughness`", "materials"),
@@ -81,13 +76,6 @@ def test_a_missing_material_is_named(tmp_path):
     assert in_order(TABLE, ["red"], tmp_path) == [RED]
     with pytest.raises(InputError, match="'blue' is missing"):
         in_order(TABLE, ["red", "blue"], tmp_path)
-
-
-def test_an_exposure_of_nothing_is_refused(tmp_path):
-    write_json(tmp_path / "exposures.json", {"hall": (1.0, 0.0, 1.0)})
-    with pytest.raises(InputError, match="not a positive number") as caught:
-        read_exposures(tmp_path / "exposures.json")
-    assert caught.value.key == "hall"
 
 
 def test_a_mirrored_pose_is_refused(tmp_path):

@@ -1,6 +1,5 @@
 """Nodes under pixels: they are where the pixel's ray meets the mesh, in the frame of the object's pose, whichever side is seen."""
 
-import msgspec
 import numpy as np
 import trimesh
 
@@ -51,16 +50,3 @@ def test_pixels_of_two_objects_know_their_nodes_and_their_pose():
         if name == "apple":  # whose axes are as they were
             np.testing.assert_allclose(at.frame[rows], np.broadcast_to(pose.rotation, (rows.sum(), 3, 3)))
     assert not at.share[maps.object[y, x] == 0].any()
-
-
-def test_a_surface_that_is_seen_from_behind_turns_the_other_way():
-    pose = Pose(np.eye(3), np.array([0, 0, 5.0]))
-    front = ball()
-    behind = msgspec.structs.replace(front, faces=front.faces[:, ::-1].copy())
-    pixel, shown = np.array([[30, 25]]), np.array([1])
-    frames = []
-    for mesh in (front, behind):
-        surfaces = Surfaces({"m": fine(mesh)})
-        frames.append(attached_pixels(pixel, shown, CAMERA, {"o": ("m", entry(pose))}, surfaces).frame[0])
-    np.testing.assert_allclose(frames[0], np.eye(3))
-    np.testing.assert_allclose(frames[1], -np.eye(3))

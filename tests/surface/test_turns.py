@@ -14,7 +14,7 @@ from factorlib.solve.fit import ROBUST, Hyperparameters, field_of
 from factorlib.solve.start import from_nothing
 from factorlib.surface import turns
 from factorlib.surface.choice import Found, Surfaces, found
-from factorlib.surface.turns import GRAZING, MOST, PULL, Attached, Detail, Stiffness, joined, no_detail, part_of, step
+from factorlib.surface.turns import GRAZING, MOST, PULL, Attached, Detail, Stiffness, part_of, step
 from studies.scenes.problems import MATERIALS
 from tests.model.made import photos_in_a_wrong_light
 from tests.solve.made import PRIOR, begun, drawn, on_even_cells, photographed, spheres
@@ -120,30 +120,6 @@ def test_a_step_is_that_of_the_dense_system_of_detail_and_lights(stiffness, monk
     assert np.array_equal(given[~free], before[~free])
 
 
-def test_nodes_that_may_not_move_keep_their_turn():
-    problem, _, body = *photographed(2, 2, size=9), surfaces(1)
-    problem = with_wrong_normals(problem, 0.1)
-    parts = [
-        part_of(one, COUNTS, PRIOR, attached_to(one.block.normal, body), body.nodes)
-        for one in problem.illuminations(begun(problem).point)
-    ]
-    moving = np.arange(body.nodes) % 2 == 0
-    after = step(parts, body.laplacian(), Stiffness(50.0), no_detail(body.nodes), moving)
-    assert after.turn[moving].any(axis=1).all() and not after.turn[~moving].any()
-
-
-def test_a_light_without_some_observations_is_that_light_linearised_without_them():
-    one, body = photos_in_a_wrong_light("bounced", curves=True), surfaces(1)
-    at, gone = attached_to(one.block.normal, body), one.block.photo == 1
-    given = part_of(one, COUNTS, PRIOR, at, body.nodes).without(gone)
-    rest = msgspec.structs.replace(one, block=one.block.take(~gone))
-    expected = part_of(rest, COUNTS, PRIOR, at.take(~gone), body.nodes)
-    np.testing.assert_allclose(given.slopes.toarray(), expected.slopes.toarray(), atol=1e-5)
-    scale = np.abs(expected.hessian).max()
-    np.testing.assert_allclose(given.hessian / scale, expected.hessian / scale, atol=1e-5)
-    np.testing.assert_allclose(given.unexplained, expected.unexplained, atol=1e-2 * np.abs(expected.unexplained).max())
-
-
 def test_turned_normals_are_unit_bounded_and_never_leave_the_viewer():
     random, body = np.random.default_rng(0), surfaces()
     normal = random.normal(size=(500, 3))
@@ -158,16 +134,6 @@ def test_turned_normals_are_unit_bounded_and_never_leave_the_viewer():
     np.testing.assert_allclose(at.turned(normal, view, np.zeros((body.nodes, 3))), normal)
     nowhere = msgspec.structs.replace(at, share=np.zeros_like(at.share))
     np.testing.assert_allclose(nowhere.turned(normal, view, np.ones((body.nodes, 3))), normal)
-
-
-def test_turns_do_not_depend_on_the_frame():
-    random, body = np.random.default_rng(1), surfaces()
-    normal = random.normal(size=(50, 3))
-    normal /= np.linalg.norm(normal, axis=1, keepdims=True)
-    at, turn = attached_to(normal, body), 0.1 * random.normal(size=(body.nodes, 3))
-    R = np.linalg.qr(random.normal(size=(3, 3)))[0]
-    after = at.in_frame(R).turned(normal @ R.T, normal @ R.T, turn)
-    np.testing.assert_allclose(after, at.turned(normal, normal, turn) @ R.T, atol=1e-12)
 
 
 def on_spheres(lights: int, size: float, seed: int = 0) -> tuple[Found, Surfaces, JointProblem, JointProblem]:
@@ -243,27 +209,3 @@ def test_patina_is_found_in_three_lights_and_is_not_taken_for_dents():
     assert what.painted.kept
     seen = np.bincount(np.concatenate([of.node.reshape(-1) for of in at]), minlength=body.nodes) > 0
     assert np.corrcoef(what.log_factors["ball"][seen], log_factor[seen])[0, 1] > 0.8
-
-
-def test_one_photo_alone_decides_nothing():
-    what = on_spheres(1, 0.15)[0]
-    assert not what.evidence.kept and not what.displacements
-
-
-def test_an_exact_mesh_stays_as_it_is_or_nearly():
-    what, body, given, true = on_spheres(3, 0.0)
-    assert not what.painted.kept
-    if what.evidence.kept:
-        turn = body.turns_of(what.displacements)
-        for block in given.blocks:
-            after = attached_to(block.normal, body).turned(block.normal, block.view, turn)
-            assert errors(after, block.normal) < 0.5
-
-
-def test_observations_of_several_photos_are_joined_in_order():
-    body = surfaces()
-    normal = np.eye(3)
-    one, other = attached_to(normal[:1], body), attached_to(normal[1:], body)
-    both = joined([one, other])
-    assert np.array_equal(both.node, attached_to(normal, body).node)
-    assert np.array_equal(both.take(np.array([2])).frame, other.frame[1:])

@@ -4,11 +4,10 @@ import msgspec
 import numpy as np
 import pytest
 
-from factorlib.conventions import FRONT
 from factorlib.errors import InputError
 from factorlib.geometry.met import BINS, UNMET
 from factorlib.urm.extract import Taken, observations_of_photo
-from factorlib.urm.merge import groups, merge
+from factorlib.urm.merge import merge
 from factorlib.urm.observations import (
     COLUMNS,
     OPTIONAL,
@@ -19,7 +18,7 @@ from factorlib.urm.observations import (
     relative_exposures,
     write_observations,
 )
-from factorlib.urm.sample import sample, strata
+from factorlib.urm.sample import sample
 
 
 def photo_and_geometry(size=64):
@@ -59,12 +58,6 @@ def test_what_faces_away_or_grazes_is_not_observed():
     assert (np.sum(seen.normal * seen.view, -1) > 0.05).all()
 
 
-def test_half_of_a_normal_facing_the_viewer_is_the_front():
-    seen = observations()
-    middle = np.argmax(seen.normal @ FRONT)
-    np.testing.assert_allclose(seen.half[middle], FRONT, atol=0.05)
-
-
 def with_columns(name="kitchen", count=64):
     """Observations with every column that need not be there; what hides directions is of material 0 or 1."""
     seen, random = observations(name, name), np.random.default_rng(0)
@@ -89,12 +82,6 @@ def test_parquet_gives_back_what_was_written_and_the_same_bytes(tmp_path, make):
     assert (again.materials, again.photos, again.exposures) == (("red", "white"), ("kitchen",), known)
 
 
-def test_a_file_that_is_no_reflectance_map_is_refused(tmp_path):
-    (tmp_path / "x.parquet").write_bytes(b"PAR1 nonsense")
-    with pytest.raises(InputError, match="not readable as a reflectance map"):
-        read_observations(tmp_path / "x.parquet")
-
-
 @pytest.mark.parametrize("key, change", [
     ("'confidence' is not between 0 and 1", lambda seen: {"confidence": seen.confidence + 0.5}),
     ("'confidence' is not between 0 and 1", lambda seen: {"confidence": seen.confidence * np.nan}),
@@ -106,26 +93,6 @@ def test_values_that_mean_nothing_are_refused(tmp_path, key, change):
     write_observations(tmp_path / "a.parquet", msgspec.structs.replace(seen, **change(seen)))
     with pytest.raises(InputError, match=key):
         read_observations(tmp_path / "a.parquet")
-
-
-def test_photos_that_do_not_say_see_all_and_are_sure():
-    part, plain = with_columns("a"), msgspec.structs.replace(observations("b", "b"), confidence=None)
-    both = concatenate([part, plain])
-    np.testing.assert_array_equal(both.visibility[both.photo == 0], part.visibility)
-    of_plain = both.photo == 1
-    assert (both.visibility[of_plain] == 255).all() and (both.met[of_plain] == UNMET).all()
-    assert (both.confidence[of_plain] == 1).all() and both.exposures == (2.0, None)
-    with pytest.raises(InputError, match="64, 128"):
-        concatenate([part, with_columns("b", count=128)])
-
-
-def test_the_order_of_photos_changes_nothing():
-    a, b = observations("a", "room"), observations("b", "garden")
-    one, other = concatenate([a, b]), concatenate([b, a])
-    assert one.illuminations == ("garden", "room")
-    for name in COLUMNS:
-        np.testing.assert_array_equal(getattr(one, name), getattr(other, name))
-    assert [one.illuminations[i] for i in one.illumination[one.photo == 0][:1]] == ["room"]
 
 
 @pytest.mark.parametrize("degrees", [3.0, 10.0])
@@ -162,22 +129,6 @@ def test_merging_never_mixes_clipped_with_unclipped():
     np.testing.assert_allclose(kept, seen.weight[seen.clipped[:, 0]].sum(), rtol=1e-5)
 
 
-def test_merging_nothing_is_the_identity():
-    seen = observations()
-    assert merge(seen, 0.0) is seen
-
-
-@pytest.mark.parametrize("largest", [1, 7, 3 * 10**8], ids=["one value", "few", "too many for one number"])
-def test_groups_are_those_of_unique_rows(largest):
-    rng = np.random.default_rng(0)
-    keys = rng.integers(-largest, largest, (500, 4))
-    keys = np.vstack([keys, keys[::3]])[rng.permutation(667)]
-    _, first, group = np.unique(keys, axis=0, return_index=True, return_inverse=True)
-    found_first, found_group = groups(keys)
-    np.testing.assert_array_equal(found_first, first)
-    np.testing.assert_array_equal(found_group, group.reshape(-1))
-
-
 def exposed(name, illumination, exposure):
     return msgspec.structs.replace(observations(name, illumination), exposures=(exposure,))
 
@@ -190,19 +141,6 @@ def test_photos_of_one_light_are_brought_to_the_exposure_of_its_first():
     of_c = seen.photo == seen.photos.index("c")
     np.testing.assert_allclose(same.radiance[of_c], seen.radiance[of_c] / 4)
     np.testing.assert_array_equal(same.radiance[~of_c], seen.radiance[~of_c])
-
-
-def test_one_photo_that_does_not_say_leaves_the_light_as_it_is():
-    seen = concatenate([exposed("a", "room", 2.0), exposed("b", "room", None), exposed("c", "room", 4.0)])
-    relative = relative_exposures(seen)
-    assert set(relative.values()) == {1.0}
-    assert at_one_exposure(seen, relative) is seen
-
-
-def test_an_exposure_that_is_unknown_leaves_no_trace_in_a_file(tmp_path):
-    for name, exposures in (("a", (None,)), ("b", ())):
-        write_observations(tmp_path / name, msgspec.structs.replace(observations("a", "room"), exposures=exposures))
-    assert (tmp_path / "a").read_bytes() == (tmp_path / "b").read_bytes()
 
 
 def many(n: int = 20_000, seed: int = 0) -> Observations:
@@ -225,16 +163,6 @@ def many(n: int = 20_000, seed: int = 0) -> Observations:
     )  # fmt: skip
 
 
-def test_no_more_than_that_many_are_no_sample():
-    seen = many(2000)
-    assert sample(seen, 2000) is seen and sample(seen, 10**9) is seen
-
-
-@pytest.mark.parametrize("most", [5000, 1500, 100])
-def test_there_are_as_many_as_asked_for(most):
-    assert len(sample(many(), most)) == most
-
-
 def test_weights_keep_their_sum_in_every_stratum_and_in_all():
     seen = many()
     kept = sample(seen, 3000)
@@ -253,42 +181,3 @@ def test_rare_normals_are_all_kept_and_the_flat_seat_is_thinned():
     flat = [np.abs(s.normal - np.float32([0, -0.6, -0.8])).max(1) < 1e-6 for s in (seen, kept)]
     assert (~flat[1]).sum() == (~flat[0]).sum() == 1000
     assert flat[1].sum() <= 2000 and (kept.weight[~flat[1]] == seen.weight[~flat[0]]).all()
-
-
-def test_the_sample_is_spread_over_the_picture_and_the_same_each_time():
-    seen = many()
-    kept, again = sample(seen, 3000), sample(many(), 3000)
-    for name in COLUMNS:
-        np.testing.assert_array_equal(getattr(kept, name), getattr(again, name))
-    assert (np.diff(kept.y * 200 + kept.x) > 0).all(), "in row order"
-    share = np.histogram(kept.y, 10, (0, 100))[0] / len(kept)
-    assert share.min() > 0.08 and share.max() < 0.12
-
-
-def test_the_mean_of_a_stratum_is_kept_within_its_noise():
-    seen = many()
-    kept = sample(seen, 3000)
-    group, small = strata(seen, 3000), strata(kept, 3000)
-    most = np.bincount(group).argmax()
-    means = [
-        np.average(s.radiance[g == n], axis=0, weights=s.weight[g == n])
-        for s, g, n in ((seen, group, most), (kept, small, np.bincount(small).argmax()))
-    ]
-    np.testing.assert_allclose(*means, atol=0.04)
-
-
-def test_names_exposures_and_the_rest_stay():
-    visibility = np.random.default_rng(1).integers(0, 256, (20_000, 8)).astype(np.uint8)
-    seen = msgspec.structs.replace(many(), visibility=visibility)
-    kept = sample(seen, 3000)
-    assert (kept.materials, kept.photos, kept.exposures) == (seen.materials, seen.photos, seen.exposures)
-    row = kept.y * 200 + kept.x
-    for name in ("visibility", "radiance"):
-        np.testing.assert_array_equal(getattr(kept, name), getattr(seen, name)[row])
-
-
-def test_a_sampled_ball_merges_to_what_the_whole_ball_merges_to():
-    seen = observations()
-    whole, part = merge(seen, 20.0), merge(sample(seen, len(seen) // 2), 20.0)
-    assert part.weight.sum(dtype=float) == pytest.approx(whole.weight.sum(dtype=float), rel=1e-5)
-    assert len(part) > 0.9 * len(whole)
