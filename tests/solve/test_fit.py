@@ -68,6 +68,15 @@ def test_a_fit_lowers_its_value(solved):
         assert fitted(problem, found, PRIOR, step).value <= before + 1e-9 * abs(before)
 
 
+def test_what_starts_nil_is_found_too():
+    """By logarithms nothing would move it."""
+    problem, _ = photographed(8, 2, size=12)
+    nil = Materials(np.full((3, 3), 1e-5), np.full((3, 3), 0.1), np.full(3, 0.4))
+    nil.diffuse[0] = 0.5
+    found = materials_in(problem, start=nil).point.materials
+    assert (found.diffuse[1] / found.diffuse[0] > 0.2 * MATERIALS.diffuse[1] / MATERIALS.diffuse[0]).all()
+
+
 def test_lights_from_the_observations_that_they_were_found_from_stay(solved):
     problem, _, found = solved
     again = fitted(problem, found, PRIOR, LIGHTS)
