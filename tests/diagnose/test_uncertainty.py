@@ -5,7 +5,6 @@ import numpy as np
 import pytest
 
 from factorlib.conventions import YUP_FROM_CAMERA, lat_long_directions
-from factorlib.diagnose import uncertainty
 from factorlib.diagnose.identifiability import tinted_alike
 from factorlib.diagnose.uncertainty import (
     LARGEST,
@@ -117,19 +116,6 @@ def test_lights_lie_within_their_standard_errors(fit):
     maps = posterior.relative_standard_errors()
     assert set(maps) == {"room0", "room1", "room2"}
     assert all(((m > 0) & (m <= LARGEST)).all() and np.isfinite(m).all() for m in maps.values())
-
-
-def test_fewer_observations_tell_less_and_cells_that_have_split_have_maps_too(fit, monkeypatch):
-    """The model's own error aside, which goes with the residuals."""
-    monkeypatch.setattr(uncertainty, "LIGHT_ERROR", 0.0)
-    problem, _, found, errors = fit
-    few = Posterior(problem.sampled(60, 0), found, PRIOR)
-    assert np.mean(few.standard_errors().materials.vector() > errors.materials.vector()) > 0.8
-    lights = [light.split(light.weight[:, 1] > np.quantile(light.weight[:, 1], 0.95)) for light in found.point.lights]
-    split = Posterior(problem, found.with_lights(lights), PRIOR)
-    one, of_few, other = (p.relative_standard_errors()["room0"] for p in (Posterior(problem, found, PRIOR), few, split))
-    assert of_few.mean() > one.mean()
-    assert other.shape == one.shape and np.isfinite(other).all() and 0.7 < other.mean() / one.mean() < 1.5
 
 
 # ── what is said of the lights' colour ──────────────────────────────────────────────────────────────────────────────

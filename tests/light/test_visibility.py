@@ -58,17 +58,3 @@ def test_constant_light_is_seen_through_the_cosine_weighted_open_part_of_the_hem
     edge = torch.cos(tilt) * normals + torch.sin(tilt) * across / across.norm(dim=1, keepdim=True)
     share = seen_share(behind(edge, d), cosine_weights(normals, d), kernel(d, unit(1), torch.tensor([1e-3]).double()))
     np.testing.assert_allclose(share, (1 + torch.cos(tilt)) / 2, atol=0.02)
-
-
-@PARTS
-def test_turning_everything_changes_nothing(part):
-    (normals, views), d, axis = points(), directions(), unit(9)
-    sharpness, visibility = torch.full((9,), 30.0).double(), torch.from_numpy(RNG.random((30, 256)))
-    turn = torch.linalg.qr(torch.from_numpy(RNG.normal(size=(3, 3))))[0]
-    one, other = (
-        seen_share(
-            visibility, weights_of(part, normals @ t.T, views @ t.T, d @ t.T), kernel(d @ t.T, axis @ t.T, sharpness)
-        )
-        for t in (torch.eye(3).double(), turn)
-    )
-    np.testing.assert_allclose(one, other, rtol=1e-9)

@@ -113,6 +113,19 @@ def test_a_material_nobody_knows_stands_beside_the_known_ones():
     explained(known, materials, found)
 
 
+def test_a_photo_new_to_a_light_gets_its_exposure_even_where_it_comes_first():
+    blocks, lights = truth(0, photos=3)
+    earlier = written(blocks, MATERIALS, lights)
+    new, *others = blocks[0].photos
+    factor = earlier.exposures[others[0]][0]
+    relative = {photo: tuple(np.array(earlier.exposures[photo]) / factor) for photo in others}
+    lobes = {name: light.scaled(factor) for name, light in earlier.lights.items()}  # as it was without `new`
+    earlier = msgspec.structs.replace(earlier, exposures=relative, lights=lobes)
+    materials, (light,) = start_from(earlier, blocks)
+    np.testing.assert_allclose(light.log_exposure, lights[0].log_exposure, atol=0.02)
+    explained(blocks, materials, [light], atol=0.02)
+
+
 def test_a_light_that_is_no_longer_so_starts_anew_and_is_named(caplog):
     blocks, lights = truth(0, 1)
     turned = [msgspec.structs.replace(lights[0], axis=-lights[0].axis, weight=lights[0].weight ** 2), lights[1]]

@@ -81,7 +81,6 @@ ONE, TWO, BLACK = THREE[[1]], THREE[[1, 2]], THREE * [[*[0] * 6, 1], [1] * 7, [1
 LAMBERTIAN = TWO * [1, 1, 1, 0, 0, 0, 1]
 RED, GREEN = (f"roughness of material '{name}' cannot be determined" for name in NAMES[:2])
 CASES = {  # what is observed; bounds of the errors of reflectance and roughness, None where it cannot be determined; what is said
-    "ordinary": (lambda: observed(TWO), 0.0043, 0.022, ()),
     "1 material × 1 light": (lambda: observed(ONE, ROOMS[:1]), 0.025, 0.02, ("by convention only, and a smooth material",)),
     "flat objects": (lambda: observed(TWO, normals=FLAT), None, None, ("'red' is flat", "'green' is flat", RED)),
     "all Lambertian": (lambda: observed(LAMBERTIAN), 0.0049, None, (RED, GREEN)),
