@@ -114,7 +114,7 @@ def test_merging_takes_weighted_means_and_the_codes_of_the_first():
     seen = with_columns()
     seen = msgspec.structs.replace(seen, weight=np.random.default_rng(0).uniform(0.1, 1, len(seen)).astype("f4"))
     merged = merge(seen, 8.0)
-    for name, tolerance in (("visibility", 2e-3), ("confidence", 1e-5)):
+    for name, tolerance in (("visibility", 2e-3), ("confidence", 1e-5), ("radiance", 1e-4)):
         sums = (np.dot(each.weight.astype(float), getattr(each, name)) for each in (merged, seen))
         np.testing.assert_allclose(*sums, rtol=tolerance)
     first = [int(np.flatnonzero((seen.x == x) & (seen.y == y))[0]) for x, y in zip(merged.x, merged.y, strict=True)]
