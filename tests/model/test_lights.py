@@ -48,6 +48,7 @@ def test_a_smooth_light_stays_when_cells_split_and_when_theirs_split_again(share
         assert off[rough].std() < 0.01 and off[~rough].std() < ripple, (off[rough].std(), off[~rough].std())
 
 
+@pytest.mark.parametrize("scattered", [False, True])
 def test_split_cells_leave_no_dark_or_bright_spots(scattered):
     """Of a constant light, at the most unfavourable direction and on average, split three times around one direction or here and there."""
     light, rng = on_even_cells(np.zeros((3, 400))), np.random.default_rng(0)
