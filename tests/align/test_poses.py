@@ -14,7 +14,7 @@ from factorlib.align.search import Search, find, focal_prior
 from factorlib.align.silhouette import UNKNOWN, Silhouette, label_agreement, silhouette_iou
 from factorlib.align.state import state_of
 from factorlib.align.target import target_of
-from factorlib.align.trust import contour_error, doubts, mirrored_score, normal_stderr_deg, trust_in
+from factorlib.align.trust import Standards, contour_error, doubts, mirrored_score, normal_stderr_deg, trust_in
 from factorlib.errors import InputError
 from factorlib.geometry.camera import angle_between
 from factorlib.geometry.raster import Caster, rasterise
@@ -130,6 +130,17 @@ def test_too_few_pixels_a_mask_of_the_whole_photo_and_a_mirrored_one_are_doubted
     assert answered(chair(), mask=lambda s: Silhouette(np.ones_like(s.label)), known=False, **SMALL)[1]
     mirrored = answered(chair(), mask=lambda s: Silhouette(np.ascontiguousarray(s.label[:, ::-1])), known=False)
     assert any("mirror" in reason for reason in mirrored[1]) and not answered(chair(), known=False)[1]
+
+
+def test_standards_are_what_doubts_are_measured_by():
+    caster, camera, pose = photo_of(mesh_of([ball(), at(ball(0.5), 1.1, 0.3, 0)]), 4)
+    moved = Pose(pose.rotation, pose.translation + np.array([0.02, 0, 0]))
+    obj = ObjectToPlace("chair", caster, true_silhouette(caster, camera, pose), moved)
+    trust = trust_in(obj, placed([obj], camera, KnownFocal(camera.focal, "dataset"), "photo", BRIEF), 0)
+    assert trust.normal_stderr_deg is None and trust.mirrored_score is None and trust.contour_error > 0
+    below, above = (Standards(most_contour_error=trust.contour_error * factor) for factor in (0.9, 1.1))
+    assert doubts(1.0, 1.0, trust, None, below) and not doubts(1.0, 1.0, trust, None, above)
+    assert not doubts(1.0, 1.0, msgspec.structs.replace(trust, contour_error=0.0), None)
 
 
 TIPS = np.array([[-0.5, -0.5, 0.05], [0.5, -0.5, 0.05], [0.5, 0.5, 0.05], [-0.45, 0.5, 1.0], [-0.45, -0.5, 1.0], [0.4, 0.4, -0.95], [-0.4, -0.4, -0.95], [0.4, -0.4, -0.95]])  # fmt: skip
