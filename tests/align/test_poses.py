@@ -16,11 +16,11 @@ from factorlib.align.state import state_of
 from factorlib.align.target import target_of
 from factorlib.align.trust import Standards, contour_error, doubts, mirrored_score, normal_stderr_deg, trust_in
 from factorlib.errors import InputError
-from factorlib.geometry.camera import angle_between
+from factorlib.geometry.camera import Pose, angle_between
 from factorlib.geometry.raster import Caster, rasterise
 from factorlib.meshes.read import CREASE_DEG, usable
 from factorlib.meshes.soup import Soup, no_normals
-from tests.align.scenes import ball, blob, chair, dumbbell, mesh_of, normal_error_deg, photo_of, true_silhouette
+from tests.align.scenes import at, ball, blob, chair, dumbbell, mesh_of, normal_error_deg, photo_of, true_silhouette
 
 QUICK = Search(views=160, rolls=16, keep=(20, 8, 4, 2))  # for what does not need the full search
 SMALL = {"width": 160, "height": 120}
