@@ -227,3 +227,20 @@ def test_no_variable_is_expanded_on_its_way(made):
         arguments, environment = json.loads(done.stdout)
         assert arguments == ["-m", "factorlib", "plan"] and environment["GOAL"] == "plan"
         assert {name: environment[name] for name in VARIABLES} == {name: given[name] for name in VARIABLES}
+
+
+LINES = [b"", b"{", b"[]", b"5", b"\xff", b'{"no": "event"}', b'{"event": 5}', b"[" * 5000]
+
+
+def test_a_damaged_line_of_a_log_costs_that_line(project, caplog, capsys):
+    write(project.root / "data" / "set" / "a.txt", "odd")
+    assert make(project) == 0
+    logs = {path: path.read_bytes() for path in (project.build / "store" / "logs").glob("*.jsonl")}
+    for line in [b'{"event": "warning", "text": [1]}', *LINES]:
+        for log, content in logs.items():
+            log.write_bytes(line + b"\n" + content + line)
+        assert verbs.show_status(project, verbs.Wish("set")) == 0 and "a is odd" in capsys.readouterr().out, line
+    for log, content in logs.items():
+        log.write_bytes(b"\n".join([*LINES, content, *LINES]))
+    assert make(project, targets=["total"], force=True) == 0 and "damaged line" in caplog.text
+    assert (project.build / "set" / "total" / "log.txt").read_text() == "6", "what the report is handed"

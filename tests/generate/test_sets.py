@@ -13,7 +13,7 @@ from factorlib.dataset.read import read_dataset
 from factorlib.errors import InputError
 from factorlib.generate import eames, folder, lights, synthetic
 from factorlib.generate.__main__ import app
-from factorlib.generate.chair import chair, labelled, rough_chair, shell
+from factorlib.generate.chair import chair, labelled
 from factorlib.images.exr import read_exr, read_rgb_exr, write_rgb_exr
 from factorlib.images.photo import read_photo
 from factorlib.images.picture import read_png
@@ -102,16 +102,6 @@ def test_the_chair_set_tells_no_pose_and_links_its_photos(chairs):
     assert read_photo(chairs / "photos/terrace.jpg").focal_px == pytest.approx(folder.focal_px_of_35mm(45, 96, 72))
     assert read_photo(chairs / "photos/kitchen.jpg").focal_px is None
     assert {photo: len(poses) for photo, poses in dataset.truth.poses.items()} == {"terrace": 2, "kitchen": 1}
-
-
-def test_the_mesh_given_is_coarser_and_a_few_millimetres_off(chairs):
-    mesh = read_mesh(chairs / "meshes/chair.obj", ["red", "wood"], {"shell": "red", "legs": "wood"})
-    fine, _ = chair()["shell"]
-    rough, faces = rough_chair(np.random.default_rng(5))["shell"]
-    exact, _ = shell(14, 22)
-    assert len(mesh.faces) < 0.1 * sum(len(f) for _, f in chair().values())
-    assert 0.0005 < np.linalg.norm(rough - exact, axis=1).mean() < 0.01
-    assert np.abs(np.ptp(rough, axis=0) - np.ptp(fine, axis=0)).max() < 0.02
 
 
 def test_a_users_lights_replace_the_made_ones(tmp_path):

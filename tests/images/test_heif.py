@@ -74,3 +74,11 @@ def test_a_damaged_file_and_one_of_another_size_than_its_header_says_are_refused
         with pytest.raises(InputError, match=words) as caught:
             read_photo(tmp_path / "a.heic", key="photos[0].image")
         assert "photos[0].image" in str(caught.value) and caught.value.cure
+
+
+def test_the_kind_is_told_by_the_content(tmp_path):
+    save(tmp_path / "a.heic", SMOOTH).rename(tmp_path / "a.jpg")
+    assert read_photo(tmp_path / "a.jpg").width == W
+    (tmp_path / "b.heic").write_bytes(b"no picture")
+    with pytest.raises(InputError, match="not readable as an image"):
+        read_photo(tmp_path / "b.heic")

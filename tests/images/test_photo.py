@@ -90,6 +90,17 @@ def test_the_exposure_is_what_the_camera_wrote(tmp_path, aperture, iso, expected
     assert exposure == (None if expected is None else pytest.approx(expected, rel=1e-3))
 
 
+@pytest.mark.parametrize("channels, names", [(1, ["Y"]), (2, ["Y", "A"]), (4, ["R", "G", "B", "A"])])
+@pytest.mark.parametrize("suffix", [".png", ".tif"])
+def test_grey_becomes_rgb_and_alpha_is_dropped_without_darkening(tmp_path, channels, names, suffix):
+    pixels = np.full((4, 6, channels), 100, dtype=np.uint8)
+    if "A" in names:
+        pixels[..., -1] = 40
+    photo = read_photo(save(tmp_path / f"a{suffix}", pixels, names))
+    assert photo.radiance.shape == (4, 6, 3)
+    assert codes(srgb_encode(photo.radiance)).tolist() == np.full((4, 6, 3), 100).tolist()
+
+
 def test_exr_channels_go_by_name_and_without_colours_it_is_refused(tmp_path):
     pixels = np.dstack([np.full((4, 6), k, dtype=np.float32) for k in (9, 1, 2, 3)])
     photo = read_photo(save(tmp_path / "a.exr", pixels, names=["Z", "B", "R", "G"]))

@@ -8,9 +8,7 @@ import typer
 from typer.testing import CliRunner
 
 from factorlib import light_prior
-from factorlib.errors import InputError
 from factorlib.images.exr import write_rgb_exr
-from factorlib.images.light_map import read_light_map
 from factorlib.light.prior import read_light_prior
 
 COUNT = 25
@@ -50,15 +48,3 @@ def test_folders_that_hold_no_map_are_named(tmp_path, run):
     for place, said in ((tmp_path / "nowhere", "no such folder"), (tmp_path, "no .hdr or .exr")):
         done = run(place)
         assert done.exit_code == 2 and said in done.output and place.name in done.output
-
-
-def test_files_that_are_no_map_are_named(folder):
-    (folder / "b.exr").write_bytes(b"no picture")
-    with pytest.raises(InputError, match="b.exr"):
-        read_light_map(folder / "b.exr")
-    write_rgb_exr(folder / "b.exr", np.ones((8, 8, 3)))
-    with pytest.raises(InputError, match="no lat-long"):
-        read_light_map(folder / "b.exr")
-    write_rgb_exr(folder / "b.exr", np.ones((4, 8, 3)))
-    with pytest.raises(InputError, match="too few"):
-        light_prior.prior_of([folder / "b.exr"], COUNT)

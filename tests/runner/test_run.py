@@ -4,12 +4,14 @@ import json
 import os
 import re
 import shutil
+import threading
 import time
 
 import pytest
 
 from factorlib.errors import InputError
 from factorlib.runner import verbs
+from factorlib.runner.child import Pools
 from factorlib.runner.gc import collect
 from tests.faults.battered import make
 from tests.faults.test_nothing_lost import done, start, wait_until
@@ -207,6 +209,26 @@ def test_what_goes_wrong_in_a_stage_fails_its_step_and_the_next_run_resumes(
     assert not traced or re.search(rf"failed by a defect of the program: .*errors/{traced[0]}", capsys.readouterr().out)
     write(project.root / file, text)
     assert new_runs(project) == []
+
+
+class Holding(Exception):
+    """An error that pickle cannot take apart."""
+
+
+def fail(text):
+    error = Holding(text)
+    error.lock = threading.Lock()
+    raise error
+
+
+def test_an_error_of_a_child_that_cannot_be_pickled_says_its_type_and_text_and_the_child_lives():
+    pools = Pools(1)
+    try:
+        with pytest.raises(RuntimeError, match="Holding: a lock"):
+            pools.submit(1, 1, fail, "a lock").result(30)
+        assert pools.submit(1, 1, abs, -1).result(30) == 1 and len(pools.children) == 1
+    finally:
+        pools.close(kill=True)
 
 
 # ── what is told ─────────────────────────────────────────────────────────────────────────────────────────────────────

@@ -17,6 +17,7 @@ from factorlib.runner.filehash import hash_of_file
 from factorlib.runner.project import LIBRARY
 from factorlib.runner.shared import MADE_FROM
 from factorlib.runner.store import output_of
+from factorlib.runner.survey import survey
 from tests.faults.battered import make
 from tests.runner import toy
 from tests.runner.toy import files_of, make_project, state, write
@@ -98,6 +99,16 @@ def test_a_forged_result_writes_nothing_outside(tmp_path, one, shared):
         path.write_text(json.dumps({**entry, "files": forged, "output": output_of(forged)}))
     assert make(other) == 0 and computed(other) == 6
     assert not list(tmp_path.rglob("*escaped*")) and not os.path.exists("/tmp/escaped")
+
+
+def test_a_record_of_another_key_is_not_taken(tmp_path, one, shared):
+    assert make(one, "table.scale=3") == 0
+    other = checkout(tmp_path / "other")
+    key = next(p.key for p in survey(other, "set", None, []).planned() if p.step.stage == "table")
+    records = {path: json.loads(path.read_text())["record"] for path in (shared / "keys").iterdir()}
+    forged = next(path for path, record in records.items() if record.get("param:scale") == 3)
+    shutil.copyfile(forged, shared / "keys" / f"{key}.json")
+    assert make(other) == 0 and (other.build / "set" / "table" / "table.json").read_text() == "2"
 
 
 def test_one_that_is_not_there_is_said_before_anything_runs(tmp_path, monkeypatch):

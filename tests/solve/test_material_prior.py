@@ -107,17 +107,3 @@ def test_classes_are_fitted_to_a_table(table):
         assert one.tint == 0
     done = run(table, "--out", table.with_suffix(".json"))
     assert done.exit_code == 0 and classes.sha256 in table.with_suffix(".json").read_text()
-
-
-def test_a_table_that_will_not_do_is_refused(table, tmp_path):
-    for word in ("grey", "nan", ""):
-        (tmp_path / "words.csv").write_text(table.read_text() + f"plastic-6,{word},1,1,1,.3\n")
-        done = run(tmp_path / "words.csv")
-        assert done.exit_code == 2 and "plastic-6" in done.output and "words.csv" in done.output
-    table.write_text(table.read_text().replace("felt", "plastic"))
-    done = run(table)
-    assert done.exit_code == 2 and "class fabric" in done.output and "measured.csv" in done.output
-    table.write_text(table.read_text().replace("roughness", "smoothness"))
-    assert "roughness" in run(table).output
-    (tmp_path / "empty.csv").write_text("")
-    assert run(tmp_path / "empty.csv").exit_code == 2

@@ -1,10 +1,9 @@
 """The arrow-shaped system against the same system written out whole, its limits, and the order of materials and lights."""
 
-import msgspec
 import numpy as np
 import pytest
 
-from factorlib.model.materials import Materials, Point
+from factorlib.model.materials import Point
 from factorlib.model.problem import JointProblem
 from factorlib.solve.descent import FLOOR
 from factorlib.solve.few_lobes.descent import DEFINITE, Bounds, damped_step, evaluate
@@ -12,12 +11,11 @@ from factorlib.solve.few_lobes.unknowns import (
     moved_point,
 )
 from studies.scenes.problems import MATERIALS, block, random_light
-from tests.model.made import OPERATOR, three_rooms
+from tests.model.made import OPERATOR
 
 DAMPING = 1e-2
 EVERY = np.ones(7 * len(MATERIALS), bool)
 SHOWN = ([0, 2], [1, 2])  # the materials of each light
-ORDER = [2, 0, 1]  # material k of the permuted problem is material ORDER[k] of the other
 
 
 def close(found, expected, rtol=1e-6, atol=1e-9):
@@ -105,36 +103,3 @@ def test_the_predicted_decrease_is_that_of_the_quadratic_model_and_a_small_step_
     dm, dl, predicted = damped_step(iterate, 1e4)  # where the quadratic model holds
     gained = iterate.loss - evaluate(problem, moved_point(iterate.point, dm, dl)).loss
     assert gained == pytest.approx(predicted, rel=0.02)
-
-
-# ── the order of materials and lights ────────────────────────────────────────────────────────────────────────────────
-
-
-def with_materials_permuted(problem, point):
-    blocks = []
-    for b in problem.blocks:
-        number = np.argsort(ORDER)[b.material]
-        blocks.append(msgspec.structs.replace(b, material=number).take(np.argsort(number, kind="stable")))
-    return problem.of(blocks), Point(Materials.of_rows(point.materials.rows()[ORDER]), point.lights)
-
-
-def test_materials_and_lights_in_another_order_take_the_same_step():
-    problem, point = three_rooms()
-    order = [1, 2, 0]
-    one, permuted, turned = (
-        evaluate(*of)
-        for of in (
-            (problem, point),
-            with_materials_permuted(problem, point),
-            (problem.restricted(order), point.restricted(order)),
-        )
-    )
-    assert one.loss == pytest.approx(permuted.loss, rel=1e-12)
-    (dm, dl, _), (dm_permuted, dl_permuted, _), (dm_turned, dl_turned, _) = (
-        damped_step(at, 1e-3) for at in (one, permuted, turned)
-    )
-    close(dm.reshape(-1, 7)[ORDER], dm_permuted.reshape(-1, 7))
-    close(dm, dm_turned)
-    for k in range(3):
-        close(dl[k], dl_permuted[k])
-        close(dl[order[k]], dl_turned[k])

@@ -6,8 +6,7 @@ import pytest
 
 from factorlib.model.illumination import Illumination
 from factorlib.model.loss import Loss
-from factorlib.model.materials import Materials, Point
-from factorlib.model.problem import JointProblem
+from factorlib.model.materials import Materials
 from factorlib.solve.few_lobes import unknowns
 from factorlib.solve.few_lobes.equations import (
     energy_equations,
@@ -17,7 +16,6 @@ from factorlib.solve.few_lobes.equations import (
     tint_prior,
     with_weights_fitted,
 )
-from factorlib.solve.few_lobes.roughness import materials_of_best_roughness
 from studies.scenes.problems import MATERIALS, block, random_light
 from tests.model.made import OPERATOR, photos_in_a_wrong_light
 from tests.solve.made import OPERATOR as NETWORK
@@ -76,15 +74,6 @@ def test_loss_of_the_normal_equations_is_the_loss_and_held_out_observations_do_n
     other = msgspec.structs.replace(clipped, block=msgspec.structs.replace(clipped.block, radiance=radiance))
     a, b = (normal_equations(one, LOSS) for one in (clipped, other))
     np.testing.assert_array_equal(a.light_gradient, b.light_gradient)
-
-
-def test_the_prior_pulls_a_tinted_light_toward_grey(clipped):
-    red = with_light(clipped, msgspec.structs.replace(clipped.light, weight=clipped.light.weight * [2.0, 1.0, 1.0]))
-    p = len(clipped.light)
-    with_prior, without = (normal_equations(red, Loss(3.0, prior)) for prior in (1e3, 0.0))
-    pull = (with_prior.light_gradient - without.light_gradient)[3 * p :]
-    assert (pull[:p] > 0).all() and (pull[p : 3 * p] < 0).all()  # less red, more green and blue
-    np.testing.assert_allclose(pull[: 3 * p].sum(), 0, atol=1e-9 * np.abs(pull).max())
 
 
 # ── weights ──────────────────────────────────────────────────────────────────────────────────────────────────────────
@@ -163,15 +152,3 @@ def shown(materials: int, size: int = 24):
     blocks = [block(f"light_{k}", light, truth, range(materials), NETWORK, size) for k, light in enumerate(lights)]
     units = [one.unit for one in blocks]
     return blocks, truth, [msgspec.structs.replace(li, weight=li.weight / u) for li, u in zip(lights, units)]
-
-
-def searched(blocks, materials, lights):
-    return materials_of_best_roughness(JointProblem(blocks, NETWORK), Point(materials, lights))
-
-
-def test_a_roughness_far_off_is_found_again():
-    blocks, truth, lights = shown(3)
-    wrong = Materials(truth.diffuse * 1.3, truth.specular * 0.5, np.array([0.95, *truth.roughness[1:]]))
-    found = searched(blocks, wrong, lights)
-    assert abs(found.roughness[0] - truth.roughness[0]) < 0.1  # the grid's own spacing
-    np.testing.assert_array_equal(found.roughness[1:], wrong.roughness[1:])  # what is right stays

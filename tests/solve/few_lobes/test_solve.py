@@ -69,13 +69,6 @@ def test_neither_the_unit_of_a_photo_nor_threads_nor_processes_change_a_bit():
             np.testing.assert_array_equal(numbers(other.point), serial)
 
 
-def test_exposures_of_photos_that_share_a_light_are_found():
-    truth = random_light(np.random.default_rng(5), 3, photos=3)
-    data = block("room", truth, MATERIALS, [0, 1, 2], OPERATOR, size=10)
-    found = run([data], msgspec.structs.replace(QUICK, polish=20)).point
-    np.testing.assert_allclose(found.lights[0].log_exposure, truth.log_exposure, atol=0.01)
-
-
 # ── specular parts ───────────────────────────────────────────────────────────────────────────────────────────────────
 
 MIXED = Materials(
