@@ -13,7 +13,7 @@ from __future__ import annotations
 import os
 import re
 import shutil
-from collections.abc import Iterable
+from collections.abc import Collection, Iterable
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
@@ -72,6 +72,8 @@ def new_dataset(target: Path, photos: Path, masks: Path | None, meshes: Path | N
     Raises InputError where the folder is there already or cannot be made, one of the others is not, there are no photos, or a file is a link, has
     a name that cannot be printed, or more pixels than are read.
     """
+    if not target.name.isprintable():
+        raise InputError(f"{target.name!a} cannot be printed", key="DATASET", cure="choose another name")
     if os.path.lexists(target):
         raise InputError("is there already", file=target, key="DATASET", cure="choose another name, or delete it")
     if not (above := next(path for path in target.absolute().parents if os.path.lexists(path))).is_dir():
@@ -81,9 +83,11 @@ def new_dataset(target: Path, photos: Path, masks: Path | None, meshes: Path | N
         fault = f"there are no photos ({', '.join(IMAGES[:6])}, …) in it"
         raise InputError(fault, file=photos, key="PHOTOS", cure="name their folder")
     missing: list[str] = []
-    materials, of_photos, silhouettes = _masks(masks, list(named), missing) if masks is not None else ([], {}, {})
-    entries = _meshes(meshes, materials, missing) if meshes is not None else {}
-    shown = {photo: _shown_in(photo, list(entries)) for photo in named}
+    of_masks = _files(masks, (".png", ".json"), "MASKS", deep=True) if masks is not None else []
+    of_meshes = _files(meshes, None, "MESHES", deep=True) if meshes is not None else []  # with .mtl, buffers
+    materials, of_photos, silhouettes = _masks(masks, of_masks, list(named), missing) if masks else ([], {}, {})
+    entries = _meshes(meshes, of_meshes, materials, missing) if meshes else {}
+    shown = {photo: _shown_in(photo, entries) for photo in named}
     if len(entries) > 1:
         missing += [f"photo {photo}: write which of the meshes it shows" for photo in named if not shown[photo]]
     missing += [f"photo {photo}: no mask called {photo}.png or {photo}_<material>.png"
@@ -108,22 +112,20 @@ def new_dataset(target: Path, photos: Path, masks: Path | None, meshes: Path | N
             objects = [{"name": name, "mesh": mesh, "mask": mask} for name, mask in silhouettes[photo].items()]
         image, mask = f"photos/{path.relative_to(photos)}", of_photos.get(photo, UNKNOWN)
         spec["photos"].append({"name": photo, "image": image, "masks": mask, "objects": objects})
+    text = yaml.dump(spec, Dumper=_Dumper, sort_keys=False, allow_unicode=True, width=10**6)
     try:
         target.parent.mkdir(parents=True, exist_ok=True)
+        with TemporaryDirectory(dir=target.parent, prefix=f".{target.name}.") as folder:
+            draft = Path(folder) / target.name
+            _copy(photos, draft / "photos", named.values())
+            _copy(masks, draft / "masks", of_masks)
+            _copy(meshes, draft / "meshes", of_meshes)
+            write_text(draft / "dataset.yaml", REMARK + text)
+            draft.rename(target)
     except OSError as error:
         cure = "name a folder that can be made"
-        known = disk_error(error, above)
+        known = disk_error(error, target.parent)
         raise known or InputError("no folder can be made here", file=above, key="DATASET", cure=cure) from error
-    with TemporaryDirectory(dir=target.parent, prefix=f".{target.name}.") as folder:
-        draft, chosen = Path(folder) / target.name, set(named.values())
-        _copy(photos, draft / "photos", chosen)
-        _copy(masks, draft / "masks", _files(masks, (".png", ".json"), "MASKS", deep=True) if masks else ())
-        _copy(
-            meshes, draft / "meshes", _files(meshes, None, "MESHES", deep=True) if meshes else ()
-        )  # with .mtl, buffers
-        text = yaml.dump(spec, Dumper=_Dumper, sort_keys=False, allow_unicode=True, width=10**6)
-        write_text(draft / "dataset.yaml", REMARK + text)
-        draft.rename(target)
     return missing
 
 
@@ -134,9 +136,10 @@ def _copy(source: Path | None, target: Path, files: Iterable[Path]) -> None:
         shutil.copyfile(path, place)
 
 
-def _masks(folder: Path, photos: list[str], missing: list[str]) -> tuple[list[str], dict, dict[str, dict[str, str]]]:
+def _masks(
+    folder: Path, paths: list[Path], photos: list[str], missing: list[str]
+) -> tuple[list[str], dict, dict[str, dict[str, str]]]:
     """Materials; by photo, its mask or {material: mask}; by photo with a mask of labels, {object: silhouette}."""
-    paths = _files(folder, (".png", ".json"), "MASKS", deep=True)
     file = {path: f"masks/{path.relative_to(folder)}" for path in paths}
     names: dict[str, None] = {}
     if coco := [path for path in paths if path.suffix.lower() == ".json"]:
@@ -184,10 +187,10 @@ def _masks(folder: Path, photos: list[str], missing: list[str]) -> tuple[list[st
     return list(names) or [f"label_{k}" for k in range(1, labels + 1)], of_photos, silhouettes
 
 
-def _meshes(folder: Path, materials: list[str], missing: list[str]) -> dict[str, dict]:
+def _meshes(folder: Path, files: list[Path], materials: list[str], missing: list[str]) -> dict[str, dict]:
     """The entry of each mesh; a part goes by its first name, and is made of a material of that name where there is one."""
     entries = {}
-    for name, path in _by_name(_files(folder, MESHES, "MESHES", deep=True), "MESHES").items():
+    for name, path in _by_name([path for path in files if path.suffix.lower() in MESHES], "MESHES").items():
         parts, file = list(dict.fromkeys(names[0] for names in read_parts(path))), f"meshes/{path.relative_to(folder)}"
         undecided = [part for part in parts if part not in materials]
         if len(materials) == 1:
@@ -200,10 +203,15 @@ def _meshes(folder: Path, materials: list[str], missing: list[str]) -> dict[str,
     return entries
 
 
-def _shown_in(photo: str, meshes: list[str]) -> list[str]:
-    """The meshes that a photo shows: the only one there is, or those whose names are whole words of the photo's."""
-    word = r"(?<![A-Za-z0-9]){}(?![A-Za-z0-9])"
-    return [mesh for mesh in meshes if len(meshes) == 1 or re.search(word.format(re.escape(mesh)), photo)]
+def _shown_in(photo: str, meshes: Collection[str]) -> list[str]:
+    """The meshes that a photo shows: the only one there is, or those whose names are whole words of the photo's.
+
+    >>> _shown_in("my_red-chair_2", ["stool", "chair", "red-chair", "hair"])
+    ['chair', 'red-chair']
+    """
+    ends = [end for word in re.finditer("[A-Za-z0-9]+", photo) for end in word.span()]
+    words = {photo[begin:end] for k, begin in enumerate(ends[::2]) for end in ends[2 * k + 1 :: 2]}
+    return list(meshes) if len(meshes) == 1 else sorted(word for word in words if word in meshes)
 
 
 def _files(folder: Path, suffixes: tuple[str, ...] | None, key: str, deep: bool = False) -> list[Path]:

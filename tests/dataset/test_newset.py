@@ -1,5 +1,6 @@
 """`make new`: a dataset.yaml of folders of files, that says what it does not know instead of guessing."""
 
+import errno
 import json
 import zlib
 from pathlib import Path
@@ -198,6 +199,30 @@ def test_a_place_where_no_folder_can_be_is_named(folder, place):
     with pytest.raises(InputError, match="is no folder") as error:
         new_dataset(folder / place, folder / "photos", None, None)
     assert error.value.key == "DATASET" and error.value.file == folder / "photos/kitchen.jpg"
+
+
+def test_a_data_set_inside_a_folder_that_it_is_made_of_does_not_copy_itself(folder):
+    new_dataset(folder / "meshes" / "mine", folder / "photos", None, folder / "meshes")
+    assert sorted(path.name for path in (folder / "meshes" / "mine" / "meshes").rglob("*")) == [
+        "chair.mtl",
+        "chair.obj",
+    ]
+
+
+@pytest.mark.parametrize("name", ["a\x7f", "a\x85", "a\n"])
+def test_a_data_set_has_a_name_that_can_be_printed(folder, name):
+    with pytest.raises(InputError, match="cannot be printed"):
+        new_dataset(folder / name, folder / "photos", None, None)
+
+
+def test_a_disk_that_is_full_is_that_of_the_data_set_though_the_system_names_no_file(folder, monkeypatch):
+    def full(path, text):
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr("factorlib.newset.write_text", full)
+    with pytest.raises(InputError, match="the disk is full") as error:
+        made(folder, masks=None)
+    assert error.value.file == folder / "data" and not list((folder / "data").iterdir())
 
 
 def test_a_folder_that_the_system_makes_none_in_is_named(folder):
