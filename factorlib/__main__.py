@@ -22,15 +22,22 @@ from factorlib.runner.display import plain_streams, printable
 from factorlib.runner.project import LIBRARY, PIPELINE, Project, photo_sets
 from factorlib.runner.stop import heed_stops
 
+SHIPPED = "share/factorlib"  # in the prefix that the package is installed in: data-files of pyproject.toml
 # What the system refuses to this user.
 NOT_OURS = {errno.EACCES, errno.EPERM, errno.EROFS, errno.ELOOP, errno.ENAMETOOLONG}
 
 
 def project() -> Project:
-    """The checkout that FACTORLIB_ROOT names, or this package lies in, or else the current folder lies in."""
+    """The checkout that FACTORLIB_ROOT names, or this package lies in, or else the current folder lies in.
+
+    Without one, the current folder, with the pipeline that came with the package, wherever pip has put that.
+    """
     here = Path.cwd()
     near = next((folder for folder in (LIBRARY, here, *here.parents) if (folder / PIPELINE).is_file()), None)
     if not (root := os.environ.get("FACTORLIB_ROOT") or near):
+        for shipped in (folder / SHIPPED for folder in (LIBRARY, *LIBRARY.parents)):
+            if (shipped / PIPELINE).is_file():
+                return Project(here, photo_sets(), shipped=shipped)
         cure = f"run it in a checkout, or name one: FACTORLIB_ROOT=<a folder with {PIPELINE}, stages and data>"
         raise InputError(f"neither this folder nor one above it has a {PIPELINE}", file=here, cure=cure)
     return Project(Path(root).resolve(), photo_sets())

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import ast
 import os
+import shutil
 import subprocess
 import sys
 import tomllib
@@ -52,7 +53,18 @@ def installed(tmp_path_factory):
     pip = [sys.executable, "-m", "pip", "--disable-pip-version-check", "--quiet"]
     source = folder / "source"
     files = subprocess.run(
-        ["git", "ls-files", "--", "factorlib", "pyproject.toml", "README.md", "LICENSE"],
+        [
+            "git",
+            "ls-files",
+            "--",
+            "factorlib",
+            "stages",
+            "recipes",
+            "pipeline.yaml",
+            "pyproject.toml",
+            "README.md",
+            "LICENSE",
+        ],
         cwd=ROOT,
         check=True,
         capture_output=True,
@@ -65,6 +77,15 @@ def installed(tmp_path_factory):
     (wheel,) = folder.glob("*.whl")
     subprocess.run([*pip, "install", "--no-deps", "--target", str(folder / "site"), str(wheel)], check=True)
     return folder / "site"
+
+
+RECORDS = """
+import json
+from factorlib.__main__ import project
+from factorlib.runner.survey import survey
+records = survey(project(), "data/synthetic", None, []).records
+print(*(f"{step} {json.dumps(record, sort_keys=True, default=str)}" for step, record in records.items()), sep="\\n")
+"""
 
 
 def run(site, *words, cwd):
@@ -80,8 +101,20 @@ def test_an_installed_wheel_has_its_command_and_its_operator(installed, tmp_path
     assert done.returncode == 0 and done.stdout.startswith(str(installed)), done.stderr
 
 
-def test_an_installed_command_away_from_a_checkout_says_so(installed, tmp_path):
-    done = run(installed, str(installed / "bin" / "factorlib"), "graph", cwd=tmp_path)
-    assert done.returncode == 1 and "pipeline.yaml" in done.stderr and "FACTORLIB_ROOT=" in done.stderr
+def test_an_installed_command_away_from_a_checkout_has_the_same_pipeline_and_the_same_keys(installed, tmp_path):
+    """What a result is known by does not depend on where the stages lie: the records of a plan are those of the checkout."""
+    shutil.copytree(ROOT / "data" / "synthetic", tmp_path / "data" / "synthetic")
+    command = str(installed / "bin" / "factorlib")
+    done = run(installed, command, "validate", "-d", "synthetic", cwd=tmp_path)
+    assert done.returncode == 0 and "are good" in done.stdout, done.stderr
+    done = run(installed, command, "plan", "-d", "synthetic", "--recipe", "insert", cwd=tmp_path)
+    assert done.returncode == 0 and "recipes" in done.stdout, done.stderr
+    assert (tmp_path / "build").is_dir() and not (installed / "build").exists()
+    code = RECORDS
+    here, there = (run(site, "-c", code, cwd=tmp_path) for site in (installed, ROOT))
+    assert here.stdout == there.stdout != "", here.stderr + there.stderr
+
+
+def test_an_installed_command_in_a_checkout_takes_its_pipeline(installed):
     done = run(installed, str(installed / "bin" / "factorlib"), "graph", cwd=ROOT / "data")
     assert done.returncode == 0 and "solve" in done.stdout

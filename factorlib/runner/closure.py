@@ -35,6 +35,7 @@ from factorlib.errors import InputError, did_you_mean
 from factorlib.runner.filehash import FileHashes, left_over, read_cache, write_cache
 
 CODE = ("source:", "data:", "environment:", "program:")  # the fields of a record that a closure makes
+OURS = ("factorlib", "stages", "studies")  # packages; an installed one lies among those of others
 DEEPEST = 16  # names that stand for names, structs in structs: one more is not followed
 
 
@@ -202,7 +203,13 @@ class Sources:
             parent, _, last = name.rpartition(".")
             above = self.find(parent) if parent else None
             of_package = above is not None and above.name == "__init__.py"
-            bases = [above.parent if of_package else above] if above else [] if parent else self.roots
+            bases = (
+                [above.parent if of_package else above]
+                if above
+                else []
+                if parent
+                else self.roots[: None if name in OURS else 1]
+            )
             self._places[name] = next((file for base in bases if (file := _module_in(base, last))), None)
         return self._places[name]
 

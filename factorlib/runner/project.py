@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import importlib
 import os
+import shlex
 import stat
 from collections.abc import Callable
 from functools import cache, partial
@@ -97,16 +98,25 @@ def photo_sets() -> Provider:
 
 
 class Project(msgspec.Struct, frozen=True):
-    """A checkout: pipeline.yaml, the package of its stages, data/ and build/."""
+    """A checkout: pipeline.yaml, the package of its stages, data/ and build/.
+
+    shipped: the folder of the first two and of recipes, where the installed package brings them and `root` is any folder
+    """
 
     root: Path
     provider: Provider
     package: str = "stages"
+    shipped: Path | None = None
+
+    @property
+    def code_root(self) -> Path:
+        """The folder of pipeline.yaml and of the package of its stages."""
+        return self.shipped or self.root
 
     @property
     def pipeline_file(self) -> Path:
         """The file that declares the stages."""
-        return self.root / PIPELINE
+        return self.code_root / PIPELINE
 
     @property
     def build(self) -> Path:
@@ -116,7 +126,12 @@ class Project(msgspec.Struct, frozen=True):
     @property
     def source_roots(self) -> list[Path]:
         """Folders in which modules of the project are found: the checkout, and the library where it lies elsewhere."""
-        return list(dict.fromkeys([self.root, LIBRARY]))
+        return list(dict.fromkeys([self.code_root, LIBRARY]))
+
+    def command(self, verb: str, dataset: str) -> str:
+        """A verb for a data set, as a user of the checkout, or of the installed package, types it."""
+        words = f"factorlib {verb} -d" if self.shipped else f"make {verb} DATASET="
+        return f"{words}{' ' * bool(self.shipped)}{shlex.quote(dataset)}"
 
     def shown(self, path: Path) -> str:
         """A path as messages write it: from where the user stands, if it lies below."""
@@ -156,8 +171,9 @@ class Project(msgspec.Struct, frozen=True):
 
         InputError where one is not there, is not good, or two are called the same.
         """
-        shared, own = self.root / "recipes", self.root / "recipes" / data.folder.name  # the latter goes before
-        known = {path.stem: path for folder in (shared, own) for path in sorted(folder.glob("*.yaml"))}
+        roots = [root / "recipes" for root in dict.fromkeys([self.code_root, self.root])]
+        folders = [*roots, *(root / data.folder.name for root in roots)]  # the latter go before
+        known = {path.stem: path for folder in folders for path in sorted(folder.glob("*.yaml"))}
         paths, recipes = [], {}
         for word in words:
             path = Path(os.path.abspath(word))

@@ -63,7 +63,7 @@ class Survey:
         """A stage with its parameters, as a worker loads it; cores: of the machine, of which it takes what it may."""
         stage, project = self.spec.pipeline.stages[name], self.project
         taken = cores if stage.cores == "all" else min(stage.cores, cores)
-        return Code(project.root, project.package, name, stage.values, project.pipeline_file, stage.threads, taken)
+        return Code(project.code_root, project.package, name, stage.values, project.pipeline_file, stage.threads, taken)
 
     def faults(self, steps: Iterable[Step], new: bool = False) -> list[str]:
         """What is wrong with the files that steps read, those of their recipes too, each fault once.

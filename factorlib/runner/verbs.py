@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import fcntl
 import os
-import shlex
 import sys
 import time
 from collections.abc import Callable, Sequence
@@ -203,7 +202,7 @@ def show_params(project: Project, stages: list[str] | None) -> int:
     """Print every parameter of the stages, or of all, with default, range and meaning."""
     for number, name in enumerate(stages or _pipeline(project).order()):
         check_stage(project, name, [])
-        params = load_stage(Code(project.root, project.package, name, {}, project.pipeline_file)).Params
+        params = load_stage(Code(project.code_root, project.package, name, {}, project.pipeline_file)).Params
         print("\n".join([""] * (number > 0) + words.parameter_lines(name, params)))
     return 0
 
@@ -248,7 +247,7 @@ def begin(project: Project, dataset: str, photos: Path | None, masks: Path | Non
     missing = import_module("factorlib.newset").new_dataset(folder, photos, masks, meshes)
     where = "; what it lacks, or leaves as `?`:" if missing else ""
     print(f"{project.shown(folder)}/dataset.yaml is written{where}")
-    print("\n".join([*(f"  {line}" for line in missing), f"next: make validate DATASET={shlex.quote(dataset)}"]))
+    print("\n".join([*(f"  {line}" for line in missing), f"next: {project.command('validate', dataset)}"]))
     return 0
 
 

@@ -67,7 +67,7 @@ class Studies(Project, frozen=True):
 def studies(scale: Scale = FULL, root: Path = LIBRARY, name: str = "") -> Studies:
     """The project of the studies of a scale; name: of the one that is to run, for steps of a study may be its own module's."""
     package = CATALOGUE if name in STUDIES and not STUDIES[name].steps else "studies.steps"
-    return Studies(root, Provider(SLICES, lambda folder: data_of(folder, scale)), package, scale)
+    return Studies(root, Provider(SLICES, lambda folder: data_of(folder, scale)), package, scale=scale)
 
 
 def data_of(folder: Path, scale: Scale) -> Data:

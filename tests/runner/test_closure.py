@@ -52,6 +52,15 @@ def test_every_form_of_import_is_followed(tmp_path):
     assert closure.external == ["numpy"]
 
 
+def test_a_package_that_lies_beside_an_installed_library_is_none_of_the_project(tmp_path):
+    toy.write(tmp_path / "root/stages/s.py", "import numpy, factorlib.a\n")
+    for name in ("factorlib/__init__.py", "factorlib/a.py", "numpy/__init__.py"):
+        toy.write(tmp_path / "site-packages" / name, "")
+    roots = [tmp_path / "root", tmp_path / "site-packages"]
+    closure = Sources(roots, FileHashes(None)).closure("stages", "s", Path("pipeline.yaml"))
+    assert closure.modules == {"stages.s", "factorlib", "factorlib.a"} and closure.external == ["numpy"]
+
+
 def test_defaults_are_followed_to_bases_constants_and_instances(tmp_path):
     files = {
         "stages/s.py": "from p.a import NOISE, Base\nLOW, HIGH = 1, (2, 3)\nclass Params(Base):\n    low: int = LOW\n"
