@@ -37,6 +37,28 @@ class InputError(ValueError):
         return partial(InputError, self.found, file=self.file, key=self.key, cure=self.cure), ()
 
 
+class InputErrors(InputError):
+    """Several of them, which were found at once; file, key and cure are those of the first."""
+
+    def __init__(self, faults: list[InputError]):
+        self.faults, first = faults, faults[0]
+        super().__init__(first.found, file=first.file, key=first.key, cure=first.cure)
+
+    def __str__(self) -> str:
+        more = len(self.faults) - MOST_LISTED
+        said = [str(fault) for fault in self.faults[:MOST_LISTED]]
+        return "\nerror: ".join([*said, f"{more} more"] if more > 0 else said)
+
+    def __reduce__(self) -> tuple:
+        return InputErrors, (self.faults,)
+
+
+def raise_all(faults: list[InputError]) -> None:
+    """Raise InputError where there is a fault, as one error where there are several."""
+    if faults:
+        raise faults[0] if len(faults) == 1 else InputErrors(faults)
+
+
 def did_you_mean(word: str, known: Iterable[object]) -> str:
     """A cure that names the nearest of the `known` words, or all of them.
 

@@ -16,7 +16,7 @@ from typing import Annotated, Any, Literal, NoReturn, TypeVar, Union, get_args, 
 import msgspec
 import yaml
 
-from factorlib.errors import InputError, did_you_mean
+from factorlib.errors import InputError, did_you_mean, raise_all
 from factorlib.reading import one_line, read_text
 
 T = TypeVar("T")
@@ -184,7 +184,13 @@ def convert(value: Any, type_: type[T], name: str | Path, prefix: str = "", text
     try:
         return msgspec.convert(value, type_)
     except msgspec.ValidationError as error:
-        words, value, types, keys = _innermost(error, value, type_)
+        innermost = _innermost(error, value, type_)
+    root = yaml.compose(text, Loader=_Parser) if text is not None else None
+    raise_all([_fault(*fault, name, prefix, root) for fault in innermost])
+
+
+def _fault(words: str, value: Any, types: list, keys: Keys, name: str | Path, prefix: str, root: Any) -> InputError:
+    """What msgspec says of a value, with its key and a cure."""
     if field := _FIELD.search(words):
         words, cure = f"the key {field['name']!r} is missing", f"add {field['name']}: …"
         if field["fault"] == "unknown":
@@ -200,23 +206,26 @@ def convert(value: Any, type_: type[T], name: str | Path, prefix: str = "", text
             cure = f'put it in quotes: "{one_line(str(value))}"'
         words = f"{words[:1].lower()}{words[1:]}"
         words += "" if isinstance(value, dict | list) else f": {one_line(repr(value))}"
-    file = f"{name}:{_line_of(text, keys)}" if text is not None else name
+    file = name if root is None else f"{name}:{_line_of(root, keys)}"
     key = ".".join(filter(None, (prefix, key_path(keys)))) or None
-    raise InputError(words, file=file, key=key, cure=cure) from None
+    return InputError(words, file=file, key=key, cure=cure)
 
 
-def _innermost(error: msgspec.ValidationError, value: Any, type_: Any, keys: Keys = ()) -> tuple[str, Any, list, Keys]:
-    """The fault's words, the innermost value at fault, the types that it may have, and the way to it."""
+def _innermost(
+    error: msgspec.ValidationError, value: Any, type_: Any, keys: Keys = ()
+) -> list[tuple[str, Any, list, Keys]]:
+    """Of each innermost value at fault, the fault's words, the value, the types that it may have, and the way to it."""
     types = [type_]
     for each in types:  # and, where one is a union or described by a `Meta`, all that it stands for
         types += get_args(each) if get_origin(each) in (Union, UnionType) else ()
         types += get_args(each)[:1] if get_origin(each) is Annotated else ()
+    found = []
     for key, item, inner in (child for each in types for child in _children(value, each)):
         try:
             msgspec.convert(item, inner)
         except msgspec.ValidationError as below:
-            return _innermost(below, item, inner, (*keys, key))
-    return str(error), value, types, keys
+            found += _innermost(below, item, inner, (*keys, key))
+    return found or [(str(error), value, types, keys)]
 
 
 def _children(value: Any, type_: Any) -> Iterator[tuple[str | int, Any, Any]]:
@@ -237,9 +246,8 @@ def _is_struct(type_: Any) -> bool:
     return isinstance(type_, type) and issubclass(type_, msgspec.Struct)
 
 
-def _line_of(text: str, keys: Keys) -> int:
-    """The line on which the value at `keys` stands, or what of the way to it is there; the text has been read before."""
-    node = yaml.compose(text, Loader=_Parser)
+def _line_of(node: yaml.Node | None, keys: Keys) -> int:
+    """The line on which the value at `keys` of a document stands, or what of the way to it is there."""
     line = node.start_mark.line if node else 0
     for key in keys:
         if isinstance(node, yaml.MappingNode):

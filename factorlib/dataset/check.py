@@ -1,6 +1,6 @@
 """The rules of a dataset that its types do not say and no image or mesh must be opened for, each with its key and a cure.
 
-`check_dataset` and `check_truth` walk a decoded file once and raise at the first rule that does not hold; `check_lights`
+`check_dataset` walks a decoded file once and names all rules that do not hold, `check_truth` the first; `check_lights`
 follows once cameras that are known from elsewhere have been read.
 """
 
@@ -21,6 +21,7 @@ from factorlib.dataset.schema import (
     PhotoEntry,
     TruthFile,
 )
+from factorlib.errors import raise_all
 
 IMAGES = (".jpg", ".jpeg", ".png", ".tif", ".tiff", ".exr", ".hdr", ".heic", ".heif", ".hif", *RAW)
 MASKS = (".png", ".json")
@@ -35,23 +36,29 @@ LEAST_OFF_LINE = 1e-3  # of the keypoints' extent
 
 
 def check_dataset(spec: DatasetFile, file: Path) -> None:
-    """Raise InputError, naming `file`, key and cure, unless everything in dataset.yaml holds together."""
+    """Raise InputError, naming `file`, key and cure of each fault, unless everything in dataset.yaml holds together."""
     refuse = Refusal(file, file.parent)
     for index, name in enumerate(spec.materials):
         if name in spec.materials[:index]:
-            cure = "label k is the k-th material: name each once"
-            refuse(f"materials[{index}]", f"material {name!r} is named twice", cure)
+            with refuse.noting():
+                cure = "label k is the k-th material: name each once"
+                refuse(f"materials[{index}]", f"material {name!r} is named twice", cure)
     for name, mesh in spec.meshes.items():
-        _check_mesh(f"meshes.{name}", mesh, spec.materials, refuse)
-        if mesh.hull and spec.cameras is None:
-            _check_hull(name, spec, refuse)
-    refuse.once("photos", (photo.name for photo in spec.photos), "photo")
+        with refuse.noting():
+            _check_mesh(f"meshes.{name}", mesh, spec.materials, refuse)
+            if mesh.hull and spec.cameras is None:
+                _check_hull(name, spec, refuse)
+    with refuse.noting():
+        refuse.once("photos", (photo.name for photo in spec.photos), "photo")
     for index, photo in enumerate(spec.photos):
         _check_photo(f"photos[{index}]", photo, spec, refuse)
-    if spec.cameras is not None:
-        _check_source(spec.cameras, spec, refuse)
-    if spec.truth is not None:
-        refuse.path("truth", spec.truth, (".yaml", ".yml"), must_exist=False)
+    with refuse.noting():
+        if spec.cameras is not None:
+            _check_source(spec.cameras, spec, refuse)
+    with refuse.noting():
+        if spec.truth is not None:
+            refuse.path("truth", spec.truth, (".yaml", ".yml"), must_exist=False)
+    raise_all(refuse.faults)
 
 
 def check_truth(truth: TruthFile, spec: DatasetFile, file: Path, folder: Path) -> None:
@@ -132,53 +139,58 @@ def _check_parts(key: str, parts: dict[str, str], mesh: MeshEntry, materials: li
 
 
 def _check_photo(key: str, photo: PhotoEntry, spec: DatasetFile, refuse: Refusal) -> None:
-    if photo.name in RESERVED_PHOTOS:
-        refuse(f"{key}.name", f"the name {photo.name!r} is taken by a file of the results", "rename the photo")
-    refuse.path(f"{key}.image", photo.image, IMAGES)
-    if photo.world_from_camera is not None:
-        refuse.rotation(f"{key}.world_from_camera", photo.world_from_camera)
-    if photo.ground is not None:
-        _check_ground(f"{key}.ground.normal", photo.ground, refuse)
-    if photo.camera and photo.camera.distortion and photo.camera.focal_px is None:
-        refuse(
-            f"{key}.camera.distortion", "its unit is the focal length, which is not given", "give focal_px beside it"
-        )
-    if isinstance(photo.masks, str):
-        refuse.path(f"{key}.masks", photo.masks, MASKS)
-    elif not photo.masks:
-        refuse(f"{key}.masks", "names no mask", "give a label PNG, a COCO json, or {material: mask.png, …}")
-    else:
-        for material, path in photo.masks.items():
+    with refuse.noting():
+        if photo.name in RESERVED_PHOTOS:
+            refuse(f"{key}.name", f"the name {photo.name!r} is taken by a file of the results", "rename the photo")
+    with refuse.noting():
+        refuse.path(f"{key}.image", photo.image, IMAGES)
+    with refuse.noting():
+        if photo.world_from_camera is not None:
+            refuse.rotation(f"{key}.world_from_camera", photo.world_from_camera)
+    with refuse.noting():
+        if photo.ground is not None:
+            _check_ground(f"{key}.ground.normal", photo.ground, refuse)
+    with refuse.noting():
+        if photo.camera and photo.camera.distortion and photo.camera.focal_px is None:
+            cure = "give focal_px beside it"
+            refuse(f"{key}.camera.distortion", "its unit is the focal length, which is not given", cure)
+    with refuse.noting():
+        if not photo.masks:
+            refuse(f"{key}.masks", "names no mask", "give a label PNG, a COCO json, or {material: mask.png, …}")
+        if isinstance(photo.masks, str):
+            refuse.path(f"{key}.masks", photo.masks, MASKS)
+    for material, path in {} if isinstance(photo.masks, str) else photo.masks.items():
+        with refuse.noting():
             refuse.known(f"{key}.masks.{material}", material, spec.materials, "material")
             refuse.path(f"{key}.masks.{material}", path, (".png",))
-    if not photo.objects:
-        cure = "add {name: …, mesh: …}: a mesh gives its pixels their normals"
-        refuse(f"{key}.objects", f"photo {photo.name!r} has no objects", cure)
-    refuse.once(f"{key}.objects", (obj.name for obj in photo.objects), "object")
+    with refuse.noting():
+        if not photo.objects:
+            cure = "add {name: …, mesh: …}: a mesh gives its pixels their normals"
+            refuse(f"{key}.objects", f"photo {photo.name!r} has no objects", cure)
+        refuse.once(f"{key}.objects", (obj.name for obj in photo.objects), "object")
     for index, obj in enumerate(photo.objects):
-        of = f"{key}.objects[{index}]"
-        refuse.known(f"{of}.mesh", obj.mesh, spec.meshes, "mesh")
-        _check_parts(f"{of}.materials", obj.materials, spec.meshes[obj.mesh], spec.materials, refuse)
-        if obj.mask is not None:
-            refuse.path(f"{of}.mask", obj.mask, (".png",))
-        if obj.pose is not None:
-            refuse.rotation(f"{of}.pose.rotation", obj.pose.rotation)
-            if spec.meshes[obj.mesh].primitive:
-                refuse(
-                    f"{of}.pose",
-                    "does not go with a primitive, whose size it would have to fit",
-                    "leave it out: it is found",
-                )
-        if obj.pose is not None and spec.meshes[obj.mesh].lathe and spec.meshes[obj.mesh].size != 1.0:
+        with refuse.noting():
+            _check_object(f"{key}.objects[{index}]", obj, spec, refuse)
+
+
+def _check_object(of: str, obj: ObjectEntry, spec: DatasetFile, refuse: Refusal) -> None:
+    refuse.known(f"{of}.mesh", obj.mesh, spec.meshes, "mesh")
+    mesh = spec.meshes[obj.mesh]
+    _check_parts(f"{of}.materials", obj.materials, mesh, spec.materials, refuse)
+    if obj.mask is not None:
+        refuse.path(f"{of}.mask", obj.mask, (".png",))
+    if obj.pose is not None:
+        refuse.rotation(f"{of}.pose.rotation", obj.pose.rotation)
+        if mesh.primitive:
+            cure = "leave it out: it is found"
+            refuse(f"{of}.pose", "does not go with a primitive, whose size it would have to fit", cure)
+        if mesh.lathe and mesh.size != 1.0:
             refuse(f"{of}.pose", f"does not go with meshes.{obj.mesh}.size: poses say how large it is", "keep one")
-        if obj.keypoints and not spec.meshes[obj.mesh].file:
-            refuse(
-                f"{of}.keypoints",
-                "its mesh has no file, so no points are known on it",
-                "leave them out, or give the mesh's file",
-            )
-        if obj.keypoints:
-            _check_keypoints(f"{of}.keypoints", obj, refuse)
+    if obj.keypoints and not mesh.file:
+        cure = "leave them out, or give the mesh's file"
+        refuse(f"{of}.keypoints", "its mesh has no file, so no points are known on it", cure)
+    if obj.keypoints:
+        _check_keypoints(f"{of}.keypoints", obj, refuse)
 
 
 def _check_ground(key: str, ground: Ground, refuse: Refusal) -> None:

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import os
 import stat
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import NoReturn
 
@@ -19,10 +20,19 @@ class Refusal:
 
     def __init__(self, file: Path, folder: Path):
         self.file, self.folder = file, folder
+        self.faults: list[InputError] = []
         self.inside: dict[str, Path] = {}  # folders that have been followed and lie in it, by how they are written
 
     def __call__(self, key: str, fault: str, cure: str) -> NoReturn:
         raise InputError(fault, file=self.file, key=key, cure=cure)
+
+    @contextmanager
+    def noting(self) -> Iterator[None]:
+        """What is refused within is kept in `faults`, and what follows is checked, too."""
+        try:
+            yield
+        except InputError as error:
+            self.faults.append(error)
 
     def known(self, key: str, name: str, known: Iterable[str], kind: str) -> None:
         """A name is among `known`; the nearest one is suggested."""

@@ -18,15 +18,16 @@ from factorlib.dataset.check import check_dataset, check_lights, check_truth
 from factorlib.dataset.gltf import buffer_path, read_header
 from factorlib.dataset.paths import Refusal, is_there
 from factorlib.dataset.schema import Dataset, DatasetFile, TruthFile
-from factorlib.errors import InputError
+from factorlib.errors import InputError, raise_all
 from factorlib.reading import check_plain, path_inside, read_text, reading
-from factorlib.yamlfile import MOST_BYTES, load_yaml, read_yaml
+from factorlib.yamlfile import MOST_BYTES, convert, parse_yaml, read_yaml
 
 FILE = "dataset.yaml"
 RESERVED = ("studies", "bench", "store", "docs")  # folders of build/ that are no datasets
 MTLLIB = re.compile(rb"^mtllib[ \t]+([^\r\n]+)", re.MULTILINE)
 log = logging.getLogger("factorlib.dataset")
 UNKNOWN = "?"
+OPEN = "left_open"  # a name that stands for it where a file is read all the same
 MOST_NAMED = 20  # of the places that are left open
 
 
@@ -44,16 +45,9 @@ def read_dataset(path: str | Path) -> Dataset:
     if folder.name in RESERVED:
         cure = "rename its folder: build/ uses that name"
         raise InputError(f"a dataset cannot be called {folder.name!r}", file=file, cure=cure)
-    if UNKNOWN in read_text(file, "a YAML file", most_bytes=MOST_BYTES) and (
-        places := list(_left_open(load_yaml(file)))
-    ):
-        named = ", ".join(places[:MOST_NAMED]) + f" and {len(places) - MOST_NAMED} more" * (len(places) > MOST_NAMED)
-        found = f"{len(places)} places are left open" if len(places) > 1 else "one place is left open"
-        raise InputError(
-            f"{found}: {named}", file=file, key=places[0], cure="write what belongs there, in place of `?`"
-        )
-    spec, external = read_yaml(file, DatasetFile), {}
-    check_dataset(spec, file)
+    spec, faults = read_draft(file)
+    raise_all(faults)
+    external = {}
     refuse = Refusal(file, file.parent)
     companions = {
         name: _companions(mesh.file, f"meshes.{name}.file", refuse) for name, mesh in spec.meshes.items() if mesh.file
@@ -64,6 +58,51 @@ def read_dataset(path: str | Path) -> Dataset:
         spec, external = external_cameras(spec, file)
     check_lights(spec.photos, file)
     return Dataset(folder=folder, spec=spec, companions=companions, external=external, truth=_read_truth(spec, file))
+
+
+def read_draft(file: Path) -> tuple[DatasetFile, list[InputError]]:
+    """A dataset.yaml as it stands, a word that nothing is called in place of each `?`, and all its faults; InputError where it is none.
+
+    Places that are left open are one fault, and what follows from them is none.
+    """
+    text = read_text(file, "a YAML file", most_bytes=MOST_BYTES)
+    value = parse_yaml(text, file)
+    places, faults = list(_left_open(value)) if UNKNOWN in text else [], []
+    if places:
+        named = ", ".join(places[:MOST_NAMED]) + f" and {len(places) - MOST_NAMED} more" * (len(places) > MOST_NAMED)
+        found = f"{len(places)} places are left open" if len(places) > 1 else "one place is left open"
+        drawn = "; `make label` draws masks" if any(place.endswith(".masks") for place in places) else ""
+        cure = f"write what belongs there, in place of `?`{drawn}"
+        faults.append(InputError(f"{found}: {named}", file=file, key=places[0], cure=cure))
+    try:
+        spec = convert(_filled(value), DatasetFile, file, text=text)
+    except InputError as error:
+        raise_all(faults + _others(error, places))
+    try:
+        check_dataset(spec, file)
+    except InputError as error:
+        faults += _others(error, places)
+    return spec, faults
+
+
+def _others(error: InputError, places: list[str]) -> list[InputError]:
+    """The faults that are none of places that are left open, nor follow from them."""
+
+    def follows(fault: InputError) -> bool:
+        unnamed = "materials[0]" in places and fault.found.startswith("unknown material")
+        return unnamed or any(_within(place, fault.key) or _within(fault.key, place) for place in places)
+
+    return [fault for fault in getattr(error, "faults", [error]) if not follows(fault)]
+
+
+def _within(key: str | None, other: str | None) -> bool:
+    return key is not None and (key == other or key.startswith((f"{other}.", f"{other}[")))
+
+
+def _filled(value: Any) -> Any:
+    if isinstance(value, dict):
+        return {name: _filled(item) for name, item in value.items()}
+    return [_filled(item) for item in value] if isinstance(value, list) else OPEN if value == UNKNOWN else value
 
 
 def _left_open(value: Any, key: str = "") -> Iterator[str]:

@@ -2,6 +2,7 @@
 
 import errno
 import json
+import pickle
 import zlib
 from pathlib import Path
 
@@ -10,7 +11,7 @@ import pytest
 from PIL import Image
 
 from factorlib.dataset.read import read_dataset
-from factorlib.errors import InputError
+from factorlib.errors import InputError, InputErrors
 from factorlib.newset import new_dataset
 from factorlib.validation import Validation
 from factorlib.yamlfile import load_yaml
@@ -75,6 +76,24 @@ def test_all_places_that_are_left_open_are_named_at_once(folder):
         "photos[1].masks",
     ):
         assert place in said, place
+
+
+def test_what_else_is_wrong_is_named_beside_the_places_that_are_left_open(folder):
+    """And what only follows from these is not: a mask that is left open is no file that is missing."""
+    made(folder, masks=None)
+    file = folder / "data" / "mine" / "dataset.yaml"
+    text = file.read_text().replace("photos/kitchen.jpg", "photos/kitten.jpg").replace("name: IMG_0412", "name: poses")
+    file.write_text(text.replace("meshes/chair.obj", "meshes/char.obj"))
+    with pytest.raises(InputErrors) as error:
+        read_dataset(file)
+    keys = ["materials[0]", "meshes.chair.file", "photos[0].name", "photos[1].image"]
+    assert [fault.key for fault in error.value.faults] == keys
+    said = str(pickle.loads(pickle.dumps(error.value)))
+    assert said.count("error: ") == 3 and all(key in said for key in keys) and "left_open" not in said
+    file.write_text(text.replace("format: 1", "format: 2").replace("    objects:", "    object:", 1))
+    with pytest.raises(InputErrors, match="left open") as error:
+        read_dataset(file)
+    assert [fault.key for fault in error.value.faults] == ["materials[0]", "format", "photos[0].object"]
 
 
 def test_a_mask_for_each_material_names_the_parts_and_nothing_is_missing(folder):
