@@ -4,8 +4,8 @@ The files are copied to data/<name>/.  A mask belongs to the photo of the same n
 `kitchen/oak.png` for one material, or one COCO json for all.  Beside a mask with labels `kitchen_chair1.png` is the silhouette of an
 object.  Materials are the names in those, or label_1, label_2, … for labels.
 
-What no file says (which material a part of a mesh has, which mesh a photo shows) is left as `?`, which `make validate` refuses, and
-listed; so is what must be renamed.
+Which label shows which part of a mesh is found by laying the mesh on the masks under every pairing; how sure that is stands beside it.
+What no file says, and pairings that are not sure, are left as `?`, which `make validate` refuses, and listed; so is what must be renamed.
 """
 
 from __future__ import annotations
@@ -13,7 +13,9 @@ from __future__ import annotations
 import os
 import re
 import shutil
-from collections.abc import Collection, Iterable
+from collections import Counter
+from collections.abc import Callable, Collection, Iterable
+from contextlib import suppress
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
@@ -22,23 +24,33 @@ import numpy as np
 import yaml
 from PIL import Image
 
+from factorlib.align.pairing import HIDDEN, pair
+from factorlib.align.silhouette import UNKNOWN as HIDES
+from factorlib.align.silhouette import Silhouette
 from factorlib.dataset.check import IMAGES, MESHES, RESERVED_PHOTOS
 from factorlib.dataset.read import UNKNOWN
 from factorlib.dataset.schema import LEFT_OUT, LONGEST_NAME, MAX_MATERIALS
 from factorlib.disk import disk_error
 from factorlib.errors import InputError
 from factorlib.images.limits import MOST_MEGAPIXELS, check_pixels
+from factorlib.images.photo import open_photo
+from factorlib.labels import read_labels
 from factorlib.labels.coco import Category
-from factorlib.labels.png import read_values
-from factorlib.meshes.read import read_parts
+from factorlib.labels.png import read_inside, read_values
+from factorlib.meshes.read import read_mesh, read_parts
 from factorlib.reading import read_bytes, reading
 from factorlib.wholefile import write_text
 
 REMARK = """\
 # What the files say; `?` is for you to write.  Every key: docs/dataset.md
 # materials: label k of a mask is the k-th, from 1;  parts: part of a mesh -> material
+# margin: how many more pixels any other pairing of parts and labels would have wrong in all photos, in parts of a mask's
 # objects: of each the mesh; another material for a part by `materials: {part: material}`
 """
+MARGIN = 0.1  # wrong pixels, as a share of a mask's: data sets with truth that were tried have .7 and more
+MOST_OBJECTS = 200  # of one mesh that are looked at: .3 s each
+SIDE = 400  # pixels of a photo in which parts are told apart
+BESIDE = "\x1f"  # between a value and the comment beside it
 HULL = "thing"  # the mesh where none is given
 NO_MESH = (
     "there is no mesh: `hull: true` and `cameras: {sfm: true}` are written, which need photos that overlap, each 10 to 20° from the next; "
@@ -87,32 +99,46 @@ def new_dataset(target: Path, photos: Path, masks: Path | None, meshes: Path | N
     of_meshes = _files(meshes, None, "MESHES", deep=True) if meshes is not None else []  # with .mtl, buffers
     materials, of_photos, silhouettes = _masks(masks, of_masks, list(named), missing) if masks else ([], {}, {})
     entries = _meshes(meshes, of_meshes, materials, missing) if meshes else {}
-    shown = {photo: _shown_in(photo, entries) for photo in named}
+    called = {mesh: {mesh, *entry.get("parts", ())} for mesh, entry in entries.items()}
+    shown = {}
+    for photo in named:
+        own = set(of_photos[photo]) if isinstance(of_photos.get(photo), dict) else set()
+        shown[photo] = _shown_in(photo, entries) or [mesh for mesh in entries if called[mesh] & own]
     if len(entries) > 1:
         missing += [f"photo {photo}: write which of the meshes it shows" for photo in named if not shown[photo]]
+    if masks is None:
+        missing.append(
+            "there are no masks: `make label` draws them in the browser, once `materials` has their names; or give MASKS=<folder>"
+        )
     missing += [f"photo {photo}: no mask called {photo}.png or {photo}_<material>.png"
-                for photo in named if photo not in of_photos]  # fmt: skip
+                for photo in named if masks is not None and photo not in of_photos]  # fmt: skip
     missing += [f"photo {photo}: write another `name`: a file of the results is called {photo}"
                 for photo in named if photo in RESERVED_PHOTOS]  # fmt: skip
     spec: dict = {"format": 1, "materials": materials or [UNKNOWN]}
-    if not entries and materials:
-        made_of = {"material": materials[0]} if len(materials) == 1 else {"parts": {name: name for name in materials}}
+    if not entries:
+        made_of = (
+            {"parts": {name: name for name in materials}} if len(materials) > 1 else {"material": spec["materials"][0]}
+        )
         entries, spec["cameras"] = {HULL: {"hull": True, **made_of}}, {"sfm": True}
         shown = {photo: [HULL] for photo in named}
         missing.append(NO_MESH)
-    elif not entries:
-        missing.append("there is no mesh: give MESHES=<folder>; rough ones will do")
-    if not materials:
+    if not materials and masks is not None:
         missing.append("no mask names a material: write the names in `materials`, label k of a mask the k-th")
     spec |= {"meshes": entries, "photos": []}
     for photo, path in named.items():
         objects = [{"name": mesh, "mesh": mesh} for mesh in shown[photo] or [UNKNOWN] * bool(entries)]
         if objects and silhouettes.get(photo):
-            mesh = objects[0]["mesh"] if len(objects) == 1 else UNKNOWN
-            objects = [{"name": name, "mesh": mesh, "mask": mask} for name, mask in silhouettes[photo].items()]
+            only = objects[0]["mesh"] if len(objects) == 1 else UNKNOWN
+            objects = [
+                {"name": name, "mesh": (_shown_in(name, entries) or [only])[0], "mask": mask}
+                for name, mask in silhouettes[photo].items()
+            ]
         image, mask = f"photos/{path.relative_to(photos)}", of_photos.get(photo, UNKNOWN)
         spec["photos"].append({"name": photo, "image": image, "masks": mask, "objects": objects})
+    places = {"photos": photos, "masks": masks, "meshes": meshes}
+    _match(spec, lambda name: places[name.partition("/")[0]] / name.partition("/")[2], missing)
     text = yaml.dump(spec, Dumper=_Dumper, sort_keys=False, allow_unicode=True, width=10**6)
+    text = re.sub(r'"(\w+|\?)\\x1F([^"]*)"', lambda m: ('"?"' if m[1] == "?" else m[1]) + f"  # {m[2]}", text)
     try:
         target.parent.mkdir(parents=True, exist_ok=True)
         with TemporaryDirectory(dir=target.parent, prefix=f".{target.name}.") as folder:
@@ -192,15 +218,68 @@ def _meshes(folder: Path, files: list[Path], materials: list[str], missing: list
     entries = {}
     for name, path in _by_name([path for path in files if path.suffix.lower() in MESHES], "MESHES").items():
         parts, file = list(dict.fromkeys(names[0] for names in read_parts(path))), f"meshes/{path.relative_to(folder)}"
-        undecided = [part for part in parts if part not in materials]
         if len(materials) == 1:
             entries[name] = {"file": file, "material": materials[0]}
             continue
-        entries[name] = {"file": file, "parts": {part: UNKNOWN if part in undecided else part for part in parts}}
-        if undecided:
-            verb = "is" if len(undecided) == 1 else "are"
-            missing.append(f"mesh {name}: write which material {', '.join(undecided)} {verb} made of")
+        entries[name] = {"file": file, "parts": {part: part if part in materials else UNKNOWN for part in parts}}
     return entries
+
+
+def _match(spec: dict, file: Callable[[str], Path], missing: list[str]) -> None:
+    """Write the material of each part that is open as the masks tell it: in the mesh what most objects have, in an object what differs.
+
+    file: where the file of such a name lies that is to be copied
+    """
+    materials = spec["materials"]
+    for name, entry in spec["meshes"].items():
+        of, objects, silhouettes, known = entry.get("parts", {}), [], [], []
+        if UNKNOWN not in of.values():
+            continue
+        for photo in spec["photos"]:
+            for obj in photo["objects"]:
+                alone = "mask" in obj or len(photo["objects"]) == 1
+                if obj["mesh"] == name and alone and photo["masks"] != UNKNOWN and len(objects) < MOST_OBJECTS:
+                    with suppress(InputError):  # a mask that does not fit its photo, which `validate` says
+                        silhouettes.append(_silhouette(photo, obj, materials, file))
+                        objects.append(obj)
+        mesh = read_mesh(file(entry["file"]), list(of), {part: part for part in of})
+        told = pair(mesh, len(of), silhouettes)
+        for k, part in [(k, part) for k, part in enumerate(of) if of[part] == UNKNOWN]:
+            ranked = [paired.labels[k] if paired else [] for paired in told]
+            margins = [paired.margins[k] if paired else 0.0 for paired in told]
+            sure = [margin >= MARGIN and each[0] != HIDDEN for margin, each in zip(margins, ranked)]
+            likely = [" or ".join(materials[label - 1] for label in each if label != HIDDEN) for each in ranked]
+            if not any(sure):
+                first = max(likely, key=len, default="")
+                of[part] = f"{UNKNOWN}{BESIDE}{first}" if first else UNKNOWN
+                missing.append(f"mesh {name}: write which material {part} is made of" + f" ({first})" * bool(first))
+                continue
+            usual = Counter(each[0] for each, yes in zip(ranked, sure) if yes).most_common(1)[0][0]
+            least = min(margin for margin, yes in zip(margins, sure) if yes)
+            known.append(part)
+            of[part] = f"{materials[usual - 1]}{BESIDE}margin {least:.2f}"
+            for obj, each, yes, words in zip(objects, ranked, sure, likely):
+                if yes and each[0] != usual:
+                    obj.setdefault("materials", {})[part] = materials[each[0] - 1]
+                elif not yes and HIDDEN not in each[:2]:  # else it is not seen there
+                    obj.setdefault("materials", {})[part] = f"{UNKNOWN}{BESIDE}{words or 'more labels than parts'}"
+                    missing.append(f"object {obj['name']}: write which material {part} is made of")
+        if known:
+            missing.append(
+                f"mesh {name}: look whether {', '.join(known)} got the right materials, from silhouettes alone"
+            )
+
+
+def _silhouette(photo: dict, obj: dict, materials: list[str], file: Callable[[str], Path]) -> Silhouette:
+    """The labels of an object, of every so many pixels."""
+    size = open_photo(file(photo["image"]), photo["name"]).size
+    check_pixels(size, MOST_MEGAPIXELS, file(photo["image"]), photo["name"])
+    labels = read_labels(photo["masks"], file, materials, size, photo["image"], photo["name"])
+    label = np.where(labels.left_out, HIDES, labels.label.astype(np.int16))
+    if "mask" in obj:
+        label[~read_inside(file(obj["mask"]), photo["name"], size) & (label > 0)] = HIDES
+    every = -(-max(size) // SIDE)
+    return Silhouette(label[::every, ::every])
 
 
 def _shown_in(photo: str, meshes: Collection[str]) -> list[str]:

@@ -1,22 +1,27 @@
 """A contact sheet of a dataset, to be looked at before anything is solved: each photo, its labels, and the meshes in the labels' colours.
 
 A row for each photo: the photo; the same in grey, materials in their colours and what is left out hatched; each object's mesh as it lies
-in its file, from the +z side with +y up, its parts in the colours of their materials in this photo.
+in its file, from the +z side with +y up, its parts in the colours of their materials in this photo.  Of a data set that is not finished
+it shows what there is: the material of a part that is left open is called `?`.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
+from contextlib import suppress
+from functools import partial
 from pathlib import Path
 
 import numpy as np
 from jaxtyping import UInt8
 from PIL import Image, ImageDraw
 
-from factorlib.dataset.read import read_dataset
-from factorlib.dataset.schema import Dataset, PhotoEntry
+from factorlib.dataset.read import FILE, OPEN, UNKNOWN, read_draft
+from factorlib.dataset.schema import DatasetFile, PhotoEntry
+from factorlib.errors import InputError
 from factorlib.geometry.camera import Camera, Pose
 from factorlib.geometry.raster import rasterise
+from factorlib.images.limits import MOST_MEGAPIXELS, check_pixels
 from factorlib.images.palette import nearest_tags, rgb_of
 from factorlib.images.photo import decoded, open_photo
 from factorlib.images.picture import picture, png_bytes
@@ -24,6 +29,7 @@ from factorlib.images.transfer import srgb_decode
 from factorlib.labels import Labels, read_labels
 from factorlib.meshes.mesh import Mesh
 from factorlib.meshes.read import read_mesh
+from factorlib.reading import path_inside
 from factorlib.wholefile import write_bytes
 
 # pixels: a photo's longer side, a mesh, between pictures, a line of text
@@ -31,27 +37,35 @@ SIDE, MESH_SIDE, MARGIN, HEAD = 320, 240, 12, 18
 PAPER, INK = (255, 255, 255), (30, 30, 30)
 DISTANCE = 6.0  # of the camera from a mesh, in its radii
 HATCH = 8  # pixels from line to line
+MOST_PHOTOS = 100
 
 Pixels = UInt8[np.ndarray, "h w 3"]
 
 
 def write_sheet(folder: Path, path: Path, report: Callable[[int, int], None] = lambda done, total: None) -> None:
-    """The sheet of the dataset in `folder` as a PNG; report: how many pieces are done of how many, two a photo."""
-    dataset = read_dataset(folder)
-    photos, materials, pictures = dataset.spec.photos, dataset.spec.materials, []
+    """The sheet of the dataset in `folder`, of its first MOST_PHOTOS photos, as a PNG; report: how many pieces are done of how many, two a photo.
+
+    Raises InputError for a dataset.yaml that does not even name photos; what else cannot be read is `validate`'s to say, and left out.
+    """
+    spec, faults = read_draft(folder / FILE)
+    names = list(dict.fromkeys([*spec.materials, *[OPEN] * bool(faults)]))
+    photos, pictures = spec.photos[:MOST_PHOTOS], []
     for done, photo in enumerate(photos):
         report(done, 2 * len(photos))
-        pictures.append(_photo(dataset, photo))
-    colours, rows = _colours(materials, pictures), []
+        pictures.append(_photo(folder, spec, photo))
+    colours, rows = _colours(names, [(image, labels) for image, labels in pictures if labels is not None]), []
     for done, (photo, (image, labels)) in enumerate(zip(photos, pictures, strict=True)):
         report(len(photos) + done, 2 * len(photos))
-        named = [(photo.name, image), ("labels", _coloured(image, labels, colours))]
+        named = [(photo.name, image)]
+        if labels is not None:
+            named.append(("labels", _coloured(image, labels, colours)))
         for obj in photo.objects:
-            entry = dataset.spec.meshes[obj.mesh]
-            if entry.file is None:  # it is found from the masks
+            entry = spec.meshes.get(obj.mesh)
+            if entry is None or entry.file is None:  # it is left open, or found from the masks
                 continue
-            mesh = read_mesh(dataset.folder / entry.file, materials, entry.made_of, obj.materials)
-            named.append((obj.name, drawn(mesh, colours)))
+            with suppress(InputError, ValueError):
+                mesh = read_mesh(path_inside(folder, entry.file), names, entry.made_of, obj.materials)
+                named.append((obj.name, drawn(mesh, colours)))
         titled = []
         for title, each in named:
             head = Image.new("RGB", (each.shape[1], HEAD), PAPER)
@@ -59,21 +73,26 @@ def write_sheet(folder: Path, path: Path, report: Callable[[int, int], None] = l
             titled.append(np.concatenate([np.asarray(head), each]))
         tall = max(len(each) for each in titled) + MARGIN
         rows.append(np.concatenate([_padded(each, tall, each.shape[1] + MARGIN) for each in titled], axis=1))
-    rows.insert(0, legend(materials, colours, max(row.shape[1] for row in rows)))
+    shown = [UNKNOWN if name == OPEN else name for name in names]
+    rows.insert(0, legend(shown, colours, max(row.shape[1] for row in rows)))
     wide = max(row.shape[1] for row in rows)
     write_bytes(path, png_bytes(np.concatenate([_padded(row, len(row), wide) for row in rows])))
 
 
-def _photo(dataset: Dataset, photo: PhotoEntry) -> tuple[Pixels, Labels]:
-    """Both averaged down, or every so many pixels taken."""
-    key, path = f"photos[{photo.name}]", dataset.folder / photo.image
-    stored = open_photo(path, f"{key}.image")
-    factor, materials = max(1, -(-max(stored.size) // SIDE)), dataset.spec.materials
-    image = picture(decoded(stored, photo.encoding, factor, path).radiance, 1.0)
-    labels = read_labels(photo.masks, dataset.folder.joinpath, materials, stored.size, photo.image, f"{key}.masks")
-    height, width = image.shape[:2]
-    fewer = slice(factor // 2, factor * height, factor), slice(factor // 2, factor * width, factor)
-    return image, Labels(labels.label[fewer], labels.left_out[fewer])
+def _photo(folder: Path, spec: DatasetFile, photo: PhotoEntry) -> tuple[Pixels, Labels | None]:
+    """Both averaged down, or every so many pixels taken; white and None where they cannot be read."""
+    key, file = f"photos[{photo.name}]", partial(path_inside, folder)
+    image, labels = np.full((SIDE, SIDE, 3), 255, np.uint8), None
+    with suppress(InputError, ValueError):
+        stored = open_photo(file(photo.image), f"{key}.image")
+        check_pixels(stored.size, MOST_MEGAPIXELS, photo.image)
+        factor = max(1, -(-max(stored.size) // SIDE))
+        image = picture(decoded(stored, photo.encoding, factor, file(photo.image)).radiance, 1.0)
+        whole = read_labels(photo.masks or OPEN, file, spec.materials, stored.size, photo.image, f"{key}.masks")
+        height, width = image.shape[:2]
+        fewer = slice(factor // 2, factor * height, factor), slice(factor // 2, factor * width, factor)
+        labels = Labels(whole.label[fewer], whole.left_out[fewer])
+    return image, labels
 
 
 def _coloured(image: Pixels, labels: Labels, colours: UInt8[np.ndarray, "k 3"]) -> Pixels:
@@ -97,8 +116,8 @@ def drawn(mesh: Mesh, by_label: UInt8[np.ndarray, "k 3"]) -> Pixels:
 
 def _colours(names: list[str], pictures: list[tuple[Pixels, Labels]]) -> UInt8[np.ndarray, "k 3"]:
     """By label, distinct and near to what the photos show there; row 0 is the background's."""
-    pixels = np.concatenate([image.reshape(-1, 3) for image, _ in pictures])
-    labels = np.concatenate([labels.label.ravel() for _, labels in pictures])
+    pixels = np.concatenate([np.zeros((0, 3)), *(image.reshape(-1, 3) for image, _ in pictures)])
+    labels = np.concatenate([np.zeros(0), *(labels.label.ravel() for _, labels in pictures)])
     own = [pixels[labels == k] for k in range(1, len(names) + 1)]
     mean = [each.mean(axis=0) / 255 if len(each) else np.full(3, 0.5) for each in own]
     tags = nearest_tags(names, srgb_decode(np.array(mean)))

@@ -76,6 +76,21 @@ def candidates(
     views: directions of view, evenly over the sphere;  rolls: turns of the photo, evenly over 360°
     keep: guesses at most, each turned by `apart_deg` at least against the others
     """
+    guesses, middle, pixel, distance = guesses_of(caster, silhouette, camera, views, rolls)
+    states = []
+    for guess in _apart(guesses, keep, apart_deg):  # shift and roll undone, seen along the ray to where it lies
+        (x, y), cos, sin = guess.shift, np.cos(guess.angle), np.sin(guess.angle)
+        place = middle + pixel * np.array([cos * x + sin * y, -sin * x + cos * y])
+        slope = (place - np.array(camera.centre)) / camera.focal
+        logs = np.log(camera.focal * distance / (guess.focal * pixel)), np.log(camera.focal)
+        states.append(State(toward(slope) @ guess.roll() @ guess.turn, *map(float, (*slope, *logs))))
+    return states
+
+
+def guesses_of(
+    caster: Caster, silhouette: Silhouette, camera: Camera, views: int, rolls: int
+) -> tuple[list[Guess], np.ndarray, float, float]:
+    """The best place of the mesh in each view, roll and size; the mask's middle and a grid pixel, in pixels; the distance of the templates."""
     low, high, extent = extent_of(silhouette)
     cut = is_cut(silhouette)
     pixel, middle = extent / (CUT if cut else WHOLE), (low + high) / 2
@@ -94,14 +109,7 @@ def candidates(
             error = 1 + errors[np.arange(rolls), best] / area
             shift = (np.stack([best % GRID, best // GRID], axis=1) + GRID // 2) % GRID - GRID // 2
             guesses += [Guess(error[k], turn, angles[k], shift[k], focal) for k in range(rolls)]
-    states = []
-    for guess in _apart(guesses, keep, apart_deg):  # shift and roll undone, seen along the ray to where it lies
-        (x, y), cos, sin = guess.shift, np.cos(guess.angle), np.sin(guess.angle)
-        place = middle + pixel * np.array([cos * x + sin * y, -sin * x + cos * y])
-        slope = (place - np.array(camera.centre)) / camera.focal
-        logs = np.log(camera.focal * distance / (guess.focal * pixel)), np.log(camera.focal)
-        states.append(State(toward(slope) @ guess.roll() @ guess.turn, *map(float, (*slope, *logs))))
-    return states
+    return guesses, middle, pixel, distance
 
 
 def _cost_images(

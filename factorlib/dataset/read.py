@@ -65,6 +65,8 @@ def read_draft(file: Path) -> tuple[DatasetFile, list[InputError]]:
 
     Places that are left open are one fault, and what follows from them is none.
     """
+    if file.is_symlink() and not Path(os.path.realpath(file)).is_relative_to(os.path.realpath(file.parent)):
+        raise InputError("is a link that leads outside the dataset", file=file, cure="put the file itself there")
     text = read_text(file, "a YAML file", most_bytes=MOST_BYTES)
     value = parse_yaml(text, file)
     places, faults = list(_left_open(value)) if UNKNOWN in text else [], []

@@ -15,7 +15,7 @@ import msgspec
 
 from factorlib.errors import InputError, did_you_mean
 from factorlib.runner import words
-from factorlib.runner.home import Home, claim, label, made_home, made_homes, show, sound_lines
+from factorlib.runner.home import Home, claim, home_of, label, made_home, made_homes, show, sound_lines
 from factorlib.runner.pipeline import Pipeline, read_pipeline
 from factorlib.runner.plan import Planned, Step, difference, in_short
 from factorlib.runner.project import RESERVED, Project, check_name
@@ -210,8 +210,10 @@ def show_params(project: Project, stages: list[str] | None) -> int:
 def validate(project: Project, dataset: str, settings: list[str], sheet: bool = False) -> int:
     """Check pipeline.yaml, the settings, dataset.yaml and every file it names, of photos only their headers.
 
-    sheet: also write build/<dataset>/sheet.png, each photo beside its labels and meshes
+    sheet: also write build/<dataset>/sheet.png, each photo beside its labels and meshes, whatever is wrong
     """
+    if sheet:
+        _draw_sheet(project, project.dataset_folder(dataset))
     seen = survey(project, dataset, None, settings)
     if faults := seen.wrong_values(seen.planned()):
         return _refused(seen, faults, "parameters")
@@ -221,20 +223,24 @@ def validate(project: Project, dataset: str, settings: list[str], sheet: bool = 
     _say(seen, f"pipeline.yaml, dataset.yaml and the files it names are good: {counts}")
     for caution in seen.data.cautions():
         print(f"  warning: {caution}")
-    if sheet:
-        from factorlib.runner.display import display_for
-
-        claim(project, seen.home, seen.data.folder)
-        path, step, started, display = seen.home.folder / "sheet.png", Step("sheet"), time.monotonic(), display_for()
-        draw = import_module("factorlib.sheet").write_sheet  # science, by its name as stages are
-        display.start(step)
-        try:
-            draw(seen.data.folder, path, lambda done, all_: (display.progress(step, done, all_, ""), display.tick()))
-            display.finish(step, time.monotonic() - started)
-        finally:
-            display.close()
-        print(f"  contact sheet: {project.shown(path)}")
+    print(f"next: {project.command('all', dataset)}")
     return 0
+
+
+def _draw_sheet(project: Project, folder: Path) -> None:
+    """Draw a data set, also one that is not finished, each photo beside its labels and meshes."""
+    from factorlib.runner.display import display_for
+
+    claim(project, home := home_of(project, folder), folder)
+    path, step, started, display = home.folder / "sheet.png", Step("sheet"), time.monotonic(), display_for()
+    draw = import_module("factorlib.sheet").write_sheet  # science, by its name as stages are
+    display.start(step)
+    try:
+        draw(folder, path, lambda done, all_: (display.progress(step, done, all_, ""), display.tick()))
+        display.finish(step, time.monotonic() - started)
+    finally:
+        display.close()
+    print(f"  contact sheet: {project.shown(path)}")
 
 
 def begin(project: Project, dataset: str, photos: Path | None, masks: Path | None, meshes: Path | None) -> int:
@@ -245,9 +251,16 @@ def begin(project: Project, dataset: str, photos: Path | None, masks: Path | Non
     folder = Path(os.path.abspath(dataset)) if "/" in dataset else project.root / "data" / dataset
     check_name(folder.name, "a dataset", key="DATASET", reserved=RESERVED)
     missing = import_module("factorlib.newset").new_dataset(folder, photos, masks, meshes)
-    where = "; what it lacks, or leaves as `?`:" if missing else ""
+    where = "; what it lacks, or leaves to you:" if missing else ""
     print(f"{project.shown(folder)}/dataset.yaml is written{where}")
-    print("\n".join([*(f"  {line}" for line in missing), f"next: {project.command('validate', dataset)}"]))
+    for line in missing:
+        print(f"  {line}")
+    try:
+        _draw_sheet(project, folder)
+    except InputError as fault:
+        print(f"  no contact sheet: {fault}")
+    first = "" if masks else f"name your materials in it, then {project.command('label', dataset)}, then "
+    print(f"next: {first}{project.command('validate', dataset)}")
     return 0
 
 

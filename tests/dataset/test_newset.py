@@ -3,6 +3,8 @@
 import errno
 import json
 import pickle
+import re
+import shutil
 import zlib
 from pathlib import Path
 
@@ -15,6 +17,7 @@ from factorlib.errors import InputError, InputErrors
 from factorlib.newset import new_dataset
 from factorlib.validation import Validation
 from factorlib.yamlfile import load_yaml
+from tests.align.test_pairing import LAMP, TWINS, seen
 
 OBJ = "v 0 0 0\nv 1 0 0\nv 0 1 0\nv 0 0 1\ng shell\nf 1 2 3\nf 1 3 4\ng legs\nf 1 2 4\nf 2 3 4\n"
 LABEL, SHELL, LEGS = [0, 1, 2, 255], [0, 255], [255, 0]
@@ -53,7 +56,9 @@ def test_labels_become_materials_parts_are_left_open_and_a_further_mask_is_the_s
     assert spec["materials"] == ["label_1", "label_2"]
     assert spec["meshes"] == {"chair": {"file": "meshes/chair.obj", "parts": {"shell": "?", "legs": "?"}}}
     assert [photo["name"] for photo in spec["photos"]] == ["IMG_0412", "kitchen"]
-    assert missing == ["mesh chair: write which material shell, legs are made of"]
+    assert [line.split(" (")[0] for line in missing] == [
+        f"mesh chair: write which material {part} is made of" for part in ("shell", "legs")
+    ]
     objects = [{"name": n, "mesh": "chair", "mask": f"masks/kitchen_{n}.png"} for n in ("left", "right")]
     assert spec["photos"][1]["objects"] == objects
     assert spec["photos"][0]["objects"] == [{"name": "chair", "mesh": "chair"}]
@@ -133,10 +138,10 @@ def test_what_is_missing_is_listed(folder):
     assert missing == [
         f"photo kitchen: {fault}; the mask of one material is called kitchen_<material>.png",
         "photo IMG_0412: no mask called IMG_0412.png or IMG_0412_<material>.png",
-        "there is no mesh: give MESHES=<folder>; rough ones will do",
+        missing[2],
         "no mask names a material: write the names in `materials`, label k of a mask the k-th",
     ]
-    assert spec["photos"][0]["masks"] == "?" and spec["photos"][1]["objects"] == []
+    assert spec["photos"][0]["masks"] == "?" and missing[2].startswith("there is no mesh: `hull: true`")
     with pytest.raises(InputError, match=r"materials\[0\]"):
         read_dataset(folder / "data" / "mine")
 
@@ -149,6 +154,73 @@ def test_without_a_mesh_a_hull_by_structure_from_motion_is_written_and_that_is_s
     assert dataset.spec.cameras.sfm and dataset.spec.meshes["thing"].hull
     assert dataset.spec.meshes["thing"].parts == {"label_1": "label_1", "label_2": "label_2"}
     assert [[obj.mesh for obj in photo.objects] for photo in dataset.spec.photos] == [["thing"], ["thing"]]
+
+
+def test_of_photographs_alone_all_that_is_open_is_left_to_write_and_the_mask_page_is_named(folder):
+    missing, spec = made(folder, masks=None, meshes=None)
+    assert [line.split(":")[0] for line in missing] == ["there are no masks", "there is no mesh"]
+    assert "make label" in missing[0] and spec["cameras"] == {"sfm": True}
+    assert spec["materials"] == ["?"] and spec["meshes"] == {"thing": {"hull": True, "material": "?"}}
+    with pytest.raises(InputError, match="4 places") as error:
+        read_dataset(folder / "data" / "mine")
+    assert "make label" in error.value.cure
+
+
+def drawn_chair(folder, *labels):
+    """Photos of a chair from several sides, with a mask each: labels of shell and legs."""
+    for path in [*(folder / "photos").iterdir(), *(folder / "meshes").iterdir()]:
+        path.unlink()
+    text, start = "", 1
+    for part, mesh in (("shell", LAMP.faces[LAMP.face_label == 1]), ("legs", LAMP.faces[LAMP.face_label == 2])):
+        text += f"g {part}\n" + "".join("f {} {} {}\n".format(*(face + start)) for face in mesh)
+    text = "".join("v {} {} {}\n".format(*vertex) for vertex in LAMP.vertices) + text
+    (folder / "meshes" / "chair.obj").write_text(text)
+    for k, of in enumerate(labels):
+        label = seen(LAMP, of, k).label.astype(np.uint8)
+        Image.fromarray(label).save(folder / "masks" / f"p{k}.png")
+        Image.fromarray(np.repeat(label[..., None] * 50, 3, axis=-1)).save(folder / "photos" / f"p{k}.png")
+
+
+def test_parts_get_the_materials_that_silhouettes_tell_and_objects_those_that_differ(folder):
+    drawn_chair(folder, (1, 3), (1, 3), (2, 3))
+    missing, spec = made(folder)
+    assert spec["meshes"]["chair"]["parts"] == {"shell": "label_1", "legs": "label_3"}
+    assert [photo["objects"][0].get("materials") for photo in spec["photos"]] == [None, None, {"shell": "label_2"}]
+    assert "shell, legs" in missing[0] and len(missing) == 1
+    file = folder / "data" / "mine" / "dataset.yaml"
+    assert re.search(r"shell: label_1  # margin \d\.\d\d$", file.read_text(), re.MULTILINE)
+    assert Validation(read_dataset(file)).faults("photo", None, {}, folder) == []
+
+
+def test_what_silhouettes_do_not_tell_is_open_and_what_it_may_be_stands_beside_it(folder):
+    drawn_chair(folder, (1, 3))
+    mask = np.zeros((90, 120), np.uint8)
+    mask[30:60, 30:60], mask[30:60, 60:90] = 1, 3
+    Image.fromarray(mask).save(folder / "masks" / "p0.png")
+    text = (folder / "meshes" / "chair.obj").read_text()
+    lines = [line for line in text.splitlines() if line[0] == "v"]
+    twins = ["v {} {} {}".format(*vertex) for vertex in TWINS.vertices]
+    (folder / "meshes" / "chair.obj").write_text("\n".join(twins + text.splitlines()[len(lines) :]))
+    missing, spec = made(folder)
+    assert spec["meshes"]["chair"]["parts"] == {"shell": "?", "legs": "?"} and len(missing) == 2
+    text = (folder / "data" / "mine" / "dataset.yaml").read_text()
+    assert re.search(r'shell: "\?"  # label_[13] or label_[13]$', text, re.MULTILINE)
+
+
+def test_an_object_is_of_the_mesh_that_its_mask_names(folder):
+    """And a photo whose masks are named as a mesh or its parts shows that mesh."""
+    (folder / "meshes" / "stool.obj").write_text(OBJ.replace("shell", "seat").replace("legs", "feet"))
+    masks(folder, kitchen=LABEL, kitchen_old_stool=[0, 1, 0], kitchen_chair=[0, 0, 1])
+    _, spec = made(folder)
+    assert {obj["name"]: obj["mesh"] for obj in spec["photos"][1]["objects"]} == {
+        "old_stool": "stool",
+        "chair": "chair",
+    }
+    shutil.rmtree(folder / "data")
+    shutil.rmtree(folder / "masks")
+    masks(folder, kitchen_seat=SHELL, IMG_0412_shell=SHELL)
+    _, spec = made(folder)
+    assert [[obj["mesh"] for obj in photo["objects"]] for photo in spec["photos"]] == [["chair"], ["stool"]]
 
 
 def test_of_several_meshes_a_photo_shows_those_whose_names_are_whole_words_of_its_own(folder):

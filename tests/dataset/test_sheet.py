@@ -1,7 +1,11 @@
 """The contact sheet: every photo, its labels and its meshes, in one picture."""
 
-import numpy as np
+import re
 
+import numpy as np
+import pytest
+
+from factorlib.errors import InputError
 from factorlib.images.picture import read_png
 from factorlib.meshes.mesh import Mesh
 from factorlib.runner import verbs
@@ -30,5 +34,12 @@ def test_validate_writes_a_row_for_each_photo_with_its_labels_and_meshes_always_
     assert verbs.validate(project, str(folder), [], sheet=True) == 0 and "contact sheet" in capsys.readouterr().out
     write_sheet(folder, tmp_path / "again.png", lambda k, total: done.append((k, total)))
     assert sheet.read_bytes() == (tmp_path / "again.png").read_bytes() and done == [(k, 4) for k in range(4)]
+    file = folder / "dataset.yaml"  # the same, as far as it goes, of one that is not finished
+    file.write_text(re.sub("masks: .*", 'masks: "?"', file.read_text(), count=1))
+    with pytest.raises(InputError, match="left open"):
+        verbs.validate(project, str(folder), [], sheet=True)
+    unfinished = read_png(sheet)
+    assert len(unfinished) == len(read_png(tmp_path / "again.png")) and (unfinished != 255).any()
+    (tmp_path / "again.png").replace(sheet)
     height = HEAD + 2 * MARGIN + 2 * (MESH_SIDE + HEAD + MARGIN)
     assert read_png(sheet).shape == (height, 2 * (good.W + MARGIN) + 2 * (MESH_SIDE + MARGIN), 3)
