@@ -99,11 +99,12 @@ def new_dataset(target: Path, photos: Path, masks: Path | None, meshes: Path | N
     of_meshes = _files(meshes, None, "MESHES", deep=True) if meshes is not None else []  # with .mtl, buffers
     materials, of_photos, silhouettes = _masks(masks, of_masks, list(named), missing) if masks else ([], {}, {})
     entries = _meshes(meshes, of_meshes, materials, missing) if meshes else {}
-    called = {mesh: {mesh, *entry.get("parts", ())} for mesh, entry in entries.items()}
+    words = [(word, mesh) for mesh, entry in entries.items() for word in {mesh, *entry.get("parts", ())}]
+    times, called = Counter(word for word, _ in words), dict(words)
     shown = {}
     for photo in named:
-        own = set(of_photos[photo]) if isinstance(of_photos.get(photo), dict) else set()
-        shown[photo] = _shown_in(photo, entries) or [mesh for mesh in entries if called[mesh] & own]
+        own = of_photos[photo] if isinstance(of_photos.get(photo), dict) else ()
+        shown[photo] = _shown_in(photo, entries) or sorted({called[word] for word in own if times[word] == 1})
     if len(entries) > 1:
         missing += [f"photo {photo}: write which of the meshes it shows" for photo in named if not shown[photo]]
     if masks is None:
@@ -138,7 +139,9 @@ def new_dataset(target: Path, photos: Path, masks: Path | None, meshes: Path | N
     places = {"photos": photos, "masks": masks, "meshes": meshes}
     _match(spec, lambda name: places[name.partition("/")[0]] / name.partition("/")[2], missing)
     text = yaml.dump(spec, Dumper=_Dumper, sort_keys=False, allow_unicode=True, width=10**6)
-    text = re.sub(r'"(\w+|\?)\\x1F([^"]*)"', lambda m: ('"?"' if m[1] == "?" else m[1]) + f"  # {m[2]}", text)
+    text = re.sub(
+        r'"([\w-]+|\?)\\x1F([^"]*)"', lambda m: f"{yaml.dump(m[1], Dumper=_Dumper).split()[0]}  # {m[2]}", text
+    )
     try:
         target.parent.mkdir(parents=True, exist_ok=True)
         with TemporaryDirectory(dir=target.parent, prefix=f".{target.name}.") as folder:
@@ -241,7 +244,7 @@ def _match(spec: dict, file: Callable[[str], Path], missing: list[str]) -> None:
                 if obj["mesh"] == name and alone and photo["masks"] != UNKNOWN and len(objects) < MOST_OBJECTS:
                     with suppress(InputError):  # a mask that does not fit its photo, which `validate` says
                         silhouettes.append(_silhouette(photo, obj, materials, file))
-                        objects.append(obj)
+                        objects.append((photo["name"], obj))
         mesh = read_mesh(file(entry["file"]), list(of), {part: part for part in of})
         told = pair(mesh, len(of), silhouettes)
         for k, part in [(k, part) for k, part in enumerate(of) if of[part] == UNKNOWN]:
@@ -258,12 +261,12 @@ def _match(spec: dict, file: Callable[[str], Path], missing: list[str]) -> None:
             least = min(margin for margin, yes in zip(margins, sure) if yes)
             known.append(part)
             of[part] = f"{materials[usual - 1]}{BESIDE}margin {least:.2f}"
-            for obj, each, yes, words in zip(objects, ranked, sure, likely):
+            for (photo, obj), each, yes, words in zip(objects, ranked, sure, likely):
                 if yes and each[0] != usual:
                     obj.setdefault("materials", {})[part] = materials[each[0] - 1]
                 elif not yes and HIDDEN not in each[:2]:  # else it is not seen there
-                    obj.setdefault("materials", {})[part] = f"{UNKNOWN}{BESIDE}{words or 'more labels than parts'}"
-                    missing.append(f"object {obj['name']}: write which material {part} is made of")
+                    obj.setdefault("materials", {})[part] = f"{UNKNOWN}{BESIDE}{words or 'not told by the mask'}"
+                    missing.append(f"photo {photo}: write which material {part} of {obj['name']} is made of")
         if known:
             missing.append(
                 f"mesh {name}: look whether {', '.join(known)} got the right materials, from silhouettes alone"

@@ -21,7 +21,7 @@ from factorlib.meshes.mesh import Mesh
 
 VIEWS, ROLLS = 60, 18
 SEEN = 0.02  # of an object's pixels: a label with fewer is a slip of the brush
-MOST_PAIRINGS, MOST_ROLES = 256, 5000  # as many of a sighting, of all labels
+MOST_PAIRINGS, MOST_ROLES = 24, 5000  # of a sighting, each of which takes .1 s;  of all labels
 HIDDEN = 0
 FOCAL = 1.2  # of a photo's longer side: a phone's; the outline changes little with it
 
@@ -66,9 +66,11 @@ def _costs(mesh: Mesh, parts: int, silhouette: Silhouette) -> dict[tuple[int, ..
     """The cost of each pairing (the label of every part) of one sighting."""
     counts = np.bincount(silhouette.label[silhouette.inside])
     seen = np.flatnonzero(counts > SEEN * counts.sum()).tolist()
-    if not 0 < len(seen) <= parts or (len(seen) + 1) ** parts > MOST_PAIRINGS:
+    if not 0 < len(seen) <= parts or (len(seen) + 1) ** parts > MOST_ROLES:
         return {}
     pairings = [each for each in product([HIDDEN, *seen], repeat=parts) if set(each) >= set(seen)]
+    if len(pairings) > MOST_PAIRINGS:
+        return {}
     if len(pairings) == 1:
         return {pairings[0]: 0.0}
     height, width = silhouette.label.shape

@@ -46,13 +46,6 @@ def test_parts_get_the_labels_that_they_were_drawn_with_in_each_photo():
     assert unseen == 1
 
 
-def test_names_of_labels_do_not_matter():
-    sightings = [seen(LAMP, (1, 2), 7), seen(LAMP, (1, 2), 8)]
-    swapped = [Silhouette(np.array([0, 9, 5], np.int16)[each.label]) for each in sightings]
-    renamed = [[[{1: 9, 2: 5, HIDDEN: HIDDEN}[k] for k in each] for each in p.labels] for p in pair(LAMP, 2, sightings)]
-    assert renamed == [paired.labels for paired in pair(LAMP, 2, swapped)]
-
-
 def test_parts_that_look_alike_are_not_sure():
     (paired,) = pair(TWINS, 2, [seen(TWINS, (1, 2), 3)])
     assert max(paired.margins) < 0.1 and all(set(each) == {1, 2} for each in paired.labels)

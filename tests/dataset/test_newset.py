@@ -190,6 +190,16 @@ def test_parts_get_the_materials_that_silhouettes_tell_and_objects_those_that_di
     file = folder / "data" / "mine" / "dataset.yaml"
     assert re.search(r"shell: label_1  # margin \d\.\d\d$", file.read_text(), re.MULTILINE)
     assert Validation(read_dataset(file)).faults("photo", None, {}, folder) == []
+    shutil.rmtree(folder / "data")
+    stripes = np.resize(np.array([1, 2, 3], np.uint8), (90, 120))  # of more materials than the chair has parts
+    Image.fromarray(stripes).save(folder / "masks" / "p2.png")
+    missing, spec = made(folder)
+    assert [photo["objects"][0].get("materials") for photo in spec["photos"]] == [
+        None,
+        None,
+        {"shell": "?", "legs": "?"},
+    ]
+    assert missing[0] == "photo p2: write which material shell of chair is made of"
 
 
 def test_what_silhouettes_do_not_tell_is_open_and_what_it_may_be_stands_beside_it(folder):
