@@ -17,7 +17,7 @@ from pathlib import Path
 from typing import Any, NoReturn
 
 from factorlib.errors import InputError
-from factorlib.runner import verbs
+from factorlib.runner import gc, verbs
 from factorlib.runner.display import plain_streams, printable
 from factorlib.runner.project import LIBRARY, PIPELINE, Project, photo_sets
 from factorlib.runner.stop import heed_stops
@@ -160,11 +160,11 @@ VERBS: dict[str, tuple[str, Callable[[Namespace], int], str]] = {  # in the orde
                  "Check pipeline.yaml, settings and dataset without running anything."),
     "pack": ("dataset out force", lambda a: verbs.pack(project(), dataset_of(a), a.out, switched_on("FORCE", a.force)),
              "Put a result into one zip file that travels without its dataset."),
-    "verify": ("dataset", lambda a: verbs.verify(project(), dataset_of(a, True)),
+    "verify": ("dataset", lambda a: gc.verify(project(), dataset_of(a, True)),
                "Read every kept result, of a dataset or of all, and name what is damaged."),
-    "clean": ("dataset", lambda a: verbs.clean(project(), dataset_of(a, True)),
+    "clean": ("dataset", lambda a: gc.clean(project(), dataset_of(a, True)),
               "Forget a dataset's results, or, where neither --dataset nor DATASET is given, all."),
-    "gc": ("force", lambda a: verbs.collect(project(), lambda: agreed(a.force)),
+    "gc": ("force", lambda a: gc.collect(project(), lambda: agreed(a.force)),
            "Show which results are current for no dataset, and delete them; a terminal is asked first."),
     "worker": ("scheduler cores", _worker,
                "Work for a Dask scheduler until it ends; further options are those of `dask worker`."),

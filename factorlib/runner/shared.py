@@ -15,7 +15,6 @@ import contextlib
 import errno
 import os
 import shutil
-import time
 import uuid
 from collections.abc import Callable
 from pathlib import Path, PurePosixPath
@@ -28,12 +27,11 @@ from factorlib.runner.filehash import hash_of_file, is_file_of
 from factorlib.runner.home import sound_lines
 from factorlib.runner.pipeline import Shipping
 from factorlib.runner.plan import Record, key_of
-from factorlib.runner.store import Entry, Store, damage_of
+from factorlib.runner.store import Entry, Store, damage_of, is_abandoned, sweep
 from factorlib.wholefile import replace_file
 
 VARIABLE = "FACTORLIB_STORE"
 NOT_OURS = (errno.EACCES, errno.EPERM, errno.EROFS)  # to read is enough
-ABANDONED = 86400.0  # seconds after which a draft in the shared store is taken to be of a run that was killed
 MADE_FROM = "made_from.json"
 CURE = "restore it from the repository, or make the result anew with FORCE=1"
 
@@ -86,10 +84,8 @@ def offer(own: Store, shared: Store, key: str, entry: Entry, say: Say) -> None:
         there = shared.entry(key)
         if there and not damage_of(shared.tree(there.output), there.files):
             return
-        for path in shared.tmp.glob("offer-*"):
-            with contextlib.suppress(OSError):
-                if time.time() - path.stat().st_mtime > ABANDONED:
-                    shutil.rmtree(path, ignore_errors=True)
+        shared.tmp.mkdir(parents=True, exist_ok=True)
+        sweep(shared.tmp, is_abandoned)
         if copied(own.tree(entry.output), draft, entry.files):
             shared.take_in(entry.record, draft)
             _copy_log(own, shared, key)

@@ -26,7 +26,7 @@ from factorlib.runner.pipeline import (
 )
 from factorlib.runner.plan import Listing, Planned, Record, Spec, Step, plan
 from factorlib.runner.project import ALL, Data, Project, Recipe
-from factorlib.runner.store import Inspector, Store
+from factorlib.runner.store import Store
 from factorlib.runner.worker import Code, params_of
 
 RENDER = "render"  # the stage whose pictures a recipe replaces
@@ -49,7 +49,6 @@ class Survey:
     store: Store
     spec: Spec
     records: dict[Step, Record]
-    outputs: Inspector
     previous: dict[str, Record]
     recipes: dict[str, Recipe]
     words: dict[str, str]
@@ -57,7 +56,7 @@ class Survey:
     def planned(self, forced: frozenset[Step] | None = None) -> list[Planned]:
         """Every step with its state and the reason for it; `forced` replaces the spec's steps that must run."""
         spec = self.spec if forced is None else msgspec.structs.replace(self.spec, forced=forced)
-        return plan(spec, self.records, Listing(self.outputs, self.previous, self.outputs.damaged))
+        return plan(spec, self.records, Listing(self.store, self.previous, self.store.damaged))
 
     def code(self, name: str, cores: int = 1) -> Code:
         """A stage with its parameters, as a worker loads it; cores: of the machine, of which it takes what it may."""
@@ -153,10 +152,9 @@ def survey(
         raise said_of_settings(error, words) from None
     with contextlib.suppress(OSError):  # of a build/ that is read-only: the next command reads more, that is all
         hashes.save()
-    outputs = Inspector(store)
-    entries = {step: outputs.entry(key) for step, key in home.keys(lenient=True).items()}
+    entries = {step: store.entry(key) for step, key in home.keys(lenient=True).items()}
     previous = {step: entry.record for step, entry in entries.items() if entry}
-    return Survey(project, data, home, store, spec, records, outputs, previous, asked, words)
+    return Survey(project, data, home, store, spec, records, previous, asked, words)
 
 
 def _records(

@@ -5,7 +5,6 @@ from __future__ import annotations
 import ast
 import inspect
 import textwrap
-import time
 from collections.abc import Callable
 from typing import Any
 
@@ -137,26 +136,6 @@ def _made_with(record: dict, events: list[dict]) -> str:
     parts += [f"{machine['system']} {machine['processor']}"] if machine else []
     parts += [f"{n.removeprefix('package:')} {v}" for n, v in sorted(record.items()) if n.startswith("package:")]
     return ", ".join(part.replace(" ", "\N{NO-BREAK SPACE}") for part in parts)
-
-
-def unneeded_lines(groups: dict[str, list[tuple[float, int]]]) -> list[str]:
-    """A line a stage: how many results nothing names, what they take, and how old they are."""
-    lines = []
-    for stage, results in groups.items():
-        oldest, newest = (_age(time.time() - pick(kept for kept, _ in results)) for pick in (min, max))
-        what = f"{stage:<10} {len(results):>5} {'result ' if len(results) == 1 else 'results'}"
-        age = newest if oldest == newest else f"{newest} to {oldest}"
-        lines.append(f"{what} {sum(size for _, size in results) / 1e6:>9.1f} MB   {age} old")
-    return lines
-
-
-def _age(seconds: float) -> str:
-    """
-    >>> _age(30), _age(7200), _age(200000)
-    ('less than an hour', '2 h', '2 days')
-    """
-    hours = int(max(0.0, seconds) // 3600)
-    return "less than an hour" if hours == 0 else f"{hours} h" if hours < 48 else f"{hours // 24} days"
 
 
 def parameter_lines(stage: str, params: type) -> list[str]:

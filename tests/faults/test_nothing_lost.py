@@ -173,7 +173,7 @@ def new_runs(project, *settings):
 
 
 def is_sound(project, dataset=None):
-    return verbs.verify(project, dataset) == 0
+    return verify(project, dataset) == 0
 
 
 def lost_in(project, wanted, *settings):

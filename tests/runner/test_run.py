@@ -12,7 +12,7 @@ import pytest
 from factorlib.errors import InputError
 from factorlib.runner import verbs
 from factorlib.runner.child import Pools
-from factorlib.runner.gc import collect
+from factorlib.runner.gc import clean, collect
 from tests.faults.battered import make
 from tests.faults.test_nothing_lost import done, start, wait_until
 from tests.runner import toy
@@ -267,16 +267,16 @@ def test_gc_shows_by_stage_and_age_what_is_not_current_asks_and_deletes_that_alo
     for key in (project.build / "store" / "keys").iterdir():
         os.utime(key, (time.time() - 3 * 86400 - 60,) * 2)
     capsys.readouterr()
-    assert verbs.collect(project, lambda: False) == 0
+    assert collect(project, lambda: False) == 0
     said = capsys.readouterr().out
     assert re.search(r"^table +1 result .* MB   3 days old$", said, re.M) and re.search("^total +1 result ", said, re.M)
     assert "nothing was deleted" in said and state(project, settings=("table.scale=3",))["table"] == "current"
-    assert verbs.collect(project, lambda: True) == 0 and "deleted 2 results" in capsys.readouterr().out
+    assert collect(project, lambda: True) == 0 and "deleted 2 results" in capsys.readouterr().out
     assert {stage: files_of(project.build / "set" / stage) for stage in before} == before
     assert set(state(project).values()) == {"current"}
     assert state(project, settings=("table.scale=3",))["table"] == "to run"
-    assert verbs.collect(project, pytest.fail) == 0  # nothing is asked where there is nothing to free
-    assert verbs.clean(project, "set") == 0 and set(state(project).values()) == {"current"}
+    assert collect(project, pytest.fail) == 0  # nothing is asked where there is nothing to free
+    assert clean(project, "set") == 0 and set(state(project).values()) == {"current"}
     collect(project)
     assert "current" not in state(project).values()
 

@@ -69,7 +69,7 @@ def test_what_one_checkout_makes_the_other_copies_with_its_log(tmp_path, one, ca
     assert "not made yet; the shared store has it" in capsys.readouterr().out
     assert make(other) == 0 and computed(other) == 0
     assert files_of(other.build / "set" / "total") == files_of(one.build / "set" / "total")
-    assert set(state(other).values()) == {"current"} and verbs.verify(other, None) == 0
+    assert set(state(other).values()) == {"current"} and verify(other, None) == 0
     assert len((other.build / "set" / "log.jsonl").read_text().splitlines()) == 6, "what it cost is known here too"
 
 
