@@ -11,18 +11,17 @@ step's, as if it had computed them itself.
 
 from __future__ import annotations
 
-import asyncio
 import contextlib
 import logging
 import os
+import re
 import sys
 import threading
 import time
 import traceback
 import uuid
-import warnings
 from collections.abc import Callable, Iterable
-from concurrent.futures import Future, ThreadPoolExecutor
+from concurrent.futures import Future
 from functools import partial
 from importlib import import_module
 from importlib.metadata import distributions
@@ -35,7 +34,7 @@ import msgspec
 
 from factorlib.errors import InputError
 from factorlib.runner.child import Child, Pools, machine_cores, taken, that_travels
-from factorlib.runner.pipeline import ADDRESS
+from factorlib.runner.pipeline import ADDRESS, HOW
 from factorlib.runner.plan import Record
 from factorlib.runner.project import LIBRARY
 from factorlib.runner.stop import whole
@@ -104,6 +103,10 @@ class Cluster(Pools):
         _require_dask("executor")
         self.site, self._busy, self._over = Site(run), {}, threading.Event()
         self._known: tuple[float, dict[str, int]] = (-FRESH, {})
+        for name in ("distributed", "distributed.client", "distributed.core", "distributed.comm"):
+            logging.getLogger(name).setLevel(logging.CRITICAL)  # what they say of a lost connection is in the outcome
+        if scheduler:
+            say(f"connecting to {scheduler}")
         with whole():
             self.client = _client(scheduler) if scheduler else _client_of_this_machine()
         try:
@@ -188,7 +191,6 @@ def _client_of_this_machine() -> Any:
     import dask
     from distributed import Client
 
-    logging.getLogger("distributed").setLevel(logging.CRITICAL)
     cores = machine_cores()
     place = {"processes": False, "protocol": "tcp", "host": "127.0.0.1", "dashboard_address": None, "memory_limit": 0}
     size = {"n_workers": 1, "threads_per_worker": cores, "resources": {CORES: cores}}
@@ -199,45 +201,13 @@ def _client_of_this_machine() -> Any:
 def _client(scheduler: str) -> Any:
     """A client of the scheduler at an address.  InputError where none answers there."""
     from distributed import Client
-    from distributed.core import rpc
-    from distributed.security import Security
 
-    async def answered() -> None:
-        """Ask what listens there who it is; TimeoutError where it says nothing, for which a client would wait without end."""
-        remote = rpc(scheduler, timeout=PATIENCE, connection_args=Security().get_connection_args("client"))
-        try:
-            await asyncio.wait_for(remote.identity(), PATIENCE)
-        finally:
-            await remote.close_rpc()
-
-    _check_protocol(scheduler, "client", "scheduler")
-    for name in ("distributed", "distributed.client", "distributed.core", "distributed.comm"):
-        logging.getLogger(name).setLevel(logging.CRITICAL)  # what they say of a lost connection is in the outcome
     try:
-        with ThreadPoolExecutor(1) as beside:  # a notebook runs an event loop in this thread already
-            beside.submit(asyncio.run, answered()).result()
         return Client(scheduler, timeout=PATIENCE, set_as_default=False)
     except Exception as error:  # what answers there may be anything: an HTTP server, garbage
         cure = "start one: dask scheduler --port 8786; or leave the scheduler out, for a cluster of this machine"
         words = str(error) or f"nothing in {PATIENCE} s"
         raise InputError(f"no Dask scheduler answers at {scheduler} ({words})", key="scheduler", cure=cure) from error
-
-
-def _check_protocol(address: str, role: str, key: str) -> None:
-    """InputError where a client or a worker cannot speak the protocol of an address here."""
-    from distributed.comm.registry import get_backend
-    from distributed.security import Security
-
-    protocol = address.partition("://")[0]
-    try:
-        with warnings.catch_warnings(action="ignore"):
-            get_backend(protocol).get_connector()
-    except Exception as error:  # which one is its own affair: ucx is an abstract class
-        cure = "install what Dask speaks it with (distributed-ucxx-cu12 for ucxx), or write tcp://<host>:<port>"
-        raise InputError(f"{protocol}:// cannot be spoken here ({error})", key=key, cure=cure) from error
-    if protocol in ("tls", "wss") and Security().get_connection_args(role).get("ssl_context") is None:
-        cure = "name them in Dask's configuration (distributed.comm.tls, or DASK_DISTRIBUTED__COMM__TLS__CA_FILE and others)"
-        raise InputError(f"{protocol}:// asks for certificates, and there are none", key=key, cure=cure)
 
 
 # ── in a worker ──────────────────────────────────────────────────────────────────────────────────────────────────────
@@ -275,13 +245,11 @@ def at_work(run: Path) -> bool:
 def start_worker(scheduler: str, cores: int | None, more: list[str]) -> None:
     """Become a worker of the cluster at `scheduler` with so many cores (default: this machine's), as steps need it.
 
-    Raises InputError where that is no address, or its protocol cannot be spoken here.
+    Raises InputError where that is no address.
     """
     _require_dask("worker")
-    if not ADDRESS.fullmatch(scheduler):
-        cure = "write tcp://<host>:<port>, as tcp://10.0.0.1:8786"
-        raise InputError(f"{scheduler!r} is no address", key="worker", cure=cure)
-    _check_protocol(scheduler, "worker", "worker")
+    if not re.match(ADDRESS, scheduler):
+        raise InputError(f"{scheduler!r} is no address", key="worker", cure=HOW)
     count = cores or machine_cores()
     options = f"--nthreads {count} --nworkers 1 --resources {CORES}={count} --memory-limit 0 --no-dashboard".split()
     path = os.pathsep.join([str(LIBRARY), *filter(None, [os.environ.get("PYTHONPATH")])])

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import math
+import json
 import re
 import shlex
 from collections.abc import Callable
@@ -14,16 +14,16 @@ import msgspec
 
 from factorlib.errors import InputError, did_you_mean
 from factorlib.runner.project import check_name
-from factorlib.yamlfile import parse_yaml, read_yaml
+from factorlib.yamlfile import convert, parse_yaml, read_yaml
 
 FORMAT = 1
 SHOWN = 80  # characters of a setting that messages repeat
 LONGEST, DEEPEST = 5000, 16  # characters of a setting, parts of its name: a path may have 4096
 NAME = re.compile("[a-z][a-z0-9_]*")
 TAKEN = ("errors",)  # a folder beside the links that are called as the stages
-PROCESSES, DASK = "processes", "dask"
-EXECUTORS, WHERE = (PROCESSES, DASK), ("executor=", "scheduler=")  # the latter begin settings
-ADDRESS = re.compile(r"(tcp|tls|ws|wss|ucx|ucxx)://[^\s/]+:\d+")
+ADDRESS = r"^(tcp|tls|ws|wss|ucx|ucxx)://[^\s/]+:\d+$"
+WHERE = ("executor=", "scheduler=")  # settings that begin so say where steps run
+HOW = "write tcp://<host>:<port>, as tcp://10.0.0.1:8786"
 DATASET = "dataset."  # prefix of the inputs that are slices of the dataset
 
 
@@ -103,8 +103,8 @@ class Pipeline(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
     format: int
     stages: dict[str, Stage]
-    executor: str = PROCESSES
-    scheduler: str | None = None
+    executor: Literal["processes", "dask"] = "processes"
+    scheduler: Annotated[str, msgspec.Meta(pattern=ADDRESS, description=HOW)] | None = None
 
     def order(self) -> list[str]:
         """Stages, each after what it takes; otherwise as they stand in the file."""
@@ -142,7 +142,7 @@ def read_pipeline(path: Path, known_slices: tuple[str, ...]) -> Pipeline:
 
     if pipeline.format != FORMAT:
         refuse(f"format {pipeline.format} is not known", "format", f"this version reads format: {FORMAT}")
-    _check_executor(pipeline, path, "")
+    _check_scheduler(pipeline, path, "add executor: dask")
     known = [*(DATASET + name for name in known_slices), *pipeline.stages]
     for name, stage in pipeline.stages.items():
         key = f"stages.{name}"
@@ -166,17 +166,9 @@ def read_pipeline(path: Path, known_slices: tuple[str, ...]) -> Pipeline:
     return pipeline
 
 
-def _check_executor(pipeline: Pipeline, file: Path | None, prefix: str) -> None:
-    name, address = pipeline.executor, pipeline.scheduler
-    if name not in EXECUTORS:
-        words, cure = f"there is no executor {name[:SHOWN]!r}", did_you_mean(name, EXECUTORS)
-        raise InputError(words, file=file, key=f"{prefix}executor", cure=cure)
-    if address is not None and name != DASK:
-        cure = "add executor: dask" if file else 'write SET="executor=dask scheduler=…"'
-        raise InputError("only Dask has a scheduler", file=file, key=f"{prefix}scheduler", cure=cure)
-    if address is not None and not ADDRESS.fullmatch(address):
-        words, cure = f"{address[:SHOWN]!r} is no address", "write tcp://<host>:<port>, as tcp://10.0.0.1:8786"
-        raise InputError(words, file=file, key=f"{prefix}scheduler", cure=cure)
+def _check_scheduler(pipeline: Pipeline, file: Path | None, cure: str) -> None:
+    if pipeline.scheduler is not None and pipeline.executor != "dask":
+        raise InputError("only Dask has a scheduler", file=file, key="scheduler", cure=cure)
 
 
 def with_settings(pipeline: Pipeline, settings: list[str]) -> Pipeline:
@@ -186,50 +178,47 @@ def with_settings(pipeline: Pipeline, settings: list[str]) -> Pipeline:
     >>> with_settings(Pipeline(1, {"solve": Stage()}), ["solve.lobes=64 solve.tolerance=1e-3"]).stages["solve"].params
     {'lobes': 64, 'tolerance': 0.001}
     """
-    words = _words(settings)
+    words, stages = _words(settings), dict(pipeline.stages)
     where = dict(word.split("=", 1) for word in words if word.startswith(WHERE))  # the last of each kind counts
     if where:
-        executor = where.get("executor", pipeline.executor)
-        kept = None if where.get("executor") == PROCESSES else pipeline.scheduler  # which drops that of pipeline.yaml
-        scheduler = where.get("scheduler", kept) or None
-        pipeline = msgspec.structs.replace(pipeline, executor=executor, scheduler=scheduler)
-        _check_executor(pipeline, None, "SET ")
-    stages = dict(pipeline.stages)
+        kept = None if where.get("executor") == "processes" else pipeline.scheduler  # which drops that of pipeline.yaml
+        chosen = {"executor": pipeline.executor, "scheduler": kept} | where
+        chosen["scheduler"] = chosen["scheduler"] or None
+        pipeline = convert({"format": FORMAT, "stages": {}} | chosen, Pipeline, "SET")  # the stages follow
+        _check_scheduler(pipeline, None, 'write SET="executor=dask scheduler=…"')
     for word in (word for word in words if not word.startswith(WHERE)):
-        stage, keys, value = _setting(word, stages)
-        stages[stage] = msgspec.structs.replace(stages[stage], params=_set(stages[stage].params, keys, value))
+        target, equals, text = word.partition("=")
+        stage, *keys = target.split(".")
+        if not equals or not keys or not all(keys) or len(keys) > DEEPEST or len(word) > LONGEST:
+            cure = 'write stage.parameter=value, as in SET="solve.cells=800", or executor=…, scheduler=…'
+            raise InputError(f"{_cut(word)!r} is no setting", key="SET", cure=cure)
+        if stage not in stages:
+            raise InputError(f"there is no stage {stage!r}", key=f"SET {_cut(word)}", cure=did_you_mean(stage, stages))
+        try:
+            value = parse_yaml(text, f"SET {_cut(word)}")
+            json.dumps(value, allow_nan=False), msgspec.json.encode(value)
+        except (ValueError, OverflowError, RecursionError) as error:
+            if isinstance(error, InputError):
+                raise
+            words, cure = f"no key can hold the value ({error})", "write a finite number, a word, or a short list"
+            raise InputError(words, key=f"SET {_cut(word)}", cure=cure) from error
+        table = params = dict(stages[stage].params)
+        for name in keys[:-1]:
+            inner = table.get(name)
+            table[name] = table = dict(inner) if isinstance(inner, dict) else {}
+        table[keys[-1]] = value
+        stages[stage] = msgspec.structs.replace(stages[stage], params=params)
     return msgspec.structs.replace(pipeline, stages=stages)
 
 
-def words_by_key(settings: list[str]) -> dict[str, str]:
-    """Each setting by the key that it stands for in pipeline.yaml: what is wrong with it is said of the setting.
-
-    >>> words_by_key(["solve.lobes=64"])
-    {'stages.solve.params.lobes': 'solve.lobes=64'}
-    """
-    targets = {word: word.partition("=")[0].partition(".") for word in _words(settings)}
-    return {f"stages.{stage}.params.{keys}": word for word, (stage, _, keys) in targets.items()}
-
-
-def said_of_settings(error: InputError, words: dict[str, str]) -> InputError:
+def said_of_settings(error: InputError, settings: list[str]) -> InputError:
     """The same error, of the setting where it is about one, not of the file whose value that replaces."""
-    for key, word in reversed(words.items()):
+    for word in reversed(_words(settings)):
+        stage, _, keys = word.partition("=")[0].partition(".")
+        key = f"stages.{stage}.params.{keys}"
         if error.key == key or (error.key or "").startswith((f"{key}.", f"{key}[")):
             return InputError(error.found, key=f"SET {_cut(word)}", cure=error.cure)
     return error
-
-
-def executor_words(settings: list[str]) -> list[str]:
-    """Settings of a run whose stages take none: where it runs.  InputError for any other.
-
-    >>> executor_words(["executor=dask scheduler=tcp://10.0.0.1:8786"])
-    ['executor=dask', 'scheduler=tcp://10.0.0.1:8786']
-    """
-    words = _words(settings)
-    for word in (word for word in words if not word.startswith(WHERE)):
-        cure = 'only where it runs can be set: SET="executor=dask scheduler=tcp://…"'
-        raise InputError(f"{word[:SHOWN]!r} cannot be set for a study", key="SET", cure=cure)
-    return words
 
 
 def _words(settings: list[str]) -> list[str]:
@@ -238,58 +227,10 @@ def _words(settings: list[str]) -> list[str]:
         try:
             words += shlex.split(text)
         except ValueError as error:
-            said = f"{text[:SHOWN]!r} cannot be split into words ({error})"
+            said = f"{_cut(text)!r} cannot be split into words ({error})"
             raise InputError(said, key="SET", cure="close every quote") from error
     return words
 
 
 def _cut(word: str) -> str:
     return word if len(word) <= SHOWN else word[:SHOWN] + "…"
-
-
-def _setting(word: str, stages: dict[str, Stage]) -> tuple[str, list[str], Any]:
-    target, equals, value = word.partition("=")
-    stage, *keys = target.split(".")
-    if not equals or not keys or not all(keys) or len(keys) > DEEPEST or len(word) > LONGEST:
-        near = "" if keys else did_you_mean(target[:SHOWN], ("executor", "scheduler"))
-        how = 'write stage.parameter=value, as in SET="solve.cells=800"'
-        raise InputError(f"{_cut(word)!r} is no setting", key="SET", cure=near if near.startswith("did") else how)
-    key = f"SET {_cut(word)}"
-    if stage not in stages:
-        raise InputError(f"there is no stage {stage!r}", key=key, cure=did_you_mean(stage, stages))
-    try:
-        return stage, keys, parse_yaml(value, key)
-    except (ValueError, RecursionError) as error:  # thousands of digits or brackets
-        cure = "write a number, a word, or a short list"
-        raise InputError(f"not readable as a value ({error})", key=key, cure=cure) from error
-
-
-def _set(params: dict[str, Any], keys: list[str], value: Any) -> dict[str, Any]:
-    first, *rest = keys
-    if rest:
-        inner = params.get(first, {})
-        value = _set(inner if isinstance(inner, dict) else {}, rest, value)
-    return {**params, first: value}
-
-
-def check_values(pipeline: Pipeline, file: Path) -> None:
-    """Raises InputError for a parameter that no key can hold: each must be a finite number of 64 bits, or text."""
-
-    def check(value: Any, key: str) -> None:
-        """Look at a value and, of a table or list, at what it holds."""
-        wrong = None
-        if isinstance(value, dict | list):
-            for name, item in value.items() if isinstance(value, dict) else enumerate(value):
-                check(item, f"{key}.{name}")
-        elif isinstance(value, float) and not math.isfinite(value):
-            wrong = "is not a finite number"
-        elif isinstance(value, int) and not -(2**63) <= value < 2**63:
-            wrong = "is not a number of 64 bits"
-        elif isinstance(value, str) and ("\0" in value or value.encode(errors="replace").decode() != value):
-            wrong = "is not text"
-        if wrong:
-            cure = "write a number, a word, or leave it out"
-            raise InputError(f"{str(value)[:SHOWN]!r} {wrong}", file=file, key=key, cure=cure)
-
-    for name, stage in pipeline.stages.items():
-        check(stage.params, f"stages.{name}.params")

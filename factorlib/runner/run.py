@@ -22,7 +22,7 @@ from factorlib.runner.child import Pools
 from factorlib.runner.display import Display
 from factorlib.runner.gc import tenant
 from factorlib.runner.home import claim, label, remember, show, sound_lines, view_of
-from factorlib.runner.pipeline import DASK, DATASET
+from factorlib.runner.pipeline import DATASET
 from factorlib.runner.plan import Planned, Step
 from factorlib.runner.shared import shared_store
 from factorlib.runner.store import lock
@@ -52,7 +52,7 @@ def run(survey: Survey, display: Display) -> Run:
         work = Run(survey, display, folder)
         if work.refused:
             return work
-        if survey.spec.pipeline.executor == DASK:
+        if survey.spec.pipeline.executor == "dask":
             from factorlib.runner.cluster import Cluster  # which is loaded only then
 
             work.pools = Cluster(survey.spec.pipeline.scheduler, folder, display.say)

@@ -18,11 +18,9 @@ from factorlib.runner.filehash import FileHashes
 from factorlib.runner.home import Home, home_of
 from factorlib.runner.pipeline import (
     DATASET,
-    check_values,
     read_pipeline,
     said_of_settings,
     with_settings,
-    words_by_key,
 )
 from factorlib.runner.plan import Listing, Planned, Record, Spec, Step, plan
 from factorlib.runner.project import ALL, Data, Project, Recipe
@@ -40,7 +38,7 @@ class Survey:
     records:  each step's record but for the results it is handed
     recipes:  those that are asked for, by name
     previous: the record each step had when it last was current for this dataset
-    words:    settings of the command line, by the keys of pipeline.yaml that they stand for
+    settings: words of the command line in place of values of pipeline.yaml
     """
 
     project: Project
@@ -51,7 +49,7 @@ class Survey:
     records: dict[Step, Record]
     previous: dict[str, Record]
     recipes: dict[str, Recipe]
-    words: dict[str, str]
+    settings: list[str]
 
     def planned(self, forced: frozenset[Step] | None = None) -> list[Planned]:
         """Every step with its state and the reason for it; `forced` replaces the spec's steps that must run."""
@@ -100,7 +98,7 @@ class Survey:
                     if isinstance(
                         error := future.exception(), InputError
                     ):  # what cannot be loaded says so when it runs
-                        faults.append(str(said_of_settings(error, self.words)))
+                        faults.append(str(said_of_settings(error, self.settings)))
             finally:
                 pools.close(kill=True)
         return faults
@@ -121,10 +119,9 @@ def survey(
              a target.  With the target `render` they are all that is wanted
     look: without running it: where recipes are named and no stage, of the recipes alone
     """
-    file, words = project.pipeline_file, words_by_key(settings)
+    file = project.pipeline_file
     pipeline = with_settings(read_pipeline(file, project.provider.slices), settings)
     try:
-        check_values(pipeline, file)
         over_recipes = [name for name, stage in pipeline.stages.items() if stage.over == "recipe"]
         if recipes and (targets == [RENDER] or (look and targets is None)):
             targets = over_recipes
@@ -149,12 +146,12 @@ def survey(
         hashes = FileHashes(store.cache / "files.json")
         records = _records(project, spec, data, hashes, Packages(store.cache / "packages.json"), asked)
     except InputError as error:
-        raise said_of_settings(error, words) from None
+        raise said_of_settings(error, settings) from None
     with contextlib.suppress(OSError):  # of a build/ that is read-only: the next command reads more, that is all
         hashes.save()
     entries = {step: store.entry(key) for step, key in home.keys(lenient=True).items()}
     previous = {step: entry.record for step, entry in entries.items() if entry}
-    return Survey(project, data, home, store, spec, records, previous, asked, words)
+    return Survey(project, data, home, store, spec, records, previous, asked, settings)
 
 
 def _records(

@@ -104,7 +104,7 @@ def test_a_name_in_the_pipeline_that_leads_elsewhere_is_refused(project):
 
 
 SETTINGS = [f"table.scale={value}" for value in (
-    ".inf", "-.inf", ".nan", "[1, .nan]", "{a: .inf}", "9" * 5000, "9" * 4000, 2**63, "0x" + "f" * 30,
+    ".inf", "-.inf", ".nan", "[1, .nan]", "{a: .inf}", "9" * 5000, "9" * 4000, "0x" + "f" * 30,
     "[" * 500 + "]" * 500, "[" * 2400, "{a: " * 1000, "'\"\\0\"'", "'\"\\ud800\"'", "'", '"', "&a [*a]",
     "!!python/object:os.system x", "'{a: 1, a: 2}'", "\udcff",
 )] + ["upper.sleep=.inf", "table" + ".a" * 3000 + "=1", "=", ".=", "table.=1", "\udcff.scale=1"]  # fmt: skip
