@@ -53,20 +53,15 @@ def shared_store(own: Path) -> Path | None:
     raise InputError("there is no such folder", file=named, key=VARIABLE, cure=cure)
 
 
-def fetch(
-    shared: Store, own: Store, key: str, record: Record, draft: Path, say: Say
-) -> tuple[Entry, Path | None] | None:
+def fetch(shared: Store, own: Store, key: str, draft: Path, say: Say) -> tuple[Entry, Path | None] | None:
     """Copy the result of `key`, with its log, into the own store; None where the shared one has it not, or not as it was kept.
 
     draft: a folder of the own store that is not there yet;  second comes what `Store.take_in` gives
     """
     try:
-        entry = shared.entry(key)
-        if entry is None:
+        if shared.entry(key) is None:
             return None
-        if key_of(entry.record) == key and copied(shared.tree(entry.output), draft, entry.files):
-            taken = own.take_in(record, draft)
-            _copy_log(shared, own, key)
+        if taken := _copied_result(shared, own, key, draft):
             return taken
         say("the shared store's result is not as it was kept: the step is run")
     except OSError as error:
@@ -75,26 +70,34 @@ def fetch(
     return None
 
 
-def offer(own: Store, shared: Store, key: str, entry: Entry, say: Say) -> None:
+def offer(own: Store, shared: Store, key: str, say: Say) -> None:
     """Copy a result into the shared store, with its log, unless it is there; silent where one may only read."""
     draft = shared.tmp / f"offer-{os.getpid()}-{uuid.uuid4().hex[:8]}"
     try:
         if not shared.root.is_dir():
             raise FileNotFoundError(errno.ENOENT, "it is gone")
-        there = shared.entry(key)
-        if there and not damage_of(shared.tree(there.output), there.files):
+        if (there := shared.entry(key)) and not damage_of(shared.tree(there.output), there.files):
             return
         shared.tmp.mkdir(parents=True, exist_ok=True)
         sweep(shared.tmp, is_abandoned)
-        if copied(own.tree(entry.output), draft, entry.files):
-            shared.take_in(entry.record, draft)
-            _copy_log(own, shared, key)
-            shared.keep(key, entry)
+        if taken := _copied_result(own, shared, key, draft):
+            shared.keep(key, taken[0])
     except OSError as error:
         if error.errno not in NOT_OURS:
             say(f"the shared store took nothing ({error.strerror}); the result is kept in build/store")
     finally:
         shutil.rmtree(draft, ignore_errors=True)
+
+
+def _copied_result(source: Store, target: Store, key: str, draft: Path) -> tuple[Entry, Path | None] | None:
+    """Copy tree and log of a key that is in `source`; None where any of it is not as it was kept."""
+    entry, log = source.entry(key), sound_lines(source.log(key))
+    if key_of(entry.record) != key or not log or not copied(source.tree(entry.output), draft, entry.files):
+        return None
+    taken = target.take_in(entry.record, draft)
+    target.logs.mkdir(parents=True, exist_ok=True)
+    replace_file(target.log(key), b"".join(line + b"\n" for line in log))
+    return taken
 
 
 def copied(tree: Path, draft: Path, files: dict[str, str]) -> bool:
@@ -108,13 +111,6 @@ def copied(tree: Path, draft: Path, files: dict[str, str]) -> bool:
         with contextlib.suppress(FileNotFoundError):
             shutil.copyfile(tree / name, draft / name, follow_symlinks=False)
     return not damage_of(draft, files)
-
-
-def _copy_log(source: Store, target: Store, key: str) -> None:
-    """What the result cost and warned of when it was made, wherever that was."""
-    if lines := sound_lines(source.log(key)):
-        target.logs.mkdir(parents=True, exist_ok=True)
-        replace_file(target.log(key), b"".join(line + b"\n" for line in lines))
 
 
 class Shipped(msgspec.Struct, frozen=True):

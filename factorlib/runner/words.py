@@ -122,8 +122,8 @@ def _cost(planned: Planned, events: list[dict]) -> str:
     done = next((event for event in reversed(events) if event["event"] == "done"), None)
     if planned.status != "current":
         return f"{planned.status}: {in_short(planned.reasons, SHOWN)}"
-    if done is None or done.get("shared"):
-        return "its log is not there" if done is None else "from the shared store, without its log"
+    if done is None:
+        return "its log is not there"
     cores = f"{done['threads']} thread{'s' * (done['threads'] > 1)} on {done['cores']} core{'s' * (done['cores'] > 1)}"
     cost = f"{done['seconds']:8.1f} s {done['cpu_seconds']:8.1f} s processor {done['memory_mb']:7.0f} MB peak"
     return f"{cost}   {cores}   {done['started'][:16].replace('T', ' ')} UTC"

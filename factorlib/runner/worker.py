@@ -112,38 +112,34 @@ def run_step(task: Task, spread_over: Callable | None = None) -> Outcome:
     spread_over: an ordered map to which its independent work goes, with what it `spent` outside this process: `cpu_seconds`,
                  and whatever else is worth a log; without, threads of this process
     """
-    meter, code, store, fetched, made = Meter(), task.code, Store(task.store), None, None
+    meter, code, store = Meter(), task.code, Store(task.store)
+    shared = Store(task.shared) if task.shared else None
     with Events(task.events) as events:
         try:
-            if task.shared and not task.forced:
-                fetched = fetch(Store(task.shared), store, task.key, task.record, task.temporary, events.say)
+            fetched = shared and not task.forced and fetch(shared, store, task.key, task.temporary, events.say)
             if fetched:
+                entry, damaged = fetched
                 for event in map(json.loads, sound_lines(store.log(task.key))):
                     if event["event"] == "warning":
                         events.say(str(event.get("text", "")))
-            elif not task.forced and (folder := shipped_folder([code.root, LIBRARY], task.stage.shipped, task.record)):
-                copy_shipped(folder, task.temporary)
-                made = store.take_in(task.record, task.temporary)
-            entry, damaged = fetched or made or _made(task, store, events, spread_over or partial(spread, code.cores))
-            cost = meter.read(code.threads, code.cores)
-            if spread_over is not None and fetched is None and made is None:
-                cpu = round(cost["cpu_seconds"] + spread_over.spent["cpu_seconds"], 3)
-                cost |= {"cpu_seconds": cpu, "spread": spread_over.spent}
-            if fetched is None or not store.log(task.key).exists():  # a line for each warning, one for the step
-                done = (
-                    {"event": "done", **cost} if fetched is None else {"event": "done", "seconds": 0.0, "shared": True}
-                )
+            else:
+                entry, damaged = _made(task, store, events, spread_over or partial(spread, code.cores))
+                cost = meter.read(code.threads, code.cores)
+                if spread_over is not None:
+                    cpu = round(cost["cpu_seconds"] + spread_over.spent["cpu_seconds"], 3)
+                    cost |= {"cpu_seconds": cpu, "spread": spread_over.spent}
                 where = {name: task.record[name] for name in ("photo", "recipe") if name in task.record}
                 where |= {"stage": code.stage, "key": task.key}
-                lines = [where | {"event": "warning", "text": text} for text in events.warnings] + [where | done]
+                lines = [where | {"event": "warning", "text": text} for text in events.warnings]
+                lines.append(where | {"event": "done", **cost})
                 store.logs.mkdir(parents=True, exist_ok=True)
                 text = "".join(json.dumps(line, sort_keys=True) + "\n" for line in lines)
                 replace_file(store.log(task.key), text.encode())
             store.keep(task.key, entry)
             shutil.rmtree(store.unfinished / task.key, ignore_errors=True)
-            if task.shared and fetched is None:
-                offer(store, Store(task.shared), task.key, entry, events.say)
-            return Outcome(output=entry.output, damaged=damaged, seconds=cost["seconds"])
+            if shared and not fetched:
+                offer(store, shared, task.key, events.say)
+            return Outcome(output=entry.output, damaged=damaged, seconds=meter.read()["seconds"])
         except BaseException as error:  # whatever it is, the parent reports it
             shutil.rmtree(task.temporary, ignore_errors=True)  # on a full disk there is room for a log then
             return _failed(error, task.temporary.parent, meter.read()["seconds"])
@@ -189,7 +185,10 @@ def limit_threads(threads: int) -> None:
 
 
 def _made(task: Task, store: Store, events: Events, map_: Callable) -> tuple[Entry, Path | None]:
-    """Run the step; its tree is in the store afterwards, its key is not."""
+    """Run the step, or copy its shipped result; its tree is in the store afterwards, its key is not."""
+    if not task.forced and (folder := shipped_folder([task.code.root, LIBRARY], task.stage.shipped, task.record)):
+        copy_shipped(folder, task.temporary)
+        return store.take_in(task.record, task.temporary)
     module, params = load_stage(task.code), params_of(task.code)  # which takes seconds
     photo, out = task.record["photo"], task.temporary
     out.mkdir(parents=True)
