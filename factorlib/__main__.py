@@ -142,7 +142,7 @@ VERBS: dict[str, tuple[str, Callable[[Namespace], int], str]] = {  # in the orde
               "Run one stage and what it needs; `render` with a recipe makes its pictures alone."),
     "plan": (f"stages {ASKED}", lambda a: verbs.show_plan(project(), wish(a, a.stages)),
              "What would run; with a recipe and no stage, for its pictures alone."),
-    "why": (f"stages {ASKED}", lambda a: verbs.show_why(project(), wish(a, a.stages)),
+    "why": (f"stages {ASKED}", lambda a: verbs.show_plan(project(), wish(a, a.stages), True),
             "Every reason why it would run."),
     "status": ("stages dataset set recipe", lambda a: verbs.show_status(project(), wish(a, a.stages)),
                "How far each stage is, and what the current results warned of."),

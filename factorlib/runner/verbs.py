@@ -6,7 +6,7 @@ import os
 import shlex
 import sys
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from importlib import import_module
 from pathlib import Path
 from typing import NamedTuple
@@ -128,8 +128,8 @@ def _refused(seen: Survey, faults: list[str], where: str = "files") -> int:
     return 1
 
 
-def show_plan(project: Project, wish: Wish, lines: Callable[[list[Planned]], list[str]] = words.plan_lines) -> int:
-    """Print what would run; 1 where a value of a parameter would not do.  lines: how a plan is told"""
+def show_plan(project: Project, wish: Wish, every_reason: bool = False) -> int:
+    """Print what would run and why, in short or every reason; 1 where a value of a parameter would not do."""
     seen = survey(project, *wish, look=True)
     planned = seen.planned()
     if faults := seen.wrong_values(planned):
@@ -138,13 +138,8 @@ def show_plan(project: Project, wish: Wish, lines: Callable[[list[Planned]], lis
     for number, p in enumerate(planned if shared else []):
         if p.status != "current" and "forced" not in p.reasons and p.key and (shared.keys / f"{p.key}.json").is_file():
             planned[number] = msgspec.structs.replace(p, reasons=[*p.reasons, "the shared store has it"])
-    print("\n".join(lines(planned)))
+    print("\n".join(words.plan_lines(planned, every_reason)))
     return 0
-
-
-def show_why(project: Project, wish: Wish) -> int:
-    """Print why each step would run; 1 where a value of a parameter would not do."""
-    return show_plan(project, wish, words.why_lines)
 
 
 def show_status(project: Project, wish: Wish) -> int:

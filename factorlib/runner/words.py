@@ -18,36 +18,24 @@ SHOWN = 8  # reasons of one step that are written out
 NAMED = 20  # steps that have failed
 
 
-def plan_lines(planned: list[Planned]) -> list[str]:
-    """What would run, one line for steps of a stage that share their reasons."""
-    lines = [
-        f"{stage:<10} {status:<7} {items:<24} {in_short(why, SHOWN)}".rstrip()
-        for stage, status, why, items in _alike(planned)
-    ]
-    current = sum(p.status == "current" for p in planned)
-    return [*lines, f"{current} of {len(planned)} steps are current" if lines else f"all {current} steps are current"]
+def plan_lines(planned: list[Planned], every_reason: bool = False) -> list[str]:
+    """What would run, one line for steps of a stage that share their reasons, the photo's own name aside.
 
-
-def why_lines(planned: list[Planned]) -> list[str]:
-    """Every reason of every step that is not current."""
-    lines = []
-    for stage, status, why, items in _alike(planned):
-        lines += [f"{stage} {items}".rstrip() + f": {status}", *(f"    {reason}" for reason in why)]
-    return lines or ["everything is current: sources, parameters, files and versions are those of the last results"]
-
-
-def _alike(planned: list[Planned]) -> list[tuple[str, str, tuple[str, ...], str]]:
-    """Stage, status, reasons and items of steps that are not current and share these, the photo's own name aside."""
+    every_reason: below it, a line each
+    """
     groups: dict[tuple, list[Step]] = {}
     for p in (p for p in planned if p.status != "current"):
         reasons = tuple(_of_any_photo(reason, p.step) for reason in p.reasons)
         groups.setdefault((p.step.stage, p.status, reasons), []).append(p.step)
     lines = []
-    for group, steps in groups.items():
+    for (stage, status, reasons), steps in groups.items():
         names = [step.of for step in steps if step.of]
-        many = f"{len(names)} {'recipes' if steps[0].recipe else 'photos'}"
-        lines.append((*group, ", ".join(names) if len(names) <= 3 else many))
-    return lines
+        items = ", ".join(names) if len(names) <= 3 else f"{len(names)} {'recipes' if steps[0].recipe else 'photos'}"
+        in_line = "" if every_reason else in_short(reasons, SHOWN)
+        lines.append(f"{stage:<10} {status:<7} {items:<24} {in_line}".rstrip())
+        lines += [f"    {reason}" for reason in reasons] if every_reason else []
+    current = sum(p.status == "current" for p in planned)
+    return [*lines, f"{current} of {len(planned)} steps are current" if lines else f"all {current} steps are current"]
 
 
 def _of_any_photo(reason: str, step: Step) -> str:

@@ -424,7 +424,7 @@ def test_the_field_and_the_parameter_that_changed_are_named_with_old_and_new(rea
         return plan(seen.spec, seen.records, listing if made else Listing(Everything(), {}))
 
     def why(made, spec=SET, settings=()):
-        return "\n".join(words.why_lines(planned_with(spec, settings, made)))
+        return "\n".join(words.plan_lines(planned_with(spec, settings, made), True))
 
     made, lobes = planned_with(), ["solve.lobes=48"]
     for place, value, line in FIELDS:

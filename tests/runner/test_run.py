@@ -6,6 +6,7 @@ import re
 import shutil
 import threading
 import time
+from functools import partial
 
 import pytest
 
@@ -123,7 +124,7 @@ def test_plan_why_and_graph_show_the_same_plan(project, capsys):
     write(project.root / "data" / "set" / "a.txt", "Alphabet")
     for show, said in (
         (verbs.show_plan, "upper      to run  a                        file a.txt: changed"),
-        (verbs.show_why, "upper a: to run\n    file a.txt: changed"),
+        (partial(verbs.show_plan, every_reason=True), "upper      to run  a\n    file a.txt: changed"),
     ):
         assert show(project, verbs.Wish("set")) == 0 and said in capsys.readouterr().out
     for mermaid, said in ((False, "total      whole set  <- count, table"), (True, "upper --> count")):
@@ -152,7 +153,7 @@ def test_a_setting_nobody_takes_is_refused_at_once_and_said_of_the_setting(proje
 @pytest.mark.parametrize("param, value", [("times", "0"), ("times", "two"), ("sleep", "[1]")])
 def test_a_value_out_of_bounds_is_refused_before_anything_runs_and_says_who_gave_it(project, capsys, param, value):
     before = done(project)
-    for verb in (verbs.make, verbs.show_plan, verbs.show_why):
+    for verb in (verbs.make, verbs.show_plan):
         assert verb(project, verbs.Wish("set", settings=[f"upper.{param}={value}"])) == 1
         said = capsys.readouterr()
         assert f": SET upper.{param}={value}: " in said.err and "pipeline.yaml" not in said.err and not said.out
