@@ -29,6 +29,7 @@ from pathlib import Path
 from typing import Any
 
 from factorlib import arithmetic
+from factorlib.errors import InputError
 from factorlib.runner.project import LIBRARY
 from factorlib.runner.stop import whole
 from factorlib.runner.worker import THREAD_VARIABLES, limit_threads
@@ -102,8 +103,6 @@ class Pools:
     `factorlib.runner.cluster.Cluster` has the same interface.
     """
 
-    AHEAD = 1  # steps are handed out for so many times the cores
-
     def __init__(self, cores: int | None = None):
         self.cores = cores or machine_cores()
         self.children, self._threads = [], ThreadPoolExecutor(1 << 16)  # as many as there are steps at once
@@ -111,8 +110,12 @@ class Pools:
 
     def free(self, cores: int) -> bool:
         """Whether a step of `cores` cores may start now: the cores suffice, or nothing else runs."""
+        return not self._work() or self._work() + cores <= self.cores
+
+    def _work(self) -> int:
+        """The cores of the steps that run."""
         self._busy = {future: count for future, count in self._busy.items() if not future.done()}
-        return not self._busy or sum(self._busy.values()) + cores <= self.AHEAD * self.cores
+        return sum(self._busy.values())
 
     def submit(self, cores: int, threads: int, function: Callable, argument: Any) -> Future:
         """Start `function(argument)` in a process of `threads` threads, which takes `cores` cores; its future."""
@@ -159,17 +162,6 @@ def main() -> None:
             try:
                 answer = ForkingPickler.dumps((True, function(*arguments)))
             except BaseException as error:  # whatever it is, it is the caller's
-                answer = ForkingPickler.dumps((False, that_travels(error)))
+                told = error if isinstance(error, InputError) else RuntimeError(f"{type(error).__name__}: {error}")
+                answer = ForkingPickler.dumps((False, told))  # others may not survive being pickled
             connection.send_bytes(answer)
-
-
-def that_travels(error: BaseException) -> BaseException:
-    """An error that another process can raise: itself, or where it cannot be pickled and made again its type and text."""
-    try:
-        ForkingPickler.loads(ForkingPickler.dumps(error))
-        return error
-    except Exception:
-        told = RuntimeError(f"{type(error).__name__}: {error}")
-        for note in getattr(error, "__notes__", ()):
-            told.add_note(note)
-        return told

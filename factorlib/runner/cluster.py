@@ -3,10 +3,6 @@
 The cluster is that of a scheduler that is running, or one in this process that lives as long as the run.  A worker hands
 its task to a child process (`factorlib.runner.child`), so that bits do not depend on how workers were started.  A task
 whose worker or child dies is tried again, on its own: nothing else is lost.
-
-A step's `Inputs.map` sends independent blocks of work in pieces, a few for each core, as tasks of the same cluster; their
-results come back in order.  What a block warns of is warned of in the step, and the first error in the blocks' order is the
-step's, as if it had computed them itself.
 """
 
 from __future__ import annotations
@@ -18,34 +14,29 @@ import re
 import sys
 import threading
 import time
-import traceback
 import uuid
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 from concurrent.futures import Future
-from functools import partial
-from importlib import import_module
 from importlib.metadata import distributions
 from importlib.util import find_spec
 from pathlib import Path
-from types import ModuleType
 from typing import Any
 
 import msgspec
 
 from factorlib.errors import InputError
-from factorlib.runner.child import Child, Pools, machine_cores, taken, that_travels
+from factorlib.runner.child import Child, Pools, machine_cores, taken
 from factorlib.runner.pipeline import ADDRESS, HOW
 from factorlib.runner.plan import Record
 from factorlib.runner.project import LIBRARY
 from factorlib.runner.stop import whole
-from factorlib.runner.worker import Heard, Meter, Outcome, Task, run_step
+from factorlib.runner.worker import Outcome, Task, run_step
 
 FRESH = 1.0  # seconds for which the scheduler is not asked again who its workers are
 PATIENCE = 10  # seconds to reach a scheduler, for steps to end that are cancelled, and until the last worker is missed
-PIECES = 4  # for each core: small enough that no core waits long for the last one
+AHEAD = 2  # steps are handed out for so many times the cores, so that no worker waits for its next one
 TRIES = 3  # of a task whose process dies
 CORES = "cores"  # the resource that workers declare
-FIRST = 10  # priority of blocks: a step waits for them
 PYTHON = f"{sys.version_info[0]}.{sys.version_info[1]}"
 QUIET = {  # what Dask does by itself between tasks: without these, a worker that waits takes 4 % of a core
     "DASK_DISTRIBUTED__WORKER__PROFILE__ENABLED": "False",
@@ -97,8 +88,6 @@ class Cluster(Pools):
     run: folder of the run, in the store
     """
 
-    AHEAD = 2  # so that no worker waits for its next step
-
     def __init__(self, scheduler: str | None, run: Path, say: Callable[[str], None]):
         _require_dask("executor")
         self.site, self._busy, self._over = Site(run), {}, threading.Event()
@@ -120,19 +109,18 @@ class Cluster(Pools):
 
     @property
     def cores(self) -> int:
-        """Those of all workers that are there now; 1 where none is."""
-        return max(1, sum(self._declared().values()))
+        """Those of the largest worker that is there now; 1 where none is."""
+        return max(self._declared().values(), default=1)
+
+    def free(self, cores: int) -> bool:
+        """Whether a step of `cores` cores may be handed out now."""
+        return not self._work() or self._work() + cores <= AHEAD * sum(self._declared().values())
 
     def submit(self, cores: int, threads: int, function: Callable, argument: Any) -> Future:
-        """Hand out a step, by its task; its future.
-
-        A step that takes more cores than threads hands out blocks itself, and holds no core meanwhile.
-        """
-        spreads, most = cores > threads, max(self._declared().values(), default=threads)
-        resources = {} if spreads else {CORES: min(threads, most)}
+        """Hand out a step, by its task; its future."""
         with whole():
-            task = hosted, self.site, threads, spreads, outcome_at, argument
-            future = self._executor.submit(*task, resources=resources)
+            task = hosted, self.site, threads, outcome_at, argument
+            future = self._executor.submit(*task, resources={CORES: min(cores, self.cores)})
             self._busy[future] = cores
             return future
 
@@ -215,12 +203,9 @@ def _client(scheduler: str) -> Any:
 _children: list[Child] = []
 
 
-def hosted(site: Site, threads: int, waits: bool, function: Callable, argument: Any) -> Any:
-    """`function(address of the scheduler, site, argument)` in a child of this worker, which ends if nobody waits any more.
-
-    waits: it mostly waits for other tasks, so the worker takes on others meanwhile
-    """
-    from distributed import get_worker, secede
+def hosted(site: Site, threads: int, function: Callable, argument: Any) -> Any:
+    """`function(site, argument)` in a child of this worker, which ends if nobody waits any more."""
+    from distributed import get_worker
 
     worker = get_worker()
     key = worker.get_current_task()
@@ -231,10 +216,7 @@ def hosted(site: Site, threads: int, waits: bool, function: Callable, argument: 
         open_ = status in ("running", "paused", "closing_gracefully")
         return task is not None and task.state != "cancelled" and open_
 
-    if waits:
-        secede()
-    child = taken(_children, threads, site.run)
-    return child.call(function, worker.scheduler.address, site, argument, wanted=wanted)
+    return taken(_children, threads, site.run).call(function, site, argument, wanted=wanted)
 
 
 def at_work(run: Path) -> bool:
@@ -257,90 +239,12 @@ def start_worker(scheduler: str, cores: int | None, more: list[str]) -> None:
     os.execve(sys.executable, command, {**QUIET, **os.environ, "PYTHONPATH": path})
 
 
-# ── in the child of a step, and in that of a block ───────────────────────────────────────────────────────────────────
+# ── in the child of a step ───────────────────────────────────────────────────────────────────────────────────────────
 
 
-def outcome_at(scheduler: str, site: Site, task: Task) -> Outcome:
-    """Run a step here; its independent work goes to the cluster.
-
-    Each try of a step has a temporary folder of its own: another may still be ending elsewhere.
-    """
+def outcome_at(site: Site, task: Task) -> Outcome:
+    """Run a step here.  Each try of a step has a temporary folder of its own: another may still be ending elsewhere."""
     if fault := site.fault(task.record):
         return Outcome(error=str(fault))
     temporary = task.temporary.with_name(f"{task.temporary.name}.{uuid.uuid4().hex[:8]}")
-    task = msgspec.structs.replace(task, temporary=temporary)
-    if task.code.cores == 1:
-        return run_step(task)
-    with contextlib.closing(Blocks(scheduler, site, task)) as blocks:
-        return run_step(task, blocks)
-
-
-class Blocks:
-    """An ordered map over the cluster at `scheduler`.  spent: what the blocks took elsewhere, for the step's log."""
-
-    def __init__(self, scheduler: str, site: Site, task: Task):
-        self.scheduler, self.site, self.code, self._client = scheduler, site, task.code, None
-        self.shelf = parcel().Shelf(task.temporary.with_name(f"{task.temporary.name}.shelf"))
-        sizes = dict.fromkeys(("maps", "tasks", "bytes_sent", "bytes_shelved", "bytes_back"), 0)
-        self.spent: dict[str, Any] = {**sizes, "cpu_seconds": 0.0, "memory_mb": 0.0}
-
-    def __call__(self, function: Callable, items: Iterable) -> list:
-        """The function of every item, in order.  Raises what the first of them raised."""
-        from distributed import Client
-
-        items = list(items)
-        if len(items) <= 1:
-            return list(map(function, items))
-        count = min(PIECES * self.code.cores, len(items))
-        cuts = [len(items) * k // count for k in range(count + 1)]
-        packed = self.shelf.pack([(function, items[start:end]) for start, end in zip(cuts, cuts[1:])])
-        self._client = self._client or Client(self.scheduler, set_as_default=False)
-        here = partial(hosted, self.site, self.code.threads, False, block_at)
-        options = {"priority": FIRST, "retries": TRIES - 1, "resources": {CORES: self.code.threads}, "pure": False}
-        answers = self._client.gather(self._client.map(here, [(self.code.root, data) for data in packed], **options))
-        for name, much in {"maps": 1, "tasks": count, "bytes_sent": sum(map(len, packed))}.items():
-            self.spent[name] += much
-        self.spent["bytes_shelved"] = self.shelf.written
-        return [value for back in answers for value in self._taken(back)]
-
-    def _taken(self, back: bytes) -> list:
-        values, texts, error, cost = parcel().unpack(back)
-        self.spent["bytes_back"] += len(back)
-        self.spent["cpu_seconds"] += cost["cpu_seconds"]
-        self.spent["memory_mb"] = max(self.spent["memory_mb"], cost["memory_mb"])
-        for text in texts:
-            logging.getLogger("factorlib").warning("%s", text)
-        if error is not None:
-            raise error
-        return values
-
-    def close(self) -> None:
-        """Leave the cluster; tasks that are still there are cancelled."""
-        if self._client is not None:
-            self._client.close()
-
-
-def block_at(scheduler: str, site: Site, work: tuple[Path, bytes]) -> bytes:
-    """What the function gave of each item of a piece, what was warned of, the first error and the cost, packed.
-
-    work: the project's root, and the packed function and items
-    """
-    if fault := site.fault():
-        raise fault
-    if str(work[0]) not in sys.path:
-        sys.path.insert(0, str(work[0]))
-    meter, values, error = Meter(), [], None
-    with Heard() as heard:
-        function, items = parcel().unpack(work[1])
-        try:
-            for item in items:
-                values.append(function(item))
-        except Exception as caught:
-            caught.add_note(traceback.format_exc())
-            error = that_travels(caught)
-    return parcel().pack((values, heard.warnings, error, meter.read()))
-
-
-def parcel() -> ModuleType:
-    """`factorlib.parcel`, by its name as stages are: it imports science."""
-    return import_module("factorlib.parcel")
+    return run_step(msgspec.structs.replace(task, temporary=temporary))

@@ -106,12 +106,8 @@ class CodeChanged(InputError):
     """The code of a stage was edited while the run went on."""
 
 
-def run_step(task: Task, spread_over: Callable | None = None) -> Outcome:
-    """Run a task and keep its result in the store.  Raises nothing: an error of any kind is part of the outcome.
-
-    spread_over: an ordered map to which its independent work goes, with what it `spent` outside this process: `cpu_seconds`,
-                 and whatever else is worth a log; without, threads of this process
-    """
+def run_step(task: Task) -> Outcome:
+    """Run a task and keep its result in the store.  Raises nothing: an error of any kind is part of the outcome."""
     meter, code, store = Meter(), task.code, Store(task.store)
     shared = Store(task.shared) if task.shared else None
     with Events(task.events) as events:
@@ -123,15 +119,11 @@ def run_step(task: Task, spread_over: Callable | None = None) -> Outcome:
                     if event["event"] == "warning":
                         events.say(str(event.get("text", "")))
             else:
-                entry, damaged = _made(task, store, events, spread_over or partial(spread, code.cores))
-                cost = meter.read(code.threads, code.cores)
-                if spread_over is not None:
-                    cpu = round(cost["cpu_seconds"] + spread_over.spent["cpu_seconds"], 3)
-                    cost |= {"cpu_seconds": cpu, "spread": spread_over.spent}
+                entry, damaged = _made(task, store, events)
                 where = {name: task.record[name] for name in ("photo", "recipe") if name in task.record}
                 where |= {"stage": code.stage, "key": task.key}
                 lines = [where | {"event": "warning", "text": text} for text in events.warnings]
-                lines.append(where | {"event": "done", **cost})
+                lines.append(where | {"event": "done", **meter.read(code.threads, code.cores)})
                 store.logs.mkdir(parents=True, exist_ok=True)
                 text = "".join(json.dumps(line, sort_keys=True) + "\n" for line in lines)
                 replace_file(store.log(task.key), text.encode())
@@ -184,7 +176,7 @@ def limit_threads(threads: int) -> None:
         sys.modules["OpenImageIO"].attribute("threads", threads)
 
 
-def _made(task: Task, store: Store, events: Events, map_: Callable) -> tuple[Entry, Path | None]:
+def _made(task: Task, store: Store, events: Events) -> tuple[Entry, Path | None]:
     """Run the step, or copy its shipped result; its tree is in the store afterwards, its key is not."""
     if not task.forced and (folder := shipped_folder([task.code.root, LIBRARY], task.stage.shipped, task.record)):
         copy_shipped(folder, task.temporary)
@@ -196,6 +188,7 @@ def _made(task: Task, store: Store, events: Events, map_: Callable) -> tuple[Ent
     _check_code(task, hashes)
     results = {folder: stamps_of(folder) for folder in task.folders.values() if folder.is_relative_to(task.store)}
     unfinished = store.unfinished / task.key
+    map_ = partial(spread, task.code.cores)
     inputs = Inputs(task.folders, task.facts, task.files, photo, map_, task.log, unfinished)
     try:
         module.main(params, inputs, out, events.progress)
@@ -267,14 +260,17 @@ def _cpu_seconds() -> float:
     return sum(one.ru_utime + one.ru_stime for one in usage)
 
 
-class Heard(logging.Handler):
-    """Within, what the library and Python warn of comes here alone.  warnings: each text once"""
+class Events(logging.Handler):
+    """Progress and warnings of one step, as JSON lines of a file that the parent reads while it runs.
+
+    Within, what the library and Python warn of comes here alone.  warnings: each text once
+    """
 
     LOGGERS = ("factorlib", "py.warnings")
 
-    def __init__(self) -> None:
+    def __init__(self, path: Path):
         super().__init__(logging.WARNING)
-        self.warnings: list[str] = []
+        self.path, self.warnings, self._last = path, [], 0.0
 
     def __enter__(self) -> Self:
         logging.captureWarnings(True)
@@ -294,17 +290,6 @@ class Heard(logging.Handler):
         if text not in self.warnings:
             self.warnings.append(text)
             self.say(text)
-
-    def say(self, text: str) -> None:
-        """Pass a warning on."""
-
-
-class Events(Heard):
-    """Progress and warnings of one step, as JSON lines of a file that the parent reads while it runs."""
-
-    def __init__(self, path: Path):
-        super().__init__()
-        self.path, self._last = path, 0.0
 
     def progress(self, done: float, total: float, text: str = "") -> None:
         """Report that `done` of `total` is done; at most once in EVERY seconds, more frequent calls are dropped."""
