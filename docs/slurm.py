@@ -38,7 +38,7 @@ def main() -> int:
     dataset, *settings = sys.argv[1:]
     with slurm_cluster() as cluster:
         cluster.scale(jobs=JOBS)
-        words = " ".join(["executor=dask", f"scheduler={cluster.scheduler_address}", *settings])
+        words = " ".join([f"executor={cluster.scheduler_address}", *settings])
         return subprocess.call(["make", "all", f"DATASET={dataset}", f"SET={words}"], cwd=CHECKOUT)
 
 

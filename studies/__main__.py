@@ -31,7 +31,7 @@ def run(
     clean: Annotated[bool, typer.Option("--clean", help="forget results instead")] = False,
     gc: Annotated[bool, typer.Option("--gc", help="delete results that no study names any more instead")] = False,
 ) -> None:
-    """Run studies, as far as anything must run; SET="executor=dask scheduler=tcp://…" says where."""
+    """Run studies, as far as anything must run; SET="executor=tcp://…" says where."""
     if gc:
         raise typer.Exit(collect(lambda: agreed(force)))
     named = names or (os.environ.get("STUDY", "").split() if one else [])

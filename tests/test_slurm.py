@@ -51,7 +51,7 @@ def test_the_job_script_run_as_slurm_would_starts_a_worker_that_serves_a_run(clu
         ["bash", "-c", script], env={**os.environ, "PYTHONPATH": str(LIBRARY)}, cwd=tmp_path, start_new_session=True
     )
     try:
-        settings = ["executor=dask", f"scheduler={cluster.scheduler_address}"]
+        settings = [f"executor={cluster.scheduler_address}"]
         assert verbs.make(project, verbs.Wish("set", settings=settings)) == 0
     finally:
         os.killpg(job.pid, signal.SIGTERM)
@@ -72,4 +72,4 @@ def test_the_example_hands_the_run_its_schedulers_address_and_ends_as_the_run_do
     assert example["main"]() == 3
     ((command, cwd),) = called
     assert command[:3] == ["make", "all", "DATASET=eames"] and cwd == LIBRARY
-    assert re.fullmatch(r"SET=executor=dask scheduler=tcp://\S+:\d+ solve.lobes=64", command[3])
+    assert re.fullmatch(r"SET=executor=tcp://\S+:\d+ solve.lobes=64", command[3])

@@ -1,7 +1,6 @@
 """Steps on a Dask cluster: each is a task with keys and paths, its result lands in the store, which all workers see.
 
-The cluster is that of a scheduler that is running, or one in this process that lives as long as the run.  A worker hands
-its task to a child process (`factorlib.runner.child`), so that bits do not depend on how workers were started.  A task
+A worker hands its task to a child process (`factorlib.runner.child`), so that bits do not depend on how workers were started.  A task
 whose worker or child dies is tried again, on its own: nothing else is lost.
 """
 
@@ -26,7 +25,7 @@ import msgspec
 
 from factorlib.errors import InputError
 from factorlib.runner.child import Child, Pools, machine_cores, taken
-from factorlib.runner.pipeline import ADDRESS, HOW
+from factorlib.runner.pipeline import ADDRESS
 from factorlib.runner.plan import Record
 from factorlib.runner.project import LIBRARY
 from factorlib.runner.stop import whole
@@ -84,24 +83,22 @@ def started_by(scheduler: str, library: Path = LIBRARY) -> str:
 class Cluster(Pools):
     """The executor of a Dask cluster.
 
-    scheduler: its address; None for a cluster of this machine's cores
+    scheduler: its address
     run: folder of the run, in the store
     """
 
-    def __init__(self, scheduler: str | None, run: Path, say: Callable[[str], None]):
+    def __init__(self, scheduler: str, run: Path, say: Callable[[str], None]):
         _require_dask("executor")
         self.site, self._busy, self._over = Site(run), {}, threading.Event()
         self._known: tuple[float, dict[str, int]] = (-FRESH, {})
         for name in ("distributed", "distributed.client", "distributed.core", "distributed.comm"):
             logging.getLogger(name).setLevel(logging.CRITICAL)  # what they say of a lost connection is in the outcome
-        if scheduler:
-            say(f"connecting to {scheduler}")
+        say(f"connecting to {scheduler}")
         with whole():
-            self.client = _client(scheduler) if scheduler else _client_of_this_machine()
+            self.client = _client(scheduler)
         try:
-            if scheduler:
-                self._check(scheduler, say)
-                threading.Thread(target=self._miss_workers, args=(scheduler, say), daemon=True).start()
+            self._check(scheduler, say)
+            threading.Thread(target=self._miss_workers, args=(scheduler, say), daemon=True).start()
             self._executor = self.client.get_executor(pure=False, retries=TRIES - 1)
         except BaseException:
             self.client.close()
@@ -153,7 +150,7 @@ class Cluster(Pools):
                 time.sleep(FRESH)
         if lacking := [address for address, cores in self._declared().items() if not cores]:
             cure = f"{started_by(scheduler)}\n  or let it declare them: dask worker --nthreads 8 --resources {CORES}=8"
-            raise InputError(f"the worker {lacking[0]} does not say how many cores it has", key="scheduler", cure=cure)
+            raise InputError(f"the worker {lacking[0]} does not say how many cores it has", key="executor", cure=cure)
         for fault in filter(None, self.client.run(Site.fault, self.site).values()):
             raise fault
 
@@ -174,18 +171,6 @@ def _require_dask(key: str) -> None:
         raise InputError("Dask is not installed", key=key, cure=cure)
 
 
-def _client_of_this_machine() -> Any:
-    """A client of a cluster in this process, of one worker with all cores."""
-    import dask
-    from distributed import Client
-
-    cores = machine_cores()
-    place = {"processes": False, "protocol": "tcp", "host": "127.0.0.1", "dashboard_address": None, "memory_limit": 0}
-    size = {"n_workers": 1, "threads_per_worker": cores, "resources": {CORES: cores}}
-    with dask.config.set(dask.config.merge(dask.config.config, dask.config.collect_env(QUIET))):
-        return Client(**place, **size, silence_logs=logging.CRITICAL, set_as_default=False)
-
-
 def _client(scheduler: str) -> Any:
     """A client of the scheduler at an address.  InputError where none answers there."""
     from distributed import Client
@@ -193,9 +178,9 @@ def _client(scheduler: str) -> Any:
     try:
         return Client(scheduler, timeout=PATIENCE, set_as_default=False)
     except Exception as error:  # what answers there may be anything: an HTTP server, garbage
-        cure = "start one: dask scheduler --port 8786; or leave the scheduler out, for a cluster of this machine"
+        cure = "start one: dask scheduler --port 8786; or leave the executor out, for processes of this machine"
         words = str(error) or f"nothing in {PATIENCE} s"
-        raise InputError(f"no Dask scheduler answers at {scheduler} ({words})", key="scheduler", cure=cure) from error
+        raise InputError(f"no Dask scheduler answers at {scheduler} ({words})", key="executor", cure=cure) from error
 
 
 # ── in a worker ──────────────────────────────────────────────────────────────────────────────────────────────────────
@@ -230,8 +215,10 @@ def start_worker(scheduler: str, cores: int | None, more: list[str]) -> None:
     Raises InputError where that is no address.
     """
     _require_dask("worker")
-    if not re.match(ADDRESS, scheduler):
-        raise InputError(f"{scheduler!r} is no address", key="worker", cure=HOW)
+    if not re.fullmatch(ADDRESS, scheduler):
+        raise InputError(
+            f"{scheduler!r} is no address", key="worker", cure="write tcp://<host>:<port>, as tcp://10.0.0.1:8786"
+        )
     count = cores or machine_cores()
     options = f"--nthreads {count} --nworkers 1 --resources {CORES}={count} --memory-limit 0 --no-dashboard".split()
     path = os.pathsep.join([str(LIBRARY), *filter(None, [os.environ.get("PYTHONPATH")])])

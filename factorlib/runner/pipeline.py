@@ -21,9 +21,9 @@ SHOWN = 80  # characters of a setting that messages repeat
 LONGEST, DEEPEST = 5000, 16  # characters of a setting, parts of its name: a path may have 4096
 NAME = re.compile("[a-z][a-z0-9_]*")
 TAKEN = ("errors",)  # a folder beside the links that are called as the stages
-ADDRESS = r"^(tcp|tls|ws|wss|ucx|ucxx)://[^\s/]+:\d+$"
-WHERE = ("executor=", "scheduler=")  # settings that begin so say where steps run
-HOW = "write tcp://<host>:<port>, as tcp://10.0.0.1:8786"
+ADDRESS = r"(tcp|tls|ws|wss|ucx|ucxx)://[^\s/]+:\d+"
+HOW = "write processes, or the address of a Dask scheduler, as tcp://10.0.0.1:8786"
+Executor = Annotated[str, msgspec.Meta(pattern=f"^(processes|{ADDRESS})$", description=HOW)]
 DATASET = "dataset."  # prefix of the inputs that are slices of the dataset
 
 
@@ -97,14 +97,12 @@ class Stage(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 class Pipeline(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """What pipeline.yaml says.
 
-    executor:  where steps run, which changes no bit and no key: `processes` of this machine, or the workers of a cluster of `dask`
-    scheduler: the address of that cluster's scheduler; without one, a cluster of this machine's cores
+    executor: where steps run, which changes no bit and no key: `processes` of this machine, or the address of a Dask scheduler
     """
 
     format: int
     stages: dict[str, Stage]
-    executor: Literal["processes", "dask"] = "processes"
-    scheduler: Annotated[str, msgspec.Meta(pattern=ADDRESS, description=HOW)] | None = None
+    executor: Executor = "processes"
 
     def order(self) -> list[str]:
         """Stages, each after what it takes; otherwise as they stand in the file."""
@@ -142,7 +140,6 @@ def read_pipeline(path: Path, known_slices: tuple[str, ...]) -> Pipeline:
 
     if pipeline.format != FORMAT:
         refuse(f"format {pipeline.format} is not known", "format", f"this version reads format: {FORMAT}")
-    _check_scheduler(pipeline, path, "add executor: dask")
     known = [*(DATASET + name for name in known_slices), *pipeline.stages]
     for name, stage in pipeline.stages.items():
         key = f"stages.{name}"
@@ -166,31 +163,21 @@ def read_pipeline(path: Path, known_slices: tuple[str, ...]) -> Pipeline:
     return pipeline
 
 
-def _check_scheduler(pipeline: Pipeline, file: Path | None, cure: str) -> None:
-    if pipeline.scheduler is not None and pipeline.executor != "dask":
-        raise InputError("only Dask has a scheduler", file=file, key="scheduler", cure=cure)
-
-
 def with_settings(pipeline: Pipeline, settings: list[str]) -> Pipeline:
-    """The pipeline with `stage.parameter=value` words in place of its own, and `executor=…` and `scheduler=…`; several words
-    in one string are split.
+    """The pipeline with `stage.parameter=value` words in place of its own, and `executor=…`; several words in one string are split.
 
     >>> with_settings(Pipeline(1, {"solve": Stage()}), ["solve.lobes=64 solve.tolerance=1e-3"]).stages["solve"].params
     {'lobes': 64, 'tolerance': 0.001}
     """
-    words, stages = _words(settings), dict(pipeline.stages)
-    where = dict(word.split("=", 1) for word in words if word.startswith(WHERE))  # the last of each kind counts
-    if where:
-        kept = None if where.get("executor") == "processes" else pipeline.scheduler  # which drops that of pipeline.yaml
-        chosen = {"executor": pipeline.executor, "scheduler": kept} | where
-        chosen["scheduler"] = chosen["scheduler"] or None
-        pipeline = convert({"format": FORMAT, "stages": {}} | chosen, Pipeline, "SET")  # the stages follow
-        _check_scheduler(pipeline, None, 'write SET="executor=dask scheduler=…"')
-    for word in (word for word in words if not word.startswith(WHERE)):
+    stages, executor = dict(pipeline.stages), pipeline.executor
+    for word in _words(settings):
         target, equals, text = word.partition("=")
+        if target == "executor":
+            executor = convert(text, Executor, f"SET {_cut(word)}")
+            continue
         stage, *keys = target.split(".")
         if not equals or not keys or not all(keys) or len(keys) > DEEPEST or len(word) > LONGEST:
-            cure = 'write stage.parameter=value, as in SET="solve.cells=800", or executor=…, scheduler=…'
+            cure = 'write stage.parameter=value, as in SET="solve.cells=800"'
             raise InputError(f"{_cut(word)!r} is no setting", key="SET", cure=cure)
         if stage not in stages:
             raise InputError(f"there is no stage {stage!r}", key=f"SET {_cut(word)}", cure=did_you_mean(stage, stages))
@@ -208,7 +195,7 @@ def with_settings(pipeline: Pipeline, settings: list[str]) -> Pipeline:
             table[name] = table = dict(inner) if isinstance(inner, dict) else {}
         table[keys[-1]] = value
         stages[stage] = msgspec.structs.replace(stages[stage], params=params)
-    return msgspec.structs.replace(pipeline, stages=stages)
+    return msgspec.structs.replace(pipeline, stages=stages, executor=executor)
 
 
 def said_of_settings(error: InputError, settings: list[str]) -> InputError:

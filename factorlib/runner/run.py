@@ -52,10 +52,10 @@ def run(survey: Survey, display: Display) -> Run:
         work = Run(survey, display, folder)
         if work.refused:
             return work
-        if survey.spec.pipeline.executor == "dask":
+        if survey.spec.pipeline.executor != "processes":
             from factorlib.runner.cluster import Cluster  # which is loaded only then
 
-            work.pools = Cluster(survey.spec.pipeline.scheduler, folder, display.say)
+            work.pools = Cluster(survey.spec.pipeline.executor, folder, display.say)
         try:
             work.go()
         except BaseException:

@@ -99,7 +99,7 @@ def make(
 ) -> int:
     """Run studies as far as anything must run; their results and the page of all that are done lie in build/studies afterwards.
 
-    settings: where their steps run, as `executor=dask`
+    settings: where their steps run, as `executor=tcp://…`
 
     A study that fails holds up no other.  Returns the exit code of the first that failed, 0 where none did.
     """

@@ -50,7 +50,7 @@ class LiveCluster(contextlib.AbstractContextManager):
     @property
     def settings(self) -> list[str]:
         """The words that make a run use it."""
-        return ["executor=dask", f"scheduler={self.address}"]
+        return [f"executor={self.address}"]
 
     def kill_workers(self) -> None:
         """SIGKILL to all but the scheduler."""

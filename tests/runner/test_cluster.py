@@ -229,7 +229,7 @@ def test_a_worker_elsewhere_or_with_another_version_of_what_a_step_imports_is_re
 def test_without_dask_the_cure_names_the_extra(project, monkeypatch):
     monkeypatch.setattr(cluster, "find_spec", lambda name: None)
     with pytest.raises(InputError, match="EXTRAS=dask"):
-        make(project, "executor=dask")
+        make(project, "executor=tcp://127.0.0.1:1")
     with pytest.raises(InputError, match="EXTRAS=dask"):
         cluster.start_worker("tcp://127.0.0.1:1", None, [])
 
@@ -253,7 +253,7 @@ def test_a_scheduler_out_of_reach_is_named_and_no_worker_is_started_for_it(
         cluster.start_worker("10.0.0.1", None, [])
 
 
-PLAIN, ON_DASK = "format: 1\nstages: {}\n", "format: 1\nexecutor: dask\nscheduler: tcp://a:1\nstages: {}\n"
+PLAIN, ON_DASK = "format: 1\nstages: {}\n", "format: 1\nexecutor: tcp://a:1\nstages: {}\n"
 
 
 @pytest.mark.parametrize("text, setting, expected", [
@@ -273,10 +273,9 @@ PLAIN, ON_DASK = "format: 1\nstages: {}\n", "format: 1\nexecutor: dask\nschedule
 ])  # fmt: skip
 def test_where_steps_run_stands_in_pipeline_yaml_and_a_setting_replaces_it(tmp_path, text, setting, expected):
     write(tmp_path / "pipeline.yaml", text)
-    if isinstance(expected, str):
-        with pytest.raises(InputError) as refused:
-            with_settings(read_pipeline(tmp_path / "pipeline.yaml", ()), [setting])
-        assert expected in str(refused.value)
-    else:
-        pipeline = with_settings(read_pipeline(tmp_path / "pipeline.yaml", ()), [setting])
-        assert (pipeline.executor, pipeline.scheduler) == expected
+    try:
+        found = with_settings(read_pipeline(tmp_path / "pipeline.yaml", ()), [setting]).executor
+    except InputError as error:
+        found = f"error: {error}"
+        assert "exec" in found and ("10.0.0.1" in found or "executor" not in expected or "did you mean" in found)
+    assert expected in found
