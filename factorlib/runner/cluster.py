@@ -35,7 +35,6 @@ FRESH = 1.0  # seconds for which the scheduler is not asked again who its worker
 PATIENCE = 10  # seconds to reach a scheduler, for steps to end that are cancelled, and until the last worker is missed
 AHEAD = 2  # steps are handed out for so many times the cores, so that no worker waits for its next one
 TRIES = 3  # of a task whose process dies
-CORES = "cores"  # the resource that workers declare
 PYTHON = f"{sys.version_info[0]}.{sys.version_info[1]}"
 QUIET = {  # what Dask does by itself between tasks: without these, a worker that waits takes 4 % of a core
     "DASK_DISTRIBUTED__WORKER__PROFILE__ENABLED": "False",
@@ -81,43 +80,59 @@ def started_by(scheduler: str, library: Path = LIBRARY) -> str:
 
 
 class Cluster(Pools):
-    """The executor of a Dask cluster.
+    """The executor of the workers of a Dask scheduler at an address.  run: folder of the run, in the store
 
-    scheduler: its address
-    run: folder of the run, in the store
+    Raises InputError where no scheduler answers there, or a worker cannot do what it must.
     """
 
     def __init__(self, scheduler: str, run: Path, say: Callable[[str], None]):
         _require_dask("executor")
+        from distributed import Client
+
         self.site, self._busy, self._over = Site(run), {}, threading.Event()
         self._known: tuple[float, dict[str, int]] = (-FRESH, {})
         for name in ("distributed", "distributed.client", "distributed.core", "distributed.comm"):
             logging.getLogger(name).setLevel(logging.CRITICAL)  # what they say of a lost connection is in the outcome
         say(f"connecting to {scheduler}")
-        with whole():
-            self.client = _client(scheduler)
         try:
-            self._check(scheduler, say)
-            threading.Thread(target=self._miss_workers, args=(scheduler, say), daemon=True).start()
+            with whole():
+                self.client = Client(scheduler, timeout=PATIENCE, set_as_default=False)
+        except Exception as error:  # what answers there may be anything: an HTTP server, garbage
+            cure = "start one: dask scheduler --port 8786; or leave the executor out, for processes of this machine"
+            words = f"no Dask scheduler answers at {scheduler} ({str(error) or f'nothing in {PATIENCE} s'})"
+            raise InputError(words, key="executor", cure=cure) from error
+        try:
+            for fault in filter(None, self.client.run(Site.fault, self.site).values()):
+                raise fault
             self._executor = self.client.get_executor(pure=False, retries=TRIES - 1)
         except BaseException:
             self.client.close()
             raise
+        threading.Thread(target=self._miss_workers, args=(scheduler, say), daemon=True).start()
+
+    @property
+    def workers(self) -> dict[str, int]:
+        """The cores of each worker, by its address, as the scheduler said not long ago."""
+        asked, known = self._known
+        if time.monotonic() - asked >= FRESH:
+            with contextlib.suppress(Exception):  # of a scheduler that is gone, which ends the tasks too
+                known = self.client.nthreads()
+            self._known = time.monotonic(), known
+        return known
 
     @property
     def cores(self) -> int:
         """Those of the largest worker that is there now; 1 where none is."""
-        return max(self._declared().values(), default=1)
+        return max(self.workers.values(), default=1)
 
     def free(self, cores: int) -> bool:
         """Whether a step of `cores` cores may be handed out now."""
-        return not self._work() or self._work() + cores <= AHEAD * sum(self._declared().values())
+        return not self._work() or self._work() + cores <= AHEAD * sum(self.workers.values())
 
     def submit(self, cores: int, threads: int, function: Callable, argument: Any) -> Future:
         """Hand out a step, by its task; its future."""
         with whole():
-            task = hosted, self.site, threads, outcome_at, argument
-            future = self._executor.submit(*task, resources={CORES: min(cores, self.cores)})
+            future = self._executor.submit(hosted, self.site, threads, argument)
             self._busy[future] = cores
             return future
 
@@ -131,37 +146,15 @@ class Cluster(Pools):
                 time.sleep(0.1)
         self.client.close()
 
-    def _declared(self) -> dict[str, int]:
-        """The cores that each worker declares, by its address, as the scheduler said not long ago."""
-        asked, known = self._known
-        if time.monotonic() - asked >= FRESH:
-            with contextlib.suppress(Exception):  # of a scheduler that is gone, which ends the tasks too
-                # not `client.scheduler_info`, whose answer a look of Dask's own that asks for no workers may replace
-                workers = self.client.sync(self.client.scheduler.identity, n_workers=-1)["workers"]
-                known = {address: int(facts["resources"].get(CORES, 0)) for address, facts in workers.items()}
-            self._known = time.monotonic(), known
-        return known
-
-    def _check(self, scheduler: str, say: Callable[[str], None]) -> None:
-        """Wait for a worker; InputError where any of those that are there cannot do what it must."""
-        if not self._declared():
-            say(f"waiting: no worker yet at {scheduler}; {started_by(scheduler)}")
-            while not self._declared():
-                time.sleep(FRESH)
-        if lacking := [address for address, cores in self._declared().items() if not cores]:
-            cure = f"{started_by(scheduler)}\n  or let it declare them: dask worker --nthreads 8 --resources {CORES}=8"
-            raise InputError(f"the worker {lacking[0]} does not say how many cores it has", key="executor", cure=cure)
-        for fault in filter(None, self.client.run(Site.fault, self.site).values()):
-            raise fault
-
     def _miss_workers(self, scheduler: str, say: Callable[[str], None]) -> None:
-        """Say once that the last worker is gone.  Dask keeps its tasks for those that come."""
-        last = time.monotonic()
+        """Say once that there is no worker.  Dask keeps its tasks for those that come."""
+        last = -PATIENCE
         while not self._over.wait(FRESH):
-            if self._declared():
+            if self.workers:
                 last = time.monotonic()
             elif time.monotonic() - last >= PATIENCE:
-                say(f"waiting: no worker is left at {scheduler}; {started_by(scheduler)}")
+                start = started_by(scheduler)
+                say(f"waiting: there is no worker at {scheduler}; {start}")
                 last = float("inf")
 
 
@@ -171,25 +164,13 @@ def _require_dask(key: str) -> None:
         raise InputError("Dask is not installed", key=key, cure=cure)
 
 
-def _client(scheduler: str) -> Any:
-    """A client of the scheduler at an address.  InputError where none answers there."""
-    from distributed import Client
-
-    try:
-        return Client(scheduler, timeout=PATIENCE, set_as_default=False)
-    except Exception as error:  # what answers there may be anything: an HTTP server, garbage
-        cure = "start one: dask scheduler --port 8786; or leave the executor out, for processes of this machine"
-        words = str(error) or f"nothing in {PATIENCE} s"
-        raise InputError(f"no Dask scheduler answers at {scheduler} ({words})", key="executor", cure=cure) from error
-
-
 # ── in a worker ──────────────────────────────────────────────────────────────────────────────────────────────────────
 
 _children: list[Child] = []
 
 
-def hosted(site: Site, threads: int, function: Callable, argument: Any) -> Any:
-    """`function(site, argument)` in a child of this worker, which ends if nobody waits any more."""
+def hosted(site: Site, threads: int, task: Task) -> Outcome:
+    """Run a step in a child of this worker, which ends if nobody waits any more."""
     from distributed import get_worker
 
     worker = get_worker()
@@ -197,11 +178,11 @@ def hosted(site: Site, threads: int, function: Callable, argument: Any) -> Any:
 
     def wanted() -> bool:
         """False once the task is cancelled, which for Dask is a change of its state, no interruption; or the worker closes."""
-        task, status = worker.state.tasks.get(key), worker.status.name
+        of_dask, status = worker.state.tasks.get(key), worker.status.name
         open_ = status in ("running", "paused", "closing_gracefully")
-        return task is not None and task.state != "cancelled" and open_
+        return of_dask is not None and of_dask.state != "cancelled" and open_
 
-    return taken(_children, threads, site.run).call(function, site, argument, wanted=wanted)
+    return taken(_children, threads, site.run).call(outcome_at, site, task, wanted=wanted)
 
 
 def at_work(run: Path) -> bool:
@@ -216,11 +197,10 @@ def start_worker(scheduler: str, cores: int | None, more: list[str]) -> None:
     """
     _require_dask("worker")
     if not re.fullmatch(ADDRESS, scheduler):
-        raise InputError(
-            f"{scheduler!r} is no address", key="worker", cure="write tcp://<host>:<port>, as tcp://10.0.0.1:8786"
-        )
+        cure = "write tcp://<host>:<port>, as tcp://10.0.0.1:8786"
+        raise InputError(f"{scheduler!r} is no address", key="worker", cure=cure)
     count = cores or machine_cores()
-    options = f"--nthreads {count} --nworkers 1 --resources {CORES}={count} --memory-limit 0 --no-dashboard".split()
+    options = f"--nthreads {count} --nworkers 1 --memory-limit 0 --no-dashboard".split()
     path = os.pathsep.join([str(LIBRARY), *filter(None, [os.environ.get("PYTHONPATH")])])
     command = [sys.executable, "-m", "distributed.cli.dask_worker", scheduler, *options, *more]
     os.execve(sys.executable, command, {**QUIET, **os.environ, "PYTHONPATH": path})

@@ -43,14 +43,10 @@ def shared_store(own: Path) -> Path | None:
     if not (named := os.environ.get(VARIABLE)):
         return None
     folder = Path(named).expanduser()
-    try:
-        if folder.is_dir():
-            return None if own.is_dir() and folder.samefile(own) else folder.resolve()
-    except (OSError, RuntimeError, ValueError) as error:  # no right to look, links in a circle, a NUL
-        words, cure = f"cannot be looked at ({error})", "name a folder that you may read"
-        raise InputError(words, file=named[:100], key=VARIABLE, cure=cure) from error
-    cure = "make it, or name another; it may be empty"
-    raise InputError("there is no such folder", file=named, key=VARIABLE, cure=cure)
+    if not os.path.isdir(folder):
+        cure = "make it, or name another that you may read; it may be empty"
+        raise InputError("there is no such folder", file=named[:100], key=VARIABLE, cure=cure)
+    return None if own.is_dir() and folder.samefile(own) else folder.resolve()
 
 
 def fetch(shared: Store, own: Store, key: str, draft: Path, say: Say) -> tuple[Entry, Path | None] | None:

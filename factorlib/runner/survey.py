@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import os
 import sys
 from collections.abc import Iterable
 from dataclasses import dataclass
@@ -12,7 +11,7 @@ from pathlib import Path
 import msgspec
 
 from factorlib.errors import InputError, did_you_mean
-from factorlib.reading import check_plain
+from factorlib.reading import check_plain, reading
 from factorlib.runner.closure import Packages, Sources, other_than, recorded
 from factorlib.runner.filehash import FileHashes
 from factorlib.runner.home import Home, home_of
@@ -175,31 +174,21 @@ def _records(
         record |= {f"default:{param}": recorded(value) for param, value in of[name].items()}
         for param, folder in stage.folders.items():
             for given in stage.given[param]:
-                try:
-                    if os.path.lexists(folder / given):
-                        check_plain(folder / given, "a result", f"{name}.{param}", most_bytes=None)  # a pipe never ends
-                    record[f"given:{param}/{given}"] = hashes.content(folder / given)
-                except (OSError, TypeError):
-                    words = "there is no such folder" if not os.path.isdir(folder) else f"it has no readable {given!r}"
-                    files = ", ".join(stage.given[param])
-                    cure = f"name a folder with {files}, such as the result of an earlier run of the stage"
-                    raise InputError(words, file=project.shown(folder), key=f"{name}.{param}", cure=cure) from None
+                record[f"given:{param}/{given}"] = _hash(folder / given, hashes, f"{name}.{param}")
         for step in spec.steps_of(name):
             records[step] = record | {"photo": step.photo}
             for slice_ in (data.slice(each, step.photo) for each in stage.slices):
                 records[step] |= {f"facts:{DATASET}{field}": value for field, value in slice_.fields.items()}
-                records[step] |= {f"file:{each}": _hash(data.folder, each, hashes) for each in slice_.files}
+                records[step] |= {f"file:{each}": _hash(data.folder / each, hashes) for each in slice_.files}
             if step.recipe is not None:
                 recipe = recipes[step.recipe]
                 records[step] |= {"recipe": step.recipe} | {f"recipe:{f}": value for f, value in recipe.facts.items()}
                 files = recipe.files.items()
-                records[step] |= {f"recipe file:{each}": _hash(path.parent, path.name, hashes) for each, path in files}
+                records[step] |= {f"recipe file:{each}": _hash(path, hashes) for each, path in files}
     return records
 
 
-def _hash(folder: Path, file: str, hashes: FileHashes) -> str:
-    try:
-        return hashes.content(folder / file)
-    except OSError as error:
-        words = f"the file {file!r} cannot be read ({error.strerror})"
-        raise InputError(words, file=folder, cure="check its name and permissions") from error
+def _hash(path: Path, hashes: FileHashes, key: str | None = None) -> str:
+    check_plain(path, "a file", key, most_bytes=None)  # a pipe never ends
+    with reading("a file", path, key):
+        return hashes.content(path)

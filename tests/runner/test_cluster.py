@@ -208,7 +208,7 @@ def test_a_run_whose_workers_are_all_killed_says_so_and_goes_on_when_one_comes(
     assert make(project, *live.settings) == 0
     thread.join()
     text = "".join(capsys.readouterr())
-    assert text.count("no worker is left at") == 1 and f"-m factorlib worker {live.address}" in text
+    assert text.count("there is no worker at") == 1 and f"-m factorlib worker {live.address}" in text
     assert kept(project) == beside(project)
 
 
