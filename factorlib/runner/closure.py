@@ -35,13 +35,6 @@ from factorlib.errors import InputError, did_you_mean
 from factorlib.runner.filehash import FileHashes, left_over, read_cache, write_cache
 
 CODE = ("source:", "data:", "environment:", "program:")  # the fields of a record that a closure makes
-FOLLOWED = (
-    ast.Constant,
-    ast.Tuple,
-    ast.UnaryOp,
-    ast.Name,
-    ast.Call,
-)  # what a default may be followed to: no list, which may change
 DEEPEST = 16  # names that stand for names, structs in structs: one more is not followed
 
 
@@ -99,8 +92,8 @@ def source_of(text: str, module: str, is_package: bool) -> Source:
             classes[node.name] = [ast.unparse(base) for base in node.bases], defaults
         elif isinstance(node, ast.ImportFrom) and node.module and not node.level:
             imported |= {alias.asname or alias.name: (node.module, alias.name) for alias in node.names}
-        elif isinstance(node, ast.Assign) and isinstance(node.value, FOLLOWED):
-            assigned |= {target.id: ast.unparse(node.value) for target in node.targets if hasattr(target, "id")}
+        elif isinstance(node, ast.Assign):
+            assigned |= {target.id: ast.unparse(value) for target, value in _pairs(node) if hasattr(target, "id")}
     stored = (ast.Store, ast.Del)
     bound = Counter(n.id for n in ast.walk(tree) if isinstance(n, ast.Name) and isinstance(n.ctx, stored))
     environment = _declared(tree, "ENVIRONMENT", list[str], '("A_VARIABLE",)') or []
@@ -133,6 +126,17 @@ def _drop_docstring(node: ast.AST) -> None:
         values = [(item, getattr(item, "value", None) if isinstance(item, ast.Expr) else None) for item in node.body]
         texts = [item for item, value in values if isinstance(value, ast.Constant) and isinstance(value.value, str)]
         node.body = [item for item in node.body if item not in texts] or [ast.Pass()]
+
+
+def _pairs(node: ast.Assign) -> Iterator[tuple[ast.expr, ast.expr]]:
+    """Targets and values that a default may be followed to; A, B = x, y are two assignments."""
+    (target, *others), value = node.targets, node.value
+    both = isinstance(target, ast.Tuple) and isinstance(value, ast.Tuple) and len(target.elts) == len(value.elts)
+    pairs = zip(target.elts, value.elts) if both and not others else ((each, value) for each in node.targets)
+    for target, value in pairs:
+        made = isinstance(value, ast.Call) and not value.args and not value.keywords
+        if made or isinstance(value, ast.Constant | ast.Tuple | ast.UnaryOp | ast.Name):
+            yield target, value
 
 
 class Unknown(str):

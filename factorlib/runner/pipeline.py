@@ -176,7 +176,7 @@ def with_settings(pipeline: Pipeline, settings: list[str]) -> Pipeline:
             raise InputError(f"there is no stage {stage!r}", key=f"SET {_cut(word)}", cure=did_you_mean(stage, stages))
         try:
             value = parse_yaml(text, f"SET {_cut(word)}")
-            json.dumps(value, allow_nan=False), msgspec.json.encode(value)
+            json.dumps(value, allow_nan=False), msgspec.msgpack.encode(value)
         except (ValueError, OverflowError, RecursionError) as error:
             if isinstance(error, InputError):
                 raise

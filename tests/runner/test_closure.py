@@ -54,7 +54,7 @@ def test_every_form_of_import_is_followed(tmp_path):
 
 def test_defaults_are_followed_to_bases_constants_and_instances(tmp_path):
     files = {
-        "stages/s.py": "from p.a import NOISE, Base\nLOW = 1\nHIGH = (2, 3)\nclass Params(Base):\n    low: int = LOW\n"
+        "stages/s.py": "from p.a import NOISE, Base\nLOW, HIGH = 1, (2, 3)\nclass Params(Base):\n    low: int = LOW\n"
         "    high: tuple = HIGH\n    noise: float = NOISE.absolute\n    sum: int = LOW + 1\n    none: int\n",
         "p/__init__.py": "",
         "p/a.py": "class Noise:\n    absolute: float = 1e-3\nNOISE = Noise()\nclass Base:\n    limits: Noise = Noise()\n    low: int = 7\n",
