@@ -9,7 +9,6 @@ from __future__ import annotations
 import contextlib
 import logging
 import os
-import re
 import sys
 import threading
 import time
@@ -24,8 +23,7 @@ from typing import Any
 import msgspec
 
 from factorlib.errors import InputError
-from factorlib.runner.child import Child, Pools, machine_cores, taken
-from factorlib.runner.pipeline import ADDRESS
+from factorlib.runner.child import Child, Pools, taken
 from factorlib.runner.plan import Record
 from factorlib.runner.project import LIBRARY
 from factorlib.runner.stop import whole
@@ -36,11 +34,6 @@ PATIENCE = 10  # seconds to reach a scheduler, for steps to end that are cancell
 AHEAD = 2  # steps are handed out for so many times the cores, so that no worker waits for its next one
 TRIES = 3  # of a task whose process dies
 PYTHON = f"{sys.version_info[0]}.{sys.version_info[1]}"
-QUIET = {  # what Dask does by itself between tasks: without these, a worker that waits takes 4 % of a core
-    "DASK_DISTRIBUTED__WORKER__PROFILE__ENABLED": "False",
-    "DASK_DISTRIBUTED__ADMIN__TICK__INTERVAL": "1s",
-    "DASK_DISTRIBUTED__ADMIN__SYSTEM_MONITOR__INTERVAL": "5s",
-}
 
 
 class Site(msgspec.Struct, frozen=True):
@@ -73,7 +66,7 @@ class Site(msgspec.Struct, frozen=True):
 
 def started_by(scheduler: str, library: Path = LIBRARY) -> str:
     """The command line that starts a worker as it must be."""
-    return f"start the worker by: cd {library} && .venv/bin/python -m factorlib worker {scheduler}"
+    return f"start the worker by: cd {library} && .venv/bin/dask worker {scheduler}"
 
 
 # ── the run ──────────────────────────────────────────────────────────────────────────────────────────────────────────
@@ -86,7 +79,9 @@ class Cluster(Pools):
     """
 
     def __init__(self, scheduler: str, run: Path, say: Callable[[str], None]):
-        _require_dask("executor")
+        if find_spec("distributed") is None:
+            cure = "make setup EXTRAS=dask, or pip install 'factorlib[dask]'"
+            raise InputError("Dask is not installed", key="executor", cure=cure)
         from distributed import Client
 
         self.site, self._busy, self._over = Site(run), {}, threading.Event()
@@ -158,12 +153,6 @@ class Cluster(Pools):
                 last = float("inf")
 
 
-def _require_dask(key: str) -> None:
-    if find_spec("distributed") is None:
-        cure = "make setup EXTRAS=dask, or pip install 'factorlib[dask]'"
-        raise InputError("Dask is not installed", key=key, cure=cure)
-
-
 # ── in a worker ──────────────────────────────────────────────────────────────────────────────────────────────────────
 
 _children: list[Child] = []
@@ -188,22 +177,6 @@ def hosted(site: Site, threads: int, task: Task) -> Outcome:
 def at_work(run: Path) -> bool:
     """Whether a task of that run has a child here."""
     return any(child.busy and child.run == run and child.process.poll() is None for child in _children)
-
-
-def start_worker(scheduler: str, cores: int | None, more: list[str]) -> None:
-    """Become a worker of the cluster at `scheduler` with so many cores (default: this machine's), as steps need it.
-
-    Raises InputError where that is no address.
-    """
-    _require_dask("worker")
-    if not re.fullmatch(ADDRESS, scheduler):
-        cure = "write tcp://<host>:<port>, as tcp://10.0.0.1:8786"
-        raise InputError(f"{scheduler!r} is no address", key="worker", cure=cure)
-    count = cores or machine_cores()
-    options = f"--nthreads {count} --nworkers 1 --memory-limit 0 --no-dashboard".split()
-    path = os.pathsep.join([str(LIBRARY), *filter(None, [os.environ.get("PYTHONPATH")])])
-    command = [sys.executable, "-m", "distributed.cli.dask_worker", scheduler, *options, *more]
-    os.execve(sys.executable, command, {**QUIET, **os.environ, "PYTHONPATH": path})
 
 
 # ── in the child of a step ───────────────────────────────────────────────────────────────────────────────────────────

@@ -22,9 +22,9 @@ SHOWN = 80  # characters of a setting that messages repeat
 LONGEST, DEEPEST = 5000, 16  # characters of a setting, parts of its name: a path may have 4096
 NAME = re.compile("[a-z][a-z0-9_]*")
 TAKEN = ("errors",)  # a folder beside the links that are called as the stages
-ADDRESS = r"(tcp|tls|ws|wss|ucx|ucxx)://[^\s/]+:\d+"
 HOW = "write processes, or the address of a Dask scheduler, as tcp://10.0.0.1:8786"
-Executor = Annotated[str, msgspec.Meta(pattern=f"^(processes|{ADDRESS})$", description=HOW)]
+WHERE = r"^(processes|(tcp|tls|ws|wss|ucx|ucxx)://[^\s/]+:\d+)$"
+Executor = Annotated[str, msgspec.Meta(pattern=WHERE, description=HOW)]
 DATASET = "dataset."  # prefix of the inputs that are slices of the dataset
 
 

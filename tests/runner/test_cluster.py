@@ -208,14 +208,14 @@ def test_a_run_whose_workers_are_all_killed_says_so_and_goes_on_when_one_comes(
     assert make(project, *live.settings) == 0
     thread.join()
     text = "".join(capsys.readouterr())
-    assert text.count("there is no worker at") == 1 and f"-m factorlib worker {live.address}" in text
+    assert text.count("there is no worker at") == 1 and f".venv/bin/dask worker {live.address}" in text
     assert kept(project) == beside(project)
 
 
 @pytest.mark.parametrize("change, words, cure", [
     ({"run": Path("/nowhere")}, "does not see the run's folder", "mount at the same path"),
-    ({"library": Path("/other")}, f"runs the code in {LIBRARY}", "cd /other && .venv/bin/python -m factorlib worker"),
-    ({"python": "3.99"}, "the run has 3.99", "-m factorlib worker"),
+    ({"library": Path("/other")}, f"runs the code in {LIBRARY}", "cd /other && .venv/bin/dask worker"),
+    ({"python": "3.99"}, "the run has 3.99", "dask worker"),
     ({"record": {"package:msgspec": "0.0"}}, f"has msgspec {msgspec.__version__}, the run has 0.0", "make setup"),
 ])  # fmt: skip
 def test_a_worker_elsewhere_or_with_another_version_of_what_a_step_imports_is_refused(tmp_path, change, words, cure):
@@ -230,8 +230,6 @@ def test_without_dask_the_cure_names_the_extra(project, monkeypatch):
     monkeypatch.setattr(cluster, "find_spec", lambda name: None)
     with pytest.raises(InputError, match="EXTRAS=dask"):
         make(project, "executor=tcp://127.0.0.1:1")
-    with pytest.raises(InputError, match="EXTRAS=dask"):
-        cluster.start_worker("tcp://127.0.0.1:1", None, [])
 
 
 @pytest.mark.parametrize("address, words, cure", [
