@@ -10,21 +10,16 @@ What else a module's numbers depend on it declares in constants, which are read 
     ENVIRONMENT = ("FACTORLIB_FUSED",)    environment variables; their values count
     PROGRAMS = {"CC": "cc"}               programs by the variable that names them, and what stands in for it; whether
                                           there is such a program counts, and its name, not where it lies
-
-A stage's parameters and their defaults are read from syntax trees too, for planning must not import what a stage imports.
-A default is followed to a base class, a constant of any module, and into an instance made without arguments (`Limits()`).
 """
 
 from __future__ import annotations
 
 import ast
 import hashlib
-import json
 import os
 import shlex
 import shutil
 import sys
-from collections import Counter
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -35,25 +30,17 @@ from factorlib.errors import InputError, did_you_mean
 from factorlib.runner.filehash import FileHashes, left_over, read_cache, write_cache
 
 CODE = ("source:", "data:", "environment:", "program:")  # the fields of a record that a closure makes
-DEEPEST = 16  # names that stand for names, structs in structs: one more is not followed
 
 
 class Source(msgspec.Struct, frozen=True):
     """What one module's text says: a digest of its syntax tree, dotted names as it imports them, and the environment variables
-    and programs that it declares its numbers to depend on; of its top level what defaults of parameters may stand for.
-
-    classes:  by name, the bases as they are written, and the fields with the text of their defaults
-    imported: by name, the module and the name there
-    assigned: by name, the text of what is assigned to it, of names that are bound once in the whole module
+    and programs that it declares its numbers to depend on.
     """
 
     digest: str = ""
     imports: list[str] = []
     environment: list[str] = []
     programs: dict[str, str] = {}
-    classes: dict[str, tuple[list[str], dict[str, str]]] = {}
-    imported: dict[str, tuple[str, str]] = {}
-    assigned: dict[str, str] = {}
 
 
 class Closure(msgspec.Struct, frozen=True):
@@ -77,7 +64,7 @@ class Closure(msgspec.Struct, frozen=True):
 def source_of(text: str, module: str, is_package: bool) -> Source:
     """What a module's text says.  Raises SyntaxError, and InputError for a declaration that is none."""
     tree = ast.parse(text)
-    imports, classes, imported, assigned = set(), {}, {}, {}
+    imports = set()
     for node in ast.walk(tree):
         if isinstance(node, ast.Import):
             imports |= {alias.name for alias in node.names}
@@ -85,24 +72,12 @@ def source_of(text: str, module: str, is_package: bool) -> Source:
             above = module.split(".")[: None if is_package else -1] if node.level else []
             base = ".".join([*above[: len(above) - node.level + 1], *([node.module] if node.module else [])])
             imports |= {base, *(f"{base}.{alias.name}" for alias in node.names)}
-    for node in tree.body:
-        if isinstance(node, ast.ClassDef):
-            fields = [item for item in node.body if isinstance(item, ast.AnnAssign) and hasattr(item.target, "id")]
-            defaults = {item.target.id: ast.unparse(item.value) if item.value else "none" for item in fields}
-            classes[node.name] = [ast.unparse(base) for base in node.bases], defaults
-        elif isinstance(node, ast.ImportFrom) and node.module and not node.level:
-            imported |= {alias.asname or alias.name: (node.module, alias.name) for alias in node.names}
-        elif isinstance(node, ast.Assign):
-            assigned |= {target.id: ast.unparse(value) for target, value in _pairs(node) if hasattr(target, "id")}
-    stored = (ast.Store, ast.Del)
-    bound = Counter(n.id for n in ast.walk(tree) if isinstance(n, ast.Name) and isinstance(n.ctx, stored))
     environment = _declared(tree, "ENVIRONMENT", list[str], '("A_VARIABLE",)') or []
     programs = _declared(tree, "PROGRAMS", dict[str, str], '{"CC": "cc"}') or {}
     for node in ast.walk(tree):
         _drop_docstring(node)
     digest = hashlib.sha256(ast.dump(tree).encode()).hexdigest()[:32]
-    once = {name: text for name, text in assigned.items() if bound[name] == 1}
-    return Source(digest, sorted(imports), environment, programs, classes, imported, once)
+    return Source(digest, sorted(imports), environment, programs)
 
 
 def _declared(tree: ast.Module, name: str, type_: Any, example: str) -> Any:
@@ -126,21 +101,6 @@ def _drop_docstring(node: ast.AST) -> None:
         values = [(item, getattr(item, "value", None) if isinstance(item, ast.Expr) else None) for item in node.body]
         texts = [item for item, value in values if isinstance(value, ast.Constant) and isinstance(value.value, str)]
         node.body = [item for item in node.body if item not in texts] or [ast.Pass()]
-
-
-def _pairs(node: ast.Assign) -> Iterator[tuple[ast.expr, ast.expr]]:
-    """Targets and values that a default may be followed to; A, B = x, y are two assignments."""
-    (target, *others), value = node.targets, node.value
-    both = isinstance(target, ast.Tuple) and isinstance(value, ast.Tuple) and len(target.elts) == len(value.elts)
-    pairs = zip(target.elts, value.elts) if both and not others else ((each, value) for each in node.targets)
-    for target, value in pairs:
-        made = isinstance(value, ast.Call) and not value.args and not value.keywords
-        if made or isinstance(value, ast.Constant | ast.Tuple | ast.UnaryOp | ast.Name):
-            yield target, value
-
-
-class Unknown(str):
-    """The text of a default that no syntax tree tells the value of: it equals no value that a parameter may have."""
 
 
 class Sources:
@@ -226,45 +186,6 @@ class Sources:
             self._read[file] = Source() if file.is_dir() else self.hashes.remembered("source", file, parse, Source)
         return self._read[file]
 
-    def stage_params(self, package: str, stage: str, pipeline_file: Path) -> dict[str, Any]:
-        """A stage's parameters and their defaults as YAML would have them (a struct is a table), read without importing it.
-
-        A default is `Unknown` where the source does not tell it for certain.
-        """
-        self._check_stage(package, stage, pipeline_file)
-        return self._fields(f"{package}.{stage}", "Params", 0)
-
-    def _fields(self, module: str, name: str, deep: int) -> dict[str, Any]:
-        """Fields of a class with their defaults, those of its bases first; nothing of a class outside the project."""
-        if deep > DEEPEST or not (file := self.find(module)):
-            return {}
-        source = self._source(module, file)
-        if name not in source.classes:
-            return self._fields(*source.imported[name], deep + 1) if name in source.imported else {}
-        bases, defaults = source.classes[name]
-        fields: dict[str, Any] = {}
-        for base in reversed(bases):  # the first of two bases decides
-            fields |= self._fields(module, base, deep + 1)
-        return fields | {field: self._value(text, module, deep) for field, text in defaults.items()}
-
-    def _value(self, text: str, module: str, deep: int) -> Any:
-        if deep > DEEPEST or not (file := self.find(module)):
-            return Unknown(text)
-        source, (of, _, attribute) = self._source(module, file), text.partition(".")
-        if text.endswith("()"):
-            return self._fields(module, text.removesuffix("()"), deep + 1) or Unknown(text)
-        if text in source.assigned:
-            return self._value(source.assigned[text], module, deep + 1)
-        if text in source.imported:
-            return self._value(*reversed(source.imported[text]), deep + 1)
-        if attribute and (of in source.assigned or of in source.imported):
-            struct = self._value(of, module, deep + 1)
-            return struct.get(attribute, Unknown(text)) if isinstance(struct, dict) else Unknown(text)
-        try:
-            return json.loads(json.dumps(ast.literal_eval(text)))  # a tuple is a list
-        except (ValueError, SyntaxError, TypeError):
-            return Unknown(text)
-
 
 def _module_in(folder: Path, name: str) -> Path | None:
     for file in (folder / name / "__init__.py", folder / f"{name}.py"):
@@ -279,40 +200,6 @@ def _data_files(folder: Path) -> Iterator[Path]:
             yield from () if (path / "__init__.py").exists() else _data_files(path)
         elif path.is_file() and path.suffix != ".py":
             yield path
-
-
-def other_than(defaults: dict[str, Any], values: dict[str, Any]) -> dict[str, Any]:
-    """The parameters that are not what they would be without being set; of a table those of its fields.
-
-    A whole number will do for any number, but 1 is not true, nor -0.0 0.0; what is unknown equals no value.
-
-    >>> other_than({"lobes": 72, "gain": 0.5, "limits": {"faces": 9}}, {"lobes": 72, "gain": 0.25, "limits": {"faces": 9}})
-    {'gain': 0.25}
-    >>> other_than({"lobes": 72, "gain": 1.0, "size": Unknown("3")}, {"lobes": 72.0, "gain": 1, "size": "3"})
-    {'lobes': 72.0, 'size': '3'}
-    """
-    others = {}
-    for name, value in values.items():
-        default = defaults.get(name, Unknown())
-        if isinstance(value, dict) and isinstance(default, dict):
-            inner = other_than(default, value)
-            others |= {name: inner} if inner else {}
-            continue
-        as_default = float(value) if type(default) is float and type(value) is int and abs(value) < 1 << 53 else value
-        if isinstance(default, Unknown) or json.dumps(as_default) != json.dumps(default):
-            others[name] = value
-    return others
-
-
-def recorded(default: Any) -> Any:
-    """A default as a key's record has it: what is unknown is told from a text that is known.
-
-    >>> recorded({"size": Unknown("3"), "name": "3"})
-    {'size': {'text': '3'}, 'name': '3'}
-    """
-    if isinstance(default, dict):
-        return {name: recorded(value) for name, value in default.items()}
-    return {"text": str(default)} if isinstance(default, Unknown) else default
 
 
 class Packages:

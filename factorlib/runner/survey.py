@@ -12,7 +12,7 @@ import msgspec
 
 from factorlib.errors import InputError, did_you_mean
 from factorlib.reading import check_plain, reading
-from factorlib.runner.closure import Packages, Sources, other_than, recorded
+from factorlib.runner.closure import Packages, Sources
 from factorlib.runner.filehash import FileHashes
 from factorlib.runner.home import Home, home_of
 from factorlib.runner.pipeline import (
@@ -158,20 +158,12 @@ def _records(
 ) -> dict[Step, Record]:
     sources, stages, file = Sources(project.source_roots, hashes), spec.pipeline.stages, project.pipeline_file
     wanted, records = spec.pipeline.needed(spec.targets), {}
-    of = {n: sources.stage_params(project.package, n, file) for n, s in stages.items() if s.params or n in wanted}
-    for name, defaults in of.items():  # names alone: values are checked where the stage is loaded
-        known = [*defaults, *stages[name].given]
-        for param in (param for param in stages[name].params if param not in known):
-            words, cure = f"the stage {name!r} has no parameter {param!r}", did_you_mean(param, known)
-            key = f"stages.{name}.params.{param}"
-            raise InputError(words, file=file, key=key, cure=cure if known else "leave it out")
     for name in wanted:
         stage, closure = stages[name], sources.closure(project.package, name, file)
         record = {"stage": name, "threads": stage.threads, "makes": stage.makes}
         record |= {"python": f"{sys.version_info[0]}.{sys.version_info[1]}"} | closure.record
         record |= {f"package:{package}": version for package, version in packages.versions(closure.external).items()}
-        record |= {f"param:{param}": value for param, value in other_than(of[name], stage.values).items()}
-        record |= {f"default:{param}": recorded(value) for param, value in of[name].items()}
+        record |= {f"param:{param}": value for param, value in stage.values.items()}
         for param, folder in stage.folders.items():
             for given in stage.given[param]:
                 record[f"given:{param}/{given}"] = _hash(folder / given, hashes, f"{name}.{param}")
