@@ -29,7 +29,14 @@ import msgspec
 from factorlib.errors import InputError, did_you_mean
 from factorlib.runner.filehash import FileHashes, left_over, read_cache, write_cache
 
-CODE = ("source:", "data:", "environment:", "program:")  # the fields of a record that a closure makes
+CODE = (
+    "source:",
+    "data:",
+    "environment:",
+    "program:",
+    "package:",
+    "python",
+)  # the fields of a record that a closure makes
 
 
 class Source(msgspec.Struct, frozen=True):
@@ -46,7 +53,7 @@ class Source(msgspec.Struct, frozen=True):
 class Closure(msgspec.Struct, frozen=True):
     """What a stage depends on besides its inputs.
 
-    record:   the part of a step's record that is its code (`source:`, `data:`), and what of the environment the code declares
+    record:   the part of a step's record that is its code, and what of the environment the code declares or imports
     external: top-level names of imports from outside the project
     files:    where what `record` names lies
     """
@@ -104,10 +111,10 @@ def _drop_docstring(node: ast.AST) -> None:
 
 
 class Sources:
-    """The modules below some root folders, read through a cache of file hashes."""
+    """The modules below some root folders, read through a cache of file hashes.  cache: of versions of packages"""
 
-    def __init__(self, roots: list[Path], hashes: FileHashes):
-        self.roots, self.hashes = list(dict.fromkeys(roots)), hashes
+    def __init__(self, roots: list[Path], hashes: FileHashes, cache: Path | None = None):
+        self.roots, self.hashes, self.packages = list(dict.fromkeys(roots)), hashes, Packages(cache)
         self._places: dict[str, Path | None] = {}
         self._read: dict[Path, Source] = {}  # each file is looked at once, however many stages import it
         self._beside: dict[Path, list[Path]] = {}  # data files by folder
@@ -154,7 +161,10 @@ class Sources:
                 if shutil.which(words[0]):  # without the folder it lies in
                     record[f"program:{name}"] = " ".join([Path(words[0]).name, *words[1:]])
         files = {f"source:{name}": places[name] for name in sources} | data
-        return Closure(record, sorted(external - sys.stdlib_module_names - {""}), files)
+        known = sorted(external - sys.stdlib_module_names - {""})
+        record |= {f"package:{package}": version for package, version in self.packages.versions(known).items()}
+        record |= {"python": f"{sys.version_info[0]}.{sys.version_info[1]}"}
+        return Closure(record, known, files)
 
     def find(self, name: str) -> Path | None:
         """The file of a module of the project; a folder without `__init__.py` stands for itself."""
@@ -205,7 +215,7 @@ def _data_files(folder: Path) -> Iterator[Path]:
 class Packages:
     """Versions of the installed packages that are imported, looked up once per state of site-packages."""
 
-    def __init__(self, cache: Path):
+    def __init__(self, cache: Path | None):
         folders = [path for path in sys.path if path.endswith("-packages") and os.path.isdir(path)]
         self.cache, self.state = cache, [[path, os.stat(path).st_mtime_ns] for path in folders]
         state, known = read_cache(cache, tuple[list, dict[str, dict[str, str]]]) or ([], {})
@@ -218,5 +228,6 @@ class Packages:
 
             of = packages_distributions()
             self.known |= {name: {each: version(each) for each in sorted(set(of.get(name, [])))} for name in missing}
-            write_cache(self.cache, (self.state, self.known))
+            if self.cache is not None:
+                write_cache(self.cache, (self.state, self.known))
         return {name: version for each in imports for name, version in self.known[each].items()}

@@ -9,13 +9,11 @@ from __future__ import annotations
 import contextlib
 import logging
 import os
-import sys
 import threading
 import time
 import uuid
 from collections.abc import Callable
 from concurrent.futures import Future
-from importlib.metadata import distributions
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
@@ -24,7 +22,6 @@ import msgspec
 
 from factorlib.errors import InputError
 from factorlib.runner.child import Child, Pools, taken
-from factorlib.runner.plan import Record
 from factorlib.runner.project import LIBRARY
 from factorlib.runner.stop import whole
 from factorlib.runner.worker import Outcome, Task, run_step
@@ -33,34 +30,23 @@ FRESH = 1.0  # seconds for which the scheduler is not asked again who its worker
 PATIENCE = 10  # seconds to reach a scheduler, for steps to end that are cancelled, and until the last worker is missed
 AHEAD = 2  # steps are handed out for so many times the cores, so that no worker waits for its next one
 TRIES = 3  # of a task whose process dies
-PYTHON = f"{sys.version_info[0]}.{sys.version_info[1]}"
 
 
 class Site(msgspec.Struct, frozen=True):
-    """What a worker must share with a run: its folder in the store, the files of the library, the version of Python."""
+    """What a worker must share with a run: its folder in the store, and the files of the library."""
 
     run: Path
     library: Path = LIBRARY
-    python: str = PYTHON
 
-    def fault(self, record: Record | None = None) -> InputError | None:
-        """What hinders this process from working for the run; a step's record asks for the versions that it names, too."""
+    def fault(self) -> InputError | None:
+        """What hinders this process from working for the run."""
         here = f"the worker on {os.uname().nodename}"
         if not self.run.is_dir():
             cure = "keep build/ and the data on a file system that all machines mount at the same path"
             return InputError(f"{here} does not see the run's folder", file=self.run, cure=cure)
-        start = started_by("<scheduler>", self.library)
         if self.library != LIBRARY:
+            start = started_by("<scheduler>", self.library)
             return InputError(f"{here} runs the code in {LIBRARY}", file=self.library, cure=start)
-        if self.python != PYTHON:
-            return InputError(f"{here} has Python {PYTHON}, the run has {self.python}", cure=start)
-        for package, wanted in (record or {}).items():
-            if package.startswith("package:"):
-                package = package.removeprefix("package:")
-                installed = next((each.version for each in distributions(name=package)), "none")
-                if installed != wanted:
-                    words = f"{here} has {package} {installed}, the run has {wanted}"
-                    return InputError(words, cure="make setup, in the same checkout")
         return None
 
 
@@ -184,7 +170,7 @@ def at_work(run: Path) -> bool:
 
 def outcome_at(site: Site, task: Task) -> Outcome:
     """Run a step here.  Each try of a step has a temporary folder of its own: another may still be ending elsewhere."""
-    if fault := site.fault(task.record):
+    if fault := site.fault():
         return Outcome(error=str(fault))
     temporary = task.temporary.with_name(f"{task.temporary.name}.{uuid.uuid4().hex[:8]}")
     return run_step(msgspec.structs.replace(task, temporary=temporary))

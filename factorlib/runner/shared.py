@@ -23,7 +23,7 @@ import msgspec
 
 from factorlib.errors import InputError
 from factorlib.jsonfile import json_text
-from factorlib.runner.filehash import hash_of_file, is_file_of
+from factorlib.runner.filehash import hash_of_file
 from factorlib.runner.home import sound_lines
 from factorlib.runner.pipeline import Shipping
 from factorlib.runner.plan import Record, key_of
@@ -146,8 +146,9 @@ def copy_shipped(folder: Path, out: Path) -> None:
     """The files of a shipped result, as the step's own.  Raises InputError where they are not those that were shipped."""
     files = _shipped(folder).files
     if not copied(folder, out, files):
-        wrong = next((name for name in files if not is_file_of(files[name], folder / name)), MADE_FROM)
-        raise InputError("is not the file that was shipped with the source", file=folder / wrong, cure=CURE)
+        raise InputError(
+            "beside it are not the files that were shipped with the source", file=folder / MADE_FROM, cure=CURE
+        )
 
 
 def ship(result: Path, record: Record, root: Path, shipping: Shipping) -> Path:

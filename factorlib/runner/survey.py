@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import sys
 from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
@@ -12,7 +11,7 @@ import msgspec
 
 from factorlib.errors import InputError, did_you_mean
 from factorlib.reading import check_plain, reading
-from factorlib.runner.closure import Packages, Sources
+from factorlib.runner.closure import Sources
 from factorlib.runner.filehash import FileHashes
 from factorlib.runner.home import Home, home_of
 from factorlib.runner.pipeline import (
@@ -143,7 +142,7 @@ def survey(
             forced = frozenset(step for name in targets or pipeline.stages for step in spec.steps_of(name))
             spec = msgspec.structs.replace(spec, forced=forced)
         hashes = FileHashes(store.cache / "files.json")
-        records = _records(project, spec, data, hashes, Packages(store.cache / "packages.json"), asked)
+        records = _records(project, spec, data, hashes, store.cache / "packages.json", asked)
     except InputError as error:
         raise said_of_settings(error, settings) from None
     with contextlib.suppress(OSError):  # of a build/ that is read-only: the next command reads more, that is all
@@ -154,16 +153,14 @@ def survey(
 
 
 def _records(
-    project: Project, spec: Spec, data: Data, hashes: FileHashes, packages: Packages, recipes: dict[str, Recipe]
+    project: Project, spec: Spec, data: Data, hashes: FileHashes, cache: Path, recipes: dict[str, Recipe]
 ) -> dict[Step, Record]:
-    sources, stages, file = Sources(project.source_roots, hashes), spec.pipeline.stages, project.pipeline_file
+    sources, stages, file = Sources(project.source_roots, hashes, cache), spec.pipeline.stages, project.pipeline_file
     wanted, records = spec.pipeline.needed(spec.targets), {}
     for name in wanted:
         stage, closure = stages[name], sources.closure(project.package, name, file)
         record = {"stage": name, "threads": stage.threads, "makes": stage.makes}
-        record |= {"python": f"{sys.version_info[0]}.{sys.version_info[1]}"} | closure.record
-        record |= {f"package:{package}": version for package, version in packages.versions(closure.external).items()}
-        record |= {f"param:{param}": value for param, value in stage.values.items()}
+        record |= closure.record | {f"param:{param}": value for param, value in stage.values.items()}
         for param, folder in stage.folders.items():
             for given in stage.given[param]:
                 record[f"given:{param}/{given}"] = _hash(folder / given, hashes, f"{name}.{param}")

@@ -220,13 +220,15 @@ def _check_inputs(task: Task, results: dict[Path, dict[str, Stamp]]) -> None:
 def _check_code(task: Task, hashes: FileHashes) -> None:
     """The code that the key was made from is the code there is: the source of every module, and the package data."""
     code = task.code
-    closure = Sources([code.root, LIBRARY], hashes).closure(code.package, code.stage, code.settings)
+    sources = Sources([code.root, LIBRARY], hashes, task.store / "cache" / "packages.json")
+    closure = sources.closure(code.package, code.stage, code.settings)
     now, before = closure.record, {n: value for n, value in task.record.items() if n.startswith(CODE)}
     if now != before:
         changed = [name for name in sorted(before.keys() | now.keys()) if before.get(name) != now.get(name)]
         files = [str(closure.files[name]) for name in changed if name in closure.files]
         words = f"the code changed while the run went on ({'; '.join(difference(before, now))})"
-        raise CodeChanged(words, file=", ".join(files) or None, cure="run again")
+        cure = "run again; a worker of a cluster needs the same checkout and the same packages"
+        raise CodeChanged(words, file=", ".join(files) or None, cure=cure)
 
 
 class Meter:

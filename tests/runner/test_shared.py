@@ -172,6 +172,6 @@ def test_a_shipped_result_is_taken_where_sources_and_parameters_are_its_own(ship
 def test_a_shipped_file_that_was_changed_is_an_error_and_what_does_not_ship_is_not_shipped(shipping, capsys):
     (shipping.root / "stages" / "tables" / "table.json").write_text("8")
     assert make(shipping, targets=["table"]) == 1
-    assert "is not the file that was shipped" in capsys.readouterr().err
+    assert "are not the files that were shipped" in capsys.readouterr().err
     with pytest.raises(InputError, match="no result of 'total' ships"):
         verbs.ship(shipping, "total", "set")
