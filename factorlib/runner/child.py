@@ -31,7 +31,6 @@ from typing import Any
 from factorlib import arithmetic
 from factorlib.errors import InputError
 from factorlib.runner.project import LIBRARY
-from factorlib.runner.stop import whole
 from factorlib.runner.worker import THREAD_VARIABLES, limit_threads
 
 TRIM = "MALLOC_TRIM_THRESHOLD_"  # Dask's nanny sets it; sums of 700 × 700 numbers then take three times as long
@@ -49,7 +48,9 @@ class Child:
         command = [sys.executable, "-P", "-c", MAIN, str(theirs.fileno()), str(threads), str(os.getpid()), str(run)]
         fixed = {"PYTHONHASHSEED": "0", **arithmetic.VARIABLES, **dict.fromkeys(THREAD_VARIABLES, str(threads))}
         environment = {name: value for name, value in os.environ.items() if name != TRIM} | fixed
+        before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})  # the child inherits that: it never sees one
         self.process = subprocess.Popen(command, env=environment, stdin=subprocess.DEVNULL, pass_fds=[theirs.fileno()])
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)
         theirs.close()
 
     def call(self, function: Callable, *arguments: Any, wanted: Callable[[], bool] = lambda: True) -> Any:
@@ -119,10 +120,9 @@ class Pools:
 
     def submit(self, cores: int, threads: int, function: Callable, argument: Any) -> Future:
         """Start `function(argument)` in a process of `threads` threads, which takes `cores` cores; its future."""
-        with whole():
-            future = self._threads.submit(taken(self.children, threads, Path("/")).call, function, argument)
-            self._busy[future] = cores
-            return future
+        future = self._threads.submit(taken(self.children, threads, Path("/")).call, function, argument)
+        self._busy[future] = cores
+        return future
 
     def close(self, kill: bool = False) -> None:
         """End all processes; `kill`: at once, whatever they do."""

@@ -23,7 +23,6 @@ import msgspec
 from factorlib.errors import InputError
 from factorlib.runner.child import Child, Pools, taken
 from factorlib.runner.project import LIBRARY
-from factorlib.runner.stop import whole
 from factorlib.runner.worker import Outcome, Task, run_step
 
 FRESH = 1.0  # seconds for which the scheduler is not asked again who its workers are
@@ -76,8 +75,7 @@ class Cluster(Pools):
             logging.getLogger(name).setLevel(logging.CRITICAL)  # what they say of a lost connection is in the outcome
         say(f"connecting to {scheduler}")
         try:
-            with whole():
-                self.client = Client(scheduler, timeout=PATIENCE, set_as_default=False)
+            self.client = Client(scheduler, timeout=PATIENCE, set_as_default=False)
         except Exception as error:  # what answers there may be anything: an HTTP server, garbage
             cure = "start one: dask scheduler --port 8786; or leave the executor out, for processes of this machine"
             words = f"no Dask scheduler answers at {scheduler} ({str(error) or f'nothing in {PATIENCE} s'})"
@@ -112,10 +110,9 @@ class Cluster(Pools):
 
     def submit(self, cores: int, threads: int, function: Callable, argument: Any) -> Future:
         """Hand out a step, by its task; its future."""
-        with whole():
-            future = self._executor.submit(hosted, self.site, threads, argument)
-            self._busy[future] = cores
-            return future
+        future = self._executor.submit(hosted, self.site, threads, argument)
+        self._busy[future] = cores
+        return future
 
     def close(self, kill: bool = False) -> None:
         """Leave the cluster; `kill`: tasks that are not finished are cancelled, and their processes killed."""
