@@ -17,7 +17,6 @@ from __future__ import annotations
 import ast
 import hashlib
 import os
-import shlex
 import shutil
 import sys
 from collections.abc import Iterator
@@ -53,19 +52,12 @@ class Source(msgspec.Struct, frozen=True):
 class Closure(msgspec.Struct, frozen=True):
     """What a stage depends on besides its inputs.
 
-    record:   the part of a step's record that is its code, and what of the environment the code declares or imports
-    external: top-level names of imports from outside the project
-    files:    where what `record` names lies
+    record: the part of a step's record that is its code, and what of the environment the code declares or imports
+    files:  where what `record` names lies
     """
 
     record: dict[str, str]
-    external: list[str]
     files: dict[str, Path]
-
-    @property
-    def modules(self) -> set[str]:
-        """Dotted names of the project's modules."""
-        return {name.removeprefix("source:") for name in self.files if name.startswith("source:")}
 
 
 def source_of(text: str, module: str, is_package: bool) -> Source:
@@ -124,7 +116,10 @@ class Sources:
 
         Raises InputError where the stage has no module, or a module of the project cannot be parsed.
         """
-        self._check_stage(package, stage, pipeline_file)
+        if self.find(f"{package}.{stage}") is None:
+            known = [p.stem for p in (self.roots[0] / package).glob("*.py") if p.stem != "__init__"]
+            words, cure = f"the stage {stage!r} has no module {package}/{stage}.py", did_you_mean(stage, known)
+            raise InputError(words, file=pipeline_file, key=f"stages.{stage}", cure=cure)
         places: dict[str, Path] = {}
         external: set[str] = set()
         stack = [f"{package}.{stage}"]
@@ -152,19 +147,13 @@ class Sources:
         for source in sources.values():
             record |= {f"environment:{name}": os.environ[name] for name in source.environment if name in os.environ}
             for name, default in source.programs.items():
-                command = os.environ.get(name, default)
-                try:
-                    words = shlex.split(command) or [""]
-                except ValueError as error:
-                    cure = f"name a program, as in {name}={default}"
-                    raise InputError(f"{command!r} is no command ({error})", key=name, cure=cure) from None
+                words = os.environ.get(name, default).split() or [""]
                 if shutil.which(words[0]):  # without the folder it lies in
                     record[f"program:{name}"] = " ".join([Path(words[0]).name, *words[1:]])
         files = {f"source:{name}": places[name] for name in sources} | data
-        known = sorted(external - sys.stdlib_module_names - {""})
-        record |= {f"package:{package}": version for package, version in self.packages.versions(known).items()}
-        record |= {"python": f"{sys.version_info[0]}.{sys.version_info[1]}"}
-        return Closure(record, known, files)
+        versions = self.packages.versions(sorted(external - sys.stdlib_module_names - {""}))
+        record |= {f"package:{package}": version for package, version in versions.items()}
+        return Closure(record | {"python": f"{sys.version_info[0]}.{sys.version_info[1]}"}, files)
 
     def find(self, name: str) -> Path | None:
         """The file of a module of the project; a folder without `__init__.py` stands for itself."""
@@ -175,12 +164,6 @@ class Sources:
             bases = [above.parent if of_package else above] if above else [] if parent else self.roots
             self._places[name] = next((file for base in bases if (file := _module_in(base, last))), None)
         return self._places[name]
-
-    def _check_stage(self, package: str, stage: str, pipeline_file: Path) -> None:
-        if self.find(f"{package}.{stage}") is None:
-            known = [p.stem for p in (self.roots[0] / package).glob("*.py") if p.stem != "__init__"]
-            words, cure = f"the stage {stage!r} has no module {package}/{stage}.py", did_you_mean(stage, known)
-            raise InputError(words, file=pipeline_file, key=f"stages.{stage}", cure=cure)
 
     def _source(self, name: str, file: Path) -> Source:
         def parse() -> Source:

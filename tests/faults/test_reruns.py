@@ -270,7 +270,7 @@ def packages():
 
 @pytest.mark.parametrize("share", [6, pytest.param(1, marks=LONG)])
 def test_another_version_of_a_package_reruns_who_imports_it(real, monkeypatch, share):
-    usual(real)
+    usual(real, "synthetic")
     version, by, known = importlib.metadata.version, packages_distributions(), real.build / "store/cache/packages.json"
     monkeypatch.setattr(importlib.metadata, "packages_distributions", lambda: by)
     for distribution in sorted(packages())[::share]:
@@ -372,10 +372,6 @@ def test_an_environment_variable_and_a_program_that_a_module_declares_are_in_the
     assert 'program TOY_CC: "sh" -> none' in reasons(fresh, "count/a")
     monkeypatch.setenv("TOY_CC", "/bin/sh")
     assert set(state(fresh).values()) == {"current"}, "where it lies is no matter"
-    monkeypatch.setenv("TOY_CC", "sh 'open")
-    with pytest.raises(InputError, match="is no command") as caught:
-        state(fresh)
-    assert caught.value.key == "TOY_CC"
     write(letters, SPEAKING.replace('("TOY_FORM",)', 'tuple(["TOY_FORM"])'))
     with pytest.raises(InputError, match=r"(?s)letters\.py.*ENVIRONMENT"):
         state(fresh)

@@ -43,13 +43,14 @@ def test_every_form_of_import_is_followed(tmp_path):
     for name, text in files.items():
         toy.write(tmp_path / name, text)
     closure = Sources([tmp_path], FileHashes(None)).closure("stages", "s", Path("pipeline.yaml"))
-    assert set(closure.modules) == {"p", "p.a", "p.b", "p.sub", "p.sub.c", "p.sub.e", "stages.s"}
+    modules = {name.removeprefix("source:") for name in closure.record if name.startswith("source:")}
+    assert modules == {"p", "p.a", "p.b", "p.sub", "p.sub.c", "p.sub.e", "stages.s"}
     assert {n for n in closure.record if n.startswith("data:")} == {
         "data:p:kernel.c",
         "data:p:w.safetensors",
         "data:p.sub:templates/page.html",
     }
-    assert closure.external == ["numpy"]
+    assert [name for name in closure.record if name.startswith("package:")] == ["package:numpy"]
 
 
 def test_defaults_are_followed_to_bases_constants_and_instances(tmp_path):
