@@ -220,7 +220,7 @@ def view_of(store: Store, stage: str, keys: dict[str, str], gather: str | None) 
             write_text(draft / gather, json_text(table))
             (draft / gather).chmod(0o444)
             files[gather] = hash_of_file(draft / gather)
-        view, _ = store.take_in(record, draft, files)
+        view = store.take_in(record, draft, log.warning, files)
         store.keep(key, view)
     finally:
         shutil.rmtree(draft, ignore_errors=True)

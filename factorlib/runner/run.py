@@ -226,9 +226,6 @@ class Run:
         if self.store.get(key) not in (None, outcome.output):
             self.display.warn(step, "made again from the same inputs, it came out different")
         self.store.forget(key)
-        if outcome.damaged:
-            where = self.survey.project.shown(outcome.damaged)
-            self.display.warn(step, f"its kept result was damaged and is replaced; what was there: {where}")
         self.survey.previous[str(step)] = work.task.record
         self.ran.append(step)
         self.made.add(key)

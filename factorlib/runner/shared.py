@@ -16,7 +16,6 @@ import errno
 import os
 import shutil
 import uuid
-from collections.abc import Callable
 from pathlib import Path, PurePosixPath
 
 import msgspec
@@ -27,15 +26,13 @@ from factorlib.runner.filehash import hash_of_file
 from factorlib.runner.home import sound_lines
 from factorlib.runner.pipeline import Shipping
 from factorlib.runner.plan import Record, key_of
-from factorlib.runner.store import Entry, Store, damage_of, is_abandoned, sweep
+from factorlib.runner.store import Entry, Say, Store, damage_of, is_abandoned, sweep
 from factorlib.wholefile import replace_file
 
 VARIABLE = "FACTORLIB_STORE"
 NOT_OURS = (errno.EACCES, errno.EPERM, errno.EROFS)  # to read is enough
 MADE_FROM = "made_from.json"
 CURE = "restore it from the repository, or make the result anew with FORCE=1"
-
-Say = Callable[[str], None]
 
 
 def shared_store(own: Path) -> Path | None:
@@ -49,16 +46,16 @@ def shared_store(own: Path) -> Path | None:
     return None if own.is_dir() and folder.samefile(own) else folder.resolve()
 
 
-def fetch(shared: Store, own: Store, key: str, draft: Path, say: Say) -> tuple[Entry, Path | None] | None:
+def fetch(shared: Store, own: Store, key: str, draft: Path, say: Say) -> Entry | None:
     """Copy the result of `key`, with its log, into the own store; None where the shared one has it not, or not as it was kept.
 
-    draft: a folder of the own store that is not there yet;  second comes what `Store.take_in` gives
+    draft: a folder of the own store that is not there yet
     """
     try:
         if shared.entry(key) is None:
             return None
-        if taken := _copied_result(shared, own, key, draft):
-            return taken
+        if entry := _copied_result(shared, own, key, draft, say):
+            return entry
         say("the shared store's result is not as it was kept: the step is run")
     except OSError as error:
         say(f"the shared store cannot be read ({error.strerror}): the step is run")
@@ -76,8 +73,8 @@ def offer(own: Store, shared: Store, key: str, say: Say) -> None:
             return
         shared.tmp.mkdir(parents=True, exist_ok=True)
         sweep(shared.tmp, is_abandoned)
-        if taken := _copied_result(own, shared, key, draft):
-            shared.keep(key, taken[0])
+        if entry := _copied_result(own, shared, key, draft, lambda _: None):
+            shared.keep(key, entry)
     except OSError as error:
         if error.errno not in NOT_OURS:
             say(f"the shared store took nothing ({error.strerror}); the result is kept in build/store")
@@ -85,15 +82,15 @@ def offer(own: Store, shared: Store, key: str, say: Say) -> None:
         shutil.rmtree(draft, ignore_errors=True)
 
 
-def _copied_result(source: Store, target: Store, key: str, draft: Path) -> tuple[Entry, Path | None] | None:
+def _copied_result(source: Store, target: Store, key: str, draft: Path, say: Say) -> Entry | None:
     """Copy tree and log of a key that is in `source`; None where any of it is not as it was kept."""
     entry, log = source.entry(key), sound_lines(source.log(key))
     if key_of(entry.record) != key or not log or not copied(source.tree(entry.output), draft, entry.files):
         return None
-    taken = target.take_in(entry.record, draft)
+    entry = target.take_in(entry.record, draft, say)
     target.logs.mkdir(parents=True, exist_ok=True)
     replace_file(target.log(key), b"".join(line + b"\n" for line in log))
-    return taken
+    return entry
 
 
 def copied(tree: Path, draft: Path, files: dict[str, str]) -> bool:

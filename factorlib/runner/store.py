@@ -36,6 +36,7 @@ from factorlib.jsonfile import json_text
 from factorlib.runner.filehash import hash_of_file, left_over, read_cache, write_cache
 from factorlib.wholefile import replace_file, sync, sync_tree
 
+Say = Callable[[str], None]
 Stamp = tuple[int, int]  # size in bytes, time of the content in ns
 ABANDONED = (
     86400.0  # seconds after which what was being written outside a run is taken to be of a process that was killed
@@ -131,36 +132,36 @@ class Store:
             write_cache(self.cache / "trees.json", there)
             self.changed = False
 
-    def take_in(self, record: dict, folder: Path, files: dict[str, str] | None = None) -> tuple[Entry, Path | None]:
+    def take_in(self, record: dict, folder: Path, say: Say, files: dict[str, str] | None = None) -> Entry:
         """Take the files of `folder` in, as what `record` gave; the folder is gone afterwards.
 
         files: their hashes, where these are known and the files are read-only and on disk
-        Where the same tree stands already it stays if it is right, every content read; else it is set aside, and second
-        comes where it is now.
+        Where the same tree stands already it stays if it is right, every content read; else it is set aside, which is said.
         """
         if files is None:
             files = hashes_of_tree(folder)
             for name in files:
                 (folder / name).chmod(0o444)
             sync_tree(folder)
-        entry, aside = Entry(output_of(files), record, files), None
+        entry = Entry(output_of(files), record, files)
         target = self.tree(entry.output)
         target.parent.mkdir(parents=True, exist_ok=True)
         while True:
             try:
                 os.rename(folder, target)
                 sync(target.parent)
-                return entry, aside
+                return entry
             except OSError:
                 if not os.path.lexists(target):
                     raise
             if not damage_of(target, files):
                 shutil.rmtree(folder)
-                return entry, aside
+                return entry
             self.damaged_trees.mkdir(parents=True, exist_ok=True)
             aside = self.damaged_trees / f"{target.name}-{uuid.uuid4().hex[:8]}"
             with contextlib.suppress(FileNotFoundError):  # another run was quicker
                 os.rename(target, aside)
+                say(f"its kept result was damaged and is replaced; what was there: {aside}")
 
     def keep(self, key: str, entry: Entry) -> None:
         """From now on `key` has that result."""

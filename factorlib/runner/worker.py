@@ -90,12 +90,10 @@ class Outcome(msgspec.Struct, frozen=True):
     """How a step ended.
 
     output: hash of what was made;  error: what went wrong;  traceback: of a defect, None where a user can mend it
-    damaged: where a result lies now that stood in the place of this one, and was not as it had been kept
     code_changed: whether the stage's code is another than that of the key, so that further steps of it would fail alike
     """
 
     output: str | None = None
-    damaged: Path | None = None
     error: str | None = None
     traceback: str | None = None
     code_changed: bool = False
@@ -113,13 +111,12 @@ def run_step(task: Task) -> Outcome:
     with Events(task.events) as events:
         try:
             fetched = shared and not task.forced and fetch(shared, store, task.key, task.temporary, events.say)
+            entry = fetched or _made(task, store, events)
             if fetched:
-                entry, damaged = fetched
                 for event in map(json.loads, sound_lines(store.log(task.key))):
                     if event["event"] == "warning":
                         events.say(str(event.get("text", "")))
             else:
-                entry, damaged = _made(task, store, events)
                 where = {name: task.record[name] for name in ("photo", "recipe") if name in task.record}
                 where |= {"stage": code.stage, "key": task.key}
                 lines = [where | {"event": "warning", "text": text} for text in events.warnings]
@@ -131,7 +128,7 @@ def run_step(task: Task) -> Outcome:
             shutil.rmtree(store.unfinished / task.key, ignore_errors=True)
             if shared and not fetched:
                 offer(store, shared, task.key, events.say)
-            return Outcome(output=entry.output, damaged=damaged, seconds=meter.read()["seconds"])
+            return Outcome(output=entry.output, seconds=meter.read()["seconds"])
         except BaseException as error:  # whatever it is, the parent reports it
             shutil.rmtree(task.temporary, ignore_errors=True)  # on a full disk there is room for a log then
             return _failed(error, task.temporary.parent, meter.read()["seconds"])
@@ -176,11 +173,11 @@ def limit_threads(threads: int) -> None:
         sys.modules["OpenImageIO"].attribute("threads", threads)
 
 
-def _made(task: Task, store: Store, events: Events) -> tuple[Entry, Path | None]:
+def _made(task: Task, store: Store, events: Events) -> Entry:
     """Run the step, or copy its shipped result; its tree is in the store afterwards, its key is not."""
     if not task.forced and (folder := shipped_folder([task.code.root, LIBRARY], task.stage.shipped, task.record)):
         copy_shipped(folder, task.temporary)
-        return store.take_in(task.record, task.temporary)
+        return store.take_in(task.record, task.temporary, events.say)
     module, params = load_stage(task.code), params_of(task.code)  # which takes seconds
     photo, out = task.record["photo"], task.temporary
     out.mkdir(parents=True)
@@ -203,7 +200,7 @@ def _made(task: Task, store: Store, events: Events) -> tuple[Entry, Path | None]
             raise FileNotFoundError(f"the stage {task.code.stage!r} made no {pattern}")
     if not any(path.is_file() for path in out.rglob("*")):
         raise FileNotFoundError(f"the stage {task.code.stage!r} made nothing")
-    return store.take_in(task.record, out)
+    return store.take_in(task.record, out, events.say)
 
 
 def _check_inputs(task: Task, results: dict[Path, dict[str, Stamp]]) -> None:
