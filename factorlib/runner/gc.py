@@ -1,7 +1,7 @@
 """Looking after a store: what killed runs left, what is damaged, what no dataset needs, and forgetting a dataset's results.
 
-Each run has a folder in store/tmp and holds a lock on it while it lives; the operating system frees the lock of a run
-that was killed, so a folder whose lock can be taken is rubbish, and no command is needed to unlock anything.
+Each run has a folder in store/tmp and holds a lock in it while it lives; the operating system frees the lock of a run
+that was killed, so a folder whose lock nobody holds is rubbish, and no command is needed to unlock anything.
 """
 
 from __future__ import annotations
@@ -18,8 +18,9 @@ from factorlib.errors import InputError
 from factorlib.runner.home import Home, made_home, made_homes
 from factorlib.runner.plan import Step, key_of
 from factorlib.runner.project import Project
-from factorlib.runner.store import Entry, Store, is_abandoned, lock, sweep
+from factorlib.runner.store import Entry, Store, is_abandoned, is_locked, lock, sweep
 
+LOCK = "lock"  # in the folder of a run
 LEFT_OVER = "left over"  # what was damaged, and files without a key
 
 
@@ -29,13 +30,11 @@ def tenant(store: Store, say: Callable[[str], None]) -> Iterator[Path]:
     folder = store.tmp / f"run-{os.getpid()}-{uuid.uuid4().hex[:8]}"
     store.locks.mkdir(parents=True, exist_ok=True)
     with _door(store, say):
-        held = lock(folder.with_suffix(".lock"))
-        folder.mkdir(parents=True)
+        held = lock(folder / LOCK)
     try:
         yield folder
     finally:
         shutil.rmtree(folder, ignore_errors=True)
-        folder.with_suffix(".lock").unlink(missing_ok=True)
         os.close(held)
 
 
@@ -43,7 +42,7 @@ def tenant(store: Store, say: Callable[[str], None]) -> Iterator[Path]:
 def alone(store: Store) -> Iterator[None]:
     """For what deletes results: no run goes on, and none starts meanwhile."""
     with _door(store, lambda _: None):
-        if any(store.tmp.glob("run-*.lock")):
+        if any(is_locked(folder / LOCK) for folder in store.tmp.iterdir()):
             raise InputError("a run is going on", file=store.root, cure="wait until it has ended")
         yield
 
@@ -56,12 +55,7 @@ def _door(store: Store, say: Callable[[str], None]) -> Iterator[None]:
         say("waiting: another command begins a run or cleans the store")
         door = lock(store.root / "door.lock", wait=True)
     try:
-        for lock_file in store.tmp.glob("run-*.lock"):
-            if (held := lock(lock_file)) is not None:
-                lock_file.unlink()
-                os.close(held)
-        alive = {path.stem for path in store.tmp.glob("run-*.lock")}
-        sweep(store.tmp, lambda path: path.stem not in alive if path.name.startswith("run-") else is_abandoned(path))
+        sweep(store.tmp, lambda of: (of.name.startswith("run-") or is_abandoned(of)) and not is_locked(of / LOCK))
         yield
     finally:
         os.close(door)
