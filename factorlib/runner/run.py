@@ -50,6 +50,9 @@ def run(survey: Survey, display: Display) -> Run:
     claim(survey.project, survey.home, survey.data.folder)
     with tenant(survey.store, display.say) as folder:
         work = Run(survey, display, folder)
+        work.refused = survey.wrong_values(survey.planned())
+        if work.refused:
+            return work
         if survey.spec.pipeline.executor != "processes":
             from factorlib.runner.cluster import Cluster  # which is loaded only then
 
@@ -68,11 +71,15 @@ def run(survey: Survey, display: Display) -> Run:
 
 
 class Run:
-    """The state of one run.  ran, failed, held_up: the steps that it came to"""
+    """The state of one run.
+
+    refused: faults of parameters, for which nothing runs;  ran, failed, held_up: the steps that it came to
+    """
 
     def __init__(self, survey: Survey, display: Display, folder: Path):
         self.survey, self.display, self.folder, self.pools = survey, display, folder, Pools()
         self.store, self.shared = survey.store, shared_store(survey.store.root)
+        self.refused: list[str] = []
         self.running: dict[Step, Running] = {}
         self.waiting: set[Step] = set()  # for another run, or for what is damaged to be made again
         self.ran: list[Step] = []

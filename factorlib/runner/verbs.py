@@ -102,14 +102,14 @@ def _run(seen: Survey, started: float) -> int:
 
     display = display_for()
     try:
-        if faults := seen.wrong_values(seen.planned()):
-            return _refused(seen, faults, "parameters")
         ran = run(seen, display)
     except (KeyboardInterrupt, Stopped) as stop:
         display.say("stopped; what was finished is kept, the next run goes on from there")
         return TERMINATED if isinstance(stop, Stopped) else INTERRUPTED
     finally:
         display.close()
+    if ran.refused:
+        return _refused(seen, ran.refused, "parameters")
     if failed := list(ran.failed):
         _say(seen, f"{words.count(failed)} failed: {in_short(failed, words.NAMED, ', ')}")
         if ran.held_up:
