@@ -43,8 +43,9 @@ from factorlib.stage import Inputs
 from factorlib.wholefile import append_text, replace_file
 from factorlib.yamlfile import convert
 
-LIBRARIES = ("OMP", "MKL", "OPENBLAS", "NUMEXPR")
-THREAD_VARIABLES = (*(f"{name}_NUM_THREADS" for name in LIBRARIES), "VECLIB_MAXIMUM_THREADS")
+THREAD_VARIABLES = tuple(f"{of}_NUM_THREADS" for of in ("OMP", "MKL", "OPENBLAS", "NUMEXPR")) + (
+    "VECLIB_MAXIMUM_THREADS",
+)
 EVERY = 0.2  # seconds between two words of progress
 
 
