@@ -28,14 +28,8 @@ import msgspec
 from factorlib.errors import InputError, did_you_mean
 from factorlib.runner.filehash import FileHashes, left_over, read_cache, write_cache
 
-CODE = (
-    "source:",
-    "data:",
-    "environment:",
-    "program:",
-    "package:",
-    "python",
-)  # the fields of a record that a closure makes
+# the fields of a record that a closure makes
+CODE = ("source:", "data:", "environment:", "program:", "package:", "python")
 
 
 class Source(msgspec.Struct, frozen=True):

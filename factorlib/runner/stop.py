@@ -21,9 +21,7 @@ class Stopped(SystemExit):
 @contextlib.contextmanager
 def heed_stops() -> Iterator[None]:
     """Within, SIGTERM raises `Stopped` and SIGINT KeyboardInterrupt, once: those that follow disturb no cleaning up."""
-    in_main_thread = (
-        threading.current_thread() is threading.main_thread()
-    )  # elsewhere Python may not say what a signal does
+    in_main_thread = threading.current_thread() is threading.main_thread()  # where alone Python may say what signals do
     numbers = [n for n in (signal.SIGINT, signal.SIGTERM) if in_main_thread and signal.getsignal(n) != signal.SIG_IGN]
     before = {number: signal.signal(number, _stop) for number in numbers}
     try:
