@@ -21,8 +21,7 @@ from pathlib import Path
 
 import pytest
 
-from factorlib.runner import verbs
-from factorlib.runner.gc import collect
+from factorlib.runner.gc import collect, verify
 from factorlib.runner.project import LIBRARY
 from tests.faults.battered import make
 from tests.runner import toy

@@ -338,17 +338,6 @@ def test_each_parameter_reruns_its_stage_and_what_is_below(real, stage):
     unnamed = [name for name in values if f"parameter {name}: " not in lines]  # the others each stand in the key
     for some in (others, *({name: others[name]} for name in unnamed)):
         assert other_keys(real, words_of(stage, some)) == below(real, steps_of(real, {stage})), some
-    classes = {}  # in which fields of the parameters are written
-    for field in {name.partition(".")[0] for name in values}:
-        owner = next(c for c in params_of(stage).__mro__ if field in getattr(c, "__annotations__", {}))
-        classes.setdefault((owner.__module__, owner.__name__), []).append(field)
-    for (module, class_), fields in classes.items():
-        with edited(real, {modules()[module]: without_fields(text_of(module), class_, fields)}):
-            assert other_keys(real) == users(real, module)
-            lines = difference(before, record_of(real, stage))
-            assert all(any(line.startswith(f"default of parameter {field}:") for line in lines) for field in fields)
-            with pytest.raises(InputError, match=f"has no parameter '{fields[0]}'"):
-                keys(real, [f"{stage}.{fields[0]}=1"])
 
 
 # ── what else counts ─────────────────────────────────────────────────────────────────────────────────────────────────

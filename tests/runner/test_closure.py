@@ -53,27 +53,6 @@ def test_every_form_of_import_is_followed(tmp_path):
     assert [name for name in closure.record if name.startswith("package:")] == ["package:numpy"]
 
 
-def test_defaults_are_followed_to_bases_constants_and_instances(tmp_path):
-    files = {
-        "stages/s.py": "from p.a import NOISE, Base\nLOW, HIGH = 1, (2, 3)\nclass Params(Base):\n    low: int = LOW\n"
-        "    high: tuple = HIGH\n    noise: float = NOISE.absolute\n    sum: int = LOW + 1\n    none: int\n",
-        "p/__init__.py": "",
-        "p/a.py": "class Noise:\n    absolute: float = 1e-3\nNOISE = Noise()\nclass Base:\n    limits: Noise = Noise()\n    low: int = 7\n",
-    }
-    for name, text in files.items():
-        toy.write(tmp_path / name, text)
-    found = Sources([tmp_path], FileHashes(None)).stage_params("stages", "s", Path("pipeline.yaml"))
-    expected = {
-        "limits": {"absolute": 0.001},
-        "low": 1,
-        "high": [2, 3],
-        "noise": 0.001,
-        "sum": "LOW + 1",
-        "none": "none",
-    }
-    assert found == expected
-
-
 class Inner(msgspec.Struct, frozen=True):
     size: Annotated[int, msgspec.Meta(ge=1, le=9)] = 3
     """Of what

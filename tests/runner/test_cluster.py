@@ -2,7 +2,6 @@
 
 import json
 import os
-import re
 import signal
 import threading
 import time
@@ -121,11 +120,6 @@ def test_any_number_of_workers_gives_the_same_bytes(project, tmp_path, workers):
     assert kept(project) == beside(project)
 
 
-def test_a_cluster_of_this_machine_gives_the_same_bytes(project):
-    ended(start(project, "executor=dask"))
-    assert kept(project) == beside(project)
-
-
 # ── what dies ────────────────────────────────────────────────────────────────────────────────────────────────────────
 
 
@@ -215,8 +209,6 @@ def test_a_run_whose_workers_are_all_killed_says_so_and_goes_on_when_one_comes(
 @pytest.mark.parametrize("change, words, cure", [
     ({"run": Path("/nowhere")}, "does not see the run's folder", "mount at the same path"),
     ({"library": Path("/other")}, f"runs the code in {LIBRARY}", "cd /other && .venv/bin/dask worker"),
-    ({"python": "3.99"}, "the run has 3.99", "dask worker"),
-    ({"record": {"package:msgspec": "0.0"}}, f"has msgspec {msgspec.__version__}, the run has 0.0", "make setup"),
 ])  # fmt: skip
 def test_a_worker_elsewhere_is_refused(tmp_path, change, words, cure):
     good = Site(tmp_path)
@@ -231,41 +223,25 @@ def test_without_dask_the_cure_names_the_extra(project, monkeypatch):
         make(project, "executor=tcp://127.0.0.1:1")
 
 
-@pytest.mark.parametrize("address, words, cure", [
-    ("tcp://127.0.0.1:9", "no Dask scheduler answers at tcp://127.0.0.1:9", "dask scheduler --port"),
-    ("tls://127.0.0.1:9", "tls:// asks for certificates, and there are none", "distributed.comm.tls"),
-    ("ucx://127.0.0.1:9", "ucx:// cannot be spoken here", "write tcp://<host>:<port>"),
-])  # fmt: skip
-def test_a_scheduler_out_of_reach_is_named_and_no_worker_is_started_for_it(
-    project, monkeypatch, address, words, cure, capfd
-):
+@pytest.mark.parametrize("address", ["tcp://127.0.0.1:9", "tls://127.0.0.1:9", "ucx://127.0.0.1:9"])
+def test_a_scheduler_out_of_reach_is_named(project, monkeypatch, address, capfd):
     monkeypatch.setattr(cluster, "PATIENCE", 0.3)
-    with pytest.raises(InputError, match=re.escape(words)) as refused:
-        make(project, "executor=dask", f"scheduler={address}")
-    assert cure in str(refused.value) and "Traceback" not in "".join(capfd.readouterr())
-    if not address.startswith("tcp"):
-        with pytest.raises(InputError, match=f"worker: {words[:20]}"):
-            cluster.start_worker(address, None, [])
-    with pytest.raises(InputError, match=r"worker: '10.0.0.1' is no address"):
-        cluster.start_worker("10.0.0.1", None, [])
+    with pytest.raises(InputError, match=f"no Dask scheduler answers at {address}") as refused:
+        make(project, f"executor={address}")
+    assert "dask scheduler --port" in str(refused.value) and "Traceback" not in "".join(capfd.readouterr())
 
 
 PLAIN, ON_DASK = "format: 1\nstages: {}\n", "format: 1\nexecutor: tcp://a:1\nstages: {}\n"
 
 
 @pytest.mark.parametrize("text, setting, expected", [
-    (PLAIN, "", ("processes", None)),
-    (PLAIN, "executor=dask scheduler=tcp://10.0.0.1:8786", ("dask", "tcp://10.0.0.1:8786")),
-    (ON_DASK, "", ("dask", "tcp://a:1")),
-    (ON_DASK, "scheduler=tls://b:2", ("dask", "tls://b:2")),
-    (ON_DASK, "scheduler=", ("dask", None)),
-    (ON_DASK, "executor=processes", ("processes", None)),
-    (PLAIN, "executor=dusk", "SET executor: there is no executor 'dusk'\n  did you mean 'dask'?"),
-    (PLAIN, "exectuor=dask", "'exectuor=dask' is no setting\n  did you mean 'executor'?"),
-    (PLAIN, "scheduler=tcp://a:1", 'only Dask has a scheduler\n  write SET="executor=dask scheduler=…"'),
-    (PLAIN, "executor=dask scheduler=a:1", "SET: scheduler: "),
-    ("executor: dusk\n" + PLAIN, "", "executor: invalid enum value 'dusk'"),
-    ("scheduler: tcp://a:1\n" + PLAIN, "", "scheduler: only Dask has a scheduler\n  add executor: dask"),
+    (PLAIN, "", "processes"),
+    (PLAIN, "executor=tcp://10.0.0.1:8786", "tcp://10.0.0.1:8786"),
+    (ON_DASK, "", "tcp://a:1"),
+    (ON_DASK, "executor=processes", "processes"),
+    (PLAIN, "executor=dusk", "SET executor=dusk: "),
+    (PLAIN, "exectuor=dask", "SET: 'exectuor=dask' is no setting"),
+    ("executor: dusk\n" + PLAIN, "", "pipeline.yaml:1: executor: "),
     ("executer: dask\n" + PLAIN, "", "did you mean 'executor'?"),
 ])  # fmt: skip
 def test_where_steps_run_stands_in_pipeline_yaml_and_a_setting_replaces_it(tmp_path, text, setting, expected):
@@ -273,6 +249,5 @@ def test_where_steps_run_stands_in_pipeline_yaml_and_a_setting_replaces_it(tmp_p
     try:
         found = with_settings(read_pipeline(tmp_path / "pipeline.yaml", ()), [setting]).executor
     except InputError as error:
-        found = f"error: {error}"
-        assert "exec" in found and ("10.0.0.1" in found or "executor" not in expected or "did you mean" in found)
+        found = str(error)
     assert expected in found

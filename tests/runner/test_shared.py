@@ -14,6 +14,7 @@ import pytest
 from factorlib.errors import InputError
 from factorlib.runner import verbs
 from factorlib.runner.filehash import hash_of_file
+from factorlib.runner.gc import verify
 from factorlib.runner.project import LIBRARY
 from factorlib.runner.shared import MADE_FROM
 from factorlib.runner.store import output_of
