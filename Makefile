@@ -92,7 +92,7 @@ help:
 	@echo 'make lock                            requirements.lock from pyproject.toml and what .venv has'
 	@echo 'make setup                           only the environment (TORCH_INDEX=<url> for another PyTorch)'
 	@echo '     EXTRAS="blender interchange"     and what tests open exported files with: Blender, MaterialX, OpenUSD'
-	@echo '     EXTRAS=dask                      and Dask: SET="executor=dask scheduler=tcp://…" runs steps on a cluster (docs/distributed.md)'
+	@echo '     EXTRAS=dask                      and Dask: SET="executor=tcp://…" runs steps on a cluster (docs/distributed.md)'
 
 .DEFAULT:
 	@test -e .venv/ready || $(MAKE) setup

@@ -28,7 +28,7 @@ def slurm_cluster(**more: object) -> SLURMCluster:
         walltime=f"{HOURS:02d}:00:00",
         python=str(CHECKOUT / ".venv" / "bin" / "python"),
         job_script_prologue=[f"cd {CHECKOUT}"],
-        worker_extra_args=["--resources", f"cores={CORES}", "--memory-limit", "0"],  # Slurm limits the memory of a job
+        worker_extra_args=["--memory-limit", "0"],  # Slurm limits the memory of a job
         **more,
     )
 
@@ -38,7 +38,7 @@ def main() -> int:
     dataset, *settings = sys.argv[1:]
     with slurm_cluster() as cluster:
         cluster.scale(jobs=JOBS)
-        words = " ".join(["executor=dask", f"scheduler={cluster.scheduler_address}", *settings])
+        words = " ".join([f"executor={cluster.scheduler_address}", *settings])
         return subprocess.call(["make", "all", f"DATASET={dataset}", f"SET={words}"], cwd=CHECKOUT)
 
 

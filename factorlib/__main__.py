@@ -17,7 +17,7 @@ from pathlib import Path
 from typing import Any, NoReturn
 
 from factorlib.errors import InputError
-from factorlib.runner import verbs
+from factorlib.runner import gc, verbs
 from factorlib.runner.display import plain_streams, printable
 from factorlib.runner.project import LIBRARY, PIPELINE, Project, photo_sets
 from factorlib.runner.stop import heed_stops
@@ -51,12 +51,6 @@ def _path(word: str) -> Path:
     return Path(word).expanduser()
 
 
-def _cores(word: str) -> int:
-    if not word.isdigit() or int(word) < 1:
-        raise argparse.ArgumentTypeError(f"{word!r} is no number of cores: a whole number from 1")
-    return int(word)
-
-
 ON, MANY, FEW = {"action": "store_true"}, {"action": "append"}, {"nargs": "*"}
 OPTIONS = {  # as `ArgumentParser.add_argument` takes them; key: of the environment, where it is not given
     "dataset": _option("--dataset", "-d", help="its name in data/, or a path to its folder; else DATASET"),
@@ -74,8 +68,6 @@ OPTIONS = {  # as `ArgumentParser.add_argument` takes them; key: of the environm
     "second": _option("second", key="B", type=_path, nargs="?", help="another; else B"),
     "out": _option("--out", key="OUT", type=_path, help="the zip file; else OUT, or <dataset>.zip here"),
     "sheet": _option("--sheet", help="also draw photos, labels and meshes; as SHEET=1", **ON),
-    "scheduler": _option("scheduler", help="its address, as tcp://10.0.0.1:8786"),
-    "cores": _option("--cores", type=_cores, help="that it computes on; default: all of this machine"),
     "name": _option("name"),
 }
 
@@ -134,13 +126,6 @@ def _validate(asked: Namespace) -> int:
     return verbs.validate(project(), dataset_of(asked), settings_of(asked), switched_on("SHEET", asked.sheet))
 
 
-def _worker(asked: Namespace) -> int:
-    from factorlib.runner.cluster import start_worker
-
-    start_worker(asked.scheduler, asked.cores, asked.further)
-    return 0
-
-
 ASKED = "dataset set force recipe"
 VERBS: dict[str, tuple[str, Callable[[Namespace], int], str]] = {  # in the order of `--help`: options, what it does, help
     "all": (f"{ASKED} strict", lambda a: verbs.make(project(), wish(a), switched_on("STRICT", a.strict)),
@@ -149,7 +134,7 @@ VERBS: dict[str, tuple[str, Callable[[Namespace], int], str]] = {  # in the orde
               "Run one stage and what it needs; `render` with a recipe makes its pictures alone."),
     "plan": (f"stages {ASKED}", lambda a: verbs.show_plan(project(), wish(a, a.stages)),
              "What would run; with a recipe and no stage, for its pictures alone."),
-    "why": (f"stages {ASKED}", lambda a: verbs.show_why(project(), wish(a, a.stages)),
+    "why": (f"stages {ASKED}", lambda a: verbs.show_plan(project(), wish(a, a.stages), True),
             "Every reason why it would run."),
     "status": ("stages dataset set recipe", lambda a: verbs.show_status(project(), wish(a, a.stages)),
                "How far each stage is, and what the current results warned of."),
@@ -167,14 +152,12 @@ VERBS: dict[str, tuple[str, Callable[[Namespace], int], str]] = {  # in the orde
                  "Check pipeline.yaml, settings and dataset without running anything."),
     "pack": ("dataset out force", lambda a: verbs.pack(project(), dataset_of(a), a.out, switched_on("FORCE", a.force)),
              "Put a result into one zip file that travels without its dataset."),
-    "verify": ("dataset", lambda a: verbs.verify(project(), dataset_of(a, True)),
+    "verify": ("dataset", lambda a: gc.verify(project(), dataset_of(a, True)),
                "Read every kept result, of a dataset or of all, and name what is damaged."),
-    "clean": ("dataset", lambda a: verbs.clean(project(), dataset_of(a, True)),
+    "clean": ("dataset", lambda a: gc.clean(project(), dataset_of(a, True)),
               "Forget a dataset's results, or, where neither --dataset nor DATASET is given, all."),
-    "gc": ("force", lambda a: verbs.collect(project(), lambda: agreed(a.force)),
+    "gc": ("force", lambda a: gc.collect(project(), lambda: agreed(a.force)),
            "Show which results are current for no dataset, and delete them; a terminal is asked first."),
-    "worker": ("scheduler cores", _worker,
-               "Work for a Dask scheduler until it ends; further options are those of `dask worker`."),
     "ship": ("name dataset", lambda a: verbs.ship(project(), a.name, dataset_of(a)),
              "Put a stage's current result into the package (for those who change the stage)."),
 }  # fmt: skip
@@ -191,10 +174,7 @@ def run(words: list[str], program: str) -> int:
             one.add_argument(*flags, **more, **({"default": os.environ.get(key) or None} if key else {}))
     if words and not words[0].startswith("-") and words[0] not in VERBS:
         words = ["stage", *words]
-    asked, further = parser.parse_known_args(words or ["--help"])
-    if further and asked.verb != "worker":
-        parser.error(f"unrecognized arguments: {' '.join(further)}")
-    asked.further = further
+    asked = parser.parse_args(words or ["--help"])
     return VERBS[asked.verb][1](asked)
 
 

@@ -33,10 +33,7 @@ def disk_error(error: BaseException, folder: Path) -> InputError | None:
     of, name = full or error, getattr(error, "filename", None)
     if not full and isinstance(name, str) and os.path.isfile(name) and not os.access(name, os.R_OK):
         return InputError(f"{words}: it may not be read", file=name, cure="give yourself the right to read it")
-    names = [
-        getattr(of, "filename", None),
-        getattr(of, "filename2", None),
-    ]  # of a copy or a rename there are two, the last is written
+    names = (getattr(of, "filename", None), getattr(of, "filename2", None))  # of a copy two, the last is written
     paths = [Path(os.path.abspath(os.fsdecode(name))).parent for name in names if isinstance(name, str | bytes)]
     # as far as they exist; `Path.is_dir` raises where it may not look
     folders = [next(p for p in (path, *path.parents) if os.path.isdir(p)) for path in paths or [folder.absolute()]]

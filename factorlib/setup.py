@@ -161,10 +161,7 @@ def check_system() -> None:
                 command = ["apt-get", "-qq", *words.split()]
                 subprocess.run(command, env=quiet, check=False, stdout=subprocess.DEVNULL)
             missing = [name for name in missing if not loads(name)]
-        how = "(the packages of your system that hold these files)"
-        if apt or shutil.which("dnf"):
-            by_dnf = "sudo dnf install " + " ".join(f"'{name}()(64bit)'" for name in missing)
-            how = f"sudo apt-get update && sudo apt-get install -y {packages}" if apt else by_dnf
+        how = f"sudo apt-get update && sudo apt-get install -y {packages}   (elsewhere: what holds these files)"
         if missing and why:
             say(f"{', '.join(missing)} is not there, and {why}; to install it:\n  {how}")
         elif missing:

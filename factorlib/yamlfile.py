@@ -21,7 +21,6 @@ from factorlib.reading import one_line, read_text
 
 T = TypeVar("T")
 Keys = tuple[str | int, ...]  # the way to a value: mapping keys and list indices from the root
-_TAG = "tag:yaml.org,2002:"
 _CORE = re.compile(  # YAML 1.2.2, section 10.3.2
     r"(?P<null>~|null|Null|NULL|)|(?P<bool>true|True|TRUE|false|False|FALSE)|(?P<int>[-+]?[0-9]+|0o[0-7]+|0x[0-9a-fA-F]+)"
     r"|(?P<float>[-+]?(?:\.[0-9]+|[0-9]+(?:\.[0-9]*)?)(?:[eE][-+]?[0-9]+)?|[-+]?\.(?:inf|Inf|INF)|\.(?:nan|NaN|NAN))"
@@ -92,22 +91,22 @@ class _Document:
                 self._refuse(f"there is no &{event.anchor} above this alias", event, keys, cure)
             return self._copy(self.anchors[event.anchor], event, keys, 0)
         self._count(event, keys, 0)
+        if event.tag not in (None, "!"):
+            self._refuse(f"the tag {one_line(repr(event.tag))} is not known", event, keys, "delete the tag")
         self.unfinished.add(event.anchor)
         if isinstance(event, yaml.ScalarEvent):
             value = self._scalar(event, keys)
         elif isinstance(event, yaml.SequenceStartEvent):
-            self._check_tag(event, keys, "seq")
             value = []
             while not isinstance(item := next(self.events), yaml.SequenceEndEvent):
                 value.append(self._node(item, (*keys, len(value))))
         else:
-            value = self._map(event, keys)
+            value = self._map(keys)
         self.unfinished.discard(event.anchor)
         self.anchors[event.anchor] = value
         return value
 
-    def _map(self, start: yaml.Event, keys: Keys) -> dict[str, Any]:
-        self._check_tag(start, keys, "map")
+    def _map(self, keys: Keys) -> dict[str, Any]:
         values, lines = {}, {}
         while not isinstance(event := next(self.events), yaml.MappingEndEvent):
             if not isinstance(event, yaml.ScalarEvent):
@@ -141,13 +140,6 @@ class _Document:
     def _scalar(self, event: yaml.ScalarEvent, keys: Keys) -> Any:
         text, match = event.value, _CORE.fullmatch(event.value)
         kind = match.lastgroup if match and event.tag is None and event.implicit[0] else "str"
-        if event.tag not in (None, "!"):
-            kind = event.tag.removeprefix(_TAG)
-            if kind not in ("null", "bool", "int", "float"):
-                self._check_tag(event, keys, "str")
-            elif match is None or (match.lastgroup != kind and (match.lastgroup, kind) != ("int", "float")):
-                cure = "delete the tag, or correct the value"
-                self._refuse(f"{one_line(repr(text))} is no {kind}", event, keys, cure)
         if kind in ("int", "float") and len(text) > MOST_DIGITS:
             cure = f"write it with {MOST_DIGITS} at most"
             self._refuse(f"a number of {len(text)} characters", event, keys, cure)
@@ -156,10 +148,6 @@ class _Document:
         if kind == "float":
             return float(text.lower().replace(".inf", "inf").replace(".nan", "nan"))
         return {"null": None, "bool": text.lower() == "true"}.get(kind, text)
-
-    def _check_tag(self, event: yaml.Event, keys: Keys, kind: str) -> None:
-        if event.tag not in (None, "!", _TAG + kind):
-            self._refuse(f"the tag {one_line(repr(event.tag))} is not known", event, keys, "delete the tag")
 
     def _refuse(self, fault: str, event: yaml.Event, keys: Keys, cure: str) -> NoReturn:
         raise InputError(fault, file=f"{self.name}:{event.start_mark.line + 1}", key=key_path(keys), cure=cure)

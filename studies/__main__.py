@@ -15,7 +15,6 @@ import typer
 from factorlib.__main__ import agreed, switched_on
 from factorlib.disk import disk_error
 from factorlib.errors import InputError, did_you_mean
-from factorlib.runner.pipeline import executor_words
 from factorlib.runner.stop import heed_stops
 from studies.run import STUDIES, collect, forget, make, studies
 from studies.study import FULL, QUICK
@@ -32,7 +31,7 @@ def run(
     clean: Annotated[bool, typer.Option("--clean", help="forget results instead")] = False,
     gc: Annotated[bool, typer.Option("--gc", help="delete results that no study names any more instead")] = False,
 ) -> None:
-    """Run studies, as far as anything must run; SET="executor=dask scheduler=tcp://…" says where."""
+    """Run studies, as far as anything must run; SET="executor=tcp://…" says where."""
     if gc:
         raise typer.Exit(collect(lambda: agreed(force)))
     named = names or (os.environ.get("STUDY", "").split() if one else [])
@@ -43,7 +42,7 @@ def run(
         studies(scale).dataset_folder(name)
     if clean:
         raise typer.Exit(forget(scale, named or list(STUDIES)))
-    code = make(scale, named or list(STUDIES), switched_on("FORCE", force), executor_words([os.environ.get("SET", "")]))
+    code = make(scale, named or list(STUDIES), switched_on("FORCE", force), [os.environ.get("SET", "")])
     if docs and code == 0 and not scale.quick:
         from studies.run.page import refresh_docs
 

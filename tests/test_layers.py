@@ -32,5 +32,5 @@ def test_every_stage_of_the_pipeline_has_its_module_and_the_runner_finds_what_it
     sources = Sources([ROOT], FileHashes(None))
     for name in pipeline.stages:
         closure = sources.closure("stages", name, ROOT / "pipeline.yaml")
-        assert f"stages.{name}" in closure.modules and "factorlib.stage" in closure.modules
-        assert not any(module.startswith("factorlib.runner") for module in closure.modules)
+        assert {f"source:stages.{name}", "source:factorlib.stage"} <= closure.record.keys()
+        assert not any(name.startswith("source:factorlib.runner") for name in closure.record)

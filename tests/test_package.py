@@ -23,9 +23,7 @@ OURS = {"factorlib", "stages", "tests", "studies"}
 
 
 # What runs on a cluster alone: loaded where one is asked for, and then the extra `dask` is there or missed by name.
-OF_CLUSTERS = {
-    ROOT / "factorlib" / name for name in ("parcel.py", *(f"runner/{module}.py" for module in ("child", "cluster")))
-}
+OF_CLUSTERS = {ROOT / "factorlib" / "runner" / f"{module}.py" for module in ("child", "cluster")}
 
 
 @pytest.mark.parametrize("folder", ["factorlib", "stages"])

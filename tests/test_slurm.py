@@ -36,7 +36,7 @@ def test_the_job_script_asks_slurm_for_what_the_example_and_the_docs_say(cluster
     for line in ("#SBATCH -p compute", "#SBATCH -A my-project", "#SBATCH --cpus-per-task=16", "#SBATCH -t 08:00:00"):
         assert line in script.splitlines(), script
     command = script.strip().splitlines()[-1]
-    assert "--nthreads 16" in command and "--resources cores=16" in command and "--memory-limit 0" in command
+    assert "--nthreads 16" in command and "--memory-limit 0" in command
     script = re.sub(r"tcp://\S+", "tcp://<scheduler>", script).replace(str(LIBRARY), "<checkout>").strip()
     without_logs = re.sub("#SBATCH -[eo] .*\n", "", script)  # they lie where the test says
     assert without_logs in (LIBRARY / "docs" / "distributed.md").read_text()
@@ -51,7 +51,7 @@ def test_the_job_script_run_as_slurm_would_starts_a_worker_that_serves_a_run(clu
         ["bash", "-c", script], env={**os.environ, "PYTHONPATH": str(LIBRARY)}, cwd=tmp_path, start_new_session=True
     )
     try:
-        settings = ["executor=dask", f"scheduler={cluster.scheduler_address}"]
+        settings = [f"executor={cluster.scheduler_address}"]
         assert verbs.make(project, verbs.Wish("set", settings=settings)) == 0
     finally:
         os.killpg(job.pid, signal.SIGTERM)
@@ -72,4 +72,4 @@ def test_the_example_hands_the_run_its_schedulers_address_and_ends_as_the_run_do
     assert example["main"]() == 3
     ((command, cwd),) = called
     assert command[:3] == ["make", "all", "DATASET=eames"] and cwd == LIBRARY
-    assert re.fullmatch(r"SET=executor=dask scheduler=tcp://\S+:\d+ solve.lobes=64", command[3])
+    assert re.fullmatch(r"SET=executor=tcp://\S+:\d+ solve.lobes=64", command[3])

@@ -29,8 +29,8 @@ from pathlib import Path
 from typing import Any
 
 from factorlib import arithmetic
+from factorlib.errors import InputError
 from factorlib.runner.project import LIBRARY
-from factorlib.runner.stop import whole
 from factorlib.runner.worker import THREAD_VARIABLES, limit_threads
 
 TRIM = "MALLOC_TRIM_THRESHOLD_"  # Dask's nanny sets it; sums of 700 × 700 numbers then take three times as long
@@ -48,7 +48,9 @@ class Child:
         command = [sys.executable, "-P", "-c", MAIN, str(theirs.fileno()), str(threads), str(os.getpid()), str(run)]
         fixed = {"PYTHONHASHSEED": "0", **arithmetic.VARIABLES, **dict.fromkeys(THREAD_VARIABLES, str(threads))}
         environment = {name: value for name, value in os.environ.items() if name != TRIM} | fixed
+        before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})  # the child inherits that: it never sees one
         self.process = subprocess.Popen(command, env=environment, stdin=subprocess.DEVNULL, pass_fds=[theirs.fileno()])
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)
         theirs.close()
 
     def call(self, function: Callable, *arguments: Any, wanted: Callable[[], bool] = lambda: True) -> Any:
@@ -102,8 +104,6 @@ class Pools:
     `factorlib.runner.cluster.Cluster` has the same interface.
     """
 
-    AHEAD = 1  # steps are handed out for so many times the cores
-
     def __init__(self, cores: int | None = None):
         self.cores = cores or machine_cores()
         self.children, self._threads = [], ThreadPoolExecutor(1 << 16)  # as many as there are steps at once
@@ -111,15 +111,18 @@ class Pools:
 
     def free(self, cores: int) -> bool:
         """Whether a step of `cores` cores may start now: the cores suffice, or nothing else runs."""
+        return not self._work() or self._work() + cores <= self.cores
+
+    def _work(self) -> int:
+        """The cores of the steps that run."""
         self._busy = {future: count for future, count in self._busy.items() if not future.done()}
-        return not self._busy or sum(self._busy.values()) + cores <= self.AHEAD * self.cores
+        return sum(self._busy.values())
 
     def submit(self, cores: int, threads: int, function: Callable, argument: Any) -> Future:
         """Start `function(argument)` in a process of `threads` threads, which takes `cores` cores; its future."""
-        with whole():
-            future = self._threads.submit(taken(self.children, threads, Path("/")).call, function, argument)
-            self._busy[future] = cores
-            return future
+        future = self._threads.submit(taken(self.children, threads, Path("/")).call, function, argument)
+        self._busy[future] = cores
+        return future
 
     def close(self, kill: bool = False) -> None:
         """End all processes; `kill`: at once, whatever they do."""
@@ -159,17 +162,6 @@ def main() -> None:
             try:
                 answer = ForkingPickler.dumps((True, function(*arguments)))
             except BaseException as error:  # whatever it is, it is the caller's
-                answer = ForkingPickler.dumps((False, that_travels(error)))
+                told = error if isinstance(error, InputError) else RuntimeError(f"{type(error).__name__}: {error}")
+                answer = ForkingPickler.dumps((False, told))  # others may not survive being pickled
             connection.send_bytes(answer)
-
-
-def that_travels(error: BaseException) -> BaseException:
-    """An error that another process can raise: itself, or where it cannot be pickled and made again its type and text."""
-    try:
-        ForkingPickler.loads(ForkingPickler.dumps(error))
-        return error
-    except Exception:
-        told = RuntimeError(f"{type(error).__name__}: {error}")
-        for note in getattr(error, "__notes__", ()):
-            told.add_note(note)
-        return told

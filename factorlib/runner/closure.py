@@ -10,21 +10,15 @@ What else a module's numbers depend on it declares in constants, which are read 
     ENVIRONMENT = ("FACTORLIB_FUSED",)    environment variables; their values count
     PROGRAMS = {"CC": "cc"}               programs by the variable that names them, and what stands in for it; whether
                                           there is such a program counts, and its name, not where it lies
-
-A stage's parameters and their defaults are read from syntax trees too, for planning must not import what a stage imports.
-A default is followed to a base class, a constant of any module, and into an instance made without arguments (`Limits()`).
 """
 
 from __future__ import annotations
 
 import ast
 import hashlib
-import json
 import os
-import shlex
 import shutil
 import sys
-from collections import Counter
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -34,51 +28,37 @@ import msgspec
 from factorlib.errors import InputError, did_you_mean
 from factorlib.runner.filehash import FileHashes, left_over, read_cache, write_cache
 
-CODE = ("source:", "data:", "environment:", "program:")  # the fields of a record that a closure makes
+# the fields of a record that a closure makes
+CODE = ("source:", "data:", "environment:", "program:", "package:", "python")
 OURS = ("factorlib", "stages", "studies")  # packages; an installed one lies among those of others
-DEEPEST = 16  # names that stand for names, structs in structs: one more is not followed
 
 
 class Source(msgspec.Struct, frozen=True):
     """What one module's text says: a digest of its syntax tree, dotted names as it imports them, and the environment variables
-    and programs that it declares its numbers to depend on; of its top level what defaults of parameters may stand for.
-
-    classes:  by name, the bases as they are written, and the fields with the text of their defaults
-    imported: by name, the module and the name there
-    assigned: by name, the text of what is assigned to it, of names that are bound once in the whole module
+    and programs that it declares its numbers to depend on.
     """
 
     digest: str = ""
     imports: list[str] = []
     environment: list[str] = []
     programs: dict[str, str] = {}
-    classes: dict[str, tuple[list[str], dict[str, str]]] = {}
-    imported: dict[str, tuple[str, str]] = {}
-    assigned: dict[str, str] = {}
 
 
 class Closure(msgspec.Struct, frozen=True):
     """What a stage depends on besides its inputs.
 
-    record:   the part of a step's record that is its code (`source:`, `data:`), and what of the environment the code declares
-    external: top-level names of imports from outside the project
-    files:    where what `record` names lies
+    record: the part of a step's record that is its code, and what of the environment the code declares or imports
+    files:  where what `record` names lies
     """
 
     record: dict[str, str]
-    external: list[str]
     files: dict[str, Path]
-
-    @property
-    def modules(self) -> set[str]:
-        """Dotted names of the project's modules."""
-        return {name.removeprefix("source:") for name in self.files if name.startswith("source:")}
 
 
 def source_of(text: str, module: str, is_package: bool) -> Source:
     """What a module's text says.  Raises SyntaxError, and InputError for a declaration that is none."""
     tree = ast.parse(text)
-    imports, classes, imported, assigned = set(), {}, {}, {}
+    imports = set()
     for node in ast.walk(tree):
         if isinstance(node, ast.Import):
             imports |= {alias.name for alias in node.names}
@@ -86,24 +66,12 @@ def source_of(text: str, module: str, is_package: bool) -> Source:
             above = module.split(".")[: None if is_package else -1] if node.level else []
             base = ".".join([*above[: len(above) - node.level + 1], *([node.module] if node.module else [])])
             imports |= {base, *(f"{base}.{alias.name}" for alias in node.names)}
-    for node in tree.body:
-        if isinstance(node, ast.ClassDef):
-            fields = [item for item in node.body if isinstance(item, ast.AnnAssign) and hasattr(item.target, "id")]
-            defaults = {item.target.id: ast.unparse(item.value) if item.value else "none" for item in fields}
-            classes[node.name] = [ast.unparse(base) for base in node.bases], defaults
-        elif isinstance(node, ast.ImportFrom) and node.module and not node.level:
-            imported |= {alias.asname or alias.name: (node.module, alias.name) for alias in node.names}
-        elif isinstance(node, ast.Assign):
-            assigned |= {target.id: ast.unparse(value) for target, value in _pairs(node) if hasattr(target, "id")}
-    stored = (ast.Store, ast.Del)
-    bound = Counter(n.id for n in ast.walk(tree) if isinstance(n, ast.Name) and isinstance(n.ctx, stored))
     environment = _declared(tree, "ENVIRONMENT", list[str], '("A_VARIABLE",)') or []
     programs = _declared(tree, "PROGRAMS", dict[str, str], '{"CC": "cc"}') or {}
     for node in ast.walk(tree):
         _drop_docstring(node)
     digest = hashlib.sha256(ast.dump(tree).encode()).hexdigest()[:32]
-    once = {name: text for name, text in assigned.items() if bound[name] == 1}
-    return Source(digest, sorted(imports), environment, programs, classes, imported, once)
+    return Source(digest, sorted(imports), environment, programs)
 
 
 def _declared(tree: ast.Module, name: str, type_: Any, example: str) -> Any:
@@ -129,26 +97,11 @@ def _drop_docstring(node: ast.AST) -> None:
         node.body = [item for item in node.body if item not in texts] or [ast.Pass()]
 
 
-def _pairs(node: ast.Assign) -> Iterator[tuple[ast.expr, ast.expr]]:
-    """Targets and values that a default may be followed to; A, B = x, y are two assignments."""
-    (target, *others), value = node.targets, node.value
-    both = isinstance(target, ast.Tuple) and isinstance(value, ast.Tuple) and len(target.elts) == len(value.elts)
-    pairs = zip(target.elts, value.elts) if both and not others else ((each, value) for each in node.targets)
-    for target, value in pairs:
-        made = isinstance(value, ast.Call) and not value.args and not value.keywords
-        if made or isinstance(value, ast.Constant | ast.Tuple | ast.UnaryOp | ast.Name):
-            yield target, value
-
-
-class Unknown(str):
-    """The text of a default that no syntax tree tells the value of: it equals no value that a parameter may have."""
-
-
 class Sources:
-    """The modules below some root folders, read through a cache of file hashes."""
+    """The modules below some root folders, read through a cache of file hashes.  cache: of versions of packages"""
 
-    def __init__(self, roots: list[Path], hashes: FileHashes):
-        self.roots, self.hashes = list(dict.fromkeys(roots)), hashes
+    def __init__(self, roots: list[Path], hashes: FileHashes, cache: Path | None = None):
+        self.roots, self.hashes, self.packages = list(dict.fromkeys(roots)), hashes, Packages(cache)
         self._places: dict[str, Path | None] = {}
         self._read: dict[Path, Source] = {}  # each file is looked at once, however many stages import it
         self._beside: dict[Path, list[Path]] = {}  # data files by folder
@@ -158,7 +111,10 @@ class Sources:
 
         Raises InputError where the stage has no module, or a module of the project cannot be parsed.
         """
-        self._check_stage(package, stage, pipeline_file)
+        if self.find(f"{package}.{stage}") is None:
+            known = [p.stem for p in (self.roots[0] / package).glob("*.py") if p.stem != "__init__"]
+            words, cure = f"the stage {stage!r} has no module {package}/{stage}.py", did_you_mean(stage, known)
+            raise InputError(words, file=pipeline_file, key=f"stages.{stage}", cure=cure)
         places: dict[str, Path] = {}
         external: set[str] = set()
         stack = [f"{package}.{stage}"]
@@ -186,16 +142,13 @@ class Sources:
         for source in sources.values():
             record |= {f"environment:{name}": os.environ[name] for name in source.environment if name in os.environ}
             for name, default in source.programs.items():
-                command = os.environ.get(name, default)
-                try:
-                    words = shlex.split(command) or [""]
-                except ValueError as error:
-                    cure = f"name a program, as in {name}={default}"
-                    raise InputError(f"{command!r} is no command ({error})", key=name, cure=cure) from None
+                words = os.environ.get(name, default).split() or [""]
                 if shutil.which(words[0]):  # without the folder it lies in
                     record[f"program:{name}"] = " ".join([Path(words[0]).name, *words[1:]])
         files = {f"source:{name}": places[name] for name in sources} | data
-        return Closure(record, sorted(external - sys.stdlib_module_names - {""}), files)
+        versions = self.packages.versions(sorted(external - sys.stdlib_module_names - {""}))
+        record |= {f"package:{package}": version for package, version in versions.items()}
+        return Closure(record | {"python": f"{sys.version_info[0]}.{sys.version_info[1]}"}, files)
 
     def find(self, name: str) -> Path | None:
         """The file of a module of the project; a folder without `__init__.py` stands for itself."""
@@ -213,12 +166,6 @@ class Sources:
             self._places[name] = next((file for base in bases if (file := _module_in(base, last))), None)
         return self._places[name]
 
-    def _check_stage(self, package: str, stage: str, pipeline_file: Path) -> None:
-        if self.find(f"{package}.{stage}") is None:
-            known = [p.stem for p in (self.roots[0] / package).glob("*.py") if p.stem != "__init__"]
-            words, cure = f"the stage {stage!r} has no module {package}/{stage}.py", did_you_mean(stage, known)
-            raise InputError(words, file=pipeline_file, key=f"stages.{stage}", cure=cure)
-
     def _source(self, name: str, file: Path) -> Source:
         def parse() -> Source:
             try:
@@ -232,45 +179,6 @@ class Sources:
         if file not in self._read:
             self._read[file] = Source() if file.is_dir() else self.hashes.remembered("source", file, parse, Source)
         return self._read[file]
-
-    def stage_params(self, package: str, stage: str, pipeline_file: Path) -> dict[str, Any]:
-        """A stage's parameters and their defaults as YAML would have them (a struct is a table), read without importing it.
-
-        A default is `Unknown` where the source does not tell it for certain.
-        """
-        self._check_stage(package, stage, pipeline_file)
-        return self._fields(f"{package}.{stage}", "Params", 0)
-
-    def _fields(self, module: str, name: str, deep: int) -> dict[str, Any]:
-        """Fields of a class with their defaults, those of its bases first; nothing of a class outside the project."""
-        if deep > DEEPEST or not (file := self.find(module)):
-            return {}
-        source = self._source(module, file)
-        if name not in source.classes:
-            return self._fields(*source.imported[name], deep + 1) if name in source.imported else {}
-        bases, defaults = source.classes[name]
-        fields: dict[str, Any] = {}
-        for base in reversed(bases):  # the first of two bases decides
-            fields |= self._fields(module, base, deep + 1)
-        return fields | {field: self._value(text, module, deep) for field, text in defaults.items()}
-
-    def _value(self, text: str, module: str, deep: int) -> Any:
-        if deep > DEEPEST or not (file := self.find(module)):
-            return Unknown(text)
-        source, (of, _, attribute) = self._source(module, file), text.partition(".")
-        if text.endswith("()"):
-            return self._fields(module, text.removesuffix("()"), deep + 1) or Unknown(text)
-        if text in source.assigned:
-            return self._value(source.assigned[text], module, deep + 1)
-        if text in source.imported:
-            return self._value(*reversed(source.imported[text]), deep + 1)
-        if attribute and (of in source.assigned or of in source.imported):
-            struct = self._value(of, module, deep + 1)
-            return struct.get(attribute, Unknown(text)) if isinstance(struct, dict) else Unknown(text)
-        try:
-            return json.loads(json.dumps(ast.literal_eval(text)))  # a tuple is a list
-        except (ValueError, SyntaxError, TypeError):
-            return Unknown(text)
 
 
 def _module_in(folder: Path, name: str) -> Path | None:
@@ -288,44 +196,10 @@ def _data_files(folder: Path) -> Iterator[Path]:
             yield path
 
 
-def other_than(defaults: dict[str, Any], values: dict[str, Any]) -> dict[str, Any]:
-    """The parameters that are not what they would be without being set; of a table those of its fields.
-
-    A whole number will do for any number, but 1 is not true, nor -0.0 0.0; what is unknown equals no value.
-
-    >>> other_than({"lobes": 72, "gain": 0.5, "limits": {"faces": 9}}, {"lobes": 72, "gain": 0.25, "limits": {"faces": 9}})
-    {'gain': 0.25}
-    >>> other_than({"lobes": 72, "gain": 1.0, "size": Unknown("3")}, {"lobes": 72.0, "gain": 1, "size": "3"})
-    {'lobes': 72.0, 'size': '3'}
-    """
-    others = {}
-    for name, value in values.items():
-        default = defaults.get(name, Unknown())
-        if isinstance(value, dict) and isinstance(default, dict):
-            inner = other_than(default, value)
-            others |= {name: inner} if inner else {}
-            continue
-        as_default = float(value) if type(default) is float and type(value) is int and abs(value) < 1 << 53 else value
-        if isinstance(default, Unknown) or json.dumps(as_default) != json.dumps(default):
-            others[name] = value
-    return others
-
-
-def recorded(default: Any) -> Any:
-    """A default as a key's record has it: what is unknown is told from a text that is known.
-
-    >>> recorded({"size": Unknown("3"), "name": "3"})
-    {'size': {'text': '3'}, 'name': '3'}
-    """
-    if isinstance(default, dict):
-        return {name: recorded(value) for name, value in default.items()}
-    return {"text": str(default)} if isinstance(default, Unknown) else default
-
-
 class Packages:
     """Versions of the installed packages that are imported, looked up once per state of site-packages."""
 
-    def __init__(self, cache: Path):
+    def __init__(self, cache: Path | None):
         folders = [path for path in sys.path if path.endswith("-packages") and os.path.isdir(path)]
         self.cache, self.state = cache, [[path, os.stat(path).st_mtime_ns] for path in folders]
         state, known = read_cache(cache, tuple[list, dict[str, dict[str, str]]]) or ([], {})
@@ -338,5 +212,6 @@ class Packages:
 
             of = packages_distributions()
             self.known |= {name: {each: version(each) for each in sorted(set(of.get(name, [])))} for name in missing}
-            write_cache(self.cache, (self.state, self.known))
+            if self.cache is not None:
+                write_cache(self.cache, (self.state, self.known))
         return {name: version for each in imports for name, version in self.known[each].items()}

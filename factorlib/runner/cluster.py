@@ -1,137 +1,118 @@
 """Steps on a Dask cluster: each is a task with keys and paths, its result lands in the store, which all workers see.
 
-The cluster is that of a scheduler that is running, or one in this process that lives as long as the run.  A worker hands
-its task to a child process (`factorlib.runner.child`), so that bits do not depend on how workers were started.  A task
+A worker hands its task to a child process (`factorlib.runner.child`), so that bits do not depend on how workers were started.  A task
 whose worker or child dies is tried again, on its own: nothing else is lost.
-
-A step's `Inputs.map` sends independent blocks of work in pieces, a few for each core, as tasks of the same cluster; their
-results come back in order.  What a block warns of is warned of in the step, and the first error in the blocks' order is the
-step's, as if it had computed them itself.
 """
 
 from __future__ import annotations
 
-import asyncio
 import contextlib
 import logging
 import os
-import sys
 import threading
 import time
-import traceback
 import uuid
-import warnings
-from collections.abc import Callable, Iterable
-from concurrent.futures import Future, ThreadPoolExecutor
-from functools import partial
-from importlib import import_module
-from importlib.metadata import distributions
+from collections.abc import Callable
+from concurrent.futures import Future
 from importlib.util import find_spec
 from pathlib import Path
-from types import ModuleType
 from typing import Any
 
 import msgspec
 
 from factorlib.errors import InputError
-from factorlib.runner.child import Child, Pools, machine_cores, taken, that_travels
-from factorlib.runner.pipeline import ADDRESS
-from factorlib.runner.plan import Record
+from factorlib.runner.child import Child, Pools, taken
 from factorlib.runner.project import LIBRARY
-from factorlib.runner.stop import whole
-from factorlib.runner.worker import Heard, Meter, Outcome, Task, run_step
+from factorlib.runner.worker import Outcome, Task, run_step
 
 FRESH = 1.0  # seconds for which the scheduler is not asked again who its workers are
 PATIENCE = 10  # seconds to reach a scheduler, for steps to end that are cancelled, and until the last worker is missed
-PIECES = 4  # for each core: small enough that no core waits long for the last one
+AHEAD = 2  # steps are handed out for so many times the cores, so that no worker waits for its next one
 TRIES = 3  # of a task whose process dies
-CORES = "cores"  # the resource that workers declare
-FIRST = 10  # priority of blocks: a step waits for them
-PYTHON = f"{sys.version_info[0]}.{sys.version_info[1]}"
-QUIET = {  # what Dask does by itself between tasks: without these, a worker that waits takes 4 % of a core
-    "DASK_DISTRIBUTED__WORKER__PROFILE__ENABLED": "False",
-    "DASK_DISTRIBUTED__ADMIN__TICK__INTERVAL": "1s",
-    "DASK_DISTRIBUTED__ADMIN__SYSTEM_MONITOR__INTERVAL": "5s",
-}
 
 
 class Site(msgspec.Struct, frozen=True):
-    """What a worker must share with a run: its folder in the store, the files of the library, the version of Python."""
+    """What a worker must share with a run: its folder in the store, and the files of the library."""
 
     run: Path
     library: Path = LIBRARY
-    python: str = PYTHON
 
-    def fault(self, record: Record | None = None) -> InputError | None:
-        """What hinders this process from working for the run; a step's record asks for the versions that it names, too."""
+    def fault(self) -> InputError | None:
+        """What hinders this process from working for the run."""
         here = f"the worker on {os.uname().nodename}"
         if not self.run.is_dir():
             cure = "keep build/ and the data on a file system that all machines mount at the same path"
             return InputError(f"{here} does not see the run's folder", file=self.run, cure=cure)
-        start = started_by("<scheduler>", self.library)
         if self.library != LIBRARY:
+            start = started_by("<scheduler>", self.library)
             return InputError(f"{here} runs the code in {LIBRARY}", file=self.library, cure=start)
-        if self.python != PYTHON:
-            return InputError(f"{here} has Python {PYTHON}, the run has {self.python}", cure=start)
-        for package, wanted in (record or {}).items():
-            if package.startswith("package:"):
-                package = package.removeprefix("package:")
-                installed = next((each.version for each in distributions(name=package)), "none")
-                if installed != wanted:
-                    words = f"{here} has {package} {installed}, the run has {wanted}"
-                    return InputError(words, cure="make setup, in the same checkout")
         return None
 
 
 def started_by(scheduler: str, library: Path = LIBRARY) -> str:
     """The command line that starts a worker as it must be."""
-    return f"start the worker by: cd {library} && .venv/bin/python -m factorlib worker {scheduler}"
+    return f"start the worker by: cd {library} && .venv/bin/dask worker {scheduler}"
 
 
 # ── the run ──────────────────────────────────────────────────────────────────────────────────────────────────────────
 
 
 class Cluster(Pools):
-    """The executor of a Dask cluster.
+    """The executor of the workers of a Dask scheduler at an address.  run: folder of the run, in the store
 
-    scheduler: its address; None for a cluster of this machine's cores
-    run: folder of the run, in the store
+    Raises InputError where no scheduler answers there, or a worker cannot do what it must.
     """
 
-    AHEAD = 2  # so that no worker waits for its next step
+    def __init__(self, scheduler: str, run: Path, say: Callable[[str], None]):
+        if find_spec("distributed") is None:
+            cure = "make setup EXTRAS=dask, or pip install 'factorlib[dask]'"
+            raise InputError("Dask is not installed", key="executor", cure=cure)
+        from distributed import Client
 
-    def __init__(self, scheduler: str | None, run: Path, say: Callable[[str], None]):
-        _require_dask("executor")
         self.site, self._busy, self._over = Site(run), {}, threading.Event()
         self._known: tuple[float, dict[str, int]] = (-FRESH, {})
-        with whole():
-            self.client = _client(scheduler) if scheduler else _client_of_this_machine()
+        for name in ("distributed", "distributed.client", "distributed.core", "distributed.comm"):
+            logging.getLogger(name).setLevel(logging.CRITICAL)  # what they say of a lost connection is in the outcome
+        say(f"connecting to {scheduler}")
         try:
-            if scheduler:
-                self._check(scheduler, say)
-                threading.Thread(target=self._miss_workers, args=(scheduler, say), daemon=True).start()
+            self.client = Client(scheduler, timeout=PATIENCE, set_as_default=False)
+        except Exception as error:  # what answers there may be anything: an HTTP server, garbage
+            cure = "start one: dask scheduler --port 8786; or leave the executor out, for processes of this machine"
+            words = f"no Dask scheduler answers at {scheduler} ({str(error) or f'nothing in {PATIENCE} s'})"
+            raise InputError(words, key="executor", cure=cure) from error
+        try:
+            for fault in filter(None, self.client.run(Site.fault, self.site).values()):
+                raise fault
             self._executor = self.client.get_executor(pure=False, retries=TRIES - 1)
         except BaseException:
             self.client.close()
             raise
+        threading.Thread(target=self._miss_workers, args=(scheduler, say), daemon=True).start()
+
+    @property
+    def workers(self) -> dict[str, int]:
+        """The cores of each worker, by its address, as the scheduler said not long ago."""
+        asked, known = self._known
+        if time.monotonic() - asked >= FRESH:
+            with contextlib.suppress(Exception):  # of a scheduler that is gone, which ends the tasks too
+                known = self.client.nthreads()
+            self._known = time.monotonic(), known
+        return known
 
     @property
     def cores(self) -> int:
-        """Those of all workers that are there now; 1 where none is."""
-        return max(1, sum(self._declared().values()))
+        """Those of the largest worker that is there now; 1 where none is."""
+        return max(self.workers.values(), default=1)
+
+    def free(self, cores: int) -> bool:
+        """Whether a step of `cores` cores may be handed out now."""
+        return not self._work() or self._work() + cores <= AHEAD * sum(self.workers.values())
 
     def submit(self, cores: int, threads: int, function: Callable, argument: Any) -> Future:
-        """Hand out a step, by its task; its future.
-
-        A step that takes more cores than threads hands out blocks itself, and holds no core meanwhile.
-        """
-        spreads, most = cores > threads, max(self._declared().values(), default=threads)
-        resources = {} if spreads else {CORES: min(threads, most)}
-        with whole():
-            task = hosted, self.site, threads, spreads, outcome_at, argument
-            future = self._executor.submit(*task, resources=resources)
-            self._busy[future] = cores
-            return future
+        """Hand out a step, by its task; its future."""
+        future = self._executor.submit(hosted, self.site, threads, argument)
+        self._busy[future] = cores
+        return future
 
     def close(self, kill: bool = False) -> None:
         """Leave the cluster; `kill`: tasks that are not finished are cancelled, and their processes killed."""
@@ -143,101 +124,16 @@ class Cluster(Pools):
                 time.sleep(0.1)
         self.client.close()
 
-    def _declared(self) -> dict[str, int]:
-        """The cores that each worker declares, by its address, as the scheduler said not long ago."""
-        asked, known = self._known
-        if time.monotonic() - asked >= FRESH:
-            with contextlib.suppress(Exception):  # of a scheduler that is gone, which ends the tasks too
-                # not `client.scheduler_info`, whose answer a look of Dask's own that asks for no workers may replace
-                workers = self.client.sync(self.client.scheduler.identity, n_workers=-1)["workers"]
-                known = {address: int(facts["resources"].get(CORES, 0)) for address, facts in workers.items()}
-            self._known = time.monotonic(), known
-        return known
-
-    def _check(self, scheduler: str, say: Callable[[str], None]) -> None:
-        """Wait for a worker; InputError where any of those that are there cannot do what it must."""
-        if not self._declared():
-            say(f"waiting: no worker yet at {scheduler}; {started_by(scheduler)}")
-            while not self._declared():
-                time.sleep(FRESH)
-        if lacking := [address for address, cores in self._declared().items() if not cores]:
-            cure = f"{started_by(scheduler)}\n  or let it declare them: dask worker --nthreads 8 --resources {CORES}=8"
-            raise InputError(f"the worker {lacking[0]} does not say how many cores it has", key="scheduler", cure=cure)
-        for fault in filter(None, self.client.run(Site.fault, self.site).values()):
-            raise fault
-
     def _miss_workers(self, scheduler: str, say: Callable[[str], None]) -> None:
-        """Say once that the last worker is gone.  Dask keeps its tasks for those that come."""
-        last = time.monotonic()
+        """Say once that there is no worker.  Dask keeps its tasks for those that come."""
+        last = -PATIENCE
         while not self._over.wait(FRESH):
-            if self._declared():
+            if self.workers:
                 last = time.monotonic()
             elif time.monotonic() - last >= PATIENCE:
-                say(f"waiting: no worker is left at {scheduler}; {started_by(scheduler)}")
+                start = started_by(scheduler)
+                say(f"waiting: there is no worker at {scheduler}; {start}")
                 last = float("inf")
-
-
-def _require_dask(key: str) -> None:
-    if find_spec("distributed") is None:
-        cure = "make setup EXTRAS=dask, or pip install 'factorlib[dask]'"
-        raise InputError("Dask is not installed", key=key, cure=cure)
-
-
-def _client_of_this_machine() -> Any:
-    """A client of a cluster in this process, of one worker with all cores."""
-    import dask
-    from distributed import Client
-
-    logging.getLogger("distributed").setLevel(logging.CRITICAL)
-    cores = machine_cores()
-    place = {"processes": False, "protocol": "tcp", "host": "127.0.0.1", "dashboard_address": None, "memory_limit": 0}
-    size = {"n_workers": 1, "threads_per_worker": cores, "resources": {CORES: cores}}
-    with dask.config.set(dask.config.merge(dask.config.config, dask.config.collect_env(QUIET))):
-        return Client(**place, **size, silence_logs=logging.CRITICAL, set_as_default=False)
-
-
-def _client(scheduler: str) -> Any:
-    """A client of the scheduler at an address.  InputError where none answers there."""
-    from distributed import Client
-    from distributed.core import rpc
-    from distributed.security import Security
-
-    async def answered() -> None:
-        """Ask what listens there who it is; TimeoutError where it says nothing, for which a client would wait without end."""
-        remote = rpc(scheduler, timeout=PATIENCE, connection_args=Security().get_connection_args("client"))
-        try:
-            await asyncio.wait_for(remote.identity(), PATIENCE)
-        finally:
-            await remote.close_rpc()
-
-    _check_protocol(scheduler, "client", "scheduler")
-    for name in ("distributed", "distributed.client", "distributed.core", "distributed.comm"):
-        logging.getLogger(name).setLevel(logging.CRITICAL)  # what they say of a lost connection is in the outcome
-    try:
-        with ThreadPoolExecutor(1) as beside:  # a notebook runs an event loop in this thread already
-            beside.submit(asyncio.run, answered()).result()
-        return Client(scheduler, timeout=PATIENCE, set_as_default=False)
-    except Exception as error:  # what answers there may be anything: an HTTP server, garbage
-        cure = "start one: dask scheduler --port 8786; or leave the scheduler out, for a cluster of this machine"
-        words = str(error) or f"nothing in {PATIENCE} s"
-        raise InputError(f"no Dask scheduler answers at {scheduler} ({words})", key="scheduler", cure=cure) from error
-
-
-def _check_protocol(address: str, role: str, key: str) -> None:
-    """InputError where a client or a worker cannot speak the protocol of an address here."""
-    from distributed.comm.registry import get_backend
-    from distributed.security import Security
-
-    protocol = address.partition("://")[0]
-    try:
-        with warnings.catch_warnings(action="ignore"):
-            get_backend(protocol).get_connector()
-    except Exception as error:  # which one is its own affair: ucx is an abstract class
-        cure = "install what Dask speaks it with (distributed-ucxx-cu12 for ucxx), or write tcp://<host>:<port>"
-        raise InputError(f"{protocol}:// cannot be spoken here ({error})", key=key, cure=cure) from error
-    if protocol in ("tls", "wss") and Security().get_connection_args(role).get("ssl_context") is None:
-        cure = "name them in Dask's configuration (distributed.comm.tls, or DASK_DISTRIBUTED__COMM__TLS__CA_FILE and others)"
-        raise InputError(f"{protocol}:// asks for certificates, and there are none", key=key, cure=cure)
 
 
 # ── in a worker ──────────────────────────────────────────────────────────────────────────────────────────────────────
@@ -245,26 +141,20 @@ def _check_protocol(address: str, role: str, key: str) -> None:
 _children: list[Child] = []
 
 
-def hosted(site: Site, threads: int, waits: bool, function: Callable, argument: Any) -> Any:
-    """`function(address of the scheduler, site, argument)` in a child of this worker, which ends if nobody waits any more.
-
-    waits: it mostly waits for other tasks, so the worker takes on others meanwhile
-    """
-    from distributed import get_worker, secede
+def hosted(site: Site, threads: int, task: Task) -> Outcome:
+    """Run a step in a child of this worker, which ends if nobody waits any more."""
+    from distributed import get_worker
 
     worker = get_worker()
     key = worker.get_current_task()
 
     def wanted() -> bool:
         """False once the task is cancelled, which for Dask is a change of its state, no interruption; or the worker closes."""
-        task, status = worker.state.tasks.get(key), worker.status.name
+        of_dask, status = worker.state.tasks.get(key), worker.status.name
         open_ = status in ("running", "paused", "closing_gracefully")
-        return task is not None and task.state != "cancelled" and open_
+        return of_dask is not None and of_dask.state != "cancelled" and open_
 
-    if waits:
-        secede()
-    child = taken(_children, threads, site.run)
-    return child.call(function, worker.scheduler.address, site, argument, wanted=wanted)
+    return taken(_children, threads, site.run).call(outcome_at, site, task, wanted=wanted)
 
 
 def at_work(run: Path) -> bool:
@@ -272,107 +162,12 @@ def at_work(run: Path) -> bool:
     return any(child.busy and child.run == run and child.process.poll() is None for child in _children)
 
 
-def start_worker(scheduler: str, cores: int | None, more: list[str]) -> None:
-    """Become a worker of the cluster at `scheduler` with so many cores (default: this machine's), as steps need it.
-
-    Raises InputError where that is no address, or its protocol cannot be spoken here.
-    """
-    _require_dask("worker")
-    if not ADDRESS.fullmatch(scheduler):
-        cure = "write tcp://<host>:<port>, as tcp://10.0.0.1:8786"
-        raise InputError(f"{scheduler!r} is no address", key="worker", cure=cure)
-    _check_protocol(scheduler, "worker", "worker")
-    count = cores or machine_cores()
-    options = f"--nthreads {count} --nworkers 1 --resources {CORES}={count} --memory-limit 0 --no-dashboard".split()
-    path = os.pathsep.join([str(LIBRARY), *filter(None, [os.environ.get("PYTHONPATH")])])
-    command = [sys.executable, "-m", "distributed.cli.dask_worker", scheduler, *options, *more]
-    os.execve(sys.executable, command, {**QUIET, **os.environ, "PYTHONPATH": path})
+# ── in the child of a step ───────────────────────────────────────────────────────────────────────────────────────────
 
 
-# ── in the child of a step, and in that of a block ───────────────────────────────────────────────────────────────────
-
-
-def outcome_at(scheduler: str, site: Site, task: Task) -> Outcome:
-    """Run a step here; its independent work goes to the cluster.
-
-    Each try of a step has a temporary folder of its own: another may still be ending elsewhere.
-    """
-    if fault := site.fault(task.record):
+def outcome_at(site: Site, task: Task) -> Outcome:
+    """Run a step here.  Each try of a step has a temporary folder of its own: another may still be ending elsewhere."""
+    if fault := site.fault():
         return Outcome(error=str(fault))
     temporary = task.temporary.with_name(f"{task.temporary.name}.{uuid.uuid4().hex[:8]}")
-    task = msgspec.structs.replace(task, temporary=temporary)
-    if task.code.cores == 1:
-        return run_step(task)
-    with contextlib.closing(Blocks(scheduler, site, task)) as blocks:
-        return run_step(task, blocks)
-
-
-class Blocks:
-    """An ordered map over the cluster at `scheduler`.  spent: what the blocks took elsewhere, for the step's log."""
-
-    def __init__(self, scheduler: str, site: Site, task: Task):
-        self.scheduler, self.site, self.code, self._client = scheduler, site, task.code, None
-        self.shelf = parcel().Shelf(task.temporary.with_name(f"{task.temporary.name}.shelf"))
-        sizes = dict.fromkeys(("maps", "tasks", "bytes_sent", "bytes_shelved", "bytes_back"), 0)
-        self.spent: dict[str, Any] = {**sizes, "cpu_seconds": 0.0, "memory_mb": 0.0}
-
-    def __call__(self, function: Callable, items: Iterable) -> list:
-        """The function of every item, in order.  Raises what the first of them raised."""
-        from distributed import Client
-
-        items = list(items)
-        if len(items) <= 1:
-            return list(map(function, items))
-        count = min(PIECES * self.code.cores, len(items))
-        cuts = [len(items) * k // count for k in range(count + 1)]
-        packed = self.shelf.pack([(function, items[start:end]) for start, end in zip(cuts, cuts[1:])])
-        self._client = self._client or Client(self.scheduler, set_as_default=False)
-        here = partial(hosted, self.site, self.code.threads, False, block_at)
-        options = {"priority": FIRST, "retries": TRIES - 1, "resources": {CORES: self.code.threads}, "pure": False}
-        answers = self._client.gather(self._client.map(here, [(self.code.root, data) for data in packed], **options))
-        for name, much in {"maps": 1, "tasks": count, "bytes_sent": sum(map(len, packed))}.items():
-            self.spent[name] += much
-        self.spent["bytes_shelved"] = self.shelf.written
-        return [value for back in answers for value in self._taken(back)]
-
-    def _taken(self, back: bytes) -> list:
-        values, texts, error, cost = parcel().unpack(back)
-        self.spent["bytes_back"] += len(back)
-        self.spent["cpu_seconds"] += cost["cpu_seconds"]
-        self.spent["memory_mb"] = max(self.spent["memory_mb"], cost["memory_mb"])
-        for text in texts:
-            logging.getLogger("factorlib").warning("%s", text)
-        if error is not None:
-            raise error
-        return values
-
-    def close(self) -> None:
-        """Leave the cluster; tasks that are still there are cancelled."""
-        if self._client is not None:
-            self._client.close()
-
-
-def block_at(scheduler: str, site: Site, work: tuple[Path, bytes]) -> bytes:
-    """What the function gave of each item of a piece, what was warned of, the first error and the cost, packed.
-
-    work: the project's root, and the packed function and items
-    """
-    if fault := site.fault():
-        raise fault
-    if str(work[0]) not in sys.path:
-        sys.path.insert(0, str(work[0]))
-    meter, values, error = Meter(), [], None
-    with Heard() as heard:
-        function, items = parcel().unpack(work[1])
-        try:
-            for item in items:
-                values.append(function(item))
-        except Exception as caught:
-            caught.add_note(traceback.format_exc())
-            error = that_travels(caught)
-    return parcel().pack((values, heard.warnings, error, meter.read()))
-
-
-def parcel() -> ModuleType:
-    """`factorlib.parcel`, by its name as stages are: it imports science."""
-    return import_module("factorlib.parcel")
+    return run_step(msgspec.structs.replace(task, temporary=temporary))

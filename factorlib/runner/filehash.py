@@ -16,7 +16,7 @@ from factorlib.wholefile import replace_file
 
 T = TypeVar("T")
 Hash = Annotated[str, msgspec.Meta(pattern="^[0-9a-f]{32}$")]
-FORMAT = 6  # of the cache; one of another format is made anew
+FORMAT = 7  # of the cache; one of another format is made anew
 FRESH_NS = 2_000_000_000  # a file changed this recently may change again within its clock's grain: not remembered
 
 

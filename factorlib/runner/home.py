@@ -28,7 +28,7 @@ from factorlib.jsonfile import json_text, read_json
 from factorlib.runner.filehash import hash_of_file
 from factorlib.runner.plan import Planned, Step, key_of
 from factorlib.runner.project import RESERVED, Project, check_name
-from factorlib.runner.store import Entry, Inspector, damage_of, output_of, stamps_of, sweep_drafts
+from factorlib.runner.store import Store, damage_of, stamps_of
 from factorlib.wholefile import replace_file, write_text
 
 if TYPE_CHECKING:
@@ -68,24 +68,24 @@ class Home(msgspec.Struct, frozen=True):
             return {}
 
 
-def home_of(project: Project, dataset: Path) -> Home:
-    """build/<name of the dataset's folder>; refused where a folder of that name elsewhere has it."""
-    home = _home_named(project, dataset.name, dataset)
-    owner = owner_of(project, home)
-    if owner is not None and os.path.isdir(owner) and not owner.samefile(dataset):
-        cure = f"rename one of the folders, or give its results up: make clean DATASET={shlex.quote(str(owner))}"
-        raise _other_owner(home, owner, dataset, cure)
-    return home
+def home_of(project: Project, dataset: Path, by_name: bool = False) -> Home:
+    """build/<name of the dataset's folder>; refused where that is a link, or holds the results of another folder.
 
-
-def _home_named(project: Project, name: str, dataset: Path | None = None) -> Home:
-    """build/<name>, which is a folder directly in build/, not a link that leads elsewhere, or is not there yet."""
-    check_name(name, "a dataset", file=dataset, key="DATASET", reserved=RESERVED)
-    folder = project.build / name
-    if os.path.realpath(folder) != os.path.join(os.path.realpath(project.build), name):
+    by_name: whoever's results it holds
+    """
+    check_name(dataset.name, "a dataset", file=dataset, key="DATASET", reserved=RESERVED)
+    home = Home(project.build / dataset.name)
+    if os.path.realpath(home.folder) != os.path.join(os.path.realpath(project.build), dataset.name):
         words = "is a link, where the runner keeps a dataset's results"
-        raise InputError(words, file=folder, cure="delete the link, or move it elsewhere")
-    return Home(folder)
+        raise InputError(words, file=home.folder, cure="delete the link, or move it elsewhere")
+    owner = None if by_name else owner_of(project, home)
+    if owner not in (None, dataset) and not (
+        os.path.isdir(dataset) and (not os.path.isdir(owner) or owner.samefile(dataset))
+    ):
+        words = f"two datasets are called {dataset.name!r}: build/{dataset.name} holds the results of {owner}"
+        cure = f"rename one of the folders, or give its results up: make clean DATASET={shlex.quote(str(owner))}"
+        raise InputError(words, file=dataset, cure=cure)
+    return home
 
 
 def made_home(project: Project, dataset: str) -> Home | None:
@@ -94,21 +94,14 @@ def made_home(project: Project, dataset: str) -> Home | None:
     A name is that of a home in build/; a path must be the one that the home was made for.  InputError for whatever else.
     """
     there = project.find_dataset(dataset)
-    folder = there or Path(os.path.abspath(dataset))
-    home = _home_named(project, folder.name)
-    if not home.mark.is_file():
-        if there is not None:
-            return None
+    home = home_of(project, there or Path(os.path.abspath(dataset)), by_name=there is None and "/" not in dataset)
+    if home.mark.is_file():
+        return home
+    if there is None:
         known = [other.folder.name for other in made_homes(project)]
         cure = did_you_mean(dataset, known) if known else "build/ holds no results of any dataset"
         raise InputError(f"there is no dataset {dataset!r}, and no results of one", key="DATASET", cure=cure)
-    if (owner := owner_of(project, home)) not in (None, folder):
-        lives = os.path.isdir(owner)
-        of_another = not (there and lives and owner.samefile(there))
-        if of_another and ("/" in dataset or (there and lives)):
-            word = shlex.quote(str(owner if lives else home.folder.name))
-            raise _other_owner(home, owner, folder, f"if it is that one: make clean DATASET={word}")
-    return home
+    return None
 
 
 def made_homes(project: Project) -> list[Home]:
@@ -116,11 +109,6 @@ def made_homes(project: Project) -> list[Home]:
     entries = sorted(project.build.iterdir()) if project.build.is_dir() else []
     homes = [Home(path) for path in entries if path.is_dir() and not path.is_symlink() and path.name not in RESERVED]
     return [home for home in homes if home.mark.is_file()]
-
-
-def _other_owner(home: Home, owner: Path, dataset: Path, cure: str) -> InputError:
-    words = f"two datasets are called {home.folder.name!r}: build/{home.folder.name} holds the results of {owner}"
-    return InputError(words, file=dataset, cure=cure)
 
 
 def owner_of(project: Project, home: Home) -> Path | None:
@@ -152,29 +140,27 @@ def remember(survey: Survey, made: dict[str, str]) -> None:
 
 def show(survey: Survey, planned: list[Planned]) -> None:
     """Write down what is current and point the links there: of a stage over photos, at one folder with all of them."""
-    current, home, stages = [p for p in planned if p.status == "current"], survey.home, survey.spec.pipeline.stages
-    keys, of_photos = {str(p.step): p.key for p in current}, {}
-    for p in current:
-        if p.step.photo:
-            of_photos.setdefault(p.step.stage, {})[p.step.photo] = p.key
+    home, store, stages = survey.home, survey.store, survey.spec.pipeline.stages
+    current = {p.step: p for p in planned if p.status == "current"}
+    keys, of_photos = {str(step): p.key for step, p in current.items()}, {}
+    for step, p in current.items():
+        if step.photo:
+            of_photos.setdefault(step.stage, {})[step.photo] = p.key
         else:
-            point(home.folder / str(p.step), survey.store.tree(p.output))
+            point(home.folder / str(step), store.tree(p.output))
     for name, of in of_photos.items():
-        keys[name] = view_of(survey.outputs, name, of, stages[name].gather)
-        point(home.folder / name, survey.store.tree(survey.outputs.get(keys[name])))
+        keys[name] = view_of(store, name, of, stages[name].gather)
+        point(home.folder / name, store.tree(store.get(keys[name])))
     remember(survey, keys)
     for link in home.folder.glob("[!.]*"):  # hidden ones are drafts of links, of another run perhaps
         if link.is_symlink() and link.name not in stages:
             link.unlink(missing_ok=True)
-    failed = {label(step) for stage in stages for step in survey.spec.steps_of(stage)} - {
-        label(p.step) for p in current
-    }
+    failed = {label(step) for stage in stages for step in survey.spec.steps_of(stage) if step not in current}
     for path in (path for path in home.errors.glob("*.txt") if path.stem not in failed):
         path.unlink(missing_ok=True)  # what is written of a failure goes with success, or with the step
     with contextlib.suppress(OSError):  # what is not empty stays; another run may have removed the folder
         home.errors.rmdir()
-    sweep_drafts(home.folder)
-    survey.outputs.save()
+    store.save()
 
 
 def label(step: Step) -> str:
@@ -201,15 +187,15 @@ def point(link: Path, target: Path) -> None:
     os.replace(draft, link)
 
 
-def view_of(outputs: Inspector, stage: str, keys: dict[str, str], gather: str | None) -> str:
+def view_of(store: Store, stage: str, keys: dict[str, str], gather: str | None) -> str:
     """The key of one folder with the files of all photos of a stage ({photo: key}), and each `<photo>.json` in `gather`.
 
     The folder is a result as those of steps are.  Its files are hard links to theirs.
     """
-    store, entries = outputs.store, {photo: outputs.entry(key) for photo, key in sorted(keys.items())}
+    entries = {photo: store.entry(key) for photo, key in sorted(keys.items())}
     record = {f"input:{stage}/{photo}": entry.output for photo, entry in entries.items()}
     record |= {"stage": stage, "photo": None, "view": gather}
-    if outputs.get(key := key_of(record)) is not None:
+    if store.get(key := key_of(record)) is not None:
         return key
     draft, files, right = store.tmp / f"view-{os.getpid()}-{key}", {}, {}
     shutil.rmtree(draft, ignore_errors=True)
@@ -225,23 +211,21 @@ def view_of(outputs: Inspector, stage: str, keys: dict[str, str], gather: str | 
                     os.link(store.tree(entry.output) / name, draft / name)
                 except OSError:  # no hard links on this file system
                     shutil.copy2(store.tree(entry.output) / name, draft / name)
-            files, right = files | entry.files, right | outputs.known.get(entry.output, {})
+            files, right = files | entry.files, right | store.known.get(entry.output, {})
         if damage := damage_of(draft, files, right):  # a result that was spoilt since it was looked at
-            raise InputError(
-                f"a result was spoilt meanwhile: {damage[0]}", key=stage, cure="run again: it is made anew"
-            )
+            cure = "run again: it is made anew"
+            raise InputError(f"a result was spoilt meanwhile: {damage[0]}", key=stage, cure=cure)
         if gather:
             table = {photo: read_json(draft / f"{photo}.json") for photo in entries}
             write_text(draft / gather, json_text(table))
             (draft / gather).chmod(0o444)
             files[gather] = hash_of_file(draft / gather)
-        view = Entry(output_of(files), record, files)
-        store.put(draft, store.tree(view.output), lambda: not damage_of(store.tree(view.output), files))
+        view = store.take_in(record, draft, log.warning, files)
         store.keep(key, view)
     finally:
         shutil.rmtree(draft, ignore_errors=True)
-    outputs.forget(key)
-    outputs.remember(view.output, stamps_of(store.tree(view.output)))
+    store.forget(key)
+    store.known[view.output], store.changed = stamps_of(store.tree(view.output)), True
     return key
 
 

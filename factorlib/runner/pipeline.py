@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-import math
+import json
+import os
 import re
 import shlex
 from collections.abc import Callable
@@ -14,16 +15,16 @@ import msgspec
 
 from factorlib.errors import InputError, did_you_mean
 from factorlib.runner.project import check_name
-from factorlib.yamlfile import parse_yaml, read_yaml
+from factorlib.yamlfile import convert, parse_yaml, read_yaml
 
 FORMAT = 1
 SHOWN = 80  # characters of a setting that messages repeat
 LONGEST, DEEPEST = 5000, 16  # characters of a setting, parts of its name: a path may have 4096
 NAME = re.compile("[a-z][a-z0-9_]*")
 TAKEN = ("errors",)  # a folder beside the links that are called as the stages
-PROCESSES, DASK = "processes", "dask"
-EXECUTORS, WHERE = (PROCESSES, DASK), ("executor=", "scheduler=")  # the latter begin settings
-ADDRESS = re.compile(r"(tcp|tls|ws|wss|ucx|ucxx)://[^\s/]+:\d+")
+HOW = "write processes, or the address of a Dask scheduler, as tcp://10.0.0.1:8786"
+WHERE = r"^(processes|(tcp|tls|ws|wss|ucx|ucxx)://[^\s/]+:\d+)$"
+Executor = Annotated[str, msgspec.Meta(pattern=WHERE, description=HOW)]
 DATASET = "dataset."  # prefix of the inputs that are slices of the dataset
 
 
@@ -82,29 +83,19 @@ class Stage(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     @property
     def folders(self) -> dict[str, Path]:
         """The folders that parameters name, from where the user stands; links are followed now, for results move on."""
-        folders = {}
-        for param, named in (
-            (name, str(self.params[name])) for name in self.given if self.params.get(name) is not None
-        ):
-            try:
-                folders[param] = Path(named).resolve()
-            except (OSError, RuntimeError, ValueError) as error:  # links in a circle, a part too long, a NUL
-                words = f"{named[:100]!r} is no path ({getattr(error, 'strerror', None) or error})"
-                raise InputError(words, key=param, cure="name a folder") from error
-        return folders
+        named = {name: str(self.params[name]) for name in self.given if self.params.get(name) is not None}
+        return {name: Path(os.path.realpath(folder.replace("\0", ""))) for name, folder in named.items()}
 
 
 class Pipeline(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """What pipeline.yaml says.
 
-    executor:  where steps run, which changes no bit and no key: `processes` of this machine, or the workers of a cluster of `dask`
-    scheduler: the address of that cluster's scheduler; without one, a cluster of this machine's cores
+    executor: where steps run, which changes no bit and no key: `processes` of this machine, or the address of a Dask scheduler
     """
 
     format: int
     stages: dict[str, Stage]
-    executor: str = PROCESSES
-    scheduler: str | None = None
+    executor: Executor = "processes"
 
     def order(self) -> list[str]:
         """Stages, each after what it takes; otherwise as they stand in the file."""
@@ -142,7 +133,6 @@ def read_pipeline(path: Path, known_slices: tuple[str, ...]) -> Pipeline:
 
     if pipeline.format != FORMAT:
         refuse(f"format {pipeline.format} is not known", "format", f"this version reads format: {FORMAT}")
-    _check_executor(pipeline, path, "")
     known = [*(DATASET + name for name in known_slices), *pipeline.stages]
     for name, stage in pipeline.stages.items():
         key = f"stages.{name}"
@@ -166,70 +156,49 @@ def read_pipeline(path: Path, known_slices: tuple[str, ...]) -> Pipeline:
     return pipeline
 
 
-def _check_executor(pipeline: Pipeline, file: Path | None, prefix: str) -> None:
-    name, address = pipeline.executor, pipeline.scheduler
-    if name not in EXECUTORS:
-        words, cure = f"there is no executor {name[:SHOWN]!r}", did_you_mean(name, EXECUTORS)
-        raise InputError(words, file=file, key=f"{prefix}executor", cure=cure)
-    if address is not None and name != DASK:
-        cure = "add executor: dask" if file else 'write SET="executor=dask scheduler=…"'
-        raise InputError("only Dask has a scheduler", file=file, key=f"{prefix}scheduler", cure=cure)
-    if address is not None and not ADDRESS.fullmatch(address):
-        words, cure = f"{address[:SHOWN]!r} is no address", "write tcp://<host>:<port>, as tcp://10.0.0.1:8786"
-        raise InputError(words, file=file, key=f"{prefix}scheduler", cure=cure)
-
-
 def with_settings(pipeline: Pipeline, settings: list[str]) -> Pipeline:
-    """The pipeline with `stage.parameter=value` words in place of its own, and `executor=…` and `scheduler=…`; several words
-    in one string are split.
+    """The pipeline with `stage.parameter=value` words in place of its own, and `executor=…`; several words in one string are split.
 
     >>> with_settings(Pipeline(1, {"solve": Stage()}), ["solve.lobes=64 solve.tolerance=1e-3"]).stages["solve"].params
     {'lobes': 64, 'tolerance': 0.001}
     """
-    words = _words(settings)
-    where = dict(word.split("=", 1) for word in words if word.startswith(WHERE))  # the last of each kind counts
-    if where:
-        executor = where.get("executor", pipeline.executor)
-        kept = None if where.get("executor") == PROCESSES else pipeline.scheduler  # which drops that of pipeline.yaml
-        scheduler = where.get("scheduler", kept) or None
-        pipeline = msgspec.structs.replace(pipeline, executor=executor, scheduler=scheduler)
-        _check_executor(pipeline, None, "SET ")
-    stages = dict(pipeline.stages)
-    for word in (word for word in words if not word.startswith(WHERE)):
-        stage, keys, value = _setting(word, stages)
-        stages[stage] = msgspec.structs.replace(stages[stage], params=_set(stages[stage].params, keys, value))
-    return msgspec.structs.replace(pipeline, stages=stages)
+    stages, executor = dict(pipeline.stages), pipeline.executor
+    for word in _words(settings):
+        target, equals, text = word.partition("=")
+        if target == "executor":
+            executor = convert(text, Executor, f"SET {_cut(word)}")
+            continue
+        stage, *keys = target.split(".")
+        if not equals or not keys or not all(keys) or len(keys) > DEEPEST or len(word) > LONGEST:
+            cure = 'write stage.parameter=value, as in SET="solve.cells=800"'
+            raise InputError(f"{_cut(word)!r} is no setting", key="SET", cure=cure)
+        if stage not in stages:
+            raise InputError(f"there is no stage {stage!r}", key=f"SET {_cut(word)}", cure=did_you_mean(stage, stages))
+        try:
+            value = parse_yaml(text, f"SET {_cut(word)}")
+            json.dumps(value, allow_nan=False), msgspec.msgpack.encode(value)
+        except (ValueError, OverflowError, RecursionError) as error:
+            if isinstance(error, InputError):
+                raise
+            words, cure = f"no key can hold the value ({error})", "write a finite number, a word, or a short list"
+            raise InputError(words, key=f"SET {_cut(word)}", cure=cure) from error
+        table = params = dict(stages[stage].params)
+        for name in keys[:-1]:
+            inner = table.get(name)
+            table[name] = table = dict(inner) if isinstance(inner, dict) else {}
+        table[keys[-1]] = value
+        stages[stage] = msgspec.structs.replace(stages[stage], params=params)
+    return msgspec.structs.replace(pipeline, stages=stages, executor=executor)
 
 
-def words_by_key(settings: list[str]) -> dict[str, str]:
-    """Each setting by the key that it stands for in pipeline.yaml: what is wrong with it is said of the setting.
-
-    >>> words_by_key(["solve.lobes=64"])
-    {'stages.solve.params.lobes': 'solve.lobes=64'}
-    """
-    targets = {word: word.partition("=")[0].partition(".") for word in _words(settings)}
-    return {f"stages.{stage}.params.{keys}": word for word, (stage, _, keys) in targets.items()}
-
-
-def said_of_settings(error: InputError, words: dict[str, str]) -> InputError:
+def said_of_settings(error: InputError, settings: list[str]) -> InputError:
     """The same error, of the setting where it is about one, not of the file whose value that replaces."""
-    for key, word in reversed(words.items()):
+    for word in reversed(_words(settings)):
+        stage, _, keys = word.partition("=")[0].partition(".")
+        key = f"stages.{stage}.params.{keys}"
         if error.key == key or (error.key or "").startswith((f"{key}.", f"{key}[")):
             return InputError(error.found, key=f"SET {_cut(word)}", cure=error.cure)
     return error
-
-
-def executor_words(settings: list[str]) -> list[str]:
-    """Settings of a run whose stages take none: where it runs.  InputError for any other.
-
-    >>> executor_words(["executor=dask scheduler=tcp://10.0.0.1:8786"])
-    ['executor=dask', 'scheduler=tcp://10.0.0.1:8786']
-    """
-    words = _words(settings)
-    for word in (word for word in words if not word.startswith(WHERE)):
-        cure = 'only where it runs can be set: SET="executor=dask scheduler=tcp://…"'
-        raise InputError(f"{word[:SHOWN]!r} cannot be set for a study", key="SET", cure=cure)
-    return words
 
 
 def _words(settings: list[str]) -> list[str]:
@@ -238,58 +207,10 @@ def _words(settings: list[str]) -> list[str]:
         try:
             words += shlex.split(text)
         except ValueError as error:
-            said = f"{text[:SHOWN]!r} cannot be split into words ({error})"
+            said = f"{_cut(text)!r} cannot be split into words ({error})"
             raise InputError(said, key="SET", cure="close every quote") from error
     return words
 
 
 def _cut(word: str) -> str:
     return word if len(word) <= SHOWN else word[:SHOWN] + "…"
-
-
-def _setting(word: str, stages: dict[str, Stage]) -> tuple[str, list[str], Any]:
-    target, equals, value = word.partition("=")
-    stage, *keys = target.split(".")
-    if not equals or not keys or not all(keys) or len(keys) > DEEPEST or len(word) > LONGEST:
-        near = "" if keys else did_you_mean(target[:SHOWN], ("executor", "scheduler"))
-        how = 'write stage.parameter=value, as in SET="solve.cells=800"'
-        raise InputError(f"{_cut(word)!r} is no setting", key="SET", cure=near if near.startswith("did") else how)
-    key = f"SET {_cut(word)}"
-    if stage not in stages:
-        raise InputError(f"there is no stage {stage!r}", key=key, cure=did_you_mean(stage, stages))
-    try:
-        return stage, keys, parse_yaml(value, key)
-    except (ValueError, RecursionError) as error:  # thousands of digits or brackets
-        cure = "write a number, a word, or a short list"
-        raise InputError(f"not readable as a value ({error})", key=key, cure=cure) from error
-
-
-def _set(params: dict[str, Any], keys: list[str], value: Any) -> dict[str, Any]:
-    first, *rest = keys
-    if rest:
-        inner = params.get(first, {})
-        value = _set(inner if isinstance(inner, dict) else {}, rest, value)
-    return {**params, first: value}
-
-
-def check_values(pipeline: Pipeline, file: Path) -> None:
-    """Raises InputError for a parameter that no key can hold: each must be a finite number of 64 bits, or text."""
-
-    def check(value: Any, key: str) -> None:
-        """Look at a value and, of a table or list, at what it holds."""
-        wrong = None
-        if isinstance(value, dict | list):
-            for name, item in value.items() if isinstance(value, dict) else enumerate(value):
-                check(item, f"{key}.{name}")
-        elif isinstance(value, float) and not math.isfinite(value):
-            wrong = "is not a finite number"
-        elif isinstance(value, int) and not -(2**63) <= value < 2**63:
-            wrong = "is not a number of 64 bits"
-        elif isinstance(value, str) and ("\0" in value or value.encode(errors="replace").decode() != value):
-            wrong = "is not text"
-        if wrong:
-            cure = "write a number, a word, or leave it out"
-            raise InputError(f"{str(value)[:SHOWN]!r} {wrong}", file=file, key=key, cure=cure)
-
-    for name, stage in pipeline.stages.items():
-        check(stage.params, f"stages.{name}.params")

@@ -137,7 +137,6 @@ _KIND = {
     "param": "parameter {}",
     "recipe": "recipe: {}",
     "recipe file": "file {} of the recipe",
-    "default": "default of parameter {}",
     "facts": "dataset.yaml: {}",
     "file": "file {}",
     "given": "given file {}",
@@ -173,15 +172,12 @@ def _change(name: str, before: Record, after: Record) -> str:
         if came + gone and all(isinstance(name, str) for name in came + gone):
             moved = [*(f"{name!r} came" for name in came[:_NAMED]), *(f"{name!r} went" for name in gone[:_NAMED])]
             return f"{label}: {', '.join(moved)}"
-    return f"{label}: {_shown(old, before, kind, what)} -> {_shown(new, after, kind, what)}"
+    return f"{label}: {_shown(old, kind)} -> {_shown(new, kind)}"
 
 
-def _shown(value: Any, record: Record, kind: str, what: str) -> str:
-    if value is _ABSENT and kind == "param":
-        default = record.get(f"default:{what}", _ABSENT)
-        return "default" if default is _ABSENT else f"{_shown(default, record, 'default', what)} (the default)"
+def _shown(value: Any, kind: str) -> str:
     if value is _ABSENT or (value is None and kind == "facts"):
-        return "not given" if kind == "facts" else "none"
+        return {"facts": "not given", "param": "default"}.get(kind, "none")
     text = json.dumps(value, ensure_ascii=False)
     return text if len(text) <= _LONGEST else text[: _LONGEST - 1] + "…"
 

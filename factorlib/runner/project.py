@@ -5,8 +5,7 @@ from __future__ import annotations
 import importlib
 import os
 import shlex
-import stat
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from functools import cache, partial
 from pathlib import Path
 from typing import Any, NamedTuple, Protocol
@@ -149,13 +148,9 @@ class Project(msgspec.Struct, frozen=True):
         if by_name:
             check_name(name, "a dataset", key="DATASET", reserved=RESERVED)
         for path in ([self.root / "data" / name] if by_name else []) + [Path(os.path.abspath(name))]:
-            try:
-                folder = path if stat.S_ISDIR(os.stat(path).st_mode) else path.parent
-            except (FileNotFoundError, NotADirectoryError):
+            if not os.path.exists(path):
                 continue
-            except (OSError, ValueError) as error:  # no right to look, links in a circle, a part too long, a NUL
-                words = f"{name!r} cannot be looked at ({getattr(error, 'strerror', None) or error})"
-                raise InputError(words, key="DATASET", cure=HOW) from error
+            folder = path if os.path.isdir(path) else path.parent
             check_name(folder.name, "a dataset", file=folder, key="DATASET", reserved=RESERVED)
             if self.root.is_relative_to(folder) or folder == self.build:
                 words = "a dataset cannot be the folder that holds the project"
@@ -194,29 +189,15 @@ class Project(msgspec.Struct, frozen=True):
 
 
 def check_name(
-    name: str,
-    kind: str,
-    *,
-    file: Any = None,
-    key: str | None = None,
-    reserved: tuple[str, ...] = (),
-    most: int = LONGEST,
+    name: str, kind: str, *, file: Any = None, key: str | None = None, reserved: Sequence[str] = (), most: int = LONGEST
 ) -> str:
     """`name`, where it can be the name of one file or folder and is not taken; InputError otherwise.
 
     kind: of what it is the name, with its article;  most: bytes that it may have
     """
-    length = len(name.encode(errors="replace"))
-    wrong = {
-        "that is no name": not name,
-        "that is another folder": name in (".", ".."),
-        "it has a slash": "/" in name,
-        "it has a NUL": "\0" in name,
-        "it has an end of a line": "\n" in name and kind == "a recipe",
-        "build/ uses that name": name in reserved,
-        "it is not UTF-8": name.encode(errors="replace").decode() != name,
-        f"it has {length} bytes, {most} may be": length > most,
-    }
-    if why := next((words for words, holds in wrong.items() if holds), None):
-        raise InputError(f"{kind} cannot be called {name!r}: {why}", file=file, key=key, cure="give it another name")
+    good = name.encode(errors="replace").decode() == name and not set("/\0\n") & set(name)
+    if not good or name in ("", ".", "..", *reserved) or len(name.encode()) > most:
+        but = f", nor {', '.join(reserved)}" if reserved else ""
+        cure = f"give it another name: UTF-8 of at most {most} bytes, without a slash or an end of a line{but}"
+        raise InputError(f"{kind} cannot be called {name!r}", file=file, key=key, cure=cure)
     return name

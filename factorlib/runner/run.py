@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import contextlib
 import json
+import os
 import time
 import traceback
 from concurrent.futures import FIRST_COMPLETED, CancelledError, Future, wait
@@ -17,15 +18,14 @@ from concurrent.futures.process import BrokenProcessPool
 from dataclasses import dataclass
 from pathlib import Path
 
-from filelock import FileLock, Timeout
-
 from factorlib.runner.child import Pools
 from factorlib.runner.display import Display
 from factorlib.runner.gc import tenant
 from factorlib.runner.home import claim, label, remember, show, sound_lines, view_of
-from factorlib.runner.pipeline import DASK, DATASET
+from factorlib.runner.pipeline import DATASET
 from factorlib.runner.plan import Planned, Step
 from factorlib.runner.shared import shared_store
+from factorlib.runner.store import lock
 from factorlib.runner.survey import Survey
 from factorlib.runner.worker import Code, Outcome, Task, run_step
 from factorlib.wholefile import append_text, write_bytes, write_text
@@ -40,7 +40,7 @@ class Running:
 
     planned: Planned
     task: Task
-    lock: FileLock
+    lock: int
     future: Future
     read: int = 0
 
@@ -50,12 +50,13 @@ def run(survey: Survey, display: Display) -> Run:
     claim(survey.project, survey.home, survey.data.folder)
     with tenant(survey.store, display.say) as folder:
         work = Run(survey, display, folder)
+        work.refused = survey.wrong_values(survey.planned())
         if work.refused:
             return work
-        if survey.spec.pipeline.executor == DASK:
+        if survey.spec.pipeline.executor != "processes":
             from factorlib.runner.cluster import Cluster  # which is loaded only then
 
-            work.pools = Cluster(survey.spec.pipeline.scheduler, folder, display.say)
+            work.pools = Cluster(survey.spec.pipeline.executor, folder, display.say)
         try:
             work.go()
         except BaseException:
@@ -63,7 +64,7 @@ def run(survey: Survey, display: Display) -> Run:
             raise
         finally:
             for running in work.running.values():
-                running.lock.release()
+                os.close(running.lock)
             show(survey, survey.planned(frozenset()))
         work.pools.close()
     return work
@@ -77,8 +78,8 @@ class Run:
 
     def __init__(self, survey: Survey, display: Display, folder: Path):
         self.survey, self.display, self.folder, self.pools = survey, display, folder, Pools()
-        self.refused = survey.wrong_values(survey.planned())
-        self.store, self.outputs, self.shared = survey.store, survey.outputs, shared_store(survey.store.root)
+        self.store, self.shared = survey.store, shared_store(survey.store.root)
+        self.refused: list[str] = []
         self.running: dict[Step, Running] = {}
         self.waiting: set[Step] = set()  # for another run, or for what is damaged to be made again
         self.ran: list[Step] = []
@@ -125,24 +126,22 @@ class Run:
         if planned.key in self.made:
             words = f"{planned.reasons[0]}, and was made just now: is the disk failing?"
             return self._fail(step, Outcome(error=words))
-        lock = FileLock(self.store.locks / f"{planned.key}.lock")
-        try:
-            lock.acquire(timeout=0)
-        except Timeout:
+        held = lock(self.store.locks / f"{planned.key}.lock")
+        if held is None:
             self.waiting.add(step)
             return self.display.waits(step)
-        self.outputs.forget(planned.key)
-        if self.outputs.get(planned.key) is not None and "forced" not in planned.reasons:
-            lock.release()  # another run has made it meanwhile
+        self.store.forget(planned.key)
+        if self.store.get(planned.key) is not None and "forced" not in planned.reasons:
+            os.close(held)  # another run has made it meanwhile
             self.stale = True
-        elif not self.outputs.still([self.planned[each].key for each in self.survey.spec.above(step)]):
-            lock.release()  # a run takes hours, and what is used only now is damaged by now
+        elif not self.store.still([self.planned[each].key for each in self.survey.spec.above(step)]):
+            os.close(held)  # a run takes hours, and what is used only now is damaged by now
             self.waiting.add(step)
         else:
             self.display.start(step)
             task = self._task(planned, code)
             future = self.pools.submit(max(code.threads, code.cores), code.threads, run_step, task)
-            self.running[step] = Running(planned, task, lock, future)
+            self.running[step] = Running(planned, task, held, future)
 
     def _task(self, planned: Planned, code: Code) -> Task:
         step, survey, record = planned.step, self.survey, planned.record
@@ -179,7 +178,7 @@ class Run:
         if not stage.over or step.photo is not None:
             return self.store.tree(self.planned[Step(name, step.photo if stage.over else None)].output)
         keys = {each.photo: self.planned[each].key for each in spec.steps_of(name)}
-        return self.store.tree(self.outputs.get(view_of(self.outputs, name, keys, stage.gather)))
+        return self.store.tree(self.store.get(view_of(self.store, name, keys, stage.gather)))
 
     def _log_above(self, step: Step, path: Path) -> Path:
         """What the steps above cost and said when their present results were made, whichever run made them."""
@@ -200,7 +199,7 @@ class Run:
             self._take(self.running.pop(futures[future]))
         self.stale = self.stale or bool(done or self.waiting)
         for step in self.waiting:
-            self.outputs.forget(self.planned[step].key)
+            self.store.forget(self.planned[step].key)
         self.display.tick()
 
     def _listen(self, work: Running) -> None:
@@ -228,15 +227,12 @@ class Run:
             outcome = Outcome(error=f"{name}: {error}", traceback="".join(traceback.format_exception(error)))
             if isinstance(error, BrokenProcessPool | CancelledError) or name == "KilledWorker":  # which is Dask's
                 outcome = Outcome(error=DIED)
-        work.lock.release()
+        os.close(work.lock)
         if outcome.error is not None:
             return self._fail(step, outcome)
-        if self.outputs.get(key) not in (None, outcome.output):
+        if self.store.get(key) not in (None, outcome.output):
             self.display.warn(step, "made again from the same inputs, it came out different")
-        self.outputs.forget(key)
-        if outcome.damaged:
-            where = self.survey.project.shown(outcome.damaged)
-            self.display.warn(step, f"its kept result was damaged and is replaced; what was there: {where}")
+        self.store.forget(key)
         self.survey.previous[str(step)] = work.task.record
         self.ran.append(step)
         self.made.add(key)

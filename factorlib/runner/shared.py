@@ -15,29 +15,24 @@ import contextlib
 import errno
 import os
 import shutil
-import time
 import uuid
-from collections.abc import Callable
 from pathlib import Path, PurePosixPath
 
 import msgspec
 
 from factorlib.errors import InputError
 from factorlib.jsonfile import json_text
-from factorlib.runner.filehash import hash_of_file, is_file_of
+from factorlib.runner.filehash import hash_of_file
 from factorlib.runner.home import sound_lines
 from factorlib.runner.pipeline import Shipping
 from factorlib.runner.plan import Record, key_of
-from factorlib.runner.store import Entry, Store, damage_of
+from factorlib.runner.store import Entry, Say, Store, damage_of, is_abandoned, sweep
 from factorlib.wholefile import replace_file
 
 VARIABLE = "FACTORLIB_STORE"
 NOT_OURS = (errno.EACCES, errno.EPERM, errno.EROFS)  # to read is enough
-ABANDONED = 86400.0  # seconds after which a draft in the shared store is taken to be of a run that was killed
 MADE_FROM = "made_from.json"
 CURE = "restore it from the repository, or make the result anew with FORCE=1"
-
-Say = Callable[[str], None]
 
 
 def shared_store(own: Path) -> Path | None:
@@ -45,31 +40,22 @@ def shared_store(own: Path) -> Path | None:
     if not (named := os.environ.get(VARIABLE)):
         return None
     folder = Path(named).expanduser()
-    try:
-        if folder.is_dir():
-            return None if own.is_dir() and folder.samefile(own) else folder.resolve()
-    except (OSError, RuntimeError, ValueError) as error:  # no right to look, links in a circle, a NUL
-        words, cure = f"cannot be looked at ({error})", "name a folder that you may read"
-        raise InputError(words, file=named[:100], key=VARIABLE, cure=cure) from error
-    cure = "make it, or name another; it may be empty"
-    raise InputError("there is no such folder", file=named, key=VARIABLE, cure=cure)
+    if not os.path.isdir(folder):
+        cure = "make it, or name another that you may read; it may be empty"
+        raise InputError("there is no such folder", file=named[:100], key=VARIABLE, cure=cure)
+    return None if own.is_dir() and folder.samefile(own) else folder.resolve()
 
 
-def fetch(
-    shared: Store, own: Store, key: str, record: Record, draft: Path, say: Say
-) -> tuple[Entry, Path | None] | None:
+def fetch(shared: Store, own: Store, key: str, draft: Path, say: Say) -> Entry | None:
     """Copy the result of `key`, with its log, into the own store; None where the shared one has it not, or not as it was kept.
 
-    draft: a folder of the own store that is not there yet;  second comes what `Store.take_in` gives
+    draft: a folder of the own store that is not there yet
     """
     try:
-        entry = shared.entry(key)
-        if entry is None:
+        if shared.entry(key) is None:
             return None
-        if key_of(entry.record) == key and copied(shared.tree(entry.output), draft, entry.files):
-            taken = own.take_in(record, draft)
-            _copy_log(shared, own, key)
-            return taken
+        if entry := _copied_result(shared, own, key, draft, say):
+            return entry
         say("the shared store's result is not as it was kept: the step is run")
     except OSError as error:
         say(f"the shared store cannot be read ({error.strerror}): the step is run")
@@ -77,28 +63,34 @@ def fetch(
     return None
 
 
-def offer(own: Store, shared: Store, key: str, entry: Entry, say: Say) -> None:
+def offer(own: Store, shared: Store, key: str, say: Say) -> None:
     """Copy a result into the shared store, with its log, unless it is there; silent where one may only read."""
     draft = shared.tmp / f"offer-{os.getpid()}-{uuid.uuid4().hex[:8]}"
     try:
         if not shared.root.is_dir():
             raise FileNotFoundError(errno.ENOENT, "it is gone")
-        there = shared.entry(key)
-        if there and not damage_of(shared.tree(there.output), there.files):
+        if (there := shared.entry(key)) and not damage_of(shared.tree(there.output), there.files):
             return
-        for path in shared.tmp.glob("offer-*"):
-            with contextlib.suppress(OSError):
-                if time.time() - path.stat().st_mtime > ABANDONED:
-                    shutil.rmtree(path, ignore_errors=True)
-        if copied(own.tree(entry.output), draft, entry.files):
-            shared.take_in(entry.record, draft)
-            _copy_log(own, shared, key)
+        shared.tmp.mkdir(parents=True, exist_ok=True)
+        sweep(shared.tmp, is_abandoned)
+        if entry := _copied_result(own, shared, key, draft, lambda _: None):
             shared.keep(key, entry)
     except OSError as error:
         if error.errno not in NOT_OURS:
             say(f"the shared store took nothing ({error.strerror}); the result is kept in build/store")
     finally:
         shutil.rmtree(draft, ignore_errors=True)
+
+
+def _copied_result(source: Store, target: Store, key: str, draft: Path, say: Say) -> Entry | None:
+    """Copy tree and log of a key that is in `source`; None where any of it is not as it was kept."""
+    entry, log = source.entry(key), sound_lines(source.log(key))
+    if key_of(entry.record) != key or not log or not copied(source.tree(entry.output), draft, entry.files):
+        return None
+    entry = target.take_in(entry.record, draft, say)
+    target.logs.mkdir(parents=True, exist_ok=True)
+    replace_file(target.log(key), b"".join(line + b"\n" for line in log))
+    return entry
 
 
 def copied(tree: Path, draft: Path, files: dict[str, str]) -> bool:
@@ -112,13 +104,6 @@ def copied(tree: Path, draft: Path, files: dict[str, str]) -> bool:
         with contextlib.suppress(FileNotFoundError):
             shutil.copyfile(tree / name, draft / name, follow_symlinks=False)
     return not damage_of(draft, files)
-
-
-def _copy_log(source: Store, target: Store, key: str) -> None:
-    """What the result cost and warned of when it was made, wherever that was."""
-    if lines := sound_lines(source.log(key)):
-        target.logs.mkdir(parents=True, exist_ok=True)
-        replace_file(target.log(key), b"".join(line + b"\n" for line in lines))
 
 
 class Shipped(msgspec.Struct, frozen=True):
@@ -158,8 +143,9 @@ def copy_shipped(folder: Path, out: Path) -> None:
     """The files of a shipped result, as the step's own.  Raises InputError where they are not those that were shipped."""
     files = _shipped(folder).files
     if not copied(folder, out, files):
-        wrong = next((name for name in files if not is_file_of(files[name], folder / name)), MADE_FROM)
-        raise InputError("is not the file that was shipped with the source", file=folder / wrong, cure=CURE)
+        raise InputError(
+            "beside it are not the files that were shipped with the source", file=folder / MADE_FROM, cure=CURE
+        )
 
 
 def ship(result: Path, record: Record, root: Path, shipping: Shipping) -> Path:

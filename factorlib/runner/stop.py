@@ -9,7 +9,6 @@ from collections.abc import Iterator
 from types import FrameType
 
 INTERRUPTED, TERMINATED = 128 + signal.SIGINT, 128 + signal.SIGTERM  # exit codes, as shells count
-_waiting: list[int] | None = None  # signals that came while nothing may be interrupted
 
 
 class Stopped(SystemExit):
@@ -22,9 +21,7 @@ class Stopped(SystemExit):
 @contextlib.contextmanager
 def heed_stops() -> Iterator[None]:
     """Within, SIGTERM raises `Stopped` and SIGINT KeyboardInterrupt, once: those that follow disturb no cleaning up."""
-    in_main_thread = (
-        threading.current_thread() is threading.main_thread()
-    )  # only there may Python say what a signal does
+    in_main_thread = threading.current_thread() is threading.main_thread()  # where alone Python may say what signals do
     numbers = [n for n in (signal.SIGINT, signal.SIGTERM) if in_main_thread and signal.getsignal(n) != signal.SIG_IGN]
     before = {number: signal.signal(number, _stop) for number in numbers}
     try:
@@ -34,21 +31,6 @@ def heed_stops() -> Iterator[None]:
             signal.signal(number, handler)
 
 
-@contextlib.contextmanager
-def whole() -> Iterator[None]:
-    """What begins within is finished before a stop is heeded.  Processes that are started within never see SIGINT."""
-    global _waiting
-    outer, _waiting = _waiting, [] if _waiting is None else _waiting
-    mask = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
-    try:
-        yield
-    finally:
-        signal.pthread_sigmask(signal.SIG_SETMASK, mask)
-        came, _waiting = _waiting, outer
-    if outer is None and came:
-        _stop(came[0])
-
-
 def take_sigterm_back() -> None:
     """What Python does at SIGTERM holds again: pycolmap, once imported, prints a C stack instead."""
     if threading.current_thread() is threading.main_thread():
@@ -56,9 +38,6 @@ def take_sigterm_back() -> None:
 
 
 def _stop(number: int, frame: FrameType | None = None) -> None:
-    if _waiting is not None:
-        _waiting.append(number)
-        return
     for each in (signal.SIGINT, signal.SIGTERM):
         signal.signal(each, signal.SIG_IGN)
     raise Stopped if number == signal.SIGTERM else KeyboardInterrupt

@@ -17,15 +17,16 @@ that a tree is read once.  A byte that flips under the same size and time is fou
 from __future__ import annotations
 
 import contextlib
+import fcntl
 import hashlib
 import json
 import os
-import re
 import shutil
 import stat
 import time
 import uuid
 from collections.abc import Callable, Iterable, Mapping
+from functools import cached_property
 from pathlib import Path
 
 import msgspec
@@ -35,9 +36,11 @@ from factorlib.jsonfile import json_text
 from factorlib.runner.filehash import hash_of_file, left_over, read_cache, write_cache
 from factorlib.wholefile import replace_file, sync, sync_tree
 
-DRAFT = re.compile(r"\..+\.([0-9]{1,9})")  # of `factorlib.wholefile.replace_file`: a dot, the name, the process
-OLD = 3600.0  # seconds: what is younger may be written by a process of another machine that shares the folder
+Say = Callable[[str], None]
 Stamp = tuple[int, int]  # size in bytes, time of the content in ns
+ABANDONED = (
+    86400.0  # seconds after which what was being written outside a run is taken to be of a process that was killed
+)
 NO_FILE: Stamp = (-1, 0)  # a link, a pipe: nothing that a stage writes
 
 
@@ -50,21 +53,20 @@ class Entry(msgspec.Struct, frozen=True):
 
 
 class Store:
-    """The store of one build folder."""
+    """The store of one build folder.
+
+    damaged: by key, what is wrong with its tree, so that it has no output
+    """
 
     def __init__(self, root: Path):
         self.root = root
         self.trees, self.keys, self.logs = root / "trees", root / "keys", root / "logs"
-        self.unfinished, self.damaged = root / "unfinished", root / "damaged"
+        self.unfinished, self.damaged_trees = root / "unfinished", root / "damaged"
         self.locks, self.tmp, self.cache = root / "locks", root / "tmp", root / "cache"
-
-    def entry(self, key: str) -> Entry | None:
-        """What is written of a key, None where it was never made; whether its tree is there and right an Inspector says."""
-        try:
-            entry = msgspec.json.decode((self.keys / f"{key}.json").read_bytes(), type=Entry)
-        except (OSError, msgspec.DecodeError):  # a folder in its place, say
-            return None
-        return entry if output_of(entry.files) == entry.output else None
+        self.damaged: dict[str, list[str]] = {}
+        self._outputs: dict[str, str | None] = {}
+        self._entries: dict[str, Entry] = {}
+        self.changed = False
 
     def tree(self, output: str) -> Path:
         """The folder of the tree with that hash."""
@@ -74,44 +76,132 @@ class Store:
         """The file with the log of the result of a key."""
         return self.logs / f"{key}.jsonl"
 
-    def take_in(self, record: dict, folder: Path) -> tuple[Entry, Path | None]:
+    def entry(self, key: str) -> Entry | None:
+        """What is written of a key, None where it was never made; whether its tree is there and right `get` says."""
+        if key not in self._entries:  # what is not there yet may come
+            try:
+                entry = msgspec.json.decode((self.keys / f"{key}.json").read_bytes(), type=Entry)
+            except (OSError, msgspec.DecodeError):  # a folder in its place, say
+                return None
+            if output_of(entry.files) != entry.output:
+                return None
+            self._entries[key] = entry
+        return self._entries[key]
+
+    def get(self, key: str) -> str | None:
+        """Tree hash of a key; None where there is no result, or its tree is damaged (then `damaged` says how)."""
+        if key not in self._outputs and (entry := self.entry(key)):
+            if damage := self.damage(entry):
+                self.damaged[key] = damage
+            self._outputs[key] = None if damage else entry.output
+        return self._outputs.get(key)
+
+    def forget(self, key: str) -> None:
+        """Look `key` up again when it is asked for next."""
+        for known in (self._outputs, self._entries, self.damaged):
+            known.pop(key, None)
+
+    def still(self, keys: Iterable[str]) -> bool:
+        """Whether those keys have the outputs they had, looked up again."""
+        before = {key: self._outputs.get(key) for key in keys}
+        for key in before:
+            self.forget(key)
+        return None not in before.values() and all(self.get(key) == output for key, output in before.items())
+
+    @cached_property
+    def known(self) -> dict[str, dict[str, Stamp]]:
+        """By tree, the stamps of its files when contents were right."""
+        return read_cache(self.cache / "trees.json", dict[str, dict[str, Stamp]]) or {}
+
+    def damage(self, entry: Entry, read_all: bool = False) -> list[str]:
+        """What is wrong with the tree of an entry, a line each; read_all: whatever is remembered of it."""
+        now, known = stamps_of(self.tree(entry.output)), self.known.get(entry.output, {})
+        if now and now == known and not read_all:
+            return []
+        damage = damage_of(self.tree(entry.output), entry.files, {} if read_all else known)
+        if damage:
+            self.changed |= self.known.pop(entry.output, None) is not None
+        else:
+            self.known[entry.output], self.changed = now, True
+        return damage
+
+    def save(self) -> None:
+        """Write down which trees are known to be right, where there is anything new to write."""
+        if self.changed:
+            there = {output: stamps for output, stamps in self.known.items() if self.tree(output).is_dir()}
+            write_cache(self.cache / "trees.json", there)
+            self.changed = False
+
+    def take_in(self, record: dict, folder: Path, say: Say, files: dict[str, str] | None = None) -> Entry:
         """Take the files of `folder` in, as what `record` gave; the folder is gone afterwards.
 
-        Where the same tree stands already it stays if it is right, every content read; else it is set aside, and second
-        comes where it is now.
+        files: their hashes, where these are known and the files are read-only and on disk
+        Where the same tree stands already it stays if it is right, every content read; else it is set aside, which is said.
         """
-        files = hashes_of_tree(folder)
+        if files is None:
+            files = hashes_of_tree(folder)
+            for name in files:
+                (folder / name).chmod(0o444)
+            sync_tree(folder)
         entry = Entry(output_of(files), record, files)
-        for name in files:
-            (folder / name).chmod(0o444)
-        sync_tree(folder)
-        return entry, self.put(folder, self.tree(entry.output), lambda: not damage_of(self.tree(entry.output), files))
-
-    def keep(self, key: str, entry: Entry) -> None:
-        """From now on `key` has that result."""
-        path = self.keys / f"{key}.json"
-        path.parent.mkdir(parents=True, exist_ok=True)
-        replace_file(path, json_text(entry).encode())
-
-    def put(self, folder: Path, target: Path, is_right: Callable[[], bool]) -> Path | None:
-        """Make `folder` the folder `target` by one rename, unless what stands there is right; where that is now, if not."""
+        target = self.tree(entry.output)
         target.parent.mkdir(parents=True, exist_ok=True)
-        aside = None
         while True:
             try:
                 os.rename(folder, target)
                 sync(target.parent)
-                return aside
+                return entry
             except OSError:
                 if not os.path.lexists(target):
                     raise
-            if is_right():
+            if not damage_of(target, files):
                 shutil.rmtree(folder)
-                return aside
-            self.damaged.mkdir(parents=True, exist_ok=True)
-            aside = self.damaged / f"{target.name}-{uuid.uuid4().hex[:8]}"
+                return entry
+            self.damaged_trees.mkdir(parents=True, exist_ok=True)
+            aside = self.damaged_trees / f"{target.name}-{uuid.uuid4().hex[:8]}"
             with contextlib.suppress(FileNotFoundError):  # another run was quicker
                 os.rename(target, aside)
+                say(f"its kept result was damaged and is replaced; what was there: {aside}")
+
+    def keep(self, key: str, entry: Entry) -> None:
+        """From now on `key` has that result."""
+        self.keys.mkdir(parents=True, exist_ok=True)
+        replace_file(self.keys / f"{key}.json", json_text(entry).encode())
+
+
+def lock(path: Path, wait: bool = False) -> int | None:
+    """A lock on a file, held until the descriptor is closed or the process ends; None where another process has it."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    descriptor = os.open(path, os.O_RDWR | os.O_CREAT, 0o666)
+    try:
+        fcntl.flock(descriptor, fcntl.LOCK_EX | (0 if wait else fcntl.LOCK_NB))
+        return descriptor
+    except BlockingIOError:
+        os.close(descriptor)
+        return None
+
+
+def is_locked(path: Path) -> bool:
+    """Whether any process has that lock; looking needs no right to write."""
+    try:
+        with open(path, "rb") as stream:
+            fcntl.flock(stream, fcntl.LOCK_SH | fcntl.LOCK_NB)
+    except (FileNotFoundError, BlockingIOError) as error:
+        return isinstance(error, BlockingIOError)
+    return False
+
+
+def sweep(folder: Path, is_rubbish: Callable[[Path], bool]) -> None:
+    """Delete the folders in `folder` that are rubbish."""
+    for path in folder.iterdir():
+        with contextlib.suppress(FileNotFoundError):
+            if path.is_dir() and is_rubbish(path):
+                shutil.rmtree(path, ignore_errors=True)
+
+
+def is_abandoned(path: Path) -> bool:
+    """Whether nobody has written to a folder for a day."""
+    return time.time() - path.stat().st_mtime > ABANDONED
 
 
 def output_of(files: dict[str, str]) -> str:
@@ -154,99 +244,3 @@ def damage_of(folder: Path, files: Mapping[str, str], right: Mapping[str, Stamp]
             except OSError as error:
                 lines.append(f"{name}: cannot be read ({error.strerror})")
     return lines + [f"{name}: no file of this result" for name in sorted(now.keys() - files.keys())]
-
-
-class Inspector:
-    """Output hash by key (`get`), and whether the trees of a store are as they were kept.
-
-    known: by tree, the stamps of its files when contents were right
-    damaged: by key, what is wrong with its tree, so that it has no output
-    """
-
-    def __init__(self, store: Store):
-        self.store, self.cache, self._changed = store, store.cache / "trees.json", False
-        self.known = read_cache(self.cache, dict[str, dict[str, Stamp]]) or {}
-        self.damaged: dict[str, list[str]] = {}
-        self._outputs: dict[str, str] = {}
-        self._entries: dict[str, Entry | None] = {}
-        self._wrong: dict[str, tuple[dict[str, Stamp], list[str]]] = {}
-
-    def get(self, key: str) -> str | None:
-        """Tree hash of a key; None where there is no result, or its tree is damaged (then `damaged` says how)."""
-        if key not in self._outputs and (entry := self.entry(key)):
-            self.damaged.pop(key, None)
-            if damage := self.damage(entry.output, entry.files):
-                self.damaged[key] = damage
-            else:
-                self._outputs[key] = entry.output
-        return self._outputs.get(key)
-
-    def entry(self, key: str) -> Entry | None:
-        """`Store.entry`, read once."""
-        if self._entries.get(key) is None:  # what is not there yet may come
-            self._entries[key] = self.store.entry(key)
-        return self._entries[key]
-
-    def forget(self, key: str) -> None:
-        """Look `key` up again when it is asked for next."""
-        self._outputs.pop(key, None)
-        self._entries.pop(key, None)
-
-    def still(self, keys: Iterable[str]) -> bool:
-        """Whether those keys have the outputs they had, looked up again."""
-        before = {key: self._outputs.get(key) for key in keys}
-        for key in before:
-            self.forget(key)
-        return None not in before.values() and all(self.get(key) == output for key, output in before.items())
-
-    def damage(self, output: str, files: Mapping[str, str]) -> list[str]:
-        """What is wrong with a tree that should hold `files` (relative path -> hash), a line each; empty where nothing is."""
-        now = stamps_of(self.store.tree(output))
-        if now and now == self.known.get(output):
-            return []
-        if self._wrong.get(output, (None,))[0] != now:
-            self._wrong[output] = now, self.thorough(output, files, self.known.get(output, {}))
-        return self._wrong[output][1]
-
-    def thorough(self, output: str, files: Mapping[str, str], right: Mapping[str, Stamp] | None = None) -> list[str]:
-        """The same, with every content read, but for files whose stamps are in `right`."""
-        tree = self.store.tree(output)
-        now, damage = stamps_of(tree), damage_of(tree, files, right)
-        if damage:
-            self._changed |= self.known.pop(output, None) is not None
-        else:
-            self.remember(output, now)
-        return damage
-
-    def remember(self, name: str, stamps: dict[str, Stamp]) -> None:
-        """Note the stamps of a tree whose contents were right."""
-        if self.known.get(name) != stamps:
-            self.known[name], self._changed = stamps, True
-
-    def save(self) -> None:
-        """Write the cache, where there is anything new to write."""
-        if self._changed:
-            write_cache(
-                self.cache, {name: stamps for name, stamps in self.known.items() if self.store.tree(name).is_dir()}
-            )
-            self._changed = False
-
-
-def sweep_drafts(folder: Path) -> None:
-    """Delete the drafts of writers that were killed: their process is no more, and they are OLD."""
-    for path in folder.glob(".*"):
-        named = DRAFT.fullmatch(path.name)
-        with contextlib.suppress(OSError):
-            if named and not is_alive(int(named[1])) and time.time() - path.lstat().st_mtime > OLD:
-                path.unlink()
-
-
-def is_alive(pid: int) -> bool:
-    """Whether there is such a process on this machine, whoever's it is."""
-    try:
-        os.kill(pid, 0)
-        return True
-    except (ProcessLookupError, OverflowError):
-        return False
-    except PermissionError:
-        return True

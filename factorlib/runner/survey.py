@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import os
-import sys
 from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
@@ -12,21 +10,19 @@ from pathlib import Path
 import msgspec
 
 from factorlib.errors import InputError, did_you_mean
-from factorlib.reading import check_plain
-from factorlib.runner.closure import Packages, Sources, other_than, recorded
+from factorlib.reading import check_plain, reading
+from factorlib.runner.closure import Sources
 from factorlib.runner.filehash import FileHashes
 from factorlib.runner.home import Home, home_of
 from factorlib.runner.pipeline import (
     DATASET,
-    check_values,
     read_pipeline,
     said_of_settings,
     with_settings,
-    words_by_key,
 )
 from factorlib.runner.plan import Listing, Planned, Record, Spec, Step, plan
 from factorlib.runner.project import ALL, Data, Project, Recipe
-from factorlib.runner.store import Inspector, Store
+from factorlib.runner.store import Store
 from factorlib.runner.worker import Code, params_of
 
 RENDER = "render"  # the stage whose pictures a recipe replaces
@@ -40,7 +36,7 @@ class Survey:
     records:  each step's record but for the results it is handed
     recipes:  those that are asked for, by name
     previous: the record each step had when it last was current for this dataset
-    words:    settings of the command line, by the keys of pipeline.yaml that they stand for
+    settings: words of the command line in place of values of pipeline.yaml
     """
 
     project: Project
@@ -49,15 +45,14 @@ class Survey:
     store: Store
     spec: Spec
     records: dict[Step, Record]
-    outputs: Inspector
     previous: dict[str, Record]
     recipes: dict[str, Recipe]
-    words: dict[str, str]
+    settings: list[str]
 
     def planned(self, forced: frozenset[Step] | None = None) -> list[Planned]:
         """Every step with its state and the reason for it; `forced` replaces the spec's steps that must run."""
         spec = self.spec if forced is None else msgspec.structs.replace(self.spec, forced=forced)
-        return plan(spec, self.records, Listing(self.outputs, self.previous, self.outputs.damaged))
+        return plan(spec, self.records, Listing(self.store, self.previous, self.store.damaged))
 
     def code(self, name: str, cores: int = 1) -> Code:
         """A stage with its parameters, as a worker loads it; cores: of the machine, of which it takes what it may."""
@@ -101,7 +96,7 @@ class Survey:
                     if isinstance(
                         error := future.exception(), InputError
                     ):  # what cannot be loaded says so when it runs
-                        faults.append(str(said_of_settings(error, self.words)))
+                        faults.append(str(said_of_settings(error, self.settings)))
             finally:
                 pools.close(kill=True)
         return faults
@@ -122,10 +117,9 @@ def survey(
              a target.  With the target `render` they are all that is wanted
     look: without running it: where recipes are named and no stage, of the recipes alone
     """
-    file, words = project.pipeline_file, words_by_key(settings)
+    file = project.pipeline_file
     pipeline = with_settings(read_pipeline(file, project.provider.slices), settings)
     try:
-        check_values(pipeline, file)
         over_recipes = [name for name, stage in pipeline.stages.items() if stage.over == "recipe"]
         if recipes and (targets == [RENDER] or (look and targets is None)):
             targets = over_recipes
@@ -148,63 +142,42 @@ def survey(
             forced = frozenset(step for name in targets or pipeline.stages for step in spec.steps_of(name))
             spec = msgspec.structs.replace(spec, forced=forced)
         hashes = FileHashes(store.cache / "files.json")
-        records = _records(project, spec, data, hashes, Packages(store.cache / "packages.json"), asked)
+        records = _records(project, spec, data, hashes, store.cache / "packages.json", asked)
     except InputError as error:
-        raise said_of_settings(error, words) from None
+        raise said_of_settings(error, settings) from None
     with contextlib.suppress(OSError):  # of a build/ that is read-only: the next command reads more, that is all
         hashes.save()
-    outputs = Inspector(store)
-    entries = {step: outputs.entry(key) for step, key in home.keys(lenient=True).items()}
+    entries = {step: store.entry(key) for step, key in home.keys(lenient=True).items()}
     previous = {step: entry.record for step, entry in entries.items() if entry}
-    return Survey(project, data, home, store, spec, records, outputs, previous, asked, words)
+    return Survey(project, data, home, store, spec, records, previous, asked, settings)
 
 
 def _records(
-    project: Project, spec: Spec, data: Data, hashes: FileHashes, packages: Packages, recipes: dict[str, Recipe]
+    project: Project, spec: Spec, data: Data, hashes: FileHashes, cache: Path, recipes: dict[str, Recipe]
 ) -> dict[Step, Record]:
-    sources, stages, file = Sources(project.source_roots, hashes), spec.pipeline.stages, project.pipeline_file
+    sources, stages, file = Sources(project.source_roots, hashes, cache), spec.pipeline.stages, project.pipeline_file
     wanted, records = spec.pipeline.needed(spec.targets), {}
-    of = {n: sources.stage_params(project.package, n, file) for n, s in stages.items() if s.params or n in wanted}
-    for name, defaults in of.items():  # names alone: values are checked where the stage is loaded
-        known = [*defaults, *stages[name].given]
-        for param in (param for param in stages[name].params if param not in known):
-            words, cure = f"the stage {name!r} has no parameter {param!r}", did_you_mean(param, known)
-            key = f"stages.{name}.params.{param}"
-            raise InputError(words, file=file, key=key, cure=cure if known else "leave it out")
     for name in wanted:
         stage, closure = stages[name], sources.closure(project.package, name, file)
         record = {"stage": name, "threads": stage.threads, "makes": stage.makes}
-        record |= {"python": f"{sys.version_info[0]}.{sys.version_info[1]}"} | closure.record
-        record |= {f"package:{package}": version for package, version in packages.versions(closure.external).items()}
-        record |= {f"param:{param}": value for param, value in other_than(of[name], stage.values).items()}
-        record |= {f"default:{param}": recorded(value) for param, value in of[name].items()}
+        record |= closure.record | {f"param:{param}": value for param, value in stage.values.items()}
         for param, folder in stage.folders.items():
             for given in stage.given[param]:
-                try:
-                    if os.path.lexists(folder / given):
-                        check_plain(folder / given, "a result", f"{name}.{param}", most_bytes=None)  # a pipe never ends
-                    record[f"given:{param}/{given}"] = hashes.content(folder / given)
-                except (OSError, TypeError):
-                    words = "there is no such folder" if not os.path.isdir(folder) else f"it has no readable {given!r}"
-                    files = ", ".join(stage.given[param])
-                    cure = f"name a folder with {files}, such as the result of an earlier run of the stage"
-                    raise InputError(words, file=project.shown(folder), key=f"{name}.{param}", cure=cure) from None
+                record[f"given:{param}/{given}"] = _hash(folder / given, hashes, f"{name}.{param}")
         for step in spec.steps_of(name):
             records[step] = record | {"photo": step.photo}
             for slice_ in (data.slice(each, step.photo) for each in stage.slices):
                 records[step] |= {f"facts:{DATASET}{field}": value for field, value in slice_.fields.items()}
-                records[step] |= {f"file:{each}": _hash(data.folder, each, hashes) for each in slice_.files}
+                records[step] |= {f"file:{each}": _hash(data.folder / each, hashes) for each in slice_.files}
             if step.recipe is not None:
                 recipe = recipes[step.recipe]
                 records[step] |= {"recipe": step.recipe} | {f"recipe:{f}": value for f, value in recipe.facts.items()}
                 files = recipe.files.items()
-                records[step] |= {f"recipe file:{each}": _hash(path.parent, path.name, hashes) for each, path in files}
+                records[step] |= {f"recipe file:{each}": _hash(path, hashes) for each, path in files}
     return records
 
 
-def _hash(folder: Path, file: str, hashes: FileHashes) -> str:
-    try:
-        return hashes.content(folder / file)
-    except OSError as error:
-        words = f"the file {file!r} cannot be read ({error.strerror})"
-        raise InputError(words, file=folder, cure="check its name and permissions") from error
+def _hash(path: Path, hashes: FileHashes, key: str | None = None) -> str:
+    check_plain(path, "a file", key, most_bytes=None)  # a pipe never ends
+    with reading("a file", path, key):
+        return hashes.content(path)

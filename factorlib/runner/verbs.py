@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-import fcntl
 import os
 import sys
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from importlib import import_module
 from pathlib import Path
 from typing import NamedTuple
@@ -15,14 +14,15 @@ import msgspec
 
 from factorlib.errors import InputError, did_you_mean
 from factorlib.runner import words
-from factorlib.runner.home import Home, claim, home_of, label, made_home, made_homes, show, sound_lines
+from factorlib.runner.gc import homes_of
+from factorlib.runner.home import Home, claim, home_of, label, made_homes, show, sound_lines
 from factorlib.runner.pipeline import Pipeline, read_pipeline
 from factorlib.runner.plan import Planned, Step, difference, in_short
 from factorlib.runner.project import RESERVED, Project, check_name
 from factorlib.runner.shared import shared_store
 from factorlib.runner.shared import ship as put_into_package
 from factorlib.runner.stop import INTERRUPTED, TERMINATED, Stopped, heed_stops
-from factorlib.runner.store import Store
+from factorlib.runner.store import Store, is_locked
 from factorlib.runner.survey import Survey, survey
 from factorlib.runner.worker import Code, load_stage
 from factorlib.wholefile import write_text
@@ -127,8 +127,8 @@ def _refused(seen: Survey, faults: list[str], where: str = "files") -> int:
     return 1
 
 
-def show_plan(project: Project, wish: Wish, lines: Callable[[list[Planned]], list[str]] = words.plan_lines) -> int:
-    """Print what would run; 1 where a value of a parameter would not do.  lines: how a plan is told"""
+def show_plan(project: Project, wish: Wish, every_reason: bool = False) -> int:
+    """Print what would run and why, in short or every reason; 1 where a value of a parameter would not do."""
     seen = survey(project, *wish, look=True)
     planned = seen.planned()
     if faults := seen.wrong_values(planned):
@@ -137,13 +137,8 @@ def show_plan(project: Project, wish: Wish, lines: Callable[[list[Planned]], lis
     for number, p in enumerate(planned if shared else []):
         if p.status != "current" and "forced" not in p.reasons and p.key and (shared.keys / f"{p.key}.json").is_file():
             planned[number] = msgspec.structs.replace(p, reasons=[*p.reasons, "the shared store has it"])
-    print("\n".join(lines(planned)))
+    print("\n".join(words.plan_lines(planned, every_reason)))
     return 0
-
-
-def show_why(project: Project, wish: Wish) -> int:
-    """Print why each step would run; 1 where a value of a parameter would not do."""
-    return show_plan(project, wish, words.why_lines)
 
 
 def show_status(project: Project, wish: Wish) -> int:
@@ -152,17 +147,7 @@ def show_status(project: Project, wish: Wish) -> int:
 
     def running(planned: Planned) -> bool:
         """Whether a run holds the lock on a step's key."""
-        try:
-            descriptor = os.open(seen.store.locks / f"{planned.key}.lock", os.O_RDONLY)  # that needs no right to write
-        except FileNotFoundError:
-            return False
-        try:
-            fcntl.flock(descriptor, fcntl.LOCK_SH | fcntl.LOCK_NB)
-            return False
-        except BlockingIOError:
-            return True
-        finally:
-            os.close(descriptor)
+        return is_locked(seen.store.locks / f"{planned.key}.lock")
 
     def warned(planned: Planned) -> list[str]:
         """What a step said when its present result was made."""
@@ -289,62 +274,11 @@ def compare(project: Project, first: Path, second: Path) -> int:
     return 0
 
 
-def _homes(project: Project, dataset: str | None, otherwise: str) -> list[Home]:
-    """The home of a dataset, or all; none, which is said, where a dataset has no results."""
-    home = None if dataset is None else made_home(project, dataset)
-    if dataset is not None and home is None:
-        print(f"nothing to {otherwise}: {dataset} has no results")
-    return made_homes(project) if dataset is None else [home] if home else []
-
-
-def clean(project: Project, dataset: str | None) -> int:
-    """Forget the results of one dataset, or of all, and say what was deleted."""
-    from factorlib.runner.gc import forget, forget_all
-
-    homes = _homes(project, dataset, "delete")
-    if homes or dataset is None:
-        deleted, left = forget_all(project) if dataset is None else forget(project, homes)
-        lines = [f"deleted {project.shown(path)}" for path in deleted] or ["nothing to delete"]
-        print("\n".join([*lines, *(f"left    {project.shown(path)}" for path in left)]))
-    return 0
-
-
-def collect(project: Project, agreed: Callable[[], bool]) -> int:
-    """Show which results in the store no data set names, and delete them where that is `agreed`, which is asked after they are shown."""
-    from factorlib.runner import gc
-
-    groups = gc.unneeded(project)
-    for line in words.unneeded_lines(groups):
-        print(line)
-    if groups and not agreed():
-        print("nothing was deleted")
-        return 0
-    results, freed = gc.collect(project)
-    print(f"deleted {results} results that nothing names any more, {freed / 1e6:.1f} MB")
-    return 0
-
-
-def verify(project: Project, dataset: str | None) -> int:
-    """Read every result, of a dataset or of all; 1 where any is not as it was kept."""
-    from factorlib.runner.gc import verify as read_all
-
-    homes = _homes(project, dataset, "read")
-    if dataset is not None and not homes:
-        return 0
-    results, damaged = read_all(Store(project.build / "store"), homes, dataset is None)
-    for where, faults, steps in damaged:
-        lines = [f"{', '.join(steps) or 'a result'}: {project.shown(where)}", *(f"    {fault}" for fault in faults)]
-        print("\n".join(lines))
-    more = f"{len(damaged)} damaged; the next run that needs one makes it again"
-    print(f"{results} results read: {more if damaged else 'all are as they were kept'}")
-    return 1 if damaged else 0
-
-
 def pack(project: Project, dataset: str, out: Path | None, replace: bool) -> int:
     """Put a dataset's results into one zip file, which needs neither this checkout nor the dataset."""
     from factorlib.pack import pack as pack_all
 
-    if not (homes := _homes(project, dataset, "pack")):
+    if not (homes := homes_of(project, dataset, "pack")):
         return 1
     out = Path(f"{homes[0].folder.name}.zip") if out is None else out
     count = pack_all(homes[0].folder, out, replace)

@@ -5,7 +5,6 @@ from __future__ import annotations
 import ast
 import inspect
 import textwrap
-import time
 from collections.abc import Callable
 from typing import Any
 
@@ -19,36 +18,24 @@ SHOWN = 8  # reasons of one step that are written out
 NAMED = 20  # steps that have failed
 
 
-def plan_lines(planned: list[Planned]) -> list[str]:
-    """What would run, one line for steps of a stage that share their reasons."""
-    lines = [
-        f"{stage:<10} {status:<7} {items:<24} {in_short(why, SHOWN)}".rstrip()
-        for stage, status, why, items in _alike(planned)
-    ]
-    current = sum(p.status == "current" for p in planned)
-    return [*lines, f"{current} of {len(planned)} steps are current" if lines else f"all {current} steps are current"]
+def plan_lines(planned: list[Planned], every_reason: bool = False) -> list[str]:
+    """What would run, one line for steps of a stage that share their reasons, the photo's own name aside.
 
-
-def why_lines(planned: list[Planned]) -> list[str]:
-    """Every reason of every step that is not current."""
-    lines = []
-    for stage, status, why, items in _alike(planned):
-        lines += [f"{stage} {items}".rstrip() + f": {status}", *(f"    {reason}" for reason in why)]
-    return lines or ["everything is current: sources, parameters, files and versions are those of the last results"]
-
-
-def _alike(planned: list[Planned]) -> list[tuple[str, str, tuple[str, ...], str]]:
-    """Stage, status, reasons and items of steps that are not current and share these, the photo's own name aside."""
+    every_reason: below it, a line each
+    """
     groups: dict[tuple, list[Step]] = {}
     for p in (p for p in planned if p.status != "current"):
         reasons = tuple(_of_any_photo(reason, p.step) for reason in p.reasons)
         groups.setdefault((p.step.stage, p.status, reasons), []).append(p.step)
     lines = []
-    for group, steps in groups.items():
+    for (stage, status, reasons), steps in groups.items():
         names = [step.of for step in steps if step.of]
-        many = f"{len(names)} {'recipes' if steps[0].recipe else 'photos'}"
-        lines.append((*group, ", ".join(names) if len(names) <= 3 else many))
-    return lines
+        items = ", ".join(names) if len(names) <= 3 else f"{len(names)} {'recipes' if steps[0].recipe else 'photos'}"
+        in_line = "" if every_reason else in_short(reasons, SHOWN)
+        lines.append(f"{stage:<10} {status:<7} {items:<24} {in_line}".rstrip())
+        lines += [f"    {reason}" for reason in reasons] if every_reason else []
+    current = sum(p.status == "current" for p in planned)
+    return [*lines, f"{current} of {len(planned)} steps are current" if lines else f"all {current} steps are current"]
 
 
 def _of_any_photo(reason: str, step: Step) -> str:
@@ -123,8 +110,8 @@ def _cost(planned: Planned, events: list[dict]) -> str:
     done = next((event for event in reversed(events) if event["event"] == "done"), None)
     if planned.status != "current":
         return f"{planned.status}: {in_short(planned.reasons, SHOWN)}"
-    if done is None or done.get("shared"):
-        return "its log is not there" if done is None else "from the shared store, without its log"
+    if done is None:
+        return "its log is not there"
     cores = f"{done['threads']} thread{'s' * (done['threads'] > 1)} on {done['cores']} core{'s' * (done['cores'] > 1)}"
     cost = f"{done['seconds']:8.1f} s {done['cpu_seconds']:8.1f} s processor {done['memory_mb']:7.0f} MB peak"
     return f"{cost}   {cores}   {done['started'][:16].replace('T', ' ')} UTC"
@@ -137,26 +124,6 @@ def _made_with(record: dict, events: list[dict]) -> str:
     parts += [f"{machine['system']} {machine['processor']}"] if machine else []
     parts += [f"{n.removeprefix('package:')} {v}" for n, v in sorted(record.items()) if n.startswith("package:")]
     return ", ".join(part.replace(" ", "\N{NO-BREAK SPACE}") for part in parts)
-
-
-def unneeded_lines(groups: dict[str, list[tuple[float, int]]]) -> list[str]:
-    """A line a stage: how many results nothing names, what they take, and how old they are."""
-    lines = []
-    for stage, results in groups.items():
-        oldest, newest = (_age(time.time() - pick(kept for kept, _ in results)) for pick in (min, max))
-        what = f"{stage:<10} {len(results):>5} {'result ' if len(results) == 1 else 'results'}"
-        age = newest if oldest == newest else f"{newest} to {oldest}"
-        lines.append(f"{what} {sum(size for _, size in results) / 1e6:>9.1f} MB   {age} old")
-    return lines
-
-
-def _age(seconds: float) -> str:
-    """
-    >>> _age(30), _age(7200), _age(200000)
-    ('less than an hour', '2 h', '2 days')
-    """
-    hours = int(max(0.0, seconds) // 3600)
-    return "less than an hour" if hours == 0 else f"{hours} h" if hours < 48 else f"{hours // 24} days"
 
 
 def parameter_lines(stage: str, params: type) -> list[str]:

@@ -43,8 +43,9 @@ from factorlib.stage import Inputs
 from factorlib.wholefile import append_text, replace_file
 from factorlib.yamlfile import convert
 
-LIBRARIES = ("OMP", "MKL", "OPENBLAS", "NUMEXPR")
-THREAD_VARIABLES = (*(f"{name}_NUM_THREADS" for name in LIBRARIES), "VECLIB_MAXIMUM_THREADS")
+THREAD_VARIABLES = tuple(f"{of}_NUM_THREADS" for of in ("OMP", "MKL", "OPENBLAS", "NUMEXPR")) + (
+    "VECLIB_MAXIMUM_THREADS",
+)
 EVERY = 0.2  # seconds between two words of progress
 
 
@@ -90,12 +91,10 @@ class Outcome(msgspec.Struct, frozen=True):
     """How a step ended.
 
     output: hash of what was made;  error: what went wrong;  traceback: of a defect, None where a user can mend it
-    damaged: where a result lies now that stood in the place of this one, and was not as it had been kept
     code_changed: whether the stage's code is another than that of the key, so that further steps of it would fail alike
     """
 
     output: str | None = None
-    damaged: Path | None = None
     error: str | None = None
     traceback: str | None = None
     code_changed: bool = False
@@ -106,44 +105,31 @@ class CodeChanged(InputError):
     """The code of a stage was edited while the run went on."""
 
 
-def run_step(task: Task, spread_over: Callable | None = None) -> Outcome:
-    """Run a task and keep its result in the store.  Raises nothing: an error of any kind is part of the outcome.
-
-    spread_over: an ordered map to which its independent work goes, with what it `spent` outside this process: `cpu_seconds`,
-                 and whatever else is worth a log; without, threads of this process
-    """
-    meter, code, store, fetched, made = Meter(), task.code, Store(task.store), None, None
+def run_step(task: Task) -> Outcome:
+    """Run a task and keep its result in the store.  Raises nothing: an error of any kind is part of the outcome."""
+    meter, code, store = Meter(), task.code, Store(task.store)
+    shared = Store(task.shared) if task.shared else None
     with Events(task.events) as events:
         try:
-            if task.shared and not task.forced:
-                fetched = fetch(Store(task.shared), store, task.key, task.record, task.temporary, events.say)
+            fetched = shared and not task.forced and fetch(shared, store, task.key, task.temporary, events.say)
+            entry = fetched or _made(task, store, events)
             if fetched:
                 for event in map(json.loads, sound_lines(store.log(task.key))):
                     if event["event"] == "warning":
                         events.say(str(event.get("text", "")))
-            elif not task.forced and (folder := shipped_folder([code.root, LIBRARY], task.stage.shipped, task.record)):
-                copy_shipped(folder, task.temporary)
-                made = store.take_in(task.record, task.temporary)
-            entry, damaged = fetched or made or _made(task, store, events, spread_over or partial(spread, code.cores))
-            cost = meter.read(code.threads, code.cores)
-            if spread_over is not None and fetched is None and made is None:
-                cpu = round(cost["cpu_seconds"] + spread_over.spent["cpu_seconds"], 3)
-                cost |= {"cpu_seconds": cpu, "spread": spread_over.spent}
-            if fetched is None or not store.log(task.key).exists():  # a line for each warning, one for the step
-                done = (
-                    {"event": "done", **cost} if fetched is None else {"event": "done", "seconds": 0.0, "shared": True}
-                )
+            else:
                 where = {name: task.record[name] for name in ("photo", "recipe") if name in task.record}
                 where |= {"stage": code.stage, "key": task.key}
-                lines = [where | {"event": "warning", "text": text} for text in events.warnings] + [where | done]
+                lines = [where | {"event": "warning", "text": text} for text in events.warnings]
+                lines.append(where | {"event": "done", **meter.read(code.threads, code.cores)})
                 store.logs.mkdir(parents=True, exist_ok=True)
                 text = "".join(json.dumps(line, sort_keys=True) + "\n" for line in lines)
                 replace_file(store.log(task.key), text.encode())
             store.keep(task.key, entry)
             shutil.rmtree(store.unfinished / task.key, ignore_errors=True)
-            if task.shared and fetched is None:
-                offer(store, Store(task.shared), task.key, entry, events.say)
-            return Outcome(output=entry.output, damaged=damaged, seconds=cost["seconds"])
+            if shared and not fetched:
+                offer(store, shared, task.key, events.say)
+            return Outcome(output=entry.output, seconds=meter.read()["seconds"])
         except BaseException as error:  # whatever it is, the parent reports it
             shutil.rmtree(task.temporary, ignore_errors=True)  # on a full disk there is room for a log then
             return _failed(error, task.temporary.parent, meter.read()["seconds"])
@@ -188,8 +174,11 @@ def limit_threads(threads: int) -> None:
         sys.modules["OpenImageIO"].attribute("threads", threads)
 
 
-def _made(task: Task, store: Store, events: Events, map_: Callable) -> tuple[Entry, Path | None]:
-    """Run the step; its tree is in the store afterwards, its key is not."""
+def _made(task: Task, store: Store, events: Events) -> Entry:
+    """Run the step, or copy its shipped result; its tree is in the store afterwards, its key is not."""
+    if not task.forced and (folder := shipped_folder([task.code.root, LIBRARY], task.stage.shipped, task.record)):
+        copy_shipped(folder, task.temporary)
+        return store.take_in(task.record, task.temporary, events.say)
     module, params = load_stage(task.code), params_of(task.code)  # which takes seconds
     photo, out = task.record["photo"], task.temporary
     out.mkdir(parents=True)
@@ -197,6 +186,7 @@ def _made(task: Task, store: Store, events: Events, map_: Callable) -> tuple[Ent
     _check_code(task, hashes)
     results = {folder: stamps_of(folder) for folder in task.folders.values() if folder.is_relative_to(task.store)}
     unfinished = store.unfinished / task.key
+    map_ = partial(spread, task.code.cores)
     inputs = Inputs(task.folders, task.facts, task.files, photo, map_, task.log, unfinished)
     try:
         module.main(params, inputs, out, events.progress)
@@ -211,7 +201,7 @@ def _made(task: Task, store: Store, events: Events, map_: Callable) -> tuple[Ent
             raise FileNotFoundError(f"the stage {task.code.stage!r} made no {pattern}")
     if not any(path.is_file() for path in out.rglob("*")):
         raise FileNotFoundError(f"the stage {task.code.stage!r} made nothing")
-    return store.take_in(task.record, out)
+    return store.take_in(task.record, out, events.say)
 
 
 def _check_inputs(task: Task, results: dict[Path, dict[str, Stamp]]) -> None:
@@ -228,13 +218,15 @@ def _check_inputs(task: Task, results: dict[Path, dict[str, Stamp]]) -> None:
 def _check_code(task: Task, hashes: FileHashes) -> None:
     """The code that the key was made from is the code there is: the source of every module, and the package data."""
     code = task.code
-    closure = Sources([code.root, LIBRARY], hashes).closure(code.package, code.stage, code.settings)
+    sources = Sources([code.root, LIBRARY], hashes, task.store / "cache" / "packages.json")
+    closure = sources.closure(code.package, code.stage, code.settings)
     now, before = closure.record, {n: value for n, value in task.record.items() if n.startswith(CODE)}
     if now != before:
         changed = [name for name in sorted(before.keys() | now.keys()) if before.get(name) != now.get(name)]
         files = [str(closure.files[name]) for name in changed if name in closure.files]
         words = f"the code changed while the run went on ({'; '.join(difference(before, now))})"
-        raise CodeChanged(words, file=", ".join(files) or None, cure="run again")
+        cure = "run again; a worker of a cluster needs the same checkout and the same packages"
+        raise CodeChanged(words, file=", ".join(files) or None, cure=cure)
 
 
 class Meter:
@@ -268,14 +260,17 @@ def _cpu_seconds() -> float:
     return sum(one.ru_utime + one.ru_stime for one in usage)
 
 
-class Heard(logging.Handler):
-    """Within, what the library and Python warn of comes here alone.  warnings: each text once"""
+class Events(logging.Handler):
+    """Progress and warnings of one step, as JSON lines of a file that the parent reads while it runs.
+
+    Within, what the library and Python warn of comes here alone.  warnings: each text once
+    """
 
     LOGGERS = ("factorlib", "py.warnings")
 
-    def __init__(self) -> None:
+    def __init__(self, path: Path):
         super().__init__(logging.WARNING)
-        self.warnings: list[str] = []
+        self.path, self.warnings, self._last = path, [], 0.0
 
     def __enter__(self) -> Self:
         logging.captureWarnings(True)
@@ -295,17 +290,6 @@ class Heard(logging.Handler):
         if text not in self.warnings:
             self.warnings.append(text)
             self.say(text)
-
-    def say(self, text: str) -> None:
-        """Pass a warning on."""
-
-
-class Events(Heard):
-    """Progress and warnings of one step, as JSON lines of a file that the parent reads while it runs."""
-
-    def __init__(self, path: Path):
-        super().__init__()
-        self.path, self._last = path, 0.0
 
     def progress(self, done: float, total: float, text: str = "") -> None:
         """Report that `done` of `total` is done; at most once in EVERY seconds, more frequent calls are dropped."""

@@ -3,7 +3,7 @@
 from studies.measured.tools import ROOT, table
 
 CENTRE = [f"factorlib/{name}" for name in ("solve", "model", "diagnose", "light")]
-LONE = ("__main__", "setup", "lock", "parcel", "wholefile", "disk", "yamlfile", "reading")
+LONE = ("__main__", "setup", "lock", "wholefile", "disk", "yamlfile", "reading")
 MACHINE = ["factorlib/runner", *(f"factorlib/{name}.py" for name in LONE)]
 PARTS = {
     "solve, model, diagnose, light": (CENTRE, 3600),

@@ -17,7 +17,7 @@ from typing import Any
 import msgspec
 
 from factorlib.errors import InputError, did_you_mean
-from factorlib.runner import verbs
+from factorlib.runner import gc, verbs
 from factorlib.runner.filehash import FileHashes
 from factorlib.runner.project import LIBRARY, Data, Project, Provider
 from studies.study import FULL, QUICK, Scale, Study
@@ -99,7 +99,7 @@ def make(
 ) -> int:
     """Run studies as far as anything must run; their results and the page of all that are done lie in build/studies afterwards.
 
-    settings: where their steps run, as `executor=dask`
+    settings: where their steps run, as `executor=tcp://…`
 
     A study that fails holds up no other.  Returns the exit code of the first that failed, 0 where none did.
     """
@@ -128,7 +128,7 @@ def forget(scale: Scale, names: list[str], root: Path = LIBRARY) -> int:
         shutil.rmtree(project.build / name / "pictures", ignore_errors=True)
         for file in FINISHED:
             (project.build / name / file).unlink(missing_ok=True)
-        verbs.clean(project, name)
+        gc.clean(project, name)
     if project.build.is_dir():
         write_page(project)
     return 0
@@ -139,5 +139,5 @@ def collect(agreed: Callable[[], bool]) -> int:
     for project in (studies(FULL), studies(QUICK)):
         if (project.build / "store").is_dir():
             print(f"{project.shown(project.build)}:")
-            verbs.collect(project, agreed)
+            gc.collect(project, agreed)
     return 0

@@ -12,7 +12,7 @@ from pathlib import Path
 import pytest
 
 from factorlib.errors import InputError
-from factorlib.runner import verbs
+from factorlib.runner import gc, verbs
 from factorlib.runner.project import LIBRARY
 from tests.faults.battered import call, make
 from tests.runner import toy
@@ -48,7 +48,7 @@ def everything(project):
 def clean(project, dataset):
     """What `make clean` returns or refuses with."""
     try:
-        return verbs.clean(project, dataset)
+        return gc.clean(project, dataset)
     except InputError as error:
         return str(error)
 
@@ -60,7 +60,7 @@ def test_every_verb_refuses_what_is_no_name_and_deletes_nothing(checkout, verb):
         last = call(checkout, verb, "--dataset", word)
         assert last.startswith("error: ") and "DATASET" in last, word
     os.mkdir(os.fsencode(checkout.root / "data") + b"/\xff\xfe")
-    assert "not UTF-8" in call(checkout, verb, "--dataset", os.fsdecode(b"\xff\xfe"))
+    assert "cannot be called" in call(checkout, verb, "--dataset", os.fsdecode(b"\xff\xfe"))
     os.rmdir(os.fsencode(checkout.root / "data") + b"/\xff\xfe")
     assert everything(checkout) == before
 
@@ -104,7 +104,7 @@ def test_a_name_in_the_pipeline_that_leads_elsewhere_is_refused(project):
 
 
 SETTINGS = [f"table.scale={value}" for value in (
-    ".inf", "-.inf", ".nan", "[1, .nan]", "{a: .inf}", "9" * 5000, "9" * 4000, 2**63, "0x" + "f" * 30,
+    ".inf", "-.inf", ".nan", "[1, .nan]", "{a: .inf}", "9" * 5000, "9" * 4000, "0x" + "f" * 30,
     "[" * 500 + "]" * 500, "[" * 2400, "{a: " * 1000, "'\"\\0\"'", "'\"\\ud800\"'", "'", '"', "&a [*a]",
     "!!python/object:os.system x", "'{a: 1, a: 2}'", "\udcff",
 )] + ["upper.sleep=.inf", "table" + ".a" * 3000 + "=1", "=", ".=", "table.=1", "\udcff.scale=1"]  # fmt: skip
@@ -115,7 +115,7 @@ def test_a_setting_that_is_none_and_a_given_folder_that_leads_nowhere(checkout, 
     before = state(checkout)
     for setting in SETTINGS:
         last = call(checkout, "table", "--dataset", "set", "--set", setting)
-        text = capsys.readouterr().err if last == 1 else last
+        text = str(capsys.readouterr().err if last == 1 else last)
         assert text.startswith("error: ") and len(text) < 600 and "Traceback" not in text, setting
     assert state(checkout) == before and not list((checkout.build / "set").glob("errors/*"))
     write(checkout.root / "pipeline.yaml", toy.PIPELINE.replace("table: {}", "table: {given: {start: [seed.txt]}}"))

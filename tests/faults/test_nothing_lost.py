@@ -21,8 +21,7 @@ from pathlib import Path
 
 import pytest
 
-from factorlib.runner import verbs
-from factorlib.runner.gc import collect
+from factorlib.runner.gc import collect, verify
 from factorlib.runner.project import LIBRARY
 from tests.faults.battered import make
 from tests.runner import toy
@@ -173,7 +172,7 @@ def new_runs(project, *settings):
 
 
 def is_sound(project, dataset=None):
-    return verbs.verify(project, dataset) == 0
+    return verify(project, dataset) == 0
 
 
 def lost_in(project, wanted, *settings):

@@ -270,7 +270,7 @@ def packages():
 
 @pytest.mark.parametrize("share", [6, pytest.param(1, marks=LONG)])
 def test_another_version_of_a_package_reruns_who_imports_it(real, monkeypatch, share):
-    usual(real)
+    usual(real, "synthetic")
     version, by, known = importlib.metadata.version, packages_distributions(), real.build / "store/cache/packages.json"
     monkeypatch.setattr(importlib.metadata, "packages_distributions", lambda: by)
     for distribution in sorted(packages())[::share]:
@@ -325,39 +325,19 @@ def record_of(project, stage, settings=()):
     return next(p.record for p in planned(project, settings) if p.step.stage == stage)
 
 
-def without_fields(text, class_, fields):
-    """The source of a module whose class has lost some fields."""
-    tree = ast.parse(text)
-    node = next(node for node in tree.body if getattr(node, "name", None) == class_)
-    node.body = [n for n in node.body if getattr(getattr(n, "target", None), "id", None) not in fields] + [ast.Pass()]
-    return ast.unparse(tree)
-
-
 WITH = [stage for stage in STAGES if [*leaves(msgspec.to_builtins(params_of(stage)()))]]
 
 
 @pytest.mark.parametrize("stage", [
     pytest.param(stage, marks=() if stage in ("urm", "solve") else LONG) for stage in WITH
 ])  # fmt: skip
-def test_each_parameter_reruns_its_stage_and_what_is_below_its_default_nothing_and_one_removed_is_named(real, stage):
+def test_each_parameter_reruns_its_stage_and_what_is_below(real, stage):
     values, before = dict(leaves(msgspec.to_builtins(params_of(stage)()))), record_of(real, stage)
-    assert other_keys(real, words_of(stage, values)) == set(), "set to their defaults"
     others = {name: another(value) for name, value in values.items()}
     lines = "\n".join(difference(before, record_of(real, stage, words_of(stage, others))))
     unnamed = [name for name in values if f"parameter {name}: " not in lines]  # the others each stand in the key
     for some in (others, *({name: others[name]} for name in unnamed)):
         assert other_keys(real, words_of(stage, some)) == below(real, steps_of(real, {stage})), some
-    classes = {}  # in which fields of the parameters are written
-    for field in {name.partition(".")[0] for name in values}:
-        owner = next(c for c in params_of(stage).__mro__ if field in getattr(c, "__annotations__", {}))
-        classes.setdefault((owner.__module__, owner.__name__), []).append(field)
-    for (module, class_), fields in classes.items():
-        with edited(real, {modules()[module]: without_fields(text_of(module), class_, fields)}):
-            assert other_keys(real) == users(real, module)
-            lines = difference(before, record_of(real, stage))
-            assert all(any(line.startswith(f"default of parameter {field}:") for line in lines) for field in fields)
-            with pytest.raises(InputError, match=f"has no parameter '{fields[0]}'"):
-                keys(real, [f"{stage}.{fields[0]}=1"])
 
 
 # ── what else counts ─────────────────────────────────────────────────────────────────────────────────────────────────
@@ -381,10 +361,6 @@ def test_an_environment_variable_and_a_program_that_a_module_declares_are_in_the
     assert 'program TOY_CC: "sh" -> none' in reasons(fresh, "count/a")
     monkeypatch.setenv("TOY_CC", "/bin/sh")
     assert set(state(fresh).values()) == {"current"}, "where it lies is no matter"
-    monkeypatch.setenv("TOY_CC", "sh 'open")
-    with pytest.raises(InputError, match="is no command") as caught:
-        state(fresh)
-    assert caught.value.key == "TOY_CC"
     write(letters, SPEAKING.replace('("TOY_FORM",)', 'tuple(["TOY_FORM"])'))
     with pytest.raises(InputError, match=r"(?s)letters\.py.*ENVIRONMENT"):
         state(fresh)
@@ -424,7 +400,7 @@ def test_the_field_and_the_parameter_that_changed_are_named_with_old_and_new(rea
         return plan(seen.spec, seen.records, listing if made else Listing(Everything(), {}))
 
     def why(made, spec=SET, settings=()):
-        return "\n".join(words.why_lines(planned_with(spec, settings, made)))
+        return "\n".join(words.plan_lines(planned_with(spec, settings, made), True))
 
     made, lobes = planned_with(), ["solve.lobes=48"]
     for place, value, line in FIELDS:
@@ -432,7 +408,7 @@ def test_the_field_and_the_parameter_that_changed_are_named_with_old_and_new(rea
         assert line in text and "changed" not in text.replace("file ", "")
     linear = edited_data(SET, "photos", value=[photo | {"encoding": "linear"} for photo in SET["photos"]])
     assert why(made, linear).count("encoding") == 1, "what changed in every photo is said once"
-    assert "parameter lobes: 72 (the default) -> 48" in why(made, settings=lobes)
-    assert "parameter lobes: 48 -> 72 (the default)" in why(planned_with(settings=lobes))
+    assert "parameter lobes: default -> 48" in why(made, settings=lobes)
+    assert "parameter lobes: 48 -> default" in why(planned_with(settings=lobes))
     write(project.root / "stages" / "table.py", toy.TABLE.replace("scale: int = 2", "scale: int = 3"))
-    assert reasons(project, "table") == ["default of parameter scale: 2 -> 3", "source of stages.table: changed"]
+    assert reasons(project, "table") == ["source of stages.table: changed"]

@@ -16,7 +16,7 @@ from factorlib.runner.project import LIBRARY
 
 
 class LiveCluster(contextlib.AbstractContextManager):
-    """A scheduler in a process of its own, and its workers, each started by `python -m factorlib worker`."""
+    """A scheduler in a process of its own, and its workers."""
 
     def __init__(self, workers: int, folder: Path, environment: dict[str, str] | None = None):
         self.folder, self.environment = folder, environment or {}
@@ -29,8 +29,8 @@ class LiveCluster(contextlib.AbstractContextManager):
 
     def add_worker(self) -> subprocess.Popen:
         """One more, of one core; returns when the scheduler knows it."""
-        options = f"--cores 1 --host 127.0.0.1 --local-directory {tempfile.gettempdir()}".split()
-        return self.start("factorlib", "worker", self.address, *options, says="Registered to")
+        options = f"--nthreads 1 --host 127.0.0.1 --local-directory {tempfile.gettempdir()}".split()
+        return self.start("distributed.cli.dask_worker", self.address, *options, says="Registered to")
 
     def start(self, *words: str, says: str) -> subprocess.Popen:
         """A process `python -m <words>` that has written `says`, a colon and a word into its log."""
@@ -50,7 +50,7 @@ class LiveCluster(contextlib.AbstractContextManager):
     @property
     def settings(self) -> list[str]:
         """The words that make a run use it."""
-        return ["executor=dask", f"scheduler={self.address}"]
+        return [f"executor={self.address}"]
 
     def kill_workers(self) -> None:
         """SIGKILL to all but the scheduler."""

@@ -43,13 +43,14 @@ def test_every_form_of_import_is_followed(tmp_path):
     for name, text in files.items():
         toy.write(tmp_path / name, text)
     closure = Sources([tmp_path], FileHashes(None)).closure("stages", "s", Path("pipeline.yaml"))
-    assert set(closure.modules) == {"p", "p.a", "p.b", "p.sub", "p.sub.c", "p.sub.e", "stages.s"}
+    modules = {name.removeprefix("source:") for name in closure.record if name.startswith("source:")}
+    assert modules == {"p", "p.a", "p.b", "p.sub", "p.sub.c", "p.sub.e", "stages.s"}
     assert {n for n in closure.record if n.startswith("data:")} == {
         "data:p:kernel.c",
         "data:p:w.safetensors",
         "data:p.sub:templates/page.html",
     }
-    assert closure.external == ["numpy"]
+    assert [name for name in closure.record if name.startswith("package:")] == ["package:numpy"]
 
 
 def test_a_package_that_lies_beside_an_installed_library_is_none_of_the_project(tmp_path):
@@ -57,29 +58,9 @@ def test_a_package_that_lies_beside_an_installed_library_is_none_of_the_project(
     for name in ("factorlib/__init__.py", "factorlib/a.py", "numpy/__init__.py"):
         toy.write(tmp_path / "site-packages" / name, "")
     roots = [tmp_path / "root", tmp_path / "site-packages"]
-    closure = Sources(roots, FileHashes(None)).closure("stages", "s", Path("pipeline.yaml"))
-    assert closure.modules == {"stages.s", "factorlib", "factorlib.a"} and closure.external == ["numpy"]
-
-
-def test_defaults_are_followed_to_bases_constants_and_instances(tmp_path):
-    files = {
-        "stages/s.py": "from p.a import NOISE, Base\nLOW, HIGH = 1, (2, 3)\nclass Params(Base):\n    low: int = LOW\n"
-        "    high: tuple = HIGH\n    noise: float = NOISE.absolute\n    sum: int = LOW + 1\n    none: int\n",
-        "p/__init__.py": "",
-        "p/a.py": "class Noise:\n    absolute: float = 1e-3\nNOISE = Noise()\nclass Base:\n    limits: Noise = Noise()\n    low: int = 7\n",
-    }
-    for name, text in files.items():
-        toy.write(tmp_path / name, text)
-    found = Sources([tmp_path], FileHashes(None)).stage_params("stages", "s", Path("pipeline.yaml"))
-    expected = {
-        "limits": {"absolute": 0.001},
-        "low": 1,
-        "high": [2, 3],
-        "noise": 0.001,
-        "sum": "LOW + 1",
-        "none": "none",
-    }
-    assert found == expected
+    record = Sources(roots, FileHashes(None)).closure("stages", "s", Path("pipeline.yaml")).record
+    sources = {name for name in record if name.startswith(("source:", "package:"))}
+    assert sources == {"source:stages.s", "source:factorlib", "source:factorlib.a", "package:numpy"}
 
 
 class Inner(msgspec.Struct, frozen=True):

@@ -2,7 +2,6 @@
 
 import json
 import os
-import re
 import signal
 import threading
 import time
@@ -39,37 +38,15 @@ def main(params, inputs, out, progress):
     (out / "environment.json").write_text(json.dumps([environment, list({{"a", "b", "c", "d"}})]))
 """
 SUMS = """
-import json, logging, os, time, uuid
-from functools import partial
+import json
 import msgspec
 import numpy as np
-from factorlib.errors import InputError
-log = logging.getLogger("factorlib.sums")
 class Params(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    bad: int = -1
-    wait: str = ""
-def total(item, bad):
-    number, values = item
-    if number == bad:
-        raise InputError(f"number {number} is bad", cure="leave it out")
-    if number == 3:
-        log.warning("number %d is odd", number)
-    return number, values.sum(0), os.environ["OMP_NUM_THREADS"]
-def delayed(item, wait):
-    if wait:
-        open(f"{os.path.dirname(wait)}/{item[0]}-begun-{uuid.uuid4().hex}", "x").close()
-    while wait and not os.path.exists(wait):
-        time.sleep(0.05)
-    return item
+    pass
 def main(params, inputs, out, progress):
     values = np.random.default_rng(0).normal(size=(12, 1000, 33)).astype(np.float32)
-    items = [(k, values[k, :, ::4]) for k in range(12)]
-    for _ in range(3):
-        sums = inputs.map(partial(total, bad=params.bad), items)
-    inputs.map(partial(delayed, wait=params.wait), items)
-    factor = float(sums[0][1][0])
-    scaled = inputs.map(lambda item: item[1] * factor, sums)
-    (out / "sums.json").write_text(json.dumps([[n, s.tobytes().hex(), t, v.tobytes().hex()] for (n, s, t), v in zip(sums, scaled)]))
+    sums = inputs.map(lambda k: values[k, :, ::4].sum(0), range(12))
+    (out / "sums.json").write_text(json.dumps([s.tobytes().hex() for s in sums]))
 """
 MORE = """  proof: {inputs: [count], threads: 2, makes: [environment.json]}
   sums: {inputs: [upper], cores: all, makes: [sums.json]}
@@ -128,12 +105,10 @@ def test_a_cluster_of_two_gives_the_bytes_and_keys_of_one_process(project, live,
     assert make(project, *live.settings) == 0
     assert kept(project) == expected
     text = capsys.readouterr().err
-    assert text.count("d is odd") == 1 and text.count("number 3 is odd") == 1, "what blocks warn of is not lost"
+    assert text.count("d is odd") == 1
     assert make(project) == 0 and "nothing to do" in capsys.readouterr().out, "where it ran is in no key"
     environment = json.loads((project.build / "set" / "proof" / "environment.json").read_text())[0]
     assert environment == FIXED, "whatever the workers were started in"
-    (cost,) = (event for event in done_of(project) if event["stage"] == "sums")
-    assert cost["spread"]["maps"] == 5 and cost["spread"]["tasks"] == 5 * 8 and cost["cores"] == 2
     assert not list((project.build / "store" / "tmp").iterdir()), "something is left behind"
 
 
@@ -142,11 +117,6 @@ def test_a_cluster_of_two_gives_the_bytes_and_keys_of_one_process(project, live,
 def test_any_number_of_workers_gives_the_same_bytes(project, tmp_path, workers):
     with LiveCluster(workers, tmp_path) as live:
         assert make(project, *live.settings) == 0
-    assert kept(project) == beside(project)
-
-
-def test_a_cluster_of_this_machine_gives_the_same_bytes(project):
-    ended(start(project, "executor=dask"))
     assert kept(project) == beside(project)
 
 
@@ -159,16 +129,6 @@ def waiting_for_a_file(project, tmp_path):
     wait = f"open({str(tries)!r}, 'a').write(inputs.photo)\n    while not __import__('os').path.exists({str(go)!r}): time.sleep(0.05)"
     write(project.root / "stages" / "upper.py", toy.UPPER.replace("time.sleep(params.sleep)", wait))
     return go, tries
-
-
-def waiting_blocks(project, tmp_path):
-    """A setting with which the blocks of `sums` end only once a file is there, that file, and the blocks that have begun."""
-    kept_lines = [
-        line for line in (toy.PIPELINE + MORE).splitlines() if not re.match("  (count|table|total|proof):", line)
-    ]
-    write(project.root / "pipeline.yaml", "\n".join(kept_lines))
-    go = tmp_path / "go"
-    return f"sums.wait={go}", go, lambda: sorted(path.name.partition("-")[0] for path in tmp_path.glob("*-begun-*"))
 
 
 def at_work(project, count):
@@ -228,10 +188,10 @@ def test_a_run_whose_workers_are_all_killed_says_so_and_goes_on_when_one_comes(
 ):
     """The last test of these workers."""
     monkeypatch.setattr(cluster, "PATIENCE", 2)
-    setting, go, begun = waiting_blocks(project, tmp_path)
+    go, tries = waiting_for_a_file(project, tmp_path)
 
     def kill_all():
-        assert wait_until(lambda: len(begun()) == 2)
+        assert wait_until(lambda: tries.exists() and len(tries.read_text()) == 2)
         live.kill_workers()
         time.sleep(5)
         go.touch()
@@ -239,78 +199,55 @@ def test_a_run_whose_workers_are_all_killed_says_so_and_goes_on_when_one_comes(
 
     thread = threading.Thread(target=kill_all)
     thread.start()
-    assert make(project, *live.settings, setting) == 0
+    assert make(project, *live.settings) == 0
     thread.join()
     text = "".join(capsys.readouterr())
-    assert text.count("no worker is left at") == 1 and f"-m factorlib worker {live.address}" in text
-    assert kept(project) == beside(project, setting)
+    assert text.count("there is no worker at") == 1 and f".venv/bin/dask worker {live.address}" in text
+    assert kept(project) == beside(project)
 
 
 @pytest.mark.parametrize("change, words, cure", [
     ({"run": Path("/nowhere")}, "does not see the run's folder", "mount at the same path"),
-    ({"library": Path("/other")}, f"runs the code in {LIBRARY}", "cd /other && .venv/bin/python -m factorlib worker"),
-    ({"python": "3.99"}, "the run has 3.99", "-m factorlib worker"),
-    ({"record": {"package:msgspec": "0.0"}}, f"has msgspec {msgspec.__version__}, the run has 0.0", "make setup"),
+    ({"library": Path("/other")}, f"runs the code in {LIBRARY}", "cd /other && .venv/bin/dask worker"),
 ])  # fmt: skip
-def test_a_worker_elsewhere_or_with_another_version_of_what_a_step_imports_is_refused(tmp_path, change, words, cure):
+def test_a_worker_elsewhere_is_refused(tmp_path, change, words, cure):
     good = Site(tmp_path)
-    assert good.fault({"package:msgspec": msgspec.__version__}) is None
-    record = change.pop("record", None)
-    fault = str(msgspec.structs.replace(good, **change).fault(record))
+    assert good.fault() is None
+    fault = str(msgspec.structs.replace(good, **change).fault())
     assert words in fault and cure in fault
 
 
 def test_without_dask_the_cure_names_the_extra(project, monkeypatch):
     monkeypatch.setattr(cluster, "find_spec", lambda name: None)
     with pytest.raises(InputError, match="EXTRAS=dask"):
-        make(project, "executor=dask")
-    with pytest.raises(InputError, match="EXTRAS=dask"):
-        cluster.start_worker("tcp://127.0.0.1:1", None, [])
+        make(project, "executor=tcp://127.0.0.1:1")
 
 
-@pytest.mark.parametrize("address, words, cure", [
-    ("tcp://127.0.0.1:9", "no Dask scheduler answers at tcp://127.0.0.1:9", "dask scheduler --port"),
-    ("tls://127.0.0.1:9", "tls:// asks for certificates, and there are none", "distributed.comm.tls"),
-    ("ucx://127.0.0.1:9", "ucx:// cannot be spoken here", "write tcp://<host>:<port>"),
-])  # fmt: skip
-def test_a_scheduler_out_of_reach_is_named_and_no_worker_is_started_for_it(
-    project, monkeypatch, address, words, cure, capfd
-):
+@pytest.mark.parametrize("address", ["tcp://127.0.0.1:9", "tls://127.0.0.1:9", "ucx://127.0.0.1:9"])
+def test_a_scheduler_out_of_reach_is_named(project, monkeypatch, address, capfd):
     monkeypatch.setattr(cluster, "PATIENCE", 0.3)
-    with pytest.raises(InputError, match=re.escape(words)) as refused:
-        make(project, "executor=dask", f"scheduler={address}")
-    assert cure in str(refused.value) and "Traceback" not in "".join(capfd.readouterr())
-    if not address.startswith("tcp"):
-        with pytest.raises(InputError, match=f"worker: {words[:20]}"):
-            cluster.start_worker(address, None, [])
-    with pytest.raises(InputError, match=r"worker: '10.0.0.1' is no address"):
-        cluster.start_worker("10.0.0.1", None, [])
+    with pytest.raises(InputError, match=f"no Dask scheduler answers at {address}") as refused:
+        make(project, f"executor={address}")
+    assert "dask scheduler --port" in str(refused.value) and "Traceback" not in "".join(capfd.readouterr())
 
 
-PLAIN, ON_DASK = "format: 1\nstages: {}\n", "format: 1\nexecutor: dask\nscheduler: tcp://a:1\nstages: {}\n"
+PLAIN, ON_DASK = "format: 1\nstages: {}\n", "format: 1\nexecutor: tcp://a:1\nstages: {}\n"
 
 
 @pytest.mark.parametrize("text, setting, expected", [
-    (PLAIN, "", ("processes", None)),
-    (PLAIN, "executor=dask scheduler=tcp://10.0.0.1:8786", ("dask", "tcp://10.0.0.1:8786")),
-    (ON_DASK, "", ("dask", "tcp://a:1")),
-    (ON_DASK, "scheduler=tls://b:2", ("dask", "tls://b:2")),
-    (ON_DASK, "scheduler=", ("dask", None)),
-    (ON_DASK, "executor=processes", ("processes", None)),
-    (PLAIN, "executor=dusk", "SET executor: there is no executor 'dusk'\n  did you mean 'dask'?"),
-    (PLAIN, "exectuor=dask", "'exectuor=dask' is no setting\n  did you mean 'executor'?"),
-    (PLAIN, "scheduler=tcp://a:1", 'only Dask has a scheduler\n  write SET="executor=dask scheduler=…"'),
-    (PLAIN, "executor=dask scheduler=a:1", "'a:1' is no address\n  write tcp://<host>:<port>"),
-    ("executor: dusk\n" + PLAIN, "", "executor: there is no executor 'dusk'\n  did you mean 'dask'?"),
-    ("scheduler: tcp://a:1\n" + PLAIN, "", "scheduler: only Dask has a scheduler\n  add executor: dask"),
+    (PLAIN, "", "processes"),
+    (PLAIN, "executor=tcp://10.0.0.1:8786", "tcp://10.0.0.1:8786"),
+    (ON_DASK, "", "tcp://a:1"),
+    (ON_DASK, "executor=processes", "processes"),
+    (PLAIN, "executor=dusk", "SET executor=dusk: "),
+    (PLAIN, "exectuor=dask", "SET: 'exectuor=dask' is no setting"),
+    ("executor: dusk\n" + PLAIN, "", "pipeline.yaml:1: executor: "),
     ("executer: dask\n" + PLAIN, "", "did you mean 'executor'?"),
 ])  # fmt: skip
 def test_where_steps_run_stands_in_pipeline_yaml_and_a_setting_replaces_it(tmp_path, text, setting, expected):
     write(tmp_path / "pipeline.yaml", text)
-    if isinstance(expected, str):
-        with pytest.raises(InputError) as refused:
-            with_settings(read_pipeline(tmp_path / "pipeline.yaml", ()), [setting])
-        assert expected in str(refused.value)
-    else:
-        pipeline = with_settings(read_pipeline(tmp_path / "pipeline.yaml", ()), [setting])
-        assert (pipeline.executor, pipeline.scheduler) == expected
+    try:
+        found = with_settings(read_pipeline(tmp_path / "pipeline.yaml", ()), [setting]).executor
+    except InputError as error:
+        found = str(error)
+    assert expected in found

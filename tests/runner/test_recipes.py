@@ -7,7 +7,7 @@ import pytest
 
 from factorlib.errors import InputError
 from factorlib.runner import verbs
-from factorlib.runner.gc import collect
+from factorlib.runner.gc import clean, collect
 from factorlib.runner.home import made_homes
 from factorlib.runner.project import Project, Provider, Recipe
 from factorlib.runner.survey import survey
@@ -84,7 +84,7 @@ def test_what_was_asked_for_before_stays_until_it_is_cleaned(project):
     assert verbs.make(project, verbs.Wish("set")) == 0  # without recipes
     collect(project)
     assert said(project, "hello") and to_run(project, "all") == []
-    verbs.clean(project, "set")
+    clean(project, "set")
     assert made_homes(project) == [] and not (project.build / "set").exists()
 
 

@@ -14,6 +14,7 @@ import pytest
 from factorlib.errors import InputError
 from factorlib.runner import verbs
 from factorlib.runner.filehash import hash_of_file
+from factorlib.runner.gc import verify
 from factorlib.runner.project import LIBRARY
 from factorlib.runner.shared import MADE_FROM
 from factorlib.runner.store import output_of
@@ -69,7 +70,7 @@ def test_what_one_checkout_makes_the_other_copies_with_its_log(tmp_path, one, ca
     assert "not made yet; the shared store has it" in capsys.readouterr().out
     assert make(other) == 0 and computed(other) == 0
     assert files_of(other.build / "set" / "total") == files_of(one.build / "set" / "total")
-    assert set(state(other).values()) == {"current"} and verbs.verify(other, None) == 0
+    assert set(state(other).values()) == {"current"} and verify(other, None) == 0
     assert len((other.build / "set" / "log.jsonl").read_text().splitlines()) == 6, "what it cost is known here too"
 
 
@@ -172,6 +173,6 @@ def test_a_shipped_result_is_taken_where_sources_and_parameters_are_its_own(ship
 def test_a_shipped_file_that_was_changed_is_an_error_and_what_does_not_ship_is_not_shipped(shipping, capsys):
     (shipping.root / "stages" / "tables" / "table.json").write_text("8")
     assert make(shipping, targets=["table"]) == 1
-    assert "is not the file that was shipped" in capsys.readouterr().err
+    assert "are not the files that were shipped" in capsys.readouterr().err
     with pytest.raises(InputError, match="no result of 'total' ships"):
         verbs.ship(shipping, "total", "set")

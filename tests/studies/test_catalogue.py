@@ -47,7 +47,7 @@ def test_every_step_has_a_module_and_takes_what_was_made_before_it():
     for name, study in STUDIES.items():
         steps, project = study.steps or (name.replace("-", "_"),), studies(name=name)
         for k, step in enumerate(steps):
-            assert sources.closure(project.package, step, project.pipeline_file).modules
+            assert sources.closure(project.package, step, project.pipeline_file).record
             assert {each for each in stages[step]["inputs"] if "." not in each} <= set(steps[:k])
         assert stages[steps[-1]]["gather"] == "scores.json"
         used |= set(steps)
