@@ -200,10 +200,12 @@ class Result:
 
     def _drawn(self, kind: str, photo: str, fields: dict[str, Any]) -> Drawn:
         """What a recipe for one photo makes."""
-        recipe, path, solved = _check(KINDS[kind], photos=[photo], **fields), Path(kind), self._solved
-        check_recipe(recipe, path, {name: own.objects for name, own in solved.objects.items()}, solved.names)
+        recipe, path, inputs = _check(KINDS[kind], photos=[photo], **fields), Path(kind), self._solved.inputs
+        check_recipe(
+            recipe, path, {name: own.objects for name, own in self._solved.objects.items()}, self._solved.names
+        )
         given = {f"recipe file:{name}": file for name, file in files_of(recipe, path).items()}
-        solved = SolvedSet(msgspec.structs.replace(solved.inputs, files={**solved.inputs.files, **given}))
+        solved = SolvedSet(msgspec.structs.replace(inputs, files=inputs.files | given))
         with TemporaryDirectory() as out:
             draw(recipe, solved, Path(out), silent)
             files = sorted(path for path in Path(out).rglob("*") if path.is_file())
@@ -271,8 +273,9 @@ class Environment(msgspec.Struct, frozen=True):
         write_hdr(path, self.lat_long)
 
     def __repr__(self) -> str:
-        height, width = self.lat_long.shape[:2]
-        return f"Environment, {width} × {height}, radiance at most {self.lat_long.max():.4g}"
+        return (
+            f"Environment, {self.lat_long.shape[1]} × {len(self.lat_long)}, radiance at most {self.lat_long.max():.4g}"
+        )
 
     def _repr_html_(self) -> str:
         return _image(picture(self.lat_long))
@@ -284,30 +287,27 @@ class Picture(Traced, frozen=True):
     about: str = ""
 
     def __repr__(self) -> str:
-        height, width = self.pixels.shape[:2]
-        return f"Picture of {self.about}, {width} × {height}"
+        return f"Picture of {self.about}, {self.pixels.shape[1]} × {len(self.pixels)}"
 
     def _repr_html_(self) -> str:
         return _image(self.rgba(min(1.0, self.exposure)))
 
 
-class Drawn(msgspec.Struct, frozen=True):
+class Drawn(dict[str, bytes]):
     """The files that a recipe makes of a photo, by name: PNG (8-bit sRGB), EXR (linear), and of an animation its GIF and frames."""
-
-    files: dict[str, bytes]
 
     def save(self, folder: str | Path) -> None:
         """Write them into a folder, which is made where it is missing; files of these names are replaced."""
-        for name, data in self.files.items():
+        for name, data in self.items():
             (path := Path(folder, name)).parent.mkdir(parents=True, exist_ok=True)
             write_bytes(path, data)
 
     def __repr__(self) -> str:
-        return f"Drawn: {', '.join(name for name in self.files if '/' not in name)}"
+        return f"Drawn: {', '.join(name for name in self if '/' not in name)}"
 
     def _repr_html_(self) -> str:
-        name = next(name for kind in (".gif", ".png") for name in self.files if name.endswith(kind))
-        return f'<img src="data:image/{name[-3:]};base64,{base64.b64encode(self.files[name]).decode("ascii")}">'
+        name = next(name for kind in (".gif", ".png") for name in self if name.endswith(kind))
+        return f'<img src="data:image/{name[-3:]};base64,{base64.b64encode(self[name]).decode("ascii")}">'
 
 
 def _image(pixels: np.ndarray) -> str:
