@@ -8,6 +8,7 @@ from importlib import import_module
 from typing import Any
 
 __version__ = "0.2.0"
+__all__ = ["__version__", "load_result"]
 
 
 def __getattr__(name: str) -> Any:

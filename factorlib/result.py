@@ -5,17 +5,21 @@
     r.environment("kitchen").rotate(90).to_exr("kitchen.exr")
     r.relight("yellow_chair", "garden")            # a picture, shown by a notebook
     r.render(view="terrace", azimuth=40).to_png("terrace.png")
+    r.insert("kitchen", mesh="chair", material="black", size=0.7).save("pictures")      # as by a recipe
 
 Names that are not there are refused with those that are.  Pictures are path-traced, as those of recipes.
 """
 
 from __future__ import annotations
 
+import base64
 import html
+import logging
 import os
 from collections.abc import Iterator, Mapping
 from pathlib import Path
-from typing import TypeVar
+from tempfile import TemporaryDirectory
+from typing import Any, TypeVar
 
 import msgspec
 import numpy as np
@@ -31,13 +35,16 @@ from factorlib.jsonfile import read_json
 from factorlib.light.latlong import turned_map
 from factorlib.reading import check_plain
 from factorlib.recipe import schema
-from factorlib.recipe.schema import is_light_file
+from factorlib.recipe.read import check_recipe, files_of
+from factorlib.recipe.schema import KINDS, is_light_file
+from factorlib.render.drawing import draw
 from factorlib.render.photo_scene import Light, PhotoScene, orbit, resized, traced_photo
 from factorlib.render.solved_set import SolvedSet
 from factorlib.render.traced import Traced, as_it_is
 from factorlib.report.pictures import data_uri
 from factorlib.results.materials import Solved
-from factorlib.stage import Inputs
+from factorlib.stage import Inputs, silent
+from factorlib.wholefile import write_bytes
 from factorlib.yamlfile import convert
 
 T = TypeVar("T")
@@ -50,6 +57,7 @@ SLICES = {
 }  # what the stage `recipes` is handed
 MARK = "dataset.txt"
 SAMPLES = 64
+log = logging.getLogger("factorlib.result")
 
 
 def load_result(folder: str | Path) -> Result:
@@ -58,6 +66,9 @@ def load_result(folder: str | Path) -> Result:
     It is as it was solved: the data set is not read, may have changed, or be gone, and the folder may be a copy (`cp -rL build/eames …`).
     Raises InputError where there is none, or it is not whole.
     """
+    if not isinstance(folder, str | os.PathLike):
+        cure = 'name its folder, as in load_result("build/eames")'
+        raise InputError(f"a result is named by a path, not by {type(folder).__name__} {folder!r}", cure=cure)
     places = [Path(*k * [".."]) for k in range(len(Path.cwd().parts))]  # a notebook runs in its own folder
     candidates = [path for place in places for path in (place / folder, place / "build" / folder)]
     found = next((path for path in candidates if os.path.isfile(path / MARK)), None)
@@ -151,13 +162,14 @@ class Result:
         _check(schema.View, azimuth=azimuth, elevation=elevation, zoom=zoom, width=width, samples=samples)
         scene = resized(self._solved.scene(photo), width)
         traced = traced_photo(scene, samples, world_from_camera=orbit(scene, azimuth, elevation, zoom))
-        return Picture(traced, self._solved.tone(photo))
+        return Picture(traced, self._solved.tone(photo), photo)
 
     def relight(
         self, name: str, light: str | Path | Environment, width: int | None = None, samples: int = SAMPLES
     ) -> Picture:
         """An object, as its photo shows it, in the light of another photo, of a file (.hdr, .exr), or of an `Environment`.
 
+        The picture's `about` says of which photo: where several have an object of that name, of the first, which a warning says, too.
         Raises InputError for an unknown object or photo, a file that is no light map, and numbers out of range.
         """
         photo, one = self._object(name)
@@ -167,7 +179,37 @@ class Result:
         objects = tuple(each for each in scene.objects if each.name == one)
         traced = traced_photo(msgspec.structs.replace(scene, objects=objects, light=self._light(light)), samples)
         of_photo = isinstance(light, str) and light in self.photos
-        return Picture(traced, self._solved.tone(light) if of_photo else as_it_is)
+        about = f"{photo}/{one} in {light if isinstance(light, str) else 'a given light'}"
+        return Picture(traced, self._solved.tone(light) if of_photo else as_it_is, about)
+
+    def insert(self, photo: str, **fields: Any) -> Drawn:
+        """A further object on the ground of a photo, with its shadow.
+
+        fields: those of the recipe `insert` (`docs/recipes.md`): mesh, material, beside, at, size, turn, …; files from the current folder
+        Raises InputError for an unknown name or field, and where the object has no place.
+        """
+        return self._drawn("insert", photo, fields)
+
+    def turntable(self, photo: str, **fields: Any) -> Drawn:
+        """Once around the objects of a photo, as GIF and frames; fields: those of the recipe `turntable`; raises as `insert`."""
+        return self._drawn("turntable", photo, fields)
+
+    def transfer(self, photo: str, materials: Mapping[str, str], **fields: Any) -> Drawn:
+        """A photo with other materials on its objects: old name to new; fields: those of the recipe `transfer`; raises as `insert`."""
+        return self._drawn("transfer", photo, {"materials": materials, **fields})
+
+    def _drawn(self, kind: str, photo: str, fields: dict[str, Any]) -> Drawn:
+        """What a recipe for one photo makes."""
+        recipe, path, inputs = _check(KINDS[kind], photos=[photo], **fields), Path(kind), self._solved.inputs
+        check_recipe(
+            recipe, path, {name: own.objects for name, own in self._solved.objects.items()}, self._solved.names
+        )
+        given = {f"recipe file:{name}": file for name, file in files_of(recipe, path).items()}
+        solved = SolvedSet(msgspec.structs.replace(inputs, files=inputs.files | given))
+        with TemporaryDirectory() as out:
+            draw(recipe, solved, Path(out), silent)
+            files = sorted(path for path in Path(out).rglob("*") if path.is_file())
+            return Drawn({path.relative_to(out).as_posix(): path.read_bytes() for path in files})
 
     def scene(self, photo: str) -> PhotoScene:
         """The photo's camera, objects and light, for pictures of one's own (`factorlib.render.photo_scene`)."""
@@ -179,7 +221,10 @@ class Result:
     def _object(self, name: str) -> tuple[str, str]:
         known = {each: tuple(each.split("/")) for each in self.objects}
         short = {one: (photo, one) for photo, one in reversed(known.values())}  # the first photo that has it
-        return Named("object", {**short, **known})[name]
+        found = Named("object", {**short, **known})[name]
+        if name not in known and len(others := [each for each, (_, one) in known.items() if one == name]) > 1:
+            log.warning("'%s' is %s: that of '%s' is taken", name, " and ".join(others), found[0])
+        return found
 
     def _light(self, light: str | Environment) -> Light:
         if isinstance(light, Environment):
@@ -203,10 +248,10 @@ class Result:
         return f"<p>{about}</p><table>{table}</table>"
 
 
-def _check(kind: type, **numbers: float | None) -> None:
-    """Of arguments, by the bounds of the recipes that have the same: InputError for one out of range."""
-    plain = {key: value.item() if isinstance(value, np.generic) else value for key, value in numbers.items()}
-    convert(plain, kind, kind.__name__.lower())
+def _check(kind: type[T], **fields: Any) -> T:
+    """The recipe of arguments that have the names of its fields; InputError for an unknown name and a value out of range."""
+    plain = {key: value.item() if isinstance(value, np.generic) else value for key, value in fields.items()}
+    return convert(plain, kind, kind.__name__.lower())
 
 
 class Environment(msgspec.Struct, frozen=True):
@@ -227,15 +272,42 @@ class Environment(msgspec.Struct, frozen=True):
         """Write it as Radiance HDR: eight bits a channel under one exponent."""
         write_hdr(path, self.lat_long)
 
+    def __repr__(self) -> str:
+        return (
+            f"Environment, {self.lat_long.shape[1]} × {len(self.lat_long)}, radiance at most {self.lat_long.max():.4g}"
+        )
+
     def _repr_html_(self) -> str:
         return _image(picture(self.lat_long))
 
 
 class Picture(Traced, frozen=True):
-    """A path-traced picture that notebooks show, darker where it would be overexposed."""
+    """A path-traced picture that notebooks show, darker where it would be overexposed; about: what it is of."""
+
+    about: str = ""
+
+    def __repr__(self) -> str:
+        return f"Picture of {self.about}, {self.pixels.shape[1]} × {len(self.pixels)}"
 
     def _repr_html_(self) -> str:
         return _image(self.rgba(min(1.0, self.exposure)))
+
+
+class Drawn(dict[str, bytes]):
+    """The files that a recipe makes of a photo, by name: PNG (8-bit sRGB), EXR (linear), and of an animation its GIF and frames."""
+
+    def save(self, folder: str | Path) -> None:
+        """Write them into a folder, which is made where it is missing; files of these names are replaced."""
+        for name, data in self.items():
+            (path := Path(folder, name)).parent.mkdir(parents=True, exist_ok=True)
+            write_bytes(path, data)
+
+    def __repr__(self) -> str:
+        return f"Drawn: {', '.join(name for name in self if '/' not in name)}"
+
+    def _repr_html_(self) -> str:
+        name = next(name for kind in (".gif", ".png") for name in self if name.endswith(kind))
+        return f'<img src="data:image/{name[-3:]};base64,{base64.b64encode(self[name]).decode("ascii")}">'
 
 
 def _image(pixels: np.ndarray) -> str:

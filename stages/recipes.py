@@ -1,34 +1,15 @@
-"""Pictures that a recipe asks for: the photos' objects from another side, in other light, of other material, with a further object.
+"""Pictures that a recipe asks for; `factorlib.render.drawing` says which files."""
 
-Writes for each photo <photo>.png (8-bit sRGB) and <photo>.exr (linear), or <photo>/<light>.…, an animation <photo>.gif with its frames
-<photo>/000.png …, or one grid.png.
-"""
-
-import logging
-from collections.abc import Callable
-from functools import partial
 from pathlib import Path
 from typing import Annotated
 
 import msgspec
-import numpy as np
 
-from factorlib.errors import InputError
-from factorlib.images.exr import write_rgb_exr
-from factorlib.images.picture import picture, write_png
-from factorlib.images.write import write_gif
 from factorlib.meshes.read import CREASE_DEG
-from factorlib.recipe import schema
-from factorlib.recipe.schema import is_light_file, recipe_of
-from factorlib.render.insertion import NEW, STEPS, inserted, spot_at, spot_beside, stood
-from factorlib.render.photo_scene import lit_ball, orbit, resized, traced_photo, turned_light
+from factorlib.recipe.schema import recipe_of
+from factorlib.render.drawing import draw
 from factorlib.render.solved_set import SolvedSet
-from factorlib.render.traced import Traced
-from factorlib.results.materials import Reflectance
 from factorlib.stage import Inputs, Progress
-from factorlib.wholefile import write_text
-
-log = logging.getLogger("factorlib.recipes")
 
 
 class Params(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -40,151 +21,4 @@ class Params(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 def main(params: Params, inputs: Inputs, out: Path, progress: Progress) -> None:
     """Make the pictures of one recipe."""
-    recipe, results = recipe_of(inputs.facts["recipe"]), SolvedSet(inputs, params.crease_deg)
-    if isinstance(recipe, schema.Grid):
-        return write_grid(recipe, results, out, progress)
-    photos, refusals = recipe.photos or results.photos, []
-    for done, photo in enumerate(photos):
-        try:
-            report = partial(_report, progress, done, len(photos), photo)
-            DRAWN[type(recipe)](recipe, results, photo, out, report)
-        except InputError as error:
-            if recipe.photos:
-                raise
-            log.warning("%s: left out: %s", photo, error.found)  # nobody named it
-            refusals.append(error)
-    if len(refusals) == len(photos):
-        raise refusals[0]
-    progress(len(photos), len(photos))
-
-
-def _report(progress: Progress, done: int, total: int, photo: str, share: float) -> None:
-    """Say how much of one photo's pictures is done."""
-    progress(done + share, total, photo)
-
-
-Report = Callable[[float], None]
-
-
-def resynthesis(
-    recipe: schema.Resynthesis | schema.Transfer, results: SolvedSet, photo: str, out: Path, report: Report
-) -> None:
-    """Path-traced objects, of other materials where the recipe says so, over the photo's background."""
-    report(0)
-    scene = results.scene(photo)
-    if isinstance(recipe, schema.Transfer):
-        known, other = results.known(recipe.table), recipe.materials
-        materials = {name: known[other[name]] if name in other else own for name, own in scene.materials.items()}
-        scene = msgspec.structs.replace(scene, materials=materials)
-    traced = Traced(traced_photo(scene, recipe.samples), results.tone(photo))
-    _write(out / photo, traced.over(results.photo(photo)))
-
-
-def insertion(recipe: schema.Insert, results: SolvedSet, photo: str, out: Path, report: Report) -> None:
-    """A further object on the ground of one that is there."""
-    scene = results.scene(photo)
-    neighbour = next((each for each in scene.objects if each.name == recipe.beside), scene.objects[0])
-    given, polish = recipe.ground, None
-    if any(given.specular):
-        polish = Reflectance((0.0,) * 3, given.specular, given.roughness)
-    ground = msgspec.structs.replace(results.ground(photo, neighbour), polish=polish)
-    if not ground.plane.seen_from_above:
-        fault = f"photo '{photo}' was taken from below the plane that '{neighbour.name}' stands on, so that no shadow on it can be seen"
-        raise InputError(fault, key="photos", cure="name other photos, or give the photo's `ground` in dataset.yaml")
-    own = {f"{NEW}{name}": material for name, material in results.known(recipe.table).items()}  # the new object's
-    mesh, names, up = results.mesh(recipe.mesh, recipe.material, recipe.up)
-    if recipe.at is not None:
-        spot = spot_at(scene, ground.plane, neighbour, results.pixel(photo, recipe.at), recipe.size)
-    else:
-        tall = np.ptp(mesh.vertices @ up)
-        wide = 2 * float(np.linalg.norm(np.cross(mesh.vertices - mesh.centre, up), axis=1).max())
-        spot = spot_beside(scene, ground.plane, neighbour, recipe.size, wide / tall)
-    new = stood(NEW, mesh, tuple(f"{NEW}{name}" for name in names), up, recipe.turn, spot)
-    scene = msgspec.structs.replace(scene, materials={**scene.materials, **own})
-    seen = results.straightened(photo), results.covered(photo)
-    found = inserted(scene, *seen, new, spot, ground, recipe.samples, lambda done: report(done / STEPS))
-    same = (found.coverage[..., None] == 0) & (found.shadow == 1) & (polish is None)
-    _write(out / photo, np.where(same, results.photo(photo), results.tone(photo)(found.composite)))
-
-
-def view(recipe: schema.View, results: SolvedSet, photo: str, out: Path, report: Report) -> None:
-    """The objects alone, from another side."""
-    report(0)
-    scene = resized(results.scene(photo), recipe.width)
-    camera = orbit(scene, recipe.azimuth, recipe.elevation, recipe.zoom)
-    traced = traced_photo(scene, recipe.samples, camera, with_light=recipe.background == "light")
-    _write_alone(out / photo, Traced(traced, results.tone(photo)))
-
-
-def animation(
-    recipe: schema.Turntable | schema.MovingLight, results: SolvedSet, photo: str, out: Path, report: Report
-) -> None:
-    """The camera or the light turns once: every frame as a PNG, and all as a GIF, which has no half-transparent pixels, on white."""
-    scene, pixels = resized(results.scene(photo), recipe.width), []
-    for k in range(recipe.frames):
-        report(k / recipe.frames)
-        degrees = 360 * k / recipe.frames
-        if isinstance(recipe, schema.Turntable):
-            lit = recipe.background == "light"
-            traced = traced_photo(scene, recipe.samples, orbit(scene, degrees), with_light=lit)
-        else:
-            turned = msgspec.structs.replace(scene, light=turned_light(scene.light, degrees))
-            traced = traced_photo(turned, recipe.samples)
-        pixels.append(Traced(traced, results.tone(photo)).rgba())
-    (out / photo).mkdir(parents=True)
-    for k, each in enumerate(pixels):
-        write_png(out / photo / f"{k:03}.png", each)
-    write_gif(out / f"{photo}.gif", pixels, recipe.seconds)
-
-
-def relight(recipe: schema.Relight, results: SolvedSet, photo: str, out: Path, report: Report) -> None:
-    """In other photos' lights, or those of files: shown as the light's own photo would be, or exposed for the objects."""
-    scene = resized(results.scene(photo), recipe.width)
-    lights = recipe.lights or [name for name in results.photos if name != photo]
-    for k, name in enumerate(lights):
-        report(k / len(lights))
-        lit = msgspec.structs.replace(scene, light=turned_light(results.light(name), recipe.rotate))
-        traced = traced_photo(lit, recipe.samples, with_light=recipe.background == "light")
-        shown = Traced(traced).exposed() if is_light_file(name) else Traced(traced, results.tone(name))
-        _write_alone(out / photo / Path(name).stem, shown)
-
-
-DRAWN = {
-    schema.Resynthesis: resynthesis,
-    schema.Transfer: resynthesis,
-    schema.Insert: insertion,
-    schema.View: view,
-    schema.Turntable: animation,
-    schema.MovingLight: animation,
-    schema.Relight: relight,
-}
-
-
-def write_grid(recipe: schema.Grid, results: SolvedSet, out: Path, progress: Progress) -> None:
-    """Balls of materials (rows) in lights (columns), each column exposed for all its balls."""
-    materials = recipe.materials or results.names
-    lights = recipe.lights or results.photos
-    columns, total = [], len(materials) * len(lights)
-    for k, name in enumerate(lights):
-        light, balls = results.light(name), []
-        for j, material in enumerate(materials):
-            progress(k * len(materials) + j, total, f"{material}, {name}")
-            balls.append(lit_ball(light, results.materials[material], recipe.size, recipe.samples))
-        columns.append(Traced(np.concatenate(balls)).exposed().pixels)
-    _write_alone(out / "grid", Traced(np.concatenate(columns, axis=1)))
-    write_text(out / "grid.txt", f"rows: {', '.join(materials)}\ncolumns: {', '.join(lights)}\n")
-    progress(total, total)
-
-
-def _write(stem: Path, radiance: np.ndarray) -> None:
-    """At the photo's own exposure."""
-    stem.parent.mkdir(parents=True, exist_ok=True)
-    write_rgb_exr(stem.with_name(stem.name + ".exr"), radiance)
-    write_png(stem.with_name(stem.name + ".png"), picture(radiance, 1.0))
-
-
-def _write_alone(stem: Path, traced: Traced) -> None:
-    """Objects without a background: transparent beside them."""
-    stem.parent.mkdir(parents=True, exist_ok=True)
-    traced.to_exr(stem.with_name(stem.name + ".exr"))
-    traced.to_png(stem.with_name(stem.name + ".png"))
+    draw(recipe_of(inputs.facts["recipe"]), SolvedSet(inputs, params.crease_deg), out, progress)

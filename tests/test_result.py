@@ -8,6 +8,7 @@ import shutil
 import subprocess
 import sys
 
+import msgspec
 import numpy as np
 import pytest
 
@@ -18,7 +19,10 @@ from factorlib.images.light_map import read_light_map
 from factorlib.images.picture import read_png
 from factorlib.jsonfile import read_json, write_json
 from factorlib.pack import pack
+from factorlib.recipe import schema
 from factorlib.runner.project import LIBRARY
+from factorlib.stage import silent
+from stages import recipes
 from tests.export import made_export
 
 
@@ -54,6 +58,15 @@ def test_what_is_not_there_is_refused_with_what_is(result, tmp_path):
         (lambda: result.render("front", width=0), "width: expected `int` >= 8"),
         (lambda: result.render("front", zoom=np.float64(0)), "zoom: expected `float` >= 0.01"),
         (lambda: result.relight("chair", "side", samples=0), "samples: expected `int` >= 1"),
+        (lambda: result.insert("frnt"), "did you mean 'front'"),
+        (lambda: result.insert("front", mesh="eggs"), "did you mean 'egg'"),
+        (lambda: result.insert("front", beside="table"), "whose objects are: chair"),
+        (lambda: result.insert("front", material="rde"), "did you mean 'red'"),
+        (lambda: result.insert("front", mesh="none.obj"), "there is no file 'none.obj'"),
+        (lambda: result.insert("front", siz=1), "did you mean 'size'"),
+        (lambda: result.transfer("front", {"rde": "red"}), "did you mean 'red'"),
+        (lambda: result.turntable("front", frames=1), "frames: expected `int` >= 2"),
+        (lambda: factorlib.load_result(123), "not by int 123"),
         (lambda: factorlib.load_result(tmp_path), "there is no result here"),
         (lambda: factorlib.load_result("a\0b"), "there is no result here"),
         (lambda: factorlib.load_result(300 * "a"), "there is no result here"),
@@ -95,10 +108,6 @@ def copy(folder, tmp_path):
     shutil.copytree(folder.parent.parent, tmp_path / "root")
     shutil.copytree(tmp_path / "root" / "build" / "set", tmp_path / "root" / "before")
     return tmp_path / "root"
-
-
-def test_a_copy_of_a_result_is_one(copy):
-    assert factorlib.load_result(copy / "before").photos == ["front", "side"]
 
 
 def test_a_copy_that_lies_far_from_its_data_set_makes_the_same_pictures(copy, result, tmp_path):
@@ -207,6 +216,38 @@ def test_an_object_in_another_light_is_that_lights_colour(result, tmp_path):
     assert result.relight("chair", "side", samples=1).pixels[..., :3].any()
 
 
+FRONT = {"photos": ["front"], "samples": 1}
+ASKED = [
+    (schema.Insert(**FRONT), lambda r: r.insert("front", samples=np.int64(1))),
+    (schema.Turntable(**FRONT, frames=2), lambda r: r.turntable("front", frames=2, samples=1)),
+    (
+        schema.Transfer(**FRONT, materials={"red": "unseen"}),
+        lambda r: r.transfer("front", {"red": "unseen"}, samples=1),
+    ),
+]
+
+
+@pytest.mark.parametrize("recipe, ask", ASKED)
+def test_pictures_that_recipes_make_are_the_same_files(result, tmp_path, recipe, ask):
+    (drawn := ask(result)).save(tmp_path / "saved")
+    (out := tmp_path / "stage").mkdir()
+    inputs = result._solved.inputs
+    facts = inputs.facts | {"recipe": msgspec.to_builtins(recipe)}
+    recipes.main(recipes.Params(), msgspec.structs.replace(inputs, facts=facts), out, silent)
+    saved, made = (
+        {str(path.relative_to(of)): path.read_bytes() for path in of.rglob("*.*")} for of in (tmp_path / "saved", out)
+    )
+    assert saved == made == drawn and drawn._repr_html_().startswith('<img src="data:image/')
+
+
+def test_what_is_printed_is_short_and_says_whose_photo_it_is(result, caplog):
+    assert repr(result.environment("side")).startswith("Environment, ")
+    assert repr(result.relight("side/chair", "front", width=16, samples=1)).startswith("Picture of side/chair in front")
+    assert not caplog.messages
+    assert repr(result.relight("chair", "side", width=16, samples=1)).startswith("Picture of front/chair in side, 16 ×")
+    assert caplog.messages == ["'chair' is front/chair and side/chair: that of 'front' is taken"]
+
+
 def test_a_notebook_shows_tables_and_pictures_and_names_are_names(result):
     shown = result._repr_html_()
     assert "0.350 ± 0.100" in shown and "front, side" in shown
@@ -250,13 +291,16 @@ def test_a_damaged_file_of_a_result_is_named(copy, file, break_, ask, words):
 def test_importing_the_package_imports_nothing_heavy():
     code = "import sys, factorlib; assert not {'numpy', 'torch', 'mitsuba'} & set(sys.modules)"
     subprocess.run([sys.executable, "-c", code], check=True)
+    names = {}
+    exec("from factorlib import *", names)
+    assert names["load_result"] is factorlib.load_result and factorlib.__version__ == names["__version__"]
 
 
 # ── the pages: names of the small result stand in place of those of data/eames ───────────────────────────────────────
 
 SMALL = {
     "build/eames": "build/set", "kitchen": "side", "garden": "front", "terrace": "front", "yellow_chair": "chair",
-    "kitchn": "sid", "width=320": "width=32",
+    "kitchn": "sid", "width=320": "width=32", '"yellow"': '"red"', '"black"': '"unseen"',
 }  # fmt: skip
 
 
@@ -277,11 +321,17 @@ def test_the_notebook_runs_in_its_own_folder_and_shows_its_tables_and_pictures(f
     cells, names = json.loads((LIBRARY / "docs" / "result.ipynb").read_text())["cells"], {}
     shown = [run("".join(cell["source"]), names) for cell in cells if cell["cell_type"] == "code"]
     shown = [html for html in shown if html]
-    assert [html[:4] for html in shown] == ["<p>.", *["<img"] * 5] and "0.350 ± 0.100" in shown[0]
+    assert [html[:4] for html in shown] == ["<p>.", *["<img"] * 8] and "0.350 ± 0.100" in shown[0]
     said = capsys.readouterr().out
     assert "roughness 0.350 ± 0.100" in said
     assert all(words in said for words in ("did you mean 'red'", "did you mean 'side'", "did you mean 'chair'"))
-    assert sorted(path.name for path in docs.iterdir()) == ["chair.exr", "chair.png", "side.exr", "side.hdr"]
+    assert sorted(path.name for path in docs.iterdir()) == [
+        "chair.exr",
+        "chair.png",
+        "pictures",
+        "side.exr",
+        "side.hdr",
+    ]
 
 
 @pytest.mark.parametrize("page", ["README.md", "docs/recipes.md"])

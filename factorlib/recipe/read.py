@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 
 from factorlib.dataset.check import MESHES
 from factorlib.dataset.paths import Refusal
-from factorlib.dataset.schema import Dataset
+from factorlib.dataset.schema import Dataset, ObjectEntry
 from factorlib.errors import InputError, did_you_mean
 from factorlib.recipe import schema
 from factorlib.recipe.schema import BALL, KINDS, AnyRecipe, is_light_file, is_mesh_file, read_table
@@ -23,8 +23,19 @@ def read_recipe(path: Path, dataset: Dataset) -> AnyRecipe:
         found = "it does not say what kind of picture to make" if kind is None else f"there is no kind {kind!r}"
         refuse("kind", found, did_you_mean(str(kind), KINDS))
     recipe = read_yaml(path, KINDS[kind])
-    photos, materials = [photo.name for photo in dataset.spec.photos], dataset.spec.materials
-    meshes = sorted({obj.mesh for photo in dataset.spec.photos for obj in photo.objects})
+    check_recipe(recipe, path, {photo.name: photo.objects for photo in dataset.spec.photos}, dataset.spec.materials)
+    return recipe
+
+
+def check_recipe(
+    recipe: AnyRecipe, path: Path, objects: Mapping[str, Sequence[ObjectEntry]], materials: list[str]
+) -> None:
+    """Raise InputError where a recipe asks for what the data set does not have.
+
+    path: what errors call the recipe, and where its files are relative to;  objects: of each photo
+    """
+    refuse, photos = Refusal(path, path.parent), list(objects)
+    meshes = sorted({obj.mesh for own in objects.values() for obj in own})
 
     def check(key: str, names: Iterable[str], known: list[str], what: str, once: bool = False) -> None:
         for name in (names := list(names)):
@@ -59,11 +70,10 @@ def read_recipe(path: Path, dataset: Dataset) -> AnyRecipe:
         elif Path(recipe.mesh).suffix.lower() not in MESHES:
             refuse("mesh", f"{recipe.mesh!r} is no mesh that is read here", f"one of {', '.join(MESHES)}")
         for photo in (recipe.photos or photos) if recipe.beside is not None else ():
-            objects = [obj.name for obj in dataset.photo(photo).objects]
-            if recipe.beside not in objects:
-                found = f"there is no object {recipe.beside!r} in photo '{photo}', whose objects are: {', '.join(objects) or 'none'}"
+            names = [obj.name for obj in objects[photo]]
+            if recipe.beside not in names:
+                found = f"there is no object {recipe.beside!r} in photo '{photo}', whose objects are: {', '.join(names) or 'none'}"
                 refuse("beside", found, "name the photos that have it: `photos: [...]`")
-    return recipe
 
 
 def files_of(recipe: AnyRecipe, path: Path) -> dict[str, Path]:
