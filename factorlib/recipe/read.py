@@ -39,6 +39,14 @@ def read_recipe(path: Path, dataset: Dataset) -> AnyRecipe:
             raise InputError(f"there is no file {name!r}", file=path, cure=cure)
     if isinstance(recipe, schema.OfPhotos):
         check("photos", recipe.photos, photos, "photo", once=True)
+        if recipe.sun is not None:
+            if isinstance(recipe, schema.Relight):
+                refuse("sun", "a relighting shows lights that are given", "leave it out")
+            if len(recipe.photos) != 1:
+                cure = "name one photo: `photos: [...]`"
+                refuse("sun.direction", "a direction holds in the light of one photo", cure)
+            if not any(recipe.sun.direction):
+                refuse("sun.direction", "it has no length", "name another")
     if isinstance(recipe, schema.Relight | schema.Grid):
         check("lights", [name for name in recipe.lights if not is_light_file(name)], photos, "photo")
     if isinstance(recipe, schema.Relight):

@@ -17,10 +17,10 @@ from factorlib.images.tone import shown, straightened
 from factorlib.meshes.mesh import Mesh, scaled
 from factorlib.meshes.read import CREASE_DEG, MeshesOnce, read_mesh
 from factorlib.reading import check_plain
-from factorlib.recipe.schema import BALL, is_light_file, is_mesh_file, read_table
+from factorlib.recipe.schema import BALL, AssumedSun, is_light_file, is_mesh_file, read_table
 from factorlib.render.ground import Plane, resting_plane
 from factorlib.render.insertion import Ground
-from factorlib.render.photo_scene import Light, PhotoScene, Placed
+from factorlib.render.photo_scene import Light, PhotoScene, Placed, with_sun
 from factorlib.render.resynthesis import light_of
 from factorlib.render.traced import Tone, as_it_is
 from factorlib.results.materials import MaterialTable, Reflectance, read_materials, reflectances
@@ -59,8 +59,8 @@ class SolvedSet:
         self._meshes = MeshesOnce(inputs.mesh, self.names, crease_deg, own.displacements, own.log_factors)
         self._pixels: dict[str, dict[str, np.ndarray]] = {}
 
-    def scene(self, photo: str) -> PhotoScene:
-        """The photo's objects, in their poses, in its light."""
+    def scene(self, photo: str, sun: AssumedSun | None = None) -> PhotoScene:
+        """The photo's objects, in their poses, in its light; or in that with a sun that is assumed."""
         poses, objects = self.poses[photo], self.objects[photo]
         if not objects.objects:
             found, cure = f"photo '{photo}' has no objects to draw", "name other photos in the recipe"
@@ -73,7 +73,16 @@ class SolvedSet:
         camera = poses.camera.camera(width, height)
         placed = tuple(self._placed(obj, objects.meshes[obj.mesh], poses) for obj in objects.objects)
         depth = ALL_BOUNCES if self.table.model.interreflection else DIRECT
-        return PhotoScene(camera, placed, self.light(photo), self.materials, depth)
+        light = self.light(photo)
+        if sun is not None:
+            light = with_sun(light, self.sun_axis(photo, sun), sun.size, sun.strength)
+        return PhotoScene(camera, placed, light, self.materials, depth)
+
+    def sun_axis(self, photo: str, sun: AssumedSun) -> Float[np.ndarray, "3"]:
+        """The unit direction to a sun in the photo's camera axes."""
+        world = self.lights[photo].world_from_camera
+        camera_from_light = np.eye(3) if world is None else np.array(world).T
+        return camera_from_light @ YUP_FROM_CAMERA @ (np.array(sun.direction) / np.linalg.norm(sun.direction))
 
     def photo(self, photo: str) -> Float[np.ndarray, "h w 3"]:
         """Its linear radiance."""

@@ -9,8 +9,9 @@ from factorlib.geometry.camera import Camera
 from factorlib.light.lobes import Lobes
 from factorlib.meshes.mesh import Mesh
 from factorlib.render.ground import Plane
-from factorlib.render.insertion import NEW, Ground, Spot, inserted, stood
-from factorlib.render.photo_scene import ALL_BOUNCES, PhotoScene, Placed, light_entry, shapes
+from factorlib.render.insertion import NEW, Ground, inserted
+from factorlib.render.photo_scene import ALL_BOUNCES, PhotoScene, Placed, light_entries, shapes
+from factorlib.render.placement import Spot, stood
 from factorlib.results.materials import Reflectance
 from factorlib.tracing.scene import bsdf, rendered, rigid, sensor, transform
 
@@ -33,7 +34,7 @@ OPEN = np.zeros((CAMERA.height, CAMERA.width), bool)  # nothing covers the groun
 
 def true_photo(objects, samples=1024):
     """Striped ground, which the insertion knows nothing of, beyond the disc too."""
-    entries = {"light": light_entry(light()), **shapes(objects, MATERIALS)}
+    entries = {**light_entries(light(), 6.0), **shapes(objects, MATERIALS)}
     for k in range(-8, 8):
         frame = rigid(np.stack([[0.5, 0, 0], [0, 0, -40.0], [0, 1.0, 0]], axis=1), (k + 0.5, -1.0, -6))
         stripe = {"type": "rectangle", "to_world": transform(frame)}

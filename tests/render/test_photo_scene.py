@@ -12,8 +12,8 @@ from factorlib.light.latlong import lat_long_of_lobes
 from factorlib.light.lobes import Lobes
 from factorlib.meshes.mesh import Mesh
 from factorlib.render.ground import Plane, resting_plane
-from factorlib.render.insertion import spot_at, spot_beside, stood
 from factorlib.render.photo_scene import PhotoScene, Placed, lit_ball, orbit, resized, traced_photo, turned_light
+from factorlib.render.placement import spot_at, spot_beside, stood
 from factorlib.results.materials import Reflectance
 from factorlib.tracing.scene import rigid
 
