@@ -5,7 +5,7 @@ intersect one of the photo's is moved along the ground to the nearest place wher
 places are those of a lattice on the ground, a tenth of its height apart, as far as the ground is known.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 
 import msgspec
 import numpy as np
@@ -26,6 +26,7 @@ from factorlib.render.photo_scene import PhotoScene, Placed
 RADIUS = 8.0  # how far from the new object the ground is known, in its heights
 GAP = 0.15  # between the objects, in heights of the new one
 STEP = 0.1  # between places that are tried, in heights
+ENOUGH = 500  # vertices, by which it is judged where the new object is seen
 SEEN = 0.5  # share of the new object's vertices that are in the picture and that nothing hides, at least, where it is moved to
 
 
@@ -108,8 +109,12 @@ class Solid(Caster):
 
     def crossed(self, start: Float[np.ndarray, "n 3"], along: Float[np.ndarray, "n 3"]) -> np.ndarray:
         """Which of the segments from `start` to `start + along` cross the surface."""
-        rays = np.column_stack([(start - self.centre) / self.radius, along / self.radius])
-        return self.scene.cast_rays(o3d.core.Tensor(rays.astype(np.float32)), nthreads=1)["t_hit"].numpy() < 1
+        low, high = start + np.minimum(along, 0), start + np.maximum(along, 0)
+        crossed = ((low <= self.box[1]) & (high >= self.box[0])).all(axis=1)
+        rays = np.column_stack([(start[crossed] - self.centre) / self.radius, along[crossed] / self.radius])
+        hits = self.scene.cast_rays(o3d.core.Tensor(rays.astype(np.float32)), nthreads=1)
+        crossed[crossed] = hits["t_hit"].numpy() < 1
+        return crossed
 
     def holds(self, points: Float[np.ndarray, "n 3"]) -> bool:
         """Whether one of the points lies within the mesh; nothing lies within an open one."""
@@ -135,14 +140,15 @@ class Room:
         self.camera, self.spot = scene.camera, spot
         self.new, self.others = Solid(new), [Solid(each) for each in scene.objects]
 
-    def pierced(self, move: Float[np.ndarray, "3"] = np.zeros(3)) -> list[str]:
+    def pierced(self, move: Float[np.ndarray, "3"] = np.zeros(3)) -> Iterator[str]:
         """What the new object would intersect if it were moved: names of objects, or the camera."""
-        inside = ["the camera"] if self.new.holds(-move[None]) else []
-        return [f"'{other.name}'" for other in self.others if self.new.meets(other, move)] + inside
+        yield from (f"'{other.name}'" for other in self.others if self.new.meets(other, move))
+        if self.new.holds(-move[None]):
+            yield "the camera"
 
-    def seen(self, move: Float[np.ndarray, "3"] = np.zeros(3)) -> tuple[float, float]:
-        """The shares of the moved object's vertices that are in the picture, and that nothing hides there."""
-        points = self.new.vertices + move
+    def seen(self, move: Float[np.ndarray, "3"] = np.zeros(3), every: int = 1) -> tuple[float, float]:
+        """The shares of the moved object's vertices (of `every` so many one) that are in the picture, and that nothing hides there."""
+        points = self.new.vertices[::every] + move
         inside = points[self._in_picture(points)]
         hidden = [other.crossed(np.zeros_like(inside), inside) for other in self.others]
         return len(inside) / len(points), float((~np.any(hidden, axis=0)).sum()) / len(points)
@@ -153,9 +159,10 @@ class Room:
         lattice = np.stack(np.meshgrid(reach, 0.0, reach, indexing="ij"), axis=-1).reshape(-1, 3)
         moves = lattice @ rotation_between(np.array([0.0, 1.0, 0.0]), spot.plane.normal).T
         distance = np.linalg.norm(lattice, axis=1)
+        every = max(1, len(self.new.vertices) // ENOUGH)
         near = (distance <= RADIUS * spot.height) & self._in_picture(spot.point + moves)
         for move in moves[near][np.argsort(distance[near], kind="stable")]:
-            if not self.pierced(move) and self.seen(move)[1] >= SEEN:
+            if self.seen(move, every)[1] >= SEEN and not any(self.pierced(move)):
                 return move
         return None
 
@@ -182,7 +189,7 @@ def stood_free(
     """
     new = stand(spot)
     room = Room(scene, new, spot)
-    pierced, (inside, seen) = room.pierced(), room.seen()
+    pierced, (inside, seen) = list(room.pierced()), room.seen()
     if not pierced and seen > 0:
         return new, spot, ""
     unseen = "it would be hidden behind other objects" if inside else "it would be outside the picture"

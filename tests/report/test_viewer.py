@@ -142,6 +142,10 @@ def test_a_mesh_shows_its_parts_where_they_are(browser):
       gl.readPixels(0, 0, 64, 64, gl.RGBA, gl.FLOAT, pixels); return pixels.reduce((a, b) => a + b); }"""
     own, *each = (page.evaluate(script, m) for m in ("", "red", "white", "brass"))
     assert own == pytest.approx(np.mean(each), rel=0.02)
+    red, white, brass = each
+    page.select_option("[data-control=materials] label:nth-child(1) select", label="white")  # the brass part alone
+    changed = page.evaluate(script.replace("Array(3).fill(material)", "viewer.state().materials"))
+    assert changed - own == pytest.approx((white - brass) / 3, rel=0.05)
 
 
 @needs_chromium
