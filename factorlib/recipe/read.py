@@ -61,7 +61,12 @@ def read_recipe(path: Path, dataset: Dataset) -> AnyRecipe:
     if isinstance(recipe, schema.Transfer):
         check("materials", recipe.materials.values(), known, "material")
     if isinstance(recipe, schema.Insert):
-        check("material", [recipe.material] if recipe.material is not None else [], known, "material")
+        if isinstance(recipe.material, dict):
+            check("material", recipe.material.values(), known, "material")
+            if recipe.mesh not in meshes:
+                refuse("material", "parts are told apart in a mesh of the data set", "name one material")
+        elif recipe.material is not None:
+            check("material", [recipe.material], known, "material")
         if not is_mesh_file(recipe.mesh):
             check("mesh", [recipe.mesh], [BALL, *meshes], "mesh")
         elif Path(recipe.mesh).suffix.lower() not in MESHES:

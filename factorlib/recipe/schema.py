@@ -138,8 +138,9 @@ class Insert(OfPhotos, frozen=True, kw_only=True, tag="insert"):
 
     mesh: str = "ball"
     """`ball`, a mesh of the data set, or a mesh file."""
-    material: str | None = None
-    """Material of the data set or of `table`; without it the mesh's own, and for a file or ball the data set's first."""
+    material: str | dict[str, str] | None = None
+    """Material of the data set or of `table`, or own material -> another for parts of a mesh of the data set; without it the mesh's own, and for a
+    file or ball the data set's first."""
     table: str | None = None
     """File of materials of one's own, like materials.json."""
     beside: str | None = None

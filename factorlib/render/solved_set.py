@@ -135,12 +135,16 @@ class SolvedSet:
         normal = YUP_FROM_CAMERA @ np.array(given.normal)
         return Ground(Plane(normal / np.linalg.norm(normal), YUP_FROM_CAMERA @ np.array(given.point)), given.diffuse)
 
-    def mesh(self, name: str, material: str | None, up: str) -> tuple[Mesh, tuple[str, ...], np.ndarray]:
+    def mesh(
+        self, name: str, material: str | dict[str, str] | None, up: str
+    ) -> tuple[Mesh, tuple[str, ...], np.ndarray]:
         """A mesh to insert, its materials by label, and which way is up in its own frame: of the data set's, as it stands in a photo.
 
-        Raises InputError for a mesh that is not there, and for one without height.
+        material: of the whole, or of some of its own materials, by name, others; None: its own
+        Raises InputError for a mesh that is not there, for one without height, and for a material that the mesh does not have.
         """
-        upward, wanted = np.eye(3)["xyz".index(up)], material or self.names[0]
+        upward = np.eye(3)["xyz".index(up)]
+        wanted = material if isinstance(material, str) else self.names[0]
         materials: tuple[str, ...] = (wanted,)
         if name == BALL:
             mesh = sphere(1.0)
@@ -154,7 +158,15 @@ class SolvedSet:
             photo, obj = shown[0]
             placed = self._placed(obj, self.objects[photo].meshes[name], self.poses[photo])
             upward = placed.world_from_object[:3, :3].T @ self.ground(photo, placed).plane.normal
-            mesh, materials = placed.mesh, (material,) * len(self.names) if material else placed.materials
+            mesh, materials = placed.mesh, placed.materials
+            if isinstance(material, str):
+                materials = (material,) * len(materials)
+            elif material is not None:
+                own = [materials[label - 1] for label in mesh.labels]
+                if other := [each for each in material if each not in own]:
+                    found = f"{name!r} as in photo '{photo}' has no material {other[0]!r}"
+                    raise InputError(found, key="material", cure=did_you_mean(other[0], own))
+                materials = tuple(material.get(each, each) for each in materials)
         if np.ptp(mesh.vertices @ upward) < LEAST_HEIGHT * mesh.radius:
             cure = "say which axis of the file points upward, as in `up: z`, or name a mesh that is not flat"
             raise InputError(f"the mesh {name!r} has no height", key="mesh", cure=cure)

@@ -91,6 +91,15 @@ def test_an_assumed_sun_stands_in_the_frame_of_the_exported_light(made, photo):
     assert brightest @ np.array(sun.direction) / np.linalg.norm(sun.direction) > np.cos(np.radians(3))
 
 
+def test_a_part_of_an_inserted_mesh_gets_another_material_and_the_rest_keeps_its_own(made):
+    results = SolvedSet(changed(made, "dataset.ground", dict.fromkeys(made_export.MESHES, GROUND)))
+    mesh, materials, _ = results.mesh("egg", {"brass": "unseen"}, "y")
+    assert [materials[label - 1] for label in mesh.labels] == ["red", "unseen"]
+    with pytest.raises(InputError, match="'egg' as in photo 'side' has no material 'unseen'") as error:
+        results.mesh("egg", {"unseen": "red"}, "y")
+    assert error.value.key == "material"
+
+
 def test_a_sun_below_the_ground_is_refused(made, tmp_path):
     made = changed(made, "dataset.ground", dict.fromkeys(made_export.MESHES, GROUND))
     with pytest.raises(InputError, match="below the ground") as error:
