@@ -46,11 +46,8 @@ FIT_SAMPLES = 16
 GREY, DARKEST, BRIGHTEST = 0.3, 0.02, 0.85  # diffuse reflectance of the ground: where nothing tells it, and its bounds
 LUMINANCE = np.array([0.2126, 0.7152, 0.0722])  # of linear Rec. 709
 HAIR = 1e-4  # of an object's size: how far apart surfaces are that must not meet
-NEAR, RIM, FEWEST = (
-    2.0,
-    2,
-    100,
-)  # shadows are compared within so many heights of an object, off the masks' rim, over at least so many pixels
+NEAR = 2.0  # shadows are compared within so many heights of an object
+RIM, FEWEST = 2, 100  # so many pixels off the masks, over at least so many pixels
 GROUND, STEPS = "+ground", 5
 NEW = "+"  # what the new object and its materials are called: no name in dataset.yaml has it
 
@@ -80,11 +77,9 @@ class ShadowMatch(msgspec.Struct, frozen=True):
 
     def __str__(self) -> str:
         if self.correlation is None:
-            return (
-                f"Shadows were not compared: too little of it is seen near the photo's objects ({self.pixels} pixels)."
-            )
+            return f"Shadows were not compared: too little is seen of the ground near the photo's objects ({self.pixels} pixels)."
         light, shape = f"{self.correlation:.2f}", f"{self.constant_light:.2f}"
-        return f"The photo's shading of it correlates with the predicted one by {light}; with that of a constant light by {shape}."
+        return f"The photo's shading of the ground correlates with the predicted one by {light}; with that of a constant light by {shape}."
 
 
 class Inserted(msgspec.Struct, frozen=True):

@@ -2,7 +2,7 @@
 
 Two meshes intersect where an edge of one crosses a triangle of the other, or where one lies within the other.  A new object that would
 intersect one of the photo's is moved along the ground to the nearest place where it does not and where at least half of it is seen: the
-places are those of a lattice on the ground, a tenth of its height apart, as far as the ground is known.
+places are those of a lattice on the ground, a tenth of its height apart, and where there is none within eight heights, of a coarser one.
 """
 
 from collections.abc import Callable, Iterator
@@ -25,7 +25,10 @@ from factorlib.render.photo_scene import PhotoScene, Placed
 
 RADIUS = 8.0  # how far from the new object the ground is known, in its heights
 GAP = 0.15  # between the objects, in heights of the new one
-STEP = 0.1  # between places that are tried, in heights
+STEP, COARSER = (
+    0.1,
+    8,
+)  # between places that are tried, in heights; where there is none within `RADIUS`, steps and radius are so many times that
 ENOUGH = 500  # vertices, by which it is judged where the new object is seen
 SEEN = 0.5  # share of the new object's vertices that are in the picture and that nothing hides, at least, where it is moved to
 
@@ -155,15 +158,16 @@ class Room:
 
     def nearest(self) -> Float[np.ndarray, "3"] | None:
         """The shortest move to a place where the object is free and seen; None where there is none."""
-        spot, reach = self.spot, np.arange(-round(RADIUS / STEP), round(RADIUS / STEP) + 1) * STEP * self.spot.height
+        plane, every = self.spot.plane, max(1, len(self.new.vertices) // ENOUGH)
+        reach = np.arange(-round(RADIUS / STEP), round(RADIUS / STEP) + 1) * STEP * self.spot.height
         lattice = np.stack(np.meshgrid(reach, 0.0, reach, indexing="ij"), axis=-1).reshape(-1, 3)
-        moves = lattice @ rotation_between(np.array([0.0, 1.0, 0.0]), spot.plane.normal).T
         distance = np.linalg.norm(lattice, axis=1)
-        every = max(1, len(self.new.vertices) // ENOUGH)
-        near = (distance <= RADIUS * spot.height) & self._in_picture(spot.point + moves)
-        for move in moves[near][np.argsort(distance[near], kind="stable")]:
-            if self.seen(move, every)[1] >= SEEN and not any(self.pierced(move)):
-                return move
+        order = np.argsort(distance, kind="stable")[: (distance <= RADIUS * self.spot.height).sum()]
+        finest = lattice[order] @ rotation_between(np.array([0.0, 1.0, 0.0]), plane.normal).T
+        for moves in (finest, COARSER * finest):
+            for move in moves[self._in_picture(self.spot.point + moves)]:
+                if self.seen(move, every)[1] >= SEEN and not any(self.pierced(move)):
+                    return move
         return None
 
     def at(self, move: Float[np.ndarray, "3"], factor: int) -> str:

@@ -74,6 +74,12 @@ def test_a_ball_in_a_ball_moves_until_they_touch_and_stays_there():
     assert words == "" and same is moved and np.array_equal(again.vertices, new.vertices)
 
 
+def test_a_small_object_in_a_large_one_leaves_it_though_that_is_many_of_its_heights():
+    spot = Spot(GROUND, np.array([0.0, -1.0, -6.0]), 0.05)
+    _, there, words = stood_free(scene(at(BOX, (0, -0.5, -6), 0.6)), stand, spot, asked=True)
+    assert "it would intersect 'there'" in words and 0.62 < np.abs(there.point - spot.point).max() < 0.67
+
+
 def test_an_object_that_touches_nothing_stays_where_it_is_asked_for():
     spot = Spot(GROUND, np.array([-0.9, -1.0, -6.0]), 1.2)
     new, there, words = stood_free(scene(at(sphere(1.0), (0.9, 0, -6.5))), stand, spot, asked=False)
