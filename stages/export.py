@@ -19,7 +19,7 @@ from factorlib.dataset.schema import LightSlice, ObjectsSlice
 from factorlib.errors import InputError
 from factorlib.export.blender import write_scene_json, write_script
 from factorlib.export.environment import mitsuba_map
-from factorlib.export.gltf import write_glb, write_suns
+from factorlib.export.gltf import variant_name, write_glb, write_suns
 from factorlib.export.loss import write_losses
 from factorlib.export.materials import headroom_factor, table_in_gauge
 from factorlib.export.materialx import materialx
@@ -89,7 +89,11 @@ def main(params: Params, inputs: Inputs, out: Path, progress: Progress) -> None:
     files = MeshFiles(inputs, out / "scenes", names, params.crease_deg, materials)
     for name, mesh in sorted({n: m for each in objects.values() for n, m in each.meshes.items()}.items()):
         whole = files.read.mesh(name, mesh)
-        write_glb(out / f"{name}.glb", whole, names, materials)
+        worn = [
+            obj.materials for each in objects.values() for obj in each.objects if obj.mesh == name and obj.materials
+        ]
+        labels = {variant_name(each): files.read.mesh(name, mesh, each).face_label for each in worn}
+        write_glb(out / f"{name}.glb", whole, names, materials, dict(sorted(labels.items())))
         write_ply(out / "meshes" / f"{name}.ply", whole)
     progress(3, 4, "scenes")
     write_script(out / "scenes")

@@ -1,4 +1,4 @@
-"""Meshes as binary glTF with their materials, and suns as glTF's directional lights.
+"""Meshes as binary glTF with their materials and the variants of these, and suns as glTF's directional lights.
 
 glTF's metallic-roughness model has GGX of the same α = roughness².  A dielectric with KHR_materials_specular has
 F0 = 0.04 · specularFactor · specularColor and F90 = specularFactor, over a diffuse part times 1 − max F.  So
@@ -12,13 +12,16 @@ A directional light of KHR_lights_punctual shines along its node's −z with an 
 radiance, in whose unit a program that also shows the map wants it.
 """
 
+import json
 from collections.abc import Mapping, Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any
 
+import msgspec
 import numpy as np
 import trimesh
+from jaxtyping import Int
 from trimesh.visual.material import PBRMaterial
 from trimesh.visual.texture import TextureVisuals
 
@@ -26,42 +29,105 @@ from factorlib.export.scene import Sun
 from factorlib.jsonfile import write_json
 from factorlib.meshes.mesh import Mesh
 from factorlib.meshes.ply import submesh
+from factorlib.reading import read_bytes
 from factorlib.results.materials import Reflectance
 from factorlib.wholefile import write_bytes
 
 DIELECTRIC = 0.04
-EXTENSION, LIGHTS = "KHR_materials_specular", "KHR_lights_punctual"
+EXTENSION, LIGHTS, VARIANTS = "KHR_materials_specular", "KHR_lights_punctual", "KHR_materials_variants"
 
 
-def write_glb(path: str | Path, mesh: Mesh, names: Sequence[str], materials: Mapping[str, Reflectance]) -> None:
-    """Write `mesh` in its own frame and units, one primitive per material; label k is names[k − 1].
+def write_glb(
+    path: str | Path,
+    mesh: Mesh,
+    names: Sequence[str],
+    materials: Mapping[str, Reflectance],
+    variants: Mapping[str, Int[np.ndarray, " f"]] = {},
+) -> None:
+    """Write `mesh` in its own frame and units, with the materials of its parts; label k is names[k − 1].
+
+    variants: by name, other labels of the faces (KHR_materials_variants); a primitive is what has one material in each of them
 
     Detail of reflectance is in vertex colours, by which glTF multiplies the base colour.  Neither may be above 1: the base colour takes the largest
     factor, as far as it can, and vertices that would be brighter still are as bright as that.
     """
-    scene, most = trimesh.Scene(), {}
-    for label in mesh.labels:
-        part, name = submesh(mesh, label), names[label - 1]
-        visual = TextureVisuals(material=PBRMaterial(name=name, doubleSided=mesh.open))
+    choices, part = np.unique([mesh.face_label, *variants.values()], axis=1, return_inverse=True)
+    split = msgspec.structs.replace(mesh, face_label=part.reshape(-1) + 1)
+    scene, parts = trimesh.Scene(), {}
+    for label in split.labels:
+        part, chosen = submesh(split, label), [names[k - 1] for k in choices[:, label - 1]]
+        name = chosen[0] if chosen[0] not in parts else f"{chosen[0]} {label}"
+        visual, factor = TextureVisuals(material=PBRMaterial(name=name)), 1.0
         if part.detail is not None:
-            brightest = max(gltf_material(materials[name])["pbrMetallicRoughness"]["baseColorFactor"][:3])
-            most[name] = min(float(part.detail.max()), 1 / max(brightest, 1e-9))
-            shade = np.rint(255 * np.minimum(part.detail / most[name], 1)).astype(np.uint8)
+            bases = [gltf_material(materials[each])["pbrMetallicRoughness"]["baseColorFactor"][:3] for each in chosen]
+            factor = min(float(part.detail.max()), 1 / max(float(np.max(bases)), 1e-9))
+            shade = np.rint(255 * np.minimum(part.detail / factor, 1)).astype(np.uint8)
             visual.vertex_attributes["color"] = np.column_stack([shade, shade, shade, np.full_like(shade, 255)])
         geometry = trimesh.Trimesh(part.vertices, part.faces, vertex_normals=part.normals, visual=visual, process=False)
         scene.add_geometry(geometry, geom_name=name, node_name=name)
-    exact = partial(_set_materials, materials=materials, most=most)
+        parts[name] = [_entry(each, materials[each], mesh.open, factor) for each in chosen]
+    exact = partial(_set_materials, parts=parts, variants=list(variants))
     write_bytes(path, scene.export(file_type="glb", include_normals=True, tree_postprocessor=exact))
 
 
-def _set_materials(tree: dict[str, Any], materials: Mapping[str, Reflectance], most: Mapping[str, float]) -> None:
-    """Exact numbers, which the mesh library would round to eight bits; most: what base colours are times."""
-    for entry in tree["materials"]:
-        exact = gltf_material(materials[entry["name"]])
-        base, factor = exact["pbrMetallicRoughness"]["baseColorFactor"], most.get(entry["name"], 1.0)
-        exact["pbrMetallicRoughness"]["baseColorFactor"] = [*(min(c * factor, 1.0) for c in base[:3]), base[3]]
-        entry.update(exact)
-    tree["extensionsUsed"] = sorted({*tree.get("extensionsUsed", []), EXTENSION})
+def _entry(name: str, material: Reflectance, open_: bool, factor: float) -> dict[str, Any]:
+    """A material of a file, whose base colours are times a factor."""
+    exact = gltf_material(material)
+    base = exact["pbrMetallicRoughness"]["baseColorFactor"]
+    exact["pbrMetallicRoughness"]["baseColorFactor"] = [*(min(c * factor, 1.0) for c in base[:3]), base[3]]
+    return {"name": name, "doubleSided": open_, **exact}
+
+
+def _set_materials(
+    tree: dict[str, Any], parts: Mapping[str, Sequence[dict[str, Any]]], variants: Sequence[str]
+) -> None:
+    """Exact numbers, which the mesh library would round to eight bits, and variants, which it does not know.
+
+    parts: by name, its materials: its own, and that in each variant
+    """
+    tree["materials"] = found = []
+    for mesh in tree["meshes"]:
+        numbers = []
+        for entry in parts[mesh["name"]]:
+            if entry not in found:
+                found.append(entry)
+            numbers.append(found.index(entry))
+        (primitive,) = mesh["primitives"]
+        primitive["material"] = numbers[0]
+        if variants:
+            mappings = [
+                {"material": k, "variants": [v for v, other in enumerate(numbers[1:]) if other == k]}
+                for k in sorted(set(numbers[1:]))
+            ]
+            primitive["extensions"] = {VARIANTS: {"mappings": mappings}}
+    if variants:
+        tree["extensions"] = {VARIANTS: {"variants": [{"name": name} for name in variants]}}
+    used = {*tree.get("extensionsUsed", []), EXTENSION, *([VARIANTS] if variants else [])}
+    tree["extensionsUsed"] = sorted(used)
+
+
+def variant_name(overrides: Mapping[str, str]) -> str:
+    """What a variant is called that gives parts of a mesh other materials.
+
+    >>> variant_name({"shell": "white", "legs": "black"})
+    'legs: black, shell: white'
+    """
+    return ", ".join(f"{part}: {material}" for part, material in sorted(overrides.items()))
+
+
+def read_part_materials(path: str | Path) -> dict[str, dict[str, str]]:
+    """The materials of each part of a file of `write_glb`, by the part's name: its own (""), and that in each variant, by the variant's name."""
+    data = read_bytes(path, "a glTF file")
+    tree = json.loads(data[20 : 20 + int.from_bytes(data[12:16], "little")])  # the JSON chunk
+    called = [entry["name"] for entry in tree["materials"]]
+    variants = [entry["name"] for entry in tree.get("extensions", {}).get(VARIANTS, {}).get("variants", [])]
+    parts = {}
+    for mesh in tree["meshes"]:
+        (primitive,) = mesh["primitives"]
+        parts[mesh["name"]] = {"": called[primitive["material"]]}
+        for each in primitive.get("extensions", {}).get(VARIANTS, {}).get("mappings", []):
+            parts[mesh["name"]] |= {variants[v]: called[each["material"]] for v in each["variants"]}
+    return parts
 
 
 def gltf_material(material: Reflectance) -> dict[str, Any]:

@@ -50,6 +50,14 @@ def check_recipe(
             raise InputError(f"there is no file {name!r}", file=path, cure=cure)
     if isinstance(recipe, schema.OfPhotos):
         check("photos", recipe.photos, photos, "photo", once=True)
+        if recipe.sun is not None:
+            if isinstance(recipe, schema.Relight):
+                refuse("sun", "a relighting shows lights that are given", "leave it out")
+            if len(recipe.photos) != 1:
+                cure = "name one photo: `photos: [...]`"
+                refuse("sun.direction", "a direction holds in the light of one photo", cure)
+            if not any(recipe.sun.direction):
+                refuse("sun.direction", "it has no length", "name another")
     if isinstance(recipe, schema.Relight | schema.Grid):
         check("lights", [name for name in recipe.lights if not is_light_file(name)], photos, "photo")
     if isinstance(recipe, schema.Relight):
@@ -64,7 +72,12 @@ def check_recipe(
     if isinstance(recipe, schema.Transfer):
         check("materials", recipe.materials.values(), known, "material")
     if isinstance(recipe, schema.Insert):
-        check("material", [recipe.material] if recipe.material is not None else [], known, "material")
+        if isinstance(recipe.material, dict):
+            check("material", recipe.material.values(), known, "material")
+            if recipe.mesh not in meshes:
+                refuse("material", "parts are told apart in a mesh of the data set", "name one material")
+        elif recipe.material is not None:
+            check("material", [recipe.material], known, "material")
         if not is_mesh_file(recipe.mesh):
             check("mesh", [recipe.mesh], [BALL, *meshes], "mesh")
         elif Path(recipe.mesh).suffix.lower() not in MESHES:

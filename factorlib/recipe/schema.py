@@ -16,7 +16,7 @@ from typing import Annotated, Literal
 
 import msgspec
 
-from factorlib.dataset.schema import Share, Shares, Vec2
+from factorlib.dataset.schema import Share, Shares, Vec2, Vec3
 from factorlib.errors import InputError
 from factorlib.reading import read_text, reading
 
@@ -38,11 +38,25 @@ class Recipe(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=Tr
     """Samples per pixel of the path tracer: noise falls as their square root."""
 
 
+class AssumedSun(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """A sun that takes the place of the recovered ones; the light as a whole keeps its energy, in each channel."""
+
+    direction: Vec3
+    """Toward the sun, in the frame of the photo's exported light (illumination/<name>.exr, lights.json): x right, y up, z toward the viewer
+    for a light fixed to the camera, the same turn of the world for one fixed to it."""
+    strength: Annotated[float, msgspec.Meta(ge=0, le=1)]
+    """Share of the light's energy (the integral of its radiance over the sphere) that the sun holds."""
+    size: Annotated[float, msgspec.Meta(ge=0.05, le=90)] = 0.53
+    """Diameter in degrees."""
+
+
 class OfPhotos(Recipe, frozen=True, kw_only=True):
     """Of kinds that make pictures of each photo."""
 
     photos: list[str] = []
     """Photos whose camera, objects and light are used; all of them where none is named."""
+    sun: AssumedSun | None = None
+    """A sun that is assumed, in the light of the one photo that the recipe names."""
 
 
 class Sized(OfPhotos, frozen=True, kw_only=True):
@@ -124,8 +138,9 @@ class Insert(OfPhotos, frozen=True, kw_only=True, tag="insert"):
 
     mesh: str = "ball"
     """`ball`, a mesh of the data set, or a mesh file."""
-    material: str | None = None
-    """Material of the data set or of `table`; without it the mesh's own, and for a file or ball the data set's first."""
+    material: str | dict[str, str] | None = None
+    """Material of the data set or of `table`, or own material -> another for parts of a mesh of the data set; without it the mesh's own, and for a
+    file or ball the data set's first."""
     table: str | None = None
     """File of materials of one's own, like materials.json."""
     beside: str | None = None

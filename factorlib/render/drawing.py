@@ -1,25 +1,29 @@
 """The pictures of a recipe, as files: the photos' objects from another side, in other light, of other material, with a further object.
 
 For each photo <photo>.png (8-bit sRGB) and <photo>.exr (linear), or <photo>/<light>.…, an animation <photo>.gif with its frames
-<photo>/000.png …, or one grid.png.
+<photo>/000.png …, or one grid.png; and <photo>.json, what is to be said beside the picture, where there is something.
 """
 
 import logging
 from collections.abc import Callable
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 import msgspec
 import numpy as np
 
+from factorlib.conventions import YUP_FROM_CAMERA
 from factorlib.errors import InputError
 from factorlib.images.exr import write_rgb_exr
 from factorlib.images.picture import picture, write_png
 from factorlib.images.write import write_gif
+from factorlib.jsonfile import write_json
 from factorlib.recipe import schema
 from factorlib.recipe.schema import AnyRecipe, is_light_file
-from factorlib.render.insertion import NEW, STEPS, inserted, spot_at, spot_beside, stood
+from factorlib.render.insertion import NEW, STEPS, inserted
 from factorlib.render.photo_scene import lit_ball, orbit, resized, traced_photo, turned_light
+from factorlib.render.placement import spot_at, spot_beside, stood, stood_free
 from factorlib.render.solved_set import SolvedSet
 from factorlib.render.traced import Traced
 from factorlib.results.materials import Reflectance
@@ -27,6 +31,10 @@ from factorlib.stage import Progress
 from factorlib.wholefile import write_text
 
 log = logging.getLogger("factorlib.recipes")
+SUN = (
+    "The sun is assumed, not recovered: it stands in direction {sun.direction} of the light's map, {sun.size:g}° wide, "
+    "and holds {sun.strength:.0%} of the light's energy, which is kept."
+)
 
 
 def draw(recipe: AnyRecipe, results: SolvedSet, out: Path, progress: Progress) -> None:
@@ -37,7 +45,13 @@ def draw(recipe: AnyRecipe, results: SolvedSet, out: Path, progress: Progress) -
     for done, photo in enumerate(photos):
         try:
             report = partial(_report, progress, done, len(photos), photo)
-            DRAWN[type(recipe)](recipe, results, photo, out, report)
+            facts = DRAWN[type(recipe)](recipe, results, photo, out, report) or {}
+            captions = [facts.pop("caption")] if facts else []
+            if recipe.sun is not None:
+                facts["assumed_sun"] = msgspec.to_builtins(recipe.sun)
+                captions.append(SUN.format(sun=recipe.sun))
+            if facts:
+                write_json(out / f"{photo}.json", {**facts, "caption": " ".join(captions)})
         except InputError as error:
             if recipe.photos:
                 raise
@@ -61,7 +75,7 @@ def resynthesis(
 ) -> None:
     """Path-traced objects, of other materials where the recipe says so, over the photo's background."""
     report(0)
-    scene = results.scene(photo)
+    scene = results.scene(photo, recipe.sun)
     if isinstance(recipe, schema.Transfer):
         known, other = results.known(recipe.table), recipe.materials
         materials = {name: known[other[name]] if name in other else own for name, own in scene.materials.items()}
@@ -70,9 +84,9 @@ def resynthesis(
     _write(out / photo, traced.over(results.photo(photo)))
 
 
-def insertion(recipe: schema.Insert, results: SolvedSet, photo: str, out: Path, report: Report) -> None:
-    """A further object on the ground of one that is there."""
-    scene = results.scene(photo)
+def insertion(recipe: schema.Insert, results: SolvedSet, photo: str, out: Path, report: Report) -> dict[str, Any]:
+    """A further object on the ground of one that is there; returns what is said beside the picture."""
+    scene = results.scene(photo, recipe.sun)
     neighbour = next((each for each in scene.objects if each.name == recipe.beside), scene.objects[0])
     given, polish = recipe.ground, None
     if any(given.specular):
@@ -81,6 +95,9 @@ def insertion(recipe: schema.Insert, results: SolvedSet, photo: str, out: Path, 
     if not ground.plane.seen_from_above:
         fault = f"photo '{photo}' was taken from below the plane that '{neighbour.name}' stands on, so that no shadow on it can be seen"
         raise InputError(fault, key="photos", cure="name other photos, or give the photo's `ground` in dataset.yaml")
+    if recipe.sun is not None and results.sun_axis(photo, recipe.sun) @ YUP_FROM_CAMERA @ ground.plane.normal <= 0:
+        fault = "the sun stands below the ground of the photo"
+        raise InputError(fault, key="sun.direction", cure="y of the direction points upward in the photo")
     own = {f"{NEW}{name}": material for name, material in results.known(recipe.table).items()}  # the new object's
     mesh, names, up = results.mesh(recipe.mesh, recipe.material, recipe.up)
     if recipe.at is not None:
@@ -89,18 +106,32 @@ def insertion(recipe: schema.Insert, results: SolvedSet, photo: str, out: Path, 
         tall = np.ptp(mesh.vertices @ up)
         wide = 2 * float(np.linalg.norm(np.cross(mesh.vertices - mesh.centre, up), axis=1).max())
         spot = spot_beside(scene, ground.plane, neighbour, recipe.size, wide / tall)
-    new = stood(NEW, mesh, tuple(f"{NEW}{name}" for name in names), up, recipe.turn, spot)
+    labels, factor = tuple(f"{NEW}{name}" for name in names), results.poses[photo].camera.factor
+    stand = partial(stood, NEW, mesh, labels, up, recipe.turn)
+    new, there, moved = stood_free(scene, stand, spot, recipe.at is not None, factor)
+    if moved:
+        log.warning("%s: %s", photo, moved)
     scene = msgspec.structs.replace(scene, materials={**scene.materials, **own})
     seen = results.straightened(photo), results.covered(photo)
-    found = inserted(scene, *seen, new, spot, ground, recipe.samples, lambda done: report(done / STEPS))
+    found = inserted(scene, *seen, new, there, ground, recipe.samples, lambda done: report(done / STEPS))
     same = (found.coverage[..., None] == 0) & (found.shadow == 1) & (polish is None)
     _write(out / photo, np.where(same, results.photo(photo), results.tone(photo)(found.composite)))
+    at = factor * scene.camera.project(there.point @ YUP_FROM_CAMERA)
+    given = f"where '{neighbour.name}' would come to rest"
+    if results.grounds[photo].ground is not None:
+        given = "that of dataset.yaml"
+    return {
+        "at": at.round(1).tolist(),
+        "moved": float(np.linalg.norm(there.point - spot.point) / spot.height),
+        "shadow": msgspec.to_builtins(found.match),
+        "caption": f"{moved} The ground is {given}. {found.match}".strip(),
+    }
 
 
 def view(recipe: schema.View, results: SolvedSet, photo: str, out: Path, report: Report) -> None:
     """The objects alone, from another side."""
     report(0)
-    scene = resized(results.scene(photo), recipe.width)
+    scene = resized(results.scene(photo, recipe.sun), recipe.width)
     camera = orbit(scene, recipe.azimuth, recipe.elevation, recipe.zoom)
     traced = traced_photo(scene, recipe.samples, camera, with_light=recipe.background == "light")
     _write_alone(out / photo, Traced(traced, results.tone(photo)))
@@ -110,7 +141,7 @@ def animation(
     recipe: schema.Turntable | schema.MovingLight, results: SolvedSet, photo: str, out: Path, report: Report
 ) -> None:
     """The camera or the light turns once: every frame as a PNG, and all as a GIF, which has no half-transparent pixels, on white."""
-    scene, pixels = resized(results.scene(photo), recipe.width), []
+    scene, pixels = resized(results.scene(photo, recipe.sun), recipe.width), []
     for k in range(recipe.frames):
         report(k / recipe.frames)
         degrees = 360 * k / recipe.frames

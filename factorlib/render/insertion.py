@@ -1,4 +1,4 @@
-"""A further object in a photo: where it stands, and what the photo would show.
+"""A further object in a photo: what the photo would show.
 
 Let B be the photo, L₀ and L₁ the path-traced scene of objects and ground without and with the new object, α its coverage.  The ground
 and the objects answer the change of light by
@@ -14,6 +14,10 @@ s under the object is that of the nearest pixel beside it.  L₀ and L₁ take t
 meets the object: those pixels stay as they were.  A ground that reflects adds what it shows of the object, the change of its specular part
 alone; s then also scales what the photo shows of that part, so such a ground is right only where it is mostly diffuse.
 
+The photo's own shadow is compared with the predicted one where the photo shows ground near its objects: over these pixels, the correlation
+of the logarithm of luminance of B with that of L₀, which on a plane in light from infinity is, up to a constant, that of the share of
+irradiance that the objects leave.
+
 The ground is a disc about the object, its diffuse reflectance that which makes L₀ look as the photo.  Beyond it nothing is known of what
 the photo shows, and shadows fade out toward its rim.
 """
@@ -24,25 +28,26 @@ from typing import Any
 import msgspec
 import numpy as np
 from jaxtyping import Bool, Float
-from scipy.ndimage import distance_transform_edt
-from scipy.spatial.transform import Rotation
+from scipy.ndimage import binary_erosion, distance_transform_edt
 
 from factorlib.conventions import YUP_FROM_CAMERA
 from factorlib.errors import InputError
 from factorlib.export.scene import ALL_BOUNCES
-from factorlib.geometry.camera import Camera, rotation_of_vector
 from factorlib.meshes.mesh import Mesh
 from factorlib.meshes.ply import submesh
 from factorlib.render.ground import Plane, height_over
-from factorlib.render.photo_scene import PhotoScene, Placed, light_entry, shapes
+from factorlib.render.photo_scene import PhotoScene, Placed, light_entries, shapes
+from factorlib.render.placement import RADIUS, Spot, rotation_between
 from factorlib.results.materials import Reflectance, vec3
 from factorlib.tracing.scene import bsdf, rendered, rgb, rigid, sensor, shape, transform
 
-RADIUS, FADE = 8.0, 0.5  # of the disc, in sizes of the object; share of it from which on shadows fade
+FADE = 0.5  # share of the disc's radius from which on shadows fade
 FIT_SAMPLES = 16
 GREY, DARKEST, BRIGHTEST = 0.3, 0.02, 0.85  # diffuse reflectance of the ground: where nothing tells it, and its bounds
-GAP = 0.15  # between the objects, in heights of the new one
+LUMINANCE = np.array([0.2126, 0.7152, 0.0722])  # of linear Rec. 709
 HAIR = 1e-4  # of an object's size: how far apart surfaces are that must not meet
+NEAR = 2.0  # shadows are compared within so many heights of an object
+RIM, FEWEST = 2, 100  # so many pixels off the masks, over at least so many pixels
 GROUND, STEPS = "+ground", 5
 NEW = "+"  # what the new object and its materials are called: no name in dataset.yaml has it
 
@@ -60,74 +65,31 @@ class Ground(msgspec.Struct, frozen=True):
     polish: Reflectance | None = None
 
 
-class Spot(msgspec.Struct, frozen=True):
-    """Where a new object stands on the ground, in the world, and how high it is."""
+class ShadowMatch(msgspec.Struct, frozen=True):
+    """Correlation of log luminance, photo and prediction, on the ground near the photo's objects; None where there are too few pixels.
 
-    plane: Plane
-    point: Float[np.ndarray, "3"]
-    height: float
-
-
-def spot_beside(scene: PhotoScene, plane: Plane, neighbour: Placed, relative_height: float, slenderness: float) -> Spot:
-    """Beside an object, on the side with more room in the picture.
-
-    relative_height: of the new object, to the neighbour's;  slenderness: its width over its height
+    constant_light: the same with a constant light in place of the recovered one: what shape alone predicts
     """
-    height = relative_height * height_over(plane, neighbour)
-    right = np.array([1.0, 0.0, 0.0]) - plane.normal[0] * plane.normal
-    right /= np.linalg.norm(right)
-    across = neighbour.vertices @ right
-    foot = plane.onto(neighbour.vertices.mean(axis=0)[None])[0]
-    foot = foot + ((across.min() + across.max()) / 2 - foot @ right) * right
-    away = (np.ptp(across) / 2 + (slenderness / 2 + GAP) * height) * right
-    spots = [foot + side * away for side in (1.0, -1.0)]
-    others = [each for each in scene.objects if each is not neighbour]
 
-    def room(point: Float[np.ndarray, "3"]) -> float:
-        """Pixels to the picture's border, or to another object's middle, whichever is less."""
-        (x, y), width = scene.camera.project(point @ YUP_FROM_CAMERA), scene.camera.width
-        middles = [each.vertices.mean(axis=0) @ YUP_FROM_CAMERA for each in others]
-        taken = [abs(scene.camera.project(middle)[0] - x) for middle in middles]
-        return min([x, width - x, scene.camera.height - y, *taken])
+    correlation: float | None
+    constant_light: float | None
+    pixels: int
 
-    return Spot(plane, max(spots, key=room), height)
-
-
-def spot_at(
-    scene: PhotoScene, plane: Plane, neighbour: Placed, pixel: tuple[float, float], relative_height: float
-) -> Spot:
-    """Where the photo's `pixel` shows the ground; InputError where it does not."""
-    ray = scene.camera.rays_through(np.array([pixel])) @ YUP_FROM_CAMERA
-    point = plane.hit(ray)[0]
-    if not np.isfinite(point).all():
-        found = f"pixel {pixel} shows no ground: it lies above the horizon"
-        raise InputError(found, key="at", cure="name a pixel further down")
-    return Spot(plane, point, relative_height * height_over(plane, neighbour))
-
-
-def stood(
-    name: str, mesh: Mesh, materials: tuple[str, ...], up: Float[np.ndarray, "3"], turn_deg: float, spot: Spot
-) -> Placed:
-    """A mesh in its own frame, `up` upward there, stood on a spot."""
-    toward = _rotation_between(up, spot.plane.normal)
-    rotation = rotation_of_vector(np.radians(turn_deg) * spot.plane.normal) @ toward
-    vertices = mesh.vertices @ rotation.T
-    along = vertices @ spot.plane.normal
-    scale = spot.height / np.ptp(along)
-    middle = (vertices.min(axis=0) + vertices.max(axis=0)) / 2
-    foot = middle + (along.min() - middle @ spot.plane.normal) * spot.plane.normal
-    matrix = np.eye(4)
-    matrix[:3, :3], matrix[:3, 3] = scale * rotation, spot.point - scale * foot
-    return Placed(name, mesh, materials, matrix)
+    def __str__(self) -> str:
+        if self.correlation is None:
+            return f"Shadows were not compared: too little is seen of the ground near the photo's objects ({self.pixels} pixels)."
+        light, shape = f"{self.correlation:.2f}", f"{self.constant_light:.2f}"
+        return f"The photo's shading of the ground correlates with the predicted one by {light}; with that of a constant light by {shape}."
 
 
 class Inserted(msgspec.Struct, frozen=True):
-    """composite: (2), linear;  coverage: α;  shadow: s of (1);  ground: the diffuse reflectance that was found for it"""
+    """composite: (2), linear;  coverage: α;  shadow: s of (1);  ground: the diffuse reflectance that was found for it;  match: of the photo's own shadow"""
 
     composite: Picture
     coverage: Float[np.ndarray, "h w"]
     shadow: Picture
     ground: Float[np.ndarray, "3"]
+    match: ShadowMatch
 
 
 def inserted(
@@ -146,14 +108,16 @@ def inserted(
     report: how many of STEPS are done
     """
     camera = sensor(scene.camera, rigid(YUP_FROM_CAMERA, np.zeros(3)), near=scene.near)
-    there = {"light": light_entry(scene.light), **shapes(scene.objects, scene.materials)}
+    there, light = shapes(scene.objects, scene.materials), light_entries(scene.light, scene.size)
     more = shapes([new], scene.materials)
 
-    def traced(entries: dict[str, Any], samples: int = samples) -> Picture:
+    def traced(entries: dict[str, Any], samples: int = samples, light: dict[str, Any] = light) -> Picture:
         """With the same random numbers each time."""
-        return rendered({**there, **entries}, camera, samples, 1, ALL_BOUNCES, hide_emitters=True)
+        return rendered({**light, **there, **entries}, camera, samples, 1, ALL_BOUNCES, hide_emitters=True)
 
-    distance = _distance(scene.camera, spot)
+    rays = scene.camera.rays() @ YUP_FROM_CAMERA
+    points = spot.plane.hit(rays.reshape(-1, 3)).reshape(rays.shape)  # of the ground; NaN above the horizon
+    distance = np.nan_to_num(np.linalg.norm(points - spot.point, axis=-1) / (RADIUS * spot.height), nan=np.inf)
     # 1 near the spot, falling smoothly to 0 at the rim of the disc; 1 above the horizon, where only objects are seen
     t = np.clip((1 - np.where(np.isinf(distance), 0, distance)) / (1 - FADE), 0, 1)
     near, shows_ground = (t * t * (3 - 2 * t))[..., None], (distance < 1) & ~covered
@@ -169,6 +133,9 @@ def inserted(
     report(2)
     disc = _disc(spot, Reflectance(diffuse, (0.0,) * 3, 1.0))
     without = traced(disc)
+    constant = traced(disc, light={"light": {"type": "constant", "radiance": rgb(1.0)}})
+    close = np.any([np.linalg.norm(points - foot, axis=-1) < far for foot, far in _feet(scene, spot.plane)], axis=0)
+    match = shadow_match(photo, without, constant, binary_erosion(shows_ground & close, iterations=RIM))
     report(3)
     with_ = traced({**disc, **more})
     report(4)
@@ -181,7 +148,7 @@ def inserted(
         mirrored = traced({**polished, **more}) - traced(polished)
         composite = np.maximum(composite + mirrored * shows_ground[..., None] * beside * near, 0)
     report(STEPS)
-    return Inserted(composite, coverage, shadow, np.asarray(diffuse))
+    return Inserted(composite, coverage, shadow, np.asarray(diffuse), match)
 
 
 def _ground_colour(lit: Picture, photo: Picture, shows_ground: Bool[np.ndarray, "h w"]) -> tuple[float, float, float]:
@@ -193,10 +160,17 @@ def _ground_colour(lit: Picture, photo: Picture, shows_ground: Bool[np.ndarray, 
     return vec3(np.clip(found, DARKEST, BRIGHTEST))
 
 
+def _feet(scene: PhotoScene, plane: Plane) -> list[tuple[Float[np.ndarray, "3"], float]]:
+    """Where the middle of each object stands on the ground, and how far from there its shadow is looked for."""
+    return [
+        (plane.onto(each.vertices.mean(axis=0)[None])[0], NEAR * height_over(plane, each)) for each in scene.objects
+    ]
+
+
 def _disc(spot: Spot, material: Reflectance) -> dict[str, Any]:
     """The ground about the spot."""
     frame = np.eye(4)
-    frame[:3, :3] = RADIUS * spot.height * _rotation_between(np.array([0.0, 0.0, 1.0]), spot.plane.normal)
+    frame[:3, :3] = RADIUS * spot.height * rotation_between(np.array([0.0, 0.0, 1.0]), spot.plane.normal)
     frame[:3, 3] = spot.point - HAIR * spot.height * spot.plane.normal
     return {GROUND: {"type": "disk", "to_world": transform(frame), "bsdf": bsdf(material)}}
 
@@ -233,13 +207,15 @@ def _shadow(
     return 1 + (shadow - 1) * near
 
 
-def _distance(camera: Camera, spot: Spot) -> Float[np.ndarray, "h w"]:
-    """Of the point of the ground behind each pixel from the spot, in radii of the disc; infinite above the horizon."""
-    rays = camera.rays() @ YUP_FROM_CAMERA
-    points = spot.plane.hit(rays.reshape(-1, 3)).reshape(rays.shape)
-    return np.nan_to_num(np.linalg.norm(points - spot.point, axis=-1) / (RADIUS * spot.height), nan=np.inf)
+def shadow_match(photo: Picture, lit: Picture, constant: Picture, where: Bool[np.ndarray, "h w"]) -> ShadowMatch:
+    """How well a prediction of the ground's radiance explains what the photo shows there.
 
-
-def _rotation_between(first: Float[np.ndarray, "3"], second: Float[np.ndarray, "3"]) -> Float[np.ndarray, "3 3"]:
-    """The smallest turn of one unit vector into another."""
-    return Rotation.align_vectors(second[None], first[None])[0].as_matrix()
+    lit, constant: the ground with the photo's objects in their light, and in a constant one;  where: pixels that show ground
+    """
+    luminances = [picture @ LUMINANCE for picture in (photo, lit, constant)]
+    where = where & np.all([luminance > 0 for luminance in luminances], axis=0)
+    logs = [np.log(luminance[where]) for luminance in luminances]
+    if where.sum() < FEWEST or min(map(np.ptp, logs)) == 0:
+        return ShadowMatch(None, None, int(where.sum()))
+    recovered, shape = (float(np.corrcoef(logs[0], other)[0, 1]) for other in logs[1:])
+    return ShadowMatch(recovered, shape, int(where.sum()))

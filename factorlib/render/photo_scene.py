@@ -13,18 +13,19 @@ import numpy as np
 from jaxtyping import Float
 
 from factorlib.conventions import YUP_FROM_CAMERA
-from factorlib.export.environment import mitsuba_map
+from factorlib.export.environment import NARROWEST, mitsuba_map
 from factorlib.export.scene import ALL_BOUNCES, DIRECT
 from factorlib.geometry.camera import Camera, rotation_of_vector
 from factorlib.light.latlong import turned_map
-from factorlib.light.lobes import Lobes
+from factorlib.light.lobes import Lobes, lobe_integral
 from factorlib.meshes.mesh import Mesh
 from factorlib.meshes.ply import submesh
 from factorlib.results.materials import Reflectance
-from factorlib.tracing.scene import bsdf, envmap, envmap_of_nodes, paint, rendered, rigid, sensor, shape
+from factorlib.tracing.scene import bsdf, envmap, envmap_of_nodes, paint, rendered, rgb, rigid, sensor, shape
 
 UP = np.array([0.0, 1.0, 0.0])
 NEAR = 1e-3  # of the objects' distance
+FAR = 3e3  # of a scene's size: where suns stand
 LOBE_ROWS, MAP_ROWS = 256, 1024  # of the lattice that Mitsuba is handed of lobes, and of a map
 
 Light = Lobes | Float[np.ndarray, "h w 3"]
@@ -60,16 +61,44 @@ class PhotoScene(msgspec.Struct, frozen=True):
         return (points.min(axis=0) + points.max(axis=0)) / 2
 
     @property
+    def size(self) -> float:
+        """How far away the objects are."""
+        return float(np.linalg.norm(self.middle))
+
+    @property
     def near(self) -> float:
         """From which distance on things are seen."""
-        return NEAR * float(np.linalg.norm(self.middle))
+        return NEAR * self.size
 
 
-def light_entry(light: Light) -> dict[str, Any]:
-    """The light as Mitsuba's `envmap`."""
-    if isinstance(light, Lobes):
-        return envmap_of_nodes(mitsuba_map(light, LOBE_ROWS, 2 * LOBE_ROWS))
-    return envmap(light, finer=max(1, MAP_ROWS // len(light)))
+def with_sun(light: Lobes, axis: Float[np.ndarray, "3"], diameter_deg: float, share: float) -> Lobes:
+    """The light with a sun that holds `share` of its energy, in place of the suns it has; each channel keeps its energy.
+
+    A channel in which the light has nothing but suns gives all its energy to the sun.
+    """
+    rest = light.take(~light.suns)
+    factor = np.divide((1 - share) * light.energy, rest.energy, out=np.zeros(3), where=rest.energy > 0)
+    sharpness = np.append(rest.sharpness, 4 / np.radians(diameter_deg / 2) ** 2)
+    weight = (light.energy - factor * rest.energy) / lobe_integral(sharpness[-1])
+    return Lobes(np.vstack([rest.axis, axis]), sharpness, np.vstack([factor * rest.weight, weight]))
+
+
+def light_entries(light: Light, size: float) -> dict[str, Any]:
+    """The light as Mitsuba's `envmap`; lobes too narrow for one are discs in the sky, far beyond a scene of that size."""
+    if not isinstance(light, Lobes):
+        return {"light": envmap(light, finer=max(1, MAP_ROWS // len(light)))}
+    narrow = light.sharpness * NARROWEST * (np.pi / (LOBE_ROWS - 1)) ** 2 > 1
+    entries = {"light": envmap_of_nodes(mitsuba_map(light.take(~narrow), LOBE_ROWS, 2 * LOBE_ROWS))}
+    few, far = light.take(narrow), FAR * size
+    energies = few.weight * lobe_integral(few.sharpness)[:, None]
+    for k, (axis, sharpness, energy) in enumerate(
+        zip(few.axis @ YUP_FROM_CAMERA, few.sharpness, energies, strict=True)
+    ):
+        radius = 2 / np.sqrt(sharpness)  # of a disc as wide (RMS) as the lobe
+        emitter = {"type": "area", "radiance": rgb(energy / (2 * np.pi * (1 - np.cos(radius))))}
+        place = {"center": (far * axis).tolist(), "radius": float(far * np.sin(radius))}
+        entries[f"sun {k}"] = {"type": "sphere", **place, "emitter": emitter}
+    return entries
 
 
 def shapes(
@@ -97,7 +126,7 @@ def traced_photo(
     world_from_camera: of OpenCV's camera axes; without it the photo's own
     """
     own = rigid(YUP_FROM_CAMERA, np.zeros(3)) if world_from_camera is None else world_from_camera
-    entries = {"light": light_entry(scene.light), **shapes(scene.objects, scene.materials)}
+    entries = {**light_entries(scene.light, scene.size), **shapes(scene.objects, scene.materials)}
     view = sensor(scene.camera, own, near=scene.near, alpha=True)
     picture = rendered(entries, view, samples, 0, scene.max_depth, hide_emitters=not with_light)
     if with_light:
@@ -112,7 +141,7 @@ def lit_ball(light: Light, material: Reflectance, size: int, samples: int) -> Fl
     camera = Camera(size, size, focal, (size / 2, size / 2))
     sphere = {"type": "sphere", "center": [0.0, 0.0, -distance], "radius": 1.0, "bsdf": bsdf(material)}
     view = sensor(camera, rigid(YUP_FROM_CAMERA, np.zeros(3)), alpha=True)
-    return rendered({"light": light_entry(light), "ball": sphere}, view, samples, 0, DIRECT, hide_emitters=True)
+    return rendered({**light_entries(light, distance), "ball": sphere}, view, samples, 0, DIRECT, hide_emitters=True)
 
 
 def resized(scene: PhotoScene, width: int | None) -> PhotoScene:

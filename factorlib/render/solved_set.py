@@ -17,10 +17,10 @@ from factorlib.images.tone import shown, straightened
 from factorlib.meshes.mesh import Mesh, scaled
 from factorlib.meshes.read import CREASE_DEG, MeshesOnce, read_mesh
 from factorlib.reading import check_plain
-from factorlib.recipe.schema import BALL, is_light_file, is_mesh_file, read_table
+from factorlib.recipe.schema import BALL, AssumedSun, is_light_file, is_mesh_file, read_table
 from factorlib.render.ground import Plane, resting_plane
 from factorlib.render.insertion import Ground
-from factorlib.render.photo_scene import Light, PhotoScene, Placed
+from factorlib.render.photo_scene import Light, PhotoScene, Placed, with_sun
 from factorlib.render.resynthesis import light_of
 from factorlib.render.traced import Tone, as_it_is
 from factorlib.results.materials import MaterialTable, Reflectance, read_materials, reflectances
@@ -59,8 +59,8 @@ class SolvedSet:
         self._meshes = MeshesOnce(inputs.mesh, self.names, crease_deg, own.displacements, own.log_factors)
         self._pixels: dict[str, dict[str, np.ndarray]] = {}
 
-    def scene(self, photo: str) -> PhotoScene:
-        """The photo's objects, in their poses, in its light."""
+    def scene(self, photo: str, sun: AssumedSun | None = None) -> PhotoScene:
+        """The photo's objects, in their poses, in its light; or in that with a sun that is assumed."""
         poses, objects = self.poses[photo], self.objects[photo]
         if not objects.objects:
             found, cure = f"photo '{photo}' has no objects to draw", "name other photos in the recipe"
@@ -73,7 +73,16 @@ class SolvedSet:
         camera = poses.camera.camera(width, height)
         placed = tuple(self._placed(obj, objects.meshes[obj.mesh], poses) for obj in objects.objects)
         depth = ALL_BOUNCES if self.table.model.interreflection else DIRECT
-        return PhotoScene(camera, placed, self.light(photo), self.materials, depth)
+        light = self.light(photo)
+        if sun is not None:
+            light = with_sun(light, self.sun_axis(photo, sun), sun.size, sun.strength)
+        return PhotoScene(camera, placed, light, self.materials, depth)
+
+    def sun_axis(self, photo: str, sun: AssumedSun) -> Float[np.ndarray, "3"]:
+        """The unit direction to a sun in the photo's camera axes."""
+        world = self.lights[photo].world_from_camera
+        camera_from_light = np.eye(3) if world is None else np.array(world).T
+        return camera_from_light @ YUP_FROM_CAMERA @ (np.array(sun.direction) / np.linalg.norm(sun.direction))
 
     def photo(self, photo: str) -> Float[np.ndarray, "h w 3"]:
         """Its linear radiance."""
@@ -126,12 +135,16 @@ class SolvedSet:
         normal = YUP_FROM_CAMERA @ np.array(given.normal)
         return Ground(Plane(normal / np.linalg.norm(normal), YUP_FROM_CAMERA @ np.array(given.point)), given.diffuse)
 
-    def mesh(self, name: str, material: str | None, up: str) -> tuple[Mesh, tuple[str, ...], np.ndarray]:
+    def mesh(
+        self, name: str, material: str | dict[str, str] | None, up: str
+    ) -> tuple[Mesh, tuple[str, ...], np.ndarray]:
         """A mesh to insert, its materials by label, and which way is up in its own frame: of the data set's, as it stands in a photo.
 
-        Raises InputError for a mesh that is not there, and for one without height.
+        material: of the whole, or of some of its own materials, by name, others; None: its own
+        Raises InputError for a mesh that is not there, for one without height, and for a material that the mesh does not have.
         """
-        upward, wanted = np.eye(3)["xyz".index(up)], material or self.names[0]
+        upward = np.eye(3)["xyz".index(up)]
+        wanted = material if isinstance(material, str) else self.names[0]
         materials: tuple[str, ...] = (wanted,)
         if name == BALL:
             mesh = sphere(1.0)
@@ -145,7 +158,15 @@ class SolvedSet:
             photo, obj = shown[0]
             placed = self._placed(obj, self.objects[photo].meshes[name], self.poses[photo])
             upward = placed.world_from_object[:3, :3].T @ self.ground(photo, placed).plane.normal
-            mesh, materials = placed.mesh, (material,) * len(self.names) if material else placed.materials
+            mesh, materials = placed.mesh, placed.materials
+            if isinstance(material, str):
+                materials = (material,) * len(materials)
+            elif material is not None:
+                own = [materials[label - 1] for label in mesh.labels]
+                if other := [each for each in material if each not in own]:
+                    found = f"{name!r} as in photo '{photo}' has no material {other[0]!r}"
+                    raise InputError(found, key="material", cure=did_you_mean(other[0], own))
+                materials = tuple(material.get(each, each) for each in materials)
         if np.ptp(mesh.vertices @ upward) < LEAST_HEIGHT * mesh.radius:
             cure = "say which axis of the file points upward, as in `up: z`, or name a mesh that is not flat"
             raise InputError(f"the mesh {name!r} has no height", key="mesh", cure=cure)

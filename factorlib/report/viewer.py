@@ -9,6 +9,7 @@ import base64
 from collections.abc import Mapping
 from typing import Any
 
+import msgspec
 import numpy as np
 import open3d as o3d
 import trimesh
@@ -17,9 +18,12 @@ from jaxtyping import Float, Int
 from factorlib.conventions import YUP_FROM_CAMERA
 from factorlib.dataset.schema import LightSlice, ObjectsSlice
 from factorlib.export.environment import sharpened
+from factorlib.export.gltf import read_part_materials, variant_name
+from factorlib.geometry.camera import Pose
 from factorlib.light.lobes import Lobes
 from factorlib.report.artifacts import Artifacts
 from factorlib.results.lobes import read_lobes
+from factorlib.results.poses import AS_IT_IS
 
 MOST_TRIANGLES = 150_000  # of all meshes together: about 3 MB of page
 FACES = (32, 64, 128, 256)  # texels across a face of the cube map
@@ -33,7 +37,7 @@ def viewed(
 
     lights, objects: slices of the photos;  exposure: by photo, shows it well.  Strings of numbers are base64, little-endian.
 
-    meshes     see `_mesh`
+    objects, meshes  see `_shown`
     materials  by name
     lights     by name: face, texels across a face of the cube map they are drawn into; lobes, float32, 7 a lobe: axis (y-up),
                sharpness, weight
@@ -50,7 +54,7 @@ def viewed(
         photo = {"name": name, "light": lights[name].illumination, "rotation": turn.ravel().tolist()}
         photos.append(photo | {"gain": run.exposures.get(name, (1.0,) * 3), "exposure": exposure[name]})
     drawn = {name: _light(each) for name, each in lobes.items()}
-    return {"meshes": _meshes(run, objects), "materials": materials, "lights": drawn, "photos": photos}
+    return {**_shown(run, objects), "materials": materials, "lights": drawn, "photos": photos}
 
 
 def _light(lobes: Lobes) -> dict[str, Any]:
@@ -72,56 +76,80 @@ def spacing_of(face: int) -> float:
 # ── Meshes ───────────────────────────────────────────────────────────────────────────────────────────────────────────
 
 
-def _meshes(run: Artifacts, objects: Mapping[str, ObjectsSlice]) -> list[dict[str, Any]]:
+class Shown(msgspec.Struct, frozen=True):
+    """An object of a photo; or a mesh that no photo shows in a trusted pose, with its own materials."""
+
+    photo: str | None
+    name: str
+    mesh: str
+    variant: str = ""
+    scale: tuple[float, float, float] = AS_IT_IS
+    pose: Pose = Pose(YUP_FROM_CAMERA.T, np.zeros(3))
+
+
+def _shown(run: Artifacts, objects: Mapping[str, ObjectsSlice]) -> dict[str, list[dict[str, Any]]]:
+    """All objects that can be looked at, and their meshes.
+
+    objects  photo, name; mesh, its index; materials, by part; rotation, y-up camera from object, row by row; eye, unit, from the object to
+             that camera
+    meshes   see `_mesh`; objects whose poses scale a mesh by different factors have different ones
+    """
     files = {name: file for name in sorted(run.set.meshes) if (file := run.folders["export"] / f"{name}.glb").exists()}
+    materials = {name: read_part_materials(file) for name, file in files.items()}
     loaded = {name: trimesh.load_scene(file, process=False).geometry for name, file in files.items()}
-    parts = {name: {material: each[material] for material in sorted(each)} for name, each in loaded.items()}
-    triangles = sum(len(part.faces) for each in parts.values() for part in each.values())
+    shown = []
+    for photo in (name for name in run.set.photos if name in run.poses):
+        for obj in objects[photo].objects:
+            entry = run.poses[photo].objects.get(obj.name)
+            if obj.mesh in files and entry is not None and not entry.left_out:
+                variant = variant_name(obj.materials)
+                shown.append(Shown(photo, obj.name, obj.mesh, variant, entry.scale, entry.pose))
+    shown += [Shown(None, name, name) for name in files if all(name != each.mesh for each in shown)]
+    kinds = sorted({(each.mesh, each.scale) for each in shown})
+    triangles = sum(len(part.faces) for name, _ in kinds for part in loaded[name].values())
     share = min(1.0, MOST_TRIANGLES / max(1, triangles))
-    return [_mesh(run, name, each, share, objects) for name, each in parts.items()]
+    meshes, placed = [_mesh(loaded[name], np.array(scale), share) for name, scale in kinds], []
+    for each in shown:
+        mesh = kinds.index((each.mesh, each.scale))
+        toward = -(YUP_FROM_CAMERA @ each.pose.apply(meshes[mesh][1][None])[0])
+        length = np.linalg.norm(toward)
+        placed.append({
+            "photo": each.photo,
+            "name": each.name,
+            "mesh": mesh,
+            "materials": [own.get(each.variant, own[""]) for _, own in sorted(materials[each.mesh].items())],
+            "rotation": (YUP_FROM_CAMERA @ each.pose.rotation).ravel().tolist(),
+            "eye": (toward / length).tolist() if length > 0 else [0.0, 0.0, 1.0],
+        })  # fmt: skip
+    return {
+        "objects": placed,
+        "meshes": [{"name": name, **mesh} for (name, _), (mesh, _) in zip(kinds, meshes, strict=True)],
+    }
 
 
 def _mesh(
-    run: Artifacts, name: str, parts: Mapping[str, trimesh.Trimesh], share: float, objects: Mapping[str, ObjectsSlice]
-) -> dict[str, Any]:
-    """A mesh, and how a photo shows it.
+    parts: Mapping[str, trimesh.Trimesh], scale: Float[np.ndarray, "3"], share: float
+) -> tuple[dict[str, Any], Float[np.ndarray, "3"]]:
+    """A mesh times a scale, at most `share` of its triangles, and its middle.
 
-    rotation: y-up camera from object, row by row;  eye: unit, from the object to that camera
-    parts: by material; vertices uint16, 3 a vertex, v / 32767.5 − 1 in radii of the mesh from its middle; normals int16, times 32767;
+    parts: by name, in order; vertices uint16, 3 a vertex, v / 32767.5 − 1 in radii of the mesh from its middle; normals int16, times 32767;
            triangles uint32
     simplified_from: its triangles, where fewer are handed over
     """
-    photo, rotation, translation, scale = _pose(run, name, objects)
     vertices = np.concatenate([part.vertices for part in parts.values()]) * scale
     centre = (vertices.min(axis=0) + vertices.max(axis=0)) / 2
     radius = float(np.linalg.norm(vertices - centre, axis=-1).max()) or 1.0
-    toward = -(YUP_FROM_CAMERA @ (rotation @ centre + translation))
-    length = np.linalg.norm(toward)
-    eye = toward / length if length > 0 else np.array([0.0, 0.0, 1.0])
     packed, count = [], sum(len(part.faces) for part in parts.values())
-    for material, part in parts.items():
+    for _, part in sorted(parts.items()):
         vertex, normal, faces = _simplified(part, share)
         unit, normal = (vertex * scale - centre) / radius, normal / scale
         normal = normal / np.maximum(np.linalg.norm(normal, axis=-1, keepdims=True), 1e-12)
         packed.append({
-            "material": material,
             "vertices": _base64(np.rint((np.clip(unit, -1, 1) + 1) * 32767.5), "<u2"),
             "normals": _base64(np.rint(32767 * normal), "<i2"),
             "triangles": _base64(faces, "<u4"),
         })  # fmt: skip
-    turn = (YUP_FROM_CAMERA @ rotation).ravel().tolist()
-    shown = {"name": name, "photo": photo, "rotation": turn, "eye": eye.tolist(), "parts": packed}
-    return shown | {"simplified_from": count if share < 1 else None}
-
-
-def _pose(run: Artifacts, mesh: str, objects: Mapping[str, ObjectsSlice]) -> tuple:
-    """(photo, rotation, translation, scale) of the first photo that shows the mesh in a pose that is trusted."""
-    for photo in run.set.photos:
-        for obj in objects[photo].objects:
-            entry = run.poses[photo].objects.get(obj.name) if photo in run.poses else None
-            if obj.mesh == mesh and entry is not None and not entry.left_out:
-                return photo, np.array(entry.rotation), np.array(entry.translation), np.broadcast_to(entry.scale, 3)
-    return None, YUP_FROM_CAMERA.T, np.zeros(3), np.ones(3)
+    return {"parts": packed, "simplified_from": count if share < 1 else None}, centre
 
 
 def _simplified(

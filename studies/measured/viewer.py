@@ -37,9 +37,9 @@ HALF_FIELD = np.radians(15)  # of the viewer's camera
 BACK = 1.04 / np.sin(HALF_FIELD)  # its distance, in radii
 EDGE = 2  # pixels inside the outline that are left out: there a pixel is filled in part
 SIZE, FRAMES = 96, 30
-RADIANCE = """([mesh, photo, chosen, size]) => {
+RADIANCE = """([object, photo, chosen, size]) => {
   const {renderer, data} = window.viewer;
-  return Array.from(renderer.radiance({...chosen, mesh: renderer.meshes.at(mesh), photo: data.photos.find((p) => p.name === photo)}, size));
+  return Array.from(renderer.radiance({...chosen, object: renderer.objects.at(object), photo: data.photos.find((p) => p.name === photo)}, size));
 }"""
 START = {"azimuth": 0, "elevation": 0, "turn": 0, "zoom": 1, "sky": False, "stops": 0}
 
@@ -70,11 +70,11 @@ def opened(file: Path, **context) -> Iterator[tuple[Any, list[str]]]:
 
 
 def shown(
-    page: Any, mesh: int, material: str, photo: str, view: dict | None = None, size: int = SIZE
+    page: Any, index: int, material: str, photo: str, view: dict | None = None, size: int = SIZE
 ) -> Float[np.ndarray, "size size 4"]:
-    """The viewer's finished picture, radiance and coverage, the uppermost row first.  mesh: −1 is the ball;  view: see START"""
-    chosen = {**START, **(view or {}), "material": material}
-    return np.array(page.evaluate(RADIANCE, [mesh, photo, chosen, size])).reshape(size, size, 4)[::-1]
+    """The viewer's finished picture, radiance and coverage, the uppermost row first.  index: of the object, −1 is the ball;  view: see START"""
+    chosen = {**START, **(view or {}), "materials": [material]}
+    return np.array(page.evaluate(RADIANCE, [index, photo, chosen, size])).reshape(size, size, 4)[::-1]
 
 
 def ball_seen(

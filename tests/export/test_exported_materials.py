@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import trimesh
 
-from factorlib.export.gltf import write_glb
+from factorlib.export.gltf import read_part_materials, write_glb
 from factorlib.export.materials import headroom_factor, table_in_gauge
 from factorlib.export.materialx import materialx
 from factorlib.meshes.mesh import Mesh
@@ -79,11 +79,57 @@ def test_glb_keeps_the_mesh_and_gives_exact_reflectances(tmp_path):
     assert data == (tmp_path / "b.glb").read_bytes()
     found = trimesh.load(tmp_path / "a.glb")
     assert set(found.geometry) == {"bright", "metal"} and found.area == pytest.approx(1.0)
-    tree = json.loads(data[20 : 20 + struct.unpack("<I", data[12:16])[0]])  # the JSON chunk
-    for entry in tree["materials"]:
+    for entry in read_tree(tmp_path / "a.glb")["materials"]:
         material, core = CASES[entry["name"]], entry["pbrMetallicRoughness"]
         more = entry["extensions"]["KHR_materials_specular"]
         f0 = 0.04 * np.array(more["specularColorFactor"]) * more["specularFactor"]
         np.testing.assert_allclose(f0, material.specular, atol=1e-12)
         np.testing.assert_allclose(np.array(core["baseColorFactor"][:3]) * (1 - f0.max()), material.diffuse, atol=1e-12)
         assert core["roughnessFactor"] == material.roughness and entry["doubleSided"]
+
+
+def test_variants_give_every_part_its_material_in_each_of_them(tmp_path):
+    """Two parts of one material are two primitives where a variant tells them apart; without variants there is no extension."""
+    rng = np.random.default_rng(0)
+    vertices, faces = rng.uniform(size=(15, 3)), np.arange(15, dtype=np.int32).reshape(5, 3)
+    own, other = np.array([1, 1, 3, 3, 1], np.int16), np.array([1, 2, 3, 3, 2], np.int16)
+    mesh, names = Mesh(vertices, faces, np.tile([0.0, 0, 1], (15, 1)), own), ["bright", "lambertian", "metal"]
+    dark = np.full(5, 3, np.int16)
+    write_glb(tmp_path / "a.glb", mesh, names, CASES, {"legs: lambertian": other, "all dark": dark})
+    tree, found = read_tree(tmp_path / "a.glb"), trimesh.load(tmp_path / "a.glb").geometry
+    parts = read_part_materials(tmp_path / "a.glb")
+    variants = tree["extensions"]["KHR_materials_variants"]["variants"]
+    assert [each["name"] for each in variants] == ["legs: lambertian", "all dark"]
+    assert "KHR_materials_variants" in tree["extensionsUsed"] and len(tree["materials"]) == 3
+    for k, labels in enumerate([own, other, dark]):
+        variant = ["", "legs: lambertian", "all dark"][k]
+        for face, label in enumerate(labels):
+            (holds,) = [n for n, part in found.items() if np.isclose(part.vertices, vertices[3 * face]).all(1).any()]
+            assert parts[holds][variant] == names[label - 1]
+    for each in tree["meshes"]:
+        mappings = each["primitives"][0]["extensions"]["KHR_materials_variants"]["mappings"]
+        assert sorted(v for mapping in mappings for v in mapping["variants"]) == [0, 1]  # each once
+    write_glb(tmp_path / "b.glb", mesh, names, CASES)
+    plain = (tmp_path / "b.glb").read_bytes()
+    assert b"variants" not in plain and read_part_materials(tmp_path / "b.glb") == {
+        n: {"": n} for n in ("bright", "metal")
+    }
+
+
+def test_variants_share_the_detail_of_reflectance_exactly(tmp_path):
+    """Base colour times vertex colour is the reflectance times the detail, in each variant."""
+    detail, labels = np.array([0.4, 0.8, 1.05]), np.array([1], np.int16)
+    mesh = Mesh(np.eye(3), np.array([[0, 1, 2]], np.int32), np.tile([0.0, 0, 1], (3, 1)), labels, detail=detail)
+    write_glb(tmp_path / "a.glb", mesh, ["bright", "lambertian"], CASES, {"dim": labels + 1})
+    ((_, part),) = trimesh.load(tmp_path / "a.glb").geometry.items()
+    shade = part.visual.vertex_attributes["color"][:, :3] / 255
+    for entry in read_tree(tmp_path / "a.glb")["materials"]:
+        material = CASES[entry["name"]]
+        base = np.array(entry["pbrMetallicRoughness"]["baseColorFactor"][:3]) * (1 - max(material.specular))
+        np.testing.assert_allclose(base * shade, np.outer(detail, material.diffuse), atol=0.005)
+
+
+def read_tree(path) -> dict:
+    """The JSON chunk of a GLB."""
+    data = path.read_bytes()
+    return json.loads(data[20 : 20 + struct.unpack("<I", data[12:16])[0]])

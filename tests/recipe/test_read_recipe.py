@@ -63,6 +63,13 @@ def test_recipes_that_come_with_the_project_are_good_and_of_every_kind_and_survi
     ("kind: transfer\nmaterials: {yelow: red}", ["did you mean 'yellow'"]),
     ("kind: transfer\nmaterials: {yellow: gold}", ["unknown material 'gold'"]),
     ("kind: transfer", ["materials"]),
+    ("kind: insert\nmesh: chair\nmaterial: {red: blak}", ["material", "did you mean 'black'"]),
+    ("kind: insert\nmaterial: {red: black}", ["material", "mesh of the data set", "name one material"]),
+    ("kind: view\nsun: {direction: [0, 1, 0], strength: 0.5}", ["sun.direction", "one photo", "photos: [...]"]),
+    ("kind: view\nphotos: [hall]\nsun: {direction: [0, 0, 0], strength: 0.5}", ["sun.direction", "no length"]),
+    ("kind: view\nphotos: [hall]\nsun: {direction: [0, 1, 0], strength: 60}", ["sun.strength", "<= 1"]),
+    ("kind: view\nphotos: [hall]\nsun: {direction: [0, 1, 0]}", ["sun", "strength"]),
+    ("kind: relight\nphotos: [hall]\nsun: {direction: [0, 1, 0], strength: 0.5}", ["sun", "leave it out"]),
     ("kind: grid\nsamples: 0", ["one.yaml:2: samples"]),
 ])  # fmt: skip
 def test_what_is_wrong_is_named_with_a_cure(text, words, dataset, tmp_path):
@@ -81,10 +88,10 @@ def test_files_are_relative_to_the_recipe_and_a_table_adds_materials(dataset, tm
     assert files_of(recipe, path) == {"own.json": tmp_path / "own.json", "bunny.obj": tmp_path / "bunny.obj"}
 
 
-def test_the_table_and_the_insertion_in_the_docs_are_good(dataset, tmp_path):
+def test_the_table_and_the_insertions_in_the_docs_are_good(dataset, tmp_path):
     text = (LIBRARY / "docs" / "recipes.md").read_text()
     (table,) = re.findall(r"```json\n(.*?)```", text, re.DOTALL)
-    (insertion,) = re.findall(r"```yaml\n(.*?)```", text, re.DOTALL)
+    recipes = re.findall(r"```yaml\n(.*?)```", text, re.DOTALL)
     (tmp_path / "own.json").write_text(table)
     assert list(read_table(tmp_path / "own.json")) == ["gold"]
-    assert isinstance(read_recipe(written(tmp_path, insertion), dataset), Insert)
+    assert recipes and all(isinstance(read_recipe(written(tmp_path, each), dataset), Insert) for each in recipes)

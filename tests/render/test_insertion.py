@@ -1,5 +1,6 @@
 """Insertion against a scene that has the object in truth."""
 
+import msgspec
 import numpy as np
 import pytest
 
@@ -9,8 +10,9 @@ from factorlib.geometry.camera import Camera
 from factorlib.light.lobes import Lobes
 from factorlib.meshes.mesh import Mesh
 from factorlib.render.ground import Plane
-from factorlib.render.insertion import NEW, Ground, Spot, inserted, stood
-from factorlib.render.photo_scene import ALL_BOUNCES, PhotoScene, Placed, light_entry, shapes
+from factorlib.render.insertion import NEW, Ground, inserted, shadow_match
+from factorlib.render.photo_scene import ALL_BOUNCES, PhotoScene, Placed, light_entries, shapes
+from factorlib.render.placement import Spot, stood
 from factorlib.results.materials import Reflectance
 from factorlib.tracing.scene import bsdf, rendered, rigid, sensor, transform
 
@@ -33,7 +35,7 @@ OPEN = np.zeros((CAMERA.height, CAMERA.width), bool)  # nothing covers the groun
 
 def true_photo(objects, samples=1024):
     """Striped ground, which the insertion knows nothing of, beyond the disc too."""
-    entries = {"light": light_entry(light()), **shapes(objects, MATERIALS)}
+    entries = {**light_entries(light(), 6.0), **shapes(objects, MATERIALS)}
     for k in range(-8, 8):
         frame = rigid(np.stack([[0.5, 0, 0], [0, 0, -40.0], [0, 1.0, 0]], axis=1), (k + 0.5, -1.0, -6))
         stripe = {"type": "rectangle", "to_world": transform(frame)}
@@ -98,3 +100,33 @@ def test_an_open_mesh_is_seen_from_either_side_and_hidden_by_what_stands_before_
         photo = np.ones((CAMERA.height, CAMERA.width, 3))
         seen.append(inserted(scene, photo, OPEN, placed, SPOT, Ground(GROUND), 16).coverage.sum())
     assert seen[0] > 100 and seen[1] < 0.9 * seen[0]
+
+
+def test_the_shadow_of_the_photo_is_recognised_whatever_its_exposure_and_not_where_there_is_none(made):
+    """A photo of its own prediction matches fully; light from elsewhere, less than none; objects' pixels do not count."""
+    rng = np.random.default_rng(0)
+    lit, constant, where = rng.uniform(0.1, 1, (20, 30, 1)) * np.ones(3), np.ones((20, 30, 3)), np.ones((20, 30), bool)
+    constant[:10] = 0.5
+    assert shadow_match(3 * lit**0.5, lit, constant, where).correlation == pytest.approx(1)
+    assert abs(shadow_match(lit, rng.uniform(0.1, 1, lit.shape), constant, where).correlation) < 0.2
+    where[:, 3:] = False
+    spoiled = np.where(where[..., None], lit, rng.uniform(0.1, 1, lit.shape))
+    few = shadow_match(spoiled, lit, constant, where)
+    assert few.correlation is None and few.pixels == 60 and "too little is seen of the ground" in str(few)
+    where[:, 3:8] = True
+    assert shadow_match(np.where(where[..., None], lit, 0.5), lit, constant, where).correlation == pytest.approx(1)
+    assert shadow_match(lit, np.ones_like(lit), constant, where).correlation is None
+
+    plain = rendered(
+        {**light_entries(light(), 6.0), **shapes([THERE], MATERIALS), "ground": floor()},
+        sensor(CAMERA, rigid(YUP_FROM_CAMERA, np.zeros(3))), 128, 7, ALL_BOUNCES,
+    )  # fmt: skip
+    match = inserted(SCENE, plain, OPEN, new(), SPOT, Ground(GROUND), 64).match
+    turned = msgspec.structs.replace(SCENE, light=Lobes(light().axis * [-1, 1, -1], light().sharpness, light().weight))
+    other = inserted(turned, plain, OPEN, new(), SPOT, Ground(GROUND), 64).match
+    assert match.correlation > 0.9 > match.constant_light > other.correlation and match.pixels == other.pixels > 500
+
+
+def floor() -> dict:
+    frame = rigid(np.stack([[40.0, 0, 0], [0, 0, -40.0], [0, 1.0, 0]], axis=1), (0, -1.0, -6))
+    return {"type": "rectangle", "to_world": transform(frame), "bsdf": bsdf(MATERIALS["grey"])}

@@ -12,8 +12,17 @@ from factorlib.light.latlong import lat_long_of_lobes
 from factorlib.light.lobes import Lobes
 from factorlib.meshes.mesh import Mesh
 from factorlib.render.ground import Plane, resting_plane
-from factorlib.render.insertion import spot_at, spot_beside, stood
-from factorlib.render.photo_scene import PhotoScene, Placed, lit_ball, orbit, resized, traced_photo, turned_light
+from factorlib.render.photo_scene import (
+    PhotoScene,
+    Placed,
+    lit_ball,
+    orbit,
+    resized,
+    traced_photo,
+    turned_light,
+    with_sun,
+)
+from factorlib.render.placement import spot_at, spot_beside, stood
 from factorlib.results.materials import Reflectance
 from factorlib.tracing.scene import rigid
 
@@ -110,6 +119,36 @@ def test_what_a_steep_photo_leaves_open_other_photos_of_the_object_decide():
     askew = about((2**-0.5, 0, -(2**-0.5)), 54.7)  # a cube on its corner
     with pytest.raises(InputError, match="rests on no side"):
         resting_plane(placed("cube", box(1, 1, 1), (0, 0, -5), rotation=askew))
+
+
+AXIS = np.array([0.6, -0.48, -0.64])
+
+
+@pytest.mark.parametrize("size, share", [(0.53, 0.8), (30.0, 0.3), (5.0, 0.0), (0.1, 1.0)])
+def test_an_assumed_sun_takes_its_share_of_the_energy_from_the_rest_and_from_other_suns(size, share):
+    one = with_sun(lobes(), np.array([0.0, 0.0, -1.0]), 0.53, 0.4)
+    assert np.allclose(one.energy, lobes().energy, rtol=1e-12) and one.suns.sum() == 1
+    two = with_sun(one, AXIS, size, share)
+    assert np.allclose(two.energy, lobes().energy, rtol=1e-12) and np.array_equal(two.axis[-1], AXIS)
+    assert len(two) == len(lobes()) + 1  # it replaces the sun that was there
+    last = np.arange(len(two)) == len(two) - 1
+    assert np.allclose(two.take(last).energy, share * two.energy, rtol=1e-9)
+    assert np.allclose(two.take(~last).weight / lobes().weight, 1 - share)
+    alone = two.take(last)
+    assert np.allclose(
+        with_sun(alone, AXIS, 0.53, 0.1).energy, alone.energy, rtol=1e-9
+    )  # nothing but a sun: it keeps all
+
+
+@pytest.mark.parametrize("size", [0.53, 1.5, 4.0])
+def test_a_sun_lights_a_ball_as_its_irradiance_says_and_stands_where_its_axis_says(size):
+    """k_d/π · E · cos, as a disc beyond the scene and as a lobe of the map; its shadow is as sharp as it is wide."""
+    dark = Lobes(AXIS[None], np.ones(1), np.full((1, 3), 1e-6))
+    light = with_sun(dark, AXIS, size, 1.0).scaled(1e6)
+    ball = lit_ball(light, MATERIALS["grey"], 64, 256)[..., 0]
+    row, column = np.unravel_index(ball.argmax(), ball.shape)  # the camera sees x right and y down of the light's axes
+    assert abs(column + 0.5 - 32 * (1 + 0.6)) < 4 and abs(row + 0.5 - 32 * (1 - 0.48)) < 4
+    assert ball.max() == pytest.approx(0.4 / np.pi * light.energy[0], rel=0.02)
 
 
 def test_a_new_object_stands_on_the_plane_as_high_as_asked_turned_and_upright(scene):

@@ -35,9 +35,9 @@ def artifacts(inputs) -> Artifacts:
     return Artifacts(inputs.folders, msgspec.convert(inputs.facts["dataset.set"], SetSlice))
 
 
-def mesh_viewed(inputs) -> dict:
+def viewed(inputs) -> dict:
     lights, objects = (msgspec.convert(inputs.facts[name], dict[str, kind]) for name, kind in report.SLICES.items())
-    return viewer.viewed(artifacts(inputs), lights, objects, dict.fromkeys(LINKED, 1.0))["meshes"][0]
+    return viewer.viewed(artifacts(inputs), lights, objects, dict.fromkeys(LINKED, 1.0))
 
 
 # ── What is handed over ──────────────────────────────────────────────────────────────────────────────────────────────
@@ -48,9 +48,14 @@ def numbers(text: str, kind: str, columns: int) -> np.ndarray:
 
 
 def test_meshes_keep_their_shape_and_stand_as_in_the_photo(made):
-    found = mesh_viewed(made[1])
-    assert (found["name"], found["photo"], found["simplified_from"]) == ("ball", "day", None)
-    assert np.allclose(np.reshape(found["rotation"], (3, 3)), YUP_FROM_CAMERA) and np.allclose(found["eye"], [0, 0, 1])
+    (found,), objects = (viewed(made[1])[name] for name in ("meshes", "objects"))
+    assert (found["name"], found["simplified_from"]) == ("ball", None)
+    assert [(each["photo"], each["mesh"]) for each in objects] == [(photo, 0) for photo in LINKED]
+    for each in objects:
+        assert np.allclose(np.reshape(each["rotation"], (3, 3)), YUP_FROM_CAMERA) and np.allclose(
+            each["eye"], [0, 0, 1]
+        )
+        assert each["materials"] == ["brass", "red", "white"]
     assert sum(len(numbers(part["triangles"], "<u4", 3)) for part in found["parts"]) == len(sphere().faces)
     for part in found["parts"]:
         vertices, normals = (
@@ -70,7 +75,7 @@ def test_lights_are_sharpened_by_what_the_cube_map_widens_them():
 
 def test_large_meshes_are_simplified_and_the_page_says_so(made, tmp_path, monkeypatch):
     monkeypatch.setattr(viewer, "MOST_TRIANGLES", 2000)
-    found = mesh_viewed(made[1])
+    (found,) = viewed(made[1])["meshes"]
     triangles = sum(len(numbers(part["triangles"], "<u4", 3)) for part in found["parts"])
     assert found["simplified_from"] == len(sphere().faces) and triangles <= 2100
     assert "is simplified for this page" in page_of(made[1], tmp_path / "simplified")
@@ -132,21 +137,25 @@ def test_a_mesh_shows_its_parts_where_they_are(browser):
     """The set's own ball is cut into three materials by turns: on the whole it is as bright as their mean."""
     page = browser[0]
     page.evaluate("viewer.controls.object.selectedIndex = 0")
-    script = """(material) => { const state = {...viewer.state(), material}; viewer.renderer.draw(state, 64, 0, 4);
+    script = """(material) => { const state = {...viewer.state(), materials: Array(3).fill(material)}; viewer.renderer.draw(state, 64, 0, 4);
       const pixels = new Float32Array(4 * 64 * 64), gl = viewer.renderer.gl;
       gl.readPixels(0, 0, 64, 64, gl.RGBA, gl.FLOAT, pixels); return pixels.reduce((a, b) => a + b); }"""
     own, *each = (page.evaluate(script, m) for m in ("", "red", "white", "brass"))
     assert own == pytest.approx(np.mean(each), rel=0.02)
+    red, white, brass = each
+    page.select_option("[data-control=materials] label:nth-child(1) select", label="white")  # the brass part alone
+    changed = page.evaluate(script.replace("Array(3).fill(material)", "viewer.state().materials"))
+    assert changed - own == pytest.approx((white - brass) / 3, rel=0.05)
 
 
 @needs_chromium
 def test_controls_work_by_mouse_and_keys(browser):
     page, _ = browser
     page.select_option("[data-control=object]", label="a ball")
-    page.select_option("[data-control=material]", label="brass")
+    page.select_option("[data-control=materials] select", label="brass")
     page.select_option("[data-control=light]", label="noon")
     label = "document.querySelector('#viewer canvas').ariaLabel"
-    page.wait_for_function(f"{label}.startsWith('ball of brass in the light of noon')")
+    page.wait_for_function(f"{label}.startsWith('a ball of brass in the light of noon')")
     page.focus("#viewer canvas")
     page.keyboard.press("ArrowRight")
     page.keyboard.press("ArrowUp")

@@ -1,14 +1,18 @@
 """The stage `recipes`: the files of every kind, what they show, the same bytes again, and what it refuses."""
 
+import json
+
 import msgspec
 import numpy as np
 import pytest
 
+from factorlib.conventions import YUP_FROM_CAMERA, lat_long_directions
 from factorlib.errors import InputError
 from factorlib.images.exr import read_exr, write_rgb_exr
 from factorlib.images.picture import picture, read_png
 from factorlib.jsonfile import write_json
 from factorlib.recipe import schema
+from factorlib.render.solved_set import SolvedSet
 from factorlib.results.materials import MaterialTable, Reflectance, StandardErrors, solved
 from factorlib.stage import Inputs, silent
 from stages import recipes
@@ -44,8 +48,8 @@ KINDS = [
     (schema.MovingLight(**FRONT, frames=2, width=16), ["front.gif", "front/000.png", "front/001.png"]),
     (schema.Relight(samples=1, rotate=30.0, photos=["side"]), [f"side/{name}" for name in PICTURES["front"]]),
     (schema.Transfer(materials={"red": "unseen"}, **FRONT), PICTURES["front"]),
-    (schema.Insert(**FRONT), PICTURES["front"]),
-    (schema.Insert(**FRONT, mesh="egg", material="brass", at=(40.0, 50.0)), PICTURES["front"]),
+    (schema.Insert(**FRONT), [*PICTURES["front"], "front.json"]),
+    (schema.Insert(**FRONT, mesh="egg", material="brass", at=(40.0, 50.0)), [*PICTURES["front"], "front.json"]),
     (schema.Grid(samples=1, size=16), ["grid.exr", "grid.png", "grid.txt"]),
 ]  # fmt: skip
 
@@ -55,6 +59,52 @@ def test_files_of_every_kind_and_the_same_bytes_again(made, tmp_path, recipe, fi
     made = changed(made, "dataset.ground", dict.fromkeys(made_export.MESHES, GROUND))
     first, second = (drawn(made, tmp_path / name, recipe) for name in "ab")
     assert sorted(first) == sorted(files) and first == second
+
+
+def test_what_is_beside_a_picture_says_where_the_object_was_moved_and_that_a_sun_is_assumed(made, tmp_path):
+    given = changed(made, "dataset.ground", dict.fromkeys(made_export.MESHES, GROUND))
+    (name,) = (obj["name"] for obj in made.facts["dataset.objects"]["front"]["objects"])
+    recipe = schema.Insert(**FRONT, at=(36.0, 48.0), sun=schema.AssumedSun((0.3, 1.0, 0.4), 0.7, 4.0))
+    facts = json.loads(drawn(given, tmp_path / "inserted", recipe)["front.json"])
+    assert f"was moved by {facts['moved']:.1f} of its heights, to `at: [" in facts["caption"] and facts["moved"] > 0
+    assert f"it would intersect '{name}'" in facts["caption"] and np.hypot(*np.subtract(facts["at"], recipe.at)) > 1
+    assert facts["assumed_sun"] == {"direction": [0.3, 1.0, 0.4], "strength": 0.7, "size": 4.0}
+    assert "sun is assumed" in facts["caption"] and "holds 70% of the light's energy" in facts["caption"]
+    assert (
+        facts["shadow"].keys() == {"correlation", "constant_light", "pixels"} and "of dataset.yaml" in facts["caption"]
+    )
+
+    view = schema.View(**FRONT, sun=recipe.sun)
+    files = drawn(made, tmp_path / "view", view), drawn(made, tmp_path / "plain", schema.View(**FRONT))
+    assert json.loads(files[0]["front.json"])["caption"].startswith("The sun is assumed")
+    assert files[0]["front.png"] != files[1]["front.png"] and "front.json" not in files[1]
+
+
+@pytest.mark.parametrize("photo", made_export.MESHES)
+def test_an_assumed_sun_stands_in_the_frame_of_the_exported_light(made, photo):
+    """Also where that is fixed to the world: the map of the light with the sun is brightest in the direction that the recipe says."""
+    results, sun = SolvedSet(made), schema.AssumedSun((0.5, 0.7, -0.4), 0.99, 20.0)
+    world = results.lights[photo].world_from_camera
+    own = results.scene(photo, sun).light.turned(YUP_FROM_CAMERA @ (np.eye(3) if world is None else np.array(world)))
+    directions = lat_long_directions(64, 128).reshape(-1, 3)
+    brightest = directions[own.radiance(directions).sum(axis=1).argmax()]
+    assert brightest @ np.array(sun.direction) / np.linalg.norm(sun.direction) > np.cos(np.radians(3))
+
+
+def test_a_part_of_an_inserted_mesh_gets_another_material_and_the_rest_keeps_its_own(made):
+    results = SolvedSet(changed(made, "dataset.ground", dict.fromkeys(made_export.MESHES, GROUND)))
+    mesh, materials, _ = results.mesh("egg", {"brass": "unseen"}, "y")
+    assert [materials[label - 1] for label in mesh.labels] == ["red", "unseen"]
+    with pytest.raises(InputError, match="'egg' as in photo 'side' has no material 'unseen'") as error:
+        results.mesh("egg", {"unseen": "red"}, "y")
+    assert error.value.key == "material"
+
+
+def test_a_sun_below_the_ground_is_refused(made, tmp_path):
+    made = changed(made, "dataset.ground", dict.fromkeys(made_export.MESHES, GROUND))
+    with pytest.raises(InputError, match="below the ground") as error:
+        drawn(made, tmp_path / "out", schema.Insert(**FRONT, sun=schema.AssumedSun((0.3, -1.0, 0.4), 0.7)))
+    assert error.value.key == "sun.direction"
 
 
 def test_the_photo_stays_where_no_object_is(made, tmp_path):

@@ -82,11 +82,11 @@ function sample_points(pass) {
 
 function unpacked(part) {
   const vertices = new Uint16Array(bytes(part.vertices)), normals = new Int16Array(bytes(part.normals));
-  return { material: part.material, vertices: Float32Array.from(vertices, (v) => v / 32767.5 - 1),
+  return { vertices: Float32Array.from(vertices, (v) => v / 32767.5 - 1),
            normals: Float32Array.from(normals, (v) => v / 32767), triangles: new Uint32Array(bytes(part.triangles)) };
 }
 
-function ball_mesh(rows = 48, columns = 96) {
+function ball(rows = 48, columns = 96) {
   const vertices = [], triangles = [];
   for (let i = 0; i <= rows; i++)
     for (let j = 0; j <= columns; j++) {
@@ -99,8 +99,8 @@ function ball_mesh(rows = 48, columns = 96) {
       triangles.push(a, b, a + 1, a + 1, b, b + 1);
     }
   const position = new Float32Array(vertices);
-  return { name: "ball", photo: null, rotation: [1, 0, 0, 0, 1, 0, 0, 0, 1], eye: [0, 0, 1],
-           parts: [{ material: null, vertices: position, normals: position, triangles: new Uint32Array(triangles) }] };
+  return { name: "a ball", photo: null, materials: [null], rotation: [1, 0, 0, 0, 1, 0, 0, 0, 1], eye: [0, 0, 1],
+           parts: [{ vertices: position, normals: position, triangles: new Uint32Array(triangles) }] };
 }
 
 // ── Shaders ──────────────────────────────────────────────────────────────────────────────────────────────────────────
@@ -212,7 +212,8 @@ class Renderer {
     this.texels = float && gl.getExtension("OES_texture_float_linear") ? gl.RGBA32F : gl.RGBA16F; // in software the larger are read faster
     this.depth = program(gl, MESH_VERTEX, DEPTH); this.shade = program(gl, MESH_VERTEX, SHADE);
     [this.sky, this.copy, this.show] = [SKY, COPY, SHOW].map((text) => program(gl, SCREEN_VERTEX, text));
-    this.meshes = [...data.meshes.map((mesh) => ({ ...mesh, parts: mesh.parts.map(unpacked) })), ball_mesh()];
+    const meshes = data.meshes.map((mesh) => mesh.parts.map(unpacked));
+    this.objects = [...data.objects.map((each) => ({ ...each, parts: meshes[each.mesh] })), ball()];
     this.lights = new Map(); this.buffers = new Map(); this.empty = gl.createVertexArray();
   }
 
@@ -225,9 +226,9 @@ class Renderer {
     return this.lights.get(name);
   }
 
-  parts(mesh) {
+  parts(parts) {
     const gl = this.gl;
-    if (!this.buffers.has(mesh)) this.buffers.set(mesh, mesh.parts.map((part) => {
+    if (!this.buffers.has(parts)) this.buffers.set(parts, parts.map((part) => {
       const array = gl.createVertexArray();
       gl.bindVertexArray(array);
       for (const [k, values] of [part.vertices, part.normals].entries()) {
@@ -235,9 +236,9 @@ class Renderer {
         gl.enableVertexAttribArray(k); gl.vertexAttribPointer(k, 3, gl.FLOAT, false, 0, 0);
       }
       gl.bindBuffer(gl.ELEMENT_ARRAY_BUFFER, gl.createBuffer()); gl.bufferData(gl.ELEMENT_ARRAY_BUFFER, part.triangles, gl.STATIC_DRAW);
-      return { array, count: part.triangles.length, material: part.material };
+      return { array, count: part.triangles.length };
     }));
-    return this.buffers.get(mesh);
+    return this.buffers.get(parts);
   }
 
   // Two square pictures: one pass with its depths, and the sum of passes.
@@ -263,7 +264,7 @@ class Renderer {
   draw(state, size, pass, count) {
     const gl = this.gl, target = this.targets(size), light = this.light(state.photo.light), view = this.camera(state, count > QUICK ? pass : null, size);
     const light_from_ref = times(state.photo.rotation, about_y(-state.turn)), gain = state.photo.gain.map((g) => g * light.unit);
-    const parts = this.parts(state.mesh);
+    const parts = this.parts(state.object.parts);
     gl.bindFramebuffer(gl.FRAMEBUFFER, target.one.frame); gl.viewport(0, 0, size, size);
     gl.clearColor(0, 0, 0, 0); gl.clear(gl.DEPTH_BUFFER_BIT | gl.COLOR_BUFFER_BIT);
     gl.enable(gl.DEPTH_TEST); gl.disable(gl.BLEND);
@@ -271,7 +272,7 @@ class Renderer {
     gl.activeTexture(gl.TEXTURE1); gl.bindTexture(gl.TEXTURE_CUBE_MAP, light.irradiance);
     const place = (shader) => {
       shader.use();
-      gl.uniformMatrix3fv(shader.at("ref_from_object"), true, state.mesh.rotation);
+      gl.uniformMatrix3fv(shader.at("ref_from_object"), true, state.object.rotation);
       gl.uniformMatrix4fv(shader.at("clip_from_ref"), true, view.clip_from_ref);
     };
     place(this.depth); gl.depthFunc(gl.LEQUAL);
@@ -281,8 +282,8 @@ class Renderer {
     gl.uniform1i(at("radiance"), 0); gl.uniform1i(at("irradiance"), 1); gl.uniformMatrix3fv(at("light_from_ref"), true, light_from_ref);
     gl.uniform3fv(at("eye"), view.eye); gl.uniform3fv(at("gain"), gain); gl.uniform3fv(at("samples"), sample_points(pass));
     gl.uniform1f(at("count"), count); gl.uniform1i(at("each"), Math.min(count, PER_PASS)); gl.uniform1f(at("texel"), 4 * Math.PI / (6 * light.size * light.size));
-    for (const part of parts) {
-      const material = this.data.materials[state.material === OWN ? part.material : state.material];
+    for (const [k, part] of parts.entries()) {
+      const material = this.data.materials[state.materials[k] || state.object.materials[k]];
       gl.uniform3fv(at("k_d"), material.diffuse); gl.uniform3fv(at("k_s"), material.specular);
       gl.uniform1f(at("alpha"), Math.max(material.roughness * material.roughness, LEAST_ALPHA));
       gl.bindVertexArray(part.array); gl.drawElements(gl.TRIANGLES, part.count, gl.UNSIGNED_INT, 0);
@@ -333,8 +334,8 @@ class Renderer {
 
   // The eye and its projections; a pass is displaced within its pixel, null is not.
   camera(state, pass, size) {
-    const azimuth = Math.atan2(state.mesh.eye[0], state.mesh.eye[2]) + state.azimuth, most = 0.4999 * Math.PI;
-    const elevation = Math.max(-most, Math.min(most, Math.asin(state.mesh.eye[1]) + state.elevation));
+    const azimuth = Math.atan2(state.object.eye[0], state.object.eye[2]) + state.azimuth, most = 0.4999 * Math.PI;
+    const elevation = Math.max(-most, Math.min(most, Math.asin(state.object.eye[1]) + state.elevation));
     const back = [Math.sin(azimuth) * Math.cos(elevation), Math.sin(elevation), Math.cos(azimuth) * Math.cos(elevation)];
     const right = unit(cross([0, 1, 0], back)), up = cross(back, right), far = STANDING_BACK + 2, near = STANDING_BACK - 1.5;
     const f = state.zoom / Math.tan(HALF_FIELD);
@@ -350,19 +351,21 @@ class Renderer {
 
 // ── The controls ─────────────────────────────────────────────────────────────────────────────────────────────────────
 
+const title = (object) => object.photo === null ? object.name : `${object.photo} / ${object.name}`;
+
 class Viewer {
   constructor(root, data) {
     this.root = root; this.canvas = root.querySelector("canvas");
     this.renderer = new Renderer(this.canvas, data); this.data = data;
     const control = (name) => root.querySelector(`[data-control=${name}]`);
-    this.controls = Object.fromEntries(["object", "material", "light", "turn", "stops", "sky", "reset"].map((name) => [name, control(name)]));
-    const { object, material, light } = this.controls;
-    for (const mesh of data.meshes) object.add(new Option(mesh.name));
-    object.add(new Option("a ball"));
-    for (const name of Object.keys(data.materials)) material.add(new Option(name));
+    this.controls = Object.fromEntries(["object", "materials", "light", "turn", "stops", "sky", "reset"].map((name) => [name, control(name)]));
+    const { object, light } = this.controls;
+    for (const each of this.renderer.objects) object.add(new Option(title(each)));
     for (const photo of data.photos) light.add(new Option(photo.name));
     for (const each of Object.values(this.controls)) each.addEventListener("input", () => this.changed());
     this.controls.reset.addEventListener("click", () => this.reset());
+    object.addEventListener("input", () => this.dress());
+    this.dress();
     Object.assign(this, { scale: 1, was_quick: false, seen: false });
     this.listen();
     this.reset();
@@ -377,13 +380,23 @@ class Viewer {
     this.changed();
   }
 
-  // What is chosen: mesh, material, photo; azimuth, elevation, turn of the light (radians), zoom, stops of exposure, sky.
+  // A control for the material of each part of the object; a ball has no material of its own.
+  dress() {
+    const object = this.renderer.objects[this.controls.object.selectedIndex];
+    this.controls.materials.replaceChildren(...object.materials.map((own, k) => {
+      const label = document.createElement("label"), select = document.createElement("select");
+      label.append(own === null ? "Material" : `Material of the ${own} part`, select);
+      if (own !== null) select.add(new Option(object.photo === null ? `${own}, its own` : `${own}, as in the photo`, OWN));
+      for (const name of Object.keys(this.data.materials)) select.add(new Option(name));
+      return label;
+    }));
+    this.changed();
+  }
+
+  // What is chosen: object, materials of its parts (OWN: as in the photo), photo whose light it is in; azimuth, elevation, turn of the light (radians), zoom, stops of exposure, sky.
   state() {
-    const { object, material, light, turn, stops, sky } = this.controls;
-    const mesh = this.renderer.meshes[object.selectedIndex], own = material.options[0];
-    own.disabled = mesh.parts[0].material === null; // a ball has no material of its own
-    if (own.disabled && material.value === OWN) material.selectedIndex = 1;
-    return { mesh, material: material.value, photo: this.data.photos[light.selectedIndex], azimuth: this.azimuth, elevation: this.elevation,
+    const { object, materials, light, turn, stops, sky } = this.controls;
+    return { object: this.renderer.objects[object.selectedIndex], materials: [...materials.querySelectorAll("select")].map((select) => select.value), photo: this.data.photos[light.selectedIndex], azimuth: this.azimuth, elevation: this.elevation,
              zoom: this.zoom, turn: turn.value * Math.PI / 180, stops: Number(stops.value), sky: sky.checked };
   }
 
@@ -418,7 +431,7 @@ class Viewer {
 
   tell(state) {
     const degrees = (angle) => `${Math.round(angle * 180 / Math.PI)}°`;
-    const what = state.material === OWN ? state.mesh.name : `${state.mesh.name} of ${state.material}`;
+    const what = `${title(state.object)} of ${state.materials.map((name, k) => name || state.object.materials[k]).join(" and ")}`;
     this.canvas.setAttribute("aria-label", `${what} in the light of ${state.photo.name}, seen from ${degrees(state.azimuth)} to the right and ` +
       `${degrees(state.elevation)} above, the light turned by ${degrees(state.turn)}`);
     for (const name of ["turn", "stops"]) {

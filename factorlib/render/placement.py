@@ -1,0 +1,222 @@
+"""Where a new object stands: on the ground of a photo, in its picture, and through none of its objects.
+
+Two meshes intersect where an edge of one crosses a triangle of the other, or where one lies within the other.  A new object that would
+intersect one of the photo's is moved along the ground to the nearest place where it does not and where at least half of it is seen: the
+places are those of a lattice on the ground, a tenth of its height apart, and where there is none within eight heights, of a coarser one.
+"""
+
+from collections.abc import Callable, Iterator
+
+import msgspec
+import numpy as np
+import open3d as o3d
+from jaxtyping import Float
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
+from scipy.spatial.transform import Rotation
+
+from factorlib.conventions import YUP_FROM_CAMERA
+from factorlib.errors import InputError
+from factorlib.geometry.camera import rotation_of_vector
+from factorlib.geometry.raster import Caster
+from factorlib.meshes.mesh import Mesh
+from factorlib.render.ground import Plane, height_over
+from factorlib.render.photo_scene import PhotoScene, Placed
+
+RADIUS = 8.0  # how far from the new object the ground is known, in its heights
+GAP = 0.15  # between the objects, in heights of the new one
+STEP, COARSER = (
+    0.1,
+    8,
+)  # between places that are tried, in heights; where there is none within `RADIUS`, steps and radius are so many times that
+ENOUGH = 500  # vertices, by which it is judged where the new object is seen
+SEEN = 0.5  # share of the new object's vertices that are in the picture and that nothing hides, at least, where it is moved to
+
+
+class Spot(msgspec.Struct, frozen=True):
+    """Where a new object stands on the ground, in the world, and how high it is."""
+
+    plane: Plane
+    point: Float[np.ndarray, "3"]
+    height: float
+
+
+def spot_beside(scene: PhotoScene, plane: Plane, neighbour: Placed, relative_height: float, slenderness: float) -> Spot:
+    """Beside an object, on the side with more room in the picture.
+
+    relative_height: of the new object, to the neighbour's;  slenderness: its width over its height
+    """
+    height = relative_height * height_over(plane, neighbour)
+    right = np.array([1.0, 0.0, 0.0]) - plane.normal[0] * plane.normal
+    right /= np.linalg.norm(right)
+    across = neighbour.vertices @ right
+    foot = plane.onto(neighbour.vertices.mean(axis=0)[None])[0]
+    foot = foot + ((across.min() + across.max()) / 2 - foot @ right) * right
+    away = (np.ptp(across) / 2 + (slenderness / 2 + GAP) * height) * right
+    spots = [foot + side * away for side in (1.0, -1.0)]
+    others = [each for each in scene.objects if each is not neighbour]
+
+    def room(point: Float[np.ndarray, "3"]) -> float:
+        """Pixels to the picture's border, or to another object's middle, whichever is less."""
+        (x, y), width = scene.camera.project(point @ YUP_FROM_CAMERA), scene.camera.width
+        middles = [each.vertices.mean(axis=0) @ YUP_FROM_CAMERA for each in others]
+        taken = [abs(scene.camera.project(middle)[0] - x) for middle in middles]
+        return min([x, width - x, scene.camera.height - y, *taken])
+
+    return Spot(plane, max(spots, key=room), height)
+
+
+def spot_at(
+    scene: PhotoScene, plane: Plane, neighbour: Placed, pixel: tuple[float, float], relative_height: float
+) -> Spot:
+    """Where the photo's `pixel` shows the ground; InputError where it does not."""
+    ray = scene.camera.rays_through(np.array([pixel])) @ YUP_FROM_CAMERA
+    point = plane.hit(ray)[0]
+    if not np.isfinite(point).all():
+        found = f"pixel {pixel} shows no ground: it lies above the horizon"
+        raise InputError(found, key="at", cure="name a pixel further down")
+    return Spot(plane, point, relative_height * height_over(plane, neighbour))
+
+
+def stood(
+    name: str, mesh: Mesh, materials: tuple[str, ...], up: Float[np.ndarray, "3"], turn_deg: float, spot: Spot
+) -> Placed:
+    """A mesh in its own frame, `up` upward there, stood on a spot."""
+    toward = rotation_between(up, spot.plane.normal)
+    rotation = rotation_of_vector(np.radians(turn_deg) * spot.plane.normal) @ toward
+    vertices = mesh.vertices @ rotation.T
+    along = vertices @ spot.plane.normal
+    scale = spot.height / np.ptp(along)
+    middle = (vertices.min(axis=0) + vertices.max(axis=0)) / 2
+    foot = middle + (along.min() - middle @ spot.plane.normal) * spot.plane.normal
+    matrix = np.eye(4)
+    matrix[:3, :3], matrix[:3, 3] = scale * rotation, spot.point - scale * foot
+    return Placed(name, mesh, materials, matrix)
+
+
+class Solid(Caster):
+    """The mesh of an object in the world, against which others are tested."""
+
+    def __init__(self, placed: Placed):
+        self.name, self.vertices = placed.name, placed.vertices
+        super().__init__(msgspec.structs.replace(placed.mesh, vertices=self.vertices))
+        faces = self.mesh.faces
+        edges = np.unique(np.sort(faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2), axis=1), axis=0)
+        self.start = self.vertices[edges[:, 0]]
+        self.along = self.vertices[edges[:, 1]] - self.start
+        graph = coo_array((np.ones(len(edges)), edges.T), shape=(len(self.vertices),) * 2)
+        piece = connected_components(graph, directed=False)[1][faces[:, 0]]
+        self.pieces = self.vertices[faces[np.unique(piece, return_index=True)[1], 0]]  # a vertex of each
+        used = self.vertices[np.unique(faces)]
+        self.box = used.min(axis=0), used.max(axis=0)
+
+    def crossed(self, start: Float[np.ndarray, "n 3"], along: Float[np.ndarray, "n 3"]) -> np.ndarray:
+        """Which of the segments from `start` to `start + along` cross the surface."""
+        low, high = start + np.minimum(along, 0), start + np.maximum(along, 0)
+        crossed = ((low <= self.box[1]) & (high >= self.box[0])).all(axis=1)
+        rays = np.column_stack([(start[crossed] - self.centre) / self.radius, along[crossed] / self.radius])
+        hits = self.scene.cast_rays(o3d.core.Tensor(rays.astype(np.float32)), nthreads=1)
+        crossed[crossed] = hits["t_hit"].numpy() < 1
+        return crossed
+
+    def holds(self, points: Float[np.ndarray, "n 3"]) -> bool:
+        """Whether one of the points lies within the mesh; nothing lies within an open one."""
+        query = o3d.core.Tensor(((points - self.centre) / self.radius).astype(np.float32))
+        return not self.mesh.open and bool(self.scene.compute_occupancy(query, nthreads=1, nsamples=3).numpy().any())
+
+    def meets(self, other: "Solid", move: Float[np.ndarray, "3"]) -> bool:
+        """Whether it intersects another when it is moved."""
+        if (self.box[0] + move > other.box[1]).any() or (self.box[1] + move < other.box[0]).any():
+            return False
+        return bool(
+            other.crossed(self.start + move, self.along).any()
+            or self.crossed(other.start - move, other.along).any()
+            or other.holds(self.pieces + move)
+            or self.holds(other.pieces - move)
+        )
+
+
+class Room:
+    """The room that a photo's objects leave for a new one, on the ground about its spot."""
+
+    def __init__(self, scene: PhotoScene, new: Placed, spot: Spot):
+        self.camera, self.spot = scene.camera, spot
+        self.new, self.others = Solid(new), [Solid(each) for each in scene.objects]
+
+    def pierced(self, move: Float[np.ndarray, "3"] = np.zeros(3)) -> Iterator[str]:
+        """What the new object would intersect if it were moved: names of objects, or the camera."""
+        yield from (f"'{other.name}'" for other in self.others if self.new.meets(other, move))
+        if self.new.holds(-move[None]):
+            yield "the camera"
+
+    def seen(self, move: Float[np.ndarray, "3"] = np.zeros(3), every: int = 1) -> tuple[float, float]:
+        """The shares of the moved object's vertices (of `every` so many one) that are in the picture, and that nothing hides there."""
+        points = self.new.vertices[::every] + move
+        inside = points[self._in_picture(points)]
+        hidden = [other.crossed(np.zeros_like(inside), inside) for other in self.others]
+        return len(inside) / len(points), float((~np.any(hidden, axis=0)).sum()) / len(points)
+
+    def nearest(self) -> Float[np.ndarray, "3"] | None:
+        """The shortest move to a place where the object is free and seen; None where there is none."""
+        plane, every = self.spot.plane, max(1, len(self.new.vertices) // ENOUGH)
+        reach = np.arange(-round(RADIUS / STEP), round(RADIUS / STEP) + 1) * STEP * self.spot.height
+        lattice = np.stack(np.meshgrid(reach, 0.0, reach, indexing="ij"), axis=-1).reshape(-1, 3)
+        distance = np.linalg.norm(lattice, axis=1)
+        order = np.argsort(distance, kind="stable")[: (distance <= RADIUS * self.spot.height).sum()]
+        finest = lattice[order] @ rotation_between(np.array([0.0, 1.0, 0.0]), plane.normal).T
+        for moves in (finest, COARSER * finest):
+            for move in moves[self._in_picture(self.spot.point + moves)]:
+                if self.seen(move, every)[1] >= SEEN and not any(self.pierced(move)):
+                    return move
+        return None
+
+    def at(self, move: Float[np.ndarray, "3"], factor: int) -> str:
+        """The pixel of the photo at which the moved object touches the ground, as a recipe names it; factor: pixels of the photo per pixel."""
+        x, y = factor * self.camera.project((self.spot.point + move) @ YUP_FROM_CAMERA)
+        return f"`at: [{x:.0f}, {y:.0f}]`"
+
+    def _in_picture(self, points: Float[np.ndarray, "n 3"]) -> np.ndarray:
+        """Which points of the world the picture's frame holds."""
+        points = points @ YUP_FROM_CAMERA
+        ahead = points[:, 2] > 0
+        pixel = self.camera.project(np.where(ahead[:, None], points, 1.0))
+        return ahead & ((pixel >= 0) & (pixel <= [self.camera.width, self.camera.height])).all(axis=1)
+
+
+def stood_free(
+    scene: PhotoScene, stand: Callable[[Spot], Placed], spot: Spot, asked: bool, factor: int = 1
+) -> tuple[Placed, Spot, str]:
+    """A new object that intersects none of the photo's and is seen, where it stands, and a sentence that says how far it was moved and why.
+
+    stand: puts the object on a spot;  asked: the recipe names the spot;  factor: pixels of the photo per pixel of the scene's camera
+    Raises InputError where there is no such place, and where nothing would be seen of an object at the place that the recipe names.
+    """
+    new = stand(spot)
+    room = Room(scene, new, spot)
+    pierced, (inside, seen) = list(room.pierced()), room.seen()
+    if not pierced and seen > 0:
+        return new, spot, ""
+    unseen = "it would be hidden behind other objects" if inside else "it would be outside the picture"
+    why = f"it would intersect {' and '.join(pierced)}" if pierced else unseen
+    if (move := room.nearest()) is None:
+        cure = "name another photo, object or place"
+        for share in (0.5, 0.25, 0.125):
+            small = msgspec.structs.replace(spot, height=share * spot.height)
+            if (move := (less := Room(scene, stand(small), small)).nearest()) is not None:
+                cure = f"at {share} of its size it would be free at {less.at(move, factor)}"
+                break
+        raise InputError(
+            f"the new object has no free place in the picture: {why}", key="at" if asked else "size", cure=cure
+        )
+    if asked and not pierced:
+        found = f"the new object would not be seen: {why}"
+        raise InputError(found, key="at", cure=f"the nearest free place is {room.at(move, factor)}")
+    there = msgspec.structs.replace(spot, point=spot.point + move)
+    far = np.linalg.norm(move) / spot.height
+    moved = f"The new object was moved by {far:.1f} of its heights, to {room.at(move, factor)}, because {why}."
+    return stand(there), there, moved
+
+
+def rotation_between(first: Float[np.ndarray, "3"], second: Float[np.ndarray, "3"]) -> Float[np.ndarray, "3 3"]:
+    """The smallest turn of one unit vector into another."""
+    return Rotation.align_vectors(second[None], first[None])[0].as_matrix()

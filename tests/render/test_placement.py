@@ -1,0 +1,119 @@
+"""Where a new object stands: through no other, in the picture, and not further from its spot than it must."""
+
+import msgspec
+import numpy as np
+import pytest
+from scipy.optimize import linprog
+from scipy.spatial.transform import Rotation
+
+from factorlib.errors import InputError
+from factorlib.generate.shapes import sphere
+from factorlib.geometry.camera import Camera
+from factorlib.light.lobes import no_lobes
+from factorlib.meshes.mesh import Mesh, smooth
+from factorlib.render.ground import Plane
+from factorlib.render.photo_scene import PhotoScene, Placed
+from factorlib.render.placement import STEP, Solid, Spot, spot_at, stood, stood_free
+from factorlib.tracing.scene import rigid
+
+GROUND, UP = Plane(np.array([0, 1.0, 0]), np.array([0, -1.0, -6])), np.array([0, 1.0, 0])
+CAMERA = Camera(64, 48, 70.0, (32.0, 20.0))
+CORNERS = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)], float)
+SIDES = [[0, 1, 3, 2], [4, 6, 7, 5], [0, 4, 5, 1], [2, 3, 7, 6], [0, 2, 6, 4], [1, 5, 7, 3]]
+BOX = smooth(CORNERS, np.array([[q[0], q[k], q[k + 1]] for q in SIDES for k in (1, 2)]))
+
+
+def at(mesh: Mesh, place, size=1.0, turn=None) -> Placed:
+    rotation = np.eye(3) if turn is None else turn
+    return Placed("there", mesh, ("grey",), rigid(size * rotation, place))
+
+
+def hulls_meet(first: Placed, second: Placed) -> bool:
+    """Whether a convex combination of the vertices of one is one of the other's."""
+    a, b = first.vertices, second.vertices
+    equal = np.vstack([np.hstack([a.T, -b.T]), np.kron(np.eye(2), np.ones(len(CORNERS)))])
+    return linprog(np.zeros(equal.shape[1]), A_eq=equal, b_eq=[0, 0, 0, 1, 1]).status == 0
+
+
+def test_convex_meshes_meet_where_their_hulls_do_and_one_within_another_does():
+    rng, met = np.random.default_rng(3), []
+    for _ in range(60):
+        sizes, turns = rng.uniform(0.1, 1.5, 2), Rotation.random(2, random_state=rng).as_matrix()
+        first, second = (at(BOX, np.zeros(3), s, t) for s, t in zip(sizes, turns, strict=True))
+        move = rng.normal(size=3) * 1.3
+        met.append(Solid(first).meets(Solid(second), move))
+        assert met[-1] == hulls_meet(at(BOX, move, sizes[0], turns[0]), second)
+        assert met[-1] == Solid(second).meets(Solid(first), -move)
+    assert 10 < sum(met) < 50
+    ball, shell = Solid(at(sphere(0.2), np.zeros(3))), msgspec.structs.replace(sphere(1.0), open=True)
+    assert ball.meets(Solid(at(sphere(1.0), np.zeros(3))), np.zeros(3))
+    assert not ball.meets(Solid(at(shell, np.zeros(3))), np.zeros(3))  # a thin shell holds nothing
+
+
+def scene(*objects: Placed) -> PhotoScene:
+    return PhotoScene(CAMERA, objects, no_lobes(), {})
+
+
+def stand(spot: Spot) -> Placed:
+    return stood("new", sphere(1.0), ("red",), UP, 0.0, spot)
+
+
+def test_a_ball_in_a_ball_moves_until_they_touch_and_stays_there():
+    there, spot = at(sphere(0.5), (0.3, -0.5, -6.2)), Spot(GROUND, np.array([0.2, -1.0, -6.0]), 0.6)
+    new, moved, words = stood_free(scene(there), stand, spot, asked=True, factor=2)
+    between = np.linalg.norm(new.vertices.mean(axis=0) - there.vertices.mean(axis=0))
+    assert 0.795 < between < 0.8 + 1.5 * STEP * 0.6  # of radii .5 and .3
+    far = np.linalg.norm(moved.point - spot.point)
+    shortest = np.sqrt(0.8**2 - 0.2**2) - np.hypot(0.1, 0.2)  # middles of balls of different size on one plane
+    assert shortest - 0.01 < far < shortest + 1.5 * STEP * 0.6 and abs((moved.point - spot.point) @ UP) < 1e-12
+    x, y = 2 * CAMERA.project(moved.point * [1, -1, -1])
+    assert words == (
+        f"The new object was moved by {far / 0.6:.1f} of its heights, to `at: [{x:.0f}, {y:.0f}]`, because it would intersect 'there'."
+    )
+    again, same, words = stood_free(scene(there), stand, moved, asked=True)
+    assert words == "" and same is moved and np.array_equal(again.vertices, new.vertices)
+
+
+def test_a_small_object_in_a_large_one_leaves_it_though_that_is_many_of_its_heights():
+    spot = Spot(GROUND, np.array([0.0, -1.0, -6.0]), 0.05)
+    _, there, words = stood_free(scene(at(BOX, (0, -0.5, -6), 0.6)), stand, spot, asked=True)
+    assert "it would intersect 'there'" in words and 0.62 < np.abs(there.point - spot.point).max() < 0.67
+
+
+def test_an_object_that_touches_nothing_stays_where_it_is_asked_for():
+    spot = Spot(GROUND, np.array([-0.9, -1.0, -6.0]), 1.2)
+    new, there, words = stood_free(scene(at(sphere(1.0), (0.9, 0, -6.5))), stand, spot, asked=False)
+    assert words == "" and there is spot and new.vertices[:, 1].min() == pytest.approx(-1.0)
+
+
+WALL = Placed("wall", BOX, ("grey",), np.diag([1.0, 1.0, 0.1, 1.0]) + np.outer([0, 0, -4.5, 0], [0, 0, 0, 1]))
+CASES = [
+    (at(sphere(0.2), (1.5, -0.8, -6)), (3.5, -1.0, -6.0), "outside the picture", "the nearest free place is `at: ["),
+    (WALL, (0.0, -1.0, -6.0), "hidden behind other objects", "the nearest free place is `at: ["),
+]  # fmt: skip
+
+
+@pytest.mark.parametrize("other, point, words, cure", CASES)
+def test_where_nothing_would_be_seen_it_is_refused_with_a_place_or_moved_where_nobody_named_one(
+    other, point, words, cure
+):
+    spot = Spot(GROUND, np.array(point), 0.8)
+    with pytest.raises(InputError, match=words) as error:
+        stood_free(scene(other), stand, spot, asked=True)
+    assert error.value.key == "at" and cure in error.value.cure
+    new, there, said = stood_free(scene(other), stand, spot, asked=False)
+    assert words in said
+    x, y = (int(v) for v in error.value.cure.split("[")[1].split("]")[0].split(","))
+    named = spot_at(scene(other), GROUND, new, (x, y), 1.0)  # the place that is named is where it is moved to
+    assert np.linalg.norm(named.point - there.point) < 0.25
+
+
+def test_an_object_that_fits_nowhere_is_refused_with_a_size_that_does():
+    """The camera looks straight down on the ground."""
+    down = Plane(np.array([0, 0, 1.0]), np.array([0, 0, -6.0]))
+    spot = Spot(down, down.point, 20.0)
+    with pytest.raises(
+        InputError, match="no free place in the picture: it would intersect 'there' and the camera"
+    ) as error:
+        stood_free(scene(at(sphere(0.3), (0, 0, -5.7))), stand, spot, asked=False)
+    assert error.value.key == "size" and "of its size it would be free at `at: [" in error.value.cure
