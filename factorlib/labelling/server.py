@@ -12,18 +12,20 @@ import io
 import re
 import secrets
 import sys
+from contextlib import suppress
 from functools import lru_cache
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from importlib.resources import files
+from itertools import cycle
 from pathlib import Path
 from threading import Lock
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
 from urllib.parse import parse_qs, urlsplit
 
 import msgspec
 import numpy as np
 from jaxtyping import UInt8
-from PIL import Image, ImageColor
+from PIL import Image
 
 from factorlib.dataset.check import IMAGES
 from factorlib.dataset.paths import Refusal, is_there
@@ -31,10 +33,9 @@ from factorlib.dataset.read import FILE, UNKNOWN
 from factorlib.dataset.schema import LEFT_OUT, AtLeastOne, Name, OneOf254
 from factorlib.errors import InputError
 from factorlib.images.limits import MOST_MEGAPIXELS, check_pixels
-from factorlib.images.palette import nearest_tags
+from factorlib.images.palette import PALETTE
 from factorlib.images.photo import decoded, open_photo
 from factorlib.images.picture import picture, png_bytes
-from factorlib.images.transfer import srgb_decode
 from factorlib.labels.grow import grow
 from factorlib.labels.png import read_values
 from factorlib.reading import read_bytes, read_text
@@ -55,7 +56,7 @@ class Entry(msgspec.Struct, frozen=True):
     name: Name
     image: str
     masks: Annotated[str, OnePng]
-    encoding: str | None = None
+    encoding: Literal["srgb", "linear", "gamma2.2"] | None = None
 
 
 class Spec(msgspec.Struct, frozen=True):
@@ -107,28 +108,30 @@ class MaskSet:
         if self.version(index) != version:
             cure = "press R to read it (what was drawn since the last save is lost), or move the file away"
             raise InputError("has changed on disk meanwhile: nothing was written", file=path, cure=cure)
+        named = self._named(photo)
         path.parent.mkdir(parents=True, exist_ok=True)
         replace_file(path, png)
-        self._name(photo)
+        if named is not None:
+            replace_file(self.yaml, named.encode())
         return self.version(index)
 
-    def _name(self, photo: str) -> None:
-        """Write the mask's path in place of a photo's `?`, if that stands in dataset.yaml, and change nothing else."""
-        value = parse_yaml(text := read_text(self.yaml, "a YAML file"), self.yaml)
-        for index, entry in enumerate(value["photos"]):
-            if entry["name"] == photo and entry["masks"] == UNKNOWN:
-                entry["masks"] = f"masks/{photo}.png"
-                text = with_value(text, ("photos", index, "masks"), entry["masks"])
-                try:
-                    alone = parse_yaml(text) == value
-                except InputError:  # the `?` had an anchor
-                    alone = False
-                if not alone:
-                    cure = f"write masks: {entry['masks']}"
-                    raise InputError(
-                        "the mask is saved, but not named", file=self.yaml, key=f"photos[{index}]", cure=cure
-                    )
-                replace_file(self.yaml, text.encode())
+    def _named(self, photo: str) -> str | None:
+        """dataset.yaml with the mask's path in place of the photo's `?` and no other change; None where none stands there."""
+        text, mask, photos = (
+            read_text(self.yaml, "a YAML file"),
+            f"masks/{photo}.png",
+            read_yaml(self.yaml, Spec).photos,
+        )
+        index = next((k for k, each in enumerate(photos) if (each.name, each.masks) == (photo, UNKNOWN)), None)
+        if index is None:
+            return None
+        value, text = parse_yaml(text), with_value(text, ("photos", index, "masks"), mask)
+        value["photos"][index]["masks"] = mask
+        with suppress(InputError):  # the `?` had an anchor, which others miss
+            if parse_yaml(text) == value:
+                return text
+        cure = f"write masks: {mask}, and save again; nothing was written"
+        raise InputError("an anchor is in the way", file=self.yaml, key=f"photos[{index}].masks", cure=cure)
 
     def version(self, index: int) -> str:
         """The hash of a mask's file, NO_FILE where there is none."""
@@ -199,10 +202,11 @@ class _Request(BaseHTTPRequestHandler):
             case "GET", "/":
                 return (files("factorlib.labelling") / "page.html").read_bytes(), "text/html; charset=utf-8"
             case "GET", "/set":
-                own = [ImageColor.colormap.get(name.lower(), "#808080") for name in masks.materials]
-                rgb = np.array([ImageColor.getrgb(colour) for colour in own]) / 255
-                tags, photos = nearest_tags(masks.materials, srgb_decode(rgb)), [photo.name for photo in masks.photos]
-                materials = [(name, tags[name]) for name in masks.materials]
+                photos, tags = (
+                    [photo.name for photo in masks.photos],
+                    cycle(PALETTE),
+                )  # not their own, to be seen on them
+                materials = list(zip(masks.materials, tags))
                 about = {"name": masks.folder.name, "photos": photos, "materials": materials}
                 return msgspec.json.encode(about), "application/json"
             case "GET", "photo":
