@@ -8,6 +8,7 @@ import sys
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from threading import Thread
+from urllib.parse import quote
 
 import numpy as np
 import pytest
@@ -122,9 +123,10 @@ def test_strangers_read_and_write_nothing(folder):
             ("Origin", word) for word in ("null", f"https://{server.host}", *(f"http://{k}" for k in of.values()))
         ]
         for name, word in strangers:
-            for asks in ("GET /", "GET /set", "GET /mask/1", "PUT /mask/1", "POST /unsaved/1"):
+            page = f"GET /?token={quote(word or '') if name == 'X_Token' else server.token}"
+            for asks in (page, "GET /set", "GET /mask/1", "PUT /mask/1", "POST /unsaved/1"):
                 body = bytes(600) if "PUT" in asks else b"1"
-                status, found, _ = asked(server, *asks.split(), body, **{"X_Version": version, name: word})
+                status, found, _ = asked(server, *asks.split(" "), body, **{"X_Version": version, name: word})
                 assert status == 403 and "Access-Control-Allow-Origin" not in found, (name, word, asks)
         assert asked(server, "GET", f"/?token={server.token}", X_Token=None)[0] == 200
         assert asked(server, "GET", f"/mask/1?token={server.token}", X_Token=None)[0] == 403  # a stranger's link
@@ -166,13 +168,15 @@ def test_odd_requests_change_nothing(folder):
 
 def test_ctrl_c_ends_it_and_names_what_is_not_saved(folder):
     command = [sys.executable, "-m", "factorlib", "label", "--dataset", str(folder), "--port"]
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)  # a shell may have handed it down as ignored
     with subprocess.Popen([*command, "0"], cwd=ROOT, stdout=subprocess.PIPE, text=True) as run:
+        signal.signal(signal.SIGINT, before)
         port, token = re.search(r"127\.0\.0\.1:(\d+)/\?token=(\S+)", run.stdout.readline()).groups()
         line = http.client.HTTPConnection("127.0.0.1", int(port))
         line.request("POST", "/unsaved/1", b"1", {"X-Token": token})
-        assert line.getresponse().status == 200
+        status = line.getresponse().status
         run.send_signal(signal.SIGINT)
-        assert "not saved: side" in run.stdout.read() and run.wait(30) == 0
+        assert "not saved: side" in run.stdout.read() and run.wait(30) == 0 and status == 200
     refused = subprocess.run([*command, "70000"], cwd=ROOT, capture_output=True, text=True, check=False)
     assert refused.returncode == 1 and "PORT: 70000 cannot be had" in refused.stderr
 
@@ -216,6 +220,7 @@ def test_in_a_browser_by_mouse_and_keys(folder):
         page.keyboard.press("2")
         page.get_by_role("button", name="brown", pressed=True).wait_for()
         drawn("g", (30, 40), (30, 48))
+        drawn("x", box[:2], box[2:])  # again, with another label: what was clicked stays
         assert ((grown := saved()) == truth).mean() > 0.98 and not server.unsaved
         page.keyboard.press("l")
         drawn("b", (5, 5), (9, 5))

@@ -47,6 +47,12 @@ def test_sure_pixels_and_what_is_beside_the_box_stay():
     truth, picture, box = scene()
     label, sure = clicked(truth, box)
     label[:3], label[50, 20], sure[50, 20] = 2, 1, True  # both wrong, but said
+    wide, picture_2 = (
+        [np.kron(each, np.ones((2, 2), each.dtype)) for each in (label, sure)],
+        picture.repeat(2, 0).repeat(2, 1),
+    )
+    wide[0][80, 41], wide[1][80, 41] = 1, True  # a stroke finer than the boxes of the walk
+    assert np.array_equal(grow(tuple(2 * k for k in box), picture_2, *wide, 3600)[wide[1]], wide[0][wide[1]])
     found = grow(box, picture, label, sure)
     outside = np.ones_like(sure)
     outside[box[1] : box[3], box[0] : box[2]] = False
