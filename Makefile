@@ -9,10 +9,10 @@ override PY := .venv/bin/python
 override STAGES := $(shell sed -n '/^stages:/,$$s/^  \([a-z_]*\):.*/\1/p' pipeline.yaml)
 MAKEFLAGS += --no-print-directory
 
-.PHONY: all plan why status graph logs params new compare validate verify clean gc pack setup lock test test-long size docs results study studies data help $(STAGES)
+.PHONY: all plan why status graph logs params new label compare validate verify clean gc pack setup lock test test-long size docs results study studies data help $(STAGES)
 
 # each reads DATASET, SET and FORCE from the environment
-all plan why status graph logs params new compare validate verify pack $(STAGES): .venv/ready
+all plan why status graph logs params new label compare validate verify pack $(STAGES): .venv/ready
 	@$(PY) -m factorlib "$$GOAL"
 
 clean: .venv/ready
@@ -72,6 +72,7 @@ help:
 	@echo 'make render DATASET=… RECIPE=insert   pictures of the result: a name in recipes/, a path to a recipe, or all (docs/recipes.md)'
 	@echo 'make plan | why | status DATASET=…   what would run; why; how far each stage is'
 	@echo 'make new DATASET=mychair PHOTOS=… MASKS=… MESHES=…   begin a dataset of your own, from folders of files'
+	@echo 'make label DATASET=mychair [PORT=…]   draw masks in a browser: boxes, clicks, brush (docs/dataset.md)'
 	@echo 'make validate DATASET=…              look at every file of a dataset, without running anything; SHEET=1: a contact sheet'
 	@echo 'make logs DATASET=… STAGE=… PHOTO=…  what results cost and were made with: time, peak memory, versions, warnings'
 	@echo 'make graph                           the stages and what they take; $(PY) -m factorlib graph --mermaid: as a diagram'

@@ -245,3 +245,11 @@ def _line_of(node: yaml.Node | None, keys: Keys) -> int:
             node = node.value[key]
             line = node.start_mark.line
     return line + 1
+
+
+def with_value(text: str, keys: Keys, word: str) -> str:
+    """The text with `word`, as it is written, in place of the value at `keys`, which is there; every other character stays."""
+    node = yaml.compose(text, Loader=yaml.SafeLoader)
+    for key in keys:
+        node = node.value[key] if isinstance(key, int) else next(item for name, item in node.value if name.value == key)
+    return text[: node.start_mark.index] + word + text[node.end_mark.index :]

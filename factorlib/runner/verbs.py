@@ -249,6 +249,12 @@ def begin(project: Project, dataset: str, photos: Path | None, masks: Path | Non
     return 0
 
 
+def label_masks(project: Project, dataset: str, port: int) -> int:
+    """Serve the page on which masks are drawn, until Ctrl-C."""
+    import_module("factorlib.labelling.server").serve(project.dataset_folder(dataset), port)
+    return 0
+
+
 def compare(project: Project, first: Path, second: Path) -> int:
     """Write a page that shows two results, folders such as build/eames, side by side."""
     homes = [Home(path if path.is_dir() else project.build / path) for path in (first, second)]

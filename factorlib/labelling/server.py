@@ -1,0 +1,257 @@
+"""The masks of a data set, and a server that shows them to a browser on this machine alone.
+
+A request carries a random token, the page's in its address, any other in a header that no stranger's page may send.  Host must be this server's
+address, so that no name turned to 127.0.0.1 (DNS rebinding) is served, and so must Origin, where a browser sends it.  A request names a photo
+by its index, never a file, and its body is as long as the photo's size asks.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import io
+import re
+import secrets
+import sys
+from contextlib import suppress
+from functools import lru_cache
+from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+from importlib.resources import files
+from itertools import cycle
+from pathlib import Path
+from threading import Lock
+from typing import Annotated, Any, Literal
+from urllib.parse import parse_qs, urlsplit
+
+import msgspec
+import numpy as np
+from jaxtyping import UInt8
+from PIL import Image
+
+from factorlib.dataset.check import IMAGES
+from factorlib.dataset.paths import Refusal, is_there
+from factorlib.dataset.read import FILE, UNKNOWN
+from factorlib.dataset.schema import LEFT_OUT, AtLeastOne, Name, OneOf254
+from factorlib.errors import InputError
+from factorlib.images.limits import MOST_MEGAPIXELS, check_pixels
+from factorlib.images.palette import PALETTE
+from factorlib.images.photo import decoded, open_photo
+from factorlib.images.picture import picture, png_bytes
+from factorlib.labels.grow import grow
+from factorlib.labels.png import read_values
+from factorlib.reading import read_bytes, read_text
+from factorlib.wholefile import replace_file
+from factorlib.yamlfile import parse_yaml, read_yaml, with_value
+
+OnePng = msgspec.Meta(
+    description='here one label PNG a photo is drawn: name it, also if it is not there yet, or write masks: "?"'
+)
+CONTENT = "default-src 'none'; img-src data:; script-src 'unsafe-inline'; style-src 'unsafe-inline'; connect-src 'self'; frame-ancestors 'none'"
+HEADERS = {"Cache-Control": "no-store", "Referrer-Policy": "no-referrer", "Content-Security-Policy": CONTENT}
+NO_FILE = "none"  # the version of a mask that is not there yet
+
+
+class Entry(msgspec.Struct, frozen=True):
+    """What is needed of a photo in dataset.yaml."""
+
+    name: Name
+    image: str
+    masks: Annotated[str, OnePng]
+    encoding: Literal["srgb", "linear", "gamma2.2"] | None = None
+
+
+class Spec(msgspec.Struct, frozen=True):
+    """What is needed of dataset.yaml; the rest may be unfinished."""
+
+    materials: Annotated[list[Name], OneOf254]
+    photos: Annotated[list[Entry], AtLeastOne]
+
+
+class MaskSet:
+    """The label masks of the photos of a data set.
+
+    One that is not there yet is empty; one that dataset.yaml leaves as `?` becomes masks/<photo>.png, and is named there when it is saved.
+    Raises InputError for a dataset.yaml or photo that cannot be read, and for masks that are no label PNG.
+    """
+
+    def __init__(self, folder: Path):
+        self.folder, self.yaml, self.files, self.sizes = folder.resolve(), folder.resolve() / FILE, [], []
+        if not is_there(self.yaml, "DATASET") or not self.yaml.resolve().is_relative_to(self.folder):
+            raise InputError("there is no such file in this folder", file=self.yaml, cure="`make new` begins one")
+        spec, refuse = read_yaml(self.yaml, Spec), Refusal(self.yaml, self.folder)
+        self.materials, self.photos = spec.materials, spec.photos
+        refuse.once("photos", (photo.name for photo in self.photos), "photo")
+        for index, photo in enumerate(self.photos):
+            key, mask = f"photos[{index}].image", f"masks/{photo.name}.png" if photo.masks == UNKNOWN else photo.masks
+            refuse.path(key, photo.image, IMAGES)
+            refuse.path(f"photos[{index}].masks", mask, (".png",), must_exist=False)
+            self.files.append((self.folder / mask).resolve())
+            self.sizes.append(open_photo(self.folder / photo.image, key).size)
+            check_pixels(self.sizes[-1], MOST_MEGAPIXELS, self.folder / photo.image, key)
+        self.picture = lru_cache(4)(self._picture)
+
+    def _picture(self, index: int) -> UInt8[np.ndarray, "h w 3"]:
+        """A photo as displayed, sRGB-encoded; a linear one is exposed."""
+        path, encoding = self.folder / self.photos[index].image, self.photos[index].encoding
+        photo = decoded(open_photo(path), encoding, 1, path)
+        return picture(photo.radiance, None if photo.encoding == "linear" else 1.0)
+
+    def read(self, index: int) -> tuple[UInt8[np.ndarray, "h w"], str]:
+        """Labels, and the version of their file.  InputError where they are not of the photo's size, or have no material."""
+        if (version := self.version(index)) == NO_FILE:
+            return np.zeros(self.sizes[index], np.uint8), version
+        labels = self._known(read_values(self.files[index], self.photos[index].name, self.sizes[index]), index)
+        return labels.astype(np.uint8), version
+
+    def save(self, index: int, labels: UInt8[np.ndarray, "h w"], version: str) -> str:
+        """Write labels, and return their file's version; InputError where that is not `version` any more, or a label has no material."""
+        png, path, photo = png_bytes(self._known(labels, index)[..., None]), self.files[index], self.photos[index].name
+        if self.version(index) != version:
+            cure = "press R to read it (what was drawn since the last save is lost), or move the file away"
+            raise InputError("has changed on disk meanwhile: nothing was written", file=path, cure=cure)
+        named = self._named(photo)
+        path.parent.mkdir(parents=True, exist_ok=True)
+        replace_file(path, png)
+        if named is not None:
+            replace_file(self.yaml, named.encode())
+        return self.version(index)
+
+    def _named(self, photo: str) -> str | None:
+        """dataset.yaml with the mask's path in place of the photo's `?` and no other change; None where none stands there."""
+        text, mask, photos = (
+            read_text(self.yaml, "a YAML file"),
+            f"masks/{photo}.png",
+            read_yaml(self.yaml, Spec).photos,
+        )
+        index = next((k for k, each in enumerate(photos) if (each.name, each.masks) == (photo, UNKNOWN)), None)
+        if index is None:
+            return None
+        value, text = parse_yaml(text), with_value(text, ("photos", index, "masks"), mask)
+        value["photos"][index]["masks"] = mask
+        with suppress(InputError):  # the `?` had an anchor, which others miss
+            if parse_yaml(text) == value:
+                return text
+        cure = f"write masks: {mask}, and save again; nothing was written"
+        raise InputError("an anchor is in the way", file=self.yaml, key=f"photos[{index}].masks", cure=cure)
+
+    def version(self, index: int) -> str:
+        """The hash of a mask's file, NO_FILE where there is none."""
+        there = is_there(self.files[index], "masks")
+        return hashlib.sha256(read_bytes(self.files[index], "a PNG")).hexdigest() if there else NO_FILE
+
+    def _known(self, labels: np.ndarray, index: int) -> np.ndarray:
+        if strange := {*np.unique(labels).tolist()} - {*range(len(self.materials) + 1), LEFT_OUT}:
+            cure = f"known are 0 background, 1 to {len(self.materials)} the materials, {LEFT_OUT} leave out"
+            raise InputError(f"unknown label {min(strange)}", file=self.files[index], cure=cure)
+        return labels
+
+
+class Server(ThreadingHTTPServer):
+    """Serves masks at `url` on 127.0.0.1; port 0 is a free one; unsaved: indices of photos with strokes that the browser alone has."""
+
+    def __init__(self, masks: MaskSet, port: int = 0):
+        self.masks, self.token, self.unsaved, self.lock = masks, secrets.token_urlsafe(24), set(), Lock()
+        super().__init__(("127.0.0.1", port), _Request)
+        self.host = f"127.0.0.1:{self.server_port}"
+        self.url = f"http://{self.host}/?token={self.token}"
+
+    def handle_error(self, *of: Any) -> None:
+        """Say nothing where the browser has hung up."""
+        if not isinstance(sys.exception(), OSError):
+            super().handle_error(*of)
+
+
+class _Request(BaseHTTPRequestHandler):
+    server: Server
+    timeout = 60  # seconds that a browser may pause
+
+    def do_GET(self) -> None:
+        url, server = urlsplit(self.path), self.server
+        query = {name: values[0] for name, values in parse_qs(url.query).items()}
+        is_page = (self.command, url.path) == ("GET", "/")
+        token = query.get("token", "") if is_page else self.headers.get("X-Token", "")
+        own = self.headers.get_all("Host") == [server.host]
+        own = own and self.headers.get("Origin", f"http://{server.host}") == f"http://{server.host}"
+        try:
+            if own and secrets.compare_digest(token.encode(), server.token.encode()):
+                return self._send(200, *self._answer(url.path, query))
+            self._send(403, b"open the address that `make label` has written")
+        except InputError as error:
+            self._send(400, str(error).encode())
+        except OSError as error:
+            self._send(500, f"{error.filename}: {error.strerror or error}: nothing was written".encode())
+
+    do_PUT = do_POST = do_GET
+
+    def log_message(self, *of: Any) -> None:
+        """Say nothing of requests."""
+
+    def _send(self, status: int, body: bytes, kind: str = "text/plain; charset=utf-8", version: str = "") -> None:
+        self.send_response(status)
+        for name, value in {**HEADERS, "Content-Type": kind, "X-Version": version, "Content-Length": len(body)}.items():
+            self.send_header(name, str(value))
+        self.end_headers()
+        self.wfile.write(body)
+
+    def _answer(self, path: str, query: dict[str, str]) -> tuple:
+        """Body, type and version of what is asked for."""
+        masks, data = self.server.masks, "application/octet-stream"
+        named = re.fullmatch(r"/(photo|mask|grow|unsaved)/([0-9]{1,9})", path)
+        index = int(named[2]) if named else 0
+        height, width = masks.sizes[index] if index < len(masks.sizes) else (0, 0)
+        match self.command, named[1] if named and height else path:
+            case "GET", "/":
+                return (files("factorlib.labelling") / "page.html").read_bytes(), "text/html; charset=utf-8"
+            case "GET", "/set":
+                photos, tags = (
+                    [photo.name for photo in masks.photos],
+                    cycle(PALETTE),
+                )  # not their own, to be seen on them
+                materials = list(zip(masks.materials, tags))
+                about = {"name": masks.folder.name, "photos": photos, "materials": materials}
+                return msgspec.json.encode(about), "application/json"
+            case "GET", "photo":
+                Image.fromarray(masks.picture(index)).save(stream := io.BytesIO(), "JPEG", quality=95)
+                return stream.getvalue(), "image/jpeg"
+            case "GET", "mask":
+                labels, version = masks.read(index)
+                return labels.tobytes(), data, version
+            case "PUT", "mask":
+                labels = np.frombuffer(self._body(height * width), np.uint8).reshape(height, width)
+                with self.server.lock:
+                    return b"", data, masks.save(index, labels, self.headers.get("X-Version", ""))
+            case "POST", "grow":  # labels, and 1 where they are sure; the labels grown in the box come back
+                box = tuple(map(int, re.findall("[0-9]+", query.get("box", "")[:40])))
+                if len(box) != 4 or not (box[0] < box[2] <= width and box[1] < box[3] <= height):
+                    raise InputError("the box is not in the photo")
+                label, sure = np.frombuffer(self._body(2 * height * width), np.uint8).reshape(2, height, width)
+                return grow(box, masks.picture(index), label, sure > 0).tobytes(), data
+            case "POST", "unsaved":
+                (self.server.unsaved.add if self._body(1) == b"1" else self.server.unsaved.discard)(index)
+                return b"", data
+        raise InputError("there is nothing of that name")
+
+    def _body(self, length: int) -> bytes:
+        if self.headers.get("Content-Length") != str(length) or len(body := self.rfile.read(length)) < length:
+            raise InputError(f"{length} bytes are expected: nothing was written")
+        return body
+
+
+def serve(folder: Path, port: int = 0) -> None:
+    """Serve the page of the data set in `folder` until Ctrl-C, and say then what was not saved.
+
+    Raises InputError as `MaskSet` does, and where the port (0: a free one) cannot be had.
+    """
+    masks = MaskSet(folder)
+    try:
+        server = Server(masks, port)
+    except (OSError, OverflowError) as error:
+        raise InputError(f"{port} cannot be had ({error})", key="PORT", cure="leave it out, or give another") from error
+    print(f"{folder.name}: open {server.url}\n  Ctrl-C ends it", flush=True)
+    try:
+        server.serve_forever()
+    except KeyboardInterrupt:
+        pass
+    finally:
+        with server.lock:  # what is being saved is finished
+            names = ", ".join(masks.photos[index].name for index in sorted(server.unsaved))
+            print(f"stopped; {f'not saved: {names}' if names else 'all is saved'}", flush=True)
