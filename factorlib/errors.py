@@ -12,6 +12,7 @@ from functools import partial
 from os import PathLike
 
 MOST_LISTED, MOST_COMPARED = 30, 3000  # of the words that might have been meant
+NEAR = 0.7  # of 1, the ratio of `difflib`: "bogus" is not near to "logs"
 
 
 class InputError(ValueError):
@@ -46,6 +47,6 @@ def did_you_mean(word: str, known: Iterable[object]) -> str:
     "known are: 'source', 'target'"
     """
     known = sorted(str(k) for k in known)
-    near = get_close_matches(word, known[:MOST_COMPARED], n=1)
+    near = get_close_matches(word, known[:MOST_COMPARED], n=1, cutoff=NEAR)
     more = f", … ({len(known)} in all)" if len(known) > MOST_LISTED else ""
     return f"did you mean {near[0]!r}?" if near else "known are: " + ", ".join(map(repr, known[:MOST_LISTED])) + more

@@ -6,6 +6,7 @@ import re
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from itertools import groupby
 from typing import Any
+from urllib.parse import quote
 
 import msgspec
 
@@ -26,6 +27,13 @@ LOW_IOU = 0.85
 MEASURES = {"median": "median", "p95": "95th percentile", "p99": "99th percentile", "worst": "worst", "samples": "samples"}  # fmt: skip
 CURVES = {"held_out_median_error": "median", "held_out_p95_error": "95th percentile"}  # columns of training.parquet
 ERROR = "relative error, %"
+FILES = {  # links of the page: the stage, and which of its files
+    "materials.json": ("export", "materials.json"), "MaterialX": ("export", "*.mtlx"), "objects, glTF": ("export", "*.glb"),
+    "lights, EXR": ("export", "illumination/*.exr"), "lights, HDR": ("export", "illumination/*.hdr"),
+    "how sure lights are": ("export", "coverage/*.exr"), "Mitsuba scenes": ("export", "scenes/*.xml"),
+    "OpenUSD scenes": ("export", "scenes/*.usda"), "Blender scenes": ("export", "scenes/blender.py"), "meshes": ("export", "meshes/*.ply"),
+    "re-syntheses": ("render", "resynthesis/*.exr"), "metrics.json": ("evaluate", "metrics.json"),
+}  # fmt: skip
 Plot = tuple[str, list[str]]  # an SVG, and the names of its lines
 
 
@@ -35,8 +43,10 @@ def page(
     tags: dict[str, str],
     viewed: dict[str, Any] | None,
     surfaces: Sequence[pictures.SurfaceRow] = (),
+    first: Sequence[tuple[str, str, str]] = (),
 ) -> str:
-    """The page as HTML, from the artifacts, the photos' rows, the materials' colours, what can be relit, and the meshes that were moved."""
+    """The page as HTML, from the artifacts, the photos' rows, the materials' colours, what can be relit, the meshes that were moved,
+    and the pictures of the first screen: title, `data:` URI, words."""
     metrics, exposure, facts, solved = run.metrics, pictures.exposures(run), run.photo_facts, run.solved
     assert metrics is not None
     photos, poses = run.set.photos, run.poses
@@ -50,6 +60,8 @@ def page(
         metrics=metrics,
         headlines=headlines(metrics),
         cautions=cautions(run, metrics),
+        links=links(run),
+        first=first,
         rows=rows,
         amplification=pictures.AMPLIFICATION,
         tags=tags,
@@ -58,12 +70,16 @@ def page(
         maps=[(p, pictures.reflectance_maps(run, p, exposure[p])) for p in photos],
         lights=[row for row in lights if row],
         missing={why: [section for _, section in group] for why, group in groupby(reasons, lambda pair: pair[0])},
-        gauge=msgspec.to_builtins(solved.gauge, order="sorted"),
+        gauge=solved.gauge,
+        groups=[
+            [m for m, k in solved.gauge.component.items() if k == n] for n in sorted({*solved.gauge.component.values()})
+        ],
         choices=sentences("choices.txt", model=solved.model),
         model=msgspec.to_builtins(solved.model, order="sorted"),
         exposures={p: f for p, f in run.exposures.items() if any(abs(c - 1) > 1e-9 for c in f)},
         plots=_plots(run.table("solve", "convergence")),
         poses=[(p, _overlay(run, p), poses[p], facts.get(p)) for p in photos if p in poses],
+        doubted=any(o.doubts or o.left_out for photo in poses.values() for o in photo.objects.values()),
         surface=run.surface,
         surfaces=surfaces,
         low_iou=LOW_IOU,
@@ -72,6 +88,16 @@ def page(
         cost=cost_of(run.events(), STAGES),
         viewed=viewed,
     )
+
+
+def links(run: Artifacts) -> dict[str, list[tuple[str, str]]]:
+    """By kind the files that are there: their names, and where they lie beside the folder of the page in build/<dataset>/."""
+    found = {}
+    for kind, (stage, pattern) in FILES.items():
+        paths = sorted(run.folders[stage].glob(pattern))
+        if paths:
+            found[kind] = [(p.stem, f"../{stage}/{quote(p.relative_to(run.folders[stage]).as_posix())}") for p in paths]
+    return found
 
 
 def cautions(run: Artifacts, metrics: Metrics) -> list[str]:

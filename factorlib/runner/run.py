@@ -22,7 +22,7 @@ from filelock import FileLock, Timeout
 from factorlib.runner.child import Pools
 from factorlib.runner.display import Display
 from factorlib.runner.gc import tenant
-from factorlib.runner.home import claim, label, remember, show, sound_lines, view_of
+from factorlib.runner.home import claim, label, remember, show, sound_lines, usual_costs, view_of
 from factorlib.runner.pipeline import DASK, DATASET
 from factorlib.runner.plan import Planned, Step
 from factorlib.runner.shared import shared_store
@@ -78,6 +78,7 @@ class Run:
     def __init__(self, survey: Survey, display: Display, folder: Path):
         self.survey, self.display, self.folder, self.pools = survey, display, folder, Pools()
         self.refused = survey.wrong_values(survey.planned())
+        display.usual, display.cores = usual_costs(survey.home.log), self.pools.cores
         self.store, self.outputs, self.shared = survey.store, survey.outputs, shared_store(survey.store.root)
         self.running: dict[Step, Running] = {}
         self.waiting: set[Step] = set()  # for another run, or for what is damaged to be made again
