@@ -1,14 +1,11 @@
 """Everything on the page, gathered and set into the template."""
 
 import json
-import math
 import re
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from itertools import groupby
 from typing import Any
 from urllib.parse import quote
-
-import msgspec
 
 from factorlib.export.gltf import EXTENSION, gltf_material
 from factorlib.export.materialx import materialx
@@ -25,8 +22,6 @@ from factorlib.results.poses import AS_IT_IS
 
 LOW_IOU = 0.85
 MEASURES = {"median": "median", "p95": "95th percentile", "p99": "99th percentile", "worst": "worst", "samples": "samples"}  # fmt: skip
-CURVES = {"held_out_median_error": "median", "held_out_p95_error": "95th percentile"}  # columns of training.parquet
-ERROR = "relative error, %"
 FILES = {  # links of the page: the stage, and which of its files
     "materials.json": ("export", "materials.json"), "MaterialX": ("export", "*.mtlx"), "objects, glTF": ("export", "*.glb"),
     "lights, EXR": ("export", "illumination/*.exr"), "lights, HDR": ("export", "illumination/*.hdr"),
@@ -75,7 +70,6 @@ def page(
             [m for m, k in solved.gauge.component.items() if k == n] for n in sorted({*solved.gauge.component.values()})
         ],
         choices=sentences("choices.txt", model=solved.model),
-        model=msgspec.to_builtins(solved.model, order="sorted"),
         exposures={p: f for p, f in run.exposures.items() if any(abs(c - 1) > 1e-9 for c in f)},
         plots=_plots(run.table("solve", "convergence")),
         poses=[(p, _overlay(run, p), poses[p], facts.get(p)) for p in photos if p in poses],
@@ -171,7 +165,7 @@ def _plots(history: dict[str, list]) -> list[Plot]:
 
 
 def _training(run: Artifacts) -> dict[str, Any] | None:
-    """From accuracy.json, {network: {measure: number, quantity: {bin: {measure: number}}}}, and training.parquet.
+    """From accuracy.json, {network: {measure: number, quantity: {bin: {measure: number}}}}.
 
     columns: the measures that occur;  lines: (level, name, numbers), level 0 a network, 1 a quantity, 2 a bin of it
     """
@@ -180,9 +174,7 @@ def _training(run: Artifacts) -> dict[str, Any] | None:
         return None
     columns = {key: title for key, title in MEASURES.items() if f"'{key}'" in str(accuracy)}
     lines = [line for part, table in sorted(accuracy.items(), reverse=True) for line in _lines(part, table, 0)]
-    bins = [_binned(*item) for item in accuracy.get("specular", {}).items() if isinstance(item[1], dict)]
-    curve = _curve(run.table("train", "training"))
-    return {"columns": columns, "lines": lines, "curve": curve, "bins": [plot for plot in bins if plot[0]]}
+    return {"columns": columns, "lines": lines}
 
 
 def _lines(name: str, table: Mapping, level: int) -> Iterator[tuple[int, str, Mapping]]:
@@ -195,25 +187,6 @@ def _in_order(names: Iterable[str]) -> list[str]:
     """Bins in the order of what they hold, by their leading numbers: "3 to 30" before "30 to 300"."""
     leading = re.compile(r"[-+]?[\d.]+(e[-+]?\d+)?")
     return sorted(names, key=lambda name: (float(number[0]) if (number := leading.match(name)) else 0.0, name))
-
-
-def _binned(quantity: str, bins: Mapping[str, Mapping[str, float]]) -> Plot:
-    """The specular error by bins of a quantity."""
-    names = _in_order(bins)
-    values = {MEASURES[k]: [100 * bins[name].get(k, math.nan) for name in names] for k in ("median", "p95")}
-    lines = {title: (range(len(names)), errors) for title, errors in values.items()}
-    return line_plot(lines, quantity, ERROR, log_y=True, names=names), list(lines)
-
-
-def _curve(table: dict[str, list]) -> Plot:
-    """Errors of each network by step; columns are part, step and `CURVES`."""
-    lines = {}
-    for part in sorted(set(table.get("part", [])), reverse=True):
-        rows = [k for k, name in enumerate(table["part"]) if name == part]
-        for column in [column for column in CURVES if column in table]:
-            errors = [100 * table[column][k] for k in rows]
-            lines[f"{part}, {CURVES[column]}"] = [table["step"][k] for k in rows], errors
-    return line_plot(lines, "training step", ERROR, log_y=True), list(lines)
 
 
 # ── Cost ─────────────────────────────────────────────────────────────────────────────────────────────────────────────

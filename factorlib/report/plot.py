@@ -10,13 +10,12 @@ Line = tuple[Sequence[float], Sequence[float]]  # x and y of its points
 
 
 def line_plot(
-    lines: Mapping[str, Line], x_label: str, y_label: str, log_y: bool = False,
-    rules: Sequence[float] = (), names: Sequence[str] = (),
-) -> str:  # fmt: skip
+    lines: Mapping[str, Line], x_label: str, y_label: str, log_y: bool = False, rules: Sequence[float] = ()
+) -> str:
     """An SVG of lines by name, with points in order of x; empty text if there is nothing to draw.
 
     A value that is not finite (or not positive, on a logarithmic axis) is left out.
-    rules: x of thin vertical rules;  names: what stands at x = 0, 1, … in place of numbers
+    rules: x of thin vertical rules
     """
     height = math.log10 if log_y else float
     kept = [[(x, height(y)) for x, y in zip(*line, strict=True) if _drawable(y, log_y)] for line in lines.values()]
@@ -24,16 +23,15 @@ def line_plot(
     if not points:
         return ""
     xs, ys = zip(*points)
-    aside, above = 0.4 if names else 0.0, 0.05 * (max(ys) - min(ys)) or 0.5
-    across = _scale(min(xs) - aside, max(xs) + aside, LEFT, RIGHT)
+    above = 0.05 * (max(ys) - min(ys)) or 0.5
+    across = _scale(min(xs), max(xs), LEFT, RIGHT)
     up = _scale(min(ys) - above, max(ys) + above, BASE, TOP)
     up_ticks = [(up(y), f"{10**y:.3g}") for y in log_ticks(min(ys), max(ys))] if log_y else []
-    marks = enumerate(names) if names else [(x, f"{x:g}") for x in ticks(min(xs), max(xs), 8)]
     return rendered(
         "plot.svg", width=WIDTH, height=HEIGHT, left=LEFT, right=RIGHT, top=TOP, base=BASE,
         x_label=x_label, y_label=y_label, rules=[f"{across(x):.1f}" for x in rules],
         up_ticks=up_ticks or [(up(y), f"{y:g}") for y in ticks(min(ys), max(ys))],
-        across_ticks=[(f"{across(x):.1f}", text) for x, text in marks],
+        across_ticks=[(f"{across(x):.1f}", f"{x:g}") for x in ticks(min(xs), max(xs), 8)],
         lines=[(k, [(f"{across(x):.1f}", f"{up(y):.1f}") for x, y in line]) for k, line in enumerate(kept) if line],
     )  # fmt: skip
 

@@ -192,10 +192,3 @@ def _whole(made: Made, folders: dict, materials: list[str]) -> None:
     write_json(folders["train"] / "accuracy.json", {"diffuse": summary, "specular": {**summary, "sharpness": bins}})
     for part in ("diffuse", "specular"):
         (folders["train"] / f"{part}.safetensors").write_bytes((SHIPPED / f"{part}.safetensors").read_bytes())
-    curve = {
-        "part": ["specular"] * 3 + ["diffuse"] * 3,
-        "step": [100, 200, 300] * 2,
-        "training_loss": [0.3, 0.2, 0.1] * 2,
-    }
-    curve |= {"held_out_median_error": [0.1, 0.05, 0.02] * 2, "held_out_p95_error": [0.3, 0.2, 0.1] * 2}
-    pq.write_table(pa.table(curve), folders["train"] / "training.parquet")

@@ -51,11 +51,9 @@ def test_any_history_gives_a_plot_inside_its_frame(values, log_y):
     assert all(0 <= float(x) <= WIDTH and 0 <= float(y) <= HEIGHT for x, y in pairs)
 
 
-def test_larger_values_stand_higher_names_stand_in_for_numbers_and_nothing_gives_nothing():
+def test_larger_values_stand_higher_and_nothing_gives_nothing():
     assert line_plot({"a": ([0], [math.nan])}, "x", "y") == line_plot({}, "x", "y") == ""
-    svg = line_plot({"a": ([0, 1], [1.0, 2.0])}, "x", "y", names=["few", "many & more"])
-    ET.fromstring(svg)
-    assert ">few</text>" in svg and ">many &amp; more</text>" in svg and ">0.2</text>" not in svg
+    svg = line_plot({"a": ([0, 1], [1.0, 2.0])}, "x", "y")
     (x0, y0), (x1, y1) = (tuple(map(float, p.split(","))) for p in re.search(r'points="([^"]*)"', svg)[1].split())
     assert x1 > x0 and y1 < y0
 

@@ -103,7 +103,9 @@ def test_lights_in_which_a_material_is_worse_than_grey_stand_in_one_line():
     (bad,), (good,) = (list(metrics_of(error).relighting.balls.values()) for error in (1.1, 0.9))
     balls = {f"l{k}": bad for k in range(5)} | {"hall": good}
     found = msgspec.structs.replace(found, relighting=Relighting(balls, {}, None))
-    assert guesses(found) == ["The recovered 'oak' predicts 5 of 6 lights worse than plain grey would: l0, l1, l2 and 2 more."]
+    assert guesses(found) == [
+        "The recovered 'oak' predicts 5 of 6 lights worse than plain grey would: l0, l1, l2 and 2 more."
+    ]
 
 
 def test_one_number_is_enough():

@@ -10,9 +10,12 @@ import time
 import pytest
 
 from factorlib.errors import InputError
-from factorlib.runner import verbs
+from factorlib.runner import display, verbs
 from factorlib.runner.child import Pools
 from factorlib.runner.gc import collect
+from factorlib.runner.home import usual_costs
+from factorlib.runner.plan import Step
+from factorlib.runner.survey import survey
 from tests.faults.battered import make
 from tests.faults.test_nothing_lost import done, start, wait_until
 from tests.runner import toy
@@ -260,6 +263,25 @@ def test_logs_have_times_memory_and_what_a_step_was_made_with_warnings_once_and_
     assert caught.value.key == "PHOTO"
     said = logs("table", settings=["table.scale=3"])
     assert re.search(r"^table +to run: parameter scale: 2 \(the default\) -> 3$", said, re.M)
+
+
+def test_what_is_left_is_told_where_every_stage_ran_before_by_what_it_took(project, monkeypatch):
+    usual = usual_costs(project.build / "set" / "log.jsonl")
+    assert usual.keys() == {"upper", "count", "table", "total"} and usual["total"][1] == 2 and usual["upper"][0] < 60
+    seen, shown, now = survey(project, "set", None, ["upper.times=2"]), display.Display(), [100.0]
+    monkeypatch.setattr(display.time, "monotonic", lambda: now[0])
+    shown.plan(seen.planned())
+    assert shown.seconds_left() is None and display.in_words(None) == ""
+    shown.usual, shown.cores = {"upper": (8.0, 1), "count": (1.0, 1), "total": (10.0, 2)}, 2
+    assert shown.seconds_left() == pytest.approx((2 * 8 + 2 * 1 + 10 * 2) / 2)  # table is current
+    for photo in "ab":
+        shown.start(Step("upper", photo))
+    now[0] += 5
+    assert shown.seconds_left() == pytest.approx((2 * 3 + 2 * 1 + 10 * 2) / 2)
+    now[0] += 60  # longer than before: nothing is left of them
+    assert shown.seconds_left() == pytest.approx((2 * 1 + 10 * 2) / 2)
+    shown.finish(Step("upper", "a"), 65.0), shown.finish(Step("upper", "b"), 65.0)
+    assert shown.seconds_left() == pytest.approx((2 * 1 + 10 * 2) / 2)
 
 
 def test_gc_shows_by_stage_and_age_what_is_not_current_asks_and_deletes_that_alone(project, capsys):
