@@ -14,7 +14,6 @@ from factorlib.images.picture import read_png
 from factorlib.jsonfile import read_json
 from factorlib.report import pictures
 from factorlib.report.artifacts import STAGES, Artifacts
-from factorlib.report.plot import line_plot
 from factorlib.report.template import headlines, rendered, sentences
 from factorlib.results.materials import Reflectance
 from factorlib.results.metrics import Metrics
@@ -29,7 +28,6 @@ FILES = {  # links of the page: the stage, and which of its files
     "OpenUSD scenes": ("export", "scenes/*.usda"), "Blender scenes": ("export", "scenes/blender.py"), "meshes": ("export", "meshes/*.ply"),
     "re-syntheses": ("render", "resynthesis/*.exr"), "metrics.json": ("evaluate", "metrics.json"),
 }  # fmt: skip
-Plot = tuple[str, list[str]]  # an SVG, and the names of its lines
 
 
 def page(
@@ -71,7 +69,6 @@ def page(
         ],
         choices=sentences("choices.txt", model=solved.model),
         exposures={p: f for p, f in run.exposures.items() if any(abs(c - 1) > 1e-9 for c in f)},
-        plots=_plots(run.table("solve", "convergence")),
         poses=[(p, _overlay(run, p), poses[p], facts.get(p)) for p in photos if p in poses],
         doubted=any(o.doubts or o.left_out for photo in poses.values() for o in photo.objects.values()),
         surface=run.surface,
@@ -144,21 +141,6 @@ def _overlay(run: Artifacts, photo: str) -> str | None:
         return None
     crop = pixels[pictures.box_of(run.channels("masks", photo)["label"] > 0.5, 0.15)].astype("f4")
     return pictures.data_uri(pictures.reduced(crop, pictures.longest_side(len(run.set.photos))).round().astype("u1"))
-
-
-def _plots(history: dict[str, list]) -> list[Plot]:
-    """Losses and number of lobes by accepted step of the solve."""
-    if not history:
-        return []
-    steps = list(range(len(history["loss"])))
-    rules = [k for k in steps[1:] if history["round"][k] != history["round"][k - 1]]
-    named = {"loss": "loss", "held out": "held_out"}
-    losses = {name: (steps, history[column]) for name, column in named.items() if column in history}
-    count = {"lobes": (steps, history["lobes"])}
-    return [
-        (line_plot(losses, "accepted step", "loss", log_y=True, rules=rules), list(losses)),
-        (line_plot(count, "accepted step", "light lobes, all lights", rules=rules), list(count)),
-    ]
 
 
 # ── Training ─────────────────────────────────────────────────────────────────────────────────────────────────────────

@@ -7,8 +7,6 @@ from pathlib import Path
 
 import msgspec
 import numpy as np
-import pyarrow as pa
-import pyarrow.parquet as pq
 
 from factorlib.conventions import YUP_FROM_CAMERA, lat_long_directions
 from factorlib.evaluate.ball import ball, light_of_lat_long
@@ -183,10 +181,6 @@ def _whole(made: Made, folders: dict, materials: list[str]) -> None:
     misfits = {photo: Misfit(0.001, 0.01) for photo in made.seen}
     uncertainty = Uncertainty(1.0, dict.fromkeys(materials, errors), "by hand", 0.001, misfits)
     write_json(folders["solve"] / "uncertainty.json", uncertainty)
-    steps = np.arange(30)
-    history = {"iteration": steps, "round": steps // 10, "lobes": 4 * (1 + steps // 10), "phase": ["joint"] * 30}
-    history |= {"loss": np.exp(-steps / 5.0) + 0.01, "held_out": np.exp(-steps / 6.0) + 0.02}
-    pq.write_table(pa.table(history), folders["solve"] / "convergence.parquet")
     bins = {"3 to 30": {"median": 0.002, "p95": 0.02, "samples": 7}, "30 to 300": {"median": 0.003}, "0.3 to 3": {"median": 0.001}}  # fmt: skip
     summary = {"median": 0.001, "p95": 0.004, "samples": 100}
     write_json(folders["train"] / "accuracy.json", {"diffuse": summary, "specular": {**summary, "sharpness": bins}})
