@@ -147,6 +147,7 @@ def test_odd_sets_give_a_whole_page(odd, tmp_path):
     assert ("no ground truth" in html) == (not odd.get("truth", True))
     if len(odd["seen"]) == 2:
         assert "2 groups that share no material" in html and "Clipped pixels" in html
+        assert html.index("2 groups that share") < html.index("Clipped pixels")  # the most harmful first
     if len(odd["seen"]) > 1:
         return
     assert "averaged down" not in html  # a photo that was says from what size, and missing pictures are left out

@@ -16,6 +16,7 @@ from factorlib.runner.gc import collect
 from factorlib.runner.home import usual_costs
 from factorlib.runner.plan import Step
 from factorlib.runner.survey import survey
+from factorlib.runner.worker import Events
 from tests.faults.battered import make
 from tests.faults.test_nothing_lost import done, start, wait_until
 from tests.runner import toy
@@ -263,6 +264,13 @@ def test_logs_have_times_memory_and_what_a_step_was_made_with_warnings_once_and_
     assert caught.value.key == "PHOTO"
     said = logs("table", settings=["table.scale=3"])
     assert re.search(r"^table +to run: parameter scale: 2 \(the default\) -> 3$", said, re.M)
+
+
+def test_progress_that_moves_is_told_at_once_and_what_stands_is_not(tmp_path):
+    events = Events(tmp_path / "events.jsonl")
+    for pieces in (0.0, 3.0, 3.001):
+        events.progress(pieces, 4, "page")
+    assert [json.loads(line)["done"] for line in (tmp_path / "events.jsonl").read_text().splitlines()] == [0, 3]
 
 
 def test_what_is_left_is_told_where_every_stage_ran_before_by_what_it_took(project, monkeypatch):
