@@ -9,7 +9,7 @@ override PY := .venv/bin/python
 override STAGES := $(shell sed -n '/^stages:/,$$s/^  \([a-z_]*\):.*/\1/p' pipeline.yaml)
 MAKEFLAGS += --no-print-directory
 
-.PHONY: all plan why status graph logs params new label compare validate verify clean gc pack setup lock test test-long size docs results study studies data help $(STAGES)
+.PHONY: all plan why status graph logs params new label compare validate verify clean gc pack setup lock test test-long size docs results study studies data help help-all $(STAGES)
 
 # each reads DATASET, SET and FORCE from the environment
 all plan why status graph logs params new label compare validate verify pack $(STAGES): .venv/ready
@@ -63,6 +63,13 @@ data: .venv/ready
 	@$(PY) -m factorlib.generate eames
 
 help:
+	@echo 'make all DATASET=eames                     start here: run the example; it ends by naming the report to open'
+	@echo 'make render DATASET=eames RECIPE=insert    then a picture of the result: a ball in every photo (docs/recipes.md)'
+	@echo 'make new DATASET=mychair PHOTOS=<folder>   begin a data set of your own (docs/tutorial.md)'
+	@echo 'make validate DATASET=mychair              look at all its files, in a second; then make all DATASET=mychair'
+	@echo 'make help-all                              everything else'
+
+help-all:
 	@echo 'make all DATASET=eames               the whole pipeline; DATASET is a name in data/ or a path to a folder'
 	@echo 'make <stage> DATASET=…               one stage and what it needs: $(STAGES)'
 	@echo '     SET="solve.cells=800 …"         with other parameters      FORCE=1   run again, whatever is there'

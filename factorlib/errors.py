@@ -12,6 +12,7 @@ from functools import partial
 from os import PathLike
 
 MOST_LISTED, MOST_COMPARED = 30, 3000  # of the words that might have been meant
+NEAR = 0.8  # the ratio of `difflib` from which a word with another first letter is near
 
 
 class InputError(ValueError):
@@ -64,10 +65,14 @@ def did_you_mean(word: str, known: Iterable[object]) -> str:
 
     >>> did_you_mean("soruce", ["source", "target"])
     "did you mean 'source'?"
+    >>> did_you_mean("bogus", ["logs", "plan"])
+    "known are: 'logs', 'plan'"
     >>> did_you_mean("x", ["source", "target"])
     "known are: 'source', 'target'"
     """
     known = sorted(str(k) for k in known)
-    near = get_close_matches(word, known[:MOST_COMPARED], n=1)
+    word, compared = word.strip("[]'\""), known[:MOST_COMPARED]
+    alike = [k for k in compared if k[:1] == word[:1]]
+    near = get_close_matches(word, compared, 1, NEAR) or get_close_matches(word, alike, 1)
     more = f", … ({len(known)} in all)" if len(known) > MOST_LISTED else ""
     return f"did you mean {near[0]!r}?" if near else "known are: " + ", ".join(map(repr, known[:MOST_LISTED])) + more

@@ -12,7 +12,7 @@ import msgspec
 from factorlib.dataset.schema import LightSlice, ObjectsSlice, SetSlice
 from factorlib.report.artifacts import Artifacts
 from factorlib.report.page import page
-from factorlib.report.pictures import exposures, material_tags, overview, photo_row, strip, surface_rows
+from factorlib.report.pictures import exposures, first_pictures, material_tags, overview, photo_row, strip, surface_rows
 from factorlib.report.viewer import viewed
 from factorlib.stage import Inputs, Progress
 from factorlib.wholefile import write_bytes, write_text
@@ -37,7 +37,5 @@ def main(params: Params, inputs: Inputs, out: Path, progress: Progress) -> None:
     progress(len(rows), len(rows) + 1, "page")
     write_bytes(out / "figures" / "overview.png", overview(run, rows))
     lights, objects = (msgspec.convert(inputs.facts[name], dict[str, kind]) for name, kind in SLICES.items())
-    write_text(
-        out / "index.html",
-        page(run, rows, tags, viewed(run, lights, objects, exposures(run)), surface_rows(run, objects)),
-    )
+    seen, moved = viewed(run, lights, objects, exposures(run)), surface_rows(run, objects)
+    write_text(out / "index.html", page(run, rows, tags, seen, moved, first_pictures(run, rows, lights)))

@@ -8,7 +8,6 @@ from html import escape
 
 import msgspec
 
-from factorlib.report.plot import log_ticks, ticks
 from studies.conclusion import Conclusion, head
 
 LEFT, WIDTH, GAP, LINE, TOP, FOOT, COLUMNS = 280, 220, 26, 18, 40, 34, 3  # pixels; columns side by side
@@ -106,3 +105,31 @@ def _line(x1: float, x2: float, y1: float, y2: float, style: str = "") -> str:
 
 def _dot(x: float, y: float, colour: str, fill: str, radius: float) -> str:
     return f'<circle cx="{x:.1f}" cy="{y:.1f}" r="{radius:g}" fill="{fill}" stroke="{colour}" stroke-width="1.8"/>'
+
+
+def ticks(low: float, high: float, most: int = 5) -> list[float]:
+    """Round values from `low` to `high`.
+
+    >>> ticks(0, 9.3)
+    [0.0, 2.0, 4.0, 6.0, 8.0]
+    """
+    span = high - low or 1.0
+    unit = 10 ** math.floor(math.log10(span / most))
+    step = next(unit * k for k in (1, 2, 5, 10) if span / (unit * k) <= most)
+    first = math.ceil(low / step - 1e-9)
+    return [round(k * step, 12) + 0.0 for k in range(first, math.floor(high / step + 1e-9) + 1)]
+
+
+def log_ticks(low: float, high: float) -> list[float]:
+    """Logarithms of round values between 10^low and 10^high: decades, and 2 and 5 where these
+    are few, or what a linear axis would have.
+
+    >>> [round(10**t, 3) for t in log_ticks(-1.2, 0.1)]
+    [0.1, 0.2, 0.5, 1.0]
+    """
+    mantissas = (1, 2, 5) if high - low < 2.5 else (1,)
+    every = [k + math.log10(m) for k in range(math.floor(low), math.ceil(high) + 1) for m in mantissas]
+    inside = [t for t in every if low - 1e-9 <= t <= high + 1e-9]
+    if len(inside) < 2:
+        return [math.log10(t) for t in ticks(10**low, 10**high, 4)]
+    return inside[:: max(1, -(-len(inside) // 8))]

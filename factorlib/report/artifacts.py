@@ -8,7 +8,6 @@ from typing import Any, TypeVar
 
 import msgspec
 import numpy as np
-import pyarrow.parquet as pq
 from jaxtyping import Float
 
 from factorlib.images.exr import read_exr, read_rgb_exr
@@ -55,10 +54,6 @@ class Artifacts(msgspec.Struct, frozen=True, dict=True):
         channels = self.exr(stage, name)
         assert channels is not None
         return channels
-
-    def table(self, stage: str, name: str) -> dict[str, list]:
-        """<name>.parquet as columns; none where there is no file."""
-        return self.read(lambda path: pq.read_table(path).to_pydict(), stage, f"{name}.parquet") or {}
 
     @cached_property
     def photo_facts(self) -> dict[str, PhotoFacts]:

@@ -1,13 +1,11 @@
 """Everything on the page, gathered and set into the template."""
 
 import json
-import math
 import re
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from itertools import groupby
 from typing import Any
-
-import msgspec
+from urllib.parse import quote
 
 from factorlib.export.gltf import EXTENSION, gltf_material
 from factorlib.export.materialx import materialx
@@ -16,7 +14,6 @@ from factorlib.images.picture import read_png
 from factorlib.jsonfile import read_json
 from factorlib.report import pictures
 from factorlib.report.artifacts import STAGES, Artifacts
-from factorlib.report.plot import line_plot
 from factorlib.report.template import headlines, rendered, sentences
 from factorlib.results.materials import Reflectance
 from factorlib.results.metrics import Metrics
@@ -24,9 +21,13 @@ from factorlib.results.poses import AS_IT_IS
 
 LOW_IOU = 0.85
 MEASURES = {"median": "median", "p95": "95th percentile", "p99": "99th percentile", "worst": "worst", "samples": "samples"}  # fmt: skip
-CURVES = {"held_out_median_error": "median", "held_out_p95_error": "95th percentile"}  # columns of training.parquet
-ERROR = "relative error, %"
-Plot = tuple[str, list[str]]  # an SVG, and the names of its lines
+FILES = {  # links of the page: the stage, and which of its files
+    "materials.json": ("export", "materials.json"), "MaterialX": ("export", "*.mtlx"), "objects, glTF": ("export", "*.glb"),
+    "lights, EXR": ("export", "illumination/*.exr"), "lights, HDR": ("export", "illumination/*.hdr"),
+    "how sure lights are": ("export", "coverage/*.exr"), "Mitsuba scenes": ("export", "scenes/*.xml"),
+    "OpenUSD scenes": ("export", "scenes/*.usda"), "Blender scenes": ("export", "scenes/blender.py"), "meshes": ("export", "meshes/*.ply"),
+    "re-syntheses": ("render", "resynthesis/*.exr"), "metrics.json": ("evaluate", "metrics.json"),
+}  # fmt: skip
 
 
 def page(
@@ -35,8 +36,10 @@ def page(
     tags: dict[str, str],
     viewed: dict[str, Any] | None,
     surfaces: Sequence[pictures.SurfaceRow] = (),
+    first: Sequence[tuple[str, str, str]] = (),
 ) -> str:
-    """The page as HTML, from the artifacts, the photos' rows, the materials' colours, what can be relit, and the meshes that were moved."""
+    """The page as HTML, from the artifacts, the photos' rows, the materials' colours, what can be relit, the meshes that were moved,
+    and the pictures of the first screen: title, `data:` URI, words."""
     metrics, exposure, facts, solved = run.metrics, pictures.exposures(run), run.photo_facts, run.solved
     assert metrics is not None
     photos, poses = run.set.photos, run.poses
@@ -50,6 +53,8 @@ def page(
         metrics=metrics,
         headlines=headlines(metrics),
         cautions=cautions(run, metrics),
+        links=links(run),
+        first=first,
         rows=rows,
         amplification=pictures.AMPLIFICATION,
         tags=tags,
@@ -58,12 +63,14 @@ def page(
         maps=[(p, pictures.reflectance_maps(run, p, exposure[p])) for p in photos],
         lights=[row for row in lights if row],
         missing={why: [section for _, section in group] for why, group in groupby(reasons, lambda pair: pair[0])},
-        gauge=msgspec.to_builtins(solved.gauge, order="sorted"),
+        gauge=solved.gauge,
+        groups=[
+            [m for m, k in solved.gauge.component.items() if k == n] for n in sorted({*solved.gauge.component.values()})
+        ],
         choices=sentences("choices.txt", model=solved.model),
-        model=msgspec.to_builtins(solved.model, order="sorted"),
         exposures={p: f for p, f in run.exposures.items() if any(abs(c - 1) > 1e-9 for c in f)},
-        plots=_plots(run.table("solve", "convergence")),
         poses=[(p, _overlay(run, p), poses[p], facts.get(p)) for p in photos if p in poses],
+        doubted=any(o.doubts or o.left_out for photo in poses.values() for o in photo.objects.values()),
         surface=run.surface,
         surfaces=surfaces,
         low_iou=LOW_IOU,
@@ -72,6 +79,16 @@ def page(
         cost=cost_of(run.events(), STAGES),
         viewed=viewed,
     )
+
+
+def links(run: Artifacts) -> dict[str, list[tuple[str, str]]]:
+    """By kind the files that are there: their names, and where they lie beside the folder of the page in build/<dataset>/."""
+    found = {}
+    for kind, (stage, pattern) in FILES.items():
+        paths = sorted(run.folders[stage].glob(pattern))
+        if paths:
+            found[kind] = [(p.stem, f"../{stage}/{quote(p.relative_to(run.folders[stage]).as_posix())}") for p in paths]
+    return found
 
 
 def cautions(run: Artifacts, metrics: Metrics) -> list[str]:
@@ -126,26 +143,11 @@ def _overlay(run: Artifacts, photo: str) -> str | None:
     return pictures.data_uri(pictures.reduced(crop, pictures.longest_side(len(run.set.photos))).round().astype("u1"))
 
 
-def _plots(history: dict[str, list]) -> list[Plot]:
-    """Losses and number of lobes by accepted step of the solve."""
-    if not history:
-        return []
-    steps = list(range(len(history["loss"])))
-    rules = [k for k in steps[1:] if history["round"][k] != history["round"][k - 1]]
-    named = {"loss": "loss", "held out": "held_out"}
-    losses = {name: (steps, history[column]) for name, column in named.items() if column in history}
-    count = {"lobes": (steps, history["lobes"])}
-    return [
-        (line_plot(losses, "accepted step", "loss", log_y=True, rules=rules), list(losses)),
-        (line_plot(count, "accepted step", "light lobes, all lights", rules=rules), list(count)),
-    ]
-
-
 # ── Training ─────────────────────────────────────────────────────────────────────────────────────────────────────────
 
 
 def _training(run: Artifacts) -> dict[str, Any] | None:
-    """From accuracy.json, {network: {measure: number, quantity: {bin: {measure: number}}}}, and training.parquet.
+    """From accuracy.json, {network: {measure: number, quantity: {bin: {measure: number}}}}.
 
     columns: the measures that occur;  lines: (level, name, numbers), level 0 a network, 1 a quantity, 2 a bin of it
     """
@@ -154,9 +156,7 @@ def _training(run: Artifacts) -> dict[str, Any] | None:
         return None
     columns = {key: title for key, title in MEASURES.items() if f"'{key}'" in str(accuracy)}
     lines = [line for part, table in sorted(accuracy.items(), reverse=True) for line in _lines(part, table, 0)]
-    bins = [_binned(*item) for item in accuracy.get("specular", {}).items() if isinstance(item[1], dict)]
-    curve = _curve(run.table("train", "training"))
-    return {"columns": columns, "lines": lines, "curve": curve, "bins": [plot for plot in bins if plot[0]]}
+    return {"columns": columns, "lines": lines}
 
 
 def _lines(name: str, table: Mapping, level: int) -> Iterator[tuple[int, str, Mapping]]:
@@ -169,25 +169,6 @@ def _in_order(names: Iterable[str]) -> list[str]:
     """Bins in the order of what they hold, by their leading numbers: "3 to 30" before "30 to 300"."""
     leading = re.compile(r"[-+]?[\d.]+(e[-+]?\d+)?")
     return sorted(names, key=lambda name: (float(number[0]) if (number := leading.match(name)) else 0.0, name))
-
-
-def _binned(quantity: str, bins: Mapping[str, Mapping[str, float]]) -> Plot:
-    """The specular error by bins of a quantity."""
-    names = _in_order(bins)
-    values = {MEASURES[k]: [100 * bins[name].get(k, math.nan) for name in names] for k in ("median", "p95")}
-    lines = {title: (range(len(names)), errors) for title, errors in values.items()}
-    return line_plot(lines, quantity, ERROR, log_y=True, names=names), list(lines)
-
-
-def _curve(table: dict[str, list]) -> Plot:
-    """Errors of each network by step; columns are part, step and `CURVES`."""
-    lines = {}
-    for part in sorted(set(table.get("part", [])), reverse=True):
-        rows = [k for k, name in enumerate(table["part"]) if name == part]
-        for column in [column for column in CURVES if column in table]:
-            errors = [100 * table[column][k] for k in rows]
-            lines[f"{part}, {CURVES[column]}"] = [table["step"][k] for k in rows], errors
-    return line_plot(lines, "training step", ERROR, log_y=True), list(lines)
 
 
 # ── Cost ─────────────────────────────────────────────────────────────────────────────────────────────────────────────

@@ -10,15 +10,19 @@ from jaxtyping import Bool, Float, UInt8
 from scipy.ndimage import binary_erosion
 
 from factorlib.conventions import lat_long_solid_angles
-from factorlib.dataset.schema import ObjectsSlice
+from factorlib.dataset.schema import LightSlice, ObjectsSlice
 from factorlib.evaluate.resynthesis import agreeing_pixels
 from factorlib.images.palette import nearest_tags, rgb_of
 from factorlib.images.picture import exposure_of, picture, png_bytes
 from factorlib.images.transfer import srgb_encode
+from factorlib.reflection import reflection_operator
+from factorlib.render.reflect import Reflector
+from factorlib.render.resynthesis import Surroundings, light_of, resynthesised
 from factorlib.report.artifacts import Artifacts, Channels, Picture
+from factorlib.results.lobes import read_lobes
 from factorlib.results.materials import Reflectance
 from factorlib.results.metrics import PhotoErrors, ScoredLight
-from factorlib.urm.geometry import on_surface
+from factorlib.urm.geometry import on_surface, read_geometry
 from factorlib.urm.observations import Observations, read_observations
 
 AMPLIFICATION = 4  # of the difference between photo and re-synthesis
@@ -131,6 +135,47 @@ def photo_row(run: Artifacts, name: str, tags: dict[str, str], errors: PhotoErro
     longest = longest_side(len(run.set.photos))
     pixels = {k: np.rint(255 * np.clip(reduced(v, longest), 0, 1)).astype(np.uint8) for k, v in panels.items()}
     return PhotoRow(name, run.illumination_of(name), pixels, {k: data_uri(v) for k, v in pixels.items()}, errors)
+
+
+def first_pictures(
+    run: Artifacts, rows: Sequence[PhotoRow], lights: Mapping[str, LightSlice]
+) -> list[tuple[str, str, str]]:
+    """Title, `data:` URI and words of the photo that counts most pixels, its re-synthesis, and the same in another photo's light."""
+    row = max(rows, key=lambda row: row.errors.pixels if row.errors else 0)
+    words = {"photo": row.name, "re-synthesis": "from what was recovered"}
+    shown = [(title, row.uris[title], text) for title, text in words.items() if title in row.uris]
+    if len(shown) < 2 or run.read(read_lobes, "export", "lobes.parquet") is None:
+        return shown
+    other = next((p for p in run.set.photos if run.illumination_of(p) != row.illumination), None)
+    words = "in its own light, turned half around" if other is None else f"in the light of {other}"
+    return [*shown, ("relit", data_uri(relit(run, row.name, other, lights)), words)]
+
+
+def relit(run: Artifacts, name: str, other: str | None, lights: Mapping[str, LightSlice]) -> UInt8[np.ndarray, "h w 4"]:
+    """A photo's objects in the light of another photo, or without one in their own light turned by 180° about the camera's y axis.
+
+    Surfaces shadow one another where the solve says so, but send each other no light.  lights: of all photos
+    """
+    of, model = other or name, run.solved.model
+    light = light_of(run.folders["export"], of, lights[of])
+    light = light if other else light.turned(np.diag([-1.0, 1.0, -1.0]))
+    operator = reflection_operator("network", weights=run.folders["train"])
+    reflector = Reflector(operator, light, curvature=model.curvature(lights[of].illumination))
+    masks, geometry = run.channels("masks", name), read_geometry(run.folders["align"], run.folders.get("surface"), name)
+    box = box_of(np.rint(masks["label"]) > 0)
+    step = max(
+        1, max(masks["label"][box].shape) // longest_side(len(run.set.photos))
+    )  # pixels that would be averaged anyway
+    label = np.zeros_like(masks["label"])
+    label[box][::step, ::step] = masks["label"][box][::step, ::step]
+    seen = run.read(read_observations, "urm", f"{name}.parquet") if model.self_shadowing else None
+    materials = [run.exported.get(m, UNKNOWN) for m in run.set.materials]
+    around = None if seen is None else Surroundings(msgspec.structs.replace(seen, met=None))
+    radiance = resynthesised(reflector, materials, {"label": label}, geometry, around=around)[box][::step, ::step]
+    inside = radiance.max(-1) > 0
+    pixels = picture(radiance, exposure_of(radiance, inside)).astype(np.float32)
+    pixels = np.concatenate([pixels, 255 * inside[..., None]], axis=-1)
+    return np.rint(reduced(pixels, longest_side(len(run.set.photos)))).astype(np.uint8)
 
 
 def _labels(masks: Channels, geometry: Channels, photo: Picture, tags: list[str]) -> Picture:

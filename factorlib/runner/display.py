@@ -7,6 +7,7 @@ anywhere: none of it may move the cursor, set a colour or a title, or ring the b
 from __future__ import annotations
 
 import contextlib
+import math
 import sys
 import time
 from collections.abc import Iterator
@@ -65,6 +66,10 @@ class Display:
 
     def __init__(self) -> None:
         self.stages: dict[str, list[int]] = {}  # how many steps each has, and how many of them are left
+        self.usual: dict[
+            str, tuple[float, int]
+        ] = {}  # by stage: seconds that a step took before, and on how many cores
+        self.cores = 1
         self.running: dict[Step, Live] = {}
         self._told: dict[str | Step, None] = {}  # stages that have begun, warnings, and steps that wait
 
@@ -74,6 +79,17 @@ class Display:
         for p in planned:
             self.stages[p.step.stage][0] += 1
             self.stages[p.step.stage][1] += p.status != "current"
+
+    def seconds_left(self) -> float | None:
+        """How long all that is left takes, if each stage takes as long as before; None where one was never run."""
+        left, now = {stage: count for stage, (_, count) in self.stages.items() if count}, time.monotonic()
+        if not left.keys() <= self.usual.keys():
+            return None
+        work = sum(count * math.prod(self.usual[stage]) for stage, count in left.items())
+        for step, live in self.running.items():
+            seconds, cores = self.usual[step.stage]
+            work -= cores * min(now - live.started, seconds)
+        return work / self.cores
 
     def say(self, text: str) -> None:
         """Print a line."""
@@ -109,11 +125,11 @@ class Display:
 
     def tick(self) -> None:
         """Show life: print a line for every step that has been silent for BEAT seconds."""
-        now = time.monotonic()
+        now, left = time.monotonic(), in_words(self.seconds_left())
         for step, live in self.running.items():
             if now - live.spoke >= BEAT:
                 live.spoke = now
-                self.line(step.stage, f"{step.of or '':<16} {now - live.started:6.0f} s  {live.words}")
+                self.line(step.stage, f"{step.of or '':<16} {now - live.started:6.0f} s  {live.words}  {left}")
 
     def warn(self, step: Step, text: str) -> None:
         """Print a warning; one that was printed before is left out."""
@@ -151,6 +167,7 @@ class Bars(Display):
         columns = [progress.SpinnerColumn(), texts[0], progress.BarColumn(24), count, progress.TimeElapsedColumn()]
         self.bars = progress.Progress(*columns, texts[1], console=Console(file=stream))
         self._rows: dict[str, int] = {}
+        self._whole = 0.0  # the most seconds that were left
         self.bars.start()
 
     def say(self, text: str) -> None:
@@ -162,7 +179,12 @@ class Bars(Display):
         self.tick()
 
     def tick(self) -> None:
-        """Draw every bar anew."""
+        """Draw every bar anew, and above them one of the whole run where it is known how long that takes."""
+        if left := self.seconds_left():
+            self._whole = max(self._whole, left)
+            if "all" not in self._rows:
+                self._rows["all"] = self.bars.add_task("all", total=1.0, count="", words="")
+            self.bars.update(self._rows["all"], completed=1 - left / self._whole, words=in_words(left))
         for stage in (stage for stage in self._told if stage in self.stages):
             if stage not in self._rows:
                 self._rows[stage] = self.bars.add_task(stage, total=1.0, count="", words="")
@@ -178,6 +200,17 @@ class Bars(Display):
         """Draw the bars a last time and give the terminal back."""
         self.tick()
         self.bars.stop()
+
+
+def in_words(left: float | None) -> str:
+    """What is said of the seconds that are left.
+
+    >>> in_words(None), in_words(3), in_words(84), in_words(290)
+    ('', '', 'about 80 s left', 'about 5 min left')
+    """
+    if left is None or left < 5:
+        return ""
+    return f"about {10 * math.ceil(left / 10 - 0.5)} s left" if left < 120 else f"about {left / 60:.0f} min left"
 
 
 def display_for() -> Display:

@@ -229,6 +229,23 @@ def view_of(store: Store, stage: str, keys: dict[str, str], gather: str | None) 
     return key
 
 
+def usual_costs(log_file: Path) -> dict[str, tuple[float, int]]:
+    """By stage, of the steps as they were last made: the mean of their seconds, and the most cores that one took."""
+    events = [msgspec.json.decode(line) for line in sound_lines(log_file)]
+    last = {
+        (e["stage"], e.get("photo")): e
+        for e in events
+        if e["event"] == "done" and {"seconds", "cores", "threads"} <= e.keys()
+    }
+    stages: dict[str, list[dict]] = {}
+    for (stage, _), event in last.items():
+        stages.setdefault(stage, []).append(event)
+    return {
+        stage: (sum(e["seconds"] for e in steps) / len(steps), max(max(e["cores"], e["threads"]) for e in steps))
+        for stage, steps in stages.items()
+    }
+
+
 def sound_lines(path: Path) -> list[bytes]:
     """The lines of a log that are events, in order, none where there is no log; damaged ones are left out, with a warning."""
     try:

@@ -21,7 +21,7 @@ from pathlib import Path
 from factorlib.runner.child import Pools
 from factorlib.runner.display import Display
 from factorlib.runner.gc import tenant
-from factorlib.runner.home import claim, label, remember, show, sound_lines, view_of
+from factorlib.runner.home import claim, label, remember, show, sound_lines, usual_costs, view_of
 from factorlib.runner.pipeline import DATASET
 from factorlib.runner.plan import Planned, Step
 from factorlib.runner.shared import shared_store
@@ -78,6 +78,7 @@ class Run:
 
     def __init__(self, survey: Survey, display: Display, folder: Path):
         self.survey, self.display, self.folder, self.pools = survey, display, folder, Pools()
+        display.usual, display.cores = usual_costs(survey.home.log), self.pools.cores
         self.store, self.shared = survey.store, shared_store(survey.store.root)
         self.refused: list[str] = []
         self.running: dict[Step, Running] = {}

@@ -56,7 +56,9 @@ def check_stage(project: Project, name: str, verbs: list[str]) -> None:
     """Raise InputError for a word of the command line that is neither a verb nor the name of a stage."""
     stages = _pipeline(project).stages
     if name not in stages:
-        raise InputError(f"there is no verb or stage {name!r}", cure=did_you_mean(name, [*stages, *verbs]))
+        near = did_you_mean(name, [*stages, *verbs])
+        cure = near if near.startswith("did") else "make help-all lists what there is"
+        raise InputError(f"there is no verb or stage {name!r}", cure=cure)
 
 
 def _pipeline(project: Project) -> Pipeline:

@@ -90,20 +90,30 @@ def count(items: list, one: str = "step") -> str:
 
 
 def log_lines(logged: list[tuple[Planned, list[dict], str | None]]) -> list[str]:
-    """What each step cost, what it was made with where that is not as for the step above, and what it warned of.
+    """What each step cost and warned of; what all were made with, and where a step was made with another version, that.
 
     logged: steps with the events of their results' logs, and the file that says by which defect one failed
     """
-    lines, last = [], ""
-    for planned, events, failed in logged:
+    made = [_made_with(p.record or {}, events) if p.status == "current" else {} for p, events, _ in logged]
+    versions: dict[str, list[str]] = {}
+    for name, version in (pair for own in made for pair in own.items()):
+        versions.setdefault(name, []).append(version)
+    most = {
+        name: max(found, key=found.count) for name, found in sorted(versions.items(), key=lambda pair: pair[0].lower())
+    }
+    lines = []
+    for (planned, events, failed), own in zip(logged, made, strict=True):
         lines.append(f"{planned.step!s:<26} {_cost(planned, events)}".rstrip())
-        if planned.status == "current" and (made_with := _made_with(planned.record or {}, events)) != last:
-            parts = textwrap.wrap(made_with, 110, initial_indent="    ", subsequent_indent="    ")
-            lines += [part.replace("\N{NO-BREAK SPACE}", " ") for part in parts]
-            last = made_with
+        lines += _listed("with ", {name: version for name, version in own.items() if version != most[name]})
         lines += [f"    warning: {event['text']}" for event in events if event["event"] == "warning"]
         lines += [f"    it failed by a defect of the program: {failed}"] if failed else []
-    return lines
+    return lines + _listed("made with ", most)
+
+
+def _listed(words: str, versions: dict[str, str]) -> list[str]:
+    text = words + ", ".join(f"{name}\N{NO-BREAK SPACE}{version}" for name, version in versions.items())
+    parts = textwrap.wrap(text, 110, initial_indent="    ", subsequent_indent="    ") if versions else []
+    return [part.replace("\N{NO-BREAK SPACE}", " ") for part in parts]
 
 
 def _cost(planned: Planned, events: list[dict]) -> str:
@@ -117,13 +127,12 @@ def _cost(planned: Planned, events: list[dict]) -> str:
     return f"{cost}   {cores}   {done['started'][:16].replace('T', ' ')} UTC"
 
 
-def _made_with(record: dict, events: list[dict]) -> str:
-    """Python, the machine's kind and the packages whose versions count; no break between a name and its version."""
+def _made_with(record: dict, events: list[dict]) -> dict[str, str]:
+    """The versions of Python and of the packages that count, and the machine's kind."""
     machine = next((event["machine"] for event in reversed(events) if "machine" in event), {})
-    parts = [f"Python {machine.get('python', record.get('python', ''))}"]
-    parts += [f"{machine['system']} {machine['processor']}"] if machine else []
-    parts += [f"{n.removeprefix('package:')} {v}" for n, v in sorted(record.items()) if n.startswith("package:")]
-    return ", ".join(part.replace(" ", "\N{NO-BREAK SPACE}") for part in parts)
+    made = {"Python": machine.get("python", record.get("python", ""))}
+    made |= {machine["system"]: machine["processor"]} if machine else {}
+    return made | {n.removeprefix("package:"): v for n, v in record.items() if n.startswith("package:")}
 
 
 def parameter_lines(stage: str, params: type) -> list[str]:

@@ -270,7 +270,7 @@ class Events(logging.Handler):
 
     def __init__(self, path: Path):
         super().__init__(logging.WARNING)
-        self.path, self.warnings, self._last = path, [], 0.0
+        self.path, self.warnings, self._last, self._share = path, [], 0.0, 0.0
 
     def __enter__(self) -> Self:
         logging.captureWarnings(True)
@@ -292,9 +292,10 @@ class Events(logging.Handler):
             self.say(text)
 
     def progress(self, done: float, total: float, text: str = "") -> None:
-        """Report that `done` of `total` is done; at most once in EVERY seconds, more frequent calls are dropped."""
-        if (now := time.monotonic()) - self._last >= EVERY:
-            self._last = now
+        """Report that `done` of `total` is done; dropped within EVERY seconds of the last that was not, unless a hundredth more is done."""
+        share = done / total if total else 0.0
+        if (now := time.monotonic()) - self._last >= EVERY or share >= self._share + 0.01:
+            self._last, self._share = now, share
             self._write({"done": float(done), "total": float(total), "text": text})
 
     def say(self, text: str) -> None:

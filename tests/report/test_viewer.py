@@ -116,6 +116,7 @@ def browser(made):
     size, allowed = {"width": 1440, "height": 900}, ["clipboard-read", "clipboard-write"]
     with opened(made[0] / "report" / "index.html", viewport=size, permissions=allowed) as (page, complaints):
         page.evaluate(f"viewer.canvas.style.width = '{SIZE}px'")  # software draws slowly
+        page.evaluate("viewer.canvas.scrollIntoView()")  # it draws only while it is seen
         yield page, complaints
 
 

@@ -11,9 +11,13 @@ from functools import partial
 import pytest
 
 from factorlib.errors import InputError
-from factorlib.runner import verbs
+from factorlib.runner import display, verbs
 from factorlib.runner.child import Pools
 from factorlib.runner.gc import clean, collect
+from factorlib.runner.home import usual_costs
+from factorlib.runner.plan import Step
+from factorlib.runner.survey import survey
+from factorlib.runner.worker import Events
 from tests.faults.battered import make
 from tests.faults.test_nothing_lost import done, start, wait_until
 from tests.runner import toy
@@ -244,7 +248,8 @@ def test_logs_have_times_memory_and_what_a_step_was_made_with_warnings_once_and_
     said = logs()
     for step, threads in (("upper/a", "1 thread"), ("count/b", "1 thread"), ("total", "2 threads")):
         assert re.search("^" + step + COST.format(threads), said, re.M), said
-    assert re.search(r"Python 3\.\d+\.\d+, \w+ \w+, msgspec \d", said) and re.search(r"filelock \d", said)
+    versions = re.findall(r"^    made with filelock \d.*, Linux \w+, msgspec \d.*, Python 3\.\d.*$", said, re.M)
+    assert len(versions) == 1 and said.count("msgspec") == 1 and "    with " not in said
     assert "warning: a is odd" in said
     texts = [path.read_text() for path in (project.build / "store" / "logs").iterdir()]
     assert not any(word in text for text in texts for word in (f'"{os.uname().nodename}"', str(project.root)))
@@ -256,6 +261,32 @@ def test_logs_have_times_memory_and_what_a_step_was_made_with_warnings_once_and_
     assert caught.value.key == "PHOTO"
     said = logs("table", settings=["table.scale=3"])
     assert re.search(r"^table +to run: parameter scale: default -> 3$", said, re.M)
+
+
+def test_progress_that_moves_is_told_at_once_and_what_stands_is_not(tmp_path):
+    events = Events(tmp_path / "events.jsonl")
+    for pieces in (0.0, 3.0, 3.001):
+        events.progress(pieces, 4, "page")
+    assert [json.loads(line)["done"] for line in (tmp_path / "events.jsonl").read_text().splitlines()] == [0, 3]
+
+
+def test_what_is_left_is_told_where_every_stage_ran_before_by_what_it_took(project, monkeypatch):
+    usual = usual_costs(project.build / "set" / "log.jsonl")
+    assert usual.keys() == {"upper", "count", "table", "total"} and usual["total"][1] == 2 and usual["upper"][0] < 60
+    seen, shown, now = survey(project, "set", None, ["upper.times=2"]), display.Display(), [100.0]
+    monkeypatch.setattr(display.time, "monotonic", lambda: now[0])
+    shown.plan(seen.planned())
+    assert shown.seconds_left() is None and display.in_words(None) == ""
+    shown.usual, shown.cores = {"upper": (8.0, 1), "count": (1.0, 1), "total": (10.0, 2)}, 2
+    assert shown.seconds_left() == pytest.approx((2 * 8 + 2 * 1 + 10 * 2) / 2)  # table is current
+    for photo in "ab":
+        shown.start(Step("upper", photo))
+    now[0] += 5
+    assert shown.seconds_left() == pytest.approx((2 * 3 + 2 * 1 + 10 * 2) / 2)
+    now[0] += 60  # longer than before: nothing is left of them
+    assert shown.seconds_left() == pytest.approx((2 * 1 + 10 * 2) / 2)
+    shown.finish(Step("upper", "a"), 65.0), shown.finish(Step("upper", "b"), 65.0)
+    assert shown.seconds_left() == pytest.approx((2 * 1 + 10 * 2) / 2)
 
 
 def test_gc_shows_by_stage_and_age_what_is_not_current_asks_and_deletes_that_alone(project, capsys):

@@ -10,7 +10,7 @@ from factorlib.model.problem import JointProblem
 from factorlib.solve import choices
 from factorlib.solve import solve as solving
 from factorlib.solve.fit import Schedule
-from factorlib.solve.history import PHASES
+from factorlib.solve.history import PHASES, Event, of_parts
 from factorlib.solve.options import Choices
 from factorlib.solve.resume import Journal
 from factorlib.solve.solve import Run, solve
@@ -129,3 +129,15 @@ def test_what_was_done_is_not_done_again_but_a_file_that_cannot_be_read_starts_t
     assert not work
     path.write_bytes(path.read_bytes()[:1000])
     assert answer(blocks, Journal(Checkpoint(path)))[0] == whole[0]
+
+
+def test_progress_never_goes_back_moves_with_every_point_and_is_whole_only_at_the_end():
+    """With three starts each model is fitted three times: the first phases are entered anew."""
+    said, effects, later = [], list(PHASES)[:3], [*list(PHASES)[3:], "splitting 1", "splitting 2", "lights", "suns"]
+    report = of_parts(lambda done, total, text: said.append(done / total), Choices(splittings=2))
+    for phase in [*(one for one in effects for _ in range(3)), *later]:
+        for iteration in (*range(40), -1):
+            report(Event(0, phase, iteration, 1.0, float("nan"), 400))
+        if phase in later:
+            assert len(set(said[-41:])) >= 40
+    assert said == sorted(said) and 0 < said[0] < 0.01 and 0.99 < said[-1] < 1
