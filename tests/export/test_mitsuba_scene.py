@@ -7,7 +7,7 @@ from scipy.ndimage import binary_erosion
 
 from factorlib.conventions import YUP_FROM_CAMERA
 from factorlib.dataset.schema import LightSlice
-from factorlib.export.environment import mitsuba_map, node_directions
+from factorlib.export.environment import mitsuba_map, node_directions, sharpened
 from factorlib.export.mitsuba import write_scene
 from factorlib.export.scene import DIRECT, ExposedMap, Scene, Shape
 from factorlib.geometry.camera import Camera
@@ -181,3 +181,12 @@ def test_map_for_mitsuba_keeps_energy_and_direction(sharpness):
     assert values.sum() == pytest.approx(lobe.energy[0], rel=2e-3)
     mean = np.einsum("hw,hwk->k", values, node_directions(256, 512))
     np.testing.assert_allclose(mean / np.linalg.norm(mean), YUP_FROM_CAMERA @ axis, atol=2e-3)
+
+
+def test_sharpening_undoes_what_interpolation_widens():
+    lobe, spacing = one_lobe((0, 0, 1), 2000.0), 0.0125
+    x = np.linspace(-0.2, 0.2, 20001)
+    nodes = np.arange(-20, 21) * spacing
+    exponent = -0.5 * sharpened(lobe, spacing).sharpness[0]
+    interpolated = np.interp(x, nodes, np.exp(exponent * nodes**2))
+    assert (x**2 * interpolated).sum() / interpolated.sum() == pytest.approx(1 / 2000.0, rel=1e-3)

@@ -49,7 +49,11 @@ def good(tmp_path_factory):
         if suffix:
             put(folder.parent / f"secret{suffix}", "secret")
             os.mkfifo(folder / f"pipe{suffix}")
-        (folder / f"link{suffix}").symlink_to(folder.parent / f"secret{suffix}")
+        for link in (
+            f"link{suffix}",
+            f"m/link{suffix}",
+        ):  # in m/ the mesh lies, so that its folder was followed already
+            (folder / link).symlink_to(folder.parent / f"secret{suffix}")
         (folder / f"twice{suffix}").symlink_to(f"link{suffix}")
     (folder / "up").symlink_to(folder.parent)
     return folder
@@ -68,7 +72,7 @@ def refused(folder, spec=DATASET, truth=TRUTH) -> InputError:
 
 OUT, NOWHERE = "outside the dataset", "no path that can be followed"
 WAYS = {
-    "../secret{}": OUT, "m/../../secret{}": OUT, "{folder}/../secret{}": OUT, "link{}": OUT, "twice{}": OUT,
+    "../secret{}": OUT, "m/../../secret{}": OUT, "{folder}/../secret{}": OUT, "link{}": OUT, "m/link{}": OUT, "twice{}": OUT,
     "up/secret{}": OUT, "circle/a{}": NOWHERE, "x\0y{}": NOWHERE, "é" * 200 + "{}": NOWHERE,
     "z/" * 4000 + "{}": NOWHERE, "pipe{}": "is a pipe, not a file|there is no folder|no folder",
 }  # fmt: skip
