@@ -13,7 +13,9 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from factorlib.dataset.check import MESHES
+import numpy as np
+
+from factorlib.dataset.check import MESHES, made_of, mirror_balls
 from factorlib.dataset.schema import Dataset, MeshEntry, ObjectEntry, PhotoEntry
 from factorlib.errors import InputError
 from factorlib.evaluate.gauge import connected_components
@@ -23,11 +25,12 @@ from factorlib.images.limits import MOST_MEGAPIXELS, check_pixels, check_values
 from factorlib.images.photo import open_photo
 from factorlib.labels import check_materials, read_labels, read_objects
 from factorlib.meshes.limits import Limits
-from factorlib.meshes.read import part_labels, read_parts
+from factorlib.meshes.read import part_labels, read_mesh, read_parts
 from factorlib.recipe.schema import is_light_file
 from factorlib.yamlfile import convert
 
 Check = Callable[[], object]
+NOT_ROUND = 0.02  # of a ball's radius
 
 
 class Validation:
@@ -57,7 +60,7 @@ class Validation:
         """What no photo will tell, by the materials that dataset.yaml names."""
         together: dict[str, set[str]] = {}
         for photo in self.spec.photos:
-            together.setdefault(photo.light, set()).update(*(self._materials_of(obj) for obj in photo.objects))
+            together.setdefault(photo.light, set()).update(*(made_of(obj, self.spec) for obj in photo.objects))
         component = connected_components({light: sorted(names) for light, names in together.items() if names})
         if (groups := len(set(component.values()))) < 2:
             return []
@@ -83,11 +86,32 @@ class Validation:
                 if (mesh := self.spec.meshes[obj.mesh]).file is None:
                     continue
                 yield f"mesh {obj.mesh} {obj.materials}", partial(self._object, obj, mesh, limits)
+        elif slice_ == "known":
+            for name, of in self.spec.known.illumination.items():
+                key = f"known.illumination.{name}"
+                if isinstance(of, str):
+                    yield f"light {of}", partial(read_light_map, self.file(of), key)
+                else:
+                    yield (
+                        f"ball {name}",
+                        partial(self._ball, next(mirror_balls(self.spec, name, of))[1], f"{key}.chrome"),
+                    )
         elif slice_ == "truth" and self.dataset.truth is not None:
             for name, path in self.dataset.truth.illumination.items():
                 yield f"light {path}", partial(read_true_light, self.file(path), name)
             for name, path in self.dataset.truth.normals.items():
                 yield f"normals {name}", partial(self._normals, name, self.file(path))
+
+    def _ball(self, obj: ObjectEntry, key: str) -> None:
+        """A mirror ball is round: all its vertices are as far from the middle of its bounding box."""
+        if (file := self.spec.meshes[obj.mesh].file) is None:
+            return
+        made = self.spec.meshes[obj.mesh].made_of
+        points = read_mesh(self.file(file), self.spec.materials, made, obj.materials).vertices
+        radius = np.linalg.norm(points - (points.min(0) + points.max(0)) / 2, axis=1)
+        if np.ptp(radius) > NOT_ROUND * radius.max():
+            fault = f"its vertices are {radius.min():.3g} to {radius.max():.3g} from its middle: it is no ball"
+            raise InputError(fault, file=self.file(file), key=key, cure="name a ball, or use `primitive: ball`")
 
     def _normals(self, name: str, path: Path) -> None:
         check_values(path, key=f"normals.{name}")
@@ -101,16 +125,9 @@ class Validation:
         check_values(path, most_megapixels, f"{key}.image")
         labels = read_labels(entry.masks, self.file, self.spec.materials, size, entry.image, f"{key}.masks")
         objects = read_objects([(obj.name, obj.mask) for obj in entry.objects], self.file, size, f"{key}.objects")
-        made_of = [(obj.name, self._materials_of(obj)) for obj in entry.objects]
+        own = [(obj.name, made_of(obj, self.spec)) for obj in entry.objects]
         masks = entry.masks if isinstance(entry.masks, str) else next(iter(entry.masks.values()))
-        check_materials(labels, objects, made_of, self.spec.materials, self.file(masks), f"{key}.objects")
-
-    def _materials_of(self, obj: ObjectEntry) -> set[str]:
-        """Return the materials of an object's parts."""
-        made_of = self.spec.meshes[obj.mesh].made_of
-        return set(
-            (made_of | obj.materials).values() if isinstance(made_of, dict) else obj.materials.values() or [made_of]
-        )
+        check_materials(labels, objects, own, self.spec.materials, self.file(masks), f"{key}.objects")
 
     def _object(self, obj: ObjectEntry, mesh: MeshEntry, limits: Limits) -> None:
         """The parts of a mesh file are read once; if they cannot be, that is said again for every object."""

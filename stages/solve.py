@@ -14,7 +14,7 @@ import numpy as np
 from jaxtyping import Float
 
 from factorlib.checkpoint import Checkpoint
-from factorlib.dataset.schema import LightSlice
+from factorlib.dataset.schema import KnownSlice, LightSlice
 from factorlib.diagnose.answer import Answer
 from factorlib.diagnose.identifiability import after_solving, before_solving, unusable_observations
 from factorlib.diagnose.uncertainty import (
@@ -26,11 +26,15 @@ from factorlib.diagnose.uncertainty import (
 )
 from factorlib.errors import InputError
 from factorlib.images.exr import LAT_LONG, write_rgb_exr
+from factorlib.images.light_map import read_light_map
 from factorlib.jsonfile import write_json
 from factorlib.light.prior import read_light_prior
+from factorlib.model.known import Known
+from factorlib.model.known_light import light_of_ball, light_of_map
 from factorlib.model.loss import Loss
+from factorlib.model.materials import ROUGHNESS
 from factorlib.model.noise import Noise
-from factorlib.model.observed import blocks_of_observations, gathered
+from factorlib.model.observed import blocks_of_observations, gathered, usable
 from factorlib.model.problem import JointProblem
 from factorlib.parquetfile import write_rows
 from factorlib.reflection import reflection_operator
@@ -49,10 +53,18 @@ from factorlib.solve.resume import Journal
 from factorlib.solve.solve import Run, solve
 from factorlib.solve.start import from_earlier, from_nothing, with_decided
 from factorlib.stage import Inputs, Progress
-from factorlib.urm.observations import Observations, at_one_exposure, concatenate, relative_exposures
+from factorlib.urm.observations import (
+    Observations,
+    at_one_exposure,
+    concatenate,
+    read_observations,
+    relative_exposures,
+    with_exposures,
+)
 
 log = logging.getLogger("factorlib.solve")
 PAPER, NOISE, LOSS = Paper(), Noise(), Loss()  # where defaults stand
+LEAST_OF_A_BALL = 1000  # pixels: then what they mirror is 6° apart, and cells are 10° wide
 
 
 class Params(LobeChoices, frozen=True, forbid_unknown_fields=True):
@@ -92,13 +104,15 @@ def main(params: Params, inputs: Inputs, out: Path, progress: Progress) -> None:
         sorted(inputs["urm"].glob("*.parquet")), params.merge_degrees, inputs.map, inputs.folders.get("surface")
     )
     _warn(unusable_observations(photos))
-    seen = concatenate([photo.merged for photo in photos])
+    given = _known(params, inputs)
+    seen = with_exposures(concatenate([photo.merged for photo in photos]), given.exposure)
     if params.solver != "bundle":  # the others know no detail of reflectance
         seen = msgspec.structs.replace(seen, detail=None)
     relative = relative_exposures(seen)
     earlier = _earlier(params, inputs, relative)
-    problem = _problem(params, inputs, at_one_exposure(seen, relative))
-    _warn(before_solving(names, seen.photos, problem.blocks))
+    seen, known = _held(inputs, given, at_one_exposure(seen, relative), relative)
+    problem = _problem(params, inputs, seen, known)
+    _warn(before_solving(names, seen.photos, problem.blocks, problem.known))
     solution = _solved(params, problem, earlier, inputs, progress)
     answer = Answer(names, problem, solution, relative, params.solver, earlier)
     errors, coverages = _uncertainty(solution, solution.shown(problem), params)
@@ -113,8 +127,8 @@ def main(params: Params, inputs: Inputs, out: Path, progress: Progress) -> None:
         write_rgb_exr(out / "coverage" / f"{name}.exr", coverage, LAT_LONG)
 
 
-def _problem(params: Params, inputs: Inputs, seen: Observations) -> JointProblem:
-    lights = msgspec.convert(inputs.facts["dataset.light"], dict[str, LightSlice])
+def _problem(params: Params, inputs: Inputs, seen: Observations, known: Known) -> JointProblem:
+    lights = _lights(inputs)
     worlds = {photo: light.world_from_camera for photo, light in lights.items()}
     rotations = {photo: np.array(world) for photo, world in worlds.items() if world is not None}
     noise, given = (
@@ -125,7 +139,52 @@ def _problem(params: Params, inputs: Inputs, seen: Observations) -> JointProblem
     automatic = "paper_network" if params.solver == "paper" else "network"
     operator = automatic if params.operator == "auto" else params.operator
     reflection = reflection_operator(operator, weights=inputs["train"])
-    return JointProblem(blocks, reflection, Loss(prior=params.prior), inputs.map)
+    return JointProblem(blocks, reflection, Loss(prior=params.prior), inputs.map, known)
+
+
+def _lights(inputs: Inputs) -> dict[str, LightSlice]:
+    return msgspec.convert(inputs.facts["dataset.light"], dict[str, LightSlice])
+
+
+def _known(params: Params, inputs: Inputs) -> KnownSlice:
+    """What dataset.yaml says is known; InputError where the solver holds nothing."""
+    known = msgspec.convert(inputs.facts.get("dataset.known", {}), KnownSlice)
+    if known != KnownSlice() and params.solver != "bundle":
+        cure = "leave `known` out of dataset.yaml, or set solve.solver=bundle"
+        raise InputError(f"the solver {params.solver} finds everything itself", key="known", cure=cure)
+    return known
+
+
+def _held(
+    inputs: Inputs, given: KnownSlice, seen: Observations, relative: dict[str, float]
+) -> tuple[Observations, Known]:
+    """The observations without those of mirror balls, and what the solver holds.  Raises InputError where nothing shows what is known."""
+    names, slices, shown = list(seen.materials), _lights(inputs), set(np.unique(seen.material).tolist())
+    for name in given.materials:
+        if names.index(name) not in shown:
+            cure = "look at its mask and at the overlays of `align`: both must show it at the same place"
+            raise InputError(f"no observation shows material '{name}'", key=f"known.materials.{name}", cure=cure)
+    unknown, chrome = (np.nan,) * 3, {ball.material for ball in given.balls.values()}
+    rows = {
+        names.index(name): np.array(
+            [*of.diffuse, *(of.specular or unknown), of.roughness or (ROUGHNESS[0] if name in chrome else np.nan)]
+        )
+        for name, of in given.materials.items()
+    }
+    lights = {name: light_of_map(read_light_map(inputs.file(file))) for name, file in given.maps.items()}
+    for name, ball in given.balls.items():
+        m, photo, world = names.index(ball.material), ball.photo, slices[ball.photo].world_from_camera
+        pixels = usable(read_observations(inputs["urm"] / f"{photo}.parquet"))
+        pixels = at_one_exposure(pixels.take(pixels.material == m), relative)
+        of_photo = seen.photo == seen.photos.index(photo)
+        rest = ~(of_photo & (seen.material == m))
+        if len(pixels) < LEAST_OF_A_BALL or not (of_photo & rest).any():
+            fault = f"photo '{photo}' shows {len(pixels)} pixels of the ball, and {(of_photo & rest).sum()} observations of other objects"
+            cure = f"the ball needs {LEAST_OF_A_BALL}, and something beside it: look at the overlay of `align`"
+            raise InputError(fault, key=f"known.illumination.{name}.chrome", cure=cure)
+        turn = np.eye(3) if world is None else np.array(world)
+        lights[name], seen = light_of_ball(pixels, rows[m][3:6], turn), seen.take(rest)
+    return seen, Known(rows, lights, tuple(sorted({slices[photo].illumination for photo in given.exposure})))
 
 
 def _earlier(params: Params, inputs: Inputs, relative: dict[str, float]) -> Earlier | None:

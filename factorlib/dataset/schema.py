@@ -26,6 +26,8 @@ CENTRE_PX = 1e6  # a principal point from the photo's corner, even of a small cr
 
 Number = Annotated[float, Meta(ge=-LARGEST, le=LARGEST, description="give a finite number below 1e+15, or none")]
 Share = Annotated[float, Meta(ge=0, le=1, description="give a fraction, 0 to 1: reflectance is linear, not 0 to 255")]
+Roughness = Annotated[float, Meta(ge=0.1, le=1, description="give 0.1 to 1, the range of the model, or none")]
+Exposure = Annotated[float, Meta(ge=-30, le=30, description="give EV, -30 to 30")]
 Focal = Annotated[float, Meta(ge=FOCAL_PX[0], le=FOCAL_PX[1], description="give finite pixels, 1 to 1e+07, or none")]
 Centre = Annotated[float, Meta(ge=-CENTRE_PX, le=CENTRE_PX, description="give finite pixels, up to 1e+06, or none")]
 Bend = Annotated[float, Meta(ge=-10, le=10, description="give k1 and k2 of COLMAP's RADIAL model")]
@@ -166,6 +168,32 @@ class CameraSource(_Format):
     mesh_unit_mm: Unit = 1.0
 
 
+class KnownMaterial(_Format):
+    """The reflectance of a material, linear Rec. 709; what is None is found."""
+
+    diffuse: Shares
+    specular: Shares | None = None
+    roughness: Roughness | None = None
+
+
+class MirrorBall(_Format):
+    """The object of a photo that is a chrome ball: what it mirrors is the photo's light."""
+
+    chrome: Name
+
+
+class Known(_Format):
+    """What is known of the set's unknowns: reflectances by the material's name, lights by the illumination's, exposures by the photo's.
+
+    illumination: a lat-long map in the frame and layout of the exported ones, whose radiance is known but for one factor, or a mirror ball
+    exposure: in EV, of all photos of an illumination, beside each other: a photo of 1 EV more has twice the values in the same light
+    """
+
+    materials: dict[str, KnownMaterial] = {}
+    illumination: dict[str, str | MirrorBall] = {}
+    exposure: dict[str, Exposure] = {}
+
+
 class DatasetFile(_Format):
     """dataset.yaml."""
 
@@ -174,6 +202,7 @@ class DatasetFile(_Format):
     photos: Annotated[list[PhotoEntry], AtLeastOne]
     meshes: dict[Name, MeshEntry] = {}
     cameras: CameraSource | None = None
+    known: Known = Known()
     truth: str | None = None
 
 
@@ -290,6 +319,22 @@ class GroundSlice(msgspec.Struct, frozen=True):
     """The ground of a photo, where dataset.yaml gives it."""
 
     ground: Ground | None
+
+
+class BallSlice(msgspec.Struct, frozen=True):
+    """The photo of a mirror ball, and the ball's material."""
+
+    photo: str
+    material: str
+
+
+class KnownSlice(msgspec.Struct, frozen=True):
+    """What is known: reflectances by material; maps and mirror balls by illumination; exposures in EV by photo."""
+
+    materials: dict[str, KnownMaterial] = {}
+    maps: dict[str, str] = {}
+    balls: dict[str, BallSlice] = {}
+    exposure: dict[str, float] = {}
 
 
 class SetSlice(msgspec.Struct, frozen=True):

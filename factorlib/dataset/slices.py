@@ -12,6 +12,7 @@ from typing import Any
 import msgspec
 
 from factorlib.dataset import schema
+from factorlib.dataset.check import made_of, mirror_balls
 from factorlib.dataset.schema import Dataset, PhotoEntry
 from factorlib.errors import did_you_mean
 
@@ -31,7 +32,7 @@ def dataset_slice(dataset: Dataset, name: str, photo: str | None = None) -> Slic
     """The slice `name` of one photo, or of the set.
 
     photo, objects, light, ground are per photo: the facts of one, or {photo: facts} of all for `photo=None`.
-    materials, set, truth are of the set, whatever the photo.  Raises KeyError for an unknown slice.
+    materials, set, known, truth are of the set, whatever the photo.  Raises KeyError for an unknown slice.
     """
     fields: dict[str, Any] = {}
     if name in _OF_SET:
@@ -76,6 +77,16 @@ def _objects(dataset: Dataset, photo: PhotoEntry) -> tuple[schema.ObjectsSlice, 
         path for name, mesh in meshes.items() if mesh.file for path in (mesh.file, *dataset.companions.get(name, ()))
     ]
     return facts, files + _object_masks(photo)
+
+
+def _known(dataset: Dataset) -> tuple[schema.KnownSlice, list[str]]:
+    known, balls = dataset.spec.known, {}
+    for name, of in known.illumination.items():
+        if isinstance(of, schema.MirrorBall):
+            photo, obj = next(mirror_balls(dataset.spec, name, of))
+            balls[name] = schema.BallSlice(photo.name, *made_of(obj, dataset.spec))
+    maps = {name: of for name, of in known.illumination.items() if isinstance(of, str)}
+    return schema.KnownSlice(known.materials, maps, balls, known.exposure), list(maps.values())
 
 
 def _shapes(dataset: Dataset) -> tuple[schema.ShapesSlice | None, list[str]]:
@@ -125,6 +136,7 @@ _OF_SET: dict[str, Callable[[Dataset], tuple[Any, list[str]]]] = {
         [],
     ),
     "shapes": _shapes,
+    "known": _known,
     "truth": lambda dataset: (dataset.truth, dataset.truth.maps if dataset.truth else []),
 }
 SLICES = (*_OF_PHOTO, *_OF_SET)

@@ -9,11 +9,12 @@ import msgspec
 import numpy as np
 from msgspec import UNSET, UnsetType
 
+from factorlib.diagnose import uncertainty
 from factorlib.diagnose.misfit import misfit
 from factorlib.diagnose.uncertainty import ABSOLUTE, GAUGE, StandardErrors
 from factorlib.light.lobes import Lobes
 from factorlib.model.blocks import Block
-from factorlib.model.gauge import DETERMINED, RULE, connected_components
+from factorlib.model.gauge import DETERMINED, GIVEN, RULE, UP_TO_SCALE, connected_components
 from factorlib.model.lights import Light
 from factorlib.model.materials import LEAST_REFLECTANCE, Materials
 from factorlib.model.problem import JointProblem
@@ -50,13 +51,13 @@ class Answer(msgspec.Struct, frozen=True):
         """The content of materials.json."""
         rows, stderr, kinds = _rows(self.solution.point.materials), self._errors(errors), self._kinds(errors.materials)
         solved = {
-            name: table.solved(table.Reflectance(*row), stderr[name], kind)
-            for name, row, kind in zip(self.names, rows, kinds, strict=True)
+            name: table.solved(table.Reflectance(*row), stderr[name], kind, self._given(m))
+            for m, (name, row, kind) in enumerate(zip(self.names, rows, kinds, strict=True))
         }
         components = connected_components(self.problem.blocks, len(self.names))
         component = {self.names[m]: k for k, (members, _) in enumerate(components) for m in members}
         absolute = self.solution.interreflection.kept
-        gauge = table.Gauge(RULE + DETERMINED * absolute, component, GAUGE + ABSOLUTE * absolute)
+        gauge = table.Gauge(RULE + DETERMINED * absolute + self._given_rule(), component, self._gauge_of_errors())
         return table.MaterialTable(solved, gauge, self.model())
 
     def _kinds(self, errors: Materials) -> list[table.Kind | UnsetType]:
@@ -69,11 +70,32 @@ class Answer(msgspec.Struct, frozen=True):
         rows = zip(specular, materials.roughness.tolist(), relative.tolist(), errors.roughness.tolist(), strict=True)
         return [table.Kind(*class_of(*row)) for row in rows]
 
+    def _given_rule(self) -> str:
+        """What is known of scale and white balance, as a sentence; empty where nothing is."""
+        known = self.problem.known
+        fixed = [self.names[m] for m in sorted(known.materials)]
+        fixed += sorted(name for name, light in known.lights.items() if not light.scale_free)
+        tinted = sorted(name for name, light in known.lights.items() if light.scale_free)
+        pairs = ((GIVEN, fixed), (UP_TO_SCALE, tinted))
+        return "".join(rule.format(", ".join(names)) for rule, names in pairs if names)
+
+    def _given(self, m: int) -> list[str] | UnsetType:
+        """The parts of a material that were known; UNSET where none was."""
+        values = self.problem.known.materials.get(m)
+        parts = zip(("diffuse", "specular", "roughness"), (0, 3, 6), strict=True)
+        return UNSET if values is None else [part for part, first in parts if not np.isnan(values[first])]
+
+    def _gauge_of_errors(self) -> str:
+        return (
+            GAUGE
+            + ABSOLUTE * self.solution.interreflection.kept
+            + uncertainty.GIVEN * bool(self.problem.known.materials or self.problem.known.lights)
+        )
+
     def uncertainty(self, errors: StandardErrors) -> Uncertainty:
         """The content of uncertainty.json."""
-        gauge = GAUGE + ABSOLUTE * self.solution.interreflection.kept
         unexplained = misfit(self.solution.shown(self.problem), self.solution.point)
-        return Uncertainty(errors.deviation, self._errors(errors), gauge, *unexplained)
+        return Uncertainty(errors.deviation, self._errors(errors), self._gauge_of_errors(), *unexplained)
 
     def _errors(self, errors: StandardErrors) -> dict[str, table.StandardErrors]:
         rows = zip(self.names, _rows(errors.materials), strict=True)

@@ -17,6 +17,7 @@ from factorlib.diagnose.uncertainty import StandardErrors
 from factorlib.geometry.sphere import mirror_directions
 from factorlib.model.blocks import Block
 from factorlib.model.gauge import LEAST_ENERGY, connected_components, is_free
+from factorlib.model.known import Known
 from factorlib.model.lights import Light
 from factorlib.model.materials import ROUGHNESS, Materials, Point
 from factorlib.model.observed import PhotoObservations
@@ -33,18 +34,18 @@ EXPOSURE_DIFFERS = 1.5  # by which factor what is found may differ from EXIF wit
 OUTLIER, OUTLIERS = 3.0, 0.1  # a residual in units of the noise model, and the share of such values that is too much
 
 
-def undetermined_by_observations(names: Sequence[str], blocks: Sequence[Block]) -> list[str]:
+def undetermined_by_observations(names: Sequence[str], blocks: Sequence[Block], known: Known = Known()) -> list[str]:
     """What no solve can find, as sentences.
 
-    names: of all materials;  a material that no block shows is left out
+    names: of all materials;  a material that no block shows, or that is known, is left out
     """
     black = [block.name for block in blocks if (block.radiance <= 0).all()]
     said = [f"illumination '{name}' is black in every photo: it tells nothing" for name in black]
     for m, name in enumerate(names):
         shown = [block.take(block.material == m) for block in blocks if (block.material == m).any()]
-        said += _of_material(name, shown) if shown else []
+        said += _of_material(name, shown) if shown and m not in known.materials else []
     for members, lights in connected_components(blocks, len(names)):
-        if len(members) == 1 and lights:
+        if len(members) == 1 and lights and known.factors(members, lights) == 3:
             said.append(
                 f"material '{names[members[0]]}' shares no light with another: its colour and brightness are separated from the light's "
                 "by convention only"
@@ -103,12 +104,14 @@ def _of_answer(name: str, found: Float[np.ndarray, "7"], error: Float[np.ndarray
             f"the reflectance of material '{name}' is known to ±{error[:6].max():.2g} only, of {whole.max():.2g}: diffuse and specular "
             "part look alike here. A photo in light with a small bright source, or next to a brighter material, would help"
         )
+    if not (found[3:6].any() or error[3:6].any()):  # which is known: it has no roughness
+        return
     if not (error[6] <= ROUGHNESS_ERROR and (found[3:6] > 2 * error[3:6]).any()):
         yield (
             f"the roughness of material '{name}' cannot be determined (±{error[6]:.2g}): no highlight stands out, or shape and photos "
             "disagree too much. A photo in light with a small bright source, or a better mesh, would help"
         )
-    elif found[6] <= ROUGHNESS[0] + 1e-9:
+    elif found[6] <= ROUGHNESS[0] + 1e-9 and error[6] > 0:
         yield f"the roughness of material '{name}' is at {ROUGHNESS[0]:g}, the least the model knows: it may be smoother"
 
 
@@ -135,14 +138,16 @@ def unlikely_curves(blocks: Sequence[Block], lights: Sequence[Light]) -> list[st
     ]
 
 
-def tinted_alike(names: Sequence[str], blocks: Sequence[Block], lights: Sequence[Light]) -> list[str]:
+def tinted_alike(
+    names: Sequence[str], blocks: Sequence[Block], lights: Sequence[Light], known: Known = Known()
+) -> list[str]:
     """Lights that interreflection gives one strong colour on average, as sentences; names: of all materials.
 
-    Where no surface lights another, the rule of `factorlib.model.gauge` makes lights grey, and nothing is said.
+    Where no surface lights another, the rule of `factorlib.model.gauge` makes lights grey, and nothing is said, nor where a material or a light is known.
     """
     said = []
-    for _, illuminations in connected_components(blocks, len(names)):
-        if not illuminations or is_free(blocks, illuminations):
+    for members, illuminations in connected_components(blocks, len(names)):
+        if not illuminations or known.factors(members, illuminations) < 3 or is_free(blocks, illuminations):
             continue
         own = [light for block, light in zip(blocks, lights, strict=True) if block.name in illuminations]
         sums = np.array([light.energy.sum(0) for light in own])
@@ -166,22 +171,24 @@ def unusable_observations(photos: Sequence[PhotoObservations]) -> list[str]:
     ]
 
 
-def before_solving(names: Sequence[str], photos: Sequence[str], blocks: Sequence[Block]) -> list[str]:
+def before_solving(
+    names: Sequence[str], photos: Sequence[str], blocks: Sequence[Block], known: Known = Known()
+) -> list[str]:
     """What observations lack and cannot tell; names: of all materials, in the order of their numbers;  photos: all that there are."""
     shown = {int(m) for block in blocks for m in np.unique(block.material)}
-    unseen = [name for m, name in enumerate(names) if m not in shown]
+    unseen = [name for m, name in enumerate(names) if m not in shown and m not in known.materials]
     said = [f"material '{name}' is observed in no photo: its reflectance is only a guess" for name in unseen]
     dark = sorted(set(photos) - {photo for block in blocks for photo in block.photos})
     said += [f"photo '{photo}' has no valid observation and gets no light" for photo in dark]
     linked = [component for component in connected_components(blocks, len(names)) if component.illuminations]
-    if len(linked) > 1:
+    if len(linked) > 1 and any(known.factors(*component) for component in linked):
         pairs = ((", ".join(lights), ", ".join(names[m] for m in members)) for members, lights in linked)
         groups = "; ".join(f"{lights} (with {materials})" for lights, materials in pairs)
         said.append(
             f"the photos fall into {len(linked)} sets that share no material, so their reflectances cannot be compared: {groups}. "
             "A photo that shows a material of each would link them"
         )
-    return said + undetermined_by_observations(names, blocks)
+    return said + undetermined_by_observations(names, blocks, known)
 
 
 def exposures_unlike_exif(answer: Answer) -> list[str]:
@@ -195,6 +202,18 @@ def exposures_unlike_exif(answer: Answer) -> list[str]:
     ]
 
 
+def _brighter_than_white(answer: Answer) -> list[str]:
+    """Materials that come out brighter than they can be beside known ones."""
+    found = answer.solution.point.materials
+    total = (found.diffuse.max(1) + found.specular.max(1)).tolist() if not answer.problem.known.nothing else []
+    return [
+        f"material '{name}' comes out with diffuse + specular = {whole:.2f} beside what is known, more than falls on it: are the known "
+        "reflectances right, and of materials that the same light falls on?"
+        for name, whole in zip(answer.names, total, strict=False)
+        if whole > 1
+    ]
+
+
 def after_solving(answer: Answer, errors: StandardErrors) -> list[str]:
     """What the answer leaves open or explains badly."""
     problem, point = answer.solution.shown(answer.problem), answer.solution.point
@@ -202,6 +221,7 @@ def after_solving(answer: Answer, errors: StandardErrors) -> list[str]:
         *undetermined_by_answer(answer.names, problem.blocks, point.materials, errors.materials),
         *poorly_explained(problem, point),
         *unlikely_curves(problem.blocks, point.lights),
-        *tinted_alike(answer.names, problem.blocks, point.lights),
+        *tinted_alike(answer.names, problem.blocks, point.lights, problem.known),
+        *_brighter_than_white(answer),
         *exposures_unlike_exif(answer),
     ]

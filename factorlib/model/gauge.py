@@ -1,6 +1,7 @@
 """Which materials and lights are linked, and the gauge: the data leave one factor per channel and connected component free, between reflectances and lights.
 
-Where surfaces light each other (interreflection), what they send is known and no factor is free: such a component stays as it is.
+Where surfaces light each other (interreflection), what they send is known and no factor is free, nor where a reflectance or a light is known
+(`factorlib.model.known`): such a component stays as it is.  Where a light is known but for one factor, it settles the tint.
 
 Tint   Lights are as near to grey as they can be, which is what the paper's prior asks for.  With E_ic the summed lobe energies of
        light i, the factors s_c minimise Σ_i Σ_c (log s_c E_ic − mean_c log s_c E_ic)²: s_c is one over the geometric mean over
@@ -22,6 +23,7 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components as components_of_graph
 
 from factorlib.model.blocks import Block
+from factorlib.model.known import Known
 from factorlib.model.materials import Materials, Point
 
 BRIGHTEST = 0.9
@@ -33,6 +35,8 @@ RULE = (
 DETERMINED = (
     "; components in which interreflection was seen have no free factor, and reflectances as it determines them"
 )
+GIVEN = "; in components with known materials or lights, scale and white balance come from these: {}"
+UP_TO_SCALE = "; where lights are known up to a factor, white balance comes from them: {}"
 
 
 class Component(NamedTuple):
@@ -63,19 +67,21 @@ def connected_components(blocks: Sequence[Block], materials: int) -> list[Compon
     )
 
 
-def in_gauge(point: Point, blocks: Sequence[Block]) -> Point:
+def in_gauge(point: Point, blocks: Sequence[Block], known: Known = Known()) -> Point:
     """The point in the gauge stated above, which predicts the same radiance; one light per block."""
     materials, lights = point.materials, list(point.lights)
     diffuse, specular = materials.diffuse.copy(), materials.specular.copy()
     names = [block.name for block in blocks]
     for members, illuminations in connected_components(blocks, len(materials)):
         own = [names.index(name) for name in illuminations]
-        if not own or not is_free(blocks, illuminations):
+        factors = known.factors(members, illuminations) if is_free(blocks, illuminations) else 0
+        if not own or not factors:
             continue
         rows = list(members)
         sums = np.array([lights[i].energy.sum(0) for i in own])
         level = np.log(np.maximum(sums, LEAST_ENERGY * np.maximum(sums.max(1, keepdims=True), 1e-300)))
-        factor = 1 / np.exp((level.mean(1, keepdims=True) - level).mean(0))  # multiplies reflectances
+        tint = (level.mean(1, keepdims=True) - level).mean(0) if factors == 3 else np.zeros(3)
+        factor = 1 / np.exp(tint)  # multiplies reflectances
         factor = factor * BRIGHTEST / (factor * (diffuse[rows] + specular[rows])).max()
         diffuse[rows], specular[rows] = diffuse[rows] * factor, specular[rows] * factor
         for i in own:

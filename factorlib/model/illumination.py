@@ -47,9 +47,10 @@ class Shown(NamedTuple):
 class Linearised(NamedTuple):
     """One channel of the observations of one material, whitened, weighted by the robust loss and divided by √T; float32.
 
-    diffuse, specular   the two parts of ∂r/∂u of the channel's cells;  by_roughness  ∂²r/∂u ∂roughness
+    diffuse, specular   the two parts of ∂r/∂u of the channel's free cells;  by_roughness  ∂²r/∂u ∂roughness
     by_material         ∂r by log k_d, log k_s and roughness, the unknowns `places` of the materials
-    by_photo            ∂r by the log exposures of all photos but the first, then by the log tone exponents
+    by_photo            ∂r by the log exposures of all photos but the first, unless they are held, by the log tone exponents, and by the
+                        log of the factor on held cells, where it is free
     """
 
     channel: int
@@ -153,23 +154,27 @@ class Illumination(msgspec.Struct, frozen=True):
             lit = lit - (kd * block.bounced[:, :3] + ks * block.bounced[:, 3:])
         if toned := len(light.log_tone) > 0:
             by_tone = scale * by_log_exponent(np.maximum(shown.linear, 0), light.exponents(block.photo))
-        photos = np.eye(len(light.log_exposure))[block.photo]
+        photos, free = np.eye(len(light.log_exposure))[block.photo], light.free if light.held.any() else slice(None)
+        first = len(light.log_exposure) - light.free_exposures
         for m, rows, of in shown.responses:
             for c in range(3):
                 kd, ks = np.float32(materials.diffuse[m, c]), np.float32(materials.specular[m, c])
                 bright = ((rising[rows, c] * self.exposure[rows, 0])[:, None] * light.weight[:, c]).astype(np.float32)
                 by_roughness = of.by_roughness * (ks * bright)
                 own = [kd * shown.diffuse[rows, c] * rising[rows, c], ks * shown.specular[rows, c] * rising[rows, c]]
-                by_photo = photos[rows, 1:] * (lit[rows, c] * rising[rows, c])[:, None]
+                diffuse, specular = of.diffuse * (kd * bright), of.specular * (ks * bright)
+                by_photo = photos[rows, first:] * (lit[rows, c] * rising[rows, c])[:, None]
                 if toned:
                     by_photo = np.hstack([by_photo, photos[rows] * by_tone[rows, c, None]])
+                if light.scale_free:
+                    by_photo = np.hstack([by_photo, (diffuse + specular)[:, light.held].sum(1, keepdims=True)])
                 yield Linearised(
                     c,
                     rows,
                     7 * m + np.array([c, 3 + c, 6]),
-                    of.diffuse * (kd * bright),
-                    of.specular * (ks * bright),
-                    by_roughness,
+                    diffuse[:, free],
+                    specular[:, free],
+                    by_roughness[:, free],
                     np.column_stack([*own, by_roughness.sum(1, dtype=float)]).astype(np.float32),
                     by_photo.astype(np.float32),
                     (residual * pull)[rows, c].astype(np.float32),

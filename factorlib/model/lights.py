@@ -56,6 +56,8 @@ class Light(msgspec.Struct, frozen=True):
 
     log_tone: log exponents of the photos' tone curves (`images.tone`); none where the photos are taken to be linear
     curvature: one over the light's distance (`factorlib.light.distance`); 0: infinitely far away
+    held: cells whose radiance is known (`factorlib.model.known`), which no step moves; empty: none;  scale_free: it is known but for one factor
+    exposures_held: whether the exposures are known
     """
 
     axis: Float[np.ndarray, "p 3"]  # unit, in the illumination's frame
@@ -64,9 +66,17 @@ class Light(msgspec.Struct, frozen=True):
     log_exposure: Float[np.ndarray, " f"]
     log_tone: Float[np.ndarray, " f"] = msgspec.field(default_factory=lambda: np.zeros(0))
     curvature: float = 0.0
+    held: Bool[np.ndarray, " p"] = msgspec.field(default_factory=lambda: np.zeros(0, bool))
+    scale_free: bool = False
+    exposures_held: bool = False
 
     def __len__(self) -> int:
         return len(self.log_sharpness)
+
+    @property
+    def free(self) -> Bool[np.ndarray, " p"]:
+        """Which cells are to be found."""
+        return ~self.held if len(self.held) else np.ones(len(self), bool)
 
     @property
     def sharpness(self) -> Float[np.ndarray, " p"]:
@@ -110,8 +120,13 @@ class Light(msgspec.Struct, frozen=True):
 
     @property
     def unknowns(self) -> int:
-        """The number of unknowns that `moved` takes: log radiances, exposures of all photos but the first, tone exponents."""
-        return 3 * len(self) + len(self.log_exposure) - 1 + len(self.log_tone)
+        """The number of unknowns of a step: log radiances of free cells, free exposures, tone exponents, the factor on what is held."""
+        return 3 * int(self.free.sum()) + self.free_exposures + len(self.log_tone) + self.scale_free
+
+    @property
+    def free_exposures(self) -> int:
+        """How many exposures are to be found: those of all photos but the first, or none."""
+        return 0 if self.exposures_held else len(self.log_exposure) - 1
 
     def with_log_radiance(self, u: Float[np.ndarray, "3 p"]) -> Light:
         """Return the same cells with other radiances."""

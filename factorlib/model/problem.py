@@ -17,6 +17,7 @@ from jaxtyping import Float
 
 from factorlib.model.blocks import Block
 from factorlib.model.illumination import Illumination
+from factorlib.model.known import Known
 from factorlib.model.loss import Loss
 from factorlib.model.materials import Point
 from factorlib.reflection.operator import Operator
@@ -26,12 +27,13 @@ Spread = Callable[[Callable, Iterable], Iterable]  # an ordered map over indepen
 
 
 class JointProblem(msgspec.Struct, frozen=True):
-    """What is known: observations by illumination, how lobes are reflected, what a residual costs, and how to spread work."""
+    """What is known: observations by illumination, how lobes are reflected, what a residual costs, how to spread work, and unknowns whose values are given."""
 
     blocks: list[Block]
     operator: Operator
     loss: Loss = Loss()
     spread: Spread = serial_map
+    known: Known = Known()
 
     def illuminations(self, point: Point) -> list[Illumination]:
         """Each block with its light; raises ValueError where there is not one light per block."""

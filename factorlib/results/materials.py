@@ -59,11 +59,15 @@ class Kind(msgspec.Struct, frozen=True):
 
 
 class Solved(Reflectance, frozen=True):
-    """A solved material; alpha, α = roughness², stands in the file for other programs; kind: where the solver has classes."""
+    """A solved material; alpha, α = roughness², stands in the file for other programs; kind: where the solver has classes.
+
+    given: the parts that were known beforehand, whose standard errors are 0
+    """
 
     alpha: AtLeast0
     stderr: StandardErrors
     kind: Kind | UnsetType = UNSET
+    given: list[str] | UnsetType = UNSET
 
     @property
     def reflectance(self) -> Reflectance:
@@ -178,10 +182,15 @@ class Uncertainty(msgspec.Struct, frozen=True):
     photos: dict[str, Misfit] = {}
 
 
-def solved(reflectance: Reflectance, stderr: StandardErrors, kind: Kind | UnsetType = UNSET) -> Solved:
-    """A reflectance with its standard errors, α and kind."""
+def solved(
+    reflectance: Reflectance,
+    stderr: StandardErrors,
+    kind: Kind | UnsetType = UNSET,
+    given: list[str] | UnsetType = UNSET,
+) -> Solved:
+    """A reflectance with its standard errors, α, kind and the parts of it that were known."""
     rows = reflectance.diffuse, reflectance.specular, reflectance.roughness
-    return Solved(*rows, reflectance.roughness**2, stderr, kind)
+    return Solved(*rows, reflectance.roughness**2, stderr, kind, given)
 
 
 def read_uncertainty(path: str | Path) -> Uncertainty:

@@ -129,7 +129,8 @@ def distances_chosen(problem: JointProblem, before: Fit, choices: Choices, fit: 
     explains its observations better than a far one.  The weaker of the two answers decides how near it comes.
     """
     lights = before.point.lights
-    known = [light.curvature > 0 or block.place is None for light, block in zip(lights, problem.blocks, strict=True)]
+    pairs = zip(lights, problem.blocks, strict=True)
+    known = [light.curvature > 0 or light.held.any() or block.place is None for light, block in pairs]
     evidence = [Evidence(light.curvature > 0) for light in lights]
     if choices.distance == "off" or problem.none_held_out or all(known):
         return Chosen(before, evidence)

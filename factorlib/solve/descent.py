@@ -5,7 +5,7 @@ With H = [[M, C_1 … C_k], [C_iᵀ, L_i]] (materials M, one block L_i a light) 
     (M − Σ C_i L_i⁻¹ C_iᵀ) dm = −(g_m − Σ C_i L_i⁻¹ (g_i + d_i)),      dl_i = −L_i⁻¹ (g_i + C_iᵀ dm)                (1)
 
 where d_i is the gradient of the determinant by the light.  It enters the step of the materials; the light's own step minimises φ.  There are
-7 unknowns a material.  A light's C has rows for the materials that it shows alone, so that cost grows with those few.  Damping
+7 unknowns a material; those that are known (`factorlib.model.known`) have no part in (1).  A light's C has rows for the materials that it shows alone, so that cost grows with those few.  Damping
 multiplies the diagonal, so that a step does not depend on the units of an unknown.
 
 What is minimised is minus twice the log marginal likelihood (`factorlib.solve.marginal`) and the prior on materials; where materials are
@@ -48,11 +48,12 @@ class State(NamedTuple):
 
 
 class Descent(msgspec.Struct, frozen=True):
-    """prior: on materials;  spread: a map over lights."""
+    """prior: on materials;  spread: a map over lights;  free: unknowns of the materials that are not known."""
 
     prior: MaterialPrior
     spread: Spread
     report: Report
+    free: Bool[np.ndarray, " 7m"]
 
     def run(
         self, fields: Sequence[Field], theta: Float[np.ndarray, "m 7"], materials_given: bool, iterations: int
@@ -60,7 +61,7 @@ class Descent(msgspec.Struct, frozen=True):
         """The state after at most so many steps of all lights and, unless they are given, of all materials."""
         state, damping = self.at(fields, theta, materials_given), DAMPING
         for _ in range(iterations):
-            trial = self.at(*stepped(state, materials_given, damping), materials_given)
+            trial = self.at(*stepped(state, self.free, materials_given, damping), materials_given)
             if trial.value < state.value:
                 small = state.value - trial.value < TOLERANCE * abs(state.value)
                 state, damping = trial, damping * LOWER
@@ -82,7 +83,9 @@ class Descent(msgspec.Struct, frozen=True):
         return State(theta, fields, sum(part.value for part in parts) + prior.value, parts, prior)
 
 
-def stepped(state: State, materials_given: bool, damping: float) -> tuple[list[Field], Float[np.ndarray, "m 7"]]:
+def stepped(
+    state: State, free: Bool[np.ndarray, " 7m"], materials_given: bool, damping: float
+) -> tuple[list[Field], Float[np.ndarray, "m 7"]]:
     """Fields and materials after the damped step (1), each unknown within its range and changed by no more than is sound."""
     H, g, solutions = state.prior.hessian.copy(), state.prior.gradient.copy(), []  # of the materials
     for part in state.parts:
@@ -98,7 +101,9 @@ def stepped(state: State, materials_given: bool, damping: float) -> tuple[list[F
         solutions.append(solution)
     theta = state.theta
     if not materials_given:
-        theta = theta + np.linalg.solve(H, -g).reshape(-1, 7).clip(-MOST_CHANGE, MOST_CHANGE)
+        step = np.zeros(len(g))
+        step[free] = np.linalg.solve(H[np.ix_(free, free)], -g[free])
+        theta = theta + step.reshape(-1, 7).clip(-MOST_CHANGE, MOST_CHANGE)
         theta[:, 6] = theta[:, 6].clip(*ROUGHNESS)
         theta[:, :6] = np.maximum(theta[:, :6], np.log(LEAST_REFLECTANCE))
     dm, fields = (theta - state.theta).reshape(-1), []
@@ -111,9 +116,14 @@ def stepped(state: State, materials_given: bool, damping: float) -> tuple[list[F
 
 def moved(light: Light, step: Float[np.ndarray, " l"]) -> Light:
     """The light after a step of its unknowns, each within its range and changed by no more than is sound."""
-    cells, exposures, tones = np.split(step, [3 * len(light), 3 * len(light) + len(light.log_exposure) - 1])
-    brighter = np.exp(cells.reshape(3, -1).clip(-MOST_LOG_RADIANCE, MOST_LOG_RADIANCE).T)
-    exposures = np.concatenate([[0.0], exposures.clip(-MOST_EXPOSURE, MOST_EXPOSURE)])
+    counts = 3 * int(light.free.sum()), light.free_exposures, len(light.log_tone)
+    cells, exposures, tones, scale = np.split(step, np.cumsum(counts))
+    brighter = np.ones((len(light), 3))
+    brighter[light.free] = np.exp(cells.reshape(3, -1).clip(-MOST_LOG_RADIANCE, MOST_LOG_RADIANCE).T)
+    brighter[~light.free] = np.exp(scale.sum().clip(-MOST_LOG_RADIANCE, MOST_LOG_RADIANCE))
+    exposures = np.concatenate(
+        [np.zeros(len(light.log_exposure) - len(exposures)), exposures.clip(-MOST_EXPOSURE, MOST_EXPOSURE)]
+    )
     tone = np.clip(light.log_tone + tones.clip(-MOST_TONE, MOST_TONE), *np.log(TONE))
     return msgspec.structs.replace(
         light, weight=light.weight * brighter, log_exposure=light.log_exposure + exposures, log_tone=tone

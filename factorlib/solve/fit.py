@@ -96,8 +96,9 @@ def fitted(
     start: where the descent begins; its cells stay;  report: called at every point that is tried, with the mean robust loss of what is fitted
     """
     problem, given, hyperparameters = problem.fitted(), schedule.given, start.hyperparameters
-    materials = start.point.materials if given else above_zero(start.point.materials)
-    descent = Descent(MaterialPrior(materials, problem.blocks), problem.spread, report)
+    materials = start.point.materials if given else problem.known.put(above_zero(start.point.materials))
+    prior_on_materials = MaterialPrior(materials, problem.blocks, problem.known)
+    descent = Descent(prior_on_materials, problem.spread, report, problem.known.free(len(materials)))
     illuminations = problem.illuminations(Point(materials, start.point.lights))
     pairs = list(zip(illuminations, hyperparameters, strict=True))
     fields = list(problem.spread(lambda pair: field_of(*pair, prior, given), pairs))
@@ -130,6 +131,9 @@ def recounted(field: Field, one: Hyperparameters, prior: LightPrior) -> Field:
         own, cells = np.tile(light.suns, 3), Q
         Q = np.diag(np.where(own, SUNS**-2.0, 0.0))
         Q[np.ix_(~own, ~own)] = cells
+    if light.held.any():  # the precision of the others, given these, is their part of Q
+        free = np.tile(light.free, 3)
+        log_determinant = float(np.linalg.slogdet(Q[np.ix_(free, free)])[1])
     return msgspec.structs.replace(field, precision=Q, log_determinant=log_determinant, temperature=one.temperature)
 
 
@@ -137,7 +141,10 @@ def estimated(field: Field, part: Marginal, prior: LightPrior, least: float) -> 
     """The hyperparameters by the residuals and the light that a descent ended with; part: its system there."""
     light = field.illumination.light
     cells = np.flatnonzero(np.tile(~light.suns, 3))
-    covariance = positive_definite_inverse(part.light_hessian[: 3 * len(light), : 3 * len(light)]).matrix
+    free = np.flatnonzero(np.tile(light.free, 3))
+    found = positive_definite_inverse(part.light_hessian[: len(free), : len(free)]).matrix
+    covariance = np.zeros((3 * len(light), 3 * len(light)))
+    covariance[np.ix_(free, free)] = found
     covariance = covariance[np.ix_(cells, cells)]
     factors = prior.likeliest_factors(light.axis[~light.suns], light.log_radiance[:, ~light.suns], covariance)
     return Hyperparameters(temperature(field.illumination.block, field.illumination.residuals(), least), factors)

@@ -22,6 +22,8 @@ steers the steps of a descent and nothing else, so every `SPARSE`-th row stands 
 
 Materials enter as log k_d, log k_s (RGB each) and roughness: 7 unknowns θ each.  Exposures and tone exponents belong to the light's block
 but are not integrated out: they have wide Gaussians about 0.
+
+Cells whose radiance is known (`Light.held`) have no part in u of (1) and (2): Q is then that of the others, given those.
 """
 
 from __future__ import annotations
@@ -84,7 +86,7 @@ def marginal(field: Field, clusters: Int[np.ndarray, " n"] | None = None, materi
     the time, is in the system
     """
     one, T = field.illumination, field.temperature
-    shown, light, p = one.shown(), one.light, len(one.light)
+    shown, light, p = one.shown(), one.light, int(one.light.free.sum())
     places = (7 * np.unique(one.block.material)[:, None] + np.arange(7)).reshape(-1)
     k, size = len(places), light.unknowns
     g_m, M, C = np.zeros(k), np.zeros((k, k)), np.zeros((k, size))
@@ -129,14 +131,19 @@ def marginal(field: Field, clusters: Int[np.ndarray, " n"] | None = None, materi
 
 def _priors(field: Field, light: Light) -> tuple[float, Float[np.ndarray, " l"], Float[np.ndarray, "l l"]]:
     """uᵀQu and the Gaussians of exposures and tones: value, half the gradient, half the Hessian."""
-    u, Q = light.log_radiance.reshape(-1), field.precision
-    others = np.concatenate([light.log_exposure[1:], light.log_tone])
-    width = np.repeat([EXPOSURE, TONE], [len(light.log_exposure) - 1, len(light.log_tone)])
-    hessian = np.zeros((light.unknowns, light.unknowns))
-    hessian[: len(u), : len(u)] = Q
-    hessian[range(len(u), light.unknowns), range(len(u), light.unknowns)] = width**-2
-    gradient = np.concatenate([Q @ u, others / width**2])
-    return float(u @ gradient[: len(u)] + np.sum((others / width) ** 2)), gradient, hessian
+    u, Q, free = light.log_radiance.reshape(-1), field.precision, np.tile(light.free, 3)
+    others = np.concatenate([light.log_exposure[len(light.log_exposure) - light.free_exposures :], light.log_tone])
+    width = np.repeat([EXPOSURE, TONE], [light.free_exposures, len(light.log_tone)])
+    hessian, slope, p = np.zeros((light.unknowns, light.unknowns)), Q @ u, int(free.sum())
+    hessian[:p, :p] = Q if free.all() else Q[np.ix_(free, free)]
+    hessian[range(p, p + len(others)), range(p, p + len(others))] = width**-2
+    gradient = np.concatenate([slope[free], others / width**2])
+    if light.scale_free:  # one step of all held cells
+        together = Q[~free].sum(0)
+        hessian[-1, :p] = hessian[:p, -1] = together[free]
+        hessian[-1, -1] = together[~free].sum()
+        gradient = np.append(gradient, slope[~free].sum())
+    return float(u @ slope + np.sum((others / width) ** 2)), gradient, hessian
 
 
 def _of_determinant(
@@ -167,6 +174,8 @@ def positive_definite_inverse(matrix: Float[np.ndarray, "n n"]) -> Inverse:
     >>> positive_definite_inverse(np.array([[4.0, 0.0], [0.0, 0.25]])).matrix.tolist()
     [[0.25, 0.0], [0.0, 4.0]]
     """
+    if not len(matrix):
+        return Inverse(matrix, 0.0)
     factor, failed = dpotrf(matrix, lower=1, clean=1)
     logarithm = np.nan if failed else 2 * float(np.log(np.diag(factor)).sum())
     if not np.isfinite(logarithm):

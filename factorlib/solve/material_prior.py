@@ -19,7 +19,7 @@ k_d + k_s, is expected to be of ordinary brightness:
 
     (log b − log BRIGHTEST)²/BRIGHTNESS²                                                                             (2)
 
-which is .5 to .95 within two standard deviations.  The tint is settled by the prior on lights, whose mean is grey.  A very wide Gaussian about
+which is .5 to .95 within two standard deviations; not so where a material or a light of the component is known.  The tint is settled by the prior on lights, whose mean is grey.  A very wide Gaussian about
 the start keeps log k_d and roughness finite where observations say nothing.  Where no bounces fix the scale, the answer is brought to the gauge
 of `factorlib.model.gauge` afterwards.
 """
@@ -39,6 +39,7 @@ from scipy.linalg import block_diag
 from factorlib.jsonfile import read_json
 from factorlib.model.blocks import Block
 from factorlib.model.gauge import connected_components
+from factorlib.model.known import Known
 from factorlib.model.materials import LEAST_REFLECTANCE, ROUGHNESS, Materials
 from factorlib.reading import reading
 
@@ -118,13 +119,15 @@ class Gaussian(NamedTuple):
 class MaterialPrior:
     """The prior on m materials that are linked by some blocks; those without specular part at the start have no prior on it."""
 
-    def __init__(self, start: Materials, blocks: Sequence[Block]):
+    def __init__(self, start: Materials, blocks: Sequence[Block], known: Known = Known()):
         self.mean = unknowns_of(start)
         self.wide = np.array([DIFFUSE**-2.0] * 3 + [0.0] * 3 + [ROUGH**-2.0])
         self.specular = np.flatnonzero((start.specular > LEAST_REFLECTANCE).any(1)).tolist()
         self.mixture = Mixture(shipped_classes().classes)
         self.members = [
-            list(members) for members, lights in connected_components(blocks, len(start)) if members and lights
+            list(members)
+            for members, lights in connected_components(blocks, len(start))
+            if members and lights and known.factors(members, lights)
         ]
 
     def at(self, theta: Float[np.ndarray, "m 7"]) -> Gaussian:

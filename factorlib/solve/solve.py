@@ -30,7 +30,7 @@ from factorlib.solve.fit import Fit, Schedule, sure_ones
 from factorlib.solve.history import Report, Solution, unreported
 from factorlib.solve.options import Choices
 from factorlib.solve.resume import Journal, Parts
-from factorlib.solve.start import Start
+from factorlib.solve.start import Start, with_known
 from factorlib.solve.suns import WIDE, candidate, clearly_better, compared
 
 MATERIALS = Schedule(lights=4, together=(10, 8))
@@ -58,21 +58,25 @@ def solve(problem: JointProblem, start: Start, run: Run | None = None) -> Soluti
     run = run or Run()
     choices, parts, sure = run.choices, Parts(run.journal, run.report, run.prior), sure_ones(problem)
     few = min(TRIAL_CELLS, choices.cells)
-    points = start(sure, few)
+    points = [with_known(point, sure) for point in start(sure, few)]
     effects = parts.part("effects", Effects, lambda: effects_chosen(sure, points, choices, parts.fit))
     problem, sure = effects.of(problem), effects.of(sure)
     curves = parts.part("tone", Chosen, lambda: curves_chosen(sure, effects.fit, choices, parts.fit))
     distances = parts.part("distances", Chosen, lambda: distances_chosen(sure, curves.fit, choices, parts.fit))
     some, all_ = (of.sampled(choices.observations, choices.seed) for of in (sure, problem))
     lights = distances.fit.point.lights  # of which an earlier solution's keep their cells
-    begun = distances.fit.with_lights([on_cells(one, choices.cells) if len(one) == few else one for one in lights])
+    coarse = [len(one) == few and not one.held.any() for one in lights]
+    begun = distances.fit.with_lights(
+        [on_cells(one, choices.cells) if again else one for one, again in zip(lights, coarse, strict=True)]
+    )
     fit = parts.part("materials", Fit, lambda: parts.judged("materials and lights", some, begun, MATERIALS))
     split = parts.part("splitting", Chosen, lambda: split_while_gaining(some, fit, choices, parts))
     smooth = parts.part("lights", Fit, lambda: parts.judged("lights", all_, split.fit, LIGHTS))
     suns = parts.part("suns", Chosen, lambda: suns_chosen(all_, smooth, parts))
     lights = suns.fit
+    answer = in_gauge(lights.point, problem.blocks, problem.known)
     return Solution(
-        in_gauge(lights.point, problem.blocks),
+        Point(problem.known.put(answer.materials), answer.lights),
         parts.history,
         problem.loss,
         lambertian=np.zeros(len(lights.point.materials), bool),
@@ -120,7 +124,7 @@ def split_while_gaining(problem: JointProblem, fit: Fit, choices: Choices, parts
     FINER standard errors is undone and the last; one that lowers their loss by less than WORTH is kept and the last."""
     evidence, before = [], losses_of(problem, fit.point)
     for number in range(0 if problem.none_held_out else choices.splittings):
-        begun = fit.with_lights([light.split(brightest(light)) for light in fit.point.lights])
+        begun = fit.with_lights([one if one.held.any() else one.split(brightest(one)) for one in fit.point.lights])
         trial = parts.judged(f"splitting {number + 1}", problem, begun, AFTER_SPLITTING)
         after = losses_of(problem, trial.point)
         evidence.append(one := compare(before, after, FINER))

@@ -9,6 +9,7 @@ From earlier   Materials are known by their names, lights by their illumination'
                new light is constant.  A light that explains its photos worse than a constant does (it was taken again, or turned, or in
                other units) is not known but new.  Only the start, and what was decided of shadows and bounces, are taken over: nothing pulls
                toward the earlier answer.
+What is known  Each component is brought to the scale of its known materials, and these stand in their places.
 """
 
 from __future__ import annotations
@@ -21,6 +22,7 @@ import numpy as np
 from jaxtyping import Float
 
 from factorlib.model.blocks import Block
+from factorlib.model.gauge import connected_components
 from factorlib.model.illumination import Illumination
 from factorlib.model.lights import TONE, Light, even_cells
 from factorlib.model.materials import LEAST_REFLECTANCE, SHARPNESS, Materials, Point
@@ -49,6 +51,37 @@ def from_nothing(materials: int) -> Start:
         return [Point(of, [constant_light(block, of, cells) for block in blocks]) for of in begun]
 
     return points
+
+
+def with_known(point: Point, problem: JointProblem) -> Point:
+    """The point with what is known in its place, and the rest of each component at the scale of what is known."""
+    known, materials, lights = problem.known, point.materials, list(point.lights)
+    if known.nothing:
+        return point
+    names, rows = [block.name for block in problem.blocks], materials.rows()
+    given = np.maximum(known.put(materials).rows(), LEAST_REFLECTANCE)
+    for members, illuminations in connected_components(problem.blocks, len(materials)):
+        own = {i: known.lights.get(problem.blocks[i].name) for i in map(names.index, illuminations)}
+        logs = [np.log((given[m, :3] + given[m, 3:6]) / (rows[m, :3] + rows[m, 3:6])) for m in known.of(members)]
+        brighter = {i: level(lights[i]) - level(one) + np.log(problem.blocks[i].unit) for i, one in own.items() if one}
+        logs = logs or [by - by.mean() * own[i].scale_free for i, by in brighter.items()] or [np.zeros(3)]
+        factor = np.mean(logs, axis=0)  # on reflectances
+        rows[list(members), :6] *= np.tile(np.exp(factor), 2)
+        for i, one in own.items():
+            weight, parts = lights[i].weight / np.exp(factor), {}
+            if one:
+                scale = (brighter[i] - factor).mean() * one.scale_free - np.log(problem.blocks[i].unit)
+                weight, held = one.weight * np.exp(scale), {"held": one.held, "scale_free": one.scale_free}
+                parts = {"axis": one.axis, "log_sharpness": one.log_sharpness, **held}
+            if names[i] in known.exposures:
+                parts |= {"log_exposure": np.zeros_like(lights[i].log_exposure), "exposures_held": True}
+            lights[i] = msgspec.structs.replace(lights[i], weight=weight, **parts)
+    return Point(known.put(Materials.of_rows(rows)), lights)
+
+
+def level(light: Light) -> Float[np.ndarray, "3"]:
+    """The logarithm of a light's mean radiance."""
+    return np.log(np.maximum(light.energy.sum(0) / 2, LEAST_RADIANCE))  # `energy` is over 2π, a mean over 4π
 
 
 def from_earlier(earlier: Earlier, names: Sequence[str]) -> Start:

@@ -38,10 +38,10 @@ CLEAR, SHARE = 0.01, 0.07
 
 
 def candidate(illumination: Illumination, sharpness: float) -> Light:
-    """The light with one lobe of that sharpness in place of its brightest cells; as it is where it has a sun already, or where its cells are
+    """The light with one lobe of that sharpness in place of its brightest cells; as it is where it has a sun already, or is known, or where its cells are
     larger than `SURROUNDINGS`."""
     light, block = illumination.light, illumination.block
-    if light.suns.any() or not len(block):
+    if light.suns.any() or light.held.any() or not len(block):
         return light
     overlap = np.exp(BLUR * (light.axis @ light.axis.T - 1))
     z = light.axis[int(np.argmax(overlap @ light.energy.sum(1)))]

@@ -12,7 +12,7 @@ point lies, as `factorlib.light.distance` has it.
 from __future__ import annotations
 
 import json
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -183,6 +183,17 @@ def concatenate(parts: Sequence[Observations]) -> Observations:
             fields[name] = np.concatenate(filled)
     of_photos = tuple(exposures.get(photo) for photo in fields["photos"])
     return Observations(**fields, materials=materials, exposures=of_photos)
+
+
+def with_exposures(observations: Observations, known: Mapping[str, float]) -> Observations:
+    """With exposures that are known, in EV by photo, in place of those of EXIF."""
+    if not known:
+        return observations
+    exif = observations.exposures or (None,) * len(observations.photos)
+    exposures = (
+        2.0 ** known[photo] if photo in known else of for photo, of in zip(observations.photos, exif, strict=True)
+    )
+    return msgspec.structs.replace(observations, exposures=tuple(exposures))
 
 
 def relative_exposures(observations: Observations) -> dict[str, float]:

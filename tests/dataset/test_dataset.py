@@ -243,6 +243,19 @@ BAD = [
     ("cameras > .world_from_camera", {"sfm": True, "world_from_camera": True}, "not known beforehand"),
     ("meshes.vase.material", "wite", "did you mean 'white'"),
     ("meshes.chair.parts.legs", "woof", "did you mean 'wood'"),
+    ("known > .materials.rde", {"materials": {"rde": {"diffuse": [0.5] * 3}}}, "did you mean 'red'"),
+    ("known > .materials.red.diffuse[1]", {"materials": {"red": {"diffuse": [0.5, 128, 0.5]}}}, "0 to 1"),
+    ("known > .materials.red", {"materials": {"red": {"diffuse": [0.5, 0, 0.5]}}}, "reflects nothing"),
+    ("known > .materials.red", {"materials": {"red": {"diffuse": [0.7] * 3, "specular": [0.4] * 3}}}, "1.1 together"),
+    ("known > .illumination.kitchn", {"illumination": {"kitchn": "map.exr"}}, "did you mean 'kitchen'"),
+    ("known > .illumination.kitchen", {"illumination": {"kitchen": "kitchen.png"}}, ".exr, .hdr"),
+    ("known > .illumination.kitchen.chrome", {"illumination": {"kitchen": {"chrome": "bal"}}}, "unknown object 'bal'"),
+    ("known > .illumination.kitchen.chrome", {"illumination": {"kitchen": {"chrome": "chair_1"}}}, "no ball of one"),
+    ("known > .illumination.kitchen.chrome", {"illumination": {"kitchen": {"chrome": "vase_1"}}}, "white' too"),
+    ("known > .illumination.hall.chrome", {"illumination": {"hall": {"chrome": "box_1"}}}, "how much of the light"),
+    ("known > .exposure.hal", {"exposure": {"hal": 1}}, "did you mean 'hall'"),
+    ("known > .exposure.hall", {"exposure": {"hall": 1}}, "no other photo shares its light"),
+    ("known > .materials.red.roughness", {"materials": {"red": {"diffuse": [0.5] * 3, "roughness": 0.0}}}, "0.1 to 1"),
 ]
 
 
@@ -255,6 +268,35 @@ def test_bad_dataset_is_refused_with_file_key_and_cure(folder, key, value, words
     assert caught.value.key == outer + inner and caught.value.cure and words in str(caught.value)
     assert re.search(r"set/dataset\.yaml(:\d+)?$", str(caught.value.file))
     assert sorted(folder.parent.rglob("*")) == sorted([*before, folder / "dataset.yaml"]), "something was written"
+
+
+def test_what_is_known_is_a_slice_of_maps_and_of_balls_with_their_materials(folder):
+    spec = copy.deepcopy(SPEC)
+    spec["photos"][2] |= {"illumination": "kitchen"}
+    spec["known"] = {
+        "materials": {"wood": {"diffuse": [0, 0, 0], "specular": [0.5, 0.5, 0.5]}},
+        "illumination": {"garden": "garden.exr", "kitchen": {"chrome": "box_1"}},
+    }
+    with pytest.raises(InputError, match="2 photos of unknown exposures") as caught:
+        read_dataset(write(folder, spec))
+    spec["known"]["exposure"] = {"kitchen": 1.0}
+    with pytest.raises(InputError, match="'hall' shares its light and has none"):
+        read_dataset(write(folder, spec))
+    spec["known"]["exposure"]["hall"] = -1
+    known = dataset_slice(read_dataset(write(folder, spec)), "known")
+    assert caught.value.key == "known.illumination.kitchen.chrome" and known.files == ["garden.exr"]
+    slice_ = msgspec.convert(known.facts, schema.KnownSlice)
+    assert slice_.balls == {"kitchen": schema.BallSlice("hall", "wood")} and slice_.maps == {"garden": "garden.exr"}
+    (folder / "box.gltf").unlink()
+    (folder / "box.obj").write_text("v 0 0 0\nv 1 0 0\nv .2 2 0\nf 1 2 3\n")
+    spec["meshes"]["box"] = {"file": "box.obj", "material": "wood"}
+    faults = Validation(read_dataset(write(folder, spec))).faults("known", None, {}, folder)
+    assert [fault.key for fault in faults] == ["known.illumination.garden", "known.illumination.kitchen.chrome"]
+    assert "it is no ball" in str(faults[1])
+    spec["materials"].append("gold")
+    spec["known"]["materials"]["gold"] = {"diffuse": [0.5, 0.4, 0.1]}
+    with pytest.raises(InputError, match="no object is made of material 'gold'"):
+        read_dataset(write(folder, spec))
 
 
 def test_photos_of_one_light_agree_on_its_frame(folder):

@@ -8,12 +8,17 @@ import pyarrow.parquet as pq
 import pytest
 
 from factorlib.errors import InputError
+from factorlib.geometry.sphere import mirror_directions
+from factorlib.images.exr import LAT_LONG, write_rgb_exr
 from factorlib.jsonfile import read_json
+from factorlib.light.latlong import lat_long_of_lobes
+from factorlib.light.lobes import Lobes
 from factorlib.model.illumination import Illumination
 from factorlib.model.noise import Noise
 from factorlib.model.observed import blocks_of_observations
 from factorlib.reflection import reflection_operator
 from factorlib.reflection.network import SHIPPED
+from factorlib.results.lobes import read_lobes
 from factorlib.results.solution import FILES
 from factorlib.stage import Inputs, silent
 from factorlib.urm.observations import Observations, write_observations
@@ -39,17 +44,34 @@ def observations(photo: str, materials, seed: int, size: int = 16, unit: float =
     return msgspec.structs.replace(empty, radiance=unit * radiance)
 
 
-def run(folder, photos: dict[str, Observations], progress=silent, unfinished=None, start=None, light=None, **params):
+def run(
+    folder,
+    photos: dict[str, Observations],
+    progress=silent,
+    unfinished=None,
+    start=None,
+    light=None,
+    known=None,
+    files=None,
+    **params,
+):
     urm, out = folder / "urm", folder / "out"
     urm.mkdir(parents=True, exist_ok=True), out.mkdir(exist_ok=True)
     for name, part in photos.items():
         write_observations(urm / f"{name}.parquet", part)
     light = light or {name: {"illumination": name, "world_from_camera": None} for name in photos}
     folders = {"urm": urm, "train": SHIPPED} | ({"start": start} if start else {})
-    inputs = Inputs(folders, {"dataset.materials": list(NAMES), "dataset.light": light}, unfinished=unfinished)
+    facts = {"dataset.materials": list(NAMES), "dataset.light": light, "dataset.known": known or {}}
+    inputs = Inputs(folders, facts, files or {}, unfinished=unfinished)
     quick = {"cells": 24, "splittings": 0, "observations": 150, "merge_degrees": 0.0, "tone": "off"}
     solve.main(solve.Params(**{**quick, **params}), inputs, out, progress)
     return out
+
+
+def random_lobes(seed: int) -> Lobes:
+    """The light of `observations` of that seed."""
+    light = random_light(np.random.default_rng(seed), 2)
+    return Lobes(light.axis, light.sharpness, light.weight)
 
 
 def table(folder):
@@ -229,3 +251,57 @@ def test_photos_of_one_light_start_from_what_exif_says_of_their_exposures(tmp_pa
     assert abs(np.log(exposure_of_b(tmp_path / "unknown", 64.0, (0.5, None)) / 64)) > abs(np.log(known / 64))
     assert exposure_of_b(tmp_path / "brighter", 1.2, (1.0, 3.0)) == pytest.approx(1.2, rel=0.02)
     assert "photo 'b': by its EXIF its exposure is 3 of its light's first photo" in caplog.text
+
+
+def test_a_known_material_is_written_as_it_was_given_and_said(tmp_path, linked, caplog):
+    known = {"materials": {"green": {"diffuse": [0.2, 0.4, 0.25], "specular": None, "roughness": 0.4}}}
+    out = table(run(tmp_path, linked, known=known))
+    green, red = out["materials"]["green"], out["materials"]["red"]
+    assert green["diffuse"] == [0.2, 0.4, 0.25] and green["roughness"] == 0.4
+    assert green["given"] == ["diffuse", "roughness"] and "given" not in red
+    assert green["stderr"]["diffuse"] == [0, 0, 0] and green["stderr"]["roughness"] == 0
+    assert min(green["stderr"]["specular"]) > 0 and min(red["stderr"]["diffuse"]) > 0
+    assert "come from these: green" in out["gauge"]["rule"] and "that alone is fixed" in out["gauge"]["stderr"]
+    assert "by convention" not in caplog.text
+    bright = {"materials": {"green": {"diffuse": [0.99, 0.99, 0.99], "specular": [0, 0, 0]}}}
+    run(tmp_path / "bright", linked, known=bright)
+    assert "more than falls on it" in caplog.text
+
+
+def test_a_known_material_that_nothing_shows_and_another_solver_are_refused(tmp_path, linked):
+    known = {"materials": {"blue": {"diffuse": [0.2, 0.4, 0.25]}}}
+    with pytest.raises(InputError, match="no observation shows material 'blue'"):
+        run(tmp_path, {"a": linked["a"]}, known=known)
+    with pytest.raises(InputError, match="the solver paper finds everything itself"):
+        run(tmp_path, linked, known=known, solver="paper")
+
+
+def test_a_known_map_ball_and_exposures_are_held(tmp_path, linked, caplog):
+    """A ball that mirrors half of the light stands beside the red sphere; the map of the other light is in other units."""
+    light, both = random_lobes(1), observations("a", [0, 2], 1, size=40)
+    ball = both.material == 2
+    both.radiance[ball] = 0.5 * light.radiance(mirror_directions(both.normal[ball], both.view[ball]))
+    write_rgb_exr(tmp_path / "b.exr", 9 * lat_long_of_lobes(random_lobes(2), 32, 64), LAT_LONG)
+    again = msgspec.structs.replace(linked["b"], photos=("c",), radiance=linked["b"].radiance / 4)
+    photos = {"a": both, "b": linked["b"], "c": again, "d": observations("d", [0, 1], 3)}
+    known = {
+        "materials": {"blue": {"diffuse": [0, 0, 0], "specular": [0.5, 0.5, 0.5]}},
+        "balls": {"a": {"photo": "a", "material": "blue"}}, "maps": {"b": "b.exr"}, "exposure": {"b": 0, "c": -2},
+    }  # fmt: skip
+    lights = {k: {"illumination": "b" if k == "c" else k, "world_from_camera": None} for k in photos}
+    files = {"b.exr": tmp_path / "b.exr"}
+    out = run(tmp_path, photos, light=lights, known=known, files=files, splittings=1)
+    found = read_lobes(out / "lobes.parquet")
+    np.testing.assert_allclose(found["a"].energy, light.energy, rtol=0.05)
+    shares = [one / one.sum() for one in (found["b"].energy, random_lobes(2).energy)]
+    np.testing.assert_allclose(*shares, rtol=1e-3)
+    assert read_json(out / "exposures.json")["c"] == [0.25] * 3
+    solved = table(out)
+    assert "come from these: blue, a" in solved["gauge"]["rule"] and "up to a factor" in solved["gauge"]["rule"]
+    blue, red = solved["materials"]["blue"], solved["materials"]["red"]
+    assert blue["given"] == ["diffuse", "specular", "roughness"] and blue["roughness"] == 0.1
+    assert red["diffuse"] == pytest.approx(MATERIALS.diffuse[0].tolist(), rel=0.1)
+    assert "'blue'" not in caplog.text
+    with pytest.raises(InputError, match="shows 192 pixels of the ball"):
+        small = {"balls": known["balls"], "materials": known["materials"]}
+        run(tmp_path / "small", photos | {"a": observations("a", [0, 2], 1)}, light=lights, known=small)

@@ -1,0 +1,84 @@
+"""A light of known radiance on cells: from a lat-long map, or from what a mirror ball shows.
+
+Radiance y_i is known in directions d_i, each of which stands for the solid angle ω_i.  The cells' weights w ≥ 0 are those of the likeliest
+Σ_p w_p φ_p(d_i), were y counts of a Poisson process, by the iteration of Richardson (1972) and Lucy (1974)
+
+    w_p ← w_p Σ_i ω_i φ_p(d_i) y_i/(Σ_q w_q φ_q(d_i)) / Σ_i ω_i φ_p(d_i)                                             (1)
+
+which keeps w ≥ 0 and the energy Σ_i ω_i y_i as it is.  Even cells come first; then, again and again, those that hold most energy split, as
+in a solve, down to `FINEST` spacings of the directions.  Cells that too few directions lie in (a ball shows nothing behind itself, and what
+it shows of other objects or clipped is left out) are not known: the solve finds them.
+"""
+
+from __future__ import annotations
+
+import msgspec
+import numpy as np
+from jaxtyping import Float
+
+from factorlib.conventions import YUP_FROM_CAMERA, lat_long_directions, lat_long_solid_angles
+from factorlib.geometry.sphere import fibonacci_sphere, mirror_directions
+from factorlib.light.lobes import lobe_integral, squared_distances
+from factorlib.model.lights import Light, even_cells
+from factorlib.urm.observations import Observations
+
+CELLS, SPLIT, SPLITTINGS = 400, 48, 4
+FINEST = 1.0  # of the spacing of the directions: with finer cells the sums of (1) are no longer integrals
+ITERATIONS, BETWEEN = 60, 15  # of the last cells, and of those that split afterwards
+COVERED = 0.5  # of a cell's integral: below, it is not known
+DARK, LEAST = 1e-6, 1e-12  # of the mean radiance, and steradians, which keep (1) from dividing by 0
+ROWS = 128  # of a map, which is averaged down to them
+
+
+def known_light(
+    directions: Float[np.ndarray, "n 3"], radiance: Float[np.ndarray, "n 3"], solid_angle: Float[np.ndarray, " n"]
+) -> Light:
+    """The light that has `radiance` in unit `directions` (in the light's frame) of n solid angles in steradians; its cells are `held` where
+    directions cover them."""
+    mean = solid_angle @ radiance / solid_angle.sum()
+    floored = np.maximum(radiance, DARK * mean.mean())
+    energy_of = (solid_angle[:, None] * floored).astype(np.float32)
+    lobes, spacing = even_cells(CELLS), np.sqrt(np.median(solid_angle))
+    light = Light(lobes.axis, np.log(lobes.sharpness), np.ones((CELLS, 3)), np.zeros(1))
+    light = light.with_log_radiance(np.tile(np.log(np.maximum(mean, DARK * mean.mean()))[:, None], CELLS))
+    for number in range(SPLITTINGS + 1):
+        if number:
+            energy = np.where(light.spacing / 2 >= FINEST * spacing, light.energy.sum(1), 0.0)
+            light = light.split(
+                np.isin(np.arange(len(light)), np.argsort(-energy, kind="stable")[:SPLIT]) & (energy > 0)
+            )
+        response = np.exp(-0.5 * light.sharpness * squared_distances(directions, light.axis)).astype(np.float32)
+        covered, weight = response.T @ solid_angle.astype(np.float32), light.weight.astype(np.float32)
+        for _ in range(ITERATIONS if number == SPLITTINGS else BETWEEN):
+            weight *= response.T @ (energy_of / (response @ weight)) / np.maximum(covered, LEAST)[:, None]
+        light = msgspec.structs.replace(light, weight=weight.astype(float))
+    return msgspec.structs.replace(light, held=covered >= COVERED * lobe_integral(light.sharpness))
+
+
+def light_of_map(lat_long: Float[np.ndarray, "h w 3"]) -> Light:
+    """The light of a map in the layout of the exported ones, in the frame that these are turned from; known but for one factor."""
+    height, width = lat_long.shape[:2]
+    rows = min(height, ROWS)
+    first = [-(-np.arange(count) * size // count) for count, size in ((rows, height), (2 * rows, width))]
+    angle = np.repeat(lat_long_solid_angles(height, width)[:, None], width, axis=1)
+    sums = (angle[..., None] * lat_long, angle[..., None])
+    energy, angle = (np.add.reduceat(np.add.reduceat(of, first[0], axis=0), first[1], axis=1) for of in sums)
+    directions = (lat_long_directions(rows, 2 * rows) @ YUP_FROM_CAMERA).reshape(-1, 3)
+    light = known_light(directions, (energy / angle).reshape(-1, 3), angle.reshape(-1))
+    return msgspec.structs.replace(light, scale_free=True)
+
+
+def light_of_ball(seen: Observations, specular: Float[np.ndarray, "3"], rotation: Float[np.ndarray, "3 3"]) -> Light:
+    """The light that a mirror ball shows, of whose k_d nothing is left, in the radiance of its photo.
+
+    seen: its pixels;  specular: its k_s;  rotation: light_from_camera.  What shows another object, or is clipped, tells nothing.  All
+    pixels of a ball stand for the same solid angle, for its picture is an equal-area projection of the sphere (from afar).
+    """
+    mirror = mirror_directions(seen.normal.astype(float), seen.view.astype(float))
+    weight = seen.weight / np.maximum(1.0 if seen.confidence is None else seen.confidence, LEAST)
+    usable = ~seen.clipped.any(1)
+    if seen.visibility is not None:
+        nearest = np.argmax(mirror @ fibonacci_sphere(seen.visibility.shape[1]).T, axis=1)
+        usable &= seen.visibility[np.arange(len(seen)), nearest] == 255
+    angle = 4 * np.pi * weight / weight.sum()
+    return known_light(mirror[usable] @ rotation.T, seen.radiance[usable] / specular, angle[usable])
