@@ -60,9 +60,8 @@ def check_dataset(spec: DatasetFile, file: Path) -> None:
     with refuse.noting():
         if spec.truth is not None:
             refuse.path("truth", spec.truth, (".yaml", ".yml"), must_exist=False)
-    with refuse.noting():
-        if not refuse.faults:  # it looks materials and meshes up
-            _check_known(spec, refuse)
+    raise_all(refuse.faults)
+    _check_known(spec, refuse)  # for which objects and meshes must be right
     raise_all(refuse.faults)
 
 
@@ -202,17 +201,20 @@ def _check_known(spec: DatasetFile, refuse: Refusal) -> None:
     """Known materials are materials that objects are made of, and reflect some light, and no more than falls on them."""
     shown = {m for photo in spec.photos for obj in photo.objects for m in made_of(obj, spec)}
     for name, of in spec.known.materials.items():
-        key = f"known.materials.{name}"
-        refuse.known(key, name, spec.materials, "material")
-        if name not in shown:
-            refuse(key, f"no object is made of material {name!r}", "leave it out, or add the object that shows it")
-        specular = of.specular or (0.0, 0.0, 0.0)
-        if not min(map(sum, zip(of.diffuse, specular, strict=True))) > 0:
-            cure = "give what it reflects in every channel, or leave it out"
-            refuse(key, "it reflects nothing in some channel, so that light cannot be told from it", cure)
-        if max(of.diffuse) + max(specular) > 1:
-            fault = f"diffuse and specular reflectance are {max(of.diffuse) + max(specular):.3g} together"
-            refuse(key, fault, "their largest channels may be 1 together: no more light is reflected than falls on it")
+        with refuse.noting():
+            key = f"known.materials.{name}"
+            refuse.known(key, name, spec.materials, "material")
+            if name not in shown:
+                refuse(key, f"no object is made of material {name!r}", "leave it out, or add the object that shows it")
+            specular = of.specular or (0.0, 0.0, 0.0)
+            if not min(map(sum, zip(of.diffuse, specular, strict=True))) > 0:
+                cure = "give what it reflects in every channel, or leave it out"
+                refuse(key, "it reflects nothing in some channel, so that light cannot be told from it", cure)
+            if max(of.diffuse) + max(specular) > 1:
+                fault = f"diffuse and specular reflectance are {max(of.diffuse) + max(specular):.3g} together"
+                refuse(
+                    key, fault, "their largest channels may be 1 together: no more light is reflected than falls on it"
+                )
     _check_known_lights(spec, refuse)
 
 
@@ -222,38 +224,38 @@ def _check_known_lights(spec: DatasetFile, refuse: Refusal) -> None:
     for photo in spec.photos:
         shots.setdefault(photo.light, []).append(photo)
     for name in spec.known.exposure:
-        key = f"known.exposure.{name}"
-        refuse.known(key, name, [photo.name for photo in spec.photos], "photo")
-        own = next(shot for shot in shots.values() if name in [photo.name for photo in shot])
-        if lacking := [photo.name for photo in own if photo.name not in spec.known.exposure]:
-            refuse(key, f"{lacking[0]!r} shares its light and has none", "give the EV of every photo of a light")
-        if len(own) == 1:
-            refuse(key, "no other photo shares its light, whose brightness holds it", "leave it out")
+        with refuse.noting():
+            key = f"known.exposure.{name}"
+            refuse.known(key, name, [photo.name for photo in spec.photos], "photo")
+            own = next(shot for shot in shots.values() if name in [photo.name for photo in shot])
+            if lacking := [photo.name for photo in own if photo.name not in spec.known.exposure]:
+                refuse(key, f"{lacking[0]!r} shares its light and has none", "give the EV of every photo of a light")
+            if len(own) == 1:
+                refuse(key, "no other photo shares its light, whose brightness holds it", "leave it out")
     for name, of in spec.known.illumination.items():
-        key = f"known.illumination.{name}"
-        refuse.known(key, name, shots, "illumination")
-        if isinstance(of, str):
-            refuse.path(key, of, MAPS)
-            continue
-        key, balls = f"{key}.chrome", list(mirror_balls(spec, name, of))
-        if not balls:
-            refuse.known(key, of.chrome, [obj.name for photo in shots[name] for obj in photo.objects], "object")
-        photo, ball = balls[0]
-        material, mesh = min(made_of(ball, spec)), spec.meshes[ball.mesh]
-        if len(made_of(ball, spec)) > 1 or not (mesh.file or mesh.primitive == "ball"):
-            refuse(key, f"mesh {ball.mesh!r} is no ball of one material", "give a mesh file, or `primitive: ball`")
-        if any(material in made_of(obj, spec) for obj in photo.objects if obj is not ball):
-            cure = "give the ball a material of its own"
-            refuse(key, f"another object of photo {photo.name!r} is made of {material!r} too", cure)
-        known = spec.known.materials.get(material)
-        if known is None or any(known.diffuse) or not known.specular:
-            cure = (
-                f"write known.materials.{material}: {{diffuse: [0, 0, 0], specular: [.55, .55, .55]}}, as chrome's is"
-            )
-            refuse(key, f"how much of the light {material!r} mirrors is not known", cure)
-        if len(shots[name]) > 1 and photo.name not in spec.known.exposure:
-            cure = "give known.exposure of its photos, or the light of one photo alone"
-            refuse(key, f"{len(shots[name])} photos of unknown exposures share the light", cure)
+        with refuse.noting():
+            key = f"known.illumination.{name}"
+            refuse.known(key, name, shots, "illumination")
+            if isinstance(of, str):
+                refuse.path(key, of, MAPS)
+                continue
+            key, balls = f"{key}.chrome", list(mirror_balls(spec, name, of))
+            if not balls:
+                refuse.known(key, of.chrome, [obj.name for photo in shots[name] for obj in photo.objects], "object")
+            photo, ball = balls[0]
+            material, mesh = min(made_of(ball, spec)), spec.meshes[ball.mesh]
+            if len(made_of(ball, spec)) > 1 or not (mesh.file or mesh.primitive == "ball"):
+                refuse(key, f"mesh {ball.mesh!r} is no ball of one material", "give a mesh file, or `primitive: ball`")
+            if any(material in made_of(obj, spec) for obj in photo.objects if obj is not ball):
+                cure = "give the ball a material of its own"
+                refuse(key, f"another object of photo {photo.name!r} is made of {material!r} too", cure)
+            known = spec.known.materials.get(material)
+            if known is None or any(known.diffuse) or not known.specular:
+                cure = f"write known.materials.{material}: {{diffuse: [0, 0, 0], specular: [.55, .55, .55]}}, as chrome's is"
+                refuse(key, f"how much of the light {material!r} mirrors is not known", cure)
+            if len(shots[name]) > 1 and photo.name not in spec.known.exposure:
+                cure = "give known.exposure of its photos, or the light of one photo alone"
+                refuse(key, f"{len(shots[name])} photos of unknown exposures share the light", cure)
 
 
 def mirror_balls(spec: DatasetFile, illumination: str, ball: MirrorBall) -> Iterator[tuple[PhotoEntry, ObjectEntry]]:
