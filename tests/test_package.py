@@ -23,21 +23,24 @@ OURS = {"factorlib", "stages", "tests", "studies"}
 
 
 # What runs on a cluster alone: loaded where one is asked for, and then the extra `dask` is there or missed by name.
-OF_CLUSTERS = {ROOT / "factorlib" / "runner" / f"{module}.py" for module in ("child", "cluster")}
+EXTRAS = {  # of modules that import what an extra alone installs
+    ROOT / "factorlib" / f"{module}.py": extra
+    for module, extra in (("runner/child", "dask"), ("runner/cluster", "dask"), ("images/film", "video"))
+}
 
 
 @pytest.mark.parametrize("folder", ["factorlib", "stages"])
 def test_every_import_is_a_dependency_that_is_declared(folder):
     of = {module: {canonicalize_name(name) for name in found} for module, found in packages_distributions().items()}
     for file in sorted((ROOT / folder).rglob("*.py")):
-        extra = PROJECT["optional-dependencies"]["dask"] if file in OF_CLUSTERS else ["packaging"]
+        extra = PROJECT["optional-dependencies"][EXTRAS[file]] if file in EXTRAS else ["packaging"]
         declared = {canonicalize_name(Requirement(text).name) for text in PROJECT["dependencies"] + extra}
         found = set()
         for node in ast.walk(ast.parse(file.read_text())):
             found |= {alias.name for alias in node.names} if isinstance(node, ast.Import) else set()
             found |= {node.module} if isinstance(node, ast.ImportFrom) and node.module and not node.level else set()
         modules = {name.split(".")[0] for name in found} - OURS - sys.stdlib_module_names
-        assert not {module for module in modules if not of[module] & declared}, file
+        assert not {module for module in modules if not ({module} | of.get(module, set())) & declared}, file
 
 
 def test_the_lock_is_what_pyproject_asks_for():

@@ -6,14 +6,11 @@ the last bytes found room: so it writes to memory, and the bytes go to disk by a
 
 from __future__ import annotations
 
-import io
-from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
 import OpenImageIO as oiio
-from jaxtyping import Float, UInt8
-from PIL import Image
+from jaxtyping import Float
 
 from factorlib.wholefile import bytes_of, write_bytes
 
@@ -48,15 +45,3 @@ def write_hdr(path: str | Path, radiance: Float[np.ndarray, "h w 3"]) -> None:
     """
     pixels = np.asarray(radiance, dtype=np.float32)
     write_image(path, oiio.ImageSpec(pixels.shape[1], pixels.shape[0], 3, oiio.FLOAT), pixels)
-
-
-def write_gif(path: str | Path, frames: Sequence[UInt8[np.ndarray, "h w 4"]], seconds: float) -> None:
-    """Write an animation of so many seconds that goes round for ever; white where frames are transparent."""
-    solid = []
-    for frame in frames:
-        alpha = frame[..., 3:].astype(float) / 255
-        solid.append(Image.fromarray(np.rint(frame[..., :3] * alpha + 255 * (1 - alpha)).astype(np.uint8)))
-    memory = io.BytesIO()
-    each = max(20, round(1000 * seconds / len(frames)))  # browsers show shorter ones slowly
-    solid[0].save(memory, "GIF", save_all=True, append_images=solid[1:], duration=each, loop=0, disposal=2)
-    write_bytes(path, memory.getvalue())

@@ -34,7 +34,7 @@ CURE = 'write {"materials": {"gold": {"diffuse": [r, g, b], "specular": [r, g, b
 class Recipe(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True, tag_field="kind"):
     """What every kind has."""
 
-    samples: Samples = 64
+    samples: Samples = 256
     """Samples per pixel of the path tracer: noise falls as their square root."""
 
 

@@ -16,8 +16,8 @@ import numpy as np
 from factorlib.conventions import YUP_FROM_CAMERA
 from factorlib.errors import InputError
 from factorlib.images.exr import write_rgb_exr
+from factorlib.images.film import write_gif, write_mp4
 from factorlib.images.picture import picture, write_png
-from factorlib.images.write import write_gif
 from factorlib.jsonfile import write_json
 from factorlib.recipe import schema
 from factorlib.recipe.schema import AnyRecipe, is_light_file
@@ -140,7 +140,7 @@ def view(recipe: schema.View, results: SolvedSet, photo: str, out: Path, report:
 def animation(
     recipe: schema.Turntable | schema.MovingLight, results: SolvedSet, photo: str, out: Path, report: Report
 ) -> None:
-    """The camera or the light turns once: every frame as a PNG, and all as a GIF, which has no half-transparent pixels, on white."""
+    """The camera or the light turns once: every frame as a PNG, and all as a GIF and, where PyAV is there, an MP4, on white."""
     scene, pixels = resized(results.scene(photo, recipe.sun), recipe.width), []
     for k in range(recipe.frames):
         report(k / recipe.frames)
@@ -156,6 +156,7 @@ def animation(
     for k, each in enumerate(pixels):
         write_png(out / photo / f"{k:03}.png", each)
     write_gif(out / f"{photo}.gif", pixels, recipe.seconds)
+    write_mp4(out / f"{photo}.mp4", pixels, recipe.seconds)
 
 
 def relight(recipe: schema.Relight, results: SolvedSet, photo: str, out: Path, report: Report) -> None:

@@ -1,6 +1,7 @@
 """The stage `recipes`: the files of every kind, what they show, the same bytes again, and what it refuses."""
 
 import json
+from importlib.util import find_spec
 
 import msgspec
 import numpy as np
@@ -41,11 +42,12 @@ def drawn(made, out, recipe, **files):
 GROUND = {"ground": {"point": [0, 1.2, 4], "normal": [0, -1, -0.2], "diffuse": None}}
 PICTURES = {"front": ["front.exr", "front.png"], "side": ["side.exr", "side.png"]}
 FRONT = {"photos": ["front"], "samples": 1}
+ANIMATED = ["front.gif", "front.mp4"] if find_spec("av") else ["front.gif"]
 KINDS = [
     (schema.Resynthesis(samples=1), PICTURES["front"] + PICTURES["side"]),
     (schema.View(photos=["side"], samples=1, width=32, background="light"), PICTURES["side"]),
-    (schema.Turntable(**FRONT, frames=3), ["front.gif", *(f"front/00{k}.png" for k in range(3))]),
-    (schema.MovingLight(**FRONT, frames=2, width=16), ["front.gif", "front/000.png", "front/001.png"]),
+    (schema.Turntable(**FRONT, frames=3), [*ANIMATED, *(f"front/00{k}.png" for k in range(3))]),
+    (schema.MovingLight(**FRONT, frames=2, width=16), [*ANIMATED, "front/000.png", "front/001.png"]),
     (schema.Relight(samples=1, rotate=30.0, photos=["side"]), [f"side/{name}" for name in PICTURES["front"]]),
     (schema.Transfer(materials={"red": "unseen"}, **FRONT), PICTURES["front"]),
     (schema.Insert(**FRONT), [*PICTURES["front"], "front.json"]),
