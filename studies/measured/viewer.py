@@ -1,7 +1,7 @@
 """The report's relighting viewer against the pipeline's own rendering: `make results ONLY=viewer`, of `build/eames`, in headless Chromium.
 
 Error: balls of every material in every light, drawn in software, against the reflection operator on the same pixels,
-|viewer − operator| / max over channels of the operator's.  Time: a frame while something moves (`QUICK` samples), waiting for its last
+|viewer − operator| / max over channels of the operator's.  Time: a frame while something moves, waiting for its last
 pixel; the smallest and the median of several, for other programs only ever add to it.
 """
 

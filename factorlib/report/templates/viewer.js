@@ -7,11 +7,12 @@
 // Specular: k_s * integral of L(i) D G1(i) G1(o) / (4 n.o) di, estimated at half vectors drawn from the visible normals
 //           (Heitz 2018; as spherical caps, Dupuy and Benyoub 2023), for which each sample counts L(i) G1(i).  A sample reads
 //           the light at the mip level whose texels are as large as the solid angle it stands for (Krivanek and Colbert 2008).
-// While something moves, one pass of QUICK samples is shown, of fewer pixels where frames are slow.  After that PASSES of them
+// While something moves, one sample is shown, the mirror direction read at the level of the whole lobe, as in a map filtered beforehand, of fewer
+// pixels where frames are slow.  After that PASSES of them
 // are averaged, each a little displaced within its pixel, and the texels are those of all these samples together, so that what
 // is shown tends to the integral.
 (() => {
-const QUICK = 4, PER_PASS = 8, PASSES = 128, SLOW_FRAME = 40, IRRADIANCE_FACE = 16, HALF_FIELD = 15 * Math.PI / 180, STANDING_BACK = 1.04 / Math.sin(HALF_FIELD);
+const QUICK = 1, PER_PASS = 8, PASSES = 128, SLOW_FRAME = 40, IRRADIANCE_FACE = 16, HALF_FIELD = 15 * Math.PI / 180, STANDING_BACK = 1.04 / Math.sin(HALF_FIELD);
 const LEAST_ALPHA = 1e-3, OWN = "";
 
 // ── Numbers ──────────────────────────────────────────────────────────────────────────────────────────────────────────
@@ -138,7 +139,7 @@ void main() {
     for (int k = 0; k < each; k++) {
       float z = (1.0 - samples[k].z) * (1.0 + stretched.z) - stretched.z, r = sqrt(max(0.0, 1.0 - z * z));
       vec3 h = vec3(r * samples[k].x, r * samples[k].y, z) + stretched;
-      h = normalize(vec3(h.xy * alpha, max(h.z, 1e-6)));
+      h = each == 1 ? vec3(0.0, 0.0, 1.0) : normalize(vec3(h.xy * alpha, max(h.z, 1e-6)));
       vec3 i = 2.0 * dot(local, h) * h - local;
       if (i.z <= 0.0) continue;
       float slope = h.z * h.z * (a2 - 1.0) + 1.0, density = seen * a2 / (3.14159265 * slope * slope) / (4.0 * facing);
