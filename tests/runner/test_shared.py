@@ -16,7 +16,7 @@ from factorlib.runner import verbs
 from factorlib.runner.filehash import hash_of_file
 from factorlib.runner.gc import verify
 from factorlib.runner.project import LIBRARY
-from factorlib.runner.shared import MADE_FROM
+from factorlib.runner.shared import MADE_FROM, copied
 from factorlib.runner.store import output_of
 from factorlib.runner.survey import survey
 from tests.faults.battered import make
@@ -100,6 +100,14 @@ def test_a_forged_result_writes_nothing_outside(tmp_path, one, shared):
         path.write_text(json.dumps({**entry, "files": forged, "output": output_of(forged)}))
     assert make(other) == 0 and computed(other) == 6
     assert not list(tmp_path.rglob("*escaped*")) and not os.path.exists("/tmp/escaped")
+
+
+def test_a_file_beside_a_tree_is_not_copied_though_its_hash_is_right(tmp_path):
+    write(tmp_path / "trees/beside", "x")
+    (tmp_path / "trees/one").mkdir()
+    right = {"../beside": hash_of_file(tmp_path / "trees/beside")}
+    assert not copied(tmp_path / "trees/one", tmp_path / "drafts/one", right)
+    assert not (tmp_path / "drafts/beside").exists()
 
 
 def test_a_record_of_another_key_is_not_taken(tmp_path, one, shared):
