@@ -111,6 +111,14 @@ def text_of(verdict: Verdict) -> str:
     return "\n".join([head, *(f"limited by: {why}" for why in verdict.reasons), f"next: {verdict.next}", ""])
 
 
+def _percent(share: float) -> str:
+    """
+    >>> _percent(0.042), _percent(0.0032)
+    ('4%', '0.3%')
+    """
+    return f"{share:.0%}" if share >= 0.01 else f"{100 * share:.1g}%"
+
+
 def _of_materials(signs: Signs) -> tuple[str, str]:
     """Return why, and what to do next."""
     name = max(signs.materials, key=signs.materials.__getitem__)
@@ -127,7 +135,7 @@ def _of_clipped(signs: Signs) -> tuple[str, str]:
     """Return why, and what to do next."""
     name, photos = max(signs.photos, key=lambda photo: signs.photos[photo].clipped), signs.photos
     return (
-        f"clipped values, in '{name}' {photos[name].clipped:.0%} of all: they say 'at least' only",
+        f"clipped values, in '{name}' {_percent(photos[name].clipped)} of all: they say 'at least' only",
         f"expose '{name}' less, or give the camera's raw file",
     )
 
@@ -147,9 +155,12 @@ def _of_unexplained(signs: Signs) -> tuple[str, str]:
     name = max(signs.photos, key=lambda photo: signs.photos[photo].unexplained)
     share = min(signs.photos[name].unexplained, 1)
     if share < MUCH:
-        return f"shading that stays unexplained, in '{name}' {share:.0%} of it", "a mesh that is nearer to the objects"
+        return (
+            f"shading that stays unexplained, in '{name}' {_percent(share)} of it",
+            "a mesh that is nearer to the objects",
+        )
     return (
-        f"shading that stays unexplained, in '{name}' {share:.0%} of it",
+        f"shading that stays unexplained, in '{name}' {_percent(share)} of it",
         f"look at the overlay of '{name}' in the report: its mesh, pose, masks or the names of its materials are wrong, or a program has changed the picture",
     )
 

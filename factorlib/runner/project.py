@@ -17,7 +17,6 @@ from factorlib.runner.stop import take_sigterm_back
 
 HOW = "name a folder in data/, or give a path to one with a dataset.yaml in it"
 PIPELINE = "pipeline.yaml"
-DATASET_FILE = "dataset.yaml"
 LIBRARY = Path(__file__).resolve().parent.parent.parent  # the folder that holds factorlib/
 RESERVED = ("studies", "bench", "store", "compare", "docs")  # folders of build/ that are no datasets
 LONGEST = 255  # bytes of a name, on every common file system
