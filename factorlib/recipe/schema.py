@@ -71,6 +71,8 @@ class Backdropped(Sized, frozen=True, kw_only=True):
 
     background: Literal["none", "light"] = "none"
     """What is seen beside the objects: nothing (transparent), or the light."""
+    floor: Share | None = None
+    """Reflectance of a grey floor that takes the objects' shadow and fades out around them; none where it is not given."""
 
 
 class Resynthesis(OfPhotos, frozen=True, kw_only=True, tag="resynthesis"):

@@ -12,6 +12,7 @@ from typing import Any
 
 import msgspec
 import numpy as np
+from jaxtyping import Float
 
 from factorlib.conventions import YUP_FROM_CAMERA
 from factorlib.errors import InputError
@@ -22,12 +23,14 @@ from factorlib.jsonfile import write_json
 from factorlib.recipe import schema
 from factorlib.recipe.schema import AnyRecipe, is_light_file
 from factorlib.render.insertion import NEW, STEPS, inserted
-from factorlib.render.photo_scene import lit_ball, orbit, resized, traced_photo, turned_light
+from factorlib.render.photo_scene import PhotoScene, lit_ball, orbit, resized, traced_photo, turned_light
 from factorlib.render.placement import spot_at, spot_beside, stood, stood_free
 from factorlib.render.solved_set import SolvedSet
+from factorlib.render.studio import on_floor
 from factorlib.render.traced import Traced
 from factorlib.results.materials import Reflectance
 from factorlib.stage import Progress
+from factorlib.tracing.scene import rigid
 from factorlib.wholefile import write_text
 
 log = logging.getLogger("factorlib.recipes")
@@ -128,12 +131,22 @@ def insertion(recipe: schema.Insert, results: SolvedSet, photo: str, out: Path, 
     }
 
 
+def staged(
+    recipe: schema.Backdropped, results: SolvedSet, photo: str, scene: PhotoScene, world_from_camera: np.ndarray
+) -> Float[np.ndarray, "h w 4"]:
+    """The objects before the light or nothing, and on a floor where the recipe asks for one."""
+    lit = recipe.background == "light"
+    if recipe.floor is None:
+        return traced_photo(scene, recipe.samples, world_from_camera, lit)
+    plane = results.ground(photo, scene.objects[0]).plane
+    return on_floor(scene, plane, recipe.floor, recipe.samples, world_from_camera, lit)
+
+
 def view(recipe: schema.View, results: SolvedSet, photo: str, out: Path, report: Report) -> None:
     """The objects alone, from another side."""
     report(0)
     scene = resized(results.scene(photo, recipe.sun), recipe.width)
-    camera = orbit(scene, recipe.azimuth, recipe.elevation, recipe.zoom)
-    traced = traced_photo(scene, recipe.samples, camera, with_light=recipe.background == "light")
+    traced = staged(recipe, results, photo, scene, orbit(scene, recipe.azimuth, recipe.elevation, recipe.zoom))
     _write_alone(out / photo, Traced(traced, results.tone(photo)))
 
 
@@ -146,8 +159,7 @@ def animation(
         report(k / recipe.frames)
         degrees = 360 * k / recipe.frames
         if isinstance(recipe, schema.Turntable):
-            lit = recipe.background == "light"
-            traced = traced_photo(scene, recipe.samples, orbit(scene, degrees), with_light=lit)
+            traced = staged(recipe, results, photo, scene, orbit(scene, degrees))
         else:
             turned = msgspec.structs.replace(scene, light=turned_light(scene.light, degrees))
             traced = traced_photo(turned, recipe.samples)
@@ -166,7 +178,7 @@ def relight(recipe: schema.Relight, results: SolvedSet, photo: str, out: Path, r
     for k, name in enumerate(lights):
         report(k / len(lights))
         lit = msgspec.structs.replace(scene, light=turned_light(results.light(name), recipe.rotate))
-        traced = traced_photo(lit, recipe.samples, with_light=recipe.background == "light")
+        traced = staged(recipe, results, photo, lit, rigid(YUP_FROM_CAMERA, np.zeros(3)))
         shown = Traced(traced).exposed() if is_light_file(name) else Traced(traced, results.tone(name))
         _write_alone(out / photo / Path(name).stem, shown)
 

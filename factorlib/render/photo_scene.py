@@ -119,16 +119,23 @@ def shapes(
 
 
 def traced_photo(
-    scene: PhotoScene, samples: int, world_from_camera: Float[np.ndarray, "4 4"] | None = None, with_light: bool = False
+    scene: PhotoScene,
+    samples: int,
+    world_from_camera: Float[np.ndarray, "4 4"] | None = None,
+    with_light: bool = False,
+    beside: Mapping[str, Any] = {},
+    max_depth: int | None = None,
 ) -> Float[np.ndarray, "h w 4"]:
     """Linear radiance times coverage, and coverage: the share of a pixel that objects (or the light, where it is seen) fill.
 
-    world_from_camera: of OpenCV's camera axes; without it the photo's own
+    world_from_camera: of OpenCV's camera axes; without it the photo's own;  beside: further entries of the scene, for Mitsuba;  max_depth: instead of
+    the scene's
     """
     own = rigid(YUP_FROM_CAMERA, np.zeros(3)) if world_from_camera is None else world_from_camera
-    entries = {**light_entries(scene.light, scene.size), **shapes(scene.objects, scene.materials)}
+    entries = {**light_entries(scene.light, scene.size), **shapes(scene.objects, scene.materials), **beside}
     view = sensor(scene.camera, own, near=scene.near, alpha=True)
-    picture = rendered(entries, view, samples, 0, scene.max_depth, hide_emitters=not with_light)
+    depth = scene.max_depth if max_depth is None else max_depth
+    picture = rendered(entries, view, samples, 0, depth, hide_emitters=not with_light)
     if with_light:
         picture[..., 3] = 1
     return picture

@@ -1,0 +1,63 @@
+"""Objects on a grey floor that takes their shadow and fades out around them.
+
+With W the share of a pixel that objects fill, and f, which falls from 1 beneath the objects to 0 at `REACH` of their size, the picture is
+
+    w L₁ + (1 − w) L₀,    w = max(W, f),
+
+where L₁ and L₀ are path-traced with the floor and without it.
+"""
+
+import numpy as np
+from jaxtyping import Float
+
+from factorlib.errors import InputError
+from factorlib.export.scene import DIRECT
+from factorlib.render.ground import Plane
+from factorlib.render.photo_scene import PhotoScene, traced_photo
+from factorlib.render.placement import rotation_between
+from factorlib.results.materials import Reflectance
+from factorlib.tracing.scene import bsdf, transform
+
+REACH, SOLID = (
+    3.0,
+    0.3,
+)  # where the floor ends, in half extents of the objects; the share of that within which it does not fade
+HAIR = 1e-4  # of the objects' extent, by which the floor lies lower: surfaces must not meet
+COVERAGE_SAMPLES = 16
+
+
+def on_floor(
+    scene: PhotoScene,
+    plane: Plane,
+    reflectance: float,
+    samples: int,
+    world_from_camera: Float[np.ndarray, "4 4"],
+    with_light: bool = False,
+) -> Float[np.ndarray, "h w 4"]:
+    """The objects of `traced_photo` on a Lambertian floor of that reflectance: radiance times coverage, and coverage.
+
+    Raises InputError for a camera that is below the floor.
+    """
+    if (world_from_camera[:3, 3] - plane.point) @ plane.normal <= 0:
+        raise InputError("the camera is below the floor", key="floor", cure="look from higher, or leave the floor out")
+    points = np.concatenate([each.vertices for each in scene.objects])
+    extent = float(np.ptp(points, axis=0).max()) / 2
+    foot, frame = plane.onto(scene.middle[None])[0], np.eye(4)
+    frame[:3, :3] = REACH * extent * rotation_between(np.array([0.0, 0.0, 1.0]), plane.normal)
+    frame[:3, 3] = foot - HAIR * extent * plane.normal
+    floor = {
+        "type": "disk",
+        "to_world": transform(frame),
+        "bsdf": bsdf(Reflectance((reflectance,) * 3, (0.0,) * 3, 1.0)),
+    }
+    without = traced_photo(scene, samples, world_from_camera, with_light)
+    with_ = traced_photo(scene, samples, world_from_camera, with_light, {"floor": floor})
+    alone = traced_photo(scene, COVERAGE_SAMPLES, world_from_camera, max_depth=DIRECT)[..., 3]
+    eye = world_from_camera[:3, 3]
+    seen = Plane(plane.normal, plane.point - eye).hit(
+        (scene.camera.rays() @ world_from_camera[:3, :3].T).reshape(-1, 3)
+    )
+    far = np.linalg.norm(seen + eye - foot, axis=-1).reshape(alone.shape) / (REACH * extent)
+    t = np.clip((1 - np.nan_to_num(far, nan=np.inf)) / (1 - SOLID), 0, 1)
+    weight = np.maximum(alone, t * t * (3 - 2 * t))[..., None]
+    return weight * with_ + (1 - weight) * without
