@@ -30,7 +30,6 @@ from factorlib.render.studio import on_floor
 from factorlib.render.traced import Traced
 from factorlib.results.materials import Reflectance
 from factorlib.stage import Progress
-from factorlib.tracing.scene import rigid
 from factorlib.wholefile import write_text
 
 log = logging.getLogger("factorlib.recipes")
@@ -132,21 +131,27 @@ def insertion(recipe: schema.Insert, results: SolvedSet, photo: str, out: Path, 
 
 
 def staged(
-    recipe: schema.Backdropped, results: SolvedSet, photo: str, scene: PhotoScene, world_from_camera: np.ndarray
+    recipe: schema.Backdropped, results: SolvedSet, photo: str, scene: PhotoScene, azimuth: float, *higher: float
 ) -> Float[np.ndarray, "h w 4"]:
-    """The objects before the light or nothing, and on a floor where the recipe asks for one."""
+    """The objects from another side, before the light or nothing, and on a floor, about whose normal the camera then goes, where the recipe asks for one.
+
+    azimuth, higher: as of `orbit`
+    """
     lit = recipe.background == "light"
     if recipe.floor is None:
-        return traced_photo(scene, recipe.samples, world_from_camera, lit)
+        return traced_photo(scene, recipe.samples, orbit(scene, azimuth, *higher), lit)
     plane = results.ground(photo, scene.objects[0]).plane
-    return on_floor(scene, plane, recipe.floor, recipe.samples, world_from_camera, lit)
+    elevation, zoom = higher or (0.0, 1.0)
+    return on_floor(
+        scene, plane, recipe.floor, recipe.samples, orbit(scene, azimuth, elevation, zoom, plane.normal), lit
+    )
 
 
 def view(recipe: schema.View, results: SolvedSet, photo: str, out: Path, report: Report) -> None:
     """The objects alone, from another side."""
     report(0)
     scene = resized(results.scene(photo, recipe.sun), recipe.width)
-    traced = staged(recipe, results, photo, scene, orbit(scene, recipe.azimuth, recipe.elevation, recipe.zoom))
+    traced = staged(recipe, results, photo, scene, recipe.azimuth, recipe.elevation, recipe.zoom)
     _write_alone(out / photo, Traced(traced, results.tone(photo)))
 
 
@@ -159,7 +164,7 @@ def animation(
         report(k / recipe.frames)
         degrees = 360 * k / recipe.frames
         if isinstance(recipe, schema.Turntable):
-            traced = staged(recipe, results, photo, scene, orbit(scene, degrees))
+            traced = staged(recipe, results, photo, scene, degrees)
         else:
             turned = msgspec.structs.replace(scene, light=turned_light(scene.light, degrees))
             traced = traced_photo(turned, recipe.samples)
@@ -178,7 +183,7 @@ def relight(recipe: schema.Relight, results: SolvedSet, photo: str, out: Path, r
     for k, name in enumerate(lights):
         report(k / len(lights))
         lit = msgspec.structs.replace(scene, light=turned_light(results.light(name), recipe.rotate))
-        traced = staged(recipe, results, photo, lit, rigid(YUP_FROM_CAMERA, np.zeros(3)))
+        traced = staged(recipe, results, photo, lit, 0.0)
         shown = Traced(traced).exposed() if is_light_file(name) else Traced(traced, results.tone(name))
         _write_alone(out / photo / Path(name).stem, shown)
 

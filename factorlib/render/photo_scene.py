@@ -162,16 +162,20 @@ def resized(scene: PhotoScene, width: int | None) -> PhotoScene:
 
 
 def orbit(
-    scene: PhotoScene, azimuth_deg: float, elevation_deg: float = 0.0, zoom: float = 1.0
+    scene: PhotoScene,
+    azimuth_deg: float,
+    elevation_deg: float = 0.0,
+    zoom: float = 1.0,
+    up: Float[np.ndarray, "3"] = UP,
 ) -> Float[np.ndarray, "4 4"]:
     """world_from_camera of the photo's camera moved about the objects' middle.
 
-    azimuth_deg: to the right;  elevation_deg: upward;  zoom: of the size in the picture, by distance
+    azimuth_deg: to the right, about `up`;  elevation_deg: upward;  zoom: of the size in the picture, by distance
     """
     middle = scene.middle
-    right = np.cross(UP, -middle)
+    right = np.cross(up, -middle)
     right /= np.linalg.norm(right)
-    turn = rotation_of_vector(np.radians(azimuth_deg) * UP) @ rotation_of_vector(-np.radians(elevation_deg) * right)
+    turn = rotation_of_vector(np.radians(azimuth_deg) * up) @ rotation_of_vector(-np.radians(elevation_deg) * right)
     return rigid(turn @ YUP_FROM_CAMERA, middle - turn @ middle / zoom)
 
 
