@@ -2,6 +2,7 @@
 
 import base64
 from collections.abc import Mapping, Sequence
+from math import ceil
 from typing import Any
 
 import msgspec
@@ -25,6 +26,7 @@ from factorlib.results.metrics import PhotoErrors, ScoredLight
 from factorlib.urm.geometry import on_surface, read_geometry
 from factorlib.urm.observations import Observations, read_observations
 
+MOST_SHADED = 40_000  # pixels of the relit picture: some ten seconds
 AMPLIFICATION = 4  # of the difference between photo and re-synthesis
 UNCOUNTED = np.array([0.45, 0.38, 0.62])  # sRGB: in the mask, but not compared
 DISAGREES = np.array([0.92, 1.0, 0.0])
@@ -163,9 +165,8 @@ def relit(run: Artifacts, name: str, other: str | None, lights: Mapping[str, Lig
     reflector = Reflector(operator, light, curvature=model.curvature(lights[of].illumination))
     masks, geometry = run.channels("masks", name), read_geometry(run.folders["align"], run.folders.get("surface"), name)
     box = box_of(np.rint(masks["label"]) > 0)
-    step = max(
-        1, max(masks["label"][box].shape) // longest_side(len(run.set.photos))
-    )  # pixels that would be averaged anyway
+    label_shape, shaded = masks["label"][box].shape, int((masks["label"][box] > 0.5).sum())
+    step = max(1, max(label_shape) // longest_side(len(run.set.photos)), ceil((shaded / MOST_SHADED) ** 0.5))
     label = np.zeros_like(masks["label"])
     label[box][::step, ::step] = masks["label"][box][::step, ::step]
     seen = run.read(read_observations, "urm", f"{name}.parquet") if model.self_shadowing else None
