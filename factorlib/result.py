@@ -82,7 +82,7 @@ def load_result(folder: str | Path) -> Result:
         cure = f"make export DATASET={found.name}"
         raise InputError(f"the result is not whole: {missing[0]} is missing", file=found, cure=cure)
     folders = {stage: (found / stage).resolve() for stage in (*STAGES, "shapes", "surface") if (found / stage).is_dir()}
-    file, source = found / "export" / "dataset.json", found / "export" / "source"
+    file, source = found / "export" / "dataset.json", folders["export"] / "source"
     facts = read_json(file) if file.is_file() else {}
     if not (isinstance(facts, dict) and facts.keys() >= SLICES):
         cure = f"make export DATASET={found.name}"
@@ -139,7 +139,7 @@ class Result:
         In the light's own frame: the world's where the photo gives `world_from_camera`, and without the photo's exposure.
         """
         light = self._solved.lights[self._photo(name)].illumination
-        path = self.folder / "export" / "illumination" / f"{light}.exr"
+        path = self._solved.inputs.folders["export"] / "illumination" / f"{light}.exr"
         check_plain(path, "an environment map", most_bytes=None)
         return Environment(read_rgb_exr(path).astype(float))
 

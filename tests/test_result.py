@@ -42,6 +42,13 @@ def test_materials_have_their_numbers_and_standard_errors(result):
     assert result.objects == ["front/chair", "side/chair"]
 
 
+def test_it_stays_where_it_was_when_the_current_folder_changes(folder, tmp_path, monkeypatch):
+    monkeypatch.chdir(folder.parent)
+    result = factorlib.load_result(folder.name)
+    monkeypatch.chdir(tmp_path)
+    assert result.environment("front").lat_long.any() and result.insert("front", samples=1)
+
+
 def test_what_is_not_there_is_refused_with_what_is(result, tmp_path):
     for ask, words in [
         (lambda: result.materials["rde"], "did you mean 'red'"),

@@ -134,6 +134,13 @@ def test_it_shows_what_the_pipeline_renders(browser, material, view):
 
 
 @needs_chromium
+def test_what_faces_the_eye_straight_is_not_black(browser):
+    """Where a surface faces the eye straight, n·o rounds to more than 1; enlarged, many pixels of a ball do."""
+    found = shown(browser[0], -1, "brass", "noon", {"azimuth": 0.6, "zoom": 1000}, SIZE)
+    assert np.isfinite(found).all()
+
+
+@needs_chromium
 def test_a_mesh_shows_its_parts_where_they_are(browser):
     """The set's own ball is cut into three materials by turns: on the whole it is as bright as their mean."""
     page = browser[0]

@@ -133,7 +133,7 @@ void main() {
     facing = max(facing, 1e-3);
     vec3 t = o - n * dot(n, o); float across = length(t);
     t = across > 1e-5 ? t / across : normalize(abs(n.y) < 0.9 ? cross(n, vec3(0.0, 1.0, 0.0)) : cross(n, vec3(1.0, 0.0, 0.0)));
-    vec3 b = cross(n, t), local = vec3(sqrt(1.0 - facing * facing), 0.0, facing), stretched = normalize(vec3(local.x * alpha, 0.0, local.z));
+    vec3 b = cross(n, t), local = vec3(sqrt(max(0.0, 1.0 - facing * facing)), 0.0, facing), stretched = normalize(vec3(local.x * alpha, 0.0, local.z));
     float seen = smith(facing), a2 = alpha * alpha;
     mat3 light_from_local = light_from_ref * mat3(t, b, n);
     for (int k = 0; k < each; k++) {
