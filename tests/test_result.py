@@ -46,7 +46,7 @@ def test_it_stays_where_it_was_when_the_current_folder_changes(folder, tmp_path,
     monkeypatch.chdir(folder.parent)
     result = factorlib.load_result(folder.name)
     monkeypatch.chdir(tmp_path)
-    assert result.environment("front").lat_long.any() and result.insert("front", samples=1)
+    assert result.environment("front").lat_long.any() and result.render("front", width=16, samples=1).pixels.any()
 
 
 def test_what_is_not_there_is_refused_with_what_is(result, tmp_path):

@@ -1,10 +1,10 @@
 """The paper's solver: limited-memory quasi-Newton steps on random subsets of the observations (arXiv 1710.08313).
 
-    minimise  mean over observations and channels of (y − radiance)² / σ²  +  π · mean over lights of Var_c(W_c) / W̄²
+    minimise  mean over observations and channels of (y − radiance)² / σ²  +  β · mean over lights of Var_c(W_c) / W̄²
 
 with y the prediction of `factorlib.model.illumination`, σ its noise model, W_c the summed lobe weights of channel c and W̄ their
 mean.  Wang, Ritschel and Mitra say: L-BFGS; another random subset at every iteration; each observation sampled 5 times on average;
-n_p = 32 lobes an illumination; π = 0.1.  This is the baseline of every comparison.
+n_p = 32 lobes an illumination; β = 0.1.  This is the baseline of every comparison.
 
 Left open by the paper, or by what is known of it here, and chosen:
 
@@ -61,7 +61,7 @@ Prior = Annotated[float, msgspec.Meta(ge=0)]
 
 
 class Paper(msgspec.Struct, frozen=True):
-    """lobes: an illumination;  samplings: of each observation, on average over the run;  prior: π."""
+    """lobes: an illumination;  samplings: of each observation, on average over the run;  prior: β."""
 
     lobes: Lobes = 32
     samplings: Samplings = 5.0
