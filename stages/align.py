@@ -39,7 +39,10 @@ from factorlib.results.shapes import read_shapes
 from factorlib.stage import Inputs, Progress
 
 log = logging.getLogger("factorlib.align")
-CURE = "look at its overlay; give the object's keypoints or pose, or the photo's camera.focal_px, in dataset.yaml"
+CURE = (
+    "look at its overlay: is the mask whole there? Where it is, give the object's keypoints or pose, or the photo's "
+    "camera.focal_px, in dataset.yaml"
+)
 EXTERNAL = (
     "look at its overlay; does the source show this photo, and is the mesh where world_from_object or obj_ids say?"
 )

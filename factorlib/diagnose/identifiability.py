@@ -186,7 +186,7 @@ def before_solving(
         groups = "; ".join(f"{lights} (with {materials})" for lights, materials in pairs)
         said.append(
             f"the photos fall into {len(linked)} sets that share no material, so their reflectances cannot be compared: {groups}. "
-            "A photo that shows a material of each would link them"
+            "An object that is left out of the solve may link them, once its pose is good; else a photo that shows a material of each would"
         )
     return said + undetermined_by_observations(names, blocks, known)
 

@@ -146,7 +146,8 @@ def _of_contour(signs: Signs) -> tuple[str, str]:
     photo, name = max(each, key=each.__getitem__)
     return (
         f"outlines of meshes and masks that differ, most of all those of '{name}' in '{photo}'",
-        f"give a mesh that is nearer to '{name}', or a larger photo; if its pose in the overlay of '{photo}' is wrong, give keypoints",
+        f"look at the overlays of '{name}': mend masks that have holes or lack a piece; else give a mesh that is nearer to it, or a larger photo; "
+        f"if its pose in '{photo}' is wrong, give keypoints",
     )
 
 

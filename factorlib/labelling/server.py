@@ -221,10 +221,10 @@ class _Request(BaseHTTPRequestHandler):
                     return b"", data, masks.save(index, labels, self.headers.get("X-Version", ""))
             case "POST", "grow":  # labels, and 1 where they are sure; the labels grown in the box come back
                 box = tuple(map(int, re.findall("[0-9]+", query.get("box", "")[:40])))
-                if len(box) != 4 or not (box[0] < box[2] <= width and box[1] < box[3] <= height):
-                    raise InputError("the box is not in the photo")
+                if len(box) != 5 or not (box[0] < box[2] <= width and box[1] < box[3] <= height and box[4] < 256):
+                    raise InputError("the box is not in the photo, or has no label")
                 label, sure = np.frombuffer(self._body(2 * height * width), np.uint8).reshape(2, height, width)
-                return grow(box, masks.picture(index), label, sure > 0).tobytes(), data
+                return grow(box[:4], box[4], masks.picture(index), label, sure > 0).tobytes(), data
             case "POST", "unsaved":
                 (self.server.unsaved.add if self._body(1) == b"1" else self.server.unsaved.discard)(index)
                 return b"", data

@@ -2,7 +2,7 @@
 
 A walker starts at a pixel, seldom crosses an edge of the photo, and stops at a stroke: the pixel takes the label that it most likely
 stops at (Grady 2006).  It also stops anywhere, at a label that has such colours there (Grady 2005).  The colours are learnt from the strokes,
-and then twice more from the answer, as GrabCut does (Rother et al. 2004).
+a little from the first guess, and then twice more from the answer, as GrabCut does (Rother et al. 2004).
 """
 
 from __future__ import annotations
@@ -19,25 +19,37 @@ ROUNDS = 3
 BINS = 32  # of a channel, in a label's histogram of colours, which is smoothed by a Gaussian of one bin
 FLOOR = 1e-7  # the probability of a colour that a label has nowhere
 PRIOR = 0.05  # γ: how often a walker stops at a colour, against a step to a pixel like its own
+GUESSED = 0.1  # the weight of the first guess's colours beside those of strokes, which may lie on a glint alone
 CROSSING = 1e-3  # how often it crosses the strongest edge, likewise
 BESIDE = 0.05  # of a box's longer side: what lies so near to it is looked at, too
 
 
 def grow(
-    box: tuple[int, int, int, int], pixels: UInt8[np.ndarray, "h w 3"], label: UInt8[np.ndarray, "h w"],
+    box: tuple[int, int, int, int], fill: int, pixels: UInt8[np.ndarray, "h w 3"], label: UInt8[np.ndarray, "h w"],
     sure: Bool[np.ndarray, "h w"], most_pixels: int = MOST_PIXELS,
 ) -> UInt8[np.ndarray, "h w"]:  # fmt: skip
     """The labels of a picture, grown inside a box from those of `sure` pixels, which stay, and of pixels beside the box.
 
-    box: first column, first row, and those behind the last;  pixels: sRGB-encoded;  label: inside, a first guess, which counts where
-    some label has no sure pixel.  A box of more than `most_pixels` is averaged down by a whole factor, and the answer interpolated.
+    box: first column, first row, and those behind the last;  fill: the label of the box;  pixels: sRGB-encoded;  label: inside, a first
+    guess.  Background, `fill` and the labels of sure pixels grow.  Any other is of another object: it stays, and counts as background, where
+    most of it lies beyond the box; elsewhere `fill` takes its place.
+    A box of more than `most_pixels` is averaged down by a whole factor, and the answer interpolated.
     """
     x0, y0, x1, y1 = box
+    inside = np.zeros_like(sure)
+    inside[y0:y1, x0:x1] = True
+    stays = ~inside
+    for kind in set(np.unique(label[inside]).tolist()) - {0, fill}:
+        bodies = ndimage.label(label == kind)[0]
+        pixels_of, pixels_in = np.bincount(bodies.ravel()), np.bincount(bodies[inside], minlength=bodies.max() + 1)
+        stays |= (2 * pixels_in < pixels_of)[bodies] & (bodies > 0)
+    own = np.isin(label, [0, fill, *np.unique(label[sure & ~stays])])
+    sure = stays | (inside & sure)
+    first = np.where(own, label, np.where(stays, 0, fill)).astype(np.uint8)
+    result = np.where(sure, label, first)
     beside = max(4, round(BESIDE * max(x1 - x0, y1 - y0)))
     part = np.s_[max(0, y0 - beside) : y1 + beside, max(0, x0 - beside) : x1 + beside]
-    all_sure, result = np.ones_like(sure), label.copy()
-    all_sure[y0:y1, x0:x1] = sure[y0:y1, x0:x1]
-    pixels, label, sure = pixels[part], label[part], all_sure[part]
+    pixels, label, sure = pixels[part], first[part], sure[part]
     factor = ceil((label.size / most_pixels) ** 0.5)
     some = np.s_[factor // 2 :: factor, factor // 2 :: factor]
     strokes = ndimage.maximum_filter(np.where(sure, label + 1.0, 0), factor)[some]  # thin ones count, too
@@ -49,7 +61,7 @@ def grow(
     chances = _walk(colour, kinds, coarse, fixed).astype(np.float32)
     scale = (1, *(n / m for n, m in zip(label.shape, coarse.shape)))
     grown = kinds[ndimage.zoom(chances, scale, order=1, mode="nearest", grid_mode=True).argmax(axis=0)]
-    result[part] = np.where(sure, label, grown)
+    result[part] = np.where(sure, result[part], grown)
     return result
 
 
@@ -75,7 +87,8 @@ def _walk(
     chances = np.empty((len(kinds), label.size))
     learnt = known if np.isin(kinds, current[known]).all() else np.ones_like(known)
     for _ in range(ROUNDS):
-        prior = np.array([_histogram(bins[learnt & (current == kind)])[bins] for kind in kinds])  # p
+        some, every = ([_histogram(bins[which & (current == kind)]) for kind in kinds] for which in (learnt, True))
+        prior = (np.array(some) + GUESSED * np.array(every))[:, bins]  # p
         prior /= prior.sum(axis=0)
         for k, kind in enumerate(kinds):
             chances[k, known] = current[known] == kind

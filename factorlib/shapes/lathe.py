@@ -20,6 +20,7 @@ import msgspec
 import numpy as np
 from jaxtyping import Float
 from scipy.interpolate import UnivariateSpline
+from scipy.ndimage import binary_fill_holes
 from scipy.optimize import minimize
 
 from factorlib.align.refine import FocalPrior
@@ -68,7 +69,7 @@ def body_of_revolution(outlines: Sequence[Outline], report: Callable[[float], No
 
     report: the share that is done.  Raises InputError where no photo shows it whole enough to tell its axis.
     """
-    outlines = sorted(outlines, key=lambda one: -int((one.part > 0).sum()))
+    outlines = sorted(map(_without_holes, outlines), key=lambda one: -int((one.part > 0).sum()))
     given = [Turned(np.zeros((0, 2)), one.pose, one.camera, 0.0) for one in outlines if one.pose is not None]
     if given:
         known = [one for one in outlines if one.pose is not None]
@@ -99,6 +100,11 @@ def body_of_revolution(outlines: Sequence[Outline], report: Callable[[float], No
     return msgspec.structs.replace(
         mesh_of(profile).of_size(1.0), overlap=float(np.mean([pose.overlap for pose in poses]))
     )
+
+
+def _without_holes(one: Outline) -> Outline:
+    """The outline with the background that it encloses, as a glint that a mask lacks: no body of revolution has such a hole."""
+    return msgspec.structs.replace(one, part=np.where(binary_fill_holes(one.part) & (one.part == 0), 1, one.part))
 
 
 class Laid(msgspec.Struct, frozen=True):

@@ -156,13 +156,13 @@ def test_odd_requests_change_nothing(folder):
             "mask/1" + "0" * 5000,
         ):
             assert asked(server, "GET", f"/{path}")[0] == 400, path
-        for odd_box in ("", "0,0,21,30", "5,5,5,9", "0,0,x,9", "1,2,3", "9" * 99):
+        for odd_box in ("", "0,0,21,30,1", "5,5,5,9,1", "0,0,x,9,1", "1,2,3,4", "0,0,9,9,256", "9" * 99):
             assert asked(server, "POST", f"/grow/1?box={odd_box}", bytes(1200))[0] == 400, odd_box
         assert (folder / "given.png").read_bytes() == before
         own = {"X_Version": version, "Origin": f"http://{server.host}"}
         assert asked(server, "PUT", "/mask/1", bytes(600), **own)[1]["X-Version"] == server.masks.version(1) != version
         body = b"".join(part.astype(np.uint8).tobytes() for part in clicked(truth, box))
-        found = asked(server, "POST", f"/grow/0?box={','.join(map(str, box))}", body)[2]
+        found = asked(server, "POST", f"/grow/0?box={','.join(map(str, box))},1", body)[2]
     assert (np.frombuffer(found, np.uint8).reshape(60, 60) == truth).mean() > 0.98
 
 
@@ -215,6 +215,8 @@ def test_in_a_browser_by_mouse_and_keys(folder):
         page.get_by_role("img", name="day: no label yet").wait_for()
         drawn("g", (30, 22))
         page.get_by_text("First draw a box").wait_for()
+        drawn("x", (30, 22))
+        page.get_by_text("A box is dragged").wait_for()
         drawn("x", box[:2], box[2:])
         drawn("g", (30, 22))
         page.keyboard.press("2")

@@ -83,6 +83,15 @@ def test_a_vase_by_lathe_has_the_vase_s_profile():
     assert min(each.mean() for each in off) < 0.05
 
 
+def test_a_glint_that_a_mask_lacks_bores_no_hole_and_narrows_no_vase():
+    whole = [outline(VASE, AROUND[k], True) for k in (1, 4)]
+    part = whole[0].part.copy()
+    x, y = whole[0].middle.astype(int)
+    part[y - 6 : y + 6, x - 12 : x - 6] = 0
+    shapes = [body_of_revolution([one, whole[1]]) for one in (whole[0], msgspec.structs.replace(whole[0], part=part))]
+    assert np.array_equal(shapes[0].vertices, shapes[1].vertices)
+
+
 def test_the_largest_disc_is_that_of_the_slow_search():
     one, heights = outline(VASE, AROUND[1], True), np.array([-0.2, 0.1, 0.3])
     fast = largest_discs(one, Turned(np.zeros((0, 2)), one.pose, one.camera, 0.0), heights)
