@@ -46,7 +46,12 @@ class Child:
         self.threads, self.run, self.busy = threads, run, False
         self.connection, theirs = Pipe()
         command = [sys.executable, "-P", "-c", MAIN, str(theirs.fileno()), str(threads), str(os.getpid()), str(run)]
-        fixed = {"PYTHONHASHSEED": "0", **arithmetic.VARIABLES, **dict.fromkeys(THREAD_VARIABLES, str(threads))}
+        fixed = {
+            "PYTHONHASHSEED": "0",
+            "OMP_WAIT_POLICY": "PASSIVE",  # threads that wait by spinning stand in the way of others, and of each other
+            **arithmetic.VARIABLES,
+            **dict.fromkeys(THREAD_VARIABLES, str(threads)),
+        }
         environment = {name: value for name, value in os.environ.items() if name != TRIM} | fixed
         before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})  # the child inherits that: it never sees one
         self.process = subprocess.Popen(command, env=environment, stdin=subprocess.DEVNULL, pass_fds=[theirs.fileno()])
