@@ -112,7 +112,8 @@ def text_of(verdict: Verdict) -> str:
 
 
 def _percent(share: float) -> str:
-    """
+    """Write a share in percent; one below a hundredth by its first digit.
+
     >>> _percent(0.042), _percent(0.0032)
     ('4%', '0.3%')
     """

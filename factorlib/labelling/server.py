@@ -116,12 +116,9 @@ class MaskSet:
         return self.version(index)
 
     def _named(self, photo: str) -> str | None:
-        """dataset.yaml with the mask's path in place of the photo's `?` and no other change; None where none stands there."""
-        text, mask, photos = (
-            read_text(self.yaml, "a YAML file"),
-            f"masks/{photo}.png",
-            read_yaml(self.yaml, Spec).photos,
-        )
+        """Return dataset.yaml with the mask's path in place of the photo's `?` and no other change; None where none stands there."""
+        text, mask = read_text(self.yaml, "a YAML file"), f"masks/{photo}.png"
+        photos = read_yaml(self.yaml, Spec).photos
         index = next((k for k, each in enumerate(photos) if (each.name, each.masks) == (photo, UNKNOWN)), None)
         if index is None:
             return None
@@ -202,11 +199,8 @@ class _Request(BaseHTTPRequestHandler):
             case "GET", "/":
                 return (files("factorlib.labelling") / "page.html").read_bytes(), "text/html; charset=utf-8"
             case "GET", "/set":
-                photos, tags = (
-                    [photo.name for photo in masks.photos],
-                    cycle(PALETTE),
-                )  # not their own, to be seen on them
-                materials = list(zip(masks.materials, tags))
+                materials = list(zip(masks.materials, cycle(PALETTE)))  # not their own colours, to be seen on them
+                photos = [photo.name for photo in masks.photos]
                 about = {"name": masks.folder.name, "photos": photos, "materials": materials}
                 return msgspec.json.encode(about), "application/json"
             case "GET", "photo":

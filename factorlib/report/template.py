@@ -29,7 +29,7 @@ def rendered(template: str, **context: Any) -> str:
     environment.filters |= {
         "in_script": _in_script, "plain": lambda value: f"{value:.6g}", "worst": lambda values: max(values, key=abs),
     }  # fmt: skip
-    environment.tests["of_a_parameter"] = lambda change: ": parameter " in change or ": default of parameter " in change
+    environment.tests["of_a_parameter"] = lambda change: ": parameter " in change
     return environment.get_template(template).render(context)
 
 

@@ -41,3 +41,10 @@ def test_a_shadow_lies_beneath_the_ball_and_nothing_far_from_it(scene):
 def test_a_camera_below_the_floor_is_refused(scene):
     with pytest.raises(InputError, match="below the floor"):
         on_floor(scene, PLANE, 0.5, 1, orbit(scene, 0, -40))
+
+
+def test_about_a_tilted_normal_the_camera_keeps_its_height_and_its_distance(scene):
+    up = np.array([0.0, 0.8, 0.6])
+    places = np.array([orbit(scene, azimuth, up=up)[:3, 3] - scene.middle for azimuth in (0, 90, 180)])
+    np.testing.assert_allclose(places @ up, np.full(3, places[0] @ up), atol=1e-9)
+    np.testing.assert_allclose(np.linalg.norm(places, axis=1), np.linalg.norm(scene.middle), atol=1e-9)

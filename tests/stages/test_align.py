@@ -10,6 +10,7 @@ import pytest
 
 from factorlib.align.given import check_before_camera, warn_of_camera
 from factorlib.align.search import Search
+from factorlib.dataset.schema import ObjectsSlice
 from factorlib.errors import InputError
 from factorlib.geometry.camera import Pose
 from factorlib.geometry.raster import rasterise
@@ -187,3 +188,20 @@ def test_keypoints_and_principal_point_are_pixels_of_the_file(tmp_path):
     assert obj["source"] == "keypoints" and obj["doubts"] == []
     assert np.allclose(obj["rotation"], pose.rotation, atol=0.02)
     assert entry["camera"]["principal_point"] == [100.0, 75.0]
+
+
+def test_keypoints_are_pixels_of_the_photo_before_its_lens_was_undone(tmp_path):
+    inputs = step(tmp_path, chair(), chair())[0]
+    known = {"focal_px": 600.0, "principal_point": [200.5, 150.0], "distortion": [0.3, 0.0]}
+    slice_ = inputs.facts["dataset.objects"]
+    slice_["objects"][0]["keypoints"] = [
+        {"pixel": [x, 2 * x], "point": [x, 0.0, 1.0]} for x in (10.0, 60.0, 80.0, 140.0)
+    ]
+    channels, found = read_exr(inputs["masks"] / "a.exr"), []
+    for camera in (known, known | {"distortion": None}):
+        given = msgspec.convert({**slice_, "camera": camera}, ObjectsSlice)
+        found.append(align.objects_of(given, channels, inputs, align.Params(), 2, None)[0].keypoints.pixel)
+    bent = (found[1] - [100.25, 75.0]) / 300
+    assert np.abs(found[1] - found[0]).max() > 1
+    straight = (found[0] - [100.25, 75.0]) / 300
+    np.testing.assert_allclose(straight * (1 + 0.3 * np.square(straight).sum(1, keepdims=True)), bent, atol=1e-9)

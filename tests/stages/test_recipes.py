@@ -46,6 +46,7 @@ ANIMATED = ["front.gif", "front.mp4"] if find_spec("av") else ["front.gif"]
 KINDS = [
     (schema.Resynthesis(samples=1), PICTURES["front"] + PICTURES["side"]),
     (schema.View(photos=["side"], samples=1, width=32, background="light"), PICTURES["side"]),
+    (schema.View(photos=["side"], samples=1, azimuth=180, floor=0.5), PICTURES["side"]),
     (schema.Turntable(**FRONT, frames=3), [*ANIMATED, *(f"front/00{k}.png" for k in range(3))]),
     (schema.MovingLight(**FRONT, frames=2, width=16), [*ANIMATED, "front/000.png", "front/001.png"]),
     (schema.Relight(samples=1, rotate=30.0, photos=["side"]), [f"side/{name}" for name in PICTURES["front"]]),
