@@ -27,6 +27,8 @@ def test_a_shadow_lies_beneath_the_ball_and_nothing_far_from_it(scene):
         for share in (None, 0.0, 0.8)
     )
     assert (pale[:3, :, 3] == plain[:3, :, 3]).all(), "the sky is empty as before"
+    fading = (plain[..., 3] == 0) & (pale[..., 3] > 0.1) & (pale[..., 3] < 0.9)
+    assert fading.sum() > 100, "the floor ends without an edge"
     inside, below = plain[..., 3] > 0.99, (plain[..., 3] == 0) & (pale[..., 3] > 0.5)
     assert below.sum() > 100 and np.abs(dark[below][:, :3]).max() < 1e-6
     rows, columns = np.nonzero(below)
