@@ -8,8 +8,6 @@ Which label shows which part of a mesh is found by laying the mesh on the masks 
 What no file says, and pairings that are not sure, are left as `?`, which `make validate` refuses, and listed; so is what must be renamed.
 """
 
-from __future__ import annotations
-
 import os
 import re
 import shutil

@@ -5,8 +5,6 @@ in its file, from the +z side with +y up, its parts in the colours of their mate
 it shows what there is: the material of a part that is left open is called `?`.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from contextlib import suppress
 from functools import partial

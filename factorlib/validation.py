@@ -6,8 +6,6 @@ The runner loads this module by its name, as it loads stages: it knows no scienc
 pay for any.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterable, Iterator
 from functools import partial
 from pathlib import Path

@@ -1,7 +1,5 @@
 """A photo as the stages `masks` and `align` left it: its channels, its camera, and its objects where they were found."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import msgspec

@@ -1,7 +1,5 @@
 """All objects of one photo: given poses are used, the others searched, one camera for all."""
 
-from __future__ import annotations
-
 import logging
 from collections.abc import Sequence
 

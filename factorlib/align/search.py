@@ -5,8 +5,6 @@ three resolutions, fewer at each.  Whatever survives beside the winner, turned b
 and is the runner-up: how near its score comes, and how different its normals are, says how far the answer can be trusted.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterable
 from typing import Annotated
 

@@ -4,8 +4,6 @@
 follows once cameras that are known from elsewhere have been read.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterator
 from pathlib import Path

@@ -3,8 +3,6 @@
 Only what geometry needs is decoded; textures, animations and the like are skipped.  Names of fields are glTF 2.0's.
 """
 
-from __future__ import annotations
-
 import re
 import struct
 from pathlib import Path, PurePosixPath

@@ -4,8 +4,6 @@ Imports nothing heavy, for a run that has nothing to do passes here too; only a 
 pays for pycolmap (.2 s).
 """
 
-from __future__ import annotations
-
 import logging
 import mmap
 import os

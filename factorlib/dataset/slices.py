@@ -4,8 +4,6 @@ A step's key holds the slices it declares and the hashes of their files, so a sl
 need, with defaults filled in: naming the default illumination, or reordering photos, changes no photo's facts.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from typing import Any
 

@@ -14,8 +14,6 @@ that scores less than 18 dB, as a flat disc of the mean colour does, is called g
 shows both on sets that had no part in this (`python -m studies.measured.verdict`).
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Mapping
 
 import msgspec

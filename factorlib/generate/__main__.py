@@ -1,7 +1,5 @@
 """python -m factorlib.generate synthetic|eames: the data sets the project carries, or others of the same protocol."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from shutil import rmtree
 from types import ModuleType

@@ -5,8 +5,6 @@ chair (47 cm wide at the feet, 52 cm deep, 82 cm high) by formulas of our own.  
 `rough_chair` what a user might have of it: fewer, flatter faces, thicker legs, and a few millimetres off everywhere; `bent_chair` a worse one.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from pathlib import Path
 

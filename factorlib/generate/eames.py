@@ -6,8 +6,6 @@ was photographed, no poses, and half of the focal lengths unknown.  Three of the
 one sees what each costs: `exact` geometry, `distant` light, `direct` light.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any

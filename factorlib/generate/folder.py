@@ -1,7 +1,5 @@
 """Writing a data set: photos as cameras write them, label masks, truth, and the YAML that names them all."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any

@@ -5,8 +5,6 @@ within a metre of the origin, so that the light which arrives at the origin, or 
 Radiance is in arbitrary units: a data set scales each light by its photo's exposure.  Random materials are here, too.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any

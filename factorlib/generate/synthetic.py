@@ -5,8 +5,6 @@ object shadows or mirrors another.  One photo is a linear EXR, one a 16-bit PNG,
 clipped; one pose is not given.  Seed 0 is the set the project carries; others have other materials, views and lights.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from pathlib import Path
 

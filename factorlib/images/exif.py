@@ -1,8 +1,6 @@
 """What a camera wrote about a photo (EXIF), by OpenImageIO's names of the tags: how much light its exposure let in, and the focal length
 in pixels.  Focal lengths hold for the whole frame only: a crop keeps the tags and changes the angle, by how much nobody wrote down."""
 
-from __future__ import annotations
-
 import logging
 import math
 import struct

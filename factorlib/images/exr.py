@@ -3,8 +3,6 @@
 OpenImageIO stamps the date into every file: here the date is fixed.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from pathlib import Path
 

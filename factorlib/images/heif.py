@@ -4,8 +4,6 @@ Orientation is a property of the picture in HEIF (`irot`, `imir`), which the dec
 be applied again.  The picture is decoded at once, in its own codes: 96 MB for 48 megapixels of 8 bits grey, 288 MB of 10 bits RGB.
 """
 
-from __future__ import annotations
-
 import io
 from contextlib import suppress
 from functools import cache

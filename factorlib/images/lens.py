@@ -4,8 +4,6 @@ A ray of slopes (a, b) = (x, y)/z meets the photo at centre + focal · (1 + k₁
 two coefficients.  The picture keeps its size, focal length and principal point.
 """
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import msgspec

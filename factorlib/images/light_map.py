@@ -1,7 +1,5 @@
 """Lat-long maps of light, in Radiance HDR or OpenEXR: read by header first, a large one averaged down while it is read."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

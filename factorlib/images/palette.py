@@ -1,7 +1,5 @@
 """A colour for each material, to tell it in masks and tables: distinct, and as near to its own as can be."""
 
-from __future__ import annotations
-
 import numpy as np
 from jaxtyping import Float
 from scipy.optimize import linear_sum_assignment

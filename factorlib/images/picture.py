@@ -1,7 +1,5 @@
 """Pictures for people: linear radiance as 8-bit sRGB, and PNG files that are the same bytes for the same pixels."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

@@ -3,8 +3,6 @@
 Neither can be undone: radiance is then no longer the same function of the pixel's code everywhere.  They are found, and said.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from typing import Any
 

@@ -5,8 +5,6 @@ Run lengths are decoded here, for pycocotools takes every one at its word; what 
 of the number of runs and one picture.  The shapes of other photos in the file are left as text.
 """
 
-from __future__ import annotations
-
 from pathlib import Path, PurePosixPath
 
 import msgspec

@@ -5,8 +5,6 @@ stops at (Grady 2006).  It also stops anywhere, at a label that has such colours
 a little from the first guess, and then twice more from the answer, as GrabCut does (Rother et al. 2004).
 """
 
-from __future__ import annotations
-
 from math import ceil
 
 import numpy as np

@@ -5,8 +5,6 @@ such edges becomes two, three or four, so that neighbours agree along every edge
 one node, on whichever side of a crease they stand; nodes are numbered by position.
 """
 
-from __future__ import annotations
-
 import msgspec
 import numpy as np
 from jaxtyping import Float, Int

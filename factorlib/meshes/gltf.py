@@ -4,8 +4,6 @@ A part goes by the name of its primitive (its mesh's, numbered from the second o
 mesh has no other primitive, and of its material.  What a header promises is counted before any buffer is opened.
 """
 
-from __future__ import annotations
-
 import base64
 from pathlib import Path
 from urllib.parse import unquote_to_bytes

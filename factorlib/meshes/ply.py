@@ -4,8 +4,6 @@ The numbers of a text file are read as rows of float64, so that one reader does 
 length (trimesh refuses these).  Nothing is made that the file has no room for.
 """
 
-from __future__ import annotations
-
 import re
 from pathlib import Path
 

@@ -5,8 +5,6 @@ one part, named as the file).  Faces that cannot be used are dropped and counted
 result in silence is refused.
 """
 
-from __future__ import annotations
-
 import logging
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path

@@ -16,8 +16,6 @@ Wherever there are gauges: none, scalar_per_set, channel_per_photo (`factorlib.e
 relative to the white of the truth and after the tone map; DSSIM after the tone map (`factorlib.evaluate.picture`).
 """
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Generic, Literal, TypeVar
 

@@ -8,8 +8,6 @@ smoothed without shrinking (Taubin 1995), as far as its outlines allow: where th
 face belongs to the part that most photos show there.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 
 import msgspec

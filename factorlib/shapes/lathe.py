@@ -11,8 +11,6 @@ agrees best is kept.  With one photo, which does not say it, the strongest tilt 
 are flat more often than round.  Then the radii are carved again from all outlines.  The axis is the shape's y.
 """
 
-from __future__ import annotations
-
 import logging
 from collections.abc import Callable, Iterator, Sequence
 

@@ -6,8 +6,6 @@ turns, the background gives cameras that stand still.  Of those believed, the on
 photos give the same cameras.
 """
 
-from __future__ import annotations
-
 import logging
 from collections.abc import Callable, Mapping
 from pathlib import Path

@@ -1,7 +1,5 @@
 """An object's outline in a photo, as shapes are found from it, and triangles as they are written."""
 
-from __future__ import annotations
-
 from functools import cached_property
 from pathlib import Path
 
@@ -81,7 +79,7 @@ class Triangles(msgspec.Struct, frozen=True):
         label = np.ones(len(self.faces), np.int16)
         return Mesh(self.vertices, self.faces.astype(np.int32), np.ones_like(self.vertices), label)
 
-    def of_size(self, size: float) -> Triangles:
+    def of_size(self, size: float) -> "Triangles":
         """The middle of its bounding box in the origin, and the longest side of that `size`."""
         low, high = self.vertices.min(axis=0), self.vertices.max(axis=0)
         return msgspec.structs.replace(self, vertices=(self.vertices - (low + high) / 2) * (size / (high - low).max()))

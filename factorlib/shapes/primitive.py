@@ -4,8 +4,6 @@ A ball has none.  A box has two, a cylinder (about y) one: the factors of its ax
 photos, to the outlines.  The descent begins from several shapes, each laid on the `PHOTOS` photos that show most; the shape that overlaps most is kept.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 
 import msgspec

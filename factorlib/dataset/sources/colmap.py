@@ -5,8 +5,6 @@ here needs, and pycolmap, which reads all of it, takes every count in a binary f
 for ever, or fills memory).
 """
 
-from __future__ import annotations
-
 import math
 import mmap
 import struct
