@@ -24,7 +24,7 @@ from factorlib.images.palette import nearest_tags, rgb_of
 from factorlib.images.photo import decoded, open_photo
 from factorlib.images.picture import picture, png_bytes
 from factorlib.images.transfer import srgb_decode
-from factorlib.labels import Labels, read_labels
+from factorlib.labels.labels import Labels, read_labels
 from factorlib.meshes.mesh import Mesh
 from factorlib.meshes.read import read_mesh
 from factorlib.reading import path_inside

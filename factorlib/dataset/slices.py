@@ -77,6 +77,11 @@ def _objects(dataset: Dataset, photo: PhotoEntry) -> tuple[schema.ObjectsSlice, 
     return facts, files + _object_masks(photo)
 
 
+def _set(dataset: Dataset) -> tuple[schema.SetSlice, list[str]]:
+    photos = [photo.name for photo in dataset.spec.photos]
+    return schema.SetSlice(dataset.name, dataset.spec.materials, dataset.spec.meshes, photos), []
+
+
 def _known(dataset: Dataset) -> tuple[schema.KnownSlice, list[str]]:
     known, balls = dataset.spec.known, {}
     for name, of in known.illumination.items():
@@ -127,12 +132,7 @@ _OF_PHOTO: dict[str, Callable[[Dataset, PhotoEntry], tuple[Any, list[str]]]] = {
 }
 _OF_SET: dict[str, Callable[[Dataset], tuple[Any, list[str]]]] = {
     "materials": lambda dataset: (dataset.spec.materials, []),
-    "set": lambda dataset: (
-        schema.SetSlice(
-            dataset.name, dataset.spec.materials, dataset.spec.meshes, [p.name for p in dataset.spec.photos]
-        ),
-        [],
-    ),
+    "set": _set,
     "shapes": _shapes,
     "known": _known,
     "truth": lambda dataset: (dataset.truth, dataset.truth.maps if dataset.truth else []),

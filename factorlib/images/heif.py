@@ -71,9 +71,7 @@ def open_heif(path: str | Path, key: str | None) -> Stored:
 
     exif = exif_of(info.get("exif"))
     across, down = (exif.get(name) for name in SIZES)
-    if (
-        across and down and (across > down) != (width > height)
-    ):  # what the camera wrote is of the picture before it was turned
+    if across and down and (across > down) != (width > height):  # those of the picture before it was turned
         exif |= dict(zip(SIZES, (down, across)))
     profile = ""
     with suppress(OSError, ImageCms.PyCMSError):

@@ -28,9 +28,8 @@ class Lens(msgspec.Struct, frozen=True):
     def colmap(self) -> pycolmap.Camera:
         """The same camera as pycolmap's."""
         width, height = (max(1, round(2 * c)) for c in self.centre)
-        return pycolmap.Camera(
-            model="RADIAL", width=width, height=height, params=[self.focal, *self.centre, *self.coefficients]
-        )
+        params = [self.focal, *self.centre, *self.coefficients]
+        return pycolmap.Camera(model="RADIAL", width=width, height=height, params=params)
 
     def distorted(self, points: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, "n 2"]:
         """Where the photo shows what a pinhole shows at these points."""

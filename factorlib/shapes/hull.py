@@ -36,21 +36,14 @@ Points = Float[np.ndarray, "n 3"]
 
 
 def visual_hull(
-    outlines: Sequence[Outline],
-    cells: int,
-    parts: int = 1,
-    report: Callable[[float], None] = lambda share: None,
+    outlines: Sequence[Outline], cells: int, parts: int = 1, report: Callable[[float], None] = lambda share: None
 ) -> Triangles:
     """The hull in the object's frame.  outlines: all with poses;  cells: of the grid, along its longest side;  parts: of the object.
 
     report: the share that is done.  Raises InputError where there are fewer than two outlines, or nothing fits into all of them.
     """
     if len(outlines) < 2:
-        fault = (
-            f"{len(outlines)} photos with a known camera show it"
-            if not outlines
-            else "only one photo with a known camera shows it"
-        )
+        fault = f"{'only one photo' if outlines else 'no photo'} with a known camera shows it"
         cure = "a hull needs two at least, better ten: `cameras: {sfm: true}` finds them where photos overlap, or use lathe or primitive"
         raise InputError(fault, cure=cure)
     middle, radius = _about(outlines)
@@ -60,9 +53,8 @@ def visual_hull(
         shape = np.ceil((high - low) / step).astype(int) + 3
         origin = (low + high) / 2 - step * (shape - 1) / 2
         field = _sampled(outlines, origin, step, shape, report)
-        inside = np.argwhere(
-            field > (-step if count == FIRST != cells else 0)
-        )  # at first, what is thinner than a cell too
+        least = -step if count == FIRST != cells else 0  # at first, what is thinner than a cell too
+        inside = np.argwhere(field > least)
         if not len(inside):
             cure = "are masks and cameras of the same photos, and does each photo show the whole object or say by 255 what hides it?"
             raise InputError("no body fits into the outlines of all photos", cure=cure)
@@ -126,9 +118,8 @@ def inside_all(outlines: Sequence[Outline], points: Points) -> Float[np.ndarray,
         seen = outline.pose.apply(points)
         depth = np.maximum(seen[:, 2], LEAST_Z)
         inner = outline.inner(outline.camera.project(np.column_stack([seen[:, :2], depth])))
-        least = np.minimum(
-            least, np.where(seen[:, 2] > LEAST_Z, np.minimum(inner, FREE) * depth / outline.camera.focal, -1.0)
-        )
+        inner = np.minimum(inner, FREE) * depth / outline.camera.focal
+        least = np.minimum(least, np.where(seen[:, 2] > LEAST_Z, inner, -1.0))
     return least
 
 

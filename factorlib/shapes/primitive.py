@@ -39,10 +39,9 @@ def primitive(
         mesh = unit(kind, np.array(begun, float)).as_mesh()
         sightings = []
         for one in outlines:
-            found = find(Caster(mesh), one.silhouette, one.camera, one.prior, SEARCH)
-            sightings.append(
-                Sighting(mesh, target_of(one.silhouette, (1,), RESOLUTION), one.camera, one.prior, found.state)
-            )
+            state = find(Caster(mesh), one.silhouette, one.camera, one.prior, SEARCH).state
+            target = target_of(one.silhouette, (1,), RESOLUTION)
+            sightings.append(Sighting(mesh, target, one.camera, one.prior, state))
         factors, _, score = fitted(sightings, STEPS, FREE_FACTORS.get(kind, np.zeros((3, 0))))
         if score > best[0]:
             best = score, factors * begun
