@@ -27,10 +27,9 @@ from jaxtyping import Float
 
 from factorlib.errors import InputError, did_you_mean
 from factorlib.geometry.camera import rotation_of_vector
-from factorlib.images.exr import LAT_LONG, read_rgb_exr, write_rgb_exr
+from factorlib.images.exr import LAT_LONG, read_rgb_exr, write_hdr, write_rgb_exr
 from factorlib.images.light_map import read_light_map
 from factorlib.images.picture import picture
-from factorlib.images.write import write_hdr
 from factorlib.jsonfile import read_json
 from factorlib.light.latlong import turned_map
 from factorlib.reading import check_plain

@@ -13,9 +13,8 @@ from factorlib.dataset.schema import LEFT_OUT
 from factorlib.geometry.camera import Camera, Pose
 from factorlib.geometry.raster import Maps, rasterise
 from factorlib.images.exif import FILM_DIAGONAL
-from factorlib.images.exr import FIXED_DATE, LAT_LONG, write_exr, write_rgb_exr
+from factorlib.images.exr import FIXED_DATE, LAT_LONG, write_exr, write_image, write_rgb_exr
 from factorlib.images.transfer import srgb_encode
-from factorlib.images.write import write_image
 from factorlib.meshes.mesh import Mesh
 from factorlib.wholefile import write_text
 from factorlib.yamlfile import yaml_text
