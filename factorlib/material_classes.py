@@ -5,8 +5,6 @@ and `k_s_b`, whose ratios are the tint.
 The class of a row is that whose words its name has: METALS, FIBROUS, or else dielectric.
 """
 
-from __future__ import annotations
-
 import csv
 import hashlib
 import io

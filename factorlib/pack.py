@@ -1,7 +1,5 @@
 """A result as one file that travels: what people and programs read of it, and what `factorlib.load_result` needs, without the data set."""
 
-from __future__ import annotations
-
 import os
 import zipfile
 from pathlib import Path

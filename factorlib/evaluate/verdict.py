@@ -124,10 +124,8 @@ def _of_materials(signs: Signs) -> tuple[str, str]:
     if signs.deviation > DISAGREES:
         why += f", for shapes and photos disagree by {signs.deviation:.0f} times their noise"
         return why, _of_unexplained(signs)[1]
-    return (
-        why,
-        f"add a photo of '{name}' in light with a small bright source, or in which it stands beside a material that is surer",
-    )
+    bright = "in light with a small bright source, or in which it stands beside a material that is surer"
+    return why, f"add a photo of '{name}' {bright}"
 
 
 def _of_clipped(signs: Signs) -> tuple[str, str]:
@@ -141,11 +139,9 @@ def _of_contour(signs: Signs) -> tuple[str, str]:
     """Return why, and what to do next."""
     each = {(photo, name): error for photo, own in signs.contours.items() for name, error in own.items()}
     photo, name = max(each, key=each.__getitem__)
-    return (
-        f"outlines of meshes and masks that differ, most of all those of '{name}' in '{photo}'",
-        f"look at the overlays of '{name}': mend masks that have holes or lack a piece; else give a mesh that is nearer to it, or a larger photo; "
-        f"if its pose in '{photo}' is wrong, give keypoints",
-    )
+    mend = "mend masks that have holes or lack a piece; else give a mesh that is nearer to it, or a larger photo"
+    next_ = f"look at the overlays of '{name}': {mend}; if its pose in '{photo}' is wrong, give keypoints"
+    return f"outlines of meshes and masks that differ, most of all those of '{name}' in '{photo}'", next_
 
 
 def _of_unexplained(signs: Signs) -> tuple[str, str]:

@@ -24,8 +24,9 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from factorlib.errors import InputError
+from factorlib.images.light_map import maps_in
 from factorlib.jsonfile import write_json
-from factorlib.light_prior import maps_in, prior_of
+from factorlib.light_prior import prior_of
 from studies.measured.standard_errors import light_deviations, material_deviations
 from studies.measured.tools import ROOT, Tables, evaluated, table, value_at
 
