@@ -4,6 +4,8 @@ A computation that goes on must end in the same bytes as one that was never stop
 unknowns, the optimiser's memory, the random generator's state and how far it is.
 """
 
+from __future__ import annotations
+
 import io
 import logging
 import pickle

@@ -1,5 +1,7 @@
 """JSON on disk: sorted keys, shortest round-trip floats, no NaN, so that the same value is the same bytes."""
 
+from __future__ import annotations
+
 import json
 import re
 from pathlib import Path

@@ -4,6 +4,8 @@ A stage is a module `stages/<name>.py` with a frozen `Params` struct and `main(p
 It never learns where the store lies or whether it runs in a pool.
 """
 
+from __future__ import annotations
+
 from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import Any, Protocol, runtime_checkable
