@@ -78,11 +78,6 @@ def focal_prior(camera_focal: float | None, source: str | None, width: int, heig
     return FocalPrior(camera_focal, EXIF_SIGMA if source == "exif" else 0.0)
 
 
-def prior_before(found: float, source: str, exif: float | None, width: int, height: int) -> FocalPrior:
-    """What was known before a focal length was found: EXIF's where it stood, nothing where it was estimated, else all."""
-    return focal_prior({"exif": exif, "estimated": None}.get(source, found), source, width, height)
-
-
 def find(caster: Caster, silhouette: Silhouette, camera: Camera, prior: FocalPrior, search: Search = Search()) -> Found:
     """The pose whose labelled silhouette agrees best with the photo's.
 

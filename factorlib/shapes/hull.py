@@ -23,7 +23,7 @@ from factorlib.align.target import extent_of, target_of
 from factorlib.errors import InputError
 from factorlib.geometry.raster import Caster, rasterise
 from factorlib.meshes.mesh import area_vectors
-from factorlib.shapes.outline import FREE, Outline, Triangles, of_one_part
+from factorlib.shapes.outline import FREE, Outline, Triangles
 
 FIRST = 32  # cells of the longest side, to find where the body is
 LEAST_SHARE = 0.02  # of the largest piece's faces: what is smaller is left away
@@ -64,7 +64,7 @@ def visual_hull(
     mesh, smoothed = trimesh.Trimesh(origin + step * (vertices - 1), faces, process=False), []
     for more in np.diff(SMOOTHINGS, prepend=0):
         trimesh.smoothing.filter_taubin(mesh, iterations=int(more))
-        shape = of_one_part(np.array(mesh.vertices), faces)
+        shape = Triangles(np.array(mesh.vertices), faces)
         smoothed.append(msgspec.structs.replace(shape, overlap=overlap(shape, outlines)))
     shape = [each for each in smoothed if each.overlap >= smoothed[0].overlap - SMOOTHED_AWAY][-1]
     return msgspec.structs.replace(shape, part=_parts_of(shape.vertices, faces, outlines, parts))
@@ -203,7 +203,7 @@ def _parts_of(
     votes = np.zeros((len(faces), parts), int)
     if parts > 1:
         area = area_vectors(vertices, faces)
-        caster, centre = Caster(of_one_part(vertices, faces).as_mesh()), vertices[faces].mean(axis=1)
+        caster, centre = Caster(Triangles(vertices, faces).as_mesh()), vertices[faces].mean(axis=1)
         for outline in outlines:
             hits = caster.cast(outline.camera, outline.pose)
             seen = outline.pose.apply(centre)

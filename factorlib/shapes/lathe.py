@@ -30,7 +30,7 @@ from factorlib.geometry.camera import Camera, Pose
 from factorlib.geometry.raster import Caster
 from factorlib.meshes.mesh import closed_grid
 from factorlib.shapes.hull import overlap
-from factorlib.shapes.outline import Outline, Triangles, of_one_part
+from factorlib.shapes.outline import Outline, Triangles
 
 HEIGHTS, AROUND, RADII = 96, 48, 80  # discs, points of each, and radii tried
 TILTS_DEG = np.arange(-75.0, 76.0, 5.0)
@@ -275,7 +275,7 @@ def mesh_of(profile: Profile) -> Triangles:
     height, radius = profile[::-1, :1], profile[::-1, 1:]  # from the top
     points = np.stack(np.broadcast_arrays(radius * np.sin(angle), height, radius * np.cos(angle)), axis=-1)
     mesh = closed_grid(points, np.array([0, height[0, 0], 0]), np.array([0, height[-1, 0], 0]))
-    return of_one_part(mesh.vertices, mesh.faces)
+    return Triangles(mesh.vertices, mesh.faces)
 
 
 def at(one: Outline, view: Turned) -> Outline:

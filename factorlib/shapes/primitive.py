@@ -15,7 +15,7 @@ from factorlib.align.proportions import BOX, ROUND, Sighting, fitted
 from factorlib.align.search import Search, find
 from factorlib.align.target import target_of
 from factorlib.geometry.raster import Caster
-from factorlib.shapes.outline import Outline, Triangles, of_one_part
+from factorlib.shapes.outline import Outline, Triangles
 
 BEGUN = {
     "box": ((1, 1, 1), (1, 0.5, 1), (1, 2, 1), (1, 0.25, 0.5), (1, 0.1, 1), (1, 0.2, 0.8)),
@@ -57,4 +57,4 @@ def unit(kind: str, factors: Float[np.ndarray, "3"]) -> Triangles:
     else:
         made = trimesh.creation.cylinder(radius=0.5, height=1.0, sections=128)
         made.apply_transform(trimesh.transformations.rotation_matrix(-np.pi / 2, (1, 0, 0)))
-    return of_one_part(np.asarray(made.vertices) * factors, np.asarray(made.faces))
+    return Triangles(np.asarray(made.vertices) * factors, np.asarray(made.faces))
