@@ -46,9 +46,8 @@ def read_dataset(path: str | Path) -> Dataset:
     raise_all(faults)
     external = {}
     refuse = Refusal(file, file.parent)
-    companions = {
-        name: _companions(mesh.file, f"meshes.{name}.file", refuse) for name, mesh in spec.meshes.items() if mesh.file
-    }
+    files = {name: mesh.file for name, mesh in spec.meshes.items() if mesh.file}
+    companions = {name: _companions(path, f"meshes.{name}.file", refuse) for name, path in files.items()}
     if spec.cameras is not None and not spec.cameras.sfm:
         from factorlib.dataset.sources.external import external_cameras
 

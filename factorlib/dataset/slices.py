@@ -71,10 +71,9 @@ def _objects(dataset: Dataset, photo: PhotoEntry) -> tuple[schema.ObjectsSlice, 
     meshes = {obj.mesh: dataset.spec.meshes[obj.mesh] for obj in photo.objects}
     external = dataset.external.get(photo.name)
     facts = schema.ObjectsSlice(photo.camera or schema.Camera(), photo.objects, meshes, external)
-    files = [
-        path for name, mesh in meshes.items() if mesh.file for path in (mesh.file, *dataset.companions.get(name, ()))
-    ]
-    return facts, files + _object_masks(photo)
+    files = [mesh.file for mesh in meshes.values() if mesh.file]
+    companions = [path for name in meshes for path in dataset.companions.get(name, ())]
+    return facts, files + companions + _object_masks(photo)
 
 
 def _set(dataset: Dataset) -> tuple[schema.SetSlice, list[str]]:

@@ -90,9 +90,8 @@ def _walk(
         prior /= prior.sum(axis=0)
         for k, kind in enumerate(kinds):
             chances[k, known] = current[known] == kind
-            chances[k, ~known], _ = cg(
-                system, PRIOR * prior[k, ~known] - beside @ chances[k, known], rtol=1e-3, M=scale
-            )
+            right = PRIOR * prior[k, ~known] - beside @ chances[k, known]
+            chances[k, ~known], _ = cg(system, right, rtol=1e-3, M=scale)
         current, learnt = kinds[chances.argmax(axis=0)], np.ones_like(known)
     return chances.reshape(-1, *label.shape)
 
