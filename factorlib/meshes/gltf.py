@@ -10,7 +10,6 @@ from urllib.parse import unquote_to_bytes
 
 import numpy as np
 from jaxtyping import Float, Int
-from scipy.spatial.transform import Rotation
 
 from factorlib.dataset.gltf import BEFORE_JSON, CURE, Header, Node, Primitive, buffer_path, read_header
 from factorlib.errors import InputError
@@ -98,8 +97,14 @@ def _parent_from_node(node: Node) -> Float[np.ndarray, "4 4"]:
     """Its matrix (given by columns), or scale, then rotation (quaternion x y z w), then translation."""
     if node.matrix is not None:
         return np.array(node.matrix, float).reshape(4, 4).T
+    x, y, z, w = np.array(node.rotation) / np.linalg.norm(node.rotation)
+    turn = [
+        [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
+        [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)],
+        [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)],
+    ]
     matrix = np.eye(4)
-    matrix[:3, :3], matrix[:3, 3] = Rotation.from_quat(node.rotation).as_matrix() * node.scale, node.translation
+    matrix[:3, :3], matrix[:3, 3] = np.array(turn) * node.scale, node.translation
     return matrix
 
 
