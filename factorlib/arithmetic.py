@@ -8,8 +8,6 @@ variables mean nothing, and results agree to rounding alone.
 They are read when a library is loaded: the runner sets them before its workers start, tests and studies before they import.
 """
 
-from __future__ import annotations
-
 import os
 
 VARIABLES = {

@@ -10,8 +10,6 @@ Lobe          w · exp(−σ|ω−z|²) of the paper is a spherical Gaussian w �
 Roughness     α = roughness².
 """
 
-from __future__ import annotations
-
 import numpy as np
 from jaxtyping import Float
 

@@ -4,8 +4,6 @@ torch.sqrt is MKL's, which is off by one unit in the last place now and then, an
 torch's products are MKL's, too, whose code for processors of any maker is five times slower than OpenBLAS, which NumPy calls.
 """
 
-from __future__ import annotations
-
 import numpy as np
 import torch
 from jaxtyping import Float

@@ -3,8 +3,6 @@
 Prints the table, and how well such a prior foresees a map that it was not fitted to, beside two nulls.
 """
 
-from __future__ import annotations
-
 import hashlib
 from collections.abc import Sequence
 from pathlib import Path
@@ -18,28 +16,13 @@ from rich.progress import Progress
 
 from factorlib.errors import InputError
 from factorlib.geometry.sphere import fibonacci_sphere
-from factorlib.images.light_map import read_light_map
+from factorlib.images.light_map import maps_in, read_light_map
 from factorlib.jsonfile import json_text, write_json
 from factorlib.light.prior import LightPrior, Source
 from factorlib.light.prior_fit import cell_means, fitted, leave_one_out, log_cells, rounded
 from factorlib.reading import read_bytes
 
 CELLS = 400  # of equal area, some 10° apart
-SUFFIXES = (".hdr", ".exr")
-
-
-def maps_in(folders: Sequence[Path]) -> list[Path]:
-    """The maps in each folder, by name; InputError for what is no folder, and for a folder without any."""
-    found = []
-    for folder in folders:
-        if not folder.is_dir():
-            raise InputError("no such folder", file=folder, cure="name folders of lat-long maps (.hdr, .exr)")
-        here = sorted(path for path in folder.iterdir() if path.suffix.lower() in SUFFIXES)
-        if not here:
-            cure = "name a folder of lat-long maps; folders within it count by themselves"
-            raise InputError("no .hdr or .exr in this folder", file=folder, cure=cure)
-        found += here
-    return found
 
 
 def means_of(path: Path, cells: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:

@@ -5,8 +5,6 @@ and `k_s_b`, whose ratios are the tint.
 The class of a row is that whose words its name has: METALS, FIBROUS, or else dielectric.
 """
 
-from __future__ import annotations
-
 import csv
 import hashlib
 import io
@@ -49,9 +47,8 @@ def classes_of(path: Path) -> Classes:
             if not np.isfinite(by_class[kind][-1]).all():
                 raise ValueError("a value is not finite")
     if few := [name for name, values in by_class.items() if len(values) < 4]:
-        raise InputError(
-            f"only few rows are of the class {few[0]}", file=path, cure="name the materials by what they are"
-        )
+        cure = "name the materials by what they are"
+        raise InputError(f"only few rows are of the class {few[0]}", file=path, cure=cure)
     classes = tuple(_fitted(name, np.array(values), len(rows)) for name, values in by_class.items())
     return Classes(classes, made_from=path.name, sha256=hashlib.sha256(content).hexdigest())
 
@@ -60,14 +57,9 @@ def _fitted(name: str, values: np.ndarray, total: int) -> MaterialClass:
     log = np.log(np.maximum(values[:, :3], LEAST))
     tint = np.median(np.linalg.norm(log - log.mean(1, keepdims=True), axis=1)) / RAYLEIGH
     x = np.column_stack([np.log(np.maximum(values[:, 3], LEAST)), values[:, 4]])
-    mean, covariance = x.mean(0), np.cov(x.T)
-    return MaterialClass(
-        name,
-        round(len(values) / total, 3),
-        tuple(np.round(mean, 3).tolist()),
-        tuple(map(tuple, np.round(covariance, 4).tolist())),
-        round(float(tint), 3),
-    )
+    mean, covariance = np.round(x.mean(0), 3).tolist(), np.round(np.cov(x.T), 4).tolist()
+    share = round(len(values) / total, 3)
+    return MaterialClass(name, share, tuple(mean), tuple(map(tuple, covariance)), round(float(tint), 3))
 
 
 def main(

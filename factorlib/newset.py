@@ -8,8 +8,6 @@ Which label shows which part of a mesh is found by laying the mesh on the masks 
 What no file says, and pairings that are not sure, are left as `?`, which `make validate` refuses, and listed; so is what must be renamed.
 """
 
-from __future__ import annotations
-
 import os
 import re
 import shutil
@@ -21,7 +19,6 @@ from tempfile import TemporaryDirectory
 
 import msgspec
 import numpy as np
-import yaml
 from PIL import Image
 
 from factorlib.align.pairing import HIDDEN, pair
@@ -34,12 +31,13 @@ from factorlib.disk import disk_error
 from factorlib.errors import InputError
 from factorlib.images.limits import MOST_MEGAPIXELS, check_pixels
 from factorlib.images.photo import open_photo
-from factorlib.labels import read_labels
 from factorlib.labels.coco import Category
+from factorlib.labels.labels import read_labels
 from factorlib.labels.png import read_inside, read_values
 from factorlib.meshes.read import read_mesh, read_parts
 from factorlib.reading import read_bytes, reading
 from factorlib.wholefile import write_text
+from factorlib.yamlfile import yaml_text
 
 REMARK = """\
 # What the files say; `?` is for you to write.  Every key: docs/dataset.md
@@ -57,25 +55,13 @@ NO_MESH = (
     "else write `lathe: true` or `primitive: ball | box | cylinder`, or give MESHES=<folder>: rough ones will do"
 )
 
+NO_MASKS = "there are no masks: `make label` draws them in the browser, once `materials` has their names; or give MASKS=<folder>"
+
 
 class Categories(msgspec.Struct):
     """The part of a COCO file that names materials."""
 
     categories: list[Category]
-
-
-class _Dumper(yaml.SafeDumper):
-    """Words plain, whatever else is a string in quotes: YAML 1.2, which reads the file, has other numbers than PyYAML."""
-
-    def increase_indent(self, flow: bool = False, indentless: bool = False) -> None:
-        super().increase_indent(flow, False)
-
-    def represent_str(self, text: str) -> yaml.Node:
-        plain = re.fullmatch(r"[A-Za-z_][A-Za-z0-9_./-]*", text)
-        return self.represent_scalar("tag:yaml.org,2002:str", text, style=None if plain else '"')
-
-
-_Dumper.add_representer(str, _Dumper.represent_str)
 
 
 def new_dataset(target: Path, photos: Path, masks: Path | None, meshes: Path | None) -> list[str]:
@@ -108,19 +94,15 @@ def new_dataset(target: Path, photos: Path, masks: Path | None, meshes: Path | N
     if len(entries) > 1:
         missing += [f"photo {photo}: write which of the meshes it shows" for photo in named if not shown[photo]]
     if masks is None:
-        missing.append(
-            "there are no masks: `make label` draws them in the browser, once `materials` has their names; or give MASKS=<folder>"
-        )
+        missing.append(NO_MASKS)
     missing += [f"photo {photo}: no mask called {photo}.png or {photo}_<material>.png"
                 for photo in named if masks is not None and photo not in of_photos]  # fmt: skip
     missing += [f"photo {photo}: write another `name`: a file of the results is called {photo}"
                 for photo in named if photo in RESERVED_PHOTOS]  # fmt: skip
     spec: dict = {"format": 1, "materials": materials or [UNKNOWN]}
     if not entries:
-        made_of = (
-            {"parts": {name: name for name in materials}} if len(materials) > 1 else {"material": spec["materials"][0]}
-        )
-        entries, spec["cameras"] = {HULL: {"hull": True, **made_of}}, {"sfm": True}
+        parts, one = {"parts": {name: name for name in materials}}, {"material": spec["materials"][0]}
+        entries, spec["cameras"] = {HULL: {"hull": True, **(parts if len(materials) > 1 else one)}}, {"sfm": True}
         shown = {photo: [HULL] for photo in named}
         missing.append(NO_MESH)
     if not materials and masks is not None:
@@ -130,18 +112,13 @@ def new_dataset(target: Path, photos: Path, masks: Path | None, meshes: Path | N
         objects = [{"name": mesh, "mesh": mesh} for mesh in shown[photo] or [UNKNOWN] * bool(entries)]
         if objects and silhouettes.get(photo):
             only = objects[0]["mesh"] if len(objects) == 1 else UNKNOWN
-            objects = [
-                {"name": name, "mesh": (_shown_in(name, entries) or [only])[0], "mask": mask}
-                for name, mask in silhouettes[photo].items()
-            ]
+            mesh_of = {name: (_shown_in(name, entries) or [only])[0] for name in silhouettes[photo]}
+            objects = [{"name": name, "mesh": mesh_of[name], "mask": mask} for name, mask in silhouettes[photo].items()]
         image, mask = f"photos/{path.relative_to(photos)}", of_photos.get(photo, UNKNOWN)
         spec["photos"].append({"name": photo, "image": image, "masks": mask, "objects": objects})
     places = {"photos": photos, "masks": masks, "meshes": meshes}
     _match(spec, lambda name: places[name.partition("/")[0]] / name.partition("/")[2], missing)
-    text = yaml.dump(spec, Dumper=_Dumper, sort_keys=False, allow_unicode=True, width=10**6)
-    text = re.sub(
-        r'"([\w-]+|\?)\\x1F([^"]*)"', lambda m: f"{yaml.dump(m[1], Dumper=_Dumper).split()[0]}  # {m[2]}", text
-    )
+    text = re.sub(r'"([\w-]+|\?)\\x1F([^"]*)"', lambda m: f"{yaml_text(m[1]).split()[0]}  # {m[2]}", yaml_text(spec))
     try:
         target.parent.mkdir(parents=True, exist_ok=True)
         with TemporaryDirectory(dir=target.parent, prefix=f".{target.name}.") as folder:
@@ -199,9 +176,9 @@ def _masks(
         if whole := own.get(photo):
             with (
                 reading("a PNG", whole, photo, "save the mask again, as PNG"),
-                Image.open(whole, formats=["PNG"]) as header,
+                Image.open(whole, formats=["PNG"]) as png,
             ):
-                size = header.size
+                size = png.size
             check_pixels(size, MOST_MEGAPIXELS, whole, photo)
             values = set(np.unique(read_values(whole, photo)).tolist())
             labels = max([labels, *(value for value in values if value <= MAX_MATERIALS)])
@@ -268,9 +245,8 @@ def _match(spec: dict, file: Callable[[str], Path], missing: list[str]) -> None:
                     obj.setdefault("materials", {})[part] = f"{UNKNOWN}{BESIDE}{words or 'not told by the mask'}"
                     missing.append(f"photo {photo}: write which material {part} of {obj['name']} is made of")
         if known:
-            missing.append(
-                f"mesh {name}: look whether {', '.join(known)} got the right materials, from silhouettes alone"
-            )
+            parts = ", ".join(known)
+            missing.append(f"mesh {name}: look whether {parts} got the right materials, from silhouettes alone")
 
 
 def _silhouette(photo: dict, obj: dict, materials: list[str], file: Callable[[str], Path]) -> Silhouette:

@@ -1,7 +1,5 @@
 """A result as one file that travels: what people and programs read of it, and what `factorlib.load_result` needs, without the data set."""
 
-from __future__ import annotations
-
 import os
 import zipfile
 from pathlib import Path
@@ -31,24 +29,15 @@ def pack(home: Path, out: Path, replace: bool = False) -> int:
     Raises InputError where a needed stage has no result, `out` is no name of a zip file, or it is there and not to be replaced.
     """
     if missing := [path for path in (*NEEDED, "export/dataset.json") if not (home / path).exists()]:
-        raise InputError(
-            f"the result is not whole: {missing[0]} is missing", file=home, cure=f"make all DATASET={home.name}"
-        )
+        cure = f"make all DATASET={home.name}"
+        raise InputError(f"the result is not whole: {missing[0]} is missing", file=home, cure=cure)
     if out.suffix != ".zip" or out.is_dir() or not out.absolute().parent.is_dir():
-        raise InputError(
-            "is no name for a zip file",
-            file=out,
-            key="OUT",
-            cure="name a file in a folder that is there: OUT=<name>.zip",
-        )
+        cure = "name a file in a folder that is there: OUT=<name>.zip"
+        raise InputError("is no name for a zip file", file=out, key="OUT", cure=cure)
     if out.exists() and not replace:
         raise InputError("is there already", file=out, key="OUT", cure="name another, or add FORCE=1")
-    found = {
-        f"{home.name}/{path.relative_to(home).as_posix()}": path
-        for stage in STAGES
-        for path in files_below(home / stage)
-    }
-    found[f"{home.name}/dataset.txt"] = home / "dataset.txt"
+    files = [home / "dataset.txt", *(path for stage in STAGES for path in files_below(home / stage))]
+    found = {f"{home.name}/{path.relative_to(home).as_posix()}": path for path in files}
     draft = out.with_name(f".{out.name}.{os.getpid()}")
     with writing(draft):
         with zipfile.ZipFile(draft, "w", zipfile.ZIP_DEFLATED) as archive:

@@ -3,8 +3,6 @@
 What a file announces is looked at before its columns are read: a kilobyte of Parquet can stand for gigabytes of one number.
 """
 
-from __future__ import annotations
-
 import json
 from collections.abc import Iterable, Sequence
 from pathlib import Path

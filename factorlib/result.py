@@ -27,10 +27,9 @@ from jaxtyping import Float
 
 from factorlib.errors import InputError, did_you_mean
 from factorlib.geometry.camera import rotation_of_vector
-from factorlib.images.exr import LAT_LONG, read_rgb_exr, write_rgb_exr
+from factorlib.images.exr import LAT_LONG, read_rgb_exr, write_hdr, write_rgb_exr
 from factorlib.images.light_map import read_light_map
 from factorlib.images.picture import picture
-from factorlib.images.write import write_hdr
 from factorlib.jsonfile import read_json
 from factorlib.light.latlong import turned_map
 from factorlib.reading import check_plain
@@ -201,9 +200,8 @@ class Result:
     def _drawn(self, kind: str, photo: str, fields: dict[str, Any]) -> Drawn:
         """What a recipe for one photo makes."""
         recipe, path, inputs = _check(KINDS[kind], photos=[photo], **fields), Path(kind), self._solved.inputs
-        check_recipe(
-            recipe, path, {name: own.objects for name, own in self._solved.objects.items()}, self._solved.names
-        )
+        objects = {name: own.objects for name, own in self._solved.objects.items()}
+        check_recipe(recipe, path, objects, self._solved.names)
         given = {f"recipe file:{name}": file for name, file in files_of(recipe, path).items()}
         solved = SolvedSet(msgspec.structs.replace(inputs, files=inputs.files | given))
         with TemporaryDirectory() as out:
@@ -273,9 +271,8 @@ class Environment(msgspec.Struct, frozen=True):
         write_hdr(path, self.lat_long)
 
     def __repr__(self) -> str:
-        return (
-            f"Environment, {self.lat_long.shape[1]} × {len(self.lat_long)}, radiance at most {self.lat_long.max():.4g}"
-        )
+        size = f"{self.lat_long.shape[1]} × {len(self.lat_long)}"
+        return f"Environment, {size}, radiance at most {self.lat_long.max():.4g}"
 
     def _repr_html_(self) -> str:
         return _image(picture(self.lat_long))

@@ -1,7 +1,5 @@
 """Statistics that a few outliers do not change."""
 
-from __future__ import annotations
-
 import numpy as np
 from jaxtyping import Float
 

@@ -5,8 +5,6 @@ in its file, from the +z side with +y up, its parts in the colours of their mate
 it shows what there is: the material of a part that is left open is called `?`.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from contextlib import suppress
 from functools import partial
@@ -14,7 +12,7 @@ from pathlib import Path
 
 import numpy as np
 from jaxtyping import UInt8
-from PIL import Image, ImageDraw
+from PIL import Image, ImageColor, ImageDraw
 
 from factorlib.dataset.read import FILE, OPEN, UNKNOWN, read_draft
 from factorlib.dataset.schema import DatasetFile, PhotoEntry
@@ -22,11 +20,11 @@ from factorlib.errors import InputError
 from factorlib.geometry.camera import Camera, Pose
 from factorlib.geometry.raster import rasterise
 from factorlib.images.limits import MOST_MEGAPIXELS, check_pixels
-from factorlib.images.palette import nearest_tags, rgb_of
+from factorlib.images.palette import nearest_tags
 from factorlib.images.photo import decoded, open_photo
 from factorlib.images.picture import picture, png_bytes
 from factorlib.images.transfer import srgb_decode
-from factorlib.labels import Labels, read_labels
+from factorlib.labels.labels import Labels, read_labels
 from factorlib.meshes.mesh import Mesh
 from factorlib.meshes.read import read_mesh
 from factorlib.reading import path_inside
@@ -121,7 +119,7 @@ def _colours(names: list[str], pictures: list[tuple[Pixels, Labels]]) -> UInt8[n
     own = [pixels[labels == k] for k in range(1, len(names) + 1)]
     mean = [each.mean(axis=0) / 255 if len(each) else np.full(3, 0.5) for each in own]
     tags = nearest_tags(names, srgb_decode(np.array(mean)))
-    return np.array([PAPER, *(rgb_of(tags[name]) for name in names)], np.uint8)
+    return np.array([PAPER, *(ImageColor.getrgb(tags[name]) for name in names)], np.uint8)
 
 
 def legend(names: list[str], by_label: UInt8[np.ndarray, "k 3"], width: int) -> Pixels:

@@ -6,8 +6,6 @@ The runner loads this module by its name, as it loads stages: it knows no scienc
 pay for any.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterable, Iterator
 from functools import partial
 from pathlib import Path
@@ -23,7 +21,7 @@ from factorlib.evaluate.truth import read_true_light, read_true_normals
 from factorlib.images.light_map import read_light_map
 from factorlib.images.limits import MOST_MEGAPIXELS, check_pixels, check_values
 from factorlib.images.photo import open_photo
-from factorlib.labels import check_materials, read_labels, read_objects
+from factorlib.labels.labels import check_materials, read_labels, read_objects
 from factorlib.meshes.limits import Limits
 from factorlib.meshes.read import part_labels, read_mesh, read_parts
 from factorlib.recipe.schema import is_light_file
@@ -64,10 +62,9 @@ class Validation:
         component = connected_components({light: sorted(names) for light, names in together.items() if names})
         if (groups := len(set(component.values()))) < 2:
             return []
-        lights = [
-            sorted(li for li, names in together.items() if names and component[min(names)] == k) for k in range(groups)
-        ]
-        said = "; ".join(", ".join(own) for own in lights)
+        lights = sorted(light for light, names in together.items() if names)
+        members = [[light for light in lights if component[min(together[light])] == k] for k in range(groups)]
+        said = "; ".join(map(", ".join, members))
         return [
             f"the lights fall into {groups} groups that share no material ({said}): brightness and colour cannot be compared between them. "
             "A photo that shows a material of each would link them"
@@ -92,10 +89,8 @@ class Validation:
                 if isinstance(of, str):
                     yield f"light {of}", partial(read_light_map, self.file(of), key)
                 else:
-                    yield (
-                        f"ball {name}",
-                        partial(self._ball, next(mirror_balls(self.spec, name, of))[1], f"{key}.chrome"),
-                    )
+                    ball = next(mirror_balls(self.spec, name, of))[1]
+                    yield f"ball {name}", partial(self._ball, ball, f"{key}.chrome")
         elif slice_ == "truth" and self.dataset.truth is not None:
             for name, path in self.dataset.truth.illumination.items():
                 yield f"light {path}", partial(read_true_light, self.file(path), name)

@@ -247,6 +247,38 @@ def _line_of(node: yaml.Node | None, keys: Keys) -> int:
     return line + 1
 
 
+class _Dumper(yaml.SafeDumper):
+    """Maps as blocks, other lists on one line; words plain, other text in quotes, for YAML 1.2 has other numbers than PyYAML."""
+
+    def increase_indent(self, flow: bool = False, indentless: bool = False) -> None:
+        super().increase_indent(flow, False)
+
+    def represent_str(self, text: str) -> yaml.Node:
+        plain = re.fullmatch(r"[A-Za-z_][A-Za-z0-9_./-]*", text)
+        return self.represent_scalar("tag:yaml.org,2002:str", text, style=None if plain else '"')
+
+    def represent_list(self, items: list) -> yaml.Node:
+        flow = not any(isinstance(item, dict) for item in items)
+        return self.represent_sequence("tag:yaml.org,2002:seq", items, flow_style=flow)
+
+
+_Dumper.add_representer(str, _Dumper.represent_str)
+_Dumper.add_representer(list, _Dumper.represent_list)
+
+
+def yaml_text(value: Any) -> str:
+    """Dicts, lists and scalars as YAML that `parse_yaml` reads.
+
+    >>> print(yaml_text({"a": [1, 0.5], "b": [{"c": "x", "d": {"e": "1"}}]}), end="")
+    a: [1, 0.5]
+    b:
+      - c: x
+        d:
+          e: "1"
+    """
+    return yaml.dump(value, Dumper=_Dumper, sort_keys=False, allow_unicode=True, default_flow_style=False, width=10**6)
+
+
 def with_value(text: str, keys: Keys, word: str) -> str:
     """The text with `word`, as it is written, in place of the value at `keys`, which is there; every other character stays."""
     node = yaml.compose(text, Loader=yaml.SafeLoader)

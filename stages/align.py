@@ -25,16 +25,7 @@ from factorlib.meshes.limits import Limits
 from factorlib.meshes.mesh import scaled
 from factorlib.meshes.read import CREASE_DEG, read_mesh
 from factorlib.results.photos import read_photo_facts
-from factorlib.results.poses import (
-    AS_IT_IS,
-    FILE,
-    CameraEntry,
-    ObjectEntry,
-    PhotoPoses,
-    RunnerUp,
-    entry_of,
-    read_poses,
-)
+from factorlib.results.poses import AS_IT_IS, FILE, CameraEntry, ObjectEntry, PhotoPoses, RunnerUp, entry_of, read_poses
 from factorlib.results.shapes import read_shapes
 from factorlib.stage import Inputs, Progress
 

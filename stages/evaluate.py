@@ -54,10 +54,8 @@ def main(params: Params, inputs: Inputs, out: Path, progress: Progress) -> None:
 
     def shot(name: str) -> Shot:
         """A photo beside its re-synthesis."""
-        photo, geometry = (
-            read_exr(inputs["masks"] / f"{name}.exr"),
-            read_geometry(inputs["align"], inputs.folders.get("surface"), name),
-        )
+        photo = read_exr(inputs["masks"] / f"{name}.exr")
+        geometry = read_geometry(inputs["align"], inputs.folders.get("surface"), name)
         return shot_of(photo, geometry, read_rgb_exr(inputs["render"] / "resynthesis" / f"{name}.exr"))
 
     progress(0, 3, "re-synthesis")
@@ -71,9 +69,7 @@ def main(params: Params, inputs: Inputs, out: Path, progress: Progress) -> None:
     sections = dict.fromkeys(MISSING)
     if truth:
         true = {n: Reflectance(m.diffuse, m.specular, m.roughness) for n, m in truth.materials.items()}
-        estimates = reflectances(
-            read_materials(inputs["export"] / "materials.json")
-        )  # in the gauge of the exported lights
+        estimates = reflectances(read_materials(inputs["export"] / "materials.json"))  # in the exported lights' gauge
         true_lights, estimated_lights = _lights(inputs, truth, out)
         sections = {
             "materials": compare_materials(estimates, true, component),
@@ -96,10 +92,8 @@ def main(params: Params, inputs: Inputs, out: Path, progress: Progress) -> None:
 
 def _verdict(inputs: Inputs, seen: dict[str, list[str]]) -> Verdict | None:
     """How far the result can be trusted; seen: by light, the materials of which a pixel counts."""
-    table, uncertainty = (
-        read_materials(inputs["export"] / "materials.json"),
-        read_uncertainty(inputs["solve"] / "uncertainty.json"),
-    )
+    table = read_materials(inputs["export"] / "materials.json")
+    uncertainty = read_uncertainty(inputs["solve"] / "uncertainty.json")
     shown, files = {m for names in seen.values() for m in names}, inputs["export"] / "illumination"
     materials = {name: solved for name, solved in table.materials.items() if name in shown}
     lights = {name: light_of_lat_long(read_rgb_exr(files / f"{name}.exr")) for name, names in seen.items() if names}

@@ -27,8 +27,7 @@ from factorlib.export.mesh_files import MeshFiles
 from factorlib.export.mitsuba import write_scene
 from factorlib.export.scene import ALL_BOUNCES, DIRECT, ExposedMap, Scene, Sun, suns_of
 from factorlib.export.usd import SUFFIX, write_usd_scene
-from factorlib.images.exr import LAT_LONG, read_rgb_exr, write_rgb_exr
-from factorlib.images.write import write_hdr
+from factorlib.images.exr import LAT_LONG, read_rgb_exr, write_hdr, write_rgb_exr
 from factorlib.jsonfile import write_json
 from factorlib.light.latlong import lat_long_of_lobes, sampled
 from factorlib.light.lobes import Lobes, no_lobes

@@ -18,12 +18,12 @@ from factorlib.images.photo import Photo, check_bright, decoded, open_photo
 from factorlib.images.processing import HALO, camera_says, halo
 from factorlib.images.raw import is_raw
 from factorlib.jsonfile import write_json
-from factorlib.labels import Labels, read_labels, read_objects
+from factorlib.labels.labels import Labels, read_labels, read_objects
 from factorlib.results.photos import PhotoFacts
 from factorlib.stage import Inputs, Progress, silent
 
 log = logging.getLogger("factorlib.masks")
-UNPROCESSED = (
+CURE = (
     "materials and lights take it for shading; use the raw file, or take it again with HDR, portrait and sharpening off"
 )
 
@@ -105,10 +105,10 @@ def reduced(labels: Labels, factor: int, path: Path, key: str) -> Labels:
 def warn_of_processing(exif: Mapping[str, Any], photo: Photo, labels: Labels, path: Path) -> None:
     """Warn of processing that no tone curve undoes, by what the camera wrote and by halos about the masks."""
     if (says := camera_says(exif)) and not is_raw(path):
-        log.warning("%s: the camera processed it (%s): %s", path, says, UNPROCESSED)
+        log.warning("%s: the camera processed it (%s): %s", path, says, CURE)
     if (overshoot := halo(photo.radiance, labels.label > 0, ~labels.left_out)) > HALO:
         words = "beside contours the background overshoots by %.0f %% of the step across them, as after sharpening or local tone mapping"
-        log.warning("%s: " + words + ": %s", path, 100 * overshoot, UNPROCESSED)
+        log.warning("%s: " + words + ": %s", path, 100 * overshoot, CURE)
 
 
 def valid_pixels(photo: Photo, labels: Labels, path: Path, key: str) -> np.ndarray:

@@ -61,12 +61,8 @@ def main(params: Params, inputs: Inputs, out: Path, progress: Progress) -> None:
     begun, found = 0.5 if slice_.sfm else 0.0, {}
     (out / "meshes").mkdir()
     for done, (name, entry) in enumerate(sorted(slice_.meshes.items())):
-        outlines = [
-            one
-            for photo in photos.values()
-            for one in photo.outlines(name, entry, cameras.get(photo.name))
-            if one.is_seen
-        ]
+        outlines = [one for photo in photos.values() for one in photo.outlines(name, entry, cameras.get(photo.name))]
+        outlines = [one for one in outlines if one.is_seen]
         at = begun + (1 - begun) * done / len(slice_.meshes)
         part = (1 - begun) / len(slice_.meshes)
         try:
@@ -75,9 +71,8 @@ def main(params: Params, inputs: Inputs, out: Path, progress: Progress) -> None:
             raise InputError(error.found, file="dataset.yaml", key=f"meshes.{name}", cure=error.cure) from error
         write_obj(out / "meshes" / f"{name}.obj", shape, parts_of(entry))
         extent = tuple(np.ptp(shape.vertices, axis=0).tolist())
-        found[name] = ShapeEntry(
-            kind_of(entry), extent, len(shape.faces), sorted({one.photo for one in outlines}), shape.overlap
-        )
+        used = sorted({one.photo for one in outlines})
+        found[name] = ShapeEntry(kind_of(entry), extent, len(shape.faces), used, shape.overlap)
         if shape.overlap < GOOD:
             log.warning("mesh '%s': the %s covers its outlines by %.0f %% only (IoU): is it of that kind, and are its masks whole?",
                         name, kind_of(entry), 100 * shape.overlap)  # fmt: skip
@@ -98,16 +93,13 @@ def parts_of(entry: MeshEntry) -> list[str]:
 def shape_of(entry: MeshEntry, outlines: list[Outline], params: Params, report: Callable[[float], None]) -> Triangles:
     """What the outlines say of a mesh's shape."""
     if not outlines:
-        raise InputError(
-            "no photo's mask shows it", cure="is its material that of a label in the masks? Else take it out"
-        )
+        cure = "is its material that of a label in the masks? Else take it out"
+        raise InputError("no photo's mask shows it", cure=cure)
     if entry.hull:
         known = [one for one in outlines if one.pose is not None]
         if 2 <= len(known) < FEW:
-            log.warning(
-                "a hull of %d outlines is larger than the body wherever they do not show it: more photos, from more sides",
-                len(known),
-            )
+            words = "a hull of %d outlines is larger than the body wherever they do not show it: more photos, from more sides"
+            log.warning(words, len(known))
         return visual_hull(known, params.cells, len(parts_of(entry)), report)
     if entry.lathe:
         shape = body_of_revolution(outlines, report)
@@ -129,12 +121,8 @@ class Photo:
         radiance = np.stack([channels[c] for c in "RGB"], axis=-1).mean(axis=-1)
         white = max(float(np.quantile(radiance[np.isfinite(radiance)], 0.99)), 1e-12)
         grey = srgb_encode(np.clip(np.nan_to_num(radiance) / white, 0, 1))
-        pixels, objects, left_out = (
-            np.round(grey * 255).astype(np.uint8),
-            channels["label"] > 0.5,
-            channels["left_out"] > 0.5,
-        )
-        return View(pixels, objects, left_out, *self.camera(None))
+        pixels, objects = np.round(grey * 255).astype(np.uint8), channels["label"] > 0.5
+        return View(pixels, objects, channels["left_out"] > 0.5, *self.camera(None))
 
     def camera(self, external: ExternalCamera | None) -> tuple[Camera, FocalPrior]:
         """The camera at the likeliest focal length, and what is known of that."""

@@ -9,8 +9,6 @@ Views are spread evenly over the sphere (Fibonacci), rolls are turns of the phot
 where frame or occluder cut the mask the areas do not say it, and several sizes are tried.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 
 import msgspec

@@ -9,8 +9,6 @@ facet: largest angle between the face's normal and its corners';  turn: RMS angl
 over that, times what contours, depth jumps, slant and sides say.
 """
 
-from __future__ import annotations
-
 import numpy as np
 from jaxtyping import Bool, Float, UInt8
 from scipy.ndimage import binary_dilation, distance_transform_edt, uniform_filter

@@ -1,8 +1,6 @@
 """What is given for a photo, checked against the photo: a pose puts its object before the camera, a camera fits the
 picture, also one of an external source (COLMAP, transforms.json, BOP), and every material of the mask is some object's."""
 
-from __future__ import annotations
-
 import logging
 from collections.abc import Iterable, Sequence
 

@@ -5,8 +5,6 @@ best view under it, as a share of the mask's.  Over all sightings a label is tha
 photo to photo), so that sightings in which pairings look alike learn from those in which they do not.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from itertools import product
 

@@ -1,13 +1,11 @@
 """A photo as the stages `masks` and `align` left it: its channels, its camera, and its objects where they were found."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import msgspec
 
 from factorlib.align.refine import FocalPrior
-from factorlib.align.search import prior_before
+from factorlib.align.search import focal_prior
 from factorlib.align.silhouette import Channels, Silhouette, silhouette_of_object
 from factorlib.dataset.schema import ObjectsSlice
 from factorlib.geometry.camera import Camera
@@ -51,7 +49,9 @@ def aligned_photo(masks: Path, photo: str, slice_: ObjectsSlice, poses: PhotoPos
     channels, facts = read_exr(masks / f"{photo}.exr"), read_photo_facts(masks / f"{photo}.json")
     height, width = channels["label"].shape
     camera, objects = poses.camera.camera(width, height), {}
-    prior = prior_before(camera.focal, poses.camera.focal_source, facts.focal_px, width, height)
+    source = poses.camera.focal_source
+    before = {"exif": facts.focal_px, "estimated": None}.get(source, camera.focal)
+    prior = focal_prior(before, source, width, height)
     for number, own in enumerate(slice_.objects, start=1):
         mesh = meshes.mesh(own.mesh, slice_.meshes[own.mesh], own.materials)
         silhouette = silhouette_of_object(channels, number, mesh.labels, own.mask is not None)

@@ -1,7 +1,5 @@
 """All objects of one photo: given poses are used, the others searched, one camera for all."""
 
-from __future__ import annotations
-
 import logging
 from collections.abc import Sequence
 
@@ -169,11 +167,8 @@ def _judged(obj: ObjectToPlace, camera: Camera, found: Found, photo: str, search
 
 def _focal_of_given(objects: Sequence[ObjectToPlace], camera: Camera) -> Camera:
     """The focal length at which given poses fit their masks best."""
-    fixed = [
-        (t.caster, t.pose, target_of(t.silhouette, t.caster.mesh.labels, 200))
-        for t in objects
-        if t.pose and t.silhouette.inside.any()
-    ]
+    shown = [t for t in objects if t.pose and t.silhouette.inside.any()]
+    fixed = [(t.caster, t.pose, target_of(t.silhouette, t.caster.mesh.labels, 200)) for t in shown]
 
     def at(log_focal: float) -> Camera:
         return msgspec.structs.replace(camera, focal=float(np.exp(log_focal)))

@@ -10,8 +10,6 @@ One photo alone can take a wrong proportion for a turn.  So factors are used onl
 them: each part of the sightings in turn is left out, the factors are fitted to the others, and only its poses are fitted to it.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from functools import partial
 from typing import Annotated

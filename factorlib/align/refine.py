@@ -14,8 +14,6 @@ The first alone lets a mesh hide inside its mask, the second alone lets it stick
 from the residuals themselves keep parts that one of the two lacks from pulling.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 
 import msgspec

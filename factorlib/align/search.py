@@ -5,8 +5,6 @@ three resolutions, fewer at each.  Whatever survives beside the winner, turned b
 and is the runner-up: how near its score comes, and how different its normals are, says how far the answer can be trusted.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterable
 from typing import Annotated
 
@@ -78,11 +76,6 @@ def focal_prior(camera_focal: float | None, source: str | None, width: int, heig
     if camera_focal is None:
         return FocalPrior(UNKNOWN_FOCAL.focal * max(width, height), UNKNOWN_FOCAL.sigma)
     return FocalPrior(camera_focal, EXIF_SIGMA if source == "exif" else 0.0)
-
-
-def prior_before(found: float, source: str, exif: float | None, width: int, height: int) -> FocalPrior:
-    """What was known before a focal length was found: EXIF's where it stood, nothing where it was estimated, else all."""
-    return focal_prior({"exif": exif, "estimated": None}.get(source, found), source, width, height)
 
 
 def find(caster: Caster, silhouette: Silhouette, camera: Camera, prior: FocalPrior, search: Search = Search()) -> Found:

@@ -1,7 +1,5 @@
 """What the masks of a photo say about where its objects are, and what they leave open."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 
 import msgspec

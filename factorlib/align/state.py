@@ -1,7 +1,5 @@
 """A pose and a focal length as the search moves them: seven numbers that hardly depend on each other in an image."""
 
-from __future__ import annotations
-
 import msgspec
 import numpy as np
 from jaxtyping import Float
@@ -36,7 +34,7 @@ class State(msgspec.Struct, frozen=True):
         """`like` with this state's focal length."""
         return msgspec.structs.replace(like, focal=float(np.exp(self.log_focal)))
 
-    def moved(self, step: Float[np.ndarray, "7"]) -> State:
+    def moved(self, step: Float[np.ndarray, "7"]) -> "State":
         """By (turn about camera axes 3, a, b, log depth, log focal); the focal length takes the depth along, so that
         the size and place in the image stay."""
         zoom, (a, b) = step[6], (self.a + step[3], self.b + step[4])

@@ -5,8 +5,6 @@ is off.  Unknown pixels are a dead zone: a contour may lie there at no cost, so 
 is never taken for the object's own contour.
 """
 
-from __future__ import annotations
-
 import msgspec
 import numpy as np
 from jaxtyping import Float, Int

@@ -9,8 +9,6 @@ mirrored_score     seen from far away, a body and its mirror image have one outl
                    and parts.  Searched with less effort, and only where a better fit is to be had.
 """
 
-from __future__ import annotations
-
 from typing import Annotated
 
 import msgspec

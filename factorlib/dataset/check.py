@@ -4,8 +4,6 @@
 follows once cameras that are known from elsewhere have been read.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterator
 from pathlib import Path
@@ -123,9 +121,8 @@ def _check_hull(name: str, spec: DatasetFile, refuse: Refusal) -> None:
         cure = (
             "add `cameras: {sfm: true}`, another source of cameras, or each object's `pose`; or use lathe or primitive"
         )
-        refuse(
-            f"meshes.{name}.hull", f"of {len(shown)} photos of it {known} have a known camera, a hull needs two", cure
-        )
+        fault = f"of {len(shown)} photos of it {known} have a known camera, a hull needs two"
+        refuse(f"meshes.{name}.hull", fault, cure)
 
 
 def _check_parts(key: str, parts: dict[str, str], mesh: MeshEntry, materials: list[str], refuse: Refusal) -> None:
@@ -212,9 +209,8 @@ def _check_known(spec: DatasetFile, refuse: Refusal) -> None:
                 refuse(key, "it reflects nothing in some channel, so that light cannot be told from it", cure)
             if max(of.diffuse) + max(specular) > 1:
                 fault = f"diffuse and specular reflectance are {max(of.diffuse) + max(specular):.3g} together"
-                refuse(
-                    key, fault, "their largest channels may be 1 together: no more light is reflected than falls on it"
-                )
+                cure = "their largest channels may be 1 together: no more light is reflected than falls on it"
+                refuse(key, fault, cure)
     _check_known_lights(spec, refuse)
 
 
@@ -306,11 +302,8 @@ def _check_source(source: CameraSource, spec: DatasetFile, refuse: Refusal) -> N
     """One source, its path inside the folder, and every photo, object and mesh it names one of the dataset's."""
     named = [kind for kind in (*SOURCES, "sfm") if getattr(source, kind)]
     if len(named) != 1:
-        refuse(
-            "cameras",
-            f"names {' and '.join(named) or 'no source'}",
-            f"name one of {', '.join(SOURCES)}, or `sfm: true`",
-        )
+        cure = f"name one of {', '.join(SOURCES)}, or `sfm: true`"
+        refuse("cameras", f"names {' and '.join(named) or 'no source'}", cure)
     if source.sfm:
         for key in ("images", "world_from_object", "world_from_camera", "obj_ids", "mesh_unit_mm"):
             if getattr(source, key) != getattr(CameraSource(), key):
@@ -325,15 +318,10 @@ def _check_source(source: CameraSource, spec: DatasetFile, refuse: Refusal) -> N
     for key in ("world_from_object", "world_from_camera") if kind == "bop" else ("obj_ids", "mesh_unit_mm"):
         if getattr(source, key) != getattr(CameraSource(), key):
             refuse(f"cameras.{key}", f"does not go with {kind}", f"leave it out: {cure}")
-    photos, objects = (
-        [photo.name for photo in spec.photos],
-        {obj.name for photo in spec.photos for obj in photo.objects},
-    )
-    for key, known, of in (
-        ("images", photos, "photo"),
-        ("world_from_object", objects, "object"),
-        ("obj_ids", spec.meshes, "mesh"),
-    ):
+    photos = [photo.name for photo in spec.photos]
+    objects = {obj.name for photo in spec.photos for obj in photo.objects}
+    named = {"images": (photos, "photo"), "world_from_object": (objects, "object"), "obj_ids": (spec.meshes, "mesh")}
+    for key, (known, of) in named.items():
         for name in getattr(source, key):
             refuse.known(f"cameras.{key}.{name}", name, known, of)
     for name, similarity in source.world_from_object.items():

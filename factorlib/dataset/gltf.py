@@ -3,8 +3,6 @@
 Only what geometry needs is decoded; textures, animations and the like are skipped.  Names of fields are glTF 2.0's.
 """
 
-from __future__ import annotations
-
 import re
 import struct
 from pathlib import Path, PurePosixPath
@@ -27,33 +25,29 @@ COMPRESSED = ("KHR_draco_mesh_compression", "EXT_meshopt_compression")
 SCHEME = re.compile(r"[A-Za-z][A-Za-z0-9+.-]*:")
 
 
-class _Part(msgspec.Struct, frozen=True):
-    """A piece of the header, of which only the keys that geometry needs are read."""
-
-
-class Asset(_Part, frozen=True):
+class Asset(msgspec.Struct, frozen=True):
     version: str
 
 
-class Buffer(_Part, frozen=True):
+class Buffer(msgspec.Struct, frozen=True):
     byteLength: Count
     uri: str | None = None  # a file or `data:…`; None for the chunk of a .glb
 
 
-class View(_Part, frozen=True):
+class View(msgspec.Struct, frozen=True):
     buffer: Count
     byteLength: Count
     byteOffset: Count = 0
     byteStride: Positive | None = None  # None where elements lie close together
 
 
-class Place(_Part, frozen=True):
+class Place(msgspec.Struct, frozen=True):
     bufferView: Count
     byteOffset: Count = 0
     componentType: int | None = None  # of indices
 
 
-class Sparse(_Part, frozen=True):
+class Sparse(msgspec.Struct, frozen=True):
     """`count` elements of an accessor that differ from what its view says, or from zero where it has none."""
 
     count: Count
@@ -61,7 +55,7 @@ class Sparse(_Part, frozen=True):
     values: Place
 
 
-class Accessor(_Part, frozen=True):
+class Accessor(msgspec.Struct, frozen=True):
     """An array of `count` elements of `type` (SCALAR, VEC3 …), of numbers of `componentType`; zeros where it has no view."""
 
     componentType: int
@@ -73,23 +67,23 @@ class Accessor(_Part, frozen=True):
     sparse: Sparse | None = None
 
 
-class Primitive(_Part, frozen=True):
+class Primitive(msgspec.Struct, frozen=True):
     attributes: dict[str, Count]  # POSITION, NORMAL … -> accessor
     indices: Count | None = None  # accessor of the corners
     material: Count | None = None
     mode: int = 4  # triangles
 
 
-class Geometry(_Part, frozen=True):
+class Geometry(msgspec.Struct, frozen=True):
     primitives: list[Primitive]
     name: str | None = None
 
 
-class Material(_Part, frozen=True):
+class Material(msgspec.Struct, frozen=True):
     name: str | None = None  # `parts` in dataset.yaml may use it
 
 
-class Node(_Part, frozen=True):
+class Node(msgspec.Struct, frozen=True):
     """A place in the scene's tree: a mesh, and its motion to the parent as a matrix (by columns) or translation, rotation
     (quaternion x y z w) and scale."""
 
@@ -102,11 +96,11 @@ class Node(_Part, frozen=True):
     scale: Numbers3 = (1.0, 1.0, 1.0)
 
 
-class Scene(_Part, frozen=True):
+class Scene(msgspec.Struct, frozen=True):
     nodes: list[Count] = []
 
 
-class Header(_Part, frozen=True):
+class Header(msgspec.Struct, frozen=True):
     """The JSON of a glTF file, as far as it says where triangles are; scene: the number of the one to read, None for the first."""
 
     asset: Asset

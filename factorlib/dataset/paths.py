@@ -1,7 +1,5 @@
 """What is asked of a key in a file that a user writes: known names, rotations, and paths, which stay in the dataset's folder, links followed."""
 
-from __future__ import annotations
-
 import os
 import stat
 from collections.abc import Iterable, Iterator

@@ -4,13 +4,10 @@ Imports nothing heavy, for a run that has nothing to do passes here too; only a 
 pays for pycolmap (.2 s).
 """
 
-from __future__ import annotations
-
 import logging
 import mmap
 import os
 import re
-from collections.abc import Iterator
 from pathlib import Path, PurePosixPath
 from typing import Any
 
@@ -49,9 +46,8 @@ def read_dataset(path: str | Path) -> Dataset:
     raise_all(faults)
     external = {}
     refuse = Refusal(file, file.parent)
-    companions = {
-        name: _companions(mesh.file, f"meshes.{name}.file", refuse) for name, mesh in spec.meshes.items() if mesh.file
-    }
+    files = {name: mesh.file for name, mesh in spec.meshes.items() if mesh.file}
+    companions = {name: _companions(path, f"meshes.{name}.file", refuse) for name, path in files.items()}
     if spec.cameras is not None and not spec.cameras.sfm:
         from factorlib.dataset.sources.external import external_cameras
 
@@ -69,7 +65,8 @@ def read_draft(file: Path) -> tuple[DatasetFile, list[InputError]]:
         raise InputError("is a link that leads outside the dataset", file=file, cure="put the file itself there")
     text = read_text(file, "a YAML file", most_bytes=MOST_BYTES)
     value = parse_yaml(text, file)
-    places, faults = list(_left_open(value)) if UNKNOWN in text else [], []
+    places: list[str] = []
+    value, faults = _filled(value, "", places), []
     if places:
         named = ", ".join(places[:MOST_NAMED]) + f" and {len(places) - MOST_NAMED} more" * (len(places) > MOST_NAMED)
         found = f"{len(places)} places are left open" if len(places) > 1 else "one place is left open"
@@ -77,7 +74,7 @@ def read_draft(file: Path) -> tuple[DatasetFile, list[InputError]]:
         cure = f"write what belongs there, in place of `?`{drawn}"
         faults.append(InputError(f"{found}: {named}", file=file, key=places[0], cure=cure))
     try:
-        spec = convert(_filled(value), DatasetFile, file, text=text)
+        spec = convert(value, DatasetFile, file, text=text)
     except InputError as error:
         raise_all(faults + _others(error, places))
     try:
@@ -101,22 +98,15 @@ def _within(key: str | None, other: str | None) -> bool:
     return key is not None and (key == other or key.startswith((f"{other}.", f"{other}[")))
 
 
-def _filled(value: Any) -> Any:
+def _filled(value: Any, key: str, places: list[str]) -> Any:
+    """The value with a word in place of each `?`, which `make new` writes; the keys of these are added to `places`."""
     if isinstance(value, dict):
-        return {name: _filled(item) for name, item in value.items()}
-    return [_filled(item) for item in value] if isinstance(value, list) else OPEN if value == UNKNOWN else value
-
-
-def _left_open(value: Any, key: str = "") -> Iterator[str]:
-    """The keys of all values that are `?`, as `make new` leaves what no file says."""
+        return {name: _filled(item, f"{key}.{name}" if key else name, places) for name, item in value.items()}
+    if isinstance(value, list):
+        return [_filled(item, f"{key}[{index}]", places) for index, item in enumerate(value)]
     if value == UNKNOWN:
-        yield key
-    elif isinstance(value, dict):
-        for name, item in value.items():
-            yield from _left_open(item, f"{key}.{name}" if key else str(name))
-    elif isinstance(value, list):
-        for index, item in enumerate(value):
-            yield from _left_open(item, f"{key}[{index}]")
+        places.append(key)
+    return OPEN if value == UNKNOWN else value
 
 
 def _read_truth(spec: DatasetFile, file: Path) -> TruthFile | None:

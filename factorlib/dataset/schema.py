@@ -6,8 +6,6 @@ have and, as its `description`, how to mend another one.  The `…Slice` structs
 directions are those of `factorlib.conventions`.
 """
 
-from __future__ import annotations
-
 from functools import cached_property
 from pathlib import Path
 from typing import Annotated, Literal

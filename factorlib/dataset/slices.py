@@ -4,8 +4,6 @@ A step's key holds the slices it declares and the hashes of their files, so a sl
 need, with defaults filled in: naming the default illumination, or reordering photos, changes no photo's facts.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from typing import Any
 
@@ -73,10 +71,14 @@ def _objects(dataset: Dataset, photo: PhotoEntry) -> tuple[schema.ObjectsSlice, 
     meshes = {obj.mesh: dataset.spec.meshes[obj.mesh] for obj in photo.objects}
     external = dataset.external.get(photo.name)
     facts = schema.ObjectsSlice(photo.camera or schema.Camera(), photo.objects, meshes, external)
-    files = [
-        path for name, mesh in meshes.items() if mesh.file for path in (mesh.file, *dataset.companions.get(name, ()))
-    ]
-    return facts, files + _object_masks(photo)
+    files = [mesh.file for mesh in meshes.values() if mesh.file]
+    companions = [path for name in meshes for path in dataset.companions.get(name, ())]
+    return facts, files + companions + _object_masks(photo)
+
+
+def _set(dataset: Dataset) -> tuple[schema.SetSlice, list[str]]:
+    photos = [photo.name for photo in dataset.spec.photos]
+    return schema.SetSlice(dataset.name, dataset.spec.materials, dataset.spec.meshes, photos), []
 
 
 def _known(dataset: Dataset) -> tuple[schema.KnownSlice, list[str]]:
@@ -129,12 +131,7 @@ _OF_PHOTO: dict[str, Callable[[Dataset, PhotoEntry], tuple[Any, list[str]]]] = {
 }
 _OF_SET: dict[str, Callable[[Dataset], tuple[Any, list[str]]]] = {
     "materials": lambda dataset: (dataset.spec.materials, []),
-    "set": lambda dataset: (
-        schema.SetSlice(
-            dataset.name, dataset.spec.materials, dataset.spec.meshes, [p.name for p in dataset.spec.photos]
-        ),
-        [],
-    ),
+    "set": _set,
     "shapes": _shapes,
     "known": _known,
     "truth": lambda dataset: (dataset.truth, dataset.truth.maps if dataset.truth else []),

@@ -13,7 +13,8 @@ not drown a dark one.  For pictures, samples brighter than white are left out, e
 them, and one wrong highlight would decide.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from typing import TypeVar
 
 import numpy as np
 from jaxtyping import Float
@@ -21,6 +22,7 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components as components_of_graph
 
 Samples = Float[np.ndarray, "_ 3"]
+Error = TypeVar("Error")
 GAUGES = ("none", "scalar_per_set", "channel_per_photo")
 
 
@@ -38,6 +40,24 @@ def gauge_factors(
         "scalar_per_set": np.full_like(cross, _ratio(cross.sum(), square.sum())),
         "channel_per_photo": _ratio(cross, square),
     }
+
+
+def errors_by_gauge(
+    estimates: Mapping[str, Sequence[Samples]],
+    truths: Sequence[Samples],
+    whites: Sequence[float],
+    error: Callable[[Samples, int], Error],
+    below_white: bool = False,
+) -> list[dict[str, dict[str, Error]]]:
+    """The errors of each photo, by gauge and kind of estimate; each kind is scaled by factors of its own.
+
+    error: of a scaled estimate of the photo of that number
+    """
+    factors = {kind: gauge_factors(of, truths, whites, below_white) for kind, of in estimates.items()}
+    return [
+        {g: {kind: error(of[i] * factors[kind][g][i], i) for kind, of in estimates.items()} for g in GAUGES}
+        for i in range(len(truths))
+    ]
 
 
 def _ratio(cross: np.ndarray | float, square: np.ndarray | float) -> np.ndarray:

@@ -25,9 +25,9 @@ from factorlib.evaluate.ball import (
     mirror_ball,
     octahedral_directions,
 )
-from factorlib.evaluate.gauge import GAUGES, gauge_factors
+from factorlib.evaluate.gauge import GAUGES, errors_by_gauge
 from factorlib.evaluate.geometry import angles_deg
-from factorlib.evaluate.picture import mean_error
+from factorlib.evaluate.picture import mean_scored
 from factorlib.geometry.sphere import ball_normals, mirror_directions
 from factorlib.results.metrics import LightError, LightErrors, ScoredLight
 
@@ -120,23 +120,17 @@ def _scored_view(
     truths: Mapping[str, Light],
     shown: Mapping[str, Bool[np.ndarray, "*t"]],
 ) -> dict[str, dict[str, ScoredLight]]:
-    """shown: by light, which of the samples count."""
+    """The errors of each light by gauge; shown: by light, which of the samples count."""
     true = [render(truths[n])[part].reshape(-1, 3) for n, part in shown.items()]
-    found = [render(estimates[n])[part].reshape(-1, 3) for n, part in shown.items()]
-    constant = [render(constant_light(truths[n].mean))[part].reshape(-1, 3) for n, part in shown.items()]
+    kinds = {
+        "estimate": [render(estimates[n])[part].reshape(-1, 3) for n, part in shown.items()],
+        "null": [render(constant_light(truths[n].mean))[part].reshape(-1, 3) for n, part in shown.items()],
+    }
     whites = [float(np.sqrt(np.mean(t**2))) or 1.0 for t in true]
-    factors = [gauge_factors(pictures, true, whites) for pictures in (found, constant)]
-
-    def scored(i: int, g: str) -> ScoredLight:
-        return ScoredLight(*(light_error(p[i] * f[g][i], true[i]) for p, f in zip((found, constant), factors)))
-
-    return {n: {g: scored(i, g) for g in GAUGES} for i, n in enumerate(shown)}
+    errors = errors_by_gauge(kinds, true, whites, lambda samples, i: light_error(samples, true[i]))
+    return {n: {g: ScoredLight(**of) for g, of in each.items()} for n, each in zip(shown, errors, strict=True)}
 
 
 def _mean(scored: list[dict[str, ScoredLight]]) -> dict[str, ScoredLight]:
     by_view = {v: [s[v] for s in scored if v in s] for v in VIEWS}
-    return {
-        v: ScoredLight(mean_error([s.estimate for s in of], 9), mean_error([s.null for s in of], 9))
-        for v, of in by_view.items()
-        if of
-    }
+    return {v: mean_scored(of, 9) for v, of in by_view.items() if of}

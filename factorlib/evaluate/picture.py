@@ -17,7 +17,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 from scipy.ndimage import correlate1d, find_objects
 
-from factorlib.results.metrics import LightError, PictureError
+from factorlib.results.metrics import LightError, PictureError, Scored
 
 Picture = Float[np.ndarray, "h w 3"]
 Mask = Bool[np.ndarray, "h w"]
@@ -103,6 +103,11 @@ def mean_error(errors: Sequence[Error], digits: int = 6) -> Error:
     """The mean of each number of errors of one kind (of dB, for PSNR), rounded; there must be some."""
     values = np.array([msgspec.structs.astuple(e) for e in errors])
     return type(errors[0])(*(round(float(np.mean(column)), digits) for column in values.T))
+
+
+def mean_scored(scored: Sequence[Scored[Error]], digits: int = 6) -> Scored[Error]:
+    """The mean of estimates and the mean of nulls, each as `mean_error`."""
+    return Scored(*(mean_error([getattr(each, part) for each in scored], digits) for part in ("estimate", "null")))
 
 
 def _blurred(values: Float[np.ndarray, "h w c"]) -> Float[np.ndarray, "h w c"]:

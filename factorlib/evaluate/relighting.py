@@ -28,7 +28,7 @@ import numpy as np
 from jaxtyping import Float
 
 from factorlib.evaluate.ball import Light, Reflected, diffuse_ball, glossy_lobe
-from factorlib.evaluate.gauge import GAUGES, gauge_factors
+from factorlib.evaluate.gauge import GAUGES, errors_by_gauge
 from factorlib.evaluate.picture import mean_error, picture_error, psnr, tone_mapped, white_of
 from factorlib.geometry.sphere import ball_normals
 from factorlib.results.materials import Reflectance, Vec3, vec3
@@ -36,7 +36,6 @@ from factorlib.results.metrics import Kinds, PictureError, Relighting, RelitBall
 
 BALL_SIZE = 32
 NORMALS, INSIDE = ball_normals(BALL_SIZE)
-KINDS = ("in_true_light", "in_estimated_light", "null_grey", "null_mean_colour")
 GREY = 0.5
 MEAN_SHOWN = 0.5  # of the true ball of the relit set score, linear, before it is clipped
 
@@ -82,32 +81,24 @@ def compare_relighting(
         return None
     lit = {li: (Appearances(true_lights[li]), Appearances(estimated_lights[li])) for li in {p[0] for p in pairs}}
     true = [lit[li][0].ball(truths[m]) for li, m in pairs]
-    kinds = [
-        [lit[li][0].ball(estimates[m]) for li, m in pairs],
-        [lit[li][1].ball(estimates[m]) for li, m in pairs],
-        [GREY * lit[li][0].diffuse for li, _ in pairs],
-        [np.broadcast_to(t.mean(axis=0), t.shape) for t in true],
-    ]
+    kinds = {
+        "in_true_light": [lit[li][0].ball(estimates[m]) for li, m in pairs],
+        "in_estimated_light": [lit[li][1].ball(estimates[m]) for li, m in pairs],
+        "null_grey": [GREY * lit[li][0].diffuse for li, _ in pairs],
+        "null_mean_colour": [np.broadcast_to(t.mean(axis=0), t.shape) for t in true],
+    }
+    whites = [white_of(t[None], np.ones((1, len(t)), bool)) for t in true]
+
+    def error(ball: Samples, i: int) -> PictureError:
+        """The error of a scaled ball against the true one."""
+        return picture_error(_disc(ball), _disc(true[i]), INSIDE, whites[i])
+
     balls: dict[str, dict[str, RelitBall]] = {}
-    for (li, m), ball in zip(pairs, _relit(true, kinds, [m in seen.get(li, ()) for li, m in pairs])):
-        balls.setdefault(li, {})[m] = ball
+    for (li, m), white, errors in zip(pairs, whites, errors_by_gauge(kinds, true, whites, error, below_white=True)):
+        balls.setdefault(li, {})[m] = RelitBall(m in seen.get(li, ()), 1 / white, errors)
     every = [b for row in balls.values() for b in row.values()]
     hidden = [b for b in every if not b.observed]
     return Relighting(balls, _mean(every), _mean(hidden) if hidden else None)
-
-
-def _relit(true: list[Samples], kinds: list[list[Samples]], observed: list[bool]) -> list[RelitBall]:
-    whites = [white_of(t[None], np.ones((1, len(t)), bool)) for t in true]
-    factors = [gauge_factors(pictures, true, whites, below_white=True) for pictures in kinds]
-
-    def error(i: int, gauge: str, kind: int) -> PictureError:
-        pictures = _disc(kinds[kind][i] * factors[kind][gauge][i]), _disc(true[i])
-        return picture_error(*pictures, INSIDE, whites[i])
-
-    return [
-        RelitBall(o, 1 / w, {g: {name: error(i, g, k) for k, name in enumerate(KINDS)} for g in GAUGES})
-        for i, (o, w) in enumerate(zip(observed, whites))
-    ]
 
 
 def _disc(samples: Samples) -> Float[np.ndarray, "h w 3"]:
@@ -117,7 +108,7 @@ def _disc(samples: Samples) -> Float[np.ndarray, "h w 3"]:
 
 
 def _mean(balls: list[RelitBall]) -> dict[str, Kinds]:
-    return {g: {k: mean_error([b.gauges[g][k] for b in balls]) for k in KINDS} for g in GAUGES}
+    return {g: {k: mean_error([b.gauges[g][k] for b in balls]) for k in balls[0].gauges[g]} for g in GAUGES}
 
 
 # ── The relit set score ──────────────────────────────────────────────────────────────────────────────────────────────

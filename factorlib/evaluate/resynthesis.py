@@ -16,7 +16,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from factorlib.evaluate.gauge import GAUGES, gauge_factors
-from factorlib.evaluate.picture import mean_error, picture_errors, white_of
+from factorlib.evaluate.picture import mean_scored, picture_errors, white_of
 from factorlib.results.materials import vec3
 from factorlib.results.metrics import PhotoErrors, PictureError, Resynthesis, ScoredPicture
 from factorlib.urm.extract import observed_pixels
@@ -70,8 +70,7 @@ def compare_photos(names: Iterable[str], materials: list[str], shot: Callable[[s
     scored = [p.gauges for p in photos.values() if p.gauges]
     if not scored:
         return Resynthesis(photos, None, None, None)
-    of = {g: ([s[g].estimate for s in scored], [s[g].null for s in scored]) for g in GAUGES}
-    mean = {g: ScoredPicture(mean_error(estimates), mean_error(nulls)) for g, (estimates, nulls) in of.items()}
+    mean = {g: mean_scored([s[g] for s in scored]) for g in GAUGES}
     worst = [min(getattr(s["none"].estimate, f"psnr_{kind}_db") for s in scored) for kind in ("linear", "tonemapped")]
     return Resynthesis(photos, mean, *worst)
 

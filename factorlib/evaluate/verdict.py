@@ -14,8 +14,6 @@ that scores less than 18 dB, as a flat disc of the mean colour does, is called g
 shows both on sets that had no part in this (`python -m studies.measured.verdict`).
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Mapping
 
 import msgspec
@@ -61,9 +59,8 @@ def _others(solved: Solved) -> Iterator[Reflectance]:
         for part in ("diffuse", "specular"):
             moved = np.clip(np.array(getattr(own, part)) + sign * np.array(getattr(errors, part)), 0, 1)
             yield msgspec.structs.replace(own, **{part: tuple(moved.tolist())})
-        yield msgspec.structs.replace(
-            own, roughness=float(np.clip(own.roughness + sign * errors.roughness, *ROUGHNESS))
-        )
+        roughness = float(np.clip(own.roughness + sign * errors.roughness, *ROUGHNESS))
+        yield msgspec.structs.replace(own, roughness=roughness)
 
 
 class Signs(msgspec.Struct, frozen=True):
@@ -123,48 +120,39 @@ def _percent(share: float) -> str:
 def _of_materials(signs: Signs) -> tuple[str, str]:
     """Return why, and what to do next."""
     name = max(signs.materials, key=signs.materials.__getitem__)
+    why = f"uncertain reflectances, most of all that of '{name}'"
     if signs.deviation > DISAGREES:
-        why = f"uncertain reflectances, most of all that of '{name}', for shapes and photos disagree by {signs.deviation:.0f} times their noise"
+        why += f", for shapes and photos disagree by {signs.deviation:.0f} times their noise"
         return why, _of_unexplained(signs)[1]
-    return (
-        f"uncertain reflectances, most of all that of '{name}'",
-        f"add a photo of '{name}' in light with a small bright source, or in which it stands beside a material that is surer",
-    )
+    bright = "in light with a small bright source, or in which it stands beside a material that is surer"
+    return why, f"add a photo of '{name}' {bright}"
 
 
 def _of_clipped(signs: Signs) -> tuple[str, str]:
     """Return why, and what to do next."""
-    name, photos = max(signs.photos, key=lambda photo: signs.photos[photo].clipped), signs.photos
-    return (
-        f"clipped values, in '{name}' {_percent(photos[name].clipped)} of all: they say 'at least' only",
-        f"expose '{name}' less, or give the camera's raw file",
-    )
+    name = max(signs.photos, key=lambda photo: signs.photos[photo].clipped)
+    why = f"clipped values, in '{name}' {_percent(signs.photos[name].clipped)} of all: they say 'at least' only"
+    return why, f"expose '{name}' less, or give the camera's raw file"
 
 
 def _of_contour(signs: Signs) -> tuple[str, str]:
     """Return why, and what to do next."""
     each = {(photo, name): error for photo, own in signs.contours.items() for name, error in own.items()}
     photo, name = max(each, key=each.__getitem__)
-    return (
-        f"outlines of meshes and masks that differ, most of all those of '{name}' in '{photo}'",
-        f"look at the overlays of '{name}': mend masks that have holes or lack a piece; else give a mesh that is nearer to it, or a larger photo; "
-        f"if its pose in '{photo}' is wrong, give keypoints",
-    )
+    mend = "mend masks that have holes or lack a piece; else give a mesh that is nearer to it, or a larger photo"
+    next_ = f"look at the overlays of '{name}': {mend}; if its pose in '{photo}' is wrong, give keypoints"
+    return f"outlines of meshes and masks that differ, most of all those of '{name}' in '{photo}'", next_
 
 
 def _of_unexplained(signs: Signs) -> tuple[str, str]:
     """Return why, and what to do next."""
     name = max(signs.photos, key=lambda photo: signs.photos[photo].unexplained)
     share = min(signs.photos[name].unexplained, 1)
-    if share < MUCH:
-        return (
-            f"shading that stays unexplained, in '{name}' {_percent(share)} of it",
-            "a mesh that is nearer to the objects",
-        )
-    return (
-        f"shading that stays unexplained, in '{name}' {_percent(share)} of it",
-        f"look at the overlay of '{name}' in the report: its mesh, pose, masks or the names of its materials are wrong, or a program has changed the picture",
-    )
+    next_ = "a mesh that is nearer to the objects"
+    if share >= MUCH:
+        wrong = "its mesh, pose, masks or the names of its materials are wrong, or a program has changed the picture"
+        next_ = f"look at the overlay of '{name}' in the report: {wrong}"
+    return f"shading that stays unexplained, in '{name}' {_percent(share)} of it", next_
 
 
 SENTENCES = {"materials": _of_materials, "clipped": _of_clipped, "unexplained": _of_unexplained, "contour": _of_contour}

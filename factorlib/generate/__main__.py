@@ -1,7 +1,5 @@
 """python -m factorlib.generate synthetic|eames: the data sets the project carries, or others of the same protocol."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from shutil import rmtree
 from types import ModuleType
@@ -13,6 +11,7 @@ from rich.progress import Progress
 
 from factorlib.disk import disk_error
 from factorlib.errors import InputError
+from factorlib.images.light_map import maps_in
 from factorlib.wholefile import sync_tree
 
 app = typer.Typer(add_completion=False, no_args_is_help=True, help=__doc__)
@@ -53,15 +52,14 @@ def eames(
     from factorlib.generate import eames as set_
 
     if (exact or distant or direct or rough) and out is None:
-        fault = "data/eames is the set without --exact, --distant, --direct and --rough"
-        typer.echo(f"error: {fault}\n  name another folder by --out", err=True)
-        raise typer.Exit(2)
+        found = "data/eames is the set without --exact, --distant, --direct and --rough: name another folder"
+        raise typer.BadParameter(found, param_hint="--out")
     parameters = set_.Parameters(exact=exact, distant=distant, direct=direct, rough=_rough(rough, exact))
     _write(set_, out or Path("data/eames"), seed, lights, parameters)
 
 
 def _rough(words: str | None, exact: bool) -> tuple[int, float] | None:
-    """TRIANGLES,WARP as numbers; says what is wrong and ends the program where they are none."""
+    """Return TRIANGLES,WARP as numbers."""
     if words is None:
         return None
     try:
@@ -70,11 +68,8 @@ def _rough(words: str | None, exact: bool) -> tuple[int, float] | None:
     except ValueError:
         numbers = 0, 0.0
     if exact or not (numbers[0] >= 20 and 0 <= numbers[1] <= 0.2):
-        typer.echo(
-            f"error: --rough {words}\n  without --exact, 20 triangles or more and 0 to .2, as in --rough 500,.02",
-            err=True,
-        )
-        raise typer.Exit(2)
+        found = "without --exact, 20 triangles or more and 0 to .2, as in --rough 500,.02"
+        raise typer.BadParameter(found, param_hint=f"--rough {words}")
     return numbers
 
 
@@ -82,9 +77,7 @@ def _write(set_: ModuleType, out: Path, seed: int, lights: Path | None, paramete
     """Generate beside `out`, then put it in its place."""
     fresh = out.with_name(out.name + ".new")
     try:
-        maps = sorted(path for path in lights.iterdir() if path.suffix.lower() in (".hdr", ".exr")) if lights else []
-        if lights and not maps:
-            raise InputError("no .hdr or .exr in this folder", file=lights, cure="name a folder of lat-long maps")
+        maps = maps_in([lights]) if lights else []
         if out.exists() and any(out.iterdir()) and not (out / "dataset.yaml").is_file():
             cure = "name an empty folder, or a data set to replace"
             raise InputError("this folder holds something else than a data set", file=out, cure=cure)

@@ -5,8 +5,6 @@ chair (47 cm wide at the feet, 52 cm deep, 82 cm high) by formulas of our own.  
 `rough_chair` what a user might have of it: fewer, flatter faces, thicker legs, and a few millimetres off everywhere; `bent_chair` a worse one.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -64,11 +62,8 @@ def bent_chair(rng: np.random.Generator, triangles: int, warp: float) -> dict[st
     parts = chair()
     points = np.concatenate([vertices for vertices, _ in parts.values()])
     extent = float(np.linalg.norm(np.ptp(points, axis=0)))
-    axes, phases, shifts = (
-        rng.normal(0, 5 / extent, (4, 3)),
-        rng.uniform(0, 2 * np.pi, (4, 1)),
-        rng.normal(0, 1, (4, 3)),
-    )
+    axes, phases = rng.normal(0, 5 / extent, (4, 3)), rng.uniform(0, 2 * np.pi, (4, 1))
+    shifts = rng.normal(0, 1, (4, 3))
     waves = np.sin(points @ axes.T + phases.T) @ shifts
     middle, deviation = waves.mean(axis=0), float(np.sqrt(np.square(waves - waves.mean(axis=0)).sum(axis=1).mean()))
     bent = {}

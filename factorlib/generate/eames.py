@@ -6,8 +6,6 @@ was photographed, no poses, and half of the focal lengths unknown.  Three of the
 one sees what each costs: `exact` geometry, `distant` light, `direct` light.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
@@ -187,10 +185,8 @@ def write_shot(out: Path, scene: Scene, materials: dict[str, Material], paramete
     exif = shot.focal_35mm if shot.focal_known_from == "exif" else None
     folder.write_photo(out / f"photos/{shot.name}.jpg", radiance * exposure, exif)
     folder.write_shot(out, shot.name, labels, light * exposure, rasterise(meshes, camera, poses))
-    objects: list[dict[str, Any]] = [
-        {"name": name, "mesh": "chair", "materials": {"shell": colour}}
-        for name, colour in zip(scene.chairs, shot.chairs, strict=True)
-    ]
+    shells = zip(scene.chairs, shot.chairs, strict=True)
+    objects: list[Any] = [{"name": name, "mesh": "chair", "materials": {"shell": colour}} for name, colour in shells]
     if len(meshes) > 1:  # each chair's silhouette
         for own, mask in zip(objects, folder.object_masks(meshes, camera, poses), strict=True):
             own["mask"] = f"masks/{shot.name}_{own['name']}.png"

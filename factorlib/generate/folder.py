@@ -1,7 +1,5 @@
 """Writing a data set: photos as cameras write them, label masks, truth, and the YAML that names them all."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -15,11 +13,11 @@ from factorlib.dataset.schema import LEFT_OUT
 from factorlib.geometry.camera import Camera, Pose
 from factorlib.geometry.raster import Maps, rasterise
 from factorlib.images.exif import FILM_DIAGONAL
-from factorlib.images.exr import FIXED_DATE, LAT_LONG, write_exr, write_rgb_exr
+from factorlib.images.exr import FIXED_DATE, LAT_LONG, write_exr, write_image, write_rgb_exr
 from factorlib.images.transfer import srgb_encode
-from factorlib.images.write import write_image
 from factorlib.meshes.mesh import Mesh
 from factorlib.wholefile import write_text
+from factorlib.yamlfile import yaml_text
 
 Image = Float[np.ndarray, "h w 3"]
 Poses = Mapping[str, Mapping[str, Pose]]  # cam_from_object by photo and object
@@ -82,11 +80,10 @@ def write_obj(path: Path, parts: Mapping[str, tuple[np.ndarray, ...]]) -> None:
     """
     lines, first = [], 1
     for name, (vertices, faces, *normals) in parts.items():
-        lines += [f"g {name}", *("v " + " ".join(f"{x:{'.9g' if normals else '.5f'}}" for x in v) for v in vertices)]
+        digits, corner = (".9g", "{0}//{0}") if normals else (".5f", "{0}")
+        lines += [f"g {name}", *("v " + " ".join(f"{x:{digits}}" for x in v) for v in vertices)]
         lines += ["vn " + " ".join(f"{x:.9g}" for x in n) for n in (normals[0] if normals else [])]
-        lines += [
-            "f " + " ".join(f"{k}//{k}" if normals else f"{k}" for k in face) for face in np.asarray(faces) + first
-        ]
+        lines += ["f " + " ".join(corner.format(k) for k in face) for face in np.asarray(faces) + first]
         first += len(vertices)
     write_text(path, "\n".join(lines) + "\n")
 
@@ -119,36 +116,16 @@ def whole_pixels(fine: Int[np.ndarray, "hh ww"]) -> Int[np.ndarray, "h w"]:
 
 
 def write_yaml(path: Path, value: dict[str, Any], comment: str) -> None:
-    """Nested mappings as YAML; lists of mappings as blocks, other lists on one line."""
-    write_text(path, f"# {comment}\n{yaml_text(value)}")
+    """Write nested mappings as YAML below a comment, numbers to six digits, those below 1e-4 as 0."""
+    write_text(path, f"# {comment}\n{yaml_text(_rounded(value))}")
 
 
-def yaml_text(value: dict[str, Any], indent: int = 0) -> str:
-    """Nested mappings as YAML, numbers to six digits, those below 1e-4 as 0.
-
-    >>> print(yaml_text({"a": [1, 0.5], "b": [{"c": "x", "d": {"e": 1e-7}}]}), end="")
-    a: [1, 0.5]
-    b:
-      - c: x
-        d:
-          e: 0.0
-    """
-    pad, text = " " * indent, ""
-    for key, item in value.items():
-        if isinstance(item, dict):
-            text += f"{pad}{key}:\n{yaml_text(item, indent + 2)}"
-        elif isinstance(item, list) and item and isinstance(item[0], dict):
-            blocks = [yaml_text(one, indent + 4) for one in item]
-            text += f"{pad}{key}:\n" + "".join(f"{pad}  - {block[indent + 4 :]}" for block in blocks)
-        else:
-            text += f"{pad}{key}: {_flow(item)}\n"
-    return text
-
-
-def _flow(item: Any) -> str:
-    if isinstance(item, (list, tuple)):
-        return "[" + ", ".join(map(_flow, item)) + "]"
-    return str(round(item, 6) if abs(item) >= 1e-4 else 0.0) if isinstance(item, float) else str(item)
+def _rounded(value: Any) -> Any:
+    if isinstance(value, dict):
+        return {key: _rounded(item) for key, item in value.items()}
+    if isinstance(value, (list, tuple)):
+        return [_rounded(item) for item in value]
+    return (round(float(value), 6) if abs(value) >= 1e-4 else 0.0) if isinstance(value, float) else value
 
 
 def pose_entry(pose: Pose) -> dict[str, Any]:
@@ -160,15 +137,12 @@ def pose_entry(pose: Pose) -> dict[str, Any]:
 def write_records(
     out: Path, comment: str, materials: Mapping[str, Any], meshes: dict[str, Any], photos: list[Any], poses: Poses
 ) -> None:
-    """dataset.yaml, whose first line is the comment, and truth/truth.yaml; poses: by photo and object."""
+    """Write dataset.yaml, whose first line is the comment, and truth/truth.yaml.
+
+    materials: structs by name;  poses: by photo and object
+    """
     record = {"format": 1, "materials": list(materials), "meshes": meshes, "photos": photos}
-    record["truth"] = "truth/truth.yaml"
-    write_yaml(out / "dataset.yaml", record, comment)
-    write_truth(out, materials, poses)
-
-
-def write_truth(out: Path, materials: Mapping[str, Any], poses: Poses) -> None:
-    """truth/truth.yaml: materials (structs), and by photo the light, the normals and the poses."""
+    write_yaml(out / "dataset.yaml", record | {"truth": "truth/truth.yaml"}, comment)
     truth = {
         "materials": {name: msgspec.to_builtins(material) for name, material in materials.items()},
         "illumination": {name: f"truth/{name}_light.exr" for name in poses},

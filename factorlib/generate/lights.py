@@ -5,8 +5,6 @@ within a metre of the origin, so that the light which arrives at the origin, or 
 Radiance is in arbitrary units: a data set scales each light by its photo's exposure.  Random materials are here, too.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any
@@ -15,7 +13,7 @@ import numpy as np
 from jaxtyping import Float
 
 from factorlib.errors import InputError
-from factorlib.images.photo import read_photo
+from factorlib.images.light_map import read_light_map
 from factorlib.results.materials import vec3
 from factorlib.tracing.scene import Material, envmap, light_seen, rgb, transform
 from factorlib.tracing.variant import mitsuba
@@ -131,12 +129,8 @@ def block(place: Float[np.ndarray, "3"], half: Float[np.ndarray, "3"], turn_deg:
 
 def captured(path: Path, height: int) -> Float[np.ndarray, "h w 3"]:
     """A lat-long map of a user's (.exr, .hdr), averaged to `height` rows, of mean radiance 1."""
-    radiance = read_photo(path, "linear").radiance.astype(float)
-    rows, columns = radiance.shape[:2]
-    if columns != 2 * rows:
-        fault = f"{columns} × {rows} pixels is no lat-long map"
-        raise InputError(fault, file=path, cure="its width must be twice its height")
-    if rows % height:
+    radiance = read_light_map(path)
+    if (rows := len(radiance)) % height:
         fault = f"{rows} rows do not divide into {height}"
         raise InputError(fault, file=path, cure=f"resize it to a multiple of {height} rows")
     radiance = radiance.reshape(height, rows // height, 2 * height, rows // height, 3).mean(axis=(1, 3))

@@ -9,8 +9,6 @@ Pixels   Single rays, not squares: the light of a sharp lobe on a glossy sphere 
 Material Reflectances of 1: the model is linear in them, and its colour channels are independent.
 """
 
-from __future__ import annotations
-
 from typing import Any
 
 import msgspec

@@ -4,8 +4,6 @@ Each is a grid of rows (from the top pole down) and columns (about the y axis) c
 that one routine makes triangles and smooth normals of them all.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from functools import partial
 

@@ -5,8 +5,6 @@ object shadows or mirrors another.  One photo is a linear EXR, one a 16-bit PNG,
 clipped; one pose is not given.  Seed 0 is the set the project carries; others have other materials, views and lights.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
@@ -168,10 +166,10 @@ def write_shot(out: Path, scene: Scene, parameters: Parameters, seed: int) -> di
         exposure = float(0.25 / brightest.mean())
     folder.write_photo(out / f"photos/{shot.name}{shot.suffix}", radiance * exposure, quality=98)
     folder.write_shot(out, shot.name, labels, scene.light * exposure, rasterise(labelled, camera, poses))
-    entries = [
-        ({"name": p.name, "mesh": p.name}, {"pose": folder.pose_entry(scene.poses[p.name])}) for p in shot.placed
-    ]
-    objects = [own | pose if p.posed else own for p, (own, pose) in zip(shot.placed, entries, strict=True)]
+    objects = [{"name": p.name, "mesh": p.name} for p in shot.placed]
+    for own, placed in zip(objects, shot.placed, strict=True):
+        if placed.posed:
+            own["pose"] = folder.pose_entry(scene.poses[placed.name])
     return {
         "name": shot.name, "image": f"photos/{shot.name}{shot.suffix}", "masks": f"masks/{shot.name}.png",
         "camera": {"focal_px": parameters.focal_px}, "objects": objects,

@@ -1,7 +1,5 @@
 """The pinhole camera of a photo and rigid poses: OpenCV axes, pixel centres at 0.5, as in COLMAP."""
 
-from __future__ import annotations
-
 import msgspec
 import numpy as np
 import pycolmap

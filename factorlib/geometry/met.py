@@ -4,8 +4,6 @@ code = number of the material · BINS + number of the direction of `fibonacci_sp
 UNMET  nothing is met, or it is not known what
 """
 
-from __future__ import annotations
-
 import numpy as np
 from jaxtyping import Float, Int, UInt16
 

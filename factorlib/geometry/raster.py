@@ -9,8 +9,6 @@ Shading normals.  Interpolated normals near the contour can face away from the v
 are bent in the plane of normal and view to the nearest direction with n·v ≥ MIN_COSINE and marked `bent`.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 import msgspec

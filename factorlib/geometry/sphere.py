@@ -1,7 +1,5 @@
 """Directions: evenly spread ones, mirror directions, and cells of similar directions."""
 
-from __future__ import annotations
-
 import numpy as np
 from jaxtyping import Bool, Float, Int
 

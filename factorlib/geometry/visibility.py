@@ -11,8 +11,6 @@ one, near in place and in normal alike.
 Of a ray that is not free it is also kept which surface it meets, as a code of `factorlib.geometry.met`.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 import msgspec

@@ -5,8 +5,6 @@ the displayed picture's upper left corner.  What is left over at the right and a
 that all boxes are whole and a place (x, y) of the photo is (x/f, y/f) of the smaller picture, to the last digit.
 """
 
-from __future__ import annotations
-
 from math import isqrt
 
 import numpy as np

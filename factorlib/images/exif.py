@@ -1,8 +1,6 @@
 """What a camera wrote about a photo (EXIF), by OpenImageIO's names of the tags: how much light its exposure let in, and the focal length
 in pixels.  Focal lengths hold for the whole frame only: a crop keeps the tags and changes the angle, by how much nobody wrote down."""
 
-from __future__ import annotations
-
 import logging
 import math
 import struct
@@ -82,16 +80,9 @@ def focal_px_of_exif(exif: Mapping[str, Any], width: int, height: int, file: str
     >>> focal_px_of_exif({"Exif:FocalLengthIn35mmFilm": 50}, 4000, 4000) is None
     True
     """
-    film, focal, density, across, down = (
-        _positive(exif, f"Exif:{tag}")
-        for tag in (
-            "FocalLengthIn35mmFilm",
-            "FocalLength",
-            "FocalPlaneXResolution",
-            "PixelXDimension",
-            "PixelYDimension",
-        )
-    )
+    lens = "FocalLengthIn35mmFilm", "FocalLength", "FocalPlaneXResolution"
+    tags = *lens, "PixelXDimension", "PixelYDimension"
+    film, focal, density, across, down = (_positive(exif, f"Exif:{tag}") for tag in tags)
     unit = UNIT_MM.get(exif.get("Exif:FocalPlaneResolutionUnit", 2))
     if film:
         focal_px = film / FILM_DIAGONAL * math.hypot(width, height)

@@ -1,7 +1,5 @@
 """Animations: GIF, and H.264 where PyAV is installed; white where frames are transparent, for neither has half-transparent pixels."""
 
-from __future__ import annotations
-
 import io
 from collections.abc import Sequence
 from fractions import Fraction

@@ -4,8 +4,6 @@ Orientation is a property of the picture in HEIF (`irot`, `imir`), which the dec
 be applied again.  The picture is decoded at once, in its own codes: 96 MB for 48 megapixels of 8 bits grey, 288 MB of 10 bits RGB.
 """
 
-from __future__ import annotations
-
 import io
 from contextlib import suppress
 from functools import cache
@@ -73,9 +71,7 @@ def open_heif(path: str | Path, key: str | None) -> Stored:
 
     exif = exif_of(info.get("exif"))
     across, down = (exif.get(name) for name in SIZES)
-    if (
-        across and down and (across > down) != (width > height)
-    ):  # what the camera wrote is of the picture before it was turned
+    if across and down and (across > down) != (width > height):  # those of the picture before it was turned
         exif |= dict(zip(SIZES, (down, across)))
     profile = ""
     with suppress(OSError, ImageCms.PyCMSError):

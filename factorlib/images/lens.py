@@ -4,8 +4,6 @@ A ray of slopes (a, b) = (x, y)/z meets the photo at centre + focal · (1 + k₁
 two coefficients.  The picture keeps its size, focal length and principal point.
 """
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import msgspec
@@ -30,9 +28,8 @@ class Lens(msgspec.Struct, frozen=True):
     def colmap(self) -> pycolmap.Camera:
         """The same camera as pycolmap's."""
         width, height = (max(1, round(2 * c)) for c in self.centre)
-        return pycolmap.Camera(
-            model="RADIAL", width=width, height=height, params=[self.focal, *self.centre, *self.coefficients]
-        )
+        params = [self.focal, *self.centre, *self.coefficients]
+        return pycolmap.Camera(model="RADIAL", width=width, height=height, params=params)
 
     def distorted(self, points: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, "n 2"]:
         """Where the photo shows what a pinhole shows at these points."""

@@ -1,7 +1,6 @@
 """Lat-long maps of light, in Radiance HDR or OpenEXR: read by header first, a large one averaged down while it is read."""
 
-from __future__ import annotations
-
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -16,7 +15,22 @@ from factorlib.reading import check_plain
 MOST_TEXELS = 4096 * 2048  # which take 250 MB as they are read, and more in a renderer
 LEAST = -1e-3  # of the mean magnitude: resampling leaves a little below 0
 LARGEST = 1e15  # radiance: the sun's disc is 1e9 times as bright as a room
+SUFFIXES = (".hdr", ".exr")
 CURE = "mend or remove this map"
+
+
+def maps_in(folders: Sequence[Path]) -> list[Path]:
+    """The maps in each folder, by name; InputError for what is no folder, and for a folder without any."""
+    found = []
+    for folder in folders:
+        if not folder.is_dir():
+            raise InputError("no such folder", file=folder, cure="name folders of lat-long maps (.hdr, .exr)")
+        here = sorted(path for path in folder.iterdir() if path.suffix.lower() in SUFFIXES)
+        if not here:
+            cure = "name a folder of lat-long maps; folders within it count by themselves"
+            raise InputError("no .hdr or .exr in this folder", file=folder, cure=cure)
+        found += here
+    return found
 
 
 def read_light_map(path: Path, key: str | None = None) -> Float[np.ndarray, "h w 3"]:

@@ -4,8 +4,6 @@ Compressed, a picture of one colour takes a thousandth of what it takes in memor
 machine has.
 """
 
-from __future__ import annotations
-
 from contextlib import suppress
 from math import ceil
 from pathlib import Path

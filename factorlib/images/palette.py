@@ -1,9 +1,8 @@
 """A colour for each material, to tell it in masks and tables: distinct, and as near to its own as can be."""
 
-from __future__ import annotations
-
 import numpy as np
 from jaxtyping import Float
+from PIL.ImageColor import getrgb
 from scipy.optimize import linear_sum_assignment
 
 from factorlib.images.transfer import srgb_encode
@@ -18,7 +17,7 @@ def nearest_tags(names: list[str], reflectance: Float[np.ndarray, "m 3"]) -> dic
     >>> nearest_tags(["wine", "snow", "coal"], np.array([[0.5, 0.05, 0.05], [0.8, 0.8, 0.8], [0.03, 0.03, 0.03]]))
     {'wine': '#d1495b', 'snow': '#e8e8e8', 'coal': '#303438'}
     """
-    palette, tags = np.array([rgb_of(tag) for tag in PALETTE]) / 255, {}
+    palette, tags = np.array([getrgb(tag) for tag in PALETTE]) / 255, {}
     for start in range(0, len(names), len(PALETTE)):
         difference = srgb_encode(np.clip(reflectance[start : start + len(PALETTE)], 0, 1))[:, None] - palette
         brightness = difference.mean(axis=-1, keepdims=True)  # colourfulness counts ten times as much
@@ -26,12 +25,3 @@ def nearest_tags(names: list[str], reflectance: Float[np.ndarray, "m 3"]) -> dic
         for row, column in zip(*linear_sum_assignment(distance), strict=True):
             tags[names[start + row]] = PALETTE[column]
     return tags
-
-
-def rgb_of(tag: str) -> tuple[int, int, int]:
-    """Red, green and blue of a colour "#rrggbb".
-
-    >>> rgb_of("#d1495b")
-    (209, 73, 91)
-    """
-    return tuple(int(tag[i : i + 2], 16) for i in (1, 3, 5))

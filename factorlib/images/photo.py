@@ -10,8 +10,6 @@ Size          a photo can be averaged down by a whole factor (`boxes`) while it 
               are ever in memory: radiance by its linear mean; clipped where any part is; finite where any part is.
 """
 
-from __future__ import annotations
-
 import logging
 from collections.abc import Callable, Iterator
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Pictures for people: linear radiance as 8-bit sRGB, and PNG files that are the same bytes for the same pixels."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np
@@ -9,8 +7,8 @@ import OpenImageIO as oiio
 from jaxtyping import Bool, Float, UInt8
 
 from factorlib.errors import InputError
+from factorlib.images.exr import encoded
 from factorlib.images.transfer import srgb_encode
-from factorlib.images.write import encoded
 from factorlib.wholefile import write_bytes
 
 PERCENTILE = 99.0

@@ -3,8 +3,6 @@
 Neither can be undone: radiance is then no longer the same function of the pixel's code everywhere.  They are found, and said.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from typing import Any
 
@@ -14,9 +12,7 @@ from scipy.ndimage import distance_transform_edt, gaussian_filter, map_coordinat
 
 RENDERED = {
     1: "by a process of its own",
-    2: "HDR",
-    3: "HDR",
-    4: "HDR",
+    **dict.fromkeys((2, 3, 4), "HDR"),
     6: "panorama",
     7: "portrait, HDR",
     8: "portrait",
@@ -61,9 +57,8 @@ def halo(
 
     def at(picture: np.ndarray, far: float) -> Float[np.ndarray, " n"]:
         """The picture at a distance from each contour pixel."""
-        return map_coordinates(
-            picture.astype(float), (y + far * normal[0], x + far * normal[1]), order=1, mode="nearest"
-        )
+        places = y + far * normal[0], x + far * normal[1]
+        return map_coordinates(picture.astype(float), places, order=1, mode="nearest")
 
     clear = length > 0.8  # no corner, and nothing else within reach
     for far in (-FAR, FAR):

@@ -7,8 +7,6 @@ The picture is cut as the file says (DNG's DefaultCrop), as other programs show 
 48 megapixels.
 """
 
-from __future__ import annotations
-
 from functools import cache
 from pathlib import Path
 

@@ -10,8 +10,6 @@ slope at black finite, as the straight toe of sRGB does.  What photos share tell
 reflectances in all of them.
 """
 
-from __future__ import annotations
-
 import numpy as np
 from jaxtyping import Float
 

@@ -4,8 +4,6 @@ sRGB: IEC 61966-2-1:1999, section 5.2.  All functions work on any shape, keep Na
 and by the same formula above 1, so that they invert each other everywhere.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 
 import numpy as np

@@ -5,8 +5,6 @@ address, so that no name turned to 127.0.0.1 (DNS rebinding) is served, and so m
 by its index, never a file, and its body is as long as the photo's size asks.
 """
 
-from __future__ import annotations
-
 import hashlib
 import io
 import re

@@ -5,8 +5,6 @@ Run lengths are decoded here, for pycocotools takes every one at its word; what 
 of the number of runs and one picture.  The shapes of other photos in the file are left as text.
 """
 
-from __future__ import annotations
-
 from pathlib import Path, PurePosixPath
 
 import msgspec
@@ -167,11 +165,8 @@ def _shapes(text: msgspec.Raw, shape: tuple[int, int], path: str | Path, key: st
         return [segmentation.counts], 0.0
     polygons, length, limit = [], 0.0, np.array(shape[::-1])
     for index, polygon in enumerate(segmentation):
-        fault, cure, corners = (
-            None,
-            "a polygon is [x1, y1, x2, y2, x3, y3, …], three corners or more",
-            np.array(polygon),
-        )
+        fault, corners = None, np.array(polygon)
+        cure = "a polygon is [x1, y1, x2, y2, x3, y3, …], three corners or more"
         if len(corners) < 6 or len(corners) % 2 or not np.isfinite(corners).all():
             fault = "is no polygon"
         elif ((corners := corners.reshape(-1, 2)) < -OVERSHOOT).any() or (corners > limit + OVERSHOOT).any():

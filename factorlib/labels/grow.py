@@ -5,8 +5,6 @@ stops at (Grady 2006).  It also stops anywhere, at a label that has such colours
 a little from the first guess, and then twice more from the answer, as GrabCut does (Rother et al. 2004).
 """
 
-from __future__ import annotations
-
 from math import ceil
 
 import numpy as np
@@ -92,9 +90,8 @@ def _walk(
         prior /= prior.sum(axis=0)
         for k, kind in enumerate(kinds):
             chances[k, known] = current[known] == kind
-            chances[k, ~known], _ = cg(
-                system, PRIOR * prior[k, ~known] - beside @ chances[k, known], rtol=1e-3, M=scale
-            )
+            right = PRIOR * prior[k, ~known] - beside @ chances[k, known]
+            chances[k, ~known], _ = cg(system, right, rtol=1e-3, M=scale)
         current, learnt = kinds[chances.argmax(axis=0)], np.ones_like(known)
     return chances.reshape(-1, *label.shape)
 

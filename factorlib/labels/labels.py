@@ -4,8 +4,6 @@ A mask has the photo's own pixels, as displayed.  Whatever is ambiguous is refus
 a label without a material, two materials in one pixel, no labelled pixel at all.
 """
 
-from __future__ import annotations
-
 import logging
 from collections.abc import Callable, Mapping
 from pathlib import Path

@@ -3,8 +3,6 @@
 Pillow, for it alone keeps the indices; grey of 2 or 4 bits, which it stretches to 8, is undone.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from pathlib import Path
 

@@ -5,8 +5,6 @@ such edges becomes two, three or four, so that neighbours agree along every edge
 one node, on whichever side of a crease they stand; nodes are numbered by position.
 """
 
-from __future__ import annotations
-
 import msgspec
 import numpy as np
 from jaxtyping import Float, Int
@@ -100,17 +98,14 @@ class Fine(msgspec.Struct, frozen=True):
         normal, rows = across / double, np.repeat(np.arange(len(place)), 3)
         slopes = [np.cross(normal, place[:, (k + 2) % 3] - place[:, (k + 1) % 3]) / double for k in range(3)]
         shape = len(place), self.nodes
-        return [
-            csr_array((np.stack([s[:, a] for s in slopes], 1).reshape(-1), (rows, self.faces.reshape(-1))), shape)
-            for a in range(3)
-        ]
+        values = np.stack(slopes, axis=1)  # by triangle, corner and axis
+        return [csr_array((values[..., a].reshape(-1), (rows, self.faces.reshape(-1))), shape) for a in range(3)]
 
     def at_nodes(self) -> csr_array:
         """The mean over the triangles about each node, by area, [v, f]."""
         count = len(self.faces)
-        weight = csr_array(
-            (np.repeat(self.areas, 3), (self.faces.reshape(-1), np.repeat(np.arange(count), 3))), (self.nodes, count)
-        )
+        places = self.faces.reshape(-1), np.repeat(np.arange(count), 3)
+        weight = csr_array((np.repeat(self.areas, 3), places), (self.nodes, count))
         total = np.maximum(np.asarray(weight.sum(1)).reshape(-1), 1e-300)
         return csr_array(diags_array(1 / total) @ weight)
 

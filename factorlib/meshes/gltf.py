@@ -4,8 +4,6 @@ A part goes by the name of its primitive (its mesh's, numbered from the second o
 mesh has no other primitive, and of its material.  What a header promises is counted before any buffer is opened.
 """
 
-from __future__ import annotations
-
 import base64
 from pathlib import Path
 from urllib.parse import unquote_to_bytes
@@ -100,15 +98,13 @@ def _parent_from_node(node: Node) -> Float[np.ndarray, "4 4"]:
     if node.matrix is not None:
         return np.array(node.matrix, float).reshape(4, 4).T
     x, y, z, w = np.array(node.rotation) / np.linalg.norm(node.rotation)
-    turn = np.array(
-        [
-            [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
-            [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)],
-            [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)],
-        ]
-    )
+    turn = [
+        [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
+        [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)],
+        [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)],
+    ]
     matrix = np.eye(4)
-    matrix[:3, :3], matrix[:3, 3] = turn * np.array(node.scale), node.translation
+    matrix[:3, :3], matrix[:3, 3] = np.array(turn) * node.scale, node.translation
     return matrix
 
 

@@ -1,7 +1,5 @@
 """How large a mesh may be: far more than a rough mesh needs, and what a machine still holds."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Annotated
 

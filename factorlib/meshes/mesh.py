@@ -1,7 +1,5 @@
 """A triangle mesh that the pipeline can use: finite, without degenerate faces, with normals and material labels."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 import msgspec

@@ -7,8 +7,6 @@ its vertex, but only of those within the crease angle of its own face: an edge s
 Duplicate vertices are one vertex here, by position.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 
 import numpy as np

@@ -4,8 +4,6 @@ Reads v, vn, f (polygons as fans, negative indices, `v/vt/vn` in all its forms),
 The .mtl is never opened: a part's name is in the OBJ itself.
 """
 
-from __future__ import annotations
-
 import re
 from array import array
 from pathlib import Path

@@ -4,8 +4,6 @@ The numbers of a text file are read as rows of float64, so that one reader does 
 length (trimesh refuses these).  Nothing is made that the file has no room for.
 """
 
-from __future__ import annotations
-
 import re
 from pathlib import Path
 
@@ -28,9 +26,7 @@ CORNERS = ("vertex_indices", "vertex_index")
 CURE = "is it whole, and a PLY? export it again"
 
 
-Properties = dict[
-    str, tuple[str, str | None]
-]  # type of each number, and of the length before a list of them, as NumPy writes them
+Properties = dict[str, tuple[str, str | None]]  # NumPy's type of each number, and of the length before a list of them
 Column = tuple[np.ndarray, np.ndarray]  # the numbers of all rows in one row; how many each row has
 
 

@@ -5,8 +5,6 @@ one part, named as the file).  Faces that cannot be used are dropped and counted
 result in silence is refused.
 """
 
-from __future__ import annotations
-
 import logging
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
@@ -147,9 +145,8 @@ def part_labels(
             fault = f"part {called} gets several materials: {', '.join(sorted(chosen))}"
             raise InputError(fault, file=file, cure="name it once")
         if None in chosen:
-            cure = (
-                f"add it to `parts`, e.g. {one_line(goes_by[0])}: {materials[0]}" if goes_by else "name it in an editor"
-            )
+            example = f"add it to `parts`, e.g. {one_line(goes_by[0])}: {materials[0]}" if goes_by else None
+            cure = example or "name it in an editor"
             raise InputError(f"part {called} has no material", file=file, key=called, cure=cure)
         labels.append(list(materials).index(*chosen) + 1)
     return np.array(labels, dtype=np.int16)

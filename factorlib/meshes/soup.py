@@ -3,8 +3,6 @@
 Text in mesh files is UTF-8, or else Latin-1, in which old programs write names and comments.
 """
 
-from __future__ import annotations
-
 import io
 import warnings
 from collections.abc import Iterator

@@ -3,8 +3,6 @@
 trimesh would read them, too, but takes a file that was cut short for a smaller mesh.
 """
 
-from __future__ import annotations
-
 import re
 from pathlib import Path
 

@@ -8,12 +8,13 @@ from typing import Any
 import msgspec
 import numpy as np
 from jaxtyping import Bool, Float, UInt8
+from PIL.ImageColor import getrgb
 from scipy.ndimage import binary_erosion
 
 from factorlib.conventions import lat_long_solid_angles
 from factorlib.dataset.schema import LightSlice, ObjectsSlice
 from factorlib.evaluate.resynthesis import agreeing_pixels
-from factorlib.images.palette import nearest_tags, rgb_of
+from factorlib.images.palette import nearest_tags
 from factorlib.images.picture import exposure_of, picture, png_bytes
 from factorlib.images.transfer import srgb_encode
 from factorlib.reflection import reflection_operator
@@ -183,7 +184,7 @@ def _labels(masks: Channels, geometry: Channels, photo: Picture, tags: list[str]
     """Materials tinted on a grey photo (already exposed); yellow where mesh and mask name different ones."""
     grey = srgb_encode(np.clip(photo.mean(axis=-1), 0, 1))[..., None] * np.ones(3)
     label = np.rint(masks["label"]).astype(int)
-    colours = np.array([(0, 0, 0), *(rgb_of(tag) for tag in tags)]) / 255
+    colours = np.array([(0, 0, 0), *(getrgb(tag) for tag in tags)]) / 255
     display = np.where((label > 0)[..., None], 0.45 * grey + 0.55 * colours[label], 0.3 + 0.5 * grey)
     display[(np.rint(geometry["label"]) != label) & (masks.get("left_out", 0 * label) < 0.5)] = DISAGREES
     return display

@@ -1,7 +1,5 @@
 """lobes.parquet of `solve` and `export`: the light of each illumination, one row per lobe."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Mapping
 from pathlib import Path

@@ -1,8 +1,6 @@
 """JSON of `solve` and `export`: materials.json has reflectances with standard errors, their gauge, and what was decided of the model;
 exposures.json what each photo's light is multiplied by, per channel; uncertainty.json the standard errors and the residual level."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Annotated, Literal

@@ -16,10 +16,8 @@ Wherever there are gauges: none, scalar_per_set, channel_per_photo (`factorlib.e
 relative to the white of the truth and after the tone map; DSSIM after the tone map (`factorlib.evaluate.picture`).
 """
 
-from __future__ import annotations
-
 from pathlib import Path
-from typing import Literal
+from typing import Generic, Literal, TypeVar
 
 import msgspec
 
@@ -44,11 +42,17 @@ class PictureError(msgspec.Struct, frozen=True):
     dssim: float
 
 
-class ScoredPicture(msgspec.Struct, frozen=True):
-    """A picture, and what a null scores in its place."""
+Error = TypeVar("Error")
 
-    estimate: PictureError
-    null: PictureError
+
+class Scored(msgspec.Struct, Generic[Error], frozen=True):
+    """The error of an estimate, and what a null scores in its place."""
+
+    estimate: Error
+    null: Error
+
+
+ScoredPicture = Scored[PictureError]
 
 
 class PhotoErrors(msgspec.Struct, frozen=True):
@@ -155,11 +159,7 @@ class LightError(msgspec.Struct, frozen=True):
     rgb_angle_deg: float
 
 
-class ScoredLight(msgspec.Struct, frozen=True):
-    """A light, and what a null scores in its place."""
-
-    estimate: LightError
-    null: LightError
+ScoredLight = Scored[LightError]
 
 
 class LightErrors(msgspec.Struct, frozen=True):

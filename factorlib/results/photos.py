@@ -1,7 +1,5 @@
 """photos.json of `masks`: what is known of each photo.  `masks` writes the entry of one as <photo>.json; photos.json gathers those."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Annotated
 

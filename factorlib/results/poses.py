@@ -3,8 +3,6 @@
 `align` and `refine` write the entry of one photo as <photo>.json; poses.json gathers those.
 """
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Annotated
 

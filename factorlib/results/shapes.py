@@ -1,7 +1,5 @@
 """shapes.json: cameras that structure from motion found, and shapes that were found of masks."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import msgspec

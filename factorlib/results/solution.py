@@ -1,7 +1,5 @@
 """An earlier solution, from which a solve may start: materials.json, lobes.parquet and exposures.json of a folder."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import msgspec
@@ -33,7 +31,7 @@ class Earlier(msgspec.Struct, frozen=True):
         """As `self_shadowing`."""
         return _decided(self.table.model.interreflection, self.table.model.interreflection_chosen_by)
 
-    def beside(self, relative: dict[str, float]) -> Earlier:
+    def beside(self, relative: dict[str, float]) -> "Earlier":
         """With exposures that are factors on `relative` ones: of each photo, those that radiances are divided by."""
         exposures = {p: tuple(e / relative.get(p, 1.0) for e in each) for p, each in self.exposures.items()}
         return msgspec.structs.replace(self, exposures=exposures)

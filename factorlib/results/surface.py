@@ -1,7 +1,5 @@
 """surface.json of `surface`: how meshes differ from the given ones, as shading has it, and what decided."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any
 
@@ -25,7 +23,7 @@ class Tried(msgspec.Struct, frozen=True):
     stiffness: float | None = None
 
     @classmethod
-    def of(cls, evidence: Any, stiffness: float | None) -> Tried:
+    def of(cls, evidence: Any, stiffness: float | None) -> "Tried":
         """From the solver's evidence."""
         return cls(evidence.held_out_loss_with, evidence.held_out_loss_without, evidence.margin, stiffness)
 

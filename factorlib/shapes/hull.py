@@ -8,8 +8,6 @@ smoothed without shrinking (Taubin 1995), as far as its outlines allow: where th
 face belongs to the part that most photos show there.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 
 import msgspec
@@ -25,7 +23,7 @@ from factorlib.align.target import extent_of, target_of
 from factorlib.errors import InputError
 from factorlib.geometry.raster import Caster, rasterise
 from factorlib.meshes.mesh import area_vectors
-from factorlib.shapes.outline import FREE, Outline, Triangles, of_one_part
+from factorlib.shapes.outline import FREE, Outline, Triangles
 
 FIRST = 32  # cells of the longest side, to find where the body is
 LEAST_SHARE = 0.02  # of the largest piece's faces: what is smaller is left away
@@ -38,21 +36,14 @@ Points = Float[np.ndarray, "n 3"]
 
 
 def visual_hull(
-    outlines: Sequence[Outline],
-    cells: int,
-    parts: int = 1,
-    report: Callable[[float], None] = lambda share: None,
+    outlines: Sequence[Outline], cells: int, parts: int = 1, report: Callable[[float], None] = lambda share: None
 ) -> Triangles:
     """The hull in the object's frame.  outlines: all with poses;  cells: of the grid, along its longest side;  parts: of the object.
 
     report: the share that is done.  Raises InputError where there are fewer than two outlines, or nothing fits into all of them.
     """
     if len(outlines) < 2:
-        fault = (
-            f"{len(outlines)} photos with a known camera show it"
-            if not outlines
-            else "only one photo with a known camera shows it"
-        )
+        fault = f"{'only one photo' if outlines else 'no photo'} with a known camera shows it"
         cure = "a hull needs two at least, better ten: `cameras: {sfm: true}` finds them where photos overlap, or use lathe or primitive"
         raise InputError(fault, cure=cure)
     middle, radius = _about(outlines)
@@ -62,9 +53,8 @@ def visual_hull(
         shape = np.ceil((high - low) / step).astype(int) + 3
         origin = (low + high) / 2 - step * (shape - 1) / 2
         field = _sampled(outlines, origin, step, shape, report)
-        inside = np.argwhere(
-            field > (-step if count == FIRST != cells else 0)
-        )  # at first, what is thinner than a cell too
+        least = -step if count == FIRST != cells else 0  # at first, what is thinner than a cell too
+        inside = np.argwhere(field > least)
         if not len(inside):
             cure = "are masks and cameras of the same photos, and does each photo show the whole object or say by 255 what hides it?"
             raise InputError("no body fits into the outlines of all photos", cure=cure)
@@ -74,7 +64,7 @@ def visual_hull(
     mesh, smoothed = trimesh.Trimesh(origin + step * (vertices - 1), faces, process=False), []
     for more in np.diff(SMOOTHINGS, prepend=0):
         trimesh.smoothing.filter_taubin(mesh, iterations=int(more))
-        shape = of_one_part(np.array(mesh.vertices), faces)
+        shape = Triangles(np.array(mesh.vertices), faces)
         smoothed.append(msgspec.structs.replace(shape, overlap=overlap(shape, outlines)))
     shape = [each for each in smoothed if each.overlap >= smoothed[0].overlap - SMOOTHED_AWAY][-1]
     return msgspec.structs.replace(shape, part=_parts_of(shape.vertices, faces, outlines, parts))
@@ -128,9 +118,8 @@ def inside_all(outlines: Sequence[Outline], points: Points) -> Float[np.ndarray,
         seen = outline.pose.apply(points)
         depth = np.maximum(seen[:, 2], LEAST_Z)
         inner = outline.inner(outline.camera.project(np.column_stack([seen[:, :2], depth])))
-        least = np.minimum(
-            least, np.where(seen[:, 2] > LEAST_Z, np.minimum(inner, FREE) * depth / outline.camera.focal, -1.0)
-        )
+        inner = np.minimum(inner, FREE) * depth / outline.camera.focal
+        least = np.minimum(least, np.where(seen[:, 2] > LEAST_Z, inner, -1.0))
     return least
 
 
@@ -214,7 +203,7 @@ def _parts_of(
     votes = np.zeros((len(faces), parts), int)
     if parts > 1:
         area = area_vectors(vertices, faces)
-        caster, centre = Caster(of_one_part(vertices, faces).as_mesh()), vertices[faces].mean(axis=1)
+        caster, centre = Caster(Triangles(vertices, faces).as_mesh()), vertices[faces].mean(axis=1)
         for outline in outlines:
             hits = caster.cast(outline.camera, outline.pose)
             seen = outline.pose.apply(centre)

@@ -11,8 +11,6 @@ agrees best is kept.  With one photo, which does not say it, the strongest tilt 
 are flat more often than round.  Then the radii are carved again from all outlines.  The axis is the shape's y.
 """
 
-from __future__ import annotations
-
 import logging
 from collections.abc import Callable, Iterator, Sequence
 
@@ -32,7 +30,7 @@ from factorlib.geometry.camera import Camera, Pose
 from factorlib.geometry.raster import Caster
 from factorlib.meshes.mesh import closed_grid
 from factorlib.shapes.hull import overlap
-from factorlib.shapes.outline import Outline, Triangles, of_one_part
+from factorlib.shapes.outline import Outline, Triangles
 
 HEIGHTS, AROUND, RADII = 96, 48, 80  # discs, points of each, and radii tried
 TILTS_DEG = np.arange(-75.0, 76.0, 5.0)
@@ -97,9 +95,8 @@ def body_of_revolution(outlines: Sequence[Outline], report: Callable[[float], No
         report(0.8 + 0.2 * k / ROUNDS)
         profile = carved_by_all(outlines, poses, (profile[0, 0], profile[-1, 0]))
         poses = [laid_on(one, profile, pose) for one, pose in zip(outlines, poses, strict=True)]
-    return msgspec.structs.replace(
-        mesh_of(profile).of_size(1.0), overlap=float(np.mean([pose.overlap for pose in poses]))
-    )
+    shown = float(np.mean([pose.overlap for pose in poses]))
+    return msgspec.structs.replace(mesh_of(profile).of_size(1.0), overlap=shown)
 
 
 def _without_holes(one: Outline) -> Outline:
@@ -206,10 +203,8 @@ def mirrors(one: Outline, camera: Camera) -> list[Float[np.ndarray, "3"]]:
     least = [min((outside(np.array([angle, off])), off) for off in np.linspace(-0.3, 0.3, 7)) for angle in angles]
     cost = np.array([value for value, _ in least])
     minima = [k for k in range(MIRRORS) if cost[k] <= min(cost[k - 1], cost[(k + 1) % MIRRORS])]
-    found = [
-        minimize(outside, [angles[k], least[k][1]], method="Nelder-Mead", options={"xatol": 1e-4, "fatol": 1e-5})
-        for k in sorted(minima, key=lambda k: cost[k])[:4]
-    ]
+    starts, options = sorted(minima, key=lambda k: cost[k])[:4], {"xatol": 1e-4, "fatol": 1e-5}
+    found = [minimize(outside, [angles[k], least[k][1]], method="Nelder-Mead", options=options) for k in starts]
     good = [each for each in found if each.fun <= max(MIRRORED_PX**2, 4 * min(each.fun for each in found))]
     if not good or min(each.fun for each in good) > 4 * MIRRORED_PX**2:
         return []
@@ -244,10 +239,8 @@ def carved_by_all(outlines: Sequence[Outline], poses: Sequence[Turned], span: tu
         return np.zeros((0, 2))
     part = slice(used[0], used[-1] + 1)
     pixel = min(float(np.linalg.norm(view.pose.translation)) / view.camera.focal for view in poses)
-    smooth = UnivariateSpline(heights[part], radius[part], s=len(used) / len(poses) * (MASK_ERROR * pixel) ** 2)(
-        heights[part]
-    )
-    return np.column_stack([heights[part], np.maximum(smooth, RIM * radius.max())])
+    spline = UnivariateSpline(heights[part], radius[part], s=len(used) / len(poses) * (MASK_ERROR * pixel) ** 2)
+    return np.column_stack([heights[part], np.maximum(spline(heights[part]), RIM * radius.max())])
 
 
 def largest_discs(one: Outline, view: Turned, heights: Float[np.ndarray, " n"]) -> Float[np.ndarray, " n"]:
@@ -282,7 +275,7 @@ def mesh_of(profile: Profile) -> Triangles:
     height, radius = profile[::-1, :1], profile[::-1, 1:]  # from the top
     points = np.stack(np.broadcast_arrays(radius * np.sin(angle), height, radius * np.cos(angle)), axis=-1)
     mesh = closed_grid(points, np.array([0, height[0, 0], 0]), np.array([0, height[-1, 0], 0]))
-    return of_one_part(mesh.vertices, mesh.faces)
+    return Triangles(mesh.vertices, mesh.faces)
 
 
 def at(one: Outline, view: Turned) -> Outline:

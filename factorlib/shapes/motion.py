@@ -6,8 +6,6 @@ turns, the background gives cameras that stand still.  Of those believed, the on
 photos give the same cameras.
 """
 
-from __future__ import annotations
-
 import logging
 from collections.abc import Callable, Mapping
 from pathlib import Path
@@ -77,10 +75,8 @@ def cameras_by_motion(
     where, (placed, points) = max(models.items(), key=lambda item: (len(item[1][0]), item[1][1]))
     if len(placed) < LEAST_PHOTOS:
         found = f"cameras of {len(placed)} of {len(views)} photos are found: too few of their features match"
-        cure = (
-            "structure from motion needs photos of one scene, each 10 to 20° from the next, with texture on the object or around it; "
-            "without, give `file`, `lathe` or `primitive` meshes"
-        )
+        cure = "structure from motion needs photos of one scene, each 10 to 20° from the next, with texture on the object or around it"
+        cure += "; without, give `file`, `lathe` or `primitive` meshes"
         raise InputError(found, file="dataset.yaml", key="cameras.sfm", cure=cure)
     log.info("cameras of %d of %d photos by %d points %s", len(placed), len(views), points, where)
     if missing := [name for name in views if name not in placed]:
@@ -123,9 +119,8 @@ def _mapped(
         matching = pycolmap.FeatureMatchingOptions(num_threads=1, use_gpu=False)
         verification = pycolmap.TwoViewGeometryOptions()
         verification.ransac.random_seed = SEED
-        pycolmap.match_exhaustive(
-            database, matching, pycolmap.ExhaustivePairingOptions(), verification, pycolmap.Device.cpu
-        )
+        pairing = pycolmap.ExhaustivePairingOptions()
+        pycolmap.match_exhaustive(database, matching, pairing, verification, pycolmap.Device.cpu)
         report(0.6, "cameras")
         options = pycolmap.IncrementalPipelineOptions(
             num_threads=1, random_seed=SEED, multiple_models=False, min_model_size=LEAST_PHOTOS, extract_colors=False,
@@ -146,9 +141,8 @@ def _mapped(
                 placed[Path(image.name).stem] = Registered(focal, pose, bent.get(image.camera_id))
     outlines = [outline_of(name, views[name], camera) for name, camera in sorted(placed.items())]
     if (overlap := agreement([one for one in outlines if one.is_seen])) < LEAST_AGREEMENT:
-        log.info(
-            "cameras by %d points do not move with the objects (hull against masks: %.2f)", best.num_points3D(), overlap
-        )
+        words = "cameras by %d points do not move with the objects (hull against masks: %.2f)"
+        log.info(words, best.num_points3D(), overlap)
         return {}, 0
     return {name: placed[name] for name in views if name in placed}, best.num_points3D()
 

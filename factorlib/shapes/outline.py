@@ -1,7 +1,5 @@
 """An object's outline in a photo, as shapes are found from it, and triangles as they are written."""
 
-from __future__ import annotations
-
 from functools import cached_property
 from pathlib import Path
 
@@ -66,14 +64,14 @@ class Outline(msgspec.Struct, frozen=True, dict=True):
 
 
 class Triangles(msgspec.Struct, frozen=True):
-    """A shape: vertices [V, 3] in its own frame, faces [F, 3] counter-clockwise from outside, the part of each face, from 0.
+    """A shape: vertices [V, 3] in its own frame, faces [F, 3] counter-clockwise from outside.
 
-    overlap: with the outlines it was found from, mean IoU
+    part: of each face, from 0; None for a shape of one part;  overlap: with the outlines it was found from, mean IoU
     """
 
     vertices: Float[np.ndarray, "v 3"]
     faces: Int[np.ndarray, "f 3"]
-    part: Int[np.ndarray, " f"]
+    part: Int[np.ndarray, " f"] | None = None
     overlap: float = 1.0
 
     def as_mesh(self) -> Mesh:
@@ -81,22 +79,17 @@ class Triangles(msgspec.Struct, frozen=True):
         label = np.ones(len(self.faces), np.int16)
         return Mesh(self.vertices, self.faces.astype(np.int32), np.ones_like(self.vertices), label)
 
-    def of_size(self, size: float) -> Triangles:
+    def of_size(self, size: float) -> "Triangles":
         """The middle of its bounding box in the origin, and the longest side of that `size`."""
         low, high = self.vertices.min(axis=0), self.vertices.max(axis=0)
         return msgspec.structs.replace(self, vertices=(self.vertices - (low + high) / 2) * (size / (high - low).max()))
-
-
-def of_one_part(vertices: Float[np.ndarray, "v 3"], faces: Int[np.ndarray, "f 3"]) -> Triangles:
-    """All faces of the part 0."""
-    return Triangles(vertices, faces, np.zeros(len(faces), int))
 
 
 def write_obj(path: Path, shape: Triangles, parts: list[str]) -> None:
     """An OBJ file with a group for each part that has faces."""
     lines = [f"v {x:.7g} {y:.7g} {z:.7g}" for x, y, z in shape.vertices.tolist()]
     for number, name in enumerate(parts):
-        if (shape.part == number).any():
-            lines.append(f"g {name}")
-            lines += [f"f {a} {b} {c}" for a, b, c in (shape.faces[shape.part == number] + 1).tolist()]
+        faces = shape.faces if shape.part is None else shape.faces[shape.part == number]
+        if len(faces):
+            lines += [f"g {name}", *(f"f {a} {b} {c}" for a, b, c in (faces + 1).tolist())]
     write_text(path, "\n".join(lines) + "\n")

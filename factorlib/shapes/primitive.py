@@ -4,8 +4,6 @@ A ball has none.  A box has two, a cylinder (about y) one: the factors of its ax
 photos, to the outlines.  The descent begins from several shapes, each laid on the `PHOTOS` photos that show most; the shape that overlaps most is kept.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 
 import msgspec
@@ -17,7 +15,7 @@ from factorlib.align.proportions import BOX, ROUND, Sighting, fitted
 from factorlib.align.search import Search, find
 from factorlib.align.target import target_of
 from factorlib.geometry.raster import Caster
-from factorlib.shapes.outline import Outline, Triangles, of_one_part
+from factorlib.shapes.outline import Outline, Triangles
 
 BEGUN = {
     "box": ((1, 1, 1), (1, 0.5, 1), (1, 2, 1), (1, 0.25, 0.5), (1, 0.1, 1), (1, 0.2, 0.8)),
@@ -41,10 +39,9 @@ def primitive(
         mesh = unit(kind, np.array(begun, float)).as_mesh()
         sightings = []
         for one in outlines:
-            found = find(Caster(mesh), one.silhouette, one.camera, one.prior, SEARCH)
-            sightings.append(
-                Sighting(mesh, target_of(one.silhouette, (1,), RESOLUTION), one.camera, one.prior, found.state)
-            )
+            state = find(Caster(mesh), one.silhouette, one.camera, one.prior, SEARCH).state
+            target = target_of(one.silhouette, (1,), RESOLUTION)
+            sightings.append(Sighting(mesh, target, one.camera, one.prior, state))
         factors, _, score = fitted(sightings, STEPS, FREE_FACTORS.get(kind, np.zeros((3, 0))))
         if score > best[0]:
             best = score, factors * begun
@@ -60,4 +57,4 @@ def unit(kind: str, factors: Float[np.ndarray, "3"]) -> Triangles:
     else:
         made = trimesh.creation.cylinder(radius=0.5, height=1.0, sections=128)
         made.apply_transform(trimesh.transformations.rotation_matrix(-np.pi / 2, (1, 0, 0)))
-    return of_one_part(np.asarray(made.vertices) * factors, np.asarray(made.faces))
+    return Triangles(np.asarray(made.vertices) * factors, np.asarray(made.faces))

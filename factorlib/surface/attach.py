@@ -1,7 +1,5 @@
 """Which nodes of the subdivided meshes the pixels of a photo show."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 
 import numpy as np

@@ -184,9 +184,8 @@ class Trial(msgspec.Struct, frozen=True):
             k, number = photo
             gone = [(block.photo == number) & (j == k) for j, block in enumerate(self.problem.blocks)]
             rest = [part.without(rows) if rows.any() else part for part, rows in zip(parts, gone, strict=True)]
-            found = step(
-                [part for part in rest if len(part.residual)], laplacian, stiffness, no_detail(self.surfaces.nodes)
-            )
+            rest = [part for part in rest if len(part.residual)]
+            found = step(rest, laplacian, stiffness, no_detail(self.surfaces.nodes))
             seen = [of.take(~rows) for of, rows in zip(self.attached, gone, strict=True)]
             moved = self.surfaces.displacements(found.turn, seen)
             return Detail(self.surfaces.turns_of(moved), found.log_factor)

@@ -138,9 +138,8 @@ class Part(msgspec.Struct, frozen=True, dict=True):
             places = np.concatenate([np.arange(c * p, (c + 1) * p), np.arange(3 * p, len(hessian))])
             hessian[np.ix_(places, places)] -= U.T @ U
         gradient = self.gradient - self.to_light(np.where(rest, 0.0, self.residual))
-        return Part(
-            self.slopes[np.flatnonzero(rest)], self.residual[rest], self.by_light[:, ~gone], hessian, gradient, p
-        )
+        slopes = self.slopes[np.flatnonzero(rest)]
+        return Part(slopes, self.residual[rest], self.by_light[:, ~gone], hessian, gradient, p)
 
     def of_light(self, unknowns: Float[np.ndarray, " l"]) -> Float[np.ndarray, " 3n"]:
         """U times a change of the light."""

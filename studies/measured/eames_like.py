@@ -24,11 +24,11 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from factorlib.errors import InputError
-from factorlib.evaluate.table import value_at
+from factorlib.images.light_map import maps_in
 from factorlib.jsonfile import write_json
-from factorlib.light_prior import maps_in, prior_of
+from factorlib.light_prior import prior_of
 from studies.measured.standard_errors import light_deviations, material_deviations
-from studies.measured.tools import ROOT, Tables, evaluated, table
+from studies.measured.tools import ROOT, Tables, evaluated, table, value_at
 
 PLACE = ROOT / "build/bench/eames-like"
 SEEDS, CAPTURED_SEEDS = (101, 102, 103, 104, 105), (106, 107, 108, 109, 110)

@@ -55,6 +55,20 @@ def table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
     return "\n".join([lines[0], "|---|" + "---:|" * (len(head) - 1), *lines[1:]])
 
 
+def value_at(metrics: Any, path: str) -> float | None:
+    """The number at a dotted path into metrics.json; None where there is nothing.
+
+    >>> value_at({"a": {"b": [1.5]}}, "a.b.0"), value_at({"a": None}, "a.b")
+    (1.5, None)
+    """
+    for key in path.split("."):
+        try:
+            metrics = metrics[int(key)] if isinstance(metrics, list) else metrics[key]
+        except (LookupError, TypeError, ValueError):
+            return None
+    return metrics
+
+
 def refresh(path: Path, parts: dict[str, str]) -> None:
     """Write each part into the file, between `<!-- begin name -->` and `<!-- end name -->`.  InputError where these marks are missing."""
     text = path.read_text(encoding="utf-8")

@@ -20,7 +20,7 @@ from scipy.optimize import least_squares
 from scipy.stats import spearmanr
 
 from factorlib.evaluate.verdict import CLIPPED, CONTOUR, FLOOR, GOOD, MATERIALS, POOR, UNEXPLAINED
-from factorlib.light_prior import maps_in
+from factorlib.images.light_map import maps_in
 from factorlib.wholefile import write_text
 from studies.figures import STYLE
 from studies.measured.eames_like import drawn, folder_of, made

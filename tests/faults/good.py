@@ -25,9 +25,9 @@ from factorlib.dataset.slices import SLICES, dataset_slice
 from factorlib.evaluate.truth import read_true_light, read_true_normals
 from factorlib.images.exr import write_exr, write_rgb_exr
 from factorlib.jsonfile import read_json
-from factorlib.labels import read_labels
+from factorlib.labels.labels import read_labels
 from factorlib.light.lobes import Lobes
-from factorlib.meshes import read_mesh
+from factorlib.meshes.read import read_mesh
 from factorlib.results.lobes import read_lobes, write_lobes
 from factorlib.results.poses import read_poses
 from factorlib.results.solution import read_earlier

@@ -29,7 +29,7 @@ from PIL import Image
 from factorlib.errors import InputError
 from factorlib.images.limits import check_pixels, check_values
 from factorlib.images.photo import decoded, open_photo
-from factorlib.meshes import read_mesh
+from factorlib.meshes.read import read_mesh
 from tests.faults import good
 from tests.faults.good import DATASET, MESHES, PLAIN, READERS, SOURCES, H, W, png, png_header
 

@@ -87,7 +87,7 @@ def test_a_file_that_finds_no_room_is_an_error_is_not_there_and_leaves_whole_wha
     if (
         path.suffix == ".jpg"
     ):  # libjpeg ends the process where it finds no room, so it must never write to a disk itself
-        monkeypatch.setattr("factorlib.images.write.bytes_of", unlimited)
+        monkeypatch.setattr("factorlib.images.exr.bytes_of", unlimited)
     write(path)
     size = path.stat().st_size
     for room in (size - 1, size // 2, 1):
@@ -109,7 +109,7 @@ def test_a_file_that_finds_no_room_is_an_error_is_not_there_and_leaves_whole_wha
 # calls that write to a path, and who may: the writers themselves, what is no result, and logs of processes
 WRITING = r"\.(write_text|write_bytes|save_file|savefig|imwrite|tofile|savez|save_image)$"
 STREAMS = r"(\.write_table|ImageOutput\.create|torch\.save)$"
-OWN = ("wholefile.py", "images/write.py", "setup.py", "reflection/fused.py", "runner/worker.py")
+OWN = ("wholefile.py", "images/exr.py", "setup.py", "reflection/fused.py", "runner/worker.py")
 
 
 def test_nothing_is_written_past_the_writers_that_check():

@@ -10,8 +10,8 @@ from PIL import Image
 from pycocotools import mask as pycocomask
 
 from factorlib.errors import InputError
-from factorlib.labels import Labels, check_materials, read_labels, read_objects
 from factorlib.labels.coco import runs_of
+from factorlib.labels.labels import Labels, check_materials, read_labels, read_objects
 from factorlib.labels.png import read_values
 
 MATERIALS = ["red", "white", "wood"]

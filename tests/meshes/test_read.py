@@ -10,10 +10,10 @@ import trimesh
 from scipy.spatial.transform import Rotation
 
 from factorlib.errors import InputError
-from factorlib.meshes import read_mesh, write_ply
 from factorlib.meshes.limits import Limits
 from factorlib.meshes.mesh import area_vectors
-from factorlib.meshes.ply import submesh
+from factorlib.meshes.ply import submesh, write_ply
+from factorlib.meshes.read import read_mesh
 from tests.faults.good import DATA, MESHES, OFF, STL_TEXT, VERTICES, glb, gltf_header, put
 
 MATERIALS = ["red", "oak"]

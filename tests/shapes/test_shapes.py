@@ -115,7 +115,7 @@ def test_what_is_no_body_of_revolution_is_refused_or_overlaps_little():
     bent = trimesh.creation.box((1.0, 0.2, 0.2)) + trimesh.creation.box((0.2, 0.6, 0.2)).apply_translation(
         (0.4, 0.3, 0)
     )
-    mesh = Triangles(np.asarray(bent.vertices), np.asarray(bent.faces), np.zeros(len(bent.faces), int)).as_mesh()
+    mesh = Triangles(np.asarray(bent.vertices), np.asarray(bent.faces)).as_mesh()
     assert body_of_revolution([outline(mesh, looking_from(20, 15), False)]).overlap < 0.9
 
 

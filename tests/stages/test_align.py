@@ -16,7 +16,7 @@ from factorlib.geometry.camera import Pose
 from factorlib.geometry.raster import rasterise
 from factorlib.images.exr import read_exr
 from factorlib.jsonfile import read_json, write_json
-from factorlib.meshes import write_ply
+from factorlib.meshes.ply import write_ply
 from factorlib.stage import Inputs, silent
 from stages import align
 from tests.align.scenes import blob, chair, photo_of

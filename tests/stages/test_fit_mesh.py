@@ -7,8 +7,8 @@ import pytest
 from factorlib.dataset.schema import ObjectsSlice
 from factorlib.geometry.raster import rasterise
 from factorlib.jsonfile import read_json, write_json
-from factorlib.meshes import write_ply
 from factorlib.meshes.mesh import scaled
+from factorlib.meshes.ply import write_ply
 from factorlib.results.poses import PhotoPoses
 from factorlib.stage import Inputs, silent
 from stages import export, fit_mesh, urm

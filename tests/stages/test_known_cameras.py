@@ -14,7 +14,7 @@ from factorlib.errors import InputError
 from factorlib.generate.folder import write_labels, write_photo
 from factorlib.geometry.camera import Camera, Pose, rotation_of_vector
 from factorlib.geometry.raster import Caster, rasterise
-from factorlib.meshes import write_ply
+from factorlib.meshes.ply import write_ply
 from factorlib.stage import Inputs
 from stages import align, masks
 from tests.align.scenes import blob, chair, normal_error_deg

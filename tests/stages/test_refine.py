@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from factorlib.jsonfile import write_json
-from factorlib.meshes import write_ply
+from factorlib.meshes.ply import write_ply
 from factorlib.reflection import reflection_operator
 from factorlib.reflection.network import SHIPPED
 from factorlib.stage import Inputs, silent

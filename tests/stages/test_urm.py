@@ -7,7 +7,7 @@ from factorlib.geometry.camera import Camera, Pose
 from factorlib.geometry.raster import rasterise
 from factorlib.images.exr import write_exr
 from factorlib.jsonfile import write_json
-from factorlib.meshes import write_ply
+from factorlib.meshes.ply import write_ply
 from factorlib.stage import Inputs, silent
 from factorlib.urm.observations import read_observations
 from factorlib.urm.sample import sample

@@ -4,8 +4,6 @@ Its camera frame is OpenCV's; lengths are millimetres.  Its pixel centres are wh
 of a depth map into the ray through (0, 0)), here they are at 0.5.  It does not say how large its images are.
 """
 
-from __future__ import annotations
-
 from typing import Annotated
 
 import msgspec

@@ -5,8 +5,6 @@ here needs, and pycolmap, which reads all of it, takes every count in a binary f
 for ever, or fills memory).
 """
 
-from __future__ import annotations
-
 import math
 import mmap
 import struct
@@ -28,7 +26,7 @@ MOST_NAME = 4096  # bytes
 CameraLine = tuple[int, str, int, int, tuple[float, ...]]  # id, model, width, height, parameters
 ImageLine = tuple[
     str, int, tuple[float, ...]
-]  # name, id of its camera, quaternion w x y z and translation: cam_from_world
+]  # name, its camera's id, cam_from_world as quaternion w x y z and translation
 
 
 def colmap_shots(path: str, refuse: Refusal) -> list[Shot]:

@@ -3,8 +3,6 @@
 What dataset.yaml gives for a photo wins: a pose or keypoints of an object are not looked for in the source.
 """
 
-from __future__ import annotations
-
 import logging
 from pathlib import Path, PurePosixPath
 

@@ -1,7 +1,5 @@
 """The common form of every source: one shot per image, its camera as COLMAP describes it."""
 
-from __future__ import annotations
-
 import json
 import math
 import warnings

@@ -3,8 +3,6 @@
 Its cameras are OpenGL's (x right, y up, z backward) and its matrices lead from camera to world.
 """
 
-from __future__ import annotations
-
 import math
 from typing import Annotated
 
