@@ -20,17 +20,3 @@ def test_the_command_line_loads_no_science():
     )
     done = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
-
-
-def test_every_stage_of_the_pipeline_has_its_module_and_the_runner_finds_what_it_imports():
-    from factorlib.runner.closure import Sources
-    from factorlib.runner.filehash import FileHashes
-    from factorlib.runner.pipeline import read_pipeline
-    from factorlib.runner.project import photo_sets
-
-    pipeline = read_pipeline(ROOT / "pipeline.yaml", photo_sets().slices)
-    sources = Sources([ROOT], FileHashes(None))
-    for name in pipeline.stages:
-        closure = sources.closure("stages", name, ROOT / "pipeline.yaml")
-        assert {f"source:stages.{name}", "source:factorlib.stage"} <= closure.record.keys()
-        assert not any(name.startswith("source:factorlib.runner") for name in closure.record)

@@ -53,24 +53,19 @@ def installed(tmp_path_factory):
     folder = tmp_path_factory.mktemp("wheel")
     pip = [sys.executable, "-m", "pip", "--disable-pip-version-check", "--quiet"]
     source = folder / "source"
-    files = subprocess.run(
-        [
-            "git",
-            "ls-files",
-            "--",
-            "factorlib",
-            "stages",
-            "recipes",
-            "pipeline.yaml",
-            "pyproject.toml",
-            "README.md",
-            "LICENSE",
-        ],
-        cwd=ROOT,
-        check=True,
-        capture_output=True,
-    )
-    for name in files.stdout.decode().splitlines():
+    listed = [
+        "git",
+        "ls-files",
+        "--",
+        "factorlib",
+        "stages",
+        "recipes",
+        "pipeline.yaml",
+        "pyproject.toml",
+        "README.md",
+        "LICENSE",
+    ]
+    for name in subprocess.check_output(listed, cwd=ROOT, text=True).splitlines():
         if (ROOT / name).is_file():
             (source / name).parent.mkdir(parents=True, exist_ok=True)
             (source / name).write_bytes((ROOT / name).read_bytes())

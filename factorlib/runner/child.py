@@ -1,13 +1,8 @@
-"""Processes that compute: whatever runs a step does so in a child, whether of a run on this machine or of a worker of a cluster.
+"""Processes that compute: every step runs in a child, of a run on this machine or of a worker of a cluster.
 
-How many threads a library uses, which instructions it may use, and in which order sets are walked, is fixed when a
-process starts, and results depend on it.  So each child is started for one number of threads, in an environment of its
-own, with the modules that are on disk now.  A worker of a cluster was started by others, in whatever environment, and
-stays for days: it computes nothing itself.  A library that crashes, or a step that is killed for want of memory, ends the
-child alone.
-
-The number of threads is part of what is computed, for sums depend on it; how many steps run at once, and over how many
-cores a step spreads independent work, is the machine's affair.
+How many threads a library uses, which instructions, and in which order sets are walked, is fixed when a process starts,
+and results depend on it.  So each child is started for one number of threads, in an environment of its own, with the
+modules that are on disk now.  A library that crashes, or a step that is killed for want of memory, ends the child alone.
 """
 
 from __future__ import annotations
@@ -110,7 +105,8 @@ class Pools:
     """
 
     def __init__(self, cores: int | None = None):
-        self.cores = cores or machine_cores()
+        can_say = hasattr(os, "sched_getaffinity")  # which cores this process may use
+        self.cores = cores or (len(os.sched_getaffinity(0)) if can_say else os.cpu_count() or 1)
         self.children, self._threads = [], ThreadPoolExecutor(1 << 16)  # as many as there are steps at once
         self._busy: dict[Future, int] = {}
 
@@ -137,11 +133,6 @@ class Pools:
         self._threads.shutdown()
         for child in self.children:
             child.end(kill)
-
-
-def machine_cores() -> int:
-    """The processor cores that this process may use."""
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
 # ── in the child ─────────────────────────────────────────────────────────────────────────────────────────────────────

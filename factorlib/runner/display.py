@@ -66,9 +66,7 @@ class Display:
 
     def __init__(self) -> None:
         self.stages: dict[str, list[int]] = {}  # how many steps each has, and how many of them are left
-        self.usual: dict[
-            str, tuple[float, int]
-        ] = {}  # by stage: seconds that a step took before, and on how many cores
+        self.usual: dict[str, tuple[float, int]] = {}  # by stage: seconds a step took before, on how many cores
         self.cores = 1
         self.running: dict[Step, Live] = {}
         self._told: dict[str | Step, None] = {}  # stages that have begun, warnings, and steps that wait

@@ -118,11 +118,6 @@ class Project(msgspec.Struct, frozen=True):
         """The folder of all results."""
         return self.root / "build"
 
-    @property
-    def source_roots(self) -> list[Path]:
-        """Folders in which modules of the project are found: the checkout, and the library where it lies elsewhere."""
-        return list(dict.fromkeys([self.code_root, LIBRARY]))
-
     def command(self, verb: str, dataset: str) -> str:
         """A verb for a data set, as a user of the checkout, or of the installed package, types it."""
         words = f"factorlib {verb} -d" if self.shipped else f"make {verb} DATASET="

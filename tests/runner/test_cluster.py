@@ -19,11 +19,10 @@ from factorlib.runner.child import TRIM
 from factorlib.runner.cluster import Site
 from factorlib.runner.pipeline import read_pipeline, with_settings
 from factorlib.runner.project import LIBRARY
-from tests.faults.battered import make
 from tests.faults.test_nothing_lost import start, wait_until
 from tests.runner import toy
 from tests.runner.clusters import LiveCluster, doing, offspring
-from tests.runner.toy import files_of, write
+from tests.runner.toy import files_of, make, write
 
 pytestmark = pytest.mark.skipif(not Path("/proc/self/stat").exists(), reason="looks for processes in /proc")
 
