@@ -257,6 +257,10 @@ def test_what_is_left_is_told_where_every_stage_ran_before_by_what_it_took(proje
     assert shown.seconds_left() == pytest.approx((2 * 1 + 10 * 2) / 2)
     shown.finish(Step("upper", "a"), 65.0), shown.finish(Step("upper", "b"), 65.0)
     assert shown.seconds_left() == pytest.approx((2 * 1 + 10 * 2) / 2)
+    shown.start(Step("table"))  # which never ran before, and whose result the plan found before its process ended
+    assert shown.seconds_left() is None
+    shown.finish(Step("table"), 1.0)
+    assert shown.seconds_left() == pytest.approx((2 * 1 + 10 * 2) / 2)
 
 
 def test_gc_shows_by_stage_and_age_what_is_not_current_asks_and_deletes_that_alone(project, capsys):
