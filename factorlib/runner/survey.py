@@ -68,10 +68,9 @@ class Survey:
     def faults(self, steps: Iterable[Step], new: bool = False) -> list[str]:
         """What is wrong with the files that steps read, those of their recipes too, each fault once.
 
-        Where several stages take a slice, it is looked at by the parameters of the first.
         new: only where the step's part of the dataset, or a file of its recipe, is another than that of its last result
         """
-        faults, done = {}, set()
+        faults: dict[str, None] = {}
         for step in steps:
             stage, before = self.spec.pipeline.stages[step.stage], self.previous.get(str(step))
             now = {name: value for name, value in self.records[step].items() if name.startswith(READ)}
@@ -79,9 +78,7 @@ class Survey:
                 continue
             errors = self.data.recipe_faults(self.recipes[step.recipe].files) if step.recipe is not None else []
             for slice_ in stage.slices:
-                if (slice_, step.photo) not in done:
-                    done.add((slice_, step.photo))
-                    errors = [*errors, *self.data.faults(slice_, step.photo, stage.values, self.project.pipeline_file)]
+                errors = [*errors, *self.data.faults(slice_, step.photo, stage.values, self.project.pipeline_file)]
             faults |= dict.fromkeys(map(str, errors))
         return list(faults)
 

@@ -22,7 +22,7 @@ from factorlib.runner.plan import Planned, Step, difference, in_short
 from factorlib.runner.project import RESERVED, Project, check_name
 from factorlib.runner.shared import shared_store
 from factorlib.runner.shared import ship as put_into_package
-from factorlib.runner.stop import INTERRUPTED, TERMINATED, heed_stops
+from factorlib.runner.stop import INTERRUPTED, TERMINATED
 from factorlib.runner.store import Store, is_locked
 from factorlib.runner.survey import Survey, survey
 from factorlib.runner.worker import Code, load_stage
@@ -72,30 +72,29 @@ def _say(seen: Survey, text: str) -> None:
 
 def make(project: Project, wish: Wish, strict: bool = False) -> int:
     """Run the stages that are wanted and what they need, as far as anything must run; strict: return UNTRUSTED for a result not to be trusted."""
-    with heed_stops():
-        started, seen = time.perf_counter(), survey(project, *wish)
-        planned = seen.planned()
-        todo = [p.step for p in planned if p.status != "current"]
-        if not todo:
-            show(seen, planned)
-            _say(seen, f"nothing to do, all {len(seen.records)} steps are current")
-        elif faults := seen.faults(todo, new=True):
-            return _refused(seen, faults)
-        elif code := _run(seen, started):
-            return code
-        home, whole = seen.home.folder, wish.targets is None  # of the whole pipeline, name what a user looks at first
-        judged = (home / VERDICT).read_text(encoding="utf-8") if whole and (home / VERDICT).exists() else ""
-        for number, line in enumerate(judged.splitlines()):
-            print(f"  verdict: {line}" if number == 0 else f"    {line}")
-        for what, path in RESULTS.items() if whole else ():
-            if (home / path).exists():
-                print(f"  {what}: {project.shown(home / path)}" + ("/*.exr" if (home / path).is_dir() else ""))
-        for name in seen.spec.targets or ():
-            over_recipes = seen.spec.pipeline.stages[name].over == "recipe"
-            if over_recipes or not whole:
-                one = next(iter(seen.recipes)) if over_recipes and len(seen.recipes) == 1 else ""
-                print(f"  {name}: {project.shown(home / name / one)}")
-        return UNTRUSTED if strict and judged.startswith(NO_TRUST) else 0
+    started, seen = time.perf_counter(), survey(project, *wish)
+    planned = seen.planned()
+    todo = [p.step for p in planned if p.status != "current"]
+    if not todo:
+        show(seen, planned)
+        _say(seen, f"nothing to do, all {len(seen.records)} steps are current")
+    elif faults := seen.faults(todo, new=True):
+        return _refused(seen, faults)
+    elif code := _run(seen, started):
+        return code
+    home, whole = seen.home.folder, wish.targets is None  # of the whole pipeline, name what a user looks at first
+    judged = (home / VERDICT).read_text(encoding="utf-8") if whole and (home / VERDICT).exists() else ""
+    for number, line in enumerate(judged.splitlines()):
+        print(f"  verdict: {line}" if number == 0 else f"    {line}")
+    for what, path in RESULTS.items() if whole else ():
+        if (home / path).exists():
+            print(f"  {what}: {project.shown(home / path)}" + ("/*.exr" if (home / path).is_dir() else ""))
+    for name in seen.spec.targets or ():
+        over_recipes = seen.spec.pipeline.stages[name].over == "recipe"
+        if over_recipes or not whole:
+            one = next(iter(seen.recipes)) if over_recipes and len(seen.recipes) == 1 else ""
+            print(f"  {name}: {project.shown(home / name / one)}")
+    return UNTRUSTED if strict and judged.startswith(NO_TRUST) else 0
 
 
 def _run(seen: Survey, started: float) -> int:
