@@ -112,12 +112,12 @@ class Pools:
 
     def free(self, cores: int) -> bool:
         """Whether a step of `cores` cores may start now: the cores suffice, or nothing else runs."""
-        return not self._work() or self._work() + cores <= self.cores
-
-    def _work(self) -> int:
-        """The cores of the steps that run."""
         self._busy = {future: count for future, count in self._busy.items() if not future.done()}
-        return sum(self._busy.values())
+        return not self._busy or sum(self._busy.values()) + cores <= self.most()
+
+    def most(self) -> int:
+        """The cores of the steps that may be started."""
+        return self.cores
 
     def submit(self, cores: int, threads: int, function: Callable, argument: Any) -> Future:
         """Start `function(argument)` in a process of `threads` threads, which takes `cores` cores; its future."""

@@ -273,8 +273,10 @@ def label_masks(project: Project, dataset: str, port: int) -> int:
     return 0
 
 
-def compare(project: Project, first: Path, second: Path) -> int:
+def compare(project: Project, first: Path | None, second: Path | None) -> int:
     """Write a page that shows two results, folders such as build/eames, side by side."""
+    if first is None or second is None:
+        raise InputError("two results are to be named", key="compare", cure="make compare A=build/eames B=<another>")
     homes = [Home(path if path.is_dir() else project.build / path) for path in (first, second)]
     for home, named in zip(homes, (first, second), strict=True):
         if not home.keys_file.is_file():
