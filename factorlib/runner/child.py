@@ -26,8 +26,8 @@ from typing import Any
 from factorlib import arithmetic
 from factorlib.errors import InputError
 from factorlib.runner.project import LIBRARY
-from factorlib.runner.worker import THREAD_VARIABLES, limit_threads
 
+THREAD_VARIABLES = [*(f"{of}_NUM_THREADS" for of in ("OMP", "MKL", "OPENBLAS", "NUMEXPR")), "VECLIB_MAXIMUM_THREADS"]
 TRIM = "MALLOC_TRIM_THRESHOLD_"  # Dask's nanny sets it; sums of 700 × 700 numbers then take three times as long
 WATCH = 0.3  # seconds between two looks at whether the work is still wanted
 _taking = threading.Lock()
@@ -40,7 +40,7 @@ class Child:
     def __init__(self, threads: int, run: Path):
         self.threads, self.run, self.busy = threads, run, False
         self.connection, theirs = Pipe()
-        command = [sys.executable, "-P", "-c", MAIN, str(theirs.fileno()), str(threads), str(os.getpid()), str(run)]
+        command = [sys.executable, "-P", "-c", MAIN, str(theirs.fileno()), str(os.getpid()), str(run)]
         fixed = {
             "PYTHONHASHSEED": "0",
             "OMP_WAIT_POLICY": "PASSIVE",  # threads that wait by spinning stand in the way of others, and of each other
@@ -140,10 +140,9 @@ class Pools:
 
 def main() -> None:
     """Answer calls until the parent is gone, or wants no more."""
-    handle, threads, parent, run = sys.argv[1:]
+    handle, parent, run = sys.argv[1:]
     for number in (signal.SIGINT, signal.SIGTERM):  # the parent ends it
         signal.signal(number, signal.SIG_IGN)
-    limit_threads(int(threads))
 
     def end_with_parent_and_run() -> None:
         while os.getppid() == int(parent) and Path(run).is_dir():

@@ -43,7 +43,6 @@ from factorlib.stage import Inputs, serial_map
 from factorlib.wholefile import append_text, replace_file
 from factorlib.yamlfile import convert
 
-THREAD_VARIABLES = [*(f"{of}_NUM_THREADS" for of in ("OMP", "MKL", "OPENBLAS", "NUMEXPR")), "VECLIB_MAXIMUM_THREADS"]
 EVERY = 0.2  # seconds between two words of progress
 
 
@@ -135,12 +134,15 @@ def run_step(task: Task) -> Outcome:
 
 
 def load_stage(code: Code) -> ModuleType:
-    """Import a stage's module from the project and limit the process to the stage's threads."""
+    """Import a stage's module from the project; what was loaded with it has the stage's threads."""
     if str(code.root) not in sys.path:
         sys.path.insert(0, str(code.root))
     module = importlib.import_module(f"{code.package}.{code.stage}")
     take_sigterm_back()
-    limit_threads(code.threads)
+    if "torch" in sys.modules:
+        sys.modules["torch"].set_num_threads(code.threads)
+    if "OpenImageIO" in sys.modules:
+        sys.modules["OpenImageIO"].attribute("threads", code.threads)
     return module
 
 
@@ -155,15 +157,6 @@ def spread(cores: int, function: Callable, items: Iterable) -> list:
         return serial_map(function, items)
     with ThreadPoolExecutor(cores) as pool:
         return list(pool.map(function, items))
-
-
-def limit_threads(threads: int) -> None:
-    """The same number for every library; those not loaded yet read the environment."""
-    os.environ.update(dict.fromkeys(THREAD_VARIABLES, str(threads)))
-    if "torch" in sys.modules:
-        sys.modules["torch"].set_num_threads(threads)
-    if "OpenImageIO" in sys.modules:
-        sys.modules["OpenImageIO"].attribute("threads", threads)
 
 
 def _made(task: Task, store: Store, events: Events) -> Entry:
