@@ -27,6 +27,7 @@ FUNCTION = "def f(x):\n    return x + 1\n"
         ("def f(x):\n    return x + 2\n", True),
         ("def f(y):\n    return y + 1\n", True),
         (FUNCTION + 'Y = "a string"\n', True),
+        (FUNCTION + '"A string that stands alone."\n', False),
     ],
 )
 def test_comments_docstrings_and_layout_do_not_count_and_anything_else_does(text, counts):
