@@ -117,16 +117,6 @@ def _stage(asked: Namespace) -> int:
     return verbs.make(project(), wish(asked, [asked.name]))
 
 
-def _compare(asked: Namespace) -> int:
-    if not (asked.first and asked.second):
-        raise InputError("two results are to be named", key="compare", cure="make compare A=build/eames B=<another>")
-    return verbs.compare(project(), asked.first, asked.second)
-
-
-def _validate(asked: Namespace) -> int:
-    return verbs.validate(project(), dataset_of(asked), settings_of(asked), switched_on("SHEET", asked.sheet))
-
-
 ASKED = "dataset set force recipe"
 VERBS: dict[str, tuple[str, Callable[[Namespace], int], str]] = {  # in the order of `--help`: options, what it does, help
     "all": (f"{ASKED} strict", lambda a: verbs.make(project(), wish(a), switched_on("STRICT", a.strict)),
@@ -149,9 +139,10 @@ VERBS: dict[str, tuple[str, Callable[[Namespace], int], str]] = {  # in the orde
             "Begin data/<name> of your own photos, masks and meshes, with a dataset.yaml."),
     "label": ("dataset port", lambda a: verbs.label_masks(project(), dataset_of(a), a.port or 0),
               "Draw masks on a page in the browser, served on this machine alone until Ctrl-C."),
-    "compare": ("first second", _compare,
+    "compare": ("first second", lambda a: verbs.compare(project(), a.first, a.second),
                 "A page that shows two results side by side: parameters, numbers, materials, lights."),
-    "validate": ("dataset set sheet", _validate,
+    "validate": ("dataset set sheet",
+                 lambda a: verbs.validate(project(), dataset_of(a), settings_of(a), switched_on("SHEET", a.sheet)),
                  "Check pipeline.yaml, settings and dataset without running anything."),
     "pack": ("dataset out force", lambda a: verbs.pack(project(), dataset_of(a), a.out, switched_on("FORCE", a.force)),
              "Put a result into one zip file that travels without its dataset."),

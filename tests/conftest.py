@@ -1,8 +1,34 @@
-"""Tests compute the bits that the runner's workers do, whatever `-n` is.
+"""Tests compute the bits that the runner's workers do, whatever `-n` is; and the toy of the runner's tests.
 
 The libraries read these variables when they are loaded, so no plugin of pytest may load one before: see `addopts` in pyproject.toml.
 """
 
+import pytest
+from hypothesis import HealthCheck, settings
+
 from factorlib.arithmetic import fix
+from tests.runner import toy
 
 fix()
+settings.register_profile("untimed", deadline=None, suppress_health_check=[HealthCheck.too_slow])
+settings.load_profile("untimed")  # a busy machine fails no test
+
+
+@pytest.fixture(scope="session")
+def made_once(tmp_path_factory):
+    """The toy, everything made; nobody changes it."""
+    made = toy.make_project(tmp_path_factory.mktemp("toy") / "root")
+    assert toy.make(made) == 0
+    return made
+
+
+@pytest.fixture
+def project(made_once, tmp_path):
+    """The toy, everything current, in a checkout of its own."""
+    return toy.copy(made_once, tmp_path / "a root with spaces")
+
+
+@pytest.fixture
+def fresh(tmp_path):
+    """The toy, nothing made yet."""
+    return toy.make_project(tmp_path / "root")

@@ -1,13 +1,8 @@
-"""Processes that compute: whatever runs a step does so in a child, whether of a run on this machine or of a worker of a cluster.
+"""Processes that compute: every step runs in a child, of a run on this machine or of a worker of a cluster.
 
-How many threads a library uses, which instructions it may use, and in which order sets are walked, is fixed when a
-process starts, and results depend on it.  So each child is started for one number of threads, in an environment of its
-own, with the modules that are on disk now.  A worker of a cluster was started by others, in whatever environment, and
-stays for days: it computes nothing itself.  A library that crashes, or a step that is killed for want of memory, ends the
-child alone.
-
-The number of threads is part of what is computed, for sums depend on it; how many steps run at once, and over how many
-cores a step spreads independent work, is the machine's affair.
+How many threads a library uses, which instructions, and in which order sets are walked, is fixed when a process starts,
+and results depend on it.  So each child is started for one number of threads, in an environment of its own, with the
+modules that are on disk now.  A library that crashes, or a step that is killed for want of memory, ends the child alone.
 """
 
 from __future__ import annotations
@@ -31,8 +26,8 @@ from typing import Any
 from factorlib import arithmetic
 from factorlib.errors import InputError
 from factorlib.runner.project import LIBRARY
-from factorlib.runner.worker import THREAD_VARIABLES, limit_threads
 
+THREAD_VARIABLES = [*(f"{of}_NUM_THREADS" for of in ("OMP", "MKL", "OPENBLAS", "NUMEXPR")), "VECLIB_MAXIMUM_THREADS"]
 TRIM = "MALLOC_TRIM_THRESHOLD_"  # Dask's nanny sets it; sums of 700 × 700 numbers then take three times as long
 WATCH = 0.3  # seconds between two looks at whether the work is still wanted
 _taking = threading.Lock()
@@ -45,7 +40,7 @@ class Child:
     def __init__(self, threads: int, run: Path):
         self.threads, self.run, self.busy = threads, run, False
         self.connection, theirs = Pipe()
-        command = [sys.executable, "-P", "-c", MAIN, str(theirs.fileno()), str(threads), str(os.getpid()), str(run)]
+        command = [sys.executable, "-P", "-c", MAIN, str(theirs.fileno()), str(os.getpid()), str(run)]
         fixed = {
             "PYTHONHASHSEED": "0",
             "OMP_WAIT_POLICY": "PASSIVE",  # threads that wait by spinning stand in the way of others, and of each other
@@ -110,18 +105,19 @@ class Pools:
     """
 
     def __init__(self, cores: int | None = None):
-        self.cores = cores or machine_cores()
+        can_say = hasattr(os, "sched_getaffinity")  # which cores this process may use
+        self.cores = cores or (len(os.sched_getaffinity(0)) if can_say else os.cpu_count() or 1)
         self.children, self._threads = [], ThreadPoolExecutor(1 << 16)  # as many as there are steps at once
         self._busy: dict[Future, int] = {}
 
     def free(self, cores: int) -> bool:
         """Whether a step of `cores` cores may start now: the cores suffice, or nothing else runs."""
-        return not self._work() or self._work() + cores <= self.cores
-
-    def _work(self) -> int:
-        """The cores of the steps that run."""
         self._busy = {future: count for future, count in self._busy.items() if not future.done()}
-        return sum(self._busy.values())
+        return not self._busy or sum(self._busy.values()) + cores <= self.most()
+
+    def most(self) -> int:
+        """The cores of the steps that may be started."""
+        return self.cores
 
     def submit(self, cores: int, threads: int, function: Callable, argument: Any) -> Future:
         """Start `function(argument)` in a process of `threads` threads, which takes `cores` cores; its future."""
@@ -139,20 +135,14 @@ class Pools:
             child.end(kill)
 
 
-def machine_cores() -> int:
-    """The processor cores that this process may use."""
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-
-
 # ── in the child ─────────────────────────────────────────────────────────────────────────────────────────────────────
 
 
 def main() -> None:
     """Answer calls until the parent is gone, or wants no more."""
-    handle, threads, parent, run = sys.argv[1:]
+    handle, parent, run = sys.argv[1:]
     for number in (signal.SIGINT, signal.SIGTERM):  # the parent ends it
         signal.signal(number, signal.SIG_IGN)
-    limit_threads(int(threads))
 
     def end_with_parent_and_run() -> None:
         while os.getppid() == int(parent) and Path(run).is_dir():

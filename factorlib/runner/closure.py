@@ -1,15 +1,14 @@
 """The source a stage depends on: its module and everything of the project it imports, however far.
 
-Each module is hashed by its syntax tree without comments and docstrings, so that a remark reruns nothing.  Imports are
-found anywhere in a module, inside functions too; modules named only at run time (`import_module(name)`) are not seen.
-Package data counts by one rule: every file that lies beside an imported module, or in a folder beside it that is no
-package, and is not Python, but for what Python and editors leave there (`left_over`).
+Each module is hashed by its syntax tree without comments and docstrings, so that a remark reruns nothing.  Imports count
+wherever they stand; modules named only at run time (`import_module(name)`) are not seen.  So does every file beside an
+imported module, or in a folder beside it that is no package, but for what Python and editors leave there (`left_over`).
 
 What else a module's numbers depend on it declares in constants, which are read from its syntax tree:
 
     ENVIRONMENT = ("FACTORLIB_FUSED",)    environment variables; their values count
-    PROGRAMS = {"CC": "cc"}               programs by the variable that names them, and what stands in for it; whether
-                                          there is such a program counts, and its name, not where it lies
+    PROGRAMS = {"CC": "cc"}               programs by the variable that names them, and the usual one; whether it is there
+                                          counts, and its name, not where it lies
 """
 
 from __future__ import annotations
@@ -20,13 +19,14 @@ import os
 import shutil
 import sys
 from collections.abc import Iterator
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
 import msgspec
 
 from factorlib.errors import InputError, did_you_mean
-from factorlib.runner.filehash import FileHashes, left_over, read_cache, write_cache
+from factorlib.runner.filehash import FileHashes, left_over
 
 # the fields of a record that a closure makes
 CODE = ("source:", "data:", "environment:", "program:", "package:", "python")
@@ -34,9 +34,7 @@ OURS = ("factorlib", "stages", "studies")  # packages; an installed one lies amo
 
 
 class Source(msgspec.Struct, frozen=True):
-    """What one module's text says: a digest of its syntax tree, dotted names as it imports them, and the environment variables
-    and programs that it declares its numbers to depend on.
-    """
+    """What one module's text says: a digest of its syntax tree, what it imports, and what it declares to depend on."""
 
     digest: str = ""
     imports: list[str] = []
@@ -45,11 +43,7 @@ class Source(msgspec.Struct, frozen=True):
 
 
 class Closure(msgspec.Struct, frozen=True):
-    """What a stage depends on besides its inputs.
-
-    record: the part of a step's record that is its code, and what of the environment the code declares or imports
-    files:  where what `record` names lies
-    """
+    """What a stage depends on besides its inputs, as a part of a step's record; and where what that names lies."""
 
     record: dict[str, str]
     files: dict[str, Path]
@@ -69,7 +63,8 @@ def source_of(text: str, module: str, is_package: bool) -> Source:
     environment = _declared(tree, "ENVIRONMENT", list[str], '("A_VARIABLE",)') or []
     programs = _declared(tree, "PROGRAMS", dict[str, str], '{"CC": "cc"}') or {}
     for node in ast.walk(tree):
-        _drop_docstring(node)
+        if (body := getattr(node, "body", None)) and isinstance(body, list):  # a lambda's is one expression
+            node.body = [item for item in body if not _is_remark(item)] or [ast.Pass()]
     digest = hashlib.sha256(ast.dump(tree).encode()).hexdigest()[:32]
     return Source(digest, sorted(imports), environment, programs)
 
@@ -86,22 +81,16 @@ def _declared(tree: ast.Module, name: str, type_: Any, example: str) -> Any:
     return None
 
 
-def _drop_docstring(node: ast.AST) -> None:
-    """The docstring of a module, class or function, and the strings that follow the fields of a class."""
-    documented = ast.Module | ast.ClassDef | ast.FunctionDef | ast.AsyncFunctionDef
-    if isinstance(node, documented) and ast.get_docstring(node, clean=False) is not None:
-        node.body = node.body[1:] or [ast.Pass()]
-    if isinstance(node, ast.ClassDef):
-        values = [(item, getattr(item, "value", None) if isinstance(item, ast.Expr) else None) for item in node.body]
-        texts = [item for item, value in values if isinstance(value, ast.Constant) and isinstance(value.value, str)]
-        node.body = [item for item in node.body if item not in texts] or [ast.Pass()]
+def _is_remark(item: ast.stmt) -> bool:
+    """Whether a statement is a string that stands alone: a docstring, or what is said of a field."""
+    return isinstance(item, ast.Expr) and isinstance(item.value, ast.Constant) and isinstance(item.value.value, str)
 
 
 class Sources:
-    """The modules below some root folders, read through a cache of file hashes.  cache: of versions of packages"""
+    """The modules below some root folders (the project, the library where it lies elsewhere), through a cache of file hashes."""
 
-    def __init__(self, roots: list[Path], hashes: FileHashes, cache: Path | None = None):
-        self.roots, self.hashes, self.packages = list(dict.fromkeys(roots)), hashes, Packages(cache)
+    def __init__(self, roots: list[Path], hashes: FileHashes):
+        self.roots, self.hashes = list(dict.fromkeys(roots)), hashes
         self._places: dict[str, Path | None] = {}
         self._read: dict[Path, Source] = {}  # each file is looked at once, however many stages import it
         self._beside: dict[Path, list[Path]] = {}  # data files by folder
@@ -146,23 +135,25 @@ class Sources:
                 if shutil.which(words[0]):  # without the folder it lies in
                     record[f"program:{name}"] = " ".join([Path(words[0]).name, *words[1:]])
         files = {f"source:{name}": places[name] for name in sources} | data
-        versions = self.packages.versions(sorted(external - sys.stdlib_module_names - {""}))
-        record |= {f"package:{package}": version for package, version in versions.items()}
+        for name in sorted(external - sys.stdlib_module_names):  # what belongs to no distribution is left out
+            record |= {f"package:{each}": version for each, version in self.versions.get(name, {}).items()}
         return Closure(record | {"python": f"{sys.version_info[0]}.{sys.version_info[1]}"}, files)
+
+    @cached_property
+    def versions(self) -> dict[str, dict[str, str]]:
+        """{name as imported: {distribution: version}}, looked up once per state of the folders of packages."""
+        folders = [path for path in sys.path if path.endswith("-packages") and os.path.isdir(path)]
+        newest = max(folders, key=os.path.getmtime, default=sys.prefix)
+        return self.hashes.remembered("packages", Path(newest), _installed, dict[str, dict[str, str]])
 
     def find(self, name: str) -> Path | None:
         """The file of a module of the project; a folder without `__init__.py` stands for itself."""
         if name not in self._places:
             parent, _, last = name.rpartition(".")
-            above = self.find(parent) if parent else None
-            of_package = above is not None and above.name == "__init__.py"
-            bases = (
-                [above.parent if of_package else above]
-                if above
-                else []
-                if parent
-                else self.roots[: None if name in OURS else 1]
-            )
+            bases = self.roots[: None if name in OURS else 1]
+            if parent:
+                above = self.find(parent)
+                bases = [] if above is None else [above.parent if above.name == "__init__.py" else above]
             self._places[name] = next((file for base in bases if (file := _module_in(base, last))), None)
         return self._places[name]
 
@@ -196,22 +187,9 @@ def _data_files(folder: Path) -> Iterator[Path]:
             yield path
 
 
-class Packages:
-    """Versions of the installed packages that are imported, looked up once per state of site-packages."""
+def _installed() -> dict[str, dict[str, str]]:
+    """{name as imported: {distribution: version}} of all that is installed."""
+    from importlib.metadata import packages_distributions, version
 
-    def __init__(self, cache: Path | None):
-        folders = [path for path in sys.path if path.endswith("-packages") and os.path.isdir(path)]
-        self.cache, self.state = cache, [[path, os.stat(path).st_mtime_ns] for path in folders]
-        state, known = read_cache(cache, tuple[list, dict[str, dict[str, str]]]) or ([], {})
-        self.known = known if state == self.state else {}
-
-    def versions(self, imports: list[str]) -> dict[str, str]:
-        """{distribution: version} by names as imported; what belongs to no distribution is left out."""
-        if missing := [name for name in imports if name not in self.known]:
-            from importlib.metadata import packages_distributions, version
-
-            of = packages_distributions()
-            self.known |= {name: {each: version(each) for each in sorted(set(of.get(name, [])))} for name in missing}
-            if self.cache is not None:
-                write_cache(self.cache, (self.state, self.known))
-        return {name: version for each in imports for name, version in self.known[each].items()}
+    found = packages_distributions()
+    return {name: {each: version(each) for each in sorted({*names})} for name, names in found.items()}

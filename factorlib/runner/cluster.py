@@ -104,9 +104,9 @@ class Cluster(Pools):
         """Those of the largest worker that is there now; 1 where none is."""
         return max(self.workers.values(), default=1)
 
-    def free(self, cores: int) -> bool:
-        """Whether a step of `cores` cores may be handed out now."""
-        return not self._work() or self._work() + cores <= AHEAD * sum(self.workers.values())
+    def most(self) -> int:
+        """The cores of the steps that may be handed out."""
+        return AHEAD * sum(self.workers.values())
 
     def submit(self, cores: int, threads: int, function: Callable, argument: Any) -> Future:
         """Hand out a step, by its task; its future."""

@@ -66,9 +66,7 @@ class Display:
 
     def __init__(self) -> None:
         self.stages: dict[str, list[int]] = {}  # how many steps each has, and how many of them are left
-        self.usual: dict[
-            str, tuple[float, int]
-        ] = {}  # by stage: seconds that a step took before, and on how many cores
+        self.usual: dict[str, tuple[float, int]] = {}  # by stage: seconds a step took before, on how many cores
         self.cores = 1
         self.running: dict[Step, Live] = {}
         self._told: dict[str | Step, None] = {}  # stages that have begun, warnings, and steps that wait
@@ -83,13 +81,13 @@ class Display:
     def seconds_left(self) -> float | None:
         """How long all that is left takes, if each stage takes as long as before; None where one was never run."""
         left, now = {stage: count for stage, (_, count) in self.stages.items() if count}, time.monotonic()
-        if not left.keys() <= self.usual.keys():
+        if not left.keys() | {step.stage for step in self.running} <= self.usual.keys():
             return None
         work = sum(count * math.prod(self.usual[stage]) for stage, count in left.items())
         for step, live in self.running.items():
             seconds, cores = self.usual[step.stage]
             work -= cores * min(now - live.started, seconds)
-        return work / self.cores
+        return max(work, 0.0) / self.cores
 
     def say(self, text: str) -> None:
         """Print a line."""
@@ -138,7 +136,7 @@ class Display:
 
     def finish(self, step: Step, seconds: float) -> None:
         """A step is done, after `seconds`."""
-        self.stages[step.stage][1] -= 1
+        self.stages[step.stage][1] = max(0, self.stages[step.stage][1] - 1)  # a plan may know already that it is made
         self.running.pop(step, None)
         self.line(step.stage, f"{step.of or '':<16} {seconds:6.1f} s")
 

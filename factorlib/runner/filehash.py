@@ -16,7 +16,7 @@ from factorlib.wholefile import replace_file
 
 T = TypeVar("T")
 Hash = Annotated[str, msgspec.Meta(pattern="^[0-9a-f]{32}$")]
-FORMAT = 7  # of the cache; one of another format is made anew
+FORMAT = 8  # of the cache; one of another format is made anew
 FRESH_NS = 2_000_000_000  # a file changed this recently may change again within its clock's grain: not remembered
 
 
@@ -24,11 +24,6 @@ def hash_of_file(path: Path) -> str:
     """First 128 bits of the SHA-256 of a file's content, as 32 hexadecimal digits."""
     with open(path, "rb") as stream:
         return hashlib.file_digest(stream, "sha256").hexdigest()[:32]
-
-
-def is_file_of(digest: str, path: Path) -> bool:
-    """Whether there is such a file, with that content."""
-    return path.is_file() and hash_of_file(path) == digest
 
 
 def left_over(name: str) -> bool:

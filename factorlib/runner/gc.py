@@ -16,11 +16,10 @@ from pathlib import Path
 
 from factorlib.errors import InputError
 from factorlib.runner.home import Home, made_home, made_homes
-from factorlib.runner.plan import Step, key_of
+from factorlib.runner.plan import Step, hash_of
 from factorlib.runner.project import Project
-from factorlib.runner.store import Entry, Store, is_abandoned, is_locked, lock, sweep
+from factorlib.runner.store import LOCK, Entry, Store, is_locked, lock, sweep
 
-LOCK = "lock"  # in the folder of a run
 LEFT_OVER = "left over"  # what was damaged, and files without a key
 
 
@@ -55,7 +54,7 @@ def _door(store: Store, say: Callable[[str], None]) -> Iterator[None]:
         say("waiting: another command begins a run or cleans the store")
         door = lock(store.root / "door.lock", wait=True)
     try:
-        sweep(store.tmp, lambda of: (of.name.startswith("run-") or is_abandoned(of)) and not is_locked(of / LOCK))
+        sweep(store.tmp)
         yield
     finally:
         os.close(door)
@@ -73,14 +72,10 @@ def collect(project: Project, agreed: Callable[[], bool] = lambda: True) -> int:
     with alone(store):
         keys, trees, rest = _dead(project, store)
         sizes = {path.name: sum(f.stat().st_size for f in path.rglob("*") if f.is_file()) for path in trees}
-        freed, groups = (
-            sum(sizes.values()),
-            {},
-        )  # by stage, of each result its age and the bytes that nothing else needs
-        for path in keys:
-            stage, output = (
-                (entry.record["stage"], entry.output) if (entry := store.entry(path.stem)) else (LEFT_OVER, "")
-            )
+        freed, groups = sum(sizes.values()), {}
+        for path in keys:  # by stage, of each result its age and the bytes that nothing else needs
+            entry = store.entry(path.stem)
+            stage, output = (entry.record["stage"], entry.output) if entry else (LEFT_OVER, "")
             groups.setdefault(stage, []).append((path.stat().st_mtime, sizes.pop(output, 0)))
         for path in (path for path in trees if path.name in sizes):
             groups.setdefault(LEFT_OVER, []).append((path.stat().st_mtime, sizes[path.name]))
@@ -93,9 +88,7 @@ def collect(project: Project, agreed: Callable[[], bool] = lambda: True) -> int:
             print("nothing was deleted")
             return 0
         for path in keys + trees + rest:
-            if (
-                path.is_dir() and not path.is_symlink()
-            ):  # by one rename: a part of it might be taken for a damaged result
+            if path.is_dir() and not path.is_symlink():  # by one rename: a part might be taken for a damaged result
                 os.rename(path, aside := store.tmp / f"run-gc-{path.name}")
                 shutil.rmtree(aside)
             else:
@@ -168,11 +161,11 @@ def verify(project: Project, dataset: str | None) -> int:
             continue
         names = users.get(key) or [f"{_step(entry)} (of an earlier run)"]
         trees.setdefault(entry.output, (entry, []))[1].extend(names)
-        if key_of(entry.record) != key:
+        if hash_of(entry.record) != key:
             damaged.append((file, ["its record is not the one that made the key"], names))
     for output, (entry, names) in trees.items():  # every tree once, whichever keys gave it
         if faults := store.damage(entry, read_all=True):
-            damaged.append((store.tree(output), faults, names))
+            damaged.append((store.trees / output, faults, names))
     store.save()
     for where, faults, steps in damaged:
         print(f"{', '.join(steps) or 'a result'}: {project.shown(where)}", *faults, sep="\n    ")

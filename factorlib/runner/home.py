@@ -26,7 +26,7 @@ import msgspec
 from factorlib.errors import InputError, did_you_mean
 from factorlib.jsonfile import json_text, read_json
 from factorlib.runner.filehash import hash_of_file
-from factorlib.runner.plan import Planned, Step, key_of
+from factorlib.runner.plan import Planned, Step, hash_of
 from factorlib.runner.project import RESERVED, Project, check_name
 from factorlib.runner.store import Store, damage_of, stamps_of
 from factorlib.wholefile import replace_file, write_text
@@ -147,10 +147,10 @@ def show(survey: Survey, planned: list[Planned]) -> None:
         if step.photo:
             of_photos.setdefault(step.stage, {})[step.photo] = p.key
         else:
-            point(home.folder / str(step), store.tree(p.output))
+            point(home.folder / str(step), store.trees / p.output)
     for name, of in of_photos.items():
         keys[name] = view_of(store, name, of, stages[name].gather)
-        point(home.folder / name, store.tree(store.get(keys[name])))
+        point(home.folder / name, store.trees / store.get(keys[name]))
     remember(survey, keys)
     for link in home.folder.glob("[!.]*"):  # hidden ones are drafts of links, of another run perhaps
         if link.is_symlink() and link.name not in stages:
@@ -195,7 +195,7 @@ def view_of(store: Store, stage: str, keys: dict[str, str], gather: str | None) 
     entries = {photo: store.entry(key) for photo, key in sorted(keys.items())}
     record = {f"input:{stage}/{photo}": entry.output for photo, entry in entries.items()}
     record |= {"stage": stage, "photo": None, "view": gather}
-    if store.get(key := key_of(record)) is not None:
+    if store.get(key := hash_of(record)) is not None:
         return key
     draft, files, right = store.tmp / f"view-{os.getpid()}-{key}", {}, {}
     shutil.rmtree(draft, ignore_errors=True)
@@ -208,9 +208,9 @@ def view_of(store: Store, stage: str, keys: dict[str, str], gather: str | None) 
                     raise InputError(words, key=photo, cure="put the photo's name into it")
                 (draft / name).parent.mkdir(parents=True, exist_ok=True)
                 try:
-                    os.link(store.tree(entry.output) / name, draft / name)
+                    os.link(store.trees / entry.output / name, draft / name)
                 except OSError:  # no hard links on this file system
-                    shutil.copy2(store.tree(entry.output) / name, draft / name)
+                    shutil.copy2(store.trees / entry.output / name, draft / name)
             files, right = files | entry.files, right | store.known.get(entry.output, {})
         if damage := damage_of(draft, files, right):  # a result that was spoilt since it was looked at
             cure = "run again: it is made anew"
@@ -225,25 +225,19 @@ def view_of(store: Store, stage: str, keys: dict[str, str], gather: str | None) 
     finally:
         shutil.rmtree(draft, ignore_errors=True)
     store.forget(key)
-    store.known[view.output], store.changed = stamps_of(store.tree(view.output)), True
+    store.known[view.output], store.changed = stamps_of(store.trees / view.output), True
     return key
 
 
 def usual_costs(log_file: Path) -> dict[str, tuple[float, int]]:
     """By stage, of the steps as they were last made: the mean of their seconds, and the most cores that one took."""
-    events = [msgspec.json.decode(line) for line in sound_lines(log_file)]
-    last = {
-        (e["stage"], e.get("photo")): e
-        for e in events
-        if e["event"] == "done" and {"seconds", "cores", "threads"} <= e.keys()
-    }
-    stages: dict[str, list[dict]] = {}
-    for (stage, _), event in last.items():
-        stages.setdefault(stage, []).append(event)
-    return {
-        stage: (sum(e["seconds"] for e in steps) / len(steps), max(max(e["cores"], e["threads"]) for e in steps))
-        for stage, steps in stages.items()
-    }
+    last: dict[str, dict[str | None, tuple[float, int]]] = {}
+    for event in map(msgspec.json.decode, sound_lines(log_file)):
+        if event["event"] == "done" and {"seconds", "cores", "threads"} <= event.keys():
+            cost = event["seconds"], max(event["cores"], event["threads"])
+            last.setdefault(event["stage"], {})[event.get("photo")] = cost
+    costs = {stage: list(zip(*of.values())) for stage, of in last.items()}
+    return {stage: (sum(seconds) / len(seconds), max(cores)) for stage, (seconds, cores) in costs.items()}
 
 
 def sound_lines(path: Path) -> list[bytes]:

@@ -104,11 +104,9 @@ class Pipeline(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     def for_data(self, says_nothing: Callable[[str], bool]) -> Pipeline:
         """The stages that a data set has, by which slices of it say nothing (`Stage.when`)."""
         gone = {name for name, stage in self.stages.items() if stage.when and says_nothing(stage.when)}
-        kept = {
-            name: msgspec.structs.replace(stage, inputs=[each for each in stage.inputs if each not in gone])
-            for name, stage in self.stages.items()
-            if name not in gone
-        }
+        kept = {name: stage for name, stage in self.stages.items() if name not in gone}
+        for name, stage in kept.items():
+            kept[name] = msgspec.structs.replace(stage, inputs=[each for each in stage.inputs if each not in gone])
         return msgspec.structs.replace(self, stages=kept)
 
     def needed(self, targets: list[str] | None) -> list[str]:

@@ -92,44 +92,36 @@ def plan(spec: Spec, hashes: Mapping[Step, Record], listing: Listing) -> list[Pl
     planned: dict[Step, Planned] = {}
     for step in spec.steps():
         outputs = {above: planned[above].output for above in spec.above(step)}
-        planned[step] = (_below if None in outputs.values() else _known)(step, spec, hashes[step], outputs, listing)
+        planned[step] = _planned(step, step in spec.forced, hashes[step], outputs, listing)
     return list(planned.values())
 
 
-def _known(step: Step, spec: Spec, own: Record, outputs: Mapping[Step, str], listing: Listing) -> Planned:
-    """A step whose inputs are all made."""
-    stages = spec.pipeline.stages
-    above = [name for name in stages[step.stage].upstream if step.photo is None]
-    gathered = {f"gathered:{name}": stages[name].gather for name in above if stages[name].gather}
-    record = {**own, **{f"input:{above}": output for above, output in outputs.items()}, **gathered}
-    key, before = key_of(record), listing.previous.get(str(step))
-    if step in spec.forced:
-        return Planned(step, "to run", ["forced"], record, key)
-    if (output := listing.outputs.get(key)) is not None:
-        return Planned(step, "current", [], record, key, output)
+def _planned(step: Step, forced: bool, own: Record, outputs: Mapping[Step, str | None], listing: Listing) -> Planned:
+    """A step that is handed those outputs, None where one is still to be made.
+
+    Under such a one it must run if what is known already changed; else that is open.
+    """
+    unmade = [above for above, output in outputs.items() if output is None]
+    record = own | {f"input:{above}": output for above, output in outputs.items() if output is not None}
+    whole, key = (None, None) if unmade else (record, hash_of(record))
+    if forced:
+        return Planned(step, "to run", ["forced"], whole, key)
+    if key and (output := listing.outputs.get(key)) is not None:
+        return Planned(step, "current", [], whole, key, output)
     if key in listing.damaged:
-        reasons = [f"its result is damaged: {in_short(listing.damaged[key])}"]
-    else:
-        reasons = ["not made yet"] if before is None else difference(before, record) or ["its result is gone"]
-    return Planned(step, "to run", reasons, record, key)
+        return Planned(step, "to run", [f"its result is damaged: {in_short(listing.damaged[key])}"], whole, key)
+    if (before := listing.previous.get(str(step))) is None:
+        return Planned(step, "to run", ["not made yet"], whole, key)
+    waiting = {f"input:{above}" for above in unmade}
+    changes = difference({name: value for name, value in before.items() if name not in waiting}, record)
+    if unmade and not changes:
+        return Planned(step, "maybe", [f"if {names(unmade)} comes out different"])
+    return Planned(step, "to run", changes or ["its result is gone"], whole, key)
 
 
-def _below(step: Step, spec: Spec, own: Record, outputs: Mapping[Step, str | None], listing: Listing) -> Planned:
-    """A step under others that are still to run: it must run if what is known already changed, else that is open."""
-    before = listing.previous.get(str(step))
-    if step in spec.forced or before is None:
-        return Planned(step, "to run", ["forced" if step in spec.forced else "not made yet"])
-    open_ = [above for above, output in outputs.items() if output is None]
-    waiting = {f"input:{above}" for above in open_}
-    inputs = {f"input:{above}": output for above, output in outputs.items() if output is not None}
-    gathered = {name: value for name, value in before.items() if name.startswith("gathered:")}
-    changes = difference({k: v for k, v in before.items() if k not in waiting}, {**gathered, **own, **inputs})
-    return Planned(step, "to run" if changes else "maybe", changes or [f"if {names(open_)} comes out different"])
-
-
-def key_of(record: Record) -> str:
-    """The same table is the same key, on any machine."""
-    return hashlib.sha256(json.dumps(record, sort_keys=True).encode()).hexdigest()[:32]
+def hash_of(table: Record) -> str:
+    """The same table has the same hash, on any machine: a record's is its key, that of a tree's files is the tree's name."""
+    return hashlib.sha256(json.dumps(table, sort_keys=True).encode()).hexdigest()[:32]
 
 
 _KIND = {

@@ -8,7 +8,7 @@ import shlex
 from collections.abc import Callable, Sequence
 from functools import cache, partial
 from pathlib import Path
-from typing import Any, NamedTuple, Protocol
+from typing import Any, NamedTuple
 
 import msgspec
 
@@ -23,14 +23,6 @@ LONGEST = 255  # bytes of a name, on every common file system
 ALL = "all"  # recipes
 
 
-class Slice(Protocol):
-    """facts: JSON-able;  fields: the same by the names that they have in the dataset's file;  files: that they name."""
-
-    facts: Any
-    fields: dict[str, Any]
-    files: list[str]
-
-
 class Recipe(msgspec.Struct, frozen=True):
     """What a recipe says.  facts: JSON-able, by field;  files: those it names, as they are written there -> absolute path"""
 
@@ -41,6 +33,7 @@ class Recipe(msgspec.Struct, frozen=True):
 class Data(msgspec.Struct, frozen=True):
     """A dataset as the runner sees it: its folder, its photos, a slice of it by name and photo, and what is wrong with it.
 
+    slice: has `facts`, JSON-able; `fields`, the same by their names in the dataset's file; and `files` that they name
     recipe: reads a recipe for this data set; InputError where it asks for what is not there
     faults: of the files that a slice names, as far as looking at headers tells, by the parameters of the stage that takes
             it and the file in which these stand
@@ -49,7 +42,7 @@ class Data(msgspec.Struct, frozen=True):
 
     folder: Path
     photos: list[str]
-    slice: Callable[[str, str | None], Slice]
+    slice: Callable[[str, str | None], Any]
     faults: Callable[[str, str | None, dict[str, Any], Path], list[InputError]] = lambda *_: []
     recipe: Callable[[Path], Recipe] | None = None
     recipe_faults: Callable[[dict[str, Path]], list[InputError]] = lambda _: []
@@ -117,11 +110,6 @@ class Project(msgspec.Struct, frozen=True):
     def build(self) -> Path:
         """The folder of all results."""
         return self.root / "build"
-
-    @property
-    def source_roots(self) -> list[Path]:
-        """Folders in which modules of the project are found: the checkout, and the library where it lies elsewhere."""
-        return list(dict.fromkeys([self.code_root, LIBRARY]))
 
     def command(self, verb: str, dataset: str) -> str:
         """A verb for a data set, as a user of the checkout, or of the installed package, types it."""

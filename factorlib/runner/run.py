@@ -1,9 +1,8 @@
 """Running a plan: start what is ready, take in what is done, plan again, until nothing is left that can run.
 
 Once all that was ready has been started and there are results, the same pure `plan` is asked anew, so an output that came
-out unchanged stops what follows there, and what another run made meanwhile is used.  What a plan calls ready stays so, for
-all it takes is made; hence a plan for every stage is enough, not one for every result.  A step that fails holds up only
-what depends on it; one that fails because its stage's code was edited meanwhile holds up the stage's further steps too.
+out unchanged stops what follows there, and what another run made meanwhile is used.  A step that fails holds up only what
+depends on it; one that fails because its stage's code was edited meanwhile holds up the stage's further steps too.
 """
 
 from __future__ import annotations
@@ -22,7 +21,6 @@ from factorlib.runner.child import Pools
 from factorlib.runner.display import Display
 from factorlib.runner.gc import tenant
 from factorlib.runner.home import claim, label, remember, show, sound_lines, usual_costs, view_of
-from factorlib.runner.pipeline import DATASET
 from factorlib.runner.plan import Planned, Step
 from factorlib.runner.shared import shared_store
 from factorlib.runner.store import lock
@@ -145,28 +143,19 @@ class Run:
             self.running[step] = Running(planned, task, held, future)
 
     def _task(self, planned: Planned, code: Code) -> Task:
-        step, survey, record = planned.step, self.survey, planned.record
-        stage, given = survey.spec.pipeline.stages[step.stage], survey.spec.pipeline.stages[step.stage].folders
-        slices = {name: survey.data.slice(name, step.photo) for name in stage.slices}
-        facts = {DATASET + name: slice_.facts for name, slice_ in slices.items()}
-        files = {file: survey.data.folder / file for slice_ in slices.values() for file in slice_.files}
-        read = {f"given:{param}/{file}": given[param] / file for param in given for file in stage.given[param]}
-        if step.recipe is not None:
-            recipe = survey.recipes[step.recipe]
-            facts["recipe"] = recipe.facts
-            read |= {f"recipe file:{name}": path for name, path in recipe.files.items()}
+        step, stage = planned.step, self.survey.spec.pipeline.stages[planned.step.stage]
+        facts, files = self.survey.handed[step]
         temporary = self.folder / label(step)
         return Task(
             code=code,
             stage=stage,
-            folders={name: self._folder(step, name) for name in stage.upstream} | given,
+            folders={name: self._folder(step, name) for name in stage.upstream} | stage.folders,
             facts=facts,
-            files=files | read,
-            hashes={file: record[f"file:{file}"] for file in files} | {file: record[file] for file in read},
+            files=files,
             log=self._log_above(step, temporary.with_name(f"{temporary.name}.log.jsonl")) if stage.logs else None,
             store=self.store.root,
             key=planned.key,
-            record=record,
+            record=planned.record,
             temporary=temporary,
             events=temporary.with_name(f"{temporary.name}.events.jsonl"),
             shared=self.shared,
@@ -177,9 +166,9 @@ class Run:
         """Where the files of the stage `name` are for this step."""
         stage, spec = self.survey.spec.pipeline.stages[name], self.survey.spec
         if not stage.over or step.photo is not None:
-            return self.store.tree(self.planned[Step(name, step.photo if stage.over else None)].output)
+            return self.store.trees / self.planned[Step(name, step.photo if stage.over else None)].output
         keys = {each.photo: self.planned[each].key for each in spec.steps_of(name)}
-        return self.store.tree(self.store.get(view_of(self.store, name, keys, stage.gather)))
+        return self.store.trees / self.store.get(view_of(self.store, name, keys, stage.gather))
 
     def _log_above(self, step: Step, path: Path) -> Path:
         """What the steps above cost and said when their present results were made, whichever run made them."""

@@ -1,12 +1,11 @@
 """Results that others have made: in a store that several checkouts share, and those that ship with the source.
 
-`FACTORLIB_STORE=<folder>` names the former.  It is laid out as every store is, but nothing there is used in place: a result is
-copied into the checkout's own store, its key compared with its record and every file with its hash, and what a checkout makes
-is copied there where it may write.  So a shared store that vanishes, is damaged or read-only costs time and no result, and no
-command deletes anything in it: `gc` and `clean` know the checkout's own store alone.
+`FACTORLIB_STORE=<folder>` names the former.  Nothing there is used in place: a result is copied into the checkout's own
+store, its key compared with its record and every file with its hash, and what a checkout makes is copied there where it may
+write.  So a shared store that vanishes, is damaged or read-only costs time and no result.
 
-A shipped result lies where the package is, with what it was made from.  A step takes it where its parameters, and the sources
-of the modules that make it, are those that it was made from; FORCE=1 makes it anew.
+A shipped result lies where the package is.  A step takes it where its parameters, and the sources of the modules that make
+it, are those that it was made from; FORCE=1 makes it anew.
 """
 
 from __future__ import annotations
@@ -25,8 +24,8 @@ from factorlib.jsonfile import json_text
 from factorlib.runner.filehash import hash_of_file
 from factorlib.runner.home import sound_lines
 from factorlib.runner.pipeline import Shipping
-from factorlib.runner.plan import Record, key_of
-from factorlib.runner.store import Entry, Say, Store, damage_of, is_abandoned, sweep
+from factorlib.runner.plan import Record, hash_of
+from factorlib.runner.store import Entry, Say, Store, damage_of, sweep
 from factorlib.wholefile import replace_file
 
 VARIABLE = "FACTORLIB_STORE"
@@ -69,10 +68,10 @@ def offer(own: Store, shared: Store, key: str, say: Say) -> None:
     try:
         if not shared.root.is_dir():
             raise FileNotFoundError(errno.ENOENT, "it is gone")
-        if (there := shared.entry(key)) and not damage_of(shared.tree(there.output), there.files):
+        if (there := shared.entry(key)) and not damage_of(shared.trees / there.output, there.files):
             return
         shared.tmp.mkdir(parents=True, exist_ok=True)
-        sweep(shared.tmp, is_abandoned)
+        sweep(shared.tmp)
         if entry := _copied_result(own, shared, key, draft, lambda _: None):
             shared.keep(key, entry)
     except OSError as error:
@@ -85,7 +84,7 @@ def offer(own: Store, shared: Store, key: str, say: Say) -> None:
 def _copied_result(source: Store, target: Store, key: str, draft: Path, say: Say) -> Entry | None:
     """Copy tree and log of a key that is in `source`; None where any of it is not as it was kept."""
     entry, log = source.entry(key), sound_lines(source.log(key))
-    if key_of(entry.record) != key or not log or not copied(source.tree(entry.output), draft, entry.files):
+    if hash_of(entry.record) != key or not log or not copied(source.trees / entry.output, draft, entry.files):
         return None
     entry = target.take_in(entry.record, draft, say)
     target.logs.mkdir(parents=True, exist_ok=True)
@@ -107,7 +106,7 @@ def copied(tree: Path, draft: Path, files: dict[str, str]) -> bool:
 
 
 class Shipped(msgspec.Struct, frozen=True):
-    """What made_from.json says: the part of the record that the result depends on, and the hash of each file."""
+    """What made_from.json says: the part of the record that the result depends on, and the hash of each file of it."""
 
     record: Record
     files: dict[str, str]
@@ -123,29 +122,24 @@ def made_from(record: Record, modules: list[str]) -> Record:
     return {name: value for name, value in record.items() if name.startswith("param:") or name in own}
 
 
-def shipped_folder(roots: list[Path], shipping: Shipping | None, record: Record) -> Path | None:
-    """The folder, below one of `roots`, whose result is that of `record`; None where it was made from something else."""
-    for folder in (root / shipping.folder for root in roots if shipping):
-        if (folder / MADE_FROM).is_file() and _shipped(folder).record == made_from(record, shipping.made_by):
-            return folder
-    return None
+def copy_shipped(roots: list[Path], shipping: Shipping | None, record: Record, out: Path) -> bool:
+    """Copy the shipped result of `record`, from below one of `roots`, to `out`; False where none was made from the same.
 
-
-def _shipped(folder: Path) -> Shipped:
-    try:
-        return msgspec.json.decode((folder / MADE_FROM).read_bytes(), type=Shipped)
-    except msgspec.DecodeError as error:
-        words = f"does not say what the shipped files were made from ({error})"
-        raise InputError(words, file=folder / MADE_FROM, cure=CURE) from None
-
-
-def copy_shipped(folder: Path, out: Path) -> None:
-    """The files of a shipped result, as the step's own.  Raises InputError where they are not those that were shipped."""
-    files = _shipped(folder).files
-    if not copied(folder, out, files):
-        raise InputError(
-            "beside it are not the files that were shipped with the source", file=folder / MADE_FROM, cure=CURE
-        )
+    Raises InputError where the files are not those that were shipped.
+    """
+    for file in (root / shipping.folder / MADE_FROM for root in roots if shipping):
+        if not file.is_file():
+            continue
+        try:
+            shipped = msgspec.json.decode(file.read_bytes(), type=Shipped)
+        except msgspec.DecodeError as error:
+            words = f"does not say what the shipped files were made from ({error})"
+            raise InputError(words, file=file, cure=CURE) from None
+        if shipped.record == made_from(record, shipping.made_by):
+            if not copied(file.parent, out, shipped.files):
+                raise InputError("beside it are not the files that were shipped with the source", file=file, cure=CURE)
+            return True
+    return False
 
 
 def ship(result: Path, record: Record, root: Path, shipping: Shipping) -> Path:

@@ -11,16 +11,9 @@ from types import FrameType
 INTERRUPTED, TERMINATED = 128 + signal.SIGINT, 128 + signal.SIGTERM  # exit codes, as shells count
 
 
-class Stopped(SystemExit):
-    """SIGTERM came."""
-
-    def __init__(self) -> None:
-        super().__init__(TERMINATED)
-
-
 @contextlib.contextmanager
 def heed_stops() -> Iterator[None]:
-    """Within, SIGTERM raises `Stopped` and SIGINT KeyboardInterrupt, once: those that follow disturb no cleaning up."""
+    """Within, SIGTERM raises SystemExit and SIGINT KeyboardInterrupt, once: those that follow disturb no cleaning up."""
     in_main_thread = threading.current_thread() is threading.main_thread()  # where alone Python may say what signals do
     numbers = [n for n in (signal.SIGINT, signal.SIGTERM) if in_main_thread and signal.getsignal(n) != signal.SIG_IGN]
     before = {number: signal.signal(number, _stop) for number in numbers}
@@ -40,4 +33,4 @@ def take_sigterm_back() -> None:
 def _stop(number: int, frame: FrameType | None = None) -> None:
     for each in (signal.SIGINT, signal.SIGTERM):
         signal.signal(each, signal.SIG_IGN)
-    raise Stopped if number == signal.SIGTERM else KeyboardInterrupt
+    raise SystemExit(TERMINATED) if number == signal.SIGTERM else KeyboardInterrupt

@@ -7,19 +7,15 @@
     build/store/damaged/          what stood where a result was made again, for it was not as it had been kept
     build/store/locks, tmp, cache
 
-A tree and a key appear by one rename each, the tree first; nothing half-written is ever visible.
-
-A tree is right if its files are exactly those of its record, with their contents; what an editor or a desktop leaves
-(`left_over`) is no part of it.  Sizes and times that a tree had when its contents were right are remembered in a cache, so
-that a tree is read once.  A byte that flips under the same size and time is found only where every content is read.
+A tree and a key appear by one rename each, the tree first; nothing half-written is ever visible.  A tree is right if its
+files are exactly those of its record, with their contents, but for what editors leave (`left_over`).  Sizes and times that
+it had when it was right are remembered, so that it is read once; `verify` reads it again.
 """
 
 from __future__ import annotations
 
 import contextlib
 import fcntl
-import hashlib
-import json
 import os
 import shutil
 import stat
@@ -34,13 +30,13 @@ import msgspec
 from factorlib.errors import InputError
 from factorlib.jsonfile import json_text
 from factorlib.runner.filehash import hash_of_file, left_over, read_cache, write_cache
+from factorlib.runner.plan import hash_of
 from factorlib.wholefile import replace_file, sync, sync_tree
 
 Say = Callable[[str], None]
 Stamp = tuple[int, int]  # size in bytes, time of the content in ns
-ABANDONED = (
-    86400.0  # seconds after which what was being written outside a run is taken to be of a process that was killed
-)
+ABANDONED = 86400.0  # seconds after which what was being written outside a run is of a process that was killed
+LOCK = "lock"  # in the folder of a run, which holds it
 NO_FILE: Stamp = (-1, 0)  # a link, a pipe: nothing that a stage writes
 
 
@@ -68,10 +64,6 @@ class Store:
         self._entries: dict[str, Entry] = {}
         self.changed = False
 
-    def tree(self, output: str) -> Path:
-        """The folder of the tree with that hash."""
-        return self.trees / output
-
     def log(self, key: str) -> Path:
         """The file with the log of the result of a key."""
         return self.logs / f"{key}.jsonl"
@@ -83,7 +75,7 @@ class Store:
                 entry = msgspec.json.decode((self.keys / f"{key}.json").read_bytes(), type=Entry)
             except (OSError, msgspec.DecodeError):  # a folder in its place, say
                 return None
-            if output_of(entry.files) != entry.output:
+            if hash_of(entry.files) != entry.output:
                 return None
             self._entries[key] = entry
         return self._entries[key]
@@ -115,10 +107,10 @@ class Store:
 
     def damage(self, entry: Entry, read_all: bool = False) -> list[str]:
         """What is wrong with the tree of an entry, a line each; read_all: whatever is remembered of it."""
-        now, known = stamps_of(self.tree(entry.output)), self.known.get(entry.output, {})
+        now, known = stamps_of(self.trees / entry.output), self.known.get(entry.output, {})
         if now and now == known and not read_all:
             return []
-        damage = damage_of(self.tree(entry.output), entry.files, {} if read_all else known)
+        damage = damage_of(self.trees / entry.output, entry.files, {} if read_all else known)
         if damage:
             self.changed |= self.known.pop(entry.output, None) is not None
         else:
@@ -128,7 +120,7 @@ class Store:
     def save(self) -> None:
         """Write down which trees are known to be right, where there is anything new to write."""
         if self.changed:
-            there = {output: stamps for output, stamps in self.known.items() if self.tree(output).is_dir()}
+            there = {output: stamps for output, stamps in self.known.items() if (self.trees / output).is_dir()}
             write_cache(self.cache / "trees.json", there)
             self.changed = False
 
@@ -143,8 +135,8 @@ class Store:
             for name in files:
                 (folder / name).chmod(0o444)
             sync_tree(folder)
-        entry = Entry(output_of(files), record, files)
-        target = self.tree(entry.output)
+        entry = Entry(hash_of(files), record, files)
+        target = self.trees / entry.output
         target.parent.mkdir(parents=True, exist_ok=True)
         while True:
             try:
@@ -191,22 +183,12 @@ def is_locked(path: Path) -> bool:
     return False
 
 
-def sweep(folder: Path, is_rubbish: Callable[[Path], bool]) -> None:
-    """Delete the folders in `folder` that are rubbish."""
-    for path in folder.iterdir():
+def sweep(folder: Path) -> None:
+    """Delete what runs left in `folder` that are dead, and drafts to which nobody has written for a day."""
+    for path in (path for path in folder.iterdir() if path.is_dir() and not is_locked(path / LOCK)):
         with contextlib.suppress(FileNotFoundError):
-            if path.is_dir() and is_rubbish(path):
+            if path.name.startswith("run-") or time.time() - path.stat().st_mtime > ABANDONED:
                 shutil.rmtree(path, ignore_errors=True)
-
-
-def is_abandoned(path: Path) -> bool:
-    """Whether nobody has written to a folder for a day."""
-    return time.time() - path.stat().st_mtime > ABANDONED
-
-
-def output_of(files: dict[str, str]) -> str:
-    """The hash of a tree: of its files' names and contents."""
-    return hashlib.sha256(json.dumps(files, sort_keys=True).encode()).hexdigest()[:32]
 
 
 def stamps_of(folder: str | Path, above: str = "") -> dict[str, Stamp]:

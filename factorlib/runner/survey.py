@@ -6,6 +6,7 @@ import contextlib
 from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any, NamedTuple
 
 import msgspec
 
@@ -14,14 +15,9 @@ from factorlib.reading import check_plain, reading
 from factorlib.runner.closure import Sources
 from factorlib.runner.filehash import FileHashes
 from factorlib.runner.home import Home, home_of
-from factorlib.runner.pipeline import (
-    DATASET,
-    read_pipeline,
-    said_of_settings,
-    with_settings,
-)
+from factorlib.runner.pipeline import DATASET, read_pipeline, said_of_settings, with_settings
 from factorlib.runner.plan import Listing, Planned, Record, Spec, Step, plan
-from factorlib.runner.project import ALL, Data, Project, Recipe
+from factorlib.runner.project import ALL, LIBRARY, Data, Project, Recipe
 from factorlib.runner.store import Store
 from factorlib.runner.worker import Code, params_of
 
@@ -29,11 +25,19 @@ RENDER = "render"  # the stage whose pictures a recipe replaces
 READ = ("file:", "recipe file:", f"facts:{DATASET}")  # fields of a record: of the dataset and recipe, what a step reads
 
 
+class Handed(NamedTuple):
+    """What a step is handed besides results: facts of the dataset or recipe, and files by the name that its record has for them."""
+
+    facts: dict[str, Any]
+    files: dict[str, Path]
+
+
 @dataclass
 class Survey:
     """All that is known before anything runs; `planned` is what every verb shows.
 
     records:  each step's record but for the results it is handed
+    handed:   facts and files of each step
     recipes:  those that are asked for, by name
     previous: the record each step had when it last was current for this dataset
     settings: words of the command line in place of values of pipeline.yaml
@@ -45,6 +49,7 @@ class Survey:
     store: Store
     spec: Spec
     records: dict[Step, Record]
+    handed: dict[Step, Handed]
     previous: dict[str, Record]
     recipes: dict[str, Recipe]
     settings: list[str]
@@ -63,10 +68,9 @@ class Survey:
     def faults(self, steps: Iterable[Step], new: bool = False) -> list[str]:
         """What is wrong with the files that steps read, those of their recipes too, each fault once.
 
-        Where several stages take a slice, it is looked at by the parameters of the first.
         new: only where the step's part of the dataset, or a file of its recipe, is another than that of its last result
         """
-        faults, done = {}, set()
+        faults: dict[str, None] = {}
         for step in steps:
             stage, before = self.spec.pipeline.stages[step.stage], self.previous.get(str(step))
             now = {name: value for name, value in self.records[step].items() if name.startswith(READ)}
@@ -74,9 +78,7 @@ class Survey:
                 continue
             errors = self.data.recipe_faults(self.recipes[step.recipe].files) if step.recipe is not None else []
             for slice_ in stage.slices:
-                if (slice_, step.photo) not in done:
-                    done.add((slice_, step.photo))
-                    errors = [*errors, *self.data.faults(slice_, step.photo, stage.values, self.project.pipeline_file)]
+                errors = [*errors, *self.data.faults(slice_, step.photo, stage.values, self.project.pipeline_file)]
             faults |= dict.fromkeys(map(str, errors))
         return list(faults)
 
@@ -93,9 +95,8 @@ class Survey:
             pools = Pools()
             try:
                 for future in [pools.submit(1, code.threads, params_of, code) for code in codes]:
-                    if isinstance(
-                        error := future.exception(), InputError
-                    ):  # what cannot be loaded says so when it runs
+                    error = future.exception()
+                    if isinstance(error, InputError):  # what cannot be loaded says so when it runs
                         faults.append(str(said_of_settings(error, self.settings)))
             finally:
                 pools.close(kill=True)
@@ -142,42 +143,50 @@ def survey(
             forced = frozenset(step for name in targets or pipeline.stages for step in spec.steps_of(name))
             spec = msgspec.structs.replace(spec, forced=forced)
         hashes = FileHashes(store.cache / "files.json")
-        records = _records(project, spec, data, hashes, store.cache / "packages.json", asked)
+        records, handed = _records(project, spec, data, hashes, asked)
     except InputError as error:
         raise said_of_settings(error, settings) from None
     with contextlib.suppress(OSError):  # of a build/ that is read-only: the next command reads more, that is all
         hashes.save()
     entries = {step: store.entry(key) for step, key in home.keys(lenient=True).items()}
     previous = {step: entry.record for step, entry in entries.items() if entry}
-    return Survey(project, data, home, store, spec, records, previous, asked, settings)
+    return Survey(project, data, home, store, spec, records, handed, previous, asked, settings)
 
 
 def _records(
-    project: Project, spec: Spec, data: Data, hashes: FileHashes, cache: Path, recipes: dict[str, Recipe]
-) -> dict[Step, Record]:
-    sources, stages, file = Sources(project.source_roots, hashes, cache), spec.pipeline.stages, project.pipeline_file
-    wanted, records = spec.pipeline.needed(spec.targets), {}
-    for name in wanted:
-        stage, closure = stages[name], sources.closure(project.package, name, file)
+    project: Project, spec: Spec, data: Data, hashes: FileHashes, recipes: dict[str, Recipe]
+) -> tuple[dict[Step, Record], dict[Step, Handed]]:
+    """Every step's own part of its record, and what it is handed; each file that is handed counts by its content."""
+    sources, records, handed = Sources([project.code_root, LIBRARY], hashes), {}, {}
+    for name in spec.pipeline.needed(spec.targets):
+        stage = spec.pipeline.stages[name]
         record = {"stage": name, "threads": stage.threads, "makes": stage.makes}
-        record |= closure.record | {f"param:{param}": value for param, value in stage.values.items()}
-        for param, folder in stage.folders.items():
-            for given in stage.given[param]:
-                record[f"given:{param}/{given}"] = _hash(folder / given, hashes, f"{name}.{param}")
+        record |= sources.closure(project.package, name, project.pipeline_file).record
+        record |= {f"param:{param}": value for param, value in stage.values.items()}
         for step in spec.steps_of(name):
-            records[step] = record | {"photo": step.photo}
-            for slice_ in (data.slice(each, step.photo) for each in stage.slices):
-                records[step] |= {f"facts:{DATASET}{field}": value for field, value in slice_.fields.items()}
-                records[step] |= {f"file:{each}": _hash(data.folder / each, hashes) for each in slice_.files}
+            own, facts = record | {"photo": step.photo}, {}
+            if step.photo is None:
+                above = {f"gathered:{each}": spec.pipeline.stages[each].gather for each in stage.upstream}
+                own |= {field: gather for field, gather in above.items() if gather}
+            files = {f"given:{p}/{file}": of / file for p, of in stage.folders.items() for file in stage.given[p]}
+            for each in stage.slices:
+                slice_ = data.slice(each, step.photo)
+                facts[DATASET + each] = slice_.facts
+                own |= {f"facts:{DATASET}{field}": value for field, value in slice_.fields.items()}
+                files |= {f"file:{file}": data.folder / file for file in slice_.files}
             if step.recipe is not None:
                 recipe = recipes[step.recipe]
-                records[step] |= {"recipe": step.recipe} | {f"recipe:{f}": value for f, value in recipe.facts.items()}
-                files = recipe.files.items()
-                records[step] |= {f"recipe file:{each}": _hash(path, hashes) for each, path in files}
-    return records
+                facts["recipe"] = recipe.facts
+                own |= {"recipe": step.recipe} | {f"recipe:{field}": value for field, value in recipe.facts.items()}
+                files |= {f"recipe file:{file}": path for file, path in recipe.files.items()}
+            records[step] = own | {field: _hash(field, path, name, hashes) for field, path in files.items()}
+            handed[step] = Handed(facts, files)
+    return records, handed
 
 
-def _hash(path: Path, hashes: FileHashes, key: str | None = None) -> str:
+def _hash(field: str, path: Path, stage: str, hashes: FileHashes) -> str:
+    kind, _, rest = field.partition(":")
+    key = f"{stage}.{rest.partition('/')[0]}" if kind == "given" else None
     check_plain(path, "a file", key, most_bytes=None)  # a pipe never ends
     with reading("a file", path, key):
         return hashes.content(path)

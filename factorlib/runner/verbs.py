@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import sys
+import textwrap
 import time
 from collections.abc import Sequence
 from importlib import import_module
@@ -21,7 +22,7 @@ from factorlib.runner.plan import Planned, Step, difference, in_short
 from factorlib.runner.project import RESERVED, Project, check_name
 from factorlib.runner.shared import shared_store
 from factorlib.runner.shared import ship as put_into_package
-from factorlib.runner.stop import INTERRUPTED, TERMINATED, Stopped, heed_stops
+from factorlib.runner.stop import INTERRUPTED, TERMINATED
 from factorlib.runner.store import Store, is_locked
 from factorlib.runner.survey import Survey, survey
 from factorlib.runner.worker import Code, load_stage
@@ -71,30 +72,29 @@ def _say(seen: Survey, text: str) -> None:
 
 def make(project: Project, wish: Wish, strict: bool = False) -> int:
     """Run the stages that are wanted and what they need, as far as anything must run; strict: return UNTRUSTED for a result not to be trusted."""
-    with heed_stops():
-        started, seen = time.perf_counter(), survey(project, *wish)
-        planned = seen.planned()
-        todo = [p.step for p in planned if p.status != "current"]
-        if not todo:
-            show(seen, planned)
-            _say(seen, f"nothing to do, all {len(seen.records)} steps are current")
-        elif faults := seen.faults(todo, new=True):
-            return _refused(seen, faults)
-        elif code := _run(seen, started):
-            return code
-        home, whole = seen.home.folder, wish.targets is None  # of the whole pipeline, name what a user looks at first
-        judged = (home / VERDICT).read_text(encoding="utf-8") if whole and (home / VERDICT).exists() else ""
-        for number, line in enumerate(judged.splitlines()):
-            print(f"  verdict: {line}" if number == 0 else f"    {line}")
-        for what, path in RESULTS.items() if whole else ():
-            if (home / path).exists():
-                print(f"  {what}: {project.shown(home / path)}" + ("/*.exr" if (home / path).is_dir() else ""))
-        for name in seen.spec.targets or ():
-            over_recipes = seen.spec.pipeline.stages[name].over == "recipe"
-            if over_recipes or not whole:
-                one = next(iter(seen.recipes)) if over_recipes and len(seen.recipes) == 1 else ""
-                print(f"  {name}: {project.shown(home / name / one)}")
-        return UNTRUSTED if strict and judged.startswith(NO_TRUST) else 0
+    started, seen = time.perf_counter(), survey(project, *wish)
+    planned = seen.planned()
+    todo = [p.step for p in planned if p.status != "current"]
+    if not todo:
+        show(seen, planned)
+        _say(seen, f"nothing to do, all {len(seen.records)} steps are current")
+    elif faults := seen.faults(todo, new=True):
+        return _refused(seen, faults)
+    elif code := _run(seen, started):
+        return code
+    home, whole = seen.home.folder, wish.targets is None  # of the whole pipeline, name what a user looks at first
+    judged = (home / VERDICT).read_text(encoding="utf-8") if whole and (home / VERDICT).exists() else ""
+    for number, line in enumerate(judged.splitlines()):
+        print(f"  verdict: {line}" if number == 0 else f"    {line}")
+    for what, path in RESULTS.items() if whole else ():
+        if (home / path).exists():
+            print(f"  {what}: {project.shown(home / path)}" + ("/*.exr" if (home / path).is_dir() else ""))
+    for name in seen.spec.targets or ():
+        over_recipes = seen.spec.pipeline.stages[name].over == "recipe"
+        if over_recipes or not whole:
+            one = next(iter(seen.recipes)) if over_recipes and len(seen.recipes) == 1 else ""
+            print(f"  {name}: {project.shown(home / name / one)}")
+    return UNTRUSTED if strict and judged.startswith(NO_TRUST) else 0
 
 
 def _run(seen: Survey, started: float) -> int:
@@ -104,9 +104,9 @@ def _run(seen: Survey, started: float) -> int:
     display = display_for()
     try:
         ran = run(seen, display)
-    except (KeyboardInterrupt, Stopped) as stop:
+    except (KeyboardInterrupt, SystemExit) as stop:
         display.say("stopped; what was finished is kept, the next run goes on from there")
-        return TERMINATED if isinstance(stop, Stopped) else INTERRUPTED
+        return INTERRUPTED if isinstance(stop, KeyboardInterrupt) else TERMINATED
     finally:
         display.close()
     if ran.refused:
@@ -145,17 +145,17 @@ def show_plan(project: Project, wish: Wish, every_reason: bool = False) -> int:
 
 def show_status(project: Project, wish: Wish) -> int:
     """Print how far each stage is, and its warnings."""
-    seen = survey(project, *wish, look=True)
-
-    def running(planned: Planned) -> bool:
-        """Whether a run holds the lock on a step's key."""
-        return is_locked(seen.store.locks / f"{planned.key}.lock")
-
-    def warned(planned: Planned) -> list[str]:
-        """What a step said when its present result was made."""
-        return [event["text"] for event in _events(seen, planned) if event["event"] == "warning"]
-
-    print("\n".join(words.status_lines(seen.planned(), running, warned)))
+    seen, states, warnings = survey(project, *wish, look=True), {}, {}
+    for p in seen.planned():
+        running = p.key and p.status != "current" and is_locked(seen.store.locks / f"{p.key}.lock")
+        states.setdefault(p.step.stage, []).append("running" if running else p.status)
+        said = (event["text"] for event in _events(seen, p) if event["event"] == "warning")
+        warnings |= dict.fromkeys(f"warning: {p.step}: {text}" for text in said)
+    for stage, of in states.items():
+        counts = (f"{of.count(s)} {s}" for s in ("current", "running", "to run", "maybe") if s in of)
+        print(f"{stage:<10} {', '.join(counts)}")
+    for warning in warnings:
+        print(warning)
     return 0
 
 
@@ -166,8 +166,20 @@ def _events(seen: Survey, planned: Planned) -> list[dict]:
 
 
 def show_graph(project: Project, mermaid: bool = False) -> int:
-    """Print the stages and what each takes, as text or as a Mermaid diagram."""
-    print("\n".join(words.graph_lines(_pipeline(project), mermaid)))
+    """Print the stages in the order they run, each with what it takes; or a Mermaid diagram, where stages over photos or recipes
+    have double frames."""
+    pipeline = _pipeline(project)
+    stages = {name: pipeline.stages[name] for name in pipeline.order()}
+    if mermaid:
+        nodes = [f"  {name}[[{name}]]" if stage.over else f"  {name}[{name}]" for name, stage in stages.items()]
+        arrows = [f"  {above} --> {name}" for name, stage in stages.items() for above in stage.upstream]
+        print("graph TD", *nodes, *arrows, sep="\n")
+        return 0
+    for name, stage in stages.items():
+        over = f"per {stage.over}" if stage.over else "whole set"
+        when = "   (only for sets that need it)" if stage.when else ""
+        when = "   (only when asked for)" if stage.optional else when
+        print(f"{name:<10} {over:<10} <- {', '.join(stage.inputs) or '(parameters only)'}{when}")
     return 0
 
 
@@ -190,7 +202,11 @@ def show_params(project: Project, stages: list[str] | None) -> int:
     for number, name in enumerate(stages or _pipeline(project).order()):
         check_stage(project, name, [])
         params = load_stage(Code(project.code_root, project.package, name, {}, project.pipeline_file)).Params
-        print("\n".join([""] * (number > 0) + words.parameter_lines(name, params)))
+        lines = [""] * (number > 0)
+        for param, may_be, default, text in words.parameters(params):
+            lines.append(f"{name}.{param} = {default}    ({may_be})")
+            lines += textwrap.wrap(text, 100, initial_indent="    ", subsequent_indent="    ")
+        print("\n".join(lines if any(lines) else [*lines, f"{name} has no parameters"]))
     return 0
 
 
@@ -257,8 +273,10 @@ def label_masks(project: Project, dataset: str, port: int) -> int:
     return 0
 
 
-def compare(project: Project, first: Path, second: Path) -> int:
+def compare(project: Project, first: Path | None, second: Path | None) -> int:
     """Write a page that shows two results, folders such as build/eames, side by side."""
+    if first is None or second is None:
+        raise InputError("two results are to be named", key="compare", cure="make compare A=build/eames B=<another>")
     homes = [Home(path if path.is_dir() else project.build / path) for path in (first, second)]
     for home, named in zip(homes, (first, second), strict=True):
         if not home.keys_file.is_file():
@@ -303,6 +321,6 @@ def ship(project: Project, stage: str, dataset: str) -> int:
     planned = next(p for p in seen.planned() if p.step.stage == stage)
     if planned.status != "current":
         raise InputError(f"{stage!r} has no current result", key="ship", cure=f"make {stage} DATASET={dataset} FORCE=1")
-    folder = put_into_package(seen.store.tree(planned.output), planned.record, project.root, known[stage])
+    folder = put_into_package(seen.store.trees / planned.output, planned.record, project.root, known[stage])
     print(f"{stage}: {project.shown(folder)}")
     return 0

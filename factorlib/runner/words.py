@@ -5,13 +5,11 @@ from __future__ import annotations
 import ast
 import inspect
 import textwrap
-from collections.abc import Callable
 from typing import Any
 
 import msgspec
 from msgspec import inspect as types
 
-from factorlib.runner.pipeline import Pipeline
 from factorlib.runner.plan import Planned, Step, in_short
 
 SHOWN = 8  # reasons of one step that are written out
@@ -51,36 +49,6 @@ def _of_any_photo(reason: str, step: Step) -> str:
     return reason
 
 
-def status_lines(
-    planned: list[Planned], running: Callable[[Planned], bool], warnings: Callable[[Planned], list[str]]
-) -> list[str]:
-    """One line a stage: how many of its steps are current, running, to run, maybe; what the current ones warned of."""
-    lines = []
-    for stage in dict.fromkeys(p.step.stage for p in planned):
-        steps = [p for p in planned if p.step.stage == stage]
-        states = ["running" if p.key and p.status != "current" and running(p) else p.status for p in steps]
-        counts = ", ".join(f"{states.count(s)} {s}" for s in ("current", "running", "to run", "maybe") if s in states)
-        lines.append(f"{stage:<10} {counts}")
-    return lines + list(dict.fromkeys(f"warning: {p.step}: {text}" for p in planned for text in warnings(p)))
-
-
-def graph_lines(pipeline: Pipeline, mermaid: bool = False) -> list[str]:
-    """Each stage under what it takes, in the order they run; or a Mermaid diagram, where stages over photos or recipes have
-    double frames."""
-    stages = {name: pipeline.stages[name] for name in pipeline.order()}
-    if mermaid:
-        nodes = [f"  {name}[[{name}]]" if stage.over else f"  {name}[{name}]" for name, stage in stages.items()]
-        return ["graph TD", *nodes, *(f"  {above} --> {name}" for name in stages for above in stages[name].upstream)]
-    lines = []
-    for name, stage in stages.items():
-        over, inputs = f"per {stage.over}" if stage.over else "whole set", ", ".join(stage.inputs)
-        optional = (
-            "   (only when asked for)" if stage.optional else "   (only for sets that need it)" if stage.when else ""
-        )
-        lines.append(f"{name:<10} {over:<10} <- {inputs or '(parameters only)'}{optional}")
-    return lines
-
-
 def count(items: list, one: str = "step") -> str:
     """
     >>> count(["a"]), count(["a", "b"], "fault")
@@ -98,9 +66,7 @@ def log_lines(logged: list[tuple[Planned, list[dict], str | None]]) -> list[str]
     versions: dict[str, list[str]] = {}
     for name, version in (pair for own in made for pair in own.items()):
         versions.setdefault(name, []).append(version)
-    most = {
-        name: max(found, key=found.count) for name, found in sorted(versions.items(), key=lambda pair: pair[0].lower())
-    }
+    most = {name: max(versions[name], key=versions[name].count) for name in sorted(versions, key=str.lower)}
     lines = []
     for (planned, events, failed), own in zip(logged, made, strict=True):
         lines.append(f"{planned.step!s:<26} {_cost(planned, events)}".rstrip())
@@ -133,15 +99,6 @@ def _made_with(record: dict, events: list[dict]) -> dict[str, str]:
     made = {"Python": machine.get("python", record.get("python", ""))}
     made |= {machine["system"]: machine["processor"]} if machine else {}
     return made | {n.removeprefix("package:"): v for n, v in record.items() if n.startswith("package:")}
-
-
-def parameter_lines(stage: str, params: type) -> list[str]:
-    """A stage's parameters, each with its default, what it may be and what it means."""
-    lines = []
-    for name, may_be, default, text in parameters(params):
-        lines.append(f"{stage}.{name} = {default}    ({may_be})")
-        lines += textwrap.wrap(text, 100, initial_indent="    ", subsequent_indent="    ")
-    return lines or [f"{stage} has no parameters"]
 
 
 def parameters(params: type) -> list[tuple[str, str, str, str]]:

@@ -31,21 +31,18 @@ import msgspec
 from factorlib.disk import disk_error
 from factorlib.errors import InputError
 from factorlib.runner.closure import CODE, Sources
-from factorlib.runner.filehash import FileHashes, is_file_of
+from factorlib.runner.filehash import FileHashes, hash_of_file
 from factorlib.runner.home import sound_lines
 from factorlib.runner.pipeline import Stage
 from factorlib.runner.plan import difference
 from factorlib.runner.project import LIBRARY
-from factorlib.runner.shared import copy_shipped, fetch, offer, shipped_folder
+from factorlib.runner.shared import copy_shipped, fetch, offer
 from factorlib.runner.stop import take_sigterm_back
 from factorlib.runner.store import Entry, Stamp, Store, stamps_of
-from factorlib.stage import Inputs
+from factorlib.stage import Inputs, serial_map
 from factorlib.wholefile import append_text, replace_file
 from factorlib.yamlfile import convert
 
-THREAD_VARIABLES = tuple(f"{of}_NUM_THREADS" for of in ("OMP", "MKL", "OPENBLAS", "NUMEXPR")) + (
-    "VECLIB_MAXIMUM_THREADS",
-)
 EVERY = 0.2  # seconds between two words of progress
 
 
@@ -67,7 +64,7 @@ class Code(msgspec.Struct, frozen=True):
 class Task(msgspec.Struct, frozen=True):
     """All that a worker knows of a step.
 
-    hashes:  of the dataset's files, as they were when the key was made
+    files:   by the name that the record has for each, whose hash it holds
     shared:  a store that others use too: what it has is copied, what is made is offered to it;  forced: make it in any case
     """
 
@@ -76,7 +73,6 @@ class Task(msgspec.Struct, frozen=True):
     folders: dict[str, Path]
     facts: dict[str, Any]
     files: dict[str, Path]
-    hashes: dict[str, str]
     log: Path | None
     store: Path
     key: str
@@ -132,23 +128,21 @@ def run_step(task: Task) -> Outcome:
             return Outcome(output=entry.output, seconds=meter.read()["seconds"])
         except BaseException as error:  # whatever it is, the parent reports it
             shutil.rmtree(task.temporary, ignore_errors=True)  # on a full disk there is room for a log then
-            return _failed(error, task.temporary.parent, meter.read()["seconds"])
-
-
-def _failed(error: BaseException, folder: Path, seconds: float) -> Outcome:
-    """What the user can mend says how; the rest is a defect, and comes with its traceback."""
-    if known := error if isinstance(error, InputError) else disk_error(error, folder):
-        return Outcome(error=str(known), code_changed=isinstance(known, CodeChanged), seconds=seconds)
-    return Outcome(error=f"{type(error).__name__}: {error}", traceback=traceback.format_exc(), seconds=seconds)
+            if known := error if isinstance(error, InputError) else disk_error(error, task.temporary.parent):
+                return Outcome(error=str(known), code_changed=isinstance(known, CodeChanged))
+            return Outcome(error=f"{type(error).__name__}: {error}", traceback=traceback.format_exc())
 
 
 def load_stage(code: Code) -> ModuleType:
-    """Import a stage's module from the project and limit the process to the stage's threads."""
+    """Import a stage's module from the project; what was loaded with it has the stage's threads."""
     if str(code.root) not in sys.path:
         sys.path.insert(0, str(code.root))
     module = importlib.import_module(f"{code.package}.{code.stage}")
     take_sigterm_back()
-    limit_threads(code.threads)
+    if "torch" in sys.modules:
+        sys.modules["torch"].set_num_threads(code.threads)
+    if "OpenImageIO" in sys.modules:
+        sys.modules["OpenImageIO"].attribute("threads", code.threads)
     return module
 
 
@@ -160,24 +154,15 @@ def params_of(code: Code) -> msgspec.Struct:
 def spread(cores: int, function: Callable, items: Iterable) -> list:
     """The function of every item, in order, on so many threads."""
     if cores == 1:
-        return [function(item) for item in items]
+        return serial_map(function, items)
     with ThreadPoolExecutor(cores) as pool:
         return list(pool.map(function, items))
 
 
-def limit_threads(threads: int) -> None:
-    """The same number for every library; those not loaded yet read the environment."""
-    os.environ.update(dict.fromkeys(THREAD_VARIABLES, str(threads)))
-    if "torch" in sys.modules:
-        sys.modules["torch"].set_num_threads(threads)
-    if "OpenImageIO" in sys.modules:
-        sys.modules["OpenImageIO"].attribute("threads", threads)
-
-
 def _made(task: Task, store: Store, events: Events) -> Entry:
     """Run the step, or copy its shipped result; its tree is in the store afterwards, its key is not."""
-    if not task.forced and (folder := shipped_folder([task.code.root, LIBRARY], task.stage.shipped, task.record)):
-        copy_shipped(folder, task.temporary)
+    roots = [task.code.root, LIBRARY]
+    if not task.forced and copy_shipped(roots, task.stage.shipped, task.record, task.temporary):
         return store.take_in(task.record, task.temporary, events.say)
     module, params = load_stage(task.code), params_of(task.code)  # which takes seconds
     photo, out = task.record["photo"], task.temporary
@@ -186,8 +171,9 @@ def _made(task: Task, store: Store, events: Events) -> Entry:
     _check_code(task, hashes)
     results = {folder: stamps_of(folder) for folder in task.folders.values() if folder.is_relative_to(task.store)}
     unfinished = store.unfinished / task.key
+    files = {field.removeprefix("file:"): path for field, path in task.files.items()}
     map_ = partial(spread, task.code.cores)
-    inputs = Inputs(task.folders, task.facts, task.files, photo, map_, task.log, unfinished)
+    inputs = Inputs(task.folders, task.facts, files, photo, map_, task.log, unfinished)
     try:
         module.main(params, inputs, out, events.progress)
     except Exception:
@@ -195,18 +181,16 @@ def _made(task: Task, store: Store, events: Events) -> Entry:
         raise
     _check_inputs(task, results)
     _check_code(task, hashes)
-    promised = [*task.stage.makes, *(["{photo}.json"] if task.stage.gather else [])]  # to break its word is a defect
+    promised = [*task.stage.makes, *(["{photo}.json"] if task.stage.gather else [])] or ["**/*"]
     for pattern in (text.replace("{photo}", photo or "") for text in promised):
-        if not any(out.glob(pattern)):
+        if not any(path.is_file() for path in out.glob(pattern)):  # to break its word is a defect
             raise FileNotFoundError(f"the stage {task.code.stage!r} made no {pattern}")
-    if not any(path.is_file() for path in out.rglob("*")):
-        raise FileNotFoundError(f"the stage {task.code.stage!r} made nothing")
     return store.take_in(task.record, out, events.say)
 
 
 def _check_inputs(task: Task, results: dict[Path, dict[str, Stamp]]) -> None:
     """Somebody may replace a photo, or open a file of build/<dataset>/ in an editor, while it is read."""
-    changed = [task.files[name] for name, before in task.hashes.items() if not is_file_of(before, task.files[name])]
+    changed = [p for name, p in task.files.items() if not p.is_file() or hash_of_file(p) != task.record[name]]
     for folder, before in results.items():
         now = stamps_of(folder)
         changed += [folder / name for name in sorted(before.keys() | now.keys()) if before.get(name) != now.get(name)]
@@ -218,8 +202,7 @@ def _check_inputs(task: Task, results: dict[Path, dict[str, Stamp]]) -> None:
 def _check_code(task: Task, hashes: FileHashes) -> None:
     """The code that the key was made from is the code there is: the source of every module, and the package data."""
     code = task.code
-    sources = Sources([code.root, LIBRARY], hashes, task.store / "cache" / "packages.json")
-    closure = sources.closure(code.package, code.stage, code.settings)
+    closure = Sources([code.root, LIBRARY], hashes).closure(code.package, code.stage, code.settings)
     now, before = closure.record, {n: value for n, value in task.record.items() if n.startswith(CODE)}
     if now != before:
         changed = [name for name in sorted(before.keys() | now.keys()) if before.get(name) != now.get(name)]

@@ -9,7 +9,6 @@ from pathlib import Path
 import pytest
 
 from factorlib import __main__ as command_line
-from factorlib.runner import verbs
 from factorlib.runner.project import LIBRARY, Project, photo_sets
 
 
@@ -24,10 +23,6 @@ def real_project(root: Path, *copied: str) -> Project:
         else:
             (root / name).symlink_to(LIBRARY / name)
     return Project(root, photo_sets())
-
-
-def make(project: Project, *settings: str, targets: list[str] | None = None, force: bool = False) -> int:
-    return verbs.make(project, verbs.Wish("set", targets, list(settings), force))
 
 
 def call(project: Project, *words: str) -> int | str:

@@ -1,4 +1,4 @@
-"""What tests of faults share: a finished toy, folders of an earlier run, and another user, without root's rights."""
+"""What tests of faults share: this project with results of its own, and another user, without root's rights."""
 
 import os
 import shutil
@@ -8,30 +8,9 @@ from pathlib import Path
 
 import pytest
 
-from tests.faults.battered import make, real_project
-from tests.runner import toy
+from tests.faults.battered import real_project
 
 NOBODY = 65534
-
-
-@pytest.fixture(scope="session")
-def made_once(tmp_path_factory):
-    """The toy, everything made; nobody changes it."""
-    made = toy.make_project(tmp_path_factory.mktemp("toy") / "root")
-    assert make(made) == 0
-    return made
-
-
-@pytest.fixture
-def project(made_once, tmp_path):
-    """The toy, everything current, in a checkout of its own."""
-    return toy.copy(made_once, tmp_path / "checkout")
-
-
-@pytest.fixture
-def fresh(tmp_path):
-    """The toy, nothing made yet."""
-    return toy.make_project(tmp_path / "root")
 
 
 @pytest.fixture(scope="module")

@@ -14,9 +14,9 @@ import pytest
 from factorlib.errors import InputError
 from factorlib.runner import gc, verbs
 from factorlib.runner.project import LIBRARY
-from tests.faults.battered import call, make
+from tests.faults.battered import call
 from tests.runner import toy
-from tests.runner.toy import files_of, state, write
+from tests.runner.toy import files_of, make, state, write
 
 # ── DATASET ──────────────────────────────────────────────────────────────────────────────────────────────────────────
 
@@ -144,7 +144,7 @@ def test_damaged_files_of_the_runner_lose_nothing_and_are_made_anew(project, cap
             assert "current.json" in last and "delete it" in last and sorted((store / "trees").iterdir()) == names
         assert set(state(project).values()) == {"current"} and "current.json" in caplog.text
     assert make(project) == 0 and json.loads(mark.read_bytes()) == before
-    caches = {store / "cache" / name for name in ("files.json", "packages.json")} | {*(store / "cache").glob("*.json")}
+    caches = {store / "cache" / "files.json", *(store / "cache").glob("*.json")}
     for path, contents in [*((cache, OF_CACHES) for cache in caches), (home / "dataset.txt", OF_MARKS)]:
         for content in contents:
             path.write_bytes(content)

@@ -137,7 +137,6 @@ ALLOWED = {"re.compile", "torch.compile", "platform.system"}
 MODULES = {"pickle", "marshal", "shelve", "dill", "joblib", "cloudpickle"}
 EXCEPTIONS = {
     "factorlib/checkpoint.py": {"pickle"},  # names the exception of what refuses to run code; torch.load is below
-    "factorlib/parcel.py": {"pickle", "cloudpickle"},  # what the processes of one run send each other over a cluster
 }
 
 

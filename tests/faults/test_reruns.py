@@ -1,21 +1,18 @@
 """Which steps get new keys by a single change: exactly those that the change can reach, and those below them; `why` names it.
 
 Of a copy of this project, at the level of plans: files are edited, nothing is run.  Who can be reached by a change of
-code another library says (grimp, of import-linter), who by a file of a data set, dataset.yaml.  `make test` takes a sample
-that is the same each time, `make test-long` every module, file and package.
+code another library says (grimp, of import-linter).  `make test` takes a sample that is the same each time,
+`make test-long` every module, file and package.
 """
 
 from __future__ import annotations
 
 import ast
 import contextlib
-import importlib.metadata
 import json
 import os
 import random
 from functools import cache
-from importlib.metadata import packages_distributions
-from itertools import islice
 from pathlib import Path
 
 import grimp
@@ -30,10 +27,10 @@ from factorlib.runner.plan import Listing, difference, plan
 from factorlib.runner.project import LIBRARY, photo_sets
 from factorlib.runner.survey import survey
 from factorlib.runner.worker import Code, load_stage
-from tests.faults.battered import make, real_project
+from tests.faults.battered import real_project
 from tests.faults.good import edited as edited_data
 from tests.runner import toy
-from tests.runner.toy import reasons, state, write
+from tests.runner.toy import make, reasons, state, write
 
 PIPELINE = read_pipeline(LIBRARY / "pipeline.yaml", photo_sets().slices).for_data(lambda _: True)
 STAGES = list(PIPELINE.stages)
@@ -53,47 +50,45 @@ def real(tmp_path_factory):
     return real_project(tmp_path_factory.mktemp("project"), "pipeline.yaml", "stages", "factorlib", "data", "recipes")
 
 
-def planned(project, settings=(), dataset="synthetic"):
+def planned(project, settings=()):
     """Every step, those of optional stages and of all recipes too, as planned were everything made."""
-    seen = survey(project, dataset, STAGES, list(settings), recipes=["all"])
+    seen = survey(project, "synthetic", STAGES, list(settings), recipes=["all"])
     return plan(seen.spec, seen.records, Listing(Everything(), {}))
 
 
-def keys(project, settings=(), dataset="synthetic"):
-    return {str(p.step): p.key for p in planned(project, settings, dataset)}
+def keys(project, settings=()):
+    return {str(p.step): p.key for p in planned(project, settings)}
 
 
 @cache
-def usual(project, dataset="synthetic"):
-    return keys(project, dataset=dataset)
+def usual(project):
+    return keys(project)
 
 
-def other_keys(project, settings=(), dataset="synthetic"):
+def other_keys(project, settings=()):
     """The steps whose keys are not the usual ones."""
-    before, now = usual(project, dataset), keys(project, settings, dataset)
+    before, now = usual(project), keys(project, settings)
     assert now.keys() == before.keys()
     return {step for step in now if now[step] != before[step]}
 
 
 @contextlib.contextmanager
-def edited(project, contents: dict[str, bytes | str]):
-    """Within, files of the project hold something else."""
-    before = {name: (project.root / name).read_bytes() for name in contents}
-    usual(project), usual(project, "eames")
+def edited(project, name: str, content: bytes):
+    """Within, a file of the project holds something else."""
+    before = (project.root / name).read_bytes()
+    usual(project)
     try:
-        for name, content in contents.items():
-            (project.root / name).write_bytes(content if isinstance(content, bytes) else content.encode())
+        (project.root / name).write_bytes(content)
         yield
     finally:
-        for name, content in before.items():
-            (project.root / name).write_bytes(content)
+        (project.root / name).write_bytes(before)
 
 
-def below(project, steps, dataset="synthetic"):
-    """Those steps, and all that take their results, however far: read from pipeline.yaml, step by step."""
-    found = set(steps)
+def below(project, stages):
+    """The steps of those stages, and all that take their results, however far: read from pipeline.yaml, step by step."""
+    found = {step for step in usual(project) if step.partition("/")[0] in stages}
     for name in PIPELINE.order():
-        of = (step for step in usual(project, dataset) if step.partition("/")[0] == name)
+        of = (step for step in usual(project) if step.partition("/")[0] == name)
         found |= {step for step in of if any(_takes(step, above) for above in found)}
     return found
 
@@ -104,11 +99,7 @@ def _takes(step, above):
     return above_stage in PIPELINE.stages[stage].inputs and (photo == above_photo or not alone)
 
 
-def steps_of(project, stages):
-    return {step for step in usual(project) if step.partition("/")[0] in stages}
-
-
-# ── code, files of packages, files of data sets ──────────────────────────────────────────────────────────────────────
+# ── code and files of packages ───────────────────────────────────────────────────────────────────────────────────────
 
 
 @cache
@@ -129,11 +120,6 @@ def reached_by(stage):
     return found
 
 
-def users(project, module):
-    """The steps that run a module, and those below."""
-    return below(project, steps_of(project, {stage for stage in STAGES if module in reached_by(stage)}))
-
-
 @cache
 def modules():
     """{name: file within the project} of the modules that any stage runs."""
@@ -142,103 +128,29 @@ def modules():
     return {name: str(file) for name, both in files.items() for file in both if (LIBRARY / file).is_file()}
 
 
-def text_of(module):
-    return (LIBRARY / modules()[module]).read_text(encoding="utf-8")
+def whole_modules():
+    """Each module's file, an addition to it, and the stages that run it."""
+    for name, file in modules().items():
+        yield file, b"\nNEW = 1\n", {stage for stage in STAGES if name in reached_by(stage)}
 
 
-def whole_modules(project, chance):
-    for module in chance.sample(sorted(modules()), len(modules())):
-        yield {modules()[module]: text_of(module) + "\nNEW = 1\n"}, "synthetic", users(project, module)
-
-
-def remarks(project, chance):
-    """Comments, docstrings and layout: texts that say the same to Python and YAML, of twenty modules at once."""
-    for name in ("data/synthetic/dataset.yaml", "data/synthetic/truth/truth.yaml"):
-        spec = yaml.safe_load((project.root / name).read_text())
-        text = "# a remark\n" + yaml.safe_dump(spec, default_flow_style=True, sort_keys=False)
-        yield {name: text}, "synthetic", set()
-    mixed = chance.sample(sorted(modules()), len(modules()))
-    for some in (mixed[k : k + 20] for k in range(0, len(mixed), 20)):
-        anew, more = {}, {}
-        for module in some:
-            tree = ast.parse(text_of(module))
-            for node in ast.walk(tree):
-                if isinstance(node, ast.Module | ast.ClassDef | ast.FunctionDef) and ast.get_docstring(node):
-                    node.body[0].value.value = "Other words."
-            anew[modules()[module]] = ast.unparse(tree)
-            more[modules()[module]] = f"# a remark\n\n{text_of(module)}\n# another\n"
-        yield from ((contents, "synthetic", set()) for contents in (anew, more))
-
-
-def files_of_packages(project, chance):
+def files_of_packages():
     """Weights, templates, kernels: whatever lies in the folder of a module that is run."""
-    root = project.root
-    files = [path for path in sorted((root / "factorlib").rglob("*")) if path.is_file() and path.suffix != ".py"]
-    for path in chance.sample(files, len(files)):
-        package = ".".join(next(f for f in path.parents if (f / "__init__.py").exists()).relative_to(root).parts)
-        in_it = lambda stage, package=package: package in {m.rpartition(".")[0] for m in reached_by(stage)}  # noqa: E731
-        stages = {stage for stage in STAGES if package in reached_by(stage) or in_it(stage)}
-        yield (
-            {str(path.relative_to(root)): path.read_bytes() + b"\n"},
-            "synthetic",
-            below(project, steps_of(project, stages)),
-        )
+    for path in sorted((LIBRARY / "factorlib").rglob("*")):
+        if path.is_file() and path.suffix != ".py" and "__pycache__" not in path.parts:
+            folder = next(f for f in path.parents if (f / "__init__.py").exists()).relative_to(LIBRARY)
+            package = ".".join(folder.parts)
+            stages = {s for s in STAGES if any(m == package or m.rpartition(".")[0] == package for m in reached_by(s))}
+            yield str(path.relative_to(LIBRARY)), b"\n", stages
 
 
-def files_of_data_sets(project, chance):
-    folders = {dataset: LIBRARY / "data" / dataset for dataset in ("synthetic", "eames")}
-    files = [
-        (dataset, p)
-        for dataset, f in folders.items()
-        for p in sorted(f.rglob("*"))
-        if p.is_file() and p.suffix != ".yaml"
-    ]
-    for dataset, path in chance.sample(files, len(files)):
-        direct = readers(project, dataset, str(path.relative_to(folders[dataset])))
-        yield {str(path.relative_to(LIBRARY)): path.read_bytes() + b"\n"}, dataset, below(project, direct, dataset)
-
-
-def readers(project, dataset, file):
-    """The steps that are handed a file of a data set, by what dataset.yaml says of it."""
-    folder, found = LIBRARY / "data" / dataset, set()
-    spec = yaml.safe_load((folder / "dataset.yaml").read_text())
-    for photo in spec["photos"]:
-        masks = photo["masks"] if isinstance(photo["masks"], dict) else {"": photo["masks"]}
-        own = {obj.get("mask") for obj in photo["objects"]}
-        meshes = {Path(spec["meshes"][obj["mesh"]]["file"]) for obj in photo["objects"]}
-        rows = [
-            (mesh, row) for mesh in meshes if mesh.suffix == ".obj" for row in (folder / mesh).read_text().splitlines()
-        ]
-        near = {str(mesh.parent / row.split()[1]) for mesh, row in rows if row.startswith("mtllib ")}
-        if file in {photo["image"], *masks.values(), *own}:
-            found |= takers(project, "dataset.photo", photo["name"], dataset)
-        if file in {*map(str, meshes), *near, *own}:
-            found |= takers(project, "dataset.objects", photo["name"], dataset)
-    truth = yaml.safe_load((folder / spec["truth"]).read_text()) if spec.get("truth") else {}
-    maps = {*truth.get("illumination", {}).values(), *truth.get("normals", {}).values()}
-    return found | (takers(project, "dataset.truth", None, dataset) if file in maps else set())
-
-
-def takers(project, slice_, photo, dataset):
-    steps = (step.partition("/") for step in usual(project, dataset))
-    taking = ((stage, mid, of) for stage, mid, of in steps if slice_ in PIPELINE.stages[stage].inputs)
-    return {stage + mid + of for stage, mid, of in taking if PIPELINE.stages[stage].over != "photo" or of == photo}
-
-
-CHANGES = {  # kind -> who makes them, at random, and how many a short and a long test take
-    "a module": (whole_modules, 6, None),
-    "comments, docstrings and layout": (remarks, 4, None),
-    "a file of a package": (files_of_packages, 3, None),
-    "a file of a data set": (files_of_data_sets, 6, None),
-}
-
-
-@pytest.mark.parametrize("most", [1, pytest.param(2, marks=LONG)], ids=["few", "all"])
-@pytest.mark.parametrize("kind", CHANGES)
-def test_a_change_reruns_who_is_reached_by_it_and_what_is_below_and_nothing_else(real, kind, most):
-    for contents, dataset, reached in islice(CHANGES[kind][0](real, random.Random(17)), CHANGES[kind][most]):
-        with edited(real, contents):
-            assert other_keys(real, dataset=dataset) == reached, list(contents)[:3]
+@pytest.mark.parametrize("few", [True, pytest.param(False, marks=LONG)])
+@pytest.mark.parametrize("files, count", [(whole_modules, 6), (files_of_packages, 3)])
+def test_a_change_reruns_who_is_reached_by_it_and_what_is_below_and_nothing_else(real, files, count, few):
+    cases = list(files())
+    for name, more, stages in random.Random(17).sample(cases, count if few else len(cases)):
+        with edited(real, name, (LIBRARY / name).read_bytes() + more):
+            assert other_keys(real) == below(real, stages), name
 
 
 def test_an_edit_that_keeps_size_and_time_is_noticed(real):
@@ -251,35 +163,11 @@ def test_an_edit_that_keeps_size_and_time_is_noticed(real):
         path, before = real.root / name, (real.root / name).read_bytes()
         os.utime(path, ns=(path.stat().st_atime_ns, path.stat().st_mtime_ns - 10**10))
         known, stat = keys(real), path.stat()
-        with edited(real, {name: before.replace(old, new, 1)}):
+        with edited(real, name, before.replace(old, new, 1)):
             os.utime(path, ns=(stat.st_atime_ns, stat.st_mtime_ns))
             assert (path.stat().st_size, path.stat().st_mtime_ns) == (stat.st_size, stat.st_mtime_ns)
             assert keys(real) != known, name
     assert other_keys(real) == set()
-
-
-@cache
-def packages():
-    """Distributions that any stage imports, and the names they are imported by."""
-    distributions, found = packages_distributions(), {}
-    for name in set().union(*map(reached_by, STAGES)) - modules().keys():
-        for distribution in distributions.get(name, []):
-            found.setdefault(distribution, set()).add(name)
-    return found
-
-
-@pytest.mark.parametrize("share", [6, pytest.param(1, marks=LONG)])
-def test_another_version_of_a_package_reruns_who_imports_it(real, monkeypatch, share):
-    usual(real, "synthetic")
-    version, by, known = importlib.metadata.version, packages_distributions(), real.build / "store/cache/packages.json"
-    monkeypatch.setattr(importlib.metadata, "packages_distributions", lambda: by)
-    for distribution in sorted(packages())[::share]:
-        newer = lambda name, it=distribution: f"{version(name)}.1" if name == it else version(name)  # noqa: E731
-        monkeypatch.setattr(importlib.metadata, "version", newer)
-        known.unlink(missing_ok=True)
-        stages = {stage for stage in STAGES if packages()[distribution] & reached_by(stage)}
-        assert stages and other_keys(real) == below(real, steps_of(real, stages)), distribution
-    known.unlink(missing_ok=True)
 
 
 def test_no_module_is_named_only_at_run_time():
@@ -337,7 +225,7 @@ def test_each_parameter_reruns_its_stage_and_what_is_below(real, stage):
     lines = "\n".join(difference(before, record_of(real, stage, words_of(stage, others))))
     unnamed = [name for name in values if f"parameter {name}: " not in lines]  # the others each stand in the key
     for some in (others, *({name: others[name]} for name in unnamed)):
-        assert other_keys(real, words_of(stage, some)) == below(real, steps_of(real, {stage})), some
+        assert other_keys(real, words_of(stage, some)) == below(real, {stage}), some
 
 
 # ── what else counts ─────────────────────────────────────────────────────────────────────────────────────────────────

@@ -1,6 +1,7 @@
 """What of the source counts: everything that is run, however far it is imported from, no remark; and what it says of parameters."""
 
 import importlib
+import importlib.metadata
 from pathlib import Path
 from typing import Annotated
 
@@ -26,6 +27,7 @@ FUNCTION = "def f(x):\n    return x + 1\n"
         ("def f(x):\n    return x + 2\n", True),
         ("def f(y):\n    return y + 1\n", True),
         (FUNCTION + 'Y = "a string"\n', True),
+        (FUNCTION + '"A string that stands alone."\n', False),
     ],
 )
 def test_comments_docstrings_and_layout_do_not_count_and_anything_else_does(text, counts):
@@ -45,12 +47,10 @@ def test_every_form_of_import_is_followed(tmp_path):
     closure = Sources([tmp_path], FileHashes(None)).closure("stages", "s", Path("pipeline.yaml"))
     modules = {name.removeprefix("source:") for name in closure.record if name.startswith("source:")}
     assert modules == {"p", "p.a", "p.b", "p.sub", "p.sub.c", "p.sub.e", "stages.s"}
-    assert {n for n in closure.record if n.startswith("data:")} == {
-        "data:p:kernel.c",
-        "data:p:w.safetensors",
-        "data:p.sub:templates/page.html",
-    }
-    assert [name for name in closure.record if name.startswith("package:")] == ["package:numpy"]
+    data = {name.removeprefix("data:") for name in closure.record if name.startswith("data:")}
+    assert data == {"p:kernel.c", "p:w.safetensors", "p.sub:templates/page.html"}
+    packages = {name: version for name, version in closure.record.items() if name.startswith("package:")}
+    assert packages == {"package:numpy": importlib.metadata.version("numpy")}
 
 
 def test_a_package_that_lies_beside_an_installed_library_is_none_of_the_project(tmp_path):
@@ -82,11 +82,8 @@ class Outer(Base):
 
 def test_parameters_are_shown_with_those_of_bases_and_of_fields(capsys):
     share, size = ("share", "number > 0 and < 1", "0.5", "A share."), ("inner.size", "1 … 9", "3", "Of what is inside.")
-    mute, quick = (
-        ("mute", "true, false", "false", ""),
-        ("quick", "true, false", "true", ""),
-    )  # the next value is no meaning
-    assert parameters(Outer) == [share, size, mute, quick]
+    others = [(name, "true, false", default, "") for name, default in (("mute", "false"), ("quick", "true"))]
+    assert parameters(Outer) == [share, size, *others]  # the next value is no meaning
     assert verbs.show_params(Project(LIBRARY, photo_sets()), ["urm"]) == 0
     assert "urm.directions = 512    (0 … 4,096)\n    Directions of the sphere" in capsys.readouterr().out
 

@@ -6,7 +6,7 @@ from hypothesis import given
 
 from factorlib.errors import InputError
 from factorlib.runner.pipeline import Pipeline, Stage, read_pipeline
-from factorlib.runner.plan import Listing, Spec, Step, difference, key_of, plan
+from factorlib.runner.plan import Listing, Spec, Step, difference, hash_of, plan
 
 PIPELINE = Pipeline(
     1,
@@ -29,14 +29,13 @@ def run(spec, own, listing, same=()):
     """Carry a plan out on paper: every output is its key, or its step's old output for the steps in `same`. -> steps run"""
     outputs, previous, ran, forced = dict(listing.outputs), dict(listing.previous), [], set(spec.forced)
     while True:
-        planned = plan(
-            Spec(spec.pipeline, spec.photos, spec.targets, frozenset(forced)), own, Listing(outputs, previous)
-        )
+        left = Spec(spec.pipeline, spec.photos, spec.targets, frozenset(forced))
+        planned = plan(left, own, Listing(outputs, previous))
         todo = [p for p in planned if p.status == "to run" and p.key]
         if not todo:
             return ran, Listing(outputs, previous | {str(p.step): p.record for p in planned if p.record})
         for p in todo:
-            old = outputs.get(key_of(previous[str(p.step)])) if str(p.step) in previous else None
+            old = outputs.get(hash_of(previous[str(p.step)])) if str(p.step) in previous else None
             outputs[p.key] = old if str(p.step) in same and old else f"out-{p.key}"
             previous[str(p.step)] = p.record
             forced.discard(p.step)
@@ -77,7 +76,7 @@ def test_what_runs_after_a_change_and_what_then_does(photos, forced, changed, ex
 def test_the_reasons_are_what_differs_from_the_last_result_and_going_back_finds_the_old_one():
     spec, listing = done()
     assert open_steps(spec, hashes(spec, masks_a=2), listing)["masks/a"][1] == ["source of m: changed"]
-    outputs = {k: v for k, v in listing.outputs.items() if k != key_of(listing.previous["train"])}
+    outputs = {k: v for k, v in listing.outputs.items() if k != hash_of(listing.previous["train"])}
     gone = open_steps(spec, hashes(spec), Listing(outputs, listing.previous))
     assert gone["train"] == ("to run", ["its result is gone"]) and gone["solve"][0] == "maybe"
     assert not open_steps(spec, hashes(spec), run(spec, hashes(spec, masks=2), listing)[1])
@@ -89,8 +88,8 @@ records = st.dictionaries(st.sampled_from(["param:a", "param:b", "source:m", "fi
 
 @given(records, records)
 def test_two_keys_are_equal_just_where_there_is_no_difference(one, other):
-    assert (key_of(one) == key_of(other)) == (difference(one, other) == [])
-    assert key_of(one) == key_of(dict(reversed(one.items())))
+    assert (hash_of(one) == hash_of(other)) == (difference(one, other) == [])
+    assert hash_of(one) == hash_of(dict(reversed(one.items())))
 
 
 @given(

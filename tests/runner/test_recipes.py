@@ -97,6 +97,10 @@ def test_a_recipe_reruns_for_what_it_says_and_for_its_files_and_alone(project):
     write(project.root / "recipes" / "set" / "more.txt", "and more")
     reasons = [p.reasons for p in survey(project, "set", ["shout"], [], recipes=["all"]).planned()[-2:]]
     assert reasons == [['recipe: word: "hello" -> "hi"'], ["file more.txt of the recipe: changed"]]
+    assert make(project, "all") == 0
+    toy.edit(project, "pipeline.yaml", "gather: sizes.json", "gather: all.json")
+    reasons = [p.reasons for p in survey(project, "set", ["shout"], [], recipes=["hello"]).planned()[-1:]]
+    assert reasons == [['gathered file of upper: "sizes.json" -> "all.json"']]
 
 
 def test_files_of_a_recipe_are_looked_at_before_anything_runs_and_only_where_they_are_new(project, capsys):

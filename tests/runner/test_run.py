@@ -18,10 +18,9 @@ from factorlib.runner.home import usual_costs
 from factorlib.runner.plan import Step
 from factorlib.runner.survey import survey
 from factorlib.runner.worker import Events
-from tests.faults.battered import make
-from tests.faults.test_nothing_lost import done, start, wait_until
+from tests.faults.test_nothing_lost import start, wait_until
 from tests.runner import toy
-from tests.runner.toy import files_of, make_project, reasons, state, write
+from tests.runner.toy import done, edit, files_of, make, new_runs, reasons, state, write
 
 COST = r" +\d+\.\d s +\d+\.\d s processor +\d+ MB peak   {} on 1 core   \d{{4}}-\d\d-\d\d \d\d:\d\d UTC$"
 WRITES = "json.dumps(params.scale)"  # what the table is, in its source
@@ -33,34 +32,6 @@ def total(project):
 
 def table(project):
     return (project.build / "set" / "table" / "table.json").read_text()
-
-
-def new_runs(project, *settings, **more):
-    """The steps that the next run does."""
-    before = len(done(project))
-    assert make(project, *settings, **more) == 0
-    return sorted(done(project)[before:])
-
-
-def edit(project, file, old, new):
-    """Replace a text in a file of the project, which must be there; the text before."""
-    text = (project.root / file).read_text()
-    assert old in text
-    write(project.root / file, text.replace(old, new, 1))
-    return text
-
-
-@pytest.fixture(scope="session")
-def made_once(tmp_path_factory):
-    made = make_project(tmp_path_factory.mktemp("toy") / "root")
-    assert make(made) == 0
-    return made
-
-
-@pytest.fixture
-def project(made_once, tmp_path):
-    """The toy, everything current, in a folder of its own."""
-    return toy.copy(made_once, tmp_path / "a root with spaces")
 
 
 def test_all_results_stand_under_the_datasets_name_read_only_and_their_costs_in_a_log(project, capsys):
@@ -102,9 +73,8 @@ def test_a_change_reruns_what_it_reaches(project, file, text, step, reason, runs
         (project.root / file).unlink()
     assert reasons(project, step) == ([reason] if reason else [])
     assert new_runs(project) == runs
-    assert {p.stem for p in (project.build / "set" / "upper").glob("*.txt")} == set(
-        toy.read(project.root / "data" / "set").photos
-    )
+    shown = {path.stem for path in (project.build / "set" / "upper").glob("*.txt")}
+    assert shown == set(toy.read(project.root / "data" / "set").photos)
 
 
 def test_a_parameter_reruns_its_stage_and_the_old_result_is_still_there_and_force_runs_just_what_is_named(project):
@@ -286,6 +256,10 @@ def test_what_is_left_is_told_where_every_stage_ran_before_by_what_it_took(proje
     now[0] += 60  # longer than before: nothing is left of them
     assert shown.seconds_left() == pytest.approx((2 * 1 + 10 * 2) / 2)
     shown.finish(Step("upper", "a"), 65.0), shown.finish(Step("upper", "b"), 65.0)
+    assert shown.seconds_left() == pytest.approx((2 * 1 + 10 * 2) / 2)
+    shown.start(Step("table"))  # which never ran before, and whose result the plan found before its process ended
+    assert shown.seconds_left() is None
+    shown.finish(Step("table"), 1.0)
     assert shown.seconds_left() == pytest.approx((2 * 1 + 10 * 2) / 2)
 
 

@@ -17,11 +17,10 @@ from factorlib.runner.filehash import hash_of_file
 from factorlib.runner.gc import verify
 from factorlib.runner.project import LIBRARY
 from factorlib.runner.shared import MADE_FROM, copied
-from factorlib.runner.store import output_of
+from factorlib.runner.store import hash_of
 from factorlib.runner.survey import survey
-from tests.faults.battered import make
 from tests.runner import toy
-from tests.runner.toy import files_of, make_project, state, write
+from tests.runner.toy import files_of, make, make_project, state, write
 
 COUNTED = "    (Path(__file__).parents[1] / 'computed').open('a').write('x')\n    (out"
 
@@ -97,7 +96,7 @@ def test_a_forged_result_writes_nothing_outside(tmp_path, one, shared):
     for number, path in enumerate(sorted((shared / "keys").iterdir())):
         entry, forged = json.loads(path.read_text()), dict([list(files.items())[number % 3]])
         path.chmod(0o644)
-        path.write_text(json.dumps({**entry, "files": forged, "output": output_of(forged)}))
+        path.write_text(json.dumps({**entry, "files": forged, "output": hash_of(forged)}))
     assert make(other) == 0 and computed(other) == 6
     assert not list(tmp_path.rglob("*escaped*")) and not os.path.exists("/tmp/escaped")
 

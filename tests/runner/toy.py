@@ -5,6 +5,7 @@
 
 from __future__ import annotations
 
+import json
 import shutil
 import sys
 from pathlib import Path
@@ -121,6 +122,32 @@ def wait_for(project: Project, file: Path) -> None:
 def write(path: Path, text: str) -> None:
     path.parent.mkdir(parents=True, exist_ok=True)
     path.write_text(text)
+
+
+def make(project: Project, *settings: str, targets: list[str] | None = None, force: bool = False) -> int:
+    return verbs.make(project, verbs.Wish("set", targets, list(settings), force))
+
+
+def done(project: Project) -> list[str]:
+    """The steps that runs say they have done, in order."""
+    log = project.build / "set" / "log.jsonl"
+    events = [json.loads(line) for line in log.read_text().splitlines()] if log.exists() else []
+    return ["/".join(filter(None, (e["stage"], e["photo"]))) for e in events if e["event"] == "done"]
+
+
+def new_runs(project: Project, *settings: str, **more) -> list[str]:
+    """The steps that the next run does, which succeeds."""
+    before = len(done(project))
+    assert make(project, *settings, **more) == 0
+    return sorted(done(project)[before:])
+
+
+def edit(project: Project, file: str, old: str, new: str) -> str:
+    """Replace a text in a file of the project, which must be there; the text before."""
+    text = (project.root / file).read_text()
+    assert old in text
+    write(project.root / file, text.replace(old, new, 1))
+    return text
 
 
 def files_of(folder: Path) -> dict[str, bytes]:
