@@ -101,6 +101,7 @@ help-all:
 	@echo 'make setup                           only the environment (TORCH_INDEX=<url> for another PyTorch)'
 	@echo '     EXTRAS="blender interchange"     and what tests open exported files with: Blender, MaterialX, OpenUSD'
 	@echo '     EXTRAS=video                     and PyAV: animations as MP4, too (docs/recipes.md)'
+	@echo '     EXTRAS=denoise                   and Intel Open Image Denoise: `denoise: true` in recipes (docs/recipes.md)'
 	@echo '     EXTRAS=dask                      and Dask: SET="executor=tcp://…" runs steps on a cluster (docs/distributed.md)'
 
 .DEFAULT:

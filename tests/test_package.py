@@ -28,7 +28,12 @@ OURS = {"factorlib", "stages", "tests", "studies"}
 # What runs on a cluster alone: loaded where one is asked for, and then the extra `dask` is there or missed by name.
 EXTRAS = {  # of modules that import what an extra alone installs
     ROOT / "factorlib" / f"{module}.py": extra
-    for module, extra in (("runner/child", "dask"), ("runner/cluster", "dask"), ("images/film", "video"))
+    for module, extra in (
+        ("runner/child", "dask"),
+        ("runner/cluster", "dask"),
+        ("images/film", "video"),
+        ("tracing/denoise", "denoise"),
+    )
 }
 
 
@@ -43,7 +48,8 @@ def test_every_import_is_a_dependency_that_is_declared(folder):
             found |= {alias.name for alias in node.names} if isinstance(node, ast.Import) else set()
             found |= {node.module} if isinstance(node, ast.ImportFrom) and node.module and not node.level else set()
         modules = {name.split(".")[0] for name in found} - OURS - sys.stdlib_module_names
-        assert not {module for module in modules if not ({module} | of.get(module, set())) & declared}, file
+        missing = {each for each in modules if not ({canonicalize_name(each)} | of.get(each, set())) & declared}
+        assert not missing, file
 
 
 def test_the_lock_is_what_pyproject_asks_for():

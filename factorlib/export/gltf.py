@@ -6,7 +6,8 @@ F0 = 0.04 · specularFactor · specularColor and F90 = specularFactor, over a di
     specularFactor = max k_s,  specularColor = k_s / (0.04 max k_s),  baseColor = k_d / (1 − max k_s),  metallic 0
 
 gives a reflectance at normal incidence of k_d and k_s exactly, and no Fresnel where k_s is grey.  Viewers without the extension
-show the default F0 of 0.04.  baseColor stays within one because max k_d + max k_s does.
+show the default F0 of 0.04.  baseColor stays within one because max k_d + max k_s does.  That default would make black plastic of a metal, so where
+k_d is at most METAL of k_s, in the largest channels, it is left out, and baseColor = k_s, metallic 1: all viewers show F0 = k_s, and F90 = 1.
 
 A directional light of KHR_lights_punctual shines along its node's −z with an illuminance in lux.  Written is the irradiance of the map's
 radiance, in whose unit a program that also shows the map wants it.
@@ -33,7 +34,7 @@ from factorlib.reading import read_bytes
 from factorlib.results.materials import Reflectance
 from factorlib.wholefile import write_bytes
 
-DIELECTRIC = 0.04
+DIELECTRIC, METAL = 0.04, 0.02
 EXTENSION, LIGHTS, VARIANTS = "KHR_materials_specular", "KHR_lights_punctual", "KHR_materials_variants"
 
 
@@ -59,20 +60,22 @@ def write_glb(
         name = chosen[0] if chosen[0] not in parts else f"{chosen[0]} {label}"
         visual, factor = TextureVisuals(material=PBRMaterial(name=name)), 1.0
         if part.detail is not None:
-            bases = [gltf_material(materials[each])["pbrMetallicRoughness"]["baseColorFactor"][:3] for each in chosen]
+            cores = [gltf_material(materials[each], True)["pbrMetallicRoughness"] for each in chosen]
+            bases = [core["baseColorFactor"][:3] for core in cores]
             factor = min(float(part.detail.max()), 1 / max(float(np.max(bases)), 1e-9))
             shade = np.rint(255 * np.minimum(part.detail / factor, 1)).astype(np.uint8)
             visual.vertex_attributes["color"] = np.column_stack([shade, shade, shade, np.full_like(shade, 255)])
         geometry = trimesh.Trimesh(part.vertices, part.faces, vertex_normals=part.normals, visual=visual, process=False)
         scene.add_geometry(geometry, geom_name=name, node_name=name)
-        parts[name] = [_entry(each, materials[each], mesh.open, factor) for each in chosen]
+        painted = part.detail is not None
+        parts[name] = [_entry(each, materials[each], mesh.open, painted, factor) for each in chosen]
     exact = partial(_set_materials, parts=parts, variants=list(variants))
     write_bytes(path, scene.export(file_type="glb", include_normals=True, tree_postprocessor=exact))
 
 
-def _entry(name: str, material: Reflectance, open_: bool, factor: float) -> dict[str, Any]:
+def _entry(name: str, material: Reflectance, open_: bool, painted: bool, factor: float) -> dict[str, Any]:
     """A material of a file, whose base colours are times a factor."""
-    exact = gltf_material(material)
+    exact = gltf_material(material, painted)
     base = exact["pbrMetallicRoughness"]["baseColorFactor"]
     exact["pbrMetallicRoughness"]["baseColorFactor"] = [*(min(c * factor, 1.0) for c in base[:3]), base[3]]
     return {"name": name, "doubleSided": open_, **exact}
@@ -102,8 +105,9 @@ def _set_materials(
             primitive["extensions"] = {VARIANTS: {"mappings": mappings}}
     if variants:
         tree["extensions"] = {VARIANTS: {"variants": [{"name": name} for name in variants]}}
-    used = {*tree.get("extensionsUsed", []), EXTENSION, *([VARIANTS] if variants else [])}
-    tree["extensionsUsed"] = sorted(used)
+    used = {*tree.get("extensionsUsed", []), *(name for each in found for name in each.get("extensions", ()))}
+    if used := sorted(used | ({VARIANTS} if variants else set())):
+        tree["extensionsUsed"] = used
 
 
 def variant_name(overrides: Mapping[str, str]) -> str:
@@ -130,9 +134,15 @@ def read_part_materials(path: str | Path) -> dict[str, dict[str, str]]:
     return parts
 
 
-def gltf_material(material: Reflectance) -> dict[str, Any]:
-    """The part of a glTF material that says how it reflects."""
+def gltf_material(material: Reflectance, painted: bool = False) -> dict[str, Any]:
+    """The part of a glTF material that says how it reflects.
+
+    painted: its base colour is times the colours of vertices, which are detail of k_d: it is not written as a metal
+    """
     brightest = max(material.specular)
+    if brightest > 0 and max(material.diffuse) <= METAL * brightest and not painted:
+        metal = {"baseColorFactor": [*material.specular, 1.0], "metallicFactor": 1.0}
+        return {"pbrMetallicRoughness": metal | {"roughnessFactor": material.roughness}}
     base = np.array(material.diffuse) / (1 - brightest)
     colour = np.array(material.specular) / (DIELECTRIC * brightest) if brightest > 0 else np.ones(3)
     plain = {"baseColorFactor": [*base.tolist(), 1.0], "metallicFactor": 0.0, "roughnessFactor": material.roughness}

@@ -6,7 +6,7 @@ All are Lambert plus GGX of the same α; they differ in shadowing, in Fresnel, a
     blender              V of the height-correlated Smith term (Heitz 2014, eq. 99), as Cycles' Glossy BSDF "GGX"
     glb                  glTF 2.0, appendix B, with KHR_materials_specular: Schlick's F to F90 = specularFactor, diffuse × (1 − max F)
     glb_correlated       the same with the height-correlated term, as most viewers draw it
-    glb_plain            the same in viewers without KHR_materials_specular: F0 = 0.04, F90 = 1
+    glb_plain            the same in viewers without KHR_materials_specular: F0 = 0.04, F90 = 1; what is written as a metal has F0 = k_s, F90 = 1 in all three
     mtlx                 MaterialX' own GLSL shaders: height-correlated, times 1 + F (1 − E)/E, E the albedo for F = 1 (Turquin 2019)
     mtlx_standard_surface  the same; the specular layer leaves 1 − specular · (its albedo for white) for the diffuse one
     usd                  UsdPreviewSurface: Schlick's F to F90 = 1, diffuse × (1 − F) as OpenUSD's shader; V, not specified, as solved
@@ -137,11 +137,15 @@ def _gltf(material: Reflectance, angles: Angles, shadowing: Shadowing, extension
     """From the numbers in the file."""
     entry = gltf_material(material)
     base = np.array(entry["pbrMetallicRoughness"]["baseColorFactor"][:3])
+    schlick = (1 - angles.oh) ** 5
+    if entry["pbrMetallicRoughness"]["metallicFactor"]:
+        fresnel = base + np.multiply.outer(schlick, 1 - base)
+        return _parts(angles, np.zeros(3), fresnel, shadowing(material.alpha, angles))
     plain = {"specularFactor": 1.0, "specularColorFactor": [1.0] * 3}
     specular = entry["extensions"][EXTENSION] if extension else plain
     f90 = specular["specularFactor"]
     f0 = f90 * np.minimum(DIELECTRIC * np.array(specular["specularColorFactor"]), 1)
-    fresnel = f0 + np.multiply.outer((1 - angles.oh) ** 5, f90 - f0)
+    fresnel = f0 + np.multiply.outer(schlick, f90 - f0)
     diffuse = base * (1 - fresnel.max(axis=-1, keepdims=True))
     return _parts(angles, diffuse, fresnel, shadowing(material.alpha, angles))
 

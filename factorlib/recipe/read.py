@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Iterable, Mapping, Sequence
+from importlib.util import find_spec
 from pathlib import Path
 
 from factorlib.dataset.check import MESHES
@@ -48,6 +49,9 @@ def check_recipe(
         if not file.is_file():
             cure = f"files are relative to the recipe; meshes that need no file: {', '.join([BALL, *meshes])}"
             raise InputError(f"there is no file {name!r}", file=path, cure=cure)
+    if recipe.denoise and find_spec(schema.DENOISER) is None:
+        cure = "make setup EXTRAS=denoise (outside a checkout: pip install mitsuba-oidn), or leave it out"
+        refuse("denoise", "the denoiser is not installed", cure)
     if isinstance(recipe, schema.OfPhotos):
         check("photos", recipe.photos, photos, "photo", once=True)
         if recipe.sun is not None:

@@ -28,6 +28,7 @@ Factor = Annotated[float, msgspec.Meta(ge=0.01, le=100)]
 Seconds = Annotated[float, msgspec.Meta(gt=0, le=1200)]  # a GIF shows a frame for 655 s at most
 LIGHT_FILES, BALL = (".hdr", ".exr"), "ball"
 MOST_REFLECTED = 0.999  # max diffuse + max specular: a surface that reflects more than arrives never comes to rest with light between surfaces
+DENOISER = "mitsuba_oidn"  # as it is imported
 CURE = 'write {"materials": {"gold": {"diffuse": [r, g, b], "specular": [r, g, b], "roughness": 0.2}}}, numbers from 0 to 1'
 
 
@@ -36,6 +37,8 @@ class Recipe(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=Tr
 
     samples: Samples = 256
     """Samples per pixel of the path tracer: noise falls as their square root."""
+    denoise: bool = False
+    """Whether what is left of the noise is taken out by Intel Open Image Denoise (the extra `denoise`)."""
 
 
 class AssumedSun(msgspec.Struct, frozen=True, forbid_unknown_fields=True):

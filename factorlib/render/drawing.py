@@ -30,6 +30,7 @@ from factorlib.render.studio import on_floor
 from factorlib.render.traced import Traced
 from factorlib.results.materials import Reflectance
 from factorlib.stage import Progress
+from factorlib.tracing.denoise import denoiser
 from factorlib.wholefile import write_text
 
 log = logging.getLogger("factorlib.recipes")
@@ -37,6 +38,7 @@ SUN = (
     "The sun is assumed, not recovered: it stands in direction {sun.direction} of the light's map, {sun.size:g}° wide, "
     "and holds {sun.strength:.0%} of the light's energy, which is kept."
 )
+DENOISED = "Denoised by {denoiser}, from {recipe.samples} samples a pixel."
 
 
 def draw(recipe: AnyRecipe, results: SolvedSet, out: Path, progress: Progress) -> None:
@@ -52,6 +54,9 @@ def draw(recipe: AnyRecipe, results: SolvedSet, out: Path, progress: Progress) -
             if recipe.sun is not None:
                 facts["assumed_sun"] = msgspec.to_builtins(recipe.sun)
                 captions.append(SUN.format(sun=recipe.sun))
+            if recipe.denoise:
+                facts["denoised"] = denoiser()
+                captions.append(DENOISED.format(recipe=recipe, denoiser=denoiser()))
             if facts:
                 write_json(out / f"{photo}.json", {**facts, "caption": " ".join(captions)})
         except InputError as error:
@@ -77,7 +82,7 @@ def resynthesis(
 ) -> None:
     """Path-traced objects, of other materials where the recipe says so, over the photo's background."""
     report(0)
-    scene = results.scene(photo, recipe.sun)
+    scene = results.scene(photo, recipe.sun, recipe.denoise)
     if isinstance(recipe, schema.Transfer):
         known, other = results.known(recipe.table), recipe.materials
         materials = {name: known[other[name]] if name in other else own for name, own in scene.materials.items()}
@@ -88,7 +93,7 @@ def resynthesis(
 
 def insertion(recipe: schema.Insert, results: SolvedSet, photo: str, out: Path, report: Report) -> dict[str, Any]:
     """A further object on the ground of one that is there; returns what is said beside the picture."""
-    scene = results.scene(photo, recipe.sun)
+    scene = results.scene(photo, recipe.sun, recipe.denoise)
     neighbour = next((each for each in scene.objects if each.name == recipe.beside), scene.objects[0])
     given, polish = recipe.ground, None
     if any(given.specular):
@@ -150,7 +155,7 @@ def staged(
 def view(recipe: schema.View, results: SolvedSet, photo: str, out: Path, report: Report) -> None:
     """The objects alone, from another side."""
     report(0)
-    scene = resized(results.scene(photo, recipe.sun), recipe.width)
+    scene = resized(results.scene(photo, recipe.sun, recipe.denoise), recipe.width)
     traced = staged(recipe, results, photo, scene, recipe.azimuth, recipe.elevation, recipe.zoom)
     _write_alone(out / photo, Traced(traced, results.tone(photo)))
 
@@ -159,7 +164,7 @@ def animation(
     recipe: schema.Turntable | schema.MovingLight, results: SolvedSet, photo: str, out: Path, report: Report
 ) -> None:
     """The camera or the light turns once: every frame as a PNG, and all as a GIF and, where PyAV is there, an MP4, on white."""
-    scene, pixels = resized(results.scene(photo, recipe.sun), recipe.width), []
+    scene, pixels = resized(results.scene(photo, recipe.sun, recipe.denoise), recipe.width), []
     for k in range(recipe.frames):
         report(k / recipe.frames)
         degrees = 360 * k / recipe.frames
@@ -178,7 +183,7 @@ def animation(
 
 def relight(recipe: schema.Relight, results: SolvedSet, photo: str, out: Path, report: Report) -> None:
     """In other photos' lights, or those of files: shown as the light's own photo would be, or exposed for the objects."""
-    scene = resized(results.scene(photo), recipe.width)
+    scene = resized(results.scene(photo, denoise=recipe.denoise), recipe.width)
     lights = recipe.lights or [name for name in results.photos if name != photo]
     for k, name in enumerate(lights):
         report(k / len(lights))
@@ -208,10 +213,11 @@ def write_grid(recipe: schema.Grid, results: SolvedSet, out: Path, progress: Pro
         light, balls = results.light(name), []
         for j, material in enumerate(materials):
             progress(k * len(materials) + j, total, f"{material}, {name}")
-            balls.append(lit_ball(light, results.materials[material], recipe.size, recipe.samples))
+            balls.append(lit_ball(light, results.materials[material], recipe.size, recipe.samples, recipe.denoise))
         columns.append(Traced(np.concatenate(balls)).exposed().pixels)
     _write_alone(out / "grid", Traced(np.concatenate(columns, axis=1)))
-    write_text(out / "grid.txt", f"rows: {', '.join(materials)}\ncolumns: {', '.join(lights)}\n")
+    said = f"denoised: {denoiser()}\n" if recipe.denoise else ""
+    write_text(out / "grid.txt", f"rows: {', '.join(materials)}\ncolumns: {', '.join(lights)}\n{said}")
     progress(total, total)
 
 

@@ -39,6 +39,7 @@ from factorlib.render.ground import Plane, height_over
 from factorlib.render.photo_scene import PhotoScene, Placed, light_entries, shapes
 from factorlib.render.placement import RADIUS, Spot, rotation_between
 from factorlib.results.materials import Reflectance, vec3
+from factorlib.tracing.denoise import denoised
 from factorlib.tracing.scene import bsdf, rendered, rgb, rigid, sensor, shape, transform
 
 FADE = 0.5  # share of the disc's radius from which on shadows fade
@@ -111,9 +112,11 @@ def inserted(
     there, light = shapes(scene.objects, scene.materials), light_entries(scene.light, scene.size)
     more = shapes([new], scene.materials)
 
-    def traced(entries: dict[str, Any], samples: int = samples, light: dict[str, Any] = light) -> Picture:
+    def traced(
+        entries: dict[str, Any], samples: int = samples, light: dict[str, Any] = light, guides: bool = False
+    ) -> Float[np.ndarray, "h w c"]:
         """With the same random numbers each time."""
-        return rendered({**light, **there, **entries}, camera, samples, 1, ALL_BOUNCES, hide_emitters=True)
+        return rendered({**light, **there, **entries}, camera, samples, 1, ALL_BOUNCES, True, guides)
 
     rays = scene.camera.rays() @ YUP_FROM_CAMERA
     points = spot.plane.hit(rays.reshape(-1, 3)).reshape(rays.shape)  # of the ground; NaN above the horizon
@@ -132,15 +135,21 @@ def inserted(
         diffuse = _ground_colour(grey, photo, shows_ground)
     report(2)
     disc = _disc(spot, Reflectance(diffuse, (0.0,) * 3, 1.0))
-    without = traced(disc)
+    without, guides_without = np.split(traced(disc, guides=scene.denoise), [3], axis=-1)
     constant = traced(disc, light={"light": {"type": "constant", "radiance": rgb(1.0)}})
     close = np.any([np.linalg.norm(points - foot, axis=-1) < far for foot, far in _feet(scene, spot.plane)], axis=0)
     match = shadow_match(photo, without, constant, binary_erosion(shows_ground & close, iterations=RIM))
     report(3)
-    with_ = traced({**disc, **more})
+    with_, guides_with = np.split(traced({**disc, **more}, guides=scene.denoise), [3], axis=-1)
     report(4)
     beside = (1 - coverage)[..., None]
     shadow = _shadow(without, with_, coverage, near)
+    if scene.denoise:  # the photo's own noise, and what no path changes, stay
+        clean, with_ = (
+            denoised(np.concatenate([noisy, np.ones_like(beside), guides], axis=-1))[..., :3]
+            for noisy, guides in ((shadow, guides_without), (with_, guides_with))
+        )
+        shadow = np.where(shadow == 1, 1, clean)
     own = np.maximum(with_ - beside * shadow * without, 0) * (beside < 1)
     composite = beside * shadow * photo + own
     if ground.polish is not None:

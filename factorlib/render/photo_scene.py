@@ -21,6 +21,7 @@ from factorlib.light.lobes import Lobes, lobe_integral
 from factorlib.meshes.mesh import Mesh
 from factorlib.meshes.ply import submesh
 from factorlib.results.materials import Reflectance
+from factorlib.tracing.denoise import denoised
 from factorlib.tracing.scene import bsdf, envmap, envmap_of_nodes, paint, rendered, rgb, rigid, sensor, shape
 
 UP = np.array([0.0, 1.0, 0.0])
@@ -46,13 +47,14 @@ class Placed(msgspec.Struct, frozen=True):
 
 
 class PhotoScene(msgspec.Struct, frozen=True):
-    """max_depth: ALL_BOUNCES or DIRECT, as the light was solved for"""
+    """max_depth: ALL_BOUNCES or DIRECT, as the light was solved for;  denoise: pictures of it are denoised"""
 
     camera: Camera
     objects: tuple[Placed, ...]
     light: Light
     materials: Mapping[str, Reflectance]
     max_depth: int = ALL_BOUNCES
+    denoise: bool = False
 
     @property
     def middle(self) -> Float[np.ndarray, "3"]:
@@ -135,20 +137,24 @@ def traced_photo(
     entries = {**light_entries(scene.light, scene.size), **shapes(scene.objects, scene.materials), **beside}
     view = sensor(scene.camera, own, near=scene.near, alpha=True)
     depth = scene.max_depth if max_depth is None else max_depth
-    picture = rendered(entries, view, samples, 0, depth, hide_emitters=not with_light)
+    picture = rendered(entries, view, samples, 0, depth, hide_emitters=not with_light, guides=scene.denoise)
     if with_light:
         picture[..., 3] = 1
-    return picture
+    return denoised(picture) if scene.denoise else picture
 
 
-def lit_ball(light: Light, material: Reflectance, size: int, samples: int) -> Float[np.ndarray, "h w 4"]:
+def lit_ball(
+    light: Light, material: Reflectance, size: int, samples: int, denoise: bool = False
+) -> Float[np.ndarray, "h w 4"]:
     """A ball of a material that fills the picture, seen from the front in a light: radiance and coverage."""
     distance = 20.0
     focal = size / 2 * np.sqrt(distance**2 - 1)
     camera = Camera(size, size, focal, (size / 2, size / 2))
     sphere = {"type": "sphere", "center": [0.0, 0.0, -distance], "radius": 1.0, "bsdf": bsdf(material)}
     view = sensor(camera, rigid(YUP_FROM_CAMERA, np.zeros(3)), alpha=True)
-    return rendered({**light_entries(light, distance), "ball": sphere}, view, samples, 0, DIRECT, hide_emitters=True)
+    entries = {**light_entries(light, distance), "ball": sphere}
+    picture = rendered(entries, view, samples, 0, DIRECT, hide_emitters=True, guides=denoise)
+    return denoised(picture) if denoise else picture
 
 
 def resized(scene: PhotoScene, width: int | None) -> PhotoScene:

@@ -59,8 +59,8 @@ class SolvedSet:
         self._meshes = MeshesOnce(inputs.mesh, self.names, crease_deg, own.displacements, own.log_factors)
         self._pixels: dict[str, dict[str, np.ndarray]] = {}
 
-    def scene(self, photo: str, sun: AssumedSun | None = None) -> PhotoScene:
-        """The photo's objects, in their poses, in its light; or in that with a sun that is assumed."""
+    def scene(self, photo: str, sun: AssumedSun | None = None, denoise: bool = False) -> PhotoScene:
+        """The photo's objects, in their poses, in its light; or in that with a sun that is assumed.  denoise: as of `PhotoScene`"""
         poses, objects = self.poses[photo], self.objects[photo]
         if not objects.objects:
             found, cure = f"photo '{photo}' has no objects to draw", "name other photos in the recipe"
@@ -76,7 +76,7 @@ class SolvedSet:
         light = self.light(photo)
         if sun is not None:
             light = with_sun(light, self.sun_axis(photo, sun), sun.size, sun.strength)
-        return PhotoScene(camera, placed, light, self.materials, depth)
+        return PhotoScene(camera, placed, light, self.materials, depth, denoise)
 
     def sun_axis(self, photo: str, sun: AssumedSun) -> Float[np.ndarray, "3"]:
         """The unit direction to a sun in the photo's camera axes."""

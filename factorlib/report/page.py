@@ -109,15 +109,14 @@ def forms(name: str, material: Reflectance) -> dict[str, str]:
     """A material by program, as text to paste there; numbers are linear, and docs/formats.md says what each makes of them."""
     numbers = {key: getattr(material, key) for key in ("diffuse", "specular", "roughness", "alpha")}
     gltf = gltf_material(material)
-    plain, specular = gltf["pbrMetallicRoughness"], gltf["extensions"][EXTENSION]
-    base, roughness = plain["baseColorFactor"][:3], plain["roughnessFactor"]
+    plain, specular = gltf["pbrMetallicRoughness"], gltf.get("extensions", {}).get(EXTENSION)
     return {
         "numbers": json.dumps({name: numbers}),
         "Mitsuba": material_xml(name, material),
         "Blender": rendered("blender.txt", name=repr(name), material=material) + "\n",
         "MaterialX": materialx({name: material}),
         "glTF": json.dumps({"name": name, **gltf}),
-        "three.js": rendered("three.txt", base=base, roughness=roughness, specular=specular),
+        "three.js": rendered("three.txt", plain=plain, specular=specular),
     }
 
 

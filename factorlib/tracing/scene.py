@@ -142,10 +142,13 @@ def traced(entries: Entry, camera: Camera, world_from_camera: Matrix, spp: int, 
     return rendered(entries, sensor(camera, world_from_camera), spp, seed, max_depth)
 
 
-def rendered(entries: Entry, view: Entry, spp: int, seed: int, max_depth: int, hide_emitters: bool = False) -> Image:
+def rendered(
+    entries: Entry, view: Entry, spp: int, seed: int, max_depth: int, hide_emitters: bool = False, guides: bool = False
+) -> Image:
     """Radiance of a scene in the picture of a `sensor`; max_depth 2 is direct light alone, −1 all bounces.
 
     hide_emitters: the light itself is not seen (where the sensor has alpha, it is 0 there)
+    guides: with six more channels, the albedo and the normal of what is seen
 
     spp: samples a pixel, at least.  Many samples are taken in passes of stratified ones, so that no pass needs much memory.
     """
@@ -154,6 +157,8 @@ def rendered(entries: Entry, view: Entry, spp: int, seed: int, max_depth: int, h
     plain = {name: entry for name, entry in entries.items() if isinstance(entry, dict)}
     loaded = entries | {name: mi.load_dict(entry, parallel=False) for name, entry in plain.items()}
     integrator = {"type": "path", "max_depth": max_depth, **({"hide_emitters": True} if hide_emitters else {})}
+    if guides:
+        integrator = {"type": "aov", "aovs": "albedo:albedo,normal:sh_normal", "picture": integrator}
     scene = mi.load_dict({"type": "scene", "integrator": integrator, "sensor": view, **loaded}, parallel=False)
     passes = -(-spp * view["film"]["crop_height"] * view["film"]["crop_width"] // SAMPLES_PER_PASS)
     images = [mi.render(scene, seed=passes * seed + k, spp=-(-spp // passes)) for k in range(passes)]

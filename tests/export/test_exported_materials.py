@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 import trimesh
 
-from factorlib.export.gltf import read_part_materials, write_glb
+from factorlib.export.gltf import gltf_material, read_part_materials, write_glb
+from factorlib.export.loss import losses
 from factorlib.export.materials import headroom_factor, table_in_gauge
 from factorlib.export.materialx import materialx
 from factorlib.meshes.mesh import Mesh
@@ -79,13 +80,30 @@ def test_glb_keeps_the_mesh_and_gives_exact_reflectances(tmp_path):
     assert data == (tmp_path / "b.glb").read_bytes()
     found = trimesh.load(tmp_path / "a.glb")
     assert set(found.geometry) == {"bright", "metal"} and found.area == pytest.approx(1.0)
-    for entry in read_tree(tmp_path / "a.glb")["materials"]:
+    tree = read_tree(tmp_path / "a.glb")
+    assert tree["extensionsUsed"] == ["KHR_materials_specular"]
+    for entry in tree["materials"]:
         material, core = CASES[entry["name"]], entry["pbrMetallicRoughness"]
+        assert core["roughnessFactor"] == material.roughness and entry["doubleSided"]
+        if entry["name"] == "metal":
+            assert core["metallicFactor"] == 1 and core["baseColorFactor"] == [*material.specular, 1]
+            continue
         more = entry["extensions"]["KHR_materials_specular"]
         f0 = 0.04 * np.array(more["specularColorFactor"]) * more["specularFactor"]
         np.testing.assert_allclose(f0, material.specular, atol=1e-12)
         np.testing.assert_allclose(np.array(core["baseColorFactor"][:3]) * (1 - f0.max()), material.diffuse, atol=1e-12)
-        assert core["roughnessFactor"] == material.roughness and entry["doubleSided"]
+        assert core["metallicFactor"] == 0
+
+
+def test_metals_are_those_that_show_as_black_plastic_where_the_extension_is_not_known():
+    gold, black = (
+        Reflectance((0.01, 0, 0), (0.9, 0.6, 0.2), 0.3),
+        Reflectance((0.02, 0.02, 0.02), (0.06, 0.06, 0.06), 0.3),
+    )
+    for material, metal in ((gold, True), (black, False), (CASES["black"], False), (CASES["lambertian"], False)):
+        assert gltf_material(material)["pbrMetallicRoughness"]["metallicFactor"] == metal
+        assert gltf_material(material, painted=True)["pbrMetallicRoughness"]["metallicFactor"] == 0
+    assert losses(CASES["metal"])["glb_plain"].mean < 0.05
 
 
 def test_variants_give_every_part_its_material_in_each_of_them(tmp_path):
@@ -120,7 +138,9 @@ def test_variants_share_the_detail_of_reflectance_exactly(tmp_path):
     """Base colour times vertex colour is the reflectance times the detail, in each variant."""
     detail, labels = np.array([0.4, 0.8, 1.05]), np.array([1], np.int16)
     mesh = Mesh(np.eye(3), np.array([[0, 1, 2]], np.int32), np.tile([0.0, 0, 1], (3, 1)), labels, detail=detail)
-    write_glb(tmp_path / "a.glb", mesh, ["bright", "lambertian"], CASES, {"dim": labels + 1})
+    write_glb(
+        tmp_path / "a.glb", mesh, ["bright", "lambertian", "metal"], CASES, {"dim": labels + 1, "bare": labels + 2}
+    )
     ((_, part),) = trimesh.load(tmp_path / "a.glb").geometry.items()
     shade = part.visual.vertex_attributes["color"][:, :3] / 255
     for entry in read_tree(tmp_path / "a.glb")["materials"]:

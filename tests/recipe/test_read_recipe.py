@@ -95,3 +95,11 @@ def test_the_table_and_the_insertions_in_the_docs_are_good(dataset, tmp_path):
     (tmp_path / "own.json").write_text(table)
     assert list(read_table(tmp_path / "own.json")) == ["gold"]
     assert recipes and all(isinstance(read_recipe(written(tmp_path, each), dataset), Insert) for each in recipes)
+
+
+def test_a_denoiser_that_is_not_installed_is_refused_with_the_cure(dataset, tmp_path, monkeypatch):
+    monkeypatch.setattr("factorlib.recipe.read.find_spec", lambda name: None)
+    with pytest.raises(InputError, match=r"denoise.*not installed") as error:
+        read_recipe(written(tmp_path, "kind: view\ndenoise: true"), dataset)
+    assert "make setup EXTRAS=denoise" in str(error.value)
+    assert not read_recipe(written(tmp_path, "kind: view\ndenoise: false"), dataset).denoise

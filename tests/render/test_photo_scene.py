@@ -170,3 +170,15 @@ def test_a_pixel_names_the_spot_that_it_shows(scene):
     assert np.allclose(np.cross(spot.point, ray), 0, atol=1e-9) and spot.point[1] == pytest.approx(-0.7)
     with pytest.raises(InputError, match="above the horizon"):
         spot_at(scene, plane, scene.objects[0], (30.5, 3.0), 0.5)
+
+
+def test_a_denoised_picture_is_nearer_to_many_samples_and_as_much_is_covered():
+    pytest.importorskip("mitsuba_oidn", reason="mitsuba-oidn is not installed: make setup EXTRAS=denoise")
+    true, plain, clean, again = (
+        lit_ball(lobes(), MATERIALS["red"], 128, samples, denoise)
+        for samples, denoise in ((1024, False), (2, False), (2, True), (2, True))
+    )
+    assert (clean[..., 3] == plain[..., 3]).all() and (clean == again).all() and (clean >= 0).all()
+    assert not clean[plain[..., 3] == 0].any()
+    error, before = (np.sqrt(np.mean((picture - true) ** 2)) for picture in (clean, plain))
+    assert error < 0.6 * before, (error, before)

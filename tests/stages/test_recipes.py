@@ -178,3 +178,10 @@ def test_a_mesh_without_height_or_that_is_not_there_is_refused(made, tmp_path):
     with pytest.raises(InputError, match="'flat.obj' has no height") as error:
         drawn(made, tmp_path / "out", recipe, **{"flat.obj": tmp_path / "flat.obj"})
     assert "up: z" in error.value.cure
+
+
+def test_what_is_denoised_says_so(made, tmp_path):
+    pytest.importorskip("mitsuba_oidn", reason="mitsuba-oidn is not installed: make setup EXTRAS=denoise")
+    facts = json.loads(drawn(made, tmp_path / "view", schema.View(**FRONT, denoise=True))["front.json"])
+    assert facts["denoised"].startswith("mitsuba-oidn ") and "from 1 samples" in facts["caption"]
+    assert b"denoised: mitsuba-oidn" in drawn(made, tmp_path / "grid", schema.Grid(size=16, denoise=True))["grid.txt"]
