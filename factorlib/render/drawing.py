@@ -22,9 +22,9 @@ from factorlib.images.picture import picture, write_png
 from factorlib.jsonfile import write_json
 from factorlib.recipe import schema
 from factorlib.recipe.schema import AnyRecipe, is_light_file
-from factorlib.render.insertion import NEW, STEPS, inserted
-from factorlib.render.photo_scene import PhotoScene, lit_ball, orbit, resized, traced_photo, turned_light
-from factorlib.render.placement import spot_at, spot_beside, stood, stood_free
+from factorlib.render.insertion import NEW, STEPS, Ground, inserted
+from factorlib.render.photo_scene import PhotoScene, Placed, lit_ball, orbit, resized, traced_photo, turned_light
+from factorlib.render.placement import Spot, spot_at, spot_beside, stood, stood_free
 from factorlib.render.solved_set import SolvedSet
 from factorlib.render.studio import on_floor
 from factorlib.render.traced import Traced
@@ -91,8 +91,22 @@ def resynthesis(
     _write(out / photo, traced.over(results.photo(photo)))
 
 
-def insertion(recipe: schema.Insert, results: SolvedSet, photo: str, out: Path, report: Report) -> dict[str, Any]:
-    """A further object on the ground of one that is there; returns what is said beside the picture."""
+class Standing(msgspec.Struct, frozen=True):
+    """A photo's scene, to whose materials the new object's are added, and where that object stands.
+
+    ground: on which it stands;  spot, found: where it was to stand, and where it stands;  moved: a sentence that says why, or nothing
+    """
+
+    scene: PhotoScene
+    ground: Ground
+    new: Placed
+    spot: Spot
+    found: Spot
+    moved: str
+
+
+def standing(recipe: schema.Insert, results: SolvedSet, photo: str) -> Standing:
+    """Where the new object of a recipe stands in a photo; raises InputError where it has no place that the photo shows."""
     scene = results.scene(photo, recipe.sun, recipe.denoise)
     neighbour = next((each for each in scene.objects if each.name == recipe.beside), scene.objects[0])
     given, polish = recipe.ground, None
@@ -115,23 +129,30 @@ def insertion(recipe: schema.Insert, results: SolvedSet, photo: str, out: Path, 
         spot = spot_beside(scene, ground.plane, neighbour, recipe.size, wide / tall)
     labels, factor = tuple(f"{NEW}{name}" for name in names), results.poses[photo].camera.factor
     stand = partial(stood, NEW, mesh, labels, up, recipe.turn)
-    new, there, moved = stood_free(scene, stand, spot, recipe.at is not None, factor)
-    if moved:
-        log.warning("%s: %s", photo, moved)
+    new, found, moved = stood_free(scene, stand, spot, recipe.at is not None, factor)
     scene = msgspec.structs.replace(scene, materials={**scene.materials, **own})
-    seen = results.straightened(photo), results.covered(photo)
-    found = inserted(scene, *seen, new, there, ground, recipe.samples, lambda done: report(done / STEPS))
-    same = (found.coverage[..., None] == 0) & (found.shadow == 1) & (polish is None)
+    return Standing(scene, ground, new, spot, found, moved)
+
+
+def insertion(recipe: schema.Insert, results: SolvedSet, photo: str, out: Path, report: Report) -> dict[str, Any]:
+    """A further object on the ground of one that is there; returns what is said beside the picture."""
+    there = standing(recipe, results, photo)
+    if there.moved:
+        log.warning("%s: %s", photo, there.moved)
+    seen, stands = (results.straightened(photo), results.covered(photo)), (there.new, there.found)
+    found = inserted(there.scene, *seen, *stands, there.ground, recipe.samples, lambda done: report(done / STEPS))
+    same = (found.coverage[..., None] == 0) & (found.shadow == 1) & (there.ground.polish is None)
     _write(out / photo, np.where(same, results.photo(photo), results.tone(photo)(found.composite)))
-    at = factor * scene.camera.project(there.point @ YUP_FROM_CAMERA)
-    given = f"where '{neighbour.name}' would come to rest"
-    if results.grounds[photo].ground is not None:
-        given = "that of dataset.yaml"
+    at = results.poses[photo].camera.factor * there.scene.camera.project(there.found.point @ YUP_FROM_CAMERA)
+    given = "that of dataset.yaml"
+    if results.grounds[photo].ground is None:
+        neighbour = recipe.beside or there.scene.objects[0].name
+        given = f"where '{neighbour}' would come to rest"
     return {
         "at": at.round(1).tolist(),
-        "moved": float(np.linalg.norm(there.point - spot.point) / spot.height),
+        "moved": float(np.linalg.norm(there.found.point - there.spot.point) / there.spot.height),
         "shadow": msgspec.to_builtins(found.match),
-        "caption": f"{moved} The ground is {given}. {found.match}".strip(),
+        "caption": f"{there.moved} The ground is {given}. {found.match}".strip(),
     }
 
 

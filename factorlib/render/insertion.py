@@ -102,11 +102,14 @@ def inserted(
     ground: Ground,
     samples: int,
     report: Callable[[int], None] = lambda done: None,
+    seed: int = 1,
+    compared: bool = True,
 ) -> Inserted:
     """The photo of the scene with the new object.  Raises InputError where that is not seen.
 
     photo: linear radiance, its tone curve undone;  covered: pixels that show something else than the ground
-    report: how many of STEPS are done
+    report: how many of STEPS are done;  seed: of the random numbers, which all tracings share
+    compared: whether the photo's own shadow is compared with the predicted one; without, `match` is of no pixels
     """
     camera = sensor(scene.camera, rigid(YUP_FROM_CAMERA, np.zeros(3)), near=scene.near)
     there, light = shapes(scene.objects, scene.materials), light_entries(scene.light, scene.size)
@@ -116,7 +119,7 @@ def inserted(
         entries: dict[str, Any], samples: int = samples, light: dict[str, Any] = light, guides: bool = False
     ) -> Float[np.ndarray, "h w c"]:
         """With the same random numbers each time."""
-        return rendered({**light, **there, **entries}, camera, samples, 1, ALL_BOUNCES, True, guides)
+        return rendered({**light, **there, **entries}, camera, samples, seed, ALL_BOUNCES, True, guides)
 
     rays = scene.camera.rays() @ YUP_FROM_CAMERA
     points = spot.plane.hit(rays.reshape(-1, 3)).reshape(rays.shape)  # of the ground; NaN above the horizon
@@ -136,9 +139,11 @@ def inserted(
     report(2)
     disc = _disc(spot, Reflectance(diffuse, (0.0,) * 3, 1.0))
     without, guides_without = np.split(traced(disc, guides=scene.denoise), [3], axis=-1)
-    constant = traced(disc, light={"light": {"type": "constant", "radiance": rgb(1.0)}})
-    close = np.any([np.linalg.norm(points - foot, axis=-1) < far for foot, far in _feet(scene, spot.plane)], axis=0)
-    match = shadow_match(photo, without, constant, binary_erosion(shows_ground & close, iterations=RIM))
+    match = ShadowMatch(None, None, 0)
+    if compared:
+        constant = traced(disc, light={"light": {"type": "constant", "radiance": rgb(1.0)}})
+        close = np.any([np.linalg.norm(points - foot, axis=-1) < far for foot, far in _feet(scene, spot.plane)], axis=0)
+        match = shadow_match(photo, without, constant, binary_erosion(shows_ground & close, iterations=RIM))
     report(3)
     with_, guides_with = np.split(traced({**disc, **more}, guides=scene.denoise), [3], axis=-1)
     report(4)

@@ -1,0 +1,200 @@
+"""Pairs of pictures of a made set: a new object in a photograph, by what was recovered and by what is true.
+
+Both are made by the recipe `insert`, with the same mesh, samples, and pixel at which the object touches the ground.  True are the light of the
+photograph, infinitely far away as the recipe takes it, the materials, and the plane on which the true poses and lenses put the chairs.  So a pair
+shows what recovering costs, and not what the recipe leaves out, such as walls near by.
+
+Observer   mean ΔE (CIE 1976, after a blur of σ = 1 pixel) over the object, or over the ground that either picture changes, whichever is larger.
+           A pair is told apart where it is above the just noticeable difference, 2.3 (Mahy, Van Eycken and Oosterlinck, 1994), and above the
+           floor: that of two truths of different noise, or of two pictures by what was recovered.
+Cause      the same with one factor recovered and the others true.  The factor per channel between materials and lights, which no photograph
+           tells, is first moved from the lights to the materials, so it counts as theirs.
+Look       of the object: the difference of mean lightness, of mean colour, and of how far the brightest 2 % are above the mean; of the ground:
+           the mean difference of lightness.  The largest names what is seen.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import Any
+
+import msgspec
+import numpy as np
+from jaxtyping import Bool, Float
+from scipy.ndimage import binary_dilation, gaussian_filter
+
+from factorlib.conventions import YUP_FROM_CAMERA
+from factorlib.dataset.schema import Dataset
+from factorlib.errors import InputError
+from factorlib.evaluate.picture import picture_error
+from factorlib.evaluate.truth import read_true_light
+from factorlib.generate.eames import SET
+from factorlib.generate.folder import focal_px_of_35mm, write_obj
+from factorlib.generate.shapes import SHAPES
+from factorlib.jsonfile import write_json
+from factorlib.recipe.schema import Insert
+from factorlib.render.drawing import standing
+from factorlib.render.ground import Plane
+from factorlib.render.insertion import Ground, Inserted, inserted
+from factorlib.render.photo_scene import Light, Placed
+from factorlib.render.solved_set import SolvedSet
+from factorlib.results.materials import Reflectance
+from factorlib.results.poses import AS_IT_IS
+from factorlib.stage import Inputs
+from studies.errors import factor_of, times
+
+GIVEN = {"chrome": Reflectance((0.0,) * 3, (0.7,) * 3, 0.15), "chalk": Reflectance((0.7,) * 3, (0.0,) * 3, 1.0)}
+TABLE, MESHES = "given.json", ("ball", "chair", "vase.obj", "blob.obj")  # the file of GIVEN, which nobody recovers
+NOTICED, CHANGED, BLUR = 2.3, 1.0, 1.0  # ΔE; ΔE; pixels
+AROUND, LEAST = 1.4, 60  # half a window's width in the object's larger extent, and in pixels at least
+PLACES = 100  # that are tried for an object
+FACTORS = ("light", "material", "ground")
+XYZ_OF_RGB = np.array([[0.4124564, 0.2126729, 0.0193339], [0.3575761, 0.7151522, 0.119192], [0.1804375, 0.072175, 0.9503041]])  # fmt: skip
+Picture, Mask = Float[np.ndarray, "h w 3"], Bool[np.ndarray, "h w"]
+Both, Sets = tuple[Picture, Picture], tuple[SolvedSet, SolvedSet]  # by what was recovered, and by the truth
+replace = msgspec.structs.replace
+
+
+class Truth(SolvedSet):
+    """A set of `factorlib.generate eames` with its true materials, lights, poses and lenses; the meshes are the solve's."""
+
+    def __init__(self, inputs: Inputs, dataset: Dataset):
+        super().__init__(inputs)
+        if dataset.truth is None or set(dataset.spec.meshes) != {"chair"}:
+            cure = "make one: python -m factorlib.generate eames --seed N --out FOLDER"
+            raise InputError("it is no set of chairs with a truth", file=dataset.folder, cure=cure)
+        self.truth, self.folder = dataset.truth, dataset.folder
+        lens = {shot.name: shot.focal_35mm for shot in SET.shots}
+        self.table = replace(self.table, model=replace(self.table.model, tone={}))
+        true = self.truth.materials.items()
+        self.materials = {name: Reflectance(m.diffuse, m.specular, m.roughness) for name, m in true}
+        for photo, found in self.poses.items():
+            height, width = self._masks(photo)["label"].shape
+            focal, middle = focal_px_of_35mm(lens[photo], width, height), (width / 2, height / 2)
+            camera = replace(found.camera, focal_px=focal, principal_point=middle)
+            poses = self.truth.poses[photo].items()
+            places = {n: {"rotation": p.rotation, "translation": p.translation, "scale": AS_IT_IS} for n, p in poses}
+            objects = {name: replace(found.objects[name], **place) for name, place in places.items()}
+            self.poses[photo] = replace(found, camera=camera, objects=objects)
+
+    def light(self, name: str) -> Light:
+        """The true map of a photo's light."""
+        return read_true_light(self.folder / self.truth.illumination[name], name).astype(float)
+
+    def ground(self, photo: str, neighbour: Placed) -> Ground:
+        """The plane y = 0 of a chair's own frame, on which it stands."""
+        pose = self.truth.poses[photo][neighbour.name]
+        normal = YUP_FROM_CAMERA @ np.array(pose.rotation)[:, 1]
+        return Ground(Plane(normal, YUP_FROM_CAMERA @ np.array(pose.translation)))
+
+
+def write_files(folder: Path) -> dict[str, Path]:
+    """Write what recipes of pairs name: the table of GIVEN, and the meshes that are no set's; as files of `Inputs`."""
+    files = {name: folder / name for name in (TABLE, *MESHES) if "." in name}
+    write_json(files[TABLE], {"materials": GIVEN})
+    for body, path in ((SHAPES[path.stem](), path) for path in files.values() if path.stem in SHAPES):
+        write_obj(path, {"all": (body.vertices, body.faces, body.normals)})
+    return {f"recipe file:{name}": path for name, path in files.items()}
+
+
+def chosen(sets: Mapping[str, Sets], count: int, samples: int, seed: int) -> Iterator[tuple[str, str, Insert]]:
+    """Sets, photos and recipes of pairs, by a seed alone: photos, meshes and materials about equally often, places, sizes and turns at random.
+
+    sets: what was recovered, and the truth.  A place where the recipe would refuse or move the object in either is drawn anew; InputError
+    where that happens `PLACES` times.
+    """
+    rng = np.random.default_rng(seed)
+    shots, numbers = [(name, photo) for name, of in sets.items() for photo in of[0].photos], np.arange(count)
+    for shot, mesh, number in np.column_stack([rng.permutation(numbers) for _ in range(3)]):
+        name, photo = shots[shot % len(shots)]
+        results, materials = sets[name][0], [*sets[name][0].materials, *GIVEN]
+        camera, factor = results.scene(photo).camera, results.poses[photo].camera.factor
+        what = {"mesh": MESHES[mesh % len(MESHES)], "material": materials[number % len(materials)], "table": TABLE}
+        for _ in range(PLACES):
+            at = rng.uniform((0.15, 0.6), (0.85, 0.95)) * (camera.width, camera.height) * factor
+            size, turn = rng.uniform((0.3, 0.0), (0.5, 360.0)).tolist()
+            recipe = Insert(**what, at=tuple(at.tolist()), size=size, turn=turn, samples=samples)
+            try:
+                if any(standing(recipe, of, photo).moved for of in sets[name]):
+                    continue
+            except InputError:
+                continue
+            yield name, photo, recipe
+            break
+        else:
+            raise InputError(f"photo '{photo}' has no place for an object", key="photos", cure="name another set")
+
+
+def drawn(photo: str, recipe: Insert, recovered: SolvedSet, truth: SolvedSet) -> tuple[Both, dict[str, Any]]:
+    """The window of the photo about the object, linear, by what was recovered and by the truth, and how they differ (`scores`)."""
+    sets, ours = {True: recovered, False: truth}, standing(recipe, recovered, photo)
+    true, factor = standing(recipe, truth, photo), factor_of(recovered.materials, truth.materials)
+    materials = {name: times(m, factor) for name, m in ours.scene.materials.items()}
+    scene = replace(ours.scene, materials=materials, light=ours.scene.light.scaled(1 / factor))
+    places = {True: replace(ours, scene=scene), False: true}
+    pixels = [of.scene.camera.project(of.new.vertices @ YUP_FROM_CAMERA) for of in (ours, true)]
+    low, high = np.concatenate(pixels).min(axis=0), np.concatenate(pixels).max(axis=0)
+    half, size = max(AROUND * (high - low).max(), LEAST), (scene.camera.width, scene.camera.height)
+    ends = np.clip(np.rint([(low + high) / 2 - half, (low + high) / 2 + half]), 0, size).astype(int)
+    (left, top), (width, height) = ends[0].tolist(), (ends[1] - ends[0]).tolist()
+    window = slice(top, top + height), slice(left, left + width)
+
+    def traced(light: bool, material: bool, ground: bool, seed: int = 1) -> tuple[Picture, Inserted]:
+        """The window with these factors recovered, the others true."""
+        here, seen = places[ground], sets[light].straightened(photo)[window]
+        lit = {"light": places[light].scene.light, "materials": places[material].scene.materials}
+        scene = replace(here.scene, camera=here.scene.camera.window(left, top, 1.0, width, height), **lit)
+        stands = recovered.covered(photo)[window], here.new, here.found, here.ground
+        found = inserted(scene, seen, *stands, recipe.samples, seed=seed, compared=False)
+        return sets[light].tone(photo)(found.composite), found
+
+    (mine, found), (right, other) = traced(True, True, True), traced(False, False, False)
+    for side, of in ((True, found), (False, other)):  # the reflectance of each ground, found in its own light
+        places[side] = replace(places[side], ground=replace(places[side].ground, diffuse=tuple(of.ground.tolist())))
+    parts = {name: traced(*(name == each for each in FACTORS))[0] for name in FACTORS}
+    again = traced(True, True, True, seed=2)[0], traced(False, False, False, seed=2)[0]
+    body = np.maximum(found.coverage, other.coverage) > 0.5
+    return (mine, right), scores((mine, right), again, parts, recovered.photo(photo)[window], body)
+
+
+def scores(pair: Both, again: Both, parts: Mapping[str, Picture], photo: Picture, body: Mask) -> dict[str, Any]:
+    """How the pictures of a pair differ, by what was recovered and by the truth, in a window of the photo.
+
+    again: both with other noise;  parts: with one factor recovered, by name;  body: the object's pixels
+    """
+    lab, true, before = cielab(pair[0]), cielab(pair[1]), cielab(photo)
+    changed = (difference(lab, before) > CHANGED) | (difference(true, before) > CHANGED)
+    region = binary_dilation(body | changed, iterations=2)
+    ground = region & ~binary_dilation(body)
+
+    def error(picture: Picture, than: Picture) -> float:
+        of = difference(cielab(picture), than)
+        return float(max(of[where].mean() for where in (body, ground) if where.any()))
+
+    off = lab[body].mean(axis=0) - true[body].mean(axis=0)
+    glow = [np.quantile(of[body][:, 0], 0.98) - of[body][:, 0].mean() for of in (lab, true)]
+    look = {"brightness": abs(off[0]), "colour": np.hypot(*off[1:]), "highlight": abs(glow[0] - glow[1])}
+    look["shadow"] = np.abs(lab - true)[ground][:, 0].mean() if ground.any() else 0.0
+    by = {"difference": error(pair[0], true), "floor": max(error(again[0], lab), error(again[1], true))}
+    by |= {name: error(picture, true) for name, picture in parts.items()}
+    dssim = {name: picture_error(of, pair[1], region, 1.0).dssim for name, of in (("dssim", pair[0]), ("dssim_floor", again[1]))}  # fmt: skip
+    told = {"told_apart": by["difference"] > max(NOTICED, by["floor"])}
+    named = {"cause": max(parts, key=by.__getitem__), "look": max(look, key=look.__getitem__)}
+    return by | dssim | {name: float(value) for name, value in look.items()} | told | named
+
+
+def cielab(radiance: Picture) -> Picture:
+    """L*, a*, b* of what a screen shows of linear Rec. 709 (white D65), blurred as an eye does.
+
+    >>> cielab(np.ones((3, 3, 3)))[1, 1].round(2).tolist()
+    [100.0, 0.0, 0.0]
+    """
+    t = gaussian_filter(np.clip(radiance, 0, 1), (BLUR, BLUR, 0)) @ (XYZ_OF_RGB / XYZ_OF_RGB.sum(axis=0))
+    f = np.where(t > (6 / 29) ** 3, np.cbrt(t), t / (3 * (6 / 29) ** 2) + 4 / 29)
+    return np.stack([116 * f[..., 1] - 16, 500 * (f[..., 0] - f[..., 1]), 200 * (f[..., 1] - f[..., 2])], axis=-1)
+
+
+def difference(a: Picture, b: Picture) -> Float[np.ndarray, "h w"]:
+    """ΔE (CIE 1976) of each pixel of two pictures in CIELAB."""
+    return np.linalg.norm(a - b, axis=-1)
