@@ -13,7 +13,7 @@ directions are similarly bright, colour varies much less than luminance, and abo
 is a factor of the covariance (2) of a whole map: some scenes have much contrast or much colour, others little. `covariance` and `precision` are those
 at s = 1, a typical map; a solve finds s by evidence. With s integrated over, a map is drawn from Student's t of ν_k degrees of freedom.
 y_0, y_1 and y_2 are independent of each other. exp(−θ/c) is positive definite on the sphere for every c > 0 (Gneiting, "Strictly and non-strictly
-positive definite functions on spheres", 2013). `factorlib.light.prior_fit` finds the numbers.
+positive definite functions on spheres", 2013). `studies.measured.light_prior` finds the numbers.
 """
 
 from __future__ import annotations
@@ -136,9 +136,7 @@ def _inverse(matrix: Float[np.ndarray, "p p"]) -> tuple[Float[np.ndarray, "p p"]
     return (inverse + inverse.T) / 2, -float(np.linalg.slogdet(matrix)[1])
 
 
-def read_light_prior(path: Path | None = None) -> LightPrior:
-    """The prior in a file that `python -m factorlib.light_prior` wrote; None: the one this package ships. InputError for a file that is none."""
-    path = path or SHIPPED
-    value = read_json(path)
-    with reading("a light prior", path, cure="write it by python -m factorlib.light_prior"):
-        return msgspec.convert(value, LightPrior)
+def read_light_prior() -> LightPrior:
+    """The prior that this package ships, which `studies.measured.light_prior` made; raises InputError where the file is damaged."""
+    with reading("a light prior", SHIPPED):
+        return msgspec.convert(read_json(SHIPPED), LightPrior)

@@ -26,7 +26,7 @@ import numpy as np
 from factorlib.errors import InputError
 from factorlib.evaluate.table import value_at
 from factorlib.jsonfile import write_json
-from factorlib.light_prior import maps_in, prior_of
+from studies.measured.light_prior import maps_in, prior_of
 from studies.measured.standard_errors import light_deviations, material_deviations
 from studies.measured.tools import ROOT, Tables, evaluated, table
 

@@ -20,10 +20,10 @@ from scipy.optimize import least_squares
 from scipy.stats import spearmanr
 
 from factorlib.evaluate.verdict import CLIPPED, CONTOUR, FLOOR, GOOD, MATERIALS, POOR, UNEXPLAINED
-from factorlib.light_prior import maps_in
 from factorlib.wholefile import write_text
 from studies.figures import STYLE
 from studies.measured.eames_like import drawn, folder_of, made
+from studies.measured.light_prior import maps_in
 from studies.measured.tools import ROOT, evaluated, needed, table
 from studies.scenes.spoilt import MIXED, spoilt
 
