@@ -13,7 +13,6 @@ import numpy as np
 from jaxtyping import Float
 
 from factorlib.diagnose.answer import Answer
-from factorlib.diagnose.uncertainty import StandardErrors
 from factorlib.geometry.sphere import mirror_directions
 from factorlib.model.blocks import Block
 from factorlib.model.gauge import LEAST_ENERGY, connected_components, is_free
@@ -214,11 +213,11 @@ def _brighter_than_white(answer: Answer) -> list[str]:
     ]
 
 
-def after_solving(answer: Answer, errors: StandardErrors) -> list[str]:
+def after_solving(answer: Answer) -> list[str]:
     """What the answer leaves open or explains badly."""
     problem, point = answer.solution.shown(answer.problem), answer.solution.point
     return [
-        *undetermined_by_answer(answer.names, problem.blocks, point.materials, errors.materials),
+        *undetermined_by_answer(answer.names, problem.blocks, point.materials, answer.errors.materials),
         *poorly_explained(problem, point),
         *unlikely_curves(problem.blocks, point.lights),
         *tinted_alike(answer.names, problem.blocks, point.lights, problem.known),

@@ -1,4 +1,4 @@
-"""A light of known radiance on cells: from a lat-long map, or from what a mirror ball shows.
+"""What dataset.yaml says is known, as the solver holds it; and a light of known radiance on cells: of a lat-long map, or of what a mirror ball shows.
 
 Radiance y_i is known in directions d_i, each of which stands for the solid angle ω_i.  The cells' weights w ≥ 0 are those of the likeliest
 Σ_p w_p φ_p(d_i), were y counts of a Poisson process, by the iteration of Richardson (1972) and Lucy (1974)
@@ -12,14 +12,20 @@ it shows of other objects or clipped is left out) are not known: the solve finds
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+
 import msgspec
 import numpy as np
 from jaxtyping import Float
 
 from factorlib.conventions import YUP_FROM_CAMERA, lat_long_directions, lat_long_solid_angles
+from factorlib.dataset.schema import KnownSlice, LightSlice
+from factorlib.errors import InputError
 from factorlib.geometry.sphere import fibonacci_sphere, mirror_directions
 from factorlib.light.lobes import lobe_integral, squared_distances
+from factorlib.model.known import Known
 from factorlib.model.lights import Light, even_cells
+from factorlib.model.materials import ROUGHNESS
 from factorlib.urm.observations import Observations
 
 CELLS, SPLIT, SPLITTINGS = 400, 48, 4
@@ -28,6 +34,7 @@ ITERATIONS, BETWEEN = 60, 15  # of the last cells, and of those that split after
 COVERED = 0.5  # of a cell's integral: below, it is not known
 DARK, LEAST = 1e-6, 1e-12  # of the mean radiance, and steradians, which keep (1) from dividing by 0
 ROWS = 128  # of a map, which is averaged down to them
+LEAST_OF_A_BALL = 1000  # pixels: then what they mirror is 6° apart, and cells are 10° wide
 
 
 def known_light(
@@ -82,3 +89,40 @@ def light_of_ball(seen: Observations, specular: Float[np.ndarray, "3"], rotation
         usable &= seen.visibility[np.arange(len(seen)), nearest] == 255
     angle = 4 * np.pi * weight / weight.sum()
     return known_light(mirror[usable] @ rotation.T, seen.radiance[usable] / specular, angle[usable])
+
+
+def what_is_known(
+    given: KnownSlice,
+    maps: Mapping[str, Float[np.ndarray, "h w 3"]],
+    shown: Mapping[str, Observations],
+    seen: Observations,
+    photos: Mapping[str, LightSlice],
+) -> tuple[Observations, Known]:
+    """The observations `seen` without those of mirror balls, and what the solver holds.
+
+    maps: by illumination;  shown: all usable pixels of the photo of each illumination's ball, at one exposure;  photos: the light of each.
+    Raises InputError where nothing shows what is known.
+    """
+    number, chrome = list(seen.materials).index, {ball.material for ball in given.balls.values()}
+    for name in given.materials:
+        if not (seen.material == number(name)).any():
+            cure = "look at its mask and at the overlays of `align`: both must show it at the same place"
+            raise InputError(f"no observation shows material '{name}'", key=f"known.materials.{name}", cure=cure)
+    rows = {
+        number(name): np.array(
+            [*of.diffuse, *(of.specular or (np.nan,) * 3), of.roughness or (ROUGHNESS[0] if name in chrome else np.nan)]
+        )
+        for name, of in given.materials.items()
+    }
+    lights = {name: light_of_map(lat_long) for name, lat_long in maps.items()}
+    for name, ball in given.balls.items():
+        m, of_photo = number(ball.material), seen.photo == seen.photos.index(ball.photo)
+        pixels, rest = shown[name].take(shown[name].material == m), ~(of_photo & (seen.material == m))
+        if len(pixels) < LEAST_OF_A_BALL or not (of_photo & rest).any():
+            fault = f"photo '{ball.photo}' shows {len(pixels)} pixels of the ball, and {(of_photo & rest).sum()} observations of other objects"
+            cure = f"the ball needs {LEAST_OF_A_BALL}, and something beside it: look at the overlay of `align`"
+            raise InputError(fault, key=f"known.illumination.{name}.chrome", cure=cure)
+        world = photos[ball.photo].world_from_camera
+        lights[name] = light_of_ball(pixels, rows[m][3:6], np.eye(3) if world is None else np.array(world))
+        seen = seen.take(rest)
+    return seen, Known(rows, lights, tuple(sorted({photos[photo].illumination for photo in given.exposure})))

@@ -114,9 +114,14 @@ class Light(msgspec.Struct, frozen=True):
         return all_
 
     @property
+    def unit_energy(self) -> Float[np.ndarray, " p"]:
+        """Energy of each lobe over 2π, were its weight one; steradians."""
+        return lobe_integral(self.sharpness) / (2 * np.pi)
+
+    @property
     def energy(self) -> Float[np.ndarray, "p 3"]:
         """Energy of each lobe over 2π, in the illumination's radiance unit times steradians."""
-        return self.weight * (lobe_integral(self.sharpness) / (2 * np.pi))[:, None]
+        return self.weight * self.unit_energy[:, None]
 
     @property
     def unknowns(self) -> int:
@@ -132,11 +137,19 @@ class Light(msgspec.Struct, frozen=True):
         """Return the same cells with other radiances."""
         return msgspec.structs.replace(self, weight=(self.peaks * np.exp(u)).T)
 
-    def with_lobe(self, axis: Float[np.ndarray, "3"], sharpness: float, weight: Float[np.ndarray, "3"]) -> Light:
-        """Return the light with one more lobe, the last."""
-        log_sharpness = np.append(self.log_sharpness, np.log(sharpness))
-        rows = np.vstack([self.axis, axis]), log_sharpness, np.vstack([self.weight, weight])
-        return msgspec.structs.replace(self, axis=rows[0], log_sharpness=rows[1], weight=rows[2])
+    def with_lobes(self, lobes: UnitLobes, weight: Float[np.ndarray, "q 3"]) -> Light:
+        """Return the light with q more lobes, the last."""
+        return msgspec.structs.replace(
+            self,
+            axis=np.vstack([self.axis, lobes.axis]),
+            log_sharpness=np.append(self.log_sharpness, np.log(lobes.sharpness)),
+            weight=np.vstack([self.weight, weight]),
+        )
+
+    def take(self, which: Bool[np.ndarray, " p"] | slice) -> Light:
+        """Return the light of some of its lobes."""
+        lobes = {name: getattr(self, name)[which] for name in ("axis", "log_sharpness", "weight")}
+        return msgspec.structs.replace(self, **lobes)
 
     def split(self, which: Bool[np.ndarray, " p"]) -> Light:
         """The light with each cell of `which` replaced by smaller ones of its radiance, which follow all others: see the head of the module."""

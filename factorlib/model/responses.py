@@ -20,7 +20,7 @@ at worst: .17 % for the factor 1.136 of the nodes.  Cells no sharper than `WIDE`
 
 from __future__ import annotations
 
-from typing import NamedTuple, TypeVar
+from typing import NamedTuple, Protocol, TypeVar
 
 import numpy as np
 import torch
@@ -112,15 +112,23 @@ def shadowed(
 
 
 class Reflected(NamedTuple):
-    """The responses D and S [n, p] of n observations of one material to p lobes of weight one, and ∂S/∂roughness; float32."""
+    """The responses D and S [n, p] of n observations of one material to p lobes of weight one, and ∂S/∂roughness."""
 
     diffuse: Float[np.ndarray, "n p"]
     specular: Float[np.ndarray, "n p"]
     by_roughness: Float[np.ndarray, "n p"]
 
 
+class Table(Protocol):
+    """Responses of a block, material by material."""
+
+    def rows(self, m: int) -> slice: ...
+
+    def at(self, m: int, roughness: float) -> Reflected: ...
+
+
 class Reflections:
-    """What a block's observations reflect of some lobes, material by material; values at nodes are kept.
+    """What a block's observations reflect of some lobes, material by material, float32; values at nodes are kept.
 
     materials_given: roughness does not change, so it is the only node, and ∂S/∂roughness, for which nobody asks, is nil
     """

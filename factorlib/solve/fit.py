@@ -30,8 +30,9 @@ from factorlib.model.loss import Loss
 from factorlib.model.materials import Materials, Point
 from factorlib.model.problem import JointProblem
 from factorlib.model.responses import Reflections
+from factorlib.solve.arrow import System
 from factorlib.solve.descent import Descent, Report
-from factorlib.solve.marginal import Field, Marginal, positive_definite_inverse
+from factorlib.solve.marginal import Field, positive_definite_inverse
 from factorlib.solve.material_prior import MaterialPrior, materials_of, unknowns_of
 
 SURE = 0.6  # times the typical confidence of a material's normals: what is less sure is left out
@@ -137,7 +138,7 @@ def recounted(field: Field, one: Hyperparameters, prior: LightPrior) -> Field:
     return msgspec.structs.replace(field, precision=Q, log_determinant=log_determinant, temperature=one.temperature)
 
 
-def estimated(field: Field, part: Marginal, prior: LightPrior, least: float) -> Hyperparameters:
+def estimated(field: Field, part: System, prior: LightPrior, least: float) -> Hyperparameters:
     """The hyperparameters by the residuals and the light that a descent ended with; part: its system there."""
     light = field.illumination.light
     cells = np.flatnonzero(np.tile(~light.suns, 3))

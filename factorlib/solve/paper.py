@@ -11,7 +11,7 @@ Left open by the paper, or by what is known of it here, and chosen:
 Bounds       by parametrisation: reflectances and roughness through a sigmoid, log sharpness through a sigmoid onto
              `SHARPNESS`, weights through softplus, axes as unnormalised vectors.
 Start        reflectances from mean radiances (`start`), lobes evenly over the sphere, as wide as they are apart, white.
-Subset       `subset` observations of all illuminations together.
+Subset       `SUBSET` observations of all illuminations together.
 Curvature    a pair (step, change of gradient) is measured on one subset, at both ends of the step, so that the change
              of subset is not taken for curvature (Schraudolph, Yu and Günter 2007, "A stochastic quasi-Newton method for
              online convex optimization"); pairs outlive their subset.
@@ -55,6 +55,7 @@ MEMORY = 20  # pairs
 LARGEST_STEP = 0.05
 SUFFICIENT, HALVINGS = 1e-4, 12
 REPORTS = 20  # in a run
+SUBSET = 512  # observations
 
 Samplings = Annotated[float, msgspec.Meta(gt=0)]
 Prior = Annotated[float, msgspec.Meta(ge=0)]
@@ -65,10 +66,7 @@ class Paper(msgspec.Struct, frozen=True):
 
     lobes: Lobes = 32
     samplings: Samplings = 5.0
-    subset: int = 512
     prior: Prior = 0.1
-    start_roughness: float = 0.4
-    start_specular_share: float = 0.2
     seed: Seed = 0
 
 
@@ -77,11 +75,11 @@ def solve(problem: JointProblem, materials: int, paper: Paper, report: Report = 
     problem = problem.with_effects(False, False).with_loss(Loss(prior=paper.prior))
     objective, history, blocks = PaperObjective(problem, materials, paper), list[Event](), problem.blocks
     rows = [np.flatnonzero(~block.held_out) for block in blocks]
-    iterations = math.ceil(paper.samplings * sum(map(len, rows)) / paper.subset)
+    iterations = math.ceil(paper.samplings * sum(map(len, rows)) / SUBSET)
     every, lobes = max(1, iterations // REPORTS), paper.lobes * len(blocks)
     x, pairs, random = objective.start(), deque(maxlen=MEMORY), np.random.default_rng(paper.seed)
     for iteration in range(iterations):
-        subset = drawn(rows, paper.subset, random)
+        subset = drawn(rows, SUBSET, random)
         x, value = stepped(lambda at, s=subset: objective.at(at, s), x, pairs)
         if (iteration + 1) % every == 0 or iteration + 1 == iterations:
             held_out = problem.held_out_loss(objective.point(x))
@@ -142,7 +140,7 @@ class PaperObjective:
     def __init__(self, problem: JointProblem, materials: int, paper: Paper):
         blocks = problem.blocks
         self.blocks, self.operator, self.paper = blocks, problem.operator, paper
-        self.begin = starting_materials(blocks, materials, paper.start_specular_share, paper.start_roughness)
+        self.begin = starting_materials(blocks, materials)
         self.sizes = [7 * materials] + [7 * paper.lobes + len(block.photos) - 1 for block in blocks]
 
     def start(self) -> Float[Tensor, " k"]:

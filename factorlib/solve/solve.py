@@ -24,8 +24,9 @@ from factorlib.model.gauge import in_gauge
 from factorlib.model.lights import Light, even_cells
 from factorlib.model.materials import Point
 from factorlib.model.problem import JointProblem
+from factorlib.results.materials import Decision
 from factorlib.solve.choices import TRIAL_CELLS, Chosen, Effects, curves_chosen, distances_chosen, effects_chosen
-from factorlib.solve.evidence import AGAINST, FINER, Evidence, compare, losses_of
+from factorlib.solve.evidence import AGAINST, FINER, compare, losses_of
 from factorlib.solve.fit import Fit, Schedule, sure_ones
 from factorlib.solve.history import Report, Solution, unreported
 from factorlib.solve.options import Choices
@@ -95,7 +96,7 @@ def suns_chosen(problem: JointProblem, fit: Fit, parts: Parts) -> Chosen:
     """Suns in the lights that have one (`factorlib.solve.suns`); the other lights stay as they are."""
     before = problem.illuminations(fit.point)
     tried = list(problem.spread(partial(candidate, sharpness=SUN), before))
-    evidence = [Evidence(bool(one.light.suns.any())) for one in before]
+    evidence = [Decision(bool(one.light.suns.any())) for one in before]
     if all(light is one.light for light, one in zip(tried, before, strict=True)):
         return Chosen(fit, evidence)
     trial = parts.judged("suns", problem, fit.with_lights(tried), AROUND_SUNS)

@@ -47,7 +47,7 @@ def from_nothing(materials: int) -> Start:
     def points(problem: JointProblem, cells: int) -> list[Point]:
         """One point a roughness, its lights constant."""
         blocks, roughness = problem.blocks, STARTS if materials <= FEW else STARTS[1:2]
-        begun = [starting_materials(blocks, materials, roughness=one) for one in roughness]
+        begun = [starting_materials(blocks, materials, one) for one in roughness]
         return [Point(of, [constant_light(block, of, cells) for block in blocks]) for of in begun]
 
     return points
@@ -97,13 +97,11 @@ def with_decided(choices: Choices, earlier: Earlier) -> Choices:
     return choices
 
 
-def starting_materials(
-    blocks: Sequence[Block], count: int, specular_share: float = SPECULAR_SHARE, roughness: float = ROUGHNESS
-) -> Materials:
+def starting_materials(blocks: Sequence[Block], count: int, roughness: float = ROUGHNESS) -> Materials:
     """Materials whose diffuse part explains the median radiances and whose specular part is grey."""
     albedo = mean_albedo(blocks, count)
-    diffuse = np.maximum(albedo * (1 - specular_share), 10 * LEAST_REFLECTANCE)
-    specular = np.maximum(np.full((count, 3), specular_share * BRIGHTEST_AT_START / 2), 10 * LEAST_REFLECTANCE)
+    diffuse = np.maximum(albedo * (1 - SPECULAR_SHARE), 10 * LEAST_REFLECTANCE)
+    specular = np.maximum(np.full((count, 3), SPECULAR_SHARE * BRIGHTEST_AT_START / 2), 10 * LEAST_REFLECTANCE)
     return Materials(diffuse, specular, np.full(count, roughness))
 
 

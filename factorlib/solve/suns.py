@@ -24,7 +24,8 @@ from factorlib.geometry.sphere import fibonacci_sphere
 from factorlib.model.illumination import Illumination
 from factorlib.model.lights import Light, UnitLobes
 from factorlib.model.loss import Loss
-from factorlib.solve.evidence import FINER, Evidence, Losses, compare
+from factorlib.results.materials import Decision
+from factorlib.solve.evidence import FINER, Losses, compare
 from factorlib.solve.fit import ROBUST
 
 # About the brightest direction: what a sun replaces, and what is shown in its place.
@@ -60,16 +61,16 @@ def candidate(illumination: Illumination, sharpness: float) -> Light:
         weight = np.maximum(-along, 0) / np.maximum(size, 1e-30)
         best = int(np.argmax((weight**2 * size).sum(0)))  # by how much (1) falls
         z, w = axes[best], weight[:, best]
-    return without.light.with_lobe(z, sharpness, w)
+    return without.light.with_lobes(UnitLobes(z[None], np.array([sharpness])), w)
 
 
-def compared(without: Illumination, richer: Illumination, least: float) -> Evidence:
+def compared(without: Illumination, richer: Illumination, least: float) -> Decision:
     """The evidence of all observations for one light of them against another."""
     number = richer.block.clusters()
     return compare(*(Losses([one.losses(Loss())], [number]) for one in (without, richer)), least)
 
 
-def clearly_better(cells: Illumination, sun: Illumination) -> Evidence:
+def clearly_better(cells: Illumination, sun: Illumination) -> Decision:
     """Whether a light explains the observations better with a sun than by cells alone: by more than `FINER` standard errors, and by
     the share `CLEAR` of their loss, with a sun that holds at least the share `SHARE` of the light and is no bluer than all of it."""
     evidence = compared(cells, sun, FINER)

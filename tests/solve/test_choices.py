@@ -15,8 +15,9 @@ from factorlib.model.interreflection import bounced_light
 from factorlib.model.noise import Noise
 from factorlib.model.observed import blocks_of_observations
 from factorlib.model.problem import JointProblem
+from factorlib.results.materials import Decision
 from factorlib.solve.choices import CURVED_GAIN, NEARER_FROM, believed
-from factorlib.solve.evidence import AGAINST, FOR, Evidence
+from factorlib.solve.evidence import AGAINST, FOR
 from factorlib.solve.options import Choices
 from factorlib.solve.solve import Run, solve
 from factorlib.solve.start import from_nothing
@@ -239,5 +240,5 @@ def test_near_lights_are_found_and_spare_the_materials_and_far_ones_stay_far():
 
 
 def test_how_near_a_light_comes_follows_the_evidence_without_a_jump():
-    shares = [believed(Evidence(True, margin=m)) for m in (-3, NEARER_FROM, 1.25, 1.5, FOR, 9)]
-    assert shares == [0, 0, 0.25, 0.5, 1, 1] and believed(Evidence(False)) == 0
+    shares = [believed(Decision(True, margin=m)) for m in (-3, NEARER_FROM, 1.25, 1.5, FOR, 9)]
+    assert shares == [0, 0, 0.25, 0.5, 1, 1] and believed(Decision(False)) == 0

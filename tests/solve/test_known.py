@@ -76,7 +76,7 @@ def test_what_is_known_has_no_error_and_nothing_else_is_held_fixed(solved):
         (Known(), [True, True]),
         (Known(lights={"room0": light}), [False, True]),
     ):
-        covariance = covariance_in_gauge(root @ root.T, MATERIALS, problem.blocks, known)
+        covariance = covariance_in_gauge(root @ root.T, MATERIALS, msgspec.structs.replace(problem, known=known))
         one, all_ = (np.tile(np.isin(np.arange(7), list(of)), 3) for of in ([0, 3], range(6)))  # a channel; all
         assert [abs(of @ covariance @ of) < 1e-9 for of in (one, all_)] == fixed
 

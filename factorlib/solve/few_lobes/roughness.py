@@ -67,9 +67,9 @@ def _weight(voters: Illumination, loss: Loss) -> Float[np.ndarray, "n 3"]:
 
 def _exposed(voters: Illumination, roughness: float) -> tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, "n 3"]]:
     """Radiance of unit k_d and of unit k_s."""
-    lit = [voters.exposure * part for part in voters.lit(slice(0, len(voters.block)), roughness)]
-    sent = (0.0, 0.0) if voters.block.bounced is None else np.hsplit(voters.block.bounced, 2)
-    return lit[0] + sent[0], lit[1] + sent[1]
+    rough = msgspec.structs.replace(voters.materials, roughness=np.full(len(voters.materials), roughness))
+    shown = msgspec.structs.replace(voters, materials=rough).shown()
+    return shown.diffuse, shown.specular
 
 
 def reflectances(

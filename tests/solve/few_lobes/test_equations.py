@@ -12,7 +12,7 @@ from factorlib.solve.few_lobes.equations import (
     energy_equations,
     nonnegative_minimum,
     normal_equations,
-    responses,
+    tabulated,
     tint_prior,
     with_weights_fitted,
 )
@@ -69,7 +69,7 @@ def test_gradients_are_finite_differences_of_the_loss(kind, moved):
 
 
 def test_loss_of_the_normal_equations_is_the_loss_and_held_out_observations_do_not_pull(clipped):
-    np.testing.assert_allclose(normal_equations(clipped, LOSS).loss, fit_loss(clipped, LOSS))
+    np.testing.assert_allclose(normal_equations(clipped, LOSS).value, fit_loss(clipped, LOSS))
     radiance = np.where(clipped.block.held_out[:, None], clipped.block.radiance + 1, clipped.block.radiance)
     other = msgspec.structs.replace(clipped, block=msgspec.structs.replace(clipped.block, radiance=radiance))
     a, b = (normal_equations(one, LOSS) for one in (clipped, other))
@@ -97,11 +97,11 @@ def by_energy(light, gradient):
 def test_energy_equations_are_those_parts_of_the_normal_equations(data, bounced):
     given, loss = photos_in_a_wrong_light("bounced") if bounced else data, Loss(1.0, 1e-2)
     part, whole, p = (
-        energy_equations(given.fitted(), responses(given.fitted()), loss),
+        energy_equations(given.fitted(), tabulated(given.fitted()), loss),
         normal_equations(given, loss),
         len(given.light),
     )
-    np.testing.assert_allclose(part.value, whole.loss, rtol=1e-12)
+    np.testing.assert_allclose(part.value, whole.value, rtol=1e-12)
     largest = np.abs(part.gradient).max()
     np.testing.assert_allclose(
         part.gradient, by_energy(given.light, whole.light_gradient), rtol=1e-9, atol=1e-9 * largest
