@@ -20,9 +20,8 @@ from factorlib.errors import InputError
 from factorlib.images.exr import LAT_LONG, write_rgb_exr
 from factorlib.images.light_map import read_light_map
 from factorlib.jsonfile import write_json
-from factorlib.model.known_light import what_is_known
-from factorlib.model.loss import Loss
-from factorlib.model.noise import Noise
+from factorlib.model.known import what_is_known
+from factorlib.model.noise import Loss, Noise
 from factorlib.model.observed import blocks_of_observations, gathered, usable
 from factorlib.model.problem import JointProblem
 from factorlib.parquetfile import write_rows
@@ -34,8 +33,8 @@ from factorlib.solve.few_lobes.solve import few_lobes
 from factorlib.solve.history import Event, Solution, of_parts, of_rounds
 from factorlib.solve.paper import REPORTS, Paper, Prior, Samplings
 from factorlib.solve.paper import solve as solve_as_the_paper
-from factorlib.solve.resume import Journal
-from factorlib.solve.solve import Run, solve
+from factorlib.solve.resume import Parts
+from factorlib.solve.solve import solve
 from factorlib.solve.start import from_earlier, from_nothing, with_decided
 from factorlib.stage import Inputs, Progress
 from factorlib.urm import observations as urm
@@ -81,7 +80,7 @@ def main(params: Params, inputs: Inputs, out: Path, progress: Progress) -> None:
     relative = urm.relative_exposures(seen)
     earlier = read_earlier(inputs["start"]).beside(relative) if "start" in inputs.folders else None
     problem = _problem(params, inputs, given, seen, relative)
-    _warn(before_solving(names, seen.photos, problem.blocks, problem.known))
+    _warn(before_solving(names, seen.photos, problem))
     solution = _solved(params, problem, earlier, inputs, progress)
     errors, coverages = uncertainty_of(solution, problem, params)
     answer = Answer(names, problem, solution, errors, relative, params.solver, earlier)
@@ -137,10 +136,10 @@ def _solved(
         return solve_as_the_paper(problem, len(names), paper, of_rounds(progress, REPORTS))
     if params.solver == "few_lobes":
         return few_lobes(problem, len(names), params, of_rounds(progress, params.rounds))
-    journal = Journal(Checkpoint(inputs.unfinished / "solve.pt" if inputs.unfinished else None))
+    unfinished = Checkpoint(inputs.unfinished / "solve.pt" if inputs.unfinished else None)
     start = from_earlier(earlier, names) if earlier else from_nothing(len(names))
     choices = with_decided(params, earlier) if earlier else params
-    return solve(problem, start, Run(choices, of_parts(progress, choices), journal))
+    return solve(problem, start, choices, Parts(unfinished, of_parts(progress, choices)))
 
 
 def _warn(sentences: Iterable[str]) -> None:

@@ -11,7 +11,7 @@ import pytest
 import torch
 
 from factorlib.arithmetic import VARIABLES
-from factorlib.elementary import square_root
+from factorlib.light.visibility import square_root
 
 ROOT = Path(__file__).resolve().parents[1]
 EMULATOR = shutil.which("qemu-x86_64")

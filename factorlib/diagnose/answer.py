@@ -107,7 +107,7 @@ class Answer(msgspec.Struct, frozen=True):
 
     def lights(self) -> dict[str, Lobes]:
         """By illumination, in scene radiance."""
-        return {block.name: Lobes(li.axis, li.sharpness, li.weight * block.unit) for block, li in self.lit()}
+        return {block.name: light.lobes.scaled(block.unit) for block, light in self.lit()}
 
     def exposures(self) -> dict[str, table.Channels]:
         """Factor of each photo on its light, per channel."""

@@ -53,8 +53,8 @@ from factorlib.light.prior import LightPrior, read_light_prior
 from factorlib.model.gauge import connected_components
 from factorlib.model.illumination import Illumination
 from factorlib.model.lights import UnitLobes
-from factorlib.model.loss import Loss
 from factorlib.model.materials import ROUGHNESS, Materials, Point
+from factorlib.model.noise import Loss
 from factorlib.model.problem import JointProblem
 from factorlib.robust import robust_deviation
 from factorlib.solve.arrow import System, information

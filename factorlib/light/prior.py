@@ -13,7 +13,7 @@ directions are similarly bright, colour varies much less than luminance, and abo
 is a factor of the covariance (2) of a whole map: some scenes have much contrast or much colour, others little. `covariance` and `precision` are those
 at s = 1, a typical map; a solve finds s by evidence. With s integrated over, a map is drawn from Student's t of ν_k degrees of freedom.
 y_0, y_1 and y_2 are independent of each other. exp(−θ/c) is positive definite on the sphere for every c > 0 (Gneiting, "Strictly and non-strictly
-positive definite functions on spheres", 2013). `studies.measured.light_prior` finds the numbers.
+positive definite functions on spheres", 2013). A solve takes the mean to be nil, for it does not know what is above. `studies.measured.light_prior` finds the numbers.
 """
 
 from __future__ import annotations
@@ -79,12 +79,6 @@ class LightPrior(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         alike = correlation(angles(directions), np.radians(self.decay_deg[k]))
         return self.variance[k] * alike + self.level[k] + self.nugget[k] * np.eye(len(directions))
 
-    def mean(self, directions: Float[np.ndarray, "p 3"], up: Float[np.ndarray, "3"] | None) -> Float[np.ndarray, "3 p"]:
-        """Mean of y in unit `directions`: equation (3); zeros where the unit vector `up` (same frame) is not known."""
-        if up is None:
-            return np.zeros((3, len(directions)))
-        return np.array(self.profile) @ legendre(directions @ up).T
-
     def precision(
         self, directions: Float[np.ndarray, "p 3"], factors: Sequence[float] = (1.0, 1.0, 1.0)
     ) -> tuple[Float[np.ndarray, "3p 3p"], float]:
@@ -123,11 +117,6 @@ def correlation(angle: Float[np.ndarray, "*n"], decay: float) -> Float[np.ndarra
 def angles(directions: Float[np.ndarray, "p 3"]) -> Float[np.ndarray, "p p"]:
     """Radians between unit directions; by the chord, which keeps its digits where they are close."""
     return 2 * np.arcsin(np.minimum(np.sqrt(squared_distances(directions, directions)) / 2, 1))
-
-
-def legendre(sine: Float[np.ndarray, " p"]) -> Float[np.ndarray, "p 3"]:
-    """P_1, P_2, P_3; over the sphere their means are zero, so they leave the level alone."""
-    return np.polynomial.legendre.legvander(sine, 3)[:, 1:]
 
 
 def _inverse(matrix: Float[np.ndarray, "p p"]) -> tuple[Float[np.ndarray, "p p"], float]:

@@ -24,8 +24,8 @@ from jaxtyping import Float, Int
 from factorlib.images.tone import by_log_exponent
 from factorlib.model.blocks import Block
 from factorlib.model.lights import Light, UnitLobes
-from factorlib.model.loss import Loss
 from factorlib.model.materials import Materials
+from factorlib.model.noise import Loss
 from factorlib.model.responses import CHUNK, Reflected, Table, diffuse_response, specular_response
 from factorlib.reflection.operator import Operator
 

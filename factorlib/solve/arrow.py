@@ -6,7 +6,10 @@ With H = [[M, C_1 … C_k], [C_iᵀ, L_i]] (materials M, one block L_i a light) 
 
 where d_i is a gradient by the light that materials alone feel (`factorlib.solve.marginal`).  The Schur complement on the left is the information
 that the data hold about the materials when the lights are unknown too.  A light's C has rows for the materials that it shows alone, so that cost
-grows with those few.  Damping multiplies the diagonal, so that a step does not depend on the units of an unknown.
+grows with those few.
+
+A step is the elimination of damped systems; standard errors come of that of the systems as they are.  Unknowns that are known or at a bound have their
+rows and columns taken out before.  Damping multiplies the diagonal, so that a step does not depend on the units of an unknown.
 """
 
 from __future__ import annotations

@@ -8,8 +8,8 @@ import msgspec
 import numpy as np
 from jaxtyping import Bool
 
-from factorlib.model.loss import Loss
 from factorlib.model.materials import Point
+from factorlib.model.noise import Loss
 from factorlib.model.problem import JointProblem
 from factorlib.results.materials import Decision
 from factorlib.solve.fit import Fit

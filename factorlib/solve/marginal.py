@@ -36,9 +36,10 @@ from jaxtyping import Float, Int
 from scipy.linalg import LinAlgError
 from scipy.linalg.lapack import dpotrf, dpotri
 
+from factorlib.light.prior import LightPrior
 from factorlib.model.illumination import Illumination, Linearised
 from factorlib.model.lights import Light
-from factorlib.model.loss import Loss
+from factorlib.model.noise import Loss
 from factorlib.solve.arrow import System
 
 SPARSE = 8  # rows of which one enters the Hessian of the determinant
@@ -48,11 +49,12 @@ EXPOSURE, TONE = 3.0, 0.3  # standard deviations of a log exposure and of a log 
 class Field(msgspec.Struct, frozen=True):
     """One illumination and how much its parts count.
 
-    illumination  with its table;  precision: Q, channel by channel, with its log determinant
+    illumination  with its table;  prior: on its light;  precision: Q, channel by channel, with its log determinant
     temperature   T;  loss: ρ
     """
 
     illumination: Illumination
+    prior: LightPrior
     precision: Float[np.ndarray, "3p 3p"]
     log_determinant: float
     temperature: float

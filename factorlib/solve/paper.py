@@ -40,10 +40,10 @@ from torch import Tensor
 from factorlib.geometry.sphere import fibonacci_sphere
 from factorlib.model.gauge import in_gauge
 from factorlib.model.lights import Light
-from factorlib.model.loss import Loss
 from factorlib.model.materials import ROUGHNESS, SHARPNESS, Materials, Point
+from factorlib.model.noise import Loss
 from factorlib.model.problem import JointProblem
-from factorlib.model.responses import UnitReflection, cosines, radiance_of
+from factorlib.reflection.operator import Operator
 from factorlib.solve.history import Event, Report, Solution, unreported
 from factorlib.solve.options import Lobes, Seed
 from factorlib.solve.start import starting_materials
@@ -189,16 +189,49 @@ class PaperObjective:
                     torch.from_numpy(of[own])
                     for of in (block.normal, block.view, block.photo, block.radiance, block.precision, block.clipped)
                 )
-                seen = cosines(normal, view, axis)
+                seen = (normal * view).sum(1), normal @ axis.T, view @ axis.T  # n·o, n·z and o·z
                 lit = UnitReflection.apply(self.operator, roughness[m], log_sharpness, *seen)
+                by_diffuse, by_specular = (part @ weight for part in lit)
                 exposure = torch.exp(log_exposure)[photo][:, None]
-                predicted = radiance_of(exposure, diffuse[m], specular[m], *(part @ weight for part in lit))
+                predicted = exposure * (diffuse[m] * by_diffuse + specular[m] * by_specular)
                 difference = (predicted - radiance) * precision
                 squares = squares + (difference.masked_fill(clipped & (difference > 0), 0.0) ** 2).sum()
                 values += difference.numel()
         value = squares / max(values, 1) + self.paper.prior * prior / len(self.blocks)
         value.backward()
         return value.item(), x.grad
+
+
+class UnitReflection(torch.autograd.Function):
+    """D and S [n, p] without shadows, for autograd; the derivatives are those of the operator's `response`."""
+
+    @staticmethod
+    def forward(
+        ctx: torch.autograd.function.FunctionCtx,
+        operator: Operator,
+        roughness: Tensor,
+        log_sharpness: Tensor,
+        *cosines: Tensor,
+    ) -> tuple[Tensor, Tensor]:
+        """D and S;  cosines: n·o [n], n·z and o·z [n, p]."""
+        inputs = [t.detach().to(operator.dtype) for t in (roughness, log_sharpness.exp(), *cosines)]
+        r = operator.response(*inputs)
+        slopes = (
+            *(r.specular_by_roughness, r.diffuse_by_log_sharpness, r.specular_by_log_sharpness),
+            *(r.diffuse_by_nz, r.specular_by_nz, r.specular_by_oz),
+        )
+        ctx.save_for_backward(*(slope.to(cosines[1].dtype) for slope in slopes))
+        return r.diffuse.to(cosines[1].dtype), r.specular.to(cosines[1].dtype)
+
+    @staticmethod
+    def backward(
+        ctx: torch.autograd.function.FunctionCtx, diffuse: Tensor, specular: Tensor
+    ) -> tuple[Tensor | None, ...]:
+        """Gradients by roughness, log sharpness, n·z and o·z; views are given, so there is none by n·o."""
+        by_roughness, d_by_sharpness, s_by_sharpness, d_by_nz, s_by_nz, s_by_oz = ctx.saved_tensors
+        by_sharpness = (diffuse * d_by_sharpness + specular * s_by_sharpness).sum(0)
+        by_nz = diffuse * d_by_nz + specular * s_by_nz
+        return None, (specular * by_roughness).sum(), by_sharpness, None, by_nz, specular * s_by_oz
 
 
 def _unbounded(value: Float[np.ndarray, "*n"], bounds: tuple[float, float] = (0.0, 1.0)) -> Float[np.ndarray, "*n"]:

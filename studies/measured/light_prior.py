@@ -38,7 +38,7 @@ from factorlib.errors import InputError
 from factorlib.geometry.sphere import fibonacci_sphere
 from factorlib.images.light_map import read_light_map
 from factorlib.jsonfile import json_text, write_json
-from factorlib.light.prior import MIX, LeaveOneOut, LightPrior, Source, angles, correlation, legendre
+from factorlib.light.prior import MIX, LeaveOneOut, LightPrior, Source, angles, correlation
 from factorlib.reading import read_bytes
 
 CELLS, SUFFIXES = 400, (".hdr", ".exr")  # cells of equal area, some 10° apart
@@ -95,6 +95,16 @@ def log_cells(means: Float[np.ndarray, "m n 3"]) -> Logs:
     """y of the mean radiances (linear Rec. 709, finite, no map black) of cells of some maps."""
     floor = FLOOR * means.mean(axis=(1, 2), keepdims=True)
     return np.einsum("kc,mnc->kmn", MIX, np.log(np.maximum(means, floor)))
+
+
+def legendre(sine: Float[np.ndarray, " p"]) -> Float[np.ndarray, "p 3"]:
+    """P_1, P_2, P_3; over the sphere their means are zero, so they leave the level alone."""
+    return np.polynomial.legendre.legvander(sine, 3)[:, 1:]
+
+
+def mean_of(prior: LightPrior, cells: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "3 n"]:
+    """Mean of y in unit directions of the maps' frame: equation (3) of `factorlib.light.prior`."""
+    return np.array(prior.profile) @ legendre(cells @ UP).T
 
 
 def fitted(
@@ -172,12 +182,10 @@ def _log_density(
     return constant - (freedom + count) / 2 * np.log1p(square / freedom)
 
 
-def log_likelihood(
-    prior: LightPrior, logs: Logs, cells: Float[np.ndarray, "n 3"], up: Float[np.ndarray, "3"] | None
-) -> Float[np.ndarray, " m"]:
+def log_likelihood(prior: LightPrior, logs: Logs, cells: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, " m"]:
     """Log density of y of each map under a prior, nats."""
     total = np.zeros(logs.shape[1])
-    for k, residual in enumerate(logs - prior.mean(cells, up)[:, None]):
+    for k, residual in enumerate(logs - mean_of(prior, cells)[:, None]):
         root = np.linalg.cholesky(prior.covariance(k, cells))
         square = np.sum(solve_triangular(root, residual.T, lower=True) ** 2, axis=0)
         total += _log_density(root, square, prior.freedom[k])
@@ -197,7 +205,7 @@ def leave_one_out(logs: Logs, cells: Float[np.ndarray, "n 3"]) -> LeaveOneOut:
         rest, one = np.delete(logs, m, axis=1), logs[:, m : m + 1]
         prior = fitted(rest, cells, start=whole)
         priors = prior, white_noise(prior), fitted(rest, cells, profile=False, start=flat)
-        scores.append([float(log_likelihood(each, one, cells, UP)[0]) for each in priors])
+        scores.append([float(log_likelihood(each, one, cells)[0]) for each in priors])
     return LeaveOneOut(*np.mean(scores, axis=0).tolist())
 
 

@@ -12,7 +12,6 @@ KNOWN = LightPrior(
     variance=(1.5, 0.05, 0.1), decay_deg=(40.0, 30.0, 60.0), level=(100.0, 0.1, 0.04), nugget=(0.2, 0.01, 0.01),
     profile=((0.5, 0.1, -0.2), (-0.2, 0.0, 0.05), (0.2, 0.1, 0.0)), cell_deg=20.0, freedom=(4.0, 4.0, 4.0),
 )  # fmt: skip
-UP = np.array([0.0, 1.0, 0.0])
 
 
 @pytest.mark.parametrize("decay_deg", [1.0, 40.0, 400.0])
@@ -28,13 +27,9 @@ def test_covariance_is_that_of_the_equation_and_positive_definite_without_a_nugg
     np.testing.assert_allclose(KNOWN.covariance(0, directions), expected, rtol=1e-12)
 
 
-def test_without_up_all_frames_are_alike_and_with_up_the_profile_turns_along_and_leaves_the_level_alone():
+def test_all_frames_are_alike():
     directions, rotation = fibonacci_sphere(40), Rotation.random(random_state=3).as_matrix()
-    turned = directions @ rotation.T
-    np.testing.assert_allclose(KNOWN.precision(turned)[0], KNOWN.precision(directions)[0], atol=1e-7)
-    assert not KNOWN.mean(turned, None).any()
-    np.testing.assert_allclose(KNOWN.mean(turned, rotation @ UP), KNOWN.mean(directions, UP), atol=1e-12)
-    np.testing.assert_allclose(KNOWN.mean(fibonacci_sphere(5000), np.array([0.6, 0.0, 0.8])).mean(axis=1), 0, atol=1e-3)
+    np.testing.assert_allclose(KNOWN.precision(directions @ rotation.T)[0], KNOWN.precision(directions)[0], atol=1e-7)
 
 
 def test_precision_is_the_inverse_of_the_covariance_of_log_radiance():

@@ -11,10 +11,8 @@ from factorlib.results.materials import Decision
 from factorlib.solve import suns
 from factorlib.solve.evidence import AGAINST
 from factorlib.solve.fit import Schedule, fitted
-from factorlib.solve.history import unreported
-from factorlib.solve.resume import Journal, Parts
-from factorlib.solve.solve import suns_chosen
-from factorlib.solve.suns import WIDE, candidate, clearly_better, compared
+from factorlib.solve.resume import Parts
+from factorlib.solve.suns import WIDE, candidate, clearly_better, compared, suns_chosen
 from studies.scenes.problems import MATERIALS
 from tests.solve.made import FEW, PRIOR, begun, drawn, on_even_cells, spheres
 
@@ -65,13 +63,13 @@ def test_no_sun_is_found_in_a_sky_without_one(seed):
 def test_the_solve_keeps_suns_of_lights_that_have_one():
     problem, _ = photographed(0.5, 1)
     _, fit = solved(problem)
-    found = suns_chosen(problem, fit, Parts(Journal(), unreported, PRIOR))
+    found = suns_chosen(problem, fit, Parts())
     assert found.evidence[0].kept and found.fit.point.lights[0].suns.any()
-    again = suns_chosen(problem, found.fit, Parts(Journal(), unreported, PRIOR))
+    again = suns_chosen(problem, found.fit, Parts())
     assert again.fit is found.fit and again.evidence[0].kept
     cloudy, _ = photographed(0.0, 1)
     _, fit = solved(cloudy)
-    none = suns_chosen(cloudy, fit, Parts(Journal(), unreported, PRIOR))
+    none = suns_chosen(cloudy, fit, Parts())
     assert not none.evidence[0].kept and none.fit.point.lights[0] is fit.point.lights[0]
 
 

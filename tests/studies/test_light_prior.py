@@ -13,7 +13,7 @@ from factorlib.images.exr import write_rgb_exr
 from factorlib.jsonfile import read_json
 from factorlib.light.prior import LightPrior, angles
 from studies.measured import light_prior
-from studies.measured.light_prior import UP, _cost, cell_means, fitted, log_cells, maps_in, rounded
+from studies.measured.light_prior import _cost, cell_means, fitted, log_cells, maps_in, mean_of, rounded
 from tests.light.test_prior import KNOWN
 
 
@@ -25,7 +25,7 @@ def drawn(prior: LightPrior, cells, count: int, seed: int = 0):
         contrast = np.sqrt(prior.freedom[k] / rng.chisquare(prior.freedom[k], (count, 1)))
         return contrast * rng.normal(size=(count, len(cells))) @ np.linalg.cholesky(prior.covariance(k, cells)).T + mean
 
-    return np.stack([one(k, mean) for k, mean in enumerate(prior.mean(cells, UP))])
+    return np.stack([one(k, mean) for k, mean in enumerate(mean_of(prior, cells))])
 
 
 def test_a_fit_finds_the_prior_that_maps_were_drawn_from():
@@ -34,6 +34,10 @@ def test_a_fit_finds_the_prior_that_maps_were_drawn_from():
     for name, rtol in (("variance", 0.25), ("decay_deg", 0.25), ("nugget", 0.3), ("level", 0.5), ("freedom", 0.4)):
         np.testing.assert_allclose(getattr(found, name), getattr(KNOWN, name), rtol=rtol)
     np.testing.assert_allclose(found.profile, KNOWN.profile, atol=0.15)
+
+
+def test_the_mean_leaves_the_level_alone():
+    np.testing.assert_allclose(mean_of(KNOWN, fibonacci_sphere(5000)).mean(axis=1), 0, atol=1e-3)
 
 
 def test_the_gradient_is_the_finite_difference():

@@ -23,8 +23,8 @@ from scipy.optimize import nnls
 from factorlib.model.blocks import Block
 from factorlib.model.illumination import Illumination, material_slices
 from factorlib.model.lights import Light
-from factorlib.model.loss import Loss
 from factorlib.model.materials import Materials
+from factorlib.model.noise import Loss
 from factorlib.model.responses import Reflected, met_cosines, shadowed
 from factorlib.solve.arrow import System
 from factorlib.solve.few_lobes.unknowns import sharpness_slopes, tangents, unknowns
@@ -150,10 +150,9 @@ def tint_prior(loss: Loss, block: Block, light: Light) -> Quadratic:
     sums = light.energy.sum(0)
     centre = (np.eye(3) - 1 / 3) / max(float(sums.mean()), 1e-30)
     residual = centre @ sums
-    by_lobes = np.hstack([np.zeros((3, p)), np.kron(np.eye(3), np.ones(p))])  # of the sums, by [s, e_R, e_G, e_B] × p
-    jacobian = centre @ by_lobes
-    gradient, hessian, lobes = np.zeros(count), np.zeros((count, count)), slice(2 * p, 6 * p)
-    gradient[lobes], hessian[lobes, lobes] = strength * jacobian.T @ residual, strength * jacobian.T @ jacobian
+    gradient, hessian, energies = np.zeros(count), np.zeros((count, count)), slice(3 * p, 6 * p)
+    gradient[energies] = strength * np.repeat(centre @ residual, p)  # centre is symmetric
+    hessian[energies, energies] = strength * np.kron(centre @ centre, np.ones((p, p)))
     return Quadratic(strength * float(residual @ residual), gradient, hessian)
 
 

@@ -22,8 +22,8 @@ import numpy as np
 from factorlib.model.gauge import in_gauge
 from factorlib.model.illumination import Illumination
 from factorlib.model.lights import Light
-from factorlib.model.loss import Loss
 from factorlib.model.materials import Point
+from factorlib.model.noise import Loss
 from factorlib.model.problem import JointProblem
 from factorlib.robust import robust_deviation
 from factorlib.solve.few_lobes.descent import Iterate, descend, evaluate, fit_weights
@@ -41,19 +41,17 @@ TOLERANCE = 1e-3  # a descent stops after two steps that lower the loss by less 
 LEAST_GAIN = 0.01  # share of the held-out loss
 PATIENCE = 2  # rounds in a row without gain, after which no further one is tried
 LEAST_DECREASE = 0.005  # of the held-out loss, in σ² of the noise model: a smaller decrease is the operator's error
-HALVED = (
-    0.5  # a round that lowers the fitted loss to this share is not the last: few held-out observations are a noisy vote
-)
+# A round that lowers the fitted loss to this share is not the last: few held-out observations are a noisy vote.
+HALVED = 0.5
 
 
 Record = Callable[[int, Iterate], None]  # called with the number of an iteration, and where it led
 
 
-class Fit(msgspec.Struct, frozen=True):
-    """The chosen round, its held-out loss, the loss function that its residuals ask for, and all events up to the last round."""
+class ChosenRound(msgspec.Struct, frozen=True):
+    """The chosen round, the loss function that its residuals ask for, and all events up to the last round."""
 
     point: Point
-    held_out: float
     loss: Loss
     history: list[Event]
 
@@ -71,7 +69,7 @@ def recorder(problem: JointProblem, history: list[Event], report: Report, number
     return record
 
 
-def chosen_round(problem: JointProblem, materials: int, options: FewLobes, report: Report) -> Fit:
+def chosen_round(problem: JointProblem, materials: int, options: FewLobes, report: Report) -> ChosenRound:
     """Rounds on a sample of the observations, until they gain nothing."""
     history, sample = list[Event](), problem.sampled(options.sample, options.seed)
     start = starting_materials(sample.blocks, materials)
@@ -89,8 +87,7 @@ def chosen_round(problem: JointProblem, materials: int, options: FewLobes, repor
         chosen = current if better or gain >= -error else chosen
         if without_gain >= PATIENCE or max(map(len, current.lights)) >= options.lobes:
             break
-    sample = sampled_for(problem, chosen, options)
-    return Fit(chosen, sample.held_out_loss(chosen), robust(sample, chosen), history)
+    return ChosenRound(chosen, robust(sampled_for(problem, chosen, options), chosen), history)
 
 
 def sampled_for(problem: JointProblem, point: Point, options: FewLobes, more: int = 0, times: int = 1) -> JointProblem:

@@ -20,19 +20,18 @@ it is compared with once another material has lost its specular part since the l
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 
 import msgspec
 import numpy as np
 from jaxtyping import Bool
 
 from factorlib.model.gauge import in_gauge
-from factorlib.model.loss import Loss
 from factorlib.model.materials import Materials, Point
 from factorlib.model.problem import JointProblem
 from factorlib.results.materials import Decision
 from factorlib.solve.few_lobes.descent import descend, evaluate, fit_weights
-from factorlib.solve.few_lobes.rounds import TOLERANCE, Fit, chosen_round, recorder, sampled_for
+from factorlib.solve.few_lobes.rounds import TOLERANCE, ChosenRound, chosen_round, recorder, sampled_for
 from factorlib.solve.few_lobes.unknowns import blurred, pruned, specular_unknowns
 from factorlib.solve.history import Event, Report, Solution, unreported
 from factorlib.solve.options import FewLobes
@@ -42,9 +41,8 @@ MANY, SETTLE = 4, 2
 # Without its specular part, the held-out loss of a material that needs it is higher by more than GAIN, or that of all observations that are
 # compared by more than HARM.  The latter moves by some 3 % as a descent goes on: less says nothing.
 GAIN, HARM = 0.03, 0.05
-NEEDED_EARLY = (
-    1.3  # times the held-out loss: if it is higher after few iterations without a specular part, that part is needed
-)
+# Times the held-out loss: if it is higher after few iterations without a specular part, that part is needed.
+NEEDED_EARLY = 1.3
 FIRST, ITERATIONS = 3, 6  # iterations of a trial, and further ones where the first do not decide
 LIGHTS = 8
 
@@ -79,23 +77,8 @@ def few_lobes(
     )
 
 
-def with_specular_chosen(
-    problem: JointProblem, fit: Fit, options: FewLobes = FewLobes(), report: Report = unreported
-) -> Specular:
-    """The fit without needless specular parts: those without which held-out observations lose nothing."""
-    if problem.none_held_out:
-        return Specular(fit.point, np.zeros(len(fit.point.materials), bool), [])
-    number, lobes = fit.history[-1].round, sum(map(len, fit.point.lights))
-
-    def tell(trial: int, held_out: float) -> None:
-        """Of a trial without one material's specular part."""
-        report(Event(number, "specular part", trial, held_out, held_out, lobes))
-
-    return without_needless_specular(sampled_for(problem, fit.point, options), fit.point, fit.loss, tell)
-
-
 def polished(
-    problem: JointProblem, fit: Fit, chosen: Specular, options: FewLobes, report: Report
+    problem: JointProblem, fit: ChosenRound, chosen: Specular, options: FewLobes, report: Report
 ) -> tuple[Point, list[Event]]:
     """The chosen round brought to its optimum on many observations, then on all, and the whole history."""
     everything = problem.with_none_held_out().with_loss(fit.loss)
@@ -116,18 +99,18 @@ def answer_of(problem: JointProblem, point: Point) -> Point:
     return in_gauge(Point(fitted.materials, [pruned(light) for light in fitted.lights]), problem.blocks)
 
 
-def without_needless_specular(
-    problem: JointProblem,
-    start: Point,
-    robust: Loss,
-    report: Callable[[int, float], None] = lambda trial, held_out: None,
+def with_specular_chosen(
+    problem: JointProblem, fit: ChosenRound, options: FewLobes = FewLobes(), report: Report = unreported
 ) -> Specular:
-    """The point with needless specular parts gone, which materials have none, and the evidence for every material.
-
-    problem: its loss judges;  start: nearly at an optimum, so that iterations change the held-out loss less than what is decided;
-    robust: the loss to lower;  report: called with the number of each trial, from 0, and the held-out loss that it is compared with
-    """
-    base, count = start.materials, len(start.materials)  # all go on from here by as many iterations
+    """The fit without needless specular parts, which materials have none, and the evidence for every material."""
+    start, base, count = (
+        fit.point,
+        fit.point.materials,
+        len(fit.point.materials),
+    )  # all go on from here by as many iterations
+    if problem.none_held_out:
+        return Specular(start, np.zeros(count, bool), [])
+    problem, last, lobes = sampled_for(problem, start, options), fit.history[-1].round, sum(map(len, start.lights))
     lambertian, every, numbers = np.zeros(count, bool), np.arange(len(problem.blocks)), np.arange(count)
     shown = np.array([np.bincount(block.material, minlength=count) for block in problem.blocks])
 
@@ -139,7 +122,7 @@ def without_needless_specular(
         plain: which are Lambertian;  most: if the held-out loss exceeds it after the `FIRST` iterations, no more are made
         """
         judge, fixed = problem.restricted(lights), specular_unknowns(plain)
-        own = judge.with_loss(robust)
+        own = judge.with_loss(fit.loss)
         before = evaluate(own, Point(materials, start.restricted(lights).lights))
         after = descend(own, before, FIRST, fixed=fixed)
         if not (np.isfinite(most) and judge.held_out_loss(after.point) > most):
@@ -157,7 +140,8 @@ def without_needless_specular(
             continue
         richer = chosen.restricted(lights) if current else near_optimum(lights, base, lambertian)
         judge, without = problem.restricted(lights), base.lambertian(m)
-        report(number, held_out := judge.held_out_loss(richer))
+        held_out = judge.held_out_loss(richer)
+        report(Event(last, "specular part", number, held_out, held_out, lobes))
         trial = near_optimum(lights, without, lambertian | (numbers == m), NEEDED_EARLY * held_out)
         evidence[m] = compare(judge, trial, richer, int(m))
         if evidence[m].kept:

@@ -23,6 +23,7 @@ from factorlib.model.lights import Light
 from factorlib.model.materials import LEAST_REFLECTANCE, ROUGHNESS, SHARPNESS, Materials, Point
 
 MOST_TURN, MOST_S, MOST_EXPOSURE = 0.3, 1.0, 1.0  # largest change of an unknown in one step
+LEAST_SHARE = 1e-5
 
 
 def starting_light(block: Block, materials: Materials) -> Light:
@@ -112,8 +113,8 @@ def blurred(light: Light, sharpest: float) -> Light:
     return msgspec.structs.replace(light, log_sharpness=log_sharpness, weight=light.weight * kept[:, None])
 
 
-def pruned(light: Light, least_share: float = 1e-5) -> Light:
-    """The light without lobes of less than `least_share` of its energy; at least one lobe stays."""
+def pruned(light: Light) -> Light:
+    """The light without lobes of less than `LEAST_SHARE` of its energy; at least one lobe stays."""
     energy = light.energy.sum(1)
-    kept = energy > least_share * max(float(energy.sum()), 1e-30)
+    kept = energy > LEAST_SHARE * max(float(energy.sum()), 1e-30)
     return light.take(kept if kept.any() else slice(0, 1))

@@ -105,8 +105,8 @@ def test_the_answer_is_within_its_bound_or_says_why_not(name):
     solution = few_lobes(problem := JointProblem(blocks, OPERATOR), len(truth), OPTIONS)
     point, found = solution.point, solution.point.materials
     errors = standard_errors(problem.with_loss(solution.loss), point)
-    said = undetermined_by_observations(seen.materials, blocks) + poorly_explained(problem, point)
-    said += undetermined_by_answer(seen.materials, blocks, found, errors.materials)
+    said = undetermined_by_observations(seen.materials, problem) + list(poorly_explained(problem, point))
+    said += undetermined_by_answer(seen.materials, problem, found, errors.materials)
     for part in (found.vector(), *(getattr(light, of) for light in point.lights for of in light.__struct_fields__)):
         assert np.isfinite(part).all()
     (f, t), factor = (np.stack([of.diffuse, of.specular]) for of in (found, truth)), factor_between(found, truth)
