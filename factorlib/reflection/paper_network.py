@@ -20,7 +20,7 @@ Activation    SiLU, so that derivatives are continuous; at the end s tanh(x/s), 
 Range         sharpness and roughness are clamped to what was rendered, `SHARPNESS` and `ROUGHNESS`.
 Pixels        50 of each of 4000 spheres, lobes uniform in direction, seen from afar, so that every view is (0, 0, −1):
               `factorlib.generate.lobe_spheres`; Mitsuba renders them in place of Blender.
-Training      relative error, Adam, each sample as often as any other.
+Training      `training.trained_plainly`: relative error, Adam.
 Frame         normals and lobes of every azimuth about the camera's axis, as in photographs.  An operator is asked for
               scalars only, so the networks are asked in the frame where the view is (0, 0, −1) and the normal in the
               plane y = 0, or, for the diffuse part, where the normal is (0, 0, −1).  To have seen that azimuth alone

@@ -4,6 +4,8 @@ The loss is what errors are measured in, |R − S| / (S + E/100), smoothed at it
 falls to zero by a cosine.  Samples of large error are drawn more often, because the worst case matters as much as the mean.  The
 weights of the least held-out error are kept, and training stops when that error has not fallen for PATIENCE points of the curve.
 Seeds and threads are fixed, so that the same parameters give the same bytes, also after a kill and a restart.
+
+The paper's networks are trained plainly on rendered pixels (`trained_plainly`): what improves the project's own stays out of it.
 """
 
 from __future__ import annotations
@@ -20,6 +22,7 @@ from torch import Tensor
 from factorlib.checkpoint import Checkpoint
 from factorlib.reflection.closed_form import diffuse
 from factorlib.reflection.filtering import filtered_specular
+from factorlib.reflection.lobe import lobe_integral
 from factorlib.reflection.network import Layers, correction, diffuse_features, specular_features
 from factorlib.reflection.samples import DiffuseSamples, Samples
 
@@ -176,3 +179,30 @@ def descended(optimiser: torch.optim.Optimizer, loss: Tensor, step: int, schedul
     loss.backward()
     optimiser.step()
     return float(loss.detach())
+
+
+def pixels_problem(inputs: Float[Tensor, "n f"], sharpness: Tensor, radiance: Float[Tensor, " n"]) -> Problem:
+    """What the paper's network is fitted to: rendered radiance of unit lobes at unit reflectance; in float32."""
+    energy, radiance = lobe_integral(sharpness.float()), radiance.float()
+    return Problem(inputs.float(), sharpness.float(), energy, radiance, radiance + energy / 100)
+
+
+def trained_plainly(problem: Problem, schedule: Schedule, report: Callable[[int, float], None]) -> Layers:
+    """The network of the last step; Adam sees every sample equally often, in random order.
+
+    report: takes the step and the mean error since the last report
+    """
+    generator = torch.Generator().manual_seed(schedule.seed)
+    layers = initial_layers(problem.features, schedule, generator)
+    optimiser = torch.optim.Adam([*layers.weights, *layers.biases], lr=schedule.rate, betas=(0.9, 0.99), fused=True)
+    every, total, order = max(1, schedule.steps // 20), 0.0, torch.empty(0, dtype=torch.long)
+    for step in range(schedule.steps):
+        if len(order) < schedule.batch:
+            order = torch.randperm(len(problem.exact), generator=generator)
+        rows, order = order[: schedule.batch], order[schedule.batch :]
+        error = problem.each(itemgetter(rows)).errors(layers)
+        total += descended(optimiser, torch.sqrt(error * error + 1e-6).mean(), step, schedule)
+        if (step + 1) % every == 0:
+            report(step + 1, total / every)
+            total = 0.0
+    return layers

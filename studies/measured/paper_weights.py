@@ -6,23 +6,17 @@
 
 from __future__ import annotations
 
-from operator import itemgetter
-
 import numpy as np
 import torch
-from jaxtyping import Float
-from torch import Tensor
 
 from factorlib.conventions import FRONT, half_of_normal_and_view
 from factorlib.generate.lobe_spheres import random_spheres, rendered
 from factorlib.jsonfile import write_json
 from factorlib.reflection import reflection_operator
-from factorlib.reflection.features import Layers
-from factorlib.reflection.lobe import lobe_integral
 from factorlib.reflection.network import SHIPPED, write_layers
 from factorlib.reflection.paper_network import diffuse_inputs, specular_inputs
 from factorlib.reflection.samples import diffuse_samples, specular_samples
-from factorlib.reflection.training import Problem, Schedule, descended, initial_layers
+from factorlib.reflection.training import Schedule, pixels_problem, trained_plainly
 from studies.measured.operator import diffuse_errors, specular_errors
 
 SPHERES, PIXELS = 4000, 50
@@ -50,37 +44,13 @@ def main() -> None:
     }
     for part, of in inputs.items():
         problem = pixels_problem(of, sharpness, _flat(getattr(pixels, part)))
-        layers = trained_plainly(problem, SCHEDULES[part])
+        layers = trained_plainly(problem, SCHEDULES[part], lambda *at, part=part: print(part, *at, flush=True))
         file, note = SHIPPED / f"paper_{part}.safetensors", "see factorlib.reflection.paper_network"
         write_layers(file, layers, torch.float16, inputs=note)
     operator = reflection_operator("paper_network")
     glossy = specular_errors(operator, specular_samples(16384, 99, tolerance=1e-6))
     matte = diffuse_errors(operator, diffuse_samples(16384, 98))
     write_json(SHIPPED / "paper_accuracy.json", {"diffuse": matte, "specular": glossy})
-
-
-def pixels_problem(inputs: Float[Tensor, "n f"], sharpness: Tensor, radiance: Float[Tensor, " n"]) -> Problem:
-    """What the paper's network is fitted to: rendered radiance of unit lobes at unit reflectance; in float32."""
-    energy, radiance = lobe_integral(sharpness.float()), radiance.float()
-    return Problem(inputs.float(), sharpness.float(), energy, radiance, radiance + energy / 100)
-
-
-def trained_plainly(problem: Problem, schedule: Schedule) -> Layers:
-    """The network of the last step: Adam sees every sample equally often, in random order.  What improves the project's own networks stays out of it."""
-    generator = torch.Generator().manual_seed(schedule.seed)
-    layers = initial_layers(problem.features, schedule, generator)
-    optimiser = torch.optim.Adam([*layers.weights, *layers.biases], lr=schedule.rate, betas=(0.9, 0.99), fused=True)
-    every, total, order = max(1, schedule.steps // 20), 0.0, torch.empty(0, dtype=torch.long)
-    for step in range(schedule.steps):
-        if len(order) < schedule.batch:
-            order = torch.randperm(len(problem.exact), generator=generator)
-        rows, order = order[: schedule.batch], order[schedule.batch :]
-        error = problem.each(itemgetter(rows)).errors(layers)
-        total += descended(optimiser, torch.sqrt(error * error + 1e-6).mean(), step, schedule)
-        if (step + 1) % every == 0:
-            print(step + 1, total / every, flush=True)
-            total = 0.0
-    return layers
 
 
 def _flat(values: np.ndarray) -> torch.Tensor:
