@@ -11,7 +11,7 @@ import pytest
 import torch
 
 from factorlib.arithmetic import VARIABLES
-from factorlib.elementary import square_root
+from factorlib.light.visibility import square_root
 
 ROOT = Path(__file__).resolve().parents[1]
 EMULATOR = shutil.which("qemu-x86_64")
@@ -24,12 +24,12 @@ from factorlib.reflection import fused
 fused.FLAGS = fused.FLAGS.replace("-march=native", "-march=x86-64-v3")  # an emulated processor's compiler is this one's
 from factorlib.model.problem import JointProblem
 from factorlib.reflection import reflection_operator
-from factorlib.solve.few_lobes.options import FewLobes, Run
 from factorlib.solve.few_lobes.solve import few_lobes
+from factorlib.solve.options import FewLobes
 from studies.scenes.problems import square
 operator = reflection_operator("network")
 brief = FewLobes(rounds=1, iterations=3, polish=2, lobes=4, insert=4)
-solution = few_lobes(JointProblem(square(1, operator, 0), operator), 1, Run(brief))
+solution = few_lobes(JointProblem(square(1, operator, 0), operator), 1, brief)
 point = solution.point
 parts = [point.materials.vector(), *(part for light in point.lights for part in (light.axis, light.log_sharpness, light.weight))]
 print(hashlib.sha256(b"".join(part.tobytes() for part in parts)).hexdigest())

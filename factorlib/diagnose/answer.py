@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from typing import Literal
 
 import msgspec
@@ -19,9 +18,8 @@ from factorlib.model.lights import Light
 from factorlib.model.materials import LEAST_REFLECTANCE, Materials
 from factorlib.model.problem import JointProblem
 from factorlib.results import materials as table
-from factorlib.results.materials import Uncertainty
+from factorlib.results.materials import Decision, Uncertainty
 from factorlib.results.solution import Earlier
-from factorlib.solve.evidence import Evidence
 from factorlib.solve.history import Solution
 from factorlib.solve.material_prior import class_of
 
@@ -36,6 +34,7 @@ class Answer(msgspec.Struct, frozen=True):
     """A solution of a problem, and where it came from.
 
     names:    of the materials, in the order of their numbers
+    errors:   of the materials
     relative: exposure of each photo by EXIF, which the problem's radiances were divided by
     earlier:  the solution that it started from
     """
@@ -43,13 +42,14 @@ class Answer(msgspec.Struct, frozen=True):
     names: list[str]
     problem: JointProblem
     solution: Solution
+    errors: StandardErrors
     relative: dict[str, float]
     solver: Literal["bundle", "few_lobes", "paper"]
     earlier: Earlier | None = None
 
-    def material_table(self, errors: StandardErrors) -> table.MaterialTable:
+    def material_table(self) -> table.MaterialTable:
         """The content of materials.json."""
-        rows, stderr, kinds = _rows(self.solution.point.materials), self._errors(errors), self._kinds(errors.materials)
+        rows, stderr, kinds = _rows(self.solution.point.materials), self._errors(), self._kinds()
         solved = {
             name: table.solved(table.Reflectance(*row), stderr[name], kind, self._given(m))
             for m, (name, row, kind) in enumerate(zip(self.names, rows, kinds, strict=True))
@@ -60,12 +60,12 @@ class Answer(msgspec.Struct, frozen=True):
         gauge = table.Gauge(RULE + DETERMINED * absolute + self._given_rule(), component, self._gauge_of_errors())
         return table.MaterialTable(solved, gauge, self.model())
 
-    def _kinds(self, errors: Materials) -> list[table.Kind | UnsetType]:
+    def _kinds(self) -> list[table.Kind | UnsetType]:
         """Return the likeliest class of each material, in the gauge of the fit; none where the solver has no classes."""
         if self.solution.materials is None:
             return [UNSET] * len(self.names)
-        materials, relative = self.solution.point.materials, errors.specular.mean(1)
-        relative = relative / np.maximum(materials.specular.mean(1), LEAST_REFLECTANCE)
+        materials, errors = self.solution.point.materials, self.errors.materials
+        relative = errors.specular.mean(1) / np.maximum(materials.specular.mean(1), LEAST_REFLECTANCE)
         specular = self.solution.materials.point.materials.specular
         rows = zip(specular, materials.roughness.tolist(), relative.tolist(), errors.roughness.tolist(), strict=True)
         return [table.Kind(*class_of(*row)) for row in rows]
@@ -92,13 +92,13 @@ class Answer(msgspec.Struct, frozen=True):
             + uncertainty.GIVEN * bool(self.problem.known.materials or self.problem.known.lights)
         )
 
-    def uncertainty(self, errors: StandardErrors) -> Uncertainty:
+    def uncertainty(self) -> Uncertainty:
         """The content of uncertainty.json."""
         unexplained = misfit(self.solution.shown(self.problem), self.solution.point)
-        return Uncertainty(errors.deviation, self._errors(errors), self._gauge_of_errors(), *unexplained)
+        return Uncertainty(self.errors.deviation, self._errors(), self._gauge_of_errors(), *unexplained)
 
-    def _errors(self, errors: StandardErrors) -> dict[str, table.StandardErrors]:
-        rows = zip(self.names, _rows(errors.materials), strict=True)
+    def _errors(self) -> dict[str, table.StandardErrors]:
+        rows = zip(self.names, _rows(self.errors.materials), strict=True)
         return {name: table.StandardErrors(*row) for name, row in rows}
 
     def lit(self) -> list[tuple[Block, Light]]:
@@ -107,7 +107,7 @@ class Answer(msgspec.Struct, frozen=True):
 
     def lights(self) -> dict[str, Lobes]:
         """By illumination, in scene radiance."""
-        return {block.name: Lobes(li.axis, li.sharpness, li.weight * block.unit) for block, li in self.lit()}
+        return {block.name: light.lobes.scaled(block.unit) for block, light in self.lit()}
 
     def exposures(self) -> dict[str, table.Channels]:
         """Factor of each photo on its light, per channel."""
@@ -120,9 +120,10 @@ class Answer(msgspec.Struct, frozen=True):
 
     def model(self) -> table.Model:
         """What was decided of the model, and by what; the pivots of tone curves in scene radiance."""
-        names, solution, lit, started = self.names, self.solution, self.lit(), msgspec.UNSET
+        names, solution, lit, started = self.names, self.solution, self.lit(), UNSET
+        lights = [block.name for block, _ in lit]
         if self.earlier is not None:
-            known = set(names) & set(self.earlier.table.materials), {b.name for b, _ in lit} & set(self.earlier.lights)
+            known = set(names) & set(self.earlier.table.materials), set(lights) & set(self.earlier.lights)
             started = table.Started(*map(sorted, known))
         return table.Model(
             solver=self.solver,
@@ -130,22 +131,22 @@ class Answer(msgspec.Struct, frozen=True):
             lobes_chosen_by=LOBES_CHOSEN_BY[self.solver],
             held_out_loss=[event.held_out for event in solution.history if event.phase in ("round", "subset")],
             specular={name: not bool(solution.lambertian[m]) for m, name in enumerate(names)},
-            specular_chosen_by=_by_name(names, solution.specular),
+            specular_chosen_by=dict(zip(names, solution.specular)),
             self_shadowing=solution.shadows.kept,
-            self_shadowing_chosen_by=_losses(solution.shadows),
+            self_shadowing_chosen_by=_tried(solution.shadows),
             interreflection=solution.interreflection.kept,
-            interreflection_chosen_by=_losses(solution.interreflection),
+            interreflection_chosen_by=_tried(solution.interreflection),
             light_prior=self.solver == "bundle",
-            splitting_chosen_by=[_decision(one) for one in solution.splitting],
-            suns_chosen_by=_by_name([block.name for block, _ in lit], solution.suns),
+            splitting_chosen_by=solution.splitting,
+            suns_chosen_by=dict(zip(lights, solution.suns)),
             tone={
                 photo: table.Tone(float(np.exp(log_tone)), block.unit * self.relative[photo])
                 for block, light in lit
                 for photo, log_tone in zip(block.photos, light.log_tone, strict=False)
             },
-            tone_chosen_by=_by_name([block.name for block, _ in lit], solution.tone),
+            tone_chosen_by=dict(zip(lights, solution.tone)),
             distance={block.name: 1 / light.curvature for block, light in lit if light.curvature > 0},
-            distance_chosen_by=_by_name([block.name for block, _ in lit], solution.distances),
+            distance_chosen_by=dict(zip(lights, solution.distances)),
             started_from=started,
         )
 
@@ -155,15 +156,6 @@ def _rows(materials: Materials) -> list[tuple[list[float], list[float], float]]:
     return list(zip(materials.diffuse.tolist(), materials.specular.tolist(), materials.roughness.tolist(), strict=True))
 
 
-def _losses(evidence: Evidence) -> dict[str, float]:
+def _tried(decision: Decision) -> dict[str, float]:
     """The held-out losses of the models that were tried, and the margin."""
-    names = ("held_out_loss_with", "held_out_loss_without", "margin")
-    return {name: value for name in names if (value := getattr(evidence, name)) is not None}
-
-
-def _decision(evidence: Evidence) -> table.Decision:
-    return table.Decision(evidence.kept, evidence.held_out_loss_with, evidence.held_out_loss_without, evidence.margin)
-
-
-def _by_name(names: Sequence[str], evidence: Sequence[Evidence]) -> dict[str, table.Decision]:
-    return {name: _decision(one) for name, one in zip(names, evidence, strict=False)}
+    return {k: value for k, value in msgspec.structs.asdict(decision).items() if k != "kept" and value is not None}

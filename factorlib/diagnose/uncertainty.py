@@ -44,28 +44,28 @@ from typing import NamedTuple
 import msgspec
 import numpy as np
 from jaxtyping import Float
-from scipy.linalg import cho_factor, cho_solve
 from scipy.stats import norm
 from scipy.stats import t as student_t
 
 from factorlib.conventions import YUP_FROM_CAMERA, lat_long_directions
 from factorlib.light.lobes import lobe_integral, squared_distances
-from factorlib.light.prior import LightPrior
-from factorlib.model.blocks import Block
+from factorlib.light.prior import LightPrior, read_light_prior
 from factorlib.model.gauge import connected_components
 from factorlib.model.illumination import Illumination
-from factorlib.model.known import Known
 from factorlib.model.lights import UnitLobes
-from factorlib.model.loss import Loss
 from factorlib.model.materials import ROUGHNESS, Materials, Point
+from factorlib.model.noise import Loss
 from factorlib.model.problem import JointProblem
 from factorlib.robust import robust_deviation
+from factorlib.solve.arrow import System, information
 from factorlib.solve.few_lobes.descent import Iterate
-from factorlib.solve.few_lobes.equations import linearise, normal_equations, places_of
+from factorlib.solve.few_lobes.equations import linearise, normal_equations, places_of, tabulated
 from factorlib.solve.few_lobes.unknowns import unknowns
-from factorlib.solve.fit import Fit, Hyperparameters, field_of
-from factorlib.solve.marginal import Marginal, marginal, positive_definite_inverse
+from factorlib.solve.fit import Fit, Hyperparameters, field_of, sure_ones
+from factorlib.solve.history import Solution
+from factorlib.solve.marginal import marginal, positive_definite_inverse
 from factorlib.solve.material_prior import materials_of, unknowns_of
+from factorlib.solve.options import Choices
 
 GAUGE = "standard errors hold the sum of diffuse + specular over a component's materials fixed in each channel"
 GIVEN = "; where a material or a light is known, that alone is fixed"
@@ -89,6 +89,31 @@ class StandardErrors(NamedTuple):
     deviation: float
 
 
+def uncertainty_of(
+    solution: Solution, problem: JointProblem, choices: Choices
+) -> tuple[StandardErrors, dict[str, Float[np.ndarray, "h w 3"]]]:
+    """Standard errors of the materials, in the gauge of the answer, and the relative ones of each light, as maps.
+
+    problem: all observations that the solution was found from
+    """
+    problem = solution.shown(problem)
+    if solution.materials and solution.lights:
+        of_materials, of_lights = (
+            Posterior(of.sampled(choices.observations, choices.seed), fit, read_light_prior())
+            for of, fit in ((sure_ones(problem), solution.materials), (problem, solution.lights))
+        )
+        fitted, materials = solution.materials.point.materials, solution.point.materials
+        found, deviation = of_materials.standard_errors()
+        diffuse = found.diffuse * materials.diffuse / fitted.diffuse
+        specular = found.specular * materials.specular / fitted.specular
+        errors = StandardErrors(Materials(diffuse, specular, found.roughness), deviation)
+        return errors, of_lights.relative_standard_errors()
+    errors = standard_errors(problem, solution.point)
+    of_light = partial(relative_standard_errors, loss=problem.loss, sigma=errors.deviation)
+    maps = problem.spread(of_light, problem.illuminations(solution.point))
+    return errors, {block.name: one for block, one in zip(problem.blocks, maps, strict=True)}
+
+
 class Posterior:
     """What is uncertain at the fit of a joint solve; problem: what it was fitted to."""
 
@@ -96,10 +121,10 @@ class Posterior:
         self.problem, self.fit, self.prior = problem, fit, prior
         self.materials = materials_of(unknowns_of(fit.point.materials))  # none of whose reflectances is nil
 
-    def systems(self, with_scores: bool) -> list[Marginal]:
+    def systems(self, with_scores: bool) -> list[System]:
         """φ's system of each illumination; with_scores: of clusters of observations, too."""
 
-        def system(one: tuple[Illumination, Hyperparameters]) -> Marginal:
+        def system(one: tuple[Illumination, Hyperparameters]) -> System:
             """Of one illumination."""
             clusters = one[0].block.clusters() if with_scores else None
             return marginal(field_of(*one, self.prior, not with_scores), clusters, materials_given=True)
@@ -109,22 +134,15 @@ class Posterior:
 
     def standard_errors(self) -> StandardErrors:
         """Standard error of every material unknown."""
-        materials = self.materials
+        problem, materials = self.problem, self.materials
         values = np.column_stack([materials.diffuse, materials.specular, np.ones(len(materials))])
-        by_log, widths = 1 / values.reshape(-1), np.tile(WIDTHS, len(materials))  # ∂ log k/∂k
-        information, scores = np.diag(widths**-2.0), []  # nothing is less known than its range says
-        for system in self.systems(with_scores=True):
-            places, k = system.places, len(system.places)
-            taken_up = cho_solve(cho_factor(system.light_hessian), system.cross_hessian.T)  # by the light
-            own = (system.material_hessian - system.cross_hessian @ taken_up) * np.outer(by_log[places], by_log[places])
-            information[np.ix_(places, places)] += own
-            scores.append(np.zeros((len(system.scores), len(widths))))
-            scores[-1][:, places] = (system.scores[:, :k] - system.scores[:, k:] @ taken_up) * by_log[places]
-        deviation = residual_deviation(self.problem, self.fit.point)
-        model_error = (deviation * MODEL_ERROR * values).reshape(-1)
-        known = self.problem.known
-        variance = largest_variance(information, scores, 1.0, materials, self.problem.blocks, known) + model_error**2
-        return _errors(np.where(known.free(len(materials)), variance, 0.0), deviation)
+        by_log = 1 / values.reshape(-1)  # ∂ log k/∂k
+        known, scores = information(self.systems(with_scores=True), len(by_log))
+        scores = [of_light * by_log for of_light in scores]
+        variance = largest_variance(known * np.outer(by_log, by_log), scores, materials, problem)
+        deviation = residual_deviation(problem, self.fit.point)
+        variance += ((deviation * MODEL_ERROR * values) ** 2).reshape(-1)
+        return _errors(np.where(problem.known.free(len(materials)), variance, 0.0), deviation)
 
     def relative_standard_errors(self) -> dict[str, Float[np.ndarray, "h w 3"]]:
         """By illumination, over the light's mean radiance: a small lat-long map in the frame of the exported ones, at most LARGEST."""
@@ -146,13 +164,6 @@ class Posterior:
         return maps
 
 
-def in_gauge_of(errors: StandardErrors, fitted: Materials, materials: Materials) -> StandardErrors:
-    """The errors of reflectances that were `fitted`, in the gauge in which they are those of `materials`."""
-    diffuse = errors.materials.diffuse * materials.diffuse / fitted.diffuse
-    specular = errors.materials.specular * materials.specular / fitted.specular
-    return StandardErrors(Materials(diffuse, specular, errors.materials.roughness), errors.deviation)
-
-
 def map_directions() -> Float[np.ndarray, "d 3"]:
     """Directions of the texels of a map of ROWS rows, in the frame of the blocks."""
     return (lat_long_directions(ROWS, 2 * ROWS) @ YUP_FROM_CAMERA).reshape(-1, 3)
@@ -168,22 +179,24 @@ def residual_deviation(problem: JointProblem, point: Point) -> float:
 def largest_variance(
     information: Float[np.ndarray, "k k"],
     scores: Sequence[Float[np.ndarray, "g k"]],
-    sigma: float,
     materials: Materials,
-    blocks: Sequence[Block],
-    known: Known = Known(),
+    problem: JointProblem,
+    sigma: float = 1.0,
 ) -> Float[np.ndarray, " k"]:
-    """The largest of three variances of each unknown, in the gauge, 0 of what is known; scores: of each light's clusters, that the
-    lights were eliminated from."""
-    free, inverse = known.free(len(materials)), np.zeros_like(information)
-    own = information[np.ix_(free, free)]
+    """The largest of three variances of each unknown, in the gauge, 0 of what is known.
+
+    information: from residuals of deviation `sigma`;  scores: of each light's clusters, that the lights were eliminated from.  What the data
+    do not see, one unknown as the roughness of a Lambertian material or a trade of one for another, is uncertain by the width of its range,
+    which counts as one more observation of each unknown.
+    """
+    free, inverse = problem.known.free(len(materials)), np.zeros_like(information)
+    own = (information / sigma**2 + np.diag(np.tile(WIDTHS, len(materials)) ** -2.0))[np.ix_(free, free)]
     scale = 1 / np.sqrt(np.diag(own))  # rows are of unlike units
-    inverse[np.ix_(free, free)] = positive_definite_inverse(own * np.outer(scale, scale)).matrix * np.outer(
-        scale, scale
-    )
+    scales = np.outer(scale, scale)
+    inverse[np.ix_(free, free)] = positive_definite_inverse(own * scales).matrix * scales
     whole = np.array([s.sum(0) for s in scores])
     covariances = inverse, sandwich(inverse, np.vstack(scores), sigma), sandwich(inverse, whole, sigma)
-    return np.max([np.diag(in_gauge(each, materials, blocks, known)) for each in covariances], axis=0).clip(0)
+    return np.max([np.diag(in_gauge(each, materials, problem)) for each in covariances], axis=0).clip(0)
 
 
 def _errors(variance: Float[np.ndarray, " 7m"], deviation: float) -> StandardErrors:
@@ -203,12 +216,12 @@ def sandwich(
 
 
 def in_gauge(
-    covariance: Float[np.ndarray, "k k"], materials: Materials, blocks: Sequence[Block], known: Known = Known()
+    covariance: Float[np.ndarray, "k k"], materials: Materials, problem: JointProblem
 ) -> Float[np.ndarray, "k k"]:
     """The covariance where the sum of each component is fixed in as many channels as have a free factor."""
     rows = materials.rows()
-    for members, illuminations in connected_components(blocks, len(materials)):
-        factors = known.factors(members, illuminations)
+    for members, illuminations in connected_components(problem.blocks, len(materials)):
+        factors = problem.known.factors(members, illuminations)
         for columns in {3: [[0, 3], [1, 4], [2, 5]], 1: [[*range(6)]], 0: []}[factors]:
             g, h = np.zeros(rows.shape), np.zeros(rows.shape)
             own = np.ix_(members, columns)
@@ -223,18 +236,12 @@ def in_gauge(
 
 
 def standard_errors(problem: JointProblem, point: Point) -> StandardErrors:
-    """Standard error of every material unknown under lights of few lobes, at a point that minimises the problem's loss.
-
-    What the data do not see, one unknown as the roughness of a Lambertian material or a trade of one for another, is uncertain by
-    the width of its range, which counts as one more observation of each unknown.
-    """
+    """Standard error of every material unknown under lights of few lobes, at a point that minimises the problem's loss."""
     sigma = max(residual_deviation(problem, point), LEAST_DEVIATION)
     loss = msgspec.structs.replace(problem.loss, robust_scale=max(problem.loss.robust_scale, 1.0))
     equations = partial(normal_equations, loss=loss, clustered=True)
-    information, scores = Iterate(point, list(problem.spread(equations, problem.illuminations(point)))).information()
-    ranges = np.diag(np.tile(WIDTHS, len(point.materials)) ** -2.0)  # nothing is less known than its range says
-    information = information / sigma**2 + ranges
-    return _errors(largest_variance(information, scores, sigma, point.materials, problem.blocks), sigma)
+    known, scores = Iterate(point, list(problem.spread(equations, problem.illuminations(point)))).information()
+    return _errors(largest_variance(known, scores, point.materials, problem, sigma), sigma)
 
 
 def relative_standard_errors(illumination: Illumination, loss: Loss, sigma: float) -> Float[np.ndarray, "h w 3"]:
@@ -252,10 +259,11 @@ def relative_standard_errors(illumination: Illumination, loss: Loss, sigma: floa
     first = len(every) - unknowns(light)
     others = np.r_[0:first, first + 6 * len(light) : len(every)]
     whole, information = [np.zeros((len(rows), len(every))) for _ in range(3)], []
-    for part in linearise(
-        sample, msgspec.structs.replace(loss, robust_scale=1e6)
-    ):  # atoms have no robust weights either
-        whole[part.channel][part.rows, np.searchsorted(every, part.places)] = part.jacobian.numpy()
+    for chunk in tabulated(sample):
+        for part in linearise(*chunk, msgspec.structs.replace(loss, robust_scale=1e6))[
+            1
+        ]:  # as atoms: no robust weights
+            whole[part.channel][part.rows, np.searchsorted(every, part.places)] = part.jacobian
     for a, J in zip(atoms, whole, strict=True):  # (2), channel by channel
         u, values, _ = np.linalg.svd(J[:, others], full_matrices=False)
         Q = u[:, values > 1e-9 * max(float(values.max(initial=0.0)), 1e-300)]

@@ -13,7 +13,7 @@ directions are similarly bright, colour varies much less than luminance, and abo
 is a factor of the covariance (2) of a whole map: some scenes have much contrast or much colour, others little. `covariance` and `precision` are those
 at s = 1, a typical map; a solve finds s by evidence. With s integrated over, a map is drawn from Student's t of ν_k degrees of freedom.
 y_0, y_1 and y_2 are independent of each other. exp(−θ/c) is positive definite on the sphere for every c > 0 (Gneiting, "Strictly and non-strictly
-positive definite functions on spheres", 2013). `factorlib.light.prior_fit` finds the numbers.
+positive definite functions on spheres", 2013). A solve takes the mean to be nil, for it does not know what is above. `studies.measured.light_prior` finds the numbers.
 """
 
 from __future__ import annotations
@@ -79,12 +79,6 @@ class LightPrior(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         alike = correlation(angles(directions), np.radians(self.decay_deg[k]))
         return self.variance[k] * alike + self.level[k] + self.nugget[k] * np.eye(len(directions))
 
-    def mean(self, directions: Float[np.ndarray, "p 3"], up: Float[np.ndarray, "3"] | None) -> Float[np.ndarray, "3 p"]:
-        """Mean of y in unit `directions`: equation (3); zeros where the unit vector `up` (same frame) is not known."""
-        if up is None:
-            return np.zeros((3, len(directions)))
-        return np.array(self.profile) @ legendre(directions @ up).T
-
     def precision(
         self, directions: Float[np.ndarray, "p 3"], factors: Sequence[float] = (1.0, 1.0, 1.0)
     ) -> tuple[Float[np.ndarray, "3p 3p"], float]:
@@ -125,20 +119,13 @@ def angles(directions: Float[np.ndarray, "p 3"]) -> Float[np.ndarray, "p p"]:
     return 2 * np.arcsin(np.minimum(np.sqrt(squared_distances(directions, directions)) / 2, 1))
 
 
-def legendre(sine: Float[np.ndarray, " p"]) -> Float[np.ndarray, "p 3"]:
-    """P_1, P_2, P_3; over the sphere their means are zero, so they leave the level alone."""
-    return np.polynomial.legendre.legvander(sine, 3)[:, 1:]
-
-
 def _inverse(matrix: Float[np.ndarray, "p p"]) -> tuple[Float[np.ndarray, "p p"], float]:
     """The inverse of a positive definite matrix, exactly symmetric, and the log of the inverse's determinant."""
     inverse = np.linalg.inv(matrix)
     return (inverse + inverse.T) / 2, -float(np.linalg.slogdet(matrix)[1])
 
 
-def read_light_prior(path: Path | None = None) -> LightPrior:
-    """The prior in a file that `python -m factorlib.light_prior` wrote; None: the one this package ships. InputError for a file that is none."""
-    path = path or SHIPPED
-    value = read_json(path)
-    with reading("a light prior", path, cure="write it by python -m factorlib.light_prior"):
-        return msgspec.convert(value, LightPrior)
+def read_light_prior() -> LightPrior:
+    """The prior that this package ships, which `studies.measured.light_prior` made; raises InputError where the file is damaged."""
+    with reading("a light prior", SHIPPED):
+        return msgspec.convert(read_json(SHIPPED), LightPrior)

@@ -15,16 +15,14 @@ from __future__ import annotations
 
 import math
 
+import numpy as np
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from factorlib.elementary import product, square_root
-
 FAINTEST = -40.0  # exponent of a lobe far from its axis: products stay normal numbers, which are multiplied much faster
-LEAST = (
-    1e-6  # of the lobe's light that the reflectance passes; below, the lobe is behind the surface and counts as seen
-)
+# Of the lobe's light that the reflectance passes; below, the lobe is behind the surface and counts as seen.
+LEAST = 1e-6
 
 
 def widest_sharpness(count: int) -> float:
@@ -71,3 +69,17 @@ def seen_share(
 ) -> Float[Tensor, "n p"]:
     """v: of the light of `lobes` (their `kernel`) that `weights` reflect, the share that `visibility` lets pass."""
     return (product(visibility * weights, lobes) + LEAST) / (product(weights, lobes) + LEAST)
+
+
+# torch.sqrt is MKL's, which is off by one unit in the last place now and then, and not at the same places on every processor.  torch's products are
+# MKL's, too, whose code for processors of any maker is five times slower than OpenBLAS, which NumPy calls (`factorlib.arithmetic`).
+
+
+def square_root(x: Float[Tensor, "*n"]) -> Float[Tensor, "*n"]:
+    """√x as IEEE 754 rounds it, without derivative."""
+    return torch.from_numpy(np.sqrt(x.numpy()))
+
+
+def product(a: Float[Tensor, "n k"], b: Float[Tensor, "k m"]) -> Float[Tensor, "n m"]:
+    """The product of two matrices, without derivative."""
+    return torch.from_numpy(a.numpy() @ b.numpy())

@@ -24,9 +24,9 @@ from jaxtyping import Float, Int
 from factorlib.images.tone import by_log_exponent
 from factorlib.model.blocks import Block
 from factorlib.model.lights import Light, UnitLobes
-from factorlib.model.loss import Loss
 from factorlib.model.materials import Materials
-from factorlib.model.responses import CHUNK, Reflected, Reflections, Rows, diffuse_response, specular_response
+from factorlib.model.noise import Loss
+from factorlib.model.responses import CHUNK, Reflected, Table, diffuse_response, specular_response
 from factorlib.reflection.operator import Operator
 
 
@@ -67,14 +67,14 @@ class Linearised(NamedTuple):
 class Illumination(msgspec.Struct, frozen=True):
     """The observations in one light, that light, the materials and the reflection operator; radiance is in the block's unit.
 
-    table: the tabulated responses of this block to the cells of this light; None: the operator itself is asked
+    table: the responses of this block to the lobes of this light; None: the operator itself is asked
     """
 
     block: Block
     light: Light
     materials: Materials
     operator: Operator
-    table: Reflections | None = None
+    table: Table | None = None
 
     @property
     def exposure(self) -> Float[np.ndarray, "n 1"]:
@@ -90,10 +90,12 @@ class Illumination(msgspec.Struct, frozen=True):
         block, kd, ks, responses = self.block, self.materials.diffuse, self.materials.specular, []
         diffuse, specular = np.zeros((len(block), 3)), np.zeros((len(block), 3))
         for m, rows in material_slices(block) if self.table is None else ():
-            diffuse[rows], specular[rows] = self.lit(rows, float(self.materials.roughness[m]))
-        weight = self.light.weight.astype(np.float32)
+            lobes, weight, roughness = self.light.unit_lobes, self.light.weight, float(self.materials.roughness[m])
+            diffuse[rows] = diffuse_response(block, rows, lobes, self.operator) @ weight
+            specular[rows] = specular_response(block, rows, lobes, roughness, self.operator) @ weight
         for m in np.unique(block.material).tolist() if self.table else ():
             rows, of = self.table.rows(m), self.table.at(m, float(self.materials.roughness[m]))
+            weight = self.light.weight.astype(of.diffuse.dtype)
             diffuse[rows], specular[rows] = of.diffuse @ weight, of.specular @ weight
             responses.append((m, rows, of))
         diffuse, specular = diffuse * self.exposure, specular * self.exposure
@@ -113,12 +115,6 @@ class Illumination(msgspec.Struct, frozen=True):
     def losses(self, loss: Loss) -> Float[np.ndarray, " n"]:
         """Robust loss of every observation, mean over its channels."""
         return loss.of_residuals(self.residuals()).mean(1)
-
-    def lit(self, rows: Rows, roughness: float) -> tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, "n 3"]]:
-        """Σ_p D w and Σ_p S w at `rows`, were their material of that roughness: without exposure and bounces."""
-        lobes, weight = self.light.unit_lobes, self.light.weight
-        diffuse = diffuse_response(self.block, rows, lobes, self.operator)
-        return diffuse @ weight, specular_response(self.block, rows, lobes, roughness, self.operator) @ weight
 
     def atoms(self, rows: Int[np.ndarray, " n"], lobes: UnitLobes) -> Float[np.ndarray, "3 n q"]:
         """What q further lobes of weight one would add to the whitened residuals at `rows`, per channel."""

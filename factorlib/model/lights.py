@@ -21,7 +21,7 @@ from jaxtyping import Bool, Float, Int
 
 from factorlib.geometry.sphere import fibonacci_sphere
 from factorlib.images import tone
-from factorlib.light.lobes import SUN, lobe_integral
+from factorlib.light.lobes import SUN, Lobes, lobe_integral
 
 WIDTH = 0.5  # of a cell, in spacings: equal weights are a constant light to 2 % (RMS); wider ones blur a sun more than materials do
 PEAK = 1 / (2 * np.pi * WIDTH**2)
@@ -86,12 +86,17 @@ class Light(msgspec.Struct, frozen=True):
     @property
     def suns(self) -> Bool[np.ndarray, " p"]:
         """Which lobes are no cells but suns: those that are as narrow as one."""
-        return self.sharpness > 0.9 * SUN
+        return self.lobes.suns
 
     @property
     def spacing(self) -> Float[np.ndarray, " p"]:
         """Radians between a cell and its neighbours: the first of (1)."""
         return 1 / (WIDTH * np.sqrt(self.sharpness))
+
+    @property
+    def lobes(self) -> Lobes:
+        """Return the light without exposures, tone curves and distance."""
+        return Lobes(self.axis, self.sharpness, self.weight)
 
     @property
     def unit_lobes(self) -> UnitLobes:
@@ -114,9 +119,14 @@ class Light(msgspec.Struct, frozen=True):
         return all_
 
     @property
+    def unit_energy(self) -> Float[np.ndarray, " p"]:
+        """Energy of each lobe over 2π, were its weight one; steradians."""
+        return lobe_integral(self.sharpness) / (2 * np.pi)
+
+    @property
     def energy(self) -> Float[np.ndarray, "p 3"]:
         """Energy of each lobe over 2π, in the illumination's radiance unit times steradians."""
-        return self.weight * (lobe_integral(self.sharpness) / (2 * np.pi))[:, None]
+        return self.weight * self.unit_energy[:, None]
 
     @property
     def unknowns(self) -> int:
@@ -132,11 +142,24 @@ class Light(msgspec.Struct, frozen=True):
         """Return the same cells with other radiances."""
         return msgspec.structs.replace(self, weight=(self.peaks * np.exp(u)).T)
 
-    def with_lobe(self, axis: Float[np.ndarray, "3"], sharpness: float, weight: Float[np.ndarray, "3"]) -> Light:
-        """Return the light with one more lobe, the last."""
-        log_sharpness = np.append(self.log_sharpness, np.log(sharpness))
-        rows = np.vstack([self.axis, axis]), log_sharpness, np.vstack([self.weight, weight])
-        return msgspec.structs.replace(self, axis=rows[0], log_sharpness=rows[1], weight=rows[2])
+    def with_lobes(self, lobes: UnitLobes, weight: Float[np.ndarray, "q 3"]) -> Light:
+        """Return the light with q more lobes, the last."""
+        return msgspec.structs.replace(
+            self,
+            axis=np.vstack([self.axis, lobes.axis]),
+            log_sharpness=np.append(self.log_sharpness, np.log(lobes.sharpness)),
+            weight=np.vstack([self.weight, weight]),
+        )
+
+    def take(self, which: Bool[np.ndarray, " p"] | slice) -> Light:
+        """Return the light of some of its lobes."""
+        lobes = {name: getattr(self, name)[which] for name in ("axis", "log_sharpness", "weight")}
+        return msgspec.structs.replace(self, **lobes)
+
+    def brightest(self, count: int, spacing: float) -> Bool[np.ndarray, " p"]:
+        """The `count` cells that hold most energy, of those that are farther than `spacing` radians from their neighbours."""
+        energy = np.where(self.spacing > spacing, self.energy.sum(1), 0.0)
+        return np.isin(np.arange(len(self)), np.argsort(-energy, kind="stable")[:count]) & (energy > 0)
 
     def split(self, which: Bool[np.ndarray, " p"]) -> Light:
         """The light with each cell of `which` replaced by smaller ones of its radiance, which follow all others: see the head of the module."""
@@ -148,16 +171,13 @@ class Light(msgspec.Struct, frozen=True):
             nearest = np.argmin(self.sharpness * (1 - near @ self.axis.T), axis=1)
             parents.append(nearest[count[nearest] == n])
             finer.append(UnitLobes(near[count[nearest] == n], np.full(len(parents[-1]), cells.sharpness[0])))
-        parent = np.concatenate(parents)
+        parent, u = np.concatenate(parents), self.log_radiance
         kept = ~np.isin(np.arange(len(self)), parent)
-        u, light = (
-            self.log_radiance,
-            msgspec.structs.replace(
-                self,
-                axis=np.vstack([self.axis[kept], *(cells.axis for cells in finer)]),
-                log_sharpness=np.log(np.concatenate([self.sharpness[kept], *(cells.sharpness for cells in finer)])),
-                weight=np.zeros((kept.sum() + len(parent), 3)),
-            ),
+        light = msgspec.structs.replace(
+            self,
+            axis=np.vstack([self.axis[kept], *(cells.axis for cells in finer)]),
+            log_sharpness=np.log(np.concatenate([self.sharpness[kept], *(cells.sharpness for cells in finer)])),
+            weight=np.zeros((kept.sum() + len(parent), 3)),
         )
         return light.with_log_radiance(np.hstack([u[:, kept], u[:, parent]]))
 

@@ -18,8 +18,8 @@ from jaxtyping import Float
 from factorlib.model.blocks import Block
 from factorlib.model.illumination import Illumination
 from factorlib.model.known import Known
-from factorlib.model.loss import Loss
 from factorlib.model.materials import Point
+from factorlib.model.noise import Loss
 from factorlib.reflection.operator import Operator
 from factorlib.stage import serial_map
 

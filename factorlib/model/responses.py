@@ -1,16 +1,8 @@
-"""What rows of observations reflect of lobes of weight one: where the main solver calls the reflection operator.
+"""What rows of observations reflect of lobes of weight one: the reflection operator, asked for a block.
 
     D_ip → a_i v_ip D_ip   diffuse response of observation i to lobe p, for k_d = 1, times the block's detail of reflectance a, where it has some
     S_ip → u_ip S_ip   specular response, for k_s = 1, times the shares v and u of each lobe's reflection that shadows leave:
                        (1) and (2) of `factorlib.light.visibility`, 1 where a block has no visibility
-
-From them follows radiance: at exposure e, a material k_d, k_s under lobes of weight w shows, before its photo's tone curve,
-
-    y_ic = e_i (k_d,c Σ_p D_ip w_pc + k_s,c Σ_p S_ip w_pc)                                                    (1)
-
-and beside it what other surfaces send there, which the photo itself shows, so without e (interreflection):
-
-    k_d,c G_d,ic + k_s,c G_s,ic                                                                               (2)
 
 The cells of a light stay where they are while a solve descends, so responses depend on materials through their roughness alone.
 `Reflections` computes them at the `NODES` when they are first asked for and interpolates between them by cubic polynomials of log roughness.
@@ -20,7 +12,7 @@ at worst: .17 % for the factor 1.136 of the nodes.  Cells no sharper than `WIDE`
 
 from __future__ import annotations
 
-from typing import NamedTuple, TypeVar
+from typing import NamedTuple, Protocol
 
 import numpy as np
 import torch
@@ -39,13 +31,7 @@ NODES = np.geomspace(0.1, 1.0, 19)  # roughness
 WIDE = 200.0  # λ
 DEGREE = 3  # of the polynomials between nodes
 KEPT = 6  # nodes of a material whose responses stay in memory
-A = TypeVar("A", np.ndarray, Tensor)
 Rows = slice | Int[np.ndarray, " n"]
-
-
-def radiance_of(exposure: A, diffuse: A, specular: A, by_diffuse: A, by_specular: A) -> A:
-    """Equation (1) [n, 3];  exposure [n, 1];  diffuse, specular: k_d, k_s [3];  by_…: Σ_p D w and Σ_p S w [n, 3]."""
-    return exposure * (diffuse * by_diffuse + specular * by_specular)
 
 
 def diffuse_response(block: Block, rows: Rows, lobes: UnitLobes, operator: Operator) -> Float[np.ndarray, "n p"]:
@@ -74,11 +60,6 @@ def met_cosines(block: Block, rows: Rows, lobes: UnitLobes) -> tuple[np.ndarray,
     if lobes.curvature == 0 or block.place is None:
         return normal @ lobes.axis.T, view @ lobes.axis.T, 1.0
     return met_from(block.place[rows], normal, view, lobes.axis, lobes.curvature)
-
-
-def cosines(normal: A, view: A, axis: A) -> tuple[A, A, A]:
-    """n·o [n], n·z and o·z [n, p] of observations [n, 3] and lobes [p, 3], all directions unit."""
-    return (normal * view).sum(1), normal @ axis.T, view @ axis.T
 
 
 def _tensor(values: np.ndarray, operator: Operator) -> Tensor:
@@ -112,15 +93,23 @@ def shadowed(
 
 
 class Reflected(NamedTuple):
-    """The responses D and S [n, p] of n observations of one material to p lobes of weight one, and ∂S/∂roughness; float32."""
+    """The responses D and S [n, p] of n observations of one material to p lobes of weight one, and ∂S/∂roughness."""
 
     diffuse: Float[np.ndarray, "n p"]
     specular: Float[np.ndarray, "n p"]
     by_roughness: Float[np.ndarray, "n p"]
 
 
+class Table(Protocol):
+    """Responses of a block, material by material."""
+
+    def rows(self, m: int) -> slice: ...
+
+    def at(self, m: int, roughness: float) -> Reflected: ...
+
+
 class Reflections:
-    """What a block's observations reflect of some lobes, material by material; values at nodes are kept.
+    """What a block's observations reflect of some lobes, material by material, float32; values at nodes are kept.
 
     materials_given: roughness does not change, so it is the only node, and ∂S/∂roughness, for which nobody asks, is nil
     """
@@ -180,35 +169,3 @@ def lagrange(nodes: Float[np.ndarray, " k"], x: float) -> tuple[Float[np.ndarray
         value[a] = np.prod(x - others) / below
         slope[a] = sum(np.prod(x - np.delete(others, b)) for b in range(len(others))) / below
     return value, slope
-
-
-class UnitReflection(torch.autograd.Function):
-    """D and S [n, p] without shadows, for autograd; the derivatives are those of the operator's `response`."""
-
-    @staticmethod
-    def forward(
-        ctx: torch.autograd.function.FunctionCtx,
-        operator: Operator,
-        roughness: Tensor,
-        log_sharpness: Tensor,
-        *cosines: Tensor,
-    ) -> tuple[Tensor, Tensor]:
-        """D and S;  cosines: n·o [n], n·z and o·z [n, p]."""
-        inputs = [t.detach().to(operator.dtype) for t in (roughness, log_sharpness.exp(), *cosines)]
-        r = operator.response(*inputs)
-        slopes = (
-            *(r.specular_by_roughness, r.diffuse_by_log_sharpness, r.specular_by_log_sharpness),
-            *(r.diffuse_by_nz, r.specular_by_nz, r.specular_by_oz),
-        )
-        ctx.save_for_backward(*(slope.to(cosines[1].dtype) for slope in slopes))
-        return r.diffuse.to(cosines[1].dtype), r.specular.to(cosines[1].dtype)
-
-    @staticmethod
-    def backward(
-        ctx: torch.autograd.function.FunctionCtx, diffuse: Tensor, specular: Tensor
-    ) -> tuple[Tensor | None, ...]:
-        """Gradients by roughness, log sharpness, n·z and o·z; views are given, so there is none by n·o."""
-        by_roughness, d_by_sharpness, s_by_sharpness, d_by_nz, s_by_nz, s_by_oz = ctx.saved_tensors
-        by_sharpness = (diffuse * d_by_sharpness + specular * s_by_sharpness).sum(0)
-        by_nz = diffuse * d_by_nz + specular * s_by_nz
-        return None, (specular * by_roughness).sum(), by_sharpness, None, by_nz, specular * s_by_oz

@@ -22,7 +22,7 @@ from jaxtyping import Float, Int
 
 from factorlib.align.refine import refined
 from factorlib.align.state import State
-from factorlib.model.loss import Loss
+from factorlib.model.noise import Loss
 from factorlib.refine.descent import Moving, descended
 from factorlib.refine.light import pursued_light, robust_scale, together, with_weights
 

@@ -15,8 +15,8 @@ from jaxtyping import Bool, Float
 from factorlib.model.blocks import Block
 from factorlib.model.illumination import Illumination
 from factorlib.model.lights import Light
-from factorlib.model.loss import Loss
 from factorlib.model.materials import Materials
+from factorlib.model.noise import Loss
 from factorlib.reflection.operator import Operator
 from factorlib.results.materials import Solved
 from factorlib.robust import robust_deviation

@@ -48,11 +48,7 @@ class Pixels(msgspec.Struct, frozen=True):
 
 
 def pixels_of(
-    photo: Mapping[str, Float[np.ndarray, "h w"]],
-    known: Sequence[bool],
-    count: int,
-    seed: int = 0,
-    noise: Noise = Noise(),
+    photo: Mapping[str, Float[np.ndarray, "h w"]], known: Sequence[bool], count: int, seed: int = 0
 ) -> Pixels | None:
     """At most `count` of the pixels inside a material that is `known`; None where there are too few cells to hold any out.
 
@@ -73,11 +69,10 @@ def pixels_of(
     radiance = np.maximum(np.stack([photo[c][y, x] for c in "RGB"], axis=-1).astype(float), 0.0)
     mean = max(float(radiance.mean()), 1e-30)
     clipped = np.stack([photo[f"clipped.{c}"][y, x] for c in "RGB"], axis=-1) > 0.5
-    sigma = np.hypot(noise.absolute, noise.relative * radiance / mean)
     out = random.permutation(len(names)) < HELD_OUT * len(names)
     if not 2 <= out.sum() < len(names):
         return None
-    cell, precision = cell.reshape(-1), np.where(clipped, 0.0, 1 / sigma)
+    cell, precision = cell.reshape(-1), np.where(clipped, 0.0, 1 / Noise().sigma(radiance / mean))
     return Pixels(x, y, radiance / mean, mean, precision, label[y, x] - 1, cell, out[cell])
 
 

@@ -4,9 +4,10 @@ Photometric bundle adjustment.  Every observation touches one material (7 unknow
 have an arrow shape and the illuminations are eliminated one by one (Schur).
 
     solve       the solver: choices, materials, splitting, lights
-    choices     what a scene needs of the model: shadows, bounces, tone curves;  evidence: how held-out observations decide
+    choices     what a scene needs of the model: shadows, bounces, tone curves, distances;  suns: one a light;  evidence: how held-out
+                observations decide
     fit         materials and lights fitted together, and how much observations and prior count
-    descent     Levenberg–Marquardt: the step and the loop
+    arrow       the arrow-shaped system, and its elimination;  descent: Levenberg–Marquardt on it
     marginal    what is minimised: the marginal likelihood, the lights integrated out;  material_prior: what is expected of materials
     start       where a solve starts, from nothing or from an earlier solution;  resume: parts that are done already
     few_lobes   another solver, for exact scenes: lights are few lobes with free axes;  it decides nothing for the first

@@ -22,7 +22,8 @@ import numpy as np
 
 from factorlib.model.materials import Point
 from factorlib.model.problem import JointProblem
-from factorlib.solve.evidence import AGAINST, FOR, Evidence, Losses, compare, losses_of
+from factorlib.results.materials import Decision
+from factorlib.solve.evidence import AGAINST, FOR, Losses, compare, losses_of
 from factorlib.solve.fit import Fit, Schedule, start_of
 from factorlib.solve.options import Choices
 
@@ -45,8 +46,8 @@ class Effects(msgspec.Struct, frozen=True):
     """Which effects were chosen: the evidence for them, and the fit of the chosen model on few observations."""
 
     fit: Fit
-    shadows: Evidence
-    bounces: Evidence
+    shadows: Decision
+    bounces: Decision
 
     def of(self, problem: JointProblem) -> JointProblem:
         """Return the problem with the effects that were chosen."""
@@ -57,7 +58,7 @@ class Chosen(msgspec.Struct, frozen=True):
     """The fit that a choice ends with, and the evidence for each thing that was asked: for each light, or for each splitting."""
 
     fit: Fit
-    evidence: list[Evidence]
+    evidence: list[Decision]
 
 
 def sample_of(problem: JointProblem, choices: Choices) -> JointProblem:
@@ -84,10 +85,10 @@ def effects_chosen(problem: JointProblem, starts: list[Point], choices: Choices,
             tried[with_shadows, with_bounces] = min(trials, key=lambda one: _geometric_mean(one[1]))
         return tried[with_shadows, with_bounces]
 
-    said = Evidence(shadows) if shadows is not None else compare(trial(False, False)[1], trial(True, False)[1], AGAINST)
+    said = Decision(shadows) if shadows is not None else compare(trial(False, False)[1], trial(True, False)[1], AGAINST)
     if not said.kept:
-        return Effects(trial(False, False)[0], said, Evidence(False))
-    lit = Evidence(bounces) if bounces is not None else compare(trial(True, False)[1], trial(True, True)[1], FOR)
+        return Effects(trial(False, False)[0], said, Decision(False))
+    lit = Decision(bounces) if bounces is not None else compare(trial(True, False)[1], trial(True, True)[1], FOR)
     return Effects(trial(True, lit.kept)[0], said, lit)
 
 
@@ -103,7 +104,7 @@ def curves_chosen(problem: JointProblem, before: Fit, choices: Choices, fit: Fit
     lights = before.point.lights
     had = [len(light.log_tone) > 0 for light in lights]
     if choices.tone == "off" or problem.none_held_out:
-        return Chosen(before, [Evidence(has) for has in had])
+        return Chosen(before, [Decision(has) for has in had])
     sample = sample_of(problem, choices)
     freed = [light if has else light.with_curves() for light, has in zip(lights, had, strict=True)]
     curved = fit("tone curves", sample, before.with_lights(freed), CURVED)
@@ -112,7 +113,7 @@ def curves_chosen(problem: JointProblem, before: Fit, choices: Choices, fit: Fit
         one = _evidence_of_light(k, *losses)
         gain = (one.held_out_loss_without or 0.0) / max(one.held_out_loss_with or 1.0, 1e-12) - 1
         kept = one.kept and gain > CURVED_GAIN and not light.beyond_cameras
-        evidence.append(Evidence(True) if had[k] else msgspec.structs.replace(one, kept=kept))
+        evidence.append(Decision(True) if had[k] else msgspec.structs.replace(one, kept=kept))
     if all(one.kept for one in evidence):
         return Chosen(curved, evidence)
     if not any(one.kept and not has for one, has in zip(evidence, had, strict=True)):
@@ -131,7 +132,7 @@ def distances_chosen(problem: JointProblem, before: Fit, choices: Choices, fit: 
     lights = before.point.lights
     pairs = zip(lights, problem.blocks, strict=True)
     known = [light.curvature > 0 or light.held.any() or block.place is None for light, block in pairs]
-    evidence = [Evidence(light.curvature > 0) for light in lights]
+    evidence = [Decision(light.curvature > 0) for light in lights]
     if choices.distance == "off" or problem.none_held_out or all(known):
         return Chosen(before, evidence)
     sample, asked = sample_of(problem, choices), np.flatnonzero(~np.array(known)).tolist()
@@ -163,11 +164,11 @@ def distances_chosen(problem: JointProblem, before: Fit, choices: Choices, fit: 
     return Chosen(fit_at(kept) if kept else before, evidence)
 
 
-def believed(evidence: Evidence) -> float:
+def believed(evidence: Decision) -> float:
     """How far the richer model is believed: from 0 at `NEARER_FROM` standard errors to 1 at `FOR`, so that rounding does not decide."""
     return float(np.clip(((evidence.margin or 0.0) - NEARER_FROM) / (FOR - NEARER_FROM), 0.0, 1.0))
 
 
-def _evidence_of_light(k: int, without: Losses, richer: Losses, least: float = FOR) -> Evidence:
+def _evidence_of_light(k: int, without: Losses, richer: Losses, least: float = FOR) -> Decision:
     """Return the evidence that light k alone gives for the richer model."""
     return compare(*(Losses([of.values[k]], [of.clusters[k]]) for of in (without, richer)), least)

@@ -1,14 +1,7 @@
-"""Levenberg–Marquardt on materials and lights: one system of arrow shape, one step, one loop.
+"""Levenberg–Marquardt on materials and lights: one step, that of (1) of `factorlib.solve.arrow`, and one loop.
 
-With H = [[M, C_1 … C_k], [C_iᵀ, L_i]] (materials M, one block L_i a light) and gradients g_m, g_i, eliminating every light leaves
-
-    (M − Σ C_i L_i⁻¹ C_iᵀ) dm = −(g_m − Σ C_i L_i⁻¹ (g_i + d_i)),      dl_i = −L_i⁻¹ (g_i + C_iᵀ dm)                (1)
-
-where d_i is the gradient of the determinant by the light.  It enters the step of the materials; the light's own step minimises φ.  There are
-7 unknowns a material; those that are known (`factorlib.model.known`) have no part in (1).  A light's C has rows for the materials that it shows alone, so that cost grows with those few.  Damping
-multiplies the diagonal, so that a step does not depend on the units of an unknown.
-
-What is minimised is minus twice the log marginal likelihood (`factorlib.solve.marginal`) and the prior on materials; where materials are
+The determinant enters the step of the materials; a light's own step minimises φ.  Unknowns that are known (`factorlib.model.known`) have no part in a
+step.  What is minimised is minus twice the log marginal likelihood (`factorlib.solve.marginal`) and the prior on materials; where materials are
 given, φ.
 """
 
@@ -20,18 +13,17 @@ from typing import NamedTuple
 import msgspec
 import numpy as np
 from jaxtyping import Bool, Float
-from scipy.linalg import cho_factor, cho_solve
 
 from factorlib.model.lights import TONE, Light
 from factorlib.model.materials import LEAST_REFLECTANCE, ROUGHNESS
 from factorlib.model.problem import Spread
-from factorlib.solve.marginal import Field, Marginal, marginal
+from factorlib.solve.arrow import System, damped, eliminate, summed
+from factorlib.solve.marginal import Field, marginal
 from factorlib.solve.material_prior import Gaussian, MaterialPrior, materials_of
 
 MOST_CHANGE = np.array([0.5] * 6 + [0.06])  # of a material's unknowns in one step
 MOST_LOG_RADIANCE, MOST_EXPOSURE, MOST_TONE = 1.5, 1.0, 0.2  # change of a light's unknowns in one step
 DAMPING, LOWER, HIGHER, MOST_DAMPING = 1e-3, 0.25, 8.0, 1e3
-FLOOR = 1e-9  # damping never sees a smaller diagonal entry than this share of the largest
 TOLERANCE = 2e-4  # a descent ends with a step that lowers the value by less than this share of it
 
 Report = Callable[[float], None]  # called at every point that is tried, with the mean robust loss there
@@ -43,7 +35,7 @@ class State(NamedTuple):
     theta: Float[np.ndarray, "m 7"]
     fields: list[Field]
     value: float
-    parts: list[Marginal]
+    parts: list[System]
     prior: Gaussian
 
 
@@ -87,18 +79,9 @@ def stepped(
     state: State, free: Bool[np.ndarray, " 7m"], materials_given: bool, damping: float
 ) -> tuple[list[Field], Float[np.ndarray, "m 7"]]:
     """Fields and materials after the damped step (1), each unknown within its range and changed by no more than is sound."""
-    H, g, solutions = state.prior.hessian.copy(), state.prior.gradient.copy(), []  # of the materials
-    for part in state.parts:
-        H[np.ix_(part.places, part.places)] += part.material_hessian
-        g[part.places] += part.material_gradient
+    H, g = summed(state.parts, state.prior.hessian, state.prior.gradient)
     H = damped(H, damping)
-    for part in state.parts:
-        L, C = damped(part.light_hessian, damping), part.cross_hessian
-        right = np.column_stack([C.T, part.light_gradient, part.determinant_by_light])
-        solution = cho_solve(cho_factor(L, check_finite=False), right, check_finite=False)
-        H[np.ix_(part.places, part.places)] -= C @ solution[:, :-2]
-        g[part.places] -= C @ (solution[:, -2] + solution[:, -1])
-        solutions.append(solution)
+    solutions = eliminate([p._replace(light_hessian=damped(p.light_hessian, damping)) for p in state.parts], H, g)
     theta = state.theta
     if not materials_given:
         step = np.zeros(len(g))
@@ -128,18 +111,3 @@ def moved(light: Light, step: Float[np.ndarray, " l"]) -> Light:
     return msgspec.structs.replace(
         light, weight=light.weight * brighter, log_exposure=light.log_exposure + exposures, log_tone=tone
     )
-
-
-def damped(hessian: Float[np.ndarray, "k k"], damping: float) -> Float[np.ndarray, "k k"]:
-    """Return the matrix with its diagonal made 1 + damping times as large, and positive."""
-    diagonal = np.diag(hessian)
-    floor = FLOOR * max(float(diagonal.max(initial=0.0)), 1e-30)
-    return hessian + np.diag(damping * np.maximum(diagonal, floor) + floor)
-
-
-def masked(matrix: Float[np.ndarray, "k k"], free: Bool[np.ndarray, " k"]) -> Float[np.ndarray, "k k"]:
-    """The matrix with rows and columns that are not free replaced by those of the identity, in the scale of the rest."""
-    scale = max(float(np.abs(np.diag(matrix)).mean()), 1e-30)
-    result = matrix * np.outer(free, free)
-    result[~free, ~free] = scale
-    return result

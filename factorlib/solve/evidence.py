@@ -17,29 +17,17 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
-import msgspec
 import numpy as np
 from jaxtyping import Float, Int
 
 from factorlib.model.materials import Point
 from factorlib.model.problem import JointProblem
+from factorlib.results.materials import Decision
 
 LEAST_LOSS = 1e-4  # in σ² of the noise model, added to every loss: two losses far below it count as equal
 # Thresholds, in standard errors.  Shadows go only if the evidence is clearly against them; bounces and tone curves need clear evidence;
 # smaller cells obey the same prior as larger ones, so one standard error is enough for them.
 AGAINST, FOR, FINER = -2.0, 2.0, 1.0
-
-
-class Evidence(msgspec.Struct, frozen=True):
-    """Whether the richer model is kept, the geometric means of held-out losses that decided, and d in standard errors.
-
-    A loss is None where that model was not tried.
-    """
-
-    kept: bool
-    held_out_loss_with: float | None = None
-    held_out_loss_without: float | None = None
-    margin: float | None = None
 
 
 class Losses(NamedTuple):
@@ -56,7 +44,7 @@ def losses_of(problem: JointProblem, point: Point) -> Losses:
     return Losses(problem.held_out_losses(point), [block.clusters() for block in judged])
 
 
-def compare(without: Losses, richer: Losses, least: float) -> Evidence:
+def compare(without: Losses, richer: Losses, least: float) -> Decision:
     """Whether the richer model is kept: if d is more than `least` standard errors; where nothing is held out, it is not.
 
     >>> same = Losses([np.array([1.0, 2.0, 3.0])], [np.array([0, 1, 2])])
@@ -65,7 +53,7 @@ def compare(without: Losses, richer: Losses, least: float) -> Evidence:
     """
     counts = np.array([len(values) for values in richer.values])
     if not counts.sum():
-        return Evidence(False)
+        return Decision(False)
     differences, variances, logs = [], [], []
     for a, b, cluster in zip(without.values, richer.values, richer.clusters, strict=True):
         both = [np.bincount(cluster, losses + LEAST_LOSS) for losses in (a, b)]
@@ -78,4 +66,4 @@ def compare(without: Losses, richer: Losses, least: float) -> Evidence:
     d, error = float(share @ differences), float(np.sqrt(share**2 @ variances))
     margin = d / max(error, 1e-12)
     with_, without_ = (float(np.exp(share @ [pair[k] for pair in logs])) for k in (1, 0))
-    return Evidence(margin > least, with_, without_, margin)
+    return Decision(margin > least, with_, without_, margin)

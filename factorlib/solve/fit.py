@@ -26,12 +26,13 @@ from factorlib.light.prior import LightPrior
 from factorlib.model.blocks import Block
 from factorlib.model.illumination import Illumination
 from factorlib.model.lights import Light
-from factorlib.model.loss import Loss
 from factorlib.model.materials import Materials, Point
+from factorlib.model.noise import Loss
 from factorlib.model.problem import JointProblem
 from factorlib.model.responses import Reflections
+from factorlib.solve.arrow import System
 from factorlib.solve.descent import Descent, Report
-from factorlib.solve.marginal import Field, Marginal, positive_definite_inverse
+from factorlib.solve.marginal import Field, positive_definite_inverse
 from factorlib.solve.material_prior import MaterialPrior, materials_of, unknowns_of
 
 SURE = 0.6  # times the typical confidence of a material's normals: what is less sure is left out
@@ -39,9 +40,8 @@ DARK = 0.2  # of the noise model's absolute part is left where normals are sure
 ROBUST = Loss(3.0)  # beyond 3 σ of the noise model a residual is an outlier
 START_TEMPERATURE = 10.0
 SUNS = 1.0  # standard deviation of a sun's log radiance: outdoors, captured lights send a third to twice as much by it as by the sky
-LEAST_AT_START = (
-    0.01  # of reflectances: by its logarithm the derivative of a smaller one is nearly zero, and no step would move it
-)
+# Of reflectances: by its logarithm the derivative of a smaller one is nearly zero, and no step would move it.
+LEAST_AT_START = 0.01
 
 
 class Hyperparameters(msgspec.Struct, frozen=True):
@@ -107,8 +107,8 @@ def fitted(
         fields = state.fields
         if number or schedule.estimate:
             parts = list(zip(fields, state.parts, strict=True))
-            hyperparameters = list(problem.spread(lambda part: estimated(*part, prior, schedule.least), parts))
-            fields = [recounted(field, one, prior) for field, one in zip(fields, hyperparameters, strict=True)]
+            hyperparameters = list(problem.spread(lambda part: estimated(*part, schedule.least), parts))
+            fields = [recounted(field, one) for field, one in zip(fields, hyperparameters, strict=True)]
         state = descent.run(fields, state.theta, given, iterations)
     lights = [field.illumination.light for field in state.fields]
     return Fit(Point(materials if given else materials_of(state.theta), lights), hyperparameters, state.value)
@@ -119,14 +119,14 @@ def field_of(
 ) -> Field:
     """Give an illumination its table of responses, and say how much its observations and the prior count."""
     table = Reflections(illumination.block, illumination.light.unit_lobes, illumination.operator, materials_given)
-    field = Field(msgspec.structs.replace(illumination, table=table), np.zeros((0, 0)), 0.0, 1.0, ROBUST)
-    return recounted(field, one, prior)
+    field = Field(msgspec.structs.replace(illumination, table=table), prior, np.zeros((0, 0)), 0.0, 1.0, ROBUST)
+    return recounted(field, one)
 
 
-def recounted(field: Field, one: Hyperparameters, prior: LightPrior) -> Field:
+def recounted(field: Field, one: Hyperparameters) -> Field:
     """Return the field as other hyperparameters weight it."""
     light = field.illumination.light
-    Q, log_determinant = prior.precision(light.axis[~light.suns], one.factors)
+    Q, log_determinant = field.prior.precision(light.axis[~light.suns], one.factors)
     if light.suns.any():  # of which the prior on cells knows nothing
         own, cells = np.tile(light.suns, 3), Q
         Q = np.diag(np.where(own, SUNS**-2.0, 0.0))
@@ -137,16 +137,15 @@ def recounted(field: Field, one: Hyperparameters, prior: LightPrior) -> Field:
     return msgspec.structs.replace(field, precision=Q, log_determinant=log_determinant, temperature=one.temperature)
 
 
-def estimated(field: Field, part: Marginal, prior: LightPrior, least: float) -> Hyperparameters:
+def estimated(field: Field, part: System, least: float) -> Hyperparameters:
     """The hyperparameters by the residuals and the light that a descent ended with; part: its system there."""
     light = field.illumination.light
-    cells = np.flatnonzero(np.tile(~light.suns, 3))
-    free = np.flatnonzero(np.tile(light.free, 3))
-    found = positive_definite_inverse(part.light_hessian[: len(free), : len(free)]).matrix
+    cells, free = (np.flatnonzero(np.tile(which, 3)) for which in (~light.suns, light.free))
     covariance = np.zeros((3 * len(light), 3 * len(light)))
-    covariance[np.ix_(free, free)] = found
+    own = part.light_hessian[: len(free), : len(free)]
+    covariance[np.ix_(free, free)] = positive_definite_inverse(own).matrix
     covariance = covariance[np.ix_(cells, cells)]
-    factors = prior.likeliest_factors(light.axis[~light.suns], light.log_radiance[:, ~light.suns], covariance)
+    factors = field.prior.likeliest_factors(light.axis[~light.suns], light.log_radiance[:, ~light.suns], covariance)
     return Hyperparameters(temperature(field.illumination.block, field.illumination.residuals(), least), factors)
 
 

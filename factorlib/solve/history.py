@@ -8,10 +8,10 @@ import msgspec
 import numpy as np
 from jaxtyping import Bool
 
-from factorlib.model.loss import Loss
 from factorlib.model.materials import Point
+from factorlib.model.noise import Loss
 from factorlib.model.problem import JointProblem
-from factorlib.solve.evidence import Evidence
+from factorlib.results.materials import Decision
 from factorlib.solve.fit import Fit
 from factorlib.solve.options import Choices
 
@@ -59,13 +59,13 @@ class Solution(msgspec.Struct, frozen=True):
     history: list[Event]
     loss: Loss
     lambertian: Bool[np.ndarray, " m"]
-    shadows: Evidence = Evidence(False)
-    interreflection: Evidence = Evidence(False)
-    specular: list[Evidence] = []
-    tone: list[Evidence] = []
-    distances: list[Evidence] = []
-    splitting: list[Evidence] = []
-    suns: list[Evidence] = []
+    shadows: Decision = Decision(False)
+    interreflection: Decision = Decision(False)
+    specular: list[Decision] = []
+    tone: list[Decision] = []
+    distances: list[Decision] = []
+    splitting: list[Decision] = []
+    suns: list[Decision] = []
     materials: Fit | None = None
     lights: Fit | None = None
 

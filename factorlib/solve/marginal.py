@@ -16,7 +16,7 @@ deconvolution algorithms").  Of a radiance that is linear in w ∝ exp(u), ∂J/
 
     ½ ∂ log det H/∂θ = Σ_i J_i Σ (∂J_i/∂θ)ᵀ / T,      ½ ∂ log det H/∂u_j = Σ_i (J_i Σ)_j J_ij / T.               (2)
 
-The second is felt by materials through the light that they imply, du/dθ = −L⁻¹Cᵀ (`factorlib.solve.descent`).  Left out, it would
+The second is felt by materials through the light that they imply, du/dθ = −L⁻¹Cᵀ (`factorlib.solve.arrow`).  Left out, it would
 push all reflectances down: a brighter light under darker materials has the same J.  The Gauss–Newton Hessian Σ_i ∂J_i Σ ∂J_iᵀ of the first
 steers the steps of a descent and nothing else, so every `SPARSE`-th row stands for its neighbours.
 
@@ -36,9 +36,11 @@ from jaxtyping import Float, Int
 from scipy.linalg import LinAlgError
 from scipy.linalg.lapack import dpotrf, dpotri
 
+from factorlib.light.prior import LightPrior
 from factorlib.model.illumination import Illumination, Linearised
 from factorlib.model.lights import Light
-from factorlib.model.loss import Loss
+from factorlib.model.noise import Loss
+from factorlib.solve.arrow import System
 
 SPARSE = 8  # rows of which one enters the Hessian of the determinant
 EXPOSURE, TONE = 3.0, 0.3  # standard deviations of a log exposure and of a log tone exponent
@@ -47,41 +49,22 @@ EXPOSURE, TONE = 3.0, 0.3  # standard deviations of a log exposure and of a log 
 class Field(msgspec.Struct, frozen=True):
     """One illumination and how much its parts count.
 
-    illumination  with its table;  precision: Q, channel by channel, with its log determinant
+    illumination  with its table;  prior: on its light;  precision: Q, channel by channel, with its log determinant
     temperature   T;  loss: ρ
     """
 
     illumination: Illumination
+    prior: LightPrior
     precision: Float[np.ndarray, "3p 3p"]
     log_determinant: float
     temperature: float
     loss: Loss
 
 
-class Marginal(NamedTuple):
-    """The value of (1), or of φ where materials are given, the loss Σ ρ(r) in it, and the Gauss–Newton system of it: half the gradient and half the Hessian.
+def marginal(field: Field, clusters: Int[np.ndarray, " n"] | None = None, materials_given: bool = False) -> System:
+    """The value of (1), or of φ where materials are given, and its system, of one illumination; the first 3p unknowns of the light are u.
 
-    places   numbers of the k unknowns of the materials that the block shows, ascending;  the light has l unknowns, of which 3p are u
-    determinant_by_light   the second of (2)
-    scores   the parts of the gradient of φ by materials and light, one a cluster of observations, where clusters were asked for
-    """
-
-    value: float
-    loss: float
-    places: Int[np.ndarray, " k"]
-    material_gradient: Float[np.ndarray, " k"]
-    material_hessian: Float[np.ndarray, "k k"]
-    light_gradient: Float[np.ndarray, " l"]
-    cross_hessian: Float[np.ndarray, "k l"]
-    light_hessian: Float[np.ndarray, "l l"]
-    determinant_by_light: Float[np.ndarray, " l"]
-    scores: Float[np.ndarray, "g k+l"] | None = None
-
-
-def marginal(field: Field, clusters: Int[np.ndarray, " n"] | None = None, materials_given: bool = False) -> Marginal:
-    """The system of one illumination.
-
-    clusters: number of each observation's cluster, from 0, for `Marginal.scores`
+    clusters: number of each observation's cluster, from 0, for `System.scores`
     materials_given: the value is φ alone, which is what the light minimises, and no derivative of the determinants, which take most of
     the time, is in the system
     """
@@ -117,7 +100,7 @@ def marginal(field: Field, clusters: Int[np.ndarray, " n"] | None = None, materi
     loss = float(field.loss.of_residuals(residual)[~one.block.held_out].sum())
     value += loss / T
     if materials_given:
-        return Marginal(value, loss, places, g_m, M, g_l, C, L, by_light, scores)
+        return System(value, loss, places, g_m, M, g_l, C, L, by_light, scores)
     covariance, log_determinant = positive_definite_inverse(L[: 3 * p, : 3 * p])
     value += log_determinant - field.log_determinant
     for part in parts:
@@ -126,7 +109,7 @@ def marginal(field: Field, clusters: Int[np.ndarray, " n"] | None = None, materi
         g_m[at] += gradient
         M[np.ix_(at, at)] += hessian
         by_light[own] += by_cells
-    return Marginal(value, loss, places, g_m, M, g_l, C, L, by_light, scores)
+    return System(value, loss, places, g_m, M, g_l, C, L, by_light, scores)
 
 
 def _priors(field: Field, light: Light) -> tuple[float, Float[np.ndarray, " l"], Float[np.ndarray, "l l"]]:

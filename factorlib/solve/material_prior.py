@@ -4,7 +4,7 @@ A material is dielectric, metal or fabric, by shares π_c.  With l = log k_s of 
 
     p(l, roughness) = Σ_c π_c N(x; μ_c, S_c) Π N(l − l̄; 0, τ_c²)                                                  (1)
 
-the last over the two dimensions of l − l̄.  μ_c, S_c and τ_c are those of measured materials (`python -m factorlib.material_classes`,
+the last over the two dimensions of l − l̄.  μ_c, S_c and τ_c are those of measured materials (`studies.measured.material_classes`,
 material_classes.json), S_c and τ_c widened by what a solve does not know better: the scale of reflectances and the white balance of photos
 (SCALE, ROUGHNESS_SLACK, WHITE).  Dielectrics reflect ((n − 1)/(n + 1))² of a ray along the normal, .02 to .08, in all colours alike; metals
 more, with a tint; fabrics scatter within, which GGX shows as a strong and very rough part.  So a smooth surface with k_s = .3 is metal, a

@@ -1,4 +1,4 @@
-"""What a user may choose of the solver: names, ranges, defaults and what they mean, once."""
+"""What a user may choose of the solvers: names, ranges, defaults and what they mean, once."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ Seed = Annotated[int, Meta(ge=0)]
 
 
 class Choices(Struct, frozen=True):
-    """A user may choose these of the solver."""
+    """A user may choose these of the joint solve."""
 
     cells: Annotated[int, Meta(ge=12, le=1600)] = 400
     """Cells of a light before any of them splits; 400 are 10° apart."""
@@ -32,3 +32,20 @@ class Choices(Struct, frozen=True):
     or, in part, by more than one."""
     seed: Seed = 0
     """Seed of what is held out, and of the observations that are drawn."""
+
+
+class FewLobes(Choices, frozen=True):
+    """A user may choose these of the solver of few lobes; of those of the joint solve it takes the seed alone."""
+
+    lobes: Lobes = 72
+    """Most lobes of an illumination; held-out observations may stop earlier."""
+    insert: Annotated[int, Meta(ge=1, le=64)] = 12
+    """Lobes that each illumination gets in a round."""
+    rounds: Annotated[int, Meta(ge=1, le=100)] = 12
+    """Most rounds of inserting lobes."""
+    iterations: Annotated[int, Meta(ge=1, le=1000)] = 10
+    """Iterations of the joint descent in a round."""
+    polish: Annotated[int, Meta(ge=0, le=1000)] = 20
+    """Iterations of the descent at the end, on four times the sample; at most two more follow on all observations."""
+    sample: Annotated[int, Meta(ge=50)] = 1500
+    """Least number of observations of an illumination on which lobes are chosen; 60 for each lobe where that is more."""

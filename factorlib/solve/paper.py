@@ -11,7 +11,7 @@ Left open by the paper, or by what is known of it here, and chosen:
 Bounds       by parametrisation: reflectances and roughness through a sigmoid, log sharpness through a sigmoid onto
              `SHARPNESS`, weights through softplus, axes as unnormalised vectors.
 Start        reflectances from mean radiances (`start`), lobes evenly over the sphere, as wide as they are apart, white.
-Subset       `subset` observations of all illuminations together.
+Subset       `SUBSET` observations of all illuminations together.
 Curvature    a pair (step, change of gradient) is measured on one subset, at both ends of the step, so that the change
              of subset is not taken for curvature (Schraudolph, Yu and Günter 2007, "A stochastic quasi-Newton method for
              online convex optimization"); pairs outlive their subset.
@@ -40,10 +40,10 @@ from torch import Tensor
 from factorlib.geometry.sphere import fibonacci_sphere
 from factorlib.model.gauge import in_gauge
 from factorlib.model.lights import Light
-from factorlib.model.loss import Loss
 from factorlib.model.materials import ROUGHNESS, SHARPNESS, Materials, Point
+from factorlib.model.noise import Loss
 from factorlib.model.problem import JointProblem
-from factorlib.model.responses import UnitReflection, cosines, radiance_of
+from factorlib.reflection.operator import Operator
 from factorlib.solve.history import Event, Report, Solution, unreported
 from factorlib.solve.options import Lobes, Seed
 from factorlib.solve.start import starting_materials
@@ -55,6 +55,7 @@ MEMORY = 20  # pairs
 LARGEST_STEP = 0.05
 SUFFICIENT, HALVINGS = 1e-4, 12
 REPORTS = 20  # in a run
+SUBSET = 512  # observations
 
 Samplings = Annotated[float, msgspec.Meta(gt=0)]
 Prior = Annotated[float, msgspec.Meta(ge=0)]
@@ -65,10 +66,7 @@ class Paper(msgspec.Struct, frozen=True):
 
     lobes: Lobes = 32
     samplings: Samplings = 5.0
-    subset: int = 512
     prior: Prior = 0.1
-    start_roughness: float = 0.4
-    start_specular_share: float = 0.2
     seed: Seed = 0
 
 
@@ -77,11 +75,11 @@ def solve(problem: JointProblem, materials: int, paper: Paper, report: Report = 
     problem = problem.with_effects(False, False).with_loss(Loss(prior=paper.prior))
     objective, history, blocks = PaperObjective(problem, materials, paper), list[Event](), problem.blocks
     rows = [np.flatnonzero(~block.held_out) for block in blocks]
-    iterations = math.ceil(paper.samplings * sum(map(len, rows)) / paper.subset)
+    iterations = math.ceil(paper.samplings * sum(map(len, rows)) / SUBSET)
     every, lobes = max(1, iterations // REPORTS), paper.lobes * len(blocks)
     x, pairs, random = objective.start(), deque(maxlen=MEMORY), np.random.default_rng(paper.seed)
     for iteration in range(iterations):
-        subset = drawn(rows, paper.subset, random)
+        subset = drawn(rows, SUBSET, random)
         x, value = stepped(lambda at, s=subset: objective.at(at, s), x, pairs)
         if (iteration + 1) % every == 0 or iteration + 1 == iterations:
             held_out = problem.held_out_loss(objective.point(x))
@@ -142,7 +140,7 @@ class PaperObjective:
     def __init__(self, problem: JointProblem, materials: int, paper: Paper):
         blocks = problem.blocks
         self.blocks, self.operator, self.paper = blocks, problem.operator, paper
-        self.begin = starting_materials(blocks, materials, paper.start_specular_share, paper.start_roughness)
+        self.begin = starting_materials(blocks, materials)
         self.sizes = [7 * materials] + [7 * paper.lobes + len(block.photos) - 1 for block in blocks]
 
     def start(self) -> Float[Tensor, " k"]:
@@ -191,16 +189,49 @@ class PaperObjective:
                     torch.from_numpy(of[own])
                     for of in (block.normal, block.view, block.photo, block.radiance, block.precision, block.clipped)
                 )
-                seen = cosines(normal, view, axis)
+                seen = (normal * view).sum(1), normal @ axis.T, view @ axis.T  # n·o, n·z and o·z
                 lit = UnitReflection.apply(self.operator, roughness[m], log_sharpness, *seen)
+                by_diffuse, by_specular = (part @ weight for part in lit)
                 exposure = torch.exp(log_exposure)[photo][:, None]
-                predicted = radiance_of(exposure, diffuse[m], specular[m], *(part @ weight for part in lit))
+                predicted = exposure * (diffuse[m] * by_diffuse + specular[m] * by_specular)
                 difference = (predicted - radiance) * precision
                 squares = squares + (difference.masked_fill(clipped & (difference > 0), 0.0) ** 2).sum()
                 values += difference.numel()
         value = squares / max(values, 1) + self.paper.prior * prior / len(self.blocks)
         value.backward()
         return value.item(), x.grad
+
+
+class UnitReflection(torch.autograd.Function):
+    """D and S [n, p] without shadows, for autograd; the derivatives are those of the operator's `response`."""
+
+    @staticmethod
+    def forward(
+        ctx: torch.autograd.function.FunctionCtx,
+        operator: Operator,
+        roughness: Tensor,
+        log_sharpness: Tensor,
+        *cosines: Tensor,
+    ) -> tuple[Tensor, Tensor]:
+        """D and S;  cosines: n·o [n], n·z and o·z [n, p]."""
+        inputs = [t.detach().to(operator.dtype) for t in (roughness, log_sharpness.exp(), *cosines)]
+        r = operator.response(*inputs)
+        slopes = (
+            *(r.specular_by_roughness, r.diffuse_by_log_sharpness, r.specular_by_log_sharpness),
+            *(r.diffuse_by_nz, r.specular_by_nz, r.specular_by_oz),
+        )
+        ctx.save_for_backward(*(slope.to(cosines[1].dtype) for slope in slopes))
+        return r.diffuse.to(cosines[1].dtype), r.specular.to(cosines[1].dtype)
+
+    @staticmethod
+    def backward(
+        ctx: torch.autograd.function.FunctionCtx, diffuse: Tensor, specular: Tensor
+    ) -> tuple[Tensor | None, ...]:
+        """Gradients by roughness, log sharpness, n·z and o·z; views are given, so there is none by n·o."""
+        by_roughness, d_by_sharpness, s_by_sharpness, d_by_nz, s_by_nz, s_by_oz = ctx.saved_tensors
+        by_sharpness = (diffuse * d_by_sharpness + specular * s_by_sharpness).sum(0)
+        by_nz = diffuse * d_by_nz + specular * s_by_nz
+        return None, (specular * by_roughness).sum(), by_sharpness, None, by_nz, specular * s_by_oz
 
 
 def _unbounded(value: Float[np.ndarray, "*n"], bounds: tuple[float, float] = (0.0, 1.0)) -> Float[np.ndarray, "*n"]:

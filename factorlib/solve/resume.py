@@ -15,29 +15,12 @@ import numpy as np
 import torch
 
 from factorlib.checkpoint import Checkpoint
-from factorlib.light.prior import LightPrior
+from factorlib.light.prior import LightPrior, read_light_prior
 from factorlib.model.problem import JointProblem
 from factorlib.solve.fit import Fit, Schedule, fitted
-from factorlib.solve.history import Event, Report
+from factorlib.solve.history import Event, Report, unreported
 
 T = TypeVar("T")
-
-
-class Journal:
-    """The parts that are done; a checkpoint of no file keeps nothing beyond this process (a notebook, a test)."""
-
-    def __init__(self, checkpoint: Checkpoint = Checkpoint(None)):
-        self._checkpoint, self._parts = checkpoint, checkpoint.load() or {}
-
-    def kept(self, part: str, type_: type[T]) -> T | None:
-        """What was saved of the part; None where it was not done."""
-        return restored(type_, self._parts[part]) if part in self._parts else None
-
-    def keep(self, part: str, value: T, type_: type[T]) -> T:
-        """Save the part; returns `value` as `kept` would."""
-        self._parts[part] = plain(value)
-        self._checkpoint.save(self._parts)
-        return restored(type_, self._parts[part])
 
 
 def plain(value: Any) -> Any:
@@ -60,20 +43,28 @@ def restored(type_: type[T], value: Any) -> T:
 
 
 class Parts:
-    """What is done part by part: the journal keeps each part with its events, which are reported and remembered."""
+    """What is done part by part: each part is kept with its events, which are reported and remembered.
 
-    def __init__(self, journal: Journal, report: Report, prior: LightPrior):
-        self.journal, self.report, self.prior, self.history = journal, report, prior, list[Event]()
+    checkpoint: of no file, it keeps nothing beyond this process (a notebook, a test);  report: called at every point that is tried;  prior: on
+    lights; None: the one that is shipped
+    """
+
+    def __init__(
+        self, checkpoint: Checkpoint = Checkpoint(None), report: Report = unreported, prior: LightPrior | None = None
+    ):
+        self.report, self.prior, self.history = report, prior or read_light_prior(), list[Event]()
+        self._checkpoint, self._kept = checkpoint, checkpoint.load() or {}
 
     def part(self, name: str, type_: type[T], compute: Callable[[], T]) -> T:
-        """The part as the journal has it, or computed now and kept; its events join the history."""
-        if (kept := self.journal.kept(name, type_)) is not None:
-            for event in self.journal.kept(f"{name}, events", list[Event]):
+        """The part as it was saved, or computed now and saved; its events join the history."""
+        if name in self._kept:
+            for event in restored(list[Event], self._kept[f"{name}, events"]):
                 self._happened(event)
-            return kept
-        before, value = len(self.history), compute()
-        self.journal.keep(f"{name}, events", self.history[before:], list[Event])
-        return self.journal.keep(name, value, type_)
+        else:
+            before, value = len(self.history), compute()
+            self._kept |= {f"{name}, events": plain(self.history[before:]), name: plain(value)}
+            self._checkpoint.save(self._kept)
+        return restored(type_, self._kept[name])
 
     def fit(self, phase: str, problem: JointProblem, start: Fit, schedule: Schedule) -> Fit:
         """`fitted`, under the prior on lights; every point that is tried is an event of this phase."""

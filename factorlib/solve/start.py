@@ -26,6 +26,7 @@ from factorlib.model.gauge import connected_components
 from factorlib.model.illumination import Illumination
 from factorlib.model.lights import TONE, Light, even_cells
 from factorlib.model.materials import LEAST_REFLECTANCE, SHARPNESS, Materials, Point
+from factorlib.model.noise import Loss
 from factorlib.model.problem import JointProblem
 from factorlib.results.solution import Earlier
 from factorlib.solve.options import Choices
@@ -36,9 +37,8 @@ ROUGHNESS, SPECULAR_SHARE = 0.4, 0.2  # of every material at the start
 FEW, STARTS = 2, (0.15, 0.4, 0.8)  # with so few materials, a solve starts from several roughnesses
 LEAST_RADIANCE = 1e-6  # of a block's mean
 
-Start = Callable[
-    [JointProblem, int], list[Point]
-]  # points on so many cells a light, of which the one that explains most goes on
+# Points on so many cells a light, of which the one that explains most goes on.
+Start = Callable[[JointProblem, int], list[Point]]
 
 
 def from_nothing(materials: int) -> Start:
@@ -47,7 +47,7 @@ def from_nothing(materials: int) -> Start:
     def points(problem: JointProblem, cells: int) -> list[Point]:
         """One point a roughness, its lights constant."""
         blocks, roughness = problem.blocks, STARTS if materials <= FEW else STARTS[1:2]
-        begun = [starting_materials(blocks, materials, roughness=one) for one in roughness]
+        begun = [starting_materials(blocks, materials, one) for one in roughness]
         return [Point(of, [constant_light(block, of, cells) for block in blocks]) for of in begun]
 
     return points
@@ -97,13 +97,11 @@ def with_decided(choices: Choices, earlier: Earlier) -> Choices:
     return choices
 
 
-def starting_materials(
-    blocks: Sequence[Block], count: int, specular_share: float = SPECULAR_SHARE, roughness: float = ROUGHNESS
-) -> Materials:
+def starting_materials(blocks: Sequence[Block], count: int, roughness: float = ROUGHNESS) -> Materials:
     """Materials whose diffuse part explains the median radiances and whose specular part is grey."""
     albedo = mean_albedo(blocks, count)
-    diffuse = np.maximum(albedo * (1 - specular_share), 10 * LEAST_REFLECTANCE)
-    specular = np.maximum(np.full((count, 3), specular_share * BRIGHTEST_AT_START / 2), 10 * LEAST_REFLECTANCE)
+    diffuse = np.maximum(albedo * (1 - SPECULAR_SHARE), 10 * LEAST_REFLECTANCE)
+    specular = np.maximum(np.full((count, 3), SPECULAR_SHARE * BRIGHTEST_AT_START / 2), 10 * LEAST_REFLECTANCE)
     return Materials(diffuse, specular, np.full(count, roughness))
 
 
@@ -140,80 +138,59 @@ def constant_light(block: Block, materials: Materials, cells: int) -> Light:
 
 
 def known_point(problem: JointProblem, earlier: Earlier, names: Sequence[str], cells: int) -> Point:
-    """Build the point from which a solve starts that has an earlier solution."""
+    """Build the point from which a solve starts that has an earlier solution.
+
+    Each component of the earlier gauge comes to the scale of `mean_albedo` by the geometric mean, over its materials that a block shows, or over all
+    of them where none is shown.
+    """
     blocks, component = problem.blocks, [earlier.table.gauge.component.get(name) for name in names]
-    factors = gauge_factors(earlier, names, component, mean_albedo(blocks, len(names)), blocks)
-    rows = starting_materials(blocks, len(names)).rows()
-    for m, name in enumerate(names):
-        if component[m] is not None:
-            known, factor = earlier.table.materials[name], factors[component[m]]
-            rows[m] = [*(known.diffuse * factor), *(known.specular * factor), known.roughness]
+    albedo, rows = mean_albedo(blocks, len(names)), starting_materials(blocks, len(names)).rows()
+    shown, factors = {int(m) for block in blocks for m in np.unique(block.material)}, {}
+    for c in sorted({c for c in component if c is not None}):
+        members = [m for m in range(len(names)) if component[m] == c]
+        known = {m: earlier.table.materials[names[m]] for m in members}
+        judged = [m for m in members if m in shown] or members
+        whole = np.array([np.array(known[m].diffuse) + np.array(known[m].specular) for m in judged])
+        factor = np.exp(np.mean(np.log(albedo[judged]) - np.log(np.maximum(whole, LEAST_RADIANCE)), axis=0))
+        for m, one in known.items():
+            rows[m] = [*(one.diffuse * factor), *(one.specular * factor), one.roughness]
+        factors[c] = factor
     materials, lights = Materials.of_vector(rows.reshape(-1)), []
     for block in blocks:
         light = constant_light(block, materials, cells)
-        shown = [component[m] for m in np.unique(block.material) if component[m] is not None]
-        if shown:
-            factor = factors[max(set(shown), key=lambda c: (shown.count(c), -c))]
-            light = better_one(problem, block, materials, known_light(block, light, earlier, factor), light)
+        own = [component[m] for m in np.unique(block.material) if component[m] is not None]
+        if own:
+            factor = factors[max(set(own), key=lambda c: (own.count(c), -c))]
+            lit = Illumination(block, light, materials, problem.operator)
+            light = earlier_light(lit, earlier, factor, problem.loss)
         lights.append(light)
     return Point(materials, lights)
 
 
-def gauge_factors(
-    earlier: Earlier,
-    names: Sequence[str],
-    component: Sequence[int | None],
-    albedo: Float[np.ndarray, "m 3"],
-    blocks: Sequence[Block],
-) -> dict[int, Float[np.ndarray, "3"]]:
-    """Find, for each component of the earlier solution, the factor per channel that brings its reflectances to the scale of `albedo`.
-
-    The factor is the geometric mean over the component's materials that a block shows, or over all of them where none is shown.
-    """
-    shown, factors = {int(m) for block in blocks for m in np.unique(block.material)}, {}
-    for c in sorted({c for c in component if c is not None}):
-        members = [m for m in range(len(names)) if component[m] == c]
-        members = [m for m in members if m in shown] or members
-        known = [earlier.table.materials[names[m]] for m in members]
-        whole = np.array([np.array(one.diffuse) + np.array(one.specular) for one in known])
-        factors[c] = np.exp(np.mean(np.log(albedo[members]) - np.log(np.maximum(whole, LEAST_RADIANCE)), axis=0))
-    return factors
-
-
-def known_light(block: Block, constant: Light, earlier: Earlier, factor: Float[np.ndarray, "3"]) -> Light | None:
-    """Bring the earlier light of a block to the block's unit and the start's gauge; None where there is none.
+def earlier_light(constant: Illumination, earlier: Earlier, factor: Float[np.ndarray, "3"], loss: Loss) -> Light:
+    """The earlier light of a block in the block's unit and the start's gauge; the constant one where there is none, or it explains the block worse.
 
     A photo that the earlier solution does not have gets its exposure in the constant light, beside those of the others.
     """
+    block, model, before = constant.block, earlier.table.model, constant.light.log_exposure
     lobes = earlier.lights.get(block.name)
     exposure = np.array([np.log(np.mean(earlier.exposures.get(photo, (np.nan,) * 3))) for photo in block.photos])
-    if not lobes or np.isnan(exposure).all():
-        return None
     new = np.isnan(exposure)
-    level = np.mean(exposure[~new] - constant.log_exposure[~new])
-    exposure = np.where(new, constant.log_exposure + level, exposure)
-    tone = [earlier.table.model.tone[photo].exponent for photo in block.photos if photo in earlier.table.model.tone]
-    return Light(
+    if not lobes or new.all():
+        return constant.light
+    exposure = np.where(new, before + np.mean(exposure[~new] - before[~new]), exposure)
+    tone = [model.tone[photo].exponent for photo in block.photos if photo in model.tone]
+    light = Light(
         lobes.axis / np.linalg.norm(lobes.axis, axis=1, keepdims=True),
         np.log(np.maximum(lobes.sharpness, SHARPNESS[0])),
         np.maximum(lobes.weight, 0) / block.unit / factor * np.exp(exposure[0]),
         exposure - exposure[0],
         np.log(np.clip(tone, *TONE)) if len(tone) == len(block.photos) else np.zeros(0),
-        earlier.table.model.curvature(block.name),
+        model.curvature(block.name),
     )
-
-
-def better_one(
-    problem: JointProblem, block: Block, materials: Materials, known: Light | None, constant: Light
-) -> Light:
-    """Return the known light, unless the constant one explains the block better."""
-    if known is None:
-        return constant
-    lit = [Illumination(block, one, materials, problem.operator) for one in (known, constant)]
-    if lit[0].losses(problem.loss).mean() <= lit[1].losses(problem.loss).mean():
-        return known
-    log.warning(
-        "illumination '%s' starts anew: what the earlier solution says of it explains less than a constant light",
-        block.name,
-    )
-    return constant
+    lit = msgspec.structs.replace(constant, light=light)
+    if lit.losses(loss).mean() <= constant.losses(loss).mean():
+        return light
+    said = "illumination '%s' starts anew: what the earlier solution says of it explains less than a constant light"
+    log.warning(said, block.name)
+    return constant.light

@@ -27,8 +27,9 @@ from factorlib.light.prior import LightPrior
 from factorlib.meshes.fine import Fine
 from factorlib.model.materials import Point
 from factorlib.model.problem import JointProblem
+from factorlib.results.materials import Decision
 from factorlib.solve.choices import effects_chosen
-from factorlib.solve.evidence import FOR, Evidence, Losses, compare, losses_of
+from factorlib.solve.evidence import FOR, Losses, compare, losses_of
 from factorlib.solve.fit import Fit, Schedule, field_of, fitted, sure_ones
 from factorlib.solve.marginal import marginal
 from factorlib.solve.options import Choices
@@ -95,8 +96,8 @@ class Found(msgspec.Struct, frozen=True):
     displacements  by mesh, at nodes, in extents; none where surfaces stay;  log_factors: by mesh, likewise
     """
 
-    evidence: Evidence
-    painted: Evidence = Evidence(False)
+    evidence: Decision
+    painted: Decision = Decision(False)
     stiffness: Stiffness = Stiffness(None)
     gains: dict[str, float] = {}
     displacements: dict[str, Float[np.ndarray, " n"]] = {}
@@ -118,7 +119,7 @@ class Judged(msgspec.Struct, frozen=True):
         return float(gains.mean() / max(gains.std(ddof=1) / np.sqrt(len(gains)), 1e-12))
 
 
-def evidence_of(after: Judged, before: Judged, held_out: float, likelihood: float) -> Evidence:
+def evidence_of(after: Judged, before: Judged, held_out: float, likelihood: float) -> Decision:
     """Whether detail is kept: better by more than so many standard errors in each of the two measures."""
     evidence = compare(before.losses, after.losses, held_out)
     return msgspec.structs.replace(evidence, kept=evidence.kept and after.gain_over(before) > likelihood)
@@ -218,12 +219,12 @@ def found(
     fit = fitted(effects.of(problem), effects.fit, prior, SETTLE)
     trial, plain = Trial(effects.of(problem), fit, surfaces, attached, prior), no_detail(surfaces.nodes)
     if len(trial.photos) < 2 or problem.none_held_out:
-        return Found(Evidence(False))
+        return Found(Decision(False))
     laplacian, parts, given = surfaces.laplacian(), trial.parts(plain, fit), trial.judged([plain] * len(trial.photos))
 
     def best(
         tried: list[Stiffness], before: Judged, done: float, held_out: float, likelihood: float
-    ) -> tuple[Stiffness, list[Detail], Judged, Evidence]:
+    ) -> tuple[Stiffness, list[Detail], Judged, Decision]:
         """The likeliest of several stiffnesses, the surfaces it gives each photo, what photos say of them, and whether they are kept.
 
         before: what photos say without it;  held_out, likelihood: by how many standard errors it must be better, in each of the two measures

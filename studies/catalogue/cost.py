@@ -118,14 +118,14 @@ def measured(seed: int, side: int, solve: dict[str, Any]) -> dict[str, float]:
 
     from factorlib.model.problem import JointProblem
     from factorlib.reflection import reflection_operator
-    from factorlib.solve.few_lobes.options import FewLobes, Run
     from factorlib.solve.few_lobes.solve import few_lobes
+    from factorlib.solve.options import FewLobes
     from studies.scenes.problems import square
 
     operator = reflection_operator("network")
     joint = JointProblem(square(side, operator, seed), operator)
     before, start = peak_bytes(), time.process_time()
-    few_lobes(joint, side, Run(msgspec.convert({**solve, "seed": seed}, FewLobes)))
+    few_lobes(joint, side, msgspec.convert({**solve, "seed": seed}, FewLobes))
     seconds, peak = time.process_time() - start, peak_bytes()
     memory = {"peak": peak / 1e9, "grown": (peak - before) / 1e9}
     return {"seconds": seconds, "seconds_an_entry": seconds / side**2, **memory}

@@ -26,7 +26,7 @@ import numpy as np
 from factorlib.errors import InputError
 from factorlib.images.light_map import maps_in
 from factorlib.jsonfile import write_json
-from factorlib.light_prior import prior_of
+from studies.measured.light_prior import prior_of
 from studies.measured.standard_errors import light_deviations, material_deviations
 from studies.measured.tools import ROOT, Tables, evaluated, table, value_at
 

@@ -25,8 +25,8 @@ from factorlib.model.observed import blocks_of_observations
 from factorlib.model.problem import JointProblem
 from factorlib.reflection import reflection_operator
 from factorlib.reflection.operator import Operator
-from factorlib.solve.few_lobes.options import FewLobes, Run
 from factorlib.solve.few_lobes.solve import few_lobes
+from factorlib.solve.options import FewLobes
 from factorlib.urm.extract import Taken, observations_of_photo
 from factorlib.urm.merge import merge
 from factorlib.urm.observations import concatenate
@@ -90,8 +90,8 @@ def solved_materials(photos: list[posed.Photo], operator: Operator) -> Materials
         name = f"photo{k}"
         seen.append(merge(observations_of_photo(photo.channels, geometry, Taken(name, name), ["a", "b", "c"]), 2.0))
     blocks = blocks_of_observations(concatenate(seen), Noise())
-    options = FewLobes(rounds=4, sample=800, polish=4, settle=0, tolerance=1e-3)
-    return few_lobes(JointProblem(blocks, operator), 3, Run(options)).point.materials
+    options = FewLobes(rounds=4, sample=800, polish=4)
+    return few_lobes(JointProblem(blocks, operator), 3, options).point.materials
 
 
 def shading() -> list[list[str]]:

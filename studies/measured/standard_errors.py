@@ -18,9 +18,9 @@ from jaxtyping import Float
 from factorlib.errors import InputError
 from factorlib.geometry.sphere import fibonacci_sphere
 from factorlib.images.exr import read_rgb_exr
-from factorlib.light.prior_fit import cell_means
 from factorlib.results.materials import in_order, read_materials
 from factorlib.results.metrics import read_metrics
+from studies.measured.light_prior import cell_means
 from studies.measured.tools import table
 
 CELLS = 500  # of equal area, 9° apart

@@ -12,8 +12,8 @@ from factorlib.diagnose.uncertainty import (
     relative_standard_errors,
     standard_errors,
 )
-from factorlib.model.loss import Loss
 from factorlib.model.materials import Materials, Point
+from factorlib.model.noise import Loss
 from factorlib.model.problem import JointProblem
 from factorlib.reflection import reflection_operator
 from factorlib.solve.few_lobes.descent import Iterate, descend, evaluate
@@ -139,7 +139,7 @@ def test_a_colour_that_all_lights_have_is_named_where_interreflection_fixes_it(t
         blocks = [replaced(one, bounced=np.zeros((len(one), 6))) for one in blocks]
     pairs = enumerate(zip(grey, tints, strict=True))
     lights = [replaced(light, weight=10.0**k * light.weight * tint) for k, (light, tint) in pairs]
-    sentences = tinted_alike(("a", "b", "c"), blocks, lights)
+    sentences = list(tinted_alike(JointProblem(blocks, operator), Point(MATERIALS, lights)))
     assert len(sentences) == said
     if said:
         for words in ("room0, room1", "R : G : B = 0.4", "solve.interreflection=off"):

@@ -3,10 +3,9 @@
 import numpy as np
 import pytest
 
-from factorlib.light.lobes import Lobes
 from factorlib.model.illumination import Illumination
 from factorlib.model.lights import Light, even_cells
-from factorlib.solve.solve import SMALLEST, SPLIT, brightest
+from factorlib.solve.solve import SMALLEST, SPLIT
 from studies.scenes.problems import MATERIALS, block
 from tests.solve.made import OPERATOR, drawn, on_even_cells
 
@@ -15,7 +14,7 @@ DIRECTIONS /= np.linalg.norm(DIRECTIONS, axis=1, keepdims=True)
 
 
 def shown(light: Light, directions=DIRECTIONS) -> np.ndarray:
-    return Lobes(light.axis, light.sharpness, light.weight).radiance(directions)
+    return light.lobes.radiance(directions)
 
 
 def smooth(cells: int) -> Light:
@@ -62,10 +61,10 @@ def test_split_cells_leave_no_dark_or_bright_spots(scattered):
 
 
 def test_the_brightest_split_but_none_that_is_too_small():
-    light = on_even_cells(drawn(1, 200))
-    which = brightest(light)
+    light, how = on_even_cells(drawn(1, 200)), (SPLIT, 2 * np.radians(SMALLEST))
+    which = light.brightest(*how)
     assert which.sum() == SPLIT and light.energy.sum(1)[which].min() >= light.energy.sum(1)[~which].max()
     for _ in range(8):
-        light = light.split(brightest(light))
+        light = light.split(light.brightest(*how))
     assert np.degrees(2 / np.sqrt(light.sharpness)).min() > SMALLEST
-    assert brightest(on_even_cells(np.zeros((3, 12)))).all()
+    assert on_even_cells(np.zeros((3, 12))).brightest(*how).all()

@@ -12,7 +12,6 @@ from factorlib.model.materials import Materials, Point
 from factorlib.model.noise import Noise
 from factorlib.model.observed import blocks_of_observations
 from factorlib.reflection import reflection_operator
-from factorlib.solve.few_lobes.unknowns import joined
 from studies.scenes.problems import MATERIALS, block, random_light
 from tests.model.made import OPERATOR, bowls, photos_in_a_wrong_light, rough_light, three_rooms
 
@@ -37,7 +36,7 @@ def test_radiance_is_linear_in_light_and_atoms_are_what_a_lobe_adds_to_the_resid
     np.testing.assert_allclose(twice.radiance(), 2 * straight.radiance())
     lobe, weight = UnitLobes(np.array([[0.6, 0.0, -0.8]]), np.array([20.0])), np.array([[0.3, 0.2, 0.1]])
     rows = np.flatnonzero(~clipped.block.clipped.any(1))
-    more = msgspec.structs.replace(straight, light=joined(straight.light, lobe, weight))
+    more = msgspec.structs.replace(straight, light=straight.light.with_lobes(lobe, weight))
     added = (more.residuals() - straight.residuals())[rows]
     atoms = straight.atoms(rows, lobe)[:, :, 0].T
     np.testing.assert_allclose(atoms * weight, added, atol=1e-9 * np.abs(added).max())

@@ -9,8 +9,8 @@ from hypothesis import strategies as st
 from factorlib.geometry.sphere import fibonacci_sphere
 from factorlib.model.illumination import Illumination
 from factorlib.model.lights import UnitLobes, even_cells
-from factorlib.model.loss import Loss
 from factorlib.model.materials import Materials
+from factorlib.model.noise import Loss
 from factorlib.model.responses import NODES, Reflections, diffuse_response, specular_response
 from studies.scenes.problems import MATERIALS, block
 from tests.solve.made import OPERATOR, drawn, on_even_cells

@@ -8,8 +8,8 @@ import numpy as np
 from factorlib.light.prior import MIX, read_light_prior
 from factorlib.model.illumination import Illumination
 from factorlib.model.lights import PEAK, Light, even_cells
-from factorlib.model.loss import Loss
 from factorlib.model.materials import Materials, Point
+from factorlib.model.noise import Loss
 from factorlib.model.problem import JointProblem
 from factorlib.reflection import reflection_operator
 from factorlib.solve.fit import Fit, Hyperparameters, Schedule, field_of, fitted, start_of

@@ -12,18 +12,20 @@ from factorlib.geometry.sphere import fibonacci_sphere
 from factorlib.images.tone import curve
 from factorlib.model.illumination import Illumination
 from factorlib.model.interreflection import bounced_light
+from factorlib.model.materials import Point
 from factorlib.model.noise import Noise
 from factorlib.model.observed import blocks_of_observations
 from factorlib.model.problem import JointProblem
+from factorlib.results.materials import Decision
 from factorlib.solve.choices import CURVED_GAIN, NEARER_FROM, believed
-from factorlib.solve.evidence import AGAINST, FOR, Evidence
+from factorlib.solve.evidence import AGAINST, FOR
 from factorlib.solve.options import Choices
-from factorlib.solve.solve import Run, solve
+from factorlib.solve.solve import solve
 from factorlib.solve.start import from_nothing
 from factorlib.urm.observations import Observations
 from studies.scenes.problems import MATERIALS, factor_between, sphere_normals
 from tests.model.made import bowls, rough_light
-from tests.solve.made import OPERATOR, PRIOR, drawn, on_even_cells, spheres
+from tests.solve.made import OPERATOR, drawn, on_even_cells, spheres
 
 QUICK = Choices(cells=60, splittings=0, observations=300)
 OF_SHAPES = msgspec.structs.replace(QUICK, cells=48, observations=240, tone="off")  # shadows and bounces
@@ -32,7 +34,7 @@ MORE = msgspec.structs.replace(QUICK, observations=1000)  # an exponent that all
 
 def solved(blocks, choices=QUICK, **others):
     choices = msgspec.structs.replace(choices, **others)
-    return solve(JointProblem(blocks, OPERATOR), from_nothing(len(MATERIALS)), Run(choices, prior=PRIOR))
+    return solve(JointProblem(blocks, OPERATOR), from_nothing(len(MATERIALS)), choices)
 
 
 # ── shadows and bounces, on bowls ────────────────────────────────────────────────────────────────────────────────────
@@ -186,9 +188,9 @@ def test_a_curve_that_no_camera_has_is_not_believed():
 
 
 def test_an_exponent_near_its_bounds_is_named():
-    blocks = rooms()[:2]
-    lights = [on_even_cells(np.zeros((3, 30)), log_tone=np.log([g])) for g in (1.2, 1.65)]
-    assert [("room1" in said, "1.6" in said) for said in unlikely_curves(blocks, lights)] == [(True, True)]
+    point = Point(MATERIALS, [on_even_cells(np.zeros((3, 30)), log_tone=np.log([g])) for g in (1.2, 1.65)])
+    (said,) = unlikely_curves(JointProblem(rooms()[:2], OPERATOR), point)
+    assert "room1" in said and "1.6" in said
 
 
 # ── what is compared, and from where ─────────────────────────────────────────────────────────────────────────────────
@@ -239,5 +241,5 @@ def test_near_lights_are_found_and_spare_the_materials_and_far_ones_stay_far():
 
 
 def test_how_near_a_light_comes_follows_the_evidence_without_a_jump():
-    shares = [believed(Evidence(True, margin=m)) for m in (-3, NEARER_FROM, 1.25, 1.5, FOR, 9)]
-    assert shares == [0, 0, 0.25, 0.5, 1, 1] and believed(Evidence(False)) == 0
+    shares = [believed(Decision(True, margin=m)) for m in (-3, NEARER_FROM, 1.25, 1.5, FOR, 9)]
+    assert shares == [0, 0, 0.25, 0.5, 1, 1] and believed(Decision(False)) == 0

@@ -10,10 +10,8 @@ from factorlib.diagnose.uncertainty import in_gauge as covariance_in_gauge
 from factorlib.geometry.camera import rotation_of_vector
 from factorlib.geometry.sphere import fibonacci_sphere, mirror_directions
 from factorlib.light.latlong import map_energy
-from factorlib.light.lobes import Lobes
 from factorlib.model.gauge import BRIGHTEST, in_gauge
-from factorlib.model.known import Known
-from factorlib.model.known_light import light_of_ball, light_of_map
+from factorlib.model.known import Known, light_of_ball, light_of_map
 from factorlib.model.lights import Light
 from factorlib.model.materials import LEAST_REFLECTANCE
 from factorlib.solve.descent import Descent, moved, stepped
@@ -76,7 +74,7 @@ def test_what_is_known_has_no_error_and_nothing_else_is_held_fixed(solved):
         (Known(), [True, True]),
         (Known(lights={"room0": light}), [False, True]),
     ):
-        covariance = covariance_in_gauge(root @ root.T, MATERIALS, problem.blocks, known)
+        covariance = covariance_in_gauge(root @ root.T, MATERIALS, msgspec.structs.replace(problem, known=known))
         one, all_ = (np.tile(np.isin(np.arange(7), list(of)), 3) for of in ([0, 3], range(6)))  # a channel; all
         assert [abs(of @ covariance @ of) < 1e-9 for of in (one, all_)] == fixed
 
@@ -179,13 +177,13 @@ def lamp(directions: np.ndarray) -> np.ndarray:
 def off_lamp(light: Light) -> float:
     """Degrees between the directions, on average, of what comes from within 15° of the lamp and should."""
     near = (everywhere := fibonacci_sphere(20000))[everywhere @ LAMP > np.cos(np.radians(15))]
-    shown = Lobes(light.axis, light.sharpness, light.weight).radiance(near)
+    shown = light.lobes.radiance(near)
     one, other = (of.sum(1) @ near / np.linalg.norm(of.sum(1) @ near) for of in (shown, lamp(near)))
     return float(np.degrees(np.arccos(one @ other)))
 
 
 def test_a_map_becomes_a_light_of_its_energy_in_its_directions(monkeypatch):
-    monkeypatch.setattr("factorlib.model.known_light.ROWS", 50)
+    monkeypatch.setattr("factorlib.model.known.ROWS", 50)
     directions = lat_long_directions(50, 100) @ YUP_FROM_CAMERA
     radiance = lamp(directions.reshape(-1, 3)).reshape(50, 100, 3)
     light = light_of_map(radiance)
@@ -217,6 +215,6 @@ def test_what_a_mirror_ball_shows_is_the_light_but_behind_it_where_another_objec
 
     assert light.held[far(light.axis)].all() and not light.scale_free
     there = (everywhere := fibonacci_sphere(4000))[far(everywhere)]
-    radiance = Lobes(light.axis, light.sharpness, light.weight).radiance(there)
+    radiance = light.lobes.radiance(there)
     np.testing.assert_allclose(radiance.mean(0), lamp(there).mean(0), rtol=0.02)
     assert off_lamp(light) < 1

@@ -1,24 +1,25 @@
-"""The prior on materials: what classes it knows, what they cost, and the command that fits them."""
+"""The prior on materials: what classes it knows, what they cost, and how they are fitted."""
 
 import csv
 
+import msgspec
 import numpy as np
 import pytest
-import typer
-from typer.testing import CliRunner
 
-from factorlib import material_classes
+from factorlib.jsonfile import read_json
 from factorlib.model.materials import Materials
 from factorlib.solve.material_prior import (
     BRIGHTEST,
     BRIGHTNESS,
     DIFFUSE,
+    Classes,
     MaterialPrior,
     Mixture,
     class_of,
     shipped_classes,
     unknowns_of,
 )
+from studies.measured import material_classes
 from studies.scenes.problems import MATERIALS
 from tests.solve.made import photographed
 
@@ -76,13 +77,9 @@ def test_gloss_ten_times_too_strong_at_roughness_1_is_not_expected():
     assert cost(*PLASTIC) + 3 < cost([0.3] * 3, 0.2) < cost([0.3] * 3, 1.0)
 
 
-# ── the command ──────────────────────────────────────────────────────────────────────────────────────────────────────
-
-
-@pytest.fixture
-def table(tmp_path):
-    """Five plastics, five steels, five felts."""
-    rng, file = np.random.default_rng(0), tmp_path / "measured.csv"
+def test_classes_are_fitted_to_a_table(tmp_path):
+    """Of five plastics, five steels, five felts."""
+    rng, file, out = np.random.default_rng(0), tmp_path / "measured.csv", tmp_path / "classes.json"
     with file.open("w", newline="") as written:
         rows = csv.writer(written)
         rows.writerow(material_classes.COLUMNS)
@@ -90,20 +87,10 @@ def table(tmp_path):
             for k in range(5):
                 factor = np.exp(0.1 * rng.normal())
                 rows.writerow([f"{name}-{k}", *[level * factor] * 4, roughness + 0.01 * k])
-    return file
-
-
-def run(*words):
-    app = typer.Typer()
-    app.command()(material_classes.main)
-    return CliRunner().invoke(app, list(map(str, words)))
-
-
-def test_classes_are_fitted_to_a_table(table):
-    classes = material_classes.classes_of(table)
+    material_classes.main(file, out)
+    classes = msgspec.convert(read_json(out), Classes)
+    assert classes == material_classes.classes_of(file) and classes.made_from == "measured.csv"
     assert [(one.name, one.share) for one in classes.classes] == [(n, 0.333) for n in ("dielectric", "metal", "fabric")]
     for one, level, roughness in zip(classes.classes, (0.03, 0.1, 0.2), (0.32, 0.22, 0.82), strict=True):
         assert one.mean == pytest.approx((np.log(level), roughness), abs=0.15)
         assert one.tint == 0
-    done = run(table, "--out", table.with_suffix(".json"))
-    assert done.exit_code == 0 and classes.sha256 in table.with_suffix(".json").read_text()

@@ -10,7 +10,7 @@ from studies.scenes.problems import MATERIALS, block, factor_between, random_lig
 
 OPERATOR = reflection_operator("network")
 EXACT = reflection_operator("closed_form", dtype="float64")
-QUICK = Paper(lobes=8, samplings=200, subset=512)
+QUICK = Paper(lobes=8, samplings=200)
 
 
 def rooms(photos=1, size=16):

@@ -12,12 +12,12 @@ from factorlib.solve import solve as solving
 from factorlib.solve.fit import Schedule
 from factorlib.solve.history import PHASES, Event, of_parts
 from factorlib.solve.options import Choices
-from factorlib.solve.resume import Journal
-from factorlib.solve.solve import Run, solve
+from factorlib.solve.resume import Parts
+from factorlib.solve.solve import solve
 from factorlib.solve.start import from_nothing
 from factorlib.stage import serial_map
 from studies.scenes.problems import MATERIALS, block, random_light
-from tests.solve.made import OPERATOR, PRIOR
+from tests.solve.made import OPERATOR
 
 CHOICES = Choices(cells=24, splittings=1, observations=100)
 PARTS = ("effects", "tone", "distances", "materials", "splitting", "lights", "suns")
@@ -53,17 +53,12 @@ def blocks():
     return [msgspec.structs.replace(b, place=rng.normal(size=(len(b), 3))) for b in bounced]
 
 
-def answer(blocks, journal=None, stop=lambda event: False, spread=serial_map):
+def answer(blocks, checkpoint=Checkpoint(None), spread=serial_map):
     """All numbers of an answer, and the events reported."""
     events = []
 
-    def report(event):
-        events.append(event)
-        if stop(event):
-            raise Killed
-
-    run = Run(CHOICES, report, journal or Journal(), PRIOR)
-    found = solve(JointProblem(blocks, OPERATOR, spread=spread), from_nothing(3), run)
+    parts = Parts(checkpoint, events.append)
+    found = solve(JointProblem(blocks, OPERATOR, spread=spread), from_nothing(3), CHOICES, parts)
     p = found.point
     parts = [p.materials.vector(), *(np.ravel(getattr(li, f)) for li in p.lights for f in li.__struct_fields__)]
     decided = [
@@ -101,8 +96,8 @@ class Fragile(Checkpoint):
 def test_a_solve_killed_after_a_part_goes_on_to_the_same_bits(blocks, whole, tmp_path, part):
     path = tmp_path / "solve.pt"
     with pytest.raises(Killed):
-        answer(blocks, Journal(Fragile(path, part)))
-    again, events = answer(blocks, Journal(Checkpoint(path)))
+        answer(blocks, Fragile(path, part))
+    again, events = answer(blocks, Checkpoint(path))
     assert again == whole[0]
     assert msgspec.json.encode(events) == msgspec.json.encode(whole[1])  # of parts that were done, too
 
@@ -119,16 +114,16 @@ def test_what_was_done_is_not_done_again_but_a_file_that_cannot_be_read_starts_t
     """Killed after the last part, nothing of a descent is computed again."""
     path, work = tmp_path / "solve.pt", []
     with pytest.raises(Killed):
-        answer(blocks, Journal(Fragile(path, "suns")))
+        answer(blocks, Fragile(path, "suns"))
 
     def counted(function, items):
         work.append(len(items))
         return serial_map(function, items)
 
-    answer(blocks, Journal(Checkpoint(path)), spread=counted)
+    answer(blocks, Checkpoint(path), spread=counted)
     assert not work
     path.write_bytes(path.read_bytes()[:1000])
-    assert answer(blocks, Journal(Checkpoint(path)))[0] == whole[0]
+    assert answer(blocks, Checkpoint(path))[0] == whole[0]
 
 
 def test_progress_never_goes_back_moves_with_every_point_and_is_whole_only_at_the_end():

@@ -5,9 +5,8 @@ import pytest
 
 from factorlib.solve.evidence import FINER
 from factorlib.solve.fit import Schedule, fitted
-from factorlib.solve.history import unreported
 from factorlib.solve.options import Choices
-from factorlib.solve.resume import Journal, Parts
+from factorlib.solve.resume import Parts
 from factorlib.solve.solve import SPLIT, split_while_gaining
 from studies.scenes.problems import MATERIALS
 from tests.solve.made import PRIOR, begun, light_of, spheres
@@ -21,15 +20,11 @@ def lamp(x: float):
     return light_of([[x, -0.4, -0.75], [0, 0, 1.0]], [100, 1e-4], np.array([20, 0.3])[:, None] * np.ones(3))
 
 
-def parts():
-    return Parts(Journal(), unreported, PRIOR)
-
-
 def splitting_of(lights, seed=0):
     """The fit on cells of one size, and what comes of splitting."""
     problem = spheres(lights, size=18, shown=SHOWN, seed=seed)
     fit = fitted(problem, begun(problem, CELLS), PRIOR, Schedule(4, (10, 8)))
-    return problem, fit, split_while_gaining(problem, fit, ONCE, parts())
+    return problem, fit, split_while_gaining(problem, fit, ONCE, Parts())
 
 
 @pytest.fixture(scope="module")
@@ -56,5 +51,5 @@ def test_a_constant_light_needs_no_finer_cells():
 def test_nothing_splits_where_nothing_is_held_out_or_nobody_asks(lamps):
     problem, fit, _ = lamps
     for some, choices in ((problem.with_none_held_out(), ONCE), (problem, Choices(splittings=0))):
-        found = split_while_gaining(some, fit, choices, parts())
+        found = split_while_gaining(some, fit, choices, Parts())
         assert found.evidence == [] and found.fit is fit

@@ -5,18 +5,19 @@ import numpy as np
 import pytest
 
 from factorlib.light.lobes import SUN, lobe_integral
+from factorlib.model.lights import UnitLobes
 from factorlib.model.problem import JointProblem
+from factorlib.results.materials import Decision
 from factorlib.solve import suns
-from factorlib.solve.evidence import AGAINST, Evidence
+from factorlib.solve.evidence import AGAINST
 from factorlib.solve.fit import Schedule, fitted
-from factorlib.solve.history import unreported
-from factorlib.solve.resume import Journal, Parts
-from factorlib.solve.solve import suns_chosen
-from factorlib.solve.suns import WIDE, candidate, clearly_better, compared
+from factorlib.solve.resume import Parts
+from factorlib.solve.suns import WIDE, candidate, clearly_better, compared, suns_chosen
 from studies.scenes.problems import MATERIALS
 from tests.solve.made import FEW, PRIOR, begun, drawn, on_even_cells, spheres
 
 TOWARDS = np.array([0.36, -0.48, -0.8])
+SUN_LOBE = UnitLobes(TOWARDS[None], np.array([SUN]))
 LIGHTS, AROUND = (Schedule(together=together, least=0.1, given=True) for together in ((0, 8, 6), (0, 8)))
 
 
@@ -24,7 +25,7 @@ def photographed(irradiance: float, seed: int):
     """A problem of spheres under a sky drawn from the prior and a sun, and the true irradiance by the sun in the blocks' unit."""
     sky = on_even_cells(drawn(seed, FEW))
     energy = irradiance * sky.energy.sum(0) * 2 * np.pi / lobe_integral(np.array([SUN]))
-    light = sky.with_lobe(TOWARDS, SUN, energy) if irradiance else sky
+    light = sky.with_lobes(SUN_LOBE, energy) if irradiance else sky
     problem = spheres([light], size=24, seed=seed)
     return problem, energy * lobe_integral(np.array([SUN])) / problem.blocks[0].unit
 
@@ -62,13 +63,13 @@ def test_no_sun_is_found_in_a_sky_without_one(seed):
 def test_the_solve_keeps_suns_of_lights_that_have_one():
     problem, _ = photographed(0.5, 1)
     _, fit = solved(problem)
-    found = suns_chosen(problem, fit, Parts(Journal(), unreported, PRIOR))
+    found = suns_chosen(problem, fit, Parts())
     assert found.evidence[0].kept and found.fit.point.lights[0].suns.any()
-    again = suns_chosen(problem, found.fit, Parts(Journal(), unreported, PRIOR))
+    again = suns_chosen(problem, found.fit, Parts())
     assert again.fit is found.fit and again.evidence[0].kept
     cloudy, _ = photographed(0.0, 1)
     _, fit = solved(cloudy)
-    none = suns_chosen(cloudy, fit, Parts(Journal(), unreported, PRIOR))
+    none = suns_chosen(cloudy, fit, Parts())
     assert not none.evidence[0].kept and none.fit.point.lights[0] is fit.point.lights[0]
 
 
@@ -77,9 +78,9 @@ def test_the_solve_keeps_suns_of_lights_that_have_one():
 )
 def test_a_sun_is_strong_and_no_bluer_than_its_light(monkeypatch, colour, share, kept):
     """Whatever the observations say."""
-    monkeypatch.setattr(suns, "compared", lambda *_: Evidence(True, 1.0, 2.0, 9.0))
+    monkeypatch.setattr(suns, "compared", lambda *_: Decision(True, 1.0, 2.0, 9.0))
     one, _ = solved(photographed(0.0, 1)[0])
     total = one.light.energy.sum() * 2 * np.pi / lobe_integral(np.array([SUN]))[0]
     weight = total * share * np.array(colour) / sum(colour)
-    lit = msgspec.structs.replace(one, light=one.light.with_lobe(TOWARDS, SUN, weight))
+    lit = msgspec.structs.replace(one, light=one.light.with_lobes(SUN_LOBE, weight))
     assert clearly_better(one, lit).kept == kept

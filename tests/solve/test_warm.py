@@ -6,17 +6,16 @@ import msgspec
 import numpy as np
 import pytest
 
-from factorlib.light.lobes import Lobes
 from factorlib.model.illumination import Illumination
 from factorlib.model.materials import Materials
 from factorlib.model.problem import JointProblem
 from factorlib.results.materials import Gauge, MaterialTable, Model, Reflectance, Tone
 from factorlib.results.solution import Earlier
 from factorlib.solve.options import Choices
-from factorlib.solve.solve import Run, solve
+from factorlib.solve.solve import solve
 from factorlib.solve.start import from_earlier, from_nothing, known_point, with_decided
 from studies.scenes.problems import MATERIALS, factor_between
-from tests.solve.made import OPERATOR, PRIOR, drawn, on_even_cells, spheres
+from tests.solve.made import OPERATOR, drawn, on_even_cells, spheres
 
 NAMES, CELLS = ["red", "green", "blue"], 40
 QUICK = Choices(cells=CELLS, splittings=0, observations=200, tone="off")
@@ -46,7 +45,7 @@ def written(blocks, materials: Materials, lights, names=NAMES, component=(0, 0, 
     solved = {name: Reflectance(tuple(r[:3]), tuple(r[3:6]), r[6]) for name, r in zip(names, rows, strict=True)}
     table = MaterialTable(solved, Gauge(component=dict(zip(names, component, strict=True))), Model())
     pairs = list(zip(blocks, lights, strict=True))
-    lobes = {b.name: Lobes(li.axis, li.sharpness, li.weight * b.unit) for b, li in pairs}
+    lobes = {b.name: li.lobes.scaled(b.unit) for b, li in pairs}
     photos = [pair for b, li in pairs for pair in zip(b.photos, li.log_exposure, strict=True)]
     return Earlier(table, lobes, {photo: (float(np.exp(e)),) * 3 for photo, e in photos})
 
@@ -163,7 +162,7 @@ def test_shadows_and_bounces_stay_as_they_were_decided_where_both_were_tried(kep
 
 
 def answer(blocks, start=None):
-    return solve(JointProblem(blocks, OPERATOR), start or from_nothing(3), Run(QUICK, prior=PRIOR))
+    return solve(JointProblem(blocks, OPERATOR), start or from_nothing(3), QUICK)
 
 
 def check_same(cold, warm, blocks):
@@ -181,6 +180,6 @@ def check_same(cold, warm, blocks):
 def test_with_more_than_was_known_the_answer_is_the_one_from_nothing(what):
     blocks, _ = truth(0, 1, noise=0.3, size=8)
     fewer, count = (blocks[:1], 3) if what == "a light" else ([b.take(b.material < 2) for b in blocks], 2)
-    before = solve(JointProblem(fewer, OPERATOR), from_nothing(count), Run(QUICK, prior=PRIOR))
+    before = solve(JointProblem(fewer, OPERATOR), from_nothing(count), QUICK)
     earlier = written(fewer, before.point.materials, before.point.lights, NAMES[:count], (0,) * count)
     check_same(answer(blocks), answer(blocks, from_earlier(earlier, NAMES)), blocks)

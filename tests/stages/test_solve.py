@@ -71,7 +71,7 @@ def run(
 def random_lobes(seed: int) -> Lobes:
     """The light of `observations` of that seed."""
     light = random_light(np.random.default_rng(seed), 2)
-    return Lobes(light.axis, light.sharpness, light.weight)
+    return light.lobes
 
 
 def table(folder):

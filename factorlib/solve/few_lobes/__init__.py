@@ -7,6 +7,6 @@ interreflection as the problem has them, photos as linear, and has no prior on l
     solve      few_lobes: rounds, the choice of specular parts, polish
     rounds     lobes are inserted where residuals are large (insertion), as long as held-out observations are explained better;
                roughness is also searched for with the lights fixed
-    descent    Levenberg–Marquardt on the system of all lights
+    descent    Levenberg–Marquardt on the system of all lights (`factorlib.solve.arrow`)
     equations  of one light: derivatives, normal equations, weights;  unknowns: of a light as few lobes, 6 a lobe
 """

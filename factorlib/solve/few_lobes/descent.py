@@ -1,15 +1,6 @@
-"""Levenberg–Marquardt over all materials and lights of few lobes: damped steps, taken when they lower the loss.
+"""Levenberg–Marquardt over all materials and lights of few lobes: steps (1) of `factorlib.solve.arrow`, taken when they lower the loss.
 
-With H = [[M, C_1 … C_k], [C_iᵀ, L_i]] (materials M, one block L_i per illumination) and gradients g_m, g_i, eliminating every
-light leaves
-
-    (M − Σ C_i L_i⁻¹ C_iᵀ) dm = −(g_m − Σ C_i L_i⁻¹ g_i),      dl_i = −L_i⁻¹ (g_i + C_iᵀ dm)                 (1)
-
-with 7 unknowns a material.  The Schur complement on the left is the information that the data hold about the materials when the
-lights are unknown too.  A light's C and M have rows for the unknowns of the materials that it shows alone, and so has what its
-elimination adds: with many materials, of which a photo shows few, cost and memory grow with those few.  Damping multiplies
-the diagonal, so that the step does not depend on the units of an unknown.  Rows and columns of unknowns that are not free become those of the
-identity.
+Unknowns that are not free stay out of a step.
 
 Radiance is linear in the lobes' weights, and its derivatives by axes and sharpnesses are proportional to the weights.  So the step
 predicts badly what happens where one lobe takes over the energy of another while it moves.  The weights of a step are therefore not
@@ -25,13 +16,12 @@ from functools import partial
 import msgspec
 import numpy as np
 from jaxtyping import Bool, Float
-from scipy.linalg import cho_factor, cho_solve
 
 from factorlib.model.lights import Light
 from factorlib.model.materials import SHARPNESS, Materials, Point
 from factorlib.model.problem import JointProblem
-from factorlib.solve.descent import damped, masked
-from factorlib.solve.few_lobes.equations import NormalEquations, normal_equations, with_weights_fitted
+from factorlib.solve.arrow import System, damped, eliminate, information, summed
+from factorlib.solve.few_lobes.equations import normal_equations, with_weights_fitted
 from factorlib.solve.few_lobes.unknowns import light_at_bound, materials_at_bound, moved_point
 
 DAMPING, LEAST_DAMPING = 1e-3, 1e-9
@@ -53,7 +43,7 @@ class Bounds:
     At the start an unknown is not free if it is at a bound and the loss would fall beyond it.  `tighten` adds further limits.
     """
 
-    def __init__(self, equations: NormalEquations, light: Light, materials: Materials):
+    def __init__(self, equations: System, light: Light, materials: Materials):
         self.light, self.diagonal = light, np.diag(equations.light_hessian)
         self.free = ~light_at_bound(light, materials, equations.light_gradient)
         self.fixed, self.extra = np.zeros(len(self.free)), np.zeros(len(self.free))
@@ -86,40 +76,34 @@ class Iterate(msgspec.Struct, frozen=True):
     """A point, and the normal equations of all illuminations there.  Sums are taken in their order, so that equal inputs give equal bits."""
 
     point: Point
-    parts: list[NormalEquations]
+    parts: list[System]
 
     @property
     def loss(self) -> float:
         """The loss of the point: robust losses of what is fitted, and priors."""
-        return sum(part.loss for part in self.parts)
+        return sum(part.value for part in self.parts)
 
     def of_materials(self) -> tuple[Float[np.ndarray, "7m 7m"], Float[np.ndarray, " 7m"]]:
         """M and g_m."""
-        M, g = np.zeros((7 * len(self.point.materials),) * 2), np.zeros(7 * len(self.point.materials))
-        for part in self.parts:
-            M[np.ix_(part.places, part.places)] += part.material_hessian
-            g[part.places] += part.material_gradient
-        return M, g
+        size = 7 * len(self.point.materials)
+        return summed(self.parts, np.zeros((size, size)), np.zeros(size))
 
     def solved(
         self, free: Bool[np.ndarray, " 7m"], bounds: Sequence[Bounds], damping: float
     ) -> tuple[Float[np.ndarray, " 7m"], list[Float[np.ndarray, " l"]]]:
-        """The damped step (1) of the `free` unknowns of the materials, and of each light within its bounds."""
+        """The damped step of the `free` unknowns of the materials, and of each light within its bounds."""
         M, g = self.of_materials()
-        reduced, right, solutions = damped(M, damping), -g, []
+        M, parts, dm = damped(M, damping), [], np.zeros(len(g))
         for part, bound in zip(self.parts, bounds, strict=True):
+            g[part.places] += part.cross_hessian @ bound.fixed
             L = damped(part.light_hessian, damping) + np.diag(bound.extra)
-            C = part.cross_hessian * bound.free
-            gradient = (part.light_gradient + part.light_hessian @ bound.fixed) * bound.free
-            factor = cho_factor(masked(L, bound.free), check_finite=False)
-            solution = cho_solve(factor, np.column_stack([C.T, gradient]), check_finite=False)
-            reduced[np.ix_(part.places, part.places)] -= C @ solution[:, :-1]
-            right[part.places] += C @ solution[:, -1] - part.cross_hessian @ bound.fixed
-            solutions.append(solution)
-        dm = np.linalg.solve(masked(reduced, free), np.where(free, right, 0.0))
+            gradient = part.light_gradient + part.light_hessian @ bound.fixed
+            parts.append(held(part._replace(light_hessian=L, light_gradient=gradient), ~bound.free))
+        solutions = eliminate(parts, M, g)
+        dm[free] = np.linalg.solve(M[np.ix_(free, free)], -g[free])
         dl = [
-            bound.fixed - (solution[:, -1] + solution[:, :-1] @ dm[part.places]) * bound.free
-            for part, bound, solution in zip(self.parts, bounds, solutions, strict=True)
+            bound.fixed - (solution[:, -2] + solution[:, :-2] @ dm[part.places]) * bound.free
+            for part, bound, solution in zip(parts, bounds, solutions, strict=True)
         ]
         return dm, dl
 
@@ -133,18 +117,25 @@ class Iterate(msgspec.Struct, frozen=True):
         return float(decrease)
 
     def information(self) -> tuple[Float[np.ndarray, "7m 7m"], list[Float[np.ndarray, "g 7m"]]]:
-        """The left side of (1), undamped, and after the same elimination the materials' scores of each illumination's clusters, if it has any."""
-        (reduced, _), scores = self.of_materials(), []
-        for part, light in zip(self.parts, self.point.lights, strict=True):
-            free, k = ~light_at_bound(light, self.point.materials, part.light_gradient), len(part.places)
-            factor = cho_factor(masked(damped(part.light_hessian, DEFINITE), free), check_finite=False)
-            C = part.cross_hessian * free
-            taken_up = cho_solve(factor, C.T, check_finite=False)  # by the light
-            reduced[np.ix_(part.places, part.places)] -= C @ taken_up
-            if part.scores is not None:
-                scores.append(np.zeros((len(part.scores), len(reduced))))
-                scores[-1][:, part.places] = part.scores[:, :k] - (part.scores[:, k:] * free) @ taken_up
-        return (reduced + reduced.T) / 2, scores
+        """That of `factorlib.solve.arrow`, unknowns of lights that are at a bound held."""
+        parts = [
+            held(
+                part._replace(light_hessian=damped(part.light_hessian, DEFINITE)),
+                light_at_bound(light, self.point.materials, part.light_gradient),
+            )
+            for part, light in zip(self.parts, self.point.lights, strict=True)
+        ]
+        return information(parts, 7 * len(self.point.materials))
+
+
+def held(part: System, which: Bool[np.ndarray, " l"]) -> System:
+    """The system without `which` of the light's unknowns: their rows and columns become those of the identity, in the scale of the rest."""
+    free, scale = ~which, max(float(np.abs(np.diag(part.light_hessian)).mean()), 1e-30)
+    L = part.light_hessian * np.outer(free, free)
+    L[which, which] = scale
+    scores = None if part.scores is None else part.scores * np.append(np.ones(len(part.places), bool), free)
+    gradient, cross = part.light_gradient * free, part.cross_hessian * free
+    return part._replace(light_hessian=L, light_gradient=gradient, cross_hessian=cross, scores=scores)
 
 
 def evaluate(problem: JointProblem, point: Point) -> Iterate:

@@ -18,7 +18,6 @@ from jaxtyping import Float, Int
 from factorlib.geometry.sphere import fibonacci_sphere
 from factorlib.model.illumination import Illumination
 from factorlib.model.lights import Light, UnitLobes
-from factorlib.solve.few_lobes.unknowns import joined
 
 DICTIONARY = {1.0: 32, 6.0: 96, 30.0: 300, 150.0: 600, 700.0: 1200}  # sharpness -> number of axes
 SAMPLE = 700  # observations whose residuals choose the lobes
@@ -69,4 +68,4 @@ def lobes_inserted(illumination: Illumination, count: int, candidates: Candidate
         width = TOO_NEAR * np.sqrt(2 / np.minimum(sharpness, sharpness[best]))
         apart = np.linalg.norm(axis - axis[best], axis=1)
         allowed &= (apart > width) | (np.abs(np.log(sharpness / sharpness[best])) > 1)
-    return joined(illumination.light, UnitLobes(axis[chosen], sharpness[chosen]), np.array(weights).reshape(-1, 3))
+    return illumination.light.with_lobes(UnitLobes(axis[chosen], sharpness[chosen]), np.array(weights).reshape(-1, 3))

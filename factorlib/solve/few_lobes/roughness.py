@@ -15,22 +15,20 @@ from jaxtyping import Float
 from scipy.optimize import nnls
 
 from factorlib.model.illumination import Illumination
-from factorlib.model.loss import Loss
 from factorlib.model.materials import LEAST_REFLECTANCE, Materials, Point
+from factorlib.model.noise import Loss
 from factorlib.model.problem import JointProblem
 
 GRID = (0.1, 0.14, 0.19, 0.26, 0.35, 0.46, 0.6, 0.78, 1.0)
 ROWS = 300  # observations of each material in each light that are used
 BETTER = 0.95  # of the present loss
 
-Material = tuple[Float[np.ndarray, "3"], Float[np.ndarray, "3"], float]  # k_d, k_s, roughness
-
 
 def materials_of_best_roughness(problem: JointProblem, point: Point) -> Materials:
     """The materials, each replaced where another roughness explains a sample of the observations clearly better."""
     searched = partial(_searched, materials=point.materials, loss=problem.loss)
     found = problem.spread(searched, [(m, _voters(problem, point, m)) for m in range(len(point.materials))])
-    return Materials(*(np.array(values) for values in zip(*found, strict=True)))
+    return Materials.of_rows(np.array(list(found)))
 
 
 def _voters(problem: JointProblem, point: Point, m: int) -> list[Illumination]:
@@ -44,46 +42,30 @@ def _voters(problem: JointProblem, point: Point, m: int) -> list[Illumination]:
     return voters
 
 
-def _searched(of: tuple[int, list[Illumination]], materials: Materials, loss: Loss) -> Material:
+def _searched(of: tuple[int, list[Illumination]], materials: Materials, loss: Loss) -> Float[np.ndarray, "7"]:
+    """The row of a material of that number, as its voters have it."""
     m, voters = of
-    present = materials.diffuse[m], materials.specular[m], float(materials.roughness[m])
+    present, trials = materials.rows()[m], []
     if not voters:
         return present
-    weight = np.concatenate([_weight(one, loss) for one in voters])
+    weight = [one.block.precision * np.sqrt(loss.trust(one.residuals())) * ~one.block.clipped for one in voters]
     radiance = np.concatenate([one.block.radiance for one in voters])
-    trials = []
-    for roughness in (present[2], *GRID):
-        parts = zip(*(_exposed(one, roughness) for one in voters), strict=True)
-        trials.append((*reflectances(*map(np.concatenate, parts), radiance, weight), roughness))
+    for roughness in (present[6], *GRID):
+        rough = Materials(materials.diffuse, materials.specular, np.full(len(materials), roughness))
+        shown = [msgspec.structs.replace(one, materials=rough).shown() for one in voters]
+        unit = np.stack([np.concatenate([getattr(one, k) for one in shown]) for k in ("diffuse", "specular")], axis=-1)
+        lost, kd, ks = reflectances(unit, radiance, np.concatenate(weight))
+        trials.append((lost, [*kd, *ks, roughness]))
     best = min(trials, key=lambda trial: trial[0])
-    return best[1:] if best[0] < BETTER * trials[0][0] else present
-
-
-def _weight(voters: Illumination, loss: Loss) -> Float[np.ndarray, "n 3"]:
-    """Square roots of the weights of radiances: small for outliers of the present model, 0 for clipped channels."""
-    trusted = voters.block.precision * np.sqrt(loss.trust(voters.residuals()))
-    return np.where(voters.block.clipped, 0.0, trusted)
-
-
-def _exposed(voters: Illumination, roughness: float) -> tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, "n 3"]]:
-    """Radiance of unit k_d and of unit k_s."""
-    lit = [voters.exposure * part for part in voters.lit(slice(0, len(voters.block)), roughness)]
-    sent = (0.0, 0.0) if voters.block.bounced is None else np.hsplit(voters.block.bounced, 2)
-    return lit[0] + sent[0], lit[1] + sent[1]
+    return np.array(best[1]) if best[0] < BETTER * trials[0][0] else present
 
 
 def reflectances(
-    diffuse: Float[np.ndarray, "n 3"],
-    specular: Float[np.ndarray, "n 3"],
-    radiance: Float[np.ndarray, "n 3"],
-    weight: Float[np.ndarray, "n 3"],
+    unit: Float[np.ndarray, "n 3 2"], radiance: Float[np.ndarray, "n 3"], weight: Float[np.ndarray, "n 3"]
 ) -> tuple[float, Float[np.ndarray, "3"], Float[np.ndarray, "3"]]:
-    """Loss, k_d and k_s of the non-negative least-squares fit of radiance by k_d · diffuse + k_s · specular."""
+    """Loss, k_d and k_s of the non-negative least-squares fit of radiance; unit: what k_d = 1 and k_s = 1 show."""
     total, factors = 0.0, np.zeros((3, 2))
     for c in range(3):
-        factors[c], residual = nnls(
-            np.column_stack([diffuse[:, c], specular[:, c]]) * weight[:, c, None], radiance[:, c] * weight[:, c]
-        )
+        factors[c], residual = nnls(unit[:, c] * weight[:, c, None], radiance[:, c] * weight[:, c])
         total += residual**2
-    factors = np.maximum(factors, LEAST_REFLECTANCE)
-    return total, factors[:, 0], factors[:, 1]
+    return total, *np.maximum(factors, LEAST_REFLECTANCE).T

@@ -20,30 +20,29 @@ it is compared with once another material has lost its specular part since the l
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 
 import msgspec
 import numpy as np
 from jaxtyping import Bool
 
 from factorlib.model.gauge import in_gauge
-from factorlib.model.loss import Loss
 from factorlib.model.materials import Materials, Point
 from factorlib.model.problem import JointProblem
-from factorlib.solve.evidence import Evidence
+from factorlib.results.materials import Decision
 from factorlib.solve.few_lobes.descent import descend, evaluate, fit_weights
-from factorlib.solve.few_lobes.options import Run
-from factorlib.solve.few_lobes.rounds import Fit, chosen_round, recorder, sampled_for
+from factorlib.solve.few_lobes.rounds import TOLERANCE, ChosenRound, chosen_round, recorder, sampled_for
 from factorlib.solve.few_lobes.unknowns import blurred, pruned, specular_unknowns
-from factorlib.solve.history import Event, Solution
+from factorlib.solve.history import Event, Report, Solution, unreported
+from factorlib.solve.options import FewLobes
 
-MANY = 4  # times `sample` observations bring the chosen round to its optimum, before all of them settle it
+# Times `sample` observations bring the chosen round to its optimum, before all of them settle it in so many iterations.
+MANY, SETTLE = 4, 2
 # Without its specular part, the held-out loss of a material that needs it is higher by more than GAIN, or that of all observations that are
 # compared by more than HARM.  The latter moves by some 3 % as a descent goes on: less says nothing.
 GAIN, HARM = 0.03, 0.05
-NEEDED_EARLY = (
-    1.3  # times the held-out loss: if it is higher after few iterations without a specular part, that part is needed
-)
+# Times the held-out loss: if it is higher after few iterations without a specular part, that part is needed.
+NEEDED_EARLY = 1.3
 FIRST, ITERATIONS = 3, 6  # iterations of a trial, and further ones where the first do not decide
 LIGHTS = 8
 
@@ -53,58 +52,43 @@ class Specular(msgspec.Struct, frozen=True):
 
     point: Point
     lambertian: Bool[np.ndarray, " m"]
-    evidence: list[Evidence]
+    evidence: list[Decision]
 
 
-def few_lobes(problem: JointProblem, materials: int, run: Run | None = None) -> Solution:
+def few_lobes(
+    problem: JointProblem, materials: int, options: FewLobes = FewLobes(), report: Report = unreported
+) -> Solution:
     """One reflectance for each of so many materials and one light per block, from nothing.
 
-    problem: its loss judges held-out observations and, made robust, is what is lowered;  run: options and reports; None: the defaults
+    problem: its loss judges held-out observations and, made robust, is what is lowered;  report: called at every accepted point
     """
-    run = run or Run()
-    fit = chosen_round(problem, materials, run)
-    chosen = with_specular_chosen(problem, fit, run)
-    point, history = polished(problem, fit, chosen, run)
+    fit = chosen_round(problem, materials, options, report)
+    chosen = with_specular_chosen(problem, fit, options, report)
+    point, history = polished(problem, fit, chosen, options, report)
     specular = np.where(chosen.lambertian[:, None], 0.0, point.materials.specular)
     return Solution(
         Point(Materials(point.materials.diffuse, specular, point.materials.roughness), point.lights),
         history,
         fit.loss,
         chosen.lambertian,
-        shadows=Evidence(any(block.visibility is not None for block in problem.blocks)),
-        interreflection=Evidence(problem.has_bounces),
+        shadows=Decision(any(block.visibility is not None for block in problem.blocks)),
+        interreflection=Decision(problem.has_bounces),
         specular=chosen.evidence,
     )
 
 
-def with_specular_chosen(problem: JointProblem, fit: Fit, run: Run) -> Specular:
-    """The fit without needless specular parts: those without which held-out observations lose nothing, or all of them."""
-    point, count = fit.point, len(fit.point.materials)
-    if run.options.specular == "off":
-        for m in range(count):
-            point = Point(point.materials.lambertian(m), point.lights)
-        return Specular(point, np.ones(count, bool), [])
-    if run.options.specular == "on" or problem.none_held_out:
-        return Specular(point, np.zeros(count, bool), [])
-    number, lobes = fit.history[-1].round, sum(map(len, point.lights))
-
-    def report(trial: int, held_out: float) -> None:
-        """Of a trial without one material's specular part."""
-        run.report(Event(number, "specular part", trial, held_out, held_out, lobes))
-
-    return without_needless_specular(sampled_for(problem, point, run.options), point, fit.loss, report)
-
-
-def polished(problem: JointProblem, fit: Fit, chosen: Specular, run: Run) -> tuple[Point, list[Event]]:
+def polished(
+    problem: JointProblem, fit: ChosenRound, chosen: Specular, options: FewLobes, report: Report
+) -> tuple[Point, list[Event]]:
     """The chosen round brought to its optimum on many observations, then on all, and the whole history."""
     everything = problem.with_none_held_out().with_loss(fit.loss)
-    many = sampled_for(everything, fit.point, run.options, times=MANY)
-    phases = [(many, run.options.polish), (everything, min(run.options.settle, run.options.polish))]
+    many = sampled_for(everything, fit.point, options, times=MANY)
+    phases = [(many, options.polish), (everything, min(SETTLE, options.polish))]
     number, fixed = fit.history[-1].round, specular_unknowns(chosen.lambertian)
     point, history = chosen.point, list(fit.history)
     for of, iterations in phases if many.fitted_values < everything.fitted_values else phases[:1]:
-        record = recorder(of, history, run, number, "polish")
-        point = descend(of, evaluate(of, point), iterations, run.options.tolerance, record, fixed).point
+        record = recorder(of, history, report, number, "polish")
+        point = descend(of, evaluate(of, point), iterations, TOLERANCE, record, fixed).point
     return answer_of(everything, point), history
 
 
@@ -115,18 +99,18 @@ def answer_of(problem: JointProblem, point: Point) -> Point:
     return in_gauge(Point(fitted.materials, [pruned(light) for light in fitted.lights]), problem.blocks)
 
 
-def without_needless_specular(
-    problem: JointProblem,
-    start: Point,
-    robust: Loss,
-    report: Callable[[int, float], None] = lambda trial, held_out: None,
+def with_specular_chosen(
+    problem: JointProblem, fit: ChosenRound, options: FewLobes = FewLobes(), report: Report = unreported
 ) -> Specular:
-    """The point with needless specular parts gone, which materials have none, and the evidence for every material.
-
-    problem: its loss judges;  start: nearly at an optimum, so that iterations change the held-out loss less than what is decided;
-    robust: the loss to lower;  report: called with the number of each trial, from 0, and the held-out loss that it is compared with
-    """
-    base, count = start.materials, len(start.materials)  # all go on from here by as many iterations
+    """The fit without needless specular parts, which materials have none, and the evidence for every material."""
+    start, base, count = (
+        fit.point,
+        fit.point.materials,
+        len(fit.point.materials),
+    )  # all go on from here by as many iterations
+    if problem.none_held_out:
+        return Specular(start, np.zeros(count, bool), [])
+    problem, last, lobes = sampled_for(problem, start, options), fit.history[-1].round, sum(map(len, start.lights))
     lambertian, every, numbers = np.zeros(count, bool), np.arange(len(problem.blocks)), np.arange(count)
     shown = np.array([np.bincount(block.material, minlength=count) for block in problem.blocks])
 
@@ -138,7 +122,7 @@ def without_needless_specular(
         plain: which are Lambertian;  most: if the held-out loss exceeds it after the `FIRST` iterations, no more are made
         """
         judge, fixed = problem.restricted(lights), specular_unknowns(plain)
-        own = judge.with_loss(robust)
+        own = judge.with_loss(fit.loss)
         before = evaluate(own, Point(materials, start.restricted(lights).lights))
         after = descend(own, before, FIRST, fixed=fixed)
         if not (np.isfinite(most) and judge.held_out_loss(after.point) > most):
@@ -146,7 +130,7 @@ def without_needless_specular(
         harmless = (1 + HARM) * judge.held_out_loss(before.point)
         return after.point if judge.held_out_loss(after.point) <= harmless else before.point
 
-    chosen, evidence = near_optimum(every, base, lambertian), [Evidence(True) for _ in lambertian]
+    chosen, evidence = near_optimum(every, base, lambertian), [Decision(True) for _ in lambertian]
     current = True  # whether `chosen` is the fit of `base`
     for number, m in enumerate(np.argsort(base.specular.mean(1), kind="stable")):
         lights = np.sort(np.argsort(-shown[:, m], kind="stable")[:LIGHTS])  # that show most of the material
@@ -156,7 +140,8 @@ def without_needless_specular(
             continue
         richer = chosen.restricted(lights) if current else near_optimum(lights, base, lambertian)
         judge, without = problem.restricted(lights), base.lambertian(m)
-        report(number, held_out := judge.held_out_loss(richer))
+        held_out = judge.held_out_loss(richer)
+        report(Event(last, "specular part", number, held_out, held_out, lobes))
         trial = near_optimum(lights, without, lambertian | (numbers == m), NEEDED_EARLY * held_out)
         evidence[m] = compare(judge, trial, richer, int(m))
         if evidence[m].kept:
@@ -167,10 +152,10 @@ def without_needless_specular(
     return Specular(chosen if current else near_optimum(every, base, lambertian), lambertian, evidence)
 
 
-def compare(problem: JointProblem, without: Point, richer: Point, material: int) -> Evidence:
+def compare(problem: JointProblem, without: Point, richer: Point, material: int) -> Decision:
     """Whether the specular part of a material is kept, by the held-out losses of two points at (or near) their optimum."""
     losses = [np.concatenate(problem.held_out_losses(point)) for point in (without, richer)]
     own = np.concatenate([b.material[b.held_out | problem.none_held_out] for b in problem.blocks]) == material
     harmed = losses[0].mean() > (1 + HARM) * losses[1].mean()
     plain, full = (float(of[own].mean()) if own.any() else 0.0 for of in losses)
-    return Evidence(bool(plain > (1 + GAIN) * full or harmed), full, plain)
+    return Decision(bool(plain > (1 + GAIN) * full or harmed), full, plain)

@@ -19,10 +19,11 @@ from jaxtyping import Bool, Float
 
 from factorlib.light.lobes import lobe_integral
 from factorlib.model.blocks import Block
-from factorlib.model.lights import Light, UnitLobes
+from factorlib.model.lights import Light
 from factorlib.model.materials import LEAST_REFLECTANCE, ROUGHNESS, SHARPNESS, Materials, Point
 
 MOST_TURN, MOST_S, MOST_EXPOSURE = 0.3, 1.0, 1.0  # largest change of an unknown in one step
+LEAST_SHARE = 1e-5
 
 
 def starting_light(block: Block, materials: Materials) -> Light:
@@ -36,11 +37,6 @@ def starting_light(block: Block, materials: Materials) -> Light:
 def unknowns(light: Light) -> int:
     """How many unknowns the light has: the length of a step."""
     return 6 * len(light) + len(light.log_exposure) - 1
-
-
-def unit_energy(light: Light) -> Float[np.ndarray, " p"]:
-    """1/λ': energy of a lobe of unit weight over 2π, steradians."""
-    return lobe_integral(light.sharpness) / (2 * np.pi)
 
 
 def sharpness_slopes(light: Light, blur: float) -> tuple[Float[np.ndarray, " p"], Float[np.ndarray, " p"]]:
@@ -110,16 +106,6 @@ def specular_unknowns(which: Bool[np.ndarray, " m"]) -> Bool[np.ndarray, " 7m"]:
     return np.outer(which, [False] * 3 + [True] * 4).reshape(-1)
 
 
-def joined(light: Light, lobes: UnitLobes, weight: Float[np.ndarray, "q 3"]) -> Light:
-    """The light with q further lobes appended."""
-    return msgspec.structs.replace(
-        light,
-        axis=np.vstack([light.axis, lobes.axis]),
-        log_sharpness=np.concatenate([light.log_sharpness, np.log(lobes.sharpness)]),
-        weight=np.vstack([light.weight, weight]),
-    )
-
-
 def blurred(light: Light, sharpest: float) -> Light:
     """The light with lobes sharper than `sharpest` widened to it; their energy stays the same."""
     log_sharpness = np.minimum(light.log_sharpness, np.log(sharpest))
@@ -127,10 +113,8 @@ def blurred(light: Light, sharpest: float) -> Light:
     return msgspec.structs.replace(light, log_sharpness=log_sharpness, weight=light.weight * kept[:, None])
 
 
-def pruned(light: Light, least_share: float = 1e-5) -> Light:
-    """The light without lobes of less than `least_share` of its energy; at least one lobe stays."""
-    energy = lobe_integral(light.sharpness) * light.weight.sum(1)
-    kept = energy > least_share * max(float(energy.sum()), 1e-30)
-    rows = kept if kept.any() else slice(0, 1)
-    lobes = {name: getattr(light, name)[rows] for name in ("axis", "log_sharpness", "weight")}
-    return msgspec.structs.replace(light, **lobes)
+def pruned(light: Light) -> Light:
+    """The light without lobes of less than `LEAST_SHARE` of its energy; at least one lobe stays."""
+    energy = light.energy.sum(1)
+    kept = energy > LEAST_SHARE * max(float(energy.sum()), 1e-30)
+    return light.take(kept if kept.any() else slice(0, 1))

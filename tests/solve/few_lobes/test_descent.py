@@ -5,7 +5,7 @@ import pytest
 
 from factorlib.model.materials import Point
 from factorlib.model.problem import JointProblem
-from factorlib.solve.descent import FLOOR
+from factorlib.solve.arrow import FLOOR
 from factorlib.solve.few_lobes.descent import DEFINITE, Bounds, damped_step, evaluate
 from factorlib.solve.few_lobes.unknowns import (
     moved_point,

@@ -5,20 +5,19 @@ import numpy as np
 import pytest
 
 from factorlib.model.illumination import Illumination
-from factorlib.model.loss import Loss
 from factorlib.model.materials import Materials
+from factorlib.model.noise import Loss
 from factorlib.solve.few_lobes import unknowns
 from factorlib.solve.few_lobes.equations import (
     energy_equations,
     nonnegative_minimum,
     normal_equations,
-    responses,
+    tabulated,
     tint_prior,
     with_weights_fitted,
 )
 from studies.scenes.problems import MATERIALS, block, random_light
 from tests.model.made import OPERATOR, photos_in_a_wrong_light
-from tests.solve.made import OPERATOR as NETWORK
 
 LOSS = Loss(robust_scale=3.0, prior=0.05)
 UNTINTED = Loss(robust_scale=3.0, prior=0.0)  # the tint prior takes Ē to be constant, so it is no part of a difference
@@ -69,7 +68,7 @@ def test_gradients_are_finite_differences_of_the_loss(kind, moved):
 
 
 def test_loss_of_the_normal_equations_is_the_loss_and_held_out_observations_do_not_pull(clipped):
-    np.testing.assert_allclose(normal_equations(clipped, LOSS).loss, fit_loss(clipped, LOSS))
+    np.testing.assert_allclose(normal_equations(clipped, LOSS).value, fit_loss(clipped, LOSS))
     radiance = np.where(clipped.block.held_out[:, None], clipped.block.radiance + 1, clipped.block.radiance)
     other = msgspec.structs.replace(clipped, block=msgspec.structs.replace(clipped.block, radiance=radiance))
     a, b = (normal_equations(one, LOSS) for one in (clipped, other))
@@ -97,11 +96,11 @@ def by_energy(light, gradient):
 def test_energy_equations_are_those_parts_of_the_normal_equations(data, bounced):
     given, loss = photos_in_a_wrong_light("bounced") if bounced else data, Loss(1.0, 1e-2)
     part, whole, p = (
-        energy_equations(given.fitted(), responses(given.fitted()), loss),
+        energy_equations(given.fitted(), tabulated(given.fitted()), loss),
         normal_equations(given, loss),
         len(given.light),
     )
-    np.testing.assert_allclose(part.value, whole.loss, rtol=1e-12)
+    np.testing.assert_allclose(part.value, whole.value, rtol=1e-12)
     largest = np.abs(part.gradient).max()
     np.testing.assert_allclose(
         part.gradient, by_energy(given.light, whole.light_gradient), rtol=1e-9, atol=1e-9 * largest
@@ -139,16 +138,3 @@ def test_nonnegative_minimum_against_every_active_set():
         tried = [solved_on(hessian, target, np.array(free, bool)) for free in np.ndindex(2, 2, 2, 2)]
         best = min((0.5 * w @ hessian @ w - target @ w, w.tolist()) for w in tried if (w >= 0).all())
         np.testing.assert_allclose(nonnegative_minimum(hessian, target), best[1], atol=1e-6)
-
-
-# ── the search for another roughness, the lights as they are, and for lobes ──────────────────────────────────────────
-
-
-def shown(materials: int, size: int = 24):
-    """Blocks, materials and lights that explain them."""
-    rng = np.random.default_rng(3)
-    truth = Materials.of_rows(MATERIALS.rows()[:materials])
-    lights = [random_light(rng, 5) for _ in range(2)]
-    blocks = [block(f"light_{k}", light, truth, range(materials), NETWORK, size) for k, light in enumerate(lights)]
-    units = [one.unit for one in blocks]
-    return blocks, truth, [msgspec.structs.replace(li, weight=li.weight / u) for li, u in zip(lights, units)]

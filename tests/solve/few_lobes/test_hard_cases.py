@@ -18,15 +18,15 @@ from factorlib.model.materials import Materials
 from factorlib.model.noise import Noise
 from factorlib.model.observed import blocks_of_observations
 from factorlib.model.problem import JointProblem
-from factorlib.solve.few_lobes.options import FewLobes, Run
 from factorlib.solve.few_lobes.solve import few_lobes
+from factorlib.solve.options import FewLobes
 from factorlib.stage import Inputs, silent
 from factorlib.urm.observations import Observations, write_observations
 from stages import solve as stage
 from studies.scenes.problems import factor_between, sphere_normals
 from tests.solve.made import OPERATOR, light_of
 
-OPTIONS = FewLobes(lobes=10, insert=5, rounds=4, iterations=10, polish=20, tolerance=1e-3)
+OPTIONS = FewLobes(lobes=10, insert=5, rounds=4, iterations=10, polish=20)
 NAMES = ("red", "green", "blue")
 THREE = np.array(
     [[0.5, 0.1, 0.1, *[0.12] * 3, 0.7], [0.2, 0.4, 0.25, *[0.2] * 3, 0.4], [0.1, 0.12, 0.2, 0.4, 0.35, 0.3, 0.25]]
@@ -86,7 +86,7 @@ CASES = {  # what is observed; bounds of the errors of reflectance and roughness
     "all Lambertian": (lambda: observed(LAMBERTIAN), 0.0049, None, (RED, GREEN)),
     "a black material": (lambda: observed(BLACK), 0.0055, None, ("'red' is so dark", RED)),
     "a light of one point": (lambda: observed(TWO, [POINT]), 0.017, 0.0039, ()),
-    "constant light": (lambda: observed(TWO, [CONSTANT] * 2), None, None, (RED, GREEN)),
+    "constant light": (lambda: observed(TWO, [CONSTANT] * 2), None, None, (RED,)),
     "half the values clipped": (lambda: changed(TWO, half_clipped), 0.042, 0.19, ("of the values of material 'red' are clipped",)),
     "NaN, infinite, no direction": (lambda: changed(TWO, with_invalid), 0.012, 0.015, ()),
 }  # fmt: skip
@@ -102,11 +102,11 @@ def test_the_answer_is_within_its_bound_or_says_why_not(name):
     made, reflectance, roughness, says = CASES[name]
     seen, truth = made()
     blocks = blocks_of_observations(seen, Noise())
-    solution = few_lobes(problem := JointProblem(blocks, OPERATOR), len(truth), Run(OPTIONS))
+    solution = few_lobes(problem := JointProblem(blocks, OPERATOR), len(truth), OPTIONS)
     point, found = solution.point, solution.point.materials
     errors = standard_errors(problem.with_loss(solution.loss), point)
-    said = undetermined_by_observations(seen.materials, blocks) + poorly_explained(problem, point)
-    said += undetermined_by_answer(seen.materials, blocks, found, errors.materials)
+    said = undetermined_by_observations(seen.materials, problem) + list(poorly_explained(problem, point))
+    said += undetermined_by_answer(seen.materials, problem, found, errors.materials)
     for part in (found.vector(), *(getattr(light, of) for light in point.lights for of in light.__struct_fields__)):
         assert np.isfinite(part).all()
     (f, t), factor = (np.stack([of.diffuse, of.specular]) for of in (found, truth)), factor_between(found, truth)

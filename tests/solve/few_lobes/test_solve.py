@@ -11,14 +11,15 @@ from factorlib.geometry.sphere import mirror_cells
 from factorlib.model.materials import Materials, Point
 from factorlib.model.problem import JointProblem
 from factorlib.solve.few_lobes import solve as solving
-from factorlib.solve.few_lobes.options import FewLobes, Run
 from factorlib.solve.few_lobes.rounds import chosen_round
 from factorlib.solve.few_lobes.solve import few_lobes, with_specular_chosen
+from factorlib.solve.history import unreported
+from factorlib.solve.options import FewLobes
 from factorlib.stage import serial_map
 from studies.scenes.problems import MATERIALS, block, factor_between, random_light
 from tests.solve.made import OPERATOR
 
-QUICK = FewLobes(lobes=10, insert=5, rounds=3, iterations=10, polish=20, tolerance=1e-5)
+QUICK = FewLobes(lobes=10, insert=5, rounds=3, iterations=10, polish=20)
 SHORT = FewLobes(lobes=4, insert=2, rounds=2, iterations=2, polish=2)
 
 
@@ -29,7 +30,7 @@ def rooms(count=2, lobes=4, size=12, seed=3):
 
 
 def run(blocks, options, map_=serial_map):
-    return few_lobes(JointProblem(blocks, OPERATOR, spread=map_), 3, Run(options))
+    return few_lobes(JointProblem(blocks, OPERATOR, spread=map_), 3, options)
 
 
 def numbers(point):
@@ -97,8 +98,8 @@ def shown_by_two(materials, shown, noise=0.3):
 def mixed():
     """The problem, the chosen round, and which specular parts are kept."""
     problem, _ = shown_by_two(MIXED, [0, 1, 2])
-    fit = chosen_round(problem, 3, Run(CHOOSING))
-    return problem, fit, with_specular_chosen(problem, fit, Run(CHOOSING))
+    fit = chosen_round(problem, 3, CHOOSING, unreported)
+    return problem, fit, with_specular_chosen(problem, fit, CHOOSING)
 
 
 def test_lambertian_materials_lose_their_specular_part_and_glossy_ones_keep_it_whether_few_lights_decide_or_all(
@@ -108,5 +109,5 @@ def test_lambertian_materials_lose_their_specular_part_and_glossy_ones_keep_it_w
     assert found.lambertian.tolist() == [True, True, False]
     assert found.evidence[2].held_out_loss_without > 1.05 * found.evidence[2].held_out_loss_with
     monkeypatch.setattr(solving, "LIGHTS", 1)
-    few = with_specular_chosen(problem, fit, Run(CHOOSING))
+    few = with_specular_chosen(problem, fit, CHOOSING)
     assert few.lambertian.tolist() == [True, True, False] and len(few.point.lights) == 2

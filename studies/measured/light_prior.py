@@ -1,4 +1,6 @@
-"""Fitting the light prior to captured maps: maximum likelihood, and how well it foresees maps it was not fitted to.
+"""The prior on natural light, fitted to captured maps, and how well it foresees maps that it was not fitted to.
+
+    python -m studies.measured.light_prior FOLDER… [--out factorlib/light/prior.json]
 
 Each map is a sample. Its area means over cells of equal area (a map's own texels are too fine, and smaller toward the poles) are the u of
 `factorlib.light.prior`. y_0, y_1 and y_2 are fitted each by itself, over n cells and m maps. Maps differ in contrast as a whole: a circus has a
@@ -15,20 +17,30 @@ is no property of light. For the same reason the level of y_0 is not fitted but 
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import hashlib
+from collections.abc import Sequence
 from functools import partial
+from pathlib import Path
+from typing import Annotated
 
 import msgspec
 import numpy as np
+import typer
 from jaxtyping import Float
 from scipy.linalg import cho_factor, cho_solve, solve_triangular
 from scipy.optimize import minimize
 from scipy.spatial import cKDTree
 from scipy.special import digamma, gammaln
+from tqdm import tqdm
 
 from factorlib.conventions import lat_long_directions, lat_long_solid_angles
-from factorlib.light.prior import MIX, LeaveOneOut, LightPrior, angles, correlation, legendre
+from factorlib.geometry.sphere import fibonacci_sphere
+from factorlib.images.light_map import maps_in, read_light_map
+from factorlib.jsonfile import json_text, write_json
+from factorlib.light.prior import MIX, LeaveOneOut, LightPrior, Source, angles, correlation
+from factorlib.reading import read_bytes
 
+CELLS = 400  # cells of equal area, some 10° apart
 EXPOSURE_VARIANCE = 100.0  # log²: a photo's exposure may be wrong by a factor e^±10
 FLOOR = 1e-4  # of a map's mean radiance: what is darker than that is noise of the capture
 UP = np.array([0.0, 1.0, 0.0])  # of a lat-long map
@@ -41,7 +53,15 @@ WEIGHTINGS = 10  # times that β and w are found from each other: far more than 
 DIGITS = 4  # significant ones of what is shipped
 
 Logs = Float[np.ndarray, "3 m n"]  # y_0, y_1, y_2 of m maps in n cells
-Progress = Callable[[int, int], None]
+
+
+def prior_of(paths: Sequence[Path], scored: bool = True) -> LightPrior:
+    """The prior of the maps in some files, as it is shipped; scored: with its leave-one-out scores, which take most of the time."""
+    cells = fibonacci_sphere(CELLS)
+    logs = log_cells(np.stack([cell_means(read_light_map(path), cells) for path in tqdm(paths, desc="reading")]))
+    sources = tuple(Source(path.name, hashlib.sha256(read_bytes(path, "a light map")).hexdigest()) for path in paths)
+    scores = leave_one_out(logs, cells) if scored and len(paths) > 1 else None
+    return rounded(msgspec.structs.replace(fitted(logs, cells), made_from=sources, leave_one_out=scores))
 
 
 def cell_means(lat_long: Float[np.ndarray, "h w 3"], cells: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
@@ -63,6 +83,16 @@ def log_cells(means: Float[np.ndarray, "m n 3"]) -> Logs:
     """y of the mean radiances (linear Rec. 709, finite, no map black) of cells of some maps."""
     floor = FLOOR * means.mean(axis=(1, 2), keepdims=True)
     return np.einsum("kc,mnc->kmn", MIX, np.log(np.maximum(means, floor)))
+
+
+def legendre(sine: Float[np.ndarray, " p"]) -> Float[np.ndarray, "p 3"]:
+    """P_1, P_2, P_3; over the sphere their means are zero, so they leave the level alone."""
+    return np.polynomial.legendre.legvander(sine, 3)[:, 1:]
+
+
+def mean_of(prior: LightPrior, cells: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "3 n"]:
+    """Mean of y in unit directions of the maps' frame: equation (3) of `factorlib.light.prior`."""
+    return np.array(prior.profile) @ legendre(cells @ UP).T
 
 
 def fitted(
@@ -140,12 +170,10 @@ def _log_density(
     return constant - (freedom + count) / 2 * np.log1p(square / freedom)
 
 
-def log_likelihood(
-    prior: LightPrior, logs: Logs, cells: Float[np.ndarray, "n 3"], up: Float[np.ndarray, "3"] | None
-) -> Float[np.ndarray, " m"]:
+def log_likelihood(prior: LightPrior, logs: Logs, cells: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, " m"]:
     """Log density of y of each map under a prior, nats."""
     total = np.zeros(logs.shape[1])
-    for k, residual in enumerate(logs - prior.mean(cells, up)[:, None]):
+    for k, residual in enumerate(logs - mean_of(prior, cells)[:, None]):
         root = np.linalg.cholesky(prior.covariance(k, cells))
         square = np.sum(solve_triangular(root, residual.T, lower=True) ** 2, axis=0)
         total += _log_density(root, square, prior.freedom[k])
@@ -158,19 +186,14 @@ def white_noise(prior: LightPrior) -> LightPrior:
     return msgspec.structs.replace(prior, variance=(0.0, 0.0, 0.0), nugget=nugget)
 
 
-def leave_one_out(
-    logs: Logs, cells: Float[np.ndarray, "n 3"], progress: Progress = lambda done, total: None
-) -> LeaveOneOut:
+def leave_one_out(logs: Logs, cells: Float[np.ndarray, "n 3"]) -> LeaveOneOut:
     """Each map under a prior fitted to the others, and under two nulls fitted to them."""
-    whole, flat = fitted(logs, cells), fitted(logs, cells, profile=False)
-    maps, scores = logs.shape[1], []
-    for m in range(maps):
-        progress(m, maps)
+    whole, flat, scores = fitted(logs, cells), fitted(logs, cells, profile=False), []
+    for m in tqdm(range(logs.shape[1]), desc="leaving one out"):
         rest, one = np.delete(logs, m, axis=1), logs[:, m : m + 1]
         prior = fitted(rest, cells, start=whole)
         priors = prior, white_noise(prior), fitted(rest, cells, profile=False, start=flat)
-        scores.append([float(log_likelihood(each, one, cells, UP)[0]) for each in priors])
-    progress(maps, maps)
+        scores.append([float(log_likelihood(each, one, cells)[0]) for each in priors])
     return LeaveOneOut(*np.mean(scores, axis=0).tolist())
 
 
@@ -185,3 +208,13 @@ def rounded(prior: LightPrior) -> LightPrior:
     if scores:
         scores = LeaveOneOut(*(round(score, 1) for score in msgspec.structs.astuple(scores)))
     return msgspec.structs.replace(prior, **{name: short(getattr(prior, name)) for name in names}, leave_one_out=scores)
+
+
+def main(folders: list[Path], out: Annotated[Path | None, typer.Option(help="File to write to.")] = None) -> None:
+    """Fit the prior on natural light to the lat-long maps (.hdr, .exr) in some folders; print it, or write it to a file."""
+    prior = prior_of(maps_in(folders))
+    print(json_text(prior)) if out is None else write_json(out, prior)
+
+
+if __name__ == "__main__":
+    typer.run(main)

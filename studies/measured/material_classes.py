@@ -1,4 +1,4 @@
-"""python -m factorlib.material_classes FILE: the classes of the prior on materials, fitted to a table of measured materials.
+"""python -m studies.measured.material_classes FILE [--out factorlib/solve/material_classes.json]: the classes of the prior on materials, fitted to a table of measured materials.
 
 FILE is a .csv with a row a material: its name in `material`, and the Lambert + GGX that was fitted to it: `k_s` and `roughness`, and `k_s_r`, `k_s_g`
 and `k_s_b`, whose ratios are the tint.
@@ -62,20 +62,10 @@ def _fitted(name: str, values: np.ndarray, total: int) -> MaterialClass:
     return MaterialClass(name, share, tuple(mean), tuple(map(tuple, covariance)), round(float(tint), 3))
 
 
-def main(
-    file: Annotated[Path, typer.Argument(help="A .csv of measured materials, see above.", metavar="FILE")],
-    out: Annotated[Path | None, typer.Option(help="File to write to; without it the classes are printed.")] = None,
-) -> None:
-    """Fit the classes of materials to a table of measured ones."""
-    try:
-        classes = classes_of(file)
-    except InputError as error:
-        typer.echo(f"error: {error}", err=True)
-        raise typer.Exit(2) from None
-    if out is None:
-        typer.echo(json_text(classes))
-    else:
-        write_json(out, classes)
+def main(file: Path, out: Annotated[Path | None, typer.Option(help="File to write to.")] = None) -> None:
+    """Fit the classes of materials to a table of measured ones; print them, or write them to a file."""
+    classes = classes_of(file)
+    print(json_text(classes)) if out is None else write_json(out, classes)
 
 
 if __name__ == "__main__":
