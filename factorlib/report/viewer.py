@@ -25,13 +25,14 @@ from factorlib.geometry.raster import unit
 from factorlib.geometry.sphere import fibonacci_sphere
 from factorlib.geometry.visibility import LIFT, Occluders, Points
 from factorlib.light.lobes import Lobes
-from factorlib.meshes.fine import LONGEST, subdivided
+from factorlib.meshes.fine import subdivided
 from factorlib.meshes.mesh import Mesh, area_vectors
 from factorlib.report.artifacts import Artifacts
 from factorlib.results.lobes import read_lobes
 from factorlib.results.poses import AS_IT_IS
 
 MOST_TRIANGLES = 150_000  # of all meshes together: about 3 MB of page
+LONGEST = 0.08  # of the mesh's extent: the longest edge
 LEAST_DIRECTIONS, MOST_DIRECTIONS = 32, 256  # in which a vertex looks for what hides the light
 MOST_VERTICES = 8_000  # of a mesh, that look in MOST_DIRECTIONS: less than 1 MB of page
 FACES = (32, 64, 128, 256)  # texels across a face of the cube map

@@ -3,7 +3,7 @@
 // Frames: y-up, right-handed.  "ref" is the photo's camera turned y-up; the object stands in it, the light is turned in it,
 // and the eye moves about the object's middle.  Lengths are in radii of the object.
 //
-// Diffuse:  k_d / pi * (v E(n) + B), the irradiance E read from a small cube map.
+// Diffuse:  k_d / pi * (v E(n) + B) at vertices, the irradiance E read from a small cube map.
 // Specular: k_s * integral of L(i) D G1(i) G1(o) / (4 n.o) di, estimated at half vectors drawn from the visible normals
 //           (Heitz 2018; as spherical caps, Dupuy and Benyoub 2023), for which each sample counts L(i) G1(i).  A sample reads
 //           the light at the mip level whose texels are as large as the solid angle it stands for (Krivanek and Colbert 2008).
@@ -157,11 +157,11 @@ function reaching({ normals, part, sight }, light, albedos) {
   return { share, bounced, sent };
 }
 
-// By vertex how much of the mirrored lobe is free, and the light of what hides the rest: 4 numbers.  eye: in the object's frame;  alphas: by part
+// By vertex what the highlight reflects of the surfaces that it meets, over k_s, and how much of it is free: 4 numbers.  eye: in the object's frame;  alphas: by part
 function mirrored({ vertices, normals, part, sight }, sent, eye, alphas) {
   const n = normals.length / 3, { directions, counts, hidden, met } = sight, out = new Float32Array(4 * n);
   for (let i = 0, pair = 0; i < n; i++) {
-    const a2 = alphas[part[i]] ** 2 + 3 * Math.PI / directions.length, x = normals[3 * i], y = normals[3 * i + 1], z = normals[3 * i + 2];
+    const alpha = alphas[part[i]], a2 = alpha * alpha + 3 * Math.PI / directions.length, x = normals[3 * i], y = normals[3 * i + 1], z = normals[3 * i + 2];
     let ox = eye[0] - vertices[3 * i], oy = eye[1] - vertices[3 * i + 1], oz = eye[2] - vertices[3 * i + 2];
     const far = Math.hypot(ox, oy, oz), facing = (ox * x + oy * y + oz * z) / far;
     ox = 2 * facing * x - ox / far; oy = 2 * facing * y - oy / far; oz = 2 * facing * z - oz / far;
@@ -171,28 +171,38 @@ function mirrored({ vertices, normals, part, sight }, sent, eye, alphas) {
       const part_of_lobe = 3 * a2 / directions.length / (spread * spread); // GGX about the half vector; over all directions the sum is 1
       whole += part_of_lobe; r += part_of_lobe * sent[j]; g += part_of_lobe * sent[j + 1]; b += part_of_lobe * sent[j + 2];
     }
-    const most = Math.max(1, whole);
-    out.set([1 - whole / most, r / most, g / most, b / most], 4 * i);
+    const most = Math.max(1, whole), cos = Math.max(facing, 1e-3), seen = 2 * cos / (cos + Math.sqrt(alpha * alpha + (1 - alpha * alpha) * cos * cos)) / most; // G1
+    out.set([r * seen, g * seen, b * seen, 1 - whole / most], 4 * i);
   }
   return out;
 }
 
 // ── Shaders ──────────────────────────────────────────────────────────────────────────────────────────────────────────
 
-const MESH_VERTEX = `#version 300 es
-in vec3 position, normal, share_at, bounced_at; in vec4 mirrored_at;
+const DEPTH_VERTEX = `#version 300 es
+in vec3 position;
 uniform mat3 ref_from_object; uniform mat4 clip_from_ref;
-out vec3 at, up, share, bounced; out vec4 mirrored;
 invariant gl_Position;
-void main() { share = share_at; bounced = bounced_at; mirrored = mirrored_at; at = ref_from_object * position; up = ref_from_object * normal; gl_Position = clip_from_ref * vec4(at, 1.0); }`;
+void main() { vec3 at = ref_from_object * position; gl_Position = clip_from_ref * vec4(at, 1.0); }`;
+const SHADE_VERTEX = `#version 300 es
+precision highp samplerCube;
+in vec3 position, normal, share, bounced; in vec4 mirrored;
+uniform samplerCube irradiance;
+uniform mat3 ref_from_object, light_from_ref; uniform mat4 clip_from_ref; uniform vec3 k_d, k_s;
+out vec3 at, up; out vec4 lit;             // lit: all but the light mirrored from afar, and how much of that is free
+invariant gl_Position;
+void main() {
+  at = ref_from_object * position; up = ref_from_object * normal; gl_Position = clip_from_ref * vec4(at, 1.0);
+  lit = vec4(k_d * (share * textureLod(irradiance, light_from_ref * up, 0.0).rgb + bounced) + k_s * mirrored.rgb, mirrored.a);
+}`;
 const DEPTH = `#version 300 es
 precision highp float; out vec4 colour;
 void main() { colour = vec4(0.0); }`;
 const SHADE = `#version 300 es
 precision highp float; precision highp samplerCube;
-in vec3 at, up, share, bounced; in vec4 mirrored; out vec4 colour;
-uniform samplerCube radiance, irradiance;
-uniform mat3 light_from_ref; uniform vec3 eye, k_d, k_s, gain;
+in vec3 at, up; in vec4 lit; out vec4 colour;
+uniform samplerCube radiance;
+uniform mat3 light_from_ref; uniform vec3 eye, k_s, gain;
 uniform float alpha, count, texel;      // of GGX; samples that lie apart; solid angle of a texel of level 0
 uniform int each;                       // samples of this pass
 uniform vec3 samples[${PER_PASS}];       // cos phi, sin phi, u
@@ -219,9 +229,9 @@ void main() {
       float level = 0.5 * log2(1.0 / (count * density * texel));
       sum += smith(i.z) * textureLod(radiance, light_from_local * i, max(level, 0.0)).rgb;
     }
-    sum = k_s * (mirrored.x * sum / float(each) + seen * mirrored.yzw);
+    sum *= lit.a * k_s / float(each);
   }
-  colour = vec4(gain * (sum + k_d * (share * textureLod(irradiance, light_from_ref * n, 0.0).rgb + bounced)), 1.0);
+  colour = vec4(gain * (sum + lit.rgb), 1.0);
 }`;
 const SCREEN_VERTEX = `#version 300 es
 out vec2 uv;
@@ -251,7 +261,7 @@ function program(gl, vertex, fragment) {
     if (!gl.getShaderParameter(shader, gl.COMPILE_STATUS) && !gl.isContextLost()) throw new Error(gl.getShaderInfoLog(shader));
     gl.attachShader(made, shader);
   }
-  for (const [k, name] of ["position", "normal", "share_at", "bounced_at", "mirrored_at"].entries()) gl.bindAttribLocation(made, k, name);
+  for (const [k, name] of ["position", "normal", "share", "bounced", "mirrored"].entries()) gl.bindAttribLocation(made, k, name);
   gl.linkProgram(made);
   const places = {};
   return { use: () => gl.useProgram(made), at: (name) => places[name] ??= gl.getUniformLocation(made, name) };
@@ -284,7 +294,7 @@ class Renderer {
     if (!float && !gl.getExtension("EXT_color_buffer_half_float")) throw new Error("this browser cannot draw into floating point numbers");
     this.format = float && blend ? gl.RGBA32F : gl.RGBA16F;
     this.texels = float && gl.getExtension("OES_texture_float_linear") ? gl.RGBA32F : gl.RGBA16F; // in software the larger are read faster
-    this.depth = program(gl, MESH_VERTEX, DEPTH); this.shade = program(gl, MESH_VERTEX, SHADE);
+    this.depth = program(gl, DEPTH_VERTEX, DEPTH); this.shade = program(gl, SHADE_VERTEX, SHADE);
     [this.sky, this.copy, this.show] = [SKY, COPY, SHOW].map((text) => program(gl, SCREEN_VERTEX, text));
     const meshes = data.meshes.map(unpacked);
     this.objects = [...data.objects.map((each) => ({ ...each, mesh: meshes[each.mesh] })), ball()];
@@ -325,7 +335,7 @@ class Renderer {
     const { mesh, rotation } = state.object, { fill } = this.buffer(mesh);
     if (!mesh.sight) {
       for (const [k, value] of [[2, 1], [3, 0]]) this.gl.vertexAttrib3f(k, value, value, value);
-      return this.gl.vertexAttrib4f(4, 1, 0, 0, 0);
+      return this.gl.vertexAttrib4f(4, 0, 0, 0, 1);
     }
     const light_from_object = times(light_from_ref, rotation), lit = [state.photo.light, light_from_object, materials].join();
     if (mesh.lit !== lit) {
@@ -486,7 +496,7 @@ class Viewer {
     const object = this.renderer.objects[this.controls.object.selectedIndex];
     this.controls.materials.replaceChildren(...object.materials.map((own, k) => {
       const label = document.createElement("label"), select = document.createElement("select");
-      label.append(own === null ? "Material" : `Material of the ${own} part`, select);
+      label.append(own === null ? "Material" : `Material of ${own} part`, select);
       if (own !== null) select.add(new Option(object.photo === null ? `${own}, its own` : `${own}, as in the photo`, OWN));
       for (const name of Object.keys(this.data.materials)) select.add(new Option(name));
       return label;
