@@ -99,6 +99,10 @@ def test_under_a_plane_no_light_comes_from_above(tmp_path, open_):
     mine, above = vertex == middle, np.flatnonzero(directions[:, 2] > 0.82)
     assert set(above) <= set(k[mine]) and (directions[k[mine], 2] > 0.55).all()
     assert (normals[met[mine], 2] < -0.9).all() and (place[met[mine], 2] > ground + 0.3).all()
+    there = met < len(normals)
+    assert (
+        np.sum(normals[met[there]] * directions[k[there]], axis=1) < 0
+    ).all() and there.any()  # the side that is met
     assert not np.isin(vertex, np.flatnonzero((normals[:, 2] > 0.9) & (place[:, 2] > high - 0.02))).any()
 
 
