@@ -11,7 +11,7 @@ one, near in place and in normal alike.
 Of a ray that is not free it is also kept which surface it meets, as a code of `factorlib.geometry.met`.
 """
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 
 import msgspec
 import numpy as np
@@ -77,17 +77,28 @@ class Occluders(Caster):
         """What the points see along `directions` (camera frame, unit)."""
         seen = np.full((len(shading_normal), len(directions)), 255, np.uint8)
         met = np.full(seen.shape, UNMET, np.uint16)
-        for i in range(0, len(seen), ROWS):
+        for row, k, face, normal in self.hidden_from(points, shading_normal, directions):
+            seen[row, k] = 0
+            material = np.where(face >= 0, self.mesh.face_label[face].astype(np.int64) - 1, -1)
+            met[row, k] = met_codes(material, normal)
+        return Sight(seen, met)
+
+    def hidden_from(
+        self, points: Points, shading_normal: Vectors, directions: Float[np.ndarray, "k 3"]
+    ) -> Iterator[tuple[np.ndarray, ...]]:
+        """The pairs of a point and a direction that is hidden from it, in order of the points, some points at a time.
+
+        point, direction, face [n]: their numbers, and that of the face that is met, −1 where it is not known;  normal [n, 3]: of that face, turned
+        to the point
+        """
+        for i in range(0, len(shading_normal), ROWS):
             rows = slice(i, i + ROWS)
             row, k = np.nonzero((shading_normal[rows] @ directions.T > BELOW) & points.found[rows, None])
             normal, place, along = points.face_normal[rows][row], points.place[rows][row], directions[k]
             along = along + np.maximum(GRAZING - np.sum(normal * along, 1), 0)[:, None] * normal
             hidden = self.scene.test_occlusions(self._rays(place, along), nthreads=1).numpy()
-            seen[rows][row, k] = np.where(hidden, 0, 255)
             distance, face, normal = self._first(place[hidden], along[hidden])
-            material = np.where(np.isfinite(distance), self.mesh.face_label[face].astype(np.int64) - 1, -1)
-            met[rows][row[hidden], k[hidden]] = met_codes(material, normal)
-        return Sight(seen, met)
+            yield i + row[hidden], k[hidden], np.where(np.isfinite(distance), face, -1), normal
 
     def _first(self, start: Vectors, along: Vectors) -> tuple[np.ndarray, ...]:
         """Of the surfaces that rays meet first: distance [n] in radii, infinite for none, face [n], and the face's normal

@@ -1,8 +1,9 @@
 """What the page's relighting viewer shades: meshes, reflectances and lights, as numbers that a browser reads.
 
-The viewer evaluates the same integral as the pipeline, Lambert + GGX without shadows, in the camera frame turned y-up
+The viewer evaluates the same integral as the pipeline, Lambert + GGX, in the camera frame turned y-up
 (`YUP_FROM_CAMERA`).  Lights are lobes; the browser draws them into a cube map and integrates over that.  Its texels are
-interpolated linearly, which widens a lobe, so lobes are handed over sharpened by as much.
+interpolated linearly, which widens a lobe, so lobes are handed over sharpened by as much.  What an object hides from
+itself is known at its vertices, which are therefore close together, in a number of directions.
 """
 
 import base64
@@ -20,12 +21,20 @@ from factorlib.dataset.schema import LightSlice, ObjectsSlice
 from factorlib.export.environment import sharpened
 from factorlib.export.gltf import read_part_materials, variant_name
 from factorlib.geometry.camera import Pose
+from factorlib.geometry.raster import unit
+from factorlib.geometry.sphere import fibonacci_sphere
+from factorlib.geometry.visibility import LIFT, Occluders, Points
 from factorlib.light.lobes import Lobes
+from factorlib.meshes.fine import subdivided
+from factorlib.meshes.mesh import Mesh, area_vectors
 from factorlib.report.artifacts import Artifacts
 from factorlib.results.lobes import read_lobes
 from factorlib.results.poses import AS_IT_IS
 
 MOST_TRIANGLES = 150_000  # of all meshes together: about 3 MB of page
+LONGEST = 0.08  # of the mesh's extent: the longest edge
+LEAST_DIRECTIONS, MOST_DIRECTIONS = 32, 256  # in which a vertex looks for what hides the light
+MOST_VERTICES = 8_000  # of a mesh, that look in MOST_DIRECTIONS: less than 1 MB of page
 FACES = (32, 64, 128, 256)  # texels across a face of the cube map
 FINE_ENOUGH = 0.7  # texel over the width 1/√λ of the sharpest lobe
 
@@ -92,7 +101,7 @@ def _shown(run: Artifacts, objects: Mapping[str, ObjectsSlice]) -> dict[str, lis
 
     objects  photo, name; mesh, its index; materials, by part; rotation, y-up camera from object, row by row; eye, unit, from the object to
              that camera
-    meshes   see `_mesh`; objects whose poses scale a mesh by different factors have different ones
+    meshes   name and `_mesh`; objects whose poses scale a mesh by different factors have different ones
     """
     files = {name: file for name in sorted(run.set.meshes) if (file := run.folders["export"] / f"{name}.glb").exists()}
     materials = {name: read_part_materials(file) for name, file in files.items()}
@@ -132,24 +141,90 @@ def _mesh(
 ) -> tuple[dict[str, Any], Float[np.ndarray, "3"]]:
     """A mesh times a scale, at most `share` of its triangles, and its middle.
 
-    parts: by name, in order; vertices uint16, 3 a vertex, v / 32767.5 − 1 in radii of the mesh from its middle; normals int16, times 32767;
-           triangles uint32
+    vertices  uint16, 3 a vertex, v / 32767.5 − 1 in radii of the mesh from its middle;  normals: int16, times 32767
+    parts     by name, in order: triangles, uint32, 3 a triangle
+    open      whether it has a border; then every triangle stands twice, once for either side
+    sight     see `_sight`
     simplified_from: its triangles, where fewer are handed over
     """
     vertices = np.concatenate([part.vertices for part in parts.values()]) * scale
     centre = (vertices.min(axis=0) + vertices.max(axis=0)) / 2
     radius = float(np.linalg.norm(vertices - centre, axis=-1).max()) or 1.0
-    packed, count = [], sum(len(part.faces) for part in parts.values())
-    for _, part in sorted(parts.items()):
-        vertex, normal, faces = _simplified(part, share)
-        unit, normal = (vertex * scale - centre) / radius, normal / scale
-        normal = normal / np.maximum(np.linalg.norm(normal, axis=-1, keepdims=True), 1e-12)
-        packed.append({
-            "vertices": _base64(np.rint((np.clip(unit, -1, 1) + 1) * 32767.5), "<u2"),
-            "normals": _base64(np.rint(32767 * normal), "<i2"),
-            "triangles": _base64(faces, "<u4"),
-        })  # fmt: skip
-    return {"parts": packed, "simplified_from": count if share < 1 else None}, centre
+    pieces = [_simplified(part, share) for _, part in sorted(parts.items())]
+    vertices, normals, faces = zip(*pieces, strict=True)
+    first, labels = np.cumsum([0, *map(len, vertices)]), np.arange(1, len(pieces) + 1, dtype=np.int16)
+    mesh = Mesh(
+        (np.vstack(vertices) * scale - centre) / radius,
+        np.vstack([face + start for face, start in zip(faces, first, strict=False)]),
+        unit(np.vstack(normals) / scale),
+        np.repeat(labels, [len(face) for face in faces]),
+        any(part.visual.material.doubleSided for part in parts.values()),
+    )
+    mesh = _fine(mesh)
+    sides = _both_sides(mesh) if mesh.open else mesh
+    packed = {
+        "vertices": _base64(np.rint((np.clip(sides.vertices, -1, 1) + 1) * 32767.5), "<u2"),
+        "normals": _base64(np.rint(32767 * sides.normals), "<i2"),
+        "parts": [_base64(sides.faces[sides.face_label == label], "<u4") for label in labels],
+        "open": mesh.open,
+        "sight": _sight(mesh, sides),
+        "simplified_from": sum(len(part.faces) for part in parts.values()) if share < 1 else None,
+    }
+    return packed, centre
+
+
+def _fine(mesh: Mesh) -> Mesh:
+    """The mesh with edges short enough for shadows to lie between its vertices; longer ones where there would be too many vertices."""
+    longest = LONGEST * np.ptp(mesh.vertices, axis=0).max()
+    most = max(MOST_VERTICES // (1 + mesh.open), len(mesh.vertices))
+    while len((fine := subdivided(mesh, longest)).vertices) > most:
+        longest *= 2
+    return fine
+
+
+def _both_sides(mesh: Mesh) -> Mesh:
+    """The mesh with its triangles turned to their normals, and once more from behind: vertex v is also v + V, with the other normal."""
+    turned = np.einsum("fd,fkd->f", area_vectors(mesh.vertices, mesh.faces), mesh.normals[mesh.faces]) < 0
+    faces = np.where(turned[:, None], mesh.faces[:, ::-1], mesh.faces)
+    return Mesh(
+        np.vstack([mesh.vertices, mesh.vertices]),
+        np.vstack([faces, faces[:, ::-1] + len(mesh.vertices)]),
+        np.vstack([mesh.normals, -mesh.normals]),
+        np.tile(mesh.face_label, 2),
+    )
+
+
+def _sight(mesh: Mesh, sides: Mesh) -> dict[str, Any]:
+    """Which directions the object hides from its own vertices, and where: pairs of a vertex and a direction, in order of the vertices.
+
+    sides: the mesh as it is handed over, whose vertices look;  mesh: what they meet
+
+    directions  float32, 3 a direction: evenly spread, at most `MOST_DIRECTIONS`, fewer where vertices are many
+    counts      uint16, by vertex: its pairs, of directions in front of it alone
+    hidden      uint8, by pair: the number of the direction
+    met         uint16, or uint32 where there are too many vertices, by pair: the number of a vertex of what is met there; that of vertices where it is a mesh's inside, which is black
+    """
+    directions = fibonacci_sphere(
+        int(np.clip(MOST_DIRECTIONS * MOST_VERTICES // len(sides.vertices), LEAST_DIRECTIONS, MOST_DIRECTIONS))
+    )
+    occluders, single = Occluders([mesh], [Pose(np.eye(3), np.zeros(3))]), len(mesh.vertices)
+    outward = np.zeros_like(sides.vertices)
+    np.add.at(outward, sides.faces.T, area_vectors(sides.vertices, sides.faces))
+    outward = unit(outward * np.where(np.sum(outward * sides.normals, 1, keepdims=True) < 0, -1, 1))
+    points = Points(sides.vertices + LIFT * mesh.radius * outward, outward, np.ones(len(outward), bool))
+    pairs = []
+    for vertex, k, face, normal in occluders.hidden_from(points, sides.normals, directions):
+        met = mesh.faces[face, 0].astype(np.int64)
+        behind = np.sum(normal * mesh.normals[met], 1) < 0
+        met = np.where((face < 0) | behind & (not mesh.open), len(outward), met + np.where(behind, single, 0))
+        pairs.append(np.stack([vertex, k, met])[:, np.sum(sides.normals[vertex] * directions[k], 1) > 0])
+    vertex, k, met = np.concatenate(pairs, axis=1)
+    return {
+        "directions": _base64(directions, "<f4"),
+        "counts": _base64(np.bincount(vertex, minlength=len(outward)), "<u2"),
+        "hidden": _base64(k, "u1"),
+        "met": _base64(met, "<u2" if len(outward) < 1 << 16 else "<u4"),
+    }
 
 
 def _simplified(

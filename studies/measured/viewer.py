@@ -73,7 +73,7 @@ def shown(
     page: Any, index: int, material: str, photo: str, view: dict | None = None, size: int = SIZE
 ) -> Float[np.ndarray, "size size 4"]:
     """The viewer's finished picture, radiance and coverage, the uppermost row first.  index: of the object, −1 is the ball;  view: see START"""
-    chosen = {**START, **(view or {}), "materials": [material]}
+    chosen = {**START, "materials": [material], **(view or {})}
     return np.array(page.evaluate(RADIANCE, [index, photo, chosen, size])).reshape(size, size, 4)[::-1]
 
 

@@ -1,19 +1,22 @@
-// The relighting viewer: a mesh of Lambert + GGX materials in a light of spherical Gaussian lobes, without shadows.
+// The relighting viewer: a mesh of Lambert + GGX materials in a light of spherical Gaussian lobes.
 //
 // Frames: y-up, right-handed.  "ref" is the photo's camera turned y-up; the object stands in it, the light is turned in it,
 // and the eye moves about the object's middle.  Lengths are in radii of the object.
 //
-// Diffuse:  k_d / pi * E(n), the irradiance E read from a small cube map.
+// Diffuse:  k_d / pi * (v E(n) + B) at vertices, the irradiance E read from a small cube map.
 // Specular: k_s * integral of L(i) D G1(i) G1(o) / (4 n.o) di, estimated at half vectors drawn from the visible normals
 //           (Heitz 2018; as spherical caps, Dupuy and Benyoub 2023), for which each sample counts L(i) G1(i).  A sample reads
 //           the light at the mip level whose texels are as large as the solid angle it stands for (Krivanek and Colbert 2008).
 // While something moves, one sample is shown, the mirror direction read at the level of the whole lobe, as in a map filtered beforehand, of fewer
 // pixels where frames are slow.  After that PASSES of them
-// are averaged, each a little displaced within its pixel, and the texels are those of all these samples together, so that what
-// is shown tends to the integral.
+// are averaged, each a little displaced within its pixel, and the texels are those of all these samples together, OVERLAP times as large (else a sun
+// is seen by some pixels and not by their neighbours), so that what is shown tends to the integral.
+// Shadows:  from each vertex some of K directions are hidden by the object (`sight`).  v is the share of E that comes from the others, B comes from
+//           the hidden ones: all bounces, of surfaces that send k_d + k_s of what they get to all sides.  Of the specular part the share of the hidden
+//           directions in a lobe of that roughness about the mirror direction is the light of what is met there.  Vertices are interpolated between.
 (() => {
 const QUICK = 1, PER_PASS = 8, PASSES = 128, SLOW_FRAME = 40, IRRADIANCE_FACE = 16, HALF_FIELD = 15 * Math.PI / 180, STANDING_BACK = 1.04 / Math.sin(HALF_FIELD);
-const LEAST_ALPHA = 1e-3, OWN = "";
+const LEAST_ALPHA = 1e-3, BOUNCES = 6, OVERLAP = 8, OWN = "";
 
 // ── Numbers ──────────────────────────────────────────────────────────────────────────────────────────────────────────
 
@@ -81,10 +84,15 @@ function sample_points(pass) {
 
 // ── Meshes ───────────────────────────────────────────────────────────────────────────────────────────────────────────
 
-function unpacked(part) {
-  const vertices = new Uint16Array(bytes(part.vertices)), normals = new Int16Array(bytes(part.normals));
-  return { vertices: Float32Array.from(vertices, (v) => v / 32767.5 - 1),
-           normals: Float32Array.from(normals, (v) => v / 32767), triangles: new Uint32Array(bytes(part.triangles)) };
+function unpacked(mesh) {
+  const vertices = Float32Array.from(new Uint16Array(bytes(mesh.vertices)), (v) => v / 32767.5 - 1);
+  const parts = mesh.parts.map((text) => new Uint32Array(bytes(text))), part = new Uint8Array(vertices.length / 3), sight = {};
+  for (const [k, triangles] of parts.entries()) for (const vertex of triangles) part[vertex] = k;
+  sight.directions = new Float32Array(bytes(mesh.sight.directions)); sight.counts = new Uint16Array(bytes(mesh.sight.counts));
+  sight.hidden = new Uint8Array(bytes(mesh.sight.hidden));
+  const met = bytes(mesh.sight.met);
+  sight.met = met.byteLength > 2 * sight.hidden.length ? new Uint32Array(met) : new Uint16Array(met);
+  return { vertices, normals: Float32Array.from(new Int16Array(bytes(mesh.normals)), (v) => v / 32767), parts, part, open: mesh.open, sight, name: mesh.name };
 }
 
 function ball(rows = 48, columns = 96) {
@@ -101,26 +109,101 @@ function ball(rows = 48, columns = 96) {
     }
   const position = new Float32Array(vertices);
   return { name: "a ball", photo: null, materials: [null], rotation: [1, 0, 0, 0, 1, 0, 0, 0, 1], eye: [0, 0, 1],
-           parts: [{ vertices: position, normals: position, triangles: new Uint32Array(triangles) }] };
+           mesh: { vertices: position, normals: position, parts: [new Uint32Array(triangles)] } };
+}
+
+// Light over `unit` in a mesh's directions; what is narrower than these lie apart is widened (factorlib.light.visibility).
+function light_along(directions, lobes, unit, light_from_object) {
+  const count = directions.length / 3, wide = lobes.slice(), out = new Float32Array(3 * count), integral = (s) => -Math.expm1(-2 * s) / s;
+  for (let j = 0; j < wide.length; j += 7) {
+    const sharpness = Math.max(lobes[j + 3], 1e-3);
+    wide[j + 3] = 1 / (1 / sharpness + Math.PI / count);
+    for (let c = 4; c < 7; c++) wide[j + c] *= integral(sharpness) / integral(wide[j + 3]) / unit;
+  }
+  for (let k = 0, m = light_from_object; k < count; k++) {
+    const [x, y, z] = directions.subarray(3 * k, 3 * k + 3);
+    add_radiance(wide, m[0] * x + m[1] * y + m[2] * z, m[3] * x + m[4] * y + m[5] * z, m[6] * x + m[7] * y + m[8] * z, out, k);
+  }
+  return out;
+}
+
+// By vertex v and B of above, and what the vertex sends: 3 numbers each; one more vertex is black.  light: along the directions;  albedos: by part
+function reaching({ normals, part, sight }, light, albedos) {
+  const n = normals.length / 3, { directions, counts, hidden, met } = sight, share = new Float32Array(3 * n).fill(1), bounced = new Float32Array(3 * n);
+  const direct = new Float32Array(3 * n), sent = new Float32Array(3 * n + 3), weight = new Float32Array(hidden.length);
+  for (let i = 0, pair = 0; i < n; i++) {
+    const x = normals[3 * i], y = normals[3 * i + 1], z = normals[3 * i + 2];
+    let all = 0, r = 0, g = 0, b = 0, hr = 0, hg = 0, hb = 0;
+    for (let k = 0; k < directions.length; k += 3) {
+      const cos = x * directions[k] + y * directions[k + 1] + z * directions[k + 2];
+      if (cos > 0) { all += cos; r += cos * light[k]; g += cos * light[k + 1]; b += cos * light[k + 2]; }
+    }
+    for (const end = pair + counts[i]; pair < end; pair++) {
+      const k = 3 * hidden[pair], cos = Math.max(0, x * directions[k] + y * directions[k + 1] + z * directions[k + 2]);
+      weight[pair] = cos / all; hr += cos * light[k]; hg += cos * light[k + 1]; hb += cos * light[k + 2];
+    }
+    for (const [c, whole, lost] of [[0, r, hr], [1, g, hg], [2, b, hb]]) {
+      share[3 * i + c] = whole > 0 ? Math.max(0, 1 - lost / whole) : 1; direct[3 * i + c] = Math.max(0, whole - lost) / all;
+    }
+  }
+  for (let bounce = 0; bounce <= BOUNCES; bounce++) {
+    for (let i = 0; i < n; i++) for (let c = 0; c < 3; c++) sent[3 * i + c] = albedos[part[i]][c] * (direct[3 * i + c] + bounced[3 * i + c]);
+    if (bounce === BOUNCES) break;
+    bounced.fill(0);
+    for (let i = 0, pair = 0; i < n; i++)
+      for (const end = pair + counts[i]; pair < end; pair++)
+        for (let c = 0; c < 3; c++) bounced[3 * i + c] += weight[pair] * sent[3 * met[pair] + c];
+  }
+  return { share, bounced, sent };
+}
+
+// By vertex what the highlight reflects of the surfaces that it meets, over k_s, and how much of it is free: 4 numbers.  eye: in the object's frame;  alphas: by part
+function mirrored({ vertices, normals, part, sight }, sent, eye, alphas) {
+  const n = normals.length / 3, { directions, counts, hidden, met } = sight, out = new Float32Array(4 * n);
+  for (let i = 0, pair = 0; i < n; i++) {
+    const alpha = alphas[part[i]], a2 = alpha * alpha + 3 * Math.PI / directions.length, x = normals[3 * i], y = normals[3 * i + 1], z = normals[3 * i + 2];
+    let ox = eye[0] - vertices[3 * i], oy = eye[1] - vertices[3 * i + 1], oz = eye[2] - vertices[3 * i + 2];
+    const far = Math.hypot(ox, oy, oz), facing = (ox * x + oy * y + oz * z) / far;
+    ox = 2 * facing * x - ox / far; oy = 2 * facing * y - oy / far; oz = 2 * facing * z - oz / far;
+    let whole = 0, r = 0, g = 0, b = 0;
+    for (const end = pair + counts[i]; pair < end; pair++) {
+      const k = 3 * hidden[pair], j = 3 * met[pair], spread = 1 - (1 - a2) * (1 + ox * directions[k] + oy * directions[k + 1] + oz * directions[k + 2]) / 2;
+      const part_of_lobe = 3 * a2 / directions.length / (spread * spread); // GGX about the half vector; over all directions the sum is 1
+      whole += part_of_lobe; r += part_of_lobe * sent[j]; g += part_of_lobe * sent[j + 1]; b += part_of_lobe * sent[j + 2];
+    }
+    const most = Math.max(1, whole), cos = Math.max(facing, 1e-3), seen = 2 * cos / (cos + Math.sqrt(alpha * alpha + (1 - alpha * alpha) * cos * cos)) / most; // G1
+    out.set([r * seen, g * seen, b * seen, 1 - whole / most], 4 * i);
+  }
+  return out;
 }
 
 // ── Shaders ──────────────────────────────────────────────────────────────────────────────────────────────────────────
 
-const MESH_VERTEX = `#version 300 es
-in vec3 position; in vec3 normal;
+const DEPTH_VERTEX = `#version 300 es
+in vec3 position;
 uniform mat3 ref_from_object; uniform mat4 clip_from_ref;
-out vec3 at; out vec3 up;
 invariant gl_Position;
-void main() { at = ref_from_object * position; up = ref_from_object * normal; gl_Position = clip_from_ref * vec4(at, 1.0); }`;
+void main() { vec3 at = ref_from_object * position; gl_Position = clip_from_ref * vec4(at, 1.0); }`;
+const SHADE_VERTEX = `#version 300 es
+precision highp samplerCube;
+in vec3 position, normal, share, bounced; in vec4 mirrored;
+uniform samplerCube irradiance;
+uniform mat3 ref_from_object, light_from_ref; uniform mat4 clip_from_ref; uniform vec3 k_d, k_s;
+out vec3 at, up; out vec4 lit;             // lit: all but the light mirrored from afar, and how much of that is free
+invariant gl_Position;
+void main() {
+  at = ref_from_object * position; up = ref_from_object * normal; gl_Position = clip_from_ref * vec4(at, 1.0);
+  lit = vec4(k_d * (share * textureLod(irradiance, light_from_ref * up, 0.0).rgb + bounced) + k_s * mirrored.rgb, mirrored.a);
+}`;
 const DEPTH = `#version 300 es
 precision highp float; out vec4 colour;
 void main() { colour = vec4(0.0); }`;
 const SHADE = `#version 300 es
 precision highp float; precision highp samplerCube;
-in vec3 at; in vec3 up; out vec4 colour;
-uniform samplerCube radiance, irradiance;
-uniform mat3 light_from_ref; uniform vec3 eye, k_d, k_s, gain;
-uniform float alpha, count, texel;      // of GGX; samples that will be averaged; solid angle of a texel of level 0
+in vec3 at, up; in vec4 lit; out vec4 colour;
+uniform samplerCube radiance;
+uniform mat3 light_from_ref; uniform vec3 eye, k_s, gain;
+uniform float alpha, count, texel;      // of GGX; samples that lie apart; solid angle of a texel of level 0
 uniform int each;                       // samples of this pass
 uniform vec3 samples[${PER_PASS}];       // cos phi, sin phi, u
 float smith(float c) { return 2.0 * c / (c + sqrt(alpha * alpha + (1.0 - alpha * alpha) * c * c)); }
@@ -146,9 +229,9 @@ void main() {
       float level = 0.5 * log2(1.0 / (count * density * texel));
       sum += smith(i.z) * textureLod(radiance, light_from_local * i, max(level, 0.0)).rgb;
     }
-    sum *= k_s / float(each);
+    sum *= lit.a * k_s / float(each);
   }
-  colour = vec4(gain * (sum + k_d * textureLod(irradiance, light_from_ref * n, 0.0).rgb), 1.0);
+  colour = vec4(gain * (sum + lit.rgb), 1.0);
 }`;
 const SCREEN_VERTEX = `#version 300 es
 out vec2 uv;
@@ -178,7 +261,7 @@ function program(gl, vertex, fragment) {
     if (!gl.getShaderParameter(shader, gl.COMPILE_STATUS) && !gl.isContextLost()) throw new Error(gl.getShaderInfoLog(shader));
     gl.attachShader(made, shader);
   }
-  gl.bindAttribLocation(made, 0, "position"); gl.bindAttribLocation(made, 1, "normal");
+  for (const [k, name] of ["position", "normal", "share", "bounced", "mirrored"].entries()) gl.bindAttribLocation(made, k, name);
   gl.linkProgram(made);
   const places = {};
   return { use: () => gl.useProgram(made), at: (name) => places[name] ??= gl.getUniformLocation(made, name) };
@@ -211,10 +294,10 @@ class Renderer {
     if (!float && !gl.getExtension("EXT_color_buffer_half_float")) throw new Error("this browser cannot draw into floating point numbers");
     this.format = float && blend ? gl.RGBA32F : gl.RGBA16F;
     this.texels = float && gl.getExtension("OES_texture_float_linear") ? gl.RGBA32F : gl.RGBA16F; // in software the larger are read faster
-    this.depth = program(gl, MESH_VERTEX, DEPTH); this.shade = program(gl, MESH_VERTEX, SHADE);
+    this.depth = program(gl, DEPTH_VERTEX, DEPTH); this.shade = program(gl, SHADE_VERTEX, SHADE);
     [this.sky, this.copy, this.show] = [SKY, COPY, SHOW].map((text) => program(gl, SCREEN_VERTEX, text));
-    const meshes = data.meshes.map((mesh) => mesh.parts.map(unpacked));
-    this.objects = [...data.objects.map((each) => ({ ...each, parts: meshes[each.mesh] })), ball()];
+    const meshes = data.meshes.map(unpacked);
+    this.objects = [...data.objects.map((each) => ({ ...each, mesh: meshes[each.mesh] })), ball()];
     this.lights = new Map(); this.buffers = new Map(); this.empty = gl.createVertexArray();
   }
 
@@ -227,19 +310,44 @@ class Renderer {
     return this.lights.get(name);
   }
 
-  parts(parts) {
+  // The arrays of a mesh's parts, and a function that fills one of its attributes with numbers.
+  buffer(mesh) {
     const gl = this.gl;
-    if (!this.buffers.has(parts)) this.buffers.set(parts, parts.map((part) => {
+    if (this.buffers.has(mesh)) return this.buffers.get(mesh);
+    const arrays = [mesh.vertices, mesh.normals, ...(mesh.sight ? [0, 0, 0] : [])].map(() => gl.createBuffer());
+    const parts = mesh.parts.map((triangles) => {
       const array = gl.createVertexArray();
       gl.bindVertexArray(array);
-      for (const [k, values] of [part.vertices, part.normals].entries()) {
-        gl.bindBuffer(gl.ARRAY_BUFFER, gl.createBuffer()); gl.bufferData(gl.ARRAY_BUFFER, values, gl.STATIC_DRAW);
-        gl.enableVertexAttribArray(k); gl.vertexAttribPointer(k, 3, gl.FLOAT, false, 0, 0);
+      for (const [k, buffer] of arrays.entries()) {
+        gl.bindBuffer(gl.ARRAY_BUFFER, buffer); gl.enableVertexAttribArray(k); gl.vertexAttribPointer(k, k < 4 ? 3 : 4, gl.FLOAT, false, 0, 0);
       }
-      gl.bindBuffer(gl.ELEMENT_ARRAY_BUFFER, gl.createBuffer()); gl.bufferData(gl.ELEMENT_ARRAY_BUFFER, part.triangles, gl.STATIC_DRAW);
-      return { array, count: part.triangles.length };
-    }));
-    return this.buffers.get(parts);
+      gl.bindBuffer(gl.ELEMENT_ARRAY_BUFFER, gl.createBuffer()); gl.bufferData(gl.ELEMENT_ARRAY_BUFFER, triangles, gl.STATIC_DRAW);
+      return { array, count: triangles.length };
+    });
+    const fill = (k, values) => { gl.bindBuffer(gl.ARRAY_BUFFER, arrays[k]); gl.bufferData(gl.ARRAY_BUFFER, values, gl.DYNAMIC_DRAW); };
+    fill(0, mesh.vertices); fill(1, mesh.normals);
+    this.buffers.set(mesh, { parts, fill });
+    return this.buffers.get(mesh);
+  }
+
+  // Fill what the light does at the vertices, and what is mirrored there, where either has changed; an object without `sight` hides nothing.
+  shadow(state, materials, eye, light, light_from_ref) {
+    const { mesh, rotation } = state.object, { fill } = this.buffer(mesh);
+    if (!mesh.sight) {
+      for (const [k, value] of [[2, 1], [3, 0]]) this.gl.vertexAttrib3f(k, value, value, value);
+      return this.gl.vertexAttrib4f(4, 0, 0, 0, 1);
+    }
+    const light_from_object = times(light_from_ref, rotation), lit = [state.photo.light, light_from_object, materials].join();
+    if (mesh.lit !== lit) {
+      const albedos = materials.map((name) => this.data.materials[name]).map((m) => m.diffuse.map((k_d, c) => Math.min(1, k_d + m.specular[c])));
+      const found = reaching(mesh, light_along(mesh.sight.directions, this.data.lights[state.photo.light].lobes, light.unit, light_from_object), albedos);
+      fill(2, found.share); fill(3, found.bounced);
+      Object.assign(mesh, { lit, sent: found.sent, eye: null });
+    }
+    if (mesh.eye === eye.join()) return;
+    mesh.eye = eye.join();
+    const object_eye = [0, 1, 2].map((k) => rotation[k] * eye[0] + rotation[k + 3] * eye[1] + rotation[k + 6] * eye[2]);
+    fill(4, mirrored(mesh, mesh.sent, object_eye, materials.map((name) => this.data.materials[name].roughness ** 2)));
   }
 
   // Two square pictures: one pass with its depths, and the sum of passes.
@@ -265,10 +373,12 @@ class Renderer {
   draw(state, size, pass, count) {
     const gl = this.gl, target = this.targets(size), light = this.light(state.photo.light), view = this.camera(state, count > QUICK ? pass : null, size);
     const light_from_ref = times(state.photo.rotation, about_y(-state.turn)), gain = state.photo.gain.map((g) => g * light.unit);
-    const parts = this.parts(state.object.parts);
+    const { parts } = this.buffer(state.object.mesh), materials = parts.map((_, k) => state.materials[k] || state.object.materials[k]);
+    this.shadow(state, materials, view.eye, light, light_from_ref);
     gl.bindFramebuffer(gl.FRAMEBUFFER, target.one.frame); gl.viewport(0, 0, size, size);
     gl.clearColor(0, 0, 0, 0); gl.clear(gl.DEPTH_BUFFER_BIT | gl.COLOR_BUFFER_BIT);
     gl.enable(gl.DEPTH_TEST); gl.disable(gl.BLEND);
+    if (state.object.mesh.open) gl.enable(gl.CULL_FACE); else gl.disable(gl.CULL_FACE);
     gl.activeTexture(gl.TEXTURE0); gl.bindTexture(gl.TEXTURE_CUBE_MAP, light.radiance);
     gl.activeTexture(gl.TEXTURE1); gl.bindTexture(gl.TEXTURE_CUBE_MAP, light.irradiance);
     const place = (shader) => {
@@ -282,9 +392,9 @@ class Renderer {
     const at = (name) => this.shade.at(name);
     gl.uniform1i(at("radiance"), 0); gl.uniform1i(at("irradiance"), 1); gl.uniformMatrix3fv(at("light_from_ref"), true, light_from_ref);
     gl.uniform3fv(at("eye"), view.eye); gl.uniform3fv(at("gain"), gain); gl.uniform3fv(at("samples"), sample_points(pass));
-    gl.uniform1f(at("count"), count); gl.uniform1i(at("each"), Math.min(count, PER_PASS)); gl.uniform1f(at("texel"), 4 * Math.PI / (6 * light.size * light.size));
+    gl.uniform1f(at("count"), count > QUICK ? count / OVERLAP : 1); gl.uniform1i(at("each"), Math.min(count, PER_PASS)); gl.uniform1f(at("texel"), 4 * Math.PI / (6 * light.size * light.size));
     for (const [k, part] of parts.entries()) {
-      const material = this.data.materials[state.materials[k] || state.object.materials[k]];
+      const material = this.data.materials[materials[k]];
       gl.uniform3fv(at("k_d"), material.diffuse); gl.uniform3fv(at("k_s"), material.specular);
       gl.uniform1f(at("alpha"), Math.max(material.roughness * material.roughness, LEAST_ALPHA));
       gl.bindVertexArray(part.array); gl.drawElements(gl.TRIANGLES, part.count, gl.UNSIGNED_INT, 0);
@@ -386,7 +496,7 @@ class Viewer {
     const object = this.renderer.objects[this.controls.object.selectedIndex];
     this.controls.materials.replaceChildren(...object.materials.map((own, k) => {
       const label = document.createElement("label"), select = document.createElement("select");
-      label.append(own === null ? "Material" : `Material of the ${own} part`, select);
+      label.append(own === null ? "Material" : `Material of ${own} part`, select);
       if (own !== null) select.add(new Option(object.photo === null ? `${own}, its own` : `${own}, as in the photo`, OWN));
       for (const name of Object.keys(this.data.materials)) select.add(new Option(name));
       return label;
@@ -414,7 +524,7 @@ class Viewer {
     Object.assign(this, { was_quick: quick, drawn_at: now });
     const whole = this.canvas.clientWidth * Math.min(window.devicePixelRatio || 1, 2), size = Math.max(64, Math.round(whole * (quick ? this.scale : 1)));
     if (quick || this.pass + 1 >= PASSES / 2) this.resize(size);
-    if (quick) { this.renderer.draw(state, size, 0, QUICK); this.renderer.present(state); this.tell(state); }
+    if (quick) { this.renderer.draw(state, size, 0, QUICK); this.renderer.present(state); this.tell(state); this.link(state); }
     else {
       this.renderer.add(state, size, this.pass);
       if (this.pass + 1 >= PASSES / 2) this.renderer.present(state, this.pass + 1);
@@ -437,8 +547,21 @@ class Viewer {
       `${degrees(state.elevation)} above, the light turned by ${degrees(state.turn)}`);
     for (const name of ["turn", "stops"]) {
       const value = Number(this.controls[name].value);
-      this.root.querySelector(`[data-value=${name}]`).textContent = (value > 0 ? "+" : "") + value + (name === "turn" ? "°" : "");
+      this.root.querySelector(`[data-value=${name}]`).textContent = (value > 0 ? "+" : "") + value + (name === "turn" ? "°" : " stops");
     }
+  }
+
+  // Links to the files of what is shown, as far as the page has them.
+  link({ object, photo }) {
+    const files = [`${object.mesh.name}.glb`, `illumination/${photo.light}.exr`, `scenes/${object.photo ?? photo.name}.xml`, "materials.json"];
+    if (files.join() === this.linked) return;
+    this.linked = files.join();
+    const there = [...document.querySelectorAll("#summary .files a")], found = files.map((file) => there.find((a) => decodeURIComponent(a.getAttribute("href")) === `../export/${file}`));
+    this.root.querySelector("[data-files]").replaceChildren(...found.filter(Boolean).map((link) => {
+      const copy = link.cloneNode();
+      copy.textContent = decodeURIComponent(link.getAttribute("href")).split("/").at(-1);
+      return copy;
+    }));
   }
 
   orbit(right, upward) {
