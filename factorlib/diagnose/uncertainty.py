@@ -37,7 +37,7 @@ d toward the camera, and where only Lambertian materials do.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from functools import partial
 from typing import NamedTuple
 
@@ -90,10 +90,10 @@ class StandardErrors(NamedTuple):
 
 
 class Posterior:
-    """What is uncertain at the fit of a joint solve; problem: what it was fitted to."""
+    """What is uncertain at the fit of a joint solve; problem: what it was fitted to;  tick: called after each light whose system is made."""
 
-    def __init__(self, problem: JointProblem, fit: Fit, prior: LightPrior):
-        self.problem, self.fit, self.prior = problem, fit, prior
+    def __init__(self, problem: JointProblem, fit: Fit, prior: LightPrior, tick: Callable[[], None] = lambda: None):
+        self.problem, self.fit, self.prior, self.tick = problem, fit, prior, tick
         self.materials = materials_of(unknowns_of(fit.point.materials))  # none of whose reflectances is nil
 
     def systems(self, with_scores: bool) -> list[Marginal]:
@@ -102,7 +102,9 @@ class Posterior:
         def system(one: tuple[Illumination, Hyperparameters]) -> Marginal:
             """Of one illumination."""
             clusters = one[0].block.clusters() if with_scores else None
-            return marginal(field_of(*one, self.prior, not with_scores), clusters, materials_given=True)
+            made = marginal(field_of(*one, self.prior, not with_scores), clusters, materials_given=True)
+            self.tick()
+            return made
 
         illuminations = self.problem.fitted().illuminations(Point(self.materials, self.fit.point.lights))
         return list(self.problem.spread(system, list(zip(illuminations, self.fit.hyperparameters, strict=True))))

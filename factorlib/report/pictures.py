@@ -341,7 +341,7 @@ def measured_map(observations: Observations, exposure: float) -> UInt8[np.ndarra
 def light_row(
     run: Artifacts, name: str, photos: list[str], errors: dict[str, dict[str, ScoredLight]] | None
 ) -> dict[str, Any] | None:
-    """What the page shows of light `name`; None where no such light was exported.  errors: its part of metrics.json
+    """Return what the page shows of light `name`; None where no such light was exported.  errors: its part of metrics.json
 
     uri, dark_uri, true_uri, spheres: the map, 4 stops darker, the true one, three spheres;  white: the radiance shown as white
     peak: the brightest texel in units of it;  overflow: share of the sphere that is brighter, outlined;  energy: its share of the light
