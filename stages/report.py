@@ -43,7 +43,12 @@ def main(params: Params, inputs: Inputs, out: Path, progress: Progress) -> None:
     seen = viewed(run, lights, objects, exposures(run))
     progress(next(done), total, "surfaces")
     moved = surface_rows(run, objects)
-    progress(next(done), total, "first pictures")
-    first = first_pictures(run, rows, lights)
+    begun = next(done)
+
+    def report(pixels: float, every: float) -> None:
+        """Say how many pixels of the relit picture are done."""
+        progress(begun + pixels / every, total, "first pictures")
+
+    first = first_pictures(run, rows, lights, report)
     progress(next(done), total, "page")
     write_text(out / "index.html", page(run, rows, tags, seen, moved, first))
