@@ -4,9 +4,11 @@ Importing this package imports nothing heavy: `from factorlib.reflection import 
 load what they need, and `factorlib.load_result` does so when it is first asked for.
 """
 
+import os
 from importlib import import_module
 from typing import Any
 
+os.environ.setdefault("OPEN3D_DISABLE_WEB_VISUALIZER", "true")  # which it would start in every notebook
 __version__ = "0.2.0"
 __all__ = ["__version__", "load_result"]
 

@@ -83,7 +83,7 @@ def dataset_of(asked: Namespace, optional: bool = False) -> str | None:
 
 
 def switched_on(key: str, option: bool) -> bool:
-    """Whether an option, or the environment's `key`, is on.  InputError where the latter is neither 0, 1 nor empty."""
+    """Return whether an option, or the environment's `key`, is on.  InputError where the latter is neither 0, 1 nor empty."""
     word = os.environ.get(key, "")
     if not option and word not in ("", "0", "1"):
         raise InputError(f"{word!r} is neither 1 nor 0", key=key, cure=f"write {key}=1, or leave it out")
@@ -91,7 +91,7 @@ def switched_on(key: str, option: bool) -> bool:
 
 
 def agreed(force: bool) -> bool:
-    """Whether to delete what was shown: a terminal is asked, but for --force or FORCE=1."""
+    """Return whether to delete what was shown: a terminal is asked, but for --force or FORCE=1."""
     asks = not switched_on("FORCE", force) and sys.stdin.isatty()
     return not asks or input("delete them? [y/N] ").strip().lower() in ("y", "yes")
 
@@ -102,7 +102,7 @@ def settings_of(asked: Namespace) -> list[str]:
 
 
 def wish(asked: Namespace, stages: list[str] | None = None) -> verbs.Wish:
-    """What is asked for; without `stages` all of them."""
+    """Return what is asked for; without `stages` all of them."""
     recipes = asked.recipes or list(filter(None, [os.environ.get("RECIPE")]))
     force = switched_on("FORCE", getattr(asked, "force", False))
     return verbs.Wish(dataset_of(asked), stages or None, settings_of(asked), force, recipes)
@@ -158,7 +158,7 @@ VERBS: dict[str, tuple[str, Callable[[Namespace], int], str]] = {  # in the orde
 
 
 def run(words: list[str], program: str) -> int:
-    """What the verb of the command line returns.  A first word that is neither an option nor a verb is a stage."""
+    """Return what the verb of the command line returns.  A first word that is neither an option nor a verb is a stage."""
     text = "Any other word is the name of a stage: it is run, and what it needs."
     parser = argparse.ArgumentParser(program, description=text)
     parsers = parser.add_subparsers(title="verbs", metavar="verb", dest="verb", required=True)

@@ -19,5 +19,5 @@ VARIABLES = {
 
 
 def fix() -> None:
-    """For this process, before it imports a numerical library, and for those that it starts."""
+    """Set it for this process, before it imports a numerical library, and for those that it starts."""
     os.environ.update(VARIABLES)

@@ -26,7 +26,7 @@ class Checkpoint:
         self.path = path
 
     def load(self) -> dict[str, Any] | None:
-        """What was saved last; None where nothing was, or what is there cannot be read."""
+        """Return what was saved last; None where nothing was, or what is there cannot be read."""
         if self.path is None or not self.path.exists():
             return None
         try:

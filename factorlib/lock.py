@@ -28,7 +28,7 @@ LEFT_OUT = {
 
 
 def lock_text() -> str:
-    """What requirements.lock should say.  Raises PackageNotFoundError for a package that is needed and not installed."""
+    """Return what requirements.lock should say.  Raises PackageNotFoundError for a package that is needed and not installed."""
     project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
     waiting = [(Requirement(text), "") for text in project["dependencies"] + project["optional-dependencies"]["dev"]]
     lines: dict[str, str] = {}

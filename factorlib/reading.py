@@ -135,7 +135,7 @@ def read_text(file: str | os.PathLike, what: str, key: str | None = None, most_b
 
 
 def path_inside(folder: str | os.PathLike, path: str) -> Path:
-    """Where a path that is written relative to `folder` leads, links not yet followed; it need not exist.
+    """Return where a path that is written relative to `folder` leads, links not yet followed; it need not exist.
 
     Raises ValueError, whose words say what is wrong with it, for a path that leads outside the folder (links followed), an
     absolute or empty one, and one that no file system can follow: with a NUL, a name of over 255 bytes, or links in a circle.

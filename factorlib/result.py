@@ -3,7 +3,7 @@
     r = factorlib.load_result("build/eames")
     r.materials["red"].roughness, r.materials["red"].stderr.roughness
     r.environment("kitchen").rotate(90).to_exr("kitchen.exr")
-    r.relight("yellow_chair", "garden")            # a picture, shown by a notebook
+    r.relight("kitchen/yellow_chair", "garden")    # a picture, shown by a notebook
     r.render(view="terrace", azimuth=40).to_png("terrace.png")
     r.insert("kitchen", mesh="chair", material="black", size=0.7).save("pictures")      # as by a recipe
 
@@ -17,6 +17,7 @@ import html
 import logging
 import os
 from collections.abc import Iterator, Mapping
+from io import BytesIO
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any, TypeVar
@@ -24,6 +25,7 @@ from typing import Any, TypeVar
 import msgspec
 import numpy as np
 from jaxtyping import Float
+from PIL import Image
 
 from factorlib.errors import InputError, did_you_mean
 from factorlib.geometry.camera import rotation_of_vector
@@ -56,6 +58,7 @@ SLICES = {
 }  # what the stage `recipes` is handed
 MARK = "dataset.txt"
 SAMPLES = 64
+SHOWN = 480  # pixels of the longer side of a photo in a notebook
 log = logging.getLogger("factorlib.result")
 
 
@@ -72,6 +75,9 @@ def load_result(folder: str | Path) -> Result:
     candidates = [path for place in places for path in (place / folder, place / "build" / folder)]
     found = next((path for path in candidates if os.path.isfile(path / MARK)), None)
     if found is None:
+        inside = (parent for path in candidates if os.path.exists(path) for parent in path.parents)
+        if whole := next((parent for parent in inside if os.path.isfile(parent / MARK)), None):
+            raise InputError("this lies inside a result", file=folder, cure=f'load_result("{whole}") loads it')
         results = (sorted(str(path.parent) for path in place.glob(f"build/*/{MARK}")) for place in places)
         known = next(filter(None, results), None)
         cure = did_you_mean(str(folder), known) if known else "make all DATASET=<name> makes one"
@@ -237,7 +243,7 @@ class Result:
     def _repr_html_(self) -> str:
         parts, rows = ("diffuse", "specular", "roughness"), []
         for name, material in self.materials.items():
-            of = [(np.atleast_1d(getattr(each, part)) for each in (material, material.stderr)) for part in parts]
+            of = [[np.atleast_1d(getattr(each, part)) for each in (material, material.stderr)] for part in parts]
             cells = [", ".join(f"{value:.3f} ± {error:.3f}" for value, error in zip(*pair, strict=True)) for pair in of]
             rows.append((html.escape(name), *cells))
         lines = [("th", ("material", *parts)), *(("td", row) for row in rows)]
@@ -287,7 +293,7 @@ class Picture(Traced, frozen=True):
         return f"Picture of {self.about}, {self.pixels.shape[1]} × {len(self.pixels)}"
 
     def _repr_html_(self) -> str:
-        return _image(self.rgba(min(1.0, self.exposure)))
+        return _image(self.rgba(min(1.0, self.exposure))) + f"<br>{html.escape(self.about)}"
 
 
 class Drawn(dict[str, bytes]):
@@ -304,7 +310,14 @@ class Drawn(dict[str, bytes]):
 
     def _repr_html_(self) -> str:
         name = next(name for kind in (".gif", ".png") for name in self if name.endswith(kind))
-        return f'<img src="data:image/{name[-3:]};base64,{base64.b64encode(self[name]).decode("ascii")}">'
+        kind, data = name[-3:], self[name]
+        if kind == "png":  # which shows the whole photo: a notebook has it smaller
+            shown, memory, kind = Image.open(BytesIO(data)).convert("RGB"), BytesIO(), "jpeg"
+            shown.thumbnail((SHOWN, SHOWN))
+            shown.save(memory, "JPEG", quality=90)
+            data = memory.getvalue()
+        image = f'<img src="data:image/{kind};base64,{base64.b64encode(data).decode("ascii")}">'
+        return f"{image}<br>{html.escape(repr(self))}"
 
 
 def _image(pixels: np.ndarray) -> str:

@@ -137,7 +137,7 @@ def site_packages() -> Path:
 
 
 def answers(url: str) -> bool:
-    """Whether a HEAD request to `url` succeeds within five seconds."""
+    """Return whether a HEAD request to `url` succeeds within five seconds."""
     try:
         with urllib.request.urlopen(urllib.request.Request(url, method="HEAD"), timeout=5) as reply:
             return reply.status == 200
@@ -169,7 +169,7 @@ def check_system() -> None:
 
 
 def loads(library: str) -> bool:
-    """Whether the dynamic linker finds and loads a shared library; on Linux alone, what is not asked for elsewhere."""
+    """Return whether the dynamic linker finds and loads a shared library; on Linux alone, what is not asked for elsewhere."""
     try:
         return sys.platform != "linux" or bool(ctypes.CDLL(library))
     except OSError:

@@ -40,7 +40,7 @@ class Validation:
         self._parts: dict[str, list[tuple[str, ...]] | InputError] = {}
 
     def faults(self, slice_: str, photo: str | None, params: dict[str, Any], settings: Path) -> list[InputError]:
-        """What is wrong with the files that a slice names, of one photo or of all; what was looked at before is left out.
+        """Return what is wrong with the files that a slice names, of one photo or of all; what was looked at before is left out.
 
         params: given to the stage that takes the slice, in the file `settings` or instead of what stands there
         """
@@ -50,12 +50,12 @@ class Validation:
         return _faults(new)
 
     def recipe_faults(self, files: dict[str, Path]) -> list[InputError]:
-        """What is wrong with the lights and meshes that a recipe names: files by how it writes them; tables were read with it."""
+        """Return what is wrong with the lights and meshes that a recipe names: files by how it writes them; tables were read with it."""
         lights = [partial(read_light_map, path) for path in files.values() if is_light_file(path.name)]
         return _faults([*lights, *(partial(read_parts, p) for p in files.values() if p.suffix.lower() in MESHES)])
 
     def cautions(self) -> list[str]:
-        """What no photo will tell, by the materials that dataset.yaml names."""
+        """Return what no photo will tell, by the materials that dataset.yaml names."""
         together: dict[str, set[str]] = {}
         for photo in self.spec.photos:
             together.setdefault(photo.light, set()).update(*(made_of(obj, self.spec) for obj in photo.objects))

@@ -18,7 +18,7 @@ NO_SYNC = {errno.EINVAL, errno.ENOTSUP, errno.EBADF}  # said by file systems tha
 
 @contextlib.contextmanager
 def writing(path: str | Path) -> Iterator[Path]:
-    """For what writes the file `path` inside: where that fails, the file is gone."""
+    """Guard what writes the file `path` inside: where that fails, the file is gone."""
     try:
         yield Path(path)
     except BaseException:
@@ -38,7 +38,7 @@ def write_text(path: str | Path, text: str, encoding: str = "utf-8") -> None:
 
 
 def replace_file(path: str | Path, data: bytes) -> None:
-    """By one rename, on disk when it returns: whoever reads `path` finds the old or the new content, after a power cut too."""
+    """Replace it by one rename, on disk when it returns: whoever reads `path` finds the old or the new content, after a power cut too."""
     path = Path(path)
     draft = path.with_name(f".{path.name}.{os.getpid()}")
     with writing(draft):
@@ -82,7 +82,7 @@ def sync(path: Path) -> None:
 
 
 def bytes_of(write: Callable[[str], None]) -> bytes:
-    """What `write(path)` writes, to a file in memory: for libraries that say nothing where there is no more room.
+    """Return what `write(path)` writes, to a file in memory: for libraries that say nothing where there is no more room.
 
     Where the system has no files in memory, a temporary one stands in.  There, too, room can end (`ulimit -f`): then
     there is none for one byte more.

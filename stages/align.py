@@ -74,11 +74,15 @@ def main(params: Params, inputs: Inputs, out: Path, progress: Progress) -> None:
     if earlier:  # the photo may have been averaged down by another factor then
         focal = earlier.camera.focal_px * (earlier.camera.factor / facts.factor)
         before = msgspec.structs.replace(earlier.camera, focal_px=focal, factor=facts.factor)
-    result = placed(objects, camera, known, name, params.search, before)
+    pieces = 2 * len(objects)  # each is placed, then judged
+    result = placed(objects, camera, known, name, params.search, before, lambda done: progress(done, pieces, name))
     camera, maps = result.camera, rasterise([each.caster for each in objects], result.camera, result.poses)
     whole = silhouette_of_photo(channels)
     write_png(out / f"{name}_overlay.png", overlay(np.stack([channels[c] for c in "RGB"], axis=-1), maps, whole))
-    entries = [entry(each, k, result, maps, params, sources[k]) for k, each in enumerate(objects)]
+    entries = []
+    for k, each in enumerate(objects):
+        progress(len(objects) + k, pieces, f"{name}: how sure {each.name} is")
+        entries.append(entry(each, k, result, maps, params, sources[k]))
     for each, of_each in zip(objects, entries, strict=True):
         complain(name, each.name, of_each, params.strict)
     left_out = np.isin(maps.object, [k for k, of_each in enumerate(entries, start=1) if of_each.left_out])
@@ -119,7 +123,7 @@ def objects_of(
 
 
 def entry(obj: ObjectToPlace, k: int, result: Placed, maps: Maps, params: Params, source: str | None) -> ObjectEntry:
-    """What poses.json says of one object; `doubts` is empty for a pose to be believed, one found that is not is left out.
+    """Return what poses.json says of one object; `doubts` is empty for a pose to be believed, one found that is not is left out.
 
     source: where the pose is from, if it was not searched.
     """

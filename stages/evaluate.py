@@ -4,6 +4,7 @@ Writes metrics.json, whose keys are documented in `factorlib.results.metrics`, a
 the report can show it, it also writes illumination/<light>.exr (the true map) and spheres/<light>_{truth,estimate}.exr.
 """
 
+from itertools import count
 from pathlib import Path
 
 import msgspec
@@ -50,35 +51,39 @@ def main(params: Params, inputs: Inputs, out: Path, progress: Progress) -> None:
     """Compare everything that was solved with the photos and the truth, and write metrics.json."""
     lights = msgspec.convert(inputs.facts["dataset.light"], dict[str, LightSlice])
     truth = msgspec.convert(inputs.facts["dataset.truth"], TruthFile | None)
-    materials = inputs.facts["dataset.materials"]
+    materials, done = inputs.facts["dataset.materials"], count()
+    total = 2 * len(lights) + (len(MISSING) if truth else 0) + 1
 
     def shot(name: str) -> Shot:
-        """A photo beside its re-synthesis."""
+        """A photo beside its re-synthesis; each is read twice."""
+        progress(next(done), total, f"re-synthesis of {name}")
         photo = read_exr(inputs["masks"] / f"{name}.exr")
         geometry = read_geometry(inputs["align"], inputs.folders.get("surface"), name)
         return shot_of(photo, geometry, read_rgb_exr(inputs["render"] / "resynthesis" / f"{name}.exr"))
 
-    progress(0, 3, "re-synthesis")
     resynthesis = compare_photos(lights, materials, shot)
     seen: dict[str, list[str]] = {slice_.illumination: [] for slice_ in lights.values()}  # materials in each light
     for name, photo in resynthesis.photos.items():
         row = seen[lights[name].illumination]
         row.extend(m for m in photo.materials if m not in row)
     component = connected_components({light: names for light, names in seen.items() if names})
-    progress(1, 3, "materials, light and relighting")
     sections = dict.fromkeys(MISSING)
     if truth:
         true = {n: Reflectance(m.diffuse, m.specular, m.roughness) for n, m in truth.materials.items()}
         estimates = reflectances(read_materials(inputs["export"] / "materials.json"))  # in the exported lights' gauge
         true_lights, estimated_lights = _lights(inputs, truth, out)
-        sections = {
-            "materials": compare_materials(estimates, true, component),
-            "relighting": compare_relighting(estimates, true, estimated_lights, true_lights, seen),
-            "relit_set": compare_relit_set(estimates, true, estimated_lights, true_lights),
-            "light": compare_lights(estimated_lights, true_lights, _mirrored(inputs, lights)),
-            "normals": _normals(inputs, truth, lights),
-            "poses": _poses(inputs, truth),
+        compute = {
+            "materials": lambda: compare_materials(estimates, true, component),
+            "relighting": lambda: compare_relighting(estimates, true, estimated_lights, true_lights, seen),
+            "relit_set": lambda: compare_relit_set(estimates, true, estimated_lights, true_lights),
+            "light": lambda: compare_lights(estimated_lights, true_lights, _mirrored(inputs, lights)),
+            "normals": lambda: _normals(inputs, truth, lights),
+            "poses": lambda: _poses(inputs, truth),
         }
+        for name, section in compute.items():
+            progress(next(done), total, name)
+            sections[name] = section()
+    progress(next(done), total, "verdict")
     sections["verdict"] = _verdict(inputs, seen)
     counts = Counts(len(lights), len(materials), len(seen), len(set(component.values())))
     reasons = {name: why if truth else NO_TRUTH for name, why in MISSING.items() if not sections[name]}
@@ -87,7 +92,7 @@ def main(params: Params, inputs: Inputs, out: Path, progress: Progress) -> None:
     write_json(out / "metrics.json", Metrics(set=counts, resynthesis=resynthesis, **sections, reasons=reasons))
     if sections["verdict"]:
         write_text(out / "verdict.txt", text_of(sections["verdict"]))
-    progress(3, 3)
+    progress(total, total)
 
 
 def _verdict(inputs: Inputs, seen: dict[str, list[str]]) -> Verdict | None:

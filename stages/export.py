@@ -7,6 +7,7 @@ and losses.json: what is lost on the way to other programs.
 
 import logging
 from collections.abc import Mapping
+from itertools import count
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -60,7 +61,9 @@ def main(params: Params, inputs: Inputs, out: Path, progress: Progress) -> None:
     names, solved = inputs.facts["dataset.materials"], inputs["solve"]
     lights = msgspec.convert(inputs.facts["dataset.light"], dict[str, LightSlice])
     objects = msgspec.convert(inputs.facts["dataset.objects"], dict[str, ObjectsSlice])
-    progress(0, 4, "materials")
+    meshes = dict(sorted({n: m for each in objects.values() for n, m in each.meshes.items()}.items()))
+    total, done = 1 + len({light.illumination for light in lights.values()}) + len(meshes) + len(lights), count()
+    progress(next(done), total, "materials")
     table, exposures = read_materials(solved / "materials.json"), read_exposures(solved / "exposures.json")
     factor = headroom_factor(table.materials)
     table = table_in_gauge(table, factor)
@@ -73,7 +76,6 @@ def main(params: Params, inputs: Inputs, out: Path, progress: Progress) -> None:
     write_text(out / "materials.mtlx", materialx(materials))
     write_losses(out / "losses.json", materials)
     _write_dataset(out, inputs)
-    progress(1, 4, "lights")
     for folder in ("illumination", "coverage", "meshes", "scenes/light", "scenes/meshes"):
         (out / folder).mkdir(parents=True)
     suns = {name: [_sun(one) for one in suns_of(light, YUP_FROM_CAMERA)] for name, light in lobes.items()}
@@ -83,10 +85,11 @@ def main(params: Params, inputs: Inputs, out: Path, progress: Progress) -> None:
         )
     write_json(out / "lights.json", suns)
     for name, light in lobes.items():
+        progress(next(done), total, f"light of {name}")
         _write_light(out, name, light, solved / "coverage" / f"{name}.exr", params)
-    progress(2, 4, "meshes")
     files = MeshFiles(inputs, out / "scenes", names, params.crease_deg, materials)
-    for name, mesh in sorted({n: m for each in objects.values() for n, m in each.meshes.items()}.items()):
+    for name, mesh in meshes.items():
+        progress(next(done), total, f"mesh {name}")
         whole = files.read.mesh(name, mesh)
         worn = [
             obj.materials for each in objects.values() for obj in each.objects if obj.mesh == name and obj.materials
@@ -94,10 +97,10 @@ def main(params: Params, inputs: Inputs, out: Path, progress: Progress) -> None:
         labels = {variant_name(each): files.read.mesh(name, mesh, each).face_label for each in worn}
         write_glb(out / f"{name}.glb", whole, names, materials, dict(sorted(labels.items())))
         write_ply(out / "meshes" / f"{name}.ply", whole)
-    progress(3, 4, "scenes")
     write_script(out / "scenes")
     poses = read_poses(inputs["align"] / "poses.json")
     for photo, light in lights.items():
+        progress(next(done), total, f"scene of {photo}")
         size = oiio.ImageInput.open(str(inputs["align"] / f"{photo}.exr")).spec()  # of align's maps, by their header
         camera, exposure = (
             poses[photo].camera.camera(size.width, size.height),
@@ -110,8 +113,8 @@ def main(params: Params, inputs: Inputs, out: Path, progress: Progress) -> None:
         sky = (
             msgspec.structs.replace(exposed, file=f"../illumination/{light.illumination}{SKY}.exr") if suns else exposed
         )
-        meshes = objects[photo].meshes
-        shapes = [s for own in objects[photo].objects for s in files.shapes(own, meshes, poses[photo].objects)]
+        own_meshes, placed = objects[photo].meshes, poses[photo].objects
+        shapes = [s for own in objects[photo].objects for s in files.shapes(own, own_meshes, placed)]
         scene = Scene(camera, shapes, materials, exposed, ALL_BOUNCES if table.model.interreflection else DIRECT)
         write_usd_scene(out / "scenes" / f"{photo}{SUFFIX}", scene)
         scene = msgspec.structs.replace(scene, light=sky, suns=suns)
@@ -122,7 +125,7 @@ def main(params: Params, inputs: Inputs, out: Path, progress: Progress) -> None:
             own = ExposedMap(f"light/{photo}.exposed.exr", np.ones(3), camera_from_light)
             _write_mitsuba_map(out / "scenes" / own.file, own_lobes.take(~own_lobes.suns).scaled(exposure), params)
         write_scene(out / "scenes" / f"{photo}.xml", msgspec.structs.replace(scene, light=own))
-    progress(4, 4)
+    progress(total, total)
 
 
 def _solved_lights(file: Path, lights: Mapping[str, LightSlice]) -> dict[str, Lobes]:

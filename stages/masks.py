@@ -89,7 +89,7 @@ def main(params: Params, inputs: Inputs, out: Path, progress: Progress = silent)
 
 
 def reduced(labels: Labels, factor: int, path: Path, key: str) -> Labels:
-    """By majority, where being left out counts as a label."""
+    """Reduce labels by majority, where being left out counts as a label."""
     if factor == 1:
         return labels
     label = box_majority(np.where(labels.left_out, np.uint8(LEFT_OUT), labels.label), factor)

@@ -80,7 +80,7 @@ def main(params: Params, inputs: Inputs, out: Path, progress: Progress) -> None:
 
 
 def surroundings(inputs: Inputs, model: Model, gauge: Gauge) -> Surroundings | None:
-    """What the solve took into account of the photo's visibility, of what its surfaces send to each other, and of where they lie.
+    """Return what the solve took into account of the photo's visibility, of what its surfaces send to each other, and of where they lie.
 
     gauge: of the materials that are rendered; its factor went out of the lights, but not out of what the photo shows
     """

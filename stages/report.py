@@ -5,6 +5,7 @@ figures/photos/<photo>.png: photo, materials, re-synthesis and difference side b
 to run but for its section on cost.
 """
 
+from itertools import count
 from pathlib import Path
 
 import msgspec
@@ -30,12 +31,24 @@ def main(params: Params, inputs: Inputs, out: Path, progress: Progress) -> None:
     errors = run.metrics.resynthesis.photos
     rows, tags = [], material_tags(run)
     (out / "figures" / "photos").mkdir(parents=True)
-    for done, name in enumerate(run.set.photos):
-        progress(done, len(run.set.photos) + 1, name)
+    total, done = len(run.set.photos) + 5, count()
+    for name in run.set.photos:
+        progress(next(done), total, name)
         rows.append(photo_row(run, name, tags, errors.get(name)))
         write_bytes(out / "figures" / "photos" / f"{name}.png", strip(rows[-1]))
-    progress(len(rows), len(rows) + 1, "page")
+    progress(next(done), total, "overview")
     write_bytes(out / "figures" / "overview.png", overview(run, rows))
     lights, objects = (msgspec.convert(inputs.facts[name], dict[str, kind]) for name, kind in SLICES.items())
-    seen, moved = viewed(run, lights, objects, exposures(run)), surface_rows(run, objects)
-    write_text(out / "index.html", page(run, rows, tags, seen, moved, first_pictures(run, rows, lights)))
+    progress(next(done), total, "viewer")
+    seen = viewed(run, lights, objects, exposures(run))
+    progress(next(done), total, "surfaces")
+    moved = surface_rows(run, objects)
+    begun = next(done)
+
+    def report(pixels: float, every: float) -> None:
+        """Say how many pixels of the relit picture are done."""
+        progress(begun + pixels / every, total, "first pictures")
+
+    first = first_pictures(run, rows, lights, report)
+    progress(next(done), total, "page")
+    write_text(out / "index.html", page(run, rows, tags, seen, moved, first))

@@ -91,7 +91,7 @@ def parts_of(entry: MeshEntry) -> list[str]:
 
 
 def shape_of(entry: MeshEntry, outlines: list[Outline], params: Params, report: Callable[[float], None]) -> Triangles:
-    """What the outlines say of a mesh's shape."""
+    """Return what the outlines say of a mesh's shape."""
     if not outlines:
         cure = "is its material that of a label in the masks? Else take it out"
         raise InputError("no photo's mask shows it", cure=cure)
@@ -116,7 +116,7 @@ class Photo:
         self.path, self.facts = inputs["masks"] / f"{name}.exr", read_photo_facts(inputs["masks"] / f"{name}.json")
 
     def view(self) -> View:
-        """What structure from motion sees of it."""
+        """Return what structure from motion sees of it."""
         channels = read_exr(self.path)
         radiance = np.stack([channels[c] for c in "RGB"], axis=-1).mean(axis=-1)
         white = max(float(np.quantile(radiance[np.isfinite(radiance)], 0.99)), 1e-12)

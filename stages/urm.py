@@ -5,6 +5,7 @@ surfaces hide the rest in its `met`.
 """
 
 import logging
+from functools import partial
 from pathlib import Path
 from typing import Annotated
 
@@ -56,7 +57,8 @@ def main(params: Params, inputs: Inputs, out: Path, progress: Progress) -> None:
         poses, (height, width) = read_photo_poses(inputs["align"] / f"{name}.json"), photo["label"].shape
         occluders, pixels = occluders_of(inputs, poses.objects), np.column_stack([seen.x, seen.y])
         camera = poses.camera.camera(width, height)
-        past = sight(occluders, camera, pixels, seen.normal, params.directions, params.cast_points)
+        report = partial(progress, text=f"{name}: visibility")
+        past = sight(occluders, camera, pixels, seen.normal, params.directions, params.cast_points, report)
         if past:
             seen = msgspec.structs.replace(seen, visibility=past.visibility, met=past.met)
     write_observations(out / f"{name}.parquet", merge(seen, params.merge_degrees))

@@ -87,14 +87,19 @@ def test_what_is_not_there_is_refused_with_what_is(result, tmp_path):
 def test_a_folder_that_is_no_result_is_refused_with_those_that_are(folder, tmp_path, monkeypatch):
     monkeypatch.chdir(folder.parent.parent)
     assert factorlib.load_result("set").photos == factorlib.load_result("build/set").photos
-    for name, words in [
-        ("build/sett", "did you mean 'build/set'"),
-        ("data/set", "build/set"),
-        ("build/set/export", "build/set"),
+    for name, found, cure in [
+        ("build/sett", "there is no result here", "did you mean 'build/set'"),
+        ("data/set", "there is no result here", "build/set"),
+        ("build/set/export", "this lies inside a result", 'load_result("build/set")'),
+        ("build/set/export/materials.json", "this lies inside a result", 'load_result("build/set")'),
+        ("build/set/exprt", "there is no result here", "build/set"),
     ]:
-        with pytest.raises(InputError, match="there is no result here") as error:
+        with pytest.raises(InputError, match=found) as error:
             factorlib.load_result(name)
-        assert words in str(error.value)
+        assert cure in str(error.value)
+    monkeypatch.chdir(folder / "masks")
+    with pytest.raises(InputError, match=r'load_result\("\.\."\)|load_result\("\.\./\.\./\.\./build/set"\)'):
+        factorlib.load_result("../export")
     monkeypatch.chdir(tmp_path)
     with pytest.raises(InputError, match="make all DATASET=<name> makes one"):
         factorlib.load_result("nothing")
@@ -257,7 +262,10 @@ def test_what_is_printed_is_short_and_says_whose_photo_it_is(result, caplog):
 
 def test_a_notebook_shows_tables_and_pictures_and_names_are_names(result):
     shown = result._repr_html_()
-    assert "0.350 ± 0.100" in shown and "front, side" in shown
+    red = result.materials["red"]
+    cells = [f"{value:.3f} ± {error:.3f}" for value, error in zip(red.diffuse, red.stderr.diffuse, strict=True)]
+    assert f"<td>red</td><td>{', '.join(cells)}</td>" in shown and "<td>0.350 ± 0.100</td>" in shown
+    assert "front, side" in shown
     assert result.render("front", samples=1)._repr_html_().startswith('<img src="data:image/png;base64,')
     assert result.environment("front")._repr_html_().startswith("<img")
 
@@ -307,7 +315,8 @@ def test_importing_the_package_imports_nothing_heavy():
 
 SMALL = {
     "build/eames": "build/set", "kitchen": "side", "garden": "front", "terrace": "front", "yellow_chair": "chair",
-    "kitchn": "sid", "width=320": "width=32", '"yellow"': '"red"', '"black"': '"unseen"',
+    "kitchn": "sid", "width=320": "width=32, samples=4", "size=0.4": "size=0.4, samples=1",
+    "frames=12": "frames=2, samples=1", '{"yellow": "black"})': '{"red": "unseen"}, samples=1)', '"black"': '"unseen"',
 }  # fmt: skip
 
 
@@ -332,13 +341,19 @@ def test_the_notebook_runs_in_its_own_folder_and_shows_its_tables_and_pictures(f
     said = capsys.readouterr().out
     assert "roughness 0.350 ± 0.100" in said
     assert all(words in said for words in ("did you mean 'red'", "did you mean 'side'", "did you mean 'chair'"))
-    assert sorted(path.name for path in docs.iterdir()) == [
-        "chair.exr",
-        "chair.png",
-        "pictures",
-        "side.exr",
-        "side.hdr",
-    ]
+    assert {path.name for path in docs.iterdir()} == {"pictures"}
+    names = {"chair.exr", "chair.png", "side_turned.exr", "side_turned.hdr", "front.exr", "front.json", "front.png"}
+    assert {path.name for path in (docs / "pictures").iterdir()} == names
+
+
+def test_the_notebook_is_kept_with_what_it_shows():
+    text = (LIBRARY / "docs" / "result.ipynb").read_text(encoding="utf-8")
+    cells = [cell for cell in json.loads(text)["cells"] if cell["cell_type"] == "code"]
+    assert [cell["execution_count"] for cell in cells] == list(range(1, len(cells) + 1))
+    assert all(cell["outputs"] and not cell["metadata"] for cell in cells) and len(text) < 1_000_000
+    kinds = {output["output_type"] for cell in cells for output in cell["outputs"]}
+    assert kinds == {"execute_result", "stream"} and '"name": "stderr"' not in text
+    assert not re.search(r"/(home|root|tmp|work|Users)/", text)  # a path of the machine that ran it
 
 
 @pytest.mark.parametrize("page", ["README.md", "docs/recipes.md"])

@@ -56,7 +56,7 @@ def looking_along(direction: Float[np.ndarray, "3"]) -> Rotation:
 
 
 def is_cut(silhouette: Silhouette) -> bool:
-    """Whether the frame, left-out pixels or other objects hide a real part of the mask's contour."""
+    """Return whether the frame, left-out pixels or other objects hide a real part of the mask's contour."""
     reach = max(int(BROAD * extent_of(silhouette)[2] / 2), 1)
     pad = 2 * reach + 2  # beyond the frame nothing is known
     unknown = np.pad(~silhouette.known, pad, constant_values=True)

@@ -33,7 +33,7 @@ class Paired(msgspec.Struct, frozen=True):
 
 
 def pair(mesh: Mesh, parts: int, sightings: Sequence[Silhouette]) -> list[Paired | None]:
-    """For each sighting the labels of the parts; None where it tells nothing: more labels than parts, or too many pairings to try.
+    """Find for each sighting the labels of the parts; None where it tells nothing: more labels than parts, or too many pairings to try.
 
     mesh: labelled by part, from 1;  sightings: one object each, labelled as the masks are
     """

@@ -2,6 +2,7 @@
 
 import logging
 from collections.abc import Sequence
+from functools import partial
 
 import msgspec
 import numpy as np
@@ -10,7 +11,7 @@ from jaxtyping import Float
 from scipy.optimize import minimize_scalar
 
 from factorlib.align.refine import FocalPrior
-from factorlib.align.search import Found, RunnerUp, Search, find, focal_prior, found_near, refined_finest
+from factorlib.align.search import Found, Report, RunnerUp, Search, find, focal_prior, found_near, refined_finest
 from factorlib.align.silhouette import Silhouette, labelled_iou
 from factorlib.align.state import State, state_of
 from factorlib.align.target import target_of
@@ -70,11 +71,12 @@ class Placed(msgspec.Struct, frozen=True):
 
 def placed(
     objects: Sequence[ObjectToPlace], camera: Camera, known: KnownFocal, photo: str,
-    search: Search = Search(), before: CameraEntry | None = None,
+    search: Search = Search(), before: CameraEntry | None = None, report: Report = lambda done: None,
 ) -> Placed:  # fmt: skip
     """Poses of all objects.  The focal length, where neither known nor found `before`, is found with the object that shows most.
 
     camera: of the photo; its focal length is not used.  before: the camera of an earlier result, in pixels of this photo.
+    report: called now and then with how many objects are done, and what share of the next
     Raises InputError for an object to search whose mask has no pixel.
     """
     source, sigma, found = known.source, 0.0, {}
@@ -85,7 +87,9 @@ def placed(
     if prior.sigma > 0 and any(each.pose is not None for each in objects):
         camera, source = _focal_of_given(objects, camera), "estimated"
         prior = FocalPrior(camera.focal, 0.0)
-    for k in sorted(range(len(objects)), key=lambda k: (-int(objects[k].silhouette.inside.sum()), k)):
+    most_first = sorted(range(len(objects)), key=lambda k: (-int(objects[k].silhouette.inside.sum()), k))
+    for done, k in enumerate(most_first):
+        report(done)
         obj = objects[k]
         if obj.pose is not None:
             continue
@@ -102,7 +106,8 @@ def placed(
                 second = RunnerUp(state_of(other.pose, camera, obj.caster), other.score, other.normal_difference_deg)
             found[k] = Found(start, score, sigma, second, earlier=True)
         elif obj.keypoints is None:
-            found[k] = find(obj.caster, obj.silhouette, camera, prior, search)
+            searching = partial(_partly, report, done)
+            found[k] = find(obj.caster, obj.silhouette, camera, prior, search, searching)
         else:
             start = state_of_keypoints(obj, camera, prior, photo)
             found[k] = found_near(obj.caster, obj.silhouette, camera, start, prior, search)
@@ -117,6 +122,10 @@ def placed(
         obj.pose or (obj.earlier.pose if obj.earlier else found[k].state.pose(obj.caster)) for k, obj in enumerate(objects)
     ]  # fmt: skip
     return Placed(camera, source or "estimated", sigma, poses, [found.get(k) for k in range(len(objects))], beforehand)
+
+
+def _partly(report: Report, done: int, share: float) -> None:
+    report(done + share)
 
 
 def state_of_keypoints(obj: ObjectToPlace, camera: Camera, prior: FocalPrior, photo: str) -> State:

@@ -5,7 +5,7 @@ three resolutions, fewer at each.  Whatever survives beside the winner, turned b
 and is the runner-up: how near its score comes, and how different its normals are, says how far the answer can be trusted.
 """
 
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from typing import Annotated
 
 import msgspec
@@ -20,6 +20,7 @@ from factorlib.geometry.camera import Camera, angle_between
 from factorlib.geometry.raster import Caster, rasterise
 
 Count = Annotated[int, msgspec.Meta(ge=1)]
+Report = Callable[[float], None]
 SAME_DEG = 6.0  # refined poses nearer than this are one
 DISTINCT_DEG = 15.0  # a runner-up is turned by more than this
 UNLIKELY_FOCAL = 0.001  # score that a focal length one sigma from the expected costs
@@ -72,28 +73,39 @@ class Found(msgspec.Struct, frozen=True):
 
 
 def focal_prior(camera_focal: float | None, source: str | None, width: int, height: int) -> FocalPrior:
-    """What is known of the focal length before looking: given is exact, EXIF nearly so, else a broad guess."""
+    """Return what is known of the focal length before looking: given is exact, EXIF nearly so, else a broad guess."""
     if camera_focal is None:
         return FocalPrior(UNKNOWN_FOCAL.focal * max(width, height), UNKNOWN_FOCAL.sigma)
     return FocalPrior(camera_focal, EXIF_SIGMA if source == "exif" else 0.0)
 
 
-def find(caster: Caster, silhouette: Silhouette, camera: Camera, prior: FocalPrior, search: Search = Search()) -> Found:
+def find(
+    caster: Caster,
+    silhouette: Silhouette,
+    camera: Camera,
+    prior: FocalPrior,
+    search: Search = Search(),
+    report: Report = lambda share: None,
+) -> Found:
     """The pose whose labelled silhouette agrees best with the photo's.
 
     camera: the photo's; its focal length is replaced by the prior's.  It must show some pixels of the object.
+    report: called with the share of the search that is done, after the first guesses and after each round of refinement
     """
     camera = msgspec.structs.replace(camera, focal=prior.focal)
     effort = search.cut_effort if is_cut(silhouette) else 1
     density = effort * search.views, search.rolls, effort * search.keep[0], search.apart_deg
     states, others = candidates(caster, silhouette, camera, *density), []
-    for keep, steps, size, margin in zip(search.keep, search.steps, search.resolution, search.margin):
+    rounds = zip(search.keep, search.steps, search.resolution, search.margin)
+    for number, (keep, steps, size, margin) in enumerate(rounds, start=1):
+        report(number / (len(search.keep) + 2))
         states = states[: keep if others else effort * keep]
         target = target_of(silhouette, caster.mesh.labels, size, margin)
         ranked = _distinct([refined(caster, target, camera, state, prior, steps) for state in states], prior)
         most = max(GIVEN_UP_RATIO * (1 - ranked[0].score), GIVEN_UP_UNEXPLAINED)
         states = [result.state for result in ranked if 1 - result.score <= most]
         others = ranked + others
+    report(1 - 1 / (len(search.keep) + 2))
     rivals: list[Refined] = []
     for other in others[len(ranked) :]:
         if len(rivals) < search.rivals and _is_apart(other, (ranked[0], *rivals), DISTINCT_DEG):

@@ -33,7 +33,7 @@ class Silhouette(msgspec.Struct, frozen=True):
 
 
 def silhouette_of_photo(channels: Channels) -> Silhouette:
-    """Of the whole photo, from the channels that the masks stage wrote."""
+    """Return the silhouette of the whole photo, from the channels that the masks stage wrote."""
     label = np.round(channels["label"]).astype(np.int16)
     if "left_out" in channels:
         label[channels["left_out"] > 0.5] = UNKNOWN
@@ -41,7 +41,7 @@ def silhouette_of_photo(channels: Channels) -> Silhouette:
 
 
 def silhouette_of_object(channels: Channels, number: int, labels: Sequence[int], own_mask: bool) -> Silhouette:
-    """Of object `number` (from 1), whose mesh carries `labels`.
+    """Return the silhouette of object `number` (from 1), whose mesh carries `labels`.
 
     With a mask of its own, what lies in it is the object; without, every pixel of its materials that no other object
     claims.  Pixels of other objects and of foreign materials may hide it: UNKNOWN.

@@ -35,7 +35,7 @@ class State(msgspec.Struct, frozen=True):
         return msgspec.structs.replace(like, focal=float(np.exp(self.log_focal)))
 
     def moved(self, step: Float[np.ndarray, "7"]) -> "State":
-        """By (turn about camera axes 3, a, b, log depth, log focal); the focal length takes the depth along, so that
+        """Return the state moved by (turn about camera axes 3, a, b, log depth, log focal); the focal length takes the depth along, so that
         the size and place in the image stay."""
         zoom, (a, b) = step[6], (self.a + step[3], self.b + step[4])
         slopes = float(a * np.exp(-zoom)), float(b * np.exp(-zoom))

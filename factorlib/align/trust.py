@@ -81,7 +81,7 @@ def doubts(
 
 
 def trust_in(obj: ObjectToPlace, placed: Placed, number: int) -> Trust:
-    """Of the pose of `obj`, the photo's `number`-th; of a pose that was given only the contours are compared."""
+    """Measure the trust in the pose of `obj`, the photo's `number`-th; of a pose that was given only the contours are compared."""
     found, caster, silhouette, camera = placed.found[number], obj.caster, obj.silhouette, placed.camera
     if not silhouette.inside.any():
         return Trust(1.0)

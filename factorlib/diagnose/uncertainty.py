@@ -37,7 +37,7 @@ d toward the camera, and where only Lambertian materials do.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from functools import partial
 from typing import NamedTuple
 
@@ -90,16 +90,16 @@ class StandardErrors(NamedTuple):
 
 
 def uncertainty_of(
-    solution: Solution, problem: JointProblem, choices: Choices
+    solution: Solution, problem: JointProblem, choices: Choices, tick: Callable[[], None] = lambda: None
 ) -> tuple[StandardErrors, dict[str, Float[np.ndarray, "h w 3"]]]:
     """Standard errors of the materials, in the gauge of the answer, and the relative ones of each light, as maps.
 
-    problem: all observations that the solution was found from
+    problem: all observations that the solution was found from;  tick: called after each of two systems for each light
     """
     problem = solution.shown(problem)
     if solution.materials and solution.lights:
         of_materials, of_lights = (
-            Posterior(of.sampled(choices.observations, choices.seed), fit, read_light_prior())
+            Posterior(of.sampled(choices.observations, choices.seed), fit, read_light_prior(), tick)
             for of, fit in ((sure_ones(problem), solution.materials), (problem, solution.lights))
         )
         fitted, materials = solution.materials.point.materials, solution.point.materials
@@ -115,10 +115,10 @@ def uncertainty_of(
 
 
 class Posterior:
-    """What is uncertain at the fit of a joint solve; problem: what it was fitted to."""
+    """What is uncertain at the fit of a joint solve; problem: what it was fitted to;  tick: called after each light whose system is made."""
 
-    def __init__(self, problem: JointProblem, fit: Fit, prior: LightPrior):
-        self.problem, self.fit, self.prior = problem, fit, prior
+    def __init__(self, problem: JointProblem, fit: Fit, prior: LightPrior, tick: Callable[[], None] = lambda: None):
+        self.problem, self.fit, self.prior, self.tick = problem, fit, prior, tick
         self.materials = materials_of(unknowns_of(fit.point.materials))  # none of whose reflectances is nil
 
     def systems(self, with_scores: bool) -> list[System]:
@@ -127,7 +127,9 @@ class Posterior:
         def system(one: tuple[Illumination, Hyperparameters]) -> System:
             """Of one illumination."""
             clusters = one[0].block.clusters() if with_scores else None
-            return marginal(field_of(*one, self.prior, not with_scores), clusters, materials_given=True)
+            made = marginal(field_of(*one, self.prior, not with_scores), clusters, materials_given=True)
+            self.tick()
+            return made
 
         illuminations = self.problem.fitted().illuminations(Point(self.materials, self.fit.point.lights))
         return list(self.problem.spread(system, list(zip(illuminations, self.fit.hyperparameters, strict=True))))

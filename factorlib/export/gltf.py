@@ -111,7 +111,7 @@ def _set_materials(
 
 
 def variant_name(overrides: Mapping[str, str]) -> str:
-    """What a variant is called that gives parts of a mesh other materials.
+    """Return what a variant is called that gives parts of a mesh other materials.
 
     >>> variant_name({"shell": "white", "legs": "black"})
     'legs: black, shell: white'

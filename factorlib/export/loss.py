@@ -39,7 +39,7 @@ def write_losses(path: str | Path, materials: Mapping[str, Reflectance]) -> None
 
 
 def losses(material: Reflectance) -> dict[str, Loss]:
-    """Of each of `viewers.MODELS` against the model of the solve, rounded to 5 digits; a black material loses nothing."""
+    """Return the loss of each of `viewers.MODELS` against the model of the solve, rounded to 5 digits; a black material loses nothing."""
     material = msgspec.structs.replace(material, roughness=max(material.roughness, LEAST_ROUGHNESS))
     filed = {name: with_roughness_of_file(material) if name == "usd" else material for name in MODELS}
     true = np.concatenate(ball(material, solved))

@@ -17,7 +17,7 @@ RULE = "where max diffuse + max specular of a material exceeds 1 - 1e-5, one fac
 
 
 def headroom_factor(materials: Mapping[str, Reflectance]) -> float:
-    """What reflectances are to be multiplied by: 1 where all materials fit already.
+    """Return what reflectances are to be multiplied by: 1 where all materials fit already.
 
     >>> headroom_factor({"red": Reflectance((0.9, 0.1, 0.1), (0.1, 0.1, 0.3), 0.3)})
     0.8333250000000001

@@ -33,7 +33,7 @@ class Shape(msgspec.Struct, frozen=True):
 
     @property
     def world_from_object(self) -> Float[np.ndarray, "4 4"]:
-        """In the y-up turn of the camera frame."""
+        """The transform into the y-up turn of the camera frame."""
         return _turn(YUP_FROM_CAMERA) @ self.cam_from_object
 
 
@@ -46,7 +46,7 @@ class ExposedMap(msgspec.Struct, frozen=True):
 
     @property
     def world_from_light(self) -> Float[np.ndarray, "4 4"]:
-        """Of the map's own axes, in the y-up turn of the camera frame."""
+        """The rotation of the map's own axes into the y-up turn of the camera frame."""
         return _turn(YUP_FROM_CAMERA @ self.camera_from_light @ YUP_FROM_CAMERA)
 
 

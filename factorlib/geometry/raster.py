@@ -63,11 +63,11 @@ class Caster:
         self.scene.add_triangles(o3d.core.Tensor(vertices), o3d.core.Tensor(mesh.faces.astype(np.uint32)))
 
     def cast(self, camera: Camera, pose: Pose) -> Hits:
-        """What the rays through the pixel centres of `camera` meet first."""
+        """Return what the rays through the pixel centres of `camera` meet first."""
         return self.cast_along(camera.rays(), pose)
 
     def cast_along(self, directions: Float[np.ndarray, "*n 3"], pose: Pose) -> Hits:
-        """What rays from the camera along `directions` (camera frame, z = 1, so that distance is depth) meet first."""
+        """Return what rays from the camera along `directions` (camera frame, z = 1, so that distance is depth) meet first."""
         rays = np.empty((*directions.shape[:-1], 6), np.float32)
         rays[..., :3] = (-pose.rotation.T @ pose.translation - self.centre) / self.radius
         rays[..., 3:] = directions @ (pose.rotation / self.radius)

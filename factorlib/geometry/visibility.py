@@ -11,7 +11,7 @@ one, near in place and in normal alike.
 Of a ray that is not free it is also kept which surface it meets, as a code of `factorlib.geometry.met`.
 """
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 
 import msgspec
 import numpy as np
@@ -30,6 +30,7 @@ GRAZING = 0.02  # sine of the least angle between a ray and its face
 BELOW = -0.1  # n·d of directions that are still cast: normals that are averaged later may lean that far
 ROWS = 4096  # points whose rays are held at once
 Vectors = Float[np.ndarray, "n 3"]
+Report = Callable[[int, int], None]
 NORMAL_WEIGHT = 10.0  # spacings of cast points that a difference of 1 between normals counts for
 
 
@@ -66,25 +67,35 @@ class Occluders(Caster):
         self.lift = LIFT * np.repeat([mesh.radius for mesh in meshes], [len(mesh.faces) for mesh in meshes])
 
     def points_under(self, camera: Camera, x: Int[np.ndarray, " n"], y: Int[np.ndarray, " n"]) -> Points:
-        """What the rays through the centres of pixels (x, y) meet first."""
+        """Return what the rays through the centres of pixels (x, y) meet first."""
         along = camera.rays_through(np.column_stack([x, y]) + 0.5)
         distance, face, normal = self._first(np.zeros_like(along), along)
         found = np.isfinite(distance)
         depth = np.where(found, distance * self.radius, 0.0)
         return Points(depth[:, None] * along + self.lift[face][:, None] * normal, normal, found)
 
-    def seen_from(self, points: Points, shading_normal: Vectors, directions: Float[np.ndarray, "k 3"]) -> Sight:
-        """What the points see along `directions` (camera frame, unit)."""
+    def seen_from(
+        self,
+        points: Points,
+        shading_normal: Vectors,
+        directions: Float[np.ndarray, "k 3"],
+        report: Report = lambda done, total: None,
+    ) -> Sight:
+        """Return what the points see along `directions` (camera frame, unit); report: called with how many of them are done."""
         seen = np.full((len(shading_normal), len(directions)), 255, np.uint8)
         met = np.full(seen.shape, UNMET, np.uint16)
-        for row, k, face, normal in self.hidden_from(points, shading_normal, directions):
+        for row, k, face, normal in self.hidden_from(points, shading_normal, directions, report):
             seen[row, k] = 0
             material = np.where(face >= 0, self.mesh.face_label[face].astype(np.int64) - 1, -1)
             met[row, k] = met_codes(material, normal)
         return Sight(seen, met)
 
     def hidden_from(
-        self, points: Points, shading_normal: Vectors, directions: Float[np.ndarray, "k 3"]
+        self,
+        points: Points,
+        shading_normal: Vectors,
+        directions: Float[np.ndarray, "k 3"],
+        report: Report = lambda done, total: None,
     ) -> Iterator[tuple[np.ndarray, ...]]:
         """The pairs of a point and a direction that is hidden from it, in order of the points, some points at a time.
 
@@ -92,6 +103,7 @@ class Occluders(Caster):
         to the point
         """
         for i in range(0, len(shading_normal), ROWS):
+            report(i, len(shading_normal))
             rows = slice(i, i + ROWS)
             row, k = np.nonzero((shading_normal[rows] @ directions.T > BELOW) & points.found[rows, None])
             normal, place, along = points.face_normal[rows][row], points.place[rows][row], directions[k]
@@ -115,14 +127,18 @@ class Occluders(Caster):
 
 
 def sight(
-    occluders: Occluders, camera: Camera, pixels: Int[np.ndarray, "n 2"], shading_normal: Vectors, directions: int, most_points: int
+    occluders: Occluders, camera: Camera, pixels: Int[np.ndarray, "n 2"], shading_normal: Vectors, directions: int, most_points: int,
+    report: Report = lambda done, total: None,
 ) -> Sight | None:  # fmt: skip
-    """What the points under pixels (x, y) see of the directions `fibonacci_sphere(directions)`; None where all see all."""
+    """Return what the points under pixels (x, y) see of the directions `fibonacci_sphere(directions)`; None where all see all.
+
+    report: called now and then with how many of the points that are cast from are done, and how many there are
+    """
     x, y = pixels.T
     points = occluders.points_under(camera, x, y)
     cast = spread_subset(x, y, most_points)
     some = Points(*(getattr(points, name)[cast] for name in points.__struct_fields__))
-    seen = occluders.seen_from(some, shading_normal[cast], fibonacci_sphere(directions))
+    seen = occluders.seen_from(some, shading_normal[cast], fibonacci_sphere(directions), report)
     if (seen.visibility == 255).all():
         return None
     if len(cast) == len(x):

@@ -54,7 +54,7 @@ def read_inside(path: str | Path, key: str, size: tuple[int, int] | None = None)
 
 
 def check_size(size: Sequence[int], expected: Sequence[int], path: str | Path, key: str) -> None:
-    """Both (height, width); InputError unless they are the same, which says so if the mask lies on its side."""
+    """Compare two sizes (height, width); raises InputError unless they are the same, which says so if the mask lies on its side."""
     if tuple(size) != tuple(expected):
         cure = "save the mask with the photo's own pixels"
         if tuple(size) == tuple(expected)[::-1]:

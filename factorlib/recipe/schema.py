@@ -33,7 +33,7 @@ CURE = 'write {"materials": {"gold": {"diffuse": [r, g, b], "specular": [r, g, b
 
 
 class Recipe(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True, tag_field="kind"):
-    """What every kind has."""
+    """The fields that every kind has."""
 
     samples: Samples = 256
     """Samples per pixel of the path tracer: noise falls as their square root."""
@@ -54,7 +54,7 @@ class AssumedSun(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class OfPhotos(Recipe, frozen=True, kw_only=True):
-    """Of kinds that make pictures of each photo."""
+    """The fields of kinds that make pictures of each photo."""
 
     photos: list[str] = []
     """Photos whose camera, objects and light are used; all of them where none is named."""
@@ -63,14 +63,14 @@ class OfPhotos(Recipe, frozen=True, kw_only=True):
 
 
 class Sized(OfPhotos, frozen=True, kw_only=True):
-    """Of kinds whose pictures need not be the photo's size."""
+    """The fields of kinds whose pictures need not be the photo's size."""
 
     width: Pixels | None = None
     """Width of the pictures; without it that of the photo as the pipeline works on it."""
 
 
 class Backdropped(Sized, frozen=True, kw_only=True):
-    """Of kinds that show what is beside the objects."""
+    """The fields of kinds that show what is beside the objects."""
 
     background: Literal["none", "light"] = "none"
     """What is seen beside the objects: nothing (transparent), or the light."""
@@ -183,7 +183,7 @@ def recipe_of(facts: dict) -> AnyRecipe:
 
 
 def is_light_file(name: str) -> bool:
-    """Whether a light is a file, not a photo's.
+    """Return whether a light is a file, not a photo's.
 
     >>> is_light_file("studio.hdr"), is_light_file("kitchen")
     (True, False)
@@ -192,7 +192,7 @@ def is_light_file(name: str) -> bool:
 
 
 def is_mesh_file(name: str) -> bool:
-    """Whether a mesh is a file, not one of the data set or the ball: it has a suffix."""
+    """Return whether a mesh is a file, not one of the data set or the ball: it has a suffix."""
     return "." in name
 
 
@@ -205,7 +205,7 @@ class OwnMaterial(msgspec.Struct, frozen=True):
 
 
 def read_table(path: Path) -> dict[str, OwnMaterial]:
-    """By name; InputError for a file that is no such table, or has a material that reflects more light than arrives."""
+    """Read the materials by name; raises InputError for a file that is no such table, or has a material that reflects more light than arrives."""
     text = read_text(path, "a table of materials")
     with reading("a table of materials", path, cure=CURE):
         content = msgspec.json.decode(text)

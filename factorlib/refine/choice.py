@@ -61,7 +61,7 @@ class Judged(msgspec.Struct, frozen=True):
     of_cells: Float[np.ndarray, " k"]
 
     def gain(self, over: Judged) -> tuple[float, float]:
-        """By what share of the loss of `over` this one's is less, and the standard error of that share."""
+        """Return by what share of the loss of `over` this one's is less, and the standard error of that share."""
         return gain_of(over.of_cells, self.of_cells)
 
 
@@ -81,7 +81,7 @@ class Settled(msgspec.Struct, frozen=True):
 def settled(
     moving: Moving, found: State, runner_up: State | None, cell: Int[np.ndarray, " n"], standards: Standards
 ) -> Settled | None:
-    """Which candidate to use; None where the candidates share too few pixels to compare them.
+    """Return which candidate to use; None where the candidates share too few pixels to compare them.
 
     cell: number of each pixel's cell
     """
@@ -97,7 +97,7 @@ def settled(
 
 
 def choice_of(verdicts: Sequence[Judged], standards: Standards) -> Settled:
-    """Of `judged` candidates; the first is the pose found."""
+    """Choose one of the `judged` candidates; the first is the pose found."""
     best = found = verdicts[0]
     for one in sorted(verdicts[1:], key=lambda one: one.held_out_loss, reverse=True):
         best = one if is_better(one, found, standards) else best
@@ -144,7 +144,7 @@ def gain_of(before: Float[np.ndarray, " k"], after: Float[np.ndarray, " k"]) -> 
 
 
 def is_better(one: Judged, than: Judged, standards: Standards) -> bool:
-    """Whether `one` replaces `than`, by the rule above."""
+    """Return whether `one` replaces `than`, by the rule above."""
     (gain, stderr), more = one.gain(than), one.score - than.score
     lost = standards.rival if "runner_up" in (one.name, than.name) else standards.most_lost
     agreed = more > standards.most_lost or gain > SURE * stderr

@@ -91,7 +91,7 @@ class View:
         self.pixels, self.casters, self.trusted, self.shadows = pixels, casters, trusted, shadows
 
     def seen(self, camera: Camera, poses: Sequence[Pose]) -> Seen:
-        """What the nearest mesh shows under each pixel."""
+        """Return what the nearest mesh shows under each pixel."""
         along = camera.rays_through(np.column_stack([self.pixels.x, self.pixels.y]) + 0.5)
         n, view = len(self.pixels), -unit(along)
         normal, label, nearest = np.tile([0.0, 0.0, -1.0], (n, 1)), np.zeros(n, int), np.full(n, np.inf)

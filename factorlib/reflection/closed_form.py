@@ -64,10 +64,10 @@ class ClosedForm(Operator):
     """Formulas alone."""
 
     def diffuse(self, sharpness: Float[Tensor, "*p"], nz: Float[Tensor, "n p"]) -> Float[Tensor, "n p"]:
-        """As of `Operator`."""
+        """Compute it as `Operator` says."""
         return diffuse(sharpness, nz)
 
     def specular(self, roughness: Tensor, sharpness: Tensor, no: Tensor, nz: Tensor, oz: Tensor) -> Tensor:
-        """As of `Operator`; at most MOST."""
+        """Compute it as `Operator` says; at most MOST."""
         scalars = torch.broadcast_tensors(roughness**2, sharpness, columns(no), nz, oz)
         return filtered_specular(*scalars).value.clamp_max(MOST)

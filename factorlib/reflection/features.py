@@ -35,7 +35,7 @@ class Layers(msgspec.Struct, frozen=True):
 
 
 def fading(sharpness: Tensor) -> Tensor:
-    """What is left of the correction of lobes sharper than in training: 1, then 1/√λ."""
+    """Return what is left of the correction of lobes sharper than in training: 1, then 1/√λ."""
     return torch.rsqrt((sharpness / SHARPEST).clamp_min(1.0))
 
 

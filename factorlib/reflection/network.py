@@ -70,7 +70,7 @@ class Network(Operator):
         return not listening and all(t.device.type == "cpu" and math.isfinite(t.sum()) for t in (sharpness, *others))
 
     def response(self, roughness: Tensor, sharpness: Tensor, no: Tensor, nz: Tensor, oz: Tensor) -> Response:
-        """As of every operator; in float32 by compiled code, where there is a compiler."""
+        """Compute it as every operator does; in float32 by compiled code, where there is a compiler."""
         if not self._compiled(*(t.detach() for t in (sharpness, roughness, no, nz, oz))):
             return super().response(roughness, sharpness, no, nz, oz)
         diffuse, _, by_log_sharpness, _, by_nz, _ = self.fused["diffuse"](0.0, sharpness, no, nz, oz)
@@ -78,7 +78,7 @@ class Network(Operator):
         return Response(diffuse, by_log_sharpness, by_nz, *specular)
 
     def diffuse(self, sharpness: Float[Tensor, "*p"], nz: Float[Tensor, "n p"]) -> Float[Tensor, "n p"]:
-        """As of `Operator`; in float32 by compiled code, where there is a compiler and no derivative is asked for."""
+        """Compute it as `Operator` says; in float32 by compiled code, where there is a compiler and no derivative is asked for."""
         if self._compiled(sharpness, nz):
             return self.fused["diffuse"].value(0.0, sharpness, nz.new_ones(len(nz)), nz, nz)
         nz = nz.clamp(-1, 1)
@@ -86,7 +86,7 @@ class Network(Operator):
         return formula * torch.exp(correction(self.layers["diffuse"], diffuse_features(sharpness, nz), sharpness))
 
     def specular(self, roughness: Tensor, sharpness: Tensor, no: Tensor, nz: Tensor, oz: Tensor) -> Tensor:
-        """As of `Operator`, at most MOST; in float32 by compiled code, where there is a compiler and no derivative is asked for."""
+        """Compute it as `Operator` says, at most MOST; in float32 by compiled code, where there is a compiler and no derivative is asked for."""
         if roughness.ndim == 0 and no.ndim == 1 and self._compiled(sharpness, no, nz, oz, roughness):
             return self.fused["specular"].value(float(roughness), sharpness, no, nz, oz)
         alpha, sharpness, no, nz, oz = torch.broadcast_tensors(roughness**2, sharpness, columns(no), nz, oz)

@@ -55,14 +55,14 @@ class PaperNetwork(Operator):
         self.layers = {part: layers.to(dtype) for part, layers in read.items()}
 
     def diffuse(self, sharpness: Float[Tensor, "*p"], nz: Float[Tensor, "n p"]) -> Float[Tensor, "n p"]:
-        """As of `Operator`; λ is clamped to SHARPNESS."""
+        """Compute it as `Operator` says; λ is clamped to SHARPNESS."""
         sharpness, nz = torch.broadcast_tensors(sharpness, nz.clamp(-1, 1))
         zero = torch.zeros_like(nz)
         normal, axis = (zero, zero, zero - 1), (soft_root(1 - nz * nz), zero, -nz)
         return self._reflected("diffuse", sharpness, diffuse_inputs(normal, axis, sharpness))
 
     def specular(self, roughness: Tensor, sharpness: Tensor, no: Tensor, nz: Tensor, oz: Tensor) -> Tensor:
-        """As of `Operator`; λ is clamped to SHARPNESS, the roughness to ROUGHNESS."""
+        """Compute it as `Operator` says; λ is clamped to SHARPNESS, the roughness to ROUGHNESS."""
         roughness, sharpness, no, nz, oz = torch.broadcast_tensors(roughness, sharpness, columns(no), nz, oz)
         normal, half, axis = frame_of_cosines(no, nz, oz)
         return self._reflected("specular", sharpness, specular_inputs(normal, half, axis, sharpness, roughness))

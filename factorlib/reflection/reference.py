@@ -43,11 +43,11 @@ class Reference(Operator):
         self.tolerance = tolerance
 
     def diffuse(self, sharpness: Float[Tensor, "*p"], nz: Float[Tensor, "n p"]) -> Float[Tensor, "n p"]:
-        """As of `Operator`, by quadrature."""
+        """Compute it as `Operator` says, by quadrature."""
         return diffuse_quadrature(sharpness.expand(nz.shape), nz)
 
     def specular(self, roughness: Tensor, sharpness: Tensor, no: Tensor, nz: Tensor, oz: Tensor) -> Tensor:
-        """As of `Operator`, by quadrature, converged to the tolerance."""
+        """Compute it as `Operator` says, by quadrature, converged to the tolerance."""
         scalars = torch.broadcast_tensors(roughness**2, sharpness, columns(no), nz, oz)
         return converged(*(t.reshape(-1) for t in scalars), tolerance=self.tolerance).reshape(nz.shape)
 

@@ -125,7 +125,7 @@ class Value:
         return self * self if exponent == 2 else NotImplemented
 
     def clamp(self, low: float, high: float) -> Value:
-        """As torch's."""
+        """Clamp as torch does."""
         return self.clamp_min(low).clamp_max(high)
 
     @classmethod

@@ -65,14 +65,14 @@ class Problem(msgspec.Struct, frozen=True):
 
 
 def specular_problem(samples: Samples) -> Problem:
-    """What the specular network is fitted to, at `samples`."""
+    """Return what the specular network is fitted to, at `samples`."""
     form = filtered_specular(*samples.inputs())
     features = specular_features(samples.alpha, samples.no, samples.nz, samples.oz, form)
     return Problem(features, samples.sharpness, form.value, samples.value, samples.scale())
 
 
 def diffuse_problem(samples: DiffuseSamples) -> Problem:
-    """What the diffuse network is fitted to, at `samples`."""
+    """Return what the diffuse network is fitted to, at `samples`."""
     formula, features = (f(samples.sharpness, samples.nz) for f in (diffuse, diffuse_features))
     return Problem(features, samples.sharpness, formula, samples.value, samples.scale())
 
@@ -87,7 +87,7 @@ class Step(msgspec.Struct, frozen=True):
     held_out_p999_error: float
 
     def score(self) -> float:
-        """Which of two networks is better: each quantile in units of what is wanted of it."""
+        """Return which of two networks is better: each quantile in units of what is wanted of it."""
         return self.held_out_median_error / 0.003 + self.held_out_p95_error / 0.02 + self.held_out_p999_error / 0.1
 
 
@@ -182,7 +182,7 @@ def descended(optimiser: torch.optim.Optimizer, loss: Tensor, step: int, schedul
 
 
 def pixels_problem(inputs: Float[Tensor, "n f"], sharpness: Tensor, radiance: Float[Tensor, " n"]) -> Problem:
-    """What the paper's network is fitted to: rendered radiance of unit lobes at unit reflectance; in float32."""
+    """Return what the paper's network is fitted to: rendered radiance of unit lobes at unit reflectance; in float32."""
     energy, radiance = lobe_integral(sharpness.float()), radiance.float()
     return Problem(inputs.float(), sharpness.float(), energy, radiance, radiance + energy / 100)
 

@@ -203,7 +203,7 @@ def animation(
 
 
 def relight(recipe: schema.Relight, results: SolvedSet, photo: str, out: Path, report: Report) -> None:
-    """In other photos' lights, or those of files: shown as the light's own photo would be, or exposed for the objects."""
+    """Draw the objects in other photos' lights, or those of files: shown as the light's own photo would be, or exposed for the objects."""
     scene = resized(results.scene(photo, denoise=recipe.denoise), recipe.width)
     lights = recipe.lights or [name for name in results.photos if name != photo]
     for k, name in enumerate(lights):

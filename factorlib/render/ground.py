@@ -17,7 +17,7 @@ MOST_TILT_DEG = 50.0  # of the upright axis against the cameras', on the mean: p
 
 
 class Plane(msgspec.Struct, frozen=True):
-    """In the world: unit normal, toward the objects, and a point."""
+    """A plane in the world: its unit normal, toward the objects, and a point."""
 
     normal: Float[np.ndarray, "3"]
     point: Float[np.ndarray, "3"]
@@ -32,7 +32,7 @@ class Plane(msgspec.Struct, frozen=True):
         return points - ((points - self.point) @ self.normal)[:, None] * self.normal
 
     def hit(self, rays: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
-        """Where rays from the origin meet the plane; NaN where they do not."""
+        """Return where rays from the origin meet the plane; NaN where they do not."""
         down = rays @ self.normal
         with np.errstate(divide="ignore", invalid="ignore"):
             distance = (self.point @ self.normal) / down
@@ -62,5 +62,5 @@ def resting_plane(placed: Placed, uprights: Float[np.ndarray, "k 3"] | None = No
 
 
 def height_over(plane: Plane, placed: Placed) -> float:
-    """How far an object reaches up from the plane."""
+    """Return how far an object reaches up from the plane."""
     return float(((placed.vertices - plane.point) @ plane.normal).max())

@@ -222,7 +222,7 @@ def _shadow(
 
 
 def shadow_match(photo: Picture, lit: Picture, constant: Picture, where: Bool[np.ndarray, "h w"]) -> ShadowMatch:
-    """How well a prediction of the ground's radiance explains what the photo shows there.
+    """Return how well a prediction of the ground's radiance explains what the photo shows there.
 
     lit, constant: the ground with the photo's objects in their light, and in a constant one;  where: pixels that show ground
     """

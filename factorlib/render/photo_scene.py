@@ -42,7 +42,7 @@ class Placed(msgspec.Struct, frozen=True):
 
     @property
     def vertices(self) -> Float[np.ndarray, "v 3"]:
-        """In the world."""
+        """The vertices in the world."""
         return self.mesh.vertices @ self.world_from_object[:3, :3].T + self.world_from_object[:3, 3]
 
 
@@ -58,7 +58,7 @@ class PhotoScene(msgspec.Struct, frozen=True):
 
     @property
     def middle(self) -> Float[np.ndarray, "3"]:
-        """Of the box about all objects."""
+        """The middle of the box about all objects."""
         points = np.concatenate([each.vertices for each in self.objects])
         return (points.min(axis=0) + points.max(axis=0)) / 2
 

@@ -69,7 +69,7 @@ def spot_beside(scene: PhotoScene, plane: Plane, neighbour: Placed, relative_hei
 def spot_at(
     scene: PhotoScene, plane: Plane, neighbour: Placed, pixel: tuple[float, float], relative_height: float
 ) -> Spot:
-    """Where the photo's `pixel` shows the ground; InputError where it does not."""
+    """Return where the photo's `pixel` shows the ground; InputError where it does not."""
     ray = scene.camera.rays_through(np.array([pixel])) @ YUP_FROM_CAMERA
     point = plane.hit(ray)[0]
     if not np.isfinite(point).all():
@@ -111,7 +111,7 @@ class Solid(Caster):
         self.box = used.min(axis=0), used.max(axis=0)
 
     def crossed(self, start: Float[np.ndarray, "n 3"], along: Float[np.ndarray, "n 3"]) -> np.ndarray:
-        """Which of the segments from `start` to `start + along` cross the surface."""
+        """Return which of the segments from `start` to `start + along` cross the surface."""
         low, high = start + np.minimum(along, 0), start + np.maximum(along, 0)
         crossed = ((low <= self.box[1]) & (high >= self.box[0])).all(axis=1)
         rays = np.column_stack([(start[crossed] - self.centre) / self.radius, along[crossed] / self.radius])
@@ -120,12 +120,12 @@ class Solid(Caster):
         return crossed
 
     def holds(self, points: Float[np.ndarray, "n 3"]) -> bool:
-        """Whether one of the points lies within the mesh; nothing lies within an open one."""
+        """Return whether one of the points lies within the mesh; nothing lies within an open one."""
         query = o3d.core.Tensor(((points - self.centre) / self.radius).astype(np.float32))
         return not self.mesh.open and bool(self.scene.compute_occupancy(query, nthreads=1, nsamples=3).numpy().any())
 
     def meets(self, other: "Solid", move: Float[np.ndarray, "3"]) -> bool:
-        """Whether it intersects another when it is moved."""
+        """Return whether it intersects another when it is moved."""
         if (self.box[0] + move > other.box[1]).any() or (self.box[1] + move < other.box[0]).any():
             return False
         return bool(
@@ -144,7 +144,7 @@ class Room:
         self.new, self.others = Solid(new), [Solid(each) for each in scene.objects]
 
     def pierced(self, move: Float[np.ndarray, "3"] = np.zeros(3)) -> Iterator[str]:
-        """What the new object would intersect if it were moved: names of objects, or the camera."""
+        """Return what the new object would intersect if it were moved: names of objects, or the camera."""
         yield from (f"'{other.name}'" for other in self.others if self.new.meets(other, move))
         if self.new.holds(-move[None]):
             yield "the camera"

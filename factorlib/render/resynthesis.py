@@ -93,7 +93,7 @@ def resynthesised(
 def around_pixels(
     around: Surroundings, material: int, y: Int[np.ndarray, " n"], x: Int[np.ndarray, " n"]
 ) -> tuple[Shadows | None, Float[np.ndarray, "n 6"] | None, Float[np.ndarray, "n 3"] | None]:
-    """What pixels of a material see and are sent, and where they lie: as the nearest observed pixel of it; None for all, nothing, the middle."""
+    """Return what pixels of a material see and are sent, and where they lie: as the nearest observed pixel of it; None for all, nothing, the middle."""
     rows = np.flatnonzero(around.seen.material == material)
     of = around.seen.take(rows)
     if len(of) == 0 or len(x) == 0:

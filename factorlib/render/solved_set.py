@@ -109,7 +109,7 @@ class SolvedSet:
         return (channels["label"] > 0) | (channels["left_out"] > 0)
 
     def tone(self, photo: str) -> Tone:
-        """What the photo shows of radiance."""
+        """Return what the photo shows of radiance."""
         tone = self.table.model.tone.get(photo)
         return (lambda radiance: shown(radiance, tone.exponent, tone.pivot)) if tone else as_it_is
 
@@ -138,7 +138,8 @@ class SolvedSet:
     def mesh(
         self, name: str, material: str | dict[str, str] | None, up: str
     ) -> tuple[Mesh, tuple[str, ...], np.ndarray]:
-        """A mesh to insert, its materials by label, and which way is up in its own frame: of the data set's, as it stands in a photo.
+        """A mesh to insert, its materials by label, and which way is up in its own frame: of the data set's, as it stands in the first
+        photo, by name, whose object has the materials that are to be replaced.
 
         material: of the whole, or of some of its own materials, by name, others; None: its own
         Raises InputError for a mesh that is not there, for one without height, and for a material that the mesh does not have.
@@ -155,8 +156,10 @@ class SolvedSet:
             known = [BALL, *sorted({obj.mesh for each in self.objects.values() for obj in each.objects})]
             raise InputError(f"there is no mesh {name!r}", key="mesh", cure=did_you_mean(name, known))
         else:
-            photo, obj = shown[0]
-            placed = self._placed(obj, self.objects[photo].meshes[name], self.poses[photo])
+            each = [(p, self._placed(obj, self.objects[p].meshes[name], self.poses[p])) for p, obj in shown]
+            asked = set(material) if isinstance(material, dict) else set()
+            own = [{self.names[label - 1] for label in one.mesh.labels} for _, one in each]
+            photo, placed = next((one for one, has in zip(each, own, strict=True) if asked <= has), each[0])
             upward = placed.world_from_object[:3, :3].T @ self.ground(photo, placed).plane.normal
             mesh, materials = placed.mesh, placed.materials
             if isinstance(material, str):
@@ -173,8 +176,10 @@ class SolvedSet:
         return mesh, materials, upward
 
     def _objects_of(self, mesh: str) -> list[tuple[str, ObjectEntry]]:
-        """All objects of that mesh, and the photos that show them."""
-        return [(photo, obj) for photo, each in self.objects.items() for obj in each.objects if obj.mesh == mesh]
+        """All objects of that mesh, and the photos that show them, by name: the order in dataset.yaml decides nothing."""
+        return [
+            (photo, obj) for photo, each in sorted(self.objects.items()) for obj in each.objects if obj.mesh == mesh
+        ]
 
     def _uprights(self, mesh: str) -> Float[np.ndarray, "k 3"]:
         """The upward axes of the cameras of all objects of that mesh, in its frame."""

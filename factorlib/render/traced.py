@@ -29,7 +29,7 @@ class Traced(msgspec.Struct, frozen=True):
 
     @property
     def coverage(self) -> Float[np.ndarray, "h w 1"]:
-        """In [0, 1]."""
+        """The share of each pixel that is covered, in [0, 1]."""
         return np.clip(self.pixels[..., 3:], 0, 1)
 
     @property
@@ -48,7 +48,7 @@ class Traced(msgspec.Struct, frozen=True):
         return Traced(self.pixels * np.array([self.exposure] * 3 + [1.0]))
 
     def over(self, photo: Radiance) -> Radiance:
-        """On top of a photo, as the photo would show it."""
+        """Lay the picture on top of a photo, as the photo would show it."""
         return (1 - self.coverage) * photo + self.coverage * self.shown
 
     def rgba(self, exposure: float = 1.0) -> UInt8[np.ndarray, "h w 4"]:

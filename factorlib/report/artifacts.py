@@ -50,24 +50,24 @@ class Artifacts(msgspec.Struct, frozen=True, dict=True):
         return self.read(read_exr, stage, f"{name}.exr")
 
     def channels(self, stage: str, name: str) -> Channels:
-        """As `exr`, of a file that is there."""
+        """Read the channels as `exr` does, of a file that is there."""
         channels = self.exr(stage, name)
         assert channels is not None
         return channels
 
     @cached_property
     def photo_facts(self) -> dict[str, PhotoFacts]:
-        """What `masks` says of each photo."""
+        """Return what `masks` says of each photo."""
         return self.read(read_photos, "masks", "photos.json") or {}
 
     @cached_property
     def poses(self) -> dict[str, PhotoPoses]:
-        """What `align` says of each photo."""
+        """Return what `align` says of each photo."""
         return self.read(read_poses, "align", "poses.json") or {}
 
     @cached_property
     def surface(self) -> SurfaceTable:
-        """What shading says of the meshes; as given, where there is no such result."""
+        """Return what shading says of the meshes; as given, where there is no such result."""
         return read_surface(self.folders.get("surface"))
 
     @cached_property
@@ -87,7 +87,7 @@ class Artifacts(msgspec.Struct, frozen=True, dict=True):
 
     @cached_property
     def metrics(self) -> Metrics | None:
-        """What `evaluate` measured."""
+        """Return what `evaluate` measured."""
         return self.read(read_metrics, "evaluate", "metrics.json")
 
     def illumination_of(self, photo: str) -> str:

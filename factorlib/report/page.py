@@ -82,7 +82,7 @@ def page(
 
 
 def links(run: Artifacts) -> dict[str, list[tuple[str, str]]]:
-    """By kind the files that are there: their names, and where they lie beside the folder of the page in build/<dataset>/."""
+    """Return by kind the files that are there: their names, and where they lie beside the folder of the page in build/<dataset>/."""
     found = {}
     for kind, (stage, pattern) in FILES.items():
         paths = sorted(run.folders[stage].glob(pattern))
@@ -174,7 +174,7 @@ def _in_order(names: Iterable[str]) -> list[str]:
 
 
 def cost_of(events: list[dict], order: list[str]) -> dict[str, list]:
-    """What each stage cost, the last time each step ran: the only part of the page that differs from run to run.
+    """Return what each stage cost, the last time each step ran: the only part of the page that differs from run to run.
 
     A line of the log is {"event": "done", "stage", "photo", "seconds", "cpu_seconds", "memory_mb", "machine", …} for a step, or
     {"event": "warning", "stage", "photo", "text"}.

@@ -18,7 +18,7 @@ from factorlib.images.palette import nearest_tags
 from factorlib.images.picture import exposure_of, picture, png_bytes
 from factorlib.images.transfer import srgb_encode
 from factorlib.reflection import reflection_operator
-from factorlib.render.reflect import Reflector
+from factorlib.render.reflect import Reflector, Report, silently
 from factorlib.render.resynthesis import Surroundings, light_of, resynthesised
 from factorlib.report.artifacts import Artifacts, Channels, Picture
 from factorlib.results.lobes import read_lobes
@@ -141,9 +141,12 @@ def photo_row(run: Artifacts, name: str, tags: dict[str, str], errors: PhotoErro
 
 
 def first_pictures(
-    run: Artifacts, rows: Sequence[PhotoRow], lights: Mapping[str, LightSlice]
+    run: Artifacts, rows: Sequence[PhotoRow], lights: Mapping[str, LightSlice], report: Report = silently
 ) -> list[tuple[str, str, str]]:
-    """Title, `data:` URI and words of the photo that counts most pixels, its re-synthesis, and the same in another photo's light."""
+    """Title, `data:` URI and words of the photo that counts most pixels, its re-synthesis, and the same in another photo's light.
+
+    report: called with how many of the last one's pixels are done, and how many there are
+    """
     row = max(rows, key=lambda row: row.errors.pixels if row.errors else 0)
     words = {"photo": row.name, "re-synthesis": "from what was recovered"}
     shown = [(title, row.uris[title], text) for title, text in words.items() if title in row.uris]
@@ -151,13 +154,15 @@ def first_pictures(
         return shown
     other = next((p for p in run.set.photos if run.illumination_of(p) != row.illumination), None)
     words = "in its own light, turned half around" if other is None else f"in the light of {other}"
-    return [*shown, ("relit", data_uri(relit(run, row.name, other, lights)), words)]
+    return [*shown, ("relit", data_uri(relit(run, row.name, other, lights, report)), words)]
 
 
-def relit(run: Artifacts, name: str, other: str | None, lights: Mapping[str, LightSlice]) -> UInt8[np.ndarray, "h w 4"]:
+def relit(
+    run: Artifacts, name: str, other: str | None, lights: Mapping[str, LightSlice], report: Report = silently
+) -> UInt8[np.ndarray, "h w 4"]:
     """A photo's objects in the light of another photo, or without one in their own light turned by 180° about the camera's y axis.
 
-    Surfaces shadow one another where the solve says so, but send each other no light.  lights: of all photos
+    Surfaces shadow one another where the solve says so, but send each other no light.  lights: of all photos;  report: as of `first_pictures`
     """
     of, model = other or name, run.solved.model
     light = light_of(run.folders["export"], of, lights[of])
@@ -173,7 +178,7 @@ def relit(run: Artifacts, name: str, other: str | None, lights: Mapping[str, Lig
     seen = run.read(read_observations, "urm", f"{name}.parquet") if model.self_shadowing else None
     materials = [run.exported.get(m, UNKNOWN) for m in run.set.materials]
     around = None if seen is None else Surroundings(msgspec.structs.replace(seen, met=None))
-    radiance = resynthesised(reflector, materials, {"label": label}, geometry, around=around)[box][::step, ::step]
+    radiance = resynthesised(reflector, materials, {"label": label}, geometry, report, around)[box][::step, ::step]
     inside = radiance.max(-1) > 0
     pixels = picture(radiance, exposure_of(radiance, inside)).astype(np.float32)
     pixels = np.concatenate([pixels, 255 * inside[..., None]], axis=-1)
@@ -342,7 +347,7 @@ def measured_map(observations: Observations, exposure: float) -> UInt8[np.ndarra
 def light_row(
     run: Artifacts, name: str, photos: list[str], errors: dict[str, dict[str, ScoredLight]] | None
 ) -> dict[str, Any] | None:
-    """What the page shows of light `name`; None where no such light was exported.  errors: its part of metrics.json
+    """Return what the page shows of light `name`; None where no such light was exported.  errors: its part of metrics.json
 
     uri, dark_uri, true_uri, spheres: the map, 4 stops darker, the true one, three spheres;  white: the radiance shown as white
     peak: the brightest texel in units of it;  overflow: share of the sphere that is brighter, outlined;  energy: its share of the light

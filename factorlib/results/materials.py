@@ -42,7 +42,7 @@ class Reflectance(msgspec.Struct, frozen=True):
 
 
 class StandardErrors(msgspec.Struct, frozen=True):
-    """Of a reflectance, in the gauge that the file's `gauge.stderr` names."""
+    """The standard errors of a reflectance, in the gauge that the file's `gauge.stderr` names."""
 
     diffuse: Channels
     specular: Channels
@@ -161,7 +161,7 @@ class MaterialTable(msgspec.Struct, frozen=True):
 
 
 class Misfit(msgspec.Struct, frozen=True):
-    """Of a photo: the share of its shading that is not explained (`factorlib.diagnose.misfit`), and of its values that are clipped."""
+    """How a photo is explained: the share of its shading that is not (`factorlib.diagnose.misfit`), and of its values that are clipped."""
 
     unexplained: AtLeast0
     clipped: AtLeast0
@@ -202,7 +202,7 @@ def read_materials(path: str | Path, cure: str = "") -> MaterialTable:
 
 
 def reflectances(table: MaterialTable) -> dict[str, Reflectance]:
-    """By name, without standard errors."""
+    """Return the reflectances by name, without standard errors."""
     return {name: material.reflectance for name, material in table.materials.items()}
 
 

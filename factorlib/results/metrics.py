@@ -26,7 +26,7 @@ from factorlib.results.materials import Reflectance, Vec3
 
 
 class Counts(msgspec.Struct, frozen=True):
-    """Of the set; components: groups of photos that share no material."""
+    """The counts of the set; components: groups of photos that share no material."""
 
     photos: int
     materials: int

@@ -31,7 +31,7 @@ class PoseEntry(msgspec.Struct, frozen=True):
 
     @property
     def pose(self) -> Pose:
-        """As arrays."""
+        """The pose as arrays."""
         return Pose(np.array(self.rotation), np.array(self.translation))
 
 
@@ -90,7 +90,7 @@ class ObjectEntry(PoseEntry, frozen=True):
 
 
 class CameraEntry(msgspec.Struct, frozen=True):
-    """In pixels of masks' <photo>.exr, each of which stands for factor² of the photo's; focal_source as of `align`."""
+    """The camera in pixels of masks' <photo>.exr, each of which stands for factor² of the photo's; focal_source as of `align`."""
 
     focal_px: Positive
     principal_point: tuple[float, float]
@@ -99,7 +99,7 @@ class CameraEntry(msgspec.Struct, frozen=True):
     factor: Annotated[int, msgspec.Meta(ge=1)] = 1
 
     def camera(self, width: int, height: int) -> Camera:
-        """Of a picture of that many pixels."""
+        """Return the camera of a picture of that many pixels."""
         return Camera(width, height, self.focal_px, self.principal_point)
 
 
@@ -116,7 +116,7 @@ def entry_of(pose: Pose) -> dict[str, list]:
 
 
 def read_poses(path: str | Path, cure: str = CURE) -> dict[str, PhotoPoses]:
-    """By photo; raises InputError for a file that holds no poses."""
+    """Read the poses by photo; raises InputError for a file that holds none."""
     photos = read_result(path, dict[str, PhotoPoses], "align", cure)
     for name, photo in photos.items():
         _check(photo, path, f"{name}.objects", cure)

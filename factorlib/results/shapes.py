@@ -31,5 +31,5 @@ class ShapesTable(msgspec.Struct, frozen=True):
 
 
 def read_shapes(folder: Path | None) -> ShapesTable:
-    """Of the folder of the stage `shapes`; empty where a data set has none."""
+    """Read the table in the folder of the stage `shapes`; it is empty where a data set has none."""
     return ShapesTable() if folder is None else read_result(folder / FILE, ShapesTable, "shapes")

@@ -28,11 +28,11 @@ class Earlier(msgspec.Struct, frozen=True):
 
     @property
     def interreflection(self) -> str | None:
-        """As `self_shadowing`."""
+        """Whether bounces were used, as `self_shadowing` says of shadows."""
         return _decided(self.table.model.interreflection, self.table.model.interreflection_chosen_by)
 
     def beside(self, relative: dict[str, float]) -> "Earlier":
-        """With exposures that are factors on `relative` ones: of each photo, those that radiances are divided by."""
+        """Return the solution with exposures that are factors on `relative` ones: of each photo, those that radiances are divided by."""
         exposures = {p: tuple(e / relative.get(p, 1.0) for e in each) for p, each in self.exposures.items()}
         return msgspec.structs.replace(self, exposures=exposures)
 

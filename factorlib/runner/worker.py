@@ -275,9 +275,9 @@ class Events(logging.Handler):
             self.say(text)
 
     def progress(self, done: float, total: float, text: str = "") -> None:
-        """Report that `done` of `total` is done; dropped within EVERY seconds of the last that was not, unless a hundredth more is done."""
+        """Report that `done` of `total` is done; dropped within EVERY seconds of the last that was not, unless the share has changed by a hundredth."""
         share = done / total if total else 0.0
-        if (now := time.monotonic()) - self._last >= EVERY or share >= self._share + 0.01:
+        if (now := time.monotonic()) - self._last >= EVERY or abs(share - self._share) >= 0.01:
             self._last, self._share = now, share
             self._write({"done": float(done), "total": float(total), "text": text})
 

@@ -151,7 +151,7 @@ def _spread(turned: Sequence[Turned]) -> list[Turned]:
 
 
 def tilted(one: Outline) -> Iterator[Turned]:
-    """For each mirror plane of the outline and each tilt in it, the largest body that fits."""
+    """Find for each mirror plane of the outline and each tilt in it the largest body that fits."""
     camera = msgspec.structs.replace(one.camera, focal=one.prior.focal)
     for normal in mirrors(one, camera):
         ray = camera.rays_through(one.middle[None])[0]

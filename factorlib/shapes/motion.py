@@ -8,6 +8,7 @@ photos give the same cameras.
 
 import logging
 from collections.abc import Callable, Mapping
+from itertools import count
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
@@ -103,31 +104,44 @@ def _mapped(
             Image.fromarray(view.grey).save(images / f"{name}.png")
             Image.fromarray(kept[name].astype(np.uint8) * 255).save(masks / f"{name}.png.png")
             groups.setdefault((view.grey.shape, view.camera.centre, view.prior), []).append(name)
-        kept_focals = set()
+        kept_focals, done = set(), count()
         # one camera for all photos of one size, principal point and focal length; COLMAP numbers them from 1
         for number, (((height, width), centre, prior), names) in enumerate(groups.items(), start=1):
-            report(0.2 * (number - 1) / len(groups), "features")
             reader = pycolmap.ImageReaderOptions(camera_model="SIMPLE_PINHOLE", mask_path=str(masks))
             if prior.sigma < UNKNOWN_FOCAL.sigma or centre != (width / 2, height / 2):
                 reader.camera_params = f"{prior.focal},{centre[0]},{centre[1]}"
             if prior.sigma == 0:
                 kept_focals.add(number)
-            pycolmap.extract_features(
-                database, images, [f"{name}.png" for name in names], pycolmap.CameraMode.SINGLE, reader, extraction, pycolmap.Device.cpu
-            )  # fmt: skip
-        report(0.2, "matches")
+            for name in names:
+                report(0.2 * next(done) / len(views), "features")
+                pycolmap.extract_features(
+                    database, images, [f"{name}.png"], pycolmap.CameraMode.SINGLE, reader, extraction, pycolmap.Device.cpu
+                )  # fmt: skip
+                reader.existing_camera_id = number
         matching = pycolmap.FeatureMatchingOptions(num_threads=1, use_gpu=False)
         verification = pycolmap.TwoViewGeometryOptions()
         verification.ransac.random_seed = SEED
-        pairing = pycolmap.ExhaustivePairingOptions()
-        pycolmap.match_exhaustive(database, matching, pairing, verification, pycolmap.Device.cpu)
+        files = [f"{name}.png" for names in groups.values() for name in names]
+        pairing = pycolmap.ImportedPairingOptions(match_list_path=str(root / "pairs.txt"))
+        for k, file in enumerate(files[1:], start=1):  # with all before it
+            report(0.2 + 0.4 * k**2 / len(files) ** 2, "matches")
+            (root / "pairs.txt").write_text("".join(f"{other} {file}\n" for other in files[:k]))
+            pycolmap.match_image_pairs(database, matching, pairing, verification, pycolmap.Device.cpu)
+        done = count(2)  # the first two photos are placed together
+
+        def placed_one() -> None:
+            """Say that one more photo has its place."""
+            report(0.6 + 0.3 * min(next(done) / len(files), 1.0), "cameras")
+
         report(0.6, "cameras")
         options = pycolmap.IncrementalPipelineOptions(
             num_threads=1, random_seed=SEED, multiple_models=False, min_model_size=LEAST_PHOTOS, extract_colors=False,
             ba_refine_focal_length=True, ba_refine_principal_point=False, constant_cameras=kept_focals,
         )  # fmt: skip
         options.mapper.num_threads, options.mapper.random_seed, options.triangulation.random_seed = 1, SEED, SEED
-        models = pycolmap.incremental_mapping(database, images, root / "models", options)
+        models = pycolmap.incremental_mapping(
+            database, images, root / "models", options, next_image_callback=placed_one
+        )
         best = max(models.values(), key=lambda model: (model.num_reg_images(), model.num_points3D()), default=None)
         if best is None or best.num_points3D() < LEAST_POINTS:
             return {}, 0
@@ -170,7 +184,7 @@ def bent_lenses(model: pycolmap.Reconstruction) -> dict[int, tuple[float, float]
 
 
 def outline_of(name: str, view: View, placed: Registered) -> Outline:
-    """What is seen of all objects together, by the camera that was found."""
+    """Return what is seen of all objects together, by the camera that was found."""
     part = np.where(view.left_out, UNKNOWN, view.objects.astype(int))
     camera = msgspec.structs.replace(view.camera, focal=placed.focal)
     return Outline(name, part, camera, FocalPrior(placed.focal, 0.0), placed.pose)

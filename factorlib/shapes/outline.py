@@ -48,7 +48,7 @@ class Outline(msgspec.Struct, frozen=True, dict=True):
         return bool((self.part > 0).any())
 
     def inner(self, pixels: Float[np.ndarray, "*n 2"]) -> Float[np.ndarray, "*n"]:
-        """How many pixels inside the outline points (x, y) lie, negative outside.  Only background says that there is no object: where nothing
+        """Return how many pixels inside the outline points (x, y) lie, negative outside.  Only background says that there is no object: where nothing
         is known counts as inside, and a point beyond the frame is as far outside as background at the frame is, else FREE."""
         x, y = pixels[..., 0], pixels[..., 1]
         values = map_coordinates(self._distance, np.stack([y, x]) - 0.5, order=1, mode="nearest")
@@ -75,7 +75,7 @@ class Triangles(msgspec.Struct, frozen=True):
     overlap: float = 1.0
 
     def as_mesh(self) -> Mesh:
-        """For outlines: label 1 all over, its normals of no account."""
+        """Return a mesh for outlines: label 1 all over, its normals of no account."""
         label = np.ones(len(self.faces), np.int16)
         return Mesh(self.vertices, self.faces.astype(np.int32), np.ones_like(self.vertices), label)
 

@@ -83,6 +83,11 @@ class Schedule(msgspec.Struct, frozen=True):
     least: float = 1.0
     given: bool = False
 
+    @property
+    def points(self) -> int:
+        """The largest number of points that a fit tries."""
+        return self.lights + 1 + sum(iterations + 1 for iterations in self.together)
+
 
 def fitted(
     problem: JointProblem,

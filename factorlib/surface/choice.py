@@ -17,6 +17,7 @@ surface    at last the displacement whose normals come nearest to the turned one
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Sequence
+from itertools import count
 
 import msgspec
 import numpy as np
@@ -28,7 +29,7 @@ from factorlib.meshes.fine import Fine
 from factorlib.model.materials import Point
 from factorlib.model.problem import JointProblem
 from factorlib.results.materials import Decision
-from factorlib.solve.choices import effects_chosen
+from factorlib.solve.choices import TRIAL, effects_chosen
 from factorlib.solve.evidence import FOR, Losses, compare, losses_of
 from factorlib.solve.fit import Fit, Schedule, field_of, fitted, sure_ones
 from factorlib.solve.marginal import marginal
@@ -62,19 +63,19 @@ class Surfaces(msgspec.Struct, frozen=True):
         return sum(mesh.nodes for mesh in self.meshes.values())
 
     def laplacian(self) -> csr_array:
-        """Of all meshes, [v, v]."""
+        """Return the Laplacian of all meshes, [v, v]."""
         return csr_array(block_diag([mesh.laplacian() for mesh in self.meshes.values()]))
 
     def displacements(
         self, turn: Float[np.ndarray, "v 3"], attached: Sequence[Attached]
     ) -> dict[str, Float[np.ndarray, " n"]]:
-        """By mesh, in its extents: what `Fine.displacement` finds for the turns of its nodes, as far as observations are attached to them."""
+        """Return by mesh, in its extents, what `Fine.displacement` finds for the turns of its nodes, as far as observations are attached to them."""
         weight = sum(np.bincount(of.node.reshape(-1), of.share.reshape(-1), self.nodes) for of in attached)
         turns, seen = self.by_mesh(turn), self.by_mesh(np.minimum(weight, 1.0))
         return {name: mesh.displacement(turns[name], seen[name]) for name, mesh in self.meshes.items()}
 
     def by_mesh(self, values: np.ndarray) -> dict[str, np.ndarray]:
-        """What belongs to each mesh's nodes."""
+        """Return what belongs to each mesh's nodes."""
         return {name: values[k : k + self.meshes[name].nodes] for name, k in self.first.items()}
 
     def turns_of(self, displacements: dict[str, Float[np.ndarray, " n"]]) -> Float[np.ndarray, "v 3"]:
@@ -84,7 +85,7 @@ class Surfaces(msgspec.Struct, frozen=True):
         return np.vstack(list((still | moved).values()))
 
     def nodes_of(self, names: Iterable[str]) -> Bool[np.ndarray, " v"]:
-        """Which nodes are of these meshes."""
+        """Return which nodes are of these meshes."""
         return np.concatenate([np.full(mesh.nodes, name in names) for name, mesh in self.meshes.items()])
 
 
@@ -105,22 +106,23 @@ class Found(msgspec.Struct, frozen=True):
 
 
 Report = Callable[[float, str], None]  # the share that is done, and what is being done
+Tick = Callable[..., None]  # called when a piece of work is done
 
 
 class Judged(msgspec.Struct, frozen=True):
-    """Of each photo: −2 log marginal likelihood and held-out losses, with detail in which it had no part."""
+    """What each photo says: −2 log marginal likelihood and held-out losses, with detail in which it had no part."""
 
     values: Float[np.ndarray, " f"]
     losses: Losses
 
     def gain_over(self, other: Judged) -> float:
-        """By how many standard errors over photos the values are less."""
+        """Return by how many standard errors over photos the values are less."""
         gains = other.values - self.values
         return float(gains.mean() / max(gains.std(ddof=1) / np.sqrt(len(gains)), 1e-12))
 
 
 def evidence_of(after: Judged, before: Judged, held_out: float, likelihood: float) -> Decision:
-    """Whether detail is kept: better by more than so many standard errors in each of the two measures."""
+    """Return whether detail is kept: better by more than so many standard errors in each of the two measures."""
     evidence = compare(before.losses, after.losses, held_out)
     return msgspec.structs.replace(evidence, kept=evidence.kept and after.gain_over(before) > likelihood)
 
@@ -157,11 +159,11 @@ class Trial(msgspec.Struct, frozen=True):
 
     @property
     def names(self) -> list[str]:
-        """Of these photos."""
+        """The names of these photos."""
         return [self.problem.blocks[k].photos[j] for k, j in self.photos]
 
-    def judged(self, details: Sequence[Detail]) -> Judged:
-        """Every photo by itself, on the surface that `details` has for it, in a light of its own, with the materials given."""
+    def judged(self, details: Sequence[Detail], tick: Tick = lambda: None) -> Judged:
+        """Every photo by itself, on the surface that `details` has for it, in a light of its own, with the materials given; tick: called after each."""
 
         def alone(of: tuple[tuple[int, int], Detail]) -> tuple[float, Losses]:
             """One photo's value and losses."""
@@ -172,13 +174,15 @@ class Trial(msgspec.Struct, frozen=True):
             begun = Fit(Point(self.fit.point.materials, [self.fit.point.lights[k]]), counts)
             point = fitted(problem, begun, self.prior, OWN_LIGHT).point
             (one,) = problem.fitted().illuminations(point)
-            return marginal(field_of(one, counts[0], self.prior)).value, losses_of(problem, point)
+            judged = marginal(field_of(one, counts[0], self.prior)).value, losses_of(problem, point)
+            tick()
+            return judged
 
         values, losses = zip(*self.problem.spread(alone, list(zip(self.photos, details, strict=True))), strict=True)
         return Judged(np.array(values), Losses(*([of[i][0] for of in losses] for i in (0, 1))))
 
-    def left_out(self, parts: list[Part], laplacian: csr_array, stiffness: Stiffness) -> list[Detail]:
-        """For every photo the surface that all others ask for; parts: of the mesh itself."""
+    def left_out(self, parts: list[Part], laplacian: csr_array, stiffness: Stiffness, tick: Tick) -> list[Detail]:
+        """Find for every photo the surface that all others ask for; parts: of the mesh itself;  tick: called after each photo."""
 
         def others(photo: tuple[int, int]) -> Detail:
             """The detail that one photo has no part in."""
@@ -189,6 +193,7 @@ class Trial(msgspec.Struct, frozen=True):
             found = step(rest, laplacian, stiffness, no_detail(self.surfaces.nodes))
             seen = [of.take(~rows) for of, rows in zip(self.attached, gone, strict=True)]
             moved = self.surfaces.displacements(found.turn, seen)
+            tick()
             return Detail(self.surfaces.turns_of(moved), found.log_factor)
 
         return list(self.problem.spread(others, self.photos))
@@ -207,20 +212,29 @@ def found(
 
     problem: all observations;  attached: where each block's lie;  start: where materials and lights begin;  seed: of what is drawn
     """
-    report(0.0, "materials and lights")
+
+    def pieces(begin: float, end: float, number: int, what: str) -> Tick:
+        """What reports, whenever it is called, that one more of so many pieces of work is done."""
+        report(begin, what)
+        done = count(1)
+        return lambda *_: report(begin + (end - begin) * min(next(done) / number, 1.0), what)
+
     sure = sure_ones(problem)
+    starts = start(sure, CELLS)
+    tick = pieces(0.0, 0.18, len(starts) * TRIAL.points + SETTLE.points, "materials and lights")
     choices = Choices(self_shadowing="on", interreflection="on", seed=seed)
 
     def fitting(name: str, some: JointProblem, begun: Fit, schedule: Schedule) -> Fit:
         """A fit under the prior."""
-        return fitted(some, begun, prior, schedule)
+        return fitted(some, begun, prior, schedule, tick)
 
-    effects = effects_chosen(sure, start(sure, CELLS), choices, fitting)
-    fit = fitted(effects.of(problem), effects.fit, prior, SETTLE)
+    effects = effects_chosen(sure, starts, choices, fitting)
+    fit = fitted(effects.of(problem), effects.fit, prior, SETTLE, tick)
     trial, plain = Trial(effects.of(problem), fit, surfaces, attached, prior), no_detail(surfaces.nodes)
     if len(trial.photos) < 2 or problem.none_held_out:
         return Found(Decision(False))
-    laplacian, parts, given = surfaces.laplacian(), trial.parts(plain, fit), trial.judged([plain] * len(trial.photos))
+    laplacian, parts, photos = surfaces.laplacian(), trial.parts(plain, fit), len(trial.photos)
+    given = trial.judged([plain] * photos, pieces(0.18, 0.2, photos, "photos without detail"))
 
     def best(
         tried: list[Stiffness], before: Judged, done: float, held_out: float, likelihood: float
@@ -231,33 +245,34 @@ def found(
         """
         details, judged = [], []
         for number, one in enumerate(tried):
-            report(done + 0.3 * number / len(tried), f"left-out photos, stiffness {one.factor or one.turn:g}")
-            details.append(trial.left_out(parts, laplacian, one))
-            judged.append(trial.judged(details[-1]))
+            begin, end = (done + 0.3 * k / len(tried) for k in (number, number + 1))
+            tick = pieces(begin, end, 2 * photos, f"left-out photos, stiffness {one.factor or one.turn:g}")
+            details.append(trial.left_out(parts, laplacian, one, tick))
+            judged.append(trial.judged(details[-1], tick))
         k = min(range(len(tried)), key=lambda i: round(float(judged[i].values.sum()), 3))
         return tried[k], details[k], judged[k], evidence_of(judged[k], before, held_out, likelihood)
 
     stiffness, turned, moved, evidence = best([Stiffness(a) for a in TURNS], given, 0.2, FOR, 0.0)
     moving = set(surfaces.meshes)
     if len(surfaces.meshes) > 1:  # those stay that, moved alone, are against it
-        report(0.48, "mesh by mesh")
-        alone = {name: trial.judged([trial.moving(of, {name}) for of in turned]) for name in surfaces.meshes}
+        tick = pieces(0.5, 0.55, photos * len(surfaces.meshes), "mesh by mesh")
+        alone = {name: trial.judged([trial.moving(of, {name}) for of in turned], tick) for name in surfaces.meshes}
         moving = {name for name, judged in alone.items() if evidence_of(judged, given, 0.0, 0.0).kept}
         if 0 < len(moving) < len(surfaces.meshes):
             moved = trial.judged([trial.moving(of, moving) for of in turned])
             evidence = evidence_of(moved, given, FOR, 0.0)
     now = (stiffness, moved) if evidence.kept else (Stiffness(None), given)
     tried = [Stiffness(now[0].turn, a) for a in FACTORS]
-    both, _, paint, painted = best(tried, now[1], 0.5, 0.0, FOR)
+    both, _, paint, painted = best(tried, now[1], 0.55, 0.0, FOR)
     stiffness, judged = (both, paint) if painted.kept else now
     gains = dict(zip(trial.names, (given.values - judged.values).tolist(), strict=True))
     if not (evidence.kept or painted.kept):
         return Found(evidence, painted)
     detail = plain
     for number in range(ROUNDS):
-        report(0.8 + 0.06 * number, f"all photos, round {number + 1}")
+        tick = pieces(0.85 + 0.05 * number, 0.9 + 0.05 * number, BETWEEN.points, f"all photos, round {number + 1}")
         if number:
-            fit = fitted(trial.on(detail), fit, prior, BETWEEN)
+            fit = fitted(trial.on(detail), fit, prior, BETWEEN, tick)
             parts = trial.parts(detail, fit)
         detail = step(parts, laplacian, stiffness, detail, surfaces.nodes_of(moving))
     displacements = surfaces.displacements(detail.turn, attached) if evidence.kept else {}

@@ -28,7 +28,7 @@ class Taken(msgspec.Struct, frozen=True):
 
 
 def observed_pixels(photo: Channels, geometry: Channels, least_confidence: float = 0.0) -> Bool[np.ndarray, "h w"]:
-    """Where mask and mesh agree on the material and the surface faces the camera."""
+    """Return where mask and mesh agree on the material and the surface faces the camera."""
     facing = sum(geometry[f"normal.{a}"] * geometry[f"view.{a}"] for a in "xyz") > GRAZING
     agrees = np.rint(photo["label"]) == np.rint(geometry["label"])
     labelled = photo["label"] > 0.5

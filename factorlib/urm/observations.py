@@ -186,7 +186,7 @@ def concatenate(parts: Sequence[Observations]) -> Observations:
 
 
 def with_exposures(observations: Observations, known: Mapping[str, float]) -> Observations:
-    """With exposures that are known, in EV by photo, in place of those of EXIF."""
+    """Return the observations with exposures that are known, in EV by photo, in place of those of EXIF."""
     if not known:
         return observations
     exif = observations.exposures or (None,) * len(observations.photos)
@@ -197,7 +197,7 @@ def with_exposures(observations: Observations, known: Mapping[str, float]) -> Ob
 
 
 def relative_exposures(observations: Observations) -> dict[str, float]:
-    """Of each photo that has observations, over the first one (by name) in its light; 1 unless all photos of the light say theirs.
+    """Return the exposure of each photo that has observations, over the first one (by name) in its light; 1 unless all photos of the light say theirs.
 
     Two photos of one light differ by a factor, which the solve finds.  From a factor of 8 it may not find back; what the cameras
     wrote, t·S/N², is right within rounding and what a camera's own rendering does.  So radiance is brought to the exposure of
@@ -215,7 +215,7 @@ def relative_exposures(observations: Observations) -> dict[str, float]:
 
 
 def at_one_exposure(observations: Observations, relative: dict[str, float]) -> Observations:
-    """With the radiance of each photo over its relative exposure; unchanged where all are 1."""
+    """Return the observations with the radiance of each photo over its relative exposure; unchanged where all are 1."""
     factors = np.array([relative.get(photo, 1.0) for photo in observations.photos])
     if (factors == 1).all():
         return observations

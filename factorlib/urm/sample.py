@@ -44,7 +44,7 @@ def strata(observations: Observations, most: int) -> Int[np.ndarray, " n"]:
 
 
 def shared_out(size: Int[np.ndarray, " g"], most: int) -> Int[np.ndarray, " g"]:
-    """How many each stratum keeps: what it has, up to a number that is the same for all but for one; `most` in all.
+    """Return how many each stratum keeps: what it has, up to a number that is the same for all but for one; `most` in all.
 
     >>> shared_out(np.array([1, 5, 100, 80]), 27).tolist()
     [1, 5, 11, 10]

@@ -2,7 +2,7 @@
 
 A section is the function `rows()` of one module of `studies.measured`, which gives its tables.  On top of it stand the version, the commit, the
 date and the kind of machine that it was measured on.  A section that needs what is not here (LIGHTS, REAL: see its module)
-is left as it was, and named at the end.  All of it takes many hours.
+is left as it was, and named at the end.  All of it takes many hours.  It also makes docs/gallery.md and the outputs of docs/result.ipynb.
 """
 
 from __future__ import annotations
@@ -33,6 +33,7 @@ SECTIONS = {  # module -> title
     "refine": "Poses by shading, and proportions of meshes",
     "viewer": "The viewer of the report",
 }
+PAGES = ("gallery", "notebook")  # modules whose `write()` makes a page of its own
 
 
 def machine() -> str:
@@ -53,23 +54,28 @@ def section(name: str, tables: Tables, measured: str) -> str:
 
 def main() -> int:
     """Measure the sections that ONLY names, or all, and write each as soon as it is measured; 1 where one is left as it was."""
-    wanted = os.environ.get("ONLY", "").split() or list(SECTIONS)
+    known = [*PAGES, *SECTIONS]
+    wanted = os.environ.get("ONLY", "").split() or known
     for name in wanted:
-        if name not in SECTIONS:
-            raise InputError(f"there is no section '{name}'", key="ONLY", cure=did_you_mean(name, list(SECTIONS)))
+        if name not in known:
+            raise InputError(f"there is no section '{name}'", key="ONLY", cure=did_you_mean(name, known))
     torch.set_num_threads(1)
     left = {}
     for name in wanted:
         start = time.perf_counter()
+        module = import_module(f"studies.measured.{name}")
         try:
-            tables = import_module(f"studies.measured.{name}").rows()
+            if name in PAGES:
+                print(module.write(), flush=True)
+                continue
+            tables = module.rows()
         except (InputError, SystemExit) as error:
             left[name] = error
             continue
         refresh(PAGE, {name: section(name, tables, f"{machine()}, {time.perf_counter() - start:.0f} s")})
         print(f"{PAGE}: {SECTIONS[name]}", flush=True)
     for name, error in left.items():
-        print(f"'{SECTIONS[name]}' is left as it was: {error}", file=sys.stderr)
+        print(f"'{SECTIONS.get(name, name)}' is left as it was: {error}", file=sys.stderr)
     return 1 if left else 0
 
 

@@ -33,7 +33,8 @@ def searched(mesh, seed, mask=None, given=None, known=True, search=QUICK, **how)
     silhouette, given = true_silhouette(caster, camera, pose), given or caster
     silhouette = mask(silhouette) if mask else silhouette
     prior = focal_prior(camera.focal if known else None, "dataset", camera.width, camera.height)
-    found = find(given, silhouette, camera, prior, search)
+    found = find(given, silhouette, camera, prior, search, (shares := []).append)
+    assert shares == sorted(set(shares)) and len(shares) == 5  # first guesses, and four rounds
     return found, normal_error_deg(caster, camera, pose, found.state.camera(camera), found.state.pose(given))
 
 

@@ -106,13 +106,14 @@ def test_materials_lie_within_a_few_standard_errors(fit):
 def test_lights_lie_within_their_standard_errors(fit):
     """Log radiance of cells, after the factor per channel that is free: about 68 % within one posterior standard deviation."""
     problem, true, found, _ = fit
-    posterior, within = Posterior(problem, found, PRIOR), []
+    made, within = [], []
+    posterior = Posterior(problem, found, PRIOR, lambda: made.append(1))
     for system, light, true_light in zip(posterior.systems(with_scores=False), found.point.lights, true, strict=True):
         cells = 3 * len(light)
         deviation = np.sqrt(np.diag(np.linalg.inv(system.light_hessian))[:cells]).reshape(3, -1)
         off = light.log_radiance - true_light.log_radiance
         within.append(np.abs(off - np.median(off, axis=1, keepdims=True)) < deviation)
-    assert 0.5 < np.mean(within) < 0.9
+    assert 0.5 < np.mean(within) < 0.9 and len(made) == len(true)  # a tick a light
     maps = posterior.relative_standard_errors()
     assert set(maps) == {"room0", "room1", "room2"}
     assert all(((m > 0) & (m <= LARGEST)).all() and np.isfinite(m).all() for m in maps.values())

@@ -21,8 +21,9 @@ from factorlib.light.lobes import SUN, Lobes, lobe_integral
 from factorlib.meshes.read import read_mesh
 from factorlib.reflection.network import SHIPPED
 from factorlib.results.lobes import write_lobes
-from factorlib.stage import Inputs, silent
+from factorlib.stage import Inputs
 from stages import export
+from tests.stages.made import Rising
 
 NAMES = ["red", "brass", "unseen"]
 MATERIALS = {
@@ -117,7 +118,7 @@ def make_exported(folder: Path) -> Inputs:
     """The same, and what `export` makes of it, at a small size: the inputs of `recipes`."""
     inputs = make(folder)
     (folder / "export").mkdir()
-    export.main(export.Params(height=16, mitsuba_height=16), inputs, folder / "export", silent)
+    export.main(export.Params(height=16, mitsuba_height=16), inputs, folder / "export", Rising())
     return Inputs({**inputs.folders, "export": folder / "export"}, inputs.facts, inputs.files)
 
 

@@ -12,10 +12,11 @@ import pytest
 
 from factorlib.images.picture import read_png
 from factorlib.jsonfile import read_json, write_json
-from factorlib.stage import Inputs, silent
+from factorlib.stage import Inputs
 from stages import evaluate, report
 from studies.measured.viewer import CHROMIUM, opened
 from tests.evaluate.made_artifacts import Made, make_artifacts
+from tests.stages.made import Rising
 
 LINKED = {"day": ["red", "white"], "noon": ["white", "brass"], "dusk": ["red"]}
 CONTENTS = {"summary", "relight", "photos", "materials", "appearance", "reflectance", "lights", "errors", "solve", "poses", "training", "cost"}  # fmt: skip
@@ -56,7 +57,7 @@ def run(folder, log=LOG, **made) -> tuple[Inputs, str]:
     inputs = make_artifacts(Made(folder / "in", **made))
     scored = folder / "evaluate"
     scored.mkdir()
-    evaluate.main(evaluate.Params(), inputs, scored, silent)
+    evaluate.main(evaluate.Params(), inputs, scored, Rising())
     (folder / "log.jsonl").write_text("\n".join(json.dumps(e) for e in log))
     inputs = msgspec.structs.replace(inputs, folders=inputs.folders | {"evaluate": scored}, log=folder / "log.jsonl")
     return inputs, page_of(inputs, folder / "report")
@@ -64,7 +65,8 @@ def run(folder, log=LOG, **made) -> tuple[Inputs, str]:
 
 def page_of(inputs, out) -> str:
     out.mkdir()
-    report.main(report.Params(), inputs, out, silent)
+    report.main(report.Params(), inputs, out, told := Rising())
+    assert told.moves >= len(inputs.facts["dataset.set"]["photos"]) + 3
     return (out / "index.html").read_text(encoding="utf-8")
 
 

@@ -235,9 +235,9 @@ def test_logs_have_times_memory_and_what_a_step_was_made_with_warnings_once_and_
 
 def test_progress_that_moves_is_told_at_once_and_what_stands_is_not(tmp_path):
     events = Events(tmp_path / "events.jsonl")
-    for pieces in (0.0, 3.0, 3.001):
+    for pieces in (0.0, 3.0, 3.001, 0.5):
         events.progress(pieces, 4, "page")
-    assert [json.loads(line)["done"] for line in (tmp_path / "events.jsonl").read_text().splitlines()] == [0, 3]
+    assert [json.loads(line)["done"] for line in (tmp_path / "events.jsonl").read_text().splitlines()] == [0, 3, 0.5]
 
 
 def test_what_is_left_is_told_where_every_stage_ran_before_by_what_it_took(project, monkeypatch):

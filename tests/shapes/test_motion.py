@@ -31,8 +31,9 @@ def turns_off(found):
 
 
 def test_cameras_about_a_body_at_rest_are_found_and_are_the_same_each_time():
-    views = views_of(BLOB, POSES, POSES)
-    found = cameras_by_motion(views)
+    views, shares = views_of(BLOB, POSES, POSES), []
+    found = cameras_by_motion(views, lambda share, what: shares.append(share))
+    assert shares == sorted(shares) and len(set(shares)) > 4 * len(views)  # it moves with every photo, twice
     assert list(found) == list(views) and max(turns_off(found)) < 0.5
     assert all(each.focal == pytest.approx(1.3 * 320, rel=0.02) for each in found.values())
     kept = {name: msgspec.structs.replace(view, prior=FocalPrior(430.0, 0.0)) for name, view in views.items()}

@@ -9,6 +9,17 @@ from factorlib.images.exr import write_exr
 from factorlib.jsonfile import write_json
 
 
+class Rising:
+    """A stage's progress, which must never fall; `moves`: how often it rose."""
+
+    def __init__(self):
+        self.share, self.moves = 0.0, 0
+
+    def __call__(self, done: float, total: float, text: str = "") -> None:
+        assert self.share - 1e-9 <= done / total <= 1, text
+        self.moves, self.share = self.moves + (done / total > self.share), done / total
+
+
 def write_masks(folder: Path, photo: str, label: np.ndarray, focal, source, channels=None) -> None:
     """The result of `masks` for a photo that is as bright as its label, or has these channels."""
     zero, (height, width) = np.zeros(label.shape), label.shape

@@ -17,10 +17,10 @@ from factorlib.geometry.raster import rasterise
 from factorlib.images.exr import read_exr
 from factorlib.jsonfile import read_json, write_json
 from factorlib.meshes.ply import write_ply
-from factorlib.stage import Inputs, silent
+from factorlib.stage import Inputs
 from stages import align
 from tests.align.scenes import blob, chair, photo_of
-from tests.stages.made import chair_facts, entry_of, write_masks
+from tests.stages.made import Rising, chair_facts, entry_of, write_masks
 
 QUICK = Search(views=160, rolls=16, keep=(20, 8, 4, 2))
 KNOWN = {"pose_given": True, "focal": 300.0, "source": "dataset"}
@@ -41,7 +41,8 @@ def step(tmp_path, mesh_in_photo, mesh_given, *, pose_given=False, focal=None, s
 def run(tmp_path, inputs, name="out", **params):
     out = tmp_path / name
     out.mkdir()
-    align.main(align.Params(search=QUICK, **params), inputs, out, silent)
+    align.main(align.Params(search=QUICK, **params), inputs, out, told := Rising())
+    assert told.moves >= 1
     return out, json.loads((out / "a.json").read_text())
 
 

@@ -20,10 +20,11 @@ from factorlib.reflection import reflection_operator
 from factorlib.reflection.network import SHIPPED
 from factorlib.results.lobes import read_lobes
 from factorlib.results.solution import FILES
-from factorlib.stage import Inputs, silent
+from factorlib.stage import Inputs
 from factorlib.urm.observations import Observations, write_observations
 from stages import solve
 from studies.scenes.problems import MATERIALS, random_light, sphere_normals
+from tests.stages.made import Rising
 
 NAMES = ("red", "green", "blue")
 
@@ -47,7 +48,7 @@ def observations(photo: str, materials, seed: int, size: int = 16, unit: float =
 def run(
     folder,
     photos: dict[str, Observations],
-    progress=silent,
+    progress=None,
     unfinished=None,
     start=None,
     light=None,
@@ -64,7 +65,8 @@ def run(
     facts = {"dataset.materials": list(NAMES), "dataset.light": light, "dataset.known": known or {}}
     inputs = Inputs(folders, facts, files or {}, unfinished=unfinished)
     quick = {"cells": 24, "splittings": 0, "observations": 150, "merge_degrees": 0.0, "tone": "off"}
-    solve.main(solve.Params(**{**quick, **params}), inputs, out, progress)
+    solve.main(solve.Params(**{**quick, **params}), inputs, out, told := progress or Rising())
+    assert progress or "solver" in params or told.share > 0.9
     return out
 
 

@@ -8,11 +8,12 @@ from factorlib.geometry.raster import rasterise
 from factorlib.images.exr import write_exr
 from factorlib.jsonfile import write_json
 from factorlib.meshes.ply import write_ply
-from factorlib.stage import Inputs, silent
+from factorlib.stage import Inputs
 from factorlib.urm.observations import read_observations
 from factorlib.urm.sample import sample
 from stages import urm
 from tests.align.scenes import ball, mesh_of
+from tests.stages.made import Rising
 
 CAMERA = Camera(80, 60, 90.0, (40.0, 30.0))
 LEFT, RIGHT = Pose(np.eye(3), np.array([-1.05, 0.0, 6.0])), Pose(np.eye(3), np.array([1.05, 0.0, 6.0]))
@@ -50,7 +51,7 @@ def step(folder, poses: dict[str, Pose]):
 
 def run(folder, inputs, **params):
     folder.mkdir()
-    urm.main(urm.Params(**params), inputs, folder, silent)
+    urm.main(urm.Params(**params), inputs, folder, Rising())
     return folder / "a.parquet"
 
 

@@ -5,15 +5,17 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from PIL import Image
 
 from factorlib.errors import InputError
 from factorlib.images.exr import LAT_LONG, write_rgb_exr
 from factorlib.jsonfile import write_json
 from factorlib.results.materials import MaterialTable, Reflectance, StandardErrors, solved
-from studies.measured import results
+from studies.measured import gallery, results
 from studies.measured.eames_like import MAPS, drawn, folder_of
 from studies.measured.standard_errors import light_deviations, material_deviations
-from studies.measured.tools import refresh
+from studies.measured.tools import ROOT, refresh
+from studies.run import STUDIES
 
 
 def test_a_section_is_replaced_and_the_rest_of_the_page_stays(tmp_path):
@@ -31,6 +33,29 @@ def test_a_section_is_replaced_and_the_rest_of_the_page_stays(tmp_path):
     )
     with pytest.raises(InputError, match="no place for the table 'other'"):
         refresh(page, {"other": ""})
+
+
+def test_the_gallery_shows_every_recipe_and_every_study():
+    page, files = gallery.PAGE.read_text(encoding="utf-8"), sorted((gallery.PAGE.parent / "gallery").iterdir())
+    recipes = {file.stem for folder in ("", gallery.DATASET) for file in (ROOT / "recipes" / folder).glob("*.yaml")}
+    assert {file.stem for file in files} == recipes and all(f"RECIPE={name}</code>" in page for name in recipes)
+    assert max(file.stat().st_size for file in files) <= 60_000
+    assert page.endswith("\n".join(gallery.studies_of(gallery.STUDIES_PAGE.read_text(encoding="utf-8"))))
+    assert page.count("`make study STUDY=") == len(STUDIES)
+
+
+def test_a_sheet_has_four_pictures_or_one_on_white(tmp_path):
+    for k in range(4):
+        Image.new("RGBA", (480, 320), (60 * k, 0, 0, 255 * (k > 0))).save(tmp_path / f"{k}.png")
+    files = sorted(tmp_path.iterdir())
+    one, four = (np.asarray(gallery.sheet(some)) for some in (files[1:2], files))
+    assert one.shape == four.shape == (320, 480, 3) and (one == [60, 0, 0]).all()
+    edged = Image.new("RGBA", (480, 320))
+    edged.paste((9, 9, 9, 255), (100, 50, 300, 150))
+    edged.save(tmp_path / "edged.png")
+    assert gallery.sheet([tmp_path / "edged.png"]).size == (200, 100)  # what is transparent is cut off
+    corners = [four[0, 0], four[0, -1], four[-1, 0], four[-1, -1]]
+    assert np.array_equal(corners, [[255] * 3, [60, 0, 0], [120, 0, 0], [180, 0, 0]])
 
 
 def test_a_prior_is_fitted_to_the_maps_that_light_no_photo(tmp_path):

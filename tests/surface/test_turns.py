@@ -18,6 +18,7 @@ from factorlib.surface.turns import GRAZING, MOST, PULL, Attached, Detail, Stiff
 from studies.scenes.problems import MATERIALS
 from tests.model.made import photos_in_a_wrong_light
 from tests.solve.made import PRIOR, begun, drawn, on_even_cells, photographed, spheres
+from tests.stages.made import Rising
 
 TURN = np.linalg.qr(np.random.default_rng(3).normal(size=(3, 3)))[0]  # the object's axes in the camera's frame
 COUNTS = Hyperparameters(2.0)
@@ -142,7 +143,13 @@ def on_spheres(lights: int, size: float, seed: int = 0) -> tuple[Found, Surfaces
     problem, body = spheres(true, size=18, seed=seed), surfaces()
     given = with_wrong_normals(problem, size)
     at = [attached_to(block.normal, body) for block in problem.blocks]
-    return found(given, body, at, from_nothing(3), PRIOR), body, given, problem
+    told = Rising()
+    return (
+        found(given, body, at, from_nothing(3), PRIOR, report=lambda share, what: told(share, 1, what)),
+        body,
+        given,
+        problem,
+    )
 
 
 def errors(normals: np.ndarray, true: np.ndarray) -> float:

@@ -1,0 +1,106 @@
+"""docs/gallery.md: a picture of every recipe, made of data/eames, and what every study shows; `make results ONLY=gallery`.
+
+Recipes are the files in recipes/ and recipes/eames/, studies those of `studies.run`: a new one appears by itself.
+"""
+
+from __future__ import annotations
+
+import os
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+from PIL import Image
+
+from factorlib.errors import InputError
+from factorlib.wholefile import write_text
+from studies.measured.tools import ROOT, table
+from studies.run import STUDIES
+
+PAGE, STUDIES_PAGE = ROOT / "docs" / "gallery.md", ROOT / "docs" / "studies.md"
+DATASET, PHOTO = "eames", "terrace"  # whose pictures are shown where a recipe makes them of all photos
+SIDE = 240  # pixels of the longer side of one of four pictures; twice as many of a single one
+HEAD = """# Gallery
+
+Every recipe with its pictures of `data/eames`, and every study with what it shows. `make results ONLY=gallery` makes this page.
+
+## Recipes
+A recipe says which pictures to make of a result; [recipes](recipes.md) has all its fields. Where it makes pictures of all photographs, those of the `terrace`
+are shown here; of several, as the frames of an animation, four.
+"""
+FIGURE = """<figure markdown="0" style="margin: 0">
+<img src="gallery/{name}.jpg" alt="{says}" width="{width}" height="{height}">
+<figcaption><strong>{name}</strong>: {says}<br><code>make render DATASET={dataset} RECIPE={name}</code></figcaption>
+</figure>"""
+GRID = (
+    '<div style="display: grid; grid-template-columns: repeat(auto-fill, minmax(min(100%, 300px), 1fr)); gap: 1.5rem">'
+)
+FINDING = re.compile(
+    r"^- (.*? grows as .*?|.*?: (?:shown|the opposite is shown|no difference is shown))(?: \(|, )", re.MULTILINE
+)
+
+
+def write() -> Path:
+    """Make the pictures of all recipes, as far as they are not made, and write the page and its pictures; returns the page."""
+    environment = {name: value for name, value in os.environ.items() if name not in ("SET", "FORCE", "STAGE")}
+    environment |= {"DATASET": DATASET, "RECIPE": "all", "PYTHONPATH": str(ROOT)}
+    if subprocess.run([sys.executable, "-m", "factorlib", "render"], cwd=ROOT, env=environment, check=False).returncode:
+        raise SystemExit(1)  # it has said why
+    recipes = {path.stem: path for folder in ("", DATASET) for path in (ROOT / "recipes" / folder).glob("*.yaml")}
+    (ROOT / "docs" / "gallery").mkdir(exist_ok=True)
+    figures = [figure(recipes[name]) for name in sorted(recipes)]
+    write_text(PAGE, "\n".join([HEAD, GRID, *figures, "</div>\n", *studies_of(STUDIES_PAGE.read_text("utf-8"))]))
+    return PAGE
+
+
+def figure(recipe: Path) -> str:
+    """Write the picture of a recipe; returns its HTML, with the recipe's first line, a comment, as its caption.
+
+    Raises InputError where the first line is no comment.
+    """
+    first = recipe.read_text("utf-8").partition("\n")[0]
+    if not first.startswith("# "):
+        raise InputError("the first line does not say what the recipe shows", file=recipe, cure="begin it with `# …`")
+    made = sorted((ROOT / "build" / DATASET / "recipes" / recipe.stem).rglob("*.png"))
+    made = [file for file in made if PHOTO in (file.stem, file.parent.name)] or made
+    picture = sheet([made[k * len(made) // 4] for k in range(4)] if len(made) >= 4 else made[:1])
+    picture.save(ROOT / "docs" / "gallery" / f"{recipe.stem}.jpg", quality=85, optimize=True)
+    width, height = picture.size
+    return FIGURE.format(name=recipe.stem, says=first[2:], width=width, height=height, dataset=DATASET)
+
+
+def sheet(files: list[Path]) -> Image.Image:
+    """One picture, or four of one size two by two: what is not transparent in any of them, on white."""
+    pictures, side = [Image.open(file).convert("RGBA") for file in files], SIDE * (2 if len(files) == 1 else 1)
+    boxes = np.array([box for picture in pictures if (box := picture.getchannel("A").getbbox())])
+    shown = (*boxes[:, :2].min(0).tolist(), *boxes[:, 2:].max(0).tolist())
+    pictures = [picture.crop(shown) for picture in pictures]
+    for picture in pictures:
+        picture.thumbnail((side, side))
+    width, height = pictures[0].size
+    whole = Image.new("RGBA", (width, height) if len(files) == 1 else (2 * width, 2 * height), "white")
+    for k, picture in enumerate(pictures):
+        whole.alpha_composite(picture, (k % 2 * width, k // 2 * height))
+    return whole.convert("RGB")
+
+
+def studies_of(page: str) -> list[str]:
+    """The part on studies, of the claims that stand in docs/studies.md, whose text `page` is."""
+    rows = []
+    for name, study in STUDIES.items():
+        found = FINDING.findall(page.partition(f"<!-- begin {name} -->")[2].partition("<!-- end")[0])
+        shown = [words for words in found if words.endswith(": shown")]
+        first = next((words for words in found if words in shown or "grows as" in words), found[0])
+        words = f"{first.removesuffix(': shown')} ({len(shown)} of {len(found)} claims)" if shown else first
+        title = f"[{study.title}](studies.md#{re.sub('[^a-z ]', '', study.title.lower().replace('-', ' ')).replace(' ', '-')})"
+        rows.append([title, study.question, words, f"`make study STUDY={name}`"])
+    about = "A study varies one thing and tests claims over at least five seeds. Here stands the first that is shown, and how many are: [studies](studies.md) has all."
+    return [
+        "## Studies",
+        about,
+        "",
+        table(["study", "question", "what is shown", "command"], rows).replace("---:", "---"),
+        "",
+    ]

@@ -1,0 +1,29 @@
+"""docs/result.ipynb with its outputs, run on data/eames: `make results ONLY=notebook`, which takes `make setup EXTRAS=notebook`."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from factorlib.errors import InputError
+from factorlib.wholefile import write_text
+from studies.measured.tools import ROOT, evaluated
+
+PAGE = ROOT / "docs" / "result.ipynb"
+
+
+def write() -> Path:
+    """Run all cells in docs/ and write the notebook with what they show, without times and versions; returns its path.
+
+    Raises InputError where what runs notebooks is not installed, and CellExecutionError where a cell fails.
+    """
+    try:
+        import nbformat
+        from nbclient import NotebookClient
+    except ImportError as error:
+        raise InputError("what runs notebooks is not installed", cure="make setup EXTRAS=notebook") from error
+    evaluated("eames", ROOT)
+    notebook, where = nbformat.read(PAGE, 4), {"metadata": {"path": str(PAGE.parent)}}
+    NotebookClient(notebook, kernel_name="python3", record_timing=False, timeout=None, resources=where).execute()
+    notebook.metadata.language_info = {"name": "python"}
+    write_text(PAGE, nbformat.writes(notebook) + "\n")
+    return PAGE
