@@ -24,6 +24,7 @@ from factorlib.runner.project import LIBRARY
 from factorlib.stage import silent
 from stages import recipes
 from tests.export import made_export
+from tests.runner.toy import files_of
 
 
 @pytest.fixture(scope="module")
@@ -241,10 +242,9 @@ def test_pictures_that_recipes_make_are_the_same_files(result, tmp_path, recipe,
     inputs = result._solved.inputs
     facts = inputs.facts | {"recipe": msgspec.to_builtins(recipe)}
     recipes.main(recipes.Params(), msgspec.structs.replace(inputs, facts=facts), out, silent)
-    saved, made = (
-        {str(path.relative_to(of)): path.read_bytes() for path in of.rglob("*.*")} for of in (tmp_path / "saved", out)
+    assert files_of(tmp_path / "saved") == files_of(out) == drawn and drawn._repr_html_().startswith(
+        '<img src="data:image/'
     )
-    assert saved == made == drawn and drawn._repr_html_().startswith('<img src="data:image/')
 
 
 def test_what_is_printed_is_short_and_says_whose_photo_it_is(result, caplog):

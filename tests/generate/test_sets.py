@@ -19,6 +19,7 @@ from factorlib.images.photo import read_photo
 from factorlib.images.picture import read_png
 from factorlib.light.latlong import sampled
 from factorlib.meshes.read import read_mesh
+from tests.runner.toy import files_of
 
 pytest.importorskip("mitsuba")
 
@@ -58,12 +59,8 @@ def exact(tmp_path_factory) -> Path:
     return made_chairs(tmp_path_factory.mktemp("sets") / "exact", exact=True)
 
 
-def files(out: Path) -> dict[str, bytes]:
-    return {str(path.relative_to(out)): path.read_bytes() for path in out.rglob("*") if path.is_file()}
-
-
 def test_the_same_seed_is_the_same_bytes(small, tmp_path):
-    assert files(made(tmp_path / "again", seed=0)) == files(small)
+    assert files_of(made(tmp_path / "again", seed=0)) == files_of(small)
 
 
 def test_the_synthetic_set_holds_one_photo_of_each_kind_and_hides_one_pose(small):

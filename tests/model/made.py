@@ -74,14 +74,17 @@ def traced(normals, sees, light: Light, material: int, count=12_000):
     return reflected(one, normals, views, d, incoming, sees(normals, d))
 
 
-def seen_from_the_front(normal, radiance, material, names, photo="room", **more) -> Observations:
-    """What one photo shows of surfaces of those normals."""
+def seen_from_the_front(normal, radiance, material, names, name="room", **more) -> Observations:
+    """What one photo shows of surfaces of those normals; more: columns that are others than usual."""
     n, zero = len(normal), np.zeros(len(normal), int)
-    return Observations(
-        normal=normal, view=np.tile([0.0, 0.0, -1.0], (n, 1)), radiance=radiance, clipped=np.zeros((n, 3), bool), material=material,
-        photo=zero, illumination=zero, x=np.arange(n), y=zero, weight=np.ones(n), materials=names, photos=(photo,),
-        illuminations=(photo,), **more,
-    )  # fmt: skip
+    usual = {
+        "view": np.tile([0.0, 0.0, -1.0], (n, 1)),
+        "clipped": np.zeros((n, 3), bool),
+        "photo": zero,
+        "illumination": zero,
+    }
+    usual |= {"x": np.arange(n), "y": zero, "weight": np.ones(n), "photos": (name,), "illuminations": (name,)}
+    return Observations(normal=normal, radiance=radiance, material=material, materials=names, **usual | more)
 
 
 def bowls(name, light, size=16, count=512) -> Observations:

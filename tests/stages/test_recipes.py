@@ -18,6 +18,7 @@ from factorlib.results.materials import MaterialTable, Reflectance, StandardErro
 from factorlib.stage import Inputs, silent
 from stages import recipes
 from tests.export import made_export
+from tests.runner.toy import files_of
 
 ERROR = StandardErrors((0.0,) * 3, (0.0,) * 3, 0.0)
 
@@ -36,7 +37,7 @@ def drawn(made, out, recipe, **files):
     given = {f"recipe file:{name}": path for name, path in files.items()}
     out.mkdir()
     recipes.main(recipes.Params(), Inputs(made.folders, facts, {**made.files, **given}), out, silent)
-    return {str(path.relative_to(out)): path.read_bytes() for path in sorted(out.rglob("*")) if path.is_file()}
+    return files_of(out)
 
 
 GROUND = {"ground": {"point": [0, 1.2, 4], "normal": [0, -1, -0.2], "diffuse": None}}

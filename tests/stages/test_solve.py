@@ -24,20 +24,17 @@ from factorlib.stage import Inputs, silent
 from factorlib.urm.observations import Observations, write_observations
 from stages import solve
 from studies.scenes.problems import MATERIALS, random_light, sphere_normals
+from tests.model.made import seen_from_the_front
+from tests.runner.toy import files_of
 
 NAMES = ("red", "green", "blue")
 
 
 def observations(photo: str, materials, seed: int, size: int = 16, unit: float = 1.0) -> Observations:
     """A sphere of each of the materials under a light of two lobes, as `network` renders it."""
-    normals = sphere_normals(size)
-    n = len(normals) * len(materials)
-    empty = Observations(
-        normal=np.tile(normals, (len(materials), 1)), view=np.tile([0.0, 0.0, -1.0], (n, 1)), radiance=np.ones((n, 3)),
-        clipped=np.zeros((n, 3), bool), material=np.repeat(materials, len(normals)), photo=np.zeros(n, int),
-        illumination=np.zeros(n, int), x=np.arange(n), y=np.zeros(n, int), weight=np.ones(n),
-        materials=NAMES, photos=(photo,), illuminations=(photo,),
-    )  # fmt: skip
+    normals = np.tile(sphere_normals(size), (len(materials), 1))
+    material = np.repeat(materials, len(normals) // len(materials))
+    empty = seen_from_the_front(normals, np.ones(normals.shape), material, NAMES, photo)
     (block,) = blocks_of_observations(empty, Noise())
     light = random_light(np.random.default_rng(seed), 2)
     radiance = Illumination(block, light, MATERIALS, reflection_operator("network")).radiance()
@@ -76,10 +73,6 @@ def random_lobes(seed: int) -> Lobes:
 
 def table(folder):
     return read_json(folder / "materials.json")
-
-
-def files_of(folder):
-    return {str(p.relative_to(folder)): p.read_bytes() for p in sorted(folder.rglob("*")) if p.is_file()}
 
 
 @pytest.fixture(scope="module")

@@ -18,7 +18,6 @@ from factorlib.solve.few_lobes.equations import (
 )
 from studies.scenes.problems import MATERIALS, block, random_light
 from tests.model.made import OPERATOR, photos_in_a_wrong_light
-from tests.solve.made import OPERATOR as NETWORK
 
 LOSS = Loss(robust_scale=3.0, prior=0.05)
 UNTINTED = Loss(robust_scale=3.0, prior=0.0)  # the tint prior takes Ē to be constant, so it is no part of a difference
@@ -139,16 +138,3 @@ def test_nonnegative_minimum_against_every_active_set():
         tried = [solved_on(hessian, target, np.array(free, bool)) for free in np.ndindex(2, 2, 2, 2)]
         best = min((0.5 * w @ hessian @ w - target @ w, w.tolist()) for w in tried if (w >= 0).all())
         np.testing.assert_allclose(nonnegative_minimum(hessian, target), best[1], atol=1e-6)
-
-
-# ── the search for another roughness, the lights as they are, and for lobes ──────────────────────────────────────────
-
-
-def shown(materials: int, size: int = 24):
-    """Blocks, materials and lights that explain them."""
-    rng = np.random.default_rng(3)
-    truth = Materials.of_rows(MATERIALS.rows()[:materials])
-    lights = [random_light(rng, 5) for _ in range(2)]
-    blocks = [block(f"light_{k}", light, truth, range(materials), NETWORK, size) for k, light in enumerate(lights)]
-    units = [one.unit for one in blocks]
-    return blocks, truth, [msgspec.structs.replace(li, weight=li.weight / u) for li, u in zip(lights, units)]

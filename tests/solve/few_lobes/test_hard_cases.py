@@ -24,6 +24,7 @@ from factorlib.stage import Inputs, silent
 from factorlib.urm.observations import Observations, write_observations
 from stages import solve as stage
 from studies.scenes.problems import factor_between, sphere_normals
+from tests.model.made import seen_from_the_front
 from tests.solve.made import OPERATOR, light_of
 
 OPTIONS = FewLobes(lobes=10, insert=5, rounds=4, iterations=10, polish=20, tolerance=1e-3)
@@ -53,11 +54,10 @@ def observed(rows, lights=ROOMS, normals=None) -> tuple[Observations, Materials]
     normals, truth = sphere_normals(12) if normals is None else normals, Materials.of_rows(np.array(rows))
     n, m = len(normals), len(truth)
     material, photo = np.tile(np.repeat(np.arange(m), n), len(lights)), np.repeat(np.arange(len(lights)), m * n)
-    total, rooms = len(photo), tuple(f"room{k}" for k in range(len(lights)))
-    seen = Observations(
-        np.tile(normals, (m * len(lights), 1)), np.tile(FRONT, (total, 1)), np.ones((total, 3)), np.zeros((total, 3), bool),
-        material, photo, photo, np.arange(total), np.zeros(total, int), np.ones(total), NAMES[:m], rooms, rooms,
-    )  # fmt: skip
+    rooms = tuple(f"room{k}" for k in range(len(lights)))
+    where = {"photo": photo, "illumination": photo, "photos": rooms, "illuminations": rooms}
+    normal = np.tile(normals, (m * len(lights), 1))
+    seen = seen_from_the_front(normal, np.ones(normal.shape), material, NAMES[:m], **where)
     for k, (block, light) in enumerate(zip(blocks_of_observations(seen, Noise()), lights, strict=True)):
         seen.radiance[photo == k] = Illumination(block, light, truth, OPERATOR).radiance()
     noise = 1 + 0.02 * np.random.default_rng(0).normal(size=seen.radiance.shape)
