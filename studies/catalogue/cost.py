@@ -1,11 +1,7 @@
 """Cost: how do time and memory grow with the entries of the matrix?
 
-Varied     the full matrix of n materials in n lights, n = 3 … 40 (9 to 1,600 entries), of small spheres (`studies.scenes.problems.square`), so
-           that the largest fits in memory and time; with the 6 lobes a light that they are made of, in one round, and as the solver of few
-           lobes is by default for the first of them.
-Measured   seconds   of the processor, of all threads between the start of the solve and its end, which other work hardly lengthens
-           peak      the largest resident set of the process, from its start, with its libraries;  grown: beyond that before the solve
-           and the exponents of time and memory over entries.  What is measured is no function of the inputs: it is kept until its source changes.
+What is measured is no function of the inputs: it is kept until its source changes.  seconds: of the processor, of all threads between the
+start of the solve and its end, which other work hardly lengthens;  peak: the largest resident set of the process;  grown: beyond that before the solve
 
 `python -m studies.catalogue.cost <case as JSON>` measures one case, in a process of its own.
 """
