@@ -5,8 +5,6 @@ import json
 import os
 import re
 import shutil
-import subprocess
-import sys
 
 import msgspec
 import numpy as np
@@ -165,11 +163,6 @@ def test_a_pack_is_whole_or_not_there_and_replaces_nothing_unasked(copy, tmp_pat
     assert file.read_bytes() == before and [path.name for path in tmp_path.iterdir() if "zip" in path.name] == ["a.zip"]
 
 
-def test_a_result_is_as_it_was_solved_whatever_becomes_of_its_data_set(copy, result):
-    (copy / "data" / "set" / "dataset.yaml").write_text("no data set any more")
-    assert factorlib.load_result(copy / "build" / "set").objects == result.objects
-
-
 @pytest.mark.parametrize(
     "break_, words",
     [
@@ -255,13 +248,6 @@ def test_what_is_printed_is_short_and_says_whose_photo_it_is(result, caplog):
     assert caplog.messages == ["'chair' is front/chair and side/chair: that of 'front' is taken"]
 
 
-def test_a_notebook_shows_tables_and_pictures_and_names_are_names(result):
-    shown = result._repr_html_()
-    assert "0.350 ± 0.100" in shown and "front, side" in shown
-    assert result.render("front", samples=1)._repr_html_().startswith('<img src="data:image/png;base64,')
-    assert result.environment("front")._repr_html_().startswith("<img")
-
-
 def a_pipe(file):
     file.unlink()
     os.mkfifo(file)
@@ -295,9 +281,7 @@ def test_a_damaged_file_of_a_result_is_named(copy, file, break_, ask, words):
     assert all(word in str(error.value) for word in [file, *words]), str(error.value)
 
 
-def test_importing_the_package_imports_nothing_heavy():
-    code = "import sys, factorlib; assert not {'numpy', 'torch', 'mitsuba'} & set(sys.modules)"
-    subprocess.run([sys.executable, "-c", code], check=True)
+def test_a_star_imports_what_is_public():
     names = {}
     exec("from factorlib import *", names)
     assert names["load_result"] is factorlib.load_result and factorlib.__version__ == names["__version__"]
@@ -328,7 +312,8 @@ def test_the_notebook_runs_in_its_own_folder_and_shows_its_tables_and_pictures(f
     cells, names = json.loads((LIBRARY / "docs" / "result.ipynb").read_text())["cells"], {}
     shown = [run("".join(cell["source"]), names) for cell in cells if cell["cell_type"] == "code"]
     shown = [html for html in shown if html]
-    assert [html[:4] for html in shown] == ["<p>.", *["<img"] * 8] and "0.350 ± 0.100" in shown[0]
+    assert [html[:4] for html in shown] == ["<p>.", *["<img"] * 8]
+    assert "0.350 ± 0.100" in shown[0] and "front, side" in shown[0]
     said = capsys.readouterr().out
     assert "roughness 0.350 ± 0.100" in said
     assert all(words in said for words in ("did you mean 'red'", "did you mean 'side'", "did you mean 'chair'"))

@@ -4,8 +4,6 @@ import copy
 import json
 import logging
 import re
-import subprocess
-import sys
 
 import msgspec
 import pytest
@@ -80,17 +78,6 @@ def changed(key, value):
         place = place[step] if isinstance(place, list) or step in place else place.setdefault(step, {})
     place[last] = value
     return spec
-
-
-def test_reading_costs_no_numpy(folder):
-    write(folder)
-    code = (
-        "import sys; from factorlib.dataset.read import read_dataset; from factorlib.dataset.slices import SLICES, dataset_slice\n"
-        f"d = read_dataset({str(folder)!r}); [dataset_slice(d, s) for s in SLICES]\n"
-        "heavy = {'numpy', 'torch', 'OpenImageIO', 'PIL'} & set(sys.modules); sys.exit(', '.join(heavy) or 0)"
-    )
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
-    assert done.returncode == 0, done.stderr
 
 
 def test_a_slice_is_json_converts_to_its_type_and_names_the_files_it_needs(folder):

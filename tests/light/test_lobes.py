@@ -4,7 +4,6 @@ import numpy as np
 import pytest
 from scipy.integrate import quad
 
-from factorlib.errors import InputError
 from factorlib.light.lobes import Lobes, lobe_integral, no_lobes
 from factorlib.results.lobes import read_lobes, write_lobes
 
@@ -35,9 +34,3 @@ def test_table_round_trip_is_exact_and_byte_equal(tmp_path):
     for name, lobes in lights.items():
         for field in ("axis", "sharpness", "weight"):
             np.testing.assert_array_equal(getattr(found[name], field), getattr(lobes, field))
-
-
-def test_something_else_is_refused_by_name(tmp_path):
-    (tmp_path / "x.parquet").write_text("no table")
-    with pytest.raises(InputError, match="not readable as a table of lobes"):
-        read_lobes(tmp_path / "x.parquet")

@@ -43,7 +43,7 @@ def tried(problem: JointProblem):
     return [one, *(problem.illuminations(around.point)[0] for around in fits)]
 
 
-@pytest.mark.parametrize("seed", [1, 2, 3])
+@pytest.mark.parametrize("seed", [1, 2])
 def test_a_sun_is_found_with_its_direction_and_its_irradiance(seed):
     problem, irradiance = photographed(0.5, seed)
     cells, sun, wide = tried(problem)
@@ -53,7 +53,7 @@ def test_a_sun_is_found_with_its_direction_and_its_irradiance(seed):
     np.testing.assert_allclose(2 * np.pi * light.energy[light.suns][0], irradiance, rtol=0.3)
 
 
-@pytest.mark.parametrize("seed", range(1, 9))
+@pytest.mark.parametrize("seed", [1, 2, 3])
 def test_no_sun_is_found_in_a_sky_without_one(seed):
     cells, sun, wide = tried(photographed(0.0, seed)[0])
     assert not (clearly_better(cells, sun).kept and compared(wide, sun, AGAINST).kept)

@@ -1,8 +1,5 @@
 """The studies: settings, claims, cases and steps fit together; what those measure that are measured in their own module."""
 
-import subprocess
-import sys
-
 import msgspec
 import pytest
 import yaml
@@ -52,15 +49,6 @@ def test_every_step_has_a_module_and_takes_what_was_made_before_it():
         assert stages[steps[-1]]["gather"] == "scores.json"
         used |= set(steps)
     assert used == stages.keys()
-
-
-def test_plans_of_all_studies_need_no_science():
-    code = (
-        "import sys; from studies.run import STUDIES; from studies.study import FULL\n"
-        "[s.cases(FULL) for s in STUDIES.values()]; heavy = {'numpy', 'torch', 'scipy'} & set(sys.modules); sys.exit(', '.join(heavy) or 0)"
-    )
-    done = subprocess.run([sys.executable, "-c", code], cwd=LIBRARY, capture_output=True, text=True, check=False)
-    assert done.returncode == 0, done.stderr
 
 
 # ── settings ─────────────────────────────────────────────────────────────────────────────────────────────────────────

@@ -20,15 +20,13 @@ from factorlib.model.observed import blocks_of_observations
 from factorlib.model.problem import JointProblem
 from factorlib.solve.few_lobes.options import FewLobes, Run
 from factorlib.solve.few_lobes.solve import few_lobes
-from factorlib.stage import Inputs, silent
-from factorlib.urm.observations import Observations, write_observations
-from stages import solve as stage
+from factorlib.urm.observations import Observations
 from studies.scenes.problems import factor_between, sphere_normals
 from tests.model.made import seen_from_the_front
 from tests.solve.made import OPERATOR, light_of
+from tests.stages.test_solve import NAMES, run
 
 OPTIONS = FewLobes(lobes=10, insert=5, rounds=4, iterations=10, polish=20, tolerance=1e-3)
-NAMES = ("red", "green", "blue")
 THREE = np.array(
     [[0.5, 0.1, 0.1, *[0.12] * 3, 0.7], [0.2, 0.4, 0.25, *[0.2] * 3, 0.4], [0.1, 0.12, 0.2, 0.4, 0.35, 0.3, 0.25]]
 )
@@ -117,26 +115,15 @@ def test_the_answer_is_within_its_bound_or_says_why_not(name):
 
 def materials_of_stage(folder, seen: Observations, **params):
     """What the stage says of the materials, from one table per photo."""
-    (folder / "urm").mkdir(parents=True), (folder / "out").mkdir()
+    photos = {}
     for k, name in enumerate(seen.photos):
         own, zero = seen.take(seen.photo == k), np.zeros((seen.photo == k).sum(), int)
-        own = msgspec.structs.replace(own, photos=(name,), illuminations=(name,), photo=zero, illumination=zero)
-        write_observations(folder / "urm" / f"{name}.parquet", own)
-    light = {name: {"illumination": name, "world_from_camera": None} for name in seen.photos}
-    inputs = Inputs(
-        {"urm": folder / "urm", "train": folder}, {"dataset.materials": list(seen.materials), "dataset.light": light}
-    )
-    quick = {
-        "solver": "few_lobes",
-        "operator": "closed_form",
-        "lobes": 4,
-        "insert": 4,
-        "rounds": 1,
-        "iterations": 4,
-        "polish": 3,
-    }
-    stage.main(stage.Params(**quick, **params), inputs, folder / "out", silent)
-    return read_json(folder / "out" / "materials.json")["materials"]
+        photos[name] = msgspec.structs.replace(
+            own, photos=(name,), illuminations=(name,), photo=zero, illumination=zero
+        )
+    folder.mkdir()
+    brief = {"operator": "closed_form", "lobes": 4, "insert": 4, "rounds": 1, "iterations": 4, "polish": 3}
+    return read_json(run(folder, photos, solver="few_lobes", **brief, **params) / "materials.json")["materials"]
 
 
 def test_observations_that_are_not_finite_are_counted_and_spoil_no_neighbour(tmp_path, caplog):
