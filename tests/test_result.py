@@ -101,9 +101,8 @@ def test_a_folder_that_is_no_result_is_refused_with_those_that_are(folder, tmp_p
 
 def test_a_result_is_found_from_a_folder_within_the_checkout(folder, monkeypatch):
     monkeypatch.chdir(folder.parent.parent / "data" / "set")
-    assert factorlib.load_result("build/set").folder.samefile(folder) and factorlib.load_result("set").folder.samefile(
-        folder
-    )
+    assert factorlib.load_result("build/set").folder.samefile(folder)
+    assert factorlib.load_result("set").folder.samefile(folder)
     with pytest.raises(InputError, match=r"did you mean '../../build/set'"):
         factorlib.load_result("../../build/sets")
 
@@ -120,11 +119,8 @@ def test_a_copy_that_lies_far_from_its_data_set_makes_the_same_pictures(copy, re
     shutil.copytree(copy / "before", tmp_path / "far" / "taken")
     shutil.rmtree(copy)
     taken = factorlib.load_result(tmp_path / "far" / "taken")
-    assert (
-        taken.photos == result.photos
-        and taken.objects == result.objects
-        and list(taken.materials) == list(result.materials)
-    )
+    assert taken.photos == result.photos and taken.objects == result.objects
+    assert list(taken.materials) == list(result.materials)
     pictures = [of.relight("front/chair", "side", width=32, samples=2).pixels for of in (taken, result)]
     np.testing.assert_array_equal(*pictures)
 
@@ -142,9 +138,8 @@ def test_a_packed_result_is_the_same_file_twice_and_loads_where_it_is_unpacked(c
     shutil.unpack_archive(files[0], tmp_path / "far")
     shutil.rmtree(copy)
     assert factorlib.load_result(tmp_path / "far" / "set").materials["red"] == result.materials["red"]
-    assert (tmp_path / "far" / "set" / "READ_ME.txt").exists() and (
-        tmp_path / "far" / "set" / "report" / "index.html"
-    ).exists()
+    assert (tmp_path / "far" / "set" / "READ_ME.txt").exists()
+    assert (tmp_path / "far" / "set" / "report" / "index.html").exists()
 
 
 def test_a_pack_is_whole_or_not_there_and_replaces_nothing_unasked(copy, tmp_path, monkeypatch):
@@ -235,9 +230,8 @@ def test_pictures_that_recipes_make_are_the_same_files(result, tmp_path, recipe,
     inputs = result._solved.inputs
     facts = inputs.facts | {"recipe": msgspec.to_builtins(recipe)}
     recipes.main(recipes.Params(), msgspec.structs.replace(inputs, facts=facts), out, silent)
-    assert files_of(tmp_path / "saved") == files_of(out) == drawn and drawn._repr_html_().startswith(
-        '<img src="data:image/'
-    )
+    assert files_of(tmp_path / "saved") == files_of(out) == drawn
+    assert drawn._repr_html_().startswith('<img src="data:image/')
 
 
 def test_what_is_printed_is_short_and_says_whose_photo_it_is(result, caplog):

@@ -28,11 +28,9 @@ def settings(scale: Scale) -> list[Setting]:
     return made
 
 
-COSTLY, OUTLINE, EVEN = (
-    ("turned-5", "turned-20", "shifted", "larger", "coarse"),
-    ("turned-5", "turned-20", "larger"),
-    ("turned-5", "coarse"),
-)
+COSTLY = ("turned-5", "turned-20", "shifted", "larger", "coarse")
+OUTLINE = ("turned-5", "turned-20", "larger")
+EVEN = ("turned-5", "coarse")
 STUDY = Study(
     name="alignment-error",
     title="Alignment error",

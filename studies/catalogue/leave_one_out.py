@@ -37,10 +37,8 @@ def case(scale: Scale, number: int, prediction: str) -> LeftOut:
 
 def by_photo(table: Any) -> list[str]:
     """Each photo's values, as a sentence: six photos are few, and one that is unlike the others decides a mean."""
-    values, photos = (
-        {row.label: row.cells["chair"].values for row in table.rows},
-        PHOTOS["quick" if table.quick else "full"],
-    )
+    values = {row.label: row.cells["chair"].values for row in table.rows}
+    photos = PHOTOS["quick" if table.quick else "full"]
     each = (f"{photos[k]} {', '.join(f'{of[k]:.2g}' for of in values.values())}" for k in table.seeds)
     return [f"DSSIM of a chair, photo by photo ({', '.join(values)}): {'; '.join(each)}."]
 

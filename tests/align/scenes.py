@@ -32,22 +32,21 @@ def ball(radius=1.0, subdivisions=3):
     return trimesh.creation.icosphere(subdivisions=subdivisions, radius=radius)
 
 
-def blob(subdivisions=3):
+def blob():
     """Smooth, without symmetry."""
-    part = ball(subdivisions=subdivisions)
+    part = ball()
     x, y, z = part.vertices.T
     radius = 1 + 0.25 * np.sin(3 * x + 1) + 0.2 * np.cos(2.5 * y - 0.4) * x + 0.3 * y * z + 0.25 * z**3
     part.vertices = part.vertices * radius[:, None]
     return mesh_of([part])
 
 
-def chair(mirrored: bool = False, labels=(1, 1)):
+def chair():
     """Seat, back, four legs and an arm on one side."""
-    side = -1 if mirrored else 1
     box = trimesh.creation.box
-    seat = [box((1, 1, 0.1)), at(box((0.1, 1, 1)), -0.45, 0, 0.5), at(box((0.6, 0.08, 0.08)), 0, 0.45 * side, 0.3)]
+    seat = [box((1, 1, 0.1)), at(box((0.1, 1, 1)), -0.45, 0, 0.5), at(box((0.6, 0.08, 0.08)), 0, 0.45, 0.3)]
     legs = [at(box((0.08, 0.08, 0.9)), x, y, -0.5) for x in (-0.4, 0.4) for y in (-0.4, 0.4)]
-    return mesh_of(seat + legs, [labels[0]] * 3 + [labels[1]] * 4)
+    return mesh_of(seat + legs)
 
 
 def dumbbell(labels=(1, 2)):

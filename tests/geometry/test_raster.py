@@ -72,7 +72,6 @@ def test_a_mirror_shows_what_lies_as_far_beyond_the_normal():
     rng = np.random.default_rng(0)
     normal, view = (v / np.linalg.norm(v, axis=1, keepdims=True) for v in rng.normal(size=(2, 20, 3)))
     mirror = mirror_directions(normal, view)
-    assert np.allclose(np.linalg.norm(mirror, axis=1), 1) and np.allclose(
-        np.sum(mirror * normal, 1), np.sum(view * normal, 1)
-    )
+    assert np.allclose(np.linalg.norm(mirror, axis=1), 1)
+    assert np.allclose(np.sum(mirror * normal, 1), np.sum(view * normal, 1))
     assert np.allclose(mirror_directions(normal, mirror), view)

@@ -113,10 +113,8 @@ def test_strangers_read_and_write_nothing(folder):
     """Without the token, by another name for this address (DNS rebinding), or from another page."""
     before = (folder / "given.png").read_bytes()
     with served(folder) as server:
-        version, of = (
-            server.masks.version(1),
-            {name: f"{name}:{server.server_port}" for name in ("localhost", "evil.example")},
-        )
+        version = server.masks.version(1)
+        of = {name: f"{name}:{server.server_port}" for name in ("localhost", "evil.example")}
         strangers = [("X_Token", word) for word in (None, "", "guess", "\xfc")]
         strangers += [("Host", word) for word in (None, "127.0.0.1", *of.values())]
         strangers += [
@@ -195,11 +193,9 @@ def test_in_a_browser_by_mouse_and_keys(folder):
             """Choose by a key, drag between pixels of the photo of 60 × 60, and wait until labels have grown."""
             page.keyboard.press(key)
             at = page.locator("canvas").first.bounding_box()
-            scale, left, top = (
-                min(at["width"], at["height"]) / 60,
-                at["x"] + at["width"] / 2,
-                at["y"] + at["height"] / 2,
-            )
+            scale = min(at["width"], at["height"]) / 60
+            left = at["x"] + at["width"] / 2
+            top = at["y"] + at["height"] / 2
             places = [(left + (x - 30) * scale, top + (y - 30) * scale) for x, y in corners]
             page.mouse.move(*places[0])
             page.mouse.down()

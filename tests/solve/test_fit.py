@@ -158,10 +158,8 @@ def test_a_constant_light_stays_nearly_constant():
 def test_one_photo_of_one_material(shown):
     light = on_even_cells(np.tile(1.5 * np.sin(3 * even_cells(FEW).axis[:, 0] + 1), (3, 1)))
     found = found_in([light], shown).point
-    assert (
-        all(np.isfinite(part).all() for part in (found.materials.vector(), found.lights[0].weight))
-        and contrast(found.lights[0]) < 3
-    )
+    assert all(np.isfinite(part).all() for part in (found.materials.vector(), found.lights[0].weight))
+    assert contrast(found.lights[0]) < 3
 
 
 def test_inverse_and_determinant_are_those_of_numpy_and_exactly_symmetric():

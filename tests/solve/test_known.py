@@ -87,9 +87,8 @@ def test_a_known_reflectance_of_nil_stays_nil_and_nothing_is_expected_of_brightn
     problem = msgspec.structs.replace(problem, known=known)
     found = fitted(problem, start_of(with_known(begun(problem).point, problem)), PRIOR, QUICK).point.materials
     assert found.specular[1].max() <= LEAST_REFLECTANCE * (1 + 1e-9)
-    assert (
-        not MaterialPrior(MATERIALS, problem.blocks, known).members and MaterialPrior(MATERIALS, problem.blocks).members
-    )
+    assert not MaterialPrior(MATERIALS, problem.blocks, known).members
+    assert MaterialPrior(MATERIALS, problem.blocks).members
 
 
 def test_a_start_comes_to_the_scale_of_what_is_known_and_shows_the_same(solved):
@@ -117,10 +116,8 @@ def test_the_slope_of_a_light_that_is_known_in_part_is_that_of_its_value(scale_f
     problem, (true,) = photographed(5, 1, cells=30, size=10)
     held, curves = true.axis[:, 2] < 0, {"log_tone": np.array([0.1])}
     one = field(problem, msgspec.structs.replace(true, held=held, scale_free=scale_free, **curves))
-    system, step = (
-        marginal(one, materials_given=True),
-        np.random.default_rng(0).normal(size=one.illumination.light.unknowns),
-    )
+    system = marginal(one, materials_given=True)
+    step = np.random.default_rng(0).normal(size=one.illumination.light.unknowns)
     assert len(step) == 3 * (~held).sum() + 1 + scale_free == len(system.light_gradient)
     lights = [moved(one.illumination.light, s * step) for s in (1e-3, -1e-3)]
     ahead, behind = (marginal(at(one, light), materials_given=True).value for light in lights)

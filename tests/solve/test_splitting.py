@@ -25,9 +25,9 @@ def parts():
     return Parts(Journal(), unreported, PRIOR)
 
 
-def splitting_of(lights, seed=0):
+def splitting_of(lights):
     """The fit on cells of one size, and what comes of splitting."""
-    problem = spheres(lights, size=18, shown=SHOWN, seed=seed)
+    problem = spheres(lights, size=18, shown=SHOWN)
     fit = fitted(problem, begun(problem, CELLS), PRIOR, Schedule(4, (10, 8)))
     return problem, fit, split_while_gaining(problem, fit, ONCE, parts())
 

@@ -67,9 +67,11 @@ def colmap(folder):
     return {"colmap": "sparse", "world_from_object": {"chair": WORLD}}
 
 
-def aligned(folder, name="usual", **averaged):
+def aligned(folder, name="usual", search=None, **averaged):
     out = folder.parent / name
-    run_stages(read_dataset(folder), out, (masks, align), {"masks": averaged})
+    run_stages(
+        read_dataset(folder), out, (masks, align), {"masks": averaged, "align": {"search": search} if search else {}}
+    )
     return read_json(out / "align" / "hall.json")
 
 
@@ -90,7 +92,8 @@ def test_the_poses_of_the_scene_come_out_of_a_photo_of_any_size(tmp_path):
 
 
 def test_where_only_the_camera_is_known_the_pose_is_searched(tmp_path):
-    entry = aligned(scene(tmp_path / "set", posed=False))
+    quick = {"views": 160, "rolls": 16, "keep": [20, 8, 4, 2]}
+    entry = aligned(scene(tmp_path / "set", posed=False), search=quick)
     camera, obj = entry["camera"], entry["objects"]["chair"]
     assert (camera["focal_source"], obj["source"], camera["focal_px"]) == ("colmap", "found", 300.0)
     assert camera["principal_point"] == list(CAMERA.centre)

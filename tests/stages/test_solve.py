@@ -167,9 +167,7 @@ def test_brighter_photos_change_lights_not_materials(tmp_path, linked, solved):
     np.testing.assert_allclose(eight, 8 * one, rtol=1e-3, atol=1e-6)
 
 
-def test_what_is_not_linked_or_that_nobody_photographed_is_named_and_nothing_at_all_refused(
-    tmp_path, caplog, earlier, linked
-):
+def test_what_is_not_linked_or_not_observed_is_named_and_nothing_at_all_refused(tmp_path, caplog, earlier, linked):
     out, text = earlier
     assert "'blue' is observed in no photo" in text
     assert min(table(out)["materials"]["blue"]["diffuse"]) > 0.01, "about as bright as the others"

@@ -57,9 +57,8 @@ def test_observations_and_maps_have_the_normals_and_the_detail_of_the_surface(tm
         {f"normal.{a}": np.ones((SIZE, SIZE)) for a in "xyz"} | {"depth": np.ones((SIZE, SIZE))},
     )
     maps = read_geometry(tmp_path / "align", tmp_path / "surface", "a")
-    assert set(maps) == {"normal.x", "normal.y", "normal.z", "depth", "detail"} and maps["normal.x"][
-        3, 3
-    ] == np.float32(0.6)
+    assert set(maps) == {"normal.x", "normal.y", "normal.z", "depth", "detail"}
+    assert maps["normal.x"][3, 3] == np.float32(0.6)
     assert "detail" not in read_geometry(tmp_path / "align", None, "a")
     assert on_surface(observations(), None) is not None and on_surface(observations(), None).detail is None
     wide = msgspec.structs.replace(observations(), x=observations().x + 1)

@@ -98,11 +98,9 @@ def test_a_step_is_that_of_the_dense_system_of_detail_and_lights(stiffness, monk
     system[:v, :v], gradient[:v] = prior, prior @ before[free]
     first = v
     for part, one, size in zip(parts, problem.illuminations(fit.point), sizes, strict=True):
-        own, J, U = (
-            slice(first, first + size),
-            part.slopes.toarray()[:, free],
-            np.stack([part.of_light(e) for e in np.eye(size)], axis=1),
-        )
+        own = slice(first, first + size)
+        J = part.slopes.toarray()[:, free]
+        U = np.stack([part.of_light(e) for e in np.eye(size)], axis=1)
         field = field_of(one, COUNTS, PRIOR, True)
         residual = field.illumination.block.residuals(field.illumination.shown().radiance)
         r = (residual * one.pull(residual, ROBUST, COUNTS.temperature)).reshape(-1)
@@ -156,10 +154,8 @@ def test_dents_that_the_object_has_not_are_found_in_three_lights():
     turn = body.turns_of(what.displacements)
     for block, exact in zip(given.blocks, true.blocks, strict=True):
         at = attached_to(exact.normal, body)
-        before, after = (
-            errors(block.normal, exact.normal),
-            errors(at.turned(block.normal, block.view, turn), exact.normal),
-        )
+        before = errors(block.normal, exact.normal)
+        after = errors(at.turned(block.normal, block.view, turn), exact.normal)
         assert after < 0.6 * before, (before, after)
 
 

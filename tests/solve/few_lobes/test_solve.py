@@ -101,9 +101,7 @@ def mixed():
     return problem, fit, with_specular_chosen(problem, fit, Run(CHOOSING))
 
 
-def test_lambertian_materials_lose_their_specular_part_and_glossy_ones_keep_it_whether_few_lights_decide_or_all(
-    mixed, monkeypatch
-):
+def test_lambertian_materials_alone_lose_their_specular_part_whether_few_lights_decide_or_all(mixed, monkeypatch):
     problem, fit, found = mixed
     assert found.lambertian.tolist() == [True, True, False]
     assert found.evidence[2].held_out_loss_without > 1.05 * found.evidence[2].held_out_loss_with
