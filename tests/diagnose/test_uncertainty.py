@@ -6,12 +6,7 @@ import pytest
 
 from factorlib.conventions import YUP_FROM_CAMERA, lat_long_directions
 from factorlib.diagnose.identifiability import tinted_alike
-from factorlib.diagnose.uncertainty import (
-    LARGEST,
-    Posterior,
-    relative_standard_errors,
-    standard_errors,
-)
+from factorlib.diagnose.uncertainty import LARGEST, Posterior, relative_standard_errors, standard_errors
 from factorlib.model.loss import Loss
 from factorlib.model.materials import Materials, Point
 from factorlib.model.problem import JointProblem

@@ -4,12 +4,7 @@ import numpy as np
 import pytest
 
 from factorlib.conventions import lat_long_directions, lat_long_solid_angles
-from factorlib.evaluate.ball import (
-    VIEW,
-    diffuse_ball,
-    glossy_ball,
-    light_of_lat_long,
-)
+from factorlib.evaluate.ball import VIEW, diffuse_ball, glossy_ball, light_of_lat_long
 from factorlib.geometry.sphere import ball_normals
 from factorlib.results.materials import Reflectance
 from tests.integral import reflected

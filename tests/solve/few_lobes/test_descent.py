@@ -7,9 +7,7 @@ from factorlib.model.materials import Point
 from factorlib.model.problem import JointProblem
 from factorlib.solve.descent import FLOOR
 from factorlib.solve.few_lobes.descent import DEFINITE, Bounds, damped_step, evaluate
-from factorlib.solve.few_lobes.unknowns import (
-    moved_point,
-)
+from factorlib.solve.few_lobes.unknowns import moved_point
 from studies.scenes.problems import MATERIALS, block, random_light
 from tests.model.made import OPERATOR
 
