@@ -167,9 +167,3 @@ def test_a_unit_lobe_is_reflected_no_brighter_than_it_is(name, domain):
 def test_constant_light_comes_back_from_white(name):
     assert laws.white_lambert(FAST[name])[0] < 1e-3
     assert laws.constant_light(FAST[name], 512)[1] < 1.01
-
-
-@single
-def test_turning_and_scaling_change_nothing_else(name):
-    assert laws.turned(FAST[name])[0] < 3e-6
-    assert laws.scaled(FAST[name])[0] < 3e-6

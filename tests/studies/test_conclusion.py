@@ -17,7 +17,7 @@ from studies.conclusion import (
     paragraph,
     spread,
 )
-from studies.figures import figure, ticks
+from studies.figures import figure
 from studies.run import studies
 from studies.run.page import write_page
 from studies.study import FULL, QUICK, Claim, Score, Setting, Study, case_name
@@ -134,9 +134,3 @@ def test_the_page_escapes_what_it_shows_and_leaves_tables_of_another_version_out
     text = write_page(project).read_text()
     assert text.count("<section") == 1 and "Title &lt;&amp;&gt;" in text and "STUDY=cost" in capsys.readouterr().out
     assert "of a solve (s)</th>" in text and "<th>DSSIM, all entries</th>" in text
-
-
-@pytest.mark.parametrize("low, high", [(0, 1), (-3, 7), (0.001, 0.0042), (5, 5), (1e5, 3e6)])
-def test_ticks_are_few_and_inside(low, high):
-    found = ticks(low, high)
-    assert len(found) <= 6 and all(low - 1e-9 <= t <= high + 1e-9 for t in found)
