@@ -20,6 +20,7 @@ from factorlib.lock import lock_text
 ROOT = Path(__file__).resolve().parent.parent
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
 OURS = {"factorlib", "stages", "tests", "studies"}
+PACKED = ["factorlib", "stages", "recipes", "pipeline.yaml", "pyproject.toml", "README.md", "LICENSE"]
 
 
 # What runs on a cluster alone: loaded where one is asked for, and then the extra `dask` is there or missed by name.
@@ -53,23 +54,7 @@ def installed(tmp_path_factory):
     folder = tmp_path_factory.mktemp("wheel")
     pip = [sys.executable, "-m", "pip", "--disable-pip-version-check", "--quiet"]
     source = folder / "source"
-    files = subprocess.run(
-        [
-            "git",
-            "ls-files",
-            "--",
-            "factorlib",
-            "stages",
-            "recipes",
-            "pipeline.yaml",
-            "pyproject.toml",
-            "README.md",
-            "LICENSE",
-        ],
-        cwd=ROOT,
-        check=True,
-        capture_output=True,
-    )
+    files = subprocess.run(["git", "ls-files", "--", *PACKED], cwd=ROOT, check=True, capture_output=True)
     for name in files.stdout.decode().splitlines():
         if (ROOT / name).is_file():
             (source / name).parent.mkdir(parents=True, exist_ok=True)
@@ -111,8 +96,7 @@ def test_an_installed_command_away_from_a_checkout_has_the_same_pipeline_and_the
     done = run(installed, command, "plan", "-d", "synthetic", "--recipe", "insert", cwd=tmp_path)
     assert done.returncode == 0 and "recipes" in done.stdout, done.stderr
     assert (tmp_path / "build").is_dir() and not (installed / "build").exists()
-    code = RECORDS
-    here, there = (run(site, "-c", code, cwd=tmp_path) for site in (installed, ROOT))
+    here, there = (run(site, "-c", RECORDS, cwd=tmp_path) for site in (installed, ROOT))
     assert here.stdout == there.stdout != "", here.stderr + there.stderr
 
 

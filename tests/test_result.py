@@ -158,23 +158,18 @@ def test_a_pack_is_whole_or_not_there_and_replaces_nothing_unasked(copy, tmp_pat
     assert file.read_bytes() == before and [path.name for path in tmp_path.iterdir() if "zip" in path.name] == ["a.zip"]
 
 
-@pytest.mark.parametrize(
-    "break_, words",
-    [
-        (lambda root: shutil.rmtree(root / "build/set/export"), ["export is missing", "make export DATASET=set"]),
-        (
-            lambda root: (root / "build/set/export/dataset.json").unlink(),
-            ["what its data set was", "make export DATASET=set"],
-        ),
-        (
-            lambda root: (root / "build/set/export/dataset.json").write_text("[]"),
-            ["dataset.json", "make export DATASET=set"],
-        ),
-        (lambda root: (root / "build/set/export/dataset.json").write_text(""), ["dataset.json", "run its stage again"]),
-    ],
-)
-def test_a_result_that_is_not_whole_is_refused_with_a_cure(copy, break_, words):
-    break_(copy)
+@pytest.mark.parametrize("path, text, words", [
+    ("export", None, ["export is missing", "make export DATASET=set"]),
+    ("export/dataset.json", None, ["what its data set was", "make export DATASET=set"]),
+    ("export/dataset.json", "[]", ["dataset.json", "make export DATASET=set"]),
+    ("export/dataset.json", "", ["dataset.json", "run its stage again"]),
+])  # fmt: skip
+def test_a_result_that_is_not_whole_is_refused_with_a_cure(copy, path, text, words):
+    place = copy / "build" / "set" / path
+    if text is None:
+        place.rename(copy / "elsewhere")
+    else:
+        place.write_text(text)
     with pytest.raises(InputError) as error:
         factorlib.load_result(copy / "build" / "set")
     assert all(word in str(error.value) for word in words), str(error.value)

@@ -9,6 +9,7 @@ from factorlib.model.materials import Point
 from factorlib.model.problem import JointProblem
 from factorlib.reflection import reflection_operator
 from studies.scenes.problems import MATERIALS, block, random_light
+from tests.model.made import in_units_of
 
 OPERATOR = reflection_operator("network")
 
@@ -19,11 +20,7 @@ def exact():
     rng = np.random.default_rng(3)
     lights = [random_light(rng, 3), random_light(rng, 3, photos=2)]
     blocks = [block(f"room{k}", light, MATERIALS, [0, 1, 2], OPERATOR) for k, light in enumerate(lights)]
-    scaled = [
-        msgspec.structs.replace(light, weight=light.weight / one.unit)
-        for light, one in zip(lights, blocks, strict=True)
-    ]
-    return JointProblem(blocks, OPERATOR), Point(MATERIALS, scaled)
+    return JointProblem(blocks, OPERATOR), Point(MATERIALS, in_units_of(blocks, lights))
 
 
 def changed(exact, **columns):

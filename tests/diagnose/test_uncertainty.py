@@ -14,6 +14,7 @@ from factorlib.reflection import reflection_operator
 from factorlib.solve.few_lobes.descent import Iterate, descend, evaluate
 from factorlib.solve.few_lobes.equations import normal_equations
 from studies.scenes.problems import MATERIALS, block, factor_between, random_light
+from tests.model.made import in_units_of
 from tests.solve.made import PRIOR, natural
 
 OPERATOR, LOSS = reflection_operator("network"), Loss()
@@ -28,12 +29,8 @@ def noisy(seed: int):
         data = block(f"room{k}", light, MATERIALS, [0, 1, 2], OPERATOR, size=20)
         radiance = data.radiance + NOISE * rng.normal(size=data.radiance.shape) / data.precision
         blocks.append(msgspec.structs.replace(data, radiance=radiance, held_out=np.zeros(len(data), bool)))
-    scaled = [
-        msgspec.structs.replace(light, weight=light.weight / data.unit)
-        for light, data in zip(lights, blocks, strict=True)
-    ]
-    problem = JointProblem(blocks, OPERATOR, LOSS)
-    return problem, descend(problem, evaluate(problem, Point(MATERIALS, scaled)), 25, 1e-7).point
+    problem, start = JointProblem(blocks, OPERATOR, LOSS), Point(MATERIALS, in_units_of(blocks, lights))
+    return problem, descend(problem, evaluate(problem, start), 25, 1e-7).point
 
 
 @pytest.fixture(scope="module")

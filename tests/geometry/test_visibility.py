@@ -16,16 +16,16 @@ CAMERA = Camera(64, 64, 100.0, (32.0, 32.0))
 AWAY = Pose(Rotation.from_euler("xyz", [20, 30, 40], degrees=True).as_matrix(), np.array([0.1, -0.1, 5.0]))
 
 
-def pixels(meshes, poses, camera=CAMERA):
+def pixels(meshes, poses):
     """x, y and normals of the pixels that show an object, and the object each shows."""
-    maps = rasterise(meshes, camera, poses)
+    maps = rasterise(meshes, CAMERA, poses)
     y, x = np.nonzero(maps.object)
     return x, y, maps.normal[y, x], maps.object[y, x]
 
 
-def seen_by(meshes, poses, count=256, most=10_000, camera=CAMERA):
-    x, y, normal, thing = pixels(meshes, poses, camera)
-    found = sight(Occluders(meshes, poses), camera, np.column_stack([x, y]), normal, count, most)
+def seen_by(meshes, poses, count=256):
+    x, y, normal, thing = pixels(meshes, poses)
+    found = sight(Occluders(meshes, poses), CAMERA, np.column_stack([x, y]), normal, count, 10_000)
     return found and found.visibility, normal, thing
 
 

@@ -15,10 +15,10 @@ def unit(*shape):
     return v / v.norm(dim=-1, keepdim=True)
 
 
-def points(n=30):
+def points():
     """Unit normals and views at most 80° from them."""
-    normals = unit(n)
-    views = normals + 0.9 * unit(n)
+    normals = unit(30)
+    views = normals + 0.9 * unit(30)
     return normals, views / views.norm(dim=-1, keepdim=True)
 
 

@@ -4,6 +4,7 @@ import msgspec
 import numpy as np
 
 from factorlib.geometry.sphere import fibonacci_sphere
+from factorlib.model.blocks import Block
 from factorlib.model.illumination import Illumination
 from factorlib.model.lights import Light
 from factorlib.model.materials import Point
@@ -58,6 +59,11 @@ def three_rooms() -> tuple[JointProblem, Point]:
     return JointProblem(blocks, OPERATOR), Point(
         MATERIALS, [msgspec.structs.replace(li, weight=li.weight / 10) for li in guess]
     )
+
+
+def in_units_of(blocks: list[Block], lights: list[Light]) -> list[Light]:
+    """Lights in the photos' radiance as lights in the units of their blocks."""
+    return [msgspec.structs.replace(li, weight=li.weight / b.unit) for li, b in zip(lights, blocks, strict=True)]
 
 
 def bowl_sees(normals, directions):

@@ -16,6 +16,7 @@ from factorlib.solve.fit import Fit, Hyperparameters, Schedule, field_of, fitted
 from factorlib.solve.marginal import Field
 from factorlib.solve.start import constant_light
 from studies.scenes.problems import MATERIALS, block
+from tests.model.made import in_units_of
 
 FEW = 120  # cells, so that tests are quick
 OPERATOR, PRIOR = reflection_operator("network"), read_light_prior()
@@ -67,10 +68,7 @@ def photographed(seed: int, lights: int, cells: int = FEW, **how) -> tuple[Joint
     """Spheres in lights drawn from the prior, and the lights in the blocks' units."""
     true = [on_even_cells(drawn(100 * seed + k, cells)) for k in range(lights)]
     problem = spheres(true, seed=seed, **{"size": 16} | how)
-    units = [one.unit for one in problem.blocks]
-    return problem, [
-        light.with_log_radiance(light.log_radiance - np.log(unit)) for light, unit in zip(true, units, strict=True)
-    ]
+    return problem, in_units_of(problem.blocks, true)
 
 
 def begun(problem: JointProblem, cells: int = FEW, materials: Materials = START) -> Fit:

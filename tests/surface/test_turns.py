@@ -16,7 +16,7 @@ from factorlib.surface import turns
 from factorlib.surface.choice import Found, Surfaces, found
 from factorlib.surface.turns import GRAZING, MOST, PULL, Attached, Detail, Stiffness, part_of, step
 from studies.scenes.problems import MATERIALS
-from tests.model.made import photos_in_a_wrong_light
+from tests.model.made import in_units_of, photos_in_a_wrong_light
 from tests.solve.made import PRIOR, begun, drawn, on_even_cells, photographed, spheres
 
 TURN = np.linalg.qr(np.random.default_rng(3).normal(size=(3, 3)))[0]  # the object's axes in the camera's frame
@@ -191,10 +191,7 @@ def test_patina_is_found_in_three_lights_and_is_not_taken_for_dents():
     painted = Detail(np.zeros((body.nodes, 3)), log_factor)
     at = [attached_to(block.normal, body) for block in problem.blocks]
     clean = problem.of([msgspec.structs.replace(b, precision=np.ones_like(b.precision)) for b in problem.blocks])
-    point = Point(
-        MATERIALS,
-        [msgspec.structs.replace(t, weight=t.weight / b.unit) for t, b in zip(true, problem.blocks, strict=True)],
-    )
+    point = Point(MATERIALS, in_units_of(problem.blocks, true))
     shown = clean.of([painted.on(b, a) for b, a in zip(clean.blocks, at, strict=True)]).radiance(point)
     plain = clean.radiance(point)
     blocks = [

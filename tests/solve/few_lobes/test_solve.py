@@ -16,14 +16,15 @@ from factorlib.solve.few_lobes.rounds import chosen_round
 from factorlib.solve.few_lobes.solve import few_lobes, with_specular_chosen
 from factorlib.stage import serial_map
 from studies.scenes.problems import MATERIALS, block, factor_between, random_light
+from tests.model.made import in_units_of
 from tests.solve.made import OPERATOR
 
 QUICK = FewLobes(lobes=10, insert=5, rounds=3, iterations=10, polish=20, tolerance=1e-5)
 SHORT = FewLobes(lobes=4, insert=2, rounds=2, iterations=2, polish=2)
 
 
-def rooms(count=2, lobes=4, size=12, seed=3):
-    rng = np.random.default_rng(seed)
+def rooms(count=2, lobes=4, size=12):
+    rng = np.random.default_rng(3)
     lights = [random_light(rng, lobes) for _ in range(count)]
     return [block(f"room{i}", li, MATERIALS, [0, 1, 2], OPERATOR, size, seed=i) for i, li in enumerate(lights)]
 
@@ -79,18 +80,18 @@ MIXED = Materials(
 CHOOSING = FewLobes(lobes=12, insert=6, polish=4, rounds=2, iterations=12)
 
 
-def shown_by_two(materials, shown, noise=0.3):
+def shown_by_two(materials, shown):
     """Two rooms, of which whole cells are held out, and the point that they show."""
     rng, blocks, lights = np.random.default_rng(11), [], []
     for k in range(2):
         light = random_light(rng, 4)
         data = block(f"room{k}", light, materials, shown, OPERATOR, size=18, seed=k)
-        radiance = np.maximum(data.radiance + noise * rng.normal(size=data.radiance.shape) / data.precision, 0)
+        radiance = np.maximum(data.radiance + 0.3 * rng.normal(size=data.radiance.shape) / data.precision, 0)
         _, cell = np.unique(mirror_cells(data.normal, data.view, 0.2), return_inverse=True)
         held_out = (rng.random(cell.max() + 1) < 0.15)[cell.reshape(-1)]
         blocks.append(msgspec.structs.replace(data, radiance=radiance, held_out=held_out))
-        lights.append(msgspec.structs.replace(light, weight=light.weight / data.unit))
-    return JointProblem(blocks, OPERATOR), Point(materials, lights)
+        lights.append(light)
+    return JointProblem(blocks, OPERATOR), Point(materials, in_units_of(blocks, lights))
 
 
 @pytest.fixture(scope="module")
