@@ -272,7 +272,7 @@ def test_a_known_map_ball_and_exposures_are_held(tmp_path, linked, caplog):
     light, both = random_lobes(1), observations("a", [0, 2], 1, size=40)
     ball = both.material == 2
     both.radiance[ball] = 0.5 * light.radiance(mirror_directions(both.normal[ball], both.view[ball]))
-    write_rgb_exr(tmp_path / "b.exr", 9 * lat_long_of_lobes(random_lobes(2), 32, 64), LAT_LONG)
+    write_rgb_exr(tmp_path / "b.exr", 9 * lat_long_of_lobes(random_lobes(2), 16, 32), LAT_LONG)
     again = msgspec.structs.replace(linked["b"], photos=("c",), radiance=linked["b"].radiance / 4)
     photos = {"a": both, "b": linked["b"], "c": again, "d": observations("d", [0, 1], 3)}
     known = {
