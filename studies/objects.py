@@ -66,10 +66,8 @@ def observed(
 
 def _entry(case: Case, m: int, li: int, material: Reflectance, light: Light) -> tuple[Observations, float]:
     how, rng, name = case.objects, np.random.default_rng([14, case.seed, m, li]), BODIES[(m + li) % len(BODIES)]
-    whole, rotation = (
-        body(name),
-        Rotation.random(rng=rng).as_matrix(),
-    )  # its middle in the middle of the picture, which it fills
+    # the body's middle in the middle of the picture, which it fills
+    whole, rotation = body(name), Rotation.random(rng=rng).as_matrix()
     middle = np.array([0.0, 0.0, 2 * CAMERA.focal * whole.radius / (FILL * SIDE)])
     truth = Pose(rotation, middle - rotation @ whole.centre)
     true_maps, (mesh, pose) = rasterise(whole, CAMERA, truth), perturbed(name, truth, how, rng)

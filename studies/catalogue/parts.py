@@ -6,9 +6,8 @@ from typing import Any
 
 from studies.study import Scale, Setting, Study, own
 
-WITHOUT: dict[
-    str, tuple[str, str, str, dict[str, Any]]
-] = {  # label, what is off, of `CHANGES`, parameters of the stage
+# label, what is off, of `CHANGES`, parameters of the stage
+WITHOUT: dict[str, tuple[str, str, str, dict[str, Any]]] = {
     "as-it-is": ("as it is", "", "", {}),
     "shadows": ("no shadows", "shadows", "", {"self_shadowing": "off", "interreflection": "off"}),
     "bounce": ("no bounce", "bounces", "", {"interreflection": "off"}),

@@ -127,14 +127,12 @@ def normal_error(photo: Photo, pose: Pose) -> float:
     """Median angle over the true silhouette where both see the object, degrees."""
     truth, found = rasterise(photo.caster, photo.camera, photo.truth), rasterise(photo.given, photo.camera, pose)
     both = (truth.label > 0) & (found.label > 0)
-    return float(
-        np.rad2deg(np.median(np.arccos(np.clip(np.sum(truth.normal[both] * found.normal[both], axis=1), -1, 1))))
-    )
+    cosine = np.sum(truth.normal[both] * found.normal[both], axis=1)
+    return float(np.rad2deg(np.median(np.arccos(np.clip(cosine, -1, 1)))))
 
 
 def refined_of(photo: Photo, materials: Materials, operator: Operator) -> Refined:
     pixels = pixels_of(photo.channels, [True] * 3, 2400)
     own = PosedObject(photo.given, Silhouette(photo.channels["label"].astype(np.int16)), photo.pose, photo.runner_up)
-    return refined_photo(
-        Scene(photo.camera, [own], FocalPrior(photo.camera.focal, 0.0)), pixels, Surfaces(materials, operator)
-    )[0]
+    scene = Scene(photo.camera, [own], FocalPrior(photo.camera.focal, 0.0))
+    return refined_photo(scene, pixels, Surfaces(materials, operator))[0]
