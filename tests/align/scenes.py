@@ -55,9 +55,7 @@ def dumbbell(labels=(1, 2)):
     return mesh_of([*ends, trimesh.creation.box((1.2, 0.3, 0.5))], [*labels, labels[0]])
 
 
-def photo_of(
-    mesh: Mesh, seed: int, width=320, height=240, fill=0.75, focal=1.5, shift=(0.0, 0.0)
-) -> tuple[Caster, Camera, Pose]:
+def photo_of(mesh, seed, width=320, height=240, fill=0.75, focal=1.5, shift=(0.0, 0.0)) -> tuple[Caster, Camera, Pose]:
     """The mesh at a random rotation, its bounding sphere `fill` of the photo's height, moved by `shift` of its size."""
     caster = Caster(mesh)
     rotation = Rotation.random(rng=np.random.default_rng(seed)).as_matrix()
@@ -71,9 +69,7 @@ def true_silhouette(caster: Caster, camera: Camera, pose: Pose) -> Silhouette:
     return Silhouette(rasterise(caster, camera, pose).label.astype(np.int16))
 
 
-def normal_error_deg(
-    caster: Caster, camera: Camera, pose: Pose, found_camera: Camera, found_pose: Pose, given: Caster | None = None
-) -> float:
+def normal_error_deg(caster, camera, pose, found_camera, found_pose, given=None) -> float:
     """Median over the true silhouette; a pixel that the mesh given misses in the pose found counts as 180°."""
     truth, found = rasterise(caster, camera, pose), rasterise(given or caster, found_camera, found_pose)
     angle = np.rad2deg(np.arccos(np.clip(np.sum(truth.normal * found.normal, axis=-1), -1, 1)))

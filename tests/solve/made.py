@@ -47,14 +47,7 @@ def light_of(axes, sharpness, weights) -> Light:
     return Light(axes / np.linalg.norm(axes, axis=1, keepdims=True), np.log(sharpness), weight, np.zeros(1))
 
 
-def spheres(
-    lights: list[Light],
-    materials: Materials = MATERIALS,
-    shown=(0, 1, 2),
-    size: int = 14,
-    noise: float = 0.3,
-    seed: int = 0,
-):
+def spheres(lights, materials=MATERIALS, shown=(0, 1, 2), size=14, noise=0.3, seed=0) -> JointProblem:
     """Noisy spheres of `shown` materials in each of the lights, named room0 and so on."""
     blocks, rng = [], np.random.default_rng(seed)
     for k, light in enumerate(lights):
@@ -83,9 +76,7 @@ def natural() -> tuple[JointProblem, list[Light], Fit]:
     return problem, true, fitted(problem, begun(problem), PRIOR, WHOLE)
 
 
-def field(
-    problem: JointProblem, light: Light, materials: Materials = MATERIALS, temperature: float = 2.0, prior=PRIOR
-) -> Field:
+def field(problem, light, materials=MATERIALS, temperature=2.0, prior=PRIOR) -> Field:
     """Of the first illumination, without outliers."""
     one = Illumination(problem.blocks[0], light, materials, OPERATOR)
     return msgspec.structs.replace(field_of(one, Hyperparameters(temperature), prior), loss=Loss(1e3))

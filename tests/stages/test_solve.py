@@ -41,17 +41,7 @@ def observations(photo: str, materials, seed: int, size: int = 16, unit: float =
     return msgspec.structs.replace(empty, radiance=unit * radiance)
 
 
-def run(
-    folder,
-    photos: dict[str, Observations],
-    progress=silent,
-    unfinished=None,
-    start=None,
-    light=None,
-    known=None,
-    files=None,
-    **params,
-):
+def run(folder, photos, progress=silent, unfinished=None, start=None, light=None, known=None, files=None, **params):
     urm, out = folder / "urm", folder / "out"
     urm.mkdir(parents=True, exist_ok=True), out.mkdir(exist_ok=True)
     for name, part in photos.items():
