@@ -60,7 +60,7 @@ def inside(found: Materials, errors: Materials) -> list[bool]:
 
 def test_with_independent_noise_two_thirds_of_true_values_lie_within_one_standard_error():
     within = []
-    for seed in range(6):
+    for seed in range(8):
         problem, point = noisy(seed)
         errors, sigma = standard_errors(problem, point)
         assert sigma == pytest.approx(NOISE, rel=0.1)
