@@ -22,6 +22,14 @@ def photo_of(kind, number, seed=0):
     return photographed(kind, number, np.random.default_rng([5, seed, KINDS.index(kind), number]), OPERATOR)
 
 
+def test_a_turned_pose_comes_back_and_its_silhouette_with_it():
+    photo = photo_of("turned", 1)
+    result = refined_of(photo, TRUE, OPERATOR)
+    assert normal_error(photo, photo.pose) > 1.5 and result.settled.chosen == "moved"
+    assert normal_error(photo, result.after.pose(photo.given)) < 0.5
+    assert result.settled.candidates["moved"].score > result.settled.candidates["found"].score
+
+
 def test_a_right_pose_stays_as_it_is():
     photo = photo_of("as found", 3)
     result = refined_of(photo, TRUE, OPERATOR)
