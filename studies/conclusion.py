@@ -52,9 +52,6 @@ MEASURES = {  # label, and the unit where there is one; lower is better where th
     "true_chromaticity": "chromaticity of the true lights|deviation over mean",
     "colour": "angle of a mirror sphere's colour|degrees",
     "tint": "tint of all reflectances|deviation of the log over channels",
-    "seconds_an_entry": "processor time of the solve, an entry|s",
-    "peak": "largest memory of the process|GB",
-    "grown": "memory beyond that before the solve|GB",
 }
 
 
@@ -66,8 +63,8 @@ def label(measure: str) -> str:
 def head(measure: str) -> str:
     """The name of a measure and its unit, of tables and axes.
 
-    >>> head("peak"), head("roughness")
-    ('largest memory of the process (GB)', 'error of roughness')
+    >>> head("seconds"), head("roughness")
+    ('processor time of a solve (s)', 'error of roughness')
     """
     words, _, unit = MEASURES[measure].partition("|")
     return f"{words} ({unit})" if unit else words
@@ -178,7 +175,7 @@ class Conclusion(msgspec.Struct, frozen=True):
 
     quick:    what stands beside everything that is shown of a quick study; empty of a full one
     pictures: captions of the PNG files in the study's folder pictures/, by file
-    over:     what intervals are over;  notes: sentences that are no claims;  own_answer: to the paper, where it is not that of the claims
+    over:     what intervals are over;  notes: sentences that are no claims
     """
 
     study: str
@@ -194,7 +191,6 @@ class Conclusion(msgspec.Struct, frozen=True):
     over: str = "seeds"
     pictures: dict[str, str] = {}
     notes: list[str] = []
-    own_answer: str = ""
 
     @property
     def sentences(self) -> list[str]:
@@ -207,8 +203,8 @@ class Conclusion(msgspec.Struct, frozen=True):
         answers = [tested.answer for tested in self.claims if tested.paper]
         if self.quick:
             return f"not tested ({self.quick})"
-        if self.own_answer or not answers:
-            return self.own_answer or "the paper claims nothing that is tested here"
+        if not answers:
+            return "the paper claims nothing that is tested here"
         shown = answers.count("agrees")
         if "disagrees" in answers or not 0 < shown < len(answers):
             return "disagrees" if "disagrees" in answers else answers[0]
@@ -230,7 +226,7 @@ def concluded(study: Study, scale: Scale, scores: Mapping[str, Score]) -> Conclu
         study.name, study.title, study.question, study.paper, study.varied, NO_CONCLUSION if scale.quick else "",
         seeds, study.measures, list(rows.values()), tested, study.over,
     )  # fmt: skip
-    return msgspec.structs.replace(table, notes=study.notes(table), own_answer=study.answer(table))
+    return msgspec.structs.replace(table, notes=study.notes(table))
 
 
 def _by_seed(side: Side, measure: str, rows: Mapping[str, Row]) -> dict[int, float]:

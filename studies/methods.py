@@ -34,10 +34,8 @@ from factorlib.results.materials import Reflectance
 from studies.body import Photos, Radiance, View, shown
 from studies.errors import Map, factor_of, in_gauge, times
 
-BETWEEN, NEAREST = (
-    4,
-    12,
-)  # pixels of the photo that a point is between; that one takes its colour from which no photo shows
+BETWEEN = 4  # pixels of the photo that a point is between
+NEAREST = 12  # those that a point takes its colour from which no photo shows
 ALBEDO = 0.5  # of the grey ball
 LAMBERT = np.array([1, *[2 / 3] * 3, *[1 / 4] * 5])  # A_l / π: what a white Lambert surface reflects of each harmonic
 ITERATIONS, LEAST, DARKEST = 60, 0.01, 1e-4

@@ -19,10 +19,8 @@ from jaxtyping import Float
 from scipy.spatial.transform import Rotation
 
 from factorlib.align.confidence import confidence
-from factorlib.align.refine import FocalPrior, refined
 from factorlib.align.silhouette import Silhouette
 from factorlib.align.state import state_of
-from factorlib.align.target import target_of
 from factorlib.conventions import FRONT, YUP_FROM_CAMERA
 from factorlib.evaluate.ball import Light, ball
 from factorlib.geometry.camera import Camera, Pose, rotation_of_vector
@@ -31,14 +29,13 @@ from factorlib.meshes.mesh import scaled
 from factorlib.results.materials import Reflectance
 from factorlib.urm.observations import Observations, concatenate
 from studies.scenes import shapes
+from studies.scenes.posed import by_contours
 from studies.spheres import GRAZING, table_of
 from studies.study import Case, Objects, light_name
 
 BODIES = ("blob", "jug", "hook")
 SIDE, FILL, FAR = 160, 0.9, 100.0  # pixels of a picture; the mesh's diameter, the focal length over that
 CAMERA = Camera(SIDE, SIDE, FAR * SIDE, (SIDE / 2, SIDE / 2))
-STEPS = 12  # of the fit to the outline
-WINDOW, MARGIN = 200, 0.1  # as the stage `refine` takes them
 
 
 @cache
@@ -69,10 +66,8 @@ def observed(
 
 def _entry(case: Case, m: int, li: int, material: Reflectance, light: Light) -> tuple[Observations, float]:
     how, rng, name = case.objects, np.random.default_rng([14, case.seed, m, li]), BODIES[(m + li) % len(BODIES)]
-    whole, rotation = (
-        body(name),
-        Rotation.random(rng=rng).as_matrix(),
-    )  # its middle in the middle of the picture, which it fills
+    # the body's middle in the middle of the picture, which it fills
+    whole, rotation = body(name), Rotation.random(rng=rng).as_matrix()
     middle = np.array([0.0, 0.0, 2 * CAMERA.focal * whole.radius / (FILL * SIDE)])
     truth = Pose(rotation, middle - rotation @ whole.centre)
     true_maps, (mesh, pose) = rasterise(whole, CAMERA, truth), perturbed(name, truth, how, rng)
@@ -106,8 +101,7 @@ def perturbed(name: str, truth: Pose, how: Objects, rng: np.random.Generator) ->
 
 def fitted(mesh: Caster, pose: Pose, outline: Silhouette) -> Pose:
     """The pose nearby whose contours lie on those of the mask: how the stages `align` and `refine` end a search."""
-    target, start = target_of(outline, mesh.mesh.labels, WINDOW, MARGIN), state_of(pose, CAMERA, mesh)
-    return refined(mesh, target, CAMERA, start, FocalPrior(CAMERA.focal, 0.0), STEPS).state.pose(mesh)
+    return by_contours(mesh, outline, CAMERA, state_of(pose, CAMERA, mesh)).pose(mesh)
 
 
 def angle_deg(first: Float[np.ndarray, "n 3"], second: Float[np.ndarray, "n 3"]) -> float:

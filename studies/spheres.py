@@ -31,21 +31,15 @@ from factorlib.tracing.scene import Material, look
 from factorlib.urm.observations import Observations
 from studies.study import SEVEN, Case, light_name
 
-ABOUT = dict(
-    zip(
-        SEVEN,
-        (
-            Material((0.5, 0.12, 0.1), (0.08, 0.08, 0.08), 0.6),
-            Material((0.1, 0.35, 0.14), (0.25, 0.25, 0.25), 0.35),
-            Material((0.12, 0.16, 0.24), (0.4, 0.4, 0.4), 0.22),
-            Material((0.6, 0.58, 0.52), (0.04, 0.04, 0.04), 0.7),
-            Material((0.15, 0.1, 0.04), (0.6, 0.45, 0.2), 0.3),
-            Material((0.34, 0.4, 0.5), (0.15, 0.15, 0.15), 0.45),
-            Material((0.2, 0.13, 0.06), (0.5, 0.34, 0.14), 0.38),
-        ),
-        strict=True,
-    )
-)
+ABOUT = {  # by the names of `SEVEN`
+    "brick": Material((0.5, 0.12, 0.1), (0.08, 0.08, 0.08), 0.6),
+    "leaf": Material((0.1, 0.35, 0.14), (0.25, 0.25, 0.25), 0.35),
+    "lacquer": Material((0.12, 0.16, 0.24), (0.4, 0.4, 0.4), 0.22),
+    "chalk": Material((0.6, 0.58, 0.52), (0.04, 0.04, 0.04), 0.7),
+    "gold": Material((0.15, 0.1, 0.04), (0.6, 0.45, 0.2), 0.3),
+    "tile": Material((0.34, 0.4, 0.5), (0.15, 0.15, 0.15), 0.45),
+    "bronze": Material((0.2, 0.13, 0.06), (0.5, 0.34, 0.14), 0.38),
+}
 SPREAD = 0.15
 GRAZING = 0.15  # n·o below which no pixel is observed
 STEEPEST = 0.25  # n·o of the faces that are observed at the flattest angle

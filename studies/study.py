@@ -233,11 +233,11 @@ class Study(msgspec.Struct, frozen=True, kw_only=True):
     paper:     the paper's conclusion;  varied: what is varied, with its unit
     measures:  those of the figure and the page, the first the main one
     claims:    what a full study tests
-    steps:     stages of studies/run/pipeline.yaml in `studies.steps`, the last one scores; none: the study's own module has its `main`
+    steps:     stages of studies/run/pipeline.yaml in `studies.steps`, the last one scores
     lights:    lights that each of its worlds has beyond those of the scale
     sets:      the data sets that its cases are photos of, as facts of the slice `sets`
     numbers:   what stands in the place of seeds, where intervals are over something else, which `over` names
-    notes:     sentences of a conclusion that are no claims;  answer: to the paper, where no claim can give it
+    notes:     sentences of a conclusion that are no claims
     """
 
     name: str
@@ -254,7 +254,6 @@ class Study(msgspec.Struct, frozen=True, kw_only=True):
     numbers: Callable[[Scale], tuple[int, ...]] = lambda scale: scale.seeds
     over: str = "seeds"
     notes: Callable[[Any], list[str]] = lambda conclusion: []
-    answer: Callable[[Any], str] = lambda conclusion: ""
 
     def worlds(self, scale: Scale) -> World:
         """The worlds that its cases show, equal for most studies of a scale, so that they are made once."""

@@ -1,7 +1,4 @@
-"""A Python package like any other: what it imports is declared, the lock follows from that, a wheel of it works by itself.
-
-Who may import whom `make test` checks by import-linter; here, that a run with nothing to do loads no science.
-"""
+"""A Python package like any other: what it imports is declared, the lock follows from that, a wheel of it works by itself."""
 
 from __future__ import annotations
 
@@ -23,6 +20,7 @@ from factorlib.lock import lock_text
 ROOT = Path(__file__).resolve().parent.parent
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
 OURS = {"factorlib", "stages", "tests", "studies"}
+PACKED = ["factorlib", "stages", "recipes", "pipeline.yaml", "pyproject.toml", "README.md", "LICENSE"]
 
 
 # What runs on a cluster alone: loaded where one is asked for, and then the extra `dask` is there or missed by name.
@@ -56,34 +54,14 @@ def test_the_lock_is_what_pyproject_asks_for():
     assert (ROOT / "requirements.lock").read_text() == lock_text(), "make lock"
 
 
-def test_the_command_line_loads_no_science():
-    code = (
-        "import sys, factorlib.__main__; from factorlib.runner.project import photo_sets; photo_sets(); from factorlib.runner import survey\n"
-        "heavy = {'numpy', 'torch', 'scipy', 'OpenImageIO', 'rich', 'filelock', 'typer', 'pydantic'} & set(sys.modules); sys.exit(', '.join(heavy) or 0)"
-    )
-    done = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, check=False)
-    assert done.returncode == 0, done.stderr
-
-
 @pytest.fixture(scope="module")
 def installed(tmp_path_factory):
     """A wheel of the package, without what it needs, installed into a folder."""
     folder = tmp_path_factory.mktemp("wheel")
     pip = [sys.executable, "-m", "pip", "--disable-pip-version-check", "--quiet"]
     source = folder / "source"
-    listed = [
-        "git",
-        "ls-files",
-        "--",
-        "factorlib",
-        "stages",
-        "recipes",
-        "pipeline.yaml",
-        "pyproject.toml",
-        "README.md",
-        "LICENSE",
-    ]
-    for name in subprocess.check_output(listed, cwd=ROOT, text=True).splitlines():
+    files = subprocess.run(["git", "ls-files", "--", *PACKED], cwd=ROOT, check=True, capture_output=True)
+    for name in files.stdout.decode().splitlines():
         if (ROOT / name).is_file():
             (source / name).parent.mkdir(parents=True, exist_ok=True)
             (source / name).write_bytes((ROOT / name).read_bytes())
@@ -124,8 +102,7 @@ def test_an_installed_command_away_from_a_checkout_has_the_same_pipeline_and_the
     done = run(installed, command, "plan", "-d", "synthetic", "--recipe", "insert", cwd=tmp_path)
     assert done.returncode == 0 and "recipes" in done.stdout, done.stderr
     assert (tmp_path / "build").is_dir() and not (installed / "build").exists()
-    code = RECORDS
-    here, there = (run(site, "-c", code, cwd=tmp_path) for site in (installed, ROOT))
+    here, there = (run(site, "-c", RECORDS, cwd=tmp_path) for site in (installed, ROOT))
     assert here.stdout == there.stdout != "", here.stderr + there.stderr
 
 

@@ -5,8 +5,6 @@ import json
 import os
 import re
 import shutil
-import subprocess
-import sys
 
 import msgspec
 import numpy as np
@@ -24,6 +22,7 @@ from factorlib.runner.project import LIBRARY
 from factorlib.stage import silent
 from stages import recipes
 from tests.export import made_export
+from tests.runner.toy import files_of
 
 
 @pytest.fixture(scope="module")
@@ -107,9 +106,8 @@ def test_a_folder_that_is_no_result_is_refused_with_those_that_are(folder, tmp_p
 
 def test_a_result_is_found_from_a_folder_within_the_checkout(folder, monkeypatch):
     monkeypatch.chdir(folder.parent.parent / "data" / "set")
-    assert factorlib.load_result("build/set").folder.samefile(folder) and factorlib.load_result("set").folder.samefile(
-        folder
-    )
+    assert factorlib.load_result("build/set").folder.samefile(folder)
+    assert factorlib.load_result("set").folder.samefile(folder)
     with pytest.raises(InputError, match=r"did you mean '../../build/set'"):
         factorlib.load_result("../../build/sets")
 
@@ -126,11 +124,8 @@ def test_a_copy_that_lies_far_from_its_data_set_makes_the_same_pictures(copy, re
     shutil.copytree(copy / "before", tmp_path / "far" / "taken")
     shutil.rmtree(copy)
     taken = factorlib.load_result(tmp_path / "far" / "taken")
-    assert (
-        taken.photos == result.photos
-        and taken.objects == result.objects
-        and list(taken.materials) == list(result.materials)
-    )
+    assert taken.photos == result.photos and taken.objects == result.objects
+    assert list(taken.materials) == list(result.materials)
     pictures = [of.relight("front/chair", "side", width=32, samples=2).pixels for of in (taken, result)]
     np.testing.assert_array_equal(*pictures)
 
@@ -148,9 +143,8 @@ def test_a_packed_result_is_the_same_file_twice_and_loads_where_it_is_unpacked(c
     shutil.unpack_archive(files[0], tmp_path / "far")
     shutil.rmtree(copy)
     assert factorlib.load_result(tmp_path / "far" / "set").materials["red"] == result.materials["red"]
-    assert (tmp_path / "far" / "set" / "READ_ME.txt").exists() and (
-        tmp_path / "far" / "set" / "report" / "index.html"
-    ).exists()
+    assert (tmp_path / "far" / "set" / "READ_ME.txt").exists()
+    assert (tmp_path / "far" / "set" / "report" / "index.html").exists()
 
 
 def test_a_pack_is_whole_or_not_there_and_replaces_nothing_unasked(copy, tmp_path, monkeypatch):
@@ -169,28 +163,18 @@ def test_a_pack_is_whole_or_not_there_and_replaces_nothing_unasked(copy, tmp_pat
     assert file.read_bytes() == before and [path.name for path in tmp_path.iterdir() if "zip" in path.name] == ["a.zip"]
 
 
-def test_a_result_is_as_it_was_solved_whatever_becomes_of_its_data_set(copy, result):
-    (copy / "data" / "set" / "dataset.yaml").write_text("no data set any more")
-    assert factorlib.load_result(copy / "build" / "set").objects == result.objects
-
-
-@pytest.mark.parametrize(
-    "break_, words",
-    [
-        (lambda root: shutil.rmtree(root / "build/set/export"), ["export is missing", "make export DATASET=set"]),
-        (
-            lambda root: (root / "build/set/export/dataset.json").unlink(),
-            ["what its data set was", "make export DATASET=set"],
-        ),
-        (
-            lambda root: (root / "build/set/export/dataset.json").write_text("[]"),
-            ["dataset.json", "make export DATASET=set"],
-        ),
-        (lambda root: (root / "build/set/export/dataset.json").write_text(""), ["dataset.json", "run its stage again"]),
-    ],
-)
-def test_a_result_that_is_not_whole_is_refused_with_a_cure(copy, break_, words):
-    break_(copy)
+@pytest.mark.parametrize("path, text, words", [
+    ("export", None, ["export is missing", "make export DATASET=set"]),
+    ("export/dataset.json", None, ["what its data set was", "make export DATASET=set"]),
+    ("export/dataset.json", "[]", ["dataset.json", "make export DATASET=set"]),
+    ("export/dataset.json", "", ["dataset.json", "run its stage again"]),
+])  # fmt: skip
+def test_a_result_that_is_not_whole_is_refused_with_a_cure(copy, path, text, words):
+    place = copy / "build" / "set" / path
+    if text is None:
+        place.rename(copy / "elsewhere")
+    else:
+        place.write_text(text)
     with pytest.raises(InputError) as error:
         factorlib.load_result(copy / "build" / "set")
     assert all(word in str(error.value) for word in words), str(error.value)
@@ -246,10 +230,8 @@ def test_pictures_that_recipes_make_are_the_same_files(result, tmp_path, recipe,
     inputs = result._solved.inputs
     facts = inputs.facts | {"recipe": msgspec.to_builtins(recipe)}
     recipes.main(recipes.Params(), msgspec.structs.replace(inputs, facts=facts), out, silent)
-    saved, made = (
-        {str(path.relative_to(of)): path.read_bytes() for path in of.rglob("*.*")} for of in (tmp_path / "saved", out)
-    )
-    assert saved == made == drawn and drawn._repr_html_().startswith('<img src="data:image/')
+    assert files_of(tmp_path / "saved") == files_of(out) == drawn
+    assert drawn._repr_html_().startswith('<img src="data:image/')
 
 
 def test_what_is_printed_is_short_and_says_whose_photo_it_is(result, caplog):
@@ -303,9 +285,7 @@ def test_a_damaged_file_of_a_result_is_named(copy, file, break_, ask, words):
     assert all(word in str(error.value) for word in [file, *words]), str(error.value)
 
 
-def test_importing_the_package_imports_nothing_heavy():
-    code = "import sys, factorlib; assert not {'numpy', 'torch', 'mitsuba'} & set(sys.modules)"
-    subprocess.run([sys.executable, "-c", code], check=True)
+def test_a_star_imports_what_is_public():
     names = {}
     exec("from factorlib import *", names)
     assert names["load_result"] is factorlib.load_result and factorlib.__version__ == names["__version__"]
@@ -337,7 +317,8 @@ def test_the_notebook_runs_in_its_own_folder_and_shows_its_tables_and_pictures(f
     cells, names = json.loads((LIBRARY / "docs" / "result.ipynb").read_text())["cells"], {}
     shown = [run("".join(cell["source"]), names) for cell in cells if cell["cell_type"] == "code"]
     shown = [html for html in shown if html]
-    assert [html[:4] for html in shown] == ["<p>.", *["<img"] * 8] and "0.350 ± 0.100" in shown[0]
+    assert [html[:4] for html in shown] == ["<p>.", *["<img"] * 8]
+    assert "0.350 ± 0.100" in shown[0] and "front, side" in shown[0]
     said = capsys.readouterr().out
     assert "roughness 0.350 ± 0.100" in said
     assert all(words in said for words in ("did you mean 'red'", "did you mean 'side'", "did you mean 'chair'"))

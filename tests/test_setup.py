@@ -64,9 +64,7 @@ def test_extras_are_installed_alone_or_move_nothing_of_the_lock(called, monkeypa
     assert not others or bare[1][-len(others) - 2 :] == ["-c", str(setup.LOCK), *others]
 
 
-def test_the_lock_is_installed_by_pip_where_uv_cannot_be_had_and_torch_apart_which_may_need_more(
-    called, monkeypatch, tmp_path
-):
+def test_without_uv_pip_installs_the_lock_and_torch_apart(called, monkeypatch, tmp_path):
     setup.install_packages()
     locked, torch = called[-1]
     assert all(command[1:3] == ["-m", "pip"] and "--no-deps" in command for command in (locked, torch))

@@ -1,15 +1,4 @@
-"""Alignment error: how much do wrong poses and meshes cost, and what helps?
-
-Varied     every object of a set is turned by 0 … 20° about a random axis, shifted in the image by a share of its diameter, its mesh too
-           large, or of few triangles; sets of 3 × 3 (quick: 2 × 2) of bodies without symmetry.  Treatments, each where a claim compares it:
-           as it is      the solve as the project has it: normals weigh as much as `align` is sure of them
-           even          every normal as sure as any other
-           outline       every pose first fitted to the outline of its mask, from the perturbed pose, as `align` ends a search
-Measured   materials and predictions, on whole spheres; and the median error of the normals that the solve is given.  Renderings are
-           of the true normals, of pixels that both the object and what stands for it show.
-
-Poses by shading (the stage `refine`) are not among them: `make results ONLY=refine` measures these.
-"""
+"""Alignment error: how much do wrong poses and meshes cost, and what helps?  Treatments are there where a claim compares them."""
 
 from __future__ import annotations
 
@@ -39,11 +28,9 @@ def settings(scale: Scale) -> list[Setting]:
     return made
 
 
-COSTLY, OUTLINE, EVEN = (
-    ("turned-5", "turned-20", "shifted", "larger", "coarse"),
-    ("turned-5", "turned-20", "larger"),
-    ("turned-5", "coarse"),
-)
+COSTLY = ("turned-5", "turned-20", "shifted", "larger", "coarse")
+OUTLINE = ("turned-5", "turned-20", "larger")
+EVEN = ("turned-5", "coarse")
 STUDY = Study(
     name="alignment-error",
     title="Alignment error",

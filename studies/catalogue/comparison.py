@@ -1,10 +1,4 @@
-"""Comparison: does a joint solve predict photos that were not taken better than methods that do less, or do the same by other means?
-
-Varied     the method: the stage `solve`, Mitsuba's joint optimisation, an intrinsic decomposition, projective texturing, a grey ball.
-           All see the same photos, of spheres of n materials in n lights, the normals and the camera.
-Measured   pictures from another side, in lights and of materials that no photo shows, each in three gauges; errors of the materials
-           and lights that a method states; the processor's time.
-"""
+"""Comparison: does a joint solve predict photos that were not taken better than methods that do less, or do the same by other means?"""
 
 from __future__ import annotations
 

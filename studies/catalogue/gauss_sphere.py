@@ -1,9 +1,4 @@
-"""Gauss-sphere coverage: what do flat-sided objects tell, and does the solve know?
-
-Varied     how many faces an object shows, from one to a sphere; sets of 3 × 3 (quick: 2 × 2) in which all objects have as many.
-Measured   errors of materials and predictions, beside the standard errors that the solve states.  Predictions are of
-           whole spheres, so what no face ever showed counts.
-"""
+"""Gauss-sphere coverage: what do flat-sided objects tell, and does the solve know?"""
 
 from __future__ import annotations
 

@@ -1,9 +1,4 @@
-"""Label quality: how much do wrong normals and wrong labels cost?
-
-Varied     noise on normals, |N(0, σ)| degrees, σ = 0 … 20; and the share of pixels, 0 … 20 %, whose label names another
-           material of the same photo.  Sets of 3 × 3 (quick: 2 × 2).
-Measured   materials and predictions.  Renderings are of the true normals; the solve gets the perturbed ones.
-"""
+"""Label quality: how much do wrong normals and wrong labels cost?"""
 
 from __future__ import annotations
 

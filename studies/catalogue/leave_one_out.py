@@ -1,15 +1,4 @@
-"""Leave one out: can a chair be predicted in a photo from everything else?
-
-Data       data/eames, six photos of chairs, rendered and made hard as photographs are: poses are searched, meshes are not exact
-Left out   one entry of the matrix, as in the paper: the pixels of one chair's shell in one photo.  Its material is then known from
-           the other photos alone, and the photo's light and exposure from what is left of the photo: the wooden legs, and the second
-           chair where there is one.  A photo of which nothing is left would tell nothing of its light
-Varied     left out; observed (the same pixels took part in the solve: what the model can fit at best); flat (no model of light: the
-           shell's mean colour in the other photos, in the brightness and tint that the legs have here)
-Spread     the six photos (of a photo with two chairs, the mean of both): one set, so nothing is said of other sets
-
-(quick: photos kitchen and hall alone, few lobes.)
-"""
+"""Leave one out: can a chair be predicted in a photo from everything else?"""
 
 from __future__ import annotations
 
@@ -48,10 +37,8 @@ def case(scale: Scale, number: int, prediction: str) -> LeftOut:
 
 def by_photo(table: Any) -> list[str]:
     """Each photo's values, as a sentence: six photos are few, and one that is unlike the others decides a mean."""
-    values, photos = (
-        {row.label: row.cells["chair"].values for row in table.rows},
-        PHOTOS["quick" if table.quick else "full"],
-    )
+    values = {row.label: row.cells["chair"].values for row in table.rows}
+    photos = PHOTOS["quick" if table.quick else "full"]
     each = (f"{photos[k]} {', '.join(f'{of[k]:.2g}' for of in values.values())}" for k in table.seeds)
     return [f"DSSIM of a chair, photo by photo ({', '.join(values)}): {'; '.join(each)}."]
 

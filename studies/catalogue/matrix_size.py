@@ -1,9 +1,4 @@
-"""Matrix size: do more photos of more materials tell more of each?
-
-Varied     the full matrix of n materials in n lights, n = 1 … 5.
-Measured   material 0 in every light of its world, and every material of the world in light 0: these two all sizes share, and
-           an answer is worth what it tells beyond the photos it was fitted to (the one entry of 1 × 1 is fitted all too easily).
-"""
+"""Matrix size: do more photos of more materials tell more of each?"""
 
 from __future__ import annotations
 

@@ -1,12 +1,6 @@
 """The paper's sets: which entries of its photo sets' matrices can be predicted?
 
-Varied     the observation pattern, of this project's own bodies, materials and lights:
-           docksta   seven materials in six photos; each photo shows a material of its own, and one, of a chair, is in all
-           lapd      two materials of one object in four photos, all observed
-           photos    all of n materials in all of n photos, n = 5
-           (quick: docksta of four materials in three photos, lapd in two photos, photos 3 × 3)
-Measured   entries that were observed and those that were not.  The paper's photographs cannot be had.  How its Docksta photos share
-           materials is read from its description (seven materials, six photos, one linking chair), not from the photos.
+How its Docksta photos share materials is read from its description (seven materials, six photos, one linking chair), not from the photos.
 """
 
 from __future__ import annotations

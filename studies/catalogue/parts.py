@@ -1,11 +1,4 @@
-"""Parts: what is each part of the model worth?
-
-Varied     one part is switched off: shadows (and with them bounces, which need them), bounces of light, tone curves, natural light's prior
-           (by lights of few lobes), how sure normals are, and clipping (clipped values taken as they are, or their pixels left out).
-           Sets of chairs as data/eames, smaller and of other seeds.
-Measured   materials and lights against the truth.
-What cannot be switched off: the gauge, and the robust loss.
-"""
+"""Parts: what is each part of the model worth?  Clipping is taken away in two ways: values as they are, or their pixels left out."""
 
 from __future__ import annotations
 
@@ -13,9 +6,8 @@ from typing import Any
 
 from studies.study import Scale, Setting, Study, own
 
-WITHOUT: dict[
-    str, tuple[str, str, str, dict[str, Any]]
-] = {  # label, what is off, of `CHANGES`, parameters of the stage
+# label, what is off, of `CHANGES`, parameters of the stage
+WITHOUT: dict[str, tuple[str, str, str, dict[str, Any]]] = {
     "as-it-is": ("as it is", "", "", {}),
     "shadows": ("no shadows", "shadows", "", {"self_shadowing": "off", "interreflection": "off"}),
     "bounce": ("no bounce", "bounces", "", {"interreflection": "off"}),

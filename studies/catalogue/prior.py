@@ -1,11 +1,4 @@
-"""Prior: what is the weight of the paper's prior on lights worth, and is natural light's worth more?
-
-Varied     the weight π of the paper's prior, the variance over channels of the light's summed lobes, 0 … 10: in this project's solver
-           with lights of a few lobes (`prior`), and in the paper's (`paper_prior`); and the prior of natural light, which the default
-           solver has.  The paper's solver has this project's operator, which is as exact as the paper's network and faster, so
-           that solvers are compared and not operators.  Sets of 3 × 3 (quick: 2 × 2).
-Measured   how coloured the lights are beside the true ones, what they and the materials predict, and their errors.
-"""
+"""Prior: what is the weight of the paper's prior on lights worth, and is natural light's worth more?"""
 
 from __future__ import annotations
 

@@ -1,10 +1,4 @@
-"""Progressive: does each further photo of the same materials improve re-rendering, material and light?
-
-Varied     photos 1 … n of the same three materials (quick: two), each in a light of its own, light 0 in all; from nothing, and from the
-           solution of all photos but the last, which is the stage's parameter `start`.
-Measured   the materials in every light of the world, all materials of the world in light 0: both are the same question of however
-           many photos; errors of the materials' numbers; processor seconds of the solve, of a warm one those of the last photo alone.
-"""
+"""Progressive: does each further photo of the same materials improve re-rendering, material and light?"""
 
 from __future__ import annotations
 

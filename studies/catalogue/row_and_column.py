@@ -1,8 +1,4 @@
-"""Row and column: is one material in many lights worth as much as many materials in one light?
-
-Varied     1 × n (one material, n lights), n × 1 (n materials, one light), and n × n and 1 × 1 to set them against.
-Measured   their own entries, as in the paper; and, as for the size of the matrix, material 0 and light 0, which all four share.
-"""
+"""Row and column: is one material in many lights worth as much as many materials in one light?"""
 
 from __future__ import annotations
 

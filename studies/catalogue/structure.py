@@ -1,14 +1,4 @@
-"""Structure: which links between photos matter?
-
-Varied     which entries of the n × n matrix are observed:
-           full        all n²
-           loop        2n: entries (i, i) and (i, i + 1), closed
-           star        2n − 1: one material in all lights, one light with all materials
-           link        2n − 1: the diagonal, and one material in all lights
-           random      2n − 1 at random, another choice for each seed, every material and every light among them
-           diagonal    n: no link at all
-Measured   all entries, and those that were not observed: the materials and lights of entries that no photo showed together.
-"""
+"""Structure: which links between photos matter?"""
 
 from __future__ import annotations
 

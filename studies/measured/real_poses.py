@@ -131,15 +131,7 @@ def tables_of(measures: list[dict]) -> Tables:
         cells += ["; ".join(row["doubts"]) or "–", f"{row['processor_s']:.0f}, {row['wall_s']:.0f}"]
         photos.append([f"{row['set']}, {row['photo']}", *(f"{row[key]:.1f}" for key in ANGLES), *cells])
     focal = "focal length, of the reference's"
-    head = [
-        "set, object",
-        "photos",
-        *ANGLES.values(),
-        "common turn (°)",
-        "less that (°)",
-        focal,
-        "doubtful",
-        "processor (s)",
-    ]
+    more = ["common turn (°)", "less that (°)", focal, "doubtful", "processor (s)"]
+    head = ["set, object", "photos", *ANGLES.values(), *more]
     each = ["photo", *ANGLES.values(), focal, "IoU (the reference's)", "doubts", "processor, wall (s)"]
     return {"Sets: median, worst": [head, *sets], "Photographs": [each, *photos]}

@@ -56,10 +56,8 @@ def main() -> None:
             )
     for kind, sides in SIDES.items():
         for count in (1, 3):
-            poses, mesh = (
-                [looking_from(25 + 8 * k, 20 + 40 * k) for k in range(count)],
-                unit(kind, np.array(sides)).as_mesh(),
-            )
+            poses = [looking_from(25 + 8 * k, 20 + 40 * k) for k in range(count)]
+            mesh = unit(kind, np.array(sides)).as_mesh()
             extent = np.ptp(primitive(kind, [outline(mesh, pose, False) for pose in poses]).vertices, axis=0)
             off = np.abs(np.sort(extent) - np.sort(sides)).max()
             print(f"{kind}, {count} photos: sides off by {off:.3f} of the longest", flush=True)

@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-import json
 import os
 import re
 import subprocess
 import sys
 import time
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -95,13 +94,6 @@ def evaluated(dataset: Path | str, root: Path = ROOT, **variables: str) -> dict[
     if subprocess.run(command, cwd=root, env=environment, check=False).returncode:
         raise SystemExit(1)  # it has said why
     return msgspec.to_builtins(read_metrics(root / "build" / Path(dataset).name / "evaluate/metrics.json"))
-
-
-def apart(module: str, facts: Any, environment: Mapping[str, str] | None = None) -> Any:
-    """What `python -m module <facts as JSON>` prints last, as JSON, in a process of its own.  Raises CalledProcessError where it fails."""
-    command = [sys.executable, "-m", module, json.dumps(facts)]
-    done = subprocess.run(command, cwd=ROOT, env=environment, stdout=subprocess.PIPE, check=True)
-    return json.loads(done.stdout.splitlines()[-1])
 
 
 class Taken(NamedTuple):

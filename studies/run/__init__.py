@@ -24,10 +24,9 @@ from studies.study import FULL, QUICK, Scale, Study
 
 ORDER = (  # of the page
     "matrix-size row-and-column structure label-quality alignment-error progressive leave-one-out paper-sets gauss-sphere comparison "
-    "prior cost speed parts"
+    "prior parts"
 )
-CATALOGUE = "studies.catalogue"
-STUDIES: dict[str, Study] = {n: import_module(f"{CATALOGUE}.{n.replace('-', '_')}").STUDY for n in ORDER.split()}
+STUDIES: dict[str, Study] = {n: import_module(f"studies.catalogue.{n.replace('-', '_')}").STUDY for n in ORDER.split()}
 SLICES = ("case", "worlds", "sets")
 
 
@@ -64,10 +63,9 @@ class Studies(Project, frozen=True):
     find_dataset = dataset_folder
 
 
-def studies(scale: Scale = FULL, root: Path = LIBRARY, name: str = "") -> Studies:
-    """The project of the studies of a scale; name: of the one that is to run, for steps of a study may be its own module's."""
-    package = CATALOGUE if name in STUDIES and not STUDIES[name].steps else "studies.steps"
-    return Studies(root, Provider(SLICES, lambda folder: data_of(folder, scale)), package, scale=scale)
+def studies(scale: Scale = FULL, root: Path = LIBRARY) -> Studies:
+    """The project of the studies of a scale."""
+    return Studies(root, Provider(SLICES, lambda folder: data_of(folder, scale)), "studies.steps", scale=scale)
 
 
 def data_of(folder: Path, scale: Scale) -> Data:
@@ -105,10 +103,10 @@ def make(
     """
     codes = []
     for name in names:
-        project, study = studies(scale, root, name), STUDIES[name]
+        project, study = studies(scale, root), STUDIES[name]
         if scale.quick:
             print(f"{name}: quick: one seed, smallest sets: no conclusion")
-        targets = list(study.steps or (name.replace("-", "_"),))
+        targets = list(study.steps)
         codes.append(verbs.make(project, verbs.Wish(name, targets=targets, settings=settings or [], force=force)))
         if codes[-1] == 0:
             from studies.run.page import conclude, write_page  # here: a plan must not pay for science

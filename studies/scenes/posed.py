@@ -32,6 +32,7 @@ from factorlib.refine.photo import PosedObject, Refined, Scene, refined_photo
 from factorlib.refine.pixels import pixels_of
 from factorlib.reflection.operator import Operator
 from studies.scenes import shapes
+from studies.scenes.problems import random_light
 
 WIDTH, HEIGHT = 320, 240
 NOISE = 0.01
@@ -66,13 +67,6 @@ def mesh_of(shape: str, materials: tuple[int, ...], rough: int | None = None) ->
     return msgspec.structs.replace(mesh, face_label=(np.array(materials) + 1)[mesh.face_label - 1].astype(np.int16))
 
 
-def random_light(rng: np.random.Generator, lobes: int = 40) -> Light:
-    axis = rng.normal(size=(lobes, 3))
-    log_sharpness = rng.uniform(0, 5.5, lobes)
-    weight = rng.lognormal(0, 0.8, (lobes, 1)) * rng.lognormal(0, 0.2, (lobes, 3)) * np.exp(log_sharpness / 2)[:, None]
-    return Light(axis / np.linalg.norm(axis, axis=1, keepdims=True), log_sharpness, weight, np.zeros(1))
-
-
 def photographed(kind: str, number: int, rng: np.random.Generator, operator: Operator) -> Photo:
     shape, materials = (AMBIGUOUS if kind == "front/back" else OBJECTS)[number]
     caster = Caster(mesh_of(shape, materials))
@@ -86,7 +80,7 @@ def photographed(kind: str, number: int, rng: np.random.Generator, operator: Ope
         rotation = Rotation.random(rng=rng).as_matrix()
     middle = np.array([0, 0, 2 * camera.focal * caster.radius / (0.9 * HEIGHT)])
     truth = Pose(rotation, middle - rotation @ caster.centre)
-    channels = rendered(caster, camera, truth, random_light(rng), rng, operator)
+    channels = rendered(caster, camera, truth, random_light(rng, 40, sharpest=5.5, contrast=0.8), rng, operator)
     silhouette = Silhouette(channels["label"].astype(np.int16))
     if flipped:
         mirrored = np.diag([1.0, 1, -1]) @ rotation @ np.diag([-1.0, 1, 1])  # x is the chair's left and right
@@ -133,14 +127,12 @@ def normal_error(photo: Photo, pose: Pose) -> float:
     """Median angle over the true silhouette where both see the object, degrees."""
     truth, found = rasterise(photo.caster, photo.camera, photo.truth), rasterise(photo.given, photo.camera, pose)
     both = (truth.label > 0) & (found.label > 0)
-    return float(
-        np.rad2deg(np.median(np.arccos(np.clip(np.sum(truth.normal[both] * found.normal[both], axis=1), -1, 1))))
-    )
+    cosine = np.sum(truth.normal[both] * found.normal[both], axis=1)
+    return float(np.rad2deg(np.median(np.arccos(np.clip(cosine, -1, 1)))))
 
 
 def refined_of(photo: Photo, materials: Materials, operator: Operator) -> Refined:
     pixels = pixels_of(photo.channels, [True] * 3, 2400)
     own = PosedObject(photo.given, Silhouette(photo.channels["label"].astype(np.int16)), photo.pose, photo.runner_up)
-    return refined_photo(
-        Scene(photo.camera, [own], FocalPrior(photo.camera.focal, 0.0)), pixels, Surfaces(materials, operator)
-    )[0]
+    scene = Scene(photo.camera, [own], FocalPrior(photo.camera.focal, 0.0))
+    return refined_photo(scene, pixels, Surfaces(materials, operator))[0]

@@ -23,10 +23,13 @@ def sphere_normals(size: int) -> np.ndarray:
     return np.column_stack([x, y, -np.sqrt(1 - x**2 - y**2)])
 
 
-def random_light(rng, lobes: int, photos: int = 1) -> Light:
+def random_light(rng, lobes: int, photos: int = 1, sharpest: float = 4.5, contrast: float = 0.7) -> Light:
+    """Lobes of random directions, of log sharpness up to `sharpest`; the exposures of photos but the first."""
     axis = rng.normal(size=(lobes, 3))
-    log_sharpness = rng.uniform(0, 4.5, lobes)
-    weight = rng.lognormal(0, 0.7, (lobes, 1)) * rng.lognormal(0, 0.2, (lobes, 3)) * np.exp(log_sharpness / 2)[:, None]
+    log_sharpness = rng.uniform(0, sharpest, lobes)
+    weight = (
+        rng.lognormal(0, contrast, (lobes, 1)) * rng.lognormal(0, 0.2, (lobes, 3)) * np.exp(log_sharpness / 2)[:, None]
+    )
     exposure = np.concatenate([[0.0], rng.normal(0, 0.5, photos - 1)])
     return Light(axis / np.linalg.norm(axis, axis=1, keepdims=True), log_sharpness, weight, exposure)
 

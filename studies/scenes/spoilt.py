@@ -123,10 +123,8 @@ def tiny(folder: Path, spec: Spec, rng: Rng) -> None:
             is_photo = file == photo["image"]
             with Image.open(folder / file) as picture:
                 how = Image.Resampling.BOX if is_photo else Image.Resampling.NEAREST
-                small, focal = (
-                    np.asarray(picture.resize((picture.width // 6, picture.height // 6), how)),
-                    focal_of(picture),
-                )
+                small = np.asarray(picture.resize((picture.width // 6, picture.height // 6), how))
+                focal = focal_of(picture)
             write_photo(folder / file, srgb_decode(small / 255.0), focal) if is_photo else write_labels(
                 folder / file, small
             )

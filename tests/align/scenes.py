@@ -32,22 +32,21 @@ def ball(radius=1.0, subdivisions=3):
     return trimesh.creation.icosphere(subdivisions=subdivisions, radius=radius)
 
 
-def blob(subdivisions=3):
+def blob():
     """Smooth, without symmetry."""
-    part = ball(subdivisions=subdivisions)
+    part = ball()
     x, y, z = part.vertices.T
     radius = 1 + 0.25 * np.sin(3 * x + 1) + 0.2 * np.cos(2.5 * y - 0.4) * x + 0.3 * y * z + 0.25 * z**3
     part.vertices = part.vertices * radius[:, None]
     return mesh_of([part])
 
 
-def chair(mirrored: bool = False, labels=(1, 1)):
+def chair():
     """Seat, back, four legs and an arm on one side."""
-    side = -1 if mirrored else 1
     box = trimesh.creation.box
-    seat = [box((1, 1, 0.1)), at(box((0.1, 1, 1)), -0.45, 0, 0.5), at(box((0.6, 0.08, 0.08)), 0, 0.45 * side, 0.3)]
+    seat = [box((1, 1, 0.1)), at(box((0.1, 1, 1)), -0.45, 0, 0.5), at(box((0.6, 0.08, 0.08)), 0, 0.45, 0.3)]
     legs = [at(box((0.08, 0.08, 0.9)), x, y, -0.5) for x in (-0.4, 0.4) for y in (-0.4, 0.4)]
-    return mesh_of(seat + legs, [labels[0]] * 3 + [labels[1]] * 4)
+    return mesh_of(seat + legs)
 
 
 def dumbbell(labels=(1, 2)):
@@ -56,9 +55,7 @@ def dumbbell(labels=(1, 2)):
     return mesh_of([*ends, trimesh.creation.box((1.2, 0.3, 0.5))], [*labels, labels[0]])
 
 
-def photo_of(
-    mesh: Mesh, seed: int, width=320, height=240, fill=0.75, focal=1.5, shift=(0.0, 0.0)
-) -> tuple[Caster, Camera, Pose]:
+def photo_of(mesh, seed, width=320, height=240, fill=0.75, focal=1.5, shift=(0.0, 0.0)) -> tuple[Caster, Camera, Pose]:
     """The mesh at a random rotation, its bounding sphere `fill` of the photo's height, moved by `shift` of its size."""
     caster = Caster(mesh)
     rotation = Rotation.random(rng=np.random.default_rng(seed)).as_matrix()
@@ -72,9 +69,7 @@ def true_silhouette(caster: Caster, camera: Camera, pose: Pose) -> Silhouette:
     return Silhouette(rasterise(caster, camera, pose).label.astype(np.int16))
 
 
-def normal_error_deg(
-    caster: Caster, camera: Camera, pose: Pose, found_camera: Camera, found_pose: Pose, given: Caster | None = None
-) -> float:
+def normal_error_deg(caster, camera, pose, found_camera, found_pose, given=None) -> float:
     """Median over the true silhouette; a pixel that the mesh given misses in the pose found counts as 180°."""
     truth, found = rasterise(caster, camera, pose), rasterise(given or caster, found_camera, found_pose)
     angle = np.rad2deg(np.arccos(np.clip(np.sum(truth.normal * found.normal, axis=-1), -1, 1)))

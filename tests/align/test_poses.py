@@ -147,10 +147,10 @@ def test_standards_are_what_doubts_are_measured_by():
 TIPS = np.array([[-0.5, -0.5, 0.05], [0.5, -0.5, 0.05], [0.5, 0.5, 0.05], [-0.45, 0.5, 1.0], [-0.45, -0.5, 1.0], [0.4, 0.4, -0.95], [-0.4, -0.4, -0.95], [0.4, -0.4, -0.95]])  # fmt: skip
 
 
-def named(camera, pose, points=TIPS, off=0.0, seed=0) -> Keypoints:
+def named(camera, pose, off, seed) -> Keypoints:
     """The points where the camera sees them, each up to `off` pixels away from there."""
-    shift = np.random.default_rng(seed).uniform(-off, off, (len(points), 2))
-    return Keypoints(camera.project(pose.apply(points)) + shift, points)
+    shift = np.random.default_rng(seed).uniform(-off, off, (len(TIPS), 2))
+    return Keypoints(camera.project(pose.apply(TIPS)) + shift, TIPS)
 
 
 def placed_by(caster, camera, keypoints, silhouette, focal):

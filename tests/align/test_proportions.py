@@ -34,9 +34,7 @@ def error_deg(true, camera, state, mesh):
     return float(np.rad2deg(np.median(np.arccos(cosine))))
 
 
-@pytest.mark.parametrize(
-    "mesh, off, focal_sigma", [(blob, (1.15, 1, 1), 0.0), (chair, (1, 1, 0.88), 0.0), (chair, (1, 1.12, 1), 0.1)]
-)
+@pytest.mark.parametrize("mesh, off, focal_sigma", [(blob, (1.15, 1, 1), 0.0), (chair, (1, 1.12, 1), 0.1)])
 def test_wrong_proportions_come_back_within_three_percent(mesh, off, focal_sigma):
     true = mesh()
     given = scaled(true, off)

@@ -1,4 +1,4 @@
-"""Standard errors of materials, and of the light in every direction: of lights of few lobes, then of a fit in natural lights."""
+"""Standard errors of materials and lights, of few lobes and of natural lights; and what is unexplained."""
 
 import msgspec
 import numpy as np
@@ -6,12 +6,8 @@ import pytest
 
 from factorlib.conventions import YUP_FROM_CAMERA, lat_long_directions
 from factorlib.diagnose.identifiability import tinted_alike
-from factorlib.diagnose.uncertainty import (
-    LARGEST,
-    Posterior,
-    relative_standard_errors,
-    standard_errors,
-)
+from factorlib.diagnose.misfit import misfit
+from factorlib.diagnose.uncertainty import LARGEST, Posterior, relative_standard_errors, standard_errors
 from factorlib.model.materials import Materials, Point
 from factorlib.model.noise import Loss
 from factorlib.model.problem import JointProblem
@@ -19,6 +15,7 @@ from factorlib.reflection import reflection_operator
 from factorlib.solve.few_lobes.descent import Iterate, descend, evaluate
 from factorlib.solve.few_lobes.equations import normal_equations
 from studies.scenes.problems import MATERIALS, block, factor_between, random_light
+from tests.model.made import in_units_of
 from tests.solve.made import PRIOR, natural
 
 OPERATOR, LOSS = reflection_operator("network"), Loss()
@@ -33,12 +30,8 @@ def noisy(seed: int):
         data = block(f"room{k}", light, MATERIALS, [0, 1, 2], OPERATOR, size=20)
         radiance = data.radiance + NOISE * rng.normal(size=data.radiance.shape) / data.precision
         blocks.append(msgspec.structs.replace(data, radiance=radiance, held_out=np.zeros(len(data), bool)))
-    scaled = [
-        msgspec.structs.replace(light, weight=light.weight / data.unit)
-        for light, data in zip(lights, blocks, strict=True)
-    ]
-    problem = JointProblem(blocks, OPERATOR, LOSS)
-    return problem, descend(problem, evaluate(problem, Point(MATERIALS, scaled)), 25, 1e-7).point
+    problem, start = JointProblem(blocks, OPERATOR, LOSS), Point(MATERIALS, in_units_of(blocks, lights))
+    return problem, descend(problem, evaluate(problem, start), 25, 1e-7).point
 
 
 @pytest.fixture(scope="module")
@@ -145,3 +138,41 @@ def test_a_colour_that_all_lights_have_is_named_where_interreflection_fixes_it(t
     if said:
         for words in ("room0, room1", "R : G : B = 0.4", "solve.interreflection=off"):
             assert words in sentences[0]
+
+
+# ── what is unexplained: what neighbours leave alike ──────────────────────────────────────────────────────────────────
+
+
+@pytest.fixture(scope="module")
+def exact():
+    """Two lights, two photos of the second, each showing three balls, at the truth."""
+    rng = np.random.default_rng(3)
+    lights = [random_light(rng, 3), random_light(rng, 3, photos=2)]
+    blocks = [block(f"room{k}", light, MATERIALS, [0, 1, 2], OPERATOR) for k, light in enumerate(lights)]
+    return JointProblem(blocks, OPERATOR), Point(MATERIALS, in_units_of(blocks, lights))
+
+
+def changed(exact, **columns):
+    """The first block with other columns."""
+    problem, point = exact
+    return JointProblem([msgspec.structs.replace(problem.blocks[0], **columns), problem.blocks[1]], OPERATOR), point
+
+
+def test_the_truth_leaves_nothing_and_noise_next_to_nothing(exact):
+    whole, photos = misfit(*exact)
+    assert whole < 1e-6 and set(photos) == {"room0_0", "room1_0", "room1_1"}
+    assert {type(whole), *(type(photo.unexplained) for photo in photos.values())} == {float}  # as JSON takes it
+    radiance = exact[0].blocks[0].radiance
+    noisy = radiance + 0.1 * np.random.default_rng(0).normal(size=radiance.shape)
+    assert misfit(*changed(exact, radiance=noisy))[0] < 0.01
+
+
+def test_what_neighbours_leave_alike_is_the_share_of_the_shading_that_it_is(exact):
+    block = exact[0].blocks[0]
+    means = np.array([block.radiance[block.material == m].mean(0) for m in block.material])
+    flatter = means + 0.7 * (
+        block.radiance - means
+    )  # of the shading, 70 % is there: the model shows .3/.7 of it too much
+    _, photos = misfit(*changed(exact, radiance=flatter))
+    assert photos["room0_0"].unexplained == pytest.approx((0.3 / 0.7) ** 2, rel=0.02)
+    assert photos["room1_1"].unexplained < 1e-6

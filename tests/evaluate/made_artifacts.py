@@ -53,10 +53,10 @@ class Made(msgspec.Struct):
     clip: float = 2.0
 
 
-def light_map(seed: int, height: int = 32) -> np.ndarray:
+def light_map(seed: int) -> np.ndarray:
     """A lat-long map of a dim sky and three lobes."""
     rng = np.random.default_rng(seed)
-    directions = lat_long_directions(height, 2 * height)
+    directions = lat_long_directions(32, 64)
     value = np.full((*directions.shape[:2], 3), 0.15) * (1 + directions[..., 1:2])
     for sharpness in (8, 40, 150):
         axis = rng.normal(size=3) + [0, 0.7, 0.7]

@@ -76,9 +76,9 @@ MAPS = {"a": light_map(1), "b": light_map(2)}
 TRUTHS = {name: light_of_lat_long(value) for name, value in MAPS.items()}
 
 
-def compared(transform, mirrored=None):
+def compared(transform):
     estimates = {name: light_of_lat_long(transform(name, value)) for name, value in MAPS.items()}
-    return compare_lights(estimates, TRUTHS, mirrored or {})
+    return compare_lights(estimates, TRUTHS, {})
 
 
 def test_the_true_light_is_perfect_and_the_null_is_not():

@@ -17,6 +17,7 @@ from factorlib.results.materials import read_materials
 from factorlib.stage import silent
 from stages import export
 from tests.export import made_export
+from tests.runner.toy import files_of
 
 SMALL = export.Params(height=32, mitsuba_height=32)
 
@@ -30,10 +31,6 @@ def run(inputs, out, params=SMALL):
     out.mkdir()
     export.main(params, inputs, out, silent)
     return out
-
-
-def files_of(folder):
-    return {str(p.relative_to(folder)): p.read_bytes() for p in sorted(folder.rglob("*")) if p.is_file()}
 
 
 def test_exported_materials_in_exported_lights_are_the_solved_ones(inputs, tmp_path):

@@ -171,11 +171,9 @@ def test_detail_of_reflectance_is_a_factor_on_the_diffuse_part_in_scenes_that_ar
 @pytest.mark.parametrize("sharpness", [0.1, 30.0, 2000.0, 1e5])
 def test_map_for_mitsuba_keeps_energy_and_direction(sharpness):
     axis = np.array([0.48, -0.36, 0.8])
-    lobe, theta, half = (
-        Lobes(axis[None], np.array([sharpness]), np.ones((1, 3))),
-        np.linspace(0, np.pi, 256),
-        np.pi / 510,
-    )
+    lobe = Lobes(axis[None], np.array([sharpness]), np.ones((1, 3)))
+    theta = np.linspace(0, np.pi, 256)
+    half = np.pi / 510
     area = -np.diff(np.cos(np.clip([theta - half, theta + half], 0, np.pi)), axis=0)[0] * np.pi / 256  # of the nodes
     values = mitsuba_map(lobe, 256, 512)[..., 0] * area[:, None]
     assert values.sum() == pytest.approx(lobe.energy[0], rel=2e-3)

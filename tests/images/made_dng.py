@@ -14,17 +14,9 @@ XYZ_TO_SRGB = (3.2406, -1.5372, -0.4986, -0.9689, 1.8758, 0.0415, 0.0557, -0.204
 WHITE, BLACK = 4000, 64
 
 
-def write_dng(
-    path: Path,
-    sensor: np.ndarray,
-    *,
-    orientation: int = 1,
-    neutral=(1.0, 1.0, 1.0),
-    exif: dict | None = None,
-    crop=None,
-) -> Path:
+def write_dng(path: Path, sensor: np.ndarray, *, orientation=1, neutral=(1.0, 1.0, 1.0), exif=None) -> Path:
     """sensor: [h, w] codes under red, green / green, blue; neutral: as the camera's white balance sees grey;
-    exif: tag -> (type, values); crop: (left, top, width, height) of the picture in it.  The preview is bright magenta."""
+    exif: tag -> (type, values).  The preview is bright magenta."""
     height, width = sensor.shape
     preview = np.tile(np.array([255, 0, 255], np.uint8), (8, 12, 1)).tobytes()
     raw = [
@@ -32,8 +24,6 @@ def write_dng(
         (277, SHORT, [1]), (278, LONG, [height]), (284, SHORT, [1]), (33421, SHORT, [2, 2]), (33422, BYTE, [0, 1, 1, 2]),
         (50714, SHORT, [BLACK]), (50717, LONG, [WHITE]),
     ]  # fmt: skip
-    if crop:
-        raw += [(50719, LONG, crop[:2]), (50720, LONG, crop[2:])]
     first = [
         (254, LONG, [1]), (256, LONG, [12]), (257, LONG, [8]), (258, SHORT, [8, 8, 8]), (259, SHORT, [1]), (262, SHORT, [2]),
         (271, ASCII, b"Made\0"), (272, ASCII, b"By hand\0"), (274, SHORT, [orientation]), (277, SHORT, [3]), (278, LONG, [8]),
@@ -74,6 +64,4 @@ def _directory(entries: list, at: int) -> bytes:
 def _packed(kind: int, values) -> bytes:
     if kind in (RATIONAL, SRATIONAL):
         values = [part for v in values for part in Fraction(v).limit_denominator(10**6).as_integer_ratio()]
-    return struct.pack(
-        f"<{len(values) if kind not in (RATIONAL, SRATIONAL) else len(values) // 2 * 2}{FORM[kind][0]}", *values
-    )
+    return struct.pack(f"<{len(values)}{FORM[kind][0]}", *values)

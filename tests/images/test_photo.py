@@ -66,9 +66,7 @@ def test_a_given_encoding_goes_before_what_the_file_implies(tmp_path, encoding, 
 
 @pytest.mark.parametrize("orientation", range(1, 9))
 @pytest.mark.parametrize("file, pixels", [("a.tif", codes(srgb_encode(RADIANCE))), ("a.exr", RADIANCE)])
-def test_orientation_is_applied_and_averaging_down_is_that_of_the_photo_as_displayed(
-    tmp_path, orientation, file, pixels
-):
+def test_orientation_is_applied_before_averaging_down(tmp_path, orientation, file, pixels):
     pixels = np.ascontiguousarray(pixels[:11, :17])  # nothing comes out even, so that the displayed corner matters
     path = save(tmp_path / file, pixels, Orientation=orientation)
     expected = oiio.ImageBufAlgo.reorient(oiio.ImageBuf(str(path))).get_pixels(oiio.FLOAT)

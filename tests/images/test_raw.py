@@ -37,12 +37,10 @@ def test_a_dng_is_what_the_sensor_saw_by_whatever_name_however_bright_the_pictur
     for brightness in (1, 0.25):
         photo = read_photo(write_dng(tmp_path / name, sensor_of(brightness * halves()), exif=EXIF))
         assert (photo.width, photo.height, photo.encoding) == (W, H, "linear") and not photo.clipped.any()
-        below, above, left, right = (
-            slice(H // 3 + 4, -4),
-            slice(4, H // 3 - 4),
-            slice(4, W // 2 - 4),
-            slice(W // 2 + 4, -4),
-        )
+        below = slice(H // 3 + 4, -4)
+        above = slice(4, H // 3 - 4)
+        left = slice(4, W // 2 - 4)
+        right = slice(W // 2 + 4, -4)
         for where, expected in (
             ((below, left), (0.2,) * 3),
             ((below, right), (0.4, 0.3, 0.2)),

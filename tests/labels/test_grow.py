@@ -3,16 +3,16 @@
 import numpy as np
 import pytest
 
-from factorlib.labels.grow import _walk, grow
+from factorlib.labels.grow import grow
 
 COLOURS = np.array([[90, 90, 90], [200, 40, 40], [150, 110, 60]])
 
 
-def scene(size=60, noise=8.0, seed=0):
+def scene(size=60, noise=8.0):
     """A red disc on a thin brown stem, before grey; the truth's labels, its picture, and a box around both."""
     y, x = np.indices((size, size)) * 60 / size
     truth = np.where(np.hypot(x - 30, y - 22) < 14, 1, np.where((abs(x - 30) < 2) & (y > 30) & (y < 52), 2, 0))
-    picture = COLOURS[truth] + np.random.default_rng(seed).normal(0, noise, (size, size, 3))
+    picture = COLOURS[truth] + np.random.default_rng(0).normal(0, noise, (size, size, 3))
     return truth.astype(np.uint8), picture.clip(0, 255).astype(np.uint8), tuple(k * size // 60 for k in (10, 4, 50, 56))
 
 
@@ -78,17 +78,3 @@ def test_a_click_on_a_glint_does_not_make_the_body_background():
     label, sure, box = np.where(ball & ~glint, 1, 0).astype(np.uint8), np.hypot(x - 24, y - 24) < 2, (8, 8, 52, 52)
     label[sure] = 1
     assert ((grow(box, 1, picture, label, sure) == 1) == ball).mean() > 0.98
-
-
-def test_chances_are_those_of_walks():
-    """On one colour: of a walker on a line, from dense algebra; they add up to one."""
-    label = np.zeros((1, 12), np.uint8)
-    label[0, -1] = 1
-    fixed = np.zeros((1, 12), bool)
-    fixed[0, [0, -1]] = True
-    found = _walk(np.full((1, 12, 3), 0.5), np.array([0, 1], np.uint8), label, fixed)[:, 0]
-    prior = 0.05 / 2  # either label has this colour, equally often
-    step = 1 + 1e-3
-    system = np.diag(np.full(10, 2 * step + 0.05)) - step * (np.eye(10, k=1) + np.eye(10, k=-1))
-    want = np.linalg.solve(system, np.full(10, prior) + step * (np.arange(10) == 9))
-    assert np.allclose(found[1, 1:-1], want, atol=2e-3) and np.allclose(found.sum(axis=0), 1, atol=2e-3)

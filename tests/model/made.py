@@ -4,13 +4,16 @@ import msgspec
 import numpy as np
 
 from factorlib.geometry.sphere import fibonacci_sphere
+from factorlib.model.blocks import Block
 from factorlib.model.illumination import Illumination
 from factorlib.model.lights import Light
-from factorlib.model.materials import Materials, Point
+from factorlib.model.materials import Point
 from factorlib.model.problem import JointProblem
 from factorlib.reflection import reflection_operator
+from factorlib.results.materials import Reflectance
 from factorlib.urm.observations import Observations
 from studies.scenes.problems import MATERIALS, block, random_light, sphere_normals
+from tests.integral import reflected
 
 OPERATOR = reflection_operator("closed_form", dtype="float64")
 
@@ -58,39 +61,36 @@ def three_rooms() -> tuple[JointProblem, Point]:
     )
 
 
+def in_units_of(blocks: list[Block], lights: list[Light]) -> list[Light]:
+    """Lights in the photos' radiance as lights in the units of their blocks."""
+    return [msgspec.structs.replace(li, weight=li.weight / b.unit) for li, b in zip(lights, blocks, strict=True)]
+
+
 def bowl_sees(normals, directions):
     """A ray from −n leaves the sphere at −n + 2(n·d)d; it is free where that lies before the rim."""
     exit_z = -normals[:, 2:] + 2 * (normals @ directions.T) * directions[:, 2]
     return (exit_z < 0) | (normals @ directions.T <= 0)
 
 
-def traced(normals, sees, light: Light, material, materials: Materials, count=12_000):
+def traced(normals, sees, light: Light, material: int, count=12_000):
     """Radiance toward (0, 0, −1) by summing the light over `count` directions: no operator, no lobes."""
-    d = fibonacci_sphere(count)
-    view = np.array([0.0, 0.0, -1.0])
-    incoming = np.exp(light.sharpness * (d @ light.axis.T - 1)) @ light.weight
-    half = (d + view) / np.maximum(np.linalg.norm(d + view, axis=1, keepdims=True), 1e-9)
-    ni, no, nh = (np.maximum(normals @ v.T, 0) for v in (d, view[None], half))
-    square = materials.roughness[material] ** 4
-
-    def smith(c):
-        return 2 * c / (c + np.sqrt(square + (1 - square) * c * c) + 1e-12)
-
-    highlight = square / (np.pi * (nh**2 * (square - 1) + 1) ** 2) * smith(ni) * smith(no) / (4 * no)
-    weight = sees(normals, d) * 4 * np.pi / count
-    return (weight * ni / np.pi) @ incoming * materials.diffuse[material] + (
-        weight * highlight
-    ) @ incoming * materials.specular[material]
+    d, row = fibonacci_sphere(count), MATERIALS.rows()[material]
+    incoming = np.exp(light.sharpness * (d @ light.axis.T - 1)) @ light.weight * 4 * np.pi / count
+    views, one = np.tile([0.0, 0.0, -1.0], (len(normals), 1)), Reflectance(row[:3], row[3:6], row[6])
+    return reflected(one, normals, views, d, incoming, sees(normals, d))
 
 
-def seen_from_the_front(normal, radiance, material, names, photo="room", **more) -> Observations:
-    """What one photo shows of surfaces of those normals."""
+def seen_from_the_front(normal, radiance, material, names, name="room", **more) -> Observations:
+    """What one photo shows of surfaces of those normals; more: columns that are others than usual."""
     n, zero = len(normal), np.zeros(len(normal), int)
-    return Observations(
-        normal=normal, view=np.tile([0.0, 0.0, -1.0], (n, 1)), radiance=radiance, clipped=np.zeros((n, 3), bool), material=material,
-        photo=zero, illumination=zero, x=np.arange(n), y=zero, weight=np.ones(n), materials=names, photos=(photo,),
-        illuminations=(photo,), **more,
-    )  # fmt: skip
+    usual = {
+        "view": np.tile([0.0, 0.0, -1.0], (n, 1)),
+        "clipped": np.zeros((n, 3), bool),
+        "photo": zero,
+        "illumination": zero,
+    }
+    usual |= {"x": np.arange(n), "y": zero, "weight": np.ones(n), "photos": (name,), "illuminations": (name,)}
+    return Observations(normal=normal, radiance=radiance, material=material, materials=names, **usual | more)
 
 
 def bowls(name, light, size=16, count=512) -> Observations:
@@ -98,7 +98,7 @@ def bowls(name, light, size=16, count=512) -> Observations:
     normals, directions, parts, sees = sphere_normals(size), fibonacci_sphere(count), [], []
     for m in range(3):
         for seen in (bowl_sees, lambda n, d: np.ones((len(n), len(d)), bool)):
-            parts.append(traced(normals, seen, light, m, MATERIALS))
+            parts.append(traced(normals, seen, light, m))
             sees.append(seen(normals, directions))
     material, visibility = np.repeat([0, 0, 1, 1, 2, 2], len(normals)), 255 * np.vstack(sees).astype(np.uint8)
     normal, names = np.tile(normals, (6, 1)), ("red", "green", "blue")

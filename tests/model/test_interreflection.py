@@ -33,7 +33,7 @@ def test_bounces_add_a_known_radiance(given):
     assert JointProblem([data], OPERATOR).with_effects(shadows=False, bounces=True).blocks[0].bounced is None
 
 
-def bowl(albedo, depth=0.5, size=40, count=1024, name="bowl") -> Observations:
+def bowl(albedo, depth=0.5, size=40, count=1024) -> Observations:
     """The inside of a sphere open to constant light 1 from beyond a cap: radiosity is constant there, for form factors are.
 
     depth: share of the sphere that is bowl.  Radiance L = albedo (1 − depth + depth L) everywhere.
@@ -49,7 +49,7 @@ def bowl(albedo, depth=0.5, size=40, count=1024, name="bowl") -> Observations:
         "visibility": np.where(hidden, 0, 255).astype(np.uint8),
         "met": np.where(hidden, codes, UNMET).astype(np.uint16),
     }
-    return seen_from_the_front(n, radiance, np.zeros(len(n), int), ("white",), name, **how)
+    return seen_from_the_front(n, radiance, np.zeros(len(n), int), ("white",), **how)
 
 
 @pytest.mark.parametrize(("albedo", "depth"), [(0.3, 0.5), (0.9, 0.5), (0.9, 0.9)])

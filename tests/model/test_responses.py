@@ -18,15 +18,7 @@ from tests.solve.made import OPERATOR, drawn, on_even_cells
 CELLS, ALL = 60, Loss(1e6)  # no outliers
 
 
-def made(
-    seed: int,
-    photos: int = 1,
-    toned: bool = False,
-    hidden: bool = False,
-    bounced: bool = False,
-    clipped: bool = False,
-    near: bool = False,
-) -> Illumination:
+def made(seed, photos=1, toned=False, hidden=False, bounced=False, clipped=False, near=False) -> Illumination:
     """Two materials of random reflectances in one light of several photos, with its table; what the photos show is of another light."""
     rng = np.random.default_rng(seed)
     exposure = [0.0, *rng.normal(0, 0.5, photos - 1)]

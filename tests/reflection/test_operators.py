@@ -15,6 +15,7 @@ from factorlib.reflection.network import FEATURES, SHIPPED, Layers, read_layers,
 from factorlib.reflection.operator import Operator
 from factorlib.reflection.reference import diffuse_quadrature
 from factorlib.reflection.samples import diffuse_samples, quantiles, specular_samples
+from studies.scenes.operators import scene
 
 FAST = {
     (name, dtype): reflection_operator(name, dtype=dtype)
@@ -30,24 +31,13 @@ def unit(generator, *shape):
     return v / v.norm(dim=-1, keepdim=True)
 
 
-def scene(seed=0, points=40, lobes=5):
-    g = torch.Generator().manual_seed(seed)
-    axis, sharpness = unit(g, lobes), torch.logspace(0, 2.5, lobes, dtype=torch.float64)
-    light = SimpleNamespace(axis=axis, sharpness=sharpness, weight=torch.rand(lobes, 3, generator=g).double())
-    kd, ks, roughness = (torch.tensor(t).double() for t in ([0.3, 0.2, 0.1], [0.2, 0.3, 0.4], 0.5))
-    material = SimpleNamespace(diffuse=kd, specular=ks, roughness=roughness)
-    normals = unit(g, points)
-    views = normals + 0.8 * unit(g, points)
-    return light, material, normals, views / views.norm(dim=-1, keepdim=True)
-
-
 def changed(namespace, **changes):
     return SimpleNamespace(**(vars(namespace) | changes))
 
 
 @pytest.mark.parametrize("operator", [*FAST.values(), REFERENCE], ids=[*map("-".join, FAST), "reference"])
 def test_radiance_is_not_negative_and_linear_in_light_and_reflectance_and_channels_know_nothing_of_each_other(operator):
-    light, material, normals, views = scene()
+    light, material, normals, views = scene(0, points=40)
     radiance, turn = operator(light, material, normals, views), [2, 0, 1]
     assert (radiance >= 0).all() and radiance.max() > 0 and radiance.shape == (40, 3)
     both = {name: getattr(material, name) for name in ("diffuse", "specular")}

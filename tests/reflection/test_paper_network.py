@@ -1,9 +1,5 @@
 """The paper's operator: laws that hold whatever its weights, what the shipped ones reach and learned from."""
 
-import subprocess
-import sys
-from pathlib import Path
-
 import numpy as np
 import pytest
 import torch
@@ -14,11 +10,8 @@ from factorlib.reflection.lobe import lobe_integral
 from factorlib.reflection.network import SHIPPED
 
 
-def test_the_shipped_weights_are_small_and_load_without_a_renderer():
+def test_the_shipped_weights_are_small():
     assert sum(path.stat().st_size for path in SHIPPED.glob("paper_*")) < 1_000_000
-    made = "import sys; from factorlib.reflection import reflection_operator; reflection_operator('paper_network')"
-    code = f"{made}; sys.exit('mitsuba' in sys.modules)"
-    assert subprocess.run([sys.executable, "-c", code], cwd=Path(__file__).parents[2], check=False).returncode == 0
 
 
 def test_rendered_spheres_are_what_the_reference_says(monkeypatch):

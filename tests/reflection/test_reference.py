@@ -6,27 +6,22 @@ from factorlib.reflection import reflection_operator
 from factorlib.reflection.lobe import lobe_integral
 from factorlib.reflection.reference import about_half_vector, about_lobe, converged
 from factorlib.reflection.samples import specular_inputs
+from factorlib.results.materials import Reflectance
+from tests.integral import reflected
 
 R = reflection_operator("reference")
 
 
-def brute_force(roughness, sharpness, no, nz, oz, size=1500) -> tuple[float, float]:
-    """Diffuse and specular reflection of a unit lobe, the rendering equation summed over a fine grid of directions in vectors:
-    it shares nothing with the product."""
+def brute_force(roughness, sharpness, no, nz, oz, size=1500) -> np.ndarray:
+    """Diffuse and specular reflection of a unit lobe, over a fine grid of the hemisphere in vectors."""
     so = np.sqrt(1 - no**2)
     zx = (oz - no * nz) / so
     n, o, z = np.array([0, 0, 1.0]), np.array([so, 0, no]), np.array([zx, np.sqrt(max(1 - nz**2 - zx**2, 0)), nz])
     c, phi = (np.arange(size)[:, None] + 0.5) / size, (np.arange(2 * size) + 0.5) / size * np.pi
     s = np.sqrt(1 - c**2)
-    i = np.stack(np.broadcast_arrays(s * np.cos(phi), s * np.sin(phi), c), -1)  # middles of cells of one solid angle
+    i = np.stack(np.broadcast_arrays(s * np.cos(phi), s * np.sin(phi), c), -1).reshape(-1, 3)  # of one solid angle each
     light = np.exp(-0.5 * sharpness * ((i - z) ** 2).sum(-1)) * np.pi / size**2
-    ni, h = i @ n, i + o
-    nh = (h @ n) / np.linalg.norm(h, axis=-1)
-    a2 = roughness**4
-    d = a2 / (np.pi * (nh**2 * (a2 - 1) + 1) ** 2)
-    for c in (ni, n @ o):
-        d = d * 2 * c / (c + np.sqrt(a2 + (1 - a2) * c**2))
-    return float((light * ni).sum() / np.pi), float((light * d).sum() / (4 * (n @ o)))
+    return reflected(Reflectance((1, 0, 0), (0, 1, 0), roughness), n[None], o[None], i, light[:, None])[0, :2]
 
 
 def scalars(*values):

@@ -96,9 +96,7 @@ def gradients(operator, leaves) -> dict[str, torch.Tensor]:
     weight=st.sampled_from([0.0, 1.0, 1e6]),
     log_sharpness=st.floats(math.log(1e-4), math.log(1e6)), cosine=st.sampled_from([None, 1e-4, 1.0]),
 )  # fmt: skip
-def test_radiance_and_every_gradient_are_finite(
-    name, normal, view, axis, place, roughness, weight, log_sharpness, cosine
-):
+def test_all_gradients_are_finite(name, normal, view, axis, place, roughness, weight, log_sharpness, cosine):
     operator = FAST[name]
     n, o, z = (torch.nn.functional.normalize(torch.tensor(v, dtype=torch.float64), dim=0) for v in (normal, view, axis))
     if cosine is not None:
@@ -169,9 +167,3 @@ def test_a_unit_lobe_is_reflected_no_brighter_than_it_is(name, domain):
 def test_constant_light_comes_back_from_white(name):
     assert laws.white_lambert(FAST[name])[0] < 1e-3
     assert laws.constant_light(FAST[name], 512)[1] < 1.01
-
-
-@single
-def test_turning_and_scaling_change_nothing_else(name):
-    assert laws.turned(FAST[name])[0] < 3e-6
-    assert laws.scaled(FAST[name])[0] < 3e-6

@@ -85,10 +85,8 @@ def test_twice_the_light_is_twice_the_picture_and_a_polished_ground_shows_the_ob
 @pytest.mark.parametrize("turn", [0, 180])
 def test_an_open_mesh_is_seen_from_either_side_and_hidden_by_what_stands_before_it(turn):
     """Whatever the objects of the photo are called."""
-    corners, faces = (
-        np.array([[-1, 0, 0], [1, 0, 0], [1, 2, 0], [-1, 2, 0]], float),
-        np.array([[0, 1, 2], [0, 2, 3]], np.int32),
-    )
+    corners = np.array([[-1, 0, 0], [1, 0, 0], [1, 2, 0], [-1, 2, 0]], float)
+    faces = np.array([[0, 1, 2], [0, 2, 3]], np.int32)
     quad = Mesh(corners, faces, np.tile([0, 0, 1.0], (4, 1)), np.ones(2, np.int16), open=True)
     seen = []
     for where in (-8.0, -4.0):

@@ -94,9 +94,7 @@ CASES = [
 
 
 @pytest.mark.parametrize("other, point, words, cure", CASES)
-def test_where_nothing_would_be_seen_it_is_refused_with_a_place_or_moved_where_nobody_named_one(
-    other, point, words, cure
-):
+def test_where_nothing_would_be_seen_it_is_refused_with_a_place_or_moved_unasked(other, point, words, cure):
     spot = Spot(GROUND, np.array(point), 0.8)
     with pytest.raises(InputError, match=words) as error:
         stood_free(scene(other), stand, spot, asked=True)

@@ -14,6 +14,7 @@ from factorlib.reflection.reference import Reference
 from factorlib.render.reflect import Reflector, Shadows
 from factorlib.render.resynthesis import ball, observed_cells
 from factorlib.results.materials import Reflectance
+from tests.integral import reflected
 
 GLOSSY = Reflectance((0.4, 0.2, 0.1), (0.1, 0.2, 0.3), 0.4)
 
@@ -34,29 +35,12 @@ def points(count: int) -> tuple[np.ndarray, np.ndarray]:
     return normals, views * np.sign((normals * views).sum(1, keepdims=True))
 
 
-def by_quadrature(lat_long: np.ndarray, material: Reflectance, normals: np.ndarray, views: np.ndarray) -> np.ndarray:
-    """Lambert + GGX over every texel of an exported map; normals and views in the camera frame."""
-    height, width = lat_long.shape[:2]
-    i = lat_long_directions(height, width).reshape(-1, 3)
-    n, o = normals @ YUP_FROM_CAMERA.T, views @ YUP_FROM_CAMERA.T
-    a2 = material.alpha**2
-
-    def g1(c):
-        return 2 * c / (c + np.sqrt(a2 + (1 - a2) * c**2))
-
-    half = i[None] + o[:, None]
-    half /= np.linalg.norm(half, axis=-1, keepdims=True)
-    ni, no, nh = np.maximum(n @ i.T, 1e-12), (n * o).sum(1)[:, None], np.einsum("pc,ptc->pt", n, half)
-    d = a2 / (np.pi * (nh**2 * (a2 - 1) + 1) ** 2)
-    specular = np.where(n @ i.T > 0, d * g1(ni) * g1(no) / (4 * no), 0)
-    incoming = lat_long.reshape(-1, 3) * np.repeat(lat_long_solid_angles(height, width), width)[:, None]
-    diffuse = np.array(material.diffuse) / np.pi * (np.maximum(n @ i.T, 0) @ incoming)
-    return diffuse + np.array(material.specular) * (specular @ incoming)
-
-
 def test_radiance_is_the_integral_over_the_exported_map():
-    expected = by_quadrature(lat_long_of_lobes(light(), 128, 256), GLOSSY, *points(12))
-    found = Reflector(Reference(tolerance=1e-4), light())(GLOSSY, *points(12))
+    light_map, (normals, views) = lat_long_of_lobes(light(), 128, 256), points(12)
+    texels = light_map * lat_long_solid_angles(128, 256)[:, None, None]
+    incoming = (lat_long_directions(128, 256) @ YUP_FROM_CAMERA).reshape(-1, 3)
+    expected = reflected(GLOSSY, normals, views, incoming, texels.reshape(-1, 3))
+    found = Reflector(Reference(tolerance=1e-4), light())(GLOSSY, normals, views)
     np.testing.assert_allclose(found, expected, rtol=2e-3)
 
 

@@ -17,10 +17,12 @@ from factorlib.reflection import reflection_operator
 from factorlib.results.lobes import write_lobes
 from factorlib.results.materials import read_materials
 from factorlib.stage import silent
-from factorlib.urm.observations import Observations, write_observations
+from factorlib.urm.observations import write_observations
 from stages import render
 from tests.export import made_export
 from tests.export.made_export import instead
+from tests.model.made import seen_from_the_front
+from tests.runner.toy import files_of
 
 FAST = render.Params(operator="closed_form", ball_size=33, map_size=32)
 
@@ -38,7 +40,7 @@ def run(made, photo, out):
 
 def test_pictures_are_all_there_and_the_same_bytes_again(made, tmp_path):
     outs = [run(made, "side", tmp_path / name) for name in "ab"]
-    first, second = ({str(p.relative_to(out)): p.read_bytes() for p in out.rglob("*.*")} for out in outs)
+    first, second = map(files_of, outs)
     stems = [f"{kind}/side/{m}" for kind in ("materials", "reflectance_maps") for m in made_export.NAMES]
     assert set(first) == {f"{stem}.{suffix}" for stem in ["resynthesis/side", *stems] for suffix in ("exr", "png")}
     assert first == second
@@ -98,11 +100,10 @@ def test_what_is_hidden_is_lit_by_what_the_photo_shows_there(made, tmp_path):
         np.uint8
     )  # the lower half is hidden, by nothing known
     normal, view = (np.stack([geometry[f"{kind}.{a}"][y, x] for a in "xyz"], axis=-1) for kind in ("normal", "view"))
-    seen = Observations(
-        normal=normal, view=view, radiance=np.full((n, 3), 0.3), clipped=np.zeros((n, 3), bool), material=np.zeros(n, int),
-        photo=np.zeros(n, int), illumination=np.zeros(n, int), x=x, y=y, weight=np.ones(n), materials=tuple(made_export.NAMES),
-        photos=("front",), illuminations=("front",), visibility=np.tile(visibility, (n, 1)), met=np.full((n, 64), UNMET, np.uint16),
-    )  # fmt: skip
+    columns = {"view": view, "x": x, "y": y, "visibility": np.tile(visibility, (n, 1))}
+    columns |= {"met": np.full((n, 64), UNMET, np.uint16)}
+    radiance, names = np.full((n, 3), 0.3), tuple(made_export.NAMES)
+    seen = seen_from_the_front(normal, radiance, np.zeros(n, int), names, "front", **columns)
     (tmp_path / "urm").mkdir()
     write_observations(tmp_path / "urm" / "front.parquet", seen)
     pictures, hidden = [], msgspec.structs.replace(made, folders={**made.folders, "urm": tmp_path / "urm"})

@@ -16,6 +16,7 @@ from factorlib.solve.fit import Fit, Hyperparameters, Schedule, field_of, fitted
 from factorlib.solve.marginal import Field
 from factorlib.solve.start import constant_light
 from studies.scenes.problems import MATERIALS, block
+from tests.model.made import in_units_of
 
 FEW = 120  # cells, so that tests are quick
 OPERATOR, PRIOR = reflection_operator("network"), read_light_prior()
@@ -46,14 +47,7 @@ def light_of(axes, sharpness, weights) -> Light:
     return Light(axes / np.linalg.norm(axes, axis=1, keepdims=True), np.log(sharpness), weight, np.zeros(1))
 
 
-def spheres(
-    lights: list[Light],
-    materials: Materials = MATERIALS,
-    shown=(0, 1, 2),
-    size: int = 14,
-    noise: float = 0.3,
-    seed: int = 0,
-):
+def spheres(lights, materials=MATERIALS, shown=(0, 1, 2), size=14, noise=0.3, seed=0) -> JointProblem:
     """Noisy spheres of `shown` materials in each of the lights, named room0 and so on."""
     blocks, rng = [], np.random.default_rng(seed)
     for k, light in enumerate(lights):
@@ -67,10 +61,7 @@ def photographed(seed: int, lights: int, cells: int = FEW, **how) -> tuple[Joint
     """Spheres in lights drawn from the prior, and the lights in the blocks' units."""
     true = [on_even_cells(drawn(100 * seed + k, cells)) for k in range(lights)]
     problem = spheres(true, seed=seed, **{"size": 16} | how)
-    units = [one.unit for one in problem.blocks]
-    return problem, [
-        light.with_log_radiance(light.log_radiance - np.log(unit)) for light, unit in zip(true, units, strict=True)
-    ]
+    return problem, in_units_of(problem.blocks, true)
 
 
 def begun(problem: JointProblem, cells: int = FEW, materials: Materials = START) -> Fit:
@@ -85,9 +76,7 @@ def natural() -> tuple[JointProblem, list[Light], Fit]:
     return problem, true, fitted(problem, begun(problem), PRIOR, WHOLE)
 
 
-def field(
-    problem: JointProblem, light: Light, materials: Materials = MATERIALS, temperature: float = 2.0, prior=PRIOR
-) -> Field:
+def field(problem, light, materials=MATERIALS, temperature=2.0, prior=PRIOR) -> Field:
     """Of the first illumination, without outliers."""
     one = Illumination(problem.blocks[0], light, materials, OPERATOR)
     return msgspec.structs.replace(field_of(one, Hyperparameters(temperature), prior), loss=Loss(1e3))

@@ -123,10 +123,8 @@ def test_shadows_that_are_none_are_given_up_and_those_that_change_nothing_stay(s
         how = {"directions": np.stack([fibonacci_sphere(96)])}
         return [msgspec.structs.replace(b, visibility=visibility(b).astype(np.uint8), **how) for b in open_]
 
-    wrong, few = (
-        hiding(lambda b: 255 * (rng.random((len(b), 96)) < 0.5)),
-        {"cells": 24, "observations": 150, "tone": "off"},
-    )
+    wrong = hiding(lambda b: 255 * (rng.random((len(b), 96)) < 0.5))
+    few = {"cells": 24, "observations": 150, "tone": "off"}
     found = solved(wrong, **few)
     assert not found.shadows.kept and found.shadows.margin < AGAINST
     assert solved(wrong, **few, self_shadowing="on").shadows.kept

@@ -35,9 +35,8 @@ def test_models_swapped_change_the_sign_and_the_order_of_lights_and_the_scale_of
     without, richer = made(**how)
     one, other = compare(without, richer, FOR), compare(richer, without, FOR)
     assert one.margin == pytest.approx(-other.margin, rel=1e-9, abs=1e-9)
-    assert (
-        one.held_out_loss_with == other.held_out_loss_without and one.held_out_loss_without == other.held_out_loss_with
-    )
+    assert one.held_out_loss_with == other.held_out_loss_without
+    assert one.held_out_loss_without == other.held_out_loss_with
 
     def scaled(losses, which):
         return Losses([factor * v if k in which else v for k, v in enumerate(losses.values)], losses.clusters)

@@ -4,7 +4,6 @@ import msgspec
 import numpy as np
 import pytest
 
-from factorlib.model.gauge import in_gauge
 from factorlib.model.lights import Light, even_cells
 from factorlib.model.materials import Materials
 from factorlib.model.noise import Noise
@@ -89,14 +88,6 @@ def test_lights_from_the_observations_that_they_were_found_from_stay(solved):
         assert np.mean(np.abs(after.log_radiance - light.log_radiance) < deviation) > 0.95
 
 
-def test_the_gauge_of_an_answer_shows_the_same(solved):
-    problem, _, found = solved
-    for one, other in zip(
-        problem.radiance(in_gauge(found.point, problem.blocks)), problem.radiance(found.point), strict=True
-    ):
-        np.testing.assert_allclose(one, other, rtol=1e-6)
-
-
 # ── hyperparameters ──────────────────────────────────────────────────────────────────────────────────────────────────
 
 
@@ -154,14 +145,11 @@ def test_a_constant_light_stays_nearly_constant():
     assert contrast(found_in([constant]).point.lights[0]) < 0.3  # natural light has 1.2
 
 
-@pytest.mark.parametrize("shown", [(0,), (2,)])
-def test_one_photo_of_one_material(shown):
+def test_one_photo_of_one_material():
     light = on_even_cells(np.tile(1.5 * np.sin(3 * even_cells(FEW).axis[:, 0] + 1), (3, 1)))
-    found = found_in([light], shown).point
-    assert (
-        all(np.isfinite(part).all() for part in (found.materials.vector(), found.lights[0].weight))
-        and contrast(found.lights[0]) < 3
-    )
+    found = found_in([light], (2,)).point
+    assert all(np.isfinite(part).all() for part in (found.materials.vector(), found.lights[0].weight))
+    assert contrast(found.lights[0]) < 3
 
 
 def test_inverse_and_determinant_are_those_of_numpy_and_exactly_symmetric():

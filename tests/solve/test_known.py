@@ -19,8 +19,8 @@ from factorlib.solve.fit import Schedule, fitted, start_of
 from factorlib.solve.marginal import marginal
 from factorlib.solve.material_prior import MaterialPrior, unknowns_of
 from factorlib.solve.start import with_known
-from factorlib.urm.observations import Observations
 from studies.scenes.problems import MATERIALS, sphere_normals
+from tests.model.made import seen_from_the_front
 from tests.solve.made import FEW, PRIOR, START, WHOLE, at, begun, drawn, field, on_even_cells, photographed, spheres
 
 LAMP, QUICK = np.array([0.48, -0.6, -0.64]), Schedule(2, (3,))
@@ -85,9 +85,8 @@ def test_a_known_reflectance_of_nil_stays_nil_and_nothing_is_expected_of_brightn
     problem = msgspec.structs.replace(problem, known=known)
     found = fitted(problem, start_of(with_known(begun(problem).point, problem)), PRIOR, QUICK).point.materials
     assert found.specular[1].max() <= LEAST_REFLECTANCE * (1 + 1e-9)
-    assert (
-        not MaterialPrior(MATERIALS, problem.blocks, known).members and MaterialPrior(MATERIALS, problem.blocks).members
-    )
+    assert not MaterialPrior(MATERIALS, problem.blocks, known).members
+    assert MaterialPrior(MATERIALS, problem.blocks).members
 
 
 def test_a_start_comes_to_the_scale_of_what_is_known_and_shows_the_same(solved):
@@ -115,10 +114,8 @@ def test_the_slope_of_a_light_that_is_known_in_part_is_that_of_its_value(scale_f
     problem, (true,) = photographed(5, 1, cells=30, size=10)
     held, curves = true.axis[:, 2] < 0, {"log_tone": np.array([0.1])}
     one = field(problem, msgspec.structs.replace(true, held=held, scale_free=scale_free, **curves))
-    system, step = (
-        marginal(one, materials_given=True),
-        np.random.default_rng(0).normal(size=one.illumination.light.unknowns),
-    )
+    system = marginal(one, materials_given=True)
+    step = np.random.default_rng(0).normal(size=one.illumination.light.unknowns)
     assert len(step) == 3 * (~held).sum() + 1 + scale_free == len(system.light_gradient)
     lights = [moved(one.illumination.light, s * step) for s in (1e-3, -1e-3)]
     ahead, behind = (marginal(at(one, light), materials_given=True).value for light in lights)
@@ -195,16 +192,13 @@ def test_a_map_becomes_a_light_of_its_energy_in_its_directions(monkeypatch):
 
 def test_what_a_mirror_ball_shows_is_the_light_but_behind_it_where_another_object_stands_and_where_it_is_clipped():
     normals, turn = sphere_normals(60), rotation_of_vector(np.array([0.2, -0.5, 0.1]))
-    n, view = len(normals), np.tile([0.0, 0.0, -1.0], (len(normals), 1))
+    view = np.tile([0.0, 0.0, -1.0], (len(normals), 1))
     mirror = mirror_directions(normals, view)
     sphere = fibonacci_sphere(512)
     hidden = sphere[:, 0] > 0.9
-    seen = Observations(
-        normal=normals, view=view, radiance=0.5 * lamp(mirror @ turn.T), clipped=np.tile(mirror[:, 1:2] > 0.9, 3),
-        material=np.zeros(n, int), photo=np.zeros(n, int), illumination=np.zeros(n, int), x=np.arange(n), y=np.zeros(n, int),
-        weight=np.ones(n), materials=("chrome",), photos=("a",), illuminations=("a",),
-        visibility=np.tile(np.where(hidden, 0, 255).astype(np.uint8), (n, 1)),
-    )  # fmt: skip
+    clipped, sees = np.tile(mirror[:, 1:2] > 0.9, 3), np.tile(np.where(hidden, 0, 255).astype(np.uint8), (len(view), 1))
+    radiance, zero = 0.5 * lamp(mirror @ turn.T), np.zeros(len(view), int)
+    seen = seen_from_the_front(normals, radiance, zero, ("chrome",), clipped=clipped, visibility=sees)
     seen.radiance[mirror[:, 0] > 0.88] = 1e3  # of the other object
     light = light_of_ball(seen, np.full(3, 0.5), turn)
     out = {"behind": [0, 0, 1], "object": [1, 0, 0], "clipped": [0, 1, 0]}

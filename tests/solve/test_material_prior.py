@@ -38,7 +38,7 @@ def test_the_brightest_material_holds_the_gauge():
         assert matt.at(shifted).value == pytest.approx(expected, rel=1e-3)
 
 
-@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize("seed", range(2))
 def test_the_gradient_is_the_finite_difference_of_the_value(seed):
     problem, rng = photographed(6, 1, cells=50, size=10)[0], np.random.default_rng(seed)
     prior, theta = MaterialPrior(MATERIALS, problem.blocks), unknowns_of(MATERIALS)

@@ -20,9 +20,9 @@ def lamp(x: float):
     return light_of([[x, -0.4, -0.75], [0, 0, 1.0]], [100, 1e-4], np.array([20, 0.3])[:, None] * np.ones(3))
 
 
-def splitting_of(lights, seed=0):
+def splitting_of(lights):
     """The fit on cells of one size, and what comes of splitting."""
-    problem = spheres(lights, size=18, shown=SHOWN, seed=seed)
+    problem = spheres(lights, size=18, shown=SHOWN)
     fit = fitted(problem, begun(problem, CELLS), PRIOR, Schedule(4, (10, 8)))
     return problem, fit, split_while_gaining(problem, fit, ONCE, Parts())
 

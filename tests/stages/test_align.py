@@ -54,9 +54,8 @@ def test_given_pose_and_focal_length_are_used_as_they_are(tmp_path):
     inputs, caster, camera, pose = step(tmp_path, chair(), chair(), **KNOWN)
     out, entry = run(tmp_path, inputs)
     obj = entry["objects"]["chair"]
-    assert (
-        is_at(obj, pose) and obj["source"] == "given" and obj["silhouette_iou"] > 0.99 and obj["label_agreement"] == 1
-    )
+    assert is_at(obj, pose) and obj["source"] == "given" and obj["silhouette_iou"] > 0.99
+    assert obj["label_agreement"] == 1
     assert entry["camera"]["focal_px"] == 300.0 and entry["camera"]["principal_point"] == [100.0, 75.0]
     maps, truth = read_exr(out / "a.exr"), rasterise(caster, camera, pose)
     both = (maps["label"] > 0) & (truth.label > 0)
@@ -92,8 +91,10 @@ def test_a_wrong_mesh_is_doubted_and_left_out_and_stops_a_strict_run(tmp_path, c
     assert (maps["label"] > 0).any() and not maps["confidence"].any()
     kept, entry = run(tmp_path, inputs, "kept", keep_doubtful=True)
     assert not entry["objects"]["chair"]["left_out"] and read_exr(kept / "a.exr")["confidence"].any()
+    (tmp_path / "given").mkdir()
+    given = step(tmp_path / "given", chair(), blob(), **KNOWN)[0]
     with pytest.raises(InputError, match="overlap"):
-        run(tmp_path, inputs, "strict", strict=True)
+        run(tmp_path / "given", given, strict=True)
 
 
 def test_object_without_a_pixel_is_refused(tmp_path):
@@ -136,12 +137,12 @@ def test_a_camera_that_few_photos_have_is_warned_of(caplog, focal, centre, words
 # ── earlier poses, and photos that were averaged down ────────────────────────────────────────────────────────────────
 
 
-def earlier(tmp_path, inputs, pose, camera, runner_up=None, focal=300.0):
+def earlier(tmp_path, inputs, pose, camera, focal=300.0):
     """The inputs, with a folder that names the pose."""
     folder = tmp_path / "earlier"
     folder.mkdir()
     camera = {"focal_px": focal, "focal_source": "estimated", "principal_point": list(camera.centre)}
-    entry = {"camera": camera, "objects": {"chair": entry_of(pose, runner_up=runner_up)}}
+    entry = {"camera": camera, "objects": {"chair": entry_of(pose, runner_up=None)}}
     write_json(folder / "poses.json", {"a": entry})
     return msgspec.structs.replace(inputs, folders={**inputs.folders, "poses": folder})
 

@@ -1,22 +1,19 @@
 """A scene whose cameras stand in a COLMAP model, through `masks` and `align`; `tests/dataset/test_sources.py` reads the other sources."""
 
-import json
 import logging
 
 import numpy as np
 import pycolmap
-import pytest
 import yaml
 
 from factorlib.dataset.read import read_dataset
-from factorlib.dataset.slices import dataset_slice
-from factorlib.errors import InputError
 from factorlib.generate.folder import write_labels, write_photo
 from factorlib.geometry.camera import Camera, Pose, rotation_of_vector
 from factorlib.geometry.raster import Caster, rasterise
+from factorlib.jsonfile import read_json
 from factorlib.meshes.ply import write_ply
-from factorlib.stage import Inputs
 from stages import align, masks
+from studies.steps.photos import run_stages
 from tests.align.scenes import blob, chair, normal_error_deg
 
 CAMERA = Camera(200, 150, 300.0, (104.0, 71.0))
@@ -70,17 +67,12 @@ def colmap(folder):
     return {"colmap": "sparse", "world_from_object": {"chair": WORLD}}
 
 
-def aligned(folder, averaged=masks.Params(), name="usual"):
-    dataset = read_dataset(folder)
-    parts = {name: dataset_slice(dataset, name, "hall") for name in ("materials", "photo", "objects")}
-    folders = {stage: folder.parent / name / stage for stage in ("masks", "align")}
-    for made in folders.values():
-        made.mkdir(parents=True)
-    files = {path: folder / path for part in parts.values() for path in part.files}
-    inputs = Inputs(folders, {f"dataset.{name}": part.facts for name, part in parts.items()}, files, "hall")
-    masks.main(averaged, inputs, folders["masks"])
-    align.main(align.Params(), inputs, folders["align"], lambda *_: None)
-    return json.loads((folders["align"] / "hall.json").read_text())
+def aligned(folder, name="usual", search=None, **averaged):
+    out = folder.parent / name
+    run_stages(
+        read_dataset(folder), out, (masks, align), {"masks": averaged, "align": {"search": search} if search else {}}
+    )
+    return read_json(out / "align" / "hall.json")
 
 
 def test_the_poses_of_the_scene_come_out_of_a_photo_of_any_size(tmp_path):
@@ -91,7 +83,7 @@ def test_the_poses_of_the_scene_come_out_of_a_photo_of_any_size(tmp_path):
     assert camera["focal_px"] == 300.0 and np.allclose(camera["principal_point"], CAMERA.centre, atol=1e-12)
     assert np.allclose(obj["rotation"], POSE.rotation, atol=1e-12) and obj["silhouette_iou"] > 0.995
     assert np.allclose(obj["translation"], POSE.translation, atol=1e-12)
-    entry = aligned(tmp_path / "same" / "set", averaged=masks.Params(frame=200 * 150 // 4), name="half")
+    entry = aligned(tmp_path / "same" / "set", name="half", frame=200 * 150 // 4)
     assert entry["camera"]["focal_px"] == 150.0 and entry["objects"]["chair"]["silhouette_iou"] > 0.98
     assert np.allclose(entry["camera"]["principal_point"], [52.0, 35.5], atol=1e-12)
     entry = aligned(scene(tmp_path / "large" / "set", scale=2))
@@ -100,7 +92,8 @@ def test_the_poses_of_the_scene_come_out_of_a_photo_of_any_size(tmp_path):
 
 
 def test_where_only_the_camera_is_known_the_pose_is_searched(tmp_path):
-    entry = aligned(scene(tmp_path / "set", posed=False))
+    quick = {"views": 160, "rolls": 16, "keep": [20, 8, 4, 2]}
+    entry = aligned(scene(tmp_path / "set", posed=False), search=quick)
     camera, obj = entry["camera"], entry["objects"]["chair"]
     assert (camera["focal_source"], obj["source"], camera["focal_px"]) == ("colmap", "found", 300.0)
     assert camera["principal_point"] == list(CAMERA.centre)
@@ -118,11 +111,3 @@ def test_a_known_pose_that_does_not_fit_is_doubted_with_its_own_cure_and_kept(tm
     with caplog.at_level(logging.WARNING, "factorlib.align"):
         obj = aligned(scene(tmp_path / "set", mesh=blob()))["objects"]["chair"]
     assert obj["doubts"] and not obj["left_out"] and "world_from_object" in caplog.text
-
-
-def test_a_photo_that_was_cropped_is_refused(tmp_path):
-    folder = scene(tmp_path / "set")
-    write_pixels(folder, np.ones((120, 200), int))
-    with pytest.raises(InputError, match="the photo has 200×120 pixels, its image in the source 200×150") as caught:
-        aligned(folder)
-    assert caught.value.key == "cameras.colmap: hall" and "cropped" in str(caught.value)

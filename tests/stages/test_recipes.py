@@ -18,6 +18,7 @@ from factorlib.results.materials import MaterialTable, Reflectance, StandardErro
 from factorlib.stage import Inputs, silent
 from stages import recipes
 from tests.export import made_export
+from tests.runner.toy import files_of
 
 ERROR = StandardErrors((0.0,) * 3, (0.0,) * 3, 0.0)
 
@@ -36,7 +37,13 @@ def drawn(made, out, recipe, **files):
     given = {f"recipe file:{name}": path for name, path in files.items()}
     out.mkdir()
     recipes.main(recipes.Params(), Inputs(made.folders, facts, {**made.files, **given}), out, silent)
-    return {str(path.relative_to(out)): path.read_bytes() for path in sorted(out.rglob("*")) if path.is_file()}
+    return files_of(out)
+
+
+@pytest.fixture
+def grounded(made):
+    """The same with a ground in every photo."""
+    return changed(made, "dataset.ground", dict.fromkeys(made_export.MESHES, GROUND))
 
 
 GROUND = {"ground": {"point": [0, 1.2, 4], "normal": [0, -1, -0.2], "diffuse": None}}
@@ -58,24 +65,21 @@ KINDS = [
 
 
 @pytest.mark.parametrize("recipe, files", KINDS, ids=lambda value: type(value).__name__)
-def test_files_of_every_kind_and_the_same_bytes_again(made, tmp_path, recipe, files):
-    made = changed(made, "dataset.ground", dict.fromkeys(made_export.MESHES, GROUND))
-    first, second = (drawn(made, tmp_path / name, recipe) for name in "ab")
+def test_files_of_every_kind_and_the_same_bytes_again(grounded, tmp_path, recipe, files):
+    first, second = (drawn(grounded, tmp_path / name, recipe) for name in "ab")
     assert sorted(first) == sorted(files) and first == second
 
 
-def test_what_is_beside_a_picture_says_where_the_object_was_moved_and_that_a_sun_is_assumed(made, tmp_path):
-    given = changed(made, "dataset.ground", dict.fromkeys(made_export.MESHES, GROUND))
+def test_what_is_beside_a_picture_says_where_the_object_was_moved_and_that_a_sun_is_assumed(made, grounded, tmp_path):
     (name,) = (obj["name"] for obj in made.facts["dataset.objects"]["front"]["objects"])
     recipe = schema.Insert(**FRONT, at=(36.0, 48.0), sun=schema.AssumedSun((0.3, 1.0, 0.4), 0.7, 4.0))
-    facts = json.loads(drawn(given, tmp_path / "inserted", recipe)["front.json"])
+    facts = json.loads(drawn(grounded, tmp_path / "inserted", recipe)["front.json"])
     assert f"was moved by {facts['moved']:.1f} of its heights, to `at: [" in facts["caption"] and facts["moved"] > 0
     assert f"it would intersect '{name}'" in facts["caption"] and np.hypot(*np.subtract(facts["at"], recipe.at)) > 1
     assert facts["assumed_sun"] == {"direction": [0.3, 1.0, 0.4], "strength": 0.7, "size": 4.0}
     assert "sun is assumed" in facts["caption"] and "holds 70% of the light's energy" in facts["caption"]
-    assert (
-        facts["shadow"].keys() == {"correlation", "constant_light", "pixels"} and "of dataset.yaml" in facts["caption"]
-    )
+    assert facts["shadow"].keys() == {"correlation", "constant_light", "pixels"}
+    assert "of dataset.yaml" in facts["caption"]
 
     view = schema.View(**FRONT, sun=recipe.sun)
     files = drawn(made, tmp_path / "view", view), drawn(made, tmp_path / "plain", schema.View(**FRONT))
@@ -94,8 +98,8 @@ def test_an_assumed_sun_stands_in_the_frame_of_the_exported_light(made, photo):
     assert brightest @ np.array(sun.direction) / np.linalg.norm(sun.direction) > np.cos(np.radians(3))
 
 
-def test_a_part_of_an_inserted_mesh_gets_another_material_and_the_rest_keeps_its_own(made):
-    results = SolvedSet(changed(made, "dataset.ground", dict.fromkeys(made_export.MESHES, GROUND)))
+def test_a_part_of_an_inserted_mesh_gets_another_material_and_the_rest_keeps_its_own(grounded):
+    results = SolvedSet(grounded)
     mesh, materials, _ = results.mesh("egg", {"brass": "unseen"}, "y")
     assert [materials[label - 1] for label in mesh.labels] == ["red", "unseen"]
     with pytest.raises(InputError, match="'egg' as in photo 'side' has no material 'unseen'") as error:
@@ -103,10 +107,9 @@ def test_a_part_of_an_inserted_mesh_gets_another_material_and_the_rest_keeps_its
     assert error.value.key == "material"
 
 
-def test_a_sun_below_the_ground_is_refused(made, tmp_path):
-    made = changed(made, "dataset.ground", dict.fromkeys(made_export.MESHES, GROUND))
+def test_a_sun_below_the_ground_is_refused(grounded, tmp_path):
     with pytest.raises(InputError, match="below the ground") as error:
-        drawn(made, tmp_path / "out", schema.Insert(**FRONT, sun=schema.AssumedSun((0.3, -1.0, 0.4), 0.7)))
+        drawn(grounded, tmp_path / "out", schema.Insert(**FRONT, sun=schema.AssumedSun((0.3, -1.0, 0.4), 0.7)))
     assert error.value.key == "sun.direction"
 
 
@@ -168,15 +171,14 @@ def test_nothing_is_put_on_a_ground_that_is_seen_from_below(made, tmp_path):
         drawn(changed(made, "dataset.ground", below), tmp_path / "out", schema.Insert(photos=["front"], samples=1))
 
 
-def test_a_mesh_without_height_or_that_is_not_there_is_refused(made, tmp_path):
-    made = changed(made, "dataset.ground", dict.fromkeys(made_export.MESHES, GROUND))
+def test_a_mesh_without_height_or_that_is_not_there_is_refused(grounded, tmp_path):
     with pytest.raises(InputError, match="there is no mesh 'egf'") as error:
-        drawn(made, tmp_path / "none", schema.Insert(photos=["front"], mesh="egf", samples=1))
+        drawn(grounded, tmp_path / "none", schema.Insert(photos=["front"], mesh="egf", samples=1))
     assert error.value.cure == "did you mean 'egg'?" and error.value.key == "mesh"
     (tmp_path / "flat.obj").write_text("v 0 0 0\nv 1 0 0\nv 1 0 1\nv 0 0 1\nf 1 2 3 4\n")
     recipe = schema.Insert(photos=["front"], mesh="flat.obj", samples=1)
     with pytest.raises(InputError, match="'flat.obj' has no height") as error:
-        drawn(made, tmp_path / "out", recipe, **{"flat.obj": tmp_path / "flat.obj"})
+        drawn(grounded, tmp_path / "out", recipe, **{"flat.obj": tmp_path / "flat.obj"})
     assert "up: z" in error.value.cure
 
 

@@ -20,10 +20,12 @@ from factorlib.reflection import reflection_operator
 from factorlib.reflection.network import SHIPPED
 from factorlib.results.lobes import read_lobes
 from factorlib.results.solution import FILES
-from factorlib.stage import Inputs
+from factorlib.stage import Inputs, silent
 from factorlib.urm.observations import Observations, write_observations
 from stages import solve
 from studies.scenes.problems import MATERIALS, random_light, sphere_normals
+from tests.model.made import seen_from_the_front
+from tests.runner.toy import files_of
 from tests.stages.made import Rising
 
 NAMES = ("red", "green", "blue")
@@ -31,31 +33,16 @@ NAMES = ("red", "green", "blue")
 
 def observations(photo: str, materials, seed: int, size: int = 16, unit: float = 1.0) -> Observations:
     """A sphere of each of the materials under a light of two lobes, as `network` renders it."""
-    normals = sphere_normals(size)
-    n = len(normals) * len(materials)
-    empty = Observations(
-        normal=np.tile(normals, (len(materials), 1)), view=np.tile([0.0, 0.0, -1.0], (n, 1)), radiance=np.ones((n, 3)),
-        clipped=np.zeros((n, 3), bool), material=np.repeat(materials, len(normals)), photo=np.zeros(n, int),
-        illumination=np.zeros(n, int), x=np.arange(n), y=np.zeros(n, int), weight=np.ones(n),
-        materials=NAMES, photos=(photo,), illuminations=(photo,),
-    )  # fmt: skip
+    normals = np.tile(sphere_normals(size), (len(materials), 1))
+    material = np.repeat(materials, len(normals) // len(materials))
+    empty = seen_from_the_front(normals, np.ones(normals.shape), material, NAMES, photo)
     (block,) = blocks_of_observations(empty, Noise())
     light = random_light(np.random.default_rng(seed), 2)
     radiance = Illumination(block, light, MATERIALS, reflection_operator("network")).radiance()
     return msgspec.structs.replace(empty, radiance=unit * radiance)
 
 
-def run(
-    folder,
-    photos: dict[str, Observations],
-    progress=None,
-    unfinished=None,
-    start=None,
-    light=None,
-    known=None,
-    files=None,
-    **params,
-):
+def run(folder, photos, progress=silent, unfinished=None, start=None, light=None, known=None, files=None, **params):
     urm, out = folder / "urm", folder / "out"
     urm.mkdir(parents=True, exist_ok=True), out.mkdir(exist_ok=True)
     for name, part in photos.items():
@@ -78,10 +65,6 @@ def random_lobes(seed: int) -> Lobes:
 
 def table(folder):
     return read_json(folder / "materials.json")
-
-
-def files_of(folder):
-    return {str(p.relative_to(folder)): p.read_bytes() for p in sorted(folder.rglob("*")) if p.is_file()}
 
 
 @pytest.fixture(scope="module")
@@ -176,9 +159,7 @@ def test_brighter_photos_change_lights_not_materials(tmp_path, linked, solved):
     np.testing.assert_allclose(eight, 8 * one, rtol=1e-3, atol=1e-6)
 
 
-def test_what_is_not_linked_or_that_nobody_photographed_is_named_and_nothing_at_all_refused(
-    tmp_path, caplog, earlier, linked
-):
+def test_what_is_not_linked_or_not_observed_is_named_and_nothing_at_all_refused(tmp_path, caplog, earlier, linked):
     out, text = earlier
     assert "'blue' is observed in no photo" in text
     assert min(table(out)["materials"]["blue"]["diffuse"]) > 0.01, "about as bright as the others"
@@ -283,7 +264,7 @@ def test_a_known_map_ball_and_exposures_are_held(tmp_path, linked, caplog):
     light, both = random_lobes(1), observations("a", [0, 2], 1, size=40)
     ball = both.material == 2
     both.radiance[ball] = 0.5 * light.radiance(mirror_directions(both.normal[ball], both.view[ball]))
-    write_rgb_exr(tmp_path / "b.exr", 9 * lat_long_of_lobes(random_lobes(2), 32, 64), LAT_LONG)
+    write_rgb_exr(tmp_path / "b.exr", 9 * lat_long_of_lobes(random_lobes(2), 16, 32), LAT_LONG)
     again = msgspec.structs.replace(linked["b"], photos=("c",), radiance=linked["b"].radiance / 4)
     photos = {"a": both, "b": linked["b"], "c": again, "d": observations("d", [0, 1], 3)}
     known = {

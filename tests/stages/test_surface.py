@@ -5,14 +5,13 @@ import json
 import msgspec
 import numpy as np
 import pytest
-import trimesh
 
 from factorlib.dataset.schema import MeshEntry
 from factorlib.errors import InputError
 from factorlib.export.gltf import write_glb
+from factorlib.generate.shapes import sphere
 from factorlib.images.exr import write_exr
 from factorlib.meshes.fine import fine
-from factorlib.meshes.mesh import Mesh
 from factorlib.meshes.ply import write_ply
 from factorlib.meshes.read import CREASE_DEG, MeshesOnce, read_mesh
 from factorlib.model.noise import Noise
@@ -23,6 +22,7 @@ from factorlib.stage import Inputs, serial_map, silent
 from factorlib.urm.geometry import on_surface, read_geometry
 from factorlib.urm.observations import Observations, write_observations
 from stages import surface
+from tests.model.made import seen_from_the_front
 
 SIZE = 12
 
@@ -30,12 +30,8 @@ SIZE = 12
 def observations() -> Observations:
     """A pixel each of two rows, normals toward the camera."""
     x, y = (of.reshape(-1).astype("i4") for of in np.meshgrid(np.arange(SIZE), np.arange(SIZE)))
-    n, front = len(x), np.tile([0.0, 0.0, -1.0], (SIZE * SIZE, 1)).astype("f4")
-    zero = np.zeros(n, "i4")
-    return Observations(
-        front, front, np.full((n, 3), 0.5, "f4"), np.zeros((n, 3), bool), zero.astype("i2"), zero, zero, x, y,
-        np.ones(n, "f4"), ("red",), ("a",), ("a",),
-    )  # fmt: skip
+    front, none = np.tile(np.float32([0, 0, -1]), (len(x), 1)), np.zeros(len(x), int)
+    return seen_from_the_front(front, np.full((len(x), 3), 0.5, "f4"), none, ("red",), "a", x=x, y=y)
 
 
 def written(folder) -> None:
@@ -61,9 +57,8 @@ def test_observations_and_maps_have_the_normals_and_the_detail_of_the_surface(tm
         {f"normal.{a}": np.ones((SIZE, SIZE)) for a in "xyz"} | {"depth": np.ones((SIZE, SIZE))},
     )
     maps = read_geometry(tmp_path / "align", tmp_path / "surface", "a")
-    assert set(maps) == {"normal.x", "normal.y", "normal.z", "depth", "detail"} and maps["normal.x"][
-        3, 3
-    ] == np.float32(0.6)
+    assert set(maps) == {"normal.x", "normal.y", "normal.z", "depth", "detail"}
+    assert maps["normal.x"][3, 3] == np.float32(0.6)
     assert "detail" not in read_geometry(tmp_path / "align", None, "a")
     assert on_surface(observations(), None) is not None and on_surface(observations(), None).detail is None
     wide = msgspec.structs.replace(observations(), x=observations().x + 1)
@@ -89,9 +84,7 @@ def test_off_writes_a_table_of_nothing_and_needs_nothing(tmp_path):
 
 
 def test_meshes_are_moved_and_painted_wherever_they_are_read(tmp_path):
-    solid = trimesh.creation.icosphere(2)
-    ball = Mesh(np.array(solid.vertices), solid.faces, np.array(solid.vertices), np.ones(len(solid.faces), np.int16))
-    write_ply(tmp_path / "ball.ply", ball)
+    write_ply(tmp_path / "ball.ply", sphere(1.0))
     dense = fine(read_mesh(tmp_path / "ball.ply", ["red"], "red"))
     table = {"ball": np.full(dense.nodes, 0.05).tolist()}
     once = MeshesOnce(lambda _, file: tmp_path / file, ["red"], CREASE_DEG, table, table)

@@ -77,7 +77,7 @@ CASES = pytest.mark.parametrize(
     ],
 )
 MAPS = {li: np.broadcast_to(np.array([1.0, 0.8, 0.5]) * (1 + li), (16, 32, 3)) for li in range(3)}
-ONES, FACTORS = np.ones((2, 3)), np.array([[0.5, 0.7, 0.9], [0.3, 0.9, 0.6]])
+FACTORS = np.array([[0.5, 0.7, 0.9], [0.3, 0.9, 0.6]])
 
 
 def scored(case, factors, roughness=0.0):

@@ -1,8 +1,9 @@
 """Nodes under pixels: they are where the pixel's ray meets the mesh, in the frame of the object's pose, whichever side is seen."""
 
+import msgspec
 import numpy as np
-import trimesh
 
+from factorlib.generate.shapes import sphere
 from factorlib.geometry.camera import Camera, Pose
 from factorlib.geometry.raster import rasterise
 from factorlib.meshes.fine import fine
@@ -15,10 +16,9 @@ CAMERA = Camera(60, 50, 80.0, (30.0, 25.0))
 
 
 def ball(offset=0.0) -> Mesh:
-    """An icosphere of radius 1 beside its origin."""
-    solid = trimesh.creation.icosphere(2)
-    vertices = np.array(solid.vertices) + [offset, 0, 0]
-    return Mesh(vertices, np.array(solid.faces), np.array(solid.vertices), np.ones(len(solid.faces), np.int16))
+    """A ball of radius 1 beside its origin."""
+    whole = sphere(1.0)
+    return msgspec.structs.replace(whole, vertices=whole.vertices + [offset, 0, 0])
 
 
 def entry(pose: Pose, scale=(1.0, 1.0, 1.0)) -> ObjectEntry:

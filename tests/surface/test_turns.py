@@ -16,7 +16,7 @@ from factorlib.surface import turns
 from factorlib.surface.choice import Found, Surfaces, found
 from factorlib.surface.turns import GRAZING, MOST, PULL, Attached, Detail, Stiffness, part_of, step
 from studies.scenes.problems import MATERIALS
-from tests.model.made import photos_in_a_wrong_light
+from tests.model.made import in_units_of, photos_in_a_wrong_light
 from tests.solve.made import PRIOR, begun, drawn, on_even_cells, photographed, spheres
 from tests.stages.made import Rising
 
@@ -99,11 +99,9 @@ def test_a_step_is_that_of_the_dense_system_of_detail_and_lights(stiffness, monk
     system[:v, :v], gradient[:v] = prior, prior @ before[free]
     first = v
     for part, one, size in zip(parts, problem.illuminations(fit.point), sizes, strict=True):
-        own, J, U = (
-            slice(first, first + size),
-            part.slopes.toarray()[:, free],
-            np.stack([part.of_light(e) for e in np.eye(size)], axis=1),
-        )
+        own = slice(first, first + size)
+        J = part.slopes.toarray()[:, free]
+        U = np.stack([part.of_light(e) for e in np.eye(size)], axis=1)
         field = field_of(one, COUNTS, PRIOR, True)
         residual = field.illumination.block.residuals(field.illumination.shown().radiance)
         r = (residual * one.pull(residual, ROBUST, COUNTS.temperature)).reshape(-1)
@@ -163,10 +161,8 @@ def test_dents_that_the_object_has_not_are_found_in_three_lights():
     turn = body.turns_of(what.displacements)
     for block, exact in zip(given.blocks, true.blocks, strict=True):
         at = attached_to(exact.normal, body)
-        before, after = (
-            errors(block.normal, exact.normal),
-            errors(at.turned(block.normal, block.view, turn), exact.normal),
-        )
+        before = errors(block.normal, exact.normal)
+        after = errors(at.turned(block.normal, block.view, turn), exact.normal)
         assert after < 0.6 * before, (before, after)
 
 
@@ -202,10 +198,7 @@ def test_patina_is_found_in_three_lights_and_is_not_taken_for_dents():
     painted = Detail(np.zeros((body.nodes, 3)), log_factor)
     at = [attached_to(block.normal, body) for block in problem.blocks]
     clean = problem.of([msgspec.structs.replace(b, precision=np.ones_like(b.precision)) for b in problem.blocks])
-    point = Point(
-        MATERIALS,
-        [msgspec.structs.replace(t, weight=t.weight / b.unit) for t, b in zip(true, problem.blocks, strict=True)],
-    )
+    point = Point(MATERIALS, in_units_of(problem.blocks, true))
     shown = clean.of([painted.on(b, a) for b, a in zip(clean.blocks, at, strict=True)]).radiance(point)
     plain = clean.radiance(point)
     blocks = [

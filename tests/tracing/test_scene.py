@@ -8,6 +8,7 @@ from factorlib.generate.shapes import sphere
 from factorlib.geometry.camera import Camera
 from factorlib.light.latlong import sampled
 from factorlib.tracing import scene as tracing
+from tests.integral import reflected
 
 pytest.importorskip("mitsuba")
 GREEN = tracing.Material((0.1, 0.4, 0.15), (0.25, 0.25, 0.2), 0.35)
@@ -50,22 +51,9 @@ def test_mitsuba_evaluates_lambert_and_ggx_of_the_design(material):
     depth = 4.0 - np.sqrt(1 - 0.6**2 - 0.3**2)  # of the ball where the camera's axis meets it
     normal, view = np.array([0, 0, depth]) - BALL, np.array([0, 0, -1.0])
     incoming = lat_long_directions(512, 1024) @ YUP_FROM_CAMERA
-    radiance = sampled(light, incoming @ YUP_FROM_CAMERA)
-    weight = lat_long_solid_angles(512, 1024)[:, None, None] * np.maximum(incoming @ normal, 0)[..., None]
-    expected = np.sum(radiance * weight * reflectance(material, normal, incoming, view), axis=(0, 1))
-    assert image == pytest.approx(expected, rel=0.006)
-
-
-def reflectance(material, normal, incoming, view):
-    """k_d/π + k_s D G / (4 (n·i)(n·o)), written out."""
-    alpha = material.roughness**2
-    half = incoming + view
-    half /= np.linalg.norm(half, axis=-1, keepdims=True)
-    ni, no, nh = np.maximum(incoming @ normal, 1e-9), view @ normal, half @ normal
-    d = alpha**2 / (np.pi * (nh**2 * (alpha**2 - 1) + 1) ** 2)
-    shadowing = [2 * c / (c + np.sqrt(alpha**2 + (1 - alpha**2) * c**2)) for c in (ni, no)]
-    g = shadowing[0] * shadowing[1]
-    return np.array(material.diffuse) / np.pi + np.array(material.specular) * (d * g / (4 * ni * no))[..., None]
+    texels = sampled(light, incoming @ YUP_FROM_CAMERA) * lat_long_solid_angles(512, 1024)[:, None, None]
+    expected = reflected(material, normal[None], view[None], incoming.reshape(-1, 3), texels.reshape(-1, 3))
+    assert image == pytest.approx(expected[0], rel=0.006)
 
 
 def smooth_light(height):

@@ -27,10 +27,8 @@ def photo_and_geometry(size=64):
     inside = x**2 + y**2 < 0.98
     z = -np.sqrt(np.maximum(1 - x**2 - y**2, 0))
     one = inside.astype("f4")
-    label, vectors = (
-        np.where(x < 0, 1, 2) * one,
-        {"normal": (x * one, y * one, z * one), "view": (0 * one, 0 * one, -one)},
-    )
+    label = np.where(x < 0, 1, 2) * one
+    vectors = {"normal": (x * one, y * one, z * one), "view": (0 * one, 0 * one, -one)}
     geometry = {f"{name}.{axis}": v for name, vector in vectors.items() for axis, v in zip("xyz", vector)}
     geometry |= {"label": label, "depth": (4 + z) * one, "confidence": one}
     photo = {"R": 1 + x, "G": 1 + y, "B": np.ones_like(x), "label": label, "valid": one}

@@ -7,9 +7,7 @@ from factorlib.model.materials import Point
 from factorlib.model.problem import JointProblem
 from factorlib.solve.arrow import FLOOR
 from factorlib.solve.few_lobes.descent import DEFINITE, Bounds, damped_step, evaluate
-from factorlib.solve.few_lobes.unknowns import (
-    moved_point,
-)
+from factorlib.solve.few_lobes.unknowns import moved_point
 from studies.scenes.problems import MATERIALS, block, random_light
 from tests.model.made import OPERATOR
 
@@ -94,9 +92,7 @@ def test_the_information_is_the_inverse_of_the_materials_part_of_the_dense_inver
     np.testing.assert_array_equal(found, found.T)
 
 
-def test_the_predicted_decrease_is_that_of_the_quadratic_model_and_a_small_step_lowers_the_loss_as_predicted(
-    problem, iterate, dense
-):
+def test_a_small_step_lowers_the_loss_by_the_decrease_that_the_quadratic_model_predicts(problem, iterate, dense):
     dm, dl, predicted = damped_step(iterate, DAMPING)
     whole, (hessian, gradient) = np.concatenate([dm, *dl]), dense
     assert predicted == pytest.approx(-(2 * gradient @ whole + whole @ hessian @ whole), rel=1e-9) and predicted > 0

@@ -95,11 +95,9 @@ def by_energy(light, gradient):
 @pytest.mark.parametrize("bounced", [False, True])
 def test_energy_equations_are_those_parts_of_the_normal_equations(data, bounced):
     given, loss = photos_in_a_wrong_light("bounced") if bounced else data, Loss(1.0, 1e-2)
-    part, whole, p = (
-        energy_equations(given.fitted(), tabulated(given.fitted()), loss),
-        normal_equations(given, loss),
-        len(given.light),
-    )
+    part = energy_equations(given.fitted(), tabulated(given.fitted()), loss)
+    whole = normal_equations(given, loss)
+    p = len(given.light)
     np.testing.assert_allclose(part.value, whole.value, rtol=1e-12)
     largest = np.abs(part.gradient).max()
     np.testing.assert_allclose(

@@ -20,14 +20,13 @@ from factorlib.model.observed import blocks_of_observations
 from factorlib.model.problem import JointProblem
 from factorlib.solve.few_lobes.solve import few_lobes
 from factorlib.solve.options import FewLobes
-from factorlib.stage import Inputs, silent
-from factorlib.urm.observations import Observations, write_observations
-from stages import solve as stage
+from factorlib.urm.observations import Observations
 from studies.scenes.problems import factor_between, sphere_normals
+from tests.model.made import seen_from_the_front
 from tests.solve.made import OPERATOR, light_of
+from tests.stages.test_solve import NAMES, run
 
 OPTIONS = FewLobes(lobes=10, insert=5, rounds=4, iterations=10, polish=20)
-NAMES = ("red", "green", "blue")
 THREE = np.array(
     [[0.5, 0.1, 0.1, *[0.12] * 3, 0.7], [0.2, 0.4, 0.25, *[0.2] * 3, 0.4], [0.1, 0.12, 0.2, 0.4, 0.35, 0.3, 0.25]]
 )
@@ -53,11 +52,10 @@ def observed(rows, lights=ROOMS, normals=None) -> tuple[Observations, Materials]
     normals, truth = sphere_normals(12) if normals is None else normals, Materials.of_rows(np.array(rows))
     n, m = len(normals), len(truth)
     material, photo = np.tile(np.repeat(np.arange(m), n), len(lights)), np.repeat(np.arange(len(lights)), m * n)
-    total, rooms = len(photo), tuple(f"room{k}" for k in range(len(lights)))
-    seen = Observations(
-        np.tile(normals, (m * len(lights), 1)), np.tile(FRONT, (total, 1)), np.ones((total, 3)), np.zeros((total, 3), bool),
-        material, photo, photo, np.arange(total), np.zeros(total, int), np.ones(total), NAMES[:m], rooms, rooms,
-    )  # fmt: skip
+    rooms = tuple(f"room{k}" for k in range(len(lights)))
+    where = {"photo": photo, "illumination": photo, "photos": rooms, "illuminations": rooms}
+    normal = np.tile(normals, (m * len(lights), 1))
+    seen = seen_from_the_front(normal, np.ones(normal.shape), material, NAMES[:m], **where)
     for k, (block, light) in enumerate(zip(blocks_of_observations(seen, Noise()), lights, strict=True)):
         seen.radiance[photo == k] = Illumination(block, light, truth, OPERATOR).radiance()
     noise = 1 + 0.02 * np.random.default_rng(0).normal(size=seen.radiance.shape)
@@ -117,26 +115,15 @@ def test_the_answer_is_within_its_bound_or_says_why_not(name):
 
 def materials_of_stage(folder, seen: Observations, **params):
     """What the stage says of the materials, from one table per photo."""
-    (folder / "urm").mkdir(parents=True), (folder / "out").mkdir()
+    photos = {}
     for k, name in enumerate(seen.photos):
         own, zero = seen.take(seen.photo == k), np.zeros((seen.photo == k).sum(), int)
-        own = msgspec.structs.replace(own, photos=(name,), illuminations=(name,), photo=zero, illumination=zero)
-        write_observations(folder / "urm" / f"{name}.parquet", own)
-    light = {name: {"illumination": name, "world_from_camera": None} for name in seen.photos}
-    inputs = Inputs(
-        {"urm": folder / "urm", "train": folder}, {"dataset.materials": list(seen.materials), "dataset.light": light}
-    )
-    quick = {
-        "solver": "few_lobes",
-        "operator": "closed_form",
-        "lobes": 4,
-        "insert": 4,
-        "rounds": 1,
-        "iterations": 4,
-        "polish": 3,
-    }
-    stage.main(stage.Params(**quick, **params), inputs, folder / "out", silent)
-    return read_json(folder / "out" / "materials.json")["materials"]
+        photos[name] = msgspec.structs.replace(
+            own, photos=(name,), illuminations=(name,), photo=zero, illumination=zero
+        )
+    folder.mkdir()
+    brief = {"operator": "closed_form", "lobes": 4, "insert": 4, "rounds": 1, "iterations": 4, "polish": 3}
+    return read_json(run(folder, photos, solver="few_lobes", **brief, **params) / "materials.json")["materials"]
 
 
 def test_observations_that_are_not_finite_are_counted_and_spoil_no_neighbour(tmp_path, caplog):
@@ -148,21 +135,14 @@ def test_observations_that_are_not_finite_are_counted_and_spoil_no_neighbour(tmp
     assert found == materials_of_stage(tmp_path / "whole", seen.take(kept), merge_degrees=20.0)
 
 
-def test_black_photos_are_named_and_nothing_but_black_is_an_error_and_what_cannot_be_told_is_in_the_log(
-    tmp_path, caplog
-):
+def test_black_photos_are_named_or_refused_and_what_cannot_be_told_is_in_the_log(tmp_path, caplog):
     seen, _ = observed(TWO)
     dark = msgspec.structs.replace(seen, radiance=np.where(seen.photo[:, None] == 0, 0.0, seen.radiance))
     flat, _ = observed(ONE, ROOMS[:1], FLAT)
     with caplog.at_level(logging.WARNING):
         materials_of_stage(tmp_path / "one", dark)
         materials_of_stage(tmp_path / "flat", flat, held_out=0.0)
-    for words in (
-        "'room0' is black",
-        "is flat",
-        "by convention only",
-        "roughness of material 'red' cannot be determined",
-    ):
+    for words in ("'room0' is black", "is flat", "by convention only", RED):
         assert words in caplog.text
     with pytest.raises(InputError, match="black"):
         materials_of_stage(tmp_path / "all", msgspec.structs.replace(seen, radiance=np.zeros_like(seen.radiance)))

@@ -1,0 +1,41 @@
+"""The layers of the code: what must start quickly loads no science, and the runner finds what every stage imports."""
+
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).resolve().parent.parent
+
+
+READ = "from factorlib.dataset.read import read_dataset; from factorlib.dataset.slices import SLICES, dataset_slice"
+SCIENCE = {"numpy", "torch", "scipy", "OpenImageIO", "PIL"}
+
+
+@pytest.mark.parametrize("code, heavy", [
+    ("import factorlib", {*SCIENCE, "mitsuba"}),
+    ("import factorlib.__main__; from factorlib.runner.project import photo_sets; photo_sets(); from factorlib.runner import survey",
+     {*SCIENCE, "rich", "filelock", "typer", "pydantic"}),
+    (f"{READ}; d = read_dataset('data/eames'); [dataset_slice(d, s) for s in SLICES]", SCIENCE),
+    ("from studies.run import STUDIES; from studies.study import FULL; [s.cases(FULL) for s in STUDIES.values()]", SCIENCE),
+    ("from factorlib.reflection import reflection_operator; reflection_operator('paper_network')", {"mitsuba"}),
+])  # fmt: skip
+def test_what_must_start_quickly_loads_nothing_heavy(code, heavy):
+    code = f"import sys; {code}; sys.exit(', '.join({heavy!r} & set(sys.modules)) or 0)"
+    done = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+
+
+def test_every_stage_of_the_pipeline_has_its_module_and_the_runner_finds_what_it_imports():
+    from factorlib.runner.closure import Sources
+    from factorlib.runner.filehash import FileHashes
+    from factorlib.runner.pipeline import read_pipeline
+    from factorlib.runner.project import photo_sets
+
+    pipeline = read_pipeline(ROOT / "pipeline.yaml", photo_sets().slices)
+    sources = Sources([ROOT], FileHashes(None))
+    for name in pipeline.stages:
+        closure = sources.closure("stages", name, ROOT / "pipeline.yaml")
+        assert {f"source:stages.{name}", "source:factorlib.stage"} <= closure.record.keys()
+        assert not any(name.startswith("source:factorlib.runner") for name in closure.record)
