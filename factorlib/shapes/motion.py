@@ -25,6 +25,7 @@ from factorlib.errors import InputError
 from factorlib.geometry.camera import Camera, Pose
 from factorlib.shapes.hull import agreement
 from factorlib.shapes.outline import Outline
+from factorlib.wholefile import write_text
 
 LEAST_PHOTOS = 3
 LEAST_POINTS = 30  # of a model that is believed
@@ -125,7 +126,7 @@ def _mapped(
         pairing = pycolmap.ImportedPairingOptions(match_list_path=str(root / "pairs.txt"))
         for k, file in enumerate(files[1:], start=1):  # with all before it
             report(0.2 + 0.4 * k**2 / len(files) ** 2, "matches")
-            (root / "pairs.txt").write_text("".join(f"{other} {file}\n" for other in files[:k]))
+            write_text(root / "pairs.txt", "".join(f"{other} {file}\n" for other in files[:k]))
             pycolmap.match_image_pairs(database, matching, pairing, verification, pycolmap.Device.cpu)
         done = count(2)  # the first two photos are placed together
 

@@ -24,7 +24,7 @@ from studies.study import FULL, QUICK, Scale, Study
 
 ORDER = (  # of the page
     "matrix-size row-and-column structure label-quality alignment-error progressive leave-one-out paper-sets gauss-sphere comparison "
-    "prior parts"
+    "prior speed parts"
 )
 STUDIES: dict[str, Study] = {n: import_module(f"studies.catalogue.{n.replace('-', '_')}").STUDY for n in ORDER.split()}
 SLICES = ("case", "worlds", "sets")
