@@ -11,6 +11,7 @@ from pathlib import Path
 import msgspec
 
 from factorlib.dataset.schema import LightSlice, ObjectsSlice, SetSlice
+from factorlib.render.solved_set import SolvedSet
 from factorlib.report.artifacts import Artifacts
 from factorlib.report.page import page
 from factorlib.report.pictures import exposures, first_pictures, material_tags, overview, photo_row, strip, surface_rows
@@ -43,12 +44,7 @@ def main(params: Params, inputs: Inputs, out: Path, progress: Progress) -> None:
     seen = viewed(run, lights, objects, exposures(run))
     progress(next(done), total, "surfaces")
     moved = surface_rows(run, objects)
-    begun = next(done)
-
-    def report(pixels: float, every: float) -> None:
-        """Say how many pixels of the relit picture are done."""
-        progress(begun + pixels / every, total, "first pictures")
-
-    first = first_pictures(run, rows, lights, report)
+    progress(next(done), total, "first pictures")
+    first = first_pictures(run, rows, SolvedSet(inputs))
     progress(next(done), total, "page")
     write_text(out / "index.html", page(run, rows, tags, seen, moved, first))

@@ -157,6 +157,14 @@ def lit_ball(
     return denoised(picture) if denoise else picture
 
 
+def cropped(scene: PhotoScene, box: tuple[slice, slice]) -> PhotoScene:
+    """The scene as a camera sees it that has these rows and columns alone."""
+    (rows, columns), (x, y) = box, scene.camera.centre
+    size = columns.stop - columns.start, rows.stop - rows.start
+    camera = Camera(*size, scene.camera.focal, (x - columns.start, y - rows.start))
+    return msgspec.structs.replace(scene, camera=camera)
+
+
 def resized(scene: PhotoScene, width: int | None) -> PhotoScene:
     """The scene as a camera of another number of pixels sees it."""
     if width is None:

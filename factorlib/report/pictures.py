@@ -2,7 +2,6 @@
 
 import base64
 from collections.abc import Mapping, Sequence
-from math import ceil
 from typing import Any
 
 import msgspec
@@ -12,22 +11,21 @@ from PIL.ImageColor import getrgb
 from scipy.ndimage import binary_erosion
 
 from factorlib.conventions import lat_long_solid_angles
-from factorlib.dataset.schema import LightSlice, ObjectsSlice
+from factorlib.dataset.schema import ObjectsSlice
 from factorlib.evaluate.resynthesis import agreeing_pixels
 from factorlib.images.palette import nearest_tags
 from factorlib.images.picture import exposure_of, picture, png_bytes
 from factorlib.images.transfer import srgb_encode
-from factorlib.reflection import reflection_operator
-from factorlib.render.reflect import Reflector, Report, silently
-from factorlib.render.resynthesis import Surroundings, light_of, resynthesised
+from factorlib.render.photo_scene import cropped, resized, traced_photo, turned_light
+from factorlib.render.solved_set import SolvedSet
+from factorlib.render.traced import Traced
 from factorlib.report.artifacts import Artifacts, Channels, Picture
-from factorlib.results.lobes import read_lobes
 from factorlib.results.materials import Reflectance
 from factorlib.results.metrics import PhotoErrors, ScoredLight
-from factorlib.urm.geometry import on_surface, read_geometry
+from factorlib.urm.geometry import on_surface
 from factorlib.urm.observations import Observations, read_observations
 
-MOST_SHADED = 40_000  # pixels of the relit picture: some ten seconds
+FIRST_SAMPLES = 64  # of a pixel: some seconds
 AMPLIFICATION = 4  # of the difference between photo and re-synthesis
 UNCOUNTED = np.array([0.45, 0.38, 0.62])  # sRGB: in the mask, but not compared
 DISAGREES = np.array([0.92, 1.0, 0.0])
@@ -140,49 +138,27 @@ def photo_row(run: Artifacts, name: str, tags: dict[str, str], errors: PhotoErro
     return PhotoRow(name, run.illumination_of(name), pixels, {k: data_uri(v) for k, v in pixels.items()}, errors)
 
 
-def first_pictures(
-    run: Artifacts, rows: Sequence[PhotoRow], lights: Mapping[str, LightSlice], report: Report = silently
-) -> list[tuple[str, str, str]]:
-    """Title, `data:` URI and words of the photo that counts most pixels, its re-synthesis, and the same in another photo's light.
-
-    report: called with how many of the last one's pixels are done, and how many there are
-    """
+def first_pictures(run: Artifacts, rows: Sequence[PhotoRow], results: SolvedSet) -> list[tuple[str, str, str]]:
+    """Title, `data:` URI and words of the photo that counts most pixels, and of its objects, path-traced: in its own light and in another photo's."""
     row = max(rows, key=lambda row: row.errors.pixels if row.errors else 0)
-    words = {"photo": row.name, "re-synthesis": "from what was recovered"}
-    shown = [(title, row.uris[title], text) for title, text in words.items() if title in row.uris]
-    if len(shown) < 2 or run.read(read_lobes, "export", "lobes.parquet") is None:
-        return shown
+    photo = ("photo", row.uris["photo"], row.name)
+    if not results.objects[row.name].objects:
+        return [photo]
+    scene, box = results.scene(row.name), box_of(np.rint(run.channels("masks", row.name)["label"]) > 0)
+    scene = cropped(scene, box)
+    smaller = longest_side(len(run.set.photos)) / max(scene.camera.width, scene.camera.height)
+    scene = resized(scene, max(1, round(scene.camera.width * min(smaller, 1.0))))
+    own = Traced(traced_photo(scene, FIRST_SAMPLES), results.tone(row.name))
     other = next((p for p in run.set.photos if run.illumination_of(p) != row.illumination), None)
-    words = "in its own light, turned half around" if other is None else f"in the light of {other}"
-    return [*shown, ("relit", data_uri(relit(run, row.name, other, lights, report)), words)]
-
-
-def relit(
-    run: Artifacts, name: str, other: str | None, lights: Mapping[str, LightSlice], report: Report = silently
-) -> UInt8[np.ndarray, "h w 4"]:
-    """A photo's objects in the light of another photo, or without one in their own light turned by 180° about the camera's y axis.
-
-    Surfaces shadow one another where the solve says so, but send each other no light.  lights: of all photos;  report: as of `first_pictures`
-    """
-    of, model = other or name, run.solved.model
-    light = light_of(run.folders["export"], of, lights[of])
-    light = light if other else light.turned(np.diag([-1.0, 1.0, -1.0]))
-    operator = reflection_operator("network", weights=run.folders["train"])
-    reflector = Reflector(operator, light, curvature=model.curvature(lights[of].illumination))
-    masks, geometry = run.channels("masks", name), read_geometry(run.folders["align"], run.folders.get("surface"), name)
-    box = box_of(np.rint(masks["label"]) > 0)
-    label_shape, shaded = masks["label"][box].shape, int((masks["label"][box] > 0.5).sum())
-    step = max(1, max(label_shape) // longest_side(len(run.set.photos)), ceil((shaded / MOST_SHADED) ** 0.5))
-    label = np.zeros_like(masks["label"])
-    label[box][::step, ::step] = masks["label"][box][::step, ::step]
-    seen = run.read(read_observations, "urm", f"{name}.parquet") if model.self_shadowing else None
-    materials = [run.exported.get(m, UNKNOWN) for m in run.set.materials]
-    around = None if seen is None else Surroundings(msgspec.structs.replace(seen, met=None))
-    radiance = resynthesised(reflector, materials, {"label": label}, geometry, report, around)[box][::step, ::step]
-    inside = radiance.max(-1) > 0
-    pixels = picture(radiance, exposure_of(radiance, inside)).astype(np.float32)
-    pixels = np.concatenate([pixels, 255 * inside[..., None]], axis=-1)
-    return np.rint(reduced(pixels, longest_side(len(run.set.photos)))).astype(np.uint8)
+    light = results.light(other) if other else turned_light(scene.light, 180.0)
+    relit = Traced(traced_photo(msgspec.structs.replace(scene, light=light), FIRST_SAMPLES))
+    exposure = row.errors.exposure if row.errors else 1.0
+    words = f"in the light of {other}" if other else "in its own light, turned half around"
+    return [
+        photo,
+        ("re-synthesis", data_uri(own.rgba(exposure)), "path-traced from what was recovered"),
+        ("relit", data_uri(relit.exposed().rgba()), words),
+    ]
 
 
 def _labels(masks: Channels, geometry: Channels, photo: Picture, tags: list[str]) -> Picture:

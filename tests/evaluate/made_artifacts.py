@@ -7,6 +7,7 @@ from pathlib import Path
 
 import msgspec
 import numpy as np
+import trimesh
 
 from factorlib.conventions import YUP_FROM_CAMERA, lat_long_directions
 from factorlib.evaluate.ball import ball, light_of_lat_long
@@ -88,12 +89,14 @@ def make_artifacts(made: Made) -> Inputs:
     _whole(made, folders, materials)
     truth = folders.pop("truth")
     meshes = {"ball": {"file": "ball.obj", "parts": None, "material": materials[0]}}
-    balls = {"camera": {}, "objects": [{"name": "balls", "mesh": "ball"}], "meshes": {}}
+    balls = {"camera": {}, "objects": [{"name": "balls", "mesh": "ball"}], "meshes": meshes}
+    trimesh.creation.icosphere(3, 0.5).export(made.folder / "ball.obj")
     facts = {
         "dataset.materials": materials,
         "dataset.objects": dict.fromkeys(made.seen, balls),
         "dataset.light": {p: {"illumination": p, "world_from_camera": None} for p in made.seen},
         "dataset.set": {"name": "made", "materials": materials, "photos": list(made.seen), "meshes": meshes},
+        "dataset.ground": {photo: {"ground": None} for photo in made.seen},
         "dataset.truth": {
             "materials": {m: msgspec.to_builtins(TRUE[m]) for m in materials},
             "illumination": {p: f"truth/{p}_env.exr" for p in made.seen},
@@ -102,7 +105,8 @@ def make_artifacts(made: Made) -> Inputs:
         },
     }
     facts["dataset.truth"] = facts["dataset.truth"] if made.truth else None
-    return Inputs(folders, facts, {f"truth/{file.name}": file for file in truth.iterdir()})
+    files = {"ball.obj": made.folder / "ball.obj"} | {f"truth/{file.name}": file for file in truth.iterdir()}
+    return Inputs(folders, facts, files)
 
 
 def _balls(names: list[str], make) -> np.ndarray:
