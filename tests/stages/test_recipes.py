@@ -107,6 +107,20 @@ def test_a_part_of_an_inserted_mesh_gets_another_material_and_the_rest_keeps_its
     assert error.value.key == "material"
 
 
+def test_the_object_that_has_the_material_to_replace_is_inserted_whatever_the_order_of_photos(grounded):
+    side = grounded.facts["dataset.objects"]["side"]
+    both = {"side": side, "front": {**side, "objects": [{**side["objects"][0], "materials": {"lower": "unseen"}}]}}
+    for photos in (both, dict(reversed(both.items()))):
+        results = SolvedSet(changed(grounded, "dataset.objects", photos))
+        for replaced, expected in (
+            ("unseen", ["red", "brass"]),
+            ("brass", ["red", "red"]),
+            ("red", ["brass", "unseen"]),
+        ):
+            mesh, materials, _ = results.mesh("egg", {replaced: "brass" if replaced != "brass" else "red"}, "y")
+            assert [materials[label - 1] for label in mesh.labels] == expected
+
+
 def test_a_sun_below_the_ground_is_refused(grounded, tmp_path):
     with pytest.raises(InputError, match="below the ground") as error:
         drawn(grounded, tmp_path / "out", schema.Insert(**FRONT, sun=schema.AssumedSun((0.3, -1.0, 0.4), 0.7)))
