@@ -86,6 +86,10 @@ def resynthesis(
     if isinstance(recipe, schema.Transfer):
         known, other = results.known(recipe.table), recipe.materials
         materials = {name: known[other[name]] if name in other else own for name, own in scene.materials.items()}
+        worn = {each.materials[label - 1] for each in scene.objects for label in each.mesh.labels}
+        if recipe.photos and not worn & other.keys():
+            words = "%s: no object has %s, so the picture shows nothing new; there are %s"
+            log.warning(words, photo, ", ".join(map(repr, sorted(other))), ", ".join(sorted(worn)))
         scene = msgspec.structs.replace(scene, materials=materials)
     traced = Traced(traced_photo(scene, recipe.samples), results.tone(photo))
     _write(out / photo, traced.over(results.photo(photo)))

@@ -138,10 +138,10 @@ class SolvedSet:
     def mesh(
         self, name: str, material: str | dict[str, str] | None, up: str
     ) -> tuple[Mesh, tuple[str, ...], np.ndarray]:
-        """A mesh to insert, its materials by label, and which way is up in its own frame: of the data set's, as it stands in the first
-        photo, by name, whose object has the materials that are to be replaced.
+        """A mesh to insert, its materials by label, and which way is up in its own frame: of the data set's, with its own `parts`, or where those
+        lack a material that is to be replaced, or one that was solved, as it stands in the first photo, by name, whose object has it.
 
-        material: of the whole, or of some of its own materials, by name, others; None: its own
+        material: of the whole, or of some of its materials, by name, others; None: its own
         Raises InputError for a mesh that is not there, for one without height, and for a material that the mesh does not have.
         """
         upward = np.eye(3)["xyz".index(up)]
@@ -156,19 +156,24 @@ class SolvedSet:
             known = [BALL, *sorted({obj.mesh for each in self.objects.values() for obj in each.objects})]
             raise InputError(f"there is no mesh {name!r}", key="mesh", cure=did_you_mean(name, known))
         else:
-            each = [(p, self._placed(obj, self.objects[p].meshes[name], self.poses[p])) for p, obj in shown]
+            plain = [(p, msgspec.structs.replace(obj, materials={})) for p, obj in shown[:1]]
+            each = [(p, self._placed(obj, self.objects[p].meshes[name], self.poses[p])) for p, obj in plain + shown]
             asked = set(material) if isinstance(material, dict) else set()
-            own = [{self.names[label - 1] for label in one.mesh.labels} for _, one in each]
-            photo, placed = next((one for one, has in zip(each, own, strict=True) if asked <= has), each[0])
+            worn = [{self.names[label - 1] for label in one.mesh.labels} for _, one in each]
+            known = [one for one, has in zip(each, worn, strict=True) if asked <= has <= self.materials.keys()]
+            photo, placed = (known or each[1:])[0]
             upward = placed.world_from_object[:3, :3].T @ self.ground(photo, placed).plane.normal
             mesh, materials = placed.mesh, placed.materials
             if isinstance(material, str):
                 materials = (material,) * len(materials)
             elif material is not None:
-                own = [materials[label - 1] for label in mesh.labels]
-                if other := [each for each in material if each not in own]:
-                    found = f"{name!r} as in photo '{photo}' has no material {other[0]!r}"
-                    raise InputError(found, key="material", cure=did_you_mean(other[0], own))
+                if not known:
+                    has = set().union(*worn)
+                    found, wrong = (
+                        f"no {name!r} has the materials {', '.join(sorted(asked))}",
+                        min(asked - has, default=min(asked)),
+                    )
+                    raise InputError(found, key="material", cure=did_you_mean(wrong, sorted(has)))
                 materials = tuple(material.get(each, each) for each in materials)
         if np.ptp(mesh.vertices @ upward) < LEAST_HEIGHT * mesh.radius:
             cure = "say which axis of the file points upward, as in `up: z`, or name a mesh that is not flat"

@@ -38,6 +38,7 @@ FORMAT, OBSERVER, HOME = 1, "the observer of studies/pairs, by mean ΔE", ROOT /
 CURE = "give files as the page saved them (the button “Save answers”), each once, of one page, people's by themselves"
 app = typer.Typer(add_completion=False, pretty_exceptions_enable=False, rich_markup_mode=None)
 Side = Literal["left", "right"]
+LEAST_PAIRS = 10  # fewer answers of one participant make no share
 
 
 class Answer(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -91,6 +92,8 @@ def summary(everyone: Sequence[Answers]) -> str:
     lines = [f"{pair}: {sum(of[pair] for of in votes)} of {len(votes)}" for pair in sorted(votes[0])]
     shares = [np.mean([*of.values()]) for of in votes] if len(votes) > 1 else [*votes[0].values()]
     share, error = 100 * np.mean(shares), 100 * np.std(shares) / max(len(shares) - 1, 1) ** 0.5
+    if len(votes) == 1 and len(shares) < LEAST_PAIRS:
+        return "\n".join([*lines, f"{len(shares)} pairs are too few to say a share: ask of {LEAST_PAIRS}"])
     who = f"simulated: {everyone[0].simulated}" if everyone[0].simulated else f"{len(everyone)} participants"
     lines.append(f"{who}: the inserted picture is named in {share:.0f} ± {error:.0f} % of answers (chance: 50 %)")
     return "\n".join([*lines, f"told apart: {2 * share - 100:.0f} ± {2 * error:.0f} %"])

@@ -102,7 +102,7 @@ def test_a_part_of_an_inserted_mesh_gets_another_material_and_the_rest_keeps_its
     results = SolvedSet(grounded)
     mesh, materials, _ = results.mesh("egg", {"brass": "unseen"}, "y")
     assert [materials[label - 1] for label in mesh.labels] == ["red", "unseen"]
-    with pytest.raises(InputError, match="'egg' as in photo 'side' has no material 'unseen'") as error:
+    with pytest.raises(InputError, match="no 'egg' has the materials unseen") as error:
         results.mesh("egg", {"unseen": "red"}, "y")
     assert error.value.key == "material"
 
@@ -115,10 +115,26 @@ def test_the_object_that_has_the_material_to_replace_is_inserted_whatever_the_or
         for replaced, expected in (
             ("unseen", ["red", "brass"]),
             ("brass", ["red", "red"]),
-            ("red", ["brass", "unseen"]),
+            ("red", ["brass", "brass"]),  # the mesh with its own parts
         ):
             mesh, materials, _ = results.mesh("egg", {replaced: "brass" if replaced != "brass" else "red"}, "y")
             assert [materials[label - 1] for label in mesh.labels] == expected
+
+
+def test_without_a_material_a_mesh_is_inserted_with_its_own_parts(grounded):
+    front = grounded.facts["dataset.objects"]["side"]
+    other = {**front, "objects": [{**front["objects"][0], "materials": {"lower": "unseen"}}]}
+    mesh, materials, _ = SolvedSet(changed(grounded, "dataset.objects", {"front": other, "side": other})).mesh(
+        "egg", None, "y"
+    )
+    assert [materials[label - 1] for label in mesh.labels] == ["red", "brass"]
+
+
+def test_a_transfer_that_changes_nothing_in_a_photo_that_is_named_says_so(made, tmp_path, caplog):
+    drawn(made, tmp_path / "named", schema.Transfer(materials={"unseen": "red"}, **FRONT))
+    assert caplog.messages == ["front: no object has 'unseen', so the picture shows nothing new; there are red"]
+    drawn(made, tmp_path / "all", schema.Transfer(materials={"unseen": "red"}, samples=1))
+    assert len(caplog.messages) == 1
 
 
 def test_a_sun_below_the_ground_is_refused(grounded, tmp_path):
