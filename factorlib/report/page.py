@@ -24,6 +24,7 @@ MEASURES = {"median": "median", "p95": "95th percentile", "p99": "99th percentil
 FILES = {  # links of the page: the stage, and which of its files
     "materials.json": ("export", "materials.json"), "MaterialX": ("export", "*.mtlx"), "objects, glTF": ("export", "*.glb"),
     "lights, EXR": ("export", "illumination/*.exr"), "lights, HDR": ("export", "illumination/*.hdr"),
+    "lights without their suns, EXR": ("export", "illumination/*_sky.exr"),
     "how sure lights are": ("export", "coverage/*.exr"), "Mitsuba scenes": ("export", "scenes/*.xml"),
     "OpenUSD scenes": ("export", "scenes/*.usda"), "Blender scenes": ("export", "scenes/blender.py"), "meshes": ("export", "meshes/*.ply"),
     "re-syntheses": ("render", "resynthesis/*.exr"), "metrics.json": ("evaluate", "metrics.json"),
@@ -83,9 +84,11 @@ def page(
 
 def links(run: Artifacts) -> dict[str, list[tuple[str, str]]]:
     """Return by kind the files that are there: their names, and where they lie beside the folder of the page in build/<dataset>/."""
-    found = {}
+    found, names = {}, run.illuminations()
     for kind, (stage, pattern) in FILES.items():
         paths = sorted(run.folders[stage].glob(pattern))
+        if kind.endswith(", EXR"):  # a light may be called …_sky itself
+            paths = [path for path in paths if (path.stem in names) == (kind == "lights, EXR")]
         if paths:
             found[kind] = [(p.stem, f"../{stage}/{quote(p.relative_to(run.folders[stage]).as_posix())}") for p in paths]
     return found

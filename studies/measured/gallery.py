@@ -27,8 +27,8 @@ HEAD = """# Gallery
 Every recipe with its pictures of `data/eames`, and every study with what it shows. `make results ONLY=gallery` makes this page.
 
 ## Recipes
-A recipe says which pictures to make of a result; [recipes](recipes.md) has all its fields. Where it makes pictures of all photographs, those of the `terrace`
-are shown here; of several, as the frames of an animation, four.
+A recipe says which pictures to make of a result; [recipes](recipes.md) has all its fields. Where it makes pictures of every photograph, this page shows
+those of the `terrace`. Where these are four or more, such as the frames of an animation, it shows four of them.
 """
 FIGURE = """<figure markdown="0" style="margin: 0">
 <img src="gallery/{name}.jpg" alt="{says}" width="{width}" height="{height}">
@@ -56,19 +56,31 @@ def write() -> Path:
 
 
 def figure(recipe: Path) -> str:
-    """Write the picture of a recipe; returns its HTML, with the recipe's first line, a comment, as its caption.
+    """Write the picture of a recipe; returns its HTML. The caption is the recipe's first line, a comment, and what the picture's parts are.
 
     Raises InputError where the first line is no comment.
     """
     first = recipe.read_text("utf-8").partition("\n")[0]
     if not first.startswith("# "):
         raise InputError("the first line does not say what the recipe shows", file=recipe, cure="begin it with `# …`")
-    made = sorted((ROOT / "build" / DATASET / "recipes" / recipe.stem).rglob("*.png"))
-    made = [file for file in made if PHOTO in (file.stem, file.parent.name)] or made
-    picture = sheet([made[k * len(made) // 4] for k in range(4)] if len(made) >= 4 else made[:1])
+    folder = ROOT / "build" / DATASET / "recipes" / recipe.stem
+    made = sorted(folder.rglob("*.png"))
+    made = [file for file in made if Path(file.relative_to(folder).parts[0]).stem == PHOTO] or made
+    made = [made[k * len(made) // 4] for k in range(4)] if len(made) >= 4 else made[:1]
+    picture = sheet(made)
     picture.save(ROOT / "docs" / "gallery" / f"{recipe.stem}.jpg", quality=85, optimize=True)
     width, height = picture.size
-    return FIGURE.format(name=recipe.stem, says=first[2:], width=width, height=height, dataset=DATASET)
+    says = first[2:] + parts_of(folder, made)
+    return FIGURE.format(name=recipe.stem, says=says, width=width, height=height, dataset=DATASET)
+
+
+def parts_of(folder: Path, shown: list[Path]) -> str:
+    """Which rows and columns a grid has, or which lights the pictures `shown` are in; nothing of frames and of single pictures."""
+    if (folder / "grid.txt").exists():
+        rows, columns = (folder / "grid.txt").read_text("utf-8").splitlines()[:2]
+        return f" R{rows[1:]}; {columns}."
+    names = [file.stem for file in shown]
+    return "" if len(names) == 1 or names[0].isdigit() else f" Here, row by row: {', '.join(names)}."
 
 
 def sheet(files: list[Path]) -> Image.Image:
@@ -96,7 +108,7 @@ def studies_of(page: str) -> list[str]:
         words = f"{first.removesuffix(': shown')} ({len(shown)} of {len(found)} claims)" if shown else first
         title = f"[{study.title}](studies.md#{re.sub('[^a-z ]', '', study.title.lower().replace('-', ' ')).replace(' ', '-')})"
         rows.append([title, study.question, words, f"`make study STUDY={name}`"])
-    about = "A study varies one thing and tests claims over at least five seeds. Here stands the first that is shown, and how many are: [studies](studies.md) has all."
+    about = "A study varies one thing and tests claims over at least five seeds. Here stands the first that is shown, and how many are: [studies](studies.md) has all. The tables are of version 0.1.0, whose solve was [another](studies.md#against-the-paper)."
     return [
         "## Studies",
         about,

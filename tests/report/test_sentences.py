@@ -89,7 +89,8 @@ def test_what_its_null_beats_has_a_line_with_both_numbers_and_nothing_else_has()
     assert guesses(metrics_of(1.1)) == [
         "The recovered 'oak' is worse than a grey guess (in brackets): roughness, wrong by 1.10 (1.00); diffuse colour, wrong by 110 % (100 %); "
         "specular colour, wrong by 110 % (100 %).",
-        "A ball of the recovered 'oak' in the recovered light is further from the truth than a grey ball in the true light, in every light.",
+        "In every light a ball of the recovered 'oak' in the recovered light looks less like the true one than a plain grey ball does, both tinted to fit. "
+        "But the grey ball is in the true light, which nobody has in practice.",
         "The light 'hall' is further from the truth than a constant light is (in brackets): mirror sphere 110 % (100 %), glossy sphere 110 % (100 %), "
         "lambertian sphere 110 % (100 %), colours 11.0° (10.0°).",
         "a: normals are wrong by 11.0°, those of a flat disc by 10.0°. Look at the overlay.",
@@ -104,8 +105,8 @@ def test_lights_in_which_a_material_is_worse_than_grey_stand_in_one_line():
     balls = {f"l{k}": bad for k in range(5)} | {"hall": good}
     found = msgspec.structs.replace(found, relighting=Relighting(balls, {}, None))
     assert guesses(found) == [
-        "A ball of the recovered 'oak' in the recovered light is further from the truth than a grey ball in the true light, in 5 of 6 lights: "
-        "l0, l1, l2 and 2 more."
+        "In 5 of 6 lights (l0, l1, l2 and 2 more) a ball of the recovered 'oak' in the recovered light looks less like the true one than a plain grey ball "
+        "does, both tinted to fit. But the grey ball is in the true light, which nobody has in practice."
     ]
 
 

@@ -44,6 +44,17 @@ def test_the_gallery_shows_every_recipe_and_every_study():
     assert page.count("`make study STUDY=") == len(STUDIES)
 
 
+def test_a_caption_names_lights_rows_and_columns_but_no_frames(tmp_path):
+    assert (
+        gallery.parts_of(tmp_path, [Path("000.png"), Path("004.png")])
+        == gallery.parts_of(tmp_path, [Path("a.png")])
+        == ""
+    )
+    assert gallery.parts_of(tmp_path, [Path("hall.png"), Path("office.png")]) == " Here, row by row: hall, office."
+    (tmp_path / "grid.txt").write_text("rows: Oak, red\ncolumns: hall\ndenoised: x\n")
+    assert gallery.parts_of(tmp_path, [Path("grid.png")]) == " Rows: Oak, red; columns: hall."
+
+
 def test_a_sheet_has_four_pictures_or_one_on_white(tmp_path):
     for k in range(4):
         Image.new("RGBA", (480, 320), (60 * k, 0, 0, 255 * (k > 0))).save(tmp_path / f"{k}.png")
