@@ -271,21 +271,32 @@ def test_controls_work_by_mouse_and_keys(browser):
 
 @needs_chromium
 def test_it_links_to_the_files_of_what_is_shown(made, browser):
-    """Relative, and there; of the files that were not exported, and of a ball, there is no link."""
-    page, export = browser[0], made[1]["export"]
+    """Relative, and there; of the files that were not exported, and of a ball, there is no link.  A photo's scene is that of what it shows alone."""
+    page, export, scene = browser[0], made[1]["export"], "../export/scenes/day.xml"
 
     def files() -> list[str]:
-        page.evaluate("viewer.canvas.scrollIntoView(), viewer.changed()")
+        page.evaluate("viewer.canvas.scrollIntoView(), viewer.linked = null, viewer.changed()")
         page.wait_for_function("viewer.pass > 0")
         return page.eval_on_selector_all("#viewer [data-files] a", "(all) => all.map((a) => a.getAttribute('href'))")
 
-    page.evaluate("viewer.controls.object.selectedIndex = 0")
+    page.evaluate("viewer.controls.object.selectedIndex = 0, viewer.dress()")
+    page.select_option("[data-control=light]", label="day")
+    assert scene not in files() and not (export / "scenes").exists()
+    assert "make render" in made[2] and not re.search("make render(?! DATASET=)", made[2])
+    link = f'<a href="{scene}"></a>'
+    page.evaluate(f"document.querySelector('#summary .files').insertAdjacentHTML('beforeend', '{link}')")
+    assert scene in files() and "scene of day" in page.inner_text("#viewer [data-files]")
+    page.fill("[data-control=turn]", "5")
+    assert scene not in files()
+    page.click("[data-control=reset]")
+    page.select_option("[data-control=materials] label:nth-child(1) select", label="white")  # the brass part alone
+    assert scene not in files()
+    page.evaluate("viewer.dress()")
     page.select_option("[data-control=light]", label="noon")
-    wanted = ["ball.glb", "illumination/noon.exr", "scenes/day.xml", "materials.json"]
-    there = [f"../export/{name}" for name in wanted if (export / name).exists()]
-    assert files() == there and 2 <= len(there) < 4
+    wanted = ["ball.glb", "illumination/noon.exr", "materials.json"]
+    assert files() == [f"../export/{name}" for name in wanted] and all((export / name).exists() for name in wanted)
     page.select_option("[data-control=object]", label="a ball")
-    assert files() == [name for name in there if "ball" not in name]
+    assert files() == [f"../export/{name}" for name in wanted[1:]]
 
 
 @needs_chromium
@@ -295,15 +306,32 @@ def test_the_picture_on_the_screen_is_the_radiance_exposed(browser):
     page.click("[data-control=reset]")
     page.evaluate("viewer.canvas.scrollIntoView()")
     page.evaluate(frames)  # a busy machine has the passes of the picture before until then
+    refining = "getComputedStyle(document.querySelector('[data-refining]')).visibility"
+    page.wait_for_function(f"viewer.pass > 0 && {refining} === 'visible'")
     page.wait_for_function(f"viewer.canvas.width === {SIZE} && viewer.pass >= 128", timeout=120000)  # all passes
     page.evaluate(frames)  # what is drawn is on the screen
-    exposure = page.evaluate("viewer.state().photo.exposure")
+    assert page.evaluate(refining) == "hidden"
+    exposure = page.evaluate("viewer.state().exposure")
     box = page.locator("#viewer canvas").bounding_box()
     clip = {"x": round(box["x"]), "y": round(box["y"]), "width": SIZE, "height": SIZE}
     shot = Image.open(io.BytesIO(page.screenshot(clip=clip))).convert("RGB")
     normals, views, inside = ball_seen(0.0, 0.0, SIZE)
     want = picture(rendered(lobes_of(1), perturbed(TRUE["brass"], 1.0), normals, views), exposure).astype(float)
     assert np.median(np.abs(np.asarray(shot).astype(float)[inside] - want)) < 3
+
+
+@needs_chromium
+def test_no_object_burns_out(browser):
+    """However bright the photo is, 98 % of the object's pixels come to at most 0.9; a dim one keeps its exposure, and no view changes either."""
+    page = browser[0]
+    for given in (100.0, 1e-3):
+        page.evaluate(f"viewer.data.photos[0].exposure = {given}, viewer.renderer.metered = null")
+        state = "{...viewer.state(), photo: viewer.data.photos[0], object: viewer.renderer.objects[0]}"
+        exposure = page.evaluate(f"viewer.renderer.exposure({{...{state}, azimuth: 1, turn: 2, zoom: 3, sky: true}})")
+        found = shown(page, 0, "", page.evaluate("viewer.data.photos[0].name"), size=64)
+        bright = exposure * np.quantile(found[found[..., 3] > 0.99][:, :3].max(axis=1), 0.98)
+        assert bright == pytest.approx(0.9, abs=0.05) if given > 1 else exposure == given
+    page.evaluate("viewer.data.photos[0].exposure = 1, viewer.renderer.metered = null")
 
 
 @needs_chromium

@@ -16,7 +16,7 @@
 //           directions in a lobe of that roughness about the mirror direction is the light of what is met there.  Vertices are interpolated between.
 (() => {
 const QUICK = 1, PER_PASS = 8, PASSES = 128, SLOW_FRAME = 40, IRRADIANCE_FACE = 16, HALF_FIELD = 15 * Math.PI / 180, STANDING_BACK = 1.04 / Math.sin(HALF_FIELD);
-const LEAST_ALPHA = 1e-3, BOUNCES = 6, OVERLAP = 8, OWN = "";
+const LEAST_ALPHA = 1e-3, BOUNCES = 6, OVERLAP = 8, OWN = "", WHITE = 0.9, BRIGHTEST = 0.02, METERED = 64;
 
 // ── Numbers ──────────────────────────────────────────────────────────────────────────────────────────────────────────
 
@@ -431,8 +431,22 @@ class Renderer {
     const gl = this.gl;
     gl.bindFramebuffer(gl.FRAMEBUFFER, null); gl.viewport(0, 0, this.canvas.width, this.canvas.height);
     this.show.use();
-    gl.uniform1f(this.show.at("passes"), passes ?? 1); gl.uniform1f(this.show.at("exposure"), state.photo.exposure * Math.pow(2, state.stops));
+    gl.uniform1f(this.show.at("passes"), passes ?? 1); gl.uniform1f(this.show.at("exposure"), state.exposure * Math.pow(2, state.stops));
     this.screen(this.show, passes ? this.made.sum.texture : this.made.one.texture);
+  }
+
+  // The exposure of 0 stops: the photo's, or less where more than the share BRIGHTEST of the object would be above WHITE, seen as in the photo.
+  exposure(state) {
+    const { object, photo } = state, gl = this.gl, key = [this.objects.indexOf(object), photo.name, ...state.materials].join();
+    if (this.metered?.key !== key) {
+      const start = { ...state, azimuth: 0, elevation: 0, turn: 0, zoom: 1, sky: false }, pixels = new Float32Array(4 * METERED * METERED), seen = [];
+      this.draw(start, METERED, 0, QUICK);
+      gl.readPixels(0, 0, METERED, METERED, gl.RGBA, gl.FLOAT, pixels);
+      for (let k = 0; k < pixels.length; k += 4) if (pixels[k + 3] > 0) seen.push(Math.max(...pixels.subarray(k, k + 3)));
+      const bright = seen.sort((a, b) => b - a)[Math.floor(BRIGHTEST * seen.length)];
+      this.metered = { key, value: bright > 0 ? Math.min(photo.exposure, WHITE / bright) : photo.exposure };
+    }
+    return this.metered.value;
   }
 
   // Radiance times coverage, and coverage, of the finished picture: float32 RGBA, the lowest row first.
@@ -504,11 +518,13 @@ class Viewer {
     this.changed();
   }
 
-  // What is chosen: object, materials of its parts (OWN: as in the photo), photo whose light it is in; azimuth, elevation, turn of the light (radians), zoom, stops of exposure, sky.
+  // What is chosen: object, materials of its parts (OWN: as in the photo), photo whose light it is in; azimuth, elevation, turn of the light (radians), zoom, stops of exposure, sky;
+  // and the exposure of 0 stops.
   state() {
     const { object, materials, light, turn, stops, sky } = this.controls;
-    return { object: this.renderer.objects[object.selectedIndex], materials: [...materials.querySelectorAll("select")].map((select) => select.value), photo: this.data.photos[light.selectedIndex], azimuth: this.azimuth, elevation: this.elevation,
+    const state = { object: this.renderer.objects[object.selectedIndex], materials: [...materials.querySelectorAll("select")].map((select) => select.value), photo: this.data.photos[light.selectedIndex], azimuth: this.azimuth, elevation: this.elevation,
              zoom: this.zoom, turn: turn.value * Math.PI / 180, stops: Number(stops.value), sky: sky.checked };
+    return { ...state, exposure: this.renderer.exposure(state) };
   }
 
   changed() {
@@ -529,7 +545,8 @@ class Viewer {
       this.renderer.add(state, size, this.pass);
       if (this.pass + 1 >= PASSES / 2) this.renderer.present(state, this.pass + 1);
     }
-    if (++this.pass < PASSES) this.pending = requestAnimationFrame((next) => this.frame(next));
+    this.root.querySelector("[data-refining]").style.visibility = ++this.pass < PASSES ? "visible" : "hidden";
+    if (this.pass < PASSES) this.pending = requestAnimationFrame((next) => this.frame(next));
   }
 
   // Half as many pixels each way while frames of a movement are slow, and back when they are fast.
@@ -549,17 +566,21 @@ class Viewer {
       const value = Number(this.controls[name].value);
       this.root.querySelector(`[data-value=${name}]`).textContent = (value > 0 ? "+" : "") + value + (name === "turn" ? "°" : " stops");
     }
+    const darker = Math.log2(state.photo.exposure / state.exposure);
+    this.root.querySelector("[data-metered]").textContent = darker < 0.05 ? "0 is the exposure of the light's photo." :
+      `0 is ${darker.toFixed(1)} stops below the light's photo, so that this object does not burn out.`;
   }
 
-  // Links to the files of what is shown, as far as the page has them.
-  link({ object, photo }) {
-    const files = [`${object.mesh.name}.glb`, `illumination/${photo.light}.exr`, `scenes/${object.photo ?? photo.name}.xml`, "materials.json"];
+  // Links to the files of what is shown, as far as the page has them; the photo's scene only while object, materials and light are the photo's.
+  link({ object, materials, photo, turn }) {
+    const as_in_photo = object.photo === photo.name && turn === 0 && materials.every((name, k) => name === OWN || name === object.materials[k]);
+    const scene = `scenes/${photo.name}.xml`, files = [`${object.mesh.name}.glb`, `illumination/${photo.light}.exr`, ...(as_in_photo ? [scene] : []), "materials.json"];
     if (files.join() === this.linked) return;
     this.linked = files.join();
     const there = [...document.querySelectorAll("#summary .files a")], found = files.map((file) => there.find((a) => decodeURIComponent(a.getAttribute("href")) === `../export/${file}`));
     this.root.querySelector("[data-files]").replaceChildren(...found.filter(Boolean).map((link) => {
-      const copy = link.cloneNode();
-      copy.textContent = decodeURIComponent(link.getAttribute("href")).split("/").at(-1);
+      const copy = link.cloneNode(), file = decodeURIComponent(link.getAttribute("href"));
+      copy.textContent = file.endsWith(scene) ? `scene of ${photo.name}` : file.split("/").at(-1);
       return copy;
     }));
   }
