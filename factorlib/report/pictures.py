@@ -20,6 +20,7 @@ from factorlib.render.photo_scene import cropped, resized, traced_photo, turned_
 from factorlib.render.solved_set import SolvedSet
 from factorlib.render.traced import Traced
 from factorlib.report.artifacts import Artifacts, Channels, Picture
+from factorlib.results.lobes import read_lobes
 from factorlib.results.materials import Reflectance
 from factorlib.results.metrics import PhotoErrors, ScoredLight
 from factorlib.urm.geometry import on_surface
@@ -142,14 +143,18 @@ def first_pictures(run: Artifacts, rows: Sequence[PhotoRow], results: SolvedSet)
     """Title, `data:` URI and words of the photo that counts most pixels, and of its objects, path-traced: in its own light and in another photo's."""
     row = max(rows, key=lambda row: row.errors.pixels if row.errors else 0)
     photo = ("photo", row.uris["photo"], row.name)
-    if not results.objects[row.name].objects:
+    lobes = run.read(read_lobes, "export", "lobes.parquet") or {}
+    lit = {name for name, light in lobes.items() if len(light)}  # the others were not solved
+    if not results.objects[row.name].objects or row.illumination not in lit:
         return [photo]
     scene, box = results.scene(row.name), box_of(np.rint(run.channels("masks", row.name)["label"]) > 0)
-    scene = cropped(scene, box)
+    known = {name: run.exported.get(name, UNKNOWN) for name in run.set.materials}
+    scene = msgspec.structs.replace(cropped(scene, box), materials=known)
     smaller = longest_side(len(run.set.photos)) / max(scene.camera.width, scene.camera.height)
     scene = resized(scene, max(1, round(scene.camera.width * min(smaller, 1.0))))
     own = Traced(traced_photo(scene, FIRST_SAMPLES), results.tone(row.name))
-    other = next((p for p in run.set.photos if run.illumination_of(p) != row.illumination), None)
+    others = [p for p in run.set.photos if run.illumination_of(p) in lit - {row.illumination}]
+    other = others[0] if others else None
     light = results.light(other) if other else turned_light(scene.light, 180.0)
     relit = Traced(traced_photo(msgspec.structs.replace(scene, light=light), FIRST_SAMPLES))
     exposure = row.errors.exposure if row.errors else 1.0

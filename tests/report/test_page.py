@@ -12,10 +12,12 @@ import pytest
 
 from factorlib.images.picture import read_png
 from factorlib.jsonfile import read_json, write_json
+from factorlib.light.lobes import no_lobes
+from factorlib.results.lobes import write_lobes
 from factorlib.stage import Inputs
 from stages import evaluate, report
 from studies.measured.viewer import CHROMIUM, opened
-from tests.evaluate.made_artifacts import Made, make_artifacts
+from tests.evaluate.made_artifacts import Made, lobes_of, make_artifacts
 from tests.stages.made import Rising
 
 LINKED = {"day": ["red", "white"], "noon": ["white", "brass"], "dusk": ["red"]}
@@ -150,6 +152,14 @@ def test_odd_sets_give_a_whole_page(odd, tmp_path):
     if len(odd["seen"]) == 2:
         assert "2 groups that share no material" in html and "Clipped pixels" in html
         assert html.index("2 groups that share") < html.index("Clipped pixels")  # the most harmful first
+    if len(odd["seen"]) == 2:  # a material and a light that were not solved
+        assert "</strong> in the light of a<" in html
+        file = inputs["export"] / "materials.json"
+        table = read_json(file)
+        del table["materials"]["black"]
+        write_json(file, table)
+        write_lobes(inputs["export"] / "lobes.parquet", {"a": no_lobes(), "b": lobes_of(1)})
+        assert "turned half around" in page_of(inputs, tmp_path / "less")
     if len(odd["seen"]) > 1:
         return
     assert "averaged down" not in html  # a photo that was says from what size, and missing pictures are left out
