@@ -22,9 +22,9 @@ from factorlib.images.picture import picture, write_png
 from factorlib.jsonfile import write_json
 from factorlib.recipe import schema
 from factorlib.recipe.schema import AnyRecipe, is_light_file
-from factorlib.render.insertion import NEW, STEPS, Ground, inserted
-from factorlib.render.photo_scene import PhotoScene, Placed, lit_ball, orbit, resized, traced_photo, turned_light
-from factorlib.render.placement import Spot, spot_at, spot_beside, stood, stood_free
+from factorlib.render.insertion import NEW, STEPS, Standing, inserted
+from factorlib.render.photo_scene import PhotoScene, lit_ball, orbit, resized, traced_photo, turned_light
+from factorlib.render.placement import spot_at, spot_beside, stood, stood_free
 from factorlib.render.solved_set import SolvedSet
 from factorlib.render.studio import on_floor
 from factorlib.render.traced import Traced
@@ -95,20 +95,6 @@ def resynthesis(
     _write(out / photo, traced.over(results.photo(photo)))
 
 
-class Standing(msgspec.Struct, frozen=True):
-    """A photo's scene, to whose materials the new object's are added, and where that object stands.
-
-    ground: on which it stands;  spot, found: where it was to stand, and where it stands;  moved: a sentence that says why, or nothing
-    """
-
-    scene: PhotoScene
-    ground: Ground
-    new: Placed
-    spot: Spot
-    found: Spot
-    moved: str
-
-
 def standing(recipe: schema.Insert, results: SolvedSet, photo: str) -> Standing:
     """Where the new object of a recipe stands in a photo; raises InputError where it has no place that the photo shows."""
     scene = results.scene(photo, recipe.sun, recipe.denoise)
@@ -143,8 +129,8 @@ def insertion(recipe: schema.Insert, results: SolvedSet, photo: str, out: Path, 
     there = standing(recipe, results, photo)
     if there.moved:
         log.warning("%s: %s", photo, there.moved)
-    seen, stands = (results.straightened(photo), results.covered(photo)), (there.new, there.found)
-    found = inserted(there.scene, *seen, *stands, there.ground, recipe.samples, lambda done: report(done / STEPS))
+    seen = results.straightened(photo), results.covered(photo)
+    found = inserted(there, *seen, recipe.samples, lambda done: report(done / STEPS))
     same = (found.coverage[..., None] == 0) & (found.shadow == 1) & (there.ground.polish is None)
     _write(out / photo, np.where(same, results.photo(photo), results.tone(photo)(found.composite)))
     at = results.poses[photo].camera.factor * there.scene.camera.project(there.found.point @ YUP_FROM_CAMERA)

@@ -67,6 +67,20 @@ class Ground(msgspec.Struct, frozen=True):
     polish: Reflectance | None = None
 
 
+class Standing(msgspec.Struct, frozen=True):
+    """A photo's scene, to whose materials the new object's are added, and where that object stands.
+
+    ground: on which it stands;  spot, found: where it was to stand, and where it stands;  moved: a sentence that says why, or nothing
+    """
+
+    scene: PhotoScene
+    ground: Ground
+    new: Placed
+    spot: Spot
+    found: Spot
+    moved: str
+
+
 class ShadowMatch(msgspec.Struct, frozen=True):
     """Correlation of log luminance, photo and prediction, on the ground near the photo's objects; None where there are too few pixels.
 
@@ -96,23 +110,21 @@ class Inserted(msgspec.Struct, frozen=True):
 
 
 def inserted(
-    scene: PhotoScene,
+    there: Standing,
     photo: Picture,
     covered: Bool[np.ndarray, "h w"],
-    new: Placed,
-    spot: Spot,
-    ground: Ground,
     samples: int,
     report: Callable[[int], None] = lambda done: None,
     seed: int = 1,
     compared: bool = True,
 ) -> Inserted:
-    """The photo of the scene with the new object.  Raises InputError where that is not seen.
+    """The photo with the new object.  Raises InputError where that is not seen.
 
     photo: linear radiance, its tone curve undone;  covered: pixels that show something else than the ground
     report: how many of STEPS are done;  seed: of the random numbers, which all tracings share
     compared: whether the photo's own shadow is compared with the predicted one; without, `match` is of no pixels
     """
+    scene, new, spot, ground = there.scene, there.new, there.found, there.ground
     camera = sensor(scene.camera, rigid(YUP_FROM_CAMERA, np.zeros(3)), near=scene.near)
     there, light = shapes(scene.objects, scene.materials), light_entries(scene.light, scene.size)
     more = shapes([new], scene.materials)

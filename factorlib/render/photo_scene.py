@@ -157,21 +157,12 @@ def lit_ball(
     return denoised(picture) if denoise else picture
 
 
-def cropped(scene: PhotoScene, box: tuple[slice, slice]) -> PhotoScene:
-    """The scene as a camera sees it that has these rows and columns alone."""
-    (rows, columns), (x, y) = box, scene.camera.centre
-    size = columns.stop - columns.start, rows.stop - rows.start
-    camera = Camera(*size, scene.camera.focal, (x - columns.start, y - rows.start))
-    return msgspec.structs.replace(scene, camera=camera)
-
-
 def resized(scene: PhotoScene, width: int | None) -> PhotoScene:
     """The scene as a camera of another number of pixels sees it."""
     if width is None:
         return scene
-    factor = width / scene.camera.width
-    centre = (scene.camera.centre[0] * factor, scene.camera.centre[1] * factor)
-    camera = Camera(width, max(1, round(scene.camera.height * factor)), scene.camera.focal * factor, centre)
+    pixel = scene.camera.width / width
+    camera = scene.camera.window(0, 0, pixel, width, max(1, round(scene.camera.height / pixel)))
     return msgspec.structs.replace(scene, camera=camera)
 
 

@@ -139,7 +139,7 @@ class SolvedSet:
         self, name: str, material: str | dict[str, str] | None, up: str
     ) -> tuple[Mesh, tuple[str, ...], np.ndarray]:
         """A mesh to insert, its materials by label, and which way is up in its own frame: of the data set's, with its own `parts`, or where those
-        lack a material that is to be replaced, or one that was solved, as it stands in the first photo, by name, whose object has it.
+        lack a material that is to be replaced, as it stands in the first photo, by name, whose object has it.
 
         material: of the whole, or of some of its materials, by name, others; None: its own
         Raises InputError for a mesh that is not there, for one without height, and for a material that the mesh does not have.
@@ -160,8 +160,8 @@ class SolvedSet:
             each = [(p, self._placed(obj, self.objects[p].meshes[name], self.poses[p])) for p, obj in plain + shown]
             asked = set(material) if isinstance(material, dict) else set()
             worn = [{self.names[label - 1] for label in one.mesh.labels} for _, one in each]
-            known = [one for one, has in zip(each, worn, strict=True) if asked <= has <= self.materials.keys()]
-            photo, placed = (known or each[1:])[0]
+            known = [one for one, has in zip(each, worn, strict=True) if asked <= has]
+            photo, placed = (known or each)[0]
             upward = placed.world_from_object[:3, :3].T @ self.ground(photo, placed).plane.normal
             mesh, materials = placed.mesh, placed.materials
             if isinstance(material, str):
@@ -169,10 +169,8 @@ class SolvedSet:
             elif material is not None:
                 if not known:
                     has = set().union(*worn)
-                    found, wrong = (
-                        f"no {name!r} has the materials {', '.join(sorted(asked))}",
-                        min(asked - has, default=min(asked)),
-                    )
+                    found = f"no {name!r} has the materials {', '.join(sorted(asked))}"
+                    wrong = min(asked - has, default=min(asked))
                     raise InputError(found, key="material", cure=did_you_mean(wrong, sorted(has)))
                 materials = tuple(material.get(each, each) for each in materials)
         if np.ptp(mesh.vertices @ upward) < LEAST_HEIGHT * mesh.radius:

@@ -18,10 +18,8 @@ from factorlib.render.placement import rotation_between
 from factorlib.results.materials import Reflectance
 from factorlib.tracing.scene import bsdf, transform
 
-REACH, SOLID = (
-    3.0,
-    0.3,
-)  # where the floor ends, in half extents of the objects; the share of that within which it does not fade
+REACH = 3.0  # half extents of the objects: where the floor ends
+SOLID = 0.3  # of that: within it the floor does not fade
 HAIR = 1e-4  # of the objects' extent, by which the floor lies lower: surfaces must not meet
 COVERAGE_SAMPLES = 16
 

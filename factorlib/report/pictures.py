@@ -2,6 +2,7 @@
 
 import base64
 from collections.abc import Mapping, Sequence
+from math import ceil
 from typing import Any
 
 import msgspec
@@ -16,7 +17,7 @@ from factorlib.evaluate.resynthesis import agreeing_pixels
 from factorlib.images.palette import nearest_tags
 from factorlib.images.picture import exposure_of, picture, png_bytes
 from factorlib.images.transfer import srgb_encode
-from factorlib.render.photo_scene import cropped, resized, traced_photo, turned_light
+from factorlib.render.photo_scene import traced_photo, turned_light
 from factorlib.render.solved_set import SolvedSet
 from factorlib.render.traced import Traced
 from factorlib.report.artifacts import Artifacts, Channels, Picture
@@ -148,10 +149,10 @@ def first_pictures(run: Artifacts, rows: Sequence[PhotoRow], results: SolvedSet)
     if not results.objects[row.name].objects or row.illumination not in lit:
         return [photo]
     scene, box = results.scene(row.name), box_of(np.rint(run.channels("masks", row.name)["label"]) > 0)
-    known = {name: run.exported.get(name, UNKNOWN) for name in run.set.materials}
-    scene = msgspec.structs.replace(cropped(scene, box), materials=known)
-    smaller = longest_side(len(run.set.photos)) / max(scene.camera.width, scene.camera.height)
-    scene = resized(scene, max(1, round(scene.camera.width * min(smaller, 1.0))))
+    (top, left), (height, width) = (of.start for of in box), (of.stop - of.start for of in box)
+    pixel = max(1.0, max(height, width) / longest_side(len(run.set.photos)))
+    camera = scene.camera.window(left, top, pixel, ceil(width / pixel), ceil(height / pixel))
+    scene = msgspec.structs.replace(scene, camera=camera)
     own = Traced(traced_photo(scene, FIRST_SAMPLES), results.tone(row.name))
     others = [p for p in run.set.photos if run.illumination_of(p) in lit - {row.illumination}]
     other = others[0] if others else None

@@ -145,8 +145,8 @@ def drawn(photo: str, recipe: Insert, recovered: SolvedSet, truth: SolvedSet) ->
         here, seen = places[ground], sets[light].straightened(photo)[window]
         lit = {"light": places[light].scene.light, "materials": places[material].scene.materials}
         scene = replace(here.scene, camera=here.scene.camera.window(left, top, 1.0, width, height), **lit)
-        stands = recovered.covered(photo)[window], here.new, here.found, here.ground
-        found = inserted(scene, seen, *stands, recipe.samples, seed=seed, compared=False)
+        covered = recovered.covered(photo)[window]
+        found = inserted(replace(here, scene=scene), seen, covered, recipe.samples, seed=seed, compared=False)
         return sets[light].tone(photo)(found.composite), found
 
     (mine, found), (right, other) = traced(True, True, True), traced(False, False, False)

@@ -10,7 +10,7 @@ from factorlib.geometry.camera import Camera
 from factorlib.light.lobes import Lobes
 from factorlib.meshes.mesh import Mesh
 from factorlib.render.ground import Plane
-from factorlib.render.insertion import NEW, Ground, inserted, shadow_match
+from factorlib.render.insertion import NEW, Ground, Standing, inserted, shadow_match
 from factorlib.render.photo_scene import ALL_BOUNCES, PhotoScene, Placed, light_entries, shapes
 from factorlib.render.placement import Spot, stood
 from factorlib.results.materials import Reflectance
@@ -21,6 +21,10 @@ MATERIALS = {"red": Reflectance((0.6, 0.2, 0.1), (0.08,) * 3, 0.3), "grey": Refl
 GROUND = Plane(np.array([0, 1.0, 0]), np.array([0, -1.0, -6]))
 SPOT = Spot(GROUND, np.array([-0.9, -1.0, -6.0]), 1.2)
 STRIPES = (0.2, 0.5)
+
+
+def stands(scene: PhotoScene, placed: Placed | None = None, polish: Reflectance | None = None) -> Standing:
+    return Standing(scene, Ground(GROUND, polish=polish), placed or new(), SPOT, SPOT, "")
 
 
 def light() -> Lobes:
@@ -50,7 +54,7 @@ def new(material="red") -> Placed:
 @pytest.fixture(scope="module")
 def made():
     photo = true_photo([THERE])
-    return photo, inserted(SCENE, photo, OPEN, new(), SPOT, Ground(GROUND), 512)
+    return photo, inserted(stands(SCENE), photo, OPEN, 512)
 
 
 def blocks(picture):
@@ -73,8 +77,8 @@ def test_twice_the_light_is_twice_the_picture_and_a_polished_ground_shows_the_ob
     photo, found = made
     brighter = PhotoScene(CAMERA, (THERE,), light().scaled(2.0), MATERIALS)
     polish = Reflectance((0.0,) * 3, (0.5,) * 3, 0.05)
-    matt, polished = (inserted(SCENE, photo, OPEN, new(), SPOT, Ground(GROUND, polish=p), 64) for p in (None, polish))
-    again = inserted(brighter, 2 * photo, OPEN, new(), SPOT, Ground(GROUND), 64)
+    matt, polished = (inserted(stands(SCENE, polish=p), photo, OPEN, 64) for p in (None, polish))
+    again = inserted(stands(brighter), 2 * photo, OPEN, 64)
     assert np.allclose(again.composite, 2 * matt.composite, rtol=1e-4, atol=1e-6)
     difference = np.abs(polished.composite - matt.composite).max(axis=-1)
     rows, columns = np.nonzero(found.coverage > 0)
@@ -96,7 +100,7 @@ def test_an_open_mesh_is_seen_from_either_side_and_hidden_by_what_stands_before_
         scene = PhotoScene(CAMERA, (before,), light(), MATERIALS)
         placed = stood(NEW, quad, ("red",), np.array([0, 1.0, 0]), turn, SPOT)
         photo = np.ones((CAMERA.height, CAMERA.width, 3))
-        seen.append(inserted(scene, photo, OPEN, placed, SPOT, Ground(GROUND), 16).coverage.sum())
+        seen.append(inserted(stands(scene, placed), photo, OPEN, 16).coverage.sum())
     assert seen[0] > 100 and seen[1] < 0.9 * seen[0]
 
 
@@ -119,9 +123,9 @@ def test_the_shadow_of_the_photo_is_recognised_whatever_its_exposure_and_not_whe
         {**light_entries(light(), 6.0), **shapes([THERE], MATERIALS), "ground": floor()},
         sensor(CAMERA, rigid(YUP_FROM_CAMERA, np.zeros(3))), 128, 7, ALL_BOUNCES,
     )  # fmt: skip
-    match = inserted(SCENE, plain, OPEN, new(), SPOT, Ground(GROUND), 64).match
+    match = inserted(stands(SCENE), plain, OPEN, 64).match
     turned = msgspec.structs.replace(SCENE, light=Lobes(light().axis * [-1, 1, -1], light().sharpness, light().weight))
-    other = inserted(turned, plain, OPEN, new(), SPOT, Ground(GROUND), 64).match
+    other = inserted(stands(turned), plain, OPEN, 64).match
     assert match.correlation > 0.9 > match.constant_light > other.correlation and match.pixels == other.pixels > 500
 
 
@@ -134,8 +138,7 @@ def test_a_denoised_insertion_leaves_the_photo_as_it_is_where_it_changes_nothing
     pytest.importorskip("mitsuba_oidn", reason="mitsuba-oidn is not installed: make setup EXTRAS=denoise")
     photo = true_photo([THERE], 16)
     plain, clean = (
-        inserted(msgspec.structs.replace(SCENE, denoise=denoise), photo, OPEN, new(), SPOT, Ground(GROUND), 16)
-        for denoise in (False, True)
+        inserted(stands(msgspec.structs.replace(SCENE, denoise=denoise)), photo, OPEN, 16) for denoise in (False, True)
     )
     assert (clean.coverage == plain.coverage).all() and clean.match == plain.match
     same = (plain.coverage == 0) & (plain.shadow == 1).all(axis=-1)

@@ -15,7 +15,6 @@ from factorlib.render.ground import Plane, resting_plane
 from factorlib.render.photo_scene import (
     PhotoScene,
     Placed,
-    cropped,
     lit_ball,
     orbit,
     resized,
@@ -95,11 +94,6 @@ def test_lobes_and_their_map_are_the_same_light(scene, angle):
 def test_a_larger_picture_shows_the_same(scene):
     large = traced_photo(resized(scene, 96), 64)
     assert differ(traced_photo(scene, 256), large.reshape(40, 2, 48, 2, 4).mean(axis=(1, 3))) < 0.03
-
-
-def test_a_cut_picture_shows_that_part_of_the_whole(scene):
-    box = slice(3, 31), slice(8, 40)
-    np.testing.assert_allclose(cropped(scene, box).camera.rays(), scene.camera.rays()[box], atol=1e-6)
 
 
 def test_a_ball_fills_its_picture():
