@@ -131,7 +131,7 @@ def surfaces_of(inputs: Inputs, slices: dict[str, ObjectsSlice]) -> Surfaces:
 
 
 def drawn(file: Path, params: Params) -> Observations:
-    """At most so many usable observations of a photo, in their order."""
+    """Return at most so many usable observations of a photo, in their order."""
     seen = usable(read_observations(file))
     chosen = np.random.default_rng(params.seed).permutation(len(seen))[: params.observations]
     return seen.take(np.sort(chosen))

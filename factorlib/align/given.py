@@ -88,7 +88,7 @@ def focal_and_centre(external: ExternalCamera, width: int, height: int, photo: s
     size, point, fault = external.size, external.principal_point, None
 
     def is_resized(size: tuple[float, float]) -> bool:
-        """By the longer side, to a pixel of the shorter one."""
+        """Return whether the longer sides say so, to a pixel of the shorter one."""
         (long, short), (longer, shorter) = (size, (width, height)) if width >= height else (size[::-1], (height, width))
         return abs(short * longer / long - shorter) <= MOST_ROUNDED_PX
 

@@ -71,7 +71,7 @@ class Answer(msgspec.Struct, frozen=True):
         return [table.Kind(*class_of(*row)) for row in rows]
 
     def _given_rule(self) -> str:
-        """What is known of scale and white balance, as a sentence; empty where nothing is."""
+        """Say what is known of scale and white balance, as a sentence; empty where nothing is."""
         known = self.problem.known
         fixed = [self.names[m] for m in sorted(known.materials)]
         fixed += sorted(name for name, light in known.lights.items() if not light.scale_free)
@@ -106,7 +106,7 @@ class Answer(msgspec.Struct, frozen=True):
         return list(zip(self.problem.blocks, self.solution.point.lights, strict=True))
 
     def lights(self) -> dict[str, Lobes]:
-        """By illumination, in scene radiance."""
+        """Return the lobes by illumination, in scene radiance."""
         return {block.name: light.lobes.scaled(block.unit) for block, light in self.lit()}
 
     def exposures(self) -> dict[str, table.Channels]:

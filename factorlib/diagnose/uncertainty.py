@@ -83,7 +83,7 @@ SAMPLE = 1000  # observations used for these; the information is scaled to all o
 
 
 class StandardErrors(NamedTuple):
-    """Of every material unknown; deviation: standard deviation of the residuals in units of the noise model."""
+    """The standard error of every material unknown; deviation: standard deviation of the residuals in units of the noise model."""
 
     materials: Materials
     deviation: float
@@ -125,7 +125,7 @@ class Posterior:
         """φ's system of each illumination; with_scores: of clusters of observations, too."""
 
         def system(one: tuple[Illumination, Hyperparameters]) -> System:
-            """Of one illumination."""
+            """Return the system of one illumination."""
             clusters = one[0].block.clusters() if with_scores else None
             made = marginal(field_of(*one, self.prior, not with_scores), clusters, materials_given=True)
             self.tick()
@@ -147,7 +147,7 @@ class Posterior:
         return _errors(np.where(problem.known.free(len(materials)), variance, 0.0), deviation)
 
     def relative_standard_errors(self) -> dict[str, Float[np.ndarray, "h w 3"]]:
-        """By illumination, over the light's mean radiance: a small lat-long map in the frame of the exported ones, at most LARGEST."""
+        """Return the standard error of each light over its mean radiance, by illumination: a small lat-long map in the frame of the exported ones, at most LARGEST."""
         directions, maps = map_directions(), {}
         model_error = residual_deviation(self.problem, self.fit.point) * LIGHT_ERROR
         for block, light, system in zip(

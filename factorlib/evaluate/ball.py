@@ -70,7 +70,7 @@ def constant_light(colour: Float[np.ndarray, "3"]) -> Light:
 
 
 def radiance_toward(direction: Float[np.ndarray, "*n 3"], solid_angle: Float[np.ndarray, "*n"]) -> Reflected:
-    """Of any light, its radiance averaged over about `solid_angle` steradians around unit `direction`: between the two nearest levels."""
+    """Return the radiance of any light, averaged over about `solid_angle` steradians around unit `direction`: between the two nearest levels."""
     finest, last = 4 * np.pi / SIDE**2, SIDE.bit_length() - 1
     level = np.clip(0.5 * np.log2(np.maximum(solid_angle, 1e-12) / finest), 0, last)
     below = np.minimum(level.astype(int), last - 1)

@@ -51,7 +51,7 @@ def angles_deg(a: Float[np.ndarray, "n 3"], b: Float[np.ndarray, "n 3"]) -> Floa
 
 
 def pose_error(estimate: PoseEntry | Pose, truth: Pose) -> PoseError:
-    """Of two cam_from_object; the translations in one unit."""
+    """Return how far two cam_from_object differ; the translations are in one unit."""
     moved = np.linalg.norm(np.subtract(estimate.translation, truth.translation))
     distance = float(np.linalg.norm(truth.translation)) or 1.0
     chord = np.linalg.norm(np.subtract(estimate.rotation, truth.rotation))  # 2√2 sin(angle / 2)

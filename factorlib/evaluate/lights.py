@@ -47,7 +47,7 @@ VIEWS: dict[str, Callable[[Light], Samples]] = {
 
 
 def light_error(estimate: Samples, truth: Samples) -> LightError:
-    """Of samples that stand for equal areas.
+    """Return the errors of samples that stand for equal areas.
 
     >>> light_error(np.full((4, 3), 2.0), np.ones((4, 3)))
     LightError(rmse=1.0, rmse_scale_invariant=0.0, rgb_angle_deg=0.0)

@@ -38,7 +38,7 @@ class Shot(msgspec.Struct, frozen=True):
 
 
 def shot_of(photo: Channels, geometry: Channels, resynthesis: Picture) -> Shot:
-    """From the channels of the stages `masks` and `align` and the re-synthesis of the same size."""
+    """Make a shot of the channels of the stages `masks` and `align` and the re-synthesis of the same size."""
     label, clipped = np.rint(photo["label"]), np.any([photo[f"clipped.{c}"] > 0.5 for c in "RGB"], axis=0)
     rgb = np.nan_to_num(np.stack([photo[c] for c in "RGB"], axis=-1), posinf=0.0, neginf=0.0)
     valid, observed = photo["valid"] > 0.5, agreeing_pixels(photo, geometry)

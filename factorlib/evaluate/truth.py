@@ -17,7 +17,7 @@ def read_true_light(path: Path, name: str) -> Float[np.ndarray, "h w 3"]:
 
 
 def read_true_normals(path: Path, name: str, size: tuple[int, int]) -> Float[np.ndarray, "h w 3"]:
-    """Of photo `name`, whose file has `size` (width, height): normal.x/y/z, or R, G, B; zero or NaN where none is known."""
+    """Read the true normals of photo `name`, whose file has `size` (width, height): normal.x/y/z, or R, G, B; zero or NaN where none is known."""
     key = f"normals.{name}"
     with reading("an image", path, key):
         channels = read_exr(path)

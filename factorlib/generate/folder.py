@@ -107,7 +107,7 @@ def _subpixels(meshes: Sequence[Mesh], camera: Camera, poses: list[Pose]) -> Map
 
 
 def whole_pixels(fine: Int[np.ndarray, "hh ww"]) -> Int[np.ndarray, "h w"]:
-    """Of a fine grid with a border of one pixel: the value where all rays in and just about a pixel agree, else 255."""
+    """Return the pixels of a fine grid with a border of one pixel: the value where all rays in and just about a pixel agree, else 255."""
     windows = np.lib.stride_tricks.sliding_window_view(fine, (SUBPIXELS + 2, SUBPIXELS + 2))
     windows = windows[SUBPIXELS - 1 :: SUBPIXELS, SUBPIXELS - 1 :: SUBPIXELS]
     height, width = (n // SUBPIXELS - 2 for n in fine.shape)

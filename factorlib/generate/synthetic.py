@@ -56,7 +56,7 @@ class Placed(msgspec.Struct, frozen=True):
 
     @property
     def name(self) -> str:
-        """Of the object: its material and its shape."""
+        """The object's name: its material and its shape."""
         return f"{self.material}_{self.shape}"
 
 

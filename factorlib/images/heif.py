@@ -24,7 +24,7 @@ FAILURES = (ValueError, EOFError, SyntaxError, RuntimeError, OSError)  # what pi
 
 
 def is_heif(path: str | Path) -> bool:
-    """By the file's first bytes: a box `ftyp` with a brand of HEIF's."""
+    """Return whether the file's first bytes say so: a box `ftyp` with a brand of HEIF's."""
     try:
         with Path(path).open("rb") as stream:
             head = stream.read(12)

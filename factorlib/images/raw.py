@@ -25,7 +25,7 @@ TAGS = ("ExposureTime", "FNumber", "Exif:PhotographicSensitivity", "Exif:FocalLe
 
 
 def is_raw(path: str | Path) -> bool:
-    """By its suffix, or as a TIFF that says it is a DNG: its first picture is but a preview."""
+    """Return whether its suffix says so, or it is a TIFF that says it is a DNG: its first picture is but a preview."""
     return Path(path).suffix.lower() in RAW or "DNG" in exif_of(path)
 
 

@@ -57,7 +57,7 @@ class Stored(msgspec.Struct, frozen=True, kw_only=True):
         return (self.width, self.height) if self.orientation >= 5 else (self.height, self.width)
 
     def clipped(self, begin: int, end: int, codes: Shaped[np.ndarray, "r w 3"]) -> Bool[np.ndarray, "r w 3"]:
-        """Where rows that were read as `codes` hold less than there was to see."""
+        """Return where rows that were read as `codes` hold less than there was to see."""
         if self.saturated is not None:
             return self.saturated(begin, end)
         return np.zeros(codes.shape, bool) if self.white is None else codes >= CLIPPED * self.white

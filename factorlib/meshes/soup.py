@@ -41,7 +41,7 @@ class Soup(msgspec.Struct, frozen=True):
 
 
 def floats(values: np.ndarray) -> Float[np.ndarray, "..."]:
-    """As float64; a NaN of any kind is one, without a warning."""
+    """Return the numbers as float64; a NaN of any kind is one, without a warning."""
     with np.errstate(invalid="ignore"):
         return np.asarray(values, dtype=float)
 

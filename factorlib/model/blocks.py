@@ -70,7 +70,7 @@ class Block(msgspec.Struct, frozen=True):
         return msgspec.structs.replace(self, held_out=np.zeros(len(self), bool))
 
     def sampled(self, count: int, seed: int) -> Block:
-        """At most `count` fitted and `count`/3 held-out observations, drawn at random, order kept."""
+        """Return at most `count` fitted and `count`/3 held-out observations, drawn at random, order kept."""
         random = np.random.default_rng(seed)
         kept = [
             random.permutation(rows)[:most]
@@ -95,7 +95,7 @@ class Block(msgspec.Struct, frozen=True):
         return msgspec.structs.replace(self, normal=normal, detail=detail, bounced=bounced)
 
     def residuals(self, radiance: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
-        """By how much `radiance`, in the block's unit, is too bright, in σ.  A clipped pixel says "at least": only too dark counts."""
+        """Return by how much `radiance`, in the block's unit, is too bright, in σ.  A clipped pixel says "at least": only too dark counts."""
         difference = (radiance - self.radiance) * self.precision
         return np.where(self.clipped, np.minimum(difference, 0.0), difference)
 

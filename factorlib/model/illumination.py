@@ -82,7 +82,7 @@ class Illumination(msgspec.Struct, frozen=True):
         return np.exp(self.light.log_exposure)[self.block.photo][:, None]
 
     def fitted(self) -> Illumination:
-        """With the observations alone that are not held out."""
+        """Return the illumination with the observations alone that are not held out."""
         return msgspec.structs.replace(self, block=self.block.fitted())
 
     def shown(self) -> Shown:

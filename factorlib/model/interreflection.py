@@ -93,6 +93,6 @@ def _sent_to(seen: Observations, surfaces: Float[np.ndarray, "c+1 3"]) -> Float[
 
 
 def unit(vectors: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
-    """Of length 1, float64."""
+    """Return the vectors with length 1, as float64."""
     vectors = vectors.astype(float)
     return vectors / np.linalg.norm(vectors, axis=1, keepdims=True)

@@ -57,7 +57,7 @@ class Materials(msgspec.Struct, frozen=True):
         return min(RESOLVED / self.blur, SHARPNESS[1])
 
     def lambertian(self, m: int) -> Materials:
-        """With material m Lambertian: its specular reflectance is added to its diffuse one."""
+        """Return the materials with material m Lambertian: its specular reflectance is added to its diffuse one."""
         diffuse, specular = self.diffuse.copy(), self.specular.copy()
         diffuse[m] += specular[m]
         specular[m] = LEAST_REFLECTANCE

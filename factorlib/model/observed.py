@@ -27,7 +27,7 @@ HELD_OUT_CELL = 0.1  # size of the cells of mirror directions that are held out 
 
 
 class PhotoObservations(msgspec.Struct, frozen=True):
-    """Of one file: its usable observations, merged; how many it holds, and how many of those are not usable."""
+    """What one file holds: its usable observations, merged; how many it holds, and how many of those are not usable."""
 
     merged: Observations
     count: int
@@ -37,7 +37,7 @@ class PhotoObservations(msgspec.Struct, frozen=True):
 def gathered(
     files: Sequence[Path], degrees: float, spread: Spread, surface: Path | None = None
 ) -> list[PhotoObservations]:
-    """Of each file, in this order; observations that are within `degrees` of each other are merged (`factorlib.urm.merge`).
+    """Read each file, in this order; observations that are within `degrees` of each other are merged (`factorlib.urm.merge`).
 
     surface: the folder of the stage `surface`, whose normals are used where it has some
     """

@@ -76,7 +76,7 @@ class JointProblem(msgspec.Struct, frozen=True):
         return sum(int((~block.held_out).sum()) * 3 for block in self.blocks)
 
     def sampled(self, count: int | Sequence[int], seed: int) -> JointProblem:
-        """At most `count` fitted observations of each block (one number, or one a block), and a third as many held out."""
+        """Return the problem with at most `count` fitted observations of each block (one number, or one a block), and a third as many held out."""
         counts = [count] * len(self.blocks) if isinstance(count, int) else count
         return self.of([block.sampled(most, seed) for block, most in zip(self.blocks, counts, strict=True)])
 

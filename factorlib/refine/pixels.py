@@ -50,7 +50,7 @@ class Pixels(msgspec.Struct, frozen=True):
 def pixels_of(
     photo: Mapping[str, Float[np.ndarray, "h w"]], known: Sequence[bool], count: int, seed: int = 0
 ) -> Pixels | None:
-    """At most `count` of the pixels inside a material that is `known`; None where there are too few cells to hold any out.
+    """Return at most `count` of the pixels inside a material that is `known`; None where there are too few cells to hold any out.
 
     photo: channels R, G, B, label, valid, clipped.R/G/B of the stage `masks`
     """

@@ -69,7 +69,7 @@ class PhotoScene(msgspec.Struct, frozen=True):
 
     @property
     def near(self) -> float:
-        """From which distance on things are seen."""
+        """The distance from which on things are seen."""
         return NEAR * self.size
 
 

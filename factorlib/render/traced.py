@@ -40,11 +40,11 @@ class Traced(msgspec.Struct, frozen=True):
 
     @property
     def exposure(self) -> float:
-        """That shows what is covered well."""
+        """The exposure that shows well what is covered."""
         return exposure_of(self.shown, self.pixels[..., 3] > 0.5)
 
     def exposed(self) -> Traced:
-        """Times its own exposure, without a tone curve."""
+        """Return the picture times its own exposure, without a tone curve."""
         return Traced(self.pixels * np.array([self.exposure] * 3 + [1.0]))
 
     def over(self, photo: Radiance) -> Radiance:

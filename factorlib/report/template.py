@@ -71,7 +71,7 @@ def number(value: float | None, digits: int = 2) -> str:
 
 
 def significant(value: float | None, digits: int = 3) -> str:
-    """That many significant digits, without an exponent for everyday sizes.
+    """Write a number with that many significant digits, without an exponent for everyday sizes.
 
     >>> significant(0.012345), significant(12345.0), significant(0.0)
     ('0.0123', '12300', '0')

@@ -69,7 +69,7 @@ class Solved(Reflectance, frozen=True):
 
     @property
     def reflectance(self) -> Reflectance:
-        """Without its standard errors."""
+        """The reflectance without its standard errors."""
         return Reflectance(self.diffuse, self.specular, self.roughness)
 
 

@@ -181,7 +181,7 @@ class AngleError(msgspec.Struct, frozen=True):
 
 
 class NormalError(msgspec.Struct, frozen=True):
-    """Over the observed pixels; the null faces the camera everywhere."""
+    """Errors of normals over the observed pixels; the null faces the camera everywhere."""
 
     pixels: int
     estimate: AngleError

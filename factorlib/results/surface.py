@@ -24,7 +24,7 @@ class Tried(msgspec.Struct, frozen=True):
 
     @classmethod
     def of(cls, evidence: Any, stiffness: float | None) -> "Tried":
-        """From the solver's evidence."""
+        """Make one of the solver's evidence."""
         return cls(evidence.held_out_loss_with, evidence.held_out_loss_without, evidence.margin, stiffness)
 
 

@@ -85,7 +85,7 @@ class Child:
 
 
 def taken(children: list[Child], threads: int, run: Path) -> Child:
-    """Of these children one that is alive and free, of that run and number of threads, or a new one among them.
+    """Return, of these children, one that is alive and free, of that run and number of threads, or a new one among them.
 
     It is busy until a call of it has returned.
     """

@@ -50,7 +50,7 @@ class Closure(msgspec.Struct, frozen=True):
 
 
 def source_of(text: str, module: str, is_package: bool) -> Source:
-    """What a module's text says.  Raises SyntaxError, and InputError for a declaration that is none."""
+    """Read what a module's text says.  Raises SyntaxError, and InputError for a declaration that is none."""
     tree = ast.parse(text)
     imports = set()
     for node in ast.walk(tree):

@@ -152,7 +152,7 @@ class Display:
 
 
 class Bars(Display):
-    """On a terminal a bar for each stage that runs, warnings and errors above them; running steps count by their share."""
+    """It shows on a terminal a bar for each stage that runs, warnings and errors above them; running steps count by their share."""
 
     def __init__(self) -> None:
         from rich import progress

@@ -39,7 +39,7 @@ def tenant(store: Store, say: Callable[[str], None]) -> Iterator[Path]:
 
 @contextlib.contextmanager
 def alone(store: Store) -> Iterator[None]:
-    """For what deletes results: no run goes on, and none starts meanwhile."""
+    """Hold the locks of what deletes results: no run goes on, and none starts meanwhile."""
     with _door(store, lambda _: None):
         if any(is_locked(folder / LOCK) for folder in store.tmp.iterdir()):
             raise InputError("a run is going on", file=store.root, cure="wait until it has ended")

@@ -230,7 +230,7 @@ def view_of(store: Store, stage: str, keys: dict[str, str], gather: str | None) 
 
 
 def usual_costs(log_file: Path) -> dict[str, tuple[float, int]]:
-    """By stage, of the steps as they were last made: the mean of their seconds, and the most cores that one took."""
+    """Return by stage, of the steps as they were last made, the mean of their seconds, and the most cores that one took."""
     last: dict[str, dict[str | None, tuple[float, int]]] = {}
     for event in map(msgspec.json.decode, sound_lines(log_file)):
         if event["event"] == "done" and {"seconds", "cores", "threads"} <= event.keys():

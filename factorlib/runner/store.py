@@ -102,7 +102,7 @@ class Store:
 
     @cached_property
     def known(self) -> dict[str, dict[str, Stamp]]:
-        """By tree, the stamps of its files when contents were right."""
+        """Return by tree the stamps of its files when contents were right."""
         return read_cache(self.cache / "trees.json", dict[str, dict[str, Stamp]]) or {}
 
     def damage(self, entry: Entry, read_all: bool = False) -> list[str]:
@@ -156,7 +156,7 @@ class Store:
                 say(f"its kept result was damaged and is replaced; what was there: {aside}")
 
     def keep(self, key: str, entry: Entry) -> None:
-        """From now on `key` has that result."""
+        """Make that the result of `key` from now on."""
         self.keys.mkdir(parents=True, exist_ok=True)
         replace_file(self.keys / f"{key}.json", json_text(entry).encode())
 

@@ -83,7 +83,7 @@ class Survey:
         return list(faults)
 
     def wrong_values(self, planned: list[Planned]) -> list[str]:
-        """Of the parameters that steps would run with: one out of its range, or of another kind.
+        """Return the faults of the parameters that steps would run with: one out of its range, or of another kind.
 
         Only a stage that is given any is imported, in a process of its own: that takes seconds where it computes.
         """

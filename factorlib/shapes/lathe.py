@@ -187,7 +187,7 @@ def mirrors(one: Outline, camera: Camera) -> list[Float[np.ndarray, "3"]]:
     spread = np.arctan(target.extent * target.pixel / 2 / camera.focal)
 
     def normal(angle: float, offset: float) -> np.ndarray:
-        """Of the plane through the middle ray, moved aside by `offset` half extents."""
+        """Return the normal of the plane through the middle ray, moved aside by `offset` half extents."""
         across = np.cos(angle) * x + np.sin(angle) * y
         return across * np.cos(offset * spread) + ray * np.sin(offset * spread)
 
@@ -228,7 +228,7 @@ def _span(outlines: Sequence[Outline], poses: Sequence[Turned]) -> tuple[float, 
 
 
 def carved_by_all(outlines: Sequence[Outline], poses: Sequence[Turned], span: tuple[float, float]) -> Profile:
-    """At each height the largest disc that fits into every outline, as smooth as pixels allow; ends as thin as nothing are cut."""
+    """Return at each height the largest disc that fits into every outline, as smooth as pixels allow; ends as thin as nothing are cut."""
     low, high = span
     if not high > low:
         return np.zeros((0, 2))

@@ -131,7 +131,7 @@ class MaterialPrior:
         ]
 
     def at(self, theta: Float[np.ndarray, "m 7"]) -> Gaussian:
-        """At the materials' unknowns."""
+        """Evaluate the prior at the materials' unknowns."""
         off = theta - self.mean
         value, gradient = float((off**2 * self.wide).sum()), off * self.wide
         hessians = np.tile(np.diag(self.wide), (len(theta), 1, 1))

@@ -71,7 +71,7 @@ class Paper(msgspec.Struct, frozen=True):
 
 
 def solve(problem: JointProblem, materials: int, paper: Paper, report: Report = unreported) -> Solution:
-    """As of the bundle solver: materials 0 … `materials`−1 and one light per block, in the gauge of `factorlib.model.gauge`."""
+    """Solve for what the bundle solver finds: materials 0 … `materials`−1 and one light per block, in the gauge of `factorlib.model.gauge`."""
     problem = problem.with_effects(False, False).with_loss(Loss(prior=paper.prior))
     objective, history, blocks = PaperObjective(problem, materials, paper), list[Event](), problem.blocks
     rows = [np.flatnonzero(~block.held_out) for block in blocks]

@@ -22,7 +22,7 @@ CELL = np.radians(3.0)  # of normals: about as well as poses and meshes are know
 
 
 def sample(observations: Observations, most: int) -> Observations:
-    """At most `most` observations of one photo, in their order; all of them, unchanged, where there are no more."""
+    """Return at most `most` observations of one photo, in their order; all of them, unchanged, where there are no more."""
     if len(observations) <= most:
         return observations
     group = strata(observations, most)

@@ -75,7 +75,7 @@ def transforms_shots(path: str, refuse: Refusal) -> list[Shot]:
 
 
 def _camera(key: str, lens: Lens, refuse: Refusal) -> tuple[pycolmap.Camera, tuple[float, float | None] | None]:
-    """With the size of its image; without `w`, a field of view is a focal length of an image of any width, here ANY_WIDTH."""
+    """Return the camera with the size of its image; without `w`, a field of view is a focal length of an image of any width, here ANY_WIDTH."""
     focal = lens.fl_x
     if focal is None and lens.camera_angle_x is None:
         cure = "give the focal length fl_x in pixels, with w and h"

@@ -108,7 +108,7 @@ class Iterate(msgspec.Struct, frozen=True):
         return dm, dl
 
     def predicted_decrease(self, dm: Float[np.ndarray, " 7m"], dl: Sequence[Float[np.ndarray, " l"]]) -> float:
-        """By how much a step lowers the quadratic model of the loss."""
+        """Return by how much a step lowers the quadratic model of the loss."""
         M, g = self.of_materials()
         decrease = -dm @ (2 * g + M @ dm)
         for part, step in zip(self.parts, dl, strict=True):
@@ -117,7 +117,7 @@ class Iterate(msgspec.Struct, frozen=True):
         return float(decrease)
 
     def information(self) -> tuple[Float[np.ndarray, "7m 7m"], list[Float[np.ndarray, "g 7m"]]]:
-        """That of `factorlib.solve.arrow`, unknowns of lights that are at a bound held."""
+        """Return the information of `factorlib.solve.arrow`, unknowns of lights that are at a bound held."""
         parts = [
             held(
                 part._replace(light_hessian=damped(part.light_hessian, DEFINITE)),
@@ -146,7 +146,7 @@ def evaluate(problem: JointProblem, point: Point) -> Iterate:
 
 
 def fit_weights(problem: JointProblem, point: Point) -> Iterate:
-    """As `evaluate`, with the lobes' weights fitted first: those that lower the loss most while nothing else changes."""
+    """Evaluate a point as `evaluate` does, with the lobes' weights fitted first: those that lower the loss most while nothing else changes."""
     fits = problem.spread(partial(with_weights_fitted, loss=problem.loss), problem.illuminations(point))
     lights, parts = zip(*fits, strict=True)
     return Iterate(Point(point.materials, list(lights)), list(parts))

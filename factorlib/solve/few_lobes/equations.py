@@ -99,7 +99,7 @@ class Whitened(NamedTuple):
 
 
 def whitened(one: Illumination, radiance: Float[np.ndarray, "n 3"], loss: Loss) -> Whitened:
-    """Of observations that the model says show `radiance`; those that are held out have weight 0."""
+    """Return the whitened residuals of observations that the model says show `radiance`; those that are held out have weight 0."""
     residual = one.block.residuals(radiance)
     pull = one.pull(residual, loss)
     lost = float(loss.of_residuals(residual)[~one.block.held_out].sum())

@@ -41,7 +41,7 @@ class Candidates(msgspec.Struct, frozen=True):
 
 
 def candidates(illumination: Illumination, seed: int, sample: int = SAMPLE) -> Candidates:
-    """At `sample` of the observations, or all of fewer, drawn by `seed`."""
+    """Return candidates at `sample` of the observations, or all of fewer, drawn by `seed`."""
     rows, lobes = np.flatnonzero(~illumination.block.held_out), dictionary(illumination.materials.sharpest)
     if len(rows) > sample:
         rows = np.sort(np.random.default_rng(seed).choice(rows, sample, replace=False))

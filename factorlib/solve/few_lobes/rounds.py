@@ -113,7 +113,7 @@ def round_after(sample: JointProblem, point: Point, options: FewLobes, record: R
 
 
 def gained(sample: JointProblem, best: Point | None, point: Point) -> tuple[float, float]:
-    """By how much the held-out loss of `point` is below the best round's, and the standard error of this difference.
+    """Return by how much the held-out loss of `point` is below the best round's, and the standard error of this difference.
 
     Both points are judged by the same observations; those that are hard for both tell nothing of the difference.  Infinitely, before
     there is a best round.
