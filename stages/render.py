@@ -16,7 +16,7 @@ from factorlib.geometry.sphere import ball_normals
 from factorlib.images.exr import read_exr, write_exr
 from factorlib.images.picture import exposure_of, picture, write_png
 from factorlib.images.tone import shown
-from factorlib.model.interreflection import bounced_light
+from factorlib.inference.interreflection import bounced_light
 from factorlib.reflection import reflection_operator
 from factorlib.render.reflect import TAIL, Reflector
 from factorlib.render.resynthesis import Surroundings, ball, light_of, observed_cells, resynthesised

@@ -15,55 +15,51 @@ import numpy as np
 
 from factorlib.checkpoint import Checkpoint
 from factorlib.dataset.schema import KnownSlice, LightSlice
-from factorlib.diagnose.answer import Answer
-from factorlib.diagnose.identifiability import after_solving, before_solving, unusable_observations
-from factorlib.diagnose.uncertainty import uncertainty_of
 from factorlib.errors import InputError
 from factorlib.images.exr import LAT_LONG, write_rgb_exr
 from factorlib.images.light_map import read_light_map
+from factorlib.inference import options
+from factorlib.inference.answer import Answer
+from factorlib.inference.history import Event, Solution, of_parts, of_rounds
+from factorlib.inference.identifiability import after_solving, before_solving, unusable_observations
+from factorlib.inference.joint_solver import solve
+from factorlib.inference.known import what_is_known
+from factorlib.inference.noise import Loss, Noise
+from factorlib.inference.observed import blocks_of_observations, gathered, usable
+from factorlib.inference.paper_solver import REPORTS, Paper, Prior, Samplings
+from factorlib.inference.paper_solver import solve as solve_as_the_paper
+from factorlib.inference.problem import JointProblem
+from factorlib.inference.resume import Parts
+from factorlib.inference.start import from_earlier, from_nothing, with_decided
+from factorlib.inference.uncertainty import uncertainty_of
 from factorlib.jsonfile import write_json
-from factorlib.model.known import what_is_known
-from factorlib.model.noise import Loss, Noise
-from factorlib.model.observed import blocks_of_observations, gathered, usable
-from factorlib.model.problem import JointProblem
 from factorlib.parquetfile import write_rows
 from factorlib.reflection import reflection_operator
 from factorlib.results.lobes import write_lobes
 from factorlib.results.solution import Earlier, read_earlier
-from factorlib.solve import options
-from factorlib.solve.few_lobes.solve import few_lobes
-from factorlib.solve.history import Event, Solution, of_parts, of_rounds
-from factorlib.solve.paper import REPORTS, Paper, Prior, Samplings
-from factorlib.solve.paper import solve as solve_as_the_paper
-from factorlib.solve.resume import Parts
-from factorlib.solve.solve import solve
-from factorlib.solve.start import from_earlier, from_nothing, with_decided
 from factorlib.stage import Inputs, Progress
 from factorlib.urm import observations as urm
 
-log = logging.getLogger("factorlib.solve")
+log = logging.getLogger("factorlib.inference")
 PAPER = Paper()  # where its defaults stand
 ERRORS = 0.07  # share of the time that standard errors take, on data/eames
 
 
-class Params(options.FewLobes, frozen=True, forbid_unknown_fields=True):
-    """Those of the joint solve, those of the solver of few lobes, those of the paper's solver (paper_…), and what all take.
+class Params(options.Choices, frozen=True, forbid_unknown_fields=True):
+    """Parameters of the joint solver, of the paper's solver (paper_…), and of both.
 
     The folder `start`, where one is given, holds an earlier solution: materials and lights that have their names there start
     from it, and whether there are shadows, and whether surfaces light each other, stays as it was decided there.
     """
 
-    solver: Literal["bundle", "few_lobes", "paper"] = "bundle"
-    """bundle: this project's solver, lights are cells; few_lobes: lights are few lobes, for exact scenes; paper: that of Wang, Ritschel
-    and Mitra, the baseline."""
+    solver: Literal["joint", "paper"] = "joint"
+    """joint: this project's solver; paper: that of Wang, Ritschel and Mitra, the baseline."""
     operator: Literal["auto", "network", "closed_form", "reference", "paper_network"] = "auto"
     """How a lobe's reflection is computed; auto: network, and paper_network for the paper's solver."""
     merge_degrees: Annotated[float, msgspec.Meta(ge=0, le=30)] = 2.0
     """Observations of one material and photo whose normals and views differ by less, in degrees, are merged before solving."""
     held_out: Annotated[float, msgspec.Meta(ge=0, le=0.5)] = 0.1
     """Share of the observations that is not fitted and chooses the model."""
-    prior: Prior = Loss().prior
-    """Weight of the paper's prior on the tint of lights, for the solver of few lobes."""
     paper_lobes: options.Lobes = PAPER.lobes
     """Lobes of an illumination, for the paper's solver."""
     paper_samplings: Samplings = PAPER.samplings
@@ -108,11 +104,11 @@ def main(params: Params, inputs: Inputs, out: Path, progress: Progress) -> None:
 def _given(params: Params, inputs: Inputs) -> KnownSlice:
     """What dataset.yaml says is known; InputError where the solver takes neither that nor the earlier solution that is given."""
     known = msgspec.convert(inputs.facts.get("dataset.known", {}), KnownSlice)
-    if params.solver != "bundle" and known != KnownSlice():
-        cure = "leave `known` out of dataset.yaml, or set solve.solver=bundle"
+    if params.solver == "paper" and known != KnownSlice():
+        cure = "leave `known` out of dataset.yaml, or set solve.solver=joint"
         raise InputError(f"the solver {params.solver} finds everything itself", key="known", cure=cure)
-    if params.solver != "bundle" and "start" in inputs.folders:
-        cure = "leave it out, or set solve.solver=bundle"
+    if params.solver == "paper" and "start" in inputs.folders:
+        cure = "leave it out, or set solve.solver=joint"
         raise InputError(f"the solver {params.solver} starts from nothing", key="solve.start", cure=cure)
     return known
 
@@ -130,7 +126,7 @@ def _problem(
     tables = {name: inputs["urm"] / f"{ball.photo}.parquet" for name, ball in given.balls.items()}
     balls = {name: urm.at_one_exposure(usable(urm.read_observations(t)), relative) for name, t in tables.items()}
     seen, known = what_is_known(given, maps, balls, urm.at_one_exposure(seen, relative), lights)
-    if params.solver != "bundle":  # the others know no detail of reflectance
+    if params.solver == "paper":  # it knows no detail of reflectance
         seen = msgspec.structs.replace(seen, detail=None)
     rotations = {photo: np.array(world) for photo, world in worlds.items() if world is not None}
     how = {"held_out": params.held_out, "world_from_camera": rotations, "seed": params.seed}
@@ -138,7 +134,7 @@ def _problem(
     automatic = "paper_network" if params.solver == "paper" else "network"
     operator = automatic if params.operator == "auto" else params.operator
     reflection = reflection_operator(operator, weights=inputs["train"])
-    return JointProblem(blocks, reflection, Loss(prior=params.prior), inputs.map, known)
+    return JointProblem(blocks, reflection, Loss(), inputs.map, known)
 
 
 def _solved(
@@ -148,8 +144,6 @@ def _solved(
     if params.solver == "paper":
         paper = Paper(params.paper_lobes, params.paper_samplings, params.paper_prior, params.seed)
         return solve_as_the_paper(problem, len(names), paper, of_rounds(progress, REPORTS))
-    if params.solver == "few_lobes":
-        return few_lobes(problem, len(names), params, of_rounds(progress, params.rounds))
     unfinished = Checkpoint(inputs.unfinished / "solve.pt" if inputs.unfinished else None)
     start = from_earlier(earlier, names) if earlier else from_nothing(len(names))
     choices = with_decided(params, earlier) if earlier else params

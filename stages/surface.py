@@ -1,7 +1,7 @@
 """Normals by shading: all photos together say how the meshes' surfaces differ from the given ones.
 
 Materials and lights are fitted as the solve begins; then normals turn until they explain all photos best, and stay so only where photos that had no
-part in it gain (`factorlib.surface.choice`).  Then detail of reflectance likewise, over what shape explains.
+part in it gain (`factorlib.inference.surface_detail`).  Then detail of reflectance likewise, over what shape explains.
 Writes surface.json, and where surfaces differ photos/<photo>.exr: the normals that every later stage uses in place of those of `align`, and detail.
 """
 
@@ -14,22 +14,22 @@ from jaxtyping import Int
 
 from factorlib.dataset.schema import LightSlice, ObjectsSlice
 from factorlib.images.exr import read_exr, write_exr
+from factorlib.inference.noise import Noise
+from factorlib.inference.observed import blocks_of_observations, usable
+from factorlib.inference.problem import JointProblem
+from factorlib.inference.start import from_nothing
+from factorlib.inference.surface_attach import attached_pixels
+from factorlib.inference.surface_detail import Found, Surfaces, found
+from factorlib.inference.surface_turns import Attached, Detail, joined, no_detail
 from factorlib.jsonfile import write_json
 from factorlib.light.prior import read_light_prior
 from factorlib.meshes.fine import fine
 from factorlib.meshes.read import CREASE_DEG, MeshesOnce
-from factorlib.model.noise import Noise
-from factorlib.model.observed import blocks_of_observations, usable
-from factorlib.model.problem import JointProblem
 from factorlib.reflection import reflection_operator
 from factorlib.results.poses import FILE as POSES
 from factorlib.results.poses import PhotoPoses, read_poses
 from factorlib.results.surface import FILE, SurfaceTable, Tried
-from factorlib.solve.start import from_nothing
 from factorlib.stage import Inputs, Progress
-from factorlib.surface.attach import attached_pixels
-from factorlib.surface.choice import Found, Surfaces, found
-from factorlib.surface.turns import Attached, Detail, joined, no_detail
 from factorlib.urm.extract import Channels
 from factorlib.urm.observations import (
     Observations,

@@ -6,10 +6,8 @@ The libraries read these variables when they are loaded, so no plugin of pytest 
 import pytest
 from hypothesis import HealthCheck, settings
 
-from factorlib.arithmetic import fix
 from tests.runner import toy
 
-fix()
 settings.register_profile("untimed", deadline=None, suppress_health_check=[HealthCheck.too_slow])
 settings.load_profile("untimed")  # a busy machine fails no test
 

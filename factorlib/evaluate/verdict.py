@@ -6,7 +6,7 @@ expected to be
     e² = FLOOR + MATERIALS m² + CLIPPED c² + UNEXPLAINED √u + CONTOUR d                                                 (1)
 
 m²  by how much a ball changes where each reflectance and each roughness is wrong by one standard error: squares summed over these, mean over balls
-c   share of values that are clipped, mean over photos;  u: share of the shading that is not explained (`factorlib.diagnose.misfit`)
+c   share of values that are clipped, mean over photos;  u: share of the shading that is not explained (`factorlib.inference.misfit`)
 d   how far meshes' outlines lie from their masks' (`contour_error` of poses.json), mean over objects
 
 and −10 log₁₀ e² is the expected score in dB.  The weights were fitted to 44 made sets of very different quality, and `GOOD` and `POOR` chosen on them, so that none
@@ -22,7 +22,7 @@ import numpy as np
 from factorlib.evaluate.ball import Light
 from factorlib.evaluate.picture import tone_mapped
 from factorlib.evaluate.relighting import MEAN_SHOWN, Appearances
-from factorlib.model.materials import ROUGHNESS
+from factorlib.inference.materials import ROUGHNESS
 from factorlib.results.materials import Misfit, Reflectance, Solved
 from factorlib.results.metrics import Verdict
 

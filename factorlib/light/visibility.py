@@ -15,7 +15,6 @@ from __future__ import annotations
 
 import math
 
-import numpy as np
 import torch
 from jaxtyping import Float
 from torch import Tensor
@@ -32,7 +31,7 @@ def widest_sharpness(count: int) -> float:
 
 def cosine_weights(normals: Float[Tensor, "n 3"], directions: Float[Tensor, "k 3"]) -> Float[Tensor, "n k"]:
     """f of equation (1), each row's sum 1."""
-    cosine = product(normals, directions.T).clamp_min(0)
+    cosine = normals @ directions.T.clamp_min(0)
     return cosine / cosine.sum(1, keepdim=True).clamp_min(1e-12)
 
 
@@ -41,12 +40,12 @@ def highlight_weights(
 ) -> Float[Tensor, "n k"]:
     """f of equation (2), each row's sum 1."""
     square = roughness**4 + 1 / widest_sharpness(len(directions))  # α² and that of the directions' spacing
-    nd, no, od = product(normals, directions.T), (normals * views).sum(1, keepdim=True), product(views, directions.T)
+    nd, no, od = normals @ directions.T, (normals * views).sum(1, keepdim=True), views @ directions.T
     upper = (nd > 0).to(nd.dtype)
     nd = nd.clamp_min(1e-6)
     nh2 = ((nd + no) ** 2 / (2 + 2 * od).clamp_min(1e-6)).clamp(0, 1)
     spread = nh2 * (square - 1) + 1
-    root = square_root(square + (1 - square) * nd * nd)
+    root = torch.sqrt(square + (1 - square) * nd * nd)
     weight = upper * square / spread**2 * nd / (nd + root)
     return weight / weight.sum(1, keepdim=True).clamp_min(1e-12)
 
@@ -68,18 +67,4 @@ def seen_share(
     visibility: Float[Tensor, "n k"], weights: Float[Tensor, "n k"], lobes: Float[Tensor, "k p"]
 ) -> Float[Tensor, "n p"]:
     """v: of the light of `lobes` (their `kernel`) that `weights` reflect, the share that `visibility` lets pass."""
-    return (product(visibility * weights, lobes) + LEAST) / (product(weights, lobes) + LEAST)
-
-
-# torch.sqrt is MKL's, which is off by one unit in the last place now and then, and not at the same places on every processor.  torch's products are
-# MKL's, too, whose code for processors of any maker is five times slower than OpenBLAS, which NumPy calls (`factorlib.arithmetic`).
-
-
-def square_root(x: Float[Tensor, "*n"]) -> Float[Tensor, "*n"]:
-    """√x as IEEE 754 rounds it, without derivative."""
-    return torch.from_numpy(np.sqrt(x.numpy()))
-
-
-def product(a: Float[Tensor, "n k"], b: Float[Tensor, "k m"]) -> Float[Tensor, "n m"]:
-    """The product of two matrices, without derivative."""
-    return torch.from_numpy(a.numpy() @ b.numpy())
+    return ((visibility * weights) @ lobes + LEAST) / (weights @ lobes + LEAST)

@@ -45,7 +45,7 @@ def light_of(exported: Path, photo: str, light: LightSlice) -> Lobes:
 class Surroundings(msgspec.Struct, frozen=True):
     """What a photo's n observations have of the light (their visibility) and of the surfaces that hide it.
 
-    sent    G_d and G_s of `factorlib.model.interreflection`, in the unit of the picture over the factor of the materials' gauge; None: nothing
+    sent    G_d and G_s of `factorlib.inference.interreflection`, in the unit of the picture over the factor of the materials' gauge; None: nothing
     """
 
     seen: Observations

@@ -117,8 +117,7 @@ class Model(msgspec.Struct, frozen=True):
     """What was decided of the model, and by what.
 
     lobes:           number of lobes, or cells, by illumination
-    held_out_loss:   after each round, of a solver that has rounds
-    specular:        whether a material has a specular part
+    held_out_loss:   after each report of the paper's solver
     light_prior:     whether lights are cells that follow the statistics of natural light
     self_shadowing_chosen_by, interreflection_chosen_by: the held-out loss of each model that was tried, and the margin in standard errors
     splitting_chosen_by: of each time that cells were split
@@ -128,12 +127,10 @@ class Model(msgspec.Struct, frozen=True):
                      distance_chosen_by: by illumination
     """
 
-    solver: Literal["bundle", "few_lobes", "paper"] = "bundle"
+    solver: Literal["joint", "paper"] = "joint"
     lobes: dict[str, int] = {}
     lobes_chosen_by: str = ""
     held_out_loss: list[float] = []
-    specular: dict[str, bool] = {}
-    specular_chosen_by: dict[str, Decision] = {}
     self_shadowing: bool = False
     self_shadowing_chosen_by: dict[str, float] = {}
     interreflection: bool = False
@@ -161,7 +158,7 @@ class MaterialTable(msgspec.Struct, frozen=True):
 
 
 class Misfit(msgspec.Struct, frozen=True):
-    """How a photo is explained: the share of its shading that is not (`factorlib.diagnose.misfit`), and of its values that are clipped."""
+    """How a photo is explained: the share of its shading that is not (`factorlib.inference.misfit`), and of its values that are clipped."""
 
     unexplained: AtLeast0
     clipped: AtLeast0

@@ -23,7 +23,6 @@ from multiprocessing.reduction import ForkingPickler
 from pathlib import Path
 from typing import Any
 
-from factorlib import arithmetic
 from factorlib.errors import InputError
 from factorlib.runner.project import LIBRARY
 
@@ -44,7 +43,6 @@ class Child:
         fixed = {
             "PYTHONHASHSEED": "0",
             "OMP_WAIT_POLICY": "PASSIVE",  # threads that wait by spinning stand in the way of others, and of each other
-            **arithmetic.VARIABLES,
             **dict.fromkeys(THREAD_VARIABLES, str(threads)),
         }
         environment = {name: value for name, value in os.environ.items() if name != TRIM} | fixed

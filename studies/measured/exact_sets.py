@@ -10,17 +10,17 @@ import numpy as np
 
 from factorlib.evaluate.ball import light_of_lat_long
 from factorlib.evaluate.materials import common_factor
-from factorlib.model.blocks import Block
-from factorlib.model.illumination import Illumination
-from factorlib.model.noise import Noise
-from factorlib.model.observed import blocks_of_observations
-from factorlib.model.problem import JointProblem
+from factorlib.inference.blocks import Block
+from factorlib.inference.forward import Illumination
+from factorlib.inference.noise import Noise
+from factorlib.inference.observed import blocks_of_observations
+from factorlib.inference.problem import JointProblem
 from factorlib.reflection import reflection_operator
 from factorlib.results.materials import Reflectance
 from factorlib.solve.few_lobes.solve import few_lobes
-from factorlib.solve.history import Solution
-from factorlib.solve.solve import solve
-from factorlib.solve.start import from_nothing
+from factorlib.inference.history import Solution
+from factorlib.inference.joint_solver import solve
+from factorlib.inference.start import from_nothing
 from factorlib.urm.merge import merge
 from factorlib.urm.observations import concatenate
 from studies.measured.tools import Clock, Tables, exact

@@ -18,7 +18,7 @@ import typer
 from factorlib.errors import InputError
 from factorlib.jsonfile import json_text, write_json
 from factorlib.reading import read_bytes, reading
-from factorlib.solve.material_prior import Classes, MaterialClass
+from factorlib.inference.priors import Classes, MaterialClass
 
 # Effect paints, satins with metallic threads and iridescent foils have flakes or wires that reflect as metal does.
 METALS = (

@@ -23,10 +23,10 @@ from factorlib.generate.chair import chair, labelled
 from factorlib.geometry.camera import Camera, Pose, rotation_of_vector
 from factorlib.geometry.raster import Caster, rasterise
 from factorlib.meshes.mesh import Mesh
-from factorlib.model.blocks import Block
-from factorlib.model.illumination import Illumination
-from factorlib.model.lights import Light
-from factorlib.model.materials import Materials
+from factorlib.inference.blocks import Block
+from factorlib.inference.forward import Illumination
+from factorlib.inference.lights import Light
+from factorlib.inference.materials import Materials
 from factorlib.refine.light import Surfaces
 from factorlib.refine.photo import PosedObject, Refined, Scene, refined_photo
 from factorlib.refine.pixels import pixels_of

@@ -3,10 +3,10 @@
 import msgspec
 import numpy as np
 
-from factorlib.model.blocks import Block
-from factorlib.model.illumination import Illumination
-from factorlib.model.lights import Light
-from factorlib.model.materials import Materials
+from factorlib.inference.blocks import Block
+from factorlib.inference.forward import Illumination
+from factorlib.inference.lights import Light
+from factorlib.inference.materials import Materials
 
 MATERIALS = Materials(
     diffuse=np.array([[0.5, 0.1, 0.1], [0.2, 0.4, 0.25], [0.1, 0.12, 0.2]]),

@@ -31,7 +31,7 @@ from factorlib.conventions import YUP_FROM_CAMERA, lat_long_directions
 from factorlib.errors import InputError
 from factorlib.images.exr import LAT_LONG, write_rgb_exr
 from factorlib.jsonfile import json_text, write_json
-from factorlib.model.materials import ROUGHNESS
+from factorlib.inference.materials import ROUGHNESS
 from factorlib.results.materials import Reflectance, read_materials
 from factorlib.stage import Inputs, Progress
 from factorlib.tracing.scene import MITSUBA_FROM_CAMERA, rgb, rigid, transform

@@ -29,7 +29,7 @@ from factorlib.parquetfile import write_rows
 from factorlib.reflection.network import Layers, write_layers
 from factorlib.results.materials import Reflectance
 from factorlib.runner.project import LIBRARY
-from factorlib.solve.history import Event
+from factorlib.inference.history import Event
 from factorlib.urm.observations import write_observations
 from factorlib.wholefile import bytes_of, replace_file, write_text
 from tests.faults import good

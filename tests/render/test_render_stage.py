@@ -12,7 +12,7 @@ from factorlib.images.exr import read_exr, read_rgb_exr, write_exr
 from factorlib.images.tone import curve
 from factorlib.jsonfile import read_json, write_json
 from factorlib.light.lobes import no_lobes
-from factorlib.model.interreflection import bounced_light
+from factorlib.inference.interreflection import bounced_light
 from factorlib.reflection import reflection_operator
 from factorlib.results.lobes import write_lobes
 from factorlib.results.materials import read_materials
@@ -21,7 +21,7 @@ from factorlib.urm.observations import write_observations
 from stages import render
 from tests.export import made_export
 from tests.export.made_export import instead
-from tests.model.made import seen_from_the_front
+from tests.inference.made import seen_from_the_front
 from tests.runner.toy import files_of
 
 FAST = render.Params(operator="closed_form", ball_size=33, map_size=32)

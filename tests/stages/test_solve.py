@@ -13,9 +13,9 @@ from factorlib.images.exr import LAT_LONG, write_rgb_exr
 from factorlib.jsonfile import read_json
 from factorlib.light.latlong import lat_long_of_lobes
 from factorlib.light.lobes import Lobes
-from factorlib.model.illumination import Illumination
-from factorlib.model.noise import Noise
-from factorlib.model.observed import blocks_of_observations
+from factorlib.inference.forward import Illumination
+from factorlib.inference.noise import Noise
+from factorlib.inference.observed import blocks_of_observations
 from factorlib.reflection import reflection_operator
 from factorlib.reflection.network import SHIPPED
 from factorlib.results.lobes import read_lobes
@@ -24,7 +24,7 @@ from factorlib.stage import Inputs, silent
 from factorlib.urm.observations import Observations, write_observations
 from stages import solve
 from studies.scenes.problems import MATERIALS, random_light, sphere_normals
-from tests.model.made import seen_from_the_front
+from tests.inference.made import seen_from_the_front
 from tests.runner.toy import files_of
 from tests.stages.made import Rising
 

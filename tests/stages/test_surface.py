@@ -14,15 +14,15 @@ from factorlib.images.exr import write_exr
 from factorlib.meshes.fine import fine
 from factorlib.meshes.ply import write_ply
 from factorlib.meshes.read import CREASE_DEG, MeshesOnce, read_mesh
-from factorlib.model.noise import Noise
-from factorlib.model.observed import blocks_of_observations, gathered
+from factorlib.inference.noise import Noise
+from factorlib.inference.observed import blocks_of_observations, gathered
 from factorlib.results.materials import Reflectance
 from factorlib.results.surface import SurfaceTable, read_surface
 from factorlib.stage import Inputs, serial_map, silent
 from factorlib.urm.geometry import on_surface, read_geometry
 from factorlib.urm.observations import Observations, write_observations
 from stages import surface
-from tests.model.made import seen_from_the_front
+from tests.inference.made import seen_from_the_front
 
 SIZE = 12
 

@@ -38,7 +38,12 @@ def test_wrong_names_and_words_are_answered(words, environment, said):
 @pytest.mark.parametrize(
     "name, step, there, absent",
     [
-        (NAME, "solve", ["stages.solve", "factorlib.solve.solve"], ["errors", "steps.score", "catalogue.matrix_size"]),
+        (
+            NAME,
+            "solve",
+            ["stages.solve", "factorlib.inference.joint_solver"],
+            ["errors", "steps.score", "catalogue.matrix_size"],
+        ),
         ("comparison", "answer", ["stages.solve"], ["steps.compare", "methods"]),
     ],
 )

@@ -1,1 +1,0 @@
-"""What the data can and cannot say about an answer: standard errors (`uncertainty`), what is open, in sentences (`identifiability`)."""

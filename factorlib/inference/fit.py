@@ -1,0 +1,192 @@
+"""Materials and lights fitted together, by marginal likelihood, and how much each light's observations and prior count.
+
+If residuals were independent, the sum of them over a cluster of n would have a variance of n σ².  It is larger, for residuals are alike (the
+design effect of L. Kish, Survey Sampling, 1965), and larger than the noise model says.  The factor is the temperature T, by which squared
+residuals are divided:
+
+    T = Σ_k (Σ_{i in k} r_i)² / Σ_k n_k, at least `least`     k: clusters of nearby mirror directions;  r: in σ, clipped at 3   (1)
+
+`least` is 1 while materials are fitted: cells are always a little too coarse, and were T below 1, materials would absorb that error.  Given the materials, lights may be as exact as the residuals are.
+
+Every light has its own, so that a photo whose mesh fits badly counts less; it is estimated anew before each descent.  So are the factors by
+which the light's contrast and colour differ from those of a typical light (equation (4) of `factorlib.light.prior`).
+
+Materials are fitted to the observations whose normals are sure (`sure_ones`), for a highlight at a wrong normal says that the material is
+rougher than it is, however little it weighs.  Lights are fitted once more to all observations, given those materials: rims and thin parts
+show directions that nothing else shows.
+"""
+
+from __future__ import annotations
+
+import msgspec
+import numpy as np
+from jaxtyping import Bool, Float
+
+from factorlib.inference.arrow import System
+from factorlib.inference.blocks import Block
+from factorlib.inference.forward import Illumination
+from factorlib.inference.lights import Light
+from factorlib.inference.likelihood import Field, positive_definite_inverse
+from factorlib.inference.materials import Materials, Point
+from factorlib.inference.noise import Loss
+from factorlib.inference.optimizer import Descent, Report
+from factorlib.inference.priors import MaterialPrior, materials_of, unknowns_of
+from factorlib.inference.problem import JointProblem
+from factorlib.inference.responses import Reflections
+from factorlib.light.prior import LightPrior
+
+SURE = 0.6  # times the typical confidence of a material's normals: what is less sure is left out
+DARK = 0.2  # of the noise model's absolute part is left where normals are sure
+ROBUST = Loss(3.0)  # beyond 3 σ of the noise model a residual is an outlier
+START_TEMPERATURE = 10.0
+SUNS = 1.0  # standard deviation of a sun's log radiance: outdoors, captured lights send a third to twice as much by it as by the sky
+# Of reflectances: by its logarithm the derivative of a smaller one is nearly zero, and no step would move it.
+LEAST_AT_START = 0.01
+
+
+class Hyperparameters(msgspec.Struct, frozen=True):
+    """How much one light's observations and prior count.
+
+    temperature   T of (1), by which squared residuals are divided
+    factors       s_k² of the prior: contrast of luminance and of colour beside those of a typical light
+    """
+
+    temperature: float = START_TEMPERATURE
+    factors: list[float] = msgspec.field(default_factory=lambda: [1.0, 1.0, 1.0])
+
+
+class Fit(msgspec.Struct, frozen=True):
+    """A point, how much each light's observations and prior count there, and minus twice the log marginal likelihood."""
+
+    point: Point
+    hyperparameters: list[Hyperparameters]
+    value: float = float("inf")
+
+    def with_lights(self, lights: list[Light]) -> Fit:
+        """Return the start of another fit, in other lights."""
+        return msgspec.structs.replace(self, point=Point(self.point.materials, lights))
+
+
+class Schedule(msgspec.Struct, frozen=True):
+    """How many steps a fit takes.
+
+    lights     of the lights alone, materials given, before all else
+    together   of lights and, unless they are given, materials; hyperparameters are estimated anew before each of these descents but the first
+    estimate   whether they are estimated before the first one too: right after a splitting, residuals show the splitting, not the noise
+    least      the least temperature of (1)
+    given      whether materials stay as they are
+    """
+
+    lights: int = 0
+    together: tuple[int, ...] = ()
+    estimate: bool = True
+    least: float = 1.0
+    given: bool = False
+
+    @property
+    def points(self) -> int:
+        """The largest number of points that a fit tries."""
+        return self.lights + 1 + sum(iterations + 1 for iterations in self.together)
+
+
+def fitted(
+    problem: JointProblem,
+    start: Fit,
+    prior: LightPrior,
+    schedule: Schedule,
+    report: Report = lambda loss: None,
+) -> Fit:
+    """The fit of the observations that are not held out.
+
+    start: where the descent begins; its cells stay;  report: called at every point that is tried, with the mean robust loss of what is fitted
+    """
+    problem, given, hyperparameters = problem.fitted(), schedule.given, start.hyperparameters
+    materials = start.point.materials if given else problem.known.put(above_zero(start.point.materials))
+    prior_on_materials = MaterialPrior(materials, problem.blocks, problem.known)
+    descent = Descent(prior_on_materials, problem.spread, report, problem.known.free(len(materials)))
+    illuminations = problem.illuminations(Point(materials, start.point.lights))
+    pairs = list(zip(illuminations, hyperparameters, strict=True))
+    fields = list(problem.spread(lambda pair: field_of(*pair, prior, given), pairs))
+    state = descent.run(fields, unknowns_of(materials), True, schedule.lights)
+    for number, iterations in enumerate(schedule.together):
+        fields = state.fields
+        if number or schedule.estimate:
+            parts = list(zip(fields, state.parts, strict=True))
+            hyperparameters = list(problem.spread(lambda part: estimated(*part, schedule.least), parts))
+            fields = [recounted(field, one) for field, one in zip(fields, hyperparameters, strict=True)]
+        state = descent.run(fields, state.theta, given, iterations)
+    lights = [field.illumination.light for field in state.fields]
+    return Fit(Point(materials if given else materials_of(state.theta), lights), hyperparameters, state.value)
+
+
+def field_of(
+    illumination: Illumination, one: Hyperparameters, prior: LightPrior, materials_given: bool = False
+) -> Field:
+    """Give an illumination its table of responses, and say how much its observations and the prior count."""
+    table = Reflections(illumination.block, illumination.light.unit_lobes, illumination.operator, materials_given)
+    field = Field(msgspec.structs.replace(illumination, table=table), prior, np.zeros((0, 0)), 0.0, 1.0, ROBUST)
+    return recounted(field, one)
+
+
+def recounted(field: Field, one: Hyperparameters) -> Field:
+    """Return the field as other hyperparameters weight it."""
+    light = field.illumination.light
+    Q, log_determinant = field.prior.precision(light.axis[~light.suns], one.factors)
+    if light.suns.any():  # of which the prior on cells knows nothing
+        own, cells = np.tile(light.suns, 3), Q
+        Q = np.diag(np.where(own, SUNS**-2.0, 0.0))
+        Q[np.ix_(~own, ~own)] = cells
+    if light.held.any():  # the precision of the others, given these, is their part of Q
+        free = np.tile(light.free, 3)
+        log_determinant = float(np.linalg.slogdet(Q[np.ix_(free, free)])[1])
+    return msgspec.structs.replace(field, precision=Q, log_determinant=log_determinant, temperature=one.temperature)
+
+
+def estimated(field: Field, part: System, least: float) -> Hyperparameters:
+    """The hyperparameters by the residuals and the light that a descent ended with; part: its system there."""
+    light = field.illumination.light
+    cells, free = (np.flatnonzero(np.tile(which, 3)) for which in (~light.suns, light.free))
+    covariance = np.zeros((3 * len(light), 3 * len(light)))
+    own = part.light_hessian[: len(free), : len(free)]
+    covariance[np.ix_(free, free)] = positive_definite_inverse(own).matrix
+    covariance = covariance[np.ix_(cells, cells)]
+    factors = field.prior.likeliest_factors(light.axis[~light.suns], light.log_radiance[:, ~light.suns], covariance)
+    return Hyperparameters(temperature(field.illumination.block, field.illumination.residuals(), least), factors)
+
+
+def temperature(block: Block, residual: Float[np.ndarray, "n 3"], least: float = 1.0) -> float:
+    """T of (1)."""
+    number, bounded = block.clusters(), residual.clip(-ROBUST.robust_scale, ROBUST.robust_scale)
+    sums = [np.bincount(number, channel) for channel in bounded.T]
+    return max(float(np.square(sums).sum()) / max(residual.size, 1), least)
+
+
+def above_zero(materials: Materials) -> Materials:
+    """The materials, reflectances raised to at least `LEAST_AT_START`."""
+    rows = materials.rows()
+    rows[:, :6] = np.maximum(rows[:, :6], LEAST_AT_START)
+    return Materials.of_rows(rows)
+
+
+def sure_ones(problem: JointProblem) -> JointProblem:
+    """The observations that materials are fitted to: those whose normals are sure, with less noise in the dark."""
+    noises = [msgspec.structs.replace(block.noise, absolute=DARK * block.noise.absolute) for block in problem.blocks]
+    return problem.of([b.take(sure(b)).with_noise(noise) for b, noise in zip(problem.blocks, noises, strict=True)])
+
+
+def sure(block: Block) -> Bool[np.ndarray, " n"]:
+    """Whether each normal's confidence is at least `SURE` times the median of its material in this light, by weight."""
+    result = np.ones(len(block), bool)
+    if block.confidence is None:
+        return result
+    weight = np.square(block.precision * block.noise.sigma(block.radiance)).max(1)
+    for m in np.unique(block.material):
+        rows = block.material == m
+        typical = np.quantile(block.confidence[rows], 0.5, weights=weight[rows], method="inverted_cdf")
+        result[rows] = block.confidence[rows] >= SURE * typical
+    return result
+
+
+def start_of(point: Point) -> Fit:
+    """Return the fit that a point is before any descent."""
+    return Fit(point, [Hyperparameters() for _ in point.lights])

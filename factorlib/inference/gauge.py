@@ -1,0 +1,94 @@
+"""Which materials and lights are linked, and the gauge: the data leave one factor per channel and connected component free, between reflectances and lights.
+
+Where surfaces light each other (interreflection), what they send is known and no factor is free, nor where a reflectance or a light is known
+(`factorlib.inference.known`): such a component stays as it is.  Where a light is known but for one factor, it settles the tint.
+
+Tint   Lights are as near to grey as they can be, which is what the paper's prior asks for.  With E_ic the summed lobe energies of
+       light i, the factors s_c minimise Σ_i Σ_c (log s_c E_ic − mean_c log s_c E_ic)²: s_c is one over the geometric mean over
+       lights of E_ic, each light counting alike.  In logarithms the rule does not depend on the gauge it starts from.
+       The paper sums weights, which are peaks.  Where one fit has one broad lobe and another has several sharper ones in its place,
+       their summed weights differ, but their summed energies agree.
+Scale  The largest k_d + k_s of a component's materials is `BRIGHTEST`: a bright material in the room reflects most of
+       the light, which is what photographs of objects show, and Mitsuba needs it below one.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import msgspec
+import numpy as np
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components as components_of_graph
+
+from factorlib.inference.blocks import Block
+from factorlib.inference.known import Known
+from factorlib.inference.materials import Materials, Point
+
+BRIGHTEST = 0.9
+LEAST_ENERGY = 1e-3  # of a light's brightest channel: a light without any blue has no say in how blue the others are
+RULE = (
+    "per connected component: channel factors make the geometric means over lights of their summed lobe energies grey (after the prior of Wang et al.); "
+    f"the largest diffuse + specular reflectance is {BRIGHTEST}"
+)
+DETERMINED = (
+    "; components in which interreflection was seen have no free factor, and reflectances as it determines them"
+)
+GIVEN = "; in components with known materials or lights, scale and white balance come from these: {}"
+UP_TO_SCALE = "; where lights are known up to a factor, white balance comes from them: {}"
+
+
+class Component(NamedTuple):
+    """Materials (by number) and illuminations (by name) that are linked, both sorted; either may be empty."""
+
+    materials: tuple[int, ...]
+    illuminations: tuple[str, ...]
+
+
+def connected_components(blocks: Sequence[Block], materials: int) -> list[Component]:
+    """All components of materials 0 … `materials`−1 and the blocks, sorted.
+
+    Two materials are linked if one light shows both.  In each component one factor per channel is not determined.
+    """
+    shown = [(m, materials + i) for i, block in enumerate(blocks) for m in np.unique(block.material).tolist()]
+    first, second = np.array(shown, dtype=int).reshape(-1, 2).T
+    size = materials + len(blocks)
+    _, label = components_of_graph(
+        coo_array((np.ones(len(first)), (first, second)), shape=(size, size)), directed=False
+    )
+    members = [np.flatnonzero(label == k).tolist() for k in np.unique(label)]
+    return sorted(
+        Component(
+            tuple(n for n in nodes if n < materials),
+            tuple(sorted(blocks[n - materials].name for n in nodes if n >= materials)),
+        )
+        for nodes in members
+    )
+
+
+def in_gauge(point: Point, blocks: Sequence[Block], known: Known = Known()) -> Point:
+    """The point in the gauge stated above, which predicts the same radiance; one light per block."""
+    materials, lights = point.materials, list(point.lights)
+    diffuse, specular = materials.diffuse.copy(), materials.specular.copy()
+    names = [block.name for block in blocks]
+    for members, illuminations in connected_components(blocks, len(materials)):
+        own = [names.index(name) for name in illuminations]
+        factors = known.factors(members, illuminations) if is_free(blocks, illuminations) else 0
+        if not own or not factors:
+            continue
+        rows = list(members)
+        sums = np.array([lights[i].energy.sum(0) for i in own])
+        level = np.log(np.maximum(sums, LEAST_ENERGY * np.maximum(sums.max(1, keepdims=True), 1e-300)))
+        tint = (level.mean(1, keepdims=True) - level).mean(0) if factors == 3 else np.zeros(3)
+        factor = 1 / np.exp(tint)  # multiplies reflectances
+        factor = factor * BRIGHTEST / (factor * (diffuse[rows] + specular[rows])).max()
+        diffuse[rows], specular[rows] = diffuse[rows] * factor, specular[rows] * factor
+        for i in own:
+            lights[i] = msgspec.structs.replace(lights[i], weight=lights[i].weight / factor)
+    return Point(Materials(diffuse, specular, materials.roughness), lights)
+
+
+def is_free(blocks: Sequence[Block], illuminations: Sequence[str]) -> bool:
+    """Whether the component of these illuminations has a free factor."""
+    return all(block.bounced is None for block in blocks if block.name in illuminations)

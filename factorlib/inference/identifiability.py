@@ -1,0 +1,213 @@
+"""What is missing or unusable in the observations, and what is not determined: by them alone, by the answer's standard errors, and where
+residuals stay large.
+
+Every sentence names what is not determined, why, and which photo would help.  None of them stops the solve.  The factor per
+channel between reflectances and lights is `factorlib.inference.gauge`'s matter.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+
+import numpy as np
+from jaxtyping import Float
+
+from factorlib.geometry.sphere import mirror_directions
+from factorlib.inference.answer import Answer
+from factorlib.inference.blocks import Block
+from factorlib.inference.gauge import LEAST_ENERGY, connected_components, is_free
+from factorlib.inference.materials import ROUGHNESS, Materials, Point
+from factorlib.inference.observed import PhotoObservations
+from factorlib.inference.problem import JointProblem
+
+FEW = 40  # observations: 7 unknowns of a material and some lobes, 6 each, with a few pixels for each
+FLAT_DEG = 15.0  # mirror directions within this of their mean show one patch of the light
+CLIPPED = 0.5  # share of channel values
+ROUGHNESS_ERROR = 0.1  # largest standard error with which dull and glossy can be distinguished
+SHARE_ERROR = 0.25  # of a material's diffuse + specular reflectance
+DARK = 0.1  # a bound on reflectance that still says 'dark'
+TINTED = 0.6  # of a mean |log R/G| or |log B/G|: three standard deviations of the level of one light's colour (docs/light-prior.md)
+EXPOSURE_DIFFERS = 1.5  # by which factor what is found may differ from EXIF without a word
+OUTLIER, OUTLIERS = 3.0, 0.1  # a residual in units of the noise model, and the share of such values that is too much
+
+
+def unusable_observations(photos: Sequence[PhotoObservations]) -> list[str]:
+    """Photos of which observations were left out, as sentences."""
+    return [
+        f"photo '{', '.join(photo.merged.photos)}': {photo.unusable} of {photo.count} observations are left out, "
+        "their radiance, normal or view not finite or their weight not positive"
+        for photo in photos
+        if photo.unusable
+    ]
+
+
+def before_solving(names: Sequence[str], photos: Sequence[str], problem: JointProblem) -> list[str]:
+    """What observations lack and cannot tell, as sentences; names: of all materials, by number;  photos: all that there are."""
+    blocks, known = problem.blocks, problem.known
+    shown = {int(m) for block in blocks for m in np.unique(block.material)}
+    unseen = [name for m, name in enumerate(names) if m not in shown and m not in known.materials]
+    said = [f"material '{name}' is observed in no photo: its reflectance is only a guess" for name in unseen]
+    dark = sorted(set(photos) - {photo for block in blocks for photo in block.photos})
+    said += [f"photo '{photo}' has no valid observation and gets no light" for photo in dark]
+    linked = [component for component in connected_components(blocks, len(names)) if component.illuminations]
+    if len(linked) > 1 and any(known.factors(*component) for component in linked):
+        pairs = ((", ".join(lights), ", ".join(names[m] for m in members)) for members, lights in linked)
+        groups = "; ".join(f"{lights} (with {materials})" for lights, materials in pairs)
+        said.append(
+            f"the photos fall into {len(linked)} sets that share no material, so their reflectances cannot be compared: {groups}. "
+            "An object that is left out of the solve may link them, once its pose is good; else a photo that shows a material of each would"
+        )
+    return said + undetermined_by_observations(names, problem)
+
+
+def undetermined_by_observations(names: Sequence[str], problem: JointProblem) -> list[str]:
+    """What no solve can find, as sentences; a material that no block shows, or that is known, is left out."""
+    blocks, known = problem.blocks, problem.known
+    black = [block.name for block in blocks if (block.radiance <= 0).all()]
+    said = [f"illumination '{name}' is black in every photo: it tells nothing" for name in black]
+    for m, name in enumerate(names):
+        shown = [block.take(block.material == m) for block in blocks if (block.material == m).any()]
+        said += _of_material(name, shown) if shown and m not in known.materials else []
+    for members, lights in connected_components(blocks, len(names)):
+        if len(members) == 1 and lights and known.factors(members, lights) == 3:
+            alone = ", and a smooth material in a soft light looks like a rough one in a sharp light. A photo of it in other light"
+            said.append(
+                f"material '{names[members[0]]}' shares no light with another: its colour and brightness are separated from the light's "
+                f"by convention only{alone if len(lights) == 1 else '. A photo'} that shows another material too would help"
+            )
+    return said
+
+
+def _of_material(name: str, shown: Sequence[Block]) -> Iterator[str]:
+    count = sum(map(len, shown))
+    if count < FEW:
+        yield (
+            f"material '{name}' has {count} observation(s), fewer than {FEW}: its reflectance is uncertain, and its roughness more so. "
+            "A photo from nearer would help"
+        )
+    if all(_spread(block) < FLAT_DEG for block in shown):
+        yield (
+            f"material '{name}' is flat: in every light it mirrors one direction only, so its roughness and what of it is specular "
+            "cannot be determined. A photo of a curved part, or several of it turned in a light that is fixed to the world, would help"
+        )
+    clipped = np.concatenate([block.clipped for block in shown]).mean()
+    if clipped >= CLIPPED:
+        yield (
+            f"{clipped:.0%} of the values of material '{name}' are clipped and say 'at least' only: its reflectance is uncertain. "
+            "A photo of shorter exposure would help"
+        )
+
+
+def _spread(block: Block) -> float:
+    """Largest angle between a mirror direction and their mean, degrees."""
+    mirror = mirror_directions(block.normal, block.view)
+    mean = mirror.mean(0)
+    return float(np.degrees(np.arccos(np.clip(mirror @ mean / max(np.linalg.norm(mean), 1e-12), -1, 1)).max()))
+
+
+def after_solving(answer: Answer) -> list[str]:
+    """What the answer leaves open or explains badly, as sentences."""
+    problem, point = answer.solution.shown(answer.problem), answer.solution.point
+    return [
+        *undetermined_by_answer(answer.names, problem, point.materials, answer.errors.materials),
+        *poorly_explained(problem, point),
+        *unlikely_curves(problem, point),
+        *tinted_alike(problem, point),
+        *_brighter_than_white(answer),
+        *_exposures_unlike_exif(answer),
+    ]
+
+
+def undetermined_by_answer(
+    names: Sequence[str], problem: JointProblem, found: Materials, errors: Materials
+) -> list[str]:
+    """What the data left open of the materials that are seen, by the standard `errors` of what was `found`."""
+    seen = sorted({int(m) for block in problem.blocks for m in np.unique(block.material)})
+    return [sentence for m in seen for sentence in _of_answer(names[m], found.rows()[m], errors.rows()[m])]
+
+
+def _of_answer(name: str, found: Float[np.ndarray, "7"], error: Float[np.ndarray, "7"]) -> Iterator[str]:
+    whole, largest, specular = (found[:3] + found[3:6]).max(), error[:6].max(), found[3:6]
+    if whole < largest <= DARK:
+        yield (
+            f"material '{name}' is so dark that of its reflectance only a bound, about {whole + 2 * largest:.2g}, can be given. "
+            "A photo of longer exposure would help"
+        )
+    elif not largest <= SHARE_ERROR * whole:
+        yield (
+            f"the reflectance of material '{name}' is known to ±{largest:.2g} only, of {whole:.2g}: diffuse and specular "
+            "part look alike here. A photo in light with a small bright source, or next to a brighter material, would help"
+        )
+    if not (specular.any() or error[3:6].any()):  # which is known: it has no roughness
+        return
+    if not (error[6] <= ROUGHNESS_ERROR and (specular > 2 * error[3:6]).any()):
+        yield (
+            f"the roughness of material '{name}' cannot be determined (±{error[6]:.2g}): no highlight stands out, or shape and photos "
+            "disagree too much. A photo in light with a small bright source, or a better mesh, would help"
+        )
+    elif found[6] <= ROUGHNESS[0] + 1e-9 and error[6] > 0:
+        yield f"the roughness of material '{name}' is at {ROUGHNESS[0]:g}, the least the model knows: it may be smoother"
+
+
+def poorly_explained(problem: JointProblem, point: Point) -> Iterator[str]:
+    """Illuminations with many residuals far beyond the noise model."""
+    for block, residual in zip(problem.blocks, problem.residuals(point), strict=True):
+        share = float((np.abs(residual * (block.precision > 0)) > OUTLIER).mean())
+        if share > OUTLIERS:
+            yield (
+                f"illumination '{block.name}': {share:.0%} of the values differ from the answer by more than {OUTLIER:g} times their noise. "
+                "Look at what `align` drew: wrong normals, poses or masks there make every material in it wrong"
+            )
+
+
+def unlikely_curves(problem: JointProblem, point: Point) -> Iterator[str]:
+    """Tone curves that have run toward the bounds of what cameras do."""
+    for block, light in zip(problem.blocks, point.lights, strict=True):
+        if light.beyond_cameras:
+            exponents = ", ".join(f"{g:.2g}" for g in np.exp(light.log_tone))
+            yield (
+                f"the tone curves of illumination '{block.name}' have exponents of {exponents}, "
+                'more than a camera does: something else is wrong there, as normals or `encoding`. SET="solve.tone=off" goes without them'
+            )
+
+
+def tinted_alike(problem: JointProblem, point: Point) -> Iterator[str]:
+    """Lights that interreflection gives one strong colour on average.
+
+    Where no surface lights another, the rule of `factorlib.inference.gauge` makes lights grey, and nothing is said, nor where a material or a light is known.
+    """
+    blocks = problem.blocks
+    for members, illuminations in connected_components(blocks, len(point.materials)):
+        if not illuminations or problem.known.factors(members, illuminations) < 3 or is_free(blocks, illuminations):
+            continue
+        pairs = zip(blocks, point.lights, strict=True)
+        sums = np.array([light.energy.sum(0) for block, light in pairs if block.name in illuminations])
+        level = np.log(np.maximum(sums, LEAST_ENERGY * sums.max(1, keepdims=True))).mean(0)
+        if np.abs(level - level[1]).max() > TINTED:
+            colour = " : ".join(f"{c:.2g}" for c in np.exp(level - level.mean()))
+            yield (
+                f"the lights of {', '.join(illuminations)} are R : G : B = {colour} on average, as interreflection fixes it: reflectances have "
+                'the opposite colour, if the lights were nearly white. SET="solve.interreflection=off" makes the lights grey'
+            )
+
+
+def _brighter_than_white(answer: Answer) -> Iterator[str]:
+    """Materials that come out brighter than they can be beside known ones."""
+    found = answer.solution.point.materials
+    for name, whole in zip(answer.names, (found.diffuse.max(1) + found.specular.max(1)).tolist(), strict=True):
+        if whole > 1 and not answer.problem.known.nothing:
+            yield (
+                f"material '{name}' comes out with diffuse + specular = {whole:.2f} beside what is known, more than falls on it: are the known "
+                "reflectances right, and of materials that the same light falls on?"
+            )
+
+
+def _exposures_unlike_exif(answer: Answer) -> Iterator[str]:
+    """Photos whose exposure is found to be another than their EXIF says."""
+    for photo, factor in answer.found_exposures().items():
+        by_exif = answer.relative[photo]
+        if by_exif != 1 and abs(np.log(factor)) > np.log(EXPOSURE_DIFFERS):
+            yield (
+                f"photo '{photo}': by its EXIF its exposure is {by_exif:.3g} of its light's first photo, by its pixels "
+                f"{factor * by_exif:.3g}: was it made brighter or darker later?"
+            )

@@ -1,0 +1,168 @@
+"""The marginal likelihood of the materials, the lights integrated out: one illumination's part of it, and its normal equations.
+
+A light is u, log radiance on cells; its prior is Gaussian with mean 0 and precision Q (`factorlib.light.prior`).  Observations are those of
+the forward model, with residuals r in σ of the noise model.  Neighbours' residuals err alike, so a squared residual counts as 1/T of one
+(`factorlib.inference.fit`).  Minus twice the log posterior of a light is
+
+    φ(u; θ) = Σ ρ(r)/T + uᵀ Q u,
+
+and with the light integrated out (Laplace's approximation about the minimising u) minus twice the log marginal likelihood of θ is
+
+    φ(u; θ) + log det H − log det Q,        H = JᵀJ/T + Q,     J = ∂r/∂u                                            (1)
+
+up to a constant.  In J, rows are weighted by the robust loss, and those of clipped channels that are bright enough are nil.  Without the determinant, light and materials are ambiguous in a way that always favours the light of least contrast and
+the materials of least roughness, as blind deconvolution favours no blur (Levin et al. 2009, "Understanding and evaluating blind
+deconvolution algorithms").  Of a radiance that is linear in w ∝ exp(u), ∂J/∂θ and ∂J/∂u are known exactly, and with Σ = H⁻¹
+
+    ½ ∂ log det H/∂θ = Σ_i J_i Σ (∂J_i/∂θ)ᵀ / T,      ½ ∂ log det H/∂u_j = Σ_i (J_i Σ)_j J_ij / T.               (2)
+
+The second is felt by materials through the light that they imply, du/dθ = −L⁻¹Cᵀ (`factorlib.inference.arrow`).  Left out, it would
+push all reflectances down: a brighter light under darker materials has the same J.  The Gauss–Newton Hessian Σ_i ∂J_i Σ ∂J_iᵀ of the first
+steers the steps of a descent and nothing else, so every `SPARSE`-th row stands for its neighbours.
+
+Materials enter as log k_d, log k_s (RGB each) and roughness: 7 unknowns θ each.  Exposures and tone exponents belong to the light's block
+but are not integrated out: they have wide Gaussians about 0.
+
+Cells whose radiance is known (`Light.held`) have no part in u of (1) and (2): Q is then that of the others, given those.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import msgspec
+import numpy as np
+from jaxtyping import Float, Int
+from scipy.linalg import LinAlgError
+from scipy.linalg.lapack import dpotrf, dpotri
+
+from factorlib.inference.arrow import System
+from factorlib.inference.forward import Illumination, Linearised
+from factorlib.inference.lights import Light
+from factorlib.inference.noise import Loss
+from factorlib.light.prior import LightPrior
+
+SPARSE = 8  # rows of which one enters the Hessian of the determinant
+EXPOSURE, TONE = 3.0, 0.3  # standard deviations of a log exposure and of a log tone exponent
+
+
+class Field(msgspec.Struct, frozen=True):
+    """One illumination and how much its parts count.
+
+    illumination  with its table;  prior: on its light;  precision: Q, channel by channel, with its log determinant
+    temperature   T;  loss: ρ
+    """
+
+    illumination: Illumination
+    prior: LightPrior
+    precision: Float[np.ndarray, "3p 3p"]
+    log_determinant: float
+    temperature: float
+    loss: Loss
+
+
+def marginal(field: Field, clusters: Int[np.ndarray, " n"] | None = None, materials_given: bool = False) -> System:
+    """The value of (1), or of φ where materials are given, and its system, of one illumination; the first 3p unknowns of the light are u.
+
+    clusters: number of each observation's cluster, from 0, for `System.scores`
+    materials_given: the value is φ alone, which is what the light minimises, and no derivative of the determinants, which take most of
+    the time, is in the system
+    """
+    one, T = field.illumination, field.temperature
+    shown, light, p = one.shown(), one.light, int(one.light.free.sum())
+    places = (7 * np.unique(one.block.material)[:, None] + np.arange(7)).reshape(-1)
+    k, size = len(places), light.unknowns
+    g_m, M, C = np.zeros(k), np.zeros((k, k)), np.zeros((k, size))
+    value, g_l, L = _priors(field, light)
+    scores = None if clusters is None else np.zeros((int(clusters.max(initial=-1)) + 1, k + size))
+    parts, photos = list(one.linearise(shown, field.loss, T)), slice(3 * p, size)
+    for part in parts:
+        own, at = slice(part.channel * p, (part.channel + 1) * p), np.searchsorted(places, part.places)
+        J = part.diffuse + part.specular
+        L[own, own] += J.T @ J
+        g_l[own] += J.T @ part.residual
+        M[np.ix_(at, at)] += part.by_material.T @ part.by_material
+        g_m[at] += part.by_material.T @ part.residual
+        C[at, own] += part.by_material.T @ J
+        if size > 3 * p:
+            L[photos, photos] += part.by_photo.T @ part.by_photo
+            g_l[photos] += part.by_photo.T @ part.residual
+            C[at, photos] += part.by_material.T @ part.by_photo
+            towards = part.by_photo.T @ J
+            L[photos, own] += towards
+            L[own, photos] += towards.T
+        if scores is not None:  # a cluster's sum of slopes, each times its residual
+            summing = (clusters[part.rows] == np.arange(len(scores))[:, None]) * part.residual
+            scores[:, at] += summing @ part.by_material
+            scores[:, k + own.start : k + own.stop] += summing @ J
+            scores[:, k + 3 * p :] += summing @ part.by_photo
+    residual, by_light = one.block.residuals(shown.radiance), np.zeros(size)
+    loss = float(field.loss.of_residuals(residual)[~one.block.held_out].sum())
+    value += loss / T
+    if materials_given:
+        return System(value, loss, places, g_m, M, g_l, C, L, by_light, scores)
+    covariance, log_determinant = positive_definite_inverse(L[: 3 * p, : 3 * p])
+    value += log_determinant - field.log_determinant
+    for part in parts:
+        own, at = slice(part.channel * p, (part.channel + 1) * p), np.searchsorted(places, part.places)
+        gradient, hessian, by_cells = _of_determinant(part, covariance[own, own].astype(np.float32))
+        g_m[at] += gradient
+        M[np.ix_(at, at)] += hessian
+        by_light[own] += by_cells
+    return System(value, loss, places, g_m, M, g_l, C, L, by_light, scores)
+
+
+def _priors(field: Field, light: Light) -> tuple[float, Float[np.ndarray, " l"], Float[np.ndarray, "l l"]]:
+    """uᵀQu and the Gaussians of exposures and tones: value, half the gradient, half the Hessian."""
+    u, Q, free = light.log_radiance.reshape(-1), field.precision, np.tile(light.free, 3)
+    others = np.concatenate([light.log_exposure[len(light.log_exposure) - light.free_exposures :], light.log_tone])
+    width = np.repeat([EXPOSURE, TONE], [light.free_exposures, len(light.log_tone)])
+    hessian, slope, p = np.zeros((light.unknowns, light.unknowns)), Q @ u, int(free.sum())
+    hessian[:p, :p] = Q if free.all() else Q[np.ix_(free, free)]
+    hessian[range(p, p + len(others)), range(p, p + len(others))] = width**-2
+    gradient = np.concatenate([slope[free], others / width**2])
+    if light.scale_free:  # one step of all held cells
+        together = Q[~free].sum(0)
+        hessian[-1, :p] = hessian[:p, -1] = together[free]
+        hessian[-1, -1] = together[~free].sum()
+        gradient = np.append(gradient, slope[~free].sum())
+    return float(u @ slope + np.sum((others / width) ** 2)), gradient, hessian
+
+
+def _of_determinant(
+    part: Linearised, covariance: Float[np.ndarray, "p p"]
+) -> tuple[list[float], Float[np.ndarray, "3 3"], Float[np.ndarray, " p"]]:
+    """Equation (2) of one channel of one material: the first, its Hessian, the second; ∂J/∂log k_d and ∂J/∂log k_s are the two parts of J."""
+    slopes, J = (part.diffuse, part.specular, part.by_roughness), part.diffuse + part.specular
+    spread = J @ covariance
+    few = [slope[::SPARSE] for slope in slopes]
+    many = len(spread) / max(len(few[0]), 1)
+    hessian = np.array([[float(np.vdot(a @ covariance, b)) for b in few] for a in few])
+    return [float(np.vdot(spread, slope)) for slope in slopes], many * hessian, (spread * J).sum(0)
+
+
+class Inverse(NamedTuple):
+    """What `positive_definite_inverse` returns: the inverse, and the log of the determinant of the matrix itself."""
+
+    matrix: Float[np.ndarray, "n n"]
+    log_determinant: float
+
+
+def positive_definite_inverse(matrix: Float[np.ndarray, "n n"]) -> Inverse:
+    """Inverse and log determinant of a symmetric positive definite matrix, by LAPACK's potrf and potri: half of what solving with
+    the identity takes.
+
+    Raises LinAlgError where it is not positive definite, or not a number.
+
+    >>> positive_definite_inverse(np.array([[4.0, 0.0], [0.0, 0.25]])).matrix.tolist()
+    [[0.25, 0.0], [0.0, 4.0]]
+    """
+    if not len(matrix):
+        return Inverse(matrix, 0.0)
+    factor, failed = dpotrf(matrix, lower=1, clean=1)
+    logarithm = np.nan if failed else 2 * float(np.log(np.diag(factor)).sum())
+    if not np.isfinite(logarithm):
+        raise LinAlgError(f"a matrix of {len(matrix)} rows is not positive definite, or not finite")
+    inverse, _ = dpotri(factor, lower=1)
+    lower = np.tril(inverse, -1)
+    return Inverse(lower + lower.T + np.diag(np.diag(inverse)), logarithm)

@@ -1,0 +1,75 @@
+"""The unknowns: materials with their ranges, and points, which are materials and lights."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import msgspec
+import numpy as np
+from jaxtyping import Float
+
+from factorlib.inference.lights import Light
+
+ROUGHNESS = (0.1, 1.0)  # the operators' domain
+SHARPNESS = (0.1, 2000.0)  # λ of few lobes: from nearly constant to 1.3° wide, about a texel of the exported map
+RESOLVED = 16.0  # times the sharpest reflection's λ: such a lobe widens it by 3 %, and nothing sharper can be resolved
+LEAST_REFLECTANCE = 1e-5  # keeps a black material inside its bounds
+
+
+class Materials(msgspec.Struct, frozen=True):
+    """m materials; diffuse and specular reflectance per channel, GGX roughness (α = roughness²)."""
+
+    diffuse: Float[np.ndarray, "m 3"]
+    specular: Float[np.ndarray, "m 3"]
+    roughness: Float[np.ndarray, " m"]
+
+    def __len__(self) -> int:
+        return len(self.roughness)
+
+    def vector(self) -> Float[np.ndarray, " 7m"]:
+        """Seven unknowns a material: diffuse RGB, specular RGB, roughness."""
+        return np.column_stack([self.diffuse, self.specular, self.roughness]).reshape(-1)
+
+    def rows(self) -> Float[np.ndarray, "m 7"]:
+        """The unknowns, one material a row; a copy."""
+        return self.vector().reshape(-1, 7)
+
+    @staticmethod
+    def of_rows(rows: Float[np.ndarray, "m 7"]) -> Materials:
+        """The inverse of `rows`."""
+        return Materials(rows[:, :3], rows[:, 3:6], rows[:, 6])
+
+    @staticmethod
+    def of_vector(vector: Float[np.ndarray, " 7m"]) -> Materials:
+        """The nearest materials within bounds."""
+        rows = vector.reshape(-1, 7)
+        reflectance = np.maximum(rows[:, :6], LEAST_REFLECTANCE)
+        return Materials(reflectance[:, :3], reflectance[:, 3:], np.clip(rows[:, 6], *ROUGHNESS))
+
+    @property
+    def blur(self) -> float:
+        """b = 2 min α²: about how much the least rough material widens a lobe's variance 1/λ."""
+        return 2 * float(self.roughness.min()) ** 4
+
+    @property
+    def sharpest(self) -> float:
+        """The largest sharpness λ that can be resolved: reflections of sharper lobes look the same."""
+        return min(RESOLVED / self.blur, SHARPNESS[1])
+
+    def lambertian(self, m: int) -> Materials:
+        """Return the materials with material m Lambertian: its specular reflectance is added to its diffuse one."""
+        diffuse, specular = self.diffuse.copy(), self.specular.copy()
+        diffuse[m] += specular[m]
+        specular[m] = LEAST_REFLECTANCE
+        return Materials(diffuse, specular, self.roughness)
+
+
+class Point(msgspec.Struct, frozen=True):
+    """The materials of a problem, and one light for each of its blocks, in their order."""
+
+    materials: Materials
+    lights: list[Light]
+
+    def restricted(self, lights: Sequence[int]) -> Point:
+        """The same materials, with the lights of numbers `lights` alone."""
+        return Point(self.materials, [self.lights[k] for k in lights])

@@ -1,0 +1,76 @@
+"""How much of the shading an answer leaves unexplained, and how many values are clipped: by photo, and of the whole set.
+
+Noise varies from pixel to pixel.  What a wrong mesh, mask, label or tone curve leaves is alike among neighbours.  Let a group g be the n_g observations
+of one material in one photo that mirror one region of the light, with sure normals and nothing clipped.  Of values x, over the mean radiance of the material in
+the photo,
+
+    E(x) = Σ_g n_g max(mean_g(x)² − s_g²(x)/n_g, 0),     s_g² the variance in the group                                 (1)
+
+is their energy without what varies from one observation to the next, over all channels.  With r what the answer leaves, and v the radiance less its mean,
+E(r) / E(v) is the unexplained share.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import numpy as np
+from jaxtyping import Bool, Float, Int
+
+from factorlib.geometry.sphere import mirror_cells
+from factorlib.inference.blocks import Block
+from factorlib.inference.materials import Point
+from factorlib.inference.problem import JointProblem
+from factorlib.results.materials import Misfit
+
+REGION = 0.3  # side of the cells of mirror directions, about 17°
+SURE = 0.3  # least confidence of a normal
+LEAST = 4  # observations of a group
+MOST = 3.0  # of an unexplained share: more says no more
+
+
+def misfit(problem: JointProblem, point: Point) -> tuple[float, dict[str, Misfit]]:
+    """The unexplained share of the whole set, and by photo that share and the share of clipped values."""
+    energies, clipped = {}, {}
+    for block, shown in zip(problem.blocks, problem.radiance(point), strict=True):
+        for number, photo in enumerate(block.photos):
+            own = block.photo == number
+            energies[photo] = np.sum(list(_energies(block, shown, own)) or [[0.0, 0.0]], axis=0)
+            clipped[photo] = float(block.clipped[own].mean()) if own.any() else 0.0
+    by_photo = {photo: Misfit(_share(*energy), clipped[photo]) for photo, energy in energies.items()}
+    return _share(*np.sum(list(energies.values()), axis=0)), by_photo
+
+
+def _energies(
+    block: Block, shown: Float[np.ndarray, "n 3"], own: Bool[np.ndarray, " n"]
+) -> Iterator[tuple[float, float]]:
+    """E(r) and E(v) of each material in a photo."""
+    sure = own & ~block.clipped.any(1) & (True if block.confidence is None else block.confidence > SURE)
+    for material in np.unique(block.material[sure]):
+        rows = sure & (block.material == material)
+        mean = np.maximum(block.radiance[rows].mean(0), 1e-12)
+        group = np.unique(mirror_cells(block.normal[rows], block.view[rows], REGION), return_inverse=True)[1].reshape(
+            -1
+        )
+        left, whole = (block.radiance[rows] - shown[rows]) / mean, block.radiance[rows] / mean - 1
+        yield energy(left, group), energy(whole, group)
+
+
+def energy(values: Float[np.ndarray, "n 3"], group: Int[np.ndarray, " n"]) -> float:
+    """E of (1); groups of fewer than `LEAST` have no say.
+
+    >>> alike, noise = np.full((8, 3), 0.1), np.tile([[0.1], [-0.1]], (4, 3))
+    >>> round(energy(alike, np.zeros(8, int)), 9), energy(noise, np.zeros(8, int))
+    (0.24, 0.0)
+    """
+    count = np.bincount(group).astype(float)
+    total = 0.0
+    for of in values.T:
+        mean = np.bincount(group, of) / count
+        variance = np.bincount(group, (of - mean[group]) ** 2) / np.maximum(count - 1, 1)
+        total += float(np.sum((count * np.maximum(mean**2 - variance / count, 0))[count >= LEAST]))
+    return total
+
+
+def _share(left: float, whole: float) -> float:
+    return round(float(min(left / max(whole, 1e-12), MOST)), 9) if left > 0 else 0.0

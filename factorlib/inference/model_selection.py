@@ -1,0 +1,174 @@
+"""What a scene needs of the model, decided in the model that gives the answer.
+
+    effects   nothing, shadows of the given meshes, or shadows and the light that surfaces send each other: each is fitted from the start, on
+              fewer observations and cells.  Shadows stay unless the evidence is against them, bounces need evidence and shadows
+    tone      exponents of tone curves are freed for all photos, and kept where evidence is for them, where the loss without them is more
+              than `CURVED_GAIN` higher, and where they end within what cameras do: an exponent also fits some errors of the rest of
+              the model, such as normals
+    distance  of `CURVATURES` the one with which held-out observations are explained best, where evidence is for it; else a light is
+              infinitely far away
+    roughness where there are few materials, the start decides in which local minimum a fit ends: a smooth surface in a soft light looks like a
+              rough one in a sharp light.  Of the fits from several starts, the one of least held-out loss goes on
+
+All but the last by `factorlib.inference.evidence`, on observations whose normals are sure.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import msgspec
+import numpy as np
+
+from factorlib.inference.evidence import AGAINST, FOR, Losses, compare, losses_of
+from factorlib.inference.fit import Fit, Schedule, start_of
+from factorlib.inference.materials import Point
+from factorlib.inference.options import Choices
+from factorlib.inference.problem import JointProblem
+from factorlib.results.materials import Decision
+
+TRIAL_OBSERVATIONS, TRIAL_CELLS = 1500, 250  # of a light, while models are compared
+TRIAL = Schedule(lights=6, together=(14, 8))
+CURVED = Schedule(together=(8,), estimate=False)
+# Of the held-out loss.  By two standard errors alone a photo whose pose is wrong got a curve (margin 3.0, captured set of seed 7), and k_d was
+# 30 % wrong instead of 13 %.
+CURVED_GAIN = 0.25
+NEARER_FROM = 1.0  # standard errors: from here on a light comes nearer, and at `FOR` it is as near as was found
+# Of lights that are 20, 10 and 5 RMS distances away: a chair's points are .4 m from their middle, a room's walls and lamps 2 to 8 m.
+CURVATURES = (0.05, 0.1, 0.2)
+NEARER = Schedule(lights=3, together=(6,), estimate=False)
+GIVEN = Schedule(lights=6, estimate=False, given=True)
+
+Fitting = Callable[[str, JointProblem, Fit, Schedule], Fit]  # what is fitted, to what, from where, by how many steps
+
+
+class Effects(msgspec.Struct, frozen=True):
+    """Which effects were chosen: the evidence for them, and the fit of the chosen model on few observations."""
+
+    fit: Fit
+    shadows: Decision
+    bounces: Decision
+
+    def of(self, problem: JointProblem) -> JointProblem:
+        """Return the problem with the effects that were chosen."""
+        return problem.with_effects(self.shadows.kept, self.bounces.kept)
+
+
+class Chosen(msgspec.Struct, frozen=True):
+    """The fit that a choice ends with, and the evidence for each thing that was asked: for each light, or for each splitting."""
+
+    fit: Fit
+    evidence: list[Decision]
+
+
+def sample_of(problem: JointProblem, choices: Choices) -> JointProblem:
+    """The observations on which models are compared."""
+    return problem.sampled(min(TRIAL_OBSERVATIONS, choices.observations), choices.seed)
+
+
+def effects_chosen(problem: JointProblem, starts: list[Point], choices: Choices, fit: Fitting) -> Effects:
+    """Shadows and bounces; problem: sure observations;  starts: the one that ends best is used."""
+    sample, hidden = sample_of(problem, choices), any(block.visibility is not None for block in problem.blocks)
+    unjudged = problem.none_held_out  # then what is there anyway stays, and nothing further is added
+    asked = {"on": True, "off": False}
+    shadows = hidden and asked.get(choices.self_shadowing, True if unjudged else None)
+    bounces = problem.has_bounces and asked.get(choices.interreflection, False if unjudged else None)
+    tried: dict[tuple[bool, bool], tuple[Fit, Losses]] = {}
+
+    def trial(with_shadows: bool, with_bounces: bool) -> tuple[Fit, Losses]:
+        """Fit one model from each start, once, and return the best fit and its losses."""
+        if (with_shadows, with_bounces) not in tried:
+            name = "shadows and bounces" if with_bounces else "shadows" if with_shadows else "no shadows"
+            model = sample.with_effects(with_shadows, with_bounces)
+            fits = [fit(name, model, start_of(start), TRIAL) for start in starts]
+            trials = [(one, losses_of(model, one.point)) for one in fits]
+            tried[with_shadows, with_bounces] = min(trials, key=lambda one: _geometric_mean(one[1]))
+        return tried[with_shadows, with_bounces]
+
+    said = Decision(shadows) if shadows is not None else compare(trial(False, False)[1], trial(True, False)[1], AGAINST)
+    if not said.kept:
+        return Effects(trial(False, False)[0], said, Decision(False))
+    lit = Decision(bounces) if bounces is not None else compare(trial(True, False)[1], trial(True, True)[1], FOR)
+    return Effects(trial(True, lit.kept)[0], said, lit)
+
+
+def _geometric_mean(losses: Losses) -> float:
+    """Of the lights' mean losses, weighted by their observations: its logarithm, to six digits, so that rounding does not decide."""
+    counts = [len(values) for values in losses.values]
+    logs = [len(values) and np.log(max(float(np.mean(values)), 1e-12)) for values in losses.values]
+    return round(float(np.dot(counts, logs)) / max(sum(counts), 1), 6)
+
+
+def curves_chosen(problem: JointProblem, before: Fit, choices: Choices, fit: Fitting) -> Chosen:
+    """Tone curves; problem: sure observations, with the effects that were chosen;  before: the fit of few of them."""
+    lights = before.point.lights
+    had = [len(light.log_tone) > 0 for light in lights]
+    if choices.tone == "off" or problem.none_held_out:
+        return Chosen(before, [Decision(has) for has in had])
+    sample = sample_of(problem, choices)
+    freed = [light if has else light.with_curves() for light, has in zip(lights, had, strict=True)]
+    curved = fit("tone curves", sample, before.with_lights(freed), CURVED)
+    losses, evidence = [losses_of(sample, one.point) for one in (before, curved)], []
+    for k, light in enumerate(curved.point.lights):
+        one = _evidence_of_light(k, *losses)
+        gain = (one.held_out_loss_without or 0.0) / max(one.held_out_loss_with or 1.0, 1e-12) - 1
+        kept = one.kept and gain > CURVED_GAIN and not light.beyond_cameras
+        evidence.append(Decision(True) if had[k] else msgspec.structs.replace(one, kept=kept))
+    if all(one.kept for one in evidence):
+        return Chosen(curved, evidence)
+    if not any(one.kept and not has for one, has in zip(evidence, had, strict=True)):
+        return Chosen(before, evidence)
+    kept = [new if one.kept else old for new, old, one in zip(curved.point.lights, lights, evidence, strict=True)]
+    return Chosen(fit("tone curves", sample, before.with_lights(kept), CURVED), evidence)
+
+
+def distances_chosen(problem: JointProblem, before: Fit, choices: Choices, fit: Fitting) -> Chosen:
+    """Distances of lights; problem: sure observations, with the effects that were chosen;  before: the fit of few of them.
+
+    First materials and all lights are fitted at each distance: materials that were fitted in far lights make up for what is wrong with those.
+    But materials that are better in near lights explain every light better, so a light stays near only if, given these materials, it also
+    explains its observations better than a far one.  The weaker of the two answers decides how near it comes.
+    """
+    lights = before.point.lights
+    pairs = zip(lights, problem.blocks, strict=True)
+    known = [light.curvature > 0 or light.held.any() or block.place is None for light, block in pairs]
+    evidence = [Decision(light.curvature > 0) for light in lights]
+    if choices.distance == "off" or problem.none_held_out or all(known):
+        return Chosen(before, evidence)
+    sample, asked = sample_of(problem, choices), np.flatnonzero(~np.array(known)).tolist()
+
+    def fit_at(curvatures: dict[int, float], start: Fit = before, schedule: Schedule = NEARER) -> Fit:
+        """The fit in lights of these curvatures, by number."""
+        placed = list(start.point.lights)
+        for k, c in curvatures.items():
+            placed[k] = msgspec.structs.replace(placed[k], curvature=c)
+        return fit("distances", sample, start.with_lights(placed), schedule)
+
+    far, *near = (losses_of(sample, fit_at(dict.fromkeys(asked, c)).point) for c in (0.0, *CURVATURES))
+    curvature = {}
+    for k in asked:
+        tried = [_evidence_of_light(k, far, one, NEARER_FROM) for one in near]
+        best = min(range(len(near)), key=lambda i: (not tried[i].kept, tried[i].held_out_loss_with or 0.0))
+        evidence[k] = tried[best]
+        if tried[best].kept:
+            curvature[k] = CURVATURES[best]
+    if not curvature:
+        return Chosen(before, evidence)
+    chosen = fit_at(curvature)
+    curvatures = (dict.fromkeys(curvature, 0.0), curvature)
+    far, there = (losses_of(sample, fit_at(of, chosen, GIVEN).point) for of in curvatures)
+    for k in curvature:
+        given = _evidence_of_light(k, far, there, NEARER_FROM)
+        evidence[k] = min(evidence[k], given, key=lambda one: one.margin or 0.0)
+    kept = {k: c * believed(evidence[k]) for k, c in curvature.items() if evidence[k].kept}
+    return Chosen(fit_at(kept) if kept else before, evidence)
+
+
+def believed(evidence: Decision) -> float:
+    """How far the richer model is believed: from 0 at `NEARER_FROM` standard errors to 1 at `FOR`, so that rounding does not decide."""
+    return float(np.clip(((evidence.margin or 0.0) - NEARER_FROM) / (FOR - NEARER_FROM), 0.0, 1.0))
+
+
+def _evidence_of_light(k: int, without: Losses, richer: Losses, least: float = FOR) -> Decision:
+    """Return the evidence that light k alone gives for the richer model."""
+    return compare(*(Losses([of.values[k]], [of.clusters[k]]) for of in (without, richer)), least)

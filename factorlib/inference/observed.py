@@ -1,0 +1,147 @@
+"""From the observations of all photos, as `urm` wrote them, to the data of the joint problem: one block per illumination."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from functools import partial
+from pathlib import Path
+
+import msgspec
+import numpy as np
+from jaxtyping import Bool, Float, Int
+
+from factorlib.errors import InputError
+from factorlib.geometry.sphere import fibonacci_sphere, mirror_cells
+from factorlib.inference.blocks import Block
+from factorlib.inference.interreflection import bounced_light
+from factorlib.inference.noise import Noise
+from factorlib.inference.problem import Spread
+from factorlib.urm.geometry import on_surface
+from factorlib.urm.merge import merge
+from factorlib.urm.observations import Observations, read_observations
+
+Rotations = Mapping[str, Float[np.ndarray, "3 3"]]  # world_from_camera, by the name of a photo
+
+
+HELD_OUT_CELL = 0.1  # size of the cells of mirror directions that are held out together
+
+
+class PhotoObservations(msgspec.Struct, frozen=True):
+    """What one file holds: its usable observations, merged; how many it holds, and how many of those are not usable."""
+
+    merged: Observations
+    count: int
+    unusable: int
+
+
+def gathered(
+    files: Sequence[Path], degrees: float, spread: Spread, surface: Path | None = None
+) -> list[PhotoObservations]:
+    """Read each file, in this order; observations that are within `degrees` of each other are merged (`factorlib.urm.merge`).
+
+    surface: the folder of the stage `surface`, whose normals are used where it has some
+    """
+    return spread(partial(_of_file, degrees=degrees, surface=surface), files)
+
+
+def _of_file(path: Path, degrees: float, surface: Path | None) -> PhotoObservations:
+    read = on_surface(read_observations(path), surface)
+    seen = usable(read)
+    return PhotoObservations(merge(seen, degrees), len(read), len(read) - len(seen))
+
+
+def blocks_of_observations(
+    observations: Observations,
+    noise: Noise,
+    *,
+    held_out: float = 0.1,
+    world_from_camera: Rotations | None = None,
+    seed: int = 0,
+) -> list[Block]:
+    """One block per illumination, in order of names; observations that are not `usable` are dropped.
+
+    world_from_camera: rotation of each photo whose illumination is fixed to the world
+    held_out:          share of observations kept for choosing the model
+    Raises InputError where nothing is left, or nothing but black.
+    """
+    seen = usable(observations)
+    if len(seen) == 0:
+        raise InputError(
+            "no valid observation in any photo", cure="look at the overlays of `align`: masks and meshes must overlap"
+        )
+    if (seen.radiance <= 0).all():
+        raise InputError(
+            "every observation is black",
+            cure="look at the photos that `masks` wrote: exposure, `encoding`, label masks",
+        )
+    block = partial(_block, noise=noise, share=held_out, rotations=world_from_camera or {}, seed=seed)
+    shown = [np.flatnonzero(seen.illumination == i) for i in range(len(seen.illuminations))]
+    blocks = [block(seen, rows) for rows in shown if len(rows)]
+    return sorted(blocks, key=lambda block: block.name)
+
+
+def usable(observations: Observations) -> Observations:
+    """The observations whose radiance and directions are finite, whose directions are not zero, and whose weight is positive."""
+    vectors = np.stack([observations.radiance, observations.normal, observations.view])
+    directed = (observations.normal != 0).any(1) & (observations.view != 0).any(1)
+    return observations.take(
+        np.isfinite(vectors).all((0, 2)) & directed & (observations.weight > 0) & np.isfinite(observations.weight)
+    )
+
+
+def _block(
+    every: Observations, rows: Int[np.ndarray, " n"], noise: Noise, share: float, rotations: Rotations, seed: int
+) -> Block:
+    """The block of the observations `rows`, which are those of one illumination."""
+    seen, name = every.take(rows), every.illuminations[every.illumination[rows[0]]]
+    photos = sorted({seen.photos[i] for i in np.unique(seen.photo)})
+    local = np.array([photos.index(p) if p in photos else -1 for p in seen.photos])[seen.photo]
+    order = np.lexsort((seen.x, seen.y, local, seen.material))
+    seen, local = seen.take(order), local[order]
+    turned = {photo: np.asarray(of, dtype=float) for photo, of in rotations.items() if of is not None}
+    normal, view = (_in_frame(vectors, seen, turned) for vectors in (seen.normal, seen.view))
+    radiance = seen.radiance.astype(float)
+    unit = max(float(np.average(radiance.mean(1), weights=seen.weight)), 1e-30)
+    scaled = radiance / unit
+    held_out = held_out_by_cells(mirror_cells(normal, view, HELD_OUT_CELL), seen.material, share, seed)
+    visibility = directions = None
+    if seen.visibility is not None and (seen.visibility < 255).any():
+        sphere = fibonacci_sphere(seen.visibility.shape[1])
+        visibility, directions = seen.visibility, np.stack([sphere @ turned.get(p, np.eye(3)).T for p in photos])
+    bounced = bounced_light(seen, scaled)
+    block = Block(
+        name, tuple(photos), unit, normal, view, scaled, seen.clipped.astype(bool), noise.precision(scaled, seen.weight),
+        seen.material.astype(np.int64), local, held_out, visibility, directions,
+        bounced if bounced is not None and bounced.any() else None, noise,
+        None if seen.confidence is None else seen.confidence.astype(float),
+        None if seen.place is None else _turned(seen.place, seen, turned), rows[order],
+    )  # fmt: skip
+    if seen.detail is None or (seen.detail == 1).all():
+        return block
+    return block.on_surface(block.normal, seen.detail.astype(float))
+
+
+def _in_frame(vectors: Float[np.ndarray, "n 3"], seen: Observations, rotations: Rotations) -> Float[np.ndarray, "n 3"]:
+    turned = _turned(vectors, seen, rotations)
+    return turned / np.linalg.norm(turned, axis=1, keepdims=True)
+
+
+def _turned(vectors: Float[np.ndarray, "n 3"], seen: Observations, rotations: Rotations) -> Float[np.ndarray, "n 3"]:
+    turned = vectors.astype(float)
+    for i, photo in enumerate(seen.photos):
+        if photo in rotations:
+            turned[seen.photo == i] = turned[seen.photo == i] @ rotations[photo].T
+    return turned
+
+
+def held_out_by_cells(
+    cell: Int[np.ndarray, " n"], material: Int[np.ndarray, " n"], share: float, seed: int
+) -> Bool[np.ndarray, " n"]:
+    """Which observations are held out: all of randomly chosen cells, a `share` of the cells, but never all of a material.
+
+    Neighbouring pixels have similar errors.  If single pixels were held out, a lobe that only fits the error of a place would
+    explain them as well as a lobe that the light needs.
+    """
+    names, number = np.unique(cell, return_inverse=True)
+    chosen = (np.random.default_rng(seed).random(len(names)) < share)[number.reshape(-1)]
+    return chosen & np.isin(material, material[~chosen])

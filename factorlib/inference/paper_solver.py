@@ -1,0 +1,242 @@
+"""The paper's solver: limited-memory quasi-Newton steps on random subsets of the observations (arXiv 1710.08313).
+
+    minimise  mean over observations and channels of (y − radiance)² / σ²  +  β · mean over lights of Var_c(W_c) / W̄²
+
+with y the prediction of `factorlib.inference.forward`, σ its noise model, W_c the summed lobe weights of channel c and W̄ their
+mean.  Wang, Ritschel and Mitra say: L-BFGS; another random subset at every iteration; each observation sampled 5 times on average;
+n_p = 32 lobes an illumination; β = 0.1.  This is the baseline of every comparison.
+
+Left open by the paper, or by what is known of it here, and chosen:
+
+Bounds       by parametrisation: reflectances and roughness through a sigmoid, log sharpness through a sigmoid onto
+             `SHARPNESS`, weights through softplus, axes as unnormalised vectors.
+Start        reflectances from mean radiances (`start`), lobes evenly over the sphere, as wide as they are apart, white.
+Subset       `SUBSET` observations of all illuminations together.
+Curvature    a pair (step, change of gradient) is measured on one subset, at both ends of the step, so that the change
+             of subset is not taken for curvature (Schraudolph, Yu and Günter 2007, "A stochastic quasi-Newton method for
+             online convex optimization"); pairs outlive their subset.
+Residuals    whitened by the noise model.  With plain differences the subsets' highlights rule: on three materials in two
+             known lights the held-out loss stayed ten times as high.
+Step         halved until it lowers the objective enough (Armijo), no further than `LARGEST_STEP` in any unknown: longer
+             ones drive the sigmoids to where their slopes vanish.
+Clipping     at least this much, as in the joint solver: a clipped channel pulls from below only.
+Exposures    of photos that share a light, beyond the first: unknowns of their own.
+Not modelled are self-shadowing, interreflection, robustness against outliers, and how many lobes a light needs.
+"""
+
+from __future__ import annotations
+
+import math
+from collections import deque
+from collections.abc import Callable, Sequence
+from typing import Annotated
+
+import msgspec
+import numpy as np
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+
+from factorlib.geometry.sphere import fibonacci_sphere
+from factorlib.inference.fit import start_of
+from factorlib.inference.gauge import in_gauge
+from factorlib.inference.history import Event, Report, Solution, unreported
+from factorlib.inference.lights import Light
+from factorlib.inference.materials import ROUGHNESS, SHARPNESS, Materials, Point
+from factorlib.inference.options import Lobes, Seed
+from factorlib.inference.problem import JointProblem
+from factorlib.inference.start import starting_materials
+from factorlib.reflection.operator import Operator
+
+Objective = Callable[[Tensor], tuple[float, Tensor]]  # value and gradient at a point
+Pairs = deque[tuple[Tensor, Tensor]]  # steps, and changes of gradient along them
+
+MEMORY = 20  # pairs
+LARGEST_STEP = 0.05
+SUFFICIENT, HALVINGS = 1e-4, 12
+REPORTS = 20  # in a run
+SUBSET = 512  # observations
+
+Samplings = Annotated[float, msgspec.Meta(gt=0)]
+Prior = Annotated[float, msgspec.Meta(ge=0)]
+
+
+class Paper(msgspec.Struct, frozen=True):
+    """lobes: an illumination;  samplings: of each observation, on average over the run;  prior: β."""
+
+    lobes: Lobes = 32
+    samplings: Samplings = 5.0
+    prior: Prior = 0.1
+    seed: Seed = 0
+
+
+def solve(problem: JointProblem, materials: int, paper: Paper, report: Report = unreported) -> Solution:
+    """Solve for what the joint solver finds: materials 0 … `materials`−1 and one light per block, in the gauge of `factorlib.inference.gauge`."""
+    problem = problem.with_effects(False, False)
+    objective, history, blocks = PaperObjective(problem, materials, paper), list[Event](), problem.blocks
+    rows = [np.flatnonzero(~block.held_out) for block in blocks]
+    iterations = math.ceil(paper.samplings * sum(map(len, rows)) / SUBSET)
+    every, lobes = max(1, iterations // REPORTS), paper.lobes * len(blocks)
+    x, pairs, random = objective.start(), deque(maxlen=MEMORY), np.random.default_rng(paper.seed)
+    for iteration in range(iterations):
+        subset = drawn(rows, SUBSET, random)
+        x, value = stepped(lambda at, s=subset: objective.at(at, s), x, pairs)
+        if (iteration + 1) % every == 0 or iteration + 1 == iterations:
+            held_out = problem.held_out_loss(objective.point(x))
+            history.append(Event((iteration + 1) // every - 1, "subset", iteration, value, held_out, lobes))
+            report(history[-1])
+    fit = start_of(objective.point(x))
+    return Solution(in_gauge(fit.point, blocks), history, problem.loss, materials=fit, lights=fit)
+
+
+def drawn(
+    rows: Sequence[Int[np.ndarray, " _"]], count: int, random: np.random.Generator
+) -> list[Int[np.ndarray, " _"]]:
+    """`count` of all rows, without replacement, as a list per block."""
+    starts = np.cumsum([0, *map(len, rows)])
+    chosen = np.sort(random.choice(starts[-1], min(count, starts[-1]), replace=False))
+    return [
+        own[chosen[(chosen >= a) & (chosen < b)] - a] for own, a, b in zip(rows, starts[:-1], starts[1:], strict=True)
+    ]
+
+
+def stepped(objective: Objective, x: Tensor, pairs: Pairs) -> tuple[Tensor, float]:
+    """x after one step on one subset, and the objective there; the pair that was measured joins `pairs`."""
+    value, gradient = objective(x)
+    direction = -inverse_hessian_times(gradient, pairs)
+    direction = direction * min(1.0, LARGEST_STEP / max(float(direction.abs().max()), 1e-30))
+    slope, length = float(gradient @ direction), 1.0
+    for _ in range(HALVINGS):
+        trial = x + length * direction
+        trial_value, trial_gradient = objective(trial)
+        if trial_value <= value + SUFFICIENT * length * slope:
+            step, change = trial - x, trial_gradient - gradient
+            if float(step @ change) > 1e-8 * float(step.norm() * change.norm()):
+                pairs.append((step, change))
+            return trial, trial_value
+        length /= 2
+    pairs.clear()
+    return x, value
+
+
+def inverse_hessian_times(gradient: Tensor, pairs: Sequence[tuple[Tensor, Tensor]]) -> Tensor:
+    """The two-loop recursion (Nocedal 1980); with no pair yet, the gradient at a tenth of its own size."""
+    q, alphas = gradient.clone(), []
+    for step, change in reversed(pairs):
+        alphas.append(float(step @ q) / float(step @ change))
+        q -= alphas[-1] * change
+    if not pairs:
+        return 0.1 * q / max(float(gradient.abs().max()), 1e-30)
+    step, change = pairs[-1]
+    q *= float(step @ change) / float(change @ change)
+    for (step, change), alpha in zip(pairs, reversed(alphas), strict=True):
+        q += (alpha - float(change @ q) / float(step @ change)) * step
+    return q
+
+
+class PaperObjective:
+    """The objective as a function of one unbounded vector: 7 a material, then 7 a lobe (axis 3, sharpness, weight 3) and
+    the exposures of each light in turn; float64."""
+
+    def __init__(self, problem: JointProblem, materials: int, paper: Paper):
+        blocks = problem.blocks
+        self.blocks, self.operator, self.paper = blocks, problem.operator, paper
+        self.begin = starting_materials(blocks, materials)
+        self.sizes = [7 * materials] + [7 * paper.lobes + len(block.photos) - 1 for block in blocks]
+
+    def start(self) -> Float[Tensor, " k"]:
+        """Even lobes under which the block's mean radiance, 1, is what its materials reflect."""
+        p, begin = self.paper.lobes, self.begin
+        roughness = _unbounded(begin.roughness, ROUGHNESS)
+        parts = [np.column_stack([_unbounded(begin.diffuse), _unbounded(begin.specular), roughness]).reshape(-1)]
+        level = np.full((p, 1), _unbounded(np.log(p / 2), np.log(SHARPNESS)))  # λ of lobes whose variances cover 4π
+        for block in self.blocks:
+            reflectance = (begin.diffuse + begin.specular)[block.material].mean(0)
+            weight = np.tile(block.radiance.mean(0) / np.maximum(reflectance, 1e-3), (p, 1))
+            lobes = np.hstack([fibonacci_sphere(p), level, np.log(np.expm1(weight))])
+            parts += [lobes.reshape(-1), np.zeros(len(block.photos) - 1)]
+        return torch.from_numpy(np.concatenate(parts))
+
+    def unpacked(self, x: Tensor) -> tuple[tuple[Tensor, ...], list[tuple[Tensor, ...]]]:
+        """(diffuse, specular, roughness) and, of each light, (axis, log sharpness, weight, log exposure)."""
+        of_materials, *of_lights = torch.split(x, self.sizes)
+        bounded = torch.sigmoid(of_materials.reshape(-1, 7))
+        (low, high), (least, most), lights = ROUGHNESS, np.log(SHARPNESS), []
+        for part in of_lights:
+            rows, others = part[: 7 * self.paper.lobes].reshape(-1, 7), part[7 * self.paper.lobes :]
+            axis = torch.nn.functional.normalize(rows[:, :3], dim=1)
+            log_sharpness = least + (most - least) * torch.sigmoid(rows[:, 3])
+            weight = torch.nn.functional.softplus(rows[:, 4:])
+            lights.append((axis, log_sharpness, weight, torch.cat([part.new_zeros(1), others])))
+        return (bounded[:, :3], bounded[:, 3:6], low + (high - low) * bounded[:, 6]), lights
+
+    def point(self, x: Tensor) -> Point:
+        """The materials and lights that x stands for."""
+        (diffuse, specular, roughness), lights = self.unpacked(x)
+        vector = torch.cat([diffuse, specular, roughness[:, None]], 1).reshape(-1).numpy()
+        return Point(Materials.of_vector(vector), [Light(*(t.numpy() for t in light)) for light in lights])
+
+    def at(self, x: Tensor, subset: Sequence[Int[np.ndarray, " _"]]) -> tuple[float, Tensor]:
+        """Value and gradient on the subset."""
+        x = x.detach().requires_grad_()
+        (diffuse, specular, roughness), lights = self.unpacked(x)
+        squares, values, prior = x.new_zeros(()), 0, x.new_zeros(())
+        for block, (axis, log_sharpness, weight, log_exposure), rows in zip(self.blocks, lights, subset, strict=True):
+            sums = weight.sum(0)
+            prior = prior + ((sums / sums.mean() - 1) ** 2).mean()  # their variance over channels
+            for m in np.unique(block.material[rows]).tolist():
+                own = rows[block.material[rows] == m]
+                normal, view, photo, radiance, precision, clipped = (
+                    torch.from_numpy(of[own])
+                    for of in (block.normal, block.view, block.photo, block.radiance, block.precision, block.clipped)
+                )
+                seen = (normal * view).sum(1), normal @ axis.T, view @ axis.T  # n·o, n·z and o·z
+                lit = UnitReflection.apply(self.operator, roughness[m], log_sharpness, *seen)
+                by_diffuse, by_specular = (part @ weight for part in lit)
+                exposure = torch.exp(log_exposure)[photo][:, None]
+                predicted = exposure * (diffuse[m] * by_diffuse + specular[m] * by_specular)
+                difference = (predicted - radiance) * precision
+                squares = squares + (difference.masked_fill(clipped & (difference > 0), 0.0) ** 2).sum()
+                values += difference.numel()
+        value = squares / max(values, 1) + self.paper.prior * prior / len(self.blocks)
+        value.backward()
+        return value.item(), x.grad
+
+
+class UnitReflection(torch.autograd.Function):
+    """D and S [n, p] without shadows, for autograd; the derivatives are those of the operator's `response`."""
+
+    @staticmethod
+    def forward(
+        ctx: torch.autograd.function.FunctionCtx,
+        operator: Operator,
+        roughness: Tensor,
+        log_sharpness: Tensor,
+        *cosines: Tensor,
+    ) -> tuple[Tensor, Tensor]:
+        """D and S;  cosines: n·o [n], n·z and o·z [n, p]."""
+        inputs = [t.detach().to(operator.dtype) for t in (roughness, log_sharpness.exp(), *cosines)]
+        r = operator.response(*inputs)
+        slopes = (
+            *(r.specular_by_roughness, r.diffuse_by_log_sharpness, r.specular_by_log_sharpness),
+            *(r.diffuse_by_nz, r.specular_by_nz, r.specular_by_oz),
+        )
+        ctx.save_for_backward(*(slope.to(cosines[1].dtype) for slope in slopes))
+        return r.diffuse.to(cosines[1].dtype), r.specular.to(cosines[1].dtype)
+
+    @staticmethod
+    def backward(
+        ctx: torch.autograd.function.FunctionCtx, diffuse: Tensor, specular: Tensor
+    ) -> tuple[Tensor | None, ...]:
+        """Gradients by roughness, log sharpness, n·z and o·z; views are given, so there is none by n·o."""
+        by_roughness, d_by_sharpness, s_by_sharpness, d_by_nz, s_by_nz, s_by_oz = ctx.saved_tensors
+        by_sharpness = (diffuse * d_by_sharpness + specular * s_by_sharpness).sum(0)
+        by_nz = diffuse * d_by_nz + specular * s_by_nz
+        return None, (specular * by_roughness).sum(), by_sharpness, None, by_nz, specular * s_by_oz
+
+
+def _unbounded(value: Float[np.ndarray, "*n"], bounds: tuple[float, float] = (0.0, 1.0)) -> Float[np.ndarray, "*n"]:
+    """The inverse of a sigmoid onto the bounds, of values that are kept off their ends."""
+    low, high = bounds
+    share = np.clip((value - low) / (high - low), 1e-4, 1 - 1e-4)
+    return np.log(share / (1 - share))

@@ -1,0 +1,196 @@
+"""Where a solve starts: from mean radiances alone, or from an earlier solution, of which what has a name there is used.
+
+From nothing   The median radiance of material m in photo i is roughly light_i · reflectance_m per channel: a rank-one matrix with gaps, whose
+               logarithm is fitted as a sum by least squares.  Exposures follow from mean radiances, lights are constant.
+From earlier   Materials are known by their names, lights by their illumination's.  Mean radiances give all materials one relative scale
+               (`mean_albedo`), known or new; each gauge of the earlier solution is brought to that scale by one factor per channel, the
+               geometric mean over its materials, and its lights by the inverse.  So groups that a new photo links come into one gauge, and
+               new materials stand beside the known ones.  A new photo of a known light gets the exposure that explains its mean radiance; a
+               new light is constant.  A light that explains its photos worse than a constant does (it was taken again, or turned, or in
+               other units) is not known but new.  Only the start, and what was decided of shadows and bounces, are taken over: nothing pulls
+               toward the earlier answer.
+What is known  Each component is brought to the scale of its known materials, and these stand in their places.
+"""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Callable, Sequence
+
+import msgspec
+import numpy as np
+from jaxtyping import Float
+
+from factorlib.inference.blocks import Block
+from factorlib.inference.forward import Illumination
+from factorlib.inference.gauge import connected_components
+from factorlib.inference.lights import TONE, Light, even_cells
+from factorlib.inference.materials import LEAST_REFLECTANCE, SHARPNESS, Materials, Point
+from factorlib.inference.noise import Loss
+from factorlib.inference.options import Choices
+from factorlib.inference.problem import JointProblem
+from factorlib.results.solution import Earlier
+
+log = logging.getLogger("factorlib.inference")
+BRIGHTEST_AT_START = 0.7  # reflectance of the brightest material at the start
+ROUGHNESS, SPECULAR_SHARE = 0.4, 0.2  # of every material at the start
+FEW, STARTS = 2, (0.15, 0.4, 0.8)  # with so few materials, a solve starts from several roughnesses
+LEAST_RADIANCE = 1e-6  # of a block's mean
+
+# Points on so many cells a light, of which the one that explains most goes on.
+Start = Callable[[JointProblem, int], list[Point]]
+
+
+def from_nothing(materials: int) -> Start:
+    """Materials 0 … `materials`−1 and lights from mean radiances alone; with few materials, from several roughnesses."""
+
+    def points(problem: JointProblem, cells: int) -> list[Point]:
+        """One point a roughness, its lights constant."""
+        blocks, roughness = problem.blocks, STARTS if materials <= FEW else STARTS[1:2]
+        begun = [starting_materials(blocks, materials, one) for one in roughness]
+        return [Point(of, [constant_light(block, of, cells) for block in blocks]) for of in begun]
+
+    return points
+
+
+def with_known(point: Point, problem: JointProblem) -> Point:
+    """The point with what is known in its place, and the rest of each component at the scale of what is known."""
+    known, materials, lights = problem.known, point.materials, list(point.lights)
+    if known.nothing:
+        return point
+    names, rows = [block.name for block in problem.blocks], materials.rows()
+    given = np.maximum(known.put(materials).rows(), LEAST_REFLECTANCE)
+    for members, illuminations in connected_components(problem.blocks, len(materials)):
+        own = {i: known.lights.get(problem.blocks[i].name) for i in map(names.index, illuminations)}
+        logs = [np.log((given[m, :3] + given[m, 3:6]) / (rows[m, :3] + rows[m, 3:6])) for m in known.of(members)]
+        brighter = {i: level(lights[i]) - level(one) + np.log(problem.blocks[i].unit) for i, one in own.items() if one}
+        logs = logs or [by - by.mean() * own[i].scale_free for i, by in brighter.items()] or [np.zeros(3)]
+        factor = np.mean(logs, axis=0)  # on reflectances
+        rows[list(members), :6] *= np.tile(np.exp(factor), 2)
+        for i, one in own.items():
+            weight, parts = lights[i].weight / np.exp(factor), {}
+            if one:
+                scale = (brighter[i] - factor).mean() * one.scale_free - np.log(problem.blocks[i].unit)
+                weight, held = one.weight * np.exp(scale), {"held": one.held, "scale_free": one.scale_free}
+                parts = {"axis": one.axis, "log_sharpness": one.log_sharpness, **held}
+            if names[i] in known.exposures:
+                parts |= {"log_exposure": np.zeros_like(lights[i].log_exposure), "exposures_held": True}
+            lights[i] = msgspec.structs.replace(lights[i], weight=weight, **parts)
+    return Point(known.put(Materials.of_rows(rows)), lights)
+
+
+def level(light: Light) -> Float[np.ndarray, "3"]:
+    """The logarithm of a light's mean radiance."""
+    return np.log(np.maximum(light.energy.sum(0) / 2, LEAST_RADIANCE))  # `energy` is over 2π, a mean over 4π
+
+
+def from_earlier(earlier: Earlier, names: Sequence[str]) -> Start:
+    """The start of a problem whose materials are called `names`; lights of the earlier solution keep their cells."""
+    return lambda problem, cells: [known_point(problem, earlier, names, cells)]
+
+
+def with_decided(choices: Choices, earlier: Earlier) -> Choices:
+    """Return the choices with shadows and bounces as they were decided before, where the two had been compared."""
+    for name in ("self_shadowing", "interreflection"):
+        if getattr(choices, name) == "auto" and getattr(earlier, name):
+            choices = msgspec.structs.replace(choices, **{name: getattr(earlier, name)})
+    return choices
+
+
+def starting_materials(blocks: Sequence[Block], count: int, roughness: float = ROUGHNESS) -> Materials:
+    """Materials whose diffuse part explains the median radiances and whose specular part is grey."""
+    albedo = mean_albedo(blocks, count)
+    diffuse = np.maximum(albedo * (1 - SPECULAR_SHARE), 10 * LEAST_REFLECTANCE)
+    specular = np.maximum(np.full((count, 3), SPECULAR_SHARE * BRIGHTEST_AT_START / 2), 10 * LEAST_REFLECTANCE)
+    return Materials(diffuse, specular, np.full(count, roughness))
+
+
+def mean_albedo(blocks: Sequence[Block], count: int) -> Float[np.ndarray, "m 3"]:
+    """Relative reflectance per material and channel, the largest being `BRIGHTEST_AT_START`; materials that no block shows get the median."""
+    rows, right, weight, first = [], [], [], count
+    for block in blocks:
+        for k in range(len(block.photos)):
+            for m in np.unique(block.material[block.photo == k]):
+                of = (block.material == m) & (block.photo == k)
+                row = np.zeros(count + sum(len(b.photos) for b in blocks))
+                row[[m, first + k]] = 1
+                rows.append(row)
+                right.append(np.log(np.maximum(np.median(block.radiance[of], axis=0), LEAST_RADIANCE)))
+                weight.append(np.sqrt(of.sum()))
+        first += len(block.photos)
+    weighted = np.array(rows) * np.array(weight)[:, None]
+    logs = np.linalg.lstsq(weighted, np.array(right) * np.array(weight)[:, None], rcond=None)[0][:count]
+    seen = np.array(rows)[:, :count].any(0)
+    logs[~seen] = np.median(logs[seen], axis=0)
+    return BRIGHTEST_AT_START * np.exp(logs - logs.max())
+
+
+def constant_light(block: Block, materials: Materials, cells: int) -> Light:
+    """The constant light that explains the mean radiance of a block's first photo, and the exposures of the others beside it."""
+    reflectance = np.maximum((materials.diffuse + materials.specular)[block.material], LEAST_REFLECTANCE)
+    logs = np.log(np.maximum(block.radiance, LEAST_RADIANCE) / reflectance)
+    shown = [k for k in range(len(block.photos)) if (block.photo == k).any()]
+    levels = np.zeros((len(block.photos), 3))
+    levels[shown] = [np.log(np.mean(np.exp(logs[block.photo == k]), axis=0)) for k in shown]
+    lobes = even_cells(cells)
+    light = Light(lobes.axis, np.log(lobes.sharpness), np.ones((cells, 3)), (levels - levels[0]).mean(1))
+    return light.with_log_radiance(np.repeat(levels[0][:, None], cells, axis=1))
+
+
+def known_point(problem: JointProblem, earlier: Earlier, names: Sequence[str], cells: int) -> Point:
+    """Build the point from which a solve starts that has an earlier solution.
+
+    Each component of the earlier gauge comes to the scale of `mean_albedo` by the geometric mean, over its materials that a block shows, or over all
+    of them where none is shown.
+    """
+    blocks, component = problem.blocks, [earlier.table.gauge.component.get(name) for name in names]
+    albedo, rows = mean_albedo(blocks, len(names)), starting_materials(blocks, len(names)).rows()
+    shown, factors = {int(m) for block in blocks for m in np.unique(block.material)}, {}
+    for c in sorted({c for c in component if c is not None}):
+        members = [m for m in range(len(names)) if component[m] == c]
+        known = {m: earlier.table.materials[names[m]] for m in members}
+        judged = [m for m in members if m in shown] or members
+        whole = np.array([np.array(known[m].diffuse) + np.array(known[m].specular) for m in judged])
+        factor = np.exp(np.mean(np.log(albedo[judged]) - np.log(np.maximum(whole, LEAST_RADIANCE)), axis=0))
+        for m, one in known.items():
+            rows[m] = [*(one.diffuse * factor), *(one.specular * factor), one.roughness]
+        factors[c] = factor
+    materials, lights = Materials.of_vector(rows.reshape(-1)), []
+    for block in blocks:
+        light = constant_light(block, materials, cells)
+        own = [component[m] for m in np.unique(block.material) if component[m] is not None]
+        if own:
+            factor = factors[max(set(own), key=lambda c: (own.count(c), -c))]
+            lit = Illumination(block, light, materials, problem.operator)
+            light = earlier_light(lit, earlier, factor, problem.loss)
+        lights.append(light)
+    return Point(materials, lights)
+
+
+def earlier_light(constant: Illumination, earlier: Earlier, factor: Float[np.ndarray, "3"], loss: Loss) -> Light:
+    """The earlier light of a block in the block's unit and the start's gauge; the constant one where there is none, or it explains the block worse.
+
+    A photo that the earlier solution does not have gets its exposure in the constant light, beside those of the others.
+    """
+    block, model, before = constant.block, earlier.table.model, constant.light.log_exposure
+    lobes = earlier.lights.get(block.name)
+    exposure = np.array([np.log(np.mean(earlier.exposures.get(photo, (np.nan,) * 3))) for photo in block.photos])
+    new = np.isnan(exposure)
+    if not lobes or new.all():
+        return constant.light
+    exposure = np.where(new, before + np.mean(exposure[~new] - before[~new]), exposure)
+    tone = [model.tone[photo].exponent for photo in block.photos if photo in model.tone]
+    light = Light(
+        lobes.axis / np.linalg.norm(lobes.axis, axis=1, keepdims=True),
+        np.log(np.maximum(lobes.sharpness, SHARPNESS[0])),
+        np.maximum(lobes.weight, 0) / block.unit / factor * np.exp(exposure[0]),
+        exposure - exposure[0],
+        np.log(np.clip(tone, *TONE)) if len(tone) == len(block.photos) else np.zeros(0),
+        model.curvature(block.name),
+    )
+    lit = msgspec.structs.replace(constant, light=light)
+    if lit.losses(loss).mean() <= constant.losses(loss).mean():
+        return light
+    said = "illumination '%s' starts anew: what the earlier solution says of it explains less than a constant light"
+    log.warning(said, block.name)
+    return constant.light

@@ -1,0 +1,41 @@
+"""Which nodes of the subdivided meshes the pixels of a photo show."""
+
+from collections.abc import Mapping
+
+import numpy as np
+from jaxtyping import Int
+
+from factorlib.geometry.camera import Camera
+from factorlib.geometry.raster import Caster, face_normals
+from factorlib.inference.surface_detail import Surfaces
+from factorlib.inference.surface_turns import Attached
+from factorlib.meshes.mesh import scaled
+from factorlib.results.poses import ObjectEntry
+
+
+def attached_pixels(
+    pixels: Int[np.ndarray, "n 2"],
+    shown: Int[np.ndarray, " n"],
+    camera: Camera,
+    objects: Mapping[str, tuple[str, ObjectEntry]],
+    surfaces: Surfaces,
+) -> Attached:
+    """The nodes under pixels (x, y), in the camera's frame.
+
+    shown: the object that each pixel shows, a number from 1 as `align` counts them, 0 for none;  objects: the mesh and the pose of each, in that order; a mesh that has no nodes stays as it is
+    """
+    along, count = camera.rays_through(pixels + 0.5), len(pixels)
+    node, share, frame = np.zeros((count, 3), np.int64), np.zeros((count, 3)), np.zeros((count, 3, 3))
+    for number, (mesh, entry) in enumerate(objects.values(), start=1):
+        if mesh not in surfaces.meshes:
+            continue
+        rows, fine, scale = np.flatnonzero(shown == number), surfaces.meshes[mesh], np.array(entry.scale)
+        solid = scaled(fine.mesh, entry.scale)
+        hits = Caster(solid).cast_along(along[rows], entry.pose)
+        rows, face, uv = rows[hits.face >= 0], hits.face[hits.face >= 0], hits.uv[hits.face >= 0]
+        node[rows] = surfaces.first[mesh] + fine.faces[face]
+        share[rows] = np.column_stack([1 - uv.sum(1), uv])
+        toward = face_normals(solid, face) @ entry.pose.rotation.T
+        side = np.where(np.sum(toward * along[rows], 1) > 0, -1.0, 1.0)
+        frame[rows] = side[:, None, None] * entry.pose.rotation * (scale.mean() / scale)
+    return Attached(node, share, frame)

@@ -1,0 +1,281 @@
+"""Whether the surfaces of a set are moved by shading, and painted, how stiff both are, and what they end with.
+
+start      materials and lights are fitted on few cells, with the shadows and bounces of the given meshes.  Lights are far away: where normals are wrong, near
+           ones take up what turns should explain (rough set of seed 0: 3.5 instead of 3.1 degrees)
+stiffness  of each of `TURNS`, from stiff to soft, turns are found from all photos but one, for every photo in turn; that photo then gets a light of its
+           own, with the materials given.  The stiffness is used with which the photos are likeliest, lights integrated out (`factorlib.inference.likelihood`)
+whether    turns are kept where the likelihood is higher than without turns, and the photos' held-out observations are explained better by more than `FOR`
+           standard errors over clusters (`factorlib.inference.evidence`).  Of several meshes, those stay with which alone neither is better
+paint      factors on the diffuse reflectance likewise, of a stiffness of `FACTORS`, beside the turns and over what these explain; they are kept where the
+           likelihood is higher by more than `FOR` standard errors over photos, and held-out observations are explained better too.  The likelihood is the
+           finer measure.  Of turns it takes too many: a light that is fitted makes up for a wrong normal, but not for dirt
+rounds     turns from all lights, materials and lights fitted again, `ROUNDS` times
+surface    at last the displacement whose normals come nearest to the turned ones: what no displacement explains (a wrong pose turns all normals
+           of a photo) is left out
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Sequence
+from itertools import count
+
+import msgspec
+import numpy as np
+from jaxtyping import Bool, Float
+from scipy.sparse import block_diag, csr_array
+
+from factorlib.inference.evidence import FOR, Losses, compare, losses_of
+from factorlib.inference.fit import Fit, Schedule, field_of, fitted, sure_ones
+from factorlib.inference.likelihood import marginal
+from factorlib.inference.materials import Point
+from factorlib.inference.model_selection import TRIAL, effects_chosen
+from factorlib.inference.options import Choices
+from factorlib.inference.problem import JointProblem
+from factorlib.inference.start import Start
+from factorlib.inference.surface_turns import Attached, Detail, Part, Stiffness, no_detail, part_of, step
+from factorlib.light.prior import LightPrior
+from factorlib.meshes.fine import Fine
+from factorlib.results.materials import Decision
+
+TURNS = (1000.0, 300.0, 100.0, 30.0)  # stiffness of turns: a of `factorlib.inference.surface_turns`; b is a share of it
+FACTORS = (300.0, 100.0, 30.0, 10.0)  # of log factors
+ROUNDS = 3
+CELLS = 250  # of a light
+SETTLE = Schedule(together=(6, 4))
+BETWEEN = Schedule(together=(3,), estimate=False)
+OWN_LIGHT = Schedule(lights=6, estimate=False, given=True)
+
+
+class Surfaces(msgspec.Struct, frozen=True):
+    """The meshes of a set by name, subdivided, in the order in which their nodes are numbered."""
+
+    meshes: dict[str, Fine]
+
+    @property
+    def first(self) -> dict[str, int]:
+        """The number of each mesh's first node."""
+        counts = [mesh.nodes for mesh in self.meshes.values()]
+        return dict(zip(self.meshes, np.cumsum([0, *counts[:-1]]).tolist()))
+
+    @property
+    def nodes(self) -> int:
+        """The number of all nodes."""
+        return sum(mesh.nodes for mesh in self.meshes.values())
+
+    def laplacian(self) -> csr_array:
+        """Return the Laplacian of all meshes, [v, v]."""
+        return csr_array(block_diag([mesh.laplacian() for mesh in self.meshes.values()]))
+
+    def displacements(
+        self, turn: Float[np.ndarray, "v 3"], attached: Sequence[Attached]
+    ) -> dict[str, Float[np.ndarray, " n"]]:
+        """Return by mesh, in its extents, what `Fine.displacement` finds for the turns of its nodes, as far as observations are attached to them."""
+        weight = sum(np.bincount(of.node.reshape(-1), of.share.reshape(-1), self.nodes) for of in attached)
+        turns, seen = self.by_mesh(turn), self.by_mesh(np.minimum(weight, 1.0))
+        return {name: mesh.displacement(turns[name], seen[name]) for name, mesh in self.meshes.items()}
+
+    def by_mesh(self, values: np.ndarray) -> dict[str, np.ndarray]:
+        """Return what belongs to each mesh's nodes."""
+        return {name: values[k : k + self.meshes[name].nodes] for name, k in self.first.items()}
+
+    def turns_of(self, displacements: dict[str, Float[np.ndarray, " n"]]) -> Float[np.ndarray, "v 3"]:
+        """The turns that displacements mean; a mesh without any stays."""
+        still = {name: np.zeros((mesh.nodes, 3)) for name, mesh in self.meshes.items()}
+        moved = {name: self.meshes[name].turn_of(of) for name, of in displacements.items()}
+        return np.vstack(list((still | moved).values()))
+
+    def nodes_of(self, names: Iterable[str]) -> Bool[np.ndarray, " v"]:
+        """Return which nodes are of these meshes."""
+        return np.concatenate([np.full(mesh.nodes, name in names) for name, mesh in self.meshes.items()])
+
+
+class Found(msgspec.Struct, frozen=True):
+    """The answer for all meshes of a set.
+
+    evidence  whether surfaces are moved, by held-out observations of photos that had no part in that;  painted: whether reflectance has detail, likewise
+    stiffness that was best;  gains: by photo, of all that is kept: how much −2 log marginal likelihood fell while the photo had no part in it
+    displacements  by mesh, at nodes, in extents; none where surfaces stay;  log_factors: by mesh, likewise
+    """
+
+    evidence: Decision
+    painted: Decision = Decision(False)
+    stiffness: Stiffness = Stiffness(None)
+    gains: dict[str, float] = {}
+    displacements: dict[str, Float[np.ndarray, " n"]] = {}
+    log_factors: dict[str, Float[np.ndarray, " n"]] = {}
+
+
+Report = Callable[[float, str], None]  # the share that is done, and what is being done
+Tick = Callable[..., None]  # called when a piece of work is done
+
+
+class Judged(msgspec.Struct, frozen=True):
+    """What each photo says: −2 log marginal likelihood and held-out losses, with detail in which it had no part."""
+
+    values: Float[np.ndarray, " f"]
+    losses: Losses
+
+    def gain_over(self, other: Judged) -> float:
+        """Return by how many standard errors over photos the values are less."""
+        gains = other.values - self.values
+        return float(gains.mean() / max(gains.std(ddof=1) / np.sqrt(len(gains)), 1e-12))
+
+
+def evidence_of(after: Judged, before: Judged, held_out: float, likelihood: float) -> Decision:
+    """Return whether detail is kept: better by more than so many standard errors in each of the two measures."""
+    evidence = compare(before.losses, after.losses, held_out)
+    return msgspec.structs.replace(evidence, kept=evidence.kept and after.gain_over(before) > likelihood)
+
+
+class Trial(msgspec.Struct, frozen=True):
+    """A problem without detail, its fit, and what its blocks are attached to."""
+
+    problem: JointProblem
+    fit: Fit
+    surfaces: Surfaces
+    attached: list[Attached]
+    prior: LightPrior
+
+    def on(self, detail: Detail) -> JointProblem:
+        """The problem on a surface with detail."""
+        pairs = zip(self.problem.blocks, self.attached, strict=True)
+        return self.problem.of([detail.on(block, at) for block, at in pairs])
+
+    def parts(self, detail: Detail, fit: Fit) -> list[Part]:
+        """Every light linearised on a surface with detail."""
+        each = zip(self.on(detail).illuminations(fit.point), fit.hyperparameters, self.attached, strict=True)
+        nodes = self.surfaces.nodes
+        return list(self.problem.spread(lambda one: part_of(*one[:2], self.prior, one[2], nodes), list(each)))
+
+    def moving(self, detail: Detail, meshes: set[str]) -> Detail:
+        """The detail with the turns of these meshes alone."""
+        turn = np.where(self.surfaces.nodes_of(meshes)[:, None], detail.turn, 0.0)
+        return msgspec.structs.replace(detail, turn=turn)
+
+    @property
+    def photos(self) -> list[tuple[int, int]]:
+        """Each photo that has observations: its block and its number there."""
+        return [(k, int(j)) for k, block in enumerate(self.problem.blocks) for j in np.unique(block.photo)]
+
+    @property
+    def names(self) -> list[str]:
+        """The names of these photos."""
+        return [self.problem.blocks[k].photos[j] for k, j in self.photos]
+
+    def judged(self, details: Sequence[Detail], tick: Tick = lambda: None) -> Judged:
+        """Every photo by itself, on the surface that `details` has for it, in a light of its own, with the materials given; tick: called after each."""
+
+        def alone(of: tuple[tuple[int, int], Detail]) -> tuple[float, Losses]:
+            """One photo's value and losses."""
+            (k, number), detail = of
+            own, counts = self.problem.blocks[k].photo == number, [self.fit.hyperparameters[k]]
+            block = detail.on(self.problem.blocks[k].take(own), self.attached[k].take(own))
+            problem = self.problem.of([block])
+            begun = Fit(Point(self.fit.point.materials, [self.fit.point.lights[k]]), counts)
+            point = fitted(problem, begun, self.prior, OWN_LIGHT).point
+            (one,) = problem.fitted().illuminations(point)
+            judged = marginal(field_of(one, counts[0], self.prior)).value, losses_of(problem, point)
+            tick()
+            return judged
+
+        values, losses = zip(*self.problem.spread(alone, list(zip(self.photos, details, strict=True))), strict=True)
+        return Judged(np.array(values), Losses(*([of[i][0] for of in losses] for i in (0, 1))))
+
+    def left_out(self, parts: list[Part], laplacian: csr_array, stiffness: Stiffness, tick: Tick) -> list[Detail]:
+        """Find for every photo the surface that all others ask for; parts: of the mesh itself;  tick: called after each photo."""
+
+        def others(photo: tuple[int, int]) -> Detail:
+            """The detail that one photo has no part in."""
+            k, number = photo
+            gone = [(block.photo == number) & (j == k) for j, block in enumerate(self.problem.blocks)]
+            rest = [part.without(rows) if rows.any() else part for part, rows in zip(parts, gone, strict=True)]
+            rest = [part for part in rest if len(part.residual)]
+            found = step(rest, laplacian, stiffness, no_detail(self.surfaces.nodes))
+            seen = [of.take(~rows) for of, rows in zip(self.attached, gone, strict=True)]
+            moved = self.surfaces.displacements(found.turn, seen)
+            tick()
+            return Detail(self.surfaces.turns_of(moved), found.log_factor)
+
+        return list(self.problem.spread(others, self.photos))
+
+
+def found(
+    problem: JointProblem,
+    surfaces: Surfaces,
+    attached: list[Attached],
+    start: Start,
+    prior: LightPrior,
+    seed: int = 0,
+    report: Report = lambda share, what: None,
+) -> Found:
+    """The detail of the meshes, if photos that had no part in it gain.
+
+    problem: all observations;  attached: where each block's lie;  start: where materials and lights begin;  seed: of what is drawn
+    """
+
+    def pieces(begin: float, end: float, number: int, what: str) -> Tick:
+        """What reports, whenever it is called, that one more of so many pieces of work is done."""
+        report(begin, what)
+        done = count(1)
+        return lambda *_: report(begin + (end - begin) * min(next(done) / number, 1.0), what)
+
+    sure = sure_ones(problem)
+    starts = start(sure, CELLS)
+    tick = pieces(0.0, 0.18, len(starts) * TRIAL.points + SETTLE.points, "materials and lights")
+    choices = Choices(self_shadowing="on", interreflection="on", seed=seed)
+
+    def fitting(name: str, some: JointProblem, begun: Fit, schedule: Schedule) -> Fit:
+        """A fit under the prior."""
+        return fitted(some, begun, prior, schedule, tick)
+
+    effects = effects_chosen(sure, starts, choices, fitting)
+    fit = fitted(effects.of(problem), effects.fit, prior, SETTLE, tick)
+    trial, plain = Trial(effects.of(problem), fit, surfaces, attached, prior), no_detail(surfaces.nodes)
+    if len(trial.photos) < 2 or problem.none_held_out:
+        return Found(Decision(False))
+    laplacian, parts, photos = surfaces.laplacian(), trial.parts(plain, fit), len(trial.photos)
+    given = trial.judged([plain] * photos, pieces(0.18, 0.2, photos, "photos without detail"))
+
+    def best(
+        tried: list[Stiffness], before: Judged, done: float, held_out: float, likelihood: float
+    ) -> tuple[Stiffness, list[Detail], Judged, Decision]:
+        """The likeliest of several stiffnesses, the surfaces it gives each photo, what photos say of them, and whether they are kept.
+
+        before: what photos say without it;  held_out, likelihood: by how many standard errors it must be better, in each of the two measures
+        """
+        details, judged = [], []
+        for number, one in enumerate(tried):
+            begin, end = (done + 0.3 * k / len(tried) for k in (number, number + 1))
+            tick = pieces(begin, end, 2 * photos, f"left-out photos, stiffness {one.factor or one.turn:g}")
+            details.append(trial.left_out(parts, laplacian, one, tick))
+            judged.append(trial.judged(details[-1], tick))
+        k = min(range(len(tried)), key=lambda i: round(float(judged[i].values.sum()), 3))
+        return tried[k], details[k], judged[k], evidence_of(judged[k], before, held_out, likelihood)
+
+    stiffness, turned, moved, evidence = best([Stiffness(a) for a in TURNS], given, 0.2, FOR, 0.0)
+    moving = set(surfaces.meshes)
+    if len(surfaces.meshes) > 1:  # those stay that, moved alone, are against it
+        tick = pieces(0.5, 0.55, photos * len(surfaces.meshes), "mesh by mesh")
+        alone = {name: trial.judged([trial.moving(of, {name}) for of in turned], tick) for name in surfaces.meshes}
+        moving = {name for name, judged in alone.items() if evidence_of(judged, given, 0.0, 0.0).kept}
+        if 0 < len(moving) < len(surfaces.meshes):
+            moved = trial.judged([trial.moving(of, moving) for of in turned])
+            evidence = evidence_of(moved, given, FOR, 0.0)
+    now = (stiffness, moved) if evidence.kept else (Stiffness(None), given)
+    tried = [Stiffness(now[0].turn, a) for a in FACTORS]
+    both, _, paint, painted = best(tried, now[1], 0.55, 0.0, FOR)
+    stiffness, judged = (both, paint) if painted.kept else now
+    gains = dict(zip(trial.names, (given.values - judged.values).tolist(), strict=True))
+    if not (evidence.kept or painted.kept):
+        return Found(evidence, painted)
+    detail = plain
+    for number in range(ROUNDS):
+        tick = pieces(0.85 + 0.05 * number, 0.9 + 0.05 * number, BETWEEN.points, f"all photos, round {number + 1}")
+        if number:
+            fit = fitted(trial.on(detail), fit, prior, BETWEEN, tick)
+            parts = trial.parts(detail, fit)
+        detail = step(parts, laplacian, stiffness, detail, surfaces.nodes_of(moving))
+    displacements = surfaces.displacements(detail.turn, attached) if evidence.kept else {}
+    displacements = {name: of for name, of in displacements.items() if name in moving}
+    factors = surfaces.by_mesh(detail.log_factor) if painted.kept else {}
+    return Found(evidence, painted, stiffness, gains, displacements, factors)

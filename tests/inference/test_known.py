@@ -1,0 +1,226 @@
+"""Unknowns that are known: they stay where they are, and settle the scale and the white balance of all others."""
+
+import msgspec
+import numpy as np
+import pytest
+
+from factorlib.conventions import YUP_FROM_CAMERA, lat_long_directions
+from factorlib.inference.uncertainty import Posterior
+from factorlib.inference.uncertainty import in_gauge as covariance_in_gauge
+from factorlib.geometry.camera import rotation_of_vector
+from factorlib.geometry.sphere import fibonacci_sphere, mirror_directions
+from factorlib.light.latlong import map_energy
+from factorlib.inference.gauge import BRIGHTEST, in_gauge
+from factorlib.inference.known import Known, light_of_ball, light_of_map
+from factorlib.inference.lights import Light
+from factorlib.inference.materials import LEAST_REFLECTANCE
+from factorlib.inference.optimizer import Descent, moved, stepped
+from factorlib.inference.fit import Schedule, fitted, start_of
+from factorlib.inference.likelihood import marginal
+from factorlib.inference.priors import MaterialPrior, unknowns_of
+from factorlib.inference.start import with_known
+from studies.scenes.problems import MATERIALS, sphere_normals
+from tests.inference.made import seen_from_the_front
+from tests.inference.made_lights import (
+    FEW,
+    PRIOR,
+    START,
+    WHOLE,
+    at,
+    begun,
+    drawn,
+    field,
+    on_even_cells,
+    photographed,
+    spheres,
+)
+
+LAMP, QUICK = np.array([0.48, -0.6, -0.64]), Schedule(2, (3,))
+CARD = Known({1: MATERIALS.rows()[1]})
+
+
+@pytest.fixture(scope="module")
+def solved():
+    problem, _ = photographed(5, 3)
+    problem = msgspec.structs.replace(problem, known=CARD)
+    return problem, fitted(problem, start_of(with_known(begun(problem).point, problem)), PRIOR, WHOLE)
+
+
+def test_a_known_material_stays_and_gives_the_others_their_scale_and_colour(solved):
+    problem, found = solved
+    materials = found.point.materials
+    np.testing.assert_allclose(materials.rows()[1], MATERIALS.rows()[1], rtol=1e-12)
+    np.testing.assert_allclose(materials.diffuse, MATERIALS.diffuse, rtol=0.03)  # in absolute scale
+    in_place, moved = (in_gauge(found.point, problem.blocks, known).materials for known in (CARD, Known()))
+    assert (in_place.vector() == materials.vector()).all() and (moved.diffuse != materials.diffuse).any()
+
+
+def test_a_step_with_known_unknowns_is_that_of_a_prior_that_holds_them(solved):
+    """Against the slow and obvious: a penalty of 1e7 on the unknowns that are known."""
+    problem, _ = photographed(5, 1, cells=40, size=10)
+    known = Known({1: np.array([0.2, 0.4, 0.25, np.nan, np.nan, np.nan, 0.4])})
+    free, theta = known.free(3), unknowns_of(START)
+    prior = MaterialPrior(START, problem.blocks, known)
+    descent = Descent(prior, problem.spread, lambda loss: None, free)
+    state = descent.at([field(problem, begun(problem, 40).point.lights[0], START)], theta, False)
+    stiff = state._replace(prior=state.prior._replace(hessian=state.prior.hessian + np.diag(np.where(free, 0, 1e7))))
+    (fields, there), (expected_fields, expected) = (
+        stepped(state, free, False, 1.0),
+        stepped(stiff, np.ones(21, bool), False, 1.0),
+    )
+    assert (there.reshape(-1)[~free] == theta.reshape(-1)[~free]).all() and (there != theta).any()
+    np.testing.assert_allclose(there, expected, atol=2e-4)
+    lights = [one.illumination.light.weight for (one,) in (fields, expected_fields)]
+    np.testing.assert_allclose(*lights, rtol=2e-3)
+
+
+def test_what_is_known_has_no_error_and_nothing_else_is_held_fixed(solved):
+    """Without it the sum of each channel is fixed; where a light is known but for a factor, the sum over channels."""
+    problem, found = solved
+    errors = Posterior(problem, found, PRIOR).standard_errors().materials
+    assert (errors.rows()[1] == 0).all() and (errors.rows()[[0, 2]] > 0).all()
+    light = msgspec.structs.replace(found.point.lights[0], held=np.ones(FEW, bool), scale_free=True)
+    root = np.random.default_rng(0).normal(size=(21, 21))
+    for known, fixed in (
+        (CARD, [False, False]),
+        (Known(), [True, True]),
+        (Known(lights={"room0": light}), [False, True]),
+    ):
+        covariance = covariance_in_gauge(root @ root.T, MATERIALS, msgspec.structs.replace(problem, known=known))
+        one, all_ = (np.tile(np.isin(np.arange(7), list(of)), 3) for of in ([0, 3], range(6)))  # a channel; all
+        assert [abs(of @ covariance @ of) < 1e-9 for of in (one, all_)] == fixed
+
+
+def test_a_known_reflectance_of_nil_stays_nil_and_nothing_is_expected_of_brightness_beside_it(solved):
+    problem, _ = solved
+    known = Known({1: np.array([0.2, 0.4, 0.25, 0, 0, 0, np.nan])})
+    problem = msgspec.structs.replace(problem, known=known)
+    found = fitted(problem, start_of(with_known(begun(problem).point, problem)), PRIOR, QUICK).point.materials
+    assert found.specular[1].max() <= LEAST_REFLECTANCE * (1 + 1e-9)
+    assert not MaterialPrior(MATERIALS, problem.blocks, known).members
+    assert MaterialPrior(MATERIALS, problem.blocks).members
+
+
+def test_a_start_comes_to_the_scale_of_what_is_known_and_shows_the_same(solved):
+    problem, _ = solved
+    known = Known({0: np.array([*(3 * START.diffuse[0]), *(3 * START.specular[0]), np.nan])})
+    point = begun(problem).point
+    there = with_known(point, msgspec.structs.replace(problem, known=known))
+    np.testing.assert_allclose(there.materials.diffuse, 3 * START.diffuse)
+    for one, other in zip(problem.radiance(there), problem.radiance(point), strict=True):
+        np.testing.assert_allclose(one, other, rtol=1e-12)
+
+
+# ── lights ───────────────────────────────────────────────────────────────────────────────────────────────────────────
+
+
+def known_but(light: Light, unit: float, held: np.ndarray, scale_free: bool) -> Light:
+    """The light as a user knows it: in the photo's radiance, or in units of their own."""
+    weight = light.weight * (7.0 if scale_free else unit)
+    return msgspec.structs.replace(light, weight=weight, held=held, scale_free=scale_free)
+
+
+@pytest.mark.parametrize("scale_free", [True, False])
+def test_the_slope_of_a_light_that_is_known_in_part_is_that_of_its_value(scale_free):
+    """Against finite differences along a step of its unknowns, of which known cells have at most their common factor."""
+    problem, (true,) = photographed(5, 1, cells=30, size=10)
+    held, curves = true.axis[:, 2] < 0, {"log_tone": np.array([0.1])}
+    one = field(problem, msgspec.structs.replace(true, held=held, scale_free=scale_free, **curves))
+    system = marginal(one, materials_given=True)
+    step = np.random.default_rng(0).normal(size=one.illumination.light.unknowns)
+    assert len(step) == 3 * (~held).sum() + 1 + scale_free == len(system.light_gradient)
+    lights = [moved(one.illumination.light, s * step) for s in (1e-3, -1e-3)]
+    ahead, behind = (marginal(at(one, light), materials_given=True).value for light in lights)
+    assert (ahead - behind) / 4e-3 == pytest.approx(system.light_gradient @ step, rel=1e-3)
+    nothing = msgspec.structs.replace(problem, blocks=[problem.blocks[0].take(slice(0))])
+    prior = field(nothing, one.illumination.light)  # which is quadratic, so that its Hessian is no approximation
+    ahead, behind = (marginal(at(prior, light), materials_given=True).light_gradient for light in lights)
+    hessian = marginal(prior, materials_given=True).light_hessian
+    np.testing.assert_allclose((ahead - behind) / 2e-3, hessian @ step, rtol=1e-6, atol=1e-8)
+    free = np.tile(~held, 3)
+    assert one.log_determinant == pytest.approx(np.linalg.slogdet(one.precision[np.ix_(free, free)])[1])
+    after = moved(one.illumination.light, 1e-3 * step).weight[held] / true.weight[held]
+    assert np.ptp(after) < 1e-12 and (after[0, 0] != 1) == scale_free
+
+
+def test_a_light_that_is_known_gives_materials_their_absolute_scale_and_one_up_to_a_factor_their_tint():
+    """Of the other light nothing is known; in the second, cells toward the viewer are not either."""
+    problem, true = photographed(5, 2)
+    tint = MATERIALS.diffuse / MATERIALS.diffuse.mean(1, keepdims=True)
+    for scale_free, held in ((False, np.ones(FEW, bool)), (True, true[0].axis[:, 2] > -0.8)):
+        light = known_but(true[0], problem.blocks[0].unit, held, scale_free)
+        one = msgspec.structs.replace(problem, known=Known(lights={"room0": light}))
+        start = with_known(begun(one).point, one)
+        change = np.log(start.materials.diffuse / START.diffuse)
+        assert (abs(change.mean()) < 1e-9) == scale_free and np.abs(change).max() > 0.01
+        found = fitted(one, start_of(start), PRIOR, WHOLE).point
+        answer = in_gauge(found, one.blocks, one.known)
+        np.testing.assert_allclose(
+            answer.materials.diffuse / answer.materials.diffuse.mean(1, keepdims=True), tint, rtol=0.05
+        )
+        factor = found.lights[0].weight[held] / true[0].weight[held]
+        assert np.ptp(factor) < 1e-9 * factor.mean()
+        if scale_free:
+            assert (answer.materials.diffuse + answer.materials.specular).max() == pytest.approx(BRIGHTEST)
+            assert (found.lights[0].weight[~held] != begun(one).point.lights[0].weight[~held]).all()
+        else:
+            assert factor[0, 0] == pytest.approx(1) and (answer.materials.vector() == found.materials.vector()).all()
+            np.testing.assert_allclose(answer.materials.diffuse, MATERIALS.diffuse, rtol=0.05)
+
+
+def test_exposures_that_are_known_stay_and_have_no_unknowns():
+    light = on_even_cells(drawn(3, 40), (0.0, 0.0))
+    problem = msgspec.structs.replace(spheres([light], size=10), known=Known(exposures=("room0",)))
+    found = fitted(problem, start_of(with_known(begun(problem, 40).point, problem)), PRIOR, QUICK).point.lights[0]
+    assert (found.log_exposure == 0).all() and found.unknowns == 3 * 40
+    free = fitted(problem, begun(problem, 40), PRIOR, QUICK).point.lights[0]
+    assert free.log_exposure[1] != 0 and free.unknowns == 3 * 40 + 1
+
+
+def lamp(directions: np.ndarray) -> np.ndarray:
+    """Radiance of a coloured sky with a lamp of 6° in direction LAMP."""
+    near = np.exp(np.minimum(400.0 * (directions @ LAMP - 1), 0))[:, None]
+    return (1 + 0.5 * directions[:, 1:2]) * [0.8, 1.0, 1.2] + 300 * near * [1.0, 0.9, 0.7]
+
+
+def off_lamp(light: Light) -> float:
+    """Degrees between the directions, on average, of what comes from within 15° of the lamp and should."""
+    near = (everywhere := fibonacci_sphere(20000))[everywhere @ LAMP > np.cos(np.radians(15))]
+    shown = light.lobes.radiance(near)
+    one, other = (of.sum(1) @ near / np.linalg.norm(of.sum(1) @ near) for of in (shown, lamp(near)))
+    return float(np.degrees(np.arccos(one @ other)))
+
+
+def test_a_map_becomes_a_light_of_its_energy_in_its_directions(monkeypatch):
+    monkeypatch.setattr("factorlib.inference.known.ROWS", 50)
+    directions = lat_long_directions(50, 100) @ YUP_FROM_CAMERA
+    radiance = lamp(directions.reshape(-1, 3)).reshape(50, 100, 3)
+    light = light_of_map(radiance)
+    np.testing.assert_allclose(2 * np.pi * light.energy.sum(0), map_energy(radiance), rtol=1e-3)
+    assert light.held.all() and light.scale_free and off_lamp(light) < 0.3
+    larger = light_of_map(np.repeat(np.repeat(radiance, 6, 0), 6, 1))  # more rows than are used
+    np.testing.assert_allclose(larger.energy.sum(0), light.energy.sum(0), rtol=1e-2)
+
+
+def test_what_a_mirror_ball_shows_is_the_light_but_behind_it_where_another_object_stands_and_where_it_is_clipped():
+    normals, turn = sphere_normals(60), rotation_of_vector(np.array([0.2, -0.5, 0.1]))
+    view = np.tile([0.0, 0.0, -1.0], (len(normals), 1))
+    mirror = mirror_directions(normals, view)
+    sphere = fibonacci_sphere(512)
+    hidden = sphere[:, 0] > 0.9
+    clipped, sees = np.tile(mirror[:, 1:2] > 0.9, 3), np.tile(np.where(hidden, 0, 255).astype(np.uint8), (len(view), 1))
+    radiance, zero = 0.5 * lamp(mirror @ turn.T), np.zeros(len(view), int)
+    seen = seen_from_the_front(normals, radiance, zero, ("chrome",), clipped=clipped, visibility=sees)
+    seen.radiance[mirror[:, 0] > 0.88] = 1e3  # of the other object
+    light = light_of_ball(seen, np.full(3, 0.5), turn)
+    out = {"behind": [0, 0, 1], "object": [1, 0, 0], "clipped": [0, 1, 0]}
+    assert not any(light.held[np.argmax(light.axis @ turn @ axis)] for axis in out.values())
+
+    def far(directions: np.ndarray) -> np.ndarray:
+        return np.all([directions @ turn @ axis < np.cos(np.radians(45)) for axis in out.values()], axis=0)
+
+    assert light.held[far(light.axis)].all() and not light.scale_free
+    there = (everywhere := fibonacci_sphere(4000))[far(everywhere)]
+    radiance = light.lobes.radiance(there)
+    np.testing.assert_allclose(radiance.mean(0), lamp(there).mean(0), rtol=0.02)
+    assert off_lamp(light) < 1

@@ -1,0 +1,243 @@
+"""What is in the model is decided by what is held out: shadows, bounces, tone curves, distances of lights, the start."""
+
+from functools import cache
+
+import msgspec
+import numpy as np
+import pytest
+
+from factorlib.inference.identifiability import unlikely_curves
+from factorlib.geometry.met import UNMET, met_codes
+from factorlib.geometry.sphere import fibonacci_sphere
+from factorlib.images.tone import curve
+from factorlib.inference.forward import Illumination
+from factorlib.inference.interreflection import bounced_light
+from factorlib.inference.materials import Point
+from factorlib.inference.noise import Noise
+from factorlib.inference.observed import blocks_of_observations
+from factorlib.inference.problem import JointProblem
+from factorlib.results.materials import Decision
+from factorlib.inference.model_selection import CURVED_GAIN, NEARER_FROM, believed
+from factorlib.inference.evidence import AGAINST, FOR
+from factorlib.inference.options import Choices
+from factorlib.inference.joint_solver import solve
+from factorlib.inference.start import from_nothing
+from factorlib.urm.observations import Observations
+from studies.scenes.problems import MATERIALS, factor_between, sphere_normals
+from tests.inference.made import bowls, rough_light
+from tests.inference.made_lights import OPERATOR, drawn, on_even_cells, spheres
+
+QUICK = Choices(cells=60, splittings=0, observations=300)
+OF_SHAPES = msgspec.structs.replace(QUICK, cells=48, observations=240, tone="off")  # shadows and bounces
+MORE = msgspec.structs.replace(QUICK, observations=1000)  # an exponent that all photos share is known less
+
+
+def solved(blocks, choices=QUICK, **others):
+    choices = msgspec.structs.replace(choices, **others)
+    return solve(JointProblem(blocks, OPERATOR), from_nothing(len(MATERIALS)), choices)
+
+
+# ── shadows and bounces, on bowls ────────────────────────────────────────────────────────────────────────────────────
+
+
+@pytest.fixture(scope="module")
+def shaded():
+    return [blocks_of_observations(bowls(f"room{i}", rough_light(20 + i)), Noise(0.02, 0.02))[0] for i in range(2)]
+
+
+def lit_bowls(name, seed) -> Observations:
+    """A bowl and a ball of each material, all bounces within a bowl as (1) has them: the fixed point of what it sends itself."""
+    seen, normals, d = bowls(name, rough_light(seed), size=12, count=256), sphere_normals(12), fibonacci_sphere(256)
+    exits = -normals[:, None] + 2 * (normals @ d.T)[..., None] * d
+    facing = met_codes(np.zeros(exits.shape[0] * 256, int), -exits.reshape(-1, 3)).reshape(-1, 256)
+    met = np.vstack([facing + 64 * (k // 2) for k in range(6)])
+    seen = msgspec.structs.replace(seen, met=np.where(seen.visibility == 0, met, UNMET).astype(np.uint16))
+    shown = seen.radiance
+    for _ in range(8):
+        sent = bounced_light(seen, shown)
+        kd, ks = MATERIALS.diffuse[seen.material], MATERIALS.specular[seen.material]
+        shown = seen.radiance + kd * sent[:, :3] + ks * sent[:, 3:]
+    return msgspec.structs.replace(seen, radiance=shown)
+
+
+@cache
+def lit_rooms(seed: int) -> list[Observations]:
+    return [lit_bowls(f"room{i}", seed + i) for i in range(2)]
+
+
+@pytest.fixture(scope="module")
+def lit():
+    return [blocks_of_observations(seen, Noise(0.02, 0.02))[0] for seen in lit_rooms(20)]
+
+
+def test_materials_of_bowls_are_better_with_self_shadowing_and_the_solve_finds_that_out(shaded):
+    error = {}
+    for choice in ("off", "auto"):
+        solution = solved(shaded, OF_SHAPES, self_shadowing=choice)
+        found = solution.point.materials
+        factor = factor_between(found, MATERIALS)
+        off = found.diffuse * factor / MATERIALS.diffuse - 1, found.roughness - MATERIALS.roughness
+        error[choice] = [np.abs(each).mean() for each in off]
+    assert solution.shadows.kept and solution.shadows.margin > FOR
+    assert solution.shadows.held_out_loss_with < 0.5 * solution.shadows.held_out_loss_without
+    assert error["auto"][0] < 0.5 * error["off"][0], error
+    assert error["auto"][1] < error["off"][1] + 0.01, error
+
+
+def test_the_solve_finds_out_that_bowls_light_themselves_and_how_bright_they_are(lit):
+    error = {}
+    for choice in ("off", "auto"):
+        solution = solved(lit, OF_SHAPES, self_shadowing="on", interreflection=choice)
+        off = solution.point.materials.diffuse / MATERIALS.diffuse - 1  # absolute: no factor is taken out
+        error[choice] = np.abs(off).mean()
+    assert solution.interreflection.kept and solution.interreflection.margin > FOR
+    assert solution.interreflection.held_out_loss_with < solution.interreflection.held_out_loss_without
+    assert error["auto"] < 0.5 * error["off"], error
+
+
+def hull(seen: Observations) -> Observations:
+    """What a mesh without hollows says of the same photos: all surfaces bulge toward the viewer, and only what rises above the horizon of a
+    shallow dish is hidden, by the same surfaces."""
+    shallow = seen.normal * [-0.4, -0.4, 1.0]
+    hidden = (seen.visibility == 0) & (fibonacci_sphere(seen.visibility.shape[1])[:, 2] > -0.3)
+    return msgspec.structs.replace(
+        seen,
+        normal=(shallow / np.linalg.norm(shallow, axis=1, keepdims=True)).astype(seen.normal.dtype),
+        visibility=np.where(hidden, 0, 255).astype(np.uint8),
+        met=np.where(hidden, seen.met, UNMET).astype(np.uint16),
+    )
+
+
+def test_bounces_of_a_hull_without_hollows_do_not_darken_the_materials():
+    blocks = [blocks_of_observations(hull(seen), Noise(0.02, 0.02))[0] for seen in lit_rooms(20)]
+    solution = solved(blocks, OF_SHAPES)
+    assert not solution.interreflection.kept, solution.interreflection
+    assert solution.point.materials.diffuse.max() > 0.5 * MATERIALS.diffuse.max()
+
+
+def test_shadows_that_are_none_are_given_up_and_those_that_change_nothing_stay(shaded):
+    rng = np.random.default_rng(0)
+    open_ = spheres([on_even_cells(drawn(k, 80)) for k in range(2)], size=10).blocks
+
+    def hiding(visibility):
+        how = {"directions": np.stack([fibonacci_sphere(96)])}
+        return [msgspec.structs.replace(b, visibility=visibility(b).astype(np.uint8), **how) for b in open_]
+
+    wrong = hiding(lambda b: 255 * (rng.random((len(b), 96)) < 0.5))
+    few = {"cells": 24, "observations": 150, "tone": "off"}
+    found = solved(wrong, **few)
+    assert not found.shadows.kept and found.shadows.margin < AGAINST
+    assert solved(wrong, **few, self_shadowing="on").shadows.kept
+    assert solved(hiding(lambda b: np.full((len(b), 96), 255)), **few).shadows.kept
+
+
+# ── tone curves ──────────────────────────────────────────────────────────────────────────────────────────────────────
+
+
+def rooms(photos=1, size=12):
+    rng = np.random.default_rng(3)
+    exposures = [np.concatenate([[0.0], rng.normal(0, 0.5, photos - 1)]) for _ in range(3)]
+    return spheres([on_even_cells(drawn(30 + k, 60), e) for k, e in enumerate(exposures)], size=size, noise=0.05).blocks
+
+
+def through(data, *exponents):
+    """What cameras with tone curves make of it, one exponent a photo."""
+    shown = curve(data.radiance, np.array(exponents)[data.photo][:, None])
+    return msgspec.structs.replace(data, radiance=shown, precision=1 / np.hypot(0.05, 0.05 * shown))
+
+
+def exponents_of(solution):
+    return [np.exp(light.log_tone) for light in solution.point.lights]
+
+
+def error_of(solution):
+    found = solution.point.materials
+    return np.abs(found.diffuse * factor_between(found, MATERIALS) - MATERIALS.diffuse).max()
+
+
+@pytest.fixture(scope="module")
+def curved():
+    return [through(data, exponent) for data, exponent in zip(rooms(size=20), (1.3, 0.8, 1.0), strict=True)]
+
+
+def test_curves_are_found_and_spare_the_materials_by_evidence_that_held_out_losses_fall(curved):
+    found, without = (solved(curved, MORE, tone=tone) for tone in ("auto", "off"))
+    exponents = [float(e[0]) if len(e) else 1.0 for e in exponents_of(found)]
+    np.testing.assert_allclose(exponents, (1.3, 0.8, 1.0), rtol=0.05)
+    assert all(len(e) == 0 for e in exponents_of(without))
+    assert error_of(found) < 0.3 * error_of(without), (error_of(found), error_of(without))
+    assert [one.kept for one in found.tone][:2] == [True, True]
+    for one in found.tone:
+        assert one.kept == (one.margin > FOR and one.held_out_loss_without > (1 + CURVED_GAIN) * one.held_out_loss_with)
+
+
+def test_photos_of_one_light_have_a_curve_each():
+    blocks = [through(data, 1.0, 1.3) if k == 0 else data for k, data in enumerate(rooms(photos=2, size=14))]
+    np.testing.assert_allclose(exponents_of(solved(blocks, MORE))[0], (1.0, 1.3), rtol=0.05)
+
+
+def test_a_curve_that_no_camera_has_is_not_believed():
+    """What else is wrong would be explained by an exponent at its bounds."""
+    blocks = [through(data, 4.0) if k == 0 else data for k, data in enumerate(rooms())]
+    solution = solved(blocks, cells=40, observations=200)
+    assert len(exponents_of(solution)[0]) == 0
+    (one, *_) = solution.tone
+    assert one.held_out_loss_with < 0.8 * one.held_out_loss_without and not one.kept
+
+
+def test_an_exponent_near_its_bounds_is_named():
+    point = Point(MATERIALS, [on_even_cells(np.zeros((3, 30)), log_tone=np.log([g])) for g in (1.2, 1.65)])
+    (said,) = unlikely_curves(JointProblem(rooms()[:2], OPERATOR), point)
+    assert "room1" in said and "1.6" in said
+
+
+# ── what is compared, and from where ─────────────────────────────────────────────────────────────────────────────────
+
+
+def test_without_held_out_observations_shadows_stay_and_nothing_further_is_decided(lit):
+    """All would be judged by the observations that they were fitted to, which more always explains better."""
+    found = solved([block.with_none_held_out() for block in lit], QUICK, cells=24, observations=100)
+    assert found.shadows.kept and found.shadows.margin is None
+    assert not found.interreflection.kept and found.interreflection.margin is None
+    assert not any(one.kept for one in found.tone) and found.splitting == []
+
+
+def test_few_materials_start_from_several_roughnesses_and_many_from_one():
+    problem = JointProblem(rooms(), OPERATOR)
+    assert [len(from_nothing(n)(problem, 30)) for n in (3, 40)] == [1, 1]
+    points = from_nothing(2)(problem.of([block.take(block.material < 2) for block in problem.blocks]), 30)
+    assert len({float(p.materials.roughness[0]) for p in points}) == 3 and {len(p.lights[0]) for p in points} == {30}
+
+
+# ── distances of lights ──────────────────────────────────────────────────────────────────────────────────────────────
+
+
+def photographed_at(*curvatures):
+    """Spheres as far apart as they are large, in lights of these curvatures."""
+    rng, blocks = np.random.default_rng(5), []
+    lights = [on_even_cells(drawn(50 + k, 60)) for k in range(len(curvatures))]
+    for data, light, c in zip(spheres(lights, size=16).blocks, lights, curvatures, strict=True):
+        middle = np.array([[-1.2, 0, 0], [0.6, 0, 1], [0.6, 0, -1]])[data.material]
+        data = msgspec.structs.replace(data, place=middle + 0.6 * data.normal)
+        clean = (
+            Illumination(data, msgspec.structs.replace(light, curvature=c), MATERIALS, OPERATOR).radiance() / data.unit
+        )
+        precision = 1 / np.hypot(0.02, 0.02 * clean)
+        noisy = clean + 0.3 * rng.normal(size=clean.shape) / precision
+        blocks.append(msgspec.structs.replace(data, radiance=np.maximum(noisy, 0), precision=precision))
+    return blocks
+
+
+def test_near_lights_are_found_and_spare_the_materials_and_far_ones_stay_far():
+    blocks = photographed_at(0.2, 0.0, 0.2)
+    found, far = (solved(blocks, MORE, tone="off", distance=distance) for distance in ("auto", "off"))
+    assert [one.kept for one in found.distances] == [True, False, True]
+    assert [light.curvature for light in found.point.lights] == [0.2, 0, 0.2]
+    assert all(one.margin > FOR for one in found.distances if one.kept)
+    assert [light.curvature for light in far.point.lights] == [0, 0, 0]
+    assert error_of(found) < 0.5 * error_of(far), (error_of(found), error_of(far))
+
+
+def test_how_near_a_light_comes_follows_the_evidence_without_a_jump():
+    shares = [believed(Decision(True, margin=m)) for m in (-3, NEARER_FROM, 1.25, 1.5, FOR, 9)]
+    assert shares == [0, 0, 0.25, 0.5, 1, 1] and believed(Decision(False)) == 0

@@ -1,0 +1,81 @@
+"""Suns: found where they shine, not found where none does, and apart from the prior on cells."""
+
+from functools import cache
+
+import msgspec
+import numpy as np
+import pytest
+
+from factorlib.light.lobes import SUN, lobe_integral
+from factorlib.inference.lights import UnitLobes
+from factorlib.results.materials import Decision
+from factorlib.solve import suns
+from factorlib.inference.evidence import AGAINST
+from factorlib.inference.fit import Schedule, fitted
+from factorlib.inference.resume import Parts
+from factorlib.inference.suns import WIDE, candidate, clearly_better, compared, suns_chosen
+from studies.scenes.problems import MATERIALS
+from tests.inference.made_lights import FEW, PRIOR, begun, drawn, on_even_cells, spheres
+
+TOWARDS = np.array([0.36, -0.48, -0.8])
+SUN_LOBE = UnitLobes(TOWARDS[None], np.array([SUN]))
+LIGHTS, AROUND = (Schedule(together=together, least=0.1, given=True) for together in ((0, 8, 6), (0, 8)))
+
+
+@cache
+def solved(irradiance: float, seed: int):
+    """Spheres under a sky drawn from the prior and a sun; the true irradiance by the sun in the blocks' unit; and the illumination and the fit
+    that a solve without suns ends with, materials as they are."""
+    sky = on_even_cells(drawn(seed, FEW))
+    energy = irradiance * sky.energy.sum(0) * 2 * np.pi / lobe_integral(np.array([SUN]))
+    light = sky.with_lobes(SUN_LOBE, energy) if irradiance else sky
+    problem = spheres([light], size=24, seed=seed)
+    fit = fitted(problem, begun(problem, 2 * FEW, MATERIALS), PRIOR, LIGHTS)
+    (one,) = problem.illuminations(fit.point)
+    return problem, energy * lobe_integral(np.array([SUN])) / problem.blocks[0].unit, one, fit
+
+
+def tried(irradiance: float, seed: int):
+    """The fits in cells alone, with a sun, and with a wide lobe."""
+    problem, _, one, fit = solved(irradiance, seed)
+    fits = [fitted(problem, fit.with_lights([candidate(one, of)]), PRIOR, AROUND) for of in (SUN, WIDE)]
+    return [one, *(problem.illuminations(around.point)[0] for around in fits)]
+
+
+@pytest.mark.parametrize("seed", [1, 2])
+def test_a_sun_is_found_with_its_direction_and_its_irradiance(seed):
+    cells, sun, wide = tried(0.5, seed)
+    light, irradiance = sun.light, solved(0.5, seed)[1]
+    assert clearly_better(cells, sun).kept and compared(wide, sun, AGAINST).kept
+    assert light.suns.sum() == 1 and np.degrees(np.arccos(light.axis[light.suns][0] @ TOWARDS)) < 3
+    np.testing.assert_allclose(2 * np.pi * light.energy[light.suns][0], irradiance, rtol=0.3)
+
+
+@pytest.mark.parametrize("seed", [1, 2, 3])
+def test_no_sun_is_found_in_a_sky_without_one(seed):
+    cells, sun, wide = tried(0.0, seed)
+    assert not (clearly_better(cells, sun).kept and compared(wide, sun, AGAINST).kept)
+
+
+def test_the_solve_keeps_suns_of_lights_that_have_one():
+    problem, *_, fit = solved(0.5, 1)
+    found = suns_chosen(problem, fit, Parts())
+    assert found.evidence[0].kept and found.fit.point.lights[0].suns.any()
+    again = suns_chosen(problem, found.fit, Parts())
+    assert again.fit is found.fit and again.evidence[0].kept
+    cloudy, *_, fit = solved(0.0, 1)
+    none = suns_chosen(cloudy, fit, Parts())
+    assert not none.evidence[0].kept and none.fit.point.lights[0] is fit.point.lights[0]
+
+
+@pytest.mark.parametrize(
+    "colour, share, kept", [((3, 2, 1), 0.2, True), ((1, 2, 3), 0.2, False), ((3, 2, 1), 0.02, False)]
+)
+def test_a_sun_is_strong_and_no_bluer_than_its_light(monkeypatch, colour, share, kept):
+    """Whatever the observations say."""
+    monkeypatch.setattr(suns, "compared", lambda *_: Decision(True, 1.0, 2.0, 9.0))
+    one = solved(0.0, 1)[2]
+    total = one.light.energy.sum() * 2 * np.pi / lobe_integral(np.array([SUN]))[0]
+    weight = total * share * np.array(colour) / sum(colour)
+    lit = msgspec.structs.replace(one, light=one.light.with_lobes(SUN_LOBE, weight))
+    assert clearly_better(one, lit).kept == kept

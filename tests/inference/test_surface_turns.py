@@ -1,0 +1,211 @@
+"""Turns of normals: derivatives against differences, the step against a dense system, and what is found or refused on spheres in natural light."""
+
+import msgspec
+import numpy as np
+import pytest
+import trimesh
+from scipy.linalg import block_diag
+
+from factorlib.meshes.fine import Fine
+from factorlib.meshes.mesh import Mesh
+from factorlib.inference.materials import Point
+from factorlib.inference.problem import JointProblem
+from factorlib.inference.fit import ROBUST, Hyperparameters, field_of
+from factorlib.inference.start import from_nothing
+from factorlib.surface import turns
+from factorlib.inference.surface_detail import Found, Surfaces, found
+from factorlib.inference.surface_turns import GRAZING, MOST, PULL, Attached, Detail, Stiffness, part_of, step
+from studies.scenes.problems import MATERIALS
+from tests.inference.made import in_units_of, photos_in_a_wrong_light
+from tests.inference.made_lights import PRIOR, begun, drawn, on_even_cells, photographed, spheres
+from tests.stages.made import Rising
+
+TURN = np.linalg.qr(np.random.default_rng(3).normal(size=(3, 3)))[0]  # the object's axes in the camera's frame
+COUNTS = Hyperparameters(2.0)
+
+
+def surfaces(subdivisions: int = 3) -> Surfaces:
+    """A ball of radius 1, no finer than the icosphere."""
+    solid = trimesh.creation.icosphere(subdivisions)
+    vertices, faces, label = np.array(solid.vertices), np.array(solid.faces), np.ones(len(solid.faces), np.int16)
+    return Surfaces({"ball": Fine(Mesh(vertices, faces, vertices, label), np.arange(len(vertices)), faces, 2.0)})
+
+
+def attached_to(normal: np.ndarray, body: Surfaces) -> Attached:
+    """Points of the ball by their normals: at each the nearest triangle, whose corners count by their nearness."""
+    (one,) = body.meshes.values()
+    place, rotation = np.zeros((one.nodes, 3)), TURN
+    place[one.node] = one.mesh.vertices
+    middles = place[one.faces].mean(1)
+    face = ((normal @ rotation) @ middles.T).argmax(1)
+    share = np.exp(30 * (np.einsum("nd,nkd->nk", normal @ rotation, place[one.faces[face]]) - 1))
+    return Attached(one.faces[face], share / share.sum(1, keepdims=True), np.tile(rotation, (len(normal), 1, 1)))
+
+
+def wrong(normal: np.ndarray, size: float) -> np.ndarray:
+    """Normals of a ball with dents: turned by the gradient of a function of the place."""
+    x = normal @ TURN
+    slope = np.stack([np.cos(4 * x[:, 0] + 1), np.sin(5 * x[:, 1]), np.cos(3 * x[:, 2] - 2 * x[:, 0])], 1) @ TURN.T
+    moved = normal + size * (slope - normal * np.sum(slope * normal, 1, keepdims=True))
+    return moved / np.linalg.norm(moved, axis=1, keepdims=True)
+
+
+def with_wrong_normals(problem: JointProblem, size: float) -> JointProblem:
+    """What the photos show is as it was; the mesh has dents that the object has not."""
+    return problem.of([msgspec.structs.replace(b, normal=wrong(b.normal, size)) for b in problem.blocks])
+
+
+@pytest.mark.parametrize("kind", ["clipped", "bounced", "hidden"])
+def test_slopes_are_those_of_the_forward_model(kind, monkeypatch):
+    monkeypatch.setattr(turns, "STEP", 1e-3)  # the step in use smooths what is sharper than a degree
+    one, body = photos_in_a_wrong_light(kind), surfaces()
+    at, random = attached_to(one.block.normal, body), np.random.default_rng(0)
+    turn, log_factor = random.normal(size=(body.nodes, 3)), random.normal(size=body.nodes)
+    part = part_of(one, COUNTS, PRIOR, at, body.nodes)
+    own = field_of(one, COUNTS, PRIOR, True).illumination
+    residual = own.block.residuals(own.shown().radiance)
+    weight = one.pull(residual, ROBUST, COUNTS.temperature)
+    after, before = (
+        msgspec.structs.replace(one, block=Detail(s * turn, s * log_factor).on(one.block, at)).residuals()
+        for s in (1e-3, -1e-3)
+    )
+    inside = np.sum(one.block.normal * one.block.view, 1) > 0.2
+    both = np.concatenate([turn.reshape(-1), log_factor])
+    expected, given = weight * (after - before) / 2e-3, (part.slopes @ both).reshape(-1, 3)
+    assert np.abs(expected).max() > 1  # there is something to compare
+    error = np.linalg.norm((given - expected)[inside]) / np.linalg.norm(expected[inside])
+    assert error < 0.03, error
+
+
+@pytest.mark.parametrize("stiffness", [Stiffness(50.0), Stiffness(50.0, 20.0), Stiffness(None, 20.0)])
+def test_a_step_is_that_of_the_dense_system_of_detail_and_lights(stiffness, monkeypatch):
+    monkeypatch.setattr(turns, "ACCURACY", 1e-7)  # that in use leaves what lights explain as well: all factors together
+    monkeypatch.setattr(turns, "ITERATIONS", 2000)
+    problem, _, body = *photographed(2, 2, size=9), surfaces(1)
+    problem = with_wrong_normals(problem, 0.1)
+    fit, random = begun(problem), np.random.default_rng(1)
+    start = Detail(0.02 * random.normal(size=(body.nodes, 3)), 0.02 * random.normal(size=body.nodes))
+    parts = [
+        part_of(one, COUNTS, PRIOR, attached_to(one.block.normal, body), body.nodes)
+        for one in problem.illuminations(fit.point)
+    ]
+    rough = body.laplacian().toarray() + PULL * np.eye(body.nodes)
+    prior = block_diag((stiffness.turn or 0) * np.kron(rough, np.eye(3)), (stiffness.factor or 0) * rough)
+    free = np.repeat([stiffness.turn is not None, stiffness.factor is not None], [3 * body.nodes, body.nodes])
+    before = np.concatenate([start.turn.reshape(-1), start.log_factor])
+    v, prior = int(free.sum()), prior[np.ix_(free, free)]
+    sizes = [one.light.unknowns for one in problem.illuminations(fit.point)]
+    system, gradient = np.zeros((v + sum(sizes),) * 2), np.zeros(v + sum(sizes))
+    system[:v, :v], gradient[:v] = prior, prior @ before[free]
+    first = v
+    for part, one, size in zip(parts, problem.illuminations(fit.point), sizes, strict=True):
+        own = slice(first, first + size)
+        J = part.slopes.toarray()[:, free]
+        U = np.stack([part.of_light(e) for e in np.eye(size)], axis=1)
+        field = field_of(one, COUNTS, PRIOR, True)
+        residual = field.illumination.block.residuals(field.illumination.shown().radiance)
+        r = (residual * one.pull(residual, ROBUST, COUNTS.temperature)).reshape(-1)
+        Q, u = field.precision, one.light.log_radiance.reshape(-1)
+        system[:v, :v] += J.T @ J
+        system[:v, own], system[own, :v], system[own, own] = J.T @ U, U.T @ J, U.T @ U + Q
+        gradient[:v] += J.T @ r
+        gradient[own] = U.T @ r + Q @ u
+        first += size
+    expected = before.copy()
+    expected[free] -= np.linalg.solve(system, gradient)[:v]
+    given = step(parts, body.laplacian(), stiffness, start)
+    given = np.concatenate([given.turn.reshape(-1), given.log_factor])
+    assert np.linalg.norm(given - expected) < 0.02 * np.linalg.norm(expected - before)
+    assert np.array_equal(given[~free], before[~free])
+
+
+def test_turned_normals_are_unit_bounded_and_never_leave_the_viewer():
+    random, body = np.random.default_rng(0), surfaces()
+    normal = random.normal(size=(500, 3))
+    normal /= np.linalg.norm(normal, axis=1, keepdims=True)
+    view = np.tile([0.0, 0.0, 1.0], (500, 1))
+    normal[:, 2] = np.abs(normal[:, 2]) + GRAZING
+    normal /= np.linalg.norm(normal, axis=1, keepdims=True)
+    at = attached_to(normal, body)
+    after = at.turned(normal, view, random.normal(size=(body.nodes, 3)))
+    np.testing.assert_allclose(np.linalg.norm(after, axis=1), 1)
+    assert (np.sum(after * normal, 1) > 1 / np.hypot(1, MOST) - 1e-9).all() and (after[:, 2] >= GRAZING).all()
+    np.testing.assert_allclose(at.turned(normal, view, np.zeros((body.nodes, 3))), normal)
+    nowhere = msgspec.structs.replace(at, share=np.zeros_like(at.share))
+    np.testing.assert_allclose(nowhere.turned(normal, view, np.ones((body.nodes, 3))), normal)
+
+
+def on_spheres(lights: int, size: float, seed: int = 0) -> tuple[Found, Surfaces, JointProblem, JointProblem]:
+    """What is found of a ball whose mesh has dents of that size, in so many lights."""
+    true = [on_even_cells(drawn(100 * seed + k, 120)) for k in range(lights)]
+    problem, body = spheres(true, size=18, seed=seed), surfaces()
+    given = with_wrong_normals(problem, size)
+    at = [attached_to(block.normal, body) for block in problem.blocks]
+    told = Rising()
+    return (
+        found(given, body, at, from_nothing(3), PRIOR, report=lambda share, what: told(share, 1, what)),
+        body,
+        given,
+        problem,
+    )
+
+
+def errors(normals: np.ndarray, true: np.ndarray) -> float:
+    """Median angle in degrees."""
+    return float(np.median(np.degrees(np.arccos(np.clip(np.sum(normals * true, 1), -1, 1)))))
+
+
+def test_dents_that_the_object_has_not_are_found_in_three_lights():
+    what, body, given, true = on_spheres(3, 0.15, 1)
+    assert what.evidence.kept and sum(what.gains.values()) > 0 and not what.painted.kept
+    turn = body.turns_of(what.displacements)
+    for block, exact in zip(given.blocks, true.blocks, strict=True):
+        at = attached_to(exact.normal, body)
+        before = errors(block.normal, exact.normal)
+        after = errors(at.turned(block.normal, block.view, turn), exact.normal)
+        assert after < 0.6 * before, (before, after)
+
+
+@pytest.mark.long
+def test_of_two_meshes_the_one_with_dents_is_moved_and_the_exact_one_stays():
+    true = [on_even_cells(drawn(100 + k, 120)) for k in range(3)]
+    problem, (one,) = spheres(true, size=18, seed=1), surfaces().meshes.values()
+    body, given, at = Surfaces({"dented": one, "exact": one}), [], []
+    for block in problem.blocks:
+        exact = block.material == block.material.max()
+        assert 0 < exact.sum() < len(block)
+        given.append(
+            msgspec.structs.replace(block, normal=np.where(exact[:, None], block.normal, wrong(block.normal, 0.15)))
+        )
+        own = attached_to(block.normal, surfaces())
+        at.append(msgspec.structs.replace(own, node=own.node + one.nodes * exact[:, None]))
+    what = found(problem.of(given), body, at, from_nothing(3), PRIOR)
+    assert what.evidence.kept and set(what.displacements) == {"dented"}
+    turn = body.turns_of(what.displacements)
+    assert turn[body.nodes_of({"dented"})].any() and not turn[body.nodes_of({"exact"})].any()
+    for block, shown, own in zip(problem.blocks, given, at, strict=True):
+        dented = block.material < block.material.max()
+        after = own.turned(shown.normal, shown.view, turn)
+        assert errors(after[dented], block.normal[dented]) < 0.7 * errors(shown.normal[dented], block.normal[dented])
+        np.testing.assert_allclose(after[~dented], shown.normal[~dented], atol=1e-12)
+
+
+def test_patina_is_found_in_three_lights_and_is_not_taken_for_dents():
+    true = [on_even_cells(drawn(k, 120)) for k in range(3)]
+    body, problem = surfaces(), spheres(true, size=18)
+    (one,) = body.meshes.values()
+    log_factor = 0.4 * np.sin(4 * one.mesh.vertices[:, 0]) * np.cos(3 * one.mesh.vertices[:, 1] + 1)
+    painted = Detail(np.zeros((body.nodes, 3)), log_factor)
+    at = [attached_to(block.normal, body) for block in problem.blocks]
+    clean = problem.of([msgspec.structs.replace(b, precision=np.ones_like(b.precision)) for b in problem.blocks])
+    point = Point(MATERIALS, in_units_of(problem.blocks, true))
+    shown = clean.of([painted.on(b, a) for b, a in zip(clean.blocks, at, strict=True)]).radiance(point)
+    plain = clean.radiance(point)
+    blocks = [
+        msgspec.structs.replace(b, radiance=b.radiance * y / np.maximum(x, 1e-9))
+        for b, x, y in zip(problem.blocks, plain, shown, strict=True)
+    ]
+    what = found(problem.of(blocks), body, at, from_nothing(3), PRIOR)
+    assert what.painted.kept
+    seen = np.bincount(np.concatenate([of.node.reshape(-1) for of in at]), minlength=body.nodes) > 0
+    assert np.corrcoef(what.log_factors["ball"][seen], log_factor[seen])[0, 1] > 0.8

@@ -1,0 +1,185 @@
+"""An earlier solution as a start: what it is taken for, and that the answer is the one from nothing."""
+
+import logging
+
+import msgspec
+import numpy as np
+import pytest
+
+from factorlib.inference.forward import Illumination
+from factorlib.inference.materials import Materials
+from factorlib.inference.problem import JointProblem
+from factorlib.results.materials import Gauge, MaterialTable, Model, Reflectance, Tone
+from factorlib.results.solution import Earlier
+from factorlib.inference.options import Choices
+from factorlib.inference.joint_solver import solve
+from factorlib.inference.start import from_earlier, from_nothing, known_point, with_decided
+from studies.scenes.problems import MATERIALS, factor_between
+from tests.inference.made_lights import OPERATOR, drawn, on_even_cells, spheres
+
+NAMES, CELLS = ["red", "green", "blue"], 40
+QUICK = Choices(cells=CELLS, splittings=0, observations=200, tone="off")
+REFLECTANCE, ROUGHNESS, RADIANCE = 0.01, 0.02, 0.01  # how near two answers are, after one factor per channel
+
+
+def truth(*numbers, shown=(0, 1, 2), photos=1, noise=0.0, size=10):
+    """Blocks and the true lights in the unit of their block."""
+    blocks, lights = [], []
+    for number in numbers:
+        exposure = np.concatenate([[0.0], np.random.default_rng(number).normal(0, 0.5, photos - 1)])
+        light = on_even_cells(drawn(50 + number, CELLS), exposure)
+        (block,) = spheres([light], size=size, shown=shown, noise=noise, seed=number).blocks
+        name = f"room{number}"
+        blocks.append(msgspec.structs.replace(block, name=name, photos=tuple(f"{name}_{k}" for k in range(photos))))
+        lights.append(msgspec.structs.replace(light, weight=light.weight / block.unit))
+    return blocks, lights
+
+
+def first(materials: Materials, count: int) -> Materials:
+    return Materials.of_rows(materials.rows()[:count])
+
+
+def written(blocks, materials: Materials, lights, names=NAMES, component=(0, 0, 0)) -> Earlier:
+    """As the stage writes it and `read_earlier` reads it."""
+    rows = materials.rows().tolist()
+    solved = {name: Reflectance(tuple(r[:3]), tuple(r[3:6]), r[6]) for name, r in zip(names, rows, strict=True)}
+    table = MaterialTable(solved, Gauge(component=dict(zip(names, component, strict=True))), Model())
+    pairs = list(zip(blocks, lights, strict=True))
+    lobes = {b.name: li.lobes.scaled(b.unit) for b, li in pairs}
+    photos = [pair for b, li in pairs for pair in zip(b.photos, li.log_exposure, strict=True)]
+    return Earlier(table, lobes, {photo: (float(np.exp(e)),) * 3 for photo, e in photos})
+
+
+def start_from(earlier, blocks, names=NAMES):
+    (point,) = from_earlier(earlier, names)(JointProblem(blocks, OPERATOR), CELLS)
+    return point.materials, point.lights
+
+
+def explained(blocks, materials, lights, atol=1e-3):
+    for b, light in zip(blocks, lights, strict=True):
+        np.testing.assert_allclose(
+            Illumination(b, light, materials, OPERATOR).radiance(), b.radiance, atol=atol, rtol=atol
+        )
+
+
+def check_same_but_for_the_gauge(found: Materials, true=MATERIALS):
+    factor = factor_between(found, true)
+    np.testing.assert_allclose(found.diffuse * factor, true.diffuse, rtol=1e-9)
+    np.testing.assert_allclose(found.specular * factor, true.specular, rtol=1e-9)
+    np.testing.assert_array_equal(found.roughness, true.roughness)
+
+
+def test_what_is_known_is_taken_over_whatever_the_order_and_the_units():
+    blocks, lights = truth(0, 1)
+    turned = [msgspec.structs.replace(b, unit=7 * b.unit, radiance=b.radiance / 7) for b in reversed(blocks)]
+    materials, found = start_from(written(blocks, MATERIALS, lights), turned)
+    check_same_but_for_the_gauge(materials)
+    explained(turned, materials, found)
+    for light, before in zip(found, reversed(lights), strict=True):
+        np.testing.assert_allclose(light.axis, before.axis, atol=1e-12)
+
+
+def test_cells_that_split_stay_as_small_as_they_are():
+    """A cell of 400 that splits three times has λ = 8,149; a wider one of the same weight would be brighter."""
+    (block,), (light,) = truth(0)
+    for _ in range(6):
+        light = light.split(np.arange(len(light)) >= len(light) - 2)
+    assert light.sharpness.max() > 10_000
+    shown = msgspec.structs.replace(block, radiance=Illumination(block, light, MATERIALS, OPERATOR).radiance())
+    _, (found,) = start_from(written([shown], MATERIALS, [light]), [shown])
+    np.testing.assert_allclose(found.sharpness, light.sharpness, rtol=1e-12)
+
+
+def test_a_light_nobody_knows_is_constant_and_the_known_ones_stay():
+    blocks, lights = truth(0, 1)
+    materials, found = start_from(written(blocks[:1], MATERIALS, lights[:1]), blocks)
+    check_same_but_for_the_gauge(materials)
+    explained(blocks[:1], materials, found[:1])
+    assert np.ptp(found[1].log_radiance, axis=1).max() < 1e-9 and len(found[1]) == CELLS
+    mean = Illumination(blocks[1], found[1], materials, OPERATOR).radiance().mean()
+    assert abs(np.log(mean)) < 0.5  # a block's is 1
+
+
+def test_a_material_nobody_knows_stands_beside_the_known_ones():
+    """Its reflectance is as its mean radiance says, on the scale of the others."""
+    blocks, lights = truth(0, 1)
+    materials, found = start_from(written(blocks, first(MATERIALS, 2), lights, NAMES[:2], (0, 0)), blocks)
+    whole, true = (m.diffuse + m.specular for m in (materials, MATERIALS))
+    check_same_but_for_the_gauge(first(materials, 2), first(MATERIALS, 2))
+    ratio = (whole[2] / whole[:2].mean(0)) / (true[2] / true[:2].mean(0))
+    assert (np.abs(np.log(ratio)) < np.log(2)).all()
+    known = [b.take(b.material < 2) for b in blocks]
+    explained(known, materials, found)
+
+
+def test_a_photo_new_to_a_light_gets_its_exposure_even_where_it_comes_first():
+    blocks, lights = truth(0, photos=3)
+    earlier = written(blocks, MATERIALS, lights)
+    new, *others = blocks[0].photos
+    factor = earlier.exposures[others[0]][0]
+    relative = {photo: tuple(np.array(earlier.exposures[photo]) / factor) for photo in others}
+    lobes = {name: light.scaled(factor) for name, light in earlier.lights.items()}  # as it was without `new`
+    earlier = msgspec.structs.replace(earlier, exposures=relative, lights=lobes)
+    materials, (light,) = start_from(earlier, blocks)
+    np.testing.assert_allclose(light.log_exposure, lights[0].log_exposure, atol=0.02)
+    explained(blocks, materials, [light], atol=0.02)
+
+
+def test_a_light_that_is_no_longer_so_starts_anew_and_is_named(caplog):
+    blocks, lights = truth(0, 1)
+    turned = [msgspec.structs.replace(lights[0], axis=-lights[0].axis, weight=lights[0].weight ** 2), lights[1]]
+    with caplog.at_level(logging.WARNING):
+        materials, found = start_from(written(blocks, MATERIALS, turned), blocks)
+    assert "'room0' starts anew" in caplog.text and "room1" not in caplog.text
+    assert np.ptp(found[0].log_radiance, axis=1).max() < 1e-9
+    explained(blocks[1:], materials, found[1:])
+
+
+def test_tone_curves_are_taken_over_where_all_photos_of_a_light_have_one():
+    blocks, lights = truth(0, 1)
+    earlier = written(blocks, MATERIALS, lights)
+    model = msgspec.structs.replace(earlier.table.model, tone={blocks[0].photos[0]: Tone(1.1, blocks[0].unit)})
+    earlier = msgspec.structs.replace(earlier, table=msgspec.structs.replace(earlier.table, model=model))
+    point = known_point(JointProblem(blocks, OPERATOR), earlier, NAMES, CELLS)
+    np.testing.assert_allclose(np.exp(point.lights[0].log_tone), [1.1])
+    assert len(point.lights[1].log_tone) == 0
+
+
+@pytest.mark.parametrize(("kept", "tried"), [(True, True), (False, True), (True, False)])
+def test_shadows_and_bounces_stay_as_they_were_decided_where_both_were_tried(kept, tried):
+    losses = {"held_out_loss_with": 1.0} | ({"held_out_loss_without": 2.0, "margin": 3.0} if tried else {})
+    chosen = {"self_shadowing_chosen_by": losses, "interreflection_chosen_by": losses}
+    model = Model(self_shadowing=kept, interreflection=not kept, **chosen)
+    earlier = Earlier(MaterialTable({}, Gauge(), model), {}, {})
+    found, names = with_decided(Choices(), earlier), ["off", "on"]
+    expected = [names[kept], names[not kept]] if tried else ["auto", "auto"]
+    assert [found.self_shadowing, found.interreflection] == expected
+    asked = Choices(self_shadowing="off", interreflection="on")
+    assert with_decided(asked, earlier) == asked
+
+
+# ── whole answers ────────────────────────────────────────────────────────────────────────────────────────────────────
+
+
+def answer(blocks, start=None):
+    return solve(JointProblem(blocks, OPERATOR), start or from_nothing(3), QUICK)
+
+
+def check_same(cold, warm, blocks):
+    one, other = warm.point, cold.point
+    factor = factor_between(one.materials, other.materials)
+    np.testing.assert_allclose(one.materials.diffuse * factor, other.materials.diffuse, atol=REFLECTANCE)
+    np.testing.assert_allclose(one.materials.specular * factor, other.materials.specular, atol=REFLECTANCE)
+    np.testing.assert_allclose(one.materials.roughness, other.materials.roughness, atol=ROUGHNESS)
+    for b, light, before in zip(blocks, one.lights, other.lights, strict=True):
+        a, c = (Illumination(b, li, p.materials, OPERATOR).radiance() for li, p in ((light, one), (before, other)))
+        assert np.sqrt(np.mean(((a - c) / (c + 1)) ** 2)) < RADIANCE
+
+
+def test_with_a_further_material_the_answer_is_the_one_from_nothing():
+    """As it is with a further light: `tests/stages/test_solve.py`."""
+    blocks, _ = truth(0, 1, noise=0.3, size=8)
+    fewer, count = [b.take(b.material < 2) for b in blocks], 2
+    before = solve(JointProblem(fewer, OPERATOR), from_nothing(count), QUICK)
+    earlier = written(fewer, before.point.materials, before.point.lights, NAMES[:count], (0,) * count)
+    check_same(answer(blocks), answer(blocks, from_earlier(earlier, NAMES)), blocks)
