@@ -5,16 +5,16 @@ from functools import cache
 import msgspec
 import numpy as np
 
-from factorlib.light.prior import MIX, read_light_prior
+from factorlib.inference.fit import Fit, Hyperparameters, Schedule, field_of, fitted, start_of
 from factorlib.inference.forward import Illumination
 from factorlib.inference.lights import PEAK, Light, even_cells
+from factorlib.inference.likelihood import Field
 from factorlib.inference.materials import Materials, Point
 from factorlib.inference.noise import Loss
 from factorlib.inference.problem import JointProblem
-from factorlib.reflection import reflection_operator
-from factorlib.inference.fit import Fit, Hyperparameters, Schedule, field_of, fitted, start_of
-from factorlib.inference.likelihood import Field
 from factorlib.inference.start import constant_light
+from factorlib.light.prior import MIX, read_light_prior
+from factorlib.reflection import reflection_operator
 from studies.scenes.problems import MATERIALS, block
 from tests.inference.made import in_units_of
 

@@ -4,13 +4,13 @@ import msgspec
 import numpy as np
 import pytest
 
+from factorlib.inference.fit import DARK, Fit, Schedule, fitted, sure_ones, temperature
 from factorlib.inference.lights import Light, even_cells
+from factorlib.inference.likelihood import marginal, positive_definite_inverse
 from factorlib.inference.materials import Materials
 from factorlib.inference.noise import Noise
-from factorlib.inference.problem import JointProblem
-from factorlib.inference.fit import DARK, Fit, Schedule, fitted, sure_ones, temperature
-from factorlib.inference.likelihood import marginal, positive_definite_inverse
 from factorlib.inference.priors import BRIGHTEST, BRIGHTNESS
+from factorlib.inference.problem import JointProblem
 from studies.scenes.problems import MATERIALS, factor_between
 from tests.inference.made_lights import (
     FEW,

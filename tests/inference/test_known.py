@@ -5,20 +5,20 @@ import numpy as np
 import pytest
 
 from factorlib.conventions import YUP_FROM_CAMERA, lat_long_directions
-from factorlib.inference.uncertainty import Posterior
-from factorlib.inference.uncertainty import in_gauge as covariance_in_gauge
 from factorlib.geometry.camera import rotation_of_vector
 from factorlib.geometry.sphere import fibonacci_sphere, mirror_directions
-from factorlib.light.latlong import map_energy
+from factorlib.inference.fit import Schedule, fitted, start_of
 from factorlib.inference.gauge import BRIGHTEST, in_gauge
 from factorlib.inference.known import Known, light_of_ball, light_of_map
 from factorlib.inference.lights import Light
+from factorlib.inference.likelihood import marginal
 from factorlib.inference.materials import LEAST_REFLECTANCE
 from factorlib.inference.optimizer import Descent, moved, stepped
-from factorlib.inference.fit import Schedule, fitted, start_of
-from factorlib.inference.likelihood import marginal
 from factorlib.inference.priors import MaterialPrior, unknowns_of
 from factorlib.inference.start import with_known
+from factorlib.inference.uncertainty import Posterior
+from factorlib.inference.uncertainty import in_gauge as covariance_in_gauge
+from factorlib.light.latlong import map_energy
 from studies.scenes.problems import MATERIALS, sphere_normals
 from tests.inference.made import seen_from_the_front
 from tests.inference.made_lights import (

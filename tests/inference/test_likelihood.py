@@ -4,9 +4,9 @@ import msgspec
 import numpy as np
 import pytest
 
-from factorlib.inference.problem import JointProblem
 from factorlib.inference.likelihood import EXPOSURE, TONE, marginal
 from factorlib.inference.priors import materials_of, unknowns_of
+from factorlib.inference.problem import JointProblem
 from studies.scenes.problems import MATERIALS
 from tests.inference.made_lights import OPERATOR, PRIOR, at, drawn, field, on_even_cells, photographed, spheres
 

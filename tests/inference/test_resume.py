@@ -6,14 +6,13 @@ import pytest
 
 from factorlib.checkpoint import Checkpoint
 from factorlib.geometry.sphere import fibonacci_sphere
-from factorlib.inference.problem import JointProblem
-from factorlib.solve import choices
-from factorlib.solve import solve as solving
+from factorlib.inference import joint_solver, model_selection
 from factorlib.inference.fit import Schedule
 from factorlib.inference.history import PHASES, Event, of_parts
-from factorlib.inference.options import Choices
-from factorlib.inference.resume import Parts
 from factorlib.inference.joint_solver import solve
+from factorlib.inference.options import Choices
+from factorlib.inference.problem import JointProblem
+from factorlib.inference.resume import Parts
 from factorlib.inference.start import from_nothing
 from factorlib.stage import serial_map
 from studies.scenes.problems import MATERIALS, block, random_light
@@ -32,12 +31,12 @@ class Killed(Exception):
 def short():
     """Where a descent ends does not matter here."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(choices, "TRIAL", Schedule(2, (3,)))
-        patch.setattr(choices, "NEARER", Schedule(together=(2,), estimate=False))
-        patch.setattr(choices, "CURVED", Schedule(together=(2,), estimate=False))
-        patch.setattr(solving, "MATERIALS", Schedule(2, (2,)))
-        patch.setattr(solving, "AFTER_SPLITTING", Schedule(1, (2,)))
-        patch.setattr(solving, "LIGHTS", Schedule(together=(0, 2), given=True))
+        patch.setattr(model_selection, "TRIAL", Schedule(2, (3,)))
+        patch.setattr(model_selection, "NEARER", Schedule(together=(2,), estimate=False))
+        patch.setattr(model_selection, "CURVED", Schedule(together=(2,), estimate=False))
+        patch.setattr(joint_solver, "MATERIALS", Schedule(2, (2,)))
+        patch.setattr(joint_solver, "AFTER_SPLITTING", Schedule(1, (2,)))
+        patch.setattr(joint_solver, "LIGHTS", Schedule(together=(0, 2), given=True))
         yield
 
 

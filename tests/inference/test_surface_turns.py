@@ -6,15 +6,15 @@ import pytest
 import trimesh
 from scipy.linalg import block_diag
 
-from factorlib.meshes.fine import Fine
-from factorlib.meshes.mesh import Mesh
+from factorlib.inference import surface_turns
+from factorlib.inference.fit import ROBUST, Hyperparameters, field_of
 from factorlib.inference.materials import Point
 from factorlib.inference.problem import JointProblem
-from factorlib.inference.fit import ROBUST, Hyperparameters, field_of
 from factorlib.inference.start import from_nothing
-from factorlib.surface import turns
 from factorlib.inference.surface_detail import Found, Surfaces, found
 from factorlib.inference.surface_turns import GRAZING, MOST, PULL, Attached, Detail, Stiffness, part_of, step
+from factorlib.meshes.fine import Fine
+from factorlib.meshes.mesh import Mesh
 from studies.scenes.problems import MATERIALS
 from tests.inference.made import in_units_of, photos_in_a_wrong_light
 from tests.inference.made_lights import PRIOR, begun, drawn, on_even_cells, photographed, spheres
@@ -57,7 +57,7 @@ def with_wrong_normals(problem: JointProblem, size: float) -> JointProblem:
 
 @pytest.mark.parametrize("kind", ["clipped", "bounced", "hidden"])
 def test_slopes_are_those_of_the_forward_model(kind, monkeypatch):
-    monkeypatch.setattr(turns, "STEP", 1e-3)  # the step in use smooths what is sharper than a degree
+    monkeypatch.setattr(surface_turns, "STEP", 1e-3)  # the step in use smooths what is sharper than a degree
     one, body = photos_in_a_wrong_light(kind), surfaces()
     at, random = attached_to(one.block.normal, body), np.random.default_rng(0)
     turn, log_factor = random.normal(size=(body.nodes, 3)), random.normal(size=body.nodes)
@@ -79,8 +79,9 @@ def test_slopes_are_those_of_the_forward_model(kind, monkeypatch):
 
 @pytest.mark.parametrize("stiffness", [Stiffness(50.0), Stiffness(50.0, 20.0), Stiffness(None, 20.0)])
 def test_a_step_is_that_of_the_dense_system_of_detail_and_lights(stiffness, monkeypatch):
-    monkeypatch.setattr(turns, "ACCURACY", 1e-7)  # that in use leaves what lights explain as well: all factors together
-    monkeypatch.setattr(turns, "ITERATIONS", 2000)
+    # the accuracy in use leaves what lights explain as well: all factors together
+    monkeypatch.setattr(surface_turns, "ACCURACY", 1e-7)
+    monkeypatch.setattr(surface_turns, "ITERATIONS", 2000)
     problem, _, body = *photographed(2, 2, size=9), surfaces(1)
     problem = with_wrong_normals(problem, 0.1)
     fit, random = begun(problem), np.random.default_rng(1)
