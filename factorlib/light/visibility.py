@@ -31,7 +31,7 @@ def widest_sharpness(count: int) -> float:
 
 def cosine_weights(normals: Float[Tensor, "n 3"], directions: Float[Tensor, "k 3"]) -> Float[Tensor, "n k"]:
     """f of equation (1), each row's sum 1."""
-    cosine = normals @ directions.T.clamp_min(0)
+    cosine = (normals @ directions.T).clamp_min(0)
     return cosine / cosine.sum(1, keepdim=True).clamp_min(1e-12)
 
 
