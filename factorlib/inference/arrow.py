@@ -18,10 +18,10 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 from scipy.linalg import cho_factor, cho_solve
 
-FLOOR = 1e-9  # damping never sees a smaller diagonal entry than this share of the largest
+FLOOR = 1e-9  # share of the largest diagonal entry that is added to all
 Vector, Matrix = Float[np.ndarray, " k"], Float[np.ndarray, "k k"]
 
 
@@ -30,7 +30,8 @@ class System(NamedTuple):
 
     value    of which `loss` is the sum of the robust losses
     places   numbers of the k unknowns of the materials that the block shows, ascending;  the light has l unknowns
-    determinant_by_light   d of (1)
+    factor   lower Cholesky factor of light_hessian
+    determinant_by_materials, determinant_hessian, determinant_by_light   of log det H: by materials, and d of (1)
     scores   the parts of the gradient by materials and light, one a cluster of observations, where clusters were asked for
     """
 
@@ -42,47 +43,60 @@ class System(NamedTuple):
     light_gradient: Float[np.ndarray, " l"]
     cross_hessian: Float[np.ndarray, "k l"]
     light_hessian: Float[np.ndarray, "l l"]
+    factor: Float[np.ndarray, "l l"]
+    determinant_by_materials: Float[np.ndarray, " k"]
+    determinant_hessian: Float[np.ndarray, "k k"]
     determinant_by_light: Float[np.ndarray, " l"]
     scores: Float[np.ndarray, "g k+l"] | None = None
 
 
-def summed(systems: Sequence[System], hessian: Matrix, gradient: Vector) -> tuple[Matrix, Vector]:
-    """M and g_m: those given, which are of the prior on materials, and the parts of all lights."""
-    hessian, gradient = hessian.copy(), gradient.copy()
-    for part in systems:
-        hessian[np.ix_(part.places, part.places)] += part.material_hessian
-        gradient[part.places] += part.material_gradient
-    return hessian, gradient
+class Arrow:
+    """H of many lights factorised, so that H⁻¹ of any vector costs two triangular solves a light.
+
+    prior, free: Hessian of the prior on materials, and which of their unknowns may move;  damping: of the materials' diagonal
+    """
+
+    def __init__(self, systems: Sequence[System], prior: Matrix, free: Bool[np.ndarray, " k"], damping: float = 0.0):
+        self.systems, self.free = systems, np.flatnonzero(free)
+        self.coupling = [solved(part.factor, part.cross_hessian.T) for part in systems]  # L⁻¹Cᵀ
+        schur = prior.copy()
+        for part, coupling in zip(systems, self.coupling, strict=True):
+            schur[np.ix_(part.places, part.places)] += part.material_hessian - part.cross_hessian @ coupling
+        self.diagonal = np.diag(prior) + self._material_diagonal(len(prior))
+        schur += np.diag(damping * self.diagonal + FLOOR * self.diagonal.max(initial=1e-30))
+        self.schur = cho_factor(((schur + schur.T) / 2)[np.ix_(self.free, self.free)], check_finite=False)
+
+    def _material_diagonal(self, size: int) -> Vector:
+        diagonal = np.zeros(size)
+        for part in self.systems:
+            diagonal[part.places] += np.diag(part.material_hessian)
+        return diagonal
+
+    def solve(self, by_materials: Vector, by_lights: Sequence[Vector]) -> tuple[Vector, list[Vector]]:
+        """Return H⁻¹ g, by (1)."""
+        alone = [solved(part.factor, g) for part, g in zip(self.systems, by_lights, strict=True)]
+        reduced, step = by_materials.copy(), np.zeros_like(by_materials)
+        for part, own in zip(self.systems, alone, strict=True):
+            reduced[part.places] -= part.cross_hessian @ own
+        step[self.free] = cho_solve(self.schur, reduced[self.free], check_finite=False)
+        lights = zip(self.systems, alone, self.coupling, strict=True)
+        return step, [own - coupling @ step[part.places] for part, own, coupling in lights]
 
 
-def eliminate(systems: Sequence[System], hessian: Matrix, gradient: Vector) -> list[Float[np.ndarray, "l k+2"]]:
-    """Take the lights out of M and g_m, in place; returns L⁻¹ [Cᵀ, g, d] of each light."""
-    solutions = []
-    for part in systems:
-        C = part.cross_hessian
-        right = np.column_stack([C.T, part.light_gradient, part.determinant_by_light])
-        factor = cho_factor(part.light_hessian, check_finite=False)
-        solutions.append(solution := cho_solve(factor, right, check_finite=False))
-        hessian[np.ix_(part.places, part.places)] -= C @ solution[:, :-2]
-        gradient[part.places] -= C @ (solution[:, -2] + solution[:, -1])
-    return solutions
+def solved(factor: Float[np.ndarray, "l l"], right: Float[np.ndarray, "l ..."]) -> Float[np.ndarray, "l ..."]:
+    """Return L⁻¹ of a vector or of columns, L given by its lower Cholesky factor."""
+    return cho_solve((factor, True), right, check_finite=False)
 
 
 def information(systems: Sequence[System], size: int) -> tuple[Matrix, list[Float[np.ndarray, "g k"]]]:
-    """The left side of (1) for `size` unknowns of materials, and the scores of each light's clusters, where there are
+    """Return the left side of (1) for `size` unknowns of materials, and the scores of each light's clusters, where there are
     any, less what the light takes up of them."""
-    hessian, gradient = summed(systems, np.zeros((size, size)), np.zeros(size))
-    scores = []
-    for part, solution in zip(systems, eliminate(systems, hessian, gradient), strict=True):
+    hessian, scores = np.zeros((size, size)), []
+    for part in systems:
+        coupling = solved(part.factor, part.cross_hessian.T)
+        hessian[np.ix_(part.places, part.places)] += part.material_hessian - part.cross_hessian @ coupling
         if part.scores is not None:
             k = len(part.places)
             scores.append(np.zeros((len(part.scores), size)))
-            scores[-1][:, part.places] = part.scores[:, :k] - part.scores[:, k:] @ solution[:, :k]
+            scores[-1][:, part.places] = part.scores[:, :k] - part.scores[:, k:] @ coupling
     return (hessian + hessian.T) / 2, scores
-
-
-def damped(hessian: Matrix, damping: float) -> Matrix:
-    """Return the matrix with its diagonal made 1 + damping times as large, and positive."""
-    diagonal = np.diag(hessian)
-    floor = FLOOR * max(float(diagonal.max(initial=0.0)), 1e-30)
-    return hessian + np.diag(damping * np.maximum(diagonal, floor) + floor)

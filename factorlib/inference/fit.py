@@ -26,7 +26,7 @@ from factorlib.inference.arrow import System
 from factorlib.inference.blocks import Block
 from factorlib.inference.forward import Illumination
 from factorlib.inference.lights import Light
-from factorlib.inference.likelihood import Field, positive_definite_inverse
+from factorlib.inference.likelihood import LightLikelihood, inverse_of
 from factorlib.inference.materials import Materials, Point
 from factorlib.inference.noise import Loss
 from factorlib.inference.optimizer import Descent, Report
@@ -106,32 +106,35 @@ def fitted(
     descent = Descent(prior_on_materials, problem.spread, report, problem.known.free(len(materials)))
     illuminations = problem.illuminations(Point(materials, start.point.lights))
     pairs = list(zip(illuminations, hyperparameters, strict=True))
-    fields = list(problem.spread(lambda pair: field_of(*pair, prior, given), pairs))
-    state = descent.run(fields, unknowns_of(materials), True, schedule.lights)
+    likelihoods = list(problem.spread(lambda pair: likelihood_of(*pair, prior, given), pairs))
+    state = descent.of_lights(likelihoods, unknowns_of(materials), schedule.lights)
     for number, iterations in enumerate(schedule.together):
-        fields = state.fields
         if number or schedule.estimate:
-            parts = list(zip(fields, state.parts, strict=True))
-            hyperparameters = list(problem.spread(lambda part: estimated(*part, schedule.least), parts))
-            fields = [recounted(field, one) for field, one in zip(fields, hyperparameters, strict=True)]
-        state = descent.run(fields, state.theta, given, iterations)
-    lights = [field.illumination.light for field in state.fields]
+            systems = list(zip(state.likelihoods, state.systems, strict=True))
+            hyperparameters = list(problem.spread(lambda each: estimated(*each, schedule.least), systems))
+            both = zip(state.likelihoods, hyperparameters, strict=True)
+            state = state._replace(likelihoods=[recounted(*each) for each in both])
+        if given:
+            state = descent.of_lights(state.likelihoods, state.theta, iterations)
+        else:
+            state = descent.of_all(state, iterations)
+    lights = [one.light for one in state.likelihoods]
     return Fit(Point(materials if given else materials_of(state.theta), lights), hyperparameters, state.value)
 
 
-def field_of(
+def likelihood_of(
     illumination: Illumination, one: Hyperparameters, prior: LightPrior, materials_given: bool = False
-) -> Field:
+) -> LightLikelihood:
     """Give an illumination its table of responses, and say how much its observations and the prior count."""
     table = Reflections(illumination.block, illumination.light.unit_lobes, illumination.operator, materials_given)
-    field = Field(msgspec.structs.replace(illumination, table=table), prior, np.zeros((0, 0)), 0.0, 1.0, ROBUST)
-    return recounted(field, one)
+    tabulated = msgspec.structs.replace(illumination, table=table)
+    return recounted(LightLikelihood(tabulated, prior, np.zeros((0, 0)), 0.0, 1.0, ROBUST), one)
 
 
-def recounted(field: Field, one: Hyperparameters) -> Field:
-    """Return the field as other hyperparameters weight it."""
-    light = field.illumination.light
-    Q, log_determinant = field.prior.precision(light.axis[~light.suns], one.factors)
+def recounted(likelihood: LightLikelihood, one: Hyperparameters) -> LightLikelihood:
+    """Return the likelihood as other hyperparameters weight it."""
+    light = likelihood.light
+    Q, log_determinant = likelihood.prior.precision(light.axis[~light.suns], one.factors)
     if light.suns.any():  # of which the prior on cells knows nothing
         own, cells = np.tile(light.suns, 3), Q
         Q = np.diag(np.where(own, SUNS**-2.0, 0.0))
@@ -139,19 +142,23 @@ def recounted(field: Field, one: Hyperparameters) -> Field:
     if light.held.any():  # the precision of the others, given these, is their part of Q
         free = np.tile(light.free, 3)
         log_determinant = float(np.linalg.slogdet(Q[np.ix_(free, free)])[1])
-    return msgspec.structs.replace(field, precision=Q, log_determinant=log_determinant, temperature=one.temperature)
+    return msgspec.structs.replace(
+        likelihood, precision=Q, log_determinant=log_determinant, temperature=one.temperature
+    )
 
 
-def estimated(field: Field, part: System, least: float) -> Hyperparameters:
-    """The hyperparameters by the residuals and the light that a descent ended with; part: its system there."""
-    light = field.illumination.light
+def estimated(likelihood: LightLikelihood, system: System, least: float) -> Hyperparameters:
+    """The hyperparameters by the residuals and the light that a descent ended with; system: there."""
+    light = likelihood.light
     cells, free = (np.flatnonzero(np.tile(which, 3)) for which in (~light.suns, light.free))
     covariance = np.zeros((3 * len(light), 3 * len(light)))
-    own = part.light_hessian[: len(free), : len(free)]
-    covariance[np.ix_(free, free)] = positive_definite_inverse(own).matrix
+    covariance[np.ix_(free, free)] = inverse_of(system.factor[: len(free), : len(free)])
     covariance = covariance[np.ix_(cells, cells)]
-    factors = field.prior.likeliest_factors(light.axis[~light.suns], light.log_radiance[:, ~light.suns], covariance)
-    return Hyperparameters(temperature(field.illumination.block, field.illumination.residuals(), least), factors)
+    factors = likelihood.prior.likeliest_factors(
+        light.axis[~light.suns], light.log_radiance[:, ~light.suns], covariance
+    )
+    residual = likelihood.illumination.residuals()
+    return Hyperparameters(temperature(likelihood.illumination.block, residual, least), factors)
 
 
 def temperature(block: Block, residual: Float[np.ndarray, "n 3"], least: float = 1.0) -> float:

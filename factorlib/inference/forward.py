@@ -33,12 +33,13 @@ from factorlib.reflection.operator import Operator
 class Shown(NamedTuple):
     """The model says that n observations should show this.
 
-    diffuse, specular   the factors of k_d and k_s in ℓ;  radiance  y
+    diffuse, specular   the factors of k_d and k_s in ℓ;  by_roughness  ∂specular/∂roughness;  radiance  y
     responses           material, its rows, its responses; empty where the operator itself was asked
     """
 
     diffuse: Float[np.ndarray, "n 3"]
     specular: Float[np.ndarray, "n 3"]
+    by_roughness: Float[np.ndarray, "n 3"]
     linear: Float[np.ndarray, "n 3"]
     radiance: Float[np.ndarray, "n 3"]
     responses: list[tuple[int, slice, Reflected]]
@@ -62,6 +63,14 @@ class Linearised(NamedTuple):
     by_material: Float[np.ndarray, "n 3"]
     by_photo: Float[np.ndarray, "n q"]
     residual: Float[np.ndarray, " n"]
+
+
+class Gradient(NamedTuple):
+    """A value, and half its gradient by log k_d, log k_s and roughness of every material, and by the unknowns of a light."""
+
+    value: float
+    by_materials: Float[np.ndarray, "m 7"]
+    by_light: Float[np.ndarray, " l"]
 
 
 class Illumination(msgspec.Struct, frozen=True):
@@ -88,21 +97,21 @@ class Illumination(msgspec.Struct, frozen=True):
     def shown(self) -> Shown:
         """Radiance, and what it is made of."""
         block, kd, ks, responses = self.block, self.materials.diffuse, self.materials.specular, []
-        diffuse, specular = np.zeros((len(block), 3)), np.zeros((len(block), 3))
+        diffuse, specular, by_roughness = np.zeros((3, len(block), 3))
         for m, rows in material_slices(block) if self.table is None else ():
             lobes, weight, roughness = self.light.unit_lobes, self.light.weight, float(self.materials.roughness[m])
             diffuse[rows] = diffuse_response(block, rows, lobes, self.operator) @ weight
             specular[rows] = specular_response(block, rows, lobes, roughness, self.operator) @ weight
         for m in np.unique(block.material).tolist() if self.table else ():
             rows, of = self.table.rows(m), self.table.at(m, float(self.materials.roughness[m]))
-            weight = self.light.weight.astype(of.diffuse.dtype)
-            diffuse[rows], specular[rows] = of.diffuse @ weight, of.specular @ weight
+            diffuse[rows], specular[rows], by_roughness[rows] = of.radiance(self.light.weight)
             responses.append((m, rows, of))
-        diffuse, specular = diffuse * self.exposure, specular * self.exposure
+        diffuse, specular, by_roughness = (part * self.exposure for part in (diffuse, specular, by_roughness))
         if block.bounced is not None:
             diffuse, specular = diffuse + block.bounced[:, :3], specular + block.bounced[:, 3:]
         linear = kd[block.material] * diffuse + ks[block.material] * specular
-        return Shown(diffuse, specular, linear, self.light.toned(linear, block.photo), responses)
+        toned = self.light.toned(linear, block.photo)
+        return Shown(diffuse, specular, by_roughness, linear, toned, responses)
 
     def radiance(self) -> Float[np.ndarray, "n 3"]:
         """y: what every observation should show."""
@@ -137,6 +146,45 @@ class Illumination(msgspec.Struct, frozen=True):
         counts = ~self.block.held_out[:, None] & ~(self.block.clipped & (residual >= 0))
         return np.sqrt(counts * loss.trust(residual) / temperature)
 
+    def gradient(self, loss: Loss, temperature: float) -> Gradient:
+        """Σ ρ(r)/T of the observations that are not held out, and half its gradient by all unknowns, without a Jacobian.
+
+        It costs two products of the responses with three columns.
+        """
+        block, light, materials, shown = self.block, self.light, self.materials, self.shown()
+        residual = block.residuals(shown.radiance)
+        value = float(loss.of_residuals(residual)[~block.held_out].sum()) / temperature
+        # a = ½ ∂(Σ ρ/T)/∂ℓ;  what of ℓ grows with the light
+        by_radiance = self.pull(residual, loss, temperature) ** 2 * residual * block.precision
+        by_linear = by_radiance * light.slope_at(shown.radiance, block.photo)
+        lit = shown.linear - self.bounced
+        by_materials, by_weight = np.zeros((len(materials), 7)), np.zeros((len(light), 3))
+        for m, rows, of in shown.responses:
+            kd, ks, a = materials.diffuse[m], materials.specular[m], by_linear[rows]
+            by_materials[m, :3] = kd * (a * shown.diffuse[rows]).sum(0)
+            by_materials[m, 3:6] = ks * (a * shown.specular[rows]).sum(0)
+            by_materials[m, 6] = float((ks * a * shown.by_roughness[rows]).sum())
+            by_weight += of.by_weight(a * self.exposure[rows] * kd, a * self.exposure[rows] * ks)
+        # by log radiance of free cells, log exposures, log tone exponents, and the log of the factor on held cells
+        by_cells = by_weight * light.weight
+        by_photo = np.bincount(block.photo, (by_linear * lit).sum(1), len(light.log_exposure))
+        parts = [by_cells[light.free].T.reshape(-1), by_photo[len(by_photo) - light.free_exposures :]]
+        if len(light.log_tone):
+            by_tone = by_radiance * by_log_exponent(np.maximum(shown.linear, 0), light.exponents(block.photo))
+            parts.append(np.bincount(block.photo, by_tone.sum(1), len(light.log_tone)))
+        if light.scale_free:
+            parts.append(by_cells[~light.free].sum(keepdims=True).reshape(1))
+        return Gradient(value, by_materials, np.concatenate(parts))
+
+    @property
+    def bounced(self) -> Float[np.ndarray, "n 3"] | float:
+        """What of ℓ other surfaces send."""
+        block, materials = self.block, self.materials
+        if block.bounced is None:
+            return 0.0
+        kd, ks = materials.diffuse[block.material], materials.specular[block.material]
+        return kd * block.bounced[:, :3] + ks * block.bounced[:, 3:]
+
     def linearise(self, shown: Shown, loss: Loss, temperature: float = 1.0) -> Iterator[Linearised]:
         """Residuals and derivatives; `shown` is what this illumination shows by its table.  Held-out observations have weight 0."""
         block, light, materials = self.block, self.light, self.materials
@@ -144,21 +192,19 @@ class Illumination(msgspec.Struct, frozen=True):
         pull = self.pull(residual, loss, temperature)
         scale = pull * block.precision
         rising = scale * light.slope_at(shown.radiance, block.photo)  # ∂r/∂ℓ
-        lit = shown.linear
-        if block.bounced is not None:
-            kd, ks = materials.diffuse[block.material], materials.specular[block.material]
-            lit = lit - (kd * block.bounced[:, :3] + ks * block.bounced[:, 3:])
+        lit = shown.linear - self.bounced
         if toned := len(light.log_tone) > 0:
             by_tone = scale * by_log_exponent(np.maximum(shown.linear, 0), light.exponents(block.photo))
         photos, free = np.eye(len(light.log_exposure))[block.photo], light.free if light.held.any() else slice(None)
         first = len(light.log_exposure) - light.free_exposures
         for m, rows, of in shown.responses:
+            of_specular, of_roughness = of.specular, of.by_roughness
             for c in range(3):
                 kd, ks = np.float32(materials.diffuse[m, c]), np.float32(materials.specular[m, c])
                 bright = ((rising[rows, c] * self.exposure[rows, 0])[:, None] * light.weight[:, c]).astype(np.float32)
-                by_roughness = of.by_roughness * (ks * bright)
+                by_roughness = of_roughness * (ks * bright)
                 own = [kd * shown.diffuse[rows, c] * rising[rows, c], ks * shown.specular[rows, c] * rising[rows, c]]
-                diffuse, specular = of.diffuse * (kd * bright), of.specular * (ks * bright)
+                diffuse, specular = of.diffuse * (kd * bright), of_specular * (ks * bright)
                 by_photo = photos[rows, first:] * (lit[rows, c] * rising[rows, c])[:, None]
                 if toned:
                     by_photo = np.hstack([by_photo, photos[rows] * by_tone[rows, c, None]])
@@ -171,7 +217,7 @@ class Illumination(msgspec.Struct, frozen=True):
                     diffuse[:, free],
                     specular[:, free],
                     by_roughness[:, free],
-                    np.column_stack([*own, by_roughness.sum(1, dtype=float)]).astype(np.float32),
+                    np.column_stack([*own, ks * shown.by_roughness[rows, c] * rising[rows, c]]).astype(np.float32),
                     by_photo.astype(np.float32),
                     (residual * pull)[rows, c].astype(np.float32),
                 )

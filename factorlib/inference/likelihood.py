@@ -28,17 +28,17 @@ Cells whose radiance is known (`Light.held`) have no part in u of (1) and (2): Q
 
 from __future__ import annotations
 
-from typing import NamedTuple
-
 import msgspec
 import numpy as np
 from jaxtyping import Float, Int
 from scipy.linalg import LinAlgError
+from scipy.linalg.blas import ssyrk
 from scipy.linalg.lapack import dpotrf, dpotri
 
 from factorlib.inference.arrow import System
-from factorlib.inference.forward import Illumination, Linearised
+from factorlib.inference.forward import Gradient, Illumination, Linearised
 from factorlib.inference.lights import Light
+from factorlib.inference.materials import Materials
 from factorlib.inference.noise import Loss
 from factorlib.light.prior import LightPrior
 
@@ -46,8 +46,8 @@ SPARSE = 8  # rows of which one enters the Hessian of the determinant
 EXPOSURE, TONE = 3.0, 0.3  # standard deviations of a log exposure and of a log tone exponent
 
 
-class Field(msgspec.Struct, frozen=True):
-    """One illumination and how much its parts count.
+class LightLikelihood(msgspec.Struct, frozen=True):
+    """Likelihood of one light's observations and prior of that light, and how much either counts.
 
     illumination  with its table;  prior: on its light;  precision: Q, channel by channel, with its log determinant
     temperature   T;  loss: ρ
@@ -60,73 +60,102 @@ class Field(msgspec.Struct, frozen=True):
     temperature: float
     loss: Loss
 
+    @property
+    def light(self) -> Light:
+        """Return the light of which this is the likelihood."""
+        return self.illumination.light
 
-def marginal(field: Field, clusters: Int[np.ndarray, " n"] | None = None, materials_given: bool = False) -> System:
-    """The value of (1), or of φ where materials are given, and its system, of one illumination; the first 3p unknowns of the light are u.
+    def at(self, light: Light | None = None, materials: Materials | None = None) -> LightLikelihood:
+        """Return the same likelihood elsewhere, with the table as it is."""
+        one = self.illumination
+        moved = msgspec.structs.replace(one, light=light or one.light, materials=materials or one.materials)
+        return msgspec.structs.replace(self, illumination=moved)
 
-    clusters: number of each observation's cluster, from 0, for `System.scores`
-    materials_given: the value is φ alone, which is what the light minimises, and no derivative of the determinants, which take most of
-    the time, is in the system
-    """
-    one, T = field.illumination, field.temperature
-    shown, light, p = one.shown(), one.light, int(one.light.free.sum())
-    places = (7 * np.unique(one.block.material)[:, None] + np.arange(7)).reshape(-1)
-    k, size = len(places), light.unknowns
-    g_m, M, C = np.zeros(k), np.zeros((k, k)), np.zeros((k, size))
-    value, g_l, L = _priors(field, light)
-    scores = None if clusters is None else np.zeros((int(clusters.max(initial=-1)) + 1, k + size))
-    parts, photos = list(one.linearise(shown, field.loss, T)), slice(3 * p, size)
-    for part in parts:
-        own, at = slice(part.channel * p, (part.channel + 1) * p), np.searchsorted(places, part.places)
-        J = part.diffuse + part.specular
-        L[own, own] += J.T @ J
-        g_l[own] += J.T @ part.residual
-        M[np.ix_(at, at)] += part.by_material.T @ part.by_material
-        g_m[at] += part.by_material.T @ part.residual
-        C[at, own] += part.by_material.T @ J
-        if size > 3 * p:
-            L[photos, photos] += part.by_photo.T @ part.by_photo
-            g_l[photos] += part.by_photo.T @ part.residual
-            C[at, photos] += part.by_material.T @ part.by_photo
-            towards = part.by_photo.T @ J
-            L[photos, own] += towards
-            L[own, photos] += towards.T
-        if scores is not None:  # a cluster's sum of slopes, each times its residual
-            summing = (clusters[part.rows] == np.arange(len(scores))[:, None]) * part.residual
-            scores[:, at] += summing @ part.by_material
-            scores[:, k + own.start : k + own.stop] += summing @ J
-            scores[:, k + 3 * p :] += summing @ part.by_photo
-    residual, by_light = one.block.residuals(shown.radiance), np.zeros(size)
-    loss = float(field.loss.of_residuals(residual)[~one.block.held_out].sum())
-    value += loss / T
-    if materials_given:
-        return System(value, loss, places, g_m, M, g_l, C, L, by_light, scores)
-    covariance, log_determinant = positive_definite_inverse(L[: 3 * p, : 3 * p])
-    value += log_determinant - field.log_determinant
-    for part in parts:
-        own, at = slice(part.channel * p, (part.channel + 1) * p), np.searchsorted(places, part.places)
-        gradient, hessian, by_cells = _of_determinant(part, covariance[own, own].astype(np.float32))
-        g_m[at] += gradient
-        M[np.ix_(at, at)] += hessian
-        by_light[own] += by_cells
-    return System(value, loss, places, g_m, M, g_l, C, L, by_light, scores)
+    def gradient(self) -> Gradient:
+        """Return φ and half its gradient, by materials and by the light."""
+        data = self.illumination.gradient(self.loss, self.temperature)
+        value, slope = self._prior()
+        return Gradient(data.value + value, data.by_materials, data.by_light + slope)
 
+    def system(self, materials_given: bool = False, clusters: Int[np.ndarray, " n"] | None = None) -> System:
+        """Return the value of (1), or of φ where materials are given, and its normal equations.
 
-def _priors(field: Field, light: Light) -> tuple[float, Float[np.ndarray, " l"], Float[np.ndarray, "l l"]]:
-    """uᵀQu and the Gaussians of exposures and tones: value, half the gradient, half the Hessian."""
-    u, Q, free = light.log_radiance.reshape(-1), field.precision, np.tile(light.free, 3)
-    others = np.concatenate([light.log_exposure[len(light.log_exposure) - light.free_exposures :], light.log_tone])
-    width = np.repeat([EXPOSURE, TONE], [light.free_exposures, len(light.log_tone)])
-    hessian, slope, p = np.zeros((light.unknowns, light.unknowns)), Q @ u, int(free.sum())
-    hessian[:p, :p] = Q if free.all() else Q[np.ix_(free, free)]
-    hessian[range(p, p + len(others)), range(p, p + len(others))] = width**-2
-    gradient = np.concatenate([slope[free], others / width**2])
-    if light.scale_free:  # one step of all held cells
-        together = Q[~free].sum(0)
-        hessian[-1, :p] = hessian[:p, -1] = together[free]
-        hessian[-1, -1] = together[~free].sum()
-        gradient = np.append(gradient, slope[~free].sum())
-    return float(u @ slope + np.sum((others / width) ** 2)), gradient, hessian
+        The first 3p unknowns of the light are u.
+        materials_given: no derivative of the determinants, which take most of the time, is in the system
+        clusters: number of each observation's cluster, from 0, for `System.scores`
+        """
+        one, T = self.illumination, self.temperature
+        shown, light, p = one.shown(), one.light, int(one.light.free.sum())
+        places = (7 * np.unique(one.block.material)[:, None] + np.arange(7)).reshape(-1)
+        k, size = len(places), light.unknowns
+        value, g_l = self._prior()
+        g_m, M, C, L = np.zeros(k), np.zeros((k, k)), np.zeros((k, size)), self._prior_hessian()
+        scores = None if clusters is None else np.zeros((int(clusters.max(initial=-1)) + 1, k + size))
+        parts, photos = list(one.linearise(shown, self.loss, T)), slice(3 * p, size)
+        for part in parts:  # H = JᵀJ/T + Q, block by block
+            own, at = slice(part.channel * p, (part.channel + 1) * p), np.searchsorted(places, part.places)
+            J = part.diffuse + part.specular
+            L[own, own] += gram(J)
+            g_l[own] += J.T @ part.residual
+            M[np.ix_(at, at)] += part.by_material.T @ part.by_material
+            g_m[at] += part.by_material.T @ part.residual
+            C[at, own] += part.by_material.T @ J
+            if size > 3 * p:
+                L[photos, photos] += part.by_photo.T @ part.by_photo
+                g_l[photos] += part.by_photo.T @ part.residual
+                C[at, photos] += part.by_material.T @ part.by_photo
+                towards = part.by_photo.T @ J
+                L[photos, own] += towards
+                L[own, photos] += towards.T
+            if scores is not None:  # a cluster's sum of slopes, each times its residual
+                summing = (clusters[part.rows] == np.arange(len(scores))[:, None]) * part.residual
+                scores[:, at] += summing @ part.by_material
+                scores[:, k + own.start : k + own.stop] += summing @ J
+                scores[:, k + 3 * p :] += summing @ part.by_photo
+        residual = one.block.residuals(shown.radiance)
+        d_m, d_M, d_l = np.zeros(k), np.zeros((k, k)), np.zeros(size)
+        loss = float(self.loss.of_residuals(residual)[~one.block.held_out].sum())
+        value += loss / T
+        factor = factorised(L)
+        if not materials_given:
+            value += 2 * float(np.log(np.diag(factor)[: 3 * p]).sum()) - self.log_determinant
+            covariance = inverse_of(factor[: 3 * p, : 3 * p])
+            for part in parts:  # (2)
+                own, at = slice(part.channel * p, (part.channel + 1) * p), np.searchsorted(places, part.places)
+                gradient, hessian, by_cells = _of_determinant(part, covariance[own, own].astype(np.float32))
+                d_m[at] += gradient
+                d_M[np.ix_(at, at)] += hessian
+                d_l[own] += by_cells
+        return System(value, loss, places, g_m, M, g_l, C, L, factor, d_m, d_M, d_l, scores)
+
+    def _prior(self) -> tuple[float, Float[np.ndarray, " l"]]:
+        """uᵀQu and the Gaussians of exposures and tones, and half the gradient."""
+        light, u = self.light, self.light.log_radiance.reshape(-1)
+        others, width = self._others()
+        slope, free = self.precision @ u, np.tile(light.free, 3)
+        gradient = [slope[free], others / width**2]
+        if light.scale_free:  # one step of all held cells
+            gradient.append(slope[~free].sum(keepdims=True))
+        return float(u @ slope + np.sum((others / width) ** 2)), np.concatenate(gradient)
+
+    def _prior_hessian(self) -> Float[np.ndarray, "l l"]:
+        """Half the Hessian of `_prior`."""
+        light, Q = self.light, self.precision
+        free, (_, width) = np.tile(light.free, 3), self._others()
+        p, hessian = int(free.sum()), np.zeros((light.unknowns, light.unknowns))
+        hessian[:p, :p] = Q if free.all() else Q[np.ix_(free, free)]
+        hessian[range(p, p + len(width)), range(p, p + len(width))] = width**-2
+        if light.scale_free:
+            together = Q[~free].sum(0)
+            hessian[-1, :p] = hessian[:p, -1] = together[free]
+            hessian[-1, -1] = together[~free].sum()
+        return hessian
+
+    def _others(self) -> tuple[Float[np.ndarray, " q"], Float[np.ndarray, " q"]]:
+        """Log exposures and log tone exponents that are to be found, and their standard deviations."""
+        light = self.light
+        others = [light.log_exposure[len(light.log_exposure) - light.free_exposures :], light.log_tone]
+        return np.concatenate(others), np.repeat([EXPOSURE, TONE], [light.free_exposures, len(light.log_tone)])
 
 
 def _of_determinant(
@@ -141,28 +170,33 @@ def _of_determinant(
     return [float(np.vdot(spread, slope)) for slope in slopes], many * hessian, (spread * J).sum(0)
 
 
-class Inverse(NamedTuple):
-    """What `positive_definite_inverse` returns: the inverse, and the log of the determinant of the matrix itself."""
+def gram(J: Float[np.ndarray, "n p"]) -> Float[np.ndarray, "p p"]:
+    """Return JᵀJ, of which BLAS computes one triangle."""
+    lower = ssyrk(1.0, J.T, lower=1)
+    return lower + np.tril(lower, -1).T
 
-    matrix: Float[np.ndarray, "n n"]
-    log_determinant: float
 
-
-def positive_definite_inverse(matrix: Float[np.ndarray, "n n"]) -> Inverse:
-    """Inverse and log determinant of a symmetric positive definite matrix, by LAPACK's potrf and potri: half of what solving with
-    the identity takes.
+def factorised(matrix: Float[np.ndarray, "n n"]) -> Float[np.ndarray, "n n"]:
+    """Return the lower Cholesky factor of a symmetric positive definite matrix.
 
     Raises LinAlgError where it is not positive definite, or not a number.
-
-    >>> positive_definite_inverse(np.array([[4.0, 0.0], [0.0, 0.25]])).matrix.tolist()
-    [[0.25, 0.0], [0.0, 4.0]]
     """
     if not len(matrix):
-        return Inverse(matrix, 0.0)
+        return matrix
     factor, failed = dpotrf(matrix, lower=1, clean=1)
-    logarithm = np.nan if failed else 2 * float(np.log(np.diag(factor)).sum())
-    if not np.isfinite(logarithm):
+    if failed or not np.isfinite(np.diag(factor)).all():
         raise LinAlgError(f"a matrix of {len(matrix)} rows is not positive definite, or not finite")
+    return factor
+
+
+def inverse_of(factor: Float[np.ndarray, "n n"]) -> Float[np.ndarray, "n n"]:
+    """Return the inverse of the matrix whose lower Cholesky factor this is, exactly symmetric.
+
+    >>> inverse_of(factorised(np.array([[4.0, 0.0], [0.0, 0.25]]))).tolist()
+    [[0.25, 0.0], [0.0, 4.0]]
+    """
+    if not len(factor):
+        return factor
     inverse, _ = dpotri(factor, lower=1)
     lower = np.tril(inverse, -1)
-    return Inverse(lower + lower.T + np.diag(np.diag(inverse)), logarithm)
+    return lower + lower.T + np.diag(np.diag(inverse))

@@ -28,16 +28,16 @@ from factorlib.inference.problem import JointProblem
 from factorlib.results.materials import Decision
 
 TRIAL_OBSERVATIONS, TRIAL_CELLS = 1500, 250  # of a light, while models are compared
-TRIAL = Schedule(lights=6, together=(14, 8))
-CURVED = Schedule(together=(8,), estimate=False)
+TRIAL = Schedule(lights=3, together=(6, 4))
+CURVED = Schedule(together=(4,), estimate=False)
 # Of the held-out loss.  By two standard errors alone a photo whose pose is wrong got a curve (margin 3.0, captured set of seed 7), and k_d was
 # 30 % wrong instead of 13 %.
 CURVED_GAIN = 0.25
 NEARER_FROM = 1.0  # standard errors: from here on a light comes nearer, and at `FOR` it is as near as was found
 # Of lights that are 20, 10 and 5 RMS distances away: a chair's points are .4 m from their middle, a room's walls and lamps 2 to 8 m.
 CURVATURES = (0.05, 0.1, 0.2)
-NEARER = Schedule(lights=3, together=(6,), estimate=False)
-GIVEN = Schedule(lights=6, estimate=False, given=True)
+NEARER = Schedule(lights=2, together=(3,), estimate=False)
+GIVEN = Schedule(lights=2, estimate=False, given=True)
 
 Fitting = Callable[[str, JointProblem, Fit, Schedule], Fit]  # what is fitted, to what, from where, by how many steps
 

@@ -1,12 +1,24 @@
-"""Levenberg–Marquardt on materials and lights: one step, that of (1) of `factorlib.inference.arrow`, and one loop.
+"""Descent of the likelihood: few factorisations, and many cheap steps on each.
 
-The determinant enters the step of the materials; a light's own step minimises φ.  Unknowns that are known (`factorlib.inference.known`) have no part in a
-step.  What is minimised is minus twice the log marginal likelihood (`factorlib.inference.likelihood`) and the prior on materials; where materials are
-given, φ.
+What is minimised is minus twice the log marginal likelihood and the prior on materials,
+
+    F(u, θ) = φ(u; θ) + log det H(u; θ) + prior(θ),                                                               (1)
+
+lights u at the minimum of φ.  A gradient of φ costs n p for a light of p cells and n observations, H costs n p², its factor and the
+derivatives of its determinant p³.  So H is factorised once, at (u₀, θ₀), and L-BFGS (Nocedal 1980) with H⁻¹ as its first metric minimises
+
+    φ(u; θ) + prior(θ) + 2 aᵀ(θ − θ₀) + (θ − θ₀)ᵀ(D + μ diag)(θ − θ₀),     a = ½ (∂/∂θ + (du/dθ)ᵀ ∂/∂u) log det H       (2)
+
+whose gradient is exact but for the determinant, which lags behind.  The minimum is accepted where it lowers (1); else damping μ grows and the same
+factor serves again.  Where nothing moves any more the gradient of (2) is that of (1), so the fixed point is the minimum of (1).  Lights move
+to the minimum of φ alone: a determinant that they felt would not be Laplace's.
+
+Given the materials, each light minimises φ by itself, in the same way.
 """
 
 from __future__ import annotations
 
+from collections import deque
 from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
@@ -14,28 +26,34 @@ import msgspec
 import numpy as np
 from jaxtyping import Bool, Float
 
-from factorlib.inference.arrow import System, damped, eliminate, summed
+from factorlib.inference.arrow import Arrow, System, solved
 from factorlib.inference.lights import TONE, Light
-from factorlib.inference.likelihood import Field, marginal
+from factorlib.inference.likelihood import LightLikelihood
 from factorlib.inference.materials import LEAST_REFLECTANCE, ROUGHNESS
 from factorlib.inference.priors import Gaussian, MaterialPrior, materials_of
 from factorlib.inference.problem import Spread
 
-MOST_CHANGE = np.array([0.5] * 6 + [0.06])  # of a material's unknowns in one step
-MOST_LOG_RADIANCE, MOST_EXPOSURE, MOST_TONE = 1.5, 1.0, 0.2  # change of a light's unknowns in one step
-DAMPING, LOWER, HIGHER, MOST_DAMPING = 1e-3, 0.25, 8.0, 1e3
-TOLERANCE = 2e-4  # a descent ends with a step that lowers the value by less than this share of it
+MOST_CHANGE = np.array([0.7] * 6 + [0.1])  # change of a material's unknowns on one factorisation
+MOST_LIGHT = 1.5  # change of a light's unknowns in one cheap step
+LOWEST = np.array([np.log(LEAST_REFLECTANCE)] * 6 + [ROUGHNESS[0]])
+HIGHEST = np.array([np.inf] * 6 + [ROUGHNESS[1]])
+FIRST_DAMPING, LOWER, HIGHER, MOST_DAMPING = 0.1, 0.25, 8.0, 1e3
+TOLERANCE = 2e-4  # a descent ends where (1) falls by less than this share of it
+MEMORY, STEPS = 10, 25  # pairs that L-BFGS keeps, and its steps on one factorisation
+DECREMENT = 0.05  # L-BFGS ends where gᵀH⁻¹g, by which a value would still fall, is less
+SUFFICIENT, SHORTEST = 1e-4, 1e-3  # of a line search: share of the slope, and of the step
 
-Report = Callable[[float], None]  # called at every point that is tried, with the mean robust loss there
+Report = Callable[[float], None]  # called at every factorisation, with the mean robust loss there
+Objective = Callable[[np.ndarray], tuple[float, np.ndarray]]  # value and half the gradient
 
 
 class State(NamedTuple):
     """Unknowns, and the systems there; theta: log k_d, log k_s, roughness."""
 
     theta: Float[np.ndarray, "m 7"]
-    fields: list[Field]
+    likelihoods: list[LightLikelihood]
     value: float
-    parts: list[System]
+    systems: list[System]
     prior: Gaussian
 
 
@@ -47,67 +65,167 @@ class Descent(msgspec.Struct, frozen=True):
     report: Report
     free: Bool[np.ndarray, " 7m"]
 
-    def run(
-        self, fields: Sequence[Field], theta: Float[np.ndarray, "m 7"], materials_given: bool, iterations: int
+    def of_lights(
+        self, likelihoods: Sequence[LightLikelihood], theta: Float[np.ndarray, "m 7"], iterations: int
     ) -> State:
-        """The state after at most so many steps of all lights and, unless they are given, of all materials."""
-        state, damping = self.at(fields, theta, materials_given), DAMPING
+        """Return the state after at most so many factorisations of each light, the materials given."""
+        fitted = list(self.spread(lambda one: light_descended(one, iterations), likelihoods))
+        return self._state(theta, [one for one, _ in fitted], [system for _, system in fitted])
+
+    def of_all(self, state: State, iterations: int) -> State:
+        """Return the state after at most so many factorisations, of materials and lights together."""
+        state, damping = self.at(state.likelihoods, state.theta), 0.0
         for _ in range(iterations):
-            trial = self.at(*stepped(state, self.free, materials_given, damping), materials_given)
-            if trial.value < state.value:
-                small = state.value - trial.value < TOLERANCE * abs(state.value)
+            trial = self.at(*self._stepped(state, damping))
+            gain = state.value - trial.value
+            if gain > 0:
                 state, damping = trial, damping * LOWER
-                if small:
-                    break
-            elif damping > MOST_DAMPING:
+            if abs(gain) < TOLERANCE * abs(state.value) or damping > MOST_DAMPING:
                 break
-            else:
-                damping = max(damping * HIGHER, DAMPING)
+            if gain < 0:
+                damping = max(damping * HIGHER, FIRST_DAMPING)
         return state
 
-    def at(self, fields: Sequence[Field], theta: Float[np.ndarray, "m 7"], materials_given: bool) -> State:
-        """Compute the systems of all lights at some materials; `marginal` says what `materials_given` means."""
-        materials, replaced = materials_of(theta), msgspec.structs.replace
-        fields = [replaced(f, illumination=replaced(f.illumination, materials=materials)) for f in fields]
-        parts = list(self.spread(lambda field: marginal(field, materials_given=materials_given), fields))
-        prior, values = self.prior.at(theta), sum(3 * int((~f.illumination.block.held_out).sum()) for f in fields)
-        self.report(sum(part.loss for part in parts) / max(values, 1))
-        return State(theta, fields, sum(part.value for part in parts) + prior.value, parts, prior)
+    def at(self, likelihoods: Sequence[LightLikelihood], theta: Float[np.ndarray, "m 7"]) -> State:
+        """Return the systems of all lights at some materials, determinants included."""
+        materials = materials_of(theta)
+        moved = [one.at(materials=materials) for one in likelihoods]
+        return self._state(theta, moved, list(self.spread(LightLikelihood.system, moved)))
+
+    def _state(
+        self, theta: Float[np.ndarray, "m 7"], likelihoods: list[LightLikelihood], systems: list[System]
+    ) -> State:
+        prior = self.prior.at(theta)
+        values = sum(3 * int((~one.illumination.block.held_out).sum()) for one in likelihoods)
+        self.report(sum(system.loss for system in systems) / max(values, 1))
+        return State(theta, likelihoods, sum(system.value for system in systems) + prior.value, systems, prior)
+
+    def _stepped(self, state: State, damping: float) -> tuple[list[LightLikelihood], Float[np.ndarray, "m 7"]]:
+        """Return lights and materials at the minimum of (2)."""
+        size = state.theta.size
+        by_determinant, hessian = determinant_of(state.systems, size)
+        gradient = state.prior.gradient + by_determinant
+        for system in state.systems:
+            gradient[system.places] += system.material_gradient
+        theta, outward = state.theta.reshape(-1), -gradient
+        at_bound = ((theta <= np.resize(LOWEST, size)) & (outward < 0)) | (
+            (theta >= np.resize(HIGHEST, size)) & (outward > 0)
+        )
+        arrow = Arrow(state.systems, state.prior.hessian + hessian, self.free & ~at_bound, damping)
+        penalty = hessian + damping * np.diag(arrow.diagonal)
+        ends = np.cumsum([size, *(len(system.light_gradient) for system in state.systems)])[:-1]
+
+        def moved(step: np.ndarray) -> tuple[np.ndarray, list[LightLikelihood]]:
+            """Return θ and the lights after a step of all unknowns."""
+            of_materials, *of_lights = np.split(step, ends)
+            change = of_materials.reshape(-1, 7).clip(-MOST_CHANGE, MOST_CHANGE)
+            there = (state.theta + change).clip(LOWEST, HIGHEST)
+            pairs = zip(state.likelihoods, of_lights, strict=True)
+            return there, [one.at(moved_light(one.light, own), materials_of(there)) for one, own in pairs]
+
+        def objective(step: np.ndarray) -> tuple[float, np.ndarray]:
+            """Return (2) and half its gradient."""
+            there, likelihoods = moved(step)
+            prior, parts = self.prior.at(there), list(self.spread(LightLikelihood.gradient, likelihoods))
+            off = (there - state.theta).reshape(-1)
+            value = prior.value + sum(part.value for part in parts) + off @ (2 * by_determinant + penalty @ off)
+            slope = prior.gradient + by_determinant + penalty @ off
+            slope = slope + sum(part.by_materials for part in parts).reshape(-1)
+            slope[~(self.free & ~at_bound)] = 0.0
+            return value, np.concatenate([slope, *(part.by_light for part in parts)])
+
+        def metric(slope: np.ndarray) -> np.ndarray:
+            """Return H⁻¹ of a gradient."""
+            of_materials, *of_lights = np.split(slope, ends)
+            step, lights = arrow.solve(of_materials, of_lights)
+            return np.concatenate([step, *lights])
+
+        theta, likelihoods = moved(minimised(objective, ends[-1] + len(state.systems[-1].light_gradient), metric))
+        return likelihoods, theta
 
 
-def stepped(
-    state: State, free: Bool[np.ndarray, " 7m"], materials_given: bool, damping: float
-) -> tuple[list[Field], Float[np.ndarray, "m 7"]]:
-    """Fields and materials after the damped step (1), each unknown within its range and changed by no more than is sound."""
-    H, g = summed(state.parts, state.prior.hessian, state.prior.gradient)
-    H = damped(H, damping)
-    solutions = eliminate([p._replace(light_hessian=damped(p.light_hessian, damping)) for p in state.parts], H, g)
-    theta = state.theta
-    if not materials_given:
-        step = np.zeros(len(g))
-        step[free] = np.linalg.solve(H[np.ix_(free, free)], -g[free])
-        theta = theta + step.reshape(-1, 7).clip(-MOST_CHANGE, MOST_CHANGE)
-        theta[:, 6] = theta[:, 6].clip(*ROUGHNESS)
-        theta[:, :6] = np.maximum(theta[:, :6], np.log(LEAST_REFLECTANCE))
-    dm, fields = (theta - state.theta).reshape(-1), []
-    for field, part, solution in zip(state.fields, state.parts, solutions, strict=True):
-        light = moved(field.illumination.light, -(solution[:, -2] + solution[:, :-2] @ dm[part.places]))
-        one = msgspec.structs.replace(field.illumination, light=light)
-        fields.append(msgspec.structs.replace(field, illumination=one))
-    return fields, theta
+def light_descended(one: LightLikelihood, iterations: int) -> tuple[LightLikelihood, System]:
+    """Return a light at the minimum of φ, the materials given, and its system there."""
+    system = one.system(materials_given=True)
+    for _ in range(iterations):
+
+        def objective(step: np.ndarray, begun: LightLikelihood = one) -> tuple[float, np.ndarray]:
+            """Return φ and half its gradient."""
+            there = begun.at(moved_light(begun.light, step)).gradient()
+            return there.value, there.by_light
+
+        def metric(slope: np.ndarray, factor: np.ndarray = system.factor) -> np.ndarray:
+            """Return H⁻¹ of a gradient."""
+            return solved(factor, slope)
+
+        step = minimised(objective, len(system.light_gradient), metric)
+        one, before = one.at(moved_light(one.light, step)), system.value
+        system = one.system(materials_given=True)
+        if before - system.value < TOLERANCE * abs(before):
+            break
+    return one, system
 
 
-def moved(light: Light, step: Float[np.ndarray, " l"]) -> Light:
-    """The light after a step of its unknowns, each within its range and changed by no more than is sound."""
+def determinant_of(systems: Sequence[System], size: int) -> tuple[Float[np.ndarray, " k"], Float[np.ndarray, "k k"]]:
+    """Return a and D of (2), of all lights."""
+    gradient, hessian = np.zeros(size), np.zeros((size, size))
+    for system in systems:
+        by_light = system.cross_hessian @ solved(system.factor, system.determinant_by_light)
+        gradient[system.places] += system.determinant_by_materials - by_light
+        hessian[np.ix_(system.places, system.places)] += system.determinant_hessian
+    return gradient, hessian
+
+
+def minimised(objective: Objective, size: int, metric: Callable[[np.ndarray], np.ndarray]) -> Float[np.ndarray, " n"]:
+    """Return the step from 0 that minimises a value, by L-BFGS; metric: about the inverse of half the Hessian, times a vector."""
+    x = np.zeros(size)
+    value, gradient = objective(x)
+    pairs: deque = deque(maxlen=MEMORY)
+    for _ in range(STEPS):
+        direction = -inverse_hessian_times(gradient, pairs, metric).clip(-MOST_LIGHT, MOST_LIGHT)
+        slope = float(gradient @ direction)
+        if -slope < DECREMENT:
+            break
+        length = 1.0
+        while length > SHORTEST:
+            trial = x + length * direction
+            trial_value, trial_gradient = objective(trial)
+            if trial_value <= value + 2 * SUFFICIENT * length * slope:
+                break
+            # the minimum of the parabola through both values and the slope
+            length *= float(np.clip(-slope * length / max(trial_value - value - 2 * slope * length, 1e-300), 0.1, 0.5))
+        else:
+            break
+        if (change := trial_gradient - gradient) @ direction > 0:
+            pairs.append((trial - x, change))
+        x, value, gradient = trial, trial_value, trial_gradient
+    return x
+
+
+def inverse_hessian_times(gradient, pairs, metric):  # noqa: ANN001, ANN201  (arrays or tensors)
+    """Return the product of L-BFGS's inverse Hessian with a gradient, by the two-loop recursion (Nocedal 1980).
+
+    pairs: steps and changes of the gradient along them;  metric: the first inverse Hessian, times a vector
+    """
+    q, alphas = gradient, []
+    for step, change in reversed(pairs):
+        alphas.append(float(step @ q) / float(step @ change))
+        q = q - alphas[-1] * change
+    q = metric(q)
+    for (step, change), alpha in zip(pairs, reversed(alphas), strict=True):
+        q = q + (alpha - float(change @ q) / float(step @ change)) * step
+    return q
+
+
+def moved_light(light: Light, step: Float[np.ndarray, " l"]) -> Light:
+    """Return the light after a step of its unknowns, tone exponents within their range."""
     counts = 3 * int(light.free.sum()), light.free_exposures, len(light.log_tone)
     cells, exposures, tones, scale = np.split(step, np.cumsum(counts))
     brighter = np.ones((len(light), 3))
-    brighter[light.free] = np.exp(cells.reshape(3, -1).clip(-MOST_LOG_RADIANCE, MOST_LOG_RADIANCE).T)
-    brighter[~light.free] = np.exp(scale.sum().clip(-MOST_LOG_RADIANCE, MOST_LOG_RADIANCE))
-    exposures = np.concatenate(
-        [np.zeros(len(light.log_exposure) - len(exposures)), exposures.clip(-MOST_EXPOSURE, MOST_EXPOSURE)]
-    )
-    tone = np.clip(light.log_tone + tones.clip(-MOST_TONE, MOST_TONE), *np.log(TONE))
+    brighter[light.free] = np.exp(cells.reshape(3, -1).T)
+    brighter[~light.free] = np.exp(scale.sum())
+    exposures = np.concatenate([np.zeros(len(light.log_exposure) - len(exposures)), exposures])
+    tone = np.clip(light.log_tone + tones, *np.log(TONE))
     return msgspec.structs.replace(
         light, weight=light.weight * brighter, log_exposure=light.log_exposure + exposures, log_tone=tone
     )

@@ -93,11 +93,48 @@ def shadowed(
 
 
 class Reflected(NamedTuple):
-    """The responses D and S [n, p] of n observations of one material to p lobes of weight one, and ∂S/∂roughness."""
+    """Responses of n observations of one material to p lobes of weight one.
 
-    diffuse: Float[np.ndarray, "n p"]
-    specular: Float[np.ndarray, "n p"]
-    by_roughness: Float[np.ndarray, "n p"]
+    stack          D, then S at each of k nodes of roughness, float32
+    share, slope   weights of the k nodes that give S, and ∂S/∂roughness
+    """
+
+    stack: Float[np.ndarray, "k+1 n p"]
+    share: Float[np.ndarray, " k"]
+    slope: Float[np.ndarray, " k"]
+
+    @property
+    def diffuse(self) -> Float[np.ndarray, "n p"]:
+        """Return D."""
+        return self.stack[0]
+
+    @property
+    def specular(self) -> Float[np.ndarray, "n p"]:
+        """Return S."""
+        return self._weighted(self.share)
+
+    @property
+    def by_roughness(self) -> Float[np.ndarray, "n p"]:
+        """Return ∂S/∂roughness."""
+        return self._weighted(self.slope)
+
+    def _weighted(self, weights: Float[np.ndarray, " k"]) -> Float[np.ndarray, "n p"]:
+        return np.tensordot(weights.astype(np.float32), self.stack[1:], axes=1)
+
+    def radiance(self, weight: Float[np.ndarray, "p 3"]) -> Float[np.ndarray, "3 n 3"]:
+        """Return D w, S w and (∂S/∂roughness) w, without forming S."""
+        nodes, n, p = self.stack.shape
+        sums = (self.stack.reshape(-1, p) @ weight.astype(np.float32)).reshape(nodes, n, 3).astype(float)
+        return np.stack(
+            [sums[0], np.tensordot(self.share, sums[1:], axes=1), np.tensordot(self.slope, sums[1:], axes=1)]
+        )
+
+    def by_weight(
+        self, by_diffuse: Float[np.ndarray, "n 3"], by_specular: Float[np.ndarray, "n 3"]
+    ) -> Float[np.ndarray, "p 3"]:
+        """Return Dᵀ a + Sᵀ b: the gradient by weights of a value whose gradient by D w is a, and by S w is b."""
+        slopes = np.concatenate([by_diffuse[None], self.share[:, None, None] * by_specular]).astype(np.float32)
+        return (self.stack.reshape(-1, self.stack.shape[2]).T @ slopes.reshape(-1, 3)).astype(float)
 
 
 class Table(Protocol):
@@ -109,7 +146,7 @@ class Table(Protocol):
 
 
 class Reflections:
-    """What a block's observations reflect of some lobes, material by material, float32; values at nodes are kept.
+    """Responses of a block's observations to some lobes, material by material, float32; values at nodes are kept.
 
     materials_given: roughness does not change, so it is the only node, and ∂S/∂roughness, for which nobody asks, is nil
     """
@@ -117,7 +154,9 @@ class Reflections:
     def __init__(self, block: Block, lobes: UnitLobes, operator: Operator, materials_given: bool = False):
         self.block, self.operator, self.lobes, self.materials_given = block, operator, lobes, materials_given
         self.nodes = NODES[::2] if lobes.sharpness.max(initial=0) <= WIDE else NODES
-        self._kept: dict[int, dict[int | None, np.ndarray]] = {}  # by material: D, which is None's, and S by node
+        self._diffuse: dict[int, np.ndarray] = {}  # by material
+        self._specular: dict[int, dict[int, np.ndarray]] = {}  # by material and node
+        self._stacks: dict[int, tuple[int, np.ndarray]] = {}  # by material: the first node, and the stack from there on
 
     def rows(self, m: int) -> slice:
         """The observations of material m: blocks are sorted by material."""
@@ -126,34 +165,41 @@ class Reflections:
 
     def at(self, m: int, roughness: float) -> Reflected:
         """The responses of material m, were its roughness so."""
-        diffuse = self._at_node(m, None, None)
         if self.materials_given:
-            specular = self._at_node(m, 0, roughness)
-            return Reflected(diffuse, specular, np.broadcast_to(np.float32(0), specular.shape))
+            if m not in self._stacks:
+                self._stacks[m] = 0, np.stack([self._diffuse_of(m), self._computed(m, roughness)])
+            return Reflected(self._stacks[m][1], np.ones(1), np.zeros(1))
         first = int(np.clip(np.searchsorted(self.nodes, roughness) - 2, 0, len(self.nodes) - DEGREE - 1))
-        nodes = range(first, first + DEGREE + 1)
-        share, slope = lagrange(np.log(self.nodes[list(nodes)]), float(np.log(roughness)))
-        known = [self._at_node(m, k, float(self.nodes[k])) for k in nodes]
-        specular = sum(np.float32(a) * values for a, values in zip(share, known, strict=True))
-        by_roughness = sum(np.float32(a / roughness) * values for a, values in zip(slope, known, strict=True))
-        return Reflected(diffuse, specular, by_roughness)
+        nodes = self.nodes[first : first + DEGREE + 1]
+        share, slope = lagrange(np.log(nodes), float(np.log(roughness)))
+        if self._stacks.get(m, (None,))[0] != first:
+            known = [self._specular_at(m, first + k) for k in range(DEGREE + 1)]
+            self._stacks[m] = first, np.stack([self._diffuse_of(m), *known])
+        return Reflected(self._stacks[m][1], share, slope / roughness)
 
-    def _at_node(self, m: int, node: int | None, roughness: float | None) -> Float[np.ndarray, "n p"]:
-        """S of material m at a node, whose roughness is given, or D, where both are None."""
-        kept = self._kept.setdefault(m, {})
+    def _diffuse_of(self, m: int) -> Float[np.ndarray, "n p"]:
+        if m not in self._diffuse:
+            self._diffuse[m] = self._computed(m, None)
+        return self._diffuse[m]
+
+    def _specular_at(self, m: int, node: int) -> Float[np.ndarray, "n p"]:
+        kept = self._specular.setdefault(m, {})
         if node not in kept:
-            if node is not None:
-                for far in sorted(kept.keys() - {None}, key=lambda k: abs(k - node))[KEPT - 1 :]:
-                    del kept[far]
-            rows, parts = self.rows(m), []
-            for i in range(rows.start, rows.stop, CHUNK):
-                chunk = np.arange(i, min(i + CHUNK, rows.stop))
-                if roughness is None:
-                    parts.append(diffuse_response(self.block, chunk, self.lobes, self.operator))
-                else:
-                    parts.append(specular_response(self.block, chunk, self.lobes, roughness, self.operator))
-            kept[node] = np.vstack(parts).astype(np.float32)
+            for far in sorted(kept, key=lambda k: abs(k - node))[KEPT - 1 :]:
+                del kept[far]
+            kept[node] = self._computed(m, float(self.nodes[node]))
         return kept[node]
+
+    def _computed(self, m: int, roughness: float | None) -> Float[np.ndarray, "n p"]:
+        """S of material m at a roughness, or D where that is None."""
+        rows, parts = self.rows(m), []
+        for i in range(rows.start, rows.stop, CHUNK):
+            chunk = np.arange(i, min(i + CHUNK, rows.stop))
+            if roughness is None:
+                parts.append(diffuse_response(self.block, chunk, self.lobes, self.operator))
+            else:
+                parts.append(specular_response(self.block, chunk, self.lobes, roughness, self.operator))
+        return np.vstack(parts).astype(np.float32)
 
 
 def lagrange(nodes: Float[np.ndarray, " k"], x: float) -> tuple[Float[np.ndarray, " k"], Float[np.ndarray, " k"]]:

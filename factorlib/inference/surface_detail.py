@@ -25,8 +25,7 @@ from jaxtyping import Bool, Float
 from scipy.sparse import block_diag, csr_array
 
 from factorlib.inference.evidence import FOR, Losses, compare, losses_of
-from factorlib.inference.fit import Fit, Schedule, field_of, fitted, sure_ones
-from factorlib.inference.likelihood import marginal
+from factorlib.inference.fit import Fit, Schedule, fitted, likelihood_of, sure_ones
 from factorlib.inference.materials import Point
 from factorlib.inference.model_selection import TRIAL, effects_chosen
 from factorlib.inference.options import Choices
@@ -174,7 +173,7 @@ class Trial(msgspec.Struct, frozen=True):
             begun = Fit(Point(self.fit.point.materials, [self.fit.point.lights[k]]), counts)
             point = fitted(problem, begun, self.prior, OWN_LIGHT).point
             (one,) = problem.fitted().illuminations(point)
-            judged = marginal(field_of(one, counts[0], self.prior)).value, losses_of(problem, point)
+            judged = likelihood_of(one, counts[0], self.prior).system().value, losses_of(problem, point)
             tick()
             return judged
 

@@ -29,9 +29,8 @@ from scipy.sparse import block_diag, csr_array, diags_array, eye_array, hstack, 
 from scipy.sparse.linalg import LinearOperator, cg
 
 from factorlib.inference.blocks import Block
-from factorlib.inference.fit import ROBUST, Hyperparameters, field_of
+from factorlib.inference.fit import ROBUST, Hyperparameters, likelihood_of
 from factorlib.inference.forward import Illumination
-from factorlib.inference.likelihood import marginal
 from factorlib.light.prior import LightPrior
 
 STEP = 0.02  # of a normal, for differences: about 1°
@@ -162,8 +161,8 @@ def part_of(
     illumination: Illumination, counts: Hyperparameters, prior: LightPrior, attached: Attached, nodes: int
 ) -> Part:
     """Linearise one light at its block's normals and detail; attached: of the block.  Held-out observations have no say."""
-    field = field_of(illumination, counts, prior, materials_given=True)
-    own, block = field.illumination, illumination.block
+    likelihood = likelihood_of(illumination, counts, prior, materials_given=True)
+    own, block = likelihood.illumination, illumination.block
     n, p, shown = len(block), len(own.light), own.shown()
     residual, by_light = np.zeros((n, 3)), np.zeros((3, n, own.light.unknowns - 2 * p), np.float32)
     by_factor = np.zeros((n, 3))
@@ -171,7 +170,7 @@ def part_of(
         residual[line.rows, line.channel] = line.residual
         by_factor[line.rows, line.channel] = line.by_material[:, 0]  # ∂r/∂log k_d
         by_light[line.channel, line.rows] = np.hstack([line.diffuse + line.specular, line.by_photo])
-    system = marginal(field, materials_given=True)
+    system = likelihood.system(materials_given=True)
     weight = own.pull(block.residuals(shown.radiance), ROBUST, counts.temperature)
     slopes = (_by_normal(illumination) * weight[:, :, None]).reshape(3 * n, 3)
     factors = np.repeat(attached.share, 3, axis=0) * by_factor.reshape(-1, 1)

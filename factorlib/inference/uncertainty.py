@@ -36,11 +36,11 @@ from scipy.stats import t as student_t
 
 from factorlib.conventions import YUP_FROM_CAMERA, lat_long_directions
 from factorlib.inference.arrow import System, information
-from factorlib.inference.fit import Fit, Hyperparameters, field_of, sure_ones
+from factorlib.inference.fit import Fit, Hyperparameters, likelihood_of, sure_ones
 from factorlib.inference.forward import Illumination
 from factorlib.inference.gauge import connected_components
 from factorlib.inference.history import Solution
-from factorlib.inference.likelihood import marginal, positive_definite_inverse
+from factorlib.inference.likelihood import factorised, inverse_of
 from factorlib.inference.materials import ROUGHNESS, Materials, Point
 from factorlib.inference.options import Choices
 from factorlib.inference.priors import materials_of, unknowns_of
@@ -98,7 +98,7 @@ class Posterior:
         def system(one: tuple[Illumination, Hyperparameters]) -> System:
             """Return the system of one illumination."""
             clusters = one[0].block.clusters() if with_scores else None
-            made = marginal(field_of(*one, self.prior, not with_scores), clusters, materials_given=True)
+            made = likelihood_of(*one, self.prior, not with_scores).system(materials_given=True, clusters=clusters)
             self.tick()
             return made
 
@@ -126,7 +126,7 @@ class Posterior:
         ):
             free, errors = light.free, np.empty((len(directions), 3))
             p = int(free.sum())
-            covariance = positive_definite_inverse(system.light_hessian[: 3 * p, : 3 * p]).matrix
+            covariance = inverse_of(system.factor[: 3 * p, : 3 * p])
             overlap = np.exp(-0.5 * light.sharpness * squared_distances(directions, light.axis))
             for c in range(3):
                 own, slope = slice(c * p, (c + 1) * p), (overlap * light.weight[:, c])[:, free]
@@ -166,7 +166,7 @@ def largest_variance(
     own = (information / sigma**2 + np.diag(np.tile(WIDTHS, len(materials)) ** -2.0))[np.ix_(free, free)]
     scale = 1 / np.sqrt(np.diag(own))  # rows are of unlike units
     scales = np.outer(scale, scale)
-    inverse[np.ix_(free, free)] = positive_definite_inverse(own * scales).matrix * scales
+    inverse[np.ix_(free, free)] = inverse_of(factorised(own * scales)) * scales
     whole = np.array([s.sum(0) for s in scores])
     covariances = inverse, sandwich(inverse, np.vstack(scores), sigma), sandwich(inverse, whole, sigma)
     return np.max([np.diag(in_gauge(each, materials, problem)) for each in covariances], axis=0).clip(0)
