@@ -7,7 +7,7 @@ import trimesh
 from scipy.linalg import block_diag
 
 from factorlib.inference import surface_turns
-from factorlib.inference.fit import ROBUST, Hyperparameters, field_of
+from factorlib.inference.fit import ROBUST, Hyperparameters, likelihood_of
 from factorlib.inference.materials import Point
 from factorlib.inference.problem import JointProblem
 from factorlib.inference.start import from_nothing
@@ -62,7 +62,7 @@ def test_slopes_are_those_of_the_forward_model(kind, monkeypatch):
     at, random = attached_to(one.block.normal, body), np.random.default_rng(0)
     turn, log_factor = random.normal(size=(body.nodes, 3)), random.normal(size=body.nodes)
     part = part_of(one, COUNTS, PRIOR, at, body.nodes)
-    own = field_of(one, COUNTS, PRIOR, True).illumination
+    own = likelihood_of(one, COUNTS, PRIOR, True).illumination
     residual = own.block.residuals(own.shown().radiance)
     weight = one.pull(residual, ROBUST, COUNTS.temperature)
     after, before = (
@@ -103,10 +103,10 @@ def test_a_step_is_that_of_the_dense_system_of_detail_and_lights(stiffness, monk
         own = slice(first, first + size)
         J = part.slopes.toarray()[:, free]
         U = np.stack([part.of_light(e) for e in np.eye(size)], axis=1)
-        field = field_of(one, COUNTS, PRIOR, True)
-        residual = field.illumination.block.residuals(field.illumination.shown().radiance)
+        likelihood = likelihood_of(one, COUNTS, PRIOR, True)
+        residual = likelihood.illumination.block.residuals(likelihood.illumination.shown().radiance)
         r = (residual * one.pull(residual, ROBUST, COUNTS.temperature)).reshape(-1)
-        Q, u = field.precision, one.light.log_radiance.reshape(-1)
+        Q, u = likelihood.precision, one.light.log_radiance.reshape(-1)
         system[:v, :v] += J.T @ J
         system[:v, own], system[own, :v], system[own, own] = J.T @ U, U.T @ J, U.T @ U + Q
         gradient[:v] += J.T @ r
