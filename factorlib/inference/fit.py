@@ -32,7 +32,7 @@ from factorlib.inference.noise import Loss
 from factorlib.inference.optimizer import Descent, Report
 from factorlib.inference.priors import MaterialPrior, materials_of, unknowns_of
 from factorlib.inference.problem import JointProblem
-from factorlib.inference.responses import Reflections
+from factorlib.inference.responses import Tables
 from factorlib.light.prior import LightPrior
 
 SURE = 0.6  # times the typical confidence of a material's normals: what is less sure is left out
@@ -106,7 +106,12 @@ def fitted(
     descent = Descent(prior_on_materials, problem.spread, report, problem.known.free(len(materials)))
     illuminations = problem.illuminations(Point(materials, start.point.lights))
     pairs = list(zip(illuminations, hyperparameters, strict=True))
-    likelihoods = list(problem.spread(lambda pair: likelihood_of(*pair, prior, given), pairs))
+
+    def likelihood(pair: tuple[Illumination, Hyperparameters]) -> LightLikelihood:
+        """Return the likelihood of one light, with a table."""
+        return likelihood_of(*pair, prior, given, problem.tables)
+
+    likelihoods = list(problem.spread(likelihood, pairs))
     state = descent.of_lights(likelihoods, unknowns_of(materials), schedule.lights)
     for number, iterations in enumerate(schedule.together):
         if number or schedule.estimate:
@@ -123,12 +128,18 @@ def fitted(
 
 
 def likelihood_of(
-    illumination: Illumination, one: Hyperparameters, prior: LightPrior, materials_given: bool = False
+    illumination: Illumination,
+    one: Hyperparameters,
+    prior: LightPrior,
+    materials_given: bool = False,
+    tables: Tables | None = None,
 ) -> LightLikelihood:
     """Give an illumination its table of responses, and say how much its observations and the prior count."""
-    table = Reflections(illumination.block, illumination.light.unit_lobes, illumination.operator, materials_given)
+    given = illumination.materials.roughness if materials_given else None
+    of = illumination.block, illumination.light.unit_lobes, illumination.operator
+    table = (tables or Tables()).of(*of, given)
     tabulated = msgspec.structs.replace(illumination, table=table)
-    return recounted(LightLikelihood(tabulated, prior, np.zeros((0, 0)), 0.0, 1.0, ROBUST), one)
+    return recounted(LightLikelihood(tabulated, prior, np.zeros(0), np.zeros((0, 0)), 0.0, 1.0, ROBUST), one)
 
 
 def recounted(likelihood: LightLikelihood, one: Hyperparameters) -> LightLikelihood:
@@ -142,9 +153,8 @@ def recounted(likelihood: LightLikelihood, one: Hyperparameters) -> LightLikelih
     if light.held.any():  # the precision of the others, given these, is their part of Q
         free = np.tile(light.free, 3)
         log_determinant = float(np.linalg.slogdet(Q[np.ix_(free, free)])[1])
-    return msgspec.structs.replace(
-        likelihood, precision=Q, log_determinant=log_determinant, temperature=one.temperature
-    )
+    counts = {"precision": Q, "log_determinant": log_determinant, "temperature": one.temperature}
+    return msgspec.structs.replace(likelihood, log_peaks=np.log(light.peaks), **counts)
 
 
 def estimated(likelihood: LightLikelihood, system: System, least: float) -> Hyperparameters:

@@ -37,7 +37,7 @@ from scipy.linalg.lapack import dpotrf, dpotri
 
 from factorlib.inference.arrow import System
 from factorlib.inference.forward import Gradient, Illumination, Linearised
-from factorlib.inference.lights import Light
+from factorlib.inference.lights import DARKEST, Light
 from factorlib.inference.materials import Materials
 from factorlib.inference.noise import Loss
 from factorlib.light.prior import LightPrior
@@ -49,12 +49,14 @@ EXPOSURE, TONE = 3.0, 0.3  # standard deviations of a log exposure and of a log 
 class LightLikelihood(msgspec.Struct, frozen=True):
     """Likelihood of one light's observations and prior of that light, and how much either counts.
 
-    illumination  with its table;  prior: on its light;  precision: Q, channel by channel, with its log determinant
+    illumination  with its table;  prior: on its light;  log_peaks: of its cells
+    precision     Q, channel by channel, with its log determinant
     temperature   T;  loss: ρ
     """
 
     illumination: Illumination
     prior: LightPrior
+    log_peaks: Float[np.ndarray, " p"]
     precision: Float[np.ndarray, "3p 3p"]
     log_determinant: float
     temperature: float
@@ -130,7 +132,8 @@ class LightLikelihood(msgspec.Struct, frozen=True):
 
     def _prior(self) -> tuple[float, Float[np.ndarray, " l"]]:
         """uᵀQu and the Gaussians of exposures and tones, and half the gradient."""
-        light, u = self.light, self.light.log_radiance.reshape(-1)
+        light = self.light
+        u = (np.log(np.maximum(light.weight.T, DARKEST)) - self.log_peaks).reshape(-1)
         others, width = self._others()
         slope, free = self.precision @ u, np.tile(light.free, 3)
         gradient = [slope[free], others / width**2]

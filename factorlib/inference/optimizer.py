@@ -39,8 +39,9 @@ LOWEST = np.array([np.log(LEAST_REFLECTANCE)] * 6 + [ROUGHNESS[0]])
 HIGHEST = np.array([np.inf] * 6 + [ROUGHNESS[1]])
 FIRST_DAMPING, LOWER, HIGHER, MOST_DAMPING = 0.1, 0.25, 8.0, 1e3
 TOLERANCE = 2e-4  # a descent ends where (1) falls by less than this share of it
-MEMORY, STEPS = 10, 25  # pairs that L-BFGS keeps, and its steps on one factorisation
-DECREMENT = 0.05  # L-BFGS ends where gᵀH⁻¹g, by which a value would still fall, is less
+MEMORY, STEPS = 10, 12  # pairs that L-BFGS keeps, and its steps on one factorisation
+# L-BFGS ends where gᵀH⁻¹g, by which a value would still fall, is less, or this share of what it was
+DECREMENT, SHARE = 0.05, 0.02
 SUFFICIENT, SHORTEST = 1e-4, 1e-3  # of a line search: share of the slope, and of the step
 
 Report = Callable[[float], None]  # called at every factorisation, with the mean robust loss there
@@ -180,11 +181,12 @@ def minimised(objective: Objective, size: int, metric: Callable[[np.ndarray], np
     """Return the step from 0 that minimises a value, by L-BFGS; metric: about the inverse of half the Hessian, times a vector."""
     x = np.zeros(size)
     value, gradient = objective(x)
-    pairs: deque = deque(maxlen=MEMORY)
+    pairs, least = deque(maxlen=MEMORY), 0.0
     for _ in range(STEPS):
         direction = -inverse_hessian_times(gradient, pairs, metric).clip(-MOST_LIGHT, MOST_LIGHT)
         slope = float(gradient @ direction)
-        if -slope < DECREMENT:
+        least = least or max(DECREMENT, -SHARE * slope)
+        if -slope < least:
             break
         length = 1.0
         while length > SHORTEST:

@@ -20,6 +20,7 @@ from factorlib.inference.forward import Illumination
 from factorlib.inference.known import Known
 from factorlib.inference.materials import Point
 from factorlib.inference.noise import Loss
+from factorlib.inference.responses import Tables
 from factorlib.reflection.operator import Operator
 from factorlib.stage import serial_map
 
@@ -34,6 +35,7 @@ class JointProblem(msgspec.Struct, frozen=True):
     loss: Loss = Loss()
     spread: Spread = serial_map
     known: Known = Known()
+    tables: Tables = msgspec.field(default_factory=Tables)
 
     def illuminations(self, point: Point) -> list[Illumination]:
         """Each block with its light; raises ValueError where there is not one light per block."""

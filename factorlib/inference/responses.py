@@ -12,6 +12,8 @@ at worst: .17 % for the factor 1.136 of the nodes.  Cells no sharper than `WIDE`
 
 from __future__ import annotations
 
+from collections import OrderedDict
+from hashlib import blake2b
 from typing import NamedTuple, Protocol
 
 import numpy as np
@@ -31,6 +33,7 @@ NODES = np.geomspace(0.1, 1.0, 19)  # roughness
 WIDE = 200.0  # λ
 DEGREE = 3  # of the polynomials between nodes
 KEPT = 6  # nodes of a material whose responses stay in memory
+KEPT_TABLES = 16  # about 400 MB
 Rows = slice | Int[np.ndarray, " n"]
 
 
@@ -200,6 +203,33 @@ class Reflections:
             else:
                 parts.append(specular_response(self.block, chunk, self.lobes, roughness, self.operator))
         return np.vstack(parts).astype(np.float32)
+
+
+class Tables:
+    """Tables of responses that fits have in common, the `KEPT_TABLES` that were asked for last.
+
+    Fits that compare models have the same observations and lobes; only radiance, materials and weights differ.
+    """
+
+    def __init__(self):
+        self._known: OrderedDict[bytes, Reflections] = OrderedDict()
+
+    def of(
+        self, block: Block, lobes: UnitLobes, operator: Operator, given: Float[np.ndarray, " m"] | None = None
+    ) -> Reflections:
+        """Return the table of a block; given: the roughness of all materials, where it does not change."""
+        optional = (block.visibility, block.directions, block.detail, block.place if lobes.curvature else None, given)
+        arrays = [block.normal, block.view, block.material, block.photo, lobes.axis, lobes.sharpness, *optional]
+        digest = blake2b(repr((id(operator), lobes.curvature, [of is None for of in optional])).encode())
+        for array in arrays:
+            digest.update(b"" if array is None else np.ascontiguousarray(array))
+        key = digest.digest()
+        if key not in self._known:
+            self._known[key] = Reflections(block, lobes, operator, given is not None)
+        self._known.move_to_end(key)
+        for old in list(self._known)[:-KEPT_TABLES]:
+            del self._known[old]
+        return self._known[key]
 
 
 def lagrange(nodes: Float[np.ndarray, " k"], x: float) -> tuple[Float[np.ndarray, " k"], Float[np.ndarray, " k"]]:
