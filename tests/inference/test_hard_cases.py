@@ -263,7 +263,7 @@ def errors_of(scene: Scene, problem: JointProblem, solution: Solution) -> tuple[
     for own in linked:
         factor = true[:, own].sum((0, 1)) / parts[:, own].sum((0, 1))
         off.append(np.abs(parts[:, own] * factor - true[:, own]).mean() / true[:, own].sum(0).mean())
-    seen = np.isin(np.arange(len(truth)), sum(linked, [])) & (truth.specular.max(1) > 0)
+    seen = np.isin(np.arange(len(truth)), np.concatenate(linked)) & (truth.specular.max(1) > 0)
     roughness = np.abs(found.roughness - truth.roughness)[seen].max(initial=0.0)
     relative = []
     blocks = zip(blocks_of_observations(scene.clean, Noise()), problem.blocks, solution.point.lights, strict=True)
