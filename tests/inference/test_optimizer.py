@@ -50,7 +50,7 @@ def valley(x):
 )
 def test_minima_that_are_known_are_found(objective, size, metric):
     x = np.zeros(size)
-    for _ in range(8):  # each begins at the end of the one before, as on a new factorisation
+    for _ in range(16):  # each begins at the end of the one before, as on a new factorisation
         x = x + minimised(lambda step, begun=x: objective(begun + step), size, metric)
     np.testing.assert_allclose(x, 1.0, atol=1e-2)
 
