@@ -31,6 +31,7 @@ from factorlib.inference.evidence import AGAINST, FOR, Losses, compare, losses_o
 from factorlib.inference.fit import Fit, Schedule, fitted, likelihood_of, sure_ones
 from factorlib.inference.materials import Point
 from factorlib.inference.model_selection import TRIAL, TRIAL_CELLS, effects_chosen
+from factorlib.inference.optimizer import light_descended
 from factorlib.inference.options import Choices
 from factorlib.inference.problem import JointProblem
 from factorlib.inference.start import Start, on_cells
@@ -45,7 +46,7 @@ ROUNDS = 3
 CELLS, FOLDS = 250, 4  # cells of a light; folds of photos
 SETTLE = Schedule(lights=2, together=(3, 2), estimate=False)
 BETWEEN = Schedule(together=(2,), estimate=False)
-OWN_LIGHT = Schedule(lights=2, estimate=False, given=True)
+OWN_LIGHT = 2  # factorisations
 
 
 class Surfaces(msgspec.Struct, frozen=True):
@@ -173,18 +174,19 @@ class Trial(msgspec.Struct, frozen=True):
         def alone(of: tuple[int, tuple[int, int], Detail]) -> tuple[float, Losses]:
             """One photo's value and losses."""
             at, (k, number), detail = of
-            own, counts = self.problem.blocks[k].photo == number, [self.fit.hyperparameters[k]]
+            own = self.problem.blocks[k].photo == number
             here = self.attached[k].take(own)
             if plain is not None and not (np.any(detail.turn[here.node]) or np.any(detail.log_factor[here.node])):
                 tick()
                 return plain.values[at], Losses([plain.losses.values[at]], [plain.losses.clusters[at]])
             problem = self.problem.of([detail.on(self.problem.blocks[k].take(own), here)])
-            begun = Fit(Point(self.fit.point.materials, [self.fit.point.lights[k]]), counts)
-            point = fitted(problem, begun, self.prior, OWN_LIGHT).point
-            (one,) = problem.fitted().illuminations(point)
-            judged = likelihood_of(one, counts[0], self.prior).system().value, losses_of(problem, point)
+            begun = Point(self.fit.point.materials, [self.fit.point.lights[k]])
+            (one,) = problem.fitted().illuminations(begun)
+            likelihood = likelihood_of(one, self.fit.hyperparameters[k], self.prior, materials_given=True)
+            likelihood, system = light_descended(likelihood, OWN_LIGHT)
+            losses = losses_of(problem, Point(begun.materials, [likelihood.light]))
             tick()
-            return judged
+            return likelihood.marginal(system), losses
 
         each = [(at, *pair) for at, pair in enumerate(zip(self.photos, details, strict=True))]
         values, losses = zip(*self.problem.spread(alone, each), strict=True)
