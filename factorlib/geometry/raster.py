@@ -13,9 +13,9 @@ from collections.abc import Sequence
 
 import msgspec
 import numpy as np
-import open3d as o3d
 from jaxtyping import Bool, Float, Int
 
+from factorlib.geometry import open3d as o3d
 from factorlib.geometry.camera import Camera, Pose
 from factorlib.meshes.mesh import Mesh
 

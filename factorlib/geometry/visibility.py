@@ -15,10 +15,10 @@ from collections.abc import Callable, Iterator, Sequence
 
 import msgspec
 import numpy as np
-import open3d as o3d
 from jaxtyping import Bool, Float, Int, UInt8, UInt16
 from scipy.spatial import cKDTree
 
+from factorlib.geometry import open3d as o3d
 from factorlib.geometry.camera import Camera, Pose
 from factorlib.geometry.met import UNMET, met_codes
 from factorlib.geometry.raster import Caster, unit

@@ -12,7 +12,6 @@ from typing import Any
 
 import msgspec
 import numpy as np
-import open3d as o3d
 import trimesh
 from jaxtyping import Float, Int
 
@@ -20,6 +19,7 @@ from factorlib.conventions import YUP_FROM_CAMERA
 from factorlib.dataset.schema import LightSlice, ObjectsSlice
 from factorlib.export.environment import sharpened
 from factorlib.export.gltf import read_part_materials, variant_name
+from factorlib.geometry import open3d as o3d
 from factorlib.geometry.camera import Pose
 from factorlib.geometry.raster import unit
 from factorlib.geometry.sphere import fibonacci_sphere
