@@ -31,9 +31,9 @@ class Camera(msgspec.Struct, frozen=True):
         centre = ((self.centre[0] - left) / pixel, (self.centre[1] - top) / pixel)
         return Camera(width, height, self.focal / pixel, centre)
 
-    def rays(self) -> Float[np.ndarray, "h w 3"]:
-        """Directions through the pixel centres, z = 1, camera frame."""
-        x, y = np.meshgrid(np.arange(self.width) + 0.5, np.arange(self.height) + 0.5)
+    def rays(self, rows: slice = slice(None), columns: slice = slice(None)) -> Float[np.ndarray, "h w 3"]:
+        """Directions through the pixel centres, z = 1, camera frame; of some rows and columns alone, where they are given."""
+        x, y = np.meshgrid(np.arange(self.width)[columns] + 0.5, np.arange(self.height)[rows] + 0.5)
         return self.rays_through(np.stack([x, y], axis=-1))
 
     def rays_through(self, pixels: Float[np.ndarray, "*n 2"]) -> Float[np.ndarray, "*n 3"]:

@@ -10,6 +10,7 @@ are bent in the plane of normal and view to the nearest direction with n·v ≥ 
 """
 
 from collections.abc import Sequence
+from itertools import product
 
 import msgspec
 import numpy as np
@@ -58,13 +59,28 @@ class Caster:
 
     def __init__(self, mesh: Mesh):
         self.mesh, self.centre, self.radius = mesh, mesh.centre, mesh.radius
+        used = mesh.vertices[np.unique(mesh.faces)]
+        self.corners = np.array(list(product(*zip(used.min(0), used.max(0)))))
         self.scene = o3d.t.geometry.RaycastingScene(nthreads=1)
         vertices = ((mesh.vertices - self.centre) / self.radius).astype(np.float32)
         self.scene.add_triangles(o3d.core.Tensor(vertices), o3d.core.Tensor(mesh.faces.astype(np.uint32)))
 
     def cast(self, camera: Camera, pose: Pose) -> Hits:
-        """Return what the rays through the pixel centres of `camera` meet first."""
-        return self.cast_along(camera.rays(), pose)
+        """Return what the rays through the pixel centres of `camera` meet first.  Rays beside the mesh's bounding box are not cast."""
+        shape, window = (camera.height, camera.width), self._window(camera, pose)
+        hits = Hits(np.full(shape, np.inf), np.full(shape, -1), np.zeros((*shape, 2)))
+        part = self.cast_along(camera.rays(*window), pose)
+        hits.depth[window], hits.face[window], hits.uv[window] = part.depth, part.face, part.uv
+        return hits
+
+    def _window(self, camera: Camera, pose: Pose) -> tuple[slice, slice]:
+        """Rows and columns of the pixels that can show the mesh: of its bounding box, all where a corner is not before the camera."""
+        corners = pose.apply(self.corners)
+        if corners[:, 2].min() <= 0:
+            return slice(0, camera.height), slice(0, camera.width)
+        pixels, size = camera.project(corners), (camera.width, camera.height)
+        low, high = np.clip([pixels.min(0) - 1, pixels.max(0) + 2], 0, size).astype(int)
+        return slice(low[1], high[1]), slice(low[0], high[0])
 
     def cast_along(self, directions: Float[np.ndarray, "*n 3"], pose: Pose) -> Hits:
         """Return what rays from the camera along `directions` (camera frame, z = 1, so that distance is depth) meet first."""
