@@ -11,7 +11,7 @@ from typing import Annotated
 import msgspec
 
 from factorlib.align.photo import aligned_photo
-from factorlib.align.search import normal_difference
+from factorlib.align.search import normal_difference, seen_in
 from factorlib.align.silhouette import silhouette_iou
 from factorlib.align.target import target_of
 from factorlib.dataset.schema import ObjectsSlice
@@ -94,7 +94,10 @@ def decided(entry: ObjectEntry, own: PosedObject, result: Refined, camera: Camer
         changed |= {**entry_of(pose), "silhouette_iou": silhouette_iou(own.silhouette, label)}
     target = target_of(own.silhouette, own.caster.mesh.labels, 200, 0.1)
     turned = angle_between(result.after.rotation, result.before.rotation)
-    moved = Moved(turned, normal_difference(own.caster, target, camera, result.before, result.after))
+    moved = Moved(
+        turned,
+        normal_difference(*(seen_in(own.caster, target, camera, state) for state in (result.before, result.after))),
+    )
     found = verdict.candidates["found"]
     candidates = {n: CandidateEntry(c.held_out_loss, *c.gain(found), c.score) for n, c in verdict.candidates.items()}
     refinement = Refinement(verdict.chosen, verdict.ruled_out, moved, candidates)

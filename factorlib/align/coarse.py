@@ -155,7 +155,8 @@ def _templates(
 def _apart(guesses: list[Guess], keep: int, apart_deg: float) -> list[Guess]:
     """The best of the guesses, none within `apart_deg` of a better one."""
     order = np.argsort(np.array([guess.error for guess in guesses]), kind="stable")[: 60 * keep]
-    rotations = np.stack([guesses[k].roll() @ guesses[k].turn for k in order])
+    rolls = rotation_of_vector(np.array([[0, 0, -guesses[k].angle] for k in order]))
+    rotations = rolls @ np.stack([guesses[k].turn for k in order])
     chosen, closest = [], 1 + 2 * np.cos(np.deg2rad(apart_deg))
     free = np.ones(len(order), bool)
     while free.any() and len(chosen) < keep:

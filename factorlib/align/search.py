@@ -17,7 +17,7 @@ from factorlib.align.silhouette import Silhouette
 from factorlib.align.state import State
 from factorlib.align.target import Target, target_of
 from factorlib.geometry.camera import Camera, angle_between
-from factorlib.geometry.raster import Caster, rasterise
+from factorlib.geometry.raster import Caster, Maps, rasterise
 
 Count = Annotated[int, msgspec.Meta(ge=1)]
 Report = Callable[[float], None]
@@ -115,7 +115,7 @@ def find(
     best, *others = _distinct(ranked + again, prior)
     away, second = next((other for other in others if _is_apart(other, [best], DISTINCT_DEG)), None), None
     if away is not None:
-        normals_deg = normal_difference(caster, target, camera, best.state, away.state)
+        normals_deg = normal_difference(*(seen_in(caster, target, camera, each.state) for each in (best, away)))
         second = RunnerUp(away.state, away.score, normals_deg)
     return Found(best.state, best.score, best.log_focal_sigma(), second)
 
@@ -162,9 +162,13 @@ def _is_apart(one: Refined, others: Iterable[Refined], degrees: float) -> bool:
     return all(angle_between(one.state.rotation, other.state.rotation) > degrees for other in others)
 
 
-def normal_difference(caster: Caster, target: Target, camera: Camera, first: State, second: State) -> float:
-    """Median angle in degrees between the normals of two states where both see the mesh; 180 if they share no pixel."""
-    a, b = (rasterise(caster, target.camera(s.camera(camera)), s.pose(caster)) for s in (first, second))
+def seen_in(caster: Caster, target: Target, camera: Camera, state: State) -> Maps:
+    """Return the maps of the mesh in a state, in the target's window."""
+    return rasterise(caster, target.camera(state.camera(camera)), state.pose(caster))
+
+
+def normal_difference(a: Maps, b: Maps) -> float:
+    """Median angle in degrees between the normals where both see the mesh; 180 if they share no pixel."""
     both = (a.label > 0) & (b.label > 0)
     if not both.any():
         return 180.0

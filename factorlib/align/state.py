@@ -8,6 +8,8 @@ from factorlib.geometry.camera import Camera, Pose, rotation_of_vector
 from factorlib.geometry.raster import Caster
 from factorlib.meshes.mesh import Mesh
 
+TURNS = np.cross(np.eye(3)[:, None], np.eye(3))  # [k, i, j]: component j of e_k × e_i
+
 
 class State(msgspec.Struct, frozen=True):
     """Where the middle of a mesh is and how it is turned.
@@ -46,8 +48,7 @@ class State(msgspec.Struct, frozen=True):
         """Derivative of the image points (photo pixels) of points at `arms` from the centre (camera axes), by `moved`."""
         depth, focal = np.exp(self.log_depth), np.exp(self.log_focal)
         point, moves = arms + self.middle(), np.zeros((len(arms), 3, 7))
-        for k in range(3):
-            moves[:, :, k] = np.cross(np.eye(3)[k], arms)
+        moves[:, :, :3] = np.moveaxis(arms @ TURNS, 0, -1)  # of axis k: e_k × arm
         moves[:, 0, 3] = moves[:, 1, 4] = depth
         moves[:, :, 5] = depth * np.array([self.a, self.b, 1.0])
         moves[:, 2, 6] = depth

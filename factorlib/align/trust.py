@@ -17,7 +17,7 @@ from scipy.spatial import cKDTree
 
 from factorlib.align.place import ObjectToPlace, Placed
 from factorlib.align.refine import FocalPrior, at_points, contour_of, normal_equations, rendered
-from factorlib.align.search import Found, Search, find, normal_difference
+from factorlib.align.search import Found, Search, find, normal_difference, seen_in
 from factorlib.align.silhouette import Silhouette
 from factorlib.align.state import State, state_of
 from factorlib.align.target import Target, target_of
@@ -114,12 +114,12 @@ def normal_stderr_deg(caster: Caster, target: Target, camera: Camera, state: Sta
     """Root of the summed squares, over the independent directions of the unknowns, of the normals' median turn by one
     standard error."""
     information, _ = normal_equations(rendered(caster, target, camera, state), target, prior)
-    turns, free = [], prior.free
+    turns, free, unmoved = [], prior.free, seen_in(caster, target, camera, state)
     precisions, directions = np.linalg.eigh(information[:free, :free])
     for precision, direction in zip(precisions, directions.T, strict=True):
         length = min(max(precision, 1e-12) ** -0.5, LARGEST_MOVE / np.abs(direction).max())
         move = np.append(length * direction, np.zeros(7 - free))
-        turns.append(normal_difference(caster, target, camera, state, state.moved(move)))
+        turns.append(normal_difference(unmoved, seen_in(caster, target, camera, state.moved(move))))
     return float(np.sqrt(np.sum(np.square(turns))))
 
 

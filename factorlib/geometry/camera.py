@@ -54,7 +54,7 @@ class Pose(msgspec.Struct, frozen=True):
         return points @ self.rotation.T + self.translation
 
 
-def rotation_of_vector(vector: Float[np.ndarray, "3"]) -> Float[np.ndarray, "3 3"]:
+def rotation_of_vector(vector: Float[np.ndarray, "*n 3"]) -> Float[np.ndarray, "*n 3 3"]:
     """Turn about `vector` by its length in radians."""
     return Rotation.from_rotvec(vector).as_matrix()
 
