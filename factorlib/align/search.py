@@ -33,7 +33,7 @@ GIVEN_UP_UNEXPLAINED = 0.04
 class Search(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """How hard to look.  The tuples hold one number per round of refinement, in order; most guesses fall in the first."""
 
-    views: Count = 300
+    views: Count = 240
     """Directions of view, evenly over the sphere, that are tried."""
     rolls: Count = 20
     """Turns about the line of sight tried for each direction of view."""
@@ -43,7 +43,7 @@ class Search(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """Factor on views and first guesses where the frame or another object cuts the mask."""
     keep: tuple[Count, Count, Count, Count] = (32, 14, 7, 3)
     """Guesses that each round of refinement takes up."""
-    steps: tuple[Count, Count, Count, Count] = (5, 8, 10, 8)
+    steps: tuple[Count, Count, Count, Count] = (4, 8, 10, 8)
     """Gauss-Newton steps of each round."""
     resolution: tuple[Count, Count, Count, Count] = (80, 100, 200, 400)
     """Pixels of the mask's longer side in each round."""

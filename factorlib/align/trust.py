@@ -26,7 +26,7 @@ from factorlib.geometry.raster import Caster
 
 LARGEST_MOVE = 0.5  # of one unknown, radians or log: beyond, normal equations say nothing
 FITS_TO_A_PIXEL = 0.995  # score from which no other pose fits clearly better
-QUICK = Search(views=200, rolls=16, keep=(10, 5, 2, 1), steps=(5, 8, 8, 6), rivals=0)
+QUICK = Search(views=200, rolls=16, keep=(10, 5, 2, 1), steps=(4, 8, 8, 6), rivals=0)
 LEAST_SCORE_LEAD = 0.001  # of the mask's pixels: a lead of less is their noise, however little is left unexplained
 DIFFERENT_DEG = 5.0  # median angle of normals from which a runner-up is another answer
 Share = Annotated[float, msgspec.Meta(ge=0, le=1)]

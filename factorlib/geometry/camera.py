@@ -65,7 +65,7 @@ def angle_between(first: Float[np.ndarray, "3 3"], second: Float[np.ndarray, "3 
     >>> round(angle_between(np.eye(3), rotation_of_vector(np.array([0.0, 0.5, 0.0]))), 6)
     28.64789
     """
-    return float(np.rad2deg(Rotation.from_matrix(first @ second.T).magnitude()))
+    return float(np.rad2deg(2 * np.arcsin(min(np.linalg.norm(first - second) / 8**0.5, 1.0))))
 
 
 def is_pose(rotation: Float[np.ndarray, "3 3"], translation: Float[np.ndarray, "3"]) -> bool:
@@ -74,6 +74,7 @@ def is_pose(rotation: Float[np.ndarray, "3 3"], translation: Float[np.ndarray, "
     >>> is_pose(np.diag([1.0, 1.0, -1.0]), np.ones(3))
     False
     """
-    if not (np.isfinite(rotation).all() and np.isfinite(translation).all()):
-        return False
-    return bool(np.abs(rotation.T @ rotation - np.eye(3)).max() < ROTATION_ERROR and np.linalg.det(rotation) > 0)
+    finite = np.isfinite(rotation).all() and np.isfinite(translation).all()
+    return bool(
+        finite and np.abs(rotation.T @ rotation - np.eye(3)).max() < ROTATION_ERROR and np.linalg.det(rotation) > 0
+    )

@@ -10,7 +10,6 @@ from importlib.util import find_spec, module_from_spec
 
 os.environ["KMP_DUPLICATE_LIB_OK"] = "True"  # as Open3D sets it: PyTorch brings an OpenMP of its own
 sys.modules["open3d"] = module_from_spec(find_spec("open3d"))
-from open3d.cpu.pybind import core, geometry, t, utility  # noqa: E402
+from open3d.cpu.pybind import core, geometry, t, utility  # noqa: E402, F401
 
 del sys.modules["open3d"]  # so that somebody else's `import open3d` gets the whole package
-__all__ = ["core", "geometry", "t", "utility"]

@@ -70,7 +70,8 @@ class Caster:
         shape, window = (camera.height, camera.width), self._window(camera, pose)
         hits = Hits(np.full(shape, np.inf), np.full(shape, -1), np.zeros((*shape, 2)))
         part = self.cast_along(camera.rays(*window), pose)
-        hits.depth[window], hits.face[window], hits.uv[window] = part.depth, part.face, part.uv
+        for name in hits.__struct_fields__:
+            getattr(hits, name)[window] = getattr(part, name)
         return hits
 
     def _window(self, camera: Camera, pose: Pose) -> tuple[slice, slice]:
@@ -78,8 +79,8 @@ class Caster:
         corners = pose.apply(self.corners)
         if corners[:, 2].min() <= 0:
             return slice(0, camera.height), slice(0, camera.width)
-        pixels, size = camera.project(corners), (camera.width, camera.height)
-        low, high = np.clip([pixels.min(0) - 1, pixels.max(0) + 2], 0, size).astype(int)
+        pixels = camera.project(corners)
+        low, high = np.clip([pixels.min(0) - 1, pixels.max(0) + 2], 0, (camera.width, camera.height)).astype(int)
         return slice(low[1], high[1]), slice(low[0], high[0])
 
     def cast_along(self, directions: Float[np.ndarray, "*n 3"], pose: Pose) -> Hits:
