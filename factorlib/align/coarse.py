@@ -73,10 +73,9 @@ def candidates(
     guesses, middle, pixel, distance = guesses_of(caster, silhouette, camera, views, rolls)
     states = []
     for guess in _apart(guesses, keep, apart_deg):  # shift and roll undone, seen along the ray to where it lies
-        place = middle + pixel * guess.roll[:2, :2] @ guess.shift
-        slope = (place - np.array(camera.centre)) / camera.focal
-        logs = np.log(camera.focal * distance / (guess.focal * pixel)), np.log(camera.focal)
-        states.append(State(toward(slope) @ guess.roll @ guess.turn, *map(float, (*slope, *logs))))
+        slope = (middle + pixel * guess.roll[:2, :2] @ guess.shift - np.array(camera.centre)) / camera.focal
+        numbers = *slope, np.log(camera.focal * distance / (guess.focal * pixel)), np.log(camera.focal)
+        states.append(State(toward(slope) @ guess.roll @ guess.turn, *map(float, numbers)))
     return states
 
 

@@ -100,9 +100,9 @@ def placed(
             start, other = state_of(obj.earlier.pose, camera, obj.caster), obj.earlier.runner_up
             known_camera = FocalPrior(camera.focal, 0.0)
             score = refined_finest(obj.caster, obj.silhouette, camera, start, known_camera, search, 0).score
-            second = None
-            if other is not None:
-                second = RunnerUp(state_of(other.pose, camera, obj.caster), other.score, other.normal_difference_deg)
+            second = other and RunnerUp(
+                state_of(other.pose, camera, obj.caster), other.score, other.normal_difference_deg
+            )
             found[k] = Found(start, score, sigma, second, earlier=True)
         elif obj.keypoints is None:
             found[k] = find(

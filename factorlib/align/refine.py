@@ -122,8 +122,7 @@ def normal_equations(
             residuals.append(np.einsum("nd,nd->n", region.outward, points[nearest] - region.contour))
             rows.append(np.einsum("nd,ndk->nk", region.outward, jacobian[nearest]))
     residual, row = np.concatenate(residuals), np.concatenate(rows)
-    spread = robust_deviation(residual) if len(residual) else LEAST_SPREAD
-    scale = float(np.clip(spread, LEAST_SPREAD, max(MOST_SCALE * target.extent, LEAST_SPREAD)))
+    scale = max(min(robust_deviation(residual) if len(residual) else 0.0, MOST_SCALE * target.extent), LEAST_SPREAD)
     weight = 1 / (1 + (residual / (2 * scale)) ** 2) / (CORRELATION * scale**2)
     information, gradient = (row * weight[:, None]).T @ row, row.T @ (weight * residual)
     if prior.sigma > 0:

@@ -94,8 +94,10 @@ def find(
     """
     camera = msgspec.structs.replace(camera, focal=prior.focal)
     effort = search.cut_effort if is_cut(silhouette) else 1
-    density = effort * search.views, search.rolls, effort * search.keep[0], search.apart_deg
-    states, others = candidates(caster, silhouette, camera, *density), []
+    states = candidates(
+        caster, silhouette, camera, effort * search.views, search.rolls, effort * search.keep[0], search.apart_deg
+    )
+    others: list[Refined] = []
     rounds = zip(search.keep, search.steps, search.resolution, search.margin)
     for number, (keep, steps, size, margin) in enumerate(rounds, start=1):
         report(number / (len(search.keep) + 2))
@@ -113,11 +115,16 @@ def find(
     # refined anew: scores of different resolutions do not compare
     again = [refined(caster, target, camera, rival.state, prior, search.steps[-1]) for rival in rivals]
     best, *others = _distinct(ranked + again, prior)
-    away, second = next((other for other in others if _is_apart(other, [best], DISTINCT_DEG)), None), None
-    if away is not None:
-        normals_deg = normal_difference(*(seen_in(caster, target, camera, each.state) for each in (best, away)))
-        second = RunnerUp(away.state, away.score, normals_deg)
-    return Found(best.state, best.score, best.log_focal_sigma(), second)
+    runners_up = (
+        RunnerUp(
+            other.state,
+            other.score,
+            normal_difference(*(seen_in(caster, target, camera, of.state) for of in (best, other))),
+        )
+        for other in others
+        if _is_apart(other, [best], DISTINCT_DEG)
+    )
+    return Found(best.state, best.score, best.log_focal_sigma(), next(runners_up, None))
 
 
 def found_near(

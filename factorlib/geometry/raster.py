@@ -115,13 +115,14 @@ def rasterise(meshes: Mesh | Caster | Sequence, camera: Camera, poses: Pose | Se
         nearest[wins] = hits.depth[wins]
         maps.depth[wins], maps.view[wins], maps.object[wins] = hits.depth[wins], view[wins], number
         mesh, face, seen_along = caster.mesh, hits.face[wins], view[wins]
-        smooth, own = smooth_normals(mesh, face, hits.uv[wins]) @ pose.rotation.T, face_normals(mesh, face)
+        own = face_normals(mesh, face)
         facing = np.sum((own @ pose.rotation.T) * seen_along, axis=1)
-        side = np.where(facing < 0, -1.0, 1.0)
-        maps.normal[wins], maps.bent[wins] = toward_viewer(unit(smooth) * side[:, None], seen_along)
-        maps.label[wins], maps.back[wins], maps.edge[wins] = mesh.face_label[face], side < 0, np.abs(facing)
-        cosine = np.abs(np.einsum("nkd,nd->nk", mesh.normals[mesh.faces[face]], own)).min(1)
-        maps.facet[wins] = np.arccos(np.minimum(cosine, 1.0))
+        side = np.where(facing < 0, -1.0, 1.0)[:, None]
+        smooth = unit(smooth_normals(mesh, face, hits.uv[wins]) @ pose.rotation.T) * side
+        maps.normal[wins], maps.bent[wins] = toward_viewer(smooth, seen_along)
+        maps.label[wins], maps.back[wins], maps.edge[wins] = mesh.face_label[face], facing < 0, np.abs(facing)
+        cosines = np.abs(np.einsum("nkd,nd->nk", mesh.normals[mesh.faces[face]], own))
+        maps.facet[wins] = np.arccos(np.minimum(cosines.min(1), 1.0))
     return maps
 
 
