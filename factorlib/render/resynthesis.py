@@ -11,6 +11,7 @@ from pathlib import Path
 import msgspec
 import numpy as np
 from jaxtyping import Bool, Float, Int
+from scipy.interpolate import RectBivariateSpline
 from scipy.ndimage import binary_closing
 from scipy.spatial import cKDTree
 
@@ -26,6 +27,10 @@ from factorlib.urm.observations import Observations
 
 log = logging.getLogger("factorlib.render")
 Channels = Mapping[str, Float[np.ndarray, "h w"]]
+STEP, LONGEST_STEP = 0.45, 0.1  # of nodes on a ball, in α and in radians
+NARROW = 4000.0  # sharpness of lobes whose highlights a spline does not follow
+RIM = np.pi / 2 - 1e-3  # radians: the largest θ, where a surface is still seen
+MARGIN = 4  # nodes beyond an end
 GAP = 6  # cells: the widest gap between observed normals that counts as observed
 
 
@@ -106,13 +111,47 @@ def around_pixels(
     return Shadows(of.visibility, fibonacci_sphere(of.visibility.shape[1]), nearest), sent, place
 
 
-def ball(reflector: Reflector, material: MaterialLike, size: int) -> Float[np.ndarray, "size size 3"]:
-    """Radiance; zero beside the ball."""
-    normals, inside = ball_normals(size)
-    normals = normals * (1, -1, -1)  # in the camera's frame
-    picture = np.zeros((size, size, 3))
-    picture[inside] = reflector(material, normals, np.broadcast_to(FRONT, normals.shape))
-    return picture
+def balls(
+    reflector: Reflector, material: MaterialLike, sizes: Sequence[int]
+) -> list[Float[np.ndarray, "size size 3"]]:
+    """Radiance of balls of several sizes, in pixels across, which share what is computed; zero beside a ball."""
+    shapes = [ball_normals(size) for size in sizes]
+    normals = np.concatenate([own for own, _ in shapes]) * (1, -1, -1)  # in the camera's frame
+    radiance, pictures = front_radiance(reflector, material, normals), []
+    for _, inside in shapes:
+        pictures.append(np.zeros((*inside.shape, 3)))
+        pictures[-1][inside], radiance = np.split(radiance, [inside.sum()])
+    return pictures
+
+
+def front_radiance(
+    reflector: Reflector, material: MaterialLike, normals: Float[np.ndarray, "n 3"]
+) -> Float[np.ndarray, "n 3"]:
+    """Radiance toward the viewer of points with many `normals`: by cubic splines over the angle θ to the viewer and the azimuth φ.
+
+    The nodes lie STEP widths α of a highlight apart.  Lobes narrower than that, and normals fewer than the nodes, are not interpolated.
+    """
+    step = min(STEP * float(material.roughness) ** 2, LONGEST_STEP)
+    rings = int(np.ceil(np.pi / 2 / step))
+    if 4 * rings**2 >= len(normals):
+        return reflector(material, normals, np.broadcast_to(FRONT, normals.shape))
+    narrow = reflector.lobes.sharpness > NARROW
+    wide, sharp = (Reflector(reflector.operator, reflector.lobes.take(of)) for of in (~narrow, narrow))
+    # nodes: θ = h/2, 3h/2, …, π/2, and φ = 0 … 2π
+    theta = (np.arange(rings) + 0.5) / (rings - 0.5) * RIM
+    phi = np.arange(4 * rings) * (np.pi / 2 / rings)
+    sin, cos = np.sin(theta)[:, None], np.cos(theta)[:, None]
+    nodes = np.stack(np.broadcast_arrays(sin * np.cos(phi), sin * np.sin(phi), -cos), axis=-1)
+    values = wide(material, nodes.reshape(-1, 3), np.broadcast_to(FRONT, (nodes.size // 3, 3))).reshape(nodes.shape)
+    # beyond the pole lies θ < 0 at φ + π, beyond φ = 2π the beginning
+    across = np.roll(values[MARGIN - 1 :: -1], 2 * rings, axis=1)
+    values = np.pad(np.concatenate([across, values]), ((0, 0), (MARGIN, MARGIN), (0, 0)), mode="wrap")
+    theta = np.concatenate([-theta[MARGIN - 1 :: -1], theta])
+    phi = np.arange(-MARGIN, 4 * rings + MARGIN) * (np.pi / 2 / rings)
+    at = np.arccos(-normals[:, 2]), np.arctan2(normals[:, 1], normals[:, 0]) % (2 * np.pi)
+    splines = [RectBivariateSpline(theta, phi, channel, s=0) for channel in np.moveaxis(values, -1, 0)]
+    smooth = np.stack([spline.ev(*at) for spline in splines], axis=-1).clip(0)
+    return smooth + sharp(material, normals, np.broadcast_to(FRONT, normals.shape))
 
 
 def observed_cells(normals: Float[np.ndarray, "n 3"], size: int) -> Bool[np.ndarray, "size size"]:
