@@ -10,25 +10,25 @@ from pathlib import Path
 
 import msgspec
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Float, Int, UInt8
 from scipy.interpolate import RectBivariateSpline
 from scipy.ndimage import binary_closing
 from scipy.spatial import cKDTree
 
 from factorlib.conventions import FRONT
 from factorlib.dataset.schema import LightSlice
-from factorlib.geometry.sphere import ball_normals, fibonacci_sphere
+from factorlib.geometry.sphere import ball_normals
 from factorlib.light.lobes import Lobes
 from factorlib.reflection.operator import MaterialLike
-from factorlib.render.reflect import Reflector, Report, Shadows, silently
+from factorlib.render.reflect import Reflector, Report, silently
 from factorlib.results.lobes import read_lobes
 from factorlib.results.materials import read_exposures
 from factorlib.urm.observations import Observations
 
 log = logging.getLogger("factorlib.render")
 Channels = Mapping[str, Float[np.ndarray, "h w"]]
-STEP, LONGEST_STEP = 0.45, 0.1  # of nodes on a ball, in α and in radians
-NARROW = 4000.0  # sharpness of lobes whose highlights a spline does not follow
+STEP, LONGEST_STEP = 0.6, 0.1  # of nodes on a ball, in α and in radians
+NARROW = 1000.0  # sharpness of lobes whose highlights a spline does not follow
 RIM = np.pi / 2 - 1e-3  # radians: the largest θ, where a surface is still seen
 MARGIN = 4  # nodes beyond an end
 GAP = 6  # cells: the widest gap between observed normals that counts as observed
@@ -82,9 +82,9 @@ def resynthesised(
         pixels = label == k
         unit = [of[pixels].astype(float) for of in (normal, view)]
         unit = [of / np.linalg.norm(of, axis=-1, keepdims=True) for of in unit]
-        shadows, sent, place = (None,) * 3 if around is None else around_pixels(around, k - 1, *np.nonzero(pixels))
+        visibility, sent, place = (None,) * 3 if around is None else around_pixels(around, k - 1, *np.nonzero(pixels))
         detail = geometry["detail"][pixels].astype(float) if "detail" in geometry else np.ones(len(unit[0]))
-        shown = reflector(material, unit[0], unit[1], of_all, shadows, place, detail)
+        shown = reflector(material, unit[0], unit[1], of_all, visibility, place, detail)
         if sent is not None:
             bounced = (
                 np.array(material.diffuse) * detail[:, None] * sent[:, :3] + np.array(material.specular) * sent[:, 3:]
@@ -97,7 +97,7 @@ def resynthesised(
 
 def around_pixels(
     around: Surroundings, material: int, y: Int[np.ndarray, " n"], x: Int[np.ndarray, " n"]
-) -> tuple[Shadows | None, Float[np.ndarray, "n 6"] | None, Float[np.ndarray, "n 3"] | None]:
+) -> tuple[UInt8[np.ndarray, "n k"] | None, Float[np.ndarray, "n 6"] | None, Float[np.ndarray, "n 3"] | None]:
     """Return what pixels of a material see and are sent, and where they lie: as the nearest observed pixel of it; None for all, nothing, the middle."""
     rows = np.flatnonzero(around.seen.material == material)
     of = around.seen.take(rows)
@@ -106,14 +106,10 @@ def around_pixels(
     nearest = cKDTree(np.column_stack([of.x, of.y])).query(np.column_stack([x, y]))[1]
     sent = None if around.sent is None else around.sent[rows[nearest]]
     place = None if of.place is None else of.place[nearest]
-    if of.visibility is None:
-        return None, sent, place
-    return Shadows(of.visibility, fibonacci_sphere(of.visibility.shape[1]), nearest), sent, place
+    return None if of.visibility is None else of.visibility[nearest], sent, place
 
 
-def balls(
-    reflector: Reflector, material: MaterialLike, sizes: Sequence[int]
-) -> list[Float[np.ndarray, "size size 3"]]:
+def balls(reflector: Reflector, material: MaterialLike, sizes: Sequence[int]) -> list[Float[np.ndarray, "size size 3"]]:
     """Radiance of balls of several sizes, in pixels across, which share what is computed; zero beside a ball."""
     shapes = [ball_normals(size) for size in sizes]
     normals = np.concatenate([own for own, _ in shapes]) * (1, -1, -1)  # in the camera's frame
