@@ -11,14 +11,13 @@ So a constant light stays constant, and c = 0 is the light of an environment map
 
 from __future__ import annotations
 
-from typing import TypeVar
+from typing import Any, TypeVar
 
 import numpy as np
 from jaxtyping import Float
-from torch import Tensor
 
 LONGEST = 0.5  # of |X|: a point that lies more than halfway to the light is taken to lie halfway
-A = TypeVar("A", np.ndarray, Tensor)
+A = TypeVar("A", bound=Any)  # an array of NumPy or a tensor of torch, which is not imported for its name
 
 
 def met_from(place: A, normal: A, view: A, axis: A, curvature: float) -> tuple[A, A, A]:

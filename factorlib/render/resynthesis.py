@@ -4,9 +4,7 @@ A ball is seen from the front, orthographically: every normal that faces the vie
 Frame: the photo's camera (x right, y down, z forward); a ball's view is (0, 0, −1).
 """
 
-import logging
 from collections.abc import Mapping, Sequence
-from pathlib import Path
 
 import msgspec
 import numpy as np
@@ -16,35 +14,17 @@ from scipy.ndimage import binary_closing
 from scipy.spatial import cKDTree
 
 from factorlib.conventions import FRONT
-from factorlib.dataset.schema import LightSlice
 from factorlib.geometry.sphere import ball_normals
-from factorlib.light.lobes import Lobes
 from factorlib.reflection.operator import MaterialLike
 from factorlib.render.reflect import Reflector, Report, silently
-from factorlib.results.lobes import read_lobes
-from factorlib.results.materials import read_exposures
 from factorlib.urm.observations import Observations
 
-log = logging.getLogger("factorlib.render")
 Channels = Mapping[str, Float[np.ndarray, "h w"]]
 STEP, LONGEST_STEP = 0.6, 0.1  # of nodes on a ball, in α and in radians
 NARROW = 1000.0  # sharpness of lobes whose highlights a spline does not follow
 RIM = np.pi / 2 - 1e-3  # radians: the largest θ, where a surface is still seen
 MARGIN = 4  # nodes beyond an end
 GAP = 6  # cells: the widest gap between observed normals that counts as observed
-
-
-def light_of(exported: Path, photo: str, light: LightSlice) -> Lobes:
-    """The light of a photo as pictures are made in it: lobes in the photo's own camera axes, its exposure included.
-
-    exported: the folder of `export`'s result, whose gauge the light is in
-    """
-    lobes = read_lobes(exported / "lobes.parquet")[light.illumination]
-    if len(lobes) == 0:
-        log.warning("%s: nothing is known of its light: its pictures are black", photo)
-    if light.world_from_camera is not None:
-        lobes = lobes.turned(np.array(light.world_from_camera).T)
-    return lobes.scaled(np.array(read_exposures(exported / "exposures.json").get(photo, 1.0)))
 
 
 class Surroundings(msgspec.Struct, frozen=True):
