@@ -63,7 +63,8 @@ def light_of_lat_long(radiance: Float[np.ndarray, "h w 3"]) -> Light:
     times = max(1, -(-1024 // radiance.shape[1]), -(-512 // radiance.shape[0]))
     fine = np.repeat(np.repeat(np.asarray(radiance, np.float64), times, axis=0), times, axis=1)
     height, width = fine.shape[:2]
-    area, texel = np.repeat(lat_long_solid_angles(height, width), width), _octahedral_texels(height, width)
+    area = np.repeat(lat_long_solid_angles(height, width), width)
+    texel = _octahedral_texels(height, width)
     total = np.bincount(texel, area, SIDE * SIDE)
     sums = [np.bincount(texel, area * channel, SIDE * SIDE) for channel in fine.reshape(-1, 3).T]
     return Light(_pyramid(np.stack([s / total for s in sums], axis=-1).reshape(SIDE, SIDE, 3).astype(np.float32)))
@@ -94,9 +95,9 @@ def texel_weights(
     offsets = np.cumsum([0] + [(SIDE >> k) ** 2 for k in range(last + 1)])
     at = [(offsets[k] + (row >> k) * (SIDE >> k) + (column >> k)).astype(np.int32) for k in (below, below + 1)]
     share = level - below  # the coarser level's
-    terms, texels = np.hstack([weight * (1 - share), weight * share]), np.hstack(at)
+    terms = np.hstack([weight * (1 - share), weight * share])
     starts = np.arange(len(terms) + 1) * terms.shape[1]
-    return csr_array((terms.astype(np.float32).ravel(), texels.ravel(), starts), shape=(len(terms), offsets[-1]))
+    return csr_array((terms.astype(np.float32).ravel(), np.hstack(at).ravel(), starts), shape=(len(terms), offsets[-1]))
 
 
 def diffuse_lobe(normals: Float[np.ndarray, "n 3"]) -> Reflected:

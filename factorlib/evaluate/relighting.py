@@ -58,7 +58,7 @@ class Appearances:
     """Balls of many materials in one light: each part of the reflection is rendered once."""
 
     def __init__(self, light: Light):
-        self.light, self.diffuse = light, matte_lobe()(light)
+        self.diffuse = matte_lobe()(light)
         self.glossy = cache(lambda roughness: lobe_of(roughness)(light))
 
     def ball(self, material: Reflectance) -> Samples:

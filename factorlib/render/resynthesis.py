@@ -20,7 +20,8 @@ from factorlib.render.reflect import Reflector, Report, silently
 from factorlib.urm.observations import Observations
 
 Channels = Mapping[str, Float[np.ndarray, "h w"]]
-STEP, LONGEST_STEP = 0.6, 0.1  # of nodes on a ball, in α and in radians
+STEP = 0.6  # between nodes on a ball, in α
+LONGEST_STEP = 0.1  # radians
 NARROW = 1000.0  # sharpness of lobes whose highlights a spline does not follow
 RIM = np.pi / 2 - 1e-3  # radians: the largest θ, where a surface is still seen
 MARGIN = 4  # nodes beyond an end
@@ -93,7 +94,8 @@ def balls(reflector: Reflector, material: MaterialLike, sizes: Sequence[int]) ->
     """Radiance of balls of several sizes, in pixels across, which share what is computed; zero beside a ball."""
     shapes = [ball_normals(size) for size in sizes]
     normals = np.concatenate([own for own, _ in shapes]) * (1, -1, -1)  # in the camera's frame
-    radiance, pictures = front_radiance(reflector, material, normals), []
+    radiance = front_radiance(reflector, material, normals)
+    pictures = []
     for _, inside in shapes:
         pictures.append(np.zeros((*inside.shape, 3)))
         pictures[-1][inside], radiance = np.split(radiance, [inside.sum()])

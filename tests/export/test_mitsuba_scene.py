@@ -16,10 +16,10 @@ from factorlib.light.lobes import Lobes
 from factorlib.meshes.ply import write_ply
 from factorlib.meshes.read import read_mesh
 from factorlib.reflection.reference import Reference
-from factorlib.render.photo_light import light_of
 from factorlib.render.photo_scene import PhotoScene, Placed, traced_photo
 from factorlib.render.reflect import Reflector
 from factorlib.render.resynthesis import resynthesised
+from factorlib.results.lobes import light_of
 from factorlib.results.materials import Reflectance, read_materials
 from factorlib.tracing.scene import node_directions, paint, rigid
 from factorlib.tracing.variant import mitsuba
