@@ -20,7 +20,7 @@ from factorlib.render.reflect import Reflector, Report, silently
 from factorlib.urm.observations import Observations
 
 Channels = Mapping[str, Float[np.ndarray, "h w"]]
-STEP = 0.6  # between nodes on a ball, in α
+STEP = 0.55  # between nodes on a ball, in α
 LONGEST_STEP = 0.1  # radians
 NARROW = 1000.0  # sharpness of lobes whose highlights a spline does not follow
 RIM = np.pi / 2 - 1e-3  # radians: the largest θ, where a surface is still seen
