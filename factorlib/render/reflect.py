@@ -1,10 +1,7 @@
 """Radiance of many surface points in a light of many lobes, as the reflection operator gives it.
 
-About half of the lobes lie behind a surface.  Points are taken in the order of their normals, so many at a time, and the operator and the
-visibility are asked for those lobes and directions alone that are in front of some of them.
-
-Points that do not see every direction (`Shadows`) reflect of each lobe what they see, and points beside the middle meet a light of
-finite distance as `factorlib.light.distance` says, as in the solve.
+Points that do not see every direction reflect of each lobe what they see (`factorlib.light.visibility`), and points beside the middle meet
+a light of finite distance as `factorlib.light.distance` says, as in the solve.
 """
 
 from __future__ import annotations

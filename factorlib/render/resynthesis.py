@@ -105,11 +105,12 @@ def balls(reflector: Reflector, material: MaterialLike, sizes: Sequence[int]) ->
 def front_radiance(
     reflector: Reflector, material: MaterialLike, normals: Float[np.ndarray, "n 3"]
 ) -> Float[np.ndarray, "n 3"]:
-    """Radiance toward the viewer of points with many `normals`: by cubic splines over the angle θ to the viewer and the azimuth φ.
+    """Interpolate the radiance toward the viewer, a smooth function of the normal alone, by cubic splines.
 
-    The nodes lie STEP widths α of a highlight apart.  Lobes narrower than that, and normals fewer than the nodes, are not interpolated.
+    The nodes, in the angle θ from the viewer and the azimuth φ, lie STEP widths α of a highlight apart: the error falls as their fourth power.
+    Lobes narrower than NARROW, and normals fewer than the nodes, are left to the operator.
     """
-    step = min(STEP * float(material.roughness) ** 2, LONGEST_STEP)
+    step = np.clip(STEP * float(material.roughness) ** 2, 1e-3, LONGEST_STEP)
     rings = int(np.ceil(np.pi / 2 / step))
     if 4 * rings**2 >= len(normals):
         return reflector(material, normals, np.broadcast_to(FRONT, normals.shape))
