@@ -72,6 +72,7 @@ def main(params: Params, inputs: Inputs, out: Path, progress: Progress) -> None:
     """Read the observations, solve, say what is uncertain, write."""
     names: list[str] = inputs.facts["dataset.materials"]
     progress(0, 1, "observations")
+    _refuse_options_of_the_other_solver(params)
     given = _given(params, inputs)
     files, surface = sorted(inputs["urm"].glob("*.parquet")), inputs.folders.get("surface")
     photos = gathered(files, params.merge_degrees, inputs.map, surface)
@@ -99,6 +100,20 @@ def main(params: Params, inputs: Inputs, out: Path, progress: Progress) -> None:
     (out / "coverage").mkdir()
     for name, coverage in coverages.items():
         write_rgb_exr(out / "coverage" / f"{name}.exr", coverage, LAT_LONG)
+
+
+def _refuse_options_of_the_other_solver(params: Params) -> None:
+    """Raise InputError where an option that only the other solver reads differs from its default."""
+    joint = set(options.Choices.__struct_fields__) - {"seed"}
+    for field in msgspec.structs.fields(Params):
+        owner = "paper" if field.name.startswith("paper_") else "joint" if field.name in joint else params.solver
+        if owner != params.solver and getattr(params, field.name) != field.default:
+            cure = f"leave it out, or set solve.solver={owner}"
+            raise InputError(
+                f"{field.name} is an option of the solver {owner}, and the solver is {params.solver}",
+                key=f"solve.{field.name}",
+                cure=cure,
+            )
 
 
 def _given(params: Params, inputs: Inputs) -> KnownSlice:

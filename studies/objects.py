@@ -19,8 +19,10 @@ from jaxtyping import Float
 from scipy.spatial.transform import Rotation
 
 from factorlib.align.confidence import confidence
+from factorlib.align.refine import FocalPrior, refined
 from factorlib.align.silhouette import Silhouette
 from factorlib.align.state import state_of
+from factorlib.align.target import target_of
 from factorlib.conventions import FRONT, YUP_FROM_CAMERA
 from factorlib.evaluate.ball import Light, ball
 from factorlib.geometry.camera import Camera, Pose, rotation_of_vector
@@ -29,7 +31,6 @@ from factorlib.meshes.mesh import scaled
 from factorlib.results.materials import Reflectance
 from factorlib.urm.observations import Observations, concatenate
 from studies.scenes import shapes
-from studies.scenes.posed import by_contours
 from studies.spheres import GRAZING, table_of
 from studies.study import Case, Objects, light_name
 
@@ -100,8 +101,10 @@ def perturbed(name: str, truth: Pose, how: Objects, rng: np.random.Generator) ->
 
 
 def fitted(mesh: Caster, pose: Pose, outline: Silhouette) -> Pose:
-    """The pose nearby whose contours lie on those of the mask: how the stages `align` and `refine` end a search."""
-    return by_contours(mesh, outline, CAMERA, state_of(pose, CAMERA, mesh)).pose(mesh)
+    """Return the pose nearby whose contours lie on those of the mask, as the stage `align` ends a search."""
+    target = target_of(outline, mesh.mesh.labels, 200, 0.1)
+    start = state_of(pose, CAMERA, mesh)
+    return refined(mesh, target, CAMERA, start, FocalPrior(CAMERA.focal, 0.0), 12).state.pose(mesh)
 
 
 def angle_deg(first: Float[np.ndarray, "n 3"], second: Float[np.ndarray, "n 3"]) -> float:

@@ -173,8 +173,11 @@ class Scale(msgspec.Struct, frozen=True):
         return self.name == "quick"
 
     def case(self, seed: int, entries: Sequence[Entry], **fields: Any) -> Case:
-        """A case of this size with further `fields` of it."""
-        return Case(seed, tuple(sorted(entries)), self.size, **fields | {"solve": self.solve | fields.get("solve", {})})
+        """A case of this size with further `fields` of it; the scale's parameters of the solve are the joint solver's."""
+        solve = fields.get("solve", {})
+        if solve.get("solver", "joint") == "joint":
+            solve = self.solve | solve
+        return Case(seed, tuple(sorted(entries)), self.size, **fields | {"solve": solve})
 
     def setting(self, name: str, label: str, entries: Sequence[Entry] | None = None, **fields: Any) -> Setting:
         """A setting of equal entries for all seeds; None: of `side` materials in as many lights."""
@@ -192,9 +195,9 @@ class Scale(msgspec.Struct, frozen=True):
         )
 
 
-FEW_LOBES = {"solver": "few_lobes", "lobes": 16, "insert": 8, "rounds": 2, "iterations": 6, "polish": 6}
+SMALL = {"cells": 24, "splittings": 0, "observations": 100}  # a solve that takes seconds and shows that a study runs
 FULL = Scale("full", seeds=(0, 1, 2, 3, 4), largest=len(NAMES), side=3, size=32, solve={})
-QUICK = Scale("quick", seeds=(0,), largest=3, side=2, size=16, solve=FEW_LOBES, light_rows=32, light_spp=8)
+QUICK = Scale("quick", seeds=(0,), largest=3, side=2, size=16, solve=SMALL, light_rows=32, light_spp=8)
 
 
 # ── claims ───────────────────────────────────────────────────────────────────────────────────────────────────────────

@@ -1,6 +1,6 @@
-"""poses.json of `align`, `fit_mesh` and `refine`: the camera and every object's pose, by photo, and how far to believe them.
+"""poses.json of `align` and `fit_mesh`: the camera and every object's pose, by photo, and how far to believe them.
 
-`align` and `refine` write the entry of one photo as <photo>.json; poses.json gathers those.
+`align` writes the entry of one photo as <photo>.json; poses.json gathers those.
 """
 
 from pathlib import Path
@@ -8,7 +8,6 @@ from typing import Annotated
 
 import msgspec
 import numpy as np
-from msgspec import UNSET, UnsetType
 
 from factorlib.errors import InputError
 from factorlib.geometry.camera import Camera, Pose, is_pose
@@ -17,7 +16,7 @@ from factorlib.jsonfile import read_result
 FILE = "poses.json"
 SEARCHED = ("found", "keypoints", "refined")  # sources of poses that may still move; others were given
 AS_IT_IS = (1.0, 1.0, 1.0)
-CURE = "name the folder of a result of `align`, `fit_mesh` or `refine`"
+CURE = "name the folder of a result of `align` or `fit_mesh`"
 
 Vec3 = tuple[float, float, float]
 Positive = Annotated[float, msgspec.Meta(gt=0)]
@@ -42,37 +41,11 @@ class RunnerUp(PoseEntry, frozen=True):
     normal_difference_deg: float
 
 
-class Moved(msgspec.Struct, frozen=True):
-    """How far shading turned a pose, and the normals that the photo sees, degrees."""
-
-    rotation_deg: float
-    normals_deg: float
-
-
-class CandidateEntry(msgspec.Struct, frozen=True):
-    """A pose that shading compared: gain is the share by which its held-out loss is below that of the pose found."""
-
-    held_out_loss: float
-    gain: float
-    gain_stderr: float
-    score: float
-
-
-class Refinement(msgspec.Struct, frozen=True):
-    """What `refine` decided.  chosen: found, moved or runner_up;  runner_up_ruled_out: None where it was not tried, or is chosen."""
-
-    chosen: str
-    runner_up_ruled_out: bool | None
-    moved: Moved
-    candidates: dict[str, CandidateEntry]
-
-
 class ObjectEntry(PoseEntry, frozen=True):
     """An object's pose and how far to believe it (`factorlib.align.trust`); None for what was not measured.
 
     scale: factors of the mesh's axes;  source: where the pose is from, one of SEARCHED or who gave it
     doubts: what speaks against the pose, in words;  left_out: of the solve, for these doubts
-    refined: None where shading could not tell, unset where `refine` has not run
     """
 
     scale: tuple[Positive, Positive, Positive] = AS_IT_IS
@@ -86,7 +59,6 @@ class ObjectEntry(PoseEntry, frozen=True):
     mirrored_score: float | None = None
     doubts: list[str] = []
     left_out: bool = False
-    refined: Refinement | UnsetType | None = UNSET
 
 
 class CameraEntry(msgspec.Struct, frozen=True):

@@ -12,7 +12,6 @@ WITHOUT: dict[str, tuple[str, str, str, dict[str, Any]]] = {
     "shadows": ("no shadows", "shadows", "", {"self_shadowing": "off", "interreflection": "off"}),
     "bounce": ("no bounce", "bounces", "", {"interreflection": "off"}),
     "tone": ("no tone curve", "tone curves", "", {"tone": "off"}),
-    "few-lobes": ("few lobes", "natural light's prior", "", {"solver": "few_lobes"}),
     "normals": ("all normals sure", "confidences of normals", "sure", {}),
     "clipped-as-data": ("clipped as data", "bounds for clipped values", "unclipped", {}),
     "clipped-left-out": ("clipped left out", "clipped pixels, as bounds,", "dropped", {}),

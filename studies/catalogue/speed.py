@@ -1,8 +1,8 @@
-"""Speed against error: every solver, operator and reduction of this project on the same sets.
+"""Speed against error: both solvers, the operators and every reduction of the joint solver on the same sets.
 
-Varied     the solver (this project's `bundle` and `few_lobes`, the paper's), its operator, most lobes a light, the merging of observations
-           that are alike, and the sample.  Sets of 2 × 2, full ones too: there are eleven solvers, and the paper's with its own
-           networks is slow.  The operator `reference` is left out: it takes hours.  Mitsuba's joint optimisation is in the study of comparisons.
+Varied     cells, splittings and observations of the joint solver, its operator, the merging of observations that are alike, and the
+           paper's solver.  Sets are of 2 × 2, full ones too: there are eleven settings, and the paper's solver with its own networks is
+           slow.  The operator `reference` is left out: it takes hours.  Mitsuba's joint optimisation is in the study of comparisons.
 Measured   processor time of the stage `solve`, and what it predicts.
 """
 
@@ -12,17 +12,16 @@ from typing import Any
 
 from studies.study import Scale, Setting, Study, full_matrix, own
 
-LOBES = {"solver": "few_lobes"}
 VARIANTS: dict[str, tuple[str, dict[str, Any]]] = {
     "default": ("as it is", {}),
-    "lobes": ("lobes", LOBES),
-    "closed-form": ("lobes, closed form", LOBES | {"operator": "closed_form"}),
-    "lobes-16": ("16 lobes", LOBES | {"lobes": 16}),
-    "lobes-32": ("32 lobes", LOBES | {"lobes": 32}),
-    "merge-0": ("not merged", LOBES | {"merge_degrees": 0.0}),
-    "merge-4": ("merged to 4°", LOBES | {"merge_degrees": 4.0}),
-    "sample-700": ("sample 700", LOBES | {"sample": 700}),
-    "sample-4000": ("sample 4000", LOBES | {"sample": 4000}),
+    "cells-150": ("150 cells", {"cells": 150}),
+    "splittings-0": ("no splitting", {"splittings": 0}),
+    "cells-150-splittings-0": ("150 cells, no splitting", {"cells": 150, "splittings": 0}),
+    "observations-300": ("300 observations", {"observations": 300}),
+    "observations-1000": ("1000 observations", {"observations": 1000}),
+    "closed-form": ("closed form", {"operator": "closed_form"}),
+    "merge-0": ("not merged", {"merge_degrees": 0.0}),
+    "merge-4": ("merged to 4°", {"merge_degrees": 4.0}),
     "paper": ("paper's solver", {"solver": "paper", "operator": "network"}),
     "paper-network": ("all the paper's", {"solver": "paper", "operator": "paper_network"}),
 }
@@ -47,9 +46,12 @@ STUDY = Study(
         own("entries", "default", "paper", "this project's solver predicts better than the paper's"),
         own("seconds", "default", "paper", "it takes less time than the paper's"),
         own("seconds", "paper", "paper-network", "this project's operator makes the paper's solver faster"),
-        own("entries", "lobes", "closed-form", "the network predicts better than the closed form"),
-        own("entries", "merge-0", "lobes", "merging observations costs accuracy"),
-        own("seconds", "lobes", "merge-0", "merging observations saves time"),
-        own("entries", "lobes", "lobes-16", "72 lobes predict better than 16"),
+        own("entries", "default", "closed-form", "the network predicts better than the closed form"),
+        own("entries", "default", "splittings-0", "splitting of cells predicts better"),
+        own("entries", "default", "cells-150", "400 cells predict better than 150"),
+        own("entries", "default", "observations-300", "4000 observations predict better than 300"),
+        own("seconds", "observations-1000", "default", "1000 observations take less time than 4000"),
+        own("entries", "merge-0", "default", "merging observations costs accuracy"),
+        own("seconds", "default", "merge-0", "merging observations saves time"),
     ),
 )

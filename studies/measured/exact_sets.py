@@ -1,7 +1,7 @@
-"""Exact sets: spheres whose normals are true and whose lights are maps, solved with cells and with few lobes in one run.
+"""Exact sets: spheres whose normals are true and whose lights are maps, solved by the joint solver.
 
 Materials and lights are those of the studies' world `SEED`; spheres are rendered by quadrature of the maps, not by the operator that solves,
-with .2 % of noise.  `make results ONLY=exact_sets` (20 min of one core).
+with .2 % of noise.  `make results ONLY=exact_sets` (10 min of one core).
 """
 
 from __future__ import annotations
@@ -12,15 +12,14 @@ from factorlib.evaluate.ball import light_of_lat_long
 from factorlib.evaluate.materials import common_factor
 from factorlib.inference.blocks import Block
 from factorlib.inference.forward import Illumination
+from factorlib.inference.history import Solution
+from factorlib.inference.joint_solver import solve
 from factorlib.inference.noise import Noise
 from factorlib.inference.observed import blocks_of_observations
 from factorlib.inference.problem import JointProblem
+from factorlib.inference.start import from_nothing
 from factorlib.reflection import reflection_operator
 from factorlib.results.materials import Reflectance
-from factorlib.solve.few_lobes.solve import few_lobes
-from factorlib.inference.history import Solution
-from factorlib.inference.joint_solver import solve
-from factorlib.inference.start import from_nothing
 from factorlib.urm.merge import merge
 from factorlib.urm.observations import concatenate
 from studies.measured.tools import Clock, Tables, exact
@@ -36,19 +35,11 @@ SETS: dict[str, dict[int, list[int]]] = {  # the materials in each light
     "5 × 1": {1: [0, 1, 2, 3, 4]},
     "5 × 5, 40 % missing": {k: [m for m in range(5) if not MISSING[m, k]] for k in range(5)},
 }
-HEAD = [
-    "set",
-    "solver",
-    "processor, s",
-    "k_d: mean, worst",
-    "k_s: mean, worst",
-    "roughness: mean, worst",
-    "dB: mean, worst",
-]
+HEAD = ["set", "processor, s", "k_d: mean, worst", "k_s: mean, worst", "roughness: mean, worst", "dB: mean, worst"]
 
 
 def rows() -> Tables:
-    """The errors of both solvers on each set: materials after one factor a channel, pictures of all pixels without any."""
+    """Return the errors on each set: materials after one factor a channel, pictures of all pixels without any."""
     materials, table, operator = materials_of(SEED), [HEAD], reflection_operator("network")
     lights = {li: light_of_lat_long(light_map(SEED, li, 128, 64)) for li in range(5)}
     for name, shown in SETS.items():
@@ -57,13 +48,12 @@ def rows() -> Tables:
         whole = blocks_of_observations(concatenate(list(photos)), Noise())
         blocks = blocks_of_observations(concatenate([merge(photo, MERGE_DEGREES) for photo in photos]), Noise())
         problem = JointProblem(blocks, operator)  # one thread: seconds are those of the work itself
-        for solver in ("cells", "few lobes"):
-            clock = Clock()
-            solution = solve(problem, from_nothing(len(truth))) if solver == "cells" else few_lobes(problem, len(truth))
-            seconds = f"{clock.taken().processor:.0f}"
-            table.append([name, solver, seconds, *_errors(solution, truth, problem, whole)])
-            print(*table[-1], sep="; ", flush=True)
-    return {"Cells and few lobes on exact sets": table}
+        clock = Clock()
+        solution = solve(problem, from_nothing(len(truth)))
+        seconds = f"{clock.taken().processor:.0f}"
+        table.append([name, seconds, *_errors(solution, truth, problem, whole)])
+        print(*table[-1], sep="; ", flush=True)
+    return {"Exact sets": table}
 
 
 def _errors(solution: Solution, truth: list[Reflectance], problem: JointProblem, whole: list[Block]) -> list[str]:

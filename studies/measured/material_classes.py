@@ -1,4 +1,4 @@
-"""python -m studies.measured.material_classes FILE [--out factorlib/solve/material_classes.json]: the classes of the prior on materials, fitted to a table of measured materials.
+"""python -m studies.measured.material_classes FILE [--out factorlib/inference/material_classes.json]: the classes of the prior on materials, fitted to a table of measured materials.
 
 FILE is a .csv with a row a material: its name in `material`, and the Lambert + GGX that was fitted to it: `k_s` and `roughness`, and `k_s_r`, `k_s_g`
 and `k_s_b`, whose ratios are the tint.
@@ -16,9 +16,9 @@ import numpy as np
 import typer
 
 from factorlib.errors import InputError
+from factorlib.inference.priors import Classes, MaterialClass
 from factorlib.jsonfile import json_text, write_json
 from factorlib.reading import read_bytes, reading
-from factorlib.inference.priors import Classes, MaterialClass
 
 # Effect paints, satins with metallic threads and iridescent foils have flakes or wires that reflect as metal does.
 METALS = (

@@ -25,12 +25,11 @@ PAGE = ROOT / "docs" / "results.md"
 SECTIONS = {  # module -> title
     "reference": "data/synthetic",
     "eames_like": "data/eames, and sets made alike",
-    "exact_sets": "Exact sets: cells and few lobes",
+    "exact_sets": "Exact sets",
     "operator": "Reflection operators",
     "align": "Poses",
     "real_poses": "Poses of real photographs",
     "real_sets": "Re-synthesis of real photographs",
-    "refine": "Poses by shading, and proportions of meshes",
     "viewer": "The viewer of the report",
 }
 PAGES = ("gallery", "notebook")  # modules whose `write()` makes a page of its own

@@ -30,8 +30,8 @@ import numpy as np
 from factorlib.conventions import YUP_FROM_CAMERA, lat_long_directions
 from factorlib.errors import InputError
 from factorlib.images.exr import LAT_LONG, write_rgb_exr
-from factorlib.jsonfile import json_text, write_json
 from factorlib.inference.materials import ROUGHNESS
+from factorlib.jsonfile import json_text, write_json
 from factorlib.results.materials import Reflectance, read_materials
 from factorlib.stage import Inputs, Progress
 from factorlib.tracing.scene import MITSUBA_FROM_CAMERA, rgb, rigid, transform

@@ -22,8 +22,8 @@ from factorlib.evaluate.picture import picture_error, white_of
 from factorlib.images.exr import read_exr
 from factorlib.images.picture import picture, write_png
 from factorlib.images.tone import shown
-from factorlib.jsonfile import write_json
 from factorlib.inference.interreflection import bounced_light
+from factorlib.jsonfile import write_json
 from factorlib.reflection import reflection_operator
 from factorlib.render.reflect import Reflector
 from factorlib.render.resynthesis import Surroundings, resynthesised

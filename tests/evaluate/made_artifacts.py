@@ -176,7 +176,7 @@ def _whole(made: Made, folders: dict, materials: list[str]) -> None:
     entry = {"camera": camera, "objects": {"balls": {**POSE, "silhouette_iou": 0.98}}}
     write_json(folders["align"] / "poses.json", dict.fromkeys(made.seen, entry))
     errors = StandardErrors((0.01,) * 3, (0.005,) * 3, 0.01)
-    model = Model(solver="bundle", lobes=dict.fromkeys(made.seen, 24))
+    model = Model(solver="joint", lobes=dict.fromkeys(made.seen, 24))
     gauge = Gauge("the lights are white on the whole")
     for stage in ("solve", "export"):
         table = MaterialTable({m: solved(each, errors) for m, each in estimates.items()}, gauge, model)

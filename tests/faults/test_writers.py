@@ -22,6 +22,7 @@ from factorlib.export.usd import write_usd_mesh
 from factorlib.generate.folder import write_codes, write_obj, write_yaml
 from factorlib.images.exr import LAT_LONG, write_exr, write_rgb_exr
 from factorlib.images.picture import write_png
+from factorlib.inference.history import Event
 from factorlib.jsonfile import write_json
 from factorlib.meshes.mesh import Mesh
 from factorlib.meshes.ply import write_ply
@@ -29,7 +30,6 @@ from factorlib.parquetfile import write_rows
 from factorlib.reflection.network import Layers, write_layers
 from factorlib.results.materials import Reflectance
 from factorlib.runner.project import LIBRARY
-from factorlib.inference.history import Event
 from factorlib.urm.observations import write_observations
 from factorlib.wholefile import bytes_of, replace_file, write_text
 from tests.faults import good

@@ -5,16 +5,16 @@ from functools import cache
 import msgspec
 import numpy as np
 
-from factorlib.light.prior import MIX, read_light_prior
+from factorlib.inference.fit import Fit, Hyperparameters, Schedule, fitted, likelihood_of, start_of
 from factorlib.inference.forward import Illumination
 from factorlib.inference.lights import PEAK, Light, even_cells
+from factorlib.inference.likelihood import LightLikelihood
 from factorlib.inference.materials import Materials, Point
 from factorlib.inference.noise import Loss
 from factorlib.inference.problem import JointProblem
-from factorlib.reflection import reflection_operator
-from factorlib.inference.fit import Fit, Hyperparameters, Schedule, field_of, fitted, start_of
-from factorlib.inference.likelihood import Field
 from factorlib.inference.start import constant_light
+from factorlib.light.prior import MIX, read_light_prior
+from factorlib.reflection import reflection_operator
 from studies.scenes.problems import MATERIALS, block
 from tests.inference.made import in_units_of
 
@@ -76,13 +76,7 @@ def natural() -> tuple[JointProblem, list[Light], Fit]:
     return problem, true, fitted(problem, begun(problem), PRIOR, WHOLE)
 
 
-def field(problem, light, materials=MATERIALS, temperature=2.0, prior=PRIOR) -> Field:
-    """Of the first illumination, without outliers."""
+def likelihood(problem, light, materials=MATERIALS, temperature=2.0, prior=PRIOR) -> LightLikelihood:
+    """That of the first illumination, without outliers."""
     one = Illumination(problem.blocks[0], light, materials, OPERATOR)
-    return msgspec.structs.replace(field_of(one, Hyperparameters(temperature), prior), loss=Loss(1e3))
-
-
-def at(one: Field, light: Light | None = None, materials: Materials | None = None) -> Field:
-    """The field elsewhere, its table as it is."""
-    where = {name: value for name, value in (("light", light), ("materials", materials)) if value is not None}
-    return msgspec.structs.replace(one, illumination=msgspec.structs.replace(one.illumination, **where))
+    return msgspec.structs.replace(likelihood_of(one, Hyperparameters(temperature), prior), loss=Loss(1e3))

@@ -6,8 +6,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from factorlib.inference.materials import Point
 from factorlib.inference.evidence import AGAINST, FOR, LEAST_LOSS, Losses, compare, losses_of
+from factorlib.inference.materials import Point
 from studies.scenes.problems import MATERIALS
 from tests.inference.made_lights import photographed
 

@@ -6,8 +6,8 @@ import pytest
 
 from factorlib.geometry.met import UNMET, met_codes
 from factorlib.geometry.sphere import fibonacci_sphere
-from factorlib.inference.gauge import in_gauge
 from factorlib.inference.forward import Illumination
+from factorlib.inference.gauge import in_gauge
 from factorlib.inference.interreflection import bounced_light
 from factorlib.inference.materials import Point
 from factorlib.inference.noise import Noise

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 from factorlib.inference.forward import Illumination
-from factorlib.inference.lights import Light, even_cells
 from factorlib.inference.joint_solver import SMALLEST, SPLIT
+from factorlib.inference.lights import Light, even_cells
 from studies.scenes.problems import MATERIALS, block
 from tests.inference.made_lights import OPERATOR, drawn, on_even_cells
 

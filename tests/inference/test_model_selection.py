@@ -6,22 +6,22 @@ import msgspec
 import numpy as np
 import pytest
 
-from factorlib.inference.identifiability import unlikely_curves
 from factorlib.geometry.met import UNMET, met_codes
 from factorlib.geometry.sphere import fibonacci_sphere
 from factorlib.images.tone import curve
+from factorlib.inference.evidence import AGAINST, FOR
 from factorlib.inference.forward import Illumination
+from factorlib.inference.identifiability import unlikely_curves
 from factorlib.inference.interreflection import bounced_light
+from factorlib.inference.joint_solver import solve
 from factorlib.inference.materials import Point
+from factorlib.inference.model_selection import CURVED_GAIN, NEARER_FROM, believed
 from factorlib.inference.noise import Noise
 from factorlib.inference.observed import blocks_of_observations
-from factorlib.inference.problem import JointProblem
-from factorlib.results.materials import Decision
-from factorlib.inference.model_selection import CURVED_GAIN, NEARER_FROM, believed
-from factorlib.inference.evidence import AGAINST, FOR
 from factorlib.inference.options import Choices
-from factorlib.inference.joint_solver import solve
+from factorlib.inference.problem import JointProblem
 from factorlib.inference.start import from_nothing
+from factorlib.results.materials import Decision
 from factorlib.urm.observations import Observations
 from studies.scenes.problems import MATERIALS, factor_between, sphere_normals
 from tests.inference.made import bowls, rough_light

@@ -3,9 +3,9 @@ import numpy as np
 import pytest
 import torch
 
+from factorlib.inference.paper_solver import Paper, PaperObjective, drawn, solve
 from factorlib.inference.problem import JointProblem
 from factorlib.reflection import reflection_operator
-from factorlib.inference.paper_solver import Paper, PaperObjective, drawn, solve
 from studies.scenes.problems import MATERIALS, block, factor_between, random_light
 
 OPERATOR = reflection_operator("network")

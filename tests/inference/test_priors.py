@@ -6,7 +6,6 @@ import msgspec
 import numpy as np
 import pytest
 
-from factorlib.jsonfile import read_json
 from factorlib.inference.materials import Materials
 from factorlib.inference.priors import (
     BRIGHTEST,
@@ -19,6 +18,7 @@ from factorlib.inference.priors import (
     shipped_classes,
     unknowns_of,
 )
+from factorlib.jsonfile import read_json
 from studies.measured import material_classes
 from studies.scenes.problems import MATERIALS
 from tests.inference.made_lights import photographed

@@ -4,13 +4,13 @@ import msgspec
 import numpy as np
 import pytest
 
-from factorlib.light.lobes import lobe_integral
-from factorlib.inference.gauge import BRIGHTEST, connected_components, in_gauge
 from factorlib.inference.forward import Illumination
+from factorlib.inference.gauge import BRIGHTEST, connected_components, in_gauge
 from factorlib.inference.lights import UnitLobes
 from factorlib.inference.materials import Materials, Point
 from factorlib.inference.noise import Noise
 from factorlib.inference.observed import blocks_of_observations
+from factorlib.light.lobes import lobe_integral
 from factorlib.reflection import reflection_operator
 from studies.scenes.problems import MATERIALS, block, random_light
 from tests.inference.made import OPERATOR, bowls, photos_in_a_wrong_light, rough_light, three_rooms

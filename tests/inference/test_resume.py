@@ -6,14 +6,13 @@ import pytest
 
 from factorlib.checkpoint import Checkpoint
 from factorlib.geometry.sphere import fibonacci_sphere
-from factorlib.inference.problem import JointProblem
-from factorlib.solve import choices
-from factorlib.solve import solve as solving
+from factorlib.inference import joint_solver, model_selection
 from factorlib.inference.fit import Schedule
 from factorlib.inference.history import PHASES, Event, of_parts
-from factorlib.inference.options import Choices
-from factorlib.inference.resume import Parts
 from factorlib.inference.joint_solver import solve
+from factorlib.inference.options import Choices
+from factorlib.inference.problem import JointProblem
+from factorlib.inference.resume import Parts
 from factorlib.inference.start import from_nothing
 from factorlib.stage import serial_map
 from studies.scenes.problems import MATERIALS, block, random_light
@@ -21,7 +20,7 @@ from tests.inference.made_lights import OPERATOR
 
 CHOICES = Choices(cells=24, splittings=1, observations=100)
 PARTS = ("effects", "tone", "distances", "materials", "splitting", "lights", "suns")
-ALL = (*PHASES, "splitting 1", "lights")
+ALL = (*PHASES, "splitting 1", "lights", "suns")
 
 
 class Killed(Exception):
@@ -32,12 +31,12 @@ class Killed(Exception):
 def short():
     """Where a descent ends does not matter here."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(choices, "TRIAL", Schedule(2, (3,)))
-        patch.setattr(choices, "NEARER", Schedule(together=(2,), estimate=False))
-        patch.setattr(choices, "CURVED", Schedule(together=(2,), estimate=False))
-        patch.setattr(solving, "MATERIALS", Schedule(2, (2,)))
-        patch.setattr(solving, "AFTER_SPLITTING", Schedule(1, (2,)))
-        patch.setattr(solving, "LIGHTS", Schedule(together=(0, 2), given=True))
+        patch.setattr(model_selection, "TRIAL", Schedule(2, (3,)))
+        patch.setattr(model_selection, "NEARER", Schedule(together=(2,), estimate=False))
+        patch.setattr(model_selection, "CURVED", Schedule(together=(2,), estimate=False))
+        patch.setattr(joint_solver, "MATERIALS", Schedule(2, (2,)))
+        patch.setattr(joint_solver, "AFTER_SPLITTING", Schedule(1, (2,)))
+        patch.setattr(joint_solver, "LIGHTS", Schedule(together=(0, 2), given=True))
         yield
 
 
@@ -105,7 +104,7 @@ def test_a_solve_killed_after_a_part_goes_on_to_the_same_bits(blocks, whole, tmp
 def test_every_part_reports_what_it_does(whole):
     _, events = whole
     seen = [event.phase for event in events]
-    assert set(seen) <= set(ALL) and set(ALL) - {"shadows and bounces"} <= set(seen)
+    assert set(seen) <= set(ALL) and set(ALL) - {"shadows and bounces", "suns"} <= set(seen)
     assert sorted(seen, key=ALL.index) == seen and all(np.isfinite(event.loss) for event in events)
     assert [event.round for event in events] == sorted(event.round for event in events)
 

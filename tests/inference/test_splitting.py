@@ -5,9 +5,9 @@ import pytest
 
 from factorlib.inference.evidence import FINER
 from factorlib.inference.fit import Schedule, fitted
+from factorlib.inference.joint_solver import SPLIT, split_while_gaining
 from factorlib.inference.options import Choices
 from factorlib.inference.resume import Parts
-from factorlib.inference.joint_solver import SPLIT, split_while_gaining
 from studies.scenes.problems import MATERIALS
 from tests.inference.made_lights import PRIOR, begun, light_of, spheres
 

@@ -6,14 +6,14 @@ import msgspec
 import numpy as np
 import pytest
 
-from factorlib.light.lobes import SUN, lobe_integral
-from factorlib.inference.lights import UnitLobes
-from factorlib.results.materials import Decision
-from factorlib.solve import suns
+from factorlib.inference import suns
 from factorlib.inference.evidence import AGAINST
 from factorlib.inference.fit import Schedule, fitted
+from factorlib.inference.lights import UnitLobes
 from factorlib.inference.resume import Parts
 from factorlib.inference.suns import WIDE, candidate, clearly_better, compared, suns_chosen
+from factorlib.light.lobes import SUN, lobe_integral
+from factorlib.results.materials import Decision
 from studies.scenes.problems import MATERIALS
 from tests.inference.made_lights import FEW, PRIOR, begun, drawn, on_even_cells, spheres
 

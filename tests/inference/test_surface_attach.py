@@ -6,11 +6,11 @@ import numpy as np
 from factorlib.generate.shapes import sphere
 from factorlib.geometry.camera import Camera, Pose
 from factorlib.geometry.raster import rasterise
+from factorlib.inference.surface_attach import attached_pixels
+from factorlib.inference.surface_detail import Surfaces
 from factorlib.meshes.fine import fine
 from factorlib.meshes.mesh import Mesh, scaled
 from factorlib.results.poses import ObjectEntry, entry_of
-from factorlib.inference.surface_attach import attached_pixels
-from factorlib.inference.surface_detail import Surfaces
 
 CAMERA = Camera(60, 50, 80.0, (30.0, 25.0))
 

@@ -6,15 +6,15 @@ import pytest
 import trimesh
 from scipy.linalg import block_diag
 
-from factorlib.meshes.fine import Fine
-from factorlib.meshes.mesh import Mesh
+from factorlib.inference import surface_turns
+from factorlib.inference.fit import ROBUST, Hyperparameters, likelihood_of
 from factorlib.inference.materials import Point
 from factorlib.inference.problem import JointProblem
-from factorlib.inference.fit import ROBUST, Hyperparameters, field_of
 from factorlib.inference.start import from_nothing
-from factorlib.surface import turns
 from factorlib.inference.surface_detail import Found, Surfaces, found
 from factorlib.inference.surface_turns import GRAZING, MOST, PULL, Attached, Detail, Stiffness, part_of, step
+from factorlib.meshes.fine import Fine
+from factorlib.meshes.mesh import Mesh
 from studies.scenes.problems import MATERIALS
 from tests.inference.made import in_units_of, photos_in_a_wrong_light
 from tests.inference.made_lights import PRIOR, begun, drawn, on_even_cells, photographed, spheres
@@ -57,12 +57,12 @@ def with_wrong_normals(problem: JointProblem, size: float) -> JointProblem:
 
 @pytest.mark.parametrize("kind", ["clipped", "bounced", "hidden"])
 def test_slopes_are_those_of_the_forward_model(kind, monkeypatch):
-    monkeypatch.setattr(turns, "STEP", 1e-3)  # the step in use smooths what is sharper than a degree
+    monkeypatch.setattr(surface_turns, "STEP", 1e-3)  # the step in use smooths what is sharper than a degree
     one, body = photos_in_a_wrong_light(kind), surfaces()
     at, random = attached_to(one.block.normal, body), np.random.default_rng(0)
     turn, log_factor = random.normal(size=(body.nodes, 3)), random.normal(size=body.nodes)
     part = part_of(one, COUNTS, PRIOR, at, body.nodes)
-    own = field_of(one, COUNTS, PRIOR, True).illumination
+    own = likelihood_of(one, COUNTS, PRIOR, True).illumination
     residual = own.block.residuals(own.shown().radiance)
     weight = one.pull(residual, ROBUST, COUNTS.temperature)
     after, before = (
@@ -79,8 +79,9 @@ def test_slopes_are_those_of_the_forward_model(kind, monkeypatch):
 
 @pytest.mark.parametrize("stiffness", [Stiffness(50.0), Stiffness(50.0, 20.0), Stiffness(None, 20.0)])
 def test_a_step_is_that_of_the_dense_system_of_detail_and_lights(stiffness, monkeypatch):
-    monkeypatch.setattr(turns, "ACCURACY", 1e-7)  # that in use leaves what lights explain as well: all factors together
-    monkeypatch.setattr(turns, "ITERATIONS", 2000)
+    # the accuracy in use leaves what lights explain as well: all factors together
+    monkeypatch.setattr(surface_turns, "ACCURACY", 1e-7)
+    monkeypatch.setattr(surface_turns, "ITERATIONS", 2000)
     problem, _, body = *photographed(2, 2, size=9), surfaces(1)
     problem = with_wrong_normals(problem, 0.1)
     fit, random = begun(problem), np.random.default_rng(1)
@@ -102,10 +103,10 @@ def test_a_step_is_that_of_the_dense_system_of_detail_and_lights(stiffness, monk
         own = slice(first, first + size)
         J = part.slopes.toarray()[:, free]
         U = np.stack([part.of_light(e) for e in np.eye(size)], axis=1)
-        field = field_of(one, COUNTS, PRIOR, True)
-        residual = field.illumination.block.residuals(field.illumination.shown().radiance)
+        likelihood = likelihood_of(one, COUNTS, PRIOR, True)
+        residual = likelihood.illumination.block.residuals(likelihood.illumination.shown().radiance)
         r = (residual * one.pull(residual, ROBUST, COUNTS.temperature)).reshape(-1)
-        Q, u = field.precision, one.light.log_radiance.reshape(-1)
+        Q, u = likelihood.precision, one.light.log_radiance.reshape(-1)
         system[:v, :v] += J.T @ J
         system[:v, own], system[own, :v], system[own, own] = J.T @ U, U.T @ J, U.T @ U + Q
         gradient[:v] += J.T @ r

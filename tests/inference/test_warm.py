@@ -7,13 +7,13 @@ import numpy as np
 import pytest
 
 from factorlib.inference.forward import Illumination
+from factorlib.inference.joint_solver import solve
 from factorlib.inference.materials import Materials
+from factorlib.inference.options import Choices
 from factorlib.inference.problem import JointProblem
+from factorlib.inference.start import from_earlier, from_nothing, known_point, with_decided
 from factorlib.results.materials import Gauge, MaterialTable, Model, Reflectance, Tone
 from factorlib.results.solution import Earlier
-from factorlib.inference.options import Choices
-from factorlib.inference.joint_solver import solve
-from factorlib.inference.start import from_earlier, from_nothing, known_point, with_decided
 from studies.scenes.problems import MATERIALS, factor_between
 from tests.inference.made_lights import OPERATOR, drawn, on_even_cells, spheres
 

@@ -10,9 +10,9 @@ from factorlib.geometry.met import UNMET
 from factorlib.geometry.sphere import fibonacci_sphere
 from factorlib.images.exr import read_exr, read_rgb_exr, write_exr
 from factorlib.images.tone import curve
+from factorlib.inference.interreflection import bounced_light
 from factorlib.jsonfile import read_json, write_json
 from factorlib.light.lobes import no_lobes
-from factorlib.inference.interreflection import bounced_light
 from factorlib.reflection import reflection_operator
 from factorlib.results.lobes import write_lobes
 from factorlib.results.materials import read_materials

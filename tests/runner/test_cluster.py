@@ -17,7 +17,6 @@ import pytest
 
 pytest.importorskip("distributed", reason="make setup EXTRAS=dask")
 
-from factorlib import arithmetic
 from factorlib.errors import InputError
 from factorlib.runner import cluster
 from factorlib.runner.child import TRIM
@@ -30,7 +29,7 @@ from tests.runner.toy import files_of, make, write
 
 pytestmark = pytest.mark.skipif(not Path("/proc/self/stat").exists(), reason="looks for processes in /proc")
 
-FIXED = {"PYTHONHASHSEED": "0", "OMP_NUM_THREADS": "2", TRIM: None, **arithmetic.VARIABLES}  # of a step of two threads
+FIXED = {"PYTHONHASHSEED": "0", "OMP_NUM_THREADS": "2", TRIM: None}  # of a step of two threads
 PROOF = f"""
 import json, os
 import msgspec
@@ -135,7 +134,7 @@ def doing(pid: int, word: str) -> bool:
 @pytest.fixture(scope="module")
 def live(tmp_path_factory):
     """Two workers, started in an environment that no step may be computed in."""
-    bad = {"OMP_NUM_THREADS": "7", "PYTHONHASHSEED": "3"} | dict.fromkeys(arithmetic.VARIABLES, "")
+    bad = {"OMP_NUM_THREADS": "7", "PYTHONHASHSEED": "3"}
     with LiveCluster(2, tmp_path_factory.mktemp("cluster"), bad) as made:
         yield made
 

@@ -11,11 +11,11 @@ from factorlib.errors import InputError
 from factorlib.export.gltf import write_glb
 from factorlib.generate.shapes import sphere
 from factorlib.images.exr import write_exr
+from factorlib.inference.noise import Noise
+from factorlib.inference.observed import blocks_of_observations, gathered
 from factorlib.meshes.fine import fine
 from factorlib.meshes.ply import write_ply
 from factorlib.meshes.read import CREASE_DEG, MeshesOnce, read_mesh
-from factorlib.inference.noise import Noise
-from factorlib.inference.observed import blocks_of_observations, gathered
 from factorlib.results.materials import Reflectance
 from factorlib.results.surface import SurfaceTable, read_surface
 from factorlib.stage import Inputs, serial_map, silent

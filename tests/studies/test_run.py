@@ -16,8 +16,7 @@ from studies.run.page import conclude, write_page
 from studies.steps import score, solve, worlds
 from studies.study import QUICK
 
-SOLVE = {"solver": "few_lobes", "lobes": 4, "insert": 4, "rounds": 1, "iterations": 2, "polish": 1}
-TINY = msgspec.structs.replace(QUICK, largest=2, side=1, size=8, solve=SOLVE, light_rows=8, light_spp=1)
+TINY = msgspec.structs.replace(QUICK, largest=2, side=1, size=8, light_rows=8, light_spp=1)
 NAME = "matrix-size"
 
 
