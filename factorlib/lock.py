@@ -17,13 +17,24 @@ from factorlib.wholefile import write_text
 ROOT = Path(__file__).resolve().parent.parent
 HEAD = """\
 # Every package of .venv, pinned; installed without looking for more (torch apart, see factorlib/setup.py).
-# Derived from pyproject.toml by `make lock`. Of what Open3D asks for, only what its import needs is here, not its notebook widgets.
+# Derived from pyproject.toml by `make lock`. Of what Open3D asks for, only what its compiled module needs is here (factorlib/geometry/open3d.py).
 """
 # What a package asks for and its import, or what is used of it, does not need.
 LEFT_OUT = {
-    "open3d-cpu": {"flask", "nbformat", "configargparse", "ipywidgets", "matplotlib", "pyquaternion"},
-    "python-dateutil": {"tzdata"},  # the system has its own
-    "dash": {"flask", "requests", "retrying", "nest-asyncio", "importlib-metadata", "comm"},
+    "open3d-cpu": {
+        *(
+            "addict",
+            "configargparse",
+            "dash",
+            "flask",
+            "ipywidgets",
+            "matplotlib",
+            "nbformat",
+            "pandas",
+            "pyquaternion",
+        ),
+        *("scikit-learn", "werkzeug"),
+    },
 }
 
 

@@ -19,6 +19,7 @@ import time
 import tomllib
 import urllib.request
 import venv
+from concurrent.futures import ThreadPoolExecutor
 from importlib.util import find_spec
 from pathlib import Path
 
@@ -30,7 +31,7 @@ TORCH_CPU = "https://download.pytorch.org/whl/cpu"  # PyPI's own wheels for Linu
 BEAT = 3.0  # seconds between two signs of life
 LOADED = (
     "torch, scipy.optimize, mitsuba, pytest",
-    "open3d, OpenImageIO, pycolmap, pyarrow.parquet, trimesh, jinja2, rich.progress",
+    "factorlib.geometry.open3d, OpenImageIO, pycolmap, pyarrow.parquet, trimesh, jinja2, rich.progress",
 )
 ALONE = ("blender", "interchange")  # extras: .venv has what they need, and bpy would ask for an older NumPy
 # System libraries of Open3D, and the Debian packages that have them.
@@ -45,8 +46,10 @@ def main() -> None:
     if not READY.exists() or READY.read_text() != digest:
         started = time.monotonic()
         make_venv()
-        check_system()
-        install_packages()
+        with ThreadPoolExecutor(1) as beside:
+            system = beside.submit(check_system)
+            install_packages()
+        system.result()
         os.environ.pop("PYTHONDONTWRITEBYTECODE", None)  # what is loaded stays compiled; pip would compile all
         commands = [[str(PYTHON), "-c", f"import {names}"] for names in LOADED]
         if not run(commands, "loading the packages for the first time"):

@@ -18,8 +18,9 @@ from factorlib.images.picture import exposure_of, picture, write_png
 from factorlib.images.tone import shown
 from factorlib.inference.interreflection import bounced_light
 from factorlib.reflection import reflection_operator
-from factorlib.render.reflect import TAIL, Reflector
-from factorlib.render.resynthesis import Surroundings, ball, light_of, observed_cells, resynthesised
+from factorlib.render.reflect import Reflector
+from factorlib.render.resynthesis import Surroundings, balls, observed_cells, resynthesised
+from factorlib.results.lobes import light_of
 from factorlib.results.materials import Gauge, Model, in_order, read_materials
 from factorlib.stage import Inputs, Progress
 from factorlib.urm.extract import observed_pixels
@@ -35,8 +36,6 @@ class Params(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
     operator: Literal["network", "closed_form", "reference", "paper_network"] = "network"
     """How a lobe's reflection is computed."""
-    tail: Annotated[float, msgspec.Meta(ge=0, le=0.1)] = TAIL
-    """Share of a pixel's radiance, of its faintest highlights, that the closed form gives; 0 for none."""
     ball_size: Size = 128
     """Pixels of a ball's side."""
     map_size: Size = 64
@@ -54,7 +53,7 @@ def main(params: Params, inputs: Inputs, out: Path, progress: Progress) -> None:
     slice_ = msgspec.convert(inputs.facts["dataset.light"], LightSlice)
     light = light_of(inputs["export"], name, slice_)
     operator = reflection_operator(params.operator, weights=inputs["train"])
-    reflector = Reflector(operator, light, params.tail, model.curvature(slice_.illumination))
+    reflector = Reflector(operator, light, model.curvature(slice_.illumination))
     exposure = exposure_of(np.stack([photo[c] for c in "RGB"], axis=-1), photo["valid"] > 0.5)
     total, materials = 10 + len(names), in_order(exported, names, file)
 
@@ -70,12 +69,11 @@ def main(params: Params, inputs: Inputs, out: Path, progress: Progress) -> None:
     observed = observed_pixels(photo, geometry)
     for k, (label, material) in enumerate(zip(names, materials, strict=True), start=1):
         progress(9 + k, total, f"{name}: {label}")
-        shaded = ball(reflector, material, params.ball_size)
+        shaded, reflectance_map = balls(reflector, material, (params.ball_size, params.map_size))
         _write(out / "materials" / name / label, shaded, exposure, ball=True)
         pixels = observed & (np.rint(photo["label"]) == k)
         cells = observed_cells(np.stack([geometry[f"normal.{a}"][pixels] for a in "xyz"], axis=-1), params.map_size)
-        shaded = ball(reflector, material, params.map_size)
-        _write(out / "reflectance_maps" / name / label, shaded, exposure, ball=True, observed=cells)
+        _write(out / "reflectance_maps" / name / label, reflectance_map, exposure, ball=True, observed=cells)
     progress(total, total, name)
 
 

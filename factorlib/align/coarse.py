@@ -22,10 +22,10 @@ from factorlib.align.state import State
 from factorlib.align.target import extent_of
 from factorlib.geometry.camera import Camera, rotation_of_vector
 from factorlib.geometry.raster import Caster
-from factorlib.geometry.sphere import fibonacci_directions
+from factorlib.geometry.sphere import fibonacci_sphere
 
-GRID = 80  # pixels of the templates
-WHOLE, CUT = 36, 26  # mask's extent in them
+GRID = 64  # pixels of the templates
+WHOLE, CUT = 29, 21  # mask's extent in them
 SIZES_OF_WHOLE = (0.95, 1.05)  # relative to the size that the areas say
 SIZES_OF_CUT = (0.95, 1.15, 1.4, 1.75, 2.2)
 CUT_SHARE = 0.03  # of the contour on the frame or on broad unknown areas: more, and the mask is taken to be cut
@@ -34,25 +34,21 @@ Rotation = Float[np.ndarray, "3 3"]
 
 
 class Guess(msgspec.Struct, frozen=True):
-    """A template laid on the photo: wrong pixels as a share of the mask's, the view, the photo's turn in radians, the shift
+    """A template laid on the photo: wrong pixels as a share of the mask's, the view, the photo's turn undone, the shift
     (x, y), and the focal length; the last two in grid pixels."""
 
     error: float
     turn: Rotation
-    angle: float
+    roll: Rotation
     shift: Int[np.ndarray, "2"]
     focal: float
 
-    def roll(self) -> Rotation:
-        """The photo's turn undone."""
-        return rotation_of_vector(np.array([0, 0, -self.angle]))
-
 
 def looking_along(direction: Float[np.ndarray, "3"]) -> Rotation:
-    """A rotation cam_from_object that looks along `direction` of the object's frame."""
-    x = np.cross(np.eye(3)[np.argmin(np.abs(direction))], direction)
-    x /= np.linalg.norm(x)
-    return np.stack([x, np.cross(direction, x), direction])
+    """Return the smallest rotation that takes `direction`, unit and not (0, 0, −1), to the optical axis."""
+    x, y, z = direction
+    near = 1 + z
+    return np.array([[1 - x * x / near, -x * y / near, -x], [-x * y / near, 1 - y * y / near, -y], [x, y, z]])
 
 
 def is_cut(silhouette: Silhouette) -> bool:
@@ -77,11 +73,9 @@ def candidates(
     guesses, middle, pixel, distance = guesses_of(caster, silhouette, camera, views, rolls)
     states = []
     for guess in _apart(guesses, keep, apart_deg):  # shift and roll undone, seen along the ray to where it lies
-        (x, y), cos, sin = guess.shift, np.cos(guess.angle), np.sin(guess.angle)
-        place = middle + pixel * np.array([cos * x + sin * y, -sin * x + cos * y])
-        slope = (place - np.array(camera.centre)) / camera.focal
-        logs = np.log(camera.focal * distance / (guess.focal * pixel)), np.log(camera.focal)
-        states.append(State(toward(slope) @ guess.roll() @ guess.turn, *map(float, (*slope, *logs))))
+        slope = (middle + pixel * guess.roll[:2, :2] @ guess.shift - np.array(camera.centre)) / camera.focal
+        numbers = *slope, np.log(camera.focal * distance / (guess.focal * pixel)), np.log(camera.focal)
+        states.append(State(toward(slope) @ guess.roll @ guess.turn, *map(float, numbers)))
     return states
 
 
@@ -96,9 +90,9 @@ def guesses_of(
     area = np.count_nonzero(silhouette.inside) / pixel**2
     costs = _cost_images(silhouette, caster.mesh.labels, middle, pixel, angles)
     spectra = rfft2(costs, axes=(-2, -1)).astype(np.complex64)  # [rolls, labels, GRID, GRID//2+1]
-    guesses = []
+    guesses, undone = [], rotation_of_vector(np.outer(-angles, [0, 0, 1]))
     distance = np.clip(camera.focal / (extent / 2), 2.5, 30.0) * caster.radius
-    for direction in fibonacci_directions(views):
+    for direction in fibonacci_sphere(views):
         turn = looking_along(direction)
         for template, focal in _templates(caster, turn, distance, area, SIZES_OF_CUT if cut else SIZES_OF_WHOLE):
             spectrum = rfft2(template, axes=(-2, -1)).astype(np.complex64)
@@ -106,7 +100,7 @@ def guesses_of(
             best = errors.argmin(axis=1)
             error = 1 + errors[np.arange(rolls), best] / area
             shift = (np.stack([best % GRID, best // GRID], axis=1) + GRID // 2) % GRID - GRID // 2
-            guesses += [Guess(error[k], turn, angles[k], shift[k], focal) for k in range(rolls)]
+            guesses += [Guess(error[k], turn, undone[k], shift[k], focal) for k in range(rolls)]
     return guesses, middle, pixel, distance
 
 
@@ -141,9 +135,8 @@ def _templates(
     pose = State(turn, 0.0, 0.0, np.log(distance), 0.0).pose(caster)
     focal = 0.48 * GRID * distance / caster.radius
     image = caster.labels(caster.cast(Camera(GRID, GRID, focal, (GRID / 2, GRID / 2)), pose))
-    own = int(np.count_nonzero(image))
     for size in sizes:
-        zoom = np.sqrt(area / max(own, 1)) * size
+        zoom = np.sqrt(area / max(np.count_nonzero(image), 1)) * size
         if zoom < 4:  # else seen edge-on: nothing like the mask
             index = np.floor((np.arange(GRID) + 0.5 - GRID / 2) / zoom + GRID / 2).astype(int)
             there = (index >= 0) & (index < GRID)
@@ -155,7 +148,7 @@ def _templates(
 def _apart(guesses: list[Guess], keep: int, apart_deg: float) -> list[Guess]:
     """The best of the guesses, none within `apart_deg` of a better one."""
     order = np.argsort(np.array([guess.error for guess in guesses]), kind="stable")[: 60 * keep]
-    rotations = np.stack([guesses[k].roll() @ guesses[k].turn for k in order])
+    rotations = np.stack([guesses[k].roll @ guesses[k].turn for k in order])
     chosen, closest = [], 1 + 2 * np.cos(np.deg2rad(apart_deg))
     free = np.ones(len(order), bool)
     while free.any() and len(chosen) < keep:
@@ -168,7 +161,5 @@ def _apart(guesses: list[Guess], keep: int, apart_deg: float) -> list[Guess]:
 
 def toward(slope: Float[np.ndarray, "2"]) -> Rotation:
     """The smallest rotation that takes the optical axis to the ray (slope, 1)."""
-    ray = np.array([slope[0], slope[1], 1.0]) / np.sqrt(1 + slope @ slope)
-    axis = np.cross([0.0, 0.0, 1.0], ray)
-    sine = np.linalg.norm(axis)
-    return rotation_of_vector(axis / sine * np.arctan2(sine, ray[2])) if sine > 0 else np.eye(3)
+    ray = np.array([*slope, 1.0])
+    return looking_along(ray / np.linalg.norm(ray)).T

@@ -2,7 +2,6 @@
 
 import logging
 from collections.abc import Sequence
-from functools import partial
 
 import msgspec
 import numpy as np
@@ -101,13 +100,14 @@ def placed(
             start, other = state_of(obj.earlier.pose, camera, obj.caster), obj.earlier.runner_up
             known_camera = FocalPrior(camera.focal, 0.0)
             score = refined_finest(obj.caster, obj.silhouette, camera, start, known_camera, search, 0).score
-            second = None
-            if other is not None:
-                second = RunnerUp(state_of(other.pose, camera, obj.caster), other.score, other.normal_difference_deg)
+            second = other and RunnerUp(
+                state_of(other.pose, camera, obj.caster), other.score, other.normal_difference_deg
+            )
             found[k] = Found(start, score, sigma, second, earlier=True)
         elif obj.keypoints is None:
-            searching = partial(_partly, report, done)
-            found[k] = find(obj.caster, obj.silhouette, camera, prior, search, searching)
+            found[k] = find(
+                obj.caster, obj.silhouette, camera, prior, search, lambda share, done=done: report(done + share)
+            )
         else:
             start = state_of_keypoints(obj, camera, prior, photo)
             found[k] = found_near(obj.caster, obj.silhouette, camera, start, prior, search)
@@ -122,10 +122,6 @@ def placed(
         obj.pose or (obj.earlier.pose if obj.earlier else found[k].state.pose(obj.caster)) for k, obj in enumerate(objects)
     ]  # fmt: skip
     return Placed(camera, source or "estimated", sigma, poses, [found.get(k) for k in range(len(objects))], beforehand)
-
-
-def _partly(report: Report, done: int, share: float) -> None:
-    report(done + share)
 
 
 def state_of_keypoints(obj: ObjectToPlace, camera: Camera, prior: FocalPrior, photo: str) -> State:

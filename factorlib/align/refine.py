@@ -35,6 +35,7 @@ HALVINGS = 3  # of a pixel, to find where the mesh's contour crosses it
 MOST_SCALE = 0.05  # of the mask's extent
 DAMPING = np.array([0.15, 0.15, 0.15, 0.1, 0.1, 0.15, 0.3]) ** -2.0  # as if each unknown had a deviation of its own
 LARGEST_STEP = 0.3  # of each unknown, in its own unit
+STILL = 0.03  # standard errors, by the normal equations: a shorter step ends the descent
 Points = Float[np.ndarray, "n 2"]
 
 
@@ -82,26 +83,21 @@ def rendered(caster: Caster, target: Target, camera: Camera, state: State) -> Re
 
 
 def refined(caster: Caster, target: Target, camera: Camera, start: State, prior: FocalPrior, steps: int) -> Refined:
-    """The best-scoring state met in `steps` steps from `start`."""
-    state, best, failures = start, None, 0
-    for k in range(steps + 1):
+    """The best-scoring state met in `steps` steps from `start`; fewer where a step is short, or three in a row gain nothing."""
+    state, free = start, prior.free
+    ran: list[Refined] = []
+    for _ in range(steps + 1):
         seen = rendered(caster, target, camera, state)
-        score, (information, gradient) = seen.score(target), normal_equations(seen, target, prior)
-        if best is None or score > best.score:
-            best, failures = Refined(state, score, information), 0
-        else:
-            failures += 1
-        if k == steps or failures > 4:
-            break
+        information, gradient = normal_equations(seen, target, prior)
+        ran.append(Refined(state, seen.score(target), information))
         step = np.zeros(7)
-        matrix, free = information + np.diag(DAMPING), prior.free
-        step[:free] = -np.linalg.solve(matrix[:free, :free], gradient[:free])
+        step[:free] = -np.linalg.solve((information + np.diag(DAMPING))[:free, :free], gradient[:free])
         step = np.clip(step, -LARGEST_STEP, LARGEST_STEP)
-        state = state.moved(step)
-        if np.abs(step).max() < 2e-5:
+        scores = [result.score for result in ran]
+        if step @ information @ step < STILL**2 or max(scores[-3:]) < max(scores):
             break
-    assert best is not None
-    return best
+        state = state.moved(step)
+    return max(ran, key=lambda result: result.score)
 
 
 def normal_equations(
@@ -126,8 +122,7 @@ def normal_equations(
             residuals.append(np.einsum("nd,nd->n", region.outward, points[nearest] - region.contour))
             rows.append(np.einsum("nd,ndk->nk", region.outward, jacobian[nearest]))
     residual, row = np.concatenate(residuals), np.concatenate(rows)
-    spread = robust_deviation(residual) if len(residual) else LEAST_SPREAD
-    scale = float(np.clip(spread, LEAST_SPREAD, max(MOST_SCALE * target.extent, LEAST_SPREAD)))
+    scale = max(min(robust_deviation(residual) if len(residual) else 0.0, MOST_SCALE * target.extent), LEAST_SPREAD)
     weight = 1 / (1 + (residual / (2 * scale)) ** 2) / (CORRELATION * scale**2)
     information, gradient = (row * weight[:, None]).T @ row, row.T @ (weight * residual)
     if prior.sigma > 0:

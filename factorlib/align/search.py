@@ -17,7 +17,7 @@ from factorlib.align.silhouette import Silhouette
 from factorlib.align.state import State
 from factorlib.align.target import Target, target_of
 from factorlib.geometry.camera import Camera, angle_between
-from factorlib.geometry.raster import Caster, rasterise
+from factorlib.geometry.raster import Caster, Maps, rasterise
 
 Count = Annotated[int, msgspec.Meta(ge=1)]
 Report = Callable[[float], None]
@@ -33,7 +33,7 @@ GIVEN_UP_UNEXPLAINED = 0.04
 class Search(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """How hard to look.  The tuples hold one number per round of refinement, in order; most guesses fall in the first."""
 
-    views: Count = 300
+    views: Count = 240
     """Directions of view, evenly over the sphere, that are tried."""
     rolls: Count = 20
     """Turns about the line of sight tried for each direction of view."""
@@ -43,7 +43,7 @@ class Search(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """Factor on views and first guesses where the frame or another object cuts the mask."""
     keep: tuple[Count, Count, Count, Count] = (32, 14, 7, 3)
     """Guesses that each round of refinement takes up."""
-    steps: tuple[Count, Count, Count, Count] = (5, 8, 10, 8)
+    steps: tuple[Count, Count, Count, Count] = (4, 8, 10, 8)
     """Gauss-Newton steps of each round."""
     resolution: tuple[Count, Count, Count, Count] = (80, 100, 200, 400)
     """Pixels of the mask's longer side in each round."""
@@ -94,8 +94,10 @@ def find(
     """
     camera = msgspec.structs.replace(camera, focal=prior.focal)
     effort = search.cut_effort if is_cut(silhouette) else 1
-    density = effort * search.views, search.rolls, effort * search.keep[0], search.apart_deg
-    states, others = candidates(caster, silhouette, camera, *density), []
+    states = candidates(
+        caster, silhouette, camera, effort * search.views, search.rolls, effort * search.keep[0], search.apart_deg
+    )
+    others: list[Refined] = []
     rounds = zip(search.keep, search.steps, search.resolution, search.margin)
     for number, (keep, steps, size, margin) in enumerate(rounds, start=1):
         report(number / (len(search.keep) + 2))
@@ -113,11 +115,16 @@ def find(
     # refined anew: scores of different resolutions do not compare
     again = [refined(caster, target, camera, rival.state, prior, search.steps[-1]) for rival in rivals]
     best, *others = _distinct(ranked + again, prior)
-    away, second = next((other for other in others if _is_apart(other, [best], DISTINCT_DEG)), None), None
-    if away is not None:
-        normals_deg = normal_difference(caster, target, camera, best.state, away.state)
-        second = RunnerUp(away.state, away.score, normals_deg)
-    return Found(best.state, best.score, best.log_focal_sigma(), second)
+    runners_up = (
+        RunnerUp(
+            other.state,
+            other.score,
+            normal_difference(*(seen_in(caster, target, camera, of.state) for of in (best, other))),
+        )
+        for other in others
+        if _is_apart(other, [best], DISTINCT_DEG)
+    )
+    return Found(best.state, best.score, best.log_focal_sigma(), next(runners_up, None))
 
 
 def found_near(
@@ -162,9 +169,13 @@ def _is_apart(one: Refined, others: Iterable[Refined], degrees: float) -> bool:
     return all(angle_between(one.state.rotation, other.state.rotation) > degrees for other in others)
 
 
-def normal_difference(caster: Caster, target: Target, camera: Camera, first: State, second: State) -> float:
-    """Median angle in degrees between the normals of two states where both see the mesh; 180 if they share no pixel."""
-    a, b = (rasterise(caster, target.camera(s.camera(camera)), s.pose(caster)) for s in (first, second))
+def seen_in(caster: Caster, target: Target, camera: Camera, state: State) -> Maps:
+    """Return the maps of the mesh in a state, in the target's window."""
+    return rasterise(caster, target.camera(state.camera(camera)), state.pose(caster))
+
+
+def normal_difference(a: Maps, b: Maps) -> float:
+    """Median angle in degrees between the normals where both see the mesh; 180 if they share no pixel."""
     both = (a.label > 0) & (b.label > 0)
     if not both.any():
         return 180.0

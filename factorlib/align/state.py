@@ -8,6 +8,8 @@ from factorlib.geometry.camera import Camera, Pose, rotation_of_vector
 from factorlib.geometry.raster import Caster
 from factorlib.meshes.mesh import Mesh
 
+TURNS = np.cross(np.eye(3)[:, None], np.eye(3))  # [k, i, j]: component j of e_k × e_i
+
 
 class State(msgspec.Struct, frozen=True):
     """Where the middle of a mesh is and how it is turned.
@@ -45,12 +47,10 @@ class State(msgspec.Struct, frozen=True):
     def jacobian(self, arms: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 2 7"]:
         """Derivative of the image points (photo pixels) of points at `arms` from the centre (camera axes), by `moved`."""
         depth, focal = np.exp(self.log_depth), np.exp(self.log_focal)
-        point, moves = arms + self.middle(), np.zeros((len(arms), 3, 7))
-        for k in range(3):
-            moves[:, :, k] = np.cross(np.eye(3)[k], arms)
-        moves[:, 0, 3] = moves[:, 1, 4] = depth
-        moves[:, :, 5] = depth * np.array([self.a, self.b, 1.0])
-        moves[:, 2, 6] = depth
+        point = arms + self.middle()
+        shifts = depth * np.array([[1, 0, self.a, 0], [0, 1, self.b, 0], [0, 0, 1, 1]])  # by a, b, log depth, log focal
+        turns = np.moveaxis(arms @ TURNS, 0, -1)  # about axis k: e_k × arm
+        moves = np.concatenate([turns, np.broadcast_to(shifts, (len(arms), 3, 4))], axis=-1)
         slope = point[:, :2] / point[:, 2:]
         result = (moves[:, :2] - slope[:, :, None] * moves[:, 2:]) * (focal / point[:, 2])[:, None, None]
         result[:, :, 6] += focal * slope

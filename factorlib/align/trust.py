@@ -17,7 +17,7 @@ from scipy.spatial import cKDTree
 
 from factorlib.align.place import ObjectToPlace, Placed
 from factorlib.align.refine import FocalPrior, at_points, contour_of, normal_equations, rendered
-from factorlib.align.search import Found, Search, find, normal_difference
+from factorlib.align.search import Found, Search, find, normal_difference, seen_in
 from factorlib.align.silhouette import Silhouette
 from factorlib.align.state import State, state_of
 from factorlib.align.target import Target, target_of
@@ -26,7 +26,7 @@ from factorlib.geometry.raster import Caster
 
 LARGEST_MOVE = 0.5  # of one unknown, radians or log: beyond, normal equations say nothing
 FITS_TO_A_PIXEL = 0.995  # score from which no other pose fits clearly better
-QUICK = Search(views=200, rolls=16, keep=(10, 5, 2, 1), steps=(5, 8, 8, 6), rivals=0)
+QUICK = Search(views=200, rolls=16, keep=(10, 5, 2, 1), steps=(4, 8, 8, 6), rivals=0)
 LEAST_SCORE_LEAD = 0.001  # of the mask's pixels: a lead of less is their noise, however little is left unexplained
 DIFFERENT_DEG = 5.0  # median angle of normals from which a runner-up is another answer
 Share = Annotated[float, msgspec.Meta(ge=0, le=1)]
@@ -65,18 +65,22 @@ def doubts(
     if agreement < standards.least_agreement:
         reasons.append(f"the materials of mesh and mask agree on {agreement:.2f} of the pixels only")
     if trust.contour_error > standards.most_contour_error:
-        far = f"{trust.contour_error:.1%} of the mask's extent"
-        reasons.append(f"half of the contours of mesh and mask lie {far} apart, or more")
+        reasons.append(
+            f"half of the contours of mesh and mask lie {trust.contour_error:.1%} of the mask's extent apart, or more"
+        )
     if trust.normal_stderr_deg is not None and trust.normal_stderr_deg > standards.most_normal_stderr_deg:
         reasons.append(f"the mask tells normals to {trust.normal_stderr_deg:.1f}° only")
     if found and trust.mirrored_score is not None and 1 - trust.mirrored_score < (1 - found.score) / 2:
-        scores = f"{trust.mirrored_score:.3f}, {found.score:.3f}"
-        reasons.append(f"the mirror image of the mask fits better ({scores}): was it mirrored?")
+        reasons.append(
+            f"the mirror image of the mask fits better ({trust.mirrored_score:.3f}, {found.score:.3f}): was it mirrored?"
+        )
     if found and (other := found.runner_up) and other.normal_difference_deg > DIFFERENT_DEG:
         lead = max(standards.least_lead * (1 - other.score), LEAST_SCORE_LEAD)
         if found.score - other.score < lead:
-            away, scores = f"{other.normal_difference_deg:.0f}° away", f"{other.score:.3f}, {found.score:.3f}"
-            reasons.append(f"another pose, its normals {away}, fits as well ({scores})")
+            reasons.append(
+                f"another pose, its normals {other.normal_difference_deg:.0f}° away, fits as well "
+                f"({other.score:.3f}, {found.score:.3f})"
+            )
     return reasons
 
 
@@ -114,17 +118,16 @@ def normal_stderr_deg(caster: Caster, target: Target, camera: Camera, state: Sta
     """Root of the summed squares, over the independent directions of the unknowns, of the normals' median turn by one
     standard error."""
     information, _ = normal_equations(rendered(caster, target, camera, state), target, prior)
-    turns, free = [], prior.free
+    turns, free, unmoved = [], prior.free, seen_in(caster, target, camera, state)
     precisions, directions = np.linalg.eigh(information[:free, :free])
     for precision, direction in zip(precisions, directions.T, strict=True):
-        length = min(max(precision, 1e-12) ** -0.5, LARGEST_MOVE / np.abs(direction).max())
-        move = np.append(length * direction, np.zeros(7 - free))
-        turns.append(normal_difference(caster, target, camera, state, state.moved(move)))
+        move = direction * min(max(precision, 1e-12) ** -0.5, LARGEST_MOVE / np.abs(direction).max())
+        moved = state.moved(np.append(move, np.zeros(7 - free)))
+        turns.append(normal_difference(unmoved, seen_in(caster, target, camera, moved)))
     return float(np.sqrt(np.sum(np.square(turns))))
 
 
 def mirrored_score(caster: Caster, silhouette: Silhouette, camera: Camera, prior: FocalPrior) -> float:
     """The best score for the photo with left and right exchanged."""
     camera = msgspec.structs.replace(camera, centre=(camera.width - camera.centre[0], camera.centre[1]))
-    mirror = Silhouette(np.ascontiguousarray(silhouette.label[:, ::-1]))
-    return find(caster, mirror, camera, prior, QUICK).score
+    return find(caster, Silhouette(np.ascontiguousarray(silhouette.label[:, ::-1])), camera, prior, QUICK).score

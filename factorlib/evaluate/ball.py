@@ -15,11 +15,12 @@ Mirror    L(2(n·o)n − o)                           averaged over the solid an
 """
 
 from collections.abc import Callable
-from functools import partial
+from functools import lru_cache, partial
 
 import msgspec
 import numpy as np
 from jaxtyping import Float, Int
+from scipy.sparse import csr_array
 
 from factorlib.conventions import lat_long_directions, lat_long_solid_angles
 from factorlib.results.materials import Reflectance
@@ -32,7 +33,7 @@ GOLDEN = (np.sqrt(5) - 1) / 2
 VIEW = np.array([0.0, 0.0, 1.0])
 
 
-class Light(msgspec.Struct, frozen=True):
+class Light(msgspec.Struct, frozen=True, eq=False):
     """Radiance averaged over octahedral texels, finest level first: [128, 128, 3], [64, 64, 3], …, [1, 1, 3]."""
 
     levels: tuple[Float[np.ndarray, "s s 3"], ...]
@@ -41,6 +42,11 @@ class Light(msgspec.Struct, frozen=True):
     def mean(self) -> Float[np.ndarray, "3"]:
         """Mean radiance over the sphere, RGB."""
         return self.levels[-1][0, 0]
+
+    @property
+    def texels(self) -> Float[np.ndarray, "t 3"]:
+        """All levels, each row by row."""
+        return np.concatenate([level.reshape(-1, 3) for level in self.levels])
 
     @property
     def wide(self) -> Float[np.ndarray, "t 3"]:
@@ -58,10 +64,16 @@ def light_of_lat_long(radiance: Float[np.ndarray, "h w 3"]) -> Light:
     fine = np.repeat(np.repeat(np.asarray(radiance, np.float64), times, axis=0), times, axis=1)
     height, width = fine.shape[:2]
     area = np.repeat(lat_long_solid_angles(height, width), width)
-    texel = np.ravel_multi_index(_texel(lat_long_directions(height, width).reshape(-1, 3)), (SIDE, SIDE))
+    texel = _octahedral_texels(height, width)
     total = np.bincount(texel, area, SIDE * SIDE)
     sums = [np.bincount(texel, area * channel, SIDE * SIDE) for channel in fine.reshape(-1, 3).T]
     return Light(_pyramid(np.stack([s / total for s in sums], axis=-1).reshape(SIDE, SIDE, 3).astype(np.float32)))
+
+
+@lru_cache(maxsize=2)
+def _octahedral_texels(height: int, width: int) -> Int[np.ndarray, " hw"]:
+    """Number of the finest octahedral texel that each texel of a lat-long map lies in."""
+    return np.ravel_multi_index(_texel(lat_long_directions(height, width).reshape(-1, 3)), (SIDE, SIDE))
 
 
 def constant_light(colour: Float[np.ndarray, "3"]) -> Light:
@@ -69,37 +81,33 @@ def constant_light(colour: Float[np.ndarray, "3"]) -> Light:
     return Light(_pyramid(np.broadcast_to(np.asarray(colour, np.float32), (SIDE, SIDE, 3))))
 
 
-def radiance_toward(direction: Float[np.ndarray, "*n 3"], solid_angle: Float[np.ndarray, "*n"]) -> Reflected:
-    """Return the radiance of any light, averaged over about `solid_angle` steradians around unit `direction`: between the two nearest levels."""
+def texel_weights(
+    direction: Float[np.ndarray, "n k 3"], solid_angle: Float[np.ndarray, "n k"], weight: Float[np.ndarray, "n k"]
+) -> csr_array:
+    """Return the matrix [n, t] of n weighted sums of a light's radiance, of its `texels`.
+
+    Each of k terms is the average over about `solid_angle` steradians around a unit `direction`: between the two nearest levels.
+    """
     finest, last = 4 * np.pi / SIDE**2, SIDE.bit_length() - 1
     level = np.clip(0.5 * np.log2(np.maximum(solid_angle, 1e-12) / finest), 0, last)
     below = np.minimum(level.astype(int), last - 1)
     row, column = _texel(direction)
-    offsets = np.cumsum([0] + [(SIDE >> k) ** 2 for k in range(last)])
-    # numbers of texels over all levels, the finest first; share: the coarser one's
+    offsets = np.cumsum([0] + [(SIDE >> k) ** 2 for k in range(last + 1)])
     at = [(offsets[k] + (row >> k) * (SIDE >> k) + (column >> k)).astype(np.int32) for k in (below, below + 1)]
-    share = (level - below)[..., None]
-
-    def seen(light: Light) -> Float[np.ndarray, "*n 3"]:
-        texels = np.concatenate([level.reshape(-1, 3) for level in light.levels])
-        return texels[at[0]] * (1 - share) + texels[at[1]] * share
-
-    return seen
+    share = level - below  # the coarser level's
+    terms = np.hstack([weight * (1 - share), weight * share])
+    starts = np.arange(len(terms) + 1) * terms.shape[1]
+    return csr_array((terms.astype(np.float32).ravel(), np.hstack(at).ravel(), starts), shape=(len(terms), offsets[-1]))
 
 
-def diffuse_ball(light: Light, normals: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
-    """Reflected radiance of a white Lambert surface, E(n)/π."""
+def diffuse_lobe(normals: Float[np.ndarray, "n 3"]) -> Reflected:
+    """Radiance that a white Lambert surface reflects of any light, E(n)/π."""
     cosine = np.maximum(normals.astype(np.float32) @ octahedral_directions(WIDE_SIDE).T.astype(np.float32), 0)
-    return _summed(cosine / np.float32(np.pi), light)
-
-
-def glossy_ball(light: Light, normals: Float[np.ndarray, "n 3"], roughness: float) -> Float[np.ndarray, "n 3"]:
-    """Reflected radiance of GGX with k_s = 1, seen from `VIEW`."""
-    return glossy_lobe(normals, roughness)(light)
+    return partial(_summed, cosine / np.float32(np.pi))
 
 
 def glossy_lobe(normals: Float[np.ndarray, "n 3"], roughness: float) -> Reflected:
-    """`glossy_ball` of any light: what is alike for every light, which is most of its work, is computed here."""
+    """Radiance that GGX with k_s = 1 reflects of any light toward `VIEW`; most of the work, which is alike for every light, is done here."""
     alpha = max(float(roughness**2), 1e-3)
     return (_wide_lobe if alpha > WIDE_ALPHA else _narrow_lobe)(normals, alpha)
 
@@ -122,21 +130,22 @@ def _narrow_lobe(normals: Float[np.ndarray, "n 3"], alpha: float) -> Reflected:
     density = _g1(cos_o, alpha) * _ggx(half[..., 2], alpha) / (4 * cos_o)  # of the incoming direction, per steradian
     frame = _frames(normals).astype(np.float32)  # rows: tangent toward the viewer, bitangent, normal
     weight = np.where(incoming[..., 2] > 0, _g1(np.maximum(incoming[..., 2], 1e-6), alpha), 0.0)
-    seen = radiance_toward(incoming @ frame, 1 / (SAMPLES * density))
-    return lambda light: np.einsum("nk,nkc->nc", weight, seen(light)) / SAMPLES
+    weights = texel_weights(incoming @ frame, 1 / (SAMPLES * density), weight / SAMPLES)
+    return lambda light: weights @ light.texels
 
 
 def mirror_ball(light: Light, normals: Float[np.ndarray, "n 3"], size: int) -> Float[np.ndarray, "n 3"]:
     """A perfect mirror: a pixel of a ball `size` pixels across sees 16 / size² steradians wherever it is."""
-    mirrored = 2 * normals[:, 2:] * normals - VIEW
-    return radiance_toward(mirrored, np.full(len(normals), 16 / size**2))(light)
+    mirrored = 2 * normals[:, None, 2:] * normals[:, None] - VIEW
+    one = np.ones((len(normals), 1))
+    return texel_weights(mirrored, 16 / size**2 * one, one) @ light.texels
 
 
 def ball(light: Light, material: Reflectance, normals: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
     """Reflected radiance of k_d/π + k_s · D G / (4 (n·i)(n·o)) in `light`."""
     diffuse, specular = np.asarray(material.diffuse, float), np.asarray(material.specular, float)
-    value = diffuse * diffuse_ball(light, normals)
-    return value + specular * glossy_ball(light, normals, material.roughness) if specular.any() else value
+    value = diffuse * diffuse_lobe(normals)(light)
+    return value + specular * glossy_lobe(normals, material.roughness)(light) if specular.any() else value
 
 
 def _summed(response: Float[np.ndarray, "n t"], light: Light) -> Float[np.ndarray, "n 3"]:

@@ -20,28 +20,25 @@ from factorlib.evaluate.ball import (
     WIDE_SIDE,
     Light,
     constant_light,
-    diffuse_ball,
-    glossy_ball,
     mirror_ball,
     octahedral_directions,
 )
 from factorlib.evaluate.gauge import GAUGES, errors_by_gauge
 from factorlib.evaluate.geometry import angles_deg
 from factorlib.evaluate.picture import mean_scored
-from factorlib.geometry.sphere import ball_normals, mirror_directions
+from factorlib.evaluate.relighting import BALL_SIZE, INSIDE, NORMALS, appearances
+from factorlib.geometry.sphere import mirror_directions
 from factorlib.results.metrics import LightError, LightErrors, ScoredLight
 
 GLOSSY_ROUGHNESS = 0.4
 COVERAGE_ROWS, COVERAGE_DILATION = 32, 1
-SPHERE_SIZE = 32
-NORMALS, INSIDE = ball_normals(SPHERE_SIZE)
 
 Samples = Float[np.ndarray, "_ 3"]
 SPHERES = ("mirror", "glossy", "lambertian")
 VIEWS: dict[str, Callable[[Light], Samples]] = {
-    "mirror": lambda light: mirror_ball(light, NORMALS, SPHERE_SIZE),
-    "glossy": lambda light: glossy_ball(light, NORMALS, GLOSSY_ROUGHNESS),
-    "lambertian": lambda light: diffuse_ball(light, NORMALS),
+    "mirror": lambda light: mirror_ball(light, NORMALS, BALL_SIZE),
+    "glossy": lambda light: appearances(light).glossy(GLOSSY_ROUGHNESS),
+    "lambertian": lambda light: appearances(light).diffuse,
     **dict.fromkeys(("map_all", "map_mirrored", "map_unmirrored"), lambda light: light.wide),
 }
 

@@ -22,12 +22,12 @@ So balls are made without it, and it is stated for what is compared apart: mater
 """
 
 from collections.abc import Iterable, Mapping, Sequence
-from functools import lru_cache
+from functools import cache, lru_cache
 
 import numpy as np
 from jaxtyping import Float
 
-from factorlib.evaluate.ball import Light, Reflected, diffuse_ball, glossy_lobe
+from factorlib.evaluate.ball import Light, Reflected, diffuse_lobe, glossy_lobe
 from factorlib.evaluate.gauge import GAUGES, errors_by_gauge
 from factorlib.evaluate.picture import mean_error, picture_error, psnr, tone_mapped, white_of
 from factorlib.geometry.sphere import ball_normals
@@ -48,21 +48,31 @@ def lobe_of(roughness: float) -> Reflected:
     return glossy_lobe(NORMALS, roughness)
 
 
+@cache
+def matte_lobe() -> Reflected:
+    """The diffuse part of a ball, cached."""
+    return diffuse_lobe(NORMALS)
+
+
 class Appearances:
     """Balls of many materials in one light: each part of the reflection is rendered once."""
 
     def __init__(self, light: Light):
-        self.light, self.diffuse = light, diffuse_ball(light, NORMALS)
-        self.glossy: dict[float, Samples] = {}
+        self.diffuse = matte_lobe()(light)
+        self.glossy = cache(lambda roughness: lobe_of(roughness)(light))
 
     def ball(self, material: Reflectance) -> Samples:
         """Radiance of a ball of `material`, one row per normal, RGB."""
         value = np.asarray(material.diffuse) * self.diffuse
         if not any(material.specular):
             return value
-        if material.roughness not in self.glossy:
-            self.glossy[material.roughness] = lobe_of(material.roughness)(self.light)
-        return value + np.asarray(material.specular) * self.glossy[material.roughness]
+        return value + np.asarray(material.specular) * self.glossy(material.roughness)
+
+
+@lru_cache(maxsize=64)
+def appearances(light: Light) -> Appearances:
+    """The balls in a light, cached: several numbers are made of the same ones."""
+    return Appearances(light)
 
 
 def compare_relighting(
@@ -79,7 +89,7 @@ def compare_relighting(
     pairs = [(li, m) for li in true_lights if li in estimated_lights for m in truths if m in estimates]
     if not pairs:
         return None
-    lit = {li: (Appearances(true_lights[li]), Appearances(estimated_lights[li])) for li in {p[0] for p in pairs}}
+    lit = {li: (appearances(true_lights[li]), appearances(estimated_lights[li])) for li in {p[0] for p in pairs}}
     true = [lit[li][0].ball(truths[m]) for li, m in pairs]
     kinds = {
         "in_true_light": [lit[li][0].ball(estimates[m]) for li, m in pairs],
@@ -123,7 +133,7 @@ def compare_relit_set(
     """The score over every material and every light that has both a truth and an estimate; None where there is no such pair."""
     names, scores, nulls = [m for m in truths if m in estimates], {}, []
     for light in [li for li in true_lights if li in estimated_lights]:
-        true, estimated = Appearances(true_lights[light]), Appearances(estimated_lights[light])
+        true, estimated = appearances(true_lights[light]), appearances(estimated_lights[light])
         for m in names:
             ball = true.ball(truths[m])
             scores[m, light] = shown_psnr(estimated.ball(estimates[m]), ball)

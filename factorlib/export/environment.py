@@ -9,12 +9,10 @@ the lobes are first sharpened by as much, at the same energy: what Mitsuba inter
 import numpy as np
 from jaxtyping import Float
 
-from factorlib.conventions import YUP_FROM_CAMERA
+from factorlib.light.latlong import lattice_of_lobes
 from factorlib.light.lobes import Lobes, lobe_integral
-from factorlib.tracing.scene import node_directions
 
 NARROWEST = 0.5  # least variance, in h², of a lobe at the nodes: narrower ones would fall between them
-ROWS_AT_ONCE = 16
 
 
 def sharpened(lobes: Lobes, spacing: float) -> Lobes:
@@ -26,7 +24,7 @@ def sharpened(lobes: Lobes, spacing: float) -> Lobes:
 
 def mitsuba_map(lobes: Lobes, height: int, width: int) -> Float[np.ndarray, "h w 3"]:
     """Node values for Mitsuba of a light given in the lobes' own frame; the map is in its y-up turn."""
-    at_nodes = sharpened(lobes, np.pi / (height - 1)).turned(YUP_FROM_CAMERA)
-    directions = node_directions(height, width)
-    parts = [at_nodes.radiance(directions[i : i + ROWS_AT_ONCE].reshape(-1, 3)) for i in range(0, height, ROWS_AT_ONCE)]
-    return np.concatenate(parts).reshape(height, width, 3)
+    at_nodes = sharpened(lobes, np.pi / (height - 1))
+    theta = np.arange(height)[:, None] / (height - 1) * np.pi
+    phi = (np.arange(width)[:, None] + 0.5) / width * 2 * np.pi
+    return lattice_of_lobes(at_nodes, height, width, lambda _: (theta, phi, np.ones(1)))

@@ -10,10 +10,10 @@ from pathlib import Path
 
 import msgspec
 import numpy as np
-import open3d as o3d
 from jaxtyping import Float
 from scipy.interpolate import CubicSpline, PchipInterpolator
 
+from factorlib.geometry import open3d as o3d
 from factorlib.meshes.mesh import Mesh, smooth
 from factorlib.yamlfile import read_yaml
 

@@ -31,9 +31,9 @@ class Camera(msgspec.Struct, frozen=True):
         centre = ((self.centre[0] - left) / pixel, (self.centre[1] - top) / pixel)
         return Camera(width, height, self.focal / pixel, centre)
 
-    def rays(self) -> Float[np.ndarray, "h w 3"]:
-        """Directions through the pixel centres, z = 1, camera frame."""
-        x, y = np.meshgrid(np.arange(self.width) + 0.5, np.arange(self.height) + 0.5)
+    def rays(self, rows: slice = slice(None), columns: slice = slice(None)) -> Float[np.ndarray, "h w 3"]:
+        """Directions through the pixel centres, z = 1, camera frame; of some rows and columns alone, where they are given."""
+        x, y = np.meshgrid(np.arange(self.width)[columns] + 0.5, np.arange(self.height)[rows] + 0.5)
         return self.rays_through(np.stack([x, y], axis=-1))
 
     def rays_through(self, pixels: Float[np.ndarray, "*n 2"]) -> Float[np.ndarray, "*n 3"]:
@@ -54,7 +54,7 @@ class Pose(msgspec.Struct, frozen=True):
         return points @ self.rotation.T + self.translation
 
 
-def rotation_of_vector(vector: Float[np.ndarray, "3"]) -> Float[np.ndarray, "3 3"]:
+def rotation_of_vector(vector: Float[np.ndarray, "*n 3"]) -> Float[np.ndarray, "*n 3 3"]:
     """Turn about `vector` by its length in radians."""
     return Rotation.from_rotvec(vector).as_matrix()
 
@@ -65,7 +65,7 @@ def angle_between(first: Float[np.ndarray, "3 3"], second: Float[np.ndarray, "3 
     >>> round(angle_between(np.eye(3), rotation_of_vector(np.array([0.0, 0.5, 0.0]))), 6)
     28.64789
     """
-    return float(np.rad2deg(Rotation.from_matrix(first @ second.T).magnitude()))
+    return float(np.rad2deg(2 * np.arcsin(min(np.linalg.norm(first - second) / 8**0.5, 1.0))))
 
 
 def is_pose(rotation: Float[np.ndarray, "3 3"], translation: Float[np.ndarray, "3"]) -> bool:
@@ -74,6 +74,7 @@ def is_pose(rotation: Float[np.ndarray, "3 3"], translation: Float[np.ndarray, "
     >>> is_pose(np.diag([1.0, 1.0, -1.0]), np.ones(3))
     False
     """
-    if not (np.isfinite(rotation).all() and np.isfinite(translation).all()):
-        return False
-    return bool(np.abs(rotation.T @ rotation - np.eye(3)).max() < ROTATION_ERROR and np.linalg.det(rotation) > 0)
+    finite = np.isfinite(rotation).all() and np.isfinite(translation).all()
+    return bool(
+        finite and np.abs(rotation.T @ rotation - np.eye(3)).max() < ROTATION_ERROR and np.linalg.det(rotation) > 0
+    )

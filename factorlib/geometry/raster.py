@@ -10,12 +10,13 @@ are bent in the plane of normal and view to the nearest direction with n·v ≥ 
 """
 
 from collections.abc import Sequence
+from itertools import product
 
 import msgspec
 import numpy as np
-import open3d as o3d
 from jaxtyping import Bool, Float, Int
 
+from factorlib.geometry import open3d as o3d
 from factorlib.geometry.camera import Camera, Pose
 from factorlib.meshes.mesh import Mesh
 
@@ -58,13 +59,29 @@ class Caster:
 
     def __init__(self, mesh: Mesh):
         self.mesh, self.centre, self.radius = mesh, mesh.centre, mesh.radius
+        used = mesh.vertices[np.unique(mesh.faces)]
+        self.corners = np.array(list(product(*zip(used.min(0), used.max(0)))))
         self.scene = o3d.t.geometry.RaycastingScene(nthreads=1)
         vertices = ((mesh.vertices - self.centre) / self.radius).astype(np.float32)
         self.scene.add_triangles(o3d.core.Tensor(vertices), o3d.core.Tensor(mesh.faces.astype(np.uint32)))
 
     def cast(self, camera: Camera, pose: Pose) -> Hits:
-        """Return what the rays through the pixel centres of `camera` meet first."""
-        return self.cast_along(camera.rays(), pose)
+        """Return what the rays through the pixel centres of `camera` meet first.  Rays beside the mesh's bounding box are not cast."""
+        shape, window = (camera.height, camera.width), self._window(camera, pose)
+        hits = Hits(np.full(shape, np.inf), np.full(shape, -1), np.zeros((*shape, 2)))
+        part = self.cast_along(camera.rays(*window), pose)
+        for name in hits.__struct_fields__:
+            getattr(hits, name)[window] = getattr(part, name)
+        return hits
+
+    def _window(self, camera: Camera, pose: Pose) -> tuple[slice, slice]:
+        """Rows and columns of the pixels that can show the mesh: of its bounding box, all where a corner is not before the camera."""
+        corners = pose.apply(self.corners)
+        if corners[:, 2].min() <= 0:
+            return slice(0, camera.height), slice(0, camera.width)
+        pixels = camera.project(corners)
+        low, high = np.clip([pixels.min(0) - 1, pixels.max(0) + 2], 0, (camera.width, camera.height)).astype(int)
+        return slice(low[1], high[1]), slice(low[0], high[0])
 
     def cast_along(self, directions: Float[np.ndarray, "*n 3"], pose: Pose) -> Hits:
         """Return what rays from the camera along `directions` (camera frame, z = 1, so that distance is depth) meet first."""
@@ -98,13 +115,14 @@ def rasterise(meshes: Mesh | Caster | Sequence, camera: Camera, poses: Pose | Se
         nearest[wins] = hits.depth[wins]
         maps.depth[wins], maps.view[wins], maps.object[wins] = hits.depth[wins], view[wins], number
         mesh, face, seen_along = caster.mesh, hits.face[wins], view[wins]
-        smooth, own = smooth_normals(mesh, face, hits.uv[wins]) @ pose.rotation.T, face_normals(mesh, face)
+        own = face_normals(mesh, face)
         facing = np.sum((own @ pose.rotation.T) * seen_along, axis=1)
-        side = np.where(facing < 0, -1.0, 1.0)
-        maps.normal[wins], maps.bent[wins] = toward_viewer(unit(smooth) * side[:, None], seen_along)
-        maps.label[wins], maps.back[wins], maps.edge[wins] = mesh.face_label[face], side < 0, np.abs(facing)
-        cosine = np.abs(np.einsum("nkd,nd->nk", mesh.normals[mesh.faces[face]], own)).min(1)
-        maps.facet[wins] = np.arccos(np.minimum(cosine, 1.0))
+        side = np.where(facing < 0, -1.0, 1.0)[:, None]
+        smooth = unit(smooth_normals(mesh, face, hits.uv[wins]) @ pose.rotation.T) * side
+        maps.normal[wins], maps.bent[wins] = toward_viewer(smooth, seen_along)
+        maps.label[wins], maps.back[wins], maps.edge[wins] = mesh.face_label[face], facing < 0, np.abs(facing)
+        cosines = np.abs(np.einsum("nkd,nd->nk", mesh.normals[mesh.faces[face]], own))
+        maps.facet[wins] = np.arccos(np.minimum(cosines.min(1), 1.0))
     return maps
 
 

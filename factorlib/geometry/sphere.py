@@ -18,19 +18,6 @@ def fibonacci_sphere(count: int) -> Float[np.ndarray, "count 3"]:
     return np.column_stack([radius * np.cos(turn), radius * np.sin(turn), z])
 
 
-def fibonacci_directions(count: int) -> Float[np.ndarray, "n 3"]:
-    """The same lattice turned and mirrored: the views from which poses are searched.  Other views would change the last digits of poses.
-
-    >>> float(np.abs(fibonacci_directions(500).mean(axis=0)).max()) < 1e-2
-    True
-    """
-    k = np.arange(count) + 0.5
-    z = 1 - 2 * k / count
-    angle = np.pi * (1 + 5**0.5) * k
-    r = np.sqrt(1 - z * z)
-    return np.stack([r * np.cos(angle), r * np.sin(angle), z], axis=1)
-
-
 def mirror_directions(normal: Vectors, view: Vectors) -> Vectors:
     """2(n·o)n − o: where a mirror at the point would show the light from; all unit, in one frame."""
     return 2 * np.sum(normal * view, axis=-1, keepdims=True) * normal - view

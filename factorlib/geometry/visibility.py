@@ -15,10 +15,10 @@ from collections.abc import Callable, Iterator, Sequence
 
 import msgspec
 import numpy as np
-import open3d as o3d
 from jaxtyping import Bool, Float, Int, UInt8, UInt16
 from scipy.spatial import cKDTree
 
+from factorlib.geometry import open3d as o3d
 from factorlib.geometry.camera import Camera, Pose
 from factorlib.geometry.met import UNMET, met_codes
 from factorlib.geometry.raster import Caster, unit
@@ -28,7 +28,7 @@ from factorlib.meshes.mesh import Mesh, area_vectors
 LIFT = 1e-3  # of the object's radius: how far off the surface rays start
 GRAZING = 0.02  # sine of the least angle between a ray and its face
 BELOW = -0.1  # n·d of directions that are still cast: normals that are averaged later may lean that far
-ROWS = 4096  # points whose rays are held at once
+ROWS = 256  # points whose rays are held at once, few enough for the processor's cache
 Vectors = Float[np.ndarray, "n 3"]
 Report = Callable[[int, int], None]
 NORMAL_WEIGHT = 10.0  # spacings of cast points that a difference of 1 between normals counts for
@@ -69,10 +69,14 @@ class Occluders(Caster):
     def points_under(self, camera: Camera, x: Int[np.ndarray, " n"], y: Int[np.ndarray, " n"]) -> Points:
         """Return what the rays through the centres of pixels (x, y) meet first."""
         along = camera.rays_through(np.column_stack([x, y]) + 0.5)
-        distance, face, normal = self._first(np.zeros_like(along), along)
+        distance, face, behind = self._first(self._rays(np.zeros_like(along), along))
         found = np.isfinite(distance)
-        depth = np.where(found, distance * self.radius, 0.0)
+        depth, normal = np.where(found, distance * self.radius, 0.0), self.turned(face, behind)
         return Points(depth[:, None] * along + self.lift[face][:, None] * normal, normal, found)
+
+    def turned(self, face: Int[np.ndarray, " n"], behind: Bool[np.ndarray, " n"]) -> Vectors:
+        """Return the normals of faces, turned over where the face is met from `behind`."""
+        return np.where(behind[:, None], -self.normal[face], self.normal[face])
 
     def seen_from(
         self,
@@ -84,10 +88,11 @@ class Occluders(Caster):
         """Return what the points see along `directions` (camera frame, unit); report: called with how many of them are done."""
         seen = np.full((len(shading_normal), len(directions)), 255, np.uint8)
         met = np.full(seen.shape, UNMET, np.uint16)
-        for row, k, face, normal in self.hidden_from(points, shading_normal, directions, report):
+        material = self.mesh.face_label.astype(np.int64) - 1
+        codes = np.array([[*met_codes(material, normal), UNMET] for normal in (self.normal, -self.normal)])
+        for row, k, face, behind in self.hidden_from(points, shading_normal, directions, report):
             seen[row, k] = 0
-            material = np.where(face >= 0, self.mesh.face_label[face].astype(np.int64) - 1, -1)
-            met[row, k] = met_codes(material, normal)
+            met[row, k] = codes[behind.astype(int), face]
         return Sight(seen, met)
 
     def hidden_from(
@@ -99,31 +104,31 @@ class Occluders(Caster):
     ) -> Iterator[tuple[np.ndarray, ...]]:
         """The pairs of a point and a direction that is hidden from it, in order of the points, some points at a time.
 
-        point, direction, face [n]: their numbers, and that of the face that is met, −1 where it is not known;  normal [n, 3]: of that face, turned
-        to the point
+        point, direction, face [n]: their numbers, and that of the face that is met, −1 where it is not known;  behind [n]: whether the face is met
+        from behind
         """
         for i in range(0, len(shading_normal), ROWS):
             report(i, len(shading_normal))
             rows = slice(i, i + ROWS)
             row, k = np.nonzero((shading_normal[rows] @ directions.T > BELOW) & points.found[rows, None])
-            normal, place, along = points.face_normal[rows][row], points.place[rows][row], directions[k]
-            along = along + np.maximum(GRAZING - np.sum(normal * along, 1), 0)[:, None] * normal
-            hidden = self.scene.test_occlusions(self._rays(place, along), nthreads=1).numpy()
-            distance, face, normal = self._first(place[hidden], along[hidden])
-            yield i + row[hidden], k[hidden], np.where(np.isfinite(distance), face, -1), normal
+            normal = points.face_normal[rows]
+            below = np.maximum(GRAZING - normal @ directions.T, 0)[row, k]
+            rays = self._rays(points.place[rows][row], directions[k] + below[:, None] * normal[row])
+            hidden = self.scene.test_occlusions(o3d.core.Tensor(rays), nthreads=1).numpy()
+            distance, face, behind = self._first(rays[hidden])
+            yield i + row[hidden], k[hidden], np.where(np.isfinite(distance), face, -1), behind
 
-    def _first(self, start: Vectors, along: Vectors) -> tuple[np.ndarray, ...]:
-        """Of the surfaces that rays meet first: distance [n] in radii, infinite for none, face [n], and the face's normal
-        [n, 3], turned against the ray."""
-        hits = self.scene.cast_rays(self._rays(start, along), nthreads=1)
+    def _first(self, rays: Float[np.ndarray, "n 6"]) -> tuple[np.ndarray, ...]:
+        """Of the surfaces that rays meet first: distance [n] in radii, infinite for none, face [n], and whether it is met
+        from behind [n]."""
+        hits = self.scene.cast_rays(o3d.core.Tensor(rays), nthreads=1)
         distance = hits["t_hit"].numpy().astype(float)
         face = np.where(np.isfinite(distance), hits["primitive_ids"].numpy(), 0).astype(np.int64)
-        normal = self.normal[face]
-        return distance, face, np.where(np.sum(normal * along, 1, keepdims=True) > 0, -normal, normal)
+        return distance, face, np.sum(self.normal[face] * rays[:, 3:], 1) > 0
 
-    def _rays(self, start: np.ndarray, along: np.ndarray) -> o3d.core.Tensor:
+    def _rays(self, start: np.ndarray, along: np.ndarray) -> Float[np.ndarray, "n 6"]:
         """In the scene's frame, where `along` keeps its length: distances come back in units of the radius."""
-        return o3d.core.Tensor(np.column_stack([(start - self.centre) / self.radius, along]).astype(np.float32))
+        return np.hstack([(start - self.centre) / self.radius, along], dtype=np.float32, casting="same_kind")
 
 
 def sight(

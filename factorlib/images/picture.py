@@ -55,6 +55,7 @@ def png_bytes(pixels: UInt8[np.ndarray, "h w c"]) -> bytes:
     pixels = np.asarray(pixels, dtype=np.uint8)
     spec = oiio.ImageSpec(pixels.shape[1], pixels.shape[0], pixels.shape[2], oiio.UINT8)
     spec.attribute("oiio:UnassociatedAlpha", 1)
+    spec.attribute("png:compressionLevel", 4)  # half the time of the default, 6, for 5 % more bytes
     return encoded("picture.png", spec, pixels)
 
 

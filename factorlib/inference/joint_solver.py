@@ -12,14 +12,12 @@ Every part is a function of the one before it, and is kept once it is done (`fac
 
 from __future__ import annotations
 
-import msgspec
 import numpy as np
 
 from factorlib.inference.evidence import FINER, compare, losses_of
 from factorlib.inference.fit import Fit, Schedule, sure_ones
 from factorlib.inference.gauge import in_gauge
 from factorlib.inference.history import Solution
-from factorlib.inference.lights import even_cells
 from factorlib.inference.materials import Point
 from factorlib.inference.model_selection import (
     TRIAL_CELLS,
@@ -32,7 +30,7 @@ from factorlib.inference.model_selection import (
 from factorlib.inference.options import Choices
 from factorlib.inference.problem import JointProblem
 from factorlib.inference.resume import Parts
-from factorlib.inference.start import Start, with_known
+from factorlib.inference.start import Start, on_cells, with_known
 from factorlib.inference.suns import suns_chosen
 
 MATERIALS = Schedule(lights=3, together=(6, 4))
@@ -56,7 +54,7 @@ def solve(problem: JointProblem, start: Start, choices: Choices = Choices(), par
     curves = parts.part("tone", Chosen, lambda: curves_chosen(sure, effects.fit, choices, parts.fit))
     distances = parts.part("distances", Chosen, lambda: distances_chosen(sure, curves.fit, choices, parts.fit))
     some, all_ = (of.sampled(choices.observations, choices.seed) for of in (sure, problem))
-    begun = on_all_cells(distances.fit, choices)
+    begun = on_cells(distances.fit, choices.cells, some)
     fit = parts.part("materials", Fit, lambda: parts.judged("materials and lights", some, begun, MATERIALS))
     split = parts.part("splitting", Chosen, lambda: split_while_gaining(some, fit, choices, parts))
     smooth = parts.part("lights", Fit, lambda: parts.judged("lights", all_, split.fit, LIGHTS))
@@ -92,15 +90,3 @@ def split_while_gaining(problem: JointProblem, fit: Fit, choices: Choices, parts
         if not one.kept or one.held_out_loss_without < (1 + WORTH) * one.held_out_loss_with:
             break
     return Chosen(fit, evidence)
-
-
-def on_all_cells(fit: Fit, choices: Choices) -> Fit:
-    """The fit with the lights of a trial on as many cells as the solve has; what is known, and an earlier solution's, keeps its own."""
-    cells, few, lights = even_cells(choices.cells), min(TRIAL_CELLS, choices.cells), []
-    for light in fit.point.lights:
-        if len(light) == few and not light.held.any():
-            radiance = light.lobes.radiance(cells.axis)
-            on = {"axis": cells.axis, "log_sharpness": np.log(cells.sharpness), "weight": radiance}
-            light = msgspec.structs.replace(light, **on).with_log_radiance(np.log(np.maximum(radiance, 1e-12)).T)
-        lights.append(light)
-    return fit.with_lights(lights)

@@ -120,7 +120,7 @@ class LightLikelihood(msgspec.Struct, frozen=True):
         value += loss / T
         factor = factorised(L)
         if not materials_given:
-            value += 2 * float(np.log(np.diag(factor)[: 3 * p]).sum()) - self.log_determinant
+            value += self._determinants(factor)
             covariance = inverse_of(factor[: 3 * p, : 3 * p])
             for part in parts:  # (2)
                 own, at = slice(part.channel * p, (part.channel + 1) * p), np.searchsorted(places, part.places)
@@ -129,6 +129,15 @@ class LightLikelihood(msgspec.Struct, frozen=True):
                 d_M[np.ix_(at, at)] += hessian
                 d_l[own] += by_cells
         return System(value, loss, places, g_m, M, g_l, C, L, factor, d_m, d_M, d_l, scores)
+
+    def marginal(self, system: System) -> float:
+        """Return the value of (1) at a minimum of φ whose system was made with the materials given."""
+        return system.value + self._determinants(system.factor)
+
+    def _determinants(self, factor: Float[np.ndarray, "l l"]) -> float:
+        """log det H − log det Q."""
+        p = 3 * int(self.light.free.sum())
+        return 2 * float(np.log(np.diag(factor)[:p]).sum()) - self.log_determinant
 
     def _prior(self) -> tuple[float, Float[np.ndarray, " l"]]:
         """uᵀQu and the Gaussians of exposures and tones, and half the gradient."""

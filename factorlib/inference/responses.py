@@ -211,7 +211,7 @@ class Tables:
     Fits that compare models have the same observations and lobes; only radiance, materials and weights differ.
     """
 
-    def __init__(self):
+    def __init__(self) -> None:
         self._known: OrderedDict[bytes, Reflections] = OrderedDict()
 
     def of(

@@ -16,15 +16,18 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Callable, Sequence
+from zlib import crc32
 
 import msgspec
 import numpy as np
 from jaxtyping import Float
+from scipy.spatial.transform import Rotation
 
 from factorlib.inference.blocks import Block
+from factorlib.inference.fit import Fit
 from factorlib.inference.forward import Illumination
 from factorlib.inference.gauge import connected_components
-from factorlib.inference.lights import TONE, Light, even_cells
+from factorlib.inference.lights import TONE, Light, UnitLobes, even_cells
 from factorlib.inference.materials import LEAST_REFLECTANCE, SHARPNESS, Materials, Point
 from factorlib.inference.noise import Loss
 from factorlib.inference.options import Choices
@@ -132,9 +135,29 @@ def constant_light(block: Block, materials: Materials, cells: int) -> Light:
     shown = [k for k in range(len(block.photos)) if (block.photo == k).any()]
     levels = np.zeros((len(block.photos), 3))
     levels[shown] = [np.log(np.mean(np.exp(logs[block.photo == k]), axis=0)) for k in shown]
-    lobes = even_cells(cells)
+    lobes = own_cells(block.name, cells)
     light = Light(lobes.axis, np.log(lobes.sharpness), np.ones((cells, 3)), (levels - levels[0]).mean(1))
     return light.with_log_radiance(np.repeat(levels[0][:, None], cells, axis=1))
+
+
+def own_cells(name: str, count: int) -> UnitLobes:
+    """Return `count` even cells, turned at random by the name of the illumination, so that what cells blur differs from light to light."""
+    cells, seed = even_cells(count), crc32(name.encode())
+    turn = Rotation.random(rng=np.random.default_rng(seed)).as_matrix()
+    return msgspec.structs.replace(cells, axis=cells.axis @ turn.T)
+
+
+def on_cells(fit: Fit, count: int, problem: JointProblem) -> Fit:
+    """Return a fit with its lights on `count` cells; what is known, and what had other cells than a trial's, keeps its own."""
+    lights = []
+    for light, block in zip(fit.point.lights, problem.blocks, strict=True):
+        if len(light) < count and not light.held.any() and not light.suns.any():
+            cells = own_cells(block.name, count)
+            radiance = light.lobes.radiance(cells.axis)
+            on = {"axis": cells.axis, "log_sharpness": np.log(cells.sharpness), "weight": radiance}
+            light = msgspec.structs.replace(light, **on).with_log_radiance(np.log(np.maximum(radiance, 1e-12)).T)
+        lights.append(light)
+    return fit.with_lights(lights)
 
 
 def known_point(problem: JointProblem, earlier: Earlier, names: Sequence[str], cells: int) -> Point:

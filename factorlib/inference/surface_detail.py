@@ -2,8 +2,10 @@
 
 start      materials and lights are fitted on few cells, with the shadows and bounces of the given meshes.  Lights are far away: where normals are wrong, near
            ones take up what turns should explain (rough set of seed 0: 3.5 instead of 3.1 degrees)
-stiffness  of each of `TURNS`, from stiff to soft, turns are found from all photos but one, for every photo in turn; that photo then gets a light of its
-           own, with the materials given.  The stiffness is used with which the photos are likeliest, lights integrated out (`factorlib.inference.likelihood`)
+stiffness  of each of `TURNS`, from stiff to soft, turns are found from all photos but those of one fold, for every fold in turn; a photo of that fold then
+           gets a light of its own, with the materials given.  The stiffness is used with which the photos are likeliest, lights integrated out
+           (`factorlib.inference.likelihood`); the search ends where that falls.  Every light has cells of its own (`factorlib.inference.start`):
+           were they the same, normals could turn toward their centres, and all photos would gain
 whether    turns are kept where the likelihood is higher than without turns, and the photos' held-out observations are explained better by more than `FOR`
            standard errors over clusters (`factorlib.inference.evidence`).  Of several meshes, those stay with which alone neither is better
 paint      factors on the diffuse reflectance likewise, of a stiffness of `FACTORS`, beside the turns and over what these explain; they are kept where the
@@ -18,19 +20,21 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Sequence
 from itertools import count
+from typing import NamedTuple
 
 import msgspec
 import numpy as np
 from jaxtyping import Bool, Float
 from scipy.sparse import block_diag, csr_array
 
-from factorlib.inference.evidence import FOR, Losses, compare, losses_of
+from factorlib.inference.evidence import AGAINST, FOR, Losses, compare, losses_of
 from factorlib.inference.fit import Fit, Schedule, fitted, likelihood_of, sure_ones
 from factorlib.inference.materials import Point
-from factorlib.inference.model_selection import TRIAL, effects_chosen
+from factorlib.inference.model_selection import TRIAL, TRIAL_CELLS, effects_chosen
+from factorlib.inference.optimizer import light_descended
 from factorlib.inference.options import Choices
 from factorlib.inference.problem import JointProblem
-from factorlib.inference.start import Start
+from factorlib.inference.start import Start, on_cells
 from factorlib.inference.surface_turns import Attached, Detail, Part, Stiffness, no_detail, part_of, step
 from factorlib.light.prior import LightPrior
 from factorlib.meshes.fine import Fine
@@ -39,10 +43,10 @@ from factorlib.results.materials import Decision
 TURNS = (1000.0, 300.0, 100.0, 30.0)  # stiffness of turns: a of `factorlib.inference.surface_turns`; b is a share of it
 FACTORS = (300.0, 100.0, 30.0, 10.0)  # of log factors
 ROUNDS = 3
-CELLS = 250  # of a light
-SETTLE = Schedule(together=(6, 4))
-BETWEEN = Schedule(together=(3,), estimate=False)
-OWN_LIGHT = Schedule(lights=6, estimate=False, given=True)
+CELLS, FOLDS = 250, 4  # cells of a light; folds of photos
+SETTLE = Schedule(lights=2, together=(3, 2), estimate=False)
+BETWEEN = Schedule(together=(2,), estimate=False)
+OWN_LIGHT = 2  # factorisations
 
 
 class Surfaces(msgspec.Struct, frozen=True):
@@ -161,32 +165,46 @@ class Trial(msgspec.Struct, frozen=True):
         """The names of these photos."""
         return [self.problem.blocks[k].photos[j] for k, j in self.photos]
 
-    def judged(self, details: Sequence[Detail], tick: Tick = lambda: None) -> Judged:
-        """Every photo by itself, on the surface that `details` has for it, in a light of its own, with the materials given; tick: called after each."""
+    def judged(self, details: Sequence[Detail], tick: Tick = lambda: None, plain: Judged | None = None) -> Judged:
+        """Judge every photo by itself, on the surface that `details` has for it, in a light of its own, with the materials given.
 
-        def alone(of: tuple[tuple[int, int], Detail]) -> tuple[float, Losses]:
+        plain: what photos say without detail, which is taken over where detail turns no normal of a photo;  tick: called after each
+        """
+
+        def alone(of: tuple[int, tuple[int, int], Detail]) -> tuple[float, Losses]:
             """One photo's value and losses."""
-            (k, number), detail = of
-            own, counts = self.problem.blocks[k].photo == number, [self.fit.hyperparameters[k]]
-            block = detail.on(self.problem.blocks[k].take(own), self.attached[k].take(own))
-            problem = self.problem.of([block])
-            begun = Fit(Point(self.fit.point.materials, [self.fit.point.lights[k]]), counts)
-            point = fitted(problem, begun, self.prior, OWN_LIGHT).point
-            (one,) = problem.fitted().illuminations(point)
-            judged = likelihood_of(one, counts[0], self.prior).system().value, losses_of(problem, point)
+            at, (k, number), detail = of
+            own = self.problem.blocks[k].photo == number
+            here = self.attached[k].take(own)
+            if plain is not None and not (np.any(detail.turn[here.node]) or np.any(detail.log_factor[here.node])):
+                tick()
+                return plain.values[at], Losses([plain.losses.values[at]], [plain.losses.clusters[at]])
+            problem = self.problem.of([detail.on(self.problem.blocks[k].take(own), here)])
+            begun = Point(self.fit.point.materials, [self.fit.point.lights[k]])
+            (one,) = problem.fitted().illuminations(begun)
+            likelihood = likelihood_of(one, self.fit.hyperparameters[k], self.prior, materials_given=True)
+            likelihood, system = light_descended(likelihood, OWN_LIGHT)
+            losses = losses_of(problem, Point(begun.materials, [likelihood.light]))
             tick()
-            return judged
+            return likelihood.marginal(system), losses
 
-        values, losses = zip(*self.problem.spread(alone, list(zip(self.photos, details, strict=True))), strict=True)
+        each = [(at, *pair) for at, pair in enumerate(zip(self.photos, details, strict=True))]
+        values, losses = zip(*self.problem.spread(alone, each), strict=True)
         return Judged(np.array(values), Losses(*([of[i][0] for of in losses] for i in (0, 1))))
 
     def left_out(self, parts: list[Part], laplacian: csr_array, stiffness: Stiffness, tick: Tick) -> list[Detail]:
-        """Find for every photo the surface that all others ask for; parts: of the mesh itself;  tick: called after each photo."""
+        """Find for every photo a surface that it had no part in: photos fall into at most `FOLDS` folds, and each takes that of the others.
 
-        def others(photo: tuple[int, int]) -> Detail:
-            """The detail that one photo has no part in."""
-            k, number = photo
-            gone = [(block.photo == number) & (j == k) for j, block in enumerate(self.problem.blocks)]
+        parts: of the mesh itself;  tick: called after each fold
+        """
+        photos, folds = self.photos, min(FOLDS, len(self.photos))
+
+        def others(fold: int) -> Detail:
+            """Return the detail that the photos of one fold have no part in."""
+            gone = [
+                np.isin(block.photo, [j for at, j in photos[fold::folds] if at == k])
+                for k, block in enumerate(self.problem.blocks)
+            ]
             rest = [part.without(rows) if rows.any() else part for part, rows in zip(parts, gone, strict=True)]
             rest = [part for part in rest if len(part.residual)]
             found = step(rest, laplacian, stiffness, no_detail(self.surfaces.nodes))
@@ -195,7 +213,53 @@ class Trial(msgspec.Struct, frozen=True):
             tick()
             return Detail(self.surfaces.turns_of(moved), found.log_factor)
 
-        return list(self.problem.spread(others, self.photos))
+        by_fold = list(self.problem.spread(others, range(folds)))
+        return [by_fold[number % folds] for number in range(len(photos))]
+
+
+class Best(NamedTuple):
+    """The likeliest of several stiffnesses: the surface of each photo, what photos say of it, and whether it is kept."""
+
+    stiffness: Stiffness
+    details: list[Detail]
+    judged: Judged
+    evidence: Decision
+
+
+class Search(msgspec.Struct, frozen=True):
+    """The search for detail of a trial; parts: of the mesh itself;  plain: what photos say without detail."""
+
+    trial: Trial
+    parts: list[Part]
+    laplacian: csr_array
+    plain: Judged
+    tick: Tick
+
+    def best(self, tried: Sequence[Stiffness], before: Judged, held_out: float, likelihood: float) -> Best:
+        """Return the likeliest stiffness, from stiff to soft until one is less likely than the one before, or the first is clearly against.
+
+        before: what photos say without it;  held_out, likelihood: by how many standard errors it must be better, in each of the two measures
+        """
+        found: Best | None = None
+        for one in tried:
+            details = self.trial.left_out(self.parts, self.laplacian, one, self.tick)
+            judged = self.trial.judged(details, self.tick, self.plain)
+            if found is not None and round(float(judged.values.sum() - found.judged.values.sum()), 3) >= 0:
+                break
+            found = Best(one, details, judged, evidence_of(judged, before, held_out, likelihood))
+            if judged.gain_over(before) < AGAINST:
+                break
+        assert found is not None
+        return found
+
+    def meshes_that_gain(self, turned: Sequence[Detail]) -> set[str]:
+        """Return the meshes that are better when they are turned alone."""
+        names = self.trial.surfaces.meshes
+        if len(names) == 1:
+            return set(names)
+        moving = [(name, [self.trial.moving(of, {name}) for of in turned]) for name in names]
+        judged = {name: self.trial.judged(details, self.tick, self.plain) for name, details in moving}
+        return {name for name, one in judged.items() if evidence_of(one, self.plain, 0.0, 0.0).kept}
 
 
 def found(
@@ -211,70 +275,56 @@ def found(
 
     problem: all observations;  attached: where each block's lie;  start: where materials and lights begin;  seed: of what is drawn
     """
-
-    def pieces(begin: float, end: float, number: int, what: str) -> Tick:
-        """What reports, whenever it is called, that one more of so many pieces of work is done."""
-        report(begin, what)
-        done = count(1)
-        return lambda *_: report(begin + (end - begin) * min(next(done) / number, 1.0), what)
-
-    sure = sure_ones(problem)
-    starts = start(sure, CELLS)
-    tick = pieces(0.0, 0.18, len(starts) * TRIAL.points + SETTLE.points, "materials and lights")
-    choices = Choices(self_shadowing="on", interreflection="on", seed=seed)
+    sure, pieces = sure_ones(problem), Pieces(report)
+    tick = pieces.of(0.0, 0.3, TRIAL.points + SETTLE.points, "materials and lights")
 
     def fitting(name: str, some: JointProblem, begun: Fit, schedule: Schedule) -> Fit:
         """A fit under the prior."""
         return fitted(some, begun, prior, schedule, tick)
 
-    effects = effects_chosen(sure, starts, choices, fitting)
-    fit = fitted(effects.of(problem), effects.fit, prior, SETTLE, tick)
+    choices = Choices(self_shadowing="on", interreflection="on", seed=seed)
+    effects = effects_chosen(sure, start(sure, TRIAL_CELLS), choices, fitting)
+    begun = on_cells(effects.fit, CELLS, problem)
+    fit = fitted(effects.of(problem), begun, prior, SETTLE, tick)
     trial, plain = Trial(effects.of(problem), fit, surfaces, attached, prior), no_detail(surfaces.nodes)
-    if len(trial.photos) < 2 or problem.none_held_out:
+    photos = len(trial.photos)
+    if photos < 2 or problem.none_held_out:
         return Found(Decision(False))
-    laplacian, parts, photos = surfaces.laplacian(), trial.parts(plain, fit), len(trial.photos)
-    given = trial.judged([plain] * photos, pieces(0.18, 0.2, photos, "photos without detail"))
-
-    def best(
-        tried: list[Stiffness], before: Judged, done: float, held_out: float, likelihood: float
-    ) -> tuple[Stiffness, list[Detail], Judged, Decision]:
-        """The likeliest of several stiffnesses, the surfaces it gives each photo, what photos say of them, and whether they are kept.
-
-        before: what photos say without it;  held_out, likelihood: by how many standard errors it must be better, in each of the two measures
-        """
-        details, judged = [], []
-        for number, one in enumerate(tried):
-            begin, end = (done + 0.3 * k / len(tried) for k in (number, number + 1))
-            tick = pieces(begin, end, 2 * photos, f"left-out photos, stiffness {one.factor or one.turn:g}")
-            details.append(trial.left_out(parts, laplacian, one, tick))
-            judged.append(trial.judged(details[-1], tick))
-        k = min(range(len(tried)), key=lambda i: round(float(judged[i].values.sum()), 3))
-        return tried[k], details[k], judged[k], evidence_of(judged[k], before, held_out, likelihood)
-
-    stiffness, turned, moved, evidence = best([Stiffness(a) for a in TURNS], given, 0.2, FOR, 0.0)
-    moving = set(surfaces.meshes)
-    if len(surfaces.meshes) > 1:  # those stay that, moved alone, are against it
-        tick = pieces(0.5, 0.55, photos * len(surfaces.meshes), "mesh by mesh")
-        alone = {name: trial.judged([trial.moving(of, {name}) for of in turned], tick) for name in surfaces.meshes}
-        moving = {name for name, judged in alone.items() if evidence_of(judged, given, 0.0, 0.0).kept}
-        if 0 < len(moving) < len(surfaces.meshes):
-            moved = trial.judged([trial.moving(of, moving) for of in turned])
-            evidence = evidence_of(moved, given, FOR, 0.0)
-    now = (stiffness, moved) if evidence.kept else (Stiffness(None), given)
-    tried = [Stiffness(now[0].turn, a) for a in FACTORS]
-    both, _, paint, painted = best(tried, now[1], 0.55, 0.0, FOR)
-    stiffness, judged = (both, paint) if painted.kept else now
-    gains = dict(zip(trial.names, (given.values - judged.values).tolist(), strict=True))
-    if not (evidence.kept or painted.kept):
-        return Found(evidence, painted)
+    laplacian, parts = surfaces.laplacian(), trial.parts(plain, fit)
+    tick = pieces.of(0.3, 0.85, 4 * len(TURNS) * photos, "left-out photos")
+    given = trial.judged([plain] * photos, tick)
+    search = Search(trial, parts, laplacian, given, tick)
+    turned = search.best([Stiffness(a) for a in TURNS], given, FOR, 0.0)
+    moving = search.meshes_that_gain(turned.details) if turned.judged.gain_over(given) > 0 else set()
+    if 0 < len(moving) < len(surfaces.meshes):
+        judged = trial.judged([trial.moving(of, moving) for of in turned.details], tick, given)
+        turned = turned._replace(judged=judged, evidence=evidence_of(judged, given, FOR, 0.0))
+    kept = turned if turned.evidence.kept else Best(Stiffness(None), [plain] * photos, given, turned.evidence)
+    painted = search.best([Stiffness(kept.stiffness.turn, a) for a in FACTORS], kept.judged, 0.0, FOR)
+    kept = painted if painted.evidence.kept else kept
+    gains = dict(zip(trial.names, (given.values - kept.judged.values).tolist(), strict=True))
+    if not (turned.evidence.kept or painted.evidence.kept):
+        return Found(turned.evidence, painted.evidence)
     detail = plain
     for number in range(ROUNDS):
-        tick = pieces(0.85 + 0.05 * number, 0.9 + 0.05 * number, BETWEEN.points, f"all photos, round {number + 1}")
+        tick = pieces.of(0.85 + 0.05 * number, 0.9 + 0.05 * number, BETWEEN.points, f"all photos, round {number + 1}")
         if number:
             fit = fitted(trial.on(detail), fit, prior, BETWEEN, tick)
             parts = trial.parts(detail, fit)
-        detail = step(parts, laplacian, stiffness, detail, surfaces.nodes_of(moving))
-    displacements = surfaces.displacements(detail.turn, attached) if evidence.kept else {}
+        detail = step(parts, laplacian, kept.stiffness, detail, surfaces.nodes_of(moving))
+    displacements = surfaces.displacements(detail.turn, attached) if turned.evidence.kept else {}
     displacements = {name: of for name, of in displacements.items() if name in moving}
-    factors = surfaces.by_mesh(detail.log_factor) if painted.kept else {}
-    return Found(evidence, painted, stiffness, gains, displacements, factors)
+    factors = surfaces.by_mesh(detail.log_factor) if painted.evidence.kept else {}
+    return Found(turned.evidence, painted.evidence, kept.stiffness, gains, displacements, factors)
+
+
+class Pieces(msgspec.Struct, frozen=True):
+    """The report of a search, in pieces of work."""
+
+    report: Report
+
+    def of(self, begin: float, end: float, number: int, what: str) -> Tick:
+        """Return what reports, whenever it is called, that one more of so many pieces of work is done."""
+        self.report(begin, what)
+        done = count(1)
+        return lambda *_: self.report(begin + (end - begin) * min(next(done) / number, 1.0), what)

@@ -15,10 +15,9 @@ from typing import TypeVar
 
 import numpy as np
 from jaxtyping import Float
-from torch import Tensor
 
 LONGEST = 0.5  # of |X|: a point that lies more than halfway to the light is taken to lie halfway
-A = TypeVar("A", np.ndarray, Tensor)
+A = TypeVar("A")  # np.ndarray or torch.Tensor
 
 
 def met_from(place: A, normal: A, view: A, axis: A, curvature: float) -> tuple[A, A, A]:

@@ -8,6 +8,7 @@ Texel averages   A texel holds the mean of the light over its area, so a sharp l
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from functools import cache
 
 import numpy as np
@@ -16,7 +17,7 @@ from jaxtyping import Float
 from factorlib.conventions import YUP_FROM_CAMERA, lat_long_directions, lat_long_of_direction, lat_long_solid_angles
 from factorlib.light.lobes import Lobes
 
-LARGEST_EXPONENT = 40.0  # e⁻⁴⁰: beyond, a lobe is nil
+LARGEST_EXPONENT = 25.0  # e⁻²⁵: beyond, a lobe is nil
 LEAST_NODES, NODES_PER_WIDTH = 3, 1.5  # Gauss nodes along a texel's side, and how many more per lobe width 1/√λ in it
 
 Map = Float[np.ndarray, "h w 3"]
@@ -24,33 +25,47 @@ Map = Float[np.ndarray, "h w 3"]
 
 def lat_long_of_lobes(lobes: Lobes, height: int, width: int) -> Map:
     """Texel area averages of the light, in the frame of the exported maps: the y-up turn of the lobes' own frame."""
+    tall, wide = np.pi / height, 2 * np.pi / width
+
+    def nodes(sharpness: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Gauss nodes in every row and column."""
+        node, share = gauss_nodes(LEAST_NODES + int(NODES_PER_WIDTH * max(tall, wide) * np.sqrt(sharpness)))
+        return (np.arange(height)[:, None] + node) * tall, (np.arange(width)[:, None] + node) * wide, share
+
+    return lattice_of_lobes(lobes, height, width, nodes)
+
+
+def lattice_of_lobes(
+    lobes: Lobes, height: int, width: int, nodes: Callable[[float], tuple[np.ndarray, np.ndarray, np.ndarray]]
+) -> Map:
+    """Averages of the light over nodes of each row and column, in the y-up turn of the lobes' own frame.
+
+    nodes: for a sharpness, θ from the top [h, g], φ from the left edge [w, g], and the nodes' shares [g]
+    """
     result = np.zeros((height, width, 3))
     lobes = lobes.turned(YUP_FROM_CAMERA)
     row, column = lat_long_of_direction(lobes.axis)
+    lit = lobes.weight.any(axis=1)
     for theta, phi, sharpness, weight in zip(
-        np.pi * row, 2 * np.pi * column, lobes.sharpness, lobes.weight, strict=True
+        np.pi * row[lit], 2 * np.pi * column[lit], lobes.sharpness[lit], lobes.weight[lit], strict=True
     ):
-        if weight.any():
-            rows, columns, mean = _texel_means(theta, phi, sharpness, height, width)
-            result[rows[:, None], columns] += mean[..., None] * weight
+        rows, columns, mean = _means(theta, phi, sharpness, *nodes(sharpness))
+        result[rows[:, None], columns] += mean[..., None] * weight
     return result
 
 
-def _texel_means(
-    theta_z: float, phi_z: float, sharpness: float, height: int, width: int
+def _means(
+    theta_z: float, phi_z: float, sharpness: float, theta: np.ndarray, phi: np.ndarray, share: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Rows [r], columns [c] that a unit lobe reaches, and its means there [r, c]; φ counts from the left edge."""
-    tall, wide = np.pi / height, 2 * np.pi / width
-    node, share = gauss_nodes(LEAST_NODES + int(NODES_PER_WIDTH * max(tall, wide) * np.sqrt(sharpness)))
-    theta = (np.arange(height)[:, None] + node) * tall  # [h, g]
-    polar = 2 * np.sin((theta - theta_z) / 2) ** 2
+    """Rows [r] and columns [c] that a unit lobe reaches, and its means there [r, c]."""
+    polar = 2 * np.sin((theta - theta_z) / 2) ** 2  # [h, g]
     rows = np.flatnonzero(sharpness * polar.min(axis=1) < LARGEST_EXPONENT)
     theta, polar = theta[rows], polar[rows]
     scale = 2 * np.sin(theta) * np.sin(theta_z)
-    azimuthal = np.sin(((np.arange(width)[:, None] + node) * wide - phi_z) / 2) ** 2  # [w, g]
-    columns = np.flatnonzero(sharpness * scale.min(initial=0) * azimuthal.min(axis=1) < LARGEST_EXPONENT)
-    across = np.stack([np.exp(-sharpness * s[:, None, None] * azimuthal[columns]) @ share for s in scale])  # [r, g, c]
-    area = share * np.sin(theta)
+    azimuthal = np.sin((phi - phi_z) / 2) ** 2  # [w, g]
+    columns = np.flatnonzero(sharpness * scale.min(initial=2) * azimuthal.min(axis=1) < LARGEST_EXPONENT)
+    across = np.exp(-sharpness * scale[..., None, None] * azimuthal[columns]) @ share  # [r, g, c]
+    area = share * np.maximum(np.sin(theta), 1e-12)  # a node may be a pole
     down = area / area.sum(axis=1, keepdims=True) * np.exp(-sharpness * polar)
     return rows, columns, np.einsum("rg,rgc->rc", down, across)
 

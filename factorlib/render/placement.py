@@ -9,7 +9,6 @@ from collections.abc import Callable, Iterator
 
 import msgspec
 import numpy as np
-import open3d as o3d
 from jaxtyping import Float
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
@@ -17,6 +16,7 @@ from scipy.spatial.transform import Rotation
 
 from factorlib.conventions import YUP_FROM_CAMERA
 from factorlib.errors import InputError
+from factorlib.geometry import open3d as o3d
 from factorlib.geometry.camera import rotation_of_vector
 from factorlib.geometry.raster import Caster
 from factorlib.meshes.mesh import Mesh

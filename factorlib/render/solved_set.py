@@ -21,8 +21,8 @@ from factorlib.recipe.schema import BALL, AssumedSun, is_light_file, is_mesh_fil
 from factorlib.render.ground import Plane, resting_plane
 from factorlib.render.insertion import Ground
 from factorlib.render.photo_scene import Light, PhotoScene, Placed, with_sun
-from factorlib.render.resynthesis import light_of
 from factorlib.render.traced import Tone, as_it_is
+from factorlib.results.lobes import light_of
 from factorlib.results.materials import MaterialTable, Reflectance, read_materials, reflectances
 from factorlib.results.poses import PhotoPoses, read_poses
 from factorlib.results.surface import read_surface

@@ -10,6 +10,7 @@ import numpy as np
 from jaxtyping import Bool, Float, UInt8
 from PIL.ImageColor import getrgb
 from scipy.ndimage import binary_erosion
+from scipy.sparse import csr_array
 
 from factorlib.conventions import lat_long_solid_angles
 from factorlib.dataset.schema import ObjectsSlice
@@ -53,15 +54,15 @@ def reduced(picture: Float[np.ndarray, "h w c"], longest: int) -> Float[np.ndarr
     if scale == 1.0:
         return picture
 
-    def averaging(source: int) -> Float[np.ndarray, "target source"]:
-        """Row t holds the share of each source cell in target cell t."""
-        target = max(1, round(source * scale))
-        edges, cells = np.arange(target + 1) * (source / target), np.arange(source)
+    def averaged(rows: Float[np.ndarray, "n m c"]) -> Float[np.ndarray, "N m c"]:
+        """Fewer rows: means over the share of each source row in the target row."""
+        target = max(1, round(len(rows) * scale))
+        edges, cells = np.arange(target + 1) * (len(rows) / target), np.arange(len(rows))
         overlap = np.minimum(edges[1:, None], cells + 1) - np.maximum(edges[:-1, None], cells)
-        return (np.maximum(overlap, 0) * (target / source)).astype(np.float32)
+        means = csr_array(np.maximum(overlap, 0) * (target / len(rows))) @ rows.reshape(len(rows), -1)
+        return means.reshape(target, *rows.shape[1:]).astype(np.float32)
 
-    narrow = np.einsum("Ww,hwc->hWc", averaging(width), picture, optimize=True)
-    return np.einsum("Hh,hwc->Hwc", averaging(height), narrow, optimize=True)
+    return averaged(averaged(picture).swapaxes(0, 1)).swapaxes(0, 1)
 
 
 def box_of(mask: Bool[np.ndarray, "h w"], margin: float = 0.06) -> tuple[slice, slice]:

@@ -12,7 +12,6 @@ from typing import Any
 
 import msgspec
 import numpy as np
-import open3d as o3d
 import trimesh
 from jaxtyping import Float, Int
 
@@ -20,6 +19,7 @@ from factorlib.conventions import YUP_FROM_CAMERA
 from factorlib.dataset.schema import LightSlice, ObjectsSlice
 from factorlib.export.environment import sharpened
 from factorlib.export.gltf import read_part_materials, variant_name
+from factorlib.geometry import open3d as o3d
 from factorlib.geometry.camera import Pose
 from factorlib.geometry.raster import unit
 from factorlib.geometry.sphere import fibonacci_sphere
@@ -213,9 +213,9 @@ def _sight(mesh: Mesh, sides: Mesh) -> dict[str, Any]:
     outward = unit(outward * np.where(np.sum(outward * sides.normals, 1, keepdims=True) < 0, -1, 1))
     points = Points(sides.vertices + LIFT * mesh.radius * outward, outward, np.ones(len(outward), bool))
     pairs = []
-    for vertex, k, face, normal in occluders.hidden_from(points, sides.normals, directions):
+    for vertex, k, face, turned in occluders.hidden_from(points, sides.normals, directions):
         met = mesh.faces[face, 0].astype(np.int64)
-        behind = np.sum(normal * mesh.normals[met], 1) < 0
+        behind = np.sum(occluders.turned(face, turned) * mesh.normals[met], 1) < 0
         met = np.where((face < 0) | behind & (not mesh.open), len(outward), met + np.where(behind, single, 0))
         pairs.append(np.stack([vertex, k, met])[:, np.sum(sides.normals[vertex] * directions[k], 1) > 0])
     vertex, k, met = np.concatenate(pairs, axis=1)

@@ -1,6 +1,7 @@
 """lobes.parquet of `solve` and `export`: the light of each illumination, one row per lobe."""
 
 import json
+import logging
 from collections.abc import Mapping
 from pathlib import Path
 
@@ -9,14 +10,17 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 
+from factorlib.dataset.schema import LightSlice
 from factorlib.light.lobes import Lobes
 from factorlib.parquetfile import read_columns
 from factorlib.reading import reading
+from factorlib.results.materials import read_exposures
 from factorlib.wholefile import writing
 
 FRAME = "camera frame of the illumination's photo (OpenCV: x right, y down, z forward), or the world where its photos give world_from_camera"
 COLUMNS = ("axis_x", "axis_y", "axis_z", "sharpness", "weight_r", "weight_g", "weight_b")
 WHAT, CURE = "a table of lobes", "run the stage `solve` again"
+log = logging.getLogger("factorlib.results")
 
 
 def write_lobes(path: str | Path, lights: Mapping[str, Lobes]) -> None:
@@ -45,3 +49,16 @@ def read_lobes(path: str | Path, cure: str = CURE) -> dict[str, Lobes]:
             raise ValueError("a lobe of an illumination that its metadata do not name")
     parts = {name: values[illumination == name] for name in names}
     return {name: Lobes(part[:, :3].copy(), part[:, 3].copy(), part[:, 4:].copy()) for name, part in parts.items()}
+
+
+def light_of(exported: Path, photo: str, light: LightSlice) -> Lobes:
+    """Read the light of a photo as pictures are made in it: lobes in the photo's own camera axes, its exposure included.
+
+    exported: the folder of `export`'s result, whose gauge the light is in
+    """
+    lobes = read_lobes(exported / "lobes.parquet")[light.illumination]
+    if len(lobes) == 0:
+        log.warning("%s: nothing is known of its light: its pictures are black", photo)
+    if light.world_from_camera is not None:
+        lobes = lobes.turned(np.array(light.world_from_camera).T)
+    return lobes.scaled(np.array(read_exposures(exported / "exposures.json").get(photo, 1.0)))

@@ -14,11 +14,11 @@ from collections.abc import Callable
 from functools import cache
 
 import numpy as np
-import open3d as o3d
 from jaxtyping import Float
 
 from factorlib.generate.chair import dowel, legs, shell
 from factorlib.generate.shapes import BUMPS, revolved
+from factorlib.geometry import open3d as o3d
 from factorlib.meshes.mesh import Mesh, closed_grid
 from factorlib.meshes.read import CREASE_DEG, usable
 from factorlib.meshes.soup import Soup, no_normals

@@ -7,7 +7,7 @@ from scipy.ndimage import binary_erosion
 
 from factorlib.conventions import YUP_FROM_CAMERA
 from factorlib.dataset.schema import LightSlice
-from factorlib.export.environment import mitsuba_map, node_directions, sharpened
+from factorlib.export.environment import mitsuba_map, sharpened
 from factorlib.export.mitsuba import write_scene
 from factorlib.export.scene import DIRECT, ExposedMap, Scene, Shape
 from factorlib.geometry.camera import Camera
@@ -18,9 +18,10 @@ from factorlib.meshes.read import read_mesh
 from factorlib.reflection.reference import Reference
 from factorlib.render.photo_scene import PhotoScene, Placed, traced_photo
 from factorlib.render.reflect import Reflector
-from factorlib.render.resynthesis import light_of, resynthesised
+from factorlib.render.resynthesis import resynthesised
+from factorlib.results.lobes import light_of
 from factorlib.results.materials import Reflectance, read_materials
-from factorlib.tracing.scene import paint, rigid
+from factorlib.tracing.scene import node_directions, paint, rigid
 from factorlib.tracing.variant import mitsuba
 from tests.export import made_export
 
@@ -179,6 +180,13 @@ def test_map_for_mitsuba_keeps_energy_and_direction(sharpness):
     assert values.sum() == pytest.approx(lobe.energy[0], rel=2e-3)
     mean = np.einsum("hw,hwk->k", values, node_directions(256, 512))
     np.testing.assert_allclose(mean / np.linalg.norm(mean), YUP_FROM_CAMERA @ axis, atol=2e-3)
+
+
+@pytest.mark.parametrize("axis", [(0, 1, 0), (0, 0.995, -0.0998749218), (0, 0.6, 0.8)], ids=["pole", "near it", "seam"])
+def test_map_for_mitsuba_is_the_lights_radiance_at_its_nodes(axis):
+    lobe, directions = one_lobe(axis, 50.0), node_directions(32, 64)
+    expected = sharpened(lobe, np.pi / 31).turned(YUP_FROM_CAMERA).radiance(directions.reshape(-1, 3))
+    np.testing.assert_allclose(mitsuba_map(lobe, 32, 64), expected.reshape(directions.shape), rtol=1e-6, atol=1e-6)
 
 
 def test_sharpening_undoes_what_interpolation_widens():

@@ -2,12 +2,12 @@
 
 import msgspec
 import numpy as np
-import open3d
 import pytest
 import trimesh
 
 from factorlib.errors import InputError
 from factorlib.generate.shapes import SHAPES
+from factorlib.geometry import open3d
 from factorlib.shapes.hull import surface_nets, visual_hull
 from factorlib.shapes.lathe import Turned, body_of_revolution, largest_discs
 from factorlib.shapes.outline import Triangles
