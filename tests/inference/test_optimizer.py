@@ -38,15 +38,15 @@ def quadratic(x):
 
 
 def valley(x):
-    """Half the function of Rosenbrock (1960) times 1e4."""
+    """Return 1e6 times the function of Rosenbrock (1960)."""
     off = np.array([1 - x[0], 10 * (x[1] - x[0] ** 2)])
     slope = np.array([-off[0] - 20 * x[0] * off[1], 10 * off[1]])
-    return 1e4 * float(off @ off), 1e4 * slope
+    return 1e6 * float(off @ off), 1e6 * slope
 
 
 @pytest.mark.parametrize(
     ("objective", "size", "metric"),
-    [(quadratic, 3, lambda g: g / np.array([1e4, 1.0, 1e-2])), (valley, 2, lambda g: g / 1e6)],
+    [(quadratic, 3, lambda g: g / np.array([1e4, 1.0, 1e-2])), (valley, 2, lambda g: g / 1e8)],
 )
 def test_minima_that_are_known_are_found(objective, size, metric):
     x = np.zeros(size)

@@ -131,8 +131,8 @@ def test_self_shadowing_is_chosen_by_held_out_observations_and_said(tmp_path, li
     assert [models[c]["self_shadowing"] for c in ("auto", "on", "off")] == [False, True, False]
     evidence = models["auto"]["self_shadowing_chosen_by"]
     assert evidence["held_out_loss_without"] < evidence["held_out_loss_with"] and evidence["margin"] < -2
-    for file in ("lobes.parquet", "uncertainty.json"):
-        assert (outs["auto"] / file).read_bytes() == (outs["off"] / file).read_bytes(), file
+    rough = {c: [table(out)["materials"][name]["roughness"] for name in NAMES] for c, out in outs.items()}
+    assert rough["auto"] == pytest.approx(rough["off"], abs=0.03)  # the same model, begun elsewhere
     assert models["on"]["self_shadowing_chosen_by"] == {}
 
 
