@@ -29,7 +29,7 @@ from factorlib.inference.observed import blocks_of_observations, gathered, usabl
 from factorlib.inference.paper_solver import REPORTS, Paper, Prior, Samplings
 from factorlib.inference.paper_solver import solve as solve_as_the_paper
 from factorlib.inference.problem import JointProblem
-from factorlib.inference.resume import Parts
+from factorlib.inference.resume import Run
 from factorlib.inference.start import from_earlier, from_nothing, with_decided
 from factorlib.inference.uncertainty import uncertainty_of
 from factorlib.jsonfile import write_json
@@ -162,7 +162,7 @@ def _solved(
     unfinished = Checkpoint(inputs.unfinished / "solve.pt" if inputs.unfinished else None)
     start = from_earlier(earlier, names) if earlier else from_nothing(len(names))
     choices = with_decided(params, earlier) if earlier else params
-    return solve(problem, start, choices, Parts(unfinished, of_parts(progress, choices)))
+    return solve(problem, start, choices, Run(unfinished, of_parts(progress, choices)))
 
 
 def _warn(sentences: Iterable[str]) -> None:

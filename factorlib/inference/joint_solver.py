@@ -7,31 +7,34 @@
     lights      given the materials, lights are fitted to observations of any confidence
     suns        each light is tried with a sun in place of its brightest cells (`factorlib.inference.suns`)
 
-Every part is a function of the one before it, and is kept once it is done (`factorlib.inference.resume`).
+Every step is a function of the state before it, and `Run` keeps each state (`factorlib.inference.resume`).
 """
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
+import msgspec
 import numpy as np
 
 from factorlib.inference.evidence import FINER, compare, losses_of
-from factorlib.inference.fit import Fit, Schedule, sure_ones
+from factorlib.inference.fit import Fit, Schedule, start_of, sure_ones
 from factorlib.inference.gauge import in_gauge
 from factorlib.inference.history import Solution
 from factorlib.inference.materials import Point
 from factorlib.inference.model_selection import (
     TRIAL_CELLS,
     Chosen,
-    Effects,
     curves_chosen,
     distances_chosen,
     effects_chosen,
 )
 from factorlib.inference.options import Choices
 from factorlib.inference.problem import JointProblem
-from factorlib.inference.resume import Parts
+from factorlib.inference.resume import Run
 from factorlib.inference.start import Start, on_cells, with_known
 from factorlib.inference.suns import suns_chosen
+from factorlib.results.materials import Decision
 
 MATERIALS = Schedule(lights=3, together=(6, 4))
 AFTER_SPLITTING = Schedule(lights=2, together=(3, 2), estimate=False)
@@ -42,47 +45,138 @@ WORTH = 0.05  # of the held-out loss; after a splitting that gained 3 %, two mor
 SMALLEST = 0.5
 
 
-def solve(problem: JointProblem, start: Start, choices: Choices = Choices(), parts: Parts | None = None) -> Solution:
-    """The answer, in the gauge of `factorlib.inference.gauge`.
+class Asked(msgspec.Struct, frozen=True):
+    """Question that a solve answers.  problem: all observations, its loss judges those that are held out;  run: makes fits."""
 
-    problem: all observations, its loss judges those that are held out;  parts: those that are done already, and who is told
+    problem: JointProblem
+    start: Start
+    choices: Choices
+    run: Run
+
+    def sure(self, state: State) -> JointProblem:
+        """Return the observations whose normals are sure, with the effects that were chosen."""
+        return sure_ones(self.problem).with_effects(state.shadows.kept, state.bounces.kept)
+
+    def sampled(self, problem: JointProblem) -> JointProblem:
+        """Return as many observations of a light as are fitted."""
+        return problem.sampled(self.choices.observations, self.choices.seed)
+
+
+class State(msgspec.Struct, frozen=True):
+    """A solve after some of its steps.
+
+    fit         of the last step;  materials: of the last step that fitted materials
+    shadows, bounces, tone, distances, splitting, suns: what was decided, of each light or of each splitting where there are several
     """
-    parts, sure = parts or Parts(), sure_ones(problem)
-    points = [with_known(point, sure) for point in start(sure, min(TRIAL_CELLS, choices.cells))]
-    effects = parts.part("effects", Effects, lambda: effects_chosen(sure, points, choices, parts.fit))
-    problem, sure = effects.of(problem), effects.of(sure)
-    curves = parts.part("tone", Chosen, lambda: curves_chosen(sure, effects.fit, choices, parts.fit))
-    distances = parts.part("distances", Chosen, lambda: distances_chosen(sure, curves.fit, choices, parts.fit))
-    some, all_ = (of.sampled(choices.observations, choices.seed) for of in (sure, problem))
-    begun = on_cells(distances.fit, choices.cells, some)
-    fit = parts.part("materials", Fit, lambda: parts.judged("materials and lights", some, begun, MATERIALS))
-    split = parts.part("splitting", Chosen, lambda: split_while_gaining(some, fit, choices, parts))
-    smooth = parts.part("lights", Fit, lambda: parts.judged("lights", all_, split.fit, LIGHTS))
-    suns = parts.part("suns", Chosen, lambda: suns_chosen(all_, smooth, parts))
-    answer = in_gauge(suns.fit.point, problem.blocks, problem.known)
+
+    fit: Fit
+    materials: Fit
+    shadows: Decision = Decision(False)
+    bounces: Decision = Decision(False)
+    tone: list[Decision] = []
+    distances: list[Decision] = []
+    splitting: list[Decision] = []
+    suns: list[Decision] = []
+
+    def after(self, fit: Fit, **decided: Decision | list[Decision]) -> State:
+        """Return the state after a step of materials and lights."""
+        return msgspec.structs.replace(self, fit=fit, materials=fit, **decided)
+
+
+def solve(problem: JointProblem, start: Start, choices: Choices = Choices(), run: Run | None = None) -> Solution:
+    """Return the answer, in the gauge of `factorlib.inference.gauge`."""
+    run = run or Run()
+    asked = Asked(problem, start, choices, run)
+    begun = start_of(starting_points(asked)[0])
+    state = run.completed(STEPS, asked, State(begun, begun))
+    answer = in_gauge(state.fit.point, problem.blocks, problem.known)
     return Solution(
         Point(problem.known.put(answer.materials), answer.lights),
-        parts.history,
+        run.history,
         problem.loss,
-        shadows=effects.shadows,
-        interreflection=effects.bounces,
-        tone=curves.evidence,
-        distances=distances.evidence,
-        splitting=split.evidence,
-        suns=suns.evidence,
-        materials=split.fit,
-        lights=suns.fit,
+        materials=state.materials,
+        lights=state.fit,
+        shadows=state.shadows,
+        interreflection=state.bounces,
+        tone=state.tone,
+        distances=state.distances,
+        splitting=state.splitting,
+        suns=state.suns,
     )
 
 
-def split_while_gaining(problem: JointProblem, fit: Fit, choices: Choices, parts: Parts) -> Chosen:
-    """Splitting after splitting, until there were `Choices.splittings`.  One that does not explain held-out observations better by more than
-    FINER standard errors is undone and the last; one that lowers their loss by less than WORTH is kept and the last."""
+def starting_points(asked: Asked) -> list[Point]:
+    """Return the points from which the first trial starts; of the fits, the best goes on."""
+    sure, cells = sure_ones(asked.problem), min(TRIAL_CELLS, asked.choices.cells)
+    return [with_known(point, sure) for point in asked.start(sure, cells)]
+
+
+def choose_effects(asked: Asked, state: State) -> State:
+    """Choose shadows and bounces."""
+    chosen = effects_chosen(sure_ones(asked.problem), starting_points(asked), asked.choices, asked.run.fit)
+    return state.after(chosen.fit, shadows=chosen.shadows, bounces=chosen.bounces)
+
+
+def choose_tone(asked: Asked, state: State) -> State:
+    """Choose tone curves."""
+    chosen = curves_chosen(asked.sure(state), state.fit, asked.choices, asked.run.fit)
+    return state.after(chosen.fit, tone=chosen.evidence)
+
+
+def choose_distances(asked: Asked, state: State) -> State:
+    """Choose distances of lights."""
+    chosen = distances_chosen(asked.sure(state), state.fit, asked.choices, asked.run.fit)
+    return state.after(chosen.fit, distances=chosen.evidence)
+
+
+def fit_materials(asked: Asked, state: State) -> State:
+    """Fit materials and lights on all cells."""
+    some = asked.sampled(asked.sure(state))
+    begun = on_cells(state.fit, asked.choices.cells, some)
+    return state.after(asked.run.judged("materials and lights", some, begun, MATERIALS))
+
+
+def split_cells(asked: Asked, state: State) -> State:
+    """Split the cells that hold most energy."""
+    chosen = split_while_gaining(asked.sampled(asked.sure(state)), state.fit, asked.choices, asked.run)
+    return state.after(chosen.fit, splitting=chosen.evidence)
+
+
+def fit_lights(asked: Asked, state: State) -> State:
+    """Fit lights to observations of any confidence, the materials given."""
+    all_ = asked.sampled(asked.problem.with_effects(state.shadows.kept, state.bounces.kept))
+    return msgspec.structs.replace(state, fit=asked.run.judged("lights", all_, state.fit, LIGHTS))
+
+
+def choose_suns(asked: Asked, state: State) -> State:
+    """Choose suns, the materials given."""
+    all_ = asked.sampled(asked.problem.with_effects(state.shadows.kept, state.bounces.kept))
+    chosen = suns_chosen(all_, state.fit, asked.run)
+    return msgspec.structs.replace(state, fit=chosen.fit, suns=chosen.evidence)
+
+
+STEPS: dict[str, Callable[[Asked, State], State]] = {
+    "effects": choose_effects,
+    "tone": choose_tone,
+    "distances": choose_distances,
+    "materials": fit_materials,
+    "splitting": split_cells,
+    "lights": fit_lights,
+    "suns": choose_suns,
+}
+
+
+def split_while_gaining(problem: JointProblem, fit: Fit, choices: Choices, run: Run) -> Chosen:
+    """Split cells at most `Choices.splittings` times.
+
+    A splitting that does not explain held-out observations better by more than FINER standard errors is undone, and the last.  One that lowers
+    their loss by less than WORTH is kept, and the last.
+    """
     evidence, before = [], losses_of(problem, fit.point)
     for number in range(0 if problem.none_held_out else choices.splittings):
         smallest = 2 * np.radians(SMALLEST)
         lights = [one if one.held.any() else one.split(one.brightest(SPLIT, smallest)) for one in fit.point.lights]
-        trial = parts.judged(f"splitting {number + 1}", problem, fit.with_lights(lights), AFTER_SPLITTING)
+        trial = run.judged(f"splitting {number + 1}", problem, fit.with_lights(lights), AFTER_SPLITTING)
         after = losses_of(problem, trial.point)
         evidence.append(one := compare(before, after, FINER))
         if one.kept:

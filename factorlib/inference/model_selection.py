@@ -70,10 +70,11 @@ def sample_of(problem: JointProblem, choices: Choices) -> JointProblem:
 def effects_chosen(problem: JointProblem, starts: list[Point], choices: Choices, fit: Fitting) -> Effects:
     """Shadows and bounces; problem: sure observations;  starts: the one that ends best is used."""
     sample, hidden = sample_of(problem, choices), any(block.visibility is not None for block in problem.blocks)
-    unjudged = problem.none_held_out  # then what is there anyway stays, and nothing further is added
-    asked = {"on": True, "off": False}
-    shadows = hidden and asked.get(choices.self_shadowing, True if unjudged else None)
-    bounces = problem.has_bounces and asked.get(choices.interreflection, False if unjudged else None)
+    # where nothing is held out, what meshes hide is hidden, and nothing further is added
+    unjudged = problem.none_held_out
+    shadows = ("on" if unjudged else "auto") if choices.self_shadowing == "auto" else choices.self_shadowing
+    bounces = ("off" if unjudged else "auto") if choices.interreflection == "auto" else choices.interreflection
+    shadows, bounces = shadows if hidden else "off", bounces if problem.has_bounces else "off"
     tried: dict[tuple[bool, bool], tuple[Fit, Losses]] = {}
 
     def trial(with_shadows: bool, with_bounces: bool) -> tuple[Fit, Losses]:
@@ -87,11 +88,14 @@ def effects_chosen(problem: JointProblem, starts: list[Point], choices: Choices,
             tried[with_shadows, with_bounces] = min(trials, key=lambda one: _geometric_mean(one[1]))
         return tried[with_shadows, with_bounces]
 
-    trial(shadows is None or shadows, bool(bounces) and shadows is not False)
-    said = Decision(shadows) if shadows is not None else compare(trial(False, False)[1], trial(True, False)[1], AGAINST)
+    trial(shadows != "off", shadows != "off" and bounces == "on")
+    said, lit = Decision(shadows == "on"), Decision(bounces == "on")
+    if shadows == "auto":
+        said = compare(trial(False, False)[1], trial(True, False)[1], AGAINST)
     if not said.kept:
         return Effects(trial(False, False)[0], said, Decision(False))
-    lit = Decision(bounces) if bounces is not None else compare(trial(True, False)[1], trial(True, True)[1], FOR)
+    if bounces == "auto":
+        lit = compare(trial(True, False)[1], trial(True, True)[1], FOR)
     return Effects(trial(True, lit.kept)[0], said, lit)
 
 

@@ -1,13 +1,13 @@
-"""The parts of a solve: each is done once, said as it is done, and kept, so that a solve that was killed goes on and ends in the same bytes.
+"""The run of a solve: each step is done once and kept, so that a solve that was killed goes on and ends in the same bytes.
 
-Every part (the choice of effects, the fit of materials, the splittings, …) is a deterministic function of the part before it, so a part that was
+Every step (the choice of effects, the fit of materials, the splittings, …) is a deterministic function of the state before it, so a state that was
 saved need not be computed again.  Even without a stop the solve goes on from the saved form: the memory layout of an array can change the order
 of a sum, and so the last bits.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from typing import Any, TypeVar, get_args, get_type_hints
 
 import msgspec
@@ -20,7 +20,7 @@ from factorlib.inference.history import Event, Report, unreported
 from factorlib.inference.problem import JointProblem
 from factorlib.light.prior import LightPrior, read_light_prior
 
-T = TypeVar("T")
+T, Q = TypeVar("T"), TypeVar("Q")
 
 
 def plain(value: Any) -> Any:
@@ -42,8 +42,8 @@ def restored(type_: type[T], value: Any) -> T:
     return [restored(*get_args(type_), item) for item in value] if isinstance(value, list) else value
 
 
-class Parts:
-    """What is done part by part: each part is kept with its events, which are reported and remembered.
+class Run:
+    """Fits under one prior, and the states that they lead to: each is kept with its events, which are reported and remembered.
 
     checkpoint: of no file, it keeps nothing beyond this process (a notebook, a test);  report: called at every point that is tried;  prior: on
     lights; None: the one that is shipped
@@ -55,16 +55,18 @@ class Parts:
         self.report, self.prior, self.history = report, prior or read_light_prior(), list[Event]()
         self._checkpoint, self._kept = checkpoint, checkpoint.load() or {}
 
-    def part(self, name: str, type_: type[T], compute: Callable[[], T]) -> T:
-        """The part as it was saved, or computed now and saved; its events join the history."""
-        if name in self._kept:
-            for event in restored(list[Event], self._kept[f"{name}, events"]):
-                self._happened(event)
-        else:
-            before, value = len(self.history), compute()
-            self._kept |= {f"{name}, events": plain(self.history[before:]), name: plain(value)}
-            self._checkpoint.save(self._kept)
-        return restored(type_, self._kept[name])
+    def completed(self, steps: Mapping[str, Callable[[Q, T], T]], asked: Q, state: T) -> T:
+        """Return the state after all steps; those that an earlier run has done are not done again."""
+        for name, step in steps.items():
+            if name in self._kept:
+                for event in restored(list[Event], self._kept[f"{name}, events"]):
+                    self._happened(event)
+            else:
+                before, after = len(self.history), step(asked, state)
+                self._kept |= {f"{name}, events": plain(self.history[before:]), name: plain(after)}
+                self._checkpoint.save(self._kept)
+            state = restored(type(state), self._kept[name])
+        return state
 
     def fit(self, phase: str, problem: JointProblem, start: Fit, schedule: Schedule) -> Fit:
         """`fitted`, under the prior on lights; every point that is tried is an event of this phase."""

@@ -31,7 +31,7 @@ from factorlib.inference.materials import Point
 from factorlib.inference.model_selection import Chosen
 from factorlib.inference.noise import Loss
 from factorlib.inference.problem import JointProblem
-from factorlib.inference.resume import Parts
+from factorlib.inference.resume import Run
 from factorlib.light.lobes import SUN
 from factorlib.results.materials import Decision
 
@@ -46,14 +46,14 @@ CLEAR, SHARE = 0.01, 0.07
 AROUND_SUNS = Schedule(together=(0, 3), least=0.1, given=True)
 
 
-def suns_chosen(problem: JointProblem, fit: Fit, parts: Parts) -> Chosen:
+def suns_chosen(problem: JointProblem, fit: Fit, run: Run) -> Chosen:
     """Suns in the lights that have one; the other lights stay as they are."""
     before = problem.illuminations(fit.point)
     tried = list(problem.spread(partial(candidate, sharpness=SUN), before))
     evidence = [Decision(bool(one.light.suns.any())) for one in before]
     if all(light is one.light for light, one in zip(tried, before, strict=True)):
         return Chosen(fit, evidence)
-    trial = parts.judged("suns", problem, fit.with_lights(tried), AROUND_SUNS)
+    trial = run.judged("suns", problem, fit.with_lights(tried), AROUND_SUNS)
     after = problem.illuminations(trial.point)
     for k, (cells, sun) in enumerate(zip(before, after, strict=True)):
         if tried[k] is not cells.light:
@@ -63,7 +63,7 @@ def suns_chosen(problem: JointProblem, fit: Fit, parts: Parts) -> Chosen:
         wide = list(problem.spread(partial(candidate, sharpness=WIDE), [before[k] for k in asked]))
         begun = Fit(Point(fit.point.materials, wide), [fit.hyperparameters[k] for k in asked])
         problem = problem.restricted(asked)
-        other = problem.illuminations(parts.judged("suns", problem, begun, AROUND_SUNS).point)
+        other = problem.illuminations(run.judged("suns", problem, begun, AROUND_SUNS).point)
         for k, one in zip(asked, other, strict=True):
             narrow = compared(one, after[k], AGAINST)
             evidence[k] = evidence[k] if narrow.kept else narrow

@@ -154,21 +154,23 @@ def largest_variance(
     scores: Sequence[Float[np.ndarray, "g k"]],
     materials: Materials,
     problem: JointProblem,
-    sigma: float = 1.0,
 ) -> Float[np.ndarray, " k"]:
-    """The largest of three variances of each unknown, in the gauge, 0 of what is known.
+    """Return the largest of three variances of each unknown, in the gauge, 0 of what is known.
 
-    information: from residuals of deviation `sigma`;  scores: of each light's clusters, that the lights were eliminated from.  What the data
+    information: of the materials, which rounding may leave with an eigenvalue below 0;  scores: of each light's clusters, that the lights were eliminated from.  What the data
     do not see, one unknown as the roughness of a Lambertian material or a trade of one for another, is uncertain by the width of its range,
     which counts as one more observation of each unknown.
     """
     free, inverse = problem.known.free(len(materials)), np.zeros_like(information)
-    own = (information / sigma**2 + np.diag(np.tile(WIDTHS, len(materials)) ** -2.0))[np.ix_(free, free)]
-    scale = 1 / np.sqrt(np.diag(own))  # rows are of unlike units
+    scale = np.sqrt(np.maximum(np.diag(information)[free], 1.0))  # rows are of unlike units
     scales = np.outer(scale, scale)
-    inverse[np.ix_(free, free)] = inverse_of(factorised(own * scales)) * scales
+    values, vectors = np.linalg.eigh(information[np.ix_(free, free)] / scales)
+    own = (vectors * np.maximum(values, 0.0)) @ vectors.T + np.diag(
+        np.tile(WIDTHS, len(materials))[free] ** -2.0 / scale**2
+    )
+    inverse[np.ix_(free, free)] = inverse_of(factorised(own)) / scales
     whole = np.array([s.sum(0) for s in scores])
-    covariances = inverse, sandwich(inverse, np.vstack(scores), sigma), sandwich(inverse, whole, sigma)
+    covariances = inverse, sandwich(inverse, np.vstack(scores)), sandwich(inverse, whole)
     return np.max([np.diag(in_gauge(each, materials, problem)) for each in covariances], axis=0).clip(0)
 
 
@@ -177,15 +179,13 @@ def _errors(variance: Float[np.ndarray, " 7m"], deviation: float) -> StandardErr
     return StandardErrors(Materials.of_rows(np.minimum(np.sqrt(variance).reshape(-1, 7), WIDTHS)), deviation)
 
 
-def sandwich(
-    inverse: Float[np.ndarray, "k k"], scores: Float[np.ndarray, "g k"], sigma: float
-) -> Float[np.ndarray, "k k"]:
+def sandwich(inverse: Float[np.ndarray, "k k"], scores: Float[np.ndarray, "g k"]) -> Float[np.ndarray, "k k"]:
     """(1) from scores that lights were eliminated from, one a row, as wide as Student's t asks for so few clusters."""
     count = len(scores)
     if count < 2:
         return np.zeros_like(inverse)
     few = float(student_t.ppf(norm.cdf(1), count - 1))
-    return few**2 * inverse @ (scores.T @ scores) @ inverse * count / (count - 1) / sigma**4
+    return few**2 * inverse @ (scores.T @ scores) @ inverse * count / (count - 1)
 
 
 def in_gauge(

@@ -12,7 +12,7 @@ from factorlib.inference.history import PHASES, Event, of_parts
 from factorlib.inference.joint_solver import solve
 from factorlib.inference.options import Choices
 from factorlib.inference.problem import JointProblem
-from factorlib.inference.resume import Parts
+from factorlib.inference.resume import Run
 from factorlib.inference.start import from_nothing
 from factorlib.stage import serial_map
 from studies.scenes.problems import MATERIALS, block, random_light
@@ -56,7 +56,7 @@ def answer(blocks, checkpoint=Checkpoint(None), spread=serial_map):
     """All numbers of an answer, and the events reported."""
     events = []
 
-    parts = Parts(checkpoint, events.append)
+    parts = Run(checkpoint, events.append)
     found = solve(JointProblem(blocks, OPERATOR, spread=spread), from_nothing(3), CHOICES, parts)
     p = found.point
     parts = [p.materials.vector(), *(np.ravel(getattr(li, f)) for li in p.lights for f in li.__struct_fields__)]

@@ -7,7 +7,7 @@ from factorlib.inference.evidence import FINER
 from factorlib.inference.fit import Schedule, fitted
 from factorlib.inference.joint_solver import SPLIT, split_while_gaining
 from factorlib.inference.options import Choices
-from factorlib.inference.resume import Parts
+from factorlib.inference.resume import Run
 from studies.scenes.problems import MATERIALS
 from tests.inference.made_lights import PRIOR, begun, light_of, spheres
 
@@ -24,7 +24,7 @@ def splitting_of(lights):
     """The fit on cells of one size, and what comes of splitting."""
     problem = spheres(lights, size=18, shown=SHOWN)
     fit = fitted(problem, begun(problem, CELLS), PRIOR, Schedule(4, (10, 8)))
-    return problem, fit, split_while_gaining(problem, fit, ONCE, Parts())
+    return problem, fit, split_while_gaining(problem, fit, ONCE, Run())
 
 
 @pytest.fixture(scope="module")
@@ -51,5 +51,5 @@ def test_a_constant_light_needs_no_finer_cells():
 def test_nothing_splits_where_nothing_is_held_out_or_nobody_asks(lamps):
     problem, fit, _ = lamps
     for some, choices in ((problem.with_none_held_out(), ONCE), (problem, Choices(splittings=0))):
-        found = split_while_gaining(some, fit, choices, Parts())
+        found = split_while_gaining(some, fit, choices, Run())
         assert found.evidence == [] and found.fit is fit

@@ -10,7 +10,7 @@ from factorlib.inference import suns
 from factorlib.inference.evidence import AGAINST
 from factorlib.inference.fit import Schedule, fitted
 from factorlib.inference.lights import UnitLobes
-from factorlib.inference.resume import Parts
+from factorlib.inference.resume import Run
 from factorlib.inference.suns import WIDE, candidate, clearly_better, compared, suns_chosen
 from factorlib.light.lobes import SUN, lobe_integral
 from factorlib.results.materials import Decision
@@ -59,12 +59,12 @@ def test_no_sun_is_found_in_a_sky_without_one(seed):
 
 def test_the_solve_keeps_suns_of_lights_that_have_one():
     problem, *_, fit = solved(0.5, 1)
-    found = suns_chosen(problem, fit, Parts())
+    found = suns_chosen(problem, fit, Run())
     assert found.evidence[0].kept and found.fit.point.lights[0].suns.any()
-    again = suns_chosen(problem, found.fit, Parts())
+    again = suns_chosen(problem, found.fit, Run())
     assert again.fit is found.fit and again.evidence[0].kept
     cloudy, *_, fit = solved(0.0, 1)
-    none = suns_chosen(cloudy, fit, Parts())
+    none = suns_chosen(cloudy, fit, Run())
     assert not none.evidence[0].kept and none.fit.point.lights[0] is fit.point.lights[0]
 
 
