@@ -34,7 +34,7 @@ from factorlib.inference.priors import Gaussian, MaterialPrior, materials_of
 from factorlib.inference.problem import Spread
 
 MOST_CHANGE = np.array([0.7] * 6 + [0.1])  # change of a material's unknowns on one factorisation
-MOST_LIGHT = 1.5  # change of a light's unknowns in one cheap step
+MOST_STEP, UPHILL = 1.5, 0.1  # change of an unknown in one cheap step; share of the slope that clipping must leave
 LOWEST = np.array([np.log(LEAST_REFLECTANCE)] * 6 + [ROUGHNESS[0]])
 HIGHEST = np.array([np.inf] * 6 + [ROUGHNESS[1]])
 FIRST_DAMPING, LOWER, HIGHER, MOST_DAMPING = 0.1, 0.25, 8.0, 1e3
@@ -183,11 +183,13 @@ def minimised(objective: Objective, size: int, metric: Callable[[np.ndarray], np
     value, gradient = objective(x)
     pairs, least = deque(maxlen=MEMORY), 0.0
     for _ in range(STEPS):
-        direction = -inverse_hessian_times(gradient, pairs, metric).clip(-MOST_LIGHT, MOST_LIGHT)
-        slope = float(gradient @ direction)
-        least = least or max(DECREMENT, -SHARE * slope)
-        if -slope < least:
+        direction = -inverse_hessian_times(gradient, pairs, metric)
+        decrement = -float(gradient @ direction)
+        least = least or max(DECREMENT, SHARE * decrement)
+        if decrement < least:
             break
+        direction = bounded(direction, gradient)
+        slope = float(gradient @ direction)
         length = 1.0
         while length > SHORTEST:
             trial = x + length * direction
@@ -202,6 +204,17 @@ def minimised(objective: Objective, size: int, metric: Callable[[np.ndarray], np
             pairs.append((trial - x, change))
         x, value, gradient = trial, trial_value, trial_gradient
     return x
+
+
+def bounded(direction: Float[np.ndarray, " n"], gradient: Float[np.ndarray, " n"]) -> Float[np.ndarray, " n"]:
+    """Return a direction no element of which is larger than `MOST_STEP`.
+
+    Each is clipped by itself, for a dark cell would hold back all others; where that leads uphill or nearly so, the whole direction is scaled.
+    """
+    clipped = direction.clip(-MOST_STEP, MOST_STEP)
+    if gradient @ clipped < UPHILL * (gradient @ direction):
+        return clipped
+    return direction * min(1.0, MOST_STEP / float(np.abs(direction).max()))
 
 
 def inverse_hessian_times(gradient, pairs, metric):  # noqa: ANN001, ANN201  (arrays or tensors)
