@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+from functools import cached_property
 from typing import Literal
 
 import msgspec
 import numpy as np
+from jaxtyping import Float
 from msgspec import UNSET, UnsetType
 
 from factorlib.inference import uncertainty
@@ -29,7 +31,7 @@ LOBES_CHOSEN_BY = {
 }
 
 
-class Answer(msgspec.Struct, frozen=True):
+class Answer(msgspec.Struct, frozen=True, dict=True):
     """A solution of a problem, and where it came from.
 
     names:    of the materials, in the order of their numbers
@@ -45,6 +47,11 @@ class Answer(msgspec.Struct, frozen=True):
     relative: dict[str, float]
     solver: Literal["joint", "paper"]
     earlier: Earlier | None = None
+
+    @cached_property
+    def radiance(self) -> list[Float[np.ndarray, "n 3"]]:
+        """Return what all observations should show, block by block, in the block's unit."""
+        return self.solution.shown(self.problem).radiance(self.solution.point)
 
     def material_table(self) -> table.MaterialTable:
         """The content of materials.json."""
@@ -93,7 +100,7 @@ class Answer(msgspec.Struct, frozen=True):
 
     def uncertainty(self) -> Uncertainty:
         """The content of uncertainty.json."""
-        unexplained = misfit(self.solution.shown(self.problem), self.solution.point)
+        unexplained = misfit(self.problem, self.radiance)
         return Uncertainty(self.errors.deviation, self._errors(), self._gauge_of_errors(), *unexplained)
 
     def _errors(self) -> dict[str, table.StandardErrors]:

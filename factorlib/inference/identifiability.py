@@ -110,7 +110,7 @@ def after_solving(answer: Answer) -> list[str]:
     problem, point = answer.solution.shown(answer.problem), answer.solution.point
     return [
         *undetermined_by_answer(answer.names, problem, point.materials, answer.errors.materials),
-        *poorly_explained(problem, point),
+        *poorly_explained(problem, answer.radiance),
         *unlikely_curves(problem, point),
         *tinted_alike(problem, point),
         *_brighter_than_white(answer),
@@ -149,9 +149,10 @@ def _of_answer(name: str, found: Float[np.ndarray, "7"], error: Float[np.ndarray
         yield f"the roughness of material '{name}' is at {ROUGHNESS[0]:g}, the least the model knows: it may be smoother"
 
 
-def poorly_explained(problem: JointProblem, point: Point) -> Iterator[str]:
+def poorly_explained(problem: JointProblem, radiance: Sequence[Float[np.ndarray, "n 3"]]) -> Iterator[str]:
     """Illuminations with many residuals far beyond the noise model."""
-    for block, residual in zip(problem.blocks, problem.residuals(point), strict=True):
+    for block, predicted in zip(problem.blocks, radiance, strict=True):
+        residual = block.residuals(predicted)
         share = float((np.abs(residual * (block.precision > 0)) > OUTLIER).mean())
         if share > OUTLIERS:
             yield (

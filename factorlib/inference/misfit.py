@@ -12,14 +12,13 @@ E(r) / E(v) is the unexplained share.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from factorlib.geometry.sphere import mirror_cells
 from factorlib.inference.blocks import Block
-from factorlib.inference.materials import Point
 from factorlib.inference.problem import JointProblem
 from factorlib.results.materials import Misfit
 
@@ -29,10 +28,10 @@ LEAST = 4  # observations of a group
 MOST = 3.0  # of an unexplained share: more says no more
 
 
-def misfit(problem: JointProblem, point: Point) -> tuple[float, dict[str, Misfit]]:
-    """The unexplained share of the whole set, and by photo that share and the share of clipped values."""
+def misfit(problem: JointProblem, radiance: Sequence[Float[np.ndarray, "n 3"]]) -> tuple[float, dict[str, Misfit]]:
+    """Return the unexplained share of the whole set, and by photo that share and the share of clipped values."""
     energies, clipped = {}, {}
-    for block, shown in zip(problem.blocks, problem.radiance(point), strict=True):
+    for block, shown in zip(problem.blocks, radiance, strict=True):
         for number, photo in enumerate(block.photos):
             own = block.photo == number
             energies[photo] = np.sum(list(_energies(block, shown, own)) or [[0.0, 0.0]], axis=0)

@@ -17,7 +17,7 @@ class Choices(Struct, frozen=True):
     """Cells of a light before any of them splits; 400 are 10° apart."""
     splittings: Annotated[int, Meta(ge=0, le=8)] = 3
     """How often the 24 cells of each light that hold most energy may split, each in about four; held-out observations stop it earlier."""
-    observations: Annotated[int, Meta(ge=50)] = 4000
+    observations: Annotated[int, Meta(ge=50)] = 1000
     """Most observations of a light that are fitted, drawn from all."""
     self_shadowing: Literal["auto", "on", "off"] = "auto"
     """Whether what meshes hide of the light is dark; auto: unless held-out observations are two standard errors against it."""

@@ -14,6 +14,7 @@ from __future__ import annotations
 
 from collections import OrderedDict
 from hashlib import blake2b
+from math import prod
 from typing import NamedTuple, Protocol
 
 import numpy as np
@@ -127,10 +128,8 @@ class Reflected(NamedTuple):
     def radiance(self, weight: Float[np.ndarray, "p 3"]) -> Float[np.ndarray, "3 n 3"]:
         """Return D w, S w and (∂S/∂roughness) w, without forming S."""
         nodes, n, p = self.stack.shape
-        sums = (self.stack.reshape(-1, p) @ weight.astype(np.float32)).reshape(nodes, n, 3).astype(float)
-        return np.stack(
-            [sums[0], np.tensordot(self.share, sums[1:], axes=1), np.tensordot(self.slope, sums[1:], axes=1)]
-        )
+        sums = (self.stack.reshape(-1, p) @ weight.astype(np.float32)).reshape(nodes, 3 * n).astype(float)
+        return np.stack([sums[0], self.share @ sums[1:], self.slope @ sums[1:]]).reshape(3, n, 3)
 
     def by_weight(
         self, by_diffuse: Float[np.ndarray, "n 3"], by_specular: Float[np.ndarray, "n 3"]
@@ -238,10 +237,10 @@ def lagrange(nodes: Float[np.ndarray, " k"], x: float) -> tuple[Float[np.ndarray
     >>> [w.tolist() for w in lagrange(np.array([0.0, 1.0, 2.0]), 0.25)]
     [[0.65625, 0.4375, -0.09375], [-1.25, 1.5, -0.25]]
     """
-    value, slope = np.empty(len(nodes)), np.empty(len(nodes))
-    for a, node in enumerate(nodes):
-        others = np.delete(nodes, a)
-        below = np.prod(node - others)
-        value[a] = np.prod(x - others) / below
-        slope[a] = sum(np.prod(x - np.delete(others, b)) for b in range(len(others))) / below
-    return value, slope
+    value, slope, points = [], [], nodes.tolist()
+    for a, node in enumerate(points):
+        others = points[:a] + points[a + 1 :]
+        below = prod(node - other for other in others)
+        value.append(prod(x - other for other in others) / below)
+        slope.append(sum(prod(x - other for other in others[:b] + others[b + 1 :]) for b in range(len(others))) / below)
+    return np.array(value), np.array(slope)

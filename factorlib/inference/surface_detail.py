@@ -44,6 +44,7 @@ TURNS = (1000.0, 300.0, 100.0, 30.0)  # stiffness of turns: a of `factorlib.infe
 FACTORS = (300.0, 100.0, 30.0, 10.0)  # of log factors
 ROUNDS = 3
 CELLS, FOLDS = 250, 4  # cells of a light; folds of photos
+OBSERVATIONS = 1000  # of a light, or of a photo that judges, that materials and lights are fitted to
 SETTLE = Schedule(lights=2, together=(3, 2), estimate=False)
 BETWEEN = Schedule(together=(2,), estimate=False)
 OWN_LIGHT = 2  # factorisations
@@ -179,7 +180,9 @@ class Trial(msgspec.Struct, frozen=True):
             if plain is not None and not (np.any(detail.turn[here.node]) or np.any(detail.log_factor[here.node])):
                 tick()
                 return plain.values[at], Losses([plain.losses.values[at]], [plain.losses.clusters[at]])
-            problem = self.problem.of([detail.on(self.problem.blocks[k].take(own), here)])
+            seen = msgspec.structs.replace(self.problem.blocks[k].take(own), row=np.arange(own.sum()))
+            seen = seen.sampled(OBSERVATIONS, 0)
+            problem = self.problem.of([detail.on(seen, here.take(seen.row))])
             begun = Point(self.fit.point.materials, [self.fit.point.lights[k]])
             (one,) = problem.fitted().illuminations(begun)
             likelihood = likelihood_of(one, self.fit.hyperparameters[k], self.prior, materials_given=True)
@@ -285,7 +288,7 @@ def found(
     choices = Choices(self_shadowing="on", interreflection="on", seed=seed)
     effects = effects_chosen(sure, start(sure, TRIAL_CELLS), choices, fitting)
     begun = on_cells(effects.fit, CELLS, problem)
-    fit = fitted(effects.of(problem), begun, prior, SETTLE, tick)
+    fit = fitted(effects.of(problem).sampled(OBSERVATIONS, seed), begun, prior, SETTLE, tick)
     trial, plain = Trial(effects.of(problem), fit, surfaces, attached, prior), no_detail(surfaces.nodes)
     photos = len(trial.photos)
     if photos < 2 or problem.none_held_out:
@@ -309,7 +312,7 @@ def found(
     for number in range(ROUNDS):
         tick = pieces.of(0.85 + 0.05 * number, 0.9 + 0.05 * number, BETWEEN.points, f"all photos, round {number + 1}")
         if number:
-            fit = fitted(trial.on(detail), fit, prior, BETWEEN, tick)
+            fit = fitted(trial.on(detail).sampled(OBSERVATIONS, seed), fit, prior, BETWEEN, tick)
             parts = trial.parts(detail, fit)
         detail = step(parts, laplacian, kept.stiffness, detail, surfaces.nodes_of(moving))
     displacements = surfaces.displacements(detail.turn, attached) if turned.evidence.kept else {}

@@ -19,6 +19,7 @@ positive definite functions on spheres", 2013). A solve takes the mean to be nil
 from __future__ import annotations
 
 from collections.abc import Sequence
+from functools import lru_cache
 from pathlib import Path
 
 import msgspec
@@ -88,7 +89,7 @@ class LightPrior(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         """
         precision, log_determinant, p = 0.0, 0.0, len(directions)
         for k, (row, factor) in enumerate(zip(MIX, factors, strict=True)):
-            inverse, log_of_inverse = _inverse(self.covariance(k, directions))
+            inverse, log_of_inverse = _inverse(self, k, directions.tobytes())
             precision = precision + np.kron(np.outer(row, row), inverse / factor)
             log_determinant += log_of_inverse - p * np.log(factor)
         return precision, float(log_determinant)
@@ -103,7 +104,7 @@ class LightPrior(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         p, factors = len(directions), []
         by_channel = covariance.reshape(3, p, 3, p)
         for k, (row, nu) in enumerate(zip(MIX, self.freedom, strict=True)):
-            inverse, y = _inverse(self.covariance(k, directions))[0], row @ log_radiance
+            inverse, y = _inverse(self, k, directions.tobytes())[0], row @ log_radiance
             spread = np.einsum("c,cpdq,d->pq", row, by_channel, row)
             factors.append(float((nu + y @ inverse @ y + np.sum(inverse * spread)) / (nu + p)))
         return factors
@@ -119,10 +120,14 @@ def angles(directions: Float[np.ndarray, "p 3"]) -> Float[np.ndarray, "p p"]:
     return 2 * np.arcsin(np.minimum(np.sqrt(squared_distances(directions, directions)) / 2, 1))
 
 
-def _inverse(matrix: Float[np.ndarray, "p p"]) -> tuple[Float[np.ndarray, "p p"], float]:
-    """The inverse of a positive definite matrix, exactly symmetric, and the log of the inverse's determinant."""
+@lru_cache(maxsize=48)  # a fit asks for those of its lights again and again
+def _inverse(prior: LightPrior, k: int, directions: bytes) -> tuple[Float[np.ndarray, "p p"], float]:
+    """The inverse of the covariance of y_k, exactly symmetric, and the log of the inverse's determinant."""
+    matrix = prior.covariance(k, np.frombuffer(directions).reshape(-1, 3))
     inverse = np.linalg.inv(matrix)
-    return (inverse + inverse.T) / 2, -float(np.linalg.slogdet(matrix)[1])
+    inverse = (inverse + inverse.T) / 2
+    inverse.setflags(write=False)
+    return inverse, -float(np.linalg.slogdet(matrix)[1])
 
 
 def read_light_prior() -> LightPrior:

@@ -248,7 +248,7 @@ def solved(scene: Scene, choices: Choices) -> tuple[JointProblem, Solution, list
     solution = solve(problem, from_nothing(len(names)), choices)
     errors, _ = uncertainty_of(solution, problem, choices)
     said = undetermined_by_observations(names, problem)
-    said += poorly_explained(solution.shown(problem), solution.point)
+    said += poorly_explained(problem, solution.shown(problem).radiance(solution.point))
     said += undetermined_by_answer(names, problem, solution.point.materials, errors.materials)
     return problem, solution, said
 
