@@ -24,7 +24,7 @@ from typing import NamedTuple
 
 import msgspec
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 
 from factorlib.inference.arrow import Arrow, System, solved
 from factorlib.inference.lights import TONE, Light
@@ -173,8 +173,19 @@ def determinant_of(systems: Sequence[System], size: int) -> tuple[Float[np.ndarr
     for system in systems:
         by_light = system.cross_hessian @ solved(system.factor, system.determinant_by_light)
         gradient[system.places] += system.determinant_by_materials - by_light
-        hessian[np.ix_(system.places, system.places)] += system.determinant_hessian
+        P = without_factors(system.places)
+        hessian[np.ix_(system.places, system.places)] += P @ system.determinant_hessian @ P
     return gradient, hessian
+
+
+def without_factors(places: Int[np.ndarray, " k"]) -> Float[np.ndarray, "k k"]:
+    """Return the projection that takes a factor per channel out of a step of the materials that a light shows.
+
+    All their reflectances times a factor, and the light divided by it, have the same J, and so the same determinant.
+    """
+    unknown = places[:, None] % 7
+    factors = (unknown == np.arange(3)) | (unknown == np.arange(3, 6))
+    return np.eye(len(places)) - factors / factors.sum(0) @ factors.T
 
 
 def minimised(objective: Objective, size: int, metric: Callable[[np.ndarray], np.ndarray]) -> Float[np.ndarray, " n"]:
