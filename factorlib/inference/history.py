@@ -30,10 +30,14 @@ class Event(msgspec.Struct, frozen=True):
 Report = Callable[[Event], None]
 Progress = Callable[[float, float, str], None]  # done, of how many, and what it is doing
 PHASES = {  # about how many points are tried, and what one costs beside one of the first phase, on data/eames
-    "no shadows": (30, 1), "shadows": (30, 1), "shadows and bounces": (30, 1), "tone curves": (10, 1), "distances": (65, 1.3),
-    "materials and lights": (22, 6),
-}  # fmt: skip
-SPLITTING, LAST = (15, 9), {"lights": (20, 5), "suns": (24, 3)}
+    "shadows": (13, 1),
+    "no shadows": (8, 1),
+    "shadows and bounces": (8, 1),
+    "tone curves": (6, 1),
+    "distances": (24, 1.5),
+    "materials and lights": (11, 7),
+}
+SPLITTING, LAST = (7, 9), {"lights": (3, 14), "suns": (4, 10)}
 
 
 def unreported(event: Event) -> None:

@@ -7,6 +7,7 @@ import pytest
 from factorlib.conventions import YUP_FROM_CAMERA, lat_long_directions
 from factorlib.geometry.camera import rotation_of_vector
 from factorlib.geometry.sphere import fibonacci_sphere, mirror_directions
+from factorlib.inference import optimizer
 from factorlib.inference.fit import Schedule, fitted, start_of
 from factorlib.inference.gauge import BRIGHTEST, in_gauge
 from factorlib.inference.known import Known, light_of_ball, light_of_map
@@ -53,8 +54,10 @@ def test_a_known_material_stays_and_gives_the_others_their_scale_and_colour(solv
     assert (in_place.vector() == materials.vector()).all() and (moved.diffuse != materials.diffuse).any()
 
 
-def test_a_descent_with_known_unknowns_is_that_of_a_prior_that_holds_them():
+def test_a_descent_with_known_unknowns_is_that_of_a_prior_that_holds_them(monkeypatch):
     """Against the slow and obvious: a penalty of 1e7 on the unknowns that are known."""
+    monkeypatch.setattr(optimizer, "TOLERANCE", 1e-9)
+    monkeypatch.setattr(optimizer, "DECREMENT", 1e-6)
     problem, _ = photographed(5, 1, cells=40, size=10)
     known = Known({1: np.array([0.2, 0.4, 0.25, np.nan, np.nan, np.nan, 0.4])})
     free, theta = known.free(3), unknowns_of(START)
@@ -70,7 +73,7 @@ def test_a_descent_with_known_unknowns_is_that_of_a_prior_that_holds_them():
     one, ends = likelihood(problem, begun(problem, 40).point.lights[0], START), []
     for of, moving in ((prior, free), (stiff, np.ones(21, bool))):
         descent = Descent(of, problem.spread, lambda loss: None, moving)
-        ends.append(descent.of_all(descent.at([one], theta), 8))
+        ends.append(descent.of_all(descent.at([one], theta), 40))
     assert (ends[0].theta.reshape(-1)[~free] == theta.reshape(-1)[~free]).all() and (ends[0].theta != theta).any()
     np.testing.assert_allclose(ends[0].theta, ends[1].theta, atol=5e-3)
 

@@ -137,7 +137,8 @@ def test_shadows_that_are_none_are_given_up_and_those_that_change_nothing_stay(s
 def rooms(photos=1, size=12):
     rng = np.random.default_rng(3)
     exposures = [np.concatenate([[0.0], rng.normal(0, 0.5, photos - 1)]) for _ in range(3)]
-    return spheres([on_even_cells(drawn(30 + k, 60), e) for k, e in enumerate(exposures)], size=size, noise=0.05).blocks
+    lights = [on_even_cells(drawn(30 + k, 60), e, name=f"room{k}") for k, e in enumerate(exposures)]
+    return spheres(lights, size=size, noise=0.05).blocks
 
 
 def through(data, *exponents):
@@ -163,7 +164,10 @@ def curved():
 def test_curves_are_found_and_spare_the_materials_by_evidence_that_held_out_losses_fall(curved):
     found, without = (solved(curved, MORE, tone=tone) for tone in ("auto", "off"))
     exponents = [float(e[0]) if len(e) else 1.0 for e in exponents_of(found)]
-    np.testing.assert_allclose(exponents, (1.3, 0.8, 1.0), rtol=0.05)
+    off = np.log(exponents) - np.log((1.3, 0.8, 1.0))
+    assert (
+        np.ptp(off) < 0.02 and abs(off.mean()) < 0.08
+    )  # what all photos share, a light of more contrast nearly explains
     assert all(len(e) == 0 for e in exponents_of(without))
     assert error_of(found) < 0.3 * error_of(without), (error_of(found), error_of(without))
     assert [one.kept for one in found.tone][:2] == [True, True]
