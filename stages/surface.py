@@ -22,7 +22,6 @@ from factorlib.inference.surface_attach import attached_pixels
 from factorlib.inference.surface_detail import Found, Surfaces, found
 from factorlib.inference.surface_turns import Attached, Detail, joined, no_detail
 from factorlib.jsonfile import write_json
-from factorlib.light.prior import read_light_prior
 from factorlib.meshes.fine import fine
 from factorlib.meshes.read import CREASE_DEG, MeshesOnce
 from factorlib.reflection import reflection_operator
@@ -158,7 +157,6 @@ def _found(
         surfaces,
         [joined(in_frame).take(block.row) for block in blocks],
         from_nothing(len(inputs.facts["dataset.materials"])),
-        read_light_prior(),
         params.seed,
         lambda share, what: progress(share, 1, what),
     )

@@ -28,6 +28,8 @@ Cells whose radiance is known (`Light.held`) have no part in u of (1) and (2): Q
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import msgspec
 import numpy as np
 from jaxtyping import Float, Int
@@ -115,20 +117,13 @@ class LightLikelihood(msgspec.Struct, frozen=True):
                 scores[:, k + own.start : k + own.stop] += summing @ J
                 scores[:, k + 3 * p :] += summing @ part.by_photo
         residual = one.block.residuals(shown.radiance)
-        d_m, d_M, d_l = np.zeros(k), np.zeros((k, k)), np.zeros(size)
         loss = float(self.loss.of_residuals(residual)[~one.block.held_out].sum())
+        factor, determinant = factorised(L), (np.zeros(k), np.zeros((k, k)), np.zeros(size))
         value += loss / T
-        factor = factorised(L)
         if not materials_given:
             value += self._determinants(factor)
-            covariance = inverse_of(factor[: 3 * p, : 3 * p])
-            for part in parts:  # (2)
-                own, at = slice(part.channel * p, (part.channel + 1) * p), np.searchsorted(places, part.places)
-                gradient, hessian, by_cells = _of_determinant(part, covariance[own, own].astype(np.float32))
-                d_m[at] += gradient
-                d_M[np.ix_(at, at)] += hessian
-                d_l[own] += by_cells
-        return System(value, loss, places, g_m, M, g_l, C, L, factor, d_m, d_M, d_l, scores)
+            determinant = _of_determinants(parts, inverse_of(factor[: 3 * p, : 3 * p]), places, size)
+        return System(value, loss, places, g_m, M, g_l, C, L, factor, *determinant, scores)
 
     def marginal(self, system: System) -> float:
         """Return the value of (1) at a minimum of φ whose system was made with the materials given."""
@@ -168,6 +163,21 @@ class LightLikelihood(msgspec.Struct, frozen=True):
         light = self.light
         others = [light.log_exposure[len(light.log_exposure) - light.free_exposures :], light.log_tone]
         return np.concatenate(others), np.repeat([EXPOSURE, TONE], [light.free_exposures, len(light.log_tone)])
+
+
+def _of_determinants(
+    parts: Sequence[Linearised], covariance: Float[np.ndarray, "3p 3p"], places: Int[np.ndarray, " k"], size: int
+) -> tuple[Float[np.ndarray, " k"], Float[np.ndarray, "k k"], Float[np.ndarray, " l"]]:
+    """Equation (2) of all channels and materials: the first, its Hessian, the second; places: of the materials' unknowns."""
+    k, p = len(places), len(covariance) // 3
+    by_materials, by_materials_twice, by_light = np.zeros(k), np.zeros((k, k)), np.zeros(size)
+    for part in parts:
+        own, at = slice(part.channel * p, (part.channel + 1) * p), np.searchsorted(places, part.places)
+        gradient, hessian, by_cells = _of_determinant(part, covariance[own, own].astype(np.float32))
+        by_materials[at] += gradient
+        by_materials_twice[np.ix_(at, at)] += hessian
+        by_light[own] += by_cells
+    return by_materials, by_materials_twice, by_light
 
 
 def _of_determinant(

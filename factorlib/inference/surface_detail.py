@@ -36,7 +36,7 @@ from factorlib.inference.options import Choices
 from factorlib.inference.problem import JointProblem
 from factorlib.inference.start import Start, on_cells
 from factorlib.inference.surface_turns import Attached, Detail, Part, Stiffness, no_detail, part_of, step
-from factorlib.light.prior import LightPrior
+from factorlib.light.prior import LightPrior, read_light_prior
 from factorlib.meshes.fine import Fine
 from factorlib.results.materials import Decision
 
@@ -255,6 +255,29 @@ class Search(msgspec.Struct, frozen=True):
         assert found is not None
         return found
 
+    def turned(self) -> tuple[Best, set[str]]:
+        """Return the likeliest turns, and the meshes that they move: those that are better when they are turned alone."""
+        trial, plain = self.trial, self.plain
+        turned = self.best([Stiffness(a) for a in TURNS], plain, FOR, 0.0)
+        moving = self.meshes_that_gain(turned.details) if turned.judged.gain_over(plain) > 0 else set()
+        if 0 < len(moving) < len(trial.surfaces.meshes):
+            judged = trial.judged([trial.moving(of, moving) for of in turned.details], self.tick, plain)
+            turned = turned._replace(judged=judged, evidence=evidence_of(judged, plain, FOR, 0.0))
+        return turned, moving
+
+    def of_all_photos(self, stiffness: Stiffness, moving: set[str], pieces: Pieces, seed: int) -> Detail:
+        """Return the detail that all photos ask for, materials and lights fitted again between its steps."""
+        trial, parts, fit = self.trial, self.parts, self.trial.fit
+        nodes, detail = trial.surfaces.nodes_of(moving), no_detail(trial.surfaces.nodes)
+        for number in range(ROUNDS):
+            begin = 0.85 + 0.05 * number
+            tick = pieces.of(begin, begin + 0.05, BETWEEN.points, f"all photos, round {number + 1}")
+            if number:
+                fit = fitted(trial.on(detail).sampled(OBSERVATIONS, seed), fit, trial.prior, BETWEEN, tick)
+                parts = trial.parts(detail, fit)
+            detail = step(parts, self.laplacian, stiffness, detail, nodes)
+        return detail
+
     def meshes_that_gain(self, turned: Sequence[Detail]) -> set[str]:
         """Return the meshes that are better when they are turned alone."""
         names = self.trial.surfaces.meshes
@@ -270,55 +293,51 @@ def found(
     surfaces: Surfaces,
     attached: list[Attached],
     start: Start,
-    prior: LightPrior,
     seed: int = 0,
     report: Report = lambda share, what: None,
 ) -> Found:
-    """The detail of the meshes, if photos that had no part in it gain.
+    """Return the detail of the meshes, if photos that had no part in it gain.
 
     problem: all observations;  attached: where each block's lie;  start: where materials and lights begin;  seed: of what is drawn
     """
-    sure, pieces = sure_ones(problem), Pieces(report)
+    pieces, plain = Pieces(report), no_detail(surfaces.nodes)
     tick = pieces.of(0.0, 0.3, TRIAL.points + SETTLE.points, "materials and lights")
-
-    def fitting(name: str, some: JointProblem, begun: Fit, schedule: Schedule) -> Fit:
-        """A fit under the prior."""
-        return fitted(some, begun, prior, schedule, tick)
-
-    choices = Choices(self_shadowing="on", interreflection="on", seed=seed)
-    effects = effects_chosen(sure, start(sure, TRIAL_CELLS), choices, fitting)
-    begun = on_cells(effects.fit, CELLS, problem)
-    fit = fitted(effects.of(problem).sampled(OBSERVATIONS, seed), begun, prior, SETTLE, tick)
-    trial, plain = Trial(effects.of(problem), fit, surfaces, attached, prior), no_detail(surfaces.nodes)
+    trial = trial_of(problem, start, seed, (surfaces, attached), tick)
     photos = len(trial.photos)
     if photos < 2 or problem.none_held_out:
         return Found(Decision(False))
-    laplacian, parts = surfaces.laplacian(), trial.parts(plain, fit)
     tick = pieces.of(0.3, 0.85, 4 * len(TURNS) * photos, "left-out photos")
     given = trial.judged([plain] * photos, tick)
-    search = Search(trial, parts, laplacian, given, tick)
-    turned = search.best([Stiffness(a) for a in TURNS], given, FOR, 0.0)
-    moving = search.meshes_that_gain(turned.details) if turned.judged.gain_over(given) > 0 else set()
-    if 0 < len(moving) < len(surfaces.meshes):
-        judged = trial.judged([trial.moving(of, moving) for of in turned.details], tick, given)
-        turned = turned._replace(judged=judged, evidence=evidence_of(judged, given, FOR, 0.0))
+    search = Search(trial, trial.parts(plain, trial.fit), surfaces.laplacian(), given, tick)
+    turned, moving = search.turned()
     kept = turned if turned.evidence.kept else Best(Stiffness(None), [plain] * photos, given, turned.evidence)
     painted = search.best([Stiffness(kept.stiffness.turn, a) for a in FACTORS], kept.judged, 0.0, FOR)
     kept = painted if painted.evidence.kept else kept
-    gains = dict(zip(trial.names, (given.values - kept.judged.values).tolist(), strict=True))
     if not (turned.evidence.kept or painted.evidence.kept):
         return Found(turned.evidence, painted.evidence)
-    detail = plain
-    for number in range(ROUNDS):
-        tick = pieces.of(0.85 + 0.05 * number, 0.9 + 0.05 * number, BETWEEN.points, f"all photos, round {number + 1}")
-        if number:
-            fit = fitted(trial.on(detail).sampled(OBSERVATIONS, seed), fit, prior, BETWEEN, tick)
-            parts = trial.parts(detail, fit)
-        detail = step(parts, laplacian, kept.stiffness, detail, surfaces.nodes_of(moving))
+    gains = dict(zip(trial.names, (given.values - kept.judged.values).tolist(), strict=True))
+    detail = search.of_all_photos(kept.stiffness, moving, pieces, seed)
     displacements = surfaces.displacements(detail.turn, attached) if turned.evidence.kept else {}
     displacements = {name: of for name, of in displacements.items() if name in moving}
     factors = surfaces.by_mesh(detail.log_factor) if painted.evidence.kept else {}
     return Found(turned.evidence, painted.evidence, kept.stiffness, gains, displacements, factors)
+
+
+def trial_of(
+    problem: JointProblem, start: Start, seed: int, surface: tuple[Surfaces, list[Attached]], tick: Tick
+) -> Trial:
+    """Return the problem without detail, and its fit with the shadows and bounces of the given meshes; surface: and where its blocks lie on it."""
+    prior, sure = read_light_prior(), sure_ones(problem)
+
+    def fitting(name: str, some: JointProblem, begun: Fit, schedule: Schedule) -> Fit:
+        """Fit under the prior."""
+        return fitted(some, begun, prior, schedule, tick)
+
+    choices = Choices(self_shadowing="on", interreflection="on", seed=seed)
+    effects = effects_chosen(sure, start(sure, TRIAL_CELLS), choices, fitting)
+    problem = effects.of(problem)
+    fit = fitted(problem.sampled(OBSERVATIONS, seed), on_cells(effects.fit, CELLS, problem), prior, SETTLE, tick)
+    return Trial(problem, fit, *surface, prior)
 
 
 class Pieces(msgspec.Struct, frozen=True):

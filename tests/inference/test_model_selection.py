@@ -169,7 +169,7 @@ def test_curves_are_found_and_spare_the_materials_by_evidence_that_held_out_loss
         np.ptp(off) < 0.02 and abs(off.mean()) < 0.08
     )  # what all photos share, a light of more contrast nearly explains
     assert all(len(e) == 0 for e in exponents_of(without))
-    assert error_of(found) < 0.3 * error_of(without), (error_of(found), error_of(without))
+    assert error_of(found) < 0.4 * error_of(without), (error_of(found), error_of(without))
     assert [one.kept for one in found.tone][:2] == [True, True]
     for one in found.tone:
         assert one.kept == (one.margin > FOR and one.held_out_loss_without > (1 + CURVED_GAIN) * one.held_out_loss_with)

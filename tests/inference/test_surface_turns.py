@@ -144,7 +144,7 @@ def on_spheres(lights: int, size: float, seed: int = 0) -> tuple[Found, Surfaces
     at = [attached_to(block.normal, body) for block in problem.blocks]
     told = Rising()
     return (
-        found(given, body, at, from_nothing(3), PRIOR, report=lambda share, what: told(share, 1, what)),
+        found(given, body, at, from_nothing(3), report=lambda share, what: told(share, 1, what)),
         body,
         given,
         problem,
@@ -180,7 +180,7 @@ def test_of_two_meshes_the_one_with_dents_is_moved_and_the_exact_one_stays():
         )
         own = attached_to(block.normal, surfaces())
         at.append(msgspec.structs.replace(own, node=own.node + one.nodes * exact[:, None]))
-    what = found(problem.of(given), body, at, from_nothing(3), PRIOR)
+    what = found(problem.of(given), body, at, from_nothing(3))
     assert what.evidence.kept and set(what.displacements) == {"dented"}
     turn = body.turns_of(what.displacements)
     assert turn[body.nodes_of({"dented"})].any() and not turn[body.nodes_of({"exact"})].any()
@@ -206,7 +206,7 @@ def test_patina_is_found_in_three_lights_and_is_not_taken_for_dents():
         msgspec.structs.replace(b, radiance=b.radiance * y / np.maximum(x, 1e-9))
         for b, x, y in zip(problem.blocks, plain, shown, strict=True)
     ]
-    what = found(problem.of(blocks), body, at, from_nothing(3), PRIOR)
+    what = found(problem.of(blocks), body, at, from_nothing(3))
     assert what.painted.kept
     seen = np.bincount(np.concatenate([of.node.reshape(-1) for of in at]), minlength=body.nodes) > 0
     assert np.corrcoef(what.log_factors["ball"][seen], log_factor[seen])[0, 1] > 0.8
