@@ -81,7 +81,7 @@ class LightLikelihood(msgspec.Struct, frozen=True):
         value, slope = self._prior()
         return Gradient(data.value + value, data.by_materials, data.by_light + slope)
 
-    def system(self, materials_given: bool = False, clusters: Int[np.ndarray, " n"] | None = None) -> System:
+    def normal_equations(self, materials_given: bool = False, clusters: Int[np.ndarray, " n"] | None = None) -> System:
         """Return the value of (1), or of φ where materials are given, and its normal equations.
 
         The first 3p unknowns of the light are u.

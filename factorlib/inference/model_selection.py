@@ -15,7 +15,7 @@ All but the last by `factorlib.inference.evidence`, on observations whose normal
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 
 import msgspec
 import numpy as np
@@ -38,6 +38,8 @@ NEARER_FROM = 1.0  # standard errors: from here on a light comes nearer, and at 
 # Of lights that are 20, 10 and 5 RMS distances away: a chair's points are .4 m from their middle, a room's walls and lamps 2 to 8 m.
 CURVATURES = (0.05, 0.1, 0.2)
 NEARER = Schedule(lights=2, together=(3,), estimate=False)
+MORE = 4  # times as many observations
+WORTH = 0.05  # of the held-out loss; after a splitting that gained 3 %, two more gained 3.6 and 1 % on data/eames, materials no better
 GIVEN = Schedule(lights=2, estimate=False, given=True)
 
 Fitting = Callable[[str, JointProblem, Fit, Schedule], Fit]  # what is fitted, to what, from where, by how many steps
@@ -60,6 +62,20 @@ class Chosen(msgspec.Struct, frozen=True):
 
     fit: Fit
     evidence: list[Decision]
+
+
+def worth_while(splitting: Decision) -> bool:
+    """Return whether a splitting was kept and gained so much that another one is tried."""
+    gain = (splitting.held_out_loss_without or 0.0) / max(splitting.held_out_loss_with or 1.0, 1e-12) - 1
+    return splitting.kept and gain > WORTH
+
+
+def observations_of(choices: Choices, splittings: Sequence[Decision]) -> int:
+    """Return how many observations of a light are fitted: more where smaller cells explain what is held out much better.
+
+    There errors of the model are small, and those of few observations show: k_d of data/synthetic is 13 % wrong with 1,000, 1.8 % with 4,000.
+    """
+    return MORE * choices.observations if splittings and worth_while(splittings[0]) else choices.observations
 
 
 def sample_of(problem: JointProblem, choices: Choices) -> JointProblem:

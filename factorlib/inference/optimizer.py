@@ -91,7 +91,7 @@ class Descent(msgspec.Struct, frozen=True):
         """Return the systems of all lights at some materials, determinants included."""
         materials = materials_of(theta)
         moved = [one.at(materials=materials) for one in likelihoods]
-        return self._state(theta, moved, list(self.spread(LightLikelihood.system, moved)))
+        return self._state(theta, moved, list(self.spread(LightLikelihood.normal_equations, moved)))
 
     def _state(
         self, theta: Float[np.ndarray, "m 7"], likelihoods: list[LightLikelihood], systems: list[System]
@@ -147,7 +147,7 @@ class Descent(msgspec.Struct, frozen=True):
 
 def light_descended(one: LightLikelihood, iterations: int) -> tuple[LightLikelihood, System]:
     """Return a light at the minimum of φ, the materials given, and its system there."""
-    system = one.system(materials_given=True)
+    system = one.normal_equations(materials_given=True)
     for _ in range(iterations):
 
         def objective(step: np.ndarray, begun: LightLikelihood = one) -> tuple[float, np.ndarray]:
@@ -161,7 +161,7 @@ def light_descended(one: LightLikelihood, iterations: int) -> tuple[LightLikelih
 
         step = minimised(objective, len(system.light_gradient), metric)
         one, before = one.at(moved_light(one.light, step)), system.value
-        system = one.system(materials_given=True)
+        system = one.normal_equations(materials_given=True)
         if before - system.value < TOLERANCE * abs(before):
             break
     return one, system

@@ -170,7 +170,7 @@ def part_of(
         residual[line.rows, line.channel] = line.residual
         by_factor[line.rows, line.channel] = line.by_material[:, 0]  # ∂r/∂log k_d
         by_light[line.channel, line.rows] = np.hstack([line.diffuse + line.specular, line.by_photo])
-    system = likelihood.system(materials_given=True)
+    system = likelihood.normal_equations(materials_given=True)
     weight = own.pull(block.residuals(shown.radiance), ROBUST, counts.temperature)
     slopes = (_by_normal(illumination) * weight[:, :, None]).reshape(3 * n, 3)
     factors = np.repeat(attached.share, 3, axis=0) * by_factor.reshape(-1, 1)

@@ -42,6 +42,7 @@ from factorlib.inference.gauge import connected_components
 from factorlib.inference.history import Solution
 from factorlib.inference.likelihood import factorised, inverse_of
 from factorlib.inference.materials import ROUGHNESS, Materials, Point
+from factorlib.inference.model_selection import observations_of
 from factorlib.inference.options import Choices
 from factorlib.inference.priors import materials_of, unknowns_of
 from factorlib.inference.problem import JointProblem
@@ -76,7 +77,8 @@ def uncertainty_of(
     problem: all observations that the solution was found from;  tick: called after each of two systems for each light
     """
     problem, prior = solution.shown(problem), read_light_prior()
-    some, all_ = (of.sampled(choices.observations, choices.seed) for of in (sure_ones(problem), problem))
+    count = observations_of(choices, solution.splitting)
+    some, all_ = (of.sampled(count, choices.seed) for of in (sure_ones(problem), problem))
     found, deviation = Posterior(some, solution.materials, prior, tick).standard_errors()
     fitted, materials = solution.materials.point.materials, solution.point.materials
     diffuse = found.diffuse * materials.diffuse / fitted.diffuse
@@ -98,7 +100,9 @@ class Posterior:
         def system(one: tuple[Illumination, Hyperparameters]) -> System:
             """Return the system of one illumination."""
             clusters = one[0].block.clusters() if with_scores else None
-            made = likelihood_of(*one, self.prior, not with_scores).system(materials_given=True, clusters=clusters)
+            made = likelihood_of(*one, self.prior, not with_scores).normal_equations(
+                materials_given=True, clusters=clusters
+            )
             self.tick()
             return made
 

@@ -109,7 +109,9 @@ class Spheres:
 
     def __init__(self, case: Case, materials: Table, lights: Maps, truths: Table, maps: Maps):
         self.case, self.materials, self.truths = case, materials, truths
-        self.true = {li: Appearances(light_of_lat_long(light)) for li, light in maps.items()}
+        true = {li: light_of_lat_long(light) for li, light in maps.items()}
+        self.true = {li: Appearances(light) for li, light in true.items()}
+        self.true_means = {li: light.mean for li, light in true.items()}
         self.own = {li: Appearances(light_of_lat_long(light)) for li, light in lights.items()}
 
     def score(self) -> Score:
@@ -131,7 +133,7 @@ class Spheres:
         grey = times(GREY, factor_of(dict.fromkeys(names, GREY), self.truths))
         white = Appearances(constant_light(np.ones(3)))
         greys = (self._dssim(true[li].ball(grey), n, li) for n in names for li in true)
-        constants = (self._dssim(white.ball(m) * true[li].light.mean, n, li) for n, m in every for li in own)
+        constants = (self._dssim(white.ball(m) * self.true_means[li], n, li) for n, m in every for li in own)
         return score | Score(values, {"new_light": _mean(greys), "new_material": _mean(constants)})
 
     def _dssim(self, predicted: Float[np.ndarray, "_ 3"], name: str, light: int) -> float:

@@ -84,7 +84,9 @@ def test_lights_from_the_observations_that_they_were_found_from_stay(solved):
         problem.fitted().blocks, found.hyperparameters, found.point.lights, again.point.lights, strict=True
     ):
         alone = likelihood(JointProblem([one], OPERATOR), light, found.point.materials, how.temperature)
-        deviation = np.sqrt(np.diag(np.linalg.inv(alone.system(materials_given=True).light_hessian))).reshape(3, -1)
+        deviation = np.sqrt(np.diag(np.linalg.inv(alone.normal_equations(materials_given=True).light_hessian))).reshape(
+            3, -1
+        )
         assert np.mean(np.abs(after.log_radiance - light.log_radiance) < deviation) > 0.95
 
 

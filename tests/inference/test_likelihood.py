@@ -24,13 +24,13 @@ def prior_of(light, precision) -> float:
 
 def log_det(one) -> float:
     """log det H, of the value."""
-    part = one.system()
+    part = one.normal_equations()
     return part.value - part.loss / one.temperature - prior_of(one.light, one.precision) + one.log_determinant
 
 
 def posterior(one) -> float:
     """φ."""
-    return one.system(materials_given=True).loss / one.temperature + prior_of(one.light, one.precision)
+    return one.normal_equations(materials_given=True).loss / one.temperature + prior_of(one.light, one.precision)
 
 
 def moved(light, step):
@@ -52,11 +52,13 @@ def here(request):
 
 
 def test_the_gradient_by_materials_is_the_finite_difference_of_the_value(here):
-    system = here.system()
+    system = here.normal_equations()
     gradient = system.material_gradient + system.determinant_by_materials
     for place in range(THETA.size):
         change = 2e-3 * np.eye(THETA.size)[place].reshape(THETA.shape)
-        high, low = (here.at(materials=materials_of(THETA + sign * change)).system().value for sign in (1, -1))
+        high, low = (
+            here.at(materials=materials_of(THETA + sign * change)).normal_equations().value for sign in (1, -1)
+        )
         assert gradient[place] == pytest.approx((high - low) / 4e-3 / 2, rel=0.02, abs=0.02 * np.abs(gradient).max()), (
             place
         )
@@ -66,7 +68,7 @@ def test_the_gradient_by_materials_is_the_finite_difference_of_the_value(here):
 def test_the_gradient_by_light_is_that_of_the_loss_and_the_prior(here, toned):
     light, rng = here.light, np.random.default_rng(2)
     light = msgspec.structs.replace(light, log_tone=0.1 * rng.normal(size=len(light.log_exposure))) if toned else light
-    gradient = here.at(light).system().light_gradient
+    gradient = here.at(light).normal_equations().light_gradient
     for _ in range(4):
         change = rng.normal(size=light.unknowns)
         high, low = (posterior(here.at(moved(light, sign * 1e-3 * change))) for sign in (1, -1))
@@ -74,7 +76,7 @@ def test_the_gradient_by_light_is_that_of_the_loss_and_the_prior(here, toned):
 
 
 def test_the_determinant_by_light_is_half_the_finite_difference_of_log_det(here):
-    light, rng, by_light = here.light, np.random.default_rng(4), here.system().determinant_by_light
+    light, rng, by_light = here.light, np.random.default_rng(4), here.normal_equations().determinant_by_light
     for change in (np.ones(3 * CELLS), rng.normal(size=3 * CELLS), np.eye(3 * CELLS)[by_light[: 3 * CELLS].argmax()]):
         step = np.concatenate([change, np.zeros(light.unknowns - len(change))])
         high, low = (log_det(here.at(moved(light, sign * 5e-3 * step))) for sign in (1, -1))
@@ -93,9 +95,9 @@ def test_darker_materials_in_a_brighter_light_are_as_likely_but_for_the_prior(he
         there = one.at(
             light.with_log_radiance(light.log_radiance + step * cells), materials_of(THETA + step * direction)
         )
-        values.append(there.system().value - prior_of(there.light, one.precision))
+        values.append(there.normal_equations().value - prior_of(there.light, one.precision))
     assert values[0] == pytest.approx(values[1], abs=1e-3 * abs(values[0]))
-    part = one.system()
+    part = one.normal_equations()
     by_light = part.light_gradient, part.light_gradient + part.determinant_by_light
     alone, whole = (
         abs(
@@ -114,7 +116,7 @@ def test_darker_materials_in_a_brighter_light_are_as_likely_but_for_the_prior(he
 def settled(one, steps=15):
     """The likelihood at the light that lowers φ."""
     for _ in range(steps):
-        part, light = one.system(materials_given=True), one.light
+        part, light = one.normal_equations(materials_given=True), one.light
         one = one.at(moved(light, -np.linalg.solve(part.light_hessian, part.light_gradient).clip(-1, 1)))
     return one
 
@@ -128,7 +130,7 @@ def test_the_determinant_is_needed_for_roughness(seed):
     tried, found = (0.15, 0.25, 0.4, 0.55), []
     for roughness in tried:
         there = settled(one.at(materials=msgspec.structs.replace(MATERIALS, roughness=np.full(3, roughness))))
-        found.append((there.system().value, posterior(there)))
+        found.append((there.normal_equations().value, posterior(there)))
     values, posteriors = np.array(found).T
     assert tried[values.argmin()] == MATERIALS.roughness[1] and np.sort(values)[1] - values.min() > 10
     assert tried[posteriors.argmin()] < MATERIALS.roughness[1] and posteriors[2] - posteriors.min() > 10

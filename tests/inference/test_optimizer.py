@@ -12,7 +12,7 @@ from tests.inference.made_lights import PRIOR, WHOLE, begun, likelihood, photogr
 
 def test_the_arrow_is_solved_as_the_dense_system_is():
     problem, lights = photographed(5, 2, cells=20, size=8)
-    systems = [likelihood(problem.restricted([k]), lights[k]).system() for k in (0, 1)]
+    systems = [likelihood(problem.restricted([k]), lights[k]).normal_equations() for k in (0, 1)]
     size, prior = 21, np.eye(21)
     free = np.arange(size) != 3
     ends = np.cumsum([size, *(len(one.light_gradient) for one in systems)])

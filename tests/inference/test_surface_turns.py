@@ -17,7 +17,7 @@ from factorlib.meshes.fine import Fine
 from factorlib.meshes.mesh import Mesh
 from studies.scenes.problems import MATERIALS
 from tests.inference.made import in_units_of, photos_in_a_wrong_light
-from tests.inference.made_lights import PRIOR, begun, drawn, on_even_cells, photographed, spheres
+from tests.inference.made_lights import PRIOR, begun, drawn, light_of, on_even_cells, photographed, spheres
 from tests.stages.made import Rising
 
 TURN = np.linalg.qr(np.random.default_rng(3).normal(size=(3, 3)))[0]  # the object's axes in the camera's frame
@@ -210,3 +210,22 @@ def test_patina_is_found_in_three_lights_and_is_not_taken_for_dents():
     assert what.painted.kept
     seen = np.bincount(np.concatenate([of.node.reshape(-1) for of in at]), minlength=body.nodes) > 0
     assert np.corrcoef(what.log_factors["ball"][seen], log_factor[seen])[0, 1] > 0.8
+
+
+def sharp(seed: int):
+    """A room with three lamps, each narrower than a cell."""
+    random = np.random.default_rng(seed)
+    axis = np.vstack([[0.0, 0.0, 1.0], random.normal(size=(3, 3)) + [0.0, 0.0, -1.0]])
+    weight = np.array([0.4, *random.uniform(20, 60, 3)])[:, None] * random.lognormal(0, 0.1, (4, 3))
+    return light_of(axis, [1e-4, 400.0, 800.0, 200.0], weight)
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("lights, shown", [(3, (0, 1, 2)), (5, (1,)), (3, (1, 2))])
+@pytest.mark.parametrize("seed", range(2))
+def test_an_exact_surface_stays_in_sharp_lights(lights, shown, seed):
+    """Were the cells of all lights the same, normals would gain by turning toward what they have in common."""
+    problem, body = spheres([sharp(10 * seed + k) for k in range(lights)], shown=shown, size=22, noise=0.1), surfaces()
+    at = [attached_to(block.normal, body) for block in problem.blocks]
+    what = found(problem, body, at, from_nothing(3))
+    assert not what.evidence.kept and not what.displacements
