@@ -33,7 +33,7 @@ GIVEN_UP_UNEXPLAINED = 0.04
 class Search(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """How hard to look.  The tuples hold one number per round of refinement, in order; most guesses fall in the first."""
 
-    views: Count = 240
+    views: Count = 300
     """Directions of view, evenly over the sphere, that are tried."""
     rolls: Count = 20
     """Turns about the line of sight tried for each direction of view."""
