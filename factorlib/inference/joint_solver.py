@@ -176,10 +176,6 @@ def split_while_gaining(problem: JointProblem, fit: Fit, choices: Choices, run: 
     evidence, before = [], losses_of(some, fit.point)
     for number in range(0 if problem.none_held_out else choices.splittings):
         phase, smallest = f"splitting {number + 1}", 2 * np.radians(SMALLEST)
-        if number == 1:
-            some = problem.sampled(observations_of(choices, evidence), choices.seed)
-            fit = run.judged(phase, some, fit, AFTER_SPLITTING)
-            before = losses_of(some, fit.point)
         lights = [one if one.held.any() else one.split(one.brightest(SPLIT, smallest)) for one in fit.point.lights]
         trial = run.judged(phase, some, fit.with_lights(lights), AFTER_SPLITTING)
         after = losses_of(some, trial.point)
@@ -188,4 +184,8 @@ def split_while_gaining(problem: JointProblem, fit: Fit, choices: Choices, run: 
             fit, before = trial, after
         if not worth_while(one):
             break
+        if number == 0:
+            some = problem.sampled(observations_of(choices, evidence), choices.seed)
+            fit = run.judged(phase, some, fit, AFTER_SPLITTING)
+            before = losses_of(some, fit.point)
     return Chosen(fit, evidence)
