@@ -23,13 +23,15 @@ from factorlib.inference.gauge import in_gauge
 from factorlib.inference.history import Solution
 from factorlib.inference.materials import Point
 from factorlib.inference.model_selection import (
+    MUCH,
     TRIAL_CELLS,
+    WORTH,
     Chosen,
     curves_chosen,
     distances_chosen,
     effects_chosen,
+    gained,
     observations_of,
-    worth_while,
 )
 from factorlib.inference.options import Choices
 from factorlib.inference.problem import JointProblem
@@ -170,7 +172,7 @@ def split_while_gaining(problem: JointProblem, fit: Fit, choices: Choices, run: 
     """Split cells at most `Choices.splittings` times.
 
     A splitting that does not explain held-out observations better by more than FINER standard errors is undone, and the last.  One that lowers
-    their loss by less than WORTH is kept, and the last.  After the first that lowers it by more, there are MORE times as many observations.
+    their loss by less than WORTH is kept, and the last.  After a first that lowers it by MUCH, there are MORE times as many observations.
     """
     some = problem.sampled(choices.observations, choices.seed)
     evidence, before = [], losses_of(some, fit.point)
@@ -182,9 +184,9 @@ def split_while_gaining(problem: JointProblem, fit: Fit, choices: Choices, run: 
         evidence.append(one := compare(before, after, FINER))
         if one.kept:
             fit, before = trial, after
-        if not worth_while(one):
+        if not gained(one, WORTH):
             break
-        if number == 0:
+        if number == 0 and gained(one, MUCH):
             some = problem.sampled(observations_of(choices, evidence), choices.seed)
             fit = run.judged(phase, some, fit, AFTER_SPLITTING)
             before = losses_of(some, fit.point)

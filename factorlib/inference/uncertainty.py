@@ -100,7 +100,7 @@ class Posterior:
         def system(one: tuple[Illumination, Hyperparameters]) -> System:
             """Return the system of one illumination."""
             clusters = one[0].block.clusters() if with_scores else None
-            made = likelihood_of(*one, self.prior, not with_scores).normal_equations(
+            made = likelihood_of(*one, self.prior, not with_scores, self.problem.tables).normal_equations(
                 materials_given=True, clusters=clusters
             )
             self.tick()
