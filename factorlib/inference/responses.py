@@ -15,6 +15,7 @@ from __future__ import annotations
 from collections import OrderedDict
 from hashlib import blake2b
 from math import prod
+from threading import Lock
 from typing import NamedTuple, Protocol
 
 import numpy as np
@@ -212,6 +213,7 @@ class Tables:
 
     def __init__(self) -> None:
         self._known: OrderedDict[bytes, Reflections] = OrderedDict()
+        self._lock = Lock()  # lights are spread over threads
 
     def of(
         self, block: Block, lobes: UnitLobes, operator: Operator, given: Float[np.ndarray, " m"] | None = None
@@ -223,12 +225,12 @@ class Tables:
         for array in arrays:
             digest.update(b"" if array is None else np.ascontiguousarray(array))
         key = digest.digest()
-        if key not in self._known:
-            self._known[key] = Reflections(block, lobes, operator, given is not None)
-        self._known.move_to_end(key)
-        for old in list(self._known)[:-KEPT_TABLES]:
-            del self._known[old]
-        return self._known[key]
+        with self._lock:
+            table = self._known.pop(key, None) or Reflections(block, lobes, operator, given is not None)
+            self._known[key] = table
+            while len(self._known) > KEPT_TABLES:
+                self._known.popitem(last=False)
+        return table
 
 
 def lagrange(nodes: Float[np.ndarray, " k"], x: float) -> tuple[Float[np.ndarray, " k"], Float[np.ndarray, " k"]]:
