@@ -27,7 +27,7 @@ from factorlib.inference.options import Choices
 from factorlib.inference.problem import JointProblem
 from factorlib.results.materials import Decision
 
-TRIAL_OBSERVATIONS, TRIAL_CELLS = 800, 120  # of a light, while models are compared
+TRIAL_OBSERVATIONS, TRIAL_CELLS = 1000, 180  # of a light, while models are compared
 TRIAL = Schedule(lights=3, together=(6, 4))
 AGAIN = Schedule(lights=2, together=(4, 2), estimate=False)
 CURVED = Schedule(together=(8,), estimate=False)
