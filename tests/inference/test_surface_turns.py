@@ -224,7 +224,7 @@ def sharp(seed: int):
 @pytest.mark.parametrize("lights, shown", [(3, (0, 1, 2)), (5, (1,)), (3, (1, 2))])
 @pytest.mark.parametrize("seed", range(2))
 def test_an_exact_surface_stays_in_sharp_lights(lights, shown, seed):
-    """Were the cells of all lights the same, normals would gain by turning toward what they have in common."""
+    """Cells blur what is sharper than they are, and turned normals must not take that up."""
     problem, body = spheres([sharp(10 * seed + k) for k in range(lights)], shown=shown, size=22, noise=0.1), surfaces()
     at = [attached_to(block.normal, body) for block in problem.blocks]
     what = found(problem, body, at, from_nothing(3))
