@@ -43,6 +43,7 @@ from factorlib.inference.gauge import in_gauge
 from factorlib.inference.history import Event, Report, Solution, unreported
 from factorlib.inference.lights import Light
 from factorlib.inference.materials import ROUGHNESS, SHARPNESS, Materials, Point
+from factorlib.inference.optimizer import inverse_hessian_times
 from factorlib.inference.options import Lobes, Seed
 from factorlib.inference.problem import JointProblem
 from factorlib.inference.start import starting_materials
@@ -103,7 +104,7 @@ def drawn(
 def stepped(objective: Objective, x: Tensor, pairs: Pairs) -> tuple[Tensor, float]:
     """x after one step on one subset, and the objective there; the pair that was measured joins `pairs`."""
     value, gradient = objective(x)
-    direction = -inverse_hessian_times(gradient, pairs)
+    direction = -inverse_hessian_times(gradient, pairs, lambda slope: first_metric(slope, pairs))
     direction = direction * min(1.0, LARGEST_STEP / max(float(direction.abs().max()), 1e-30))
     slope, length = float(gradient @ direction), 1.0
     for _ in range(HALVINGS):
@@ -119,19 +120,12 @@ def stepped(objective: Objective, x: Tensor, pairs: Pairs) -> tuple[Tensor, floa
     return x, value
 
 
-def inverse_hessian_times(gradient: Tensor, pairs: Sequence[tuple[Tensor, Tensor]]) -> Tensor:
-    """The two-loop recursion (Nocedal 1980); with no pair yet, the gradient at a tenth of its own size."""
-    q, alphas = gradient.clone(), []
-    for step, change in reversed(pairs):
-        alphas.append(float(step @ q) / float(step @ change))
-        q -= alphas[-1] * change
+def first_metric(slope: Tensor, pairs: Pairs) -> Tensor:
+    """Return a vector at the scale of the last pair; with no pair yet, at a tenth of its own size."""
     if not pairs:
-        return 0.1 * q / max(float(gradient.abs().max()), 1e-30)
+        return 0.1 * slope / max(float(slope.abs().max()), 1e-30)
     step, change = pairs[-1]
-    q *= float(step @ change) / float(change @ change)
-    for (step, change), alpha in zip(pairs, reversed(alphas), strict=True):
-        q += (alpha - float(change @ q) / float(step @ change)) * step
-    return q
+    return slope * (float(step @ change) / float(change @ change))
 
 
 class PaperObjective:
