@@ -20,7 +20,7 @@ from factorlib.images.exr import LAT_LONG, write_rgb_exr
 from factorlib.images.light_map import read_light_map
 from factorlib.inference import options
 from factorlib.inference.answer import Answer
-from factorlib.inference.history import Event, Solution, of_parts, of_rounds
+from factorlib.inference.history import Event, Solution, of_parts, of_subsets
 from factorlib.inference.identifiability import after_solving, before_solving, unusable_observations
 from factorlib.inference.joint_solver import solve
 from factorlib.inference.known import what_is_known
@@ -158,7 +158,7 @@ def _solved(
     names = inputs.facts["dataset.materials"]
     if params.solver == "paper":
         paper = Paper(params.paper_lobes, params.paper_samplings, params.paper_prior, params.seed)
-        return solve_as_the_paper(problem, len(names), paper, of_rounds(progress, REPORTS))
+        return solve_as_the_paper(problem, len(names), paper, of_subsets(progress, REPORTS))
     unfinished = Checkpoint(inputs.unfinished / "solve.pt" if inputs.unfinished else None)
     start = from_earlier(earlier, names) if earlier else from_nothing(len(names))
     choices = with_decided(params, earlier) if earlier else params

@@ -8,8 +8,9 @@ where d_i is a gradient by the light that materials alone feel (`factorlib.infer
 that the data hold about the materials when the lights are unknown too.  A light's C has rows for the materials that it shows alone, so that cost
 grows with those few.
 
-A step is the elimination of damped systems; standard errors come of that of the systems as they are.  Unknowns that are known or at a bound have their
-rows and columns taken out before.  Damping multiplies the diagonal, so that a step does not depend on the units of an unknown.
+`Arrow` is H factorised: the metric in which the optimiser steps.  Unknowns that are known or at a bound have their rows and columns taken out.
+Damping multiplies the diagonal, so that a step does not depend on the units of an unknown.  `information` is the Schur complement alone, of which
+standard errors come.
 """
 
 from __future__ import annotations

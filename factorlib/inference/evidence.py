@@ -1,6 +1,6 @@
-"""How choices of the model are made: by observations that no candidate was fitted to.
+"""Evidence for a choice of the model: held-out observations, to which no candidate was fitted.
 
-Two models are fitted to the same observations, each for itself.  Held-out observations are those of whole cells of mirror directions
+Two models are fitted to the same observations.  Held-out observations are those of whole cells of mirror directions
 (`factorlib.inference.observed`).  With a_i and b_i the mean robust losses of light i without and with the richer part, and n_i its held-out
 observations,
 

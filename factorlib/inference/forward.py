@@ -5,8 +5,8 @@
     residual   r_ic = (y_ic − radiance_ic) / σ_ic; where the channel is clipped min(r_ic, 0), for the true radiance may be higher
 
 D and S are the responses of `factorlib.inference.responses`, e is the photo's exposure, G what other surfaces send
-(`factorlib.inference.interreflection`).  A new physical effect is added here once: radiance and derivatives are of one and the same sum (few lobes have
-a Jacobian of their own).
+(`factorlib.inference.interreflection`).  A new physical effect is added here once: radiance and derivatives are of one
+and the same sum.
 
 Unknowns: log k_d, log k_s (RGB each) and roughness of a material; u of every cell and channel; log exposures and log tone exponents.  A
 channel's residuals depend on the cells of that channel alone, so the Jacobian is a dense block a channel.

@@ -8,7 +8,6 @@ import msgspec
 
 from factorlib.inference.fit import Fit
 from factorlib.inference.materials import Point
-from factorlib.inference.noise import Loss
 from factorlib.inference.options import Choices
 from factorlib.inference.problem import JointProblem
 from factorlib.results.materials import Decision
@@ -47,7 +46,7 @@ def unreported(event: Event) -> None:
 class Solution(msgspec.Struct, frozen=True):
     """The answer of a solver: a point, and what was decided of the model.
 
-    history     every point that was tried;  loss: the loss function that judges held-out observations
+    history     every point that was tried
     shadows     whether visibility was used, with its evidence;  interreflection: whether surfaces light each other
     tone        the evidence for each light's tone curves;  distances: for each light's distance; empty where nothing was tried
     splitting   the evidence for each splitting of the lights' cells
@@ -57,7 +56,6 @@ class Solution(msgspec.Struct, frozen=True):
 
     point: Point
     history: list[Event]
-    loss: Loss
     materials: Fit
     lights: Fit
     shadows: Decision = Decision(False)
@@ -68,17 +66,18 @@ class Solution(msgspec.Struct, frozen=True):
     suns: list[Decision] = []
 
     def shown(self, problem: JointProblem) -> JointProblem:
-        """The problem that the answer solves: with shadows and bounces or without, with the last loss."""
-        return problem.with_effects(self.shadows.kept, self.interreflection.kept).with_loss(self.loss)
+        """Return the problem that the answer solves: with shadows and bounces, or without."""
+        return problem.with_effects(self.shadows.kept, self.interreflection.kept)
 
 
-def of_rounds(progress: Progress, rounds: int) -> Report:
-    """The progress of a solver that takes at most so many rounds, or reports so many subsets: few lobes', or the paper's."""
+def of_subsets(progress: Progress, subsets: int) -> Report:
+    """Return the progress of the paper's solver, which reports so many subsets."""
 
     def report(event: Event) -> None:
-        """Say how many of all rounds are done."""
-        done = event.round if event.phase in ("descent", "round", "subset") else rounds
-        progress(done, rounds + 1, f"{event.phase} {event.iteration}: loss {event.loss:.3g}, {event.lobes} lobes")
+        """Say how many of all subsets are done."""
+        progress(
+            event.round, subsets + 1, f"{event.phase} {event.iteration}: loss {event.loss:.3g}, {event.lobes} lobes"
+        )
 
     return report
 

@@ -97,7 +97,6 @@ def solve(problem: JointProblem, start: Start, choices: Choices = Choices(), run
     return Solution(
         Point(problem.known.put(answer.materials), answer.lights),
         run.history,
-        problem.loss,
         materials=state.materials,
         lights=state.fit,
         shadows=state.shadows,

@@ -11,8 +11,10 @@ from jaxtyping import Float
 from factorlib.inference.lights import Light
 
 ROUGHNESS = (0.1, 1.0)  # the operators' domain
-SHARPNESS = (0.1, 2000.0)  # λ of few lobes: from nearly constant to 1.3° wide, about a texel of the exported map
-RESOLVED = 16.0  # times the sharpest reflection's λ: such a lobe widens it by 3 %, and nothing sharper can be resolved
+SHARPNESS = (
+    0.1,
+    2000.0,
+)  # λ of the paper's lobes: from nearly constant to 1.3° wide, about a texel of the exported map
 LEAST_REFLECTANCE = 1e-5  # keeps a black material inside its bounds
 
 
@@ -45,23 +47,6 @@ class Materials(msgspec.Struct, frozen=True):
         rows = vector.reshape(-1, 7)
         reflectance = np.maximum(rows[:, :6], LEAST_REFLECTANCE)
         return Materials(reflectance[:, :3], reflectance[:, 3:], np.clip(rows[:, 6], *ROUGHNESS))
-
-    @property
-    def blur(self) -> float:
-        """b = 2 min α²: about how much the least rough material widens a lobe's variance 1/λ."""
-        return 2 * float(self.roughness.min()) ** 4
-
-    @property
-    def sharpest(self) -> float:
-        """The largest sharpness λ that can be resolved: reflections of sharper lobes look the same."""
-        return min(RESOLVED / self.blur, SHARPNESS[1])
-
-    def lambertian(self, m: int) -> Materials:
-        """Return the materials with material m Lambertian: its specular reflectance is added to its diffuse one."""
-        diffuse, specular = self.diffuse.copy(), self.specular.copy()
-        diffuse[m] += specular[m]
-        specular[m] = LEAST_REFLECTANCE
-        return Materials(diffuse, specular, self.roughness)
 
 
 class Point(msgspec.Struct, frozen=True):

@@ -59,7 +59,7 @@ class State(NamedTuple):
 
 
 class Descent(msgspec.Struct, frozen=True):
-    """prior: on materials;  spread: a map over lights;  free: unknowns of the materials that are not known."""
+    """Descent under a prior on materials.  spread: a map over lights;  free: unknowns of the materials that are not known."""
 
     prior: MaterialPrior
     spread: Spread

@@ -87,7 +87,7 @@ def solve(problem: JointProblem, materials: int, paper: Paper, report: Report = 
             history.append(Event((iteration + 1) // every - 1, "subset", iteration, value, held_out, lobes))
             report(history[-1])
     fit = start_of(objective.point(x))
-    return Solution(in_gauge(fit.point, blocks), history, problem.loss, materials=fit, lights=fit)
+    return Solution(in_gauge(fit.point, blocks), history, materials=fit, lights=fit)
 
 
 def drawn(

@@ -72,11 +72,6 @@ class JointProblem(msgspec.Struct, frozen=True):
         """Whether all observations are fitted, so that none can choose a model."""
         return not any(block.held_out.any() for block in self.blocks)
 
-    @property
-    def fitted_values(self) -> int:
-        """How many channel values are fitted."""
-        return sum(int((~block.held_out).sum()) * 3 for block in self.blocks)
-
     def sampled(self, count: int | Sequence[int], seed: int) -> JointProblem:
         """Return the problem with at most `count` fitted observations of each block (one number, or one a block), and a third as many held out."""
         counts = [count] * len(self.blocks) if isinstance(count, int) else count
@@ -97,10 +92,6 @@ class JointProblem(msgspec.Struct, frozen=True):
     def with_none_held_out(self) -> JointProblem:
         """The same observations, all to be fitted."""
         return self.of([block.with_none_held_out() for block in self.blocks])
-
-    def with_loss(self, loss: Loss) -> JointProblem:
-        """The same observations, another loss."""
-        return msgspec.structs.replace(self, loss=loss)
 
     def of(self, blocks: list[Block]) -> JointProblem:
         """The same question of other observations."""

@@ -1,11 +1,11 @@
-"""Whether the surfaces of a set are moved by shading, and painted, how stiff both are, and what they end with.
+"""Surface detail: turns of normals and factors on albedo, chosen with their stiffness by photos that had no part in them.
 
 start      materials and lights are fitted on few cells, with the shadows and bounces of the given meshes.  Lights are far away: where normals are wrong, near
            ones take up what turns should explain (rough set of seed 0: 3.5 instead of 3.1 degrees)
 stiffness  of each of `TURNS`, from stiff to soft, turns are found from all photos but those of one fold, for every fold in turn; a photo of that fold then
            gets a light of its own, with the materials given.  The stiffness is used with which the photos are likeliest, lights integrated out
            (`factorlib.inference.likelihood`); the search ends where that falls.  Every light has cells of its own (`factorlib.inference.start`):
-           were they the same, normals could turn toward their centres, and all photos would gain
+           were they the same, normals could turn toward their centres in all photos at once
 whether    turns are kept where the likelihood is higher than without turns, and the photos' held-out observations are explained better by more than `FOR`
            standard errors over clusters (`factorlib.inference.evidence`).  Of several meshes, those stay with which alone neither is better
 paint      factors on the diffuse reflectance likewise, of a stiffness of `FACTORS`, beside the turns and over what these explain; they are kept where the

@@ -8,7 +8,7 @@ Materials   With all lights eliminated, S is the materials' information and s_k 
 
             lets residuals within a cluster depend on each other in any way (Liang and Zeger 1986).  It is taken over two kinds of
             clusters.  One is what a light sends toward nearby mirror directions: a region of the light, whose bias all materials there
-            share.  The other is a whole light: with few lobes it is wrong everywhere in ways that agree, and only other lights
+            share.  The other is a whole light: what is wrong everywhere in it agrees, and only other lights
             show it.  The largest of the three variances is taken, unknown by unknown.
 
             The data leave one factor per channel and component free, so an error is only defined once that factor is fixed.

@@ -67,7 +67,6 @@ def answer(blocks, checkpoint=Checkpoint(None), spread=serial_map):
         found.tone,
         found.distances,
         found.splitting,
-        found.loss,
     ]
     hyper = [[one.value, one.hyperparameters] for one in (found.materials, found.lights)]
     return np.concatenate(parts).tobytes() + msgspec.json.encode([decided, hyper]), events
