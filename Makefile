@@ -34,7 +34,7 @@ lock: .venv/ready
 
 test: .venv/ready
 	@$(PY) -m ruff check --no-cache && $(PY) -m ruff format --check --no-cache --quiet
-	@.venv/bin/lint-imports --no-cache
+	@.venv/bin/lint-imports --no-cache && $(PY) -m mypy
 	@OMP_NUM_THREADS=1 PYTHONDONTWRITEBYTECODE=1 env -u DATASET -u SET -u FORCE $(PY) -m pytest -n 2 -p no:cacheprovider
 
 test-long: .venv/ready

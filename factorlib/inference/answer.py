@@ -126,7 +126,8 @@ class Answer(msgspec.Struct, frozen=True, dict=True):
 
     def model(self) -> table.Model:
         """What was decided of the model, and by what; the pivots of tone curves in scene radiance."""
-        names, solution, lit, started = self.names, self.solution, self.lit(), UNSET
+        names, solution, lit = self.names, self.solution, self.lit()
+        started: table.Started | UnsetType = UNSET
         lights = [block.name for block, _ in lit]
         if self.earlier is not None:
             known = set(names) & set(self.earlier.table.materials), set(lights) & set(self.earlier.lights)
@@ -155,9 +156,9 @@ class Answer(msgspec.Struct, frozen=True, dict=True):
         )
 
 
-def _rows(materials: Materials) -> list[tuple[list[float], list[float], float]]:
+def _rows(materials: Materials) -> list[tuple[table.Channels, table.Channels, float]]:
     """Diffuse, specular and roughness of each."""
-    return list(zip(materials.diffuse.tolist(), materials.specular.tolist(), materials.roughness.tolist(), strict=True))
+    return [((a, b, c), (d, e, f), r) for a, b, c, d, e, f, r in materials.rows().tolist()]
 
 
 def _tried(decision: Decision) -> dict[str, float]:

@@ -23,7 +23,8 @@ from jaxtyping import Bool, Float, Int
 from scipy.linalg import cho_factor, cho_solve
 
 FLOOR = 1e-9  # share of the largest diagonal entry that is added to all
-Vector, Matrix = Float[np.ndarray, " k"], Float[np.ndarray, "k k"]
+Vector = Float[np.ndarray, " k"]
+Matrix = Float[np.ndarray, "k k"]
 
 
 class System(NamedTuple):

@@ -116,7 +116,7 @@ def fitted(
     for number, iterations in enumerate(schedule.together):
         if number or schedule.estimate:
             systems = list(zip(state.likelihoods, state.systems, strict=True))
-            hyperparameters = list(problem.spread(lambda each: estimated(*each, schedule.least), systems))
+            hyperparameters = list(problem.spread(lambda each: estimated(each[0], each[1], schedule.least), systems))
             both = zip(state.likelihoods, hyperparameters, strict=True)
             state = state._replace(likelihoods=[recounted(*each) for each in both])
         if given:

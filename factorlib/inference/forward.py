@@ -98,14 +98,17 @@ class Illumination(msgspec.Struct, frozen=True):
         """Radiance, and what it is made of."""
         block, kd, ks, responses = self.block, self.materials.diffuse, self.materials.specular, []
         diffuse, specular, by_roughness = np.zeros((3, len(block), 3))
-        for m, rows in material_slices(block) if self.table is None else ():
-            lobes, weight, roughness = self.light.unit_lobes, self.light.weight, float(self.materials.roughness[m])
-            diffuse[rows] = diffuse_response(block, rows, lobes, self.operator) @ weight
-            specular[rows] = specular_response(block, rows, lobes, roughness, self.operator) @ weight
-        for m in np.unique(block.material).tolist() if self.table else ():
-            rows, of = self.table.rows(m), self.table.at(m, float(self.materials.roughness[m]))
-            diffuse[rows], specular[rows], by_roughness[rows] = of.radiance(self.light.weight)
-            responses.append((m, rows, of))
+        weight, roughness = self.light.weight, self.materials.roughness.tolist()
+        if self.table is None:
+            lobes = self.light.unit_lobes
+            for m, rows in material_slices(block):
+                diffuse[rows] = diffuse_response(block, rows, lobes, self.operator) @ weight
+                specular[rows] = specular_response(block, rows, lobes, roughness[m], self.operator) @ weight
+        else:
+            for m in np.unique(block.material).tolist():
+                rows, of = self.table.rows(m), self.table.at(m, roughness[m])
+                diffuse[rows], specular[rows], by_roughness[rows] = of.radiance(weight)
+                responses.append((m, rows, of))
         diffuse, specular, by_roughness = (part * self.exposure for part in (diffuse, specular, by_roughness))
         if block.bounced is not None:
             diffuse, specular = diffuse + block.bounced[:, :3], specular + block.bounced[:, 3:]

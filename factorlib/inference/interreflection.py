@@ -39,7 +39,7 @@ def bounced_light(seen: Observations, radiance: Float[np.ndarray, "n 3"]) -> Flo
     if seen.visibility is None or seen.met is None:
         return None
     sent = np.zeros((len(seen), 6))
-    hidden = (seen.visibility < 255).any(1)
+    hidden = seen.visibility.min(1) < 255
     for photo in np.unique(seen.photo):
         rows = np.flatnonzero(seen.photo == photo)
         surfaces = radiance_by_code(seen.take(rows), radiance[rows])
@@ -78,18 +78,20 @@ def _by_bin(
 
 def _sent_to(seen: Observations, surfaces: Float[np.ndarray, "c+1 3"]) -> Float[np.ndarray, "n 6"]:
     """(1) at observations of one photo; the highlight is no narrower than the directions lie apart, as in factorlib.light.visibility."""
-    count, unknown = seen.visibility.shape[1], len(surfaces) - 1
+    visibility, met = seen.visibility, seen.met
+    assert visibility is not None and met is not None  # `bounced_light` asks for such observations alone
+    count, unknown = visibility.shape[1], len(surfaces) - 1
     directions = torch.from_numpy(fibonacci_sphere(count)).float()
     normal, view = (torch.from_numpy(unit(v)).float() for v in (seen.normal, seen.view))
-    hidden = 1 - torch.from_numpy(seen.visibility).float() / 255
+    hidden = 1 - torch.from_numpy(visibility).float() / 255
     alpha = torch.tensor(math.sqrt(ROUGHNESS**4 + 1 / widest_sharpness(count)))
     nd, no, od = normal @ directions.T, (normal * view).sum(1, keepdim=True), view @ directions.T
     nh = ((nd + no) / (2 + 2 * od).clamp_min(1e-6).sqrt()).clamp(0, 1)
     highlight = specular(alpha, nd, no, nh) * (4 * math.pi / count)
-    code = np.where((seen.met == UNMET) | (seen.met >= unknown), unknown, seen.met).astype(np.int64)
+    code = np.where((met == UNMET) | (met >= unknown), unknown, met).astype(np.int64)
     by_channel = [torch.from_numpy(surfaces[:, c]).float()[torch.from_numpy(code)] for c in range(3)]
     weights = [hidden * of for of in (cosine_weights(normal, directions), highlight)]
-    return np.column_stack([(weight * met).sum(1).double().numpy() for weight in weights for met in by_channel])
+    return np.column_stack([(weight * sent).sum(1).double().numpy() for weight in weights for sent in by_channel])
 
 
 def unit(vectors: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:

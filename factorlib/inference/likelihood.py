@@ -111,7 +111,7 @@ class LightLikelihood(msgspec.Struct, frozen=True):
                 towards = part.by_photo.T @ J
                 L[photos, own] += towards
                 L[own, photos] += towards.T
-            if scores is not None:  # a cluster's sum of slopes, each times its residual
+            if clusters is not None and scores is not None:  # a cluster's sum of slopes, each times its residual
                 summing = (clusters[part.rows] == np.arange(len(scores))[:, None]) * part.residual
                 scores[:, at] += summing @ part.by_material
                 scores[:, k + own.start : k + own.stop] += summing @ J

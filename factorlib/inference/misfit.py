@@ -34,7 +34,7 @@ def misfit(problem: JointProblem, radiance: Sequence[Float[np.ndarray, "n 3"]]) 
     for block, shown in zip(problem.blocks, radiance, strict=True):
         for number, photo in enumerate(block.photos):
             own = block.photo == number
-            energies[photo] = np.sum(list(_energies(block, shown, own)) or [[0.0, 0.0]], axis=0)
+            energies[photo] = np.sum(list(_energies(block, shown, own)) or [(0.0, 0.0)], axis=0)
             clipped[photo] = float(block.clipped[own].mean()) if own.any() else 0.0
     by_photo = {photo: Misfit(_share(*energy), clipped[photo]) for photo, energy in energies.items()}
     return _share(*np.sum(list(energies.values()), axis=0)), by_photo

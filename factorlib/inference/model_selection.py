@@ -131,9 +131,10 @@ def curves_chosen(problem: JointProblem, before: Fit, choices: Choices, fit: Fit
     sample = sample_of(problem, choices)
     freed = [light if has else light.with_curves() for light, has in zip(lights, had, strict=True)]
     curved = fit("tone curves", sample, before.with_lights(freed), CURVED)
-    losses, evidence = [losses_of(sample, one.point) for one in (before, curved)], []
+    without, richer = (losses_of(sample, one.point) for one in (before, curved))
+    evidence = []
     for k, light in enumerate(curved.point.lights):
-        one = _evidence_of_light(k, *losses)
+        one = _evidence_of_light(k, without, richer)
         gain = (one.held_out_loss_without or 0.0) / max(one.held_out_loss_with or 1.0, 1e-12) - 1
         kept = one.kept and gain > CURVED_GAIN and not light.beyond_cameras
         evidence.append(Decision(True) if had[k] else msgspec.structs.replace(one, kept=kept))
@@ -141,8 +142,8 @@ def curves_chosen(problem: JointProblem, before: Fit, choices: Choices, fit: Fit
         return Chosen(curved, evidence)
     if not any(one.kept and not has for one, has in zip(evidence, had, strict=True)):
         return Chosen(before, evidence)
-    kept = [new if one.kept else old for new, old, one in zip(curved.point.lights, lights, evidence, strict=True)]
-    return Chosen(fit("tone curves", sample, before.with_lights(kept), CURVED), evidence)
+    mixed = [new if one.kept else old for new, old, one in zip(curved.point.lights, lights, evidence, strict=True)]
+    return Chosen(fit("tone curves", sample, before.with_lights(mixed), CURVED), evidence)
 
 
 def distances_chosen(problem: JointProblem, before: Fit, choices: Choices, fit: Fitting) -> Chosen:
@@ -194,4 +195,5 @@ def believed(evidence: Decision) -> float:
 
 def _evidence_of_light(k: int, without: Losses, richer: Losses, least: float = FOR) -> Decision:
     """Return the evidence that light k alone gives for the richer model."""
-    return compare(*(Losses([of.values[k]], [of.clusters[k]]) for of in (without, richer)), least)
+    losses = [Losses([of.values[k]], [of.clusters[k]]) for of in (without, richer)]
+    return compare(losses[0], losses[1], least)

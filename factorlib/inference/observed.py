@@ -41,7 +41,7 @@ def gathered(
 
     surface: the folder of the stage `surface`, whose normals are used where it has some
     """
-    return spread(partial(_of_file, degrees=degrees, surface=surface), files)
+    return list(spread(partial(_of_file, degrees=degrees, surface=surface), files))
 
 
 def _of_file(path: Path, degrees: float, surface: Path | None) -> PhotoObservations:

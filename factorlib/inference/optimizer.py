@@ -192,7 +192,8 @@ def minimised(objective: Objective, size: int, metric: Callable[[np.ndarray], np
     """Return the step from 0 that minimises a value, by L-BFGS; metric: about the inverse of half the Hessian, times a vector."""
     x = np.zeros(size)
     value, gradient = objective(x)
-    pairs, least = deque(maxlen=MEMORY), 0.0
+    pairs: deque[tuple[np.ndarray, np.ndarray]] = deque(maxlen=MEMORY)
+    least = 0.0
     for _ in range(STEPS):
         direction = -inverse_hessian_times(gradient, pairs, metric)
         decrement = -float(gradient @ direction)

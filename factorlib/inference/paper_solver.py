@@ -29,7 +29,8 @@ from __future__ import annotations
 import math
 from collections import deque
 from collections.abc import Callable, Sequence
-from typing import Annotated
+from functools import partial
+from typing import Annotated, Any
 
 import msgspec
 import numpy as np
@@ -55,6 +56,7 @@ Pairs = deque[tuple[Tensor, Tensor]]  # steps, and changes of gradient along the
 MEMORY = 20  # pairs
 LARGEST_STEP = 0.05
 SUFFICIENT, HALVINGS = 1e-4, 12
+LOG_SHARPNESS = (math.log(SHARPNESS[0]), math.log(SHARPNESS[1]))
 REPORTS = 20  # in a run
 SUBSET = 512  # observations
 
@@ -78,10 +80,11 @@ def solve(problem: JointProblem, materials: int, paper: Paper, report: Report = 
     rows = [np.flatnonzero(~block.held_out) for block in blocks]
     iterations = math.ceil(paper.samplings * sum(map(len, rows)) / SUBSET)
     every, lobes = max(1, iterations // REPORTS), paper.lobes * len(blocks)
-    x, pairs, random = objective.start(), deque(maxlen=MEMORY), np.random.default_rng(paper.seed)
+    x, random = objective.start(), np.random.default_rng(paper.seed)
+    pairs: Pairs = deque(maxlen=MEMORY)
     for iteration in range(iterations):
         subset = drawn(rows, SUBSET, random)
-        x, value = stepped(lambda at, s=subset: objective.at(at, s), x, pairs)
+        x, value = stepped(partial(objective.at, subset=subset), x, pairs)
         if (iteration + 1) % every == 0 or iteration + 1 == iterations:
             held_out = problem.held_out_loss(objective.point(x))
             history.append(Event((iteration + 1) // every - 1, "subset", iteration, value, held_out, lobes))
@@ -143,7 +146,7 @@ class PaperObjective:
         p, begin = self.paper.lobes, self.begin
         roughness = _unbounded(begin.roughness, ROUGHNESS)
         parts = [np.column_stack([_unbounded(begin.diffuse), _unbounded(begin.specular), roughness]).reshape(-1)]
-        level = np.full((p, 1), _unbounded(np.log(p / 2), np.log(SHARPNESS)))  # λ of lobes whose variances cover 4π
+        level = np.full((p, 1), _unbounded(np.log(p / 2), LOG_SHARPNESS))  # λ of lobes whose variances cover 4π
         for block in self.blocks:
             reflectance = (begin.diffuse + begin.specular)[block.material].mean(0)
             weight = np.tile(block.radiance.mean(0) / np.maximum(reflectance, 1e-3), (p, 1))
@@ -155,7 +158,8 @@ class PaperObjective:
         """(diffuse, specular, roughness) and, of each light, (axis, log sharpness, weight, log exposure)."""
         of_materials, *of_lights = torch.split(x, self.sizes)
         bounded = torch.sigmoid(of_materials.reshape(-1, 7))
-        (low, high), (least, most), lights = ROUGHNESS, np.log(SHARPNESS), []
+        (low, high), (least, most) = ROUGHNESS, LOG_SHARPNESS
+        lights: list[tuple[Tensor, ...]] = []
         for part in of_lights:
             rows, others = part[: 7 * self.paper.lobes].reshape(-1, 7), part[7 * self.paper.lobes :]
             axis = torch.nn.functional.normalize(rows[:, :3], dim=1)
@@ -168,7 +172,9 @@ class PaperObjective:
         """The materials and lights that x stands for."""
         (diffuse, specular, roughness), lights = self.unpacked(x)
         vector = torch.cat([diffuse, specular, roughness[:, None]], 1).reshape(-1).numpy()
-        return Point(Materials.of_vector(vector), [Light(*(t.numpy() for t in light)) for light in lights])
+        arrays = [[part.numpy() for part in light] for light in lights]
+        found = [Light(axis, sharpness, weight, exposure) for axis, sharpness, weight, exposure in arrays]
+        return Point(Materials.of_vector(vector), found)
 
     def at(self, x: Tensor, subset: Sequence[Int[np.ndarray, " _"]]) -> tuple[float, Tensor]:
         """Value and gradient on the subset."""
@@ -193,8 +199,8 @@ class PaperObjective:
                 squares = squares + (difference.masked_fill(clipped & (difference > 0), 0.0) ** 2).sum()
                 values += difference.numel()
         value = squares / max(values, 1) + self.paper.prior * prior / len(self.blocks)
-        value.backward()
-        return value.item(), x.grad
+        (gradient,) = torch.autograd.grad(value, x)
+        return float(value.detach()), gradient
 
 
 class UnitReflection(torch.autograd.Function):
@@ -202,7 +208,7 @@ class UnitReflection(torch.autograd.Function):
 
     @staticmethod
     def forward(
-        ctx: torch.autograd.function.FunctionCtx,
+        ctx: Any,
         operator: Operator,
         roughness: Tensor,
         log_sharpness: Tensor,
@@ -219,9 +225,7 @@ class UnitReflection(torch.autograd.Function):
         return r.diffuse.to(cosines[1].dtype), r.specular.to(cosines[1].dtype)
 
     @staticmethod
-    def backward(
-        ctx: torch.autograd.function.FunctionCtx, diffuse: Tensor, specular: Tensor
-    ) -> tuple[Tensor | None, ...]:
+    def backward(ctx: Any, diffuse: Tensor, specular: Tensor) -> tuple[Tensor | None, ...]:
         """Gradients by roughness, log sharpness, n·z and o·z; views are given, so there is none by n·o."""
         by_roughness, d_by_sharpness, s_by_sharpness, d_by_nz, s_by_nz, s_by_oz = ctx.saved_tensors
         by_sharpness = (diffuse * d_by_sharpness + specular * s_by_sharpness).sum(0)

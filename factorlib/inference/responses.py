@@ -54,7 +54,7 @@ def specular_response(
     """S at `rows`, for a material of that roughness; float64."""
     nz, oz, larger = met_cosines(block, rows, lobes)
     no = (block.normal[rows] * block.view[rows]).sum(1)
-    inputs = (_tensor(v, operator) for v in (np.float64(roughness), lobes.sharpness, no, nz, oz))
+    inputs = (_tensor(v, operator) for v in (np.array(roughness), lobes.sharpness, no, nz, oz))
     with torch.no_grad():
         return larger * shadowed(operator.specular(*inputs), block, rows, lobes, roughness).double().numpy()
 
@@ -75,7 +75,7 @@ def shadowed(
     response: Float[Tensor, "n p"], block: Block, rows: Rows, lobes: UnitLobes, roughness: float | None = None
 ) -> Float[Tensor, "n p"]:
     """The response to lobes at `rows` with shadows: the diffuse one, or the specular one of a material of that roughness."""
-    if block.visibility is None:
+    if block.visibility is None or block.directions is None:
         return response
     response = response.clone()
     visibility, photo = block.visibility[rows], block.photo[rows]
@@ -223,7 +223,7 @@ class Tables:
         arrays = [block.normal, block.view, block.material, block.photo, lobes.axis, lobes.sharpness, *optional]
         digest = blake2b(repr((id(operator), lobes.curvature, [of is None for of in optional])).encode())
         for array in arrays:
-            digest.update(b"" if array is None else np.ascontiguousarray(array))
+            digest.update(b"" if array is None else np.ascontiguousarray(array).data)
         key = digest.digest()
         with self._lock:
             table = self._known.pop(key, None) or Reflections(block, lobes, operator, given is not None)

@@ -20,7 +20,8 @@ from factorlib.inference.history import Event, Report, unreported
 from factorlib.inference.problem import JointProblem
 from factorlib.light.prior import LightPrior, read_light_prior
 
-T, Q = TypeVar("T"), TypeVar("Q")
+T = TypeVar("T")
+Q = TypeVar("Q")
 
 
 def plain(value: Any) -> Any:
@@ -32,14 +33,14 @@ def plain(value: Any) -> Any:
     return [plain(item) for item in value] if isinstance(value, list) else value
 
 
-def restored(type_: type[T], value: Any) -> T:
+def restored(type_: Any, value: Any) -> Any:
     """The inverse of `plain`."""
     if isinstance(value, torch.Tensor):
         return value.numpy().copy()
     if isinstance(value, dict):
         hints = get_type_hints(type_)
         return type_(**{name: restored(hints[name], item) for name, item in value.items()})
-    return [restored(*get_args(type_), item) for item in value] if isinstance(value, list) else value
+    return [restored(get_args(type_)[0], item) for item in value] if isinstance(value, list) else value
 
 
 class Run:

@@ -64,15 +64,16 @@ def with_known(point: Point, problem: JointProblem) -> Point:
     names, rows = [block.name for block in problem.blocks], materials.rows()
     given = np.maximum(known.put(materials).rows(), LEAST_REFLECTANCE)
     for members, illuminations in connected_components(problem.blocks, len(materials)):
-        own = {i: known.lights.get(problem.blocks[i].name) for i in map(names.index, illuminations)}
+        lit = [names.index(name) for name in illuminations]
+        own = {i: known.lights[names[i]] for i in lit if names[i] in known.lights}
         logs = [np.log((given[m, :3] + given[m, 3:6]) / (rows[m, :3] + rows[m, 3:6])) for m in known.of(members)]
-        brighter = {i: level(lights[i]) - level(one) + np.log(problem.blocks[i].unit) for i, one in own.items() if one}
+        brighter = {i: level(lights[i]) - level(one) + np.log(problem.blocks[i].unit) for i, one in own.items()}
         logs = logs or [by - by.mean() * own[i].scale_free for i, by in brighter.items()] or [np.zeros(3)]
         factor = np.mean(logs, axis=0)  # on reflectances
         rows[list(members), :6] *= np.tile(np.exp(factor), 2)
-        for i, one in own.items():
+        for i in lit:
             weight, parts = lights[i].weight / np.exp(factor), {}
-            if one:
+            if one := own.get(i):
                 scale = (brighter[i] - factor).mean() * one.scale_free - np.log(problem.blocks[i].unit)
                 weight, held = one.weight * np.exp(scale), {"held": one.held, "scale_free": one.scale_free}
                 parts = {"axis": one.axis, "log_sharpness": one.log_sharpness, **held}

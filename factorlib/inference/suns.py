@@ -103,7 +103,8 @@ def candidate(illumination: Illumination, sharpness: float) -> Light:
 def compared(without: Illumination, richer: Illumination, least: float) -> Decision:
     """The evidence of all observations for one light of them against another."""
     number = richer.block.clusters()
-    return compare(*(Losses([one.losses(Loss())], [number]) for one in (without, richer)), least)
+    losses = [Losses([one.losses(Loss())], [number]) for one in (without, richer)]
+    return compare(losses[0], losses[1], least)
 
 
 def clearly_better(cells: Illumination, sun: Illumination) -> Decision:

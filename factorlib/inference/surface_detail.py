@@ -149,7 +149,7 @@ class Trial(msgspec.Struct, frozen=True):
         """Every light linearised on a surface with detail."""
         each = zip(self.on(detail).illuminations(fit.point), fit.hyperparameters, self.attached, strict=True)
         nodes = self.surfaces.nodes
-        return list(self.problem.spread(lambda one: part_of(*one[:2], self.prior, one[2], nodes), list(each)))
+        return list(self.problem.spread(lambda one: part_of(one[0], one[1], self.prior, one[2], nodes), list(each)))
 
     def moving(self, detail: Detail, meshes: set[str]) -> Detail:
         """The detail with the turns of these meshes alone."""
@@ -182,6 +182,7 @@ class Trial(msgspec.Struct, frozen=True):
                 return plain.values[at], Losses([plain.losses.values[at]], [plain.losses.clusters[at]])
             seen = msgspec.structs.replace(self.problem.blocks[k].take(own), row=np.arange(own.sum()))
             seen = seen.sampled(OBSERVATIONS, 0)
+            assert seen.row is not None
             problem = self.problem.of([detail.on(seen, here.take(seen.row))])
             begun = Point(self.fit.point.materials, [self.fit.point.lights[k]])
             (one,) = problem.fitted().illuminations(begun)

@@ -203,7 +203,6 @@ def in_gauge(
             g, h = np.zeros(rows.shape), np.zeros(rows.shape)
             own = np.ix_(members, columns)
             g[own], h[own] = rows[own], 1
-            g, h = g.reshape(-1), h.reshape(-1)
-            P = np.eye(len(g)) - np.outer(g, h) / (h @ g)
+            P = np.eye(rows.size) - np.outer(g, h) / np.vdot(h, g)
             covariance = P @ covariance @ P.T
     return covariance

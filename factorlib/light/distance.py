@@ -11,13 +11,13 @@ So a constant light stays constant, and c = 0 is the light of an environment map
 
 from __future__ import annotations
 
-from typing import TypeVar
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float
 
 LONGEST = 0.5  # of |X|: a point that lies more than halfway to the light is taken to lie halfway
-A = TypeVar("A")  # np.ndarray or torch.Tensor
+A = Any  # np.ndarray or torch.Tensor
 
 
 def met_from(place: A, normal: A, view: A, axis: A, curvature: float) -> tuple[A, A, A]:

@@ -62,7 +62,7 @@ def squared_distances(directions: Float[np.ndarray, "n 3"], axes: Float[np.ndarr
     return sum((directions[:, None, k] - axes[None, :, k]) ** 2 for k in range(3))
 
 
-def lobe_integral(sharpness: float | Float[np.ndarray, "*p"]) -> float | Float[np.ndarray, "*p"]:
+def lobe_integral(sharpness: float | Float[np.ndarray, "*p"]) -> Float[np.ndarray, "*p"]:
     """∫ exp(λ(ω·z − 1)) dω over the sphere, steradian.
 
     >>> (lobe_integral(np.array([0.0, 1e-12, 1e6])) / np.pi).round(9).tolist()

@@ -87,7 +87,8 @@ class LightPrior(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
         u is log R of all `directions`, then log G, then log B:  Q = Σ_k A_kᵀ A_k ⊗ K_k⁻¹/s_k²
         """
-        precision, log_determinant, p = 0.0, 0.0, len(directions)
+        p, log_determinant = len(directions), 0.0
+        precision = np.zeros((3 * p, 3 * p))
         for k, (row, factor) in enumerate(zip(MIX, factors, strict=True)):
             inverse, log_of_inverse = _inverse(self, k, directions.tobytes())
             precision = precision + np.kron(np.outer(row, row), inverse / factor)
