@@ -30,13 +30,14 @@ from factorlib.inference.paper_solver import REPORTS, Paper, Prior, Samplings
 from factorlib.inference.paper_solver import solve as solve_as_the_paper
 from factorlib.inference.problem import JointProblem
 from factorlib.inference.resume import Run
-from factorlib.inference.start import from_earlier, from_nothing, with_decided
+from factorlib.inference.start import Beginning, Start, from_beginning, from_earlier, from_nothing, with_decided
 from factorlib.inference.uncertainty import uncertainty_of
-from factorlib.jsonfile import write_json
+from factorlib.jsonfile import read_result, write_json
 from factorlib.parquetfile import write_rows
 from factorlib.reflection import reflection_operator
 from factorlib.results.lobes import write_lobes
 from factorlib.results.solution import Earlier, read_earlier
+from factorlib.results.surface import BEGINNING
 from factorlib.stage import Inputs, Progress
 from factorlib.urm import observations as urm
 
@@ -160,9 +161,17 @@ def _solved(
         paper = Paper(params.paper_lobes, params.paper_samplings, params.paper_prior, params.seed)
         return solve_as_the_paper(problem, len(names), paper, of_subsets(progress, REPORTS))
     unfinished = Checkpoint(inputs.unfinished / "solve.pt" if inputs.unfinished else None)
-    start = from_earlier(earlier, names) if earlier else from_nothing(len(names))
+    start = from_earlier(earlier, names) if earlier else _beginning(inputs, problem) or from_nothing(len(names))
     choices = with_decided(params, earlier) if earlier else params
     return solve(problem, start, choices, Run(unfinished, of_parts(progress, choices)))
+
+
+def _beginning(inputs: Inputs, problem: JointProblem) -> Start | None:
+    """Return the start at what `surface` has fitted; none where that is not there, or was fitted without what is known."""
+    surface = inputs.folders.get("surface")
+    if surface is None or not problem.known.nothing or not (surface / BEGINNING).is_file():
+        return None
+    return from_beginning(read_result(surface / BEGINNING, Beginning, "surface"))
 
 
 def _warn(sentences: Iterable[str]) -> None:

@@ -2,7 +2,8 @@
 
 Materials and lights are fitted as the solve begins; then normals turn until they explain all photos best, and stay so only where photos that had no
 part in it gain (`factorlib.inference.surface_detail`).  Then detail of reflectance likewise, over what shape explains.
-Writes surface.json, and where surfaces differ photos/<photo>.exr: the normals that every later stage uses in place of those of `align`, and detail.
+Writes surface.json, beginning.json (materials and lights of the first fit, from which `solve` goes on), and where surfaces differ
+photos/<photo>.exr: the normals that every later stage uses in place of those of `align`, and detail.
 """
 
 from pathlib import Path
@@ -27,7 +28,7 @@ from factorlib.meshes.read import CREASE_DEG, MeshesOnce
 from factorlib.reflection import reflection_operator
 from factorlib.results.poses import FILE as POSES
 from factorlib.results.poses import PhotoPoses, read_poses
-from factorlib.results.surface import FILE, SurfaceTable, Tried
+from factorlib.results.surface import BEGINNING, FILE, SurfaceTable, Tried
 from factorlib.stage import Inputs, Progress
 from factorlib.urm.extract import Channels
 from factorlib.urm.observations import (
@@ -81,6 +82,7 @@ def main(params: Params, inputs: Inputs, out: Path, progress: Progress) -> None:
         bool(factors), Tried.of(result.painted, result.stiffness.factor), result.gains, *by_mesh,
     )  # fmt: skip
     write_json(out / FILE, table)
+    write_json(out / BEGINNING, result.beginning)
     progress(1, 1)
 
 

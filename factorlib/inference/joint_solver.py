@@ -18,7 +18,7 @@ import msgspec
 import numpy as np
 
 from factorlib.inference.evidence import FINER, compare, losses_of
-from factorlib.inference.fit import Fit, Schedule, start_of, sure_ones
+from factorlib.inference.fit import Fit, Schedule, sure_ones
 from factorlib.inference.gauge import in_gauge
 from factorlib.inference.history import Solution
 from factorlib.inference.materials import Point
@@ -91,7 +91,7 @@ def solve(problem: JointProblem, start: Start, choices: Choices = Choices(), run
     """Return the answer, in the gauge of `factorlib.inference.gauge`."""
     run = run or Run()
     asked = Asked(problem, start, choices, run)
-    begun = start_of(starting_points(asked)[0])
+    begun = beginnings(asked)[0]
     state = run.completed(STEPS, asked, State(begun, begun))
     answer = in_gauge(state.fit.point, problem.blocks, problem.known)
     return Solution(
@@ -108,15 +108,16 @@ def solve(problem: JointProblem, start: Start, choices: Choices = Choices(), run
     )
 
 
-def starting_points(asked: Asked) -> list[Point]:
-    """Return the points from which the first trial starts; of the fits, the best goes on."""
+def beginnings(asked: Asked) -> list[Fit]:
+    """Return the fits from which the first trial starts; of the trials, the best goes on."""
     sure, cells = sure_ones(asked.problem), min(TRIAL_CELLS, asked.choices.cells)
-    return [with_known(point, sure) for point in asked.start(sure, cells)]
+    begun = asked.start(sure, cells)
+    return [msgspec.structs.replace(fit, point=with_known(fit.point, sure)) for fit in begun]
 
 
 def choose_effects(asked: Asked, state: State) -> State:
     """Choose shadows and bounces."""
-    chosen = effects_chosen(sure_ones(asked.problem), starting_points(asked), asked.choices, asked.run.fit)
+    chosen = effects_chosen(sure_ones(asked.problem), beginnings(asked), asked.choices, asked.run.fit)
     return state.after(chosen.fit, shadows=chosen.shadows, bounces=chosen.bounces)
 
 

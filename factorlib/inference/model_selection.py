@@ -21,8 +21,7 @@ import msgspec
 import numpy as np
 
 from factorlib.inference.evidence import AGAINST, FOR, Losses, compare, losses_of
-from factorlib.inference.fit import Fit, Schedule, start_of
-from factorlib.inference.materials import Point
+from factorlib.inference.fit import Fit, Schedule
 from factorlib.inference.options import Choices
 from factorlib.inference.problem import JointProblem
 from factorlib.results.materials import Decision
@@ -83,7 +82,7 @@ def sample_of(problem: JointProblem, choices: Choices) -> JointProblem:
     return problem.sampled(min(TRIAL_OBSERVATIONS, choices.observations), choices.seed)
 
 
-def effects_chosen(problem: JointProblem, starts: list[Point], choices: Choices, fit: Fitting) -> Effects:
+def effects_chosen(problem: JointProblem, starts: list[Fit], choices: Choices, fit: Fitting) -> Effects:
     """Shadows and bounces; problem: sure observations;  starts: the one that ends best is used."""
     sample, hidden = sample_of(problem, choices), any(block.visibility is not None for block in problem.blocks)
     # where nothing is held out, what meshes hide is hidden, and nothing further is added
@@ -98,8 +97,8 @@ def effects_chosen(problem: JointProblem, starts: list[Point], choices: Choices,
         if (with_shadows, with_bounces) not in tried:
             name = "shadows and bounces" if with_bounces else "shadows" if with_shadows else "no shadows"
             model = sample.with_effects(with_shadows, with_bounces)
-            begun = [fit for fit, _ in list(tried.values())[:1]] or [start_of(start) for start in starts]
-            fits = [fit(name, model, one, AGAIN if tried else TRIAL) for one in begun]
+            begun = [fit for fit, _ in list(tried.values())[:1]] or starts
+            fits = [fit(name, model, one, AGAIN if np.isfinite(one.value) else TRIAL) for one in begun]
             trials = [(one, losses_of(model, one.point)) for one in fits]
             tried[with_shadows, with_bounces] = min(trials, key=lambda one: _geometric_mean(one[1]))
         return tried[with_shadows, with_bounces]

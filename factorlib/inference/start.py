@@ -1,7 +1,8 @@
-"""Where a solve starts: from mean radiances alone, or from an earlier solution, of which what has a name there is used.
+"""Where a solve starts: from mean radiances alone, from what `surface` has fitted, or from an earlier solution.
 
 From nothing   The median radiance of material m in photo i is roughly light_i · reflectance_m per channel: a rank-one matrix with gaps, whose
                logarithm is fitted as a sum by least squares.  Exposures follow from mean radiances, lights are constant.
+From surface   The stage `surface` fits the same materials and lights to the meshes as they are; a solve goes on from there (`Beginning`).
 From earlier   Materials are known by their names, lights by their illumination's.  Mean radiances give all materials one relative scale
                (`mean_albedo`), known or new; each gauge of the earlier solution is brought to that scale by one factor per channel, the
                geometric mean over its materials, and its lights by the inverse.  So groups that a new photo links come into one gauge, and
@@ -24,7 +25,7 @@ from jaxtyping import Float
 from scipy.spatial.transform import Rotation
 
 from factorlib.inference.blocks import Block
-from factorlib.inference.fit import Fit
+from factorlib.inference.fit import Fit, Hyperparameters, start_of
 from factorlib.inference.forward import Illumination
 from factorlib.inference.gauge import connected_components
 from factorlib.inference.lights import TONE, Light, UnitLobes, even_cells
@@ -40,20 +41,70 @@ ROUGHNESS, SPECULAR_SHARE = 0.4, 0.2  # of every material at the start
 FEW, STARTS = 2, (0.15, 0.4, 0.8)  # with so few materials, a solve starts from several roughnesses
 LEAST_RADIANCE = 1e-6  # of a block's mean
 
-# Points on so many cells a light, of which the one that explains most goes on.
-Start = Callable[[JointProblem, int], list[Point]]
+# Fits on so many cells a light, of which the one that explains most goes on.
+Start = Callable[[JointProblem, int], list[Fit]]
 
 
 def from_nothing(materials: int) -> Start:
     """Materials 0 … `materials`−1 and lights from mean radiances alone; with few materials, from several roughnesses."""
 
-    def points(problem: JointProblem, cells: int) -> list[Point]:
-        """One point a roughness, its lights constant."""
+    def fits(problem: JointProblem, cells: int) -> list[Fit]:
+        """Return one fit a roughness, its lights constant."""
         blocks, roughness = problem.blocks, STARTS if materials <= FEW else STARTS[1:2]
         begun = [starting_materials(blocks, materials, one) for one in roughness]
-        return [Point(of, [constant_light(block, of, cells) for block in blocks]) for of in begun]
+        return [start_of(Point(of, [constant_light(block, of, cells) for block in blocks])) for of in begun]
 
-    return points
+    return fits
+
+
+class BegunLight(msgspec.Struct, frozen=True):
+    """Light on the first p of `own_cells`.
+
+    weight: of the cells, RGB, in scene radiance;  log_exposure: of its photos;  hyperparameters: of the fit
+    """
+
+    weight: list[list[float]]
+    log_exposure: list[float]
+    hyperparameters: Hyperparameters
+
+
+class Beginning(msgspec.Struct, frozen=True):
+    """Materials and lights that were fitted to the meshes as they are.
+
+    materials: k_d, k_s (RGB each) and roughness by number;  lights: by illumination;  value: of the fit
+    """
+
+    materials: list[list[float]]
+    lights: dict[str, BegunLight]
+    value: float
+
+    @staticmethod
+    def of(fit: Fit, blocks: Sequence[Block]) -> Beginning:
+        """Return what is written of a fit of these blocks, whose lights are far away and have no tone curves."""
+        lights = {
+            block.name: BegunLight((light.weight * block.unit).tolist(), light.log_exposure.tolist(), hyperparameters)
+            for block, light, hyperparameters in zip(blocks, fit.point.lights, fit.hyperparameters, strict=True)
+        }
+        return Beginning(fit.point.materials.rows().tolist(), lights, fit.value)
+
+
+def from_beginning(begun: Beginning) -> Start:
+    """Return the start at a fit; a light of other cells or other photos than the fit's is constant."""
+
+    def fits(problem: JointProblem, cells: int) -> list[Fit]:
+        """Return the fit in the units of the problem."""
+        materials = Materials.of_rows(np.array(begun.materials))
+        lights, counts = [], []
+        for block in problem.blocks:
+            one, light = begun.lights.get(block.name), constant_light(block, materials, cells)
+            if one and (len(one.weight), len(one.log_exposure)) == (cells, len(block.photos)):
+                values = {"weight": np.array(one.weight) / block.unit, "log_exposure": np.array(one.log_exposure)}
+                light = msgspec.structs.replace(light, **values)
+            lights.append(light)
+            counts.append(one.hyperparameters if one else Hyperparameters())
+        return [Fit(Point(materials, lights), counts, begun.value)]
+
+    return fits
 
 
 def with_known(point: Point, problem: JointProblem) -> Point:
@@ -90,7 +141,7 @@ def level(light: Light) -> Float[np.ndarray, "3"]:
 
 def from_earlier(earlier: Earlier, names: Sequence[str]) -> Start:
     """The start of a problem whose materials are called `names`; lights of the earlier solution keep their cells."""
-    return lambda problem, cells: [known_point(problem, earlier, names, cells)]
+    return lambda problem, cells: [start_of(known_point(problem, earlier, names, cells))]
 
 
 def with_decided(choices: Choices, earlier: Earlier) -> Choices:

@@ -34,7 +34,7 @@ from factorlib.inference.model_selection import TRIAL, TRIAL_CELLS, effects_chos
 from factorlib.inference.optimizer import light_descended
 from factorlib.inference.options import Choices
 from factorlib.inference.problem import JointProblem
-from factorlib.inference.start import Start, on_cells
+from factorlib.inference.start import Beginning, Start, on_cells
 from factorlib.inference.surface_turns import Attached, Detail, Part, Stiffness, no_detail, part_of, step
 from factorlib.light.prior import LightPrior, read_light_prior
 from factorlib.meshes.fine import Fine
@@ -96,11 +96,13 @@ class Surfaces(msgspec.Struct, frozen=True):
 class Found(msgspec.Struct, frozen=True):
     """The answer for all meshes of a set.
 
+    beginning of a solve: the fit on few cells, to the meshes as they are
     evidence  whether surfaces are moved, by held-out observations of photos that had no part in that;  painted: whether reflectance has detail, likewise
     stiffness that was best;  gains: by photo, of all that is kept: how much −2 log marginal likelihood fell while the photo had no part in it
     displacements  by mesh, at nodes, in extents; none where surfaces stay;  log_factors: by mesh, likewise
     """
 
+    beginning: Beginning
     evidence: Decision
     painted: Decision = Decision(False)
     stiffness: Stiffness = Stiffness(None)
@@ -303,10 +305,10 @@ def found(
     """
     pieces, plain = Pieces(report), no_detail(surfaces.nodes)
     tick = pieces.of(0.0, 0.3, TRIAL.points + SETTLE.points, "materials and lights")
-    trial = trial_of(problem, start, seed, (surfaces, attached), tick)
+    trial, begun = trial_of(problem, start, seed, (surfaces, attached), tick)
     photos = len(trial.photos)
     if photos < 2 or problem.none_held_out:
-        return Found(Decision(False))
+        return Found(begun, Decision(False))
     tick = pieces.of(0.3, 0.85, 4 * len(TURNS) * photos, "left-out photos")
     given = trial.judged([plain] * photos, tick)
     search = Search(trial, trial.parts(plain, trial.fit), surfaces.laplacian(), given, tick)
@@ -315,19 +317,22 @@ def found(
     painted = search.best([Stiffness(kept.stiffness.turn, a) for a in FACTORS], kept.judged, 0.0, FOR)
     kept = painted if painted.evidence.kept else kept
     if not (turned.evidence.kept or painted.evidence.kept):
-        return Found(turned.evidence, painted.evidence)
+        return Found(begun, turned.evidence, painted.evidence)
     gains = dict(zip(trial.names, (given.values - kept.judged.values).tolist(), strict=True))
     detail = search.of_all_photos(kept.stiffness, moving, pieces, seed)
     displacements = surfaces.displacements(detail.turn, attached) if turned.evidence.kept else {}
     displacements = {name: of for name, of in displacements.items() if name in moving}
     factors = surfaces.by_mesh(detail.log_factor) if painted.evidence.kept else {}
-    return Found(turned.evidence, painted.evidence, kept.stiffness, gains, displacements, factors)
+    return Found(begun, turned.evidence, painted.evidence, kept.stiffness, gains, displacements, factors)
 
 
 def trial_of(
     problem: JointProblem, start: Start, seed: int, surface: tuple[Surfaces, list[Attached]], tick: Tick
-) -> Trial:
-    """Return the problem without detail, and its fit with the shadows and bounces of the given meshes; surface: and where its blocks lie on it."""
+) -> tuple[Trial, Beginning]:
+    """Return the problem without detail and its fit with the shadows and bounces of the given meshes, and the fit on few cells.
+
+    surface: and where the problem's blocks lie on it
+    """
     prior, sure = read_light_prior(), sure_ones(problem)
 
     def fitting(name: str, some: JointProblem, begun: Fit, schedule: Schedule) -> Fit:
@@ -338,7 +343,7 @@ def trial_of(
     effects = effects_chosen(sure, start(sure, TRIAL_CELLS), choices, fitting)
     problem = effects.of(problem)
     fit = fitted(problem.sampled(OBSERVATIONS, seed), on_cells(effects.fit, CELLS, problem), prior, SETTLE, tick)
-    return Trial(problem, fit, *surface, prior)
+    return Trial(problem, fit, *surface, prior), Beginning.of(effects.fit, problem.blocks)
 
 
 class Pieces(msgspec.Struct, frozen=True):

@@ -7,7 +7,7 @@ import msgspec
 
 from factorlib.jsonfile import read_result
 
-FILE = "surface.json"
+FILE, BEGINNING = "surface.json", "beginning.json"
 
 
 class Tried(msgspec.Struct, frozen=True):

@@ -209,7 +209,8 @@ def test_without_held_out_observations_shadows_stay_and_nothing_further_is_decid
 def test_few_materials_start_from_several_roughnesses_and_many_from_one():
     problem = JointProblem(rooms(), OPERATOR)
     assert [len(from_nothing(n)(problem, 30)) for n in (3, 40)] == [1, 1]
-    points = from_nothing(2)(problem.of([block.take(block.material < 2) for block in problem.blocks]), 30)
+    fits = from_nothing(2)(problem.of([block.take(block.material < 2) for block in problem.blocks]), 30)
+    points = [fit.point for fit in fits]
     assert len({float(p.materials.roughness[0]) for p in points}) == 3 and {len(p.lights[0]) for p in points} == {30}
 
 

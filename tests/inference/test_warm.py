@@ -11,11 +11,11 @@ from factorlib.inference.joint_solver import solve
 from factorlib.inference.materials import Materials
 from factorlib.inference.options import Choices
 from factorlib.inference.problem import JointProblem
-from factorlib.inference.start import from_earlier, from_nothing, known_point, with_decided
+from factorlib.inference.start import Beginning, from_beginning, from_earlier, from_nothing, known_point, with_decided
 from factorlib.results.materials import Gauge, MaterialTable, Model, Reflectance, Tone
 from factorlib.results.solution import Earlier
 from studies.scenes.problems import MATERIALS, factor_between
-from tests.inference.made_lights import OPERATOR, drawn, on_even_cells, spheres
+from tests.inference.made_lights import FEW, OPERATOR, drawn, natural, on_even_cells, spheres
 
 NAMES, CELLS = ["red", "green", "blue"], 40
 QUICK = Choices(cells=CELLS, splittings=0, observations=200, tone="off")
@@ -51,7 +51,7 @@ def written(blocks, materials: Materials, lights, names=NAMES, component=(0, 0, 
 
 
 def start_from(earlier, blocks, names=NAMES):
-    (point,) = from_earlier(earlier, names)(JointProblem(blocks, OPERATOR), CELLS)
+    point = from_earlier(earlier, names)(JointProblem(blocks, OPERATOR), CELLS)[0].point
     return point.materials, point.lights
 
 
@@ -183,3 +183,26 @@ def test_with_a_further_material_the_answer_is_the_one_from_nothing():
     before = solve(JointProblem(fewer, OPERATOR), from_nothing(count), QUICK)
     earlier = written(fewer, before.point.materials, before.point.lights, NAMES[:count], (0,) * count)
     check_same(answer(blocks), answer(blocks, from_earlier(earlier, NAMES)), blocks)
+
+
+def test_a_solve_goes_on_from_the_fit_that_surface_wrote_in_whatever_unit_a_block_has():
+    problem, _, fit = natural()
+    written = msgspec.json.decode(msgspec.json.encode(Beginning.of(fit, problem.blocks)), type=Beginning)
+    block = problem.blocks[0]
+    brighter = msgspec.structs.replace(block, unit=4 * block.unit)
+    (found,) = from_beginning(written)(problem.of([brighter, *problem.blocks[1:]]), FEW)
+    assert (found.hyperparameters, found.value) == (fit.hyperparameters, fit.value)
+    for light, before, factor in zip(found.point.lights, fit.point.lights, (4, 1, 1), strict=True):
+        np.testing.assert_allclose(light.weight * factor, before.weight, rtol=1e-12)
+        np.testing.assert_array_equal(light.axis, before.axis)
+    np.testing.assert_array_equal(found.point.materials.rows(), fit.point.materials.rows())
+
+
+def test_a_light_of_other_cells_or_photos_than_the_fit_had_begins_constant():
+    problem, _, fit = natural()
+    begun = from_beginning(Beginning.of(fit, problem.blocks))
+    (coarse,) = begun(problem, 30)
+    assert all(np.ptp(light.log_radiance, axis=1).max() < 0.2 for light in coarse.point.lights)
+    two = msgspec.structs.replace(problem.blocks[0], photos=("room0", "another"))
+    light = begun(problem.of([two, *problem.blocks[1:]]), FEW)[0].point.lights[0]
+    assert len(light.log_exposure) == 2 and np.ptp(light.log_radiance, axis=1).max() < 0.2
