@@ -18,7 +18,7 @@ class Choices(Struct, frozen=True):
     splittings: Annotated[int, Meta(ge=0, le=8)] = 3
     """How often the 24 cells of each light that hold most energy may split, each in about four; held-out observations stop it earlier."""
     observations: Annotated[int, Meta(ge=50)] = 1000
-    """Most observations of a light that are fitted, drawn from all; four times as many where splitting explains much more."""
+    """Most observations of a light that are fitted, drawn from all; eight times as many where splitting explains much more."""
     self_shadowing: Literal["auto", "on", "off"] = "auto"
     """Whether what meshes hide of the light is dark; auto: unless held-out observations are two standard errors against it."""
     interreflection: Literal["auto", "on", "off"] = "auto"
