@@ -55,7 +55,9 @@ class Answer(msgspec.Struct, frozen=True, dict=True):
 
     def material_table(self) -> table.MaterialTable:
         """The content of materials.json."""
-        rows, stderr, kinds = _rows(self.solution.point.materials), self._errors(), self._kinds()
+        rows = _rows(self.solution.point.materials)
+        stderr = self._errors()
+        kinds = self._kinds()
         solved = {
             name: table.solved(table.Reflectance(*row), stderr[name], kind, self._given(m))
             for m, (name, row, kind) in enumerate(zip(self.names, rows, kinds, strict=True))
@@ -70,7 +72,8 @@ class Answer(msgspec.Struct, frozen=True, dict=True):
         """Return the likeliest class of each material, in the gauge of the fit; none where the solver has no classes."""
         if self.solver == "paper":
             return [UNSET] * len(self.names)
-        materials, errors = self.solution.point.materials, self.errors.materials
+        materials = self.solution.point.materials
+        errors = self.errors.materials
         relative = errors.specular.mean(1) / np.maximum(materials.specular.mean(1), LEAST_REFLECTANCE)
         specular = self.solution.materials.point.materials.specular
         rows = zip(specular, materials.roughness.tolist(), relative.tolist(), errors.roughness.tolist(), strict=True)
@@ -126,7 +129,9 @@ class Answer(msgspec.Struct, frozen=True, dict=True):
 
     def model(self) -> table.Model:
         """What was decided of the model, and by what; the pivots of tone curves in scene radiance."""
-        names, solution, lit = self.names, self.solution, self.lit()
+        names = self.names
+        solution = self.solution
+        lit = self.lit()
         started: table.Started | UnsetType = UNSET
         lights = [block.name for block, _ in lit]
         if self.earlier is not None:

@@ -59,7 +59,8 @@ class Arrow:
     """
 
     def __init__(self, systems: Sequence[System], prior: Matrix, free: Bool[np.ndarray, " k"], damping: float = 0.0):
-        self.systems, self.free = systems, np.flatnonzero(free)
+        self.systems = systems
+        self.free = np.flatnonzero(free)
         self.coupling = [solved(part.factor, part.cross_hessian.T) for part in systems]  # L⁻¹Cᵀ
         schur = prior.copy()
         for part, coupling in zip(systems, self.coupling, strict=True):
@@ -77,7 +78,8 @@ class Arrow:
     def solve(self, by_materials: Vector, by_lights: Sequence[Vector]) -> tuple[Vector, list[Vector]]:
         """Return H⁻¹ g, by (1)."""
         alone = [solved(part.factor, g) for part, g in zip(self.systems, by_lights, strict=True)]
-        reduced, step = by_materials.copy(), np.zeros_like(by_materials)
+        reduced = by_materials.copy()
+        step = np.zeros_like(by_materials)
         for part, own in zip(self.systems, alone, strict=True):
             reduced[part.places] -= part.cross_hessian @ own
         step[self.free] = cho_solve(self.schur, reduced[self.free], check_finite=False)
@@ -93,7 +95,8 @@ def solved(factor: Float[np.ndarray, "l l"], right: Float[np.ndarray, "l ..."]) 
 def information(systems: Sequence[System], size: int) -> tuple[Matrix, list[Float[np.ndarray, "g k"]]]:
     """Return the left side of (1) for `size` unknowns of materials, and the scores of each light's clusters, where there are
     any, less what the light takes up of them."""
-    hessian, scores = np.zeros((size, size)), []
+    hessian = np.zeros((size, size))
+    scores = []
     for part in systems:
         coupling = solved(part.factor, part.cross_hessian.T)
         hessian[np.ix_(part.places, part.places)] += part.material_hessian - part.cross_hessian @ coupling

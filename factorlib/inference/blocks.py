@@ -80,7 +80,8 @@ class Block(msgspec.Struct, frozen=True):
 
     def with_effects(self, shadows: bool, bounces: bool) -> Block:
         """The same observations, as if nothing hid anything, or as if what hides the light were black."""
-        visibility, bounced = self.visibility if shadows else None, self.bounced if shadows and bounces else None
+        visibility = self.visibility if shadows else None
+        bounced = self.bounced if shadows and bounces else None
         return msgspec.structs.replace(self, visibility=visibility, bounced=bounced)
 
     def with_noise(self, noise: Noise) -> Block:

@@ -27,7 +27,9 @@ from factorlib.results.materials import Decision
 LEAST_LOSS = 1e-4  # in σ² of the noise model, added to every loss: two losses far below it count as equal
 # Thresholds, in standard errors.  Shadows go only if the evidence is clearly against them; bounces and tone curves need clear evidence;
 # smaller cells obey the same prior as larger ones, so one standard error is enough for them.
-AGAINST, FOR, FINER = -2.0, 2.0, 1.0
+AGAINST = -2.0
+FOR = 2.0
+FINER = 1.0
 
 
 class Losses(NamedTuple):
@@ -54,7 +56,9 @@ def compare(without: Losses, richer: Losses, least: float) -> Decision:
     counts = np.array([len(values) for values in richer.values])
     if not counts.sum():
         return Decision(False)
-    differences, variances, logs = [], [], []
+    differences = []
+    variances = []
+    logs = []
     for a, b, cluster in zip(without.values, richer.values, richer.clusters, strict=True):
         both = [np.bincount(cluster, losses + LEAST_LOSS) for losses in (a, b)]
         shares = [sums / max(float(sums.sum()), 1e-300) for sums in both]
@@ -63,7 +67,8 @@ def compare(without: Losses, richer: Losses, least: float) -> Decision:
         number = len(both[0])
         variances.append(number / max(number - 1, 1) * float(np.sum((shares[0] - shares[1]) ** 2)))
     share = counts / counts.sum()
-    d, error = float(share @ differences), float(np.sqrt(share**2 @ variances))
+    d = float(share @ differences)
+    error = float(np.sqrt(share**2 @ variances))
     margin = d / max(error, 1e-12)
     with_, without_ = (float(np.exp(share @ [pair[k] for pair in logs])) for k in (1, 0))
     return Decision(margin > least, with_, without_, margin)

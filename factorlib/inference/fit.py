@@ -100,7 +100,9 @@ def fitted(
 
     start: where the descent begins; its cells stay;  report: called at every point that is tried, with the mean robust loss of what is fitted
     """
-    problem, given, hyperparameters = problem.fitted(), schedule.given, start.hyperparameters
+    problem = problem.fitted()
+    given = schedule.given
+    hyperparameters = start.hyperparameters
     materials = start.point.materials if given else problem.known.put(above_zero(start.point.materials))
     prior_on_materials = MaterialPrior(materials, problem.blocks, problem.known)
     descent = Descent(prior_on_materials, problem.spread, report, problem.known.free(len(materials)))
@@ -147,7 +149,8 @@ def recounted(likelihood: LightLikelihood, one: Hyperparameters) -> LightLikelih
     light = likelihood.light
     Q, log_determinant = likelihood.prior.precision(light.axis[~light.suns], one.factors)
     if light.suns.any():  # of which the prior on cells knows nothing
-        own, cells = np.tile(light.suns, 3), Q
+        own = np.tile(light.suns, 3)
+        cells = Q
         Q = np.diag(np.where(own, SUNS**-2.0, 0.0))
         Q[np.ix_(~own, ~own)] = cells
     if light.held.any():  # the precision of the others, given these, is their part of Q
@@ -173,7 +176,8 @@ def estimated(likelihood: LightLikelihood, system: System, least: float) -> Hype
 
 def temperature(block: Block, residual: Float[np.ndarray, "n 3"], least: float = 1.0) -> float:
     """T of (1)."""
-    number, bounded = block.clusters(), residual.clip(-ROBUST.robust_scale, ROBUST.robust_scale)
+    number = block.clusters()
+    bounded = residual.clip(-ROBUST.robust_scale, ROBUST.robust_scale)
     sums = [np.bincount(number, channel) for channel in bounded.T]
     return max(float(np.square(sums).sum()) / max(residual.size, 1), least)
 

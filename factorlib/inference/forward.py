@@ -96,9 +96,13 @@ class Illumination(msgspec.Struct, frozen=True):
 
     def shown(self) -> Shown:
         """Radiance, and what it is made of."""
-        block, kd, ks, responses = self.block, self.materials.diffuse, self.materials.specular, []
+        block = self.block
+        kd = self.materials.diffuse
+        ks = self.materials.specular
+        responses = []
         diffuse, specular, by_roughness = np.zeros((3, len(block), 3))
-        weight, roughness = self.light.weight, self.materials.roughness.tolist()
+        weight = self.light.weight
+        roughness = self.materials.roughness.tolist()
         if self.table is None:
             lobes = self.light.unit_lobes
             for m, rows in material_slices(block):
@@ -106,12 +110,14 @@ class Illumination(msgspec.Struct, frozen=True):
                 specular[rows] = specular_response(block, rows, lobes, roughness[m], self.operator) @ weight
         else:
             for m in np.unique(block.material).tolist():
-                rows, of = self.table.rows(m), self.table.at(m, roughness[m])
+                rows = self.table.rows(m)
+                of = self.table.at(m, roughness[m])
                 diffuse[rows], specular[rows], by_roughness[rows] = of.radiance(weight)
                 responses.append((m, rows, of))
         diffuse, specular, by_roughness = (part * self.exposure for part in (diffuse, specular, by_roughness))
         if block.bounced is not None:
-            diffuse, specular = diffuse + block.bounced[:, :3], specular + block.bounced[:, 3:]
+            diffuse = diffuse + block.bounced[:, :3]
+            specular = specular + block.bounced[:, 3:]
         linear = kd[block.material] * diffuse + ks[block.material] * specular
         toned = self.light.toned(linear, block.photo)
         return Shown(diffuse, specular, by_roughness, linear, toned, responses)
@@ -130,14 +136,17 @@ class Illumination(msgspec.Struct, frozen=True):
 
     def atoms(self, rows: Int[np.ndarray, " n"], lobes: UnitLobes) -> Float[np.ndarray, "3 n q"]:
         """What q further lobes of weight one would add to the whitened residuals at `rows`, per channel."""
-        block, materials, response = self.block, self.materials, np.empty((2, len(rows), len(lobes)))
+        block = self.block
+        materials = self.materials
+        response = np.empty((2, len(rows), len(lobes)))
         for m in np.unique(block.material[rows]).tolist():
             of = block.material[rows] == m
             response[0, of] = diffuse_response(block, rows[of], lobes, self.operator)
             response[1, of] = specular_response(block, rows[of], lobes, float(materials.roughness[m]), self.operator)
         slope = self.light.slope_at(block.radiance[rows], block.photo[rows])
         scale = block.precision[rows] * slope * self.exposure[rows]
-        kd, ks = materials.diffuse[block.material[rows]], materials.specular[block.material[rows]]
+        kd = materials.diffuse[block.material[rows]]
+        ks = materials.specular[block.material[rows]]
         return np.stack(
             [scale[:, c, None] * (kd[:, c, None] * response[0] + ks[:, c, None] * response[1]) for c in range(3)]
         )
@@ -154,16 +163,22 @@ class Illumination(msgspec.Struct, frozen=True):
 
         It costs two products of the responses with three columns.
         """
-        block, light, materials, shown = self.block, self.light, self.materials, self.shown()
+        block = self.block
+        light = self.light
+        materials = self.materials
+        shown = self.shown()
         residual = block.residuals(shown.radiance)
         value = float(loss.of_residuals(residual)[~block.held_out].sum()) / temperature
         # a = ½ ∂(Σ ρ/T)/∂ℓ;  what of ℓ grows with the light
         by_radiance = self.pull(residual, loss, temperature) ** 2 * residual * block.precision
         by_linear = by_radiance * light.slope_at(shown.radiance, block.photo)
         lit = shown.linear - self.bounced
-        by_materials, by_weight = np.zeros((len(materials), 7)), np.zeros((len(light), 3))
+        by_materials = np.zeros((len(materials), 7))
+        by_weight = np.zeros((len(light), 3))
         for m, rows, of in shown.responses:
-            kd, ks, a = materials.diffuse[m], materials.specular[m], by_linear[rows]
+            kd = materials.diffuse[m]
+            ks = materials.specular[m]
+            a = by_linear[rows]
             by_materials[m, :3] = kd * (a * shown.diffuse[rows]).sum(0)
             by_materials[m, 3:6] = ks * (a * shown.specular[rows]).sum(0)
             by_materials[m, 6] = float((ks * a * shown.by_roughness[rows]).sum())
@@ -182,15 +197,19 @@ class Illumination(msgspec.Struct, frozen=True):
     @property
     def bounced(self) -> Float[np.ndarray, "n 3"] | float:
         """What of ℓ other surfaces send."""
-        block, materials = self.block, self.materials
+        block = self.block
+        materials = self.materials
         if block.bounced is None:
             return 0.0
-        kd, ks = materials.diffuse[block.material], materials.specular[block.material]
+        kd = materials.diffuse[block.material]
+        ks = materials.specular[block.material]
         return kd * block.bounced[:, :3] + ks * block.bounced[:, 3:]
 
     def linearise(self, shown: Shown, loss: Loss, temperature: float = 1.0) -> Iterator[Linearised]:
         """Residuals and derivatives; `shown` is what this illumination shows by its table.  Held-out observations have weight 0."""
-        block, light, materials = self.block, self.light, self.materials
+        block = self.block
+        light = self.light
+        materials = self.materials
         residual = block.residuals(shown.radiance)
         pull = self.pull(residual, loss, temperature)
         scale = pull * block.precision
@@ -198,16 +217,20 @@ class Illumination(msgspec.Struct, frozen=True):
         lit = shown.linear - self.bounced
         if toned := len(light.log_tone) > 0:
             by_tone = scale * by_log_exponent(np.maximum(shown.linear, 0), light.exponents(block.photo))
-        photos, free = np.eye(len(light.log_exposure))[block.photo], light.free if light.held.any() else slice(None)
+        photos = np.eye(len(light.log_exposure))[block.photo]
+        free = light.free if light.held.any() else slice(None)
         first = len(light.log_exposure) - light.free_exposures
         for m, rows, of in shown.responses:
-            of_specular, of_roughness = of.specular, of.by_roughness
+            of_specular = of.specular
+            of_roughness = of.by_roughness
             for c in range(3):
-                kd, ks = np.float32(materials.diffuse[m, c]), np.float32(materials.specular[m, c])
+                kd = np.float32(materials.diffuse[m, c])
+                ks = np.float32(materials.specular[m, c])
                 bright = ((rising[rows, c] * self.exposure[rows, 0])[:, None] * light.weight[:, c]).astype(np.float32)
                 by_roughness = of_roughness * (ks * bright)
                 own = [kd * shown.diffuse[rows, c] * rising[rows, c], ks * shown.specular[rows, c] * rising[rows, c]]
-                diffuse, specular = of.diffuse * (kd * bright), of_specular * (ks * bright)
+                diffuse = of.diffuse * (kd * bright)
+                specular = of_specular * (ks * bright)
                 by_photo = photos[rows, first:] * (lit[rows, c] * rising[rows, c])[:, None]
                 if toned:
                     by_photo = np.hstack([by_photo, photos[rows] * by_tone[rows, c, None]])

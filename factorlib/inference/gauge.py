@@ -69,8 +69,10 @@ def connected_components(blocks: Sequence[Block], materials: int) -> list[Compon
 
 def in_gauge(point: Point, blocks: Sequence[Block], known: Known = Known()) -> Point:
     """The point in the gauge stated above, which predicts the same radiance; one light per block."""
-    materials, lights = point.materials, list(point.lights)
-    diffuse, specular = materials.diffuse.copy(), materials.specular.copy()
+    materials = point.materials
+    lights = list(point.lights)
+    diffuse = materials.diffuse.copy()
+    specular = materials.specular.copy()
     names = [block.name for block in blocks]
     for members, illuminations in connected_components(blocks, len(materials)):
         own = [names.index(name) for name in illuminations]
@@ -83,7 +85,8 @@ def in_gauge(point: Point, blocks: Sequence[Block], known: Known = Known()) -> P
         tint = (level.mean(1, keepdims=True) - level).mean(0) if factors == 3 else np.zeros(3)
         factor = 1 / np.exp(tint)  # multiplies reflectances
         factor = factor * BRIGHTEST / (factor * (diffuse[rows] + specular[rows])).max()
-        diffuse[rows], specular[rows] = diffuse[rows] * factor, specular[rows] * factor
+        diffuse[rows] = diffuse[rows] * factor
+        specular[rows] = specular[rows] * factor
         for i in own:
             lights[i] = msgspec.structs.replace(lights[i], weight=lights[i].weight / factor)
     return Point(Materials(diffuse, specular, materials.roughness), lights)

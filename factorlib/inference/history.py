@@ -36,7 +36,8 @@ PHASES = {  # about how many points are tried, and what one costs beside one of 
     "distances": (24, 1.5),
     "materials and lights": (11, 7),
 }
-SPLITTING, LAST = (7, 9), {"lights": (3, 14), "suns": (4, 10)}
+SPLITTING = (7, 9)
+LAST = {"lights": (3, 14), "suns": (4, 10)}
 
 
 def unreported(event: Event) -> None:
@@ -87,7 +88,9 @@ def of_parts(progress: Progress, choices: Choices) -> Report:
     phase is entered several times, it does not go back."""
     phases = PHASES | {f"splitting {k + 1}": SPLITTING for k in range(choices.splittings)} | LAST
     costs = {phase: points * cost for phase, (points, cost) in phases.items()}
-    tried, total, furthest = dict.fromkeys(phases, 0), sum(costs.values()), 0.0
+    tried = dict.fromkeys(phases, 0)
+    total = sum(costs.values())
+    furthest = 0.0
 
     def report(event: Event) -> None:
         """Say how much is done: three quarters of a phase after its usual number of points, for there may be more."""

@@ -28,7 +28,9 @@ SHARE_ERROR = 0.25  # of a material's diffuse + specular reflectance
 DARK = 0.1  # a bound on reflectance that still says 'dark'
 TINTED = 0.6  # of a mean |log R/G| or |log B/G|: three standard deviations of the level of one light's colour (docs/light-prior.md)
 EXPOSURE_DIFFERS = 1.5  # by which factor what is found may differ from EXIF without a word
-OUTLIER, OUTLIERS = 3.0, 0.1  # a residual in units of the noise model, and the share of such values that is too much
+# a residual in units of the noise model, and the share of such values that is too much
+OUTLIER = 3.0
+OUTLIERS = 0.1
 
 
 def unusable_observations(photos: Sequence[PhotoObservations]) -> list[str]:
@@ -43,7 +45,8 @@ def unusable_observations(photos: Sequence[PhotoObservations]) -> list[str]:
 
 def before_solving(names: Sequence[str], photos: Sequence[str], problem: JointProblem) -> list[str]:
     """What observations lack and cannot tell, as sentences; names: of all materials, by number;  photos: all that there are."""
-    blocks, known = problem.blocks, problem.known
+    blocks = problem.blocks
+    known = problem.known
     shown = {int(m) for block in blocks for m in np.unique(block.material)}
     unseen = [name for m, name in enumerate(names) if m not in shown and m not in known.materials]
     said = [f"material '{name}' is observed in no photo: its reflectance is only a guess" for name in unseen]
@@ -62,7 +65,8 @@ def before_solving(names: Sequence[str], photos: Sequence[str], problem: JointPr
 
 def undetermined_by_observations(names: Sequence[str], problem: JointProblem) -> list[str]:
     """What no solve can find, as sentences; a material that no block shows, or that is known, is left out."""
-    blocks, known = problem.blocks, problem.known
+    blocks = problem.blocks
+    known = problem.known
     black = [block.name for block in blocks if (block.radiance <= 0).all()]
     said = [f"illumination '{name}' is black in every photo: it tells nothing" for name in black]
     for m, name in enumerate(names):
@@ -107,7 +111,8 @@ def _spread(block: Block) -> float:
 
 def after_solving(answer: Answer) -> list[str]:
     """What the answer leaves open or explains badly, as sentences."""
-    problem, point = answer.solution.shown(answer.problem), answer.solution.point
+    problem = answer.solution.shown(answer.problem)
+    point = answer.solution.point
     return [
         *undetermined_by_answer(answer.names, problem, point.materials, answer.errors.materials),
         *poorly_explained(problem, answer.radiance),
@@ -127,7 +132,9 @@ def undetermined_by_answer(
 
 
 def _of_answer(name: str, found: Float[np.ndarray, "7"], error: Float[np.ndarray, "7"]) -> Iterator[str]:
-    whole, largest, specular = (found[:3] + found[3:6]).max(), error[:6].max(), found[3:6]
+    whole = (found[:3] + found[3:6]).max()
+    largest = error[:6].max()
+    specular = found[3:6]
     if whole < largest <= DARK:
         yield (
             f"material '{name}' is so dark that of its reflectance only a bound, about {whole + 2 * largest:.2g}, can be given. "

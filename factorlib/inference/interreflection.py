@@ -27,7 +27,8 @@ from factorlib.reflection.brdf import specular
 from factorlib.urm.observations import Observations
 
 ROUGHNESS = 0.35  # of the highlight through which hidden surfaces are seen, whatever the material: of most materials a few tenths
-PSEUDO, NEARNESS = 3.0, 4.0
+PSEUDO = 3.0
+NEARNESS = 4.0
 ROWS = 1024  # observations whose weights are held at once
 
 
@@ -51,7 +52,8 @@ def bounced_light(seen: Observations, radiance: Float[np.ndarray, "n 3"]) -> Flo
 
 def radiance_by_code(shown: Observations, radiance: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "c+1 3"]:
     """B of every code of `Observations.met` in one photo, from its observations; last what an unknown surface sends."""
-    normal, bins = unit(shown.normal), fibonacci_sphere(BINS)
+    normal = unit(shown.normal)
+    bins = fibonacci_sphere(BINS)
     everything = np.average(radiance, axis=0, weights=shown.weight)
     found = np.tile(everything, (len(shown.materials) * BINS + 1, 1))
     for m in np.unique(shown.material):
@@ -67,7 +69,8 @@ def _by_bin(
     """The mean radiance of one material by bin of its normals; cosine: of each normal with each bin's direction."""
     near = np.exp(NEARNESS * cosine) * weight[:, None]
     expected = near.T @ radiance / near.sum(0)[:, None]
-    own, bins = cosine.argmax(1), cosine.shape[1]
+    own = cosine.argmax(1)
+    bins = cosine.shape[1]
     total = np.bincount(own, weight, bins)
     mean = (
         np.column_stack([np.bincount(own, weight * r, bins) for r in radiance.T]) / np.maximum(total, 1e-300)[:, None]
@@ -78,14 +81,18 @@ def _by_bin(
 
 def _sent_to(seen: Observations, surfaces: Float[np.ndarray, "c+1 3"]) -> Float[np.ndarray, "n 6"]:
     """(1) at observations of one photo; the highlight is no narrower than the directions lie apart, as in factorlib.light.visibility."""
-    visibility, met = seen.visibility, seen.met
+    visibility = seen.visibility
+    met = seen.met
     assert visibility is not None and met is not None  # `bounced_light` asks for such observations alone
-    count, unknown = visibility.shape[1], len(surfaces) - 1
+    count = visibility.shape[1]
+    unknown = len(surfaces) - 1
     directions = torch.from_numpy(fibonacci_sphere(count)).float()
     normal, view = (torch.from_numpy(unit(v)).float() for v in (seen.normal, seen.view))
     hidden = 1 - torch.from_numpy(visibility).float() / 255
     alpha = torch.tensor(math.sqrt(ROUGHNESS**4 + 1 / widest_sharpness(count)))
-    nd, no, od = normal @ directions.T, (normal * view).sum(1, keepdim=True), view @ directions.T
+    nd = normal @ directions.T
+    no = (normal * view).sum(1, keepdim=True)
+    od = view @ directions.T
     nh = ((nd + no) / (2 + 2 * od).clamp_min(1e-6).sqrt()).clamp(0, 1)
     highlight = specular(alpha, nd, no, nh) * (4 * math.pi / count)
     code = np.where((met == UNMET) | (met >= unknown), unknown, met).astype(np.int64)

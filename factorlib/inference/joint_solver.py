@@ -110,7 +110,8 @@ def solve(problem: JointProblem, start: Start, choices: Choices = Choices(), run
 
 def beginnings(asked: Asked) -> list[Fit]:
     """Return the fits from which the first trial starts; of the trials, the best goes on."""
-    sure, cells = sure_ones(asked.problem), min(TRIAL_CELLS, asked.choices.cells)
+    sure = sure_ones(asked.problem)
+    cells = min(TRIAL_CELLS, asked.choices.cells)
     begun = asked.start(sure, cells)
     return [msgspec.structs.replace(fit, point=with_known(fit.point, sure)) for fit in begun]
 
@@ -175,15 +176,18 @@ def split_while_gaining(problem: JointProblem, fit: Fit, choices: Choices, run: 
     their loss by less than WORTH is kept, and the last.  After a first that lowers it by MUCH, there are MORE times as many observations.
     """
     some = problem.sampled(choices.observations, choices.seed)
-    evidence, before = [], losses_of(some, fit.point)
+    evidence = []
+    before = losses_of(some, fit.point)
     for number in range(0 if problem.none_held_out else choices.splittings):
-        phase, smallest = f"splitting {number + 1}", 2 * np.radians(SMALLEST)
+        phase = f"splitting {number + 1}"
+        smallest = 2 * np.radians(SMALLEST)
         lights = [one if one.held.any() else one.split(one.brightest(SPLIT, smallest)) for one in fit.point.lights]
         trial = run.judged(phase, some, fit.with_lights(lights), AFTER_SPLITTING)
         after = losses_of(some, trial.point)
         evidence.append(one := compare(before, after, FINER))
         if one.kept:
-            fit, before = trial, after
+            fit = trial
+            before = after
         if not gained(one, WORTH):
             break
         if number == 0 and gained(one, MUCH):

@@ -33,11 +33,17 @@ from factorlib.inference.materials import ROUGHNESS, Materials
 from factorlib.light.lobes import lobe_integral, squared_distances
 from factorlib.urm.observations import Observations
 
-CELLS, SPLIT, SPLITTINGS = 400, 48, 4
+CELLS = 400
+SPLIT = 48
+SPLITTINGS = 4
 FINEST = 1.0  # of the spacing of the directions: with finer cells the sums of (1) are no longer integrals
-ITERATIONS, BETWEEN = 60, 15  # of the last cells, and of those that split afterwards
+# of the last cells, and of those that split afterwards
+ITERATIONS = 60
+BETWEEN = 15
 COVERED = 0.5  # of a cell's integral: below, it is not known
-DARK, LEAST = 1e-6, 1e-12  # of the mean radiance, and steradians, which keep (1) from dividing by 0
+# of the mean radiance, and steradians, which keep (1) from dividing by 0
+DARK = 1e-6
+LEAST = 1e-12
 ROWS = 128  # of a map, which is averaged down to them
 LEAST_OF_A_BALL = 1000  # pixels: then what they mirror is 6° apart, and cells are 10° wide
 
@@ -94,14 +100,16 @@ def known_light(
     mean = solid_angle @ radiance / solid_angle.sum()
     floored = np.maximum(radiance, DARK * mean.mean())
     energy_of = (solid_angle[:, None] * floored).astype(np.float32)
-    lobes, spacing = even_cells(CELLS), np.sqrt(np.median(solid_angle))
+    lobes = even_cells(CELLS)
+    spacing = np.sqrt(np.median(solid_angle))
     light = Light(lobes.axis, np.log(lobes.sharpness), np.ones((CELLS, 3)), np.zeros(1))
     light = light.with_log_radiance(np.tile(np.log(np.maximum(mean, DARK * mean.mean()))[:, None], CELLS))
     for number in range(SPLITTINGS + 1):
         if number:
             light = light.split(light.brightest(SPLIT, 2 * FINEST * spacing))
         response = np.exp(-0.5 * light.sharpness * squared_distances(directions, light.axis)).astype(np.float32)
-        covered, weight = response.T @ solid_angle.astype(np.float32), light.weight.astype(np.float32)
+        covered = response.T @ solid_angle.astype(np.float32)
+        weight = light.weight.astype(np.float32)
         for _ in range(ITERATIONS if number == SPLITTINGS else BETWEEN):
             weight *= response.T @ (energy_of / (response @ weight)) / np.maximum(covered, LEAST)[:, None]
         light = msgspec.structs.replace(light, weight=weight.astype(float))
@@ -149,7 +157,8 @@ def what_is_known(
     maps: by illumination;  shown: all usable pixels of the photo of each illumination's ball, at one exposure;  photos: the light of each.
     Raises InputError where nothing shows what is known.
     """
-    number, chrome = list(seen.materials).index, {ball.material for ball in given.balls.values()}
+    number = list(seen.materials).index
+    chrome = {ball.material for ball in given.balls.values()}
     for name in given.materials:
         if not (seen.material == number(name)).any():
             cure = "look at its mask and at the overlays of `align`: both must show it at the same place"
@@ -162,8 +171,10 @@ def what_is_known(
     }
     lights = {name: light_of_map(lat_long) for name, lat_long in maps.items()}
     for name, ball in given.balls.items():
-        m, of_photo = number(ball.material), seen.photo == seen.photos.index(ball.photo)
-        pixels, rest = shown[name].take(shown[name].material == m), ~(of_photo & (seen.material == m))
+        m = number(ball.material)
+        of_photo = seen.photo == seen.photos.index(ball.photo)
+        pixels = shown[name].take(shown[name].material == m)
+        rest = ~(of_photo & (seen.material == m))
         if len(pixels) < LEAST_OF_A_BALL or not (of_photo & rest).any():
             fault = f"photo '{ball.photo}' shows {len(pixels)} pixels of the ball, and {(of_photo & rest).sum()} observations of other objects"
             cure = f"the ball needs {LEAST_OF_A_BALL}, and something beside it: look at the overlay of `align`"

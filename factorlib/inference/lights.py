@@ -111,7 +111,9 @@ class Light(msgspec.Struct, frozen=True):
     @property
     def peaks(self) -> Float[np.ndarray, " p"]:
         """Each cell's weight where radiance is 1: the last of (1), by iterating peak ← peak/√(Σ peak·overlap); SUN_PEAK of a sun."""
-        axis, peaks, all_ = self.axis[~self.suns], np.full(len(self), PEAK)[~self.suns], np.full(len(self), SUN_PEAK)
+        axis = self.axis[~self.suns]
+        peaks = np.full(len(self), PEAK)[~self.suns]
+        all_ = np.full(len(self), SUN_PEAK)
         overlap = np.exp(self.sharpness[~self.suns] * (axis @ axis.T - 1))
         for _ in range(SCALINGS):
             peaks /= np.sqrt(overlap @ peaks)
@@ -164,14 +166,17 @@ class Light(msgspec.Struct, frozen=True):
     def split(self, which: Bool[np.ndarray, " p"]) -> Light:
         """The light with each cell of `which` replaced by smaller ones of its radiance, which follow all others: see the head of the module."""
         count = np.where(which, np.rint(self.sharpness * 4 * np.pi * WIDTH**2), 0).astype(int)
-        parents, finer = [np.zeros(0, int)], [UnitLobes(np.zeros((0, 3)), np.zeros(0))]
+        parents = [np.zeros(0, int)]
+        finer = [UnitLobes(np.zeros((0, 3)), np.zeros(0))]
         for n in np.unique(count[which]).tolist():
-            cells, own = even_cells(4 * n), np.flatnonzero(count == n)
+            cells = even_cells(4 * n)
+            own = np.flatnonzero(count == n)
             near = cells.axis[(cells.axis @ self.axis[own].T).max(1) > 1 - 2 * 4 * np.pi / n]  # within two spacings
             nearest = np.argmin(self.sharpness * (1 - near @ self.axis.T), axis=1)
             parents.append(nearest[count[nearest] == n])
             finer.append(UnitLobes(near[count[nearest] == n], np.full(len(parents[-1]), cells.sharpness[0])))
-        parent, u = np.concatenate(parents), self.log_radiance
+        parent = np.concatenate(parents)
+        u = self.log_radiance
         kept = ~np.isin(np.arange(len(self)), parent)
         light = msgspec.structs.replace(
             self,

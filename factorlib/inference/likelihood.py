@@ -45,7 +45,9 @@ from factorlib.inference.noise import Loss
 from factorlib.light.prior import LightPrior
 
 SPARSE = 8  # rows of which one enters the Hessian of the determinant
-EXPOSURE, TONE = 3.0, 0.3  # standard deviations of a log exposure and of a log tone exponent
+# standard deviations of a log exposure and of a log tone exponent
+EXPOSURE = 3.0
+TONE = 0.3
 
 
 class LightLikelihood(msgspec.Struct, frozen=True):
@@ -88,16 +90,25 @@ class LightLikelihood(msgspec.Struct, frozen=True):
         materials_given: no derivative of the determinants, which take most of the time, is in the system
         clusters: number of each observation's cluster, from 0, for `System.scores`
         """
-        one, T = self.illumination, self.temperature
-        shown, light, p = one.shown(), one.light, int(one.light.free.sum())
+        one = self.illumination
+        T = self.temperature
+        shown = one.shown()
+        light = one.light
+        p = int(one.light.free.sum())
         places = (7 * np.unique(one.block.material)[:, None] + np.arange(7)).reshape(-1)
-        k, size = len(places), light.unknowns
+        k = len(places)
+        size = light.unknowns
         value, g_l = self._prior()
-        g_m, M, C, L = np.zeros(k), np.zeros((k, k)), np.zeros((k, size)), self._prior_hessian()
+        g_m = np.zeros(k)
+        M = np.zeros((k, k))
+        C = np.zeros((k, size))
+        L = self._prior_hessian()
         scores = None if clusters is None else np.zeros((int(clusters.max(initial=-1)) + 1, k + size))
-        parts, photos = list(one.linearise(shown, self.loss, T)), slice(3 * p, size)
+        parts = list(one.linearise(shown, self.loss, T))
+        photos = slice(3 * p, size)
         for part in parts:  # H = JᵀJ/T + Q, block by block
-            own, at = slice(part.channel * p, (part.channel + 1) * p), np.searchsorted(places, part.places)
+            own = slice(part.channel * p, (part.channel + 1) * p)
+            at = np.searchsorted(places, part.places)
             J = part.diffuse + part.specular
             L[own, own] += gram(J)
             g_l[own] += J.T @ part.residual
@@ -118,7 +129,8 @@ class LightLikelihood(msgspec.Struct, frozen=True):
                 scores[:, k + 3 * p :] += summing @ part.by_photo
         residual = one.block.residuals(shown.radiance)
         loss = float(self.loss.of_residuals(residual)[~one.block.held_out].sum())
-        factor, determinant = factorised(L), (np.zeros(k), np.zeros((k, k)), np.zeros(size))
+        factor = factorised(L)
+        determinant = (np.zeros(k), np.zeros((k, k)), np.zeros(size))
         value += loss / T
         if not materials_given:
             value += self._determinants(factor)
@@ -139,7 +151,8 @@ class LightLikelihood(msgspec.Struct, frozen=True):
         light = self.light
         u = (np.log(np.maximum(light.weight.T, DARKEST)) - self.log_peaks).reshape(-1)
         others, width = self._others()
-        slope, free = self.precision @ u, np.tile(light.free, 3)
+        slope = self.precision @ u
+        free = np.tile(light.free, 3)
         gradient = [slope[free], others / width**2]
         if light.scale_free:  # one step of all held cells
             gradient.append(slope[~free].sum(keepdims=True))
@@ -147,9 +160,12 @@ class LightLikelihood(msgspec.Struct, frozen=True):
 
     def _prior_hessian(self) -> Float[np.ndarray, "l l"]:
         """Half the Hessian of `_prior`."""
-        light, Q = self.light, self.precision
-        free, (_, width) = np.tile(light.free, 3), self._others()
-        p, hessian = int(free.sum()), np.zeros((light.unknowns, light.unknowns))
+        light = self.light
+        Q = self.precision
+        free = np.tile(light.free, 3)
+        (_, width) = self._others()
+        p = int(free.sum())
+        hessian = np.zeros((light.unknowns, light.unknowns))
         hessian[:p, :p] = Q if free.all() else Q[np.ix_(free, free)]
         hessian[range(p, p + len(width)), range(p, p + len(width))] = width**-2
         if light.scale_free:
@@ -169,10 +185,14 @@ def _of_determinants(
     parts: Sequence[Linearised], covariance: Float[np.ndarray, "3p 3p"], places: Int[np.ndarray, " k"], size: int
 ) -> tuple[Float[np.ndarray, " k"], Float[np.ndarray, "k k"], Float[np.ndarray, " l"]]:
     """Equation (2) of all channels and materials: the first, its Hessian, the second; places: of the materials' unknowns."""
-    k, p = len(places), len(covariance) // 3
-    by_materials, by_materials_twice, by_light = np.zeros(k), np.zeros((k, k)), np.zeros(size)
+    k = len(places)
+    p = len(covariance) // 3
+    by_materials = np.zeros(k)
+    by_materials_twice = np.zeros((k, k))
+    by_light = np.zeros(size)
     for part in parts:
-        own, at = slice(part.channel * p, (part.channel + 1) * p), np.searchsorted(places, part.places)
+        own = slice(part.channel * p, (part.channel + 1) * p)
+        at = np.searchsorted(places, part.places)
         gradient, hessian, by_cells = _of_determinant(part, covariance[own, own].astype(np.float32))
         by_materials[at] += gradient
         by_materials_twice[np.ix_(at, at)] += hessian
@@ -184,7 +204,8 @@ def _of_determinant(
     part: Linearised, covariance: Float[np.ndarray, "p p"]
 ) -> tuple[list[float], Float[np.ndarray, "3 3"], Float[np.ndarray, " p"]]:
     """Equation (2) of one channel of one material: the first, its Hessian, the second; ∂J/∂log k_d and ∂J/∂log k_s are the two parts of J."""
-    slopes, J = (part.diffuse, part.specular, part.by_roughness), part.diffuse + part.specular
+    slopes = (part.diffuse, part.specular, part.by_roughness)
+    J = part.diffuse + part.specular
     spread = J @ covariance
     few = [slope[::SPARSE] for slope in slopes]
     many = len(spread) / max(len(few[0]), 1)

@@ -30,7 +30,8 @@ MOST = 3.0  # of an unexplained share: more says no more
 
 def misfit(problem: JointProblem, radiance: Sequence[Float[np.ndarray, "n 3"]]) -> tuple[float, dict[str, Misfit]]:
     """Return the unexplained share of the whole set, and by photo that share and the share of clipped values."""
-    energies, clipped = {}, {}
+    energies = {}
+    clipped = {}
     for block, shown in zip(problem.blocks, radiance, strict=True):
         for number, photo in enumerate(block.photos):
             own = block.photo == number
@@ -51,7 +52,8 @@ def _energies(
         group = np.unique(mirror_cells(block.normal[rows], block.view[rows], REGION), return_inverse=True)[1].reshape(
             -1
         )
-        left, whole = (block.radiance[rows] - shown[rows]) / mean, block.radiance[rows] / mean - 1
+        left = (block.radiance[rows] - shown[rows]) / mean
+        whole = block.radiance[rows] / mean - 1
         yield energy(left, group), energy(whole, group)
 
 

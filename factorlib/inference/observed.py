@@ -93,11 +93,13 @@ def _block(
     every: Observations, rows: Int[np.ndarray, " n"], noise: Noise, share: float, rotations: Rotations, seed: int
 ) -> Block:
     """The block of the observations `rows`, which are those of one illumination."""
-    seen, name = every.take(rows), every.illuminations[every.illumination[rows[0]]]
+    seen = every.take(rows)
+    name = every.illuminations[every.illumination[rows[0]]]
     photos = sorted({seen.photos[i] for i in np.unique(seen.photo)})
     local = np.array([photos.index(p) if p in photos else -1 for p in seen.photos])[seen.photo]
     order = np.lexsort((seen.x, seen.y, local, seen.material))
-    seen, local = seen.take(order), local[order]
+    seen = seen.take(order)
+    local = local[order]
     turned = {photo: np.asarray(of, dtype=float) for photo, of in rotations.items() if of is not None}
     normal, view = (_in_frame(vectors, seen, turned) for vectors in (seen.normal, seen.view))
     radiance = seen.radiance.astype(float)
@@ -107,7 +109,8 @@ def _block(
     visibility = directions = None
     if seen.visibility is not None and (seen.visibility < 255).any():
         sphere = fibonacci_sphere(seen.visibility.shape[1])
-        visibility, directions = seen.visibility, np.stack([sphere @ turned.get(p, np.eye(3)).T for p in photos])
+        visibility = seen.visibility
+        directions = np.stack([sphere @ turned.get(p, np.eye(3)).T for p in photos])
     bounced = bounced_light(seen, scaled)
     block = Block(
         name, tuple(photos), unit, normal, view, scaled, seen.clipped.astype(bool), noise.precision(scaled, seen.weight),

@@ -34,15 +34,25 @@ from factorlib.inference.priors import Gaussian, MaterialPrior, materials_of
 from factorlib.inference.problem import Spread
 
 MOST_CHANGE = np.array([0.7] * 6 + [0.1])  # change of a material's unknowns on one factorisation
-MOST_STEP, UPHILL = 1.5, 0.1  # change of an unknown in one cheap step; share of the slope that clipping must leave
+# change of an unknown in one cheap step; share of the slope that clipping must leave
+MOST_STEP = 1.5
+UPHILL = 0.1
 LOWEST = np.array([np.log(LEAST_REFLECTANCE)] * 6 + [ROUGHNESS[0]])
 HIGHEST = np.array([np.inf] * 6 + [ROUGHNESS[1]])
-FIRST_DAMPING, LOWER, HIGHER, MOST_DAMPING = 0.1, 0.25, 8.0, 1e3
+FIRST_DAMPING = 0.1
+LOWER = 0.25
+HIGHER = 8.0
+MOST_DAMPING = 1e3
 TOLERANCE = 2e-4  # a descent ends where (1) falls by less than this share of it
-MEMORY, STEPS = 10, 12  # pairs that L-BFGS keeps, and its steps on one factorisation
+# pairs that L-BFGS keeps, and its steps on one factorisation
+MEMORY = 10
+STEPS = 12
 # L-BFGS ends where gᵀH⁻¹g, by which a value would still fall, is less, or this share of what it was
-DECREMENT, SHARE = 0.05, 0.02
-SUFFICIENT, SHORTEST = 1e-4, 1e-3  # of a line search: share of the slope, and of the step
+DECREMENT = 0.05
+SHARE = 0.02
+# of a line search: share of the slope, and of the step
+SUFFICIENT = 1e-4
+SHORTEST = 1e-3
 
 Report = Callable[[float], None]  # called at every factorisation, with the mean robust loss there
 Objective = Callable[[np.ndarray], tuple[float, np.ndarray]]  # value and half the gradient
@@ -75,12 +85,14 @@ class Descent(msgspec.Struct, frozen=True):
 
     def of_all(self, state: State, iterations: int) -> State:
         """Return the state after at most so many factorisations, of materials and lights together."""
-        state, damping = self.at(state.likelihoods, state.theta), 0.0
+        state = self.at(state.likelihoods, state.theta)
+        damping = 0.0
         for _ in range(iterations):
             trial = self.at(*self._stepped(state, damping))
             gain = state.value - trial.value
             if gain > 0:
-                state, damping = trial, damping * LOWER
+                state = trial
+                damping = damping * LOWER
             if abs(gain) < TOLERANCE * abs(state.value) or damping > MOST_DAMPING:
                 break
             if gain < 0:
@@ -108,7 +120,8 @@ class Descent(msgspec.Struct, frozen=True):
         gradient = state.prior.gradient + by_determinant
         for system in state.systems:
             gradient[system.places] += system.material_gradient
-        theta, outward = state.theta.reshape(-1), -gradient
+        theta = state.theta.reshape(-1)
+        outward = -gradient
         at_bound = ((theta <= np.resize(LOWEST, size)) & (outward < 0)) | (
             (theta >= np.resize(HIGHEST, size)) & (outward > 0)
         )
@@ -127,7 +140,8 @@ class Descent(msgspec.Struct, frozen=True):
         def objective(step: np.ndarray) -> tuple[float, np.ndarray]:
             """Return (2) and half its gradient."""
             there, likelihoods = moved(step)
-            prior, parts = self.prior.at(there), list(self.spread(LightLikelihood.gradient, likelihoods))
+            prior = self.prior.at(there)
+            parts = list(self.spread(LightLikelihood.gradient, likelihoods))
             off = (there - state.theta).reshape(-1)
             value = prior.value + sum(part.value for part in parts) + off @ (2 * by_determinant + penalty @ off)
             slope = prior.gradient + by_determinant + penalty @ off
@@ -160,7 +174,8 @@ def light_descended(one: LightLikelihood, iterations: int) -> tuple[LightLikelih
             return solved(factor, slope)
 
         step = minimised(objective, len(system.light_gradient), metric)
-        one, before = one.at(moved_light(one.light, step)), system.value
+        one = one.at(moved_light(one.light, step))
+        before = system.value
         system = one.normal_equations(materials_given=True)
         if before - system.value < TOLERANCE * abs(before):
             break
@@ -169,7 +184,8 @@ def light_descended(one: LightLikelihood, iterations: int) -> tuple[LightLikelih
 
 def determinant_of(systems: Sequence[System], size: int) -> tuple[Float[np.ndarray, " k"], Float[np.ndarray, "k k"]]:
     """Return a and D of (2), of all lights."""
-    gradient, hessian = np.zeros(size), np.zeros((size, size))
+    gradient = np.zeros(size)
+    hessian = np.zeros((size, size))
     for system in systems:
         by_light = system.cross_hessian @ solved(system.factor, system.determinant_by_light)
         gradient[system.places] += system.determinant_by_materials - by_light
@@ -214,7 +230,9 @@ def minimised(objective: Objective, size: int, metric: Callable[[np.ndarray], np
             break
         if (change := trial_gradient - gradient) @ direction > 0:
             pairs.append((trial - x, change))
-        x, value, gradient = trial, trial_value, trial_gradient
+        x = trial
+        value = trial_value
+        gradient = trial_gradient
     return x
 
 
@@ -234,7 +252,8 @@ def inverse_hessian_times(gradient, pairs, metric):  # noqa: ANN001, ANN201  (ar
 
     pairs: steps and changes of the gradient along them;  metric: the first inverse Hessian, times a vector
     """
-    q, alphas = gradient, []
+    q = gradient
+    alphas = []
     for step, change in reversed(pairs):
         alphas.append(float(step @ q) / float(step @ change))
         q = q - alphas[-1] * change

@@ -55,7 +55,8 @@ Pairs = deque[tuple[Tensor, Tensor]]  # steps, and changes of gradient along the
 
 MEMORY = 20  # pairs
 LARGEST_STEP = 0.05
-SUFFICIENT, HALVINGS = 1e-4, 12
+SUFFICIENT = 1e-4
+HALVINGS = 12
 LOG_SHARPNESS = (math.log(SHARPNESS[0]), math.log(SHARPNESS[1]))
 REPORTS = 20  # in a run
 SUBSET = 512  # observations
@@ -76,11 +77,15 @@ class Paper(msgspec.Struct, frozen=True):
 def solve(problem: JointProblem, materials: int, paper: Paper, report: Report = unreported) -> Solution:
     """Solve for what the joint solver finds: materials 0 … `materials`−1 and one light per block, in the gauge of `factorlib.inference.gauge`."""
     problem = problem.with_effects(False, False)
-    objective, history, blocks = PaperObjective(problem, materials, paper), list[Event](), problem.blocks
+    objective = PaperObjective(problem, materials, paper)
+    history = list[Event]()
+    blocks = problem.blocks
     rows = [np.flatnonzero(~block.held_out) for block in blocks]
     iterations = math.ceil(paper.samplings * sum(map(len, rows)) / SUBSET)
-    every, lobes = max(1, iterations // REPORTS), paper.lobes * len(blocks)
-    x, random = objective.start(), np.random.default_rng(paper.seed)
+    every = max(1, iterations // REPORTS)
+    lobes = paper.lobes * len(blocks)
+    x = objective.start()
+    random = np.random.default_rng(paper.seed)
     pairs: Pairs = deque(maxlen=MEMORY)
     for iteration in range(iterations):
         subset = drawn(rows, SUBSET, random)
@@ -109,12 +114,14 @@ def stepped(objective: Objective, x: Tensor, pairs: Pairs) -> tuple[Tensor, floa
     value, gradient = objective(x)
     direction = -inverse_hessian_times(gradient, pairs, lambda slope: first_metric(slope, pairs))
     direction = direction * min(1.0, LARGEST_STEP / max(float(direction.abs().max()), 1e-30))
-    slope, length = float(gradient @ direction), 1.0
+    slope = float(gradient @ direction)
+    length = 1.0
     for _ in range(HALVINGS):
         trial = x + length * direction
         trial_value, trial_gradient = objective(trial)
         if trial_value <= value + SUFFICIENT * length * slope:
-            step, change = trial - x, trial_gradient - gradient
+            step = trial - x
+            change = trial_gradient - gradient
             if float(step @ change) > 1e-8 * float(step.norm() * change.norm()):
                 pairs.append((step, change))
             return trial, trial_value
@@ -137,13 +144,16 @@ class PaperObjective:
 
     def __init__(self, problem: JointProblem, materials: int, paper: Paper):
         blocks = problem.blocks
-        self.blocks, self.operator, self.paper = blocks, problem.operator, paper
+        self.blocks = blocks
+        self.operator = problem.operator
+        self.paper = paper
         self.begin = starting_materials(blocks, materials)
         self.sizes = [7 * materials] + [7 * paper.lobes + len(block.photos) - 1 for block in blocks]
 
     def start(self) -> Float[Tensor, " k"]:
         """Even lobes under which the block's mean radiance, 1, is what its materials reflect."""
-        p, begin = self.paper.lobes, self.begin
+        p = self.paper.lobes
+        begin = self.begin
         roughness = _unbounded(begin.roughness, ROUGHNESS)
         parts = [np.column_stack([_unbounded(begin.diffuse), _unbounded(begin.specular), roughness]).reshape(-1)]
         level = np.full((p, 1), _unbounded(np.log(p / 2), LOG_SHARPNESS))  # λ of lobes whose variances cover 4π
@@ -158,10 +168,12 @@ class PaperObjective:
         """(diffuse, specular, roughness) and, of each light, (axis, log sharpness, weight, log exposure)."""
         of_materials, *of_lights = torch.split(x, self.sizes)
         bounded = torch.sigmoid(of_materials.reshape(-1, 7))
-        (low, high), (least, most) = ROUGHNESS, LOG_SHARPNESS
+        (low, high) = ROUGHNESS
+        (least, most) = LOG_SHARPNESS
         lights: list[tuple[Tensor, ...]] = []
         for part in of_lights:
-            rows, others = part[: 7 * self.paper.lobes].reshape(-1, 7), part[7 * self.paper.lobes :]
+            rows = part[: 7 * self.paper.lobes].reshape(-1, 7)
+            others = part[7 * self.paper.lobes :]
             axis = torch.nn.functional.normalize(rows[:, :3], dim=1)
             log_sharpness = least + (most - least) * torch.sigmoid(rows[:, 3])
             weight = torch.nn.functional.softplus(rows[:, 4:])
@@ -180,7 +192,9 @@ class PaperObjective:
         """Value and gradient on the subset."""
         x = x.detach().requires_grad_()
         (diffuse, specular, roughness), lights = self.unpacked(x)
-        squares, values, prior = x.new_zeros(()), 0, x.new_zeros(())
+        squares = x.new_zeros(())
+        values = 0
+        prior = x.new_zeros(())
         for block, (axis, log_sharpness, weight, log_exposure), rows in zip(self.blocks, lights, subset, strict=True):
             sums = weight.sum(0)
             prior = prior + ((sums / sums.mean() - 1) ** 2).mean()  # their variance over channels

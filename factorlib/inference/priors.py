@@ -44,10 +44,19 @@ from factorlib.jsonfile import read_json
 from factorlib.reading import reading
 
 SHIPPED = Path(__file__).with_name("material_classes.json")
-DIFFUSE, ROUGH = 3.0, 1.0  # standard deviations of log k_d and of roughness about the start
-SCALE, ROUGHNESS_SLACK, WHITE = 0.5, 0.2, 0.1  # standard deviations added in squares to those of l̄, roughness, l − l̄
-BRIGHTEST, BRIGHTNESS = 0.69, 0.16  # of (2)
-MEAN, TINTS = np.full((3, 3), 1 / 3), np.eye(3) - 1 / 3  # projections of l on its mean and on what differs from it
+# standard deviations of log k_d and of roughness about the start
+DIFFUSE = 3.0
+ROUGH = 1.0
+# standard deviations added in squares to those of l̄, roughness, l − l̄
+SCALE = 0.5
+ROUGHNESS_SLACK = 0.2
+WHITE = 0.1
+# of (2)
+BRIGHTEST = 0.69
+BRIGHTNESS = 0.16
+# projections of l on its mean and on what differs from it
+MEAN = np.full((3, 3), 1 / 3)
+TINTS = np.eye(3) - 1 / 3
 
 
 class MaterialClass(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -133,13 +142,16 @@ class MaterialPrior:
     def at(self, theta: Float[np.ndarray, "m 7"]) -> Gaussian:
         """Evaluate the prior at the materials' unknowns."""
         off = theta - self.mean
-        value, gradient = float((off**2 * self.wide).sum()), off * self.wide
+        value = float((off**2 * self.wide).sum())
+        gradient = off * self.wide
         hessians = np.tile(np.diag(self.wide), (len(theta), 1, 1))
         for m in self.specular:
             more, slope, curvature, _ = self.mixture.at(theta[m, 3:])
-            value, gradient[m, 3:] = value + more, gradient[m, 3:] + slope
+            value = value + more
+            gradient[m, 3:] = gradient[m, 3:] + slope
             hessians[m, 3:, 3:] += curvature
-        gradient, hessian = gradient.reshape(-1), block_diag(*hessians)
+        gradient = gradient.reshape(-1)
+        hessian = block_diag(*hessians)
         reflectance = np.exp(theta[:, :6])
         for members in self.members:
             brightest = members[int(reflectance[members].sum(1).argmax())]
@@ -147,7 +159,8 @@ class MaterialPrior:
             slope = np.zeros_like(theta)
             slope[brightest, :6] = reflectance[brightest] / (total * BRIGHTNESS)
             residual = (np.log(total / 3) - np.log(BRIGHTEST)) / BRIGHTNESS
-            value, gradient = value + residual**2, gradient + residual * slope.reshape(-1)
+            value = value + residual**2
+            gradient = gradient + residual * slope.reshape(-1)
             hessian += np.outer(slope, slope)
         return Gaussian(float(value), gradient, hessian)
 

@@ -61,7 +61,8 @@ def specular_response(
 
 def met_cosines(block: Block, rows: Rows, lobes: UnitLobes) -> tuple[np.ndarray, np.ndarray, np.ndarray | float]:
     """n·z', o·z' and w'/w of (1) of `factorlib.light.distance` [n, p]; for shadows alone the light is far away."""
-    normal, view = block.normal[rows], block.view[rows]
+    normal = block.normal[rows]
+    view = block.view[rows]
     if lobes.curvature == 0 or block.place is None:
         return normal @ lobes.axis.T, view @ lobes.axis.T, 1.0
     return met_from(block.place[rows], normal, view, lobes.axis, lobes.curvature)
@@ -78,13 +79,15 @@ def shadowed(
     if block.visibility is None or block.directions is None:
         return response
     response = response.clone()
-    visibility, photo = block.visibility[rows], block.photo[rows]
+    visibility = block.visibility[rows]
+    photo = block.photo[rows]
     hidden = (visibility < 255).any(1)
     axis, sharpness, normal, view = (
         torch.from_numpy(v).float() for v in (lobes.axis, lobes.sharpness, block.normal[rows], block.view[rows])
     )
     for k in np.unique(photo[hidden]):
-        directions, own = torch.from_numpy(block.directions[k]).float(), np.flatnonzero(hidden & (photo == k))
+        directions = torch.from_numpy(block.directions[k]).float()
+        own = np.flatnonzero(hidden & (photo == k))
         lit = kernel(directions, axis, sharpness)
         for some in np.split(own, range(TOGETHER, len(own), TOGETHER)):
             weights = (
@@ -155,7 +158,10 @@ class Reflections:
     """
 
     def __init__(self, block: Block, lobes: UnitLobes, operator: Operator, materials_given: bool = False):
-        self.block, self.operator, self.lobes, self.materials_given = block, operator, lobes, materials_given
+        self.block = block
+        self.operator = operator
+        self.lobes = lobes
+        self.materials_given = materials_given
         self.nodes = NODES[::2] if lobes.sharpness.max(initial=0) <= WIDE else NODES
         self._diffuse: dict[int, np.ndarray] = {}  # by material
         self._specular: dict[int, dict[int, np.ndarray]] = {}  # by material and node
@@ -195,7 +201,8 @@ class Reflections:
 
     def _computed(self, m: int, roughness: float | None) -> Float[np.ndarray, "n p"]:
         """S of material m at a roughness, or D where that is None."""
-        rows, parts = self.rows(m), []
+        rows = self.rows(m)
+        parts = []
         for i in range(rows.start, rows.stop, CHUNK):
             chunk = np.arange(i, min(i + CHUNK, rows.stop))
             if roughness is None:
@@ -239,7 +246,9 @@ def lagrange(nodes: Float[np.ndarray, " k"], x: float) -> tuple[Float[np.ndarray
     >>> [w.tolist() for w in lagrange(np.array([0.0, 1.0, 2.0]), 0.25)]
     [[0.65625, 0.4375, -0.09375], [-1.25, 1.5, -0.25]]
     """
-    value, slope, points = [], [], nodes.tolist()
+    value = []
+    slope = []
+    points = nodes.tolist()
     for a, node in enumerate(points):
         others = points[:a] + points[a + 1 :]
         below = prod(node - other for other in others)

@@ -53,8 +53,11 @@ class Run:
     def __init__(
         self, checkpoint: Checkpoint = Checkpoint(None), report: Report = unreported, prior: LightPrior | None = None
     ):
-        self.report, self.prior, self.history = report, prior or read_light_prior(), list[Event]()
-        self._checkpoint, self._kept = checkpoint, checkpoint.load() or {}
+        self.report = report
+        self.prior = prior or read_light_prior()
+        self.history = list[Event]()
+        self._checkpoint = checkpoint
+        self._kept = checkpoint.load() or {}
 
     def completed(self, steps: Mapping[str, Callable[[Q, T], T]], asked: Q, state: T) -> T:
         """Return the state after all steps; those that an earlier run has done are not done again."""
@@ -63,7 +66,8 @@ class Run:
                 for event in restored(list[Event], self._kept[f"{name}, events"]):
                     self._happened(event)
             else:
-                before, after = len(self.history), step(asked, state)
+                before = len(self.history)
+                after = step(asked, state)
                 self._kept |= {f"{name}, events": plain(self.history[before:]), name: plain(after)}
                 self._checkpoint.save(self._kept)
             state = restored(type(state), self._kept[name])
@@ -72,7 +76,8 @@ class Run:
     def fit(self, phase: str, problem: JointProblem, start: Fit, schedule: Schedule) -> Fit:
         """`fitted`, under the prior on lights; every point that is tried is an event of this phase."""
         number = self.history[-1].round + 1 if self.history else 0
-        iteration, cells = 0, sum(map(len, start.point.lights))
+        iteration = 0
+        cells = sum(map(len, start.point.lights))
 
         def tell(loss: float) -> None:
             """Report one point."""

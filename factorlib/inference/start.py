@@ -37,8 +37,12 @@ from factorlib.results.solution import Earlier
 
 log = logging.getLogger("factorlib.inference")
 BRIGHTEST_AT_START = 0.7  # reflectance of the brightest material at the start
-ROUGHNESS, SPECULAR_SHARE = 0.4, 0.2  # of every material at the start
-FEW, STARTS = 2, (0.15, 0.4, 0.8)  # with so few materials, a solve starts from several roughnesses
+# of every material at the start
+ROUGHNESS = 0.4
+SPECULAR_SHARE = 0.2
+# with so few materials, a solve starts from several roughnesses
+FEW = 2
+STARTS = (0.15, 0.4, 0.8)
 LEAST_RADIANCE = 1e-6  # of a block's mean
 
 # Fits on so many cells a light, of which the one that explains most goes on.
@@ -50,7 +54,8 @@ def from_nothing(materials: int) -> Start:
 
     def fits(problem: JointProblem, cells: int) -> list[Fit]:
         """Return one fit a roughness, its lights constant."""
-        blocks, roughness = problem.blocks, STARTS if materials <= FEW else STARTS[1:2]
+        blocks = problem.blocks
+        roughness = STARTS if materials <= FEW else STARTS[1:2]
         begun = [starting_materials(blocks, materials, one) for one in roughness]
         return [start_of(Point(of, [constant_light(block, of, cells) for block in blocks])) for of in begun]
 
@@ -94,9 +99,11 @@ def from_beginning(begun: Beginning) -> Start:
     def fits(problem: JointProblem, cells: int) -> list[Fit]:
         """Return the fit in the units of the problem."""
         materials = Materials.of_rows(np.array(begun.materials))
-        lights, counts = [], []
+        lights = []
+        counts = []
         for block in problem.blocks:
-            one, light = begun.lights.get(block.name), constant_light(block, materials, cells)
+            one = begun.lights.get(block.name)
+            light = constant_light(block, materials, cells)
             if one and (len(one.weight), len(one.log_exposure)) == (cells, len(block.photos)):
                 values = {"weight": np.array(one.weight) / block.unit, "log_exposure": np.array(one.log_exposure)}
                 light = msgspec.structs.replace(light, **values)
@@ -109,10 +116,13 @@ def from_beginning(begun: Beginning) -> Start:
 
 def with_known(point: Point, problem: JointProblem) -> Point:
     """The point with what is known in its place, and the rest of each component at the scale of what is known."""
-    known, materials, lights = problem.known, point.materials, list(point.lights)
+    known = problem.known
+    materials = point.materials
+    lights = list(point.lights)
     if known.nothing:
         return point
-    names, rows = [block.name for block in problem.blocks], materials.rows()
+    names = [block.name for block in problem.blocks]
+    rows = materials.rows()
     given = np.maximum(known.put(materials).rows(), LEAST_REFLECTANCE)
     for members, illuminations in connected_components(problem.blocks, len(materials)):
         lit = [names.index(name) for name in illuminations]
@@ -123,10 +133,12 @@ def with_known(point: Point, problem: JointProblem) -> Point:
         factor = np.mean(logs, axis=0)  # on reflectances
         rows[list(members), :6] *= np.tile(np.exp(factor), 2)
         for i in lit:
-            weight, parts = lights[i].weight / np.exp(factor), {}
+            weight = lights[i].weight / np.exp(factor)
+            parts = {}
             if one := own.get(i):
                 scale = (brighter[i] - factor).mean() * one.scale_free - np.log(problem.blocks[i].unit)
-                weight, held = one.weight * np.exp(scale), {"held": one.held, "scale_free": one.scale_free}
+                weight = one.weight * np.exp(scale)
+                held = {"held": one.held, "scale_free": one.scale_free}
                 parts = {"axis": one.axis, "log_sharpness": one.log_sharpness, **held}
             if names[i] in known.exposures:
                 parts |= {"log_exposure": np.zeros_like(lights[i].log_exposure), "exposures_held": True}
@@ -162,7 +174,10 @@ def starting_materials(blocks: Sequence[Block], count: int, roughness: float = R
 
 def mean_albedo(blocks: Sequence[Block], count: int) -> Float[np.ndarray, "m 3"]:
     """Relative reflectance per material and channel, the largest being `BRIGHTEST_AT_START`; materials that no block shows get the median."""
-    rows, right, weight, first = [], [], [], count
+    rows = []
+    right = []
+    weight = []
+    first = count
     for block in blocks:
         for k in range(len(block.photos)):
             for m in np.unique(block.material[block.photo == k]):
@@ -194,7 +209,8 @@ def constant_light(block: Block, materials: Materials, cells: int) -> Light:
 
 def own_cells(name: str, count: int) -> UnitLobes:
     """Return `count` even cells, turned at random by the name of the illumination, so that what cells blur differs from light to light."""
-    cells, seed = even_cells(count), crc32(name.encode())
+    cells = even_cells(count)
+    seed = crc32(name.encode())
     turn = Rotation.random(rng=np.random.default_rng(seed)).as_matrix()
     return msgspec.structs.replace(cells, axis=cells.axis @ turn.T)
 
@@ -218,9 +234,12 @@ def known_point(problem: JointProblem, earlier: Earlier, names: Sequence[str], c
     Each component of the earlier gauge comes to the scale of `mean_albedo` by the geometric mean, over its materials that a block shows, or over all
     of them where none is shown.
     """
-    blocks, component = problem.blocks, [earlier.table.gauge.component.get(name) for name in names]
-    albedo, rows = mean_albedo(blocks, len(names)), starting_materials(blocks, len(names)).rows()
-    shown, factors = {int(m) for block in blocks for m in np.unique(block.material)}, {}
+    blocks = problem.blocks
+    component = [earlier.table.gauge.component.get(name) for name in names]
+    albedo = mean_albedo(blocks, len(names))
+    rows = starting_materials(blocks, len(names)).rows()
+    shown = {int(m) for block in blocks for m in np.unique(block.material)}
+    factors = {}
     for c in sorted({c for c in component if c is not None}):
         members = [m for m in range(len(names)) if component[m] == c]
         known = {m: earlier.table.materials[names[m]] for m in members}
@@ -230,7 +249,8 @@ def known_point(problem: JointProblem, earlier: Earlier, names: Sequence[str], c
         for m, one in known.items():
             rows[m] = [*(one.diffuse * factor), *(one.specular * factor), one.roughness]
         factors[c] = factor
-    materials, lights = Materials.of_vector(rows.reshape(-1)), []
+    materials = Materials.of_vector(rows.reshape(-1))
+    lights = []
     for block in blocks:
         light = constant_light(block, materials, cells)
         own = [component[m] for m in np.unique(block.material) if component[m] is not None]
@@ -247,7 +267,9 @@ def earlier_light(constant: Illumination, earlier: Earlier, factor: Float[np.nda
 
     A photo that the earlier solution does not have gets its exposure in the constant light, beside those of the others.
     """
-    block, model, before = constant.block, earlier.table.model, constant.light.log_exposure
+    block = constant.block
+    model = earlier.table.model
+    before = constant.light.log_exposure
     lobes = earlier.lights.get(block.name)
     exposure = np.array([np.log(np.mean(earlier.exposures.get(photo, (np.nan,) * 3))) for photo in block.photos])
     new = np.isnan(exposure)

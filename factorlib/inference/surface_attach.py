@@ -24,15 +24,22 @@ def attached_pixels(
 
     shown: the object that each pixel shows, a number from 1 as `align` counts them, 0 for none;  objects: the mesh and the pose of each, in that order; a mesh that has no nodes stays as it is
     """
-    along, count = camera.rays_through(pixels + 0.5), len(pixels)
-    node, share, frame = np.zeros((count, 3), np.int64), np.zeros((count, 3)), np.zeros((count, 3, 3))
+    along = camera.rays_through(pixels + 0.5)
+    count = len(pixels)
+    node = np.zeros((count, 3), np.int64)
+    share = np.zeros((count, 3))
+    frame = np.zeros((count, 3, 3))
     for number, (mesh, entry) in enumerate(objects.values(), start=1):
         if mesh not in surfaces.meshes:
             continue
-        rows, fine, scale = np.flatnonzero(shown == number), surfaces.meshes[mesh], np.array(entry.scale)
+        rows = np.flatnonzero(shown == number)
+        fine = surfaces.meshes[mesh]
+        scale = np.array(entry.scale)
         solid = scaled(fine.mesh, entry.scale)
         hits = Caster(solid).cast_along(along[rows], entry.pose)
-        rows, face, uv = rows[hits.face >= 0], hits.face[hits.face >= 0], hits.uv[hits.face >= 0]
+        rows = rows[hits.face >= 0]
+        face = hits.face[hits.face >= 0]
+        uv = hits.uv[hits.face >= 0]
         node[rows] = surfaces.first[mesh] + fine.faces[face]
         share[rows] = np.column_stack([1 - uv.sum(1), uv])
         toward = face_normals(solid, face) @ entry.pose.rotation.T

@@ -43,7 +43,9 @@ from factorlib.results.materials import Decision
 TURNS = (1000.0, 300.0, 100.0, 30.0)  # stiffness of turns: a of `factorlib.inference.surface_turns`; b is a share of it
 FACTORS = (300.0, 100.0, 30.0, 10.0)  # of log factors
 ROUNDS = 3
-CELLS, FOLDS = 250, 4  # cells of a light; folds of photos
+# cells of a light; folds of photos
+CELLS = 250
+FOLDS = 4
 OBSERVATIONS = 1000  # of a light, or of a photo that judges, that materials and lights are fitted to
 SETTLE = Schedule(lights=2, together=(3, 2), estimate=False)
 BETWEEN = Schedule(together=(2,), estimate=False)
@@ -75,7 +77,8 @@ class Surfaces(msgspec.Struct, frozen=True):
     ) -> dict[str, Float[np.ndarray, " n"]]:
         """Return by mesh, in its extents, what `Fine.displacement` finds for the turns of its nodes, as far as observations are attached to them."""
         weight = sum(np.bincount(of.node.reshape(-1), of.share.reshape(-1), self.nodes) for of in attached)
-        turns, seen = self.by_mesh(turn), self.by_mesh(np.minimum(weight, 1.0))
+        turns = self.by_mesh(turn)
+        seen = self.by_mesh(np.minimum(weight, 1.0))
         return {name: mesh.displacement(turns[name], seen[name]) for name, mesh in self.meshes.items()}
 
     def by_mesh(self, values: np.ndarray) -> dict[str, np.ndarray]:
@@ -203,7 +206,8 @@ class Trial(msgspec.Struct, frozen=True):
 
         parts: of the mesh itself;  tick: called after each fold
         """
-        photos, folds = self.photos, min(FOLDS, len(self.photos))
+        photos = self.photos
+        folds = min(FOLDS, len(self.photos))
 
         def others(fold: int) -> Detail:
             """Return the detail that the photos of one fold have no part in."""
@@ -260,7 +264,8 @@ class Search(msgspec.Struct, frozen=True):
 
     def turned(self) -> tuple[Best, set[str]]:
         """Return the likeliest turns, and the meshes that they move: those that are better when they are turned alone."""
-        trial, plain = self.trial, self.plain
+        trial = self.trial
+        plain = self.plain
         turned = self.best([Stiffness(a) for a in TURNS], plain, FOR, 0.0)
         moving = self.meshes_that_gain(turned.details) if turned.judged.gain_over(plain) > 0 else set()
         if 0 < len(moving) < len(trial.surfaces.meshes):
@@ -270,8 +275,11 @@ class Search(msgspec.Struct, frozen=True):
 
     def of_all_photos(self, stiffness: Stiffness, moving: set[str], pieces: Pieces, seed: int) -> Detail:
         """Return the detail that all photos ask for, materials and lights fitted again between its steps."""
-        trial, parts, fit = self.trial, self.parts, self.trial.fit
-        nodes, detail = trial.surfaces.nodes_of(moving), no_detail(trial.surfaces.nodes)
+        trial = self.trial
+        parts = self.parts
+        fit = self.trial.fit
+        nodes = trial.surfaces.nodes_of(moving)
+        detail = no_detail(trial.surfaces.nodes)
         for number in range(ROUNDS):
             begin = 0.85 + 0.05 * number
             tick = pieces.of(begin, begin + 0.05, BETWEEN.points, f"all photos, round {number + 1}")
@@ -303,7 +311,8 @@ def found(
 
     problem: all observations;  attached: where each block's lie;  start: where materials and lights begin;  seed: of what is drawn
     """
-    pieces, plain = Pieces(report), no_detail(surfaces.nodes)
+    pieces = Pieces(report)
+    plain = no_detail(surfaces.nodes)
     tick = pieces.of(0.0, 0.3, TRIAL.points + SETTLE.points, "materials and lights")
     trial, begun = trial_of(problem, start, seed, (surfaces, attached), tick)
     photos = len(trial.photos)
@@ -333,7 +342,8 @@ def trial_of(
 
     surface: and where the problem's blocks lie on it
     """
-    prior, sure = read_light_prior(), sure_ones(problem)
+    prior = read_light_prior()
+    sure = sure_ones(problem)
 
     def fitting(name: str, some: JointProblem, begun: Fit, schedule: Schedule) -> Fit:
         """Fit under the prior."""

@@ -37,7 +37,9 @@ STEP = 0.02  # of a normal, for differences: about 1°
 MOST = 0.6  # of |n' − n|: 35°
 GRAZING = 0.05  # least n'·o: a normal that would turn further stays
 PULL = 0.06  # b over a: what holds a node whose neighbours know nothing
-ACCURACY, ITERATIONS = 3e-3, 150  # of conjugate gradients
+# of conjugate gradients
+ACCURACY = 3e-3
+ITERATIONS = 150
 
 
 class Attached(msgspec.Struct, frozen=True):
@@ -132,7 +134,8 @@ class Part(msgspec.Struct, frozen=True, dict=True):
     def without(self, gone: Bool[np.ndarray, " n"]) -> Part:
         """The same light, seen by the other observations alone."""
         rest = np.repeat(~gone, 3)
-        hessian, p = self.hessian.copy(), self.cells
+        hessian = self.hessian.copy()
+        p = self.cells
         for c, U in enumerate(self.by_light[:, gone].astype(float)):
             places = np.concatenate([np.arange(c * p, (c + 1) * p), np.arange(3 * p, len(hessian))])
             hessian[np.ix_(places, places)] -= U.T @ U
@@ -142,7 +145,8 @@ class Part(msgspec.Struct, frozen=True, dict=True):
 
     def of_light(self, unknowns: Float[np.ndarray, " l"]) -> Float[np.ndarray, " 3n"]:
         """U times a change of the light."""
-        own, shared = unknowns[: 3 * self.cells].reshape(3, -1), unknowns[3 * self.cells :]
+        own = unknowns[: 3 * self.cells].reshape(3, -1)
+        shared = unknowns[3 * self.cells :]
         each = [U @ np.append(u, shared).astype(np.float32) for U, u in zip(self.by_light, own, strict=True)]
         return np.stack(each, axis=1).reshape(-1).astype(float)
 
@@ -162,9 +166,13 @@ def part_of(
 ) -> Part:
     """Linearise one light at its block's normals and detail; attached: of the block.  Held-out observations have no say."""
     likelihood = likelihood_of(illumination, counts, prior, materials_given=True)
-    own, block = likelihood.illumination, illumination.block
-    n, p, shown = len(block), len(own.light), own.shown()
-    residual, by_light = np.zeros((n, 3)), np.zeros((3, n, own.light.unknowns - 2 * p), np.float32)
+    own = likelihood.illumination
+    block = illumination.block
+    n = len(block)
+    p = len(own.light)
+    shown = own.shown()
+    residual = np.zeros((n, 3))
+    by_light = np.zeros((3, n, own.light.unknowns - 2 * p), np.float32)
     by_factor = np.zeros((n, 3))
     for line in own.linearise(shown, ROBUST, counts.temperature):
         residual[line.rows, line.channel] = line.residual
@@ -190,7 +198,8 @@ def _rows(slopes: Float[np.ndarray, "3n 3"]) -> csr_array:
 def _by_normal(illumination: Illumination) -> Float[np.ndarray, "n 3 3"]:
     """∂r/∂n of each observation, channel by axis, along the surface alone."""
     block = illumination.block
-    normal, before = block.normal, illumination.residuals()
+    normal = block.normal
+    before = illumination.residuals()
     first = np.cross(normal, np.eye(3)[np.abs(normal).argmin(1)])
     first /= np.linalg.norm(first, axis=1, keepdims=True)
     result = np.zeros((len(block), 3, 3))
@@ -217,13 +226,16 @@ def step(
     moving: Bool[np.ndarray, " v"] | None = None,
 ) -> Detail:
     """The detail that minimises (2), where the parts were linearised `at` one; moving: nodes whose normals may turn, None for all."""
-    v, both = len(at.log_factor), np.concatenate([at.turn.reshape(-1), at.log_factor])
+    v = len(at.log_factor)
+    both = np.concatenate([at.turn.reshape(-1), at.log_factor])
     roughness = csr_array(laplacian + PULL * eye_array(v))
     prior = block_diag([kron((stiffness.turn or 0) * roughness, np.eye(3)), (stiffness.factor or 0) * roughness])
     turning = np.repeat(np.ones(v, bool) if moving is None else moving, 3) & (stiffness.turn is not None)
     free = np.append(turning, np.full(v, stiffness.factor is not None))
-    slopes, prior = [part.slopes[:, free] for part in parts], prior.tocsr()[free][:, free]
-    right, diagonal = -(prior @ both[free]), prior.diagonal()
+    slopes = [part.slopes[:, free] for part in parts]
+    prior = prior.tocsr()[free][:, free]
+    right = -(prior @ both[free])
+    diagonal = prior.diagonal()
     for part, J in zip(parts, slopes, strict=True):
         right -= J.T @ part.unexplained
         diagonal = diagonal + J.multiply(J).sum(0)

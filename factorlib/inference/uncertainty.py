@@ -59,7 +59,9 @@ WIDTHS = (*[1.0] * 6, ROUGHNESS[1] - ROUGHNESS[0])  # of the ranges of a materia
 # 32, 45 and 57 %).
 MODEL_ERROR = np.array([0.09] * 3 + [0.25] * 3 + [0.07])
 LIGHT_ERROR = 0.7
-ROWS, LARGEST = 32, 1000.0  # of the maps of a light's relative standard errors
+# of the maps of a light's relative standard errors
+ROWS = 32
+LARGEST = 1000.0
 
 
 class StandardErrors(NamedTuple):
@@ -76,11 +78,13 @@ def uncertainty_of(
 
     problem: all observations that the solution was found from;  tick: called after each of two systems for each light
     """
-    problem, prior = solution.shown(problem), read_light_prior()
+    problem = solution.shown(problem)
+    prior = read_light_prior()
     count = observations_of(choices, solution.splitting)
     some, all_ = (of.sampled(count, choices.seed) for of in (sure_ones(problem), problem))
     found, deviation = Posterior(some, solution.materials, prior, tick).standard_errors()
-    fitted, materials = solution.materials.point.materials, solution.point.materials
+    fitted = solution.materials.point.materials
+    materials = solution.point.materials
     diffuse = found.diffuse * materials.diffuse / fitted.diffuse
     specular = found.specular * materials.specular / fitted.specular
     errors = StandardErrors(Materials(diffuse, specular, found.roughness), deviation)
@@ -91,7 +95,10 @@ class Posterior:
     """What is uncertain at the fit of a joint solve; problem: what it was fitted to;  tick: called after each light whose system is made."""
 
     def __init__(self, problem: JointProblem, fit: Fit, prior: LightPrior, tick: Callable[[], None] = lambda: None):
-        self.problem, self.fit, self.prior, self.tick = problem, fit, prior, tick
+        self.problem = problem
+        self.fit = fit
+        self.prior = prior
+        self.tick = tick
         self.materials = materials_of(unknowns_of(fit.point.materials))  # none of whose reflectances is nil
 
     def systems(self, with_scores: bool) -> list[System]:
@@ -111,7 +118,8 @@ class Posterior:
 
     def standard_errors(self) -> StandardErrors:
         """Standard error of every material unknown."""
-        problem, materials = self.problem, self.materials
+        problem = self.problem
+        materials = self.materials
         values = np.column_stack([materials.diffuse, materials.specular, np.ones(len(materials))])
         by_log = 1 / values.reshape(-1)  # ∂ log k/∂k
         known, scores = information(self.systems(with_scores=True), len(by_log))
@@ -123,17 +131,20 @@ class Posterior:
 
     def relative_standard_errors(self) -> dict[str, Float[np.ndarray, "h w 3"]]:
         """Return the standard error of each light over its mean radiance, by illumination: a small lat-long map in the frame of the exported ones, at most LARGEST."""
-        directions, maps = map_directions(), {}
+        directions = map_directions()
+        maps = {}
         model_error = residual_deviation(self.problem, self.fit.point) * LIGHT_ERROR
         for block, light, system in zip(
             self.problem.blocks, self.fit.point.lights, self.systems(with_scores=False), strict=True
         ):
-            free, errors = light.free, np.empty((len(directions), 3))
+            free = light.free
+            errors = np.empty((len(directions), 3))
             p = int(free.sum())
             covariance = inverse_of(system.factor[: 3 * p, : 3 * p])
             overlap = np.exp(-0.5 * light.sharpness * squared_distances(directions, light.axis))
             for c in range(3):
-                own, slope = slice(c * p, (c + 1) * p), (overlap * light.weight[:, c])[:, free]
+                own = slice(c * p, (c + 1) * p)
+                slope = (overlap * light.weight[:, c])[:, free]
                 variance = np.maximum(np.sum(slope @ covariance[own, own] * slope, axis=1), 0)
                 errors[:, c] = np.hypot(np.sqrt(variance), model_error * slope.sum(1))
             mean = light.energy.sum(0) / 2  # `energy` is over 2π, a mean over 4π
@@ -165,7 +176,8 @@ def largest_variance(
     do not see, one unknown as the roughness of a Lambertian material or a trade of one for another, is uncertain by the width of its range,
     which counts as one more observation of each unknown.
     """
-    free, inverse = problem.known.free(len(materials)), np.zeros_like(information)
+    free = problem.known.free(len(materials))
+    inverse = np.zeros_like(information)
     scale = np.sqrt(np.maximum(np.diag(information)[free], 1.0))  # rows are of unlike units
     scales = np.outer(scale, scale)
     values, vectors = np.linalg.eigh(information[np.ix_(free, free)] / scales)
@@ -200,9 +212,11 @@ def in_gauge(
     for members, illuminations in connected_components(problem.blocks, len(materials)):
         factors = problem.known.factors(members, illuminations)
         for columns in {3: [[0, 3], [1, 4], [2, 5]], 1: [[*range(6)]], 0: []}[factors]:
-            g, h = np.zeros(rows.shape), np.zeros(rows.shape)
+            g = np.zeros(rows.shape)
+            h = np.zeros(rows.shape)
             own = np.ix_(members, columns)
-            g[own], h[own] = rows[own], 1
+            g[own] = rows[own]
+            h[own] = 1
             P = np.eye(rows.size) - np.outer(g, h) / np.vdot(h, g)
             covariance = P @ covariance @ P.T
     return covariance

@@ -18,14 +18,17 @@ from factorlib.conventions import YUP_FROM_CAMERA, lat_long_directions, lat_long
 from factorlib.light.lobes import Lobes
 
 LARGEST_EXPONENT = 25.0  # e⁻²⁵: beyond, a lobe is nil
-LEAST_NODES, NODES_PER_WIDTH = 3, 1.5  # Gauss nodes along a texel's side, and how many more per lobe width 1/√λ in it
+# Gauss nodes along a texel's side, and how many more per lobe width 1/√λ in it
+LEAST_NODES = 3
+NODES_PER_WIDTH = 1.5
 
 Map = Float[np.ndarray, "h w 3"]
 
 
 def lat_long_of_lobes(lobes: Lobes, height: int, width: int) -> Map:
     """Texel area averages of the light, in the frame of the exported maps: the y-up turn of the lobes' own frame."""
-    tall, wide = np.pi / height, 2 * np.pi / width
+    tall = np.pi / height
+    wide = 2 * np.pi / width
 
     def nodes(sharpness: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Gauss nodes in every row and column."""
@@ -60,7 +63,8 @@ def _means(
     """Rows [r] and columns [c] that a unit lobe reaches, and its means there [r, c]."""
     polar = 2 * np.sin((theta - theta_z) / 2) ** 2  # [h, g]
     rows = np.flatnonzero(sharpness * polar.min(axis=1) < LARGEST_EXPONENT)
-    theta, polar = theta[rows], polar[rows]
+    theta = theta[rows]
+    polar = polar[rows]
     scale = 2 * np.sin(theta) * np.sin(theta_z)
     azimuthal = np.sin((phi - phi_z) / 2) ** 2  # [w, g]
     columns = np.flatnonzero(sharpness * scale.min(initial=2) * azimuthal.min(axis=1) < LARGEST_EXPONENT)
@@ -86,9 +90,12 @@ def sampled(lat_long: Map, directions: Float[np.ndarray, "*n 3"]) -> Float[np.nd
     """Bilinear interpolation between texel centres, in unit directions of the map's frame; continuous over the poles."""
     height, width = lat_long.shape[:2]
     row, column = lat_long_of_direction(directions)
-    i, j = row * height - 0.5, column * width - 0.5
-    i0, j0 = np.floor(i).astype(int), np.floor(j).astype(int)
-    a, b = (i - i0)[..., None], (j - j0)[..., None]
+    i = row * height - 0.5
+    j = column * width - 0.5
+    i0 = np.floor(i).astype(int)
+    j0 = np.floor(j).astype(int)
+    a = (i - i0)[..., None]
+    b = (j - j0)[..., None]
     pick = [[_texel(lat_long, i0 + di, j0 + dj) for dj in (0, 1)] for di in (0, 1)]
     return (1 - a) * ((1 - b) * pick[0][0] + b * pick[0][1]) + a * ((1 - b) * pick[1][0] + b * pick[1][1])
 

@@ -87,7 +87,8 @@ class LightPrior(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
         u is log R of all `directions`, then log G, then log B:  Q = Σ_k A_kᵀ A_k ⊗ K_k⁻¹/s_k²
         """
-        p, log_determinant = len(directions), 0.0
+        p = len(directions)
+        log_determinant = 0.0
         precision = np.zeros((3 * p, 3 * p))
         for k, (row, factor) in enumerate(zip(MIX, factors, strict=True)):
             inverse, log_of_inverse = _inverse(self, k, directions.tobytes())
@@ -102,10 +103,12 @@ class LightPrior(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         covariance: Float[np.ndarray, "3p 3p"],
     ) -> list[float]:
         """The s_k² of a light that is known as a Gaussian, u with its covariance: one step of expectation maximisation of (4)."""
-        p, factors = len(directions), []
+        p = len(directions)
+        factors = []
         by_channel = covariance.reshape(3, p, 3, p)
         for k, (row, nu) in enumerate(zip(MIX, self.freedom, strict=True)):
-            inverse, y = _inverse(self, k, directions.tobytes())[0], row @ log_radiance
+            inverse = _inverse(self, k, directions.tobytes())[0]
+            y = row @ log_radiance
             spread = np.einsum("c,cpdq,d->pq", row, by_channel, row)
             factors.append(float((nu + y @ inverse @ y + np.sum(inverse * spread)) / (nu + p)))
         return factors

@@ -40,7 +40,9 @@ def highlight_weights(
 ) -> Float[Tensor, "n k"]:
     """f of equation (2), each row's sum 1."""
     square = roughness**4 + 1 / widest_sharpness(len(directions))  # α² and that of the directions' spacing
-    nd, no, od = normals @ directions.T, (normals * views).sum(1, keepdim=True), views @ directions.T
+    nd = normals @ directions.T
+    no = (normals * views).sum(1, keepdim=True)
+    od = views @ directions.T
     upper = (nd > 0).to(nd.dtype)
     nd = nd.clamp_min(1e-6)
     nh2 = ((nd + no) ** 2 / (2 + 2 * od).clamp_min(1e-6)).clamp(0, 1)
