@@ -5,12 +5,10 @@ illumination (3 unknowns a cell, plus exposures and tone curves of its photos). 
 arrow shape, and the illuminations are eliminated one by one (Schur complement).
 
 Method   joint_solver (its steps), model_selection and evidence (choices by held-out observations), suns, surface_detail
-with
-         surface_turns and surface_attach (normals from shading), paper_solver (the baseline)
+         with surface_turns and surface_attach (normals from shading), paper_solver (the baseline)
 Fit      fit (materials and lights together), likelihood (the objective), priors (of materials), optimizer and arrow
 Model    problem (every question about a point), forward (radiance and derivatives), responses (reflection of cells),
-lights,
-         materials, noise, interreflection, known
+         lights, materials, noise, interreflection, known
 Data     observed and blocks (observations by illumination), start (initial values), resume (checkpoints of steps)
 Results  gauge, uncertainty, identifiability, misfit, answer, history
 """

@@ -5,14 +5,12 @@ where surfaces light each other, because their radiance is known, nor where a re
 (`factorlib.inference.known`).  Such a component stays as it is.  A light that is known up to one factor fixes the tint.
 
 Tint   Lights are as near to grey as possible, as the paper's prior asks.  Let E_ic be the summed lobe energies of light
-i.
-       The factors s_c minimise Σ_i Σ_c (log s_c E_ic − mean_c log s_c E_ic)²: s_c is one over the geometric mean over
-       lights of E_ic, and each light counts alike.  In logarithms the rule does not depend on the initial gauge.  The
-       paper sums weights, which are peak values.  One broad lobe and several sharper ones in its place have different
-       summed weights, but equal summed energies.
+       i.  The factors s_c minimise Σ_i Σ_c (log s_c E_ic − mean_c log s_c E_ic)²: s_c is one over the geometric mean
+       over lights of E_ic, and each light counts alike.  In logarithms the rule does not depend on the initial gauge.
+       The paper sums weights, which are peak values.  One broad lobe and several sharper ones in its place have
+       different summed weights, but equal summed energies.
 Scale  The largest k_d + k_s of a component's materials is `BRIGHTEST`.  A bright material in a room reflects most of
-the
-       light, as in most photographs of objects, and Mitsuba requires a value below one.
+       the light, as in most photographs of objects, and Mitsuba requires a value below one.
 """
 
 from __future__ import annotations

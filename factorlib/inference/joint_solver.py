@@ -1,11 +1,11 @@
 """Joint solve: one reflectance per material and one light per illumination, from all photos at once.
 
-effects     Held-out observations choose shadows and interreflection, tone curves, and distances of lights
-            (`factorlib.inference.model_selection`).
+effects     Held-out observations choose shadows and interreflection (`factorlib.inference.model_selection`).
+tone        They choose tone curves.
+distances   They choose distances of lights.
 materials   Materials and lights are fitted together to observations with reliable normals (`factorlib.inference.fit`).
 splitting   The cells with most of each light's energy split in four while held-out observations gain.  Light sharper
-than a
-            cell makes materials look smoother.  Suns and lamps are deeply split cells.
+            than a cell makes materials look smoother.  Suns and lamps are deeply split cells.
 lights      Given the materials, lights are fitted to observations of any confidence.
 suns        Each light is compared with one that has a sun in place of its brightest cells (`factorlib.inference.suns`).
 
