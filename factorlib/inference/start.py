@@ -1,16 +1,19 @@
-"""Where a solve starts: from mean radiances alone, from what `surface` has fitted, or from an earlier solution.
+"""Initial fits of a solve: from mean radiances alone, from the fit of `surface`, or from an earlier solution.
 
-From nothing   The median radiance of material m in photo i is roughly light_i · reflectance_m per channel: a rank-one matrix with gaps, whose
-               logarithm is fitted as a sum by least squares.  Exposures follow from mean radiances, lights are constant.
-From surface   The stage `surface` fits the same materials and lights to the meshes as they are; a solve goes on from there (`Beginning`).
-From earlier   Materials are known by their names, lights by their illumination's.  Mean radiances give all materials one relative scale
-               (`mean_albedo`), known or new; each gauge of the earlier solution is brought to that scale by one factor per channel, the
-               geometric mean over its materials, and its lights by the inverse.  So groups that a new photo links come into one gauge, and
-               new materials stand beside the known ones.  A new photo of a known light gets the exposure that explains its mean radiance; a
-               new light is constant.  A light that explains its photos worse than a constant does (it was taken again, or turned, or in
-               other units) is not known but new.  Only the start, and what was decided of shadows and bounces, are taken over: nothing pulls
-               toward the earlier answer.
-What is known  Each component is brought to the scale of its known materials, and these stand in their places.
+Nothing   The median radiance of material m in photo i is roughly light_i · reflectance_m per channel, a rank-one matrix
+          with gaps.  Its logarithm is fitted as a sum by least squares.  Exposures follow from mean radiances, and
+          lights are constant.
+Surface   The stage `surface` fits the same materials and lights to the meshes as they are.  A solve continues from that
+          fit (`Beginning`).
+Earlier   Materials are identified by name, and lights by the name of their illumination.  Mean radiances give all
+          materials, known or new, one relative scale (`mean_albedo`).  One factor per channel brings each gauge of the
+          earlier solution to that scale: the geometric mean over its materials.  Its lights get the inverse factor.
+          Groups that a new photo links therefore share one gauge, and new materials are on the same scale as known
+          ones.  A new photo of a known light gets the exposure that explains its mean radiance.  A new light is
+          constant.  A light that explains its photos worse than a constant one counts as new: it was taken again, or
+          rotated, or is in other units.  Only the start and the decisions on shadows and interreflection are taken
+          over; no prior pulls toward the earlier answer.
+Known     Each component is brought to the scale of its known materials, which are then inserted.
 """
 
 from __future__ import annotations
@@ -37,23 +40,23 @@ from factorlib.results.solution import Earlier
 
 log = logging.getLogger("factorlib.inference")
 BRIGHTEST_AT_START = 0.7  # reflectance of the brightest material at the start
-# of every material at the start
+# Start of every material.
 ROUGHNESS = 0.4
 SPECULAR_SHARE = 0.2
-# with so few materials, a solve starts from several roughnesses
+# With at most FEW materials, a solve starts from each roughness of STARTS.
 FEW = 2
 STARTS = (0.15, 0.4, 0.8)
-LEAST_RADIANCE = 1e-6  # of a block's mean
+LEAST_RADIANCE = 1e-6  # least radiance, as a share of a block's mean
 
-# Fits on so many cells a light, of which the one that explains most goes on.
+# Function of a problem and a number of cells a light; the best of its fits continues.
 Start = Callable[[JointProblem, int], list[Fit]]
 
 
 def from_nothing(materials: int) -> Start:
-    """Materials 0 … `materials`−1 and lights from mean radiances alone; with few materials, from several roughnesses."""
+    """Return the start from mean radiances alone; with few materials, from several roughnesses."""
 
     def fits(problem: JointProblem, cells: int) -> list[Fit]:
-        """Return one fit a roughness, its lights constant."""
+        """Return one fit per roughness, with constant lights."""
         blocks = problem.blocks
         roughness = STARTS if materials <= FEW else STARTS[1:2]
         begun = [starting_materials(blocks, materials, one) for one in roughness]
@@ -65,7 +68,10 @@ def from_nothing(materials: int) -> Start:
 class BegunLight(msgspec.Struct, frozen=True):
     """Light on the first p of `own_cells`.
 
-    weight: of the cells, RGB, in scene radiance;  log_exposure: of its photos;  hyperparameters: of the fit
+    Attributes:
+        weight: Weights of the cells, RGB, in scene radiance.
+        log_exposure: Log exposures of its photos.
+        hyperparameters: Hyperparameters of the fit.
     """
 
     weight: list[list[float]]
@@ -76,7 +82,10 @@ class BegunLight(msgspec.Struct, frozen=True):
 class Beginning(msgspec.Struct, frozen=True):
     """Materials and lights that were fitted to the meshes as they are.
 
-    materials: k_d, k_s (RGB each) and roughness by number;  lights: by illumination;  value: of the fit
+    Attributes:
+        materials: k_d, k_s (RGB each) and roughness, by number.
+        lights: Lights by illumination.
+        value: Objective of the fit.
     """
 
     materials: list[list[float]]
@@ -85,7 +94,10 @@ class Beginning(msgspec.Struct, frozen=True):
 
     @staticmethod
     def of(fit: Fit, blocks: Sequence[Block]) -> Beginning:
-        """Return what is written of a fit of these blocks, whose lights are far away and have no tone curves."""
+        """Return the serialisable form of a fit of these blocks.
+
+        Its lights are infinitely far away and have no tone curves.
+        """
         lights = {
             block.name: BegunLight((light.weight * block.unit).tolist(), light.log_exposure.tolist(), hyperparameters)
             for block, light, hyperparameters in zip(blocks, fit.point.lights, fit.hyperparameters, strict=True)
@@ -94,7 +106,7 @@ class Beginning(msgspec.Struct, frozen=True):
 
 
 def from_beginning(begun: Beginning) -> Start:
-    """Return the start at a fit; a light of other cells or other photos than the fit's is constant."""
+    """Return the start from a fit; a light with other cells or other photos than the fit's is constant."""
 
     def fits(problem: JointProblem, cells: int) -> list[Fit]:
         """Return the fit in the units of the problem."""
@@ -115,7 +127,7 @@ def from_beginning(begun: Beginning) -> Start:
 
 
 def with_known(point: Point, problem: JointProblem) -> Point:
-    """The point with what is known in its place, and the rest of each component at the scale of what is known."""
+    """Return the point with known values inserted, and the rest of each component at their scale."""
     known = problem.known
     materials = point.materials
     lights = list(point.lights)
@@ -127,6 +139,7 @@ def with_known(point: Point, problem: JointProblem) -> Point:
     for members, illuminations in connected_components(problem.blocks, len(materials)):
         lit = [names.index(name) for name in illuminations]
         own = {i: known.lights[names[i]] for i in lit if names[i] in known.lights}
+        # log factor on reflectances: of the known materials, else of the known lights, else 0
         logs = [np.log((given[m, :3] + given[m, 3:6]) / (rows[m, :3] + rows[m, 3:6])) for m in known.of(members)]
         brighter = {i: level(lights[i]) - level(one) + np.log(problem.blocks[i].unit) for i, one in own.items()}
         logs = logs or [by - by.mean() * own[i].scale_free for i, by in brighter.items()] or [np.zeros(3)]
@@ -147,17 +160,23 @@ def with_known(point: Point, problem: JointProblem) -> Point:
 
 
 def level(light: Light) -> Float[np.ndarray, "3"]:
-    """The logarithm of a light's mean radiance."""
+    """Return the logarithm of a light's mean radiance."""
     return np.log(np.maximum(light.energy.sum(0) / 2, LEAST_RADIANCE))  # `energy` is over 2π, a mean over 4π
 
 
 def from_earlier(earlier: Earlier, names: Sequence[str]) -> Start:
-    """The start of a problem whose materials are called `names`; lights of the earlier solution keep their cells."""
+    """Return the start from an earlier solution, for materials called `names`.
+
+    Lights of the earlier solution keep their cells.
+    """
     return lambda problem, cells: [start_of(known_point(problem, earlier, names, cells))]
 
 
 def with_decided(choices: Choices, earlier: Earlier) -> Choices:
-    """Return the choices with shadows and bounces as they were decided before, where the two had been compared."""
+    """Return the choices with shadows and interreflection as decided before.
+
+    A decision counts only if both alternatives had been compared.
+    """
     for name in ("self_shadowing", "interreflection"):
         if getattr(choices, name) == "auto" and getattr(earlier, name):
             choices = msgspec.structs.replace(choices, **{name: getattr(earlier, name)})
@@ -165,7 +184,7 @@ def with_decided(choices: Choices, earlier: Earlier) -> Choices:
 
 
 def starting_materials(blocks: Sequence[Block], count: int, roughness: float = ROUGHNESS) -> Materials:
-    """Materials whose diffuse part explains the median radiances and whose specular part is grey."""
+    """Return materials whose diffuse part explains the median radiances and whose specular part is grey."""
     albedo = mean_albedo(blocks, count)
     diffuse = np.maximum(albedo * (1 - SPECULAR_SHARE), 10 * LEAST_REFLECTANCE)
     specular = np.maximum(np.full((count, 3), SPECULAR_SHARE * BRIGHTEST_AT_START / 2), 10 * LEAST_REFLECTANCE)
@@ -173,11 +192,15 @@ def starting_materials(blocks: Sequence[Block], count: int, roughness: float = R
 
 
 def mean_albedo(blocks: Sequence[Block], count: int) -> Float[np.ndarray, "m 3"]:
-    """Relative reflectance per material and channel, the largest being `BRIGHTEST_AT_START`; materials that no block shows get the median."""
+    """Return the relative reflectance per material and channel; the largest is `BRIGHTEST_AT_START`.
+
+    Materials that no block shows get the median.
+    """
     rows = []
     right = []
     weight = []
     first = count
+    # one equation per photo and material: log median radiance = log reflectance + log light, weighted by √count
     for block in blocks:
         for k in range(len(block.photos)):
             for m in np.unique(block.material[block.photo == k]):
@@ -196,7 +219,10 @@ def mean_albedo(blocks: Sequence[Block], count: int) -> Float[np.ndarray, "m 3"]
 
 
 def constant_light(block: Block, materials: Materials, cells: int) -> Light:
-    """The constant light that explains the mean radiance of a block's first photo, and the exposures of the others beside it."""
+    """Return the constant light that explains the mean radiance of a block's first photo.
+
+    The exposures of the other photos explain their mean radiances.
+    """
     reflectance = np.maximum((materials.diffuse + materials.specular)[block.material], LEAST_REFLECTANCE)
     logs = np.log(np.maximum(block.radiance, LEAST_RADIANCE) / reflectance)
     shown = [k for k in range(len(block.photos)) if (block.photo == k).any()]
@@ -208,7 +234,10 @@ def constant_light(block: Block, materials: Materials, cells: int) -> Light:
 
 
 def own_cells(name: str, count: int) -> UnitLobes:
-    """Return `count` even cells, turned at random by the name of the illumination, so that what cells blur differs from light to light."""
+    """Return `count` even cells, rotated at random by the name of the illumination.
+
+    The blur of the cells therefore differs from light to light.
+    """
     cells = even_cells(count)
     seed = crc32(name.encode())
     turn = Rotation.random(rng=np.random.default_rng(seed)).as_matrix()
@@ -216,7 +245,10 @@ def own_cells(name: str, count: int) -> UnitLobes:
 
 
 def on_cells(fit: Fit, count: int, problem: JointProblem) -> Fit:
-    """Return a fit with its lights on `count` cells; what is known, and what had other cells than a trial's, keeps its own."""
+    """Return a fit with its lights on `count` cells.
+
+    Known lights, and lights with suns or with at least `count` cells, keep their own.
+    """
     lights = []
     for light, block in zip(fit.point.lights, problem.blocks, strict=True):
         if len(light) < count and not light.held.any() and not light.suns.any():
@@ -229,10 +261,16 @@ def on_cells(fit: Fit, count: int, problem: JointProblem) -> Fit:
 
 
 def known_point(problem: JointProblem, earlier: Earlier, names: Sequence[str], cells: int) -> Point:
-    """Build the point from which a solve starts that has an earlier solution.
+    """Return the point from which a solve with an earlier solution starts.
 
-    Each component of the earlier gauge comes to the scale of `mean_albedo` by the geometric mean, over its materials that a block shows, or over all
-    of them where none is shown.
+    Each component of the earlier gauge is brought to the scale of `mean_albedo` by a geometric mean.  The mean is over
+    its materials that a block shows, or over all of them if none is shown.
+
+    Args:
+        problem: Observations.
+        earlier: Earlier solution.
+        names: Names of the materials, by number.
+        cells: Number of cells of a new light.
     """
     blocks = problem.blocks
     component = [earlier.table.gauge.component.get(name) for name in names]
@@ -263,9 +301,16 @@ def known_point(problem: JointProblem, earlier: Earlier, names: Sequence[str], c
 
 
 def earlier_light(constant: Illumination, earlier: Earlier, factor: Float[np.ndarray, "3"], loss: Loss) -> Light:
-    """The earlier light of a block in the block's unit and the start's gauge; the constant one where there is none, or it explains the block worse.
+    """Return the earlier light of a block, in the block's unit and the start's gauge.
 
-    A photo that the earlier solution does not have gets its exposure in the constant light, beside those of the others.
+    The constant light is returned if there is no earlier one, or if that explains the block worse.  A photo that the
+    earlier solution lacks gets its exposure in the constant light, relative to the others.
+
+    Args:
+        constant: Block in its constant light.
+        earlier: Earlier solution.
+        factor: Factor on the reflectances of the earlier solution.
+        loss: Loss that compares both lights.
     """
     block = constant.block
     model = earlier.table.model
