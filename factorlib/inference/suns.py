@@ -9,12 +9,12 @@ window or a lamp.  Its direction z and its weight w ≥ 0 minimise
 
     Σ_i t_i² (r_i + A_i(z) w)²                                                                                       (1)
 
-channel by channel, with t² the weight of the robust loss and A the whitened response.  (1) is quadratic in w and is
-searched over a coarse and then finer grids of z.  Then cells are fitted anew around either lobe.  The sun is kept if
-its light explains the observations better than cells alone (`clearly_better`).  It is rejected if the observations are
-against it in comparison with the wide lobe (`AGAINST`), because natural light has suns.  Air scatters blue light from
-the sun into the sky, so no sun is bluer than the light as a whole.  All observations decide: a sun has five unknowns
-and replaces those of dozens of cells, so it cannot overfit.
+channel by channel, with t² the weight of the robust loss and A the whitened response.  The residual is linear in w; z
+is searched over grids, coarse and then fine.  Then cells are fitted anew around either lobe.  The sun is kept if its
+light explains the observations better than cells alone (`clearly_better`).  Natural light has suns, so the comparison
+with the wide lobe rejects one only if the evidence is clearly against it (`AGAINST`).  Air scatters blue light from the
+sun into the sky, so no sun is bluer than the light as a whole.  All observations decide: a sun has five unknowns and
+replaces those of dozens of cells, so it cannot overfit.
 """
 
 from __future__ import annotations

@@ -131,7 +131,7 @@ Tick = Callable[..., None]  # called at the end of each unit of work
 
 
 class Judged(msgspec.Struct, frozen=True):
-    """Scores of each photo with detail that was estimated without it.
+    """Scores of each photo, with detail that was estimated from other photos.
 
     Attributes:
         values: −2 log marginal likelihood of each photo.
@@ -199,7 +199,7 @@ class Trial(msgspec.Struct, frozen=True):
         """Score every photo by itself: on its own detail, in its own light, with the materials given.
 
         Args:
-            details: Detail for each photo, estimated without it.
+            details: Detail for each photo, estimated from other photos.
             tick: Called after each photo.
             plain: Scores without detail, used for a photo whose detail is zero; None to compute all.
         """
@@ -229,7 +229,7 @@ class Trial(msgspec.Struct, frozen=True):
         return Judged(np.array(values), Losses(*([of[i][0] for of in losses] for i in (0, 1))))
 
     def left_out(self, parts: list[Part], laplacian: csr_array, stiffness: Stiffness, tick: Tick) -> list[Detail]:
-        """Return a surface for every photo that is estimated without it.
+        """Return a surface for every photo, estimated from other photos.
 
         Photos are split into at most `FOLDS` folds, and each photo gets the surface of the other folds.
 
@@ -265,7 +265,7 @@ class Best(NamedTuple):
 
     Attributes:
         stiffness: Stiffness.
-        details: Detail for each photo, estimated without it.
+        details: Detail for each photo, estimated from other photos.
         judged: Scores of the photos.
         evidence: Decision on the detail.
     """
@@ -296,8 +296,8 @@ class Search(msgspec.Struct, frozen=True):
     def best(self, tried: Sequence[Stiffness], before: Judged, held_out: float, likelihood: float) -> Best:
         """Return the likeliest stiffness.
 
-        The search goes from stiff to soft.  It ends at a stiffness that is less likely than the previous one, or that
-        is clearly worse than no detail.
+        The search goes from stiff to soft.  It ends at a stiffness that is less likely than the previous one, or
+        with clear evidence against the detail.
 
         Args:
             tried: Stiffnesses, from stiff to soft.

@@ -8,10 +8,9 @@ Materials   Let S be the materials' information with all lights eliminated.  Let
                 S⁻¹ (Σ_k s_k s_kᵀ · K/(K − 1)) S⁻¹                                                                   (1)
 
             allows any dependence within a cluster (Liang and Zeger 1986).  It is computed for two kinds of clusters.
-            One
-            is the light toward nearby mirror directions, a region whose bias all materials there share.  The other is a
-            whole light, because an error everywhere in it is visible only in comparison with other lights.  The largest
-            of the three variances is used, unknown by unknown.
+            One is the light toward nearby mirror directions, a region whose bias all materials there share.  The other
+            is a whole light, because an error everywhere in it is visible only in comparison with other lights.  The
+            largest of the three variances is used, unknown by unknown.
 
 Gauge       The data leave one factor per channel and component free, so an error is defined only once that factor is
             fixed.  Here the sum of diffuse and specular reflectance over a component's materials is fixed in each
