@@ -161,9 +161,11 @@ def light_of_ball(seen: Observations, specular: Float[np.ndarray, "3"], rotation
     mirror = mirror_directions(seen.normal.astype(float), seen.view.astype(float))
     weight = seen.weight / np.maximum(1.0 if seen.confidence is None else seen.confidence, LEAST)
     usable = ~seen.clipped.any(1)
+    # keep pixels whose mirrored direction is not hidden by another object
     if seen.visibility is not None:
         nearest = np.argmax(mirror @ fibonacci_sphere(seen.visibility.shape[1]).T, axis=1)
         usable &= seen.visibility[np.arange(len(seen)), nearest] == 255
+    # equal-area projection: solid angle in proportion to pixels
     angle = 4 * np.pi * weight / weight.sum()
     return known_light(mirror[usable] @ rotation.T, seen.radiance[usable] / specular, angle[usable])
 

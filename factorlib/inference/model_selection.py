@@ -28,7 +28,7 @@ from factorlib.inference.options import Choices
 from factorlib.inference.problem import JointProblem
 from factorlib.results.materials import Decision
 
-# Size of a light in comparisons of models.
+# Observations and cells of a light in comparisons of models.
 TRIAL_OBSERVATIONS = 1000
 TRIAL_CELLS = 180
 TRIAL = Schedule(lights=3, together=(6, 4))

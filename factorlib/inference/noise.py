@@ -15,7 +15,7 @@ class Noise(msgspec.Struct, frozen=True):
 
     Attributes:
         absolute: σ in the dark.
-        relative: σ per radiance.
+        relative: Part of σ that is proportional to radiance, per radiance.
         most_weight: Limit of the number of independent observations that a merged one counts for.
     """
 
@@ -31,6 +31,7 @@ class Noise(msgspec.Struct, frozen=True):
         self, radiance: Float[np.ndarray, "n 3"], weight: Float[np.ndarray, " n"]
     ) -> Float[np.ndarray, "n 3"]:
         """Return √weight/σ of observations, with their weights limited."""
+        # smooth limit of the weight
         limited = weight / (1 + weight / self.most_weight)
         return np.sqrt(limited)[:, None] / self.sigma(radiance)
 

@@ -127,6 +127,7 @@ def _block(
     # radiance in units of the weighted mean
     unit = max(float(np.average(radiance.mean(1), weights=seen.weight)), 1e-30)
     scaled = radiance / unit
+    # whole cells of mirror directions are held out
     held_out = held_out_by_cells(mirror_cells(normal, view, HELD_OUT_CELL), seen.material, share, seed)
     visibility = directions = None
     if seen.visibility is not None and (seen.visibility < 255).any():

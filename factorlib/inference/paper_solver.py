@@ -141,6 +141,7 @@ def stepped(objective: Objective, x: Tensor, pairs: Pairs) -> tuple[Tensor, floa
         trial = x + length * direction
         trial_value, trial_gradient = objective(trial)
         if trial_value <= value + SUFFICIENT * length * slope:
+            # both gradients are of the same subset
             step = trial - x
             change = trial_gradient - gradient
             if float(step @ change) > 1e-8 * float(step.norm() * change.norm()):

@@ -211,6 +211,7 @@ def mean_albedo(blocks: Sequence[Block], count: int) -> Float[np.ndarray, "m 3"]
                 right.append(np.log(np.maximum(np.median(block.radiance[of], axis=0), LEAST_RADIANCE)))
                 weight.append(np.sqrt(of.sum()))
         first += len(block.photos)
+    # weighted least squares; the scale is fixed by the brightest material
     weighted = np.array(rows) * np.array(weight)[:, None]
     logs = np.linalg.lstsq(weighted, np.array(right) * np.array(weight)[:, None], rcond=None)[0][:count]
     seen = np.array(rows)[:, :count].any(0)
@@ -226,6 +227,7 @@ def constant_light(block: Block, materials: Materials, cells: int) -> Light:
     reflectance = np.maximum((materials.diffuse + materials.specular)[block.material], LEAST_REFLECTANCE)
     logs = np.log(np.maximum(block.radiance, LEAST_RADIANCE) / reflectance)
     shown = [k for k in range(len(block.photos)) if (block.photo == k).any()]
+    # log of each photo's mean radiance over reflectance
     levels = np.zeros((len(block.photos), 3))
     levels[shown] = [np.log(np.mean(np.exp(logs[block.photo == k]), axis=0)) for k in shown]
     lobes = own_cells(block.name, cells)
@@ -320,6 +322,7 @@ def earlier_light(constant: Illumination, earlier: Earlier, factor: Float[np.nda
     new = np.isnan(exposure)
     if not lobes or new.all():
         return constant.light
+    # a new photo has its exposure in the constant light, relative to the known photos
     exposure = np.where(new, before + np.mean(exposure[~new] - before[~new]), exposure)
     tone = [model.tone[photo].exponent for photo in block.photos if photo in model.tone]
     light = Light(

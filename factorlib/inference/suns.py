@@ -102,6 +102,7 @@ def candidate(illumination: Illumination, sharpness: float) -> Light:
     ring = (away >= DISC) & (away < SURROUNDINGS)
     if not ring.any():
         return light
+    # replace the brightest cells by the median of the ring
     u[:, away < DISC] = np.median(u[:, ring], axis=1)[:, None]
     without = msgspec.structs.replace(illumination, light=light.with_log_radiance(u))
     residual = without.residuals()

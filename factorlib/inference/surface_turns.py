@@ -235,6 +235,7 @@ def _by_normal(illumination: Illumination) -> Float[np.ndarray, "n 3 3"]:
     block = illumination.block
     normal = block.normal
     before = illumination.residuals()
+    # two tangents, and finite differences of the residuals along each
     first = np.cross(normal, np.eye(3)[np.abs(normal).argmin(1)])
     first /= np.linalg.norm(first, axis=1, keepdims=True)
     result = np.zeros((len(block), 3, 3))
@@ -277,6 +278,7 @@ def step(
     v = len(at.log_factor)
     both = np.concatenate([at.turn.reshape(-1), at.log_factor])
     roughness = csr_array(laplacian + PULL * eye_array(v))
+    # a L + b 1 for turns (three axes) and log factors, (2)
     prior = block_diag([kron((stiffness.turn or 0) * roughness, np.eye(3)), (stiffness.factor or 0) * roughness])
     turning = np.repeat(np.ones(v, bool) if moving is None else moving, 3) & (stiffness.turn is not None)
     free = np.append(turning, np.full(v, stiffness.factor is not None))

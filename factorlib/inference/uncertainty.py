@@ -240,6 +240,7 @@ def sandwich(inverse: Float[np.ndarray, "k k"], scores: Float[np.ndarray, "g k"]
     count = len(scores)
     if count < 2:
         return np.zeros_like(inverse)
+    # S⁻¹ (Σ_k s_k s_kᵀ · K/(K − 1)) S⁻¹, (1), times the squared t quantile of one standard deviation
     few = float(student_t.ppf(norm.cdf(1), count - 1))
     return few**2 * inverse @ (scores.T @ scores) @ inverse * count / (count - 1)
 
