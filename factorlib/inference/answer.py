@@ -1,4 +1,7 @@
-"""A solution as it is written: materials with standard errors, lights and exposures in scene radiance, and what was decided."""
+"""Solution in the form that is written to files: materials with standard errors, lights, exposures and model choices.
+
+Lights and exposures are in scene radiance.
+"""
 
 from __future__ import annotations
 
@@ -32,12 +35,16 @@ LOBES_CHOSEN_BY = {
 
 
 class Answer(msgspec.Struct, frozen=True, dict=True):
-    """A solution of a problem, and where it came from.
+    """Solution of a problem, and where it came from.
 
-    names:    of the materials, in the order of their numbers
-    errors:   of the materials
-    relative: exposure of each photo by EXIF, which the problem's radiances were divided by
-    earlier:  the solution that it started from
+    Attributes:
+        names: Names of the materials, in the order of their numbers.
+        problem: Problem that was solved.
+        solution: Result of the solver.
+        errors: Standard errors of the materials.
+        relative: Exposure of each photo by EXIF; the problem's radiances were divided by it.
+        solver: Name of the solver.
+        earlier: Solution that the solve started from.
     """
 
     names: list[str]
@@ -50,12 +57,14 @@ class Answer(msgspec.Struct, frozen=True, dict=True):
 
     @cached_property
     def radiance(self) -> list[Float[np.ndarray, "n 3"]]:
-        """Return what all observations should show, block by block, in the block's unit."""
+        """Predicted radiance of all observations, block by block, in the block's unit."""
         return self.solution.shown(self.problem).radiance(self.solution.point)
 
     def material_table(self) -> table.MaterialTable:
-        """The content of materials.json."""
-        rows, stderr, kinds = _rows(self.solution.point.materials), self._errors(), self._kinds()
+        """Return the content of materials.json."""
+        rows = _rows(self.solution.point.materials)
+        stderr = self._errors()
+        kinds = self._kinds()
         solved = {
             name: table.solved(table.Reflectance(*row), stderr[name], kind, self._given(m))
             for m, (name, row, kind) in enumerate(zip(self.names, rows, kinds, strict=True))
@@ -67,17 +76,21 @@ class Answer(msgspec.Struct, frozen=True, dict=True):
         return table.MaterialTable(solved, gauge, self.model())
 
     def _kinds(self) -> list[table.Kind | UnsetType]:
-        """Return the likeliest class of each material, in the gauge of the fit; none where the solver has no classes."""
+        """Return the likeliest class of each material, in the gauge of the fit.
+
+        The class is UNSET where the solver has no classes.
+        """
         if self.solver == "paper":
             return [UNSET] * len(self.names)
-        materials, errors = self.solution.point.materials, self.errors.materials
+        materials = self.solution.point.materials
+        errors = self.errors.materials
         relative = errors.specular.mean(1) / np.maximum(materials.specular.mean(1), LEAST_REFLECTANCE)
         specular = self.solution.materials.point.materials.specular
         rows = zip(specular, materials.roughness.tolist(), relative.tolist(), errors.roughness.tolist(), strict=True)
         return [table.Kind(*class_of(*row)) for row in rows]
 
     def _given_rule(self) -> str:
-        """Say what is known of scale and white balance, as a sentence; empty where nothing is."""
+        """Return a sentence that names what fixes scale and white balance; empty if nothing is known beforehand."""
         known = self.problem.known
         fixed = [self.names[m] for m in sorted(known.materials)]
         fixed += sorted(name for name, light in known.lights.items() if not light.scale_free)
@@ -86,12 +99,13 @@ class Answer(msgspec.Struct, frozen=True, dict=True):
         return "".join(rule.format(", ".join(names)) for rule, names in pairs if names)
 
     def _given(self, m: int) -> list[str] | UnsetType:
-        """The parts of a material that were known; UNSET where none was."""
+        """Return the parts of a material that were known beforehand; UNSET for a material without any."""
         values = self.problem.known.materials.get(m)
         parts = zip(("diffuse", "specular", "roughness"), (0, 3, 6), strict=True)
         return UNSET if values is None else [part for part, first in parts if not np.isnan(values[first])]
 
     def _gauge_of_errors(self) -> str:
+        """Return the sentence that states the gauge of the standard errors."""
         return (
             GAUGE
             + ABSOLUTE * self.solution.interreflection.kept
@@ -99,16 +113,17 @@ class Answer(msgspec.Struct, frozen=True, dict=True):
         )
 
     def uncertainty(self) -> Uncertainty:
-        """The content of uncertainty.json."""
+        """Return the content of uncertainty.json."""
         unexplained = misfit(self.problem, self.radiance)
         return Uncertainty(self.errors.deviation, self._errors(), self._gauge_of_errors(), *unexplained)
 
     def _errors(self) -> dict[str, table.StandardErrors]:
+        """Return the standard errors by material name."""
         rows = zip(self.names, _rows(self.errors.materials), strict=True)
         return {name: table.StandardErrors(*row) for name, row in rows}
 
     def lit(self) -> list[tuple[Block, Light]]:
-        """Each illumination with its light."""
+        """Return each illumination with its light."""
         return list(zip(self.problem.blocks, self.solution.point.lights, strict=True))
 
     def lights(self) -> dict[str, Lobes]:
@@ -116,17 +131,19 @@ class Answer(msgspec.Struct, frozen=True, dict=True):
         return {block.name: light.lobes.scaled(block.unit) for block, light in self.lit()}
 
     def exposures(self) -> dict[str, table.Channels]:
-        """Factor of each photo on its light, per channel."""
+        """Return each photo's factor on its light, per channel."""
         return {photo: (factor * self.relative[photo],) * 3 for photo, factor in self.found_exposures().items()}
 
     def found_exposures(self) -> dict[str, float]:
-        """Factor of each photo beside what its EXIF says."""
+        """Return each photo's factor on its light, relative to its EXIF exposure."""
         pairs = (pair for b, light in self.lit() for pair in zip(b.photos, light.log_exposure, strict=True))
         return {photo: float(np.exp(log_exposure)) for photo, log_exposure in pairs}
 
     def model(self) -> table.Model:
-        """What was decided of the model, and by what; the pivots of tone curves in scene radiance."""
-        names, solution, lit = self.names, self.solution, self.lit()
+        """Return the model choices and their evidence; the pivots of tone curves are in scene radiance."""
+        names = self.names
+        solution = self.solution
+        lit = self.lit()
         started: table.Started | UnsetType = UNSET
         lights = [block.name for block, _ in lit]
         if self.earlier is not None:
@@ -157,10 +174,10 @@ class Answer(msgspec.Struct, frozen=True, dict=True):
 
 
 def _rows(materials: Materials) -> list[tuple[table.Channels, table.Channels, float]]:
-    """Diffuse, specular and roughness of each."""
+    """Return diffuse, specular and roughness of each material."""
     return [((a, b, c), (d, e, f), r) for a, b, c, d, e, f, r in materials.rows().tolist()]
 
 
 def _tried(decision: Decision) -> dict[str, float]:
-    """The held-out losses of the models that were tried, and the margin."""
+    """Return the held-out losses of the models that were compared, and the margin."""
     return {k: value for k, value in msgspec.structs.asdict(decision).items() if k != "kept" and value is not None}

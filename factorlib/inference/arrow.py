@@ -1,16 +1,17 @@
-"""Normal equations of arrow shape: each light is linked to the materials that it shows, and to no other light.
+"""Normal equations of arrow shape: each light is coupled to the materials it illuminates, and to no other light.
 
-With H = [[M, C_1 … C_k], [C_iᵀ, L_i]] (materials M, one block L_i a light) and gradients g_m, g_i, eliminating every light leaves
+H = [[M, C_1 … C_k], [C_iᵀ, L_i]] has materials M and one block L_i a light; the gradients are g_m and g_i.  Eliminating
+every light leaves
 
-    (M − Σ C_i L_i⁻¹ C_iᵀ) dm = −(g_m − Σ C_i L_i⁻¹ (g_i + d_i)),      dl_i = −L_i⁻¹ (g_i + C_iᵀ dm)                (1)
+    (M − Σ C_i L_i⁻¹ C_iᵀ) dm = −(g_m − Σ C_i L_i⁻¹ (g_i + d_i)),      dl_i = −L_i⁻¹ (g_i + C_iᵀ dm)               (1)
 
-where d_i is a gradient by the light that materials alone feel (`factorlib.inference.likelihood`).  The Schur complement on the left is the information
-that the data hold about the materials when the lights are unknown too.  A light's C has rows for the materials that it shows alone, so that cost
-grows with those few.
+d_i is a gradient with respect to the light that acts on the materials only (`factorlib.inference.likelihood`).  The
+Schur complement on the left is the information of the data about the materials with the lights unknown too.  C_i has
+rows only for the materials that light i illuminates, so the cost grows with those few.
 
-`Arrow` is H factorised: the metric in which the optimiser steps.  Unknowns that are known or at a bound have their rows and columns taken out.
-Damping multiplies the diagonal, so that a step does not depend on the units of an unknown.  `information` is the Schur complement alone, of which
-standard errors come.
+`Arrow` is H factorised, the metric of the optimiser's steps.  Rows and columns of known unknowns and of unknowns at a
+bound are removed.  Damping multiplies the diagonal, so that a step does not depend on the units of an unknown.
+`information` is the Schur complement alone, the source of the standard errors.
 """
 
 from __future__ import annotations
@@ -22,19 +23,31 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 from scipy.linalg import cho_factor, cho_solve
 
-FLOOR = 1e-9  # share of the largest diagonal entry that is added to all
+FLOOR = 1e-9  # share of the largest diagonal entry that is added to every diagonal entry
 Vector = Float[np.ndarray, " k"]
 Matrix = Float[np.ndarray, "k k"]
 
 
 class System(NamedTuple):
-    """One illumination's part of a value that is minimised, half its gradient and half its Gauss–Newton Hessian.
+    """Contribution of one illumination to the objective, half its gradient and half its Gauss–Newton Hessian.
 
-    value    of which `loss` is the sum of the robust losses
-    places   numbers of the k unknowns of the materials that the block shows, ascending;  the light has l unknowns
-    factor   lower Cholesky factor of light_hessian
-    determinant_by_materials, determinant_hessian, determinant_by_light   of log det H: by materials, and d of (1)
-    scores   the parts of the gradient by materials and light, one a cluster of observations, where clusters were asked for
+    The k unknowns of the materials are those the block shows; the light has l unknowns.
+
+    Attributes:
+        value: Contribution to the objective.
+        loss: Sum of the robust losses in `value`.
+        places: Indices of the block's material unknowns, ascending.
+        material_gradient: g_m.
+        material_hessian: M.
+        light_gradient: g_i.
+        cross_hessian: C_i.
+        light_hessian: L_i.
+        factor: Lower Cholesky factor of L_i.
+        determinant_by_materials: Half the gradient of log det H with respect to materials.
+        determinant_hessian: Half its Hessian with respect to materials.
+        determinant_by_light: d_i of (1).
+        scores: Contributions to the gradient, materials then light, one row a cluster of observations; None if not
+            requested.
     """
 
     value: float
@@ -53,14 +66,20 @@ class System(NamedTuple):
 
 
 class Arrow:
-    """H of many lights factorised, so that H⁻¹ of any vector costs two triangular solves a light.
+    """Factorised H of many lights; H⁻¹ of a vector costs two triangular solves a light.
 
-    prior, free: Hessian of the prior on materials, and which of their unknowns may move;  damping: of the materials' diagonal
+    Args:
+        systems: Contribution of each light.
+        prior: Half the Hessian of the prior on materials.
+        free: Mask of the material unknowns that may move.
+        damping: Multiple of the materials' diagonal that is added to it.
     """
 
     def __init__(self, systems: Sequence[System], prior: Matrix, free: Bool[np.ndarray, " k"], damping: float = 0.0):
-        self.systems, self.free = systems, np.flatnonzero(free)
+        self.systems = systems
+        self.free = np.flatnonzero(free)
         self.coupling = [solved(part.factor, part.cross_hessian.T) for part in systems]  # L⁻¹Cᵀ
+        # M − Σ C_i L_i⁻¹ C_iᵀ, (1), damped
         schur = prior.copy()
         for part, coupling in zip(systems, self.coupling, strict=True):
             schur[np.ix_(part.places, part.places)] += part.material_hessian - part.cross_hessian @ coupling
@@ -69,6 +88,7 @@ class Arrow:
         self.schur = cho_factor(((schur + schur.T) / 2)[np.ix_(self.free, self.free)], check_finite=False)
 
     def _material_diagonal(self, size: int) -> Vector:
+        """Return the diagonal of the sum of the lights' material Hessians."""
         diagonal = np.zeros(size)
         for part in self.systems:
             diagonal[part.places] += np.diag(part.material_hessian)
@@ -76,8 +96,10 @@ class Arrow:
 
     def solve(self, by_materials: Vector, by_lights: Sequence[Vector]) -> tuple[Vector, list[Vector]]:
         """Return H⁻¹ g, by (1)."""
+        # L_i⁻¹ g_i, then dm by the Schur complement, then L_i⁻¹ (g_i − C_iᵀ dm)
         alone = [solved(part.factor, g) for part, g in zip(self.systems, by_lights, strict=True)]
-        reduced, step = by_materials.copy(), np.zeros_like(by_materials)
+        reduced = by_materials.copy()
+        step = np.zeros_like(by_materials)
         for part, own in zip(self.systems, alone, strict=True):
             reduced[part.places] -= part.cross_hessian @ own
         step[self.free] = cho_solve(self.schur, reduced[self.free], check_finite=False)
@@ -91,14 +113,25 @@ def solved(factor: Float[np.ndarray, "l l"], right: Float[np.ndarray, "l ..."]) 
 
 
 def information(systems: Sequence[System], size: int) -> tuple[Matrix, list[Float[np.ndarray, "g k"]]]:
-    """Return the left side of (1) for `size` unknowns of materials, and the scores of each light's clusters, where there are
-    any, less what the light takes up of them."""
-    hessian, scores = np.zeros((size, size)), []
+    """Return the Schur complement of (1), and the scores of clusters with the lights eliminated.
+
+    Args:
+        systems: Contribution of each light.
+        size: Number of material unknowns.
+
+    Returns:
+        The left side of (1) [size, size], and for each light with scores their values [g, size] less the part that the
+        light absorbs.
+    """
+    hessian = np.zeros((size, size))
+    scores = []
     for part in systems:
         coupling = solved(part.factor, part.cross_hessian.T)
+        # Σ M − C_i L_i⁻¹ C_iᵀ
         hessian[np.ix_(part.places, part.places)] += part.material_hessian - part.cross_hessian @ coupling
         if part.scores is not None:
             k = len(part.places)
             scores.append(np.zeros((len(part.scores), size)))
+            # s_m − s_l L_i⁻¹ C_iᵀ
             scores[-1][:, part.places] = part.scores[:, :k] - part.scores[:, k:] @ coupling
     return (hessian + hessian.T) / 2, scores

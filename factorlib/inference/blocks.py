@@ -11,26 +11,36 @@ from factorlib.inference.noise import Noise
 
 PER_OBSERVATION = (
     *("normal", "view", "radiance", "clipped", "precision", "material", "photo", "held_out"),
-    *("visibility", "bounced", "confidence", "place", "row", "detail"),  # where the block has them
+    *("visibility", "bounced", "confidence", "place", "row", "detail"),  # optional columns
 )
-CLUSTER = 0.35  # size of a cluster's cell of mirror directions: 20°
+CLUSTER = 0.35  # side of a cluster's cell of mirror directions: 20°
 
 
 class Block(msgspec.Struct, frozen=True):
     """The n observations under one illumination, sorted by material.
 
-    unit        the block's mean radiance; `radiance` is divided by it
-    precision   1/σ of the noise model times the root of the observation's weight; 0 where a channel says nothing
-    held_out    observations that choose between models and are not fitted
-    visibility  how much of each of k directions an observation sees, 0 (nothing) to 255 (all); None: all see everything
-    directions  the k directions of `visibility`, in the block's frame, for each of the f photos
-    noise       of which `precision` is the reciprocal
-    confidence  how sure normals are, 0 to 1; None: all are as sure
-    row         the observation's number among all usable ones
-    detail      factor on the diffuse reflectance of each observation's material; None: 1
-    place       x of `factorlib.light.distance`, in the block's frame; None: all lie in the middle
-    bounced     what hidden directions send, by the cosine (RGB) and by a highlight (RGB): G_d and G_s of `factorlib.inference.interreflection`,
-                in the block's unit; None: nothing
+    Attributes:
+        name: Name of the illumination.
+        photos: Names of its f photos.
+        unit: Mean radiance of the block; `radiance` is divided by it.
+        normal: Unit normals, in the illumination's frame.
+        view: Unit vectors toward the camera, in the illumination's frame.
+        radiance: Observed linear radiance, in `unit`.
+        clipped: Mask of the channels whose radiance is a lower bound.
+        precision: 1/σ of the noise model times the root of the observation's weight; 0 for a channel without
+            information.
+        material: Number of each observation's material.
+        photo: Number of each observation's photo in `photos`.
+        held_out: Mask of the observations that select models and are not fitted.
+        visibility: Visible share of each of k directions, 0 (hidden) to 255 (visible); None if nothing is hidden.
+        directions: The k directions of `visibility`, in the block's frame, for each of the f photos.
+        bounced: Radiance that hidden directions send, weighted by the cosine (RGB) and by a highlight (RGB): G_d and
+            G_s of `factorlib.inference.interreflection`, in `unit`; None for no interreflection.
+        noise: Noise model; `precision` derives from its σ.
+        confidence: Confidence of the normals, 0 to 1; None if all are equally reliable.
+        place: x of `factorlib.light.distance`, in the block's frame; None if all points lie at the centre.
+        row: Index of the observation among all usable ones.
+        detail: Factor on the diffuse reflectance of each observation's material; None for 1.
     """
 
     name: str
@@ -57,20 +67,20 @@ class Block(msgspec.Struct, frozen=True):
         return len(self.material)
 
     def take(self, rows: np.ndarray | slice) -> Block:
-        """Return the observations `rows` (numbers or a mask) alone."""
+        """Return the observations `rows` (indices or a mask) alone."""
         values = ((name, getattr(self, name)) for name in PER_OBSERVATION)
         return msgspec.structs.replace(self, **{name: of[rows] for name, of in values if of is not None})
 
     def fitted(self) -> Block:
-        """The observations that are not held out."""
+        """Return the observations that are not held out."""
         return self.take(~self.held_out) if self.held_out.any() else self
 
     def with_none_held_out(self) -> Block:
-        """The same observations, all to be fitted."""
+        """Return the same observations, none held out."""
         return msgspec.structs.replace(self, held_out=np.zeros(len(self), bool))
 
     def sampled(self, count: int, seed: int) -> Block:
-        """Return at most `count` fitted and `count`/3 held-out observations, drawn at random, order kept."""
+        """Return at most `count` fitted and `count`/3 held-out observations, drawn at random, in their order."""
         random = np.random.default_rng(seed)
         kept = [
             random.permutation(rows)[:most]
@@ -79,26 +89,39 @@ class Block(msgspec.Struct, frozen=True):
         return self.take(np.sort(np.concatenate(kept)))
 
     def with_effects(self, shadows: bool, bounces: bool) -> Block:
-        """The same observations, as if nothing hid anything, or as if what hides the light were black."""
-        visibility, bounced = self.visibility if shadows else None, self.bounced if shadows and bounces else None
+        """Return the same observations with shadows or interreflection switched off where the argument is False.
+
+        Interreflection needs shadows.
+        """
+        visibility = self.visibility if shadows else None
+        bounced = self.bounced if shadows and bounces else None
         return msgspec.structs.replace(self, visibility=visibility, bounced=bounced)
 
     def with_noise(self, noise: Noise) -> Block:
-        """The same observations, which are expected to be off by as much as another noise model says."""
+        """Return the same observations under another noise model."""
         return msgspec.structs.replace(
             self, precision=self.precision * self.noise.sigma(self.radiance) / noise.sigma(self.radiance), noise=noise
         )
 
     def on_surface(self, normal: Float[np.ndarray, "n 3"], detail: Float[np.ndarray, " n"]) -> Block:
-        """The same observations of a surface with other normals and with that detail of reflectance, of which the block has none."""
+        """Return the same observations with other normals and with that detail of reflectance.
+
+        The block must have no detail yet.
+        """
         bounced = None if self.bounced is None else self.bounced * np.where(np.arange(6) < 3, detail[:, None], 1.0)
         return msgspec.structs.replace(self, normal=normal, detail=detail, bounced=bounced)
 
     def residuals(self, radiance: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
-        """Return by how much `radiance`, in the block's unit, is too bright, in σ.  A clipped pixel says "at least": only too dark counts."""
+        """Return the whitened residuals of a predicted `radiance`, which is in the block's unit.
+
+        A clipped channel is a lower bound: it has a residual only where the prediction is too dark.
+        """
         difference = (radiance - self.radiance) * self.precision
         return np.where(self.clipped, np.minimum(difference, 0.0), difference)
 
     def clusters(self) -> Int[np.ndarray, " n"]:
-        """The number, from 0, of each observation's cluster: those that mirror one region of the light, whose residuals err alike."""
+        """Return the number, from 0, of each observation's cluster.
+
+        The observations of a cluster mirror one region of the light, so that their residuals are correlated.
+        """
         return np.unique(mirror_cells(self.normal, self.view, CLUSTER), return_inverse=True)[1].reshape(-1)

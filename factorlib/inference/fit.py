@@ -1,19 +1,22 @@
-"""Materials and lights fitted together, by marginal likelihood, and how much each light's observations and prior count.
+"""Joint fit of materials and lights by marginal likelihood, with the weights of each light's observations and prior.
 
-If residuals were independent, the sum of them over a cluster of n would have a variance of n σ².  It is larger, for residuals are alike (the
-design effect of L. Kish, Survey Sampling, 1965), and larger than the noise model says.  The factor is the temperature T, by which squared
-residuals are divided:
+For independent residuals, the sum of n of them in a cluster has the variance n σ².  The actual variance is larger,
+because residuals are correlated (design effect, L. Kish, Survey Sampling, 1965) and exceed the noise model.  The ratio
+is the temperature T, which divides squared residuals:
 
-    T = Σ_k (Σ_{i in k} r_i)² / Σ_k n_k, at least `least`     k: clusters of nearby mirror directions;  r: in σ, clipped at 3   (1)
+    T = Σ_k (Σ_{i in k} r_i)² / Σ_k n_k, at least `least`                                                           (1)
 
-`least` is 1 while materials are fitted: cells are always a little too coarse, and were T below 1, materials would absorb that error.  Given the materials, lights may be as exact as the residuals are.
+The clusters k hold nearby mirror directions; r is in σ and clipped at 3.  `least` is 1 while materials are fitted:
+cells are always a little too coarse, and with T below 1 the materials would
+absorb that error.  Given the materials, lights may fit as closely as the residuals allow.
 
-Every light has its own, so that a photo whose mesh fits badly counts less; it is estimated anew before each descent.  So are the factors by
-which the light's contrast and colour differ from those of a typical light (equation (4) of `factorlib.light.prior`).
+Every light has its own T, so that a photo with a badly fitting mesh counts less.  T is estimated anew before each
+descent.  So are the factors that scale the light's contrast and colour relative to a typical light (equation (4) of
+`factorlib.light.prior`).
 
-Materials are fitted to the observations whose normals are sure (`sure_ones`), for a highlight at a wrong normal says that the material is
-rougher than it is, however little it weighs.  Lights are fitted once more to all observations, given those materials: rims and thin parts
-show directions that nothing else shows.
+Materials are fitted to the observations with reliable normals (`sure_ones`).  A highlight at a wrong normal makes the
+material look rougher than it is, however little it weighs.  Given those materials, lights are fitted once more to all
+observations: rims and thin parts show directions that nothing else shows.
 """
 
 from __future__ import annotations
@@ -35,20 +38,22 @@ from factorlib.inference.problem import JointProblem
 from factorlib.inference.responses import Tables
 from factorlib.light.prior import LightPrior
 
-SURE = 0.6  # times the typical confidence of a material's normals: what is less sure is left out
-DARK = 0.2  # of the noise model's absolute part is left where normals are sure
+SURE = 0.6  # least confidence of a normal, as a share of its material's median
+DARK = 0.2  # factor on the noise model's absolute part where normals are reliable
 ROBUST = Loss(3.0)  # beyond 3 σ of the noise model a residual is an outlier
 START_TEMPERATURE = 10.0
-SUNS = 1.0  # standard deviation of a sun's log radiance: outdoors, captured lights send a third to twice as much by it as by the sky
-# Of reflectances: by its logarithm the derivative of a smaller one is nearly zero, and no step would move it.
+# Standard deviation of a sun's log radiance: in lights captured outdoors its energy is a third to twice the sky's.
+SUNS = 1.0
+# Least reflectance at the start.  The derivative with respect to the logarithm of a smaller one is nearly zero.
 LEAST_AT_START = 0.01
 
 
 class Hyperparameters(msgspec.Struct, frozen=True):
-    """How much one light's observations and prior count.
+    """Weights of one light's observations and prior.
 
-    temperature   T of (1), by which squared residuals are divided
-    factors       s_k² of the prior: contrast of luminance and of colour beside those of a typical light
+    Attributes:
+        temperature: T of (1), which divides squared residuals.
+        factors: s_k² of the prior: contrast of luminance and of colour relative to a typical light.
     """
 
     temperature: float = START_TEMPERATURE
@@ -56,7 +61,7 @@ class Hyperparameters(msgspec.Struct, frozen=True):
 
 
 class Fit(msgspec.Struct, frozen=True):
-    """A point, how much each light's observations and prior count there, and minus twice the log marginal likelihood."""
+    """Point, the hyperparameters of each light there, and minus twice the log marginal likelihood."""
 
     point: Point
     hyperparameters: list[Hyperparameters]
@@ -68,13 +73,16 @@ class Fit(msgspec.Struct, frozen=True):
 
 
 class Schedule(msgspec.Struct, frozen=True):
-    """How many steps a fit takes.
+    """Number of steps of a fit.
 
-    lights     of the lights alone, materials given, before all else
-    together   of lights and, unless they are given, materials; hyperparameters are estimated anew before each of these descents but the first
-    estimate   whether they are estimated before the first one too: right after a splitting, residuals show the splitting, not the noise
-    least      the least temperature of (1)
-    given      whether materials stay as they are
+    Attributes:
+        lights: Steps of the lights alone, materials given, before the others.
+        together: Steps of each descent of lights and, unless they are given, materials; hyperparameters are estimated
+            anew before each descent but the first.
+        estimate: True to estimate them before the first descent too; right after a splitting, residuals reflect the
+            splitting and not the noise.
+        least: Least temperature of (1).
+        given: True to keep the materials fixed.
     """
 
     lights: int = 0
@@ -85,7 +93,7 @@ class Schedule(msgspec.Struct, frozen=True):
 
     @property
     def points(self) -> int:
-        """The largest number of points that a fit tries."""
+        """Largest number of points that a fit evaluates."""
         return self.lights + 1 + sum(iterations + 1 for iterations in self.together)
 
 
@@ -96,11 +104,21 @@ def fitted(
     schedule: Schedule,
     report: Report = lambda loss: None,
 ) -> Fit:
-    """The fit of the observations that are not held out.
+    """Fit materials and lights to the observations that are not held out.
 
-    start: where the descent begins; its cells stay;  report: called at every point that is tried, with the mean robust loss of what is fitted
+    Args:
+        problem: Observations and model.
+        start: Initial point and hyperparameters; the cells of its lights stay.
+        prior: Prior on lights.
+        schedule: Number of steps.
+        report: Called at every point that is evaluated, with the mean robust loss of the fitted observations.
+
+    Returns:
+        The fit, with the value of its objective.
     """
-    problem, given, hyperparameters = problem.fitted(), schedule.given, start.hyperparameters
+    problem = problem.fitted()
+    given = schedule.given
+    hyperparameters = start.hyperparameters
     materials = start.point.materials if given else problem.known.put(above_zero(start.point.materials))
     prior_on_materials = MaterialPrior(materials, problem.blocks, problem.known)
     descent = Descent(prior_on_materials, problem.spread, report, problem.known.free(len(materials)))
@@ -108,7 +126,7 @@ def fitted(
     pairs = list(zip(illuminations, hyperparameters, strict=True))
 
     def likelihood(pair: tuple[Illumination, Hyperparameters]) -> LightLikelihood:
-        """Return the likelihood of one light, with a table."""
+        """Return the likelihood of one light, with a table of responses."""
         return likelihood_of(*pair, prior, given, problem.tables)
 
     likelihoods = list(problem.spread(likelihood, pairs))
@@ -134,7 +152,15 @@ def likelihood_of(
     materials_given: bool = False,
     tables: Tables | None = None,
 ) -> LightLikelihood:
-    """Give an illumination its table of responses, and say how much its observations and the prior count."""
+    """Return the likelihood of one light, with its table of responses and the given hyperparameters.
+
+    Args:
+        illumination: Observations, light and materials.
+        one: Hyperparameters.
+        prior: Prior on lights.
+        materials_given: True if the materials do not change.
+        tables: Cache of response tables; None for a new one.
+    """
     given = illumination.materials.roughness if materials_given else None
     of = illumination.block, illumination.light.unit_lobes, illumination.operator
     table = (tables or Tables()).of(*of, given)
@@ -143,14 +169,16 @@ def likelihood_of(
 
 
 def recounted(likelihood: LightLikelihood, one: Hyperparameters) -> LightLikelihood:
-    """Return the likelihood as other hyperparameters weight it."""
+    """Return the likelihood with other hyperparameters."""
     light = likelihood.light
+    # Q of the cells, under the scale factors s_k²
     Q, log_determinant = likelihood.prior.precision(light.axis[~light.suns], one.factors)
-    if light.suns.any():  # of which the prior on cells knows nothing
-        own, cells = np.tile(light.suns, 3), Q
+    if light.suns.any():  # the prior on cells does not cover suns: each has an independent Gaussian
+        own = np.tile(light.suns, 3)
+        cells = Q
         Q = np.diag(np.where(own, SUNS**-2.0, 0.0))
         Q[np.ix_(~own, ~own)] = cells
-    if light.held.any():  # the precision of the others, given these, is their part of Q
+    if light.held.any():  # Q of the free cells given the held ones is their block of Q
         free = np.tile(light.free, 3)
         log_determinant = float(np.linalg.slogdet(Q[np.ix_(free, free)])[1])
     counts = {"precision": Q, "log_determinant": log_determinant, "temperature": one.temperature}
@@ -158,9 +186,16 @@ def recounted(likelihood: LightLikelihood, one: Hyperparameters) -> LightLikelih
 
 
 def estimated(likelihood: LightLikelihood, system: System, least: float) -> Hyperparameters:
-    """The hyperparameters by the residuals and the light that a descent ended with; system: there."""
+    """Return the hyperparameters estimated from the residuals and the light at the end of a descent.
+
+    Args:
+        likelihood: Likelihood at that point.
+        system: Normal equations at that point.
+        least: Least temperature.
+    """
     light = likelihood.light
     cells, free = (np.flatnonzero(np.tile(which, 3)) for which in (~light.suns, light.free))
+    # covariance of u: H⁻¹ of the free cells, 0 of the held ones, without suns
     covariance = np.zeros((3 * len(light), 3 * len(light)))
     covariance[np.ix_(free, free)] = inverse_of(system.factor[: len(free), : len(free)])
     covariance = covariance[np.ix_(cells, cells)]
@@ -172,27 +207,31 @@ def estimated(likelihood: LightLikelihood, system: System, least: float) -> Hype
 
 
 def temperature(block: Block, residual: Float[np.ndarray, "n 3"], least: float = 1.0) -> float:
-    """T of (1)."""
-    number, bounded = block.clusters(), residual.clip(-ROBUST.robust_scale, ROBUST.robust_scale)
+    """Return T of (1) from whitened residuals."""
+    number = block.clusters()
+    bounded = residual.clip(-ROBUST.robust_scale, ROBUST.robust_scale)
     sums = [np.bincount(number, channel) for channel in bounded.T]
     return max(float(np.square(sums).sum()) / max(residual.size, 1), least)
 
 
 def above_zero(materials: Materials) -> Materials:
-    """The materials, reflectances raised to at least `LEAST_AT_START`."""
+    """Return the materials with reflectances raised to at least `LEAST_AT_START`."""
     rows = materials.rows()
     rows[:, :6] = np.maximum(rows[:, :6], LEAST_AT_START)
     return Materials.of_rows(rows)
 
 
 def sure_ones(problem: JointProblem) -> JointProblem:
-    """The observations that materials are fitted to: those whose normals are sure, with less noise in the dark."""
+    """Return the observations that materials are fitted to: reliable normals, with less noise in the dark."""
     noises = [msgspec.structs.replace(block.noise, absolute=DARK * block.noise.absolute) for block in problem.blocks]
     return problem.of([b.take(sure(b)).with_noise(noise) for b, noise in zip(problem.blocks, noises, strict=True)])
 
 
 def sure(block: Block) -> Bool[np.ndarray, " n"]:
-    """Whether each normal's confidence is at least `SURE` times the median of its material in this light, by weight."""
+    """Return a mask of the normals whose confidence is at least `SURE` times the weighted median of their material.
+
+    The median is taken over the material's observations in this light.
+    """
     result = np.ones(len(block), bool)
     if block.confidence is None:
         return result
@@ -205,5 +244,5 @@ def sure(block: Block) -> Bool[np.ndarray, " n"]:
 
 
 def start_of(point: Point) -> Fit:
-    """Return the fit that a point is before any descent."""
+    """Return the fit of a point before any descent."""
     return Fit(point, [Hyperparameters() for _ in point.lights])

@@ -1,15 +1,17 @@
-"""One illumination of the joint problem at a point: what its photos show, what the model says they should, and all derivatives.
+"""Forward model of one illumination: predicted radiance of its photos, residuals and all derivatives.
 
-    linear     ℓ_ic = k_d,c (e_i Σ_p D_ip w_pc + G_d,ic) + k_s,c (e_i Σ_p S_ip w_pc + G_s,ic),       w_p = peak_p exp(u_p)
+    linear     ℓ_ic = k_d,c (e_i Σ_p D_ip w_pc + G_d,ic) + k_s,c (e_i Σ_p S_ip w_pc + G_s,ic),   w_p = peak_p exp(u_p)
     predicted  y_ic = τ_i(ℓ_ic), τ the photo's tone curve
-    residual   r_ic = (y_ic − radiance_ic) / σ_ic; where the channel is clipped min(r_ic, 0), for the true radiance may be higher
+    residual   r_ic = (y_ic − radiance_ic) / σ_ic
 
-D and S are the responses of `factorlib.inference.responses`, e is the photo's exposure, G what other surfaces send
-(`factorlib.inference.interreflection`).  A new physical effect is added here once: radiance and derivatives are of one
-and the same sum.
+A clipped channel has the residual min(r_ic, 0), because its true radiance may be higher.  D and S are the responses of
+`factorlib.inference.responses`, e is the photo's exposure, and G is the radiance that other surfaces send
+(`factorlib.inference.interreflection`).  A new physical effect is added here once, because radiance and derivatives
+come from the same sum.
 
-Unknowns: log k_d, log k_s (RGB each) and roughness of a material; u of every cell and channel; log exposures and log tone exponents.  A
-channel's residuals depend on the cells of that channel alone, so the Jacobian is a dense block a channel.
+The unknowns are log k_d, log k_s (RGB each) and roughness of a material, u of every cell and channel, log exposures and
+log tone exponents.  A channel's residuals depend on the cells of that channel alone, so the Jacobian is one dense block
+a channel.
 """
 
 from __future__ import annotations
@@ -31,10 +33,15 @@ from factorlib.reflection.operator import Operator
 
 
 class Shown(NamedTuple):
-    """The model says that n observations should show this.
+    """Prediction of the model for n observations.
 
-    diffuse, specular   the factors of k_d and k_s in ℓ;  by_roughness  ∂specular/∂roughness;  radiance  y
-    responses           material, its rows, its responses; empty where the operator itself was asked
+    Attributes:
+        diffuse: Factor of k_d in ℓ.
+        specular: Factor of k_s in ℓ.
+        by_roughness: ∂specular/∂roughness; zeros without a table.
+        linear: ℓ.
+        radiance: y.
+        responses: Material, its rows and its responses; empty without a table.
     """
 
     diffuse: Float[np.ndarray, "n 3"]
@@ -46,12 +53,21 @@ class Shown(NamedTuple):
 
 
 class Linearised(NamedTuple):
-    """One channel of the observations of one material, whitened, weighted by the robust loss and divided by √T; float32.
+    """Linearisation of one channel of one material's observations, float32.
 
-    diffuse, specular   the two parts of ∂r/∂u of the channel's free cells;  by_roughness  ∂²r/∂u ∂roughness
-    by_material         ∂r by log k_d, log k_s and roughness, the unknowns `places` of the materials
-    by_photo            ∂r by the log exposures of all photos but the first, unless they are held, by the log tone exponents, and by the
-                        log of the factor on held cells, where it is free
+    Rows are whitened, weighted by the robust loss and divided by √T.
+
+    Attributes:
+        channel: Number of the channel.
+        rows: The n observations, as rows of the block.
+        places: Indices of log k_d, log k_s and roughness among the material unknowns.
+        diffuse: Diffuse part of ∂r/∂u of the channel's p free cells.
+        specular: Specular part of ∂r/∂u.
+        by_roughness: ∂²r/∂u ∂roughness.
+        by_material: ∂r with respect to log k_d, log k_s and roughness.
+        by_photo: ∂r with respect to the free log exposures, the log tone exponents and, where it is free, the log of
+            the factor on held cells.  The first photo's exposure is fixed.
+        residual: r.
     """
 
     channel: int
@@ -66,7 +82,7 @@ class Linearised(NamedTuple):
 
 
 class Gradient(NamedTuple):
-    """A value, and half its gradient by log k_d, log k_s and roughness of every material, and by the unknowns of a light."""
+    """Value, and half its gradient by the material unknowns of all m materials and by the unknowns of a light."""
 
     value: float
     by_materials: Float[np.ndarray, "m 7"]
@@ -74,9 +90,16 @@ class Gradient(NamedTuple):
 
 
 class Illumination(msgspec.Struct, frozen=True):
-    """The observations in one light, that light, the materials and the reflection operator; radiance is in the block's unit.
+    """Observations under one light, that light, the materials and the reflection operator.
 
-    table: the responses of this block to the lobes of this light; None: the operator itself is asked
+    Radiance is in the block's unit.
+
+    Attributes:
+        block: Observations.
+        light: Light.
+        materials: Materials.
+        operator: Reflection operator.
+        table: Responses of this block to the lobes of this light; None to evaluate the operator itself.
     """
 
     block: Block
@@ -87,18 +110,23 @@ class Illumination(msgspec.Struct, frozen=True):
 
     @property
     def exposure(self) -> Float[np.ndarray, "n 1"]:
-        """Return the exposure of each observation's photo: a factor on the light."""
+        """Exposure of each observation's photo, a factor on the light."""
         return np.exp(self.light.log_exposure)[self.block.photo][:, None]
 
     def fitted(self) -> Illumination:
-        """Return the illumination with the observations alone that are not held out."""
+        """Return the illumination without its held-out observations."""
         return msgspec.structs.replace(self, block=self.block.fitted())
 
     def shown(self) -> Shown:
-        """Radiance, and what it is made of."""
-        block, kd, ks, responses = self.block, self.materials.diffuse, self.materials.specular, []
+        """Return the predicted radiance and its components."""
+        block = self.block
+        kd = self.materials.diffuse
+        ks = self.materials.specular
+        responses = []
+        # D w, S w and (∂S/∂roughness) w, material by material
         diffuse, specular, by_roughness = np.zeros((3, len(block), 3))
-        weight, roughness = self.light.weight, self.materials.roughness.tolist()
+        weight = self.light.weight
+        roughness = self.materials.roughness.tolist()
         if self.table is None:
             lobes = self.light.unit_lobes
             for m, rows in material_slices(block):
@@ -106,38 +134,45 @@ class Illumination(msgspec.Struct, frozen=True):
                 specular[rows] = specular_response(block, rows, lobes, roughness[m], self.operator) @ weight
         else:
             for m in np.unique(block.material).tolist():
-                rows, of = self.table.rows(m), self.table.at(m, roughness[m])
+                rows = self.table.rows(m)
+                of = self.table.at(m, roughness[m])
                 diffuse[rows], specular[rows], by_roughness[rows] = of.radiance(weight)
                 responses.append((m, rows, of))
         diffuse, specular, by_roughness = (part * self.exposure for part in (diffuse, specular, by_roughness))
         if block.bounced is not None:
-            diffuse, specular = diffuse + block.bounced[:, :3], specular + block.bounced[:, 3:]
+            diffuse = diffuse + block.bounced[:, :3]
+            specular = specular + block.bounced[:, 3:]
+        # ℓ and y
         linear = kd[block.material] * diffuse + ks[block.material] * specular
         toned = self.light.toned(linear, block.photo)
         return Shown(diffuse, specular, by_roughness, linear, toned, responses)
 
     def radiance(self) -> Float[np.ndarray, "n 3"]:
-        """y: what every observation should show."""
+        """Return y, the predicted radiance of every observation."""
         return self.shown().radiance
 
     def residuals(self) -> Float[np.ndarray, "n 3"]:
-        """r, in σ of the noise model."""
+        """Return r, in σ of the noise model."""
         return self.block.residuals(self.radiance())
 
     def losses(self, loss: Loss) -> Float[np.ndarray, " n"]:
-        """Robust loss of every observation, mean over its channels."""
+        """Return the robust loss of every observation, averaged over its channels."""
         return loss.of_residuals(self.residuals()).mean(1)
 
     def atoms(self, rows: Int[np.ndarray, " n"], lobes: UnitLobes) -> Float[np.ndarray, "3 n q"]:
-        """What q further lobes of weight one would add to the whitened residuals at `rows`, per channel."""
-        block, materials, response = self.block, self.materials, np.empty((2, len(rows), len(lobes)))
+        """Return the whitened response at `rows` to q further lobes of weight one, per channel."""
+        block = self.block
+        materials = self.materials
+        response = np.empty((2, len(rows), len(lobes)))
         for m in np.unique(block.material[rows]).tolist():
             of = block.material[rows] == m
             response[0, of] = diffuse_response(block, rows[of], lobes, self.operator)
             response[1, of] = specular_response(block, rows[of], lobes, float(materials.roughness[m]), self.operator)
+        # A = (k_d D + k_s S) e τ'/σ, linearised at the observed radiance
         slope = self.light.slope_at(block.radiance[rows], block.photo[rows])
         scale = block.precision[rows] * slope * self.exposure[rows]
-        kd, ks = materials.diffuse[block.material[rows]], materials.specular[block.material[rows]]
+        kd = materials.diffuse[block.material[rows]]
+        ks = materials.specular[block.material[rows]]
         return np.stack(
             [scale[:, c, None] * (kd[:, c, None] * response[0] + ks[:, c, None] * response[1]) for c in range(3)]
         )
@@ -145,30 +180,40 @@ class Illumination(msgspec.Struct, frozen=True):
     def pull(
         self, residual: Float[np.ndarray, "n 3"], loss: Loss, temperature: float = 1.0
     ) -> Float[np.ndarray, "n 3"]:
-        """The root of how much each residual counts; 0 for one that is held out, and for a clipped one that is bright enough."""
+        """Return the root of each residual's weight in the robust loss divided by T.
+
+        It is 0 for held-out observations, and for clipped channels that are predicted bright enough.
+        """
         counts = ~self.block.held_out[:, None] & ~(self.block.clipped & (residual >= 0))
         return np.sqrt(counts * loss.trust(residual) / temperature)
 
     def gradient(self, loss: Loss, temperature: float) -> Gradient:
-        """Σ ρ(r)/T of the observations that are not held out, and half its gradient by all unknowns, without a Jacobian.
+        """Return Σ ρ(r)/T of the fitted observations and half its gradient, without a Jacobian.
 
-        It costs two products of the responses with three columns.
+        The cost is two products of the responses with three columns.
         """
-        block, light, materials, shown = self.block, self.light, self.materials, self.shown()
+        block = self.block
+        light = self.light
+        materials = self.materials
+        shown = self.shown()
         residual = block.residuals(shown.radiance)
         value = float(loss.of_residuals(residual)[~block.held_out].sum()) / temperature
-        # a = ½ ∂(Σ ρ/T)/∂ℓ;  what of ℓ grows with the light
+        # a = ½ ∂(Σ ρ/T)/∂ℓ; `lit` is the part of ℓ that is proportional to the light
         by_radiance = self.pull(residual, loss, temperature) ** 2 * residual * block.precision
         by_linear = by_radiance * light.slope_at(shown.radiance, block.photo)
         lit = shown.linear - self.bounced
-        by_materials, by_weight = np.zeros((len(materials), 7)), np.zeros((len(light), 3))
+        # Σ a ∂ℓ/∂(log k_d, log k_s, roughness), and Dᵀ a e k_d + Sᵀ a e k_s with respect to w
+        by_materials = np.zeros((len(materials), 7))
+        by_weight = np.zeros((len(light), 3))
         for m, rows, of in shown.responses:
-            kd, ks, a = materials.diffuse[m], materials.specular[m], by_linear[rows]
+            kd = materials.diffuse[m]
+            ks = materials.specular[m]
+            a = by_linear[rows]
             by_materials[m, :3] = kd * (a * shown.diffuse[rows]).sum(0)
             by_materials[m, 3:6] = ks * (a * shown.specular[rows]).sum(0)
             by_materials[m, 6] = float((ks * a * shown.by_roughness[rows]).sum())
             by_weight += of.by_weight(a * self.exposure[rows] * kd, a * self.exposure[rows] * ks)
-        # by log radiance of free cells, log exposures, log tone exponents, and the log of the factor on held cells
+        # gradient by log radiance of free cells, log exposures, log tone exponents and the log factor on held cells
         by_cells = by_weight * light.weight
         by_photo = np.bincount(block.photo, (by_linear * lit).sum(1), len(light.log_exposure))
         parts = [by_cells[light.free].T.reshape(-1), by_photo[len(by_photo) - light.free_exposures :]]
@@ -181,16 +226,28 @@ class Illumination(msgspec.Struct, frozen=True):
 
     @property
     def bounced(self) -> Float[np.ndarray, "n 3"] | float:
-        """What of ℓ other surfaces send."""
-        block, materials = self.block, self.materials
+        """Part of ℓ that other surfaces send."""
+        block = self.block
+        materials = self.materials
         if block.bounced is None:
             return 0.0
-        kd, ks = materials.diffuse[block.material], materials.specular[block.material]
+        kd = materials.diffuse[block.material]
+        ks = materials.specular[block.material]
         return kd * block.bounced[:, :3] + ks * block.bounced[:, 3:]
 
     def linearise(self, shown: Shown, loss: Loss, temperature: float = 1.0) -> Iterator[Linearised]:
-        """Residuals and derivatives; `shown` is what this illumination shows by its table.  Held-out observations have weight 0."""
-        block, light, materials = self.block, self.light, self.materials
+        """Yield residuals and derivatives, by material and channel.
+
+        Held-out observations have weight 0.
+
+        Args:
+            shown: Prediction of this illumination by its table.
+            loss: Robust loss.
+            temperature: T, which divides squared residuals.
+        """
+        block = self.block
+        light = self.light
+        materials = self.materials
         residual = block.residuals(shown.radiance)
         pull = self.pull(residual, loss, temperature)
         scale = pull * block.precision
@@ -198,16 +255,22 @@ class Illumination(msgspec.Struct, frozen=True):
         lit = shown.linear - self.bounced
         if toned := len(light.log_tone) > 0:
             by_tone = scale * by_log_exponent(np.maximum(shown.linear, 0), light.exponents(block.photo))
-        photos, free = np.eye(len(light.log_exposure))[block.photo], light.free if light.held.any() else slice(None)
+        photos = np.eye(len(light.log_exposure))[block.photo]
+        free = light.free if light.held.any() else slice(None)
         first = len(light.log_exposure) - light.free_exposures
         for m, rows, of in shown.responses:
-            of_specular, of_roughness = of.specular, of.by_roughness
+            of_specular = of.specular
+            of_roughness = of.by_roughness
             for c in range(3):
-                kd, ks = np.float32(materials.diffuse[m, c]), np.float32(materials.specular[m, c])
+                kd = np.float32(materials.diffuse[m, c])
+                ks = np.float32(materials.specular[m, c])
+                # ∂r/∂u = τ' e (k_d D + k_s S) w/σ, and its derivative by roughness
                 bright = ((rising[rows, c] * self.exposure[rows, 0])[:, None] * light.weight[:, c]).astype(np.float32)
                 by_roughness = of_roughness * (ks * bright)
                 own = [kd * shown.diffuse[rows, c] * rising[rows, c], ks * shown.specular[rows, c] * rising[rows, c]]
-                diffuse, specular = of.diffuse * (kd * bright), of_specular * (ks * bright)
+                diffuse = of.diffuse * (kd * bright)
+                specular = of_specular * (ks * bright)
+                # ∂r/∂log e = τ' (ℓ − bounced)/σ, ∂r/∂log g, and ∂r/∂ log of the factor on held cells
                 by_photo = photos[rows, first:] * (lit[rows, c] * rising[rows, c])[:, None]
                 if toned:
                     by_photo = np.hstack([by_photo, photos[rows] * by_tone[rows, c, None]])
@@ -227,7 +290,7 @@ class Illumination(msgspec.Struct, frozen=True):
 
 
 def material_slices(block: Block) -> list[tuple[int, slice]]:
-    """(material, rows) of runs of one material, of at most CHUNK rows."""
+    """Return (material, rows) of runs of one material, each of at most CHUNK rows."""
     starts = np.flatnonzero(np.diff(block.material, prepend=-1))
     ends = np.append(starts, len(block))[1:]
     return [

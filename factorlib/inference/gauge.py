@@ -1,15 +1,16 @@
-"""Which materials and lights are linked, and the gauge: the data leave one factor per channel and connected component free, between reflectances and lights.
+"""Gauge of a solution: connected components of materials and lights, and the rule that fixes their free factors.
 
-Where surfaces light each other (interreflection), what they send is known and no factor is free, nor where a reflectance or a light is known
-(`factorlib.inference.known`): such a component stays as it is.  Where a light is known but for one factor, it settles the tint.
+The data leave one factor per channel and connected component free between reflectances and lights.  No factor is free
+where surfaces light each other, because their radiance is known, nor where a reflectance or a light is known
+(`factorlib.inference.known`).  Such a component stays as it is.  A light that is known up to one factor fixes the tint.
 
-Tint   Lights are as near to grey as they can be, which is what the paper's prior asks for.  With E_ic the summed lobe energies of
-       light i, the factors s_c minimise Σ_i Σ_c (log s_c E_ic − mean_c log s_c E_ic)²: s_c is one over the geometric mean over
-       lights of E_ic, each light counting alike.  In logarithms the rule does not depend on the gauge it starts from.
-       The paper sums weights, which are peaks.  Where one fit has one broad lobe and another has several sharper ones in its place,
-       their summed weights differ, but their summed energies agree.
-Scale  The largest k_d + k_s of a component's materials is `BRIGHTEST`: a bright material in the room reflects most of
-       the light, which is what photographs of objects show, and Mitsuba needs it below one.
+Tint   Lights are as near to grey as possible, as the paper's prior asks.  Let E_ic be the summed lobe energies of light
+       i.  The factors s_c minimise Σ_i Σ_c (log s_c E_ic − mean_c log s_c E_ic)²: s_c is one over the geometric mean
+       over lights of E_ic, and each light counts alike.  In logarithms the rule does not depend on the initial gauge.
+       The paper sums weights, which are peak values.  One broad lobe and several sharper ones in its place have
+       different summed weights, but equal summed energies.
+Scale  The largest k_d + k_s of a component's materials is `BRIGHTEST`.  A bright material in a room reflects most of
+       the light, as in most photographs of objects, and Mitsuba requires a value below one.
 """
 
 from __future__ import annotations
@@ -27,9 +28,11 @@ from factorlib.inference.known import Known
 from factorlib.inference.materials import Materials, Point
 
 BRIGHTEST = 0.9
-LEAST_ENERGY = 1e-3  # of a light's brightest channel: a light without any blue has no say in how blue the others are
+# Least energy, as a share of a light's brightest channel: a light without blue does not decide how blue the others are.
+LEAST_ENERGY = 1e-3
 RULE = (
-    "per connected component: channel factors make the geometric means over lights of their summed lobe energies grey (after the prior of Wang et al.); "
+    "per connected component: channel factors make the geometric means over lights of their summed lobe energies "
+    "grey (after the prior of Wang et al.); "
     f"the largest diffuse + specular reflectance is {BRIGHTEST}"
 )
 DETERMINED = (
@@ -40,16 +43,19 @@ UP_TO_SCALE = "; where lights are known up to a factor, white balance comes from
 
 
 class Component(NamedTuple):
-    """Materials (by number) and illuminations (by name) that are linked, both sorted; either may be empty."""
+    """Set of linked materials (by number) and illuminations (by name).
+
+    Both are sorted, and either may be empty.
+    """
 
     materials: tuple[int, ...]
     illuminations: tuple[str, ...]
 
 
 def connected_components(blocks: Sequence[Block], materials: int) -> list[Component]:
-    """All components of materials 0 … `materials`−1 and the blocks, sorted.
+    """Return all components of materials 0 … `materials`−1 and the blocks, sorted.
 
-    Two materials are linked if one light shows both.  In each component one factor per channel is not determined.
+    Two materials are linked if one light illuminates both.  In each component one factor per channel is undetermined.
     """
     shown = [(m, materials + i) for i, block in enumerate(blocks) for m in np.unique(block.material).tolist()]
     first, second = np.array(shown, dtype=int).reshape(-1, 2).T
@@ -68,9 +74,17 @@ def connected_components(blocks: Sequence[Block], materials: int) -> list[Compon
 
 
 def in_gauge(point: Point, blocks: Sequence[Block], known: Known = Known()) -> Point:
-    """The point in the gauge stated above, which predicts the same radiance; one light per block."""
-    materials, lights = point.materials, list(point.lights)
-    diffuse, specular = materials.diffuse.copy(), materials.specular.copy()
+    """Return the point in the gauge of this module; it predicts the same radiance.
+
+    Args:
+        point: Materials, and one light per block.
+        blocks: Observations by illumination.
+        known: Unknowns with given values.
+    """
+    materials = point.materials
+    lights = list(point.lights)
+    diffuse = materials.diffuse.copy()
+    specular = materials.specular.copy()
     names = [block.name for block in blocks]
     for members, illuminations in connected_components(blocks, len(materials)):
         own = [names.index(name) for name in illuminations]
@@ -78,17 +92,19 @@ def in_gauge(point: Point, blocks: Sequence[Block], known: Known = Known()) -> P
         if not own or not factors:
             continue
         rows = list(members)
+        # log s_c from the geometric means of E_ic; reflectances take 1/s_c and the scale of BRIGHTEST
         sums = np.array([lights[i].energy.sum(0) for i in own])
         level = np.log(np.maximum(sums, LEAST_ENERGY * np.maximum(sums.max(1, keepdims=True), 1e-300)))
         tint = (level.mean(1, keepdims=True) - level).mean(0) if factors == 3 else np.zeros(3)
         factor = 1 / np.exp(tint)  # multiplies reflectances
         factor = factor * BRIGHTEST / (factor * (diffuse[rows] + specular[rows])).max()
-        diffuse[rows], specular[rows] = diffuse[rows] * factor, specular[rows] * factor
+        diffuse[rows] = diffuse[rows] * factor
+        specular[rows] = specular[rows] * factor
         for i in own:
             lights[i] = msgspec.structs.replace(lights[i], weight=lights[i].weight / factor)
     return Point(Materials(diffuse, specular, materials.roughness), lights)
 
 
 def is_free(blocks: Sequence[Block], illuminations: Sequence[str]) -> bool:
-    """Whether the component of these illuminations has a free factor."""
+    """Return True if no block of these illuminations has interreflection, so that their component has a free factor."""
     return all(block.bounced is None for block in blocks if block.name in illuminations)

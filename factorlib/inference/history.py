@@ -1,4 +1,4 @@
-"""What a run of a solver reports, how far that says it is, and what it ends with."""
+"""Events, progress and final state of a solver's run."""
 
 from __future__ import annotations
 
@@ -14,9 +14,18 @@ from factorlib.results.materials import Decision
 
 
 class Event(msgspec.Struct, frozen=True):
-    """One point that was tried: `loss` per fitted channel value, whitened (1 = explained to the noise model).
+    """Evaluation of one point, or the end of a phase.
 
-    The last event of a part has iteration −1 and says its held-out loss, which is not a number in all others."""
+    The last event of a phase has iteration −1 and states the held-out loss, which is NaN in all others.
+
+    Attributes:
+        round: Number of the fit.
+        phase: Name of the phase.
+        iteration: Number of the evaluation in this fit.
+        loss: Whitened loss per fitted channel value; 1 means explained to the noise model.
+        held_out: Held-out loss.
+        lobes: Number of lobes or cells.
+    """
 
     round: int
     phase: str
@@ -27,8 +36,9 @@ class Event(msgspec.Struct, frozen=True):
 
 
 Report = Callable[[Event], None]
-Progress = Callable[[float, float, str], None]  # done, of how many, and what it is doing
-PHASES = {  # about how many points are tried, and what one costs beside one of the first phase, on data/eames
+Progress = Callable[[float, float, str], None]  # amount done, total amount, and the current activity
+# Typical number of evaluations of each phase, and the cost of one relative to the first phase's, on data/eames.
+PHASES = {
     "shadows": (13, 1),
     "no shadows": (8, 1),
     "shadows and bounces": (8, 1),
@@ -36,22 +46,28 @@ PHASES = {  # about how many points are tried, and what one costs beside one of 
     "distances": (24, 1.5),
     "materials and lights": (11, 7),
 }
-SPLITTING, LAST = (7, 9), {"lights": (3, 14), "suns": (4, 10)}
+SPLITTING = (7, 9)
+LAST = {"lights": (3, 14), "suns": (4, 10)}
 
 
 def unreported(event: Event) -> None:
-    """The default: no reports."""
+    """Ignore an event."""
 
 
 class Solution(msgspec.Struct, frozen=True):
-    """The answer of a solver: a point, and what was decided of the model.
+    """Result of a solver: a point and the model choices.
 
-    history     every point that was tried
-    shadows     whether visibility was used, with its evidence;  interreflection: whether surfaces light each other
-    tone        the evidence for each light's tone curves;  distances: for each light's distance; empty where nothing was tried
-    splitting   the evidence for each splitting of the lights' cells
-    suns        the evidence for each light's sun
-    materials   the fit of the sure observations, whose materials the answer has;  lights: that of all
+    Attributes:
+        point: Materials and lights, in the gauge of `factorlib.inference.gauge`.
+        history: All evaluations.
+        materials: Fit of the observations with reliable normals; the answer has its materials.
+        lights: Fit of all observations.
+        shadows: Decision on the use of visibility.
+        interreflection: Decision on light that surfaces send each other.
+        tone: Decision on each light's tone curves; empty if not tried.
+        distances: Decision on each light's distance; empty if not tried.
+        splitting: Decision on each splitting of the lights' cells.
+        suns: Decision on each light's sun.
     """
 
     point: Point
@@ -66,15 +82,15 @@ class Solution(msgspec.Struct, frozen=True):
     suns: list[Decision] = []
 
     def shown(self, problem: JointProblem) -> JointProblem:
-        """Return the problem that the answer solves: with shadows and bounces, or without."""
+        """Return the problem that the answer solves: with or without shadows and interreflection."""
         return problem.with_effects(self.shadows.kept, self.interreflection.kept)
 
 
 def of_subsets(progress: Progress, subsets: int) -> Report:
-    """Return the progress of the paper's solver, which reports so many subsets."""
+    """Return a report that converts events of the paper's solver to progress in `subsets` reported subsets."""
 
     def report(event: Event) -> None:
-        """Say how many of all subsets are done."""
+        """Report the number of subsets done."""
         progress(
             event.round, subsets + 1, f"{event.phase} {event.iteration}: loss {event.loss:.3g}, {event.lobes} lobes"
         )
@@ -83,14 +99,21 @@ def of_subsets(progress: Progress, subsets: int) -> Report:
 
 
 def of_parts(progress: Progress, choices: Choices) -> Report:
-    """The progress of the joint solve, in points of the first phase.  It moves with every point, and where there are several starts, and a
-    phase is entered several times, it does not go back."""
+    """Return a report that converts events of the joint solve to progress, in evaluations of the first phase.
+
+    Progress moves with every evaluation.  It never goes back, even if several starts enter a phase several times.
+    """
     phases = PHASES | {f"splitting {k + 1}": SPLITTING for k in range(choices.splittings)} | LAST
     costs = {phase: points * cost for phase, (points, cost) in phases.items()}
-    tried, total, furthest = dict.fromkeys(phases, 0), sum(costs.values()), 0.0
+    tried = dict.fromkeys(phases, 0)
+    total = sum(costs.values())
+    furthest = 0.0
 
     def report(event: Event) -> None:
-        """Say how much is done: three quarters of a phase after its usual number of points, for there may be more."""
+        """Report the work done.
+
+        A phase counts as three quarters done after its usual number of evaluations, because there may be more.
+        """
         nonlocal furthest
         tried[event.phase] += 1
         within = 1.0 if event.iteration < 0 else 1 - 0.25 ** (tried[event.phase] / phases[event.phase][0])

@@ -1,8 +1,8 @@
-"""What is missing or unusable in the observations, and what is not determined: by them alone, by the answer's standard errors, and where
-residuals stay large.
+"""Warnings about missing, unusable or undetermined quantities.
 
-Every sentence names what is not determined, why, and which photo would help.  None of them stops the solve.  The factor per
-channel between reflectances and lights is `factorlib.inference.gauge`'s matter.
+They follow from the observations alone, from the standard errors of the answer, and from large residuals.  Every
+sentence names what is not determined, the reason, and a photo that would help.  No warning stops the solve.  The factor
+per channel between reflectances and lights is the subject of `factorlib.inference.gauge`.
 """
 
 from __future__ import annotations
@@ -20,19 +20,21 @@ from factorlib.inference.materials import ROUGHNESS, Materials, Point
 from factorlib.inference.observed import PhotoObservations
 from factorlib.inference.problem import JointProblem
 
-FEW = 40  # observations: 7 unknowns of a material and some lobes, 6 each, with a few pixels for each
-FLAT_DEG = 15.0  # mirror directions within this of their mean show one patch of the light
-CLIPPED = 0.5  # share of channel values
-ROUGHNESS_ERROR = 0.1  # largest standard error with which dull and glossy can be distinguished
-SHARE_ERROR = 0.25  # of a material's diffuse + specular reflectance
-DARK = 0.1  # a bound on reflectance that still says 'dark'
-TINTED = 0.6  # of a mean |log R/G| or |log B/G|: three standard deviations of the level of one light's colour (docs/light-prior.md)
-EXPOSURE_DIFFERS = 1.5  # by which factor what is found may differ from EXIF without a word
-OUTLIER, OUTLIERS = 3.0, 0.1  # a residual in units of the noise model, and the share of such values that is too much
+FEW = 40  # observations: a few for each of 7 unknowns of a material and some lobes of 6
+FLAT_DEG = 15.0  # mirror directions within this angle of their mean show one patch of the light
+CLIPPED = 0.5  # share of clipped channel values
+ROUGHNESS_ERROR = 0.1  # largest standard error that still separates dull from glossy
+SHARE_ERROR = 0.25  # largest standard error, as a share of a material's diffuse + specular reflectance
+DARK = 0.1  # largest bound on reflectance that still means 'dark'
+# Largest mean |log R/G| or |log B/G|: three standard deviations of the colour of one light (docs/light-prior.md).
+TINTED = 0.6
+EXPOSURE_DIFFERS = 1.5  # largest factor between estimated and EXIF exposure without a warning
+OUTLIER = 3.0  # residual in σ of the noise model
+OUTLIERS = 0.1  # largest share of such residuals without a warning
 
 
 def unusable_observations(photos: Sequence[PhotoObservations]) -> list[str]:
-    """Photos of which observations were left out, as sentences."""
+    """Return a sentence for each photo with unusable observations."""
     return [
         f"photo '{', '.join(photo.merged.photos)}': {photo.unusable} of {photo.count} observations are left out, "
         "their radiance, normal or view not finite or their weight not positive"
@@ -42,8 +44,15 @@ def unusable_observations(photos: Sequence[PhotoObservations]) -> list[str]:
 
 
 def before_solving(names: Sequence[str], photos: Sequence[str], problem: JointProblem) -> list[str]:
-    """What observations lack and cannot tell, as sentences; names: of all materials, by number;  photos: all that there are."""
-    blocks, known = problem.blocks, problem.known
+    """Return sentences about missing observations and quantities that they cannot determine.
+
+    Args:
+        names: Names of all materials, by number.
+        photos: Names of all photos.
+        problem: Observations.
+    """
+    blocks = problem.blocks
+    known = problem.known
     shown = {int(m) for block in blocks for m in np.unique(block.material)}
     unseen = [name for m, name in enumerate(names) if m not in shown and m not in known.materials]
     said = [f"material '{name}' is observed in no photo: its reflectance is only a guess" for name in unseen]
@@ -54,15 +63,20 @@ def before_solving(names: Sequence[str], photos: Sequence[str], problem: JointPr
         pairs = ((", ".join(lights), ", ".join(names[m] for m in members)) for members, lights in linked)
         groups = "; ".join(f"{lights} (with {materials})" for lights, materials in pairs)
         said.append(
-            f"the photos fall into {len(linked)} sets that share no material, so their reflectances cannot be compared: {groups}. "
-            "An object that is left out of the solve may link them, once its pose is good; else a photo that shows a material of each would"
+            f"the photos fall into {len(linked)} sets that share no material, so their reflectances cannot be "
+            f"compared: {groups}. An object that is left out of the solve may link them, once its pose is good; else "
+            "a photo that shows a material of each would"
         )
     return said + undetermined_by_observations(names, problem)
 
 
 def undetermined_by_observations(names: Sequence[str], problem: JointProblem) -> list[str]:
-    """What no solve can find, as sentences; a material that no block shows, or that is known, is left out."""
-    blocks, known = problem.blocks, problem.known
+    """Return sentences about quantities that no solve can determine.
+
+    Known materials and materials without observations are left out.
+    """
+    blocks = problem.blocks
+    known = problem.known
     black = [block.name for block in blocks if (block.radiance <= 0).all()]
     said = [f"illumination '{name}' is black in every photo: it tells nothing" for name in black]
     for m, name in enumerate(names):
@@ -70,44 +84,51 @@ def undetermined_by_observations(names: Sequence[str], problem: JointProblem) ->
         said += _of_material(name, shown) if shown and m not in known.materials else []
     for members, lights in connected_components(blocks, len(names)):
         if len(members) == 1 and lights and known.factors(members, lights) == 3:
-            alone = ", and a smooth material in a soft light looks like a rough one in a sharp light. A photo of it in other light"
+            alone = (
+                ", and a smooth material in a soft light looks like a rough one in a sharp light. "
+                "A photo of it in other light"
+            )
             said.append(
-                f"material '{names[members[0]]}' shares no light with another: its colour and brightness are separated from the light's "
-                f"by convention only{alone if len(lights) == 1 else '. A photo'} that shows another material too would help"
+                f"material '{names[members[0]]}' shares no light with another: its colour and brightness are "
+                f"separated from the light's by convention only{alone if len(lights) == 1 else '. A photo'} that "
+                "shows another material too would help"
             )
     return said
 
 
 def _of_material(name: str, shown: Sequence[Block]) -> Iterator[str]:
+    """Yield sentences about one material from its observations in each light."""
     count = sum(map(len, shown))
     if count < FEW:
         yield (
-            f"material '{name}' has {count} observation(s), fewer than {FEW}: its reflectance is uncertain, and its roughness more so. "
-            "A photo from nearer would help"
+            f"material '{name}' has {count} observation(s), fewer than {FEW}: its reflectance is uncertain, and its "
+            "roughness more so. A photo from nearer would help"
         )
     if all(_spread(block) < FLAT_DEG for block in shown):
         yield (
-            f"material '{name}' is flat: in every light it mirrors one direction only, so its roughness and what of it is specular "
-            "cannot be determined. A photo of a curved part, or several of it turned in a light that is fixed to the world, would help"
+            f"material '{name}' is flat: in every light it mirrors one direction only, so its roughness and what of "
+            "it is specular cannot be determined. A photo of a curved part, or several of it turned in a light that "
+            "is fixed to the world, would help"
         )
     clipped = np.concatenate([block.clipped for block in shown]).mean()
     if clipped >= CLIPPED:
         yield (
-            f"{clipped:.0%} of the values of material '{name}' are clipped and say 'at least' only: its reflectance is uncertain. "
-            "A photo of shorter exposure would help"
+            f"{clipped:.0%} of the values of material '{name}' are clipped and say 'at least' only: its reflectance "
+            "is uncertain. A photo of shorter exposure would help"
         )
 
 
 def _spread(block: Block) -> float:
-    """Largest angle between a mirror direction and their mean, degrees."""
+    """Return the largest angle between a mirror direction and their mean, degrees."""
     mirror = mirror_directions(block.normal, block.view)
     mean = mirror.mean(0)
     return float(np.degrees(np.arccos(np.clip(mirror @ mean / max(np.linalg.norm(mean), 1e-12), -1, 1)).max()))
 
 
 def after_solving(answer: Answer) -> list[str]:
-    """What the answer leaves open or explains badly, as sentences."""
-    problem, point = answer.solution.shown(answer.problem), answer.solution.point
+    """Return sentences about quantities that the answer leaves open or explains badly."""
+    problem = answer.solution.shown(answer.problem)
+    point = answer.solution.point
     return [
         *undetermined_by_answer(answer.names, problem, point.materials, answer.errors.materials),
         *poorly_explained(problem, answer.radiance),
@@ -121,61 +142,78 @@ def after_solving(answer: Answer) -> list[str]:
 def undetermined_by_answer(
     names: Sequence[str], problem: JointProblem, found: Materials, errors: Materials
 ) -> list[str]:
-    """What the data left open of the materials that are seen, by the standard `errors` of what was `found`."""
+    """Return sentences about observed materials that the data leave uncertain.
+
+    Args:
+        names: Names of all materials, by number.
+        problem: Observations.
+        found: Estimated materials.
+        errors: Their standard errors.
+    """
     seen = sorted({int(m) for block in problem.blocks for m in np.unique(block.material)})
     return [sentence for m in seen for sentence in _of_answer(names[m], found.rows()[m], errors.rows()[m])]
 
 
 def _of_answer(name: str, found: Float[np.ndarray, "7"], error: Float[np.ndarray, "7"]) -> Iterator[str]:
-    whole, largest, specular = (found[:3] + found[3:6]).max(), error[:6].max(), found[3:6]
+    """Yield sentences about one material from its estimate and standard errors, both (k_d, k_s, roughness)."""
+    whole = (found[:3] + found[3:6]).max()
+    largest = error[:6].max()
+    specular = found[3:6]
     if whole < largest <= DARK:
         yield (
-            f"material '{name}' is so dark that of its reflectance only a bound, about {whole + 2 * largest:.2g}, can be given. "
-            "A photo of longer exposure would help"
+            f"material '{name}' is so dark that of its reflectance only a bound, about {whole + 2 * largest:.2g}, "
+            "can be given. A photo of longer exposure would help"
         )
     elif not largest <= SHARE_ERROR * whole:
         yield (
-            f"the reflectance of material '{name}' is known to ±{largest:.2g} only, of {whole:.2g}: diffuse and specular "
-            "part look alike here. A photo in light with a small bright source, or next to a brighter material, would help"
+            f"the reflectance of material '{name}' is known to ±{largest:.2g} only, of {whole:.2g}: diffuse and "
+            "specular part look alike here. A photo in light with a small bright source, or next to a brighter "
+            "material, would help"
         )
-    if not (specular.any() or error[3:6].any()):  # which is known: it has no roughness
+    if not (specular.any() or error[3:6].any()):  # k_s is known to be 0: roughness has no meaning
         return
     if not (error[6] <= ROUGHNESS_ERROR and (specular > 2 * error[3:6]).any()):
         yield (
-            f"the roughness of material '{name}' cannot be determined (±{error[6]:.2g}): no highlight stands out, or shape and photos "
-            "disagree too much. A photo in light with a small bright source, or a better mesh, would help"
+            f"the roughness of material '{name}' cannot be determined (±{error[6]:.2g}): no highlight stands out, or "
+            "shape and photos disagree too much. A photo in light with a small bright source, or a better mesh, "
+            "would help"
         )
     elif found[6] <= ROUGHNESS[0] + 1e-9 and error[6] > 0:
-        yield f"the roughness of material '{name}' is at {ROUGHNESS[0]:g}, the least the model knows: it may be smoother"
+        yield (
+            f"the roughness of material '{name}' is at {ROUGHNESS[0]:g}, the least the model knows: it may be smoother"
+        )
 
 
 def poorly_explained(problem: JointProblem, radiance: Sequence[Float[np.ndarray, "n 3"]]) -> Iterator[str]:
-    """Illuminations with many residuals far beyond the noise model."""
+    """Yield a sentence for each illumination with many residuals far beyond the noise model."""
     for block, predicted in zip(problem.blocks, radiance, strict=True):
         residual = block.residuals(predicted)
         share = float((np.abs(residual * (block.precision > 0)) > OUTLIER).mean())
         if share > OUTLIERS:
             yield (
-                f"illumination '{block.name}': {share:.0%} of the values differ from the answer by more than {OUTLIER:g} times their noise. "
-                "Look at what `align` drew: wrong normals, poses or masks there make every material in it wrong"
+                f"illumination '{block.name}': {share:.0%} of the values differ from the answer by more than "
+                f"{OUTLIER:g} times their noise. Look at what `align` drew: wrong normals, poses or masks there make "
+                "every material in it wrong"
             )
 
 
 def unlikely_curves(problem: JointProblem, point: Point) -> Iterator[str]:
-    """Tone curves that have run toward the bounds of what cameras do."""
+    """Yield a sentence for each light whose tone curves end near the bounds of real cameras."""
     for block, light in zip(problem.blocks, point.lights, strict=True):
         if light.beyond_cameras:
             exponents = ", ".join(f"{g:.2g}" for g in np.exp(light.log_tone))
             yield (
-                f"the tone curves of illumination '{block.name}' have exponents of {exponents}, "
-                'more than a camera does: something else is wrong there, as normals or `encoding`. SET="solve.tone=off" goes without them'
+                f"the tone curves of illumination '{block.name}' have exponents of {exponents}, more than a camera "
+                'does: something else is wrong there, as normals or `encoding`. SET="solve.tone=off" goes without '
+                "them"
             )
 
 
 def tinted_alike(problem: JointProblem, point: Point) -> Iterator[str]:
-    """Lights that interreflection gives one strong colour on average.
+    """Yield a sentence for each set of lights with a strong common tint, fixed by interreflection.
 
-    Where no surface lights another, the rule of `factorlib.inference.gauge` makes lights grey, and nothing is said, nor where a material or a light is known.
+    There is none where the gauge of `factorlib.inference.gauge` makes lights grey, or where a material or a light is
+    known.
     """
     blocks = problem.blocks
     for members, illuminations in connected_components(blocks, len(point.materials)):
@@ -187,28 +225,29 @@ def tinted_alike(problem: JointProblem, point: Point) -> Iterator[str]:
         if np.abs(level - level[1]).max() > TINTED:
             colour = " : ".join(f"{c:.2g}" for c in np.exp(level - level.mean()))
             yield (
-                f"the lights of {', '.join(illuminations)} are R : G : B = {colour} on average, as interreflection fixes it: reflectances have "
-                'the opposite colour, if the lights were nearly white. SET="solve.interreflection=off" makes the lights grey'
+                f"the lights of {', '.join(illuminations)} are R : G : B = {colour} on average, as interreflection "
+                "fixes it: reflectances have the opposite colour, if the lights were nearly white. "
+                'SET="solve.interreflection=off" makes the lights grey'
             )
 
 
 def _brighter_than_white(answer: Answer) -> Iterator[str]:
-    """Materials that come out brighter than they can be beside known ones."""
+    """Yield a sentence for each material brighter than white beside known ones."""
     found = answer.solution.point.materials
     for name, whole in zip(answer.names, (found.diffuse.max(1) + found.specular.max(1)).tolist(), strict=True):
         if whole > 1 and not answer.problem.known.nothing:
             yield (
-                f"material '{name}' comes out with diffuse + specular = {whole:.2f} beside what is known, more than falls on it: are the known "
-                "reflectances right, and of materials that the same light falls on?"
+                f"material '{name}' comes out with diffuse + specular = {whole:.2f} beside what is known, more than "
+                "falls on it: are the known reflectances right, and of materials that the same light falls on?"
             )
 
 
 def _exposures_unlike_exif(answer: Answer) -> Iterator[str]:
-    """Photos whose exposure is found to be another than their EXIF says."""
+    """Yield a sentence for each photo whose estimated exposure differs from its EXIF."""
     for photo, factor in answer.found_exposures().items():
         by_exif = answer.relative[photo]
         if by_exif != 1 and abs(np.log(factor)) > np.log(EXPOSURE_DIFFERS):
             yield (
-                f"photo '{photo}': by its EXIF its exposure is {by_exif:.3g} of its light's first photo, by its pixels "
-                f"{factor * by_exif:.3g}: was it made brighter or darker later?"
+                f"photo '{photo}': by its EXIF its exposure is {by_exif:.3g} of its light's first photo, by its "
+                f"pixels {factor * by_exif:.3g}: was it made brighter or darker later?"
             )

@@ -1,15 +1,17 @@
-"""Interreflection: from a direction that is hidden comes the light of the surface that hides it.
+"""Interreflection: light that arrives from hidden directions, sent by the surfaces that hide them.
 
     G_d,i = Σ_k w_ik (1 − V_ik) B_ik,                w_ik the cosine weights of factorlib.light.visibility, Σ_k w_ik = 1
-    G_s,i = Σ_k D G1 G1 / (4 n·o) (1 − V_ik) B_ik Ω,   GGX at the roughness ROUGHNESS, Ω = 4π/K                (1)
+    G_s,i = Σ_k D G1 G1 / (4 n·o) (1 − V_ik) B_ik Ω,   GGX at the roughness ROUGHNESS, Ω = 4π/K                     (1)
 
-B_ik is the radiance of what observation i meets in direction k.  It is taken from the photo itself: the mean radiance of the
-observations of that material whose normals lie in that bin.  Few observations are no sure mean, so it is drawn, as by `PSEUDO` further
-observations, toward the mean of the whole material with weights exp(NEARNESS n·b): a bin that the photo does not show gets the radiance
-of the nearest normals.  What met nothing known, or a material that the photo does not show, sends the photo's mean radiance.
+B_ik is the radiance of the surface that hides direction k from observation i.  It is taken from the photo itself: the
+mean radiance of the observations of that material whose normals lie in that bin.  Few observations give an uncertain
+mean.  It is therefore shrunk, with the weight of `PSEUDO` observations, toward the mean of the whole material with
+weights exp(NEARNESS n·b).  A bin without observations gets the radiance of the nearest normals.  An unknown surface, or
+a material that the photo does not show, sends the photo's mean radiance.
 
-So B holds all bounces, and is known: G does not depend on materials or lights.  Surfaces are taken to send the same light everywhere:
-toward the camera and toward each other.  Absolute reflectances become observable, for G does not scale with the light.
+B contains all bounces and is known, so G does not depend on materials or lights.  The model assumes that surfaces send
+the same radiance toward the camera and toward each other.  Absolute reflectances become observable, because G does not
+scale with the light.
 """
 
 from __future__ import annotations
@@ -26,15 +28,16 @@ from factorlib.light.visibility import cosine_weights, widest_sharpness
 from factorlib.reflection.brdf import specular
 from factorlib.urm.observations import Observations
 
-ROUGHNESS = 0.35  # of the highlight through which hidden surfaces are seen, whatever the material: of most materials a few tenths
-PSEUDO, NEARNESS = 3.0, 4.0
-ROWS = 1024  # observations whose weights are held at once
+ROUGHNESS = 0.35  # roughness of the highlight that reflects hidden surfaces, for all materials; most have a few tenths
+PSEUDO = 3.0  # weight of the expected mean, in observations
+NEARNESS = 4.0  # sharpness of the weights by normal
+ROWS = 1024  # observations whose weights are in memory at once
 
 
 def bounced_light(seen: Observations, radiance: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 6"] | None:
-    """G_d and G_s in the unit of `radiance`, which the n observations show; None where nothing is known of what hides the light.
+    """Return G_d and G_s of the n observations, in the unit of `radiance`; None without visibility and hit surfaces.
 
-    normals, views and directions: in the camera frame of each photo
+    Normals, views and directions are in the camera frame of each photo.
     """
     if seen.visibility is None or seen.met is None:
         return None
@@ -50,8 +53,9 @@ def bounced_light(seen: Observations, radiance: Float[np.ndarray, "n 3"]) -> Flo
 
 
 def radiance_by_code(shown: Observations, radiance: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "c+1 3"]:
-    """B of every code of `Observations.met` in one photo, from its observations; last what an unknown surface sends."""
-    normal, bins = unit(shown.normal), fibonacci_sphere(BINS)
+    """Return B of every code of `Observations.met` in one photo; the last row is the radiance of an unknown surface."""
+    normal = unit(shown.normal)
+    bins = fibonacci_sphere(BINS)
     everything = np.average(radiance, axis=0, weights=shown.weight)
     found = np.tile(everything, (len(shown.materials) * BINS + 1, 1))
     for m in np.unique(shown.material):
@@ -64,28 +68,45 @@ def radiance_by_code(shown: Observations, radiance: Float[np.ndarray, "n 3"]) ->
 def _by_bin(
     cosine: Float[np.ndarray, "n b"], radiance: Float[np.ndarray, "n 3"], weight: Float[np.ndarray, " n"]
 ) -> Float[np.ndarray, "b 3"]:
-    """The mean radiance of one material by bin of its normals; cosine: of each normal with each bin's direction."""
+    """Return the mean radiance of one material by bin of its normals.
+
+    Args:
+        cosine: Cosine of each normal with each bin's direction.
+        radiance: Radiance of the n observations.
+        weight: Weights of the n observations.
+    """
+    # expected mean of each bin, from all normals with weights exp(NEARNESS n·b)
     near = np.exp(NEARNESS * cosine) * weight[:, None]
     expected = near.T @ radiance / near.sum(0)[:, None]
-    own, bins = cosine.argmax(1), cosine.shape[1]
+    own = cosine.argmax(1)
+    bins = cosine.shape[1]
     total = np.bincount(own, weight, bins)
     mean = (
         np.column_stack([np.bincount(own, weight * r, bins) for r in radiance.T]) / np.maximum(total, 1e-300)[:, None]
     )
+    # mean of the bin, shrunk toward the expected one
     count = np.bincount(own, minlength=bins)[:, None]
     return (count * mean + PSEUDO * expected) / (count + PSEUDO)
 
 
 def _sent_to(seen: Observations, surfaces: Float[np.ndarray, "c+1 3"]) -> Float[np.ndarray, "n 6"]:
-    """(1) at observations of one photo; the highlight is no narrower than the directions lie apart, as in factorlib.light.visibility."""
-    visibility, met = seen.visibility, seen.met
-    assert visibility is not None and met is not None  # `bounced_light` asks for such observations alone
-    count, unknown = visibility.shape[1], len(surfaces) - 1
+    """Return (1) at observations of one photo.
+
+    The highlight is at least as wide as the spacing of the directions, as in `factorlib.light.visibility`.
+    """
+    visibility = seen.visibility
+    met = seen.met
+    assert visibility is not None and met is not None  # `bounced_light` selects only such observations
+    count = visibility.shape[1]
+    unknown = len(surfaces) - 1
     directions = torch.from_numpy(fibonacci_sphere(count)).float()
     normal, view = (torch.from_numpy(unit(v)).float() for v in (seen.normal, seen.view))
     hidden = 1 - torch.from_numpy(visibility).float() / 255
     alpha = torch.tensor(math.sqrt(ROUGHNESS**4 + 1 / widest_sharpness(count)))
-    nd, no, od = normal @ directions.T, (normal * view).sum(1, keepdim=True), view @ directions.T
+    # GGX reflectance D G1 G1 / (4 n·o), times Ω
+    nd = normal @ directions.T
+    no = (normal * view).sum(1, keepdim=True)
+    od = view @ directions.T
     nh = ((nd + no) / (2 + 2 * od).clamp_min(1e-6).sqrt()).clamp(0, 1)
     highlight = specular(alpha, nd, no, nh) * (4 * math.pi / count)
     code = np.where((met == UNMET) | (met >= unknown), unknown, met).astype(np.int64)

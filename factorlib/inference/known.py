@@ -1,18 +1,19 @@
-"""What is known beforehand: unknowns of materials and lights that are held at their values while all others are found.
+"""Known reflectances, lights and exposures, which the solver holds fixed while it estimates the rest.
 
-A known reflectance settles the factor per channel that is otherwise free in its connected component (`factorlib.inference.gauge`): scale and
-white balance come from it.  So does a known light, unless its radiance is known but for one factor: then white balance alone comes from it.
-Held unknowns have no rows and columns in the solver's system.
+A known reflectance fixes the factor per channel that is otherwise free in its connected component
+(`factorlib.inference.gauge`): scale and white balance follow from it.  So does a known light.  A light that is known up
+to one factor fixes white balance alone.  Held unknowns have no rows and columns in the solver's system.
 
-A light of known radiance on cells comes from a lat-long map, or from what a mirror ball shows.  Radiance y_i is known in directions d_i, each of
-which stands for the solid angle ω_i.  The cells' weights w ≥ 0 are those of the likeliest Σ_p w_p φ_p(d_i), were y counts of a Poisson process, by
-the iteration of Richardson (1972) and Lucy (1974)
+A light of known radiance on cells comes from a lat-long map or from the photo of a mirror ball.  The radiance y_i is
+known in directions d_i, each with a solid angle ω_i.  The cells' weights w ≥ 0 maximise the likelihood of Σ_p w_p
+φ_p(d_i), with y as counts of a Poisson process, by the iteration of Richardson (1972) and Lucy (1974)
 
-    w_p ← w_p Σ_i ω_i φ_p(d_i) y_i/(Σ_q w_q φ_q(d_i)) / Σ_i ω_i φ_p(d_i)                                             (1)
+    w_p ← w_p Σ_i ω_i φ_p(d_i) y_i/(Σ_q w_q φ_q(d_i)) / Σ_i ω_i φ_p(d_i)                                            (1)
 
-which keeps w ≥ 0 and the energy Σ_i ω_i y_i as it is.  Even cells come first; then, again and again, those that hold most energy split, as
-in a solve, down to `FINEST` spacings of the directions.  Cells that too few directions lie in (a ball shows nothing behind itself, and what
-it shows of other objects or clipped is left out) are not known: the solve finds them.
+It keeps w ≥ 0 and the energy Σ_i ω_i y_i.  Even cells come first.  Then the cells with most energy split repeatedly, as
+in a solve, down to `FINEST` spacings of the directions.  A cell that too few directions cover is not known, and the
+solve estimates it.  A ball does not show the directions behind itself; its pixels that are clipped or that mirror other
+objects are left out.
 """
 
 from __future__ import annotations
@@ -33,20 +34,27 @@ from factorlib.inference.materials import ROUGHNESS, Materials
 from factorlib.light.lobes import lobe_integral, squared_distances
 from factorlib.urm.observations import Observations
 
-CELLS, SPLIT, SPLITTINGS = 400, 48, 4
-FINEST = 1.0  # of the spacing of the directions: with finer cells the sums of (1) are no longer integrals
-ITERATIONS, BETWEEN = 60, 15  # of the last cells, and of those that split afterwards
-COVERED = 0.5  # of a cell's integral: below, it is not known
-DARK, LEAST = 1e-6, 1e-12  # of the mean radiance, and steradians, which keep (1) from dividing by 0
-ROWS = 128  # of a map, which is averaged down to them
-LEAST_OF_A_BALL = 1000  # pixels: then what they mirror is 6° apart, and cells are 10° wide
+CELLS = 400  # even cells at the start
+SPLIT = 48  # cells that split at once
+SPLITTINGS = 4  # number of splittings
+FINEST = 1.0  # least size of cells in spacings of the directions: finer cells turn the sums of (1) into poor integrals
+ITERATIONS = 60  # iterations of (1) after the last splitting
+BETWEEN = 15  # iterations of (1) before each splitting
+COVERED = 0.5  # least covered share of a known cell's integral
+# Both keep (1) from dividing by 0.
+DARK = 1e-6  # least radiance, as a share of the mean
+LEAST = 1e-12  # least solid angle, steradians
+ROWS = 128  # most rows of a map; a larger one is averaged down
+LEAST_OF_A_BALL = 1000  # pixels: they mirror directions 6° apart, and cells are 10° wide
 
 
 class Known(msgspec.Struct, frozen=True):
-    """materials: k_d, k_s (RGB each) and roughness by a material's number, NaN where it is not known.
+    """Known values of materials, lights and exposures.
 
-    lights: by illumination, in the radiance of its photos, with the cells that are known (`Light.held`)
-    exposures: illuminations whose photos' exposures are known: radiance has been divided by them
+    Attributes:
+        materials: k_d, k_s (RGB each) and roughness by number of the material; NaN for an unknown value.
+        lights: Light by illumination, in the radiance of its photos, with its known cells (`Light.held`).
+        exposures: Illuminations whose photos have known exposures; radiance has been divided by them.
     """
 
     materials: dict[int, Float[np.ndarray, "7"]] = {}
@@ -55,11 +63,11 @@ class Known(msgspec.Struct, frozen=True):
 
     @property
     def nothing(self) -> bool:
-        """Whether everything is to be found."""
+        """True if nothing is known."""
         return not (self.materials or self.lights or self.exposures)
 
     def put(self, materials: Materials) -> Materials:
-        """The materials with what is known in its place."""
+        """Return the materials with their known values inserted."""
         if not self.materials:
             return materials
         rows = materials.rows()
@@ -68,40 +76,53 @@ class Known(msgspec.Struct, frozen=True):
         return Materials.of_rows(rows)
 
     def free(self, count: int) -> Bool[np.ndarray, " 7m"]:
-        """Which unknowns of `count` materials are to be found."""
+        """Return a mask of the unknowns of `count` materials that are to be estimated."""
         free = np.ones((count, 7), bool)
         for m, values in self.materials.items():
             free[m] = np.isnan(values)
         return free.reshape(-1)
 
     def factors(self, members: Iterable[int], illuminations: Iterable[str]) -> Literal[0, 1, 3]:
-        """How many factors stay free between the reflectances and the lights of a component: one a channel, one for all, or none."""
+        """Return the number of free factors between reflectances and lights of a component.
+
+        It is 3 (one a channel), 1 (one for all channels) or 0.
+        """
         lights = [self.lights[name] for name in illuminations if name in self.lights]
         if self.of(members) or not all(light.scale_free for light in lights):
             return 0
         return 1 if lights else 3
 
     def of(self, members: Iterable[int]) -> list[int]:
-        """The known ones of some materials."""
+        """Return the known ones among some materials."""
         return [m for m in members if m in self.materials]
 
 
 def known_light(
     directions: Float[np.ndarray, "n 3"], radiance: Float[np.ndarray, "n 3"], solid_angle: Float[np.ndarray, " n"]
 ) -> Light:
-    """The light that has `radiance` in unit `directions` (in the light's frame) of n solid angles in steradians; its cells are `held` where
-    directions cover them."""
+    """Return the light with a given radiance in given directions, by (1).
+
+    Cells that the directions cover are `held`.
+
+    Args:
+        directions: Unit vectors, in the light's frame.
+        radiance: y, radiance in each direction.
+        solid_angle: ω of each direction, steradians.
+    """
     mean = solid_angle @ radiance / solid_angle.sum()
     floored = np.maximum(radiance, DARK * mean.mean())
     energy_of = (solid_angle[:, None] * floored).astype(np.float32)
-    lobes, spacing = even_cells(CELLS), np.sqrt(np.median(solid_angle))
+    lobes = even_cells(CELLS)
+    spacing = np.sqrt(np.median(solid_angle))
     light = Light(lobes.axis, np.log(lobes.sharpness), np.ones((CELLS, 3)), np.zeros(1))
     light = light.with_log_radiance(np.tile(np.log(np.maximum(mean, DARK * mean.mean()))[:, None], CELLS))
     for number in range(SPLITTINGS + 1):
         if number:
             light = light.split(light.brightest(SPLIT, 2 * FINEST * spacing))
         response = np.exp(-0.5 * light.sharpness * squared_distances(directions, light.axis)).astype(np.float32)
-        covered, weight = response.T @ solid_angle.astype(np.float32), light.weight.astype(np.float32)
+        covered = response.T @ solid_angle.astype(np.float32)
+        weight = light.weight.astype(np.float32)
+        # Richardson–Lucy iterations, (1)
         for _ in range(ITERATIONS if number == SPLITTINGS else BETWEEN):
             weight *= response.T @ (energy_of / (response @ weight)) / np.maximum(covered, LEAST)[:, None]
         light = msgspec.structs.replace(light, weight=weight.astype(float))
@@ -109,11 +130,15 @@ def known_light(
 
 
 def light_of_map(lat_long: Float[np.ndarray, "h w 3"]) -> Light:
-    """The light of a map in the layout of the exported ones, in the frame that these are turned from; known but for one factor."""
+    """Return the light of a lat-long map, known up to one factor.
+
+    The map has the layout of the exported ones.  The light is in the frame that these are turned from.
+    """
     height, width = lat_long.shape[:2]
     rows = min(height, ROWS)
     first = [-(-np.arange(count) * size // count) for count, size in ((rows, height), (2 * rows, width))]
     angle = np.repeat(lat_long_solid_angles(height, width)[:, None], width, axis=1)
+    # radiance averaged over blocks of texels, weighted by solid angle
     sums = (angle[..., None] * lat_long, angle[..., None])
     energy, angle = (np.add.reduceat(np.add.reduceat(of, first[0], axis=0), first[1], axis=1) for of in sums)
     directions = (lat_long_directions(rows, 2 * rows) @ YUP_FROM_CAMERA).reshape(-1, 3)
@@ -122,17 +147,25 @@ def light_of_map(lat_long: Float[np.ndarray, "h w 3"]) -> Light:
 
 
 def light_of_ball(seen: Observations, specular: Float[np.ndarray, "3"], rotation: Float[np.ndarray, "3 3"]) -> Light:
-    """The light that a mirror ball shows, of whose k_d nothing is left, in the radiance of its photo.
+    """Return the light that a mirror ball shows, in the radiance of its photo.
 
-    seen: its pixels;  specular: its k_s;  rotation: light_from_camera.  What shows another object, or is clipped, tells nothing.  All
-    pixels of a ball stand for the same solid angle, for its picture is an equal-area projection of the sphere (from afar).
+    The ball's diffuse reflectance is neglected.  All its pixels stand for the same solid angle, because from afar the
+    picture of a mirror ball is an equal-area projection of the sphere.  Pixels that are clipped or that mirror another
+    object are not used.
+
+    Args:
+        seen: Observations of the ball.
+        specular: k_s of the ball.
+        rotation: light_from_camera.
     """
     mirror = mirror_directions(seen.normal.astype(float), seen.view.astype(float))
     weight = seen.weight / np.maximum(1.0 if seen.confidence is None else seen.confidence, LEAST)
     usable = ~seen.clipped.any(1)
+    # keep pixels whose mirrored direction is not hidden by another object
     if seen.visibility is not None:
         nearest = np.argmax(mirror @ fibonacci_sphere(seen.visibility.shape[1]).T, axis=1)
         usable &= seen.visibility[np.arange(len(seen)), nearest] == 255
+    # equal-area projection: solid angle in proportion to pixels
     angle = 4 * np.pi * weight / weight.sum()
     return known_light(mirror[usable] @ rotation.T, seen.radiance[usable] / specular, angle[usable])
 
@@ -144,12 +177,21 @@ def what_is_known(
     seen: Observations,
     photos: Mapping[str, LightSlice],
 ) -> tuple[Observations, Known]:
-    """The observations `seen` without those of mirror balls, and what the solver holds.
+    """Return the observations without mirror balls, and the known values that the solver holds fixed.
 
-    maps: by illumination;  shown: all usable pixels of the photo of each illumination's ball, at one exposure;  photos: the light of each.
-    Raises InputError where nothing shows what is known.
+    Args:
+        given: Known values in dataset.yaml.
+        maps: Lat-long maps by illumination.
+        shown: All usable pixels of each ball's photo, at one exposure, by illumination.
+        seen: Observations.
+        photos: Illumination of each photo.
+
+    Raises:
+        InputError: If no observation shows a known material, or a ball's photo shows too little of the ball or nothing
+            else.
     """
-    number, chrome = list(seen.materials).index, {ball.material for ball in given.balls.values()}
+    number = list(seen.materials).index
+    chrome = {ball.material for ball in given.balls.values()}
     for name in given.materials:
         if not (seen.material == number(name)).any():
             cure = "look at its mask and at the overlays of `align`: both must show it at the same place"
@@ -162,10 +204,15 @@ def what_is_known(
     }
     lights = {name: light_of_map(lat_long) for name, lat_long in maps.items()}
     for name, ball in given.balls.items():
-        m, of_photo = number(ball.material), seen.photo == seen.photos.index(ball.photo)
-        pixels, rest = shown[name].take(shown[name].material == m), ~(of_photo & (seen.material == m))
+        m = number(ball.material)
+        of_photo = seen.photo == seen.photos.index(ball.photo)
+        pixels = shown[name].take(shown[name].material == m)
+        rest = ~(of_photo & (seen.material == m))
         if len(pixels) < LEAST_OF_A_BALL or not (of_photo & rest).any():
-            fault = f"photo '{ball.photo}' shows {len(pixels)} pixels of the ball, and {(of_photo & rest).sum()} observations of other objects"
+            fault = (
+                f"photo '{ball.photo}' shows {len(pixels)} pixels of the ball, "
+                f"and {(of_photo & rest).sum()} observations of other objects"
+            )
             cure = f"the ball needs {LEAST_OF_A_BALL}, and something beside it: look at the overlay of `align`"
             raise InputError(fault, key=f"known.illumination.{name}.chrome", cure=cure)
         world = photos[ball.photo].world_from_camera

@@ -1,29 +1,34 @@
-"""The marginal likelihood of the materials, the lights integrated out: one illumination's part of it, and its normal equations.
+"""Marginal likelihood of the materials with the lights integrated out, and its normal equations, for one illumination.
 
-A light is u, log radiance on cells; its prior is Gaussian with mean 0 and precision Q (`factorlib.light.prior`).  Observations are those of
-the forward model, with residuals r in σ of the noise model.  Neighbours' residuals err alike, so a squared residual counts as 1/T of one
-(`factorlib.inference.fit`).  Minus twice the log posterior of a light is
+A light is u, log radiance on cells, with a Gaussian prior of mean 0 and precision Q (`factorlib.light.prior`).  The
+forward model gives residuals r in σ of the noise model.  Neighbouring residuals are correlated, so a squared residual
+counts as 1/T of one (`factorlib.inference.fit`).  Minus twice the log posterior of a light is
 
-    φ(u; θ) = Σ ρ(r)/T + uᵀ Q u,
+    φ(u; θ) = Σ ρ(r)/T + uᵀ Q u.
 
-and with the light integrated out (Laplace's approximation about the minimising u) minus twice the log marginal likelihood of θ is
+Laplace's approximation about the minimising u integrates the light out.  Minus twice the log marginal likelihood of θ
+is then
 
     φ(u; θ) + log det H − log det Q,        H = JᵀJ/T + Q,     J = ∂r/∂u                                            (1)
 
-up to a constant.  In J, rows are weighted by the robust loss, and those of clipped channels that are bright enough are nil.  Without the determinant, light and materials are ambiguous in a way that always favours the light of least contrast and
-the materials of least roughness, as blind deconvolution favours no blur (Levin et al. 2009, "Understanding and evaluating blind
-deconvolution algorithms").  Of a radiance that is linear in w ∝ exp(u), ∂J/∂θ and ∂J/∂u are known exactly, and with Σ = H⁻¹
+up to a constant.  The rows of J are weighted by the robust loss, and those of clipped channels that are bright enough
+are zero.  Without the determinant, light and materials are ambiguous.  The ambiguity then always favours the light of
+least contrast and the materials of least roughness, as blind deconvolution favours no blur (Levin et al. 2009,
+"Understanding and evaluating blind deconvolution algorithms").  Radiance is linear in w ∝ exp(u), so ∂J/∂θ and ∂J/∂u
+are known exactly.  With Σ = H⁻¹
 
-    ½ ∂ log det H/∂θ = Σ_i J_i Σ (∂J_i/∂θ)ᵀ / T,      ½ ∂ log det H/∂u_j = Σ_i (J_i Σ)_j J_ij / T.               (2)
+    ½ ∂ log det H/∂θ = Σ_i J_i Σ (∂J_i/∂θ)ᵀ / T,      ½ ∂ log det H/∂u_j = Σ_i (J_i Σ)_j J_ij / T.                  (2)
 
-The second is felt by materials through the light that they imply, du/dθ = −L⁻¹Cᵀ (`factorlib.inference.arrow`).  Left out, it would
-push all reflectances down: a brighter light under darker materials has the same J.  The Gauss–Newton Hessian Σ_i ∂J_i Σ ∂J_iᵀ of the first
-steers the steps of a descent and nothing else, so every `SPARSE`-th row stands for its neighbours.
+The second acts on materials through the light that they imply, du/dθ = −L⁻¹Cᵀ (`factorlib.inference.arrow`).  Without
+it, all reflectances would fall: a brighter light under darker materials has the same J.  The Gauss–Newton Hessian of
+the first, Σ_i ∂J_i Σ ∂J_iᵀ, only steers the steps of a descent.  Every `SPARSE`-th row therefore stands for its
+neighbours.
 
-Materials enter as log k_d, log k_s (RGB each) and roughness: 7 unknowns θ each.  Exposures and tone exponents belong to the light's block
-but are not integrated out: they have wide Gaussians about 0.
+Materials enter as log k_d, log k_s (RGB each) and roughness, 7 unknowns θ each.  Exposures and tone exponents belong to
+the light's block but are not integrated out.  They have wide Gaussian priors about 0.
 
-Cells whose radiance is known (`Light.held`) have no part in u of (1) and (2): Q is then that of the others, given those.
+Cells of known radiance (`Light.held`) are not part of u in (1) and (2).  Q is then the precision of the other cells,
+given the held ones.
 """
 
 from __future__ import annotations
@@ -44,16 +49,22 @@ from factorlib.inference.materials import Materials
 from factorlib.inference.noise import Loss
 from factorlib.light.prior import LightPrior
 
-SPARSE = 8  # rows of which one enters the Hessian of the determinant
-EXPOSURE, TONE = 3.0, 0.3  # standard deviations of a log exposure and of a log tone exponent
+SPARSE = 8  # one row in so many enters the Hessian of the determinant
+EXPOSURE = 3.0  # standard deviation of a log exposure
+TONE = 0.3  # standard deviation of a log tone exponent
 
 
 class LightLikelihood(msgspec.Struct, frozen=True):
-    """Likelihood of one light's observations and prior of that light, and how much either counts.
+    """Likelihood of one light's observations with the prior of that light.
 
-    illumination  with its table;  prior: on its light;  log_peaks: of its cells
-    precision     Q, channel by channel, with its log determinant
-    temperature   T;  loss: ρ
+    Attributes:
+        illumination: Observations and light, with its table of responses.
+        prior: Prior on the light.
+        log_peaks: Log of the cells' weights at radiance 1.
+        precision: Q, channel by channel, over all cells and suns.
+        log_determinant: log det Q of the free cells and suns.
+        temperature: T, which divides squared residuals.
+        loss: Robust loss ρ.
     """
 
     illumination: Illumination
@@ -66,11 +77,11 @@ class LightLikelihood(msgspec.Struct, frozen=True):
 
     @property
     def light(self) -> Light:
-        """Return the light of which this is the likelihood."""
+        """Light of this likelihood."""
         return self.illumination.light
 
     def at(self, light: Light | None = None, materials: Materials | None = None) -> LightLikelihood:
-        """Return the same likelihood elsewhere, with the table as it is."""
+        """Return the same likelihood at another light or other materials, with the same table."""
         one = self.illumination
         moved = msgspec.structs.replace(one, light=light or one.light, materials=materials or one.materials)
         return msgspec.structs.replace(self, illumination=moved)
@@ -82,22 +93,34 @@ class LightLikelihood(msgspec.Struct, frozen=True):
         return Gradient(data.value + value, data.by_materials, data.by_light + slope)
 
     def normal_equations(self, materials_given: bool = False, clusters: Int[np.ndarray, " n"] | None = None) -> System:
-        """Return the value of (1), or of φ where materials are given, and its normal equations.
+        """Return the value of (1) and its normal equations.
 
         The first 3p unknowns of the light are u.
-        materials_given: no derivative of the determinants, which take most of the time, is in the system
-        clusters: number of each observation's cluster, from 0, for `System.scores`
+
+        Args:
+            materials_given: True to return φ instead of (1), without the costly derivatives of the determinants.
+            clusters: Number of each observation's cluster, from 0, for `System.scores`.
         """
-        one, T = self.illumination, self.temperature
-        shown, light, p = one.shown(), one.light, int(one.light.free.sum())
+        one = self.illumination
+        T = self.temperature
+        shown = one.shown()
+        light = one.light
+        p = int(one.light.free.sum())
         places = (7 * np.unique(one.block.material)[:, None] + np.arange(7)).reshape(-1)
-        k, size = len(places), light.unknowns
+        k = len(places)
+        size = light.unknowns
         value, g_l = self._prior()
-        g_m, M, C, L = np.zeros(k), np.zeros((k, k)), np.zeros((k, size)), self._prior_hessian()
+        g_m = np.zeros(k)
+        M = np.zeros((k, k))
+        C = np.zeros((k, size))
+        L = self._prior_hessian()
         scores = None if clusters is None else np.zeros((int(clusters.max(initial=-1)) + 1, k + size))
-        parts, photos = list(one.linearise(shown, self.loss, T)), slice(3 * p, size)
-        for part in parts:  # H = JᵀJ/T + Q, block by block
-            own, at = slice(part.channel * p, (part.channel + 1) * p), np.searchsorted(places, part.places)
+        parts = list(one.linearise(shown, self.loss, T))
+        photos = slice(3 * p, size)
+        # H = JᵀJ/T + Q, (1), block by block: L = H of the light, M of the materials, C between them
+        for part in parts:
+            own = slice(part.channel * p, (part.channel + 1) * p)
+            at = np.searchsorted(places, part.places)
             J = part.diffuse + part.specular
             L[own, own] += gram(J)
             g_l[own] += J.T @ part.residual
@@ -111,14 +134,15 @@ class LightLikelihood(msgspec.Struct, frozen=True):
                 towards = part.by_photo.T @ J
                 L[photos, own] += towards
                 L[own, photos] += towards.T
-            if clusters is not None and scores is not None:  # a cluster's sum of slopes, each times its residual
+            if clusters is not None and scores is not None:  # sum over a cluster of each derivative times its residual
                 summing = (clusters[part.rows] == np.arange(len(scores))[:, None]) * part.residual
                 scores[:, at] += summing @ part.by_material
                 scores[:, k + own.start : k + own.stop] += summing @ J
                 scores[:, k + 3 * p :] += summing @ part.by_photo
         residual = one.block.residuals(shown.radiance)
         loss = float(self.loss.of_residuals(residual)[~one.block.held_out].sum())
-        factor, determinant = factorised(L), (np.zeros(k), np.zeros((k, k)), np.zeros(size))
+        factor = factorised(L)
+        determinant = (np.zeros(k), np.zeros((k, k)), np.zeros(size))
         value += loss / T
         if not materials_given:
             value += self._determinants(factor)
@@ -126,30 +150,34 @@ class LightLikelihood(msgspec.Struct, frozen=True):
         return System(value, loss, places, g_m, M, g_l, C, L, factor, *determinant, scores)
 
     def marginal(self, system: System) -> float:
-        """Return the value of (1) at a minimum of φ whose system was made with the materials given."""
+        """Return the value of (1) at a minimum of φ, from a system made with the materials given."""
         return system.value + self._determinants(system.factor)
 
     def _determinants(self, factor: Float[np.ndarray, "l l"]) -> float:
-        """log det H − log det Q."""
+        """Return log det H − log det Q."""
         p = 3 * int(self.light.free.sum())
         return 2 * float(np.log(np.diag(factor)[:p]).sum()) - self.log_determinant
 
     def _prior(self) -> tuple[float, Float[np.ndarray, " l"]]:
-        """uᵀQu and the Gaussians of exposures and tones, and half the gradient."""
+        """Return uᵀQu plus the Gaussian priors of exposures and tones, and half the gradient."""
         light = self.light
         u = (np.log(np.maximum(light.weight.T, DARKEST)) - self.log_peaks).reshape(-1)
         others, width = self._others()
-        slope, free = self.precision @ u, np.tile(light.free, 3)
+        slope = self.precision @ u
+        free = np.tile(light.free, 3)
         gradient = [slope[free], others / width**2]
-        if light.scale_free:  # one step of all held cells
+        if light.scale_free:  # the derivative of all held cells together
             gradient.append(slope[~free].sum(keepdims=True))
         return float(u @ slope + np.sum((others / width) ** 2)), np.concatenate(gradient)
 
     def _prior_hessian(self) -> Float[np.ndarray, "l l"]:
-        """Half the Hessian of `_prior`."""
-        light, Q = self.light, self.precision
-        free, (_, width) = np.tile(light.free, 3), self._others()
-        p, hessian = int(free.sum()), np.zeros((light.unknowns, light.unknowns))
+        """Return half the Hessian of `_prior`."""
+        light = self.light
+        Q = self.precision
+        free = np.tile(light.free, 3)
+        _, width = self._others()
+        p = int(free.sum())
+        hessian = np.zeros((light.unknowns, light.unknowns))
         hessian[:p, :p] = Q if free.all() else Q[np.ix_(free, free)]
         hessian[range(p, p + len(width)), range(p, p + len(width))] = width**-2
         if light.scale_free:
@@ -159,7 +187,7 @@ class LightLikelihood(msgspec.Struct, frozen=True):
         return hessian
 
     def _others(self) -> tuple[Float[np.ndarray, " q"], Float[np.ndarray, " q"]]:
-        """Log exposures and log tone exponents that are to be found, and their standard deviations."""
+        """Return the free log exposures and log tone exponents, and their standard deviations."""
         light = self.light
         others = [light.log_exposure[len(light.log_exposure) - light.free_exposures :], light.log_tone]
         return np.concatenate(others), np.repeat([EXPOSURE, TONE], [light.free_exposures, len(light.log_tone)])
@@ -168,11 +196,22 @@ class LightLikelihood(msgspec.Struct, frozen=True):
 def _of_determinants(
     parts: Sequence[Linearised], covariance: Float[np.ndarray, "3p 3p"], places: Int[np.ndarray, " k"], size: int
 ) -> tuple[Float[np.ndarray, " k"], Float[np.ndarray, "k k"], Float[np.ndarray, " l"]]:
-    """Equation (2) of all channels and materials: the first, its Hessian, the second; places: of the materials' unknowns."""
-    k, p = len(places), len(covariance) // 3
-    by_materials, by_materials_twice, by_light = np.zeros(k), np.zeros((k, k)), np.zeros(size)
+    """Return (2) summed over channels and materials: the first part, its Hessian, and the second part.
+
+    Args:
+        parts: Linearised observations by channel and material.
+        covariance: Σ of u.
+        places: Indices of the k material unknowns.
+        size: Number of the light's unknowns.
+    """
+    k = len(places)
+    p = len(covariance) // 3
+    by_materials = np.zeros(k)
+    by_materials_twice = np.zeros((k, k))
+    by_light = np.zeros(size)
     for part in parts:
-        own, at = slice(part.channel * p, (part.channel + 1) * p), np.searchsorted(places, part.places)
+        own = slice(part.channel * p, (part.channel + 1) * p)
+        at = np.searchsorted(places, part.places)
         gradient, hessian, by_cells = _of_determinant(part, covariance[own, own].astype(np.float32))
         by_materials[at] += gradient
         by_materials_twice[np.ix_(at, at)] += hessian
@@ -183,8 +222,13 @@ def _of_determinants(
 def _of_determinant(
     part: Linearised, covariance: Float[np.ndarray, "p p"]
 ) -> tuple[list[float], Float[np.ndarray, "3 3"], Float[np.ndarray, " p"]]:
-    """Equation (2) of one channel of one material: the first, its Hessian, the second; ∂J/∂log k_d and ∂J/∂log k_s are the two parts of J."""
-    slopes, J = (part.diffuse, part.specular, part.by_roughness), part.diffuse + part.specular
+    """Return (2) of one channel of one material: the first part, its Hessian, and the second part.
+
+    ∂J/∂log k_d and ∂J/∂log k_s are the two parts of J.
+    """
+    # J Σ, and ∂J by the three material unknowns; every SPARSE-th row for the Hessian
+    slopes = (part.diffuse, part.specular, part.by_roughness)
+    J = part.diffuse + part.specular
     spread = J @ covariance
     few = [slope[::SPARSE] for slope in slopes]
     many = len(spread) / max(len(few[0]), 1)
@@ -193,7 +237,7 @@ def _of_determinant(
 
 
 def gram(J: Float[np.ndarray, "n p"]) -> Float[np.ndarray, "p p"]:
-    """Return JᵀJ, of which BLAS computes one triangle."""
+    """Return JᵀJ; BLAS computes one triangle of it."""
     lower = ssyrk(1.0, J.T, lower=1)
     return lower + np.tril(lower, -1).T
 
@@ -201,7 +245,8 @@ def gram(J: Float[np.ndarray, "n p"]) -> Float[np.ndarray, "p p"]:
 def factorised(matrix: Float[np.ndarray, "n n"]) -> Float[np.ndarray, "n n"]:
     """Return the lower Cholesky factor of a symmetric positive definite matrix.
 
-    Raises LinAlgError where it is not positive definite, or not a number.
+    Raises:
+        LinAlgError: If the matrix is not positive definite, or not finite.
     """
     if not len(matrix):
         return matrix
@@ -212,7 +257,7 @@ def factorised(matrix: Float[np.ndarray, "n n"]) -> Float[np.ndarray, "n n"]:
 
 
 def inverse_of(factor: Float[np.ndarray, "n n"]) -> Float[np.ndarray, "n n"]:
-    """Return the inverse of the matrix whose lower Cholesky factor this is, exactly symmetric.
+    """Return the inverse of the matrix whose lower Cholesky factor is given, exactly symmetric.
 
     >>> inverse_of(factorised(np.array([[4.0, 0.0], [0.0, 0.25]]))).tolist()
     [[0.25, 0.0], [0.0, 4.0]]

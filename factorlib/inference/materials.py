@@ -1,4 +1,4 @@
-"""The unknowns: materials with their ranges, and points, which are materials and lights."""
+"""Unknowns of the joint problem: materials with their ranges, and points of materials and lights."""
 
 from __future__ import annotations
 
@@ -10,16 +10,20 @@ from jaxtyping import Float
 
 from factorlib.inference.lights import Light
 
-ROUGHNESS = (0.1, 1.0)  # the operators' domain
-SHARPNESS = (
-    0.1,
-    2000.0,
-)  # λ of the paper's lobes: from nearly constant to 1.3° wide, about a texel of the exported map
+ROUGHNESS = (0.1, 1.0)  # range of roughness, the domain of the operators
+# Range of λ of the paper's lobes: from nearly constant to 1.3° wide, about a texel of the exported map.
+SHARPNESS = (0.1, 2000.0)
 LEAST_REFLECTANCE = 1e-5  # keeps a black material inside its bounds
 
 
 class Materials(msgspec.Struct, frozen=True):
-    """m materials; diffuse and specular reflectance per channel, GGX roughness (α = roughness²)."""
+    """Set of m materials.
+
+    Attributes:
+        diffuse: k_d per channel.
+        specular: k_s per channel.
+        roughness: GGX roughness, α = roughness².
+    """
 
     diffuse: Float[np.ndarray, "m 3"]
     specular: Float[np.ndarray, "m 3"]
@@ -29,32 +33,32 @@ class Materials(msgspec.Struct, frozen=True):
         return len(self.roughness)
 
     def vector(self) -> Float[np.ndarray, " 7m"]:
-        """Seven unknowns a material: diffuse RGB, specular RGB, roughness."""
+        """Return seven unknowns a material: diffuse RGB, specular RGB, roughness."""
         return np.column_stack([self.diffuse, self.specular, self.roughness]).reshape(-1)
 
     def rows(self) -> Float[np.ndarray, "m 7"]:
-        """The unknowns, one material a row; a copy."""
+        """Return a copy of the unknowns, one material a row."""
         return self.vector().reshape(-1, 7)
 
     @staticmethod
     def of_rows(rows: Float[np.ndarray, "m 7"]) -> Materials:
-        """The inverse of `rows`."""
+        """Return the materials with these rows of unknowns."""
         return Materials(rows[:, :3], rows[:, 3:6], rows[:, 6])
 
     @staticmethod
     def of_vector(vector: Float[np.ndarray, " 7m"]) -> Materials:
-        """The nearest materials within bounds."""
+        """Return the nearest materials within bounds."""
         rows = vector.reshape(-1, 7)
         reflectance = np.maximum(rows[:, :6], LEAST_REFLECTANCE)
         return Materials(reflectance[:, :3], reflectance[:, 3:], np.clip(rows[:, 6], *ROUGHNESS))
 
 
 class Point(msgspec.Struct, frozen=True):
-    """The materials of a problem, and one light for each of its blocks, in their order."""
+    """Materials of a problem, and one light for each of its blocks, in their order."""
 
     materials: Materials
     lights: list[Light]
 
     def restricted(self, lights: Sequence[int]) -> Point:
-        """The same materials, with the lights of numbers `lights` alone."""
+        """Return the same materials with the selected lights alone."""
         return Point(self.materials, [self.lights[k] for k in lights])

@@ -1,13 +1,13 @@
-"""How much of the shading an answer leaves unexplained, and how many values are clipped: by photo, and of the whole set.
+"""Share of the shading that an answer leaves unexplained, and share of clipped values, by photo and for the whole set.
 
-Noise varies from pixel to pixel.  What a wrong mesh, mask, label or tone curve leaves is alike among neighbours.  Let a group g be the n_g observations
-of one material in one photo that mirror one region of the light, with sure normals and nothing clipped.  Of values x, over the mean radiance of the material in
-the photo,
+Noise varies from pixel to pixel.  Errors of a wrong mesh, mask, label or tone curve are correlated among neighbours.  A
+group g holds the n_g observations of one material in one photo that mirror one region of the light, with reliable
+normals and nothing clipped.  Values x are relative to the mean radiance of the material in the photo.  Their energy
+without independent noise, over all channels, is
 
-    E(x) = Σ_g n_g max(mean_g(x)² − s_g²(x)/n_g, 0),     s_g² the variance in the group                                 (1)
+    E(x) = Σ_g n_g max(mean_g(x)² − s_g²(x)/n_g, 0),     s_g² the variance in the group                              (1)
 
-is their energy without what varies from one observation to the next, over all channels.  With r what the answer leaves, and v the radiance less its mean,
-E(r) / E(v) is the unexplained share.
+The unexplained share is E(r) / E(v), with r the residual of the answer and v the radiance minus its mean.
 """
 
 from __future__ import annotations
@@ -23,14 +23,15 @@ from factorlib.inference.problem import JointProblem
 from factorlib.results.materials import Misfit
 
 REGION = 0.3  # side of the cells of mirror directions, about 17°
-SURE = 0.3  # least confidence of a normal
-LEAST = 4  # observations of a group
-MOST = 3.0  # of an unexplained share: more says no more
+SURE = 0.3  # least confidence of a normal, exclusive
+LEAST = 4  # least number of observations in a group
+MOST = 3.0  # upper limit of an unexplained share
 
 
 def misfit(problem: JointProblem, radiance: Sequence[Float[np.ndarray, "n 3"]]) -> tuple[float, dict[str, Misfit]]:
-    """Return the unexplained share of the whole set, and by photo that share and the share of clipped values."""
-    energies, clipped = {}, {}
+    """Return the unexplained share of the whole set, and unexplained and clipped shares by photo."""
+    energies = {}
+    clipped = {}
     for block, shown in zip(problem.blocks, radiance, strict=True):
         for number, photo in enumerate(block.photos):
             own = block.photo == number
@@ -43,7 +44,7 @@ def misfit(problem: JointProblem, radiance: Sequence[Float[np.ndarray, "n 3"]]) 
 def _energies(
     block: Block, shown: Float[np.ndarray, "n 3"], own: Bool[np.ndarray, " n"]
 ) -> Iterator[tuple[float, float]]:
-    """E(r) and E(v) of each material in a photo."""
+    """Yield E(r) and E(v) of each material in a photo."""
     sure = own & ~block.clipped.any(1) & (True if block.confidence is None else block.confidence > SURE)
     for material in np.unique(block.material[sure]):
         rows = sure & (block.material == material)
@@ -51,12 +52,13 @@ def _energies(
         group = np.unique(mirror_cells(block.normal[rows], block.view[rows], REGION), return_inverse=True)[1].reshape(
             -1
         )
-        left, whole = (block.radiance[rows] - shown[rows]) / mean, block.radiance[rows] / mean - 1
+        left = (block.radiance[rows] - shown[rows]) / mean
+        whole = block.radiance[rows] / mean - 1
         yield energy(left, group), energy(whole, group)
 
 
 def energy(values: Float[np.ndarray, "n 3"], group: Int[np.ndarray, " n"]) -> float:
-    """E of (1); groups of fewer than `LEAST` have no say.
+    """Return E of (1); groups of fewer than `LEAST` observations are left out.
 
     >>> alike, noise = np.full((8, 3), 0.1), np.tile([[0.1], [-0.1]], (4, 3))
     >>> round(energy(alike, np.zeros(8, int)), 9), energy(noise, np.zeros(8, int))
@@ -65,6 +67,7 @@ def energy(values: Float[np.ndarray, "n 3"], group: Int[np.ndarray, " n"]) -> fl
     count = np.bincount(group).astype(float)
     total = 0.0
     for of in values.T:
+        # mean and s² of each group, then n max(mean² − s²/n, 0)
         mean = np.bincount(group, of) / count
         variance = np.bincount(group, (of - mean[group]) ** 2) / np.maximum(count - 1, 1)
         total += float(np.sum((count * np.maximum(mean**2 - variance / count, 0))[count >= LEAST]))
@@ -72,4 +75,5 @@ def energy(values: Float[np.ndarray, "n 3"], group: Int[np.ndarray, " n"]) -> fl
 
 
 def _share(left: float, whole: float) -> float:
+    """Return the ratio of two energies, at most `MOST`, rounded to nine digits."""
     return round(float(min(left / max(whole, 1e-12), MOST)), 9) if left > 0 else 0.0

@@ -1,16 +1,18 @@
-"""Choices of the model that a scene needs, made in the model that gives the answer.
+"""Model choices that a scene needs, made in the model that gives the answer.
 
-    effects   nothing, shadows of the given meshes, or shadows and the light that surfaces send each other: on fewer observations and
-              cells, the first is fitted from every start, the others from where it ended.  Shadows stay unless the evidence is against them, bounces need evidence and shadows
-    tone      exponents of tone curves are freed for all photos, and kept where evidence is for them, where the loss without them is more
-              than `CURVED_GAIN` higher, and where they end within what cameras do: an exponent also fits some errors of the rest of
-              the model, such as normals
-    distance  of `CURVATURES` the one with which held-out observations are explained best, where evidence is for it; else a light is
-              infinitely far away
-    roughness where there are few materials, the start decides in which local minimum a fit ends: a smooth surface in a soft light looks like a
-              rough one in a sharp light.  Of the fits from several starts, the one of least held-out loss goes on
+effects     No shadows, shadows of the given meshes, or shadows with interreflection, on fewer observations and cells.
+            The first model is fitted from every start, the others from its result.  Shadows stay unless the evidence is
+            against them.  Interreflection needs evidence and shadows.
+tone        Exponents of tone curves are freed for all photos.  A light keeps its curves under three conditions: the
+            evidence supports them, the loss without them is more than `CURVED_GAIN` higher, and they end within the
+            range of real cameras.  An exponent also fits some errors of the rest of the model, such as wrong normals.
+distance    A light gets the curvature of `CURVATURES` that explains held-out observations best, if the evidence
+            supports it.  Otherwise the light is infinitely far away.
+roughness   With few materials, the start decides which local minimum a fit reaches: a smooth surface in soft light
+            looks like a rough one in sharp light.  Of the fits from several starts, the one of least held-out loss
+            continues.
 
-All but the last by `factorlib.inference.evidence`, on observations whose normals are sure.
+All choices but the last use `factorlib.inference.evidence`, on observations with reliable normals.
 """
 
 from __future__ import annotations
@@ -26,74 +28,90 @@ from factorlib.inference.options import Choices
 from factorlib.inference.problem import JointProblem
 from factorlib.results.materials import Decision
 
-TRIAL_OBSERVATIONS, TRIAL_CELLS = 1000, 180  # of a light, while models are compared
+# Observations and cells of a light in comparisons of models.
+TRIAL_OBSERVATIONS = 1000
+TRIAL_CELLS = 180
 TRIAL = Schedule(lights=3, together=(6, 4))
 AGAIN = Schedule(lights=2, together=(4, 2), estimate=False)
 CURVED = Schedule(together=(8,), estimate=False)
-# Of the held-out loss.  By two standard errors alone a photo whose pose is wrong got a curve (margin 3.0, captured set of seed 7), and k_d was
-# 30 % wrong instead of 13 %.
+# Least relative gain of the held-out loss.  Under two standard errors alone, a photo with a wrong pose got a curve
+# (margin 3.0, captured set of seed 7), and k_d was 30 % wrong instead of 13 %.
 CURVED_GAIN = 0.25
-NEARER_FROM = 1.0  # standard errors: from here on a light comes nearer, and at `FOR` it is as near as was found
-# Of lights that are 20, 10 and 5 RMS distances away: a chair's points are .4 m from their middle, a room's walls and lamps 2 to 8 m.
+NEARER_FROM = 1.0  # standard errors from which a light comes nearer; at `FOR` it has its estimated distance
+# Curvatures of lights 20, 10 and 5 RMS distances away.  A chair's points are 0.4 m from their centre, and a room's
+# walls and lamps 2 to 8 m.
 CURVATURES = (0.05, 0.1, 0.2)
 NEARER = Schedule(lights=2, together=(2,), estimate=False)
-MORE, MUCH = 8, 0.2  # times as many observations, and the gain of the first splitting from which they are asked for
-WORTH = 0.05  # of the held-out loss; after a splitting that gained 3 %, two more gained 3.6 and 1 % on data/eames, materials no better
+MORE = 8  # factor on the number of observations
+MUCH = 0.2  # least relative gain of the first splitting for that factor
+# Least relative gain of a splitting for another one.  After a splitting that gained 3 %, two more gained 3.6 and 1 % on
+# data/eames, and materials did not improve.
+WORTH = 0.05
 GIVEN = Schedule(lights=2, estimate=False, given=True)
 
-Fitting = Callable[[str, JointProblem, Fit, Schedule], Fit]  # what is fitted, to what, from where, by how many steps
+Fitting = Callable[[str, JointProblem, Fit, Schedule], Fit]  # phase, problem, start and schedule
 
 
 class Effects(msgspec.Struct, frozen=True):
-    """Which effects were chosen: the evidence for them, and the fit of the chosen model on few observations."""
+    """Chosen effects, the evidence for them, and the fit of the chosen model on few observations."""
 
     fit: Fit
     shadows: Decision
     bounces: Decision
 
     def of(self, problem: JointProblem) -> JointProblem:
-        """Return the problem with the effects that were chosen."""
+        """Return the problem under the chosen effects."""
         return problem.with_effects(self.shadows.kept, self.bounces.kept)
 
 
 class Chosen(msgspec.Struct, frozen=True):
-    """The fit that a choice ends with, and the evidence for each thing that was asked: for each light, or for each splitting."""
+    """Fit after a choice, and the evidence for each light or each splitting."""
 
     fit: Fit
     evidence: list[Decision]
 
 
 def gained(splitting: Decision, share: float) -> bool:
-    """Return whether a splitting was kept, and lowers the held-out loss by more than a share of what it comes to."""
+    """Return True if a splitting was kept and lowers the held-out loss by more than a share of the new loss."""
     gain = (splitting.held_out_loss_without or 0.0) / max(splitting.held_out_loss_with or 1.0, 1e-12) - 1
     return splitting.kept and gain > share
 
 
 def observations_of(choices: Choices, splittings: Sequence[Decision]) -> int:
-    """Return how many observations of a light are fitted: more where smaller cells explain what is held out much better.
+    """Return the number of a light's observations to fit: more where smaller cells gain much.
 
-    There errors of the model are small, and those of few observations show: k_d of data/synthetic is 13 % wrong with 1,000, 2.6 % with 4,000, 1.0 % with 8,000.
+    Errors of the model are small there, and those of few observations matter: k_d of data/synthetic is 13 % wrong with
+    1,000 observations, 2.6 % with 4,000 and 1.0 % with 8,000.
     """
     return MORE * choices.observations if splittings and gained(splittings[0], MUCH) else choices.observations
 
 
 def sample_of(problem: JointProblem, choices: Choices) -> JointProblem:
-    """The observations on which models are compared."""
+    """Return the observations on which models are compared."""
     return problem.sampled(min(TRIAL_OBSERVATIONS, choices.observations), choices.seed)
 
 
 def effects_chosen(problem: JointProblem, starts: list[Fit], choices: Choices, fit: Fitting) -> Effects:
-    """Shadows and bounces; problem: sure observations;  starts: the one that ends best is used."""
-    sample, hidden = sample_of(problem, choices), any(block.visibility is not None for block in problem.blocks)
-    # where nothing is held out, what meshes hide is hidden, and nothing further is added
+    """Choose shadows and interreflection.
+
+    Args:
+        problem: Observations with reliable normals.
+        starts: Initial fits; the best result continues.
+        choices: Options of the user.
+        fit: Function that fits a model.
+    """
+    sample = sample_of(problem, choices)
+    hidden = any(block.visibility is not None for block in problem.blocks)
+    # without held-out observations, shadows are on and interreflection is off
     unjudged = problem.none_held_out
     shadows = ("on" if unjudged else "auto") if choices.self_shadowing == "auto" else choices.self_shadowing
     bounces = ("off" if unjudged else "auto") if choices.interreflection == "auto" else choices.interreflection
-    shadows, bounces = shadows if hidden else "off", bounces if problem.has_bounces else "off"
+    shadows = shadows if hidden else "off"
+    bounces = bounces if problem.has_bounces else "off"
     tried: dict[tuple[bool, bool], tuple[Fit, Losses]] = {}
 
     def trial(with_shadows: bool, with_bounces: bool) -> tuple[Fit, Losses]:
-        """Return the fit of one model and its losses: the first from every start, the others from the best of these."""
+        """Return the fit of one model and its losses, from every start at first and then from the best result."""
         if (with_shadows, with_bounces) not in tried:
             name = "shadows and bounces" if with_bounces else "shadows" if with_shadows else "no shadows"
             model = sample.with_effects(with_shadows, with_bounces)
@@ -104,7 +122,8 @@ def effects_chosen(problem: JointProblem, starts: list[Fit], choices: Choices, f
         return tried[with_shadows, with_bounces]
 
     trial(shadows != "off", shadows != "off" and bounces == "on")
-    said, lit = Decision(shadows == "on"), Decision(bounces == "on")
+    said = Decision(shadows == "on")
+    lit = Decision(bounces == "on")
     if shadows == "auto":
         said = compare(trial(False, False)[1], trial(True, False)[1], AGAINST)
     if not said.kept:
@@ -115,14 +134,24 @@ def effects_chosen(problem: JointProblem, starts: list[Fit], choices: Choices, f
 
 
 def _geometric_mean(losses: Losses) -> float:
-    """Of the lights' mean losses, weighted by their observations: its logarithm, to six digits, so that rounding does not decide."""
+    """Return the log of the geometric mean over lights of their mean losses, weighted by observations.
+
+    It is rounded to six digits, so that rounding errors do not decide.
+    """
     counts = [len(values) for values in losses.values]
     logs = [len(values) and np.log(max(float(np.mean(values)), 1e-12)) for values in losses.values]
     return round(float(np.dot(counts, logs)) / max(sum(counts), 1), 6)
 
 
 def curves_chosen(problem: JointProblem, before: Fit, choices: Choices, fit: Fitting) -> Chosen:
-    """Tone curves; problem: sure observations, with the effects that were chosen;  before: the fit of few of them."""
+    """Choose tone curves.
+
+    Args:
+        problem: Observations with reliable normals, under the chosen effects.
+        before: Fit of few of them.
+        choices: Options of the user.
+        fit: Function that fits a model.
+    """
     lights = before.point.lights
     had = [len(light.log_tone) > 0 for light in lights]
     if choices.tone == "off" or problem.none_held_out:
@@ -146,11 +175,18 @@ def curves_chosen(problem: JointProblem, before: Fit, choices: Choices, fit: Fit
 
 
 def distances_chosen(problem: JointProblem, before: Fit, choices: Choices, fit: Fitting) -> Chosen:
-    """Distances of lights; problem: sure observations, with the effects that were chosen;  before: the fit of few of them.
+    """Choose distances of lights.
 
-    First materials and all lights are fitted at each distance: materials that were fitted in far lights make up for what is wrong with those.
-    But materials that are better in near lights explain every light better, so a light stays near only if, given these materials, it also
-    explains its observations better than a far one.  The weaker of the two answers decides how near it comes.
+    First, materials and all lights are fitted at each distance.  Materials that were fitted in far lights compensate
+    for errors of those.  Materials that are better in near lights, however, explain every light better.  A light
+    therefore stays near only if, given these materials, it also explains its observations better than a far one.  The
+    weaker of the two decisions determines its distance.
+
+    Args:
+        problem: Observations with reliable normals, under the chosen effects.
+        before: Fit of few of them.
+        choices: Options of the user.
+        fit: Function that fits a model.
     """
     lights = before.point.lights
     pairs = zip(lights, problem.blocks, strict=True)
@@ -158,10 +194,11 @@ def distances_chosen(problem: JointProblem, before: Fit, choices: Choices, fit: 
     evidence = [Decision(light.curvature > 0) for light in lights]
     if choices.distance == "off" or problem.none_held_out or all(known):
         return Chosen(before, evidence)
-    sample, asked = sample_of(problem, choices), np.flatnonzero(~np.array(known)).tolist()
+    sample = sample_of(problem, choices)
+    asked = np.flatnonzero(~np.array(known)).tolist()
 
     def fit_at(curvatures: dict[int, float], start: Fit = before, schedule: Schedule = NEARER) -> Fit:
-        """The fit in lights of these curvatures, by number."""
+        """Return the fit with lights of these curvatures, by number of the light."""
         placed = list(start.point.lights)
         for k, c in curvatures.items():
             placed[k] = msgspec.structs.replace(placed[k], curvature=c)
@@ -193,11 +230,14 @@ def distances_chosen(problem: JointProblem, before: Fit, choices: Choices, fit: 
 
 
 def believed(evidence: Decision) -> float:
-    """How far the richer model is believed: from 0 at `NEARER_FROM` standard errors to 1 at `FOR`, so that rounding does not decide."""
+    """Return the weight of the richer model, from 0 at `NEARER_FROM` standard errors to 1 at `FOR`.
+
+    It is continuous, so that rounding does not decide.
+    """
     return float(np.clip(((evidence.margin or 0.0) - NEARER_FROM) / (FOR - NEARER_FROM), 0.0, 1.0))
 
 
 def _evidence_of_light(k: int, without: Losses, richer: Losses, least: float = FOR) -> Decision:
-    """Return the evidence that light k alone gives for the richer model."""
+    """Return the evidence of light k alone for the richer model."""
     losses = [Losses([of.values[k]], [of.clusters[k]]) for of in (without, richer)]
     return compare(losses[0], losses[1], least)

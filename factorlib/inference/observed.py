@@ -1,4 +1,7 @@
-"""From the observations of all photos, as `urm` wrote them, to the data of the joint problem: one block per illumination."""
+"""Conversion of the photos' observations, as `urm` writes them, to the blocks of the joint problem.
+
+There is one block per illumination.
+"""
 
 from __future__ import annotations
 
@@ -23,11 +26,17 @@ from factorlib.urm.observations import Observations, read_observations
 Rotations = Mapping[str, Float[np.ndarray, "3 3"]]  # world_from_camera, by the name of a photo
 
 
-HELD_OUT_CELL = 0.1  # size of the cells of mirror directions that are held out together
+HELD_OUT_CELL = 0.1  # side of the cells of mirror directions that are held out together
 
 
 class PhotoObservations(msgspec.Struct, frozen=True):
-    """What one file holds: its usable observations, merged; how many it holds, and how many of those are not usable."""
+    """Usable observations of one file, merged.
+
+    Attributes:
+        merged: Merged observations.
+        count: Number of observations in the file.
+        unusable: Number of those that are not usable.
+    """
 
     merged: Observations
     count: int
@@ -37,14 +46,19 @@ class PhotoObservations(msgspec.Struct, frozen=True):
 def gathered(
     files: Sequence[Path], degrees: float, spread: Spread, surface: Path | None = None
 ) -> list[PhotoObservations]:
-    """Read each file, in this order; observations that are within `degrees` of each other are merged (`factorlib.urm.merge`).
+    """Read each file in order, and merge its observations within `degrees` of each other (`factorlib.urm.merge`).
 
-    surface: the folder of the stage `surface`, whose normals are used where it has some
+    Args:
+        files: Files of `urm`.
+        degrees: Largest angle between merged observations.
+        spread: Map over independent work.
+        surface: Folder of the stage `surface`, whose normals replace those of the mesh; None for the mesh's.
     """
     return list(spread(partial(_of_file, degrees=degrees, surface=surface), files))
 
 
 def _of_file(path: Path, degrees: float, surface: Path | None) -> PhotoObservations:
+    """Return the usable observations of one file, merged."""
     read = on_surface(read_observations(path), surface)
     seen = usable(read)
     return PhotoObservations(merge(seen, degrees), len(read), len(read) - len(seen))
@@ -58,11 +72,17 @@ def blocks_of_observations(
     world_from_camera: Rotations | None = None,
     seed: int = 0,
 ) -> list[Block]:
-    """One block per illumination, in order of names; observations that are not `usable` are dropped.
+    """Return one block per illumination, in order of names, without unusable observations.
 
-    world_from_camera: rotation of each photo whose illumination is fixed to the world
-    held_out:          share of observations kept for choosing the model
-    Raises InputError where nothing is left, or nothing but black.
+    Args:
+        observations: Observations of all photos.
+        noise: Noise model.
+        held_out: Share of the observations that select models.
+        world_from_camera: Rotation of each photo whose illumination is fixed to the world.
+        seed: Seed of the random choice of held-out cells.
+
+    Raises:
+        InputError: If no usable observation is left, or all are black.
     """
     seen = usable(observations)
     if len(seen) == 0:
@@ -81,7 +101,7 @@ def blocks_of_observations(
 
 
 def usable(observations: Observations) -> Observations:
-    """The observations whose radiance and directions are finite, whose directions are not zero, and whose weight is positive."""
+    """Return the observations with finite radiance, finite and non-zero directions, and finite positive weight."""
     vectors = np.stack([observations.radiance, observations.normal, observations.view])
     directed = (observations.normal != 0).any(1) & (observations.view != 0).any(1)
     return observations.take(
@@ -92,25 +112,32 @@ def usable(observations: Observations) -> Observations:
 def _block(
     every: Observations, rows: Int[np.ndarray, " n"], noise: Noise, share: float, rotations: Rotations, seed: int
 ) -> Block:
-    """The block of the observations `rows`, which are those of one illumination."""
-    seen, name = every.take(rows), every.illuminations[every.illumination[rows[0]]]
+    """Return the block of the observations `rows` of one illumination."""
+    seen = every.take(rows)
+    name = every.illuminations[every.illumination[rows[0]]]
     photos = sorted({seen.photos[i] for i in np.unique(seen.photo)})
     local = np.array([photos.index(p) if p in photos else -1 for p in seen.photos])[seen.photo]
+    # order by material, photo, row and column
     order = np.lexsort((seen.x, seen.y, local, seen.material))
-    seen, local = seen.take(order), local[order]
+    seen = seen.take(order)
+    local = local[order]
     turned = {photo: np.asarray(of, dtype=float) for photo, of in rotations.items() if of is not None}
     normal, view = (_in_frame(vectors, seen, turned) for vectors in (seen.normal, seen.view))
     radiance = seen.radiance.astype(float)
+    # radiance in units of the weighted mean
     unit = max(float(np.average(radiance.mean(1), weights=seen.weight)), 1e-30)
     scaled = radiance / unit
+    # whole cells of mirror directions are held out
     held_out = held_out_by_cells(mirror_cells(normal, view, HELD_OUT_CELL), seen.material, share, seed)
     visibility = directions = None
     if seen.visibility is not None and (seen.visibility < 255).any():
         sphere = fibonacci_sphere(seen.visibility.shape[1])
-        visibility, directions = seen.visibility, np.stack([sphere @ turned.get(p, np.eye(3)).T for p in photos])
+        visibility = seen.visibility
+        directions = np.stack([sphere @ turned.get(p, np.eye(3)).T for p in photos])
     bounced = bounced_light(seen, scaled)
     block = Block(
-        name, tuple(photos), unit, normal, view, scaled, seen.clipped.astype(bool), noise.precision(scaled, seen.weight),
+        name, tuple(photos), unit, normal, view, scaled,
+        seen.clipped.astype(bool), noise.precision(scaled, seen.weight),
         seen.material.astype(np.int64), local, held_out, visibility, directions,
         bounced if bounced is not None and bounced.any() else None, noise,
         None if seen.confidence is None else seen.confidence.astype(float),
@@ -122,11 +149,13 @@ def _block(
 
 
 def _in_frame(vectors: Float[np.ndarray, "n 3"], seen: Observations, rotations: Rotations) -> Float[np.ndarray, "n 3"]:
+    """Return unit vectors in the illumination's frame."""
     turned = _turned(vectors, seen, rotations)
     return turned / np.linalg.norm(turned, axis=1, keepdims=True)
 
 
 def _turned(vectors: Float[np.ndarray, "n 3"], seen: Observations, rotations: Rotations) -> Float[np.ndarray, "n 3"]:
+    """Return vectors in the illumination's frame: each photo's rotated by its world_from_camera."""
     turned = vectors.astype(float)
     for i, photo in enumerate(seen.photos):
         if photo in rotations:
@@ -137,10 +166,16 @@ def _turned(vectors: Float[np.ndarray, "n 3"], seen: Observations, rotations: Ro
 def held_out_by_cells(
     cell: Int[np.ndarray, " n"], material: Int[np.ndarray, " n"], share: float, seed: int
 ) -> Bool[np.ndarray, " n"]:
-    """Which observations are held out: all of randomly chosen cells, a `share` of the cells, but never all of a material.
+    """Return a mask of the held-out observations: all those of randomly chosen cells, but never all of a material.
 
-    Neighbouring pixels have similar errors.  If single pixels were held out, a lobe that only fits the error of a place would
+    Neighbouring pixels have similar errors.  If single pixels were held out, a lobe that only fits a local error would
     explain them as well as a lobe that the light needs.
+
+    Args:
+        cell: Number of each observation's cell.
+        material: Number of each observation's material.
+        share: Share of the cells.
+        seed: Seed of the random choice.
     """
     names, number = np.unique(cell, return_inverse=True)
     chosen = (np.random.default_rng(seed).random(len(names)) < share)[number.reshape(-1)]

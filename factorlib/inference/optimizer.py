@@ -1,17 +1,19 @@
-"""Descent of the likelihood: few factorisations, and many cheap steps on each.
+"""Optimiser of the marginal likelihood: few factorisations, and many cheap steps on each.
 
-What is minimised is minus twice the log marginal likelihood and the prior on materials,
+The objective is minus twice the log marginal likelihood plus the prior on materials,
 
-    F(u, θ) = φ(u; θ) + log det H(u; θ) + prior(θ),                                                               (1)
+    F(u, θ) = φ(u; θ) + log det H(u; θ) + prior(θ),                                                                 (1)
 
-lights u at the minimum of φ.  A gradient of φ costs n p for a light of p cells and n observations, H costs n p², its factor and the
-derivatives of its determinant p³.  So H is factorised once, at (u₀, θ₀), and L-BFGS (Nocedal 1980) with H⁻¹ as its first metric minimises
+with lights u at the minimum of φ.  For a light of p cells and n observations, a gradient of φ costs n p and H costs n
+p².  The factor of H and the derivatives of its determinant cost p³.  H is therefore factorised once, at (u₀, θ₀).
+L-BFGS (Nocedal 1980) with H⁻¹ as its initial inverse Hessian then minimises
 
-    φ(u; θ) + prior(θ) + 2 aᵀ(θ − θ₀) + (θ − θ₀)ᵀ(D + μ diag)(θ − θ₀),     a = ½ (∂/∂θ + (du/dθ)ᵀ ∂/∂u) log det H       (2)
+    φ(u; θ) + prior(θ) + 2 aᵀ(θ − θ₀) + (θ − θ₀)ᵀ(D + μ diag)(θ − θ₀),     a = ½ (∂/∂θ + (du/dθ)ᵀ ∂/∂u) log det H    (2)
 
-whose gradient is exact but for the determinant, which lags behind.  The minimum is accepted where it lowers (1); else damping μ grows and the same
-factor serves again.  Where nothing moves any more the gradient of (2) is that of (1), so the fixed point is the minimum of (1).  Lights move
-to the minimum of φ alone: a determinant that they felt would not be Laplace's.
+Its gradient is exact except for the determinant, which lags behind.  The minimum is accepted if it lowers (1).
+Otherwise the damping μ grows and the same factor serves again.  At a fixed point the gradient of (2) is that of (1), so
+it is the minimum of (1).  Lights move to the minimum of φ alone: with the determinant in their objective, the
+approximation would not be Laplace's.
 
 Given the materials, each light minimises φ by itself, in the same way.
 """
@@ -33,23 +35,38 @@ from factorlib.inference.materials import LEAST_REFLECTANCE, ROUGHNESS
 from factorlib.inference.priors import Gaussian, MaterialPrior, materials_of
 from factorlib.inference.problem import Spread
 
-MOST_CHANGE = np.array([0.7] * 6 + [0.1])  # change of a material's unknowns on one factorisation
-MOST_STEP, UPHILL = 1.5, 0.1  # change of an unknown in one cheap step; share of the slope that clipping must leave
+MOST_CHANGE = np.array([0.7] * 6 + [0.1])  # largest change of a material's unknowns on one factorisation
+MOST_STEP = 1.5  # largest change of an unknown in one cheap step
+UPHILL = 0.1  # least share of the slope that a clipped direction must keep
 LOWEST = np.array([np.log(LEAST_REFLECTANCE)] * 6 + [ROUGHNESS[0]])
 HIGHEST = np.array([np.inf] * 6 + [ROUGHNESS[1]])
-FIRST_DAMPING, LOWER, HIGHER, MOST_DAMPING = 0.1, 0.25, 8.0, 1e3
-TOLERANCE = 2e-4  # a descent ends where (1) falls by less than this share of it
-MEMORY, STEPS = 10, 12  # pairs that L-BFGS keeps, and its steps on one factorisation
-# L-BFGS ends where gᵀH⁻¹g, by which a value would still fall, is less, or this share of what it was
-DECREMENT, SHARE = 0.05, 0.02
-SUFFICIENT, SHORTEST = 1e-4, 1e-3  # of a line search: share of the slope, and of the step
+FIRST_DAMPING = 0.1  # μ after the first rejected step
+LOWER = 0.25  # factor on μ after an accepted step
+HIGHER = 8.0  # factor on μ after a rejected step
+MOST_DAMPING = 1e3  # a descent ends beyond this μ
+TOLERANCE = 2e-4  # a descent ends if (1) falls by less than this share of its value
+MEMORY = 10  # pairs of L-BFGS
+STEPS = 12  # most steps of L-BFGS on one factorisation
+# L-BFGS ends if gᵀH⁻¹g, the predicted decrease, falls below DECREMENT or below SHARE of its first value.
+DECREMENT = 0.05
+SHARE = 0.02
+SUFFICIENT = 1e-4  # least decrease in a line search, as a share of the slope
+SHORTEST = 1e-3  # a line search ends below this share of the step
 
 Report = Callable[[float], None]  # called at every factorisation, with the mean robust loss there
 Objective = Callable[[np.ndarray], tuple[float, np.ndarray]]  # value and half the gradient
 
 
 class State(NamedTuple):
-    """Unknowns, and the systems there; theta: log k_d, log k_s, roughness."""
+    """Unknowns of the materials and lights, and the normal equations there.
+
+    Attributes:
+        theta: log k_d, log k_s and roughness of m materials.
+        likelihoods: Likelihood of each light.
+        value: Objective.
+        systems: Normal equations of each light.
+        prior: Prior on the materials.
+    """
 
     theta: Float[np.ndarray, "m 7"]
     likelihoods: list[LightLikelihood]
@@ -59,7 +76,14 @@ class State(NamedTuple):
 
 
 class Descent(msgspec.Struct, frozen=True):
-    """Descent under a prior on materials.  spread: a map over lights;  free: unknowns of the materials that are not known."""
+    """Descent under a prior on materials.
+
+    Attributes:
+        prior: Prior on materials.
+        spread: Map over lights.
+        report: Called at every factorisation.
+        free: Mask of the material unknowns that are not known.
+    """
 
     prior: MaterialPrior
     spread: Spread
@@ -69,18 +93,20 @@ class Descent(msgspec.Struct, frozen=True):
     def of_lights(
         self, likelihoods: Sequence[LightLikelihood], theta: Float[np.ndarray, "m 7"], iterations: int
     ) -> State:
-        """Return the state after at most so many factorisations of each light, the materials given."""
+        """Return the state after at most `iterations` factorisations of each light, materials given."""
         fitted = list(self.spread(lambda one: light_descended(one, iterations), likelihoods))
         return self._state(theta, [one for one, _ in fitted], [system for _, system in fitted])
 
     def of_all(self, state: State, iterations: int) -> State:
-        """Return the state after at most so many factorisations, of materials and lights together."""
-        state, damping = self.at(state.likelihoods, state.theta), 0.0
+        """Return the state after at most `iterations` factorisations, of materials and lights together."""
+        state = self.at(state.likelihoods, state.theta)
+        damping = 0.0
         for _ in range(iterations):
             trial = self.at(*self._stepped(state, damping))
             gain = state.value - trial.value
             if gain > 0:
-                state, damping = trial, damping * LOWER
+                state = trial
+                damping = damping * LOWER
             if abs(gain) < TOLERANCE * abs(state.value) or damping > MOST_DAMPING:
                 break
             if gain < 0:
@@ -88,7 +114,7 @@ class Descent(msgspec.Struct, frozen=True):
         return state
 
     def at(self, likelihoods: Sequence[LightLikelihood], theta: Float[np.ndarray, "m 7"]) -> State:
-        """Return the systems of all lights at some materials, determinants included."""
+        """Return the normal equations of all lights at some materials, determinants included."""
         materials = materials_of(theta)
         moved = [one.at(materials=materials) for one in likelihoods]
         return self._state(theta, moved, list(self.spread(LightLikelihood.normal_equations, moved)))
@@ -96,6 +122,7 @@ class Descent(msgspec.Struct, frozen=True):
     def _state(
         self, theta: Float[np.ndarray, "m 7"], likelihoods: list[LightLikelihood], systems: list[System]
     ) -> State:
+        """Return the state with these systems, and report its mean robust loss."""
         prior = self.prior.at(theta)
         values = sum(3 * int((~one.illumination.block.held_out).sum()) for one in likelihoods)
         self.report(sum(system.loss for system in systems) / max(values, 1))
@@ -105,13 +132,16 @@ class Descent(msgspec.Struct, frozen=True):
         """Return lights and materials at the minimum of (2)."""
         size = state.theta.size
         by_determinant, hessian = determinant_of(state.systems, size)
+        # half the gradient of (1) by materials; unknowns at a bound that it would push outward are fixed
         gradient = state.prior.gradient + by_determinant
         for system in state.systems:
             gradient[system.places] += system.material_gradient
-        theta, outward = state.theta.reshape(-1), -gradient
+        theta = state.theta.reshape(-1)
+        outward = -gradient
         at_bound = ((theta <= np.resize(LOWEST, size)) & (outward < 0)) | (
             (theta >= np.resize(HIGHEST, size)) & (outward > 0)
         )
+        # H with D and the damping μ
         arrow = Arrow(state.systems, state.prior.hessian + hessian, self.free & ~at_bound, damping)
         penalty = hessian + damping * np.diag(arrow.diagonal)
         ends = np.cumsum([size, *(len(system.light_gradient) for system in state.systems)])[:-1]
@@ -127,7 +157,8 @@ class Descent(msgspec.Struct, frozen=True):
         def objective(step: np.ndarray) -> tuple[float, np.ndarray]:
             """Return (2) and half its gradient."""
             there, likelihoods = moved(step)
-            prior, parts = self.prior.at(there), list(self.spread(LightLikelihood.gradient, likelihoods))
+            prior = self.prior.at(there)
+            parts = list(self.spread(LightLikelihood.gradient, likelihoods))
             off = (there - state.theta).reshape(-1)
             value = prior.value + sum(part.value for part in parts) + off @ (2 * by_determinant + penalty @ off)
             slope = prior.gradient + by_determinant + penalty @ off
@@ -136,7 +167,7 @@ class Descent(msgspec.Struct, frozen=True):
             return value, np.concatenate([slope, *(part.by_light for part in parts)])
 
         def metric(slope: np.ndarray) -> np.ndarray:
-            """Return H⁻¹ of a gradient."""
+            """Return H⁻¹ times a gradient."""
             of_materials, *of_lights = np.split(slope, ends)
             step, lights = arrow.solve(of_materials, of_lights)
             return np.concatenate([step, *lights])
@@ -146,7 +177,7 @@ class Descent(msgspec.Struct, frozen=True):
 
 
 def light_descended(one: LightLikelihood, iterations: int) -> tuple[LightLikelihood, System]:
-    """Return a light at the minimum of φ, the materials given, and its system there."""
+    """Return a light at the minimum of φ, materials given, and its normal equations there."""
     system = one.normal_equations(materials_given=True)
     for _ in range(iterations):
 
@@ -156,11 +187,12 @@ def light_descended(one: LightLikelihood, iterations: int) -> tuple[LightLikelih
             return there.value, there.by_light
 
         def metric(slope: np.ndarray, factor: np.ndarray = system.factor) -> np.ndarray:
-            """Return H⁻¹ of a gradient."""
+            """Return H⁻¹ times a gradient."""
             return solved(factor, slope)
 
         step = minimised(objective, len(system.light_gradient), metric)
-        one, before = one.at(moved_light(one.light, step)), system.value
+        one = one.at(moved_light(one.light, step))
+        before = system.value
         system = one.normal_equations(materials_given=True)
         if before - system.value < TOLERANCE * abs(before):
             break
@@ -168,9 +200,11 @@ def light_descended(one: LightLikelihood, iterations: int) -> tuple[LightLikelih
 
 
 def determinant_of(systems: Sequence[System], size: int) -> tuple[Float[np.ndarray, " k"], Float[np.ndarray, "k k"]]:
-    """Return a and D of (2), of all lights."""
-    gradient, hessian = np.zeros(size), np.zeros((size, size))
+    """Return a and D of (2), summed over lights."""
+    gradient = np.zeros(size)
+    hessian = np.zeros((size, size))
     for system in systems:
+        # (du/dθ)ᵀ ∂/∂u = −C L⁻¹ ∂/∂u
         by_light = system.cross_hessian @ solved(system.factor, system.determinant_by_light)
         gradient[system.places] += system.determinant_by_materials - by_light
         P = without_factors(system.places)
@@ -179,9 +213,9 @@ def determinant_of(systems: Sequence[System], size: int) -> tuple[Float[np.ndarr
 
 
 def without_factors(places: Int[np.ndarray, " k"]) -> Float[np.ndarray, "k k"]:
-    """Return the projection that takes a factor per channel out of a step of the materials that a light shows.
+    """Return the projection that removes a factor per channel from a step of the materials of a light.
 
-    All their reflectances times a factor, and the light divided by it, have the same J, and so the same determinant.
+    J and the determinant do not change if all reflectances are multiplied by a factor and the light is divided by it.
     """
     unknown = places[:, None] % 7
     factors = (unknown == np.arange(3)) | (unknown == np.arange(3, 6))
@@ -189,7 +223,13 @@ def without_factors(places: Int[np.ndarray, " k"]) -> Float[np.ndarray, "k k"]:
 
 
 def minimised(objective: Objective, size: int, metric: Callable[[np.ndarray], np.ndarray]) -> Float[np.ndarray, " n"]:
-    """Return the step from 0 that minimises a value, by L-BFGS; metric: about the inverse of half the Hessian, times a vector."""
+    """Minimise a function by L-BFGS and return the step from 0.
+
+    Args:
+        objective: Function that returns the value and half the gradient.
+        size: Number of unknowns.
+        metric: Product of a vector with the approximate inverse of half the Hessian.
+    """
     x = np.zeros(size)
     value, gradient = objective(x)
     pairs: deque[tuple[np.ndarray, np.ndarray]] = deque(maxlen=MEMORY)
@@ -203,25 +243,29 @@ def minimised(objective: Objective, size: int, metric: Callable[[np.ndarray], np
         direction = bounded(direction, gradient)
         slope = float(gradient @ direction)
         length = 1.0
+        # backtracking line search (Armijo); the gradient is half the true one
         while length > SHORTEST:
             trial = x + length * direction
             trial_value, trial_gradient = objective(trial)
             if trial_value <= value + 2 * SUFFICIENT * length * slope:
                 break
-            # the minimum of the parabola through both values and the slope
+            # minimum of the parabola through both values and the slope
             length *= float(np.clip(-slope * length / max(trial_value - value - 2 * slope * length, 1e-300), 0.1, 0.5))
         else:
             break
         if (change := trial_gradient - gradient) @ direction > 0:
             pairs.append((trial - x, change))
-        x, value, gradient = trial, trial_value, trial_gradient
+        x = trial
+        value = trial_value
+        gradient = trial_gradient
     return x
 
 
 def bounded(direction: Float[np.ndarray, " n"], gradient: Float[np.ndarray, " n"]) -> Float[np.ndarray, " n"]:
-    """Return a direction no element of which is larger than `MOST_STEP`.
+    """Return a direction with no element larger than `MOST_STEP`.
 
-    Each is clipped by itself, for a dark cell would hold back all others; where that leads uphill or nearly so, the whole direction is scaled.
+    Each element is clipped by itself, because otherwise a dark cell would limit all others.  If clipping turns the
+    direction uphill or nearly so, the whole direction is scaled instead.
     """
     clipped = direction.clip(-MOST_STEP, MOST_STEP)
     if gradient @ clipped < UPHILL * (gradient @ direction):
@@ -232,9 +276,13 @@ def bounded(direction: Float[np.ndarray, " n"], gradient: Float[np.ndarray, " n"
 def inverse_hessian_times(gradient, pairs, metric):  # noqa: ANN001, ANN201  (arrays or tensors)
     """Return the product of L-BFGS's inverse Hessian with a gradient, by the two-loop recursion (Nocedal 1980).
 
-    pairs: steps and changes of the gradient along them;  metric: the first inverse Hessian, times a vector
+    Args:
+        gradient: Gradient, an array or a tensor.
+        pairs: Steps, and changes of the gradient along them.
+        metric: Product of the initial inverse Hessian with a vector.
     """
-    q, alphas = gradient, []
+    q = gradient
+    alphas = []
     for step, change in reversed(pairs):
         alphas.append(float(step @ q) / float(step @ change))
         q = q - alphas[-1] * change
@@ -245,7 +293,7 @@ def inverse_hessian_times(gradient, pairs, metric):  # noqa: ANN001, ANN201  (ar
 
 
 def moved_light(light: Light, step: Float[np.ndarray, " l"]) -> Light:
-    """Return the light after a step of its unknowns, tone exponents within their range."""
+    """Return the light after a step of its unknowns, with tone exponents within their range."""
     counts = 3 * int(light.free.sum()), light.free_exposures, len(light.log_tone)
     cells, exposures, tones, scale = np.split(step, np.cumsum(counts))
     brighter = np.ones((len(light), 3))

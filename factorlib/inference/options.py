@@ -1,4 +1,4 @@
-"""What a user may choose of the solvers: names, ranges, defaults and what they mean, once."""
+"""Options of the solvers: names, ranges, defaults and meanings."""
 
 from __future__ import annotations
 
@@ -11,24 +11,26 @@ Seed = Annotated[int, Meta(ge=0)]
 
 
 class Choices(Struct, frozen=True):
-    """A user may choose these of the joint solve."""
+    """Options of the joint solve."""
 
     cells: Annotated[int, Meta(ge=12, le=1600)] = 400
-    """Cells of a light before any of them splits; 400 are 10° apart."""
+    """Number of a light's cells before any of them splits; 400 cells are 10° apart."""
     splittings: Annotated[int, Meta(ge=0, le=8)] = 3
-    """How often the 24 cells of each light that hold most energy may split, each in about four; held-out observations stop it earlier."""
+    """Largest number of splittings.  Each splits the 24 cells of a light with most energy in about four; held-out
+    observations may stop it earlier."""
     observations: Annotated[int, Meta(ge=50)] = 1000
-    """Most observations of a light that are fitted, drawn from all; eight times as many where splitting explains much more."""
+    """Largest number of a light's observations that are fitted, drawn at random; eight times as many if splitting
+    gains much more."""
     self_shadowing: Literal["auto", "on", "off"] = "auto"
-    """Whether what meshes hide of the light is dark; auto: unless held-out observations are two standard errors against it."""
+    """Shadows of the meshes; auto: on, unless held-out observations are against them by two standard errors."""
     interreflection: Literal["auto", "on", "off"] = "auto"
-    """Whether surfaces that hide the light send their own, as the photo shows it, which needs self_shadowing; auto: where held-out observations are two standard
-    errors for it."""
+    """Light that surfaces send each other, as the photo shows it; needs self_shadowing.  auto: on, if held-out
+    observations support it by two standard errors."""
     tone: Literal["auto", "off"] = "auto"
-    """Whether a photo may have a tone curve beyond its encoding; auto: where held-out observations are two standard errors for one, and their
-    loss is a quarter higher without."""
+    """Tone curve of a photo beyond its encoding; auto: used if held-out observations support it by two standard errors
+    and their loss is a quarter higher without it."""
     distance: Literal["auto", "off"] = "auto"
-    """Whether a light may be at a finite distance; auto: where held-out observations are for one, by two standard errors
-    or, in part, by more than one."""
+    """Finite distance of a light; auto: used if held-out observations support it by two standard errors or, in part,
+    by more than one."""
     seed: Seed = 0
-    """Seed of what is held out, and of the observations that are drawn."""
+    """Seed of the held-out cells and of the observations that are drawn."""

@@ -1,27 +1,29 @@
-"""The paper's solver: limited-memory quasi-Newton steps on random subsets of the observations (arXiv 1710.08313).
+"""Solver of the paper: limited-memory quasi-Newton steps on random subsets of the observations (arXiv 1710.08313).
 
     minimise  mean over observations and channels of (y − radiance)² / σ²  +  β · mean over lights of Var_c(W_c) / W̄²
 
-with y the prediction of `factorlib.inference.forward`, σ its noise model, W_c the summed lobe weights of channel c and W̄ their
-mean.  Wang, Ritschel and Mitra say: L-BFGS; another random subset at every iteration; each observation sampled 5 times on average;
-n_p = 32 lobes an illumination; β = 0.1.  This is the baseline of every comparison.
+y is the prediction of `factorlib.inference.forward`, σ its noise model, W_c the summed lobe weights of channel c, and
+W̄ their mean.  Wang, Ritschel and Mitra state: L-BFGS; another random subset at every iteration; each observation
+sampled 5 times on average; n_p = 32 lobes an illumination; β = 0.1.  This solver is the baseline of every comparison.
 
-Left open by the paper, or by what is known of it here, and chosen:
+The paper leaves the following open, as far as it is known here:
 
-Bounds       by parametrisation: reflectances and roughness through a sigmoid, log sharpness through a sigmoid onto
-             `SHARPNESS`, weights through softplus, axes as unnormalised vectors.
-Start        reflectances from mean radiances (`start`), lobes evenly over the sphere, as wide as they are apart, white.
-Subset       `SUBSET` observations of all illuminations together.
-Curvature    a pair (step, change of gradient) is measured on one subset, at both ends of the step, so that the change
-             of subset is not taken for curvature (Schraudolph, Yu and Günter 2007, "A stochastic quasi-Newton method for
-             online convex optimization"); pairs outlive their subset.
-Residuals    whitened by the noise model.  With plain differences the subsets' highlights rule: on three materials in two
-             known lights the held-out loss stayed ten times as high.
-Step         halved until it lowers the objective enough (Armijo), no further than `LARGEST_STEP` in any unknown: longer
-             ones drive the sigmoids to where their slopes vanish.
-Clipping     at least this much, as in the joint solver: a clipped channel pulls from below only.
-Exposures    of photos that share a light, beyond the first: unknowns of their own.
-Not modelled are self-shadowing, interreflection, robustness against outliers, and how many lobes a light needs.
+Bounds       They come from the parametrisation: reflectances and roughness through a sigmoid, log sharpness through a
+             sigmoid onto `SHARPNESS`, weights through softplus, axes as unnormalised vectors.
+Start        Reflectances come from mean radiances (`start`).  Lobes are white, evenly spread over the sphere, and as
+             wide as they are apart.
+Subset       A subset has `SUBSET` observations of all illuminations together.
+Curvature    A pair (step, change of gradient) is measured on one subset, at both ends of the step.  The change of
+             subset is therefore not mistaken for curvature (Schraudolph, Yu and Günter 2007, "A stochastic quasi-Newton
+             method for online convex optimization").  Pairs outlive their subset.
+Residuals    They are whitened by the noise model.  With plain differences the subsets' highlights dominate: on three
+             materials in two known lights the held-out loss stayed ten times as high.
+Step         It is halved until it lowers the objective enough (Armijo).  No unknown moves by more than `LARGEST_STEP`:
+             longer steps drive the sigmoids to where their slopes vanish.
+Clipping     A clipped channel is a lower bound, as in the joint solver: it pulls from below only.
+Exposures    Exposures of further photos that share a light are unknowns of their own.
+
+The solver does not model self-shadowing, interreflection, outliers, or the number of lobes that a light needs.
 """
 
 from __future__ import annotations
@@ -53,19 +55,27 @@ from factorlib.reflection.operator import Operator
 Objective = Callable[[Tensor], tuple[float, Tensor]]  # value and gradient at a point
 Pairs = deque[tuple[Tensor, Tensor]]  # steps, and changes of gradient along them
 
-MEMORY = 20  # pairs
-LARGEST_STEP = 0.05
-SUFFICIENT, HALVINGS = 1e-4, 12
+MEMORY = 20  # pairs of L-BFGS
+LARGEST_STEP = 0.05  # largest change of an unknown in one step
+SUFFICIENT = 1e-4  # least decrease in a line search, as a share of the slope
+HALVINGS = 12  # most halvings of a step
 LOG_SHARPNESS = (math.log(SHARPNESS[0]), math.log(SHARPNESS[1]))
-REPORTS = 20  # in a run
-SUBSET = 512  # observations
+REPORTS = 20  # reports in a run
+SUBSET = 512  # observations of a subset
 
 Samplings = Annotated[float, msgspec.Meta(gt=0)]
 Prior = Annotated[float, msgspec.Meta(ge=0)]
 
 
 class Paper(msgspec.Struct, frozen=True):
-    """lobes: an illumination;  samplings: of each observation, on average over the run;  prior: β."""
+    """Options of the paper's solver.
+
+    Attributes:
+        lobes: Number of lobes of an illumination.
+        samplings: Average number of times that each observation is sampled in the run.
+        prior: β.
+        seed: Seed of the random subsets.
+    """
 
     lobes: Lobes = 32
     samplings: Samplings = 5.0
@@ -74,13 +84,26 @@ class Paper(msgspec.Struct, frozen=True):
 
 
 def solve(problem: JointProblem, materials: int, paper: Paper, report: Report = unreported) -> Solution:
-    """Solve for what the joint solver finds: materials 0 … `materials`−1 and one light per block, in the gauge of `factorlib.inference.gauge`."""
+    """Solve the problem as the paper does, in the gauge of `factorlib.inference.gauge`.
+
+    The unknowns are those of the joint solver: materials 0 … `materials`−1 and one light per block.
+
+    Args:
+        problem: Observations and model; shadows and interreflection are ignored.
+        materials: Number of materials.
+        paper: Options.
+        report: Called with each reported subset.
+    """
     problem = problem.with_effects(False, False)
-    objective, history, blocks = PaperObjective(problem, materials, paper), list[Event](), problem.blocks
+    objective = PaperObjective(problem, materials, paper)
+    history = list[Event]()
+    blocks = problem.blocks
     rows = [np.flatnonzero(~block.held_out) for block in blocks]
     iterations = math.ceil(paper.samplings * sum(map(len, rows)) / SUBSET)
-    every, lobes = max(1, iterations // REPORTS), paper.lobes * len(blocks)
-    x, random = objective.start(), np.random.default_rng(paper.seed)
+    every = max(1, iterations // REPORTS)
+    lobes = paper.lobes * len(blocks)
+    x = objective.start()
+    random = np.random.default_rng(paper.seed)
     pairs: Pairs = deque(maxlen=MEMORY)
     for iteration in range(iterations):
         subset = drawn(rows, SUBSET, random)
@@ -96,7 +119,7 @@ def solve(problem: JointProblem, materials: int, paper: Paper, report: Report = 
 def drawn(
     rows: Sequence[Int[np.ndarray, " _"]], count: int, random: np.random.Generator
 ) -> list[Int[np.ndarray, " _"]]:
-    """`count` of all rows, without replacement, as a list per block."""
+    """Return `count` of all rows, drawn without replacement, as a list per block."""
     starts = np.cumsum([0, *map(len, rows)])
     chosen = np.sort(random.choice(starts[-1], min(count, starts[-1]), replace=False))
     return [
@@ -105,16 +128,22 @@ def drawn(
 
 
 def stepped(objective: Objective, x: Tensor, pairs: Pairs) -> tuple[Tensor, float]:
-    """x after one step on one subset, and the objective there; the pair that was measured joins `pairs`."""
+    """Return x after one step on one subset, and the objective there.
+
+    The measured pair is added to `pairs`.  Without a sufficient decrease, x stays and `pairs` is cleared.
+    """
     value, gradient = objective(x)
     direction = -inverse_hessian_times(gradient, pairs, lambda slope: first_metric(slope, pairs))
     direction = direction * min(1.0, LARGEST_STEP / max(float(direction.abs().max()), 1e-30))
-    slope, length = float(gradient @ direction), 1.0
+    slope = float(gradient @ direction)
+    length = 1.0
     for _ in range(HALVINGS):
         trial = x + length * direction
         trial_value, trial_gradient = objective(trial)
         if trial_value <= value + SUFFICIENT * length * slope:
-            step, change = trial - x, trial_gradient - gradient
+            # both gradients are of the same subset
+            step = trial - x
+            change = trial_gradient - gradient
             if float(step @ change) > 1e-8 * float(step.norm() * change.norm()):
                 pairs.append((step, change))
             return trial, trial_value
@@ -124,7 +153,7 @@ def stepped(objective: Objective, x: Tensor, pairs: Pairs) -> tuple[Tensor, floa
 
 
 def first_metric(slope: Tensor, pairs: Pairs) -> Tensor:
-    """Return a vector at the scale of the last pair; with no pair yet, at a tenth of its own size."""
+    """Return a vector at the scale of the last pair, or at a tenth of its own size without one."""
     if not pairs:
         return 0.1 * slope / max(float(slope.abs().max()), 1e-30)
     step, change = pairs[-1]
@@ -132,18 +161,23 @@ def first_metric(slope: Tensor, pairs: Pairs) -> Tensor:
 
 
 class PaperObjective:
-    """The objective as a function of one unbounded vector: 7 a material, then 7 a lobe (axis 3, sharpness, weight 3) and
-    the exposures of each light in turn; float64."""
+    """Objective as a function of one unbounded vector, float64.
+
+    The vector has 7 entries a material, then for each light 7 a lobe (axis 3, sharpness, weight 3) and its exposures.
+    """
 
     def __init__(self, problem: JointProblem, materials: int, paper: Paper):
         blocks = problem.blocks
-        self.blocks, self.operator, self.paper = blocks, problem.operator, paper
+        self.blocks = blocks
+        self.operator = problem.operator
+        self.paper = paper
         self.begin = starting_materials(blocks, materials)
         self.sizes = [7 * materials] + [7 * paper.lobes + len(block.photos) - 1 for block in blocks]
 
     def start(self) -> Float[Tensor, " k"]:
-        """Even lobes under which the block's mean radiance, 1, is what its materials reflect."""
-        p, begin = self.paper.lobes, self.begin
+        """Return even lobes under which materials reflect the block's mean radiance, 1."""
+        p = self.paper.lobes
+        begin = self.begin
         roughness = _unbounded(begin.roughness, ROUGHNESS)
         parts = [np.column_stack([_unbounded(begin.diffuse), _unbounded(begin.specular), roughness]).reshape(-1)]
         level = np.full((p, 1), _unbounded(np.log(p / 2), LOG_SHARPNESS))  # λ of lobes whose variances cover 4π
@@ -155,13 +189,15 @@ class PaperObjective:
         return torch.from_numpy(np.concatenate(parts))
 
     def unpacked(self, x: Tensor) -> tuple[tuple[Tensor, ...], list[tuple[Tensor, ...]]]:
-        """(diffuse, specular, roughness) and, of each light, (axis, log sharpness, weight, log exposure)."""
+        """Return (diffuse, specular, roughness) and, of each light, (axis, log sharpness, weight, log exposure)."""
         of_materials, *of_lights = torch.split(x, self.sizes)
         bounded = torch.sigmoid(of_materials.reshape(-1, 7))
-        (low, high), (least, most) = ROUGHNESS, LOG_SHARPNESS
+        (low, high) = ROUGHNESS
+        (least, most) = LOG_SHARPNESS
         lights: list[tuple[Tensor, ...]] = []
         for part in of_lights:
-            rows, others = part[: 7 * self.paper.lobes].reshape(-1, 7), part[7 * self.paper.lobes :]
+            rows = part[: 7 * self.paper.lobes].reshape(-1, 7)
+            others = part[7 * self.paper.lobes :]
             axis = torch.nn.functional.normalize(rows[:, :3], dim=1)
             log_sharpness = least + (most - least) * torch.sigmoid(rows[:, 3])
             weight = torch.nn.functional.softplus(rows[:, 4:])
@@ -169,7 +205,7 @@ class PaperObjective:
         return (bounded[:, :3], bounded[:, 3:6], low + (high - low) * bounded[:, 6]), lights
 
     def point(self, x: Tensor) -> Point:
-        """The materials and lights that x stands for."""
+        """Return the materials and lights that x encodes."""
         (diffuse, specular, roughness), lights = self.unpacked(x)
         vector = torch.cat([diffuse, specular, roughness[:, None]], 1).reshape(-1).numpy()
         arrays = [[part.numpy() for part in light] for light in lights]
@@ -177,13 +213,15 @@ class PaperObjective:
         return Point(Materials.of_vector(vector), found)
 
     def at(self, x: Tensor, subset: Sequence[Int[np.ndarray, " _"]]) -> tuple[float, Tensor]:
-        """Value and gradient on the subset."""
+        """Return the value and the gradient on the subset."""
         x = x.detach().requires_grad_()
         (diffuse, specular, roughness), lights = self.unpacked(x)
-        squares, values, prior = x.new_zeros(()), 0, x.new_zeros(())
+        squares = x.new_zeros(())
+        values = 0
+        prior = x.new_zeros(())
         for block, (axis, log_sharpness, weight, log_exposure), rows in zip(self.blocks, lights, subset, strict=True):
             sums = weight.sum(0)
-            prior = prior + ((sums / sums.mean() - 1) ** 2).mean()  # their variance over channels
+            prior = prior + ((sums / sums.mean() - 1) ** 2).mean()  # Var_c(W_c) / W̄²
             for m in np.unique(block.material[rows]).tolist():
                 own = rows[block.material[rows] == m]
                 normal, view, photo, radiance, precision, clipped = (
@@ -191,6 +229,7 @@ class PaperObjective:
                     for of in (block.normal, block.view, block.photo, block.radiance, block.precision, block.clipped)
                 )
                 seen = (normal * view).sum(1), normal @ axis.T, view @ axis.T  # n·o, n·z and o·z
+                # y = e (k_d D w + k_s S w), one-sided where clipped
                 lit = UnitReflection.apply(self.operator, roughness[m], log_sharpness, *seen)
                 by_diffuse, by_specular = (part @ weight for part in lit)
                 exposure = torch.exp(log_exposure)[photo][:, None]
@@ -204,7 +243,7 @@ class PaperObjective:
 
 
 class UnitReflection(torch.autograd.Function):
-    """D and S [n, p] without shadows, for autograd; the derivatives are those of the operator's `response`."""
+    """Differentiable D and S [n, p] without shadows, with the derivatives of the operator's `response`."""
 
     @staticmethod
     def forward(
@@ -214,7 +253,7 @@ class UnitReflection(torch.autograd.Function):
         log_sharpness: Tensor,
         *cosines: Tensor,
     ) -> tuple[Tensor, Tensor]:
-        """D and S;  cosines: n·o [n], n·z and o·z [n, p]."""
+        """Return D and S from the cosines n·o [n], n·z and o·z [n, p]."""
         inputs = [t.detach().to(operator.dtype) for t in (roughness, log_sharpness.exp(), *cosines)]
         r = operator.response(*inputs)
         slopes = (
@@ -226,7 +265,7 @@ class UnitReflection(torch.autograd.Function):
 
     @staticmethod
     def backward(ctx: Any, diffuse: Tensor, specular: Tensor) -> tuple[Tensor | None, ...]:
-        """Gradients by roughness, log sharpness, n·z and o·z; views are given, so there is none by n·o."""
+        """Return gradients by roughness, log sharpness, n·z and o·z; n·o is fixed and has none."""
         by_roughness, d_by_sharpness, s_by_sharpness, d_by_nz, s_by_nz, s_by_oz = ctx.saved_tensors
         by_sharpness = (diffuse * d_by_sharpness + specular * s_by_sharpness).sum(0)
         by_nz = diffuse * d_by_nz + specular * s_by_nz
@@ -234,7 +273,7 @@ class UnitReflection(torch.autograd.Function):
 
 
 def _unbounded(value: Float[np.ndarray, "*n"], bounds: tuple[float, float] = (0.0, 1.0)) -> Float[np.ndarray, "*n"]:
-    """The inverse of a sigmoid onto the bounds, of values that are kept off their ends."""
+    """Return the inverse of a sigmoid onto the bounds, for values kept off their ends."""
     low, high = bounds
     share = np.clip((value - low) / (high - low), 1e-4, 1 - 1e-4)
     return np.log(share / (1 - share))

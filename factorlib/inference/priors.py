@@ -1,27 +1,31 @@
-"""What is expected of materials before any photo is seen.
+"""Prior on materials: a mixture of dielectrics, metals and fabrics for k_s and roughness, and ordinary brightness.
 
-A material is dielectric, metal or fabric, by shares π_c.  With l = log k_s of its three channels, l̄ their mean and x = (l̄, roughness),
+A material is dielectric, metal or fabric, with shares π_c.  Let l = log k_s of its three channels, l̄ their mean and x
+= (l̄, roughness):
 
-    p(l, roughness) = Σ_c π_c N(x; μ_c, S_c) Π N(l − l̄; 0, τ_c²)                                                  (1)
+    p(l, roughness) = Σ_c π_c N(x; μ_c, S_c) Π N(l − l̄; 0, τ_c²)                                                   (1)
 
-the last over the two dimensions of l − l̄.  μ_c, S_c and τ_c are those of measured materials (`studies.measured.material_classes`,
-material_classes.json), S_c and τ_c widened by what a solve does not know better: the scale of reflectances and the white balance of photos
-(SCALE, ROUGHNESS_SLACK, WHITE).  Dielectrics reflect ((n − 1)/(n + 1))² of a ray along the normal, .02 to .08, in all colours alike; metals
-more, with a tint; fabrics scatter within, which GGX shows as a strong and very rough part.  So a smooth surface with k_s = .3 is metal, a
-k_s of .2 at roughness 1 fabric, and neither is said of a material without evidence.
+The last factor is over the two dimensions of l − l̄.  μ_c, S_c and τ_c are those of measured materials
+(`studies.measured.material_classes`, material_classes.json).  S_c and τ_c are widened by the unknown scale of
+reflectances and the unknown white balance of photos (SCALE, ROUGHNESS_SLACK, WHITE).  Dielectrics reflect ((n − 1)/(n +
+1))² of a ray along the normal, 0.02 to 0.08, equally in all colours.  Metals reflect more, with a tint.  Fabrics
+scatter within, and GGX shows this as a strong and very rough part.  A smooth surface with k_s = 0.3 is therefore metal,
+and a k_s of 0.2 at roughness 1 is fabric; neither is inferred without evidence.
 
-With r_c the share of class c in the sum (1), half the gradient of −2 log p is Σ_c r_c P_c (x − μ_c), P_c the class's precision.  Σ_c r_c P_c, the
-Hessian of the bound by which expectation maximisation descends, is positive definite and stands for half the Hessian.
+Let r_c be the share of class c in the sum (1).  Half the gradient of −2 log p is Σ_c r_c P_c (x − μ_c), P_c the class's
+precision.  Half the Hessian is approximated by Σ_c r_c P_c, the Hessian of the bound of expectation maximisation, which
+is positive definite.
 
-A factor per channel is free between the materials and the lights of a connected component, unless surfaces light each other, and then it is
-known to no more than the model of interreflection is right.  So the brightest material of a component, b the mean over channels of its
-k_d + k_s, is expected to be of ordinary brightness:
+A factor per channel is free between the materials and the lights of a connected component, unless surfaces light each
+other.  Then it is known only as well as the model of interreflection holds.  So the brightest material of a component
+is expected to be of ordinary brightness.  Let b be the mean over channels of its k_d + k_s:
 
     (log b − log BRIGHTEST)²/BRIGHTNESS²                                                                             (2)
 
-which is .5 to .95 within two standard deviations; not so where a material or a light of the component is known.  The tint is settled by the prior on lights, whose mean is grey.  A very wide Gaussian about
-the start keeps log k_d and roughness finite where observations say nothing.  Where no bounces fix the scale, the answer is brought to the gauge
-of `factorlib.inference.gauge` afterwards.
+b lies between 0.5 and 0.95 within two standard deviations.  (2) does not apply where a material or a light of the
+component is known.  The prior on lights, whose mean is grey, settles the tint.  A very wide Gaussian about the start
+keeps log k_d and roughness finite where observations are uninformative.  Where no interreflection fixes the scale, the
+answer is later brought to the gauge of `factorlib.inference.gauge`.
 """
 
 from __future__ import annotations
@@ -44,14 +48,30 @@ from factorlib.jsonfile import read_json
 from factorlib.reading import reading
 
 SHIPPED = Path(__file__).with_name("material_classes.json")
-DIFFUSE, ROUGH = 3.0, 1.0  # standard deviations of log k_d and of roughness about the start
-SCALE, ROUGHNESS_SLACK, WHITE = 0.5, 0.2, 0.1  # standard deviations added in squares to those of l̄, roughness, l − l̄
-BRIGHTEST, BRIGHTNESS = 0.69, 0.16  # of (2)
-MEAN, TINTS = np.full((3, 3), 1 / 3), np.eye(3) - 1 / 3  # projections of l on its mean and on what differs from it
+DIFFUSE = 3.0  # standard deviation of log k_d about the start
+ROUGH = 1.0  # standard deviation of roughness about the start
+# Standard deviations that are added in quadrature to those of l̄, roughness and l − l̄.
+SCALE = 0.5
+ROUGHNESS_SLACK = 0.2
+WHITE = 0.1
+# Median of b, and standard deviation of log b, in (2).
+BRIGHTEST = 0.69
+BRIGHTNESS = 0.16
+# Projections of l on its mean and on the difference from it.
+MEAN = np.full((3, 3), 1 / 3)
+TINTS = np.eye(3) - 1 / 3
 
 
 class MaterialClass(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """π, μ, S and τ of (1), as measured.  mean, covariance: of the mean log k_s and of roughness."""
+    """Class of measured materials: π, μ, S and τ of (1).
+
+    Attributes:
+        name: Name of the class.
+        share: π.
+        mean: μ of the mean log k_s and of roughness.
+        covariance: S of the same.
+        tint: τ.
+    """
 
     name: str
     share: float
@@ -61,7 +81,13 @@ class MaterialClass(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class Classes(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """The classes, and the table that they were fitted to: its file's name and the SHA-256 of its bytes."""
+    """Material classes, and the table that they were fitted to.
+
+    Attributes:
+        classes: The classes.
+        made_from: Name of the table's file.
+        sha256: SHA-256 of its bytes.
+    """
 
     classes: tuple[MaterialClass, ...]
     made_from: str
@@ -70,13 +96,23 @@ class Classes(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 @cache
 def shipped_classes() -> Classes:
-    """The classes of material_classes.json; raises InputError where the file is damaged."""
+    """Read the classes of material_classes.json.
+
+    Raises:
+        InputError: If the file is damaged.
+    """
     with reading("the classes of materials", SHIPPED):
         return msgspec.convert(read_json(SHIPPED), Classes)
 
 
 class Mixture:
-    """Equation (1).  relative, rough: standard deviations that are added to those of l and of roughness."""
+    """Mixture of material classes, (1).
+
+    Args:
+        classes: The classes.
+        relative: Standard deviation that is added to that of l, in quadrature.
+        rough: Standard deviation that is added to that of roughness, in quadrature.
+    """
 
     def __init__(self, classes: Sequence[MaterialClass], relative: float = 0.0, rough: float = ROUGHNESS_SLACK):
         self.names = [one.name for one in classes]
@@ -85,6 +121,7 @@ class Mixture:
         tints = np.array([one.tint**2 + WHITE**2 + relative**2 for one in classes])
         self.mean = np.array([[one.mean[0]] * 3 + [one.mean[1]] for one in classes])
         self.precision = np.zeros((len(classes), 4, 4))
+        # precision of (log k_s, roughness), [4, 4] a class
         for P, covariance, variance in zip(self.precision, covariances, tints, strict=True):
             inverse = np.linalg.inv(covariance)
             P[:3, :3] = MEAN * inverse[0, 0] / 3 + TINTS / variance  # l̄ = Σ l/3
@@ -97,7 +134,10 @@ class Mixture:
     def at(
         self, x: Float[np.ndarray, "4"]
     ) -> tuple[float, Float[np.ndarray, "4"], Float[np.ndarray, "4 4"], Float[np.ndarray, " c"]]:
-        """−2 log p, half its gradient, half its Hessian and the classes' probabilities at x = (log k_s, roughness)."""
+        """Return −2 log p, half its gradient, half its Hessian and the class probabilities.
+
+        x is (log k_s, roughness), with log k_s of three channels.
+        """
         off = x - self.mean
         slope = np.einsum("cij,cj->ci", self.precision, off)
         energy = (off * slope).sum(1) + self.constant
@@ -109,7 +149,7 @@ class Mixture:
 
 
 class Gaussian(NamedTuple):
-    """Minus twice a log density, half its gradient and half its Gauss–Newton Hessian by the materials' unknowns."""
+    """Minus twice a log density, half its gradient and half its Gauss–Newton Hessian by the material unknowns."""
 
     value: float
     gradient: Float[np.ndarray, " 7m"]
@@ -117,7 +157,10 @@ class Gaussian(NamedTuple):
 
 
 class MaterialPrior:
-    """The prior on m materials that are linked by some blocks; those without specular part at the start have no prior on it."""
+    """Prior on m materials that are linked by some blocks.
+
+    Materials without a specular part at the start have no prior on it.
+    """
 
     def __init__(self, start: Materials, blocks: Sequence[Block], known: Known = Known()):
         self.mean = unknowns_of(start)
@@ -132,14 +175,19 @@ class MaterialPrior:
 
     def at(self, theta: Float[np.ndarray, "m 7"]) -> Gaussian:
         """Evaluate the prior at the materials' unknowns."""
+        # wide Gaussian about the start, then (1)
         off = theta - self.mean
-        value, gradient = float((off**2 * self.wide).sum()), off * self.wide
+        value = float((off**2 * self.wide).sum())
+        gradient = off * self.wide
         hessians = np.tile(np.diag(self.wide), (len(theta), 1, 1))
         for m in self.specular:
             more, slope, curvature, _ = self.mixture.at(theta[m, 3:])
-            value, gradient[m, 3:] = value + more, gradient[m, 3:] + slope
+            value = value + more
+            gradient[m, 3:] = gradient[m, 3:] + slope
             hessians[m, 3:, 3:] += curvature
-        gradient, hessian = gradient.reshape(-1), block_diag(*hessians)
+        gradient = gradient.reshape(-1)
+        hessian = block_diag(*hessians)
+        # (2) of each component's brightest material
         reflectance = np.exp(theta[:, :6])
         for members in self.members:
             brightest = members[int(reflectance[members].sum(1).argmax())]
@@ -147,13 +195,21 @@ class MaterialPrior:
             slope = np.zeros_like(theta)
             slope[brightest, :6] = reflectance[brightest] / (total * BRIGHTNESS)
             residual = (np.log(total / 3) - np.log(BRIGHTEST)) / BRIGHTNESS
-            value, gradient = value + residual**2, gradient + residual * slope.reshape(-1)
+            value = value + residual**2
+            gradient = gradient + residual * slope.reshape(-1)
             hessian += np.outer(slope, slope)
         return Gaussian(float(value), gradient, hessian)
 
 
 def class_of(specular: Float[np.ndarray, "3"], roughness: float, relative: float, rough: float) -> tuple[str, float]:
-    """The likeliest class of a material and its probability.  relative, rough: standard errors of log k_s and of roughness."""
+    """Return the likeliest class of a material and its probability.
+
+    Args:
+        specular: k_s.
+        roughness: Roughness.
+        relative: Standard error of log k_s.
+        rough: Standard error of roughness.
+    """
     mixture = Mixture(shipped_classes().classes, relative, rough)
     x = np.append(np.log(np.maximum(specular, LEAST_REFLECTANCE)), roughness)
     probability = mixture.at(x)[3]
@@ -162,11 +218,11 @@ def class_of(specular: Float[np.ndarray, "3"], roughness: float, relative: float
 
 
 def unknowns_of(materials: Materials) -> Float[np.ndarray, "m 7"]:
-    """log k_d, log k_s and roughness."""
+    """Return log k_d, log k_s and roughness."""
     reflectance = np.maximum(np.column_stack([materials.diffuse, materials.specular]), LEAST_REFLECTANCE)
     return np.column_stack([np.log(reflectance), np.clip(materials.roughness, *ROUGHNESS)])
 
 
 def materials_of(theta: Float[np.ndarray, "m 7"]) -> Materials:
-    """The inverse of `unknowns_of`."""
+    """Return the materials with these unknowns, the inverse of `unknowns_of`."""
     return Materials(np.exp(theta[:, :3]), np.exp(theta[:, 3:6]), theta[:, 6])

@@ -1,13 +1,16 @@
-"""What rows of observations reflect of lobes of weight one: the reflection operator, asked for a block.
+"""Responses of observations to lobes of weight one: the reflection operator evaluated for the rows of a block.
 
-    D_ip → a_i v_ip D_ip   diffuse response of observation i to lobe p, for k_d = 1, times the block's detail of reflectance a, where it has some
-    S_ip → u_ip S_ip   specular response, for k_s = 1, times the shares v and u of each lobe's reflection that shadows leave:
-                       (1) and (2) of `factorlib.light.visibility`, 1 where a block has no visibility
+    D_ip → a_i v_ip D_ip   diffuse response of observation i to lobe p, for k_d = 1
+    S_ip → u_ip S_ip       specular response, for k_s = 1
 
-The cells of a light stay where they are while a solve descends, so responses depend on materials through their roughness alone.
-`Reflections` computes them at the `NODES` when they are first asked for and interpolates between them by cubic polynomials of log roughness.
-The peak of a highlight of a sharp cell falls with roughness⁻⁴; between nodes apart by a factor h, interpolation leaves (9/384)(4 ln h)⁴ of it
-at worst: .17 % for the factor 1.136 of the nodes.  Cells no sharper than `WIDE` blur highlights, and every second node is near enough.
+a is the block's detail of reflectance, where it has one.  v and u are the shares of each lobe's reflection that shadows
+leave: (1) and (2) of `factorlib.light.visibility`, and 1 without visibility.
+
+The cells of a light stay in place during a descent, so responses depend on materials through their roughness alone.
+`Reflections` computes them at the `NODES` when they are first needed.  It interpolates between nodes by cubic
+polynomials of log roughness.  The peak of a sharp cell's highlight falls with roughness⁻⁴.  Between nodes a factor h
+apart, the interpolation error is (9/384)(4 ln h)⁴ of the peak at worst: 0.17 % for the nodes' factor 1.136.  Cells no
+sharper than `WIDE` blur highlights, and every second node is enough.
 """
 
 from __future__ import annotations
@@ -31,16 +34,23 @@ from factorlib.reflection.operator import Operator
 
 CHUNK = 4096  # observations whose responses are computed at once
 TOGETHER = 512  # observations whose visibility a processor's cache holds
-NODES = np.geomspace(0.1, 1.0, 19)  # roughness
-WIDE = 200.0  # λ
+NODES = np.geomspace(0.1, 1.0, 19)  # roughness of the nodes
+WIDE = 200.0  # λ up to which every second node is enough
 DEGREE = 3  # of the polynomials between nodes
 KEPT = 6  # nodes of a material whose responses stay in memory
-KEPT_TABLES = 16  # about 400 MB
+KEPT_TABLES = 16  # tables that stay in memory, about 400 MB
 Rows = slice | Int[np.ndarray, " n"]
 
 
 def diffuse_response(block: Block, rows: Rows, lobes: UnitLobes, operator: Operator) -> Float[np.ndarray, "n p"]:
-    """D at `rows`; float64."""
+    """Return D at `rows`, float64.
+
+    Args:
+        block: Observations.
+        rows: Selected observations.
+        lobes: Lobes of weight one.
+        operator: Reflection operator.
+    """
     nz, _, larger = met_cosines(block, rows, lobes)
     with torch.no_grad():
         response = operator.diffuse(_tensor(lobes.sharpness, operator), _tensor(nz, operator))
@@ -51,7 +61,15 @@ def diffuse_response(block: Block, rows: Rows, lobes: UnitLobes, operator: Opera
 def specular_response(
     block: Block, rows: Rows, lobes: UnitLobes, roughness: float, operator: Operator
 ) -> Float[np.ndarray, "n p"]:
-    """S at `rows`, for a material of that roughness; float64."""
+    """Return S at `rows` for a material of the given roughness, float64.
+
+    Args:
+        block: Observations.
+        rows: Selected observations, all of that material.
+        lobes: Lobes of weight one.
+        roughness: Roughness of the material.
+        operator: Reflection operator.
+    """
     nz, oz, larger = met_cosines(block, rows, lobes)
     no = (block.normal[rows] * block.view[rows]).sum(1)
     inputs = (_tensor(v, operator) for v in (np.array(roughness), lobes.sharpness, no, nz, oz))
@@ -60,32 +78,53 @@ def specular_response(
 
 
 def met_cosines(block: Block, rows: Rows, lobes: UnitLobes) -> tuple[np.ndarray, np.ndarray, np.ndarray | float]:
-    """n·z', o·z' and w'/w of (1) of `factorlib.light.distance` [n, p]; for shadows alone the light is far away."""
-    normal, view = block.normal[rows], block.view[rows]
+    """Return n·z', o·z' and w'/w of (1) of `factorlib.light.distance`, each [n, p].
+
+    Shadows do not use them: for visibility the light is infinitely far away.
+
+    Args:
+        block: Observations.
+        rows: Selected observations.
+        lobes: Lobes with their curvature.
+    """
+    normal = block.normal[rows]
+    view = block.view[rows]
     if lobes.curvature == 0 or block.place is None:
         return normal @ lobes.axis.T, view @ lobes.axis.T, 1.0
     return met_from(block.place[rows], normal, view, lobes.axis, lobes.curvature)
 
 
 def _tensor(values: np.ndarray, operator: Operator) -> Tensor:
+    """Return values as a tensor of the operator's type."""
     return torch.as_tensor(values).to(operator.dtype)
 
 
 def shadowed(
     response: Float[Tensor, "n p"], block: Block, rows: Rows, lobes: UnitLobes, roughness: float | None = None
 ) -> Float[Tensor, "n p"]:
-    """The response to lobes at `rows` with shadows: the diffuse one, or the specular one of a material of that roughness."""
+    """Return the response at `rows` with shadows.
+
+    Args:
+        response: Response without shadows.
+        block: Observations.
+        rows: Selected observations.
+        lobes: Lobes of weight one.
+        roughness: Roughness of the material for the specular response; None for the diffuse one.
+    """
     if block.visibility is None or block.directions is None:
         return response
     response = response.clone()
-    visibility, photo = block.visibility[rows], block.photo[rows]
+    visibility = block.visibility[rows]
+    photo = block.photo[rows]
     hidden = (visibility < 255).any(1)
     axis, sharpness, normal, view = (
         torch.from_numpy(v).float() for v in (lobes.axis, lobes.sharpness, block.normal[rows], block.view[rows])
     )
     for k in np.unique(photo[hidden]):
-        directions, own = torch.from_numpy(block.directions[k]).float(), np.flatnonzero(hidden & (photo == k))
+        directions = torch.from_numpy(block.directions[k]).float()
+        own = np.flatnonzero(hidden & (photo == k))
         lit = kernel(directions, axis, sharpness)
+        # v of (1) or u of (2) of factorlib.light.visibility, for as many observations as fit in the cache
         for some in np.split(own, range(TOGETHER, len(own), TOGETHER)):
             weights = (
                 cosine_weights(normal[some], directions)
@@ -100,8 +139,10 @@ def shadowed(
 class Reflected(NamedTuple):
     """Responses of n observations of one material to p lobes of weight one.
 
-    stack          D, then S at each of k nodes of roughness, float32
-    share, slope   weights of the k nodes that give S, and ∂S/∂roughness
+    Attributes:
+        stack: D, then S at each of k nodes of roughness, float32.
+        share: Weights of the k nodes in S.
+        slope: Weights of the k nodes in ∂S/∂roughness.
     """
 
     stack: Float[np.ndarray, "k+1 n p"]
@@ -110,20 +151,21 @@ class Reflected(NamedTuple):
 
     @property
     def diffuse(self) -> Float[np.ndarray, "n p"]:
-        """Return D."""
+        """Diffuse response D."""
         return self.stack[0]
 
     @property
     def specular(self) -> Float[np.ndarray, "n p"]:
-        """Return S."""
+        """Specular response S."""
         return self._weighted(self.share)
 
     @property
     def by_roughness(self) -> Float[np.ndarray, "n p"]:
-        """Return ∂S/∂roughness."""
+        """Derivative ∂S/∂roughness."""
         return self._weighted(self.slope)
 
     def _weighted(self, weights: Float[np.ndarray, " k"]) -> Float[np.ndarray, "n p"]:
+        """Return the weighted sum over nodes."""
         return np.tensordot(weights.astype(np.float32), self.stack[1:], axes=1)
 
     def radiance(self, weight: Float[np.ndarray, "p 3"]) -> Float[np.ndarray, "3 n 3"]:
@@ -135,7 +177,7 @@ class Reflected(NamedTuple):
     def by_weight(
         self, by_diffuse: Float[np.ndarray, "n 3"], by_specular: Float[np.ndarray, "n 3"]
     ) -> Float[np.ndarray, "p 3"]:
-        """Return Dᵀ a + Sᵀ b: the gradient by weights of a value whose gradient by D w is a, and by S w is b."""
+        """Return Dᵀ a + Sᵀ b, the gradient by weights of a value with the gradient a by D w and b by S w."""
         slopes = np.concatenate([by_diffuse[None], self.share[:, None, None] * by_specular]).astype(np.float32)
         return (self.stack.reshape(-1, self.stack.shape[2]).T @ slopes.reshape(-1, 3)).astype(float)
 
@@ -143,35 +185,48 @@ class Reflected(NamedTuple):
 class Table(Protocol):
     """Responses of a block, material by material."""
 
-    def rows(self, m: int) -> slice: ...
+    def rows(self, m: int) -> slice:
+        """Return the rows of material m."""
+        ...
 
-    def at(self, m: int, roughness: float) -> Reflected: ...
+    def at(self, m: int, roughness: float) -> Reflected:
+        """Return the responses of material m at a roughness."""
+        ...
 
 
 class Reflections:
     """Responses of a block's observations to some lobes, material by material, float32; values at nodes are kept.
 
-    materials_given: roughness does not change, so it is the only node, and ∂S/∂roughness, for which nobody asks, is nil
+    Args:
+        block: Observations.
+        lobes: Lobes of weight one.
+        operator: Reflection operator.
+        materials_given: True if roughness does not change.  It is then the only node, and ∂S/∂roughness is zero,
+            because nothing uses it.
     """
 
     def __init__(self, block: Block, lobes: UnitLobes, operator: Operator, materials_given: bool = False):
-        self.block, self.operator, self.lobes, self.materials_given = block, operator, lobes, materials_given
+        self.block = block
+        self.operator = operator
+        self.lobes = lobes
+        self.materials_given = materials_given
         self.nodes = NODES[::2] if lobes.sharpness.max(initial=0) <= WIDE else NODES
         self._diffuse: dict[int, np.ndarray] = {}  # by material
         self._specular: dict[int, dict[int, np.ndarray]] = {}  # by material and node
         self._stacks: dict[int, tuple[int, np.ndarray]] = {}  # by material: the first node, and the stack from there on
 
     def rows(self, m: int) -> slice:
-        """The observations of material m: blocks are sorted by material."""
+        """Return the rows of material m, which are contiguous."""
         first, last = np.searchsorted(self.block.material, [m, m + 1])
         return slice(int(first), int(last))
 
     def at(self, m: int, roughness: float) -> Reflected:
-        """The responses of material m, were its roughness so."""
+        """Return the responses of material m at a roughness."""
         if self.materials_given:
             if m not in self._stacks:
                 self._stacks[m] = 0, np.stack([self._diffuse_of(m), self._computed(m, roughness)])
             return Reflected(self._stacks[m][1], np.ones(1), np.zeros(1))
+        # cubic interpolation between the four nearest nodes, in log roughness
         first = int(np.clip(np.searchsorted(self.nodes, roughness) - 2, 0, len(self.nodes) - DEGREE - 1))
         nodes = self.nodes[first : first + DEGREE + 1]
         share, slope = lagrange(np.log(nodes), float(np.log(roughness)))
@@ -181,11 +236,13 @@ class Reflections:
         return Reflected(self._stacks[m][1], share, slope / roughness)
 
     def _diffuse_of(self, m: int) -> Float[np.ndarray, "n p"]:
+        """Return D of material m, computed once."""
         if m not in self._diffuse:
             self._diffuse[m] = self._computed(m, None)
         return self._diffuse[m]
 
     def _specular_at(self, m: int, node: int) -> Float[np.ndarray, "n p"]:
+        """Return S of material m at a node; the `KEPT` nearest nodes stay in memory."""
         kept = self._specular.setdefault(m, {})
         if node not in kept:
             for far in sorted(kept, key=lambda k: abs(k - node))[KEPT - 1 :]:
@@ -194,8 +251,9 @@ class Reflections:
         return kept[node]
 
     def _computed(self, m: int, roughness: float | None) -> Float[np.ndarray, "n p"]:
-        """S of material m at a roughness, or D where that is None."""
-        rows, parts = self.rows(m), []
+        """Return S of material m at a roughness, or D if that is None."""
+        rows = self.rows(m)
+        parts = []
         for i in range(rows.start, rows.stop, CHUNK):
             chunk = np.arange(i, min(i + CHUNK, rows.stop))
             if roughness is None:
@@ -206,9 +264,9 @@ class Reflections:
 
 
 class Tables:
-    """Tables of responses that fits have in common, the `KEPT_TABLES` that were asked for last.
+    """Cache of response tables, shared by fits; it keeps the `KEPT_TABLES` last used.
 
-    Fits that compare models have the same observations and lobes; only radiance, materials and weights differ.
+    Fits that compare models have the same observations and lobes.  Only radiance, materials and weights differ.
     """
 
     def __init__(self) -> None:
@@ -218,7 +276,14 @@ class Tables:
     def of(
         self, block: Block, lobes: UnitLobes, operator: Operator, given: Float[np.ndarray, " m"] | None = None
     ) -> Reflections:
-        """Return the table of a block; given: the roughness of all materials, where it does not change."""
+        """Return the table of a block.
+
+        Args:
+            block: Observations.
+            lobes: Lobes of weight one.
+            operator: Reflection operator.
+            given: Roughness of all materials if it does not change; otherwise None.
+        """
         optional = (block.visibility, block.directions, block.detail, block.place if lobes.curvature else None, given)
         arrays = [block.normal, block.view, block.material, block.photo, lobes.axis, lobes.sharpness, *optional]
         digest = blake2b(repr((id(operator), lobes.curvature, [of is None for of in optional])).encode())
@@ -234,12 +299,14 @@ class Tables:
 
 
 def lagrange(nodes: Float[np.ndarray, " k"], x: float) -> tuple[Float[np.ndarray, " k"], Float[np.ndarray, " k"]]:
-    """Weights of values at `nodes` that give the interpolating polynomial's value at x, and its derivative there.
+    """Return the weights of values at `nodes` in the interpolating polynomial at x, and in its derivative.
 
     >>> [w.tolist() for w in lagrange(np.array([0.0, 1.0, 2.0]), 0.25)]
     [[0.65625, 0.4375, -0.09375], [-1.25, 1.5, -0.25]]
     """
-    value, slope, points = [], [], nodes.tolist()
+    value = []
+    slope = []
+    points = nodes.tolist()
     for a, node in enumerate(points):
         others = points[:a] + points[a + 1 :]
         below = prod(node - other for other in others)

@@ -1,8 +1,8 @@
-"""The run of a solve: each step is done once and kept, so that a solve that was killed goes on and ends in the same bytes.
+"""Run of a solve with checkpoints: each step is computed once, and a killed solve resumes and ends in the same bytes.
 
-Every step (the choice of effects, the fit of materials, the splittings, …) is a deterministic function of the state before it, so a state that was
-saved need not be computed again.  Even without a stop the solve goes on from the saved form: the memory layout of an array can change the order
-of a sum, and so the last bits.
+Every step (the choice of effects, the fit of materials, the splittings, …) is a deterministic function of the previous
+state, so a saved state need not be computed again.  The solve continues from the saved form even without an
+interruption.  The memory layout of an array can change the order of a sum, and with it the last bits.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ Q = TypeVar("Q")
 
 
 def plain(value: Any) -> Any:
-    """Structs as dictionaries, arrays as tensors of their own."""
+    """Return a structure with structs as dictionaries and arrays as independent tensors."""
     if isinstance(value, msgspec.Struct):
         return {name: plain(getattr(value, name)) for name in value.__struct_fields__}
     if isinstance(value, np.ndarray):
@@ -34,7 +34,7 @@ def plain(value: Any) -> Any:
 
 
 def restored(type_: Any, value: Any) -> Any:
-    """The inverse of `plain`."""
+    """Return the value of a given type from its `plain` form."""
     if isinstance(value, torch.Tensor):
         return value.numpy().copy()
     if isinstance(value, dict):
@@ -44,38 +44,58 @@ def restored(type_: Any, value: Any) -> Any:
 
 
 class Run:
-    """Fits under one prior, and the states that they lead to: each is kept with its events, which are reported and remembered.
+    """Runner of fits under one prior, which saves, reports and remembers states and events.
 
-    checkpoint: of no file, it keeps nothing beyond this process (a notebook, a test);  report: called at every point that is tried;  prior: on
-    lights; None: the one that is shipped
+    Args:
+        checkpoint: File of the states; without a file nothing outlives the process (a notebook, a test).
+        report: Called at every evaluated point.
+        prior: Prior on lights; None for the shipped one.
     """
 
     def __init__(
         self, checkpoint: Checkpoint = Checkpoint(None), report: Report = unreported, prior: LightPrior | None = None
     ):
-        self.report, self.prior, self.history = report, prior or read_light_prior(), list[Event]()
-        self._checkpoint, self._kept = checkpoint, checkpoint.load() or {}
+        self.report = report
+        self.prior = prior or read_light_prior()
+        self.history = list[Event]()
+        self._checkpoint = checkpoint
+        self._kept = checkpoint.load() or {}
 
     def completed(self, steps: Mapping[str, Callable[[Q, T], T]], asked: Q, state: T) -> T:
-        """Return the state after all steps; those that an earlier run has done are not done again."""
+        """Return the state after all steps; steps that an earlier run completed are read.
+
+        Args:
+            steps: Steps by name, each a function of the question and the state.
+            asked: Question.
+            state: Initial state.
+        """
         for name, step in steps.items():
             if name in self._kept:
                 for event in restored(list[Event], self._kept[f"{name}, events"]):
                     self._happened(event)
             else:
-                before, after = len(self.history), step(asked, state)
+                before = len(self.history)
+                after = step(asked, state)
                 self._kept |= {f"{name}, events": plain(self.history[before:]), name: plain(after)}
                 self._checkpoint.save(self._kept)
             state = restored(type(state), self._kept[name])
         return state
 
     def fit(self, phase: str, problem: JointProblem, start: Fit, schedule: Schedule) -> Fit:
-        """`fitted`, under the prior on lights; every point that is tried is an event of this phase."""
+        """Fit under the prior on lights, and report every evaluated point as an event of the phase.
+
+        Args:
+            phase: Name of the phase.
+            problem: Observations and model.
+            start: Initial fit.
+            schedule: Number of steps.
+        """
         number = self.history[-1].round + 1 if self.history else 0
-        iteration, cells = 0, sum(map(len, start.point.lights))
+        iteration = 0
+        cells = sum(map(len, start.point.lights))
 
         def tell(loss: float) -> None:
-            """Report one point."""
+            """Report one evaluated point."""
             nonlocal iteration
             self._happened(Event(number, phase, iteration, loss, float("nan"), cells))
             iteration += 1
@@ -83,12 +103,20 @@ class Run:
         return fitted(problem, start, self.prior, schedule, tell)
 
     def judged(self, phase: str, problem: JointProblem, start: Fit, schedule: Schedule) -> Fit:
-        """The fit, whose held-out loss is reported as the end of its part (iteration −1)."""
+        """Fit, and report the held-out loss as the end of the phase (iteration −1).
+
+        Args:
+            phase: Name of the phase.
+            problem: Observations and model.
+            start: Initial fit.
+            schedule: Number of steps.
+        """
         fit = self.fit(phase, problem, start, schedule)
         held_out = problem.held_out_loss(fit.point)
         self._happened(msgspec.structs.replace(self.history[-1], iteration=-1, held_out=held_out))
         return fit
 
     def _happened(self, event: Event) -> None:
+        """Remember and report an event."""
         self.history.append(event)
         self.report(event)

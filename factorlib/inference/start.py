@@ -1,16 +1,19 @@
-"""Where a solve starts: from mean radiances alone, from what `surface` has fitted, or from an earlier solution.
+"""Initial fits of a solve: from mean radiances alone, from the fit of `surface`, or from an earlier solution.
 
-From nothing   The median radiance of material m in photo i is roughly light_i · reflectance_m per channel: a rank-one matrix with gaps, whose
-               logarithm is fitted as a sum by least squares.  Exposures follow from mean radiances, lights are constant.
-From surface   The stage `surface` fits the same materials and lights to the meshes as they are; a solve goes on from there (`Beginning`).
-From earlier   Materials are known by their names, lights by their illumination's.  Mean radiances give all materials one relative scale
-               (`mean_albedo`), known or new; each gauge of the earlier solution is brought to that scale by one factor per channel, the
-               geometric mean over its materials, and its lights by the inverse.  So groups that a new photo links come into one gauge, and
-               new materials stand beside the known ones.  A new photo of a known light gets the exposure that explains its mean radiance; a
-               new light is constant.  A light that explains its photos worse than a constant does (it was taken again, or turned, or in
-               other units) is not known but new.  Only the start, and what was decided of shadows and bounces, are taken over: nothing pulls
-               toward the earlier answer.
-What is known  Each component is brought to the scale of its known materials, and these stand in their places.
+Nothing   The median radiance of material m in photo i is roughly light_i · reflectance_m per channel, a rank-one matrix
+          with gaps.  Its logarithm is fitted as a sum by least squares.  Exposures follow from mean radiances, and
+          lights are constant.
+Surface   The stage `surface` fits the same materials and lights to the meshes as they are.  A solve continues from that
+          fit (`Beginning`).
+Earlier   Materials are identified by name, and lights by the name of their illumination.  Mean radiances give all
+          materials, known or new, one relative scale (`mean_albedo`).  One factor per channel brings each gauge of the
+          earlier solution to that scale: the geometric mean over its materials.  Its lights get the inverse factor.
+          Groups that a new photo links therefore share one gauge, and new materials are on the same scale as known
+          ones.  A new photo of a known light gets the exposure that explains its mean radiance.  A new light is
+          constant.  A light that explains its photos worse than a constant one counts as new: it was taken again, or
+          rotated, or is in other units.  Only the start and the decisions on shadows and interreflection are taken
+          over; no prior pulls toward the earlier answer.
+Known     Each component is brought to the scale of its known materials, which are then inserted.
 """
 
 from __future__ import annotations
@@ -37,20 +40,25 @@ from factorlib.results.solution import Earlier
 
 log = logging.getLogger("factorlib.inference")
 BRIGHTEST_AT_START = 0.7  # reflectance of the brightest material at the start
-ROUGHNESS, SPECULAR_SHARE = 0.4, 0.2  # of every material at the start
-FEW, STARTS = 2, (0.15, 0.4, 0.8)  # with so few materials, a solve starts from several roughnesses
-LEAST_RADIANCE = 1e-6  # of a block's mean
+# Start of every material.
+ROUGHNESS = 0.4
+SPECULAR_SHARE = 0.2
+# With at most FEW materials, a solve starts from each roughness of STARTS.
+FEW = 2
+STARTS = (0.15, 0.4, 0.8)
+LEAST_RADIANCE = 1e-6  # least radiance, as a share of a block's mean
 
-# Fits on so many cells a light, of which the one that explains most goes on.
+# Function of a problem and a number of cells a light; the best of its fits continues.
 Start = Callable[[JointProblem, int], list[Fit]]
 
 
 def from_nothing(materials: int) -> Start:
-    """Materials 0 … `materials`−1 and lights from mean radiances alone; with few materials, from several roughnesses."""
+    """Return the start from mean radiances alone; with few materials, from several roughnesses."""
 
     def fits(problem: JointProblem, cells: int) -> list[Fit]:
-        """Return one fit a roughness, its lights constant."""
-        blocks, roughness = problem.blocks, STARTS if materials <= FEW else STARTS[1:2]
+        """Return one fit per roughness, with constant lights."""
+        blocks = problem.blocks
+        roughness = STARTS if materials <= FEW else STARTS[1:2]
         begun = [starting_materials(blocks, materials, one) for one in roughness]
         return [start_of(Point(of, [constant_light(block, of, cells) for block in blocks])) for of in begun]
 
@@ -60,7 +68,10 @@ def from_nothing(materials: int) -> Start:
 class BegunLight(msgspec.Struct, frozen=True):
     """Light on the first p of `own_cells`.
 
-    weight: of the cells, RGB, in scene radiance;  log_exposure: of its photos;  hyperparameters: of the fit
+    Attributes:
+        weight: Weights of the cells, RGB, in scene radiance.
+        log_exposure: Log exposures of its photos.
+        hyperparameters: Hyperparameters of the fit.
     """
 
     weight: list[list[float]]
@@ -71,7 +82,10 @@ class BegunLight(msgspec.Struct, frozen=True):
 class Beginning(msgspec.Struct, frozen=True):
     """Materials and lights that were fitted to the meshes as they are.
 
-    materials: k_d, k_s (RGB each) and roughness by number;  lights: by illumination;  value: of the fit
+    Attributes:
+        materials: k_d, k_s (RGB each) and roughness, by number.
+        lights: Lights by illumination.
+        value: Objective of the fit.
     """
 
     materials: list[list[float]]
@@ -80,7 +94,10 @@ class Beginning(msgspec.Struct, frozen=True):
 
     @staticmethod
     def of(fit: Fit, blocks: Sequence[Block]) -> Beginning:
-        """Return what is written of a fit of these blocks, whose lights are far away and have no tone curves."""
+        """Return the serialisable form of a fit of these blocks.
+
+        Its lights are infinitely far away and have no tone curves.
+        """
         lights = {
             block.name: BegunLight((light.weight * block.unit).tolist(), light.log_exposure.tolist(), hyperparameters)
             for block, light, hyperparameters in zip(blocks, fit.point.lights, fit.hyperparameters, strict=True)
@@ -89,14 +106,16 @@ class Beginning(msgspec.Struct, frozen=True):
 
 
 def from_beginning(begun: Beginning) -> Start:
-    """Return the start at a fit; a light of other cells or other photos than the fit's is constant."""
+    """Return the start from a fit; a light with other cells or other photos than the fit's is constant."""
 
     def fits(problem: JointProblem, cells: int) -> list[Fit]:
         """Return the fit in the units of the problem."""
         materials = Materials.of_rows(np.array(begun.materials))
-        lights, counts = [], []
+        lights = []
+        counts = []
         for block in problem.blocks:
-            one, light = begun.lights.get(block.name), constant_light(block, materials, cells)
+            one = begun.lights.get(block.name)
+            light = constant_light(block, materials, cells)
             if one and (len(one.weight), len(one.log_exposure)) == (cells, len(block.photos)):
                 values = {"weight": np.array(one.weight) / block.unit, "log_exposure": np.array(one.log_exposure)}
                 light = msgspec.structs.replace(light, **values)
@@ -108,25 +127,31 @@ def from_beginning(begun: Beginning) -> Start:
 
 
 def with_known(point: Point, problem: JointProblem) -> Point:
-    """The point with what is known in its place, and the rest of each component at the scale of what is known."""
-    known, materials, lights = problem.known, point.materials, list(point.lights)
+    """Return the point with known values inserted, and the rest of each component at their scale."""
+    known = problem.known
+    materials = point.materials
+    lights = list(point.lights)
     if known.nothing:
         return point
-    names, rows = [block.name for block in problem.blocks], materials.rows()
+    names = [block.name for block in problem.blocks]
+    rows = materials.rows()
     given = np.maximum(known.put(materials).rows(), LEAST_REFLECTANCE)
     for members, illuminations in connected_components(problem.blocks, len(materials)):
         lit = [names.index(name) for name in illuminations]
         own = {i: known.lights[names[i]] for i in lit if names[i] in known.lights}
+        # log factor on reflectances: of the known materials, else of the known lights, else 0
         logs = [np.log((given[m, :3] + given[m, 3:6]) / (rows[m, :3] + rows[m, 3:6])) for m in known.of(members)]
         brighter = {i: level(lights[i]) - level(one) + np.log(problem.blocks[i].unit) for i, one in own.items()}
         logs = logs or [by - by.mean() * own[i].scale_free for i, by in brighter.items()] or [np.zeros(3)]
         factor = np.mean(logs, axis=0)  # on reflectances
         rows[list(members), :6] *= np.tile(np.exp(factor), 2)
         for i in lit:
-            weight, parts = lights[i].weight / np.exp(factor), {}
+            weight = lights[i].weight / np.exp(factor)
+            parts = {}
             if one := own.get(i):
                 scale = (brighter[i] - factor).mean() * one.scale_free - np.log(problem.blocks[i].unit)
-                weight, held = one.weight * np.exp(scale), {"held": one.held, "scale_free": one.scale_free}
+                weight = one.weight * np.exp(scale)
+                held = {"held": one.held, "scale_free": one.scale_free}
                 parts = {"axis": one.axis, "log_sharpness": one.log_sharpness, **held}
             if names[i] in known.exposures:
                 parts |= {"log_exposure": np.zeros_like(lights[i].log_exposure), "exposures_held": True}
@@ -135,17 +160,23 @@ def with_known(point: Point, problem: JointProblem) -> Point:
 
 
 def level(light: Light) -> Float[np.ndarray, "3"]:
-    """The logarithm of a light's mean radiance."""
+    """Return the logarithm of a light's mean radiance."""
     return np.log(np.maximum(light.energy.sum(0) / 2, LEAST_RADIANCE))  # `energy` is over 2π, a mean over 4π
 
 
 def from_earlier(earlier: Earlier, names: Sequence[str]) -> Start:
-    """The start of a problem whose materials are called `names`; lights of the earlier solution keep their cells."""
+    """Return the start from an earlier solution, for materials called `names`.
+
+    Lights of the earlier solution keep their cells.
+    """
     return lambda problem, cells: [start_of(known_point(problem, earlier, names, cells))]
 
 
 def with_decided(choices: Choices, earlier: Earlier) -> Choices:
-    """Return the choices with shadows and bounces as they were decided before, where the two had been compared."""
+    """Return the choices with shadows and interreflection as decided before.
+
+    A decision counts only if both alternatives had been compared.
+    """
     for name in ("self_shadowing", "interreflection"):
         if getattr(choices, name) == "auto" and getattr(earlier, name):
             choices = msgspec.structs.replace(choices, **{name: getattr(earlier, name)})
@@ -153,7 +184,7 @@ def with_decided(choices: Choices, earlier: Earlier) -> Choices:
 
 
 def starting_materials(blocks: Sequence[Block], count: int, roughness: float = ROUGHNESS) -> Materials:
-    """Materials whose diffuse part explains the median radiances and whose specular part is grey."""
+    """Return materials whose diffuse part explains the median radiances and whose specular part is grey."""
     albedo = mean_albedo(blocks, count)
     diffuse = np.maximum(albedo * (1 - SPECULAR_SHARE), 10 * LEAST_REFLECTANCE)
     specular = np.maximum(np.full((count, 3), SPECULAR_SHARE * BRIGHTEST_AT_START / 2), 10 * LEAST_REFLECTANCE)
@@ -161,8 +192,15 @@ def starting_materials(blocks: Sequence[Block], count: int, roughness: float = R
 
 
 def mean_albedo(blocks: Sequence[Block], count: int) -> Float[np.ndarray, "m 3"]:
-    """Relative reflectance per material and channel, the largest being `BRIGHTEST_AT_START`; materials that no block shows get the median."""
-    rows, right, weight, first = [], [], [], count
+    """Return the relative reflectance per material and channel; the largest is `BRIGHTEST_AT_START`.
+
+    Materials that no block shows get the median.
+    """
+    rows = []
+    right = []
+    weight = []
+    first = count
+    # one equation per photo and material: log median radiance = log reflectance + log light, weighted by √count
     for block in blocks:
         for k in range(len(block.photos)):
             for m in np.unique(block.material[block.photo == k]):
@@ -173,6 +211,7 @@ def mean_albedo(blocks: Sequence[Block], count: int) -> Float[np.ndarray, "m 3"]
                 right.append(np.log(np.maximum(np.median(block.radiance[of], axis=0), LEAST_RADIANCE)))
                 weight.append(np.sqrt(of.sum()))
         first += len(block.photos)
+    # weighted least squares; the scale is fixed by the brightest material
     weighted = np.array(rows) * np.array(weight)[:, None]
     logs = np.linalg.lstsq(weighted, np.array(right) * np.array(weight)[:, None], rcond=None)[0][:count]
     seen = np.array(rows)[:, :count].any(0)
@@ -181,10 +220,14 @@ def mean_albedo(blocks: Sequence[Block], count: int) -> Float[np.ndarray, "m 3"]
 
 
 def constant_light(block: Block, materials: Materials, cells: int) -> Light:
-    """The constant light that explains the mean radiance of a block's first photo, and the exposures of the others beside it."""
+    """Return the constant light that explains the mean radiance of a block's first photo.
+
+    The exposures of the other photos explain their mean radiances.
+    """
     reflectance = np.maximum((materials.diffuse + materials.specular)[block.material], LEAST_REFLECTANCE)
     logs = np.log(np.maximum(block.radiance, LEAST_RADIANCE) / reflectance)
     shown = [k for k in range(len(block.photos)) if (block.photo == k).any()]
+    # log of each photo's mean radiance over reflectance
     levels = np.zeros((len(block.photos), 3))
     levels[shown] = [np.log(np.mean(np.exp(logs[block.photo == k]), axis=0)) for k in shown]
     lobes = own_cells(block.name, cells)
@@ -193,14 +236,21 @@ def constant_light(block: Block, materials: Materials, cells: int) -> Light:
 
 
 def own_cells(name: str, count: int) -> UnitLobes:
-    """Return `count` even cells, turned at random by the name of the illumination, so that what cells blur differs from light to light."""
-    cells, seed = even_cells(count), crc32(name.encode())
+    """Return `count` even cells, rotated at random by the name of the illumination.
+
+    The blur of the cells therefore differs from light to light.
+    """
+    cells = even_cells(count)
+    seed = crc32(name.encode())
     turn = Rotation.random(rng=np.random.default_rng(seed)).as_matrix()
     return msgspec.structs.replace(cells, axis=cells.axis @ turn.T)
 
 
 def on_cells(fit: Fit, count: int, problem: JointProblem) -> Fit:
-    """Return a fit with its lights on `count` cells; what is known, and what had other cells than a trial's, keeps its own."""
+    """Return a fit with its lights on `count` cells.
+
+    Known lights, and lights with suns or with at least `count` cells, keep their own.
+    """
     lights = []
     for light, block in zip(fit.point.lights, problem.blocks, strict=True):
         if len(light) < count and not light.held.any() and not light.suns.any():
@@ -213,14 +263,23 @@ def on_cells(fit: Fit, count: int, problem: JointProblem) -> Fit:
 
 
 def known_point(problem: JointProblem, earlier: Earlier, names: Sequence[str], cells: int) -> Point:
-    """Build the point from which a solve starts that has an earlier solution.
+    """Return the point from which a solve with an earlier solution starts.
 
-    Each component of the earlier gauge comes to the scale of `mean_albedo` by the geometric mean, over its materials that a block shows, or over all
-    of them where none is shown.
+    Each component of the earlier gauge is brought to the scale of `mean_albedo` by a geometric mean.  The mean is over
+    its materials that a block shows, or over all of them if none is shown.
+
+    Args:
+        problem: Observations.
+        earlier: Earlier solution.
+        names: Names of the materials, by number.
+        cells: Number of cells of a new light.
     """
-    blocks, component = problem.blocks, [earlier.table.gauge.component.get(name) for name in names]
-    albedo, rows = mean_albedo(blocks, len(names)), starting_materials(blocks, len(names)).rows()
-    shown, factors = {int(m) for block in blocks for m in np.unique(block.material)}, {}
+    blocks = problem.blocks
+    component = [earlier.table.gauge.component.get(name) for name in names]
+    albedo = mean_albedo(blocks, len(names))
+    rows = starting_materials(blocks, len(names)).rows()
+    shown = {int(m) for block in blocks for m in np.unique(block.material)}
+    factors = {}
     for c in sorted({c for c in component if c is not None}):
         members = [m for m in range(len(names)) if component[m] == c]
         known = {m: earlier.table.materials[names[m]] for m in members}
@@ -230,7 +289,8 @@ def known_point(problem: JointProblem, earlier: Earlier, names: Sequence[str], c
         for m, one in known.items():
             rows[m] = [*(one.diffuse * factor), *(one.specular * factor), one.roughness]
         factors[c] = factor
-    materials, lights = Materials.of_vector(rows.reshape(-1)), []
+    materials = Materials.of_vector(rows.reshape(-1))
+    lights = []
     for block in blocks:
         light = constant_light(block, materials, cells)
         own = [component[m] for m in np.unique(block.material) if component[m] is not None]
@@ -243,16 +303,26 @@ def known_point(problem: JointProblem, earlier: Earlier, names: Sequence[str], c
 
 
 def earlier_light(constant: Illumination, earlier: Earlier, factor: Float[np.ndarray, "3"], loss: Loss) -> Light:
-    """The earlier light of a block in the block's unit and the start's gauge; the constant one where there is none, or it explains the block worse.
+    """Return the earlier light of a block, in the block's unit and the start's gauge.
 
-    A photo that the earlier solution does not have gets its exposure in the constant light, beside those of the others.
+    The constant light is returned if there is no earlier one, or if that explains the block worse.  A photo that the
+    earlier solution lacks gets its exposure in the constant light, relative to the others.
+
+    Args:
+        constant: Block in its constant light.
+        earlier: Earlier solution.
+        factor: Factor on the reflectances of the earlier solution.
+        loss: Loss that compares both lights.
     """
-    block, model, before = constant.block, earlier.table.model, constant.light.log_exposure
+    block = constant.block
+    model = earlier.table.model
+    before = constant.light.log_exposure
     lobes = earlier.lights.get(block.name)
     exposure = np.array([np.log(np.mean(earlier.exposures.get(photo, (np.nan,) * 3))) for photo in block.photos])
     new = np.isnan(exposure)
     if not lobes or new.all():
         return constant.light
+    # a new photo has its exposure in the constant light, relative to the known photos
     exposure = np.where(new, before + np.mean(exposure[~new] - before[~new]), exposure)
     tone = [model.tone[photo].exponent for photo in block.photos if photo in model.tone]
     light = Light(

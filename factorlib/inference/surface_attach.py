@@ -1,4 +1,4 @@
-"""Which nodes of the subdivided meshes the pixels of a photo show."""
+"""Attachment of a photo's pixels to nodes of the subdivided meshes."""
 
 from collections.abc import Mapping
 
@@ -20,21 +20,35 @@ def attached_pixels(
     objects: Mapping[str, tuple[str, ObjectEntry]],
     surfaces: Surfaces,
 ) -> Attached:
-    """The nodes under pixels (x, y), in the camera's frame.
+    """Return the nodes under pixels (x, y), in the camera's frame.
 
-    shown: the object that each pixel shows, a number from 1 as `align` counts them, 0 for none;  objects: the mesh and the pose of each, in that order; a mesh that has no nodes stays as it is
+    Args:
+        pixels: Integer pixel coordinates.
+        shown: Object in each pixel, numbered from 1 as in `align`; 0 for none.
+        camera: Camera of the photo.
+        objects: Mesh name and pose of each object, in the order of their numbers.
+        surfaces: Subdivided meshes; objects with other meshes are not attached.
     """
-    along, count = camera.rays_through(pixels + 0.5), len(pixels)
-    node, share, frame = np.zeros((count, 3), np.int64), np.zeros((count, 3)), np.zeros((count, 3, 3))
+    along = camera.rays_through(pixels + 0.5)
+    count = len(pixels)
+    node = np.zeros((count, 3), np.int64)
+    share = np.zeros((count, 3))
+    frame = np.zeros((count, 3, 3))
     for number, (mesh, entry) in enumerate(objects.values(), start=1):
         if mesh not in surfaces.meshes:
             continue
-        rows, fine, scale = np.flatnonzero(shown == number), surfaces.meshes[mesh], np.array(entry.scale)
+        rows = np.flatnonzero(shown == number)
+        fine = surfaces.meshes[mesh]
+        scale = np.array(entry.scale)
         solid = scaled(fine.mesh, entry.scale)
+        # first hits of the pixels' rays, their triangles and barycentric coordinates
         hits = Caster(solid).cast_along(along[rows], entry.pose)
-        rows, face, uv = rows[hits.face >= 0], hits.face[hits.face >= 0], hits.uv[hits.face >= 0]
+        rows = rows[hits.face >= 0]
+        face = hits.face[hits.face >= 0]
+        uv = hits.uv[hits.face >= 0]
         node[rows] = surfaces.first[mesh] + fine.faces[face]
         share[rows] = np.column_stack([1 - uv.sum(1), uv])
+        # R of (1) of `surface_turns`, with its sign changed where the surface is seen from behind
         toward = face_normals(solid, face) @ entry.pose.rotation.T
         side = np.where(np.sum(toward * along[rows], 1) > 0, -1.0, 1.0)
         frame[rows] = side[:, None, None] * entry.pose.rotation * (scale.mean() / scale)

@@ -1,19 +1,24 @@
-"""Surface detail: turns of normals and factors on albedo, chosen with their stiffness by photos that had no part in them.
+"""Surface detail: normals and albedo factors, chosen with their stiffness by held-out photos.
 
-start      materials and lights are fitted on few cells, with the shadows and bounces of the given meshes.  Lights are far away: where normals are wrong, near
-           ones take up what turns should explain (rough set of seed 0: 3.5 instead of 3.1 degrees)
-stiffness  of each of `TURNS`, from stiff to soft, turns are found from all photos but those of one fold, for every fold in turn; a photo of that fold then
-           gets a light of its own, with the materials given.  The stiffness is used with which the photos are likeliest, lights integrated out
-           (`factorlib.inference.likelihood`); the search ends where that falls.  Every light has cells of its own (`factorlib.inference.start`):
-           were they the same, normals could turn toward their centres in all photos at once
-whether    turns are kept where the likelihood is higher than without turns, and the photos' held-out observations are explained better by more than `FOR`
-           standard errors over clusters (`factorlib.inference.evidence`).  Of several meshes, those stay with which alone neither is better
-paint      factors on the diffuse reflectance likewise, of a stiffness of `FACTORS`, beside the turns and over what these explain; they are kept where the
-           likelihood is higher by more than `FOR` standard errors over photos, and held-out observations are explained better too.  The likelihood is the
-           finer measure.  Of turns it takes too many: a light that is fitted makes up for a wrong normal, but not for dirt
-rounds     turns from all lights, materials and lights fitted again, `ROUNDS` times
-surface    at last the displacement whose normals come nearest to the turned ones: what no displacement explains (a wrong pose turns all normals
-           of a photo) is left out
+start       Materials and lights are fitted on few cells, with the shadows and interreflection of the given meshes.
+            Lights are infinitely far away: near lights absorb what turns of wrong normals should explain (rough set of
+            seed 0: 3.5 instead of 3.1 degrees).
+stiffness   For each of `TURNS`, from stiff to soft, and for every fold, turns are estimated from all photos outside the
+            fold.  A photo of the fold then gets its own light, with the materials given.  The stiffness with the
+            largest marginal likelihood of the photos is used (`factorlib.inference.likelihood`); the search ends where
+            that falls.  Every light has its own cells (`factorlib.inference.start`): with common cells, normals could
+            turn toward the cells' centres in all photos at once.
+decision    Turns are kept under two conditions: the likelihood is higher than without them, and they explain the
+            photos' held-out observations better by more than `FOR` standard errors over clusters
+            (`factorlib.inference.evidence`).  Of several meshes, one stays as it is if its turns alone do not improve
+            both.
+paint       Factors on the diffuse reflectance are chosen likewise, with a stiffness of `FACTORS`, in addition to the
+            turns.  They are kept if the likelihood is higher by more than `FOR` standard errors over photos and
+            held-out observations are explained better.  The likelihood is the finer measure.  It accepts too many
+            turns: a fitted light compensates for a wrong normal, but not for dirt.
+rounds      Turns are estimated from all lights, and materials and lights are fitted again, `ROUNDS` times.
+surface     The result is the displacement whose normals are nearest to the turned ones.  It excludes turns that no
+            displacement explains: a wrong pose turns all normals of a photo.
 """
 
 from __future__ import annotations
@@ -40,30 +45,32 @@ from factorlib.light.prior import LightPrior, read_light_prior
 from factorlib.meshes.fine import Fine
 from factorlib.results.materials import Decision
 
-TURNS = (1000.0, 300.0, 100.0, 30.0)  # stiffness of turns: a of `factorlib.inference.surface_turns`; b is a share of it
-FACTORS = (300.0, 100.0, 30.0, 10.0)  # of log factors
+# Stiffness of turns: a of `factorlib.inference.surface_turns`; b is a share of it.
+TURNS = (1000.0, 300.0, 100.0, 30.0)
+FACTORS = (300.0, 100.0, 30.0, 10.0)  # stiffness of log factors
 ROUNDS = 3
-CELLS, FOLDS = 250, 4  # cells of a light; folds of photos
-OBSERVATIONS = 1000  # of a light, or of a photo that judges, that materials and lights are fitted to
+CELLS = 250  # cells of a light
+FOLDS = 4  # folds of photos
+OBSERVATIONS = 1000  # fitted observations of a light, or of a held-out photo
 SETTLE = Schedule(lights=2, together=(3, 2), estimate=False)
 BETWEEN = Schedule(together=(2,), estimate=False)
-OWN_LIGHT = 2  # factorisations
+OWN_LIGHT = 2  # factorisations in the fit of a held-out photo's light
 
 
 class Surfaces(msgspec.Struct, frozen=True):
-    """The meshes of a set by name, subdivided, in the order in which their nodes are numbered."""
+    """Subdivided meshes of a set by name, in the order of their nodes' numbers."""
 
     meshes: dict[str, Fine]
 
     @property
     def first(self) -> dict[str, int]:
-        """The number of each mesh's first node."""
+        """Number of each mesh's first node."""
         counts = [mesh.nodes for mesh in self.meshes.values()]
         return dict(zip(self.meshes, np.cumsum([0, *counts[:-1]]).tolist()))
 
     @property
     def nodes(self) -> int:
-        """The number of all nodes."""
+        """Number of all nodes."""
         return sum(mesh.nodes for mesh in self.meshes.values())
 
     def laplacian(self) -> csr_array:
@@ -73,33 +80,41 @@ class Surfaces(msgspec.Struct, frozen=True):
     def displacements(
         self, turn: Float[np.ndarray, "v 3"], attached: Sequence[Attached]
     ) -> dict[str, Float[np.ndarray, " n"]]:
-        """Return by mesh, in its extents, what `Fine.displacement` finds for the turns of its nodes, as far as observations are attached to them."""
+        """Return the displacement of each mesh that best explains the turns of its nodes, in extents.
+
+        Nodes count by the observations attached to them (`Fine.displacement`).
+        """
         weight = sum(np.bincount(of.node.reshape(-1), of.share.reshape(-1), self.nodes) for of in attached)
-        turns, seen = self.by_mesh(turn), self.by_mesh(np.minimum(weight, 1.0))
+        turns = self.by_mesh(turn)
+        seen = self.by_mesh(np.minimum(weight, 1.0))
         return {name: mesh.displacement(turns[name], seen[name]) for name, mesh in self.meshes.items()}
 
     def by_mesh(self, values: np.ndarray) -> dict[str, np.ndarray]:
-        """Return what belongs to each mesh's nodes."""
+        """Return the values of each mesh's nodes."""
         return {name: values[k : k + self.meshes[name].nodes] for name, k in self.first.items()}
 
     def turns_of(self, displacements: dict[str, Float[np.ndarray, " n"]]) -> Float[np.ndarray, "v 3"]:
-        """The turns that displacements mean; a mesh without any stays."""
+        """Return the turns that displacements imply; a mesh without a displacement has none."""
         still = {name: np.zeros((mesh.nodes, 3)) for name, mesh in self.meshes.items()}
         moved = {name: self.meshes[name].turn_of(of) for name, of in displacements.items()}
         return np.vstack(list((still | moved).values()))
 
     def nodes_of(self, names: Iterable[str]) -> Bool[np.ndarray, " v"]:
-        """Return which nodes are of these meshes."""
+        """Return a mask of the nodes of these meshes."""
         return np.concatenate([np.full(mesh.nodes, name in names) for name, mesh in self.meshes.items()])
 
 
 class Found(msgspec.Struct, frozen=True):
-    """The answer for all meshes of a set.
+    """Surface detail of all meshes of a set.
 
-    beginning of a solve: the fit on few cells, to the meshes as they are
-    evidence  whether surfaces are moved, by held-out observations of photos that had no part in that;  painted: whether reflectance has detail, likewise
-    stiffness that was best;  gains: by photo, of all that is kept: how much −2 log marginal likelihood fell while the photo had no part in it
-    displacements  by mesh, at nodes, in extents; none where surfaces stay;  log_factors: by mesh, likewise
+    Attributes:
+        beginning: Fit on few cells to the meshes as they are, from which a solve starts.
+        evidence: Decision on turns, by held-out observations of held-out photos.
+        painted: Decision on detail of reflectance, likewise.
+        stiffness: Stiffness of the chosen detail.
+        gains: Decrease of −2 log marginal likelihood of each held-out photo by the kept detail.
+        displacements: Displacements at the nodes of each moved mesh, in extents.
+        log_factors: Log factors at the nodes of each mesh; empty if they are not kept.
     """
 
     beginning: Beginning
@@ -111,30 +126,42 @@ class Found(msgspec.Struct, frozen=True):
     log_factors: dict[str, Float[np.ndarray, " n"]] = {}
 
 
-Report = Callable[[float, str], None]  # the share that is done, and what is being done
-Tick = Callable[..., None]  # called when a piece of work is done
+Report = Callable[[float, str], None]  # completed share, and the current activity
+Tick = Callable[..., None]  # called at the end of each unit of work
 
 
 class Judged(msgspec.Struct, frozen=True):
-    """What each photo says: −2 log marginal likelihood and held-out losses, with detail in which it had no part."""
+    """Scores of each photo, with detail that was estimated from other photos.
+
+    Attributes:
+        values: −2 log marginal likelihood of each photo.
+        losses: Held-out losses of each photo.
+    """
 
     values: Float[np.ndarray, " f"]
     losses: Losses
 
     def gain_over(self, other: Judged) -> float:
-        """Return by how many standard errors over photos the values are less."""
+        """Return the mean decrease of the values, in standard errors over photos."""
         gains = other.values - self.values
         return float(gains.mean() / max(gains.std(ddof=1) / np.sqrt(len(gains)), 1e-12))
 
 
 def evidence_of(after: Judged, before: Judged, held_out: float, likelihood: float) -> Decision:
-    """Return whether detail is kept: better by more than so many standard errors in each of the two measures."""
+    """Return the decision on detail: kept if both measures gain more than their thresholds.
+
+    Args:
+        after: Scores with the detail.
+        before: Scores without it.
+        held_out: Threshold of the held-out losses, in standard errors.
+        likelihood: Threshold of the marginal likelihood, in standard errors.
+    """
     evidence = compare(before.losses, after.losses, held_out)
     return msgspec.structs.replace(evidence, kept=evidence.kept and after.gain_over(before) > likelihood)
 
 
 class Trial(msgspec.Struct, frozen=True):
-    """A problem without detail, its fit, and what its blocks are attached to."""
+    """Problem without detail, its fit, and the attachment of its blocks to the surface."""
 
     problem: JointProblem
     fit: Fit
@@ -143,39 +170,42 @@ class Trial(msgspec.Struct, frozen=True):
     prior: LightPrior
 
     def on(self, detail: Detail) -> JointProblem:
-        """The problem on a surface with detail."""
+        """Return the problem on a surface with detail."""
         pairs = zip(self.problem.blocks, self.attached, strict=True)
         return self.problem.of([detail.on(block, at) for block, at in pairs])
 
     def parts(self, detail: Detail, fit: Fit) -> list[Part]:
-        """Every light linearised on a surface with detail."""
+        """Linearise every light on a surface with detail."""
         each = zip(self.on(detail).illuminations(fit.point), fit.hyperparameters, self.attached, strict=True)
         nodes = self.surfaces.nodes
         return list(self.problem.spread(lambda one: part_of(one[0], one[1], self.prior, one[2], nodes), list(each)))
 
     def moving(self, detail: Detail, meshes: set[str]) -> Detail:
-        """The detail with the turns of these meshes alone."""
+        """Return the detail with the turns of these meshes alone."""
         turn = np.where(self.surfaces.nodes_of(meshes)[:, None], detail.turn, 0.0)
         return msgspec.structs.replace(detail, turn=turn)
 
     @property
     def photos(self) -> list[tuple[int, int]]:
-        """Each photo that has observations: its block and its number there."""
+        """Photos with observations, each as its block and its number there."""
         return [(k, int(j)) for k, block in enumerate(self.problem.blocks) for j in np.unique(block.photo)]
 
     @property
     def names(self) -> list[str]:
-        """The names of these photos."""
+        """Names of these photos."""
         return [self.problem.blocks[k].photos[j] for k, j in self.photos]
 
     def judged(self, details: Sequence[Detail], tick: Tick = lambda: None, plain: Judged | None = None) -> Judged:
-        """Judge every photo by itself, on the surface that `details` has for it, in a light of its own, with the materials given.
+        """Score every photo by itself: on its own detail, in its own light, with the materials given.
 
-        plain: what photos say without detail, which is taken over where detail turns no normal of a photo;  tick: called after each
+        Args:
+            details: Detail for each photo, estimated from other photos.
+            tick: Called after each photo.
+            plain: Scores without detail, used for a photo whose detail is zero; None to compute all.
         """
 
         def alone(of: tuple[int, tuple[int, int], Detail]) -> tuple[float, Losses]:
-            """One photo's value and losses."""
+            """Return one photo's value and losses."""
             at, (k, number), detail = of
             own = self.problem.blocks[k].photo == number
             here = self.attached[k].take(own)
@@ -199,14 +229,21 @@ class Trial(msgspec.Struct, frozen=True):
         return Judged(np.array(values), Losses(*([of[i][0] for of in losses] for i in (0, 1))))
 
     def left_out(self, parts: list[Part], laplacian: csr_array, stiffness: Stiffness, tick: Tick) -> list[Detail]:
-        """Find for every photo a surface that it had no part in: photos fall into at most `FOLDS` folds, and each takes that of the others.
+        """Return a surface for every photo, estimated from other photos.
 
-        parts: of the mesh itself;  tick: called after each fold
+        Photos are split into at most `FOLDS` folds, and each photo gets the surface of the other folds.
+
+        Args:
+            parts: Linearised lights on the mesh itself.
+            laplacian: Laplacian of all meshes.
+            stiffness: Stiffness of the detail.
+            tick: Called after each fold.
         """
-        photos, folds = self.photos, min(FOLDS, len(self.photos))
+        photos = self.photos
+        folds = min(FOLDS, len(self.photos))
 
         def others(fold: int) -> Detail:
-            """Return the detail that the photos of one fold have no part in."""
+            """Return the detail that is estimated without the photos of one fold."""
             gone = [
                 np.isin(block.photo, [j for at, j in photos[fold::folds] if at == k])
                 for k, block in enumerate(self.problem.blocks)
@@ -224,7 +261,14 @@ class Trial(msgspec.Struct, frozen=True):
 
 
 class Best(NamedTuple):
-    """The likeliest of several stiffnesses: the surface of each photo, what photos say of it, and whether it is kept."""
+    """Likeliest of several stiffnesses.
+
+    Attributes:
+        stiffness: Stiffness.
+        details: Detail for each photo, estimated from other photos.
+        judged: Scores of the photos.
+        evidence: Decision on the detail.
+    """
 
     stiffness: Stiffness
     details: list[Detail]
@@ -233,7 +277,15 @@ class Best(NamedTuple):
 
 
 class Search(msgspec.Struct, frozen=True):
-    """The search for detail of a trial; parts: of the mesh itself;  plain: what photos say without detail."""
+    """Search for the surface detail of a trial.
+
+    Attributes:
+        trial: Problem and its fit.
+        parts: Linearised lights on the mesh itself.
+        laplacian: Laplacian of all meshes.
+        plain: Scores without detail.
+        tick: Called after each unit of work.
+    """
 
     trial: Trial
     parts: list[Part]
@@ -242,9 +294,16 @@ class Search(msgspec.Struct, frozen=True):
     tick: Tick
 
     def best(self, tried: Sequence[Stiffness], before: Judged, held_out: float, likelihood: float) -> Best:
-        """Return the likeliest stiffness, from stiff to soft until one is less likely than the one before, or the first is clearly against.
+        """Return the likeliest stiffness.
 
-        before: what photos say without it;  held_out, likelihood: by how many standard errors it must be better, in each of the two measures
+        The search goes from stiff to soft.  It ends at a stiffness that is less likely than the previous one, or
+        with clear evidence against the detail.
+
+        Args:
+            tried: Stiffnesses, from stiff to soft.
+            before: Scores without this detail.
+            held_out: Threshold of the held-out losses, in standard errors.
+            likelihood: Threshold of the marginal likelihood, in standard errors.
         """
         found: Best | None = None
         for one in tried:
@@ -259,8 +318,9 @@ class Search(msgspec.Struct, frozen=True):
         return found
 
     def turned(self) -> tuple[Best, set[str]]:
-        """Return the likeliest turns, and the meshes that they move: those that are better when they are turned alone."""
-        trial, plain = self.trial, self.plain
+        """Return the likeliest turns, and the meshes that gain from their turns alone."""
+        trial = self.trial
+        plain = self.plain
         turned = self.best([Stiffness(a) for a in TURNS], plain, FOR, 0.0)
         moving = self.meshes_that_gain(turned.details) if turned.judged.gain_over(plain) > 0 else set()
         if 0 < len(moving) < len(trial.surfaces.meshes):
@@ -269,9 +329,19 @@ class Search(msgspec.Struct, frozen=True):
         return turned, moving
 
     def of_all_photos(self, stiffness: Stiffness, moving: set[str], pieces: Pieces, seed: int) -> Detail:
-        """Return the detail that all photos ask for, materials and lights fitted again between its steps."""
-        trial, parts, fit = self.trial, self.parts, self.trial.fit
-        nodes, detail = trial.surfaces.nodes_of(moving), no_detail(trial.surfaces.nodes)
+        """Return the detail from all photos, with materials and lights fitted again between its steps.
+
+        Args:
+            stiffness: Stiffness of the detail.
+            moving: Meshes whose normals may turn.
+            pieces: Report of progress.
+            seed: Seed of the drawn observations.
+        """
+        trial = self.trial
+        parts = self.parts
+        fit = self.trial.fit
+        nodes = trial.surfaces.nodes_of(moving)
+        detail = no_detail(trial.surfaces.nodes)
         for number in range(ROUNDS):
             begin = 0.85 + 0.05 * number
             tick = pieces.of(begin, begin + 0.05, BETWEEN.points, f"all photos, round {number + 1}")
@@ -282,7 +352,7 @@ class Search(msgspec.Struct, frozen=True):
         return detail
 
     def meshes_that_gain(self, turned: Sequence[Detail]) -> set[str]:
-        """Return the meshes that are better when they are turned alone."""
+        """Return the meshes that gain from their turns alone."""
         names = self.trial.surfaces.meshes
         if len(names) == 1:
             return set(names)
@@ -299,11 +369,18 @@ def found(
     seed: int = 0,
     report: Report = lambda share, what: None,
 ) -> Found:
-    """Return the detail of the meshes, if photos that had no part in it gain.
+    """Return the detail of the meshes, if photos gain from detail that was estimated without them.
 
-    problem: all observations;  attached: where each block's lie;  start: where materials and lights begin;  seed: of what is drawn
+    Args:
+        problem: All observations.
+        surfaces: Subdivided meshes.
+        attached: Attachment of each block to the surface.
+        start: Maker of the initial fits.
+        seed: Seed of the drawn observations.
+        report: Called with the completed share and the current activity.
     """
-    pieces, plain = Pieces(report), no_detail(surfaces.nodes)
+    pieces = Pieces(report)
+    plain = no_detail(surfaces.nodes)
     tick = pieces.of(0.0, 0.3, TRIAL.points + SETTLE.points, "materials and lights")
     trial, begun = trial_of(problem, start, seed, (surfaces, attached), tick)
     photos = len(trial.photos)
@@ -329,14 +406,22 @@ def found(
 def trial_of(
     problem: JointProblem, start: Start, seed: int, surface: tuple[Surfaces, list[Attached]], tick: Tick
 ) -> tuple[Trial, Beginning]:
-    """Return the problem without detail and its fit with the shadows and bounces of the given meshes, and the fit on few cells.
+    """Return the problem without detail with its fit, and the fit on few cells.
 
-    surface: and where the problem's blocks lie on it
+    Shadows and interreflection are those of the given meshes.
+
+    Args:
+        problem: All observations.
+        start: Maker of the initial fits.
+        seed: Seed of the drawn observations.
+        surface: Subdivided meshes, and the attachment of each block to them.
+        tick: Called at every evaluated point.
     """
-    prior, sure = read_light_prior(), sure_ones(problem)
+    prior = read_light_prior()
+    sure = sure_ones(problem)
 
     def fitting(name: str, some: JointProblem, begun: Fit, schedule: Schedule) -> Fit:
-        """Fit under the prior."""
+        """Fit under the prior on lights."""
         return fitted(some, begun, prior, schedule, tick)
 
     choices = Choices(self_shadowing="on", interreflection="on", seed=seed)
@@ -347,12 +432,19 @@ def trial_of(
 
 
 class Pieces(msgspec.Struct, frozen=True):
-    """The report of a search, in pieces of work."""
+    """Report of a search, in units of work."""
 
     report: Report
 
     def of(self, begin: float, end: float, number: int, what: str) -> Tick:
-        """Return what reports, whenever it is called, that one more of so many pieces of work is done."""
+        """Return a function that reports one more completed unit of work at each call.
+
+        Args:
+            begin: Share that is complete before.
+            end: Share that is complete afterwards.
+            number: Number of units.
+            what: Activity.
+        """
         self.report(begin, what)
         done = count(1)
         return lambda *_: self.report(begin + (end - begin) * min(next(done) / number, 1.0), what)

@@ -1,27 +1,34 @@
-"""Standard errors of materials and lights, honest about what the model cannot say, in a fixed gauge.
+"""Standard errors of materials and lights in a fixed gauge, including errors of the model.
 
-Materials   With all lights eliminated, S is the materials' information and s_k the score of cluster k of observations: its part of
-            the gradient, less what the lights take up of it.  Were residuals independent noise, the covariance would be σ² S⁻¹.
-            They are not: where cells are too coarse or lobes too few, or normals are wrong, neighbouring pixels err alike.  The sandwich
+Materials   Let S be the materials' information with all lights eliminated.  Let s_k be the score of cluster k of
+            observations: its part of the gradient, less the part that the lights absorb.  For residuals of independent
+            noise the covariance would be σ² S⁻¹.  Too coarse cells, too few lobes or wrong normals make neighbouring
+            residuals correlated.  The sandwich
 
-                S⁻¹ (Σ_k s_k s_kᵀ · K/(K − 1)) S⁻¹                                                                     (1)
+                S⁻¹ (Σ_k s_k s_kᵀ · K/(K − 1)) S⁻¹                                                                   (1)
 
-            lets residuals within a cluster depend on each other in any way (Liang and Zeger 1986).  It is taken over two kinds of
-            clusters.  One is what a light sends toward nearby mirror directions: a region of the light, whose bias all materials there
-            share.  The other is a whole light: what is wrong everywhere in it agrees, and only other lights
-            show it.  The largest of the three variances is taken, unknown by unknown.
+            allows any dependence within a cluster (Liang and Zeger 1986).  It is computed for two kinds of clusters.
+            One is the light toward nearby mirror directions, a region whose bias all materials there share.  The other
+            is a whole light, because an error everywhere in it is visible only in comparison with other lights.  The
+            largest of the three variances is used, unknown by unknown.
 
-            The data leave one factor per channel and component free, so an error is only defined once that factor is fixed.
-            Here the sum of diffuse and specular reflectance over a component's materials is fixed in each channel: with g the
-            direction of that factor and h the gradient of the fixed sum, covariances are projected by P = I − g hᵀ / (hᵀ g).
-            Where a material or a light is known, it fixes the factor, its own errors are 0, and nothing is projected.
-            Where surfaces light each other that factor is known, too, but badly: on data/eames and sets made alike it is off by 7 to 50 %.
+Gauge       The data leave one factor per channel and component free, so an error is defined only once that factor is
+            fixed.  Here the sum of diffuse and specular reflectance over a component's materials is fixed in each
+            channel.  With g the direction of that factor and h the gradient of the fixed sum, covariances are projected
+            by P = I − g hᵀ / (hᵀ g).  A known material or light fixes the factor and has no error, and nothing is
+            projected.  Surfaces that light each other determine the factor too, but badly: on data/eames and similar
+            synthetic sets it is off by 7 to 50 %.
 
-Of a joint solve (`Posterior`), S is that of φ's system (`factorlib.inference.likelihood`), by reflectances, for by their logarithms a nil reflectance
-would look exactly known.  The prior on materials is left out.  More observations do not remove errors of the model itself, mostly of the
-mesh: MODEL_ERROR is added in quadrature, in proportion to the residuals.  Given the materials, log radiance
-of a light has covariance Σ = H⁻¹.  A map's radiance in direction d is Σ_p φ_p(d) w_p with w_p = peak_p exp(u_p), so its variance is gᵀ Σ g with
-g_p = φ_p(d) w_p, to which the light's own error of the model, LIGHT_ERROR, is added.  Where no observation tells anything, Σ is the prior's covariance.
+Joint       For a joint solve (`Posterior`), S comes from the system of φ (`factorlib.inference.likelihood`), by
+            reflectances: by their logarithms, a zero reflectance would look exactly known.  The prior on materials is
+            left out.
+
+Model       More observations do not remove errors of the model itself, mostly of the mesh.  MODEL_ERROR is therefore
+            added in quadrature, in proportion to the residuals.
+
+Lights      Given the materials, log radiance of a light has the covariance Σ = H⁻¹.  A map's radiance in direction d is
+            Σ_p φ_p(d) w_p with w_p = peak_p exp(u_p).  Its variance is gᵀ Σ g with g_p = φ_p(d) w_p, plus the light's
+            own model error LIGHT_ERROR.  In directions without information, Σ is the prior's covariance.
 """
 
 from __future__ import annotations
@@ -53,17 +60,23 @@ from factorlib.robust import robust_deviation
 GAUGE = "standard errors hold the sum of diffuse + specular over a component's materials fixed in each channel"
 GIVEN = "; where a material or a light is known, that alone is fixed"
 ABSOLUTE = "; where surfaces light each other, that sum is known too, but to about a quarter of itself only"
-WIDTHS = (*[1.0] * 6, ROUGHNESS[1] - ROUGHNESS[0])  # of the ranges of a material's unknowns
-# Standard deviations, relative of k_d, k_s and lights, absolute of roughness, for residuals of one σ of the noise model: with them about 68 % of true
-# values lie within one standard error on sets that settings were chosen on (data/eames and the made sets of seeds 11, 12 and 13; without, 35,
-# 32, 45 and 57 %).
+WIDTHS = (*[1.0] * 6, ROUGHNESS[1] - ROUGHNESS[0])  # widths of the ranges of a material's unknowns
+# Standard deviations for residuals of one σ of the noise model, relative for k_d, k_s and lights, absolute for
+# roughness.  About 68 % of true values then lie within one standard error on the sets that settings were chosen on
+# (data/eames and the synthetic sets of seeds 11, 12 and 13); without them 35, 32, 45 and 57 % do.
 MODEL_ERROR = np.array([0.09] * 3 + [0.25] * 3 + [0.07])
 LIGHT_ERROR = 0.7
-ROWS, LARGEST = 32, 1000.0  # of the maps of a light's relative standard errors
+ROWS = 32  # rows of the maps of a light's relative standard errors
+LARGEST = 1000.0  # upper limit in these maps
 
 
 class StandardErrors(NamedTuple):
-    """The standard error of every material unknown; deviation: standard deviation of the residuals in units of the noise model."""
+    """Standard errors of the material unknowns.
+
+    Attributes:
+        materials: Standard error of every unknown.
+        deviation: Standard deviation of the residuals, in σ of the noise model.
+    """
 
     materials: Materials
     deviation: float
@@ -72,15 +85,21 @@ class StandardErrors(NamedTuple):
 def uncertainty_of(
     solution: Solution, problem: JointProblem, choices: Choices, tick: Callable[[], None] = lambda: None
 ) -> tuple[StandardErrors, dict[str, Float[np.ndarray, "h w 3"]]]:
-    """Standard errors of the materials, in the gauge of the answer, and the relative ones of each light, as maps.
+    """Return the standard errors of the materials in the gauge of the answer, and maps of each light's relative errors.
 
-    problem: all observations that the solution was found from;  tick: called after each of two systems for each light
+    Args:
+        solution: Result of the solver.
+        problem: All observations of the solve.
+        choices: Options of the user.
+        tick: Called after each of two systems for each light.
     """
-    problem, prior = solution.shown(problem), read_light_prior()
+    problem = solution.shown(problem)
+    prior = read_light_prior()
     count = observations_of(choices, solution.splitting)
     some, all_ = (of.sampled(count, choices.seed) for of in (sure_ones(problem), problem))
     found, deviation = Posterior(some, solution.materials, prior, tick).standard_errors()
-    fitted, materials = solution.materials.point.materials, solution.point.materials
+    fitted = solution.materials.point.materials
+    materials = solution.point.materials
     diffuse = found.diffuse * materials.diffuse / fitted.diffuse
     specular = found.specular * materials.specular / fitted.specular
     errors = StandardErrors(Materials(diffuse, specular, found.roughness), deviation)
@@ -88,14 +107,24 @@ def uncertainty_of(
 
 
 class Posterior:
-    """What is uncertain at the fit of a joint solve; problem: what it was fitted to;  tick: called after each light whose system is made."""
+    """Posterior of materials and lights at the fit of a joint solve.
+
+    Args:
+        problem: Observations of the fit.
+        fit: Fit of materials and lights.
+        prior: Prior on lights.
+        tick: Called after each light's system.
+    """
 
     def __init__(self, problem: JointProblem, fit: Fit, prior: LightPrior, tick: Callable[[], None] = lambda: None):
-        self.problem, self.fit, self.prior, self.tick = problem, fit, prior, tick
-        self.materials = materials_of(unknowns_of(fit.point.materials))  # none of whose reflectances is nil
+        self.problem = problem
+        self.fit = fit
+        self.prior = prior
+        self.tick = tick
+        self.materials = materials_of(unknowns_of(fit.point.materials))  # reflectances above zero
 
     def systems(self, with_scores: bool) -> list[System]:
-        """φ's system of each illumination; with_scores: of clusters of observations, too."""
+        """Return the system of φ of each illumination, with scores of clusters of observations if requested."""
 
         def system(one: tuple[Illumination, Hyperparameters]) -> System:
             """Return the system of one illumination."""
@@ -110,10 +139,12 @@ class Posterior:
         return list(self.problem.spread(system, list(zip(illuminations, self.fit.hyperparameters, strict=True))))
 
     def standard_errors(self) -> StandardErrors:
-        """Standard error of every material unknown."""
-        problem, materials = self.problem, self.materials
+        """Return the standard error of every material unknown."""
+        problem = self.problem
+        materials = self.materials
         values = np.column_stack([materials.diffuse, materials.specular, np.ones(len(materials))])
         by_log = 1 / values.reshape(-1)  # ∂ log k/∂k
+        # S and s_k, from logarithms to reflectances
         known, scores = information(self.systems(with_scores=True), len(by_log))
         scores = [of_light * by_log for of_light in scores]
         variance = largest_variance(known * np.outer(by_log, by_log), scores, materials, problem)
@@ -122,18 +153,25 @@ class Posterior:
         return _errors(np.where(problem.known.free(len(materials)), variance, 0.0), deviation)
 
     def relative_standard_errors(self) -> dict[str, Float[np.ndarray, "h w 3"]]:
-        """Return the standard error of each light over its mean radiance, by illumination: a small lat-long map in the frame of the exported ones, at most LARGEST."""
-        directions, maps = map_directions(), {}
+        """Return maps of each light's standard error relative to its mean radiance, by illumination.
+
+        The maps are lat-long, of ROWS rows, in the frame of the exported ones; values are at most LARGEST.
+        """
+        directions = map_directions()
+        maps = {}
         model_error = residual_deviation(self.problem, self.fit.point) * LIGHT_ERROR
         for block, light, system in zip(
             self.problem.blocks, self.fit.point.lights, self.systems(with_scores=False), strict=True
         ):
-            free, errors = light.free, np.empty((len(directions), 3))
+            free = light.free
+            errors = np.empty((len(directions), 3))
             p = int(free.sum())
             covariance = inverse_of(system.factor[: 3 * p, : 3 * p])
             overlap = np.exp(-0.5 * light.sharpness * squared_distances(directions, light.axis))
             for c in range(3):
-                own, slope = slice(c * p, (c + 1) * p), (overlap * light.weight[:, c])[:, free]
+                own = slice(c * p, (c + 1) * p)
+                slope = (overlap * light.weight[:, c])[:, free]
+                # gᵀ Σ g plus LIGHT_ERROR in quadrature
                 variance = np.maximum(np.sum(slope @ covariance[own, own] * slope, axis=1), 0)
                 errors[:, c] = np.hypot(np.sqrt(variance), model_error * slope.sum(1))
             mean = light.energy.sum(0) / 2  # `energy` is over 2π, a mean over 4π
@@ -142,12 +180,15 @@ class Posterior:
 
 
 def map_directions() -> Float[np.ndarray, "d 3"]:
-    """Directions of the texels of a map of ROWS rows, in the frame of the blocks."""
+    """Return the directions of the texels of a map of ROWS rows, in the frame of the blocks."""
     return (lat_long_directions(ROWS, 2 * ROWS) @ YUP_FROM_CAMERA).reshape(-1, 3)
 
 
 def residual_deviation(problem: JointProblem, point: Point) -> float:
-    """Robust standard deviation of the whitened residuals of what is not clipped: a bound that holds leaves no residual."""
+    """Return the robust standard deviation of the whitened residuals.
+
+    Clipped values are left out, because a satisfied bound has no residual.
+    """
     pairs = list(zip(problem.residuals(point), problem.blocks, strict=True))
     whole = np.concatenate([residual[~block.clipped] for residual, block in pairs])
     return robust_deviation(whole if len(whole) else np.concatenate([residual for residual, _ in pairs]))
@@ -159,15 +200,23 @@ def largest_variance(
     materials: Materials,
     problem: JointProblem,
 ) -> Float[np.ndarray, " k"]:
-    """Return the largest of three variances of each unknown, in the gauge, 0 of what is known.
+    """Return the largest of three variances of each unknown, in the gauge; 0 for known ones.
 
-    information: of the materials, which rounding may leave with an eigenvalue below 0;  scores: of each light's clusters, that the lights were eliminated from.  What the data
-    do not see, one unknown as the roughness of a Lambertian material or a trade of one for another, is uncertain by the width of its range,
-    which counts as one more observation of each unknown.
+    The data may leave unknowns undetermined, such as the roughness of a Lambertian material, or a trade of one unknown
+    for another.  The variance of such an unknown is that of the width of its range, which counts as one more
+    observation.
+
+    Args:
+        information: S of the materials; rounding may leave an eigenvalue below 0.
+        scores: s_k of each light's clusters, with the lights eliminated.
+        materials: Estimated materials.
+        problem: Observations.
     """
-    free, inverse = problem.known.free(len(materials)), np.zeros_like(information)
-    scale = np.sqrt(np.maximum(np.diag(information)[free], 1.0))  # rows are of unlike units
+    free = problem.known.free(len(materials))
+    inverse = np.zeros_like(information)
+    scale = np.sqrt(np.maximum(np.diag(information)[free], 1.0))  # rows have different units
     scales = np.outer(scale, scale)
+    # S, made positive definite by the ranges of the unknowns, and its inverse
     values, vectors = np.linalg.eigh(information[np.ix_(free, free)] / scales)
     own = (vectors * np.maximum(values, 0.0)) @ vectors.T + np.diag(
         np.tile(WIDTHS, len(materials))[free] ** -2.0 / scale**2
@@ -179,15 +228,19 @@ def largest_variance(
 
 
 def _errors(variance: Float[np.ndarray, " 7m"], deviation: float) -> StandardErrors:
-    """No unknown is less known than its range says."""
+    """Return standard errors that are at most the width of each unknown's range."""
     return StandardErrors(Materials.of_rows(np.minimum(np.sqrt(variance).reshape(-1, 7), WIDTHS)), deviation)
 
 
 def sandwich(inverse: Float[np.ndarray, "k k"], scores: Float[np.ndarray, "g k"]) -> Float[np.ndarray, "k k"]:
-    """(1) from scores that lights were eliminated from, one a row, as wide as Student's t asks for so few clusters."""
+    """Return (1) from scores with the lights eliminated, one a row.
+
+    It is widened by Student's t for the number of clusters, and zero for fewer than two.
+    """
     count = len(scores)
     if count < 2:
         return np.zeros_like(inverse)
+    # S⁻¹ (Σ_k s_k s_kᵀ · K/(K − 1)) S⁻¹, (1), times the squared t quantile of one standard deviation
     few = float(student_t.ppf(norm.cdf(1), count - 1))
     return few**2 * inverse @ (scores.T @ scores) @ inverse * count / (count - 1)
 
@@ -195,14 +248,23 @@ def sandwich(inverse: Float[np.ndarray, "k k"], scores: Float[np.ndarray, "g k"]
 def in_gauge(
     covariance: Float[np.ndarray, "k k"], materials: Materials, problem: JointProblem
 ) -> Float[np.ndarray, "k k"]:
-    """The covariance where the sum of each component is fixed in as many channels as have a free factor."""
+    """Return the covariance with the sum of each component fixed in as many channels as have a free factor.
+
+    Args:
+        covariance: Covariance of all material unknowns.
+        materials: Estimated materials.
+        problem: Observations.
+    """
     rows = materials.rows()
     for members, illuminations in connected_components(problem.blocks, len(materials)):
         factors = problem.known.factors(members, illuminations)
         for columns in {3: [[0, 3], [1, 4], [2, 5]], 1: [[*range(6)]], 0: []}[factors]:
-            g, h = np.zeros(rows.shape), np.zeros(rows.shape)
+            g = np.zeros(rows.shape)
+            h = np.zeros(rows.shape)
             own = np.ix_(members, columns)
-            g[own], h[own] = rows[own], 1
+            g[own] = rows[own]
+            h[own] = 1
+            # P = I − g hᵀ / (hᵀ g)
             P = np.eye(rows.size) - np.outer(g, h) / np.vdot(h, g)
             covariance = P @ covariance @ P.T
     return covariance

@@ -1,1 +1,1 @@
-"""Light at infinity: as spherical Gaussian lobes, and as lat-long maps."""
+"""Light at infinity and at a finite distance: spherical Gaussian lobes, lat-long maps and a prior on natural light."""

@@ -1,7 +1,7 @@
 """Light as a sum of spherical Gaussian lobes w · exp(λ(ω·z − 1)).
 
-A lobe's exponent is never computed as λ(ω·z − 1), which has no digits left at λ = 10⁶ in single precision, but as
-−λ|ω − z|²/2 or from half angles.  Its integral is 2π(−expm1(−2λ))/λ, a series where λ is small.
+The exponent is computed as −λ|ω − z|²/2 or from half angles.  The form λ(ω·z − 1) has no digits left at λ = 10⁶ in
+single precision.  The integral of a unit lobe is 2π(−expm1(−2λ))/λ, and a series where λ is small.
 """
 
 from __future__ import annotations
@@ -10,17 +10,18 @@ import msgspec
 import numpy as np
 from jaxtyping import Bool, Float
 
-SMALL_SHARPNESS = 1e-3
-SUN_DEG = 0.53  # diameter of the sun's disc
-SUN = 4 / np.radians(SUN_DEG / 2) ** 2  # λ of the lobe that is as wide (RMS) as the disc
+SMALL_SHARPNESS = 1e-3  # λ below which the integral is a series
+SUN_DEG = 0.53  # diameter of the sun's disc, degrees
+SUN = 4 / np.radians(SUN_DEG / 2) ** 2  # λ of the lobe whose RMS width is that of the disc
 
 
 class Lobes(msgspec.Struct, frozen=True):
-    """p lobes w · exp(λ(ω·z − 1)), float64.
+    """Set of p lobes w · exp(λ(ω·z − 1)), float64.
 
-    axis:      z, unit, in the illumination's frame
-    sharpness: λ ≥ 0
-    weight:    w ≥ 0, radiance at the axis per channel, linear Rec. 709
+    Attributes:
+        axis: z, unit, in the illumination's frame.
+        sharpness: λ ≥ 0.
+        weight: w ≥ 0, radiance at the axis per channel, linear Rec. 709.
     """
 
     axis: Float[np.ndarray, "p 3"]
@@ -31,39 +32,39 @@ class Lobes(msgspec.Struct, frozen=True):
         return len(self.sharpness)
 
     def turned(self, rotation: Float[np.ndarray, "3 3"]) -> Lobes:
-        """The same light in another frame: `rotation` = new_from_old."""
+        """Return the same light in another frame, `rotation` = new_from_old."""
         return Lobes(self.axis @ np.asarray(rotation).T, self.sharpness, self.weight)
 
     def scaled(self, factor: float | Float[np.ndarray, "3"]) -> Lobes:
-        """The light times `factor`, a number or one per channel."""
+        """Return the light times `factor`, a number or one per channel."""
         return Lobes(self.axis, self.sharpness, self.weight * np.asarray(factor))
 
     def radiance(self, directions: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
-        """Sum of the lobes in unit `directions`."""
+        """Return the sum of the lobes in unit `directions`."""
         return np.exp(-0.5 * self.sharpness * squared_distances(directions, self.axis)) @ self.weight
 
     @property
     def suns(self) -> Bool[np.ndarray, " p"]:
-        """Which lobes are as narrow as the sun."""
+        """Mask of the lobes that are as narrow as the sun."""
         return self.sharpness > 0.9 * SUN
 
     def take(self, which: Bool[np.ndarray, " p"]) -> Lobes:
-        """Return the light of some of its lobes."""
+        """Return the light of the selected lobes."""
         return Lobes(self.axis[which], self.sharpness[which], self.weight[which])
 
     @property
     def energy(self) -> Float[np.ndarray, "3"]:
-        """∫ of the light over the sphere, radiance × steradian."""
+        """Integral of the light over the sphere, radiance × steradian."""
         return lobe_integral(self.sharpness) @ self.weight
 
 
 def squared_distances(directions: Float[np.ndarray, "n 3"], axes: Float[np.ndarray, "p 3"]) -> Float[np.ndarray, "n p"]:
-    """|ω − z|², by differences: it keeps its digits where it is small."""
+    """Return |ω − z|², computed from differences to keep its digits where it is small."""
     return sum((directions[:, None, k] - axes[None, :, k]) ** 2 for k in range(3))
 
 
 def lobe_integral(sharpness: float | Float[np.ndarray, "*p"]) -> Float[np.ndarray, "*p"]:
-    """∫ exp(λ(ω·z − 1)) dω over the sphere, steradian.
+    """Return ∫ exp(λ(ω·z − 1)) dω over the sphere, steradian.
 
     >>> (lobe_integral(np.array([0.0, 1e-12, 1e6])) / np.pi).round(9).tolist()
     [4.0, 4.0, 2e-06]
@@ -76,5 +77,5 @@ def lobe_integral(sharpness: float | Float[np.ndarray, "*p"]) -> Float[np.ndarra
 
 
 def no_lobes() -> Lobes:
-    """Darkness."""
+    """Return a light without lobes, which is dark."""
     return Lobes(np.zeros((0, 3)), np.zeros(0), np.zeros((0, 3)))

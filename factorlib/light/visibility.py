@@ -1,14 +1,15 @@
-"""How much of a lobe a surface point sees, when it sees some directions and not others.
+"""Share of a lobe that reaches a surface point, from the visibility of a fixed set of directions.
 
-A point reflects ∫ L(i) f(i) V(i) di, f being the reflectance times the cosine and V ∈ [0, 1] what of direction i is not
-hidden.  The reflection operator knows the integral without V.  What V leaves of it is taken from K fixed directions d_k:
+A point reflects ∫ L(i) f(i) V(i) di.  f is the reflectance times the cosine, and V ∈ [0, 1] is the visible share of
+direction i.  The reflection operator gives the integral without V.  The share that V leaves is estimated from K fixed
+directions d_k:
 
     v = Σ_k V_k f_k L_k / Σ_k f_k L_k,       f_k = max(n·d_k, 0)             for the diffuse part                  (1)
                                              f_k = D(h_k) G1(n·d_k), GGX     for the specular part                (2)
 
-with L_k the lobe at d_k.  V = 1 gives 1 exactly, a constant light the ambient occlusion.  V is known at the d_k alone,
-so nothing may be narrower than their spacing: a lobe's sharpness λ becomes κ = 1/(1/λ + 1/κ_K), α² grows likewise.
-Two sums over k for all points and lobes are two matrix products.
+L_k is the lobe at d_k.  V = 1 gives exactly 1, and a constant light gives the ambient occlusion.  V is known only at
+the d_k, so no factor may be narrower than their spacing: a lobe's sharpness λ becomes κ = 1/(1/λ + 1/κ_K), and α²
+grows likewise.  The two sums over k for all points and lobes are two matrix products.
 """
 
 from __future__ import annotations
@@ -19,18 +20,18 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-FAINTEST = -40.0  # exponent of a lobe far from its axis: products stay normal numbers, which are multiplied much faster
-# Of the lobe's light that the reflectance passes; below, the lobe is behind the surface and counts as seen.
+FAINTEST = -40.0  # least exponent of a lobe: products stay normal numbers, which multiply much faster
+# Least share of the lobe that the reflectance passes; below it, the lobe is behind the surface and counts as visible.
 LEAST = 1e-6
 
 
 def widest_sharpness(count: int) -> float:
-    """κ_K, the sharpness of lobes as wide as `count` directions lie apart: a Gaussian of half their spacing."""
+    """Return κ_K, the sharpness of a Gaussian whose width is half the spacing of `count` directions."""
     return count / math.pi
 
 
 def cosine_weights(normals: Float[Tensor, "n 3"], directions: Float[Tensor, "k 3"]) -> Float[Tensor, "n k"]:
-    """f of equation (1), each row's sum 1."""
+    """Return f of equation (1), normalised to a sum of 1 in each row."""
     cosine = (normals @ directions.T).clamp_min(0)
     return cosine / cosine.sum(1, keepdim=True).clamp_min(1e-12)
 
@@ -38,9 +39,19 @@ def cosine_weights(normals: Float[Tensor, "n 3"], directions: Float[Tensor, "k 3
 def highlight_weights(
     normals: Float[Tensor, "n 3"], views: Float[Tensor, "n 3"], directions: Float[Tensor, "k 3"], roughness: float
 ) -> Float[Tensor, "n k"]:
-    """f of equation (2), each row's sum 1."""
-    square = roughness**4 + 1 / widest_sharpness(len(directions))  # α² and that of the directions' spacing
-    nd, no, od = normals @ directions.T, (normals * views).sum(1, keepdim=True), views @ directions.T
+    """Return f of equation (2), normalised to a sum of 1 in each row.
+
+    Args:
+        normals: n of the points, unit.
+        views: o of the points, unit, toward the camera.
+        directions: d_k, unit.
+        roughness: GGX roughness, α = roughness².
+    """
+    square = roughness**4 + 1 / widest_sharpness(len(directions))  # α² plus the variance of the directions' spacing
+    nd = normals @ directions.T
+    no = (normals * views).sum(1, keepdim=True)
+    od = views @ directions.T
+    # D(h_k) G1(n·d_k) up to a constant, 0 below the horizon
     upper = (nd > 0).to(nd.dtype)
     nd = nd.clamp_min(1e-6)
     nh2 = ((nd + no) ** 2 / (2 + 2 * od).clamp_min(1e-6)).clamp(0, 1)
@@ -53,18 +64,30 @@ def highlight_weights(
 def kernel(
     directions: Float[Tensor, "k 3"], axis: Float[Tensor, "p 3"], sharpness: Float[Tensor, " p"]
 ) -> Float[Tensor, "k p"]:
-    """L of the equations: lobes at the directions, widened, and no less than e^FAINTEST."""
+    """Return L of (1) and (2): lobes at the directions, widened, and at least e^FAINTEST.
+
+    Args:
+        directions: d_k, unit.
+        axis: Axes of the lobes, unit.
+        sharpness: λ of the lobes.
+    """
     distance = torch.cdist(directions, axis, compute_mode="donot_use_mm_for_euclid_dist")
     return torch.exp((-0.5 * widened(sharpness, len(directions)) * distance**2).clamp_min(FAINTEST))
 
 
 def widened(sharpness: Float[Tensor, " p"], count: int) -> Float[Tensor, " p"]:
-    """κ of lobes seen through `count` directions."""
+    """Return κ of lobes sampled at `count` directions."""
     return 1 / (1 / sharpness + 1 / widest_sharpness(count))
 
 
 def seen_share(
     visibility: Float[Tensor, "n k"], weights: Float[Tensor, "n k"], lobes: Float[Tensor, "k p"]
 ) -> Float[Tensor, "n p"]:
-    """v: of the light of `lobes` (their `kernel`) that `weights` reflect, the share that `visibility` lets pass."""
+    """Return v of (1) and (2), the share of each lobe's reflected light that is visible.
+
+    Args:
+        visibility: V of each point and direction, 0 to 1.
+        weights: f of each point and direction.
+        lobes: L of each direction and lobe, from `kernel`.
+    """
     return ((visibility * weights) @ lobes + LEAST) / (weights @ lobes + LEAST)
