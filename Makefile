@@ -75,7 +75,6 @@ help-all:
 	@echo '     SET="solve.cells=800 …"         with other parameters      FORCE=1   run again, whatever is there'
 	@echo '     STRICT=1                         exit code 3 (2 of make) where the verdict is "do not trust" (docs/verdict.md)'
 	@echo '     FACTORLIB_STORE=<folder>         share results with other checkouts (docs/runner.md)'
-	@echo 'make fit_mesh DATASET=…              only when asked for: proportions of meshes; SET="align.poses=build/…/fit_mesh" uses them'
 	@echo 'make render DATASET=… RECIPE=insert   pictures of the result: a name in recipes/, a path to a recipe, or all (docs/recipes.md)'
 	@echo 'make plan | why | status DATASET=…   what would run; why; how far each stage is'
 	@echo 'make new DATASET=mychair PHOTOS=… MASKS=… MESHES=…   begin a dataset of your own, from folders of files'

@@ -1,4 +1,4 @@
-"""poses.json of `align` and `fit_mesh`: the camera and every object's pose, by photo, and how far to believe them.
+"""poses.json of `align`: the camera and every object's pose, by photo, and how far to believe them.
 
 `align` writes the entry of one photo as <photo>.json; poses.json gathers those.
 """
@@ -14,9 +14,8 @@ from factorlib.geometry.camera import Camera, Pose, is_pose
 from factorlib.jsonfile import read_result
 
 FILE = "poses.json"
-SEARCHED = ("found", "keypoints", "refined")  # sources of poses that may still move; others were given
 AS_IT_IS = (1.0, 1.0, 1.0)
-CURE = "name the folder of a result of `align` or `fit_mesh`"
+CURE = "name the folder of a result of `align`"
 
 Vec3 = tuple[float, float, float]
 Positive = Annotated[float, msgspec.Meta(gt=0)]
@@ -44,7 +43,7 @@ class RunnerUp(PoseEntry, frozen=True):
 class ObjectEntry(PoseEntry, frozen=True):
     """An object's pose and how far to believe it (`factorlib.align.trust`); None for what was not measured.
 
-    scale: factors of the mesh's axes;  source: where the pose is from, one of SEARCHED or who gave it
+    scale: factors of the mesh's axes;  source: found, keypoints, refined (an earlier result), or who gave the pose
     doubts: what speaks against the pose, in words;  left_out: of the solve, for these doubts
     """
 

@@ -1,6 +1,6 @@
 """Balls, boxes and cylinders, their proportions fitted to outlines.
 
-A ball has none.  A box has two, a cylinder (about y) one: the factors of its axes that `align.proportions` fits, with the poses of all
+A ball has none.  A box has two, a cylinder (about y) one: the factors of its axes that `shapes.proportions` fits, with the poses of all
 photos, to the outlines.  The descent begins from several shapes, each laid on the `PHOTOS` photos that show most; the shape that overlaps most is kept.
 """
 
@@ -11,11 +11,11 @@ import numpy as np
 import trimesh
 from jaxtyping import Float
 
-from factorlib.align.proportions import BOX, ROUND, Sighting, fitted
 from factorlib.align.search import Search, find
 from factorlib.align.target import target_of
 from factorlib.geometry.raster import Caster
 from factorlib.shapes.outline import Outline, Triangles
+from factorlib.shapes.proportions import BOX, ROUND, Sighting, fitted
 
 BEGUN = {
     "box": ((1, 1, 1), (1, 0.5, 1), (1, 2, 1), (1, 0.25, 0.5), (1, 0.1, 1), (1, 0.2, 0.8)),

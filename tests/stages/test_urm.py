@@ -1,13 +1,18 @@
 """The urm stage from masks, align's maps and meshes to observations with visibility."""
 
+import msgspec
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
+from factorlib.dataset.schema import ObjectsSlice
+from factorlib.export.mesh_files import MeshFiles
 from factorlib.geometry.camera import Camera, Pose
 from factorlib.geometry.raster import rasterise
 from factorlib.images.exr import write_exr
 from factorlib.jsonfile import write_json
 from factorlib.meshes.ply import write_ply
+from factorlib.results.poses import ObjectEntry
 from factorlib.stage import Inputs
 from factorlib.urm.observations import read_observations
 from factorlib.urm.sample import sample
@@ -89,3 +94,16 @@ def test_of_many_pixels_a_weighted_sample_is_written_with_its_visibility(tmp_pat
     place = {(x, y): k for k, (x, y) in enumerate(zip(whole.x.tolist(), whole.y.tolist()))}
     rows = [place[at] for at in zip(part.x.tolist(), part.y.tolist())]
     np.testing.assert_array_equal(part.visibility, whole.visibility[rows])
+
+
+def test_urm_and_export_place_a_scaled_mesh_alike(tmp_path, two):
+    """x_cam = R (s ∘ x) + t, whatever frame a vertex is in."""
+    turn, scale, shift = Rotation.from_rotvec([0.3, -0.5, 0.2]).as_matrix(), (1.0, 1.2, 0.8), (0.1, 0.2, 6.0)
+    entry = msgspec.convert({"rotation": turn.tolist(), "translation": shift, "scale": scale}, ObjectEntry)
+    poses, given = dict.fromkeys(("left", "right"), entry), mesh_of([ball(1.0, 3)])
+    there = (given.vertices * scale) @ turn.T + shift
+    assert np.allclose(urm.occluders_of(two, poses).centre, (there.min(0) + there.max(0)) / 2, atol=1e-4)
+    (tmp_path / "meshes").mkdir()
+    own = msgspec.convert(two.facts["dataset.objects"], ObjectsSlice)
+    shape = MeshFiles(two, tmp_path, ["white"], 60.0, {}).shapes(own.objects[0], own.meshes, poses)[0]
+    assert np.allclose(given.vertices @ shape.cam_from_object[:3, :3].T + shape.cam_from_object[:3, 3], there)

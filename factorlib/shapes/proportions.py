@@ -1,25 +1,21 @@
-"""A mesh whose proportions differ from the object's: factors of its three axes, from all photos that show it.
+"""Factors of a shape's three axes, fitted to its outlines in all photos together with its poses.
 
     x_cam = R · (s ∘ x_object) + t,        s₁ s₂ s₃ = 1: overall size is not seen
 
 The contours' normal equations of every sighting (`factorlib.align.refine`) get two more unknowns, which all sightings share:
 a surface point at arm a from the mesh's middle moves by R e_k e_kᵀ Rᵀ a as log s_k grows, and the contour with it.  The
 sightings' own unknowns are eliminated (Schur complement) and follow.
-
-One photo alone can take a wrong proportion for a turn.  So factors are used only where they pay on photos that had no say in
-them: each part of the sightings in turn is left out, the factors are fitted to the others, and only its poses are fitted to it.
 """
 
 from collections.abc import Sequence
 from functools import partial
-from typing import Annotated
 
 import msgspec
 import numpy as np
 from jaxtyping import Float
 
 from factorlib.align.refine import DAMPING as OF_POSES
-from factorlib.align.refine import FocalPrior, normal_equations, refined, rendered
+from factorlib.align.refine import FocalPrior, normal_equations, rendered
 from factorlib.align.state import State
 from factorlib.align.target import Target
 from factorlib.geometry.camera import Camera
@@ -31,24 +27,11 @@ ROUND = np.array([[-1, 2, -1]]).T / 6.0**0.5  # those that leave a body of revol
 OF_FACTORS = 0.1**-2.0  # damping of d, as OF_POSES
 LARGEST_STEP = 0.15  # of the logarithms d; of other unknowns twice as much
 STILL = 1e-4  # a step of d that ends the descent
-PARTS = 4  # that are left out in turn, at most
 Factors = Float[np.ndarray, "3"]
-Share = Annotated[float, msgspec.Meta(ge=0, le=1)]
-
-
-class Standards(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """When factors are used."""
-
-    least_gain: Share = 0.2
-    """Share of what silhouettes of photos left out leave unexplained that factors must explain to be used."""
-    least_share: Share = 0.003
-    """Share of the mask's pixels that factors must explain to be used."""
-    steps: Annotated[int, msgspec.Meta(ge=1, le=100)] = 15
-    """Gauss-Newton steps of factors and poses together."""
 
 
 class Sighting(msgspec.Struct, frozen=True):
-    """An object in a photo: its mesh with its own labels, as read; what is seen of it; where it is taken to be."""
+    """An object in a photo: its mesh, its outline, and the state at which the fit begins."""
 
     mesh: Mesh
     target: Target
@@ -57,51 +40,10 @@ class Sighting(msgspec.Struct, frozen=True):
     state: State
 
 
-class Verdict(msgspec.Struct, frozen=True):
-    """Whether factors are used, the factors, their product 1, and the state of each sighting with them; shares of the mask
-    that silhouettes leave unexplained, mean over the sightings.
-
-    held_out_before, held_out_after: with the mesh as it is and with factors of other photos, poses fitted to both alike
-    """
-
-    used: bool
-    reason: str
-    factors: Factors
-    states: list[State]
-    held_out_before: float | None = None
-    held_out_after: float | None = None
-
-
-def proportions(sightings: Sequence[Sighting], standards: Standards = Standards()) -> Verdict:
-    """Factors of the one mesh that all sightings show; exactly 1 where they are not used."""
-    as_it_is = np.ones(3), [one.state for one in sightings]
-    if len(sightings) < 2:
-        return Verdict(False, "one photo alone can take a wrong proportion for a turn", *as_it_is)
-    before, after = [], []
-    count = len(sightings)
-    for part in ([*range(first, count, PARTS)] for first in range(min(count, PARTS))):  # left out together
-        others = [one for k, one in enumerate(sightings) if k not in part]
-        factors, _, _ = fitted(others, standards.steps)
-        for k in part:
-            before.append(unexplained(sightings[k], np.ones(3), standards.steps))
-            after.append(unexplained(sightings[k], factors, standards.steps))
-    losses = float(np.mean(before)), float(np.mean(after))
-    gain = losses[0] - losses[1]
-    if gain < max(standards.least_gain * losses[0], standards.least_share):
-        return Verdict(False, "photos left out are explained no better", *as_it_is, *losses)
-    return Verdict(True, "photos left out are explained better", *fitted(sightings, standards.steps)[:2], *losses)
-
-
-def unexplained(one: Sighting, factors: Factors, steps: int) -> float:
-    """The share of the mask at the best pose of the mesh with these factors."""
-    caster = Caster(scaled(one.mesh, tuple(factors)))
-    return 1 - refined(caster, one.target, one.camera, one.state, one.prior, steps).score
-
-
 def fitted(
     sightings: Sequence[Sighting], steps: int, free: Float[np.ndarray, "3 k"] = BOX
 ) -> tuple[Factors, list[State], float]:
-    """Factors, of product 1, and states together, by Gauss-Newton from the mesh as it is; the best met, and their mean score.
+    """Fit factors, of product 1, and states together by Gauss-Newton; return the best ones and their mean score.
 
     free: directions in which the logarithms of the factors may go
     """
