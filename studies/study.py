@@ -87,14 +87,9 @@ class Case(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class Comparison(Case, frozen=True, forbid_unknown_fields=True):
-    """The photos that a method sees; `size` is in pixels across a photo.
+    """The photos that a method sees; `size` is in pixels across a photo."""
 
-    pixels, steps:  of Mitsuba's optimisation: pixels across its pictures, and the largest number of its steps
-    """
-
-    method: Literal["ours", "mitsuba", "intrinsic", "projective", "grey"] = "ours"
-    pixels: int = 48
-    steps: int = 2000
+    method: Literal["ours", "intrinsic", "projective", "grey"] = "ours"
 
 
 class World(msgspec.Struct, frozen=True, forbid_unknown_fields=True):

@@ -1,12 +1,11 @@
-"""docs/gallery.md: a picture of every recipe, made of data/eames, and what every study shows; `make results ONLY=gallery`.
+"""docs/gallery.md: a picture of every recipe, made of data/eames; `make results ONLY=gallery`.
 
-Recipes are the files in recipes/ and recipes/eames/, studies those of `studies.run`: a new one appears by itself.
+Recipes are the files in recipes/ and recipes/eames/: a new one appears by itself.
 """
 
 from __future__ import annotations
 
 import os
-import re
 import subprocess
 import sys
 from pathlib import Path
@@ -16,17 +15,15 @@ from PIL import Image
 
 from factorlib.errors import InputError
 from factorlib.wholefile import write_text
-from studies.measured.tools import ROOT, table
-from studies.run import STUDIES
+from studies.measured.tools import ROOT
 
-PAGE, STUDIES_PAGE = ROOT / "docs" / "gallery.md", ROOT / "docs" / "studies.md"
+PAGE = ROOT / "docs" / "gallery.md"
 DATASET, PHOTO = "eames", "terrace"  # whose pictures are shown where a recipe makes them of all photos
 SIDE = 240  # pixels of the longer side of one of four pictures; twice as many of a single one
 HEAD = """# Gallery
 
-Every recipe with its pictures of `data/eames`, and every study with what it shows. `make results ONLY=gallery` makes this page.
+Every recipe with its pictures of `data/eames`. `make results ONLY=gallery` makes this page.
 
-## Recipes
 A recipe says which pictures to make of a result; [recipes](recipes.md) has all its fields. Where it makes pictures of every photograph, this page shows
 those of the `terrace`. Where these are four or more, such as the frames of an animation, it shows four of them.
 """
@@ -36,9 +33,6 @@ FIGURE = """<figure markdown="0" style="margin: 0">
 </figure>"""
 GRID = (
     '<div style="display: grid; grid-template-columns: repeat(auto-fill, minmax(min(100%, 300px), 1fr)); gap: 1.5rem">'
-)
-FINDING = re.compile(
-    r"^- (.*? grows as .*?|.*?: (?:shown|the opposite is shown|no difference is shown))(?: \(|, )", re.MULTILINE
 )
 
 
@@ -51,7 +45,7 @@ def write() -> Path:
     recipes = {path.stem: path for folder in ("", DATASET) for path in (ROOT / "recipes" / folder).glob("*.yaml")}
     (ROOT / "docs" / "gallery").mkdir(exist_ok=True)
     figures = [figure(recipes[name]) for name in sorted(recipes)]
-    write_text(PAGE, "\n".join([HEAD, GRID, *figures, "</div>\n", *studies_of(STUDIES_PAGE.read_text("utf-8"))]))
+    write_text(PAGE, "\n".join([HEAD, GRID, *figures, "</div>\n"]))
     return PAGE
 
 
@@ -96,23 +90,3 @@ def sheet(files: list[Path]) -> Image.Image:
     for k, picture in enumerate(pictures):
         whole.alpha_composite(picture, (k % 2 * width, k // 2 * height))
     return whole.convert("RGB")
-
-
-def studies_of(page: str) -> list[str]:
-    """The part on studies, of the claims that stand in docs/studies.md, whose text `page` is."""
-    rows = []
-    for name, study in STUDIES.items():
-        found = FINDING.findall(page.partition(f"<!-- begin {name} -->")[2].partition("<!-- end")[0])
-        shown = [words for words in found if words.endswith(": shown")]
-        first = next((words for words in found if words in shown or "grows as" in words), found[0])
-        words = f"{first.removesuffix(': shown')} ({len(shown)} of {len(found)} claims)" if shown else first
-        title = f"[{study.title}](studies.md#{re.sub('[^a-z ]', '', study.title.lower().replace('-', ' ')).replace(' ', '-')})"
-        rows.append([title, study.question, words, f"`make study STUDY={name}`"])
-    about = "A study varies one thing and tests claims over at least five seeds. Here stands the first that is shown, and how many are: [studies](studies.md) has all. The tables are of version 0.1.0, whose solve was [another](studies.md#against-the-paper)."
-    return [
-        "## Studies",
-        about,
-        "",
-        table(["study", "question", "what is shown", "command"], rows).replace("---:", "---"),
-        "",
-    ]

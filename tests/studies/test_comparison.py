@@ -1,16 +1,11 @@
 """The comparison: scores of the truth and of a grey ball, and scores by its steps."""
 
-import subprocess
-from pathlib import Path
-
 import numpy as np
 import pytest
 
 from factorlib.conventions import lat_long_directions
 from factorlib.evaluate.materials import compare_materials
-from factorlib.results.materials import Reflectance
 from studies.body import photographed
-from studies.catalogue import comparison
 from studies.errors import in_gauge, times
 from studies.methods import (
     grey,
@@ -36,9 +31,9 @@ def light(seed, rows=32):
     return sky
 
 
-def case(side=3, size=24, seed=0, method="ours", steps=2):
+def case(side=3, size=24, seed=0, method="ours"):
     """All of so many materials in as many lights."""
-    return Comparison(seed, tuple(full_matrix(side, side)), size, method=method, pixels=12, steps=steps)
+    return Comparison(seed, tuple(full_matrix(side, side)), size, method=method)
 
 
 def lights(seed, count=4):
@@ -90,20 +85,10 @@ def test_the_truth_in_any_gauge_scores_nothing_a_grey_ball_does_and_what_is_not_
 
 
 def test_from_worlds_to_pictures(tmp_path, monkeypatch):
-    """By its steps; Mitsuba's stands still: it is given a made answer, for what takes LLVM is tested below."""
-    monkeypatch.setitem(comparison.SIZES, "quick", (12, 12, 2))
-    material = Reflectance((0.3,) * 3, (0.1,) * 3, 0.4)
-    run = subprocess.run
-
-    def stand_in(words, **how):
-        if answer.__name__ not in words:
-            return run(words, **how)
-        return answer.written(Path(words[-1]), {"brick": material}, {0: np.ones((8, 16, 3))}, 1.0)
-
-    monkeypatch.setattr(answer.subprocess, "run", stand_in)
+    """By its steps."""
     table, out = concluded(tmp_path, "comparison", data_of(tmp_path / "comparison", TINY), TINY, [answer, compare])
     cells = {row["name"]: {m: c["spread"]["mean"] for m, c in row["cells"].items()} for row in table["rows"]}
-    assert list(cells) == ["ours", "mitsuba", "intrinsic", "projective", "grey"] and table["quick"]
+    assert list(cells) == ["ours", "intrinsic", "projective", "grey"] and table["quick"]
     assert all({"novel_view", "novel_light", "processor"} <= of.keys() for of in cells.values())
     assert cells["ours"]["novel_view"] < cells["grey"]["novel_view"] and "novel_material" not in cells["projective"]
     assert {path.stem for path in (out / "pictures").iterdir()} == {f"{method}-seed0" for method in cells}
