@@ -9,7 +9,7 @@ override PY := .venv/bin/python
 override STAGES := $(shell sed -n '/^stages:/,$$s/^  \([a-z_]*\):.*/\1/p' pipeline.yaml)
 MAKEFLAGS += --no-print-directory
 
-.PHONY: all plan why status graph logs params new label compare validate verify clean gc pack setup lock test test-long size docs results study studies data help help-all $(STAGES)
+.PHONY: all plan why status graph logs params new label compare validate verify clean gc pack setup lock test test-long docs results study studies data help help-all $(STAGES)
 
 # each reads DATASET, SET and FORCE from the environment
 all plan why status graph logs params new label compare validate verify pack $(STAGES): .venv/ready
@@ -43,9 +43,6 @@ test-long: .venv/ready
 docs: .venv/ready
 	@test -x .venv/bin/mkdocs || EXTRAS=docs $(PY) -I factorlib/setup.py extras
 	@NO_MKDOCS_2_WARNING=1 .venv/bin/mkdocs build -q && echo 'build/docs/index.html'
-
-size: .venv/ready
-	@$(PY) -m studies.measured.size
 
 # reads ONLY, LIGHTS and REAL from the environment
 results: .venv/ready
@@ -90,12 +87,11 @@ help-all:
 	@echo 'make gc                              show results that no dataset or study names any more, and delete them (FORCE=1: without asking)'
 	@echo 'make test                            lint, layers, tests'
 	@echo 'make test-long                       the tests that take long, which make test leaves out'
-	@echo 'make size                            how long each part is, beside its budget'
 	@echo 'make docs                            docs/ and the library as a site, to build/docs/index.html'
 	@echo 'make results [ONLY=operator]          measure what docs/results.md shows, all of it (hours) or one section, and write it there;'
 	@echo '                                      ONLY=gallery | notebook: docs/gallery.md, docs/result.ipynb (EXTRAS=notebook)'
-	@echo 'make study STUDY=matrix-size         an experiment: figure, table and conclusion, to build/studies/<name>; QUICK=1: one seed, small sets'
-	@echo 'make studies                         all experiments, and one page of them: build/studies/index.html (docs/studies.md)'
+	@echo 'make study STUDY=matrix-size         an experiment: table and conclusion, to build/studies/<name>; QUICK=1: one seed, small sets'
+	@echo 'make studies                         all experiments, and one page of them: build/studies/index.md (docs/studies.md)'
 	@echo 'make data                            make data/ again'
 	@echo 'make lock                            requirements.lock from pyproject.toml and what .venv has'
 	@echo 'make setup                           only the environment (TORCH_INDEX=<url> for another PyTorch)'

@@ -174,7 +174,6 @@ class Conclusion(msgspec.Struct, frozen=True):
     """All of a study's table.json.
 
     quick:    what stands beside everything that is shown of a quick study; empty of a full one
-    pictures: captions of the PNG files in the study's folder pictures/, by file
     over:     what intervals are over;  notes: sentences that are no claims
     """
 
@@ -189,7 +188,6 @@ class Conclusion(msgspec.Struct, frozen=True):
     rows: list[Row]
     claims: list[Outcome] = []
     over: str = "seeds"
-    pictures: dict[str, str] = {}
     notes: list[str] = []
 
     @property

@@ -30,7 +30,6 @@ SECTIONS = {  # module -> title
     "align": "Poses",
     "real_poses": "Poses of real photographs",
     "real_sets": "Re-synthesis of real photographs",
-    "viewer": "The viewer of the report",
 }
 PAGES = ("gallery", "notebook")  # modules whose `write()` makes a page of its own
 

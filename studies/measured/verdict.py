@@ -5,7 +5,7 @@ fit    44 sets: data/eames and seeds 111 to 120 of `studies.measured.eames_like`
 test   20 others of seeds 201 to 205, the last two in captured light, each way once: what is expected with the weights as they stand
 
 Sets lie in build/bench/verdict, results in build/.  Printed of each that is named: every set, rank correlations (Spearman), and the deviation; of `fit` also
-with each set left out of the fit.  The figure of all that are named is build/bench/verdict/calibration.svg.
+with each set left out of the fit.  Expected and true scores of all that are named are in build/bench/verdict/calibration.csv.
 """
 
 from __future__ import annotations
@@ -19,10 +19,9 @@ from jaxtyping import Float
 from scipy.optimize import least_squares
 from scipy.stats import spearmanr
 
-from factorlib.evaluate.verdict import CLIPPED, CONTOUR, FLOOR, GOOD, MATERIALS, POOR, UNEXPLAINED
+from factorlib.evaluate.verdict import CLIPPED, CONTOUR, FLOOR, MATERIALS, UNEXPLAINED
 from factorlib.images.light_map import maps_in
 from factorlib.wholefile import write_text
-from studies.figures import STYLE
 from studies.measured.eames_like import drawn, folder_of, made
 from studies.measured.tools import ROOT, evaluated, needed, table
 from studies.scenes.spoilt import MIXED, spoilt
@@ -33,7 +32,6 @@ SEEDS = {"fit": (None, *range(111, 121)), "test": tuple(range(201, 206))}  # Non
 FIRST = {"fit": 0, "test": 1000}  # number of the first set
 ORDER = {"fit": 5, "test": 6}  # seeds of the order in which ways to spoil are dealt
 TIMES = 4  # a base
-LEAST, MOST = 10, 35  # dB, of the figure
 HOPELESS = 18.0  # dB: a flat disc of the true ball's mean colour scores 17.6 to 18.6
 WEIGHTS = {"materials": MATERIALS, "clipped": CLIPPED, "unexplained": UNEXPLAINED, "contour": CONTOUR}
 
@@ -88,35 +86,6 @@ def fitted(sets: list[Judged]) -> Float[np.ndarray, " 4"]:
     return np.exp(least_squares(lambda w: expected(np.exp(w), signs) - scores, start, loss="soft_l1").x)
 
 
-def scatter(sets: dict[str, list[tuple[float, float]]]) -> str:
-    """Return an SVG of (expected, true) scores in dB by kind: hollow dots for the first, full ones for the others; the diagonal, and the verdict's bounds."""
-
-    def across(db: float) -> float:
-        return 50 + 12 * (db - LEAST)
-
-    def up(db: float) -> float:
-        return 330 - 12 * (db - LEAST)
-
-    ends = across(LEAST), across(MOST), up(LEAST), up(MOST)
-    parts = [f'<line x1="{ends[0]}" y1="{ends[2]}" x2="{ends[1]}" y2="{ends[3]}"/>']
-    parts += [
-        f'<line class="grid" x1="{across(db)}" x2="{across(db)}" y1="{ends[2]}" y2="{ends[3]}"/>' for db in (POOR, GOOD)
-    ]
-    for db in range(LEAST, MOST + 1, 5):
-        parts += [f'<text x="{across(db)}" y="346" text-anchor="middle">{db}</text>', f'<text x="44" y="{up(db) + 4}" text-anchor="end">{db}</text>']  # fmt: skip
-    for k, points in enumerate(sets.values()):
-        fill = "#2b5c9e" if k else "none"
-        parts += [
-            f'<circle cx="{across(x):.1f}" cy="{up(y):.1f}" r="3.5" stroke="#2b5c9e" fill="{fill}"/>' for x, y in points
-        ]
-    words = "; ".join(f"{'full' if k else 'hollow'}: {name}" for k, name in enumerate(sets))
-    captions = "expected score, dB", words, "true relit set score, dB"
-    parts += [f'<text x="50" y="{y}">{text}</text>' for y, text in zip((366, 384, 20), captions, strict=True)]
-    return (
-        f'<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 420 394"><style>{STYLE}</style>{"".join(parts)}</svg>\n'
-    )
-
-
 def told(sets: list[Judged]) -> str:
     """Every set in a table, and how well scores are foreseen."""
     rows = [[one.spoilt_by, f"{one.score:.1f}", f"{one.expected:.1f}", one.trust] for one in sorted(sets, key=lambda s: -s.expected)]  # fmt: skip
@@ -134,7 +103,7 @@ def agreement(foreseen: Float[np.ndarray, " n"], sets: list[Judged]) -> str:
 
 
 def main() -> None:
-    """Print what came out of each kind of sets that is named, and draw all."""
+    """Print what came out of each kind of sets that is named, and write the scores of all."""
     kinds = {name: judged(name) for name in sys.argv[1:] or SEEDS}
     for name, sets in kinds.items():
         print(f"{name}\n{told(sets)}")
@@ -142,8 +111,8 @@ def main() -> None:
         print("weights:", dict(zip(WEIGHTS, np.round(fitted(sets), 4).tolist(), strict=True)))
         rest = [expected(fitted([*sets[:k], *sets[k + 1 :]]), np.array([one.signs]))[0] for k, one in enumerate(sets)]
         print("each set left out of the fit:", agreement(np.array(rest), sets))
-    points = {f"{len(sets)} sets, {name}": [(one.expected, one.score) for one in sets] for name, sets in kinds.items()}
-    write_text(PLACE / "calibration.svg", scatter(points))
+    lines = [f"{name},{one.expected:.3f},{one.score:.3f}" for name, sets in kinds.items() for one in sets]
+    write_text(PLACE / "calibration.csv", "\n".join(["kind,expected_db,true_db", *lines, ""]))
 
 
 if __name__ == "__main__":

@@ -112,7 +112,7 @@ def make(
             from studies.run.page import conclude, write_page  # here: a plan must not pay for science
 
             conclude(study, scale, project.build / name / targets[-1], project.build / name)
-            print(f"  study: {project.shown(project.build / name / 'figure.svg')}")
+            print(f"  study: {project.shown(project.build / name / 'paragraph.md')}")
             print(f"  page: {project.shown(write_page(project))}")
     return next((code for code in codes if code), 0)
 

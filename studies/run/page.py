@@ -1,40 +1,38 @@
-"""What people read of studies: a study's table, figure and paragraph, index.html, which stands alone, and the tables of docs/studies.md."""
+"""Pages of studies: paragraph.md and tables of each, index.md of all, and the tables of docs/studies.md."""
 
 from __future__ import annotations
 
-import base64
 import re
 import shutil
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
-import jinja2
 import msgspec
 
 from factorlib.jsonfile import json_text, read_json
 from factorlib.runner.project import LIBRARY, Project
 from factorlib.wholefile import replace_file
 from studies.conclusion import Conclusion, concluded, csv_text, head, paragraph
-from studies.figures import figure
 from studies.measured.tools import refresh, table
 from studies.run import STUDIES, studies
 from studies.study import FULL, Scale, Score, Study, case_name
 
 DOCS = LIBRARY / "docs" / "studies.md"
 COLUMNS = 4  # measures of a study that the documentation has
-FINISHED = ("figure.svg", "table.csv", "table.json", "paragraph.md")
+FINISHED = ("table.csv", "table.json", "paragraph.md")
 
 
 def conclude(study: Study, scale: Scale, scores: Path, home: Path) -> None:
-    """Write what a study comes to into the folder `home`: table.json and .csv, figure.svg, paragraph.md and pictures/.
+    """Write what a study comes to into the folder `home`: table.json and .csv, paragraph.md and pictures/.
 
     scores: the folder of its last step, with scores.json, and <case>.png of some cases
     """
     result = concluded(study, scale, msgspec.convert(read_json(scores / "scores.json"), dict[str, Score]))
     cases = {case_name(s.name, n): f"{s.label}, {study.over.removesuffix('s')} {n}" for s in study.settings(scale) for n in study.numbers(scale)}  # fmt: skip
     pictures = {f"{case}.png": caption for case, caption in cases.items() if (scores / f"{case}.png").is_file()}
-    result = msgspec.structs.replace(result, pictures=pictures)
-    texts = (figure(result), csv_text(result), json_text(result), paragraph(result))
+    shown = [f"![{caption}](pictures/{file})\n" for file, caption in pictures.items()]
+    page = "\n".join([paragraph(result), numbers(result, len(result.measures)), "", *shown])
+    texts = (csv_text(result), json_text(result), page)
     for file, words in zip(FINISHED, texts, strict=True):
         replace_file(home / file, words.encode())
     shutil.rmtree(home / "pictures", ignore_errors=True)
@@ -44,19 +42,12 @@ def conclude(study: Study, scale: Scale, scores: Path, home: Path) -> None:
 
 
 def write_page(project: Project) -> Path:
-    """index.html of all studies of this scale that are done; it stands alone."""
-    sections = []
-    for name, c in done_of(project).items():
-        folder = project.build / name
-        images = {c.pictures[f]: base64.b64encode((folder / "pictures" / f).read_bytes()).decode() for f in c.pictures}
-        sections.append((c, (folder / "figure.svg").read_text(encoding="utf-8"), images))
-    environment = jinja2.Environment(
-        autoescape=True, trim_blocks=True, lstrip_blocks=True, undefined=jinja2.StrictUndefined
-    )
-    template = environment.from_string(Path(__file__).with_name("index.html").read_text(encoding="utf-8"))
-    text = template.render(studies=sections, quick=any(c.quick for c, _, _ in sections), head=head)
-    replace_file(project.build / "index.html", text.encode())
-    return project.build / "index.html"
+    """Write index.md, a table of all studies of this scale that are done; returns its path."""
+    done = done_of(project)
+    rows = [[f"[{c.title}]({name}/paragraph.md)", c.paper, c.answer] for name, c in done.items()]
+    text = "# Studies\n\n" + table(["study", "the paper", "here"], rows) + "\n"
+    replace_file(project.build / "index.md", text.encode())
+    return project.build / "index.md"
 
 
 def done_of(project: Project) -> dict[str, Conclusion]:
@@ -79,7 +70,9 @@ def done_of(project: Project) -> dict[str, Conclusion]:
 def refresh_docs(names: Sequence[str]) -> None:
     """Write the tables of full studies, and that of all answers to the paper, into docs/studies.md."""
     done, text = done_of(studies(FULL)), DOCS.read_text(encoding="utf-8")
-    parts = {name: numbers(done[name]) for name in names if name in done}
+    parts = {}
+    for name in [name for name in names if name in done]:
+        parts[name] = "\n".join([numbers(done[name], COLUMNS), "", *(f"- {words}" for words in done[name].sentences)])
     refresh(DOCS, {"conclusions": against_the_paper({name: c.answer for name, c in done.items()}, text)} | parts)
 
 
@@ -93,10 +86,7 @@ def against_the_paper(answers: Mapping[str, str], text: str = "") -> str:
     return table(["study", "the paper", "here"], rows)
 
 
-def numbers(c: Conclusion) -> str:
-    """The first measures of a study, and its sentences."""
-    measures = c.measures[:COLUMNS]
-    rows = [[row.label, *(str(row.cells.get(m, "–")) for m in measures)] for row in c.rows]
-    return "\n".join(
-        [table([c.varied, *map(head, measures)], rows), "", *(f"- {sentence}" for sentence in c.sentences)]
-    )
+def numbers(c: Conclusion, most: int) -> str:
+    """Return a table of the first measures of a study, at most so many."""
+    rows = [[row.label, *(str(row.cells.get(m, "–")) for m in c.measures[:most])] for row in c.rows]
+    return table([c.varied, *map(head, c.measures[:most])], rows)

@@ -17,7 +17,7 @@ from PIL import Image
 from factorlib.errors import InputError
 from factorlib.labelling.server import MaskSet, Server
 from factorlib.labels.png import read_values
-from studies.measured.viewer import CHROMIUM, _browser
+from tests.browser import CHROMIUM, started
 from tests.labels.test_grow import clicked, scene
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -176,7 +176,7 @@ def test_ctrl_c_ends_it_and_names_what_is_not_saved(folder):
 def test_in_a_browser_by_mouse_and_keys(folder):
     truth, box, mask = scene()[0], scene()[2], folder / "masks/day.png"
     with served(folder) as server:
-        context = _browser().new_context(viewport={"width": 1440, "height": 900})
+        context = started().new_context(viewport={"width": 1440, "height": 900})
         page, complaints = context.new_page(), []
         page.on("console", lambda said: complaints.append(said.text) if said.type in ("error", "warning") else None)
         page.on("pageerror", lambda error: complaints.append(str(error)))

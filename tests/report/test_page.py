@@ -16,7 +16,7 @@ from factorlib.light.lobes import no_lobes
 from factorlib.results.lobes import write_lobes
 from factorlib.stage import Inputs
 from stages import evaluate, report
-from studies.measured.viewer import CHROMIUM, opened
+from tests.browser import CHROMIUM, opened
 from tests.evaluate.made_artifacts import Made, lobes_of, make_artifacts
 from tests.stages.made import Rising
 

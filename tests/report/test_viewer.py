@@ -24,8 +24,8 @@ from factorlib.report.artifacts import Artifacts
 from factorlib.report.page import forms
 from factorlib.report.pictures import light_row
 from stages import report
-from studies.measured.viewer import BACK, CHROMIUM, HALF_FIELD, ball_seen, error, opened, rendered, shown
 from tests.align.scenes import mesh_of
+from tests.browser import BACK, CHROMIUM, HALF_FIELD, ball_seen, error, opened, rendered, shown
 from tests.evaluate.made_artifacts import TRUE, lobes_of, perturbed
 from tests.report.test_page import LINKED, page_of
 

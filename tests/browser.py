@@ -1,8 +1,6 @@
-"""The report's relighting viewer against the pipeline's own rendering: `make results ONLY=viewer`, of `build/eames`, in headless Chromium.
+"""A browser for tests of pages, and what the report's viewer shows beside the same pixels by the reflection operator.
 
-Error: balls of every material in every light, drawn in software, against the reflection operator on the same pixels,
-|viewer − operator| / max over channels of the operator's.  Time: a frame while something moves, waiting for its last
-pixel; the smallest and the median of several, for other programs only ever add to it.
+Error: |viewer − operator| / max over channels of the operator's.
 """
 
 from __future__ import annotations
@@ -20,13 +18,10 @@ from jaxtyping import Bool, Float
 from scipy.ndimage import binary_erosion
 
 from factorlib.conventions import YUP_FROM_CAMERA
-from factorlib.errors import InputError
 from factorlib.light.lobes import Lobes
 from factorlib.reflection import reflection_operator
 from factorlib.render.reflect import Reflector
-from factorlib.results.lobes import read_lobes
-from factorlib.results.materials import Reflectance, read_materials, reflectances
-from studies.measured.tools import ROOT, Tables
+from factorlib.results.materials import Reflectance
 
 CHROMIUM = next((p for p in map(shutil.which, ("chromium", "chromium-browser", "google-chrome")) if p), None)
 FLAGS = [
@@ -36,7 +31,7 @@ FLAGS = [
 HALF_FIELD = np.radians(15)  # of the viewer's camera
 BACK = 1.04 / np.sin(HALF_FIELD)  # its distance, in radii
 EDGE = 2  # pixels inside the outline that are left out: there a pixel is filled in part
-SIZE, FRAMES = 96, 30
+SIZE = 96
 RADIANCE = """([object, photo, chosen, size]) => {
   const {renderer, data} = window.viewer;
   return Array.from(renderer.radiance({...chosen, object: renderer.objects.at(object), photo: data.photos.find((p) => p.name === photo)}, size));
@@ -45,7 +40,7 @@ START = {"azimuth": 0, "elevation": 0, "turn": 0, "zoom": 1, "sky": False, "stop
 
 
 @cache
-def _browser() -> Any:
+def started() -> Any:
     """One browser a process: Playwright allows no second."""
     from playwright.sync_api import sync_playwright
 
@@ -58,7 +53,7 @@ def _browser() -> Any:
 @contextmanager
 def opened(file: Path, **context) -> Iterator[tuple[Any, list[str]]]:
     """The page and a list that gathers what it complains of; context: what Playwright's `new_context` takes."""
-    here = _browser().new_context(**context)
+    here = started().new_context(**context)
     page, complaints = here.new_page(), []
     page.on("console", lambda said: complaints.append(said.text) if said.type in ("error", "warning") else None)
     page.on("pageerror", lambda error: complaints.append(str(error)))
@@ -105,32 +100,3 @@ def rendered(
 def error(radiance: Float[np.ndarray, "n 3"], true: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, " n"]:
     """The error of each pixel."""
     return np.abs(radiance - true).max(axis=1) / np.maximum(true.max(axis=1), 1e-12)
-
-
-def rows() -> Tables:
-    """Errors by material, and times of a frame by its size.  InputError without the report or a browser."""
-    build = ROOT / "build/eames"
-    if CHROMIUM is None or not (build / "report/index.html").is_file():
-        raise InputError(
-            "no report, or no Chromium", file=build, cure="make all DATASET=eames; apt-get install chromium"
-        )
-    lights, (normals, views, inside) = read_lobes(build / "export/lobes.parquet"), ball_seen(0.0, 0.0)
-    with opened(build / "report/index.html", viewport={"width": 1440, "height": 900}) as (page, _):
-        photos = page.evaluate("viewer.data.photos.map((p) => [p.name, p.light])")
-        page.evaluate("viewer.canvas.style.width = '64px'")
-        errors, times = [], []
-        for name, material in reflectances(read_materials(build / "export/materials.json")).items():
-            pairs = (
-                (shown(page, -1, name, p)[inside][:, :3], rendered(lights[light], material, normals, views))
-                for p, light in photos
-            )
-            quantiles = np.percentile(np.concatenate([error(*pair) for pair in pairs]), [50, 95, 100])
-            errors.append([name, f"{material.roughness:.2f}", *(f"{100 * e:.2f} %" for e in quantiles)])
-        for size in (512, 256, 128):
-            page.evaluate(f"viewer.seconds(3, {size})")
-            seconds = page.evaluate(f"Array.from({{length: {FRAMES}}}, () => viewer.seconds(1, {size}))")
-            times.append([f"{size}²", f"{1000 * min(seconds):.0f} ms", f"{1000 * np.median(seconds):.0f} ms"])
-    return {
-        "Error": [["material", "roughness", "median", "95th percentile", "worst"], *errors],
-        f"A frame, of {FRAMES}": [["pixels", "smallest", "median"], *times],
-    }
