@@ -31,17 +31,6 @@ def cluster(example, tmp_path):
         yield found
 
 
-def test_the_job_script_asks_slurm_for_what_the_example_and_the_docs_say(cluster):
-    script = cluster.job_script()
-    for line in ("#SBATCH -p compute", "#SBATCH -A my-project", "#SBATCH --cpus-per-task=16", "#SBATCH -t 08:00:00"):
-        assert line in script.splitlines(), script
-    command = script.strip().splitlines()[-1]
-    assert "--nthreads 16" in command and "--memory-limit 0" in command
-    script = re.sub(r"tcp://\S+", "tcp://<scheduler>", script).replace(str(LIBRARY), "<checkout>").strip()
-    without_logs = re.sub("#SBATCH -[eo] .*\n", "", script)  # they lie where the test says
-    assert without_logs in (LIBRARY / "docs" / "distributed.md").read_text()
-
-
 def test_the_job_script_run_as_slurm_would_starts_a_worker_that_serves_a_run(cluster, tmp_path):
     """Every line of it but the interpreter's path, which is that of the tests."""
     script = cluster.job_script().replace(f"{LIBRARY}/.venv/bin/python", sys.executable)

@@ -297,17 +297,6 @@ def test_photos_of_one_light_agree_on_its_frame(folder):
     assert facts == {"illumination": "studio", "world_from_camera": TURN}
 
 
-def test_names_of_build_and_what_is_not_there_are_no_datasets(folder):
-    place = write(folder)
-    for name in ("studies", "bench", "store"):
-        place = place.rename(folder.parent / name)
-        with pytest.raises(InputError, match=name):
-            read_dataset(place)
-    with pytest.raises(InputError, match="no such dataset") as caught:
-        read_dataset(folder)
-    assert "set" in str(caught.value.file) and caught.value.cure
-
-
 @pytest.mark.parametrize("old, new, line, words", [
     ("mesh: chair\n", "mehs: chair\n", 30, ["mehs", "did you mean 'mesh'"]),
     ("  image: garden.exr\n", "  image: garden.exr\n  image: kitchen.jpg\n", 53, ["the key 'image' stands here twice"]),

@@ -2,28 +2,14 @@
 
 import re
 
-import numpy as np
 import pytest
 
 from factorlib.errors import InputError
 from factorlib.images.picture import read_png
-from factorlib.meshes.mesh import Mesh
 from factorlib.runner import verbs
 from factorlib.runner.project import LIBRARY, Project, photo_sets
-from factorlib.sheet import HEAD, MARGIN, MESH_SIDE, drawn, write_sheet
+from factorlib.sheet import HEAD, MARGIN, MESH_SIDE, write_sheet
 from tests.faults import good
-
-
-def test_a_mesh_is_drawn_upright_in_the_colours_of_its_labels():
-    """Label 1 above, label 2 below, as the mesh lies in its file: +y up."""
-    corners = np.array([[-1, 0, 0], [1, 0, 0], [1, 1, 0], [-1, 1, 0], [-1, -1, 0], [1, -1, 0]], float)
-    faces = np.array([[0, 1, 2], [0, 2, 3], [4, 5, 1], [4, 1, 0]], np.int32)
-    mesh = Mesh(corners, faces, np.tile([0, 0, 1.0], (6, 1)), np.array([1, 1, 2, 2], np.int16), open=True)
-    picture = drawn(mesh, np.array([[255, 255, 255], [200, 0, 0], [0, 0, 200]], np.uint8))
-    middle = MESH_SIDE // 2
-    above, below = picture[middle - 20, middle], picture[middle + 20, middle]
-    assert above[0] > 150 > above[2] and below[2] > 150 > below[0]
-    assert (picture[0, 0] == 255).all()
 
 
 def test_validate_writes_a_row_for_each_photo_with_its_labels_and_meshes_always_the_same(tmp_path, capsys):

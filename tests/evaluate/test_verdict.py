@@ -37,25 +37,6 @@ def test_clean_signs_are_good_and_each_sign_alone_can_spoil_the_trust_and_is_the
         assert BLAMED[name] in spoilt.reasons[0] and "'" in spoilt.next, name
 
 
-def test_the_weightiest_reason_comes_first_and_says_what_to_do():
-    for level in (0.08, 0.8):  # of the materials, beside outlines that differ
-        both = verdict(msgspec.structs.replace(CLEAN, materials={"wood": level}, contours={"day": {"stool": 0.05}}))
-        assert len(both.reasons) == 2 and ("'wood'" in both.next) == ("'wood'" in both.reasons[0]) == (level > 0.5)
-        assert (both.terms["materials"] > both.terms["contour"]) == (level > 0.5)
-
-
-def test_reflectances_that_are_uncertain_for_the_photos_fit_badly_ask_for_a_better_mesh_not_for_another_photo():
-    unsure = msgspec.structs.replace(CLEAN, materials={"wood": 0.2}, photos=UNEXPLAINED, deviation=12.0)
-    assert "12 times" in verdict(unsure).reasons[0] and "mesh" in verdict(unsure).next
-    assert "'dusk'" in verdict(unsure).next
-    assert "mesh" not in verdict(msgspec.structs.replace(unsure, deviation=1.0)).next
-
-
-def test_where_nothing_is_wrong_at_all_it_still_says_what_to_do_next():
-    nothing = verdict(Signs({"red": 0.0}, 0.0, {"day": Misfit(0.0, 0.0)}, {}))
-    assert nothing.trust == "good" and nothing.next and len(nothing.reasons) == 1
-
-
 def test_a_worse_sign_never_raises_what_is_expected():
     levels = np.linspace(0, 1, 6)
     for name in ("materials", "unexplained", "clipped", "contours"):

@@ -6,8 +6,6 @@ from factorlib.stage import silent
 from stages import export
 from tests.export import made_export
 
-collect_ignore = ["in_materialx.py"]  # runs in a process of its own, where MaterialX is installed
-
 
 @pytest.fixture(scope="session")
 def exported(tmp_path_factory):

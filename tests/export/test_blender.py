@@ -4,7 +4,6 @@ Blender runs in a process of its own: its libraries do not get on with others of
 """
 
 import importlib.util
-import json
 import shutil
 import subprocess
 import sys
@@ -29,7 +28,6 @@ from factorlib.tracing.variant import mitsuba
 from tests.export import made_export
 
 MISSING = 'Blender is not installed: make setup EXTRAS="blender", or put `blender` on the PATH'
-BLENDER_FROM_YUP = np.array([[1, 0, 0], [0, 0, -1], [0, 1, 0]])  # Blender turns scenes z-up
 OPEN = """
 import bpy, json
 def opened(file):
@@ -38,21 +36,6 @@ def opened(file):
     bpy.ops.wm.usd_import(filepath=file)
     bpy.context.scene.camera, = (found for found in bpy.data.objects if found.type == "CAMERA")
     return bpy.context.scene
-"""
-DUMP = """
-told = {}
-for file in FILES:
-    camera = opened(file).camera
-    lens = camera.data
-    meshes = [found for found in bpy.data.objects if found.type == "MESH"]
-    told[file] = {
-        "lens": [lens.lens, lens.sensor_width, lens.shift_x, lens.shift_y],
-        "camera": [list(row) for row in camera.matrix_world],
-        "vertices": {m.name: [list(m.matrix_world @ v.co) for v in m.data.vertices] for m in meshes},
-        "bound": {m.name: [slot.material.name for slot in m.material_slots] for m in meshes},
-        "materials": len(bpy.data.materials),
-    }
-open(OUT, "w").write(json.dumps(told))
 """
 RENDER = """
 for file in FILES:
@@ -210,28 +193,3 @@ def test_round_trip_shows_what_mitsuba_shows(exported):
         print(f"{photo}: difference {np.median(error):.2%} (median), {np.percentile(error, 95):.2%} (95th percentile)")
         assert np.median(error) <= 0.03 and np.percentile(error, 95) <= 0.1
         assert found[photo][mask][:, 3].min() == 1.0
-
-
-@pytest.mark.long
-def test_camera_vertices_and_materials_arrive_as_usd(exported, tmp_path):
-    inputs, out = exported
-    files = {photo: out / "scenes" / f"{photo}.usda" for photo in made_export.MESHES}
-    run_usd(DUMP, files.values(), OUT=str(tmp_path / "told.json"))
-    told = json.loads((tmp_path / "told.json").read_text())
-    for photo, file in files.items():
-        found, camera = told[str(file)], made_export.CAMERAS[photo]
-        lens, sensor, *shift = found["lens"]
-        assert lens / sensor * camera.width == pytest.approx(camera.focal, rel=1e-6) and sensor == pytest.approx(36)
-        middle = (np.array([camera.width, camera.height]) / 2 - camera.centre) * [1, -1] / camera.width
-        np.testing.assert_allclose(shift, middle, atol=1e-6)
-        expected = np.eye(4)
-        expected[:3, :3] = BLENDER_FROM_YUP
-        np.testing.assert_allclose(found["camera"], expected, atol=1e-6)
-        parts = {"front": ["red"], "side": ["brass", "red"]}[photo]
-        assert found["bound"] == {name: [name] for name in parts} and found["materials"] == len(parts)
-        entry = inputs.facts["dataset.objects"][photo]["meshes"][made_export.MESHES[photo]]
-        mesh = read_mesh(inputs.files[entry["file"]], made_export.NAMES, entry["parts"])
-        placed = made_export.POSES[photo].apply(mesh.vertices) @ YUP_FROM_CAMERA @ BLENDER_FROM_YUP.T
-        for name, vertices in found["vertices"].items():
-            used = np.unique(mesh.faces[mesh.face_label == made_export.NAMES.index(name) + 1])
-            np.testing.assert_allclose(vertices, placed[used], atol=2e-6)

@@ -95,14 +95,6 @@ def test_clean_deletes_nobody_elses_what_a_user_put_beside_the_results_stays_and
 # ── pipeline.yaml and SET ────────────────────────────────────────────────────────────────────────────────────────────
 
 
-def test_a_name_in_the_pipeline_that_leads_elsewhere_is_refused(project):
-    for name in ("../up", ".", "a/b", "", "Store x", "log.jsonl", "errors"):
-        write(project.root / "pipeline.yaml", toy.PIPELINE + f"  ? {name!r}\n  : {{}}\n")
-        assert "stage" in call(project, "graph")
-    write(project.root / "pipeline.yaml", toy.PIPELINE.replace("gather: sizes.json", "gather: ../../sizes.json"))
-    assert "gathered file" in call(project, "graph")
-
-
 SETTINGS = [f"table.scale={value}" for value in (
     ".inf", "-.inf", ".nan", "[1, .nan]", "{a: .inf}", "9" * 5000, "9" * 4000, "0x" + "f" * 30,
     "[" * 500 + "]" * 500, "[" * 2400, "{a: " * 1000, "'\"\\0\"'", "'\"\\ud800\"'", "'", '"', "&a [*a]",
@@ -149,37 +141,6 @@ def test_damaged_files_of_the_runner_lose_nothing_and_are_made_anew(project, cap
         for content in contents:
             path.write_bytes(content)
             assert set(state(project).values()) == {"current"}, (path, content)
-
-
-# ── rights ───────────────────────────────────────────────────────────────────────────────────────────────────────────
-
-CLOSED = [
-    "data/set", "data", "build", "build/set", "build/store/keys", "build/set/current.json", "pipeline.yaml", "stages",
-]  # fmt: skip
-
-
-def test_of_a_build_that_may_only_be_read_another_user_sees_everything_and_changes_nothing(
-    made_once, open_folder, as_other_user, capsys
-):
-    foreign = toy.copy(made_once, open_folder / "checkout")
-
-    def by_another(*words):
-        with as_other_user():
-            return call(foreign, *words)
-
-    assert call(foreign, "plan", "-d", "set") == 0  # loads what another user may not, as Python in root's home
-    for verb in ("plan", "why", "status", "validate"):
-        assert by_another(verb, "-d", "set") == 0 and capsys.readouterr().out
-    for words in ("table -d set --set table.scale=3", "all -d set --force", "gc", "clean", "clean -d set"):
-        last = by_another(*words.split()).lower()
-        assert last.startswith("error: ") and "permission denied" in last and str(foreign.build) in last, words
-    for place in CLOSED:
-        mode = (foreign.root / place).stat().st_mode
-        (foreign.root / place).chmod(0)
-        for verb in ("all", "plan", "status", "clean"):
-            last = by_another(verb, "-d", "set")
-            assert last == 0 or last.startswith("error: "), (place, verb)
-        (foreign.root / place).chmod(mode)
 
 
 # ── make and the shell: what is given as NAME=value reaches programs as it was written ───────────────────────────────

@@ -14,7 +14,6 @@ import shutil
 import signal
 import subprocess
 import sys
-import tempfile
 import time
 from functools import partial
 from pathlib import Path
@@ -216,17 +215,6 @@ def test_sigterm_ends_a_run_as_an_interrupt_does(fresh):
     assert not list((fresh.build / "store" / "tmp").iterdir())
 
 
-def test_a_reader_that_takes_sigterm_prints_no_c_stack():
-    """pycolmap itself, as reading cameras of a COLMAP model imports it."""
-    code = (
-        "import os, signal, factorlib.runner.stop as stop\n"
-        "with stop.heed_stops():\n"
-        "    import pycolmap; stop.take_sigterm_back(); os.kill(os.getpid(), signal.SIGTERM)"
-    )
-    ended = subprocess.run([sys.executable, "-c", code], cwd=LIBRARY, capture_output=True, check=False)
-    assert ended.returncode == 143 and not ended.stderr
-
-
 # ── two runs, inputs, clocks, places ─────────────────────────────────────────────────────────────────────────────────
 
 
@@ -260,21 +248,6 @@ def test_what_changes_while_a_step_runs_is_named_and_costs_that_step(fresh, made
     for path, text in usual.items():
         write(path, text)
     assert make(fresh) == 0 and is_sound(fresh) and results(fresh) == results(made_once)
-
-
-def test_a_checkout_that_is_moved_and_its_store_on_another_file_system_change_nothing(fresh, made_once, tmp_path):
-    """Killed here, moved, and finished there."""
-    if not Path("/dev/shm").is_dir() or Path("/dev/shm").stat().st_dev == fresh.root.stat().st_dev:
-        pytest.skip("there is no second file system")
-    place, moved = Path(tempfile.mkdtemp(dir="/dev/shm")), toy.toy(tmp_path / "moved")
-    try:
-        fresh.build.symlink_to(place)
-        struck(fresh, 5)
-        shutil.move(fresh.root, moved.root)
-        assert lost_in(moved, results(made_once)) == [] and set(kept(moved)) == set(kept(made_once))
-        assert (moved.build / "store").resolve().is_relative_to(place)
-    finally:
-        shutil.rmtree(place)
 
 
 GONE = (".", "set", *(f"store/{name}" for name in ("trees", "keys", "views", "cache")))
@@ -346,12 +319,6 @@ def overwrite(path, text, keep_times=False):
     path.chmod(0o444)
     if keep_times:
         os.utime(path, ns=(stat.st_atime_ns, stat.st_mtime_ns))
-
-
-def replace(path, text):
-    """By rename, as `sed -i`: the other links keep the old content."""
-    write(path.with_name("draft"), text)
-    os.replace(path.with_name("draft"), path)
 
 
 def link_elsewhere(path):
@@ -464,13 +431,3 @@ def test_no_room_is_said_as_what_it_is_and_with_room_the_run_goes_on(fresh, agai
     assert before <= set(kept(project).values()) and stage not in {s.partition("/")[0] for s in kept(project).values()}
     assert not any((project.build / "store" / "tmp").iterdir()) and not list((project.build / "set").glob("errors/*"))
     assert lost_in(project, results(usual)) == []
-
-
-def test_the_traceback_of_a_failure_goes_once_its_step_succeeds_even_by_code_of_before(project):
-    errors, path = project.build / "set" / "errors", project.root / "stages" / "table.py"
-    for mended in (toy.TABLE.replace("params.scale", "2 * params.scale"), toy.TABLE):
-        write(path, toy.TABLE.replace("json.dumps(params.scale)", "json.dumps(1 / 0)"))
-        assert make(project) == 1 and [error.name for error in errors.iterdir()] == ["table.txt"]
-        assert make(project, targets=["count"]) == 0 and errors.exists(), "the table has not succeeded"
-        write(path, mended)
-        assert make(project, targets=["table"]) == 0 and not errors.exists()

@@ -7,26 +7,22 @@ code another library says (grimp, of import-linter).  `make test` takes a sample
 
 from __future__ import annotations
 
-import ast
 import contextlib
-import json
 import os
 import random
 from functools import cache
 from pathlib import Path
 
 import grimp
-import msgspec
 import pytest
 import yaml
 
 from factorlib.errors import InputError
 from factorlib.runner import words
 from factorlib.runner.pipeline import read_pipeline
-from factorlib.runner.plan import Listing, difference, plan
+from factorlib.runner.plan import Listing, plan
 from factorlib.runner.project import LIBRARY, photo_sets
 from factorlib.runner.survey import survey
-from factorlib.runner.worker import Code, load_stage
 from tests.faults.battered import real_project
 from tests.faults.good import edited as edited_data
 from tests.runner import toy
@@ -170,29 +166,7 @@ def test_an_edit_that_keeps_size_and_time_is_noticed(real):
     assert other_keys(real) == set()
 
 
-def test_no_module_is_named_only_at_run_time():
-    """`import_module(name)` hides a module from the keys of the steps that run it; the runner alone loads stages so.
-
-    The package's own `__init__` hides `load_result` from every stage on purpose: no stage calls it.
-    """
-    loaders = {"import_module", "__import__", "run_path", "run_module", "spec_from_file_location"}
-    files = {*(LIBRARY / "factorlib").rglob("*.py"), *(LIBRARY / "stages").rglob("*.py")}
-    for path in files - {LIBRARY / "factorlib" / "__init__.py", *(LIBRARY / "factorlib" / "runner").rglob("*.py")}:
-        nodes = ast.walk(ast.parse(path.read_text()))
-        assert not {getattr(node, "id", getattr(node, "attr", "")) for node in nodes} & loaders, path
-    assert not [p for p in (LIBRARY / "stages").glob("*.py") if "load_result" in p.read_text()]
-
-
 # ── parameters ───────────────────────────────────────────────────────────────────────────────────────────────────────
-
-
-def params_of(stage):
-    return load_stage(Code(LIBRARY, "stages", stage, {}, LIBRARY / "pipeline.yaml")).Params
-
-
-def leaves(values, above=""):
-    for name, value in values.items():
-        yield from leaves(value, f"{above}{name}.") if isinstance(value, dict) else [(above + name, value)]
 
 
 def another(value):
@@ -203,29 +177,6 @@ def another(value):
     if isinstance(value, list | tuple):
         return [another(value[0]), *value[1:]]
     return value + 1 if isinstance(value, int) else value * 1.5 + 0.001
-
-
-def words_of(stage, values):
-    return [f"{stage}.{name}={json.dumps(value, separators=(',', ':'))}" for name, value in values.items()]
-
-
-def record_of(project, stage, settings=()):
-    return next(p.record for p in planned(project, settings) if p.step.stage == stage)
-
-
-WITH = [stage for stage in STAGES if [*leaves(msgspec.to_builtins(params_of(stage)()))]]
-
-
-@pytest.mark.parametrize("stage", [
-    pytest.param(stage, marks=() if stage in ("urm", "solve") else LONG) for stage in WITH
-])  # fmt: skip
-def test_each_parameter_reruns_its_stage_and_what_is_below(real, stage):
-    values, before = dict(leaves(msgspec.to_builtins(params_of(stage)()))), record_of(real, stage)
-    others = {name: another(value) for name, value in values.items()}
-    lines = "\n".join(difference(before, record_of(real, stage, words_of(stage, others))))
-    unnamed = [name for name in values if f"parameter {name}: " not in lines]  # the others each stand in the key
-    for some in (others, *({name: others[name]} for name in unnamed)):
-        assert other_keys(real, words_of(stage, some)) == below(real, {stage}), some
 
 
 # ── what else counts ─────────────────────────────────────────────────────────────────────────────────────────────────

@@ -5,13 +5,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 from scipy.spatial import cKDTree
-from typer.testing import CliRunner
 
 from factorlib.conventions import YUP_FROM_CAMERA, lat_long_directions, lat_long_solid_angles
 from factorlib.dataset.read import read_dataset
 from factorlib.errors import InputError
 from factorlib.generate import eames, folder, lights, synthetic
-from factorlib.generate.__main__ import app
 from factorlib.generate.chair import chair, labelled
 from factorlib.images.exr import read_exr, read_rgb_exr, write_rgb_exr
 from factorlib.images.photo import read_photo
@@ -57,14 +55,6 @@ def test_the_same_seed_is_the_same_bytes(small, tmp_path):
     assert files_of(made(tmp_path / "again", seed=0)) == files_of(small)
 
 
-def test_the_synthetic_set_holds_one_photo_of_each_kind_and_hides_one_pose(small):
-    dataset = read_dataset(small)
-    assert [Path(photo.image).suffix for photo in dataset.spec.photos] == [".exr", ".png", ".jpg"]
-    hidden = [obj.name for photo in dataset.spec.photos for obj in photo.objects if obj.pose is None]
-    assert hidden == ["red_blob"]
-    assert set(dataset.truth.poses["study"]) == {obj.name for obj in dataset.photo("study").objects}
-
-
 def test_a_matte_pixel_is_its_irradiance(small):
     """Photo, mask, normals, light and exposure belong together: Lambert's law from the truth gives the red ball."""
     radiance, labels = read_photo(small / "photos/garden.exr").radiance, read_png(small / "masks/garden.png")[..., 0]
@@ -85,14 +75,6 @@ def irradiance_of(normal, light):
     light = sampled(light, lat_long_directions(height, width))
     cosine = np.maximum(np.einsum("nd,hwd->nhw", normal, lat_long_directions(height, width)), 0)
     return np.einsum("nhw,hwc,h->nc", cosine, light, lat_long_solid_angles(height, width))
-
-
-def test_the_chair_set_tells_no_pose_and_links_its_photos(chairs):
-    dataset = read_dataset(chairs)
-    assert all(obj.pose is None for photo in dataset.spec.photos for obj in photo.objects)
-    assert read_photo(chairs / "photos/terrace.jpg").focal_px == pytest.approx(folder.focal_px_of_35mm(45, 96, 72))
-    assert read_photo(chairs / "photos/kitchen.jpg").focal_px is None
-    assert {photo: len(poses) for photo, poses in dataset.truth.poses.items()} == {"terrace": 2, "kitchen": 1}
 
 
 def test_a_users_lights_replace_the_made_ones(tmp_path):
@@ -124,9 +106,3 @@ def test_exact_geometry_is_the_photographed_mesh_at_its_pose(exact):
     assert alike.mean() > 0.97, (
         "of flat ends of legs, which stand on the floor or in the seat, the reader takes its own"
     )
-
-
-def test_an_easier_set_does_not_replace_the_one_the_project_carries(tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    done = CliRunner().invoke(app, ["eames", "--direct"])
-    assert done.exit_code == 2 and "--out" in done.output and not list(tmp_path.iterdir())

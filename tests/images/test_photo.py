@@ -137,19 +137,6 @@ def test_a_photo_that_is_black_or_negative_wherever_it_is_used_and_a_pipe_are_re
             read(tmp_path / "pipe.exr")
 
 
-@pytest.mark.parametrize("file", ["a.jpg", "a.png", "a.tif", "a.exr", "a.hdr"])
-@pytest.mark.parametrize("part", [0.0, 0.5, 0.97])
-def test_truncated_files_are_refused_where_averaging_drops_the_rows_too(tmp_path, file, part):
-    noise = RNG.uniform(0, 1, (65, 64, 3)).astype(np.float32)
-    path = save(tmp_path / file, noise if file.endswith(("exr", "hdr")) else codes(noise))
-    whole = path.read_bytes()
-    path.write_bytes(whole[: int(part * len(whole))] or b"no image at all")
-    for factor in (1, 64):
-        with pytest.raises(InputError, match="truncated or damaged|not readable") as caught:
-            decoded(open_photo(path, "photos[1].image"), None, factor, path)
-        assert f"{path}: photos[1].image" in str(caught.value) and caught.value.cure
-
-
 def test_focal_of_35mm_film_is_the_same_for_any_size_orientation_and_average(tmp_path):
     for size, orientation in (((40, 60), 1), ((80, 120), 6)):
         tags = {"Orientation": orientation, "Exif__FocalLengthIn35mmFilm": 50}

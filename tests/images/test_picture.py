@@ -4,7 +4,6 @@ import numpy as np
 import pytest
 
 from factorlib.errors import InputError
-from factorlib.images.film import write_mp4
 from factorlib.images.picture import exposure_of, picture, read_png, write_png
 
 RNG = np.random.default_rng(5)
@@ -30,16 +29,3 @@ def test_a_png_keeps_colours_under_alpha_and_has_no_date(tmp_path, channels):
     (tmp_path / "a.png").write_bytes(data[:8])
     with pytest.raises(InputError, match="a.png"):
         read_png(tmp_path / "a.png")
-
-
-def test_a_film_has_the_frames_on_white_at_their_pace(tmp_path):
-    av = pytest.importorskip("av", reason="PyAV is not installed: make setup EXTRAS=video")
-    frames = [np.full((31, 42, 4), (200 - 10 * k, 40, 20, 255), np.uint8) for k in range(6)]
-    frames[5][..., 3] = 0
-    write_mp4(tmp_path / "a.mp4", frames, 1.5)
-    with av.open(tmp_path / "a.mp4") as file:
-        shown = [frame.to_ndarray(format="rgb24", src_colorspace="ITU709") for frame in file.decode(video=0)]
-        assert float(file.streams.video[0].duration * file.streams.video[0].time_base) == pytest.approx(1.5, abs=0.01)
-    assert len(shown) == 6 and shown[0].shape == (30, 42, 3)
-    means = np.array([frame.reshape(-1, 3).mean(0) for frame in shown])
-    np.testing.assert_allclose(means, [[200 - 10 * k, 40, 20] for k in range(5)] + [[255] * 3], atol=4)

@@ -68,21 +68,6 @@ def test_what_the_sensors_white_level_cut_is_clipped_in_all_channels(tmp_path):
     assert not (clipped[:20].any() or clipped[30:].any() or clipped[:, :36].any())
 
 
-@pytest.mark.parametrize("orientation, top_left", [(1, 0), (3, 3), (6, 2), (8, 1)])
-def test_orientation_is_applied_once(tmp_path, orientation, top_left):
-    rgb = np.empty((H, W, 3))
-    levels = [0.1, 0.2, 0.4, 0.8]  # upper left, upper right, lower left, lower right of the sensor
-    for k, level in enumerate(levels):
-        rgb[(k // 2) * H // 2 :][: H // 2, (k % 2) * W // 2 :][:, : W // 2] = level
-    sensor = sensor_of(rgb)
-    sensor[:6, :6] = WHITE  # marks the sensor's upper left
-    photo = read_photo(write_dng(tmp_path / "a.dng", sensor, orientation=orientation))
-    assert (photo.height, photo.width) == ((W, H) if orientation in (6, 8) else (H, W))
-    assert photo.radiance[9:15, 9:15].mean() == pytest.approx(levels[top_left], rel=0.03)
-    marked = {1: (0, 0), 3: (-1, -1), 6: (0, -1), 8: (-1, 0)}[orientation]
-    assert photo.clipped[marked].all() and photo.clipped.any(-1).sum() < 100
-
-
 def test_a_damaged_raw_file_is_refused_with_the_command_that_develops_it(tmp_path):
     whole = write_dng(tmp_path / "a.dng", sensor_of(halves())).read_bytes()
     for broken in (b"no raw file", whole[:100], whole[: len(whole) // 2]):

@@ -68,13 +68,3 @@ def test_another_object_keeps_its_labels_and_lends_them_to_none():
         assert (grow(box, 1, picture, label, marked) == truth).mean() > 0.99
     wrong = np.where(truth == 1, 2, 0).astype(np.uint8)  # the box was drawn with another label before
     assert (grow(box, 1, picture, wrong, np.zeros_like(sure)) == np.where(truth == 1, 1, 0))[truth < 2].mean() > 0.99
-
-
-def test_a_click_on_a_glint_does_not_make_the_body_background():
-    y, x = np.indices((60, 60))
-    ball, glint = np.hypot(x - 30, y - 30) < 18, np.hypot(x - 24, y - 24) < 4
-    picture = np.where(glint, 220, np.where(ball, 60, 110))[..., None].repeat(3, 2)
-    picture = (picture + np.random.default_rng(0).normal(0, 4, picture.shape)).clip(0, 255).astype(np.uint8)
-    label, sure, box = np.where(ball & ~glint, 1, 0).astype(np.uint8), np.hypot(x - 24, y - 24) < 2, (8, 8, 52, 52)
-    label[sure] = 1
-    assert ((grow(box, 1, picture, label, sure) == 1) == ball).mean() > 0.98

@@ -124,28 +124,6 @@ def test_rle_is_decoded_as_pycocotools_does_and_so_are_millions_of_runs():
     assert len(runs_of("10" * 500_000, 1 + 499_999 * 500_000 // 2)) == 1_000_000
 
 
-@pytest.mark.parametrize("form", ["label", "per material", "coco"])
-@pytest.mark.parametrize("size, hint", [((H + 1, W), "own pixels"), ((W, H), "EXIF orientation")])
-def test_another_size(tmp_path, form, size, hint):
-    name = save(tmp_path / "a.png", LABEL)
-    masks = {"label": name, "per material": {"red": name}, "coco": coco(tmp_path, [])}[form]
-    message = refusal(tmp_path, masks, size=size)
-    assert f"{W} × {H}" in message and f"{size[1]} × {size[0]}" in message and hint in message
-    assert KEY in message and ("coco.json" if form == "coco" else "a.png") in message
-
-
-@pytest.mark.parametrize("values, words", [
-    (np.vstack([np.full((1, W), 4, np.uint8), LABEL[1:]]), ["unknown label 4 (30 pixels)", "3 wood"]),
-    (np.zeros((H, W), np.uint8), ["the mask is empty"]),
-    (np.uint8(255) * (LABEL > 0), ["only 0 and 255", "masks: {red:"]),
-    (np.dstack([LABEL * 60, LABEL, LABEL]), ["colour picture", "one channel"]),
-    (np.dstack([LABEL] * 3 + [LABEL * 50]), ["transparent"]),
-])  # fmt: skip
-def test_a_mask_whose_values_are_no_labels(tmp_path, values, words):
-    message = refusal(tmp_path, save(tmp_path / "a.png", values))
-    assert all(word in message for word in [*words, "a.png", KEY]), message
-
-
 def test_masks_that_are_empty_or_overlap(tmp_path):
     name = save(tmp_path / "a.png", np.zeros((H, W), dtype=np.uint8))
     for masks in ({"red": name, "wood": name}, coco(tmp_path, [])):
@@ -163,19 +141,6 @@ def test_outlines_that_share_an_edge_lose_it_and_ones_that_share_more_are_refuse
     assert 0 < both.sum() <= H and (edge.label[both] == 0).all() and {1, 2} <= set(edge.label.ravel().tolist())
     message = refusal(tmp_path, coco(tmp_path, [side, (11, [box(10, 0, 30, 20)])]))
     assert "'red' and 'white' share 200 pixels" in message
-
-
-@pytest.mark.parametrize("category, segmentation, words", [
-    (13, [box(3, 2, 12, 9)], ["'whit'", "did you mean 'white'"]),
-    (99, [box(3, 2, 12, 9)], ["99", "not in categories"]),
-    (10, [], ["only a box", "annotations[0].segmentation"]),
-    (10, [[1, 2, 3, 4]], ["no polygon", "segmentation[0]"]),
-    (10, [box(3, 2, 60, 9)], ["leaves the image", "30 × 20"]),
-    (10, rle([H * W], (W, H)), ["20 × 30", "30 × 20"]),
-])  # fmt: skip
-def test_bad_annotations(tmp_path, category, segmentation, words):
-    message = refusal(tmp_path, coco(tmp_path, [(category, segmentation)], categories=[*MATERIALS, "whit"]))
-    assert all(word in message for word in ["coco.json", *words]), message
 
 
 def test_a_photo_of_coco_goes_by_its_whole_path_first(tmp_path):

@@ -14,7 +14,7 @@ from factorlib.meshes.limits import Limits
 from factorlib.meshes.mesh import area_vectors
 from factorlib.meshes.ply import submesh, write_ply
 from factorlib.meshes.read import read_mesh
-from tests.faults.good import DATA, MESHES, OFF, STL_TEXT, VERTICES, glb, gltf_header, put
+from tests.faults.good import DATA, MESHES, VERTICES, glb, gltf_header, put
 
 MATERIALS = ["red", "oak"]
 PARTS = {"shell": "red", "legs": "oak"}
@@ -155,15 +155,3 @@ def test_gltf_strips_fans_sparse_accessors_and_repeated_primitives_are_read(tmp_
     header["meshes"][0]["primitives"] *= 3
     header["nodes"] = [{"children": [1, 2]}, {"mesh": 0}, {"mesh": 0, "translation": [3, 0, 0]}]
     assert len(read_all(tmp_path / "a.glb", glb(header)).faces) == 8
-
-
-def test_more_parts_than_any_mesh_has_and_text_whose_words_would_fill_memory_are_refused(tmp_path, monkeypatch):
-    monkeypatch.setattr("factorlib.meshes.gltf.MOST_PARTS", 1000)
-    parts = "".join(f"g {k}\nf 1 2 3\n" for k in range(1001))
-    for name, text, words in (
-        ("a.obj", "v 0 0 0\nv 1 0 0\nv 0 1 0\n" + parts, "1,001 parts"),
-        ("a.off", OFF.replace("3 0 2 1", "1500000" + " 1" * 1_500_000), "more than 2,000,000"),
-        ("a.stl", STL_TEXT.replace("vertex 1.0", "vertex" + " 1" * 1_500_000), "has not three"),
-    ):
-        with pytest.raises(InputError, match=words):
-            read_all(tmp_path / name, text)

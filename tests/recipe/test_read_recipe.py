@@ -1,6 +1,5 @@
 """Recipes: what is written is read, what is not there is named, and every recipe that comes with the project is good."""
 
-import re
 from pathlib import Path
 
 import msgspec
@@ -10,7 +9,7 @@ from factorlib.dataset.read import read_dataset
 from factorlib.errors import InputError
 from factorlib.jsonfile import write_json
 from factorlib.recipe.read import files_of, read_recipe
-from factorlib.recipe.schema import KINDS, Insert, read_table, recipe_of
+from factorlib.recipe.schema import KINDS, Insert, recipe_of
 from factorlib.results.materials import MaterialTable, Reflectance, StandardErrors, solved
 from factorlib.runner.project import LIBRARY
 from factorlib.yamlfile import load_yaml, read_yaml
@@ -86,15 +85,6 @@ def test_files_are_relative_to_the_recipe_and_a_table_adds_materials(dataset, tm
     recipe = read_recipe(path, dataset)
     assert isinstance(recipe, Insert) and recipe.material == "gold"
     assert files_of(recipe, path) == {"own.json": tmp_path / "own.json", "bunny.obj": tmp_path / "bunny.obj"}
-
-
-def test_the_table_and_the_insertions_in_the_docs_are_good(dataset, tmp_path):
-    text = (LIBRARY / "docs" / "recipes.md").read_text()
-    (table,) = re.findall(r"```json\n(.*?)```", text, re.DOTALL)
-    recipes = re.findall(r"```yaml\n(.*?)```", text, re.DOTALL)
-    (tmp_path / "own.json").write_text(table)
-    assert list(read_table(tmp_path / "own.json")) == ["gold"]
-    assert recipes and all(isinstance(read_recipe(written(tmp_path, each), dataset), Insert) for each in recipes)
 
 
 def test_a_denoiser_that_is_not_installed_is_refused_with_the_cure(dataset, tmp_path, monkeypatch):

@@ -1,7 +1,6 @@
 """Laws that every operator obeys, errors of the fast ones against the reference, and the compiled networks against torch."""
 
 import os
-import platform
 import shutil
 from types import SimpleNamespace
 
@@ -9,7 +8,7 @@ import pytest
 import torch
 
 from factorlib.errors import InputError
-from factorlib.reflection import fused, reflection_operator
+from factorlib.reflection import reflection_operator
 from factorlib.reflection.lobe import lobe_integral
 from factorlib.reflection.network import FEATURES, SHIPPED, Layers, read_layers, write_layers
 from factorlib.reflection.operator import Operator
@@ -131,7 +130,6 @@ def test_weights_of_another_version_are_refused(tmp_path):
 
 
 compiler = pytest.mark.skipif(shutil.which(os.environ.get("CC", "cc")) is None, reason="no C compiler")
-OLDEST = "-march=x86-64-v3" if platform.machine() == "x86_64" else "-march=armv8-a"
 
 
 @compiler
@@ -154,17 +152,3 @@ def test_without_a_compiler_torch_computes_the_same(monkeypatch):
     operator = reflection_operator("network")
     assert not operator.fused
     assert operator.response(*grid(0.5, torch.float32)).specular.isfinite().all()
-
-
-@compiler
-def test_the_bits_do_not_depend_on_the_instructions_that_the_compiler_may_use(monkeypatch):
-    """The oldest processor with fused multiplication, and code without vectors, against this one's own."""
-    layers = reflection_operator("network").layers["specular"]
-    roughness, *point = grid(0.3, torch.float32, rows=40)
-    found, own = [], fused.FLAGS
-    for flags in (own, own.replace("-march=native", OLDEST), own.replace("-O3 -march=native", f"-O1 {OLDEST}")):
-        monkeypatch.setattr(fused, "FLAGS", flags)
-        fused.compiled.cache_clear()
-        found.append(b"".join(t.numpy().tobytes() for t in fused.Fused("specular", layers)(float(roughness), *point)))
-    fused.compiled.cache_clear()
-    assert found[0] == found[1] == found[2]

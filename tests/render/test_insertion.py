@@ -132,14 +132,3 @@ def test_the_shadow_of_the_photo_is_recognised_whatever_its_exposure_and_not_whe
 def floor() -> dict:
     frame = rigid(np.stack([[40.0, 0, 0], [0, 0, -40.0], [0, 1.0, 0]], axis=1), (0, -1.0, -6))
     return {"type": "rectangle", "to_world": transform(frame), "bsdf": bsdf(MATERIALS["grey"])}
-
-
-def test_a_denoised_insertion_leaves_the_photo_as_it_is_where_it_changes_nothing():
-    pytest.importorskip("mitsuba_oidn", reason="mitsuba-oidn is not installed: make setup EXTRAS=denoise")
-    photo = true_photo([THERE], 16)
-    plain, clean = (
-        inserted(stands(msgspec.structs.replace(SCENE, denoise=denoise)), photo, OPEN, 16) for denoise in (False, True)
-    )
-    assert (clean.coverage == plain.coverage).all() and clean.match == plain.match
-    same = (plain.coverage == 0) & (plain.shadow == 1).all(axis=-1)
-    assert same.sum() > 100 and (clean.composite[same] == photo[same]).all()

@@ -17,7 +17,6 @@ from factorlib.render.photo_scene import (
     Placed,
     lit_ball,
     orbit,
-    resized,
     traced_photo,
     turned_light,
     with_sun,
@@ -91,18 +90,6 @@ def test_lobes_and_their_map_are_the_same_light(scene, angle):
     assert differ(traced_photo(as_lobes, 256), traced_photo(as_map, 256)) < 0.02
 
 
-def test_a_larger_picture_shows_the_same(scene):
-    large = traced_photo(resized(scene, 96), 64)
-    assert differ(traced_photo(scene, 256), large.reshape(40, 2, 48, 2, 4).mean(axis=(1, 3))) < 0.03
-
-
-def test_a_ball_fills_its_picture():
-    picture = lit_ball(lobes(), MATERIALS["grey"], 32, 16)
-    inside = picture[..., 3] > 0.99
-    assert inside.mean() == pytest.approx(np.pi / 4, abs=0.06)
-    assert inside[16, 1] and inside[1, 16] and not inside[0, 0]
-
-
 def test_a_box_stands_on_its_largest_side_that_looks_down():
     tilted = about((1, 0, 0), 25)
     plane = resting_plane(placed("box", box(2, 1, 1.5), (0, 0, -5), rotation=tilted))
@@ -170,15 +157,3 @@ def test_a_pixel_names_the_spot_that_it_shows(scene):
     assert np.allclose(np.cross(spot.point, ray), 0, atol=1e-9) and spot.point[1] == pytest.approx(-0.7)
     with pytest.raises(InputError, match="above the horizon"):
         spot_at(scene, plane, scene.objects[0], (30.5, 3.0), 0.5)
-
-
-def test_a_denoised_picture_is_nearer_to_many_samples_and_as_much_is_covered():
-    pytest.importorskip("mitsuba_oidn", reason="mitsuba-oidn is not installed: make setup EXTRAS=denoise")
-    true, plain, clean, again = (
-        lit_ball(lobes(), MATERIALS["red"], 128, samples, denoise)
-        for samples, denoise in ((1024, False), (2, False), (2, True), (2, True))
-    )
-    assert (clean[..., 3] == plain[..., 3]).all() and (clean == again).all() and (clean >= 0).all()
-    assert not clean[plain[..., 3] == 0].any()
-    error, before = (np.sqrt(np.mean((picture - true) ** 2)) for picture in (clean, plain))
-    assert error < 0.6 * before, (error, before)

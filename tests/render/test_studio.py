@@ -3,7 +3,6 @@
 import numpy as np
 import pytest
 
-from factorlib.errors import InputError
 from factorlib.geometry.camera import Camera
 from factorlib.render.ground import Plane
 from factorlib.render.photo_scene import PhotoScene, orbit, traced_photo
@@ -38,11 +37,6 @@ def test_a_shadow_lies_beneath_the_ball_and_nothing_far_from_it(scene):
     assert foot < 0.7 * colour[below].mean(), "where it stands, less light comes"
     assert pale[inside][:, :3].mean() > dark[inside][:, :3].mean(), "the floor lights the ball"
     np.testing.assert_allclose(dark[inside][:, :3].mean(), plain[inside][:, :3].mean(), rtol=0.35)
-
-
-def test_a_camera_below_the_floor_is_refused(scene):
-    with pytest.raises(InputError, match="below the floor"):
-        on_floor(scene, PLANE, 0.5, 1, orbit(scene, 0, -40))
 
 
 def test_about_a_tilted_normal_the_camera_keeps_its_height_and_its_distance(scene):

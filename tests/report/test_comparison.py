@@ -1,7 +1,6 @@
 """`make compare`: two results on one page."""
 
 import html
-import os
 import re
 import shutil
 
@@ -98,15 +97,6 @@ def test_what_only_one_has_is_named_and_nothing_in_common_is_refused(folders):
     assert "Only in the first: oak." in page
     result(folders[1], names=("other",), photo="garden")
     with pytest.raises(InputError, match="no photo and no material in common"):
-        comparison(*folders, [])
-
-
-def test_a_pipe_in_place_of_a_picture_is_refused(folders):
-    result(folders[0]), result(folders[1])
-    picture = folders[1] / "export" / "illumination" / "kitchen.exr"
-    picture.unlink()
-    os.mkfifo(picture)
-    with pytest.raises(InputError, match="is a pipe"):
         comparison(*folders, [])
 
 

@@ -21,7 +21,6 @@ from factorlib.images.picture import picture
 from factorlib.meshes.mesh import Mesh
 from factorlib.report import viewer
 from factorlib.report.artifacts import Artifacts
-from factorlib.report.page import forms
 from factorlib.report.pictures import light_row
 from stages import report
 from tests.align.scenes import mesh_of
@@ -137,17 +136,6 @@ def test_a_name_cannot_end_the_script(made, tmp_path):
     assert evil in json.loads(data)["materials"]
 
 
-def test_forms_hold_the_numbers():
-    material = TRUE["brass"]
-    found = forms("brass", material)
-    assert json.loads(found["numbers"])["brass"]["roughness"] == 0.25
-    assert json.loads(found["glTF"])["pbrMetallicRoughness"]["roughnessFactor"] == 0.25
-    assert found["Mitsuba"].startswith('<bsdf type="blendbsdf" id="brass">')
-    assert "MeshPhysicalMaterial" in found["three.js"]
-    compile(found["Blender"], "console", "exec")
-    assert "0.05, 0.04, 0.02, 1" in found["Blender"] and 'name="m_brass"' in found["MaterialX"]
-
-
 # ── In a browser ─────────────────────────────────────────────────────────────────────────────────────────────────────
 
 
@@ -172,16 +160,6 @@ def test_it_shows_what_the_pipeline_renders(browser, material, view):
     found = shown(browser[0], -1, material, "noon", view, SIZE)[inside]
     want = rendered(lobes_of(1), perturbed(TRUE[material], 1.0), normals, views, view.get("turn", 0.0))
     assert np.percentile(error(found[:, :3], want), 95) < 0.02 and np.allclose(found[:, 3], 1, atol=1e-5)
-
-
-@needs_chromium
-def test_what_hides_nothing_from_itself_looks_as_a_ball_does(browser):
-    """The set's own ball, of one material, and the viewer's."""
-    one, other = (
-        shown(browser[0], k, "brass", "noon", {"turn": 1.0, "materials": ["brass"] * 3}, SIZE) for k in (0, -1)
-    )
-    inside = ball_seen(0.0, 0.0, SIZE)[2]
-    assert np.percentile(error(one[inside][:, :3], other[inside][:, :3]), 95) < 0.02
 
 
 FURNACE = """() => {
@@ -270,36 +248,6 @@ def test_controls_work_by_mouse_and_keys(browser):
 
 
 @needs_chromium
-def test_it_links_to_the_files_of_what_is_shown(made, browser):
-    """Relative, and there; of the files that were not exported, and of a ball, there is no link.  A photo's scene is that of what it shows alone."""
-    page, export, scene = browser[0], made[1]["export"], "../export/scenes/day.xml"
-
-    def files() -> list[str]:
-        page.evaluate("viewer.canvas.scrollIntoView(), viewer.linked = null, viewer.changed()")
-        page.wait_for_function("viewer.pass > 0")
-        return page.eval_on_selector_all("#viewer [data-files] a", "(all) => all.map((a) => a.getAttribute('href'))")
-
-    page.evaluate("viewer.controls.object.selectedIndex = 0, viewer.dress()")
-    page.select_option("[data-control=light]", label="day")
-    assert scene not in files() and not (export / "scenes").exists()
-    assert "make render" in made[2] and not re.search("make render(?! DATASET=)", made[2])
-    link = f'<a href="{scene}"></a>'
-    page.evaluate(f"document.querySelector('#summary .files').insertAdjacentHTML('beforeend', '{link}')")
-    assert scene in files() and "scene of day" in page.inner_text("#viewer [data-files]")
-    page.fill("[data-control=turn]", "5")
-    assert scene not in files()
-    page.click("[data-control=reset]")
-    page.select_option("[data-control=materials] label:nth-child(1) select", label="white")  # the brass part alone
-    assert scene not in files()
-    page.evaluate("viewer.dress()")
-    page.select_option("[data-control=light]", label="noon")
-    wanted = ["ball.glb", "illumination/noon.exr", "materials.json"]
-    assert files() == [f"../export/{name}" for name in wanted] and all((export / name).exists() for name in wanted)
-    page.select_option("[data-control=object]", label="a ball")
-    assert files() == [f"../export/{name}" for name in wanted[1:]]
-
-
-@needs_chromium
 def test_the_picture_on_the_screen_is_the_radiance_exposed(browser):
     page, _ = browser
     frames = "() => new Promise((done) => requestAnimationFrame(() => requestAnimationFrame(done)))"
@@ -332,41 +280,7 @@ def test_no_object_burns_out(browser):
         bright = exposure * np.quantile(found[found[..., 3] > 0.99][:, :3].max(axis=1), 0.98)
         assert bright == pytest.approx(0.9, abs=0.05) if given > 1 else exposure == given
     page.evaluate("viewer.data.photos[0].exposure = 1, viewer.renderer.metered = null")
-
-
-@needs_chromium
-def test_other_controls_of_the_page(browser):
-    """The photo over its re-synthesis from the left; maps exposed anew; a material's numbers copied."""
-    page, _ = browser
-    slider = page.locator(".panels input[type=range]").first
-    assert "day" in slider.get_attribute("aria-label")
-    slider.fill("40")
-    assert page.locator(".cut img + img").first.evaluate("(e) => e.style.clipPath") == "inset(0px 60% 0px 0px)"
-    page.fill("#maps-stops", "-3")
-    page.wait_for_function("document.querySelectorAll('.map canvas').length === 3")
-
-    def mean() -> float:
-        page.wait_for_timeout(500)
-        return np.asarray(Image.open(io.BytesIO(page.locator(".map canvas").first.screenshot())).convert("RGB")).mean()
-
-    dark = mean()
-    page.fill("#maps-stops", "0")
-    assert mean() > dark + 5
-    page.click('button[aria-label="copy brass as glTF"]')
-    page.wait_for_function("document.getElementById('copied').textContent === 'Copied brass as glTF.'")
-    assert json.loads(page.evaluate("navigator.clipboard.readText()"))["name"] == "brass"
     assert browser[1] == []  # last, after everything above
-
-
-@needs_chromium
-@pytest.mark.parametrize("scheme", ["light", "dark"])
-def test_a_phone_needs_no_scrolling_sideways(made, scheme):
-    phone = {"viewport": {"width": 390, "height": 844}, "has_touch": True, "is_mobile": True}
-    with opened(made[0] / "report" / "index.html", color_scheme=scheme, **phone) as (page, complaints):
-        page.evaluate("viewer.canvas.scrollIntoView()")
-        page.wait_for_function("viewer.pass > 0", timeout=120000)
-        assert page.evaluate("document.documentElement.scrollWidth") <= 390
-        assert page.locator("#viewer canvas").bounding_box()["width"] > 300 and complaints == []
 
 
 @needs_chromium

@@ -9,10 +9,10 @@ from factorlib.errors import InputError
 from factorlib.generate.shapes import SHAPES
 from factorlib.geometry import open3d
 from factorlib.shapes.hull import surface_nets, visual_hull
-from factorlib.shapes.lathe import Turned, body_of_revolution, largest_discs
+from factorlib.shapes.lathe import body_of_revolution
 from factorlib.shapes.outline import Triangles
 from factorlib.shapes.primitive import primitive, unit
-from studies.scenes.outlines import CAMERA, looking_from, outline
+from studies.scenes.outlines import looking_from, outline
 
 AROUND = [
     looking_from(elevation, 30 * k) for k, elevation in enumerate([10, 20, -10, 30, 50, 0, 15, -25, 40, 5, -40, 25])
@@ -90,20 +90,6 @@ def test_a_glint_that_a_mask_lacks_bores_no_hole_and_narrows_no_vase():
     part[y - 6 : y + 6, x - 12 : x - 6] = 0
     shapes = [body_of_revolution([one, whole[1]]) for one in (whole[0], msgspec.structs.replace(whole[0], part=part))]
     assert np.array_equal(shapes[0].vertices, shapes[1].vertices)
-
-
-def test_the_largest_disc_is_that_of_the_slow_search():
-    one, heights = outline(VASE, AROUND[1], True), np.array([-0.2, 0.1, 0.3])
-    fast = largest_discs(one, Turned(np.zeros((0, 2)), one.pose, one.camera, 0.0), heights)
-    angle = np.arange(48) * 2 * np.pi / 48
-    for height, radius in zip(heights, fast, strict=True):
-        slow = 0.0
-        while True:
-            points = np.column_stack([slow * np.cos(angle), np.full(48, height), slow * np.sin(angle)])
-            if (one.inner(CAMERA.project(one.pose.apply(points))) < 0).any():
-                break
-            slow += 1e-4
-        assert radius == pytest.approx(slow, abs=2e-3)
 
 
 def test_what_is_no_body_of_revolution_is_refused_or_overlaps_little():

@@ -1,14 +1,13 @@
 """The align stage from masks and dataset slices to its files."""
 
 import json
-import logging
 import warnings
 
 import msgspec
 import numpy as np
 import pytest
 
-from factorlib.align.given import check_before_camera, warn_of_camera
+from factorlib.align.given import check_before_camera
 from factorlib.align.search import Search
 from factorlib.dataset.schema import ObjectsSlice
 from factorlib.errors import InputError
@@ -121,17 +120,6 @@ def test_a_pose_behind_the_camera_is_refused_without_raw_warnings(tmp_path, z, k
     with pytest.raises(InputError) as caught:
         check_before_camera(blob(), Pose(np.eye(3), np.array([0, 0, -9.0])), "hall", "vase", "colmap")
     assert caught.value.key == "cameras.colmap: hall: vase"
-
-
-@pytest.mark.parametrize("focal, centre, words", [
-    (800.0, (-1.0, 240.0), ["principal point (-1, 240) lies outside"]), (800.0, (320.0, 1e6), ["lies outside"]),
-    (1.0, (320.0, 240.0), ["field of view of 179.6°"]), (1e7, (320.0, 240.0), ["field of view"]),
-    (800.0, (320.0, 240.0), []), (None, (0.0, 480.0), []),
-])  # fmt: skip
-def test_a_camera_that_few_photos_have_is_warned_of(caplog, focal, centre, words):
-    with caplog.at_level(logging.WARNING, "factorlib.align"):
-        warn_of_camera(focal, centre, (640, 480), "hall")
-    assert all(word in caplog.text for word in words) and len(caplog.records) == len(words)
 
 
 # ── earlier poses, and photos that were averaged down ────────────────────────────────────────────────────────────────

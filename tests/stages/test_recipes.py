@@ -1,6 +1,5 @@
 """The stage `recipes`: the files of every kind, what they show, the same bytes again, and what it refuses."""
 
-import json
 from importlib.util import find_spec
 
 import msgspec
@@ -70,23 +69,6 @@ def test_files_of_every_kind_and_the_same_bytes_again(grounded, tmp_path, recipe
     assert sorted(first) == sorted(files) and first == second
 
 
-def test_what_is_beside_a_picture_says_where_the_object_was_moved_and_that_a_sun_is_assumed(made, grounded, tmp_path):
-    (name,) = (obj["name"] for obj in made.facts["dataset.objects"]["front"]["objects"])
-    recipe = schema.Insert(**FRONT, at=(36.0, 48.0), sun=schema.AssumedSun((0.3, 1.0, 0.4), 0.7, 4.0))
-    facts = json.loads(drawn(grounded, tmp_path / "inserted", recipe)["front.json"])
-    assert f"was moved by {facts['moved']:.1f} of its heights, to `at: [" in facts["caption"] and facts["moved"] > 0
-    assert f"it would intersect '{name}'" in facts["caption"] and np.hypot(*np.subtract(facts["at"], recipe.at)) > 1
-    assert facts["assumed_sun"] == {"direction": [0.3, 1.0, 0.4], "strength": 0.7, "size": 4.0}
-    assert "sun is assumed" in facts["caption"] and "holds 70% of the light's energy" in facts["caption"]
-    assert facts["shadow"].keys() == {"correlation", "constant_light", "pixels"}
-    assert "of dataset.yaml" in facts["caption"]
-
-    view = schema.View(**FRONT, sun=recipe.sun)
-    files = drawn(made, tmp_path / "view", view), drawn(made, tmp_path / "plain", schema.View(**FRONT))
-    assert json.loads(files[0]["front.json"])["caption"].startswith("The sun is assumed")
-    assert files[0]["front.png"] != files[1]["front.png"] and "front.json" not in files[1]
-
-
 @pytest.mark.parametrize("photo", made_export.MESHES)
 def test_an_assumed_sun_stands_in_the_frame_of_the_exported_light(made, photo):
     """Also where that is fixed to the world: the map of the light with the sun is brightest in the direction that the recipe says."""
@@ -128,13 +110,6 @@ def test_without_a_material_a_mesh_is_inserted_with_its_own_parts(grounded):
         "egg", None, "y"
     )
     assert [materials[label - 1] for label in mesh.labels] == ["red", "brass"]
-
-
-def test_a_transfer_that_changes_nothing_in_a_photo_that_is_named_says_so(made, tmp_path, caplog):
-    drawn(made, tmp_path / "named", schema.Transfer(materials={"unseen": "red"}, **FRONT))
-    assert caplog.messages == ["front: no object has 'unseen', so the picture shows nothing new; there are red"]
-    drawn(made, tmp_path / "all", schema.Transfer(materials={"unseen": "red"}, samples=1))
-    assert len(caplog.messages) == 1
 
 
 def test_a_sun_below_the_ground_is_refused(grounded, tmp_path):
@@ -210,10 +185,3 @@ def test_a_mesh_without_height_or_that_is_not_there_is_refused(grounded, tmp_pat
     with pytest.raises(InputError, match="'flat.obj' has no height") as error:
         drawn(grounded, tmp_path / "out", recipe, **{"flat.obj": tmp_path / "flat.obj"})
     assert "up: z" in error.value.cure
-
-
-def test_what_is_denoised_says_so(made, tmp_path):
-    pytest.importorskip("mitsuba_oidn", reason="mitsuba-oidn is not installed: make setup EXTRAS=denoise")
-    facts = json.loads(drawn(made, tmp_path / "view", schema.View(**FRONT, denoise=True))["front.json"])
-    assert facts["denoised"].startswith("mitsuba-oidn ") and "from 1 samples" in facts["caption"]
-    assert b"denoised: mitsuba-oidn" in drawn(made, tmp_path / "grid", schema.Grid(size=16, denoise=True))["grid.txt"]

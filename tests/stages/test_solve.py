@@ -19,7 +19,6 @@ from factorlib.light.lobes import Lobes
 from factorlib.reflection import reflection_operator
 from factorlib.reflection.network import SHIPPED
 from factorlib.results.lobes import read_lobes
-from factorlib.results.solution import FILES
 from factorlib.stage import Inputs, silent
 from factorlib.urm.observations import Observations, write_observations
 from stages import solve
@@ -201,27 +200,6 @@ def test_a_start_gives_the_answer_from_nothing_and_is_said(tmp_path, linked, sol
     for name in NAMES:
         rough, expected = (result["materials"][name]["roughness"] for result in (warm, cold))
         assert rough == pytest.approx(expected, abs=0.03)
-
-
-@pytest.mark.parametrize("file, old, new, words", [
-    ("materials.json", '"roughness"', '"rougness"', "missing required field `roughness`"),
-    ("materials.json", '"diffuse": [', '"diffuse": [-1, ', "of length 3"),
-    ("materials.json", '"component": {', '"component": {"gold": 0, ', "names other materials"),
-    ("materials.json", "{", "(", "not readable as JSON"),
-    ("exposures.json", "1.0", "0.0", "not a positive number"),
-    ("exposures.json", "1.0", '"one"', "Expected `float`"),
-    ("lobes.parquet", None, None, "not readable as a table of lobes"),
-])  # fmt: skip
-def test_a_start_that_is_none_says_which_file_and_what_to_do(tmp_path, solved, linked, file, old, new, words):
-    folder = tmp_path / "earlier"
-    folder.mkdir()
-    for name in FILES:
-        (folder / name).write_bytes((solved / name).read_bytes())
-    path = folder / file
-    path.write_bytes(b"rows") if old is None else path.write_text(path.read_text().replace(old, new))
-    with pytest.raises(InputError) as caught:
-        run(tmp_path, linked, start=folder)
-    assert words in str(caught.value) and str(path) in str(caught.value) and caught.value.cure
 
 
 def exposure_of_b(folder, true: float, exif: tuple[float, float | None]) -> float:

@@ -36,10 +36,6 @@ def test_a_fit_finds_the_prior_that_maps_were_drawn_from():
     np.testing.assert_allclose(found.profile, KNOWN.profile, atol=0.15)
 
 
-def test_the_mean_leaves_the_level_alone():
-    np.testing.assert_allclose(mean_of(KNOWN, fibonacci_sphere(5000)).mean(axis=1), 0, atol=1e-3)
-
-
 def test_the_gradient_is_the_finite_difference():
     cells, t = fibonacci_sphere(30), np.log([0.5, 0.4, 0.3, 0.2, 3.0])
     design, values = np.ones((30, 1)), np.random.default_rng(0).standard_t(3, size=(6, 30))

@@ -5,7 +5,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from PIL import Image
 
 from factorlib.errors import InputError
 from factorlib.images.exr import LAT_LONG, write_rgb_exr
@@ -39,31 +38,6 @@ def test_the_gallery_shows_every_recipe():
     recipes = {file.stem for folder in ("", gallery.DATASET) for file in (ROOT / "recipes" / folder).glob("*.yaml")}
     assert {file.stem for file in files} == recipes and all(f"RECIPE={name}</code>" in page for name in recipes)
     assert max(file.stat().st_size for file in files) <= 60_000
-
-
-def test_a_caption_names_lights_rows_and_columns_but_no_frames(tmp_path):
-    assert (
-        gallery.parts_of(tmp_path, [Path("000.png"), Path("004.png")])
-        == gallery.parts_of(tmp_path, [Path("a.png")])
-        == ""
-    )
-    assert gallery.parts_of(tmp_path, [Path("hall.png"), Path("office.png")]) == " Here, row by row: hall, office."
-    (tmp_path / "grid.txt").write_text("rows: Oak, red\ncolumns: hall\ndenoised: x\n")
-    assert gallery.parts_of(tmp_path, [Path("grid.png")]) == " Rows: Oak, red; columns: hall."
-
-
-def test_a_sheet_has_four_pictures_or_one_on_white(tmp_path):
-    for k in range(4):
-        Image.new("RGBA", (480, 320), (60 * k, 0, 0, 255 * (k > 0))).save(tmp_path / f"{k}.png")
-    files = sorted(tmp_path.iterdir())
-    one, four = (np.asarray(gallery.sheet(some)) for some in (files[1:2], files))
-    assert one.shape == four.shape == (320, 480, 3) and (one == [60, 0, 0]).all()
-    edged = Image.new("RGBA", (480, 320))
-    edged.paste((9, 9, 9, 255), (100, 50, 300, 150))
-    edged.save(tmp_path / "edged.png")
-    assert gallery.sheet([tmp_path / "edged.png"]).size == (200, 100)  # what is transparent is cut off
-    corners = [four[0, 0], four[0, -1], four[-1, 0], four[-1, -1]]
-    assert np.array_equal(corners, [[255] * 3, [60, 0, 0], [120, 0, 0], [180, 0, 0]])
 
 
 def test_a_prior_is_fitted_to_the_maps_that_light_no_photo(tmp_path):

@@ -76,15 +76,3 @@ def ball_normal(camera: Camera, distance: float) -> np.ndarray:
     with np.errstate(invalid="ignore"):
         depth = (b - np.sqrt(b**2 - a * c)) / a
     return ray * depth[..., None] - [0, 0, distance]
-
-
-def test_guides_leave_the_picture_and_its_coverage_as_they_are():
-    matte = {"type": "diffuse", "reflectance": tracing.rgb(0.5)}
-    ball = tracing.shape(sphere(1.0), matte, tracing.rigid(YUP_FROM_CAMERA, YUP_FROM_CAMERA @ [0, 0, 4.0]))
-    entries, view = {"ball": ball, "light": {"type": "constant"}}, tracing.sensor(CAMERA, AT_ORIGIN, alpha=True)
-    plain, guided = (tracing.rendered(entries, view, 16, 0, 2, True, guides) for guides in (False, True))
-    assert guided.shape == (*plain.shape[:2], 10) and (guided[..., :4] == plain).all()
-    covered = plain[..., 3] == 1
-    assert guided[covered][:, 4:7] == pytest.approx(0.5, abs=0.01) and not guided[plain[..., 3] == 0].any()
-    normals = guided[covered][:, 7:] @ YUP_FROM_CAMERA
-    assert np.abs(normals - ball_normal(CAMERA, 4.0)[covered]).max() < 0.2
