@@ -1,6 +1,6 @@
 """A data set that means harm reads and writes nothing outside its folder, runs no code and forges no report.
 
-With `test_hostile_input` and `test_fuzz` these are the promises of docs/security.md; what is given to make is in `test_commands`.
+With `test_damaged_files` these are the promises of docs/security.md; what is given to make is in `test_commands`.
 """
 
 from __future__ import annotations

@@ -1,10 +1,17 @@
-"""A reader refuses a hostile file with file, place and cure, soon and in little memory; what is odd but legal is read."""
+"""Readers and damaged files: a file is refused with file, place and cure, soon and in little memory; what is odd but legal is read.
+
+A table holds what was found before. Beyond it files of every kind are spoiled at random: `make test` spoils some hundred, always the same;
+the long test goes on for FUZZ_SECONDS (600), shared by its parts, each time with others.
+"""
 
 from __future__ import annotations
 
+import copy
 import json
+import logging
 import os
 import re
+import resource
 import struct
 import time
 import tracemalloc
@@ -17,16 +24,37 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 import yaml
+from hypothesis import HealthCheck, Phase, given, seed, settings
+from hypothesis import strategies as st
 
 from factorlib.errors import InputError
 from factorlib.images.exr import write_exr, write_rgb_exr
 from factorlib.light.lobes import Lobes
+from factorlib.meshes.read import read_mesh
 from factorlib.results.lobes import write_lobes
 from factorlib.runner import verbs
-from factorlib.runner.project import photo_sets
 from factorlib.urm.observations import write_observations
 from tests.faults import good
-from tests.faults.good import DATA, OBJ, OFF, PLY, PLY_TEXT, STL, STL_TEXT, H, W, coco, glb
+from tests.faults.good import (
+    DATA,
+    DATASET,
+    MESHES,
+    OBJ,
+    OFF,
+    PLAIN,
+    PLY,
+    PLY_TEXT,
+    READERS,
+    SOURCES,
+    STL,
+    STL_TEXT,
+    H,
+    W,
+    coco,
+    glb,
+    png,
+    png_header,
+)
 
 MOST_MEMORY = 60_000_000  # bytes: what a file of some kB may take
 MOST_SECONDS = 10.0  # of processor time
@@ -40,6 +68,9 @@ JSONS = (DEEP, '{"a":' * 500 + "1" + "}" * 500, "", "\x00", "[]", "null")
 def folder(tmp_path_factory):
     folder = good.make_set(tmp_path_factory.mktemp("hostile") / "set")
     (folder / "m/circle").symlink_to("circle")
+    os.mkfifo(folder / "pipe.png")
+    (folder / "link.png").symlink_to("/etc/passwd")
+    (folder / "x").symlink_to("x")
     (folder / "m/out").symlink_to("/etc/passwd")
     os.mkfifo(folder / "m/pipe")
     with open(folder / "m/sparse", "wb") as stream:
@@ -452,17 +483,10 @@ FAULTS = {  # file -> what is in it, and words of the error
 
 
 def test_all_faults_are_said_at_once_and_each_once_without_running_anything(linked, tmp_path, capsys):
-    folder, data = good.make_set(tmp_path / "set"), photo_sets().read(tmp_path / "set")
-    files = {name: folder / name for name in ("light.exr", "m/chair.obj", "m/box.gltf")}
-    assert data.recipe_faults(files | {"own.json": folder / "nothing_looks_at_tables.json"}) == []
+    folder = good.make_set(tmp_path / "set")
     look = lambda *settings: verbs.validate(linked, str(folder), list(settings))  # noqa: E731
-    assert look() == 0 and "2 photos" in capsys.readouterr().out
-    began = time.process_time()
-    assert [fault for slice_ in ("photo", "objects") for fault in data.faults(slice_, None, {}, folder)] == []
-    assert time.process_time() - began < 1.0
     assert look("align.limits.triangles=4") == 0
     assert "4 triangles" in refusal(lambda: look("align.limits.triangles=3"), capsys)
-    assert "SET align.limits.triangles=0: " in refusal(lambda: look("align.limits.triangles=0"), capsys)
     for name, (content, _) in FAULTS.items():
         good.put(folder / name, content)
     for verb in (look, lambda: verbs.make(linked, verbs.Wish(str(folder)))):
@@ -491,3 +515,190 @@ def test_a_file_of_a_recipe_is_refused_before_anything_runs(linked, tmp_path, ca
         text = refusal(lambda wish=wish: verbs.make(linked, wish), capsys)
         assert re.search(words, text, re.DOTALL) and str(folder / name) in text and "\n  " in text, text
     assert not list((linked.root / "build").glob("set/*")), "something was run"
+
+
+# ── spoiled at random ──
+
+FUZZ_SECONDS = float(os.environ.get("FUZZ_SECONDS", "600"))
+FEW, MANY = 8, 200
+MOST_ADDRESSES = 16 << 30  # of addresses, libraries included
+
+# ── spoiling ─────────────────────────────────────────────────────────────────────────────────────────────────────────
+
+NUMBERS = [0, -1, 255, 2**31, 2**63, 2**64, 10**30, 10**400, 1e300, -1e300, 1e-300, 5e-324, -0.0, 5126, 5123]
+WORDS = [
+    "", ".", "..", "/", "../x", "\0", "x" * 300, "é" * 200, "z/" * 3000, "²", "7", "NaN", "red.png", "model", "link.png",
+    "pipe.png", "a\nb", "*a", "` - at `$.a[0]`", "!!int", "VEC3", "POSITION", "data:;base64,AAAA", "data:,x",
+]  # fmt: skip
+ODD = (
+    st.none()
+    | st.booleans()
+    | st.sampled_from(NUMBERS + WORDS)
+    | st.integers(-3, 300)
+    | st.floats()
+    | st.text(max_size=8)
+)
+BELOW = lambda inner: st.lists(inner, max_size=4) | st.dictionaries(st.text(max_size=4), inner, max_size=3)  # noqa: E731
+ODDER = st.recursive(ODD, BELOW, max_leaves=6)
+PIECES = [
+    b"\xff" * 8, b"\0" * 8, b"\xff" * 4, b"\x7f\xff\xff\xff", b"\0\0\xc0\x7f", struct.pack("<Q", 10**9), b"[[[[", b'"',
+    b"&a [*a]", b"\r", *(f" {word} ".encode() for word in (
+        "0", "-1", "1e300", "1e999", "nan", "9" * 5000, "4294967295", "2.5", "²", "\0", "1" + "0" * 12, "v", "f", "usemtl",
+        "mtllib", "element", "property list uchar", "face", "end_header", "OFF", "endsolid", "#", "\\", "1/2/3", "1//",
+        "a" * 300, "ü", "../x",
+    )),
+]  # fmt: skip
+
+
+def places(value, way=()):
+    """The ways to every part of plain data."""
+    yield way
+    for key, item in value.items() if isinstance(value, dict) else enumerate(value) if isinstance(value, list) else ():
+        yield from places(item, (*way, key))
+
+
+@st.composite
+def spoiled(draw, value):
+    """Plain data with some parts replaced, removed, doubled or renamed."""
+    value = copy.deepcopy(value)
+    for _ in range(draw(st.integers(1, 3))):
+        if not (ways := [way for way in places(value) if way]):
+            break
+        (*above, last), holder = draw(st.sampled_from(ways)), value
+        for step in above:
+            holder = holder[step]
+        kind = draw(st.sampled_from(["replace"] * 5 + ["remove", "double", "rename"]))
+        if kind == "replace":
+            holder[last] = draw(ODDER)
+        elif kind == "remove":
+            del holder[last]
+        elif kind == "rename" and isinstance(holder, dict):
+            holder[draw(st.text(max_size=6) | st.sampled_from(["x" * 300, "a\0b"]))] = holder.pop(last)
+        elif isinstance(holder, list):
+            holder.insert(last, copy.deepcopy(holder[last]))
+    return value
+
+
+@st.composite
+def spoiled_bytes(draw, content: bytes) -> bytes:
+    """A file with bytes changed, cut out, doubled or put in, half of them in the header; cut at the end at times."""
+    for _ in range(draw(st.integers(1, 4))):
+        reach = len(content) if draw(st.booleans()) else min(len(content), 400)
+        at, length = draw(st.integers(0, reach)), draw(st.sampled_from([0, 1, 1, 4, 8, 40]))
+        new = draw(st.binary(max_size=6) | st.sampled_from([*PIECES, content[at : at + 60]]))
+        content = content[:at] + new + content[at + length :]
+    return content[: draw(st.integers(0, len(content)))] if draw(st.integers(0, 7)) == 0 else content
+
+
+def yaml_of(value) -> bytes:
+    return yaml.safe_dump(value, allow_unicode=True).encode("utf-8", "replace")
+
+
+def spoiled_json(value, write=lambda value: json.dumps(value).encode()) -> st.SearchStrategy:
+    """The text of plain data, spoiled before or after it was written."""
+    return spoiled(value).map(write) | spoiled_bytes(write(value))
+
+
+# ── who reads meshes, and how they are spoiled ──
+
+
+def read_usable_mesh(folder, name: str) -> None:
+    """What is read can be used: finite, unit normals, indices in range; by one material, or by the names of parts."""
+    made_of = "red" if (folder / name).stat().st_size % 2 else {"red": "red", "shell": "red"}
+    mesh = read_mesh(folder / name, ["red"], made_of)
+    assert len(mesh.faces) and 0 <= mesh.faces.min() and mesh.faces.max() < len(mesh.vertices)
+    assert np.isfinite(mesh.vertices).all() and np.isfinite(mesh.radius) and mesh.radius > 0
+    assert np.abs(np.linalg.norm(mesh.normals, axis=1) - 1).max() < 1e-6 and set(mesh.labels) == {1}
+
+
+def spoiled_mesh(name: str) -> st.SearchStrategy:
+    if name not in ("a.gltf", "a.glb"):
+        return spoiled_bytes(MESHES[name])
+    header = spoiled(json.loads(good.gltf_text())).map(json.dumps)
+    return header.map(good.glb if name == "a.glb" else str.encode) | spoiled_bytes(MESHES[name])
+
+
+# ── what is spoiled, and who reads it ────────────────────────────────────────────────────────────────────────────────
+
+PARTS_OF_PNG = (png_header(W, H, kind=3), good.PIXELS, bytes(range(9)))
+A_PNG = st.builds(png, *(spoiled_bytes(part) | st.just(part) for part in PARTS_OF_PNG))
+PNG_KINDS = st.tuples(
+    st.sampled_from([1, 2, 4, 8, 16]), st.sampled_from([0, 2, 3, 4, 6]), st.binary(min_size=50, max_size=800)
+)
+ANY_PNG = PNG_KINDS.map(lambda kind: png(png_header(W, H, *kind[:2]), zlib.compress(kind[2] * 4), PARTS_OF_PNG[2]))
+SETS = st.sampled_from([{}, *({"cameras": source} for source in SOURCES.values())])
+PLAIN_PARTS = {  # name -> the file that holds plain data as JSON, and who reads it
+    "COCO": ("coco.json", "mask"), "transforms.json": ("t.json", "transforms"),
+    "BOP cameras": ("model/scene_camera.json", "bop"), "BOP poses": ("model/scene_gt.json", "bop"),
+    "earlier solution": ("solve/materials.json", "solution"), "earlier exposures": ("solve/exposures.json", "solution"),
+    "earlier poses": ("poses.json", "poses"),
+}  # fmt: skip
+PARTS = {  # name -> (file, its contents, who reads it); None: the good file's bytes spoiled
+    "dataset.yaml": ("dataset.yaml", SETS.flatmap(lambda more: spoiled_json(DATASET | more, yaml_of)), "set"),
+    "truth.yaml": ("truth.yaml", spoiled(PLAIN["truth.yaml"]).map(yaml_of), "set"),
+    "PNG": ("mask.png", A_PNG | ANY_PNG, "mask"),
+    "COLMAP cameras": ("model/cameras.bin", None, "colmap"),
+    "COLMAP images": ("model/images.bin", None, "colmap"),
+    "COLMAP cameras as text": ("text/cameras.txt", None, "colmap text"),
+    "COLMAP images as text": ("text/images.txt", None, "colmap text"),
+    "observations": ("observations.parquet", None, "observations"),
+    "lobes": ("solve/lobes.parquet", None, "lobes"),
+    "true light": ("light.exr", None, "true light"),
+    **{name: (file, spoiled_json(PLAIN[file]), reader) for name, (file, reader) in PLAIN_PARTS.items()},
+    **{name: (name, spoiled_mesh(name), read_usable_mesh) for name in MESHES},
+    "photo": ("7.png", None, "masks"),
+}
+
+
+@pytest.fixture
+def little_memory():
+    before = resource.getrlimit(resource.RLIMIT_AS)
+    most = MOST_ADDRESSES if before[1] == resource.RLIM_INFINITY else min(MOST_ADDRESSES, before[1])
+    resource.setrlimit(resource.RLIMIT_AS, (most, before[1]))
+    logging.disable(logging.WARNING)
+    yield
+    logging.disable(logging.NOTSET)
+    resource.setrlimit(resource.RLIMIT_AS, before)
+
+
+def check(read, folder, file: str) -> None:
+    """The file is read or refused; the only exception that may come out is InputError, and no raw warning."""
+    began, refused = time.process_time(), None
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        try:
+            read(folder, file)
+        except InputError as error:
+            refused = error
+    assert refused is None or (refused.file and refused.found and refused.cure and len(str(refused)) < 3000)
+    assert time.process_time() - began < MOST_SECONDS
+
+
+def fuzz(folder, part: str, **options) -> None:
+    file, contents, reader = PARTS[part]
+    read = READERS.get(reader, reader)
+    check(read, folder, file)
+    contents = spoiled_bytes((folder / file).read_bytes()) if contents is None else contents
+
+    @settings(deadline=None, database=None, suppress_health_check=list(HealthCheck), print_blob=False, **options)
+    @given(contents)
+    def spoil(content):
+        with good.changed(folder, file, content):
+            check(read, folder, file)
+
+    if not options.get("derandomize"):
+        seed(time.time_ns())(spoil)
+    spoil()
+
+
+@pytest.mark.parametrize("part", PARTS)
+def test_a_spoiled_file_is_read_or_refused(folder, little_memory, part):
+    fuzz(folder, part, max_examples=FEW, derandomize=True, phases=(Phase.generate,))
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("part", PARTS)
+def test_thousands_of_spoiled_files_are_read_or_refused(folder, little_memory, part):
+    end = time.monotonic() + FUZZ_SECONDS / len(PARTS)
+    while time.monotonic() < end:
+        fuzz(folder, part, max_examples=MANY)
