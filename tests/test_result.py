@@ -39,13 +39,6 @@ def test_materials_have_their_numbers_and_standard_errors(result):
     assert result.objects == ["front/chair", "side/chair"]
 
 
-def test_it_stays_where_it_was_when_the_current_folder_changes(folder, tmp_path, monkeypatch):
-    monkeypatch.chdir(folder.parent)
-    result = factorlib.load_result(folder.name)
-    monkeypatch.chdir(tmp_path)
-    assert result.environment("front").lat_long.any() and result.render("front", width=16, samples=1).pixels.any()
-
-
 def test_what_is_not_there_is_refused_with_what_is(result, tmp_path):
     for ask, words in [
         (lambda: result.materials["rde"], "did you mean 'red'"),
@@ -102,30 +95,12 @@ def test_a_folder_that_is_no_result_is_refused_with_those_that_are(folder, tmp_p
         factorlib.load_result("nothing")
 
 
-def test_a_result_is_found_from_a_folder_within_the_checkout(folder, monkeypatch):
-    monkeypatch.chdir(folder.parent.parent / "data" / "set")
-    assert factorlib.load_result("build/set").folder.samefile(folder)
-    assert factorlib.load_result("set").folder.samefile(folder)
-    with pytest.raises(InputError, match=r"did you mean '../../build/set'"):
-        factorlib.load_result("../../build/sets")
-
-
 @pytest.fixture
 def copy(folder, tmp_path):
     """Of the checkout; cp -rL of the result lies beside build/."""
     shutil.copytree(folder.parent.parent, tmp_path / "root")
     shutil.copytree(tmp_path / "root" / "build" / "set", tmp_path / "root" / "before")
     return tmp_path / "root"
-
-
-def test_a_copy_that_lies_far_from_its_data_set_makes_the_same_pictures(copy, result, tmp_path):
-    shutil.copytree(copy / "before", tmp_path / "far" / "taken")
-    shutil.rmtree(copy)
-    taken = factorlib.load_result(tmp_path / "far" / "taken")
-    assert taken.photos == result.photos and taken.objects == result.objects
-    assert list(taken.materials) == list(result.materials)
-    pictures = [of.relight("front/chair", "side", width=32, samples=2).pixels for of in (taken, result)]
-    np.testing.assert_array_equal(*pictures)
 
 
 def test_a_packed_result_is_the_same_file_twice_and_loads_where_it_is_unpacked(copy, result, tmp_path):

@@ -1,7 +1,6 @@
 """The worked example for Slurm, docs/slurm.py: the job script that it generates, shown in docs/distributed.md, starts a worker that serves a run."""
 
 import os
-import re
 import runpy
 import signal
 import subprocess
@@ -47,18 +46,3 @@ def test_the_job_script_run_as_slurm_would_starts_a_worker_that_serves_a_run(clu
         job.wait(60)
     assert verbs.make(other, verbs.Wish("set")) == 0
     assert files_of(project.build / "store" / "trees") == files_of(other.build / "store" / "trees")
-
-
-def test_the_example_hands_the_run_its_schedulers_address_and_ends_as_the_run_does(example, monkeypatch, tmp_path):
-    called = []
-    monkeypatch.setattr(sys, "argv", ["slurm.py", "eames", "solve.lobes=64"])
-    monkeypatch.setattr(subprocess, "call", lambda command, cwd: called.append((command, cwd)) or 3)
-    jobs = tmp_path / "jobs"
-    for name, text in {"sbatch": f"echo asked >> {jobs}; echo Submitted batch job 1", "scancel": ":"}.items():
-        (tmp_path / name).write_text(f"#!/bin/sh\n{text}\n")
-        (tmp_path / name).chmod(0o755)
-    monkeypatch.setenv("PATH", f"{tmp_path}:{os.environ['PATH']}")
-    assert example["main"]() == 3
-    ((command, cwd),) = called
-    assert command[:3] == ["make", "all", "DATASET=eames"] and cwd == LIBRARY
-    assert re.fullmatch(r"SET=executor=tcp://\S+:\d+ solve.lobes=64", command[3])

@@ -131,16 +131,6 @@ def write_truth(folder, truth):
     return write(folder, {**SPEC, "truth": "truth/truth.yaml"})
 
 
-def test_lights_that_no_material_links_are_named_before_anything_runs(folder):
-    assert Validation(read_dataset(write(folder))).cautions() == []  # wood links them
-    spec = changed("photos[1].objects[0].materials", {"shell": "red", "legs": "red"})
-    (said,) = Validation(read_dataset(write(folder, spec))).cautions()
-    assert "2 groups" in said
-    assert "(garden; hall, kitchen)" in said.replace("hall, kitchen; garden", "garden; hall, kitchen")
-    spec["photos"][1]["illumination"] = "kitchen"  # one light links whatever stands in it
-    assert Validation(read_dataset(write(folder, spec))).cautions() == []
-
-
 def test_truth_is_its_own_slice_and_a_warning_where_it_is_missing(folder, caplog):
     plain, dataset = read_dataset(write(folder)), read_dataset(write_truth(folder, TRUTH))
     truth = dataset_slice(dataset, "truth")

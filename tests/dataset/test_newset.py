@@ -92,21 +92,6 @@ def test_a_coco_file_names_the_materials_of_all_photos_and_what_is_no_name_is_to
     assert Validation(dataset).faults(*arguments) == []
 
 
-def test_what_is_missing_is_listed(folder):
-    masks(folder, kitchen=[0, 255])
-    missing, spec = made(folder, meshes=None)
-    fault = "kitchen.png has no label, for 255 means left out"
-    assert missing == [
-        f"photo kitchen: {fault}; the mask of one material is called kitchen_<material>.png",
-        "photo IMG_0412: no mask called IMG_0412.png or IMG_0412_<material>.png",
-        missing[2],
-        "no mask names a material: write the names in `materials`, label k of a mask the k-th",
-    ]
-    assert spec["photos"][0]["masks"] == "?" and missing[2].startswith("there is no mesh: `hull: true`")
-    with pytest.raises(InputError, match=r"materials\[0\]"):
-        read_dataset(folder / "data" / "mine")
-
-
 def test_without_a_mesh_a_hull_by_structure_from_motion_is_written_and_that_is_said(folder):
     masks(folder, kitchen=[0, 1, 2], IMG_0412=[0, 1])
     missing, spec = made(folder, meshes=None)
@@ -190,17 +175,6 @@ def test_a_folder_that_is_there_is_left_alone_and_nothing_half_made_stays(folder
     assert not list((folder / "data").iterdir())
 
 
-def test_a_folder_that_is_not_there_and_two_photos_of_one_name_are_refused(folder):
-    for name in ("photos", "masks", "meshes"):
-        (folder / name).rename(folder / "elsewhere")
-        with pytest.raises(InputError, match=f"{name.upper()}: there is no such folder"):
-            made(folder)
-        (folder / "elsewhere").rename(folder / name)
-    Image.fromarray(np.zeros((4, 4, 3), np.uint8)).save(folder / "photos" / "kitchen.png")
-    with pytest.raises(InputError, match="would both be called 'kitchen'"):
-        made(folder)
-
-
 @pytest.mark.parametrize("kind", ["photos", "masks", "meshes"])
 def test_a_link_is_refused_for_it_may_lead_to_what_is_not_to_be_copied(folder, kind):
     masks(folder, kitchen=LABEL)
@@ -210,23 +184,3 @@ def test_a_link_is_refused_for_it_may_lead_to_what_is_not_to_be_copied(folder, k
     with pytest.raises(InputError, match="is a link") as error:
         made(folder)
     assert error.value.file == file and not (folder / "data" / "mine").exists()
-
-
-def test_a_data_set_inside_a_folder_that_it_is_made_of_does_not_copy_itself(folder):
-    new_dataset(folder / "meshes" / "mine", folder / "photos", None, folder / "meshes")
-    copied = {path.name for path in (folder / "meshes" / "mine" / "meshes").rglob("*")}
-    assert copied == {"chair.mtl", "chair.obj"}
-
-
-def test_a_photo_whose_name_the_results_take_is_listed_and_names_that_yaml_takes_for_numbers_are_quoted(folder):
-    for old, new in (("kitchen", "poses"), ("IMG 0412", "0812")):
-        next((folder / "photos").glob(f"{old}.*")).rename(folder / "photos" / f"{new}.jpg")
-    masks(folder, **{f"{photo}_{part}": SHELL for photo in ("poses", "0812") for part in ("shell", "1e3")})
-    (folder / "meshes" / "chair.obj").write_text(OBJ.replace("g legs", "g 1e3"))
-    missing, _ = made(folder)
-    assert missing == ["photo poses: write another `name`: a file of the results is called poses"]
-    file = folder / "data" / "mine" / "dataset.yaml"
-    with pytest.raises(InputError, match="rename the photo"):
-        read_dataset(file)
-    file.write_text(file.read_text().replace("name: poses", "name: hall"))  # and that is all
-    assert read_dataset(file).photo("hall").image == "photos/poses.jpg" and read_dataset(file).photo("0812")

@@ -1,7 +1,6 @@
 """Cameras from elsewhere: a known point lands where the source's own tool puts it, and what cannot be used is refused."""
 
 import json
-import logging
 import math
 
 import numpy as np
@@ -129,22 +128,6 @@ def test_a_photo_is_matched_by_path_then_file_name_then_that_without_suffix_or_a
     assert set(read(folder, OF_TRANSFORMS, photo={"image": "photos/r_0.5.png"}).external) == {"hall"}
 
 
-def test_a_photo_that_is_not_in_the_model_or_has_no_pose_there_is_warned_of_and_searched(folder, caplog):
-    colmap(folder)
-    model = pycolmap.Reconstruction(str(folder / "sparse/0"))
-    model.deregister_frame(next(image.frame_id for image in model.images.values() if image.name == "attic.png"))
-    model.write_binary(str(folder / "sparse/0"))
-    for names in (None, ("hall.png",)):
-        if names:
-            colmap(folder, names=names)
-        with caplog.at_level(logging.WARNING):
-            dataset = read(folder, {"colmap": "sparse/0"})
-        assert set(dataset.external) == {"hall"}
-        assert "no image of photo 'attic'" in caplog.text and "cameras.images" in caplog.text
-        assert dataset_slice(dataset, "objects", "attic").facts["external"] is None
-        caplog.clear()
-
-
 def test_a_camera_that_is_no_pinhole_of_one_focal_length_is_refused_unless_it_is_so_within_half_a_pixel(folder):
     for model, params, fault, cure in (
         ("SIMPLE_RADIAL", (300.0, 100.0, 75.0, -0.1), "distorts", "image_undistorter"),
@@ -249,30 +232,6 @@ def test_bop_millimetres_become_the_meshs_units_and_whole_pixels_half_ones(folde
 ])  # fmt: skip
 def test_wrong_scenes_are_refused_where_they_are_wrong(folder, cameras, poses, key, words):
     refusal(bop(folder, cameras, poses), OF_BOP, key, words, names=("000007",))
-
-
-@pytest.mark.parametrize("cameras, key, words", [
-    ({}, "", "names no source"),
-    ({"colmap": "sparse/0", "bop": "scene"}, "", "names colmap and bop"),
-    ({"colmap": "../elsewhere"}, ".colmap", "outside the dataset"),
-    ({"colmap": "nowhere"}, ".colmap", "no folder 'nowhere'"),
-    ({"colmap": "photos"}, ".colmap", "sparse/0"),
-    ({"transforms": "transfrms.json"}, ".transforms", "did you mean 'transforms.json'"),
-    ({"bop": "photos"}, ".bop", "test/000001"),
-    ({"colmap": "sparse/0", "images": {"hal": "hall.png"}}, ".images.hal", "did you mean 'hall'"),
-    ({"colmap": "sparse/0", "images": {"hall": "hal.png"}}, ".images.hall", "did you mean 'hall.png'"),
-    ({"colmap": "sparse/0", "world_from_object": {"chai": {}}}, ".world_from_object.chai", "did you mean 'chair'"),
-    ({"colmap": "sparse/0", "obj_ids": {"chair": 1}}, ".obj_ids", "world_from_object"),
-    ({"bop": "scene", "world_from_camera": True}, ".world_from_camera", "obj_id"),
-    ({"bop": "scene", "obj_ids": {"chai": 1}}, ".obj_ids.chai", "did you mean 'chair'"),
-    *((PLACED | {"world_from_object": {"chair": {key: value}}}, f".world_from_object.chair.{key}", words)
-      for key, value, words in [("scale", 0, "more than 0"), ("scale", 1e300, "1e-09 to 1e+09"),
-                                ("scale", 1e-300, "1e-09 to 1e+09"), ("rotation", (2 * EYE).tolist(), "unit vectors")]),
-    *((OF_BOP | {"mesh_unit_mm": value}, ".mesh_unit_mm", "1e-09 to 1e+09") for value in (1e300, 1e-300)),
-])  # fmt: skip
-def test_a_wrong_key_is_refused_with_a_cure(folder, cameras, key, words):
-    colmap(bop(transforms(folder, FRAMES)))
-    assert "dataset.yaml" in str(refusal(folder, cameras, f"cameras{key}", words).file)
 
 
 EXTERNAL = ExternalCamera("colmap", 300.0, (104.0, 71.0), (200, 150), {})

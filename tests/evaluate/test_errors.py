@@ -10,7 +10,7 @@ from factorlib.evaluate.geometry import normal_error, pose_error
 from factorlib.evaluate.lights import compare_lights, light_error, rgb_angle
 from factorlib.evaluate.materials import compare_materials
 from factorlib.evaluate.picture import WINDOW, picture_error, psnr, ssim_map, tone_mapped, white_of
-from factorlib.evaluate.resynthesis import compare_photos, flat_materials, shot_of
+from factorlib.evaluate.resynthesis import shot_of
 from factorlib.results.materials import Reflectance
 from tests.evaluate.made_artifacts import TRUE, light_map, perturbed, scaled
 
@@ -151,10 +151,6 @@ def channels():
     return photo, vectors | {"label": label.copy(), "confidence": one.copy()}, radiance
 
 
-def errors_of(photo, geometry, estimate):
-    return compare_photos(["p"], ["m", "n"], lambda _: shot_of(photo, geometry, estimate))
-
-
 def test_what_is_left_out_is_counted_and_clipped_pixels_are_bounds(channels):
     photo, geometry, radiance = channels
     photo["clipped.R"][0, :4], photo["valid"][1, :3] = 1, 0
@@ -163,16 +159,3 @@ def test_what_is_left_out_is_counted_and_clipped_pixels_are_bounds(channels):
     assert shot.counts == {"pixels": 600 - 9, "unused": 7, "clipped": 4, "invalid": 3, "uncovered": 2}
     satisfied = [shot_of(photo, geometry, factor * radiance).clipped_satisfied for factor in (1.5, 0.5)]
     assert satisfied == [1.0, 0.0]
-
-
-def test_gauges_and_the_flat_null_of_a_photo(channels):
-    photo, geometry, radiance = channels
-    found = errors_of(photo, geometry, 0.5 * radiance).photos["p"]
-    scores = {gauge: scored.estimate.psnr_linear_db for gauge, scored in found.gauges.items()}
-    assert scores["none"] < 15 < 119 < scores["scalar_per_set"]
-    assert found.factor["channel_per_photo"] == pytest.approx((2, 2, 2))
-    flat = errors_of(photo, geometry, flat_materials(shot_of(photo, geometry, radiance))).photos["p"]
-    assert flat.gauges["none"].estimate == flat.gauges["none"].null
-    geometry["label"][:] = 0  # a photo that shows nothing
-    found = errors_of(photo, geometry, radiance)
-    assert found.photos["p"].gauges is None and found.mean is None and found.photos["p"].materials == {}

@@ -105,13 +105,6 @@ def test_a_coloured_exposure_has_a_map_of_its_own(inputs, tmp_path):
     assert "side.exposed.exr" in (out / "scenes" / "side.xml").read_text()
 
 
-def test_a_light_that_was_not_solved_for_is_black_and_said(inputs, tmp_path, caplog):
-    write_lobes(inputs["solve"] / "lobes.parquet", {"front": made_export.light(0)})
-    out = run(inputs, tmp_path / "out")
-    assert "'room' was not solved for" in caplog.text
-    assert not read_rgb_exr(out / "illumination" / "room.exr").any()
-
-
 def test_suns_are_said_once_in_every_form(inputs, tmp_path):
     """The sky and the sun together are the map; glTF's light shines where lights.json says."""
     out = run(inputs, tmp_path / "out")

@@ -8,8 +8,7 @@ import numpy as np
 import pytest
 import trimesh
 
-from factorlib.export.gltf import gltf_material, read_part_materials, write_glb
-from factorlib.export.loss import losses
+from factorlib.export.gltf import read_part_materials, write_glb
 from factorlib.export.materials import headroom_factor, table_in_gauge
 from factorlib.export.materialx import materialx
 from factorlib.meshes.mesh import Mesh
@@ -93,17 +92,6 @@ def test_glb_keeps_the_mesh_and_gives_exact_reflectances(tmp_path):
         np.testing.assert_allclose(f0, material.specular, atol=1e-12)
         np.testing.assert_allclose(np.array(core["baseColorFactor"][:3]) * (1 - f0.max()), material.diffuse, atol=1e-12)
         assert core["metallicFactor"] == 0
-
-
-def test_metals_are_those_that_show_as_black_plastic_where_the_extension_is_not_known():
-    gold, black = (
-        Reflectance((0.01, 0, 0), (0.9, 0.6, 0.2), 0.3),
-        Reflectance((0.02, 0.02, 0.02), (0.06, 0.06, 0.06), 0.3),
-    )
-    for material, metal in ((gold, True), (black, False), (CASES["black"], False), (CASES["lambertian"], False)):
-        assert gltf_material(material)["pbrMetallicRoughness"]["metallicFactor"] == metal
-        assert gltf_material(material, painted=True)["pbrMetallicRoughness"]["metallicFactor"] == 0
-    assert losses(CASES["metal"])["glb_plain"].mean < 0.05
 
 
 def test_variants_give_every_part_its_material_in_each_of_them(tmp_path):

@@ -355,16 +355,6 @@ def test_a_damaged_result_is_made_again_and_nothing_else_is_and_a_damaged_view_t
     assert make(project) == 0 and new_runs(project) == [] and results(project) == before and is_sound(project)
 
 
-def test_what_stood_in_the_place_of_a_result_is_kept_until_gc(project, capsys):
-    overwrite(tree_of(project, "total", "total.txt"), "a user's own words")
-    assert make(project) == 0
-    text, damaged = capsys.readouterr().err, project.build / "store" / "damaged"
-    assert "its kept result was damaged and is replaced" in text and "store/damaged/" in text
-    assert [path.read_text() for path in damaged.rglob("total.txt")] == ["a user's own words"]
-    collect(project)
-    assert not list(damaged.iterdir())
-
-
 def test_damage_under_the_same_size_and_time_is_found_by_verify_or_replaced_by_force(project, capsys):
     before, spoil = results(project), partial(overwrite, text="total: 19", keep_times=True)
     spoil(tree_of(project, "total", "total.txt"))

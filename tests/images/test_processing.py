@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy.ndimage import gaussian_filter
 
-from factorlib.images.processing import HALO, camera_says, halo
+from factorlib.images.processing import HALO, halo
 
 H, W = 120, 160
 Y, X = np.mgrid[:H, :W]
@@ -42,8 +42,3 @@ def test_too_few_contours_and_pixels_that_are_left_out_say_nothing():
     of_three = np.repeat(linear[..., None], 3, axis=-1)
     assert halo(of_three, INSIDE, INSIDE) == 0
     assert halo(of_three, np.hypot(Y - 60, X - 80) < 4, KNOWN) == 0
-
-
-def test_what_the_camera_wrote():
-    assert camera_says({"Exif:CustomRendered": 1, "Exif:Sharpness": 2}) == "by a process of its own, sharpened"
-    assert camera_says({}) is None and camera_says({"Exif:CustomRendered": 0}) is None

@@ -134,15 +134,6 @@ def test_masks_that_are_empty_or_overlap(tmp_path):
     assert f"'red' and 'wood' share {RED.sum()} pixels" in message and "w.png" in message and "r.png" in message
 
 
-def test_outlines_that_share_an_edge_lose_it_and_ones_that_share_more_are_refused(tmp_path):
-    side = (10, [box(0, 0, 20, 20)])
-    edge = labels(tmp_path, coco(tmp_path, [side, (11, [box(19, 0, 30, 20)])]))
-    both = edge.left_out
-    assert 0 < both.sum() <= H and (edge.label[both] == 0).all() and {1, 2} <= set(edge.label.ravel().tolist())
-    message = refusal(tmp_path, coco(tmp_path, [side, (11, [box(10, 0, 30, 20)])]))
-    assert "'red' and 'white' share 200 pixels" in message
-
-
 def test_a_photo_of_coco_goes_by_its_whole_path_first(tmp_path):
     images = lambda *names: [{"id": 6 + k, "file_name": f"{name}.jpg"} for k, name in enumerate(names)]  # noqa: E731
     name = coco(tmp_path, [(10, [box(3, 2, 12, 9)])], images=images("other/kitchen", "photos/kitchen"))

@@ -97,17 +97,6 @@ def test_a_box_stands_on_its_largest_side_that_looks_down():
     assert (plane.point - np.array([0, 0, -5])) @ plane.normal == pytest.approx(-0.5)
 
 
-def test_what_a_steep_photo_leaves_open_other_photos_of_the_object_decide():
-    steep = about((1, 0, 0), 60)
-    tower = placed("tower", box(1, 4, 1), (0, 0, -9), rotation=steep)
-    assert np.allclose(resting_plane(tower).normal, steep @ [0, 0, -1], atol=1e-6)  # as if it lay
-    uprights = np.stack([about((1, 0, 0), degrees).T @ [0, 1, 0] for degrees in (60, 0, 10)])
-    assert np.allclose(resting_plane(tower, uprights).normal, steep @ [0, 1, 0], atol=1e-6)
-    askew = about((2**-0.5, 0, -(2**-0.5)), 54.7)  # a cube on its corner
-    with pytest.raises(InputError, match="rests on no side"):
-        resting_plane(placed("cube", box(1, 1, 1), (0, 0, -5), rotation=askew))
-
-
 AXIS = np.array([0.6, -0.48, -0.64])
 
 

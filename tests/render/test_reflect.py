@@ -12,7 +12,7 @@ from factorlib.light.lobes import Lobes, no_lobes
 from factorlib.reflection import reflection_operator
 from factorlib.reflection.reference import Reference
 from factorlib.render.reflect import Reflector
-from factorlib.render.resynthesis import balls, observed_cells
+from factorlib.render.resynthesis import balls
 from factorlib.results.materials import Reflectance
 from tests.integral import reflected
 
@@ -95,13 +95,6 @@ def test_shadows_that_hide_nothing_change_nothing_and_those_that_hide_all_leave_
     for level, factor in ((255, 1.0), (0, 0.0)):
         found = reflector(GLOSSY, normals, views, visibility=np.full((40, 256), level, np.uint8))
         np.testing.assert_allclose(found, factor * reflector(GLOSSY, normals, views), rtol=1e-5, atol=2e-3)
-
-
-def test_observed_cells_are_where_the_normals_are_without_holes():
-    normals = ball_normals(20)[0] * (1, -1, -1)  # in the camera's frame
-    right = normals[normals[:, 0] > 0.1]
-    cells = observed_cells(right, 64)
-    assert not cells[:, :32].any() and cells[24:40, 38:60].all() and not observed_cells(right[:0], 64).any()
 
 
 def test_a_near_light_is_to_each_point_a_far_one_of_moved_lobes():

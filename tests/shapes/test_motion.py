@@ -2,7 +2,6 @@
 
 import msgspec
 import numpy as np
-import pycolmap
 import pytest
 
 from factorlib.align.refine import FocalPrior
@@ -10,7 +9,7 @@ from factorlib.errors import InputError
 from factorlib.generate.shapes import SHAPES
 from factorlib.geometry.camera import angle_between
 from factorlib.shapes.hull import agreement
-from factorlib.shapes.motion import LEAST_AGREEMENT, bent_lenses, cameras_by_motion
+from factorlib.shapes.motion import LEAST_AGREEMENT, cameras_by_motion
 from factorlib.shapes.primitive import unit
 from studies.scenes.outlines import looking_from, outline, views_of
 
@@ -61,21 +60,3 @@ def test_photos_that_do_not_overlap_are_refused():
     with pytest.raises(InputError, match="of 4 photos are found") as error:
         cameras_by_motion(views_of(BLOB, apart, [looking_from(20, 40 + 90.0 * k) for k in range(4)]))
     assert "each 10 to 20° from the next" in error.value.cure
-
-
-@pytest.mark.parametrize("k", [0.0, -0.01, -0.3])
-def test_a_lens_that_bends_is_named_by_its_coefficient_and_the_model_stays(k):
-    pycolmap.set_random_seed(0)
-    options = pycolmap.SyntheticDatasetOptions()
-    options.camera_model_id, options.camera_params = pycolmap.CameraModelId.SIMPLE_RADIAL, [1280.0, 512.0, 384.0, k]
-    options.num_rigs, options.num_frames_per_rig = 1, 6
-    model = pycolmap.synthesize_dataset(options)
-    (camera,) = model.cameras.values()
-    camera.model, camera.params = pycolmap.CameraModelId.SIMPLE_PINHOLE, [1280.0, 512.0, 384.0]
-    bent = bent_lenses(model)
-    assert camera.params.tolist() == [1280.0, 512.0, 384.0]
-    if k > -0.1:
-        assert bent == {}
-    else:
-        ((focal, found),) = bent.values()
-        assert focal == pytest.approx(1280, rel=1e-3) and found == pytest.approx(k, rel=1e-3)

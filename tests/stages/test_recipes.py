@@ -89,35 +89,6 @@ def test_a_part_of_an_inserted_mesh_gets_another_material_and_the_rest_keeps_its
     assert error.value.key == "material"
 
 
-def test_the_object_that_has_the_material_to_replace_is_inserted_whatever_the_order_of_photos(grounded):
-    side = grounded.facts["dataset.objects"]["side"]
-    both = {"side": side, "front": {**side, "objects": [{**side["objects"][0], "materials": {"lower": "unseen"}}]}}
-    for photos in (both, dict(reversed(both.items()))):
-        results = SolvedSet(changed(grounded, "dataset.objects", photos))
-        for replaced, expected in (
-            ("unseen", ["red", "brass"]),
-            ("brass", ["red", "red"]),
-            ("red", ["brass", "brass"]),  # the mesh with its own parts
-        ):
-            mesh, materials, _ = results.mesh("egg", {replaced: "brass" if replaced != "brass" else "red"}, "y")
-            assert [materials[label - 1] for label in mesh.labels] == expected
-
-
-def test_without_a_material_a_mesh_is_inserted_with_its_own_parts(grounded):
-    front = grounded.facts["dataset.objects"]["side"]
-    other = {**front, "objects": [{**front["objects"][0], "materials": {"lower": "unseen"}}]}
-    mesh, materials, _ = SolvedSet(changed(grounded, "dataset.objects", {"front": other, "side": other})).mesh(
-        "egg", None, "y"
-    )
-    assert [materials[label - 1] for label in mesh.labels] == ["red", "brass"]
-
-
-def test_a_sun_below_the_ground_is_refused(grounded, tmp_path):
-    with pytest.raises(InputError, match="below the ground") as error:
-        drawn(grounded, tmp_path / "out", schema.Insert(**FRONT, sun=schema.AssumedSun((0.3, -1.0, 0.4), 0.7)))
-    assert error.value.key == "sun.direction"
-
-
 def test_the_photo_stays_where_no_object_is(made, tmp_path):
     drawn(made, tmp_path / "out", schema.Resynthesis(photos=["front"], samples=4))
     masks = read_exr(made["masks"] / "front.exr")
@@ -174,14 +145,3 @@ def test_nothing_is_put_on_a_ground_that_is_seen_from_below(made, tmp_path):
     below = {**made.facts["dataset.ground"], "front": above}
     with pytest.raises(InputError, match="'front' was taken from below"):
         drawn(changed(made, "dataset.ground", below), tmp_path / "out", schema.Insert(photos=["front"], samples=1))
-
-
-def test_a_mesh_without_height_or_that_is_not_there_is_refused(grounded, tmp_path):
-    with pytest.raises(InputError, match="there is no mesh 'egf'") as error:
-        drawn(grounded, tmp_path / "none", schema.Insert(photos=["front"], mesh="egf", samples=1))
-    assert error.value.cure == "did you mean 'egg'?" and error.value.key == "mesh"
-    (tmp_path / "flat.obj").write_text("v 0 0 0\nv 1 0 0\nv 1 0 1\nv 0 0 1\nf 1 2 3 4\n")
-    recipe = schema.Insert(photos=["front"], mesh="flat.obj", samples=1)
-    with pytest.raises(InputError, match="'flat.obj' has no height") as error:
-        drawn(grounded, tmp_path / "out", recipe, **{"flat.obj": tmp_path / "flat.obj"})
-    assert "up: z" in error.value.cure

@@ -1,7 +1,6 @@
 """From photos and masks alone: cameras, a hull, bodies of revolution, and the poses of all, through `masks`, `shapes` and `align`."""
 
 import json
-import logging
 
 import numpy as np
 import pytest
@@ -9,7 +8,6 @@ import yaml
 
 from factorlib.dataset.read import read_dataset
 from factorlib.dataset.slices import dataset_slice
-from factorlib.errors import InputError
 from factorlib.generate.folder import write_labels, write_photo
 from factorlib.generate.shapes import SHAPES
 from factorlib.geometry.camera import Camera
@@ -75,19 +73,3 @@ def test_photos_and_masks_of_a_body_at_rest_give_cameras_a_hull_and_normals(tmp_
         both = (true.label > 0) & (found["label"] > 0)
         normal = np.stack([found[f"normal.{a}"] for a in "xyz"], axis=-1)
         assert np.median(np.rad2deg(np.arccos(np.clip(np.sum(normal * true.normal, axis=-1)[both], -1, 1)))) < 12
-
-
-def test_a_shape_that_does_not_look_like_its_outlines_is_named_and_one_that_cannot_be_made_is_refused(tmp_path, caplog):
-    label = np.zeros((120, 160), int)
-    label[20:100, 30:45] = label[85:100, 30:130] = 1
-    photos = {name: (label * 0.3, label, [{"name": "thing", "mesh": "thing"}], 200.0) for name in ("one",)}
-    with caplog.at_level(logging.WARNING):
-        run(
-            write_set(tmp_path / "set", {"thing": {"primitive": "cylinder", "material": "red"}}, photos),
-            tmp_path / "out",
-            [],
-        )
-    assert "mesh 'thing': the cylinder covers its outlines by" in caplog.text
-    with pytest.raises(InputError, match="a hull needs two") as error:
-        run(write_set(tmp_path / "hull", {"thing": {"hull": True, "material": "red"}}, photos), tmp_path / "none", [])
-    assert error.value.key == "meshes.thing.hull" and "sfm: true" in error.value.cure

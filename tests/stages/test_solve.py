@@ -202,26 +202,6 @@ def test_a_start_gives_the_answer_from_nothing_and_is_said(tmp_path, linked, sol
         assert rough == pytest.approx(expected, abs=0.03)
 
 
-def exposure_of_b(folder, true: float, exif: tuple[float, float | None]) -> float:
-    """What is solved of two photos in one light, b `true` times as bright as a, whose EXIF says `exif`."""
-    photos, light = {}, {name: {"illumination": "room", "world_from_camera": None} for name in "ab"}
-    for name, unit, exposure in zip("ab", (1.0, true), exif):
-        part = observations(name, [0, 1, 2], 1, 8, unit)
-        photos[name] = msgspec.structs.replace(part, illuminations=("room",), exposures=(exposure,))
-    exposures = read_json(run(folder, photos, light=light, cells=40, observations=300) / "exposures.json")
-    assert exposures["a"][0] == 1
-    return exposures["b"][0]
-
-
-def test_photos_of_one_light_start_from_what_exif_says_of_their_exposures(tmp_path, caplog):
-    """Six stops apart; and one that was made brighter later, of which EXIF is only where the solve starts."""
-    known = exposure_of_b(tmp_path / "known", 64.0, (0.5, 30.0))
-    assert known == pytest.approx(64, rel=0.1)
-    assert abs(np.log(exposure_of_b(tmp_path / "unknown", 64.0, (0.5, None)) / 64)) > abs(np.log(known / 64))
-    assert exposure_of_b(tmp_path / "brighter", 1.2, (1.0, 3.0)) == pytest.approx(1.2, rel=0.02)
-    assert "photo 'b': by its EXIF its exposure is 3 of its light's first photo" in caplog.text
-
-
 def test_a_known_material_is_written_as_it_was_given_and_said(tmp_path, linked, caplog):
     known = {"materials": {"green": {"diffuse": [0.2, 0.4, 0.25], "specular": None, "roughness": 0.4}}}
     out = table(run(tmp_path, linked, known=known))
