@@ -21,11 +21,11 @@ from factorlib.errors import InputError
 from factorlib.export.blender import write_scene_json, write_script
 from factorlib.export.environment import mitsuba_map
 from factorlib.export.gltf import variant_name, write_glb, write_suns
-from factorlib.export.loss import write_losses
 from factorlib.export.materials import headroom_factor, table_in_gauge
 from factorlib.export.materialx import materialx
 from factorlib.export.mesh_files import MeshFiles
 from factorlib.export.mitsuba import write_scene
+from factorlib.export.other_renderers import write_losses
 from factorlib.export.scene import ALL_BOUNCES, DIRECT, ExposedMap, Scene, Sun, suns_of
 from factorlib.export.usd import SUFFIX, write_usd_scene
 from factorlib.images.exr import LAT_LONG, read_rgb_exr, write_hdr, write_rgb_exr

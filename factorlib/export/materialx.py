@@ -9,7 +9,7 @@ where the index of refraction is very large, and which leaves 1 − specular for
     specular = max k_s,  specular_color = k_s / max k_s,  specular_IOR = 10⁴,  base_color = k_d / (1 − max k_s)
 
 Different from what was solved: MaterialX's renderers shadow with the height-correlated Smith term and give back the
-energy of multiple scattering (`factorlib.export.viewers`, measured by `factorlib.export.loss`).
+energy of multiple scattering (measured by `factorlib.export.other_renderers`).
 """
 
 import xml.etree.ElementTree as ET

@@ -54,14 +54,6 @@ def block(name: str, light: Light, materials: Materials, shown, operator, size: 
     )
 
 
-def square(n: int, operator, seed: int = 0) -> list[Block]:
-    """n random materials in n random lights, each pair a small sphere: problems that differ in size alone."""
-    rng = np.random.default_rng([n, seed] if seed else n)
-    gloss = np.repeat(rng.uniform(0.05, 0.4, n)[:, None], 3, 1)
-    materials = Materials(rng.uniform(0.05, 0.5, (n, 3)), gloss, rng.uniform(0.2, 0.7, n))
-    return [block(f"{i:02d}", random_light(rng, 6), materials, range(n), operator, size=12, seed=i) for i in range(n)]
-
-
 def factor_between(found: Materials, true: Materials) -> np.ndarray:
     """The factor per channel that takes `found` reflectances to `true` ones."""
     return (true.diffuse + true.specular).sum(0) / (found.diffuse + found.specular).sum(0)

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 import torch
 
-from factorlib.export import loss, viewers
-from factorlib.export.viewers import MODELS, Angles, distribution
+from factorlib.export import other_renderers
+from factorlib.export.other_renderers import MODELS, Angles, distribution
 from factorlib.light.lobes import Lobes
 from factorlib.reflection import reflection_operator
 from factorlib.reflection.brdf import ggx, specular
@@ -35,17 +35,19 @@ def brute_force(material: Reflectance, model, no: float) -> np.ndarray:
 @pytest.mark.parametrize("material", [GREY, COLOURED], ids=["grey", "coloured"])
 def test_radiance_in_the_sky_is_the_integral_of_the_brdf(name, material):
     for no in (0.3, 0.9):
-        found = loss.in_sky(material, MODELS[name], np.array([no]))[0]
+        found = other_renderers.in_sky(material, MODELS[name], np.array([no]))[0]
         np.testing.assert_allclose(found, brute_force(material, MODELS[name], no), rtol=5e-3)
 
 
 def test_the_solved_model_is_the_operators():
     angles, _ = hemisphere(0.7, 40)
-    mine = distribution(GREY.alpha, angles.nh) * viewers.separable(GREY.alpha, angles) * angles.ni
+    mine = distribution(GREY.alpha, angles.nh) * other_renderers.separable(GREY.alpha, angles) * angles.ni
     alpha, ni, no, nh = (torch.tensor(a, dtype=torch.float64) for a in (GREY.alpha, angles.ni, angles.no, angles.nh))
     np.testing.assert_allclose(mine, specular(alpha, ni, no, nh), rtol=1e-9)
     np.testing.assert_allclose(distribution(GREY.alpha, angles.nh), ggx(alpha, nh), rtol=1e-9)
     sky = Lobes(np.array([[0.0, 0.0, 1.0]]), np.array([1e-6]), np.ones((1, 3)))
     normal, view = (torch.tensor([v], dtype=torch.float64) for v in ([0.0, 0.0, 1.0], [np.sqrt(1 - 0.49), 0.0, 0.7]))
     expected = reflection_operator("reference")(sky, GREY, normal, view)
-    np.testing.assert_allclose(loss.in_sky(GREY, viewers.solved, np.array([0.7])), expected, rtol=2e-3)
+    np.testing.assert_allclose(
+        other_renderers.in_sky(GREY, other_renderers.solved, np.array([0.7])), expected, rtol=2e-3
+    )

@@ -169,16 +169,6 @@ def test_an_edit_that_keeps_size_and_time_is_noticed(real):
 # ── parameters ───────────────────────────────────────────────────────────────────────────────────────────────────────
 
 
-def another(value):
-    if isinstance(value, bool):
-        return not value
-    if isinstance(value, str):
-        return f"{value}_"
-    if isinstance(value, list | tuple):
-        return [another(value[0]), *value[1:]]
-    return value + 1 if isinstance(value, int) else value * 1.5 + 0.001
-
-
 # ── what else counts ─────────────────────────────────────────────────────────────────────────────────────────────────
 
 

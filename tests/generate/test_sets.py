@@ -42,11 +42,6 @@ def small(tmp_path_factory) -> Path:
 
 
 @pytest.fixture(scope="module")
-def chairs(tmp_path_factory) -> Path:
-    return made_chairs(tmp_path_factory.mktemp("sets") / "chairs", names=("terrace", "kitchen"))
-
-
-@pytest.fixture(scope="module")
 def exact(tmp_path_factory) -> Path:
     return made_chairs(tmp_path_factory.mktemp("sets") / "exact", exact=True)
 
