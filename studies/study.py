@@ -141,7 +141,7 @@ def full_matrix(materials: int, lights: int) -> list[Entry]:
 class Setting(msgspec.Struct, frozen=True):
     """One value of what a study varies.
 
-    name:   a word of a-z, 0-9 and -, part of file names;  label: as figures and tables write it
+    name:   a word of a-z, 0-9 and -, part of file names;  label: as tables write it
     case:   the case of a seed; what the study's first step is handed
     """
 
@@ -229,7 +229,7 @@ class Study(msgspec.Struct, frozen=True, kw_only=True):
     """What is varied and measured.
 
     paper:     the paper's conclusion;  varied: what is varied, with its unit
-    measures:  those of the figure and the page, the first the main one
+    measures:  those of the page, the first the main one
     claims:    what a full study tests
     steps:     stages of studies/run/pipeline.yaml in `studies.steps`, the last one scores
     lights:    lights that each of its worlds has beyond those of the scale

@@ -3,11 +3,9 @@
 import math
 
 import msgspec
-import numpy as np
 import pytest
 
-from factorlib.images.exr import read_exr, write_exr
-from factorlib.jsonfile import read_json, write_json
+from factorlib.jsonfile import read_json
 from factorlib.results.metrics import Metrics
 from factorlib.stage import silent
 from stages import evaluate
@@ -58,13 +56,3 @@ def test_without_truth_re_synthesis_remains_and_the_rest_says_why(tmp_path):
     assert found["resynthesis"]["mean"]["none"]["estimate"]["psnr_linear_db"] > 20
     assert found["verdict"]["trust"] == "good"
     assert (tmp_path / "out" / "verdict.txt").read_text().startswith("good: relit pictures are expected to reach ")
-
-
-def test_true_normals_in_the_photos_own_pixels_are_averaged_as_the_photo_was(tmp_path):
-    inputs = make_artifacts(Made(tmp_path / "in", seen={"only": ["red"]}))
-    plain, facts = evaluated(inputs, tmp_path / "plain")["normals"], read_json(inputs["masks"] / "photos.json")
-    facts["only"] |= {"factor": 3, "original_size": [3 * n for n in facts["only"]["original_size"]]}
-    file = inputs.file("truth/only_normal.exr")
-    write_exr(file, {name: np.repeat(np.repeat(pixels, 3, 0), 3, 1) for name, pixels in read_exr(file).items()})
-    write_json(inputs["masks"] / "photos.json", facts)
-    assert evaluated(inputs, tmp_path / "out")["normals"] == plain and set(plain) == {"only"}

@@ -11,7 +11,7 @@ from factorlib.images.exr import read_rgb_exr
 from factorlib.meshes.ply import submesh
 from factorlib.meshes.read import read_mesh
 from factorlib.results.lobes import read_lobes
-from factorlib.results.materials import Reflectance, read_materials
+from factorlib.results.materials import Reflectance
 from tests.export import made_export
 
 ROWS = 256
@@ -112,39 +112,6 @@ def test_vertices_stand_where_the_pose_puts_them(pxr, exported, photo):
         np.testing.assert_allclose(normals, part.normals, atol=1e-6)
         np.testing.assert_array_equal(np.array(found.GetFaceVertexIndicesAttr().Get()).reshape(-1, 3), part.faces)
         assert set(found.GetFaceVertexCountsAttr().Get()) == {3} and found.GetNormalsInterpolation() == "vertex"
-
-
-@pytest.mark.parametrize("photo", PHOTOS)
-def test_camera_sees_points_in_the_pixels_of_the_photo(pxr, exported, photo):
-    from pxr import Gf, UsdGeom, UsdRender
-
-    stage, camera = opened(exported, photo), made_export.CAMERAS[photo]
-    settings = UsdRender.Settings.GetStageRenderSettings(stage)
-    width, height = settings.GetResolutionAttr().Get()
-    assert (width, height) == (camera.width, camera.height)
-    (target,) = settings.GetCameraRel().GetTargets()
-    frustum = UsdGeom.Camera(stage.GetPrimAtPath(target)).GetCamera().frustum
-    seen = frustum.ComputeViewMatrix() * frustum.ComputeProjectionMatrix()
-    for point in np.random.default_rng(0).uniform([-1, -1, 2], [1, 1, 6], (20, 3)):
-        x, y, _ = seen.Transform(Gf.Vec3d(*(YUP_FROM_CAMERA @ point).tolist()))
-        np.testing.assert_allclose([(1 + x) / 2 * width, (1 - y) / 2 * height], camera.project(point), atol=1e-4)
-
-
-@pytest.mark.parametrize("photo", PHOTOS)
-def test_meshes_are_bound_to_the_exported_materials(pxr, exported, photo):
-    from pxr import UsdGeom, UsdShade
-
-    table = read_materials(exported[1] / "materials.json").materials
-    stage = opened(exported, photo)
-    meshes = [prim for prim in stage.Traverse() if prim.IsA(UsdGeom.Mesh)]
-    assert {prim.GetName() for prim in meshes} == {"front": {"red"}, "side": {"red", "brass"}}[photo]
-    for prim in meshes:
-        bound, _ = UsdShade.MaterialBindingAPI(prim).ComputeBoundMaterial()
-        assert bound.GetPrim().GetDisplayName() == prim.GetDisplayName() == prim.GetName()
-        shader, _, _ = bound.ComputeSurfaceSource()
-        assert shader.GetIdAttr().Get() == "UsdPreviewSurface"
-        for key, value in shader_inputs(table[prim.GetName()]).items():
-            np.testing.assert_allclose(np.array(shader.GetInput(key).Get()), value, rtol=1e-6)
 
 
 @pytest.mark.parametrize("photo", PHOTOS)

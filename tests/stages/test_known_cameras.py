@@ -101,12 +101,6 @@ def test_where_only_the_camera_is_known_the_pose_is_searched(tmp_path):
     assert normal_error_deg(CASTER, CAMERA, POSE, CAMERA, pose) < 1
 
 
-def test_what_dataset_yaml_says_of_the_camera_wins(tmp_path):
-    camera = aligned(scene(tmp_path / "set", photo={"camera": {"focal_px": 310.0}}))["camera"]
-    assert (camera["focal_px"], camera["focal_source"]) == (310.0, "dataset")
-    assert camera["principal_point"] == list(CAMERA.centre)
-
-
 def test_a_known_pose_that_does_not_fit_is_doubted_with_its_own_cure_and_kept(tmp_path, caplog):
     with caplog.at_level(logging.WARNING, "factorlib.align"):
         obj = aligned(scene(tmp_path / "set", mesh=blob()))["objects"]["chair"]

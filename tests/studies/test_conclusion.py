@@ -1,4 +1,4 @@
-"""A conclusion stands only where seeds leave no doubt; numbers here are made up.  Tables, figures and pages of it."""
+"""A conclusion stands only where seeds leave no doubt; numbers here are made up.  Tables and pages of it."""
 
 import json
 
