@@ -18,8 +18,6 @@ from factorlib.align.trust import doubts, mirrored_score, normal_stderr_deg, tru
 from factorlib.errors import InputError
 from factorlib.geometry.camera import angle_between
 from factorlib.geometry.raster import Caster, rasterise
-from factorlib.meshes.read import CREASE_DEG, usable
-from factorlib.meshes.soup import Soup, no_normals
 from tests.align.scenes import ball, blob, chair, dumbbell, mesh_of, normal_error_deg, photo_of, true_silhouette
 
 QUICK = Search(views=160, rolls=16, keep=(20, 8, 4, 2))  # for what does not need the full search
@@ -79,32 +77,6 @@ def test_labels_settle_what_the_shape_cannot():
     found, error = searched(dumbbell((1, 2)), 10)
     other, _ = searched(dumbbell((1, 2)), 10, given=Caster(dumbbell((2, 1))), **SMALL)
     assert error < 2 and found.score > 0.97 and angle_between(found.state.rotation, other.state.rotation) > 60
-
-
-def untidy(vertices, faces):
-    """z up, in millimetres, far off; some faces turned over, some missing; slivers of one point, of two, and of a line."""
-    faces = np.delete(faces, np.s_[5 : len(faces) : 40], axis=0)
-    faces[::3] = faces[::3, ::-1]
-    vertices, n = np.vstack([vertices, vertices[0] + [[0.1, 0, 0], [0.2, 0, 0]]]), len(vertices)
-    faces = np.vstack([faces, [[0, 0, 0], [0, 1, 0], [0, n, n + 1]]])
-    return 1000 * vertices @ np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]]) + (4e6, -1e6, 2e6), faces
-
-
-def torn(vertices, faces):
-    """Fins inside the body make edges of three faces, and no face shares a vertex with another."""
-    a, b, _ = faces[::50].T
-    fins = np.stack([a, b, np.full(len(a), len(vertices))], axis=1)
-    vertices = np.vstack([vertices, vertices.mean(axis=0)])
-    return vertices[np.vstack([faces, fins])].reshape(-1, 3), np.arange(3 * (len(faces) + len(fins))).reshape(-1, 3)
-
-
-@pytest.mark.parametrize("how", [untidy, torn])
-def test_a_damaged_or_strange_mesh_shows_the_same_normals(how):
-    mesh = blob()
-    vertices, faces = how(mesh.vertices.copy(), mesh.faces.astype(np.int64))
-    soup = Soup(vertices, faces, np.zeros(len(faces), int), [("all",)], no_normals(len(faces)))
-    error, reasons, _ = answered(mesh, given=Caster(usable(soup, np.ones(len(faces), np.int16), CREASE_DEG, "test")))
-    assert error < 2 and not reasons
 
 
 def test_a_sphere_is_believed_though_its_turn_is_unknown():

@@ -11,7 +11,7 @@ from factorlib.geometry.camera import angle_between
 from factorlib.shapes.hull import agreement
 from factorlib.shapes.motion import LEAST_AGREEMENT, cameras_by_motion
 from factorlib.shapes.primitive import unit
-from studies.scenes.outlines import looking_from, outline, views_of
+from tests.shapes.outlines import looking_from, outline, views_of
 
 BLOB = SHAPES["blob"]()
 POSES = [looking_from(20 + 15 * (k % 2), 18.0 * k) for k in range(5)]

@@ -12,7 +12,7 @@ from factorlib.shapes.hull import surface_nets, visual_hull
 from factorlib.shapes.lathe import body_of_revolution
 from factorlib.shapes.outline import Triangles
 from factorlib.shapes.primitive import primitive, unit
-from studies.scenes.outlines import looking_from, outline
+from tests.shapes.outlines import looking_from, outline
 
 AROUND = [
     looking_from(elevation, 30 * k) for k, elevation in enumerate([10, 20, -10, 30, 50, 0, 15, -25, 40, 5, -40, 25])

@@ -15,7 +15,7 @@ from factorlib.geometry.raster import rasterise
 from factorlib.images.exr import read_exr
 from factorlib.stage import Inputs
 from stages import align, masks, shapes
-from studies.scenes.outlines import looking_from, views_of
+from tests.shapes.outlines import looking_from, views_of
 
 AROUND = [looking_from(20 + 15 * (k % 2), 18.0 * k) for k in range(8)]
 
