@@ -5,6 +5,7 @@ Room ends by a limit on the size of files, which needs no right: the system then
 
 import ast
 import contextlib
+import errno
 import re
 import resource
 
@@ -104,6 +105,13 @@ def test_a_file_that_finds_no_room_is_an_error_is_not_there_and_leaves_whole_wha
         with largest_file(size // 2), pytest.raises(OSError):
             write(path)
         assert path.read_bytes() == b"old" and list(tmp_path.iterdir()) == [path]
+
+
+def test_a_quota_and_a_full_disk_in_a_librarys_words_are_the_users_to_mend(tmp_path):
+    said = RuntimeError("a library: I/O error: No space left on device (os error 28)")
+    assert "the disk is full" in disk_error(said, tmp_path).found
+    assert "quota is used up" in disk_error(OSError(errno.EDQUOT, "Disk quota exceeded"), tmp_path).found
+    assert disk_error(RuntimeError("another"), tmp_path) is None
 
 
 # calls that write to a path, and who may: the writers themselves, what is no result, and logs of processes
