@@ -22,7 +22,7 @@ from factorlib.runner.display import plain_streams, printable
 from factorlib.runner.project import LIBRARY, PIPELINE, Project, photo_sets
 from factorlib.runner.stop import heed_stops
 
-SHIPPED = "share/factorlib"  # in the prefix that the package is installed in: data-files of pyproject.toml
+SHIPPED = "share/factorlib"  # relative to the prefix of the installation: data-files of pyproject.toml
 # errors of the system that the user can fix
 NOT_OURS = {errno.EACCES, errno.EPERM, errno.EROFS, errno.ELOOP, errno.ENAMETOOLONG}
 

@@ -97,7 +97,7 @@ def new_dataset(target: Path, photos: Path, masks: Path | None, meshes: Path | N
         raise InputError(fault, file=photos, key="PHOTOS", cure="name their folder")
     missing: list[str] = []
     of_masks = _files(masks, (".png", ".json"), "MASKS", deep=True) if masks is not None else []
-    of_meshes = _files(meshes, None, "MESHES", deep=True) if meshes is not None else []  # with .mtl, buffers
+    of_meshes = _files(meshes, None, "MESHES", deep=True) if meshes is not None else []  # including .mtl and buffers
     materials, of_photos, silhouettes = _masks(masks, of_masks, list(named), missing) if masks else ([], {}, {})
     entries = _meshes(meshes, of_meshes, materials, missing) if meshes else {}
     words = [(word, mesh) for mesh, entry in entries.items() for word in {mesh, *entry.get("parts", ())}]

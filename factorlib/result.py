@@ -375,7 +375,9 @@ class Drawn(dict[str, bytes]):
         kind = name[-3:]
         data = self[name]
         if kind == "png":  # a photo at full size, reduced for the notebook
-            shown, memory, kind = Image.open(BytesIO(data)).convert("RGB"), BytesIO(), "jpeg"
+            shown = Image.open(BytesIO(data)).convert("RGB")
+            memory = BytesIO()
+            kind = "jpeg"
             shown.thumbnail((SHOWN, SHOWN))
             shown.save(memory, "JPEG", quality=90)
             data = memory.getvalue()

@@ -34,7 +34,9 @@ class Validation:
     """The files of one dataset, each checked once."""
 
     def __init__(self, dataset: Dataset):
-        self.dataset, self.spec, self.file = dataset, dataset.spec, dataset.folder.joinpath
+        self.dataset = dataset
+        self.spec = dataset.spec
+        self.file = dataset.folder.joinpath
         self._done: set[str] = set()
         self._parts: dict[str, list[tuple[str, ...]] | InputError] = {}
 

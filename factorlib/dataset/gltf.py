@@ -157,6 +157,7 @@ def read_header(file: Path, key: str | None = None, most_bytes: int = MOST_BYTES
     """
 
     def refused(fault: str, cure: str) -> InputError:
+        """Return an InputError about the file."""
         return InputError(fault, file=file, key=key, cure=cure)
 
     size = check_plain(file, WHAT, key, most_bytes)

@@ -94,6 +94,7 @@ def _others(error: InputError, places: list[str]) -> list[InputError]:
     """Return the faults that are neither open places nor consequences of them."""
 
     def follows(fault: InputError) -> bool:
+        """Return True if a fault is an open place or follows from one."""
         unnamed = "materials[0]" in places and fault.found.startswith("unknown material")
         return unnamed or any(_within(place, fault.key) or _within(fault.key, place) for place in places)
 

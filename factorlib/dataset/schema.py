@@ -322,7 +322,7 @@ class PhotoSlice(msgspec.Struct, frozen=True):
     focal_px: float | None
     illumination: str
     objects: list[ObjectMask]
-    camera: Camera | None = None  # where its lens distorts
+    camera: Camera | None = None
 
 
 class ObjectsSlice(msgspec.Struct, frozen=True):

@@ -96,7 +96,8 @@ def texel_weights(
         weight: weight of each term
     """
     # pyramid level whose texels have the solid angle, as a real number; `share` interpolates between two levels
-    finest, last = 4 * np.pi / SIDE**2, SIDE.bit_length() - 1
+    finest = 4 * np.pi / SIDE**2
+    last = SIDE.bit_length() - 1
     level = np.clip(0.5 * np.log2(np.maximum(solid_angle, 1e-12) / finest), 0, last)
     below = np.minimum(level.astype(int), last - 1)
     row, column = _texel(direction)
@@ -193,7 +194,8 @@ def _visible_normals(cos_o: Float[np.ndarray, "n 1"], alpha: float) -> Float[np.
     # view in the stretched space, where the distribution is a hemisphere
     stretched = np.stack([alpha * np.sqrt(1 - cos_o**2), cos_o], axis=-1)
     sin, cos = np.moveaxis(stretched / np.linalg.norm(stretched, axis=-1, keepdims=True), -1, 0)
-    across, along = np.broadcast_arrays(radius * np.cos(phi), cos_o)[0], radius * np.sin(phi)
+    across = np.broadcast_arrays(radius * np.cos(phi), cos_o)[0]
+    along = radius * np.sin(phi)
     lift = 0.5 * (1 + cos)
     along = (1 - lift) * np.sqrt(1 - across**2) + lift * along
     up = np.sqrt(np.maximum(1 - across**2 - along**2, 0))

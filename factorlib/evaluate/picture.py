@@ -73,8 +73,10 @@ def ssim_map(a: Picture, b: Picture, mask: Mask) -> Float[np.ndarray, "h w"]:
     total = np.maximum(_blurred(inside), 1e-12)
 
     def mean(values: np.ndarray) -> np.ndarray:
+        """Return Gaussian-weighted local means over the mask."""
         return _blurred(values * inside) / total
 
+    # SSIM = (2 μa μb + C1)(2 cov + C2) / ((μa² + μb² + C1)(var a + var b + C2)), from local moments
     a, b = a.astype(np.float32), b.astype(np.float32)
     mean_a, mean_b = mean(a), mean(b)
     var_a, var_b = mean(a * a) - mean_a**2, mean(b * b) - mean_b**2
@@ -105,6 +107,7 @@ def picture_errors(
     ssim = ssim_map(shown[0], shown[1], union)
 
     def error(region: Mask) -> PictureError:
+        """Return the errors inside one region."""
         psnr_linear = psnr(estimate[region], truth[region], white)
         dssim = round(float(np.clip((1 - ssim[region].mean()) / 2, 0, 1)), 9)
         return PictureError(psnr_linear, psnr(shown[0][region], shown[1][region], 1.0), dssim)

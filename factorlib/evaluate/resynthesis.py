@@ -130,6 +130,7 @@ def _photo_errors(shot: Shot, materials: list[str], factor: dict[str, Float[np.n
     found = {g: _scored(shot.resynthesis * factor[g], shot, regions) for g in GAUGES}
 
     def scores(region: str) -> dict[str, ScoredPicture]:
+        """Return the scores of a region in each gauge."""
         return {g: ScoredPicture(found[g][region], null[region]) for g in GAUGES}
 
     return PhotoErrors(

@@ -65,7 +65,8 @@ def _add_nodes(document: ET.Element, prefix: str, material: Reflectance) -> None
 
 def _add_standard(document: ET.Element, prefix: str, material: Reflectance) -> None:
     brightest = max(material.specular)
-    base, tint = np.array(material.diffuse) / (1 - brightest), np.array(material.specular) / (brightest or 1)
+    base = np.array(material.diffuse) / (1 - brightest)
+    tint = np.array(material.specular) / (brightest or 1)
     numbers = {"specular": brightest, "specular_roughness": material.roughness, "specular_IOR": NO_FRESNEL}
     colours = {"base_color": base, "specular_color": tint}
     _add(document, "standard_surface", f"{prefix}_surface", "surfaceshader", base=1.0, **colours, **numbers)

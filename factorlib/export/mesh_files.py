@@ -37,7 +37,9 @@ class MeshFiles:
         crease_deg: float,
         solved: Mapping[str, Reflectance],
     ):
-        self.scenes, self.materials, self.solved = scenes, materials, solved
+        self.scenes = scenes
+        self.materials = materials
+        self.solved = solved
         own = read_surface(inputs.folders.get("surface"))
         self.read = MeshesOnce(inputs.mesh, materials, crease_deg, own.displacements, own.log_factors)
         self._stems: dict[tuple, str] = {}  # file names up to the material, relative to the scenes

@@ -49,7 +49,7 @@ FIT_SAMPLES = 16
 GREY = 0.3  # default diffuse reflectance of the ground
 DARKEST = 0.02  # least diffuse reflectance of the ground
 BRIGHTEST = 0.85  # largest diffuse reflectance of the ground
-LUMINANCE = np.array([0.2126, 0.7152, 0.0722])  # of linear Rec. 709
+LUMINANCE = np.array([0.2126, 0.7152, 0.0722])  # weights of linear Rec. 709
 HAIR = 1e-4  # separation of surfaces that must not touch, in object sizes
 NEAR = 2.0  # radius in which shadows are compared, in object heights
 RIM = 2  # pixels beside the masks that the comparison of shadows leaves out
@@ -180,7 +180,7 @@ def inserted(
         return rendered({**light, **there, **entries}, camera, samples, seed, ALL_BOUNCES, True, guides)
 
     rays = scene.camera.rays() @ YUP_FROM_CAMERA
-    points = spot.plane.hit(rays.reshape(-1, 3)).reshape(rays.shape)  # of the ground; NaN above the horizon
+    points = spot.plane.hit(rays.reshape(-1, 3)).reshape(rays.shape)  # points of the ground; NaN above the horizon
     distance = np.nan_to_num(np.linalg.norm(points - spot.point, axis=-1) / (RADIUS * spot.height), nan=np.inf)
     # fade: 1 near the spot, smoothly to 0 at the rim of the disc; 1 above the horizon, where only objects are seen
     t = np.clip((1 - np.where(np.isinf(distance), 0, distance)) / (1 - FADE), 0, 1)

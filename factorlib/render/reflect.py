@@ -39,7 +39,8 @@ class Reflector:
         self.operator = operator
         self.curvature = curvature
         self.lobes = lobes.take(lobes.weight.max(axis=1) > 0)
-        self.axis, self.weight = self._tensor(self.lobes.axis), self._tensor(self.lobes.weight)
+        self.axis = self._tensor(self.lobes.axis)
+        self.weight = self._tensor(self.lobes.weight)
         self.sharpness = self._tensor(self.lobes.sharpness)
 
     def __call__(
@@ -90,7 +91,9 @@ class Reflector:
         of_material = material.diffuse, material.specular, material.roughness
         kd, ks, roughness = (torch.tensor(of, dtype=self.operator.dtype) for of in of_material)
         # cosines n·o per point, n·z and o·z per point and lobe; shares of each lobe that a point receives
-        no, nz, oz = (normals * views).sum(-1), (normals @ self.axis.T).clamp(-1, 1), (views @ self.axis.T).clamp(-1, 1)
+        no = (normals * views).sum(-1)
+        nz = (normals @ self.axis.T).clamp(-1, 1)
+        oz = (views @ self.axis.T).clamp(-1, 1)
         shares = [1.0, 1.0] if visibility is None else self._seen(visibility, normals, views, float(roughness))
         if place is not None and self.curvature > 0:
             nz, oz, larger = met_from(place, normals, views, self.axis, self.curvature)

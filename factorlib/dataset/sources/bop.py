@@ -13,7 +13,8 @@ from factorlib.dataset.schema import Number, Pose, Vec3
 from factorlib.dataset.sources.shot import Shot, colmap_camera, read_source
 
 KEY = "cameras.bop"
-CAMERAS, POSES = "scene_camera.json", "scene_gt.json"
+CAMERAS = "scene_camera.json"
+POSES = "scene_gt.json"
 IDS = "it is not the id of an image: ids are whole numbers, of 18 digits at most"
 ImageId = Annotated[str, msgspec.Meta(pattern=r"^[0-9]{1,18}\Z", description=IDS)]
 Nine = tuple[Number, Number, Number, Number, Number, Number, Number, Number, Number]

@@ -104,7 +104,7 @@ def pinhole(camera: pycolmap.Camera, key: str, refuse: Refusal) -> tuple[float, 
     pixels = [[camera.width * i / (GRID - 1), camera.height * j / (GRID - 1)] for i in range(GRID) for j in range(GRID)]
     places = pixels - camera.calibration_matrix()[:2, 2]  # an array, as pycolmap's are
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore", RuntimeWarning)  # of pixels without a ray: the refusal below says so
+        warnings.simplefilter("ignore", RuntimeWarning)  # for pixels without a ray, which are rejected below
         # least-squares focal length of pixel offset over slope, and the largest residual
         slopes = camera.cam_from_img(pixels)
         focal = float((slopes * places).sum() / (slopes * slopes).sum())
