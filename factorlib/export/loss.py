@@ -1,10 +1,10 @@
-"""What is lost on the way to other programs: the difference that a ball of a material shows there, in three lights.
+"""Losses of exported materials: the difference in radiance of a ball, in three lights, against the solved model.
 
-Ball       of radius 1, seen from far away in PIXELS × PIXELS; pixels where n·o is under LEAST_COSINE are left out.
-Lights     a sky of the same radiance from everywhere; a lamp above the viewer's left shoulder; a lamp behind the ball, to the right, whose
-           light grazes it, where shadowing and Fresnel differ most.  White, without shadows.
-Difference |shown − solved| / max(solved, 0.001), per channel; in the sky a white Lambertian ball sends 1.  "mean" and "worst" are over
-           all lit pixels, channels and lights.
+Ball        Radius 1, seen from far away in PIXELS × PIXELS; pixels with n·o under LEAST_COSINE are left out.
+Lights      A sky of constant radiance; a lamp above the viewer's left shoulder; a lamp behind the ball, to the right.
+            The last one grazes the ball, where shadowing and Fresnel differ most.  White, without shadows.
+Difference  |shown − solved| / max(solved, 0.001), per channel; a white Lambertian ball in the sky has radiance 1.
+            "mean" and "worst" are over all lit pixels, channels and lights.
 """
 
 from collections.abc import Mapping
@@ -20,14 +20,17 @@ from factorlib.geometry.sphere import ball_normals
 from factorlib.jsonfile import write_json
 from factorlib.results.materials import Reflectance
 
-PIXELS, LEAST_COSINE, FLOOR = 48, 0.1, 1e-3
-LEAST_ROUGHNESS = 1e-3**0.5  # mirrors are taken at this roughness
+PIXELS = 48  # width and height of the ball's picture
+LEAST_COSINE = 0.1  # least n·o of a pixel
+FLOOR = 1e-3  # least denominator of a relative difference
+LEAST_ROUGHNESS = 1e-3**0.5  # roughness used for mirrors
 LAMPS = {"lamp": (-1.0, 1.0, 1.5), "grazing lamp": (1.0, 0.3, -0.6)}  # x right, y up, z toward the viewer
-SKY_NODES, SKY_SAMPLES = 33, 1024
+SKY_NODES = 33
+SKY_SAMPLES = 1024
 
 
 class Loss(msgspec.Struct, frozen=True):
-    """Relative differences."""
+    """Mean and largest relative difference."""
 
     mean: float
     worst: float
@@ -39,7 +42,10 @@ def write_losses(path: str | Path, materials: Mapping[str, Reflectance]) -> None
 
 
 def losses(material: Reflectance) -> dict[str, Loss]:
-    """Return the loss of each of `viewers.MODELS` against the model of the solve, rounded to 5 digits; a black material loses nothing."""
+    """Return the loss of each of `viewers.MODELS` against the solved model, rounded to 5 digits.
+
+    The losses of a black material are 0.
+    """
     material = msgspec.structs.replace(material, roughness=max(material.roughness, LEAST_ROUGHNESS))
     filed = {name: with_roughness_of_file(material) if name == "usd" else material for name in MODELS}
     true = np.concatenate(ball(material, solved))
@@ -52,7 +58,7 @@ def _loss(shown: Float[np.ndarray, "n 3"], true: Float[np.ndarray, "n 3"]) -> Lo
 
 
 def ball(material: Reflectance, model: Model) -> list[Float[np.ndarray, "n 3"]]:
-    """Radiance of the ball's pixels in each light: sky of radiance 1, lamps of irradiance π."""
+    """Return the radiance of the ball's pixels in each light: sky of radiance 1, lamps of irradiance π."""
     normals = ball_normals(PIXELS)[0]
     normals = normals[normals[:, 2] >= LEAST_COSINE]
     nodes = np.linspace(LEAST_COSINE, 1.0, SKY_NODES)
@@ -64,8 +70,16 @@ def ball(material: Reflectance, model: Model) -> list[Float[np.ndarray, "n 3"]]:
 def in_lamp(
     material: Reflectance, model: Model, normals: Float[np.ndarray, "n 3"], lamp: Float[np.ndarray, "3"]
 ) -> Float[np.ndarray, "n 3"]:
-    """f · n·i · π for a lamp far away in the direction `lamp`."""
-    view, light = np.array([0.0, 0.0, 1.0]), lamp / np.linalg.norm(lamp)
+    """Return f · n·i · π, the radiance in the light of a distant lamp.
+
+    Args:
+        material: the reflectance
+        model: the reflection model
+        normals: unit normals; x right, y up, z toward the viewer
+        lamp: direction to the lamp, of any length
+    """
+    view = np.array([0.0, 0.0, 1.0])
+    light = lamp / np.linalg.norm(lamp)
     half = (view + light) / np.linalg.norm(view + light)
     ni = (normals @ light).clip(0)
     angles = Angles(ni, normals[:, 2], (normals @ half).clip(0), np.full(len(normals), view @ half))
@@ -74,9 +88,17 @@ def in_lamp(
 
 
 def in_sky(material: Reflectance, model: Model, no: Float[np.ndarray, " n"]) -> Float[np.ndarray, "n 3"]:
-    """∫ f n·i di by n·o: the specular part over directions spread by the GGX, the diffuse part over ones spread by n·i."""
+    """Integrate f n·i over the hemisphere, in a sky of radiance 1.
+
+    Args:
+        material: the reflectance
+        model: the reflection model
+        no: cosines n·o
+    """
+    # specular part, by importance sampling of the GGX distribution
     angles, weight = mirrored(material.alpha, no, SKY_SAMPLES)
     specular = (weight[..., None] * model(material, angles).lobe).mean(axis=1)
+    # diffuse part, by cosine-weighted sampling
     square, phi = spread(SKY_SAMPLES)
     ni = np.broadcast_to(np.sqrt(square), (len(no), square.size))
     no = np.broadcast_to(no[:, None], ni.shape)
