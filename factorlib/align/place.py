@@ -235,6 +235,7 @@ def _focal_of_given(objects: Sequence[ObjectToPlace], camera: Camera) -> Camera:
     fixed = [(t.caster, t.pose, target_of(t.silhouette, t.caster.mesh.labels, 200)) for t in shown]
 
     def at(log_focal: float) -> Camera:
+        """Return the camera with the focal length exp(log_focal)."""
         return msgspec.structs.replace(camera, focal=float(np.exp(log_focal)))
 
     def misfit(log_focal: float) -> float:

@@ -89,6 +89,7 @@ def _write(set_: ModuleType, out: Path, seed: int, lights: Path | None, paramete
             task = bar.add_task(f"{out}", total=1)
 
             def report(done: float, total: float, text: str) -> None:
+                """Update the progress bar."""
                 bar.update(task, completed=done, total=total, description=text)
 
             set_.generate(fresh, seed, maps, parameters, report)

@@ -66,6 +66,7 @@ def blob() -> Mesh:
     """Return a smooth body without any symmetry: a ball with broad bumps of several heights."""
 
     def radius(direction: Float[np.ndarray, "*n 3"]) -> Float[np.ndarray, "*n"]:
+        """Return the distance of the surface from the origin in each direction."""
         size = np.full(direction.shape[:-1], 0.42)
         for axis, height, sharpness in BUMPS:
             axis = np.array(axis) / np.linalg.norm(axis)

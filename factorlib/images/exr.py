@@ -53,6 +53,7 @@ def encoded(name: str | Path, spec: oiio.ImageSpec, pixels: np.ndarray) -> bytes
     """
 
     def encode(memory: str) -> None:
+        """Write the image to the path `memory`, a file in memory."""
         output = oiio.ImageOutput.create(str(name))
         if output is None:
             raise OSError(f"{name}: cannot be written: {oiio.geterror()}")

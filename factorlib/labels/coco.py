@@ -197,7 +197,8 @@ def _shapes(text: msgspec.Raw, shape: tuple[int, int], path: str | Path, key: st
             corners = np.clip(corners, 0, limit)
             longer = float(np.abs(np.diff(corners, axis=0, append=corners[:1])).max(axis=1).sum())
             if longer > LONGEST * sum(shape):
-                fault, cure = f"its outline is {longer:.3g} pixels long", "draw it again, with fewer corners"
+                fault = f"its outline is {longer:.3g} pixels long"
+                cure = "draw it again, with fewer corners"
         if fault:
             raise InputError(fault, file=path, key=f"{key}[{index}]", cure=cure)
         polygons.append(corners.ravel().tolist())

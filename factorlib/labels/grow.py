@@ -19,7 +19,7 @@ BINS = 32  # number of bins per channel of a label's histogram, which is smoothe
 FLOOR = 1e-7  # probability of a colour that a label does not have
 PRIOR = 0.05  # γ: rate of stopping at a colour, relative to a step to a pixel of the same colour
 GUESSED = 0.1  # weight of the first guess's colours beside those of strokes, which may be on a highlight only
-CROSSING = 1e-3  # rate of crossing the strongest edge, likewise
+CROSSING = 1e-3  # rate of crossing the strongest edge, relative to the same step
 BESIDE = 0.05  # margin around the box that is included, in units of its longer side
 
 

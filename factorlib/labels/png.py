@@ -45,7 +45,8 @@ def read_values(path: str | Path, key: str, size: tuple[int, int] | None = None)
         depth, colour_type = stream.read(26)[24:26]
     fault = None
     if depth == 16 and colour_type not in (_GREY, _PALETTE):  # Pillow keeps only the upper byte
-        fault, cure = "has several channels of 16 bits", "save labels in one channel of 8 bits"
+        fault = "has several channels of 16 bits"
+        cure = "save labels in one channel of 8 bits"
     elif values.ndim == 3:
         alpha = values[..., -1] if values.shape[-1] in (2, 4) else None
         colours = values if alpha is None else values[..., :-1]
@@ -54,7 +55,8 @@ def read_values(path: str | Path, key: str, size: tuple[int, int] | None = None)
             fault = f"is a colour picture (one pixel is {tuple(colours[coloured][0].tolist())})"
             cure = "save labels in one channel: 0 background, k for the k-th material, 255 leave out"
         elif alpha is not None and (alpha != np.iinfo(alpha.dtype).max).any():
-            fault, cure = "has transparent pixels", "save it without alpha: 0 is background"
+            fault = "has transparent pixels"
+            cure = "save it without alpha: 0 is background"
         values = colours[..., 0]
     if fault:
         raise InputError(fault, file=path, key=key, cure=cure)

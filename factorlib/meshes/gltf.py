@@ -50,7 +50,7 @@ def read_gltf(path: Path, limits: Limits) -> Soup:
     return _joined([place for place, size in zip(places, sizes) if size[1]], _Buffers(header, path, limits))
 
 
-# ── which triangles there are, and where ─────────────────────────────────────────────────────────────────────────────
+# ── scene graph ──────────────────────────────────────────────────────────────────────────────────────────────────────
 
 
 def _placed(header: Header) -> list[Placed]:
@@ -131,7 +131,7 @@ def _size(primitive: Primitive, header: Header, path: Path) -> tuple[int, int]:
     return vertices, corners // 3 if primitive.mode == TRIANGLES else max(corners - 2, 0)
 
 
-# ── what they are ────────────────────────────────────────────────────────────────────────────────────────────────────
+# ── buffers and triangles ────────────────────────────────────────────────────────────────────────────────────────────
 
 
 class _Buffers:

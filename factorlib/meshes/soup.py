@@ -98,6 +98,7 @@ def check(soup: Soup, file: str | Path) -> Soup:
     """
 
     def refuse(fault: str, cure: str) -> NoReturn:
+        """Raise an InputError for this file."""
         raise InputError(fault, file=file, cure=cure)
 
     if len(soup.faces) == 0:

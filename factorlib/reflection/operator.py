@@ -96,6 +96,7 @@ class Operator:
         return Response(*(torch.cat([getattr(part, field) for part in parts]) for field in Response.__struct_fields__))
 
     def _response(self, roughness: Tensor, sharpness: Tensor, no: Tensor, nz: Tensor, oz: Tensor) -> Response:
+        """Compute `response` of one chunk by automatic differentiation."""
         with torch.enable_grad():
             given = (roughness, sharpness.log(), columns(no), nz, oz)
             r, log_sharpness, views, nz, oz = (t.detach().expand(nz.shape).clone().requires_grad_() for t in given)

@@ -41,7 +41,7 @@ from factorlib.reflection.operator import Operator, columns
 
 INPUTS = {"diffuse": 7, "specular": 11}  # beside k · w
 SHARPNESS = (0.05, 1e4)  # range that `factorlib.generate.lobe_spheres` renders
-ROUGHNESS = (0.09, 1.0)  # likewise
+ROUGHNESS = (0.09, 1.0)  # range that `factorlib.generate.lobe_spheres` renders
 Vector = tuple[Tensor, ...]  # three components
 SOFTENED = 1e-5  # added under roots, whose derivatives are unbounded otherwise
 
@@ -80,6 +80,7 @@ class PaperNetwork(Operator):
         return self._reflected("specular", sharpness, specular_inputs(normal, half, axis, sharpness, roughness))
 
     def _reflected(self, part: str, sharpness: Tensor, inputs: Tensor) -> Tensor:
+        """Return the lobe's integral times the exponential of the network's output."""
         return lobe_integral(sharpness) * torch.exp(correction(self.layers[part], inputs, sharpness.clamp(*SHARPNESS)))
 
 

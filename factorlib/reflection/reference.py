@@ -187,6 +187,7 @@ def about_lobe(nodes: int, alpha: Tensor, sharpness: Tensor, no: Tensor, nz: Ten
     full = torch.where(above, zero, b.minimum(reach)), torch.where(above, a, zero + math.pi).minimum(reach)
 
     def integrand(theta: Tensor, cos_phi: Tensor, sin_phi: Tensor) -> Tensor:
+        """Return SG(i) D(h) G1(n·i) sin θ at polar angle θ and azimuth φ."""
         cos, sin = torch.cos(theta), torch.sin(theta)
         ni = nz * cos + sz * sin * cos_phi
         oi = oz * cos + sin * (ox * cos_phi + oy * sin_phi)
@@ -229,6 +230,7 @@ def about_half_vector(nodes: int, alpha: Tensor, sharpness: Tensor, no: Tensor, 
     y_least, y_a, y_b = (torch.asinh(t / alpha) for t in (least, (math.pi / 2 - tilt) / 2, (math.pi / 2 + tilt) / 2))
 
     def integrand(y: Tensor, cos_phi: Tensor, sin_phi: Tensor) -> Tensor:
+        """Return SG(i) D(h) G1(n·i) 4(o·h) sin θ dθ/dy at θ = α sinh y and azimuth φ."""
         theta = alpha * torch.sinh(y)
         cos, sin = torch.cos(theta), torch.sin(theta)
         oh = no * cos + so * sin * cos_phi

@@ -130,10 +130,12 @@ class Tape:
 
 
 def _c(argument: int | float) -> str:
+    """Format an argument as C: a variable for an operation, a literal for a number."""
     return f"v{argument}" if isinstance(argument, int) else f"{argument!r}f"
 
 
 def _op(name: str, swap: bool = False) -> Callable[[Any, Any], Any]:
+    """Return a method of `Value` that records operation `name`, with its operands swapped if `swap`."""
     return lambda self, other: self.tape.apply(name, *((other, self) if swap else (self, other)))
 
 

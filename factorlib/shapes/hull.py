@@ -81,7 +81,8 @@ def visual_hull(
         high = origin + step * (inside.max(axis=0) + 1)
     vertices, faces = surface_nets(unambiguous(np.pad(field, 1, constant_values=-step)))
     vertices, faces = _largest(vertices, faces)
-    mesh, smoothed = trimesh.Trimesh(origin + step * (vertices - 1), faces, process=False), []
+    mesh = trimesh.Trimesh(origin + step * (vertices - 1), faces, process=False)
+    smoothed = []
     # smooth in stages; take the last stage that keeps the overlap
     for more in np.diff(SMOOTHINGS, prepend=0):
         trimesh.smoothing.filter_taubin(mesh, iterations=int(more))
@@ -122,12 +123,14 @@ def _about(outlines: Sequence[Outline]) -> tuple[Float[np.ndarray, "3"], float]:
     right = np.zeros(3)
     places = []
     for outline in outlines:
-        rotation, centre = outline.pose.rotation, -outline.pose.rotation.T @ outline.pose.translation
+        rotation = outline.pose.rotation
+        centre = -outline.pose.rotation.T @ outline.pose.translation
         ray = rotation.T @ outline.camera.rays_through(outline.middle[None])[0]
         ray /= np.linalg.norm(ray)
         # normal equations of the point nearest to all rays: Σ (I − d dᵀ)(x − c) = 0
         across = np.eye(3) - np.outer(ray, ray)
-        left, right = left + across, right + across @ centre
+        left = left + across
+        right = right + across @ centre
         places.append((centre, ray))
     if np.linalg.cond(left) > 1e8:
         cure = "a hull needs photos from different sides"
