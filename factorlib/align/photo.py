@@ -1,4 +1,4 @@
-"""A photo as the stages `masks` and `align` left it: its channels, its camera, and its objects where they were found."""
+"""Photo with the results of the stages `masks` and `align`: channels, camera, and objects with their poses."""
 
 from pathlib import Path
 
@@ -18,7 +18,7 @@ from factorlib.results.poses import SEARCHED, ObjectEntry, PhotoPoses
 
 
 class AlignedObject(msgspec.Struct, frozen=True):
-    """An object of a photo: the name of its mesh, the mesh as its file has it, its mask, and its entry of poses.json."""
+    """Object of a photo: name of its mesh, mesh as in its file, mask, and entry of poses.json."""
 
     mesh_name: str
     mesh: Mesh
@@ -26,17 +26,21 @@ class AlignedObject(msgspec.Struct, frozen=True):
     entry: ObjectEntry
 
     def caster(self) -> Caster:
-        """The mesh with the proportions that its pose was found with."""
+        """Return the ray caster of the mesh with the proportions of its pose."""
         return Caster(scaled(self.mesh, self.entry.scale))
 
     @property
     def moves(self) -> bool:
-        """Whether its pose was searched; one that was given may not move."""
+        """True if the pose was searched; a given pose may not move."""
         return self.entry.source in SEARCHED
 
 
 class AlignedPhoto(msgspec.Struct, frozen=True):
-    """prior: what was known of the focal length before it was found;  objects: by name, in the order of dataset.yaml."""
+    """Photo with its camera and objects.
+
+    prior     prior of the focal length, before alignment
+    objects   objects by name, in the order of dataset.yaml
+    """
 
     channels: Channels
     camera: Camera
@@ -45,10 +49,23 @@ class AlignedPhoto(msgspec.Struct, frozen=True):
 
 
 def aligned_photo(masks: Path, photo: str, slice_: ObjectsSlice, poses: PhotoPoses, meshes: MeshesOnce) -> AlignedPhoto:
-    """The photo by the files of the stage `masks` in the folder `masks`, and its entry of poses.json."""
-    channels, facts = read_exr(masks / f"{photo}.exr"), read_photo_facts(masks / f"{photo}.json")
+    """Read a photo with its masks, camera and objects.
+
+    Args:
+        masks: Folder with the results of the stage `masks`.
+        photo: Name of the photo.
+        slice_: Entries of dataset.yaml that the photo needs.
+        poses: The photo's entry of poses.json.
+        meshes: Reader of meshes.
+
+    Returns:
+        The photo.
+    """
+    channels = read_exr(masks / f"{photo}.exr")
+    facts = read_photo_facts(masks / f"{photo}.json")
     height, width = channels["label"].shape
-    camera, objects = poses.camera.camera(width, height), {}
+    camera = poses.camera.camera(width, height)
+    objects = {}
     source = poses.camera.focal_source
     before = {"exif": facts.focal_px, "estimated": None}.get(source, camera.focal)
     prior = focal_prior(before, source, width, height)
