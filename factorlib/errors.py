@@ -11,8 +11,7 @@ from difflib import get_close_matches
 from functools import partial
 from os import PathLike
 
-MOST_LISTED = 30  # words or faults that an error lists
-MOST_COMPARED = 3000  # known words that are compared with an unknown one
+MOST_LISTED, MOST_COMPARED = 30, 3000
 NEAR = 0.8  # `difflib` ratio from which a word with another first letter is a suggestion
 
 
@@ -43,8 +42,7 @@ class InputErrors(InputError):
     """Several faults found at once; file, key and cure are those of the first."""
 
     def __init__(self, faults: list[InputError]):
-        self.faults = faults
-        first = faults[0]
+        self.faults, first = faults, faults[0]
         super().__init__(first.found, file=first.file, key=first.key, cure=first.cure)
 
     def __str__(self) -> str:
@@ -73,8 +71,7 @@ def did_you_mean(word: str, known: Iterable[object]) -> str:
     "known are: 'source', 'target'"
     """
     known = sorted(str(k) for k in known)
-    word = word.strip("[]'\"")
-    compared = known[:MOST_COMPARED]
+    word, compared = word.strip("[]'\""), known[:MOST_COMPARED]
     alike = [k for k in compared if k[:1] == word[:1]]
     near = get_close_matches(word, compared, 1, NEAR) or get_close_matches(word, alike, 1)
     more = f", … ({len(known)} in all)" if len(known) > MOST_LISTED else ""

@@ -89,8 +89,7 @@ def _fault(error: BaseException, what: str) -> str:
         return f"not readable as {what}: it does not fit into memory"
     if isinstance(error, OSError) and error.errno is not None and error.strerror:
         return f"cannot be read ({error.strerror})"
-    words = one_line(str(error))
-    says_little = (LookupError, TypeError, AttributeError, AssertionError)
+    words, says_little = one_line(str(error)), (LookupError, TypeError, AttributeError, AssertionError)
     if not words or isinstance(error, says_little):
         words = ": ".join(filter(None, (type(error).__name__, words)))
     return f"not readable as {what} ({words})"

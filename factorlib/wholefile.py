@@ -63,8 +63,7 @@ def append_text(path: Path, text: str) -> None:
     """Append text to a file, whole or not at all, and create its folder if needed."""
     path.parent.mkdir(parents=True, exist_ok=True)
     with open(path, "ab", buffering=0) as stream:
-        before = stream.seek(0, os.SEEK_END)
-        data = text.encode("utf-8")
+        before, data = stream.seek(0, os.SEEK_END), text.encode("utf-8")
         try:
             while data:
                 data = data[stream.write(data) :]

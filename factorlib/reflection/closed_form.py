@@ -54,15 +54,13 @@ def diffuse_of_moments(lam: Tensor, mean: Tensor, along: Tensor, across: Tensor,
         A tensor of the arguments' broadcast shape.
     """
     c = nz.clamp(-1, 1)
-    m = mean * c
-    deviation = torch.sqrt(across * (1 - c * c) + along * c * c + 1e-30)
+    m, deviation = mean * c, torch.sqrt(across * (1 - c * c) + along * c * c + 1e-30)
     # E[max(n·i, 0)] of a normal distribution, (1)
     u = m / deviation
     inside = 0.5 * m * torch.special.erfc(u * -math.sqrt(0.5))
     normal = inside + deviation * torch.exp(-0.5 * u * u) / math.sqrt(2 * math.pi)
     # the even remainder: Chebyshev polynomials of x = 2t̄ − 1, then Horner's scheme in c²
-    x = 2 * mean - 1
-    square = c * c
+    x, square = 2 * mean - 1, c * c
     chebyshev: list[Tensor | float] = [1.0, x]
     for _ in range(len(REMAINDER) - 2):
         chebyshev.append(2 * x * chebyshev[-1] - chebyshev[-2])

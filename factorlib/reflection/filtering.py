@@ -48,8 +48,7 @@ GAUSSIANS = (
 TAIL = 200.0  # T of (1): the mixture's far tail is 1/((1 + x)² + T²)
 LOGISTIC = 1.702  # the logistic law of this scale is within 0.01 of the normal one
 LEAST_HALF = 2e-4  # least |o + z|²
-LEAST_HN = 1e-3  # least (n·h)²: h is perpendicular to n at the unit circle
-LARGEST_P = 0.998  # greatest |p*|²
+LEAST_HN, LARGEST_P = 1e-3, 0.998
 SHARE = 2.0  # curvature of −log D at its peak over k, as assumed by the blend
 WIDE = 0.03  # V of a lobe is at most 1/WIDE, because p ends at the unit circle
 RIDGE = 1e-4  # keeps JᵀJ regular where h is perpendicular to o
@@ -114,8 +113,7 @@ def filtered(
     Returns:
         Tensors of the arguments' common shape.
     """
-    alpha = alpha.clamp(LEAST_ALPHA, 1)
-    no = no.clamp(LEAST_COSINE, 1)
+    alpha, no = alpha.clamp(LEAST_ALPHA, 1), no.clamp(LEAST_COSINE, 1)
     # components of o and z, and k of D
     so = torch.sqrt((1 - no * no).clamp_min(1e-8))
     zx = (oz - no * nz) / so

@@ -59,8 +59,7 @@ class Fused:
         self.made_of = part, layers
         self.function = compiled(part, layers.weights[0].shape[1], layers.weights[0].shape[0], len(layers.weights) - 1)
         first = layers.weights[0] * layers.scale
-        weights = [first, *layers.weights[1:]]
-        biases = [layers.biases[0] - first @ layers.mean, *layers.biases[1:]]
+        weights, biases = [first, *layers.weights[1:]], [layers.biases[0] - first @ layers.mean, *layers.biases[1:]]
         tables = weights, biases, [w.T for w in weights[:-1]]
         self.tables = [torch.cat([t.detach().float().reshape(-1) for t in table]).contiguous() for table in tables]
 
@@ -116,8 +115,7 @@ def recorded(part: str, tape: Tape) -> tuple[Any, tuple]:
         inputs = [tape.input(name) for name in ("lam", "mean", "along", "across", "nz")]
         return diffuse_of_moments(*inputs), diffuse_columns(*inputs)
     inputs = [tape.input(name) for name in ("alpha", "sharpness", "lam", "along", "no", "nz", "oz")]
-    form = filtered(*inputs)
-    (alpha, *_, no, nz, oz) = inputs
+    form, (alpha, *_, no, nz, oz) = filtered(*inputs), inputs
     return form.value, specular_columns(alpha, no, nz, oz, form)
 
 
@@ -191,8 +189,7 @@ def compiled(part: str, features: int, width: int, depth: int) -> Callable:
     library.parent.mkdir(parents=True, exist_ok=True)
     if not library.exists():
         with tempfile.TemporaryDirectory(dir=library.parent) as folder:
-            made = Path(folder) / "kernel.so"
-            code = Path(folder) / "kernel.c"
+            made, code = Path(folder) / "kernel.so", Path(folder) / "kernel.c"
             code.write_text(text)
             command = [*compiler, *FLAGS.split(), "-o", str(made), str(code), "-lm"]
             subprocess.run(command, check=True, capture_output=True, text=True)

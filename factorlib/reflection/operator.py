@@ -125,11 +125,8 @@ class Operator:
         given = lobes.axis, lobes.sharpness, lobes.weight, material.diffuse, material.specular, material.roughness
         tensors = (torch.as_tensor(t).to(self.dtype) for t in (*given, normals, views))
         axis, sharpness, weight, kd, ks, roughness, normals, views = tensors
-        no = (normals * views).sum(-1)
-        nz = normals @ axis.T
-        oz = views @ axis.T
-        diffuse = self.diffuse(sharpness, nz)
-        specular = self.specular(roughness, sharpness, no, nz, oz)
+        no, nz, oz = (normals * views).sum(-1), normals @ axis.T, views @ axis.T
+        diffuse, specular = self.diffuse(sharpness, nz), self.specular(roughness, sharpness, no, nz, oz)
         radiance = kd * (diffuse @ weight) + ks * (specular @ weight)
         return torch.where(no[:, None] <= 0, torch.zeros_like(radiance), radiance)  # NaN passes: it is not ≤ 0
 

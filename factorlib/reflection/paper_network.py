@@ -40,8 +40,7 @@ from factorlib.reflection.network import SHIPPED, correction, read_layers
 from factorlib.reflection.operator import Operator, columns
 
 INPUTS = {"diffuse": 7, "specular": 11}  # beside k · w
-SHARPNESS = (0.05, 1e4)  # range that `factorlib.generate.lobe_spheres` renders
-ROUGHNESS = (0.09, 1.0)  # range that `factorlib.generate.lobe_spheres` renders
+SHARPNESS, ROUGHNESS = (0.05, 1e4), (0.09, 1.0)
 Vector = tuple[Tensor, ...]  # three components
 SOFTENED = 1e-5  # added under roots, whose derivatives are unbounded otherwise
 
@@ -58,8 +57,7 @@ class PaperNetwork(Operator):
         """Return the diffuse reflection of unit lobes, λ clamped to SHARPNESS; see `Operator.diffuse`."""
         sharpness, nz = torch.broadcast_tensors(sharpness, nz.clamp(-1, 1))
         zero = torch.zeros_like(nz)
-        normal = (zero, zero, zero - 1)
-        axis = (soft_root(1 - nz * nz), zero, -nz)
+        normal, axis = (zero, zero, zero - 1), (soft_root(1 - nz * nz), zero, -nz)
         return self._reflected("diffuse", sharpness, diffuse_inputs(normal, axis, sharpness))
 
     def specular(self, roughness: Tensor, sharpness: Tensor, no: Tensor, nz: Tensor, oz: Tensor) -> Tensor:
@@ -98,8 +96,7 @@ def frame_of_cosines(no: Tensor, nz: Tensor, oz: Tensor) -> tuple[Vector, ...]:
         Normal, half vector and axis, three components each.
     """
     no, nz, oz = (t.clamp(-1, 1) for t in (no, nz, oz))
-    zero = torch.zeros_like(no)
-    across = soft_root(1 - no * no)
+    zero, across = torch.zeros_like(no), soft_root(1 - no * no)
     along = ((nz - no * oz) / across).clamp(-1, 1)
     axis = along, soft_root(1 - oz * oz - along * along), -oz
     return (across, zero, -no), (no * across, zero, -no * no), axis

@@ -85,8 +85,7 @@ def converged(alpha: Tensor, sharpness: Tensor, no: Tensor, nz: Tensor, oz: Tens
         A tensor [b], differentiable in every input.
     """
     scalars = alpha, sharpness, no, nz, oz
-    value = torch.zeros_like(alpha)
-    level = torch.zeros(alpha.shape, dtype=torch.long)
+    value, level = torch.zeros_like(alpha), torch.zeros(alpha.shape, dtype=torch.long)
     with torch.no_grad():
         floor = FLOOR * lobe_integral(sharpness)
         todo = torch.arange(len(alpha))
@@ -123,9 +122,7 @@ def specular_quadrature(nodes: int, *scalars: Tensor) -> Float[Tensor, " b"]:
     values = []
     rows = max(1, NODES_AT_ONCE // (2 * nodes * nodes))
     for alpha, sharpness, no, nz, oz in zip(*(t.split(rows) for t in scalars), strict=True):
-        no = no.clamp(LEAST_COSINE, 1)
-        nz = nz.clamp(-1, 1)
-        oz = oz.clamp(-1, 1)
+        no, nz, oz = no.clamp(LEAST_COSINE, 1), nz.clamp(-1, 1), oz.clamp(-1, 1)
         # about n where D is narrower than the lobe and the lobe reaches D's peak: its axis is near the mirror direction
         deviation = 1 / torch.sqrt(sharpness)
         about_normal = 2 * alpha * torch.sqrt(no) < deviation
@@ -179,18 +176,15 @@ def about_lobe(nodes: int, alpha: Tensor, sharpness: Tensor, no: Tensor, nz: Ten
     oy = root(1 - oz**2 - ox**2)
     # limits a and b of the polar angle between whole circles, arcs and nothing lit, cut at the lobe's reach
     tilt = torch.atan2(sz, nz)
-    a = (math.pi / 2 - tilt).abs()
-    b = math.pi - (math.pi / 2 - tilt).abs()
+    a, b = (math.pi / 2 - tilt).abs(), math.pi - (math.pi / 2 - tilt).abs()
     reach = reach_of(sharpness)
-    above = nz > 0
-    zero = torch.zeros_like(a)
+    above, zero = nz > 0, torch.zeros_like(a)
     full = torch.where(above, zero, b.minimum(reach)), torch.where(above, a, zero + math.pi).minimum(reach)
 
     def integrand(theta: Tensor, cos_phi: Tensor, sin_phi: Tensor) -> Tensor:
         """Return SG(i) D(h) G1(n·i) sin θ at polar angle θ and azimuth φ."""
         cos, sin = torch.cos(theta), torch.sin(theta)
-        ni = nz * cos + sz * sin * cos_phi
-        oi = oz * cos + sin * (ox * cos_phi + oy * sin_phi)
+        ni, oi = nz * cos + sz * sin * cos_phi, oz * cos + sin * (ox * cos_phi + oy * sin_phi)
         nh = (no + ni) / torch.sqrt((2 + 2 * oi).clamp_min(1e-12))
         lobe = torch.exp(-2 * sharpness * torch.sin(theta / 2) ** 2)
         return lobe * sin * ggx(alpha, nh.clamp(max=1)) * smith(alpha, ni)
@@ -233,8 +227,7 @@ def about_half_vector(nodes: int, alpha: Tensor, sharpness: Tensor, no: Tensor, 
         """Return SG(i) D(h) G1(n·i) 4(o·h) sin θ dθ/dy at θ = α sinh y and azimuth φ."""
         theta = alpha * torch.sinh(y)
         cos, sin = torch.cos(theta), torch.sin(theta)
-        oh = no * cos + so * sin * cos_phi
-        zh = nz * cos + sin * (zx * cos_phi + zy * sin_phi)
+        oh, zh = no * cos + so * sin * cos_phi, nz * cos + sin * (zx * cos_phi + zy * sin_phi)
         lobe = torch.exp(-sharpness * (1 + oz - 2 * oh * zh))
         return lobe * ggx(alpha, cos) * smith(alpha, 2 * oh * cos - no) * 4 * oh * sin * alpha * torch.cosh(y)
 
@@ -302,8 +295,7 @@ def diffuse_quadrature(sharpness: Tensor, nz: Tensor, nodes: int = 48) -> Tensor
     Returns:
         A tensor [*b].
     """
-    lam = sharpness[..., None]
-    c = nz.clamp(-1, 1)[..., None]
+    lam, c = sharpness[..., None], nz.clamp(-1, 1)[..., None]
     s = root(1 - c**2)
     a = (math.pi / 2 - torch.atan2(s, c)).abs()
     reach = reach_of(lam)
@@ -312,8 +304,7 @@ def diffuse_quadrature(sharpness: Tensor, nz: Tensor, nodes: int = 48) -> Tensor
     total = torch.zeros((), dtype=c.dtype)
     # pieces of θ: whole circles (or none), arcs between a and π − a, none (or whole circles)
     for first, last in ((low, a), (a, math.pi - a), (math.pi - a, low + math.pi)):
-        first = first.minimum(reach)
-        last = last.minimum(reach)
+        first, last = first.minimum(reach), last.minimum(reach)
         theta = first + (last - first) * torch.sin(math.pi / 2 * x) ** 2
         weight = w * (last - first) * math.pi / 2 * torch.sin(math.pi * x)
         cos, sin = torch.cos(theta), torch.sin(theta)

@@ -115,8 +115,7 @@ class Tape:
         `results` maps C lvalues to values, `inputs` maps names of inputs to C expressions.
         """
         # all operations that the results depend on
-        needed = set()
-        todo = [v.index for v in results.values() if isinstance(v, Value)]
+        needed, todo = set(), [v.index for v in results.values() if isinstance(v, Value)]
         while todo:
             if (index := todo.pop()) not in needed:
                 needed.add(index)
@@ -143,8 +142,7 @@ class Value:
     """Number on a tape; supports the arithmetic and the torch functions that the formulas use."""
 
     def __init__(self, tape: Tape, index: int):
-        self.tape = tape
-        self.index = index
+        self.tape, self.index = tape, index
 
     __add__, __radd__, __sub__, __rsub__ = _op("add"), _op("add", True), _op("sub"), _op("sub", True)
     __mul__, __rmul__, __truediv__, __rtruediv__ = _op("mul"), _op("mul", True), _op("div"), _op("div", True)

@@ -29,8 +29,7 @@ from factorlib.reflection.samples import DiffuseSamples, Samples
 
 POINTS = 40  # number of points of the training curve
 PATIENCE = POINTS // 4
-HARD = 0.02  # samples of this error are drawn twice as often
-REPEATED = 20.0  # the worst samples are drawn this often
+HARD, REPEATED = 0.02, 20.0
 
 
 class Schedule(msgspec.Struct, frozen=True):
@@ -117,16 +116,12 @@ def train(
     Returns:
         The network and the points of its curve.
     """
-    problem = problem.float()
-    held_out = held_out.float()
-    checkpoint = checkpoint or Checkpoint(None)
+    problem, held_out, checkpoint = problem.float(), held_out.float(), checkpoint or Checkpoint(None)
     generator = torch.Generator().manual_seed(schedule.seed)
     layers = initial_layers(problem.features, schedule, generator)
     parameters = [*layers.weights, *layers.biases]
     optimiser = torch.optim.Adam(parameters, lr=schedule.rate, betas=(0.9, 0.99), fused=True)
-    order = torch.empty(0, dtype=torch.long)
-    best = parameters
-    curve = []
+    order, best, curve = torch.empty(0, dtype=torch.long), parameters, []
     # continue from the checkpoint
     if (state := checkpoint.load()) is not None:
         with torch.no_grad():
@@ -134,19 +129,15 @@ def train(
                 parameter.copy_(value)
         optimiser.load_state_dict(state["optimiser"])
         generator.set_state(state["generator"])
-        order = state["order"]
-        best = state["best"]
-        curve = [Step(**point) for point in state["curve"]]
+        order, best, curve = state["order"], state["best"], [Step(**point) for point in state["curve"]]
     # train from point to point of the curve, `stretch` steps apart
     stretch = max(1, schedule.steps // POINTS)
     while len(curve) < POINTS and not is_stuck([point.score() for point in curve]):
-        total = 0.0
-        first = len(curve) * stretch
+        total, first = 0.0, len(curve) * stretch
         for step in range(first, first + stretch):
             if len(order) < schedule.batch:
                 order = hard_ones_often(problem, layers if curve else None, generator)
-            rows = order[: schedule.batch]
-            order = order[schedule.batch :]
+            rows, order = order[: schedule.batch], order[schedule.batch :]
             error = problem.each(itemgetter(rows)).errors(layers)
             # loss: √(e² + 1e-6) + 2e², about |e| but smooth at 0; the square makes single large errors count more
             loss = (torch.sqrt(error * error + 1e-6) + 2 * error * error).mean()
@@ -255,8 +246,7 @@ def pixels_problem(inputs: Float[Tensor, "n f"], sharpness: Tensor, radiance: Fl
     Returns:
         Training data whose formula is the lobe's integral.
     """
-    energy = lobe_integral(sharpness.float())
-    radiance = radiance.float()
+    energy, radiance = lobe_integral(sharpness.float()), radiance.float()
     return Problem(inputs.float(), sharpness.float(), energy, radiance, radiance + energy / 100)
 
 
@@ -274,14 +264,11 @@ def trained_plainly(problem: Problem, schedule: Schedule, report: Callable[[int,
     generator = torch.Generator().manual_seed(schedule.seed)
     layers = initial_layers(problem.features, schedule, generator)
     optimiser = torch.optim.Adam([*layers.weights, *layers.biases], lr=schedule.rate, betas=(0.9, 0.99), fused=True)
-    every = max(1, schedule.steps // 20)
-    total = 0.0
-    order = torch.empty(0, dtype=torch.long)
+    every, total, order = max(1, schedule.steps // 20), 0.0, torch.empty(0, dtype=torch.long)
     for step in range(schedule.steps):
         if len(order) < schedule.batch:
             order = torch.randperm(len(problem.exact), generator=generator)
-        rows = order[: schedule.batch]
-        order = order[schedule.batch :]
+        rows, order = order[: schedule.batch], order[schedule.batch :]
         error = problem.each(itemgetter(rows)).errors(layers)
         total += descended(optimiser, torch.sqrt(error * error + 1e-6).mean(), step, schedule)
         if (step + 1) % every == 0:
