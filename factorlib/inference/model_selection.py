@@ -203,8 +203,7 @@ def distances_chosen(problem: JointProblem, before: Fit, choices: Choices, fit: 
             placed[k] = msgspec.structs.replace(placed[k], curvature=c)
         return fit("distances", sample, start.with_lights(placed), schedule)
 
-    # each fit goes on from the one before: light that comes a little nearer changes a little
-    losses, last = [], before
+    losses, last = [], before  # each fit goes on from the one before
     for c in (0.0, *CURVATURES):
         last = fit_at(dict.fromkeys(asked, c), last)
         losses.append(losses_of(sample, last.point))
@@ -214,8 +213,8 @@ def distances_chosen(problem: JointProblem, before: Fit, choices: Choices, fit: 
     if not curvature:
         return Chosen(before, evidence)
     chosen = fit_at(curvature)
-    curvatures = (dict.fromkeys(curvature, 0.0), curvature)
-    far, there = (losses_of(sample, fit_at(of, chosen, GIVEN).point) for of in curvatures)
+    both = (dict.fromkeys(curvature, 0.0), curvature)
+    far, there = (losses_of(sample, fit_at(one, chosen, GIVEN).point) for one in both)
     for k in curvature:
         given = _evidence_of_light(k, far, there, NEARER_FROM)
         evidence[k] = min(evidence[k], given, key=lambda one: one.margin or 0.0)
