@@ -98,7 +98,7 @@ def main(params: Params, inputs: Inputs, out: Path, progress: Progress) -> None:
 
 
 def _verdict(inputs: Inputs, seen: dict[str, list[str]]) -> Verdict | None:
-    """Return the verdict on the result's reliability; None without an observed material.
+    """Return the verdict on the result's reliability; None without observed materials.
 
     Args:
         inputs: Inputs of the stage.

@@ -110,9 +110,7 @@ def main(params: Params, inputs: Inputs, out: Path, progress: Progress) -> None:
     poses = read_poses(inputs["align"] / "poses.json")
     for photo, light in lights.items():
         progress(next(done), total, f"scene of {photo}")
-        size = oiio.ImageInput.open(
-            str(inputs["align"] / f"{photo}.exr")
-        ).spec()  # size of align's maps, from the header
+        size = oiio.ImageInput.open(str(inputs["align"] / f"{photo}.exr")).spec()  # from the header
         camera = poses[photo].camera.camera(size.width, size.height)
         exposure = np.array(exposures.get(photo, [1.0] * 3))
         camera_from_light = np.eye(3) if light.world_from_camera is None else np.array(light.world_from_camera).T

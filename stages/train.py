@@ -55,7 +55,7 @@ class Params(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """Seed of samples, initial weights and batches."""
 
 
-# ranges of training samples: wider than those of held-out samples, because errors are largest at the edges
+# ranges of training samples: wider than those of held-out samples, so that none of these lies at an edge
 WIDER = {"alpha": (0.008, 1.0), "sharpness": (0.05, 1e4), "least_no": 0.005}
 
 
