@@ -38,7 +38,7 @@ class Params(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     most: Annotated[int, msgspec.Meta(ge=5000)] = 100_000
     """Largest number of a photo's observations.  More are sampled evenly over materials and normals, and weighted."""
     directions: Annotated[int, msgspec.Meta(ge=0, le=4096)] = 512
-    """Number of directions, over the sphere, whose visibility is computed; 0 for none."""
+    """Directions of the sphere whose visibility is computed (their number); 0 for none."""
     cast_points: Annotated[int, msgspec.Meta(ge=100)] = 25_000
     """Number of a photo's observations from which rays are cast; the others take the visibility of neighbours."""
 
