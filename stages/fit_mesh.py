@@ -1,7 +1,8 @@
-"""A mesh that is like the object but for its proportions: factors of its three axes, fitted once per mesh over all photos.
+"""Proportions of meshes: scale factors of each mesh's three axes, fitted to all photos together.
 
-Only where that pays on photos that had no say: see `factorlib.align.proportions`.  Writes meshes.json (factors, evidence) and
-poses.json (poses in the fitted mesh's frame, with its `scale`), which SET="align.poses=build/<dataset>/fit_mesh" uses.
+Factors are used only if they improve held-out photos (`factorlib.align.proportions`).  Writes meshes.json (factors and
+evidence) and poses.json (poses in the fitted mesh's frame, with its `scale`).
+SET="align.poses=build/<dataset>/fit_mesh" uses the latter.
 """
 
 import logging
@@ -26,22 +27,24 @@ from factorlib.results.poses import FILE, PhotoPoses, entry_of, read_poses
 from factorlib.stage import Inputs, Progress
 
 log = logging.getLogger("factorlib.align")
-MARGIN = 0.15  # of the mask's extent, seen around it
+MARGIN = 0.15  # margin around the mask, as a share of its extent
 
 
 class Params(Standards, frozen=True, forbid_unknown_fields=True):
-    """When factors of a mesh's axes are used, and what they are fitted to."""
+    """Parameters of the fit of axis factors, and criteria for their use."""
 
     resolution: Annotated[int, msgspec.Meta(ge=50, le=2000)] = 200
-    """Pixels of a mask's longer side, to which it is scaled."""
+    """Length, in pixels, to which the longer side of a mask is scaled."""
     least_iou: Annotated[float, msgspec.Meta(ge=0, le=1)] = 0.6
-    """Least overlap of mesh and mask at a pose that factors are fitted from."""
+    """Smallest overlap (IoU) of mesh and mask at a pose that factors are fitted from."""
 
 
 def main(params: Params, inputs: Inputs, out: Path, progress: Progress) -> None:
     """Fit the proportions of every mesh, and write meshes.json and poses.json."""
-    poses, sightings = read_poses(inputs["align"] / FILE), {}  # mesh -> (photo, object) -> the object, its sighting
+    poses = read_poses(inputs["align"] / FILE)
+    sightings = {}  # by mesh, then by photo and object: the object and its sighting
     meshes = MeshesOnce(inputs.mesh, inputs.facts["dataset.materials"], CREASE_DEG)
+    # sightings: objects with an estimated pose that overlaps its mask well enough
     for photo in sorted(poses):
         slice_ = msgspec.convert(inputs.facts["dataset.objects"][photo], ObjectsSlice)
         aligned = aligned_photo(inputs["masks"], photo, slice_, poses[photo], meshes)
@@ -75,9 +78,22 @@ def main(params: Params, inputs: Inputs, out: Path, progress: Progress) -> None:
 def placed(
     entry: PhotoPoses, name: str, own: AlignedObject, sighting: Sighting, state: State, factors: np.ndarray
 ) -> PhotoPoses:
-    """The photo's entry of poses.json with an object's pose of the fitted mesh; its runner-up was of another mesh."""
+    """Return the photo's entry of poses.json with an object's pose for the fitted mesh.
+
+    The runner-up is dropped, because it was a pose of the mesh as given.
+
+    Args:
+        entry: The photo's entry as `align` wrote it.
+        name: Name of the object.
+        own: Object, with its mesh as given and its silhouette.
+        sighting: Observation that the factors were fitted to.
+        state: Fitted pose and focal length.
+        factors: Scale factors of the mesh's axes, [3].
+    """
     caster = Caster(scaled(own.mesh, factors))
-    pose, camera, camera_entry = state.pose(caster), state.camera(sighting.camera), entry.camera
+    pose = state.pose(caster)
+    camera = state.camera(sighting.camera)
+    camera_entry = entry.camera
     if sighting.prior.sigma > 0:
         camera_entry = msgspec.structs.replace(camera_entry, focal_px=float(camera.focal))
     iou = silhouette_iou(own.silhouette, rasterise(caster, camera, pose).label)
