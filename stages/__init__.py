@@ -1,1 +1,0 @@
-"""Stages of the pipeline, one module each; `pipeline.yaml` names their inputs."""

@@ -61,9 +61,7 @@ WIDER = {"alpha": (0.008, 1.0), "sharpness": (0.05, 1e4), "least_no": 0.005}
 
 def main(params: Params, inputs: Inputs, out: Path, progress: Progress) -> None:
     """Train the diffuse and the specular network, and write weights, learning curves and accuracy."""
-    threads = torch.get_num_threads()
-    accuracy = {}
-    curves = {}
+    threads, accuracy, curves = torch.get_num_threads(), {}, {}
     torch.set_num_threads(1)  # batches are too small for more, and rounding of sums depends on the number
     try:
         for part, fit in (("diffuse", _diffuse), ("specular", _specular)):
@@ -115,8 +113,7 @@ def _trained(
 
     def report(point: Step) -> None:
         """Report the errors of held-out samples at a step."""
-        median = point.held_out_median_error
-        p95 = point.held_out_p95_error
+        median, p95 = point.held_out_median_error, point.held_out_p95_error
         progress(point.step, schedule.steps, f"{part}: held-out error {median:.2%} (median), {p95:.2%} (p95)")
 
     checkpoint = Checkpoint(inputs.unfinished / f"{part}.pt" if inputs.unfinished else None)
