@@ -1,7 +1,7 @@
 """The command line: `python -m factorlib all|<stage>|plan|why|status|graph|validate|verify|clean|gc --dataset eames`.
 
-It is read by `argparse`, for a run with nothing to do must not wait for a library that reads it more comfortably.  What the
-command line leaves out the environment may say: make passes NAME=value on so, untouched by any shell.
+`argparse` reads it, because a run with nothing to do must not wait for a heavier library.  Environment variables supply
+what the command line omits: make passes NAME=value on this way, untouched by any shell.
 """
 
 from __future__ import annotations
@@ -22,15 +22,15 @@ from factorlib.runner.display import plain_streams, printable
 from factorlib.runner.project import LIBRARY, PIPELINE, Project, photo_sets
 from factorlib.runner.stop import heed_stops
 
-SHIPPED = "share/factorlib"  # in the prefix that the package is installed in: data-files of pyproject.toml
-# What the system refuses to this user.
+SHIPPED = "share/factorlib"  # relative to the prefix of the installation: data-files of pyproject.toml
+# errors of the system that the user can fix
 NOT_OURS = {errno.EACCES, errno.EPERM, errno.EROFS, errno.ELOOP, errno.ENAMETOOLONG}
 
 
 def project() -> Project:
-    """The checkout that FACTORLIB_ROOT names, or this package lies in, or else the current folder lies in.
+    """Return the project: the checkout of FACTORLIB_ROOT, of this package, or of the current folder.
 
-    Without one, the current folder, with the pipeline that came with the package, wherever pip has put that.
+    Without a checkout, it is the current folder with the pipeline that pip installed with the package.
     """
     here = Path.cwd()
     near = next((folder for folder in (LIBRARY, here, *here.parents) if (folder / PIPELINE).is_file()), None)
@@ -51,8 +51,10 @@ def _path(word: str) -> Path:
     return Path(word).expanduser()
 
 
-ON, MANY, FEW = {"action": "store_true"}, {"action": "append"}, {"nargs": "*"}
-OPTIONS = {  # as `ArgumentParser.add_argument` takes them; key: of the environment, where it is not given
+ON = {"action": "store_true"}
+MANY = {"action": "append"}
+FEW = {"nargs": "*"}
+OPTIONS = {  # arguments of `ArgumentParser.add_argument`; `key` is the environment variable with the default
     "dataset": _option("--dataset", "-d", help="its name in data/, or a path to its folder; else DATASET"),
     "set": _option("--set", dest="settings", metavar="X.Y=Z", help="stage.parameter=value; else SET", **MANY),
     "force": _option("--force", help="whatever the store holds, or without asking; as FORCE=1", **ON),
@@ -74,8 +76,13 @@ OPTIONS = {  # as `ArgumentParser.add_argument` takes them; key: of the environm
 
 
 def dataset_of(asked: Namespace, optional: bool = False) -> str | None:
-    """The dataset's name or path: the option's, else the environment's DATASET.  InputError where it is not `optional`."""
-    dataset = os.environ.get("DATASET") if asked.dataset is None else asked.dataset  # an empty one is not none
+    """Return the dataset's name or path, from the option or the environment's DATASET.
+
+    Raises:
+        InputError: There is none, and it is not `optional`.
+    """
+    # An empty name is not a missing one.
+    dataset = os.environ.get("DATASET") if asked.dataset is None else asked.dataset
     if dataset is None and not optional:
         cure = "add DATASET=<a name in data/, or a path to a folder>"
         raise InputError("no dataset is named", key="DATASET", cure=cure)
@@ -83,7 +90,7 @@ def dataset_of(asked: Namespace, optional: bool = False) -> str | None:
 
 
 def switched_on(key: str, option: bool) -> bool:
-    """Return whether an option, or the environment's `key`, is on.  InputError where the latter is neither 0, 1 nor empty."""
+    """Return True if an option, or the environment's `key`, is on; InputError for a value other than 0, 1 and empty."""
     word = os.environ.get(key, "")
     if not option and word not in ("", "0", "1"):
         raise InputError(f"{word!r} is neither 1 nor 0", key=key, cure=f"write {key}=1, or leave it out")
@@ -91,18 +98,18 @@ def switched_on(key: str, option: bool) -> bool:
 
 
 def agreed(force: bool) -> bool:
-    """Return whether to delete what was shown: a terminal is asked, but for --force or FORCE=1."""
+    """Return True to delete what was listed; a terminal is asked unless --force or FORCE=1 is given."""
     asks = not switched_on("FORCE", force) and sys.stdin.isatty()
     return not asks or input("delete them? [y/N] ").strip().lower() in ("y", "yes")
 
 
 def settings_of(asked: Namespace) -> list[str]:
-    """Parameters `stage.name=value` as they were written: the options', else the environment's SET."""
+    """Return parameters `stage.name=value` as written, from the options or the environment's SET."""
     return asked.settings or [os.environ.get("SET", "")]
 
 
 def wish(asked: Namespace, stages: list[str] | None = None) -> verbs.Wish:
-    """Return what is asked for; without `stages` all of them."""
+    """Return the request of the command line; without `stages` it is for all of them."""
     recipes = asked.recipes or list(filter(None, [os.environ.get("RECIPE")]))
     force = switched_on("FORCE", getattr(asked, "force", False))
     return verbs.Wish(dataset_of(asked), stages or None, settings_of(asked), force, recipes)
@@ -118,7 +125,7 @@ def _stage(asked: Namespace) -> int:
 
 
 ASKED = "dataset set force recipe"
-VERBS: dict[str, tuple[str, Callable[[Namespace], int], str]] = {  # in the order of `--help`: options, what it does, help
+VERBS: dict[str, tuple[str, Callable[[Namespace], int], str]] = {  # options, function, help; in the order of `--help`
     "all": (f"{ASKED} strict", lambda a: verbs.make(project(), wish(a), switched_on("STRICT", a.strict)),
             "Run the whole pipeline, as far as anything must run, and make the pictures of named recipes."),
     "stage": (f"name {ASKED}", _stage,
@@ -158,7 +165,10 @@ VERBS: dict[str, tuple[str, Callable[[Namespace], int], str]] = {  # in the orde
 
 
 def run(words: list[str], program: str) -> int:
-    """Return what the verb of the command line returns.  A first word that is neither an option nor a verb is a stage."""
+    """Run the verb of the command line and return its exit code.
+
+    A first word that is neither an option nor a verb is a stage.
+    """
     text = "Any other word is the name of a stage: it is run, and what it needs."
     parser = argparse.ArgumentParser(program, description=text)
     parsers = parser.add_subparsers(title="verbs", metavar="verb", dest="verb", required=True)
@@ -174,17 +184,17 @@ def run(words: list[str], program: str) -> int:
 
 def main() -> NoReturn:
     """Run the verb of the command line; an error of the input ends the program with its message and exit code 1."""
-    sys.stdout.reconfigure(errors="backslashreplace")  # names of files may be anything
+    sys.stdout.reconfigure(errors="backslashreplace")  # File names may contain anything.
     try:
         with plain_streams(), heed_stops():
             logging.basicConfig(format="warning: %(message)s", level=logging.WARNING)
             sys.exit(run(sys.argv[1:], "factorlib" if Path(sys.argv[0]).name == "factorlib" else "python -m factorlib"))
     except InputError as error:
         sys.exit(printable(f"error: {error}"))
-    except BrokenPipeError:  # whoever reads has enough, as `head` does
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # so that the flush at exit says nothing
+    except BrokenPipeError:  # The reader, such as `head`, has closed the pipe.
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # The flush at exit must not fail.
         sys.exit(1)
-    except OSError as error:  # the system's word where a user can mend it; whatever else is a defect
+    except OSError as error:  # A message for errors that the user can fix; anything else is a defect.
         from factorlib.disk import disk_error
 
         known = disk_error(error, project().build)

@@ -1,7 +1,7 @@
-"""What lets a killed computation go on where it was: numbers and tensors in one file, replaced by one rename.
+"""Checkpoints of long computations: numbers and tensors in one file, replaced by one rename.
 
-A computation that goes on must end in the same bytes as one that was never stopped, so its whole state is kept: the
-unknowns, the optimiser's memory, the random generator's state and how far it is.
+A resumed computation must end in the same bytes as an uninterrupted one.  A checkpoint therefore holds the whole state:
+the unknowns, the optimiser's memory, the random generator's state and the progress.
 """
 
 from __future__ import annotations
@@ -20,13 +20,17 @@ log = logging.getLogger("factorlib")
 
 
 class Checkpoint:
-    """path: the file; None keeps nothing (a notebook, a test)."""
+    """A checkpoint file.
+
+    Attributes:
+        path: the file; None saves nothing (a notebook, a test)
+    """
 
     def __init__(self, path: Path | None):
         self.path = path
 
     def load(self) -> dict[str, Any] | None:
-        """Return what was saved last; None where nothing was, or what is there cannot be read."""
+        """Return the last saved state; None if there is none or it cannot be read."""
         if self.path is None or not self.path.exists():
             return None
         try:
@@ -36,7 +40,7 @@ class Checkpoint:
             return None
 
     def save(self, state: dict[str, Any]) -> None:
-        """Keep `state`: tensors, numbers, strings, lists and dictionaries of them."""
+        """Save the state: tensors, numbers, strings, and lists and dictionaries of them."""
         if self.path is not None:
             self.path.parent.mkdir(parents=True, exist_ok=True)
             stream = io.BytesIO()

@@ -1,12 +1,12 @@
-"""Frames, directions and units: every convention of the project, said once.
+"""Frames, directions and units: every convention of the project, defined once.
 
 Camera frame  OpenCV: x right, y down, z forward; pixel centres at 0.5 as in COLMAP.  The viewer stands at −z,
               so the paper's "front" is (0, 0, −1).
-Light frame   the camera frame turned y-up: x right, y up, z toward the viewer (`YUP_FROM_CAMERA`).
-Lat-long map  OpenEXR's "LatLong Environment", shared by Mitsuba's `envmap`: top row +y, the image's centre +z,
+Light frame   The camera frame turned y-up: x right, y up, z toward the viewer (`YUP_FROM_CAMERA`).  Lat-long map
+OpenEXR's "LatLong Environment", shared by Mitsuba's `envmap`: top row +y, the image's centre +z,
               +x a quarter of the width from the left edge; texel (i, j) has its centre at ((i+½)/H, (j+½)/W).
-Transforms    are named for their frames: `cam_from_object` takes object coordinates to camera coordinates.
-Lobe          w · exp(−σ|ω−z|²) of the paper is a spherical Gaussian w · exp(λ(ω·z − 1)) of sharpness λ = 2σ.
+Transforms    Named for their frames: `cam_from_object` takes object coordinates to camera coordinates.
+Lobe          The paper's w · exp(−σ|ω−z|²) is a spherical Gaussian w · exp(λ(ω·z − 1)) of sharpness λ = 2σ.
 Roughness     α = roughness².
 """
 
@@ -19,7 +19,7 @@ YUP_FROM_CAMERA = np.diag([1.0, -1.0, -1.0])  # a rotation by π about x, its ow
 
 
 def lat_long_directions(height: int, width: int) -> Float[np.ndarray, "height width 3"]:
-    """Unit directions of the texel centres of a lat-long map, in the light (y-up) frame.
+    """Return unit directions of the texel centres of a lat-long map, in the light (y-up) frame.
 
     >>> lat_long_directions(2, 4)[0].round(3).tolist()[0]
     [0.5, 0.707, -0.5]
@@ -31,7 +31,7 @@ def lat_long_directions(height: int, width: int) -> Float[np.ndarray, "height wi
 
 
 def lat_long_of_direction(direction: Float[np.ndarray, "*batch 3"]) -> tuple[np.ndarray, np.ndarray]:
-    """Row and column in units of the map's height and width, [0, 1], of unit directions in the light frame.
+    """Return row and column of unit directions in the light frame, as fractions of height and width in [0, 1].
 
     >>> [float(t) for t in lat_long_of_direction(np.array([1.0, 0.0, 0.0]))]
     [0.5, 0.25]
@@ -43,7 +43,7 @@ def lat_long_of_direction(direction: Float[np.ndarray, "*batch 3"]) -> tuple[np.
 
 
 def lat_long_solid_angles(height: int, width: int) -> Float[np.ndarray, " height"]:
-    """Exact solid angle of one texel of each row, steradians; height × width texels sum to 4π.
+    """Return the exact solid angle of one texel of each row, steradians; height × width texels sum to 4π.
 
     >>> round(float(lat_long_solid_angles(8, 16).sum() * 16 / (4 * np.pi)), 12)
     1.0
@@ -53,7 +53,7 @@ def lat_long_solid_angles(height: int, width: int) -> Float[np.ndarray, " height
 
 
 def half_of_normal_and_view(normal: Vectors, view: Vectors) -> Vectors:
-    """The URM's `half` = (2(n·o)n − o + (0,0,−1)) / 2, as in the paper (not of unit length).
+    """Return the URM's `half` = (2(n·o)n − o + (0,0,−1)) / 2, as in the paper (not of unit length).
 
     >>> half_of_normal_and_view(FRONT, FRONT).tolist()
     [0.0, 0.0, -1.0]

@@ -1,4 +1,4 @@
-"""A full disk and a folder that may not be written are the user's to mend: errors that say which folder, and what is free."""
+"""Errors of a full disk or a folder without write permission, for the user to fix: the folder and its free space."""
 
 from __future__ import annotations
 
@@ -19,9 +19,9 @@ ROOM = "make room there, for instance by `make gc`, which deletes results that n
 
 
 def disk_error(error: BaseException, folder: Path) -> InputError | None:
-    """`error` as the user's, where a full disk or a missing right is behind it; None where neither is.
+    """Convert an error that a full disk or a missing permission has caused; None for any other error.
 
-    folder: what was being written to, where the error itself does not say
+    `folder` is the folder being written to, for an error that does not name one.
     """
     behind = [error]
     while (cause := behind[-1].__cause__ or behind[-1].__context__) is not None and cause not in behind:
@@ -30,12 +30,13 @@ def disk_error(error: BaseException, folder: Path) -> InputError | None:
     words = FULL[_code(full)] if full else CLOSED.get(_code(error))
     if words is None:
         return None
-    of, name = full or error, getattr(error, "filename", None)
+    of = full or error
+    name = getattr(error, "filename", None)
     if not full and isinstance(name, str) and os.path.isfile(name) and not os.access(name, os.R_OK):
         return InputError(f"{words}: it may not be read", file=name, cure="give yourself the right to read it")
-    names = (getattr(of, "filename", None), getattr(of, "filename2", None))  # of a copy two, the last is written
+    names = (getattr(of, "filename", None), getattr(of, "filename2", None))  # A copy has two; the last is written.
     paths = [Path(os.path.abspath(os.fsdecode(name))).parent for name in names if isinstance(name, str | bytes)]
-    # as far as they exist; `Path.is_dir` raises where it may not look
+    # nearest existing folders; `Path.is_dir` raises for a folder that it may not read
     folders = [next(p for p in (path, *path.parents) if os.path.isdir(p)) for path in paths or [folder.absolute()]]
     place = folders[-1] if full else next((path for path in folders if not os.access(path, os.W_OK)), folders[0])
     free = f"{shutil.disk_usage(place).free / 1e6:.1f} MB are free"
@@ -46,7 +47,7 @@ def disk_error(error: BaseException, folder: Path) -> InputError | None:
 
 
 def _code(error: BaseException) -> int | None:
-    """What the system said; libraries that have errors of their own repeat its words."""
+    """Return the system's error code, also from the text of errors that libraries raise."""
     if isinstance(error, OSError) and error.errno is not None:
         return error.errno
     return next((code for code in (*FULL, errno.EROFS) if os.strerror(code) in str(error)), None)

@@ -1,7 +1,7 @@
-"""The one error a user can mend.
+"""The error that a user can fix.
 
-Whatever is wrong with a user's files or words is an `InputError`: it says what was found and where, what was
-expected, and how to mend it.  Everything else that is raised is a defect of this project.
+Anything wrong with a user's files or words is an `InputError`.  It states the fault, its place, and the cure.  Every
+other exception is a defect of this project.
 """
 
 from __future__ import annotations
@@ -11,12 +11,12 @@ from difflib import get_close_matches
 from functools import partial
 from os import PathLike
 
-MOST_LISTED, MOST_COMPARED = 30, 3000  # of the words that might have been meant
-NEAR = 0.8  # the ratio of `difflib` from which a word with another first letter is near
+MOST_LISTED, MOST_COMPARED = 30, 3000
+NEAR = 0.8  # `difflib` ratio from which a word with another first letter is a suggestion
 
 
 class InputError(ValueError):
-    """Something in a user's input that the user can mend.
+    """A fault in a user's input that the user can fix.
 
     >>> print(InputError("unknown material 'rde'", file="dataset.yaml", key="photos[0]", cure="did you mean 'red'?"))
     dataset.yaml: photos[0]: unknown material 'rde'
@@ -34,12 +34,12 @@ class InputError(ValueError):
         cure = f"\n  {self.cure}" if self.cure else ""
         return f"{where}{self.found}{cure}"
 
-    def __reduce__(self) -> tuple:  # survives the trip back from a worker process
+    def __reduce__(self) -> tuple:  # for pickling in a worker process
         return partial(InputError, self.found, file=self.file, key=self.key, cure=self.cure), ()
 
 
 class InputErrors(InputError):
-    """Several of them, which were found at once; file, key and cure are those of the first."""
+    """Several faults found at once; file, key and cure are those of the first."""
 
     def __init__(self, faults: list[InputError]):
         self.faults, first = faults, faults[0]
@@ -55,13 +55,13 @@ class InputErrors(InputError):
 
 
 def raise_all(faults: list[InputError]) -> None:
-    """Raise InputError where there is a fault, as one error where there are several."""
+    """Raise the faults, if any, as one InputError."""
     if faults:
         raise faults[0] if len(faults) == 1 else InputErrors(faults)
 
 
 def did_you_mean(word: str, known: Iterable[object]) -> str:
-    """A cure that names the nearest of the `known` words, or all of them.
+    """Return a cure that names the nearest of the `known` words, or all of them.
 
     >>> did_you_mean("soruce", ["source", "target"])
     "did you mean 'source'?"

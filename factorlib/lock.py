@@ -1,6 +1,6 @@
-"""requirements.lock, derived: what pyproject.toml asks for, and what that needs, at the versions that .venv has (`make lock`).
+"""Derivation of requirements.lock: the requirements of pyproject.toml, and theirs, pinned to the versions in .venv.
 
-To move a package: `.venv/bin/python -m pip install -U <name>`, `make test`, `make lock`.
+`make lock` writes it.  To update a package: `.venv/bin/python -m pip install -U <name>`, `make test`, `make lock`.
 """
 
 from __future__ import annotations
@@ -17,9 +17,10 @@ from factorlib.wholefile import write_text
 ROOT = Path(__file__).resolve().parent.parent
 HEAD = """\
 # Every package of .venv, pinned; installed without looking for more (torch apart, see factorlib/setup.py).
-# Derived from pyproject.toml by `make lock`. Of what Open3D asks for, only what its compiled module needs is here (factorlib/geometry/open3d.py).
+# Derived from pyproject.toml by `make lock`. Of what Open3D asks for, only what its compiled module needs is here \
+(factorlib/geometry/open3d.py).
 """
-# What a package asks for and its import, or what is used of it, does not need.
+# Requirements of a package that the parts in use do not need.
 LEFT_OUT = {
     "open3d-cpu": {
         *(
@@ -39,7 +40,11 @@ LEFT_OUT = {
 
 
 def lock_text() -> str:
-    """Return what requirements.lock should say.  Raises PackageNotFoundError for a package that is needed and not installed."""
+    """Return the text of requirements.lock.
+
+    Raises:
+        PackageNotFoundError: A required package is not installed.
+    """
     project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
     waiting = [(Requirement(text), "") for text in project["dependencies"] + project["optional-dependencies"]["dev"]]
     lines: dict[str, str] = {}
@@ -52,7 +57,7 @@ def lock_text() -> str:
         needed = [Requirement(text) for text in requires(name) or []]
         needed = [each for each in needed if canonicalize_name(each.name) not in LEFT_OUT.get(name, ())]
         waiting += [(each, extra) for each in needed for extra in ("", *requirement.extras)]
-    del lines["torch"]  # installed before the others, from an index of its own
+    del lines["torch"]  # installed separately, from its own index
     return HEAD + "".join(sorted(lines.values(), key=str.lower))
 
 

@@ -1,11 +1,13 @@
-"""A dataset.yaml for photos of one's own: `make new DATASET=mychair PHOTOS=… MASKS=… MESHES=…`.
+"""Draft of a dataset.yaml for a user's own photos: `make new DATASET=mychair PHOTOS=… MASKS=… MESHES=…`.
 
-The files are copied to data/<name>/.  A mask belongs to the photo of the same name: `kitchen.png` with labels, `kitchen_oak.png` or
-`kitchen/oak.png` for one material, or one COCO json for all.  Beside a mask with labels `kitchen_chair1.png` is the silhouette of an
-object.  Materials are the names in those, or label_1, label_2, … for labels.
+The files are copied to data/<name>/.  A mask belongs to the photo of the same name: `kitchen.png` with labels,
+`kitchen_oak.png` or `kitchen/oak.png` for one material, or one COCO json for all.  Beside a mask with labels,
+`kitchen_chair1.png` is the silhouette of an object.  Materials are the names in those, or label_1, label_2, … for
+labels.
 
-Which label shows which part of a mesh is found by laying the mesh on the masks under every pairing; how sure that is stands beside it.
-What no file says, and pairings that are not sure, are left as `?`, which `make validate` refuses, and listed; so is what must be renamed.
+The labels of a mesh's parts are found by comparing the mesh with the masks under every pairing.  The draft states the
+margin of the best one.  Values that no file determines, and uncertain pairings, are left as `?`, which `make validate`
+rejects, and listed.  Names that must change are listed too.
 """
 
 import os
@@ -42,20 +44,26 @@ from factorlib.yamlfile import yaml_text
 REMARK = """\
 # What the files say; `?` is for you to write.  Every key: docs/dataset.md
 # materials: label k of a mask is the k-th, from 1;  parts: part of a mesh -> material
-# margin: how many more pixels any other pairing of parts and labels would have wrong in all photos, in parts of a mask's
+# margin: how many more pixels any other pairing of parts and labels would have wrong in all photos, \
+in parts of a mask's
 # objects: of each the mesh; another material for a part by `materials: {part: material}`
 """
-MARGIN = 0.1  # wrong pixels, as a share of a mask's: data sets with truth that were tried have .7 and more
-MOST_OBJECTS = 200  # of one mesh that are looked at: .3 s each
-SIDE = 400  # pixels of a photo in which parts are told apart
-BESIDE = "\x1f"  # between a value and the comment beside it
-HULL = "thing"  # the mesh where none is given
+# Least margin of a certain pairing, in wrong pixels over the mask's.  Data sets with truth have 0.7 and more.
+MARGIN = 0.1
+MOST_OBJECTS = 200  # objects of one mesh that are examined, at 0.3 s each
+SIDE = 400  # longest side of a silhouette for pairing, pixels
+BESIDE = "\x1f"  # separates a value from the comment beside it
+HULL = "thing"  # name of the mesh if none is given
 NO_MESH = (
-    "there is no mesh: `hull: true` and `cameras: {sfm: true}` are written, which need photos that overlap, each 10 to 20° from the next; "
+    "there is no mesh: `hull: true` and `cameras: {sfm: true}` are written, which need photos that overlap, "
+    "each 10 to 20° from the next; "
     "else write `lathe: true` or `primitive: ball | box | cylinder`, or give MESHES=<folder>: rough ones will do"
 )
 
-NO_MASKS = "there are no masks: `make label` draws them in the browser, once `materials` has their names; or give MASKS=<folder>"
+NO_MASKS = (
+    "there are no masks: `make label` draws them in the browser, once `materials` has their names; "
+    "or give MASKS=<folder>"
+)
 
 
 class Categories(msgspec.Struct):
@@ -67,8 +75,15 @@ class Categories(msgspec.Struct):
 def new_dataset(target: Path, photos: Path, masks: Path | None, meshes: Path | None) -> list[str]:
     """Copy the files, write target/dataset.yaml, and return what is still missing, in words.
 
-    Raises InputError where the folder is there already or cannot be made, one of the others is not, there are no photos, or a file is a link, has
-    a name that cannot be printed, or more pixels than are read.
+    Args:
+        target: the folder to create
+        photos: folder of photos
+        masks: folder of masks
+        meshes: folder of meshes
+
+    Raises:
+        InputError: The target exists or cannot be created, or a folder is missing or has no photos.  It is also raised
+            for a link, an unprintable file name, and too many pixels.
     """
     if not target.name.isprintable():
         raise InputError(f"{target.name!a} cannot be printed", key="DATASET", cure="choose another name")
@@ -82,11 +97,12 @@ def new_dataset(target: Path, photos: Path, masks: Path | None, meshes: Path | N
         raise InputError(fault, file=photos, key="PHOTOS", cure="name their folder")
     missing: list[str] = []
     of_masks = _files(masks, (".png", ".json"), "MASKS", deep=True) if masks is not None else []
-    of_meshes = _files(meshes, None, "MESHES", deep=True) if meshes is not None else []  # with .mtl, buffers
+    of_meshes = _files(meshes, None, "MESHES", deep=True) if meshes is not None else []  # including .mtl and buffers
     materials, of_photos, silhouettes = _masks(masks, of_masks, list(named), missing) if masks else ([], {}, {})
     entries = _meshes(meshes, of_meshes, materials, missing) if meshes else {}
     words = [(word, mesh) for mesh, entry in entries.items() for word in {mesh, *entry.get("parts", ())}]
-    times, called = Counter(word for word, _ in words), dict(words)
+    times = Counter(word for word, _ in words)
+    called = dict(words)
     shown = {}
     for photo in named:
         own = of_photos[photo] if isinstance(of_photos.get(photo), dict) else ()
@@ -101,8 +117,10 @@ def new_dataset(target: Path, photos: Path, masks: Path | None, meshes: Path | N
                 for photo in named if photo in RESERVED_PHOTOS]  # fmt: skip
     spec: dict = {"format": 1, "materials": materials or [UNKNOWN]}
     if not entries:
-        parts, one = {"parts": {name: name for name in materials}}, {"material": spec["materials"][0]}
-        entries, spec["cameras"] = {HULL: {"hull": True, **(parts if len(materials) > 1 else one)}}, {"sfm": True}
+        parts = {"parts": {name: name for name in materials}}
+        one = {"material": spec["materials"][0]}
+        entries = {HULL: {"hull": True, **(parts if len(materials) > 1 else one)}}
+        spec["cameras"] = {"sfm": True}
         shown = {photo: [HULL] for photo in named}
         missing.append(NO_MESH)
     if not materials and masks is not None:
@@ -114,7 +132,8 @@ def new_dataset(target: Path, photos: Path, masks: Path | None, meshes: Path | N
             only = objects[0]["mesh"] if len(objects) == 1 else UNKNOWN
             mesh_of = {name: (_shown_in(name, entries) or [only])[0] for name in silhouettes[photo]}
             objects = [{"name": name, "mesh": mesh_of[name], "mask": mask} for name, mask in silhouettes[photo].items()]
-        image, mask = f"photos/{path.relative_to(photos)}", of_photos.get(photo, UNKNOWN)
+        image = f"photos/{path.relative_to(photos)}"
+        mask = of_photos.get(photo, UNKNOWN)
         spec["photos"].append({"name": photo, "image": image, "masks": mask, "objects": objects})
     places = {"photos": photos, "masks": masks, "meshes": meshes}
     _match(spec, lambda name: places[name.partition("/")[0]] / name.partition("/")[2], missing)
@@ -145,7 +164,10 @@ def _copy(source: Path | None, target: Path, files: Iterable[Path]) -> None:
 def _masks(
     folder: Path, paths: list[Path], photos: list[str], missing: list[str]
 ) -> tuple[list[str], dict, dict[str, dict[str, str]]]:
-    """Materials; by photo, its mask or {material: mask}; by photo with a mask of labels, {object: silhouette}."""
+    """Return the materials, the masks by photo, and the silhouettes by photo and object.
+
+    A photo's mask is a path, or {material: path}.  Only photos with a mask of labels have silhouettes.
+    """
     file = {path: f"masks/{path.relative_to(folder)}" for path in paths}
     names: dict[str, None] = {}
     if coco := [path for path in paths if path.suffix.lower() == ".json"]:
@@ -158,11 +180,15 @@ def _masks(
                 missing.append(f"{file[coco[0]]}: rename its category {category.name!r} to {name!r}: {letters}")
         missing += [f"{file[path]}: a second COCO file is not used" for path in coco[1:]]
         return list(names), dict.fromkeys(photos, file[coco[0]]), {}
-    labels, of_photos, silhouettes = 0, {}, {}
-    known, own, further = set(photos), {}, {photo: {} for photo in photos}
+    labels = 0
+    of_photos = {}
+    silhouettes = {}
+    known = set(photos)
+    own = {}
+    further = {photo: {} for photo in photos}
     for path in paths:
         name = _word(path.stem)
-        if name in known:  # kitchen_2.png may be a photo's own
+        if name in known:  # Even kitchen_2.png may be the mask of a photo of that name.
             if path.parent == folder:
                 own.setdefault(name, path)
         elif path.parent == folder:
@@ -186,7 +212,8 @@ def _masks(
                 cure = f"the mask of one material is called {photo}_<material>.png"
                 fault = f"{whole.name} has no label, for {LEFT_OUT} means left out"
                 missing.append(f"photo {photo}: {fault}; {cure}")
-            of_photos[photo], silhouettes[photo] = file[whole], each
+            of_photos[photo] = file[whole]
+            silhouettes[photo] = each
         elif each:
             of_photos[photo] = each
             names |= dict.fromkeys(each)
@@ -194,10 +221,11 @@ def _masks(
 
 
 def _meshes(folder: Path, files: list[Path], materials: list[str], missing: list[str]) -> dict[str, dict]:
-    """The entry of each mesh; a part goes by its first name, and is made of a material of that name where there is one."""
+    """Return the entry of each mesh, with a part's own name as its material if there is a material of that name."""
     entries = {}
     for name, path in _by_name([path for path in files if path.suffix.lower() in MESHES], "MESHES").items():
-        parts, file = list(dict.fromkeys(names[0] for names in read_parts(path))), f"meshes/{path.relative_to(folder)}"
+        parts = list(dict.fromkeys(names[0] for names in read_parts(path)))
+        file = f"meshes/{path.relative_to(folder)}"
         if len(materials) == 1:
             entries[name] = {"file": file, "material": materials[0]}
             continue
@@ -206,20 +234,23 @@ def _meshes(folder: Path, files: list[Path], materials: list[str], missing: list
 
 
 def _match(spec: dict, file: Callable[[str], Path], missing: list[str]) -> None:
-    """Write the material of each part that is open as the masks tell it: in the mesh what most objects have, in an object what differs.
+    """Write the material of each open part as the masks suggest it, in the mesh or, if it differs, in an object.
 
-    file: where the file of such a name lies that is to be copied
+    `file` returns the present path of a file that is to be copied.
     """
     materials = spec["materials"]
     for name, entry in spec["meshes"].items():
-        of, objects, silhouettes, known = entry.get("parts", {}), [], [], []
+        of = entry.get("parts", {})
+        objects = []
+        silhouettes = []
+        known = []
         if UNKNOWN not in of.values():
             continue
         for photo in spec["photos"]:
             for obj in photo["objects"]:
                 alone = "mask" in obj or len(photo["objects"]) == 1
                 if obj["mesh"] == name and alone and photo["masks"] != UNKNOWN and len(objects) < MOST_OBJECTS:
-                    with suppress(InputError):  # a mask that does not fit its photo, which `validate` says
+                    with suppress(InputError):  # `validate` reports a mask that does not fit its photo.
                         silhouettes.append(_silhouette(photo, obj, materials, file))
                         objects.append((photo["name"], obj))
         mesh = read_mesh(file(entry["file"]), list(of), {part: part for part in of})
@@ -241,7 +272,7 @@ def _match(spec: dict, file: Callable[[str], Path], missing: list[str]) -> None:
             for (photo, obj), each, yes, words in zip(objects, ranked, sure, likely):
                 if yes and each[0] != usual:
                     obj.setdefault("materials", {})[part] = materials[each[0] - 1]
-                elif not yes and HIDDEN not in each[:2]:  # else it is not seen there
+                elif not yes and HIDDEN not in each[:2]:  # not if the part may be hidden
                     obj.setdefault("materials", {})[part] = f"{UNKNOWN}{BESIDE}{words or 'not told by the mask'}"
                     missing.append(f"photo {photo}: write which material {part} of {obj['name']} is made of")
         if known:
@@ -250,7 +281,7 @@ def _match(spec: dict, file: Callable[[str], Path], missing: list[str]) -> None:
 
 
 def _silhouette(photo: dict, obj: dict, materials: list[str], file: Callable[[str], Path]) -> Silhouette:
-    """The labels of an object, of every so many pixels."""
+    """Return the labels of an object, subsampled."""
     size = open_photo(file(photo["image"]), photo["name"]).size
     check_pixels(size, MOST_MEGAPIXELS, file(photo["image"]), photo["name"])
     labels = read_labels(photo["masks"], file, materials, size, photo["image"], photo["name"])
@@ -262,7 +293,7 @@ def _silhouette(photo: dict, obj: dict, materials: list[str], file: Callable[[st
 
 
 def _shown_in(photo: str, meshes: Collection[str]) -> list[str]:
-    """The meshes that a photo shows: the only one there is, or those whose names are whole words of the photo's.
+    """Return the meshes that a photo shows: the only one, or those whose names are whole words of the photo's.
 
     >>> _shown_in("my_red-chair_2", ["stool", "chair", "red-chair", "hair"])
     ['chair', 'red-chair']
@@ -273,7 +304,10 @@ def _shown_in(photo: str, meshes: Collection[str]) -> list[str]:
 
 
 def _files(folder: Path, suffixes: tuple[str, ...] | None, key: str, deep: bool = False) -> list[Path]:
-    """The files of a folder, or of those in it, too; suffixes: None for any.  What macOS keeps beside a file (`._name`) is none of them."""
+    """Return the files of a folder, sorted, without those that macOS keeps beside a file (`._name`).
+
+    `deep` includes its subfolders.  `suffixes` is None for any suffix.
+    """
     if not folder.is_dir():
         raise InputError("there is no such folder", file=folder, key=key, cure="name one")
     paths = []
@@ -300,7 +334,7 @@ def _by_name(paths: list[Path], key: str) -> dict[str, Path]:
 
 
 def _word(text: str) -> str:
-    """A name that dataset.yaml takes.
+    """Return a name that is valid in dataset.yaml.
 
     >>> _word("IMG 0412 (1)")
     'IMG_0412_1'

@@ -1,4 +1,7 @@
-"""A result as one file that travels: what people and programs read of it, and what `factorlib.load_result` needs, without the data set."""
+"""Packing of a result into one portable file, with all that readers and `factorlib.load_result` need.
+
+The data set itself is not included.
+"""
 
 import os
 import zipfile
@@ -11,11 +14,15 @@ NEEDED = ("report", "export", "masks", "align")
 STAGES = (*NEEDED, "evaluate", "render", "shapes", "solve", "surface")
 READ_ME = """\
 report/index.html              everything on one page: open this first
-export/materials.json          diffuse and specular reflectance (linear Rec. 709), roughness r (GGX with alpha = r * r), standard errors
-export/illumination/*.exr      environment maps, lat-long, linear radiance in the units of their photos: top row +y, centre +z toward the
+export/materials.json          diffuse and specular reflectance (linear Rec. 709), roughness r (GGX with \
+alpha = r * r), standard errors
+export/illumination/*.exr      environment maps, lat-long, linear radiance in the units of their photos: top row +y, \
+centre +z toward the
                                viewer, +x a quarter of the width from the left edge
-export/*.glb, *.mtlx, scenes/  meshes, materials and scenes for other programs; the camera's frame of scenes is x right, y up, z toward the viewer
-export/meshes/*.ply            meshes in their own frames; align/poses.json: cam_from_object, OpenCV (x right, y down, z forward), lengths as in the meshes
+export/*.glb, *.mtlx, scenes/  meshes, materials and scenes for other programs; the camera's frame of scenes is \
+x right, y up, z toward the viewer
+export/meshes/*.ply            meshes in their own frames; align/poses.json: cam_from_object, OpenCV \
+(x right, y down, z forward), lengths as in the meshes
 render/resynthesis/*.exr       photographs rendered again, linear
 evaluate/metrics.json          errors, and how far to trust the result
 
@@ -24,9 +31,15 @@ In Python: factorlib.load_result("<this folder>")
 
 
 def pack(home: Path, out: Path, replace: bool = False) -> int:
-    """Write the results in `home` (build/<dataset>) into the zip file `out`, in a folder of the data set's name; the number of files.
+    """Write a result into a zip file, in a folder of the data set's name, and return the number of files.
 
-    Raises InputError where a needed stage has no result, `out` is no name of a zip file, or it is there and not to be replaced.
+    Args:
+        home: the result folder build/<dataset>
+        out: the zip file
+        replace: replace an existing file
+
+    Raises:
+        InputError: A needed stage has no result, `out` is not the name of a zip file, or it exists already.
     """
     if missing := [path for path in (*NEEDED, "export/dataset.json") if not (home / path).exists()]:
         cure = f"make all DATASET={home.name}"
@@ -49,11 +62,12 @@ def pack(home: Path, out: Path, replace: bool = False) -> int:
 
 
 def files_below(folder: Path) -> list[Path]:
-    """Every file below a folder, which may be a link into the store."""
+    """Return every file below a folder, which may be a link into the store."""
     return sorted(Path(place) / name for place, _, names in os.walk(folder) for name in names)
 
 
 def _entry(name: str) -> zipfile.ZipInfo:
-    entry = zipfile.ZipInfo(name)  # of its own fixed date, so that equal results are equal files
-    entry.compress_type, entry.external_attr = zipfile.ZIP_DEFLATED, 0o644 << 16
+    entry = zipfile.ZipInfo(name)  # It has a fixed date, so that equal results are equal files.
+    entry.compress_type = zipfile.ZIP_DEFLATED
+    entry.external_attr = 0o644 << 16
     return entry

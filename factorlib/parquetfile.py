@@ -1,6 +1,7 @@
-"""Parquet on disk: named columns of numbers, and what this project writes about them in the schema's metadata.
+"""Parquet on disk: named columns of numbers, with this project's metadata in the schema.
 
-What a file announces is looked at before its columns are read: a kilobyte of Parquet can stand for gigabytes of one number.
+The header of a file is checked before its columns are read, because a kilobyte of Parquet can stand for gigabytes of
+one number.
 """
 
 import json
@@ -16,7 +17,7 @@ from factorlib.reading import check_plain, reading
 from factorlib.wholefile import writing
 
 MOST_ROWS = 100_000_000
-MOST_BYTES = 8192  # of one value: what hides each of as many directions as visibility may have
+MOST_BYTES = 8192  # bytes of one value: one for each direction of visibility
 
 
 def read_columns(
@@ -27,10 +28,18 @@ def read_columns(
     cure: str = "",
     most_rows: int = MOST_ROWS,
 ) -> tuple[dict[str, pa.Array], dict[str, Any]]:
-    """The columns by name, without nulls, and the metadata `factorlib`; what else stands in the file is not read.
+    """Read columns by name, without nulls, and the metadata `factorlib`; other columns are not read.
 
-    what: what the file should be, with its article, for messages.  Raises InputError for a file that is no Parquet, has more
-    than `most_rows` rows, or lacks a needed column.
+    Args:
+        path: the file
+        what: the kind of file with its article, for messages
+        needed: names of required columns
+        optional: names of columns to read if they exist
+        cure: cure for a rejected file
+        most_rows: largest number of rows
+
+    Raises:
+        InputError: The file is not Parquet, has too many rows, or lacks a needed column.
     """
     check_plain(path, what, most_bytes=None)
     with reading(what, path, cure=cure, also=(pa.ArrowException,)), pq.ParquetFile(path) as file:
@@ -56,14 +65,20 @@ def read_columns(
 
 
 def write_rows(path: str | Path, type_: type[msgspec.Struct], rows: Sequence[msgspec.Struct]) -> None:
-    """Write a column for each field of the rows, which are structs of `type_`."""
+    """Write a column for each field of the rows.
+
+    Args:
+        path: the file
+        type_: type of the rows
+        rows: structs of that type
+    """
     columns = {name: [getattr(row, name) for row in rows] for name in type_.__struct_fields__}
     with writing(path):
         pq.write_table(pa.table(columns), path, compression="zstd")
 
 
 def _is_readable(kind: pa.DataType) -> bool:
-    """Whether a column holds numbers, lists of three of them, text, or bytes of a fixed length."""
+    """Return True if a column holds numbers, lists of three of them, text, or bytes of a fixed length."""
     is_list = pa.types.is_fixed_size_list(kind)
     of = kind.value_type if is_list else kind
     if pa.types.is_integer(of) or pa.types.is_floating(of) or pa.types.is_boolean(of):

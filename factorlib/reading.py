@@ -1,11 +1,12 @@
-"""The boundary of every reader of a user's files: whatever goes wrong within becomes an InputError with file, key and cure.
+"""The boundary of every reader of a user's files: any failure becomes an InputError with file, key and cure.
 
-    with reading("a mesh", path, key):          # around the calls of a parser, and only those: what it raises is the
+    with reading("a mesh", path, key):          # around the calls of a parser, and only those: its exceptions are the
         scene = trimesh.load_scene(path)        #   file's fault; FAILURES names the families
-    content = read_bytes(path, "a mesh", key)   # the whole of a plain file that is not too large; never a pipe or a device
-    target = path_inside(folder, "a/b.obj")     # where a path leads, links followed; ValueError says why it leads nowhere
+    content = read_bytes(path, "a mesh", key)   # the whole of a plain file that is not too large; never a pipe or a
+    device
+    target = path_inside(folder, "a/b.obj")     # the path with links checked; ValueError says why it leads nowhere
 
-Keep the `with` narrow: a mistake of this project inside it would be blamed on the file.
+Keep the `with` narrow, because it would blame the file for a defect of this project.
 """
 
 from __future__ import annotations
@@ -24,14 +25,15 @@ import msgspec
 from factorlib.errors import InputError
 
 FAILURES = (
-    # OSError has PIL.UnidentifiedImageError, ValueError UnicodeError and pyarrow.ArrowInvalid, RuntimeError RecursionError;
-    # SyntaxError is Pillow's word for a damaged PNG, ImportError for a package that a parser wants for odd files only
+    # OSError includes PIL.UnidentifiedImageError, ValueError includes UnicodeError and pyarrow.ArrowInvalid, and
+    # RuntimeError includes RecursionError.  Pillow raises SyntaxError for a damaged PNG, and parsers raise ImportError
+    # for packages that only rare files need.
     *(OSError, ValueError, ArithmeticError, LookupError, TypeError, AttributeError, AssertionError, RuntimeError),
     *(MemoryError, EOFError, SyntaxError, BufferError, ImportError, struct.error, zlib.error, msgspec.MsgspecError),
 )
 COPY_AGAIN = "is it whole, and of the kind its suffix says? copy it again from where it came"
-MOST_BYTES = 1 << 30  # of a file that is read as a whole
-MOST_WORDS = 200  # characters of a parser's message
+MOST_BYTES = 1 << 30  # largest file that is read as a whole
+MOST_WORDS = 200  # longest message of a parser, characters
 KINDS = {stat.S_IFDIR: "a folder", stat.S_IFIFO: "a pipe", stat.S_IFSOCK: "a socket", stat.S_IFCHR: "a device",
          stat.S_IFBLK: "a device"}  # fmt: skip
 NO_RIGHT = "give yourself the right to read it, and to enter the folders above it (chmod u+rX)"
@@ -55,10 +57,14 @@ def reading(
     cure: str = COPY_AGAIN,
     also: tuple[type[Exception], ...] = (),
 ) -> Iterator[None]:
-    """Whatever a parser raises within is raised as an InputError that names file and key; an InputError passes as it is.
+    """Convert exceptions of a parser to InputError with file and key; an InputError passes unchanged.
 
-    what: what the file should be, as in "not readable as {what}", with its article;  cure: unless the system's own
-    complaint (no right to read, no such file, …) has a better one;  also: what else the parser raises, of its own
+    Args:
+        what: the kind of file with its article, as in "not readable as {what}"
+        file: the file
+        key: the key that names the file
+        cure: cure, unless the system's error (no permission, no such file, …) has a better one
+        also: further exceptions of the parser
     """
     try:
         yield
@@ -70,7 +76,7 @@ def reading(
 
 
 def _fault(error: BaseException, what: str) -> str:
-    """What went wrong, in one line.
+    """Describe an error in one line.
 
     >>> _fault(PermissionError(13, "Permission denied"), "a mesh")
     'cannot be read (Permission denied)'
@@ -90,9 +96,9 @@ def _fault(error: BaseException, what: str) -> str:
 
 
 def one_line(text: str) -> str:
-    """A parser's words, printable, on one line, of at most MOST_WORDS characters.
+    r"""Return a parser's message, printable, on one line, of at most MOST_WORDS characters.
 
-    >>> one_line("line 1\\n  line\\x002")
+    >>> one_line("line 1\n  line\x002")
     'line 1 line?2'
     """
     flat = "".join(c if c.isprintable() else "?" for c in " ".join(text[: 8 * MOST_WORDS].split()))
@@ -100,10 +106,16 @@ def one_line(text: str) -> str:
 
 
 def check_plain(file: str | os.PathLike, what: str, key: str | None = None, most_bytes: int | None = MOST_BYTES) -> int:
-    """The size in bytes of a plain file, links followed, that can be opened; nothing of it is read.
+    """Return the size in bytes of a plain, readable file, with links followed; nothing of it is read.
 
-    Raises InputError for what is not there or may not be read, for folders, pipes and devices, which would never end,
-    and for a file of more than `most_bytes`; None: of any size.
+    Args:
+        file: the file
+        what: the kind of file with its article, for messages
+        key: the key that names the file
+        most_bytes: largest size; None for any
+
+    Raises:
+        InputError: The file does not exist, is not readable, is a folder, pipe or device, or is too large.
     """
     with reading(what, file, key):
         status = os.stat(file)
@@ -119,14 +131,34 @@ def check_plain(file: str | os.PathLike, what: str, key: str | None = None, most
 
 
 def read_bytes(file: str | os.PathLike, what: str, key: str | None = None, most_bytes: int = MOST_BYTES) -> bytes:
-    """The content of a plain file of at most `most_bytes`; InputError as in `check_plain`."""
+    """Read a plain file.
+
+    Args:
+        file: the file
+        what: the kind of file with its article, for messages
+        key: the key that names the file
+        most_bytes: largest size
+
+    Raises:
+        InputError: As for `check_plain`.
+    """
     size = check_plain(file, what, key, most_bytes)
     with reading(what, file, key), open(file, "rb") as stream:
-        return stream.read(size)  # so much memory is taken at once, whatever the file holds
+        return stream.read(size)  # bounded, even if the file has grown
 
 
 def read_text(file: str | os.PathLike, what: str, key: str | None = None, most_bytes: int = MOST_BYTES) -> str:
-    """The content as UTF-8 text, without a byte order mark; InputError as in `check_plain`, and for other text."""
+    """Read a plain file as UTF-8 text, without a byte order mark.
+
+    Args:
+        file: the file
+        what: the kind of file with its article, for messages
+        key: the key that names the file
+        most_bytes: largest size
+
+    Raises:
+        InputError: As for `check_plain`, or the file is not UTF-8.
+    """
     content = read_bytes(file, what, key, most_bytes)
     try:
         return content.decode("utf-8-sig")
@@ -135,15 +167,16 @@ def read_text(file: str | os.PathLike, what: str, key: str | None = None, most_b
 
 
 def path_inside(folder: str | os.PathLike, path: str) -> Path:
-    """Return where a path that is written relative to `folder` leads, links not yet followed; it need not exist.
+    """Return the target of a path relative to a folder, with links not yet followed; it need not exist.
 
-    Raises ValueError, whose words say what is wrong with it, for a path that leads outside the folder (links followed), an
-    absolute or empty one, and one that no file system can follow: with a NUL, a name of over 255 bytes, or links in a circle.
+    Raises:
+        ValueError: The path is absolute or empty, leads outside the folder (links followed), or cannot be followed.
+            Causes of the last are a NUL, a name of over 255 bytes, and links in a circle.
     """
     target = Path(folder) / path
     try:
         where = target.resolve()
-        with suppress(FileNotFoundError, NotADirectoryError, PermissionError):  # for whoever opens it to say
+        with suppress(FileNotFoundError, NotADirectoryError, PermissionError):  # reported when the file is opened
             os.stat(target)
     except (OSError, RuntimeError, ValueError) as error:
         words = one_line(getattr(error, "strerror", None) or str(error))

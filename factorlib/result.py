@@ -7,7 +7,7 @@
     r.render(view="terrace", azimuth=40).to_png("terrace.png")
     r.insert("kitchen", mesh="chair", material="black", size=0.7).save("pictures")      # as by a recipe
 
-Names that are not there are refused with those that are.  Pictures are path-traced, as those of recipes.
+An error for an unknown name lists the known ones.  Pictures are path-traced, as those of recipes.
 """
 
 from __future__ import annotations
@@ -50,28 +50,33 @@ from factorlib.yamlfile import convert
 
 T = TypeVar("T")
 STAGES = "masks", "align", "export"
+# slices of the data set that the stage `recipes` receives
 SLICES = {
     "dataset.materials",
     "dataset.objects",
     "dataset.light",
     "dataset.ground",
-}  # what the stage `recipes` is handed
+}
 MARK = "dataset.txt"
-SAMPLES = 64
-SHOWN = 480  # pixels of the longer side of a photo in a notebook
+SAMPLES = 64  # default samples per pixel
+SHOWN = 480  # longer side of a photo in a notebook, pixels
 log = logging.getLogger("factorlib.result")
 
 
 def load_result(folder: str | Path) -> Result:
-    """The result in a folder such as build/eames, or called eames in build/; from the current folder, or else from one above it.
+    """Load the result in a folder such as build/eames, or called eames in build/.
 
-    It is as it was solved: the data set is not read, may have changed, or be gone, and the folder may be a copy (`cp -rL build/eames …`).
-    Raises InputError where there is none, or it is not whole.
+    The folder is relative to the current one, or else to one above it.  The result is self-contained: the data set is
+    not read and may have changed or be gone.  The folder may be a copy (`cp -rL build/eames …`).
+
+    Raises:
+        InputError: There is no result, or it is incomplete.
     """
     if not isinstance(folder, str | os.PathLike):
         cure = 'name its folder, as in load_result("build/eames")'
         raise InputError(f"a result is named by a path, not by {type(folder).__name__} {folder!r}", cure=cure)
-    places = [Path(*k * [".."]) for k in range(len(Path.cwd().parts))]  # a notebook runs in its own folder
+    # the current folder and those above it, because a notebook runs in its own folder
+    places = [Path(*k * [".."]) for k in range(len(Path.cwd().parts))]
     candidates = [path for place in places for path in (place / folder, place / "build" / folder)]
     found = next((path for path in candidates if os.path.isfile(path / MARK)), None)
     if found is None:
@@ -87,7 +92,8 @@ def load_result(folder: str | Path) -> Result:
         cure = f"make export DATASET={found.name}"
         raise InputError(f"the result is not whole: {missing[0]} is missing", file=found, cure=cure)
     folders = {stage: (found / stage).resolve() for stage in (*STAGES, "shapes", "surface") if (found / stage).is_dir()}
-    file, source = found / "export" / "dataset.json", folders["export"] / "source"
+    file = found / "export" / "dataset.json"
+    source = folders["export"] / "source"
     facts = read_json(file) if file.is_file() else {}
     if not (isinstance(facts, dict) and facts.keys() >= SLICES):
         cure = f"make export DATASET={found.name}"
@@ -97,14 +103,15 @@ def load_result(folder: str | Path) -> Result:
 
 
 class UnknownName(InputError, KeyError):
-    """Both, so that `get` and `in` work as they do with any mapping."""
+    """An InputError that is also a KeyError, so that `get` and `in` work as for any mapping."""
 
 
 class Named(Mapping[str, T]):
-    """A table whose missing names are refused with those that are there."""
+    """A mapping whose error for a missing name lists the known ones."""
 
     def __init__(self, what: str, table: Mapping[str, T]):
-        self._what, self._table = what, table
+        self._what = what
+        self._table = table
 
     def __getitem__(self, name: str) -> T:
         if not isinstance(name, str) or name not in self._table:
@@ -122,14 +129,17 @@ class Named(Mapping[str, T]):
 
 
 class Result:
-    """What was solved of a data set.
+    """The solution of a data set.
 
-    materials: by name, with `diffuse`, `specular` (linear Rec. 709), `roughness` and their standard errors `stderr`
-    photos, objects: names;  an object is named as in dataset.yaml, or <photo>/<object> where several photos have one of that name
+    Attributes:
+        materials: by name, with `diffuse`, `specular` (linear Rec. 709), `roughness` and their standard errors `stderr`
+        photos: names of the photos
+        objects: names of the objects, as in dataset.yaml, or <photo>/<object> if several photos have one of that name
     """
 
     def __init__(self, folder: Path, solved: SolvedSet):
-        self.folder, self._solved = folder, solved
+        self.folder = folder
+        self._solved = solved
         self.materials: Named[Solved] = Named("material", {name: solved.table.materials[name] for name in solved.names})
         self.photos = solved.photos
 
@@ -139,9 +149,10 @@ class Result:
         return [f"{photo}/{obj.name}" for photo, each in self._solved.objects.items() for obj in each.objects]
 
     def environment(self, name: str) -> Environment:
-        """The environment map of a photo's light, as exported (`docs/formats.md`); InputError for an unknown photo.
+        """Return the exported environment map of a photo's light (`docs/formats.md`); InputError for an unknown photo.
 
-        In the light's own frame: the world's where the photo gives `world_from_camera`, and without the photo's exposure.
+        It is in the light's own frame, which is the world's if the photo has `world_from_camera`.  It does not include
+        the photo's exposure.
         """
         light = self._solved.lights[self._photo(name)].illumination
         path = self._solved.inputs.folders["export"] / "illumination" / f"{light}.exr"
@@ -157,11 +168,18 @@ class Result:
         width: int | None = None,
         samples: int = SAMPLES,
     ) -> Picture:
-        """The objects of a photo, in its light, as its camera sees them or from another side.
+        """Render the objects of a photo in its light, from its camera or another view.
 
-        view: the photo's name;  azimuth (to the right), elevation (up): degrees by which the camera is moved about the objects' middle
-        zoom: factor on their size;  width: of the picture, in pixels; the photo's where None;  samples: per pixel
-        Raises InputError for an unknown photo and for numbers out of range.
+        Args:
+            view: name of the photo
+            azimuth: angle of the camera about the objects' middle, to the right; degrees
+            elevation: angle of the camera about the objects' middle, upward; degrees
+            zoom: magnification of the objects
+            width: width of the picture in pixels; None is the photo's
+            samples: samples per pixel
+
+        Raises:
+            InputError: The photo is unknown, or a number is out of range.
         """
         photo = self._photo(view)
         _check(schema.View, azimuth=azimuth, elevation=elevation, zoom=zoom, width=width, samples=samples)
@@ -172,10 +190,18 @@ class Result:
     def relight(
         self, name: str, light: str | Path | Environment, width: int | None = None, samples: int = SAMPLES
     ) -> Picture:
-        """An object, as its photo shows it, in the light of another photo, of a file (.hdr, .exr), or of an `Environment`.
+        """Render an object, as its photo shows it, in another light.
 
-        The picture's `about` says of which photo: where several have an object of that name, of the first, which a warning says, too.
-        Raises InputError for an unknown object or photo, a file that is no light map, and numbers out of range.
+        If several photos have an object of that name, the first is used; a warning and the picture's `about` name it.
+
+        Args:
+            name: name of the object
+            light: name of a photo, a file (.hdr, .exr), or an `Environment`
+            width: width of the picture in pixels; None is the photo's
+            samples: samples per pixel
+
+        Raises:
+            InputError: A name is unknown, a file is not a light map, or a number is out of range.
         """
         photo, one = self._object(name)
         light = str(light) if isinstance(light, Path) else light
@@ -188,24 +214,48 @@ class Result:
         return Picture(traced, self._solved.tone(light) if of_photo else as_it_is, about)
 
     def insert(self, photo: str, **fields: Any) -> Drawn:
-        """A further object on the ground of a photo, with its shadow.
+        """Insert a further object on the ground of a photo, with its shadow.
 
-        fields: those of the recipe `insert` (`docs/recipes.md`): mesh, material, beside, at, size, turn, …; files from the current folder
-        Raises InputError for an unknown name or field, and where the object has no place.
+        Args:
+            photo: name of the photo
+            **fields: fields of the recipe `insert` (`docs/recipes.md`): mesh, material, beside, at, size, turn, …;
+                files are relative to the current folder
+
+        Raises:
+            InputError: A name or field is unknown, or the object has no place.
         """
         return self._drawn("insert", photo, fields)
 
     def turntable(self, photo: str, **fields: Any) -> Drawn:
-        """Once around the objects of a photo, as GIF and frames; fields: those of the recipe `turntable`; raises as `insert`."""
+        """Render one turn around the objects of a photo, as GIF and frames.
+
+        Args:
+            photo: name of the photo
+            **fields: fields of the recipe `turntable`
+
+        Raises:
+            InputError: As for `insert`.
+        """
         return self._drawn("turntable", photo, fields)
 
     def transfer(self, photo: str, materials: Mapping[str, str], **fields: Any) -> Drawn:
-        """A photo with other materials on its objects: old name to new; fields: those of the recipe `transfer`; raises as `insert`."""
+        """Render a photo with other materials on its objects.
+
+        Args:
+            photo: name of the photo
+            materials: new material by old one
+            **fields: fields of the recipe `transfer`
+
+        Raises:
+            InputError: As for `insert`.
+        """
         return self._drawn("transfer", photo, {"materials": materials, **fields})
 
     def _drawn(self, kind: str, photo: str, fields: dict[str, Any]) -> Drawn:
-        """What a recipe for one photo makes."""
-        recipe, path, inputs = _check(KINDS[kind], photos=[photo], **fields), Path(kind), self._solved.inputs
+        """Render a recipe for one photo."""
+        recipe = _check(KINDS[kind], photos=[photo], **fields)
+        path = Path(kind)
+        inputs = self._solved.inputs
         objects = {name: own.objects for name, own in self._solved.objects.items()}
         check_recipe(recipe, path, objects, self._solved.names)
         given = {f"recipe file:{name}": file for name, file in files_of(recipe, path).items()}
@@ -216,7 +266,7 @@ class Result:
             return Drawn({path.relative_to(out).as_posix(): path.read_bytes() for path in files})
 
     def scene(self, photo: str) -> PhotoScene:
-        """The photo's camera, objects and light, for pictures of one's own (`factorlib.render.photo_scene`)."""
+        """Return the photo's camera, objects and light, for custom pictures (`factorlib.render.photo_scene`)."""
         return self._solved.scene(self._photo(photo))
 
     def _photo(self, name: str) -> str:
@@ -224,7 +274,7 @@ class Result:
 
     def _object(self, name: str) -> tuple[str, str]:
         known = {each: tuple(each.split("/")) for each in self.objects}
-        short = {one: (photo, one) for photo, one in reversed(known.values())}  # the first photo that has it
+        short = {one: (photo, one) for photo, one in reversed(known.values())}  # keeps the first photo that has it
         found = Named("object", {**short, **known})[name]
         if name not in known and len(others := [each for each, (_, one) in known.items() if one == name]) > 1:
             log.warning("'%s' is %s: that of '%s' is taken", name, " and ".join(others), found[0])
@@ -241,7 +291,8 @@ class Result:
         return f"{self.folder}: {len(self.photos)} photos, {self.materials!r}"
 
     def _repr_html_(self) -> str:
-        parts, rows = ("diffuse", "specular", "roughness"), []
+        parts = ("diffuse", "specular", "roughness")
+        rows = []
         for name, material in self.materials.items():
             of = [[np.atleast_1d(getattr(each, part)) for each in (material, material.stderr)] for part in parts]
             cells = [", ".join(f"{value:.3f} ± {error:.3f}" for value, error in zip(*pair, strict=True)) for pair in of]
@@ -253,27 +304,31 @@ class Result:
 
 
 def _check(kind: type[T], **fields: Any) -> T:
-    """The recipe of arguments that have the names of its fields; InputError for an unknown name and a value out of range."""
+    """Return the recipe with these fields; InputError for an unknown name and a value out of range."""
     plain = {key: value.item() if isinstance(value, np.generic) else value for key, value in fields.items()}
     return convert(plain, kind, kind.__name__.lower())
 
 
 class Environment(msgspec.Struct, frozen=True):
-    """lat_long: [h, 2h, 3], linear Rec. 709; the top row is up (+y), the middle of the picture toward the viewer (+z)"""
+    """A lat-long environment map.
+
+    Attributes:
+        lat_long: [h, 2h, 3], linear Rec. 709; the top row is up (+y), the middle of the picture toward the viewer (+z)
+    """
 
     lat_long: Float[np.ndarray, "h w 3"]
 
     def rotate(self, degrees: float) -> Environment:
-        """Turned about the upright axis: what was toward the viewer goes to the right (+x) at 90°."""
+        """Return the map turned about the upright axis; at 90° the viewer's side (+z) goes to the right (+x)."""
         rotation = rotation_of_vector(np.radians(degrees) * np.array([0.0, 1.0, 0.0]))
         return Environment(turned_map(self.lat_long, rotation))
 
     def to_exr(self, path: str | Path) -> None:
-        """Write it as OpenEXR's lat-long environment."""
+        """Write the map as OpenEXR's lat-long environment."""
         write_rgb_exr(path, self.lat_long, LAT_LONG)
 
     def to_hdr(self, path: str | Path) -> None:
-        """Write it as Radiance HDR: eight bits a channel under one exponent."""
+        """Write the map as Radiance HDR: eight bits per channel with a common exponent."""
         write_hdr(path, self.lat_long)
 
     def __repr__(self) -> str:
@@ -285,7 +340,11 @@ class Environment(msgspec.Struct, frozen=True):
 
 
 class Picture(Traced, frozen=True):
-    """A path-traced picture that notebooks show, darker where it would be overexposed; about: what it is of."""
+    """A path-traced picture that notebooks display, darkened if it would be overexposed.
+
+    Attributes:
+        about: description of the picture
+    """
 
     about: str = ""
 
@@ -297,10 +356,13 @@ class Picture(Traced, frozen=True):
 
 
 class Drawn(dict[str, bytes]):
-    """The files that a recipe makes of a photo, by name: PNG (8-bit sRGB), EXR (linear), and of an animation its GIF and frames."""
+    """The files that a recipe makes of a photo, by name.
+
+    They are PNG (8-bit sRGB), EXR (linear) and, for an animation, a GIF and its frames.
+    """
 
     def save(self, folder: str | Path) -> None:
-        """Write them into a folder, which is made where it is missing; files of these names are replaced."""
+        """Write the files into a folder, which is created if needed; existing files are replaced."""
         for name, data in self.items():
             (path := Path(folder, name)).parent.mkdir(parents=True, exist_ok=True)
             write_bytes(path, data)
@@ -310,9 +372,12 @@ class Drawn(dict[str, bytes]):
 
     def _repr_html_(self) -> str:
         name = next(name for kind in (".gif", ".png") for name in self if name.endswith(kind))
-        kind, data = name[-3:], self[name]
-        if kind == "png":  # which shows the whole photo: a notebook has it smaller
-            shown, memory, kind = Image.open(BytesIO(data)).convert("RGB"), BytesIO(), "jpeg"
+        kind = name[-3:]
+        data = self[name]
+        if kind == "png":  # a photo at full size, reduced for the notebook
+            shown = Image.open(BytesIO(data)).convert("RGB")
+            memory = BytesIO()
+            kind = "jpeg"
             shown.thumbnail((SHOWN, SHOWN))
             shown.save(memory, "JPEG", quality=90)
             data = memory.getvalue()

@@ -1,13 +1,13 @@
-"""Statistics that a few outliers do not change."""
+"""Statistics that are robust to outliers."""
 
 import numpy as np
 from jaxtyping import Float
 
-PER_MEDIAN = 1.4826  # σ over the median of |x|, for x normal with mean 0
+PER_MEDIAN = 1.4826  # σ over the median of |x| for a normal x of mean 0
 
 
 def robust_deviation(residual: Float[np.ndarray, "*n"]) -> float:
-    """The standard deviation of residuals of mean 0, from the median of their absolute values; NaN of none.
+    """Return the standard deviation of residuals of mean 0, from the median of their absolute values; NaN for none.
 
     This is the median absolute deviation about 0 (scipy.stats.median_abs_deviation is about the median), scaled for
     normal residuals (P. J. Huber, Robust Statistics, 1981, section 5.1).

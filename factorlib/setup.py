@@ -1,8 +1,8 @@
-"""The environment: .venv with the pinned packages, and the few system libraries they need.
+"""Set-up of the environment: .venv with the pinned packages, and the few system libraries they need.
 
-Run by the Makefile as a script, on a Python without packages: nothing but the standard library may be imported here.
+The Makefile runs it as a script, on a Python without packages, so only the standard library may be imported here.
 
-    python3 -I factorlib/setup.py        (TORCH_INDEX=<url> for a PyTorch of one's own choice, e.g. with CUDA)
+    python3 -I factorlib/setup.py        (TORCH_INDEX=<url> for another PyTorch, e.g. with CUDA)
     .venv/bin/python -I factorlib/setup.py extras        (EXTRAS="dask blender": extras of pyproject.toml, into .venv)
 """
 
@@ -24,23 +24,26 @@ from importlib.util import find_spec
 from pathlib import Path
 
 ROOT = Path(__file__).resolve().parent.parent
-LOCK, VENV = ROOT / "requirements.lock", ROOT / ".venv"
-READY, PYTHON = VENV / "ready", VENV / "bin" / "python"
+LOCK = ROOT / "requirements.lock"
+VENV = ROOT / ".venv"
+READY = VENV / "ready"
+PYTHON = VENV / "bin" / "python"
 TORCH = "torch==2.13.0"
-TORCH_CPU = "https://download.pytorch.org/whl/cpu"  # PyPI's own wheels for Linux draw in gigabytes of CUDA
-BEAT = 3.0  # seconds between two signs of life
+TORCH_CPU = "https://download.pytorch.org/whl/cpu"  # PyPI's own wheels for Linux require gigabytes of CUDA.
+BEAT = 3.0  # seconds between two progress messages
 LOADED = (
     "torch, scipy.optimize, mitsuba, pytest",
     "factorlib.geometry.open3d, OpenImageIO, pycolmap, pyarrow.parquet, trimesh, jinja2, rich.progress",
 )
-ALONE = ("blender", "interchange")  # extras: .venv has what they need, and bpy would ask for an older NumPy
-# System libraries of Open3D, and the Debian packages that have them.
+# extras installed without dependencies: .venv has what they need, and bpy would require an older NumPy
+ALONE = ("blender", "interchange")
+# system libraries of Open3D, and the Debian packages that contain them
 NEEDED = {"libGL.so.1": "libgl1", "libX11.so.6": "libx11-6", "libudev.so.1": "libudev1", "libgomp.so.1": "libgomp1"}
-FASTER = {"libLLVM.so.19.1": "libllvm19"}  # of Mitsuba, which renders three times faster with it
+FASTER = {"libLLVM.so.19.1": "libllvm19"}  # Mitsuba renders three times faster with it.
 
 
 def main() -> None:
-    """Make .venv for requirements.lock and this Python, unless it is there.  Ends the program, with a cure, if it fails."""
+    """Make .venv for requirements.lock and this Python, unless it exists; a failure ends the program with a cure."""
     state = LOCK.read_bytes() + sys.version.encode() + os.environ.get("TORCH_INDEX", "").encode()
     digest = hashlib.sha256(state).hexdigest()
     if not READY.exists() or READY.read_text() != digest:
@@ -50,7 +53,7 @@ def main() -> None:
             system = beside.submit(check_system)
             install_packages()
         system.result()
-        os.environ.pop("PYTHONDONTWRITEBYTECODE", None)  # what is loaded stays compiled; pip would compile all
+        os.environ.pop("PYTHONDONTWRITEBYTECODE", None)  # Only loaded modules are compiled; pip would compile all.
         commands = [[str(PYTHON), "-c", f"import {names}"] for names in LOADED]
         if not run(commands, "loading the packages for the first time"):
             sys.exit("set-up: the packages are installed, but one does not load: see above")
@@ -60,7 +63,10 @@ def main() -> None:
 
 
 def install_extras() -> None:
-    """Install EXTRAS of pyproject.toml: those that are ALONE without what they ask for; the others move no locked package."""
+    """Install EXTRAS of pyproject.toml.
+
+    Those in ALONE are installed without dependencies.  The others change no locked package.
+    """
     known = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["optional-dependencies"]
     asked = os.environ.get("EXTRAS", "").replace(",", " ").split()
     if unknown := [name for name in asked if name not in known]:
@@ -71,23 +77,23 @@ def install_extras() -> None:
 
 
 def say(text: str) -> None:
-    """Print a line, marked as set-up's."""
+    """Print a line with the prefix of set-up."""
     print(f"set-up: {text}", flush=True)
 
 
 def ended(well: bool) -> None:
-    """End the program where an installation failed, which has said why."""
+    """End the program if an installation failed; the installer has printed the reason."""
     if not well:
         sys.exit("set-up: the packages could not be installed: see above; run make again when that is mended")
 
 
 def make_venv() -> None:
-    """Create .venv with pip; one of another Python version is replaced.  Refuses a Python that cannot have the packages."""
+    """Create .venv with pip, or replace one of another Python version; an unsupported Python ends the program."""
     version = f"{sys.version_info[0]}.{sys.version_info[1]}"
     if version not in ("3.11", "3.12"):
         cure = "the pinned packages need 3.11 or 3.12: make PYTHON=python3.11 …"
         sys.exit(f"set-up: Python {platform.python_version()} will not do, {cure}")
-    if find_spec("ensurepip") is None:  # Debian keeps it in a package of its own
+    if find_spec("ensurepip") is None:  # Debian has it in a separate package.
         sys.exit(f"set-up: this Python has no venv; install it: sudo apt-get install python{version}-venv")
     READY.unlink(missing_ok=True)
     if not PYTHON.exists() or not (VENV / "lib" / f"python{version}").is_dir():
@@ -97,32 +103,37 @@ def make_venv() -> None:
 
 
 def install_packages() -> None:
-    """Install all that the lock names, without asking what it needs: the lock answers that.  uv does it, or else pip.
+    """Install all packages of the lock without resolving dependencies, by uv or else by pip.
 
-    A PyTorch that is not of its index of CPU wheels may need more (CUDA): that is asked for afterwards.
+    A PyTorch from another index than that of CPU wheels may need more (CUDA), which is installed afterwards.
     """
     index = os.environ.get("TORCH_INDEX") or (TORCH_CPU if answers(f"{TORCH_CPU}/torch/") else None)
     torch = [TORCH, *(["--index-url", index] if index else [])]
-    locked, pinned = ["--no-deps", "-r", str(LOCK)], ["--no-deps", *torch]
+    locked = ["--no-deps", "-r", str(LOCK)]
+    pinned = ["--no-deps", *torch]
     say(words := f"installing about 400 MB of packages; PyTorch from {index or 'the default package index'}")
     uv = shutil.which("uv") or (run([with_pip(["--no-deps", "uv"])], "installing uv") and str(VENV / "bin" / "uv"))
     with_uv = [str(uv), "pip", "install", "-q", "--python", str(PYTHON)]
-    by_uv = [[*with_uv, *locked], [*with_uv, *pinned] if index else with_pip(pinned)]  # pip knows a user's own wheels
+    # Without an index, pip installs PyTorch, because it knows the user's own wheels.
+    by_uv = [[*with_uv, *locked], [*with_uv, *pinned] if index else with_pip(pinned)]
     if not uv or not run(by_uv, words):
         ended(run([with_pip(locked), with_pip(pinned)], words))
     if index != TORCH_CPU:
         ended(run([with_pip(["-c", str(LOCK), *torch])], "installing what PyTorch needs"))
-    # relative, so that the checkout can be moved; `import factorlib` then works from anywhere, notebooks too
+    # The path is relative, so that the checkout can be moved.  `import factorlib` then works from anywhere.
     site_packages().joinpath("factorlib.pth").write_text("../../../..\n")
 
 
 def with_pip(words: list[str]) -> list[str]:
-    """Return pip's command, which shows errors alone and compiles nothing."""
+    """Return pip's install command, which prints only errors and compiles nothing."""
     return [str(PYTHON), "-m", "pip", "install", "--no-compile", "-qq", "--disable-pip-version-check", *words]
 
 
 def run(commands: list[list[str]], words: str) -> bool:
-    """Run the commands, all at once, and show that they live; whether all went well.  Errors are shown as they come."""
+    """Run the commands in parallel with progress messages, and return True if all succeed.
+
+    `words` describes them.  Errors are printed as they occur.
+    """
     running = [subprocess.Popen(command, cwd=ROOT, stdout=subprocess.DEVNULL) for command in commands]
     started = shown = time.monotonic()
     while any(process.poll() is None for process in running):
@@ -140,7 +151,7 @@ def site_packages() -> Path:
 
 
 def answers(url: str) -> bool:
-    """Return whether a HEAD request to `url` succeeds within five seconds."""
+    """Return True if a HEAD request to `url` succeeds within five seconds."""
     try:
         with urllib.request.urlopen(urllib.request.Request(url, method="HEAD"), timeout=5) as reply:
             return reply.status == 200
@@ -149,9 +160,9 @@ def answers(url: str) -> bool:
 
 
 def check_system() -> None:
-    """Install what is missing where that is allowed (root, apt); otherwise say by which command it is installed.
+    """Install missing system libraries if permitted (root, apt); otherwise print the command that does.
 
-    Ends the program where one is missing still that is NEEDED; what makes it FASTER is only recommended.
+    A missing library of NEEDED ends the program.  One of FASTER is only recommended.
     """
     apt = shutil.which("apt-get")
     for libraries, why in ((NEEDED, ""), (FASTER, "renders are three times faster with it")):
@@ -172,7 +183,7 @@ def check_system() -> None:
 
 
 def loads(library: str) -> bool:
-    """Return whether the dynamic linker finds and loads a shared library; on Linux alone, what is not asked for elsewhere."""
+    """Return True if the dynamic linker finds and loads a shared library; always True except on Linux."""
     try:
         return sys.platform != "linux" or bool(ctypes.CDLL(library))
     except OSError:

@@ -1,8 +1,9 @@
-"""A contact sheet of a dataset, to be looked at before anything is solved: each photo, its labels, and the meshes in the labels' colours.
+"""Contact sheet of a dataset, for inspection before a solve: photos, labels, and meshes in the labels' colours.
 
-A row for each photo: the photo; the same in grey, materials in their colours and what is left out hatched; each object's mesh as it lies
-in its file, from the +z side with +y up, its parts in the colours of their materials in this photo.  Of a data set that is not finished
-it shows what there is: the material of a part that is left open is called `?`.
+A row shows one photo.  The first picture is the photo.  The second is the photo in grey, with materials in their
+colours and left-out pixels hatched.  The others are the objects' meshes in their own frames, from the +z side with +y
+up.  Their parts have the colours of their materials in this photo.  An unfinished data set is shown as far as possible:
+the material of an open part is called `?`.
 """
 
 from collections.abc import Callable
@@ -30,28 +31,40 @@ from factorlib.meshes.read import read_mesh
 from factorlib.reading import path_inside
 from factorlib.wholefile import write_bytes
 
-# pixels: a photo's longer side, a mesh, between pictures, a line of text
-SIDE, MESH_SIDE, MARGIN, HEAD = 320, 240, 12, 18
+SIDE = 320  # longer side of a photo, pixels
+MESH_SIDE = 240  # side of a mesh's picture, pixels
+MARGIN = 12  # margin between pictures, pixels
+HEAD = 18  # height of a line of text, pixels
 PAPER, INK = (255, 255, 255), (30, 30, 30)
-DISTANCE = 6.0  # of the camera from a mesh, in its radii
-HATCH = 8  # pixels from line to line
+DISTANCE = 6.0  # distance of the camera from a mesh, in its radii
+HATCH = 8  # spacing of hatching lines, pixels
 MOST_PHOTOS = 100
 
 Pixels = UInt8[np.ndarray, "h w 3"]
 
 
 def write_sheet(folder: Path, path: Path, report: Callable[[int, int], None] = lambda done, total: None) -> None:
-    """The sheet of the dataset in `folder`, of its first MOST_PHOTOS photos, as a PNG; report: how many pieces are done of how many, two a photo.
+    """Write the contact sheet of the dataset in a folder as a PNG, of its first MOST_PHOTOS photos.
 
-    Raises InputError for a dataset.yaml that does not even name photos; what else cannot be read is `validate`'s to say, and left out.
+    Photos and meshes that cannot be read are left out, because `validate` reports them.
+
+    Args:
+        folder: folder of the dataset
+        path: the file to write
+        report: receives the number of pieces done and their total, two per photo
+
+    Raises:
+        InputError: dataset.yaml does not name photos.
     """
     spec, faults = read_draft(folder / FILE)
     names = list(dict.fromkeys([*spec.materials, *[OPEN] * bool(faults)]))
-    photos, pictures = spec.photos[:MOST_PHOTOS], []
+    photos = spec.photos[:MOST_PHOTOS]
+    pictures = []
     for done, photo in enumerate(photos):
         report(done, 2 * len(photos))
         pictures.append(_photo(folder, spec, photo))
-    colours, rows = _colours(names, [(image, labels) for image, labels in pictures if labels is not None]), []
+    colours = _colours(names, [(image, labels) for image, labels in pictures if labels is not None])
+    rows = []
     for done, (photo, (image, labels)) in enumerate(zip(photos, pictures, strict=True)):
         report(len(photos) + done, 2 * len(photos))
         named = [(photo.name, image)]
@@ -59,7 +72,7 @@ def write_sheet(folder: Path, path: Path, report: Callable[[int, int], None] = l
             named.append(("labels", _coloured(image, labels, colours)))
         for obj in photo.objects:
             entry = spec.meshes.get(obj.mesh)
-            if entry is None or entry.file is None:  # it is left open, or found from the masks
+            if entry is None or entry.file is None:  # left open, or reconstructed from the masks
                 continue
             with suppress(InputError, ValueError):
                 mesh = read_mesh(path_inside(folder, entry.file), names, entry.made_of, obj.materials)
@@ -78,9 +91,11 @@ def write_sheet(folder: Path, path: Path, report: Callable[[int, int], None] = l
 
 
 def _photo(folder: Path, spec: DatasetFile, photo: PhotoEntry) -> tuple[Pixels, Labels | None]:
-    """Both averaged down, or every so many pixels taken; white and None where they cannot be read."""
-    key, file = f"photos[{photo.name}]", partial(path_inside, folder)
-    image, labels = np.full((SIDE, SIDE, 3), 255, np.uint8), None
+    """Return the photo, averaged down, and its labels, subsampled; white and None if they cannot be read."""
+    key = f"photos[{photo.name}]"
+    file = partial(path_inside, folder)
+    image = np.full((SIDE, SIDE, 3), 255, np.uint8)
+    labels = None
     with suppress(InputError, ValueError):
         stored = open_photo(file(photo.image), f"{key}.image")
         check_pixels(stored.size, MOST_MEGAPIXELS, photo.image)
@@ -103,7 +118,7 @@ def _coloured(image: Pixels, labels: Labels, colours: UInt8[np.ndarray, "k 3"]) 
 
 
 def drawn(mesh: Mesh, by_label: UInt8[np.ndarray, "k 3"]) -> Pixels:
-    """A mesh in the colours of its labels, shaded as from a light at the camera."""
+    """Render a mesh in the colours of its labels, shaded by a light at the camera."""
     camera = Camera(MESH_SIDE, MESH_SIDE, MESH_SIDE * DISTANCE / 2.2, (MESH_SIDE / 2, MESH_SIDE / 2))
     rotation = np.diag([1.0, -1.0, -1.0])
     maps = rasterise(mesh, camera, Pose(rotation, np.array([0, 0, DISTANCE * mesh.radius]) - rotation @ mesh.centre))
@@ -113,7 +128,7 @@ def drawn(mesh: Mesh, by_label: UInt8[np.ndarray, "k 3"]) -> Pixels:
 
 
 def _colours(names: list[str], pictures: list[tuple[Pixels, Labels]]) -> UInt8[np.ndarray, "k 3"]:
-    """By label, distinct and near to what the photos show there; row 0 is the background's."""
+    """Return distinct colours by label, near the photos' mean colours; row 0 is the background's."""
     pixels = np.concatenate([np.zeros((0, 3)), *(image.reshape(-1, 3) for image, _ in pictures)])
     labels = np.concatenate([np.zeros(0), *(labels.label.ravel() for _, labels in pictures)])
     own = [pixels[labels == k] for k in range(1, len(names) + 1)]
@@ -123,12 +138,24 @@ def _colours(names: list[str], pictures: list[tuple[Pixels, Labels]]) -> UInt8[n
 
 
 def legend(names: list[str], by_label: UInt8[np.ndarray, "k 3"], width: int) -> Pixels:
-    """The materials and their colours, in as many lines of `width` pixels as they need; a longer name widens its own."""
-    pen, places, x, line = ImageDraw.Draw(Image.new("RGB", (1, 1))), [], MARGIN, 0
+    """Render the materials' names and colours, in as many lines of `width` pixels as they need.
+
+    A longer name widens the legend.
+
+    Args:
+        names: names of the materials
+        by_label: colours by label
+        width: width in pixels
+    """
+    pen = ImageDraw.Draw(Image.new("RGB", (1, 1)))
+    places = []
+    x = MARGIN
+    line = 0
     for name in names:
         own = int(pen.textlength(name)) + 1 + HEAD + 2 * MARGIN
         if x > MARGIN and x + own > width:
-            x, line = MARGIN, line + 1
+            x = MARGIN
+            line = line + 1
         places.append((x, MARGIN + line * HEAD, own))
         x += own
     sheet = Image.new("RGB", (max(x + own for x, _, own in places), (line + 1) * HEAD + 2 * MARGIN), PAPER)

@@ -1,7 +1,7 @@
-"""What a stage sees of the world: its inputs by logical name, an output folder, a way to say how far it is.
+"""Interface of a stage: its inputs by logical name, an output folder, and a progress report.
 
-A stage is a module `stages/<name>.py` with a frozen `Params` struct and `main(params, inputs, out, progress)`.
-It never learns where the store lies or whether it runs in a pool.
+A stage is a module `stages/<name>.py` with a frozen `Params` struct and `main(params, inputs, out, progress)`.  It does
+not know where the store is or whether it runs in a pool.
 """
 
 from __future__ import annotations
@@ -15,31 +15,34 @@ import msgspec
 
 @runtime_checkable
 class Progress(Protocol):
-    """Called as often as a stage likes: `done` of `total` pieces of work, and what is being done."""
+    """Callback that reports progress, as often as a stage likes."""
 
-    def __call__(self, done: float, total: float, text: str = "") -> None: ...
+    def __call__(self, done: float, total: float, text: str = "") -> None:
+        """Report that `done` of `total` pieces of work are done; `text` describes the current one."""
+        ...
 
 
 def silent(done: float, total: float, text: str = "") -> None:
-    """The progress of a stage that is called from a notebook or a test."""
+    """Ignore the progress of a stage that a notebook or a test calls."""
 
 
 def serial_map(function: Callable, items: Iterable) -> list:
-    """`map` in this process, all results at once, in the order of `items`."""
+    """Apply a function to the items in this process and return all results in order."""
     return [function(item) for item in items]
 
 
 class Inputs(msgspec.Struct, frozen=True):
     """The declared inputs of one step.
 
-    folders: stage name -> folder of that stage's files (of this photo only, where both are per photo);
-             parameter that names a folder -> that folder, where it is given
-    facts:   "dataset.<slice>" -> JSON-able facts of the dataset
-    files:   dataset-relative path, as it stands in dataset.yaml -> absolute path
-    photo:   name of this step's photo, None in a stage over the whole set
-    map:     an ordered map over independent work
-    log:     the run log (JSON lines), only for a stage that declares `logs: true`
-    unfinished: a folder that outlives a kill of this step and goes with its success; None outside the runner
+    Attributes:
+        folders: folder of files by stage (of this photo only, if both stages are per photo), or by a parameter that
+            names one
+        facts: JSON-able facts of the dataset by "dataset.<slice>"
+        files: absolute path by dataset-relative path as in dataset.yaml
+        photo: name of this step's photo, None in a stage over the whole set
+        map: an ordered map over independent work
+        log: the run log (JSON lines), only for a stage that declares `logs: true`
+        unfinished: a folder that survives a kill of this step and is deleted after its success; None outside the runner
     """
 
     folders: dict[str, Path]
@@ -54,9 +57,9 @@ class Inputs(msgspec.Struct, frozen=True):
         return self.folders[stage]
 
     def file(self, relative: str) -> Path:
-        """Absolute path of a file that dataset.yaml names; KeyError for one that this step did not declare."""
+        """Return the absolute path of a file of dataset.yaml; KeyError for one that the step did not declare."""
         return self.files[relative]
 
     def mesh(self, name: str, file: str | None) -> Path:
-        """Absolute path of a mesh: of its file in dataset.yaml, or where it has none, of what the stage `shapes` found."""
+        """Return the absolute path of a mesh: its file in dataset.yaml, or the result of the stage `shapes`."""
         return self.file(file) if file else self.folders["shapes"] / "meshes" / f"{name}.obj"

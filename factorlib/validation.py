@@ -1,9 +1,8 @@
-"""What can be said of files before anything runs: photos against their masks, meshes against their parts, what recipes name.
+"""Validation of files before anything runs: photos against masks, meshes against parts, and files of recipes.
 
-These are the checks that the stages make of what they read first, by the same functions, and that masks and dataset.yaml name the same materials;
-of photos only headers are read.
-The runner loads this module by its name, as it loads stages: it knows no science, and a run with nothing to do must not
-pay for any.
+The checks are those that stages make first, by the same functions, and the consistency of materials in masks and
+dataset.yaml.  Only headers of photos are read.  The runner loads this module by name, as it loads stages.  It knows no
+science, and a run with nothing to do must not import any.
 """
 
 from collections.abc import Callable, Iterable, Iterator
@@ -28,21 +27,27 @@ from factorlib.recipe.schema import is_light_file
 from factorlib.yamlfile import convert
 
 Check = Callable[[], object]
-NOT_ROUND = 0.02  # of a ball's radius
+NOT_ROUND = 0.02  # largest variation of a ball's radius, relative
 
 
 class Validation:
-    """The files of one dataset, each looked at once."""
+    """The files of one dataset, each checked once."""
 
     def __init__(self, dataset: Dataset):
-        self.dataset, self.spec, self.file = dataset, dataset.spec, dataset.folder.joinpath
+        self.dataset = dataset
+        self.spec = dataset.spec
+        self.file = dataset.folder.joinpath
         self._done: set[str] = set()
         self._parts: dict[str, list[tuple[str, ...]] | InputError] = {}
 
     def faults(self, slice_: str, photo: str | None, params: dict[str, Any], settings: Path) -> list[InputError]:
-        """Return what is wrong with the files that a slice names, of one photo or of all; what was looked at before is left out.
+        """Return the faults of the files that a slice names, except those checked before.
 
-        params: given to the stage that takes the slice, in the file `settings` or instead of what stands there
+        Args:
+            slice_: name of the slice
+            photo: name of the photo; None for all
+            params: parameters of the stage that takes the slice
+            settings: the file that gives them, for errors
         """
         checks = dict(self._checks(slice_, photo, params, settings))
         new = [check for what, check in checks.items() if what not in self._done]
@@ -50,12 +55,15 @@ class Validation:
         return _faults(new)
 
     def recipe_faults(self, files: dict[str, Path]) -> list[InputError]:
-        """Return what is wrong with the lights and meshes that a recipe names: files by how it writes them; tables were read with it."""
+        """Return the faults of the lights and meshes that a recipe names; tables are checked with the recipe.
+
+        `files` are the paths by the names that the recipe uses.
+        """
         lights = [partial(read_light_map, path) for path in files.values() if is_light_file(path.name)]
         return _faults([*lights, *(partial(read_parts, p) for p in files.values() if p.suffix.lower() in MESHES)])
 
     def cautions(self) -> list[str]:
-        """Return what no photo will tell, by the materials that dataset.yaml names."""
+        """Return warnings about what no photo can determine, from the materials that dataset.yaml names."""
         together: dict[str, set[str]] = {}
         for photo in self.spec.photos:
             together.setdefault(photo.light, set()).update(*(made_of(obj, self.spec) for obj in photo.objects))
@@ -66,7 +74,8 @@ class Validation:
         members = [[light for light in lights if component[min(together[light])] == k] for k in range(groups)]
         said = "; ".join(map(", ".join, members))
         return [
-            f"the lights fall into {groups} groups that share no material ({said}): brightness and colour cannot be compared between them. "
+            f"the lights fall into {groups} groups that share no material ({said}): "
+            "brightness and colour cannot be compared between them. "
             "A photo that shows a material of each would link them"
         ]
 
@@ -98,7 +107,7 @@ class Validation:
                 yield f"normals {name}", partial(self._normals, name, self.file(path))
 
     def _ball(self, obj: ObjectEntry, key: str) -> None:
-        """A mirror ball is round: all its vertices are as far from the middle of its bounding box."""
+        """Check that a mirror ball is round: its vertices are equally far from the centre of its bounding box."""
         if (file := self.spec.meshes[obj.mesh].file) is None:
             return
         made = self.spec.meshes[obj.mesh].made_of
@@ -114,7 +123,8 @@ class Validation:
         read_true_normals(path, name, size[::-1])
 
     def _photo(self, entry: PhotoEntry, most_megapixels: float) -> None:
-        key, path = f"photos[{entry.name}]", self.file(entry.image)
+        key = f"photos[{entry.name}]"
+        path = self.file(entry.image)
         size = open_photo(path, f"{key}.image").size
         check_pixels(size, most_megapixels, path, f"{key}.image")
         check_values(path, most_megapixels, f"{key}.image")
@@ -125,7 +135,7 @@ class Validation:
         check_materials(labels, objects, own, self.spec.materials, self.file(masks), f"{key}.objects")
 
     def _object(self, obj: ObjectEntry, mesh: MeshEntry, limits: Limits) -> None:
-        """The parts of a mesh file are read once; if they cannot be, that is said again for every object."""
+        """Check the parts of a mesh file, which is read once; a failure is raised again for every object."""
         file = self.file(mesh.file)
         if mesh.file not in self._parts:
             try:

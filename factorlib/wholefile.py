@@ -1,7 +1,7 @@
-"""Files that are there whole or not at all: no writer leaves a cut one, whatever the disk says.
+"""Files that exist whole or not at all: no writer leaves a truncated one, whatever error the disk reports.
 
-Python raises what `write` and `close` report; what a library does not report it must not write itself: let it write to
-memory (`bytes_of`) and hand over the bytes.
+Python raises the errors of `write` and `close`.  A library that ignores them must write to memory instead (`bytes_of`)
+and return the bytes.
 """
 
 from __future__ import annotations
@@ -13,12 +13,12 @@ import tempfile
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
-NO_SYNC = {errno.EINVAL, errno.ENOTSUP, errno.EBADF}  # said by file systems that cannot sync a folder
+NO_SYNC = {errno.EINVAL, errno.ENOTSUP, errno.EBADF}  # errors of file systems that cannot sync a folder
 
 
 @contextlib.contextmanager
 def writing(path: str | Path) -> Iterator[Path]:
-    """Guard what writes the file `path` inside: where that fails, the file is gone."""
+    """Delete the file `path` if the code inside, which writes it, fails."""
     try:
         yield Path(path)
     except BaseException:
@@ -27,18 +27,27 @@ def writing(path: str | Path) -> Iterator[Path]:
 
 
 def write_bytes(path: str | Path, data: bytes | memoryview) -> None:
-    """Write a file, whole or not at all; OSError, with the file's name, where that fails."""
+    """Write a file, whole or not at all; a failure raises OSError with the file's name."""
     with writing(path), open(path, "wb") as stream:
         stream.write(data)
 
 
 def write_text(path: str | Path, text: str, encoding: str = "utf-8") -> None:
-    """Write a text file, whole or not at all; OSError, with the file's name, where that fails."""
+    """Write a text file, whole or not at all; a failure raises OSError with the file's name.
+
+    Args:
+        path: the file
+        text: its content
+        encoding: its encoding
+    """
     write_bytes(path, text.encode(encoding))
 
 
 def replace_file(path: str | Path, data: bytes) -> None:
-    """Replace it by one rename, on disk when it returns: whoever reads `path` finds the old or the new content, after a power cut too."""
+    """Replace a file by one rename, and sync it to disk.
+
+    A reader of `path` gets the old or the new content, after a power cut too.
+    """
     path = Path(path)
     draft = path.with_name(f".{path.name}.{os.getpid()}")
     with writing(draft):
@@ -51,7 +60,7 @@ def replace_file(path: str | Path, data: bytes) -> None:
 
 
 def append_text(path: Path, text: str) -> None:
-    """`text` at the end of the file, all of it or nothing; its folder is made."""
+    """Append text to a file, whole or not at all, and create its folder if needed."""
     path.parent.mkdir(parents=True, exist_ok=True)
     with open(path, "ab", buffering=0) as stream:
         before, data = stream.seek(0, os.SEEK_END), text.encode("utf-8")
@@ -64,13 +73,13 @@ def append_text(path: Path, text: str) -> None:
 
 
 def sync_tree(folder: Path) -> None:
-    """Every file and folder below a folder, and itself, on disk."""
+    """Sync a folder and everything below it to disk."""
     for path in (*folder.rglob("*"), folder):
         sync(path)
 
 
 def sync(path: Path) -> None:
-    """A file's content, or a folder's entries, on disk."""
+    """Sync a file's content, or a folder's entries, to disk."""
     descriptor = os.open(path, os.O_RDONLY)
     try:
         os.fsync(descriptor)
@@ -82,10 +91,10 @@ def sync(path: Path) -> None:
 
 
 def bytes_of(write: Callable[[str], None]) -> bytes:
-    """Return what `write(path)` writes, to a file in memory: for libraries that say nothing where there is no more room.
+    """Return the bytes that `write(path)` writes to a file in memory, for libraries that ignore a full disk.
 
-    Where the system has no files in memory, a temporary one stands in.  There, too, room can end (`ulimit -f`): then
-    there is none for one byte more.
+    A temporary file stands in on systems without files in memory.  Its space can end too (`ulimit -f`); writing one
+    more byte then fails.
     """
     in_memory = hasattr(os, "memfd_create")
     with open(os.memfd_create("factorlib"), "r+b") if in_memory else tempfile.TemporaryFile() as stream:

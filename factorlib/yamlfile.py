@@ -1,8 +1,8 @@
-"""YAML files as typed structs: scalars as in YAML 1.2, no key twice or unknown, every complaint with file, line and key.
+"""YAML files as typed structs: scalars as in YAML 1.2, no duplicate or unknown key, errors with file, line and key.
 
-PyYAML reads `1e-3` as a string and `no` as False, and lets a duplicate key win silently, so only its events are used.  What is
-nested without end, grows without end through aliases, or is merely huge is refused when it passes a limit, not when memory or
-the stack is full.  msgspec converts the value to its type, whose `Meta` says what a number or a name may be and how to mend it.
+PyYAML reads `1e-3` as a string and `no` as False, and silently accepts a duplicate key, so only its events are used.
+Nesting, growth through aliases and size have limits, so that an error comes before memory or the stack is full.
+msgspec converts the value to its type, whose `Meta` states the valid numbers or names and the cure for others.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from factorlib.errors import InputError, did_you_mean, raise_all
 from factorlib.reading import one_line, read_text
 
 T = TypeVar("T")
-Keys = tuple[str | int, ...]  # the way to a value: mapping keys and list indices from the root
+Keys = tuple[str | int, ...]  # path to a value: mapping keys and list indices from the root
 _CORE = re.compile(  # YAML 1.2.2, section 10.3.2
     r"(?P<null>~|null|Null|NULL|)|(?P<bool>true|True|TRUE|false|False|FALSE)|(?P<int>[-+]?[0-9]+|0o[0-7]+|0x[0-9a-fA-F]+)"
     r"|(?P<float>[-+]?(?:\.[0-9]+|[0-9]+(?:\.[0-9]*)?)(?:[eE][-+]?[0-9]+)?|[-+]?\.(?:inf|Inf|INF)|\.(?:nan|NaN|NAN))"
@@ -29,24 +29,43 @@ _Parser = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
 _FIELD = re.compile(r"(?P<fault>unknown|missing required) field `(?P<name>.*)`", re.DOTALL)
 
 
-# The most that a file may hold, far above a dataset of ten thousand photos: values are scalars, lists and maps, those that
-# aliases repeat counted each time; the depth is that of lists and maps in each other; digits are those of a number.
-MOST_BYTES, MOST_VALUES, MOST_DEPTH, MOST_DIGITS = 64_000_000, 2_000_000, 64, 300
+# limits of a file, far above a dataset of ten thousand photos
+MOST_BYTES = 64_000_000
+MOST_VALUES = 2_000_000  # scalars, lists and maps; those that aliases repeat count each time
+MOST_DEPTH = 64  # nesting of lists and maps
+MOST_DIGITS = 300  # characters of a number
 
 
 def read_yaml(path: str | Path, type_: type[T], most_values: int = MOST_VALUES) -> T:
-    """The file as a value of a msgspec type; InputError with file, line, key and cure for whatever does not fit."""
+    """Read a file as a value of a msgspec type.
+
+    Args:
+        path: the file
+        type_: the type
+        most_values: largest number of values
+
+    Raises:
+        InputError: Something does not fit; the error names file, line, key and cure.
+    """
     text = read_text(path, "a YAML file", most_bytes=MOST_BYTES)
     return convert(parse_yaml(text, path, most_values), type_, path, text=text)
 
 
 def load_yaml(path: str | Path) -> Any:
-    """The file as dicts, lists and scalars; InputError with file, line, key and cure for what is not YAML."""
+    """Read a file as dicts, lists and scalars; InputError names file, line, key and cure if it is not YAML."""
     return parse_yaml(read_text(path, "a YAML file", most_bytes=MOST_BYTES), path)
 
 
 def parse_yaml(text: str, name: str | Path = "", most_values: int = MOST_VALUES) -> Any:
-    """The text's one document as dicts, lists and scalars; InputError names line, key and `name`, which errors call the text.
+    """Parse the text's one document to dicts, lists and scalars.
+
+    Args:
+        text: the text
+        name: the name of the text in errors
+        most_values: largest number of values
+
+    Raises:
+        InputError: The text is not YAML; the error names line and key.
 
     >>> parse_yaml("{a: 1e-3, b: no, c: [1, ~, true]}")
     {'a': 0.001, 'b': 'no', 'c': [1, None, True]}
@@ -55,14 +74,19 @@ def parse_yaml(text: str, name: str | Path = "", most_values: int = MOST_VALUES)
 
 
 class _Document:
-    """One pass over the events of a text, which builds its value and counts it."""
+    """One pass over the events of a text that builds its value and counts its parts."""
 
     def __init__(self, text: str, name: str | Path, most_values: int):
-        self.text, self.name, self.most_values, self.events = text, name, most_values, self._events()
-        self.count, self.anchors, self.unfinished = 0, {}, set()
+        self.text = text
+        self.name = name
+        self.most_values = most_values
+        self.events = self._events()
+        self.count = 0
+        self.anchors = {}
+        self.unfinished = set()
 
     def value(self) -> Any:
-        """The value of the one document in the text, None for an empty text.  InputError where there is a second."""
+        """Return the value of the text's one document, None for an empty text; InputError for a second document."""
         next(self.events)  # the stream
         if isinstance(next(self.events), yaml.StreamEndEvent):
             return None
@@ -76,7 +100,8 @@ class _Document:
         try:
             yield from yaml.parse(self.text, Loader=_Parser)
         except yaml.YAMLError as error:
-            mark, context = getattr(error, "problem_mark", None), getattr(error, "context", None)
+            mark = getattr(error, "problem_mark", None)
+            context = getattr(error, "context", None)
             words = [one_line(part) for part in (getattr(error, "problem", None) or str(error), context) if part]
             cure = "look for a bracket, quote, colon or indent on or above this line"
             file = f"{self.name}:{mark.line + 1}" if mark else self.name
@@ -107,7 +132,8 @@ class _Document:
         return value
 
     def _map(self, keys: Keys) -> dict[str, Any]:
-        values, lines = {}, {}
+        values = {}
+        lines = {}
         while not isinstance(event := next(self.events), yaml.MappingEndEvent):
             if not isinstance(event, yaml.ScalarEvent):
                 self._refuse("a key that is not a word", event, keys, "write key: value")
@@ -120,7 +146,7 @@ class _Document:
         return values
 
     def _copy(self, value: Any, event: yaml.Event, keys: Keys, depth: int) -> Any:
-        """A copy of what an alias repeats, each value of which counts."""
+        """Copy the value that an alias repeats, and count its parts."""
         self._count(event, keys, depth)
         if isinstance(value, list):
             return [self._copy(item, event, keys, depth + 1) for item in value]
@@ -138,7 +164,8 @@ class _Document:
             self._refuse(fault, event, keys[:4], "is a bracket missing, or an indent too much?")
 
     def _scalar(self, event: yaml.ScalarEvent, keys: Keys) -> Any:
-        text, match = event.value, _CORE.fullmatch(event.value)
+        text = event.value
+        match = _CORE.fullmatch(event.value)
         kind = match.lastgroup if match and event.tag is None and event.implicit[0] else "str"
         if kind in ("int", "float") and len(text) > MOST_DIGITS:
             cure = f"write it with {MOST_DIGITS} at most"
@@ -154,7 +181,7 @@ class _Document:
 
 
 def key_path(keys: Keys) -> str | None:
-    """The way to a value as errors write it.
+    """Return the path to a value as errors write it.
 
     >>> key_path(("photos", 0, "masks"))
     'photos[0].masks'
@@ -164,10 +191,19 @@ def key_path(keys: Keys) -> str | None:
 
 
 def convert(value: Any, type_: type[T], name: str | Path, prefix: str = "", text: str | None = None) -> T:
-    """Plain data, wherever it came from, as a value of a msgspec type; errors as in `read_yaml`.
+    """Convert plain data to a value of a msgspec type.
 
-    The cure is the `description` of the field's `Meta`, where it has one.
-    name: what errors call the data;  prefix: stands before their keys;  text: what it was read from, for their lines
+    The cure of an error is the `description` of the field's `Meta`, if it has one.
+
+    Args:
+        value: the data
+        type_: the type
+        name: the name of the data in errors
+        prefix: the prefix of keys in errors
+        text: the YAML text of the data, for line numbers in errors
+
+    Raises:
+        InputError: Something does not fit, as for `read_yaml`.
     """
     try:
         return msgspec.convert(value, type_)
@@ -178,12 +214,14 @@ def convert(value: Any, type_: type[T], name: str | Path, prefix: str = "", text
 
 
 def _fault(words: str, value: Any, types: list, keys: Keys, name: str | Path, prefix: str, root: Any) -> InputError:
-    """What msgspec says of a value, with its key and a cure."""
+    """Convert msgspec's error about a value to an InputError with key and cure."""
     if field := _FIELD.search(words):
-        words, cure = f"the key {field['name']!r} is missing", f"add {field['name']}: …"
+        words = f"the key {field['name']!r} is missing"
+        cure = f"add {field['name']}: …"
         if field["fault"] == "unknown":
             known = [f.encode_name for each in types if _is_struct(each) for f in msgspec.structs.fields(each)]
-            words, cure = f"unknown key {one_line(repr(field['name']))}", did_you_mean(field["name"], known)
+            words = f"unknown key {one_line(repr(field['name']))}"
+            cure = did_you_mean(field["name"], known)
             keys = (*keys, field["name"])
     else:
         choices = [str(word) for each in types if get_origin(each) is Literal for word in get_args(each)]
@@ -202,9 +240,9 @@ def _fault(words: str, value: Any, types: list, keys: Keys, name: str | Path, pr
 def _innermost(
     error: msgspec.ValidationError, value: Any, type_: Any, keys: Keys = ()
 ) -> list[tuple[str, Any, list, Keys]]:
-    """Of each innermost value at fault, the fault's words, the value, the types that it may have, and the way to it."""
+    """Return the error text, value, possible types and path of each innermost invalid value."""
     types = [type_]
-    for each in types:  # and, where one is a union or described by a `Meta`, all that it stands for
+    for each in types:  # grows by the members of unions and the types inside `Annotated`
         types += get_args(each) if get_origin(each) in (Union, UnionType) else ()
         types += get_args(each)[:1] if get_origin(each) is Annotated else ()
     found = []
@@ -217,8 +255,9 @@ def _innermost(
 
 
 def _children(value: Any, type_: Any) -> Iterator[tuple[str | int, Any, Any]]:
-    """Key, value and type of what a list or map holds, and of a map's own keys."""
-    args, origin = get_args(type_), get_origin(type_)
+    """Yield key, value and type of the items of a list or map, and of a map's own keys."""
+    args = get_args(type_)
+    origin = get_origin(type_)
     if isinstance(value, dict) and origin is dict:
         yield from ((key, key, args[0]) for key in value)
         yield from ((key, item, args[1]) for key, item in value.items())
@@ -235,7 +274,7 @@ def _is_struct(type_: Any) -> bool:
 
 
 def _line_of(node: yaml.Node | None, keys: Keys) -> int:
-    """The line on which the value at `keys` of a document stands, or what of the way to it is there."""
+    """Return the line of the value at `keys` of a document, or of the last existing part of that path."""
     line = node.start_mark.line if node else 0
     for key in keys:
         if isinstance(node, yaml.MappingNode):
@@ -248,16 +287,22 @@ def _line_of(node: yaml.Node | None, keys: Keys) -> int:
 
 
 class _Dumper(yaml.SafeDumper):
-    """Maps as blocks, other lists on one line; words plain, other text in quotes, for YAML 1.2 has other numbers than PyYAML."""
+    """Dumper with maps as blocks and other lists on one line.
+
+    Words are plain and other text is quoted, because YAML 1.2 has other numbers than PyYAML.
+    """
 
     def increase_indent(self, flow: bool = False, indentless: bool = False) -> None:
+        """Indent lists inside maps."""
         super().increase_indent(flow, False)
 
     def represent_str(self, text: str) -> yaml.Node:
+        """Represent a word plain, other text in double quotes."""
         plain = re.fullmatch(r"[A-Za-z_][A-Za-z0-9_./-]*", text)
         return self.represent_scalar("tag:yaml.org,2002:str", text, style=None if plain else '"')
 
     def represent_list(self, items: list) -> yaml.Node:
+        """Represent a list without maps on one line."""
         flow = not any(isinstance(item, dict) for item in items)
         return self.represent_sequence("tag:yaml.org,2002:seq", items, flow_style=flow)
 
@@ -267,7 +312,7 @@ _Dumper.add_representer(list, _Dumper.represent_list)
 
 
 def yaml_text(value: Any) -> str:
-    """Dicts, lists and scalars as YAML that `parse_yaml` reads.
+    """Return dicts, lists and scalars as YAML that `parse_yaml` reads.
 
     >>> print(yaml_text({"a": [1, 0.5], "b": [{"c": "x", "d": {"e": "1"}}]}), end="")
     a: [1, 0.5]
@@ -280,7 +325,13 @@ def yaml_text(value: Any) -> str:
 
 
 def with_value(text: str, keys: Keys, word: str) -> str:
-    """The text with `word`, as it is written, in place of the value at `keys`, which is there; every other character stays."""
+    """Return the text with the value at `keys`, which must exist, replaced; every other character is unchanged.
+
+    Args:
+        text: the YAML text
+        keys: path to the value
+        word: the new value, as written
+    """
     node = yaml.compose(text, Loader=yaml.SafeLoader)
     for key in keys:
         node = node.value[key] if isinstance(key, int) else next(item for name, item in node.value if name.value == key)

@@ -1,4 +1,7 @@
-"""Where the meshes are in each photo, and what every pixel sees of them: normals, view directions, depth, labels."""
+"""Pose estimation: poses of the meshes in one photo, with maps of normals, view directions, depth and labels.
+
+Writes <photo>.json (camera and poses), <photo>.exr (maps in the camera frame) and <photo>_overlay.png.
+"""
 
 import logging
 from pathlib import Path
@@ -40,43 +43,48 @@ EXTERNAL = (
 
 
 class Params(Standards, frozen=True, forbid_unknown_fields=True):
-    """How meshes are read and poses searched, and what follows from a doubtful pose."""
+    """Parameters of mesh reading and pose search, and the handling of doubtful poses."""
 
     crease_deg: Annotated[float, msgspec.Meta(gt=0, le=180)] = CREASE_DEG
-    """Angle, in degrees, between the normals of two triangles above which the edge between them stays sharp."""
+    """Crease angle, in degrees: an edge whose two triangles differ by more in their normals stays sharp."""
     strict: bool = False
-    """Whether a doubtful pose stops the run."""
+    """Stop the run at a doubtful pose."""
     keep_doubtful: bool = False
-    """Whether an object whose pose was found, and is doubtful, takes part in the solve."""
+    """Use objects with a doubtful estimated pose in the solve; otherwise they are left out."""
     limits: Limits = Limits()
     search: Search = Search()
 
 
 def main(params: Params, inputs: Inputs, out: Path, progress: Progress) -> None:
     """Align the meshes of one photo and write its maps, its poses and the overlay."""
-    name, materials = inputs.photo, inputs.facts["dataset.materials"]
+    name = inputs.photo
+    materials = inputs.facts["dataset.materials"]
     slice_ = msgspec.convert(inputs.facts["dataset.objects"], ObjectsSlice)
     if camera := read_shapes(inputs.folders.get("shapes")).cameras.get(name):
         slice_ = msgspec.structs.replace(slice_, external=camera)
-    channels, facts = read_exr(inputs["masks"] / f"{name}.exr"), read_photo_facts(inputs["masks"] / f"{name}.json")
+    channels = read_exr(inputs["masks"] / f"{name}.exr")
+    facts = read_photo_facts(inputs["masks"] / f"{name}.json")
     earlier = read_poses(inputs["poses"] / FILE).get(name) if "poses" in inputs.folders else None
     objects = objects_of(slice_, channels, inputs, params, facts.factor, earlier)
     camera, known = camera_of(slice_, facts, name)
     external = slice_.external.source if slice_.external else None
     sources = ["given" if own.pose else external for own in slice_.objects]
+    # given data: refuse objects behind the camera, warn of materials that do not match and of an unlikely camera
     for each, source in zip(objects, sources, strict=True):
         if each.pose is not None:
             given_by = "dataset" if source == "given" else source
             check_before_camera(each.caster.mesh, each.pose, name, each.name, given_by)
     warn_of_materials(channels["label"], [each.caster.mesh.labels for each in objects], materials, name)
     warn_of_camera(known.focal, camera.centre, (camera.width, camera.height), name)
+    # focal length of an earlier run, in pixels of this one: the two may have reduced the photo by different factors
     before = None
-    if earlier:  # the photo may have been averaged down by another factor then
+    if earlier:
         focal = earlier.camera.focal_px * (earlier.camera.factor / facts.factor)
         before = msgspec.structs.replace(earlier.camera, focal_px=focal, factor=facts.factor)
-    pieces = 2 * len(objects)  # each is placed, then judged
+    pieces = 2 * len(objects)  # a pose and a check of it for each object
     result = placed(objects, camera, known, name, params.search, before, lambda done: progress(done, pieces, name))
-    camera, maps = result.camera, rasterise([each.caster for each in objects], result.camera, result.poses)
+    camera = result.camera
+    maps = rasterise([each.caster for each in objects], result.camera, result.poses)
     whole = silhouette_of_photo(channels)
     write_png(out / f"{name}_overlay.png", overlay(np.stack([channels[c] for c in "RGB"], axis=-1), maps, whole))
     entries = []
@@ -85,6 +93,7 @@ def main(params: Params, inputs: Inputs, out: Path, progress: Progress) -> None:
         entries.append(entry(each, k, result, maps, params, sources[k]))
     for each, of_each in zip(objects, entries, strict=True):
         complain(name, each.name, of_each, params.strict)
+    # maps of the photo; pixels of objects that are left out have confidence 0
     left_out = np.isin(maps.object, [k for k, of_each in enumerate(entries, start=1) if of_each.left_out])
     channels = {f"{kind}.{a}": getattr(maps, kind)[..., k] for kind in ("normal", "view") for k, a in enumerate("xyz")}
     channels |= {kind: getattr(maps, kind) for kind in ("depth", "label", "object")}
@@ -99,20 +108,34 @@ def main(params: Params, inputs: Inputs, out: Path, progress: Progress) -> None:
 def objects_of(
     slice_: ObjectsSlice, channels: dict, inputs: Inputs, params: Params, factor: int, earlier: PhotoPoses | None
 ) -> list[ObjectToPlace]:
-    """Every object of the photo, which was averaged down by `factor`; poses that dataset.yaml or its source of cameras gives go
-    before those found earlier, these before keypoints."""
-    objects, materials = [], inputs.facts["dataset.materials"]
+    """Return every object of the photo, with its mesh, its silhouette and what is known of its pose.
+
+    A pose in dataset.yaml or in its camera source takes precedence over one of an earlier run, and that over keypoints.
+
+    Args:
+        slice_: Objects, meshes and camera of the photo.
+        channels: Channels of the EXR that `masks` writes.
+        inputs: Inputs of the stage.
+        params: Parameters of the stage.
+        factor: Factor by which `masks` reduced the photo.
+        earlier: Poses of an earlier run, or None.
+    """
+    objects = []
+    materials = inputs.facts["dataset.materials"]
     for number, own in enumerate(slice_.objects, start=1):
-        mesh, pose, keypoints = slice_.meshes[own.mesh], own.pose, None
+        mesh = slice_.meshes[own.mesh]
+        pose = own.pose
+        keypoints = None
         if pose is None and slice_.external:
             pose = slice_.external.poses.get(own.name)
         before = earlier.objects.get(own.name) if earlier and pose is None else None
-        file, scale = inputs.mesh(own.mesh, mesh.file), before.scale if before else AS_IT_IS
+        file = inputs.mesh(own.mesh, mesh.file)
+        scale = before.scale if before else AS_IT_IS
         read = read_mesh(file, materials, mesh.made_of, own.materials, params.crease_deg, params.limits)
         silhouette = silhouette_of_object(channels, number, read.labels, own.mask is not None)
         if pose is not None:
             pose = Pose(np.array(pose.rotation), np.array(pose.translation))
-        if own.keypoints:
+        if own.keypoints:  # pixels of the file, to undistorted pixels of the reduced photo
             pixels, points = (np.array([getattr(k, of) for k in own.keypoints]) for of in ("pixel", "point"))
             pixels = pixels / factor
             lens = lens_of(slice_.camera, factor, *channels["label"].shape[::-1])
@@ -123,13 +146,24 @@ def objects_of(
 
 
 def entry(obj: ObjectToPlace, k: int, result: Placed, maps: Maps, params: Params, source: str | None) -> ObjectEntry:
-    """Return what poses.json says of one object; `doubts` is empty for a pose to be believed, one found that is not is left out.
+    """Return the entry of one object in poses.json.
 
-    source: where the pose is from, if it was not searched.
+    A pose without `doubts` is reliable.  An object with a doubtful estimated pose is left out of the solve.
+
+    Args:
+        obj: Object, with its silhouette.
+        k: Index of the object in the photo, from 0.
+        result: Poses and camera.
+        maps: Maps of the rasterised objects.
+        params: Parameters of the stage.
+        source: Source of the pose, if it was not searched.
     """
     label = np.where(maps.object == k + 1, maps.label, 0)
-    iou, agreement = silhouette_iou(obj.silhouette, label), label_agreement(obj.silhouette, label)
-    found, trust, runner_up = result.found[k], trust_in(obj, result, k), None
+    iou = silhouette_iou(obj.silhouette, label)
+    agreement = label_agreement(obj.silhouette, label)
+    found = result.found[k]
+    trust = trust_in(obj, result, k)
+    runner_up = None
     reasons = doubts(iou, agreement, trust, found, params)
     if found is not None:
         source = "refined" if found.earlier else "keypoints" if found.by_keypoints else "found"
@@ -144,7 +178,11 @@ def entry(obj: ObjectToPlace, k: int, result: Placed, maps: Maps, params: Params
 
 
 def complain(photo: str, name: str, entry: ObjectEntry, strict: bool) -> None:
-    """Warn of a pose's doubts; `strict`: raise InputError for the first instead."""
+    """Warn of each doubt about a pose.
+
+    Raises:
+        InputError: With `strict`, for the first doubt.
+    """
     cure = EXTERNAL if entry.source in (*SOURCES, "sfm") else CURE
     for reason in entry.doubts:
         if strict:

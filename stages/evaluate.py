@@ -1,7 +1,7 @@
-"""How good the result is: re-synthesis against the photos, everything else against the truth where there is one.
+"""Evaluation: re-synthesis compared with the photos, and all other results with the ground truth if there is one.
 
-Writes metrics.json, whose keys are documented in `factorlib.results.metrics`, and verdict.txt.  Only this stage reads the truth: so that
-the report can show it, it also writes illumination/<light>.exr (the true map) and spheres/<light>_{truth,estimate}.exr.
+Writes metrics.json (`factorlib.results.metrics` describes its keys) and verdict.txt.  No other stage reads the truth.
+For the report it writes illumination/<light>.exr (the true map) and spheres/<light>_{truth,estimate}.exr.
 """
 
 from itertools import count
@@ -44,25 +44,27 @@ MISSING = {
 
 
 class Params(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """Nothing to choose: a metric that can be tuned is none."""
+    """Empty parameters: metrics cannot be tuned."""
 
 
 def main(params: Params, inputs: Inputs, out: Path, progress: Progress) -> None:
-    """Compare everything that was solved with the photos and the truth, and write metrics.json."""
+    """Compare results with the photos and the truth, and write metrics.json."""
     lights = msgspec.convert(inputs.facts["dataset.light"], dict[str, LightSlice])
     truth = msgspec.convert(inputs.facts["dataset.truth"], TruthFile | None)
-    materials, done = inputs.facts["dataset.materials"], count()
+    materials = inputs.facts["dataset.materials"]
+    done = count()
     total = 2 * len(lights) + (len(MISSING) if truth else 0) + 1
 
     def shot(name: str) -> Shot:
-        """A photo beside its re-synthesis; each is read twice."""
+        """Return a photo and its re-synthesis; `compare_photos` reads each twice."""
         progress(next(done), total, f"re-synthesis of {name}")
         photo = read_exr(inputs["masks"] / f"{name}.exr")
         geometry = read_geometry(inputs["align"], inputs.folders.get("surface"), name)
         return shot_of(photo, geometry, read_rgb_exr(inputs["render"] / "resynthesis" / f"{name}.exr"))
 
     resynthesis = compare_photos(lights, materials, shot)
-    seen: dict[str, list[str]] = {slice_.illumination: [] for slice_ in lights.values()}  # materials in each light
+    # observed materials of each light, and the connected components of the graph of materials and lights
+    seen: dict[str, list[str]] = {slice_.illumination: [] for slice_ in lights.values()}
     for name, photo in resynthesis.photos.items():
         row = seen[lights[name].illumination]
         row.extend(m for m in photo.materials if m not in row)
@@ -96,10 +98,16 @@ def main(params: Params, inputs: Inputs, out: Path, progress: Progress) -> None:
 
 
 def _verdict(inputs: Inputs, seen: dict[str, list[str]]) -> Verdict | None:
-    """How far the result can be trusted; seen: by light, the materials of which a pixel counts."""
+    """Return the verdict on the result's reliability; None without observed materials.
+
+    Args:
+        inputs: Inputs of the stage.
+        seen: Names of the observed materials, by light.
+    """
     table = read_materials(inputs["export"] / "materials.json")
     uncertainty = read_uncertainty(inputs["solve"] / "uncertainty.json")
-    shown, files = {m for names in seen.values() for m in names}, inputs["export"] / "illumination"
+    shown = {m for names in seen.values() for m in names}
+    files = inputs["export"] / "illumination"
     materials = {name: solved for name, solved in table.materials.items() if name in shown}
     lights = {name: light_of_lat_long(read_rgb_exr(files / f"{name}.exr")) for name, names in seen.items() if names}
     if not (materials and uncertainty.photos):
@@ -108,13 +116,15 @@ def _verdict(inputs: Inputs, seen: dict[str, list[str]]) -> Verdict | None:
         photo: {name: own.contour_error for name, own in entry.objects.items() if own.contour_error is not None}
         for photo, entry in read_poses(inputs["align"] / "poses.json").items()
     }
-    errors, misfit = material_errors(materials, lights), (uncertainty.unexplained, uncertainty.photos)
+    errors = material_errors(materials, lights)
+    misfit = (uncertainty.unexplained, uncertainty.photos)
     return verdict(Signs(errors, *misfit, contours, uncertainty.residual_sigma))
 
 
 def _lights(inputs: Inputs, truth: TruthFile, out: Path) -> tuple[dict[str, Light], dict[str, Light]]:
-    """The true lights, and the estimated ones of these; writes the maps and spheres of those that are estimated."""
-    true, estimated = {}, {}
+    """Return the true lights and those of them that are estimated, and write maps and spheres of the latter."""
+    true = {}
+    estimated = {}
     for name, path in truth.illumination.items():
         true[name] = light_of_lat_long(read_true_light(inputs.file(path), name))
         if (file := inputs["export"] / "illumination" / f"{name}.exr").exists():
@@ -128,14 +138,14 @@ def _lights(inputs: Inputs, truth: TruthFile, out: Path) -> tuple[dict[str, Ligh
 
 
 def _geometry(inputs: Inputs, name: str) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Normals and views [h w 3] of a photo and its observed pixels."""
+    """Return normals and view directions [h, w, 3] of a photo, in its camera frame, and its observed pixels [h, w]."""
     geometry = read_geometry(inputs["align"], inputs.folders.get("surface"), name)
     normal, view = (np.stack([geometry[f"{kind}.{a}"] for a in "xyz"], axis=-1) for kind in ("normal", "view"))
     return normal, view, observed_pixels(read_exr(inputs["masks"] / f"{name}.exr"), geometry)
 
 
 def _mirrored(inputs: Inputs, lights: dict[str, LightSlice]) -> dict[str, np.ndarray]:
-    """The directions of each light that an observed pixel mirrors."""
+    """Return, by light, a mask of the directions that an observed pixel mirrors."""
     mirrored: dict[str, np.ndarray] = {}
     for name, slice_ in lights.items():
         normal, view, pixels = _geometry(inputs, name)
@@ -146,15 +156,18 @@ def _mirrored(inputs: Inputs, lights: dict[str, LightSlice]) -> dict[str, np.nda
 
 
 def _normals(inputs: Inputs, truth: TruthFile, lights: dict[str, LightSlice]) -> dict[str, NormalError] | None:
-    errors, photos = {}, read_photos(inputs["masks"] / "photos.json")
+    """Return the errors of normals, by photo; None without true normals."""
+    errors = {}
+    photos = read_photos(inputs["masks"] / "photos.json")
     for name in [name for name in lights if name in truth.normals]:
         true = read_true_normals(inputs.file(truth.normals[name]), name, photos[name].original_size)
         normal, _, pixels = _geometry(inputs, name)
-        errors[name] = normal_error(normal, averaged_normals(true, photos[name].factor), pixels)  # as the photo was
+        errors[name] = normal_error(normal, averaged_normals(true, photos[name].factor), pixels)
     return {name: error for name, error in errors.items() if error} or None
 
 
 def _poses(inputs: Inputs, truth: TruthFile) -> dict[str, dict[str, PoseError]] | None:
+    """Return the errors of poses, by photo and object; None without true poses of these objects."""
     estimated = read_poses(inputs["align"] / "poses.json")
     errors: dict[str, dict[str, PoseError]] = {}
     for photo, objects in truth.poses.items():

@@ -1,8 +1,14 @@
-"""What was solved, in the forms that other programs read.
+"""Export of materials, lights and scenes to the formats of other programs.
 
-Writes illumination/<light>.exr and .hdr, coverage/<light>.exr, materials.json, lobes.parquet and exposures.json in the gauge that
-Mitsuba needs, scenes/<photo>.xml with their meshes and lights, the same scenes for Blender and as OpenUSD, materials.mtlx, <mesh>.glb and meshes/<mesh>.ply,
-and losses.json: what is lost on the way to other programs.
+Writes, in the gauge that Mitsuba needs:
+
+illumination/<light>.exr, .hdr   Environment maps; a light with suns also gets <light>_sky.exr and <light>_suns.gltf.
+coverage/<light>.exr             Standard error of radiance over its mean, in the same layout.
+materials.json, lobes.parquet, exposures.json, lights.json
+scenes/<photo>.xml               Mitsuba scenes, with meshes and lights; the same scenes for Blender and as OpenUSD.
+materials.mtlx, <mesh>.glb, meshes/<mesh>.ply
+losses.json                      Properties that each format cannot express.
+dataset.json, source/            Facts and meshes of the dataset, for new pictures of the result.
 """
 
 import logging
@@ -41,34 +47,37 @@ from factorlib.stage import Inputs, Progress
 from factorlib.wholefile import write_bytes, write_text
 
 log = logging.getLogger("factorlib.export")
-SKY = "_sky"  # ends the name of a map without its suns
+SKY = "_sky"  # suffix of the map without suns
 Rows = Annotated[int, msgspec.Meta(ge=8, le=4096)]
 
 
 class Params(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """Sizes of what is written, and how meshes are read."""
+    """Sizes of exported maps, and parameters of mesh reading."""
 
     height: Rows = 128
-    """Rows of the exported environment maps, which are twice as wide."""
+    """Rows of the exported environment maps; the number of columns is twice as large."""
     mitsuba_height: Rows = 256
     """Rows of the environment maps in the Mitsuba scenes."""
     crease_deg: Annotated[float, msgspec.Meta(gt=0, le=180)] = CREASE_DEG
-    """Angle, in degrees, between the normals of two triangles above which the edge between them stays sharp."""
+    """Crease angle, in degrees: an edge whose two triangles differ by more in their normals stays sharp."""
 
 
 def main(params: Params, inputs: Inputs, out: Path, progress: Progress) -> None:
-    """Write materials, lights, coverage and scenes in the forms of other programs."""
-    names, solved = inputs.facts["dataset.materials"], inputs["solve"]
+    """Write materials, lights, coverage and scenes in the formats of other programs."""
+    names = inputs.facts["dataset.materials"]
+    solved = inputs["solve"]
     lights = msgspec.convert(inputs.facts["dataset.light"], dict[str, LightSlice])
     objects = msgspec.convert(inputs.facts["dataset.objects"], dict[str, ObjectsSlice])
     meshes = dict(sorted({n: m for each in objects.values() for n, m in each.meshes.items()}.items()))
-    total, done = 1 + len({light.illumination for light in lights.values()}) + len(meshes) + len(lights), count()
+    total = 1 + len({light.illumination for light in lights.values()}) + len(meshes) + len(lights)
+    done = count()
     progress(next(done), total, "materials")
-    table, exposures = read_materials(solved / "materials.json"), read_exposures(solved / "exposures.json")
+    table = read_materials(solved / "materials.json")
+    exposures = read_exposures(solved / "exposures.json")
+    # gauge of Mitsuba, max k_d + max k_s < 1: one factor multiplies all reflectances and divides all lights
     factor = headroom_factor(table.materials)
     table = table_in_gauge(table, factor)
     materials = reflectances(table)
-    # the factor that leaves the materials enters the lights
     lobes = {n: light.scaled(1 / factor) for n, light in _solved_lights(solved / "lobes.parquet", lights).items()}
     write_json(out / "materials.json", table)
     write_json(out / "exposures.json", exposures)
@@ -101,11 +110,9 @@ def main(params: Params, inputs: Inputs, out: Path, progress: Progress) -> None:
     poses = read_poses(inputs["align"] / "poses.json")
     for photo, light in lights.items():
         progress(next(done), total, f"scene of {photo}")
-        size = oiio.ImageInput.open(str(inputs["align"] / f"{photo}.exr")).spec()  # of align's maps, by their header
-        camera, exposure = (
-            poses[photo].camera.camera(size.width, size.height),
-            np.array(exposures.get(photo, [1.0] * 3)),
-        )
+        size = oiio.ImageInput.open(str(inputs["align"] / f"{photo}.exr")).spec()  # from the header
+        camera = poses[photo].camera.camera(size.width, size.height)
+        exposure = np.array(exposures.get(photo, [1.0] * 3))
         camera_from_light = np.eye(3) if light.world_from_camera is None else np.array(light.world_from_camera).T
         own_lobes = lobes[light.illumination]
         suns = suns_of(own_lobes.scaled(exposure), YUP_FROM_CAMERA @ camera_from_light)
@@ -113,7 +120,8 @@ def main(params: Params, inputs: Inputs, out: Path, progress: Progress) -> None:
         sky = (
             msgspec.structs.replace(exposed, file=f"../illumination/{light.illumination}{SKY}.exr") if suns else exposed
         )
-        own_meshes, placed = objects[photo].meshes, poses[photo].objects
+        own_meshes = objects[photo].meshes
+        placed = poses[photo].objects
         shapes = [s for own in objects[photo].objects for s in files.shapes(own, own_meshes, placed)]
         scene = Scene(camera, shapes, materials, exposed, ALL_BOUNCES if table.model.interreflection else DIRECT)
         write_usd_scene(out / "scenes" / f"{photo}{SUFFIX}", scene)
@@ -121,7 +129,7 @@ def main(params: Params, inputs: Inputs, out: Path, progress: Progress) -> None:
         write_scene_json(out / "scenes" / f"{photo}.json", scene)
         if np.ptp(exposure) == 0:
             own = msgspec.structs.replace(exposed, file=f"light/{light.illumination}.exr")
-        else:  # Mitsuba's scale is grey: a map of the photo's own; a dot is in no illumination's name
+        else:  # Mitsuba scales all channels alike, so the photo gets its own map; no illumination has a dot in its name
             own = ExposedMap(f"light/{photo}.exposed.exr", np.ones(3), camera_from_light)
             _write_mitsuba_map(out / "scenes" / own.file, own_lobes.take(~own_lobes.suns).scaled(exposure), params)
         write_scene(out / "scenes" / f"{photo}.xml", msgspec.structs.replace(scene, light=own))
@@ -129,7 +137,7 @@ def main(params: Params, inputs: Inputs, out: Path, progress: Progress) -> None:
 
 
 def _solved_lights(file: Path, lights: Mapping[str, LightSlice]) -> dict[str, Lobes]:
-    """The lobes of every illumination, by name in order; none of one that was not solved for, with a warning."""
+    """Return the lobes of every illumination, sorted by name; none, with a warning, for one that was not solved for."""
     solved = read_lobes(file)
     names = sorted({light.illumination for light in lights.values()})
     for name in names:
@@ -140,7 +148,10 @@ def _solved_lights(file: Path, lights: Mapping[str, LightSlice]) -> dict[str, Lo
 
 
 def _write_dataset(out: Path, inputs: Inputs) -> None:
-    """What pictures of the result need of its data set: the facts, and under source/ the files, of meshes, by their paths there."""
+    """Write the parts of the dataset that pictures of the result need.
+
+    They are the facts, in dataset.json, and the mesh files, under source/ by their paths in the dataset.
+    """
     write_json(out / "dataset.json", {name: inputs.facts[name] for name in sorted(inputs.facts)})
     for relative, file in sorted(inputs.files.items()):
         copy = out / "source" / relative
@@ -149,7 +160,7 @@ def _write_dataset(out: Path, inputs: Inputs) -> None:
 
 
 def _write_light(out: Path, name: str, light: Lobes, coverage: Path, params: Params) -> None:
-    """The map of a light, for Mitsuba too, and the standard errors over its mean radiance, in the same layout, if there are any."""
+    """Write the maps of a light: radiance, without suns, for Mitsuba, and coverage if there is one."""
     lat_long = lat_long_of_lobes(light, params.height, 2 * params.height)
     write_rgb_exr(out / "illumination" / f"{name}.exr", lat_long, LAT_LONG)
     write_hdr(out / "illumination" / f"{name}.hdr", lat_long)
@@ -164,6 +175,7 @@ def _write_light(out: Path, name: str, light: Lobes, coverage: Path, params: Par
 
 
 def _sun(sun: Sun) -> dict[str, Any]:
+    """Return the entry of a sun in lights.json."""
     return {
         **{name: getattr(sun, name).tolist() for name in ("direction", "irradiance")},
         "angular_diameter_deg": sun.angular_diameter_deg,
@@ -171,4 +183,5 @@ def _sun(sun: Sun) -> dict[str, Any]:
 
 
 def _write_mitsuba_map(path: Path, light: Lobes, params: Params) -> None:
+    """Write a light as a map in the row layout of Mitsuba's `envmap`."""
     write_rgb_exr(path, mitsuba_map(light, params.mitsuba_height, 2 * params.mitsuba_height), LAT_LONG)

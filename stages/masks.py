@@ -1,4 +1,7 @@
-"""Photo and masks to one EXR of linear radiance, labels, and which pixels can be used, no larger than is useful."""
+"""Input of one photo and its masks: linear radiance, labels and usable pixels, averaged down to a useful size.
+
+Writes <photo>.exr and <photo>.json.
+"""
 
 import logging
 from collections.abc import Mapping
@@ -29,40 +32,54 @@ CURE = (
 
 
 class Params(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """A photo that has more pixels than these is averaged down by the least whole factor that makes it fit."""
+    """Limits on the size of a photo; a larger one is averaged down by the smallest sufficient integer factor."""
 
     pixels: Annotated[int, msgspec.Meta(ge=100)] = 1_000_000
-    """Most pixels that show a material."""
+    """Largest number of pixels with a material."""
     frame: Annotated[int, msgspec.Meta(ge=100)] = 4_000_000
-    """Most pixels of the whole photo, whatever they show."""
+    """Largest number of pixels of the whole photo."""
     most_megapixels: Annotated[float, msgspec.Meta(gt=0)] = MOST_MEGAPIXELS
-    """Most megapixels of a photo's file, by its header; a larger one is refused before it is read."""
+    """Largest number of megapixels in the header of a photo's file; a larger file is refused unread."""
 
 
 def main(params: Params, inputs: Inputs, out: Path, progress: Progress = silent) -> None:
     """Write `<photo>.exr` and `<photo>.json`.
 
-    EXR, float32: R G B (linear Rec. 709, up to exposure), label (0 background, k), valid (1 = has a material and is
-    finite), clipped.R/G/B, left_out (neither background nor a material), object (1-based, by its own mask; 0 unsaid).
+    Channels of the EXR, float32:
+
+    R, G, B         Linear Rec. 709 radiance, up to exposure.
+    label           Number of the material, from 1; 0 for background.
+    valid           1 for finite pixels with a material.
+    clipped.R/G/B   1 for clipped values.
+    left_out        1 for pixels that are neither background nor a material.
+    object          Number of the object, from 1, where objects have masks of their own; else 0.
     """
-    name, facts = inputs.photo, msgspec.convert(inputs.facts["dataset.photo"], PhotoSlice)
-    materials, path, entry = inputs.facts["dataset.materials"], inputs.file(facts.image), f"photos[{name}]"
+    name = inputs.photo
+    facts = msgspec.convert(inputs.facts["dataset.photo"], PhotoSlice)
+    materials = inputs.facts["dataset.materials"]
+    path = inputs.file(facts.image)
+    entry = f"photos[{name}]"
     stored = open_photo(path, f"{entry}.image")
-    (height, width), key = stored.size, f"{entry}.masks"
+    height, width = stored.size
+    key = f"{entry}.masks"
     check_pixels(stored.size, params.most_megapixels, path, f"{entry}.image")
-    progress(0, 3, f"{name}: masks")  # before the photo: they say how far it is averaged down while it is read
+    progress(0, 3, f"{name}: masks")  # read first: they give the factor by which the photo is reduced while it is read
     labels = read_labels(facts.masks, inputs.file, materials, stored.size, facts.image, key)
     own_masks = [(o.name, o.mask) for o in facts.objects]
     objects = read_objects(own_masks, inputs.file, stored.size, f"{entry}.objects")
+    # smallest integer factor at which materials and frame fit their limits
     materials_fit = least_factor(int(np.count_nonzero(labels.label)), params.pixels)
     factor = min(max(materials_fit, least_factor(height * width, params.frame)), height, width)
-    labels, objects = reduced(labels, factor, path, key), box_majority(objects, factor)
+    labels = reduced(labels, factor, path, key)
+    objects = box_majority(objects, factor)
     progress(1, 3, f"{name}: photo")
     photo = decoded(stored, facts.encoding, factor, path)
+    # remove lens distortion
     if lens := lens_of(facts.camera, photo.factor, photo.width, photo.height):
         lens.check(photo.width, photo.height, "dataset.yaml", f"{entry}.camera.distortion")
         straight = Undistorted(lens, photo.height, photo.width)
-        photo, objects = straight.photo(photo), straight.nearest(objects)
+        photo = straight.photo(photo)
+        objects = straight.nearest(objects)
         labels = Labels(straight.nearest(labels.label), straight.nearest(labels.left_out) | ~straight.inside)
     valid = valid_pixels(photo, labels, path, f"{entry}.image")
     warn_of_processing(stored.exif, photo, labels, path)
@@ -89,7 +106,11 @@ def main(params: Params, inputs: Inputs, out: Path, progress: Progress = silent)
 
 
 def reduced(labels: Labels, factor: int, path: Path, key: str) -> Labels:
-    """Reduce labels by majority, where being left out counts as a label."""
+    """Reduce labels by majority of each box; "left out" counts as a label.
+
+    Raises:
+        InputError: If no pixel of the result has a material.
+    """
     if factor == 1:
         return labels
     label = box_majority(np.where(labels.left_out, np.uint8(LEFT_OUT), labels.label), factor)
@@ -103,18 +124,26 @@ def reduced(labels: Labels, factor: int, path: Path, key: str) -> Labels:
 
 
 def warn_of_processing(exif: Mapping[str, Any], photo: Photo, labels: Labels, path: Path) -> None:
-    """Warn of processing that no tone curve undoes, by what the camera wrote and by halos about the masks."""
+    """Warn of processing that no tone curve undoes, from EXIF and from halos at the masks' contours."""
     if (says := camera_says(exif)) and not is_raw(path):
         log.warning("%s: the camera processed it (%s): %s", path, says, CURE)
     if (overshoot := halo(photo.radiance, labels.label > 0, ~labels.left_out)) > HALO:
-        words = "beside contours the background overshoots by %.0f %% of the step across them, as after sharpening or local tone mapping"
+        words = (
+            "beside contours the background overshoots by %.0f %% of the step across them, "
+            "as after sharpening or local tone mapping"
+        )
         log.warning("%s: " + words + ": %s", path, 100 * overshoot, CURE)
 
 
 def valid_pixels(photo: Photo, labels: Labels, path: Path, key: str) -> np.ndarray:
-    """Pixels of a material that are numbers, [h, w]; if some are not, a warning; if none are, InputError."""
+    """Return the mask [h, w] of finite pixels with a material, and warn of those that are not finite.
+
+    Raises:
+        InputError: If no pixel with a material is finite, or the photo is not bright enough.
+    """
     inside = labels.label > 0
-    total, lost = int(inside.sum()), int((inside & ~photo.finite).sum())
+    total = int(inside.sum())
+    lost = int((inside & ~photo.finite).sum())
     if lost == total:
         cure = "render or develop the photo again"
         raise InputError("every pixel in its mask is NaN or infinite", file=path, key=key, cure=cure)

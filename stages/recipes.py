@@ -1,4 +1,4 @@
-"""Pictures that a recipe asks for; `factorlib.render.drawing` says which files."""
+"""Pictures of one recipe; `factorlib.render.drawing` lists the files."""
 
 from pathlib import Path
 from typing import Annotated
@@ -13,12 +13,12 @@ from factorlib.stage import Inputs, Progress
 
 
 class Params(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """How meshes are read; what pictures show stands in the recipe."""
+    """Parameters of mesh reading; the recipe defines the pictures."""
 
     crease_deg: Annotated[float, msgspec.Meta(gt=0, le=180)] = CREASE_DEG
-    """Angle, in degrees, between the normals of two triangles above which the edge between them stays sharp."""
+    """Crease angle, in degrees: an edge whose two triangles differ by more in their normals stays sharp."""
 
 
 def main(params: Params, inputs: Inputs, out: Path, progress: Progress) -> None:
-    """Make the pictures of one recipe."""
+    """Render the pictures of one recipe."""
     draw(recipe_of(inputs.facts["recipe"]), SolvedSet(inputs, params.crease_deg), out, progress)

@@ -1,7 +1,8 @@
-"""What was solved, as pictures: the photo synthesised again, and every material in the photo's light.
+"""Re-synthesis of one photo from materials and light, with balls and reflectance maps of every material in its light.
 
-Writes resynthesis/<photo>, materials/<photo>/<material> (balls) and reflectance_maps/<photo>/<material> (channel
-`observed`: 1 where the photo shows that normal), each as linear EXR and as PNG at the photo's own exposure.
+Writes resynthesis/<photo>, materials/<photo>/<material> (balls) and reflectance_maps/<photo>/<material>.  Each is a
+linear EXR and a PNG at the photo's exposure.  Channel `observed` of a reflectance map is 1 where the photo shows that
+normal.
 """
 
 from pathlib import Path
@@ -32,33 +33,35 @@ RING = (255, 255, 255)
 
 
 class Params(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """How pictures are computed, and their sizes."""
+    """Reflection operator and sizes of pictures."""
 
     operator: Literal["network", "closed_form", "reference", "paper_network"] = "network"
-    """How a lobe's reflection is computed."""
+    """Reflection operator."""
     ball_size: Size = 128
-    """Pixels of a ball's side."""
+    """Width and height of a ball's picture, in pixels."""
     map_size: Size = 64
-    """Pixels of the side of a reflectance map."""
+    """Width and height of a reflectance map, in pixels."""
 
 
 def main(params: Params, inputs: Inputs, out: Path, progress: Progress) -> None:
-    """Render a photo again, and balls and reflectance maps of every material in its light."""
-    name, names, file = inputs.photo, inputs.facts["dataset.materials"], inputs["export"] / "materials.json"
-    exported, model = read_materials(file), read_materials(inputs["solve"] / "materials.json").model
-    photo, geometry = (
-        read_exr(inputs["masks"] / f"{name}.exr"),
-        read_geometry(inputs["align"], inputs.folders.get("surface"), name),
-    )
+    """Render the re-synthesis of a photo, and balls and reflectance maps of every material in its light."""
+    name = inputs.photo
+    names = inputs.facts["dataset.materials"]
+    file = inputs["export"] / "materials.json"
+    exported = read_materials(file)
+    model = read_materials(inputs["solve"] / "materials.json").model
+    photo = read_exr(inputs["masks"] / f"{name}.exr")
+    geometry = read_geometry(inputs["align"], inputs.folders.get("surface"), name)
     slice_ = msgspec.convert(inputs.facts["dataset.light"], LightSlice)
     light = light_of(inputs["export"], name, slice_)
     operator = reflection_operator(params.operator, weights=inputs["train"])
     reflector = Reflector(operator, light, model.curvature(slice_.illumination))
     exposure = exposure_of(np.stack([photo[c] for c in "RGB"], axis=-1), photo["valid"] > 0.5)
-    total, materials = 10 + len(names), in_order(exported, names, file)
+    total = 10 + len(names)
+    materials = in_order(exported, names, file)
 
     def report(done: float, pixels: float) -> None:
-        """Pixels of the re-synthesis."""
+        """Report progress of the re-synthesis, in pixels."""
         progress(10 * done / pixels, total, f"{name}: {done} of {pixels} pixels")
 
     around = surroundings(inputs, model, exported.gauge)
@@ -66,6 +69,7 @@ def main(params: Params, inputs: Inputs, out: Path, progress: Progress) -> None:
     if tone := model.tone.get(name):
         radiance = shown(radiance, tone.exponent, tone.pivot)
     _write(out / "resynthesis" / name, radiance, exposure, ball=False)
+    # balls and reflectance maps, material by material
     observed = observed_pixels(photo, geometry)
     for k, (label, material) in enumerate(zip(names, materials, strict=True), start=1):
         progress(9 + k, total, f"{name}: {label}")
@@ -78,9 +82,12 @@ def main(params: Params, inputs: Inputs, out: Path, progress: Progress) -> None:
 
 
 def surroundings(inputs: Inputs, model: Model, gauge: Gauge) -> Surroundings | None:
-    """Return what the solve took into account of the photo's visibility, of what its surfaces send to each other, and of where they lie.
+    """Return visibility, bounced radiance and positions of the photo's observations; None if the model uses none.
 
-    gauge: of the materials that are rendered; its factor went out of the lights, but not out of what the photo shows
+    Args:
+        inputs: Inputs of the stage.
+        model: Effects that the solve included.
+        gauge: Gauge of the rendered materials.  Its factor divides bounced radiance, as it divides exported lights.
     """
     if not (model.self_shadowing or model.distance):
         return None
@@ -92,9 +99,18 @@ def surroundings(inputs: Inputs, model: Model, gauge: Gauge) -> Surroundings | N
 
 
 def _write(stem: Path, radiance: np.ndarray, exposure: float, ball: bool, observed: np.ndarray | None = None) -> None:
-    """An EXR of the radiance and of what is observed, and a PNG, transparent beside a ball, with a ring about what is observed."""
+    """Write a picture as EXR and PNG.
+
+    Args:
+        stem: Path of both files, without suffix.
+        radiance: Linear radiance, [h, w, 3].
+        exposure: Exposure of the PNG.
+        ball: True for a ball; the PNG is transparent around it.
+        observed: Mask of observed normals, [h, w]: a channel of the EXR, outlined in the PNG.
+    """
     stem.parent.mkdir(parents=True, exist_ok=True)
-    channels, pixels = dict(zip("RGB", np.moveaxis(radiance, -1, 0))), picture(radiance, exposure)
+    channels = dict(zip("RGB", np.moveaxis(radiance, -1, 0)))
+    pixels = picture(radiance, exposure)
     if observed is not None:
         channels["observed"] = observed
         pixels[observed & ~binary_erosion(observed)] = RING

@@ -1,8 +1,8 @@
-"""One self-contained page about the run, and a few figures as PNG.
+"""Report of the run: a self-contained page, and a few figures as PNG.
 
-Writes index.html (no other file and no network is needed to read it), figures/overview.png, and for each photo
-figures/photos/<photo>.png: photo, materials, re-synthesis and difference side by side.  The page is byte-equal from run
-to run but for its section on cost.
+Writes index.html, which needs no other file and no network, and figures/overview.png.  For each photo it writes
+figures/photos/<photo>.png: photo, materials, re-synthesis and difference side by side.  Except for the section on cost,
+the page has the same bytes in every run.
 """
 
 from itertools import count
@@ -23,16 +23,18 @@ SLICES = {"dataset.light": LightSlice, "dataset.objects": ObjectsSlice}
 
 
 class Params(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """Nothing to choose: the page shows everything there is."""
+    """Empty parameters: the page shows all results."""
 
 
 def main(params: Params, inputs: Inputs, out: Path, progress: Progress) -> None:
     """Write the page and its figures."""
     run = Artifacts(inputs.folders, msgspec.convert(inputs.facts["dataset.set"], SetSlice), inputs.log)
     errors = run.metrics.resynthesis.photos
-    rows, tags = [], material_tags(run)
+    rows = []
+    tags = material_tags(run)
     (out / "figures" / "photos").mkdir(parents=True)
-    total, done = len(run.set.photos) + 5, count()
+    total = len(run.set.photos) + 5
+    done = count()
     for name in run.set.photos:
         progress(next(done), total, name)
         rows.append(photo_row(run, name, tags, errors.get(name)))

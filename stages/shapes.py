@@ -1,6 +1,7 @@
-"""Cameras that no file gives, by structure from motion, and meshes that no file gives: hulls, bodies of revolution, primitives, from masks.
+"""Shape estimation: cameras by structure from motion, and meshes from masks.
 
-There only where dataset.yaml asks for such.  Writes shapes.json, and meshes/<mesh>.obj, which every later stage reads in place of a file.
+Meshes are visual hulls, bodies of revolution or primitives.  The stage runs only if dataset.yaml asks for such cameras
+or meshes.  Writes shapes.json, and meshes/<mesh>.obj, which later stages read as they read mesh files.
 """
 
 import logging
@@ -33,19 +34,19 @@ from factorlib.shapes.primitive import primitive
 from factorlib.stage import Inputs, Progress
 
 log = logging.getLogger("factorlib.shapes")
-GOOD = 0.9  # overlap (IoU) below which a shape does not look like its outlines
-FEW = 6  # outlines of a hull: with fewer, what they do not show is filled
+GOOD = 0.9  # IoU of a shape and its outlines below which a warning is given
+FEW = 6  # number of a hull's outlines below which a warning is given: hulls keep what no outline excludes
 
 
 class Params(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """How fine hulls are."""
+    """Resolution of hulls."""
 
     cells: Annotated[int, msgspec.Meta(ge=16, le=400)] = 80
-    """Cells of the grid along a hull's longest side."""
+    """Number of grid cells along a hull's longest side."""
 
 
 def main(params: Params, inputs: Inputs, out: Path, progress: Progress) -> None:
-    """Find cameras, then shapes, and write both."""
+    """Estimate cameras, then shapes, and write both."""
     slice_ = msgspec.convert(inputs.facts["dataset.shapes"], ShapesSlice)
     photos = {name: Photo(inputs, name, own) for name, own in sorted(slice_.photos.items())}
     cameras: dict[str, ExternalCamera] = {}
@@ -55,10 +56,17 @@ def main(params: Params, inputs: Inputs, out: Path, progress: Progress) -> None:
         cameras = {name: photos[name].external(camera, slice_.meshes) for name, camera in placed.items()}
         for name, camera in placed.items():
             if camera.bent:
-                focal, k = camera.bent[0] * photos[name].facts.factor, camera.bent[1]
-                log.warning("%s: its lens bends straight lines; give the photo `camera: {focal_px: %.0f, distortion: [%.4f, 0]}` and the "
-                            "picture is straightened", name, focal, k)  # fmt: skip
-    begun, found = 0.5 if slice_.sfm else 0.0, {}
+                focal = camera.bent[0] * photos[name].facts.factor
+                k = camera.bent[1]
+                log.warning(
+                    "%s: its lens bends straight lines; give the photo "
+                    "`camera: {focal_px: %.0f, distortion: [%.4f, 0]}` and the picture is straightened",
+                    name,
+                    focal,
+                    k,
+                )
+    begun = 0.5 if slice_.sfm else 0.0
+    found = {}
     (out / "meshes").mkdir()
     for done, (name, entry) in enumerate(sorted(slice_.meshes.items())):
         outlines = [one for photo in photos.values() for one in photo.outlines(name, entry, cameras.get(photo.name))]
@@ -74,31 +82,49 @@ def main(params: Params, inputs: Inputs, out: Path, progress: Progress) -> None:
         used = sorted({one.photo for one in outlines})
         found[name] = ShapeEntry(kind_of(entry), extent, len(shape.faces), used, shape.overlap)
         if shape.overlap < GOOD:
-            log.warning("mesh '%s': the %s covers its outlines by %.0f %% only (IoU): is it of that kind, and are its masks whole?",
-                        name, kind_of(entry), 100 * shape.overlap)  # fmt: skip
+            log.warning(
+                "mesh '%s': the %s covers its outlines by %.0f %% only (IoU): is it of that kind, "
+                "and are its masks whole?",
+                name,
+                kind_of(entry),
+                100 * shape.overlap,
+            )
     write_json(out / FILE, ShapesTable(cameras, found))
     progress(1, 1)
 
 
 def kind_of(entry: MeshEntry) -> str:
-    """hull, lathe, ball, box or cylinder."""
+    """Return the kind of a shape: hull, lathe, ball, box or cylinder."""
     return entry.primitive or ("hull" if entry.hull else "lathe")
 
 
 def parts_of(entry: MeshEntry) -> list[str]:
-    """The names of the shape's parts."""
+    """Return the names of the shape's parts."""
     return list(entry.parts or {ALL_OF_IT: entry.material})
 
 
 def shape_of(entry: MeshEntry, outlines: list[Outline], params: Params, report: Callable[[float], None]) -> Triangles:
-    """Return what the outlines say of a mesh's shape."""
+    """Return the shape of a mesh, estimated from its outlines.
+
+    Args:
+        entry: Mesh in dataset.yaml.
+        outlines: Outlines of its objects in all photos.
+        params: Parameters of the stage.
+        report: Receiver of the share that is done.
+
+    Raises:
+        InputError: If no photo shows the mesh.
+    """
     if not outlines:
         cure = "is its material that of a label in the masks? Else take it out"
         raise InputError("no photo's mask shows it", cure=cure)
     if entry.hull:
         known = [one for one in outlines if one.pose is not None]
         if 2 <= len(known) < FEW:
-            words = "a hull of %d outlines is larger than the body wherever they do not show it: more photos, from more sides"
+            words = (
+                "a hull of %d outlines is larger than the body wherever they do not show it: "
+                "more photos, from more sides"
+            )
             log.warning(words, len(known))
         return visual_hull(known, params.cells, len(parts_of(entry)), report)
     if entry.lathe:
@@ -109,42 +135,58 @@ def shape_of(entry: MeshEntry, outlines: list[Outline], params: Params, report: 
 
 
 class Photo:
-    """A photo as `masks` left it, and its objects."""
+    """Photo as written by `masks`, with its objects."""
 
     def __init__(self, inputs: Inputs, name: str, own: ObjectsSlice):
-        self.name, self.own, self.materials = name, own, inputs.facts["dataset.materials"]
-        self.path, self.facts = inputs["masks"] / f"{name}.exr", read_photo_facts(inputs["masks"] / f"{name}.json")
+        self.name = name
+        self.own = own
+        self.materials = inputs.facts["dataset.materials"]
+        self.path = inputs["masks"] / f"{name}.exr"
+        self.facts = read_photo_facts(inputs["masks"] / f"{name}.json")
 
     def view(self) -> View:
-        """Return what structure from motion sees of it."""
+        """Return the input of structure from motion: sRGB grey values, mask of objects, left-out pixels, camera."""
         channels = read_exr(self.path)
+        # grey values, with the 99th percentile of radiance as white
         radiance = np.stack([channels[c] for c in "RGB"], axis=-1).mean(axis=-1)
         white = max(float(np.quantile(radiance[np.isfinite(radiance)], 0.99)), 1e-12)
         grey = srgb_encode(np.clip(np.nan_to_num(radiance) / white, 0, 1))
-        pixels, objects = np.round(grey * 255).astype(np.uint8), channels["label"] > 0.5
+        pixels = np.round(grey * 255).astype(np.uint8)
+        objects = channels["label"] > 0.5
         return View(pixels, objects, channels["left_out"] > 0.5, *self.camera(None))
 
     def camera(self, external: ExternalCamera | None) -> tuple[Camera, FocalPrior]:
-        """The camera at the likeliest focal length, and what is known of that."""
+        """Return the camera at the most probable focal length, and the prior on that."""
         camera, known = camera_of(msgspec.structs.replace(self.own, external=external), self.facts, self.name)
         prior = focal_prior(known.focal, known.source, camera.width, camera.height)
         return msgspec.structs.replace(camera, focal=prior.focal), prior
 
     def external(self, placed: Registered, meshes: dict[str, MeshEntry]) -> ExternalCamera:
-        """The camera in pixels of the photo's file; hulls are made in the world's frame."""
+        """Return the camera in pixels of the photo's file, with the poses of hulls.
+
+        Hulls are made in the world frame, so cam_from_world is their pose.
+        """
         pose = Pose(tuple(map(tuple, placed.pose.rotation.tolist())), tuple(placed.pose.translation.tolist()))
         poses = {obj.name: pose for obj in self.own.objects if obj.mesh in meshes and meshes[obj.mesh].hull}
         return ExternalCamera("sfm", placed.focal * self.facts.factor, None, None, poses)
 
     def outlines(self, mesh: str, entry: MeshEntry, by_motion: ExternalCamera | None) -> list[Outline]:
-        """The outline of each object of that mesh."""
-        outlines, channels = [], None
+        """Return the outline of each of the photo's objects with that mesh.
+
+        Args:
+            mesh: Name of the mesh.
+            entry: Mesh in dataset.yaml.
+            by_motion: Camera from structure from motion, or None.
+        """
+        outlines = []
+        channels = None
         for number, obj in enumerate(self.own.objects, start=1):
             if obj.mesh == mesh:
                 channels = channels or read_exr(self.path)
                 labels = self._labels(obj, entry)
                 external = by_motion or self.own.external
                 label = silhouette_of_object(channels, number, sorted(set(labels)), obj.mask is not None).label
+                # number, from 1, of the shape's part at each pixel; the first, where parts share a label
                 part = np.where(label == UNKNOWN, UNKNOWN, 0)
                 for k, own in reversed(list(enumerate(labels, start=1))):
                     part[label == own] = k
@@ -155,6 +197,6 @@ class Photo:
         return outlines
 
     def _labels(self, obj: ObjectEntry, entry: MeshEntry) -> list[int]:
-        """The label of each part of the shape in this photo."""
+        """Return the label of each part of the shape in this photo."""
         made_of = entry.parts or {ALL_OF_IT: entry.material}
         return [self.materials.index((made_of | obj.materials)[part]) + 1 for part in parts_of(entry)]

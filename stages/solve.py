@@ -1,6 +1,7 @@
-"""The joint solve: from all observations, one reflectance per material and one light per illumination.
+"""Joint solve: one reflectance per material and one light per illumination, from all observations.
 
-Writes materials.json, lobes.parquet, exposures.json, convergence.parquet, uncertainty.json and coverage/<illumination>.exr.
+Writes materials.json, lobes.parquet, exposures.json, convergence.parquet, uncertainty.json and
+coverage/<illumination>.exr.
 """
 
 import logging
@@ -42,52 +43,63 @@ from factorlib.stage import Inputs, Progress
 from factorlib.urm import observations as urm
 
 log = logging.getLogger("factorlib.inference")
-PAPER = Paper()  # where its defaults stand
-ERRORS = 0.07  # share of the time that standard errors take, on data/eames
+PAPER = Paper()  # defaults of the paper's solver
+# Shares of the stage's time on data/eames.
+READING = 0.03
+ERRORS = 0.07  # standard errors
 
 
 class Params(options.Choices, frozen=True, forbid_unknown_fields=True):
     """Parameters of the joint solver, of the paper's solver (paper_…), and of both.
 
-    The folder `start`, where one is given, holds an earlier solution: materials and lights that have their names there start
-    from it, and whether there are shadows, and whether surfaces light each other, stays as it was decided there.
+    The optional folder `start` holds an earlier solution.  Materials and lights of the same names start from it.
+    Its decisions on shadows and interreflection are kept.
     """
 
     solver: Literal["joint", "paper"] = "joint"
-    """joint: this project's solver; paper: that of Wang, Ritschel and Mitra, the baseline."""
+    """Solver; joint: this project's; paper: that of Wang, Ritschel and Mitra, the baseline."""
     operator: Literal["auto", "network", "closed_form", "reference", "paper_network"] = "auto"
-    """How a lobe's reflection is computed; auto: network, and paper_network for the paper's solver."""
+    """Reflection operator; auto: network, or paper_network for the paper's solver."""
     merge_degrees: Annotated[float, msgspec.Meta(ge=0, le=30)] = 2.0
-    """Observations of one material and photo whose normals and views differ by less, in degrees, are merged before solving."""
+    """Angle, in degrees.  Observations of one material and photo whose normals and views differ by less are merged."""
     held_out: Annotated[float, msgspec.Meta(ge=0, le=0.5)] = 0.1
-    """Share of the observations that is not fitted and chooses the model."""
+    """Share of held-out observations: they are not fitted, and choose the model."""
     paper_lobes: options.Lobes = PAPER.lobes
-    """Lobes of an illumination, for the paper's solver."""
+    """Number of an illumination's lobes, for the paper's solver."""
     paper_samplings: Samplings = PAPER.samplings
-    """How often, on average, the paper's solver samples an observation."""
+    """Average number of times that the paper's solver samples an observation."""
     paper_prior: Prior = PAPER.prior
     """Weight of the prior on the tint of lights, for the paper's solver."""
 
 
 def main(params: Params, inputs: Inputs, out: Path, progress: Progress) -> None:
-    """Read the observations, solve, say what is uncertain, write."""
+    """Read the observations, solve, estimate standard errors, and write all of it."""
     names: list[str] = inputs.facts["dataset.materials"]
     progress(0, 1, "observations")
+    read = count(1)
     _refuse_options_of_the_other_solver(params)
     given = _given(params, inputs)
-    files, surface = sorted(inputs["urm"].glob("*.parquet")), inputs.folders.get("surface")
-    photos = gathered(files, params.merge_degrees, inputs.map, surface)
+    files = sorted(inputs["urm"].glob("*.parquet"))
+    surface = inputs.folders.get("surface")
+    photos = gathered(
+        files,
+        params.merge_degrees,
+        inputs.map,
+        surface,
+        lambda: progress(READING * next(read) / len(files), 1, "observations"),
+    )
     _warn(unusable_observations(photos))
     seen = urm.with_exposures(urm.concatenate([photo.merged for photo in photos]), given.exposure)
     relative = urm.relative_exposures(seen)
     earlier = read_earlier(inputs["start"]).beside(relative) if "start" in inputs.folders else None
     problem = _problem(params, inputs, given, seen, relative)
     _warn(before_solving(names, seen.photos, problem))
-    solution = _solved(params, problem, earlier, inputs, partial(_share, progress, 1 - ERRORS))
-    systems, made = 2 * len(problem.blocks), count(1)
+    solution = _solved(params, problem, earlier, inputs, partial(_share, progress))
+    systems = 2 * len(problem.blocks)
+    made = count(1)
 
     def tick() -> None:
-        """Say that one more of the systems that standard errors are made of is there."""
+        """Report that one more system of normal equations for the standard errors is done."""
         progress(1 - ERRORS + ERRORS * next(made) / systems, 1, "standard errors")
 
     errors, coverages = uncertainty_of(solution, problem, params, tick)
@@ -104,7 +116,7 @@ def main(params: Params, inputs: Inputs, out: Path, progress: Progress) -> None:
 
 
 def _refuse_options_of_the_other_solver(params: Params) -> None:
-    """Raise InputError where an option that only the other solver reads differs from its default."""
+    """Raise InputError if an option that only the other solver reads differs from its default."""
     joint = set(options.Choices.__struct_fields__) - {"seed"}
     for field in msgspec.structs.fields(Params):
         owner = "paper" if field.name.startswith("paper_") else "joint" if field.name in joint else params.solver
@@ -118,7 +130,11 @@ def _refuse_options_of_the_other_solver(params: Params) -> None:
 
 
 def _given(params: Params, inputs: Inputs) -> KnownSlice:
-    """What dataset.yaml says is known; InputError where the solver takes neither that nor the earlier solution that is given."""
+    """Return the known materials, lights and exposures of dataset.yaml.
+
+    Raises:
+        InputError: If something is known, or an earlier solution is given, and the solver is the paper's.
+    """
     known = msgspec.convert(inputs.facts.get("dataset.known", {}), KnownSlice)
     if params.solver == "paper" and known != KnownSlice():
         cure = "leave `known` out of dataset.yaml, or set solve.solver=joint"
@@ -129,20 +145,30 @@ def _given(params: Params, inputs: Inputs) -> KnownSlice:
     return known
 
 
-def _share(progress: Progress, share: float, done: float, total: float, text: str = "") -> None:
-    progress(share * done, total, text)
+def _share(progress: Progress, done: float, total: float, text: str = "") -> None:
+    """Report progress between reading and standard errors."""
+    progress(READING * total + (1 - READING - ERRORS) * done, total, text)
 
 
 def _problem(
     params: Params, inputs: Inputs, given: KnownSlice, seen: urm.Observations, relative: dict[str, float]
 ) -> JointProblem:
+    """Return the problem: blocks of observations at one exposure, operator, loss and known quantities.
+
+    Args:
+        params: Parameters of the stage.
+        inputs: Inputs of the stage.
+        given: Known quantities of dataset.yaml.
+        seen: Observations of all photos.
+        relative: Relative exposures, by photo.
+    """
     lights = msgspec.convert(inputs.facts["dataset.light"], dict[str, LightSlice])
     worlds = {photo: light.world_from_camera for photo, light in lights.items()}
     maps = {name: read_light_map(inputs.file(file)) for name, file in given.maps.items()}
     tables = {name: inputs["urm"] / f"{ball.photo}.parquet" for name, ball in given.balls.items()}
     balls = {name: urm.at_one_exposure(usable(urm.read_observations(t)), relative) for name, t in tables.items()}
     seen, known = what_is_known(given, maps, balls, urm.at_one_exposure(seen, relative), lights)
-    if params.solver == "paper":  # it knows no detail of reflectance
+    if params.solver == "paper":  # its materials are uniform
         seen = msgspec.structs.replace(seen, detail=None)
     rotations = {photo: np.array(world) for photo, world in worlds.items() if world is not None}
     how = {"held_out": params.held_out, "world_from_camera": rotations, "seed": params.seed}
@@ -156,6 +182,15 @@ def _problem(
 def _solved(
     params: Params, problem: JointProblem, earlier: Earlier | None, inputs: Inputs, progress: Progress
 ) -> Solution:
+    """Return the solution of the chosen solver.
+
+    Args:
+        params: Parameters of the stage.
+        problem: Observations and model.
+        earlier: Earlier solution to start from, or None.
+        inputs: Inputs of the stage.
+        progress: Receiver of progress.
+    """
     names = inputs.facts["dataset.materials"]
     if params.solver == "paper":
         paper = Paper(params.paper_lobes, params.paper_samplings, params.paper_prior, params.seed)
@@ -167,7 +202,7 @@ def _solved(
 
 
 def _beginning(inputs: Inputs, problem: JointProblem) -> Start | None:
-    """Return the start at what `surface` has fitted; none where that is not there, or was fitted without what is known."""
+    """Return the start at the fit of `surface`; None without one, or with known quantities, which it ignores."""
     surface = inputs.folders.get("surface")
     if surface is None or not problem.known.nothing or not (surface / BEGINNING).is_file():
         return None
@@ -175,5 +210,6 @@ def _beginning(inputs: Inputs, problem: JointProblem) -> Start | None:
 
 
 def _warn(sentences: Iterable[str]) -> None:
+    """Log each sentence as a warning."""
     for sentence in sentences:
         log.warning("%s", sentence)

@@ -1,9 +1,11 @@
-"""Normals by shading: all photos together say how the meshes' surfaces differ from the given ones.
+"""Surface detail by shading: normals and albedo factors that differ from the meshes as given, from all photos together.
 
-Materials and lights are fitted as the solve begins; then normals turn until they explain all photos best, and stay so only where photos that had no
-part in it gain (`factorlib.inference.surface_detail`).  Then detail of reflectance likewise, over what shape explains.
-Writes surface.json, beginning.json (materials and lights of the first fit, from which `solve` goes on), and where surfaces differ
-photos/<photo>.exr: the normals that every later stage uses in place of those of `align`, and detail.
+Materials and lights are fitted as at the start of the solve.  Normals then turn to explain all photos best, and the
+turns are kept only if they improve held-out photos (`factorlib.inference.surface_detail`).  Factors on the diffuse
+reflectance are chosen likewise, in addition to the turns.
+
+Writes surface.json, and beginning.json: materials and lights of the first fit, from which `solve` continues.  If
+surfaces differ, it writes photos/<photo>.exr: normals, which later stages use instead of those of `align`, and factors.
 """
 
 from pathlib import Path
@@ -41,23 +43,24 @@ from factorlib.urm.observations import (
 
 
 class Params(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """Whether surfaces are turned, and by how many observations."""
+    """Choice of surface detail, and the observations it is estimated from."""
 
     shape: Literal["auto", "off"] = "auto"
-    """Whether normals are turned by shading; auto: where photos that had no part in it gain."""
+    """Normals and albedo factors by shading; auto: used if they improve held-out photos."""
     observations: Annotated[int, msgspec.Meta(ge=200)] = 2000
-    """Observations of a photo, drawn from all, that turns are found from."""
+    """Number of a photo's observations, drawn at random, that turns are estimated from."""
     seed: Annotated[int, msgspec.Meta(ge=0)] = 0
-    """Seed of the draw, and of what is held out."""
+    """Seed of the observations that are drawn and of those that are held out."""
 
 
 def main(params: Params, inputs: Inputs, out: Path, progress: Progress) -> None:
-    """Find the surfaces of all meshes, and write them where they are kept."""
+    """Estimate the surface detail of all meshes, and write it if it is kept."""
     if params.shape == "off":
         write_json(out / FILE, SurfaceTable())
         return
     slices = msgspec.convert(inputs.facts["dataset.objects"], dict[str, ObjectsSlice])
-    photos, surfaces = _photos(inputs, slices), surfaces_of(inputs, slices)
+    photos = _photos(inputs, slices)
+    surfaces = surfaces_of(inputs, slices)
     if not surfaces.meshes:
         write_json(out / FILE, SurfaceTable())
         return
@@ -67,6 +70,7 @@ def main(params: Params, inputs: Inputs, out: Path, progress: Progress) -> None:
     displacements, factors = (
         {name: values.astype("f4") for name, values in of.items()} for of in (result.displacements, result.log_factors)
     )
+    # turns of normals and log albedo factors at the nodes of all meshes
     detail = no_detail(surfaces.nodes)
     if displacements:
         detail = msgspec.structs.replace(detail, turn=surfaces.turns_of(displacements))
@@ -87,21 +91,24 @@ def main(params: Params, inputs: Inputs, out: Path, progress: Progress) -> None:
 
 
 class Photo(msgspec.Struct, frozen=True):
-    """A photo as `align` left it: its maps, its objects and where they are."""
+    """Photo as written by `align`: its maps, its objects and their poses."""
 
     geometry: Channels
     objects: ObjectsSlice
     poses: PhotoPoses
 
     def attached(self, pixels: Int[np.ndarray, "n 2"], surfaces: Surfaces) -> Attached:
-        """The nodes under pixels (x, y)."""
+        """Return the positions of pixels (x, y) on the surfaces."""
         height, width = self.geometry["object"].shape
         objects = {own.name: (own.mesh, self.poses.objects[own.name]) for own in self.objects.objects}
         shown = np.rint(self.geometry["object"][pixels[:, 1], pixels[:, 0]]).astype(int)
         return attached_pixels(pixels, shown, self.poses.camera.camera(width, height), objects, surfaces)
 
     def detailed(self, surfaces: Surfaces, detail: Detail) -> Channels:
-        """The channels normal.x/y/z and detail (the factor on diffuse reflectance) of the surfaces, 0 where no mesh is seen."""
+        """Return the channels normal.x, .y, .z (camera frame) and detail (factor on the diffuse reflectance).
+
+        All are 0 at pixels without a mesh.
+        """
         y, x = np.nonzero(self.geometry["object"] > 0.5)
         normal, view = (
             np.stack([self.geometry[f"{kind}.{a}"][y, x] for a in "xyz"], axis=-1).astype(float)
@@ -115,6 +122,7 @@ class Photo(msgspec.Struct, frozen=True):
 
 
 def _photos(inputs: Inputs, slices: dict[str, ObjectsSlice]) -> dict[str, Photo]:
+    """Return all photos as written by `align`, sorted by name."""
     poses = read_poses(inputs["align"] / POSES)
     return {
         name: Photo(read_exr(inputs["align"] / f"{name}.exr"), slices[name], poses[name]) for name in sorted(slices)
@@ -122,8 +130,13 @@ def _photos(inputs: Inputs, slices: dict[str, ObjectsSlice]) -> dict[str, Photo]
 
 
 def surfaces_of(inputs: Inputs, slices: dict[str, ObjectsSlice]) -> Surfaces:
-    """Every mesh that a photo shows, subdivided, but for bodies of revolution found from outlines, of which no photo says what side it shows; parts may be of several materials, which changes no vertex."""
-    read, meshes = MeshesOnce(inputs.mesh, inputs.facts["dataset.materials"], CREASE_DEG), {}
+    """Return the subdivided meshes that photos show.
+
+    Bodies of revolution that were estimated from outlines are left out, because their rotation about the axis is
+    unknown.  Objects may give the parts of a mesh different materials; vertices do not depend on them.
+    """
+    read = MeshesOnce(inputs.mesh, inputs.facts["dataset.materials"], CREASE_DEG)
+    meshes = {}
     for slice_ in slices.values():
         for own in slice_.objects:
             if own.mesh not in meshes and not slice_.meshes[own.mesh].revolved:
@@ -132,7 +145,7 @@ def surfaces_of(inputs: Inputs, slices: dict[str, ObjectsSlice]) -> Surfaces:
 
 
 def drawn(file: Path, params: Params) -> Observations:
-    """Return at most so many usable observations of a photo, in their order."""
+    """Return at most `params.observations` usable observations of a photo, drawn at random, in their order."""
     seen = usable(read_observations(file))
     chosen = np.random.default_rng(params.seed).permutation(len(seen))[: params.observations]
     return seen.take(np.sort(chosen))
@@ -146,7 +159,16 @@ def _found(
     surfaces: Surfaces,
     progress: Progress,
 ) -> Found:
-    """What all photos say of the surfaces."""
+    """Return the surface detail estimated from all photos.
+
+    Args:
+        params: Parameters of the stage.
+        inputs: Inputs of the stage.
+        seen: Observations, by photo.
+        attached: Nodes under the observations, by photo.
+        surfaces: Subdivided meshes.
+        progress: Receiver of progress.
+    """
     lights = msgspec.convert(inputs.facts["dataset.light"], dict[str, LightSlice])
     worlds = {name: np.array(of.world_from_camera) for name, of in lights.items() if of.world_from_camera is not None}
     every = concatenate(list(seen.values()))

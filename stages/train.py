@@ -1,6 +1,7 @@
-"""Train the reflection networks on samples of the reference operator; needs nothing but parameters.
+"""Training of the reflection networks on samples of the reference operator; it has parameters but no inputs.
 
-Writes specular.safetensors and diffuse.safetensors, training.parquet (the curve) and accuracy.json (held-out errors).
+Writes specular.safetensors and diffuse.safetensors, training.parquet (learning curves) and accuracy.json (held-out
+errors).
 """
 
 from pathlib import Path
@@ -20,48 +21,48 @@ from factorlib.stage import Inputs, Progress
 from factorlib.wholefile import writing
 
 Meta = msgspec.Meta
-HELD_OUT_TOLERANCE = 1e-5  # of the reference; a tenth of the median error that is measured with it, or less
+HELD_OUT_TOLERANCE = 1e-5  # relative tolerance of held-out samples; at most a tenth of the median error
 
 
 class Params(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """What networks are trained on, how long, and their sizes."""
+    """Samples, schedule and sizes of the networks."""
 
     samples: Annotated[int, Meta(ge=1024, le=1 << 24)] = 524_288
-    """Samples of the reference that the specular network is fitted to; half as many more lie at grazing views."""
+    """Number of reference samples that the specular network is fitted to; half as many are added at grazing views."""
     held_out: Annotated[int, Meta(ge=1024, le=1 << 20)] = 16_384
-    """Other samples, which the error is measured on."""
+    """Number of held-out samples, on which the error is measured."""
     tolerance: Annotated[float, Meta(gt=0, le=0.1)] = 1e-3
-    """Relative tolerance of the reference's quadrature on `samples`."""
+    """Relative tolerance of the quadrature of training samples."""
     steps: Annotated[int, Meta(ge=40, le=10_000_000)] = 60_000
-    """Steps of Adam, for the specular network."""
+    """Number of Adam steps, for the specular network."""
     batch: Annotated[int, Meta(ge=64, le=1 << 16)] = 2048
-    """Samples of a step."""
+    """Number of samples in a step."""
     rate: Annotated[float, Meta(gt=0, le=0.1)] = 6e-3
-    """Largest learning rate of Adam."""
+    """Largest learning rate of Adam's schedule."""
     width: Annotated[int, Meta(ge=4, le=1024)] = 32
-    """Units of a hidden layer of the specular network."""
+    """Number of units in a hidden layer of the specular network."""
     depth: Annotated[int, Meta(ge=1, le=16)] = 3
-    """Hidden layers of the specular network."""
+    """Number of hidden layers of the specular network."""
     diffuse_samples: Annotated[int, Meta(ge=1024, le=1 << 20)] = 16_384
-    """Samples that the diffuse network is fitted to."""
+    """Number of samples that the diffuse network is fitted to."""
     diffuse_steps: Annotated[int, Meta(ge=40, le=10_000_000)] = 3000
-    """Steps of Adam, for the diffuse network."""
+    """Number of Adam steps, for the diffuse network."""
     diffuse_width: Annotated[int, Meta(ge=4, le=1024)] = 16
-    """Units of a hidden layer of the diffuse network."""
+    """Number of units in a hidden layer of the diffuse network."""
     diffuse_depth: Annotated[int, Meta(ge=1, le=16)] = 2
-    """Hidden layers of the diffuse network."""
+    """Number of hidden layers of the diffuse network."""
     seed: Annotated[int, Meta(ge=0)] = 0
-    """Seed of samples, first weights and batches."""
+    """Seed of samples, initial weights and batches."""
 
 
-# What training sees beyond what is measured, so that the edges of the domain are not the edges of the training set.
+# ranges of training samples: wider than those of held-out samples, so that none of these lies at an edge
 WIDER = {"alpha": (0.008, 1.0), "sharpness": (0.05, 1e4), "least_no": 0.005}
 
 
 def main(params: Params, inputs: Inputs, out: Path, progress: Progress) -> None:
-    """Train the diffuse and the specular network, and write weights, curves and accuracy."""
+    """Train the diffuse and the specular network, and write weights, learning curves and accuracy."""
     threads, accuracy, curves = torch.get_num_threads(), {}, {}
-    torch.set_num_threads(1)  # batches are too small for more, and sums depend on it
+    torch.set_num_threads(1)  # batches are too small for more, and rounding of sums depends on the number
     try:
         for part, fit in (("diffuse", _diffuse), ("specular", _specular)):
             layers, accuracy[part], curves[part] = fit(params, inputs, progress)
@@ -75,6 +76,7 @@ def main(params: Params, inputs: Inputs, out: Path, progress: Progress) -> None:
 
 
 def _specular(params: Params, inputs: Inputs, progress: Progress) -> tuple[Layers, dict, list[Step]]:
+    """Train the specular network; return weights, held-out errors and learning curve."""
     progress(0, 1, "specular: samples of the reference")
     even = specular_samples(params.samples, params.seed, tolerance=params.tolerance, **WIDER)
     grazing = specular_samples(params.samples // 2, params.seed + 1, tolerance=params.tolerance, grazing=True, **WIDER)
@@ -86,6 +88,7 @@ def _specular(params: Params, inputs: Inputs, progress: Progress) -> tuple[Layer
 
 
 def _diffuse(params: Params, inputs: Inputs, progress: Progress) -> tuple[Layers, dict, list[Step]]:
+    """Train the diffuse network; return weights, held-out errors and learning curve."""
     samples = diffuse_samples(params.diffuse_samples, params.seed, sharpness=(1e-3, 1e5))
     held_out = diffuse_samples(params.held_out, params.seed + 1_000_003)
     problems = diffuse_problem(samples), diffuse_problem(held_out)
@@ -98,10 +101,18 @@ def _diffuse(params: Params, inputs: Inputs, progress: Progress) -> tuple[Layers
 def _trained(
     part: str, problems: tuple[Problem, Problem], schedule: Schedule, inputs: Inputs, progress: Progress
 ) -> tuple[Layers, list[Step]]:
-    """problems: what is fitted, and what the error is measured on; it goes on where a killed run was."""
+    """Train a network, from the checkpoint of a killed run if there is one; return weights and learning curve.
+
+    Args:
+        part: Name of the network: diffuse or specular.
+        problems: Training samples and held-out samples.
+        schedule: Schedule and sizes.
+        inputs: Inputs of the stage.
+        progress: Receiver of progress.
+    """
 
     def report(point: Step) -> None:
-        """Errors of held-out samples at a step."""
+        """Report the errors of held-out samples at a step."""
         median, p95 = point.held_out_median_error, point.held_out_p95_error
         progress(point.step, schedule.steps, f"{part}: held-out error {median:.2%} (median), {p95:.2%} (p95)")
 
@@ -110,6 +121,7 @@ def _trained(
 
 
 def _write_curves(path: Path, curves: dict[str, list[Step]]) -> None:
+    """Write the learning curves, one row a step."""
     rows = [{"part": part, **msgspec.structs.asdict(point)} for part, curve in curves.items() for point in curve]
     with writing(path):
         pq.write_table(pa.Table.from_pylist(rows), path, compression="zstd")

@@ -1,7 +1,7 @@
-"""Unstructured reflectance map: every pixel whose material and normal are known becomes an observation, or a sample of them.
+"""Unstructured reflectance map (URM): observations of one photo, from pixels with a known material and normal.
 
-What an observation sees past its own mesh and the photo's other objects stands in its `visibility`, and which
-surfaces hide the rest in its `met`.
+Observations also have `visibility`, the share of light that arrives from each direction past the photo's meshes, and
+`met`, the surfaces that hide the rest.  Writes <photo>.parquet.
 """
 
 import logging
@@ -29,23 +29,24 @@ log = logging.getLogger("factorlib.urm")
 
 
 class Params(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """Which pixels become observations, and what they see of the sphere."""
+    """Selection of pixels, and resolution of visibility."""
 
     merge_degrees: Annotated[float, msgspec.Meta(ge=0, le=30)] = 0.0
-    """Pixels of one material whose normals and views differ by less, in degrees, become one observation; 0 keeps every pixel."""
+    """Angle, in degrees.  Pixels of one material whose normals and views differ by less are merged; 0 merges none."""
     least_confidence: Annotated[float, msgspec.Meta(ge=0, lt=1)] = 0.0
-    """Least confidence that `align` gives a pixel for it to be observed."""
+    """Smallest confidence, 0 to 1 as computed by `align`, of a pixel that becomes an observation."""
     most: Annotated[int, msgspec.Meta(ge=5000)] = 100_000
-    """Most observations of a photo; of more, a sample is taken, evenly over materials and normals, and weighted."""
+    """Largest number of a photo's observations.  More are sampled evenly over materials and normals, and weighted."""
     directions: Annotated[int, msgspec.Meta(ge=0, le=4096)] = 512
-    """Directions of the sphere whose visibility is cast; 0 for none."""
+    """Directions of the sphere whose visibility is computed (their number); 0 for none."""
     cast_points: Annotated[int, msgspec.Meta(ge=100)] = 25_000
-    """Observations of a photo that rays are cast from; the others take their neighbours' visibility."""
+    """Number of a photo's observations from which rays are cast; the others take the visibility of neighbours."""
 
 
 def main(params: Params, inputs: Inputs, out: Path, progress: Progress) -> None:
     """Write the observations of one photo."""
-    name, facts = inputs.photo, inputs.facts
+    name = inputs.photo
+    facts = inputs.facts
     photo, geometry = (read_exr(inputs[stage] / f"{name}.exr") for stage in ("masks", "align"))
     exposure = read_photo_facts(inputs["masks"] / f"{name}.json").exposure
     taken = Taken(name, facts["dataset.light"]["illumination"], exposure)
@@ -53,9 +54,12 @@ def main(params: Params, inputs: Inputs, out: Path, progress: Progress) -> None:
     if len(seen) == 0:
         log.warning("%s: no pixel where mask and mesh agree: the photo tells nothing; see its overlay in align", name)
     seen = sample(seen, params.most)
+    # visibility: rays from observations past all meshes of the photo
     if params.directions and len(seen):
-        poses, (height, width) = read_photo_poses(inputs["align"] / f"{name}.json"), photo["label"].shape
-        occluders, pixels = occluders_of(inputs, poses.objects), np.column_stack([seen.x, seen.y])
+        poses = read_photo_poses(inputs["align"] / f"{name}.json")
+        height, width = photo["label"].shape
+        occluders = occluders_of(inputs, poses.objects)
+        pixels = np.column_stack([seen.x, seen.y])
         camera = poses.camera.camera(width, height)
         report = partial(progress, text=f"{name}: visibility")
         past = sight(occluders, camera, pixels, seen.normal, params.directions, params.cast_points, report)
@@ -65,7 +69,7 @@ def main(params: Params, inputs: Inputs, out: Path, progress: Progress) -> None:
 
 
 def occluders_of(inputs: Inputs, poses: dict[str, ObjectEntry]) -> Occluders:
-    """Every object of the photo where `align` put it."""
+    """Return the meshes of the photo's objects at the poses that `align` estimated."""
     slice_ = msgspec.convert(inputs.facts["dataset.objects"], ObjectsSlice)
     read = MeshesOnce(inputs.mesh, inputs.facts["dataset.materials"], CREASE_DEG)
     meshes = [read.mesh(own.mesh, slice_.meshes[own.mesh], own.materials) for own in slice_.objects]

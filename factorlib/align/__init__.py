@@ -1,5 +1,6 @@
-"""Alignment: where the meshes of a photo are, and how sure that is.
+"""Alignment: estimation of object poses in a photo, and of their reliability.
 
-`place` begins with all objects of a photo, `search` with one: guesses (`coarse`), refined on contours (`refine`) against what the
-masks say (`silhouette`, `target`).  `given` checks what was given, and `trust` says which poses are to be doubted.
+`place` handles all objects of a photo, `search` a single one. The search starts from guesses (`coarse`) and refines
+them on contours (`refine`) against the masks (`silhouette`, `target`). `given` checks poses and cameras that the user
+gives. `trust` names the poses that are doubtful.
 """

@@ -1,12 +1,13 @@
-"""A first guess of the pose: every view of the mesh, at every roll, laid on the mask at every place.
+"""Initial poses by template matching: every view of the mesh, at every roll, laid on the mask at every place.
 
 The number of wrong pixels of a template T (one image per material l) laid on the mask at a shift t is linear in T,
 
-    errors(t) = |mask| + Σ_l Σ_p T_l(p − t) E_l(p),     E_l = +1 on background, −1 on material l, 0 elsewhere,
+    errors(t) = |mask| + Σ_l Σ_p T_l(p − t) E_l(p),     E_l = +1 on background, −1 on material l, 0 elsewhere.   (1)
 
-0 also where nothing is known: left out, hidden, outside the frame.  So one correlation by FFT gives it for all shifts.
-Views are spread evenly over the sphere (Fibonacci), rolls are turns of the photo, and the size follows from the areas;
-where frame or occluder cut the mask the areas do not say it, and several sizes are tried.
+E_l is also 0 where nothing is known: on pixels left out or hidden, and outside the frame. So one correlation by FFT
+gives the errors of all shifts. Views are spread evenly over the sphere (Fibonacci), rolls are rotations of the photo,
+and the size follows from the areas. The areas do not give the size where the frame or an occluder cuts the mask;
+several sizes are tried there.
 """
 
 from collections.abc import Iterator
@@ -24,18 +25,25 @@ from factorlib.geometry.camera import Camera, rotation_of_vector
 from factorlib.geometry.raster import Caster
 from factorlib.geometry.sphere import fibonacci_sphere
 
-GRID = 64  # pixels of the templates
-WHOLE, CUT = 29, 21  # mask's extent in them
-SIZES_OF_WHOLE = (0.95, 1.05)  # relative to the size that the areas say
+GRID = 64  # side of the templates, pixels
+WHOLE = 29  # extent of a whole mask, grid pixels
+CUT = 21  # extent of a cut mask, grid pixels
+SIZES_OF_WHOLE = (0.95, 1.05)  # relative to the size that the areas give
 SIZES_OF_CUT = (0.95, 1.15, 1.4, 1.75, 2.2)
-CUT_SHARE = 0.03  # of the contour on the frame or on broad unknown areas: more, and the mask is taken to be cut
-BROAD = 0.03  # of the mask's extent: narrower unknown bands, as along a contour, hide nothing
+CUT_SHARE = 0.03  # a mask is cut if more of its contour is at the frame or at broad unknown areas
+BROAD = 0.03  # share of the mask's extent: narrower unknown bands, as along a contour, hide nothing
 Rotation = Float[np.ndarray, "3 3"]
 
 
 class Guess(msgspec.Struct, frozen=True):
-    """A template laid on the photo: wrong pixels as a share of the mask's, the view, the photo's turn undone, the shift
-    (x, y), and the focal length; the last two in grid pixels."""
+    """Placement of a template on the photo.
+
+    error   wrong pixels, as a share of the mask's
+    turn    rotation of the view: it takes the direction of view to the optical axis
+    roll    rotation about the optical axis that undoes the photo's rotation
+    shift   (x, y) of the template, grid pixels
+    focal   focal length, grid pixels
+    """
 
     error: float
     turn: Rotation
@@ -52,11 +60,12 @@ def looking_along(direction: Float[np.ndarray, "3"]) -> Rotation:
 
 
 def is_cut(silhouette: Silhouette) -> bool:
-    """Return whether the frame, left-out pixels or other objects hide a real part of the mask's contour."""
+    """Return whether the frame, left-out pixels or other objects hide a substantial part of the mask's contour."""
     reach = max(int(BROAD * extent_of(silhouette)[2] / 2), 1)
-    pad = 2 * reach + 2  # beyond the frame nothing is known
+    pad = 2 * reach + 2
+    # unknown pixels, also beyond the frame, by morphological opening without bands narrower than 2 · reach
     unknown = np.pad(~silhouette.known, pad, constant_values=True)
-    unknown = ndimage.distance_transform_edt(~(ndimage.distance_transform_edt(unknown) > reach)) <= reach + 1  # opened
+    unknown = ndimage.distance_transform_edt(~(ndimage.distance_transform_edt(unknown) > reach)) <= reach + 1
     inside = np.pad(silhouette.inside, pad)
     border = inside & ~ndimage.binary_erosion(inside)
     return bool(np.count_nonzero(border & unknown) > CUT_SHARE * np.count_nonzero(border))
@@ -65,14 +74,24 @@ def is_cut(silhouette: Silhouette) -> bool:
 def candidates(
     caster: Caster, silhouette: Silhouette, camera: Camera, views: int, rolls: int, keep: int, apart_deg: float
 ) -> list[State]:
-    """The best guesses that differ in rotation, best first; the photo must show some pixel of the object.
+    """Return the best initial states that differ in rotation, best first.
 
-    views: directions of view, evenly over the sphere;  rolls: turns of the photo, evenly over 360°
-    keep: guesses at most, each turned by `apart_deg` at least against the others
+    Args:
+        caster: The mesh.
+        silhouette: The mask, with at least one pixel of the object.
+        camera: The photo's camera.
+        views: Number of directions of view, spread evenly over the sphere.
+        rolls: Number of rotations of the photo, spread evenly over 360°.
+        keep: Greatest number of states.
+        apart_deg: Least angle of rotation between any two states, degrees.
+
+    Returns:
+        States, best first.
     """
     guesses, middle, pixel, distance = guesses_of(caster, silhouette, camera, views, rolls)
     states = []
-    for guess in _apart(guesses, keep, apart_deg):  # shift and roll undone, seen along the ray to where it lies
+    for guess in _apart(guesses, keep, apart_deg):
+        # undo shift and roll: slopes of the ray to the object's centre, log depth and log focal length
         slope = (middle + pixel * guess.roll[:2, :2] @ guess.shift - np.array(camera.centre)) / camera.focal
         numbers = *slope, np.log(camera.focal * distance / (guess.focal * pixel)), np.log(camera.focal)
         states.append(State(toward(slope) @ guess.roll @ guess.turn, *map(float, numbers)))
@@ -82,19 +101,35 @@ def candidates(
 def guesses_of(
     caster: Caster, silhouette: Silhouette, camera: Camera, views: int, rolls: int
 ) -> tuple[list[Guess], np.ndarray, float, float]:
-    """The best place of the mesh in each view, roll and size; the mask's middle and a grid pixel, in pixels; the distance of the templates."""
+    """Return the best placement of the mesh for each view, roll and size.
+
+    Args:
+        caster: The mesh.
+        silhouette: The mask, with at least one pixel of the object.
+        camera: The photo's camera.
+        views: Number of directions of view, spread evenly over the sphere.
+        rolls: Number of rotations of the photo, spread evenly over 360°.
+
+    Returns:
+        The guesses, the mask's centre (x, y) in photo pixels, the size of a grid pixel in photo pixels, and the
+        distance from which the templates are seen, in units of the mesh.
+    """
     low, high, extent = extent_of(silhouette)
     cut = is_cut(silhouette)
-    pixel, middle = extent / (CUT if cut else WHOLE), (low + high) / 2
+    pixel = extent / (CUT if cut else WHOLE)
+    middle = (low + high) / 2
     angles = np.arange(rolls) * 2 * np.pi / rolls
     area = np.count_nonzero(silhouette.inside) / pixel**2
+    # spectra of E_l for every roll
     costs = _cost_images(silhouette, caster.mesh.labels, middle, pixel, angles)
     spectra = rfft2(costs, axes=(-2, -1)).astype(np.complex64)  # [rolls, labels, GRID, GRID//2+1]
-    guesses, undone = [], rotation_of_vector(np.outer(-angles, [0, 0, 1]))
+    guesses = []
+    undone = rotation_of_vector(np.outer(-angles, [0, 0, 1]))
     distance = np.clip(camera.focal / (extent / 2), 2.5, 30.0) * caster.radius
     for direction in fibonacci_sphere(views):
         turn = looking_along(direction)
         for template, focal in _templates(caster, turn, distance, area, SIZES_OF_CUT if cut else SIZES_OF_WHOLE):
+            # Σ_l Σ_p T_l(p − t) E_l(p) of (1) for every shift t, by correlation; the best shift of every roll
             spectrum = rfft2(template, axes=(-2, -1)).astype(np.complex64)
             errors = irfft2((spectra * np.conj(spectrum)).sum(axis=1), s=(GRID, GRID), axes=(-2, -1)).reshape(rolls, -1)
             best = errors.argmin(axis=1)
@@ -107,8 +142,9 @@ def guesses_of(
 def _cost_images(
     silhouette: Silhouette, labels: tuple[int, ...], middle: np.ndarray, pixel: float, angles: np.ndarray
 ) -> Float[np.ndarray, "rolls labels GRID GRID"]:
-    """E_l of the photo turned by each angle about `middle`."""
-    step = max(int(pixel / 2), 1)  # averaged in blocks first: thin parts count by their area
+    """Return E_l of (1) for the photo rotated by each angle about `middle`."""
+    # average E_l over blocks of step × step pixels, so that thin parts count by their area
+    step = max(int(pixel / 2), 1)
     height, width = (-(-n // step) * step for n in silhouette.label.shape)
     means = []
     for label in labels:
@@ -116,6 +152,7 @@ def _cost_images(
         of_photo = np.where(silhouette.label == 0, 1.0, np.where(silhouette.label == label, -1.0, 0.0))
         cost[: len(of_photo), : of_photo.shape[1]] = of_photo
         means.append(cost.reshape(height // step, step, width // step, step).mean(axis=(1, 3)))
+    # sample it on the grid rotated about the centre
     offset = np.arange(GRID) + 0.5 - GRID / 2
     x, y = np.meshgrid(offset * pixel, offset * pixel)
     images = np.empty((len(angles), len(labels), GRID, GRID), np.float32)
@@ -130,14 +167,16 @@ def _cost_images(
 def _templates(
     caster: Caster, turn: Rotation, distance: float, area: float, sizes: tuple[float, ...]
 ) -> Iterator[tuple[Float[np.ndarray, "labels GRID GRID"], float]]:
-    """Label images of the mesh at each size, scaled about the middle to the nearest pixel, and the focal length (grid
-    pixels) that gives it."""
+    """Yield label images of the mesh at each size and the focal length (grid pixels) of each.
+
+    The images are scaled about the centre by nearest-neighbour sampling.
+    """
     pose = State(turn, 0.0, 0.0, np.log(distance), 0.0).pose(caster)
     focal = 0.48 * GRID * distance / caster.radius
     image = caster.labels(caster.cast(Camera(GRID, GRID, focal, (GRID / 2, GRID / 2)), pose))
     for size in sizes:
         zoom = np.sqrt(area / max(np.count_nonzero(image), 1)) * size
-        if zoom < 4:  # else seen edge-on: nothing like the mask
+        if zoom < 4:  # otherwise the mesh is seen edge-on and cannot be the mask
             index = np.floor((np.arange(GRID) + 0.5 - GRID / 2) / zoom + GRID / 2).astype(int)
             there = (index >= 0) & (index < GRID)
             index = np.clip(index, 0, GRID - 1)
@@ -146,10 +185,11 @@ def _templates(
 
 
 def _apart(guesses: list[Guess], keep: int, apart_deg: float) -> list[Guess]:
-    """The best of the guesses, none within `apart_deg` of a better one."""
+    """Select the best guesses such that none is within `apart_deg` of a better one."""
     order = np.argsort(np.array([guess.error for guess in guesses]), kind="stable")[: 60 * keep]
     rotations = np.stack([guesses[k].roll @ guesses[k].turn for k in order])
-    chosen, closest = [], 1 + 2 * np.cos(np.deg2rad(apart_deg))
+    chosen = []
+    closest = 1 + 2 * np.cos(np.deg2rad(apart_deg))
     free = np.ones(len(order), bool)
     while free.any() and len(chosen) < keep:
         k = int(np.argmax(free))
@@ -160,6 +200,6 @@ def _apart(guesses: list[Guess], keep: int, apart_deg: float) -> list[Guess]:
 
 
 def toward(slope: Float[np.ndarray, "2"]) -> Rotation:
-    """The smallest rotation that takes the optical axis to the ray (slope, 1)."""
+    """Return the smallest rotation that takes the optical axis to the ray (slope, 1)."""
     ray = np.array([*slope, 1.0])
     return looking_along(ray / np.linalg.norm(ray)).T

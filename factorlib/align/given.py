@@ -1,5 +1,8 @@
-"""What is given for a photo, checked against the photo: a pose puts its object before the camera, a camera fits the
-picture, also one of an external source (COLMAP, transforms.json, BOP), and every material of the mask is some object's."""
+"""Checks of poses and cameras that are given for a photo.
+
+A pose must put its object in front of the camera. A camera must fit the picture, also a camera from an external source
+(COLMAP, transforms.json, BOP). Every material of the mask must belong to some object.
+"""
 
 import logging
 from collections.abc import Iterable, Sequence
@@ -14,116 +17,182 @@ from factorlib.geometry.camera import Camera, Pose
 from factorlib.meshes.mesh import Mesh
 from factorlib.results.photos import PhotoFacts
 
-FIELD_DEG = 1.0, 150.0  # of view, across the longer side, that cameras have
-MOST_ROUNDED_PX = 1.0  # a side of a picture made smaller is a whole number: its middle is off by half of this
-INNER = 0.25, 0.75  # of a photo, in which its principal point lies
+FIELD_DEG = 1.0, 150.0  # range of cameras' fields of view across the longer side, degrees
+MOST_ROUNDED_PX = 1.0  # greatest rounding of a resized picture's side, which is a whole number
+INNER = 0.25, 0.75  # range of a principal point, as a share of the photo's side
 log = logging.getLogger("factorlib.align")
 
 
 def check_before_camera(mesh: Mesh, pose: Pose, photo: str, name: str, source: str = "dataset") -> None:
-    """Raise InputError where a given pose puts the object, or its middle, not before the camera, z > 0; warn where it
-    reaches behind the camera, which then stands inside it.
+    """Check that a given pose puts the object in front of the camera (z > 0).
 
-    source: dataset, or the source of cameras that gives the pose
+    A warning is logged if the object reaches behind the camera, which then stands inside it.
+
+    Args:
+        mesh: Mesh of the object.
+        pose: Given pose.
+        photo: Name of the photo.
+        name: Name of the object.
+        source: "dataset", or the source of cameras that gives the pose.
+
+    Raises:
+        InputError: If all vertices, or the mesh's centre, are behind the camera.
     """
     depth = pose.apply(mesh.vertices)[:, 2]
     middle = float(pose.apply(mesh.centre[None])[0, 2])
     if depth.max() <= 0 or middle <= 0:
         what = f"object {name!r}" if depth.max() <= 0 else f"the middle of object {name!r}"
         raise InputError(
-            f"{what} is not before the camera: z = {middle:.4g}", file="dataset.yaml",
-            key=f"photos[{photo}].objects[{name}].pose" if source == "dataset" else f"cameras.{source}: {photo}: {name}",
-            cure="x_cam = R x_object + t with x right, y down, z forward (OpenGL's camera looks along −z: turn y and z over); "
-            "take the object out of photos that do not show it",
-        )  # fmt: skip
+            f"{what} is not before the camera: z = {middle:.4g}",
+            file="dataset.yaml",
+            key=f"photos[{photo}].objects[{name}].pose"
+            if source == "dataset"
+            else f"cameras.{source}: {photo}: {name}",
+            cure="x_cam = R x_object + t with x right, y down, z forward (OpenGL's camera looks along −z: turn y and z "
+            "over); take the object out of photos that do not show it",
+        )
     if behind := int(np.count_nonzero(depth <= 0)):
         log.warning(
-            "%s: %s: its pose (%s) puts %d of its %d vertices behind the camera, which then stands inside it: is it so, and in the "
-            "mesh's units?", photo, name, source, behind, len(depth),
-        )  # fmt: skip
+            "%s: %s: its pose (%s) puts %d of its %d vertices behind the camera, which then stands inside it: is it "
+            "so, and in the mesh's units?",
+            photo,
+            name,
+            source,
+            behind,
+            len(depth),
+        )
 
 
 def warn_of_materials(
     label: Float[np.ndarray, "h w"], of_objects: Iterable[Sequence[int]], materials: Sequence[str], photo: str
 ) -> None:
-    """Warn of materials of the mask that no object of the photo has: their pixels get no normals and are not used.
+    """Warn of materials of the mask that no object of the photo has; their pixels get no normals and are not used.
 
-    of_objects: labels of the materials of each object
+    Args:
+        label: Label of each pixel; k stands for `materials[k - 1]`, 0 for background.
+        of_objects: Labels of the materials of each object.
+        materials: Names of all materials.
+        photo: Name of the photo.
     """
     labels, counts = np.unique(np.round(label[label > 0.5]).astype(int), return_counts=True)
     known = {int(k) for labels_of_one in of_objects for k in labels_of_one}
     for k, count in zip(labels.tolist(), counts.tolist()):
         if k not in known:
             log.warning(
-                "%s: material %r has %d pixels in the mask, but no object of the photo has it: they are not used; is a label wrong, or "
-                "is an object, or a part's material, missing in dataset.yaml?", photo, materials[k - 1], count,
-            )  # fmt: skip
+                "%s: material %r has %d pixels in the mask, but no object of the photo has it: they are not used; is a "
+                "label wrong, or is an object, or a part's material, missing in dataset.yaml?",
+                photo,
+                materials[k - 1],
+                count,
+            )
 
 
 def warn_of_camera(focal: float | None, centre: tuple[float, float], size: tuple[int, int], photo: str) -> None:
-    """Warn of a principal point outside the photo and of a field of view that is no camera's, all in pixels.
+    """Warn of a principal point outside the photo and of an implausible field of view.
 
-    focal: None where it is not known;  size: width, height
+    Args:
+        focal: Focal length in pixels; None if it is unknown.
+        centre: Principal point (x, y) in pixels.
+        size: Width and height in pixels.
+        photo: Name of the photo.
     """
     width, height = size
     if not (0 <= centre[0] <= width and 0 <= centre[1] <= height):
         log.warning(
-            "%s: its principal point (%.6g, %.6g) lies outside the photo of %d × %d pixels: so it is only where the photo is cut out of "
-            "a larger one", photo, *centre, width, height,
-        )  # fmt: skip
+            "%s: its principal point (%.6g, %.6g) lies outside the photo of %d × %d pixels: so it is only where the "
+            "photo is cut out of a larger one",
+            photo,
+            *centre,
+            width,
+            height,
+        )
     if focal is not None:
         field = 2 * float(np.degrees(np.arctan(max(size) / 2 / focal)))
         if not FIELD_DEG[0] <= field <= FIELD_DEG[1]:
             log.warning(
-                "%s: its focal length of %.6g px makes a field of view of %.4g°, which few cameras have: is it in pixels of the photo, "
-                "not in millimetres?", photo, focal, field,
-            )  # fmt: skip
+                "%s: its focal length of %.6g px makes a field of view of %.4g°, which few cameras have: is it in "
+                "pixels of the photo, not in millimetres?",
+                photo,
+                focal,
+                field,
+            )
 
 
 def focal_and_centre(external: ExternalCamera, width: int, height: int, photo: str) -> tuple[float, Vec2]:
-    """Focal length and principal point of an external source's image, in pixels of the photo of width × height, as displayed.
+    """Convert focal length and principal point of an external source's image to pixels of the photo, as displayed.
 
-    Raises InputError where the photo is not the image at another size: it was cropped, turned or squeezed.
+    Args:
+        external: Camera of the external source.
+        width: Width of the photo as displayed.
+        height: Height of the photo as displayed.
+        photo: Name of the photo.
+
+    Returns:
+        Focal length and principal point (x, y).
+
+    Raises:
+        InputError: If the photo is not the image at another size, but was cropped, rotated or squeezed.
     """
-    size, point, fault = external.size, external.principal_point, None
+    size = external.size
+    point = external.principal_point
+    fault = None
 
     def is_resized(size: tuple[float, float]) -> bool:
-        """Return whether the longer sides say so, to a pixel of the shorter one."""
+        """Return whether the ratio of the longer sides gives the shorter one to within a pixel."""
         (long, short), (longer, shorter) = (size, (width, height)) if width >= height else (size[::-1], (height, width))
         return abs(short * longer / long - shorter) <= MOST_ROUNDED_PX
 
-    # photo pixels per image pixel: one number, but for the rounding of the photo's shorter side
+    # photo pixels per image pixel across and down: equal but for the rounding of the photo's shorter side
     across = down = 1.0 if size is None else width / size[0]
     if size is not None and (tall := size[1]) is not None:
-        down, image = height / tall, (size[0], tall)
+        down = height / tall
+        image = (size[0], tall)
         sizes = f"the photo has {width}×{height} pixels, its image in the source {size[0]:g}×{tall:g}"
         if not is_resized(image):
             cure = "give the image itself, or the same at another size, and masks of it"
             fault = f"{sizes}: it was cropped or squeezed"
             if is_resized(image[::-1]):
                 fault = f"{sizes}: it was made of the photo before its EXIF orientation was applied"
-                cure = "turn the photo's own pixels upright (ImageMagick: mogrify -auto-orient) and make the source of those"
+                cure = (
+                    "turn the photo's own pixels upright (ImageMagick: mogrify -auto-orient) and make the source of "
+                    "those"
+                )
     centre = (width / 2, height / 2) if point is None else (point[0] * across, point[1] * down)
     if size is None and not all(INNER[0] * side <= c <= INNER[1] * side for side, c in zip((width, height), centre)):
         where = f"({centre[0]:.0f}, {centre[1]:.0f}) is far from the middle of the photo's {width}×{height} pixels"
         fault = f"its principal point {where}"
-        cure = "give the photo at the size that the source was made of, or its camera in dataset.yaml (camera, and pose of its objects)"
+        cure = (
+            "give the photo at the size that the source was made of, or its camera in dataset.yaml (camera, and pose "
+            "of its objects)"
+        )
     if fault:
         raise InputError(fault, file="dataset.yaml", key=f"cameras.{external.source}: {photo}", cure=cure)
     return external.focal_px * (across if width >= height else down), centre
 
 
 def camera_of(slice_: ObjectsSlice, facts: PhotoFacts, photo: str) -> tuple[Camera, KnownFocal]:
-    """The photo's camera, its focal length to be found later, and what is known of that length.
+    """Return the photo's camera without its focal length, and the prior knowledge of the focal length.
 
-    What dataset.yaml gives goes before what its source of cameras gives, and that before EXIF and the middle of the photo.
-    Both say so in pixels of the photo's file, of which `masks` made a box one pixel.
+    dataset.yaml takes precedence over the dataset's source of cameras, which takes precedence over EXIF and the photo's
+    centre. The first two are in pixels of the photo's file; the stage `masks` reduced several of these to one pixel.
+
+    Args:
+        slice_: Entries of dataset.yaml that the photo needs.
+        facts: Size, scale factor and focal length of the photo.
+        photo: Name of the photo.
+
+    Returns:
+        The camera with a focal length of 1, and the known focal length.
     """
-    factor, (width, height) = facts.factor, facts.original_size
-    focal, source, centre = facts.focal_px, facts.focal_source, (width / 2, height / 2)
+    factor = facts.factor
+    (width, height) = facts.original_size
+    focal = facts.focal_px
+    source = facts.focal_source
+    centre = (width / 2, height / 2)
     if slice_.external is not None and (source != "dataset" or slice_.camera.principal_point is None):
         external_focal, centre = focal_and_centre(slice_.external, width, height, photo)
         if source != "dataset":
-            focal, source = external_focal / factor, slice_.external.source
+            focal = external_focal / factor
+            source = slice_.external.source
     across, down = slice_.camera.principal_point or centre
     return Camera(facts.width, facts.height, 1.0, (across / factor, down / factor)), KnownFocal(focal, source)

@@ -1,8 +1,9 @@
-"""Which part of a mesh shows which label, by laying the mesh on the masks under every pairing.
+"""Pairing of mesh parts with labels of masks, by laying the mesh on the masks under every pairing.
 
-In one sighting of an object every label that is seen is that of a part, and a part has one label or is not seen (HIDDEN).  A pairing costs the wrong pixels of the
-best view under it, as a share of the mask's.  Over all sightings a label is that of one part (which differs from mesh to mesh, not from
-photo to photo), so that sightings in which pairings look alike learn from those in which they do not.
+In one observation of an object every visible label belongs to a part, and a part has one label or is not visible
+(HIDDEN). The cost of a pairing is the number of wrong pixels of its best view, as a share of the mask's. Over all
+observations a label belongs to one part, which differs from mesh to mesh, not from photo to photo. So observations in
+which several pairings look alike are decided by the others.
 """
 
 from collections.abc import Sequence
@@ -17,32 +18,45 @@ from factorlib.geometry.camera import Camera
 from factorlib.geometry.raster import Caster
 from factorlib.meshes.mesh import Mesh
 
-VIEWS, ROLLS = 60, 18
-SEEN = 0.02  # of an object's pixels: a label with fewer is a slip of the brush
-MOST_PAIRINGS, MOST_ROLES = 24, 5000  # of a sighting, each of which takes .1 s;  of all labels
-HIDDEN = 0
-FOCAL = 1.2  # of a photo's longer side: a phone's; the outline changes little with it
+VIEWS = 60  # directions of view per pairing
+ROLLS = 18  # rotations of the photo per view
+SEEN = 0.02  # share of an object's pixels: a label with fewer is a slip of the brush
+MOST_PAIRINGS = 24  # pairings of one observation; each takes 0.1 s
+MOST_ROLES = 5000  # assignments of all labels to parts
+HIDDEN = 0  # label of a part that is not visible
+FOCAL = 1.2  # focal length of a phone in units of the photo's longer side; the outline changes little with it
 
 
 class Paired(msgspec.Struct, frozen=True):
-    """The label of each part in one sighting, the most likely first of all that it may have (HIDDEN among them), and by how many wrong pixels, as a share of a
-    mask's, all sightings together prefer that label to the next."""
+    """Labels of each part in one observation, and the margins of the decision.
+
+    labels    every label that a part may have, HIDDEN among them, most likely first
+    margins   cost over all observations of the second label less that of the first, as a share of a mask's pixels
+    """
 
     labels: list[list[int]]
     margins: list[float]
 
 
 def pair(mesh: Mesh, parts: int, sightings: Sequence[Silhouette]) -> list[Paired | None]:
-    """Find for each sighting the labels of the parts; None where it tells nothing: more labels than parts, or too many pairings to try.
+    """Find the labels of the parts in each observation.
 
-    mesh: labelled by part, from 1;  sightings: one object each, labelled as the masks are
+    Args:
+        mesh: The mesh, labelled by part, from 1.
+        parts: Number of parts.
+        sightings: Masks of one object each, labelled as the masks are.
+
+    Returns:
+        Labels for each observation; None where it has more labels than parts, or where there are too many pairings to
+        try.
     """
     costs = [_costs(mesh, parts, silhouette) for silhouette in sightings]
     labels = sorted({label for cost in costs for pairing in cost for label in pairing} - {HIDDEN})
     if parts ** len(labels) > MOST_ROLES:
         return [None] * len(costs)
-    best = [{} for _ in costs]  # of each sighting: (part, its label) -> the least cost of all sightings
-    for roles in product(range(parts), repeat=len(labels)):  # the part of each label
+    best = [{} for _ in costs]  # for each observation: (part, its label) -> least total cost over all observations
+    # for every assignment of labels to parts: the least total cost, for each pairing of each observation that agrees
+    for roles in product(range(parts), repeat=len(labels)):
         role = dict(zip(labels, roles))
         agreeing = [{p: c for p, c in cost.items() if all(k == HIDDEN or p[role[k]] == k for k in p)} for cost in costs]
         if not all(own or not cost for own, cost in zip(agreeing, costs)):
@@ -52,6 +66,7 @@ def pair(mesh: Mesh, parts: int, sightings: Sequence[Silhouette]) -> list[Paired
             for pairing, cost in own.items():
                 for key in enumerate(pairing):
                     known[key] = min(known.get(key, np.inf), total - min(own.values()) + cost)
+    # rank the labels of each part by cost
     found = []
     for known in best:
         ranked = [sorted((cost, label) for (p, label), cost in known.items() if p == part) for part in range(parts)]
@@ -61,7 +76,7 @@ def pair(mesh: Mesh, parts: int, sightings: Sequence[Silhouette]) -> list[Paired
 
 
 def _costs(mesh: Mesh, parts: int, silhouette: Silhouette) -> dict[tuple[int, ...], float]:
-    """The cost of each pairing (the label of every part) of one sighting."""
+    """Return the cost of each pairing (a tuple with the label of every part) of one observation."""
     counts = np.bincount(silhouette.label[silhouette.inside])
     seen = np.flatnonzero(counts > SEEN * counts.sum()).tolist()
     if not 0 < len(seen) <= parts or (len(seen) + 1) ** parts > MOST_ROLES:

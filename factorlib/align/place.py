@@ -1,4 +1,4 @@
-"""All objects of one photo: given poses are used, the others searched, one camera for all."""
+"""Placement of all objects of one photo: given poses are used, the others are searched, with one camera for all."""
 
 import logging
 from collections.abc import Sequence
@@ -19,17 +19,17 @@ from factorlib.geometry.camera import Camera, Pose
 from factorlib.geometry.raster import Caster, rasterise
 from factorlib.results.poses import AS_IT_IS, CameraEntry, ObjectEntry
 
-WELL_FOUND = 0.9  # score from which the pose is right enough to judge EXIF's focal length by
-CLEARLY_BETTER = 0.01  # score by which another focal length must win against EXIF's
-MOST_ERROR = 0.015  # of the photo's longer side, from a point named in the photo to the mesh's: more is a mistake
-LEAST_AGREEING = 4  # three have up to four poses
-LEAST_FOR_FOCAL = 6  # so many also tell the focal length
-FOCALS = (0.4, 10.0)  # of the longer side: what else comes out is not believed
+WELL_FOUND = 0.9  # least score of a pose that can judge EXIF's focal length
+CLEARLY_BETTER = 0.01  # lead in score that another focal length needs over EXIF's
+MOST_ERROR = 0.015  # greatest reprojection error of a keypoint, as a share of the photo's longer side
+LEAST_AGREEING = 4  # least number of keypoints that agree; three have up to four poses
+LEAST_FOR_FOCAL = 6  # least number of keypoints that determine the focal length too
+FOCALS = (0.4, 10.0)  # range of plausible focal lengths in units of the photo's longer side
 log = logging.getLogger("factorlib.align")
 
 
 class KnownFocal(msgspec.Struct, frozen=True):
-    """What is known of the focal length beforehand, photo pixels; None where nothing is.
+    """Prior knowledge of the focal length in photo pixels; None where nothing is known.
 
     source: dataset | colmap | transforms | bop | exif
     """
@@ -39,14 +39,18 @@ class KnownFocal(msgspec.Struct, frozen=True):
 
 
 class Keypoints(msgspec.Struct, frozen=True):
-    """pixel [n, 2] (x right, y down, pixel centres at 0.5) shows point [n, 3] of the mesh, in its own frame and units."""
+    """Correspondences of pixels and points of the mesh.
+
+    pixel   [n, 2], x right, y down, pixel centres at 0.5
+    point   [n, 3], in the mesh's frame and units
+    """
 
     pixel: Float[np.ndarray, "n 2"]
     point: Float[np.ndarray, "n 3"]
 
 
 class ObjectToPlace(msgspec.Struct, frozen=True):
-    """An object to place: its mesh, what the photo says about it, and what the user, or an earlier result, said of its pose."""
+    """Object to place: its mesh, its mask, and its pose as far as the user or an earlier result gives it."""
 
     name: str
     caster: Caster
@@ -54,37 +58,60 @@ class ObjectToPlace(msgspec.Struct, frozen=True):
     pose: Pose | None = None
     keypoints: Keypoints | None = None
     earlier: ObjectEntry | None = None
-    scale: tuple[float, float, float] = AS_IT_IS  # of the caster's mesh, against the file's
+    scale: tuple[float, float, float] = AS_IT_IS  # factors of the caster's mesh against the file's
 
 
 class Placed(msgspec.Struct, frozen=True):
-    """The photo's camera with its focal length, where that is from, its standard error (log), and each object's pose."""
+    """Camera of the photo with its focal length, its source and standard error (log), and the pose of each object."""
 
     camera: Camera
     focal_source: str  # dataset | colmap | transforms | bop | exif | estimated
     log_focal_sigma: float
     poses: list[Pose]
-    found: list[Found | None]  # None where the pose was given
-    prior: FocalPrior  # what was known of the focal length beforehand
+    found: list[Found | None]  # None for a given pose
+    prior: FocalPrior  # prior of the focal length, before alignment
 
 
 def placed(
-    objects: Sequence[ObjectToPlace], camera: Camera, known: KnownFocal, photo: str,
-    search: Search = Search(), before: CameraEntry | None = None, report: Report = lambda done: None,
-) -> Placed:  # fmt: skip
-    """Poses of all objects.  The focal length, where neither known nor found `before`, is found with the object that shows most.
+    objects: Sequence[ObjectToPlace],
+    camera: Camera,
+    known: KnownFocal,
+    photo: str,
+    search: Search = Search(),
+    before: CameraEntry | None = None,
+    report: Report = lambda done: None,
+) -> Placed:
+    """Estimate the poses of all objects of a photo.
 
-    camera: of the photo; its focal length is not used.  before: the camera of an earlier result, in pixels of this photo.
-    report: called now and then with how many objects are done, and what share of the next
-    Raises InputError for an object to search whose mask has no pixel.
+    The focal length, where neither `known` nor `before` gives it, is estimated with the object that covers most pixels.
+
+    Args:
+        objects: The objects.
+        camera: The photo's camera; its focal length is not used.
+        known: Prior knowledge of the focal length.
+        photo: Name of the photo.
+        search: Effort of the search.
+        before: Camera of an earlier result, in pixels of this photo.
+        report: Function called now and then with the number of objects that are done, fractions included.
+
+    Returns:
+        The camera and the poses.
+
+    Raises:
+        InputError: If the mask of an object to search has no pixel, or if its keypoints do not agree.
     """
-    source, sigma, found = known.source, 0.0, {}
+    source = known.source
+    sigma = 0.0
+    found = {}
     prior = beforehand = focal_prior(known.focal, source, camera.width, camera.height)
     if before is not None:
-        prior, source, sigma = FocalPrior(before.focal_px, 0.0), before.focal_source, before.focal_relative_stderr
+        prior = FocalPrior(before.focal_px, 0.0)
+        source = before.focal_source
+        sigma = before.focal_relative_stderr
     camera = msgspec.structs.replace(camera, focal=prior.focal)
     if prior.sigma > 0 and any(each.pose is not None for each in objects):
-        camera, source = _focal_of_given(objects, camera), "estimated"
+        camera = _focal_of_given(objects, camera)
+        source = "estimated"
         prior = FocalPrior(camera.focal, 0.0)
     most_first = sorted(range(len(objects)), key=lambda k: (-int(objects[k].silhouette.inside.sum()), k))
     for done, k in enumerate(most_first):
@@ -96,8 +123,9 @@ def placed(
             cure = "remove the object from this photo, or check its mask and materials"
             fault = f"no pixel of the mask shows object {obj.name!r}"
             raise InputError(fault, file="dataset.yaml", key=photo, cure=cure)
-        if obj.earlier is not None:  # as it is, scored anew, with its runner-up where that still counts
-            start, other = state_of(obj.earlier.pose, camera, obj.caster), obj.earlier.runner_up
+        if obj.earlier is not None:  # keep the earlier pose and its runner-up; compute the score again
+            start = state_of(obj.earlier.pose, camera, obj.caster)
+            other = obj.earlier.runner_up
             known_camera = FocalPrior(camera.focal, 0.0)
             score = refined_finest(obj.caster, obj.silhouette, camera, start, known_camera, search, 0).score
             second = other and RunnerUp(
@@ -116,30 +144,50 @@ def placed(
                 found[k], source = _judged(obj, camera, found[k], photo, search)
             else:
                 source = "estimated"
-            sigma, camera = found[k].log_focal_sigma, found[k].state.camera(camera)
+            sigma = found[k].log_focal_sigma
+            camera = found[k].state.camera(camera)
             prior = FocalPrior(camera.focal, 0.0)
-    poses = [  # known ones are used to the last digit
-        obj.pose or (obj.earlier.pose if obj.earlier else found[k].state.pose(obj.caster)) for k, obj in enumerate(objects)
-    ]  # fmt: skip
+    # given and earlier poses are kept to the last digit
+    poses = [
+        obj.pose or (obj.earlier.pose if obj.earlier else found[k].state.pose(obj.caster))
+        for k, obj in enumerate(objects)
+    ]
     return Placed(camera, source or "estimated", sigma, poses, [found.get(k) for k in range(len(objects))], beforehand)
 
 
 def state_of_keypoints(obj: ObjectToPlace, camera: Camera, prior: FocalPrior, photo: str) -> State:
-    """The state in which most keypoints of `obj` agree, by COLMAP's robust absolute pose (LO-RANSAC over P3P, or P4Pf where the focal
-    length is sought too), then refined.  Points named wrongly are outliers, as long as enough agree: raises InputError where
-    fewer than LEAST_AGREEING do.
+    """Return the state in which most keypoints of `obj` agree.
 
-    camera: its focal length is the prior's; it is replaced only where nothing was known and LEAST_FOR_FOCAL are given.
+    It is COLMAP's robust absolute pose (LO-RANSAC over P3P, or over P4Pf with an unknown focal length), then refined.
+    Wrong keypoints are outliers as long as enough of the others agree.
+
+    Args:
+        obj: Object with keypoints.
+        camera: The photo's camera with the prior's focal length. The length is estimated too if it is not exactly known
+            and there are LEAST_FOR_FOCAL keypoints.
+        prior: Prior of the focal length.
+        photo: Name of the photo.
+
+    Returns:
+        The state.
+
+    Raises:
+        InputError: If fewer than LEAST_AGREEING keypoints agree.
     """
-    keypoints, caster = obj.keypoints, obj.caster
+    keypoints = obj.keypoints
+    caster = obj.caster
     assert keypoints is not None
-    side, points = max(camera.width, camera.height), (keypoints.point - caster.centre) / caster.radius
-    estimation, refinement = pycolmap.AbsolutePoseEstimationOptions(), pycolmap.AbsolutePoseRefinementOptions()
-    estimation.ransac.max_error, estimation.ransac.random_seed = MOST_ERROR * side, 0
+    side = max(camera.width, camera.height)
+    points = (keypoints.point - caster.centre) / caster.radius
+    estimation = pycolmap.AbsolutePoseEstimationOptions()
+    refinement = pycolmap.AbsolutePoseRefinementOptions()
+    estimation.ransac.max_error = MOST_ERROR * side
+    estimation.ransac.random_seed = 0
+    # first with an unknown focal length, if there are enough keypoints, then with the known one
     sought = prior.sigma > 0 and len(keypoints.pixel) >= LEAST_FOR_FOCAL
     for free in (True, False) if sought else (False,):
         estimation.estimate_focal_length = refinement.refine_focal_length = free
-        colmap = camera.colmap()  # gets the focal length
+        colmap = camera.colmap()  # pycolmap writes the estimated focal length into it
         found = pycolmap.estimate_and_refine_absolute_pose(keypoints.pixel, points, colmap, estimation, refinement)
         agreeing = found["num_inliers"] if found else 0
         if found and agreeing >= LEAST_AGREEING and FOCALS[0] * side <= colmap.focal_length <= FOCALS[1] * side:
@@ -147,13 +195,19 @@ def state_of_keypoints(obj: ObjectToPlace, camera: Camera, prior: FocalPrior, ph
             pose = Pose(rotation, caster.radius * found["cam_from_world"].translation - rotation @ caster.centre)
             return state_of(pose, msgspec.structs.replace(camera, focal=float(colmap.focal_length)), caster)
     raise InputError(
-        f"only {agreeing} of the {len(keypoints.pixel)} keypoints of '{obj.name}' agree on a pose", file="dataset.yaml", key=f"{photo}.{obj.name}.keypoints",
-        cure=f"at least {LEAST_AGREEING} must, within {MOST_ERROR:.1%} of the photo's longer side: is each pixel (x, y) beside its own point?",
-    )  # fmt: skip
+        f"only {agreeing} of the {len(keypoints.pixel)} keypoints of '{obj.name}' agree on a pose",
+        file="dataset.yaml",
+        key=f"{photo}.{obj.name}.keypoints",
+        cure=f"at least {LEAST_AGREEING} must, within {MOST_ERROR:.1%} of the photo's longer side: is each pixel (x, "
+        "y) beside its own point?",
+    )
 
 
 def _judged(obj: ObjectToPlace, camera: Camera, found: Found, photo: str, search: Search) -> tuple[Found, str]:
-    """EXIF's focal length stands unless the mask clearly contradicts it: crops keep their EXIF."""
+    """Decide between EXIF's focal length and an estimated one; return the pose and the source of the length.
+
+    EXIF's length is replaced only if the mask clearly contradicts it: cropped photos keep their EXIF.
+    """
     broad = focal_prior(None, None, camera.width, camera.height)
     if found.score >= WELL_FOUND:
         steps = 2 * search.steps[-1]
@@ -164,25 +218,32 @@ def _judged(obj: ObjectToPlace, camera: Camera, found: Found, photo: str, search
     if free.score < found.score + CLEARLY_BETTER:
         return found, "exif"
     log.warning(
-        "%s: the EXIF focal length (%.0f px) does not fit the mask, %.0f px does (%.3f against %.3f): is the photo a crop? "
-        "give camera.focal_px to settle it", photo, camera.focal, np.exp(free.state.log_focal), free.score, found.score,
-    )  # fmt: skip
+        "%s: the EXIF focal length (%.0f px) does not fit the mask, %.0f px does (%.3f against %.3f): is the photo a "
+        "crop? give camera.focal_px to settle it",
+        photo,
+        camera.focal,
+        np.exp(free.state.log_focal),
+        free.score,
+        found.score,
+    )
     return free, "estimated"
 
 
 def _focal_of_given(objects: Sequence[ObjectToPlace], camera: Camera) -> Camera:
-    """The focal length at which given poses fit their masks best."""
+    """Return the camera with the focal length at which given poses fit their masks best."""
     shown = [t for t in objects if t.pose and t.silhouette.inside.any()]
     fixed = [(t.caster, t.pose, target_of(t.silhouette, t.caster.mesh.labels, 200)) for t in shown]
 
     def at(log_focal: float) -> Camera:
+        """Return the camera with the focal length exp(log_focal)."""
         return msgspec.structs.replace(camera, focal=float(np.exp(log_focal)))
 
     def misfit(log_focal: float) -> float:
-        """Minus the sum of overlaps (IoU) with the focal length exp(log_focal)."""
+        """Return minus the sum of overlaps (IoU) at the focal length exp(log_focal)."""
         seen = ((t, rasterise(caster, t.camera(at(log_focal)), pose)) for caster, pose, t in fixed)
         return -sum(labelled_iou(target.silhouette, maps.label) for target, maps in seen)
 
+    # a grid over log focal length, then Brent's method about its best point
     grid = np.log(camera.focal) + np.linspace(-1.6, 1.6, 33)
     best = grid[int(np.argmin([misfit(g) for g in grid]))]
     return at(minimize_scalar(misfit, bounds=(best - 0.1, best + 0.1), method="bounded", options={"xatol": 1e-4}).x)

@@ -1,17 +1,17 @@
-"""Refinement of a pose on contours, by Gauss-Newton.
+"""Refinement of a pose on contours, by Gauss–Newton.
 
-The contour of the mesh in the image is rendered anew at every step, to a fraction of a pixel: between a pixel in and
-one out, rays are halved in.  (With whole pixels most residuals are exactly 0, and a robust fit sticks to them.)  To
-first order the image of an occluding contour moves, across itself, as the surface points on it do; so each contour
-point's 3D point carries the derivative.  COLMAP's absolute pose refinement on the same correspondences, measured on
-real photos, ends in the same place.
-Two kinds of residual, both in window pixels and both per material, so that the border between two parts counts too:
+Every step renders the contour of the mesh to a fraction of a pixel. Rays are bisected between a pixel inside and one
+outside. (With whole pixels most residuals are exactly 0, and a robust fit sticks to them.) To first order the image of
+an occluding contour moves, across itself, as the surface points on it do. So the 3D point of each contour point carries
+the derivative. COLMAP's absolute pose refinement on the same correspondences, measured on real photos, ends in the same
+place. There are two kinds of residual, both in window pixels and both per material, so that the border between two
+parts counts too:
 
     mesh → mask    the mask's signed distance at each contour point of the mesh
-    mask → mesh    how far, along the mask's normal, the nearest contour point of the mesh is from each one of the mask
+    mask → mesh    the distance along the mask's normal from each of its contour points to the mesh's nearest one
 
-The first alone lets a mesh hide inside its mask, the second alone lets it stick out.  Cauchy weights with a scale
-from the residuals themselves keep parts that one of the two lacks from pulling.
+The first kind alone lets a mesh hide inside its mask, the second alone lets it stick out. Cauchy weights, with a scale
+from the residuals themselves, limit the influence of parts that only one of the two has.
 """
 
 from collections.abc import Callable
@@ -29,42 +29,42 @@ from factorlib.geometry.camera import Camera
 from factorlib.geometry.raster import Caster, Hits
 from factorlib.robust import robust_deviation
 
-CORRELATION = 10.0  # contour pixels that share one error of mask or mesh
-LEAST_SPREAD = 0.35  # window pixels: the error of a mask's contour, of whole pixels as it is
-HALVINGS = 3  # of a pixel, to find where the mesh's contour crosses it
-MOST_SCALE = 0.05  # of the mask's extent
-DAMPING = np.array([0.15, 0.15, 0.15, 0.1, 0.1, 0.15, 0.3]) ** -2.0  # as if each unknown had a deviation of its own
-LARGEST_STEP = 0.3  # of each unknown, in its own unit
-STILL = 0.03  # standard errors, by the normal equations: a shorter step ends the descent
+CORRELATION = 10.0  # number of contour pixels that share one error of mask or mesh
+LEAST_SPREAD = 0.35  # error of a mask's contour, which follows whole pixels; in window pixels
+HALVINGS = 3  # bisections of a pixel, to locate the mesh's contour
+MOST_SCALE = 0.05  # greatest scale of the residuals, as a share of the mask's extent
+DAMPING = np.array([0.15, 0.15, 0.15, 0.1, 0.1, 0.15, 0.3]) ** -2.0  # inverse variance of a step of each unknown
+LARGEST_STEP = 0.3  # greatest step of each unknown, in its unit
+STILL = 0.03  # a step of fewer standard errors ends the iteration
 Points = Float[np.ndarray, "n 2"]
 
 
 class FocalPrior(msgspec.Struct, frozen=True):
-    """log focal length ~ Normal(log `focal`, `sigma`); sigma 0: known."""
+    """Prior of the focal length, log f ~ Normal(log `focal`, `sigma`); a sigma of 0 means that f is known."""
 
     focal: float
     sigma: float
 
     @property
     def free(self) -> int:
-        """The number of unknowns of `State.moved` that may move: the last is the focal length."""
+        """Number of unknowns of `State.moved` that may move; the last one is the focal length."""
         return 7 if self.sigma > 0 else 6
 
 
 class Refined(msgspec.Struct, frozen=True):
-    """A state, its labelled IoU in the window, and the information of the normal equations there."""
+    """State, its labelled IoU in the window, and the information matrix of the normal equations there."""
 
     state: State
     score: float
     information: Float[np.ndarray, "7 7"]
 
     def log_focal_sigma(self) -> float:
-        """Standard error of the log focal length by the normal equations, the prior included."""
+        """Return the standard error of the log focal length by the normal equations, prior included."""
         return float(np.sqrt(max(np.linalg.pinv(self.information)[6, 6], 0.0)))
 
 
 class Rendered(msgspec.Struct, frozen=True):
-    """A mesh in a state, as a target's window sees it: the camera of the window, and what its pixels' rays hit."""
+    """Mesh in a state, rendered in a target's window: the camera of the window, and the hits of its pixels' rays."""
 
     caster: Caster
     state: State
@@ -72,24 +72,50 @@ class Rendered(msgspec.Struct, frozen=True):
     hits: Hits
 
     def score(self, target: Target) -> float:
-        """Labelled IoU with the target's mask."""
+        """Return the labelled IoU with the target's mask."""
         return labelled_iou(target.silhouette, self.caster.labels(self.hits))
 
 
 def rendered(caster: Caster, target: Target, camera: Camera, state: State) -> Rendered:
-    """The mesh in `state`, cast in the target's window of the photo with camera `camera`."""
+    """Cast the mesh in `state` into the target's window of the photo.
+
+    Args:
+        caster: The mesh.
+        target: Window about the mask.
+        camera: The photo's camera.
+        state: State of the mesh.
+
+    Returns:
+        The camera of the window and its hits.
+    """
     window = target.camera(state.camera(camera))
     return Rendered(caster, state, window, caster.cast(window, state.pose(caster)))
 
 
 def refined(caster: Caster, target: Target, camera: Camera, start: State, prior: FocalPrior, steps: int) -> Refined:
-    """The best-scoring state met in `steps` steps from `start`; fewer where a step is short, or three in a row gain nothing."""
-    state, free = start, prior.free
+    """Refine `start` by Gauss–Newton and return the state of the best score.
+
+    It ends early if a step is short or if three steps in a row gain nothing.
+
+    Args:
+        caster: The mesh.
+        target: Window about the mask.
+        camera: The photo's camera.
+        start: Initial state.
+        prior: Prior of the focal length.
+        steps: Greatest number of steps.
+
+    Returns:
+        The best of all states on the way, `start` included.
+    """
+    state = start
+    free = prior.free
     ran: list[Refined] = []
     for _ in range(steps + 1):
         seen = rendered(caster, target, camera, state)
         information, gradient = normal_equations(seen, target, prior)
         ran.append(Refined(state, seen.score(target), information))
+        # damped Gauss–Newton step of the free unknowns
         step = np.zeros(7)
         step[:free] = -np.linalg.solve((information + np.diag(DAMPING))[:free, :free], gradient[:free])
         step = np.clip(step, -LARGEST_STEP, LARGEST_STEP)
@@ -103,28 +129,42 @@ def refined(caster: Caster, target: Target, camera: Camera, start: State, prior:
 def normal_equations(
     seen: Rendered, target: Target, prior: FocalPrior, jacobian_of: Callable[..., np.ndarray] = State.jacobian
 ) -> tuple[Float[np.ndarray, "k k"], Float[np.ndarray, " k"]]:
-    """Information and gradient of the contours' residuals by all unknowns, the first seven those of `State.moved`, robustly
-    weighted, with the prior of the focal length.
+    """Return information matrix and gradient of the contours' residuals, robustly weighted, prior included.
 
-    jacobian_of: derivative of image points by all unknowns, from the state and the points' arms, as `State.jacobian`
+    Args:
+        seen: The rendered mesh.
+        target: Window about the mask.
+        prior: Prior of the focal length.
+        jacobian_of: Derivative of image points by all unknowns, from the state and the points' offsets, as
+            `State.jacobian`.
+
+    Returns:
+        Information and gradient; the first seven unknowns are those of `State.moved`.
     """
-    residuals, rows = [np.zeros(0)], [np.zeros((0, jacobian_of(seen.state, np.zeros((0, 3))).shape[-1]))]
+    residuals = [np.zeros(0)]
+    rows = [np.zeros((0, jacobian_of(seen.state, np.zeros((0, 3))).shape[-1]))]
     for name, region in target.regions.items():
         points, arms = contour_of(seen, name)
         if len(points) == 0:
             continue
+        # mesh → mask: signed distance, and its slope times the Jacobian of the image points
         jacobian = jacobian_of(seen.state, arms) / target.pixel
         slope_x, slope_y = (at_points(region.slope[..., k], points)[:, None] for k in (0, 1))
         residuals.append(at_points(region.distance, points))
         rows.append(slope_x * jacobian[:, 0] + slope_y * jacobian[:, 1])
+        # mask → mesh: distance along the mask's normal to the nearest contour point of the mesh
         if len(region.contour):
             nearest = cKDTree(points).query(region.contour)[1]
             residuals.append(np.einsum("nd,nd->n", region.outward, points[nearest] - region.contour))
             rows.append(np.einsum("nd,ndk->nk", region.outward, jacobian[nearest]))
-    residual, row = np.concatenate(residuals), np.concatenate(rows)
+    # Cauchy weights 1/(1 + (r/2s)²) of scale s, over the variance of CORRELATION pixels
+    residual = np.concatenate(residuals)
+    row = np.concatenate(rows)
     scale = max(min(robust_deviation(residual) if len(residual) else 0.0, MOST_SCALE * target.extent), LEAST_SPREAD)
     weight = 1 / (1 + (residual / (2 * scale)) ** 2) / (CORRELATION * scale**2)
-    information, gradient = (row * weight[:, None]).T @ row, row.T @ (weight * residual)
+    # information JᵀWJ and gradient JᵀWr, with the prior of log focal length
+    information = (row * weight[:, None]).T @ row
+    gradient = row.T @ (weight * residual)
     if prior.sigma > 0:
         information[6, 6] += prior.sigma**-2
         gradient[6] += (seen.state.log_focal - np.log(prior.focal)) / prior.sigma**2
@@ -132,23 +172,33 @@ def normal_equations(
 
 
 def contour_of(seen: Rendered, name: int) -> tuple[Points, Float[np.ndarray, "n 3"]]:
-    """Points (x, y) of the contour of the mesh's part of label `name`, window pixels, and the arms from the mesh's centre
-    to the surface points that move them (camera axes, mesh units): where another part covers it, the contour moves with
-    the nearer surface.
+    """Return the contour of the mesh's part of label `name` and the surface points that move it.
+
+    Where another part covers this one, the contour moves with the nearer surface.
+
+    Returns:
+        Points (x, y) of the contour in window pixels, and offsets from the mesh's centre to their surface points
+        (camera axes, mesh units).
     """
-    caster, window, hits = seen.caster, seen.window, seen.hits
+    caster = seen.caster
+    window = seen.window
+    hits = seen.hits
     inside = caster.labels(hits) == name
     pixel_in, pixel_out = border_pairs(inside, ~inside)
     depth = np.minimum(hits.depth[tuple(pixel_in.T)], hits.depth[tuple(pixel_out.T)])
-    near, far, pose = pixel_in[:, ::-1] + 0.5, pixel_out[:, ::-1] + 0.5, seen.state.pose(caster)
+    near = pixel_in[:, ::-1] + 0.5
+    far = pixel_out[:, ::-1] + 0.5
+    pose = seen.state.pose(caster)
+    # bisect between the pixel inside and the pixel outside
     for _ in range(HALVINGS):
         middle = (near + far) / 2
         within = (caster.labels(caster.cast_along(window.rays_through(middle), pose)) == name)[:, None]
-        near, far = np.where(within, middle, near), np.where(within, far, middle)
+        near = np.where(within, middle, near)
+        far = np.where(within, far, middle)
     points = (near + far) / 2
     return points, window.rays_through(points) * depth[:, None] - seen.state.middle()
 
 
 def at_points(image: Float[np.ndarray, "h w"], points: Points) -> Float[np.ndarray, " n"]:
-    """An image's values at points (x, y), pixel centres at 0.5, linear between pixels."""
+    """Return an image's values at points (x, y), pixel centres at 0.5, by bilinear interpolation."""
     return map_coordinates(image, points.T[::-1] - 0.5, order=1, mode="nearest")

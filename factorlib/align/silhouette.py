@@ -1,4 +1,4 @@
-"""What the masks of a photo say about where its objects are, and what they leave open."""
+"""Silhouettes of objects in a photo, from its masks, with the pixels that remain unknown."""
 
 from collections.abc import Mapping, Sequence
 
@@ -7,33 +7,33 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 UNKNOWN = -1
-Channels = Mapping[str, Float[np.ndarray, "h w"]]  # of the stage `masks`
+Channels = Mapping[str, Float[np.ndarray, "h w"]]  # channels that the stage `masks` writes
 Labels = Int[np.ndarray, "h w"]
 Mask = Bool[np.ndarray, "h w"]
 
 
 class Silhouette(msgspec.Struct, frozen=True):
-    """Which pixels of a photo show an object (or all of them together), by material.
+    """Label image of one object, or of all objects of a photo together.
 
-    label  [h, w] int16: material k, 0 background, UNKNOWN where the photo does not say: left out by the user,
-           or covered by something that may stand in front of the object
+    label  [h, w] int16: material k, 0 background, UNKNOWN where the photo does not tell: left out by the user,
+           or covered by something that may be in front of the object
     """
 
     label: Labels
 
     @property
     def inside(self) -> Mask:
-        """Where the photo shows some material of the object."""
+        """Mask of the pixels that show some material of the object."""
         return self.label > 0
 
     @property
     def known(self) -> Mask:
-        """Where the photo says what is seen."""
+        """Mask of the pixels that are not UNKNOWN."""
         return self.label != UNKNOWN
 
 
 def silhouette_of_photo(channels: Channels) -> Silhouette:
-    """Return the silhouette of the whole photo, from the channels that the masks stage wrote."""
+    """Return the silhouette of the whole photo, from the channels that the stage `masks` wrote."""
     label = np.round(channels["label"]).astype(np.int16)
     if "left_out" in channels:
         label[channels["left_out"] > 0.5] = UNKNOWN
@@ -41,10 +41,19 @@ def silhouette_of_photo(channels: Channels) -> Silhouette:
 
 
 def silhouette_of_object(channels: Channels, number: int, labels: Sequence[int], own_mask: bool) -> Silhouette:
-    """Return the silhouette of object `number` (from 1), whose mesh carries `labels`.
+    """Return the silhouette of one object.
 
-    With a mask of its own, what lies in it is the object; without, every pixel of its materials that no other object
-    claims.  Pixels of other objects and of foreign materials may hide it: UNKNOWN.
+    Pixels of other objects and of foreign materials may hide it: they are UNKNOWN.
+
+    Args:
+        channels: Channels that the stage `masks` wrote.
+        number: Number of the object in the photo, from 1.
+        labels: Labels that the object's mesh carries.
+        own_mask: Whether the object has a mask of its own. If so, it is what lies in that mask; if not, it is every
+            pixel of its materials that no other object claims.
+
+    Returns:
+        The silhouette.
     """
     label = silhouette_of_photo(channels).label
     owner = np.round(channels["object"]).astype(int) if "object" in channels else np.zeros(label.shape, int)
@@ -54,7 +63,7 @@ def silhouette_of_object(channels: Channels, number: int, labels: Sequence[int],
 
 
 def silhouette_iou(silhouette: Silhouette, mesh_label: Labels) -> float:
-    """Intersection over union of mask and mesh over the pixels that are known; 0 where there is neither.
+    """Return the intersection over union of mask and mesh over the known pixels; 0 if both are empty.
 
     >>> silhouette_iou(Silhouette(np.array([[0, 1, 1, UNKNOWN]])), np.array([[1, 1, 0, 1]]))
     0.3333333333333333
@@ -64,7 +73,7 @@ def silhouette_iou(silhouette: Silhouette, mesh_label: Labels) -> float:
 
 
 def label_agreement(silhouette: Silhouette, mesh_label: Labels) -> float:
-    """Share of the pixels in both mask and mesh whose material is the same in both; 0 where there are none.
+    """Return the share of pixels in both mask and mesh whose materials agree; 0 if there are none.
 
     >>> label_agreement(Silhouette(np.array([[0, 1, 2]])), np.array([[1, 1, 1]]))
     0.5
@@ -74,7 +83,7 @@ def label_agreement(silhouette: Silhouette, mesh_label: Labels) -> float:
 
 
 def labelled_iou(silhouette: Silhouette, mesh_label: Labels) -> float:
-    """IoU that counts a pixel as shared only if its material is the same too: what the search maximises.
+    """Return the IoU that counts a pixel as shared only if its materials agree; the search maximises it.
 
     >>> labelled_iou(Silhouette(np.array([[0, 1, 2, 1]])), np.array([[1, 1, 1, 1]]))
     0.5
@@ -84,5 +93,6 @@ def labelled_iou(silhouette: Silhouette, mesh_label: Labels) -> float:
 
 
 def _share(part: Mask, whole: Mask) -> float:
+    """Return the number of pixels in `part` over that in `whole`; 0 if `whole` is empty."""
     total = np.count_nonzero(whole)
     return float(np.count_nonzero(part) / total) if total else 0.0

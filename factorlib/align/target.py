@@ -1,8 +1,8 @@
-"""What the silhouette of one object is in a photo, at a resolution that a pose can be compared with quickly.
+"""Silhouette of one object in a photo, at a resolution at which poses are compared with it quickly.
 
-For each material, the signed distance to the border of its region says how far, and which way, a contour of the mesh
-is off.  Unknown pixels are a dead zone: a contour may lie there at no cost, so an occluder or the frame of the photo
-is never taken for the object's own contour.
+For each material, the signed distance to the border of its region tells how far, and in which direction, a contour of
+the mesh is off. Unknown pixels are a dead zone: a contour may lie there at no cost. So an occluder or the frame of the
+photo is never taken for the object's own contour.
 """
 
 import msgspec
@@ -30,7 +30,7 @@ class Region(msgspec.Struct, frozen=True):
 
 
 class Target(msgspec.Struct, frozen=True):
-    """A window about the mask: its place in the photo, its labels, and a region per material of the mesh."""
+    """Window about the mask: its place in the photo, its labels, and a region per material of the mesh."""
 
     left: float
     top: float
@@ -39,7 +39,7 @@ class Target(msgspec.Struct, frozen=True):
     regions: dict[int, Region]
 
     def camera(self, photo_camera: Camera) -> Camera:
-        """The photo's camera seen through the window, in the window's pixels."""
+        """Return the photo's camera restricted to the window, in the window's pixels."""
         height, width = self.silhouette.label.shape
         return photo_camera.window(self.left, self.top, self.pixel, width, height)
 
@@ -50,26 +50,35 @@ class Target(msgspec.Struct, frozen=True):
 
 
 def extent_of(silhouette: Silhouette) -> tuple[np.ndarray, np.ndarray, float]:
-    """Lowest and highest (x, y) corner of the mask's bounding box, and its longer side, in pixels."""
+    """Return the lowest and highest (x, y) corner of the mask's bounding box, and its longer side, in pixels."""
     rows, columns = np.nonzero(silhouette.inside)
     low, high = np.array([columns.min(), rows.min()], float), np.array([columns.max(), rows.max()], float) + 1
     return low, high, float((high - low).max())
 
 
 def target_of(silhouette: Silhouette, labels: tuple[int, ...], resolution: int, margin: float = 0.2) -> Target:
-    """The silhouette, cut out with `margin` of its extent around it.
+    """Cut out the silhouette with a margin around it and compute the region of each material.
 
-    resolution: pixels of the mask's longer side in the window, fewer if the photo has fewer
+    Args:
+        silhouette: The silhouette of the object.
+        labels: Labels of the mesh's materials.
+        resolution: Pixels of the mask's longer side in the window; fewer if the photo has fewer.
+        margin: Margin as a share of the mask's extent.
+
+    Returns:
+        The window.
     """
     low, high, extent = extent_of(silhouette)
     pixel = max(extent / resolution, 1.0)
     height, width = silhouette.label.shape
+    # nearest photo pixel of each window pixel
     low = np.maximum(np.floor(low - margin * extent), 0)
     high = np.minimum(np.ceil(high + margin * extent), (width, height))
     columns, rows = (np.arange(int(np.ceil((high[k] - low[k]) / pixel))) for k in (0, 1))
     x = np.minimum((low[0] + (columns + 0.5) * pixel).astype(int), width - 1)
     y = np.minimum((low[1] + (rows + 0.5) * pixel).astype(int), height - 1)
     window = silhouette.label[np.ix_(y, x)]
+    # one pixel around the window, unknown beyond the photo's frame
     padded = np.pad(window, 1, mode="edge")
     at_frame = low[1] == 0, high[1] == height, low[0] == 0, high[0] == width
     for touches, edge in zip(at_frame, (padded[0], padded[-1], padded[:, 0], padded[:, -1]), strict=True):
@@ -80,29 +89,37 @@ def target_of(silhouette: Silhouette, labels: tuple[int, ...], resolution: int, 
 
 
 def _region(inside: Mask, known: Mask) -> Region:
-    """The region `inside`, from a window with a border of one pixel beyond it."""
+    """Return the region `inside`, from a window with a border of one pixel around it."""
 
     def distance_to(where: Mask) -> Float[np.ndarray, "h w"]:
+        """Return the distance of each pixel to the nearest pixel in `where`."""
         return distance_transform_edt(~where) if where.any() else np.full(where.shape, float(sum(where.shape)))
 
+    # signed distance to the border, 0 on unknown pixels, and its gradient
     distance = np.where(inside, 0.5 - distance_to(~inside), distance_to(inside | ~known) - 0.5)
     distance[~known] = 0.0
     by_y, by_x = np.gradient(distance)
     slope = np.stack([by_x, by_y], axis=-1)
+    # contour points between neighbouring pixels, with their normals
     a, b = border_pairs(inside, known & ~inside)
     normal = slope[a[:, 0], a[:, 1]] + slope[b[:, 0], b[:, 1]]
     length = np.linalg.norm(normal, axis=1)
-    good = length > 0.4  # where it vanishes it says no direction
-    contour, outward = ((a + b) / 2 + 0.5)[good][:, ::-1], normal[good] / length[good, None]
+    good = length > 0.4  # a vanishing gradient has no direction
+    contour = ((a + b) / 2 + 0.5)[good][:, ::-1]
+    outward = normal[good] / length[good, None]
     return Region(distance[1:-1, 1:-1], slope[1:-1, 1:-1], contour - 1.0, outward)
 
 
 def border_pairs(inside: Mask, outside: Mask) -> tuple[Int[np.ndarray, "n 2"], Int[np.ndarray, "n 2"]]:
-    """(row, column) of each pixel in `inside` with a right, left, lower or upper neighbour in `outside`, and of that."""
+    """Return pairs of neighbouring pixels (row, column): the first in `inside`, the second in `outside`.
+
+    Neighbours are right, left, upper and lower ones.
+    """
     pairs = []
     for axis in (0, 1):
         low, high = (slice(None),) * axis + (slice(None, -1),), (slice(None),) * axis + (slice(1, None),)
         step = np.eye(2, dtype=int)[axis]
-        first, second = np.argwhere(inside[low] & outside[high]), np.argwhere(outside[low] & inside[high])
+        first = np.argwhere(inside[low] & outside[high])
+        second = np.argwhere(outside[low] & inside[high])
         pairs += [(first, first + step), (second + step, second)]
     return np.concatenate([a for a, _ in pairs]), np.concatenate([b for _, b in pairs])

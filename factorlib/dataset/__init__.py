@@ -1,1 +1,1 @@
-"""Datasets: the fixed format of dataset.yaml, what is wrong with one, and the slice of it that each stage sees."""
+"""Datasets: the fixed format of dataset.yaml, its checks, and the slice of it that each stage receives."""

@@ -1,7 +1,7 @@
-"""The rules of a dataset that its types do not say and no image or mesh must be opened for, each with its key and a cure.
+"""Checks of a dataset that its types do not express and that open no image or mesh, each with a key and a cure.
 
-`check_dataset` walks a decoded file once and names all rules that do not hold, `check_truth` the first; `check_lights`
-follows once cameras that are known from elsewhere have been read.
+`check_dataset` reports all violations in a decoded file, `check_truth` the first.  `check_lights` runs after cameras
+from external sources have been read.
 """
 
 import math
@@ -25,18 +25,19 @@ from factorlib.errors import raise_all
 
 IMAGES = (".jpg", ".jpeg", ".png", ".tif", ".tiff", ".exr", ".hdr", ".heic", ".heif", ".hif", *RAW)
 MASKS = (".png", ".json")
-ONE_PART = (".ply", ".stl", ".off")  # their one part goes by the file's own name
+ONE_PART = (".ply", ".stl", ".off")  # formats with one part, which has the file's own name
 MESHES = (".obj", ".gltf", ".glb", *ONE_PART)
 MAPS = (".exr", ".hdr")
-RESERVED_PHOTOS = ("photos", "poses")  # `<photo>.json` would be the gathered photos.json, poses.json
-ALL_OF_IT = "all"  # the one part of a shape that is found
-LEAST_OUTLINES = 2  # of a hull, with known cameras
-LEAST_KEYPOINTS, GOOD_KEYPOINTS = 4, 6
-LEAST_OFF_LINE = 1e-3  # of the keypoints' extent
+RESERVED_PHOTOS = ("photos", "poses")  # <photo>.json would collide with photos.json and poses.json
+ALL_OF_IT = "all"  # the one part of a reconstructed shape
+LEAST_OUTLINES = 2  # least number of outlines of a hull, with known cameras
+LEAST_KEYPOINTS = 4
+GOOD_KEYPOINTS = 6  # recommended number for an unknown focal length
+LEAST_OFF_LINE = 1e-3  # least distance of some keypoint from a line, in extents of the keypoints
 
 
 def check_dataset(spec: DatasetFile, file: Path) -> None:
-    """Raise InputError, naming `file`, key and cure of each fault, unless everything in dataset.yaml holds together."""
+    """Check dataset.yaml for consistency; InputError names file, key and cure of each fault."""
     refuse = Refusal(file, file.parent)
     for index, name in enumerate(spec.materials):
         if name in spec.materials[:index]:
@@ -59,12 +60,22 @@ def check_dataset(spec: DatasetFile, file: Path) -> None:
         if spec.truth is not None:
             refuse.path("truth", spec.truth, (".yaml", ".yml"), must_exist=False)
     raise_all(refuse.faults)
-    _check_known(spec, refuse)  # for which objects and meshes must be right
+    _check_known(spec, refuse)  # requires valid objects and meshes
     raise_all(refuse.faults)
 
 
 def check_truth(truth: TruthFile, spec: DatasetFile, file: Path, folder: Path) -> None:
-    """Raise InputError unless every name in truth.yaml is one of the dataset's, every map a path inside `folder`."""
+    """Check truth.yaml against the dataset.
+
+    Args:
+        truth: content of truth.yaml
+        spec: content of dataset.yaml
+        file: the path of truth.yaml, for errors
+        folder: the folder that must contain every map
+
+    Raises:
+        InputError: A name is unknown, or the path of a map is outside the folder.
+    """
     refuse = Refusal(file, folder)
     photos = {photo.name: photo for photo in spec.photos}
     lights = {photo.light for photo in spec.photos}
@@ -82,7 +93,7 @@ def check_truth(truth: TruthFile, spec: DatasetFile, file: Path, folder: Path) -
 
 
 def check_lights(photos: list[PhotoEntry], file: Path) -> None:
-    """Raise InputError unless photos that share a light are all fixed to the camera, or all to the world."""
+    """Check that photos that share a light are all fixed to the camera, or all to the world; else InputError."""
     first: dict[str, PhotoEntry] = {}
     for index, photo in enumerate(photos):
         other = first.setdefault(photo.light, photo)
@@ -126,7 +137,7 @@ def _check_hull(name: str, spec: DatasetFile, refuse: Refusal) -> None:
 
 
 def _check_parts(key: str, parts: dict[str, str], mesh: MeshEntry, materials: list[str], refuse: Refusal) -> None:
-    """A file of one part has no other; which parts the others have, only reading them shows."""
+    """Check the names of parts that are known without opening the mesh, and their materials."""
     file = Path(mesh.file or "")
     for part, material in parts.items():
         if not mesh.file and not mesh.parts and part != ALL_OF_IT:
@@ -195,7 +206,7 @@ def _check_object(of: str, obj: ObjectEntry, spec: DatasetFile, refuse: Refusal)
 
 
 def _check_known(spec: DatasetFile, refuse: Refusal) -> None:
-    """Known materials are materials that objects are made of, and reflect some light, and no more than falls on them."""
+    """Check that known materials occur on objects, and reflect some light but no more than arrives."""
     shown = {m for photo in spec.photos for obj in photo.objects for m in made_of(obj, spec)}
     for name, of in spec.known.materials.items():
         with refuse.noting():
@@ -215,7 +226,10 @@ def _check_known(spec: DatasetFile, refuse: Refusal) -> None:
 
 
 def _check_known_lights(spec: DatasetFile, refuse: Refusal) -> None:
-    """Maps are files; a mirror ball is an object of the light, all of one known material that nothing else in the photo is made of."""
+    """Check known exposures, maps and mirror balls.
+
+    A mirror ball is an object of the light.  It consists of one known material that nothing else in the photo has.
+    """
     shots: dict[str, list[PhotoEntry]] = {}
     for photo in spec.photos:
         shots.setdefault(photo.light, []).append(photo)
@@ -235,11 +249,13 @@ def _check_known_lights(spec: DatasetFile, refuse: Refusal) -> None:
             if isinstance(of, str):
                 refuse.path(key, of, MAPS)
                 continue
-            key, balls = f"{key}.chrome", list(mirror_balls(spec, name, of))
+            key = f"{key}.chrome"
+            balls = list(mirror_balls(spec, name, of))
             if not balls:
                 refuse.known(key, of.chrome, [obj.name for photo in shots[name] for obj in photo.objects], "object")
             photo, ball = balls[0]
-            material, mesh = min(made_of(ball, spec)), spec.meshes[ball.mesh]
+            material = min(made_of(ball, spec))
+            mesh = spec.meshes[ball.mesh]
             if len(made_of(ball, spec)) > 1 or not (mesh.file or mesh.primitive == "ball"):
                 refuse(key, f"mesh {ball.mesh!r} is no ball of one material", "give a mesh file, or `primitive: ball`")
             if any(material in made_of(obj, spec) for obj in photo.objects if obj is not ball):
@@ -247,7 +263,10 @@ def _check_known_lights(spec: DatasetFile, refuse: Refusal) -> None:
                 refuse(key, f"another object of photo {photo.name!r} is made of {material!r} too", cure)
             known = spec.known.materials.get(material)
             if known is None or any(known.diffuse) or not known.specular:
-                cure = f"write known.materials.{material}: {{diffuse: [0, 0, 0], specular: [.55, .55, .55]}}, as chrome's is"
+                cure = (
+                    f"write known.materials.{material}: "
+                    "{diffuse: [0, 0, 0], specular: [.55, .55, .55]}, as chrome's is"
+                )
                 refuse(key, f"how much of the light {material!r} mirrors is not known", cure)
             if len(shots[name]) > 1 and photo.name not in spec.known.exposure:
                 cure = "give known.exposure of its photos, or the light of one photo alone"
@@ -255,14 +274,20 @@ def _check_known_lights(spec: DatasetFile, refuse: Refusal) -> None:
 
 
 def mirror_balls(spec: DatasetFile, illumination: str, ball: MirrorBall) -> Iterator[tuple[PhotoEntry, ObjectEntry]]:
-    """The photos in an illumination that show a mirror ball, each with it."""
+    """Yield the photos in an illumination that show a mirror ball, each with the ball's object.
+
+    Args:
+        spec: content of dataset.yaml
+        illumination: name of the illumination
+        ball: the mirror ball
+    """
     for photo in spec.photos:
         if photo.light == illumination:
             yield from ((photo, obj) for obj in photo.objects if obj.name == ball.chrome)
 
 
 def made_of(obj: ObjectEntry, spec: DatasetFile) -> set[str]:
-    """The materials of an object's parts."""
+    """Return the materials of an object's parts."""
     own = spec.meshes[obj.mesh].made_of
     return set((own | obj.materials).values() if isinstance(own, dict) else obj.materials.values() or [own])
 
@@ -276,7 +301,7 @@ def _check_ground(key: str, ground: Ground, refuse: Refusal) -> None:
 
 
 def _check_keypoints(key: str, obj: ObjectEntry, refuse: Refusal) -> None:
-    """Enough of them, of different places, and not all on a line, about which the object could turn."""
+    """Check that keypoints are enough, distinct, and not collinear, which would leave a rotation free."""
     if obj.pose is not None:
         cure = "keep one: a pose is used as it is, keypoints are where the search begins"
         refuse(key, "has both a pose and keypoints", cure)
@@ -284,10 +309,12 @@ def _check_keypoints(key: str, obj: ObjectEntry, refuse: Refusal) -> None:
         cure = f"give {LEAST_KEYPOINTS} or more; {GOOD_KEYPOINTS} where the focal length is unknown"
         refuse(key, f"{len(obj.keypoints)} keypoints do not settle a pose", cure)
     for name in ("pixel", "point"):
-        places, first = [getattr(keypoint, name) for keypoint in obj.keypoints], {}
+        places = [getattr(keypoint, name) for keypoint in obj.keypoints]
+        first = {}
         for index, place in enumerate(places):
             if (other := first.setdefault(place, index)) != index:
                 refuse(f"{key}[{index}].{name}", f"the same as {key}[{other}]'s", "name each place once")
+        # largest distance of a place from the line through the first and the farthest one
         arms = [[x - x0 for x, x0 in zip(place, places[0])] for place in places[1:]]
         longest = max(arms, key=lambda arm: math.hypot(*arm))
         unit = [x / math.hypot(*longest) for x in longest]
@@ -299,7 +326,7 @@ def _check_keypoints(key: str, obj: ObjectEntry, refuse: Refusal) -> None:
 
 
 def _check_source(source: CameraSource, spec: DatasetFile, refuse: Refusal) -> None:
-    """One source, its path inside the folder, and every photo, object and mesh it names one of the dataset's."""
+    """Check that there is one source of cameras, with a path inside the folder and known names."""
     named = [kind for kind in (*SOURCES, "sfm") if getattr(source, kind)]
     if len(named) != 1:
         cure = f"name one of {', '.join(SOURCES)}, or `sfm: true`"
@@ -309,7 +336,8 @@ def _check_source(source: CameraSource, spec: DatasetFile, refuse: Refusal) -> N
             if getattr(source, key) != getattr(CameraSource(), key):
                 refuse(f"cameras.{key}", "does not go with sfm, whose world is not known beforehand", "leave it out")
         return
-    kind, path = named[0], getattr(source, named[0])
+    kind = named[0]
+    path = getattr(source, named[0])
     if kind == "transforms":
         refuse.path("cameras.transforms", path, (".json",))
     else:

@@ -1,6 +1,7 @@
-"""The header of a glTF file: which buffers it draws in, and how its triangles lie in them.  No buffer is opened here.
+"""The header of a glTF file: its buffers, and the layout of its triangles in them.  No buffer is opened here.
 
-Only what geometry needs is decoded; textures, animations and the like are skipped.  Names of fields are glTF 2.0's.
+Only the fields that geometry needs are decoded; textures, animations and the like are skipped.  Field names are glTF
+2.0's.
 """
 
 import re
@@ -16,39 +17,48 @@ from factorlib.reading import MOST_BYTES, check_plain, reading
 
 Count = Annotated[int, msgspec.Meta(ge=0, lt=1 << 53)]
 Positive = Annotated[int, msgspec.Meta(gt=0, lt=1 << 53)]
-Numbers3, Numbers4 = tuple[float, float, float], tuple[float, float, float, float]
+Numbers3 = tuple[float, float, float]
+Numbers4 = tuple[float, float, float, float]
 WHAT = "glTF"
 CURE = "is it whole? export it again, as .glb or .gltf"
-MOST_VALUES = 2_000_000  # of a header: each becomes an object of some hundred bytes; base64 has no commas
-BEFORE_JSON = 20  # bytes of a .glb: its own header, and that of its first chunk
+MOST_VALUES = 2_000_000  # values in a header: each becomes an object of some hundred bytes; base64 has no commas
+BEFORE_JSON = 20  # bytes of a .glb before its JSON: its own header, and that of its first chunk
 COMPRESSED = ("KHR_draco_mesh_compression", "EXT_meshopt_compression")
 SCHEME = re.compile(r"[A-Za-z][A-Za-z0-9+.-]*:")
 
 
 class Asset(msgspec.Struct, frozen=True):
+    """Version of glTF."""
+
     version: str
 
 
 class Buffer(msgspec.Struct, frozen=True):
+    """A buffer: a file or `data:…`, or the chunk of a .glb if there is no uri."""
+
     byteLength: Count
-    uri: str | None = None  # a file or `data:…`; None for the chunk of a .glb
+    uri: str | None = None
 
 
 class View(msgspec.Struct, frozen=True):
+    """A range of a buffer; without a stride, elements are contiguous."""
+
     buffer: Count
     byteLength: Count
     byteOffset: Count = 0
-    byteStride: Positive | None = None  # None where elements lie close together
+    byteStride: Positive | None = None
 
 
 class Place(msgspec.Struct, frozen=True):
+    """Start of an array in a view; only indices have a component type."""
+
     bufferView: Count
     byteOffset: Count = 0
-    componentType: int | None = None  # of indices
+    componentType: int | None = None
 
 
 class Sparse(msgspec.Struct, frozen=True):
-    """`count` elements of an accessor that differ from what its view says, or from zero where it has none."""
+    """Elements of an accessor, `count` of them, that differ from its view or, without a view, from zero."""
 
     count: Count
     indices: Place
@@ -56,7 +66,7 @@ class Sparse(msgspec.Struct, frozen=True):
 
 
 class Accessor(msgspec.Struct, frozen=True):
-    """An array of `count` elements of `type` (SCALAR, VEC3 …), of numbers of `componentType`; zeros where it has no view."""
+    """An array of `count` elements of `type` (SCALAR, VEC3, …), of numbers of `componentType`; zeros without a view."""
 
     componentType: int
     count: Count
@@ -68,24 +78,37 @@ class Accessor(msgspec.Struct, frozen=True):
 
 
 class Primitive(msgspec.Struct, frozen=True):
-    attributes: dict[str, Count]  # POSITION, NORMAL … -> accessor
-    indices: Count | None = None  # accessor of the corners
+    """Triangles of one material.
+
+    Attributes:
+        attributes: accessor by POSITION, NORMAL and so on
+        indices: accessor of the corners
+    """
+
+    attributes: dict[str, Count]
+    indices: Count | None = None
     material: Count | None = None
     mode: int = 4  # triangles
 
 
 class Geometry(msgspec.Struct, frozen=True):
+    """A mesh of primitives."""
+
     primitives: list[Primitive]
     name: str | None = None
 
 
 class Material(msgspec.Struct, frozen=True):
-    name: str | None = None  # `parts` in dataset.yaml may use it
+    """A material, whose name `parts` in dataset.yaml may use."""
+
+    name: str | None = None
 
 
 class Node(msgspec.Struct, frozen=True):
-    """A place in the scene's tree: a mesh, and its motion to the parent as a matrix (by columns) or translation, rotation
-    (quaternion x y z w) and scale."""
+    """A node of the scene graph: a mesh and its transform to the parent.
+
+    The transform is a matrix (by columns), or translation, rotation (quaternion x y z w) and scale.
+    """
 
     mesh: Count | None = None
     name: str | None = None
@@ -97,11 +120,17 @@ class Node(msgspec.Struct, frozen=True):
 
 
 class Scene(msgspec.Struct, frozen=True):
+    """The root nodes of a scene."""
+
     nodes: list[Count] = []
 
 
 class Header(msgspec.Struct, frozen=True):
-    """The JSON of a glTF file, as far as it says where triangles are; scene: the number of the one to read, None for the first."""
+    """The JSON of a glTF file, as far as it describes triangles.
+
+    Attributes:
+        scene: index of the scene to read, None for the first
+    """
 
     asset: Asset
     buffers: list[Buffer] = []
@@ -116,12 +145,23 @@ class Header(msgspec.Struct, frozen=True):
 
 
 def read_header(file: Path, key: str | None = None, most_bytes: int = MOST_BYTES) -> Header:
-    """The header of a .gltf or .glb; InputError for what is none, is of another version, or is compressed."""
+    """Read the header of a .gltf or .glb.
+
+    Args:
+        file: the file
+        key: the key in dataset.yaml, for errors
+        most_bytes: largest size of the file
+
+    Raises:
+        InputError: The file is not glTF 2.0, or its meshes are compressed.
+    """
 
     def refused(fault: str, cure: str) -> InputError:
+        """Return an InputError about the file."""
         return InputError(fault, file=file, key=key, cure=cure)
 
-    size, length = check_plain(file, WHAT, key, most_bytes), None
+    size = check_plain(file, WHAT, key, most_bytes)
+    length = None
     with reading(WHAT, file, key, CURE), open(file, "rb") as stream:
         if file.suffix.lower() == ".glb":
             magic, version, _, length, kind = struct.unpack("<4sIII4s", stream.read(BEFORE_JSON))
@@ -143,7 +183,10 @@ def read_header(file: Path, key: str | None = None, most_bytes: int = MOST_BYTES
 
 
 def buffer_path(uri: str) -> str | None:
-    """The path of a buffer, relative to the file that names it; None for one that lies within.  ValueError for a web address.
+    """Return the path of a buffer relative to the file that names it; None for an embedded one.
+
+    Raises:
+        ValueError: The address is not a file's.
 
     >>> buffer_path("../buffers/box%201.bin"), buffer_path("data:;base64,AAAA")
     ('../buffers/box 1.bin', None)

@@ -1,4 +1,7 @@
-"""What is asked of a key in a file that a user writes: known names, rotations, and paths, which stay in the dataset's folder, links followed."""
+"""Checks of keys in a file that a user writes: known names, rotations, and paths that stay in the dataset's folder.
+
+Links are followed before a path is checked.
+"""
 
 import os
 import stat
@@ -10,36 +13,56 @@ from typing import NoReturn
 from factorlib.errors import InputError, did_you_mean
 from factorlib.reading import check_plain, path_inside, reading
 
-ROTATION_TOLERANCE = 1e-3  # largest entry of RᵀR − 1: matrices typed with four digits pass
+ROTATION_TOLERANCE = 1e-3  # largest entry of RᵀR − 1, which matrices typed with four digits satisfy
 
 
 class Refusal:
-    """The file that is being checked, and the folder its paths stay in; called, it refuses a key, and so do its methods."""
+    """The file that is being checked; called, it raises InputError for a key, and so do its methods.
+
+    Attributes:
+        file: the file, for errors
+        folder: the folder that must contain its paths
+    """
 
     def __init__(self, file: Path, folder: Path):
-        self.file, self.folder = file, folder
+        self.file = file
+        self.folder = folder
         self.faults: list[InputError] = []
-        self.inside: dict[str, Path] = {}  # folders that have been followed and lie in it, by how they are written
+        self.inside: dict[str, Path] = {}  # resolved folders inside `folder`, by their paths as written
 
     def __call__(self, key: str, fault: str, cure: str) -> NoReturn:
+        """Raise InputError for a key, with a fault and its cure."""
         raise InputError(fault, file=self.file, key=key, cure=cure)
 
     @contextmanager
     def noting(self) -> Iterator[None]:
-        """What is refused within is kept in `faults`, and what follows is checked, too."""
+        """Collect an InputError raised within in `faults`, so that checking continues."""
         try:
             yield
         except InputError as error:
             self.faults.append(error)
 
     def known(self, key: str, name: str, known: Iterable[str], kind: str) -> None:
-        """A name is among `known`; the nearest one is suggested."""
+        """Check that a name is among the known ones; the error suggests the nearest one.
+
+        Args:
+            key: the key with the name
+            name: the name
+            known: the known names
+            kind: the kind of name, for errors
+        """
         if name not in (known := list(known)):
             cure = did_you_mean(name, known) if known else f"the dataset has no {kind} here"
             self(key, f"unknown {kind} {name!r}", cure)
 
     def once(self, key: str, names: Iterable[str], kind: str) -> None:
-        """Each name of a list stands in it once."""
+        """Check that the names of a list are distinct.
+
+        Args:
+            key: the key of the list
+            names: its names
+            kind: the kind of name, for errors
+        """
         first: dict[str, int] = {}
         for index, name in enumerate(names):
             if first.setdefault(name, index) != index:
@@ -47,7 +70,7 @@ class Refusal:
                 self(f"{key}[{index}].name", fault, f"{key}[{first[name]}] has it already: rename one")
 
     def rotation(self, key: str, rows: tuple) -> None:
-        """Three rows are a rotation: RᵀR = 1 within ROTATION_TOLERANCE, determinant +1."""
+        """Check that three rows are a rotation: RᵀR = 1 within ROTATION_TOLERANCE, determinant +1."""
         gram = [[sum(r[i] * r[j] for r in rows) - (i == j) for j in range(3)] for i in range(3)]
         worst = max(abs(entry) for row in gram for entry in row)
         if not worst <= ROTATION_TOLERANCE:
@@ -59,7 +82,14 @@ class Refusal:
             self(key, fault, "one axis is flipped: the camera frame is x right, y down, z forward")
 
     def path(self, key: str, path: str, suffixes: Iterable[str], must_exist: bool = True) -> None:
-        """A path of a known suffix leads to a plain file inside the folder, which may be read."""
+        """Check that a path has a known suffix and leads to a plain, readable file inside the folder.
+
+        Args:
+            key: the key with the path
+            path: the path
+            suffixes: the known suffixes
+            must_exist: require that the file exists
+        """
         target = self._followed(key, path, "file")
         if target.suffix.lower() not in suffixes:
             self(key, f"{path!r} has a suffix that is not read here", f"expected one of {', '.join(suffixes)}")
@@ -75,7 +105,7 @@ class Refusal:
             self(key, f"there is no file {path!r}", cure)
 
     def subfolder(self, key: str, path: str) -> None:
-        """A path leads to a folder inside the dataset's, links followed, whose files can be listed."""
+        """Check that a path leads to a readable folder inside the dataset's, with links followed."""
         folder = self._followed(key, path, "folder")
         with reading("a folder", self.file, key):
             if not folder.is_dir():
@@ -83,7 +113,13 @@ class Refusal:
             os.scandir(folder).close()
 
     def file_of(self, key: str, folder: str, name: str) -> Path | None:
-        """The file `name` of a folder inside the dataset's; None where there is none.  It does not lead outside either."""
+        """Return the path of a file in a folder inside the dataset's; None if it does not exist.
+
+        Args:
+            key: the key with the folder
+            folder: the folder
+            name: name of the file, which may not lead outside either
+        """
         target = self._followed(key, f"{folder}/{name}", "file")
         if not is_there(target, key):
             return None
@@ -97,14 +133,17 @@ class Refusal:
             self(key, f"{path!r} {error.found}", error.cure or "correct the path")
 
     def _followed(self, key: str, path: str, kind: str) -> Path:
-        """Files of one folder that are no links are where that folder is, which is followed once: a set may have thousands."""
+        """Return the path with links followed, which must stay in the folder.
+
+        A folder with plain files is resolved once, because a set may have thousands of them.
+        """
         above, _, name = path.rpartition("/")
         plain_name = name not in ("", ".", "..")
         try:
             if plain_name and above in self.inside and stat.S_ISREG(os.lstat(self.inside[above] / name).st_mode):
                 return self.inside[above] / name
         except (OSError, ValueError):
-            pass  # for the rest to say
+            pass  # reported below
         try:
             target = path_inside(self.folder, path)
             if above and plain_name:
@@ -116,7 +155,7 @@ class Refusal:
 
 
 def is_there(target: Path, key: str) -> bool:
-    """Whether anything is there; InputError where that may not be known."""
+    """Return True if the path exists; InputError if that cannot be determined."""
     with reading("a file", target, key):
         try:
             os.stat(target)

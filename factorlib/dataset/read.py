@@ -1,7 +1,7 @@
-"""Reading a dataset: YAML to types, then every check that needs no pixel.
+"""Reading of a dataset: YAML to types, then every check that needs no pixel.
 
-Imports nothing heavy, for a run that has nothing to do passes here too; only a dataset that names a source of cameras
-pays for pycolmap (.2 s).
+The module imports nothing heavy, because a run with nothing to do passes here too.  Only a dataset that names a source
+of cameras pays for pycolmap (0.2 s).
 """
 
 import logging
@@ -20,19 +20,21 @@ from factorlib.reading import check_plain, path_inside, read_text, reading
 from factorlib.yamlfile import MOST_BYTES, convert, parse_yaml, read_yaml
 
 FILE = "dataset.yaml"
-RESERVED = ("studies", "bench", "store", "docs")  # folders of build/ that are no datasets
+RESERVED = ("studies", "bench", "store", "docs")  # folders of build/ that are not datasets
 MTLLIB = re.compile(rb"^mtllib[ \t]+([^\r\n]+)", re.MULTILINE)
 log = logging.getLogger("factorlib.dataset")
 UNKNOWN = "?"
-OPEN = "left_open"  # a name that stands for it where a file is read all the same
-MOST_NAMED = 20  # of the places that are left open
+OPEN = "left_open"  # placeholder for `?` in a draft
+MOST_NAMED = 20  # open places that an error lists
 
 
 def read_dataset(path: str | Path) -> Dataset:
-    """The dataset in a folder, or of a dataset.yaml.
+    """Read the dataset in a folder, or of a dataset.yaml.
 
-    A missing truth.yaml, or one that names missing maps, is a warning: only what compares with the truth needs it.
-    Anything else that is wrong is an InputError that names file, key and cure.
+    A missing truth.yaml, or one that names missing maps, is a warning, because only comparisons with the truth need it.
+
+    Raises:
+        InputError: Anything else is wrong; the error names file, key and cure.
     """
     with reading("a dataset", path, "DATASET"):
         file = Path(path) / FILE if Path(path).is_dir() else Path(path)
@@ -57,16 +59,20 @@ def read_dataset(path: str | Path) -> Dataset:
 
 
 def read_draft(file: Path) -> tuple[DatasetFile, list[InputError]]:
-    """A dataset.yaml as it stands, a word that nothing is called in place of each `?`, and all its faults; InputError where it is none.
+    """Read a dataset.yaml that may be unfinished, with a placeholder for each `?`, and all its faults.
 
-    Places that are left open are one fault, and what follows from them is none.
+    Open places are one fault, and faults that follow from them are omitted.
+
+    Raises:
+        InputError: The file is not a dataset.yaml.
     """
     if file.is_symlink() and not Path(os.path.realpath(file)).is_relative_to(os.path.realpath(file.parent)):
         raise InputError("is a link that leads outside the dataset", file=file, cure="put the file itself there")
     text = read_text(file, "a YAML file", most_bytes=MOST_BYTES)
     value = parse_yaml(text, file)
     places: list[str] = []
-    value, faults = _filled(value, "", places), []
+    value = _filled(value, "", places)
+    faults = []
     if places:
         named = ", ".join(places[:MOST_NAMED]) + f" and {len(places) - MOST_NAMED} more" * (len(places) > MOST_NAMED)
         found = f"{len(places)} places are left open" if len(places) > 1 else "one place is left open"
@@ -85,9 +91,10 @@ def read_draft(file: Path) -> tuple[DatasetFile, list[InputError]]:
 
 
 def _others(error: InputError, places: list[str]) -> list[InputError]:
-    """The faults that are none of places that are left open, nor follow from them."""
+    """Return the faults that are neither open places nor consequences of them."""
 
     def follows(fault: InputError) -> bool:
+        """Return True if a fault is an open place or follows from one."""
         unnamed = "materials[0]" in places and fault.found.startswith("unknown material")
         return unnamed or any(_within(place, fault.key) or _within(fault.key, place) for place in places)
 
@@ -99,7 +106,7 @@ def _within(key: str | None, other: str | None) -> bool:
 
 
 def _filled(value: Any, key: str, places: list[str]) -> Any:
-    """The value with a word in place of each `?`, which `make new` writes; the keys of these are added to `places`."""
+    """Replace each `?`, which `make new` writes, by a placeholder and add its key to `places`."""
     if isinstance(value, dict):
         return {name: _filled(item, f"{key}.{name}" if key else name, places) for name, item in value.items()}
     if isinstance(value, list):
@@ -126,14 +133,16 @@ def _read_truth(spec: DatasetFile, file: Path) -> TruthFile | None:
 
 
 def _companions(path: str, key: str, refuse: Refusal) -> list[str]:
-    """The files that the mesh at dataset-relative `path` draws in: an OBJ's .mtl, a glTF's buffers, not their textures.
+    """Return the files that a mesh refers to: an OBJ's .mtl, a glTF's buffers, but not their textures.
 
-    They belong to the mesh's content: when one changes, so does the mesh.  An absent .mtl is left out, for a part's name is in
-    the OBJ itself, and so is one that is no plain file; an absent glTF buffer is refused, and so is any companion outside
-    the dataset, or too large.
+    They belong to the mesh's content: a change of one changes the mesh.  An .mtl that is missing or not a plain file is
+    left out, because the names of parts are in the OBJ itself.  A missing glTF buffer is an error, and so is any
+    companion that is too large or outside the dataset.
     """
-    file, suffix = refuse.folder / path, Path(path).suffix.lower()
-    is_obj, named = suffix == ".obj", []
+    file = refuse.folder / path
+    suffix = Path(path).suffix.lower()
+    is_obj = suffix == ".obj"
+    named = []
     if is_obj and check_plain(file, "an OBJ", key):
         with (
             reading("an OBJ", file, key),

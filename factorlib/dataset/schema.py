@@ -1,9 +1,9 @@
-"""The fixed dataset format as types, and the slices of it that stages are handed.
+"""The fixed dataset format as types, and the slices of it that stages receive.
 
-`DatasetFile` and `TruthFile` mirror dataset.yaml and truth.yaml key by key; the `Meta` of a type says which values it may
-have and, as its `description`, how to mend another one.  The `…Slice` structs are what a stage converts its facts to:
-`msgspec.convert(inputs.facts["dataset.photo"], PhotoSlice)`.  Every path is relative to the dataset's folder.  Frames, units and
-directions are those of `factorlib.conventions`.
+`DatasetFile` and `TruthFile` mirror dataset.yaml and truth.yaml key by key.  The `Meta` of a type states its valid
+values and, as `description`, the cure for others.  A stage converts its facts to the `…Slice` structs:
+`msgspec.convert(inputs.facts["dataset.photo"], PhotoSlice)`.  Every path is relative to the dataset's folder.  Frames,
+units and directions are those of `factorlib.conventions`.
 """
 
 from functools import cached_property
@@ -15,12 +15,12 @@ from msgspec import Meta
 
 LEFT_OUT = 255  # mask value of pixels that are neither background nor a material
 MAX_MATERIALS = LEFT_OUT - 1
-LONGEST_NAME = 100  # characters; names of files are made of it, and file systems allow these 255 bytes
+LONGEST_NAME = 100  # characters of a name; file names contain it, and file systems allow 255 bytes
 SOURCES = ("colmap", "transforms", "bop")
 RAW = (".dng", ".cr2", ".cr3", ".nef", ".nrw", ".arw", ".raf", ".orf", ".rw2", ".pef", ".srw")  # suffixes of raw photos
-LARGEST = 1e15  # of any number: what is larger loses its digits in the squares that are taken of it
-FOCAL_PX = 1.0, 1e7  # a telescope has 1e6
-CENTRE_PX = 1e6  # a principal point from the photo's corner, even of a small crop
+LARGEST = 1e15  # largest absolute value of any number, so that its square keeps its digits
+FOCAL_PX = 1.0, 1e7  # range of focal lengths in pixels; a telescope has 1e6
+CENTRE_PX = 1e6  # largest coordinate of a principal point in pixels, even of a small crop
 
 Number = Annotated[float, Meta(ge=-LARGEST, le=LARGEST, description="give a finite number below 1e+15, or none")]
 Share = Annotated[float, Meta(ge=0, le=1, description="give a fraction, 0 to 1: reflectance is linear, not 0 to 255")]
@@ -43,15 +43,23 @@ Masks = str | dict[str, str]  # a label PNG, a COCO json, or {material: PNG}
 
 
 class _Format(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """A piece of a file a user writes: an unknown key is an error."""
+    """Base of the structs of user-written files, in which an unknown key is an error."""
 
 
 class MeshEntry(_Format):
-    """A mesh of several parts (OBJ group or usemtl, glTF primitive or material -> material), or of one material.
+    """A mesh of several parts, or of one material.
 
-    Exactly one of: file;  hull: the visual hull of the masks, where cameras are known (its parts are named here and seen in the masks);
-    lathe: a body of revolution from its outlines, about y;  primitive: one whose proportions the outlines say, about y.
-    size: the longest side of a lathe's or primitive's bounding box, in the unit of the set's meshes
+    A part is an OBJ group or usemtl, or a glTF primitive or material.  Exactly one of file, hull, lathe and primitive
+    is given.
+
+    Attributes:
+        file: the mesh file
+        hull: visual hull of the masks, for known cameras; its parts are named here and visible in the masks
+        lathe: body of revolution about y, from its outlines
+        primitive: a primitive about y, with proportions from its outlines
+        size: longest side of a lathe's or primitive's bounding box, in the unit of the set's meshes
+        parts: material by part
+        material: material of the whole mesh
     """
 
     file: str | None = None
@@ -64,19 +72,20 @@ class MeshEntry(_Format):
 
     @property
     def made_of(self) -> dict[str, str] | str | None:
-        """The material of each part, or that of all; None where the entry names none, which the reader refuses."""
+        """The material of each part, or of the whole; None if the entry names none, which the reader rejects."""
         return self.parts or self.material
 
     @property
     def revolved(self) -> bool:
-        """Whether it looks the same however it is turned about its axis, so that photos do not say which of its sides they show."""
+        """True for a shape that is symmetric about its axis, so that its rotation about it is not observable."""
         return self.lathe or self.primitive in ("ball", "cylinder")
 
 
 class Camera(_Format):
-    """Intrinsics in pixels of the photo as displayed, pixel centres at 0.5; what is not given is sought.
+    """Intrinsics in pixels of the photo as displayed, pixel centres at 0.5; missing ones are estimated.
 
-    distortion: k1 and k2 of COLMAP's RADIAL model, which `masks` undoes
+    Attributes:
+        distortion: k1 and k2 of COLMAP's RADIAL model, which `masks` removes
     """
 
     focal_px: Focal | None = None
@@ -85,7 +94,7 @@ class Camera(_Format):
 
 
 class Pose(_Format):
-    """cam_from_object: x_cam = rotation · x_object + translation, in the mesh's units."""
+    """The pose cam_from_object: x_cam = rotation · x_object + translation, in the mesh's units."""
 
     rotation: Mat3
     translation: Vec3
@@ -99,7 +108,12 @@ class Keypoint(_Format):
 
 
 class ObjectEntry(_Format):
-    """One instance of a mesh in a photo; `materials` overrides the mesh's parts, `mask` is its own silhouette."""
+    """One instance of a mesh in a photo.
+
+    Attributes:
+        materials: overrides the materials of the mesh's parts
+        mask: the instance's own silhouette
+    """
 
     name: Name
     mesh: str
@@ -110,9 +124,11 @@ class ObjectEntry(_Format):
 
 
 class Ground(_Format):
-    """The plane that a photo's objects stand on, in its camera frame and the poses' units; the normal points toward them.
+    """The plane that a photo's objects stand on, in its camera frame and the poses' units.
 
-    diffuse: its Lambertian reflectance (linear Rec. 709), where it is known
+    Attributes:
+        normal: points toward the objects
+        diffuse: Lambertian reflectance (linear Rec. 709), if it is known
     """
 
     point: Vec3
@@ -121,7 +137,12 @@ class Ground(_Format):
 
 
 class PhotoEntry(_Format):
-    """One photo.  `illumination` defaults to the photo's name; `world_from_camera` fixes its light to the world."""
+    """One photo.
+
+    Attributes:
+        illumination: name of its light; by default the photo's name
+        world_from_camera: rotation that fixes its light to the world
+    """
 
     name: Name
     image: str
@@ -135,12 +156,15 @@ class PhotoEntry(_Format):
 
     @property
     def light(self) -> str:
-        """The name of the illumination that the photo is in."""
+        """The name of the photo's illumination."""
         return self.illumination or self.name
 
 
 class Similarity(_Format):
-    """world_from_object: x_world = scale · rotation · x_object + translation; as it stands, the mesh lies in the world's frame."""
+    """The similarity world_from_object: x_world = scale · rotation · x_object + translation.
+
+    By default the mesh is in the world's frame.
+    """
 
     scale: Unit = 1.0
     rotation: Mat3 = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
@@ -148,11 +172,17 @@ class Similarity(_Format):
 
 
 class CameraSource(_Format):
-    """Where cameras, and perhaps poses, are known from: exactly one of colmap, transforms, bop, sfm.
+    """Source of cameras, and possibly poses: exactly one of colmap, transforms, bop, sfm.
 
-    colmap, bop: a folder; transforms: a json; sfm: they are found from the photos by structure from motion.  images: photo -> its image in the source (BOP: its id), where the file's
-    name does not tell.  world_from_object: object -> where it lies in the source's world; its pose is the source's then.
-    world_from_camera: the source's rotations fix lights to its world.  obj_ids: mesh -> BOP's obj_id.
+    Attributes:
+        colmap: a folder
+        transforms: a JSON file
+        bop: a folder
+        sfm: estimate cameras from the photos by structure from motion
+        images: image in the source (BOP: its id) by photo, if the file's name does not identify it
+        world_from_object: placement of an object in the source's world, which gives its pose
+        world_from_camera: fix lights to the source's world by its rotations
+        obj_ids: BOP's obj_id by mesh
     """
 
     colmap: str | None = None
@@ -167,7 +197,7 @@ class CameraSource(_Format):
 
 
 class KnownMaterial(_Format):
-    """The reflectance of a material, linear Rec. 709; what is None is found."""
+    """Known reflectance of a material, linear Rec. 709; a value of None is estimated."""
 
     diffuse: Shares
     specular: Shares | None = None
@@ -175,16 +205,18 @@ class KnownMaterial(_Format):
 
 
 class MirrorBall(_Format):
-    """The object of a photo that is a chrome ball: what it mirrors is the photo's light."""
+    """A chrome ball in a photo, which mirrors the photo's light; `chrome` is the object's name."""
 
     chrome: Name
 
 
 class Known(_Format):
-    """What is known of the set's unknowns: reflectances by the material's name, lights by the illumination's, exposures by the photo's.
+    """Known quantities: reflectances by material, lights by illumination, exposures by photo.
 
-    illumination: a lat-long map in the frame and layout of the exported ones, whose radiance is known but for one factor, or a mirror ball
-    exposure: in EV, of all photos of an illumination, beside each other: a photo of 1 EV more has twice the values in the same light
+    Attributes:
+        illumination: a mirror ball, or a lat-long map in the frame and layout of the exported ones, known up to one
+            factor
+        exposure: in EV, for all photos of an illumination; 1 EV more doubles the values in the same light
     """
 
     materials: dict[str, KnownMaterial] = {}
@@ -193,7 +225,7 @@ class Known(_Format):
 
 
 class DatasetFile(_Format):
-    """dataset.yaml."""
+    """Content of dataset.yaml."""
 
     format: Annotated[Literal[1], Meta(description="this version reads format: 1")]
     materials: Annotated[list[Name], OneOf254]
@@ -213,7 +245,7 @@ class TrueMaterial(_Format):
 
 
 class TruthFile(_Format):
-    """truth.yaml; its paths are relative to the dataset's folder too."""
+    """Content of truth.yaml; its paths are relative to the dataset's folder too."""
 
     materials: dict[str, TrueMaterial] = {}
     illumination: dict[str, str] = {}
@@ -222,15 +254,17 @@ class TruthFile(_Format):
 
     @property
     def maps(self) -> list[str]:
-        """The maps it names, in a fixed order."""
+        """The maps that the file names, sorted."""
         return sorted({*self.illumination.values(), *self.normals.values()})
 
 
 class ExternalCamera(msgspec.Struct, frozen=True):
-    """The camera of one photo by a source of cameras, in the source's own pixels: of an image of `size` (width, height).
+    """The camera of one photo from a source of cameras, in pixels of the source's image.
 
-    size: None where the source does not say it, the height None where only the width counts (a focal length in widths);
-    principal_point: None where the source does not say it; poses: object -> cam_from_object, in the mesh's units
+    Attributes:
+        principal_point: None if the source does not give it
+        size: width and height of the source's image; None if unknown; the height is None for a focal length in widths
+        poses: cam_from_object by object, in the mesh's units
     """
 
     source: Literal["colmap", "transforms", "bop", "sfm"]
@@ -243,8 +277,9 @@ class ExternalCamera(msgspec.Struct, frozen=True):
 class Dataset(msgspec.Struct, frozen=True, dict=True):
     """A dataset that has been read and checked.
 
-    companions: mesh -> the files its file draws in (.mtl, glTF buffers), relative to the folder
-    external: photo -> its camera by the source of cameras
+    Attributes:
+        companions: files that a mesh's file refers to (.mtl, glTF buffers), relative to the folder, by mesh
+        external: camera from the source of cameras, by photo
     """
 
     folder: Path
@@ -255,11 +290,11 @@ class Dataset(msgspec.Struct, frozen=True, dict=True):
 
     @property
     def name(self) -> str:
-        """Name of the data set: its folder's."""
+        """The name of the data set, which is its folder's."""
         return self.folder.name
 
     def photo(self, name: str) -> PhotoEntry:
-        """The entry of a photo; KeyError where there is none of that name."""
+        """Return the entry of a photo; KeyError for an unknown name."""
         return self._photos[name]
 
     @cached_property
@@ -268,14 +303,18 @@ class Dataset(msgspec.Struct, frozen=True, dict=True):
 
 
 class ObjectMask(msgspec.Struct, frozen=True):
-    """An object in the order of dataset.yaml and its own silhouette, if it has one."""
+    """An object in the order of dataset.yaml, and its own silhouette, if it has one."""
 
     name: str
     mask: str | None
 
 
 class PhotoSlice(msgspec.Struct, frozen=True):
-    """The slice needed to read a photo and its masks."""
+    """Slice for reading a photo and its masks.
+
+    Attributes:
+        camera: only for a lens with distortion
+    """
 
     image: str
     encoding: Literal["srgb", "linear", "gamma2.2"] | None
@@ -283,11 +322,11 @@ class PhotoSlice(msgspec.Struct, frozen=True):
     focal_px: float | None
     illumination: str
     objects: list[ObjectMask]
-    camera: Camera | None = None  # where its lens distorts
+    camera: Camera | None = None
 
 
 class ObjectsSlice(msgspec.Struct, frozen=True):
-    """The slice needed to lay meshes over a photo: its camera, its objects, the meshes these use, and what else is known."""
+    """Slice for placing meshes over a photo: its camera, its objects, their meshes, and the external camera."""
 
     camera: Camera
     objects: list[ObjectEntry]
@@ -296,9 +335,10 @@ class ObjectsSlice(msgspec.Struct, frozen=True):
 
 
 class ShapesSlice(msgspec.Struct, frozen=True):
-    """The slice needed to find cameras and shapes from masks: the meshes that have no file, and the photos with their objects.
+    """Slice for estimating cameras and shapes from masks: the meshes without a file, and the photos with their objects.
 
-    sfm: whether cameras are found from the photos
+    Attributes:
+        sfm: True if cameras are estimated from the photos
     """
 
     meshes: dict[str, MeshEntry]
@@ -307,14 +347,14 @@ class ShapesSlice(msgspec.Struct, frozen=True):
 
 
 class LightSlice(msgspec.Struct, frozen=True):
-    """The illumination that a photo is in, and the rotation that fixes it to the world (None: fixed to the camera)."""
+    """The illumination of a photo, and the rotation that fixes it to the world (None: fixed to the camera)."""
 
     illumination: str
     world_from_camera: Mat3 | None
 
 
 class GroundSlice(msgspec.Struct, frozen=True):
-    """The ground of a photo, where dataset.yaml gives it."""
+    """The ground of a photo, if dataset.yaml gives it."""
 
     ground: Ground | None
 
@@ -327,7 +367,7 @@ class BallSlice(msgspec.Struct, frozen=True):
 
 
 class KnownSlice(msgspec.Struct, frozen=True):
-    """What is known: reflectances by material; maps and mirror balls by illumination; exposures in EV by photo."""
+    """Known quantities: reflectances by material; maps and mirror balls by illumination; exposures in EV by photo."""
 
     materials: dict[str, KnownMaterial] = {}
     maps: dict[str, str] = {}

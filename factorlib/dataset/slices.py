@@ -1,7 +1,7 @@
-"""The slice of a dataset that a stage sees: its facts (JSON-able) and the files these name.
+"""Slices of a dataset that stages receive: facts (JSON-able) and the files that these name.
 
-A step's key holds the slices it declares and the hashes of their files, so a slice carries only what its readers
-need, with defaults filled in: naming the default illumination, or reordering photos, changes no photo's facts.
+The key of a step holds the slices it declares and the hashes of their files.  A slice therefore carries only what its
+readers need, with defaults filled in.  Naming the default illumination, or reordering photos, changes no photo's facts.
 """
 
 from collections.abc import Callable
@@ -16,9 +16,12 @@ from factorlib.errors import did_you_mean
 
 
 class Slice(msgspec.Struct, frozen=True):
-    """facts: plain JSON-able values; files: the dataset-relative paths in them, sorted, each once.
+    """A slice of a dataset.
 
-    fields: the same facts, all of them, by the names that they have in dataset.yaml, as in photos.kitchen.camera.focal_px
+    Attributes:
+        facts: plain JSON-able values
+        files: the dataset-relative paths in them, sorted and distinct
+        fields: all facts by their keys in dataset.yaml, such as photos.kitchen.camera.focal_px
     """
 
     facts: Any
@@ -27,10 +30,18 @@ class Slice(msgspec.Struct, frozen=True):
 
 
 def dataset_slice(dataset: Dataset, name: str, photo: str | None = None) -> Slice:
-    """The slice `name` of one photo, or of the set.
+    """Return a slice of one photo, or of the set.
 
-    photo, objects, light, ground are per photo: the facts of one, or {photo: facts} of all for `photo=None`.
-    materials, set, known, truth are of the set, whatever the photo.  Raises KeyError for an unknown slice.
+    The slices photo, objects, light and ground are per photo.  The slices materials, set, shapes, known and truth are
+    of the set.
+
+    Args:
+        dataset: the dataset
+        name: name of the slice
+        photo: name of the photo; None returns facts by photo; ignored for slices of the set
+
+    Raises:
+        KeyError: There is no such slice.
     """
     fields: dict[str, Any] = {}
     if name in _OF_SET:
@@ -82,7 +93,8 @@ def _set(dataset: Dataset) -> tuple[schema.SetSlice, list[str]]:
 
 
 def _known(dataset: Dataset) -> tuple[schema.KnownSlice, list[str]]:
-    known, balls = dataset.spec.known, {}
+    known = dataset.spec.known
+    balls = {}
     for name, of in known.illumination.items():
         if isinstance(of, schema.MirrorBall):
             photo, obj = next(mirror_balls(dataset.spec, name, of))
@@ -92,7 +104,7 @@ def _known(dataset: Dataset) -> tuple[schema.KnownSlice, list[str]]:
 
 
 def _shapes(dataset: Dataset) -> tuple[schema.ShapesSlice | None, list[str]]:
-    """None where every mesh has a file and no camera is to be found."""
+    """Return the slice, or None if every mesh has a file and no camera is to be estimated."""
     meshes = {name: mesh for name, mesh in dataset.spec.meshes.items() if not mesh.file}
     sfm = dataset.spec.cameras is not None and dataset.spec.cameras.sfm
     if not meshes and not sfm:
@@ -110,7 +122,8 @@ def _json_able(facts: Any) -> Any:
 
 
 def _fields(value: Any, name: str) -> dict[str, Any]:
-    """
+    """Return the leaves of a value by their keys.
+
     >>> _fields([{"name": "a", "mask": None}], "objects")
     {'objects[0].name': 'a', 'objects[0].mask': None}
     """

@@ -1,1 +1,1 @@
-"""How good a result is: errors of pictures, materials, light and geometry, each beside what a null would score."""
+"""Errors of pictures, materials, light and geometry, each beside the score of a null."""

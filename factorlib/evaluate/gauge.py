@@ -1,16 +1,17 @@
-"""What may be scaled before an estimate is compared with the truth.
+"""Gauges for the comparison of an estimate with the truth.
 
-A factor per colour channel can move between all materials and all lights that are linked by observations, and the
-exposure of a photo is not known: so an error is quoted three times.
+A factor per colour channel can move between all materials and all lights that observations link, and the exposure of a
+photo is unknown.  An error is therefore reported in three gauges:
 
 none               nothing is scaled
 scalar_per_set     one number scales everything in the set
-channel_per_photo  one number for each channel and each photo (light, relit picture): the most forgiving, where
-                   even a grey ball scores well, so never to be quoted alone
+channel_per_photo  one number for each channel and each photo (light, relit picture): the most lenient, where even a
+                   grey
+                   ball scores well, so it is never to be reported alone
 
-Each factor is the least-squares one, Σ e·t / Σ e², every picture weighted by 1 / white², so that a bright photo does
-not drown a dark one.  For pictures, samples brighter than white are left out, estimate and truth alike: the tone map cuts
-them, and one wrong highlight would decide.
+Each factor is the least-squares one, Σ e·t / Σ e².  Every picture has the weight 1 / white², so that a bright photo
+does not outweigh a dark one.  For pictures, samples brighter than white in estimate or truth are left out.  The tone
+map clips them, and one wrong highlight would dominate.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -29,7 +30,14 @@ GAUGES = ("none", "scalar_per_set", "channel_per_photo")
 def gauge_factors(
     estimates: Sequence[Samples], truths: Sequence[Samples], whites: Sequence[float], below_white: bool = False
 ) -> dict[str, Float[np.ndarray, "photos 3"]]:
-    """The factor of each photo and channel on the estimate, for each gauge; below_white: leave out what is brighter."""
+    """Return the factors on the estimates in each gauge, per photo and channel.
+
+    Args:
+        estimates: samples of each photo
+        truths: true samples of each photo
+        whites: white of each photo
+        below_white: leave out samples brighter than white
+    """
     if below_white:
         kept = [np.maximum(e, t).max(axis=-1) <= w for e, t, w in zip(estimates, truths, whites, strict=True)]
         estimates, truths = ([s[k] for s, k in zip(samples, kept, strict=True)] for samples in (estimates, truths))
@@ -49,9 +57,14 @@ def errors_by_gauge(
     error: Callable[[Samples, int], Error],
     below_white: bool = False,
 ) -> list[dict[str, dict[str, Error]]]:
-    """The errors of each photo, by gauge and kind of estimate; each kind is scaled by factors of its own.
+    """Return the errors of each photo, by gauge and kind of estimate.
 
-    error: of a scaled estimate of the photo of that number
+    Args:
+        estimates: samples of each photo, by kind; each kind is scaled by its own factors
+        truths: true samples of each photo
+        whites: white of each photo
+        error: error of the scaled estimate of the photo with the given index
+        below_white: leave out samples brighter than white
     """
     factors = {kind: gauge_factors(of, truths, whites, below_white) for kind, of in estimates.items()}
     return [
@@ -61,15 +74,15 @@ def errors_by_gauge(
 
 
 def _ratio(cross: np.ndarray | float, square: np.ndarray | float) -> np.ndarray:
-    """cross / square, and 1 where there is nothing to scale."""
+    """Return cross / square, and 1 where square is 0."""
     square = np.asarray(square)
     return np.where(square > 0, cross / np.where(square > 0, square, 1.0), 1.0)
 
 
 def connected_components(pairs: Mapping[str, Sequence[str]]) -> dict[str, int]:
-    """Number of the component of each material, given the materials seen in each light.
+    """Return the connected component of each material, given the materials observed in each light.
 
-    Materials seen together in a light are linked; components are numbered by their first material's name.
+    A light links the materials observed in it.  Components are numbered by their first material's name.
 
     >>> connected_components({"day": ["red", "white"], "night": ["blue"]})
     {'blue': 0, 'red': 1, 'white': 1}

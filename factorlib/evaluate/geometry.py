@@ -1,9 +1,11 @@
-"""Errors of normals and poses against true ones.
+"""Errors of normals and poses.
 
-Normals  angle between estimated and true normal over the pixels where both are known; null: every normal faces the camera.
-Poses    geodesic angle of rotation_estimateᵀ · rotation_truth, and the distance of the translations relative to the true
-         distance from the camera.  A random rotation is 126.5° off on average (90° + 114.6° / π): the null.  A shape with
-         a symmetry can be far off in rotation and right in every pixel: normals tell.
+Normals  Angle between estimated and true normal over the pixels where both are known; null: every normal faces the
+         camera.
+Poses    Geodesic angle of rotation_estimateᵀ · rotation_truth, and the distance of the translations relative to the
+         true
+         distance from the camera.  The null is a random rotation, with a mean error of 126.5° (90° + 114.6° / π).
+         A symmetric shape can have a large rotation error and yet match every pixel; the normals show it.
 """
 
 import numpy as np
@@ -21,7 +23,13 @@ RANDOM_ROTATION_DEG = float(np.degrees(np.pi / 2 + 2 / np.pi))
 def normal_error(
     estimate: Float[np.ndarray, "h w 3"], truth: Float[np.ndarray, "h w 3"], mask: Bool[np.ndarray, "h w"]
 ) -> NormalError | None:
-    """Errors over the pixels of `mask` where both normals are known (not zero); None where there is none."""
+    """Return the errors over the pixels of `mask` where both normals are known (not zero); None if there are none.
+
+    Args:
+        estimate: estimated unit normals, zero where unknown
+        truth: true unit normals, zero where unknown
+        mask: pixels to compare
+    """
     known = mask & (np.linalg.norm(estimate, axis=-1) > 0.5) & (np.linalg.norm(truth, axis=-1) > 0.5)
     if not known.any():
         return None
@@ -30,7 +38,7 @@ def normal_error(
 
 
 def averaged_normals(normal: Float[np.ndarray, "h w 3"], factor: int) -> Float[np.ndarray, "i j 3"]:
-    """Unit mean normals of boxes of factor × factor pixels; zero where less than half of a box is known."""
+    """Return unit mean normals of boxes of factor × factor pixels; zero where under half of a box is known."""
     if factor == 1:
         return normal
     known = np.linalg.norm(normal, axis=-1) > 0.5
@@ -41,7 +49,7 @@ def averaged_normals(normal: Float[np.ndarray, "h w 3"], factor: int) -> Float[n
 
 
 def angles_deg(a: Float[np.ndarray, "n 3"], b: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, " n"]:
-    """Angles between vectors of any length, exact for small ones too.
+    """Return the angles between vectors of any length, in degrees, accurate for small angles too.
 
     >>> angles_deg(np.array([[1.0, 0, 0]]), np.array([[0, 2.0, 0]])).tolist()
     [90.0]
@@ -51,7 +59,7 @@ def angles_deg(a: Float[np.ndarray, "n 3"], b: Float[np.ndarray, "n 3"]) -> Floa
 
 
 def pose_error(estimate: PoseEntry | Pose, truth: Pose) -> PoseError:
-    """Return how far two cam_from_object differ; the translations are in one unit."""
+    """Return the difference of two cam_from_object; the translations are in one unit."""
     moved = np.linalg.norm(np.subtract(estimate.translation, truth.translation))
     distance = float(np.linalg.norm(truth.translation)) or 1.0
     chord = np.linalg.norm(np.subtract(estimate.rotation, truth.rotation))  # 2√2 sin(angle / 2)

@@ -1,12 +1,13 @@
-"""Errors of recovered light against true light.
+"""Errors of recovered light.
 
-Three spheres  a white `mirror`, a `glossy` (GGX, roughness 0.4) and a `lambertian` sphere, rendered in the estimated and
-               in the true light, as LeGendre et al. 2019 ("DeepLight") and others do.
-Env map        the maps themselves, averaged to texels of equal solid angle about 3° across; all directions, and split
-               into those that an observed pixel mirrors toward the camera (within about 6°) and the rest.
-Errors         rmse: √mean (e − t)² over √mean t²; 1 is what black scores.  rmse_scale_invariant: the same after the best
+Three spheres  A white `mirror`, a `glossy` (GGX, roughness 0.4) and a `lambertian` sphere, rendered in the estimated
+and
+               in the true light, as in LeGendre et al. 2019 ("DeepLight").
+Env map        The maps themselves, averaged to texels of equal solid angle about 3° across: over all directions, over
+               those that an observed pixel mirrors toward the camera (within about 6°), and over the rest.
+Errors         rmse: √mean (e − t)² over √mean t²; black scores 1.  rmse_scale_invariant: rmse after the best
                single factor (Grosse et al. 2009).  rgb_angle_deg: mean angle between the RGB vectors, in degrees.
-Null           a constant light of the true map's mean colour: a generous null, for no method knows that colour.
+Null           A constant light of the true map's mean colour: a strong null, because no method knows that colour.
 """
 
 from collections.abc import Callable, Mapping
@@ -31,7 +32,8 @@ from factorlib.geometry.sphere import mirror_directions
 from factorlib.results.metrics import LightError, LightErrors, ScoredLight
 
 GLOSSY_ROUGHNESS = 0.4
-COVERAGE_ROWS, COVERAGE_DILATION = 32, 1
+COVERAGE_ROWS = 32  # rows of the mask of mirrored directions
+COVERAGE_DILATION = 1  # texels by which the mask grows
 
 Samples = Float[np.ndarray, "_ 3"]
 SPHERES = ("mirror", "glossy", "lambertian")
@@ -56,7 +58,10 @@ def light_error(estimate: Samples, truth: Samples) -> LightError:
 
 
 def rgb_angle(estimate: Samples, truth: Samples) -> float:
-    """Mean angle between RGB vectors, degrees; samples where either is black are left out, 90 where all are."""
+    """Return the mean angle between RGB vectors, in degrees.
+
+    Samples where either is black are left out.  The angle is 90 if no samples are left.
+    """
     lit = (np.linalg.norm(estimate, axis=-1) > 0) & (np.linalg.norm(truth, axis=-1) > 0)
     return float(angles_deg(estimate[lit], truth[lit]).mean()) if lit.any() else 90.0
 
@@ -64,7 +69,13 @@ def rgb_angle(estimate: Samples, truth: Samples) -> float:
 def compare_lights(
     estimates: Mapping[str, Light], truths: Mapping[str, Light], mirrored: Mapping[str, Bool[np.ndarray, "h w"]]
 ) -> LightErrors | None:
-    """Errors of the lights that have a truth; `mirrored` holds lat-long masks from `mirrored_directions`."""
+    """Return the errors of the lights that have a truth; None if there are none.
+
+    Args:
+        estimates: recovered lights by name
+        truths: true lights by name
+        mirrored: lat-long masks from `mirrored_directions`, by name
+    """
     names = [n for n in estimates if n in truths]
     if not names:
         return None
@@ -84,21 +95,24 @@ def compare_lights(
 def mirrored_directions(
     normals: Float[np.ndarray, "n 3"], views: Float[np.ndarray, "n 3"], frame_from_camera: Float[np.ndarray, "3 3"]
 ) -> Bool[np.ndarray, "h w"]:
-    """Lat-long mask of the directions that some pixel mirrors into its view, grown by one texel of 5.6°.
+    """Return a lat-long mask of the directions that some pixel mirrors into its view, dilated by one texel of 5.6°.
 
-    normals, views: camera frame;  frame_from_camera: identity for a light fixed to the camera.
+    Args:
+        normals: unit normals, camera frame
+        views: unit directions toward the viewer, camera frame
+        frame_from_camera: rotation into the light's frame; the identity for a light fixed to the camera
     """
     mirror = mirror_directions(normals, views)
     row, column = lat_long_of_direction(mirror @ (YUP_FROM_CAMERA @ frame_from_camera).T)
     shape = np.array([COVERAGE_ROWS, 2 * COVERAGE_ROWS])
     hit = np.zeros(shape, bool)
     hit[tuple(np.minimum((np.stack([row, column]) * shape[:, None]).astype(int), shape[:, None] - 1))] = True
-    wide = np.concatenate([hit[:, -1:], hit, hit[:, :1]], axis=1)  # the map closes around its sides
+    wide = np.concatenate([hit[:, -1:], hit, hit[:, :1]], axis=1)  # The map is periodic in azimuth.
     return binary_dilation(wide, np.ones((3, 3)), iterations=COVERAGE_DILATION)[:, 1:-1]
 
 
 def sphere_row(light: Light) -> Float[np.ndarray, "s w 3"]:
-    """The three spheres side by side, black around them."""
+    """Render the three spheres side by side, black around them."""
     row = np.zeros((len(SPHERES), *INSIDE.shape, 3))
     for picture, name in zip(row, SPHERES, strict=True):
         picture[INSIDE] = VIEWS[name](light)
@@ -106,7 +120,7 @@ def sphere_row(light: Light) -> Float[np.ndarray, "s w 3"]:
 
 
 def _at(mask: Bool[np.ndarray, "h w"]) -> tuple[np.ndarray, np.ndarray]:
-    """Texels of a lat-long mask at the centres of the octahedral texels."""
+    """Return the texels of a lat-long mask at the centres of the octahedral texels."""
     row, column = lat_long_of_direction(octahedral_directions(WIDE_SIDE))
     return tuple(np.minimum((t * n).astype(int), n - 1) for t, n in zip((row, column), mask.shape))
 
@@ -117,7 +131,7 @@ def _scored_view(
     truths: Mapping[str, Light],
     shown: Mapping[str, Bool[np.ndarray, "*t"]],
 ) -> dict[str, dict[str, ScoredLight]]:
-    """The errors of each light by gauge; shown: by light, which of the samples count."""
+    """Return the errors of each light by gauge; `shown` selects the samples that count, by light."""
     true = [render(truths[n])[part].reshape(-1, 3) for n, part in shown.items()]
     kinds = {
         "estimate": [render(estimates[n])[part].reshape(-1, 3) for n, part in shown.items()],

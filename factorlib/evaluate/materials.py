@@ -1,12 +1,12 @@
-"""Errors of recovered materials against true ones.
+"""Errors of recovered materials.
 
-Roughness     absolute difference.
-Colours       diffuse and specular, relative to the truth, after one factor per channel that all materials of a
-              connected component share, because observations cannot tell it from the light.  The factor is the
-              median over the component's materials of true over estimated diffuse + specular: what one material
-              reflects in all is known best, and one bad material does not move it.  A true albedo below 0.01 counts as
-              0.01.
-Null          a grey ball: diffuse 0.5, specular 0.05, roughness 0.5 for every material, scaled by its own factor.
+Roughness     Absolute difference.
+Colours       Diffuse and specular, relative to the truth, after one factor per channel that all materials of a
+              connected component share, because observations cannot separate it from the light.  The factor is the
+              median over the component's materials of true over estimated diffuse + specular: a material's total
+              reflectance is known best, and one bad material does not move a median.  A true albedo below 0.01 counts
+              as 0.01.
+Null          A grey ball: diffuse 0.5, specular 0.05, roughness 0.5 for every material, scaled by its own factor.
 """
 
 from collections.abc import Mapping
@@ -24,14 +24,18 @@ GREY = Reflectance(diffuse=(0.5, 0.5, 0.5), specular=(0.05, 0.05, 0.05), roughne
 def compare_materials(
     estimates: Mapping[str, Reflectance], truths: Mapping[str, Reflectance], component: Mapping[str, int]
 ) -> MaterialErrors | None:
-    """Errors of the materials that have a truth; None where none has.
+    """Return the errors of the materials that have a truth; None if there are none.
 
-    component: number of the component of each material; a material not in it (never seen) is left out.
+    Args:
+        estimates: recovered materials by name
+        truths: true materials by name
+        component: connected component of each material; a material without one was never observed and is left out
     """
     names = [n for n in estimates if n in truths and n in component]
     if not names:
         return None
-    factor, compared = {}, {}
+    factor = {}
+    compared = {}
     for c in sorted({component[n] for n in names}):
         group = [n for n in names if component[n] == c]
         true = [truths[n] for n in group]
@@ -44,7 +48,9 @@ def compare_materials(
 
 
 def common_factor(estimates: list[Reflectance], truths: list[Reflectance]) -> Vec3:
-    """The median over materials of true over estimated diffuse + specular, per channel; 1 where nothing is reflected.
+    """Return the median over materials of true over estimated diffuse + specular, per channel.
+
+    A material that reflects nothing counts as 1.
 
     >>> m = Reflectance((0.2, 0.4, 0.1), (0.1, 0.1, 0.1), 0.3)
     >>> common_factor([m], [Reflectance((0.4, 0.4, 0.1), (0.2, 0.1, 0.1), 0.3)])

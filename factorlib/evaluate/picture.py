@@ -1,11 +1,11 @@
 """Errors between two pictures of linear radiance, inside a mask.
 
-PSNR   10 log10(peak² / mean squared error), dB.  In linear radiance, where `peak` is the truth's white, and again
-       after the tone map, where the peak is 1.  A perfect match reads 120 dB, so that every number is finite.
-DSSIM  (1 − SSIM) / 2; SSIM after Wang, Bovik, Sheikh and Simoncelli 2004: Gaussian window of 11 × 11 pixels with
-       σ = 1.5, C1 = 0.01², C2 = 0.03².  The window is renormalised to the mask, so that nothing outside leaks in.
-Tone map   clip(exposure · radiance, 0, 1)^(1/2.2) with exposure = 1 / white: linear, and the same for both pictures.
-White      the 99th percentile, over the mask, of the truth's brightest channel.
+PSNR      10 log10(peak² / mean squared error), dB: in linear radiance, where `peak` is the truth's white, and
+          after the tone map, where the peak is 1.  A perfect match has 120 dB, so that every number is finite.
+DSSIM     (1 − SSIM) / 2; SSIM after Wang, Bovik, Sheikh and Simoncelli 2004: Gaussian window of 11 × 11 pixels with
+          σ = 1.5, C1 = 0.01², C2 = 0.03².  The window is renormalised to the mask, so that nothing outside leaks in.
+Tone map  clip(exposure · radiance, 0, 1)^(1/2.2) with exposure = 1 / white, the same for both pictures.
+White     The 99th percentile, over the mask, of the truth's brightest channel.
 """
 
 import math
@@ -30,7 +30,7 @@ WINDOW = WINDOW / WINDOW.sum()
 
 
 def white_of(truth: Picture, mask: Mask) -> float:
-    """The radiance that the tone map shows as white; 1 for a picture that is black or empty."""
+    """Return the radiance that the tone map shows as white; 1 for a picture that is black or empty."""
     if not mask.any():
         return 1.0
     white = float(np.percentile(truth[mask].max(axis=-1), WHITE_PERCENTILE))
@@ -38,7 +38,7 @@ def white_of(truth: Picture, mask: Mask) -> float:
 
 
 def tone_mapped(radiance: Float[np.ndarray, "*s 3"], exposure: float) -> Float[np.ndarray, "*s 3"]:
-    """Display values in [0, 1].
+    """Return display values in [0, 1].
 
     >>> float(tone_mapped(np.array([0.25, 1.0, 9.0]), 2.0)[0].round(3))
     0.73
@@ -47,7 +47,12 @@ def tone_mapped(radiance: Float[np.ndarray, "*s 3"], exposure: float) -> Float[n
 
 
 def psnr(estimate: Float[np.ndarray, "n 3"], truth: Float[np.ndarray, "n 3"], peak: float) -> float:
-    """dB over all entries, at most 120.
+    """Return the PSNR in dB over all entries, at most 120.
+
+    Args:
+        estimate: estimated values
+        truth: true values
+        peak: the value of white
 
     >>> psnr(np.full((5, 3), 0.9), np.ones((5, 3)), 1.0)
     20.0
@@ -57,13 +62,21 @@ def psnr(estimate: Float[np.ndarray, "n 3"], truth: Float[np.ndarray, "n 3"], pe
 
 
 def ssim_map(a: Picture, b: Picture, mask: Mask) -> Float[np.ndarray, "h w"]:
-    """SSIM of each pixel of the mask, averaged over channels; 0 outside.  `a` and `b` are display values."""
+    """Return the SSIM of each pixel of the mask, averaged over channels; 0 outside.
+
+    Args:
+        a: display values in [0, 1]
+        b: display values in [0, 1]
+        mask: pixels to compare
+    """
     inside = mask[..., None].astype(np.float32)
     total = np.maximum(_blurred(inside), 1e-12)
 
     def mean(values: np.ndarray) -> np.ndarray:
+        """Return Gaussian-weighted local means over the mask."""
         return _blurred(values * inside) / total
 
+    # SSIM = (2 μa μb + C1)(2 cov + C2) / ((μa² + μb² + C1)(var a + var b + C2)), from local moments
     a, b = a.astype(np.float32), b.astype(np.float32)
     mean_a, mean_b = mean(a), mean(b)
     var_a, var_b = mean(a * a) - mean_a**2, mean(b * b) - mean_b**2
@@ -76,7 +89,14 @@ def ssim_map(a: Picture, b: Picture, mask: Mask) -> Float[np.ndarray, "h w"]:
 def picture_errors(
     estimate: Picture, truth: Picture, regions: dict[str, Mask], white: float
 ) -> dict[str, PictureError]:
-    """The errors of each region; the SSIM window sees the union of the regions.  Empty regions are left out."""
+    """Return the errors of each region; empty regions are left out.
+
+    Args:
+        estimate: linear radiance
+        truth: linear radiance
+        regions: masks by name; the SSIM window covers their union
+        white: radiance that the tone map shows as white
+    """
     regions = {name: region for name, region in regions.items() if region.any()}
     if not regions:
         return {}
@@ -87,6 +107,7 @@ def picture_errors(
     ssim = ssim_map(shown[0], shown[1], union)
 
     def error(region: Mask) -> PictureError:
+        """Return the errors inside one region."""
         psnr_linear = psnr(estimate[region], truth[region], white)
         dssim = round(float(np.clip((1 - ssim[region].mean()) / 2, 0, 1)), 9)
         return PictureError(psnr_linear, psnr(shown[0][region], shown[1][region], 1.0), dssim)
@@ -95,18 +116,25 @@ def picture_errors(
 
 
 def picture_error(estimate: Picture, truth: Picture, mask: Mask, white: float) -> PictureError:
-    """The errors inside one mask, which is not empty."""
+    """Return the errors inside one mask.
+
+    Args:
+        estimate: linear radiance
+        truth: linear radiance
+        mask: pixels to compare, at least one
+        white: radiance that the tone map shows as white
+    """
     return picture_errors(estimate, truth, {"": mask}, white)[""]
 
 
 def mean_error(errors: Sequence[Error], digits: int = 6) -> Error:
-    """The mean of each number of errors of one kind (of dB, for PSNR), rounded; there must be some."""
+    """Return the mean of each number over errors of one kind (of dB, for PSNR), rounded; there must be at least one."""
     values = np.array([msgspec.structs.astuple(e) for e in errors])
     return type(errors[0])(*(round(float(np.mean(column)), digits) for column in values.T))
 
 
 def mean_scored(scored: Sequence[Scored[Error]], digits: int = 6) -> Scored[Error]:
-    """The mean of estimates and the mean of nulls, each as `mean_error`."""
+    """Return the mean of estimates and the mean of nulls, each by `mean_error`."""
     return Scored(*(mean_error([getattr(each, part) for each in scored], digits) for part in ("estimate", "null")))
 
 

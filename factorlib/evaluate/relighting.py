@@ -1,24 +1,26 @@
 """Balls of the recovered materials in other light, against balls of the true materials in the true light.
 
-in_true_light       the recovered material in the true light: what is wrong with the material alone
-in_estimated_light  the recovered material in the recovered light: what the two together would show
+in_true_light       the recovered material in the true light: the error of the material alone
+in_estimated_light  the recovered material in the recovered light: the error of both together
 null_grey           a grey ball (diffuse 0.5, no specular) in the true light
 null_mean_colour    a flat disc of the true ball's mean colour
 
-Balls are seen along the light frame's own z axis (for a light fixed to a photo's camera: as that camera sees them).
-A ball is a "photo" for the gauge `channel_per_photo`.
+Balls are seen along the z axis of the light's frame.  For a light fixed to a photo's camera, that is the camera's view.
+The gauge `channel_per_photo` treats a ball as a "photo".
 
-The relit set score: every pair of a recovered material and a recovered light counts, whether or not a photo shows it.
+The relit set score covers every pair of a recovered material and a recovered light, whether or not a photo shows it.
 
-    factor    f_c = exp(median over materials and over k_d, k_s of log(true / recovered)), one for each channel c of the whole set;
-              the materials are multiplied and the lights divided by it.  Reflectances of 0, true or recovered, have no logarithm
-              and are left out; 1 where none is left.
-    shown     s(L) = clip(e L, 0, 1)^(1/2.2), e = .5 / mean of the true ball's radiance over pixels and channels, for both balls
+    factor    f_c = exp(median over materials and over k_d, k_s of log(true / recovered)), one for each channel c of the
+              whole set; the materials are multiplied and the lights divided by it.  Reflectances of 0, true or
+              recovered, have no logarithm and are left out; 1 if none is left.
+    shown     s(L) = clip(e L, 0, 1)^(1/2.2), e = 0.5 / mean of the true ball's radiance over pixels and channels, for
+              both balls
     score     PSNR = −10 log₁₀ mean (s(recovered) − s(true))², dB over the ball's pixels and channels, at most 120
-    null      the same of a flat disc of the true ball's mean radiance, RGB
+    null      the PSNR of a flat disc of the true ball's mean radiance, RGB
 
-A pair's radiance is linear in its reflectances and in its light, so the factor cancels in each of them: (f k_d) (E / f) = k_d E.
-So balls are made without it, and it is stated for what is compared apart: materials × factor, lights / factor.
+A pair's radiance is linear in its reflectances and in its light, so the factor cancels in each pair: (f k_d) (E / f) =
+k_d E.  Balls are therefore rendered without it.  The factor is reported for separate comparisons of materials × factor
+and of lights / factor.
 """
 
 from collections.abc import Iterable, Mapping, Sequence
@@ -37,32 +39,32 @@ from factorlib.results.metrics import Kinds, PictureError, Relighting, RelitBall
 BALL_SIZE = 32
 NORMALS, INSIDE = ball_normals(BALL_SIZE)
 GREY = 0.5
-MEAN_SHOWN = 0.5  # of the true ball of the relit set score, linear, before it is clipped
+MEAN_SHOWN = 0.5  # mean of the true ball in the relit set score, linear, before clipping
 
 Samples = Float[np.ndarray, "_ 3"]
 
 
 @lru_cache(maxsize=16)
 def lobe_of(roughness: float) -> Reflected:
-    """The lobe of a ball, cached, for materials are shown in many lights.  16 take 200 MB at most."""
+    """Return the glossy lobe of a ball, cached because materials appear in many lights; 16 take 200 MB at most."""
     return glossy_lobe(NORMALS, roughness)
 
 
 @cache
 def matte_lobe() -> Reflected:
-    """The diffuse part of a ball, cached."""
+    """Return the diffuse lobe of a ball, cached."""
     return diffuse_lobe(NORMALS)
 
 
 class Appearances:
-    """Balls of many materials in one light: each part of the reflection is rendered once."""
+    """Balls of many materials in one light, with each part of the reflection rendered once."""
 
     def __init__(self, light: Light):
         self.diffuse = matte_lobe()(light)
         self.glossy = cache(lambda roughness: lobe_of(roughness)(light))
 
     def ball(self, material: Reflectance) -> Samples:
-        """Radiance of a ball of `material`, one row per normal, RGB."""
+        """Return the radiance of a ball of `material`, one row per normal, RGB."""
         value = np.asarray(material.diffuse) * self.diffuse
         if not any(material.specular):
             return value
@@ -71,7 +73,7 @@ class Appearances:
 
 @lru_cache(maxsize=64)
 def appearances(light: Light) -> Appearances:
-    """The balls in a light, cached: several numbers are made of the same ones."""
+    """Return the balls in a light, cached because several scores use them."""
     return Appearances(light)
 
 
@@ -82,9 +84,14 @@ def compare_relighting(
     true_lights: Mapping[str, Light],
     seen: Mapping[str, Sequence[str]],
 ) -> Relighting | None:
-    """Every material with a truth in every light with a truth; None where there is no such pair.
+    """Compare every material with a truth in every light with a truth; None if there is no such pair.
 
-    seen: the materials observed in each light.
+    Args:
+        estimates: recovered materials by name
+        truths: true materials by name
+        estimated_lights: recovered lights by name
+        true_lights: true lights by name
+        seen: the materials observed in each light
     """
     pairs = [(li, m) for li in true_lights if li in estimated_lights for m in truths if m in estimates]
     if not pairs:
@@ -100,7 +107,7 @@ def compare_relighting(
     whites = [white_of(t[None], np.ones((1, len(t)), bool)) for t in true]
 
     def error(ball: Samples, i: int) -> PictureError:
-        """The error of a scaled ball against the true one."""
+        """Return the error of a scaled ball against the true one."""
         return picture_error(_disc(ball), _disc(true[i]), INSIDE, whites[i])
 
     balls: dict[str, dict[str, RelitBall]] = {}
@@ -130,10 +137,20 @@ def compare_relit_set(
     estimated_lights: Mapping[str, Light],
     true_lights: Mapping[str, Light],
 ) -> RelitSet | None:
-    """The score over every material and every light that has both a truth and an estimate; None where there is no such pair."""
-    names, scores, nulls = [m for m in truths if m in estimates], {}, []
+    """Return the score over every pair of a material and a light that have a truth and an estimate; None without any.
+
+    Args:
+        estimates: recovered materials by name
+        truths: true materials by name
+        estimated_lights: recovered lights by name
+        true_lights: true lights by name
+    """
+    names = [m for m in truths if m in estimates]
+    scores = {}
+    nulls = []
     for light in [li for li in true_lights if li in estimated_lights]:
-        true, estimated = appearances(true_lights[light]), appearances(estimated_lights[light])
+        true = appearances(true_lights[light])
+        estimated = appearances(estimated_lights[light])
         for m in names:
             ball = true.ball(truths[m])
             scores[m, light] = shown_psnr(estimated.ball(estimates[m]), ball)
@@ -147,7 +164,7 @@ def compare_relit_set(
 
 
 def set_factor(pairs: Iterable[tuple[Reflectance, Reflectance]]) -> Vec3:
-    """The factor on the recovered reflectances, of (recovered, true) materials.
+    """Return the factor on the recovered reflectances, from pairs of (recovered, true) materials.
 
     >>> true = Reflectance((0.4, 0.4, 0.1), (0.2, 0.1, 0.0), 0.3)
     >>> set_factor([(Reflectance((0.2, 0.4, 0.1), (0.1, 0.1, 0.1), 0.3), true)])
@@ -160,7 +177,7 @@ def set_factor(pairs: Iterable[tuple[Reflectance, Reflectance]]) -> Vec3:
 
 
 def shown_psnr(recovered: Samples, true: Samples) -> float:
-    """PSNR in dB of two balls at the exposure of the true one, which is 1 where that is black."""
+    """Return the PSNR in dB of two balls at the exposure of the true one, or at exposure 1 if that is black."""
     mean = float(np.mean(true, dtype=float))
     exposure = MEAN_SHOWN / mean if mean > np.finfo(np.float32).tiny else 1.0
     return psnr(tone_mapped(recovered, exposure), tone_mapped(true, exposure), 1.0)

@@ -1,12 +1,12 @@
-"""How well the solved materials in the solved light give back the photos; this needs no truth.
+"""Errors of the re-synthesis of photos from the solved materials and light, which need no truth.
 
-A pixel counts where mask and mesh name the same material and the surface faces the camera, whether the solve used it
-or not, and no channel of the photo is clipped.  What is left out is counted: `clipped`, `invalid` (left out by the mask
-or not finite), `uncovered` (in the mask, but not explained by the mesh).  `unused` pixels count, but the solve did not
-use them: their normals had no confidence.  Of the clipped pixels, `clipped_satisfied` is the fraction whose re-synthesis
-is at least what was clipped, up to 2 %.
+A pixel counts if mask and mesh name the same material, the surface faces the camera, and no channel of the photo is
+clipped.  It counts whether or not the solve used it.  Other pixels are reported as `clipped`, `invalid` (left out by
+the mask or not finite) and `uncovered` (in the mask, but not explained by the mesh).  `unused` pixels count, but the
+solve did not use them because their normals had no confidence.  `clipped_satisfied` is the fraction of the clipped
+pixels whose re-synthesis reaches the clipped value, up to 2 %.
 
-Null: each material in each photo is one flat colour, its own mean over the counted pixels.
+The null gives each material in each photo one flat colour, its own mean over the counted pixels.
 """
 
 from collections.abc import Callable, Iterable, Mapping
@@ -26,7 +26,15 @@ Channels = Mapping[str, Float[np.ndarray, "h w"]]
 
 
 class Shot(msgspec.Struct, frozen=True):
-    """One photo beside its re-synthesis: `pixels` are those that count, `label` 1..m, `white` as the tone map's."""
+    """One photo with its re-synthesis.
+
+    Attributes:
+        label: material, 1 to m
+        pixels: mask of the pixels that count
+        white: radiance that the tone map shows as white
+        counts: numbers of pixels by kind
+        clipped_satisfied: see the module
+    """
 
     photo: Picture
     resynthesis: Picture
@@ -38,10 +46,18 @@ class Shot(msgspec.Struct, frozen=True):
 
 
 def shot_of(photo: Channels, geometry: Channels, resynthesis: Picture) -> Shot:
-    """Make a shot of the channels of the stages `masks` and `align` and the re-synthesis of the same size."""
-    label, clipped = np.rint(photo["label"]), np.any([photo[f"clipped.{c}"] > 0.5 for c in "RGB"], axis=0)
+    """Combine a photo with its re-synthesis.
+
+    Args:
+        photo: channels of the stage `masks`
+        geometry: channels of the stage `align`
+        resynthesis: linear radiance, of the photo's size
+    """
+    label = np.rint(photo["label"])
+    clipped = np.any([photo[f"clipped.{c}"] > 0.5 for c in "RGB"], axis=0)
     rgb = np.nan_to_num(np.stack([photo[c] for c in "RGB"], axis=-1), posinf=0.0, neginf=0.0)
-    valid, observed = photo["valid"] > 0.5, agreeing_pixels(photo, geometry)
+    valid = photo["valid"] > 0.5
+    observed = agreeing_pixels(photo, geometry)
     pixels, bounds = observed & ~clipped, observed & clipped
     left_out = photo["left_out"] > 0.5 if "left_out" in photo else np.zeros(valid.shape, bool)
     counts = {
@@ -59,12 +75,23 @@ def shot_of(photo: Channels, geometry: Channels, resynthesis: Picture) -> Shot:
 
 
 def agreeing_pixels(photo: Channels, geometry: Channels) -> Bool[np.ndarray, "h w"]:
-    """Where mask and mesh name the same material and the surface faces the camera, however little its normal is trusted."""
+    """Return a mask of the pixels where mask and mesh name the same material and the surface faces the camera.
+
+    The confidence of the normals is ignored.
+    """
     return observed_pixels(photo, {**geometry, "confidence": np.ones_like(geometry["confidence"])})
 
 
 def compare_photos(names: Iterable[str], materials: list[str], shot: Callable[[str], Shot]) -> Resynthesis:
-    """Errors of all photos; `shot` reads one by name, and only one is in memory at a time but for its counted pixels."""
+    """Return the errors of all photos.
+
+    Only one photo is in memory at a time, apart from the samples of the counted pixels.
+
+    Args:
+        names: names of the photos
+        materials: names by label, from 1
+        shot: reads a photo by name
+    """
     factors = _factors(list(names), shot)
     photos = {name: _photo_errors(shot(name), materials, factor) for name, factor in factors.items()}
     scored = [p.gauges for p in photos.values() if p.gauges]
@@ -76,7 +103,7 @@ def compare_photos(names: Iterable[str], materials: list[str], shot: Callable[[s
 
 
 def flat_materials(shot: Shot) -> Picture:
-    """The null: every material of the photo in its mean colour."""
+    """Return the null: every material of the photo in its mean colour."""
     flat = np.zeros_like(shot.photo)
     for label in np.unique(shot.label[shot.pixels]):
         of_material = shot.pixels & (shot.label == label)
@@ -85,7 +112,9 @@ def flat_materials(shot: Shot) -> Picture:
 
 
 def _factors(names: list[str], shot: Callable[[str], Shot]) -> dict[str, dict[str, Float[np.ndarray, "3"]]]:
-    estimates, truths, whites = [], [], []
+    estimates = []
+    truths = []
+    whites = []
     for name in names:
         s = shot(name)
         estimates.append(s.resynthesis[s.pixels])
@@ -101,6 +130,7 @@ def _photo_errors(shot: Shot, materials: list[str], factor: dict[str, Float[np.n
     found = {g: _scored(shot.resynthesis * factor[g], shot, regions) for g in GAUGES}
 
     def scores(region: str) -> dict[str, ScoredPicture]:
+        """Return the scores of a region in each gauge."""
         return {g: ScoredPicture(found[g][region], null[region]) for g in GAUGES}
 
     return PhotoErrors(

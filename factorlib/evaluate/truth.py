@@ -1,4 +1,4 @@
-"""The maps of a truth, read and checked against what they describe: a true light is radiance, true normals have the photo's pixels."""
+"""Maps of a truth, read and checked: a true light is radiance, true normals have the photo's size."""
 
 from pathlib import Path
 
@@ -12,12 +12,24 @@ from factorlib.reading import reading
 
 
 def read_true_light(path: Path, name: str) -> Float[np.ndarray, "h w 3"]:
-    """The lat-long map of illumination `name`; InputError where a texel is no radiance."""
+    """Read the lat-long map of illumination `name`; InputError if a texel is not a valid radiance."""
     return read_light_map(path, f"illumination.{name}").astype(np.float32)
 
 
 def read_true_normals(path: Path, name: str, size: tuple[int, int]) -> Float[np.ndarray, "h w 3"]:
-    """Read the true normals of photo `name`, whose file has `size` (width, height): normal.x/y/z, or R, G, B; zero or NaN where none is known."""
+    """Read the true normals of a photo from channels normal.x/y/z, or R, G, B.
+
+    Args:
+        path: the EXR file
+        name: name of the photo
+        size: width and height of the photo
+
+    Returns:
+        Normals, zero or NaN where unknown.
+
+    Raises:
+        InputError: The file lacks a channel, has another size, or holds an infinite value.
+    """
     key = f"normals.{name}"
     with reading("an image", path, key):
         channels = read_exr(path)

@@ -1,17 +1,19 @@
-"""Whether a result can be trusted, from what is known without any truth.
+"""Verdict on whether a result can be trusted, without any truth.
 
-The mean square error of balls of the recovered materials in the recovered lights, shown as for the relit set score (`factorlib.evaluate.relighting`), is
-expected to be
+The expected mean square error of balls of the recovered materials in the recovered lights, shown as for the relit set
+score (`factorlib.evaluate.relighting`), is
 
-    e² = FLOOR + MATERIALS m² + CLIPPED c² + UNEXPLAINED √u + CONTOUR d                                                 (1)
+    e² = FLOOR + MATERIALS m² + CLIPPED c² + UNEXPLAINED √u + CONTOUR d          (1)
 
-m²  by how much a ball changes where each reflectance and each roughness is wrong by one standard error: squares summed over these, mean over balls
-c   share of values that are clipped, mean over photos;  u: share of the shading that is not explained (`factorlib.inference.misfit`)
-d   how far meshes' outlines lie from their masks' (`contour_error` of poses.json), mean over objects
+m²  squared change of a ball per standard error of each reflectance and of roughness, summed over these, mean over balls
+c   share of values that are clipped, mean over photos
+u   share of the shading that is not explained (`factorlib.inference.misfit`)
+d   distance between the outlines of meshes and masks (`contour_error` of poses.json), mean over objects
 
-and −10 log₁₀ e² is the expected score in dB.  The weights were fitted to 44 made sets of very different quality, and `GOOD` and `POOR` chosen on them, so that none
-that scores less than 18 dB, as a flat disc of the mean colour does, is called good, and none that scores 24 dB or more is not to be trusted.  docs/verdict.md
-shows both on sets that had no part in this (`python -m studies.measured.verdict`).
+and −10 log₁₀ e² is the expected score in dB.  The weights were fitted to 44 made sets of very different quality.
+`GOOD` and `POOR` were chosen on the same sets.  No set that scores less than 18 dB, as a flat disc of the mean colour
+does, is called good.  No set that scores 24 dB or more is called untrustworthy.  docs/verdict.md shows both on other
+sets (`python -m studies.measured.verdict`).
 """
 
 from collections.abc import Iterator, Mapping
@@ -26,25 +28,31 @@ from factorlib.inference.materials import ROUGHNESS
 from factorlib.results.materials import Misfit, Reflectance, Solved
 from factorlib.results.metrics import Verdict
 
-FLOOR, MATERIALS, CLIPPED, UNEXPLAINED, CONTOUR = 1e-5, 0.28, 0.19, 0.0186, 1.38
-DEVIATION = 3.0  # dB, of the scores from what is expected
-GOOD, POOR = 24.0, 19.0  # dB
-DISAGREES = 3.0  # residuals, in units of their noise
-MUCH = 0.1  # unexplained: something is wrong, not only rough
-TELLING = 0.2  # least share of e² that is a reason
+# weights of (1)
+FLOOR = 1e-5
+MATERIALS = 0.28
+CLIPPED = 0.19
+UNEXPLAINED = 0.0186
+CONTOUR = 1.38
+DEVIATION = 3.0  # deviation of the scores from the expected one, dB
+GOOD = 24.0  # least expected score of a good result, dB
+POOR = 19.0  # least expected score of a usable result, dB
+DISAGREES = 3.0  # residuals above which shapes and photos disagree, in units of their noise
+MUCH = 0.1  # unexplained share from which an input is wrong and not only inaccurate
+TELLING = 0.2  # least share of e² for a term to be a reason
 
 
 def material_errors(materials: Mapping[str, Solved], lights: Mapping[str, Light]) -> dict[str, float]:
-    """m² of each material, mean over lights.
+    """Return m² of each material, mean over lights.
 
-    materials, lights: as they were recovered, in one gauge, the former with standard errors
+    Both arguments are in one gauge, and the materials have standard errors.
     """
     lit = [Appearances(light) for light in lights.values()]
     return {name: float(np.mean([_change(solved, own) for own in lit])) for name, solved in materials.items()}
 
 
 def _change(solved: Solved, lit: Appearances) -> float:
-    """The mean square by which a ball changes in a light, summed over diffuse and specular reflectance and roughness."""
+    """Return the mean square change of a ball in a light, summed over diffuse, specular and roughness."""
     ball = lit.ball(solved.reflectance)
     exposure = MEAN_SHOWN / max(float(ball.mean()), 1e-30)
     shown = tone_mapped(ball, exposure)
@@ -53,8 +61,9 @@ def _change(solved: Solved, lit: Appearances) -> float:
 
 
 def _others(solved: Solved) -> Iterator[Reflectance]:
-    """The reflectance with each of its parts a standard error lower and higher."""
-    own, errors = solved.reflectance, solved.stderr
+    """Yield the reflectance with each of its parts one standard error lower and higher."""
+    own = solved.reflectance
+    errors = solved.stderr
     for sign in (-1, 1):
         for part in ("diffuse", "specular"):
             moved = np.clip(np.array(getattr(own, part)) + sign * np.array(getattr(errors, part)), 0, 1)
@@ -64,12 +73,14 @@ def _others(solved: Solved) -> Iterator[Reflectance]:
 
 
 class Signs(msgspec.Struct, frozen=True):
-    """The signs of (1), as far as they are measured.
+    """The measured quantities of (1).
 
-    materials    m² of each material that a photo shows (`material_errors`)
-    unexplained  u of the set;  photos: the unexplained share of each photo, and its share of clipped values
-    contours     d of each object whose outline was compared, by photo and object
-    deviation    of the residuals, in units of their noise: standard errors of materials grow with it
+    Attributes:
+        materials: m² of each material that a photo shows (`material_errors`)
+        unexplained: u of the set
+        photos: unexplained share and clipped share of each photo
+        contours: d of each object with a compared outline, by photo and object
+        deviation: deviation of the residuals in units of their noise, which scales the standard errors of materials
     """
 
     materials: dict[str, float]
@@ -79,7 +90,7 @@ class Signs(msgspec.Struct, frozen=True):
     deviation: float = 1.0
 
     def terms(self) -> dict[str, float]:
-        """The terms of (1) but for the first."""
+        """Return the terms of (1) except the first."""
         contours = [error for own in self.contours.values() for error in own.values()]
         return {
             "materials": MATERIALS * float(np.mean(list(self.materials.values()))),
@@ -90,7 +101,7 @@ class Signs(msgspec.Struct, frozen=True):
 
 
 def verdict(signs: Signs) -> Verdict:
-    """What (1) says, why, and what to do next."""
+    """Return the expected score of (1), the reasons that limit it, and the next step."""
     terms = signs.terms()
     whole = FLOOR + sum(terms.values())
     expected = round(float(-10 * np.log10(whole)), 3)
@@ -103,13 +114,16 @@ def verdict(signs: Signs) -> Verdict:
 
 
 def text_of(verdict: Verdict) -> str:
-    """The verdict as lines for a terminal, what it comes to first."""
-    head = f"{verdict.trust}: relit pictures are expected to reach {verdict.expected_relit_db:.0f} ± {verdict.deviation_db:.0f} dB"
+    """Format the verdict for a terminal, conclusion first."""
+    head = (
+        f"{verdict.trust}: relit pictures are expected to reach "
+        f"{verdict.expected_relit_db:.0f} ± {verdict.deviation_db:.0f} dB"
+    )
     return "\n".join([head, *(f"limited by: {why}" for why in verdict.reasons), f"next: {verdict.next}", ""])
 
 
 def _percent(share: float) -> str:
-    """Write a share in percent; one below a hundredth by its first digit.
+    """Format a share in percent; a share below a hundredth with one digit.
 
     >>> _percent(0.042), _percent(0.0032)
     ('4%', '0.3%')
@@ -118,7 +132,7 @@ def _percent(share: float) -> str:
 
 
 def _of_materials(signs: Signs) -> tuple[str, str]:
-    """Return why, and what to do next."""
+    """Return the reason and the next step if materials limit the score."""
     name = max(signs.materials, key=signs.materials.__getitem__)
     why = f"uncertain reflectances, most of all that of '{name}'"
     if signs.deviation > DISAGREES:
@@ -129,14 +143,14 @@ def _of_materials(signs: Signs) -> tuple[str, str]:
 
 
 def _of_clipped(signs: Signs) -> tuple[str, str]:
-    """Return why, and what to do next."""
+    """Return the reason and the next step if clipped values limit the score."""
     name = max(signs.photos, key=lambda photo: signs.photos[photo].clipped)
     why = f"clipped values, in '{name}' {_percent(signs.photos[name].clipped)} of all: they say 'at least' only"
     return why, f"expose '{name}' less, or give the camera's raw file"
 
 
 def _of_contour(signs: Signs) -> tuple[str, str]:
-    """Return why, and what to do next."""
+    """Return the reason and the next step if outlines limit the score."""
     each = {(photo, name): error for photo, own in signs.contours.items() for name, error in own.items()}
     photo, name = max(each, key=each.__getitem__)
     mend = "mend masks that have holes or lack a piece; else give a mesh that is nearer to it, or a larger photo"
@@ -145,7 +159,7 @@ def _of_contour(signs: Signs) -> tuple[str, str]:
 
 
 def _of_unexplained(signs: Signs) -> tuple[str, str]:
-    """Return why, and what to do next."""
+    """Return the reason and the next step if unexplained shading limits the score."""
     name = max(signs.photos, key=lambda photo: signs.photos[photo].unexplained)
     share = min(signs.photos[name].unexplained, 1)
     next_ = "a mesh that is nearer to the objects"

@@ -1,1 +1,4 @@
-"""Results in the forms that other programs read: lat-long EXRs, scenes for Mitsuba and Blender, OpenUSD, MaterialX, glTF, and what is lost."""
+"""Export of a solution: lat-long EXRs, Mitsuba and Blender scenes, OpenUSD, MaterialX and glTF.
+
+The package also measures what each format loses.
+"""

@@ -1,13 +1,14 @@
-"""A scene for Blender: a script, the same for every set, and what it builds of each photo, as JSON.
+"""Export of a photo's scene to Blender: a script that is the same for every set, and the scene as JSON.
 
-The script (`blender.py.txt` in this package, exported as `blender.py`) needs nothing but Blender; a `.blend` file would need Blender to
-be written and would not be the same bytes twice.  The JSON is a `factorlib.export.scene.Scene` in plain numbers:
+The script (`blender.py.txt` in this package, exported as `blender.py`) needs nothing but Blender.  A `.blend` file
+would need Blender to be written and would not be the same bytes twice.  The JSON is a `factorlib.export.scene.Scene` in
+plain numbers:
 
     camera     width, height, focal_px, principal_point in pixels, centres at 0.5
     shapes     name, file (relative), material, cam_from_object: 4 × 4, rows, mesh units, OpenCV's camera axes
     materials  diffuse k_d, specular k_s (linear Rec. 709), roughness
     light      file (relative): lat-long map of texel means, exposure: factor per channel, camera_from_light: 3 × 3
-    suns       beside the map: direction (toward it, y-up turn of the camera frame), irradiance (RGB), angular_diameter_deg
+    suns       not in the map: direction (toward it, y-up camera frame), irradiance (RGB), angular_diameter_deg
     max_depth  2 direct light alone, −1 all bounces
 """
 
@@ -29,10 +30,12 @@ def write_script(folder: str | Path) -> None:
 
 
 def write_scene_json(path: str | Path, scene: Scene) -> None:
-    """Write a photo's scene; of its materials those that shapes name."""
+    """Write a photo's scene as JSON, with the materials that its shapes name."""
     camera = scene.camera
     write_json(path, {
-        "camera": {"width": camera.width, "height": camera.height, "focal_px": camera.focal, "principal_point": camera.centre},
+        "camera": {
+            "width": camera.width, "height": camera.height, "focal_px": camera.focal, "principal_point": camera.centre,
+        },
         "shapes": [_plain(shape, "name", "file", "material", "cam_from_object") for shape in scene.shapes],
         "materials": {shape.material: scene.materials[shape.material] for shape in scene.shapes},
         "light": _plain(scene.light, "file", "exposure", "camera_from_light"),

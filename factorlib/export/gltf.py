@@ -1,16 +1,17 @@
-"""Meshes as binary glTF with their materials and the variants of these, and suns as glTF's directional lights.
+"""Export of meshes as binary glTF with materials and their variants, and of suns as directional lights.
 
-glTF's metallic-roughness model has GGX of the same α = roughness².  A dielectric with KHR_materials_specular has
-F0 = 0.04 · specularFactor · specularColor and F90 = specularFactor, over a diffuse part times 1 − max F.  So
+glTF's metallic-roughness model has GGX of the same α = roughness².  A dielectric with KHR_materials_specular has F0 =
+0.04 · specularFactor · specularColor and F90 = specularFactor, over a diffuse part times 1 − max F.  The values
 
     specularFactor = max k_s,  specularColor = k_s / (0.04 max k_s),  baseColor = k_d / (1 − max k_s),  metallic 0
 
-gives a reflectance at normal incidence of k_d and k_s exactly, and no Fresnel where k_s is grey.  Viewers without the extension
-show the default F0 of 0.04.  baseColor stays within one because max k_d + max k_s does.  That default would make black plastic of a metal, so where
-k_d is at most METAL of k_s, in the largest channels, it is left out, and baseColor = k_s, metallic 1: all viewers show F0 = k_s, and F90 = 1.
+give a reflectance at normal incidence of exactly k_d and k_s, and no Fresnel term if k_s is grey.  baseColor is at most
+one because max k_d + max k_s is.  Viewers without the extension show the default F0 of 0.04, which would turn a metal
+into black plastic.  A material with max k_d at most METAL times max k_s is therefore written without k_d, as baseColor
+= k_s, metallic 1.  All viewers then show F0 = k_s and F90 = 1.
 
-A directional light of KHR_lights_punctual shines along its node's −z with an illuminance in lux.  Written is the irradiance of the map's
-radiance, in whose unit a program that also shows the map wants it.
+A directional light of KHR_lights_punctual shines along its node's −z with an illuminance in lux.  The value written is
+the irradiance in the unit of the map's radiance, as a program that also shows the map needs it.
 """
 
 import json
@@ -34,8 +35,11 @@ from factorlib.reading import read_bytes
 from factorlib.results.materials import Reflectance
 from factorlib.wholefile import write_bytes
 
-DIELECTRIC, METAL = 0.04, 0.02
-EXTENSION, LIGHTS, VARIANTS = "KHR_materials_specular", "KHR_lights_punctual", "KHR_materials_variants"
+DIELECTRIC = 0.04  # F0 of glTF's dielectric
+METAL = 0.02  # largest max k_d / max k_s of a material written as a metal
+EXTENSION = "KHR_materials_specular"
+LIGHTS = "KHR_lights_punctual"
+VARIANTS = "KHR_materials_variants"
 
 
 def write_glb(
@@ -45,22 +49,32 @@ def write_glb(
     materials: Mapping[str, Reflectance],
     variants: Mapping[str, Int[np.ndarray, " f"]] = {},
 ) -> None:
-    """Write `mesh` in its own frame and units, with the materials of its parts; label k is names[k − 1].
+    """Write a mesh in its own frame and units, with the materials of its parts.
 
-    variants: by name, other labels of the faces (KHR_materials_variants); a primitive is what has one material in each of them
+    Detail of diffuse reflectance becomes vertex colours, by which glTF multiplies the base colour.  Neither may exceed
+    1.  The base colour takes the largest factor up to that limit; brighter vertices are clamped.
 
-    Detail of reflectance is in vertex colours, by which glTF multiplies the base colour.  Neither may be above 1: the base colour takes the largest
-    factor, as far as it can, and vertices that would be brighter still are as bright as that.
+    Args:
+        path: the file to write
+        mesh: the mesh
+        names: label k is names[k − 1]
+        materials: reflectances by name
+        variants: alternative labels of the faces, by variant name (KHR_materials_variants)
     """
+    # one primitive per combination of the faces' own label and their labels in each variant
     choices, part = np.unique([mesh.face_label, *variants.values()], axis=1, return_inverse=True)
     split = msgspec.structs.replace(mesh, face_label=part.reshape(-1) + 1)
-    scene, parts = trimesh.Scene(), {}
+    scene = trimesh.Scene()
+    parts = {}
     for label in split.labels:
-        part, chosen = submesh(split, label), [names[k - 1] for k in choices[:, label - 1]]
+        part = submesh(split, label)
+        chosen = [names[k - 1] for k in choices[:, label - 1]]
         name = chosen[0] if chosen[0] not in parts else f"{chosen[0]} {label}"
-        visual, factor = TextureVisuals(material=PBRMaterial(name=name)), 1.0
+        visual = TextureVisuals(material=PBRMaterial(name=name))
+        factor = 1.0
         if part.detail is not None:
             cores = [gltf_material(materials[each], True)["pbrMetallicRoughness"] for each in chosen]
+            # vertex colours in [0, 1]; the base colour takes their largest value, up to 1 itself
             bases = [core["baseColorFactor"][:3] for core in cores]
             factor = min(float(part.detail.max()), 1 / max(float(np.max(bases)), 1e-9))
             shade = np.rint(255 * np.minimum(part.detail / factor, 1)).astype(np.uint8)
@@ -74,7 +88,7 @@ def write_glb(
 
 
 def _entry(name: str, material: Reflectance, open_: bool, painted: bool, factor: float) -> dict[str, Any]:
-    """A material of a file, whose base colours are times a factor."""
+    """Return a material of the file, with its base colour times a factor."""
     exact = gltf_material(material, painted)
     base = exact["pbrMetallicRoughness"]["baseColorFactor"]
     exact["pbrMetallicRoughness"]["baseColorFactor"] = [*(min(c * factor, 1.0) for c in base[:3]), base[3]]
@@ -84,9 +98,10 @@ def _entry(name: str, material: Reflectance, open_: bool, painted: bool, factor:
 def _set_materials(
     tree: dict[str, Any], parts: Mapping[str, Sequence[dict[str, Any]]], variants: Sequence[str]
 ) -> None:
-    """Exact numbers, which the mesh library would round to eight bits, and variants, which it does not know.
+    """Set the materials and variants of a glTF tree exactly.
 
-    parts: by name, its materials: its own, and that in each variant
+    The mesh library rounds numbers to eight bits and knows no variants.  `parts` gives the materials of each mesh by
+    name: its own first, then one per variant.
     """
     tree["materials"] = found = []
     for mesh in tree["meshes"]:
@@ -111,7 +126,7 @@ def _set_materials(
 
 
 def variant_name(overrides: Mapping[str, str]) -> str:
-    """Return what a variant is called that gives parts of a mesh other materials.
+    """Return the name of a variant that gives parts of a mesh other materials.
 
     >>> variant_name({"shell": "white", "legs": "black"})
     'legs: black, shell: white'
@@ -120,7 +135,10 @@ def variant_name(overrides: Mapping[str, str]) -> str:
 
 
 def read_part_materials(path: str | Path) -> dict[str, dict[str, str]]:
-    """The materials of each part of a file of `write_glb`, by the part's name: its own (""), and that in each variant, by the variant's name."""
+    """Read the materials of each part of a file from `write_glb`.
+
+    Return them by part name: the part's own under "", and those of the variants under their names.
+    """
     data = read_bytes(path, "a glTF file")
     tree = json.loads(data[20 : 20 + int.from_bytes(data[12:16], "little")])  # the JSON chunk
     called = [entry["name"] for entry in tree["materials"]]
@@ -135,9 +153,9 @@ def read_part_materials(path: str | Path) -> dict[str, dict[str, str]]:
 
 
 def gltf_material(material: Reflectance, painted: bool = False) -> dict[str, Any]:
-    """The part of a glTF material that says how it reflects.
+    """Return the reflectance part of a glTF material.
 
-    painted: its base colour is times the colours of vertices, which are detail of k_d: it is not written as a metal
+    A `painted` material has vertex colours, which hold detail of k_d.  It is never written as a metal.
     """
     brightest = max(material.specular)
     if brightest > 0 and max(material.diffuse) <= METAL * brightest and not painted:
@@ -151,11 +169,14 @@ def gltf_material(material: Reflectance, painted: bool = False) -> dict[str, Any
 
 
 def write_suns(path: str | Path, suns: Sequence[Sun]) -> None:
-    """Write suns as a glTF scene of directional lights, in the frame of the maps: y up."""
-    lights, nodes = [], []
+    """Write suns as a glTF scene of directional lights, in the y-up frame of the maps."""
+    lights = []
+    nodes = []
     for number, sun in enumerate(suns):
-        intensity, (x, y, z) = float(max(sun.irradiance)), sun.direction
-        turn = np.array([-y, x, 0.0, 1 + z]) if z > -1 + 1e-9 else np.array([1.0, 0.0, 0.0, 0.0])  # of +z to the sun
+        intensity = float(max(sun.irradiance))
+        x, y, z = sun.direction
+        # quaternion (x, y, z, w) that turns +z to the sun
+        turn = np.array([-y, x, 0.0, 1 + z]) if z > -1 + 1e-9 else np.array([1.0, 0.0, 0.0, 0.0])
         colour = (sun.irradiance / intensity).tolist()
         lights.append({"type": "directional", "color": colour, "intensity": intensity, "name": f"sun {number}"})
         rotation = (turn / np.linalg.norm(turn)).tolist()

@@ -1,9 +1,9 @@
-"""Solved materials, and the gauge in which other programs accept them.
+"""The gauge of exported materials, in which other programs accept them.
 
-Mitsuba refuses reflectances above one, and its mixture (see `factorlib.export.mitsuba`) needs
-max k_d + max k_s ≤ 1 − 1e-5 of every material.  Only the product of reflectance and light is known, so where a
-material exceeds that, one factor for the whole set moves from all reflectances into all lights: every material in
-every light keeps its radiance, also across photos that share nothing.
+Mitsuba refuses reflectances above one, and its mixture (see `factorlib.export.mitsuba`) needs max k_d + max k_s ≤ 1 −
+1e-5 of every material.  Only the product of reflectance and light is known.  If a material exceeds the limit, one
+factor for the whole set moves from all reflectances into all lights.  Every material then keeps its radiance in every
+light, also across photos that share nothing.
 """
 
 from collections.abc import Mapping
@@ -13,11 +13,14 @@ import msgspec
 from factorlib.results.materials import MaterialTable, Reflectance, Solved, StandardErrors
 
 HEADROOM = 1e-5
-RULE = "where max diffuse + max specular of a material exceeds 1 - 1e-5, one factor moves from all reflectances to all lights"
+RULE = (
+    "where max diffuse + max specular of a material exceeds 1 - 1e-5, "
+    "one factor moves from all reflectances to all lights"
+)
 
 
 def headroom_factor(materials: Mapping[str, Reflectance]) -> float:
-    """Return what reflectances are to be multiplied by: 1 where all materials fit already.
+    """Return the factor that brings all reflectances within the limit; 1 if they already are.
 
     >>> headroom_factor({"red": Reflectance((0.9, 0.1, 0.1), (0.1, 0.1, 0.3), 0.3)})
     0.8333250000000001
@@ -28,10 +31,11 @@ def headroom_factor(materials: Mapping[str, Reflectance]) -> float:
 
 
 def table_in_gauge(table: MaterialTable, factor: float) -> MaterialTable:
-    """The table with reflectances and their standard errors times `factor`, which `gauge` then tells."""
+    """Return the table with reflectances and standard errors times `factor`, which `gauge` records."""
     gauge = msgspec.structs.replace(table.gauge, export_factor=factor, export_rule=RULE)
 
     def scaled(of: Solved | StandardErrors) -> Solved | StandardErrors:
+        """Return the diffuse and specular values times the factor."""
         diffuse, specular = (tuple(factor * value for value in colour) for colour in (of.diffuse, of.specular))
         return msgspec.structs.replace(of, diffuse=diffuse, specular=specular)
 

@@ -1,15 +1,16 @@
-"""Materials as MaterialX 1.39: with the nodes of its physically based shading library, and as its standard surface.
+"""Export of materials as MaterialX 1.39: nodes of its physically based shading library, and its standard surface.
 
 k_d/π is `oren_nayar_diffuse_bsdf` of roughness 0, exactly.  k_s D G/(4 …) is `generalized_schlick_bsdf` with color0 =
 color90 = k_s/w: GGX of the same α and no Fresnel.  A `mix` of weight w adds them, as Mitsuba's `blendbsdf` does.
 
-Programs without these nodes take `standard_surface`.  Its specular layer is a dielectric, whose Fresnel term is next to one at every angle
-where the index of refraction is very large, and which leaves 1 − specular for the diffuse part.  So
+Programs without these nodes use `standard_surface`.  Its specular layer is a dielectric.  At a very large index of
+refraction its Fresnel term is nearly one at every angle, and it leaves 1 − specular for the diffuse part.  The values
+are
 
     specular = max k_s,  specular_color = k_s / max k_s,  specular_IOR = 10⁴,  base_color = k_d / (1 − max k_s)
 
-Different from what was solved: MaterialX's renderers shadow with the height-correlated Smith term and give back the
-energy of multiple scattering (measured by `factorlib.export.other_renderers`).
+MaterialX's renderers differ from the solved model.  They shadow with the height-correlated Smith term and compensate
+for the energy of multiple scattering (measured by `factorlib.export.other_renderers`).
 """
 
 import xml.etree.ElementTree as ET
@@ -23,7 +24,10 @@ NO_FRESNEL = 1e4  # index of refraction: F0 = 0.9996
 
 
 def materialx(materials: Mapping[str, Reflectance]) -> str:
-    """A document of two `surfacematerial` per material: m_<name>, and m_<name>_standard_surface for programs without the nodes of the first."""
+    """Return a document with two `surfacematerial` per material: m_<name> and m_<name>_standard_surface.
+
+    The second is for programs without the nodes of the first.
+    """
     document = ET.Element("materialx", version="1.39", colorspace="lin_rec709")
     for name, material in materials.items():
         prefix = f"m_{name.replace('-', '_')}"
@@ -40,7 +44,7 @@ def materialx(materials: Mapping[str, Reflectance]) -> str:
 
 
 def mixture(material: Reflectance) -> tuple[float, np.ndarray, np.ndarray]:
-    """Weight w of the specular part, and the colours k_d/(1 − w) and k_s/w of the parts."""
+    """Return the weight w of the specular part, and the colours k_d/(1 − w) and k_s/w of the parts."""
     weight = max(material.specular) / material.total if material.total > 0 else 0.0
     diffuse = [v / (1 - weight) if weight < 1 else 0.0 for v in material.diffuse]
     return weight, np.array(diffuse), np.array([v / weight if weight > 0 else 0.0 for v in material.specular])
@@ -61,7 +65,8 @@ def _add_nodes(document: ET.Element, prefix: str, material: Reflectance) -> None
 
 def _add_standard(document: ET.Element, prefix: str, material: Reflectance) -> None:
     brightest = max(material.specular)
-    base, tint = np.array(material.diffuse) / (1 - brightest), np.array(material.specular) / (brightest or 1)
+    base = np.array(material.diffuse) / (1 - brightest)
+    tint = np.array(material.specular) / (brightest or 1)
     numbers = {"specular": brightest, "specular_roughness": material.roughness, "specular_IOR": NO_FRESNEL}
     colours = {"base_color": base, "specular_color": tint}
     _add(document, "standard_surface", f"{prefix}_surface", "surfaceshader", base=1.0, **colours, **numbers)

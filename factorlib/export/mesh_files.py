@@ -1,4 +1,4 @@
-"""The mesh files that scenes refer to: PLY and OpenUSD, a file for each part of one material."""
+"""Mesh files that scenes refer to, as PLY and OpenUSD: one file for each part of one material."""
 
 from collections.abc import Mapping
 from pathlib import Path
@@ -19,9 +19,14 @@ from factorlib.tracing.scene import paint
 
 
 class MeshFiles:
-    """Meshes, on the surfaces that shading found, read once and written once, split by material, per choice of materials for their parts.
+    """Meshes with their refined surfaces, each read once and written once per choice of materials, split by material.
 
-    solved: the materials, whose colours meshes with detail of reflectance are painted with
+    Attributes:
+        inputs: the data set's meshes, and the folder of the stage `surface`
+        scenes: the folder of the scenes, which file names are relative to
+        materials: names by label, from 1
+        crease_deg: crease angle for vertex normals, degrees
+        solved: reflectances, which colour the vertices of meshes with detail
     """
 
     def __init__(
@@ -32,26 +37,41 @@ class MeshFiles:
         crease_deg: float,
         solved: Mapping[str, Reflectance],
     ):
-        self.scenes, self.materials, self.solved = scenes, materials, solved
+        self.scenes = scenes
+        self.materials = materials
+        self.solved = solved
         own = read_surface(inputs.folders.get("surface"))
         self.read = MeshesOnce(inputs.mesh, materials, crease_deg, own.displacements, own.log_factors)
-        self._stems: dict[tuple, str] = {}  # what files are called before the material, relative to the scenes
+        self._stems: dict[tuple, str] = {}  # file names up to the material, relative to the scenes
 
     def shapes(
         self, obj: schema.ObjectEntry, meshes: Mapping[str, MeshEntry], poses: Mapping[str, ObjectEntry]
     ) -> list[Shape]:
-        """One per material of the object; a second choice of materials is in files called <mesh>.2."""
-        mesh, pose, place = self.read.mesh(obj.mesh, meshes[obj.mesh], obj.materials), poses[obj.name], np.eye(4)
-        place[:3, :3], place[:3, 3] = np.array(pose.rotation) * pose.scale, pose.translation
+        """Return one shape per material of the object, and write its files if they are new.
+
+        Files of a mesh's second choice of materials are called <mesh>.2.
+
+        Args:
+            obj: the object
+            meshes: entries of the meshes by name
+            poses: poses of the objects by name
+        """
+        mesh = self.read.mesh(obj.mesh, meshes[obj.mesh], obj.materials)
+        pose = poses[obj.name]
+        place = np.eye(4)
+        place[:3, :3] = np.array(pose.rotation) * pose.scale
+        place[:3, 3] = pose.translation
         names = {label: self.materials[label - 1] for label in mesh.labels}
         key = (obj.mesh, *sorted(obj.materials.items()))
         if key not in self._stems:
             number = 1 + sum(other[0] == obj.mesh for other in self._stems)
             self._stems[key] = f"meshes/{obj.mesh}" + (f".{number}" if number > 1 else "")
             for label, name in names.items():
-                part, file = submesh(mesh, label), self.scenes / f"{self._stems[key]}.{name}"
+                part = submesh(mesh, label)
+                file = self.scenes / f"{self._stems[key]}.{name}"
                 painted = part.detail is not None
                 write_ply(f"{file}.ply", part, paint(self.solved[name], part.detail) if painted else None)
                 write_usd_mesh(f"{file}{SUFFIX}", part, colours(self.solved[name], part.detail) if painted else None)
-        stem, painted = self._stems[key], mesh.detail is not None
+        stem = self._stems[key]
+        painted = mesh.detail is not None
         return [Shape(f"{obj.name}.{m}", f"{stem}.{m}.ply", m, place, mesh.open, painted) for m in names.values()]

@@ -1,9 +1,11 @@
-"""A scene for Mitsuba 3: the photo's camera, its objects in their poses with the solved materials, and its light.
+"""Export of a photo's scene to Mitsuba 3: its camera, its objects with the solved materials, and its light.
 
-Camera     Mitsuba's principal point offset counts against the axes of the picture: (W/2 − c_x)/W, (H/2 − c_y)/H.
-Material   `factorlib.tracing.scene.bsdf`, in whose words all of the scene is said before it is written as XML.
-Light      A map, and beside it a directional emitter for each sun.  As it was solved for: seen directly, without bounces between objects (`max_depth` 2), or with all of them (−1).
-           `mitsuba -D max_depth=-1 scene.xml` traces them in any case; `-D spp=…` sets the samples per pixel.
+Camera    Mitsuba's principal point offset counts against the axes of the picture: (W/2 − c_x)/W, (H/2 − c_y)/H.
+Material  A dictionary of `factorlib.tracing.scene.bsdf`.  The whole scene is built of such dictionaries and written as
+          XML.
+Light     A map, and a directional emitter for each sun.  `max_depth` is as in the solve: 2 for direct light without
+          bounces between objects, −1 for all bounces.  `mitsuba -D max_depth=-1 scene.xml` traces them in any case;
+          `-D spp=…` sets the samples per pixel.
 """
 
 import xml.etree.ElementTree as ET
@@ -18,12 +20,13 @@ from factorlib.results.materials import Reflectance
 from factorlib.tracing.scene import bsdf
 from factorlib.wholefile import write_text
 
-VERSION, SAMPLES = "3.0.0", 256
+VERSION = "3.0.0"
+SAMPLES = 256  # default samples per pixel
 KINDS = {bool: "boolean", int: "integer", float: "float", str: "string"}
 
 
 def write_scene(path: str | Path, scene: Scene) -> None:
-    """Write the scene as XML; the light's exposure is grey, and its file a map for Mitsuba."""
+    """Write the scene as XML; the light's exposure is grey, and its file is a map for Mitsuba."""
     root = ET.Element("scene", version=VERSION)
     for name, value in {"spp": SAMPLES, "max_depth": scene.max_depth}.items():
         ET.SubElement(root, "default", name=name, value=str(value))
@@ -39,7 +42,8 @@ def write_scene(path: str | Path, scene: Scene) -> None:
         surface = {"type": "twosided", "bsdf": surface} if two_sided else surface
         _add(root, "bsdf", surface, id=_id(name, two_sided, painted))
     for shape in scene.shapes:
-        file, place = {"type": "ply", "filename": shape.file}, _matrix(shape.world_from_object)
+        file = {"type": "ply", "filename": shape.file}
+        place = _matrix(shape.world_from_object)
         element = _add(root, "shape", {**file, "to_world": place}, id=shape.name)
         ET.SubElement(element, "ref", id=_id(shape.material, shape.two_sided, shape.painted))
     ET.indent(root, " ")
@@ -47,7 +51,7 @@ def write_scene(path: str | Path, scene: Scene) -> None:
 
 
 def material_xml(name: str, material: Reflectance) -> str:
-    """A material alone, as XML: a `bsdf` with the id `name`, to which a scene of one's own can refer."""
+    """Return a material alone as XML: a `bsdf` with the id `name`, which any scene can refer to."""
     element = _add(ET.Element("scene"), "bsdf", bsdf(material), id=name)
     ET.indent(element, " ")
     return ET.tostring(element, encoding="unicode").strip()
@@ -79,7 +83,10 @@ def _matrix(matrix: np.ndarray) -> tuple[str, dict[str, str]]:
 
 
 def _add(parent: ET.Element, kind: str, entry: dict[str, Any], **attributes: str) -> ET.Element:
-    """Mitsuba's dictionary of a plugin as an element, with a child for each value; "$…" stands for a default, a whole number."""
+    """Add Mitsuba's dictionary of a plugin as an element, with a child for each value.
+
+    A value "$…" refers to a default and is an integer.
+    """
     element = ET.SubElement(parent, kind, {"type": entry["type"], **attributes})
     for name, value in entry.items():
         if isinstance(value, tuple):

@@ -1,21 +1,28 @@
-"""How other programs show the exported materials: what each documents of its reflection model, and how far a ball of it is from the solved one.
+"""Exported materials in other programs: their documented reflection models, and how far a ball of each is from the solved one.
 
-All are Lambert plus GGX of the same α; they differ in shadowing, in Fresnel, and in what the specular part leaves for the diffuse one:
+All are Lambert plus GGX of the same α.  They differ in shadowing, in Fresnel, and in the share that the specular part
+leaves for the diffuse one:
 
-    solved               k_d/π + k_s D V,  V = G1(n·i) G1(n·o) / (4 (n·i)(n·o))      (`factorlib.reflection.brdf`)
-    blender              V of the height-correlated Smith term (Heitz 2014, eq. 99), as Cycles' Glossy BSDF "GGX"
-    glb                  glTF 2.0, appendix B, with KHR_materials_specular: Schlick's F to F90 = specularFactor, diffuse × (1 − max F)
-    glb_correlated       the same with the height-correlated term, as most viewers draw it
-    glb_plain            the same in viewers without KHR_materials_specular: F0 = 0.04, F90 = 1; what is written as a metal has F0 = k_s, F90 = 1 in all three
-    mtlx                 MaterialX' own GLSL shaders: height-correlated, times 1 + F (1 − E)/E, E the albedo for F = 1 (Turquin 2019)
-    mtlx_standard_surface  the same; the specular layer leaves 1 − specular · (its albedo for white) for the diffuse one
-    usd                  UsdPreviewSurface: Schlick's F to F90 = 1, diffuse × (1 − F) as OpenUSD's shader; V, not specified, as solved
+    solved                 k_d/π + k_s D V,  V = G1(n·i) G1(n·o) / (4 (n·i)(n·o))      (`factorlib.reflection.brdf`)
+    blender                V of the height-correlated Smith term (Heitz 2014, eq. 99), as Cycles' Glossy BSDF "GGX"
+    glb                    glTF 2.0, appendix B, with KHR_materials_specular:
+                           Schlick's F to F90 = specularFactor, diffuse × (1 − max F)
+    glb_correlated         glb with the height-correlated term, as most viewers draw it
+    glb_plain              glb in viewers without KHR_materials_specular: F0 = 0.04, F90 = 1
+    mtlx                   MaterialX' own GLSL shaders: height-correlated, times 1 + F (1 − E)/E,
+                           E the albedo for F = 1 (Turquin 2019)
+    mtlx_standard_surface  mtlx, where the specular layer leaves 1 − specular · (its albedo for white) for the diffuse
+                           one
+    usd                    UsdPreviewSurface: Schlick's F to F90 = 1, diffuse × (1 − F) as OpenUSD's shader;
+                           V, not specified, as solved
 
-Ball       of radius 1, seen from far away in PIXELS × PIXELS; pixels where n·o is under LEAST_COSINE are left out.
-Lights     a sky of the same radiance from everywhere; a lamp above the viewer's left shoulder; a lamp behind the ball, to the right, whose
-           light grazes it, where shadowing and Fresnel differ most.  White, without shadows.
-Difference |shown − solved| / max(solved, 0.001), per channel; in the sky a white Lambertian ball sends 1.  "mean" and "worst" are over
-           all lit pixels, channels and lights.
+A material written as a metal has F0 = k_s and F90 = 1 in all three models of glTF.
+
+Ball        Radius 1, seen from far away in PIXELS × PIXELS; pixels with n·o under LEAST_COSINE are left out.
+Lights      A sky of constant radiance; a lamp above the viewer's left shoulder; a lamp behind the ball, to the right.
+            The last one grazes the ball, where shadowing and Fresnel differ most.  White, without shadows.
+Difference  |shown − solved| / max(solved, 0.001), per channel; a white Lambertian ball in the sky has radiance 1.
+            "mean" and "worst" are over all lit pixels, channels and lights.
 """
 
 from collections.abc import Callable, Mapping
@@ -33,16 +40,20 @@ from factorlib.geometry.sphere import ball_normals
 from factorlib.jsonfile import write_json
 from factorlib.results.materials import Reflectance
 
-ALBEDO_NODES, ALBEDO_SAMPLES = 64, 4096  # cosines of the albedo's table; half vectors
+ALBEDO_NODES = 64  # cosines in the table of albedos
+ALBEDO_SAMPLES = 4096  # half vectors per cosine
 GOLDEN = (5**0.5 - 1) / 2
-PIXELS, LEAST_COSINE, FLOOR = 48, 0.1, 1e-3
-LEAST_ROUGHNESS = 1e-3**0.5  # mirrors are taken at this roughness
+PIXELS = 48  # width and height of the ball's picture
+LEAST_COSINE = 0.1  # least n·o of a pixel
+FLOOR = 1e-3  # least denominator of a relative difference
+LEAST_ROUGHNESS = 1e-3**0.5  # roughness used for mirrors
 LAMPS = {"lamp": (-1.0, 1.0, 1.5), "grazing lamp": (1.0, 0.3, -0.6)}  # x right, y up, z toward the viewer
-SKY_NODES, SKY_SAMPLES = 33, 1024
+SKY_NODES = 33
+SKY_SAMPLES = 1024
 
 
 class Angles(msgspec.Struct, frozen=True):
-    """Cosines between normal n, direction to the light i, to the viewer o, and half vector h; of one shape."""
+    """Cosines between normal n, light direction i, view direction o and half vector h, as arrays of one shape."""
 
     ni: Float[np.ndarray, "*n"]
     no: Float[np.ndarray, "*n"]
@@ -51,7 +62,7 @@ class Angles(msgspec.Struct, frozen=True):
 
 
 class Parts(msgspec.Struct, frozen=True):
-    """A BRDF, 1/steradian: diffuse + D(n·h) · lobe, per channel."""
+    """A BRDF per channel, 1/steradian: diffuse + D(n·h) · lobe."""
 
     diffuse: Float[np.ndarray, "*n 3"]
     lobe: Float[np.ndarray, "*n 3"]
@@ -62,17 +73,17 @@ Shadowing = Callable[[float, Angles], Float[np.ndarray, "*n"]]
 
 
 def distribution(alpha: float, nh: Float[np.ndarray, "*n"]) -> Float[np.ndarray, "*n"]:
-    """GGX D, 1/steradian."""
+    """Return the GGX distribution D, 1/steradian."""
     return alpha**2 / (np.pi * ((alpha**2 - 1) * nh**2 + 1) ** 2)
 
 
 def solved(material: Reflectance, angles: Angles) -> Parts:
-    """The model of the solve."""
+    """Evaluate the model of the solve."""
     return _parts(angles, material.diffuse, material.specular, separable(material.alpha, angles))
 
 
 def mtlx(material: Reflectance, angles: Angles) -> Parts:
-    """The nodes of `factorlib.export.materialx`."""
+    """Evaluate the nodes of `factorlib.export.materialx`."""
     weight, diffuse, specular = mixture(material)
     escaped = 1 / albedo(material.alpha, angles.no) - 1
     brighter = 1 + specular * escaped[..., None]
@@ -80,14 +91,17 @@ def mtlx(material: Reflectance, angles: Angles) -> Parts:
 
 
 def mtlx_standard_surface(material: Reflectance, angles: Angles) -> Parts:
-    """The standard surface of `factorlib.export.materialx`, whose F is 1: there E · (1 + (1 − E)/E) = 1."""
+    """Evaluate the standard surface of `factorlib.export.materialx`; for its F of 1, E · (1 + (1 − E)/E) = 1."""
     brighter = 1 / albedo(material.alpha, angles.no)
     specular = np.multiply.outer(brighter, material.specular)
     return _parts(angles, material.diffuse, specular, correlated(material.alpha, angles))
 
 
 def usd(material: Reflectance, angles: Angles) -> Parts:
-    """UsdPreviewSurface, from the numbers in the file; of the material's own roughness, which `losses` makes the file's."""
+    """Evaluate UsdPreviewSurface with the inputs in the file, at the roughness of `material`.
+
+    `losses` passes the material with the roughness of the file.
+    """
     inputs = shader_inputs(material)
     base = np.asarray(inputs["diffuseColor"])
     if not inputs["useSpecularWorkflow"]:  # a metal
@@ -101,12 +115,12 @@ def usd(material: Reflectance, angles: Angles) -> Parts:
 
 
 def separable(alpha: float, angles: Angles) -> Float[np.ndarray, "*n"]:
-    """G1(n·i) G1(n·o) / (4 (n·i)(n·o)), finite at the horizon."""
+    """Return G1(n·i) G1(n·o) / (4 (n·i)(n·o)), finite at the horizon."""
     return 1 / ((angles.ni + _root(alpha, angles.ni)) * (angles.no + _root(alpha, angles.no)))
 
 
 def correlated(alpha: float, angles: Angles) -> Float[np.ndarray, "*n"]:
-    """The height-correlated Smith term over 4 (n·i)(n·o)."""
+    """Return the height-correlated Smith term over 4 (n·i)(n·o)."""
     return 0.5 / (angles.no * _root(alpha, angles.ni) + angles.ni * _root(alpha, angles.no))
 
 
@@ -115,7 +129,7 @@ def _root(alpha: float, cosine: Float[np.ndarray, "*n"]) -> Float[np.ndarray, "*
 
 
 def albedo(alpha: float, no: Float[np.ndarray, "*n"]) -> Float[np.ndarray, "*n"]:
-    """E: what a height-correlated GGX of F = 1 reflects of a constant light, by n·o; interpolated in a table."""
+    """Return E by n·o, the albedo of a height-correlated GGX of F = 1 in a constant light, interpolated in a table."""
     return np.interp(no, *_albedo_table(alpha))
 
 
@@ -127,16 +141,25 @@ def _albedo_table(alpha: float) -> tuple[Float[np.ndarray, " n"], Float[np.ndarr
 
 
 def spread(count: int) -> tuple[Float[np.ndarray, " s"], Float[np.ndarray, " s"]]:
-    """Points spread evenly over [0, 1] × [0, π] (Fibonacci's lattice); azimuths beyond π are mirror images."""
+    """Return points spread evenly over [0, 1] × [0, π] (Fibonacci lattice); azimuths beyond π are mirror images."""
     index = np.arange(count)
     return (index + 0.5) / count, np.pi * (index * GOLDEN % 1)
 
 
 def mirrored(alpha: float, no: Float[np.ndarray, " n"], count: int) -> tuple[Angles, Float[np.ndarray, "n s"]]:
-    """Directions i for views at n·o = `no`, mirrored at `count` half vectors spread by D(n·h) n·h.
+    """Sample light directions i for views at n·o = `no`, mirrored at half vectors distributed by D(n·h) n·h.
 
-    The mean of weight · lobe is ∫ D · lobe · n·i di; weight = 4 (n·i)(o·h)/(n·h), zero below the horizon.
+    The mean of weight · lobe is ∫ D · lobe · n·i di.  The weight is 4 (n·i)(o·h)/(n·h), and zero below the horizon.
+
+    Args:
+        alpha: GGX width α
+        no: cosines n·o
+        count: samples per cosine
+
+    Returns:
+        The angles and the weights.
     """
+    # sample h by D(n·h) n·h, mirror o at h, and weight by the Jacobian
     u, phi = spread(count)
     nh = np.sqrt((1 - u) / (1 + (alpha**2 - 1) * u))
     oh = no[:, None] * nh + np.sqrt(1 - no[:, None] ** 2) * np.sqrt(1 - nh**2) * np.cos(phi)
@@ -147,7 +170,7 @@ def mirrored(alpha: float, no: Float[np.ndarray, " n"], count: int) -> tuple[Ang
 
 
 def _gltf(material: Reflectance, angles: Angles, shadowing: Shadowing, extension: bool = True) -> Parts:
-    """From the numbers in the file."""
+    """Evaluate a model of glTF with the numbers in the file."""
     entry = gltf_material(material)
     base = np.array(entry["pbrMetallicRoughness"]["baseColorFactor"][:3])
     schlick = (1 - angles.oh) ** 5
@@ -166,7 +189,7 @@ def _gltf(material: Reflectance, angles: Angles, shadowing: Shadowing, extension
 def _parts(
     angles: Angles, diffuse: np.ndarray | tuple, specular: np.ndarray | tuple, visibility: Float[np.ndarray, "*n"]
 ) -> Parts:
-    """diffuse: an albedo;  specular: F."""
+    """Return the BRDF of a diffuse albedo, a Fresnel term (`specular`) and a shadowing term V (`visibility`)."""
     shape = (*angles.no.shape, 3)
     return Parts(np.broadcast_to(np.asarray(diffuse) / np.pi, shape), visibility[..., None] * np.asarray(specular))
 
@@ -186,7 +209,7 @@ MODELS: dict[str, Model] = {
 
 
 class Loss(msgspec.Struct, frozen=True):
-    """Relative differences."""
+    """Mean and largest relative difference."""
 
     mean: float
     worst: float
@@ -198,7 +221,10 @@ def write_losses(path: str | Path, materials: Mapping[str, Reflectance]) -> None
 
 
 def losses(material: Reflectance) -> dict[str, Loss]:
-    """Return the loss of each of `MODELS` against the model of the solve, rounded to 5 digits; a black material loses nothing."""
+    """Return the loss of each of `MODELS` against the solved model, rounded to 5 digits.
+
+    The losses of a black material are 0.
+    """
     material = msgspec.structs.replace(material, roughness=max(material.roughness, LEAST_ROUGHNESS))
     filed = {name: with_roughness_of_file(material) if name == "usd" else material for name in MODELS}
     true = np.concatenate(ball(material, solved))
@@ -211,7 +237,7 @@ def _loss(shown: Float[np.ndarray, "n 3"], true: Float[np.ndarray, "n 3"]) -> Lo
 
 
 def ball(material: Reflectance, model: Model) -> list[Float[np.ndarray, "n 3"]]:
-    """Radiance of the ball's pixels in each light: sky of radiance 1, lamps of irradiance π."""
+    """Return the radiance of the ball's pixels in each light: sky of radiance 1, lamps of irradiance π."""
     normals = ball_normals(PIXELS)[0]
     normals = normals[normals[:, 2] >= LEAST_COSINE]
     nodes = np.linspace(LEAST_COSINE, 1.0, SKY_NODES)
@@ -223,8 +249,16 @@ def ball(material: Reflectance, model: Model) -> list[Float[np.ndarray, "n 3"]]:
 def in_lamp(
     material: Reflectance, model: Model, normals: Float[np.ndarray, "n 3"], lamp: Float[np.ndarray, "3"]
 ) -> Float[np.ndarray, "n 3"]:
-    """f · n·i · π for a lamp far away in the direction `lamp`."""
-    view, light = np.array([0.0, 0.0, 1.0]), lamp / np.linalg.norm(lamp)
+    """Return f · n·i · π, the radiance in the light of a distant lamp.
+
+    Args:
+        material: the reflectance
+        model: the reflection model
+        normals: unit normals; x right, y up, z toward the viewer
+        lamp: direction to the lamp, of any length
+    """
+    view = np.array([0.0, 0.0, 1.0])
+    light = lamp / np.linalg.norm(lamp)
     half = (view + light) / np.linalg.norm(view + light)
     ni = (normals @ light).clip(0)
     angles = Angles(ni, normals[:, 2], (normals @ half).clip(0), np.full(len(normals), view @ half))
@@ -233,9 +267,17 @@ def in_lamp(
 
 
 def in_sky(material: Reflectance, model: Model, no: Float[np.ndarray, " n"]) -> Float[np.ndarray, "n 3"]:
-    """∫ f n·i di by n·o: the specular part over directions spread by the GGX, the diffuse part over ones spread by n·i."""
+    """Integrate f n·i over the hemisphere, in a sky of radiance 1.
+
+    Args:
+        material: the reflectance
+        model: the reflection model
+        no: cosines n·o
+    """
+    # specular part, by importance sampling of the GGX distribution
     angles, weight = mirrored(material.alpha, no, SKY_SAMPLES)
     specular = (weight[..., None] * model(material, angles).lobe).mean(axis=1)
+    # diffuse part, by cosine-weighted sampling
     square, phi = spread(SKY_SAMPLES)
     ni = np.broadcast_to(np.sqrt(square), (len(no), square.size))
     no = np.broadcast_to(no[:, None], ni.shape)

@@ -1,7 +1,8 @@
-"""A photo's scene, as it is written for every program: its camera, its objects in files of one material each, and its light.
+"""A photo's scene as every export format writes it: camera, objects in files of one material each, and light.
 
-Frame     The camera frame turned y-up (x right, y up, z toward the viewer), the camera at the origin: `YUP_FROM_CAMERA @ cam_from_object`
-          places an object.  Maps of lights have OpenEXR's layout in that frame, so that only a light fixed to the world turns.
+Frame  The camera frame turned y-up (x right, y up, z toward the viewer), the camera at the origin.
+       `YUP_FROM_CAMERA @ cam_from_object` places an object.  Maps of lights have OpenEXR's layout in that frame,
+       so that only a light fixed to the world is rotated.
 """
 
 from collections.abc import Mapping, Sequence
@@ -15,13 +16,17 @@ from factorlib.geometry.camera import Camera
 from factorlib.light.lobes import SUN_DEG, Lobes, lobe_integral
 from factorlib.results.materials import Reflectance
 
-DIRECT, ALL_BOUNCES = 2, -1
+DIRECT = 2  # max_depth of direct light alone
+ALL_BOUNCES = -1  # max_depth of all bounces
 
 
 class Shape(msgspec.Struct, frozen=True):
-    """A PLY file (relative to the scene) of one material, and where it stands;  two_sided: the inside can be seen
+    """A PLY file of one material, and its pose.
 
-    painted: its diffuse part has the colours of the file's vertices
+    Attributes:
+        file: relative to the scene
+        two_sided: True if the inside can be visible
+        painted: True if the diffuse part has the colours of the file's vertices
     """
 
     name: str
@@ -33,12 +38,18 @@ class Shape(msgspec.Struct, frozen=True):
 
     @property
     def world_from_object(self) -> Float[np.ndarray, "4 4"]:
-        """The transform into the y-up turn of the camera frame."""
+        """The transform into the y-up camera frame."""
         return _turn(YUP_FROM_CAMERA) @ self.cam_from_object
 
 
 class ExposedMap(msgspec.Struct, frozen=True):
-    """A lat-long map (relative to the scene), a factor per channel on it, and camera_from_light: the identity unless fixed to the world."""
+    """A lat-long map with an exposure and a rotation.
+
+    Attributes:
+        file: relative to the scene
+        exposure: factor per channel
+        camera_from_light: rotation of the light; the identity unless the light is fixed to the world
+    """
 
     file: str
     exposure: Float[np.ndarray, "3"]
@@ -46,14 +57,16 @@ class ExposedMap(msgspec.Struct, frozen=True):
 
     @property
     def world_from_light(self) -> Float[np.ndarray, "4 4"]:
-        """The rotation of the map's own axes into the y-up turn of the camera frame."""
+        """The rotation of the map's own axes into the y-up camera frame."""
         return _turn(YUP_FROM_CAMERA @ self.camera_from_light @ YUP_FROM_CAMERA)
 
 
 class Sun(msgspec.Struct, frozen=True):
-    """Light from one direction, which the map of a scene does not hold.
+    """A directional light, which the map of a scene does not contain.
 
-    direction: toward it, unit, in the y-up turn of the camera frame;  irradiance: of a surface that faces it, radiance × steradian
+    Attributes:
+        direction: unit, toward the sun, in the y-up camera frame
+        irradiance: on a surface that faces the sun, radiance × steradian
     """
 
     direction: Float[np.ndarray, "3"]
@@ -62,14 +75,20 @@ class Sun(msgspec.Struct, frozen=True):
 
 
 def suns_of(lobes: Lobes, rotation: Float[np.ndarray, "3 3"]) -> list[Sun]:
-    """The suns of a light, turned by a rotation from the lobes' frame."""
+    """Return the suns of a light, turned by a rotation from the lobes' frame."""
     suns = lobes.take(lobes.suns)
     energies = suns.weight * lobe_integral(suns.sharpness)[:, None]
     return [Sun(axis, energy) for axis, energy in zip(suns.axis @ rotation.T, energies, strict=True)]
 
 
 class Scene(msgspec.Struct, frozen=True):
-    """materials: by name, at least those that shapes name;  max_depth: DIRECT or ALL_BOUNCES, as the light was solved for;  suns: beside the map"""
+    """A photo's camera, shapes, materials and light.
+
+    Attributes:
+        materials: reflectances by name, at least those that shapes name
+        max_depth: DIRECT or ALL_BOUNCES, as in the solve
+        suns: directional lights beside the map
+    """
 
     camera: Camera
     shapes: Sequence[Shape]
@@ -80,7 +99,7 @@ class Scene(msgspec.Struct, frozen=True):
 
     @property
     def clip_distances(self) -> tuple[float, float]:
-        """Near and far, of the objects' distances: generous, for the meshes' extents are not known here."""
+        """The near and far clipping distances, generous because the meshes' extents are unknown here."""
         distances = [float(np.linalg.norm(shape.cam_from_object[:3, 3])) for shape in self.shapes] or [1.0]
         return 1e-3 * min(distances), 1e3 * max(distances)
 

@@ -1,14 +1,17 @@
-"""A photo's scene as OpenUSD text, written here: no USD library is needed, and the same scene is the same bytes.
+"""Export of a photo's scene as OpenUSD text, written without a USD library and byte for byte reproducible.
 
     /scene/camera, light, materials/<material>, objects/<object>/<material>;  /Render/photo: the size in pixels
 
-Frame     As of `factorlib.export.scene`, in the poses' units; the camera looks along −z, as every USD camera does.  USD multiplies
-          rows from the left: matrices are written transposed.
-Camera    Apertures are fractions of FILM wide; their offset is where the picture's middle is, right of and above the principal point.
+Frame     The frame of `factorlib.export.scene`, in the poses' units; the camera looks along −z, as every USD camera
+          does.
+          USD multiplies row vectors from the left, so matrices are written transposed.
+Camera    Apertures are fractions of FILM; their offset is the picture's middle, right of and above the principal point.
 Light     A dome light's map has OpenEXR's layout, as the exported maps have it.
-Material  UsdPreviewSurface: GGX of α = roughness², Schlick's F from F0 to F90, diffuseColor × (1 − F) per channel (`shader_inputs`).
+Material  UsdPreviewSurface: GGX of α = roughness², Schlick's F from F0 to F90, diffuseColor × (1 − F) per channel
+          (`shader_inputs`).
 Meshes    A file for each part of one material, beside the PLY file, to which scenes refer.
-Names     Every prim bears the name of the data set as displayName; its identifier is that name where USD allows it (`identifiers`).
+Names     Every prim has the name from the data set as displayName.  Its identifier is that name if USD allows it
+          (`identifiers`).
 """
 
 import re
@@ -25,16 +28,20 @@ from factorlib.meshes.mesh import Mesh
 from factorlib.results.materials import Reflectance
 from factorlib.wholefile import write_text
 
-FILM = 0.36  # width of the film in tenths of a unit: 36 mm where a unit is a metre; only its ratio to the focal length counts
+# Width of the film in tenths of a unit, 36 mm if a unit is a metre.  Only its ratio to the focal length matters.
+FILM = 0.36
 SUFFIX = ".usda"
-PAINTED = " (painted)"  # of the name of a material whose diffuse part has the colours of vertices
+PAINTED = " (painted)"  # suffix of a material whose diffuse part has the colours of vertices
 INDENT = "    "
-UP_AXIS = ["metersPerUnit = 1", 'upAxis = "Y"']  # what a unit of the poses is in metres is not known
+UP_AXIS = ["metersPerUnit = 1", 'upAxis = "Y"']  # The size of a unit of the poses in metres is unknown.
 ESCAPES = {"\\": "\\\\", '"': '\\"', "\n": "\\n", "\r": "\\r", "\t": "\\t"}
 
 
 def write_usd_scene(path: str | Path, scene: Scene) -> None:
-    """Write a photo's scene; of its materials those that shapes name.  A shape's file has a twin by `write_usd_mesh`."""
+    """Write a photo's scene with the materials that its shapes name.
+
+    It refers to the files that `write_usd_mesh` writes beside the shapes' own.
+    """
     named = identifiers(sorted({shape.material + PAINTED * shape.painted for shape in scene.shapes}))
     parts = [*_camera(scene), *_light(scene.light), *_materials(scene, named), *_objects(scene.shapes, named)]
     size = f"uniform int2 resolution = ({scene.camera.width}, {scene.camera.height})"
@@ -44,7 +51,13 @@ def write_usd_scene(path: str | Path, scene: Scene) -> None:
 
 
 def write_usd_mesh(path: str | Path, mesh: Mesh, colours: Float[np.ndarray, "v 3"] | None = None) -> None:
-    """Write a mesh in its own frame and units, as float32; /mesh, without a material.  colours: of its vertices, as `displayColor`."""
+    """Write a mesh as the prim /mesh in its own frame and units, as float32 and without a material.
+
+    Args:
+        path: the file to write
+        mesh: the mesh
+        colours: colours of the vertices, written as `displayColor`
+    """
     points, normals = (array.astype(np.float32).astype(float) + 0.0 for array in (mesh.vertices, mesh.normals))
     lines = [
         f"uniform bool doubleSided = {int(mesh.open)}",
@@ -63,10 +76,10 @@ def write_usd_mesh(path: str | Path, mesh: Mesh, colours: Float[np.ndarray, "v 3
 
 
 def shader_inputs(material: Reflectance) -> dict[str, float | np.ndarray]:
-    """Inputs of UsdPreviewSurface.
+    """Return the inputs of UsdPreviewSurface.
 
-    Specular workflow: F0 = specularColor = k_s, F90 = 1, diffuseColor = k_d / (1 − k_s): k_d and k_s at normal incidence.
-    Without k_d a metal, whose F is diffuseColor = k_s at every angle.
+    The specular workflow has F0 = specularColor = k_s, F90 = 1 and diffuseColor = k_d / (1 − k_s), which gives k_d and
+    k_s at normal incidence.  A material without k_d is a metal, whose F is diffuseColor = k_s at every angle.
     """
     diffuse, specular = np.array(material.diffuse, dtype=float), np.array(material.specular, dtype=float)
     roughness = with_roughness_of_file(material).roughness
@@ -77,17 +90,21 @@ def shader_inputs(material: Reflectance) -> dict[str, float | np.ndarray]:
 
 
 def colours(material: Reflectance, detail: Float[np.ndarray, " v"]) -> Float[np.ndarray, "v 3"]:
-    """diffuseColor at the vertices of a mesh with detail."""
+    """Return diffuseColor at the vertices of a mesh with detail."""
     return np.minimum(detail[:, None] * shader_inputs(material)["diffuseColor"], 1.0)
 
 
 def with_roughness_of_file(material: Reflectance) -> Reflectance:
-    """Without k_s the roughness is free: at 1 the Fresnel term, which cannot be left out, shows least."""
+    """Return the material with the roughness that the file has.
+
+    Without k_s the roughness is free.  It is set to 1, where the Fresnel term, which UsdPreviewSurface cannot omit, is
+    least visible.
+    """
     return material if any(material.specular) else msgspec.structs.replace(material, roughness=1.0)
 
 
 def identifiers(names: Iterable[str]) -> dict[str, str]:
-    """An identifier of its own for every name: letters, digits and _ of ASCII, not beginning with a digit.
+    """Return a distinct identifier for every name: ASCII letters, digits and _, not beginning with a digit.
 
     >>> identifiers(["red-1", "red_1", "2", ""])
     {'red_1': 'red_1', 'red-1': 'red_1_2', '2': '_2', '': '_'}
@@ -104,7 +121,8 @@ def identifiers(names: Iterable[str]) -> dict[str, str]:
 
 
 def _camera(scene: Scene) -> list[str]:
-    camera, pixel = scene.camera, FILM / scene.camera.width
+    camera = scene.camera
+    pixel = FILM / scene.camera.width
     (cx, cy), (w, h) = camera.centre, (camera.width, camera.height)
     numbers = {
         "focalLength": camera.focal * pixel,
@@ -118,7 +136,7 @@ def _camera(scene: Scene) -> list[str]:
 
 
 def _light(light: ExposedMap) -> list[str]:
-    """exposure = intensity · color."""
+    """Return a dome light whose intensity · color is the exposure."""
     intensity = float(light.exposure.max())
     colour = light.exposure / intensity if intensity > 0 else np.ones(3)
     lines = [
@@ -153,7 +171,7 @@ def _materials(scene: Scene, named: Mapping[str, str]) -> list[str]:
 
 
 def _objects(shapes: Sequence[Shape], materials: Mapping[str, str]) -> list[str]:
-    """A Xform per object, and in it a mesh per material."""
+    """Return an Xform per object, and in it a mesh per material."""
     objects: dict[str, list[Shape]] = {}
     for shape in shapes:
         objects.setdefault(shape.name.removesuffix(f".{shape.material}"), []).append(shape)
@@ -171,7 +189,7 @@ def _objects(shapes: Sequence[Shape], materials: Mapping[str, str]) -> list[str]
 
 
 def _transform(matrix: Float[np.ndarray, "4 4"]) -> list[str]:
-    """A matrix for columns, as USD's for rows."""
+    """Return a matrix for column vectors in USD's row-vector convention."""
     rows = ", ".join(_tuple(row) for row in matrix.T)
     return [f"matrix4d xformOp:transform = ({rows})", 'uniform token[] xformOpOrder = ["xformOp:transform"]']
 
@@ -210,5 +228,5 @@ def _tuple(values: Iterable[float]) -> str:
 
 
 def _tuples(rows: Float[np.ndarray, "n 3"]) -> str:
-    """Nine digits, which tell all float32 apart."""
+    """Format rows with nine digits, which distinguish all float32."""
     return ", ".join(["(%.9g, %.9g, %.9g)"] * len(rows)) % tuple(rows.reshape(-1).tolist())

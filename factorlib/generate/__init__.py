@@ -1,1 +1,1 @@
-"""The data sets the project carries, made by Mitsuba from shapes, materials and lights of the project's own."""
+"""Generator of the data sets in the repository, rendered by Mitsuba from shapes, materials and lights of our own."""

@@ -1,4 +1,7 @@
-"""python -m factorlib.generate synthetic|eames: the data sets the project carries, or others of the same protocol."""
+"""Command line of the generator: python -m factorlib.generate synthetic|eames.
+
+It writes the data sets in the repository, or others of the same protocol.
+"""
 
 from pathlib import Path
 from shutil import rmtree
@@ -32,7 +35,7 @@ Lights = Annotated[Path | None, typer.Option(help="Folder of lat-long .hdr or .e
 
 @app.command()
 def synthetic(seed: Seed = 0, out: Out = None, lights: Lights = None) -> None:
-    """Three materials in three lights on exact shapes, direct light only."""
+    """Generate three materials in three lights on exact shapes, with direct light only."""
     from factorlib.generate import synthetic as set_
 
     _write(set_, out or Path("data/synthetic"), seed, lights, set_.Parameters())
@@ -48,7 +51,7 @@ def eames(
     direct: Annotated[bool, DIRECT] = False,
     rough: Annotated[str | None, ROUGH] = None,
 ) -> None:
-    """Six photos of moulded side chairs, path traced with all bounces, on a mesh of less quality."""
+    """Generate six photos of moulded side chairs, path-traced with all bounces, on an approximate mesh."""
     from factorlib.generate import eames as set_
 
     if (exact or distant or direct or rough) and out is None:
@@ -59,7 +62,7 @@ def eames(
 
 
 def _rough(words: str | None, exact: bool) -> tuple[int, float] | None:
-    """Return TRIANGLES,WARP as numbers."""
+    """Parse TRIANGLES,WARP."""
     if words is None:
         return None
     try:
@@ -74,7 +77,7 @@ def _rough(words: str | None, exact: bool) -> tuple[int, float] | None:
 
 
 def _write(set_: ModuleType, out: Path, seed: int, lights: Path | None, parameters: msgspec.Struct) -> None:
-    """Generate beside `out`, then put it in its place."""
+    """Generate into a folder beside `out`, then rename it to `out`."""
     fresh = out.with_name(out.name + ".new")
     try:
         maps = maps_in([lights]) if lights else []
@@ -86,6 +89,7 @@ def _write(set_: ModuleType, out: Path, seed: int, lights: Path | None, paramete
             task = bar.add_task(f"{out}", total=1)
 
             def report(done: float, total: float, text: str) -> None:
+                """Update the progress bar."""
                 bar.update(task, completed=done, total=total, description=text)
 
             set_.generate(fresh, seed, maps, parameters, report)

@@ -1,8 +1,9 @@
-"""The moulded side chair: a smooth shell with thickness on four splayed, tapered dowel legs with struts.
+"""Moulded side chair: a smooth shell with thickness on four splayed, tapered dowel legs with struts.
 
-Object frame: metres, y up, the floor at y = 0, the sitter looks along +z; made after the proportions of the well-known
-chair (47 cm wide at the feet, 52 cm deep, 82 cm high) by formulas of our own.  `chair` is the one that is photographed;
-`rough_chair` what a user might have of it: fewer, flatter faces, thicker legs, and a few millimetres off everywhere; `bent_chair` a worse one.
+Object frame: metres, y up, the floor at y = 0, the sitter looks along +z. The chair has the proportions of the
+well-known one (47 cm wide at the feet, 52 cm deep, 82 cm high), by formulas of our own. `chair` is the object that is
+rendered. `rough_chair` is a mesh that a user might have of it: fewer, flatter faces, thicker legs, and errors of a few
+millimetres everywhere. `bent_chair` is a worse one.
 """
 
 from collections.abc import Sequence
@@ -24,7 +25,7 @@ Radii = tuple[float, float, float]
 
 
 class Shape(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """What chair.yaml says, where each number is explained."""
+    """Contents of chair.yaml, which explains each number."""
 
     profile: list[Pair]
     half_width: list[Pair]
@@ -44,13 +45,14 @@ SHAPE = read_yaml(Path(__file__).with_name("chair.yaml"), Shape)
 
 
 def chair() -> dict[str, Part]:
-    """shell and legs, fine enough to be rendered smooth."""
+    """Return shell and legs, fine enough to be rendered smooth."""
     return {"shell": shell(64, 96), "legs": legs(24, 14)}
 
 
 def rough_chair(rng: np.random.Generator) -> dict[str, Part]:
-    """shell and legs with few faces, bent by about 4 mm in ways that differ from seed to seed."""
-    axes, phases = rng.normal(0, 5, (4, 3)), rng.uniform(0, 2 * np.pi, (4, 1))
+    """Return shell and legs with few faces, bent by about 4 mm in ways that differ from seed to seed."""
+    axes = rng.normal(0, 5, (4, 3))
+    phases = rng.uniform(0, 2 * np.pi, (4, 1))
     shifts = rng.normal(0, 0.002, (4, 3))
 
     parts = {"shell": shell(14, 22), "legs": legs(7, 3, radii=SHAPE.rough_leg_radii)}
@@ -58,14 +60,25 @@ def rough_chair(rng: np.random.Generator) -> dict[str, Part]:
 
 
 def bent_chair(rng: np.random.Generator, triangles: int, warp: float) -> dict[str, Part]:
-    """shell and legs of `triangles` each, bent by four waves, of about a chair's length, whose largest displacement is about `warp` of its extent."""
+    """Return shell and legs, decimated and bent by four waves of about a chair's length.
+
+    Args:
+        rng: Random generator.
+        triangles: Number of triangles of each part.
+        warp: Approximate largest displacement, as a share of the chair's extent.
+
+    Returns:
+        Vertices and faces by part.
+    """
     parts = chair()
     points = np.concatenate([vertices for vertices, _ in parts.values()])
     extent = float(np.linalg.norm(np.ptp(points, axis=0)))
-    axes, phases = rng.normal(0, 5 / extent, (4, 3)), rng.uniform(0, 2 * np.pi, (4, 1))
+    axes = rng.normal(0, 5 / extent, (4, 3))
+    phases = rng.uniform(0, 2 * np.pi, (4, 1))
     shifts = rng.normal(0, 1, (4, 3))
     waves = np.sin(points @ axes.T + phases.T) @ shifts
-    middle, deviation = waves.mean(axis=0), float(np.sqrt(np.square(waves - waves.mean(axis=0)).sum(axis=1).mean()))
+    middle = waves.mean(axis=0)
+    deviation = float(np.sqrt(np.square(waves - waves.mean(axis=0)).sum(axis=1).mean()))
     bent = {}
     for name, (vertices, faces) in parts.items():
         mesh = o3d.geometry.TriangleMesh(o3d.utility.Vector3dVector(vertices), o3d.utility.Vector3iVector(faces))
@@ -77,7 +90,7 @@ def bent_chair(rng: np.random.Generator, triangles: int, warp: float) -> dict[st
 
 
 def labelled(parts: dict[str, Part], labels: dict[str, int]) -> Mesh:
-    """One mesh of all parts, smooth within each, with their material labels."""
+    """Join all parts to one mesh with material labels, smooth within each part."""
     meshes = [smooth(vertices, faces, labels[name]) for name, (vertices, faces) in parts.items()]
     vertices, faces = joined([(mesh.vertices, mesh.faces) for mesh in meshes])
     normals, label = (np.concatenate([getattr(mesh, of) for mesh in meshes]) for of in ("normals", "face_label"))
@@ -85,37 +98,42 @@ def labelled(parts: dict[str, Part], labels: dict[str, int]) -> Mesh:
 
 
 def joined(parts: Sequence[Part]) -> Part:
-    """All parts as one."""
+    """Join all parts to one."""
     first = np.cumsum([0] + [len(vertices) for vertices, _ in parts])
     faces = [faces + offset for (_, faces), offset in zip(parts, first)]
     return np.concatenate([vertices for vertices, _ in parts]), np.concatenate(faces)
 
 
 def shell(across: int, along: int) -> Part:
-    """The shell's upper and lower sides, half a thickness off its middle surface, joined by a rounded rim."""
+    """Return the shell: upper and lower sides, half a thickness off its middle surface, joined by a rounded rim."""
     s, t = np.meshgrid(np.linspace(-1, 1, across + 1), np.linspace(-1, 1, along + 1))
     u, v = s * np.sqrt(1 - SHAPE.corners * t**2 / 2), t * np.sqrt(1 - SHAPE.corners * s**2 / 2)
-    middle, step = middle_surface(u, v), 1e-4
+    # normals of the middle surface, by central differences
+    middle = middle_surface(u, v)
+    step = 1e-4
     by_u = middle_surface(u + step, v) - middle_surface(u - step, v)
     normal = np.cross(by_u, middle_surface(u, v - step) - middle_surface(u, v + step))
     normal /= -np.linalg.norm(normal, axis=-1, keepdims=True)
     upper, lower = middle + normal * SHAPE.thickness / 2, middle - normal * SHAPE.thickness / 2
     rows, columns = u.shape
     index = np.arange(rows * columns).reshape(rows, columns)
-    border = np.concatenate([index[0, :-1], index[:-1, -1], index[-1, :0:-1], index[:0:-1, 0]])  # once around
-    middle, normal = middle.reshape(-1, 3)[border], normal.reshape(-1, 3)[border]
-    out = np.cross(np.roll(middle, -1, axis=0) - np.roll(middle, 1, axis=0), normal)  # of the border, in the surface
+    border = np.concatenate([index[0, :-1], index[:-1, -1], index[-1, :0:-1], index[:0:-1, 0]])  # closed ring
+    middle = middle.reshape(-1, 3)[border]
+    normal = normal.reshape(-1, 3)[border]
+    # rim: half a thickness outward from the border, in the surface
+    out = np.cross(np.roll(middle, -1, axis=0) - np.roll(middle, 1, axis=0), normal)
     out *= np.sign(np.sum(out * (middle - middle.mean(axis=0)), axis=1).sum())
     edge = middle + out / np.linalg.norm(out, axis=1, keepdims=True) * SHAPE.thickness / 2
     a, b, c, d = index[:-1, :-1], index[:-1, 1:], index[1:, :-1], index[1:, 1:]
     top = np.concatenate([np.stack([a, b, d], -1), np.stack([a, d, c], -1)]).reshape(-1, 3)
-    rim, count = 2 * rows * columns + np.arange(len(border)), rows * columns
+    rim = 2 * rows * columns + np.arange(len(border))
+    count = rows * columns
     faces = [top, top[:, ::-1] + count, band(border, rim), band(rim, border + count)]
     return np.concatenate([upper.reshape(-1, 3), lower.reshape(-1, 3), edge]), np.concatenate(faces)
 
 
 def middle_surface(u: Float[np.ndarray, "*n"], v: Float[np.ndarray, "*n"]) -> Float[np.ndarray, "*n 3"]:
-    """A point of the shell: u from −1 to 1 across, v from −1 (front lip) to 1 (top of the back)."""
+    """Return points of the shell: u from −1 to 1 across, v from −1 (front lip) to 1 (top of the back)."""
     profile = np.array(SHAPE.profile)
     length = np.concatenate([[0], np.cumsum(np.linalg.norm(np.diff(profile, axis=0), axis=1))])
     curve = CubicSpline(length / length[-1], profile)
@@ -128,13 +146,22 @@ def middle_surface(u: Float[np.ndarray, "*n"], v: Float[np.ndarray, "*n"]) -> Fl
 
 
 def band(first: np.ndarray, second: np.ndarray) -> np.ndarray:
-    """Triangles between two closed rings of as many points."""
+    """Triangulate the band between two closed rings of as many points."""
     a, b, c, d = first, np.roll(first, -1), second, np.roll(second, -1)
     return np.concatenate([np.stack([a, c, d], -1), np.stack([a, d, b], -1)])
 
 
 def legs(sides: int, rings: int, radii: Radii = SHAPE.leg_radii) -> Part:
-    """Four legs and the struts between neighbours."""
+    """Return four legs and the struts between neighbours.
+
+    Args:
+        sides: Number of sides of a leg.
+        rings: Number of rings of vertices along a leg.
+        radii: Radii of a leg at its top, middle and foot.
+
+    Returns:
+        Vertices and faces.
+    """
     top = [np.array([x, SHAPE.seat_y, z]) for x, z in SHAPE.tops]
     foot = [np.array([x, 0.0, z]) for x, z in SHAPE.feet]
     dowels = [dowel(a, b, radii, sides, rings) for a, b in zip(top, foot, strict=True)]
@@ -145,7 +172,18 @@ def legs(sides: int, rings: int, radii: Radii = SHAPE.leg_radii) -> Part:
 
 
 def dowel(start: Float[np.ndarray, "3"], end: Float[np.ndarray, "3"], radii: Radii, sides: int, rings: int) -> Part:
-    """A closed round rod of radius `radii` at its start, middle and end."""
+    """Return a closed round rod.
+
+    Args:
+        start: Start of the axis.
+        end: End of the axis.
+        radii: Radii at start, middle and end.
+        sides: Number of sides.
+        rings: Number of rings of vertices.
+
+    Returns:
+        Vertices and faces.
+    """
     axis = (end - start) / np.linalg.norm(end - start)
     across = np.cross(axis, [0.3, 0.2, 1.0])
     across /= np.linalg.norm(across)
@@ -157,6 +195,6 @@ def dowel(start: Float[np.ndarray, "3"], end: Float[np.ndarray, "3"], radii: Rad
     index = np.arange(rings * sides).reshape(rings, sides)
     tube = np.concatenate([band(index[k], index[k + 1]) for k in range(rings - 1)])
     (first, last), (right, right_last) = index[[0, -1]], np.roll(index, -1, axis=1)[[0, -1]]
-    middles = np.full(sides, rings * sides), np.full(sides, rings * sides + 1)  # of the caps
+    middles = np.full(sides, rings * sides), np.full(sides, rings * sides + 1)  # centres of the caps
     caps = [np.stack([middles[0], first, right], -1), np.stack([middles[1], right_last, last], -1)]
     return np.concatenate([points.reshape(-1, 3), [start, end]]), np.concatenate([tube, *caps])[:, ::-1]

@@ -1,9 +1,9 @@
-"""The chair set: six photos of moulded side chairs in six lights, with all bounces of light, as cameras write them.
+"""Chair set: six photos of moulded side chairs in six lights, with all bounces of light, as cameras write them.
 
-What makes it harder than the synthetic set is what makes photographs hard: JPEGs with clipped highlights, chairs that
-shadow and mirror themselves, each other and the ground, a mesh coarser than and a few millimetres off the chair that
-was photographed, no poses, and half of the focal lengths unknown.  Three of these can be taken away, each by itself, so that
-one sees what each costs: `exact` geometry, `distant` light, `direct` light.
+It is harder than the synthetic set in the ways of real photographs. Its JPEGs have clipped highlights. Its chairs
+shadow and reflect themselves, each other and the ground. Its mesh is coarser than the rendered chair and a few
+millimetres off. Poses, and half of the focal lengths, are unknown. Three difficulties can be removed one by one, to
+measure the cost of each: `exact` geometry, `distant` light, `direct` light.
 """
 
 from collections.abc import Callable, Sequence
@@ -31,12 +31,15 @@ Maps = Sequence[Path]
 
 
 class Parameters(msgspec.Struct, frozen=True):
-    """Pixels, pixels, rows, samples per pixel of photos and of lights, and what is made easier.
+    """Parameters of the set.
 
-    exact:    the data set's mesh is the one that was photographed, and poses and focal lengths are given
-    distant:  nothing lights or surrounds the chairs but the light's map, infinitely far away
-    direct:   light is not reflected on its way: only what shines by itself lights the chairs
-    rough:    the data set's mesh has so many triangles a part and is bent by this share of its extent: worse than it is without
+    width, height    size of photos, pixels
+    light_rows       rows of light maps
+    spp, light_spp   samples per pixel of photos and of light maps
+    exact            the data set has the rendered mesh, poses and focal lengths
+    distant          the light's map, infinitely far away, is the only light and surroundings of the chairs
+    direct           light is not reflected on its way: only emitters light the chairs
+    rough            the data set's mesh has this number of triangles a part, and is bent by this share of its extent
     """
 
     width: int = 480
@@ -51,11 +54,12 @@ class Parameters(msgspec.Struct, frozen=True):
 
 
 class Shot(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """A photo: shell colours of its chairs, how the first stands to the camera, the lens, and the surroundings.
+    """Photo: shell colours of its chairs, pose of the first chair, lens, and surroundings.
 
-    facing_deg    0 looks at the camera, positive turns its front to the photo's right
-    focal_35mm    the lens; how the data set tells it: exif, given or nothing
-    sun           elevation and how far from behind the camera, degrees; None: a room
+    facing_deg         0 faces the camera, positive turns the front to the photo's right
+    focal_35mm         focal length of the lens, 35 mm equivalent
+    focal_known_from   source of the focal length in the data set: exif, given or nothing
+    sun                elevation, and angle from behind the camera, degrees; None: a room
     """
 
     name: str
@@ -72,7 +76,7 @@ class Shot(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class Set(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """What eames.yaml says, where each number is explained."""
+    """Contents of eames.yaml, which explains each number."""
 
     materials: dict[str, Material]
     shots: list[Shot]
@@ -87,17 +91,29 @@ SET = read_yaml(Path(__file__).with_name("eames.yaml"), Set)
 def generate(
     out: Path, seed: int, lat_longs: Maps, parameters: Parameters, progress: Progress, shots: Sequence[Shot] = SET.shots
 ) -> None:
-    """Write the data set into the empty folder `out`; `lat_longs` (maps of the user's) replace the made lights."""
+    """Write the data set into the empty folder `out`.
+
+    Args:
+        out: Empty folder.
+        seed: Seed; 0 is the set in the repository.
+        lat_longs: Light maps of the user, which replace the generated lights.
+        parameters: Parameters of the set.
+        progress: Function of the number of photos that are done, of their total, and of the current photo's name.
+        shots: Photos.
+    """
     for name in ("photos", "masks", "meshes", "truth"):
         (out / name).mkdir(parents=True)
-    rng, spread = np.random.default_rng([11, seed]), 0.0 if seed == 0 else 1.0
-    materials, rough = random_materials(rng, 0.2 * spread, SET.materials), rough_chair(rng)
+    rng = np.random.default_rng([11, seed])
+    spread = 0.0 if seed == 0 else 1.0
+    materials = random_materials(rng, 0.2 * spread, SET.materials)
+    rough = rough_chair(rng)
     exact = {name: smooth(*part) for name, part in chair().items()} if parameters.exact else {}
     if parameters.rough:
         rough = bent_chair(np.random.default_rng([13, seed]), *parameters.rough)
     parts = {name: (mesh.vertices, mesh.faces, mesh.normals) for name, mesh in exact.items()} or rough
     folder.write_obj(out / "meshes/chair.obj", parts)
-    photos, poses = [], {}
+    photos = []
+    poses = {}
     for number, shot in enumerate(shots):
         progress(number, len(shots), shot.name)
         scene = laid_out(shot, number, lat_longs, rng, spread, parameters)
@@ -112,7 +128,10 @@ def generate(
 
 
 class Scene(msgspec.Struct, frozen=True):
-    """A photo before it is taken: surroundings, camera and chairs in the world (y up, floor at −EYE, chairs about x = z = 0)."""
+    """Photo before it is rendered: surroundings, camera and chairs in the world.
+
+    The world has y up, the floor at −EYE, and the chairs about x = z = 0.
+    """
 
     shot: Shot
     surroundings: SceneDict
@@ -122,16 +141,30 @@ class Scene(msgspec.Struct, frozen=True):
 
     @property
     def poses(self) -> dict[str, Pose]:
-        """cam_from_object of each chair."""
+        """Pose cam_from_object of each chair."""
         matrices = {name: np.linalg.inv(self.world_from_camera) @ chair for name, chair in self.chairs.items()}
         return {name: Pose(matrix[:3, :3], matrix[:3, 3]) for name, matrix in matrices.items()}
 
 
 def laid_out(shot: Shot, number: int, lat_longs: Maps, rng: Rng, spread: float, parameters: Parameters) -> Scene:
-    """Camera, chairs and surroundings of a shot: a sky, a room, or a user's map over a grey ground (without it where light is
-    `distant`); nothing stands between camera and chairs.  A spread turns the chairs and moves the camera.
+    """Place camera, chairs and surroundings of a shot; nothing is between camera and chairs.
+
+    The surroundings are a sky, a room, or a user's map over a grey ground (without the ground if light is `distant`).
+
+    Args:
+        shot: The shot.
+        number: Number of the shot.
+        lat_longs: Light maps of the user.
+        rng: Random generator.
+        spread: Size of the random changes of chairs' rotations and camera position, from 0 to 1.
+        parameters: Parameters of the set.
+
+    Returns:
+        The scene.
     """
-    yaw, width, height = rng.uniform(0, 360), parameters.width, parameters.height
+    yaw = rng.uniform(0, 360)
+    width = parameters.width
+    height = parameters.height
     distance = shot.distance * (1 + 0.08 * spread * rng.uniform(-1, 1))
     eye = shot.eye + 0.15 * spread * rng.uniform(-1, 1)
     facing = shot.facing_deg + 40 * spread * rng.uniform(-1, 1)
@@ -141,7 +174,8 @@ def laid_out(shot: Shot, number: int, lat_longs: Maps, rng: Rng, spread: float, 
     sideways = [0.0] if len(shot.chairs) == 1 else [-SET.apart, SET.apart]
     chairs = {}
     for k, (colour, aside) in enumerate(zip(shot.chairs, sideways)):
-        turn = look(0, yaw + 180 - facing + 55 * k) @ np.diag([-1.0, -1.0, 1.0])  # the chair's +z toward the camera
+        # the chair's +z points toward the camera
+        turn = look(0, yaw + 180 - facing + 55 * k) @ np.diag([-1.0, -1.0, 1.0])
         chairs[f"{colour}_chair"] = rigid(turn, aside * level[:, 0] + [0, -EYE, 0] + 0.15 * k * level[:, 2])
     camera = Camera(width, height, folder.focal_px_of_35mm(shot.focal_35mm, width, height), (width / 2, height / 2))
     if lat_longs:
@@ -157,18 +191,32 @@ def laid_out(shot: Shot, number: int, lat_longs: Maps, rng: Rng, spread: float, 
 
 
 def write_shot(out: Path, scene: Scene, materials: dict[str, Material], parameters: Parameters, seed: int) -> dict:
-    """Trace, expose and write one photo, its masks, its light in the photo's units and its normals; its entry.
+    """Render, expose and write one photo, with its masks, its light in the photo's units, and its normals.
 
-    The entry has poses only if `exact`, the focal length only then and where the user is to give it there.
+    Args:
+        out: Folder of the data set.
+        scene: The scene.
+        materials: Materials by name, in the order of their labels.
+        parameters: Parameters of the set.
+        seed: Seed of the renderer.
+
+    Returns:
+        The photo's entry of dataset.yaml. It has poses only if `exact`, and the focal length only if `exact` or if the
+        shot gives it there.
     """
-    shot, camera, names, poses = scene.shot, scene.camera, list(materials), list(scene.poses.values())
+    shot = scene.shot
+    camera = scene.camera
+    names = list(materials)
+    poses = list(scene.poses.values())
     wood = names.index("wood") + 1
     meshes = [labelled(chair(), {"shell": names.index(colour) + 1, "legs": wood}) for colour in shot.chairs]
     labels = folder.labels_of(meshes, camera, poses)
-    # the light at the chairs' middle, without the chairs; where it is direct but not distant, what shines by itself
+    # light at the chairs' centre, without the chairs; if it is direct but not distant, only that of emitters
     turn = scene.world_from_camera[:3, :3] @ YUP_FROM_CAMERA  # world_from_light
     depth = 1 if parameters.direct and not parameters.distant else -1
-    place, rows, spp = rigid(turn, (0, SET.middle - EYE, 0)), parameters.light_rows, parameters.light_spp
+    place = rigid(turn, (0, SET.middle - EYE, 0))
+    rows = parameters.light_rows
+    spp = parameters.light_spp
     light = light_seen(scene.surroundings, place, rows, spp, seed, depth)
     around = scene.surroundings
     if parameters.distant:
@@ -181,13 +229,14 @@ def write_shot(out: Path, scene: Scene, materials: dict[str, Material], paramete
     depth = 2 if parameters.direct else -1
     radiance = traced(around | solids, camera, scene.world_from_camera, parameters.spp, seed, depth)
     on_chair = (labels > 0) & (labels < LEFT_OUT)
-    exposure = float(1 / np.quantile(radiance[on_chair].max(axis=-1), 1 - SET.clipped))  # clips `clipped` of them
+    # exposure that clips the share `clipped` of the chairs' pixels
+    exposure = float(1 / np.quantile(radiance[on_chair].max(axis=-1), 1 - SET.clipped))
     exif = shot.focal_35mm if shot.focal_known_from == "exif" else None
     folder.write_photo(out / f"photos/{shot.name}.jpg", radiance * exposure, exif)
     folder.write_shot(out, shot.name, labels, light * exposure, rasterise(meshes, camera, poses))
     shells = zip(scene.chairs, shot.chairs, strict=True)
     objects: list[Any] = [{"name": name, "mesh": "chair", "materials": {"shell": colour}} for name, colour in shells]
-    if len(meshes) > 1:  # each chair's silhouette
+    if len(meshes) > 1:  # a mask for each chair
         for own, mask in zip(objects, folder.object_masks(meshes, camera, poses), strict=True):
             own["mask"] = f"masks/{shot.name}_{own['name']}.png"
             folder.write_labels(out / own["mask"], np.where(mask, 255, 0))

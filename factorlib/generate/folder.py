@@ -1,4 +1,4 @@
-"""Writing a data set: photos as cameras write them, label masks, truth, and the YAML that names them all."""
+"""Writers of a data set: photos as cameras write them, label masks, truth, and the YAML files."""
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -21,11 +21,18 @@ from factorlib.yamlfile import yaml_text
 
 Image = Float[np.ndarray, "h w 3"]
 Poses = Mapping[str, Mapping[str, Pose]]  # cam_from_object by photo and object
-SUBPIXELS = 4  # rays per pixel and side that decide what a pixel shows
+SUBPIXELS = 4  # number of rays per pixel and side that determine its label
 
 
 def write_photo(path: Path, radiance: Image, focal_35mm: float | None = None, quality: int = 95) -> None:
-    """Linear float for .exr; sRGB, clipped at 1, for .png (16 bits) and .jpg (8 bits, EXIF focal if given)."""
+    """Write a photo: linear float for .exr; sRGB, clipped at 1, for .png (16 bits) and .jpg (8 bits).
+
+    Args:
+        path: File to write.
+        radiance: Linear radiance.
+        focal_35mm: Focal length for the EXIF data of a .jpg, 35 mm equivalent.
+        quality: Quality of a .jpg.
+    """
     if path.suffix == ".exr":
         return write_rgb_exr(path, radiance)
     encoded = srgb_encode(np.clip(radiance, 0, 1))
@@ -39,17 +46,32 @@ def write_photo(path: Path, radiance: Image, focal_35mm: float | None = None, qu
 
 
 def focal_px_of_35mm(focal_35mm: float, width: int, height: int) -> float:
-    """Pixels of a whole-millimetre 35 mm equivalent, by the convention of CIPA DCG-001."""
+    """Convert a 35 mm equivalent in whole millimetres to pixels, by the convention of CIPA DCG-001.
+
+    Args:
+        focal_35mm: 35 mm equivalent, to be rounded.
+        width: Width of the photo.
+        height: Height of the photo.
+
+    Returns:
+        Focal length in pixels.
+    """
     return round(focal_35mm) / FILM_DIAGONAL * float(np.hypot(width, height))
 
 
 def write_labels(path: Path, labels: Int[np.ndarray, "h w"]) -> None:
-    """A one-channel 8-bit PNG: 0 background, k the k-th material, 255 left out."""
+    """Write labels as a one-channel 8-bit PNG: 0 background, k the k-th material, 255 left out."""
     write_codes(path, labels.astype(np.uint8)[..., None], {})
 
 
 def write_codes(path: Path, codes: np.ndarray, attributes: dict[str, Any]) -> None:
-    """Integer pixels [h, w, c] by OpenImageIO."""
+    """Write integer pixels [h, w, c] by OpenImageIO.
+
+    Args:
+        path: File to write.
+        codes: Pixels of 8 or 16 bits.
+        attributes: Attributes of the file.
+    """
     height, width, channels = codes.shape
     spec = oiio.ImageSpec(width, height, channels, oiio.UINT16 if codes.dtype == np.uint16 else oiio.UINT8)
     for name, value in attributes.items():
@@ -63,22 +85,33 @@ def write_light(path: Path, lat_long: Image) -> None:
 
 
 def write_normals(path: Path, normal: Image) -> None:
-    """Unit normals in the camera frame, 0 where there is no object."""
+    """Write unit normals in the camera frame, 0 where there is no object, as EXR."""
     write_exr(path, {f"normal.{axis}": normal[..., k] for k, axis in enumerate("xyz")})
 
 
 def write_shot(out: Path, name: str, labels: Int[np.ndarray, "h w"], light: Image, maps: Maps) -> None:
-    """The mask of one photo, and its truth: the light in the photo's units, and the normals."""
+    """Write the mask of one photo and its truth: light and normals.
+
+    Args:
+        out: Folder of the data set.
+        name: Name of the photo.
+        labels: Labels of the mask.
+        light: Light map, in the photo's units.
+        maps: Rendered maps of the true geometry.
+    """
     write_labels(out / f"masks/{name}.png", labels)
     write_light(out / f"truth/{name}_light.exr", light)
     write_normals(out / f"truth/{name}_normal.exr", maps.normal)
 
 
 def write_obj(path: Path, parts: Mapping[str, tuple[np.ndarray, ...]]) -> None:
-    """Parts as groups of a Wavefront OBJ: name -> vertices [V, 3], faces [F, 3] and, where they are written to nine digits,
-    normals [V, 3].
+    """Write parts as groups of a Wavefront OBJ.
+
+    `parts` maps names to vertices [V, 3], faces [F, 3] and, optionally, normals [V, 3]. With normals, numbers have nine
+    digits.
     """
-    lines, first = [], 1
+    lines = []
+    first = 1
     for name, (vertices, faces, *normals) in parts.items():
         digits, corner = (".9g", "{0}//{0}") if normals else (".5f", "{0}")
         lines += [f"g {name}", *("v " + " ".join(f"{x:{digits}}" for x in v) for v in vertices)]
@@ -89,25 +122,46 @@ def write_obj(path: Path, parts: Mapping[str, tuple[np.ndarray, ...]]) -> None:
 
 
 def labels_of(meshes: Sequence[Mesh], camera: Camera, poses: list[Pose]) -> Int[np.ndarray, "h w"]:
-    """The material label of each pixel; 255 where its square, or a quarter pixel beyond, shows more than one material."""
+    """Return the material label of each pixel; 255 if the pixel with a margin of a quarter shows several materials.
+
+    Args:
+        meshes: Meshes.
+        camera: Camera.
+        poses: Pose of each mesh.
+
+    Returns:
+        Labels.
+    """
     return whole_pixels(_subpixels(meshes, camera, poses).label)
 
 
 def object_masks(meshes: Sequence[Mesh], camera: Camera, poses: list[Pose]) -> list[Bool[np.ndarray, "h w"]]:
-    """Where each object fills at least half of the pixel."""
+    """Return masks of the pixels of which each object fills at least half.
+
+    Args:
+        meshes: Meshes.
+        camera: Camera.
+        poses: Pose of each mesh.
+
+    Returns:
+        One mask for each object.
+    """
     number = _subpixels(meshes, camera, poses).object[SUBPIXELS:-SUBPIXELS, SUBPIXELS:-SUBPIXELS]
     inside = number.reshape(camera.height, SUBPIXELS, camera.width, SUBPIXELS)
     return [(inside == k + 1).mean(axis=(1, 3)) >= 0.5 for k in range(len(poses))]
 
 
 def _subpixels(meshes: Sequence[Mesh], camera: Camera, poses: list[Pose]) -> Maps:
-    """Maps on a grid SUBPIXELS times finer, with one pixel of border all round."""
+    """Render maps on a grid SUBPIXELS times finer, with a border of one pixel."""
     window = camera.window(-1, -1, 1 / SUBPIXELS, (camera.width + 2) * SUBPIXELS, (camera.height + 2) * SUBPIXELS)
     return rasterise(meshes, window, poses)
 
 
 def whole_pixels(fine: Int[np.ndarray, "hh ww"]) -> Int[np.ndarray, "h w"]:
-    """Return the pixels of a fine grid with a border of one pixel: the value where all rays in and just about a pixel agree, else 255."""
+    """Reduce a fine grid with a border of one pixel to pixels: the value on which all rays agree, else 255.
+
+    The rays are those of the pixel and of the nearest ones around it.
+    """
     windows = np.lib.stride_tricks.sliding_window_view(fine, (SUBPIXELS + 2, SUBPIXELS + 2))
     windows = windows[SUBPIXELS - 1 :: SUBPIXELS, SUBPIXELS - 1 :: SUBPIXELS]
     height, width = (n // SUBPIXELS - 2 for n in fine.shape)
@@ -116,11 +170,20 @@ def whole_pixels(fine: Int[np.ndarray, "hh ww"]) -> Int[np.ndarray, "h w"]:
 
 
 def write_yaml(path: Path, value: dict[str, Any], comment: str) -> None:
-    """Write nested mappings as YAML below a comment, numbers to six digits, those below 1e-4 as 0."""
+    """Write nested mappings as YAML below a comment.
+
+    Numbers have six decimals; those below 1e-4 become 0.
+
+    Args:
+        path: File to write.
+        value: Mapping.
+        comment: First line.
+    """
     write_text(path, f"# {comment}\n{yaml_text(_rounded(value))}")
 
 
 def _rounded(value: Any) -> Any:
+    """Round all floats of nested mappings and lists."""
     if isinstance(value, dict):
         return {key: _rounded(item) for key, item in value.items()}
     if isinstance(value, (list, tuple)):
@@ -129,7 +192,7 @@ def _rounded(value: Any) -> Any:
 
 
 def pose_entry(pose: Pose) -> dict[str, Any]:
-    """cam_from_object as dataset.yaml and truth.yaml write it."""
+    """Return cam_from_object in the form of dataset.yaml and truth.yaml."""
     rotation = [[round(float(v), 6) for v in row] for row in pose.rotation]
     return {"rotation": rotation, "translation": [float(v) for v in pose.translation]}
 
@@ -137,9 +200,15 @@ def pose_entry(pose: Pose) -> dict[str, Any]:
 def write_records(
     out: Path, comment: str, materials: Mapping[str, Any], meshes: dict[str, Any], photos: list[Any], poses: Poses
 ) -> None:
-    """Write dataset.yaml, whose first line is the comment, and truth/truth.yaml.
+    """Write dataset.yaml and truth/truth.yaml.
 
-    materials: structs by name;  poses: by photo and object
+    Args:
+        out: Folder of the data set.
+        comment: First line of dataset.yaml.
+        materials: Materials by name.
+        meshes: Entries of meshes by name.
+        photos: Entries of photos.
+        poses: Poses by photo and object.
     """
     record = {"format": 1, "materials": list(materials), "meshes": meshes, "photos": photos}
     write_yaml(out / "dataset.yaml", record | {"truth": "truth/truth.yaml"}, comment)

@@ -1,8 +1,9 @@
 """Surroundings that light a scene: a sky with its sun over a ground, and rooms with windows and lamps.
 
-Every surrounding is a dictionary of Mitsuba objects in a world with y up, its ground or floor at y = −EYE and nothing
-within a metre of the origin, so that the light which arrives at the origin, or at a chair on the floor, can be traced.
-Radiance is in arbitrary units: a data set scales each light by its photo's exposure.  Random materials are here, too.
+Every surrounding is a dictionary of Mitsuba objects in a world with y up and its ground or floor at y = −EYE. Nothing
+is within a metre of the origin, so that the light that arrives at the origin, or at a chair on the floor, can be
+traced. Radiance is in arbitrary units: a data set scales each light by its photo's exposure. The module also makes
+random materials.
 """
 
 from collections.abc import Iterable, Sequence
@@ -18,21 +19,31 @@ from factorlib.results.materials import vec3
 from factorlib.tracing.scene import Material, envmap, light_seen, rgb, transform
 from factorlib.tracing.variant import mitsuba
 
-EYE = 1.2  # height of the origin over the ground
-# sunsky's zenith is its +z; its sun_direction is the world's
+EYE = 1.2  # height of the origin above the ground
+# the zenith of sunsky is its +z, but its sun_direction is in the world's frame
 Y_UP_FROM_Z_UP = np.array([[1.0, 0, 0, 0], [0, 0, 1, 0], [0, -1, 0, 0], [0, 0, 0, 1]])
-SUN_SCALE, SUN_APERTURE_DEG = 0.12, 3.0  # radiance of the sun against the real one's; its diameter
+SUN_SCALE = 0.12  # radiance of the sun relative to the real one
+SUN_APERTURE_DEG = 3.0  # diameter of the sun
 GROUND = (0.32, 0.3, 0.26)  # reflectance
 Colour = float | Sequence[float] | Float[np.ndarray, "3"]  # linear Rec. 709; a number is grey
 Rotation = Float[np.ndarray, "3 3"]
 Rng = np.random.Generator
 SceneDict = dict[str, Any]  # shapes and emitters by name, as Mitsuba's `load_dict` takes them
-# about x, about y, of +z
+# rotations about x and about y that take +z to each side
 TURNS = {"+x": (0, 90), "-x": (0, -90), "+z": (0, 0), "-z": (0, 180), "+y": (-90, 0), "-y": (90, 0)}
 
 
 def random_materials(rng: np.random.Generator, spread: float, about: dict[str, Material]) -> dict[str, Material]:
-    """The materials of `about`, each number times exp(spread · normal), within k_d + k_s ≤ 0.95, to four digits."""
+    """Vary materials at random: each number times exp(spread · normal), within k_d + k_s ≤ 0.95, to four digits.
+
+    Args:
+        rng: Random generator.
+        spread: Deviation of the logarithms.
+        about: Materials by name.
+
+    Returns:
+        Materials by name.
+    """
     result = {}
     for name, material in about.items():
         factor = np.exp(spread * rng.standard_normal(5))
@@ -45,21 +56,35 @@ def random_materials(rng: np.random.Generator, spread: float, about: dict[str, M
 
 
 def daylight(rng: Rng, elevation_deg: float, azimuth_deg: float, turbidity: float = 4.0, rows: int = 256) -> SceneDict:
-    """Clear sky (Hosek and Wilkie 2012, 2013, by Mitsuba's `sunsky`) over a ground with some painted walls.
+    """Return a clear sky (Hosek and Wilkie 2012, 2013, by Mitsuba's `sunsky`) over a ground with some painted walls.
 
-    elevation_deg, azimuth_deg: of the sun; azimuth from +z toward +x.  The sun is veiled: wider (SUN_APERTURE_DEG) and weaker
-    (SUN_SCALE) than the real one, whose 0.5° only a mirror shows.  rows: of the map by which the sky is handed on, which Mitsuba
-    samples with less noise than the model itself
+    The sun is veiled: wider (SUN_APERTURE_DEG) and weaker (SUN_SCALE) than the real one, whose 0.5° only a mirror
+    shows.
+
+    Args:
+        rng: Random generator.
+        elevation_deg: Elevation of the sun.
+        azimuth_deg: Azimuth of the sun, from +z toward +x.
+        turbidity: Turbidity of the sky.
+        rows: Rows of the map that stands for the sky, which Mitsuba samples with less noise than the model itself.
+
+    Returns:
+        Mitsuba objects by name.
     """
     up, turn = np.radians([elevation_deg, azimuth_deg])
     sun = [np.cos(up) * np.sin(turn), np.sin(up), np.cos(up) * np.cos(turn)]
     sky = {
-        "type": "sunsky", "turbidity": turbidity, "sun_scale": SUN_SCALE, "sun_aperture": SUN_APERTURE_DEG,
-        "albedo": 0.3, "sun_direction": [float(c) for c in sun], "to_world": transform(Y_UP_FROM_Z_UP),
-    }  # fmt: skip
+        "type": "sunsky",
+        "turbidity": turbidity,
+        "sun_scale": SUN_SCALE,
+        "sun_aperture": SUN_APERTURE_DEG,
+        "albedo": 0.3,
+        "sun_direction": [float(c) for c in sun],
+        "to_world": transform(Y_UP_FROM_Z_UP),
+    }
     seen = light_seen({"sky": sky}, np.eye(4), rows, 4, 0, max_depth=2)
     scene = {"sky": envmap(seen, finer=2), "ground": wall("-y", EYE, (200, 200), GROUND)}
-    for k in range(4):  # coloured blocks some metres away; none stands before the sun
+    for k in range(4):  # coloured blocks some metres away, none in front of the sun
         angle = np.radians(azimuth_deg + 60 + 80 * k + rng.uniform(-20, 20))
         size = np.array([rng.uniform(1.5, 3), rng.uniform(1, 3), rng.uniform(1, 2)])
         place = np.array([np.sin(angle), 0, np.cos(angle)]) * rng.uniform(8, 12) + [0, size[1] - EYE, 0]
@@ -68,7 +93,18 @@ def daylight(rng: Rng, elevation_deg: float, azimuth_deg: float, turbidity: floa
 
 
 def room(rng: Rng, windows: int, lamps: int, clear_deg: float = 0.0, clear_half_deg: float = 75.0) -> SceneDict:
-    """A closed room of coloured walls with bright windows, warm lamps and pictures; no furniture about `clear_deg`."""
+    """Return a closed room of coloured walls with bright windows, warm lamps, pictures and furniture.
+
+    Args:
+        rng: Random generator.
+        windows: Number of windows, at most 4.
+        lamps: Number of lamps.
+        clear_deg: Azimuth about which there is no furniture.
+        clear_half_deg: Half width of that range.
+
+    Returns:
+        Mitsuba objects by name.
+    """
     half = np.array([rng.uniform(2.6, 3.6), rng.uniform(1.1, 1.5), rng.uniform(2.6, 3.6)])
     ceiling = 2.9 - EYE
     scene = {
@@ -80,7 +116,8 @@ def room(rng: Rng, windows: int, lamps: int, clear_deg: float = 0.0, clear_half_
         distance, width = (half[0], half[2]) if side[1] == "x" else (half[2], half[0])
         paint = np.clip(rng.uniform(0.45, 0.75) + rng.uniform(-0.2, 0.15, 3), 0.1, 0.85)
         scene[f"wall{side}"] = wall(side, distance, (width, 1.6), paint, (0, 0.25))
-        size, colour = rng.uniform(0.3, 0.6, 2), _vivid(rng)
+        size = rng.uniform(0.3, 0.6, 2)
+        colour = _vivid(rng)
         shift = rng.uniform(-1.6, 1.6), rng.uniform(0, 0.5)
         scene[f"picture{side}"] = wall(side, distance - 0.02, size, colour, shift)
     for k, side in enumerate(rng.permutation(sides)[:windows]):
@@ -102,16 +139,30 @@ def room(rng: Rng, windows: int, lamps: int, clear_deg: float = 0.0, clear_half_
 
 
 def _vivid(rng: np.random.Generator) -> Float[np.ndarray, "3"]:
-    """A strong colour."""
+    """Draw a saturated colour."""
     return 0.06 + 0.65 * rng.dirichlet([0.7, 0.7, 0.7])
 
 
 def wall(
-    side: str, distance: float, half: Iterable[float], colour: Colour, shift: Sequence[float] = (0.0, 0.0), glow: Colour | None = None
-) -> SceneDict:  # fmt: skip
-    """A rectangle of half sizes `half` (width, height), `distance` from the origin toward `side`, that faces the origin.
+    side: str,
+    distance: float,
+    half: Iterable[float],
+    colour: Colour,
+    shift: Sequence[float] = (0.0, 0.0),
+    glow: Colour | None = None,
+) -> SceneDict:
+    """Return a rectangle that faces the origin.
 
-    shift: of its middle in its own plane (along, up);  glow: the radiance it emits, None for a wall that only reflects
+    Args:
+        side: Direction from the origin to the wall, such as "+x".
+        distance: Distance from the origin.
+        half: Half width and half height.
+        colour: Reflectance.
+        shift: Offset of its centre in its own plane (along, up).
+        glow: Emitted radiance; None for a wall that only reflects.
+
+    Returns:
+        A Mitsuba object.
     """
     pitch, yaw = TURNS[side]
     to_world = mitsuba().ScalarTransform4f().rotate([0, 1, 0], yaw).rotate([1, 0, 0], pitch)
@@ -121,14 +172,24 @@ def wall(
 
 
 def block(place: Float[np.ndarray, "3"], half: Float[np.ndarray, "3"], turn_deg: float, colour: Colour) -> SceneDict:
-    """A box of half sizes `half` about `place`, turned about y."""
+    """Return a box rotated about y.
+
+    Args:
+        place: Centre.
+        half: Half sizes.
+        turn_deg: Angle of the rotation.
+        colour: Reflectance.
+
+    Returns:
+        A Mitsuba object.
+    """
     to_world = mitsuba().ScalarTransform4f().translate([*map(float, place)]).rotate([0, 1, 0], float(turn_deg))
     to_world = to_world.scale([*map(float, half)])
     return {"type": "cube", "to_world": to_world, "bsdf": {"type": "diffuse", "reflectance": rgb(colour)}}
 
 
 def captured(path: Path, height: int) -> Float[np.ndarray, "h w 3"]:
-    """A lat-long map of a user's (.exr, .hdr), averaged to `height` rows, of mean radiance 1."""
+    """Read a user's lat-long map (.exr, .hdr), averaged to `height` rows and scaled to a mean radiance of 1."""
     radiance = read_light_map(path)
     if (rows := len(radiance)) % height:
         fault = f"{rows} rows do not divide into {height}"

@@ -1,11 +1,11 @@
-"""Pixels of rendered spheres, each sphere of one material in the light of one lobe: what the paper's network learns from.
+"""Training data of the paper's network: pixels of rendered spheres, each of one material in the light of one lobe.
 
-Scene    A unit sphere seen from afar, so that every pixel's view is (0, 0, −1), in the camera frame (OpenCV), which is
-         Mitsuba's world here.
-Light    A unit lobe exp(λ(ω·z − 1)) as an `envmap` turned so that its pole lies along z: the map is then a function of
-         its row alone, and `MAP_ROWS` rows of a few columns hold the sharpest lobe.
-Pixels   Single rays, not squares: the light of a sharp lobe on a glossy sphere changes within a pixel of any small image.
-         Half of them are spread evenly over the sphere's disc, half about its highlight.
+Scene    A unit sphere in the camera frame (OpenCV), which is Mitsuba's world here. The camera is infinitely far away,
+         so that every pixel's view is (0, 0, −1).
+Light    A unit lobe exp(λ(ω·z − 1)) as an `envmap` rotated so that its pole is along z: the map is then a function of
+         its row alone, and `MAP_ROWS` rows of a few columns resolve the sharpest lobe.
+Pixels   Single rays, not squares: the light of a sharp lobe on a glossy sphere changes within a pixel of any small
+         image. Half of them are spread evenly over the sphere's disc, half about its highlight.
 Material Reflectances of 1: the model is linear in them, and its colour channels are independent.
 """
 
@@ -21,13 +21,15 @@ from factorlib.tracing.scene import SAMPLER, rgb, rigid, transform
 from factorlib.tracing.variant import mitsuba
 
 MAP_ROWS, MAP_COLUMNS = 2048, 8
-SPP, SHADOW_RAYS = 16, 4  # rays a pixel, and of each, directions by the light and as many by the material
-LEAST_FACING = 0.01  # n·o of a pixel
-ALPHA, SHARPNESS = (0.008, 1.0), (0.05, 1e4)  # log-uniform
+SPP = 16  # number of rays per pixel
+SHADOW_RAYS = 4  # number of directions per ray sampled by the light, and as many by the material
+LEAST_FACING = 0.01  # least n·o of a pixel
+ALPHA = (0.008, 1.0)  # range of α, log-uniform
+SHARPNESS = (0.05, 1e4)  # range of λ, log-uniform
 
 
 class Spheres(msgspec.Struct, frozen=True):
-    """n spheres: the lobe's axis (camera frame, unit) and sharpness, the material's roughness."""
+    """Parameters of n spheres: the lobe's axis (camera frame, unit) and sharpness, and the material's roughness."""
 
     axis: Float[np.ndarray, "n 3"]
     sharpness: Float[np.ndarray, " n"]
@@ -35,7 +37,7 @@ class Spheres(msgspec.Struct, frozen=True):
 
 
 class Pixels(msgspec.Struct, frozen=True):
-    """Pixels of spheres [n, m]: unit normals in the camera frame, and the radiance at unit reflectance and unit weight."""
+    """Pixels of spheres [n, m]: unit normals in the camera frame, and radiance at unit reflectance and unit weight."""
 
     normal: Float[np.ndarray, "n m 3"]
     diffuse: Float[np.ndarray, "n m"]
@@ -43,21 +45,31 @@ class Pixels(msgspec.Struct, frozen=True):
 
 
 def random_spheres(rng: np.random.Generator, count: int) -> Spheres:
-    """Axes uniform on the sphere, α and λ log-uniform."""
+    """Draw spheres: axes uniform on the sphere, α and λ log-uniform."""
     axis = unit(rng.standard_normal((count, 3)))
     alpha, sharpness = (np.exp(rng.uniform(low, high, count)) for low, high in np.log([ALPHA, SHARPNESS]))
     return Spheres(axis, sharpness, np.sqrt(alpha))
 
 
 def rendered(spheres: Spheres, pixels: int, rng: np.random.Generator) -> Pixels:
-    """`pixels` random pixels of each sphere, by Mitsuba; equal generators give equal bytes on one machine."""
+    """Render random pixels of each sphere by Mitsuba.
+
+    Args:
+        spheres: The spheres.
+        pixels: Number of pixels of each sphere.
+        rng: Random generator; equal ones give equal bytes on one machine.
+
+    Returns:
+        The pixels.
+    """
     rows = []
     lambertian = {"type": "diffuse", "reflectance": rgb(1.0)}
     for k, (axis, sharpness, alpha) in enumerate(
         zip(spheres.axis, spheres.sharpness, spheres.roughness**2, strict=True)
     ):
         normal = _normals(axis, sharpness, alpha, pixels, rng)
-        light, sensor = _envmap(axis, sharpness), _sensor(normal)
+        light = _envmap(axis, sharpness)
+        sensor = _sensor(normal)
         glossy = {"type": "roughconductor", "material": "none", "distribution": "ggx", "alpha": float(alpha)}
         rows.append((normal, *(_radiance(bsdf, light, sensor, k) for bsdf in (lambertian, glossy))))
     return Pixels(*(np.stack(column) for column in zip(*rows, strict=True)))
@@ -66,22 +78,23 @@ def rendered(spheres: Spheres, pixels: int, rng: np.random.Generator) -> Pixels:
 def _normals(
     axis: Float[np.ndarray, "3"], sharpness: float, alpha: float, count: int, rng: np.random.Generator
 ) -> Float[np.ndarray, "m 3"]:
-    """Normals that the camera sees, the even ones and those of the highlight in turn.
+    """Draw normals that the camera sees: first the even ones, then those about the highlight.
 
-    A normal's change turns the mirror direction twice as much: the highlight's are spread by √(α²/2 + 1/λ), half of what
-    `factorlib.reflection.samples` spreads lobes by.
+    A change of a normal rotates the mirror direction twice as much. So the highlight's normals have a spread of √(α²/2
+    + 1/λ), half of that of lobes in `factorlib.reflection.samples`.
     """
-    angle, radius = rng.uniform(0, 2 * np.pi, 4 * count), np.sqrt(rng.uniform(0, 1, 4 * count))
+    angle = rng.uniform(0, 2 * np.pi, 4 * count)
+    radius = np.sqrt(rng.uniform(0, 1, 4 * count))
     even = np.stack([radius * np.cos(angle), radius * np.sin(angle), -np.sqrt(1 - radius**2)], axis=-1)
     highlight = unit(axis + FRONT) + np.sqrt(alpha**2 / 2 + 1 / sharpness) * rng.standard_normal((4 * count, 3))
     even, highlight = (n[n @ FRONT > LEAST_FACING] for n in (even, unit(highlight)))
-    half = min(count // 2, len(highlight))  # none is seen of a light right behind the sphere
+    half = min(count // 2, len(highlight))  # a light right behind the sphere has no visible highlight
     return np.concatenate([even[: count - half], highlight[:half]])
 
 
 def _envmap(axis: Float[np.ndarray, "3"], sharpness: float) -> Any:
-    """A lobe of peak 1 as Mitsuba's emitter."""
-    theta = np.arange(MAP_ROWS) / (MAP_ROWS - 1) * np.pi  # Mitsuba's rows
+    """Return a lobe of peak 1 as Mitsuba's emitter."""
+    theta = np.arange(MAP_ROWS) / (MAP_ROWS - 1) * np.pi  # polar angle of Mitsuba's rows
     radiance = np.exp(-2 * sharpness * np.sin(theta / 2) ** 2).astype(np.float32)
     bitmap = mitsuba().Bitmap(np.tile(radiance[:, None, None], (1, MAP_COLUMNS, 3)))
     across = unit(np.cross(axis, np.eye(3)[np.abs(axis).argmin()]))
@@ -90,7 +103,7 @@ def _envmap(axis: Float[np.ndarray, "3"], sharpness: float) -> Any:
 
 
 def _sensor(normal: Float[np.ndarray, "m 3"]) -> Any:
-    """One ray a pixel, toward the sphere's points of these normals, side by side in an image of one row."""
+    """Return a sensor of one ray per pixel, toward the sphere's points of these normals, in an image of one row."""
     film = {"type": "hdrfilm", "height": 1, "rfilter": {"type": "box"}, "pixel_format": "rgb"}
     ray = {"type": "radiancemeter", "direction": (-FRONT).tolist(), "film": film | {"width": 1}}
     rays = {f"ray{k:05d}": ray | {"origin": (point + FRONT).tolist()} for k, point in enumerate(normal)}
@@ -99,6 +112,7 @@ def _sensor(normal: Float[np.ndarray, "m 3"]) -> Any:
 
 
 def _radiance(bsdf: dict[str, Any], light: Any, sensor: Any, seed: int) -> Float[np.ndarray, " m"]:
+    """Render the sphere with a BSDF and return the radiance of each pixel."""
     mi = mitsuba()
     integrator = {"type": "direct", "emitter_samples": SHADOW_RAYS, "bsdf_samples": SHADOW_RAYS}
     ball = mi.load_dict({"type": "sphere", "bsdf": bsdf})

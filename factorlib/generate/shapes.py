@@ -1,7 +1,7 @@
 """Shapes of the synthetic set: closed smooth surfaces about the origin, y up, about 1.2 units across.
 
-Each is a grid of rows (from the top pole down) and columns (about the y axis) closed by one vertex at either pole, so
-that one routine makes triangles and smooth normals of them all.
+Each is a grid of rows (from the top pole down) and columns (about the y axis), closed by one vertex at either pole. So
+one routine triangulates them all and computes their smooth normals.
 """
 
 from collections.abc import Callable
@@ -15,24 +15,58 @@ from factorlib.meshes.mesh import Mesh, closed_grid
 
 ROWS, COLUMNS = 60, 96
 
-# profiles (radius, y) of a foot, belly, neck and lip, and of a body, shoulder and neck
-VASE = ((0.0, 0.78), (0.22, 0.77), (0.33, 0.72), (0.31, 0.62), (0.29, 0.52), (0.38, 0.32), (0.55, 0.08), (0.60, -0.14),
-        (0.55, -0.38), (0.42, -0.62), (0.36, -0.74), (0.28, -0.78), (0.0, -0.79))  # fmt: skip
-BOTTLE = ((0.0, 0.86), (0.12, 0.85), (0.16, 0.80), (0.155, 0.70), (0.16, 0.52), (0.24, 0.36), (0.38, 0.20), (0.43, 0.02),
-          (0.43, -0.30), (0.43, -0.62), (0.41, -0.72), (0.34, -0.77), (0.0, -0.78))  # fmt: skip
-BUMPS = (((0.8, 0.5, 0.3), 0.75, 3.5), ((-0.85, -0.15, 0.4), 0.40, 5.0), ((-0.15, 0.9, -0.4), 0.20, 5.0),
-         ((0.25, -0.9, 0.3), 0.30, 3.0), ((0.2, 0.1, -0.95), 0.35, 4.0))  # direction, height, sharpness  # fmt: skip
+# profile (radius, y) of a vase with lip, neck, belly and foot
+VASE = (
+    (0.0, 0.78),
+    (0.22, 0.77),
+    (0.33, 0.72),
+    (0.31, 0.62),
+    (0.29, 0.52),
+    (0.38, 0.32),
+    (0.55, 0.08),
+    (0.60, -0.14),
+    (0.55, -0.38),
+    (0.42, -0.62),
+    (0.36, -0.74),
+    (0.28, -0.78),
+    (0.0, -0.79),
+)
+# profile (radius, y) of a bottle with neck, shoulder and body
+BOTTLE = (
+    (0.0, 0.86),
+    (0.12, 0.85),
+    (0.16, 0.80),
+    (0.155, 0.70),
+    (0.16, 0.52),
+    (0.24, 0.36),
+    (0.38, 0.20),
+    (0.43, 0.02),
+    (0.43, -0.30),
+    (0.43, -0.62),
+    (0.41, -0.72),
+    (0.34, -0.77),
+    (0.0, -0.78),
+)
+# direction, height and sharpness of each bump
+BUMPS = (
+    ((0.8, 0.5, 0.3), 0.75, 3.5),
+    ((-0.85, -0.15, 0.4), 0.40, 5.0),
+    ((-0.15, 0.9, -0.4), 0.20, 5.0),
+    ((0.25, -0.9, 0.3), 0.30, 3.0),
+    ((0.2, 0.1, -0.95), 0.35, 4.0),
+)
 
 
 def sphere(radius: float = 0.6) -> Mesh:
-    """A sphere."""
+    """Return a sphere."""
     return star(lambda direction: np.full(direction.shape[:-1], radius))
 
 
 def blob() -> Mesh:
-    """A smooth body without any symmetry: a ball with broad bumps of several heights."""
+    """Return a smooth body without any symmetry: a ball with broad bumps of several heights."""
 
     def radius(direction: Float[np.ndarray, "*n 3"]) -> Float[np.ndarray, "*n"]:
+        """Return the distance of the surface from the origin in each direction."""
         size = np.full(direction.shape[:-1], 0.42)
         for axis, height, sharpness in BUMPS:
             axis = np.array(axis) / np.linalg.norm(axis)
@@ -43,8 +77,9 @@ def blob() -> Mesh:
 
 
 def star(radius: Callable[[np.ndarray], np.ndarray]) -> Mesh:
-    """The surface at distance `radius(direction [*n, 3]) -> [*n]` from the origin."""
-    theta, phi = np.arange(1, ROWS) / ROWS * np.pi, np.arange(COLUMNS) / COLUMNS * 2 * np.pi
+    """Return the surface at distance `radius(direction [*n, 3]) -> [*n]` from the origin."""
+    theta = np.arange(1, ROWS) / ROWS * np.pi
+    phi = np.arange(COLUMNS) / COLUMNS * 2 * np.pi
     sin = np.sin(theta)[:, None]
     direction = np.stack(np.broadcast_arrays(sin * np.sin(phi), np.cos(theta)[:, None], sin * np.cos(phi)), axis=-1)
     poles = np.array([[0.0, 1.0, 0.0], [0.0, -1.0, 0.0]])
@@ -52,7 +87,7 @@ def star(radius: Callable[[np.ndarray], np.ndarray]) -> Mesh:
 
 
 def revolved(profile: Float[np.ndarray, "n 2"]) -> Mesh:
-    """Surface of revolution about y of a profile of (radius, y), from the top pole to the bottom one."""
+    """Return the surface of revolution about y of a profile (radius, y), from the top pole to the bottom one."""
     length = np.concatenate([[0], np.cumsum(np.linalg.norm(np.diff(profile, axis=0), axis=1))])
     curve = PchipInterpolator(length, profile)(np.arange(1, ROWS) / ROWS * length[-1])
     phi = np.arange(COLUMNS) / COLUMNS * 2 * np.pi
@@ -62,5 +97,8 @@ def revolved(profile: Float[np.ndarray, "n 2"]) -> Mesh:
 
 
 SHAPES: dict[str, Callable[[], Mesh]] = {
-    "sphere": sphere, "vase": partial(revolved, np.array(VASE)), "bottle": partial(revolved, np.array(BOTTLE)), "blob": blob,
-}  # fmt: skip
+    "sphere": sphere,
+    "vase": partial(revolved, np.array(VASE)),
+    "bottle": partial(revolved, np.array(BOTTLE)),
+    "blob": blob,
+}

@@ -1,8 +1,8 @@
-"""The synthetic set: three materials in three lights on exact shapes at given poses, with every truth known.
+"""Synthetic set: three materials in three lights on exact shapes at given poses, with all ground truth known.
 
-Each object is traced alone in its light by direct light only, so that the image is what the model says it is: no
-object shadows or mirrors another.  One photo is a linear EXR, one a 16-bit PNG, one an 8-bit JPEG with some highlights
-clipped; one pose is not given.  Seed 0 is the set the project carries; others have other materials, views and lights.
+Each object is traced alone in its light by direct light only, so that the image satisfies the model exactly: no object
+shadows or reflects another. One photo is a linear EXR, one a 16-bit PNG, one an 8-bit JPEG with some highlights
+clipped; one pose is not given. Seed 0 is the set in the repository; others have other materials, views and lights.
 """
 
 from collections.abc import Callable, Sequence
@@ -34,7 +34,13 @@ MATERIALS = {
 
 
 class Parameters(msgspec.Struct, frozen=True):
-    """Pixels, pixels, pixels, rows, samples per pixel of photos and of lights."""
+    """Parameters of the set.
+
+    width, height    size of photos, pixels
+    focal_px         focal length, pixels
+    light_rows       rows of light maps
+    spp, light_spp   samples per pixel of photos and of light maps
+    """
 
     width: int = 192
     height: int = 128
@@ -45,7 +51,13 @@ class Parameters(msgspec.Struct, frozen=True):
 
 
 class Placed(msgspec.Struct, frozen=True):
-    """A shape of a material at a place in the photo, turned about the vertical, then tilted about two axes, radians."""
+    """Shape of a material in a photo.
+
+    x      position across, at the distance DISTANCE
+    turn   rotation about the vertical, radians
+    tilt   rotation about two axes after that, radians
+    posed  True if the data set gives the pose
+    """
 
     shape: str
     material: str
@@ -56,12 +68,12 @@ class Placed(msgspec.Struct, frozen=True):
 
     @property
     def name(self) -> str:
-        """The object's name: its material and its shape."""
+        """Name of the object: its material and its shape."""
         return f"{self.material}_{self.shape}"
 
 
 class Shot(msgspec.Struct, frozen=True):
-    """A photo: its file's kind, its objects, and the brightest fraction of object pixels that clips (None: nothing)."""
+    """Photo: suffix of its file, its objects, and the fraction of object pixels that is clipped (None: nothing)."""
 
     name: str
     suffix: str
@@ -70,21 +82,36 @@ class Shot(msgspec.Struct, frozen=True):
 
 
 SHOTS = (
-    Shot("garden", ".exr", (Placed("sphere", "red", -1.22), Placed("vase", "green", 0.0), Placed("blob", "blue", 1.22, 0.6))),
-    Shot("parlour", ".png", (Placed("bottle", "green", -1.22), Placed("sphere", "blue", 0.0), Placed("vase", "red", 1.22))),
     Shot(
-        "study", ".jpg",
-        (Placed("blob", "red", -1.22, 2.2, (0.2, -0.3), posed=False), Placed("bottle", "blue", 0.0, 0.0, (0.25, 0.15)), Placed("sphere", "green", 1.22)),
+        "garden",
+        ".exr",
+        (Placed("sphere", "red", -1.22), Placed("vase", "green", 0.0), Placed("blob", "blue", 1.22, 0.6)),
+    ),
+    Shot(
+        "parlour",
+        ".png",
+        (Placed("bottle", "green", -1.22), Placed("sphere", "blue", 0.0), Placed("vase", "red", 1.22)),
+    ),
+    Shot(
+        "study",
+        ".jpg",
+        (
+            Placed("blob", "red", -1.22, 2.2, (0.2, -0.3), posed=False),
+            Placed("bottle", "blue", 0.0, 0.0, (0.25, 0.15)),
+            Placed("sphere", "green", 1.22),
+        ),
         clipped=0.03,
     ),
-)  # fmt: skip
+)
 
 
 class Scene(msgspec.Struct, frozen=True):
-    """What one photo shows: objects in one light.
+    """Contents of one photo: objects in one light.
 
-    light: lat-long map in the camera's y-up frame, radiance in its own unit;  materials: by name, in the order of their labels
-    meshes: by shape;  poses: cam_from_object by the object's name, in the order of `shot.placed`
+    light       lat-long map in the camera's y-up frame, radiance in its own unit
+    materials   materials by name, in the order of their labels
+    meshes      meshes by shape
+    poses       cam_from_object by the object's name, in the order of `shot.placed`
     """
 
     shot: Shot
@@ -95,15 +122,25 @@ class Scene(msgspec.Struct, frozen=True):
 
 
 def generate(out: Path, seed: int, lat_longs: Sequence[Path], parameters: Parameters, progress: Progress) -> None:
-    """Write the data set into the empty folder `out`; `lat_longs` (maps of the user's) replace the made lights."""
+    """Write the data set into the empty folder `out`.
+
+    Args:
+        out: Empty folder.
+        seed: Seed; 0 is the set in the repository.
+        lat_longs: Light maps of the user, which replace the generated lights.
+        parameters: Parameters of the set.
+        progress: Function of the number of steps that are done, of their total, and of the current step.
+    """
     for name in ("photos", "masks", "meshes", "truth"):
         (out / name).mkdir(parents=True)
-    rng, spread = np.random.default_rng([7, seed]), 0.0 if seed == 0 else 1.0
+    rng = np.random.default_rng([7, seed])
+    spread = 0.0 if seed == 0 else 1.0
     materials = random_materials(rng, 0.25 * spread, MATERIALS)
     meshes = {name: make() for name, make in SHAPES.items()}
     for name, mesh in meshes.items():
         write_ply(out / f"meshes/{name}.ply", mesh)
-    photos, poses = [], {}
+    photos = []
+    poses = {}
     for number, shot in enumerate(SHOTS):
         progress(2 * number, 2 * len(SHOTS), f"light of {shot.name}")
         world_from_camera = look(rng.uniform(-14, -6), rng.uniform(0, 360))
@@ -121,8 +158,21 @@ def generate(out: Path, seed: int, lat_longs: Sequence[Path], parameters: Parame
 def light_of(
     number: int, world_from_camera: Rotation, lat_longs: Sequence[Path], rng: Rng, rows: int, spp: int
 ) -> Float[np.ndarray, "h w 3"]:
-    """The light of photo `number`, in the camera's y-up frame: one of `lat_longs`, or daylight for photo 0, the sun behind the camera
-    to its left or right, and for the others rooms with as many lamps as their number.  rows, spp: of the map, and samples a pixel
+    """Return the light of a photo in the camera's y-up frame.
+
+    It is one of `lat_longs`. Without them, photo 0 has daylight, with the sun behind the camera to its left or right,
+    and the others have rooms with as many lamps as their number.
+
+    Args:
+        number: Number of the photo.
+        world_from_camera: Rotation of the camera.
+        lat_longs: Light maps of the user.
+        rng: Random generator.
+        rows: Rows of the map.
+        spp: Samples per pixel.
+
+    Returns:
+        A lat-long map.
     """
     if lat_longs:
         return captured(lat_longs[number % len(lat_longs)], rows)
@@ -131,13 +181,24 @@ def light_of(
         scene = room(rng, windows=2, lamps=number)
     else:
         forward = np.degrees(np.arctan2(world_from_camera[0, 2], world_from_camera[2, 2]))
-        up, turn = rng.uniform(30, 50), rng.choice([-1, 1]) * rng.uniform(35, 70)
+        up = rng.uniform(30, 50)
+        turn = rng.choice([-1, 1]) * rng.uniform(35, 70)
         scene = daylight(rng, up, forward + 180 + turn, rows=2 * rows)
     return light_seen(scene, rigid(world_from_camera @ YUP_FROM_CAMERA, (0, 0, 0)), rows, spp, seed)
 
 
 def placements(shot: Shot, world_from_camera: Rotation, rng: np.random.Generator, spread: float) -> dict[str, Pose]:
-    """cam_from_object of each object, upright in the world but for its tilt; a spread turns each at random."""
+    """Return cam_from_object of each object, upright in the world but for its tilt.
+
+    Args:
+        shot: The shot.
+        world_from_camera: Rotation of the camera.
+        rng: Random generator.
+        spread: Size of the random rotations, from 0 to 1.
+
+    Returns:
+        Poses by the object's name.
+    """
     poses = {}
     for placed in shot.placed:
         turn = rotation_of_vector(np.array([0, placed.turn + spread * rng.uniform(-np.pi, np.pi), 0]))
@@ -148,8 +209,20 @@ def placements(shot: Shot, world_from_camera: Rotation, rng: np.random.Generator
 
 
 def write_shot(out: Path, scene: Scene, parameters: Parameters, seed: int) -> dict:
-    """Trace, expose and write one photo, its mask, its light in the photo's units and its normals; its entry of dataset.yaml."""
-    shot, poses, order = scene.shot, list(scene.poses.values()), list(scene.materials)
+    """Render, expose and write one photo, with its mask, its light in the photo's units, and its normals.
+
+    Args:
+        out: Folder of the data set.
+        scene: The scene.
+        parameters: Parameters of the set.
+        seed: Seed of the renderer.
+
+    Returns:
+        The photo's entry of dataset.yaml.
+    """
+    shot = scene.shot
+    poses = list(scene.poses.values())
+    order = list(scene.materials)
     width, height = parameters.width, parameters.height
     camera = Camera(width, height, parameters.focal_px, (width / 2, height / 2))
     labelled = []
@@ -159,7 +232,7 @@ def write_shot(out: Path, scene: Scene, parameters: Parameters, seed: int) -> di
         labelled.append(msgspec.structs.replace(mesh, face_label=label))
     labels = folder.labels_of(labelled, camera, poses)
     radiance = composed(scene, camera, parameters.spp, seed)
-    # clips the wanted fraction of object pixels; for none, the brightest just not; floats have mean ¼
+    # exposure that clips the given fraction of object pixels, or just none; a float file gets a mean of ¼
     brightest = radiance[(labels > 0) & (labels < LEFT_OUT)].max(axis=-1)
     exposure = float(1 / np.quantile(brightest, 1 - shot.clipped) if shot.clipped else 0.95 / brightest.max())
     if shot.suffix == ".exr":
@@ -171,15 +244,33 @@ def write_shot(out: Path, scene: Scene, parameters: Parameters, seed: int) -> di
         if placed.posed:
             own["pose"] = folder.pose_entry(scene.poses[placed.name])
     return {
-        "name": shot.name, "image": f"photos/{shot.name}{shot.suffix}", "masks": f"masks/{shot.name}.png",
-        "camera": {"focal_px": parameters.focal_px}, "objects": objects,
-    }  # fmt: skip
+        "name": shot.name,
+        "image": f"photos/{shot.name}{shot.suffix}",
+        "masks": f"masks/{shot.name}.png",
+        "camera": {"focal_px": parameters.focal_px},
+        "objects": objects,
+    }
 
 
 def composed(scene: Scene, camera: Camera, spp: int, seed: int) -> Float[np.ndarray, "h w 3"]:
-    """The photo: each pixel is that of the nearest object, traced alone; the background is the same in all."""
-    shot, meshes, poses = scene.shot, scene.meshes, list(scene.poses.values())
-    radiance, world = np.zeros((camera.height, camera.width, 3)), rigid(YUP_FROM_CAMERA, np.zeros(3))
+    """Compose the photo: each pixel is taken from the render of the nearest object alone.
+
+    The background is the same in all renders.
+
+    Args:
+        scene: The scene.
+        camera: Camera.
+        spp: Samples per pixel.
+        seed: Seed of the renderer.
+
+    Returns:
+        Radiance.
+    """
+    shot = scene.shot
+    meshes = scene.meshes
+    poses = list(scene.poses.values())
+    radiance = np.zeros((camera.height, camera.width, 3))
+    world = rigid(YUP_FROM_CAMERA, np.zeros(3))
     silhouettes = folder.object_masks([meshes[placed.shape] for placed in shot.placed], camera, poses)
     nearest = np.argmin([distance_transform_edt(~inside) for inside in silhouettes], axis=0)
     for number, (placed, pose) in enumerate(zip(shot.placed, poses, strict=True)):
@@ -187,7 +278,8 @@ def composed(scene: Scene, camera: Camera, spp: int, seed: int) -> Float[np.ndar
         solid = shape(meshes[placed.shape], bsdf(scene.materials[placed.material]), place)
         own = nearest == number
         columns = slice(np.flatnonzero(own.any(axis=0))[0], np.flatnonzero(own.any(axis=0))[-1] + 1)
-        entries, view = {"shape": solid, "light": envmap(scene.light)}, sensor(camera, world, columns)
+        entries = {"shape": solid, "light": envmap(scene.light)}
+        view = sensor(camera, world, columns)
         alone = rendered(entries, view, spp, 100 * seed + number, max_depth=2)
         radiance[:, columns][own[:, columns]] = alone[own[:, columns]]
     return radiance

@@ -1,7 +1,8 @@
-"""Where objects are and what they see of each other: nothing here knows of pictures' values or of materials' reflectances.
+"""Geometry of objects and cameras, independent of images and of reflectance.
 
 camera      cameras and rigid poses
-raster      ray casting and rasterising of meshes
-visibility  which directions a surface point sees past the objects of its photo
+raster      ray casting and rasterisation of meshes
+visibility  directions in which a surface point is not occluded by the objects of its photo
 sphere      even sets of directions, mirror directions, cells of directions
+met         codes of occluding surfaces
 """

@@ -1,7 +1,7 @@
-"""Codes of the surfaces that hide directions: which material a ray meets, and about which normal it has there.
+"""Codes of surfaces that hide directions: the material that a ray hits, and its approximate normal there.
 
 code = number of the material · BINS + number of the direction of `fibonacci_sphere(BINS)` nearest to the normal
-UNMET  nothing is met, or it is not known what
+UNMET  no surface is hit, or it is unknown
 """
 
 import numpy as np
@@ -9,11 +9,15 @@ from jaxtyping import Float, Int, UInt16
 
 from factorlib.geometry.sphere import fibonacci_sphere
 
-BINS, UNMET = 64, 65535
+BINS = 64  # number of normals
+UNMET = 65535
 
 
 def met_codes(material: Int[np.ndarray, " n"], normal: Float[np.ndarray, "n 3"]) -> UInt16[np.ndarray, " n"]:
-    """Codes by number of the material (from 0; below 0: not known) and normal, unit, camera frame, on the side that is met.
+    """Return the codes of materials and normals.
+
+    `material` counts from 0; negative numbers are unknown. `normal` is unit, in the camera frame, on the side that is
+    hit.
 
     >>> met_codes(np.array([0, 2, -1]), np.array([[0.0, 0, 1], [0, 0, 1], [0, 0, 1]])).tolist()
     [0, 128, 65535]

@@ -7,7 +7,7 @@ Vectors = Float[np.ndarray, "*n 3"]
 
 
 def fibonacci_sphere(count: int) -> Float[np.ndarray, "count 3"]:
-    """`count` nearly uniform unit directions.
+    """Return `count` nearly uniform unit directions.
 
     >>> bool(abs(fibonacci_sphere(100).mean()) < 1e-2)
     True
@@ -19,19 +19,28 @@ def fibonacci_sphere(count: int) -> Float[np.ndarray, "count 3"]:
 
 
 def mirror_directions(normal: Vectors, view: Vectors) -> Vectors:
-    """2(n·o)n − o: where a mirror at the point would show the light from; all unit, in one frame."""
+    """Return mirror directions 2(n·o)n − o, the directions of incident light of a mirror; all unit, in one frame."""
     return 2 * np.sum(normal * view, axis=-1, keepdims=True) * normal - view
 
 
 def mirror_cells(normal: Vectors, view: Vectors, size: float) -> Int[np.ndarray, " n"]:
-    """Number of the cell in which each observation's mirror direction lies; cells are cubes with sides of length `size`."""
+    """Return the number of the cell that contains each observation's mirror direction; cells are cubes.
+
+    Args:
+        normal: Unit normals.
+        view: Unit directions to the viewer.
+        size: Side of a cell.
+
+    Returns:
+        A number for each observation.
+    """
     return np.floor((mirror_directions(normal, view) + 1) / size).astype(int) @ [1, 1_000, 1_000_000]
 
 
 def direction_cells(direction: Float[np.ndarray, "n 3"], size: float) -> Int[np.ndarray, "n 3"]:
-    """Cells of roughly `size` radians: an octahedral map of the sphere, cut into squares."""
+    """Return cells of roughly `size` radians, by an octahedral map of the sphere that is cut into squares."""
     x, y, z = np.moveaxis(direction / np.abs(direction).sum(-1, keepdims=True), -1, 0)
-    fold = z > 0  # the viewer's side (z < 0) stays whole in the middle
+    fold = z > 0  # the viewer's hemisphere (z < 0) is the connected middle of the map
     u = np.where(fold, (1 - np.abs(y)) * np.sign(x), x)
     v = np.where(fold, (1 - np.abs(x)) * np.sign(y), y)
     step = size / np.sqrt(np.pi)  # the square of area 4 covers 4π steradians
@@ -39,7 +48,9 @@ def direction_cells(direction: Float[np.ndarray, "n 3"], size: float) -> Int[np.
 
 
 def ball_normals(size: int) -> tuple[Float[np.ndarray, "n 3"], Bool[np.ndarray, "size size"]]:
-    """Normals of the pixels whose centre is on the ball that fills the picture, and those pixels; +y is up, +z toward the viewer.
+    """Return the normals of a ball that fills a picture, and a mask of its pixels.
+
+    A pixel belongs to the ball if its centre does; +y is up, +z points toward the viewer.
 
     >>> ball_normals(1)[0].tolist()
     [[0.0, -0.0, 1.0]]

@@ -1,14 +1,14 @@
-"""Which directions each observed surface point sees past the objects of its photo, by Open3D's ray casting on the CPU.
+"""Visibility of directions from surface points past the objects of a photo, by Open3D's ray casting on the CPU.
 
-A ray leaves the surface a thousandth of its object's radius along the face's normal.  What is asked is the smooth
-surface that the mesh stands for, so a direction that the shading normal's hemisphere holds but the flat face's does not
-is bent up to the face's horizon first: no convex mesh, however coarse, shadows itself.  Directions below the shading
-normal's horizon are not cast and count as seen; nothing is reflected from there.
+A ray leaves the surface a thousandth of its object's radius along the face's normal. The mesh stands for a smooth
+surface. So a direction above the horizon of the shading normal, but below that of the flat face, is first bent up to
+the latter. Then no convex mesh, however coarse, shadows itself. Directions below the shading normal's horizon are not
+cast and count as visible; nothing is reflected from there.
 
-Of more than `most_points` points an evenly spread subset is cast, and the others take the visibility of the nearest cast
-one, near in place and in normal alike.
+If there are more than `most_points` points, an evenly spread subset is cast. The other points take the visibility of
+the nearest cast point, near in position and in normal alike.
 
-Of a ray that is not free it is also kept which surface it meets, as a code of `factorlib.geometry.met`.
+For a ray that is not free, the surface that it hits is recorded too, as a code of `factorlib.geometry.met`.
 """
 
 from collections.abc import Callable, Iterator, Sequence
@@ -25,17 +25,17 @@ from factorlib.geometry.raster import Caster, unit
 from factorlib.geometry.sphere import fibonacci_sphere
 from factorlib.meshes.mesh import Mesh, area_vectors
 
-LIFT = 1e-3  # of the object's radius: how far off the surface rays start
+LIFT = 1e-3  # distance of a ray's origin from the surface, in units of the object's radius
 GRAZING = 0.02  # sine of the least angle between a ray and its face
-BELOW = -0.1  # n·d of directions that are still cast: normals that are averaged later may lean that far
-ROWS = 256  # points whose rays are held at once, few enough for the processor's cache
+BELOW = -0.1  # least n·d of directions that are cast: normals that are averaged later may lean that far
+ROWS = 256  # number of points whose rays are in memory at once, few enough for the processor's cache
 Vectors = Float[np.ndarray, "n 3"]
 Report = Callable[[int, int], None]
-NORMAL_WEIGHT = 10.0  # spacings of cast points that a difference of 1 between normals counts for
+NORMAL_WEIGHT = 10.0  # a difference of 1 between normals counts as this many spacings of cast points
 
 
 class Points(msgspec.Struct, frozen=True):
-    """Surface points under pixels: place and face normal (camera frame, facing the camera) and where there is one."""
+    """Surface points under pixels: position and face normal (camera frame, facing the camera), and their existence."""
 
     place: Float[np.ndarray, "n 3"]  # mesh units, lifted off the surface
     face_normal: Float[np.ndarray, "n 3"]
@@ -43,10 +43,10 @@ class Points(msgspec.Struct, frozen=True):
 
 
 class Sight(msgspec.Struct, frozen=True):
-    """What n points see of k directions.
+    """Visibility of k directions from n points.
 
     visibility  255 where a direction is free of the objects, 0 where not
-    met         codes of the surfaces that are met
+    met         codes of the surfaces that are hit
     """
 
     visibility: UInt8[np.ndarray, "n k"]
@@ -54,28 +54,39 @@ class Sight(msgspec.Struct, frozen=True):
 
 
 class Occluders(Caster):
-    """The posed objects of one photo as one mesh, in the camera's frame."""
+    """Posed objects of one photo as one mesh, in the camera's frame."""
 
     def __init__(self, meshes: Sequence[Mesh], poses: Sequence[Pose]):
-        """poses: cam_from_object; raises ValueError for no mesh at all."""
+        """Join the meshes at their poses (cam_from_object); raise ValueError if there is no mesh."""
         vertices = [pose.apply(mesh.vertices) for mesh, pose in zip(meshes, poses, strict=True)]
         first = np.cumsum([0, *map(len, vertices)])
         faces = np.vstack([mesh.faces + start for mesh, start in zip(meshes, first, strict=False)])
-        normals, labels = np.vstack([mesh.normals for mesh in meshes]), [mesh.face_label for mesh in meshes]
+        normals = np.vstack([mesh.normals for mesh in meshes])
+        labels = [mesh.face_label for mesh in meshes]
         super().__init__(Mesh(np.vstack(vertices), faces, normals, np.concatenate(labels)))
-        self.normal = unit(area_vectors(self.mesh.vertices, faces))  # of faces
+        self.normal = unit(area_vectors(self.mesh.vertices, faces))  # face normals
         self.lift = LIFT * np.repeat([mesh.radius for mesh in meshes], [len(mesh.faces) for mesh in meshes])
 
     def points_under(self, camera: Camera, x: Int[np.ndarray, " n"], y: Int[np.ndarray, " n"]) -> Points:
-        """Return what the rays through the centres of pixels (x, y) meet first."""
+        """Return the surface points that the rays through the centres of pixels (x, y) hit first.
+
+        Args:
+            camera: Camera.
+            x: Columns of the pixels.
+            y: Rows of the pixels.
+
+        Returns:
+            The points.
+        """
         along = camera.rays_through(np.column_stack([x, y]) + 0.5)
         distance, face, behind = self._first(self._rays(np.zeros_like(along), along))
         found = np.isfinite(distance)
-        depth, normal = np.where(found, distance * self.radius, 0.0), self.turned(face, behind)
+        depth = np.where(found, distance * self.radius, 0.0)
+        normal = self.turned(face, behind)
         return Points(depth[:, None] * along + self.lift[face][:, None] * normal, normal, found)
 
     def turned(self, face: Int[np.ndarray, " n"], behind: Bool[np.ndarray, " n"]) -> Vectors:
-        """Return the normals of faces, turned over where the face is met from `behind`."""
+        """Return the normals of faces, flipped where the face is hit from `behind`."""
         return np.where(behind[:, None], -self.normal[face], self.normal[face])
 
     def seen_from(
@@ -85,7 +96,17 @@ class Occluders(Caster):
         directions: Float[np.ndarray, "k 3"],
         report: Report = lambda done, total: None,
     ) -> Sight:
-        """Return what the points see along `directions` (camera frame, unit); report: called with how many of them are done."""
+        """Compute the visibility of directions from points.
+
+        Args:
+            points: Surface points.
+            shading_normal: Unit shading normals of the points.
+            directions: Unit directions, camera frame.
+            report: Function of the number of points that are done and of their total.
+
+        Returns:
+            Visibility and codes of the hiding surfaces.
+        """
         seen = np.full((len(shading_normal), len(directions)), 255, np.uint8)
         met = np.full(seen.shape, UNMET, np.uint16)
         material = self.mesh.face_label.astype(np.int64) - 1
@@ -102,15 +123,23 @@ class Occluders(Caster):
         directions: Float[np.ndarray, "k 3"],
         report: Report = lambda done, total: None,
     ) -> Iterator[tuple[np.ndarray, ...]]:
-        """The pairs of a point and a direction that is hidden from it, in order of the points, some points at a time.
+        """Yield the pairs of a point and a direction that is hidden from it, in order of the points, in chunks.
 
-        point, direction, face [n]: their numbers, and that of the face that is met, −1 where it is not known;  behind [n]: whether the face is met
-        from behind
+        Args:
+            points: Surface points.
+            shading_normal: Unit shading normals of the points.
+            directions: Unit directions, camera frame.
+            report: Function of the number of points that are done and of their total.
+
+        Yields:
+            Arrays [n]: number of the point; number of the direction; number of the face that is hit, −1 if unknown;
+            whether the face is hit from behind.
         """
         for i in range(0, len(shading_normal), ROWS):
             report(i, len(shading_normal))
             rows = slice(i, i + ROWS)
             row, k = np.nonzero((shading_normal[rows] @ directions.T > BELOW) & points.found[rows, None])
+            # bend directions below the face's horizon up to it
             normal = points.face_normal[rows]
             below = np.maximum(GRAZING - normal @ directions.T, 0)[row, k]
             rays = self._rays(points.place[rows][row], directions[k] + below[:, None] * normal[row])
@@ -119,25 +148,39 @@ class Occluders(Caster):
             yield i + row[hidden], k[hidden], np.where(np.isfinite(distance), face, -1), behind
 
     def _first(self, rays: Float[np.ndarray, "n 6"]) -> tuple[np.ndarray, ...]:
-        """Of the surfaces that rays meet first: distance [n] in radii, infinite for none, face [n], and whether it is met
-        from behind [n]."""
+        """Return the first hits of rays: distance in radii (inf for none), face, and whether it is hit from behind."""
         hits = self.scene.cast_rays(o3d.core.Tensor(rays), nthreads=1)
         distance = hits["t_hit"].numpy().astype(float)
         face = np.where(np.isfinite(distance), hits["primitive_ids"].numpy(), 0).astype(np.int64)
         return distance, face, np.sum(self.normal[face] * rays[:, 3:], 1) > 0
 
     def _rays(self, start: np.ndarray, along: np.ndarray) -> Float[np.ndarray, "n 6"]:
-        """In the scene's frame, where `along` keeps its length: distances come back in units of the radius."""
+        """Return rays in the scene's frame; `along` keeps its length, so that distances are in units of the radius."""
         return np.hstack([(start - self.centre) / self.radius, along], dtype=np.float32, casting="same_kind")
 
 
 def sight(
-    occluders: Occluders, camera: Camera, pixels: Int[np.ndarray, "n 2"], shading_normal: Vectors, directions: int, most_points: int,
+    occluders: Occluders,
+    camera: Camera,
+    pixels: Int[np.ndarray, "n 2"],
+    shading_normal: Vectors,
+    directions: int,
+    most_points: int,
     report: Report = lambda done, total: None,
-) -> Sight | None:  # fmt: skip
-    """Return what the points under pixels (x, y) see of the directions `fibonacci_sphere(directions)`; None where all see all.
+) -> Sight | None:
+    """Compute the visibility of the directions `fibonacci_sphere(directions)` from the points under pixels.
 
-    report: called now and then with how many of the points that are cast from are done, and how many there are
+    Args:
+        occluders: Objects of the photo.
+        camera: Camera.
+        pixels: Pixels (x, y).
+        shading_normal: Unit shading normals of the pixels.
+        directions: Number of directions.
+        most_points: Greatest number of points to cast from, approximately.
+        report: Function, called now and then, of the number of cast points that are done and of their total.
+
+    Returns:
+        Visibility and codes; None if all directions are visible from all points.
     """
     x, y = pixels.T
     points = occluders.points_under(camera, x, y)
@@ -148,7 +191,7 @@ def sight(
         return None
     if len(cast) == len(x):
         return seen
-    # of the cast points the nearest one, in place (in units of their spacing) and in normal
+    # nearest cast point, in position (in units of their spacing) and in normal
     spacing = max(float(np.median(cKDTree(some.place).query(some.place, k=2)[0][:, 1])), 1e-12)
     places = np.column_stack([points.place / spacing, NORMAL_WEIGHT * shading_normal])
     near = cKDTree(places[cast]).query(places)[1]
@@ -156,7 +199,15 @@ def sight(
 
 
 def spread_subset(x: Int[np.ndarray, " n"], y: Int[np.ndarray, " n"], most: int) -> Int[np.ndarray, " m"]:
-    """Rows of at most about `most` pixels: the first in each square of the picture.
+    """Select at most about `most` pixels: the first in each square of the picture.
+
+    Args:
+        x: Columns of the pixels.
+        y: Rows of the pixels.
+        most: Approximate limit of the number of pixels.
+
+    Returns:
+        Ascending indices of pixels.
 
     >>> y, x = np.divmod(np.arange(64), 8)
     >>> spread_subset(x, y, 16).tolist() == [8 * i + j for i in range(0, 8, 2) for j in range(0, 8, 2)]

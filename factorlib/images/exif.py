@@ -1,5 +1,8 @@
-"""What a camera wrote about a photo (EXIF), by OpenImageIO's names of the tags: how much light its exposure let in, and the focal length
-in pixels.  Focal lengths hold for the whole frame only: a crop keeps the tags and changes the angle, by how much nobody wrote down."""
+"""EXIF data of a photo, under OpenImageIO's names of the tags: exposure and focal length in pixels.
+
+Focal lengths hold for the whole frame only. A crop keeps the tags and changes the field of view, by an amount that is
+not recorded.
+"""
 
 import logging
 import math
@@ -14,15 +17,22 @@ from PIL import Image
 
 EXIF_IFD = 0x8769
 NAMES = {
-    0x829A: "ExposureTime", 0x829D: "FNumber", 0x8827: "Exif:PhotographicSensitivity", 0x920A: "Exif:FocalLength",
-    0xA002: "Exif:PixelXDimension", 0xA003: "Exif:PixelYDimension", 0xA20E: "Exif:FocalPlaneXResolution",
-    0xA210: "Exif:FocalPlaneResolutionUnit", 0xA405: "Exif:FocalLengthIn35mmFilm", 0xA401: "Exif:CustomRendered",
+    0x829A: "ExposureTime",
+    0x829D: "FNumber",
+    0x8827: "Exif:PhotographicSensitivity",
+    0x920A: "Exif:FocalLength",
+    0xA002: "Exif:PixelXDimension",
+    0xA003: "Exif:PixelYDimension",
+    0xA20E: "Exif:FocalPlaneXResolution",
+    0xA210: "Exif:FocalPlaneResolutionUnit",
+    0xA405: "Exif:FocalLengthIn35mmFilm",
+    0xA401: "Exif:CustomRendered",
     0xA40A: "Exif:Sharpness",
-}  # fmt: skip
-WHOLE = (0x8827, 0xA002, 0xA003, 0xA210, 0xA401, 0xA405, 0xA40A)
-DNG_VERSION = 0xC612  # a tag that every DNG has
-ISO_UNSAID = 65535  # what the tag holds for all that does not fit into it
-DAMAGED = (OSError, ValueError, SyntaxError, TypeError, KeyError, IndexError, struct.error)  # what Pillow makes of it
+}
+WHOLE = (0x8827, 0xA002, 0xA003, 0xA210, 0xA401, 0xA405, 0xA40A)  # tags of whole numbers
+DNG_VERSION = 0xC612  # tag that every DNG has
+ISO_UNSAID = 65535  # value of the tag if the sensitivity does not fit into it
+DAMAGED = (OSError, ValueError, SyntaxError, TypeError, KeyError, IndexError, struct.error)  # Pillow on damaged tags
 FILM_DIAGONAL = math.hypot(36.0, 24.0)  # mm
 FRAMES = (3 / 2, 4 / 3, 16 / 9)  # long side / short side of whole frames
 SAME_SHAPE = 0.02  # relative tolerance of proportions: cameras trim some pixels
@@ -31,12 +41,16 @@ log = logging.getLogger("factorlib.images")
 
 
 def exif_of(source: bytes | str | Path | None) -> dict[str, float | int]:
-    """The tags of a block as HEIF keeps it ("Exif", two zeros, a TIFF), or of a file that begins as a TIFF does, as DNG and most raw
-    files do; none where there are none, or where they are damaged.  `DNG` is True for a DNG."""
-    exif, named, numbers = Image.Exif(), {}, {}
+    """Read the tags of a block in HEIF's form ("Exif", two zeros, a TIFF), or of a file that begins as a TIFF does.
+
+    DNG and most raw files begin so. Missing or damaged tags are left out. `DNG` is True for a DNG.
+    """
+    exif = Image.Exif()
+    named = {}
+    numbers = {}
     with (
         suppress(*DAMAGED),
-        warnings.catch_warnings(action="ignore"),  # of damaged tags, in lines of Pillow's source
+        warnings.catch_warnings(action="ignore"),  # Pillow warns of damaged tags
         nullcontext() if isinstance(source, bytes | None) else Path(source).open("rb") as stream,
     ):
         exif.load(source or b"") if stream is None else exif.load_from_fp(stream)
@@ -54,9 +68,9 @@ def exif_of(source: bytes | str | Path | None) -> dict[str, float | int]:
 
 
 def exposure_of_exif(exif: Mapping[str, Any]) -> float | None:
-    """t · S / N²: exposure time (s) times ISO sensitivity over the square of the f-number; None where one is not said.
+    """Return t · S / N², exposure time (s) times ISO sensitivity over the squared f-number; None if one is missing.
 
-    What a camera writes of the same light is proportional to it.
+    The values that a camera records of the same light are proportional to it.
 
     >>> exposure_of_exif({"ExposureTime": 0.01, "FNumber": 2.0, "Exif:PhotographicSensitivity": 100})
     0.25
@@ -69,11 +83,21 @@ def exposure_of_exif(exif: Mapping[str, Any]) -> float | None:
 
 
 def focal_px_of_exif(exif: Mapping[str, Any], width: int, height: int, file: str | Path = "") -> float | None:
-    """Focal length in pixels of a photo of width × height as stored; None where EXIF does not say it, or the photo is a crop.
+    """Return the focal length in pixels of a photo by its EXIF data.
 
-    The first of two ways that works: `FocalLengthIn35mmFilm` f₃₅ by the convention of CIPA DCG-001, the same angle across the diagonal
-    as on 36 × 24 mm film, so f₃₅ / 43.27 mm × the photo's diagonal (whole millimetres, so about 1 %); and `FocalLength` ×
-    `FocalPlaneXResolution`, scaled from the width the camera wrote (`PixelXDimension`) to this one.
+    There are two ways, and the first that works is taken. `FocalLengthIn35mmFilm` f₃₅ has, by the convention of CIPA
+    DCG-001, the same angle across the diagonal as on 36 × 24 mm film. So the length is f₃₅ / 43.27 mm × the photo's
+    diagonal (whole millimetres, so about 1 %). The other way is `FocalLength` × `FocalPlaneXResolution`, scaled from
+    the width that the camera recorded (`PixelXDimension`) to this one.
+
+    Args:
+        exif: Tags.
+        width: Width of the photo as stored.
+        height: Height of the photo as stored.
+        file: File to name in a warning.
+
+    Returns:
+        The focal length; None if EXIF does not give it, or if the photo is a crop.
 
     >>> round(focal_px_of_exif({"Exif:FocalLengthIn35mmFilm": 50}, 6000, 4000), 1)
     8333.3
@@ -99,10 +123,11 @@ def focal_px_of_exif(exif: Mapping[str, Any], width: int, height: int, file: str
 
 
 def _proportion(a: float, b: float) -> float:
+    """Return the ratio of the longer to the shorter side."""
     return max(a, b) / min(a, b)
 
 
 def _positive(exif: Mapping[str, Any], name: str) -> float | None:
-    """A tag as a number, None where it is none, or not more than 0."""
+    """Return a tag as a number, None if it is missing or not positive."""
     value = exif.get(name)
     return float(value) if isinstance(value, (int, float)) and math.isfinite(value) and value > 0 else None

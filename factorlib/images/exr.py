@@ -1,7 +1,8 @@
-"""Image files by OpenImageIO, and OpenEXR files of named float32 channels; the same pixels are the same bytes.
+"""Image files by OpenImageIO, and OpenEXR files of named float32 channels; the same pixels give the same bytes.
 
-OpenImageIO stamps the date into every EXR: here the date is fixed.  It leaves an EXR incomplete until its output object is deleted, and
-neither `close` nor the deletion say whether the last bytes found room: so it writes to memory, and the bytes go to disk by a writer that does.
+OpenImageIO writes the date into every EXR: here the date is fixed. It leaves an EXR incomplete until its output object
+is deleted, and neither `close` nor the deletion reports a full disk. So it encodes into memory, and the bytes go to
+disk by a writer that does report it.
 """
 
 from __future__ import annotations
@@ -18,19 +19,41 @@ from factorlib.reading import check_plain
 from factorlib.wholefile import bytes_of, write_bytes
 
 FIXED_DATE = "2000:01:01 00:00:00"
-LAT_LONG = {"textureformat": "LatLong Environment"}  # OpenImageIO's word for the OpenEXR attribute `envmap`
+LAT_LONG = {"textureformat": "LatLong Environment"}  # OpenImageIO's name of the OpenEXR attribute `envmap`
 Channels = Mapping[str, Float[np.ndarray, "h w"]]
 
 
 def write_image(path: str | Path, spec: oiio.ImageSpec, pixels: np.ndarray) -> None:
-    """Write `pixels` [h, w, c] in the format that the suffix of `path` names; raises OSError where that fails."""
+    """Write `pixels` [h, w, c] in the format of the suffix of `path`.
+
+    Args:
+        path: File to write.
+        spec: Size, channels and attributes.
+        pixels: Pixels.
+
+    Raises:
+        OSError: If encoding or writing fails.
+    """
     write_bytes(path, encoded(path, spec, pixels))
 
 
 def encoded(name: str | Path, spec: oiio.ImageSpec, pixels: np.ndarray) -> bytes:
-    """The bytes of an image file of `pixels` [h, w, c], in the format of the suffix of `name`; raises OSError where that fails."""
+    """Encode `pixels` [h, w, c] as an image file in the format of the suffix of `name`.
+
+    Args:
+        name: Name of the file.
+        spec: Size, channels and attributes.
+        pixels: Pixels.
+
+    Returns:
+        The bytes of the file.
+
+    Raises:
+        OSError: If encoding fails.
+    """
 
     def encode(memory: str) -> None:
+        """Write the image to the path `memory`, a file in memory."""
         output = oiio.ImageOutput.create(str(name))
         if output is None:
             raise OSError(f"{name}: cannot be written: {oiio.geterror()}")
@@ -46,7 +69,13 @@ def encoded(name: str | Path, spec: oiio.ImageSpec, pixels: np.ndarray) -> bytes
 
 
 def write_exr(path: str | Path, channels: Channels, attributes: Mapping[str, str | int | float] | None = None) -> None:
-    """Write `channels` (name -> [h, w], any real type) as float32, ZIP-compressed, in the order given."""
+    """Write `channels` (name -> [h, w], any real type) as float32, ZIP-compressed, in the given order.
+
+    Args:
+        path: File to write.
+        channels: Channels by name.
+        attributes: Further attributes.
+    """
     names = list(channels)
     pixels = np.stack([np.asarray(channels[n], dtype=np.float32) for n in names], axis=-1)
     spec = oiio.ImageSpec(pixels.shape[1], pixels.shape[0], len(names), oiio.FLOAT)
@@ -58,21 +87,31 @@ def write_exr(path: str | Path, channels: Channels, attributes: Mapping[str, str
 
 
 def write_rgb_exr(path: str | Path, radiance: Float[np.ndarray, "h w 3"], attributes: Mapping | None = None) -> None:
-    """Write linear Rec. 709 radiance."""
+    """Write linear Rec. 709 radiance.
+
+    Args:
+        path: File to write.
+        radiance: Radiance.
+        attributes: Further attributes.
+    """
     write_exr(path, dict(zip("RGB", np.moveaxis(np.asarray(radiance), -1, 0))), attributes)
 
 
 def write_hdr(path: str | Path, radiance: Float[np.ndarray, "h w 3"]) -> None:
-    """Write linear radiance, Rec. 709, as RGBE: a channel is off by up to 1/256 of the pixel's brightest.
+    """Write linear radiance, Rec. 709, as RGBE: the error of a channel is up to 1/256 of the pixel's brightest channel.
 
-    What has no alpha and no name for its layout is read as a lat-long map by other programs.
+    Other programs read a file without alpha and without a layout attribute as a lat-long map.
     """
     pixels = np.asarray(radiance, dtype=np.float32)
     write_image(path, oiio.ImageSpec(pixels.shape[1], pixels.shape[0], 3, oiio.FLOAT), pixels)
 
 
 def read_exr(path: str | Path) -> dict[str, Float[np.ndarray, "h w"]]:
-    """All channels of an EXR as float32 by name; InputError for what is none, or no plain file (a pipe would never end)."""
+    """Read all channels of an EXR as float32, by name.
+
+    Raises:
+        InputError: If the file is no EXR, or no plain file (a pipe would never end).
+    """
     check_plain(path, "an image", most_bytes=None)
     source = oiio.ImageInput.open(str(path))
     if source is None:
@@ -87,7 +126,7 @@ def read_exr(path: str | Path) -> dict[str, Float[np.ndarray, "h w"]]:
 
 
 def read_rgb_exr(path: str | Path) -> Float[np.ndarray, "h w 3"]:
-    """The channels R, G, B."""
+    """Read the channels R, G, B of an EXR; InputError if one is missing."""
     channels = read_exr(path)
     for name in "RGB":
         if name not in channels:

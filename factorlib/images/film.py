@@ -1,4 +1,7 @@
-"""Animations: GIF, and H.264 where PyAV is installed; white where frames are transparent, for neither has half-transparent pixels."""
+"""Animations as GIF, and as H.264 if PyAV is installed; transparent frames are composited on white.
+
+Neither format has half-transparent pixels.
+"""
 
 import io
 from collections.abc import Sequence
@@ -13,25 +16,41 @@ from factorlib.wholefile import write_bytes
 
 
 def write_gif(path: str | Path, frames: Sequence[UInt8[np.ndarray, "h w 4"]], seconds: float) -> None:
-    """Write an animation of so many seconds that goes round for ever; white where frames are transparent."""
-    solid, memory = [Image.fromarray(_on_white(frame)) for frame in frames], io.BytesIO()
-    each = max(20, round(1000 * seconds / len(frames)))  # browsers show shorter ones slowly
+    """Write a looping animation on a white background.
+
+    Args:
+        path: File to write.
+        frames: Frames, RGBA.
+        seconds: Duration of one loop.
+    """
+    solid = [Image.fromarray(_on_white(frame)) for frame in frames]
+    memory = io.BytesIO()
+    each = max(20, round(1000 * seconds / len(frames)))  # milliseconds; browsers slow down shorter frames
     solid[0].save(memory, "GIF", save_all=True, append_images=solid[1:], duration=each, loop=0, disposal=2)
     write_bytes(path, memory.getvalue())
 
 
 def write_mp4(path: str | Path, frames: Sequence[UInt8[np.ndarray, "h w 4"]], seconds: float) -> None:
-    """Write the same animation, once round, as H.264 (BT.709), where PyAV is installed (the extra `video`); an odd last row or column is cut."""
+    """Write an animation as H.264 (BT.709) on a white background, if PyAV is installed (the extra `video`).
+
+    An odd last row or column is cut off.
+
+    Args:
+        path: File to write.
+        frames: Frames, RGBA.
+        seconds: Duration.
+    """
     try:
         import av
     except ImportError:
         return
-    memory, bt709 = io.BytesIO(), 1
+    memory = io.BytesIO()
+    bt709 = 1
     with av.open(memory, "w", format="mp4") as file:
         stream = file.add_stream("libx264", rate=Fraction(len(frames) / seconds).limit_denominator(1000))
         height, width = (n // 2 * 2 for n in frames[0].shape[:2])
         stream.width, stream.height, stream.pix_fmt = width, height, "yuv420p"
-        stream.options = {"crf": "16", "threads": "1"}  # one thread: the same bytes each time
+        stream.options = {"crf": "16", "threads": "1"}  # one thread gives the same bytes each time
         stream.codec_context.colorspace = stream.codec_context.color_primaries = stream.codec_context.color_trc = bt709
         for frame in frames:
             picture = av.VideoFrame.from_ndarray(np.ascontiguousarray(_on_white(frame)[:height, :width]), "rgb24")
@@ -41,5 +60,6 @@ def write_mp4(path: str | Path, frames: Sequence[UInt8[np.ndarray, "h w 4"]], se
 
 
 def _on_white(frame: UInt8[np.ndarray, "h w 4"]) -> UInt8[np.ndarray, "h w 3"]:
+    """Composite a frame on white."""
     alpha = frame[..., 3:].astype(float) / 255
     return np.rint(frame[..., :3] * alpha + 255 * (1 - alpha)).astype(np.uint8)

@@ -1,7 +1,8 @@
-"""HEIF photos (HEIC), as phones take them, by pillow-heif: 8, 10 or 12 bits, the primary picture of the file.
+"""Reader of HEIF photos (HEIC), as phones take them, by pillow-heif: 8, 10 or 12 bits, the primary picture of the file.
 
-Orientation is a property of the picture in HEIF (`irot`, `imir`), which the decoder applies; what EXIF says beside it must not
-be applied again.  The picture is decoded at once, in its own codes: 96 MB for 48 megapixels of 8 bits grey, 288 MB of 10 bits RGB.
+In HEIF, orientation is a property of the picture (`irot`, `imir`), which the decoder applies. EXIF's orientation must
+not be applied again. The picture is decoded at once, in its own codes: 96 MB for 48 megapixels of 8 bits grey, 288 MB
+of 10 bits RGB.
 """
 
 import io
@@ -18,13 +19,13 @@ from factorlib.images.exif import exif_of
 from factorlib.images.scanlines import COPY, Stored
 
 BRANDS = {b"heic", b"heix", b"heim", b"heis", b"hevc", b"hevx", b"mif1", b"msf1", b"mif2"}
-VIDEO = {16: "PQ", 18: "HLG"}  # transfer characteristics of ITU-T H.273 that are no sRGB
+VIDEO = {16: "PQ", 18: "HLG"}  # transfer characteristics of ITU-T H.273 for HDR video
 SIZES = ("Exif:PixelXDimension", "Exif:PixelYDimension")
-FAILURES = (ValueError, EOFError, SyntaxError, RuntimeError, OSError)  # what pillow-heif makes of damage
+FAILURES = (ValueError, EOFError, SyntaxError, RuntimeError, OSError)  # exceptions of pillow-heif for damaged files
 
 
 def is_heif(path: str | Path) -> bool:
-    """Return whether the file's first bytes say so: a box `ftyp` with a brand of HEIF's."""
+    """Return whether the file begins with a box `ftyp` of a HEIF brand."""
     try:
         with Path(path).open("rb") as stream:
             head = stream.read(12)
@@ -34,9 +35,14 @@ def is_heif(path: str | Path) -> bool:
 
 
 def open_heif(path: str | Path, key: str | None) -> Stored:
-    """Raises InputError for a file that cannot be decoded, and for one in a transfer function of HDR video."""
+    """Open a HEIF photo.
+
+    Raises:
+        InputError: If the file cannot be decoded, or has a transfer function of HDR video.
+    """
 
     def refused(fault: str, cure: str) -> InputError:
+        """Return an InputError for this file."""
         return InputError(fault, file=path, key=key, cure=cure)
 
     convert = f"convert it: magick {Path(path).name} {Path(path).stem}.png"
@@ -50,7 +56,8 @@ def open_heif(path: str | Path, key: str | None) -> Stored:
         picture = file[file.primary_index]
     except FAILURES as error:
         raise refused(f"not readable as HEIF ({error})", convert) from None
-    info, (width, height) = picture.info, picture.size
+    info = picture.info
+    width, height = picture.size
     curve = VIDEO.get((info.get("nclx_profile") or {}).get("transfer_characteristics"))
     if curve:
         cure = "export it from the phone as a JPEG, or without HDR"
@@ -58,7 +65,7 @@ def open_heif(path: str | Path, key: str | None) -> Stored:
 
     @cache
     def pixels() -> Shaped[np.ndarray, "h w 3"]:
-        """RGB codes, alpha dropped; grey is repeated where it is looked at, not in memory."""
+        """Decode RGB codes without alpha; grey is repeated by broadcasting, not in memory."""
         try:
             codes = np.asarray(picture)
         except FAILURES as error:
@@ -71,7 +78,7 @@ def open_heif(path: str | Path, key: str | None) -> Stored:
 
     exif = exif_of(info.get("exif"))
     across, down = (exif.get(name) for name in SIZES)
-    if across and down and (across > down) != (width > height):  # those of the picture before it was turned
+    if across and down and (across > down) != (width > height):  # EXIF has the size before rotation
         exif |= dict(zip(SIZES, (down, across)))
     profile = ""
     with suppress(OSError, ImageCms.PyCMSError):

@@ -1,7 +1,7 @@
-"""Undoing a lens's radial distortion: every later stage sees the picture that a pinhole camera would have taken.
+"""Correction of a lens's radial distortion: every later stage works on the picture of a pinhole camera.
 
-A ray of slopes (a, b) = (x, y)/z meets the photo at centre + focal · (1 + k₁r² + k₂r⁴) (a, b), with r² = a² + b²: COLMAP's RADIAL model, and OpenCV's with
-two coefficients.  The picture keeps its size, focal length and principal point.
+A ray of slopes (a, b) = (x, y)/z projects to centre + focal · (1 + k₁r² + k₂r⁴) (a, b), with r² = a² + b². This is
+COLMAP's RADIAL model, and OpenCV's with two coefficients. The picture keeps its size, focal length and principal point.
 """
 
 from pathlib import Path
@@ -18,7 +18,7 @@ from factorlib.images.photo import Photo
 
 
 class Lens(msgspec.Struct, frozen=True):
-    """A lens of one focal length, in pixels whose centres lie at 0.5; coefficients: k₁ and k₂."""
+    """Lens of one focal length, in pixels whose centres are at 0.5; coefficients are k₁ and k₂."""
 
     focal: float
     centre: tuple[float, float]
@@ -26,22 +26,32 @@ class Lens(msgspec.Struct, frozen=True):
 
     @property
     def colmap(self) -> pycolmap.Camera:
-        """The same camera as pycolmap's."""
+        """Equivalent camera of pycolmap."""
         width, height = (max(1, round(2 * c)) for c in self.centre)
         params = [self.focal, *self.centre, *self.coefficients]
         return pycolmap.Camera(model="RADIAL", width=width, height=height, params=params)
 
     def distorted(self, points: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, "n 2"]:
-        """Where the photo shows what a pinhole shows at these points."""
+        """Map points of the pinhole picture to points of the photo."""
         slopes = (points - np.array(self.centre)) / self.focal
         return self.colmap.img_from_cam(np.column_stack([slopes, np.ones(len(slopes))]))
 
     def undistorted(self, points: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, "n 2"]:
-        """Where a pinhole shows what the photo shows at these points."""
+        """Map points of the photo to points of the pinhole picture."""
         return self.focal * self.colmap.cam_from_img(points) + np.array(self.centre)
 
     def check(self, width: int, height: int, file: str | Path, key: str) -> None:
-        """Raise InputError where two rays within the picture meet the photo at one place: such coefficients are of no lens."""
+        """Check that the distortion is invertible within the picture.
+
+        Args:
+            width: Width of the picture.
+            height: Height of the picture.
+            file: File to name in the error.
+            key: Key to name in the error.
+
+        Raises:
+            InputError: If two rays within the picture project to one point of the photo.
+        """
         corners = np.array([[x, y] for x in (0, width) for y in (0, height)])
         r2 = np.square((corners - self.centre) / self.focal).sum(1).max() * np.linspace(0, 1, 100)
         k1, k2 = self.coefficients
@@ -52,7 +62,17 @@ class Lens(msgspec.Struct, frozen=True):
 
 
 def lens_of(camera: Camera | None, factor: int, width: int, height: int) -> Lens | None:
-    """The lens of a photo that was averaged down by `factor` to width × height pixels; None where dataset.yaml gives no distortion."""
+    """Return the lens of a photo that was downsampled; None if dataset.yaml gives no distortion.
+
+    Args:
+        camera: Camera of the photo in dataset.yaml.
+        factor: Factor of the downsampling.
+        width: Width of the downsampled photo.
+        height: Height of the downsampled photo.
+
+    Returns:
+        The lens, in pixels of the downsampled photo.
+    """
     if camera is None or camera.distortion is None:
         return None
     centre = camera.principal_point or (factor * width / 2, factor * height / 2)
@@ -60,29 +80,30 @@ def lens_of(camera: Camera | None, factor: int, width: int, height: int) -> Lens
 
 
 class Undistorted:
-    """The picture of a pinhole of height × width pixels, from a photo of the same size that the lens took.
+    """Resampling of a photo to the picture of a pinhole camera, height × width pixels each.
 
-    inside: pixels that the photo shows
+    The attribute `inside` is the mask of pixels that the photo shows.
     """
 
     def __init__(self, lens: Lens, height: int, width: int):
         x, y = np.meshgrid(np.arange(width) + 0.5, np.arange(height) + 0.5)
         place = lens.distorted(np.stack([x, y], axis=-1).reshape(-1, 2)).reshape(height, width, 2) - 0.5
-        self.rows, self.columns = place[..., 1], place[..., 0]
+        self.rows = place[..., 1]
+        self.columns = place[..., 0]
         ends = ((self.rows, height), (self.columns, width))
         self.inside: Bool[np.ndarray, "h w"] = np.logical_and.reduce([(of >= 0) & (of <= n - 1) for of, n in ends])
 
     def nearest(self, picture: Shaped[np.ndarray, "h w"]) -> Shaped[np.ndarray, "h w"]:
-        """The values of the nearest pixels, 0 outside the photo."""
+        """Resample by the nearest pixels, 0 outside the photo."""
         y, x = (np.clip(np.rint(of), 0, n - 1).astype(int) for of, n in zip((self.rows, self.columns), picture.shape))
         return np.where(self.inside, picture[y, x], np.zeros((), picture.dtype))
 
     def between(self, picture: Shaped[np.ndarray, "h w"]) -> Float[np.ndarray, "h w"]:
-        """The values between pixels, bilinear, 0 outside the photo."""
+        """Resample by bilinear interpolation, 0 outside the photo."""
         return map_coordinates(picture.astype(np.float32), (self.rows, self.columns), order=1, cval=0.0)
 
     def photo(self, photo: Photo) -> Photo:
-        """The photo: a pixel is clipped where any of the four it lies between is, and finite where all are."""
+        """Resample a photo; a pixel is clipped if any of its four source pixels is, and finite if all are."""
         channels = range(3)
         radiance = np.stack([self.between(photo.radiance[..., c]) for c in channels], axis=-1)
         clipped = np.stack([self.between(photo.clipped[..., c]) > 1e-6 for c in channels], axis=-1)

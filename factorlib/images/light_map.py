@@ -1,4 +1,4 @@
-"""Lat-long maps of light, in Radiance HDR or OpenEXR: read by header first, a large one averaged down while it is read."""
+"""Reader of lat-long light maps, Radiance HDR or OpenEXR; a large map is downsampled while it is read."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -12,15 +12,19 @@ from factorlib.images.limits import check_values
 from factorlib.images.photo import decoded, open_photo
 from factorlib.reading import check_plain
 
-MOST_TEXELS = 4096 * 2048  # which take 250 MB as they are read, and more in a renderer
-LEAST = -1e-3  # of the mean magnitude: resampling leaves a little below 0
-LARGEST = 1e15  # radiance: the sun's disc is 1e9 times as bright as a room
+MOST_TEXELS = 4096 * 2048  # they take 250 MB when read, and more in a renderer
+LEAST = -1e-3  # least radiance, in units of the mean magnitude: resampling leaves small negative values
+LARGEST = 1e15  # greatest radiance: the sun's disc is 1e9 times as bright as a room
 SUFFIXES = (".hdr", ".exr")
 CURE = "mend or remove this map"
 
 
 def maps_in(folders: Sequence[Path]) -> list[Path]:
-    """The maps in each folder, by name; InputError for what is no folder, and for a folder without any."""
+    """List the maps in each folder, by name.
+
+    Raises:
+        InputError: If a folder does not exist or has no map.
+    """
     found = []
     for folder in folders:
         if not folder.is_dir():
@@ -34,10 +38,18 @@ def maps_in(folders: Sequence[Path]) -> list[Path]:
 
 
 def read_light_map(path: Path, key: str | None = None) -> Float[np.ndarray, "h w 3"]:
-    """Linear radiance of a lat-long map; one of more than MOST_TEXELS is averaged down by a whole factor.
+    """Read the linear radiance of a lat-long map; more than MOST_TEXELS are downsampled by a whole factor.
 
-    key: where the map is named, for messages.  Raises InputError for a file that is no map, is black, or holds radiance that is
-    no number, infinite, or less than 0 (by more than resampling leaves).
+    Args:
+        path: File of the map.
+        key: Key to name in errors.
+
+    Returns:
+        Radiance.
+
+    Raises:
+        InputError: If the file is no map, is black, or has radiance that is not a number, infinite, or negative beyond
+            what resampling leaves.
     """
     check_plain(path, "a light", key, most_bytes=None)
     check_values(path, key=key)
@@ -46,15 +58,18 @@ def read_light_map(path: Path, key: str | None = None) -> Float[np.ndarray, "h w
     if width != 2 * height:
         fault = f"{width} × {height} pixels is no lat-long map"
         raise InputError(fault, file=path, key=key, cure="its width must be twice its height")
-    least, total, lost = np.inf, 0.0, 0
+    least = np.inf
+    total = 0.0
+    lost = 0
 
     def look(linear: Float[np.ndarray, "r w 3"]) -> None:
-        """Take in some rows of the map as they are stored."""
+        """Accumulate statistics of some rows of the map as stored."""
         nonlocal least, total, lost
         usable = np.isfinite(linear) & (np.abs(linear) <= LARGEST)
         lost += int((~usable.all(axis=-1)).sum())
         numbers = np.where(usable, linear, 0)
-        least, total = min(least, float(numbers.min())), total + float(np.abs(numbers).sum(dtype=float))
+        least = min(least, float(numbers.min()))
+        total = total + float(np.abs(numbers).sum(dtype=float))
 
     factor = least_factor(height * width, MOST_TEXELS)
     factor = next((divisor for divisor in range(factor, 2 * factor) if height % divisor == 0), factor)

@@ -1,7 +1,7 @@
-"""How large a picture may be: asked of its header, before any pixel is read.
+"""Limits on the size of a picture, checked by its header before any pixel is read.
 
-Compressed, a picture of one colour takes a thousandth of what it takes in memory: a file of a few megabytes can stand for all a
-machine has.
+A compressed picture of one colour takes a thousandth of its size in memory, so a file of a few megabytes can need all
+memory of a machine.
 """
 
 from contextlib import suppress
@@ -12,12 +12,21 @@ import OpenImageIO as oiio
 
 from factorlib.errors import InputError
 
-MOST_MEGAPIXELS = 200.0  # twice what the largest sensors have
-CHANNELS = 4  # of an ordinary photo: so many of each of the most pixels
+MOST_MEGAPIXELS = 200.0  # twice the number of the largest sensors
+CHANNELS = 4  # greatest number of channels of an ordinary photo
 
 
 def check_pixels(size: tuple[int, int], most_megapixels: float, path: str | Path, key: str | None = None) -> None:
-    """Raises InputError for more pixels; size: (height, width).
+    """Check the size (height, width) of a picture.
+
+    Args:
+        size: Height and width.
+        most_megapixels: Limit.
+        path: File to name in the error.
+        key: Key to name in the error.
+
+    Raises:
+        InputError: If it has more pixels.
 
     >>> check_pixels((30_000, 30_000), 200.0, "kitchen.png")
     Traceback (most recent call last):
@@ -33,14 +42,22 @@ def check_pixels(size: tuple[int, int], most_megapixels: float, path: str | Path
 
 
 def check_values(path: str | Path, most_megapixels: float = MOST_MEGAPIXELS, key: str | None = None) -> None:
-    """Raises InputError for an image with more values than a photo of `most_megapixels` has in CHANNELS channels.
+    """Check the number of values of an image file against that of a photo with CHANNELS channels.
 
-    A file that is no image, or of a kind that OpenImageIO does not read, passes: who reads it refuses it.
+    A file that is no image, or of a kind that OpenImageIO does not read, passes: its reader rejects it.
+
+    Args:
+        path: File.
+        most_megapixels: Limit of a photo.
+        key: Key to name in the error.
+
+    Raises:
+        InputError: If it has more values.
     """
     source = oiio.ImageInput.open(str(path))
     if source is None:
-        with suppress(UnicodeError):  # the words of a damaged file may be damaged themselves
-            oiio.geterror()  # read, so that nobody else takes it for their own
+        with suppress(UnicodeError):  # the message about a damaged file may be no UTF-8
+            oiio.geterror()  # clear the error
         return
     spec = source.spec()
     millions = spec.width * spec.height * spec.nchannels / 1e6

@@ -1,13 +1,13 @@
-"""Reading a photo: linear radiance, which channels are clipped, which pixels are numbers, and what the camera wrote about it.
+"""Reader of photos: linear radiance, clipped channels, finite pixels, and EXIF data.
 
 Orientation   as displayed: the EXIF orientation is applied.
-Encoding      8- and 16-bit files are sRGB-encoded, float and raw files linear, unless `encoding` says otherwise; primaries
-              are taken for Rec. 709.
-Channels      one is grey; alpha is dropped.
-Clipped       integer codes from CLIPPED of the range (254 of 255) on; of a raw file, what the sensor's white level cut.
-              A float file has no top code; what is not finite in it is no pixel.
-Size          a photo can be averaged down by a whole factor (`boxes`) while it is read, so that no more than some rows of it
-              are ever in memory: radiance by its linear mean; clipped where any part is; finite where any part is.
+Encoding      8- and 16-bit files are sRGB-encoded, float and raw files linear, unless `encoding` is given; primaries
+              are assumed to be Rec. 709.
+Channels      one channel is grey; alpha is dropped.
+Clipped       integer codes from CLIPPED of the range (254 of 255) on; for a raw file, saturated sensor pixels. A float
+              file has no top code; values that are not finite are invalid pixels.
+Size          a photo can be downsampled by a whole factor (`boxes`) while it is read, so that only some rows of it are
+              in memory at a time: radiance by its linear mean; clipped if any part is; finite if any part is.
 """
 
 import logging
@@ -27,14 +27,23 @@ from factorlib.images.scanlines import Stored, open_scanlines
 from factorlib.images.transfer import decoder
 from factorlib.reading import reading
 
-READ_AT_ONCE = 1 << 21  # pixels of the rows that are in memory as floats
+READ_AT_ONCE = 1 << 21  # number of pixels that are in memory as floats
 log = logging.getLogger("factorlib.images")
 
 
 class Photo(msgspec.Struct, frozen=True):
-    """radiance: linear Rec. 709, scene-referred up to exposure, 0 where not finite; clipped: at the top code or above;
-    finite: all three channels are numbers; focal_px: from EXIF, in pixels of `radiance` as displayed; encoding: the one used;
-    factor: a pixel of `radiance` stands for factor² of the file; exposure: t·S/N² from EXIF."""
+    """Photo as linear radiance.
+
+    radiance   linear Rec. 709, scene-referred up to exposure, 0 where not finite
+    clipped    True at the top code or above
+    finite     True if all three channels are numbers
+    focal_px   focal length from EXIF, in pixels of `radiance` as displayed
+    width      width of `radiance`
+    height     height of `radiance`
+    encoding   encoding of the file, as given or implied
+    factor     a pixel of `radiance` stands for factor² pixels of the file
+    exposure   t·S/N² from EXIF
+    """
 
     radiance: Float[np.ndarray, "h w 3"]
     clipped: Bool[np.ndarray, "h w 3"]
@@ -48,29 +57,55 @@ class Photo(msgspec.Struct, frozen=True):
 
 
 def open_photo(path: str | Path, key: str | None = None) -> Stored:
-    """The photo at `path` (JPEG, PNG, TIFF, EXR, HDR, HEIC, DNG or raw): its header is read, its pixels are not.
+    """Open a photo (JPEG, PNG, TIFF, EXR, HDR, HEIC, DNG or raw) and read its header, not its pixels.
 
-    What kind of file it is, its contents say: a DNG is a TIFF whose first picture is a small preview.
-    key: where the photo is named, for messages.
-    Raises InputError for a file that is unreadable, or holds no grey or RGB.
+    The format is determined by the contents: a DNG is a TIFF whose first picture is a small preview.
+
+    Args:
+        path: File.
+        key: Key to name in errors.
+
+    Returns:
+        The open photo.
+
+    Raises:
+        InputError: If the file is unreadable, or has neither grey nor RGB.
     """
-    with reading("an image", path, key):  # a library's words about a damaged file may be damaged themselves
+    with reading("an image", path, key):
         if is_heif(path):
             return open_heif(path, key)
         return open_raw(path, key) if is_raw(path) else open_scanlines(path, key)
 
 
 def read_photo(path: str | Path, encoding: str | None = None, key: str | None = None) -> Photo:
-    """The photo at `path` as displayed, in its own pixels.
+    """Read a photo as displayed, in its own pixels.
 
-    encoding: srgb, linear or gamma2.2; None takes what the kind of file implies.
-    Raises InputError as `open_photo` does, and for a file that is truncated.
+    Args:
+        path: File.
+        encoding: "srgb", "linear" or "gamma2.2"; None takes what the format implies.
+        key: Key to name in errors.
+
+    Returns:
+        The photo.
+
+    Raises:
+        InputError: As `open_photo` does, and if the file is truncated.
     """
     return decoded(open_photo(path, key), encoding, 1, path)
 
 
 def check_bright(photo: Photo, where: Bool[np.ndarray, "h w"], path: str | Path, key: str | None = None) -> None:
-    """Raises InputError where no pixel of `where` that is a number has any radiance: all are black, or less than 0."""
+    """Check that some finite pixel of a region has positive radiance.
+
+    Args:
+        photo: The photo.
+        where: Mask of the region.
+        path: File to name in the error.
+        key: Key to name in the error.
+
+    Raises:
+        InputError: If all pixels are black or negative.
+    """
     if not (photo.radiance[where & photo.finite] > 0).any():
         cure = "expose, render or develop it again; was the exposure 0, or a sign turned? or drop the photo"
         raise InputError("every pixel in its mask is black, or less than 0", file=path, key=key, cure=cure)
@@ -83,15 +118,25 @@ def decoded(
     path: str | Path,
     look: Callable[[Float[np.ndarray, "r w 3"]], None] = lambda linear: None,
 ) -> Photo:
-    """An open photo as displayed, averaged down by `factor`; `path` is named in warnings.
+    """Decode an open photo as displayed, downsampled by `factor`.
 
-    look: is handed all linear values of the file, some rows at a time, before they are averaged
+    Args:
+        stored: The open photo.
+        encoding: Encoding of its values; None takes what the format implies.
+        factor: Factor of the downsampling.
+        path: File to name in warnings.
+        look: Function of all linear values of the file, some rows at a time, before they are averaged.
+
+    Returns:
+        The photo.
     """
     encoding = encoding or stored.encoding
     height, width = (n // factor for n in (stored.height, stored.width))
-    radiance, clipped = np.empty((height, width, 3), np.float32), np.empty((height, width, 3), bool)
+    radiance = np.empty((height, width, 3), np.float32)
+    clipped = np.empty((height, width, 3), bool)
     finite = np.empty((height, width), bool)
     for rows, codes, cut in _strips(stored, factor, path):
+        # linear values: computed for floats and wide codes, looked up for codes of up to 16 bits
         if (white := stored.white) is None:
             with np.errstate(over="ignore", invalid="ignore"):
                 linear = np.array(decoder(encoding)(codes.astype(np.float32)), dtype=np.float32)
@@ -103,7 +148,9 @@ def decoded(
         numbers = np.isfinite(linear).all(axis=-1) if stored.white is None else np.ones(linear.shape[:2], bool)
         linear[~numbers] = 0
         if factor == 1:
-            radiance[rows], finite[rows], clipped[rows] = linear, numbers, cut
+            radiance[rows] = linear
+            finite[rows] = numbers
+            clipped[rows] = cut
         else:
             radiance[rows], finite[rows] = box_mean(linear, numbers, factor)
             clipped[rows] = box_any(cut, factor)
@@ -111,29 +158,38 @@ def decoded(
     if profile and "srgb" not in profile.lower() and "709" not in profile:
         words = "its primaries are taken for Rec. 709: convert it to sRGB for exact colours"
         log.warning("%s: its colour profile is %r; %s", path, profile, words)
-    swapped, back = stored.orientation >= 5, [-1 if flip else 1 for flip in _flipped(stored.orientation)]
+    swapped = stored.orientation >= 5
+    back = [-1 if flip else 1 for flip in _flipped(stored.orientation)]
     radiance, clipped, finite = (
         np.ascontiguousarray((pixels.swapaxes(0, 1) if swapped else pixels)[:: back[0], :: back[1]])
         for pixels in (radiance, clipped, finite)
     )
     focal_px = focal_px_of_exif(stored.exif, stored.width, stored.height, path)
     return Photo(
-        radiance, clipped, finite, focal_px and focal_px / factor, finite.shape[1], finite.shape[0], encoding, factor,
+        radiance,
+        clipped,
+        finite,
+        focal_px and focal_px / factor,
+        finite.shape[1],
+        finite.shape[0],
+        encoding,
+        factor,
         exposure_of_exif(stored.exif),
-    )  # fmt: skip
+    )
 
 
 def _strips(
     stored: Stored, factor: int, path: str | Path
 ) -> Iterator[tuple[slice, Shaped[np.ndarray, "r w 3"], Bool[np.ndarray, "r w 3"]]]:
-    """Whole rows of boxes, some at a time: which rows of boxes, the codes in them, and where these are clipped.
+    """Yield whole rows of boxes, some at a time: indices of the rows, the codes in them, and their clipped values.
 
-    Boxes count from the displayed corner, so what is left over lies at the other end of an axis that display turns round.
+    Boxes count from the displayed corner, so the remainder is at the other end of an axis that display reverses.
     """
     flips = _flipped(stored.orientation)
     turned = flips[::-1] if stored.orientation >= 5 else flips
     top, left = (n % factor if back else 0 for n, back in zip((stored.height, stored.width), turned))
-    columns, height = slice(left, left + stored.width // factor * factor), stored.height // factor
+    columns = slice(left, left + stored.width // factor * factor)
+    height = stored.height // factor
     step = max(1, READ_AT_ONCE // (factor * stored.width))
     for first in range(0, height, step):
         last = min(first + step, height)
@@ -144,9 +200,9 @@ def _strips(
         yield slice(first, last), codes[:, columns], clipped[:, columns]
     if end < stored.height:
         with reading("an image", path):
-            stored.rows(end, stored.height)  # a file that is cut short there is refused all the same
+            stored.rows(end, stored.height)  # a file that is truncated in the remainder must raise too
 
 
 def _flipped(orientation: int) -> tuple[bool, bool]:
-    """Whether the order of rows, and of columns, is turned round, once 5-8 have them swapped."""
+    """Return whether display reverses the rows, and the columns, after orientations 5 to 8 have swapped them."""
     return orientation in (3, 4, 7, 8), orientation in (2, 3, 6, 7)

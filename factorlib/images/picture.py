@@ -1,4 +1,4 @@
-"""Pictures for people: linear radiance as 8-bit sRGB, and PNG files that are the same bytes for the same pixels."""
+"""Pictures for display: linear radiance as 8-bit sRGB, and PNG files that are deterministic."""
 
 from pathlib import Path
 
@@ -19,9 +19,17 @@ def exposure_of(
     where: Bool[np.ndarray, "*batch"] | None = None,
     percentile: float = PERCENTILE,
 ) -> float:
-    """The factor that takes the `percentile` of each pixel's brightest channel, over `where`, to white.
+    """Return the factor that takes the `percentile` of each pixel's brightest channel to white.
 
-    1 where there is nothing to expose for (no finite pixel, or all black).
+    It is 1 if there is no finite pixel, or if all are black.
+
+    Args:
+        radiance: Linear radiance.
+        where: Mask of the pixels that count.
+        percentile: Percentile.
+
+    Returns:
+        The factor.
 
     >>> exposure_of(np.full((4, 4, 3), 0.25))
     4.0
@@ -33,9 +41,9 @@ def exposure_of(
 
 
 def picture(radiance: Float[np.ndarray, "*batch 3"], exposure: float | None = None) -> UInt8[np.ndarray, "*batch 3"]:
-    """`radiance` (linear Rec. 709) times `exposure`, cut to [0, 1], sRGB-encoded, rounded; NaN is black.
+    """Convert `radiance` (linear Rec. 709) times `exposure` to 8-bit sRGB, clipped; NaN is black.
 
-    exposure: None takes `exposure_of` the whole picture; give the same number to pictures to be compared.
+    An exposure of None takes `exposure_of` the whole picture; pictures to be compared need the same number.
 
     >>> picture(np.array([[0.0, 0.18, 2.0]]), exposure=1.0).tolist()
     [[0, 118, 255]]
@@ -46,12 +54,12 @@ def picture(radiance: Float[np.ndarray, "*batch 3"], exposure: float | None = No
 
 
 def write_png(path: str | Path, pixels: UInt8[np.ndarray, "h w c"]) -> None:
-    """Write the PNG of `png_bytes`, whole or not at all."""
+    """Write the PNG of `png_bytes` atomically."""
     write_bytes(path, png_bytes(pixels))
 
 
 def png_bytes(pixels: UInt8[np.ndarray, "h w c"]) -> bytes:
-    """An 8-bit PNG of 1, 3 or 4 channels (alpha not multiplied in), without date or program name."""
+    """Encode an 8-bit PNG of 1, 3 or 4 channels (alpha not premultiplied), without date or program name."""
     pixels = np.asarray(pixels, dtype=np.uint8)
     spec = oiio.ImageSpec(pixels.shape[1], pixels.shape[0], pixels.shape[2], oiio.UINT8)
     spec.attribute("oiio:UnassociatedAlpha", 1)
@@ -60,7 +68,7 @@ def png_bytes(pixels: UInt8[np.ndarray, "h w c"]) -> bytes:
 
 
 def read_png(path: str | Path) -> UInt8[np.ndarray, "h w c"]:
-    """The 8-bit pixels of a PNG as `write_png` wrote them."""
+    """Read the 8-bit pixels of a PNG of `write_png`; InputError if the file cannot be read."""
     wish = oiio.ImageSpec()
     wish.attribute("oiio:UnassociatedAlpha", 1)
     source = oiio.ImageInput.open(str(path), wish)

@@ -1,6 +1,7 @@
-"""What a phone did to a photo beyond a tone curve: tone mapping that differs from place to place, and sharpening.
+"""Detection of a phone's processing beyond a tone curve: local tone mapping, and sharpening.
 
-Neither can be undone: radiance is then no longer the same function of the pixel's code everywhere.  They are found, and said.
+Neither can be undone, because radiance is no longer the same function of the pixel's code everywhere. They are detected
+and reported.
 """
 
 from collections.abc import Mapping
@@ -17,17 +18,20 @@ RENDERED = {
     7: "portrait, HDR",
     8: "portrait",
 }
-HARD = 2  # EXIF's Sharpness
-NEAR, FAR = 2.0, 7.0  # pixels from the contour
-LEAST_STEP = 0.05  # of white, encoded, from one side of the contour to the other
-LEAST_PLACES = 100
-# 31 photos that nobody sharpened (data/eames and three real sets): −.11 to .04; the same, sharpened with σ = 2 pixels and twice the contrast:
-# .04 to .24, 28 of the 31 above .08
+HARD = 2  # value of EXIF's Sharpness
+NEAR = 2.0  # distance from the contour, pixels
+FAR = 7.0  # distance from the contour, pixels
+LEAST_STEP = 0.05  # least encoded step across the contour, in units of white
+LEAST_PLACES = 100  # least number of contour pixels
+# Threshold of sharpening. 31 photos without sharpening (data/eames and three real sets) have −0.11 to 0.04. The same
+# photos, sharpened with σ = 2 pixels and twice the contrast, have 0.04 to 0.24, 28 of the 31 above 0.08.
 HALO = 0.08
 
 
 def camera_says(exif: Mapping[str, Any]) -> str | None:
-    """What EXIF says of processing that cannot be undone (CustomRendered, also with Apple's values, and Sharpness); None for nothing.
+    """Return EXIF's description of irreversible processing (CustomRendered, also with Apple's values, and Sharpness).
+
+    It is None if there is none.
 
     >>> camera_says({"Exif:CustomRendered": 3}), camera_says({"Exif:Sharpness": 0})
     ('HDR', None)
@@ -39,15 +43,24 @@ def camera_says(exif: Mapping[str, Any]) -> str | None:
 def halo(
     radiance: Float[np.ndarray, "h w 3"], inside: Bool[np.ndarray, "h w"], known: Bool[np.ndarray, "h w"]
 ) -> float:
-    """How far the background overshoots beside contours, as a share of the step across them; 0 where too few contours tell.
+    """Return the overshoot of the background beside contours, as a share of the step across them.
 
-    inside: pixels of materials;  known: pixels that are either of these or background
-    The median over contour pixels of (L(NEAR) − L(FAR)) / (L(FAR) − L(−FAR)), L being the encoded luminance at a distance along the outward normal.
-    Blur, shadows at contact and masks that are a pixel off make it negative, or turn its sign from place to place.
+    It is the median over contour pixels of (L(NEAR) − L(FAR)) / (L(FAR) − L(−FAR)), where L is the encoded luminance at
+    a distance along the outward normal. Blur, contact shadows and masks that are off by a pixel make it negative, or of
+    varying sign.
+
+    Args:
+        radiance: The photo, linear.
+        inside: Pixels of materials.
+        known: Pixels of materials and background.
+
+    Returns:
+        The overshoot; 0 if there are too few usable contour pixels.
     """
     mean = radiance.mean(axis=-1)
     white = float(np.quantile(mean, 0.99)) or 1.0
     encoded = np.clip(mean / white, 0, 1) ** (1 / 2.2)
+    # signed distance to the contour, and outward normals of contour pixels
     distance = distance_transform_edt(~inside) - distance_transform_edt(inside) + np.where(inside, 0.5, -0.5)
     slopes = np.stack(np.gradient(gaussian_filter(distance, 1.5)))
     y, x = np.nonzero(inside & (np.abs(distance) < 1))
@@ -56,11 +69,12 @@ def halo(
     normal = normal / np.maximum(length, 1e-9)
 
     def at(picture: np.ndarray, far: float) -> Float[np.ndarray, " n"]:
-        """The picture at a distance from each contour pixel."""
+        """Sample the picture at a distance from each contour pixel."""
         places = y + far * normal[0], x + far * normal[1]
         return map_coordinates(picture.astype(float), places, order=1, mode="nearest")
 
-    clear = length > 0.8  # no corner, and nothing else within reach
+    # usable contour pixels: no corner, no other contour within reach, a sufficient step
+    clear = length > 0.8
     for far in (-FAR, FAR):
         clear &= (at(distance, far) * np.sign(far) > 0.7 * FAR) & (at(known, far) > 0.99)
     step = at(encoded, FAR) - at(encoded, -FAR)

@@ -1,10 +1,10 @@
-"""A photo's pixels as its file stores them: an open file, of which some rows are read at a time; those that OpenImageIO reads.
+"""Open photos, of which some rows are read at a time, and a reader of those that OpenImageIO reads.
 
-A camera's 48 megapixels are 576 MB as floating-point radiance.  So a file is opened first, which tells its size, and its rows
-are read in order, as many at once as one likes.
+A camera's 48 megapixels are 576 MB as floating-point radiance. So a file is opened first, which gives its size, and its
+rows are read in order, in chunks of any height.
 
-Of what OpenImageIO reads (JPEG, PNG, TIFF, EXR, HDR), one channel is grey, and repeated; alpha is dropped.  Integer colours are
-taken as stored, without the alpha multiplied in; float colours (EXR) are premultiplied by convention and are taken so.
+For the formats of OpenImageIO (JPEG, PNG, TIFF, EXR, HDR), one channel is grey, and repeated; alpha is dropped. Integer
+colours are taken as stored, not premultiplied by alpha; float colours (EXR) are premultiplied by convention.
 """
 
 from __future__ import annotations
@@ -22,23 +22,23 @@ from jaxtyping import Bool, Shaped
 from factorlib.errors import InputError
 from factorlib.reading import one_line
 
-CLIPPED = 0.995  # of the white code: JPEG compression ripples the top code a little
+CLIPPED = 0.995  # least share of the white code that is clipped: JPEG compression disturbs the top code a little
 WHITE = {oiio.UINT8: 2**8 - 1, oiio.UINT16: 2**16 - 1, oiio.UINT32: 2**32 - 1}
 COPY = "copy it again from where it came"
 log = logging.getLogger("factorlib.images")
 
 
 class Stored(msgspec.Struct, frozen=True, kw_only=True):
-    """An open photo.
+    """Open photo.
 
-    width, height  as stored
-    orientation    EXIF's, of the stored pixels: 1 as they are displayed, 2-4 mirrored or half turned, 5-8 lying on a side
-    exif           what the camera wrote, by OpenImageIO's names
+    width, height  size as stored
+    orientation    EXIF's, of the stored pixels: 1 as displayed, 2 to 4 mirrored or rotated by 180°, 5 to 8 transposed
+    exif           EXIF tags by OpenImageIO's names
     profile        name of the colour profile, "" for none
-    white          the code of 1.0; None where the pixels are floats
-    encoding       what this kind of file implies
-    rows           (begin, end) -> those rows, which are asked for in order, each at most once
-    saturated      (begin, end) -> where those rows hold less than there was to see; None: where codes are near white
+    white          code of 1.0; None if the pixels are floats
+    encoding       encoding that the format implies
+    rows           (begin, end) -> those rows, which are requested in order, each at most once
+    saturated      (begin, end) -> mask of saturated values in those rows; None: values with codes near white
     """
 
     width: int
@@ -53,18 +53,31 @@ class Stored(msgspec.Struct, frozen=True, kw_only=True):
 
     @property
     def size(self) -> tuple[int, int]:
-        """(height, width) as displayed."""
+        """Height and width as displayed."""
         return (self.width, self.height) if self.orientation >= 5 else (self.height, self.width)
 
     def clipped(self, begin: int, end: int, codes: Shaped[np.ndarray, "r w 3"]) -> Bool[np.ndarray, "r w 3"]:
-        """Return where rows that were read as `codes` hold less than there was to see."""
+        """Return the mask of saturated values in rows that were read as `codes`.
+
+        Args:
+            begin: First row.
+            end: End of the rows.
+            codes: Codes of the rows.
+
+        Returns:
+            A mask.
+        """
         if self.saturated is not None:
             return self.saturated(begin, end)
         return np.zeros(codes.shape, bool) if self.white is None else codes >= CLIPPED * self.white
 
 
 def open_scanlines(path: str | Path, key: str | None) -> Stored:
-    """Raises InputError for a file that is no image, or holds no grey or RGB."""
+    """Open a photo of a format that OpenImageIO reads.
+
+    Raises:
+        InputError: If the file is no image, or has neither grey nor RGB.
+    """
     wish = oiio.ImageSpec()
     wish.attribute("oiio:UnassociatedAlpha", 1)
     source = oiio.ImageInput.open(str(path), wish)
@@ -73,16 +86,19 @@ def open_scanlines(path: str | Path, key: str | None) -> Stored:
         raise InputError(fault, file=path, key=key, cure="is it whole, and of the kind its suffix says?")
     spec = source.spec()
     colours = _colours(spec, path, key)
-    first, last, picked = min(colours), max(colours) + 1, [c - min(colours) for c in colours]
+    first = min(colours)
+    last = max(colours) + 1
+    picked = [c - min(colours) for c in colours]
 
     def rows(begin: int, end: int) -> Shaped[np.ndarray, "r w 3"]:
-        """Rows begin … end − 1; of a file of tiles, the rows of tiles that these lie in are read."""
+        """Read rows begin … end − 1; from a tiled file, the rows of tiles that contain them are read."""
         if tall := spec.tile_height:
             top, bottom = begin // tall * tall, min(-(-end // tall) * tall, spec.height)
             box = (spec.x, spec.x + spec.width, spec.y + top, spec.y + bottom, spec.z, spec.z + 1)
             pixels = source.read_tiles(*box, first, last, spec.format)
         else:
-            top, pixels = begin, source.read_scanlines(spec.y + begin, spec.y + end, 0, first, last, spec.format)
+            top = begin
+            pixels = source.read_scanlines(spec.y + begin, spec.y + end, 0, first, last, spec.format)
         error = source.geterror()
         if pixels is None or "Premature end" in error:
             raise InputError(f"truncated or damaged ({one_line(error)})", file=path, key=key, cure=COPY)
@@ -90,7 +106,8 @@ def open_scanlines(path: str | Path, key: str | None) -> Stored:
             log.warning("%s: %s", path, one_line(error))
         return pixels.reshape(-1, spec.width, last - first)[begin - top : end - top, :, picked]
 
-    orientation, white = spec.get_int_attribute("Orientation", 1), WHITE.get(spec.format.basetype)
+    orientation = spec.get_int_attribute("Orientation", 1)
+    white = WHITE.get(spec.format.basetype)
     return Stored(
         width=spec.width,
         height=spec.height,
@@ -104,7 +121,7 @@ def open_scanlines(path: str | Path, key: str | None) -> Stored:
 
 
 def _colours(spec: oiio.ImageSpec, path: str | Path, key: str | None) -> list[int]:
-    """The channels that are red, green and blue; thrice the same where there is only grey."""
+    """Return the indices of the red, green and blue channels, equal for grey; InputError if there are neither."""
     names = list(spec.channelnames)
     if set("RGB") <= set(names):
         return [names.index(name) for name in "RGB"]

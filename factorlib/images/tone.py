@@ -1,13 +1,13 @@
-"""A photo's tone curve: what its file makes of linear radiance, beyond the encoding it declares.
+"""Tone curve of a photo: the camera's mapping of linear radiance, beyond the encoding that the file declares.
 
-Cameras render: they raise contrast, or lift shadows.  What is left after undoing the declared encoding is modelled by one
-exponent g per photo,
+Cameras render: they raise contrast, or lift shadows. The mapping that remains after the declared encoding is undone is
+modelled by one exponent g per photo,
 
-    τ(x) = ((x + ε)^g − ε^g) / ((1 + ε)^g − ε^g),
+    τ(x) = ((x + ε)^g − ε^g) / ((1 + ε)^g − ε^g),                                                               (1)
 
-with x in units of the illumination's mean radiance.  τ(0) = 0 and τ(1) = 1, so that g does not trade with exposure; ε keeps the
-slope at black finite, as the straight toe of sRGB does.  What photos share tells g: two materials have one ratio of
-reflectances in all of them.
+with x in units of the illumination's mean radiance. τ(0) = 0 and τ(1) = 1, so that g is independent of exposure; ε
+keeps the slope at black finite, as the straight toe of sRGB does. The photos together determine g: two materials have
+one ratio of reflectances in all of them.
 """
 
 import numpy as np
@@ -17,35 +17,54 @@ TOE = 0.02  # ε
 
 
 def curve(x: Float[np.ndarray, "*n"], exponent: Float[np.ndarray, "*n"] | float) -> Float[np.ndarray, "*n"]:
-    """τ(x) of x ≥ 0."""
+    """Return τ(x) of (1) for x ≥ 0."""
     return ((x + TOE) ** exponent - TOE**exponent) / _range(exponent)
 
 
 def inverse(y: Float[np.ndarray, "*n"], exponent: Float[np.ndarray, "*n"] | float) -> Float[np.ndarray, "*n"]:
-    """x ≥ 0 with τ(x) = y, and 0 for y < 0."""
+    """Return x ≥ 0 with τ(x) = y, and 0 for y < 0."""
     return (np.maximum(y, 0.0) * _range(exponent) + TOE**exponent) ** (1 / exponent) - TOE
 
 
 def slope(x: Float[np.ndarray, "*n"], exponent: Float[np.ndarray, "*n"] | float) -> Float[np.ndarray, "*n"]:
-    """dτ/dx."""
+    """Return dτ/dx."""
     return exponent * (x + TOE) ** (exponent - 1) / _range(exponent)
 
 
 def by_log_exponent(x: Float[np.ndarray, "*n"], exponent: Float[np.ndarray, "*n"] | float) -> Float[np.ndarray, "*n"]:
-    """dτ/d log g."""
+    """Return dτ/d log g."""
     at_x, at_black, at_one = (end**exponent * np.log(end) for end in (x + TOE, TOE, 1 + TOE))
     return exponent * (at_x - at_black - curve(x, exponent) * (at_one - at_black)) / _range(exponent)
 
 
 def shown(radiance: Float[np.ndarray, "*n"], exponent: float, pivot: float) -> Float[np.ndarray, "*n"]:
-    """What a photo shows of linear radiance, where radiance `pivot` stays what it is."""
+    """Apply the tone curve to linear radiance; radiance `pivot` is unchanged.
+
+    Args:
+        radiance: Linear radiance.
+        exponent: Exponent g.
+        pivot: Unit of x in (1).
+
+    Returns:
+        Values of the photo.
+    """
     return pivot * curve(radiance / pivot, exponent)
 
 
 def straightened(radiance: Float[np.ndarray, "*n"], exponent: float, pivot: float) -> Float[np.ndarray, "*n"]:
-    """The inverse of `shown`."""
+    """Invert `shown`.
+
+    Args:
+        radiance: Values of the photo.
+        exponent: Exponent g.
+        pivot: Unit of x in (1).
+
+    Returns:
+        Linear radiance.
+    """
     return pivot * inverse(radiance / pivot, exponent)
 
 
 def _range(exponent: Float[np.ndarray, "*n"] | float) -> Float[np.ndarray, "*n"] | float:
+    """Return the denominator of (1)."""
     return (1 + TOE) ** exponent - TOE**exponent

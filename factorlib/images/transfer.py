@@ -1,7 +1,7 @@
 """Transfer functions between encoded values in [0, 1] and linear radiance.
 
-sRGB: IEC 61966-2-1:1999, section 5.2.  All functions work on any shape, keep NaN, and go on as odd functions below 0
-and by the same formula above 1, so that they invert each other everywhere.
+sRGB: IEC 61966-2-1:1999, section 5.2. All functions work on any shape and keep NaN. They continue as odd functions
+below 0 and by the same formula above 1, so that they invert each other everywhere.
 """
 
 from collections.abc import Callable
@@ -13,7 +13,7 @@ Values = Float[np.ndarray, "*shape"]
 
 
 def srgb_decode(encoded: Values) -> Values:
-    """Linear value of an sRGB-encoded one.
+    """Convert sRGB-encoded values to linear ones.
 
     >>> srgb_decode(np.array([0.0, 0.04045, 0.5, 1.0])).round(6).tolist()
     [0.0, 0.003131, 0.214041, 1.0]
@@ -23,7 +23,7 @@ def srgb_decode(encoded: Values) -> Values:
 
 
 def srgb_encode(linear: Values) -> Values:
-    """sRGB-encoded value of a linear one.
+    """Convert linear values to sRGB-encoded ones.
 
     >>> srgb_encode(np.array([0.0, 0.0031308, 0.18, 1.0])).round(6).tolist()
     [0.0, 0.04045, 0.461356, 1.0]
@@ -33,10 +33,10 @@ def srgb_encode(linear: Values) -> Values:
 
 
 def gamma_decode(encoded: Values) -> Values:
-    """encoded^2.2."""
+    """Return encoded^2.2."""
     return np.copysign(np.abs(encoded) ** 2.2, encoded)
 
 
 def decoder(encoding: str) -> Callable[[Values], Values]:
-    """The function from values of `encoding` (srgb, linear, gamma2.2) to linear ones."""
+    """Return the function from values of `encoding` (srgb, linear, gamma2.2) to linear ones."""
     return {"srgb": srgb_decode, "linear": np.asarray, "gamma2.2": gamma_decode}[encoding]

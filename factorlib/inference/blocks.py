@@ -80,12 +80,9 @@ class Block(msgspec.Struct, frozen=True):
         return msgspec.structs.replace(self, held_out=np.zeros(len(self), bool))
 
     def sampled(self, count: int, seed: int) -> Block:
-        """Return at most `count` fitted and `count`/3 held-out observations, drawn at random, in their order."""
+        """Return at most `count` fitted and `count` held-out observations, drawn at random, in their order."""
         random = np.random.default_rng(seed)
-        kept = [
-            random.permutation(rows)[:most]
-            for rows, most in ((np.flatnonzero(~self.held_out), count), (np.flatnonzero(self.held_out), count // 3))
-        ]
+        kept = [random.permutation(np.flatnonzero(rows))[:count] for rows in (~self.held_out, self.held_out)]
         return self.take(np.sort(np.concatenate(kept)))
 
     def with_effects(self, shadows: bool, bounces: bool) -> Block:

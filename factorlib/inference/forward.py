@@ -252,12 +252,8 @@ class Illumination(msgspec.Struct, frozen=True):
         pull = self.pull(residual, loss, temperature)
         scale = pull * block.precision
         rising = scale * light.slope_at(shown.radiance, block.photo)  # ∂r/∂ℓ
-        lit = shown.linear - self.bounced
-        if toned := len(light.log_tone) > 0:
-            by_tone = scale * by_log_exponent(np.maximum(shown.linear, 0), light.exponents(block.photo))
-        photos = np.eye(len(light.log_exposure))[block.photo]
+        by_photos = self._by_photos(shown, scale, rising)
         free = light.free if light.held.any() else slice(None)
-        first = len(light.log_exposure) - light.free_exposures
         for m, rows, of in shown.responses:
             of_specular = of.specular
             of_roughness = of.by_roughness
@@ -270,11 +266,8 @@ class Illumination(msgspec.Struct, frozen=True):
                 own = [kd * shown.diffuse[rows, c] * rising[rows, c], ks * shown.specular[rows, c] * rising[rows, c]]
                 diffuse = of.diffuse * (kd * bright)
                 specular = of_specular * (ks * bright)
-                # ∂r/∂log e = τ' (ℓ − bounced)/σ, ∂r/∂log g, and ∂r/∂ log of the factor on held cells
-                by_photo = photos[rows, first:] * (lit[rows, c] * rising[rows, c])[:, None]
-                if toned:
-                    by_photo = np.hstack([by_photo, photos[rows] * by_tone[rows, c, None]])
-                if light.scale_free:
+                by_photo = by_photos[c][rows]
+                if light.scale_free:  # ∂r/∂ log of the factor on held cells
                     by_photo = np.hstack([by_photo, (diffuse + specular)[:, light.held].sum(1, keepdims=True)])
                 yield Linearised(
                     c,
@@ -287,6 +280,27 @@ class Illumination(msgspec.Struct, frozen=True):
                     by_photo.astype(np.float32),
                     (residual * pull)[rows, c].astype(np.float32),
                 )
+
+    def _by_photos(
+        self, shown: Shown, scale: Float[np.ndarray, "n 3"], rising: Float[np.ndarray, "n 3"]
+    ) -> list[Float[np.ndarray, "n q"]]:
+        """Return ∂r/∂log e = τ' (ℓ − bounced)/σ and ∂r/∂log g of each channel, by the photos' exposures and exponents.
+
+        Args:
+            shown: Prediction of this illumination.
+            scale: ∂r/∂y.
+            rising: ∂r/∂ℓ.
+        """
+        block = self.block
+        light = self.light
+        photos = np.eye(len(light.log_exposure))[block.photo]
+        by_exposure = (shown.linear - self.bounced) * rising
+        free = photos[:, len(light.log_exposure) - light.free_exposures :]
+        columns = [free * by_exposure[:, c, None] for c in range(3)]
+        if len(light.log_tone):
+            by_tone = scale * by_log_exponent(np.maximum(shown.linear, 0), light.exponents(block.photo))
+            columns = [np.hstack([one, photos * by_tone[:, c, None]]) for c, one in enumerate(columns)]
+        return columns
 
 
 def material_slices(block: Block) -> list[tuple[int, slice]]:

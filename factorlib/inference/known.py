@@ -191,17 +191,7 @@ def what_is_known(
             else.
     """
     number = list(seen.materials).index
-    chrome = {ball.material for ball in given.balls.values()}
-    for name in given.materials:
-        if not (seen.material == number(name)).any():
-            cure = "look at its mask and at the overlays of `align`: both must show it at the same place"
-            raise InputError(f"no observation shows material '{name}'", key=f"known.materials.{name}", cure=cure)
-    rows = {
-        number(name): np.array(
-            [*of.diffuse, *(of.specular or (np.nan,) * 3), of.roughness or (ROUGHNESS[0] if name in chrome else np.nan)]
-        )
-        for name, of in given.materials.items()
-    }
+    rows = {number(name): row for name, row in _known_rows(given, seen).items()}
     lights = {name: light_of_map(lat_long) for name, lat_long in maps.items()}
     for name, ball in given.balls.items():
         m = number(ball.material)
@@ -219,3 +209,20 @@ def what_is_known(
         lights[name] = light_of_ball(pixels, rows[m][3:6], np.eye(3) if world is None else np.array(world))
         seen = seen.take(rest)
     return seen, Known(rows, lights, tuple(sorted({photos[photo].illumination for photo in given.exposure})))
+
+
+def _known_rows(given: KnownSlice, seen: Observations) -> dict[str, Float[np.ndarray, "7"]]:
+    """Return k_d, k_s and roughness of the known materials, NaN where unknown.
+
+    Raises:
+        InputError: If no observation shows a known material.
+    """
+    chrome = {ball.material for ball in given.balls.values()}
+    rows = {}
+    for name, known in given.materials.items():
+        if not (seen.material == list(seen.materials).index(name)).any():
+            cure = "look at its mask and at the overlays of `align`: both must show it at the same place"
+            raise InputError(f"no observation shows material '{name}'", key=f"known.materials.{name}", cure=cure)
+        roughness = known.roughness or (ROUGHNESS[0] if name in chrome else np.nan)
+        rows[name] = np.array([*known.diffuse, *(known.specular or (np.nan,) * 3), roughness])
+    return rows

@@ -95,28 +95,23 @@ class LightLikelihood(msgspec.Struct, frozen=True):
     def normal_equations(self, materials_given: bool = False, clusters: Int[np.ndarray, " n"] | None = None) -> System:
         """Return the value of (1) and its normal equations.
 
-        The first 3p unknowns of the light are u.
-
         Args:
             materials_given: True to return φ instead of (1), without the costly derivatives of the determinants.
             clusters: Number of each observation's cluster, from 0, for `System.scores`.
         """
         one = self.illumination
-        T = self.temperature
         shown = one.shown()
-        light = one.light
         p = int(one.light.free.sum())
         places = (7 * np.unique(one.block.material)[:, None] + np.arange(7)).reshape(-1)
         k = len(places)
-        size = light.unknowns
+        size = one.light.unknowns
         value, g_l = self._prior()
         g_m = np.zeros(k)
         M = np.zeros((k, k))
         C = np.zeros((k, size))
         L = self._prior_hessian()
-        scores = None if clusters is None else np.zeros((int(clusters.max(initial=-1)) + 1, k + size))
-        parts = list(one.linearise(shown, self.loss, T))
-        photos = slice(3 * p, size)
+        parts = list(one.linearise(shown, self.loss, self.temperature))
+        photos = slice(3 * p, size)  # behind u, the first 3p unknowns of the light
         # H = JᵀJ/T + Q, (1), block by block: L = H of the light, M of the materials, C between them
         for part in parts:
             own = slice(part.channel * p, (part.channel + 1) * p)
@@ -134,19 +129,14 @@ class LightLikelihood(msgspec.Struct, frozen=True):
                 towards = part.by_photo.T @ J
                 L[photos, own] += towards
                 L[own, photos] += towards.T
-            if clusters is not None and scores is not None:  # sum over a cluster of each derivative times its residual
-                summing = (clusters[part.rows] == np.arange(len(scores))[:, None]) * part.residual
-                scores[:, at] += summing @ part.by_material
-                scores[:, k + own.start : k + own.stop] += summing @ J
-                scores[:, k + 3 * p :] += summing @ part.by_photo
-        residual = one.block.residuals(shown.radiance)
-        loss = float(self.loss.of_residuals(residual)[~one.block.held_out].sum())
+        loss = float(self.loss.of_residuals(one.block.residuals(shown.radiance))[~one.block.held_out].sum())
         factor = factorised(L)
         determinant = (np.zeros(k), np.zeros((k, k)), np.zeros(size))
-        value += loss / T
+        value += loss / self.temperature
         if not materials_given:
             value += self._determinants(factor)
             determinant = _of_determinants(parts, inverse_of(factor[: 3 * p, : 3 * p]), places, size)
+        scores = None if clusters is None else _scores(parts, clusters, places, size)
         return System(value, loss, places, g_m, M, g_l, C, L, factor, *determinant, scores)
 
     def marginal(self, system: System) -> float:
@@ -191,6 +181,29 @@ class LightLikelihood(msgspec.Struct, frozen=True):
         light = self.light
         others = [light.log_exposure[len(light.log_exposure) - light.free_exposures :], light.log_tone]
         return np.concatenate(others), np.repeat([EXPOSURE, TONE], [light.free_exposures, len(light.log_tone)])
+
+
+def _scores(
+    parts: Sequence[Linearised], clusters: Int[np.ndarray, " n"], places: Int[np.ndarray, " k"], size: int
+) -> Float[np.ndarray, "g k+l"]:
+    """Return the sum over each cluster of every derivative times its residual.
+
+    Args:
+        parts: All channels and materials of a light.
+        clusters: Number of each observation's cluster, from 0.
+        places: Numbers of the materials' unknowns.
+        size: l, number of the light's unknowns.
+    """
+    k = len(places)
+    scores = np.zeros((int(clusters.max(initial=-1)) + 1, k + size))
+    for part in parts:
+        p = part.diffuse.shape[1]
+        first = k + part.channel * p
+        summing = (clusters[part.rows] == np.arange(len(scores))[:, None]) * part.residual
+        scores[:, np.searchsorted(places, part.places)] += summing @ part.by_material
+        scores[:, first : first + p] += summing @ (part.diffuse + part.specular)
+        scores[:, k + 3 * p :] += summing @ part.by_photo
+    return scores
 
 
 def _of_determinants(

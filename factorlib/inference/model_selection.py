@@ -177,9 +177,8 @@ def curves_chosen(problem: JointProblem, before: Fit, choices: Choices, fit: Fit
 def distances_chosen(problem: JointProblem, before: Fit, choices: Choices, fit: Fitting) -> Chosen:
     """Choose distances of lights.
 
-    First, materials and all lights are fitted at each distance.  Materials that were fitted in far lights compensate
-    for errors of those.  Materials that are better in near lights, however, explain every light better.  A light
-    therefore stays near only if, given these materials, it also explains its observations better than a far one.  The
+    Materials and all lights are fitted at each distance: those fitted in far lights make up for errors of these.  A
+    light stays near only if, given the materials, it also explains its observations better than a far one does.  The
     weaker of the two decisions determines its distance.
 
     Args:
@@ -195,7 +194,7 @@ def distances_chosen(problem: JointProblem, before: Fit, choices: Choices, fit: 
     if choices.distance == "off" or problem.none_held_out or all(known):
         return Chosen(before, evidence)
     sample = sample_of(problem, choices)
-    asked = np.flatnonzero(~np.array(known)).tolist()
+    asked = [k for k, one in enumerate(known) if not one]
 
     def fit_at(curvatures: dict[int, float], start: Fit = before, schedule: Schedule = NEARER) -> Fit:
         """Return the fit with lights of these curvatures, by number of the light."""
@@ -204,29 +203,30 @@ def distances_chosen(problem: JointProblem, before: Fit, choices: Choices, fit: 
             placed[k] = msgspec.structs.replace(placed[k], curvature=c)
         return fit("distances", sample, start.with_lights(placed), schedule)
 
-    # each fit goes on from the one before: light that comes a little nearer changes a little
-    losses, last = [], before
+    losses, last = [], before  # each fit goes on from the one before
     for c in (0.0, *CURVATURES):
         last = fit_at(dict.fromkeys(asked, c), last)
         losses.append(losses_of(sample, last.point))
-    far, *near = losses
-    curvature = {}
-    for k in asked:
-        tried = [_evidence_of_light(k, far, one, NEARER_FROM) for one in near]
-        best = min(range(len(near)), key=lambda i: (not tried[i].kept, tried[i].held_out_loss_with or 0.0))
-        evidence[k] = tried[best]
-        if tried[best].kept:
-            curvature[k] = CURVATURES[best]
+    likeliest = {k: _likeliest_curvature(k, losses) for k in asked}
+    evidence = [likeliest[k][1] if k in likeliest else one for k, one in enumerate(evidence)]
+    curvature = {k: c for k, (c, one) in likeliest.items() if one.kept}
     if not curvature:
         return Chosen(before, evidence)
     chosen = fit_at(curvature)
-    curvatures = (dict.fromkeys(curvature, 0.0), curvature)
-    far, there = (losses_of(sample, fit_at(of, chosen, GIVEN).point) for of in curvatures)
+    both = (dict.fromkeys(curvature, 0.0), curvature)
+    far, there = (losses_of(sample, fit_at(one, chosen, GIVEN).point) for one in both)
     for k in curvature:
         given = _evidence_of_light(k, far, there, NEARER_FROM)
         evidence[k] = min(evidence[k], given, key=lambda one: one.margin or 0.0)
     kept = {k: c * believed(evidence[k]) for k, c in curvature.items() if evidence[k].kept}
     return Chosen(fit_at(kept) if kept else before, evidence)
+
+
+def _likeliest_curvature(k: int, losses: Sequence[Losses]) -> tuple[float, Decision]:
+    """Return the best of `CURVATURES` for light k and the evidence for it; losses: far away, then at each of them."""
+    tried = [_evidence_of_light(k, losses[0], near, NEARER_FROM) for near in losses[1:]]
+    best = min(range(len(tried)), key=lambda i: (not tried[i].kept, tried[i].held_out_loss_with or 0.0))
+    return CURVATURES[best], tried[best]
 
 
 def believed(evidence: Decision) -> float:

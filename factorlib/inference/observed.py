@@ -5,7 +5,7 @@ There is one block per illumination.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from pathlib import Path
 
@@ -44,7 +44,11 @@ class PhotoObservations(msgspec.Struct, frozen=True):
 
 
 def gathered(
-    files: Sequence[Path], degrees: float, spread: Spread, surface: Path | None = None
+    files: Sequence[Path],
+    degrees: float,
+    spread: Spread,
+    surface: Path | None = None,
+    tick: Callable[[], None] = lambda: None,
 ) -> list[PhotoObservations]:
     """Read each file in order, and merge its observations within `degrees` of each other (`factorlib.urm.merge`).
 
@@ -53,15 +57,17 @@ def gathered(
         degrees: Largest angle between merged observations.
         spread: Map over independent work.
         surface: Folder of the stage `surface`, whose normals replace those of the mesh; None for the mesh's.
+        tick: Called after each file.
     """
-    return list(spread(partial(_of_file, degrees=degrees, surface=surface), files))
 
+    def merged(path: Path) -> PhotoObservations:
+        """Return the usable observations of one file, merged."""
+        read = on_surface(read_observations(path), surface)
+        seen = usable(read)
+        tick()
+        return PhotoObservations(merge(seen, degrees), len(read), len(read) - len(seen))
 
-def _of_file(path: Path, degrees: float, surface: Path | None) -> PhotoObservations:
-    """Return the usable observations of one file, merged."""
-    read = on_surface(read_observations(path), surface)
-    seen = usable(read)
-    return PhotoObservations(merge(seen, degrees), len(read), len(read) - len(seen))
+    return list(spread(merged, files))
 
 
 def blocks_of_observations(

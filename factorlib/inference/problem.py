@@ -90,7 +90,7 @@ class JointProblem(msgspec.Struct, frozen=True):
         return not any(block.held_out.any() for block in self.blocks)
 
     def sampled(self, count: int | Sequence[int], seed: int) -> JointProblem:
-        """Return the problem with at most `count` fitted observations a block, and at most a third as many held out.
+        """Return the problem with at most `count` fitted and `count` held-out observations of each block.
 
         `count` is one number, or one a block.
         """

@@ -1,1 +1,1 @@
-"""A page in the browser on which label masks are drawn: `make label DATASET=…`."""
+"""A browser page for drawing label masks: `make label DATASET=…`."""

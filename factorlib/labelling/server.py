@@ -1,8 +1,9 @@
-"""The masks of a data set, and a server that shows them to a browser on this machine alone.
+"""Label masks of a data set, and a server that shows them to a browser on this machine alone.
 
-A request carries a random token, the page's in its address, any other in a header that no stranger's page may send.  Host must be this server's
-address, so that no name turned to 127.0.0.1 (DNS rebinding) is served, and so must Origin, where a browser sends it.  A request names a photo
-by its index, never a file, and its body is as long as the photo's size asks.
+A request carries a random token: that of the page in its address, any other in a header, which a foreign page cannot
+send.  Host must be this server's address, so that a name that resolves to 127.0.0.1 (DNS rebinding) is not served.
+Origin, if a browser sends it, must be the same.  A request names a photo by its index, never a file, and its body has
+the length that the photo's size implies.
 """
 
 import hashlib
@@ -43,13 +44,16 @@ from factorlib.yamlfile import parse_yaml, read_yaml, with_value
 OnePng = msgspec.Meta(
     description='here one label PNG a photo is drawn: name it, also if it is not there yet, or write masks: "?"'
 )
-CONTENT = "default-src 'none'; img-src data:; script-src 'unsafe-inline'; style-src 'unsafe-inline'; connect-src 'self'; frame-ancestors 'none'"
+CONTENT = (
+    "default-src 'none'; img-src data:; script-src 'unsafe-inline'; style-src 'unsafe-inline'; "
+    "connect-src 'self'; frame-ancestors 'none'"
+)
 HEADERS = {"Cache-Control": "no-store", "Referrer-Policy": "no-referrer", "Content-Security-Policy": CONTENT}
-NO_FILE = "none"  # the version of a mask that is not there yet
+NO_FILE = "none"  # version of a mask that does not exist yet
 
 
 class Entry(msgspec.Struct, frozen=True):
-    """What is needed of a photo in dataset.yaml."""
+    """Keys of a photo in dataset.yaml that labelling needs."""
 
     name: Name
     image: str
@@ -58,7 +62,7 @@ class Entry(msgspec.Struct, frozen=True):
 
 
 class Spec(msgspec.Struct, frozen=True):
-    """What is needed of dataset.yaml; the rest may be unfinished."""
+    """Keys of dataset.yaml that labelling needs; the rest may be unfinished."""
 
     materials: Annotated[list[Name], OneOf254]
     photos: Annotated[list[Entry], AtLeastOne]
@@ -67,19 +71,27 @@ class Spec(msgspec.Struct, frozen=True):
 class MaskSet:
     """The label masks of the photos of a data set.
 
-    One that is not there yet is empty; one that dataset.yaml leaves as `?` becomes masks/<photo>.png, and is named there when it is saved.
-    Raises InputError for a dataset.yaml or photo that cannot be read, and for masks that are no label PNG.
+    A mask that does not exist yet is empty.  If dataset.yaml leaves it as `?`, it becomes masks/<photo>.png, and
+    dataset.yaml names it when it is saved.
+
+    Raises:
+        InputError: dataset.yaml or a photo cannot be read, or a mask is not a label PNG.
     """
 
     def __init__(self, folder: Path):
-        self.folder, self.yaml, self.files, self.sizes = folder.resolve(), folder.resolve() / FILE, [], []
+        self.folder = folder.resolve()
+        self.yaml = folder.resolve() / FILE
+        self.files = []
+        self.sizes = []
         if not is_there(self.yaml, "DATASET") or not self.yaml.resolve().is_relative_to(self.folder):
             raise InputError("there is no such file in this folder", file=self.yaml, cure="`make new` begins one")
-        spec, refuse = read_yaml(self.yaml, Spec), Refusal(self.yaml, self.folder)
+        spec = read_yaml(self.yaml, Spec)
+        refuse = Refusal(self.yaml, self.folder)
         self.materials, self.photos = spec.materials, spec.photos
         refuse.once("photos", (photo.name for photo in self.photos), "photo")
         for index, photo in enumerate(self.photos):
-            key, mask = f"photos[{index}].image", f"masks/{photo.name}.png" if photo.masks == UNKNOWN else photo.masks
+            key = f"photos[{index}].image"
+            mask = f"masks/{photo.name}.png" if photo.masks == UNKNOWN else photo.masks
             refuse.path(key, photo.image, IMAGES)
             refuse.path(f"photos[{index}].masks", mask, (".png",), must_exist=False)
             self.files.append((self.folder / mask).resolve())
@@ -88,21 +100,37 @@ class MaskSet:
         self.picture = lru_cache(4)(self._picture)
 
     def _picture(self, index: int) -> UInt8[np.ndarray, "h w 3"]:
-        """A photo as displayed, sRGB-encoded; a linear one is exposed."""
-        path, encoding = self.folder / self.photos[index].image, self.photos[index].encoding
+        """Return a photo as displayed, sRGB-encoded; a linear one is exposed."""
+        path = self.folder / self.photos[index].image
+        encoding = self.photos[index].encoding
         photo = decoded(open_photo(path), encoding, 1, path)
         return picture(photo.radiance, None if photo.encoding == "linear" else 1.0)
 
     def read(self, index: int) -> tuple[UInt8[np.ndarray, "h w"], str]:
-        """Labels, and the version of their file.  InputError where they are not of the photo's size, or have no material."""
+        """Return the labels and the version of their file.
+
+        Raises:
+            InputError: The labels differ in size from the photo, or one has no material.
+        """
         if (version := self.version(index)) == NO_FILE:
             return np.zeros(self.sizes[index], np.uint8), version
         labels = self._known(read_values(self.files[index], self.photos[index].name, self.sizes[index]), index)
         return labels.astype(np.uint8), version
 
     def save(self, index: int, labels: UInt8[np.ndarray, "h w"], version: str) -> str:
-        """Write labels, and return their file's version; InputError where that is not `version` any more, or a label has no material."""
-        png, path, photo = png_bytes(self._known(labels, index)[..., None]), self.files[index], self.photos[index].name
+        """Write the labels and return the new version of their file.
+
+        Args:
+            index: index of the photo
+            labels: the labels, of the photo's size
+            version: version of the file that the labels are based on
+
+        Raises:
+            InputError: The file has changed since that version, or a label has no material.
+        """
+        png = png_bytes(self._known(labels, index)[..., None])
+        path = self.files[index]
+        photo = self.photos[index].name
         if self.version(index) != version:
             cure = "press R to read it (what was drawn since the last save is lost), or move the file away"
             raise InputError("has changed on disk meanwhile: nothing was written", file=path, cure=cure)
@@ -114,26 +142,29 @@ class MaskSet:
         return self.version(index)
 
     def _named(self, photo: str) -> str | None:
-        """Return dataset.yaml with the mask's path in place of the photo's `?` and no other change; None where none stands there."""
-        text, mask = read_text(self.yaml, "a YAML file"), f"masks/{photo}.png"
+        """Return dataset.yaml with the mask's path in place of the photo's `?`, or None if there is no `?`."""
+        text = read_text(self.yaml, "a YAML file")
+        mask = f"masks/{photo}.png"
         photos = read_yaml(self.yaml, Spec).photos
         index = next((k for k, each in enumerate(photos) if (each.name, each.masks) == (photo, UNKNOWN)), None)
         if index is None:
             return None
-        value, text = parse_yaml(text), with_value(text, ("photos", index, "masks"), mask)
+        value = parse_yaml(text)
+        text = with_value(text, ("photos", index, "masks"), mask)
         value["photos"][index]["masks"] = mask
-        with suppress(InputError):  # the `?` had an anchor, which others miss
+        with suppress(InputError):  # The `?` had an anchor that other places refer to.
             if parse_yaml(text) == value:
                 return text
         cure = f"write masks: {mask}, and save again; nothing was written"
         raise InputError("an anchor is in the way", file=self.yaml, key=f"photos[{index}].masks", cure=cure)
 
     def version(self, index: int) -> str:
-        """The hash of a mask's file, NO_FILE where there is none."""
+        """Return the hash of a mask's file, or NO_FILE if it does not exist."""
         there = is_there(self.files[index], "masks")
         return hashlib.sha256(read_bytes(self.files[index], "a PNG")).hexdigest() if there else NO_FILE
 
     def _known(self, labels: np.ndarray, index: int) -> np.ndarray:
+        """Return the labels; InputError if one has no material."""
         if strange := {*np.unique(labels).tolist()} - {*range(len(self.materials) + 1), LEFT_OUT}:
             cure = f"known are 0 background, 1 to {len(self.materials)} the materials, {LEFT_OUT} leave out"
             raise InputError(f"unknown label {min(strange)}", file=self.files[index], cure=cure)
@@ -141,26 +172,37 @@ class MaskSet:
 
 
 class Server(ThreadingHTTPServer):
-    """Serves masks at `url` on 127.0.0.1; port 0 is a free one; unsaved: indices of photos with strokes that the browser alone has."""
+    """A server of masks at `url` on 127.0.0.1.
+
+    Attributes:
+        masks: the masks
+        port: the port; 0 is a free one
+        unsaved: indices of photos with strokes that only the browser has
+    """
 
     def __init__(self, masks: MaskSet, port: int = 0):
-        self.masks, self.token, self.unsaved, self.lock = masks, secrets.token_urlsafe(24), set(), Lock()
+        self.masks = masks
+        self.token = secrets.token_urlsafe(24)
+        self.unsaved = set()
+        self.lock = Lock()
         super().__init__(("127.0.0.1", port), _Request)
         self.host = f"127.0.0.1:{self.server_port}"
         self.url = f"http://{self.host}/?token={self.token}"
 
     def handle_error(self, *of: Any) -> None:
-        """Say nothing where the browser has hung up."""
+        """Ignore a browser that has closed the connection; report other errors."""
         if not isinstance(sys.exception(), OSError):
             super().handle_error(*of)
 
 
 class _Request(BaseHTTPRequestHandler):
     server: Server
-    timeout = 60  # seconds that a browser may pause
+    timeout = 60  # longest pause of a browser, seconds
 
     def do_GET(self) -> None:
-        url, server = urlsplit(self.path), self.server
+        """Answer a request whose token, Host and Origin are right."""
+        url = urlsplit(self.path)
+        server = self.server
         query = {name: values[0] for name, values in parse_qs(url.query).items()}
         is_page = (self.command, url.path) == ("GET", "/")
         token = query.get("token", "") if is_page else self.headers.get("X-Token", "")
@@ -178,7 +220,7 @@ class _Request(BaseHTTPRequestHandler):
     do_PUT = do_POST = do_GET
 
     def log_message(self, *of: Any) -> None:
-        """Say nothing of requests."""
+        """Log nothing about requests."""
 
     def _send(self, status: int, body: bytes, kind: str = "text/plain; charset=utf-8", version: str = "") -> None:
         self.send_response(status)
@@ -188,8 +230,9 @@ class _Request(BaseHTTPRequestHandler):
         self.wfile.write(body)
 
     def _answer(self, path: str, query: dict[str, str]) -> tuple:
-        """Body, type and version of what is asked for."""
-        masks, data = self.server.masks, "application/octet-stream"
+        """Return body, type and version of the requested resource."""
+        masks = self.server.masks
+        data = "application/octet-stream"
         named = re.fullmatch(r"/(photo|mask|grow|unsaved)/([0-9]{1,9})", path)
         index = int(named[2]) if named else 0
         height, width = masks.sizes[index] if index < len(masks.sizes) else (0, 0)
@@ -197,7 +240,7 @@ class _Request(BaseHTTPRequestHandler):
             case "GET", "/":
                 return (files("factorlib.labelling") / "page.html").read_bytes(), "text/html; charset=utf-8"
             case "GET", "/set":
-                materials = list(zip(masks.materials, cycle(PALETTE)))  # not their own colours, to be seen on them
+                materials = list(zip(masks.materials, cycle(PALETTE)))  # colours that stand out from the materials
                 photos = [photo.name for photo in masks.photos]
                 about = {"name": masks.folder.name, "photos": photos, "materials": materials}
                 return msgspec.json.encode(about), "application/json"
@@ -211,7 +254,7 @@ class _Request(BaseHTTPRequestHandler):
                 labels = np.frombuffer(self._body(height * width), np.uint8).reshape(height, width)
                 with self.server.lock:
                     return b"", data, masks.save(index, labels, self.headers.get("X-Version", ""))
-            case "POST", "grow":  # labels, and 1 where they are sure; the labels grown in the box come back
+            case "POST", "grow":  # The body is the labels, then 1 where they are sure; the reply is the grown labels.
                 box = tuple(map(int, re.findall("[0-9]+", query.get("box", "")[:40])))
                 if len(box) != 5 or not (box[0] < box[2] <= width and box[1] < box[3] <= height and box[4] < 256):
                     raise InputError("the box is not in the photo, or has no label")
@@ -223,15 +266,17 @@ class _Request(BaseHTTPRequestHandler):
         raise InputError("there is nothing of that name")
 
     def _body(self, length: int) -> bytes:
+        """Return the request's body; InputError if it does not have the expected length."""
         if self.headers.get("Content-Length") != str(length) or len(body := self.rfile.read(length)) < length:
             raise InputError(f"{length} bytes are expected: nothing was written")
         return body
 
 
 def serve(folder: Path, port: int = 0) -> None:
-    """Serve the page of the data set in `folder` until Ctrl-C, and say then what was not saved.
+    """Serve the page of the data set in `folder` until Ctrl-C, then report unsaved photos.
 
-    Raises InputError as `MaskSet` does, and where the port (0: a free one) cannot be had.
+    Raises:
+        InputError: As for `MaskSet`, or the port is in use (0 is a free one).
     """
     masks = MaskSet(folder)
     try:
@@ -244,6 +289,6 @@ def serve(folder: Path, port: int = 0) -> None:
     except KeyboardInterrupt:
         pass
     finally:
-        with server.lock:  # what is being saved is finished
+        with server.lock:  # Wait for a save in progress.
             names = ", ".join(masks.photos[index].name for index in sorted(server.unsaved))
             print(f"stopped; {f'not saved: {names}' if names else 'all is saved'}", flush=True)

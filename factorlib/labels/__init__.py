@@ -1,1 +1,1 @@
-"""Masks: which pixel shows which material, from label PNGs, one PNG per material, or COCO."""
+"""Masks: the material of each pixel, from label PNGs, one PNG per material, or COCO."""

@@ -1,8 +1,8 @@
-"""COCO annotations as masks: polygons, and RLE as counts or compressed, by category and file name.
+"""Reader of COCO annotations as masks: polygons, and RLE as counts or compressed, by category and file name.
 
-Polygons are filled by pycocotools, which takes memory for every pixel of an outline: how long one may be is checked first.
-Run lengths are decoded here, for pycocotools takes every one at its word; what is drawn of several is their union, at the cost
-of the number of runs and one picture.  The shapes of other photos in the file are left as text.
+pycocotools fills the polygons. It needs memory for every pixel of an outline, so the length of outlines is checked
+first. Run lengths are decoded here, because pycocotools does not validate them. Several shapes give their union, at the
+cost of the number of runs and one picture. The shapes of other photos in the file are left as text.
 """
 
 from pathlib import Path, PurePosixPath
@@ -16,22 +16,23 @@ from factorlib.errors import InputError, did_you_mean
 from factorlib.labels.png import check_size
 from factorlib.reading import read_bytes, reading
 
-OVERSHOOT = 2.0  # pixels by which a polygon may leave the image
-MOST_BYTES = 512_000_000  # of a file; a hundred thousand outlines have half of it
-LONGEST, LONGEST_OF_ALL = 200, 5000  # an outline, and all of a photo together, in half perimeters of the photo
-MOST_DIGITS = 7  # of a compressed run length, 5 bits each: no picture has 2**35 pixels
+OVERSHOOT = 2.0  # a polygon may leave the image by this many pixels
+MOST_BYTES = 512_000_000  # greatest size of a file; a hundred thousand outlines take half of it
+LONGEST = 200  # greatest length of an outline, in half perimeters of the photo
+LONGEST_OF_ALL = 5000  # greatest length of all outlines of a photo together
+MOST_DIGITS = 7  # greatest number of 5-bit digits of a compressed run length: no picture has 2**35 pixels
 CURE = "export the file again"
 
 
 class Rle(msgspec.Struct, frozen=True):
-    """Lengths of runs of outside, inside, outside, … down the columns; a string is COCO's compressed form of it."""
+    """Lengths of runs outside, inside, outside, … down the columns; a string is COCO's compressed form."""
 
     size: tuple[int, int]  # height, width
     counts: list[int] | str
 
 
 class Annotation(msgspec.Struct, frozen=True):
-    """The shape of one object in one image; segmentation: polygons or RLE, left as JSON text until its photo is read."""
+    """Shape of one object in one image; segmentation (polygons or RLE) stays JSON text until its photo is read."""
 
     image_id: int | str
     category_id: int | str
@@ -40,14 +41,14 @@ class Annotation(msgspec.Struct, frozen=True):
 
 
 class Category(msgspec.Struct, frozen=True):
-    """What an annotation shows: the name is a material's."""
+    """Category of annotations; its name is that of a material."""
 
     id: int | str
     name: str
 
 
 class CocoImage(msgspec.Struct, frozen=True):
-    """An image that annotations are about; width, height: in pixels, None where the file does not say."""
+    """Image of a COCO file; width and height are in pixels, None if the file does not give them."""
 
     id: int | str
     file_name: str
@@ -56,7 +57,7 @@ class CocoImage(msgspec.Struct, frozen=True):
 
 
 class Coco(msgspec.Struct, frozen=True):
-    """The part of a COCO file that is read; what else stands in it is left alone."""
+    """Contents of a COCO file that are read; others are ignored."""
 
     images: list[CocoImage]
     annotations: list[Annotation]
@@ -66,10 +67,20 @@ class Coco(msgspec.Struct, frozen=True):
 def read_coco(
     path: str | Path, image: str, materials: list[str], size: tuple[int, int], key: str = "masks"
 ) -> dict[str, Bool[np.ndarray, "h w"]]:
-    """The union of the annotations of each material in the photo named `image`.
+    """Read the union of the annotations of each material in one photo.
 
-    size: (height, width) of the photo; key: where the file is named, for messages.
-    Raises InputError naming the annotation, and for a file that is about a picture of another size.
+    Args:
+        path: COCO file.
+        image: File name of the photo.
+        materials: Materials of the dataset.
+        size: Height and width of the photo.
+        key: Key to name in errors.
+
+    Returns:
+        Masks by material.
+
+    Raises:
+        InputError: If an annotation is invalid, or if the image has another size.
     """
     content = read_bytes(path, "COCO", key, MOST_BYTES)
     with reading("COCO", path, key, "it needs images, annotations and categories"):
@@ -81,7 +92,8 @@ def read_coco(
     for index, annotation in enumerate(coco.annotations):
         if annotation.image_id != entry.id:
             continue
-        at, name = f"annotations[{index}]", names.get(annotation.category_id)
+        at = f"annotations[{index}]"
+        name = names.get(annotation.category_id)
         if name is None:
             fault = f"category_id {annotation.category_id!r} is not in categories"
             raise InputError(fault, file=path, key=at, cure=CURE)
@@ -89,9 +101,10 @@ def read_coco(
             cure = did_you_mean(name, materials) + " (categories are the dataset's materials)"
             raise InputError(f"category {name!r} is no material", file=path, key=at, cure=cure)
         of_material.setdefault(name, []).append((f"{at}.segmentation", annotation.segmentation))
-    masks, length = {}, 0.0  # of all outlines
+    masks = {}  # of all outlines
+    length = 0.0
     for name, own in of_material.items():
-        edges = np.zeros(size[0] * size[1] + 1, np.int32)  # how many shapes begin at a pixel, less how many end
+        edges = np.zeros(size[0] * size[1] + 1, np.int32)  # number of shapes that begin at a pixel, less those that end
         for at, segmentation in own:
             shapes, longer = _shapes(segmentation, size, path, at)
             length += longer
@@ -109,10 +122,13 @@ def read_coco(
 
 
 def runs_of(counts: list[int] | str, pixels: int) -> Int[np.ndarray, " n"]:
-    """Run lengths, decompressed where they are a string.  Raises ValueError unless they fill so many pixels exactly.
+    """Return run lengths, decompressed if they are a string.
 
-    Compressed, a character holds 5 bits (+48), the sixth says "more follows", the sign is the highest bit of the last; from the
-    third run on each is the difference to the run two before.
+    In the compressed form, a character holds 5 bits (+48). Its sixth bit means that more characters follow, and the
+    sign is the highest bit of the last. From the third run on, each is the difference to the run two before.
+
+    Raises:
+        ValueError: If the runs do not fill the pixels exactly.
 
     >>> runs_of([1, 2, 1], 4).tolist(), runs_of("R47g1", 192).tolist()
     ([1, 2, 1], [130, 7, 55])
@@ -122,6 +138,7 @@ def runs_of(counts: list[int] | str, pixels: int) -> Int[np.ndarray, " n"]:
         ends = np.flatnonzero(codes & 32 == 0)
         if ((codes < 0) | (codes >= 64)).any() or len(codes) != (ends[-1] + 1 if len(ends) else 0):
             raise ValueError("it is no compressed RLE, or cut short")
+        # sum the 5-bit digits of each run, subtract for the sign, then undo the differences
         begins = np.r_[0, ends[:-1] + 1][: len(ends)]
         digits = ends - begins + 1
         if digits.max(initial=0) > MOST_DIGITS:
@@ -129,7 +146,8 @@ def runs_of(counts: list[int] | str, pixels: int) -> Int[np.ndarray, " n"]:
         place = np.arange(len(codes)) - np.repeat(begins, digits)
         runs = np.add.reduceat((codes & 31) << 5 * place, begins) if len(ends) else codes
         runs -= np.where(codes[ends] & 16, 1 << 5 * digits, 0)
-        runs[1::2], runs[2::2] = np.cumsum(runs[1::2]), np.cumsum(runs[2::2])
+        runs[1::2] = np.cumsum(runs[1::2])
+        runs[2::2] = np.cumsum(runs[2::2])
     else:
         runs = np.array(counts, np.int64)
     if runs.min(initial=0) < 0 or runs.max(initial=0) > pixels or runs.sum() != pixels:
@@ -138,7 +156,7 @@ def runs_of(counts: list[int] | str, pixels: int) -> Int[np.ndarray, " n"]:
 
 
 def _entry(coco: Coco, image: str, path: str | Path) -> CocoImage:
-    """The image entry of the same path, or else of the same file name."""
+    """Return the image entry of the same path, or else of the same file name."""
     base = PurePosixPath(image).name
     bases = [PurePosixPath(entry.file_name.replace("\\", "/")).name for entry in coco.images]
     same = [entry for entry in coco.images if PurePosixPath(entry.file_name) == PurePosixPath(image)]
@@ -152,7 +170,7 @@ def _entry(coco: Coco, image: str, path: str | Path) -> CocoImage:
 
 
 def _shapes(text: msgspec.Raw, shape: tuple[int, int], path: str | Path, key: str) -> tuple[list, float]:
-    """Run lengths of the parts of a shape, and how long its outlines are."""
+    """Return the run lengths of the parts of a shape, and the total length of its outlines."""
     with reading("a COCO segmentation", path, key, CURE):
         segmentation = msgspec.json.decode(text, type=list[list[float]] | Rle | None)
     if not segmentation:
@@ -163,9 +181,12 @@ def _shapes(text: msgspec.Raw, shape: tuple[int, int], path: str | Path, key: st
             fault = f"its RLE is {_wh(segmentation.size)} pixels, the image {_wh(shape)}"
             raise InputError(fault, file=path, key=key, cure="export it at the photo's own size")
         return [segmentation.counts], 0.0
-    polygons, length, limit = [], 0.0, np.array(shape[::-1])
+    polygons = []
+    length = 0.0
+    limit = np.array(shape[::-1])
     for index, polygon in enumerate(segmentation):
-        fault, corners = None, np.array(polygon)
+        fault = None
+        corners = np.array(polygon)
         cure = "a polygon is [x1, y1, x2, y2, x3, y3, …], three corners or more"
         if len(corners) < 6 or len(corners) % 2 or not np.isfinite(corners).all():
             fault = "is no polygon"
@@ -176,7 +197,8 @@ def _shapes(text: msgspec.Raw, shape: tuple[int, int], path: str | Path, key: st
             corners = np.clip(corners, 0, limit)
             longer = float(np.abs(np.diff(corners, axis=0, append=corners[:1])).max(axis=1).sum())
             if longer > LONGEST * sum(shape):
-                fault, cure = f"its outline is {longer:.3g} pixels long", "draw it again, with fewer corners"
+                fault = f"its outline is {longer:.3g} pixels long"
+                cure = "draw it again, with fewer corners"
         if fault:
             raise InputError(fault, file=path, key=f"{key}[{index}]", cure=cure)
         polygons.append(corners.ravel().tolist())
@@ -185,4 +207,5 @@ def _shapes(text: msgspec.Raw, shape: tuple[int, int], path: str | Path, key: st
 
 
 def _wh(shape: tuple[int, int]) -> str:
+    """Format a size as width × height."""
     return f"{shape[1]} × {shape[0]}"

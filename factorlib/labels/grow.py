@@ -1,8 +1,9 @@
-"""Labels grown from strokes: a random walker over a photo, with the colours of each label as its prior.
+"""Growth of labels from strokes: a random walker on a photo, with the colours of each label as its prior.
 
-A walker starts at a pixel, seldom crosses an edge of the photo, and stops at a stroke: the pixel takes the label that it most likely
-stops at (Grady 2006).  It also stops anywhere, at a label that has such colours there (Grady 2005).  The colours are learnt from the strokes,
-a little from the first guess, and then twice more from the answer, as GrabCut does (Rother et al. 2004).
+A walker starts at a pixel, seldom crosses an edge of the photo, and stops at a stroke. The pixel gets the label at
+which it most likely stops (Grady 2006). It may also stop anywhere, at a label that has such colours (Grady 2005). The
+colours are learnt from the strokes, a little from the first guess, and then twice more from the result, as in GrabCut
+(Rother et al. 2004).
 """
 
 from math import ceil
@@ -12,34 +13,51 @@ from jaxtyping import Bool, Float, UInt8
 from scipy import ndimage, sparse
 from scipy.sparse.linalg import cg
 
-MOST_PIXELS = 200_000  # that walkers walk on: about a second
-ROUNDS = 3
-BINS = 32  # of a channel, in a label's histogram of colours, which is smoothed by a Gaussian of one bin
-FLOOR = 1e-7  # the probability of a colour that a label has nowhere
-PRIOR = 0.05  # γ: how often a walker stops at a colour, against a step to a pixel like its own
-GUESSED = 0.1  # the weight of the first guess's colours beside those of strokes, which may lie on a glint alone
-CROSSING = 1e-3  # how often it crosses the strongest edge, likewise
-BESIDE = 0.05  # of a box's longer side: what lies so near to it is looked at, too
+MOST_PIXELS = 200_000  # greatest number of pixels of the random walk, which takes about a second
+ROUNDS = 3  # number of rounds of learning colours
+BINS = 32  # number of bins per channel of a label's histogram, which is smoothed by a Gaussian of one bin
+FLOOR = 1e-7  # probability of a colour that a label does not have
+PRIOR = 0.05  # γ: rate of stopping at a colour, relative to a step to a pixel of the same colour
+GUESSED = 0.1  # weight of the first guess's colours beside those of strokes, which may be on a highlight only
+CROSSING = 1e-3  # rate of crossing the strongest edge, relative to the same step
+BESIDE = 0.05  # margin around the box that is included, in units of its longer side
 
 
 def grow(
-    box: tuple[int, int, int, int], fill: int, pixels: UInt8[np.ndarray, "h w 3"], label: UInt8[np.ndarray, "h w"],
-    sure: Bool[np.ndarray, "h w"], most_pixels: int = MOST_PIXELS,
-) -> UInt8[np.ndarray, "h w"]:  # fmt: skip
-    """The labels of a picture, grown inside a box from those of `sure` pixels, which stay, and of pixels beside the box.
+    box: tuple[int, int, int, int],
+    fill: int,
+    pixels: UInt8[np.ndarray, "h w 3"],
+    label: UInt8[np.ndarray, "h w"],
+    sure: Bool[np.ndarray, "h w"],
+    most_pixels: int = MOST_PIXELS,
+) -> UInt8[np.ndarray, "h w"]:
+    """Grow the labels of a picture inside a box.
 
-    box: first column, first row, and those behind the last;  fill: the label of the box;  pixels: sRGB-encoded;  label: inside, a first
-    guess.  Background, `fill` and the labels of sure pixels grow.  Any other is of another object: it stays, and counts as background, where
-    most of it lies beyond the box; elsewhere `fill` takes its place.
-    A box of more than `most_pixels` is averaged down by a whole factor, and the answer interpolated.
+    They grow from the labels of `sure` pixels, which are fixed, and of pixels beside the box.
+    Background, `fill` and the labels of sure pixels grow. Any other label belongs to another object. If most of a
+    connected region of it lies outside the box, the region is fixed and counts as background; otherwise `fill` replaces
+    it. A box of more than `most_pixels` is downsampled by a whole factor, and the result is interpolated.
+
+    Args:
+        box: First column and row, and the column and row after the last.
+        fill: Label of the box.
+        pixels: Photo, sRGB-encoded.
+        label: Labels; inside the box, a first guess.
+        sure: Mask of fixed pixels.
+        most_pixels: Greatest number of pixels of the random walk.
+
+    Returns:
+        Labels of the picture.
     """
     x0, y0, x1, y1 = box
     inside = np.zeros_like(sure)
     inside[y0:y1, x0:x1] = True
     stays = ~inside
+    # fix the connected regions of other labels that lie mostly outside the box
     for kind in set(np.unique(label[inside]).tolist()) - {0, fill}:
         bodies = ndimage.label(label == kind)[0]
-        pixels_of, pixels_in = np.bincount(bodies.ravel()), np.bincount(bodies[inside], minlength=bodies.max() + 1)
+        pixels_of = np.bincount(bodies.ravel())
+        pixels_in = np.bincount(bodies[inside], minlength=bodies.max() + 1)
         stays |= (2 * pixels_in < pixels_of)[bodies] & (bodies > 0)
     own = np.isin(label, [0, fill, *np.unique(label[sure & ~stays])])
     sure = stays | (inside & sure)
@@ -47,11 +65,15 @@ def grow(
     result = np.where(sure, label, first)
     beside = max(4, round(BESIDE * max(x1 - x0, y1 - y0)))
     part = np.s_[max(0, y0 - beside) : y1 + beside, max(0, x0 - beside) : x1 + beside]
-    pixels, label, sure = pixels[part], first[part], sure[part]
+    pixels = pixels[part]
+    label = first[part]
+    sure = sure[part]
     factor = ceil((label.size / most_pixels) ** 0.5)
     some = np.s_[factor // 2 :: factor, factor // 2 :: factor]
-    strokes = ndimage.maximum_filter(np.where(sure, label + 1.0, 0), factor)[some]  # thin ones count, too
-    coarse, fixed = np.where(strokes > 0, strokes - 1, label[some]).astype(np.uint8), strokes > 0
+    # downsample labels and colours; the maximum keeps thin strokes
+    strokes = ndimage.maximum_filter(np.where(sure, label + 1.0, 0), factor)[some]
+    coarse = np.where(strokes > 0, strokes - 1, label[some]).astype(np.uint8)
+    fixed = strokes > 0
     kinds = np.unique(coarse)
     if fixed.all() or len(kinds) == 1:
         return result
@@ -64,39 +86,53 @@ def grow(
 
 
 def _walk(
-    pixels: Float[np.ndarray, "h w 3"], kinds: UInt8[np.ndarray, " k"], label: UInt8[np.ndarray, "h w"],
+    pixels: Float[np.ndarray, "h w 3"],
+    kinds: UInt8[np.ndarray, " k"],
+    label: UInt8[np.ndarray, "h w"],
     fixed: Bool[np.ndarray, "h w"],
-) -> Float[np.ndarray, "k h w"]:  # fmt: skip
-    """The probability of each of the labels `kinds` at each pixel: (L + γ) x = γ p beside strokes, x known in them."""
-    number, colour, edges = np.arange(label.size).reshape(label.shape), pixels.reshape(-1, 3), []
+) -> Float[np.ndarray, "k h w"]:
+    """Return the probability of each of the labels `kinds` at each pixel.
+
+    Outside strokes it solves (L + γ) x = γ p with x fixed at strokes, where L is the graph Laplacian and p the prior.
+    """
+    number = np.arange(label.size).reshape(label.shape)
+    colour = pixels.reshape(-1, 3)
+    edges = []
     for here, there in ((np.s_[:, :-1], np.s_[:, 1:]), (np.s_[:-1], np.s_[1:])):
         edges.append((number[here].ravel(), number[there].ravel()))
     one, other = np.concatenate(edges, axis=1)
+    # L, with weights that fall with the difference of colours between neighbours
     step = np.square(colour[one] - colour[other]).sum(axis=1)
     weight = np.exp(-step / max(2 * step.mean(), 1e-12)) + CROSSING
     weights = sparse.coo_array((weight, (one, other)), shape=(label.size, label.size)).tocsr()
     weights = weights + weights.T
-    laplacian = (sparse.diags_array(weights.sum(axis=1)) - weights).tocsr()  # L
-    known, current = fixed.ravel(), label.ravel().copy()
+    laplacian = (sparse.diags_array(weights.sum(axis=1)) - weights).tocsr()
+    known = fixed.ravel()
+    current = label.ravel().copy()
+    # system of the unknown pixels, with the diagonal as preconditioner
     rows = laplacian[~known]
-    system, beside = rows[:, ~known] + PRIOR * sparse.eye_array((~known).sum()), rows[:, known]
+    system = rows[:, ~known] + PRIOR * sparse.eye_array((~known).sum())
+    beside = rows[:, known]
     scale = sparse.diags_array(1 / system.diagonal())
     bins = np.ravel_multi_index(tuple((colour.T * (BINS - 1)).round().astype(int)), (BINS,) * 3)
     chances = np.empty((len(kinds), label.size))
     learnt = known if np.isin(kinds, current[known]).all() else np.ones_like(known)
     for _ in range(ROUNDS):
+        # p from the histograms of colours, then (L + γ) x = γ p for each label
         some, every = ([_histogram(bins[which & (current == kind)]) for kind in kinds] for which in (learnt, True))
-        prior = (np.array(some) + GUESSED * np.array(every))[:, bins]  # p
+        prior = (np.array(some) + GUESSED * np.array(every))[:, bins]
         prior /= prior.sum(axis=0)
         for k, kind in enumerate(kinds):
             chances[k, known] = current[known] == kind
             right = PRIOR * prior[k, ~known] - beside @ chances[k, known]
             chances[k, ~known], _ = cg(system, right, rtol=1e-3, M=scale)
-        current, learnt = kinds[chances.argmax(axis=0)], np.ones_like(known)
+        current = kinds[chances.argmax(axis=0)]
+        learnt = np.ones_like(known)
     return chances.reshape(-1, *label.shape)
 
 
 def _histogram(bins: np.ndarray) -> Float[np.ndarray, " b"]:
+    """Return the smoothed, normalised histogram of colours."""
     counts = np.bincount(bins, minlength=BINS**3).reshape((BINS,) * 3).astype(float)
     counts = ndimage.gaussian_filter(counts, 1.0, mode="constant").ravel()
     return counts / max(counts.sum(), 1.0) + FLOOR

@@ -1,7 +1,7 @@
-"""The labels of a photo, whichever way its masks are given, as one map of material labels.
+"""Material labels of a photo as one map, from any form of masks.
 
-A mask has the photo's own pixels, as displayed.  Whatever is ambiguous is refused: another size,
-a label without a material, two materials in one pixel, no labelled pixel at all.
+A mask has the photo's own pixels, as displayed. Ambiguous input raises InputError: another size, a label without a
+material, two materials in one pixel, no labelled pixel at all.
 """
 
 import logging
@@ -18,13 +18,17 @@ from factorlib.errors import InputError
 from factorlib.labels.coco import read_coco
 from factorlib.labels.png import read_inside, read_values
 
-MUCH = 0.1  # of an object's pixels: more than a slip of the brush
-DRAWN_EDGE = 2  # outlines drawn side by side share edge pixels: what is no wider is left out, not refused
+MUCH = 0.1  # share of an object's pixels that is more than a slip of the brush
+DRAWN_EDGE = 2  # width of the pixels that adjacent outlines may share; they are left out without an error
 log = logging.getLogger("factorlib.labels")
 
 
 class Labels(msgspec.Struct, frozen=True):
-    """label: 0 background, k the k-th material; left_out: neither background nor a material (there label is 0)."""
+    """Label map.
+
+    label      0 background, k the k-th material
+    left_out   True for pixels that are neither background nor a material, whose label is 0
+    """
 
     label: UInt8[np.ndarray, "h w"]
     left_out: Bool[np.ndarray, "h w"]
@@ -38,11 +42,21 @@ def read_labels(
     image: str,
     key: str = "masks",
 ) -> Labels:
-    """The labels of one photo.
+    """Read the labels of one photo.
 
-    masks: a label PNG, a COCO json, or {material: PNG}, as in dataset.yaml; file: path of such a name.
-    size: (height, width) of the photo as displayed; image: its name, for COCO; key: of `masks`, for messages.
-    Raises InputError naming file and key.
+    Args:
+        masks: A label PNG, a COCO json, or {material: PNG}, as in dataset.yaml.
+        file: Function from such a name to a path.
+        materials: Materials of the dataset, in order.
+        size: Height and width of the photo as displayed.
+        image: File name of the photo, for COCO.
+        key: Key of `masks`, to name in errors.
+
+    Returns:
+        The labels.
+
+    Raises:
+        InputError: If the masks are invalid or empty.
     """
     where = file(masks if isinstance(masks, str) else next(iter(masks.values())))
     if not isinstance(masks, str):
@@ -62,7 +76,20 @@ def read_labels(
 def read_objects(
     masks: list[tuple[str, str | None]], file: Callable[[str], Path], size: tuple[int, int], key: str = "objects"
 ) -> UInt16[np.ndarray, "h w"]:
-    """1-based index of the object whose own mask covers a pixel, 0 where none says so; masks: (name, PNG or None)."""
+    """Read the index (from 1) of the object whose own mask covers each pixel, 0 for none.
+
+    Args:
+        masks: Name and PNG, or None, of each object.
+        file: Function from such a name to a path.
+        size: Height and width of the photo as displayed.
+        key: Key of the objects, to name in errors.
+
+    Returns:
+        Indices.
+
+    Raises:
+        InputError: If a mask is invalid or empty, or if two masks overlap.
+    """
     objects = np.zeros(size, dtype=np.uint16)
     for index, (name, path) in enumerate(masks):
         if path is None:
@@ -90,11 +117,21 @@ def check_materials(
     path: Path,
     key: str = "objects",
 ) -> None:
-    """Raise InputError where the mask shows a material that no object there is made of, and not one that they are made of: a wrong name.
+    """Check that the materials in the mask are those of the objects.
 
-    objects: as `read_objects` has it; objects without a mask of their own share the rest of the photo
-    made_of: name and materials of each object;  path: of the mask, for messages
-    Either alone is no contradiction: a part may be hidden, and a mask may show what has no mesh.
+    A wrong name shows as two faults at once: the mask has a material that no object has there, and lacks one that they
+    have. Either alone is no contradiction, because a part may be hidden, and a mask may show things without a mesh.
+
+    Args:
+        labels: Labels of the photo.
+        objects: Result of `read_objects`; objects without a mask of their own share the rest of the photo.
+        made_of: Name and materials of each object.
+        materials: Materials of the dataset, in order.
+        path: Path of the mask, to name in errors.
+        key: Key of the objects, to name in errors.
+
+    Raises:
+        InputError: If both faults occur.
     """
     groups = [([k], objects == k + 1) for k in range(len(made_of)) if (objects == k + 1).any()]
     alone = [k for k in range(len(made_of)) if not (objects == k + 1).any()]
@@ -104,13 +141,18 @@ def check_materials(
         strange = [k for k, count in enumerate(counts) if count >= MUCH * counts.sum() > 0 and materials[k] not in own]
         missing = [name for name in materials if name in own and not counts[materials.index(name)]]
         if strange and missing:
-            names, most = ", ".join(repr(made_of[k][0]) for k in members), max(strange, key=counts.__getitem__)
-            fault = f"the mask shows {materials[most]!r} in {counts[most] / counts.sum():.0%} of the pixels of {names}, but no {missing[0]!r}"
+            names = ", ".join(repr(made_of[k][0]) for k in members)
+            most = max(strange, key=counts.__getitem__)
+            fault = (
+                f"the mask shows {materials[most]!r} in {counts[most] / counts.sum():.0%} of the pixels of {names}, "
+                f"but no {missing[0]!r}"
+            )
             cure = f"correct the materials in dataset.yaml (there {', '.join(sorted(own))}), or the labels of the mask"
             raise InputError(fault, file=path, key=f"{key}[{members[0]}].materials", cure=cure)
 
 
 def _of_values(values: UInt16[np.ndarray, "h w"], path: Path, materials: list[str], key: str) -> Labels:
+    """Convert the values of a label PNG to labels; InputError for an unknown value."""
     present, counts = np.unique(values, return_counts=True)
     if set(present.tolist()) <= {0, LEFT_OUT} and LEFT_OUT in present:
         cure = f"if 255 means inside, write masks: {{{materials[0]}: <this file>}}: in a label mask it means leave out"
@@ -127,7 +169,10 @@ def _of_values(values: UInt16[np.ndarray, "h w"], path: Path, materials: list[st
 def _merged(
     inside: Mapping[str, np.ndarray], materials: list[str], where: Mapping[str, tuple[Path, str]], edge: int
 ) -> Labels | None:
-    """One map of several masks, None of none; what two of them claim is refused where it is wider than `edge` pixels, else left out."""
+    """Merge several masks into one map; None if there are none.
+
+    Pixels that two masks claim are left out; if they are wider than `edge` pixels, InputError is raised.
+    """
     if not inside:
         return None
     label = np.zeros(next(iter(inside.values())).shape, dtype=np.uint8)
@@ -135,7 +180,8 @@ def _merged(
     for number, material in ((k, name) for k, name in enumerate(materials, 1) if name in inside):
         path, key = where[material]
         for other in np.unique(label[inside[material] & (label > 0)]).tolist():
-            both, also = inside[material] & (label == other), where[materials[other - 1]][0]
+            both = inside[material] & (label == other)
+            also = where[materials[other - 1]][0]
             fault = f"materials {materials[other - 1]!r} and {material!r} share {int(both.sum())} pixels"
             fault += f" with {also.name}" if also != path else ""
             square = (edge + 1, edge + 1)

@@ -1,6 +1,6 @@
-"""Values of a one-channel PNG as they are stored: palette indices, not the palette's colours.
+"""Reader of the stored values of a one-channel PNG: palette indices, not the palette's colours.
 
-Pillow, for it alone keeps the indices; grey of 2 or 4 bits, which it stretches to 8, is undone.
+Pillow reads it, because it alone keeps the indices. It stretches grey of 2 or 4 bits to 8 bits, which is undone.
 """
 
 from collections.abc import Sequence
@@ -13,25 +13,40 @@ from PIL import Image
 from factorlib.errors import InputError
 from factorlib.reading import check_plain, reading
 
-_STRETCH = {2: 85, 4: 17}  # what 1 becomes when grey of so many bits is stretched to 8
-_GREY, _PALETTE = 0, 3  # PNG colour types
-Image.MAX_IMAGE_PIXELS = None  # Pillow warns at 89 megapixels; a mask is as large as its photo, whose size has a limit
+_STRETCH = {2: 85, 4: 17}  # code of 1 after grey of so many bits is stretched to 8
+_GREY = 0  # PNG colour types
+_PALETTE = 3
+Image.MAX_IMAGE_PIXELS = None  # Pillow warns at 89 megapixels; a mask has the size of its photo, which is limited
 
 
 def read_values(path: str | Path, key: str, size: tuple[int, int] | None = None) -> UInt16[np.ndarray, "h w"]:
-    """The stored values of the PNG at `path`.  RGB is read only where R = G = B, alpha only where it is opaque.
+    """Read the stored values of a PNG.
 
-    size: (height, width) that it should have; a picture of another size is refused by its header.
+    RGB is accepted only if R = G = B, alpha only if it is opaque.
+
+    Args:
+        path: File.
+        key: Key to name in errors.
+        size: Expected height and width, checked by the header.
+
+    Returns:
+        Values.
+
+    Raises:
+        InputError: If the file is no such PNG, or has another size.
     """
     check_plain(path, "a PNG", key)
     with reading("a PNG", path, key, "save the mask again, as PNG"), Image.open(path, formats=["PNG"]) as image:
         check_size(image.size[::-1], size or image.size[::-1], path, key)
         values = np.asarray(image)
-    with Path(path).open("rb") as stream:  # after the signature, IHDR's length and name, and the size
+    with Path(path).open(
+        "rb"
+    ) as stream:  # bit depth and colour type, after signature, IHDR's length and name, and size
         depth, colour_type = stream.read(26)[24:26]
     fault = None
-    if depth == 16 and colour_type not in (_GREY, _PALETTE):  # Pillow would keep the upper byte alone
-        fault, cure = "has several channels of 16 bits", "save labels in one channel of 8 bits"
+    if depth == 16 and colour_type not in (_GREY, _PALETTE):  # Pillow keeps only the upper byte
+        fault = "has several channels of 16 bits"
+        cure = "save labels in one channel of 8 bits"
     elif values.ndim == 3:
         alpha = values[..., -1] if values.shape[-1] in (2, 4) else None
         colours = values if alpha is None else values[..., :-1]
@@ -40,7 +55,8 @@ def read_values(path: str | Path, key: str, size: tuple[int, int] | None = None)
             fault = f"is a colour picture (one pixel is {tuple(colours[coloured][0].tolist())})"
             cure = "save labels in one channel: 0 background, k for the k-th material, 255 leave out"
         elif alpha is not None and (alpha != np.iinfo(alpha.dtype).max).any():
-            fault, cure = "has transparent pixels", "save it without alpha: 0 is background"
+            fault = "has transparent pixels"
+            cure = "save it without alpha: 0 is background"
         values = colours[..., 0]
     if fault:
         raise InputError(fault, file=path, key=key, cure=cure)
@@ -48,13 +64,34 @@ def read_values(path: str | Path, key: str, size: tuple[int, int] | None = None)
 
 
 def read_inside(path: str | Path, key: str, size: tuple[int, int] | None = None) -> Bool[np.ndarray, "h w"]:
-    """A mask of one object or material: inside is what lies above half of the greatest value in the file (0/1, 0/255, soft edges)."""
+    """Read a mask of one object or material.
+
+    Inside are the values above half of the greatest one, which suits 0/1, 0/255 and soft edges.
+
+    Args:
+        path: File.
+        key: Key to name in errors.
+        size: Expected height and width.
+
+    Returns:
+        A mask.
+    """
     values = read_values(path, key, size)
     return values * 2 > values.max() if values.any() else np.zeros(values.shape, dtype=bool)
 
 
 def check_size(size: Sequence[int], expected: Sequence[int], path: str | Path, key: str) -> None:
-    """Compare two sizes (height, width); raises InputError unless they are the same, which says so if the mask lies on its side."""
+    """Check a size (height, width) against the photo's; the error says so if the mask is rotated by 90°.
+
+    Args:
+        size: Size of the mask.
+        expected: Size of the photo.
+        path: File to name in the error.
+        key: Key to name in the error.
+
+    Raises:
+        InputError: If they differ.
+    """
     if tuple(size) != tuple(expected):
         cure = "save the mask with the photo's own pixels"
         if tuple(size) == tuple(expected)[::-1]:

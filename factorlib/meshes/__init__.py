@@ -1,1 +1,1 @@
-"""Meshes: files to labelled triangles with smooth normals (`read`), and back to PLY (`ply`)."""
+"""Meshes: readers of files that yield labelled triangles with smooth normals (`read`), and a writer of PLY (`ply`)."""

@@ -1,8 +1,9 @@
-"""A mesh with vertices close enough together to carry detail, and what lives on them: smoothness, gradients, displacements.
+"""Subdivided mesh with vertices close enough together to carry detail, and differential operators on it.
 
-Vertices are those of the mesh itself and of its subdivision: every edge longer than a length is halved, and a triangle with one, two or three
-such edges becomes two, three or four, so that neighbours agree along every edge and a closed mesh stays closed.  Vertices at one position are
-one node, on whichever side of a crease they stand; nodes are numbered by position.
+Its vertices are those of the mesh and of its subdivision. Every edge longer than a threshold is halved. A triangle with
+one, two or three such edges becomes two, three or four, so that neighbours agree along every edge and a closed mesh
+stays closed. Vertices at one position are one node, on whichever side of a crease they are; nodes are numbered by
+position.
 """
 
 import msgspec
@@ -14,14 +15,20 @@ from scipy.sparse.linalg import spsolve
 from factorlib.meshes.mesh import Mesh, area_vectors
 from factorlib.meshes.normals import welded
 
-LONGEST = 0.04  # of the mesh's extent: the longest edge after subdivision
-LEVEL = 1e-3  # of the gradient's weight: what keeps the mean displacement at zero
+LONGEST = 0.04  # longest edge after subdivision, in units of the mesh's extent
+LEVEL = 1e-3  # weight that keeps the mean displacement at zero, relative to the gradient's
 UNSEEN = 0.05  # weight of the gradient where no photo sees the surface
 
 
 def subdivided(mesh: Mesh, longest: float) -> Mesh:
-    """The mesh with every edge at most `longest` long, in its units; new vertices lie on the old triangles, with interpolated normals."""
-    vertices, normals, faces, label = mesh.vertices, mesh.normals, mesh.faces.astype(np.int64), mesh.face_label
+    """Subdivide the mesh until every edge is at most `longest` long, in units of the mesh.
+
+    New vertices lie on the old triangles and have interpolated normals.
+    """
+    vertices = mesh.vertices
+    normals = mesh.normals
+    faces = mesh.faces.astype(np.int64)
+    label = mesh.face_label
     while True:
         ends = np.stack([faces, np.roll(faces, -1, axis=1)], axis=-1)  # edge k goes from corner k to the next
         too_long = np.linalg.norm(vertices[ends[..., 0]] - vertices[ends[..., 1]], axis=-1) > longest
@@ -29,6 +36,7 @@ def subdivided(mesh: Mesh, longest: float) -> Mesh:
             return msgspec.structs.replace(
                 mesh, vertices=vertices, normals=normals, faces=faces.astype(np.int32), face_label=label
             )
+        # one new vertex at the midpoint of every long edge, with the mean normal of its ends
         pairs, number = np.unique(np.sort(ends[too_long], axis=1), axis=0, return_inverse=True)
         middle = np.full(faces.shape, -1)
         middle[too_long] = len(vertices) + number.reshape(-1)
@@ -36,7 +44,10 @@ def subdivided(mesh: Mesh, longest: float) -> Mesh:
         length = np.linalg.norm(between, axis=1, keepdims=True)
         between = np.where(length > 1e-9, between / np.maximum(length, 1e-9), normals[pairs[:, 0]])
         vertices, normals = np.vstack([vertices, vertices[pairs].mean(1)]), np.vstack([normals, between])
-        count, parts, labels = too_long.sum(1), [faces[~too_long.any(1)]], [label[~too_long.any(1)]]
+        count = too_long.sum(1)
+        parts = [faces[~too_long.any(1)]]
+        labels = [label[~too_long.any(1)]]
+        # rotate the corners of each triangle so that its long edges come first, then split it
         for long_edges, pieces in PIECES.items():
             some = count == long_edges
             first = too_long[some].argmax(1) if long_edges == 1 else (too_long[some].argmin(1) + 1) % 3
@@ -44,10 +55,12 @@ def subdivided(mesh: Mesh, longest: float) -> Mesh:
             corners = np.hstack([np.take_along_axis(of[some], turn, 1) for of in (faces, middle)])
             parts.append(corners[:, pieces].reshape(-1, 3))
             labels.append(np.repeat(label[some], len(pieces)))
-        faces, label = np.vstack(parts), np.concatenate(labels)
+        faces = np.vstack(parts)
+        label = np.concatenate(labels)
 
 
-# By the number of long edges, which come first: the triangles that take a triangle's place; 0 to 2 its corners, 3 to 5 the middles of its edges.
+# Triangles that replace a triangle, by its number of long edges, which come first.
+# 0 to 2 are its corners, 3 to 5 the midpoints of its edges.
 PIECES = {
     1: [[0, 3, 2], [3, 1, 2]],
     2: [[3, 1, 4], [0, 3, 4], [0, 4, 2]],
@@ -56,10 +69,12 @@ PIECES = {
 
 
 class Fine(msgspec.Struct, frozen=True):
-    """A subdivided mesh and its v nodes.
+    """Subdivided mesh and its v nodes.
 
-    mesh   its vertices may stand several times at one position;  node: the number of each vertex's node
-    faces  corners as numbers of nodes;  extent: the largest side of the bounding box, in mesh units
+    mesh    subdivided mesh, which may have several vertices at one position
+    node    number of each vertex's node
+    faces   corners as numbers of nodes
+    extent  largest side of the bounding box, in mesh units
     """
 
     mesh: Mesh
@@ -69,7 +84,7 @@ class Fine(msgspec.Struct, frozen=True):
 
     @property
     def nodes(self) -> int:
-        """The number of nodes."""
+        """Number of nodes."""
         return int(self.node.max()) + 1
 
     @property
@@ -80,29 +95,38 @@ class Fine(msgspec.Struct, frozen=True):
 
     @property
     def areas(self) -> Float[np.ndarray, " f"]:
-        """Areas of the triangles, in squares of the extent."""
+        """Areas of the triangles, in units of the squared extent."""
         return np.linalg.norm(area_vectors(self.mesh.vertices, self.mesh.faces), axis=1) / self.extent**2
 
     def laplacian(self) -> csr_array:
-        """L with δᵀ L δ = Σ over edges of (δ_i − δ_j)², [v, v]; in two dimensions this does not depend on how fine the mesh is."""
-        edges, number = self.edges, np.arange(len(self.edges))
+        """Return the graph Laplacian L with δᵀ L δ = Σ over edges of (δ_i − δ_j)², [v, v].
+
+        In two dimensions this sum does not depend on the resolution of the mesh.
+        """
+        edges = self.edges
+        number = np.arange(len(self.edges))
         signs = np.concatenate([np.ones(len(edges)), -np.ones(len(edges))])
         difference = csr_array((signs, (np.tile(number, 2), edges.T.reshape(-1))), (len(edges), self.nodes))
         return csr_array(difference.T @ difference)
 
     def gradients(self) -> list[csr_array]:
-        """∂/∂x, ∂/∂y and ∂/∂z on the surface of a function at nodes, constant on each triangle: [f, v] each, with lengths in extents."""
+        """Return ∂/∂x, ∂/∂y and ∂/∂z on the surface for functions at nodes, [f, v] each.
+
+        They are constant on each triangle; lengths are in units of the extent.
+        """
         place = self.mesh.vertices[self.mesh.faces] / self.extent
         across = np.cross(place[:, 1] - place[:, 0], place[:, 2] - place[:, 0])
         double = np.maximum(np.linalg.norm(across, axis=1, keepdims=True), 1e-12)
-        normal, rows = across / double, np.repeat(np.arange(len(place)), 3)
+        normal = across / double
+        rows = np.repeat(np.arange(len(place)), 3)
+        # gradient of the hat function of each corner: n × (opposite edge) / (2 · area)
         slopes = [np.cross(normal, place[:, (k + 2) % 3] - place[:, (k + 1) % 3]) / double for k in range(3)]
         shape = len(place), self.nodes
-        values = np.stack(slopes, axis=1)  # by triangle, corner and axis
+        values = np.stack(slopes, axis=1)  # [triangle, corner, axis]
         return [csr_array((values[..., a].reshape(-1), (rows, self.faces.reshape(-1))), shape) for a in range(3)]
 
     def at_nodes(self) -> csr_array:
-        """The mean over the triangles about each node, by area, [v, f]."""
+        """Return the operator that averages over the triangles about each node, weighted by area, [v, f]."""
         count = len(self.faces)
         places = self.faces.reshape(-1), np.repeat(np.arange(count), 3)
         weight = csr_array((np.repeat(self.areas, 3), places), (self.nodes, count))
@@ -110,28 +134,31 @@ class Fine(msgspec.Struct, frozen=True):
         return csr_array(diags_array(1 / total) @ weight)
 
     def displacement(self, turn: Float[np.ndarray, "v 3"], seen: Float[np.ndarray, " v"]) -> Float[np.ndarray, " v"]:
-        """The displacement along the normals, in extents, whose normals are turned as nearly as can be: n' = n − ∇d.
+        """Fit the displacement along the normals whose normals n' = n − ∇d are nearest to the given ones.
 
-        turn: n' − n at nodes, in the mesh's frame;  seen: how much is known of each node's turn, 0 to 1
-        Least squares over triangles, by area (Poisson's equation).
+        This is least squares over triangles, weighted by area (Poisson's equation). `turn` is n' − n at nodes, in the
+        mesh's frame; `seen` is the weight of each node's turn, from 0 to 1. The result is in units of the extent.
         """
-        slopes, areas = self.gradients(), self.areas
+        slopes = self.gradients()
+        areas = self.areas
         wanted = turn[self.faces].mean(1)
         weight = areas * np.maximum(seen[self.faces].min(1), UNSEEN)
+        # normal equations Σ_a G_aᵀ W G_a d = −Σ_a G_aᵀ W t_a, with a small multiple of the identity
         system = sum(slope.T @ diags_array(weight) @ slope for slope in slopes)
         system = system + LEVEL * areas.mean() * eye_array(self.nodes)
         right = -sum(slope.T @ (weight * wanted[:, a]) for a, slope in enumerate(slopes))
         return spsolve(system.tocsc(), right)
 
     def turn_of(self, displacement: Float[np.ndarray, " v"]) -> Float[np.ndarray, "v 3"]:
-        """−∇d at nodes: how a displacement, in extents, turns normals."""
+        """Return −∇d at nodes, the change of normals by a displacement d in units of the extent."""
         mean = self.at_nodes()
         return -np.stack([mean @ (slope @ displacement) for slope in self.gradients()], axis=1)
 
     def moved(self, displacement: Float[np.ndarray, " v"]) -> Mesh:
-        """The subdivided mesh with its vertices moved along their nodes' normals, in extents, and its normals turned with them."""
+        """Move the vertices along their nodes' normals, by a displacement in extents, and update the normals."""
         weighted = area_vectors(self.mesh.vertices, self.mesh.faces)
         sums = [np.bincount(self.faces.reshape(-1), np.repeat(weighted[:, a], 3), self.nodes) for a in range(3)]
+        # area-weighted normals of the nodes
         outward = np.stack(sums, axis=1)
         outward /= np.maximum(np.linalg.norm(outward, axis=1, keepdims=True), 1e-300)
         place = self.mesh.vertices + (displacement[:, None] * self.extent * outward)[self.node]
@@ -141,7 +168,7 @@ class Fine(msgspec.Struct, frozen=True):
 
 
 def fine(mesh: Mesh) -> Fine:
-    """The mesh, subdivided to `LONGEST` times its extent."""
+    """Subdivide the mesh to edges of `LONGEST` times its extent."""
     extent = float(np.ptp(mesh.vertices[np.unique(mesh.faces)], axis=0).max())
     dense = subdivided(mesh, LONGEST * extent)
     node = welded(dense.vertices)

@@ -1,4 +1,4 @@
-"""How large a mesh may be: far more than a rough mesh needs, and what a machine still holds."""
+"""Limits on the size of a mesh: far more than a rough mesh needs, but within the memory of a usual machine."""
 
 from pathlib import Path
 from typing import Annotated
@@ -11,20 +11,29 @@ VERTICES_A_TRIANGLE = 3
 
 
 class Limits(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """What is refused before it is read; a mesh of a million triangles takes about 1 GB and 20 s."""
+    """Limits that are checked before a mesh is read; a mesh of a million triangles takes about 1 GB and 20 s."""
 
     megabytes: Annotated[float, msgspec.Meta(gt=0, le=1e6)] = 500.0
-    """Largest size of a mesh's file, and of the buffers it refers to together, in megabytes."""
+    """Greatest size of a mesh's file, and of all its buffers together, megabytes."""
     triangles: Annotated[int, msgspec.Meta(ge=1, le=10**9)] = 5_000_000
-    """Most triangles of a mesh."""
+    """Greatest number of triangles of a mesh."""
 
     @property
     def bytes(self) -> int:
-        """The limit of a file in bytes."""
+        """Greatest size of a file, bytes."""
         return int(self.megabytes * 1e6)
 
     def check(self, vertices: int, triangles: int, file: str | Path) -> None:
-        """Raises InputError for more triangles, or more vertices than so many triangles can use."""
+        """Check the numbers of vertices and triangles of a file against the limits.
+
+        Args:
+            vertices: Number of vertices.
+            triangles: Number of triangles.
+            file: File to name in the error.
+
+        Raises:
+            InputError: If there are too many triangles, or more vertices than the most triangles can use.
+        """
         most_vertices = VERTICES_A_TRIANGLE * self.triangles
         for count, most, what in ((triangles, self.triangles, "triangles"), (vertices, most_vertices, "vertices")):
             if count > most:
@@ -32,4 +41,4 @@ class Limits(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
                 raise InputError(f"has {count:,} {what}", file=file, cure=cure)
 
 
-NO_LIMITS = Limits(megabytes=1e6, triangles=10**9)  # of what an earlier stage has read within its own
+NO_LIMITS = Limits(megabytes=1e6, triangles=10**9)  # for meshes that an earlier stage has checked

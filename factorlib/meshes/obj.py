@@ -1,7 +1,7 @@
-"""A small reader of Wavefront OBJ that keeps what general readers drop: `g` and `o` names, and `usemtl` without a .mtl.
+"""Small reader of Wavefront OBJ that keeps names which general readers drop: `g`, `o`, and `usemtl` without a .mtl.
 
-Reads v, vn, f (polygons as fans, negative indices, `v/vt/vn` in all its forms), g, o, usemtl, and continued lines.
-The .mtl is never opened: a part's name is in the OBJ itself.
+It reads v, vn, f (polygons as fans, negative indices, `v/vt/vn` in all its forms), g, o, usemtl, and continued lines.
+It never opens the .mtl: a part's name is in the OBJ itself.
 """
 
 import re
@@ -14,18 +14,32 @@ from factorlib.errors import InputError
 from factorlib.meshes.limits import Limits
 from factorlib.meshes.soup import Soup, lines_of, quoted
 
-MOST = 2**31  # vertices that any file numbers
-COUNTED_EVERY = 4096  # lines between two looks at how many triangles there are
-CONTINUED = re.compile(rb"\\(\r\n|\r|\n|\Z)")  # a line that goes on in the next
+MOST = 2**31  # greatest index in any file
+COUNTED_EVERY = 4096  # number of lines between two checks of the number of triangles
+CONTINUED = re.compile(rb"\\(\r\n|\r|\n|\Z)")  # line that continues in the next
 
 
 def read_obj(path: Path, content: bytes, limits: Limits) -> Soup:
-    """Triangles of an OBJ file, parts named by (usemtl, groups…, object); InputError names the line that is wrong."""
+    """Read the triangles of an OBJ file, with parts named by (usemtl, groups…, object).
+
+    Args:
+        path: File, to be named in errors.
+        content: Content of the file.
+        limits: Limits on its size.
+
+    Returns:
+        The triangles.
+
+    Raises:
+        InputError: If a line cannot be read or the mesh is too large.
+    """
     table = {"v": array("d"), "vn": array("d")}
-    faces, face_normals, part = array("q"), array("q"), array("q")  # indices from 0; −1 for no normal
+    faces = array("q")  # indices from 0; −1 for no normal
+    face_normals = array("q")
+    part = array("q")
     parts: dict[tuple[str, ...], int] = {}
-    names = {"usemtl": (), "g": (), "o": ()}  # of the faces that follow
-    current: int | None = None  # the part of these; None until a face asks
+    names = {"usemtl": (), "g": (), "o": ()}  # names of the faces that follow
+    current: int | None = None  # part of these faces; None until the first of them
     number = counted = 0
     for line in lines_of(CONTINUED.sub(b"\v", content) if b"\\" in content else content):
         number += 1 + line.count("\v")
@@ -50,7 +64,8 @@ def read_obj(path: Path, content: bytes, limits: Limits) -> Soup:
                     face_normals.extend((corners[0][1], second[1], third[1]))
                     part.append(current)
             elif key in names:
-                names[key], current = tuple(words) if key == "g" else (" ".join(words),), None
+                names[key] = tuple(words) if key == "g" else (" ".join(words),)
+                current = None
         except (ValueError, IndexError, OverflowError) as error:
             fault = f"line {number}: {quoted(line)} cannot be read ({quoted(str(error))[1:-1]})"
             raise InputError(fault, file=path, cure="is it a text OBJ?") from error
@@ -67,7 +82,7 @@ def read_obj(path: Path, content: bytes, limits: Limits) -> Soup:
 
 
 def _index(word: str, count: int) -> int:
-    """OBJ counts from 1, and backwards from −1; 0 does not exist."""
+    """Convert an OBJ index to one from 0; OBJ counts from 1, and backwards from −1."""
     index = int(word)
     if index == 0:
         raise ValueError("index 0: OBJ counts from 1")

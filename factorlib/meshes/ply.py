@@ -1,7 +1,7 @@
-"""PLY files: read in text and both byte orders, written in binary little-endian, the same mesh as the same bytes.
+"""PLY files: a reader of text and both byte orders, and a deterministic writer of binary little-endian.
 
-The numbers of a text file are read as rows of float64, so that one reader does for text and binary.  Lists in one file may differ in
-length (trimesh refuses these).  Nothing is made that the file has no room for.
+The numbers of a text file are read as rows of float64, so that one reader serves text and binary. Lists in one file may
+differ in length (trimesh refuses these). Nothing is allocated that the file has no room for.
 """
 
 import re
@@ -15,30 +15,51 @@ from factorlib.meshes.mesh import Mesh
 from factorlib.meshes.soup import Soup, fans, floats, lines_of, numbers_in, of_one_part, quoted
 from factorlib.wholefile import write_bytes
 
-TYPES = {"char": "i1", "uchar": "u1", "short": "i2", "ushort": "u2", "int": "i4", "uint": "u4", "float": "f4",
-         "double": "f8", **{f"{kind}{8 * size}": f"{kind[0]}{size}" for kind in ("int", "uint", "float")
-                            for size in (1, 2, 4, 8)}}  # fmt: skip
+TYPES = {
+    "char": "i1",
+    "uchar": "u1",
+    "short": "i2",
+    "ushort": "u2",
+    "int": "i4",
+    "uint": "u4",
+    "float": "f4",
+    "double": "f8",
+    **{f"{kind}{8 * size}": f"{kind[0]}{size}" for kind in ("int", "uint", "float") for size in (1, 2, 4, 8)},
+}
 ORDERS = {"ascii": "", "binary_little_endian": "<", "binary_big_endian": ">"}
-LONGEST = 1 << 20  # bytes of a header
+LONGEST = 1 << 20  # greatest size of a header, bytes
 END = re.compile(rb"^end_header[ \t]*(\r\n|\n|\r)", re.MULTILINE)
 COUNT = re.compile(r"[0-9]{1,18}")
 CORNERS = ("vertex_indices", "vertex_index")
 CURE = "is it whole, and a PLY? export it again"
 
 
-Properties = dict[str, tuple[str, str | None]]  # NumPy's type of each number, and of the length before a list of them
-Column = tuple[np.ndarray, np.ndarray]  # the numbers of all rows in one row; how many each row has
+Properties = dict[str, tuple[str, str | None]]  # NumPy types of the numbers, and of the length before a list of them
+Column = tuple[np.ndarray, np.ndarray]  # the numbers of all rows, concatenated, and the count of each row
 
 
 def read_ply(path: Path, content: bytes, limits: Limits) -> Soup:
-    """Vertices, polygons and, where there are all three of nx, ny, nz, normals; textures that it names are left alone."""
+    """Read vertices, polygons and, if all of nx, ny, nz are present, normals of a PLY file; textures are ignored.
+
+    Args:
+        path: File, to be named in errors.
+        content: Content of the file.
+        limits: Limits on its size.
+
+    Returns:
+        The triangles, in one part.
+
+    Raises:
+        InputError: If the file is malformed or too large.
+    """
     order, elements, start = _header(path, content)
     counts = {name: count for name, (count, _) in elements.items()}
     limits.check(counts.get("vertex", 0), counts.get("face", 0), path)
     content, at, columns = (content, start, {}) if order else (numbers_in(content[start:]).tobytes(), 0, {})
     for name, (count, properties) in elements.items():
         columns[name], at = _columns(content, at, order, count, properties)
-    faces = columns.get("face", {})  # the list of that name, or the only one
+    # corners of the faces: the list of a known name, or the only one
+    faces = columns.get("face", {})
     name = next((name for name in CORNERS if name in faces), next(iter(faces)) if len(faces) == 1 else None)
     values, sizes = faces[name] if name else (np.empty(0), np.zeros(0, np.int64))
     limits.check(0, int(np.maximum(sizes - 2, 0).sum()), path)
@@ -48,19 +69,28 @@ def read_ply(path: Path, content: bytes, limits: Limits) -> Soup:
     numbers = {name: floats(own) for name, (own, each) in columns.get("vertex", {}).items() if (each == 1).all()}
     if not {"x", "y", "z"} <= numbers.keys():
         raise InputError("its vertices have no x, y, z", file=path, cure=CURE)
-    points, normals = (np.stack([numbers[n] for n in names], axis=1) if set(names) <= numbers.keys() else None
-                       for names in ("xyz", ("nx", "ny", "nz")))  # fmt: skip
+    points, normals = (
+        np.stack([numbers[n] for n in names], axis=1) if set(names) <= numbers.keys() else None
+        for names in ("xyz", ("nx", "ny", "nz"))
+    )
     return of_one_part(points, fans(sizes, corners), path.stem, normals)
 
 
 def _header(path: Path, content: bytes) -> tuple[str, dict[str, tuple[int, Properties]], int]:
-    """The byte order ("": text), rows and properties of each element, and where rows begin; InputError for counts that the file has
-    no room for."""
+    """Parse the header.
+
+    The result is the byte order ("" for text), rows and properties of each element, and the offset of the rows.
+    InputError is raised for counts that the file has no room for.
+    """
     end = END.search(content, 0, LONGEST)
     if not content.startswith(b"ply") or end is None:
         raise InputError("has no header of a PLY", file=path, cure=CURE)
-    data_begins = end.group(1) == b"\r\n" and b"\r\n" not in content[:5]  # with a \n, where no other line ends so
-    order, elements, start, properties = None, {}, end.end() - data_begins, None
+    # if only the last line ends in \r\n, the \n is the first byte of the data
+    data_begins = end.group(1) == b"\r\n" and b"\r\n" not in content[:5]
+    order = None
+    elements = {}
+    start = end.end() - data_begins
+    properties = None
     for line in lines_of(content[3 : end.start()]):
         try:
             match line.split():
@@ -84,11 +114,13 @@ def _header(path: Path, content: bytes) -> tuple[str, dict[str, tuple[int, Prope
             raise InputError(fault, file=path, cure=CURE) from error
     if order is None:
         raise InputError("its header does not say its format", file=path, cure=CURE)
-    # a row takes at least: every list empty; in text a digit and a space each
-    sizes = [sum(np.dtype(length or kind).itemsize if order else 2 for kind, length in properties.values())
-             for _, properties in elements.values()]  # fmt: skip
+    # least size of a row: every list is empty; in text, each number is a digit and a space
+    sizes = [
+        sum(np.dtype(length or kind).itemsize if order else 2 for kind, length in properties.values())
+        for _, properties in elements.values()
+    ]
     needed = sum(count * size for (count, _), size in zip(elements.values(), sizes))
-    if needed > len(content) - start + 1:  # text may end without a line's end
+    if needed > len(content) - start + 1:  # text may end without a line end
         counts = ", ".join(f"{count:,} {quoted(name)[1:-1]}" for name, (count, _) in elements.items())
         fault = f"its header says {counts}: {needed:,} bytes at least; {len(content) - start:,} follow"
         raise InputError(fault, file=path, cure=CURE)
@@ -96,14 +128,20 @@ def _header(path: Path, content: bytes) -> tuple[str, dict[str, tuple[int, Prope
 
 
 def _columns(content: bytes, at: int, order: str, count: int, properties: Properties) -> tuple[dict[str, Column], int]:
-    """The columns of an element's rows, and where these end.  Rows whose lists are as long as the next one's are taken together.
+    """Return the columns of an element's rows, and the offset of their end.
 
-    order: the byte order; "": every number is a float64.  Raises ValueError where the file ends early, or a list has no length.
+    Consecutive rows with lists of equal lengths are read together. `order` is the byte order; "" means that every
+    number is a float64. ValueError is raised if the file ends early or a list has no valid length.
     """
     kinds = [[np.dtype(order + t if order else "f8") if t else None for t in each] for each in properties.values()]
-    pieces, row, ahead = [([np.empty(0)], [np.zeros(0, np.int64)]) for _ in kinds], 0, 64
+    pieces = [([np.empty(0)], [np.zeros(0, np.int64)]) for _ in kinds]
+    row = 0
+    ahead = 64
     while kinds and row < count:
-        lengths, fields, place = [], [], at
+        # layout of the next row, whose lists have their lengths in the file
+        lengths = []
+        fields = []
+        place = at
         for number, (kind, counter) in enumerate(kinds):
             if counter:
                 fields.append((f"n{number}", counter))
@@ -116,6 +154,7 @@ def _columns(content: bytes, at: int, order: str, count: int, properties: Proper
             place += lengths[-1] * kind.itemsize
             if place > len(content):
                 raise ValueError("its rows end early")
+        # read ahead as many rows as have lists of the same lengths
         layout = np.dtype(fields)
         rows = np.frombuffer(content, layout, min(ahead, count - row, (len(content) - at) // layout.itemsize), at)
         others = [rows[name] != lengths[int(name[1:])] for name in layout.names if name[0] == "n"]
@@ -124,15 +163,19 @@ def _columns(content: bytes, at: int, order: str, count: int, properties: Proper
         for number, (values, sizes) in enumerate(pieces):
             values.append(rows[f"v{number}"].reshape(-1))
             sizes.append(np.full(len(rows), lengths[number]))
-        row, at = row + len(rows), at + len(rows) * layout.itemsize
+        row = row + len(rows)
+        at = at + len(rows) * layout.itemsize
     joined = [(np.concatenate(values[1:] or values), np.concatenate(sizes)) for values, sizes in pieces]
     return dict(zip(properties, joined)), at
 
 
 def write_ply(path: str | Path, mesh: Mesh, colours: np.ndarray | None = None) -> None:
-    """Write vertices (float64 as float32), normals and faces, with `label` per face: what Mitsuba and other readers read.
+    """Write vertices (float64 as float32), normals and faces, with `label` per face, in the form that Mitsuba reads.
 
-    A mesh with detail has a further property `detail` per vertex, or in its place the vertices' linear `colours` [v, 3] (red, green, blue).
+    Args:
+        path: File to write.
+        mesh: The mesh; its detail is a further property `detail` per vertex.
+        colours: Linear colours [v, 3] of the vertices (red, green, blue), in place of the detail.
     """
     lines = ["ply", "format binary_little_endian 1.0", f"element vertex {len(mesh.vertices)}"]
     further = {"red green blue": colours} if colours is not None else {"detail": mesh.detail}
@@ -143,13 +186,15 @@ def write_ply(path: str | Path, mesh: Mesh, colours: np.ndarray | None = None) -
     lines += [f"element face {len(mesh.faces)}", "property list uchar int vertex_indices", "property int label"]
     vertices = np.concatenate(columns, axis=1).astype("<f4")
     faces = np.empty(len(mesh.faces), dtype=[("count", "u1"), ("index", "<i4", 3), ("label", "<i4")])
-    faces["count"], faces["index"], faces["label"] = 3, mesh.faces, mesh.face_label
+    faces["count"] = 3
+    faces["index"] = mesh.faces
+    faces["label"] = mesh.face_label
     header = "\n".join([*lines, "end_header", ""]).encode("ascii")
     write_bytes(path, header + vertices.tobytes() + faces.tobytes())
 
 
 def submesh(mesh: Mesh, label: int) -> Mesh:
-    """The faces of one material, with only the vertices they use."""
+    """Return the faces of one material, with only the vertices that they use."""
     keep = mesh.face_label == label
     used, index = np.unique(mesh.faces[keep], return_inverse=True)
     faces = index.reshape(-1, 3).astype(np.int32)

@@ -1,8 +1,8 @@
-"""Mesh files: OBJ, glTF/GLB, PLY, STL, OFF; their parts become material labels.
+"""Reader of mesh files (OBJ, glTF/GLB, PLY, STL, OFF) that turns their parts into material labels.
 
-A part goes by any name the file gives it (OBJ: usemtl, group, object; glTF: primitive, node, material; the others have
-one part, named as the file).  Faces that cannot be used are dropped and counted in the log; what would make a wrong
-result in silence is refused.
+A part has every name that the file gives it (OBJ: usemtl, group, object; glTF: primitive, node, material; the other
+formats have one part, named as the file). Unusable faces are dropped and counted in the log. Faults that would silently
+give a wrong result raise InputError.
 """
 
 import logging
@@ -25,7 +25,7 @@ from factorlib.meshes.soup import Soup, check
 from factorlib.meshes.stl import read_off, read_stl
 from factorlib.reading import one_line, read_bytes, reading
 
-WITHIN = {".obj": read_obj, ".ply": read_ply, ".stl": read_stl, ".off": read_off}  # all in one file
+WITHIN = {".obj": read_obj, ".ply": read_ply, ".stl": read_stl, ".off": read_off}  # formats of a single file
 FORMATS = (*WITHIN, ".glb", ".gltf")
 CURE = "is it whole? try to open and export it again"
 CREASE_DEG = 60.0
@@ -40,15 +40,22 @@ def read_mesh(
     crease_deg: float = CREASE_DEG,
     limits: Limits | None = None,
 ) -> Mesh:
-    """The mesh of one object, labelled by material.
+    """Read the mesh of one object, labelled by material.
 
-    materials   the dataset's, in order: label k is the k-th, from 1
-    made_of     part -> material, or the material of the whole mesh; `overrides` (part -> material) go before it
-    crease_deg  edges sharper than this stay sharp in the normals
-    limits      how large it may be
+    Args:
+        path: File of the mesh.
+        materials: Materials of the dataset, in order: label k is the k-th, from 1.
+        made_of: Material of each part, or of the whole mesh.
+        overrides: Material of some parts, with precedence over `made_of`.
+        crease_deg: Edges of a greater angle stay sharp in the normals.
+        limits: Limits on the size.
 
-    Raises InputError, and nothing else, for a file that cannot be read, is larger, or has no usable faces, a vertex that is not
-    finite, a part of the mesh that has no material, a named part that the mesh lacks, and a material that the dataset lacks.
+    Returns:
+        The mesh.
+
+    Raises:
+        InputError: If the file cannot be read or is too large; if it has no usable faces, or a vertex that is not
+            finite; if a part has no material; if a named part is not in the mesh, or a material not in the dataset.
     """
     soup = _soup(path, limits)
     label = part_labels(soup.parts, materials, made_of, overrides or {}, path)
@@ -56,17 +63,20 @@ def read_mesh(
 
 
 def read_parts(path: str | Path, limits: Limits | None = None) -> list[tuple[str, ...]]:
-    """The names of each part of a mesh file in which everything but its materials is as `read_mesh` needs it."""
+    """Return the names of each part of a mesh file, which must be usable by `read_mesh` but for its materials."""
     soup = _soup(path, limits)
     solid(soup, path)
     return soup.parts
 
 
 class MeshesOnce:
-    """Meshes of a data set, each read once for each choice of materials for its parts; sizes were limited by an earlier stage.
+    """Cache of a dataset's meshes, each read once for each choice of materials; an earlier stage checked the sizes.
 
-    path: of a mesh by its name and, where it has one, its file in dataset.yaml (`Inputs.mesh`);  materials: the data set's;  crease_deg: as of `read_mesh`
-    displacements, log_factors: by mesh, those that `surface` found at its nodes: such a mesh is subdivided, moved and given detail
+    path            path of a mesh, by its name and, if it has one, its file in dataset.yaml (`Inputs.mesh`)
+    materials       materials of the dataset
+    crease_deg      crease angle, as in `read_mesh`
+    displacements   by mesh, displacements at the nodes that `surface` estimated; the mesh is subdivided and moved
+    log_factors     by mesh, logarithms of the detail at the nodes that `surface` estimated
     """
 
     def __init__(
@@ -77,12 +87,27 @@ class MeshesOnce:
         displacements: Mapping[str, Sequence[float]] = {},
         log_factors: Mapping[str, Sequence[float]] = {},
     ):
-        self.path, self.materials, self.crease_deg = path, materials, crease_deg
-        self.displacements, self.log_factors = displacements, log_factors
+        self.path = path
+        self.materials = materials
+        self.crease_deg = crease_deg
+        self.displacements = displacements
+        self.log_factors = log_factors
         self._meshes: dict[tuple, Mesh] = {}
 
     def mesh(self, name: str, entry: MeshEntry, overrides: Mapping[str, str] = {}) -> Mesh:
-        """The mesh `name` with `overrides` of its parts' materials, read when first asked for."""
+        """Return the mesh `name` with `overrides` of its parts' materials, read on first use.
+
+        Args:
+            name: Name of the mesh.
+            entry: Entry of the mesh in dataset.yaml.
+            overrides: Material of some parts.
+
+        Returns:
+            The mesh.
+
+        Raises:
+            InputError: If the mesh cannot be read, or is not the one that `surface` moved.
+        """
         key = (name, *sorted(overrides.items()))
         if key not in self._meshes:
             file = self.path(name, entry.file)
@@ -92,7 +117,8 @@ class MeshesOnce:
                 still = np.zeros(dense.nodes)
                 moves, factors = (np.array(of.get(name, still)) for of in (self.displacements, self.log_factors))
                 if not len(moves) == len(factors) == dense.nodes:
-                    found, cure = "it is not the mesh that the stage `surface` moved", "run `surface` again"
+                    found = "it is not the mesh that the stage `surface` moved"
+                    cure = "run `surface` again"
                     raise InputError(found, file=file, cure=cure)
                 detail = np.exp(factors)[dense.node] if name in self.log_factors else None
                 mesh = msgspec.structs.replace(dense.moved(moves), detail=detail)
@@ -101,7 +127,9 @@ class MeshesOnce:
 
 
 def _soup(path: str | Path, limits: Limits | None) -> Soup:
-    path, limits = Path(path), limits or Limits()
+    """Read a file by its format and check the result."""
+    path = Path(path)
+    limits = limits or Limits()
     suffix = path.suffix.lower()
     if suffix not in FORMATS:
         raise InputError(f"unknown mesh format {path.suffix!r}", file=path, cure="use one of " + ", ".join(FORMATS))
@@ -121,11 +149,23 @@ def part_labels(
     overrides: Mapping[str, str],
     file: str | Path,
 ) -> np.ndarray:
-    """Material label (int16, from 1) of each part of a file, given the names it goes by.
+    """Return the material label (int16, from 1) of each part of a file.
 
-    made_of: part -> material, or the material of all parts;  overrides: part -> material, which go before it
+    Args:
+        names: Names of each part.
+        materials: Materials of the dataset, in order.
+        made_of: Material of each part, or of all parts.
+        overrides: Material of some parts, with precedence over `made_of`.
+        file: File to name in errors.
 
-    >>> part_labels([("shell",), ("legs", "wood")], ["red", "oak"], {"shell": "red", "wood": "oak"}, {}, "a.obj").tolist()
+    Returns:
+        A label for each part.
+
+    Raises:
+        InputError: If a part is unknown, or has no material or several; if a material is unknown.
+
+    >>> made_of = {"shell": "red", "wood": "oak"}
+    >>> part_labels([("shell",), ("legs", "wood")], ["red", "oak"], made_of, {}, "a.obj").tolist()
     [1, 2]
     """
     known = sorted({name for each in names for name in each})
@@ -153,9 +193,24 @@ def part_labels(
 
 
 def usable(soup: Soup, face_label: np.ndarray, crease_deg: float, file: str | Path) -> Mesh:
-    """Welded, without zero-area and duplicate faces, consistently wound, with normals; InputError if nothing is left."""
+    """Weld vertices, drop zero-area and duplicate faces, orient the faces consistently, and compute normals.
+
+    Args:
+        soup: Triangles as read.
+        face_label: Label of each face.
+        crease_deg: Edges of a greater angle stay sharp in the normals.
+        file: File to name in errors.
+
+    Returns:
+        The mesh.
+
+    Raises:
+        InputError: If no face is left.
+    """
     vertices, faces, keep = solid(soup, file)
-    faces, face_label, supplied = faces[keep], face_label[keep], soup.normals[keep]
+    faces = faces[keep]
+    face_label = face_label[keep]
+    supplied = soup.normals[keep]
     flip, is_open = consistently_wound(vertices, faces)
     faces = np.where(flip[:, None], faces[:, ::-1], faces)
     supplied = np.where(flip[:, None, None], -supplied[:, ::-1], supplied)
@@ -176,15 +231,21 @@ def usable(soup: Soup, face_label: np.ndarray, crease_deg: float, file: str | Pa
 
 
 def solid(soup: Soup, file: str | Path) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Welded vertices, the faces by these, and which of them have an area and are no copies, which the log counts; InputError if none."""
-    used, faces = np.unique(soup.faces, return_inverse=True)  # a stray vertex far away must not set the scale
+    """Return welded vertices, the faces on them, and a mask of the faces that have an area and are no duplicates.
+
+    The others are counted in the log.
+
+    Raises:
+        InputError: If no face is left.
+    """
+    used, faces = np.unique(soup.faces, return_inverse=True)  # an unused vertex far away must not set the scale
     weld = welded(soup.vertices[used])
     vertices = soup.vertices[used][np.unique(weld, return_index=True)[1]]
     faces = weld[faces.reshape(-1, 3)]
     extent = float(np.ptp(vertices, axis=0).max()) or 1.0
     distinct = (faces[:, 0] != faces[:, 1]) & (faces[:, 1] != faces[:, 2]) & (faces[:, 2] != faces[:, 0])
     solid = distinct & (np.linalg.norm(area_vectors(vertices, faces), axis=1) > 1e-14 * extent**2)
-    single = np.zeros(len(faces), bool)  # no copy of an earlier one, in either winding
+    single = np.zeros(len(faces), bool)  # no duplicate of an earlier face, in either winding
     single[np.unique(np.sort(faces, axis=1), axis=0, return_index=True)[1]] = True
     for count, what in ((int((~solid).sum()), "zero-area"), (int((solid & ~single).sum()), "duplicate")):
         if count:
@@ -195,8 +256,19 @@ def solid(soup: Soup, file: str | Path) -> tuple[np.ndarray, np.ndarray, np.ndar
 
 
 def merged_normals(own: np.ndarray, supplied: np.ndarray, area: np.ndarray) -> np.ndarray:
-    """[F, 3, 3]: the file's normals where they are sane (unit length, within 75° of the face's), else our own."""
-    with np.errstate(all="ignore"):  # a file may hold any number for a normal; what is not sane is not used
+    """Return the file's corner normals where they are sane, else the computed ones.
+
+    Sane normals have unit length and are within 75° of the face's normal.
+
+    Args:
+        own: Computed normals, [F, 3, 3].
+        supplied: Normals of the file, [F, 3, 3], NaN if there are none.
+        area: Area vectors of the faces, [F, 3].
+
+    Returns:
+        Normals, [F, 3, 3].
+    """
+    with np.errstate(all="ignore"):  # a file may have any number for a normal
         length = np.linalg.norm(supplied, axis=-1, keepdims=True)
         unit = supplied / length
         face = (area / np.linalg.norm(area, axis=1, keepdims=True))[:, None, :]

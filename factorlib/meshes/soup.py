@@ -1,4 +1,4 @@
-"""A mesh as its file says it, before it is made fit for use: triangles, their corners' normals, the names of their parts.
+"""Mesh as its file has it, before it is made usable: triangles, normals of their corners, names of their parts.
 
 Text in mesh files is UTF-8, or else Latin-1, in which old programs write names and comments.
 """
@@ -15,11 +15,11 @@ from jaxtyping import Float, Int
 
 from factorlib.errors import InputError
 
-LARGEST = 1e15  # coordinate: cubes of it, and its ratio to any honest length, are numbers
-LEAST_EXTENT = 1e-12
-LEAST_SHARE = 1e-9  # extent over distance from the origin: below, too few digits are left for the shape
-QUOTED = 80  # characters of a line in a message
-LONGEST = 2_000_000  # characters of a line: words of a line are objects of their own
+LARGEST = 1e15  # greatest coordinate: its cube, and its ratio to any plausible length, are finite
+LEAST_EXTENT = 1e-12  # least extent
+LEAST_SHARE = 1e-9  # least extent over distance from the origin: below, too few digits are left for the shape
+QUOTED = 80  # number of characters of a line in a message
+LONGEST = 2_000_000  # number of characters of a line; each of its words becomes an object
 
 
 class Soup(msgspec.Struct, frozen=True):
@@ -28,7 +28,7 @@ class Soup(msgspec.Struct, frozen=True):
     vertices  [V, 3] float64
     faces     [F, 3] int64
     part      [F] int: index into `parts`
-    parts     one tuple of names per part: whatever the file calls it (OBJ: usemtl, groups, object; glTF: primitive,
+    parts     one tuple of names per part, all that the file gives it (OBJ: usemtl, groups, object; glTF: primitive,
               node, material); a dataset may use any of them
     normals   [F, 3, 3] float64 per corner, NaN where the file has none
     """
@@ -41,34 +41,44 @@ class Soup(msgspec.Struct, frozen=True):
 
 
 def floats(values: np.ndarray) -> Float[np.ndarray, "..."]:
-    """Return the numbers as float64; a NaN of any kind is one, without a warning."""
+    """Convert to float64, without a warning for NaN of any kind."""
     with np.errstate(invalid="ignore"):
         return np.asarray(values, dtype=float)
 
 
 def of_one_part(vertices: np.ndarray, faces: np.ndarray, name: str, normals: np.ndarray | None = None) -> Soup:
-    """A soup whose faces are all one part; normals: [V, 3], by vertex."""
+    """Build a soup whose faces are all one part.
+
+    Args:
+        vertices: Vertices, [V, 3].
+        faces: Triangles, [F, 3].
+        name: Name of the part.
+        normals: Normals by vertex, [V, 3].
+
+    Returns:
+        The soup.
+    """
     faces = np.asarray(faces, np.int64).reshape(-1, 3)
     of_corners = no_normals(len(faces)) if normals is None else at_corners(normals, faces)
     return Soup(floats(vertices).reshape(-1, 3), faces, np.zeros(len(faces), np.int64), [(name,)], of_corners)
 
 
 def no_normals(faces: int) -> Float[np.ndarray, "f 3 3"]:
-    """Corner normals of a file that gives none: NaN."""
+    """Return the corner normals of a file without normals: NaN."""
     return np.full((faces, 3, 3), np.nan)
 
 
 def at_corners(normals: Float[np.ndarray, "v 3"], faces: Int[np.ndarray, "f 3"]) -> Float[np.ndarray, "f 3 3"]:
-    """Normals by vertex as normals by corner, NaN where a face's index is not one of a vertex."""
+    """Convert normals by vertex to normals by corner, NaN where a face's index is out of range."""
     exists = (faces >= 0) & (faces < len(normals))
     table = np.concatenate([floats(normals), np.full((1, 3), np.nan)])
     return table[np.where(exists, faces, len(normals))]
 
 
 def fans(counts: Int[np.ndarray, " n"], corners: Int[np.ndarray, " c"]) -> Int[np.ndarray, "f 3"]:
-    """Triangles of polygons, each a fan about its first corner; polygons of fewer than three corners have none.
+    """Triangulate polygons, each as a fan about its first corner; polygons of fewer than three corners give none.
 
-    counts: corners of each polygon;  corners: those of all polygons, in a row
+    `counts` are the numbers of corners of the polygons, `corners` those of all polygons in a row.
 
     >>> fans(np.array([3, 2, 4]), np.array([7, 8, 9, 1, 2, 3, 4, 5, 6])).tolist()
     [[7, 8, 9], [3, 4, 5], [3, 5, 6]]
@@ -80,10 +90,15 @@ def fans(counts: Int[np.ndarray, " n"], corners: Int[np.ndarray, " c"]) -> Int[n
 
 
 def check(soup: Soup, file: str | Path) -> Soup:
-    """The soup itself; raises InputError for no faces, indices out of range, vertices that are not finite, and a size or a
-    place that leaves no digits for the shape."""
+    """Check a soup and return it.
+
+    Raises:
+        InputError: If it has no faces, an index out of range, a vertex that is not finite, or a size or position that
+            leaves no digits for the shape.
+    """
 
     def refuse(fault: str, cure: str) -> NoReturn:
+        """Raise an InputError for this file."""
         raise InputError(fault, file=file, cure=cure)
 
     if len(soup.faces) == 0:
@@ -96,8 +111,10 @@ def check(soup: Soup, file: str | Path) -> Soup:
     if bad.any():
         fault = f"{int(bad.sum())} vertices are not finite, first is number {int(np.argmax(bad)) + 1}"
         refuse(fault, "remove them in a mesh editor, or export the mesh again")
-    corners, cure = soup.vertices[soup.faces.reshape(-1)], "give it in another unit, about its own origin"
-    largest, extent = float(np.abs(corners).max()), float(np.ptp(corners, axis=0).max())
+    corners = soup.vertices[soup.faces.reshape(-1)]
+    cure = "give it in another unit, about its own origin"
+    largest = float(np.abs(corners).max())
+    extent = float(np.ptp(corners, axis=0).max())
     if largest > LARGEST:
         refuse(f"a coordinate is {largest:.3g}, more than {LARGEST:.0e}", cure)
     if 0 < extent < LEAST_EXTENT:
@@ -108,18 +125,20 @@ def check(soup: Soup, file: str | Path) -> Soup:
 
 
 def lines_of(content: bytes) -> Iterator[str]:
-    """Lines, whichever of the three ways they end; characters that Python alone takes for line ends are none.  ValueError
-    for one of more than LONGEST characters.
+    r"""Yield the lines of a text with any of the three line ends.
 
-    >>> list(lines_of("Stühle\\r\\nb\\rc\\x0cd\\n".encode("utf-8-sig"))), list(lines_of("Stühle".encode("latin-1")))
-    (['Stühle', 'b', 'c\\x0cd'], ['Stühle'])
+    Other characters that Python treats as line ends do not count.
+    ValueError is raised for a line of more than LONGEST characters.
+
+    >>> list(lines_of("Stühle\r\nb\rc\x0cd\n".encode("utf-8-sig"))), list(lines_of("Stühle".encode("latin-1")))
+    (['Stühle', 'b', 'c\x0cd'], ['Stühle'])
     """
     try:
         content.decode("utf-8-sig")
         encoding = "utf-8-sig"
     except UnicodeDecodeError:
         encoding = "latin-1"
-    with io.TextIOWrapper(io.BytesIO(content), encoding) as text:  # line by line: a list of them is far larger
+    with io.TextIOWrapper(io.BytesIO(content), encoding) as text:  # line by line, since a list takes far more memory
         for line in text:
             if len(line) > LONGEST:
                 raise ValueError(f"a line of more than {LONGEST:,} letters")
@@ -127,13 +146,13 @@ def lines_of(content: bytes) -> Iterator[str]:
 
 
 def numbers_in(text: str | bytes) -> Float[np.ndarray, " n"]:
-    """All numbers of a text, whatever white space is between them; ValueError for anything else in it.
+    r"""Parse all numbers of a text, separated by white space; ValueError for anything else in it.
 
-    >>> numbers_in("1 2.5\\n-3e2").tolist()
+    >>> numbers_in("1 2.5\n-3e2").tolist()
     [1.0, 2.5, -300.0]
     """
     with warnings.catch_warnings():
-        warnings.simplefilter("error")  # NumPy stops at what is no number, with a warning
+        warnings.simplefilter("error")  # NumPy only warns of text that is no number
         try:
             return np.fromstring(text, dtype=float, sep=" ") if text.strip() else np.empty(0)
         except DeprecationWarning:
@@ -141,6 +160,6 @@ def numbers_in(text: str | bytes) -> Float[np.ndarray, " n"]:
 
 
 def quoted(line: str) -> str:
-    """A line as messages quote it, cut to QUOTED characters."""
+    """Quote a line for a message, cut to QUOTED characters."""
     line = line.strip()
     return repr(line if len(line) <= QUOTED else line[: QUOTED - 1] + "…")

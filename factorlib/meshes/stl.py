@@ -1,6 +1,7 @@
-"""STL files, binary and text, and OFF files, text: triangles of one part.  Normals, colours and what else they hold are left alone.
+"""Readers of STL files, binary and text, and of OFF files, text: triangles of one part.
 
-trimesh would read them, too, but takes a file that was cut short for a smaller mesh.
+Normals, colours and other contents are ignored. trimesh would read these files too, but takes a truncated file for a
+smaller mesh.
 """
 
 import re
@@ -12,17 +13,31 @@ from factorlib.errors import InputError
 from factorlib.meshes.limits import Limits
 from factorlib.meshes.soup import Soup, fans, lines_of, numbers_in, of_one_part, quoted
 
-HEADER = 84  # bytes: 80 for any text, 4 for the number of triangles
+HEADER = 84  # size in bytes: 80 for any text, 4 for the number of triangles
 FACET = np.dtype([("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("attribute", "<u2")])
 VERTEX = re.compile(rb"^[ \t]*vertex\b([^\r\n]*)", re.MULTILINE | re.IGNORECASE)
 SOLID = re.compile(rb"\s*solid\b", re.IGNORECASE)
-# the word may be left out, so may the space after
+# first line of an OFF file: the word is optional, and so is the space after it
 OFF = re.compile(r"(ST)?C?N?OFF\b(?!\s*BINARY)|(?=[0-9])|OFF(?=[0-9])")
 CURE = "is it whole? export it again"
 
 
 def read_stl(path: Path, content: bytes, limits: Limits) -> Soup:
-    """Binary where the size is the one that its count of triangles implies, else text; some binary headers say `solid` too."""
+    """Read an STL file: binary if its size matches its count of triangles, else text.
+
+    Some binary headers begin with `solid` too.
+
+    Args:
+        path: File, to be named in errors.
+        content: Content of the file.
+        limits: Limits on its size.
+
+    Returns:
+        The triangles, in one part.
+
+    Raises:
+        InputError: If the file is malformed or too large.
+    """
     count = int.from_bytes(content[80:HEADER], "little") if len(content) >= HEADER else -1
     size = HEADER + count * FACET.itemsize
     if len(content) == size:
@@ -44,7 +59,19 @@ def read_stl(path: Path, content: bytes, limits: Limits) -> Soup:
 
 
 def read_off(path: Path, content: bytes, limits: Limits) -> Soup:
-    """Read an OFF file; polygons become fans of triangles.  InputError for a malformed or too large one."""
+    """Read an OFF file; polygons become fans of triangles.
+
+    Args:
+        path: File, to be named in errors.
+        content: Content of the file.
+        limits: Limits on its size.
+
+    Returns:
+        The triangles, in one part.
+
+    Raises:
+        InputError: If the file is malformed or too large.
+    """
     lines = [line for line in (line.split("#", 1)[0].strip() for line in lines_of(content)) if line]
     keyword = OFF.match(lines[0]) if lines else None
     if keyword is None:
@@ -58,7 +85,8 @@ def read_off(path: Path, content: bytes, limits: Limits) -> Soup:
         raise InputError(fault, file=path, cure=CURE)
     points = np.array([_numbers(line, 3, float, path) for line in lines[1 : vertices + 1]]).reshape(-1, 3)
     polygons = []
-    for line in lines[vertices + 1 : vertices + faces + 1]:  # their number of corners, these, and perhaps a colour
+    # a line of a face: its number of corners, the corners, and perhaps a colour
+    for line in lines[vertices + 1 : vertices + faces + 1]:
         (count,) = _numbers(line, 1, int, path)
         if not 0 <= count < len(line.split()):
             raise InputError(f"{quoted(line)} is no face: its first number counts its corners", file=path, cure=CURE)
@@ -70,6 +98,7 @@ def read_off(path: Path, content: bytes, limits: Limits) -> Soup:
 
 
 def _numbers(line: str, count: int, kind: type, path: Path) -> list:
+    """Parse the first `count` numbers of a line; InputError if there are fewer."""
     words = line.split()[:count]
     try:
         if len(words) < count:

@@ -1,1 +1,1 @@
-"""Recipes: which pictures to make of a result, as YAML files."""
+"""Recipes: YAML files that describe pictures to render from a result."""

@@ -1,4 +1,4 @@
-"""Reading a recipe for a data set: what it asks for must be there, and every complaint names what is."""
+"""Reading of recipes for a data set: every name and file in a recipe must exist, and every error names the choices."""
 
 from __future__ import annotations
 
@@ -17,8 +17,9 @@ from factorlib.yamlfile import load_yaml, read_yaml
 
 
 def read_recipe(path: Path, dataset: Dataset) -> AnyRecipe:
-    """The recipe in a file; InputError for one that is not good, or asks for what the data set does not have."""
-    refuse, written = Refusal(path, path.parent), load_yaml(path)
+    """Read the recipe in a file; InputError if it is invalid or refers to something that the data set lacks."""
+    refuse = Refusal(path, path.parent)
+    written = load_yaml(path)
     kind = written.get("kind") if isinstance(written, dict) else None
     if not isinstance(kind, str) or kind not in KINDS:
         found = "it does not say what kind of picture to make" if kind is None else f"there is no kind {kind!r}"
@@ -31,14 +32,23 @@ def read_recipe(path: Path, dataset: Dataset) -> AnyRecipe:
 def check_recipe(
     recipe: AnyRecipe, path: Path, objects: Mapping[str, Sequence[ObjectEntry]], materials: list[str]
 ) -> None:
-    """Raise InputError where a recipe asks for what the data set does not have.
+    """Check a recipe against a data set.
 
-    path: what errors call the recipe, and where its files are relative to;  objects: of each photo
+    Args:
+        recipe: the recipe
+        path: the recipe's file, which errors name and to which its files are relative
+        objects: objects of each photo
+        materials: materials of the data set
+
+    Raises:
+        InputError: The recipe refers to something that the data set lacks.
     """
-    refuse, photos = Refusal(path, path.parent), list(objects)
+    refuse = Refusal(path, path.parent)
+    photos = list(objects)
     meshes = sorted({obj.mesh for own in objects.values() for obj in own})
 
     def check(key: str, names: Iterable[str], known: list[str], what: str, once: bool = False) -> None:
+        """Check that names are known and, if `once`, distinct."""
         for name in (names := list(names)):
             refuse.known(key, name, known, what)
             if once and names.count(name) > 1:
@@ -89,12 +99,15 @@ def check_recipe(
         for photo in (recipe.photos or photos) if recipe.beside is not None else ():
             names = [obj.name for obj in objects[photo]]
             if recipe.beside not in names:
-                found = f"there is no object {recipe.beside!r} in photo '{photo}', whose objects are: {', '.join(names) or 'none'}"
+                found = (
+                    f"there is no object {recipe.beside!r} in photo '{photo}', "
+                    f"whose objects are: {', '.join(names) or 'none'}"
+                )
                 refuse("beside", found, "name the photos that have it: `photos: [...]`")
 
 
 def files_of(recipe: AnyRecipe, path: Path) -> dict[str, Path]:
-    """The files that a recipe names, by how it writes them."""
+    """Return the absolute paths of the files that a recipe names, by the names it uses."""
     named = [name for name in getattr(recipe, "lights", []) if is_light_file(name)]
     named += [name for name in [getattr(recipe, "table", None)] if name is not None]
     named += [name for name in [getattr(recipe, "mesh", "")] if is_mesh_file(name)]

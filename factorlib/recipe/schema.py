@@ -1,11 +1,11 @@
-"""What a recipe may say: one struct for each kind of picture, its fields those of the YAML file.
+"""Schema of recipes: one struct for each kind of picture, with the fields of the YAML file.
 
     kind: relight
     photos: [kitchen]
     lights: [hall, my_studio.exr]
 
-Photos, objects, materials and lights go by their names in dataset.yaml; files are relative to the recipe.  Materials of one's own stand in
-a table, a JSON file like materials.json, of which only the reflectances are read.
+Photos, objects, materials and lights have their names in dataset.yaml.  Files are relative to the recipe.
+User-supplied materials stand in a table, a JSON file like materials.json, of which only the reflectances are read.
 Angles are in degrees, sizes in pixels, colours linear Rec. 709.
 """
 
@@ -26,56 +26,61 @@ Frames = Annotated[int, msgspec.Meta(ge=2, le=1000)]
 Degrees = Annotated[float, msgspec.Meta(ge=-360, le=360)]
 Factor = Annotated[float, msgspec.Meta(ge=0.01, le=100)]
 Seconds = Annotated[float, msgspec.Meta(gt=0, le=1200)]  # a GIF shows a frame for 655 s at most
-LIGHT_FILES, BALL = (".hdr", ".exr"), "ball"
-MOST_REFLECTED = 0.999  # max diffuse + max specular: a surface that reflects more than arrives never comes to rest with light between surfaces
-DENOISER = "mitsuba_oidn"  # as it is imported
-CURE = 'write {"materials": {"gold": {"diffuse": [r, g, b], "specular": [r, g, b], "roughness": 0.2}}}, numbers from 0 to 1'
+LIGHT_FILES = (".hdr", ".exr")
+BALL = "ball"
+MOST_REFLECTED = 0.999  # largest max diffuse + max specular: with more, light between surfaces does not decay
+DENOISER = "mitsuba_oidn"  # name of the module
+CURE = (
+    'write {"materials": {"gold": {"diffuse": [r, g, b], "specular": [r, g, b], "roughness": 0.2}}}, '
+    "numbers from 0 to 1"
+)
 
 
 class Recipe(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True, tag_field="kind"):
-    """The fields that every kind has."""
+    """Fields of every kind."""
 
     samples: Samples = 256
-    """Samples per pixel of the path tracer: noise falls as their square root."""
+    """Samples per pixel of the path tracer; the noise falls with their square root."""
     denoise: bool = False
-    """Whether what is left of the noise is taken out by Intel Open Image Denoise (the extra `denoise`)."""
+    """Remove the remaining noise by Intel Open Image Denoise (the extra `denoise`)."""
 
 
 class AssumedSun(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """A sun that takes the place of the recovered ones; the light as a whole keeps its energy, in each channel."""
+    """A sun that replaces the recovered ones; the light as a whole keeps its energy in each channel."""
 
     direction: Vec3
-    """Toward the sun, in the frame of the photo's exported light (illumination/<name>.exr, lights.json): x right, y up, z toward the viewer
-    for a light fixed to the camera, the same turn of the world for one fixed to it."""
+    """Direction toward the sun, in the frame of the photo's exported light (illumination/<name>.exr, lights.json).
+    The axes are x right, y up, z toward the viewer for a light fixed to the camera.  For a light fixed to the world,
+    they are the world's axes with y and z reversed."""
     strength: Annotated[float, msgspec.Meta(ge=0, le=1)]
-    """Share of the light's energy (the integral of its radiance over the sphere) that the sun holds."""
+    """The sun's share of the light's energy, which is the integral of radiance over the sphere."""
     size: Annotated[float, msgspec.Meta(ge=0.05, le=90)] = 0.53
-    """Diameter in degrees."""
+    """Angular diameter in degrees."""
 
 
 class OfPhotos(Recipe, frozen=True, kw_only=True):
-    """The fields of kinds that make pictures of each photo."""
+    """Fields of kinds that make pictures of each photo."""
 
     photos: list[str] = []
-    """Photos whose camera, objects and light are used; all of them where none is named."""
+    """Photos whose camera, objects and light are used; by default all."""
     sun: AssumedSun | None = None
-    """A sun that is assumed, in the light of the one photo that the recipe names."""
+    """An assumed sun in the light of the one photo that the recipe names."""
 
 
 class Sized(OfPhotos, frozen=True, kw_only=True):
-    """The fields of kinds whose pictures need not be the photo's size."""
+    """Fields of kinds whose pictures may differ from the photo in size."""
 
     width: Pixels | None = None
-    """Width of the pictures; without it that of the photo as the pipeline works on it."""
+    """Width of the pictures; by default that of the photo after downsampling by the pipeline."""
 
 
 class Backdropped(Sized, frozen=True, kw_only=True):
-    """The fields of kinds that show what is beside the objects."""
+    """Fields of kinds that show a background beside the objects."""
 
     background: Literal["none", "light"] = "none"
-    """What is seen beside the objects: nothing (transparent), or the light."""
+    """Background of the objects: none (transparent), or the light."""
     floor: Share | None = None
-    """Reflectance of a grey floor that takes the objects' shadow and fades out around them; none where it is not given."""
+    """Reflectance of a grey floor that receives the objects' shadow and fades out around them; by default no floor."""
 
 
 class Resynthesis(OfPhotos, frozen=True, kw_only=True, tag="resynthesis"):
@@ -83,94 +88,95 @@ class Resynthesis(OfPhotos, frozen=True, kw_only=True, tag="resynthesis"):
 
 
 class View(Backdropped, frozen=True, kw_only=True, tag="view"):
-    """The objects from another side: the camera is moved about their middle; the light stays."""
+    """The objects from another view: the camera moves about their middle; the light stays."""
 
     azimuth: Degrees = 30.0
-    """Angle about the camera's upright axis, to the right as the photo's camera sees it."""
+    """Angle about the camera's upright axis, to the right in the photo."""
     elevation: Annotated[float, msgspec.Meta(ge=-89, le=89)] = 0.0
-    """Angle upward, added to the photo's own."""
+    """Angle upward, relative to the photo's camera."""
     zoom: Factor = 1.0
-    """Factor on the size in the picture."""
+    """Magnification of the objects in the picture."""
 
 
 class Turntable(Backdropped, frozen=True, kw_only=True, tag="turntable"):
     """An animation once around the objects; the light stays."""
 
     frames: Frames = 24
-    """Pictures of the whole turn."""
+    """Number of pictures in the whole turn."""
     seconds: Seconds = 4.0
-    """Of the whole turn."""
+    """Duration of the whole turn."""
 
 
 class MovingLight(Sized, frozen=True, kw_only=True, tag="moving_light"):
     """An animation in which the light turns once about the camera's upright axis, so that highlights move."""
 
     frames: Frames = 24
-    """Pictures of the whole turn."""
+    """Number of pictures in the whole turn."""
     seconds: Seconds = 4.0
-    """Of the whole turn."""
+    """Duration of the whole turn."""
 
 
 class Relight(Backdropped, frozen=True, kw_only=True, tag="relight"):
     """The photo's objects in other lights."""
 
     lights: list[str] = []
-    """Photos whose light is used, or files (.hdr, .exr: lat-long, up is the first row); all other photos where none is named."""
+    """Photos whose light is used, or files (.hdr, .exr: lat-long, up is the first row); by default all other photos."""
     rotate: Degrees = 0.0
-    """Turn of those lights about the camera's upright axis."""
+    """Rotation of those lights about the camera's upright axis."""
 
 
 class Transfer(OfPhotos, frozen=True, kw_only=True, tag="transfer"):
     """The photo with other materials on its objects."""
 
     materials: dict[str, str]
-    """Material of the data set -> the one that takes its place: another of the data set, or one of `table`."""
+    """Replacement by material of the data set: another material of the data set, or one of `table`."""
     table: str | None = None
-    """File of materials of one's own, like materials.json."""
+    """File of user-supplied materials, like materials.json."""
 
 
 class Polish(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """What a ground reflects beside its diffuse colour, which the photo shows."""
+    """Specular reflection of a ground whose diffuse colour the photo shows."""
 
     specular: Shares = (0.0, 0.0, 0.0)
-    """k_s of a ground that reflects, such as a polished floor."""
+    """k_s of a reflective ground, such as a polished floor."""
     roughness: Share = 0.3
-    """Of that reflection."""
+    """Roughness of that reflection."""
 
 
 class Insert(OfPhotos, frozen=True, kw_only=True, tag="insert"):
-    """A further object in the photo, standing beside one that is there, with its shadow."""
+    """A further object in the photo, standing beside an existing one, with its shadow."""
 
     mesh: str = "ball"
     """`ball`, a mesh of the data set, or a mesh file."""
     material: str | dict[str, str] | None = None
-    """Material of the data set or of `table`, or own material -> another for parts of a mesh of the data set; without it the mesh's own, and for a
-    file or ball the data set's first."""
+    """Material of the data set or of `table`, or replacements by material for parts of a mesh of the data set.
+    By default the mesh keeps its own materials; a file or the ball gets the data set's first."""
     table: str | None = None
-    """File of materials of one's own, like materials.json."""
+    """File of user-supplied materials, like materials.json."""
     beside: str | None = None
-    """Object on whose ground it stands; without it the photo's first."""
+    """Object on whose ground the new one stands; by default the photo's first."""
     at: Vec2 | None = None
-    """Pixel of the photo where it touches the ground; without it beside the object, where there is more room."""
+    """Pixel of the photo where the new object touches the ground; by default beside the object, where there is more
+    room."""
     size: Factor = 0.5
-    """Its height, in heights of that object."""
+    """Height of the new object, in heights of that object."""
     turn: Degrees = 0.0
-    """Turn about the ground's normal."""
+    """Rotation about the ground's normal."""
     up: Literal["x", "y", "z"] = "y"
     """The axis of a mesh file that points upward."""
     ground: Polish = Polish()
-    """What the ground reflects beside its diffuse colour."""
+    """Specular reflection of the ground beside its diffuse colour."""
 
 
 class Grid(Recipe, frozen=True, kw_only=True, tag="grid"):
-    """Balls of every material in every light, in one picture: rows are materials, columns lights, those that no photo shows included."""
+    """Balls of every material (rows) in every light (columns), including pairs that no photo shows."""
 
     materials: list[str] = []
-    """Materials of the data set; all where none is named."""
+    """Materials of the data set; by default all."""
     lights: list[str] = []
-    """Photos whose light is used, or files; all photos where none is named."""
+    """Photos whose light is used, or files; by default all photos."""
     size: Pixels = 128
-    """Of a ball's picture."""
+    """Width of a ball's picture."""
 
 
 AnyRecipe = Resynthesis | View | Turntable | MovingLight | Relight | Transfer | Insert | Grid
@@ -178,12 +184,12 @@ KINDS = {kind.__struct_config__.tag: kind for kind in AnyRecipe.__args__}
 
 
 def recipe_of(facts: dict) -> AnyRecipe:
-    """A recipe from its JSON-able facts, as a stage is handed them."""
+    """Convert the JSON-able facts of a stage to a recipe."""
     return msgspec.convert(facts, KINDS[facts["kind"]])
 
 
 def is_light_file(name: str) -> bool:
-    """Return whether a light is a file, not a photo's.
+    """Return True if a light is a file and not a photo's.
 
     >>> is_light_file("studio.hdr"), is_light_file("kitchen")
     (True, False)
@@ -192,12 +198,15 @@ def is_light_file(name: str) -> bool:
 
 
 def is_mesh_file(name: str) -> bool:
-    """Return whether a mesh is a file, not one of the data set or the ball: it has a suffix."""
+    """Return True if a mesh is a file, which has a suffix, and not a mesh of the data set or the ball."""
     return "." in name
 
 
 class OwnMaterial(msgspec.Struct, frozen=True):
-    """Lambert k_d and GGX k_s per channel (linear Rec. 709), and roughness with α = roughness²; what else the file says is passed over."""
+    """Lambert k_d and GGX k_s per channel (linear Rec. 709), and roughness with α = roughness².
+
+    Other fields of the file are ignored.
+    """
 
     diffuse: Shares
     specular: Shares
@@ -205,7 +214,11 @@ class OwnMaterial(msgspec.Struct, frozen=True):
 
 
 def read_table(path: Path) -> dict[str, OwnMaterial]:
-    """Read the materials by name; raises InputError for a file that is no such table, or has a material that reflects more light than arrives."""
+    """Read the materials of a table by name.
+
+    Raises:
+        InputError: The file is not a table of materials, or one reflects more light than arrives.
+    """
     text = read_text(path, "a table of materials")
     with reading("a table of materials", path, cure=CURE):
         content = msgspec.json.decode(text)

@@ -1,8 +1,8 @@
-"""R(lobe | material): what a surface of Lambert + GGX reflectance reflects of one light lobe.
+"""Radiance R(lobe | material) that a surface of Lambert + GGX reflectance reflects of one light lobe.
 
-Four operators compute it, behind one interface (`reflection_operator`): `reference` by quadrature, `closed_form` by
-formula, `network` by a learned correction of the formula, compiled where there is a C compiler, and `paper_network`, the
-baseline, by networks that know no formula.
+Four operators compute R behind one interface (`reflection_operator`): `reference` by quadrature, `closed_form` by
+formula, `network` by a learned correction of the formula, and `paper_network` by networks without a formula (the
+baseline). `network` is compiled where there is a C compiler.
 
 By symmetry the diffuse part depends on 2 scalars (λ, n·z) and the specular part on 5 (α, λ, n·o, n·z, o·z).
 
@@ -33,10 +33,18 @@ DTYPES = {"float32": torch.float32, "float64": torch.float64}
 
 
 def reflection_operator(name: Name, weights: str | Path | None = None, *, dtype: str | None = None) -> Operator:
-    """The operator `name`; each is imported when it is asked for.
+    """Return the reflection operator `name`, importing only its own module.
 
-    weights: folder with diffuse.safetensors and specular.safetensors, for the networks; None takes the shipped ones
-    dtype:   float32 or float64; None takes the operator's own (float64 for the reference, float32 for the others)
+    Args:
+        name: Operator, one of `NAMES`.
+        weights: Folder with diffuse.safetensors and specular.safetensors for `network`; None takes the shipped ones.
+        dtype: "float32" or "float64"; None takes the operator's default (float64 for `reference`, else float32).
+
+    Returns:
+        The operator.
+
+    Raises:
+        InputError: If the name or the dtype is unknown.
     """
     if name not in NAMES:
         raise InputError(f"no reflection operator '{name}'", cure=did_you_mean(name, NAMES))

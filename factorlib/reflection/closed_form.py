@@ -1,13 +1,15 @@
-"""The operator by formulas alone: `diffuse` below, within .03 % of its peak, and `filtering` for the specular part.
+"""Reflection operator in closed form.
 
-The diffuse reflection of a lobe is E[max(n·i, 0)] over the lobe, times its integral, over π.
+`diffuse` below is within 0.03 % of its peak; the module `filtering` has the formula of the specular part.
 
-n·i has mean m = t̄ c and variance τ² = v⊥ s² + v∥ c² over the lobe (c = n·z, s² = 1 − c²).  Were it normally distributed,
+The diffuse reflection of a lobe is E[max(n·i, 0)] over the lobe, times the lobe's integral, over π. Over the lobe, n·i
+has mean m = t̄ c and variance τ² = v⊥ s² + v∥ c² (c = n·z, s² = 1 − c²). If n·i were normally distributed,
 
     E[max(n·i, 0)] = m Φ(m/τ) + τ φ(m/τ)                                                                   (1)
 
-which is exact as λ → ∞ and 8 % low for constant light.  E[max(x, 0)] − E[max(−x, 0)] = E[x] holds for (1) as for the
-truth, so that what is left is even in c:  (1 − t̄)² Σ_ij a_ij T_i(2t̄ − 1) c^2j, within .03 % of the peak for every λ.
+Equation (1) is exact as λ → ∞ and 8 % low for constant light. Both (1) and the exact value satisfy
+E[max(x, 0)] − E[max(−x, 0)] = E[x], so their difference is even in c. The polynomial
+(1 − t̄)² Σ_ij a_ij T_i(2t̄ − 1) c^2j approximates it within 0.03 % of the peak for every λ.
 """
 
 from __future__ import annotations
@@ -22,7 +24,7 @@ from factorlib.reflection.filtering import filtered_specular
 from factorlib.reflection.lobe import gaussian_sharpness, lobe_moments
 from factorlib.reflection.operator import MOST, Operator, columns
 
-# studies/measured/operator_fit.py of version 0.1.0 fitted these
+# a_ij: row i belongs to T_i, column j to c^2j; fitted by studies/measured/operator_fit.py of version 0.1.0
 REMAINDER = torch.tensor(
     [
         [0.117057442, 0.883729683, -4.79232173, 6.88170859, -3.04039177],
@@ -39,12 +41,25 @@ REMAINDER = torch.tensor(
 
 
 def diffuse_of_moments(lam: Tensor, mean: Tensor, along: Tensor, across: Tensor, nz: Tensor) -> Tensor:
-    """`diffuse`, from λ' and the lobe's moments."""
+    """Return `diffuse` from λ' and the lobe's moments.
+
+    Args:
+        lam: λ' = λ / (1 − e^{−2λ}), see `gaussian_sharpness`.
+        mean: Mean t̄ of i·z over the lobe.
+        along: Variance v∥ along the lobe's axis.
+        across: Variance v⊥ in each direction across the axis.
+        nz: Cosine n·z of the lobe's axis.
+
+    Returns:
+        A tensor of the arguments' broadcast shape.
+    """
     c = nz.clamp(-1, 1)
     m, deviation = mean * c, torch.sqrt(across * (1 - c * c) + along * c * c + 1e-30)
+    # E[max(n·i, 0)] of a normal distribution, (1)
     u = m / deviation
     inside = 0.5 * m * torch.special.erfc(u * -math.sqrt(0.5))
-    normal = inside + deviation * torch.exp(-0.5 * u * u) / math.sqrt(2 * math.pi)  # (1)
+    normal = inside + deviation * torch.exp(-0.5 * u * u) / math.sqrt(2 * math.pi)
+    # the even remainder: Chebyshev polynomials of x = 2t̄ − 1, then Horner's scheme in c²
     x, square = 2 * mean - 1, c * c
     chebyshev: list[Tensor | float] = [1.0, x]
     for _ in range(len(REMAINDER) - 2):
@@ -56,18 +71,29 @@ def diffuse_of_moments(lam: Tensor, mean: Tensor, along: Tensor, across: Tensor,
 
 
 def diffuse(sharpness: Float[Tensor, "*p"], nz: Float[Tensor, "n p"]) -> Float[Tensor, "n p"]:
-    """(1/π) ∫ exp(λ(i·z − 1)) max(n·i, 0) di."""
+    """Return (1/π) ∫ exp(λ(i·z − 1)) max(n·i, 0) di."""
     return diffuse_of_moments(gaussian_sharpness(sharpness), *lobe_moments(sharpness), nz)
 
 
 class ClosedForm(Operator):
-    """Formulas alone."""
+    """Reflection operator that evaluates formulas alone."""
 
     def diffuse(self, sharpness: Float[Tensor, "*p"], nz: Float[Tensor, "n p"]) -> Float[Tensor, "n p"]:
-        """Compute it as `Operator` says."""
+        """Return the diffuse reflection of unit lobes; see `Operator.diffuse`."""
         return diffuse(sharpness, nz)
 
     def specular(self, roughness: Tensor, sharpness: Tensor, no: Tensor, nz: Tensor, oz: Tensor) -> Tensor:
-        """Compute it as `Operator` says; at most MOST."""
+        """Return the specular reflection of unit lobes, at most MOST; see `Operator.specular`.
+
+        Args:
+            roughness: Roughness √α, [] or [n, p].
+            sharpness: Sharpness λ, [p] or [n, p].
+            no: Cosine n·o, [n] or [n, p].
+            nz: Cosine n·z, [n, p].
+            oz: Cosine o·z, [n, p].
+
+        Returns:
+            Reflection for k_s = 1, [n, p].
+        """
         scalars = torch.broadcast_tensors(roughness**2, sharpness, columns(no), nz, oz)
         return filtered_specular(*scalars).value.clamp_max(MOST)

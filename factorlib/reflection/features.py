@@ -1,4 +1,4 @@
-"""What the reflection networks are made of: their layers, and the features of a lobe and a material that these are given."""
+"""Layers of the reflection networks and the features of a lobe and a material that enter them."""
 
 from __future__ import annotations
 
@@ -10,12 +10,12 @@ from torch.nn.functional import silu
 
 from factorlib.reflection.filtering import Filtered
 
-LARGEST = 8.0  # of the logarithm of the correction
-SHARPEST = 1e4  # in training
+LARGEST = 8.0  # greatest logarithm of the correction
+SHARPEST = 1e4  # greatest sharpness at which the correction applies in full
 
 
 class Layers(msgspec.Struct, frozen=True):
-    """A fully connected network of SiLU layers; `mean` and `scale` standardise its features."""
+    """Fully connected network of SiLU layers; `mean` and `scale` standardise its features."""
 
     mean: Float[Tensor, " features"]
     scale: Float[Tensor, " features"]
@@ -23,28 +23,40 @@ class Layers(msgspec.Struct, frozen=True):
     biases: list[Tensor]
 
     def __call__(self, features: Float[Tensor, "*b features"]) -> Float[Tensor, "*b"]:
+        """Return the network's output, one number for each row of features."""
         x = (features - self.mean) * self.scale
         for weight, bias in zip(self.weights[:-1], self.biases[:-1], strict=True):
             x = silu(torch.nn.functional.linear(x, weight, bias))
         return torch.nn.functional.linear(x, self.weights[-1], self.biases[-1])[..., 0]
 
     def to(self, dtype: torch.dtype) -> Layers:
-        """The same network in another floating-point type."""
+        """Convert the network to another floating-point type."""
         weights, biases = ([t.to(dtype) for t in tensors] for tensors in (self.weights, self.biases))
         return Layers(self.mean.to(dtype), self.scale.to(dtype), weights, biases)
 
 
 def fading(sharpness: Tensor) -> Tensor:
-    """Return what is left of the correction of lobes sharper than in training: 1, then 1/√λ."""
+    """Return the factor on the correction of each lobe: 1 up to SHARPEST, and √(SHARPEST/λ) beyond it."""
     return torch.rsqrt((sharpness / SHARPEST).clamp_min(1.0))
 
 
 def specular_columns(alpha: Tensor, no: Tensor, nz: Tensor, oz: Tensor, form: Filtered) -> tuple[Tensor, ...]:
-    """Features: bounded, smooth, and of the order of one; see `Filtered` for what they are made of."""
+    """Return the features of the specular network, bounded, smooth and of the order of one.
+
+    Args:
+        alpha: GGX width α = roughness².
+        no: Cosine n·o of the view direction.
+        nz: Cosine n·z of the lobe's axis.
+        oz: Cosine o·z between view and axis.
+        form: Intermediate results of the formula for the same inputs.
+
+    Returns:
+        One tensor for each feature, 24 in all.
+    """
     alpha = alpha.clamp(0.005, 1)
     log_width = torch.log(form.sharpness.clamp_max(2e4))
     u = form.ni / form.deviation
-    height = nz * torch.sqrt(form.sharpness)  # of the axis above the horizon, in widths of the lobe
+    height = nz * torch.sqrt(form.sharpness)  # height of the axis above the horizon, in widths of the lobe
     mirror = form.sharpness * (1 + oz - 2 * no * nz).clamp_min(0)  # λ'(1 − z·m), m the mirror direction
     of_inputs = torch.log(alpha), log_width, form.ratio, no, torch.log(no.clamp_min(1e-4) + 0.02), nz, oz
     of_place = form.px, form.py * form.py, form.misfit / (1 + form.misfit)
@@ -57,9 +69,17 @@ def specular_columns(alpha: Tensor, no: Tensor, nz: Tensor, oz: Tensor, form: Fi
 
 
 def diffuse_columns(lam: Tensor, mean: Tensor, along: Tensor, across: Tensor, nz: Tensor) -> tuple[Tensor, ...]:
-    """Features: bounded, smooth, and of the order of one.
+    """Return the features of the diffuse network, bounded, smooth and of the order of one.
 
-    lam: λ';  mean, along, across: the lobe's moments, as `lobe_moments` gives them
+    Args:
+        lam: λ' = λ / (1 − e^{−2λ}), see `gaussian_sharpness`.
+        mean: Mean t̄ of i·z over the lobe, as `lobe_moments` returns it.
+        along: Variance along the lobe's axis.
+        across: Variance in each direction across the axis.
+        nz: Cosine n·z of the lobe's axis.
+
+    Returns:
+        One tensor for each feature, 8 in all.
     """
     u = nz * mean * torch.rsqrt(across * (1 - nz * nz) + along * nz * nz + 1e-6)
     widths = mean, torch.log(lam.clamp_max(2e4)), across

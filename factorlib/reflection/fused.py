@@ -1,10 +1,12 @@
-"""The reflection networks' values and gradients as C functions, compiled on first use.
+"""Values and gradients of the reflection networks as C functions, compiled on first use.
 
-The formulas are written once, in torch.  They are run on a `Tape`, which derives their derivatives and writes both as C into kernel.c;
-that code can leave the derivatives out.  With t = tanh(net/s) the result is R = formula · exp(fade · s · t).  kernel.c computes the
-network and its derivative by the features itself, and its part BACKWARD begins with ∂R/∂formula, ∂R/∂fade and ∂R/∂feature.
+The formulas are written once, in torch. A `Tape` records them, differentiates them, and writes values and derivatives
+as C into kernel.c; that code can leave the derivatives out. With t = tanh(net/s) the result is
+R = formula · exp(fade · s · t). kernel.c itself computes the network and its derivative by the features; its part
+BACKWARD begins with ∂R/∂formula, ∂R/∂fade and ∂R/∂feature.
 
-Without a C compiler (`cc`, or what CC says) torch computes the same in 6.5 times the time.  `tape` says how this compares with other generators.
+Without a C compiler (`cc`, or the command in CC) torch computes the same in 6.5 times the time. The module `tape`
+compares this with other code generators.
 """
 
 from __future__ import annotations
@@ -37,17 +39,21 @@ from factorlib.reflection.tape import Tape
 from factorlib.wholefile import sync
 
 log = logging.getLogger("factorlib.reflection")
-ENVIRONMENT = ("FACTORLIB_FUSED",)  # "0": in torch, the same up to rounding: which form ran is in the keys of steps
+# "0" runs the networks in torch, with the same values up to rounding; the keys of steps hold this choice
+ENVIRONMENT = ("FACTORLIB_FUSED",)
 PROGRAMS = {"CC": "cc"}
-# Every flag leaves the bits as they are: no operation is contracted, reordered or replaced, errno and traps are nobody's.
-FLAGS = "-std=gnu11 -O3 -march=native -ffp-contract=off -ffinite-math-only -fno-signed-zeros -fno-math-errno -fno-trapping-math -fPIC -shared"
-MOMENTS = ("sharpness", "lam", "mean", "along", "across")  # of a lobe; all but the first are functions of it
+# No flag changes the bits: no operation is contracted, reordered or replaced, and nobody reads errno or traps.
+FLAGS = (
+    "-std=gnu11 -O3 -march=native -ffp-contract=off -ffinite-math-only -fno-signed-zeros -fno-math-errno "
+    "-fno-trapping-math -fPIC -shared"
+)
+MOMENTS = ("sharpness", "lam", "mean", "along", "across")  # λ and the moments of a lobe, which are functions of λ
 PLACES = {name: f"lobe[{k}][l]" for k, name in enumerate([*MOMENTS, *(f"d{m}" for m in MOMENTS)])}
 PLACES |= {name: f"{name}[l]" for name in ("no", "nz", "oz", "net")} | {"alpha": "alpha"}
 
 
 class Fused:
-    """The compiled function with a network's weights."""
+    """Compiled function of one part (diffuse or specular) with a network's weights."""
 
     def __init__(self, part: str, layers: Layers):
         self.made_of = part, layers
@@ -58,18 +64,29 @@ class Fused:
         self.tables = [torch.cat([t.detach().float().reshape(-1) for t in table]).contiguous() for table in tables]
 
     def __reduce__(self) -> tuple:
-        """A copy in another process compiles, or finds in the user's cache, its own."""
+        """Return the constructor and its arguments: a copy in another process compiles or loads its own code."""
         return Fused, self.made_of
 
     def value(self, roughness: float, sharpness: Tensor, no: Tensor, nz: Tensor, oz: Tensor) -> Tensor:
-        """The value alone, in about a third of the time."""
+        """Return the value alone, in about a third of the time of value and derivatives.
+
+        Args:
+            roughness: Roughness √α of the material.
+            sharpness: Sharpness λ of each lobe, [p].
+            no: Cosine n·o of each point, [n].
+            nz: Cosine n·z, [n, p].
+            oz: Cosine o·z, [n, p].
+
+        Returns:
+            Reflection of unit lobes, [n, p], float32.
+        """
         return self(roughness, sharpness, no, nz, oz, results=1)[0]
 
     def __call__(self, roughness: float, sharpness: Tensor, *cosines: Tensor, results: int = 6) -> list[Tensor]:
-        """Value and derivatives by roughness, log λ, n·o, n·z, o·z; [n, p], float32."""
+        """Return the value and its derivatives by roughness, log λ, n·o, n·z and o·z; [n, p] each, float32."""
         no, nz, oz = (t.detach().float().contiguous() for t in cosines)
         out = [torch.empty_like(nz) for _ in range(results)]
-        pointers = (ctypes.c_void_p * 6)(*(t.data_ptr() for t in out))  # the rest are null
+        pointers = (ctypes.c_void_p * 6)(*(t.data_ptr() for t in out))  # null pointers after the last
         lobes = _lobe_table_of(sharpness.detach().double().numpy().tobytes())
         arrays = [t.data_ptr() for t in (lobes, no, nz, oz, *self.tables)]
         self.function(nz.shape[0], nz.shape[1], ctypes.c_float(roughness**2), *map(ctypes.c_void_p, arrays), pointers)
@@ -78,9 +95,9 @@ class Fused:
         return out
 
 
-@lru_cache(maxsize=256)  # the same lobes are asked for again for every material
+@lru_cache(maxsize=256)  # every material asks for the same lobes
 def _lobe_table_of(sharpness: bytes) -> Tensor:
-    """MOMENTS and their derivatives by log λ, [10, p], of float64 λ."""
+    """Return the MOMENTS of lobes and their derivatives by log λ, [10, p]; `sharpness` holds λ as float64."""
     with torch.enable_grad():
         log_sharpness = torch.from_numpy(np.frombuffer(sharpness).copy()).log().requires_grad_()
         lam = log_sharpness.exp()
@@ -90,7 +107,10 @@ def _lobe_table_of(sharpness: bytes) -> Tensor:
 
 
 def recorded(part: str, tape: Tape) -> tuple[Any, tuple]:
-    """The formula and the features of `part`, of inputs named as in PLACES."""
+    """Record the formula of `part` on the tape; return its value and the network's features.
+
+    The inputs have the names of PLACES.
+    """
     if part == "diffuse":
         inputs = [tape.input(name) for name in ("lam", "mean", "along", "across", "nz")]
         return diffuse_of_moments(*inputs), diffuse_columns(*inputs)
@@ -100,15 +120,27 @@ def recorded(part: str, tape: Tape) -> tuple[Any, tuple]:
 
 
 def source(part: str, features: int, width: int, depth: int) -> str:
-    """kernel.c with the formulas of `part` written in."""
+    """Return the C source of `part`: kernel.c with the recorded formulas written in.
+
+    Args:
+        part: "diffuse" or "specular".
+        features: Number of the network's inputs.
+        width: Number of units of a hidden layer.
+        depth: Number of hidden layers.
+
+    Returns:
+        The text of one C file.
+    """
     tape = Tape()
     formula, columns = recorded(part, tape)
+    # features, formula and R = formula · exp(fade · s · tanh(net/s))
     fade = fading(tape.input("sharpness"))
     forward = tape.c_code({f"feature[{k}][l]": c for k, c in enumerate(columns)} | {"formula[l]": formula}, PLACES)
     t = torch.tanh(tape.input("net") / LARGEST)
     grown = torch.exp(fade * LARGEST * t)
     result = formula * grown
-    inside = tape.apply("above", MOST, result)  # beyond, the result is MOST and its derivatives are nil
+    # derivatives of R; the result is clamped to MOST, where its derivatives are zero
+    inside = tape.apply("above", MOST, result)
     by_net = inside * result * fade * (1 - t * t)
     seeds: list[tuple[Any, Any]] = [(formula, inside * grown), (fade, inside * result * LARGEST * t)]
     seeds += [(c, by_net * tape.input(f"slope{k}")) for k, c in enumerate(columns)]
@@ -119,10 +151,11 @@ def source(part: str, features: int, width: int, depth: int) -> str:
     places = PLACES | {"formula": "formula[l]"} | {f"slope{k}": f"slope[{k}][l]" for k in range(len(columns))}
     backward = tape.c_code({f"result[{k}][l]": value for k, value in enumerate(results)}, places)
     value = tape.c_code({"result[0][l]": (tape.input("formula") * grown).clamp_max(MOST)}, places)
+    # write the three pieces of code into kernel.c
     text = (Path(__file__).parent / "kernel.c").read_text()
     for place, lines in (("      FORWARD\n", forward), ("        BACKWARD\n", backward), ("        VALUE\n", value)):
         code = "".join(line + "\n" for line in lines)
-        for name in ("expf", "logf", "log1pf", "erfcf"):  # kernel.c has its own
+        for name in ("expf", "logf", "log1pf", "erfcf"):  # kernel.c has functions of its own for these
             code = code.replace(f"{name}(", f"{name[:-1]}_(")
         text = text.replace(place, code)
     sizes = {"FEATURES": features, "WIDTH": width, "DEPTH": depth, "MOMENTS": len(MOMENTS)}
@@ -131,7 +164,23 @@ def source(part: str, features: int, width: int, depth: int) -> str:
 
 @lru_cache(maxsize=8)
 def compiled(part: str, features: int, width: int, depth: int) -> Callable:
-    """The C function; kept in the user's cache by what it was made of."""
+    """Return the C function of `part`, compiled once and kept in the user's cache.
+
+    The library's name holds a hash of source, flags, compiler version and processor.
+
+    Args:
+        part: "diffuse" or "specular".
+        features: Number of the network's inputs.
+        width: Number of units of a hidden layer.
+        depth: Number of hidden layers.
+
+    Returns:
+        The function `response` of kernel.c.
+
+    Raises:
+        OSError: If the compiler cannot be started or the library cannot be loaded.
+        subprocess.SubprocessError: If the compiler fails.
+    """
     compiler = shlex.split(os.environ.get("CC", "cc"))
     text = source(part, features, width, depth)
     version = subprocess.run([*compiler, "--version"], capture_output=True, text=True, check=True).stdout
@@ -153,7 +202,7 @@ def compiled(part: str, features: int, width: int, depth: int) -> Callable:
 
 
 def _machine() -> str:
-    """What -march=native depends on."""
+    """Describe the processor as far as -march=native depends on it."""
     try:
         lines = Path("/proc/cpuinfo").read_text().splitlines()
         return next(line for line in lines if line.startswith(("flags", "Features")))
@@ -162,7 +211,13 @@ def _machine() -> str:
 
 
 def fused(part: str, layers: Layers) -> Fused | None:
-    """The compiled network, or None, with a message, where there is no compiler; InputError where it fails."""
+    """Return the compiled network, or None if FACTORLIB_FUSED=0, if there is no compiler, or if the sizes do not fit.
+
+    Sizes fit if the numbers of features and of units are multiples of 4. A missing compiler is logged.
+
+    Raises:
+        InputError: If the compiler fails.
+    """
     if os.environ.get("FACTORLIB_FUSED") == "0" or layers.weights[0].shape[0] % 4 or layers.weights[0].shape[1] % 4:
         return None
     if shutil.which(shlex.split(os.environ.get("CC", "cc"))[0]) is None:
@@ -171,7 +226,7 @@ def fused(part: str, layers: Layers) -> Fused | None:
     try:
         return Fused(part, layers)
     except (OSError, subprocess.SubprocessError) as error:
-        # not torch instead: which form runs is in the keys of steps, and nothing there knows that this one failed
+        # no fallback to torch: the keys of steps hold the form that runs, and cannot tell that it failed
         said = " ".join((getattr(error, "stderr", None) or str(error)).split())
         cure = "mend the compiler, name another (CC=gcc), or take torch, about ten times slower: FACTORLIB_FUSED=0"
         raise InputError(

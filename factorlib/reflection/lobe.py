@@ -14,7 +14,7 @@ from torch import Tensor
 
 
 def lobe_integral(sharpness: Tensor) -> Tensor:
-    """∫ exp(λ(ω·z − 1)) dω over the sphere, steradians.
+    """Return ∫ exp(λ(ω·z − 1)) dω over the sphere, in steradians.
 
     >>> round(float(lobe_integral(torch.tensor(1e-9))) / math.pi, 5)
     4.0
@@ -23,7 +23,10 @@ def lobe_integral(sharpness: Tensor) -> Tensor:
 
 
 def gaussian_sharpness(sharpness: Tensor) -> Tensor:
-    """λ / (1 − e^{−2λ}): the sharpness of the plane Gaussian of the lobe's integral and peak; ½ at λ = 0."""
+    """Return λ' = λ / (1 − e^{−2λ}), the sharpness of the plane Gaussian with the lobe's integral and peak.
+
+    It is ½ at λ = 0.
+    """
     small = sharpness < 1e-2
     safe = torch.where(small, torch.ones_like(sharpness), sharpness)
     series = 0.5 + sharpness / 2 + sharpness**2 / 6
@@ -31,7 +34,7 @@ def gaussian_sharpness(sharpness: Tensor) -> Tensor:
 
 
 def lobe_moments(sharpness: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Mean t̄, variance along z, variance in each direction across."""
+    """Return the mean t̄, the variance v∥ along z, and the variance v⊥ in each direction across."""
     small = sharpness < 0.5
     safe = torch.where(small, torch.ones_like(sharpness), sharpness)
     x = torch.where(small, sharpness, torch.zeros_like(sharpness))

@@ -1,4 +1,4 @@
-"""The interface of every reflection operator."""
+"""Interface of every reflection operator."""
 
 from __future__ import annotations
 
@@ -11,11 +11,11 @@ from torch import Tensor
 
 Name = Literal["reference", "closed_form", "network", "paper_network"]
 NAMES = get_args(Name)
-MOST = 1.0  # what a unit lobe reflects at most: its radiance is nowhere above 1, nor the albedo
+MOST = 1.0  # greatest reflection of a unit lobe: its radiance is at most 1, and so is the albedo
 PerLobe = Float[Tensor, "*p"]
 PerPoint = Float[Tensor, "*n"]
 PerPair = Float[Tensor, "n p"]
-CHUNK = 1 << 14  # evaluations whose intermediate results are in memory at once
+CHUNK = 1 << 14  # number of evaluations whose intermediate results are in memory at once
 
 
 class LobesLike(Protocol):
@@ -27,7 +27,7 @@ class LobesLike(Protocol):
 
 
 class MaterialLike(Protocol):
-    """A reflectance: diffuse k_d [3], specular k_s [3], roughness [] with α = roughness²."""
+    """Reflectance of a material: diffuse k_d [3], specular k_s [3], roughness [] with α = roughness²."""
 
     diffuse: Any
     specular: Any
@@ -49,31 +49,54 @@ class Response(msgspec.Struct, frozen=True):
 
 
 class Operator:
-    """R(lobe | material) for lobes exp(λ(ω·z − 1)).
+    """Reflection R(lobe | material) of lobes exp(λ(ω·z − 1)).
 
-    A subclass gives `diffuse` and `specular`, elementwise functions that torch can differentiate; a faster
-    `response` where there is one.
+    A subclass implements `diffuse` and `specular`, elementwise functions that torch can differentiate. It may override
+    `response` by a faster one.
     """
 
     def __init__(self, dtype: torch.dtype = torch.float32):
         self.dtype = dtype
 
     def diffuse(self, sharpness: PerLobe, nz: PerPair) -> PerPair:
-        """(1/π) ∫ exp(λ(i·z − 1)) max(n·i, 0) di."""
+        """Return (1/π) ∫ exp(λ(i·z − 1)) max(n·i, 0) di."""
         raise NotImplementedError
 
     def specular(self, roughness: Tensor, sharpness: PerLobe, no: PerPoint, nz: PerPair, oz: PerPair) -> PerPair:
-        """∫ exp(λ(i·z − 1)) D G / (4 n·o) di over the upper hemisphere, α = roughness²; every input may be [n, p] as well."""
+        """Return ∫ exp(λ(i·z − 1)) D G / (4 n·o) di over the upper hemisphere.
+
+        Args:
+            roughness: Roughness √α, [] or [n, p].
+            sharpness: Sharpness λ, [p] or [n, p].
+            no: Cosine n·o, [n] or [n, p].
+            nz: Cosine n·z, [n, p].
+            oz: Cosine o·z, [n, p].
+
+        Returns:
+            Reflection for k_s = 1, [n, p].
+        """
         raise NotImplementedError
 
     def response(self, roughness: Tensor, sharpness: PerLobe, no: PerPoint, nz: PerPair, oz: PerPair) -> Response:
-        """Values and derivatives together; nothing is left on torch's graph."""
+        """Return values and derivatives together.
+
+        Args:
+            roughness: Roughness √α of the material, [].
+            sharpness: Sharpness λ, [p].
+            no: Cosine n·o, [n].
+            nz: Cosine n·z, [n, p].
+            oz: Cosine o·z, [n, p].
+
+        Returns:
+            Values and derivatives, [n, p] each, detached from torch's graph.
+        """
         rows = max(1, CHUNK // max(nz.shape[1], 1))
         chunks = zip(no.split(rows), nz.split(rows), oz.split(rows), strict=True)
         parts = [self._response(roughness, sharpness, *chunk) for chunk in chunks]
         return Response(*(torch.cat([getattr(part, field) for part in parts]) for field in Response.__struct_fields__))
 
     def _response(self, roughness: Tensor, sharpness: Tensor, no: Tensor, nz: Tensor, oz: Tensor) -> Response:
+        """Compute `response` of one chunk by automatic differentiation."""
         with torch.enable_grad():
             given = (roughness, sharpness.log(), columns(no), nz, oz)
             r, log_sharpness, views, nz, oz = (t.detach().expand(nz.shape).clone().requires_grad_() for t in given)
@@ -86,9 +109,18 @@ class Operator:
     def __call__(
         self, lobes: LobesLike, material: MaterialLike, normals: Float[Tensor, "n 3"], views: Float[Tensor, "n 3"]
     ) -> Float[Tensor, "n 3"]:
-        """Radiance toward the viewer, in the units of the lobes' weights; differentiable in everything.
+        """Return the radiance toward the viewer in the units of the lobes' weights, differentiable in every input.
 
-        normals, views: unit, any common frame; surfaces that face away reflect nothing; NaN anywhere is NaN in what depends on it
+        Surfaces that face away reflect nothing. A NaN in the input gives NaN in all results that depend on it.
+
+        Args:
+            lobes: The light.
+            material: The reflectance of all points.
+            normals: Unit normals in any frame that is common to lobes, normals and views.
+            views: Unit directions from the points to the viewer.
+
+        Returns:
+            Radiance of each point, RGB.
         """
         given = lobes.axis, lobes.sharpness, lobes.weight, material.diffuse, material.specular, material.roughness
         tensors = (torch.as_tensor(t).to(self.dtype) for t in (*given, normals, views))
@@ -96,9 +128,9 @@ class Operator:
         no, nz, oz = (normals * views).sum(-1), normals @ axis.T, views @ axis.T
         diffuse, specular = self.diffuse(sharpness, nz), self.specular(roughness, sharpness, no, nz, oz)
         radiance = kd * (diffuse @ weight) + ks * (specular @ weight)
-        return torch.where(no[:, None] <= 0, torch.zeros_like(radiance), radiance)  # so that NaN is not zero
+        return torch.where(no[:, None] <= 0, torch.zeros_like(radiance), radiance)  # NaN passes: it is not ≤ 0
 
 
 def columns(no: Tensor) -> Tensor:
-    """n·o as it meets the lobes: [n, 1], or [n, p] as it is."""
+    """Return n·o in a shape that broadcasts over the lobes: [n] becomes [n, 1], [n, p] is left as it is."""
     return no if no.ndim == 2 else no[:, None]

@@ -1,1 +1,1 @@
-"""Pictures of the result: photos synthesised again, balls and reflectance maps of any material in any light."""
+"""Renderings of a solution: photos re-rendered, balls and reflectance maps of any material in any light."""

@@ -1,7 +1,8 @@
-"""The pictures of a recipe, as files: the photos' objects from another side, in other light, of other material, with a further object.
+"""Rendering of recipes to files: other views, other light, other materials, and inserted objects.
 
-For each photo <photo>.png (8-bit sRGB) and <photo>.exr (linear), or <photo>/<light>.…, an animation <photo>.gif with its frames
-<photo>/000.png …, or one grid.png; and <photo>.json, what is to be said beside the picture, where there is something.
+A photo gets <photo>.png (8-bit sRGB) and <photo>.exr (linear), or one pair per light as <photo>/<light>.png and .exr.
+An animation is <photo>.gif with its frames <photo>/000.png and so on.  A grid is one grid.png. <photo>.json holds the
+caption of the picture and other facts about it, if there are any.
 """
 
 import logging
@@ -42,10 +43,21 @@ DENOISED = "Denoised by {denoiser}, from {recipe.samples} samples a pixel."
 
 
 def draw(recipe: AnyRecipe, results: SolvedSet, out: Path, progress: Progress) -> None:
-    """Write the pictures of one recipe into the folder `out`; raises InputError where none of its photos can be drawn."""
+    """Write the pictures of one recipe into a folder.
+
+    Args:
+        recipe: the recipe to render
+        results: the solved data set
+        out: the folder to write to
+        progress: receives the number of photos done and their total
+
+    Raises:
+        InputError: None of the recipe's photos can be rendered, or one that the recipe names cannot.
+    """
     if isinstance(recipe, schema.Grid):
         return write_grid(recipe, results, out, progress)
-    photos, refusals = recipe.photos or results.photos, []
+    photos = recipe.photos or results.photos
+    refusals = []
     for done, photo in enumerate(photos):
         try:
             report = partial(_report, progress, done, len(photos), photo)
@@ -62,7 +74,8 @@ def draw(recipe: AnyRecipe, results: SolvedSet, out: Path, progress: Progress) -
         except InputError as error:
             if recipe.photos:
                 raise
-            log.warning("%s: left out: %s", photo, error.found)  # nobody named it
+            # The recipe names no photos: a photo that cannot be drawn is skipped.
+            log.warning("%s: left out: %s", photo, error.found)
             refusals.append(error)
     if len(refusals) == len(photos):
         raise refusals[0]
@@ -70,7 +83,7 @@ def draw(recipe: AnyRecipe, results: SolvedSet, out: Path, progress: Progress) -
 
 
 def _report(progress: Progress, done: int, total: int, photo: str, share: float) -> None:
-    """Say how much of one photo's pictures is done."""
+    """Report the progress within one photo; `share`, in [0, 1], is the part of it that is done."""
     progress(done + share, total, photo)
 
 
@@ -80,11 +93,20 @@ Report = Callable[[float], None]
 def resynthesis(
     recipe: schema.Resynthesis | schema.Transfer, results: SolvedSet, photo: str, out: Path, report: Report
 ) -> None:
-    """Path-traced objects, of other materials where the recipe says so, over the photo's background."""
+    """Write a photo with its objects path-traced over it, with other materials if the recipe replaces some.
+
+    Args:
+        recipe: the recipe to render
+        results: the solved data set
+        photo: name of the photo
+        out: the folder to write to
+        report: receives the share that is done, in [0, 1]
+    """
     report(0)
     scene = results.scene(photo, recipe.sun, recipe.denoise)
     if isinstance(recipe, schema.Transfer):
-        known, other = results.known(recipe.table), recipe.materials
+        known = results.known(recipe.table)
+        other = recipe.materials
         materials = {name: known[other[name]] if name in other else own for name, own in scene.materials.items()}
         worn = {each.materials[label - 1] for each in scene.objects for label in each.mesh.labels}
         if recipe.photos and not worn & other.keys():
@@ -96,28 +118,47 @@ def resynthesis(
 
 
 def standing(recipe: schema.Insert, results: SolvedSet, photo: str) -> Standing:
-    """Where the new object of a recipe stands in a photo; raises InputError where it has no place that the photo shows."""
+    """Place the new object of a recipe on the ground of a photo.
+
+    Args:
+        recipe: the recipe to render
+        results: the solved data set
+        photo: name of the photo
+
+    Returns:
+        The scene with the new object's materials, the ground, and the object's pose.
+
+    Raises:
+        InputError: The photo shows no place for the object, or the assumed sun stands below the ground.
+    """
     scene = results.scene(photo, recipe.sun, recipe.denoise)
     neighbour = next((each for each in scene.objects if each.name == recipe.beside), scene.objects[0])
-    given, polish = recipe.ground, None
+    given = recipe.ground
+    polish = None
     if any(given.specular):
         polish = Reflectance((0.0,) * 3, given.specular, given.roughness)
     ground = msgspec.structs.replace(results.ground(photo, neighbour), polish=polish)
     if not ground.plane.seen_from_above:
-        fault = f"photo '{photo}' was taken from below the plane that '{neighbour.name}' stands on, so that no shadow on it can be seen"
+        fault = (
+            f"photo '{photo}' was taken from below the plane that '{neighbour.name}' stands on, "
+            "so that no shadow on it can be seen"
+        )
         raise InputError(fault, key="photos", cure="name other photos, or give the photo's `ground` in dataset.yaml")
     if recipe.sun is not None and results.sun_axis(photo, recipe.sun) @ YUP_FROM_CAMERA @ ground.plane.normal <= 0:
         fault = "the sun stands below the ground of the photo"
         raise InputError(fault, key="sun.direction", cure="y of the direction points upward in the photo")
-    own = {f"{NEW}{name}": material for name, material in results.known(recipe.table).items()}  # the new object's
+    # materials of the new object, under names of their own
+    own = {f"{NEW}{name}": material for name, material in results.known(recipe.table).items()}
     mesh, names, up = results.mesh(recipe.mesh, recipe.material, recipe.up)
     if recipe.at is not None:
         spot = spot_at(scene, ground.plane, neighbour, results.pixel(photo, recipe.at), recipe.size)
     else:
+        # extent along the upright axis, and diameter about it
         tall = np.ptp(mesh.vertices @ up)
         wide = 2 * float(np.linalg.norm(np.cross(mesh.vertices - mesh.centre, up), axis=1).max())
         spot = spot_beside(scene, ground.plane, neighbour, recipe.size, wide / tall)
-    labels, factor = tuple(f"{NEW}{name}" for name in names), results.poses[photo].camera.factor
+    labels = tuple(f"{NEW}{name}" for name in names)
+    factor = results.poses[photo].camera.factor
     stand = partial(stood, NEW, mesh, labels, up, recipe.turn)
     new, found, moved = stood_free(scene, stand, spot, recipe.at is not None, factor)
     scene = msgspec.structs.replace(scene, materials={**scene.materials, **own})
@@ -125,12 +166,24 @@ def standing(recipe: schema.Insert, results: SolvedSet, photo: str) -> Standing:
 
 
 def insertion(recipe: schema.Insert, results: SolvedSet, photo: str, out: Path, report: Report) -> dict[str, Any]:
-    """A further object on the ground of one that is there; returns what is said beside the picture."""
+    """Write a photo with a further object inserted on the ground of an existing one.
+
+    Args:
+        recipe: the recipe to render
+        results: the solved data set
+        photo: name of the photo
+        out: the folder to write to
+        report: receives the share that is done, in [0, 1]
+
+    Returns:
+        The facts that accompany the picture: place in pixels, displacement in object heights, shadow match, caption.
+    """
     there = standing(recipe, results, photo)
     if there.moved:
         log.warning("%s: %s", photo, there.moved)
     seen = results.straightened(photo), results.covered(photo)
     found = inserted(there, *seen, recipe.samples, lambda done: report(done / STEPS))
+    # Pixels that the new object does not change keep the photo's values exactly.
     same = (found.coverage[..., None] == 0) & (found.shadow == 1) & (there.ground.polish is None)
     _write(out / photo, np.where(same, results.photo(photo), results.tone(photo)(found.composite)))
     at = results.poses[photo].camera.factor * there.scene.camera.project(there.found.point @ YUP_FROM_CAMERA)
@@ -149,9 +202,20 @@ def insertion(recipe: schema.Insert, results: SolvedSet, photo: str, out: Path, 
 def staged(
     recipe: schema.Backdropped, results: SolvedSet, photo: str, scene: PhotoScene, azimuth: float, *higher: float
 ) -> Float[np.ndarray, "h w 4"]:
-    """The objects from another side, before the light or nothing, and on a floor, about whose normal the camera then goes, where the recipe asks for one.
+    """Render the objects from another view, before the light or a transparent background, on a floor if asked.
 
-    azimuth, higher: as of `orbit`
+    The camera moves about the normal of the floor, or about the upright axis if there is no floor.
+
+    Args:
+        recipe: background, floor and samples of the picture
+        results: the solved data set
+        photo: name of the photo
+        scene: the photo's scene
+        azimuth: see `orbit`; degrees
+        *higher: elevation in degrees and zoom, see `orbit`
+
+    Returns:
+        Linear radiance times coverage, and coverage.
     """
     lit = recipe.background == "light"
     if recipe.floor is None:
@@ -164,7 +228,15 @@ def staged(
 
 
 def view(recipe: schema.View, results: SolvedSet, photo: str, out: Path, report: Report) -> None:
-    """The objects alone, from another side."""
+    """Write the objects alone, from another view.
+
+    Args:
+        recipe: the recipe to render
+        results: the solved data set
+        photo: name of the photo
+        out: the folder to write to
+        report: receives the share that is done, in [0, 1]
+    """
     report(0)
     scene = resized(results.scene(photo, recipe.sun, recipe.denoise), recipe.width)
     traced = staged(recipe, results, photo, scene, recipe.azimuth, recipe.elevation, recipe.zoom)
@@ -174,8 +246,19 @@ def view(recipe: schema.View, results: SolvedSet, photo: str, out: Path, report:
 def animation(
     recipe: schema.Turntable | schema.MovingLight, results: SolvedSet, photo: str, out: Path, report: Report
 ) -> None:
-    """The camera or the light turns once: every frame as a PNG, and all as a GIF and, where PyAV is there, an MP4, on white."""
-    scene, pixels = resized(results.scene(photo, recipe.sun, recipe.denoise), recipe.width), []
+    """Write an animation in which the camera or the light turns once.
+
+    Each frame is a PNG.  All frames are a GIF on white and, if PyAV is installed, an MP4 on white.
+
+    Args:
+        recipe: the recipe to render
+        results: the solved data set
+        photo: name of the photo
+        out: the folder to write to
+        report: receives the share that is done, in [0, 1]
+    """
+    scene = resized(results.scene(photo, recipe.sun, recipe.denoise), recipe.width)
+    pixels = []
     for k in range(recipe.frames):
         report(k / recipe.frames)
         degrees = 360 * k / recipe.frames
@@ -193,7 +276,17 @@ def animation(
 
 
 def relight(recipe: schema.Relight, results: SolvedSet, photo: str, out: Path, report: Report) -> None:
-    """Draw the objects in other photos' lights, or those of files: shown as the light's own photo would be, or exposed for the objects."""
+    """Write the objects in the lights of other photos or of files.
+
+    The light of a photo comes with that photo's tone curve.  The light of a file is exposed for the objects.
+
+    Args:
+        recipe: the recipe to render
+        results: the solved data set
+        photo: name of the photo
+        out: the folder to write to
+        report: receives the share that is done, in [0, 1]
+    """
     scene = resized(results.scene(photo, denoise=recipe.denoise), recipe.width)
     lights = recipe.lights or [name for name in results.photos if name != photo]
     for k, name in enumerate(lights):
@@ -216,12 +309,21 @@ DRAWN = {
 
 
 def write_grid(recipe: schema.Grid, results: SolvedSet, out: Path, progress: Progress) -> None:
-    """Balls of materials (rows) in lights (columns), each column exposed for all its balls."""
+    """Write balls of materials (rows) in lights (columns), each column at one exposure.
+
+    Args:
+        recipe: the recipe to render
+        results: the solved data set
+        out: the folder to write to
+        progress: receives the number of balls done and their total
+    """
     materials = recipe.materials or results.names
     lights = recipe.lights or results.photos
-    columns, total = [], len(materials) * len(lights)
+    columns = []
+    total = len(materials) * len(lights)
     for k, name in enumerate(lights):
-        light, balls = results.light(name), []
+        light = results.light(name)
+        balls = []
         for j, material in enumerate(materials):
             progress(k * len(materials) + j, total, f"{material}, {name}")
             balls.append(lit_ball(light, results.materials[material], recipe.size, recipe.samples, recipe.denoise))
@@ -233,14 +335,14 @@ def write_grid(recipe: schema.Grid, results: SolvedSet, out: Path, progress: Pro
 
 
 def _write(stem: Path, radiance: np.ndarray) -> None:
-    """At the photo's own exposure."""
+    """Write an opaque picture as EXR and PNG, at the photo's own exposure."""
     stem.parent.mkdir(parents=True, exist_ok=True)
     write_rgb_exr(stem.with_name(stem.name + ".exr"), radiance)
     write_png(stem.with_name(stem.name + ".png"), picture(radiance, 1.0))
 
 
 def _write_alone(stem: Path, traced: Traced) -> None:
-    """Objects without a background: transparent beside them."""
+    """Write objects as EXR and PNG, transparent outside them."""
     stem.parent.mkdir(parents=True, exist_ok=True)
     traced.to_exr(stem.with_name(stem.name + ".exr"))
     traced.to_png(stem.with_name(stem.name + ".png"))

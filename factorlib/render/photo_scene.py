@@ -1,8 +1,8 @@
-"""A photo's objects, camera and light as a scene that is path-traced: as it was, from another side, or in other light.
+"""Path-traced scenes of a photo's objects, camera and light, for the same view, another view, or another light.
 
-World    the y-up turn of the photo's camera: x right, y up, z toward the viewer, camera at the origin.
-Light    infinitely far, given in the photo's camera axes (lobes) or in the world (a lat-long map).
-Upright  the camera's own y.
+World    The photo's camera frame turned y-up: x right, y up, z toward the viewer, camera at the origin.
+Light    Infinitely far, given in the photo's camera axes (lobes) or in the world (a lat-long map).
+Upright  The camera's own y.
 """
 
 from collections.abc import Mapping, Sequence
@@ -25,15 +25,21 @@ from factorlib.tracing.denoise import denoised
 from factorlib.tracing.scene import bsdf, envmap, envmap_of_nodes, paint, rendered, rgb, rigid, sensor, shape
 
 UP = np.array([0.0, 1.0, 0.0])
-NEAR = 1e-3  # of the objects' distance
-FAR = 3e3  # of a scene's size: where suns stand
-LOBE_ROWS, MAP_ROWS = 256, 1024  # of the lattice that Mitsuba is handed of lobes, and of a map
+NEAR = 1e-3  # near clipping distance, in distances of the objects
+FAR = 3e3  # distance of suns, in sizes of the scene
+LOBE_ROWS = 256  # rows of Mitsuba's map of lobes
+MAP_ROWS = 1024  # rows of Mitsuba's map of a lat-long map
 
 Light = Lobes | Float[np.ndarray, "h w 3"]
 
 
 class Placed(msgspec.Struct, frozen=True):
-    """A mesh and where it stands.  materials: by label, from 1;  world_from_object: a similarity"""
+    """A mesh and its pose in the world.
+
+    Attributes:
+        materials: names by label, from 1
+        world_from_object: a similarity
+    """
 
     name: str
     mesh: Mesh
@@ -42,12 +48,17 @@ class Placed(msgspec.Struct, frozen=True):
 
     @property
     def vertices(self) -> Float[np.ndarray, "v 3"]:
-        """The vertices in the world."""
+        """The vertices in the world frame."""
         return self.mesh.vertices @ self.world_from_object[:3, :3].T + self.world_from_object[:3, 3]
 
 
 class PhotoScene(msgspec.Struct, frozen=True):
-    """max_depth: ALL_BOUNCES or DIRECT, as the light was solved for;  denoise: pictures of it are denoised"""
+    """Camera, objects, light and materials of one photo.
+
+    Attributes:
+        max_depth: ALL_BOUNCES or DIRECT, as in the solve
+        denoise: True if renderings of the scene are denoised
+    """
 
     camera: Camera
     objects: tuple[Placed, ...]
@@ -58,26 +69,33 @@ class PhotoScene(msgspec.Struct, frozen=True):
 
     @property
     def middle(self) -> Float[np.ndarray, "3"]:
-        """The middle of the box about all objects."""
+        """The centre of the bounding box of all objects."""
         points = np.concatenate([each.vertices for each in self.objects])
         return (points.min(axis=0) + points.max(axis=0)) / 2
 
     @property
     def size(self) -> float:
-        """How far away the objects are."""
+        """The distance from the camera to the middle of the objects."""
         return float(np.linalg.norm(self.middle))
 
     @property
     def near(self) -> float:
-        """The distance from which on things are seen."""
+        """The near clipping distance of the camera."""
         return NEAR * self.size
 
 
 def with_sun(light: Lobes, axis: Float[np.ndarray, "3"], diameter_deg: float, share: float) -> Lobes:
-    """The light with a sun that holds `share` of its energy, in place of the suns it has; each channel keeps its energy.
+    """Return the light with its suns replaced by one that holds `share` of its energy.
 
-    A channel in which the light has nothing but suns gives all its energy to the sun.
+    Each channel keeps its energy.  If a channel has no energy outside its suns, all of it goes to the new sun.
+
+    Args:
+        light: the light, with or without suns
+        axis: unit direction to the sun, in the light's frame
+        diameter_deg: angular diameter of the sun, degrees
+        share: the sun's share of the energy, in [0, 1]
     """
+    # `factor` scales the rest of the light; the sun takes the energy that is left
     rest = light.take(~light.suns)
     factor = np.divide((1 - share) * light.energy, rest.energy, out=np.zeros(3), where=rest.energy > 0)
     sharpness = np.append(rest.sharpness, 4 / np.radians(diameter_deg / 2) ** 2)
@@ -86,17 +104,22 @@ def with_sun(light: Lobes, axis: Float[np.ndarray, "3"], diameter_deg: float, sh
 
 
 def light_entries(light: Light, size: float) -> dict[str, Any]:
-    """The light as Mitsuba's `envmap`; lobes too narrow for one are discs in the sky, far beyond a scene of that size."""
+    """Return the light as Mitsuba's `envmap`, with lobes too narrow for one as spheres far beyond the scene.
+
+    `size` is the size of the scene, as in `PhotoScene.size`.
+    """
     if not isinstance(light, Lobes):
         return {"light": envmap(light, finer=max(1, MAP_ROWS // len(light)))}
+    # lobes narrower than Mitsuba's lattice can hold become spheres far away
     narrow = light.sharpness * NARROWEST * (np.pi / (LOBE_ROWS - 1)) ** 2 > 1
     entries = {"light": envmap_of_nodes(mitsuba_map(light.take(~narrow), LOBE_ROWS, 2 * LOBE_ROWS))}
-    few, far = light.take(narrow), FAR * size
+    few = light.take(narrow)
+    far = FAR * size
     energies = few.weight * lobe_integral(few.sharpness)[:, None]
     for k, (axis, sharpness, energy) in enumerate(
         zip(few.axis @ YUP_FROM_CAMERA, few.sharpness, energies, strict=True)
     ):
-        radius = 2 / np.sqrt(sharpness)  # of a disc as wide (RMS) as the lobe
+        radius = 2 / np.sqrt(sharpness)  # angular radius of a disc of the lobe's RMS width
         emitter = {"type": "area", "radiance": rgb(energy / (2 * np.pi * (1 - np.cos(radius))))}
         place = {"center": (far * axis).tolist(), "radius": float(far * np.sin(radius))}
         entries[f"sun {k}"] = {"type": "sphere", **place, "emitter": emitter}
@@ -106,7 +129,13 @@ def light_entries(light: Light, size: float) -> dict[str, Any]:
 def shapes(
     objects: Sequence[Placed], materials: Mapping[str, Reflectance], black: Sequence[str] = ()
 ) -> dict[str, Any]:
-    """A shape for each material of each object; objects named in `black` reflect nothing."""
+    """Return a Mitsuba shape for each material of each object.
+
+    Args:
+        objects: the objects
+        materials: reflectances by name
+        black: names of objects that reflect nothing
+    """
     found = {}
     for each in objects:
         for label in each.mesh.labels:
@@ -128,10 +157,18 @@ def traced_photo(
     beside: Mapping[str, Any] = {},
     max_depth: int | None = None,
 ) -> Float[np.ndarray, "h w 4"]:
-    """Linear radiance times coverage, and coverage: the share of a pixel that objects (or the light, where it is seen) fill.
+    """Render the scene by path tracing.
 
-    world_from_camera: of OpenCV's camera axes; without it the photo's own;  beside: further entries of the scene, for Mitsuba;  max_depth: instead of
-    the scene's
+    Args:
+        scene: the scene
+        samples: samples per pixel
+        world_from_camera: pose of the camera, in OpenCV's axes; by default the photo's own
+        with_light: show the light behind the objects
+        beside: further entries of the scene, for Mitsuba
+        max_depth: replaces the scene's own
+
+    Returns:
+        Linear radiance times coverage, and coverage: the share of a pixel that objects, or the visible light, fill.
     """
     own = rigid(YUP_FROM_CAMERA, np.zeros(3)) if world_from_camera is None else world_from_camera
     entries = {**light_entries(scene.light, scene.size), **shapes(scene.objects, scene.materials), **beside}
@@ -146,7 +183,19 @@ def traced_photo(
 def lit_ball(
     light: Light, material: Reflectance, size: int, samples: int, denoise: bool = False
 ) -> Float[np.ndarray, "h w 4"]:
-    """A ball of a material that fills the picture, seen from the front in a light: radiance and coverage."""
+    """Render a ball that fills the picture, seen from the front.
+
+    Args:
+        light: the light
+        material: the ball's reflectance
+        size: width and height of the picture, in pixels
+        samples: samples per pixel
+        denoise: denoise the picture
+
+    Returns:
+        Linear radiance times coverage, and coverage.
+    """
+    # the ball, of radius 1, touches the border of the picture
     distance = 20.0
     focal = size / 2 * np.sqrt(distance**2 - 1)
     camera = Camera(size, size, focal, (size / 2, size / 2))
@@ -158,7 +207,7 @@ def lit_ball(
 
 
 def resized(scene: PhotoScene, width: int | None) -> PhotoScene:
-    """The scene as a camera of another number of pixels sees it."""
+    """Return the scene with a camera of another width in pixels and the same field of view."""
     if width is None:
         return scene
     pixel = scene.camera.width / width
@@ -173,21 +222,27 @@ def orbit(
     zoom: float = 1.0,
     up: Float[np.ndarray, "3"] = UP,
 ) -> Float[np.ndarray, "4 4"]:
-    """world_from_camera of the photo's camera moved about the objects' middle.
+    """Return world_from_camera of the photo's camera moved about the middle of the objects.
 
-    azimuth_deg: to the right, about `up`;  elevation_deg: upward;  zoom: of the size in the picture, by distance
+    Args:
+        scene: the scene
+        azimuth_deg: angle to the right, about `up`; degrees
+        elevation_deg: angle upward; degrees
+        zoom: magnification, by a shorter distance
+        up: unit axis of the azimuth, in the world
     """
     middle = scene.middle
     right = np.cross(up, -middle)
     right /= np.linalg.norm(right)
+    # rotation about the middle; the distance is divided by the zoom
     turn = rotation_of_vector(np.radians(azimuth_deg) * up) @ rotation_of_vector(-np.radians(elevation_deg) * right)
     return rigid(turn @ YUP_FROM_CAMERA, middle - turn @ middle / zoom)
 
 
 def turned_light(light: Light, angle_deg: float) -> Light:
-    """The light turned about the upright axis of the world; as it is for 0."""
+    """Return the light turned about the upright axis of the world."""
     if angle_deg == 0:
-        return light  # a turned map is a little blurred
+        return light  # resampling would blur a map
     turn = rotation_of_vector(np.radians(angle_deg) * UP)
     if isinstance(light, Lobes):
         return light.turned(YUP_FROM_CAMERA @ turn @ YUP_FROM_CAMERA)

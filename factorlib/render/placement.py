@@ -1,8 +1,9 @@
-"""Where a new object stands: on the ground of a photo, in its picture, and through none of its objects.
+"""Placement of a new object on the ground of a photo, inside the picture and clear of the photo's objects.
 
-Two meshes intersect where an edge of one crosses a triangle of the other, or where one lies within the other.  A new object that would
-intersect one of the photo's is moved along the ground to the nearest place where it does not and where at least half of it is seen: the
-places are those of a lattice on the ground, a tenth of its height apart, and where there is none within eight heights, of a coarser one.
+Two meshes intersect if an edge of one crosses a triangle of the other, or if one lies within the other.  A new object
+that would intersect an existing one moves along the ground.  It moves to the nearest place where it is free and at
+least half of it is visible.  Candidate places form a lattice on the ground with a spacing of a tenth of the object's
+height. If none within eight heights is free, a coarser lattice follows.
 """
 
 from collections.abc import Callable, Iterator
@@ -23,18 +24,16 @@ from factorlib.meshes.mesh import Mesh
 from factorlib.render.ground import Plane, height_over
 from factorlib.render.photo_scene import PhotoScene, Placed
 
-RADIUS = 8.0  # how far from the new object the ground is known, in its heights
-GAP = 0.15  # between the objects, in heights of the new one
-STEP, COARSER = (
-    0.1,
-    8,
-)  # between places that are tried, in heights; where there is none within `RADIUS`, steps and radius are so many times that
-ENOUGH = 500  # vertices, by which it is judged where the new object is seen
-SEEN = 0.5  # share of the new object's vertices that are in the picture and that nothing hides, at least, where it is moved to
+RADIUS = 8.0  # radius of the ground about the new object, in its heights
+GAP = 0.15  # gap between the objects, in heights of the new one
+STEP = 0.1  # spacing of candidate places, in heights
+COARSER = 8  # factor on spacing and radius if the first lattice has no free place
+ENOUGH = 500  # vertices of the new object that are tested for visibility
+SEEN = 0.5  # least share of the new object's vertices that are visible at the place it is moved to
 
 
 class Spot(msgspec.Struct, frozen=True):
-    """Where a new object stands on the ground, in the world, and how high it is."""
+    """Place of a new object on the ground, in the world, and its height."""
 
     plane: Plane
     point: Float[np.ndarray, "3"]
@@ -42,10 +41,16 @@ class Spot(msgspec.Struct, frozen=True):
 
 
 def spot_beside(scene: PhotoScene, plane: Plane, neighbour: Placed, relative_height: float, slenderness: float) -> Spot:
-    """Beside an object, on the side with more room in the picture.
+    """Return the place beside an object, on the side with more room in the picture.
 
-    relative_height: of the new object, to the neighbour's;  slenderness: its width over its height
+    Args:
+        scene: the photo's scene
+        plane: the ground
+        neighbour: the object to stand beside
+        relative_height: height of the new object over the neighbour's
+        slenderness: width of the new object over its height
     """
+    # candidates on both sides of the neighbour, along the picture's x axis in the plane
     height = relative_height * height_over(plane, neighbour)
     right = np.array([1.0, 0.0, 0.0]) - plane.normal[0] * plane.normal
     right /= np.linalg.norm(right)
@@ -57,8 +62,9 @@ def spot_beside(scene: PhotoScene, plane: Plane, neighbour: Placed, relative_hei
     others = [each for each in scene.objects if each is not neighbour]
 
     def room(point: Float[np.ndarray, "3"]) -> float:
-        """Pixels to the picture's border, or to another object's middle, whichever is less."""
-        (x, y), width = scene.camera.project(point @ YUP_FROM_CAMERA), scene.camera.width
+        """Return the distance in pixels to the picture's border or to another object's middle, whichever is less."""
+        x, y = scene.camera.project(point @ YUP_FROM_CAMERA)
+        width = scene.camera.width
         middles = [each.vertices.mean(axis=0) @ YUP_FROM_CAMERA for each in others]
         taken = [abs(scene.camera.project(middle)[0] - x) for middle in middles]
         return min([x, width - x, scene.camera.height - y, *taken])
@@ -69,7 +75,18 @@ def spot_beside(scene: PhotoScene, plane: Plane, neighbour: Placed, relative_hei
 def spot_at(
     scene: PhotoScene, plane: Plane, neighbour: Placed, pixel: tuple[float, float], relative_height: float
 ) -> Spot:
-    """Return where the photo's `pixel` shows the ground; InputError where it does not."""
+    """Return the place on the ground that a pixel shows.
+
+    Args:
+        scene: the photo's scene
+        plane: the ground
+        neighbour: the object whose height is the reference
+        pixel: position in the scene's camera, in pixels
+        relative_height: height of the new object over the neighbour's
+
+    Raises:
+        InputError: The pixel lies above the horizon.
+    """
     ray = scene.camera.rays_through(np.array([pixel])) @ YUP_FROM_CAMERA
     point = plane.hit(ray)[0]
     if not np.isfinite(point).all():
@@ -81,7 +98,17 @@ def spot_at(
 def stood(
     name: str, mesh: Mesh, materials: tuple[str, ...], up: Float[np.ndarray, "3"], turn_deg: float, spot: Spot
 ) -> Placed:
-    """A mesh in its own frame, `up` upward there, stood on a spot."""
+    """Return a mesh standing on a spot.
+
+    Args:
+        name: name of the object
+        mesh: the mesh, in its own frame
+        materials: names by label, from 1
+        up: unit upward direction in the mesh's frame
+        turn_deg: angle about the ground's normal, in degrees
+        spot: place and height
+    """
+    # turn `up` onto the normal, then about it; scale to the height; put the lowest point on the spot
     toward = rotation_between(up, spot.plane.normal)
     rotation = rotation_of_vector(np.radians(turn_deg) * spot.plane.normal) @ toward
     vertices = mesh.vertices @ rotation.T
@@ -90,28 +117,32 @@ def stood(
     middle = (vertices.min(axis=0) + vertices.max(axis=0)) / 2
     foot = middle + (along.min() - middle @ spot.plane.normal) * spot.plane.normal
     matrix = np.eye(4)
-    matrix[:3, :3], matrix[:3, 3] = scale * rotation, spot.point - scale * foot
+    matrix[:3, :3] = scale * rotation
+    matrix[:3, 3] = spot.point - scale * foot
     return Placed(name, mesh, materials, matrix)
 
 
 class Solid(Caster):
-    """The mesh of an object in the world, against which others are tested."""
+    """Mesh of an object in the world, for intersection tests against others."""
 
     def __init__(self, placed: Placed):
-        self.name, self.vertices = placed.name, placed.vertices
+        self.name = placed.name
+        self.vertices = placed.vertices
         super().__init__(msgspec.structs.replace(placed.mesh, vertices=self.vertices))
         faces = self.mesh.faces
         edges = np.unique(np.sort(faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2), axis=1), axis=0)
         self.start = self.vertices[edges[:, 0]]
         self.along = self.vertices[edges[:, 1]] - self.start
+        # one vertex of each connected component
         graph = coo_array((np.ones(len(edges)), edges.T), shape=(len(self.vertices),) * 2)
         piece = connected_components(graph, directed=False)[1][faces[:, 0]]
-        self.pieces = self.vertices[faces[np.unique(piece, return_index=True)[1], 0]]  # a vertex of each
+        self.pieces = self.vertices[faces[np.unique(piece, return_index=True)[1], 0]]
         used = self.vertices[np.unique(faces)]
         self.box = used.min(axis=0), used.max(axis=0)
 
     def crossed(self, start: Float[np.ndarray, "n 3"], along: Float[np.ndarray, "n 3"]) -> np.ndarray:
-        """Return which of the segments from `start` to `start + along` cross the surface."""
+        """Return a mask of the segments from `start` to `start + along` that cross the surface."""
+        # Only segments whose boxes meet the mesh's are cast, in units of the mesh's radius.
         low, high = start + np.minimum(along, 0), start + np.maximum(along, 0)
         crossed = ((low <= self.box[1]) & (high >= self.box[0])).all(axis=1)
         rays = np.column_stack([(start[crossed] - self.centre) / self.radius, along[crossed] / self.radius])
@@ -120,12 +151,12 @@ class Solid(Caster):
         return crossed
 
     def holds(self, points: Float[np.ndarray, "n 3"]) -> bool:
-        """Return whether one of the points lies within the mesh; nothing lies within an open one."""
+        """Return True if one of the points lies within the mesh; an open mesh contains nothing."""
         query = o3d.core.Tensor(((points - self.centre) / self.radius).astype(np.float32))
         return not self.mesh.open and bool(self.scene.compute_occupancy(query, nthreads=1, nsamples=3).numpy().any())
 
     def meets(self, other: "Solid", move: Float[np.ndarray, "3"]) -> bool:
-        """Return whether it intersects another when it is moved."""
+        """Return True if the mesh, moved by `move`, intersects another."""
         if (self.box[0] + move > other.box[1]).any() or (self.box[1] + move < other.box[0]).any():
             return False
         return bool(
@@ -137,28 +168,35 @@ class Solid(Caster):
 
 
 class Room:
-    """The room that a photo's objects leave for a new one, on the ground about its spot."""
+    """Free space on the ground for a new object about its spot."""
 
     def __init__(self, scene: PhotoScene, new: Placed, spot: Spot):
-        self.camera, self.spot = scene.camera, spot
-        self.new, self.others = Solid(new), [Solid(each) for each in scene.objects]
+        self.camera = scene.camera
+        self.spot = spot
+        self.new = Solid(new)
+        self.others = [Solid(each) for each in scene.objects]
 
     def pierced(self, move: Float[np.ndarray, "3"] = np.zeros(3)) -> Iterator[str]:
-        """Return what the new object would intersect if it were moved: names of objects, or the camera."""
+        """Yield the names of what the moved object would intersect: objects, or the camera."""
         yield from (f"'{other.name}'" for other in self.others if self.new.meets(other, move))
         if self.new.holds(-move[None]):
             yield "the camera"
 
     def seen(self, move: Float[np.ndarray, "3"] = np.zeros(3), every: int = 1) -> tuple[float, float]:
-        """The shares of the moved object's vertices (of `every` so many one) that are in the picture, and that nothing hides there."""
+        """Return the shares of the moved object's vertices that are in the picture, and that are also unoccluded.
+
+        Only every `every`-th vertex is tested.
+        """
         points = self.new.vertices[::every] + move
         inside = points[self._in_picture(points)]
         hidden = [other.crossed(np.zeros_like(inside), inside) for other in self.others]
         return len(inside) / len(points), float((~np.any(hidden, axis=0)).sum()) / len(points)
 
     def nearest(self) -> Float[np.ndarray, "3"] | None:
-        """The shortest move to a place where the object is free and seen; None where there is none."""
-        plane, every = self.spot.plane, max(1, len(self.new.vertices) // ENOUGH)
+        """Return the shortest move to a place where the object is free and visible; None if there is none."""
+        plane = self.spot.plane
+        every = max(1, len(self.new.vertices) // ENOUGH)
+        # lattice of moves on the ground, nearest first
         reach = np.arange(-round(RADIUS / STEP), round(RADIUS / STEP) + 1) * STEP * self.spot.height
         lattice = np.stack(np.meshgrid(reach, 0.0, reach, indexing="ij"), axis=-1).reshape(-1, 3)
         distance = np.linalg.norm(lattice, axis=1)
@@ -171,12 +209,15 @@ class Room:
         return None
 
     def at(self, move: Float[np.ndarray, "3"], factor: int) -> str:
-        """The pixel of the photo at which the moved object touches the ground, as a recipe names it; factor: pixels of the photo per pixel."""
+        """Return the pixel where the moved object touches the ground, as a recipe writes it.
+
+        `factor` is the number of the photo's pixels per pixel of the scene's camera.
+        """
         x, y = factor * self.camera.project((self.spot.point + move) @ YUP_FROM_CAMERA)
         return f"`at: [{x:.0f}, {y:.0f}]`"
 
     def _in_picture(self, points: Float[np.ndarray, "n 3"]) -> np.ndarray:
-        """Which points of the world the picture's frame holds."""
+        """Return a mask of the points of the world that project into the picture."""
         points = points @ YUP_FROM_CAMERA
         ahead = points[:, 2] > 0
         pixel = self.camera.project(np.where(ahead[:, None], points, 1.0))
@@ -186,14 +227,25 @@ class Room:
 def stood_free(
     scene: PhotoScene, stand: Callable[[Spot], Placed], spot: Spot, asked: bool, factor: int = 1
 ) -> tuple[Placed, Spot, str]:
-    """A new object that intersects none of the photo's and is seen, where it stands, and a sentence that says how far it was moved and why.
+    """Place a new object where it intersects none of the photo's objects and is visible.
 
-    stand: puts the object on a spot;  asked: the recipe names the spot;  factor: pixels of the photo per pixel of the scene's camera
-    Raises InputError where there is no such place, and where nothing would be seen of an object at the place that the recipe names.
+    Args:
+        scene: the photo's scene
+        stand: places the object on a spot
+        spot: the requested spot
+        asked: True if the recipe names the spot
+        factor: pixels of the photo per pixel of the scene's camera
+
+    Returns:
+        The object, its spot, and a sentence about the displacement and its reason (empty if it did not move).
+
+    Raises:
+        InputError: There is no free place, or the object would be invisible at the place that the recipe names.
     """
     new = stand(spot)
     room = Room(scene, new, spot)
-    pierced, (inside, seen) = list(room.pierced()), room.seen()
+    pierced = list(room.pierced())
+    inside, seen = room.seen()
     if not pierced and seen > 0:
         return new, spot, ""
     unseen = "it would be hidden behind other objects" if inside else "it would be outside the picture"
@@ -218,5 +270,5 @@ def stood_free(
 
 
 def rotation_between(first: Float[np.ndarray, "3"], second: Float[np.ndarray, "3"]) -> Float[np.ndarray, "3 3"]:
-    """The smallest turn of one unit vector into another."""
+    """Return the smallest rotation of one unit vector into another."""
     return Rotation.align_vectors(second[None], first[None])[0].as_matrix()

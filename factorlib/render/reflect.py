@@ -1,7 +1,7 @@
-"""Radiance of many surface points in a light of many lobes, as the reflection operator gives it.
+"""Radiance of many surface points in a light of many lobes, by the reflection operator.
 
-Points that do not see every direction reflect of each lobe what they see (`factorlib.light.visibility`), and points beside the middle meet
-a light of finite distance as `factorlib.light.distance` says, as in the solve.
+Occlusion scales each lobe by the share that a point sees (`factorlib.light.visibility`).  A light of finite distance
+changes angles and weights for points away from the middle (`factorlib.light.distance`).  Both are as in the solve.
 """
 
 from __future__ import annotations
@@ -20,22 +20,27 @@ from factorlib.light.visibility import cosine_weights, highlight_weights, kernel
 from factorlib.reflection import Operator
 from factorlib.reflection.operator import MaterialLike
 
-PAIRS_AT_ONCE = 1 << 18  # of a point and a lobe
+PAIRS_AT_ONCE = 1 << 18  # pairs of a point and a lobe in one batch
 
-Report = Callable[[float, float], None]  # of points done, of how many
+Report = Callable[[float, float], None]  # points done, their total
 
 
 def silently(done: float, total: float) -> None:
-    """The report to nobody."""
+    """Ignore a progress report."""
 
 
 class Reflector:
-    """One light, seen by any number of materials and points; `lobes` in the frame of the normals and views."""
+    """One light, reflected by any number of materials and points.
+
+    The lobes are in the frame of the normals and views.
+    """
 
     def __init__(self, operator: Operator, lobes: Lobes, curvature: float = 0.0):
-        self.operator, self.curvature = operator, curvature
+        self.operator = operator
+        self.curvature = curvature
         self.lobes = lobes.take(lobes.weight.max(axis=1) > 0)
-        self.axis, self.weight = self._tensor(self.lobes.axis), self._tensor(self.lobes.weight)
+        self.axis = self._tensor(self.lobes.axis)
+        self.weight = self._tensor(self.lobes.weight)
         self.sharpness = self._tensor(self.lobes.sharpness)
 
     def __call__(
@@ -48,12 +53,20 @@ class Reflector:
         place: Float[np.ndarray, "n 3"] | None = None,
         detail: Float[np.ndarray, " n"] | None = None,
     ) -> Float[np.ndarray, "n 3"]:
-        """Radiance toward unit `views` of points with unit `normals`; float64, zero where a normal faces away.
+        """Return the radiance that points reflect toward the viewer; float64, zero where a normal faces away.
 
-        visibility: of the directions of `fibonacci_sphere(k)`, 0 hidden to 255 seen, None is all seen
-        place: None is the middle;  detail: factor on the diffuse reflectance, None is 1
+        Args:
+            material: diffuse and specular reflectance, and roughness
+            normals: unit normals
+            views: unit directions toward the viewer
+            report: receives the number of points done and their total
+            visibility: visibility of the directions of `fibonacci_sphere(k)`, 0 hidden to 255 visible; None is all
+                visible
+            place: position relative to the middle, as `factorlib.light.distance` takes it; None is the middle
+            detail: factor on the diffuse reflectance; None is 1
         """
-        result, step = np.zeros((len(normals), 3)), max(1, PAIRS_AT_ONCE // max(len(self.sharpness), 1))
+        result = np.zeros((len(normals), 3))
+        step = max(1, PAIRS_AT_ONCE // max(len(self.sharpness), 1))
         columns = normals, views, visibility, place, detail
         with torch.no_grad():
             for i in range(0, len(normals) if len(self.sharpness) else 0, step):
@@ -77,11 +90,15 @@ class Reflector:
     ) -> Float[Tensor, "n 3"]:
         of_material = material.diffuse, material.specular, material.roughness
         kd, ks, roughness = (torch.tensor(of, dtype=self.operator.dtype) for of in of_material)
-        no, nz, oz = (normals * views).sum(-1), (normals @ self.axis.T).clamp(-1, 1), (views @ self.axis.T).clamp(-1, 1)
+        # cosines n·o per point, n·z and o·z per point and lobe; shares of each lobe that a point receives
+        no = (normals * views).sum(-1)
+        nz = (normals @ self.axis.T).clamp(-1, 1)
+        oz = (views @ self.axis.T).clamp(-1, 1)
         shares = [1.0, 1.0] if visibility is None else self._seen(visibility, normals, views, float(roughness))
         if place is not None and self.curvature > 0:
             nz, oz, larger = met_from(place, normals, views, self.axis, self.curvature)
             shares = [larger * share for share in shares]
+        # diffuse part plus specular part, summed over lobes
         radiance = kd * ((shares[0] * self.operator.diffuse(self.sharpness, nz)) @ self.weight)
         if detail is not None:
             radiance = radiance * detail[:, None]
@@ -91,7 +108,7 @@ class Reflector:
         return torch.where(no[:, None] > 0, radiance, torch.zeros_like(radiance))
 
     def _seen(self, visibility: Tensor, normals: Tensor, views: Tensor, roughness: float) -> list[Float[Tensor, "n p"]]:
-        """Shares of the diffuse and of the specular reflection of each lobe."""
+        """Return the visible shares of the diffuse and of the specular reflection of each lobe."""
         directions = torch.from_numpy(fibonacci_sphere(visibility.shape[1])).float()
         visibility, normals, views = visibility.float() / 255, normals.float(), views.float()
         lobes = kernel(directions, self.axis.float(), self.sharpness.float())

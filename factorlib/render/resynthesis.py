@@ -1,7 +1,7 @@
-"""What was solved, as the reflection operator shows it: a photo again, on the normals and views of its aligned meshes, and balls.
+"""Re-synthesis by the reflection operator: a photo on the normals and views of its aligned meshes, and balls.
 
-A ball is seen from the front, orthographically: every normal that faces the viewer, once; the same picture is a reflectance map.
-Frame: the photo's camera (x right, y down, z forward); a ball's view is (0, 0, −1).
+A ball is seen from the front, orthographically: it shows every normal that faces the viewer once.  The same picture is
+a reflectance map.  Frame: the photo's camera (x right, y down, z forward); a ball's view is (0, 0, −1).
 """
 
 from collections.abc import Mapping, Sequence
@@ -20,18 +20,21 @@ from factorlib.render.reflect import Reflector, Report, silently
 from factorlib.urm.observations import Observations
 
 Channels = Mapping[str, Float[np.ndarray, "h w"]]
-STEP = 0.55  # between nodes on a ball, in α
-LONGEST_STEP = 0.1  # radians
-NARROW = 1000.0  # sharpness of lobes whose highlights a spline does not follow
-RIM = np.pi / 2 - 1e-3  # radians: the largest θ, where a surface is still seen
-MARGIN = 4  # nodes beyond an end
-GAP = 6  # cells: the widest gap between observed normals that counts as observed
+STEP = 0.55  # spacing of nodes on a ball, in α
+LONGEST_STEP = 0.1  # largest spacing of nodes, radians
+NARROW = 1000.0  # sharpness above which a spline does not follow a lobe's highlight
+RIM = np.pi / 2 - 1e-3  # largest θ of a node, radians: the surface is still visible there
+MARGIN = 4  # periodic nodes beyond each end
+GAP = 6  # widest gap between observed normals that is closed, in cells
 
 
 class Surroundings(msgspec.Struct, frozen=True):
-    """What a photo's n observations have of the light (their visibility) and of the surfaces that hide it.
+    """Visibility, position and bounced radiance of a photo's n observations.
 
-    sent    G_d and G_s of `factorlib.inference.interreflection`, in the unit of the picture over the factor of the materials' gauge; None: nothing
+    Attributes:
+        seen: the observations, with their visibility
+        sent: G_d and G_s of `factorlib.inference.interreflection`, in the unit of the picture over the factor of the
+            materials' gauge; None is zero
     """
 
     seen: Observations
@@ -46,26 +49,36 @@ def resynthesised(
     report: Report = silently,
     around: Surroundings | None = None,
 ) -> Float[np.ndarray, "h w 3"]:
-    """Linear radiance; zero outside the mask, and where no mesh lies under it.
+    """Return the photo's linear radiance; zero outside the mask and where no mesh lies under it.
 
-    materials: label k is materials[k − 1];  photo: channel label;  geometry: channels normal.x/y/z, view.x/y/z, and detail, where diffuse reflectance has some
-    around:    shadows the picture, and lights what is in shadow
+    Args:
+        reflector: the light
+        materials: label k is materials[k − 1]
+        photo: channel label
+        geometry: channels normal.x/y/z, view.x/y/z and, if diffuse reflectance has detail, detail
+        report: receives the number of pixels done and their total
+        around: occlusion and bounces; None for neither
     """
     label = np.rint(photo["label"]).astype(int)
     normal, view = (np.stack([geometry[f"{kind}.{a}"] for a in "xyz"], axis=-1) for kind in ("normal", "view"))
     label[~(np.abs(normal).max(axis=-1) > 0)] = 0
-    picture, total, before = np.zeros((*label.shape, 3)), int((label > 0).sum()), 0
+    picture = np.zeros((*label.shape, 3))
+    total = int((label > 0).sum())
+    before = 0
 
     def of_all(done: float, _: float) -> None:
+        """Report progress over all materials."""
         report(before + done, total)
 
     for k, material in enumerate(materials, start=1):
         pixels = label == k
+        # unit normals and views of this material's pixels
         unit = [of[pixels].astype(float) for of in (normal, view)]
         unit = [of / np.linalg.norm(of, axis=-1, keepdims=True) for of in unit]
         visibility, sent, place = (None,) * 3 if around is None else around_pixels(around, k - 1, *np.nonzero(pixels))
         detail = geometry["detail"][pixels].astype(float) if "detail" in geometry else np.ones(len(unit[0]))
         shown = reflector(material, unit[0], unit[1], of_all, visibility, place, detail)
+        # radiance of bounces: k_d G_d + k_s G_s
         if sent is not None:
             bounced = (
                 np.array(material.diffuse) * detail[:, None] * sent[:, :3] + np.array(material.specular) * sent[:, 3:]
@@ -79,7 +92,17 @@ def resynthesised(
 def around_pixels(
     around: Surroundings, material: int, y: Int[np.ndarray, " n"], x: Int[np.ndarray, " n"]
 ) -> tuple[UInt8[np.ndarray, "n k"] | None, Float[np.ndarray, "n 6"] | None, Float[np.ndarray, "n 3"] | None]:
-    """Return what pixels of a material see and are sent, and where they lie: as the nearest observed pixel of it; None for all, nothing, the middle."""
+    """Look up visibility, bounced radiance and position of the nearest observed pixel of the same material.
+
+    Args:
+        around: the photo's observations
+        material: index of the material, from 0
+        y: rows of the pixels
+        x: columns of the pixels
+
+    Returns:
+        Visibility, bounced radiance and position; each is None if it is unknown.
+    """
     rows = np.flatnonzero(around.seen.material == material)
     of = around.seen.take(rows)
     if len(of) == 0 or len(x) == 0:
@@ -91,7 +114,16 @@ def around_pixels(
 
 
 def balls(reflector: Reflector, material: MaterialLike, sizes: Sequence[int]) -> list[Float[np.ndarray, "size size 3"]]:
-    """Radiance of balls of several sizes, in pixels across, which share what is computed; zero beside a ball."""
+    """Render a ball at several sizes, which share one evaluation.
+
+    Args:
+        reflector: the light
+        material: the ball's reflectance
+        sizes: widths of the pictures, in pixels
+
+    Returns:
+        A picture of radiance per size; zero outside the ball.
+    """
     shapes = [ball_normals(size) for size in sizes]
     normals = np.concatenate([own for own, _ in shapes]) * (1, -1, -1)  # in the camera's frame
     radiance = front_radiance(reflector, material, normals)
@@ -107,8 +139,14 @@ def front_radiance(
 ) -> Float[np.ndarray, "n 3"]:
     """Interpolate the radiance toward the viewer, a smooth function of the normal alone, by cubic splines.
 
-    The nodes, in the angle θ from the viewer and the azimuth φ, lie STEP widths α of a highlight apart: the error falls as their fourth power.
-    Lobes narrower than NARROW, and normals fewer than the nodes, are left to the operator.
+    The nodes lie on a grid of the angle θ from the viewer and the azimuth φ.  Their spacing is STEP times α, the width
+    of a highlight, and the error falls as its fourth power.  The operator itself evaluates lobes narrower than NARROW.
+    It also evaluates all lobes if there are fewer normals than nodes.
+
+    Args:
+        reflector: the light
+        material: the reflectance
+        normals: unit normals, camera frame
     """
     step = np.clip(STEP * float(material.roughness) ** 2, 1e-3, LONGEST_STEP)
     rings = int(np.ceil(np.pi / 2 / step))
@@ -116,13 +154,13 @@ def front_radiance(
         return reflector(material, normals, np.broadcast_to(FRONT, normals.shape))
     narrow = reflector.lobes.sharpness > NARROW
     wide, sharp = (Reflector(reflector.operator, reflector.lobes.take(of)) for of in (~narrow, narrow))
-    # nodes: θ = h/2, 3h/2, …, π/2, and φ = 0 … 2π
+    # nodes: θ = h/2, 3h/2, …, RIM, and φ from 0 to 2π
     theta = (np.arange(rings) + 0.5) / (rings - 0.5) * RIM
     phi = np.arange(4 * rings) * (np.pi / 2 / rings)
     sin, cos = np.sin(theta)[:, None], np.cos(theta)[:, None]
     nodes = np.stack(np.broadcast_arrays(sin * np.cos(phi), sin * np.sin(phi), -cos), axis=-1)
     values = wide(material, nodes.reshape(-1, 3), np.broadcast_to(FRONT, (nodes.size // 3, 3))).reshape(nodes.shape)
-    # beyond the pole lies θ < 0 at φ + π, beyond φ = 2π the beginning
+    # margins: θ < 0 continues at φ + π beyond the pole, and φ is periodic
     across = np.roll(values[MARGIN - 1 :: -1], 2 * rings, axis=1)
     values = np.pad(np.concatenate([across, values]), ((0, 0), (MARGIN, MARGIN), (0, 0)), mode="wrap")
     theta = np.concatenate([-theta[MARGIN - 1 :: -1], theta])
@@ -134,10 +172,11 @@ def front_radiance(
 
 
 def observed_cells(normals: Float[np.ndarray, "n 3"], size: int) -> Bool[np.ndarray, "size size"]:
-    """Pixels of a ball where a normal was seen; gaps as wide as the spacing of so few normals are closed."""
+    """Return the pixels of a ball whose normals were observed, with gaps of the normals' mean spacing closed."""
     cells = np.zeros((size, size), bool)
     if len(normals) == 0:
         return cells
+    # mark the cells of the normals, then close gaps of up to the mean spacing of the normals
     column, row = (np.clip(((normals[:, k] + 1) / 2 * size).astype(int), 0, size - 1) for k in (0, 1))
     cells[row, column] = True
     gap = int(np.clip(np.ceil(size / np.sqrt(len(normals))), 1, GAP))

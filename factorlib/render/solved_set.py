@@ -1,4 +1,4 @@
-"""A solved data set as pictures are made of it: scenes of its photos, their lights, grounds and materials."""
+"""A solved data set for rendering: scenes of its photos, their lights, grounds and materials."""
 
 import logging
 
@@ -29,15 +29,17 @@ from factorlib.results.surface import read_surface
 from factorlib.stage import Inputs
 from factorlib.tracing.scene import rigid
 
-LEAST_HEIGHT = 1e-6  # of a mesh to insert, in its radii
+LEAST_HEIGHT = 1e-6  # least height of a mesh to insert, in its radii
 
 log = logging.getLogger("factorlib.render")
 
 
 class SolvedSet:
-    """The solved materials, lights and poses, and the photos; each is read when first asked for.
+    """The solved materials, lights and poses, and the photos; photos and lights are read on demand.
 
-    inputs: with the slices materials, objects, light and ground of the data set, and the folders of `masks`, `align`, `surface` and `export`
+    Attributes:
+        inputs: slices materials, objects, light and ground of the data set, and folders of masks, align, surface and
+            export
     """
 
     def __init__(self, inputs: Inputs, crease_deg: float = CREASE_DEG):
@@ -60,10 +62,21 @@ class SolvedSet:
         self._pixels: dict[str, dict[str, np.ndarray]] = {}
 
     def scene(self, photo: str, sun: AssumedSun | None = None, denoise: bool = False) -> PhotoScene:
-        """The photo's objects, in their poses, in its light; or in that with a sun that is assumed.  denoise: as of `PhotoScene`"""
-        poses, objects = self.poses[photo], self.objects[photo]
+        """Return the photo's objects in their poses and in its light.
+
+        Args:
+            photo: name of the photo
+            sun: an assumed sun, which replaces the light's own suns
+            denoise: see `PhotoScene`
+
+        Raises:
+            InputError: The photo has no objects.
+        """
+        poses = self.poses[photo]
+        objects = self.objects[photo]
         if not objects.objects:
-            found, cure = f"photo '{photo}' has no objects to draw", "name other photos in the recipe"
+            found = f"photo '{photo}' has no objects to draw"
+            cure = "name other photos in the recipe"
             raise InputError(found, key=f"photos.{photo}.objects", cure=cure)
         for obj in objects.objects:
             if poses.objects[obj.name].left_out:
@@ -79,23 +92,23 @@ class SolvedSet:
         return PhotoScene(camera, placed, light, self.materials, depth, denoise)
 
     def sun_axis(self, photo: str, sun: AssumedSun) -> Float[np.ndarray, "3"]:
-        """The unit direction to a sun in the photo's camera axes."""
+        """Return the unit direction to a sun in the photo's camera axes."""
         world = self.lights[photo].world_from_camera
         camera_from_light = np.eye(3) if world is None else np.array(world).T
         return camera_from_light @ YUP_FROM_CAMERA @ (np.array(sun.direction) / np.linalg.norm(sun.direction))
 
     def photo(self, photo: str) -> Float[np.ndarray, "h w 3"]:
-        """Its linear radiance."""
+        """Return the photo's linear radiance."""
         channels = self._masks(photo)
         return np.nan_to_num(np.stack([channels[c] for c in "RGB"], axis=-1).astype(float))
 
     def straightened(self, photo: str) -> Float[np.ndarray, "h w 3"]:
-        """The same without its tone curve."""
+        """Return the photo's linear radiance with its tone curve undone."""
         tone = self.table.model.tone.get(photo)
         return straightened(self.photo(photo), tone.exponent, tone.pivot) if tone else self.photo(photo)
 
     def pixel(self, photo: str, at: tuple[float, float]) -> tuple[float, float]:
-        """A pixel of the photo in pixels of masks' picture; InputError where it is none of the photo's."""
+        """Convert a pixel of the photo to pixels of the picture from `masks`; InputError if it lies outside."""
         height, width = self._masks(photo)["label"].shape
         factor = self.poses[photo].camera.factor
         if not (0 <= at[0] <= factor * width and 0 <= at[1] <= factor * height):
@@ -104,30 +117,30 @@ class SolvedSet:
         return at[0] / factor, at[1] / factor
 
     def covered(self, photo: str) -> Bool[np.ndarray, "h w"]:
-        """Pixels that are no background."""
+        """Return a mask of the pixels that are not background."""
         channels = self._masks(photo)
         return (channels["label"] > 0) | (channels["left_out"] > 0)
 
     def tone(self, photo: str) -> Tone:
-        """Return what the photo shows of radiance."""
+        """Return the photo's tone curve."""
         tone = self.table.model.tone.get(photo)
         return (lambda radiance: shown(radiance, tone.exponent, tone.pivot)) if tone else as_it_is
 
     def light(self, name: str) -> Light:
-        """A photo's light in its camera's axes, or that of a file."""
+        """Return a photo's light in its camera's axes, or the light of a file."""
         if is_light_file(name):
             return read_light_map(self.inputs.file(f"recipe file:{name}"))
         return light_of(self.inputs["export"], name, self.lights[name])
 
     def known(self, table: str | None) -> dict[str, Reflectance]:
-        """The solved materials, and those of a table of one's own, which go before."""
+        """Return the solved materials, replaced and extended by those of a table file."""
         if table is None:
             return self.materials
         own = read_table(self.inputs.file(f"recipe file:{table}")).items()
         return self.materials | {name: Reflectance(m.diffuse, m.specular, m.roughness) for name, m in own}
 
     def ground(self, photo: str, neighbour: Placed) -> Ground:
-        """Given with the photo, or what the neighbour rests on."""
+        """Return the ground given with the photo, or the plane that the neighbour rests on."""
         given = self.grounds[photo].ground
         if given is None:
             mesh = next(obj.mesh for obj in self.objects[photo].objects if obj.name == neighbour.name)
@@ -138,11 +151,18 @@ class SolvedSet:
     def mesh(
         self, name: str, material: str | dict[str, str] | None, up: str
     ) -> tuple[Mesh, tuple[str, ...], np.ndarray]:
-        """A mesh to insert, its materials by label, and which way is up in its own frame: of the data set's, with its own `parts`, or where those
-        lack a material that is to be replaced, as it stands in the first photo, by name, whose object has it.
+        """Return a mesh to insert, its materials by label, and the unit upward direction in its frame.
 
-        material: of the whole, or of some of its materials, by name, others; None: its own
-        Raises InputError for a mesh that is not there, for one without height, and for a material that the mesh does not have.
+        A mesh of the data set has its own `parts`.  If these lack a material to be replaced, the mesh is that of the
+        first photo, by name, whose object has it.
+
+        Args:
+            name: a mesh of the data set, a mesh file, or BALL
+            material: a material for the whole mesh, or replacements by material name; None keeps its own
+            up: upward axis of a mesh file: x, y or z
+
+        Raises:
+            InputError: The mesh does not exist or has no height, or lacks a material to be replaced.
         """
         upward = np.eye(3)["xyz".index(up)]
         wanted = material if isinstance(material, str) else self.names[0]
@@ -156,6 +176,7 @@ class SolvedSet:
             known = [BALL, *sorted({obj.mesh for each in self.objects.values() for obj in each.objects})]
             raise InputError(f"there is no mesh {name!r}", key="mesh", cure=did_you_mean(name, known))
         else:
+            # The mesh's own materials come first, then those of each object; the first that has all `asked` is taken.
             plain = [(p, msgspec.structs.replace(obj, materials={})) for p, obj in shown[:1]]
             each = [(p, self._placed(obj, self.objects[p].meshes[name], self.poses[p])) for p, obj in plain + shown]
             asked = set(material) if isinstance(material, dict) else set()
@@ -163,7 +184,8 @@ class SolvedSet:
             known = [one for one, has in zip(each, worn, strict=True) if asked <= has]
             photo, placed = (known or each)[0]
             upward = placed.world_from_object[:3, :3].T @ self.ground(photo, placed).plane.normal
-            mesh, materials = placed.mesh, placed.materials
+            mesh = placed.mesh
+            materials = placed.materials
             if isinstance(material, str):
                 materials = (material,) * len(materials)
             elif material is not None:
@@ -179,19 +201,20 @@ class SolvedSet:
         return mesh, materials, upward
 
     def _objects_of(self, mesh: str) -> list[tuple[str, ObjectEntry]]:
-        """All objects of that mesh, and the photos that show them, by name: the order in dataset.yaml decides nothing."""
+        """Return all objects of a mesh with their photos, sorted by photo name, independent of dataset.yaml's order."""
         return [
             (photo, obj) for photo, each in sorted(self.objects.items()) for obj in each.objects if obj.mesh == mesh
         ]
 
     def _uprights(self, mesh: str) -> Float[np.ndarray, "k 3"]:
-        """The upward axes of the cameras of all objects of that mesh, in its frame."""
+        """Return the up vectors of the cameras of all objects of a mesh, in its frame."""
         poses = [self.poses[photo].objects[obj.name] for photo, obj in self._objects_of(mesh)]
         trusted = [pose for pose in poses if not pose.left_out] or poses
         return np.stack([np.array(pose.rotation).T @ YUP_FROM_CAMERA[1] for pose in trusted])
 
     def _placed(self, obj: ObjectEntry, entry: MeshEntry, poses: PhotoPoses) -> Placed:
-        pose, mesh = poses.objects[obj.name], self._meshes.mesh(obj.mesh, entry, obj.materials)
+        pose = poses.objects[obj.name]
+        mesh = self._meshes.mesh(obj.mesh, entry, obj.materials)
         place = rigid(YUP_FROM_CAMERA @ np.array(pose.rotation), YUP_FROM_CAMERA @ np.array(pose.translation))
         return Placed(obj.name, scaled(mesh, pose.scale), tuple(self.names), place)
 
@@ -199,7 +222,7 @@ class SolvedSet:
         if photo not in self._pixels:
             file = self.inputs["masks"] / f"{photo}.exr"
             check_plain(file, "an EXR", most_bytes=None)
-            self._pixels = {photo: read_exr(file)}  # one at a time: photos are large
+            self._pixels = {photo: read_exr(file)}  # Only one photo is held: photos are large.
             for channel in (*"RGB", "label", "left_out"):
                 if channel not in self._pixels[photo]:
                     cure = "run the stage `masks` again"

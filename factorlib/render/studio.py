@@ -1,6 +1,7 @@
-"""Objects on a grey floor that takes their shadow and fades out around them.
+"""Objects on a grey floor that receives their shadow and fades out around them.
 
-With W the share of a pixel that objects fill, and f, which falls from 1 beneath the objects to 0 at `REACH` of their size, the picture is
+W is the share of a pixel that objects fill.  f falls from 1 beneath the objects to 0 at `REACH` of their size.  The
+picture is
 
     w L₁ + (1 − w) L₀,    w = max(W, f),
 
@@ -18,9 +19,9 @@ from factorlib.render.placement import rotation_between
 from factorlib.results.materials import Reflectance
 from factorlib.tracing.scene import bsdf, transform
 
-REACH = 3.0  # half extents of the objects: where the floor ends
-SOLID = 0.3  # of that: within it the floor does not fade
-HAIR = 1e-4  # of the objects' extent, by which the floor lies lower: surfaces must not meet
+REACH = 3.0  # radius of the floor, in half extents of the objects
+SOLID = 0.3  # share of the radius within which the floor does not fade
+HAIR = 1e-4  # depth of the floor below the plane, in half extents: surfaces must not touch
 COVERAGE_SAMPLES = 16
 
 
@@ -32,15 +33,28 @@ def on_floor(
     world_from_camera: Float[np.ndarray, "4 4"],
     with_light: bool = False,
 ) -> Float[np.ndarray, "h w 4"]:
-    """The objects of `traced_photo` on a Lambertian floor of that reflectance: radiance times coverage, and coverage.
+    """Render the objects on a Lambertian floor, as `traced_photo` does without one.
 
-    Raises InputError for a camera that is below the floor.
+    Args:
+        scene: the scene
+        plane: the plane of the floor
+        reflectance: the floor's reflectance
+        samples: samples per pixel
+        world_from_camera: pose of the camera, in OpenCV's axes
+        with_light: show the light behind the objects
+
+    Returns:
+        Linear radiance times coverage, and coverage.
+
+    Raises:
+        InputError: The camera is below the floor.
     """
     if (world_from_camera[:3, 3] - plane.point) @ plane.normal <= 0:
         raise InputError("the camera is below the floor", key="floor", cure="look from higher, or leave the floor out")
     points = np.concatenate([each.vertices for each in scene.objects])
     extent = float(np.ptp(points, axis=0).max()) / 2
-    foot, frame = plane.onto(scene.middle[None])[0], np.eye(4)
+    foot = plane.onto(scene.middle[None])[0]
+    frame = np.eye(4)
     frame[:3, :3] = REACH * extent * rotation_between(np.array([0.0, 0.0, 1.0]), plane.normal)
     frame[:3, 3] = foot - HAIR * extent * plane.normal
     floor = {
@@ -48,9 +62,11 @@ def on_floor(
         "to_world": transform(frame),
         "bsdf": bsdf(Reflectance((reflectance,) * 3, (0.0,) * 3, 1.0)),
     }
+    # L₀, L₁ and W
     without = traced_photo(scene, samples, world_from_camera, with_light)
     with_ = traced_photo(scene, samples, world_from_camera, with_light, {"floor": floor})
     alone = traced_photo(scene, COVERAGE_SAMPLES, world_from_camera, max_depth=DIRECT)[..., 3]
+    # f, from the distance between the foot of the objects and the floor point of each pixel
     eye = world_from_camera[:3, 3]
     seen = Plane(plane.normal, plane.point - eye).hit(
         (scene.camera.rays() @ world_from_camera[:3, :3].T).reshape(-1, 3)

@@ -1,4 +1,4 @@
-"""A path-traced picture: linear radiance times coverage, and coverage; its files and how it is shown."""
+"""A path-traced picture with coverage, its display and its files."""
 
 from __future__ import annotations
 
@@ -17,12 +17,17 @@ Tone = Callable[[Radiance], Radiance]
 
 
 def as_it_is(radiance: Radiance) -> Radiance:
-    """The tone curve of a photo that has none."""
+    """Return the radiance unchanged: the tone curve of a photo that has none."""
     return radiance
 
 
 class Traced(msgspec.Struct, frozen=True):
-    """pixels: radiance (linear Rec. 709) times coverage, and coverage, the share of a pixel that is filled;  tone: what a photo would show"""
+    """A path-traced picture.
+
+    Attributes:
+        pixels: linear Rec. 709 radiance times coverage, and coverage, the share of a pixel that is filled
+        tone: tone curve of the photo
+    """
 
     pixels: Float[np.ndarray, "h w 4"]
     tone: Tone = as_it_is
@@ -34,13 +39,13 @@ class Traced(msgspec.Struct, frozen=True):
 
     @property
     def shown(self) -> Radiance:
-        """After the tone curve, of what fills a pixel in part as if it filled all of it."""
+        """The radiance after the tone curve, with coverage divided out."""
         share = self.pixels[..., 3:]
         return self.tone(self.pixels[..., :3] / np.where(share > 0, share, 1))
 
     @property
     def exposure(self) -> float:
-        """The exposure that shows well what is covered."""
+        """The display exposure for the covered pixels."""
         return exposure_of(self.shown, self.pixels[..., 3] > 0.5)
 
     def exposed(self) -> Traced:
@@ -48,11 +53,11 @@ class Traced(msgspec.Struct, frozen=True):
         return Traced(self.pixels * np.array([self.exposure] * 3 + [1.0]))
 
     def over(self, photo: Radiance) -> Radiance:
-        """Lay the picture on top of a photo, as the photo would show it."""
+        """Composite the picture, after its tone curve, over a photo."""
         return (1 - self.coverage) * photo + self.coverage * self.shown
 
     def rgba(self, exposure: float = 1.0) -> UInt8[np.ndarray, "h w 4"]:
-        """8-bit sRGB, transparent where nothing is covered."""
+        """Return 8-bit sRGB with coverage as alpha."""
         return np.concatenate([picture(self.shown, exposure), np.rint(255 * self.coverage).astype(np.uint8)], axis=-1)
 
     def to_exr(self, path: str | Path) -> None:
@@ -60,5 +65,5 @@ class Traced(msgspec.Struct, frozen=True):
         write_exr(path, {channel: self.pixels[..., k] for k, channel in enumerate("RGBA")})
 
     def to_png(self, path: str | Path, exposure: float = 1.0) -> None:
-        """Write `rgba`; exposure 1 is the photo's."""
+        """Write `rgba` as a PNG; exposure 1 is the photo's."""
         write_png(path, self.rgba(exposure))

@@ -1,1 +1,1 @@
-"""One self-contained page about a run: pictures beside the photos, numbers beside their nulls, and what it cost."""
+"""The report of a run: one self-contained page with pictures beside the photos, errors beside nulls, and costs."""

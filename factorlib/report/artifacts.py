@@ -1,4 +1,4 @@
-"""What the other stages wrote, read when it is asked for, one photo at a time; a file that is not there reads as None."""
+"""Results of the other stages, read on demand, one photo at a time; a missing file reads as None."""
 
 import json
 from collections.abc import Callable, Mapping
@@ -27,14 +27,32 @@ Picture = Float[np.ndarray, "h w 3"]
 
 
 class Artifacts(msgspec.Struct, frozen=True, dict=True):
-    """folders: of the stages, by name;  set: `SetSlice` of the dataset's schema, in the order of dataset.yaml;  log: of the run"""
+    """Results of one run.
+
+    Attributes:
+        folders: folders of the stages, by name
+        set: `SetSlice` of the dataset's schema, in the order of dataset.yaml
+        log: the run log
+    """
 
     folders: Mapping[str, Path]
     set: Any
     log: Path | None = None
 
     def read(self, reader: Callable[[Path], T], stage: str, name: str) -> T | None:
-        """The file `name` of a stage's result, as `reader` reads it; InputError for what is no plain file."""
+        """Read a file of a stage's result.
+
+        Args:
+            reader: reads the file
+            stage: name of the stage
+            name: name of the file
+
+        Returns:
+            The file's content, or None if it does not exist.
+
+        Raises:
+            InputError: The path is not a plain file.
+        """
         path = self.folders[stage] / name
         if not path.exists():
             return None
@@ -42,37 +60,37 @@ class Artifacts(msgspec.Struct, frozen=True, dict=True):
         return reader(path)
 
     def rgb(self, stage: str, name: str) -> Picture | None:
-        """Linear radiance of <name>.exr."""
+        """Return the linear radiance of <name>.exr."""
         return self.read(read_rgb_exr, stage, f"{name}.exr")
 
     def exr(self, stage: str, name: str) -> Channels | None:
-        """All channels of <name>.exr."""
+        """Return all channels of <name>.exr."""
         return self.read(read_exr, stage, f"{name}.exr")
 
     def channels(self, stage: str, name: str) -> Channels:
-        """Read the channels as `exr` does, of a file that is there."""
+        """Return all channels of <name>.exr, which must exist."""
         channels = self.exr(stage, name)
         assert channels is not None
         return channels
 
     @cached_property
     def photo_facts(self) -> dict[str, PhotoFacts]:
-        """Return what `masks` says of each photo."""
+        """Facts about each photo from `masks`."""
         return self.read(read_photos, "masks", "photos.json") or {}
 
     @cached_property
     def poses(self) -> dict[str, PhotoPoses]:
-        """Return what `align` says of each photo."""
+        """Camera and object poses of each photo from `align`."""
         return self.read(read_poses, "align", "poses.json") or {}
 
     @cached_property
     def surface(self) -> SurfaceTable:
-        """Return what shading says of the meshes; as given, where there is no such result."""
+        """Refinements of the meshes from `surface`; none if there is no such result."""
         return read_surface(self.folders.get("surface"))
 
     @cached_property
     def solved(self) -> MaterialTable:
-        """The materials, their gauge and model as solved; without materials where there is no solve."""
+        """Materials, gauge and model of the solve; without materials if there is no solve."""
         return self.read(read_materials, "solve", "materials.json") or MaterialTable({})
 
     @cached_property
@@ -82,27 +100,27 @@ class Artifacts(msgspec.Struct, frozen=True, dict=True):
 
     @cached_property
     def exposures(self) -> dict[str, Factors]:
-        """Factors of photos on their lights."""
+        """Factors of photos on their lights, by photo and per channel."""
         return self.read(read_exposures, "solve", "exposures.json") or {}
 
     @cached_property
     def metrics(self) -> Metrics | None:
-        """Return what `evaluate` measured."""
+        """Errors from `evaluate`."""
         return self.read(read_metrics, "evaluate", "metrics.json")
 
     def illumination_of(self, photo: str) -> str:
-        """The light's name: the photo's own where nothing is known of the photo."""
+        """Return the name of a photo's light, or the photo's own name if the photo is unknown."""
         facts = self.photo_facts.get(photo)
         return facts.illumination if facts else photo
 
     def illuminations(self) -> dict[str, list[str]]:
-        """Photos of each illumination, in the order of the set."""
+        """Return the photos of each light, in the order of the set."""
         photos: dict[str, list[str]] = {}
         for photo in self.set.photos:
             photos.setdefault(self.illumination_of(photo), []).append(photo)
         return photos
 
     def events(self) -> list[dict]:
-        """The run log, line by line."""
+        """Return the events of the run log, in order."""
         lines = self.log.read_text(encoding="utf-8").splitlines() if self.log and self.log.exists() else []
         return [json.loads(line) for line in lines if line.strip()]

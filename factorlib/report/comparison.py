@@ -1,4 +1,4 @@
-"""Two runs side by side: parameters, numbers, materials in standard errors, lights and re-syntheses."""
+"""Comparison of two runs: parameters, errors, materials in standard errors, lights and re-syntheses."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -16,14 +16,22 @@ from factorlib.report.template import DASH, headlines, number, percent, rendered
 from factorlib.results.materials import MaterialTable, Solved, read_materials
 from factorlib.results.photos import read_photos
 
-PHOTOS, MATERIALS = "masks/photos.json", "export/materials.json"  # without which there is nothing to compare
-WIDTH = 480  # pixels of a picture
+# results that both runs must have
+PHOTOS = "masks/photos.json"
+MATERIALS = "export/materials.json"
+WIDTH = 480  # longest side of a picture, pixels
 
 
 def comparison(first: Path, second: Path, changes: Sequence[str] | None) -> str:
-    """The page as HTML.  first, second: folders such as build/eames;  changes: in words, between what the two were made from
+    """Return the page of a comparison as HTML.
 
-    InputError where one holds no whole result, or they have no material or photo in common.
+    Args:
+        first: a result folder such as build/eames
+        second: the other result folder
+        changes: differences between the inputs of the two runs, in words
+
+    Raises:
+        InputError: A run is incomplete, or the two have no material and no photo in common.
     """
     one, two = runs = [_run(folder) for folder in (first, second)]
     tables = [read_materials(f / MATERIALS, f"make export DATASET={_dataset_of(f)}") for f in (first, second)]
@@ -35,6 +43,7 @@ def comparison(first: Path, second: Path, changes: Sequence[str] | None) -> str:
     lights = dict.fromkeys(one.illumination_of(p) for p in photos if one.illumination_of(p) == two.illumination_of(p))
 
     def pairs(stage: str, kind: str, names: Sequence[str]) -> list[dict[str, str | None]]:
+        """Return both runs' pictures of a kind, by name."""
         return [_pair(name, *(run.rgb(stage, f"{kind}/{name}") for run in runs)) for name in names]
 
     return rendered(
@@ -50,7 +59,7 @@ def comparison(first: Path, second: Path, changes: Sequence[str] | None) -> str:
 
 
 def _run(folder: Path) -> Artifacts:
-    """InputError where the data set was not run as far as `export`."""
+    """Return the results of a run; InputError if it did not reach `export`."""
     for file in (PHOTOS, MATERIALS):
         if not (folder / file).is_file():
             stage, _, name = file.partition("/")
@@ -61,25 +70,29 @@ def _run(folder: Path) -> Artifacts:
 
 
 def _dataset_of(folder: Path) -> str:
-    """The data set whose result it is: a copy may be called otherwise."""
+    """Return the name of the data set of a result; the folder may have another name."""
     mark = folder / "dataset.txt"
     return Path(mark.read_text(encoding="utf-8", errors="replace").strip()).name if mark.is_file() else folder.name
 
 
 def _numbers(runs: list[Artifacts]) -> list[tuple[str, list[str]]]:
-    """Headlines of both, by label; a dash where one has none."""
+    """Return the headlines of both runs by label; a dash if one has none."""
     metrics = [run.metrics for run in runs]
     both = [{h.label: f"{h.value} {h.unit}".strip() for h in headlines(m)} if m else {} for m in metrics]
     return [(label, [each.get(label, DASH) for each in both]) for label in dict.fromkeys([*both[0], *both[1]])]
 
 
 def _rows(tables: list[MaterialTable], names: list[str]) -> list[dict[str, Any]]:
-    """A row for each part of each material, after the factors that observations leave free: one per channel and group of materials
-    that lie in one connected component of both results; the second's reflectances are brought to the first's sum."""
+    """Return a row for each part of each material, in a common gauge.
+
+    One factor per channel brings the second run's reflectances to the first's sum.  It is fitted to each group of
+    materials that lie in one connected component of both results.
+    """
     groups: dict[tuple[int, ...], list[str]] = {}
     for name in names:
         groups.setdefault(tuple(table.gauge.component.get(name, 0) for table in tables), []).append(name)
-    factor, (first, second) = {}, (table.materials for table in tables)
+    factor = {}
+    first, second = (table.materials for table in tables)
     for group in groups.values():
         both = ([table.materials[name] for name in group] for table in tables)
         sums = [np.sum([np.add(m.diffuse, m.specular) for m in each], axis=0) for each in both]
@@ -89,7 +102,10 @@ def _rows(tables: list[MaterialTable], names: list[str]) -> list[dict[str, Any]]
 
 
 def _row(name: str, part: str, first: Solved, second: Solved, factor: Float[np.ndarray, "3"]) -> dict[str, Any]:
-    """Both values per channel in words, and off: their difference in standard errors; None where neither has an error."""
+    """Return both values per channel in words, and `off`, their difference in standard errors.
+
+    `off` is None if neither value has a standard error.
+    """
     scales = 1.0, factor if part != "roughness" else 1.0
     values, errors = (
         [np.atleast_1d(getattr(of, part)) * scale for of, scale in zip(each, scales)]
@@ -101,7 +117,7 @@ def _row(name: str, part: str, first: Solved, second: Solved, factor: Float[np.n
 
 
 def _pair(name: str, first: Picture | None, second: Picture | None) -> dict[str, str | None]:
-    """Two pictures of one thing, where they are there, at one exposure, and how far they are apart, in words."""
+    """Return two pictures of one thing at one exposure, with their difference in words; either may be missing."""
     present = [each for each in (first, second) if each is not None]
     exposure = exposure_of(present[0]) if present else 1.0
     uris = [None if each is None else data_uri(picture(reduced(each, WIDTH), exposure)) for each in (first, second)]

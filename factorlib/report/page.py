@@ -1,4 +1,4 @@
-"""Everything on the page, gathered and set into the template."""
+"""Content of the report's page, collected and rendered into the template."""
 
 import json
 import re
@@ -19,14 +19,18 @@ from factorlib.results.materials import Reflectance
 from factorlib.results.metrics import Metrics
 from factorlib.results.poses import AS_IT_IS
 
-LOW_IOU = 0.85
-MEASURES = {"median": "median", "p95": "95th percentile", "p99": "99th percentile", "worst": "worst", "samples": "samples"}  # fmt: skip
-FILES = {  # links of the page: the stage, and which of its files
-    "materials.json": ("export", "materials.json"), "MaterialX": ("export", "*.mtlx"), "objects, glTF": ("export", "*.glb"),
+LOW_IOU = 0.85  # silhouette overlap below which a pose is doubted
+MEASURES = {
+    "median": "median", "p95": "95th percentile", "p99": "99th percentile", "worst": "worst", "samples": "samples",
+}  # fmt: skip
+FILES = {  # links of the page: stage and pattern of its files
+    "materials.json": ("export", "materials.json"), "MaterialX": ("export", "*.mtlx"),
+    "objects, glTF": ("export", "*.glb"),
     "lights, EXR": ("export", "illumination/*.exr"), "lights, HDR": ("export", "illumination/*.hdr"),
     "lights without their suns, EXR": ("export", "illumination/*_sky.exr"),
     "how sure lights are": ("export", "coverage/*.exr"), "Mitsuba scenes": ("export", "scenes/*.xml"),
-    "OpenUSD scenes": ("export", "scenes/*.usda"), "Blender scenes": ("export", "scenes/blender.py"), "meshes": ("export", "meshes/*.ply"),
+    "OpenUSD scenes": ("export", "scenes/*.usda"), "Blender scenes": ("export", "scenes/blender.py"),
+    "meshes": ("export", "meshes/*.ply"),
     "re-syntheses": ("render", "resynthesis/*.exr"), "metrics.json": ("evaluate", "metrics.json"),
 }  # fmt: skip
 
@@ -39,11 +43,23 @@ def page(
     surfaces: Sequence[pictures.SurfaceRow] = (),
     first: Sequence[tuple[str, str, str]] = (),
 ) -> str:
-    """The page as HTML, from the artifacts, the photos' rows, the materials' colours, what can be relit, the meshes that were moved,
-    and the pictures of the first screen: title, `data:` URI, words."""
-    metrics, exposure, facts, solved = run.metrics, pictures.exposures(run), run.photo_facts, run.solved
+    """Return the page as HTML.
+
+    Args:
+        run: results of the run
+        rows: the photos' rows
+        tags: colours of the materials, by name
+        viewed: content of the relighting viewer
+        surfaces: the refined meshes
+        first: pictures of the first screen: title, `data:` URI, caption
+    """
+    metrics = run.metrics
+    exposure = pictures.exposures(run)
+    facts = run.photo_facts
+    solved = run.solved
     assert metrics is not None
-    photos, poses = run.set.photos, run.poses
+    photos = run.set.photos
+    poses = run.poses
     cells = [[pictures.ball_cell(run, m, p, exposure[p]) for p in photos] for m in run.set.materials]
     errors = metrics.light.lights if metrics.light else {}
     lights = [pictures.light_row(run, name, photos, errors.get(name)) for name, photos in run.illuminations().items()]
@@ -83,11 +99,12 @@ def page(
 
 
 def links(run: Artifacts) -> dict[str, list[tuple[str, str]]]:
-    """Return by kind the files that are there: their names, and where they lie beside the folder of the page in build/<dataset>/."""
-    found, names = {}, run.illuminations()
+    """Return the existing files by kind: their names, and their paths relative to the page's folder."""
+    found = {}
+    names = run.illuminations()
     for kind, (stage, pattern) in FILES.items():
         paths = sorted(run.folders[stage].glob(pattern))
-        if kind.endswith(", EXR"):  # a light may be called …_sky itself
+        if kind.endswith(", EXR"):  # A light's own name may end in _sky.
             paths = [path for path in paths if (path.stem in names) == (kind == "lights, EXR")]
         if paths:
             found[kind] = [(p.stem, f"../{stage}/{quote(p.relative_to(run.folders[stage]).as_posix())}") for p in paths]
@@ -95,8 +112,10 @@ def links(run: Artifacts) -> dict[str, list[tuple[str, str]]]:
 
 
 def cautions(run: Artifacts, metrics: Metrics) -> list[str]:
-    """Sentences about what should be distrusted, and about what is no better than a guess."""
-    errors, poses, facts = metrics.resynthesis.photos, run.poses, run.photo_facts.values()
+    """Return sentences about unreliable results, and about results no better than a guess."""
+    errors = metrics.resynthesis.photos
+    poses = run.poses
+    facts = run.photo_facts.values()
     return sentences(
         "cautions.txt",
         metrics=metrics,
@@ -109,10 +128,14 @@ def cautions(run: Artifacts, metrics: Metrics) -> list[str]:
 
 
 def forms(name: str, material: Reflectance) -> dict[str, str]:
-    """A material by program, as text to paste there; numbers are linear, and docs/formats.md says what each makes of them."""
+    """Return a material as text for each program, to paste there.
+
+    Numbers are linear; docs/formats.md describes how each program interprets them.
+    """
     numbers = {key: getattr(material, key) for key in ("diffuse", "specular", "roughness", "alpha")}
     gltf = gltf_material(material)
-    plain, specular = gltf["pbrMetallicRoughness"], gltf.get("extensions", {}).get(EXTENSION)
+    plain = gltf["pbrMetallicRoughness"]
+    specular = gltf.get("extensions", {}).get(EXTENSION)
     return {
         "numbers": json.dumps({name: numbers}),
         "Mitsuba": material_xml(name, material),
@@ -124,8 +147,10 @@ def forms(name: str, material: Reflectance) -> dict[str, str]:
 
 
 def _materials(run: Artifacts, cells: list[list[pictures.Cell]]) -> list[dict[str, Any]]:
-    """What the table says of each material that was solved; ball: in the light of the photo that shows it most."""
-    solved, exported, facts = run.solved.materials, run.exported, run.photo_facts
+    """Return the table's row of each solved material; its ball is in the light of the photo that shows it most."""
+    solved = run.solved.materials
+    exported = run.exported
+    facts = run.photo_facts
     rows = []
     for name, row in zip(run.set.materials, cells, strict=True):
         if name in solved:
@@ -137,7 +162,7 @@ def _materials(run: Artifacts, cells: list[list[pictures.Cell]]) -> list[dict[st
 
 
 def _overlay(run: Artifacts, photo: str) -> str | None:
-    """The mesh drawn over the photo, cut to its objects."""
+    """Return the mesh drawn over the photo, cropped to its objects."""
     pixels = run.read(read_png, "align", f"{photo}_overlay.png")
     if pixels is None:
         return None
@@ -149,9 +174,10 @@ def _overlay(run: Artifacts, photo: str) -> str | None:
 
 
 def _training(run: Artifacts) -> dict[str, Any] | None:
-    """From accuracy.json, {network: {measure: number, quantity: {bin: {measure: number}}}}.
+    """Return the table of accuracy.json, {network: {measure: number, quantity: {bin: {measure: number}}}}.
 
-    columns: the measures that occur;  lines: (level, name, numbers), level 0 a network, 1 a quantity, 2 a bin of it
+    `columns` are the measures that occur.  `lines` are (level, name, numbers), where level 0 is a network, 1 a quantity
+    and 2 a bin of it.
     """
     accuracy = run.read(read_json, "train", "accuracy.json")
     if accuracy is None:
@@ -168,7 +194,7 @@ def _lines(name: str, table: Mapping, level: int) -> Iterator[tuple[int, str, Ma
 
 
 def _in_order(names: Iterable[str]) -> list[str]:
-    """Bins in the order of what they hold, by their leading numbers: "3 to 30" before "30 to 300"."""
+    """Sort bins by their leading numbers: "3 to 30" before "30 to 300"."""
     leading = re.compile(r"[-+]?[\d.]+(e[-+]?\d+)?")
     return sorted(names, key=lambda name: (float(number[0]) if (number := leading.match(name)) else 0.0, name))
 
@@ -177,12 +203,15 @@ def _in_order(names: Iterable[str]) -> list[str]:
 
 
 def cost_of(events: list[dict], order: list[str]) -> dict[str, list]:
-    """Return what each stage cost, the last time each step ran: the only part of the page that differs from run to run.
+    """Return the cost of each stage in the last run of each step: the only part of the page that differs between runs.
 
-    A line of the log is {"event": "done", "stage", "photo", "seconds", "cpu_seconds", "memory_mb", "machine", …} for a step, or
+    An event is {"event": "done", "stage", "photo", "seconds", "cpu_seconds", "memory_mb", "machine", …} for a step, or
     {"event": "warning", "stage", "photo", "text"}.
-    stages: in the order given, with seconds of all steps and of the longest, and the largest peak of memory
-    machines: those that steps ran on, in words;  warnings: (stage, text) in the order of the stages, each once
+
+    The result has these keys.
+    stages: in the order given, with seconds of all steps and of the longest, and peak memory
+    machines: machines that steps ran on, in words
+    warnings: distinct pairs (stage, text), in the order of the stages
     """
     last = {(e["stage"], e.get("photo")): e for e in events if e.get("event") == "done" and "seconds" in e}
     by_stage = {s: [e for (stage, _), e in last.items() if stage == s] for s in order}

@@ -1,4 +1,4 @@
-"""Pictures inside the page: each photo beside its re-synthesis, balls, reflectance maps, lights, and one of the whole run."""
+"""Pictures of the report: photos beside re-syntheses, balls, reflectance maps, lights, and an overview of the run."""
 
 import base64
 from collections.abc import Mapping, Sequence
@@ -28,36 +28,39 @@ from factorlib.results.metrics import PhotoErrors, ScoredLight
 from factorlib.urm.geometry import on_surface
 from factorlib.urm.observations import Observations, read_observations
 
-FIRST_SAMPLES = 64  # of a pixel: some seconds
-AMPLIFICATION = 4  # of the difference between photo and re-synthesis
-UNCOUNTED = np.array([0.45, 0.38, 0.62])  # sRGB: in the mask, but not compared
-DISAGREES = np.array([0.92, 1.0, 0.0])
+FIRST_SAMPLES = 64  # samples per pixel of the first screen's pictures, which take some seconds
+AMPLIFICATION = 4  # factor on the difference between photo and re-synthesis
+UNCOUNTED = np.array([0.45, 0.38, 0.62])  # sRGB colour of pixels in the mask that are not compared
+DISAGREES = np.array([0.92, 1.0, 0.0])  # sRGB colour of pixels where mesh and mask name different materials
 MAGENTA = (214, 40, 120)
-COLUMN, GAP, MOST_PHOTOS = 200, 8, 8  # of the overview: pixels, pixels, photos
-UNKNOWN = Reflectance((0.2,) * 3, (0.0,) * 3, 1.0)  # of a material that was not solved
-MAP_SIZE = 64
+COLUMN = 200  # width of a column of the overview, pixels
+GAP = 8  # gap between pictures of the overview, pixels
+MOST_PHOTOS = 8  # photos in the overview
+UNKNOWN = Reflectance((0.2,) * 3, (0.0,) * 3, 1.0)  # stands for a material that was not solved
+MAP_SIZE = 64  # largest width of a measured map, cells
 CLAY_LIGHT = np.array([-0.5, -0.6, -0.6245])  # camera frame, unit: from above, left of the camera
-LEAST_OBSERVED = 0.002  # of a disc: fewer normals than this are not ringed
+LEAST_OBSERVED = 0.002  # share of a disc below which observed normals are not outlined
 
 Pixels = UInt8[np.ndarray, "h w c"]
 
 
 def data_uri(pixels: Pixels) -> str:
-    """Pixels as a PNG in a `data:` URI, for the `src` of an image."""
+    """Return pixels as a PNG in a `data:` URI, for the `src` of an image."""
     return "data:image/png;base64," + base64.b64encode(png_bytes(pixels)).decode("ascii")
 
 
 def reduced(picture: Float[np.ndarray, "h w c"], longest: int) -> Float[np.ndarray, "H W c"]:
-    """Area averages, so that no side is longer than `longest` pixels; a small picture stays as it is."""
+    """Downsample by area averages until no side is longer than `longest` pixels; a small picture is unchanged."""
     height, width = picture.shape[:2]
     scale = min(1.0, longest / max(height, width))
     if scale == 1.0:
         return picture
 
     def averaged(rows: Float[np.ndarray, "n m c"]) -> Float[np.ndarray, "N m c"]:
-        """Fewer rows: means over the share of each source row in the target row."""
+        """Downsample rows: means weighted by the overlap of source and target rows."""
         target = max(1, round(len(rows) * scale))
-        edges, cells = np.arange(target + 1) * (len(rows) / target), np.arange(len(rows))
+        edges = np.arange(target + 1) * (len(rows) / target)
+        cells = np.arange(len(rows))
         overlap = np.minimum(edges[1:, None], cells + 1) - np.maximum(edges[:-1, None], cells)
         means = csr_array(np.maximum(overlap, 0) * (target / len(rows))) @ rows.reshape(len(rows), -1)
         return means.reshape(target, *rows.shape[1:]).astype(np.float32)
@@ -66,7 +69,10 @@ def reduced(picture: Float[np.ndarray, "h w c"], longest: int) -> Float[np.ndarr
 
 
 def box_of(mask: Bool[np.ndarray, "h w"], margin: float = 0.06) -> tuple[slice, slice]:
-    """Rows and columns of the mask, with a margin of that fraction of its longer side; everything for an empty mask."""
+    """Return rows and columns of the mask's bounding box; the whole picture for an empty mask.
+
+    `margin` is the margin as a fraction of the box's longer side.
+    """
     if not mask.any():
         return slice(0, mask.shape[0]), slice(0, mask.shape[1])
     spans = [np.nonzero(mask.any(axis=1 - axis))[0][[0, -1]] for axis in (0, 1)]
@@ -76,12 +82,12 @@ def box_of(mask: Bool[np.ndarray, "h w"], margin: float = 0.06) -> tuple[slice, 
 
 
 def outline(mask: Bool[np.ndarray, "h w"]) -> Bool[np.ndarray, "h w"]:
-    """Pixels of the mask that touch its outside; the picture's border is not outside."""
+    """Return the pixels of the mask that touch its outside; the picture's border does not count as outside."""
     return mask & ~binary_erosion(mask, border_value=1)
 
 
 def disc(radiance: Float[np.ndarray, "n n 3"], exposure: float) -> UInt8[np.ndarray, "n n 4"]:
-    """Display values, transparent outside the disc that fills the picture."""
+    """Return display values, transparent outside the disc that fills the picture."""
     height, width = radiance.shape[:2]
     y, x = ((np.arange(n) + 0.5) / n * 2 - 1 for n in (height, width))
     alpha = np.clip((1 - np.hypot(x[None], y[:, None])) * height / 2 + 0.5, 0, 1)
@@ -89,7 +95,7 @@ def disc(radiance: Float[np.ndarray, "n n 3"], exposure: float) -> UInt8[np.ndar
 
 
 def exposures(run: Artifacts) -> dict[str, float]:
-    """One exposure per photo for all balls and reflectance maps in its light: the one its own picture is shown with."""
+    """Return one exposure per photo for all balls and reflectance maps in its light: the photo's own."""
     photos = metrics.resynthesis.photos if (metrics := run.metrics) else {}
     return {name: photos[name].exposure if name in photos else 1.0 for name in run.set.photos}
 
@@ -98,7 +104,13 @@ def exposures(run: Artifacts) -> dict[str, float]:
 
 
 class PhotoRow(msgspec.Struct, frozen=True):
-    """A photo: panels of one crop by title, as sRGB pixels and as `data:` URIs, and its errors, where there are any."""
+    """A photo with its panels and errors.
+
+    Attributes:
+        panels: sRGB pixels of one crop, by title
+        uris: the panels as `data:` URIs
+        errors: errors of the re-synthesis, if there are any
+    """
 
     name: str
     illumination: str
@@ -108,25 +120,35 @@ class PhotoRow(msgspec.Struct, frozen=True):
 
 
 def material_tags(run: Artifacts) -> dict[str, str]:
-    """A colour "#rrggbb" of each material of the set, near to its diffuse one (to its specular one, for a metal)."""
+    """Return a colour "#rrggbb" for each material of the set, near its diffuse colour, or a metal's specular colour."""
     reflectances = [run.solved.materials.get(name, UNKNOWN) for name in run.set.materials]
     colours = [np.add(m.diffuse, np.multiply(0.15, m.specular)) for m in reflectances]
     return nearest_tags(run.set.materials, np.array(colours))
 
 
 def longest_side(photos: int) -> int:
-    """Pixels of a panel's longer side: smaller where there are many photos, so that the page stays light."""
+    """Return the longer side of a panel in pixels, smaller for many photos to keep the page small."""
     return 440 if photos <= 12 else 300
 
 
 def photo_row(run: Artifacts, name: str, tags: dict[str, str], errors: PhotoErrors | None) -> PhotoRow:
-    """`tags`: the colour of each material in masks; `errors`: the photo's entry of the metrics."""
-    masks, geometry = run.channels("masks", name), run.channels("align", name)
-    again, exposure = run.rgb("render", f"resynthesis/{name}"), errors.exposure if errors else 1.0
+    """Return a photo's panels: photo, materials, re-synthesis and difference.
+
+    Args:
+        run: results of the run
+        name: name of the photo
+        tags: colours of the materials in masks, by name
+        errors: the photo's entry of the metrics
+    """
+    masks = run.channels("masks", name)
+    geometry = run.channels("align", name)
+    again = run.rgb("render", f"resynthesis/{name}")
+    exposure = errors.exposure if errors else 1.0
     box = box_of(np.rint(masks["label"]) > 0)
     masks, geometry = ({k: v[box] for k, v in channels.items()} for channels in (masks, geometry))
     photo = np.nan_to_num(np.stack([masks[c] for c in "RGB"], axis=-1), posinf=0, neginf=0)
-    display, in_mask = picture(photo, exposure).astype(np.float32) / 255, masks["label"] > 0.5
+    display = picture(photo, exposure).astype(np.float32) / 255
+    in_mask = masks["label"] > 0.5
     panels = {"photo": display, "materials": _labels(masks, geometry, photo * exposure, list(tags.values()))}
     if again is not None:
         again = picture(np.nan_to_num(again[box], posinf=0, neginf=0), exposure).astype(np.float32) / 255
@@ -142,14 +164,27 @@ def photo_row(run: Artifacts, name: str, tags: dict[str, str], errors: PhotoErro
 
 
 def first_pictures(run: Artifacts, rows: Sequence[PhotoRow], results: SolvedSet) -> list[tuple[str, str, str]]:
-    """Title, `data:` URI and words of the photo that counts most pixels, and of its objects, path-traced: in its own light and in another photo's."""
+    """Return the pictures of the first screen: the photo with the most counted pixels, and two path-traced pictures.
+
+    These show its objects in their own light and in another photo's.
+
+    Args:
+        run: results of the run
+        rows: the photos' rows
+        results: the solved data set
+
+    Returns:
+        Title, `data:` URI and caption of each picture.
+    """
     row = max(rows, key=lambda row: row.errors.pixels if row.errors else 0)
     photo = ("photo", row.uris["photo"], row.name)
     lobes = run.read(read_lobes, "export", "lobes.parquet") or {}
-    lit = {name for name, light in lobes.items() if len(light)}  # the others were not solved
+    lit = {name for name, light in lobes.items() if len(light)}  # lights that were solved
     if not results.objects[row.name].objects or row.illumination not in lit:
         return [photo]
-    scene, box = results.scene(row.name), box_of(np.rint(run.channels("masks", row.name)["label"]) > 0)
+    # camera cropped to the objects, and enlarged to the panel's size
+    scene = results.scene(row.name)
+    box = box_of(np.rint(run.channels("masks", row.name)["label"]) > 0)
     (top, left), (height, width) = (of.start for of in box), (of.stop - of.start for of in box)
     pixel = max(1.0, max(height, width) / longest_side(len(run.set.photos)))
     camera = scene.camera.window(left, top, pixel, ceil(width / pixel), ceil(height / pixel))
@@ -169,7 +204,7 @@ def first_pictures(run: Artifacts, rows: Sequence[PhotoRow], results: SolvedSet)
 
 
 def _labels(masks: Channels, geometry: Channels, photo: Picture, tags: list[str]) -> Picture:
-    """Materials tinted on a grey photo (already exposed); yellow where mesh and mask name different ones."""
+    """Tint a grey photo (already exposed) by material; yellow where mesh and mask name different materials."""
     grey = srgb_encode(np.clip(photo.mean(axis=-1), 0, 1))[..., None] * np.ones(3)
     label = np.rint(masks["label"]).astype(int)
     colours = np.array([(0, 0, 0), *(getrgb(tag) for tag in tags)]) / 255
@@ -179,7 +214,13 @@ def _labels(masks: Channels, geometry: Channels, photo: Picture, tags: list[str]
 
 
 class SurfaceRow(msgspec.Struct, frozen=True):
-    """A mesh in the photo that shows most of it, as given and as shading has it: pictures by title, and the displacement over the extent."""
+    """A refined mesh in the photo that shows most of it.
+
+    Attributes:
+        uris: pictures by title, of the mesh as given and as refined
+        typical: RMS displacement over the extent
+        largest: largest displacement over the extent
+    """
 
     mesh: str
     photo: str
@@ -189,8 +230,9 @@ class SurfaceRow(msgspec.Struct, frozen=True):
 
 
 def surface_rows(run: Artifacts, objects: Mapping[str, ObjectsSlice]) -> list[SurfaceRow]:
-    """Every mesh that was moved or has detail of reflectance, in the order of their names."""
-    rows, table = [], run.surface
+    """Return a row for every mesh with displacements or detail of reflectance, sorted by name."""
+    rows = []
+    table = run.surface
     for mesh in sorted(table.displacements | table.log_factors):
         shown = {}
         for photo, slice_ in objects.items():
@@ -205,18 +247,21 @@ def surface_rows(run: Artifacts, objects: Mapping[str, ObjectsSlice]) -> list[Su
         panels |= {f"normals, {which}": 0.5 + 0.5 * n * (1, -1, -1) for which, n in normals.items()}
         if mesh in table.log_factors:
             panels["detail of reflectance"] = srgb_encode(np.clip(0.4 * maps["by shading"]["detail"], 0, 1))
-        uris, box, longest = {}, box_of(shown[photo]), longest_side(len(run.set.photos))
+        uris = {}
+        box = box_of(shown[photo])
+        longest = longest_side(len(run.set.photos))
         for title, panel in panels.items():
             colour = panel if panel.ndim == 3 else panel[..., None].repeat(3, 2)
             small = reduced(np.where(shown[photo][..., None], colour, 1.0)[box].astype(np.float32), longest)
             uris[title] = data_uri(np.rint(255 * np.clip(small, 0, 1)).astype(np.uint8))
+        # RMS and largest displacement, relative to the extent
         size = np.abs(table.displacements.get(mesh, [0.0]))
         rows.append(SurfaceRow(mesh, photo, uris, float(np.sqrt(np.mean(size**2))), float(size.max())))
     return rows
 
 
 def strip(row: PhotoRow) -> bytes:
-    """A row's panels side by side on white, as a PNG."""
+    """Return a row's panels side by side on white, as a PNG."""
     return png_bytes(np.concatenate([_on_white(pixels) for pixels in row.panels.values()], axis=1))
 
 
@@ -230,8 +275,12 @@ def _whitened(pixels: Pixels, down: int, right: int) -> Pixels:
 
 
 def overview(run: Artifacts, rows: Sequence[PhotoRow]) -> bytes:
-    """A PNG on white for a README: a column per photo (the first eight), with photo, re-synthesis, light, and balls."""
-    exposure, rows = exposures(run), rows[:MOST_PHOTOS]
+    """Return a PNG on white for a README: a column per photo, with photo, re-synthesis, light and balls.
+
+    Only the first `MOST_PHOTOS` photos appear.
+    """
+    exposure = exposures(run)
+    rows = rows[:MOST_PHOTOS]
     tallest = max(round(COLUMN * p.shape[0] / p.shape[1]) for row in rows for p in row.panels.values())
     columns = [_column(run, row, exposure[row.name], min(COLUMN * 3 // 2, tallest)) for row in rows]
     height = max(len(column) for column in columns)
@@ -253,7 +302,7 @@ def _column(run: Artifacts, row: PhotoRow, exposure: float, height: int) -> Pixe
 
 
 def _fitted(pixels: Pixels, height: int, width: int) -> Pixels:
-    """In the middle of a white cell, as large as fits; what is smaller than the cell is enlarged by whole pixels."""
+    """Scale pixels to fit the middle of a white cell; smaller pictures are enlarged by whole factors first."""
     pixels = _on_white(pixels).astype(np.float32)
     times = max(1, -(-max(height, width) // min(pixels.shape[:2])))
     pixels = np.repeat(np.repeat(pixels, times, axis=0), times, axis=1)
@@ -269,7 +318,13 @@ def _fitted(pixels: Pixels, height: int, width: int) -> Pixels:
 
 
 class Cell(msgspec.Struct, frozen=True):
-    """A material in a photo's light; `uri` is None where nothing was rendered, `measured` where nothing was seen."""
+    """A material in a photo's light.
+
+    Attributes:
+        observed: True if the photo shows the material
+        uri: the rendering, or None
+        measured: the measured map, or None if there are no observations
+    """
 
     material: str
     photo: str
@@ -279,7 +334,14 @@ class Cell(msgspec.Struct, frozen=True):
 
 
 def ball_cell(run: Artifacts, material: str, photo: str, exposure: float) -> Cell:
-    """The ball of a material in a photo's light."""
+    """Return the ball of a material in a photo's light.
+
+    Args:
+        run: results of the run
+        material: name of the material
+        photo: name of the photo
+        exposure: exposure of the picture
+    """
     observed = photo in run.photo_facts and run.photo_facts[photo].pixels.get(material, 0) > 0
     radiance = run.rgb("render", f"materials/{photo}/{material}")
     uri = None if radiance is None else data_uri(disc(reduced(radiance, 96), exposure))
@@ -287,8 +349,15 @@ def ball_cell(run: Artifacts, material: str, photo: str, exposure: float) -> Cel
 
 
 def reflectance_maps(run: Artifacts, photo: str, exposure: float) -> list[Cell]:
-    """One cell per material: solved, with the observed normals ringed, and beside it what the photo measured."""
-    cells, observations = [], run.read(read_observations, "urm", f"{photo}.parquet")
+    """Return one cell per material: the solved map with the observed normals outlined, and the measured map.
+
+    Args:
+        run: results of the run
+        photo: name of the photo
+        exposure: exposure of the pictures
+    """
+    cells = []
+    observations = run.read(read_observations, "urm", f"{photo}.parquet")
     observations = observations and on_surface(observations, run.folders.get("surface"))
     for index, name in enumerate(run.set.materials):
         channels = run.exr("render", f"reflectance_maps/{photo}/{name}")
@@ -300,7 +369,7 @@ def reflectance_maps(run: Artifacts, photo: str, exposure: float) -> list[Cell]:
 
 
 def _ringed(channels: Channels, exposure: float) -> Pixels:
-    """The solved map; the line about the observed normals is white on dark and black on bright."""
+    """Return the solved map with an outline of the observed normals, white on dark and black on bright."""
     pixels = disc(np.stack([channels[c] for c in "RGB"], axis=-1), exposure)
     observed = channels.get("observed", np.zeros(pixels.shape[:2])) > 0.5
     if observed.mean() > LEAST_OBSERVED:
@@ -310,12 +379,14 @@ def _ringed(channels: Channels, exposure: float) -> Pixels:
 
 
 def measured_map(observations: Observations, exposure: float) -> UInt8[np.ndarray, "s s 4"]:
-    """Mean radiance by normal, seen from the front, as RGBA; transparent where no normal was seen.
+    """Return the mean radiance by normal, seen from the front, as RGBA; transparent without observations.
 
-    The disc is as many cells across as leave about two observations to a cell, at most `MAP_SIZE`.
+    The disc's width leaves about two observations per cell, and is at most `MAP_SIZE` cells.
     """
-    n, side = observations.normal, int(np.clip(np.sqrt(len(observations) * 2 / np.pi), 8, MAP_SIZE))
+    n = observations.normal
+    side = int(np.clip(np.sqrt(len(observations) * 2 / np.pi), 8, MAP_SIZE))
     column, row = (np.clip(((n[:, k] + 1) / 2 * side).astype(int), 0, side - 1) for k in (0, 1))  # x right, y down
+    # mean radiance of each cell
     cell = row * side + column
     weight = np.bincount(cell, minlength=side**2)
     total = np.stack([np.bincount(cell, c, side**2) for c in observations.radiance.T], axis=-1)
@@ -330,20 +401,33 @@ def measured_map(observations: Observations, exposure: float) -> UInt8[np.ndarra
 def light_row(
     run: Artifacts, name: str, photos: list[str], errors: dict[str, dict[str, ScoredLight]] | None
 ) -> dict[str, Any] | None:
-    """Return what the page shows of light `name`; None where no such light was exported.  errors: its part of metrics.json
+    """Return the page's row of a light; None if it was not exported.
 
-    uri, dark_uri, true_uri, spheres: the map, 4 stops darker, the true one, three spheres;  white: the radiance shown as white
-    peak: the brightest texel in units of it;  overflow: share of the sphere that is brighter, outlined;  energy: its share of the light
+    The row has these keys.
+    uri, dark_uri, true_uri, spheres: the map, the map 4 stops darker, the true map, three spheres
+    white: radiance shown as white
+    peak: brightest texel in units of white
+    overflow: share of the sphere above white, which is outlined
+    energy: share of the light's energy above white
     known: share of the sphere where the standard error is below the radiance
-    known_uri: that error as grey: white where it is nil, mid-grey where it is as large, black where it is many times that
+    known_uri: standard error over radiance r as grey 1 / (1 + r): white for none, mid-grey for 1
+
+    Args:
+        run: results of the run
+        name: name of the light
+        photos: photos of the light
+        errors: its part of metrics.json
     """
     radiance = run.rgb("export", f"illumination/{name}")
     if radiance is None:
         return None
     exposure = exposure_of(radiance, percentile=95.0)
-    brightest, area = radiance.max(axis=-1) * exposure, _areas(radiance)
-    over, energy = brightest > 1, radiance.sum(axis=-1) * area
-    true, known = run.rgb("evaluate", f"illumination/{name}"), run.rgb("export", f"coverage/{name}")
+    brightest = radiance.max(axis=-1) * exposure
+    area = _areas(radiance)
+    over = brightest > 1
+    energy = radiance.sum(axis=-1) * area
+    true = run.rgb("evaluate", f"illumination/{name}")
+    known = run.rgb("export", f"coverage/{name}")
     row = {
         "name": name, "photos": photos, "errors": errors, "white": 1 / exposure, "peak": float(brightest.max()),
         "uri": _outlined(radiance, exposure),
@@ -354,6 +438,7 @@ def light_row(
         "known_uri": None, "known": None, "spheres": _spheres(run, name),
     }  # fmt: skip
     if known is not None:
+        # standard error relative to the radiance of each texel
         mean = float((radiance * area[..., None]).sum() / (3 * area.sum() * radiance.shape[1]))
         error = known.mean(axis=-1) * mean / np.maximum(radiance.mean(axis=-1), 1e-30)
         row["known"] = float(((error < 1) * area).sum() / (4 * np.pi))
@@ -372,13 +457,13 @@ def _outlined(radiance: Picture, exposure: float) -> str:
 
 
 def _true_map(true: Picture, estimate: Picture, exposure: float) -> str:
-    """The true map, scaled to the mean of the estimate: the overall scale is a matter of gauge."""
+    """Return the true map scaled to the mean of the estimate, because the overall scale is a gauge freedom."""
     means = [float((m * (_areas(m)[..., None] / m.shape[1])).sum()) for m in (true, estimate)]
     return _outlined(reduced(true, max(estimate.shape[:2])) * (means[1] / max(means[0], 1e-30)), exposure)
 
 
 def _spheres(run: Artifacts, name: str) -> str | None:
-    """Truth above, estimate below, the estimate scaled to the truth's mean."""
+    """Return the spheres of the truth above those of the estimate, which is scaled to the truth's mean."""
     truth, estimate = (run.rgb("evaluate", f"spheres/{name}_{which}") for which in ("truth", "estimate"))
     if truth is None or estimate is None:
         return None

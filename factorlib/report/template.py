@@ -1,4 +1,4 @@
-"""Templates of this package: they hold the words of the pages, and this module prints numbers into them."""
+"""Rendering of this package's templates, which hold the text of the pages."""
 
 import math
 from collections.abc import Mapping, Sequence
@@ -12,11 +12,12 @@ import numpy as np
 from factorlib.images.transfer import srgb_encode
 from factorlib.results.metrics import Metrics
 
-MINUS, DASH = "\u2212", "\u2013"
+MINUS = "\u2212"
+DASH = "\u2013"
 
 
 def rendered(template: str, **context: Any) -> str:
-    """A template with what it is about filled in; text is escaped, but in templates that end in .txt."""
+    """Render a template; values are escaped, except in templates that end in .txt."""
     folder = files("factorlib.report") / "templates"
     environment = jinja2.Environment(
         loader=jinja2.FunctionLoader(lambda name: (folder / name).read_text(encoding="utf-8")),
@@ -34,12 +35,17 @@ def rendered(template: str, **context: Any) -> str:
 
 
 def sentences(template: str, **context: Any) -> list[str]:
-    """The lines of a template of sentences that are not empty."""
+    """Render a template of sentences and return its lines that are not empty."""
     return list(filter(None, rendered(template, **context).split("\n")))
 
 
 class Headline(msgspec.Struct, frozen=True):
-    """A number in words; beside: what it is compared with; meaning: a sentence for who does not know the measure."""
+    """A number of the report in words.
+
+    Attributes:
+        beside: the number it is compared with
+        meaning: an explanation of the measure for a lay reader
+    """
 
     label: str
     value: str
@@ -49,21 +55,21 @@ class Headline(msgspec.Struct, frozen=True):
 
 
 def headlines(metrics: Metrics) -> list[Headline]:
-    """Re-synthesis where a pixel counts; materials and relighting where there is a truth."""
+    """Return the headline numbers: re-synthesis, if pixels count, and materials and relighting, if there is a truth."""
     return [Headline(*line.split(" | ")) for line in sentences("headlines.txt", metrics=metrics)]
 
 
 def _in_script(value: Mapping) -> str:
-    """JSON that no `</script>` in a name can end."""
+    """Return JSON that is safe inside a script element: no name in it can contain `</script>`."""
     text = msgspec.json.encode(value).decode("utf-8")
     return text.replace("<", "\\u003c").replace(">", "\\u003e").replace("&", "\\u0026")
 
 
 def number(value: float | None, digits: int = 2) -> str:
-    """Fixed digits, a true minus, a dash for what is not known.
+    """Format with fixed digits and a true minus sign; a dash for an unknown value.
 
     >>> number(-0.1234, 2), number(None)
-    ('\u22120.12', '\u2013')
+    ('−0.12', '–')
     """
     if value is None or not math.isfinite(value):
         return DASH
@@ -71,7 +77,7 @@ def number(value: float | None, digits: int = 2) -> str:
 
 
 def significant(value: float | None, digits: int = 3) -> str:
-    """Write a number with that many significant digits, without an exponent for everyday sizes.
+    """Format with significant digits, without an exponent for sizes from 1e-4 to 1e6.
 
     >>> significant(0.012345), significant(12345.0), significant(0.0)
     ('0.0123', '12300', '0')
@@ -85,7 +91,7 @@ def significant(value: float | None, digits: int = 3) -> str:
 
 
 def percent(fraction: float | None, digits: int = 1) -> str:
-    """A fraction in percent.
+    """Format a fraction in percent.
 
     >>> percent(0.0423)
     '4.2 %'
@@ -94,7 +100,7 @@ def percent(fraction: float | None, digits: int = 1) -> str:
 
 
 def duration(seconds: float | None) -> str:
-    """Seconds, or minutes and seconds.
+    """Format seconds, as minutes and seconds from one minute on.
 
     >>> duration(4.31), duration(75)
     ('4.3 s', '1 min 15 s')
@@ -105,7 +111,7 @@ def duration(seconds: float | None) -> str:
 
 
 def css_colour(linear: Sequence[float]) -> str:
-    """A reflectance as a CSS colour: sRGB-encoded, cut to [0, 1].
+    """Return a reflectance as a CSS colour: sRGB-encoded, clamped to [0, 1].
 
     >>> css_colour([1.0, 0.18, 0.0])
     'rgb(255 118 0)'

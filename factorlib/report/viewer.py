@@ -1,9 +1,9 @@
-"""What the page's relighting viewer shades: meshes, reflectances and lights, as numbers that a browser reads.
+"""Data of the page's relighting viewer: meshes, reflectances and lights, as numbers that a browser reads.
 
 The viewer evaluates the same integral as the pipeline, Lambert + GGX, in the camera frame turned y-up
 (`YUP_FROM_CAMERA`).  Lights are lobes; the browser draws them into a cube map and integrates over that.  Its texels are
-interpolated linearly, which widens a lobe, so lobes are handed over sharpened by as much.  What an object hides from
-itself is known at its vertices, which are therefore close together, in a number of directions.
+interpolated linearly, which widens a lobe, so lobes are first sharpened to compensate.  Self-occlusion is stored at the
+vertices, which are therefore close together, for a number of directions.
 """
 
 import base64
@@ -31,28 +31,37 @@ from factorlib.report.artifacts import Artifacts
 from factorlib.results.lobes import read_lobes
 from factorlib.results.poses import AS_IT_IS
 
-MOST_TRIANGLES = 150_000  # of all meshes together: about 3 MB of page
-LONGEST = 0.08  # of the mesh's extent: the longest edge
-LEAST_DIRECTIONS, MOST_DIRECTIONS = 32, 256  # in which a vertex looks for what hides the light
-MOST_VERTICES = 8_000  # of a mesh, that look in MOST_DIRECTIONS: less than 1 MB of page
-FACES = (32, 64, 128, 256)  # texels across a face of the cube map
-FINE_ENOUGH = 0.7  # texel over the width 1/√λ of the sharpest lobe
+MOST_TRIANGLES = 150_000  # triangles of all meshes together: about 3 MB of page
+LONGEST = 0.08  # longest edge, in extents of the mesh
+LEAST_DIRECTIONS = 32  # least number of directions of a vertex's visibility
+MOST_DIRECTIONS = 256  # largest number of directions of a vertex's visibility
+MOST_VERTICES = 8_000  # vertices of a mesh with visibility in MOST_DIRECTIONS: less than 1 MB of page
+FACES = (32, 64, 128, 256)  # possible numbers of texels across a face of the cube map
+FINE_ENOUGH = 0.7  # largest texel, in widths 1/√λ of the sharpest lobe
 
 
 def viewed(
     run: Artifacts, lights: Mapping[str, LightSlice], objects: Mapping[str, ObjectsSlice], exposure: Mapping[str, float]
 ) -> dict[str, Any] | None:
-    """All that can be chosen, as the viewer's script reads it; None where no light or no material was exported.
+    """Return the viewer's data; None if no light or no material was exported.
 
-    lights, objects: slices of the photos;  exposure: by photo, shows it well.  Strings of numbers are base64, little-endian.
+    Strings of numbers are base64, little-endian.
 
-    objects, meshes  see `_shown`
-    materials  by name
-    lights     by name: face, texels across a face of the cube map they are drawn into; lobes, float32, 7 a lobe: axis (y-up),
-               sharpness, weight
-    photos     name, light, rotation: y-up light from y-up camera, row by row; gain on the light, per channel; exposure
+    objects    see `_shown`
+    meshes     see `_shown`
+    materials  reflectances by name
+    lights     by name: face, texels across a face of the cube map; lobes, float32, 7 per lobe: axis (y-up), sharpness,
+               weight
+    photos     name; light; rotation, y-up light from y-up camera, row by row; gain on the light, per channel; exposure
+
+    Args:
+        run: results of the run
+        lights: light slices of the photos
+        objects: object slices of the photos
+        exposure: display exposure of each photo
     """
-    lobes, table = run.read(read_lobes, "export", "lobes.parquet"), run.exported
+    lobes = run.read(read_lobes, "export", "lobes.parquet")
+    table = run.exported
     materials = {name: table[name].reflectance for name in run.set.materials if name in table}
     if not lobes or not materials:
         return None
@@ -74,7 +83,7 @@ def _light(lobes: Lobes) -> dict[str, Any]:
 
 
 def spacing_of(face: int) -> float:
-    """Mean angle between texels of a cube map, radians.
+    """Return the mean angle between texels of a cube map, in radians.
 
     >>> round(spacing_of(64), 4)
     0.0226
@@ -86,7 +95,7 @@ def spacing_of(face: int) -> float:
 
 
 class Shown(msgspec.Struct, frozen=True):
-    """An object of a photo; or a mesh that no photo shows in a trusted pose, with its own materials."""
+    """An object of a photo, or a mesh with its own materials that no photo shows in a trusted pose."""
 
     photo: str | None
     name: str
@@ -97,11 +106,12 @@ class Shown(msgspec.Struct, frozen=True):
 
 
 def _shown(run: Artifacts, objects: Mapping[str, ObjectsSlice]) -> dict[str, list[dict[str, Any]]]:
-    """All objects that can be looked at, and their meshes.
+    """Return all objects that can be viewed, and their meshes.
 
-    objects  photo, name; mesh, its index; materials, by part; rotation, y-up camera from object, row by row; eye, unit, from the object to
-             that camera
-    meshes   name and `_mesh`; objects whose poses scale a mesh by different factors have different ones
+    objects  photo, name; mesh, its index; materials, by part; rotation, y-up camera from object, row by row; eye, unit
+             vector
+             from the object to that camera
+    meshes   name and `_mesh`; poses that scale a mesh by different factors have a mesh each
     """
     files = {name: file for name in sorted(run.set.meshes) if (file := run.folders["export"] / f"{name}.glb").exists()}
     materials = {name: read_part_materials(file) for name, file in files.items()}
@@ -117,7 +127,8 @@ def _shown(run: Artifacts, objects: Mapping[str, ObjectsSlice]) -> dict[str, lis
     kinds = sorted({(each.mesh, each.scale) for each in shown})
     triangles = sum(len(part.faces) for name, _ in kinds for part in loaded[name].values())
     share = min(1.0, MOST_TRIANGLES / max(1, triangles))
-    meshes, placed = [_mesh(loaded[name], np.array(scale), share) for name, scale in kinds], []
+    meshes = [_mesh(loaded[name], np.array(scale), share) for name, scale in kinds]
+    placed = []
     for each in shown:
         mesh = kinds.index((each.mesh, each.scale))
         toward = -(YUP_FROM_CAMERA @ each.pose.apply(meshes[mesh][1][None])[0])
@@ -139,20 +150,22 @@ def _shown(run: Artifacts, objects: Mapping[str, ObjectsSlice]) -> dict[str, lis
 def _mesh(
     parts: Mapping[str, trimesh.Trimesh], scale: Float[np.ndarray, "3"], share: float
 ) -> tuple[dict[str, Any], Float[np.ndarray, "3"]]:
-    """A mesh times a scale, at most `share` of its triangles, and its middle.
+    """Return a mesh times a scale, with at most `share` of its triangles, and its centre.
 
-    vertices  uint16, 3 a vertex, v / 32767.5 − 1 in radii of the mesh from its middle;  normals: int16, times 32767
-    parts     by name, in order: triangles, uint32, 3 a triangle
-    open      whether it has a border; then every triangle stands twice, once for either side
-    sight     see `_sight`
-    simplified_from: its triangles, where fewer are handed over
+    vertices         uint16, 3 per vertex, v / 32767.5 − 1 in radii of the mesh from its centre
+    normals          int16, times 32767
+    parts            by name, in order: triangles, uint32, 3 per triangle
+    open             true if the mesh has a border; every triangle then occurs twice, once for either side
+    sight            see `_sight`
+    simplified_from  number of triangles before simplification, if it was simplified
     """
     vertices = np.concatenate([part.vertices for part in parts.values()]) * scale
     centre = (vertices.min(axis=0) + vertices.max(axis=0)) / 2
     radius = float(np.linalg.norm(vertices - centre, axis=-1).max()) or 1.0
     pieces = [_simplified(part, share) for _, part in sorted(parts.items())]
     vertices, normals, faces = zip(*pieces, strict=True)
-    first, labels = np.cumsum([0, *map(len, vertices)]), np.arange(1, len(pieces) + 1, dtype=np.int16)
+    first = np.cumsum([0, *map(len, vertices)])
+    labels = np.arange(1, len(pieces) + 1, dtype=np.int16)
     mesh = Mesh(
         (np.vstack(vertices) * scale - centre) / radius,
         np.vstack([face + start for face, start in zip(faces, first, strict=False)]),
@@ -174,7 +187,7 @@ def _mesh(
 
 
 def _fine(mesh: Mesh) -> Mesh:
-    """The mesh with edges short enough for shadows to lie between its vertices; longer ones where there would be too many vertices."""
+    """Subdivide the mesh so that shadows fall between its vertices, less finely if there would be too many."""
     longest = LONGEST * np.ptp(mesh.vertices, axis=0).max()
     most = max(MOST_VERTICES // (1 + mesh.open), len(mesh.vertices))
     while len((fine := subdivided(mesh, longest)).vertices) > most:
@@ -183,7 +196,10 @@ def _fine(mesh: Mesh) -> Mesh:
 
 
 def _both_sides(mesh: Mesh) -> Mesh:
-    """The mesh with its triangles turned to their normals, and once more from behind: vertex v is also v + V, with the other normal."""
+    """Return the mesh with its triangles oriented by their normals, followed by a reversed copy.
+
+    Vertex v of a mesh of V vertices is v + V, with the opposite normal, in the copy.
+    """
     turned = np.einsum("fd,fkd->f", area_vectors(mesh.vertices, mesh.faces), mesh.normals[mesh.faces]) < 0
     faces = np.where(turned[:, None], mesh.faces[:, ::-1], mesh.faces)
     return Mesh(
@@ -195,19 +211,24 @@ def _both_sides(mesh: Mesh) -> Mesh:
 
 
 def _sight(mesh: Mesh, sides: Mesh) -> dict[str, Any]:
-    """Which directions the object hides from its own vertices, and where: pairs of a vertex and a direction, in order of the vertices.
+    """Return the directions that an object occludes at its own vertices, as pairs of vertex and direction.
 
-    sides: the mesh as it is handed over, whose vertices look;  mesh: what they meet
+    `mesh` occludes; the vertices are those of `sides`, the mesh as the viewer gets it.  Pairs are in the order of the
+    vertices.
 
-    directions  float32, 3 a direction: evenly spread, at most `MOST_DIRECTIONS`, fewer where vertices are many
-    counts      uint16, by vertex: its pairs, of directions in front of it alone
-    hidden      uint8, by pair: the number of the direction
-    met         uint16, or uint32 where there are too many vertices, by pair: the number of a vertex of what is met there; that of vertices where it is a mesh's inside, which is black
+    directions  float32, 3 per direction: evenly spread, at most `MOST_DIRECTIONS`, fewer for many vertices
+    counts      uint16, per vertex: its number of pairs, for directions in front of it alone
+    hidden      uint8, per pair: index of the direction
+    met         uint16, or uint32 for many vertices, per pair: index of a vertex at the occluder; the number of vertices
+                if
+                it is the inside of the mesh, which is black
     """
     directions = fibonacci_sphere(
         int(np.clip(MOST_DIRECTIONS * MOST_VERTICES // len(sides.vertices), LEAST_DIRECTIONS, MOST_DIRECTIONS))
     )
-    occluders, single = Occluders([mesh], [Pose(np.eye(3), np.zeros(3))]), len(mesh.vertices)
+    occluders = Occluders([mesh], [Pose(np.eye(3), np.zeros(3))])
+    single = len(mesh.vertices)
+    # start points, lifted off the surface along the area-weighted vertex normal
     outward = np.zeros_like(sides.vertices)
     np.add.at(outward, sides.faces.T, area_vectors(sides.vertices, sides.faces))
     outward = unit(outward * np.where(np.sum(outward * sides.normals, 1, keepdims=True) < 0, -1, 1))
@@ -215,6 +236,7 @@ def _sight(mesh: Mesh, sides: Mesh) -> dict[str, Any]:
     pairs = []
     for vertex, k, face, turned in occluders.hidden_from(points, sides.normals, directions):
         met = mesh.faces[face, 0].astype(np.int64)
+        # a hit on the back of a triangle is on the mesh's other side, or inside a closed mesh, which is black
         behind = np.sum(occluders.turned(face, turned) * mesh.normals[met], 1) < 0
         met = np.where((face < 0) | behind & (not mesh.open), len(outward), met + np.where(behind, single, 0))
         pairs.append(np.stack([vertex, k, met])[:, np.sum(sides.normals[vertex] * directions[k], 1) > 0])
@@ -230,7 +252,7 @@ def _sight(mesh: Mesh, sides: Mesh) -> dict[str, Any]:
 def _simplified(
     part: trimesh.Trimesh, share: float
 ) -> tuple[Float[np.ndarray, "v 3"], Float[np.ndarray, "v 3"], Int[np.ndarray, "f 3"]]:
-    """Vertices, normals and triangles, of which at most that share is kept, by quadric error."""
+    """Return vertices, normals and triangles of a part, simplified to `share` of its triangles by quadric error."""
     if share == 1.0:
         return part.vertices, part.vertex_normals, part.faces
     mesh = o3d.geometry.TriangleMesh(o3d.utility.Vector3dVector(part.vertices), o3d.utility.Vector3iVector(part.faces))

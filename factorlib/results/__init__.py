@@ -1,1 +1,1 @@
-"""The files that stages hand on, as typed structs: each has one reader (`jsonfile.write_json` writes those that are JSON)."""
+"""Files that stages exchange, as typed structs with one reader each; `jsonfile.write_json` writes the JSON ones."""

@@ -17,14 +17,18 @@ from factorlib.reading import reading
 from factorlib.results.materials import read_exposures
 from factorlib.wholefile import writing
 
-FRAME = "camera frame of the illumination's photo (OpenCV: x right, y down, z forward), or the world where its photos give world_from_camera"
+FRAME = (
+    "camera frame of the illumination's photo (OpenCV: x right, y down, z forward), "
+    "or the world where its photos give world_from_camera"
+)
 COLUMNS = ("axis_x", "axis_y", "axis_z", "sharpness", "weight_r", "weight_g", "weight_b")
-WHAT, CURE = "a table of lobes", "run the stage `solve` again"
+WHAT = "a table of lobes"
+CURE = "run the stage `solve` again"
 log = logging.getLogger("factorlib.results")
 
 
 def write_lobes(path: str | Path, lights: Mapping[str, Lobes]) -> None:
-    """Write lobes.parquet: one row per lobe, illuminations by name; an illumination may have no lobe."""
+    """Write lobes.parquet, sorted by illumination; an illumination may have no lobe."""
     names = sorted(lights)
     rows = [np.column_stack([lights[n].axis, lights[n].sharpness, lights[n].weight]) for n in names]
     table = np.concatenate([np.zeros((0, len(COLUMNS))), *rows]).astype(float)
@@ -38,7 +42,7 @@ def write_lobes(path: str | Path, lights: Mapping[str, Lobes]) -> None:
 
 
 def read_lobes(path: str | Path, cure: str = CURE) -> dict[str, Lobes]:
-    """Lobes by illumination; raises InputError for a file that `write_lobes` did not write."""
+    """Read the lobes by illumination; InputError for a file that `write_lobes` did not write."""
     columns, about = read_columns(path, WHAT, ("illumination", *COLUMNS), cure=cure)
     with reading(WHAT, path, cure=cure):
         names = msgspec.convert(about["illuminations"], list[str])
@@ -52,9 +56,12 @@ def read_lobes(path: str | Path, cure: str = CURE) -> dict[str, Lobes]:
 
 
 def light_of(exported: Path, photo: str, light: LightSlice) -> Lobes:
-    """Read the light of a photo as pictures are made in it: lobes in the photo's own camera axes, its exposure included.
+    """Read the light of a photo in the photo's own camera axes, with its exposure applied.
 
-    exported: the folder of `export`'s result, whose gauge the light is in
+    Args:
+        exported: the folder of `export`'s result, whose gauge the light is in
+        photo: name of the photo
+        light: the photo's illumination and rotation
     """
     lobes = read_lobes(exported / "lobes.parquet")[light.illumination]
     if len(lobes) == 0:

@@ -1,5 +1,8 @@
-"""JSON of `solve` and `export`: materials.json has reflectances with standard errors, their gauge, and what was decided of the model;
-exposures.json what each photo's light is multiplied by, per channel; uncertainty.json the standard errors and the residual level."""
+"""JSON files of `solve` and `export`: materials.json, exposures.json and uncertainty.json.
+
+materials.json has reflectances with standard errors, their gauge, and the choices of the model.  exposures.json has the
+factor of each photo on its light, per channel.  uncertainty.json has the standard errors and the residual level.
+"""
 
 from collections.abc import Iterable, Sequence
 from pathlib import Path
@@ -18,7 +21,7 @@ Positive = Annotated[float, msgspec.Meta(gt=0)]
 
 
 def vec3(values: Iterable[float]) -> Vec3:
-    """Three numbers as plain floats."""
+    """Return three numbers as plain floats."""
     x, y, z = map(float, values)
     return x, y, z
 
@@ -32,17 +35,17 @@ class Reflectance(msgspec.Struct, frozen=True):
 
     @property
     def alpha(self) -> float:
-        """α of GGX."""
+        """GGX width α."""
         return self.roughness**2
 
     @property
     def total(self) -> float:
-        """max k_d + max k_s."""
+        """The sum max k_d + max k_s."""
         return max(self.diffuse) + max(self.specular)
 
 
 class StandardErrors(msgspec.Struct, frozen=True):
-    """The standard errors of a reflectance, in the gauge that the file's `gauge.stderr` names."""
+    """Standard errors of a reflectance, in the gauge that the file's `gauge.stderr` names."""
 
     diffuse: Channels
     specular: Channels
@@ -50,16 +53,19 @@ class StandardErrors(msgspec.Struct, frozen=True):
 
 
 class Kind(msgspec.Struct, frozen=True):
-    """The likeliest class of a material, dielectric, metal or fabric, by its specular part, and the probability of it."""
+    """Most probable class of a material (dielectric, metal or fabric) by its specular part, and its probability."""
 
     name: str
     probability: Annotated[float, msgspec.Meta(ge=0, le=1)]
 
 
 class Solved(Reflectance, frozen=True):
-    """A solved material; alpha, α = roughness², stands in the file for other programs; kind: where the solver has classes.
+    """A solved material with its standard errors.
 
-    given: the parts that were known beforehand, whose standard errors are 0
+    Attributes:
+        alpha: α = roughness², for other programs
+        kind: class of the material, if the solver has classes
+        given: parts that were known beforehand, with standard errors of 0
     """
 
     alpha: AtLeast0
@@ -74,10 +80,13 @@ class Solved(Reflectance, frozen=True):
 
 
 class Gauge(msgspec.Struct, frozen=True):
-    """Which rule settled the factor per channel that the observations leave free.
+    """Rule that fixed the factor per channel that the observations leave free.
 
-    component: number of each material's connected component, which has a factor of its own;  stderr: the gauge of standard errors
-    export_factor, export_rule: what `export` multiplied all reflectances by, and why
+    Attributes:
+        component: index of each material's connected component, which has its own factor
+        stderr: gauge of the standard errors
+        export_factor: factor of `export` on all reflectances
+        export_rule: reason of that factor
     """
 
     rule: str = ""
@@ -88,16 +97,21 @@ class Gauge(msgspec.Struct, frozen=True):
 
 
 class Tone(msgspec.Struct, frozen=True):
-    """The tone curve of a photo (`factorlib.images.tone`); pivot is the radiance that it leaves as it is."""
+    """Tone curve of a photo (`factorlib.images.tone`).
+
+    Attributes:
+        pivot: radiance that the curve leaves unchanged
+    """
 
     exponent: Positive
     pivot: Positive
 
 
 class Decision(msgspec.Struct, frozen=True):
-    """Whether a part of the model was kept, and the mean held-out loss with and without it; None for what was not tried.
+    """Choice of a part of the model, with the mean held-out loss with and without it; None for what was not tried.
 
-    margin: by how many standard errors the loss is higher without it
+    Attributes:
+        margin: increase of the loss without it, in standard errors
     """
 
     kept: bool
@@ -107,24 +121,27 @@ class Decision(msgspec.Struct, frozen=True):
 
 
 class Started(msgspec.Struct, frozen=True):
-    """What was taken over from an earlier solution."""
+    """Materials and illuminations taken over from an earlier solution."""
 
     materials: list[str]
     illuminations: list[str]
 
 
 class Model(msgspec.Struct, frozen=True):
-    """What was decided of the model, and by what.
+    """Choices of the model, and the evidence for them.
 
-    lobes:           number of lobes, or cells, by illumination
-    held_out_loss:   after each report of the paper's solver
-    light_prior:     whether lights are cells that follow the statistics of natural light
-    self_shadowing_chosen_by, interreflection_chosen_by: the held-out loss of each model that was tried, and the margin in standard errors
-    splitting_chosen_by: of each time that cells were split
-    suns_chosen_by: of a sun in each illumination
-    tone:            curves of the photos that have one;  tone_chosen_by: by illumination
-    distance:        of lights that are not infinitely far away, in RMS distances of a photo's points from their middle;
-                     distance_chosen_by: by illumination
+    Attributes:
+        lobes: number of lobes, or cells, by illumination
+        held_out_loss: loss after each report of the paper's solver
+        light_prior: True if lights are cells with the prior of natural light
+        self_shadowing_chosen_by: held-out loss of each model that was tried, and the margin in standard errors
+        interreflection_chosen_by: held-out loss of each model that was tried, and the margin in standard errors
+        splitting_chosen_by: decision of each splitting of cells
+        suns_chosen_by: decision on a sun, by illumination
+        tone: curves of the photos that have one
+        tone_chosen_by: decision on tone curves, by illumination
+        distance: distance of each light that is not at infinity, in RMS distances of a photo's points from their middle
+        distance_chosen_by: decision on the distance, by illumination
     """
 
     solver: Literal["joint", "paper"] = "joint"
@@ -145,12 +162,12 @@ class Model(msgspec.Struct, frozen=True):
     started_from: Started | UnsetType = UNSET
 
     def curvature(self, illumination: str) -> float:
-        """One over the distance of a light; 0 where it is infinitely far away."""
+        """Return one over the distance of a light; 0 for a light at infinity."""
         return 1 / self.distance[illumination] if illumination in self.distance else 0.0
 
 
 class MaterialTable(msgspec.Struct, frozen=True):
-    """The whole of materials.json."""
+    """Content of materials.json."""
 
     materials: dict[str, Solved]
     gauge: Gauge = Gauge()
@@ -158,16 +175,26 @@ class MaterialTable(msgspec.Struct, frozen=True):
 
 
 class Misfit(msgspec.Struct, frozen=True):
-    """How a photo is explained: the share of its shading that is not (`factorlib.inference.misfit`), and of its values that are clipped."""
+    """Misfit of a photo.
+
+    Attributes:
+        unexplained: share of the photo's shading that is not explained (`factorlib.inference.misfit`)
+        clipped: share of the photo's values that are clipped
+    """
 
     unexplained: AtLeast0
     clipped: AtLeast0
 
 
 class Uncertainty(msgspec.Struct, frozen=True):
-    """residual_sigma: deviation of the residuals in units of the noise model;  materials: by name;  gauge: of the standard errors.
+    """Content of uncertainty.json.
 
-    unexplained: share of the shading of all photos that the answer does not explain;  photos: misfit of each
+    Attributes:
+        residual_sigma: deviation of the residuals in units of the noise model
+        materials: standard errors by material
+        gauge: gauge of the standard errors
+        unexplained: share of the shading of all photos that the solution does not explain
+        photos: misfit of each photo
     """
 
     residual_sigma: AtLeast0
@@ -183,18 +210,25 @@ def solved(
     kind: Kind | UnsetType = UNSET,
     given: list[str] | UnsetType = UNSET,
 ) -> Solved:
-    """A reflectance with its standard errors, α, kind and the parts of it that were known."""
+    """Combine a reflectance with its standard errors.
+
+    Args:
+        reflectance: the reflectance
+        stderr: its standard errors
+        kind: class of the material
+        given: parts of the reflectance that were known beforehand
+    """
     rows = reflectance.diffuse, reflectance.specular, reflectance.roughness
     return Solved(*rows, reflectance.roughness**2, stderr, kind, given)
 
 
 def read_uncertainty(path: str | Path) -> Uncertainty:
-    """Raises InputError for a file that is none."""
+    """Read uncertainty.json; InputError for another file."""
     return read_result(path, Uncertainty, "solve")
 
 
 def read_materials(path: str | Path, cure: str = "") -> MaterialTable:
-    """Raises InputError for a file that is no table of materials."""
+    """Read materials.json; InputError for another file."""
     return read_result(path, MaterialTable, "solve", cure)
 
 
@@ -204,7 +238,16 @@ def reflectances(table: MaterialTable) -> dict[str, Reflectance]:
 
 
 def in_order(table: MaterialTable, names: Sequence[str], path: str | Path) -> list[Solved]:
-    """The materials called `names`; InputError where one is missing in the table, which was read from `path`."""
+    """Return the materials called `names`, in that order.
+
+    Args:
+        table: the materials
+        names: names to look up
+        path: the table's file, for errors
+
+    Raises:
+        InputError: The table lacks a material.
+    """
     for name in names:
         if name not in table.materials:
             found = f"not the materials of this set: {name!r} is missing"
@@ -213,7 +256,7 @@ def in_order(table: MaterialTable, names: Sequence[str], path: str | Path) -> li
 
 
 def read_exposures(path: str | Path, cure: str = "") -> dict[str, Channels]:
-    """Factors by photo, all positive; raises InputError for a file that is none."""
+    """Read the factors by photo, all positive; InputError for another file."""
     exposures = read_result(path, dict[str, Channels], "solve", cure)
     for photo, channels in exposures.items():
         if min(channels) <= 0:

@@ -1,19 +1,20 @@
-"""metrics.json of `evaluate`: errors against the photos and against the truth, and why a part of them is missing.
+"""metrics.json of `evaluate`: errors against the photos and against the truth, and reasons for missing ones.
 
-Keys are stable; every number is finite.  A section that cannot be had is null and `reasons` says why, by section.
+Keys are stable, and every number is finite.  A section that cannot be computed is null, and `reasons` says why, by
+section.
 
-set          counts of photos, materials, illuminations and of the connected components of the observation matrix
-resynthesis  always there: `factorlib.evaluate.resynthesis`
+set          counts of photos, materials, illuminations and connected components of the observation matrix
+resynthesis  always present: `factorlib.evaluate.resynthesis`
 materials    `factorlib.evaluate.materials`
 relighting   `factorlib.evaluate.relighting`
-relit_set    `factorlib.evaluate.relighting`: the relit set score
+relit_set    the relit set score of `factorlib.evaluate.relighting`
 light        `factorlib.evaluate.lights`
 normals      photo -> `NormalError`; see `factorlib.evaluate.geometry`
 poses        photo -> object -> `PoseError`
-verdict      how far the result can be trusted, truth or not; null where no photo shows a material
+verdict      trust in the result, with or without truth; null if no photo shows a material
 
-Wherever there are gauges: none, scalar_per_set, channel_per_photo (`factorlib.evaluate.gauge`).  PSNR in dB, linear
-relative to the white of the truth and after the tone map; DSSIM after the tone map (`factorlib.evaluate.picture`).
+Gauges are none, scalar_per_set and channel_per_photo (`factorlib.evaluate.gauge`).  PSNR is in dB, in linear radiance
+relative to the truth's white and after the tone map.  DSSIM is after the tone map (`factorlib.evaluate.picture`).
 """
 
 from pathlib import Path
@@ -26,7 +27,11 @@ from factorlib.results.materials import Reflectance, Vec3
 
 
 class Counts(msgspec.Struct, frozen=True):
-    """The counts of the set; components: groups of photos that share no material."""
+    """Counts of the set.
+
+    Attributes:
+        components: groups of photos that share no material
+    """
 
     photos: int
     materials: int
@@ -35,7 +40,13 @@ class Counts(msgspec.Struct, frozen=True):
 
 
 class PictureError(msgspec.Struct, frozen=True):
-    """psnr_linear_db and psnr_tonemapped_db in dB, higher is better; dssim in [0, 1], 0 is the same picture."""
+    """Errors of a picture.
+
+    Attributes:
+        psnr_linear_db: dB, higher is better
+        psnr_tonemapped_db: dB, higher is better
+        dssim: in [0, 1]; 0 is the same picture
+    """
 
     psnr_linear_db: float
     psnr_tonemapped_db: float
@@ -46,7 +57,7 @@ Error = TypeVar("Error")
 
 
 class Scored(msgspec.Struct, Generic[Error], frozen=True):
-    """The error of an estimate, and what a null scores in its place."""
+    """Error of an estimate, and that of a null."""
 
     estimate: Error
     null: Error
@@ -56,9 +67,19 @@ ScoredPicture = Scored[PictureError]
 
 
 class PhotoErrors(msgspec.Struct, frozen=True):
-    """pixels, unused (of these), clipped, invalid, uncovered: numbers of pixels.  exposure = 1 / white of the photo.
+    """Errors of the re-synthesis of a photo.
 
-    gauges: gauge -> scores over all counted pixels; null where none counts.  materials: material -> gauge -> scores.
+    Attributes:
+        exposure: 1 / white of the photo
+        pixels: number of counted pixels
+        unused: number of these that the solve did not use
+        clipped: number of clipped pixels
+        invalid: number of pixels left out by the mask or not finite
+        uncovered: number of pixels in the mask that the mesh does not explain
+        clipped_satisfied: fraction of clipped pixels whose re-synthesis reaches the clipped value
+        factor: factor per channel, by gauge
+        gauges: scores over all counted pixels, by gauge; null if there are none
+        materials: scores by material and gauge
     """
 
     exposure: float
@@ -74,7 +95,13 @@ class PhotoErrors(msgspec.Struct, frozen=True):
 
 
 class Resynthesis(msgspec.Struct, frozen=True):
-    """mean: over photos; worst_*: the lowest PSNR of any photo in the gauge `none`; null where no pixel counts at all."""
+    """Errors of the re-synthesis of all photos.
+
+    Attributes:
+        mean: mean over photos, by gauge
+        worst_psnr_linear_db: lowest PSNR of any photo in the gauge `none`; null if no pixel counts
+        worst_psnr_tonemapped_db: lowest PSNR of any photo in the gauge `none`; null if no pixel counts
+    """
 
     photos: dict[str, PhotoErrors]
     mean: dict[str, ScoredPicture] | None
@@ -83,7 +110,13 @@ class Resynthesis(msgspec.Struct, frozen=True):
 
 
 class MaterialError(msgspec.Struct, frozen=True):
-    """roughness: |estimate − truth|; diffuse, specular: signed relative error of each channel, after the factor."""
+    """Errors of a material.
+
+    Attributes:
+        roughness: |estimate − truth|
+        diffuse: signed relative error of each channel, after the factor
+        specular: signed relative error of each channel, after the factor
+    """
 
     roughness: float
     diffuse: Vec3
@@ -91,17 +124,27 @@ class MaterialError(msgspec.Struct, frozen=True):
 
 
 class ComparedMaterial(msgspec.Struct, frozen=True):
-    """A material beside the truth; component: the connected component whose factor it has."""
+    """A material with its truth.
+
+    Attributes:
+        component: connected component whose factor it has
+        estimate: as solved, without the factor
+    """
 
     component: int
     truth: Reflectance
-    estimate: Reflectance  # as solved, the factor not applied
+    estimate: Reflectance
     error: MaterialError
     null: MaterialError
 
 
 class MaterialErrors(msgspec.Struct, frozen=True):
-    """factor: of each component, per channel, on the estimate.  The means are over materials (and channels)."""
+    """Errors of all materials.
+
+    Attributes:
+        factor: factor on the estimates of each component, per channel
+        mean_roughness: mean over materials, as all means; those of colours are over channels too
+    """
 
     factor: dict[str, Vec3]
     materials: dict[str, ComparedMaterial]
@@ -120,7 +163,13 @@ Kinds = dict[str, PictureError]  # kind -> error
 
 
 class RelitBall(msgspec.Struct, frozen=True):
-    """gauges: gauge -> kind -> error.  exposure = 1 / white of the true ball.  observed: seen in this light in a photo."""
+    """A ball of a recovered material in one light.
+
+    Attributes:
+        observed: True if a photo shows the material in this light
+        exposure: 1 / white of the true ball
+        gauges: errors by gauge and kind
+    """
 
     observed: bool
     exposure: float
@@ -128,7 +177,13 @@ class RelitBall(msgspec.Struct, frozen=True):
 
 
 class Relighting(msgspec.Struct, frozen=True):
-    """balls: light -> material.  The means are over balls; mean_unobserved over pairs that no photo shows, null if none."""
+    """Errors of relit balls.
+
+    Attributes:
+        balls: by light and material
+        mean: mean over balls, by gauge and kind
+        mean_unobserved: mean over pairs that no photo shows; null if there are none
+    """
 
     balls: dict[str, dict[str, RelitBall]]
     mean: dict[str, Kinds]
@@ -136,10 +191,14 @@ class Relighting(msgspec.Struct, frozen=True):
 
 
 class RelitSet(msgspec.Struct, frozen=True):
-    """The relit set score over all pairs of a recovered material and a recovered light, dB, higher is better, beside its null's.
+    """The relit set score over all pairs of a recovered material and a recovered light, in dB; higher is better.
 
-    pairs: how many;  worst_material, worst_light: the pair that scores worst_psnr_db
-    factor: per channel, times the recovered reflectances and divided out of the recovered lights
+    Attributes:
+        pairs: number of pairs
+        null_mean_psnr_db: score of the null
+        worst_material: material of the pair with worst_psnr_db
+        worst_light: light of the pair with worst_psnr_db
+        factor: per channel, times the recovered reflectances and divided out of the recovered lights
     """
 
     pairs: int
@@ -152,7 +211,7 @@ class RelitSet(msgspec.Struct, frozen=True):
 
 
 class LightError(msgspec.Struct, frozen=True):
-    """Fractions of the truth's root mean square, and degrees; 0 is perfect."""
+    """Errors of a light, as fractions of the truth's root mean square and in degrees; 0 is perfect."""
 
     rmse: float
     rmse_scale_invariant: float
@@ -163,9 +222,14 @@ ScoredLight = Scored[LightError]
 
 
 class LightErrors(msgspec.Struct, frozen=True):
-    """gauge -> view -> errors; the views are mirror, glossy, lambertian and map_all, map_mirrored, map_unmirrored.
+    """Errors of lights, by gauge and view.
 
-    mean: over lights.  mirrored_fraction: of the sphere, by light; null where no observation is known.
+    The views are mirror, glossy, lambertian and map_all, map_mirrored, map_unmirrored.
+
+    Attributes:
+        lights: errors by light, gauge and view
+        mean: mean over lights
+        mirrored_fraction: share of the sphere that some pixel mirrors, by light; null if no observations are known
     """
 
     lights: dict[str, dict[str, dict[str, ScoredLight]]]
@@ -174,7 +238,7 @@ class LightErrors(msgspec.Struct, frozen=True):
 
 
 class AngleError(msgspec.Struct, frozen=True):
-    """Degrees."""
+    """Median and 90th percentile of angles, in degrees."""
 
     median_deg: float
     p90_deg: float
@@ -189,7 +253,13 @@ class NormalError(msgspec.Struct, frozen=True):
 
 
 class PoseError(msgspec.Struct, frozen=True):
-    """rotation in degrees; translation as a fraction of the true distance; null is a random rotation's mean angle."""
+    """Errors of a pose.
+
+    Attributes:
+        rotation_deg: angle in degrees
+        translation_relative: distance over the true distance from the camera
+        null_rotation_deg: mean angle of a random rotation
+    """
 
     rotation_deg: float
     translation_relative: float
@@ -197,11 +267,14 @@ class PoseError(msgspec.Struct, frozen=True):
 
 
 class Verdict(msgspec.Struct, frozen=True):
-    """How far a result can be trusted, from what is known without truth (`factorlib.evaluate.verdict`).
+    """Trust in a result from what is known without truth (`factorlib.evaluate.verdict`).
 
-    expected_relit_db, deviation_db: the relit set score that is expected, and how far scores of made sets lie from that
-    reasons: what speaks against the result, the weightiest first;  next: what would help most
-    terms: what each sign adds to the mean square error that is expected of shown balls
+    Attributes:
+        expected_relit_db: expected relit set score
+        deviation_db: deviation of the scores of made sets from the expected ones
+        reasons: what limits the score, the largest term first
+        next: the most helpful next step
+        terms: terms of the expected mean square error of shown balls
     """
 
     trust: Literal["good", "usable with care", "do not trust"]
@@ -213,7 +286,7 @@ class Verdict(msgspec.Struct, frozen=True):
 
 
 class Metrics(msgspec.Struct, frozen=True):
-    """Everything that `evaluate` says of a set."""
+    """Content of metrics.json."""
 
     set: Counts
     resynthesis: Resynthesis
@@ -228,5 +301,5 @@ class Metrics(msgspec.Struct, frozen=True):
 
 
 def read_metrics(path: str | Path) -> Metrics:
-    """Raises InputError for a file that is none."""
+    """Read metrics.json; InputError for another file."""
     return read_result(path, Metrics, "evaluate")

@@ -1,4 +1,7 @@
-"""photos.json of `masks`: what is known of each photo.  `masks` writes the entry of one as <photo>.json; photos.json gathers those."""
+"""photos.json of `masks`: facts about each photo.
+
+`masks` writes the entry of one photo as <photo>.json; photos.json collects them.
+"""
 
 from pathlib import Path
 from typing import Annotated
@@ -12,12 +15,15 @@ Size = Annotated[int, msgspec.Meta(ge=1)]
 
 
 class PhotoFacts(msgspec.Struct, frozen=True):
-    """Pixels are those of masks' <photo>.exr, each of which stands for factor² of the photo's.
+    """Facts about one photo, in pixels of <photo>.exr of `masks`, each of which covers factor² of the photo's.
 
-    original_size     width and height of the photo itself, as displayed
-    focal_px          None where nothing is known of it;  focal_source: dataset or exif
-    exposure          t·S/N² from EXIF, None where unknown
-    pixels            the valid ones of each material;  clipped_fraction: the share of them clipped in any channel
+    Attributes:
+        original_size: width and height of the photo itself, as displayed
+        focal_px: None if it is unknown
+        focal_source: dataset or exif
+        exposure: t·S/N² from EXIF, None if it is unknown
+        pixels: number of valid pixels by material
+        clipped_fraction: share of them clipped in any channel
     """
 
     width: Size
@@ -34,10 +40,10 @@ class PhotoFacts(msgspec.Struct, frozen=True):
 
 
 def read_photo_facts(path: str | Path) -> PhotoFacts:
-    """The entry of one photo; raises InputError for a file that is none."""
+    """Read the entry of one photo; InputError for another file."""
     return read_result(path, PhotoFacts, "masks")
 
 
 def read_photos(path: str | Path) -> dict[str, PhotoFacts]:
-    """All entries, by photo; raises InputError for a file that is none."""
+    """Read all entries by photo; InputError for another file."""
     return read_result(path, dict[str, PhotoFacts], "masks")

@@ -1,6 +1,6 @@
-"""poses.json of `align`: the camera and every object's pose, by photo, and how far to believe them.
+"""poses.json of `align`: camera and object poses by photo, with measures of confidence.
 
-`align` writes the entry of one photo as <photo>.json; poses.json gathers those.
+`align` writes the entry of one photo as <photo>.json; poses.json collects them.
 """
 
 from pathlib import Path
@@ -22,7 +22,7 @@ Positive = Annotated[float, msgspec.Meta(gt=0)]
 
 
 class PoseEntry(msgspec.Struct, frozen=True):
-    """cam_from_object: x_cam = rotation · (scale ∘ x_object) + translation, the scale being the object's."""
+    """The pose cam_from_object: x_cam = rotation · (scale ∘ x_object) + translation, with the object's scale."""
 
     rotation: tuple[Vec3, Vec3, Vec3]
     translation: Vec3
@@ -34,17 +34,25 @@ class PoseEntry(msgspec.Struct, frozen=True):
 
 
 class RunnerUp(PoseEntry, frozen=True):
-    """The pose that came second: its labelled IoU, and how far its normals are from those of the pose found, degrees."""
+    """The second-best pose.
+
+    Attributes:
+        score: labelled IoU
+        normal_difference_deg: angle between its normals and those of the best pose, degrees
+    """
 
     score: float
     normal_difference_deg: float
 
 
 class ObjectEntry(PoseEntry, frozen=True):
-    """An object's pose and how far to believe it (`factorlib.align.trust`); None for what was not measured.
+    """An object's pose and its measures of confidence (`factorlib.align.trust`); None for what was not measured.
 
-    scale: factors of the mesh's axes;  source: found, keypoints, refined (an earlier result), or who gave the pose
-    doubts: what speaks against the pose, in words;  left_out: of the solve, for these doubts
+    Attributes:
+        scale: factors on the mesh's axes
+        source: origin of the pose: found, keypoints, refined (an earlier result), or who gave it
+        doubts: reasons against the pose, in words
+        left_out: True if the solve leaves the object out because of them
     """
 
     scale: tuple[Positive, Positive, Positive] = AS_IT_IS
@@ -61,7 +69,11 @@ class ObjectEntry(PoseEntry, frozen=True):
 
 
 class CameraEntry(msgspec.Struct, frozen=True):
-    """The camera in pixels of masks' <photo>.exr, each of which stands for factor² of the photo's; focal_source as of `align`."""
+    """The camera in pixels of <photo>.exr of `masks`, each of which covers factor² of the photo's.
+
+    Attributes:
+        focal_source: see `align`
+    """
 
     focal_px: Positive
     principal_point: tuple[float, float]
@@ -75,19 +87,19 @@ class CameraEntry(msgspec.Struct, frozen=True):
 
 
 class PhotoPoses(msgspec.Struct, frozen=True):
-    """The entry of one photo."""
+    """Camera and object poses of one photo."""
 
     camera: CameraEntry
     objects: dict[str, ObjectEntry]
 
 
 def entry_of(pose: Pose) -> dict[str, list]:
-    """The fields of a `PoseEntry`."""
+    """Return the fields of a `PoseEntry`."""
     return {"rotation": pose.rotation.tolist(), "translation": pose.translation.tolist()}
 
 
 def read_poses(path: str | Path, cure: str = CURE) -> dict[str, PhotoPoses]:
-    """Read the poses by photo; raises InputError for a file that holds none."""
+    """Read the poses by photo; InputError for another file."""
     photos = read_result(path, dict[str, PhotoPoses], "align", cure)
     for name, photo in photos.items():
         _check(photo, path, f"{name}.objects", cure)
@@ -95,7 +107,7 @@ def read_poses(path: str | Path, cure: str = CURE) -> dict[str, PhotoPoses]:
 
 
 def read_photo_poses(path: str | Path) -> PhotoPoses:
-    """The entry of one photo; raises InputError for a file that is none."""
+    """Read the entry of one photo; InputError for another file."""
     photo = read_result(path, PhotoPoses, "align")
     _check(photo, path, "objects", "run the stage `align` again")
     return photo

@@ -1,4 +1,4 @@
-"""shapes.json: cameras that structure from motion found, and shapes that were found of masks."""
+"""shapes.json: cameras from structure from motion, and shapes reconstructed from masks."""
 
 from pathlib import Path
 
@@ -11,9 +11,13 @@ FILE = "shapes.json"
 
 
 class ShapeEntry(msgspec.Struct, frozen=True):
-    """kind: hull, lathe, ball, box or cylinder;  extent: of its bounding box, in its own units;  photos: whose outlines were used
+    """A reconstructed shape.
 
-    overlap: of the shape with these outlines, mean IoU
+    Attributes:
+        kind: hull, lathe, ball, box or cylinder
+        extent: size of its bounding box, in its own units
+        photos: photos whose outlines were used
+        overlap: mean IoU of the shape with these outlines
     """
 
     kind: str
@@ -24,12 +28,17 @@ class ShapeEntry(msgspec.Struct, frozen=True):
 
 
 class ShapesTable(msgspec.Struct, frozen=True):
-    """cameras: by photo, of those that structure from motion placed;  meshes: by name"""
+    """Content of shapes.json.
+
+    Attributes:
+        cameras: cameras that structure from motion placed, by photo
+        meshes: shapes by name
+    """
 
     cameras: dict[str, ExternalCamera] = {}
     meshes: dict[str, ShapeEntry] = {}
 
 
 def read_shapes(folder: Path | None) -> ShapesTable:
-    """Read the table in the folder of the stage `shapes`; it is empty where a data set has none."""
+    """Read the table in the folder of the stage `shapes`; it is empty without a folder."""
     return ShapesTable() if folder is None else read_result(folder / FILE, ShapesTable, "shapes")

@@ -1,4 +1,4 @@
-"""An earlier solution, from which a solve may start: materials.json, lobes.parquet and exposures.json of a folder."""
+"""An earlier solution from which a solve may start: materials.json, lobes.parquet and exposures.json of a folder."""
 
 from pathlib import Path
 
@@ -15,7 +15,12 @@ CURE = "name the folder of a result of `solve`, as it was written"
 
 
 class Earlier(msgspec.Struct, frozen=True):
-    """lights: in scene radiance, by illumination;  exposures: factor of each photo on its illumination, per channel."""
+    """An earlier solution.
+
+    Attributes:
+        lights: in scene radiance, by illumination
+        exposures: factor of each photo on its illumination, per channel
+    """
 
     table: MaterialTable
     lights: dict[str, Lobes]
@@ -23,16 +28,16 @@ class Earlier(msgspec.Struct, frozen=True):
 
     @property
     def self_shadowing(self) -> str | None:
-        """`on` or `off`, as it was decided, where both were tried; else None."""
+        """`on` or `off` as chosen, if both were tried; else None."""
         return _decided(self.table.model.self_shadowing, self.table.model.self_shadowing_chosen_by)
 
     @property
     def interreflection(self) -> str | None:
-        """Whether bounces were used, as `self_shadowing` says of shadows."""
+        """`on` or `off` as chosen, if both were tried; else None."""
         return _decided(self.table.model.interreflection, self.table.model.interreflection_chosen_by)
 
     def beside(self, relative: dict[str, float]) -> "Earlier":
-        """Return the solution with exposures that are factors on `relative` ones: of each photo, those that radiances are divided by."""
+        """Return the solution with exposures relative to those that the photos' radiances are divided by."""
         exposures = {p: tuple(e / relative.get(p, 1.0) for e in each) for p, each in self.exposures.items()}
         return msgspec.structs.replace(self, exposures=exposures)
 
@@ -42,12 +47,14 @@ def _decided(kept: bool, chosen_by: dict[str, float]) -> str | None:
 
 
 def read_earlier(folder: Path) -> Earlier:
-    """Raises InputError for files that the stage `solve` did not write."""
+    """Read the solution in a folder; InputError for files that the stage `solve` did not write."""
     table, lobes, exposures = (folder / name for name in FILES)
     earlier = Earlier(read_materials(table, CURE), read_lobes(lobes, CURE), read_exposures(exposures, CURE))
-    fault, path = None, lobes
+    fault = None
+    path = lobes
     if set(earlier.table.gauge.component) != set(earlier.table.materials):
-        fault, path = "`gauge.component` names other materials", table
+        fault = "`gauge.component` names other materials"
+        path = table
     for name, light in earlier.lights.items():
         finite = all(np.isfinite(part).all() for part in (light.axis, light.sharpness, light.weight))
         shaped = (light.sharpness > 0).all() and (np.linalg.norm(light.axis, axis=1) > 0.5).all()

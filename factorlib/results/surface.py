@@ -1,4 +1,4 @@
-"""surface.json of `surface`: how meshes differ from the given ones, as shading has it, and what decided."""
+"""surface.json of `surface`: refinement of the meshes by shading, and the evidence for it."""
 
 from pathlib import Path
 from typing import Any
@@ -7,14 +7,18 @@ import msgspec
 
 from factorlib.jsonfile import read_result
 
-FILE, BEGINNING = "surface.json", "beginning.json"
+FILE = "surface.json"
+BEGINNING = "beginning.json"
 
 
 class Tried(msgspec.Struct, frozen=True):
-    """What decided, of photos that had no part in the surface; None where nothing was tried.
+    """Evidence from photos that had no part in the surface; None for what was not tried.
 
-    held_out_loss_with, held_out_loss_without   of their held-out observations;  margin: of the difference of the logarithms, in standard errors
-    stiffness   of what is kept: the best of those that were tried
+    Attributes:
+        held_out_loss_with: loss of their held-out observations with the refinement
+        held_out_loss_without: loss of their held-out observations without it
+        margin: difference of the logarithms, in standard errors
+        stiffness: the best of the values that were tried
     """
 
     held_out_loss_with: float | None = None
@@ -24,18 +28,23 @@ class Tried(msgspec.Struct, frozen=True):
 
     @classmethod
     def of(cls, evidence: Any, stiffness: float | None) -> "Tried":
-        """Make one of the solver's evidence."""
+        """Convert the solver's evidence."""
         return cls(evidence.held_out_loss_with, evidence.held_out_loss_without, evidence.margin, stiffness)
 
 
 class SurfaceTable(msgspec.Struct, frozen=True):
-    """How the surfaces of a set differ from its meshes.
+    """Differences between the surfaces of a set and its meshes.
 
-    moved, moved_by      whether surfaces differ from the given meshes, and what decided
-    painted, painted_by  whether diffuse reflectance has detail, over what moved surfaces explain
-    gains          by photo: how much minus twice the log marginal likelihood of its observations fell, while it had no part in the surface
-    displacements  by mesh: along the normal of each node of the subdivided mesh (`factorlib.meshes.fine`), over the mesh's extent; none where not moved
-    log_factors    by mesh: of the diffuse reflectance at each node; none where not painted
+    Attributes:
+        moved: True if surfaces differ from the given meshes
+        moved_by: evidence for it
+        painted: True if diffuse reflectance has detail, beyond what moved surfaces explain
+        painted_by: evidence for it
+        gains: by photo: decrease of minus twice the log marginal likelihood of its observations, without a part in the
+            surface
+        displacements: by mesh: along the normal at each node of the subdivided mesh (`factorlib.meshes.fine`), in
+            extents
+        log_factors: by mesh: log factor on diffuse reflectance at each node
     """
 
     moved: bool = False
@@ -48,7 +57,11 @@ class SurfaceTable(msgspec.Struct, frozen=True):
 
 
 def read_surface(folder: str | Path | None) -> SurfaceTable:
-    """The table in the folder of a result of `surface`; without a folder, meshes are as given.  Raises InputError for a file that is none."""
+    """Read the table in a result folder of `surface`; without a folder, meshes are as given.
+
+    Raises:
+        InputError: The file is not such a table.
+    """
     if folder is None:
         return SurfaceTable()
     return read_result(Path(folder) / FILE, SurfaceTable, "surface")

@@ -1,1 +1,4 @@
-"""Shapes of objects that no mesh is given of, and cameras, from masks and photos: hulls, bodies of revolution, primitives, structure from motion."""
+"""Shapes of objects without a given mesh, and cameras, from masks and photos.
+
+The methods are visual hulls, bodies of revolution, primitives, and structure from motion.
+"""

@@ -1,11 +1,12 @@
-"""The visual hull: the largest body that fits into all outlines (Laurentini 1994), where the cameras are known.
+"""Visual hull: the largest body that fits into all outlines (Laurentini 1994), for known cameras.
 
     f(x) = min over photos of (pixels that x lies inside the outline) · (its depth / focal length)
 
-is negative outside.  It is sampled on a grid; the surface f = 0 is meshed by surface nets (Gibson 1998: in each cell that the surface
-crosses, a vertex in the middle of where it crosses the cell's edges), which close where f is negative on the grid's border.  Then it is
-smoothed without shrinking (Taubin 1995), as far as its outlines allow: where they meet, a hull has ridges, which bodies seldom have.  A
-face belongs to the part that most photos show there.
+f is negative outside the hull. It is sampled on a grid. Surface nets (Gibson 1998) mesh the surface f = 0: each cell
+that the surface crosses gets a vertex, the mean of the points where it crosses the cell's edges. The mesh is closed if
+f is negative on the grid's border. It is then smoothed without shrinking (Taubin 1995), as far as its outlines allow: a
+hull has ridges where outlines meet, which real bodies seldom have. A face belongs to the part that most photos show
+there.
 """
 
 from collections.abc import Callable, Sequence
@@ -25,12 +26,12 @@ from factorlib.geometry.raster import Caster, rasterise
 from factorlib.meshes.mesh import area_vectors
 from factorlib.shapes.outline import FREE, Outline, Triangles
 
-FIRST = 32  # cells of the longest side, to find where the body is
-LEAST_SHARE = 0.02  # of the largest piece's faces: what is smaller is left away
-SMOOTHINGS = (10, 40, 160, 640)  # rounds, of which the most are taken that leave the outlines as they are:
+FIRST = 32  # cells of the longest side of the first grid, which locates the body
+LEAST_SHARE = 0.02  # share of the largest piece's faces: smaller pieces are removed
+SMOOTHINGS = (10, 40, 160, 640)  # rounds of smoothing; the most that keep the outlines are taken
 SMOOTHED_AWAY = 0.004  # overlap (IoU) that smoothing may cost
-SLAB = 1 << 18  # points at a time
-LEAST_Z = 1e-6
+SLAB = 1 << 18  # number of points evaluated at once
+LEAST_Z = 1e-6  # least depth in front of a camera
 
 Points = Float[np.ndarray, "n 3"]
 
@@ -38,30 +39,51 @@ Points = Float[np.ndarray, "n 3"]
 def visual_hull(
     outlines: Sequence[Outline], cells: int, parts: int = 1, report: Callable[[float], None] = lambda share: None
 ) -> Triangles:
-    """The hull in the object's frame.  outlines: all with poses;  cells: of the grid, along its longest side;  parts: of the object.
+    """Compute the visual hull in the object's frame.
 
-    report: the share that is done.  Raises InputError where there are fewer than two outlines, or nothing fits into all of them.
+    Args:
+        outlines: Outlines, all with poses.
+        cells: Number of grid cells along the longest side.
+        parts: Number of parts of the object.
+        report: Function of the share that is done.
+
+    Returns:
+        The mesh with its parts and its overlap with the outlines.
+
+    Raises:
+        InputError: If there are fewer than two outlines, or nothing fits into all of them.
     """
     if len(outlines) < 2:
         fault = f"{'only one photo' if outlines else 'no photo'} with a known camera shows it"
-        cure = "a hull needs two at least, better ten: `cameras: {sfm: true}` finds them where photos overlap, or use lathe or primitive"
+        cure = (
+            "a hull needs two at least, better ten: `cameras: {sfm: true}` finds them where photos overlap, or use "
+            "lathe or primitive"
+        )
         raise InputError(fault, cure=cure)
     middle, radius = _about(outlines)
-    low, high = middle - radius, middle + radius
+    low = middle - radius
+    high = middle + radius
+    # sample f on a coarse grid to locate the body, then on a fine one about it
     for count in (FIRST, cells):
         step = float((high - low).max()) / count
         shape = np.ceil((high - low) / step).astype(int) + 3
         origin = (low + high) / 2 - step * (shape - 1) / 2
         field = _sampled(outlines, origin, step, shape, report)
-        least = -step if count == FIRST != cells else 0  # at first, what is thinner than a cell too
+        least = -step if count == FIRST != cells else 0  # the coarse grid also keeps parts thinner than a cell
         inside = np.argwhere(field > least)
         if not len(inside):
-            cure = "are masks and cameras of the same photos, and does each photo show the whole object or say by 255 what hides it?"
+            cure = (
+                "are masks and cameras of the same photos, and does each photo show the whole object or say by 255 "
+                "what hides it?"
+            )
             raise InputError("no body fits into the outlines of all photos", cure=cure)
-        low, high = origin + step * (inside.min(axis=0) - 1), origin + step * (inside.max(axis=0) + 1)
+        low = origin + step * (inside.min(axis=0) - 1)
+        high = origin + step * (inside.max(axis=0) + 1)
     vertices, faces = surface_nets(unambiguous(np.pad(field, 1, constant_values=-step)))
     vertices, faces = _largest(vertices, faces)
-    mesh, smoothed = trimesh.Trimesh(origin + step * (vertices - 1), faces, process=False), []
+    mesh = trimesh.Trimesh(origin + step * (vertices - 1), faces, process=False)
+    smoothed = []
+    # smooth in stages; take the last stage that keeps the overlap
     for more in np.diff(SMOOTHINGS, prepend=0):
         trimesh.smoothing.filter_taubin(mesh, iterations=int(more))
         shape = Triangles(np.array(mesh.vertices), faces)
@@ -71,8 +93,9 @@ def visual_hull(
 
 
 def overlap(shape: Triangles, outlines: Sequence[Outline]) -> float:
-    """The mean IoU of a shape with the outlines that have a pose."""
-    caster, overlaps = Caster(shape.as_mesh()), []
+    """Return the mean IoU of a shape with the outlines; all must have poses."""
+    caster = Caster(shape.as_mesh())
+    overlaps = []
     for one in outlines:
         target = target_of(one.silhouette, (1,), 200)
         whole = Silhouette(np.where(target.silhouette.label > 0, 1, target.silhouette.label))
@@ -81,7 +104,10 @@ def overlap(shape: Triangles, outlines: Sequence[Outline]) -> float:
 
 
 def agreement(outlines: Sequence[Outline]) -> float:
-    """The overlap of a coarse hull with its outlines: whether cameras move with what the outlines show; 0 where nothing fits."""
+    """Return the overlap of a coarse hull with its outlines, 0 if nothing fits.
+
+    It is high if the cameras move with the objects that the outlines show.
+    """
     try:
         return visual_hull(outlines, FIRST).overlap
     except InputError:
@@ -89,19 +115,28 @@ def agreement(outlines: Sequence[Outline]) -> float:
 
 
 def _about(outlines: Sequence[Outline]) -> tuple[Float[np.ndarray, "3"], float]:
-    """The point nearest to the rays through the outlines' middles, and a radius about it that holds the smallest cone's outline."""
-    left, right, places = np.zeros((3, 3)), np.zeros(3), []
+    """Return the point nearest to the rays through the outlines' centres, and a radius about it.
+
+    The radius is the least extent of an outline, projected back to that point.
+    """
+    left = np.zeros((3, 3))
+    right = np.zeros(3)
+    places = []
     for outline in outlines:
-        rotation, centre = outline.pose.rotation, -outline.pose.rotation.T @ outline.pose.translation
+        rotation = outline.pose.rotation
+        centre = -outline.pose.rotation.T @ outline.pose.translation
         ray = rotation.T @ outline.camera.rays_through(outline.middle[None])[0]
         ray /= np.linalg.norm(ray)
+        # normal equations of the point nearest to all rays: Σ (I − d dᵀ)(x − c) = 0
         across = np.eye(3) - np.outer(ray, ray)
-        left, right = left + across, right + across @ centre
+        left = left + across
+        right = right + across @ centre
         places.append((centre, ray))
     if np.linalg.cond(left) > 1e8:
         cure = "a hull needs photos from different sides"
         raise InputError("all photos see it from the same side", cure=cure)
-    middle, radii = np.linalg.solve(left, right), []
+    middle = np.linalg.solve(left, right)
+    radii = []
     for outline, (centre, ray) in zip(outlines, places, strict=True):
         depth = float((middle - centre) @ ray)
         if depth <= 0:
@@ -112,7 +147,7 @@ def _about(outlines: Sequence[Outline]) -> tuple[Float[np.ndarray, "3"], float]:
 
 
 def inside_all(outlines: Sequence[Outline], points: Points) -> Float[np.ndarray, " n"]:
-    """f at points of the object's frame, in its units; outside at a camera's back."""
+    """Return f at points of the object's frame, in its units; points behind a camera are outside."""
     least = np.full(len(points), np.inf)
     for outline in outlines:
         seen = outline.pose.apply(points)
@@ -126,6 +161,7 @@ def inside_all(outlines: Sequence[Outline], points: Points) -> Float[np.ndarray,
 def _sampled(
     outlines: Sequence[Outline], origin: np.ndarray, step: float, shape: np.ndarray, report: Callable[[float], None]
 ) -> Float[np.ndarray, "x y z"]:
+    """Sample f on a grid."""
     field = np.empty(int(np.prod(shape)))
     for start in range(0, len(field), SLAB):
         index = np.stack(np.unravel_index(np.arange(start, min(start + SLAB, len(field))), shape), axis=-1)
@@ -135,10 +171,15 @@ def _sampled(
 
 
 def surface_nets(field: Float[np.ndarray, "x y z"]) -> tuple[Points, Int[np.ndarray, "f 3"]]:
-    """The surface field = 0 in grid units, closed where the field is not positive on the grid's border; faces look toward less of it."""
+    """Mesh the surface field = 0 in grid units, by surface nets; faces point toward lower values.
+
+    The mesh is closed if the field is not positive on the grid's border.
+    """
     shape = np.array(field.shape)
-    cells, inside = shape - 1, field > 0
-    total, count = np.zeros((*cells, 3)), np.zeros(cells)
+    cells = shape - 1
+    inside = field > 0
+    total = np.zeros((*cells, 3))
+    count = np.zeros(cells)
     quads = []
     for axis in range(3):
         other = [k for k in range(3) if k != axis]
@@ -146,9 +187,10 @@ def surface_nets(field: Float[np.ndarray, "x y z"]) -> tuple[Points, Int[np.ndar
         second = tuple(slice(1, None) if k == axis else slice(None) for k in range(3))
         crossed = np.argwhere(inside[first] != inside[second])
         a, b = field[first][tuple(crossed.T)], field[second][tuple(crossed.T)]
+        # crossing of each edge, by linear interpolation; each of the four cells about the edge averages its crossings
         place = crossed.astype(float)
         place[:, axis] += a / (a - b)
-        around = []  # the four cells about an edge, in turn
+        around = []
         for down in ((0, 0), (1, 0), (1, 1), (0, 1)):
             cell = crossed.copy()
             cell[:, other] -= down
@@ -157,7 +199,8 @@ def surface_nets(field: Float[np.ndarray, "x y z"]) -> tuple[Points, Int[np.ndar
             np.add.at(count, tuple(cell[held].T), 1)
             around.append(np.where(held, np.ravel_multi_index(np.clip(cell, 0, cells - 1).T, cells), -1))
         corner = np.stack(around, axis=1)
-        turned = (a > 0) == (axis == 1)  # the other axes of y are x, z: left-handed
+        # orient the quads; for axis y the other axes are x, z, which are left-handed
+        turned = (a > 0) == (axis == 1)
         corner = np.where(turned[:, None], corner[:, ::-1], corner)
         quads.append(corner[(corner >= 0).all(axis=1)])
     quad = np.concatenate(quads)
@@ -169,8 +212,10 @@ def surface_nets(field: Float[np.ndarray, "x y z"]) -> tuple[Points, Int[np.ndar
 
 
 def unambiguous(field: Float[np.ndarray, "x y z"]) -> Float[np.ndarray, "x y z"]:
-    """The field with points filled where two opposite corners of a square are inside and the others not: there an edge of the net would
-    have four faces."""
+    """Fill grid points so that no edge of the net has four faces.
+
+    That happens where two opposite corners of a square are inside and the other two outside.
+    """
     field = field.copy()
     least = np.abs(field[field > 0]).min()
     while True:
@@ -187,7 +232,7 @@ def unambiguous(field: Float[np.ndarray, "x y z"]) -> Float[np.ndarray, "x y z"]
 
 
 def _largest(vertices: Points, faces: Int[np.ndarray, "f 3"]) -> tuple[Points, Int[np.ndarray, "f 3"]]:
-    """Without small pieces beside the largest."""
+    """Remove small pieces beside the largest one."""
     edges = np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]]])
     graph = coo_array((np.ones(len(edges)), edges.T), shape=(len(vertices), len(vertices)))
     piece = connected_components(graph, directed=False)[1][faces[:, 0]]
@@ -199,15 +244,20 @@ def _largest(vertices: Points, faces: Int[np.ndarray, "f 3"]) -> tuple[Points, I
 def _parts_of(
     vertices: Points, faces: Int[np.ndarray, "f 3"], outlines: Sequence[Outline], parts: int
 ) -> Int[np.ndarray, " f"]:
-    """The part that most photos which see a face show there; of the nearest face that is seen, where none does."""
+    """Return the part of each face, by majority among the photos that see it.
+
+    A face that no photo sees gets the votes of the nearest visible face.
+    """
     votes = np.zeros((len(faces), parts), int)
     if parts > 1:
         area = area_vectors(vertices, faces)
-        caster, centre = Caster(Triangles(vertices, faces).as_mesh()), vertices[faces].mean(axis=1)
+        caster = Caster(Triangles(vertices, faces).as_mesh())
+        centre = vertices[faces].mean(axis=1)
         for outline in outlines:
             hits = caster.cast(outline.camera, outline.pose)
             seen = outline.pose.apply(centre)
             facing = np.einsum("nd,nd->n", area @ outline.pose.rotation.T, seen) < 0
+            # faces toward the camera that lie on the first surface hit, within their own size
             x, y = np.floor(outline.camera.project(np.where(seen[:, 2:] > LEAST_Z, seen, 1.0))).astype(int).T
             height, width = outline.part.shape
             near = np.flatnonzero(facing & (seen[:, 2] > LEAST_Z) & (x >= 0) & (x < width) & (y >= 0) & (y < height))

@@ -1,4 +1,4 @@
-"""An object's outline in a photo, as shapes are found from it, and triangles as they are written."""
+"""Outline of an object in a photo, the input of shape estimation, and triangles, its result."""
 
 from functools import cached_property
 from pathlib import Path
@@ -15,14 +15,14 @@ from factorlib.geometry.camera import Camera, Pose
 from factorlib.meshes.mesh import Mesh
 from factorlib.wholefile import write_text
 
-FREE = 1e9  # pixels: farther inside than any outline; of places that no photo shows
+FREE = 1e9  # signed distance of places that the photo does not show, pixels: farther inside than any outline
 
 
 class Outline(msgspec.Struct, frozen=True, dict=True):
-    """An object in a photo.
+    """Object in a photo.
 
-    part   [h, w] number of the object's part that a pixel shows, from 1; 0 background, −1 where the photo does not say
-    prior  what is known of the focal length;  pose  cam_from_object, where it is known
+    part   [h, w] number of the object's part that a pixel shows, from 1; 0 background, −1 unknown
+    prior  prior of the focal length;  pose  cam_from_object, if it is known
     """
 
     photo: str
@@ -33,23 +33,26 @@ class Outline(msgspec.Struct, frozen=True, dict=True):
 
     @property
     def silhouette(self) -> Silhouette:
-        """Its parts as labels."""
+        """Silhouette with the parts as labels."""
         return Silhouette(self.part)
 
     @property
     def middle(self) -> Float[np.ndarray, "2"]:
-        """Middle of the bounding box (x, y)."""
+        """Centre (x, y) of the bounding box."""
         low, high, _ = extent_of(self.silhouette)
         return (low + high) / 2
 
     @property
     def is_seen(self) -> bool:
-        """Whether the photo shows any of it."""
+        """True if the photo shows any part of the object."""
         return bool((self.part > 0).any())
 
     def inner(self, pixels: Float[np.ndarray, "*n 2"]) -> Float[np.ndarray, "*n"]:
-        """Return how many pixels inside the outline points (x, y) lie, negative outside.  Only background says that there is no object: where nothing
-        is known counts as inside, and a point beyond the frame is as far outside as background at the frame is, else FREE."""
+        """Return the signed distance of points (x, y) to the outline in pixels, positive inside.
+
+        Only background counts as outside: unknown pixels are inside. A point beyond the frame is outside if the nearest
+        pixel of the frame is, at the sum of both distances; otherwise the value is FREE.
+        """
         x, y = pixels[..., 0], pixels[..., 1]
         values = map_coordinates(self._distance, np.stack([y, x]) - 0.5, order=1, mode="nearest")
         height, width = self.part.shape
@@ -58,15 +61,17 @@ class Outline(msgspec.Struct, frozen=True, dict=True):
 
     @cached_property
     def _distance(self) -> Float[np.ndarray, "h w"]:
+        """Signed distance of each pixel to the background's border, positive inside."""
         empty = self.part == 0
         far = distance_transform_edt(~empty) if empty.any() else np.full(empty.shape, float(sum(empty.shape)))
         return np.where(empty, 0.5 - distance_transform_edt(empty), far - 0.5)
 
 
 class Triangles(msgspec.Struct, frozen=True):
-    """A shape: vertices [V, 3] in its own frame, faces [F, 3] counter-clockwise from outside.
+    """Shape as a triangle mesh: vertices [V, 3] in its own frame, faces [F, 3] counter-clockwise from outside.
 
-    part: of each face, from 0; None for a shape of one part;  overlap: with the outlines it was found from, mean IoU
+    part      part of each face, from 0; None for a shape of one part
+    overlap   mean IoU with the outlines of its fit
     """
 
     vertices: Float[np.ndarray, "v 3"]
@@ -75,18 +80,24 @@ class Triangles(msgspec.Struct, frozen=True):
     overlap: float = 1.0
 
     def as_mesh(self) -> Mesh:
-        """Return a mesh for outlines: label 1 all over, its normals of no account."""
+        """Return a mesh for rendering outlines: label 1 everywhere, with meaningless normals."""
         label = np.ones(len(self.faces), np.int16)
         return Mesh(self.vertices, self.faces.astype(np.int32), np.ones_like(self.vertices), label)
 
     def of_size(self, size: float) -> "Triangles":
-        """The middle of its bounding box in the origin, and the longest side of that `size`."""
+        """Centre the bounding box at the origin and scale its longest side to `size`."""
         low, high = self.vertices.min(axis=0), self.vertices.max(axis=0)
         return msgspec.structs.replace(self, vertices=(self.vertices - (low + high) / 2) * (size / (high - low).max()))
 
 
 def write_obj(path: Path, shape: Triangles, parts: list[str]) -> None:
-    """An OBJ file with a group for each part that has faces."""
+    """Write an OBJ file with a group for each part that has faces.
+
+    Args:
+        path: File to write.
+        shape: The shape.
+        parts: Names of its parts.
+    """
     lines = [f"v {x:.7g} {y:.7g} {z:.7g}" for x, y, z in shape.vertices.tolist()]
     for number, name in enumerate(parts):
         faces = shape.faces if shape.part is None else shape.faces[shape.part == number]

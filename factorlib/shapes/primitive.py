@@ -1,7 +1,8 @@
-"""Balls, boxes and cylinders, their proportions fitted to outlines.
+"""Spheres, boxes and cylinders, with proportions fitted to outlines.
 
-A ball has none.  A box has two, a cylinder (about y) one: the factors of its axes that `shapes.proportions` fits, with the poses of all
-photos, to the outlines.  The descent begins from several shapes, each laid on the `PHOTOS` photos that show most; the shape that overlaps most is kept.
+A sphere has no free proportion, a box has two, a cylinder (about y) one. They are factors of the axes, which
+`shapes.proportions` fits to the outlines together with the poses of all photos. The fit starts from several shapes, each
+placed on the `PHOTOS` photos that show most pixels. The shape of the largest overlap is kept.
 """
 
 from collections.abc import Callable, Sequence
@@ -17,21 +18,31 @@ from factorlib.geometry.raster import Caster
 from factorlib.shapes.outline import Outline, Triangles
 from factorlib.shapes.proportions import BOX, ROUND, Sighting, fitted
 
+# initial factors of the axes
 BEGUN = {
     "box": ((1, 1, 1), (1, 0.5, 1), (1, 2, 1), (1, 0.25, 0.5), (1, 0.1, 1), (1, 0.2, 0.8)),
     "cylinder": ((1, 0.3, 1), (1, 1, 1), (1, 3, 1)),
 }
 FREE_FACTORS = {"box": BOX, "cylinder": ROUND}
-PHOTOS = 6
-STEPS = 20
-RESOLUTION = 200
+PHOTOS = 6  # greatest number of photos used
+STEPS = 20  # Gauss–Newton steps of factors and poses
+RESOLUTION = 200  # pixels of the mask's longer side
 SEARCH = Search(views=150, keep=(20, 8, 4, 2))
 
 
 def primitive(
     kind: str, outlines: Sequence[Outline], report: Callable[[float], None] = lambda share: None
 ) -> Triangles:
-    """The shape of unit size.  kind: ball, box or cylinder;  outlines: one at least, which all show some of it"""
+    """Fit a primitive to outlines and return it at unit size.
+
+    Args:
+        kind: "ball", "box" or "cylinder".
+        outlines: Outlines, at least one, each with some pixel of the object.
+        report: Function of the share that is done.
+
+    Returns:
+        The mesh with its overlap.
+    """
     outlines = sorted(outlines, key=lambda one: -int((one.part > 0).sum()))[:PHOTOS]
     best: tuple[float, Float[np.ndarray, "3"]] = -1.0, np.ones(3)
     for done, begun in enumerate(starts := BEGUN.get(kind, ((1, 1, 1),))):
@@ -49,7 +60,7 @@ def primitive(
 
 
 def unit(kind: str, factors: Float[np.ndarray, "3"]) -> Triangles:
-    """A shape whose axes are as `factors`."""
+    """Return the unit shape of a kind, with its axes scaled by `factors`."""
     if kind == "ball":
         made = trimesh.creation.icosphere(subdivisions=5)
     elif kind == "box":

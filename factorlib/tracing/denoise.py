@@ -1,7 +1,8 @@
-"""Noise taken out of path-traced pictures by Intel Open Image Denoise, where the package mitsuba-oidn is installed (the extra `denoise`).
+"""Denoising of path-traced pictures by Intel Open Image Denoise, if mitsuba-oidn is installed (the extra `denoise`).
 
-It is a neural network that is given linear radiance, and as guides the albedo and the normal that each pixel shows, which have hardly any noise.
-What fills a pixel in part is spread over all of it and over the pixels beside it before, so that no contour is blurred.
+The denoiser is a neural network. Its input is linear radiance and, as guides, the albedo and normal of each pixel,
+which have hardly any noise. Before denoising, a partly covered pixel gets its foreground colour in full, and pixels
+without coverage get that of the nearest covered one, so that no contour is blurred.
 """
 
 import os
@@ -15,12 +16,12 @@ from factorlib.tracing.variant import mitsuba
 
 
 def denoised(picture: Float[np.ndarray, "h w 10"]) -> Float[np.ndarray, "h w 4"]:
-    """Linear radiance without noise, times coverage, and coverage, which stays as it is.
+    """Denoise linear radiance times coverage; coverage is left unchanged.
 
-    picture: radiance, coverage, and the guides of `factorlib.tracing.scene.rendered`, all times coverage
+    `picture` holds radiance, coverage, and the guides of `factorlib.tracing.scene.rendered`, all times coverage.
     """
-    os.environ["OIDN_DEFAULT_DEVICE"] = "cpu"  # also where there is a GPU: the same bytes
-    mitsuba()  # whose thread pool it works in
+    os.environ["OIDN_DEFAULT_DEVICE"] = "cpu"  # the same bytes with and without a GPU
+    mitsuba()  # the denoiser uses its thread pool
     import mitsuba_oidn
 
     coverage = picture[..., 3:4]
@@ -34,5 +35,5 @@ def denoised(picture: Float[np.ndarray, "h w 10"]) -> Float[np.ndarray, "h w 4"]
 
 
 def denoiser() -> str:
-    """The name and version of what `denoised` runs."""
+    """Return name and version of the denoiser."""
     return f"mitsuba-oidn {version('mitsuba-oidn')}"

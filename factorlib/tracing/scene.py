@@ -1,8 +1,8 @@
-"""Mitsuba scenes of this project: materials, meshes, cameras, environment maps, and the light seen from a point.
+"""Mitsuba scenes: materials, meshes, cameras, environment maps, and the light that arrives at a point.
 
-Frames   Scenes stand in a world with y up.  A camera is given by world_from_camera, the camera in OpenCV's axes; for
-         the y-up turn of the camera itself that is YUP_FROM_CAMERA, and an `envmap` then needs no turn at all.
-Pixels   a box filter, so that a pixel is the mean over its own square.
+Frames   The world has y up. A camera is given by world_from_camera, with the camera in OpenCV's axes. If the world is
+         the camera's own y-up frame, that matrix is YUP_FROM_CAMERA, and an `envmap` needs no rotation.
+Pixels   The reconstruction filter is a box, so that a pixel is the mean over its own square.
 Envmap   Mitsuba puts row i of a map at i/(H−1) of the way down, and column j at (j+½)/W: maps in the layout of
          `factorlib.conventions` are resampled to a finer lattice of that kind.
 """
@@ -26,12 +26,14 @@ from factorlib.meshes.ply import write_ply
 from factorlib.results.materials import Reflectance
 from factorlib.tracing.variant import mitsuba
 
-SAMPLER, SAMPLES_PER_PASS = "multijitter", 1 << 23
-ENVMAP_FINER = 8  # rows of the lattice handed to Mitsuba, per row of a map
+SAMPLER = "multijitter"
+SAMPLES_PER_PASS = 1 << 23
+ENVMAP_FINER = 8  # rows of Mitsuba's lattice per row of a map
 MITSUBA_FROM_CAMERA = np.diag([-1.0, -1.0, 1.0, 1.0])  # Mitsuba's sensors: x left, y up, z forward
 Entry = dict[str, Any]
 Matrix = Float[np.ndarray, "4 4"]
 Image = Float[np.ndarray, "h w c"]
+# pitch and yaw of the six views of a cube map
 FACE_LOOKS = {"+x": (0, 90), "-x": (0, -90), "+y": (90, 0), "-y": (-90, 0), "+z": (0, 0), "-z": (0, 180)}
 
 
@@ -44,11 +46,12 @@ class Material(msgspec.Struct, frozen=True):
 
 
 def bsdf(material: Material | Reflectance, painted: bool = False) -> dict[str, Any]:
-    """Mitsuba's `blendbsdf` that evaluates to k_d/π + k_s D G / (4 (n·i)(n·o)), without Fresnel.
+    """Return Mitsuba's `blendbsdf` that evaluates to k_d/π + k_s D G / (4 (n·i)(n·o)), without Fresnel.
 
-    painted: the diffuse part has the colours of the mesh's vertices, which are those of `paint`
+    If `painted`, the diffuse part has the colours of the mesh's vertices, which `paint` computes.
     """
-    diffuse, specular = np.array(material.diffuse), np.array(material.specular)
+    diffuse = np.array(material.diffuse)
+    specular = np.array(material.specular)
     if not diffuse.any() and not specular.any():
         return {"type": "diffuse", "reflectance": rgb(0.0)}
     share = _share(material)
@@ -63,35 +66,40 @@ def bsdf(material: Material | Reflectance, painted: bool = False) -> dict[str, A
 
 
 def paint(material: Material | Reflectance, detail: Float[np.ndarray, " v"]) -> Float[np.ndarray, "v 3"]:
-    """Colours of the vertices of a mesh with `detail` for `bsdf`; a reflectance above 1, which Mitsuba's diffuse part has not, is 1."""
+    """Return the vertex colours for `bsdf` of a mesh with `detail`, at most 1.
+
+    Mitsuba's diffuse BSDF has no reflectance above 1.
+    """
     share = _share(material)
     colour = np.array(material.diffuse) / (1 - share) if share < 1 else np.zeros(3)
     return np.minimum(detail[:, None] * colour, 1.0)
 
 
 def _share(material: Material | Reflectance) -> float:
-    """Of the specular part in the mixture; 0 where nothing is reflected."""
-    diffuse, specular = max(material.diffuse), max(material.specular)
+    """Return the weight of the specular part in the blend; 0 if nothing is reflected."""
+    diffuse = max(material.diffuse)
+    specular = max(material.specular)
     return specular / (diffuse + specular) if diffuse + specular > 0 else 0.0
 
 
 def _conductor(reflectance: Float[np.ndarray, "3"], roughness: float) -> dict[str, Any]:
+    """Return Mitsuba's GGX `roughconductor` without Fresnel."""
     ggx = {"type": "roughconductor", "material": "none", "distribution": "ggx", "alpha": roughness**2}
     return ggx | {"specular_reflectance": rgb(reflectance)}
 
 
 def rgb(value: float | Sequence[float] | Float[np.ndarray, "3"]) -> dict[str, Any]:
-    """A colour as a Mitsuba dictionary; a single number is grey."""
+    """Return a colour as a Mitsuba dictionary; a single number is grey."""
     return {"type": "rgb", "value": [float(v) for v in np.broadcast_to(value, 3)]}
 
 
 def transform(matrix: Matrix) -> Any:
-    """Mitsuba's transform of a 4 × 4 matrix."""
+    """Convert a 4 × 4 matrix to Mitsuba's transform."""
     return mitsuba().ScalarTransform4f(np.asarray(matrix, dtype=float))
 
 
 def rigid(rotation: Float[np.ndarray, "3 3"], translation: Sequence[float] | Float[np.ndarray, "3"]) -> Matrix:
-    """The 4 × 4 matrix of a rotation and a translation."""
+    """Return the 4 × 4 matrix of a rotation and a translation."""
     matrix = np.eye(4)
     matrix[:3, :3], matrix[:3, 3] = rotation, translation
     return matrix
@@ -104,7 +112,18 @@ def shape(
     emitter: Entry | None = None,
     colours: Float[np.ndarray, "v 3"] | None = None,
 ) -> Any:
-    """A mesh as a Mitsuba shape, with its own vertex normals; `material` is a BSDF, colours those of the vertices."""
+    """Load a mesh as a Mitsuba shape, with its own vertex normals.
+
+    Args:
+        mesh: The mesh.
+        material: BSDF.
+        world_from_object: Transform of the mesh.
+        emitter: Emitter on the surface.
+        colours: Colours of the vertices.
+
+    Returns:
+        A Mitsuba shape.
+    """
     with TemporaryDirectory() as folder:
         path = Path(folder) / "mesh.ply"
         write_ply(path, mesh, colours)
@@ -115,14 +134,22 @@ def shape(
 def sensor(
     camera: Camera, world_from_camera: Matrix, columns: slice = slice(None), near: float = 1e-3, alpha: bool = False
 ) -> dict[str, Any]:
-    """The pinhole camera, of whose image some columns are taken.
+    """Return the pinhole camera as a Mitsuba sensor, restricted to some columns of its image.
 
-    near: distance from which on things are seen, to 10⁷ times that;  alpha: with a fourth channel, the share of a pixel that is covered
+    Args:
+        camera: Camera.
+        world_from_camera: Transform of the camera.
+        columns: Columns to render.
+        near: Distance of the near clipping plane; the far one is at 10⁷ times that.
+        alpha: Add a fourth channel, the coverage of each pixel.
+
+    Returns:
+        A Mitsuba dictionary.
     """
     left, right, _ = columns.indices(camera.width)
     crop = {"crop_offset_x": left, "crop_offset_y": 0, "crop_width": right - left, "crop_height": camera.height}
     (cx, cy), (w, h), kind = camera.centre, (camera.width, camera.height), "rgba" if alpha else "rgb"
-    offset = {"x": (w / 2 - cx) / w, "y": (h / 2 - cy) / h}  # as its pictures, not its x axis
+    offset = {"x": (w / 2 - cx) / w, "y": (h / 2 - cy) / h}  # along the axes of the picture, not of the sensor
     film = {"type": "hdrfilm", "width": w, "height": h, "rfilter": {"type": "box"}, "pixel_format": kind, **crop}
     return {
         "type": "perspective",
@@ -138,22 +165,43 @@ def sensor(
 
 
 def traced(entries: Entry, camera: Camera, world_from_camera: Matrix, spp: int, seed: int, max_depth: int) -> Image:
-    """Radiance of a scene, by a camera at world_from_camera; as `rendered`."""
+    """Render the radiance of a scene by a camera; see `rendered`.
+
+    Args:
+        entries: Mitsuba objects by name.
+        camera: Camera.
+        world_from_camera: Transform of the camera.
+        spp: Least number of samples per pixel.
+        seed: Seed.
+        max_depth: 2 for direct light alone, −1 for all bounces.
+
+    Returns:
+        Radiance.
+    """
     return rendered(entries, sensor(camera, world_from_camera), spp, seed, max_depth)
 
 
 def rendered(
     entries: Entry, view: Entry, spp: int, seed: int, max_depth: int, hide_emitters: bool = False, guides: bool = False
 ) -> Image:
-    """Radiance of a scene in the picture of a `sensor`; max_depth 2 is direct light alone, −1 all bounces.
+    """Render the radiance of a scene in the picture of a `sensor`.
 
-    hide_emitters: the light itself is not seen (where the sensor has alpha, it is 0 there)
-    guides: with six more channels, the albedo and the normal of what is seen
+    Many samples are rendered in several passes of stratified samples, so that no pass needs much memory.
 
-    spp: samples a pixel, at least.  Many samples are taken in passes of stratified ones, so that no pass needs much memory.
+    Args:
+        entries: Mitsuba objects by name.
+        view: Sensor.
+        spp: Least number of samples per pixel.
+        seed: Seed.
+        max_depth: 2 for direct light alone, −1 for all bounces.
+        hide_emitters: Hide the light itself, where alpha is then 0.
+        guides: Add six channels, albedo and normal.
+
+    Returns:
+        Radiance and further channels.
     """
     mi = mitsuba()
-    # loaded one by one: a nested dictionary's lights come out in an order left to chance, and with it the noise
+    # load objects one by one: the lights of a nested dictionary come in a random order, which changes the noise
     plain = {name: entry for name, entry in entries.items() if isinstance(entry, dict)}
     loaded = entries | {name: mi.load_dict(entry, parallel=False) for name, entry in plain.items()}
     integrator = {"type": "path", "max_depth": max_depth, **({"hide_emitters": True} if hide_emitters else {})}
@@ -166,18 +214,21 @@ def rendered(
 
 
 def envmap(lat_long: Float[np.ndarray, "h w 3"], finer: int = ENVMAP_FINER) -> dict[str, Any]:
-    """An emitter of a lat-long map in the world's frame: bilinear between the map's texel centres."""
+    """Return an emitter of a lat-long map in the world's frame, bilinear between the map's texel centres."""
     height, width = lat_long.shape[:2]
     return envmap_of_nodes(sampled(lat_long, node_directions(finer * height + 1, finer * width)))
 
 
 def envmap_of_nodes(radiance: Float[np.ndarray, "h w 3"]) -> dict[str, Any]:
-    """An emitter of radiance at `node_directions`."""
+    """Return an emitter of radiance at `node_directions`."""
     return {"type": "envmap", "bitmap": mitsuba().Bitmap(radiance.astype(np.float32))}
 
 
 def node_directions(height: int, width: int) -> Float[np.ndarray, "h w 3"]:
-    """Directions of the nodes of Mitsuba's `envmap`, in its own (y-up) frame: row i at i/(H−1), column j at (j+½)/W."""
+    """Return directions of the nodes of Mitsuba's `envmap`, in its own (y-up) frame.
+
+    Row i is at i/(H−1) of the way down, column j at (j+½)/W of the way around.
+    """
     theta = np.arange(height) / (height - 1) * np.pi
     phi = (0.5 - (np.arange(width) + 0.5) / width) * 2 * np.pi
     sin = np.sin(theta)[:, None]
@@ -187,9 +238,20 @@ def node_directions(height: int, width: int) -> Float[np.ndarray, "h w 3"]:
 def light_seen(
     entries: Entry, world_from_light: Matrix, height: int, spp: int, seed: int, max_depth: int = -1
 ) -> Image:
-    """The radiance that arrives at the origin of the light frame (y-up), a lat-long map of [height, 2·height].
+    """Render the radiance that arrives at the origin of the light frame (y-up) as a lat-long map of [height, 2·height].
 
-    Six square views of 90° along the light frame's axes, then means over 8 × 8 directions a texel.
+    Six square views of 90° along the light frame's axes are averaged over 8 × 8 directions a texel.
+
+    Args:
+        entries: Mitsuba objects by name.
+        world_from_light: Transform of the light frame.
+        height: Rows of the map.
+        spp: Least number of samples per pixel.
+        seed: Seed.
+        max_depth: 2 for direct light alone, −1 for all bounces, 1 for emitters alone.
+
+    Returns:
+        Radiance.
     """
     size = 2 * height
     camera = Camera(size, size, size / 2, (size / 2, size / 2))
@@ -198,7 +260,8 @@ def light_seen(
         world_from_camera = rigid(world_from_light[:3, :3] @ look(pitch, yaw), world_from_light[:3, 3])
         faces[name] = traced(entries, camera, world_from_camera, spp, 6 * seed + number, max_depth)
     fine = 8 * height, 16 * height
-    directions, weight = lat_long_directions(*fine), lat_long_solid_angles(*fine)[:, None, None]
+    directions = lat_long_directions(*fine)
+    weight = lat_long_solid_angles(*fine)[:, None, None]
     sums = (
         array.reshape(height, 8, 2 * height, 8, -1).sum(axis=(1, 3))
         for array in (looked_up(faces, directions) * weight, np.broadcast_to(weight, (*fine, 1)))
@@ -207,7 +270,7 @@ def light_seen(
 
 
 def look(pitch_deg: float, yaw_deg: float) -> Float[np.ndarray, "3 3"]:
-    """world_from_camera of a level camera that looks along +z (0, 0), turned toward +x by yaw, then upward by pitch."""
+    """Return world_from_camera of a camera that looks along +z, rotated toward +x by yaw, then upward by pitch."""
     pitch, yaw = np.radians([pitch_deg, yaw_deg])
     forward = np.array([np.cos(pitch) * np.sin(yaw), np.sin(pitch), np.cos(pitch) * np.cos(yaw)])
     right = np.array([-np.cos(yaw), 0.0, np.sin(yaw)])
@@ -215,11 +278,12 @@ def look(pitch_deg: float, yaw_deg: float) -> Float[np.ndarray, "3 3"]:
 
 
 def looked_up(faces: dict[str, np.ndarray], directions: Float[np.ndarray, "*n 3"]) -> Float[np.ndarray, "*n 3"]:
-    """The pixel of the cube's faces that each direction falls in."""
+    """Look up each direction in the faces of a cube map, by the nearest pixel."""
     largest = np.abs(directions).argmax(axis=-1)
     values = np.zeros(directions.shape)
     for name, (pitch, yaw) in FACE_LOOKS.items():
-        axis, sign = "xyz".index(name[1]), 1 if name[0] == "+" else -1
+        axis = "xyz".index(name[1])
+        sign = 1 if name[0] == "+" else -1
         hit = (largest == axis) & (sign * directions[..., axis] > 0)
         x, y, z = np.moveaxis(directions[hit] @ look(pitch, yaw), -1, 0)
         size = len(faces[name])

@@ -1,1 +1,1 @@
-"""Unstructured reflectance maps: what was seen of each material, as (normal, view, radiance) without pixel order."""
+"""Unstructured reflectance maps: observations (normal, view, radiance) of each material, without pixel order."""

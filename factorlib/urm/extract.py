@@ -1,7 +1,7 @@
-"""From a photo's radiance and its aligned geometry to observations.
+"""Extraction of observations from a photo's radiance and its aligned geometry.
 
-A pixel is observed where the mask and the mesh name the same material, the radiance is valid, and the shading
-normal faces the camera: elsewhere the normal belongs to something else than the radiance.
+A pixel is observed where the mask and the mesh have the same material, the radiance is valid, and the shading normal
+faces the camera. Elsewhere normal and radiance do not belong together.
 """
 
 from __future__ import annotations
@@ -16,11 +16,14 @@ from factorlib.light.distance import places_of
 from factorlib.urm.observations import Observations
 
 Channels = Mapping[str, Float[np.ndarray, "h w"]]
-GRAZING = 0.05  # least n·o: beyond 87° neither the normal nor the pixel's footprint can be trusted
+GRAZING = 0.05  # least n·o: beyond 87° neither the normal nor the pixel's footprint is reliable
 
 
 class Taken(msgspec.Struct, frozen=True):
-    """A photo's name, the light it was taken in, and its exposure t·S/N² (time, ISO speed, f-number) from EXIF, None if unknown."""
+    """Name of a photo, its illumination, and its exposure from EXIF.
+
+    The exposure is t·S/N² (time, ISO speed, f-number), None if it is unknown.
+    """
 
     photo: str
     illumination: str
@@ -28,7 +31,16 @@ class Taken(msgspec.Struct, frozen=True):
 
 
 def observed_pixels(photo: Channels, geometry: Channels, least_confidence: float = 0.0) -> Bool[np.ndarray, "h w"]:
-    """Return where mask and mesh agree on the material and the surface faces the camera."""
+    """Select the pixels on which mask and mesh agree on the material and the surface faces the camera.
+
+    Args:
+        photo: Channels of the stage `masks`.
+        geometry: Channels of the stage `align`.
+        least_confidence: Pixels whose confidence is not greater are excluded.
+
+    Returns:
+        A mask.
+    """
     facing = sum(geometry[f"normal.{a}"] * geometry[f"view.{a}"] for a in "xyz") > GRAZING
     agrees = np.rint(photo["label"]) == np.rint(geometry["label"])
     labelled = photo["label"] > 0.5
@@ -38,26 +50,47 @@ def observed_pixels(photo: Channels, geometry: Channels, least_confidence: float
 def observations_of_photo(
     photo: Channels, geometry: Channels, taken: Taken, materials: Sequence[str], least_confidence: float = 0.0
 ) -> Observations:
-    """One observation per observed pixel, in row order; `weight` and `confidence` are the confidence of its normal, 0 to 1.
+    """Extract one observation per observed pixel, in row order.
 
-    photo:     channels R, G, B, label, valid, clipped.R/G/B of the stage `masks`
-    geometry:  channels normal.x/y/z, view.x/y/z, depth, label, confidence of the stage `align`
-    least_confidence: 0 to 1; pixels whose normals are less certain are left out
+    `weight` and `confidence` are the confidence of the pixel's normal, from 0 to 1.
+
+    Args:
+        photo: Channels R, G, B, label, valid, clipped.R/G/B of the stage `masks`.
+        geometry: Channels normal.x/y/z, view.x/y/z, depth, label, confidence of the stage `align`.
+        taken: Name, illumination and exposure of the photo.
+        materials: Names of all materials, in the order of their labels.
+        least_confidence: Pixels whose normals are less certain are excluded; from 0 to 1.
+
+    Returns:
+        The observations.
     """
     seen = observed_pixels(photo, geometry, least_confidence)
     y, x = np.nonzero(seen)
-    none, sure = np.zeros(len(x), "i4"), geometry["confidence"][seen]
+    none = np.zeros(len(x), "i4")
+    sure = geometry["confidence"][seen]
 
     def gather(channels: Channels, names: Iterable[str]) -> np.ndarray:
-        """The named channels at the observed pixels."""
+        """Stack the named channels at the observed pixels."""
         return np.stack([channels[n][seen] for n in names], axis=-1)
 
     normal, view = (gather(geometry, [f"{name}.{axis}" for axis in "xyz"]) for name in ("normal", "view"))
     normal, view = (v / np.maximum(np.linalg.norm(v, axis=-1, keepdims=True), 1e-12) for v in (normal, view))
     place = places_of(view, geometry["depth"][seen].astype(float), sure)
     return Observations(
-        normal, view, np.maximum(gather(photo, "RGB"), 0.0), gather(photo, [f"clipped.{c}" for c in "RGB"]) > 0.5,
-        material=np.rint(photo["label"][seen]).astype("i2") - 1, photo=none, illumination=none, x=x.astype("i4"), y=y.astype("i4"),
-        weight=sure, confidence=sure, place=place.astype("f4"), materials=tuple(materials),
-        photos=(taken.photo,), illuminations=(taken.illumination,), exposures=(taken.exposure,),
-    )  # fmt: skip
+        normal,
+        view,
+        np.maximum(gather(photo, "RGB"), 0.0),
+        gather(photo, [f"clipped.{c}" for c in "RGB"]) > 0.5,
+        material=np.rint(photo["label"][seen]).astype("i2") - 1,
+        photo=none,
+        illumination=none,
+        x=x.astype("i4"),
+        y=y.astype("i4"),
+        weight=sure,
+        confidence=sure,
+        place=place.astype("f4"),
+        materials=tuple(materials),
+        photos=(taken.photo,),
+        illuminations=(taken.illumination,),
+        exposures=(taken.exposure,),
+    )

@@ -1,4 +1,4 @@
-"""What every pixel of a photo shows of the meshes: as `align` has it, with the normals and the detail of reflectance of `surface` where it found some."""
+"""Geometry of every pixel of a photo: the maps of `align`, and those of `surface` if there are any."""
 
 from __future__ import annotations
 
@@ -14,14 +14,26 @@ from factorlib.urm.observations import Observations
 
 
 def read_geometry(align: Path, surface: Path | None, photo: str) -> dict[str, Float[np.ndarray, "h w"]]:
-    """The maps that `align` wrote of a photo, with the normals and the channel `detail` of the folder of `surface` where there are any."""
+    """Read the maps that `align` wrote of a photo; those of `surface` replace its normals and add the channel `detail`.
+
+    Args:
+        align: Folder of the stage `align`.
+        surface: Folder of the stage `surface`, if any.
+        photo: Name of the photo.
+
+    Returns:
+        Channels by name.
+    """
     return {**read_exr(align / f"{photo}.exr"), **_normals(surface, photo)}
 
 
 def on_surface(seen: Observations, surface: Path | None) -> Observations:
-    """The observations of one photo with the normals and the detail of its surface, where the folder of `surface` has them.
+    """Replace normals and detail of one photo's observations by those in the folder of `surface`, if it has any.
 
-    Merged observations have the normal of the pixel that their group is called by.  Raises InputError where the maps are of another photo's size.
+    A merged observation gets the normal of the first pixel of its group.
+
+    Raises:
+        InputError: If the maps have another size than the photo.
     """
     if not seen.photos or not (maps := _normals(surface, seen.photos[0])):
         return seen
@@ -39,6 +51,7 @@ def on_surface(seen: Observations, surface: Path | None) -> Observations:
 
 
 def _normals(surface: Path | None, photo: str) -> dict[str, Float[np.ndarray, "h w"]]:
+    """Read the maps of a photo in the folder of `surface`; empty if there are none."""
     if surface is None:
         return {}
     file = surface / "photos" / f"{photo}.exr"

@@ -1,12 +1,12 @@
-"""Merging observations of nearly the same normal and view into weighted ones.
+"""Merging of observations with nearly the same normal and view into weighted ones.
 
 Radiance depends on a pixel through its normal and its mirror direction (twice the URM's `half`, less the front).
-Pixels of one photo, material and clipping state that fall into one cell of both are replaced by their weighted
-mean: normal, view, radiance, place, confidence and detail alike, so that what is lost is second order in the cell's size.
+Pixels of one photo, material and clipping state that fall into one cell of both are replaced by their weighted mean.
+Normal, view, radiance, place, confidence and detail are averaged, so that the error is second order in the cell's size.
 
-Radiance is linear in visibility, whose mean is thus what the mean radiance shows.  But on a flat seat all points would
-become one, and what their shadows tell of the light be lost: points merge only where what is hidden from them lies
-alike, by the mean over the sphere of hidden × direction.
+Radiance is linear in visibility, so mean visibility belongs to mean radiance. But on a flat seat all points would merge
+into one, and the information of their shadows about the light would be lost. So points merge only if the directions
+hidden from them are similar, by the mean over the sphere of hidden × direction.
 """
 
 from __future__ import annotations
@@ -19,30 +19,32 @@ from scipy.sparse import csr_array
 from factorlib.geometry.sphere import direction_cells, fibonacci_sphere, mirror_directions
 from factorlib.urm.observations import Observations
 
-DETAIL_CELL = 0.1  # of the logarithm of the detail of reflectance
-HIDDEN_CELL = 0.05  # of the mean of hidden × direction, which is 1/4 where a whole hemisphere is hidden
-ROWS = 1 << 16  # observations whose visibility is in memory as floats
+DETAIL_CELL = 0.1  # cell of the logarithm of the reflectance detail
+HIDDEN_CELL = 0.05  # cell of the mean of hidden × direction, which is 1/4 if a whole hemisphere is hidden
+ROWS = 1 << 16  # number of observations whose visibility is in memory as floats
 
 
 def merge(observations: Observations, degrees: float) -> Observations:
-    """Merge within cells of about `degrees`; 0 merges nothing.  The total weight is kept.
+    """Merge within cells of about `degrees`; 0 merges nothing. The total weight is preserved.
 
     `x`, `y` and `met` become those of the group's first pixel.
     """
     seen = observations
     if degrees <= 0 or len(seen) == 0:
         return seen
-    cell, mirror = np.radians(degrees), mirror_directions(seen.normal, seen.view)
+    cell = np.radians(degrees)
+    mirror = mirror_directions(seen.normal, seen.view)
     flags = seen.clipped @ np.array([1, 2, 4])
     cells = [direction_cells(seen.normal, cell), direction_cells(mirror, 2 * cell)]
     if seen.detail is not None:
         cells.append(np.rint(np.log(np.maximum(seen.detail, 1e-3)) / DETAIL_CELL).astype(np.int64)[:, None])
-    if (visibility := seen.visibility) is not None:  # where the hidden directions lie
+    if (visibility := seen.visibility) is not None:  # mean of hidden × direction
         directions = fibonacci_sphere(visibility.shape[1]).astype("f4") / visibility.shape[1]
         chunks = (visibility[i : i + ROWS] for i in range(0, len(visibility), ROWS))
         hidden = [(255 - chunk).astype("f4") / 255 @ directions for chunk in chunks]
         cells.append(np.rint(np.vstack(hidden) / HIDDEN_CELL).astype(np.int64))
     first, group = groups(np.column_stack([seen.photo, seen.material, flags, *cells]))
+    # weighted mean of each column over each group
     weight = np.maximum(seen.weight.astype(float), 1e-12)
     total = np.bincount(group, weight)
 
@@ -64,17 +66,20 @@ def merge(observations: Observations, degrees: float) -> Observations:
 
 
 def groups(keys: Int[np.ndarray, "n k"]) -> tuple[Int[np.ndarray, " g"], Int[np.ndarray, " n"]]:
-    """The first row of each group of equal rows, groups in lexicographic order, and each row's group.
+    """Group equal rows; give the first row of each group, in lexicographic order of groups, and the group of each row.
 
-    As np.unique of rows, on one number a row.
+    This is np.unique of rows, on one number a row.
     """
-    code, size = np.zeros(len(keys), np.int64), 1
+    # encode each row as one integer in mixed radix; compress the codes before they overflow
+    code = np.zeros(len(keys), np.int64)
+    size = 1
     for column in keys.T - keys.min(0)[:, None]:
         span = int(column.max()) + 1
         if size * span >= 1 << 62:
             code = np.unique(code, return_inverse=True)[1]
             size = int(code.max()) + 1
-        code, size = code * span + column, size * span
+        code = code * span + column
+        size = size * span
     order = np.argsort(code)
     starts = np.flatnonzero(np.diff(code[order], prepend=-1))
     group = np.empty(len(keys), np.int64)

@@ -1,12 +1,12 @@
 """Observations of materials in photos: one row per pixel (or per merged group of pixels), as a struct of arrays.
 
-The Parquet form is fixed (docs/formats.md): all vectors in the camera frame, radiance linear, the names behind the
-indices and the units in the schema metadata under the key `factorlib`.
+The Parquet form is fixed (docs/formats.md): all vectors in the camera frame, radiance linear. The names behind the
+indices and the units are in the schema metadata under the key `factorlib`.
 
-`visibility`, where some observation does not see every direction, is a further column of K bytes: the share of each
-direction of `fibonacci_sphere(K)` that is seen, 0 to 255.  `met`, beside it, says which surface hides a direction.  `confidence`, which a file
-need not have, says how sure each normal is; `weight` is the same until observations are sampled or merged.  Nor need it have `place`, where the
-point lies, as `factorlib.light.distance` has it.
+Four columns are optional. `visibility` is there if some observation does not see every direction. It has K bytes: the
+visible share of each direction of `fibonacci_sphere(K)`, 0 to 255. `met`, beside it, tells which surface hides a
+direction. `confidence` is the confidence of each normal; `weight` is the same until observations are sampled or merged.
+`place` is the position of the point, as defined in `factorlib.light.distance`.
 """
 
 from __future__ import annotations
@@ -29,23 +29,27 @@ from factorlib.parquetfile import read_columns
 from factorlib.reading import reading
 from factorlib.wholefile import writing
 
-WHAT, CURE = "a reflectance map", "run the stage `urm` again"
+WHAT = "a reflectance map"
+CURE = "run the stage `urm` again"
 VISIBILITY = (
     "one byte per direction k of K, 0 hidden by an object to 255 seen; direction k, camera frame: z = 1 − (2k+1)/K, "
     "azimuth about z from x toward y = k π (3 − √5)"
 )
 MET = (
-    f"two bytes (uint16, little-endian) per direction k of `visibility`: the surface that hides it, number in `materials` · {BINS} + "
-    f"number of the direction of {BINS}, placed as those of `visibility`, that is nearest to its normal; {UNMET}: none, or not known"
+    f"two bytes (uint16, little-endian) per direction k of `visibility`: the surface that hides it, number in "
+    f"`materials` · {BINS} + number of the direction of {BINS}, placed as those of `visibility`, that is nearest to "
+    f"its normal; {UNMET}: none, or not known"
 )
 UNITS = {
-    "frame": "camera: OpenCV, x right, y down, z forward; half = (2(n·o)n − o + (0,0,−1))/2; view points toward the camera",
-    "units": {"radiance": "linear, scene-referred, Rec. 709, unknown exposure per photo"} | dict.fromkeys(("x", "y", "weight"), "pixels"),
-}  # fmt: skip
+    "frame": "camera: OpenCV, x right, y down, z forward; half = (2(n·o)n − o + (0,0,−1))/2; view points toward the "
+    "camera",
+    "units": {"radiance": "linear, scene-referred, Rec. 709, unknown exposure per photo"}
+    | dict.fromkeys(("x", "y", "weight"), "pixels"),
+}
 
 
 class Observations(msgspec.Struct, frozen=True):
-    """n observations of `materials` in `photos`; indices are positions in the tuples of names."""
+    """Observations (n rows) of `materials` in `photos`; indices are positions in the tuples of names."""
 
     normal: Float[np.ndarray, "n 3"]
     view: Float[np.ndarray, "n 3"]  # unit, toward the camera
@@ -60,38 +64,50 @@ class Observations(msgspec.Struct, frozen=True):
     materials: tuple[str, ...]
     photos: tuple[str, ...]
     illuminations: tuple[str, ...]
-    visibility: UInt8[np.ndarray, "n k"] | None = None  # 255: that direction is seen; None: all are
-    met: UInt16[np.ndarray, "n k"] | None = None  # codes of what hides them (geometry.met); not without `visibility`
-    exposures: tuple[float | None, ...] = ()  # of `photos`, t·S/N² from EXIF, None where unknown; empty: all are
-    confidence: Float[np.ndarray, " n"] | None = None  # of the normal, 0 to 1; None: all are as sure
+    visibility: UInt8[np.ndarray, "n k"] | None = None  # 255: the direction is visible; None: all are
+    met: UInt16[np.ndarray, "n k"] | None = None  # codes of hiding surfaces (geometry.met); needs `visibility`
+    exposures: tuple[float | None, ...] = ()  # t·S/N² of `photos` from EXIF, None if unknown; empty if all are unknown
+    confidence: Float[np.ndarray, " n"] | None = None  # confidence of the normal, 0 to 1; None: all are equal
     place: Float[np.ndarray, "n 3"] | None = None  # camera frame, about the photo's middle, RMS 1 (light.distance)
-    detail: Float[np.ndarray, " n"] | None = None  # factor on diffuse reflectance, of `surface`, in no file; None: 1
+    detail: Float[np.ndarray, " n"] | None = None  # factor on diffuse reflectance by `surface`, never written; None: 1
 
     def __len__(self) -> int:
         return len(self.weight)
 
     @property
     def half(self) -> Float[np.ndarray, "n 3"]:
-        """The paper's half vector, (2(n·o)n − o + (0, 0, −1)) / 2, camera frame, of the stored float32 normals and views."""
+        """Half vector of the paper, (2(n·o)n − o + (0, 0, −1)) / 2, camera frame, from normals and views as float32."""
         return half_of_normal_and_view(self.normal.astype("f4").astype("f8"), self.view.astype("f4").astype("f8"))
 
     def take(self, rows: np.ndarray) -> Observations:
-        """The observations of `rows` (indices or a mask), with the same names."""
+        """Select the observations of `rows` (indices or a mask), with the same names."""
         columns = {name: getattr(self, name) for name in (*COLUMNS, *WIDE, *OPTIONAL, "detail")}
         taken = {name: values[rows] for name, values in columns.items() if values is not None}
         return msgspec.structs.replace(self, **taken)
 
 
-COLUMNS = {"normal": "f4", "view": "f4", "radiance": "f4", "clipped": "?", "material": "i2", "photo": "i4", "illumination": "i4",
-           "x": "i4", "y": "i4", "weight": "f4"}  # and their types  # fmt: skip
+# types of the required columns
+COLUMNS = {
+    "normal": "f4",
+    "view": "f4",
+    "radiance": "f4",
+    "clipped": "?",
+    "material": "i2",
+    "photo": "i4",
+    "illumination": "i4",
+    "x": "i4",
+    "y": "i4",
+    "weight": "f4",
+}
 VECTORS = ("normal", "view", "radiance", "clipped", "place")
-OPTIONAL = {"confidence": "f4", "place": "f4"}  # columns that need not be there
+OPTIONAL = {"confidence": "f4", "place": "f4"}  # types of the optional columns
+# tuples of names, and the columns of indices into them
 NAMES = {
     "materials": "material",
     "photos": "photo",
     "illuminations": "illumination",
-}  # and the columns that number them
-# K values a row, where there are any: type, value where everything is seen, meaning
+}
+# optional columns of K values a row: type, value if everything is visible, meaning
 WIDE: dict[str, tuple[np.dtype, int, str]] = {
     "visibility": (np.dtype("u1"), 255, VISIBILITY),
     "met": (np.dtype("<u2"), UNMET, MET),
@@ -99,8 +115,9 @@ WIDE: dict[str, tuple[np.dtype, int, str]] = {
 
 
 def write_observations(path: str | Path, observations: Observations) -> None:
-    """Write the fixed Parquet columns, and `confidence`, `place`, `visibility` and `met`, where there is one."""
-    columns, types = {}, {"normal": "f4", "half": "f4", **COLUMNS, **OPTIONAL}
+    """Write the fixed Parquet columns, and `confidence`, `place`, `visibility` and `met` if they are present."""
+    columns = {}
+    types = {"normal": "f4", "half": "f4", **COLUMNS, **OPTIONAL}
     for name, dtype in types.items():
         if (values := getattr(observations, name)) is not None:
             values = np.ascontiguousarray(values, dtype=dtype)
@@ -112,7 +129,7 @@ def write_observations(path: str | Path, observations: Observations) -> None:
     for name, (wide, _, meaning) in WIDE.items():
         if (values := getattr(observations, name)) is not None:
             data = pa.py_buffer(np.ascontiguousarray(values, dtype=wide))
-            type_ = pa.binary(values.shape[1] * wide.itemsize)  # a row's values as one binary of fixed size
+            type_ = pa.binary(values.shape[1] * wide.itemsize)  # the values of a row as one binary of fixed size
             columns[name] = pa.FixedSizeBinaryArray.from_buffers(type_, len(values), [None, data])
             about[name] = meaning
     metadata = {"factorlib": json.dumps(about, sort_keys=True, ensure_ascii=False)}
@@ -121,7 +138,11 @@ def write_observations(path: str | Path, observations: Observations) -> None:
 
 
 def read_observations(path: str | Path) -> Observations:
-    """Read what `write_observations` wrote; raises InputError for any other Parquet file."""
+    """Read a file of `write_observations`.
+
+    Raises:
+        InputError: If it is any other Parquet file.
+    """
     parts, about = read_columns(path, WHAT, COLUMNS, (*OPTIONAL, *WIDE), CURE)
     with reading(WHAT, path, cure=CURE):
         narrow = {name: dtype for name, dtype in (COLUMNS | OPTIONAL).items() if name in parts}
@@ -135,9 +156,13 @@ def read_observations(path: str | Path) -> Observations:
 
 
 def _check(seen: Observations) -> None:
-    """Raise ValueError for a number that names nothing; what is not finite, or weighs nothing, the solve leaves out and counts."""
+    """Raise ValueError for an index without a name or a value out of range.
+
+    Values that are not finite, or of no weight, are allowed: the solve excludes and counts them.
+    """
     for kind, name in NAMES.items():
-        index, known = getattr(seen, name), getattr(seen, kind)
+        index = getattr(seen, name)
+        known = getattr(seen, kind)
         if len(index) and not 0 <= index.min() <= index.max() < len(known):
             raise ValueError(f"column {name!r} points beyond the names of the metadata")
     if seen.exposures and len(seen.exposures) != len(seen.photos):
@@ -155,12 +180,20 @@ def _check(seen: Observations) -> None:
 
 
 def concatenate(parts: Sequence[Observations]) -> Observations:
-    """All observations of `parts`, indices renumbered over the sorted union of names: the order of parts changes no index."""
-    parts, cure = sorted(parts, key=lambda part: part.photos), "run the stage `urm` again for all photos"
+    """Concatenate observations, with indices renumbered over the sorted union of names.
+
+    The order of `parts` changes no index.
+
+    Raises:
+        InputError: If the parts have different materials or numbers of directions.
+    """
+    parts = sorted(parts, key=lambda part: part.photos)
+    cure = "run the stage `urm` again for all photos"
     materials = parts[0].materials
     if any(part.materials != materials for part in parts):
         raise InputError("reflectance maps of different material lists", cure=cure)
     fields: dict[str, Any] = {name: np.concatenate([getattr(part, name) for part in parts]) for name in COLUMNS}
+    # renumber photos and illuminations over the sorted union of names
     for kind, column in (("photos", "photo"), ("illuminations", "illumination")):
         fields[kind] = tuple(sorted({name for part in parts for name in getattr(part, kind)}))
         numbers = [np.array([fields[kind].index(name) for name in getattr(part, kind)], "i4") for part in parts]
@@ -170,7 +203,8 @@ def concatenate(parts: Sequence[Observations]) -> Observations:
     exposures = {photo: exposure for part in parts for photo, exposure in zip(part.photos, part.exposures)}
     fills = {name: (dtype, nothing) for name, (dtype, nothing, _) in WIDE.items()}
     fills |= {"confidence": (np.dtype("f4"), 1), "place": (np.dtype("f4"), 0), "detail": (np.dtype("f4"), 1)}
-    for name, (dtype, fill) in fills.items():  # parts without see everything, are sure, and lie in the middle
+    # optional columns: parts without them get full visibility, full confidence, and the origin as place
+    for name, (dtype, fill) in fills.items():
         given = [getattr(part, name) for part in parts]
         shapes = {values.shape[1:] for values in given if values is not None}
         if len(shapes) > 1:
@@ -186,7 +220,7 @@ def concatenate(parts: Sequence[Observations]) -> Observations:
 
 
 def with_exposures(observations: Observations, known: Mapping[str, float]) -> Observations:
-    """Return the observations with exposures that are known, in EV by photo, in place of those of EXIF."""
+    """Replace exposures of EXIF by those that are known, in EV by photo."""
     if not known:
         return observations
     exif = observations.exposures or (None,) * len(observations.photos)
@@ -197,11 +231,12 @@ def with_exposures(observations: Observations, known: Mapping[str, float]) -> Ob
 
 
 def relative_exposures(observations: Observations) -> dict[str, float]:
-    """Return the exposure of each photo that has observations, over the first one (by name) in its light; 1 unless all photos of the light say theirs.
+    """Return the exposure of each photo with observations, relative to the first photo (by name) of its light.
 
-    Two photos of one light differ by a factor, which the solve finds.  From a factor of 8 it may not find back; what the cameras
-    wrote, t·S/N², is right within rounding and what a camera's own rendering does.  So radiance is brought to the exposure of
-    the light's first photo by EXIF, and what is solved for is what EXIF leaves.
+    It is 1 unless the exposures of all photos of the light are known. Two photos of one light differ by a factor, which
+    the solve estimates. From a factor of 8 it may not converge. EXIF's t·S/N² is right within rounding and within the
+    changes of a camera's own rendering. So radiance is brought to the exposure of the light's first photo by EXIF, and
+    the solve estimates the rest.
     """
     known = dict(zip(observations.photos, observations.exposures))
     relative = {}
@@ -215,7 +250,7 @@ def relative_exposures(observations: Observations) -> dict[str, float]:
 
 
 def at_one_exposure(observations: Observations, relative: dict[str, float]) -> Observations:
-    """Return the observations with the radiance of each photo over its relative exposure; unchanged where all are 1."""
+    """Divide the radiance of each photo by its relative exposure; all factors of 1 change nothing."""
     factors = np.array([relative.get(photo, 1.0) for photo in observations.photos])
     if (factors == 1).all():
         return observations
@@ -223,7 +258,7 @@ def at_one_exposure(observations: Observations, relative: dict[str, float]) -> O
 
 
 def _of_bytes(column: pa.Array, dtype: np.dtype) -> np.ndarray:
-    """The rows' values, each row's in one binary; ValueError for bytes that are no whole values."""
+    """Convert a column of fixed-size binaries to one row of values each; ValueError for a fraction of a value."""
     k, over = divmod(column.type.byte_width, dtype.itemsize)
     if over:
         raise ValueError(f"a binary of {column.type.byte_width} bytes holds no numbers of {dtype.itemsize}")
@@ -231,7 +266,7 @@ def _of_bytes(column: pa.Array, dtype: np.dtype) -> np.ndarray:
 
 
 def _array(column: pa.Array, dtype: str, is_vector: bool) -> np.ndarray:
-    """Of the type that it is written in; ValueError for values that do not fit into it."""
+    """Convert a column to an array of the type `dtype`; ValueError for values that do not fit into it."""
     if pa.types.is_fixed_size_list(column.type) != is_vector or pa.types.is_string(column.type):
         raise ValueError(f"a column is of type {column.type}")
     flat = column.flatten() if is_vector else column

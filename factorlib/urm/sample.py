@@ -1,11 +1,11 @@
-"""A sample of a photo's observations that tells as much of its materials and light: stratified, weighted, without chance.
+"""Stratified, weighted, deterministic sample of a photo's observations, with little loss of information.
 
-Strata are the materials, what is clipped of them, and cells of their normals.  Pixels of one stratum show much the same, so
-that large strata are thinned first: each keeps what it has, up to a number that is the same for all and as large as fits.  What
-is left over of a flat seat is worth little; the few pixels at the rim of a highlight are all kept.
+Strata are the materials, their clipping states, and cells of normals. Pixels of one stratum are nearly redundant, so
+large strata are thinned first. Each stratum keeps its pixels up to a number that is the same for all and as large as
+possible. Most pixels of a flat seat are dropped; the few pixels at the rim of a highlight are all kept.
 
-Those that are kept are spread evenly over their stratum's pixels and stand for the others too: weights grow, so that the weights
-of each stratum have the sum that they had.
+The selected pixels are spread evenly over their stratum and stand for the others too: weights are scaled so that the
+sum of weights of each stratum is preserved.
 """
 
 from __future__ import annotations
@@ -18,11 +18,11 @@ from factorlib.geometry.sphere import direction_cells
 from factorlib.urm.merge import groups
 from factorlib.urm.observations import Observations
 
-CELL = np.radians(3.0)  # of normals: about as well as poses and meshes are known
+CELL = np.radians(3.0)  # cell of normals, about the accuracy of poses and meshes
 
 
 def sample(observations: Observations, most: int) -> Observations:
-    """Return at most `most` observations of one photo, in their order; all of them, unchanged, where there are no more."""
+    """Select at most `most` observations of one photo, in their order; all of them, unchanged, if there are no more."""
     if len(observations) <= most:
         return observations
     group = strata(observations, most)
@@ -33,8 +33,9 @@ def sample(observations: Observations, most: int) -> Observations:
 
 
 def strata(observations: Observations, most: int) -> Int[np.ndarray, " n"]:
-    """The stratum of each observation, from 0; cells grow until there are no more strata than `most`."""
-    kind, cell = np.column_stack([observations.material, observations.clipped @ np.array([1, 2, 4])]), CELL
+    """Return the stratum of each observation, from 0; cells grow until there are at most `most` strata."""
+    kind = np.column_stack([observations.material, observations.clipped @ np.array([1, 2, 4])])
+    cell = CELL
     while True:
         of_normal = direction_cells(observations.normal, cell) if cell < np.pi else np.zeros((len(kind), 0), np.int64)
         first, group = groups(np.column_stack([kind, of_normal]))
@@ -44,14 +45,17 @@ def strata(observations: Observations, most: int) -> Int[np.ndarray, " n"]:
 
 
 def shared_out(size: Int[np.ndarray, " g"], most: int) -> Int[np.ndarray, " g"]:
-    """Return how many each stratum keeps: what it has, up to a number that is the same for all but for one; `most` in all.
+    """Return the number of pixels that each stratum keeps: its size, up to a common limit; `most` in all.
+
+    The limit differs by one between some strata, so that the sum is exact.
 
     >>> shared_out(np.array([1, 5, 100, 80]), 27).tolist()
     [1, 5, 11, 10]
     """
     ascending = np.sort(size)
     before = np.concatenate([[0], np.cumsum(ascending)[:-1]])
-    room = (most - before) // np.arange(len(size), 0, -1)  # for each stratum from here on, were those before kept whole
+    # by ascending size: the limit for this stratum and all larger ones, if all smaller ones are kept whole
+    room = (most - before) // np.arange(len(size), 0, -1)
     cut = np.flatnonzero(room < ascending)
     if not len(cut):
         return size
@@ -62,13 +66,15 @@ def shared_out(size: Int[np.ndarray, " g"], most: int) -> Int[np.ndarray, " g"]:
 
 
 def evenly_spread(group: Int[np.ndarray, " n"], count: Int[np.ndarray, " g"]) -> Int[np.ndarray, " m"]:
-    """Rows, ascending: `count` of each group, at even steps through its rows.
+    """Select `count` rows of each group at even steps through its rows; return them in ascending order.
 
     >>> evenly_spread(np.array([0, 1, 0, 0, 0]), np.array([2, 1])).tolist()
     [1, 2, 4]
     """
+    # rank of each row in its group; select a row where ⌊rank · count / size⌋ steps up
     order = np.argsort(group, kind="stable")
     size = np.bincount(group, minlength=len(count))
     rank = np.arange(len(group)) - np.repeat(np.cumsum(size) - size, size)
-    total, wanted = np.repeat(size, size), np.repeat(count, size)
+    total = np.repeat(size, size)
+    wanted = np.repeat(count, size)
     return np.sort(order[(rank + 1) * wanted // total > rank * wanted // total])

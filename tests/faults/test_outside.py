@@ -18,7 +18,10 @@ from PIL import Image
 from factorlib.checkpoint import Checkpoint
 from factorlib.dataset.read import read_dataset
 from factorlib.errors import InputError
+from factorlib.recipe.read import read_recipe
 from factorlib.runner import verbs
+from factorlib.runner.project import LIBRARY, Project, photo_sets
+from factorlib.runner.survey import survey
 from factorlib.validation import Validation
 from tests.faults.battered import call
 from tests.faults.good import DATASET, TRUTH, edited, make_set, put
@@ -86,6 +89,20 @@ def test_no_path_leads_out_or_nowhere(good):
         else:
             continue
         assert re.search(words, error.found), (place, way, error)
+
+
+def test_a_given_folder_and_a_recipe_open_no_pipe_and_no_device(tmp_path):
+    dataset = read_dataset(make_set(tmp_path / "set"))
+    for kind in ("pipe", "device"):
+        given = tmp_path / kind
+        given.mkdir()
+        for name in ("poses.json", "odd.obj", "odd.hdr", "odd.json"):
+            os.mkfifo(given / name) if kind == "pipe" else (given / name).symlink_to("/dev/zero")
+        with pytest.raises(InputError, match=f"is a {kind}"):
+            survey(Project(LIBRARY, photo_sets()), "synthetic", ["align"], [f"align.poses={given}"])
+        for text in ("mesh: odd.obj\nkind: insert", "kind: relight\nlights: [odd.hdr]"):
+            with pytest.raises(InputError, match="there is no file"):
+                read_recipe(put(given / "own.yaml", text), dataset)
 
 
 # ── it writes nothing outside build/ ─────────────────────────────────────────────────────────────────────────────────

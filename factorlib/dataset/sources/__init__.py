@@ -1,1 +1,1 @@
-"""Cameras and poses that are known from elsewhere: a COLMAP model, a NeRF-style transforms.json, a BOP scene."""
+"""Cameras and poses from external sources: a COLMAP model, a NeRF-style transforms.json, a BOP scene."""

@@ -1,7 +1,7 @@
-"""A scene of a BOP data set (Hodaň et al. 2018): scene_camera.json and, where poses are public, scene_gt.json.
+"""Reading of a scene of a BOP data set (Hodaň et al. 2018): scene_camera.json and scene_gt.json, if poses are public.
 
-Its camera frame is OpenCV's; lengths are millimetres.  Its pixel centres are whole numbers (the toolkit turns pixel (0, 0)
-of a depth map into the ray through (0, 0)), here they are at 0.5.  It does not say how large its images are.
+Its camera frame is OpenCV's, and lengths are millimetres.  Its pixel centres are whole numbers: the toolkit turns pixel
+(0, 0) of a depth map into the ray through (0, 0).  Here they are at 0.5.  It does not state the size of its images.
 """
 
 from typing import Annotated
@@ -13,20 +13,21 @@ from factorlib.dataset.schema import Number, Pose, Vec3
 from factorlib.dataset.sources.shot import Shot, colmap_camera, read_source
 
 KEY = "cameras.bop"
-CAMERAS, POSES = "scene_camera.json", "scene_gt.json"
+CAMERAS = "scene_camera.json"
+POSES = "scene_gt.json"
 IDS = "it is not the id of an image: ids are whole numbers, of 18 digits at most"
 ImageId = Annotated[str, msgspec.Meta(pattern=r"^[0-9]{1,18}\Z", description=IDS)]
 Nine = tuple[Number, Number, Number, Number, Number, Number, Number, Number, Number]
 
 
 class SceneCamera(msgspec.Struct, frozen=True):
-    """cam_K: [[fx, s, cx], [0, fy, cy], [0, 0, 1]] row by row."""
+    """Camera of an image; cam_K is [[fx, s, cx], [0, fy, cy], [0, 0, 1]], row by row."""
 
     cam_K: Nine
 
 
 class SceneObject(msgspec.Struct, frozen=True):
-    """cam_from_object, millimetres."""
+    """An instance of an object with its cam_from_object, in millimetres."""
 
     obj_id: int
     cam_R_m2c: Nine
@@ -34,7 +35,10 @@ class SceneObject(msgspec.Struct, frozen=True):
 
 
 def bop_shots(path: str, refuse: Refusal) -> list[Shot]:
-    """The images of the scene in the dataset's folder `path`, by id; each is taken to be twice its principal point large."""
+    """Read the images of the scene in the dataset's folder `path`, sorted by id.
+
+    The size of an image is assumed to be twice its principal point.
+    """
     camera_file, pose_file = (refuse.file_of(KEY, path, name) for name in (CAMERAS, POSES))
     if camera_file is None:
         refuse(KEY, f"there is no {CAMERAS} in {path!r}", "name the folder of one scene, such as test/000001")
@@ -47,7 +51,9 @@ def bop_shots(path: str, refuse: Refusal) -> list[Shot]:
         if skew != 0 or min(fx, fy, cx, cy) <= 0:
             cure = "give [fx, 0, cx, 0, fy, cy, 0, 0, 1] in pixels"
             of_cameras(f"{image}.cam_K", "is not the camera of square axes", cure)
-        size, params = (2 * cx + 1, 2 * cy + 1), [fx, fy, cx + 0.5, cy + 0.5]
+        # pixel centres from whole numbers to 0.5
+        size = (2 * cx + 1, 2 * cy + 1)
+        params = [fx, fy, cx + 0.5, cy + 0.5]
         pinhole = colmap_camera(f"{image}.cam_K", "PINHOLE", *size, params, of_cameras)
         instances: dict[int, list[Pose]] = {}
         for index, obj in enumerate(poses.get(image, [])):

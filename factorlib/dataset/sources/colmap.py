@@ -1,8 +1,8 @@
-"""A COLMAP model, text or binary: COLMAP's frames and pixels are this project's, so nothing is converted.
+"""Reading of a COLMAP model, text or binary.  COLMAP's frames and pixels are this project's, so nothing is converted.
 
-Only cameras and images are read, by the layout that COLMAP documents: a model's points and tracks are gigabytes that nothing
-here needs, and pycolmap, which reads all of it, takes every count in a binary file at its word (a damaged one keeps it busy
-for ever, or fills memory).
+Only cameras and images are read, by the layout that COLMAP documents.  A model's points and tracks are gigabytes that
+are not needed here.  pycolmap reads all of it and trusts every count in a binary file.  A damaged one keeps it busy for
+ever or fills memory.
 """
 
 import math
@@ -21,16 +21,15 @@ from factorlib.reading import one_line, reading
 KEY = "cameras.colmap"
 CURE = "name the folder of cameras and images (.bin or .txt), such as sparse/0"
 MODELS = {int(model): name for name, model in pycolmap.CameraModelId.__members__.items() if name != "INVALID"}
-MOST_NAME = 4096  # bytes
+MOST_NAME = 4096  # longest name of an image, bytes
 
 CameraLine = tuple[int, str, int, int, tuple[float, ...]]  # id, model, width, height, parameters
-ImageLine = tuple[
-    str, int, tuple[float, ...]
-]  # name, its camera's id, cam_from_world as quaternion w x y z and translation
+# name, camera id, cam_from_world as quaternion w x y z and translation
+ImageLine = tuple[str, int, tuple[float, ...]]
 
 
 def colmap_shots(path: str, refuse: Refusal) -> list[Shot]:
-    """The registered images of the model in the dataset's folder `path`, by name."""
+    """Read the registered images of the model in the dataset's folder `path`, sorted by name."""
     refuse.subfolder(KEY, path)
     models = {suffix: [refuse.file_of(KEY, path, f"{name}{suffix}") for name in ("cameras", "images")]
               for suffix in (".bin", ".txt")}  # fmt: skip
@@ -38,7 +37,8 @@ def colmap_shots(path: str, refuse: Refusal) -> list[Shot]:
     if suffix is None:
         fault = f"{path!r} is not readable as a COLMAP model (it has no cameras and images, .bin or .txt)"
         refuse(KEY, fault, CURE)
-    (camera_file, image_file), is_text = models[suffix], suffix == ".txt"
+    camera_file, image_file = models[suffix]
+    is_text = suffix == ".txt"
     with reading("a COLMAP model", camera_file, KEY, CURE):
         lines = _text_cameras(camera_file) if is_text else _records(camera_file, _binary_camera)
         cameras = {number: entry for number, *entry in lines}
@@ -54,7 +54,9 @@ def colmap_shots(path: str, refuse: Refusal) -> list[Shot]:
     made = {number: colmap_camera(f"{KEY}: camera {number}", *entry, refuse) for number, entry in cameras.items()}
     shots = []
     for name, camera_id, (*quaternion, x, y, z) in images:
-        key, camera, length = f"{KEY}: {one_line(name)}", made[camera_id], math.hypot(*quaternion)
+        key = f"{KEY}: {one_line(name)}"
+        camera = made[camera_id]
+        length = math.hypot(*quaternion)
         if not (0 < length <= LARGEST and max(abs(x), abs(y), abs(z)) <= LARGEST and not math.isnan(x + y + z)):
             refuse(key, "is no pose: its numbers are zero, not finite or too large", DAMAGED)
         unit = [value / length for value in (*quaternion[1:], quaternion[0])]
@@ -64,16 +66,20 @@ def colmap_shots(path: str, refuse: Refusal) -> list[Shot]:
 
 
 def _count_of(model: str) -> int:
-    """How many parameters a camera model has."""
+    """Return the number of parameters of a camera model."""
     if model not in MODELS.values():
         raise ValueError(f"{one_line(model)!r} is no camera model")
     return len(pycolmap.Camera.create_from_model_name(0, model, 1.0, 1, 1).params)
 
 
 def _records(file: Path, record: Callable[[mmap.mmap, int], tuple[tuple, int]]) -> Iterator[tuple]:
-    """What `record` makes of each that the file announces: of its bytes, from a place on, with the place where it ends."""
+    """Yield the records of a binary file.
+
+    `record` decodes one at an offset, and returns it with the offset of its end.
+    """
     with file.open("rb") as stream, mmap.mmap(stream.fileno(), 0, access=mmap.ACCESS_READ) as content:
-        (count,), at = struct.unpack_from("<Q", content), 8
+        (count,) = struct.unpack_from("<Q", content)
+        at = 8
         for _ in range(count):
             entry, at = record(content, at)
             yield entry
@@ -89,7 +95,7 @@ def _binary_camera(content: mmap.mmap, at: int) -> tuple[CameraLine, int]:
 
 
 def _binary_image(content: mmap.mmap, at: int) -> tuple[ImageLine, int]:
-    """A pose, a name, which a zero byte ends, and points, which are passed over."""
+    """Decode a pose and a zero-terminated name, and skip the points."""
     _, *pose, camera_id = struct.unpack_from("<I7dI", content, at)
     end = content.find(b"\0", at + 64, at + 64 + MOST_NAME)
     if end < 0:
@@ -109,7 +115,7 @@ def _text_cameras(file: Path) -> Iterator[CameraLine]:
 
 
 def _text_images(file: Path) -> Iterator[ImageLine]:
-    """Two lines each; the second, of points, may be empty."""
+    """Yield images of two lines each; the second, of points, may be empty."""
     with file.open(encoding="utf-8") as lines:
         for line in filter(_says_something, lines):
             words = line.strip().split(maxsplit=9)

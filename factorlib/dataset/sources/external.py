@@ -1,6 +1,7 @@
-"""The camera of each photo by a source of cameras: its image matched, its camera a pinhole, its poses in the meshes' units.
+"""Cameras of photos from an external source.
 
-What dataset.yaml gives for a photo wins: a pose or keypoints of an object are not looked for in the source.
+Images are matched, cameras are reduced to pinholes, and poses are converted to mesh units.  Values in dataset.yaml take
+precedence: an object with a pose or keypoints there gets no pose from the source.
 """
 
 import logging
@@ -17,28 +18,41 @@ from factorlib.dataset.sources.shot import Shot, as_rows, pinhole, rigid
 from factorlib.dataset.sources.transforms import transforms_shots
 from factorlib.errors import did_you_mean
 
-SUFFIXES = (*IMAGES, ".webp", ".bmp")  # what else follows a dot is part of a name: transforms.json may say "r_0.5"
+SUFFIXES = (*IMAGES, ".webp", ".bmp")  # Other suffixes are part of a name: transforms.json may say "r_0.5".
 READERS = {"colmap": colmap_shots, "transforms": transforms_shots, "bop": bop_shots}
 log = logging.getLogger("factorlib.dataset")
 
 
 def external_cameras(spec: DatasetFile, file: Path) -> tuple[DatasetFile, dict[str, ExternalCamera]]:
-    """The dataset with world_from_camera filled in, where `cameras` asks for it, and the cameras of its photos in the source.
+    """Return the dataset and the cameras of its photos in the source.
 
-    Photos that the source does not have are named in a warning.  Raises InputError, naming file, key and cure, for a source
-    that cannot be read, a photo that could be several of its images, and a camera that is no pinhole of one focal length.
+    The dataset gets world_from_camera from the source if `cameras` asks for it.  A warning names photos that the source
+    lacks.
+
+    Raises:
+        InputError: The source cannot be read, a photo matches several of its images, or a camera is not a pinhole.
     """
-    refuse, source, external, photos = Refusal(file, file.parent), spec.cameras, {}, []
+    refuse = Refusal(file, file.parent)
+    source = spec.cameras
+    external = {}
+    photos = []
     kind = next(kind for kind in SOURCES if getattr(source, kind) is not None)
     shots = matched(spec, kind, READERS[kind](getattr(source, kind), refuse), refuse)
     for photo in spec.photos:
         shot = shots.get(photo.name)
         if shot is None:
-            log.warning("%s: cameras.%s has no image of photo %r: it is aligned as if there were none; if it has one, name "
-                        "it: cameras.images: {%s: …}", file, kind, photo.name, photo.name)  # fmt: skip
+            log.warning(
+                "%s: cameras.%s has no image of photo %r: it is aligned as if there were none; "
+                "if it has one, name it: cameras.images: {%s: …}",
+                file,
+                kind,
+                photo.name,
+                photo.name,
+            )
         else:
             hulls = {obj.name for obj in photo.objects if spec.meshes[obj.mesh].hull}
-            poses, given = _poses(photo, shot, source, hulls, refuse), photo.camera
+            poses = _poses(photo, shot, source, hulls, refuse)
+            given = photo.camera
             if given is not None and given.focal_px is not None and given.principal_point is not None:
                 camera = ExternalCamera(kind, given.focal_px, given.principal_point, None, poses)
             else:
@@ -53,16 +67,30 @@ def external_cameras(spec: DatasetFile, file: Path) -> tuple[DatasetFile, dict[s
 
 
 def matched(spec: DatasetFile, kind: str, shots: list[Shot], refuse: Refusal) -> dict[str, Shot]:
-    """photo -> its image in the source: as `images` says; else by path, by file name, or by that without suffix; BOP: by id."""
-    by_name, result = {shot.image: shot for shot in shots}, {}
-    alike: dict[tuple, list[Shot]] = {}  # shots by each way in which a photo may be named like them
+    """Match the photos to images of the source.
+
+    The match is by `images`, else by path, by file name, or by file name without suffix; for BOP it is by id.
+
+    Args:
+        spec: content of dataset.yaml
+        kind: kind of the source
+        shots: images of the source
+        refuse: raises errors
+
+    Returns:
+        The matching image by photo.
+    """
+    by_name = {shot.image: shot for shot in shots}
+    result = {}
+    alike: dict[tuple, list[Shot]] = {}  # shots by each name that may match a photo's
     for shot in shots:
         path = PurePosixPath(str(shot.image).replace("\\", "/"))
         stem = path.stem if path.suffix.lower() in SUFFIXES else path.name
         for way in (("id", shot.image), ("path", *path.parts), ("file", path.name), ("stem", stem)):
             alike.setdefault(way, []).append(shot)
     for photo in spec.photos:
-        key, path = f"cameras.images.{photo.name}", PurePosixPath(photo.image)
+        key = f"cameras.images.{photo.name}"
+        path = PurePosixPath(photo.image)
         if photo.name in spec.cameras.images:
             image = spec.cameras.images[photo.name]
             if image not in by_name:
@@ -86,10 +114,13 @@ def matched(spec: DatasetFile, kind: str, shots: list[Shot], refuse: Refusal) ->
 
 
 def _poses(photo: PhotoEntry, shot: Shot, source: CameraSource, hulls: set[str], refuse: Refusal) -> dict[str, Pose]:
-    """object -> pose, of those whose place the source gives and dataset.yaml does not; `hulls` lie in the source's frame where it does not say."""
+    """Return poses by object, for objects that the source places and dataset.yaml does not.
+
+    Objects in `hulls` are in the source's frame unless it says otherwise.
+    """
     objects = [obj for obj in photo.objects if obj.pose is None and not obj.keypoints]
     poses = {}
-    if source.bop is not None:  # the one instance of the object's mesh, in units of the mesh
+    if source.bop is not None:  # pose of the one instance of the object's mesh, in units of the mesh
         for obj in (obj for obj in objects if obj.mesh in source.obj_ids):
             obj_id = source.obj_ids[obj.mesh]
             instances = shot.poses.get(obj_id, [])
@@ -109,7 +140,7 @@ def _poses(photo: PhotoEntry, shot: Shot, source: CameraSource, hulls: set[str],
     if len(scales) > 1:
         fault = f"photo {photo.name!r} shows objects of different scales, {', '.join(f'{s:g}' for s in scales)}"
         refuse("cameras.world_from_object", fault, "objects of one photo share its unit: scale the meshes' files alike")
-    for name, similarity in placed.items():  # of scale 1: the camera's unit becomes the mesh's, which no picture shows
+    for name, similarity in placed.items():  # The mesh's unit replaces the source's, which changes no picture.
         cam_from_object = shot.cam_from_world * rigid(similarity.rotation, similarity.translation)
         translation = tuple(float(x) / similarity.scale for x in cam_from_object.translation)
         poses[name] = Pose(as_rows(cam_from_object.rotation), translation)

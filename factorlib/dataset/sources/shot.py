@@ -1,4 +1,4 @@
-"""The common form of every source: one shot per image, its camera as COLMAP describes it."""
+"""Common form of every source of cameras: one shot per image, with its camera in COLMAP's terms."""
 
 import json
 import math
@@ -15,21 +15,23 @@ from factorlib.dataset.schema import CENTRE_PX, FOCAL_PX, LARGEST, Mat3, Pose, V
 from factorlib.reading import read_text, reading
 from factorlib.yamlfile import convert
 
-SIDE_PX = 1e6  # most pixels of an image's width or height
-MOST_OFF_PX = 0.5  # from a pinhole of one focal length, anywhere in the image
-GRID = 33  # points a side at which the two are compared
-MOST_BYTES = 256_000_000  # of a json; a scene of BOP has some 10 MB
+SIDE_PX = 1e6  # largest width or height of an image, pixels
+MOST_OFF_PX = 0.5  # largest distance from a pinhole of one focal length, anywhere in the image
+GRID = 33  # points per side at which the two are compared
+MOST_BYTES = 256_000_000  # largest size of a JSON file; a scene of BOP has some 10 MB
 DAMAGED = "the file is damaged: copy it again from where it came"
 
 
 class Shot(msgspec.Struct, frozen=True):
-    """An image of a source: its name or id, its camera, and the poses of what it shows.
+    """An image of a source, with its camera and the poses of objects.
 
-    size            of the image in pixels, as in `schema.ExternalCamera`
-    key             the place in the source, for messages
-    centred         the source does not say where the principal point is
-    cam_from_world  None where the source knows no world
-    poses           obj_id -> cam_from_object of each instance, in millimetres
+    Attributes:
+        image: name or id
+        size: size of the image in pixels, as in `schema.ExternalCamera`
+        key: place in the source, for messages
+        centred: True if the source does not give the principal point
+        cam_from_world: None if the source has no world
+        poses: cam_from_object of each instance by obj_id, in millimetres
     """
 
     image: str | int
@@ -42,7 +44,16 @@ class Shot(msgspec.Struct, frozen=True):
 
 
 def read_source(file: Path, type_: type, key: str | None = None) -> Any:
-    """A json as a value of `type_`.  Raises InputError that names file and key."""
+    """Read a JSON file as a value of a type.
+
+    Args:
+        file: the file
+        type_: the type
+        key: the key in dataset.yaml, for errors
+
+    Raises:
+        InputError: The file does not hold such a value; the error names file and key.
+    """
     text = read_text(file, "a JSON file", key, MOST_BYTES)
     with reading("JSON", file, key):
         return convert(json.loads(text), type_, file)
@@ -51,7 +62,18 @@ def read_source(file: Path, type_: type, key: str | None = None) -> Any:
 def colmap_camera(
     key: str, model: str, width: float, height: float, params: Sequence[float], refuse: Refusal
 ) -> pycolmap.Camera:
-    """A camera of one of COLMAP's models; numbers that no camera has are refused, for pycolmap takes any."""
+    """Return a camera of one of COLMAP's models.
+
+    pycolmap accepts any numbers, so implausible ones are rejected here.
+
+    Args:
+        key: place in the source, for errors
+        model: name of the camera model
+        width: width in pixels
+        height: height in pixels
+        params: parameters of the model
+        refuse: raises errors
+    """
     fault = f"is no camera: {width:g}×{height:g} pixels, {model} {', '.join(f'{x:g}' for x in params)}"
     if not (1 <= width <= SIDE_PX and 1 <= height <= SIDE_PX):
         refuse(key, fault, f"an image is 1 to {SIDE_PX:g} pixels wide and high; {DAMAGED}")
@@ -61,9 +83,12 @@ def colmap_camera(
 
 
 def pinhole(camera: pycolmap.Camera, key: str, refuse: Refusal) -> tuple[float, Vec2]:
-    """Focal length and principal point of the pinhole nearest to a camera: by least squares over its image.
+    """Return focal length and principal point of the pinhole nearest to a camera, by least squares over its image.
 
-    Pixels of the camera's image, centres at 0.5.  Refused where the two differ by more than MOST_OFF_PX somewhere.
+    Args:
+        camera: the camera; pixel centres at 0.5
+        key: place in the source, for errors
+        refuse: raises an error if the two differ by more than MOST_OFF_PX anywhere
     """
     centre = float(camera.principal_point_x), float(camera.principal_point_y)
     focals = camera.focal_length_x, camera.focal_length_y
@@ -79,29 +104,36 @@ def pinhole(camera: pycolmap.Camera, key: str, refuse: Refusal) -> tuple[float, 
     pixels = [[camera.width * i / (GRID - 1), camera.height * j / (GRID - 1)] for i in range(GRID) for j in range(GRID)]
     places = pixels - camera.calibration_matrix()[:2, 2]  # an array, as pycolmap's are
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore", RuntimeWarning)  # of pixels without a ray: the refusal below says so
+        warnings.simplefilter("ignore", RuntimeWarning)  # for pixels without a ray, which are rejected below
+        # least-squares focal length of pixel offset over slope, and the largest residual
         slopes = camera.cam_from_img(pixels)
         focal = float((slopes * places).sum() / (slopes * slopes).sum())
         off = float((((places - focal * slopes) ** 2).sum(axis=1) ** 0.5).max())
     if not off <= MOST_OFF_PX:  # NaN where a pixel has no ray
         far = f"by {off:.1f} px" if off == off else "so much that some pixels have no ray"
-        how, cure = "the camera's lens distorts", "give the photo's camera.focal_px, principal_point and distortion: [k1, k2] in " \
-            "dataset.yaml; or undistort by `colmap image_undistorter` and use its images, its model, and masks of them"  # fmt: skip
+        how = "the camera's lens distorts"
+        cure = (
+            "give the photo's camera.focal_px, principal_point and distortion: [k1, k2] in dataset.yaml; "
+            "or undistort by `colmap image_undistorter` and use its images, its model, and masks of them"
+        )
         if camera.is_undistorted():
-            how, cure = "the camera's pixels are not square", "calibrate with one focal length (COLMAP's SIMPLE_PINHOLE or " \
-                "SIMPLE_RADIAL), or resample photos and masks to square pixels"  # fmt: skip
+            how = "the camera's pixels are not square"
+            cure = (
+                "calibrate with one focal length (COLMAP's SIMPLE_PINHOLE or SIMPLE_RADIAL), "
+                "or resample photos and masks to square pixels"
+            )
         limit = f"up to {MOST_OFF_PX} px would not matter"
         refuse(key, f"{how}: it differs from a pinhole of one focal length {far}; {limit}", cure)
     return focal, centre
 
 
 def rigid(rotation: Mat3, translation: Vec3) -> pycolmap.Rigid3d:
-    """The rigid motion of a rotation matrix (made orthonormal) and a translation."""
+    """Return the rigid motion of a rotation matrix (made orthonormal) and a translation."""
     turn = pycolmap.Rotation3d(rotation)
     turn.normalize()
     return pycolmap.Rigid3d(turn, translation)
 
 
 def as_rows(rotation: pycolmap.Rotation3d) -> Mat3:
-    """The rotation as the rows of its matrix."""
+    """Return the rows of a rotation's matrix."""
     return tuple(tuple(map(float, row)) for row in rotation.matrix())

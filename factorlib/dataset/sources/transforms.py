@@ -1,6 +1,6 @@
-"""A NeRF-style transforms.json, as nerfstudio and instant-ngp write it and as NeRF's own scenes have it.
+"""Reading of a NeRF-style transforms.json, as nerfstudio, instant-ngp and NeRF's own scenes have it.
 
-Its cameras are OpenGL's (x right, y up, z backward) and its matrices lead from camera to world.
+Its cameras are OpenGL's (x right, y up, z backward), and its matrices are world_from_camera.
 """
 
 import math
@@ -14,8 +14,9 @@ from factorlib.dataset.schema import FOCAL_PX, Centre, Focal, Number
 from factorlib.dataset.sources.shot import SIDE_PX, Shot, colmap_camera, read_source, rigid
 from factorlib.reading import one_line
 
-FISHEYE, PERSPECTIVE = "OPENCV_FISHEYE", ("SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV")
-ANY_WIDTH = 1000.0  # of an image of which only the field of view is known
+FISHEYE = "OPENCV_FISHEYE"
+PERSPECTIVE = ("SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV")
+ANY_WIDTH = 1000.0  # assumed width of an image with only a known field of view
 Side = Annotated[float, msgspec.Meta(ge=1, le=SIDE_PX, description="an image has 1 to 1e+06 pixels a side")]
 Row4 = tuple[Number, Number, Number, Number]
 
@@ -41,41 +42,47 @@ class Lens(msgspec.Struct, frozen=True):
 
 
 class Frame(Lens, frozen=True, kw_only=True):
-    """transform_matrix: world_from_camera, OpenGL, 3 or 4 rows."""
+    """A frame; transform_matrix is world_from_camera, OpenGL, with 3 or 4 rows."""
 
     file_path: str
     transform_matrix: list[Row4]
 
 
 class TransformsFile(Lens, frozen=True, kw_only=True):
-    """A whole transforms.json: the lens that its frames share, and the frames."""
+    """Content of transforms.json: the lens that its frames share, and the frames."""
 
     frames: list[Frame]
 
 
 def transforms_shots(path: str, refuse: Refusal) -> list[Shot]:
-    """The frames of the dataset's file `path`, in its order; a frame's own lens goes before the file's."""
+    """Read the frames of the dataset's file `path`, in its order; a frame's own lens overrides the file's."""
     file = refuse.folder / path
-    content, refuse = read_source(file, TransformsFile), Refusal(file, refuse.folder)
+    content = read_source(file, TransformsFile)
+    refuse = Refusal(file, refuse.folder)
     shots = []
     for index, frame in enumerate(content.frames):
-        key, names = f"frames[{index}]", Lens.__struct_fields__
+        key = f"frames[{index}]"
+        names = Lens.__struct_fields__
         own = {name: getattr(frame, name) for name in names}
         lens = Lens(**{name: getattr(content, name) if own[name] is None else own[name] for name in names})
         camera, size = _camera(key, lens, refuse)
         centred = lens.cx is None or lens.cy is None
-        of, rows = f"{key}.transform_matrix", frame.transform_matrix
+        of = f"{key}.transform_matrix"
+        rows = frame.transform_matrix
         if len(rows) not in (3, 4) or (len(rows) == 4 and tuple(rows[3]) != (0, 0, 0, 1)):
             refuse(of, "is not a rigid matrix", "give the rows [R | t], and [0, 0, 0, 1] below them or nothing")
         refuse.rotation(of, tuple(row[:3] for row in rows[:3]))
-        opencv = tuple((x, -y, -z) for x, y, z, _ in rows[:3])  # the camera's y and z axes, turned over
+        opencv = tuple((x, -y, -z) for x, y, z, _ in rows[:3])  # OpenGL's camera axes to OpenCV's
         cam_from_world = rigid(opencv, tuple(row[3] for row in rows[:3])).inverse()
         shots.append(Shot(frame.file_path, camera, size, f"{file.name}: {key}", centred, cam_from_world))
     return shots
 
 
 def _camera(key: str, lens: Lens, refuse: Refusal) -> tuple[pycolmap.Camera, tuple[float, float | None] | None]:
-    """Return the camera with the size of its image; without `w`, a field of view is a focal length of an image of any width, here ANY_WIDTH."""
+    """Return the camera with the size of its image.
+
+    Without `w`, a field of view gives the focal length of an image of width ANY_WIDTH.
+    """
     focal = lens.fl_x
     if focal is None and lens.camera_angle_x is None:
         cure = "give the focal length fl_x in pixels, with w and h"
@@ -96,11 +103,14 @@ def _camera(key: str, lens: Lens, refuse: Refusal) -> tuple[pycolmap.Camera, tup
     k1, k2, k3, k4, p1, p2 = (value or 0.0 for value in (lens.k1, lens.k2, lens.k3, lens.k4, lens.p1, lens.p2))
     is_perspective = lens.camera_model in (None, *PERSPECTIVE)
     if not any((k1, k2, k3, k4, p1, p2)) and not lens.is_fisheye and is_perspective:
-        model, params = "PINHOLE", pinhole
+        model = "PINHOLE"
+        params = pinhole
     elif lens.is_fisheye or lens.camera_model == FISHEYE:
-        model, params = FISHEYE, [*pinhole, k1, k2, k3, k4]
+        model = FISHEYE
+        params = [*pinhole, k1, k2, k3, k4]
     elif is_perspective and k4 == 0:
-        model, params = "FULL_OPENCV", [*pinhole, k1, k2, p1, p2, k3, 0, 0, 0]
+        model = "FULL_OPENCV"
+        params = [*pinhole, k1, k2, p1, p2, k3, 0, 0, 0]
     else:
         fault = f"the camera model {one_line(repr(lens.camera_model))} with k4 = {k4} is not read here"
         refuse(f"{key}.camera_model", fault, f"undistort the photos, or give {', '.join((*PERSPECTIVE, FISHEYE))}")
