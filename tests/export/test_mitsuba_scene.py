@@ -182,6 +182,13 @@ def test_map_for_mitsuba_keeps_energy_and_direction(sharpness):
     np.testing.assert_allclose(mean / np.linalg.norm(mean), YUP_FROM_CAMERA @ axis, atol=2e-3)
 
 
+@pytest.mark.parametrize("axis", [(0, 1, 0), (0, 0.995, -0.0998749218), (0, 0.6, 0.8)], ids=["pole", "near it", "seam"])
+def test_map_for_mitsuba_is_the_lights_radiance_at_its_nodes(axis):
+    lobe, directions = one_lobe(axis, 50.0), node_directions(32, 64)
+    expected = sharpened(lobe, np.pi / 31).turned(YUP_FROM_CAMERA).radiance(directions.reshape(-1, 3))
+    np.testing.assert_allclose(mitsuba_map(lobe, 32, 64), expected.reshape(directions.shape), rtol=1e-6, atol=1e-6)
+
+
 def test_sharpening_undoes_what_interpolation_widens():
     lobe, spacing = one_lobe((0, 0, 1), 2000.0), 0.0125
     x = np.linspace(-0.2, 0.2, 20001)

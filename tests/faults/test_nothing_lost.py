@@ -14,6 +14,7 @@ import shutil
 import signal
 import subprocess
 import sys
+import tempfile
 import time
 from functools import partial
 from pathlib import Path
@@ -389,3 +390,18 @@ def test_no_room_is_said_as_what_it_is_and_with_room_the_run_goes_on(fresh, agai
     assert before <= set(kept(project).values()) and stage not in {s.partition("/")[0] for s in kept(project).values()}
     assert not any((project.build / "store" / "tmp").iterdir()) and not list((project.build / "set").glob("errors/*"))
     assert lost_in(project, results(usual)) == []
+
+
+def test_a_checkout_that_is_moved_and_its_store_on_another_file_system_change_nothing(fresh, made_once, tmp_path):
+    """Killed here, moved, and finished there."""
+    if not Path("/dev/shm").is_dir() or Path("/dev/shm").stat().st_dev == fresh.root.stat().st_dev:
+        pytest.skip("there is no second file system")
+    place, moved = Path(tempfile.mkdtemp(dir="/dev/shm")), toy.toy(tmp_path / "moved")
+    try:
+        fresh.build.symlink_to(place)
+        struck(fresh, 5)
+        shutil.move(fresh.root, moved.root)
+        assert lost_in(moved, results(made_once)) == [] and set(kept(moved)) == set(kept(made_once))
+        assert (moved.build / "store").resolve().is_relative_to(place)
+    finally:
+        shutil.rmtree(place)

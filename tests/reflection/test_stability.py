@@ -130,6 +130,28 @@ def test_gradients_obey_the_laws_of_the_radiance(name, sharpness):
 
 # what is not a number -------------------------------------------------------------------------------------------------
 
+INPUTS = ("roughness", "sharpness", "no", "nz", "oz")
+TOUCHED = {"roughness": ("specular",), "sharpness": ("diffuse", "specular"), "no": ("specular",),
+"nz": ("diffuse", "specular"), "oz": ("specular",)}  # fmt: skip
+
+
+@fast
+@pytest.mark.parametrize("bad", INPUTS)
+def test_nan_reaches_every_value_that_depends_on_it_and_no_other(name, bad):
+    operator = FAST[name]
+    values = torch.tensor(0.4), torch.tensor([3.0, 30.0]), torch.tensor([0.5, 0.6]), *[torch.rand(2, 2)] * 2
+    point = {key: t.to(operator.dtype).clone() for key, t in zip(INPUTS, values, strict=True)}
+    point[bad].view(-1)[0] = math.nan
+    expected, all_ = torch.zeros(2, 2, dtype=torch.bool), slice(None)
+    expected[{"roughness": (all_, all_), "sharpness": (all_, 0), "no": (0, all_)}.get(bad, (0, 0))] = True
+    response = operator.response(**point)
+    with torch.no_grad():
+        values = {"diffuse": operator.diffuse(point["sharpness"], point["nz"]), "specular": operator.specular(**point)}
+    for part in ("diffuse", "specular"):
+        touched = expected if part in TOUCHED[bad] else torch.zeros_like(expected)
+        assert torch.equal(getattr(response, part).isnan(), touched), part
+        assert torch.equal(values[part].isnan(), touched), part
+
 
 # laws -----------------------------------------------------------------------------------------------------------------
 

@@ -2,6 +2,8 @@
 
 import json
 import logging
+import subprocess
+import sys
 
 import msgspec
 import numpy as np
@@ -162,6 +164,41 @@ def test_averaging_says_where_a_part_is_clipped_or_not_finite(folder):
     assert summary["clipped_fraction"] == pytest.approx(1 / sum(summary["pixels"].values()))
 
 
+METERED = """
+import json, sys
+from pathlib import Path
+from factorlib.runner.worker import Meter
+from factorlib.stage import Inputs
+from stages import masks
+
+folder, facts = Path(sys.argv[1]), json.loads(sys.argv[2])
+meter = Meter()
+masks.main(masks.Params(), Inputs({}, facts, {name: folder / name for name in ("a.jpg", "a.png")}, "a"), folder)
+print(json.dumps(meter.read(1)))
+"""
+MOST_MB = 900  # floating-point radiance of the photo alone would be 576; 300 are Python and its libraries
+
+
+@pytest.mark.long
+def test_a_photo_of_48_megapixels_is_read_in_strips_within_the_memory_of_a_step(tmp_path):
+    wave = np.sin(np.arange(8000) / 50)[None] * np.sin(np.arange(6000) / 70)[:, None]
+    picture = np.repeat((110 + 100 * wave).astype(np.uint8)[..., None], 3, axis=2)
+    Image.fromarray(picture).save(tmp_path / "a.jpg", quality=90)
+    label = np.zeros((6000, 8000), np.uint8)
+    label[1000:5000, 2000:6000], label[2000:4000, 3000:5000] = 1, 2  # a third of the photo
+    Image.fromarray(label).save(tmp_path / "a.png", compress_level=1)
+    del wave, label, picture
+    facts = {
+        "dataset.photo": {**GIVEN, "image": "a.jpg", "masks": "a.png", "objects": []},
+        "dataset.materials": MATERIALS,
+    }
+    command = [sys.executable, "-c", METERED, str(tmp_path), json.dumps(facts)]
+    cost = json.loads(subprocess.run(command, check=True, capture_output=True, text=True).stdout)
+    summary = json.loads((tmp_path / "a.json").read_text())
+    assert summary["factor"] == 4 and sum(summary["pixels"].values()) == 1_000_000
+    assert (summary["width"], summary["height"]) == (2000, 1500) and cost["memory_mb"] < MOST_MB
+
+
 def test_a_lens_is_undone_in_photo_and_masks_alike(folder):
     camera = {"focal_px": 20.0, "principal_point": None, "distortion": [0.6, 0.0]}
     plain, _ = run(folder)
@@ -176,3 +213,12 @@ def test_a_lens_is_undone_in_photo_and_masks_alike(folder):
 def refusal_of_lens(folder, camera):
     [path.unlink() for path in (folder / "out").iterdir()]
     return refusal(folder, camera=camera, focal_px=20.0)
+
+
+def test_what_a_phone_did_is_said(folder, caplog):
+    exif = Image.Exif()
+    exif.get_ifd(0x8769)[0xA401] = 3
+    codes = np.rint(255 * srgb_encode(RADIANCE)).astype(np.uint8)
+    Image.fromarray(codes).save(folder / "in" / "photo.jpg", exif=exif)
+    run(folder, image="photo.jpg")
+    assert "processed it (HDR)" in caplog.text and "take it again" in caplog.text
