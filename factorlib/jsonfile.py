@@ -62,5 +62,5 @@ def read_result(path: str | Path, type_: type[T], stage: str, cure: str = "") ->
         try:
             return msgspec.convert(content, type_)
         except msgspec.ValidationError as error:
-            found = _WHERE.match(str(error))
-            raise InputError(found["found"], file=path, key=found["key"] or None, cure=cure) from None
+            found = _WHERE.match(str(error))  # type: ignore[assignment]
+            raise InputError(found["found"], file=path, key=found["key"] or None, cure=cure) from None  # type: ignore[index]

@@ -14,10 +14,11 @@ import os
 import re
 import shutil
 from collections import Counter
-from collections.abc import Callable, Collection, Iterable
+from collections.abc import Callable, Collection, Iterable, Mapping
 from contextlib import suppress
 from pathlib import Path
 from tempfile import TemporaryDirectory
+from typing import Any
 
 import msgspec
 import numpy as np
@@ -135,16 +136,16 @@ def new_dataset(target: Path, photos: Path, masks: Path | None, meshes: Path | N
         image = f"photos/{path.relative_to(photos)}"
         mask = of_photos.get(photo, UNKNOWN)
         spec["photos"].append({"name": photo, "image": image, "masks": mask, "objects": objects})
-    places = {"photos": photos, "masks": masks, "meshes": meshes}
-    _match(spec, lambda name: places[name.partition("/")[0]] / name.partition("/")[2], missing)
+    sources = {"photos": (photos, named.values()), "masks": (masks, of_masks), "meshes": (meshes, of_meshes)}
+    places = {name: (folder, files) for name, (folder, files) in sources.items() if folder is not None}
+    _match(spec, lambda name: places[name.partition("/")[0]][0] / name.partition("/")[2], missing)
     text = re.sub(r'"([\w-]+|\?)\\x1F([^"]*)"', lambda m: f"{yaml_text(m[1]).split()[0]}  # {m[2]}", yaml_text(spec))
     try:
         target.parent.mkdir(parents=True, exist_ok=True)
         with TemporaryDirectory(dir=target.parent, prefix=f".{target.name}.") as folder:
             draft = Path(folder) / target.name
-            _copy(photos, draft / "photos", named.values())
-            _copy(masks, draft / "masks", of_masks)
-            _copy(meshes, draft / "meshes", of_meshes)
+            for name, (source, files) in places.items():
+                _copy(source, draft / name, files)
             write_text(draft / "dataset.yaml", REMARK + text)
             draft.rename(target)
     except OSError as error:
@@ -154,7 +155,7 @@ def new_dataset(target: Path, photos: Path, masks: Path | None, meshes: Path | N
     return missing
 
 
-def _copy(source: Path | None, target: Path, files: Iterable[Path]) -> None:
+def _copy(source: Path, target: Path, files: Iterable[Path]) -> None:
     for path in files:
         place = target / path.relative_to(source)
         place.parent.mkdir(parents=True, exist_ok=True)
@@ -163,7 +164,7 @@ def _copy(source: Path | None, target: Path, files: Iterable[Path]) -> None:
 
 def _masks(
     folder: Path, paths: list[Path], photos: list[str], missing: list[str]
-) -> tuple[list[str], dict, dict[str, dict[str, str]]]:
+) -> tuple[list[str], Mapping[str, str | dict[str, str]], dict[str, dict[str, str]]]:
     """Return the materials, the masks by photo, and the silhouettes by photo and object.
 
     A photo's mask is a path, or {material: path}.  Only photos with a mask of labels have silhouettes.
@@ -181,11 +182,11 @@ def _masks(
         missing += [f"{file[path]}: a second COCO file is not used" for path in coco[1:]]
         return list(names), dict.fromkeys(photos, file[coco[0]]), {}
     labels = 0
-    of_photos = {}
+    of_photos: dict[str, str | dict[str, str]] = {}
     silhouettes = {}
     known = set(photos)
-    own = {}
-    further = {photo: {} for photo in photos}
+    own: dict[str, Path] = {}
+    further: dict[str, dict[str, str]] = {photo: {} for photo in photos}
     for path in paths:
         name = _word(path.stem)
         if name in known:  # Even kitchen_2.png may be the mask of a photo of that name.
@@ -220,9 +221,9 @@ def _masks(
     return list(names) or [f"label_{k}" for k in range(1, labels + 1)], of_photos, silhouettes
 
 
-def _meshes(folder: Path, files: list[Path], materials: list[str], missing: list[str]) -> dict[str, dict]:
+def _meshes(folder: Path, files: list[Path], materials: list[str], missing: list[str]) -> dict[str, dict[str, Any]]:
     """Return the entry of each mesh, with a part's own name as its material if there is a material of that name."""
-    entries = {}
+    entries: dict[str, dict[str, Any]] = {}
     for name, path in _by_name([path for path in files if path.suffix.lower() in MESHES], "MESHES").items():
         parts = list(dict.fromkeys(names[0] for names in read_parts(path)))
         file = f"meshes/{path.relative_to(folder)}"
@@ -241,7 +242,7 @@ def _match(spec: dict, file: Callable[[str], Path], missing: list[str]) -> None:
     materials = spec["materials"]
     for name, entry in spec["meshes"].items():
         of = entry.get("parts", {})
-        objects = []
+        objects: list[tuple[str, dict]] = []
         silhouettes = []
         known = []
         if UNKNOWN not in of.values():

@@ -70,8 +70,8 @@ def reading(
         yield
     except InputError:
         raise
-    except (*FAILURES, *also) as error:
-        cure = CURES.get(error.errno, cure) if isinstance(error, OSError) else cure
+    except (*FAILURES, *also) as error:  # type: ignore[misc]
+        cure = CURES.get(error.errno, cure) if isinstance(error, OSError) else cure  # type: ignore[arg-type]
         raise InputError(_fault(error, what), file=file, key=key, cure=cure) from error
 
 

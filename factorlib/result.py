@@ -209,9 +209,9 @@ class Result:
         scene = resized(self._solved.scene(photo), width)
         objects = tuple(each for each in scene.objects if each.name == one)
         traced = traced_photo(msgspec.structs.replace(scene, objects=objects, light=self._light(light)), samples)
-        of_photo = isinstance(light, str) and light in self.photos
+        of_photo = light if isinstance(light, str) and light in self.photos else None
         about = f"{photo}/{one} in {light if isinstance(light, str) else 'a given light'}"
-        return Picture(traced, self._solved.tone(light) if of_photo else as_it_is, about)
+        return Picture(traced, as_it_is if of_photo is None else self._solved.tone(of_photo), about)
 
     def insert(self, photo: str, **fields: Any) -> Drawn:
         """Insert a further object on the ground of a photo, with its shadow.
@@ -273,7 +273,7 @@ class Result:
         return Named("photo", {photo: photo for photo in self.photos})[name]
 
     def _object(self, name: str) -> tuple[str, str]:
-        known = {each: tuple(each.split("/")) for each in self.objects}
+        known = {f"{photo}/{one}": (photo, one) for photo, one in (each.split("/") for each in self.objects)}
         short = {one: (photo, one) for photo, one in reversed(known.values())}  # keeps the first photo that has it
         found = Named("object", {**short, **known})[name]
         if name not in known and len(others := [each for each, (_, one) in known.items() if one == name]) > 1:

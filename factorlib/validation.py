@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from factorlib.dataset.check import MESHES, made_of, mirror_balls
-from factorlib.dataset.schema import Dataset, MeshEntry, ObjectEntry, PhotoEntry
+from factorlib.dataset.schema import Dataset, ObjectEntry, PhotoEntry
 from factorlib.errors import InputError
 from factorlib.evaluate.gauge import connected_components
 from factorlib.evaluate.truth import read_true_light, read_true_normals
@@ -89,9 +89,9 @@ class Validation:
         elif slice_ == "objects":
             limits = convert(params.get("limits", {}), Limits, settings, "limits")
             for obj in (obj for entry in entries for obj in entry.objects):
-                if (mesh := self.spec.meshes[obj.mesh]).file is None:
+                if (file := self.spec.meshes[obj.mesh].file) is None:
                     continue
-                yield f"mesh {obj.mesh} {obj.materials}", partial(self._object, obj, mesh, limits)
+                yield f"mesh {obj.mesh} {obj.materials}", partial(self._object, obj, file, limits)
         elif slice_ == "known":
             for name, of in self.spec.known.illumination.items():
                 key = f"known.illumination.{name}"
@@ -134,17 +134,17 @@ class Validation:
         masks = entry.masks if isinstance(entry.masks, str) else next(iter(entry.masks.values()))
         check_materials(labels, objects, own, self.spec.materials, self.file(masks), f"{key}.objects")
 
-    def _object(self, obj: ObjectEntry, mesh: MeshEntry, limits: Limits) -> None:
+    def _object(self, obj: ObjectEntry, relative: str, limits: Limits) -> None:
         """Check the parts of a mesh file, which is read once; a failure is raised again for every object."""
-        file = self.file(mesh.file)
-        if mesh.file not in self._parts:
+        file = self.file(relative)
+        if relative not in self._parts:
             try:
-                self._parts[mesh.file] = read_parts(file, limits)
+                self._parts[relative] = read_parts(file, limits)
             except InputError as error:
-                self._parts[mesh.file] = error
-        if isinstance(parts := self._parts[mesh.file], InputError):
+                self._parts[relative] = error
+        if isinstance(parts := self._parts[relative], InputError):
             raise parts
-        part_labels(parts, self.spec.materials, mesh.made_of, obj.materials, file)
+        part_labels(parts, self.spec.materials, self.spec.meshes[obj.mesh].made_of, obj.materials, file)
 
 
 def _faults(checks: Iterable[Check]) -> list[InputError]:

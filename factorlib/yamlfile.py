@@ -82,8 +82,8 @@ class _Document:
         self.most_values = most_values
         self.events = self._events()
         self.count = 0
-        self.anchors = {}
-        self.unfinished = set()
+        self.anchors: dict[str | None, Any] = {}
+        self.unfinished: set[str | None] = set()
 
     def value(self) -> Any:
         """Return the value of the text's one document, None for an empty text; InputError for a second document."""
@@ -132,8 +132,8 @@ class _Document:
         return value
 
     def _map(self, keys: Keys) -> dict[str, Any]:
-        values = {}
-        lines = {}
+        values: dict[str, Any] = {}
+        lines: dict[str, int] = {}
         while not isinstance(event := next(self.events), yaml.MappingEndEvent):
             if not isinstance(event, yaml.ScalarEvent):
                 self._refuse("a key that is not a word", event, keys, "write key: value")
@@ -174,7 +174,9 @@ class _Document:
             return int(text, 0) if text[:2] in ("0o", "0x") else int(text)
         if kind == "float":
             return float(text.lower().replace(".inf", "inf").replace(".nan", "nan"))
-        return {"null": None, "bool": text.lower() == "true"}.get(kind, text)
+        if kind == "bool":
+            return text.lower() == "true"
+        return None if kind == "null" else text
 
     def _refuse(self, fault: str, event: yaml.Event, keys: Keys, cure: str) -> NoReturn:
         raise InputError(fault, file=f"{self.name}:{event.start_mark.line + 1}", key=key_path(keys), cure=cure)
@@ -211,6 +213,7 @@ def convert(value: Any, type_: type[T], name: str | Path, prefix: str = "", text
         innermost = _innermost(error, value, type_)
     root = yaml.compose(text, Loader=_Parser) if text is not None else None
     raise_all([_fault(*fault, name, prefix, root) for fault in innermost])
+    raise AssertionError("a validation error has a fault")
 
 
 def _fault(words: str, value: Any, types: list, keys: Keys, name: str | Path, prefix: str, root: Any) -> InputError:

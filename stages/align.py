@@ -58,10 +58,11 @@ class Params(Standards, frozen=True, forbid_unknown_fields=True):
 def main(params: Params, inputs: Inputs, out: Path, progress: Progress) -> None:
     """Align the meshes of one photo and write its maps, its poses and the overlay."""
     name = inputs.photo
+    assert name is not None  # a stage over one photo
     materials = inputs.facts["dataset.materials"]
     slice_ = msgspec.convert(inputs.facts["dataset.objects"], ObjectsSlice)
-    if camera := read_shapes(inputs.folders.get("shapes")).cameras.get(name):
-        slice_ = msgspec.structs.replace(slice_, external=camera)
+    if by_motion := read_shapes(inputs.folders.get("shapes")).cameras.get(name):
+        slice_ = msgspec.structs.replace(slice_, external=by_motion)
     channels = read_exr(inputs["masks"] / f"{name}.exr")
     facts = read_photo_facts(inputs["masks"] / f"{name}.json")
     earlier = read_poses(inputs["poses"] / FILE).get(name) if "poses" in inputs.folders else None
@@ -72,7 +73,7 @@ def main(params: Params, inputs: Inputs, out: Path, progress: Progress) -> None:
     # given data: refuse objects behind the camera, warn of materials that do not match and of an unlikely camera
     for each, source in zip(objects, sources, strict=True):
         if each.pose is not None:
-            given_by = "dataset" if source == "given" else source
+            given_by = "dataset" if source is None or source == "given" else source
             check_before_camera(each.caster.mesh, each.pose, name, each.name, given_by)
     warn_of_materials(channels["label"], [each.caster.mesh.labels for each in objects], materials, name)
     warn_of_camera(known.focal, camera.centre, (camera.width, camera.height), name)
@@ -124,17 +125,16 @@ def objects_of(
     materials = inputs.facts["dataset.materials"]
     for number, own in enumerate(slice_.objects, start=1):
         mesh = slice_.meshes[own.mesh]
-        pose = own.pose
+        given = own.pose
         keypoints = None
-        if pose is None and slice_.external:
-            pose = slice_.external.poses.get(own.name)
-        before = earlier.objects.get(own.name) if earlier and pose is None else None
+        if given is None and slice_.external:
+            given = slice_.external.poses.get(own.name)
+        before = earlier.objects.get(own.name) if earlier and given is None else None
         file = inputs.mesh(own.mesh, mesh.file)
         scale = before.scale if before else AS_IT_IS
         read = read_mesh(file, materials, mesh.made_of, own.materials, params.crease_deg, params.limits)
         silhouette = silhouette_of_object(channels, number, read.labels, own.mask is not None)
-        if pose is not None:
-            pose = Pose(np.array(pose.rotation), np.array(pose.translation))
+        pose = Pose(np.array(given.rotation), np.array(given.translation)) if given is not None else None
         if own.keypoints:  # pixels of the file, to undistorted pixels of the reduced photo
             pixels, points = (np.array([getattr(k, of) for k in own.keypoints]) for of in ("pixel", "point"))
             pixels = pixels / factor
@@ -170,11 +170,20 @@ def entry(obj: ObjectToPlace, k: int, result: Placed, maps: Maps, params: Params
         if other := found.runner_up:
             pose = entry_of(other.state.pose(obj.caster))
             runner_up = RunnerUp(**pose, score=other.score, normal_difference_deg=other.normal_difference_deg)
-    measured = {"silhouette_iou": iou, "label_agreement": agreement, "score": found.score if found else None}
-    left_out = bool(reasons) and found is not None and not params.keep_doubtful
-    believed = {**msgspec.structs.asdict(trust), "doubts": reasons, "left_out": left_out}
-    place = {**entry_of(result.poses[k]), "scale": obj.scale}
-    return ObjectEntry(**place, **measured, source=source, runner_up=runner_up, **believed)
+    return ObjectEntry(
+        **entry_of(result.poses[k]),
+        scale=obj.scale,
+        silhouette_iou=iou,
+        label_agreement=agreement,
+        source=source,
+        score=found.score if found else None,
+        runner_up=runner_up,
+        contour_error=trust.contour_error,
+        normal_stderr_deg=trust.normal_stderr_deg,
+        mirrored_score=trust.mirrored_score,
+        doubts=reasons,
+        left_out=bool(reasons) and found is not None and not params.keep_doubtful,
+    )
 
 
 def complain(photo: str, name: str, entry: ObjectEntry, strict: bool) -> None:

@@ -108,27 +108,31 @@ def main(params: Params, inputs: Inputs, out: Path, progress: Progress) -> None:
         write_ply(out / "meshes" / f"{name}.ply", whole)
     write_script(out / "scenes")
     poses = read_poses(inputs["align"] / "poses.json")
-    for photo, light in lights.items():
+    for photo, entry in lights.items():
         progress(next(done), total, f"scene of {photo}")
-        size = oiio.ImageInput.open(str(inputs["align"] / f"{photo}.exr")).spec()  # from the header
+        maps = oiio.ImageInput.open(str(inputs["align"] / f"{photo}.exr"))
+        assert maps is not None  # `align` wrote it
+        size = maps.spec()  # from the header
         camera = poses[photo].camera.camera(size.width, size.height)
         exposure = np.array(exposures.get(photo, [1.0] * 3))
-        camera_from_light = np.eye(3) if light.world_from_camera is None else np.array(light.world_from_camera).T
-        own_lobes = lobes[light.illumination]
-        suns = suns_of(own_lobes.scaled(exposure), YUP_FROM_CAMERA @ camera_from_light)
-        exposed = ExposedMap(f"../illumination/{light.illumination}.exr", exposure, camera_from_light)
+        camera_from_light = np.eye(3) if entry.world_from_camera is None else np.array(entry.world_from_camera).T
+        own_lobes = lobes[entry.illumination]
+        own_suns = suns_of(own_lobes.scaled(exposure), YUP_FROM_CAMERA @ camera_from_light)
+        exposed = ExposedMap(f"../illumination/{entry.illumination}.exr", exposure, camera_from_light)
         sky = (
-            msgspec.structs.replace(exposed, file=f"../illumination/{light.illumination}{SKY}.exr") if suns else exposed
+            msgspec.structs.replace(exposed, file=f"../illumination/{entry.illumination}{SKY}.exr")
+            if own_suns
+            else exposed
         )
         own_meshes = objects[photo].meshes
         placed = poses[photo].objects
         shapes = [s for own in objects[photo].objects for s in files.shapes(own, own_meshes, placed)]
         scene = Scene(camera, shapes, materials, exposed, ALL_BOUNCES if table.model.interreflection else DIRECT)
         write_usd_scene(out / "scenes" / f"{photo}{SUFFIX}", scene)
-        scene = msgspec.structs.replace(scene, light=sky, suns=suns)
+        scene = msgspec.structs.replace(scene, light=sky, suns=own_suns)
         write_scene_json(out / "scenes" / f"{photo}.json", scene)
         if np.ptp(exposure) == 0:
-            own = msgspec.structs.replace(exposed, file=f"light/{light.illumination}.exr")
+            own = msgspec.structs.replace(exposed, file=f"light/{entry.illumination}.exr")
         else:  # Mitsuba scales all channels alike, so the photo gets its own map; no illumination has a dot in its name
             own = ExposedMap(f"light/{photo}.exposed.exr", np.ones(3), camera_from_light)
             _write_mitsuba_map(out / "scenes" / own.file, own_lobes.take(~own_lobes.suns).scaled(exposure), params)

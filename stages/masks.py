@@ -55,6 +55,7 @@ def main(params: Params, inputs: Inputs, out: Path, progress: Progress = silent)
     object          Number of the object, from 1, where objects have masks of their own; else 0.
     """
     name = inputs.photo
+    assert name is not None  # a stage over one photo
     facts = msgspec.convert(inputs.facts["dataset.photo"], PhotoSlice)
     materials = inputs.facts["dataset.materials"]
     path = inputs.file(facts.image)

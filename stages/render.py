@@ -46,6 +46,7 @@ class Params(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 def main(params: Params, inputs: Inputs, out: Path, progress: Progress) -> None:
     """Render the re-synthesis of a photo, and balls and reflectance maps of every material in its light."""
     name = inputs.photo
+    assert name is not None  # a stage over one photo
     names = inputs.facts["dataset.materials"]
     file = inputs["export"] / "materials.json"
     exported = read_materials(file)

@@ -19,8 +19,6 @@ from factorlib.report.viewer import viewed
 from factorlib.stage import Inputs, Progress
 from factorlib.wholefile import write_bytes, write_text
 
-SLICES = {"dataset.light": LightSlice, "dataset.objects": ObjectsSlice}
-
 
 class Params(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """Empty parameters: the page shows all results."""
@@ -29,7 +27,9 @@ class Params(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 def main(params: Params, inputs: Inputs, out: Path, progress: Progress) -> None:
     """Write the page and its figures."""
     run = Artifacts(inputs.folders, msgspec.convert(inputs.facts["dataset.set"], SetSlice), inputs.log)
-    errors = run.metrics.resynthesis.photos
+    metrics = run.metrics
+    assert metrics is not None  # `evaluate` is an input of this stage
+    errors = metrics.resynthesis.photos
     rows = []
     tags = material_tags(run)
     (out / "figures" / "photos").mkdir(parents=True)
@@ -41,7 +41,8 @@ def main(params: Params, inputs: Inputs, out: Path, progress: Progress) -> None:
         write_bytes(out / "figures" / "photos" / f"{name}.png", strip(rows[-1]))
     progress(next(done), total, "overview")
     write_bytes(out / "figures" / "overview.png", overview(run, rows))
-    lights, objects = (msgspec.convert(inputs.facts[name], dict[str, kind]) for name, kind in SLICES.items())
+    lights = msgspec.convert(inputs.facts["dataset.light"], dict[str, LightSlice])
+    objects = msgspec.convert(inputs.facts["dataset.objects"], dict[str, ObjectsSlice])
     progress(next(done), total, "viewer")
     seen = viewed(run, lights, objects, exposures(run))
     progress(next(done), total, "surfaces")

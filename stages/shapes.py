@@ -5,7 +5,7 @@ or meshes.  Writes shapes.json, and meshes/<mesh>.obj, which later stages read a
 """
 
 import logging
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Annotated
 
@@ -25,6 +25,7 @@ from factorlib.images.exr import read_exr
 from factorlib.images.transfer import srgb_encode
 from factorlib.jsonfile import write_json
 from factorlib.results.photos import read_photo_facts
+from factorlib.results.poses import entry_of
 from factorlib.results.shapes import FILE, ShapeEntry, ShapesTable
 from factorlib.shapes.hull import visual_hull
 from factorlib.shapes.lathe import body_of_revolution
@@ -74,7 +75,7 @@ def main(params: Params, inputs: Inputs, out: Path, progress: Progress) -> None:
         at = begun + (1 - begun) * done / len(slice_.meshes)
         part = (1 - begun) / len(slice_.meshes)
         try:
-            shape = shape_of(entry, outlines, params, lambda share, a=at, p=part, n=name: progress(a + p * share, 1, n))
+            shape = shape_of(entry, outlines, params, _share(at, part, name, progress))
         except InputError as error:
             raise InputError(error.found, file="dataset.yaml", key=f"meshes.{name}", cure=error.cure) from error
         write_obj(out / "meshes" / f"{name}.obj", shape, parts_of(entry))
@@ -93,6 +94,11 @@ def main(params: Params, inputs: Inputs, out: Path, progress: Progress) -> None:
     progress(1, 1)
 
 
+def _share(begin: float, part: float, name: str, progress: Progress) -> Callable[[float], None]:
+    """Return the report of one mesh, whose share of the work begins at `begin` and is `part`."""
+    return lambda share: progress(begin + part * share, 1, name)
+
+
 def kind_of(entry: MeshEntry) -> str:
     """Return the kind of a shape: hull, lathe, ball, box or cylinder."""
     return entry.primitive or ("hull" if entry.hull else "lathe")
@@ -100,7 +106,7 @@ def kind_of(entry: MeshEntry) -> str:
 
 def parts_of(entry: MeshEntry) -> list[str]:
     """Return the names of the shape's parts."""
-    return list(entry.parts or {ALL_OF_IT: entry.material})
+    return list(entry.parts or [ALL_OF_IT])
 
 
 def shape_of(entry: MeshEntry, outlines: list[Outline], params: Params, report: Callable[[float], None]) -> Triangles:
@@ -131,6 +137,7 @@ def shape_of(entry: MeshEntry, outlines: list[Outline], params: Params, report: 
         shape = body_of_revolution(outlines, report)
         given = any(one.pose is not None for one in outlines)
         return shape if given else msgspec.structs.replace(shape, vertices=shape.vertices * entry.size)
+    assert entry.primitive is not None  # the reader accepts no other mesh without a file
     return primitive(entry.primitive, outlines, report).of_size(entry.size)
 
 
@@ -166,7 +173,7 @@ class Photo:
 
         Hulls are made in the world frame, so cam_from_world is their pose.
         """
-        pose = Pose(tuple(map(tuple, placed.pose.rotation.tolist())), tuple(placed.pose.translation.tolist()))
+        pose = Pose(**entry_of(placed.pose))
         poses = {obj.name: pose for obj in self.own.objects if obj.mesh in meshes and meshes[obj.mesh].hull}
         return ExternalCamera("sfm", placed.focal * self.facts.factor, None, None, poses)
 
@@ -198,5 +205,5 @@ class Photo:
 
     def _labels(self, obj: ObjectEntry, entry: MeshEntry) -> list[int]:
         """Return the label of each part of the shape in this photo."""
-        made_of = entry.parts or {ALL_OF_IT: entry.material}
-        return [self.materials.index((made_of | obj.materials)[part]) + 1 for part in parts_of(entry)]
+        made_of: Mapping[str, str | None] = entry.parts or {ALL_OF_IT: entry.material}
+        return [self.materials.index({**made_of, **obj.materials}[part]) + 1 for part in parts_of(entry)]

@@ -36,6 +36,7 @@ from factorlib.inference.uncertainty import uncertainty_of
 from factorlib.jsonfile import read_result, write_json
 from factorlib.parquetfile import write_rows
 from factorlib.reflection import reflection_operator
+from factorlib.reflection.operator import Name
 from factorlib.results.lobes import write_lobes
 from factorlib.results.solution import Earlier, read_earlier
 from factorlib.results.surface import BEGINNING
@@ -171,9 +172,10 @@ def _problem(
     if params.solver == "paper":  # its materials are uniform
         seen = msgspec.structs.replace(seen, detail=None)
     rotations = {photo: np.array(world) for photo, world in worlds.items() if world is not None}
-    how = {"held_out": params.held_out, "world_from_camera": rotations, "seed": params.seed}
-    blocks = blocks_of_observations(seen, Noise(), **how)
-    automatic = "paper_network" if params.solver == "paper" else "network"
+    blocks = blocks_of_observations(
+        seen, Noise(), held_out=params.held_out, world_from_camera=rotations, seed=params.seed
+    )
+    automatic: Name = "paper_network" if params.solver == "paper" else "network"
     operator = automatic if params.operator == "auto" else params.operator
     reflection = reflection_operator(operator, weights=inputs["train"])
     return JointProblem(blocks, reflection, Loss(), inputs.map, known)

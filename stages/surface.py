@@ -176,10 +176,15 @@ def _found(
     blocks = blocks_of_observations(every, Noise(), world_from_camera=worlds, seed=params.seed)
     in_frame = [of.in_frame(worlds.get(name, np.eye(3))) for name, of in attached.items()]
     problem = JointProblem(blocks, reflection_operator("network", weights=inputs["train"]), spread=inputs.map)
+    nodes = joined(in_frame)
+    of_blocks = []
+    for block in blocks:
+        assert block.row is not None  # `blocks_of_observations` numbers the observations
+        of_blocks.append(nodes.take(block.row))
     return found(
         problem,
         surfaces,
-        [joined(in_frame).take(block.row) for block in blocks],
+        of_blocks,
         from_nothing(len(inputs.facts["dataset.materials"])),
         params.seed,
         lambda share, what: progress(share, 1, what),

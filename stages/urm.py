@@ -46,6 +46,7 @@ class Params(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 def main(params: Params, inputs: Inputs, out: Path, progress: Progress) -> None:
     """Write the observations of one photo."""
     name = inputs.photo
+    assert name is not None  # a stage over one photo
     facts = inputs.facts
     photo, geometry = (read_exr(inputs[stage] / f"{name}.exr") for stage in ("masks", "align"))
     exposure = read_photo_facts(inputs["masks"] / f"{name}.json").exposure

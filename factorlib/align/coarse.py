@@ -175,7 +175,7 @@ def _templates(
     focal = 0.48 * GRID * distance / caster.radius
     image = caster.labels(caster.cast(Camera(GRID, GRID, focal, (GRID / 2, GRID / 2)), pose))
     for size in sizes:
-        zoom = np.sqrt(area / max(np.count_nonzero(image), 1)) * size
+        zoom = np.sqrt(area / max(int(np.count_nonzero(image)), 1)) * size
         if zoom < 4:  # otherwise the mesh is seen edge-on and cannot be the mask
             index = np.floor((np.arange(GRID) + 0.5 - GRID / 2) / zoom + GRID / 2).astype(int)
             there = (index >= 0) & (index < GRID)
@@ -188,7 +188,7 @@ def _apart(guesses: list[Guess], keep: int, apart_deg: float) -> list[Guess]:
     """Select the best guesses such that none is within `apart_deg` of a better one."""
     order = np.argsort(np.array([guess.error for guess in guesses]), kind="stable")[: 60 * keep]
     rotations = np.stack([guesses[k].roll @ guesses[k].turn for k in order])
-    chosen = []
+    chosen: list[Guess] = []
     closest = 1 + 2 * np.cos(np.deg2rad(apart_deg))
     free = np.ones(len(order), bool)
     while free.any() and len(chosen) < keep:

@@ -54,7 +54,8 @@ def pair(mesh: Mesh, parts: int, sightings: Sequence[Silhouette]) -> list[Paired
     labels = sorted({label for cost in costs for pairing in cost for label in pairing} - {HIDDEN})
     if parts ** len(labels) > MOST_ROLES:
         return [None] * len(costs)
-    best = [{} for _ in costs]  # for each observation: (part, its label) -> least total cost over all observations
+    # for each observation: (part, its label) -> least total cost over all observations
+    best: list[dict[tuple[int, int], float]] = [{} for _ in costs]
     # for every assignment of labels to parts: the least total cost, for each pairing of each observation that agrees
     for roles in product(range(parts), repeat=len(labels)):
         role = dict(zip(labels, roles))

@@ -10,7 +10,7 @@ from jaxtyping import Float
 from scipy.optimize import minimize_scalar
 
 from factorlib.align.refine import FocalPrior
-from factorlib.align.search import Found, Report, RunnerUp, Search, find, focal_prior, found_near, refined_finest
+from factorlib.align.search import Found, Report, RunnerUp, Search, after, find, focal_prior, found_near, refined_finest
 from factorlib.align.silhouette import Silhouette, labelled_iou
 from factorlib.align.state import State, state_of
 from factorlib.align.target import target_of
@@ -125,17 +125,15 @@ def placed(
             raise InputError(fault, file="dataset.yaml", key=photo, cure=cure)
         if obj.earlier is not None:  # keep the earlier pose and its runner-up; compute the score again
             start = state_of(obj.earlier.pose, camera, obj.caster)
-            other = obj.earlier.runner_up
             known_camera = FocalPrior(camera.focal, 0.0)
             score = refined_finest(obj.caster, obj.silhouette, camera, start, known_camera, search, 0).score
-            second = other and RunnerUp(
-                state_of(other.pose, camera, obj.caster), other.score, other.normal_difference_deg
-            )
+            second = None
+            if (other := obj.earlier.runner_up) is not None:
+                state = state_of(other.pose, camera, obj.caster)
+                second = RunnerUp(state, other.score, other.normal_difference_deg)
             found[k] = Found(start, score, sigma, second, earlier=True)
         elif obj.keypoints is None:
-            found[k] = find(
-                obj.caster, obj.silhouette, camera, prior, search, lambda share, done=done: report(done + share)
-            )
+            found[k] = find(obj.caster, obj.silhouette, camera, prior, search, after(done, report))
         else:
             start = state_of_keypoints(obj, camera, prior, photo)
             found[k] = found_near(obj.caster, obj.silhouette, camera, start, prior, search)
@@ -231,8 +229,11 @@ def _judged(obj: ObjectToPlace, camera: Camera, found: Found, photo: str, search
 
 def _focal_of_given(objects: Sequence[ObjectToPlace], camera: Camera) -> Camera:
     """Return the camera with the focal length at which given poses fit their masks best."""
-    shown = [t for t in objects if t.pose and t.silhouette.inside.any()]
-    fixed = [(t.caster, t.pose, target_of(t.silhouette, t.caster.mesh.labels, 200)) for t in shown]
+    fixed = [
+        (t.caster, t.pose, target_of(t.silhouette, t.caster.mesh.labels, 200))
+        for t in objects
+        if t.pose is not None and t.silhouette.inside.any()
+    ]
 
     def at(log_focal: float) -> Camera:
         """Return the camera with the focal length exp(log_focal)."""

@@ -32,6 +32,11 @@ GIVEN_UP_RATIO = 4.0
 GIVEN_UP_UNEXPLAINED = 0.04
 
 
+def after(done: float, report: Report) -> Report:
+    """Return a report of the share of the next piece of work, which follows `done` pieces."""
+    return lambda share: report(done + share)
+
+
 class Search(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """Effort of the search; the tuples hold one number per round of refinement, in order.
 

@@ -289,7 +289,7 @@ def mirror_balls(spec: DatasetFile, illumination: str, ball: MirrorBall) -> Iter
 def made_of(obj: ObjectEntry, spec: DatasetFile) -> set[str]:
     """Return the materials of an object's parts."""
     own = spec.meshes[obj.mesh].made_of
-    return set((own | obj.materials).values() if isinstance(own, dict) else obj.materials.values() or [own])
+    return set((own | obj.materials).values() if isinstance(own, dict) else obj.materials.values() or [own or ""])
 
 
 def _check_ground(key: str, ground: Ground, refuse: Refusal) -> None:
@@ -310,7 +310,7 @@ def _check_keypoints(key: str, obj: ObjectEntry, refuse: Refusal) -> None:
         refuse(key, f"{len(obj.keypoints)} keypoints do not settle a pose", cure)
     for name in ("pixel", "point"):
         places = [getattr(keypoint, name) for keypoint in obj.keypoints]
-        first = {}
+        first: dict[tuple[float, ...], int] = {}
         for index, place in enumerate(places):
             if (other := first.setdefault(place, index)) != index:
                 refuse(f"{key}[{index}].{name}", f"the same as {key}[{other}]'s", "name each place once")
@@ -348,8 +348,8 @@ def _check_source(source: CameraSource, spec: DatasetFile, refuse: Refusal) -> N
             refuse(f"cameras.{key}", f"does not go with {kind}", f"leave it out: {cure}")
     photos = [photo.name for photo in spec.photos]
     objects = {obj.name for photo in spec.photos for obj in photo.objects}
-    named = {"images": (photos, "photo"), "world_from_object": (objects, "object"), "obj_ids": (spec.meshes, "mesh")}
-    for key, (known, of) in named.items():
+    keys = {"images": (photos, "photo"), "world_from_object": (objects, "object"), "obj_ids": (spec.meshes, "mesh")}
+    for key, (known, of) in keys.items():
         for name in getattr(source, key):
             refuse.known(f"cameras.{key}.{name}", name, known, of)
     for name, similarity in source.world_from_object.items():

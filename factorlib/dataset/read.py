@@ -14,7 +14,7 @@ from typing import Any
 from factorlib.dataset.check import check_dataset, check_lights, check_truth
 from factorlib.dataset.gltf import buffer_path, read_header
 from factorlib.dataset.paths import Refusal, is_there
-from factorlib.dataset.schema import Dataset, DatasetFile, TruthFile
+from factorlib.dataset.schema import Dataset, DatasetFile, ExternalCamera, TruthFile
 from factorlib.errors import InputError, raise_all
 from factorlib.reading import check_plain, path_inside, read_text, reading
 from factorlib.yamlfile import MOST_BYTES, convert, parse_yaml, read_yaml
@@ -46,7 +46,7 @@ def read_dataset(path: str | Path) -> Dataset:
         raise InputError(f"a dataset cannot be called {folder.name!r}", file=file, cure=cure)
     spec, faults = read_draft(file)
     raise_all(faults)
-    external = {}
+    external: dict[str, ExternalCamera] = {}
     refuse = Refusal(file, file.parent)
     files = {name: mesh.file for name, mesh in spec.meshes.items() if mesh.file}
     companions = {name: _companions(path, f"meshes.{name}.file", refuse) for name, path in files.items()}

@@ -16,7 +16,7 @@ from msgspec import Meta
 LEFT_OUT = 255  # mask value of pixels that are neither background nor a material
 MAX_MATERIALS = LEFT_OUT - 1
 LONGEST_NAME = 100  # characters of a name; file names contain it, and file systems allow 255 bytes
-SOURCES = ("colmap", "transforms", "bop")
+SOURCES: tuple[Literal["colmap", "transforms", "bop"], ...] = ("colmap", "transforms", "bop")
 RAW = (".dng", ".cr2", ".cr3", ".nef", ".nrw", ".arw", ".raf", ".orf", ".rw2", ".pef", ".srw")  # suffixes of raw photos
 LARGEST = 1e15  # largest absolute value of any number, so that its square keeps its digits
 FOCAL_PX = 1.0, 1e7  # range of focal lengths in pixels; a telescope has 1e6
@@ -46,7 +46,7 @@ class _Format(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """Base of the structs of user-written files, in which an unknown key is an error."""
 
 
-class MeshEntry(_Format):
+class MeshEntry(_Format, frozen=True):
     """A mesh of several parts, or of one material.
 
     A part is an OBJ group or usemtl, or a glTF primitive or material.  Exactly one of file, hull, lathe and primitive
@@ -81,7 +81,7 @@ class MeshEntry(_Format):
         return self.lathe or self.primitive in ("ball", "cylinder")
 
 
-class Camera(_Format):
+class Camera(_Format, frozen=True):
     """Intrinsics in pixels of the photo as displayed, pixel centres at 0.5; missing ones are estimated.
 
     Attributes:
@@ -93,21 +93,21 @@ class Camera(_Format):
     distortion: tuple[Bend, Bend] | None = None
 
 
-class Pose(_Format):
+class Pose(_Format, frozen=True):
     """The pose cam_from_object: x_cam = rotation · x_object + translation, in the mesh's units."""
 
     rotation: Mat3
     translation: Vec3
 
 
-class Keypoint(_Format):
+class Keypoint(_Format, frozen=True):
     """A pixel of the photo (x right, y down, pixel centres at 0.5) and the point of the mesh that it shows."""
 
     pixel: Vec2
     point: Vec3
 
 
-class ObjectEntry(_Format):
+class ObjectEntry(_Format, frozen=True):
     """One instance of a mesh in a photo.
 
     Attributes:
@@ -123,7 +123,7 @@ class ObjectEntry(_Format):
     keypoints: list[Keypoint] = []
 
 
-class Ground(_Format):
+class Ground(_Format, frozen=True):
     """The plane that a photo's objects stand on, in its camera frame and the poses' units.
 
     Attributes:
@@ -136,7 +136,7 @@ class Ground(_Format):
     diffuse: Shares | None = None
 
 
-class PhotoEntry(_Format):
+class PhotoEntry(_Format, frozen=True):
     """One photo.
 
     Attributes:
@@ -160,7 +160,7 @@ class PhotoEntry(_Format):
         return self.illumination or self.name
 
 
-class Similarity(_Format):
+class Similarity(_Format, frozen=True):
     """The similarity world_from_object: x_world = scale · rotation · x_object + translation.
 
     By default the mesh is in the world's frame.
@@ -171,7 +171,7 @@ class Similarity(_Format):
     translation: Vec3 = (0.0, 0.0, 0.0)
 
 
-class CameraSource(_Format):
+class CameraSource(_Format, frozen=True):
     """Source of cameras, and possibly poses: exactly one of colmap, transforms, bop, sfm.
 
     Attributes:
@@ -196,7 +196,7 @@ class CameraSource(_Format):
     mesh_unit_mm: Unit = 1.0
 
 
-class KnownMaterial(_Format):
+class KnownMaterial(_Format, frozen=True):
     """Known reflectance of a material, linear Rec. 709; a value of None is estimated."""
 
     diffuse: Shares
@@ -204,13 +204,13 @@ class KnownMaterial(_Format):
     roughness: Roughness | None = None
 
 
-class MirrorBall(_Format):
+class MirrorBall(_Format, frozen=True):
     """A chrome ball in a photo, which mirrors the photo's light; `chrome` is the object's name."""
 
     chrome: Name
 
 
-class Known(_Format):
+class Known(_Format, frozen=True):
     """Known quantities: reflectances by material, lights by illumination, exposures by photo.
 
     Attributes:
@@ -224,7 +224,7 @@ class Known(_Format):
     exposure: dict[str, Exposure] = {}
 
 
-class DatasetFile(_Format):
+class DatasetFile(_Format, frozen=True):
     """Content of dataset.yaml."""
 
     format: Annotated[Literal[1], Meta(description="this version reads format: 1")]
@@ -236,7 +236,7 @@ class DatasetFile(_Format):
     truth: str | None = None
 
 
-class TrueMaterial(_Format):
+class TrueMaterial(_Format, frozen=True):
     """Lambert k_d, GGX k_s (linear Rec. 709) and roughness in [0, 1]."""
 
     diffuse: Shares
@@ -244,7 +244,7 @@ class TrueMaterial(_Format):
     roughness: Share
 
 
-class TruthFile(_Format):
+class TruthFile(_Format, frozen=True):
     """Content of truth.yaml; its paths are relative to the dataset's folder too."""
 
     materials: dict[str, TrueMaterial] = {}

@@ -79,7 +79,7 @@ def compare_lights(
     names = [n for n in estimates if n in truths]
     if not names:
         return None
-    lights = {n: {gauge: {} for gauge in GAUGES} for n in names}
+    lights: dict[str, dict[str, dict[str, ScoredLight]]] = {n: {gauge: {} for gauge in GAUGES} for n in names}
     seen = {n: mirrored[n][_at(mirrored[n])] for n in names if n in mirrored}
     parts = {"map_mirrored": seen, "map_unmirrored": {n: ~hit for n, hit in seen.items()}}
     for view, render in VIEWS.items():

@@ -72,7 +72,7 @@ def _error(estimate: Reflectance, truth: Reflectance, factor: Vec3) -> MaterialE
 
 
 def _summary(compared: Mapping[str, ComparedMaterial]) -> dict[str, float]:
-    found = {}
+    found: dict[str, float] = {}
     for part in ("roughness", "diffuse", "specular"):
         errors, null = (np.abs([getattr(getattr(m, k), part) for m in compared.values()]) for k in ("error", "null"))
         found |= {f"mean_{part}": float(errors.mean()), f"worst_{part}": float(errors.max())}

@@ -26,7 +26,7 @@ from factorlib.evaluate.picture import tone_mapped
 from factorlib.evaluate.relighting import MEAN_SHOWN, Appearances
 from factorlib.inference.materials import ROUGHNESS
 from factorlib.results.materials import Misfit, Reflectance, Solved
-from factorlib.results.metrics import Verdict
+from factorlib.results.metrics import Trust, Verdict
 
 # weights of (1)
 FLOOR = 1e-5
@@ -105,7 +105,7 @@ def verdict(signs: Signs) -> Verdict:
     terms = signs.terms()
     whole = FLOOR + sum(terms.values())
     expected = round(float(-10 * np.log10(whole)), 3)
-    trust = "good" if expected >= GOOD else "usable with care" if expected >= POOR else "do not trust"
+    trust: Trust = "good" if expected >= GOOD else "usable with care" if expected >= POOR else "do not trust"
     ranked = sorted(terms, key=terms.__getitem__, reverse=True)
     telling = [name for name in ranked if terms[name] >= TELLING * whole] or ranked[:1]
     said = [SENTENCES[name](signs) for name in telling]

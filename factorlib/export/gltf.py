@@ -62,8 +62,8 @@ def write_glb(
         variants: alternative labels of the faces, by variant name (KHR_materials_variants)
     """
     # one primitive per combination of the faces' own label and their labels in each variant
-    choices, part = np.unique([mesh.face_label, *variants.values()], axis=1, return_inverse=True)
-    split = msgspec.structs.replace(mesh, face_label=part.reshape(-1) + 1)
+    choices, choice = np.unique([mesh.face_label, *variants.values()], axis=1, return_inverse=True)
+    split = msgspec.structs.replace(mesh, face_label=choice.reshape(-1) + 1)
     scene = trimesh.Scene()
     parts = {}
     for label in split.labels:
@@ -120,8 +120,8 @@ def _set_materials(
             primitive["extensions"] = {VARIANTS: {"mappings": mappings}}
     if variants:
         tree["extensions"] = {VARIANTS: {"variants": [{"name": name} for name in variants]}}
-    used = {*tree.get("extensionsUsed", []), *(name for each in found for name in each.get("extensions", ()))}
-    if used := sorted(used | ({VARIANTS} if variants else set())):
+    extensions = {*tree.get("extensionsUsed", []), *(name for each in found for name in each.get("extensions", ()))}
+    if used := sorted(extensions | ({VARIANTS} if variants else set())):
         tree["extensionsUsed"] = used
 
 

@@ -69,9 +69,10 @@ class MeshFiles:
             for label, name in names.items():
                 part = submesh(mesh, label)
                 file = self.scenes / f"{self._stems[key]}.{name}"
-                painted = part.detail is not None
-                write_ply(f"{file}.ply", part, paint(self.solved[name], part.detail) if painted else None)
-                write_usd_mesh(f"{file}{SUFFIX}", part, colours(self.solved[name], part.detail) if painted else None)
+                detail = part.detail
+                write_ply(f"{file}.ply", part, None if detail is None else paint(self.solved[name], detail))
+                shades = None if detail is None else colours(self.solved[name], detail)
+                write_usd_mesh(f"{file}{SUFFIX}", part, shades)
         stem = self._stems[key]
         painted = mesh.detail is not None
         return [Shape(f"{obj.name}.{m}", f"{stem}.{m}.ply", m, place, mesh.open, painted) for m in names.values()]

@@ -7,6 +7,7 @@ clipped; one pose is not given. Seed 0 is the set in the repository; others have
 
 from collections.abc import Callable, Sequence
 from pathlib import Path
+from typing import Any
 
 import msgspec
 import numpy as np
@@ -239,7 +240,7 @@ def write_shot(out: Path, scene: Scene, parameters: Parameters, seed: int) -> di
         exposure = float(0.25 / brightest.mean())
     folder.write_photo(out / f"photos/{shot.name}{shot.suffix}", radiance * exposure, quality=98)
     folder.write_shot(out, shot.name, labels, scene.light * exposure, rasterise(labelled, camera, poses))
-    objects = [{"name": p.name, "mesh": p.name} for p in shot.placed]
+    objects: list[dict[str, Any]] = [{"name": p.name, "mesh": p.name} for p in shot.placed]
     for own, placed in zip(objects, shot.placed, strict=True):
         if placed.posed:
             own["pose"] = folder.pose_entry(scene.poses[placed.name])

@@ -76,7 +76,7 @@ def angle_between(first: Float[np.ndarray, "3 3"], second: Float[np.ndarray, "3 
     >>> round(angle_between(np.eye(3), rotation_of_vector(np.array([0.0, 0.5, 0.0]))), 6)
     28.64789
     """
-    return float(np.rad2deg(2 * np.arcsin(min(np.linalg.norm(first - second) / 8**0.5, 1.0))))
+    return float(np.rad2deg(2 * np.arcsin(min(float(np.linalg.norm(first - second)) / 8**0.5, 1.0))))
 
 
 def is_pose(rotation: Float[np.ndarray, "3 3"], translation: Float[np.ndarray, "3"]) -> bool:

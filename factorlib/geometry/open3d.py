@@ -9,7 +9,9 @@ import sys
 from importlib.util import find_spec, module_from_spec
 
 os.environ["KMP_DUPLICATE_LIB_OK"] = "True"  # Open3D sets it too, since PyTorch brings an OpenMP of its own
-sys.modules["open3d"] = module_from_spec(find_spec("open3d"))
+_spec = find_spec("open3d")
+assert _spec is not None  # pyproject.toml asks for it
+sys.modules["open3d"] = module_from_spec(_spec)
 from open3d.cpu.pybind import core, geometry, t, utility  # noqa: E402, F401
 
 del sys.modules["open3d"]  # any other `import open3d` gets the whole package

@@ -70,7 +70,7 @@ def box_mean(
 
 def box_any(flags: Bool[np.ndarray, "h w *c"], factor: int) -> Bool[np.ndarray, "i j *c"]:
     """Return a mask of the boxes in which any pixel is set."""
-    return whole_boxes(flags, factor).any(1).any(2)
+    return np.logical_or.reduce(np.logical_or.reduce(whole_boxes(flags, factor), axis=1), axis=2)
 
 
 def box_majority(values: Shaped[np.ndarray, "h w"], factor: int) -> Shaped[np.ndarray, "i j"]:

@@ -46,14 +46,17 @@ def exif_of(source: bytes | str | Path | None) -> dict[str, float | int]:
     DNG and most raw files begin so. Missing or damaged tags are left out. `DNG` is True for a DNG.
     """
     exif = Image.Exif()
-    named = {}
+    named: dict[str, float | int] = {}
     numbers = {}
     with (
         suppress(*DAMAGED),
         warnings.catch_warnings(action="ignore"),  # Pillow warns of damaged tags
         nullcontext() if isinstance(source, bytes | None) else Path(source).open("rb") as stream,
     ):
-        exif.load(source or b"") if stream is None else exif.load_from_fp(stream)
+        if stream is not None:
+            exif.load_from_fp(stream)
+        elif isinstance(source, bytes | None):
+            exif.load(source or b"")
         named |= {"DNG": True} if DNG_VERSION in exif else {}
         tags = exif.get_ifd(EXIF_IFD)
         for tag in NAMES.keys() & tags.keys():

@@ -58,7 +58,7 @@ def open_heif(path: str | Path, key: str | None) -> Stored:
         raise refused(f"not readable as HEIF ({error})", convert) from None
     info = picture.info
     width, height = picture.size
-    curve = VIDEO.get((info.get("nclx_profile") or {}).get("transfer_characteristics"))
+    curve = VIDEO.get((info.get("nclx_profile") or {}).get("transfer_characteristics", 0))
     if curve:
         cure = "export it from the phone as a JPEG, or without HDR"
         raise refused(f"is encoded for HDR video ({curve}), not as sRGB", cure)

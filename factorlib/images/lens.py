@@ -75,6 +75,7 @@ def lens_of(camera: Camera | None, factor: int, width: int, height: int) -> Lens
     """
     if camera is None or camera.distortion is None:
         return None
+    assert camera.focal_px is not None  # the reader refuses distortion without it
     centre = camera.principal_point or (factor * width / 2, factor * height / 2)
     return Lens(camera.focal_px / factor, (centre[0] / factor, centre[1] / factor), camera.distortion)
 

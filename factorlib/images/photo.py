@@ -145,7 +145,9 @@ def decoded(
         else:
             linear = decoder(encoding)(np.arange(white + 1) / white).astype(np.float32)[codes]
         look(linear)
-        numbers = np.isfinite(linear).all(axis=-1) if stored.white is None else np.ones(linear.shape[:2], bool)
+        numbers = (
+            np.logical_and.reduce(np.isfinite(linear), -1) if stored.white is None else np.ones(linear.shape[:2], bool)
+        )
         linear[~numbers] = 0
         if factor == 1:
             radiance[rows] = linear

@@ -36,7 +36,10 @@ def camera_says(exif: Mapping[str, Any]) -> str | None:
     >>> camera_says({"Exif:CustomRendered": 3}), camera_says({"Exif:Sharpness": 0})
     ('HDR', None)
     """
-    kinds = [RENDERED.get(exif.get("Exif:CustomRendered")), "sharpened" if exif.get("Exif:Sharpness") == HARD else None]
+    kinds = [
+        RENDERED.get(exif.get("Exif:CustomRendered", 0)),
+        "sharpened" if exif.get("Exif:Sharpness") == HARD else None,
+    ]
     return ", ".join(filter(None, kinds)) or None
 
 

@@ -86,7 +86,7 @@ def open_raw(path: str | Path, key: str | None) -> Stored:
             # developed pixels for which some contributing sensor pixel has reached the white level
             levels = [level for level in (sensor.camera_white_level_per_channel or []) if level > 0]
             full = sensor.raw_image_visible >= CLIPPED * min([sensor.white_level, *levels])
-            full = full.any(axis=2) if full.ndim == 3 else maximum_filter(full, size=AROUND)
+            full = np.logical_or.reduce(full, axis=2) if full.ndim == 3 else maximum_filter(full, size=AROUND)
             return pixels[inner], full[inner]
 
     return Stored(

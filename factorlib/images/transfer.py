@@ -39,4 +39,6 @@ def gamma_decode(encoded: Values) -> Values:
 
 def decoder(encoding: str) -> Callable[[Values], Values]:
     """Return the function from values of `encoding` (srgb, linear, gamma2.2) to linear ones."""
-    return {"srgb": srgb_decode, "linear": np.asarray, "gamma2.2": gamma_decode}[encoding]
+    decoders: dict[str, Callable[[Values], Values]]
+    decoders = {"srgb": srgb_decode, "linear": np.asarray, "gamma2.2": gamma_decode}
+    return decoders[encoding]

@@ -183,7 +183,7 @@ class Server(ThreadingHTTPServer):
     def __init__(self, masks: MaskSet, port: int = 0):
         self.masks = masks
         self.token = secrets.token_urlsafe(24)
-        self.unsaved = set()
+        self.unsaved: set[int] = set()
         self.lock = Lock()
         super().__init__(("127.0.0.1", port), _Request)
         self.host = f"127.0.0.1:{self.server_port}"

@@ -178,8 +178,8 @@ def _shapes(text: msgspec.Raw, shape: tuple[int, int], path: str | Path, key: st
         raise InputError("is empty: the annotation has only a box", file=path, key=key, cure=cure)
     if isinstance(segmentation, Rle):
         if tuple(segmentation.size) != shape:
-            fault = f"its RLE is {_wh(segmentation.size)} pixels, the image {_wh(shape)}"
-            raise InputError(fault, file=path, key=key, cure="export it at the photo's own size")
+            words = f"its RLE is {_wh(segmentation.size)} pixels, the image {_wh(shape)}"
+            raise InputError(words, file=path, key=key, cure="export it at the photo's own size")
         return [segmentation.counts], 0.0
     polygons = []
     length = 0.0

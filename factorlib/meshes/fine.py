@@ -160,7 +160,7 @@ class Fine(msgspec.Struct, frozen=True):
         sums = [np.bincount(self.faces.reshape(-1), np.repeat(weighted[:, a], 3), self.nodes) for a in range(3)]
         # area-weighted normals of the nodes
         outward = np.stack(sums, axis=1)
-        outward /= np.maximum(np.linalg.norm(outward, axis=1, keepdims=True), 1e-300)
+        outward = outward / np.maximum(np.linalg.norm(outward, axis=1, keepdims=True), 1e-300)
         place = self.mesh.vertices + (displacement[:, None] * self.extent * outward)[self.node]
         normal = self.mesh.normals + self.turn_of(displacement)[self.node]
         normal /= np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-300)

@@ -18,7 +18,7 @@ from factorlib.meshes.limits import Limits
 from factorlib.meshes.soup import Soup, at_corners, floats, no_normals
 from factorlib.reading import read_bytes
 
-COMPONENTS = {5120: "<i1", 5121: "<u1", 5122: "<i2", 5123: "<u2", 5125: "<u4", 5126: "<f4"}
+COMPONENTS: dict[int | None, str] = {5120: "<i1", 5121: "<u1", 5122: "<i2", 5123: "<u2", 5125: "<u4", 5126: "<f4"}
 WIDTHS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4}
 TRIANGLES, STRIP, FAN = 4, 5, 6
 UNNAMED = "GLTF"
@@ -46,7 +46,8 @@ def read_gltf(path: Path, limits: Limits) -> Soup:
     check_count(sum(len(header.meshes[node.mesh].primitives) for node in header.nodes if node.mesh is not None), path)
     places = _placed(header)
     sizes = np.array([_size(primitive, header, path) for primitive, _, _ in places], object).reshape(-1, 2)
-    limits.check(*sizes.sum(axis=0).tolist(), path)
+    vertices, triangles = sizes.sum(axis=0).tolist()
+    limits.check(vertices, triangles, path)
     return _joined([place for place, size in zip(places, sizes) if size[1]], _Buffers(header, path, limits))
 
 
@@ -60,7 +61,9 @@ def _placed(header: Header) -> list[Placed]:
     places = []
     for index, world_from_node in sorted(_world_from_nodes(header).items()):
         node = header.nodes[index]
-        primitives = header.meshes[node.mesh].primitives if node.mesh is not None else []
+        if node.mesh is None:
+            continue
+        primitives = header.meshes[node.mesh].primitives
         for k, primitive in enumerate(primitives):
             own = (node.name or str(index),) if len(primitives) == 1 else ()
             material = header.materials[primitive.material].name if primitive.material is not None else None
@@ -174,8 +177,8 @@ class _Buffers:
         content = read_bytes(self.path, "glTF", most_bytes=self.left) if self.path.suffix.lower() == ".glb" else b""
         begin = BEFORE_JSON + int.from_bytes(content[12:16], "little")
         length = int.from_bytes(content[begin : begin + 4], "little")
-        kind = content[begin + 4 : begin + 8]
-        if kind != b"BIN\0" or begin + 8 + length > len(content):
+        tag = content[begin + 4 : begin + 8]
+        if tag != b"BIN\0" or begin + 8 + length > len(content):
             raise self.refused("its binary chunk is missing or cut short")
         return content[begin + 8 : begin + 8 + length]
 

@@ -49,10 +49,10 @@ def scaled(mesh: Mesh, factors: Sequence[float]) -> Mesh:
     >>> (scaled(tilted, (1, 1, 0.5)).normals[0] * 6**0.5).round(9).tolist()
     [1.0, 1.0, 2.0]
     """
-    factors = np.asarray(factors, dtype=float)
-    normals = mesh.normals / factors
+    along_axes = np.asarray(factors, dtype=float)
+    normals = mesh.normals / along_axes
     normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-300)
-    return msgspec.structs.replace(mesh, vertices=mesh.vertices * factors, normals=normals)
+    return msgspec.structs.replace(mesh, vertices=mesh.vertices * along_axes, normals=normals)
 
 
 def area_vectors(vertices: Float[np.ndarray, "v 3"], faces: Int[np.ndarray, "f 3"]) -> Float[np.ndarray, "f 3"]:

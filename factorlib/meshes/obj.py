@@ -38,7 +38,7 @@ def read_obj(path: Path, content: bytes, limits: Limits) -> Soup:
     face_normals = array("q")
     part = array("q")
     parts: dict[tuple[str, ...], int] = {}
-    names = {"usemtl": (), "g": (), "o": ()}  # names of the faces that follow
+    names: dict[str, tuple[str, ...]] = {"usemtl": (), "g": (), "o": ()}  # names of the faces that follow
     current: int | None = None  # part of these faces; None until the first of them
     number = counted = 0
     for line in lines_of(CONTINUED.sub(b"\v", content) if b"\\" in content else content):
@@ -52,8 +52,8 @@ def read_obj(path: Path, content: bytes, limits: Limits) -> Soup:
             elif key == "f":
                 corners = []
                 for vertex, _, normal in ((word.split("/") + ["", ""])[:3] for word in words):
-                    own = _index(normal, len(table["vn"]) // 3) if normal else -1
-                    corners.append((_index(vertex, len(table["v"]) // 3), own))
+                    of_normal = _index(normal, len(table["vn"]) // 3) if normal else -1
+                    corners.append((_index(vertex, len(table["v"]) // 3), of_normal))
                 if len(corners) < 3:
                     raise ValueError("a face has three corners at least")
                 if current is None:
@@ -76,9 +76,9 @@ def read_obj(path: Path, content: bytes, limits: Limits) -> Soup:
     normals = np.concatenate([np.array(table["vn"]), np.full(3, np.nan)]).reshape(-1, 3)
     index = np.array(face_normals, dtype=np.int64).reshape(-1, 3)
     index[(index < 0) | (index >= len(normals))] = len(normals) - 1
-    corners = np.array(faces, dtype=np.int64).reshape(-1, 3)
     vertices = np.array(table["v"], dtype=float).reshape(-1, 3)
-    return Soup(vertices, corners, np.array(part, dtype=np.int64), list(parts), normals[index])
+    triangles = np.array(faces, dtype=np.int64).reshape(-1, 3)
+    return Soup(vertices, triangles, np.array(part, dtype=np.int64), list(parts), normals[index])
 
 
 def _index(word: str, count: int) -> int:

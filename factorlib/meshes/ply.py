@@ -60,8 +60,8 @@ def read_ply(path: Path, content: bytes, limits: Limits) -> Soup:
         columns[name], at = _columns(content, at, order, count, properties)
     # corners of the faces: the list of a known name, or the only one
     faces = columns.get("face", {})
-    name = next((name for name in CORNERS if name in faces), next(iter(faces)) if len(faces) == 1 else None)
-    values, sizes = faces[name] if name else (np.empty(0), np.zeros(0, np.int64))
+    chosen = next((name for name in CORNERS if name in faces), next(iter(faces)) if len(faces) == 1 else None)
+    values, sizes = faces[chosen] if chosen else (np.empty(0), np.zeros(0, np.int64))
     limits.check(0, int(np.maximum(sizes - 2, 0).sum()), path)
     whole = values.dtype.kind != "f" or (np.abs(values) < 2**53).all()
     if not whole or ((corners := values.astype(np.int64)) != values).any():
@@ -69,10 +69,9 @@ def read_ply(path: Path, content: bytes, limits: Limits) -> Soup:
     numbers = {name: floats(own) for name, (own, each) in columns.get("vertex", {}).items() if (each == 1).all()}
     if not {"x", "y", "z"} <= numbers.keys():
         raise InputError("its vertices have no x, y, z", file=path, cure=CURE)
-    points, normals = (
-        np.stack([numbers[n] for n in names], axis=1) if set(names) <= numbers.keys() else None
-        for names in ("xyz", ("nx", "ny", "nz"))
-    )
+    points = np.stack([numbers[n] for n in "xyz"], axis=1)
+    of_normals = "nx", "ny", "nz"
+    normals = np.stack([numbers[n] for n in of_normals], axis=1) if set(of_normals) <= numbers.keys() else None
     return of_one_part(points, fans(sizes, corners), path.stem, normals)
 
 
@@ -88,9 +87,9 @@ def _header(path: Path, content: bytes) -> tuple[str, dict[str, tuple[int, Prope
     # if only the last line ends in \r\n, the \n is the first byte of the data
     data_begins = end.group(1) == b"\r\n" and b"\r\n" not in content[:5]
     order = None
-    elements = {}
+    elements: dict[str, tuple[int, Properties]] = {}
     start = end.end() - data_begins
-    properties = None
+    properties: Properties | None = None  # of the last element
     for line in lines_of(content[3 : end.start()]):
         try:
             match line.split():
@@ -102,10 +101,10 @@ def _header(path: Path, content: bytes) -> tuple[str, dict[str, tuple[int, Prope
                     properties = {}
                     elements[name] = int(count), properties
                 case ["property", "list", length, kind, name] if (
-                    TYPES.get(length, "f")[0] != "f" and name not in properties
+                    TYPES.get(length, "f")[0] != "f" and properties is not None and name not in properties
                 ):
                     properties[name] = TYPES[kind], TYPES[length]
-                case ["property", kind, name] if name not in properties:
+                case ["property", kind, name] if properties is not None and name not in properties:
                     properties[name] = TYPES[kind], None
                 case _:
                     raise ValueError("not a line of PLY, or a second one of that name")
@@ -133,18 +132,21 @@ def _columns(content: bytes, at: int, order: str, count: int, properties: Proper
     Consecutive rows with lists of equal lengths are read together. `order` is the byte order; "" means that every
     number is a float64. ValueError is raised if the file ends early or a list has no valid length.
     """
-    kinds = [[np.dtype(order + t if order else "f8") if t else None for t in each] for each in properties.values()]
+    kinds = [
+        (np.dtype(order + kind if order else "f8"), np.dtype(order + length if order else "f8") if length else None)
+        for kind, length in properties.values()
+    ]
     pieces = [([np.empty(0)], [np.zeros(0, np.int64)]) for _ in kinds]
     row = 0
     ahead = 64
     while kinds and row < count:
         # layout of the next row, whose lists have their lengths in the file
         lengths = []
-        fields = []
+        fields: list[tuple[str, np.dtype, tuple[int, ...]]] = []
         place = at
         for number, (kind, counter) in enumerate(kinds):
             if counter:
-                fields.append((f"n{number}", counter))
+                fields.append((f"n{number}", counter, ()))
                 length = np.frombuffer(content, counter, 1, place)[0].item()
                 if length < 0 or length != int(length):
                     raise ValueError(f"a list of {length} numbers")
@@ -157,7 +159,7 @@ def _columns(content: bytes, at: int, order: str, count: int, properties: Proper
         # read ahead as many rows as have lists of the same lengths
         layout = np.dtype(fields)
         rows = np.frombuffer(content, layout, min(ahead, count - row, (len(content) - at) // layout.itemsize), at)
-        others = [rows[name] != lengths[int(name[1:])] for name in layout.names if name[0] == "n"]
+        others = [rows[name] != lengths[int(name[1:])] for name in layout.names or () if name[0] == "n"]
         other = np.logical_or.reduce(others) if others else np.zeros(len(rows), bool)
         rows, ahead = (rows[: np.argmax(other)], 64) if other.any() else (rows, 2 * ahead)
         for number, (values, sizes) in enumerate(pieces):

@@ -182,7 +182,7 @@ def part_labels(
         chosen = next(filter(None, ({m[n] for n in goes_by if n in m} for m in (overrides, parts))), {default})
         called = one_line(" / ".join(goes_by)) or "(unnamed)"
         if len(chosen) > 1:
-            fault = f"part {called} gets several materials: {', '.join(sorted(chosen))}"
+            fault = f"part {called} gets several materials: {', '.join(sorted(filter(None, chosen)))}"
             raise InputError(fault, file=file, cure="name it once")
         if None in chosen:
             example = f"add it to `parts`, e.g. {one_line(goes_by[0])}: {materials[0]}" if goes_by else None

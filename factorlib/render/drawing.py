@@ -200,7 +200,13 @@ def insertion(recipe: schema.Insert, results: SolvedSet, photo: str, out: Path, 
 
 
 def staged(
-    recipe: schema.Backdropped, results: SolvedSet, photo: str, scene: PhotoScene, azimuth: float, *higher: float
+    recipe: schema.Backdropped,
+    results: SolvedSet,
+    photo: str,
+    scene: PhotoScene,
+    azimuth: float,
+    elevation: float = 0.0,
+    zoom: float = 1.0,
 ) -> Float[np.ndarray, "h w 4"]:
     """Render the objects from another view, before the light or a transparent background, on a floor if asked.
 
@@ -212,16 +218,16 @@ def staged(
         photo: name of the photo
         scene: the photo's scene
         azimuth: see `orbit`; degrees
-        *higher: elevation in degrees and zoom, see `orbit`
+        elevation: see `orbit`; degrees
+        zoom: see `orbit`
 
     Returns:
         Linear radiance times coverage, and coverage.
     """
     lit = recipe.background == "light"
     if recipe.floor is None:
-        return traced_photo(scene, recipe.samples, orbit(scene, azimuth, *higher), lit)
+        return traced_photo(scene, recipe.samples, orbit(scene, azimuth, elevation, zoom), lit)
     plane = results.ground(photo, scene.objects[0]).plane
-    elevation, zoom = higher or (0.0, 1.0)
     return on_floor(
         scene, plane, recipe.floor, recipe.samples, orbit(scene, azimuth, elevation, zoom, plane.normal), lit
     )
@@ -297,7 +303,7 @@ def relight(recipe: schema.Relight, results: SolvedSet, photo: str, out: Path, r
         _write_alone(out / photo / Path(name).stem, shown)
 
 
-DRAWN = {
+DRAWN: dict[type, Callable[[Any, SolvedSet, str, Path, Report], dict[str, Any] | None]] = {
     schema.Resynthesis: resynthesis,
     schema.Transfer: resynthesis,
     schema.Insert: insertion,

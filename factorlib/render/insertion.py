@@ -169,7 +169,7 @@ def inserted(
     spot = there.found
     ground = there.ground
     camera = sensor(scene.camera, rigid(YUP_FROM_CAMERA, np.zeros(3)), near=scene.near)
-    there = shapes(scene.objects, scene.materials)
+    old = shapes(scene.objects, scene.materials)
     light = light_entries(scene.light, scene.size)
     more = shapes([new], scene.materials)
 
@@ -177,7 +177,7 @@ def inserted(
         entries: dict[str, Any], samples: int = samples, light: dict[str, Any] = light, guides: bool = False
     ) -> Float[np.ndarray, "h w c"]:
         """Render with the same random numbers each time."""
-        return rendered({**light, **there, **entries}, camera, samples, seed, ALL_BOUNCES, True, guides)
+        return rendered({**light, **old, **entries}, camera, samples, seed, ALL_BOUNCES, True, guides)
 
     rays = scene.camera.rays() @ YUP_FROM_CAMERA
     points = spot.plane.hit(rays.reshape(-1, 3)).reshape(rays.shape)  # points of the ground; NaN above the horizon

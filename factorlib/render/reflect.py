@@ -18,7 +18,7 @@ from factorlib.light.distance import met_from
 from factorlib.light.lobes import Lobes
 from factorlib.light.visibility import cosine_weights, highlight_weights, kernel, seen_share
 from factorlib.reflection import Operator
-from factorlib.reflection.operator import MaterialLike
+from factorlib.results.materials import Reflectance
 
 PAIRS_AT_ONCE = 1 << 18  # pairs of a point and a lobe in one batch
 
@@ -45,7 +45,7 @@ class Reflector:
 
     def __call__(
         self,
-        material: MaterialLike,
+        material: Reflectance,
         normals: Float[np.ndarray, "n 3"],
         views: Float[np.ndarray, "n 3"],
         report: Report = silently,
@@ -67,12 +67,13 @@ class Reflector:
         """
         result = np.zeros((len(normals), 3))
         step = max(1, PAIRS_AT_ONCE // max(len(self.sharpness), 1))
-        columns = normals, views, visibility, place, detail
+        optional = visibility, place, detail
         with torch.no_grad():
             for i in range(0, len(normals) if len(self.sharpness) else 0, step):
                 rows = slice(i, i + step)
-                some = (None if of is None else self._tensor(of[rows]) for of in columns)
-                result[rows] = self._radiance(material, *some).double().numpy()
+                some = (None if of is None else self._tensor(of[rows]) for of in optional)
+                radiance = self._radiance(material, self._tensor(normals[rows]), self._tensor(views[rows]), *some)
+                result[rows] = radiance.double().numpy()
                 report(min(i + step, len(normals)), len(normals))
         return result
 
@@ -81,7 +82,7 @@ class Reflector:
 
     def _radiance(
         self,
-        material: MaterialLike,
+        material: Reflectance,
         normals: Float[Tensor, "n 3"],
         views: Float[Tensor, "n 3"],
         visibility: Float[Tensor, "n k"] | None,

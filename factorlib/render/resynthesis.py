@@ -15,8 +15,8 @@ from scipy.spatial import cKDTree
 
 from factorlib.conventions import FRONT
 from factorlib.geometry.sphere import ball_normals
-from factorlib.reflection.operator import MaterialLike
 from factorlib.render.reflect import Reflector, Report, silently
+from factorlib.results.materials import Reflectance
 from factorlib.urm.observations import Observations
 
 Channels = Mapping[str, Float[np.ndarray, "h w"]]
@@ -43,7 +43,7 @@ class Surroundings(msgspec.Struct, frozen=True):
 
 def resynthesised(
     reflector: Reflector,
-    materials: Sequence[MaterialLike],
+    materials: Sequence[Reflectance],
     photo: Channels,
     geometry: Channels,
     report: Report = silently,
@@ -113,7 +113,7 @@ def around_pixels(
     return None if of.visibility is None else of.visibility[nearest], sent, place
 
 
-def balls(reflector: Reflector, material: MaterialLike, sizes: Sequence[int]) -> list[Float[np.ndarray, "size size 3"]]:
+def balls(reflector: Reflector, material: Reflectance, sizes: Sequence[int]) -> list[Float[np.ndarray, "size size 3"]]:
     """Render a ball at several sizes, which share one evaluation.
 
     Args:
@@ -135,7 +135,7 @@ def balls(reflector: Reflector, material: MaterialLike, sizes: Sequence[int]) ->
 
 
 def front_radiance(
-    reflector: Reflector, material: MaterialLike, normals: Float[np.ndarray, "n 3"]
+    reflector: Reflector, material: Reflectance, normals: Float[np.ndarray, "n 3"]
 ) -> Float[np.ndarray, "n 3"]:
     """Interpolate the radiance toward the viewer, a smooth function of the normal alone, by cubic splines.
 

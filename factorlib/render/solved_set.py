@@ -86,7 +86,7 @@ class SolvedSet:
         camera = poses.camera.camera(width, height)
         placed = tuple(self._placed(obj, objects.meshes[obj.mesh], poses) for obj in objects.objects)
         depth = ALL_BOUNCES if self.table.model.interreflection else DIRECT
-        light = self.light(photo)
+        light = light_of(self.inputs["export"], photo, self.lights[photo])
         if sun is not None:
             light = with_sun(light, self.sun_axis(photo, sun), sun.size, sun.strength)
         return PhotoScene(camera, placed, light, self.materials, depth, denoise)
@@ -181,15 +181,15 @@ class SolvedSet:
             each = [(p, self._placed(obj, self.objects[p].meshes[name], self.poses[p])) for p, obj in plain + shown]
             asked = set(material) if isinstance(material, dict) else set()
             worn = [{self.names[label - 1] for label in one.mesh.labels} for _, one in each]
-            known = [one for one, has in zip(each, worn, strict=True) if asked <= has]
-            photo, placed = (known or each)[0]
+            suited = [one for one, has in zip(each, worn, strict=True) if asked <= has]
+            photo, placed = (suited or each)[0]
             upward = placed.world_from_object[:3, :3].T @ self.ground(photo, placed).plane.normal
             mesh = placed.mesh
             materials = placed.materials
             if isinstance(material, str):
                 materials = (material,) * len(materials)
             elif material is not None:
-                if not known:
+                if not suited:
                     has = set().union(*worn)
                     found = f"no {name!r} has the materials {', '.join(sorted(asked))}"
                     wrong = min(asked - has, default=min(asked))

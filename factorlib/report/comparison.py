@@ -91,7 +91,7 @@ def _rows(tables: list[MaterialTable], names: list[str]) -> list[dict[str, Any]]
     groups: dict[tuple[int, ...], list[str]] = {}
     for name in names:
         groups.setdefault(tuple(table.gauge.component.get(name, 0) for table in tables), []).append(name)
-    factor = {}
+    factor: dict[str, np.ndarray] = {}
     first, second = (table.materials for table in tables)
     for group in groups.values():
         both = ([table.materials[name] for name in group] for table in tables)

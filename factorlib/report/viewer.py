@@ -14,6 +14,8 @@ import msgspec
 import numpy as np
 import trimesh
 from jaxtyping import Float, Int
+from trimesh.visual.material import PBRMaterial
+from trimesh.visual.texture import TextureVisuals
 
 from factorlib.conventions import YUP_FROM_CAMERA
 from factorlib.dataset.schema import LightSlice, ObjectsSlice
@@ -147,6 +149,12 @@ def _shown(run: Artifacts, objects: Mapping[str, ObjectsSlice]) -> dict[str, lis
     }
 
 
+def _double_sided(part: trimesh.Trimesh) -> bool:
+    """Return whether both sides of a part of a GLB are visible."""
+    assert isinstance(part.visual, TextureVisuals) and isinstance(part.visual.material, PBRMaterial)
+    return bool(part.visual.material.doubleSided)
+
+
 def _mesh(
     parts: Mapping[str, trimesh.Trimesh], scale: Float[np.ndarray, "3"], share: float
 ) -> tuple[dict[str, Any], Float[np.ndarray, "3"]]:
@@ -171,7 +179,7 @@ def _mesh(
         np.vstack([face + start for face, start in zip(faces, first, strict=False)]),
         unit(np.vstack(normals) / scale),
         np.repeat(labels, [len(face) for face in faces]),
-        any(part.visual.material.doubleSided for part in parts.values()),
+        any(_double_sided(part) for part in parts.values()),
     )
     mesh = _fine(mesh)
     sides = _both_sides(mesh) if mesh.open else mesh

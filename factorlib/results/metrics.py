@@ -266,6 +266,9 @@ class PoseError(msgspec.Struct, frozen=True):
     null_rotation_deg: float
 
 
+Trust = Literal["good", "usable with care", "do not trust"]
+
+
 class Verdict(msgspec.Struct, frozen=True):
     """Trust in a result from what is known without truth (`factorlib.evaluate.verdict`).
 
@@ -277,7 +280,7 @@ class Verdict(msgspec.Struct, frozen=True):
         terms: terms of the expected mean square error of shown balls
     """
 
-    trust: Literal["good", "usable with care", "do not trust"]
+    trust: Trust
     expected_relit_db: float
     deviation_db: float
     reasons: list[str]

@@ -4,7 +4,7 @@
 """
 
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, TypedDict
 
 import msgspec
 import numpy as np
@@ -12,12 +12,12 @@ import numpy as np
 from factorlib.errors import InputError
 from factorlib.geometry.camera import Camera, Pose, is_pose
 from factorlib.jsonfile import read_result
+from factorlib.results.materials import Vec3, vec3
 
 FILE = "poses.json"
 AS_IT_IS = (1.0, 1.0, 1.0)
 CURE = "name the folder of a result of `align`"
 
-Vec3 = tuple[float, float, float]
 Positive = Annotated[float, msgspec.Meta(gt=0)]
 
 
@@ -93,9 +93,17 @@ class PhotoPoses(msgspec.Struct, frozen=True):
     objects: dict[str, ObjectEntry]
 
 
-def entry_of(pose: Pose) -> dict[str, list]:
+class PoseFields(TypedDict):
+    """The fields of a `PoseEntry`."""
+
+    rotation: tuple[Vec3, Vec3, Vec3]
+    translation: Vec3
+
+
+def entry_of(pose: Pose) -> PoseFields:
     """Return the fields of a `PoseEntry`."""
-    return {"rotation": pose.rotation.tolist(), "translation": pose.translation.tolist()}
+    x, y, z = (vec3(row) for row in pose.rotation)
+    return {"rotation": (x, y, z), "translation": vec3(pose.translation)}
 
 
 def read_poses(path: str | Path, cure: str = CURE) -> dict[str, PhotoPoses]:

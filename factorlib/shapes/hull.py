@@ -86,10 +86,10 @@ def visual_hull(
     # smooth in stages; take the last stage that keeps the overlap
     for more in np.diff(SMOOTHINGS, prepend=0):
         trimesh.smoothing.filter_taubin(mesh, iterations=int(more))
-        shape = Triangles(np.array(mesh.vertices), faces)
-        smoothed.append(msgspec.structs.replace(shape, overlap=overlap(shape, outlines)))
-    shape = [each for each in smoothed if each.overlap >= smoothed[0].overlap - SMOOTHED_AWAY][-1]
-    return msgspec.structs.replace(shape, part=_parts_of(shape.vertices, faces, outlines, parts))
+        body = Triangles(np.array(mesh.vertices), faces)
+        smoothed.append(msgspec.structs.replace(body, overlap=overlap(body, outlines)))
+    body = [each for each in smoothed if each.overlap >= smoothed[0].overlap - SMOOTHED_AWAY][-1]
+    return msgspec.structs.replace(body, part=_parts_of(body.vertices, faces, outlines, parts))
 
 
 def overlap(shape: Triangles, outlines: Sequence[Outline]) -> float:
@@ -99,7 +99,7 @@ def overlap(shape: Triangles, outlines: Sequence[Outline]) -> float:
     for one in outlines:
         target = target_of(one.silhouette, (1,), 200)
         whole = Silhouette(np.where(target.silhouette.label > 0, 1, target.silhouette.label))
-        overlaps.append(labelled_iou(whole, rasterise(caster, target.camera(one.camera), one.pose).label))
+        overlaps.append(labelled_iou(whole, rasterise(caster, target.camera(one.camera), one.known_pose).label))
     return float(np.mean(overlaps))
 
 
@@ -123,8 +123,8 @@ def _about(outlines: Sequence[Outline]) -> tuple[Float[np.ndarray, "3"], float]:
     right = np.zeros(3)
     places = []
     for outline in outlines:
-        rotation = outline.pose.rotation
-        centre = -outline.pose.rotation.T @ outline.pose.translation
+        rotation = outline.known_pose.rotation
+        centre = -outline.known_pose.rotation.T @ outline.known_pose.translation
         ray = rotation.T @ outline.camera.rays_through(outline.middle[None])[0]
         ray /= np.linalg.norm(ray)
         # normal equations of the point nearest to all rays: Σ (I − d dᵀ)(x − c) = 0
@@ -150,7 +150,7 @@ def inside_all(outlines: Sequence[Outline], points: Points) -> Float[np.ndarray,
     """Return f at points of the object's frame, in its units; points behind a camera are outside."""
     least = np.full(len(points), np.inf)
     for outline in outlines:
-        seen = outline.pose.apply(points)
+        seen = outline.known_pose.apply(points)
         depth = np.maximum(seen[:, 2], LEAST_Z)
         inner = outline.inner(outline.camera.project(np.column_stack([seen[:, :2], depth])))
         inner = np.minimum(inner, FREE) * depth / outline.camera.focal
@@ -254,9 +254,9 @@ def _parts_of(
         caster = Caster(Triangles(vertices, faces).as_mesh())
         centre = vertices[faces].mean(axis=1)
         for outline in outlines:
-            hits = caster.cast(outline.camera, outline.pose)
-            seen = outline.pose.apply(centre)
-            facing = np.einsum("nd,nd->n", area @ outline.pose.rotation.T, seen) < 0
+            hits = caster.cast(outline.camera, outline.known_pose)
+            seen = outline.known_pose.apply(centre)
+            facing = np.einsum("nd,nd->n", area @ outline.known_pose.rotation.T, seen) < 0
             # faces toward the camera that lie on the first surface hit, within their own size
             x, y = np.floor(outline.camera.project(np.where(seen[:, 2:] > LEAST_Z, seen, 1.0))).astype(int).T
             height, width = outline.part.shape

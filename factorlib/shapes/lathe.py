@@ -151,11 +151,12 @@ def _tilt_chosen(
     best = max(laid, key=lambda each: each.overlap)
     for turn in FINER_DEG:
         pose = best.begun.pose
-        each = _at_tilt(best.of, best.begun.camera, pose.rotation[:, 0], pose.translation, best.begun.tilt_deg + turn)
-        if each is not None:
+        tilt = best.begun.tilt_deg + turn
+        tilted = _at_tilt(best.of, best.begun.camera, pose.rotation[:, 0], pose.translation, tilt)
+        if tilted is not None:
             near = zip(judges, best.poses, strict=True)
-            poses = [each if one is best.of else laid_on(one, each.profile, pose) for one, pose in near]
-            laid.append(Laid(best.of, each, poses))
+            poses = [tilted if one is best.of else laid_on(one, tilted.profile, pose) for one, pose in near]
+            laid.append(Laid(best.of, tilted, poses))
     best = max(laid, key=lambda each: each.overlap)
     alike = [e.begun.tilt_deg for e in laid if e.of is best.of and e.overlap >= best.overlap - AS_GOOD]
     if max(alike) - min(alike) > UNTOLD_DEG:
@@ -245,8 +246,8 @@ def _span(outlines: Sequence[Outline], poses: Sequence[Turned]) -> tuple[float, 
 
     It contains the body, because the centre of every disc lies inside the outlines.
     """
-    lows = []
-    highs = []
+    lows: list[float] = []
+    highs: list[float] = []
     for one, view in zip(outlines, poses, strict=True):
         distance = float(np.linalg.norm(view.pose.translation))
         half = distance * 4 * one.silhouette.inside.sum() ** 0.5 / view.camera.focal

@@ -83,9 +83,7 @@ def cameras_by_motion(
     models = {}
     for done, (where, pixels) in enumerate((("on the objects", True), ("beside them", False))):
         kept = {name: (view.objects if pixels else ~view.objects) & ~view.left_out for name, view in views.items()}
-        models[where] = _mapped(
-            views, kept, lambda share, what, d=done, w=where: report((d + share) / 2, f"{what} {w}")
-        )
+        models[where] = _mapped(views, kept, _half(done, where, report))
     where, (placed, points) = max(models.items(), key=lambda item: (len(item[1][0]), item[1][1]))
     if len(placed) < LEAST_PHOTOS:
         found = f"cameras of {len(placed)} of {len(views)} photos are found: too few of their features match"
@@ -102,6 +100,11 @@ def cameras_by_motion(
             ", ".join(missing),
         )
     return placed
+
+
+def _half(done: int, where: str, report: Callable[[float, str], None]) -> Callable[[float, str], None]:
+    """Return the report of one of two models, after `done` others."""
+    return lambda share, what: report((done + share) / 2, f"{what} {where}")
 
 
 def _mapped(

@@ -43,6 +43,13 @@ class Outline(msgspec.Struct, frozen=True, dict=True):
         return (low + high) / 2
 
     @property
+    def known_pose(self) -> Pose:
+        """The pose of an outline that has one; ValueError for another."""
+        if self.pose is None:
+            raise ValueError(f"the outline in '{self.photo}' has no pose")
+        return self.pose
+
+    @property
     def is_seen(self) -> bool:
         """True if the photo shows any part of the object."""
         return bool((self.part > 0).any())

@@ -239,7 +239,7 @@ def relative_exposures(observations: Observations) -> dict[str, float]:
     the solve estimates the rest.
     """
     known = dict(zip(observations.photos, observations.exposures))
-    relative = {}
+    relative: dict[str, float] = {}
     for light in np.unique(observations.illumination):
         of_light = np.unique(observations.photo[observations.illumination == light])
         photos = sorted(observations.photos[k] for k in of_light)

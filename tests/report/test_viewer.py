@@ -13,7 +13,7 @@ import trimesh
 from PIL import Image
 
 from factorlib.conventions import YUP_FROM_CAMERA, lat_long_solid_angles
-from factorlib.dataset.schema import SetSlice
+from factorlib.dataset.schema import LightSlice, ObjectsSlice, SetSlice
 from factorlib.export.gltf import write_glb
 from factorlib.generate.shapes import sphere
 from factorlib.images.exr import write_rgb_exr
@@ -22,7 +22,6 @@ from factorlib.meshes.mesh import Mesh
 from factorlib.report import viewer
 from factorlib.report.artifacts import Artifacts
 from factorlib.report.pictures import light_row
-from stages import report
 from tests.align.scenes import mesh_of
 from tests.browser import BACK, CHROMIUM, HALF_FIELD, ball_seen, error, opened, rendered, shown
 from tests.evaluate.made_artifacts import TRUE, lobes_of, perturbed
@@ -38,7 +37,8 @@ def artifacts(inputs) -> Artifacts:
 
 
 def viewed(inputs) -> dict:
-    lights, objects = (msgspec.convert(inputs.facts[name], dict[str, kind]) for name, kind in report.SLICES.items())
+    lights = msgspec.convert(inputs.facts["dataset.light"], dict[str, LightSlice])
+    objects = msgspec.convert(inputs.facts["dataset.objects"], dict[str, ObjectsSlice])
     return viewer.viewed(artifacts(inputs), lights, objects, dict.fromkeys(LINKED, 1.0))
 
 

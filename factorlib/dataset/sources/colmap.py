@@ -10,6 +10,7 @@ import mmap
 import struct
 from collections.abc import Callable, Iterator
 from pathlib import Path
+from typing import TypeVar
 
 import pycolmap
 
@@ -26,32 +27,39 @@ MOST_NAME = 4096  # longest name of an image, bytes
 CameraLine = tuple[int, str, int, int, tuple[float, ...]]  # id, model, width, height, parameters
 # name, camera id, cam_from_world as quaternion w x y z and translation
 ImageLine = tuple[str, int, tuple[float, ...]]
+Line = TypeVar("Line", CameraLine, ImageLine)
 
 
 def colmap_shots(path: str, refuse: Refusal) -> list[Shot]:
     """Read the registered images of the model in the dataset's folder `path`, sorted by name."""
     refuse.subfolder(KEY, path)
-    models = {suffix: [refuse.file_of(KEY, path, f"{name}{suffix}") for name in ("cameras", "images")]
-              for suffix in (".bin", ".txt")}  # fmt: skip
-    suffix = next((suffix for suffix, files in models.items() if all(files)), None)
-    if suffix is None:
+    cameras_and_images = [
+        (refuse.file_of(KEY, path, f"cameras{suffix}"), refuse.file_of(KEY, path, f"images{suffix}"))
+        for suffix in (".bin", ".txt")
+    ]
+    for camera_file, image_file in cameras_and_images:
+        if camera_file is not None and image_file is not None:
+            break
+    else:
         fault = f"{path!r} is not readable as a COLMAP model (it has no cameras and images, .bin or .txt)"
         refuse(KEY, fault, CURE)
-    camera_file, image_file = models[suffix]
-    is_text = suffix == ".txt"
+    is_text = camera_file.suffix == ".txt"
     with reading("a COLMAP model", camera_file, KEY, CURE):
-        lines = _text_cameras(camera_file) if is_text else _records(camera_file, _binary_camera)
-        cameras = {number: entry for number, *entry in lines}
-        for model, _, _, params in cameras.values():
+        camera_lines = _text_cameras(camera_file) if is_text else _records(camera_file, _binary_camera)
+        cameras = {line[0]: line for line in camera_lines}
+        for _, model, _, _, params in cameras.values():
             if len(params) != _count_of(model):
                 raise ValueError(f"a {model} camera has {_count_of(model)} parameters, not {len(params)}")
     with reading("a COLMAP model", image_file, KEY, CURE):
-        lines = _text_images(image_file) if is_text else _records(image_file, _binary_image)
-        images = sorted(lines, key=lambda line: line[0])
+        image_lines = _text_images(image_file) if is_text else _records(image_file, _binary_image)
+        images = sorted(image_lines, key=lambda line: line[0])
         for name, camera_id, _ in images:
             if camera_id not in cameras:
                 raise ValueError(f"image {name!r} has camera {camera_id}, which {camera_file.name} lacks")
-    made = {number: colmap_camera(f"{KEY}: camera {number}", *entry, refuse) for number, entry in cameras.items()}
+    made = {
+        number: colmap_camera(f"{KEY}: camera {number}", model, width, height, params, refuse)
+        for number, model, width, height, params in cameras.values()
+    }
     shots = []
     for name, camera_id, (*quaternion, x, y, z) in images:
         key = f"{KEY}: {one_line(name)}"
@@ -72,7 +80,7 @@ def _count_of(model: str) -> int:
     return len(pycolmap.Camera.create_from_model_name(0, model, 1.0, 1, 1).params)
 
 
-def _records(file: Path, record: Callable[[mmap.mmap, int], tuple[tuple, int]]) -> Iterator[tuple]:
+def _records(file: Path, record: Callable[[mmap.mmap, int], tuple[Line, int]]) -> Iterator[Line]:
     """Yield the records of a binary file.
 
     `record` decodes one at an offset, and returns it with the offset of its end.

@@ -5,13 +5,23 @@ precedence: an object with a pose or keypoints there gets no pose from the sourc
 """
 
 import logging
+from collections.abc import Iterable
 from pathlib import Path, PurePosixPath
 
 import msgspec
 
 from factorlib.dataset.check import IMAGES
 from factorlib.dataset.paths import Refusal
-from factorlib.dataset.schema import SOURCES, CameraSource, DatasetFile, ExternalCamera, PhotoEntry, Pose, Similarity
+from factorlib.dataset.schema import (
+    SOURCES,
+    CameraSource,
+    DatasetFile,
+    ExternalCamera,
+    PhotoEntry,
+    Pose,
+    Similarity,
+    Vec3,
+)
 from factorlib.dataset.sources.bop import bop_shots
 from factorlib.dataset.sources.colmap import colmap_shots
 from factorlib.dataset.sources.shot import Shot, as_rows, pinhole, rigid
@@ -34,6 +44,7 @@ def external_cameras(spec: DatasetFile, file: Path) -> tuple[DatasetFile, dict[s
     """
     refuse = Refusal(file, file.parent)
     source = spec.cameras
+    assert source is not None  # the reader asks only for a source of files
     external = {}
     photos = []
     kind = next(kind for kind in SOURCES if getattr(source, kind) is not None)
@@ -60,6 +71,7 @@ def external_cameras(spec: DatasetFile, file: Path) -> tuple[DatasetFile, dict[s
                 camera = ExternalCamera(kind, focal, None if shot.centred else centre, shot.size, poses)
             external[photo.name] = camera
             if source.world_from_camera and photo.world_from_camera is None:
+                assert shot.cam_from_world is not None  # world_from_camera does not go with bop, which has no world
                 world_from_camera = as_rows(shot.cam_from_world.inverse().rotation)
                 photo = msgspec.structs.replace(photo, world_from_camera=world_from_camera)
         photos.append(photo)
@@ -80,6 +92,7 @@ def matched(spec: DatasetFile, kind: str, shots: list[Shot], refuse: Refusal) ->
     Returns:
         The matching image by photo.
     """
+    assert spec.cameras is not None
     by_name = {shot.image: shot for shot in shots}
     result = {}
     alike: dict[tuple, list[Shot]] = {}  # shots by each name that may match a photo's
@@ -132,7 +145,7 @@ def _poses(photo: PhotoEntry, shot: Shot, source: CameraSource, hulls: set[str],
                 log.warning("%s: cameras.bop knows no obj_id %d in image %s: the pose of %s in %s is searched",
                             refuse.file, obj_id, shot.image, obj.name, photo.name)  # fmt: skip
             for pose in instances:
-                poses[obj.name] = Pose(pose.rotation, tuple(x / source.mesh_unit_mm for x in pose.translation))
+                poses[obj.name] = Pose(pose.rotation, _divided(pose.translation, source.mesh_unit_mm))
         return poses
     here = {name: Similarity() for name in hulls} | source.world_from_object
     placed = {obj.name: here[obj.name] for obj in objects if obj.name in here}
@@ -141,7 +154,14 @@ def _poses(photo: PhotoEntry, shot: Shot, source: CameraSource, hulls: set[str],
         fault = f"photo {photo.name!r} shows objects of different scales, {', '.join(f'{s:g}' for s in scales)}"
         refuse("cameras.world_from_object", fault, "objects of one photo share its unit: scale the meshes' files alike")
     for name, similarity in placed.items():  # The mesh's unit replaces the source's, which changes no picture.
+        assert shot.cam_from_world is not None  # only bop has no world
         cam_from_object = shot.cam_from_world * rigid(similarity.rotation, similarity.translation)
-        translation = tuple(float(x) / similarity.scale for x in cam_from_object.translation)
+        translation = _divided(cam_from_object.translation, similarity.scale)
         poses[name] = Pose(as_rows(cam_from_object.rotation), translation)
     return poses
+
+
+def _divided(vector: Iterable[float], unit: float) -> Vec3:
+    """Return a vector in another unit."""
+    x, y, z = (float(value) / unit for value in vector)
+    return x, y, z

@@ -107,6 +107,7 @@ def pinhole(camera: pycolmap.Camera, key: str, refuse: Refusal) -> tuple[float, 
         warnings.simplefilter("ignore", RuntimeWarning)  # for pixels without a ray, which are rejected below
         # least-squares focal length of pixel offset over slope, and the largest residual
         slopes = camera.cam_from_img(pixels)
+        assert slopes is not None  # as of a single point; rows of many points are NaN
         focal = float((slopes * places).sum() / (slopes * slopes).sum())
         off = float((((places - focal * slopes) ** 2).sum(axis=1) ** 0.5).max())
     if not off <= MOST_OFF_PX:  # NaN where a pixel has no ray
@@ -136,4 +137,5 @@ def rigid(rotation: Mat3, translation: Vec3) -> pycolmap.Rigid3d:
 
 def as_rows(rotation: pycolmap.Rotation3d) -> Mat3:
     """Return the rows of a rotation's matrix."""
-    return tuple(tuple(map(float, row)) for row in rotation.matrix())
+    x, y, z = ((float(a), float(b), float(c)) for a, b, c in rotation.matrix())
+    return x, y, z

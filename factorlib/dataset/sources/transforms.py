@@ -72,8 +72,8 @@ def transforms_shots(path: str, refuse: Refusal) -> list[Shot]:
         if len(rows) not in (3, 4) or (len(rows) == 4 and tuple(rows[3]) != (0, 0, 0, 1)):
             refuse(of, "is not a rigid matrix", "give the rows [R | t], and [0, 0, 0, 1] below them or nothing")
         refuse.rotation(of, tuple(row[:3] for row in rows[:3]))
-        opencv = tuple((x, -y, -z) for x, y, z, _ in rows[:3])  # OpenGL's camera axes to OpenCV's
-        cam_from_world = rigid(opencv, tuple(row[3] for row in rows[:3])).inverse()
+        right, down, forward = ((x, -y, -z) for x, y, z, _ in rows[:3])  # OpenGL's camera axes to OpenCV's
+        cam_from_world = rigid((right, down, forward), (rows[0][3], rows[1][3], rows[2][3])).inverse()
         shots.append(Shot(frame.file_path, camera, size, f"{file.name}: {key}", centred, cam_from_world))
     return shots
 
@@ -84,14 +84,14 @@ def _camera(key: str, lens: Lens, refuse: Refusal) -> tuple[pycolmap.Camera, tup
     Without `w`, a field of view gives the focal length of an image of width ANY_WIDTH.
     """
     focal = lens.fl_x
-    if focal is None and lens.camera_angle_x is None:
-        cure = "give the focal length fl_x in pixels, with w and h"
-        refuse(f"{key}.fl_x", "neither fl_x nor camera_angle_x is given", cure)
     if focal is None:
-        is_angle = 0 < lens.camera_angle_x < math.pi
-        focal = (lens.w or ANY_WIDTH) / 2 / math.tan(lens.camera_angle_x / 2) if is_angle else math.nan
+        angle = lens.camera_angle_x
+        if angle is None:
+            cure = "give the focal length fl_x in pixels, with w and h"
+            refuse(f"{key}.fl_x", "neither fl_x nor camera_angle_x is given", cure)
+        focal = (lens.w or ANY_WIDTH) / 2 / math.tan(angle / 2) if 0 < angle < math.pi else math.nan
         if not FOCAL_PX[0] <= focal <= FOCAL_PX[1]:
-            fault = f"an angle of {lens.camera_angle_x:g} is no field of view"
+            fault = f"an angle of {angle:g} is no field of view"
             refuse(f"{key}.camera_angle_x", fault, "give it in radians, more than 0 and less than π")
         if lens.w is None:
             params = [focal, ANY_WIDTH / 2, 0.5]
