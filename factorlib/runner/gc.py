@@ -23,18 +23,15 @@ from factorlib.runner.store import LOCK, Entry, Store, is_locked, lock, sweep
 LEFT_OVER = "left over"  # what was damaged, and files without a key
 
 
-@contextlib.contextmanager
-def tenant(store: Store, say: Callable[[str], None]) -> Iterator[Path]:
-    """A run's own folder for what it has not finished; gone afterwards, with everything that dead runs left."""
+def begin_run(store: Store, say: Callable[[str], None]) -> tuple[Path, int]:
+    """Make a run's own folder for what it has not finished; everything that dead runs left is gone.
+
+    Returns the folder, and the lock in it, by which others know that the run goes on.
+    """
     folder = store.tmp / f"run-{os.getpid()}-{uuid.uuid4().hex[:8]}"
     store.locks.mkdir(parents=True, exist_ok=True)
     with _door(store, say):
-        held = lock(folder / LOCK)
-    try:
-        yield folder
-    finally:
-        shutil.rmtree(folder, ignore_errors=True)
-        os.close(held)
+        return folder, lock(folder / LOCK)
 
 
 @contextlib.contextmanager

@@ -10,18 +10,18 @@ from __future__ import annotations
 import contextlib
 import json
 import os
+import shutil
 import time
-import traceback
-from concurrent.futures import FIRST_COMPLETED, CancelledError, Future, wait
-from concurrent.futures.process import BrokenProcessPool
+from concurrent.futures import FIRST_COMPLETED, Future, wait
 from dataclasses import dataclass
 from pathlib import Path
 
-from factorlib.runner.child import Pools
+from factorlib.errors import InputError
 from factorlib.runner.display import Display
-from factorlib.runner.gc import tenant
+from factorlib.runner.gc import begin_run
 from factorlib.runner.home import claim, label, remember, show, sound_lines, usual_costs, view_of
 from factorlib.runner.plan import Planned, Step
+from factorlib.runner.processes import Cluster, Processes
 from factorlib.runner.shared import shared_store
 from factorlib.runner.store import lock
 from factorlib.runner.survey import Survey
@@ -46,25 +46,23 @@ class Running:
 def run(survey: Survey, display: Display) -> Run:
     """Run whatever of the plan must run; the results are in the store and under build/<dataset>/ afterwards."""
     claim(survey.project, survey.home, survey.data.folder)
-    with tenant(survey.store, display.say) as folder:
+    folder, held = begin_run(survey.store, display.say)
+    with contextlib.ExitStack() as after:
+        after.callback(shutil.rmtree, folder, ignore_errors=True)
         work = Run(survey, display, folder)
+        after.callback(lambda: work.pools.close())
+        after.callback(os.close, held)  # the first of these, at which processes end that are not done
         work.refused = survey.wrong_values(survey.planned())
         if work.refused:
             return work
-        if survey.spec.pipeline.executor != "processes":
-            from factorlib.runner.cluster import Cluster  # which is loaded only then
-
-            work.pools = Cluster(survey.spec.pipeline.executor, folder, display.say)
+        if (executor := survey.spec.pipeline.executor) != "processes":
+            work.pools = Cluster(executor, folder, display.say)
         try:
             work.go()
-        except BaseException:
-            work.pools.close(kill=True)
-            raise
         finally:
             for running in work.running.values():
                 os.close(running.lock)
             show(survey, survey.planned(frozenset()))
-        work.pools.close()
     return work
 
 
@@ -75,7 +73,7 @@ class Run:
     """
 
     def __init__(self, survey: Survey, display: Display, folder: Path):
-        self.survey, self.display, self.folder, self.pools = survey, display, folder, Pools()
+        self.survey, self.display, self.folder, self.pools = survey, display, folder, Processes(folder)
         display.usual, display.cores = usual_costs(survey.home.log), self.pools.cores
         self.store, self.shared = survey.store, shared_store(survey.store.root)
         self.refused: list[str] = []
@@ -212,11 +210,9 @@ class Run:
         step, key = work.planned.step, work.task.key
         try:
             outcome = work.future.result()
-        except Exception as error:
-            name = type(error).__name__
-            outcome = Outcome(error=f"{name}: {error}", traceback="".join(traceback.format_exception(error)))
-            if isinstance(error, BrokenProcessPool | CancelledError) or name == "KilledWorker":  # which is Dask's
-                outcome = Outcome(error=DIED)
+        except Exception as error:  # of the executor: `run_step` raises nothing
+            known = isinstance(error, InputError)
+            outcome = Outcome(error=str(error) if known else f"{DIED} ({type(error).__name__})")
         os.close(work.lock)
         if outcome.error is not None:
             return self._fail(step, outcome)

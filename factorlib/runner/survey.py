@@ -19,7 +19,7 @@ from factorlib.runner.pipeline import DATASET, read_pipeline, said_of_settings, 
 from factorlib.runner.plan import Listing, Planned, Record, Spec, Step, plan
 from factorlib.runner.project import ALL, LIBRARY, Data, Project, Recipe
 from factorlib.runner.store import Store
-from factorlib.runner.worker import Code, params_of
+from factorlib.runner.worker import Code, fault_of_params
 
 RENDER = "render"  # the stage whose pictures a recipe replaces
 READ = ("file:", "recipe file:", f"facts:{DATASET}")  # fields of a record: of the dataset and recipe, what a step reads
@@ -90,16 +90,12 @@ class Survey:
         open_ = dict.fromkeys(p.step.stage for p in planned if p.status != "current")
         codes, faults = [self.code(name) for name in open_ if self.spec.pipeline.stages[name].values], []
         if codes:
-            from factorlib.runner.child import Pools
+            from factorlib.runner.processes import Processes
 
-            pools = Pools()
-            try:
-                for future in [pools.submit(1, code.threads, params_of, code) for code in codes]:
-                    error = future.exception()
-                    if isinstance(error, InputError):  # what cannot be loaded says so when it runs
+            with contextlib.closing(Processes()) as processes:
+                for future in [processes.submit(1, code.threads, fault_of_params, code) for code in codes]:
+                    if error := future.result():
                         faults.append(str(said_of_settings(error, self.settings)))
-            finally:
-                pools.close(kill=True)
         return faults
 
 

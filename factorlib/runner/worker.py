@@ -18,6 +18,7 @@ import shutil
 import sys
 import time
 import traceback
+import uuid
 import warnings
 from collections.abc import Callable, Iterable
 from concurrent.futures import ThreadPoolExecutor
@@ -103,6 +104,8 @@ class CodeChanged(InputError):
 
 def run_step(task: Task) -> Outcome:
     """Run a task and keep its result in the store.  Raises nothing: an error of any kind is part of the outcome."""
+    temporary = task.temporary.with_name(f"{task.temporary.name}.{uuid.uuid4().hex[:8]}")
+    task = msgspec.structs.replace(task, temporary=temporary)  # another try of it may still be ending elsewhere
     meter, code, store = Meter(), task.code, Store(task.store)
     shared = Store(task.shared) if task.shared else None
     with Events(task.events) as events:
@@ -149,6 +152,16 @@ def load_stage(code: Code) -> ModuleType:
 def params_of(code: Code) -> msgspec.Struct:
     """The stage's parameters as its own struct.  Raises InputError where one is out of its bounds."""
     return convert(code.params, load_stage(code).Params, code.settings, f"stages.{code.stage}.params")
+
+
+def fault_of_params(code: Code) -> InputError | None:
+    """Return what is wrong with a stage's parameters; None, too, for a stage that cannot be loaded: it says so when it runs."""
+    try:
+        params_of(code)
+    except InputError as error:
+        return error
+    except Exception:
+        return None
 
 
 def spread(cores: int, function: Callable, items: Iterable) -> list:

@@ -126,7 +126,7 @@ def kill(process, whom):
             os.killpg(process.pid, signal.SIGKILL)
         elif whom == "the run":
             os.kill(process.pid, signal.SIGKILL)
-        elif pids := members(process.pid, b"runner.child"):
+        elif pids := members(process.pid, b"--multiprocessing-fork"):
             os.kill(pids[-1], signal.SIGKILL)
 
 
@@ -198,7 +198,7 @@ def test_a_killed_worker_does_not_fail_the_step_beside_it(fresh, tmp_path):
     toy.wait_for(fresh, tmp_path / "go")
     process = start(fresh)
     assert wait_until(lambda: at_work(fresh, "upper-a") and at_work(fresh, "upper-b"))
-    os.kill(members(process.pid, b"runner.child")[0], signal.SIGKILL)
+    os.kill(members(process.pid, b"--multiprocessing-fork")[0], signal.SIGKILL)
     (tmp_path / "go").touch()
     code, text = end(process)
     assert code == 1 and text.count("process died") == 1 and "1 step failed" in text

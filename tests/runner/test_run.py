@@ -4,7 +4,6 @@ import json
 import os
 import re
 import shutil
-import threading
 import time
 from functools import partial
 
@@ -12,7 +11,6 @@ import pytest
 
 from factorlib.errors import InputError
 from factorlib.runner import display, verbs
-from factorlib.runner.child import Pools
 from factorlib.runner.gc import clean, collect
 from factorlib.runner.home import usual_costs
 from factorlib.runner.plan import Step
@@ -180,26 +178,6 @@ def test_what_goes_wrong_in_a_stage_fails_its_step_and_the_next_run_resumes(
     assert not traced or re.search(rf"failed by a defect of the program: .*errors/{traced[0]}", capsys.readouterr().out)
     write(project.root / file, text)
     assert new_runs(project) == []
-
-
-class Holding(Exception):
-    """An error that pickle cannot take apart."""
-
-
-def fail(text):
-    error = Holding(text)
-    error.lock = threading.Lock()
-    raise error
-
-
-def test_an_error_of_a_child_that_cannot_be_pickled_says_its_type_and_text_and_the_child_lives():
-    pools = Pools(1)
-    try:
-        with pytest.raises(RuntimeError, match="Holding: a lock"):
-            pools.submit(1, 1, fail, "a lock").result(30)
-        assert pools.submit(1, 1, abs, -1).result(30) == 1 and len(pools.children) == 1
-    finally:
-        pools.close(kill=True)
 
 
 # ── what is told ─────────────────────────────────────────────────────────────────────────────────────────────────────
