@@ -4,6 +4,10 @@ Run by the Makefile as a script, on a Python without packages: nothing but the s
 
     python3 -I factorlib/setup.py        (TORCH_INDEX=<url> for a PyTorch of one's own choice, e.g. with CUDA)
     .venv/bin/python -I factorlib/setup.py extras        (EXTRAS="dask blender": extras of pyproject.toml, into .venv)
+    .venv/bin/python -I factorlib/setup.py lock          (requirements.lock: what pyproject.toml asks for, and what that needs,
+                                                         at the versions that .venv has)
+
+To move a package: `.venv/bin/python -m pip install -U <name>`, `make test`, `make lock`.
 """
 
 from __future__ import annotations
@@ -179,5 +183,59 @@ def loads(library: str) -> bool:
         return False
 
 
+# ── requirements.lock ────────────────────────────────────────────────────────────────────────────────────────────────
+
+HEAD = """\
+# Every package of .venv, pinned; installed without looking for more (torch apart, see factorlib/setup.py).
+# Derived from pyproject.toml by `make lock`. Of what Open3D asks for, only what its compiled module needs is here (factorlib/geometry/open3d.py).
+"""
+# What a package asks for and its import, or what is used of it, does not need.
+LEFT_OUT = {
+    "open3d-cpu": {
+        *(
+            "addict",
+            "configargparse",
+            "dash",
+            "flask",
+            "ipywidgets",
+            "matplotlib",
+            "nbformat",
+            "pandas",
+            "pyquaternion",
+        ),
+        *("scikit-learn", "werkzeug"),
+    },
+}
+
+
+def lock_text() -> str:
+    """Return what requirements.lock should say.  Raises PackageNotFoundError for a package that is needed and not installed."""
+    from importlib.metadata import distribution, requires  # what set-up has not yet installed
+
+    from packaging.requirements import Requirement
+    from packaging.utils import canonicalize_name
+
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+    waiting = [(Requirement(text), "") for text in project["dependencies"] + project["optional-dependencies"]["dev"]]
+    lines: dict[str, str] = {}
+    while waiting:
+        requirement, extra = waiting.pop()
+        name = canonicalize_name(requirement.name)
+        if name in lines or (requirement.marker and not requirement.marker.evaluate({"extra": extra})):
+            continue
+        lines[name] = f"{distribution(name).metadata['Name']}=={distribution(name).version}\n"
+        needed = [Requirement(text) for text in requires(name) or []]
+        needed = [each for each in needed if canonicalize_name(each.name) not in LEFT_OUT.get(name, ())]
+        waiting += [(each, extra) for each in needed for extra in ("", *requirement.extras)]
+    del lines["torch"]  # installed before the others, from an index of its own
+    return HEAD + "".join(sorted(lines.values(), key=str.lower))
+
+
 if __name__ == "__main__":
-    install_extras() if sys.argv[1:] == ["extras"] else main()
+    if sys.argv[1:] == ["extras"]:
+        install_extras()
+    elif sys.argv[1:] == ["lock"]:
+        LOCK.write_text(lock_text())
+        print("requirements.lock is written")
+    else:
+        main()

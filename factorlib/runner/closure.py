@@ -26,7 +26,7 @@ from typing import Any
 import msgspec
 
 from factorlib.errors import InputError, did_you_mean
-from factorlib.runner.filehash import FileHashes, left_over
+from factorlib.runner.store import FileHashes, left_over
 
 # the fields of a record that a closure makes
 CODE = ("source:", "data:", "environment:", "program:", "package:", "python")

@@ -5,6 +5,8 @@ from __future__ import annotations
 import importlib
 import os
 import shlex
+import signal
+import threading
 from collections.abc import Callable, Sequence
 from functools import cache, partial
 from pathlib import Path
@@ -13,7 +15,6 @@ from typing import Any, NamedTuple
 import msgspec
 
 from factorlib.errors import InputError, did_you_mean
-from factorlib.runner.stop import take_sigterm_back
 
 HOW = "name a folder in data/, or give a path to one with a dataset.yaml in it"
 PIPELINE = "pipeline.yaml"
@@ -54,6 +55,12 @@ class Provider(NamedTuple):
 
     slices: tuple[str, ...]
     read: Callable[[Path], Data]
+
+
+def take_sigterm_back() -> None:
+    """What Python does at SIGTERM holds again: pycolmap, once imported, prints a C stack instead."""
+    if threading.current_thread() is threading.main_thread():
+        signal.signal(signal.SIGTERM, signal.getsignal(signal.SIGTERM))
 
 
 def photo_sets() -> Provider:

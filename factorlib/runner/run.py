@@ -17,14 +17,12 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from factorlib.errors import InputError
+from factorlib.runner.dataset_state import Survey
 from factorlib.runner.display import Display
-from factorlib.runner.gc import begin_run
-from factorlib.runner.home import claim, label, remember, show, sound_lines, usual_costs, view_of
 from factorlib.runner.plan import Planned, Step
 from factorlib.runner.processes import Cluster, Processes
-from factorlib.runner.shared import shared_store
-from factorlib.runner.store import lock
-from factorlib.runner.survey import Survey
+from factorlib.runner.results_folder import begin_run, claim, label, usual_costs, view_of
+from factorlib.runner.store import lock, shared_store, sound_lines
 from factorlib.runner.worker import Code, Outcome, Task, run_step
 from factorlib.wholefile import append_text, write_bytes, write_text
 
@@ -62,7 +60,7 @@ def run(survey: Survey, display: Display) -> Run:
         finally:
             for running in work.running.values():
                 os.close(running.lock)
-            show(survey, survey.planned(frozenset()))
+            survey.show(survey.planned(frozenset()))
     return work
 
 
@@ -223,7 +221,7 @@ class Run:
         self.ran.append(step)
         self.made.add(key)
         append_text(self.survey.home.log, self.store.log(key).read_text(encoding="utf-8"))
-        remember(self.survey, {str(step): key})
+        self.survey.remember({str(step): key})
         self.display.finish(step, outcome.seconds)
 
     def _fail(self, step: Step, outcome: Outcome) -> None:

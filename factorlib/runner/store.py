@@ -15,7 +15,10 @@ it had when it was right are remembered, so that it is read once; `verify` reads
 from __future__ import annotations
 
 import contextlib
+import errno
 import fcntl
+import hashlib
+import logging
 import os
 import shutil
 import stat
@@ -23,15 +26,88 @@ import time
 import uuid
 from collections.abc import Callable, Iterable, Mapping
 from functools import cached_property
-from pathlib import Path
+from pathlib import Path, PurePosixPath
+from typing import Annotated, Any, TypeVar
 
 import msgspec
 
 from factorlib.errors import InputError
 from factorlib.jsonfile import json_text
-from factorlib.runner.filehash import hash_of_file, left_over, read_cache, write_cache
-from factorlib.runner.plan import hash_of
+from factorlib.runner.pipeline import Shipping
+from factorlib.runner.plan import Record, hash_of
 from factorlib.wholefile import replace_file, sync, sync_tree
+
+log = logging.getLogger("factorlib.runner")
+T = TypeVar("T")
+Hash = Annotated[str, msgspec.Meta(pattern="^[0-9a-f]{32}$")]
+FORMAT = 8  # of the cache; one of another format is made anew
+FRESH_NS = 2_000_000_000  # a file changed this recently may change again within its clock's grain: not remembered
+
+
+def hash_of_file(path: Path) -> str:
+    """First 128 bits of the SHA-256 of a file's content, as 32 hexadecimal digits."""
+    with open(path, "rb") as stream:
+        return hashlib.file_digest(stream, "sha256").hexdigest()[:32]
+
+
+def left_over(name: str) -> bool:
+    """Whether a file or folder is what Python, editors and desktops leave: hidden, a backup, or compiled Python.
+
+    >>> [left_over(name) for name in (".a.c.swp", "a.c~", "#a.c#", "__pycache__", "a.pyc", "a.c")]
+    [True, True, True, True, True, False]
+    """
+    return name.startswith((".", "#")) or name.endswith(("~", ".pyc")) or name == "__pycache__"
+
+
+def read_cache(path: Path | None, type_: type[T]) -> T | None:
+    """What a cache holds; None where there is none, or it is damaged or of another kind."""
+    try:
+        return msgspec.json.decode(path.read_bytes(), type=type_) if path else None
+    except (OSError, msgspec.MsgspecError, UnicodeError, RecursionError):
+        return None
+
+
+def write_cache(path: Path, tables: Any) -> None:
+    """Replace a cache; where it cannot be written (a full disk, a read-only folder) the next run takes longer, no more."""
+    with contextlib.suppress(OSError):
+        path.parent.mkdir(parents=True, exist_ok=True)
+        replace_file(path, msgspec.json.encode(tables))
+
+
+class FileHashes:
+    """What was made of files, by kind and path, in a cache beside the store; `save` writes it.  cache: its file, None to keep nothing."""
+
+    def __init__(self, cache: Path | None):
+        self.cache, self._changed = cache, False
+        format_, tables = read_cache(cache, tuple[int, dict[str, dict[str, Any]]]) or (0, {})
+        self._tables = tables if format_ == FORMAT else {}
+
+    def content(self, path: Path) -> str:
+        """`hash_of_file`, from the cache where the file's size, times and inode are unchanged."""
+        return self.remembered("content", path, lambda: hash_of_file(path), Hash)
+
+    def remembered(self, kind: str, path: Path, make: Callable[[], T], type_: type[T]) -> T:
+        """What `make` makes of the content of a file, from the cache where that is unchanged; type_: what it is."""
+        stat, table = os.stat(path), self._tables.setdefault(kind, {})
+        now = stat.st_size, stat.st_mtime_ns, stat.st_ctime_ns, stat.st_ino
+        with contextlib.suppress(KeyError, OverflowError, msgspec.ValidationError):  # not there, or damaged
+            then, value = msgspec.convert(table[str(path)], tuple[tuple[int, int, int, int], Any])
+            if then == now:
+                return msgspec.convert(value, type_)
+        value, stat = make(), os.stat(path)
+        unchanged = now == (stat.st_size, stat.st_mtime_ns, stat.st_ctime_ns, stat.st_ino)
+        if unchanged and time.time_ns() - max(now[1], now[2]) > FRESH_NS:
+            table[str(path)], self._changed = (now, value), True
+        return value
+
+    def save(self) -> None:
+        """Write the cache, where there is anything new to write."""
+        if self._changed and self.cache is not None:
+            write_cache(self.cache, (FORMAT, self._tables))
+            self._changed = False
+
+
+# ── the store ─────────────────────────────────────────────────────────────────────────────────────────────────────────
 
 Say = Callable[[str], None]
 Stamp = tuple[int, int]  # size in bytes, time of the content in ns
@@ -226,3 +302,147 @@ def damage_of(folder: Path, files: Mapping[str, str], right: Mapping[str, Stamp]
             except OSError as error:
                 lines.append(f"{name}: cannot be read ({error.strerror})")
     return lines + [f"{name}: no file of this result" for name in sorted(now.keys() - files.keys())]
+
+
+def sound_lines(path: Path) -> list[bytes]:
+    """The lines of a log that are events, in order, none where there is no log; damaged ones are left out, with a warning."""
+    try:
+        lines = path.read_bytes().splitlines()
+    except FileNotFoundError:
+        return []
+    sound = []
+    for line in lines:
+        with contextlib.suppress(msgspec.MsgspecError, UnicodeError, RecursionError):
+            event = msgspec.json.decode(line, type=dict)
+            sound += [line] if isinstance(event.get("event"), str) else []
+    if len(sound) < len(lines):
+        words = "%s: %d damaged lines are left out; the results are not affected"
+        log.warning(words, path, len(lines) - len(sound))
+    return sound
+
+
+# ── results of others ────────────────────────────────────────────────────────────────────────────────────────────────
+
+VARIABLE = "FACTORLIB_STORE"
+NOT_OURS = (errno.EACCES, errno.EPERM, errno.EROFS)  # to read is enough
+MADE_FROM = "made_from.json"
+CURE = "restore it from the repository, or make the result anew with FORCE=1"
+
+
+def shared_store(own: Path) -> Path | None:
+    """The folder that FACTORLIB_STORE names, None where it names none or `own`; InputError where there is no such folder."""
+    if not (named := os.environ.get(VARIABLE)):
+        return None
+    folder = Path(named).expanduser()
+    if not os.path.isdir(folder):
+        cure = "make it, or name another that you may read; it may be empty"
+        raise InputError("there is no such folder", file=named[:100], key=VARIABLE, cure=cure)
+    return None if own.is_dir() and folder.samefile(own) else folder.resolve()
+
+
+def fetch(shared: Store, own: Store, key: str, draft: Path, say: Say) -> Entry | None:
+    """Copy the result of `key`, with its log, into the own store; None where the shared one has it not, or not as it was kept.
+
+    draft: a folder of the own store that is not there yet
+    """
+    try:
+        if shared.entry(key) is None:
+            return None
+        if entry := _copied_result(shared, own, key, draft, say):
+            return entry
+        say("the shared store's result is not as it was kept: the step is run")
+    except OSError as error:
+        say(f"the shared store cannot be read ({error.strerror}): the step is run")
+    shutil.rmtree(draft, ignore_errors=True)
+    return None
+
+
+def offer(own: Store, shared: Store, key: str, say: Say) -> None:
+    """Copy a result into the shared store, with its log, unless it is there; silent where one may only read."""
+    draft = shared.tmp / f"offer-{os.getpid()}-{uuid.uuid4().hex[:8]}"
+    try:
+        if not shared.root.is_dir():
+            raise FileNotFoundError(errno.ENOENT, "it is gone")
+        if (there := shared.entry(key)) and not damage_of(shared.trees / there.output, there.files):
+            return
+        shared.tmp.mkdir(parents=True, exist_ok=True)
+        sweep(shared.tmp)
+        if entry := _copied_result(own, shared, key, draft, lambda _: None):
+            shared.keep(key, entry)
+    except OSError as error:
+        if error.errno not in NOT_OURS:
+            say(f"the shared store took nothing ({error.strerror}); the result is kept in build/store")
+    finally:
+        shutil.rmtree(draft, ignore_errors=True)
+
+
+def _copied_result(source: Store, target: Store, key: str, draft: Path, say: Say) -> Entry | None:
+    """Copy tree and log of a key that is in `source`; None where any of it is not as it was kept."""
+    entry, log = source.entry(key), sound_lines(source.log(key))
+    if hash_of(entry.record) != key or not log or not copied(source.trees / entry.output, draft, entry.files):
+        return None
+    entry = target.take_in(entry.record, draft, say)
+    target.logs.mkdir(parents=True, exist_ok=True)
+    replace_file(target.log(key), b"".join(line + b"\n" for line in log))
+    return entry
+
+
+def copied(tree: Path, draft: Path, files: dict[str, str]) -> bool:
+    """Copy the files of a tree; whether each is what its hash says.  No name may lead out of the draft."""
+    if any(PurePosixPath(name).is_absolute() or ".." in PurePosixPath(name).parts for name in files):
+        return False
+    shutil.rmtree(draft, ignore_errors=True)
+    draft.mkdir(parents=True)
+    for name in files:
+        (draft / name).parent.mkdir(parents=True, exist_ok=True)
+        with contextlib.suppress(FileNotFoundError):
+            shutil.copyfile(tree / name, draft / name, follow_symlinks=False)
+    return not damage_of(draft, files)
+
+
+class Shipped(msgspec.Struct, frozen=True):
+    """What made_from.json says: the part of the record that the result depends on, and the hash of each file of it."""
+
+    record: Record
+    files: dict[str, str]
+
+
+def made_from(record: Record, modules: list[str]) -> Record:
+    """The part of a step's record that a result made by `modules` depends on.
+
+    >>> made_from({"param:steps": 3, "source:stages.train": "1", "package:torch": "2.13"}, ["stages.train"])
+    {'param:steps': 3, 'source:stages.train': '1'}
+    """
+    own = {f"source:{module}" for module in modules}
+    return {name: value for name, value in record.items() if name.startswith("param:") or name in own}
+
+
+def copy_shipped(roots: list[Path], shipping: Shipping | None, record: Record, out: Path) -> bool:
+    """Copy the shipped result of `record`, from below one of `roots`, to `out`; False where none was made from the same.
+
+    Raises InputError where the files are not those that were shipped.
+    """
+    for file in (root / shipping.folder / MADE_FROM for root in roots if shipping):
+        if not file.is_file():
+            continue
+        try:
+            shipped = msgspec.json.decode(file.read_bytes(), type=Shipped)
+        except msgspec.DecodeError as error:
+            words = f"does not say what the shipped files were made from ({error})"
+            raise InputError(words, file=file, cure=CURE) from None
+        if shipped.record == made_from(record, shipping.made_by):
+            if not copied(file.parent, out, shipped.files):
+                raise InputError("beside it are not the files that were shipped with the source", file=file, cure=CURE)
+            return True
+    return False
+
+
+def ship(result: Path, record: Record, root: Path, shipping: Shipping) -> Path:
+    """Put the files of `result`, a flat folder that `record` gave, into the package; returns where they are."""
+    target, hashes = root / shipping.folder, {}
+    target.mkdir(parents=True, exist_ok=True)
+    for path in sorted(result.iterdir()):
+        replace_file(target / path.name, path.read_bytes())
+        hashes[path.name] = hash_of_file(target / path.name)
+    replace_file(target / MADE_FROM, json_text(Shipped(made_from(record, shipping.made_by), hashes)).encode())
+    return target

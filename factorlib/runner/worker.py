@@ -29,19 +29,25 @@ from typing import Any, Self
 
 import msgspec
 
-from factorlib.disk import disk_error
 from factorlib.errors import InputError
 from factorlib.runner.closure import CODE, Sources
-from factorlib.runner.filehash import FileHashes, hash_of_file
-from factorlib.runner.home import sound_lines
 from factorlib.runner.pipeline import Stage
 from factorlib.runner.plan import difference
-from factorlib.runner.project import LIBRARY
-from factorlib.runner.shared import copy_shipped, fetch, offer
-from factorlib.runner.stop import take_sigterm_back
-from factorlib.runner.store import Entry, Stamp, Store, stamps_of
+from factorlib.runner.project import LIBRARY, take_sigterm_back
+from factorlib.runner.store import (
+    Entry,
+    FileHashes,
+    Stamp,
+    Store,
+    copy_shipped,
+    fetch,
+    hash_of_file,
+    offer,
+    sound_lines,
+    stamps_of,
+)
 from factorlib.stage import Inputs, serial_map
-from factorlib.wholefile import append_text, replace_file
+from factorlib.wholefile import append_text, disk_error, replace_file
 from factorlib.yamlfile import convert
 
 EVERY = 0.2  # seconds between two words of progress

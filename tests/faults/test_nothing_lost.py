@@ -21,8 +21,8 @@ from pathlib import Path
 
 import pytest
 
-from factorlib.runner.gc import collect, verify
 from factorlib.runner.project import LIBRARY
+from factorlib.runner.results_folder import collect, verify
 from tests.runner import toy
 from tests.runner.toy import done, edit, files_of, make, new_runs, reasons, state, write
 
@@ -219,9 +219,10 @@ def test_sigterm_ends_a_run_as_an_interrupt_does(fresh):
 def test_a_reader_that_takes_sigterm_prints_no_c_stack():
     """pycolmap itself, as reading cameras of a COLMAP model imports it."""
     code = (
-        "import os, signal, factorlib.runner.stop as stop\n"
-        "with stop.heed_stops():\n"
-        "    import pycolmap; stop.take_sigterm_back(); os.kill(os.getpid(), signal.SIGTERM)"
+        "import os, signal, factorlib.runner.project as project\n"
+        "from factorlib.__main__ import heed_stops\n"
+        "with heed_stops():\n"
+        "    import pycolmap; project.take_sigterm_back(); os.kill(os.getpid(), signal.SIGTERM)"
     )
     ended = subprocess.run([sys.executable, "-c", code], cwd=LIBRARY, capture_output=True, check=False)
     assert ended.returncode == 143 and not ended.stderr
@@ -293,7 +294,7 @@ SLOW_GC = """
 import os, sys, time
 from pathlib import Path
 from tests.runner import toy
-from factorlib.runner.gc import collect
+from factorlib.runner.results_folder import collect
 def slow(function):
     def wrapped(*words, **more):
         time.sleep(0.02)

@@ -11,10 +11,9 @@ import pytest
 
 from factorlib.errors import InputError
 from factorlib.runner import display, verbs
-from factorlib.runner.gc import clean, collect
-from factorlib.runner.home import usual_costs
+from factorlib.runner.dataset_state import survey
 from factorlib.runner.plan import Step
-from factorlib.runner.survey import survey
+from factorlib.runner.results_folder import clean, collect, usual_costs
 from factorlib.runner.worker import Events
 from tests.faults.test_nothing_lost import start, wait_until
 from tests.runner import toy

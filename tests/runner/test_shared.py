@@ -13,12 +13,10 @@ import pytest
 
 from factorlib.errors import InputError
 from factorlib.runner import verbs
-from factorlib.runner.filehash import hash_of_file
-from factorlib.runner.gc import verify
+from factorlib.runner.dataset_state import survey
 from factorlib.runner.project import LIBRARY
-from factorlib.runner.shared import MADE_FROM, copied
-from factorlib.runner.store import hash_of
-from factorlib.runner.survey import survey
+from factorlib.runner.results_folder import verify
+from factorlib.runner.store import MADE_FROM, copied, hash_of, hash_of_file
 from tests.runner import toy
 from tests.runner.toy import files_of, make, make_project, state, write
 

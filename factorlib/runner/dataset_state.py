@@ -11,15 +11,16 @@ from typing import Any, NamedTuple
 import msgspec
 
 from factorlib.errors import InputError, did_you_mean
+from factorlib.jsonfile import json_text
 from factorlib.reading import check_plain, reading
 from factorlib.runner.closure import Sources
-from factorlib.runner.filehash import FileHashes
-from factorlib.runner.home import Home, home_of
 from factorlib.runner.pipeline import DATASET, read_pipeline, said_of_settings, with_settings
 from factorlib.runner.plan import Listing, Planned, Record, Spec, Step, plan
 from factorlib.runner.project import ALL, LIBRARY, Data, Project, Recipe
-from factorlib.runner.store import Store
+from factorlib.runner.results_folder import Home, claim, home_of, label, point, view_of
+from factorlib.runner.store import FileHashes, Store
 from factorlib.runner.worker import Code, fault_of_params
+from factorlib.wholefile import replace_file
 
 RENDER = "render"  # the stage whose pictures a recipe replaces
 READ = ("file:", "recipe file:", f"facts:{DATASET}")  # fields of a record: of the dataset and recipe, what a step reads
@@ -97,6 +98,40 @@ class Survey:
                     if error := future.result():
                         faults.append(str(said_of_settings(error, self.settings)))
         return faults
+
+    def remember(self, made: dict[str, str]) -> None:
+        """Write down the keys that steps have now; steps of photos and stages that are no more are dropped."""
+        stages, before = self.spec.pipeline.stages, self.home.keys(lenient=True)
+        names = {*stages, *(str(step) for stage in stages for step in self.spec.steps_of(stage))}
+        asked_for_before = tuple(f"{name}/" for name, stage in stages.items() if stage.over == "recipe")
+        keys = {name: key for name, key in before.items() if name in names or name.startswith(asked_for_before)} | made
+        if keys != before:
+            claim(self.project, self.home, self.data.folder)
+            replace_file(self.home.keys_file, json_text(keys).encode())
+
+    def show(self, planned: list[Planned]) -> None:
+        """Write down what is current and point the links there: of a stage over photos, at one folder with all of them."""
+        home, store, stages = self.home, self.store, self.spec.pipeline.stages
+        current = {p.step: p for p in planned if p.status == "current"}
+        keys, of_photos = {str(step): p.key for step, p in current.items()}, {}
+        for step, p in current.items():
+            if step.photo:
+                of_photos.setdefault(step.stage, {})[step.photo] = p.key
+            else:
+                point(home.folder / str(step), store.trees / p.output)
+        for name, of in of_photos.items():
+            keys[name] = view_of(store, name, of, stages[name].gather)
+            point(home.folder / name, store.trees / store.get(keys[name]))
+        self.remember(keys)
+        for link in home.folder.glob("[!.]*"):  # hidden ones are drafts of links, of another run perhaps
+            if link.is_symlink() and link.name not in stages:
+                link.unlink(missing_ok=True)
+        failed = {label(step) for stage in stages for step in self.spec.steps_of(stage) if step not in current}
+        for path in (path for path in home.errors.glob("*.txt") if path.stem not in failed):
+            path.unlink(missing_ok=True)  # what is written of a failure goes with success, or with the step
+        with contextlib.suppress(OSError):  # what is not empty stays; another run may have removed the folder
+            home.errors.rmdir()
+        store.save()
 
 
 def survey(
