@@ -40,7 +40,6 @@ from factorlib.runner.store import (
     hash_of_file,
     is_locked,
     lock,
-    sound_lines,
     stamps_of,
     sweep,
 )
@@ -48,6 +47,7 @@ from factorlib.wholefile import replace_file, write_text
 
 log = logging.getLogger("factorlib.runner")
 Key = Annotated[str, msgspec.Meta(pattern="^[0-9a-f]{32}$")]  # it becomes a part of paths
+LEFT_OVER = "left over"  # what was damaged, and files without a key
 LONGEST = 85  # bytes of the name of a step's files, to which suffixes are added
 
 
@@ -203,20 +203,6 @@ def view_of(store: Store, stage: str, keys: dict[str, str], gather: str | None) 
     store.forget(key)
     store.known[view.output], store.changed = stamps_of(store.trees / view.output), True
     return key
-
-
-def usual_costs(log_file: Path) -> dict[str, tuple[float, int]]:
-    """Return by stage, of the steps as they were last made, the mean of their seconds, and the most cores that one took."""
-    last: dict[str, dict[str | None, tuple[float, int]]] = {}
-    for event in map(msgspec.json.decode, sound_lines(log_file)):
-        if event["event"] == "done" and {"seconds", "cores", "threads"} <= event.keys():
-            cost = event["seconds"], max(event["cores"], event["threads"])
-            last.setdefault(event["stage"], {})[event.get("photo")] = cost
-    costs = {stage: list(zip(*of.values())) for stage, of in last.items()}
-    return {stage: (sum(seconds) / len(seconds), max(cores)) for stage, (seconds, cores) in costs.items()}
-
-
-LEFT_OVER = "left over"  # what was damaged, and files without a key
 
 
 def begin_run(store: Store, say: Callable[[str], None]) -> tuple[Path, int]:

@@ -21,7 +21,7 @@ from factorlib.runner.dataset_state import Survey
 from factorlib.runner.display import Display
 from factorlib.runner.plan import Planned, Step
 from factorlib.runner.processes import Cluster, Processes
-from factorlib.runner.results_folder import begin_run, claim, label, usual_costs, view_of
+from factorlib.runner.results_folder import begin_run, claim, label, view_of
 from factorlib.runner.store import lock, shared_store, sound_lines
 from factorlib.runner.worker import Code, Outcome, Task, run_step
 from factorlib.wholefile import append_text, write_bytes, write_text
@@ -72,7 +72,6 @@ class Run:
 
     def __init__(self, survey: Survey, display: Display, folder: Path):
         self.survey, self.display, self.folder, self.pools = survey, display, folder, Processes(folder)
-        display.usual, display.cores = usual_costs(survey.home.log), self.pools.cores
         self.store, self.shared = survey.store, shared_store(survey.store.root)
         self.refused: list[str] = []
         self.running: dict[Step, Running] = {}

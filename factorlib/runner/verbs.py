@@ -99,10 +99,10 @@ def make(project: Project, wish: Wish, strict: bool = False) -> int:
 
 
 def _run(seen: Survey, started: float) -> int:
-    from factorlib.runner.display import display_for
+    from factorlib.runner.display import Display
     from factorlib.runner.run import run
 
-    display = display_for()
+    display = Display()
     try:
         ran = run(seen, display)
     except (KeyboardInterrupt, SystemExit) as stop:
@@ -233,10 +233,10 @@ def validate(project: Project, dataset: str, settings: list[str], sheet: bool = 
 
 def _draw_sheet(project: Project, folder: Path) -> None:
     """Draw a data set, also one that is not finished, each photo beside its labels and meshes."""
-    from factorlib.runner.display import display_for
+    from factorlib.runner.display import Display
 
     claim(project, home := home_of(project, folder), folder)
-    path, step, started, display = home.folder / "sheet.png", Step("sheet"), time.monotonic(), display_for()
+    path, step, started, display = home.folder / "sheet.png", Step("sheet"), time.monotonic(), Display()
     draw = import_module("factorlib.sheet").write_sheet  # science, by its name as stages are
     display.start(step)
     try:
