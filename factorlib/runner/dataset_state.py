@@ -118,10 +118,10 @@ class Survey:
             if step.photo:
                 of_photos.setdefault(step.stage, {})[step.photo] = p.key
             else:
-                point(home.folder / str(step), store.trees / p.output)
+                point(home.folder / str(step), store.trees / p.output, self.project.build)
         for name, of in of_photos.items():
             keys[name] = view_of(store, name, of, stages[name].gather)
-            point(home.folder / name, store.trees / store.get(keys[name]))
+            point(home.folder / name, store.trees / store.get(keys[name]), self.project.build)
         self.remember(keys)
         for link in home.folder.glob("[!.]*"):  # hidden ones are drafts of links, of another run perhaps
             if link.is_symlink() and link.name not in stages:
@@ -167,7 +167,7 @@ def survey(
         for name in (name for name in targets or [] if name not in pipeline.stages):
             found = f"the stage {name!r} has nothing to do for this data set"
             raise InputError(found, file=data.folder, key=whole.stages[name].when, cure="leave it out")
-        home, store = home_of(project, data.folder), Store(project.build / "store")
+        home, store = home_of(project, data.folder), Store(project.store)
         asked = project.recipes(data, recipes or [])
         spec = Spec(pipeline, data.photos, targets, recipes=list(asked))
         if force:

@@ -21,6 +21,7 @@ PIPELINE = "pipeline.yaml"
 LIBRARY = Path(__file__).resolve().parent.parent.parent  # the folder that holds factorlib/
 RESERVED = ("studies", "bench", "store", "compare", "docs")  # folders of build/ that are no datasets
 LONGEST = 255  # bytes of a name, on every common file system
+SHARED = "FACTORLIB_STORE"  # environment variable: the folder of a store that several checkouts share
 ALL = "all"  # recipes
 
 
@@ -117,6 +118,16 @@ class Project(msgspec.Struct, frozen=True):
     def build(self) -> Path:
         """The folder of all results."""
         return self.root / "build"
+
+    @property
+    def store(self) -> Path:
+        """The folder of the store: in `build`, or that which FACTORLIB_STORE names.  InputError where there is none."""
+        if not (named := os.environ.get(SHARED)):
+            return self.build / "store"
+        if not os.path.isdir(folder := Path(named).expanduser()):
+            cure = "make it, or name another that you may write; it may be empty"
+            raise InputError("there is no such folder", file=named[:100], key=SHARED, cure=cure)
+        return folder.resolve()
 
     def command(self, verb: str, dataset: str) -> str:
         """A verb for a data set, as a user of the checkout, or of the installed package, types it."""

@@ -31,7 +31,7 @@ import msgspec
 from factorlib.errors import InputError, did_you_mean
 from factorlib.jsonfile import json_text, read_json
 from factorlib.runner.plan import Step, hash_of
-from factorlib.runner.project import RESERVED, Project, check_name
+from factorlib.runner.project import RESERVED, SHARED, Project, check_name
 from factorlib.runner.store import (
     LOCK,
     Entry,
@@ -149,9 +149,9 @@ def label(step: Step) -> str:
     return name if len(name.encode()) <= LONGEST else f"{step.stage[:20]}-{hashlib.sha256(name.encode()).hexdigest()}"
 
 
-def point(link: Path, target: Path) -> None:
-    """Make `link` name the folder `target` from one moment to the next; relative, so that build/ can be moved."""
-    words = os.path.relpath(target, link.parent)
+def point(link: Path, target: Path, build: Path) -> None:
+    """Make `link` name the folder `target` from one moment to the next; relative within `build`, so that it can be moved."""
+    words = os.path.relpath(target, link.parent) if target.is_relative_to(build) else str(target)
     if link.is_symlink() and os.readlink(link) == words:
         return
     link.parent.mkdir(parents=True, exist_ok=True)
@@ -247,7 +247,11 @@ def collect(project: Project, agreed: Callable[[], bool] = lambda: True) -> int:
 
     Raises InputError while a run goes on.
     """
-    store = Store(project.build / "store")
+    if (store := Store(project.store)).root != project.build / "store":
+        cure = f"leave {SHARED} out for the store of this checkout; of that one delete files of trees and keys by age"
+        raise InputError(
+            "other checkouts share this store, and what they need is not known here", file=store.root, cure=cure
+        )
     with alone(store):
         keys, trees, rest = _dead(project, store)
         sizes = {path.name: sum(f.stat().st_size for f in path.rglob("*") if f.is_file()) for path in trees}
@@ -328,7 +332,7 @@ def verify(project: Project, dataset: str | None) -> int:
     What is damaged is no longer taken for right by its size and time: the next run makes it again.
     """
     homes = made_homes(project) if dataset is None else homes_of(project, dataset, "read")
-    store, users, trees, damaged = Store(project.build / "store"), {}, {}, []
+    store, users, trees, damaged = Store(project.store), {}, {}, []
     for home in homes:
         for step, key in home.keys().items():
             users.setdefault(key, []).append(f"{step} ({home.folder.name})")
@@ -336,12 +340,10 @@ def verify(project: Project, dataset: str | None) -> int:
     for key in keys:
         entry, file = store.entry(key), store.keys / f"{key}.json"
         if entry is None:
-            damaged.append((file, ["missing or not readable"], users.get(key, [])))
+            damaged.append((file, ["missing, not readable, or not of this key"], users.get(key, [])))
             continue
         names = users.get(key) or [f"{_step(entry)} (of an earlier run)"]
         trees.setdefault(entry.output, (entry, []))[1].extend(names)
-        if hash_of(entry.record) != key:
-            damaged.append((file, ["its record is not the one that made the key"], names))
     for output, (entry, names) in trees.items():  # every tree once, whichever keys gave it
         if faults := store.damage(entry, read_all=True):
             damaged.append((store.trees / output, faults, names))
@@ -370,13 +372,13 @@ def clean(project: Project, dataset: str | None) -> int:
     What a dataset's links led to in the store goes with the next gc.
     """
     homes = made_homes(project) if dataset is None else homes_of(project, dataset, "delete")
-    deleted, left, store = [], [], Store(project.build / "store")
+    deleted, left, store = [], [], Store(project.store)
     if homes or (dataset is None and project.build.is_dir()):
         with alone(store):
             for home in homes:
                 deleted += _forget(home)
                 left += sorted(home.folder.iterdir()) if home.folder.is_dir() else []
-            if dataset is None and not store.root.is_symlink():
+            if dataset is None and store.root == project.build / "store" and not store.root.is_symlink():
                 shutil.rmtree(store.root)
                 deleted.append(store.root)
         if dataset is None:
@@ -408,4 +410,4 @@ def _forget(home: Home) -> list[Path]:
 
 
 def _is_link_to_result(path: Path) -> bool:
-    return path.is_symlink() and os.readlink(path).startswith(("../store/", "../../store/"))
+    return path.is_symlink() and Path(os.readlink(path)).parent.name == "trees"

@@ -22,7 +22,7 @@ from factorlib.runner.display import Display
 from factorlib.runner.plan import Planned, Step
 from factorlib.runner.processes import Cluster, Processes
 from factorlib.runner.results_folder import begin_run, claim, label, view_of
-from factorlib.runner.store import lock, shared_store, sound_lines
+from factorlib.runner.store import lock, sound_lines
 from factorlib.runner.worker import Code, Outcome, Task, run_step
 from factorlib.wholefile import append_text, write_bytes, write_text
 
@@ -72,7 +72,7 @@ class Run:
 
     def __init__(self, survey: Survey, display: Display, folder: Path):
         self.survey, self.display, self.folder, self.pools = survey, display, folder, Processes(folder)
-        self.store, self.shared = survey.store, shared_store(survey.store.root)
+        self.store = survey.store
         self.refused: list[str] = []
         self.running: dict[Step, Running] = {}
         self.waiting: set[Step] = set()  # for another run, or for what is damaged to be made again
@@ -153,7 +153,6 @@ class Run:
             record=planned.record,
             temporary=temporary,
             events=temporary.with_name(f"{temporary.name}.events.jsonl"),
-            shared=self.shared,
             forced="forced" in planned.reasons,
         )
 

@@ -15,7 +15,6 @@ it had when it was right are remembered, so that it is read once; `verify` reads
 from __future__ import annotations
 
 import contextlib
-import errno
 import fcntl
 import hashlib
 import logging
@@ -151,7 +150,7 @@ class Store:
                 entry = msgspec.json.decode((self.keys / f"{key}.json").read_bytes(), type=Entry)
             except (OSError, msgspec.DecodeError):  # a folder in its place, say
                 return None
-            if hash_of(entry.files) != entry.output:
+            if hash_of(entry.files) != entry.output or hash_of(entry.record) != key:
                 return None
             self._entries[key] = entry
         return self._entries[key]
@@ -321,70 +320,10 @@ def sound_lines(path: Path) -> list[bytes]:
     return sound
 
 
-# ── results of others ────────────────────────────────────────────────────────────────────────────────────────────────
+# ── results that ship with the source ────────────────────────────────────────────────────────────────────────────────────────────────
 
-VARIABLE = "FACTORLIB_STORE"
-NOT_OURS = (errno.EACCES, errno.EPERM, errno.EROFS)  # to read is enough
 MADE_FROM = "made_from.json"
 CURE = "restore it from the repository, or make the result anew with FORCE=1"
-
-
-def shared_store(own: Path) -> Path | None:
-    """The folder that FACTORLIB_STORE names, None where it names none or `own`; InputError where there is no such folder."""
-    if not (named := os.environ.get(VARIABLE)):
-        return None
-    folder = Path(named).expanduser()
-    if not os.path.isdir(folder):
-        cure = "make it, or name another that you may read; it may be empty"
-        raise InputError("there is no such folder", file=named[:100], key=VARIABLE, cure=cure)
-    return None if own.is_dir() and folder.samefile(own) else folder.resolve()
-
-
-def fetch(shared: Store, own: Store, key: str, draft: Path, say: Say) -> Entry | None:
-    """Copy the result of `key`, with its log, into the own store; None where the shared one has it not, or not as it was kept.
-
-    draft: a folder of the own store that is not there yet
-    """
-    try:
-        if shared.entry(key) is None:
-            return None
-        if entry := _copied_result(shared, own, key, draft, say):
-            return entry
-        say("the shared store's result is not as it was kept: the step is run")
-    except OSError as error:
-        say(f"the shared store cannot be read ({error.strerror}): the step is run")
-    shutil.rmtree(draft, ignore_errors=True)
-    return None
-
-
-def offer(own: Store, shared: Store, key: str, say: Say) -> None:
-    """Copy a result into the shared store, with its log, unless it is there; silent where one may only read."""
-    draft = shared.tmp / f"offer-{os.getpid()}-{uuid.uuid4().hex[:8]}"
-    try:
-        if not shared.root.is_dir():
-            raise FileNotFoundError(errno.ENOENT, "it is gone")
-        if (there := shared.entry(key)) and not damage_of(shared.trees / there.output, there.files):
-            return
-        shared.tmp.mkdir(parents=True, exist_ok=True)
-        sweep(shared.tmp)
-        if entry := _copied_result(own, shared, key, draft, lambda _: None):
-            shared.keep(key, entry)
-    except OSError as error:
-        if error.errno not in NOT_OURS:
-            say(f"the shared store took nothing ({error.strerror}); the result is kept in build/store")
-    finally:
-        shutil.rmtree(draft, ignore_errors=True)
-
-
-def _copied_result(source: Store, target: Store, key: str, draft: Path, say: Say) -> Entry | None:
-    """Copy tree and log of a key that is in `source`; None where any of it is not as it was kept."""
-    entry, log = source.entry(key), sound_lines(source.log(key))
-    if hash_of(entry.record) != key or not log or not copied(source.trees / entry.output, draft, entry.files):
-        return None
-    entry = target.take_in(entry.record, draft, say)
-    target.logs.mkdir(parents=True, exist_ok=True)
-    replace_file(target.log(key), b"".join(line + b"\n" for line in log))
-    return entry
 
 
 def copied(tree: Path, draft: Path, files: dict[str, str]) -> bool:

@@ -23,7 +23,7 @@ from factorlib.runner.pipeline import Pipeline, read_pipeline
 from factorlib.runner.plan import Planned, Step, difference, in_short
 from factorlib.runner.project import RESERVED, Project, check_name
 from factorlib.runner.results_folder import Home, claim, home_of, homes_of, label, made_homes
-from factorlib.runner.store import Store, is_locked, shared_store, sound_lines
+from factorlib.runner.store import Store, is_locked, sound_lines
 from factorlib.runner.store import ship as put_into_package
 from factorlib.runner.worker import Code, load_stage
 from factorlib.wholefile import write_text
@@ -136,10 +136,6 @@ def show_plan(project: Project, wish: Wish, every_reason: bool = False) -> int:
     planned = seen.planned()
     if faults := seen.wrong_values(planned):
         return _refused(seen, faults, "parameters")
-    shared = Store(folder) if (folder := shared_store(seen.store.root)) else None
-    for number, p in enumerate(planned if shared else []):
-        if p.status != "current" and "forced" not in p.reasons and p.key and (shared.keys / f"{p.key}.json").is_file():
-            planned[number] = msgspec.structs.replace(p, reasons=[*p.reasons, "the shared store has it"])
     print("\n".join(plan_lines(planned, every_reason)))
     return 0
 
@@ -284,7 +280,7 @@ def compare(project: Project, first: Path | None, second: Path | None) -> int:
             known = [home.folder.name for home in made_homes(project)]
             cure = did_you_mean(str(named), known) if known else "make all DATASET=<name> makes one"
             raise InputError("there is no result here", file=named, key="compare", cure=cure)
-    (one, other), store, changes = (home.keys() for home in homes), Store(project.build / "store"), set()
+    (one, other), store, changes = (home.keys() for home in homes), Store(project.store), set()
     for step in one.keys() & other.keys():
         pair = store.entry(one[step]), store.entry(other[step])
         if None in pair:

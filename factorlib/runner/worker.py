@@ -40,10 +40,7 @@ from factorlib.runner.store import (
     Stamp,
     Store,
     copy_shipped,
-    fetch,
     hash_of_file,
-    offer,
-    sound_lines,
     stamps_of,
 )
 from factorlib.stage import Inputs, serial_map
@@ -72,7 +69,7 @@ class Task(msgspec.Struct, frozen=True):
     """All that a worker knows of a step.
 
     files:   by the name that the record has for each, whose hash it holds
-    shared:  a store that others use too: what it has is copied, what is made is offered to it;  forced: make it in any case
+    forced:  make it, whatever ships with the source
     """
 
     code: Code
@@ -86,7 +83,6 @@ class Task(msgspec.Struct, frozen=True):
     record: dict[str, Any]
     temporary: Path
     events: Path
-    shared: Path | None = None
     forced: bool = False
 
 
@@ -113,27 +109,18 @@ def run_step(task: Task) -> Outcome:
     temporary = task.temporary.with_name(f"{task.temporary.name}.{uuid.uuid4().hex[:8]}")
     task = msgspec.structs.replace(task, temporary=temporary)  # another try of it may still be ending elsewhere
     meter, code, store = Meter(), task.code, Store(task.store)
-    shared = Store(task.shared) if task.shared else None
     with Events(task.events) as events:
         try:
-            fetched = shared and not task.forced and fetch(shared, store, task.key, task.temporary, events.say)
-            entry = fetched or _made(task, store, events)
-            if fetched:
-                for event in map(json.loads, sound_lines(store.log(task.key))):
-                    if event["event"] == "warning":
-                        events.say(str(event.get("text", "")))
-            else:
-                where = {name: task.record[name] for name in ("photo", "recipe") if name in task.record}
-                where |= {"stage": code.stage, "key": task.key}
-                lines = [where | {"event": "warning", "text": text} for text in events.warnings]
-                lines.append(where | {"event": "done", **meter.read(code.threads, code.cores)})
-                store.logs.mkdir(parents=True, exist_ok=True)
-                text = "".join(json.dumps(line, sort_keys=True) + "\n" for line in lines)
-                replace_file(store.log(task.key), text.encode())
+            entry = _made(task, store, events)
+            where = {name: task.record[name] for name in ("photo", "recipe") if name in task.record}
+            where |= {"stage": code.stage, "key": task.key}
+            lines = [where | {"event": "warning", "text": text} for text in events.warnings]
+            lines.append(where | {"event": "done", **meter.read(code.threads, code.cores)})
+            store.logs.mkdir(parents=True, exist_ok=True)
+            text = "".join(json.dumps(line, sort_keys=True) + "\n" for line in lines)
+            replace_file(store.log(task.key), text.encode())
             store.keep(task.key, entry)
             shutil.rmtree(store.unfinished / task.key, ignore_errors=True)
-            if shared and not fetched:
-                offer(store, shared, task.key, events.say)
             return Outcome(output=entry.output, seconds=meter.read()["seconds"])
         except BaseException as error:  # whatever it is, the parent reports it
             shutil.rmtree(task.temporary, ignore_errors=True)  # on a full disk there is room for a log then
