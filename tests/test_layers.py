@@ -29,8 +29,7 @@ def test_what_must_start_quickly_loads_nothing_heavy(code, heavy):
 
 def test_every_stage_of_the_pipeline_has_its_module_and_the_runner_finds_what_it_imports():
     from factorlib.runner.closure import Sources
-    from factorlib.runner.pipeline import read_pipeline
-    from factorlib.runner.project import photo_sets
+    from factorlib.runner.project import photo_sets, read_pipeline
     from factorlib.runner.store import FileHashes
 
     pipeline = read_pipeline(ROOT / "pipeline.yaml", photo_sets().slices)

@@ -14,12 +14,21 @@ from factorlib.errors import InputError, did_you_mean
 from factorlib.jsonfile import json_text
 from factorlib.reading import check_plain, reading
 from factorlib.runner.closure import Sources
-from factorlib.runner.pipeline import DATASET, read_pipeline, said_of_settings, with_settings
 from factorlib.runner.plan import Listing, Planned, Record, Spec, Step, plan
-from factorlib.runner.project import ALL, LIBRARY, Data, Project, Recipe
+from factorlib.runner.project import (
+    ALL,
+    DATASET,
+    LIBRARY,
+    Code,
+    Data,
+    Project,
+    Recipe,
+    read_pipeline,
+    said_of_settings,
+    with_settings,
+)
 from factorlib.runner.results_folder import Home, claim, home_of, label, point, view_of
 from factorlib.runner.store import FileHashes, Store
-from factorlib.runner.worker import Code, fault_of_params
 from factorlib.wholefile import replace_file
 
 RENDER = "render"  # the stage whose pictures a recipe replaces
@@ -91,7 +100,10 @@ class Survey:
         open_ = dict.fromkeys(p.step.stage for p in planned if p.status != "current")
         codes, faults = [self.code(name) for name in open_ if self.spec.pipeline.stages[name].values], []
         if codes:
-            from factorlib.runner.processes import Processes
+            from factorlib.runner.worker import (  # which a run with nothing to do need not load
+                Processes,
+                fault_of_params,
+            )
 
             with contextlib.closing(Processes()) as processes:
                 for future in [processes.submit(1, code.threads, fault_of_params, code) for code in codes]:

@@ -15,7 +15,7 @@ from typing import Any, Literal
 
 import msgspec
 
-from factorlib.runner.pipeline import DATASET, Pipeline
+from factorlib.runner.project import DATASET, Pipeline
 
 Record = dict[str, Any]
 Status = Literal["current", "to run", "maybe"]

@@ -20,10 +20,9 @@ from factorlib.errors import InputError
 from factorlib.runner.dataset_state import Survey
 from factorlib.runner.display import Display
 from factorlib.runner.plan import Planned, Step
-from factorlib.runner.processes import Cluster, Processes
 from factorlib.runner.results_folder import begin_run, claim, label, view_of
 from factorlib.runner.store import lock, sound_lines
-from factorlib.runner.worker import Code, Outcome, Task, run_step
+from factorlib.runner.worker import Cluster, Code, Outcome, Processes, Task, run_step
 from factorlib.wholefile import append_text, write_bytes, write_text
 
 POLL = 0.1  # seconds between two looks at what the workers say

@@ -32,8 +32,8 @@ import msgspec
 
 from factorlib.errors import InputError
 from factorlib.jsonfile import json_text
-from factorlib.runner.pipeline import Shipping
 from factorlib.runner.plan import Record, hash_of
+from factorlib.runner.project import Shipping
 from factorlib.wholefile import replace_file, sync, sync_tree
 
 log = logging.getLogger("factorlib.runner")

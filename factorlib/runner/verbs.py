@@ -19,13 +19,11 @@ from msgspec import inspect as types
 
 from factorlib.errors import InputError, did_you_mean
 from factorlib.runner.dataset_state import Survey, survey
-from factorlib.runner.pipeline import Pipeline, read_pipeline
 from factorlib.runner.plan import Planned, Step, difference, in_short
-from factorlib.runner.project import RESERVED, Project, check_name
+from factorlib.runner.project import RESERVED, Code, Pipeline, Project, check_name, read_pipeline
 from factorlib.runner.results_folder import Home, claim, home_of, homes_of, label, made_homes
 from factorlib.runner.store import Store, is_locked, sound_lines
 from factorlib.runner.store import ship as put_into_package
-from factorlib.runner.worker import Code, load_stage
 from factorlib.wholefile import write_text
 
 INTERRUPTED, TERMINATED = 128 + signal.SIGINT, 128 + signal.SIGTERM  # exit codes, as shells count
@@ -196,6 +194,8 @@ def show_logs(project: Project, wish: Wish, photo: str | None) -> int:
 
 def show_params(project: Project, stages: list[str] | None) -> int:
     """Print every parameter of the stages, or of all, with default, range and meaning."""
+    from factorlib.runner.worker import load_stage
+
     for number, name in enumerate(stages or _pipeline(project).order()):
         check_stage(project, name, [])
         params = load_stage(Code(project.code_root, project.package, name, {}, project.pipeline_file)).Params

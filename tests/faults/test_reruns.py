@@ -23,10 +23,9 @@ import yaml
 from factorlib.errors import InputError
 from factorlib.runner import verbs
 from factorlib.runner.dataset_state import survey
-from factorlib.runner.pipeline import read_pipeline
 from factorlib.runner.plan import Listing, difference, plan
-from factorlib.runner.project import LIBRARY, photo_sets
-from factorlib.runner.worker import Code, load_stage
+from factorlib.runner.project import LIBRARY, Code, photo_sets, read_pipeline
+from factorlib.runner.worker import load_stage
 from tests.faults.battered import real_project
 from tests.faults.good import edited as edited_data
 from tests.runner import toy

@@ -10,8 +10,7 @@ import pytest
 
 from factorlib.runner import verbs
 from factorlib.runner.closure import Sources, source_of
-from factorlib.runner.pipeline import read_pipeline
-from factorlib.runner.project import LIBRARY, Project, photo_sets
+from factorlib.runner.project import LIBRARY, Project, photo_sets, read_pipeline
 from factorlib.runner.store import FileHashes
 from factorlib.runner.verbs import parameters
 from tests.runner import toy

@@ -17,9 +17,8 @@ import pytest
 pytest.importorskip("distributed", reason="make setup EXTRAS=dask")
 
 from factorlib.errors import InputError
-from factorlib.runner import processes
-from factorlib.runner.pipeline import read_pipeline, with_settings
-from factorlib.runner.project import LIBRARY
+from factorlib.runner import worker
+from factorlib.runner.project import LIBRARY, read_pipeline, with_settings
 from tests.faults.test_nothing_lost import start, wait_until
 from tests.runner import toy
 from tests.runner.toy import files_of, make, write
@@ -267,19 +266,19 @@ def test_a_run_whose_workers_are_all_killed_says_so_and_goes_on_when_one_comes(p
 
 def test_a_worker_that_does_not_see_the_build_folder_is_refused():
     with pytest.raises(InputError, match="does not see the run's folder") as refused:
-        processes._on_worker(Path("/nowhere"), 1, abs, -1)
+        worker._on_worker(Path("/nowhere"), 1, abs, -1)
     assert "mount at the same path" in refused.value.cure
 
 
 def test_without_dask_the_cure_names_the_extra(project, monkeypatch):
-    monkeypatch.setattr(processes, "find_spec", lambda name: None)
+    monkeypatch.setattr(worker, "find_spec", lambda name: None)
     with pytest.raises(InputError, match="EXTRAS=dask"):
         make(project, "executor=tcp://127.0.0.1:1")
 
 
 @pytest.mark.parametrize("address", ["tcp://127.0.0.1:9", "tls://127.0.0.1:9", "ucx://127.0.0.1:9"])
 def test_a_scheduler_out_of_reach_is_named(project, monkeypatch, address, capfd):
-    monkeypatch.setattr(processes, "PATIENCE", 0.3)
+    monkeypatch.setattr(worker, "PATIENCE", 0.3)
     with pytest.raises(InputError, match=f"no Dask scheduler answers at {address}") as refused:
         make(project, f"executor={address}")
     assert "dask scheduler --port" in str(refused.value) and "Traceback" not in "".join(capfd.readouterr())
