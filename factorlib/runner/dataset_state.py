@@ -100,14 +100,13 @@ class Survey:
         open_ = dict.fromkeys(p.step.stage for p in planned if p.status != "current")
         codes, faults = [self.code(name) for name in open_ if self.spec.pipeline.stages[name].values], []
         if codes:
-            from factorlib.runner.worker import (  # which a run with nothing to do need not load
-                Processes,
-                fault_of_params,
-            )
+            from factorlib.runner.worker import Processes, check_params  # a run with nothing to do need not load it
 
             with contextlib.closing(Processes()) as processes:
-                for future in [processes.submit(1, code.threads, fault_of_params, code) for code in codes]:
-                    if error := future.result():
+                for future in [processes.submit(1, code.threads, check_params, code) for code in codes]:
+                    if isinstance(
+                        error := future.exception(), InputError
+                    ):  # what cannot be loaded says so when it runs
                         faults.append(str(said_of_settings(error, self.settings)))
         return faults
 

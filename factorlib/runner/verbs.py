@@ -371,28 +371,20 @@ def count(items: list, one: str = "step") -> str:
 
 
 def log_lines(logged: list[tuple[Planned, list[dict], str | None]]) -> list[str]:
-    """What each step cost and warned of; what all were made with, and where a step was made with another version, that.
+    """Return what each step cost and warned of, and what all were made with, every version of it.
 
     logged: steps with the events of their results' logs, and the file that says by which defect one failed
     """
-    made = [_made_with(p.record or {}, events) if p.status == "current" else {} for p, events, _ in logged]
-    versions: dict[str, list[str]] = {}
-    for name, version in (pair for own in made for pair in own.items()):
-        versions.setdefault(name, []).append(version)
-    most = {name: max(versions[name], key=versions[name].count) for name in sorted(versions, key=str.lower)}
-    lines = []
-    for (planned, events, failed), own in zip(logged, made, strict=True):
+    lines, made = [], {}
+    for planned, events, failed in logged:
         lines.append(f"{planned.step!s:<26} {_cost(planned, events)}".rstrip())
-        lines += _listed("with ", {name: version for name, version in own.items() if version != most[name]})
         lines += [f"    warning: {event['text']}" for event in events if event["event"] == "warning"]
         lines += [f"    it failed by a defect of the program: {failed}"] if failed else []
-    return lines + _listed("made with ", most)
-
-
-def _listed(words: str, versions: dict[str, str]) -> list[str]:
-    text = words + ", ".join(f"{name}\N{NO-BREAK SPACE}{version}" for name, version in versions.items())
-    parts = textwrap.wrap(text, 110, initial_indent="    ", subsequent_indent="    ") if versions else []
-    return [part.replace("\N{NO-BREAK SPACE}", " ") for part in parts]
+        for name, version in _made_with(planned, events).items():
+            made.setdefault(name, {})[version] = None
+    text = ", ".join(f"{name} {' or '.join(made[name])}" for name in sorted(made, key=str.lower))
+    indents = {"initial_indent": "    made with ", "subsequent_indent": "    "}
+    return lines + textwrap.wrap(text, 110, **indents)
 
 
 def _cost(planned: Planned, events: list[dict]) -> str:
@@ -406,12 +398,13 @@ def _cost(planned: Planned, events: list[dict]) -> str:
     return f"{cost}   {cores}   {done['started'][:16].replace('T', ' ')} UTC"
 
 
-def _made_with(record: dict, events: list[dict]) -> dict[str, str]:
-    """The versions of Python and of the packages that count, and the machine's kind."""
+def _made_with(planned: Planned, events: list[dict]) -> dict[str, str]:
+    """Return the versions of Python and of the packages that count, and the machine's kind; nothing of no current result."""
+    if planned.status != "current":
+        return {}
     machine = next((event["machine"] for event in reversed(events) if "machine" in event), {})
-    made = {"Python": machine.get("python", record.get("python", ""))}
-    made |= {machine["system"]: machine["processor"]} if machine else {}
-    return made | {n.removeprefix("package:"): v for n, v in record.items() if n.startswith("package:")}
+    made = {"Python": machine["python"], machine["system"]: machine["processor"]} if machine else {}
+    return made | {n.removeprefix("package:"): v for n, v in planned.record.items() if n.startswith("package:")}
 
 
 def parameters(params: type) -> list[tuple[str, str, str, str]]:

@@ -144,14 +144,9 @@ def params_of(code: Code) -> msgspec.Struct:
     return convert(code.params, load_stage(code).Params, code.settings, f"stages.{code.stage}.params")
 
 
-def fault_of_params(code: Code) -> InputError | None:
-    """Return what is wrong with a stage's parameters; None, too, for a stage that cannot be loaded: it says so when it runs."""
-    try:
-        params_of(code)
-    except InputError as error:
-        return error
-    except Exception:
-        return None
+def check_params(code: Code) -> None:
+    """Raise InputError where a parameter of a stage is out of its bounds; return nothing, which the stage's module defines."""
+    params_of(code)
 
 
 def spread(cores: int, function: Callable, items: Iterable) -> list:
