@@ -31,7 +31,7 @@ NOT_OURS = {errno.EACCES, errno.EPERM, errno.EROFS, errno.ELOOP, errno.ENAMETOOL
 
 
 def project() -> Project:
-    """The checkout that FACTORLIB_ROOT names, or this package lies in, or else the current folder lies in.
+    """Find the checkout that FACTORLIB_ROOT names, or this package lies in, or else the current folder lies in.
 
     Without one, the current folder, with the pipeline that came with the package, wherever pip has put that.
     """
@@ -77,7 +77,7 @@ OPTIONS = {  # as `ArgumentParser.add_argument` takes them; key: of the environm
 
 
 def dataset_of(asked: Namespace, optional: bool = False) -> str | None:
-    """The dataset's name or path: the option's, else the environment's DATASET.  InputError where it is not `optional`."""
+    """Return the dataset's name or path: the option's, else the environment's DATASET.  InputError where it is not `optional`."""
     dataset = os.environ.get("DATASET") if asked.dataset is None else asked.dataset  # an empty one is not none
     if dataset is None and not optional:
         cure = "add DATASET=<a name in data/, or a path to a folder>"

@@ -70,7 +70,7 @@ def reading(
 
 
 def _fault(error: BaseException, what: str) -> str:
-    """What went wrong, in one line.
+    """Describe what went wrong, in one line.
 
     >>> _fault(PermissionError(13, "Permission denied"), "a mesh")
     'cannot be read (Permission denied)'
@@ -90,7 +90,7 @@ def _fault(error: BaseException, what: str) -> str:
 
 
 def one_line(text: str) -> str:
-    """A parser's words, printable, on one line, of at most MOST_WORDS characters.
+    """Format a parser's words, printable, on one line, of at most MOST_WORDS characters.
 
     >>> one_line("line 1\\n  line\\x002")
     'line 1 line?2'
@@ -100,7 +100,7 @@ def one_line(text: str) -> str:
 
 
 def check_plain(file: str | os.PathLike, what: str, key: str | None = None, most_bytes: int | None = MOST_BYTES) -> int:
-    """The size in bytes of a plain file, links followed, that can be opened; nothing of it is read.
+    """Return the size in bytes of a plain file, links followed, that can be opened; nothing of it is read.
 
     Raises InputError for what is not there or may not be read, for folders, pipes and devices, which would never end,
     and for a file of more than `most_bytes`; None: of any size.
@@ -119,14 +119,14 @@ def check_plain(file: str | os.PathLike, what: str, key: str | None = None, most
 
 
 def read_bytes(file: str | os.PathLike, what: str, key: str | None = None, most_bytes: int = MOST_BYTES) -> bytes:
-    """The content of a plain file of at most `most_bytes`; InputError as in `check_plain`."""
+    """Return the content of a plain file of at most `most_bytes`; InputError as in `check_plain`."""
     size = check_plain(file, what, key, most_bytes)
     with reading(what, file, key), open(file, "rb") as stream:
         return stream.read(size)  # so much memory is taken at once, whatever the file holds
 
 
 def read_text(file: str | os.PathLike, what: str, key: str | None = None, most_bytes: int = MOST_BYTES) -> str:
-    """The content as UTF-8 text, without a byte order mark; InputError as in `check_plain`, and for other text."""
+    """Return the content as UTF-8 text, without a byte order mark; InputError as in `check_plain`, and for other text."""
     content = read_bytes(file, what, key, most_bytes)
     try:
         return content.decode("utf-8-sig")

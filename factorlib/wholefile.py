@@ -54,7 +54,7 @@ def replace_file(path: str | Path, data: bytes) -> None:
 
 
 def append_text(path: Path, text: str) -> None:
-    """`text` at the end of the file, all of it or nothing; its folder is made."""
+    """Append `text` to the file, all of it or nothing; its folder is made."""
     path.parent.mkdir(parents=True, exist_ok=True)
     with open(path, "ab", buffering=0) as stream:
         before, data = stream.seek(0, os.SEEK_END), text.encode("utf-8")
@@ -67,13 +67,13 @@ def append_text(path: Path, text: str) -> None:
 
 
 def sync_tree(folder: Path) -> None:
-    """Every file and folder below a folder, and itself, on disk."""
+    """Bring every file and folder below a folder, and itself, to disk."""
     for path in (*folder.rglob("*"), folder):
         sync(path)
 
 
 def sync(path: Path) -> None:
-    """A file's content, or a folder's entries, on disk."""
+    """Bring a file's content, or a folder's entries, to disk."""
     descriptor = os.open(path, os.O_RDONLY)
     try:
         os.fsync(descriptor)
@@ -140,7 +140,7 @@ def disk_error(error: BaseException, folder: Path) -> InputError | None:
 
 
 def _code(error: BaseException) -> int | None:
-    """What the system said; libraries that have errors of their own repeat its words."""
+    """Return the system's error number; libraries that have errors of their own repeat its words."""
     if isinstance(error, OSError) and error.errno is not None:
         return error.errno
     return next((code for code in (*FULL, errno.EROFS) if os.strerror(code) in str(error)), None)

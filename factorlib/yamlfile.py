@@ -35,18 +35,18 @@ MOST_BYTES, MOST_VALUES, MOST_DEPTH, MOST_DIGITS = 64_000_000, 2_000_000, 64, 30
 
 
 def read_yaml(path: str | Path, type_: type[T], most_values: int = MOST_VALUES) -> T:
-    """The file as a value of a msgspec type; InputError with file, line, key and cure for whatever does not fit."""
+    """Read the file as a value of a msgspec type; InputError with file, line, key and cure for whatever does not fit."""
     text = read_text(path, "a YAML file", most_bytes=MOST_BYTES)
     return convert(parse_yaml(text, path, most_values), type_, path, text=text)
 
 
 def load_yaml(path: str | Path) -> Any:
-    """The file as dicts, lists and scalars; InputError with file, line, key and cure for what is not YAML."""
+    """Read the file as dicts, lists and scalars; InputError with file, line, key and cure for what is not YAML."""
     return parse_yaml(read_text(path, "a YAML file", most_bytes=MOST_BYTES), path)
 
 
 def parse_yaml(text: str, name: str | Path = "", most_values: int = MOST_VALUES) -> Any:
-    """The text's one document as dicts, lists and scalars; InputError names line, key and `name`, which errors call the text.
+    """Parse the text's one document as dicts, lists and scalars; InputError names line, key and `name`, which errors call the text.
 
     >>> parse_yaml("{a: 1e-3, b: no, c: [1, ~, true]}")
     {'a': 0.001, 'b': 'no', 'c': [1, None, True]}
@@ -62,7 +62,7 @@ class _Document:
         self.count, self.anchors, self.unfinished = 0, {}, set()
 
     def value(self) -> Any:
-        """The value of the one document in the text, None for an empty text.  InputError where there is a second."""
+        """Return the value of the one document in the text, None for an empty text.  InputError where there is a second."""
         next(self.events)  # the stream
         if isinstance(next(self.events), yaml.StreamEndEvent):
             return None
@@ -120,7 +120,7 @@ class _Document:
         return values
 
     def _copy(self, value: Any, event: yaml.Event, keys: Keys, depth: int) -> Any:
-        """A copy of what an alias repeats, each value of which counts."""
+        """Copy what an alias repeats, each value of which counts."""
         self._count(event, keys, depth)
         if isinstance(value, list):
             return [self._copy(item, event, keys, depth + 1) for item in value]
@@ -154,7 +154,7 @@ class _Document:
 
 
 def key_path(keys: Keys) -> str | None:
-    """The way to a value as errors write it.
+    """Format the way to a value as errors write it.
 
     >>> key_path(("photos", 0, "masks"))
     'photos[0].masks'
@@ -164,7 +164,7 @@ def key_path(keys: Keys) -> str | None:
 
 
 def convert(value: Any, type_: type[T], name: str | Path, prefix: str = "", text: str | None = None) -> T:
-    """Plain data, wherever it came from, as a value of a msgspec type; errors as in `read_yaml`.
+    """Convert plain data, wherever it came from, to a value of a msgspec type; errors as in `read_yaml`.
 
     The cure is the `description` of the field's `Meta`, where it has one.
     name: what errors call the data;  prefix: stands before their keys;  text: what it was read from, for their lines
@@ -178,7 +178,7 @@ def convert(value: Any, type_: type[T], name: str | Path, prefix: str = "", text
 
 
 def _fault(words: str, value: Any, types: list, keys: Keys, name: str | Path, prefix: str, root: Any) -> InputError:
-    """What msgspec says of a value, with its key and a cure."""
+    """Describe what msgspec says of a value, with its key and a cure."""
     if field := _FIELD.search(words):
         words, cure = f"the key {field['name']!r} is missing", f"add {field['name']}: …"
         if field["fault"] == "unknown":
@@ -202,7 +202,7 @@ def _fault(words: str, value: Any, types: list, keys: Keys, name: str | Path, pr
 def _innermost(
     error: msgspec.ValidationError, value: Any, type_: Any, keys: Keys = ()
 ) -> list[tuple[str, Any, list, Keys]]:
-    """Of each innermost value at fault, the fault's words, the value, the types that it may have, and the way to it."""
+    """List each innermost value at fault: the fault's words, the value, the types that it may have, and the way to it."""
     types = [type_]
     for each in types:  # and, where one is a union or described by a `Meta`, all that it stands for
         types += get_args(each) if get_origin(each) in (Union, UnionType) else ()
@@ -235,7 +235,7 @@ def _is_struct(type_: Any) -> bool:
 
 
 def _line_of(node: yaml.Node | None, keys: Keys) -> int:
-    """The line on which the value at `keys` of a document stands, or what of the way to it is there."""
+    """Return the line on which the value at `keys` of a document stands, or what of the way to it is there."""
     line = node.start_mark.line if node else 0
     for key in keys:
         if isinstance(node, yaml.MappingNode):
@@ -280,7 +280,7 @@ def yaml_text(value: Any) -> str:
 
 
 def with_value(text: str, keys: Keys, word: str) -> str:
-    """The text with `word`, as it is written, in place of the value at `keys`, which is there; every other character stays."""
+    """Replace the value at `keys`, which is there, by `word` as it is written; every other character stays."""
     node = yaml.compose(text, Loader=yaml.SafeLoader)
     for key in keys:
         node = node.value[key] if isinstance(key, int) else next(item for name, item in node.value if name.value == key)

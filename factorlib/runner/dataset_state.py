@@ -36,7 +36,7 @@ READ = ("file:", "recipe file:", f"facts:{DATASET}")  # fields of a record: of t
 
 
 class Handed(NamedTuple):
-    """What a step is handed besides results: facts of the dataset or recipe, and files by the name that its record has for them."""
+    """Facts of the dataset or recipe that a step is handed, and files by the name that its record has for them."""
 
     facts: dict[str, Any]
     files: dict[str, Path]
@@ -44,7 +44,7 @@ class Handed(NamedTuple):
 
 @dataclass
 class Survey:
-    """All that is known before anything runs; `planned` is what every verb shows.
+    """State of a dataset before anything runs; `planned` is what every verb shows.
 
     records:  each step's record but for the results it is handed
     handed:   facts and files of each step
@@ -65,18 +65,18 @@ class Survey:
     settings: list[str]
 
     def planned(self, forced: frozenset[Step] | None = None) -> list[Planned]:
-        """Every step with its state and the reason for it; `forced` replaces the spec's steps that must run."""
+        """Plan every step, with its state and the reason for it; `forced` replaces the spec's steps that must run."""
         spec = self.spec if forced is None else msgspec.structs.replace(self.spec, forced=forced)
         return plan(spec, self.records, Listing(self.store, self.previous, self.store.damaged))
 
     def code(self, name: str, cores: int = 1) -> Code:
-        """A stage with its parameters, as a worker loads it; cores: of the machine, of which it takes what it may."""
+        """Describe a stage with its parameters, as a worker loads it; cores: of the machine, of which it takes what it may."""
         stage, project = self.spec.pipeline.stages[name], self.project
         taken = cores if stage.cores == "all" else min(stage.cores, cores)
         return Code(project.code_root, project.package, name, stage.values, project.pipeline_file, stage.threads, taken)
 
     def faults(self, steps: Iterable[Step], new: bool = False) -> list[str]:
-        """What is wrong with the files that steps read, those of their recipes too, each fault once.
+        """List the faults of the files that steps read, those of their recipes too, each fault once.
 
         new: only where the step's part of the dataset, or a file of its recipe, is another than that of its last result
         """
@@ -198,7 +198,7 @@ def survey(
 def _records(
     project: Project, spec: Spec, data: Data, hashes: FileHashes, recipes: dict[str, Recipe]
 ) -> tuple[dict[Step, Record], dict[Step, Handed]]:
-    """Every step's own part of its record, and what it is handed; each file that is handed counts by its content."""
+    """Return every step's own part of its record, and what it is handed; each file that is handed counts by its content."""
     sources, records, handed = Sources([project.code_root, LIBRARY], hashes), {}, {}
     for name in spec.pipeline.needed(spec.targets):
         stage = spec.pipeline.stages[name]

@@ -18,7 +18,7 @@ BEAT = 10.0  # seconds between two plain lines about the same step
 
 
 def printable(text: str) -> str:
-    """`text` with every character that prints nothing, but for ends of lines, in the form that Python's literals have.
+    """Replace every character that prints nothing, but for ends of lines, by the form that Python's literals have.
 
     >>> printable("a\\x1b[31mb\\u202ec\\n")
     'a\\\\x1b[31mb\\\\u202ec\\n'

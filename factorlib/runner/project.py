@@ -30,7 +30,7 @@ ALL = "all"  # recipes
 
 
 class Recipe(msgspec.Struct, frozen=True):
-    """What a recipe says.  facts: JSON-able, by field;  files: those it names, as they are written there -> absolute path"""
+    """Content of a recipe.  facts: JSON-able, by field;  files: those it names, as they are written there -> absolute path"""
 
     facts: dict[str, Any]
     files: dict[str, Path]
@@ -56,25 +56,25 @@ class Data(msgspec.Struct, frozen=True):
 
 
 class Provider(NamedTuple):
-    """How to read datasets: the names of their slices, and a reader."""
+    """Reader of datasets, and the names of their slices."""
 
     slices: tuple[str, ...]
     read: Callable[[Path], Data]
 
 
 def take_sigterm_back() -> None:
-    """What Python does at SIGTERM holds again: pycolmap, once imported, prints a C stack instead."""
+    """Let Python handle SIGTERM again: pycolmap, once imported, prints a C stack instead."""
     if threading.current_thread() is threading.main_thread():
         signal.signal(signal.SIGTERM, signal.getsignal(signal.SIGTERM))
 
 
 def photo_sets() -> Provider:
-    """The provider of the project's own datasets."""
+    """Return the provider of the project's own datasets."""
     from factorlib.dataset.read import read_dataset
     from factorlib.dataset.slices import SLICES, dataset_slice
 
     def read(path: Path) -> Data:
-        """The data set of a folder, as the runner sees it."""
+        """Return the data set of a folder, as the runner sees it."""
         dataset = read_dataset(path)
         take_sigterm_back()
 
@@ -110,22 +110,22 @@ class Project(msgspec.Struct, frozen=True):
 
     @property
     def code_root(self) -> Path:
-        """The folder of pipeline.yaml and of the package of its stages."""
+        """Return the folder of pipeline.yaml and of the package of its stages."""
         return self.shipped or self.root
 
     @property
     def pipeline_file(self) -> Path:
-        """The file that declares the stages."""
+        """Return the file that declares the stages."""
         return self.code_root / PIPELINE
 
     @property
     def build(self) -> Path:
-        """The folder of all results."""
+        """Return the folder of all results."""
         return self.root / "build"
 
     @property
     def store(self) -> Path:
-        """The folder of the store: in `build`, or that which FACTORLIB_STORE names.  InputError where there is none."""
+        """Return the folder of the store: in `build`, or that which FACTORLIB_STORE names.  InputError where there is none."""
         if not (named := os.environ.get(SHARED)):
             return self.build / "store"
         if not os.path.isdir(folder := Path(named).expanduser()):
@@ -134,17 +134,17 @@ class Project(msgspec.Struct, frozen=True):
         return folder.resolve()
 
     def command(self, verb: str, dataset: str) -> str:
-        """A verb for a data set, as a user of the checkout, or of the installed package, types it."""
+        """Format a verb for a data set as a user of the checkout, or of the installed package, types it."""
         words = f"factorlib {verb} -d" if self.shipped else f"make {verb} DATASET="
         return f"{words}{' ' * bool(self.shipped)}{shlex.quote(dataset)}"
 
     def shown(self, path: Path) -> str:
-        """A path as messages write it: from where the user stands, if it lies below."""
+        """Format a path for messages: from where the user stands, if it lies below."""
         here = Path.cwd()
         return str(path.relative_to(here)) if path.is_relative_to(here) else str(path)
 
     def dataset_folder(self, name: str) -> Path:
-        """A dataset by its name in data/, or by its path; InputError where it is not there."""
+        """Find a dataset by its name in data/, or by its path; InputError where it is not there."""
         if (folder := self.find_dataset(name)) is not None:
             return folder
         known = [p.parent.name for p in (self.root / "data").glob("*/dataset.yaml")]
@@ -152,7 +152,7 @@ class Project(msgspec.Struct, frozen=True):
         raise InputError(f"there is no dataset {name!r}", key="DATASET", cure=cure)
 
     def find_dataset(self, name: str) -> Path | None:
-        """The same, None where it is not there; InputError for what can be no dataset's name or path."""
+        """Find a dataset as `dataset_folder` does; None where it is not there, InputError for what can be no dataset's name or path."""
         by_name = "/" not in name or name.rstrip("/") in ("", ".", "..")
         if by_name:
             check_name(name, "a dataset", key="DATASET", reserved=RESERVED)
@@ -168,7 +168,7 @@ class Project(msgspec.Struct, frozen=True):
         return None
 
     def recipes(self, data: Data, words: list[str]) -> dict[str, Recipe]:
-        """The recipes that words name, by name: each a path, a name in recipes/ or recipes/<dataset>/, or `all` of these.
+        """Read the recipes that words name, by name: each a path, a name in recipes/ or recipes/<dataset>/, or `all` of these.
 
         InputError where one is not there, is not good, or two are called the same.
         """
@@ -213,7 +213,7 @@ def check_name(
 
 
 class Code(msgspec.Struct, frozen=True):
-    """Which stage, where its module is found, the parameters given to it (in which file), and how much of the machine it has.
+    """Name of a stage, where its module is found, the parameters given to it (in which file), and its share of the machine.
 
     threads: of its libraries' numerics;  cores: that independent work is spread over
     """
@@ -289,18 +289,18 @@ class Stage(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
     @property
     def values(self) -> dict[str, Any]:
-        """The parameters that the stage itself takes."""
+        """Return the parameters that the stage itself takes."""
         return {name: value for name, value in self.params.items() if name not in self.given}
 
     @property
     def folders(self) -> dict[str, Path]:
-        """The folders that parameters name, from where the user stands; links are followed now, for results move on."""
+        """Return the folders that parameters name, from where the user stands; links are followed now, for results move on."""
         named = {name: str(self.params[name]) for name in self.given if self.params.get(name) is not None}
         return {name: Path(os.path.realpath(folder.replace("\0", ""))) for name, folder in named.items()}
 
 
 class Pipeline(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """What pipeline.yaml says.
+    """Content of pipeline.yaml.
 
     executor: where steps run, which changes no bit and no key: `processes` of this machine, or the address of a Dask scheduler
     """
@@ -314,7 +314,7 @@ class Pipeline(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         return list(TopologicalSorter({name: stage.upstream for name, stage in self.stages.items()}).static_order())
 
     def for_data(self, says_nothing: Callable[[str], bool]) -> Pipeline:
-        """The stages that a data set has, by which slices of it say nothing (`Stage.when`)."""
+        """Return the stages that a data set has, by which slices of it say nothing (`Stage.when`)."""
         gone = {name for name, stage in self.stages.items() if stage.when and says_nothing(stage.when)}
         kept = {name: stage for name, stage in self.stages.items() if name not in gone}
         for name, stage in kept.items():
@@ -322,7 +322,7 @@ class Pipeline(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         return msgspec.structs.replace(self, stages=kept)
 
     def needed(self, targets: list[str] | None) -> list[str]:
-        """The targets and everything above them, in order; for None all stages but the optional ones that none of them takes."""
+        """Return the targets and everything above them, in order; for None all stages but the optional ones that none of them takes."""
         usual = [name for name, stage in self.stages.items() if not stage.optional]
         wanted, order = set(usual if targets is None else targets), self.order()
         for name in reversed(order):
@@ -367,7 +367,7 @@ def read_pipeline(path: Path, known_slices: tuple[str, ...]) -> Pipeline:
 
 
 def with_settings(pipeline: Pipeline, settings: list[str]) -> Pipeline:
-    """The pipeline with `stage.parameter=value` words in place of its own, and `executor=…`; several words in one string are split.
+    """Replace values of the pipeline by words `stage.parameter=value` and `executor=…`; several words in one string are split.
 
     >>> with_settings(Pipeline(1, {"solve": Stage()}), ["solve.lobes=64 solve.tolerance=1e-3"]).stages["solve"].params
     {'lobes': 64, 'tolerance': 0.001}
@@ -402,7 +402,7 @@ def with_settings(pipeline: Pipeline, settings: list[str]) -> Pipeline:
 
 
 def said_of_settings(error: InputError, settings: list[str]) -> InputError:
-    """The same error, of the setting where it is about one, not of the file whose value that replaces."""
+    """Return the error as one of the setting, where it is about one, not of the file whose value that replaces."""
     for word in reversed(_words(settings)):
         stage, _, keys = word.partition("=")[0].partition(".")
         key = f"stages.{stage}.params.{keys}"

@@ -81,7 +81,7 @@ class Home(msgspec.Struct, frozen=True):
 
 
 def home_of(project: Project, dataset: Path, by_name: bool = False) -> Home:
-    """build/<name of the dataset's folder>; refused where that is a link, or holds the results of another folder.
+    """Return build/<name of the dataset's folder>; refuse it where that is a link, or holds the results of another folder.
 
     by_name: whoever's results it holds
     """
@@ -101,7 +101,7 @@ def home_of(project: Project, dataset: Path, by_name: bool = False) -> Home:
 
 
 def made_home(project: Project, dataset: str) -> Home | None:
-    """The home with results of a dataset by its name or path, which need not be there any more; None where it has none yet.
+    """Find the home of a dataset that has results, by its name or path, which need not be there any more; None where it has none yet.
 
     A name is that of a home in build/; a path must be the one that the home was made for.  InputError for whatever else.
     """
@@ -117,14 +117,14 @@ def made_home(project: Project, dataset: str) -> Home | None:
 
 
 def made_homes(project: Project) -> list[Home]:
-    """Every home that the runner made; links are not followed."""
+    """Return every home that the runner made; links are not followed."""
     entries = sorted(project.build.iterdir()) if project.build.is_dir() else []
     homes = [Home(path) for path in entries if path.is_dir() and not path.is_symlink() and path.name not in RESERVED]
     return [home for home in homes if home.mark.is_file()]
 
 
 def owner_of(project: Project, home: Home) -> Path | None:
-    """The dataset whose results these are; None where nothing says it."""
+    """Return the dataset whose results these are; None where nothing says it."""
     with contextlib.suppress(OSError):
         words = home.mark.read_text(encoding="utf-8", errors="surrogateescape").removesuffix("\n")
         return project.root / words if words else None
@@ -140,7 +140,7 @@ def claim(project: Project, home: Home, dataset: Path) -> None:
 
 
 def label(step: Step) -> str:
-    """The name of a step's own files, short however long the photo's name is.
+    """Name a step's own files, shortly however long the photo's name is.
 
     >>> label(Step("masks", "kitchen")), len(label(Step("masks", "k" * 240)))
     ('masks-kitchen', 70)
@@ -164,7 +164,7 @@ def point(link: Path, target: Path, build: Path) -> None:
 
 
 def view_of(store: Store, stage: str, keys: dict[str, str], gather: str | None) -> str:
-    """The key of one folder with the files of all photos of a stage ({photo: key}), and each `<photo>.json` in `gather`.
+    """Put the files of all photos of a stage ({photo: key}) into one folder, and each `<photo>.json` into `gather`; return its key.
 
     The folder is a result as those of steps are.  Its files are hard links to theirs.
     """
@@ -227,7 +227,7 @@ def alone(store: Store) -> Iterator[None]:
 
 @contextlib.contextmanager
 def _door(store: Store, say: Callable[[str], None]) -> Iterator[None]:
-    """Only one command at a time is within; what dead runs left in tmp is gone."""
+    """Let only one command at a time within; what dead runs left in tmp is gone."""
     store.tmp.mkdir(parents=True, exist_ok=True)
     if (door := lock(store.root / "door.lock")) is None:
         say("waiting: another command begins a run or cleans the store")
@@ -290,7 +290,7 @@ def _age(seconds: float) -> str:
 
 
 def _dead(project: Project, store: Store) -> tuple[list[Path], list[Path], list[Path]]:
-    """What may go from a store: files of keys, trees of results, and everything else; drafts of killed writers too."""
+    """List the store's entries that no result refers to: files of keys, trees of results, and the rest, drafts of killed writers too."""
     homes = [Home(path) for path in project.build.glob("*") if path.is_dir() and path.name != "store"]
     keys = _needed(store, {key for home in homes for key in home.keys().values()})
     trees = {entry.output for key in keys if (entry := store.entry(key))}
@@ -301,7 +301,7 @@ def _dead(project: Project, store: Store) -> tuple[list[Path], list[Path], list[
 
 
 def _needed(store: Store, current: set[str]) -> set[str]:
-    """Those keys, and of every result that they were made from, however far, the keys that gave it.
+    """Return those keys, and of every result that they were made from, however far, the keys that gave it.
 
     A step whose result is current is current only as long as what it was made from is there, though another run may have made
     that anew in the meantime, with other parameters.
@@ -357,7 +357,7 @@ def verify(project: Project, dataset: str | None) -> int:
 
 
 def homes_of(project: Project, dataset: str, otherwise: str) -> list[Home]:
-    """The home of a dataset, or none, which is said."""
+    """Return the home of a dataset, or none, and say so."""
     if (home := made_home(project, dataset)) is None:
         print(f"nothing to {otherwise}: {dataset} has no results")
     return [home] if home else []
@@ -393,7 +393,7 @@ def clean(project: Project, dataset: str | None) -> int:
 
 
 def _forget(home: Home) -> list[Path]:
-    """Only what the runner put there, the mark last; a link is deleted, what it leads to is not touched."""
+    """Delete what the runner put there, the mark last; a link is deleted, what it leads to is not touched."""
     entries = list(home.folder.iterdir())
     folders = [path for path in entries if path.is_dir() and not path.is_symlink() and path != home.errors]
     pictures = [path for folder in folders for path in folder.iterdir() if _is_link_to_result(path)]  # of recipes

@@ -156,7 +156,7 @@ class Run:
         )
 
     def _folder(self, step: Step, name: str) -> Path:
-        """Where the files of the stage `name` are for this step."""
+        """Return the folder with the files of the stage `name` for this step."""
         stage, spec = self.survey.spec.pipeline.stages[name], self.survey.spec
         if not stage.over or step.photo is not None:
             return self.store.trees / self.planned[Step(name, step.photo if stage.over else None)].output
@@ -164,7 +164,7 @@ class Run:
         return self.store.trees / self.store.get(view_of(self.store, name, keys, stage.gather))
 
     def _log_above(self, step: Step, path: Path) -> Path:
-        """What the steps above cost and said when their present results were made, whichever run made them."""
+        """Write the log of the steps above, of their present results, whichever run made them."""
         above = set(self.survey.spec.pipeline.needed([step.stage])) - {step.stage}
         logs = [self.store.log(p.key) for p in self.planned.values() if p.step.stage in above and p.key]
         write_bytes(path, b"".join(line + b"\n" for log in logs for line in sound_lines(log)))

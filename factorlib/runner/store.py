@@ -50,7 +50,7 @@ def hash_of_file(path: Path) -> str:
 
 
 def left_over(name: str) -> bool:
-    """Whether a file or folder is what Python, editors and desktops leave: hidden, a backup, or compiled Python.
+    """Return whether a file or folder is what Python, editors and desktops leave: hidden, a backup, or compiled Python.
 
     >>> [left_over(name) for name in (".a.c.swp", "a.c~", "#a.c#", "__pycache__", "a.pyc", "a.c")]
     [True, True, True, True, True, False]
@@ -59,7 +59,7 @@ def left_over(name: str) -> bool:
 
 
 def read_cache(path: Path | None, type_: type[T]) -> T | None:
-    """What a cache holds; None where there is none, or it is damaged or of another kind."""
+    """Return what a cache holds; None where there is none, or it is damaged or of another kind."""
     try:
         return msgspec.json.decode(path.read_bytes(), type=type_) if path else None
     except (OSError, msgspec.MsgspecError, UnicodeError, RecursionError):
@@ -74,7 +74,7 @@ def write_cache(path: Path, tables: Any) -> None:
 
 
 class FileHashes:
-    """What was made of files, by kind and path, in a cache beside the store; `save` writes it.  cache: its file, None to keep nothing."""
+    """Values made of the contents of files, by kind and path, in a cache beside the store; `save` writes it.  cache: its file, None to keep nothing."""
 
     def __init__(self, cache: Path | None):
         self.cache, self._changed = cache, False
@@ -86,7 +86,7 @@ class FileHashes:
         return self.remembered("content", path, lambda: hash_of_file(path), Hash)
 
     def remembered(self, kind: str, path: Path, make: Callable[[], T], type_: type[T]) -> T:
-        """What `make` makes of the content of a file, from the cache where that is unchanged; type_: what it is."""
+        """Return what `make` makes of the content of a file, from the cache where that is unchanged; type_: what it is."""
         stat, table = os.stat(path), self._tables.setdefault(kind, {})
         now = stat.st_size, stat.st_mtime_ns, stat.st_ctime_ns, stat.st_ino
         with contextlib.suppress(KeyError, OverflowError, msgspec.ValidationError):  # not there, or damaged
@@ -116,7 +116,7 @@ NO_FILE: Stamp = (-1, 0)  # a link, a pipe: nothing that a stage writes
 
 
 class Entry(msgspec.Struct, frozen=True):
-    """What a key gave: the hash of the tree, the record that made the key, and each file's hash."""
+    """Result of a key: the hash of the tree, the record that made the key, and each file's hash."""
 
     output: str
     record: dict
@@ -140,11 +140,11 @@ class Store:
         self.changed = False
 
     def log(self, key: str) -> Path:
-        """The file with the log of the result of a key."""
+        """Return the file with the log of the result of a key."""
         return self.logs / f"{key}.jsonl"
 
     def entry(self, key: str) -> Entry | None:
-        """What is written of a key, None where it was never made; whether its tree is there and right `get` says."""
+        """Read the entry of a key, None where it was never made; whether its tree is there and right `get` says."""
         if key not in self._entries:  # what is not there yet may come
             try:
                 entry = msgspec.json.decode((self.keys / f"{key}.json").read_bytes(), type=Entry)
@@ -169,7 +169,7 @@ class Store:
             known.pop(key, None)
 
     def still(self, keys: Iterable[str]) -> bool:
-        """Whether those keys have the outputs they had, looked up again."""
+        """Return whether those keys have the outputs they had, looked up again."""
         before = {key: self._outputs.get(key) for key in keys}
         for key in before:
             self.forget(key)
@@ -181,7 +181,7 @@ class Store:
         return read_cache(self.cache / "trees.json", dict[str, dict[str, Stamp]]) or {}
 
     def damage(self, entry: Entry, read_all: bool = False) -> list[str]:
-        """What is wrong with the tree of an entry, a line each; read_all: whatever is remembered of it."""
+        """List the faults of the tree of an entry, a line each; read_all: whatever is remembered of it."""
         now, known = stamps_of(self.trees / entry.output), self.known.get(entry.output, {})
         if now and now == known and not read_all:
             return []
@@ -237,7 +237,7 @@ class Store:
 
 
 def lock(path: Path, wait: bool = False) -> int | None:
-    """A lock on a file, held until the descriptor is closed or the process ends; None where another process has it."""
+    """Lock a file until the descriptor is closed or the process ends; None where another process has it."""
     path.parent.mkdir(parents=True, exist_ok=True)
     descriptor = os.open(path, os.O_RDWR | os.O_CREAT, 0o666)
     try:
@@ -249,7 +249,7 @@ def lock(path: Path, wait: bool = False) -> int | None:
 
 
 def is_locked(path: Path) -> bool:
-    """Whether any process has that lock; looking needs no right to write."""
+    """Return whether any process has that lock; looking needs no right to write."""
     try:
         with open(path, "rb") as stream:
             fcntl.flock(stream, fcntl.LOCK_SH | fcntl.LOCK_NB)
@@ -290,7 +290,7 @@ def hashes_of_tree(folder: Path) -> dict[str, str]:
 
 
 def damage_of(folder: Path, files: Mapping[str, str], right: Mapping[str, Stamp] | None = None) -> list[str]:
-    """How a folder is not what `files` (relative path -> hash) says, a line each; contents are read but for stamps in `right`."""
+    """List how a folder is not what `files` (relative path -> hash) says, a line each; contents are read but for stamps in `right`."""
     lines, now = [], stamps_of(folder)
     for name in sorted(files):
         if (stamp := now.get(name)) in (None, NO_FILE):
@@ -304,7 +304,7 @@ def damage_of(folder: Path, files: Mapping[str, str], right: Mapping[str, Stamp]
 
 
 def sound_lines(path: Path) -> list[bytes]:
-    """The lines of a log that are events, in order, none where there is no log; damaged ones are left out, with a warning."""
+    """Read the lines of a log that are events, in order, none where there is no log; damaged ones are left out, with a warning."""
     try:
         lines = path.read_bytes().splitlines()
     except FileNotFoundError:
@@ -340,14 +340,14 @@ def copied(tree: Path, draft: Path, files: dict[str, str]) -> bool:
 
 
 class Shipped(msgspec.Struct, frozen=True):
-    """What made_from.json says: the part of the record that the result depends on, and the hash of each file of it."""
+    """Content of made_from.json: the part of the record that the result depends on, and the hash of each file of it."""
 
     record: Record
     files: dict[str, str]
 
 
 def made_from(record: Record, modules: list[str]) -> Record:
-    """The part of a step's record that a result made by `modules` depends on.
+    """Return the part of a step's record that a result made by `modules` depends on.
 
     >>> made_from({"param:steps": 3, "source:stages.train": "1", "package:torch": "2.13"}, ["stages.train"])
     {'param:steps': 3, 'source:stages.train': '1'}

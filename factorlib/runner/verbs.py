@@ -38,7 +38,7 @@ RESULTS = {  # what a user looks at first
 
 
 class Wish(NamedTuple):
-    """What the command line asks for, as `survey` takes it.
+    """Request of the command line, as `survey` takes it.
 
     targets:  stages; None for all but those that run only when asked for
     settings: `stage.parameter=value`;  force: run the targets again, whatever the store holds
@@ -155,7 +155,7 @@ def show_status(project: Project, wish: Wish) -> int:
 
 
 def _events(seen: Survey, planned: Planned) -> list[dict]:
-    """The log of a step's current result."""
+    """Read the log of a step's current result."""
     lines = sound_lines(seen.store.log(planned.key)) if planned.status == "current" else []
     return [{"text": "", **msgspec.json.decode(line)} for line in lines]
 
@@ -330,7 +330,7 @@ NAMED = 20  # steps that have failed
 
 
 def plan_lines(planned: list[Planned], every_reason: bool = False) -> list[str]:
-    """What would run, one line for steps of a stage that share their reasons, the photo's own name aside.
+    """Format what would run, one line for steps of a stage that share their reasons, the photo's own name aside.
 
     every_reason: below it, a line each
     """
@@ -408,7 +408,7 @@ def _made_with(planned: Planned, events: list[dict]) -> dict[str, str]:
 
 
 def parameters(params: type) -> list[tuple[str, str, str, str]]:
-    """The fields of a stage's `Params`, in its order: name, what is allowed, default as YAML has it, meaning.
+    """List the fields of a stage's `Params`, in its order: name, what is allowed, default as YAML has it, meaning.
 
     The meaning is the string that follows a field.  One that is a struct stands for its own fields, with dotted names.
     """
@@ -432,7 +432,7 @@ def parameters(params: type) -> list[tuple[str, str, str, str]]:
 
 
 def allowed(of: Any) -> str:
-    """What a value of a type, as `msgspec.inspect` has it, may be.
+    """Format what a value of a type, as `msgspec.inspect` has it, may be.
 
     >>> allowed(types.type_info(int)), allowed(types.IntType(ge=1, le=1024)), allowed(types.FloatType(gt=0))
     ('whole number', '1 … 1,024', 'number > 0')

@@ -63,7 +63,7 @@ EVERY = 0.2  # seconds between two words of progress
 
 
 class Task(msgspec.Struct, frozen=True):
-    """All that a worker knows of a step.
+    """Description of a step for a worker.
 
     files:   by the name that the record has for each, whose hash it holds
     forced:  make it, whatever ships with the source
@@ -84,7 +84,7 @@ class Task(msgspec.Struct, frozen=True):
 
 
 class Outcome(msgspec.Struct, frozen=True):
-    """How a step ended.
+    """Result of a step that ended.
 
     output: hash of what was made;  error: what went wrong;  traceback: of a defect, None where a user can mend it
     code_changed: whether the stage's code is another than that of the key, so that further steps of it would fail alike
@@ -140,7 +140,7 @@ def load_stage(code: Code) -> ModuleType:
 
 
 def params_of(code: Code) -> msgspec.Struct:
-    """The stage's parameters as its own struct.  Raises InputError where one is out of its bounds."""
+    """Convert the stage's parameters to its own struct.  Raises InputError where one is out of its bounds."""
     return convert(code.params, load_stage(code).Params, code.settings, f"stages.{code.stage}.params")
 
 
@@ -150,7 +150,7 @@ def check_params(code: Code) -> None:
 
 
 def spread(cores: int, function: Callable, items: Iterable) -> list:
-    """The function of every item, in order, on so many threads."""
+    """Apply the function to every item, in order, on so many threads."""
     if cores == 1:
         return serial_map(function, items)
     with ThreadPoolExecutor(cores) as pool:
@@ -198,7 +198,7 @@ def _check_inputs(task: Task, results: dict[Path, dict[str, Stamp]]) -> None:
 
 
 def _check_code(task: Task, hashes: FileHashes) -> None:
-    """The code that the key was made from is the code there is: the source of every module, and the package data."""
+    """Check that the key's code is the code there is: the source of every module, and the package data."""
     code = task.code
     closure = Sources([code.root, LIBRARY], hashes).closure(code.package, code.stage, code.settings)
     now, before = closure.record, {n: value for n, value in task.record.items() if n.startswith(CODE)}
@@ -211,7 +211,7 @@ def _check_code(task: Task, hashes: FileHashes) -> None:
 
 
 class Meter:
-    """What is spent since it was made: wall and processor seconds, and the most memory."""
+    """Meter of wall and processor seconds since it was made, and the most memory."""
 
     def __init__(self) -> None:
         with contextlib.suppress(OSError), open("/proc/self/clear_refs", "w") as stream:  # Linux counts the peak anew
