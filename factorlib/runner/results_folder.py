@@ -173,8 +173,7 @@ def view_of(store: Store, stage: str, keys: dict[str, str], gather: str | None) 
     record |= {"stage": stage, "photo": None, "view": gather}
     if store.get(key := hash_of(record)) is not None:
         return key
-    draft, files, right = store.tmp / f"view-{os.getpid()}-{key}", {}, {}
-    shutil.rmtree(draft, ignore_errors=True)
+    draft, files, right = store.tmp / f"view-{uuid.uuid4().hex[:8]}-{key}", {}, {}
     draft.mkdir(parents=True)
     try:
         for photo, entry in entries.items():
@@ -332,25 +331,23 @@ def verify(project: Project, dataset: str | None) -> int:
     What is damaged is no longer taken for right by its size and time: the next run makes it again.
     """
     homes = made_homes(project) if dataset is None else homes_of(project, dataset, "read")
-    store, users, trees, damaged = Store(project.store), {}, {}, []
+    store, users, read, damaged = Store(project.store), {}, {}, 0
     for home in homes:
         for step, key in home.keys().items():
             users.setdefault(key, []).append(f"{step} ({home.folder.name})")
     keys = sorted(users.keys() | ({path.stem for path in store.keys.glob("*.json")} if dataset is None else set()))
     for key in keys:
-        entry, file = store.entry(key), store.keys / f"{key}.json"
-        if entry is None:
-            damaged.append((file, ["missing, not readable, or not of this key"], users.get(key, [])))
-            continue
-        names = users.get(key) or [f"{_step(entry)} (of an earlier run)"]
-        trees.setdefault(entry.output, (entry, []))[1].extend(names)
-    for output, (entry, names) in trees.items():  # every tree once, whichever keys gave it
-        if faults := store.damage(entry, read_all=True):
-            damaged.append((store.trees / output, faults, names))
+        place, faults, steps = store.keys / f"{key}.json", ["missing, not readable, or not of this key"], users.get(key)
+        if entry := store.entry(key):
+            place, steps = store.trees / entry.output, steps or [f"{_step(entry)} (of an earlier run)"]
+            if place not in read:  # every tree once, whichever keys gave it
+                read[place] = store.damage(entry, read_all=True)
+            faults = read[place]
+        if faults:
+            damaged += 1
+            print(f"{', '.join(steps or ['a result'])}: {project.shown(place)}", *faults, sep="\n    ")
     store.save()
-    for where, faults, steps in damaged:
-        print(f"{', '.join(steps) or 'a result'}: {project.shown(where)}", *faults, sep="\n    ")
-    more = f"{len(damaged)} damaged; the next run that needs one makes it again"
+    more = f"{damaged} damaged; the next run that needs one makes it again"
     if keys or dataset is None:
         print(f"{len(keys)} results read: {more if damaged else 'all are as they were kept'}")
     return 1 if damaged else 0
