@@ -395,7 +395,7 @@ class Cluster(Processes):
         from distributed import Client
 
         super().__init__(run)
-        self.scheduler, self.say, self._workers, self._asked = scheduler, say, {}, False
+        self.scheduler, self.say, self._asked = scheduler, say, False
         for name in ("distributed", "distributed.client", "distributed.core", "distributed.comm"):
             logging.getLogger(name).setLevel(logging.CRITICAL)  # what they say of a lost connection is in the outcome
         say(f"connecting to {scheduler}")
@@ -406,6 +406,7 @@ class Cluster(Processes):
             words = f"no Dask scheduler answers at {scheduler} ({str(error) or f'nothing in {PATIENCE} s'})"
             raise InputError(words, key="executor", cure=cure) from error
         self._executor = self.client.get_executor(pure=False, retries=TRIES - 1)
+        self._workers = self.client.nthreads()
 
     @property
     def cores(self) -> int:
