@@ -27,8 +27,7 @@ PACKED = ["factorlib", "stages", "recipes", "pipeline.yaml", "pyproject.toml", "
 EXTRAS = {  # of modules that import what an extra alone installs
     ROOT / "factorlib" / f"{module}.py": extra
     for module, extra in (
-        ("runner/child", "dask"),
-        ("runner/cluster", "dask"),
+        ("runner/worker", "dask"),
         ("images/film", "video"),
         ("tracing/denoise", "denoise"),
     )
