@@ -1,6 +1,6 @@
 """The environment: .venv with the pinned packages, and the few system libraries they need.
 
-Run by the Makefile as a script, on a Python without packages: nothing but the standard library may be imported here.
+Run by the Makefile as a script, on a Python without packages: nothing but the standard library may be imported here, but for `lock_text`.
 
     python3 -I factorlib/setup.py        (TORCH_INDEX=<url> for a PyTorch of one's own choice, e.g. with CUDA)
     .venv/bin/python -I factorlib/setup.py extras        (EXTRAS="dask blender": extras of pyproject.toml, into .venv)
@@ -210,9 +210,9 @@ LEFT_OUT = {
 
 def lock_text() -> str:
     """Return what requirements.lock should say.  Raises PackageNotFoundError for a package that is needed and not installed."""
-    from importlib.metadata import distribution, requires  # what set-up has not yet installed
+    from importlib.metadata import distribution, requires
 
-    from packaging.requirements import Requirement
+    from packaging.requirements import Requirement  # which set-up installs
     from packaging.utils import canonicalize_name
 
     project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
