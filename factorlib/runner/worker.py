@@ -103,7 +103,7 @@ class CodeChanged(InputError):
 
 def run_step(task: Task) -> Outcome:
     """Run a task and keep its result in the store.  Raises nothing: an error of any kind is part of the outcome."""
-    temporary = task.temporary.with_name(f"{task.temporary.name}.{uuid.uuid4().hex[:8]}")
+    temporary = task.temporary.with_name(f"{task.temporary.name}-{uuid.uuid4().hex[:8]}")
     task = msgspec.structs.replace(task, temporary=temporary)  # another try of it may still be ending elsewhere
     meter, code, store = Meter(), task.code, Store(task.store)
     with Events(task.events) as events:
