@@ -30,7 +30,7 @@ setup: .venv/ready
 	done; echo "set-up: no Python 3.11 or 3.12 was found; install one, or name it: make PYTHON=/path/to/python3.11" >&2; exit 1
 
 lock: .venv/ready
-	@$(PY) -m factorlib.lock
+	@$(PY) -I factorlib/setup.py lock
 
 test: .venv/ready
 	@$(PY) -m ruff check --no-cache && $(PY) -m ruff format --check --no-cache --quiet

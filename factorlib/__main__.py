@@ -7,20 +7,23 @@ what the command line omits: make passes NAME=value on this way, untouched by an
 from __future__ import annotations
 
 import argparse
+import contextlib
 import errno
 import logging
 import os
+import signal
 import sys
+import threading
 from argparse import Namespace
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
+from types import FrameType
 from typing import Any, NoReturn
 
 from factorlib.errors import InputError
-from factorlib.runner import gc, verbs
+from factorlib.runner import results_folder, verbs
 from factorlib.runner.display import plain_streams, printable
 from factorlib.runner.project import LIBRARY, PIPELINE, Project, photo_sets
-from factorlib.runner.stop import heed_stops
 
 SHIPPED = "share/factorlib"  # relative to the prefix of the installation: data-files of pyproject.toml
 # errors of the system that the user can fix
@@ -153,11 +156,11 @@ VERBS: dict[str, tuple[str, Callable[[Namespace], int], str]] = {  # options, fu
                  "Check pipeline.yaml, settings and dataset without running anything."),
     "pack": ("dataset out force", lambda a: verbs.pack(project(), dataset_of(a), a.out, switched_on("FORCE", a.force)),
              "Put a result into one zip file that travels without its dataset."),
-    "verify": ("dataset", lambda a: gc.verify(project(), dataset_of(a, True)),
+    "verify": ("dataset", lambda a: results_folder.verify(project(), dataset_of(a, True)),
                "Read every kept result, of a dataset or of all, and name what is damaged."),
-    "clean": ("dataset", lambda a: gc.clean(project(), dataset_of(a, True)),
+    "clean": ("dataset", lambda a: results_folder.clean(project(), dataset_of(a, True)),
               "Forget a dataset's results, or, where neither --dataset nor DATASET is given, all."),
-    "gc": ("force", lambda a: gc.collect(project(), lambda: agreed(a.force)),
+    "gc": ("force", lambda a: results_folder.collect(project(), lambda: agreed(a.force)),
            "Show which results are current for no dataset, and delete them; a terminal is asked first."),
     "ship": ("name dataset", lambda a: verbs.ship(project(), a.name, dataset_of(a)),
              "Put a stage's current result into the package (for those who change the stage)."),
@@ -182,6 +185,25 @@ def run(words: list[str], program: str) -> int:
     return VERBS[asked.verb][1](asked)
 
 
+@contextlib.contextmanager
+def heed_stops() -> Iterator[None]:
+    """Raise SystemExit on SIGTERM and KeyboardInterrupt on SIGINT, once; later signals do not disturb cleaning up."""
+    in_main_thread = threading.current_thread() is threading.main_thread()  # Python sets handlers in no other thread.
+    numbers = [n for n in (signal.SIGINT, signal.SIGTERM) if in_main_thread and signal.getsignal(n) != signal.SIG_IGN]
+    before = {number: signal.signal(number, _stop) for number in numbers}
+    try:
+        yield
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
+
+
+def _stop(number: int, frame: FrameType | None = None) -> None:
+    for each in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(each, signal.SIG_IGN)
+    raise SystemExit(verbs.TERMINATED) if number == signal.SIGTERM else KeyboardInterrupt
+
+
 def main() -> NoReturn:
     """Run the verb of the command line; an error of the input ends the program with its message and exit code 1."""
     sys.stdout.reconfigure(errors="backslashreplace")  # File names may contain anything.
@@ -195,7 +217,7 @@ def main() -> NoReturn:
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # The flush at exit must not fail.
         sys.exit(1)
     except OSError as error:  # A message for errors that the user can fix; anything else is a defect.
-        from factorlib.disk import disk_error
+        from factorlib.wholefile import disk_error
 
         known = disk_error(error, project().build)
         if known is None and error.errno in NOT_OURS:

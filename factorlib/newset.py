@@ -30,7 +30,6 @@ from factorlib.align.silhouette import Silhouette
 from factorlib.dataset.check import IMAGES, MESHES, RESERVED_PHOTOS
 from factorlib.dataset.read import UNKNOWN
 from factorlib.dataset.schema import LEFT_OUT, LONGEST_NAME, MAX_MATERIALS
-from factorlib.disk import disk_error
 from factorlib.errors import InputError
 from factorlib.images.limits import MOST_MEGAPIXELS, check_pixels
 from factorlib.images.photo import open_photo
@@ -39,7 +38,7 @@ from factorlib.labels.labels import read_labels
 from factorlib.labels.png import read_inside, read_values
 from factorlib.meshes.read import read_mesh, read_parts
 from factorlib.reading import read_bytes, reading
-from factorlib.wholefile import write_text
+from factorlib.wholefile import disk_error, write_text
 from factorlib.yamlfile import yaml_text
 
 REMARK = """\

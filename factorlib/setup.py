@@ -1,9 +1,14 @@
 """Set-up of the environment: .venv with the pinned packages, and the few system libraries they need.
 
-The Makefile runs it as a script, on a Python without packages, so only the standard library may be imported here.
+The Makefile runs it as a script, on a Python without packages, so only the standard library may be imported here;
+`lock_text` alone imports a package.
 
     python3 -I factorlib/setup.py        (TORCH_INDEX=<url> for another PyTorch, e.g. with CUDA)
     .venv/bin/python -I factorlib/setup.py extras        (EXTRAS="dask blender": extras of pyproject.toml, into .venv)
+    .venv/bin/python -I factorlib/setup.py lock          (requirements.lock: the requirements of pyproject.toml, and
+                                                         theirs, pinned to the versions in .venv)
+
+To update a package: `.venv/bin/python -m pip install -U <name>`, `make test`, `make lock`.
 """
 
 from __future__ import annotations
@@ -190,5 +195,64 @@ def loads(library: str) -> bool:
         return False
 
 
+# ── requirements.lock ────────────────────────────────────────────────────────────────────────────────────────────────
+
+HEAD = """\
+# Every package of .venv, pinned; installed without looking for more (torch apart, see factorlib/setup.py).
+# Derived from pyproject.toml by `make lock`. Of what Open3D asks for, only what its compiled module needs is here \
+(factorlib/geometry/open3d.py).
+"""
+# Requirements of a package that the parts in use do not need.
+LEFT_OUT = {
+    "open3d-cpu": {
+        *(
+            "addict",
+            "configargparse",
+            "dash",
+            "flask",
+            "ipywidgets",
+            "matplotlib",
+            "nbformat",
+            "pandas",
+            "pyquaternion",
+        ),
+        *("scikit-learn", "werkzeug"),
+    },
+}
+
+
+def lock_text() -> str:
+    """Return the text of requirements.lock.
+
+    Raises:
+        PackageNotFoundError: A required package is not installed.
+    """
+    from importlib.metadata import distribution, requires
+
+    from packaging.requirements import Requirement  # installed by set-up
+    from packaging.utils import canonicalize_name
+
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+    waiting = [(Requirement(text), "") for text in project["dependencies"] + project["optional-dependencies"]["dev"]]
+    lines: dict[str, str] = {}
+    while waiting:
+        requirement, extra = waiting.pop()
+        name = canonicalize_name(requirement.name)
+        if name in lines or (requirement.marker and not requirement.marker.evaluate({"extra": extra})):
+            continue
+        lines[name] = f"{distribution(name).metadata['Name']}=={distribution(name).version}\n"
+        needed = [Requirement(text) for text in requires(name) or []]
+        needed = [each for each in needed if canonicalize_name(each.name) not in LEFT_OUT.get(name, ())]
+        waiting += [(each, extra) for each in needed for extra in ("", *requirement.extras)]
+    del lines["torch"]  # installed separately, from its own index
+    return HEAD + "".join(sorted(lines.values(), key=str.lower))
+
+
 if __name__ == "__main__":
-    install_extras() if sys.argv[1:] == ["extras"] else main()
+    if sys.argv[1:] == ["extras"]:
+        install_extras()
+    elif sys.argv[1:] == ["lock"]:
+        LOCK.write_text(lock_text())
+        print("requirements.lock is written")
+    else:
+        main()

@@ -12,10 +12,9 @@ from typing import Annotated
 
 import typer
 
-from factorlib.__main__ import agreed, switched_on
-from factorlib.disk import disk_error
+from factorlib.__main__ import agreed, heed_stops, switched_on
 from factorlib.errors import InputError, did_you_mean
-from factorlib.runner.stop import heed_stops
+from factorlib.wholefile import disk_error
 from studies.run import STUDIES, collect, forget, make, studies
 from studies.study import FULL, QUICK
 

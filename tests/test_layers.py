@@ -15,7 +15,7 @@ SCIENCE = {"numpy", "torch", "scipy", "OpenImageIO", "PIL"}
 
 @pytest.mark.parametrize("code, heavy", [
     ("import factorlib", {*SCIENCE, "mitsuba"}),
-    ("import factorlib.__main__; from factorlib.runner.project import photo_sets; photo_sets(); from factorlib.runner import survey",
+    ("import factorlib.__main__; from factorlib.runner.project import photo_sets; photo_sets(); from factorlib.runner import dataset_state",
      {*SCIENCE, "rich", "filelock", "typer", "pydantic"}),
     (f"{READ}; d = read_dataset('data/eames'); [dataset_slice(d, s) for s in SLICES]", SCIENCE),
     ("from studies.run import STUDIES; from studies.study import FULL; [s.cases(FULL) for s in STUDIES.values()]", SCIENCE),
@@ -29,9 +29,8 @@ def test_what_must_start_quickly_loads_nothing_heavy(code, heavy):
 
 def test_every_stage_of_the_pipeline_has_its_module_and_the_runner_finds_what_it_imports():
     from factorlib.runner.closure import Sources
-    from factorlib.runner.filehash import FileHashes
-    from factorlib.runner.pipeline import read_pipeline
-    from factorlib.runner.project import photo_sets
+    from factorlib.runner.project import photo_sets, read_pipeline
+    from factorlib.runner.store import FileHashes
 
     pipeline = read_pipeline(ROOT / "pipeline.yaml", photo_sets().slices)
     sources = Sources([ROOT], FileHashes(None))

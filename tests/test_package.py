@@ -15,7 +15,7 @@ import pytest
 from packaging.requirements import Requirement
 from packaging.utils import canonicalize_name
 
-from factorlib.lock import lock_text
+from factorlib.setup import lock_text
 
 ROOT = Path(__file__).resolve().parent.parent
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
@@ -27,8 +27,7 @@ PACKED = ["factorlib", "stages", "recipes", "pipeline.yaml", "pyproject.toml", "
 EXTRAS = {  # of modules that import what an extra alone installs
     ROOT / "factorlib" / f"{module}.py": extra
     for module, extra in (
-        ("runner/child", "dask"),
-        ("runner/cluster", "dask"),
+        ("runner/worker", "dask"),
         ("images/film", "video"),
         ("tracing/denoise", "denoise"),
     )
@@ -74,7 +73,7 @@ def installed(tmp_path_factory):
 RECORDS = """
 import json
 from factorlib.__main__ import project
-from factorlib.runner.survey import survey
+from factorlib.runner.dataset_state import survey
 records = survey(project(), "data/synthetic", None, []).records
 print(*(f"{step} {json.dumps(record, sort_keys=True, default=str)}" for step, record in records.items()), sep="\\n")
 """

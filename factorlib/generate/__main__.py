@@ -12,10 +12,9 @@ import msgspec
 import typer
 from rich.progress import Progress
 
-from factorlib.disk import disk_error
 from factorlib.errors import InputError
 from factorlib.images.light_map import maps_in
-from factorlib.wholefile import sync_tree
+from factorlib.wholefile import disk_error, sync_tree
 
 app = typer.Typer(add_completion=False, no_args_is_help=True, help=__doc__)
 Seed = Annotated[

@@ -26,7 +26,7 @@ from typing import Any
 import msgspec
 
 from factorlib.errors import InputError, did_you_mean
-from factorlib.runner.filehash import FileHashes, left_over
+from factorlib.runner.store import FileHashes, left_over
 
 # the fields of a record that a closure makes
 CODE = ("source:", "data:", "environment:", "program:", "package:", "python")
@@ -34,7 +34,7 @@ OURS = ("factorlib", "stages", "studies")  # packages; an installed one lies amo
 
 
 class Source(msgspec.Struct, frozen=True):
-    """What one module's text says: a digest of its syntax tree, what it imports, and what it declares to depend on."""
+    """Text of one module as far as it counts: a digest of its syntax tree, what it imports, and what it declares to depend on."""
 
     digest: str = ""
     imports: list[str] = []
@@ -43,7 +43,7 @@ class Source(msgspec.Struct, frozen=True):
 
 
 class Closure(msgspec.Struct, frozen=True):
-    """What a stage depends on besides its inputs, as a part of a step's record; and where what that names lies."""
+    """Source, package data, versions and environment that a stage depends on, as a part of a step's record; and where its files lie."""
 
     record: dict[str, str]
     files: dict[str, Path]
@@ -70,7 +70,7 @@ def source_of(text: str, module: str, is_package: bool) -> Source:
 
 
 def _declared(tree: ast.Module, name: str, type_: Any, example: str) -> Any:
-    """The value of the constant `name` of a module, without running it; None where it has none."""
+    """Return the value of the constant `name` of a module, without running it; None where it has none."""
     for node in tree.body:
         if isinstance(node, ast.Assign) and any(getattr(target, "id", None) == name for target in node.targets):
             try:
@@ -82,7 +82,7 @@ def _declared(tree: ast.Module, name: str, type_: Any, example: str) -> Any:
 
 
 def _is_remark(item: ast.stmt) -> bool:
-    """Whether a statement is a string that stands alone: a docstring, or what is said of a field."""
+    """Return whether a statement is a string that stands alone: a docstring, or what is said of a field."""
     return isinstance(item, ast.Expr) and isinstance(item.value, ast.Constant) and isinstance(item.value.value, str)
 
 
@@ -96,7 +96,7 @@ class Sources:
         self._beside: dict[Path, list[Path]] = {}  # data files by folder
 
     def closure(self, package: str, stage: str, pipeline_file: Path) -> Closure:
-        """All modules of the project that `stage` imports, with their hashes, and the installed packages among its imports.
+        """Return all modules of the project that `stage` imports, with their hashes, and the installed packages among its imports.
 
         Raises InputError where the stage has no module, or a module of the project cannot be parsed.
         """
@@ -147,7 +147,7 @@ class Sources:
         return self.hashes.remembered("packages", Path(newest), _installed, dict[str, dict[str, str]])
 
     def find(self, name: str) -> Path | None:
-        """The file of a module of the project; a folder without `__init__.py` stands for itself."""
+        """Return the file of a module of the project; a folder without `__init__.py` stands for itself."""
         if name not in self._places:
             parent, _, last = name.rpartition(".")
             bases = self.roots[: None if name in OURS else 1]

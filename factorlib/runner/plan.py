@@ -15,7 +15,7 @@ from typing import Any, Literal
 
 import msgspec
 
-from factorlib.runner.pipeline import DATASET, Pipeline
+from factorlib.runner.project import DATASET, Pipeline
 
 Record = dict[str, Any]
 Status = Literal["current", "to run", "maybe"]
@@ -30,7 +30,7 @@ class Step(msgspec.Struct, frozen=True, order=True):
 
     @property
     def of(self) -> str | None:
-        """The name of its photo or recipe."""
+        """Return the name of its photo or recipe."""
         return self.photo or self.recipe
 
     def __str__(self) -> str:
@@ -47,18 +47,18 @@ class Spec(msgspec.Struct, frozen=True):
     recipes: list[str] = []
 
     def steps(self) -> list[Step]:
-        """All steps of the wanted stages and of what they need, upstream first."""
+        """Return all steps of the wanted stages and of what they need, upstream first."""
         return [step for name in self.pipeline.needed(self.targets) for step in self.steps_of(name)]
 
     def steps_of(self, stage: str) -> list[Step]:
-        """The steps of one stage: one per photo or recipe, or one for the whole set."""
+        """Return the steps of one stage: one per photo or recipe, or one for the whole set."""
         over = self.pipeline.stages[stage].over
         if over == "recipe":
             return [Step(stage, recipe=recipe) for recipe in self.recipes]
         return [Step(stage, photo) for photo in self.photos] if over else [Step(stage)]
 
     def above(self, step: Step) -> list[Step]:
-        """The steps whose results a step is handed: of its own photo, or of all for a step over the whole set or of a recipe."""
+        """Return the steps whose results a step is handed: of its own photo, or of all for a step over the whole set or of a recipe."""
         upstream = self.pipeline.stages[step.stage].upstream
         if step.photo is None:
             return [found for name in upstream for found in self.steps_of(name)]
@@ -66,7 +66,7 @@ class Spec(msgspec.Struct, frozen=True):
 
 
 class Listing(msgspec.Struct, frozen=True):
-    """What the store holds: output hash by key (asked by `get`); and the record each step had when it last was current here.
+    """Contents of the store: output hash by key (asked by `get`); and the record each step had when it last was current here.
 
     damaged: by key, what is wrong with a result that is not as it was kept, and so has no output
     """
@@ -88,7 +88,7 @@ class Planned(msgspec.Struct, frozen=True):
 
 
 def plan(spec: Spec, hashes: Mapping[Step, Record], listing: Listing) -> list[Planned]:
-    """Every wanted step in order; `hashes` holds each step's record but for the results it is handed."""
+    """Plan every wanted step in order; `hashes` holds each step's record but for the results it is handed."""
     planned: dict[Step, Planned] = {}
     for step in spec.steps():
         outputs = {above: planned[above].output for above in spec.above(step)}
@@ -97,7 +97,7 @@ def plan(spec: Spec, hashes: Mapping[Step, Record], listing: Listing) -> list[Pl
 
 
 def _planned(step: Step, forced: bool, own: Record, outputs: Mapping[Step, str | None], listing: Listing) -> Planned:
-    """A step that is handed those outputs, None where one is still to be made.
+    """Plan a step that is handed those outputs, None where one is still to be made.
 
     Under such a one it must run if what is known already changed; else that is open.
     """
@@ -120,7 +120,7 @@ def _planned(step: Step, forced: bool, own: Record, outputs: Mapping[Step, str |
 
 
 def hash_of(table: Record) -> str:
-    """The same table has the same hash, on any machine: a record's is its key, that of a tree's files is the tree's name."""
+    """Return the hash of a table, the same on any machine: a record's is its key, that of a tree's files is the tree's name."""
     return hashlib.sha256(json.dumps(table, sort_keys=True).encode()).hexdigest()[:32]
 
 
@@ -148,7 +148,7 @@ _NAMED = 4  # names that came or went
 
 
 def difference(before: Record, after: Record) -> list[str]:
-    """What changed between two records, in words, one line per cause."""
+    """List what changed between two records, in words, one line per cause."""
     both = sorted(before.keys() | after.keys())
     return [_change(name, before, after) for name in both if before.get(name, _ABSENT) != after.get(name, _ABSENT)]
 
@@ -175,7 +175,7 @@ def _shown(value: Any, kind: str) -> str:
 
 
 def in_short(lines: Sequence[object], most: int = 3, between: str = "; ") -> str:
-    """The first lines, and how many more there are.
+    """Return the first lines, and how many more there are.
 
     >>> in_short(["a: missing", "b: missing", "c: missing", "d: missing"])
     'a: missing; b: missing; c: missing; 1 more'
@@ -184,7 +184,7 @@ def in_short(lines: Sequence[object], most: int = 3, between: str = "; ") -> str
 
 
 def names(steps: Iterable[Step]) -> str:
-    """Steps by the name of their stage, with the number of photos.
+    """Format steps by the name of their stage, with the number of photos.
 
     >>> names([Step("masks", "a"), Step("masks", "b"), Step("train")])
     'masks (2 photos), train'

@@ -10,22 +10,19 @@ from __future__ import annotations
 import contextlib
 import json
 import os
+import shutil
 import time
-import traceback
-from concurrent.futures import FIRST_COMPLETED, CancelledError, Future, wait
-from concurrent.futures.process import BrokenProcessPool
+from concurrent.futures import FIRST_COMPLETED, Future, wait
 from dataclasses import dataclass
 from pathlib import Path
 
-from factorlib.runner.child import Pools
+from factorlib.errors import InputError
+from factorlib.runner.dataset_state import Survey
 from factorlib.runner.display import Display
-from factorlib.runner.gc import tenant
-from factorlib.runner.home import claim, label, remember, show, sound_lines, usual_costs, view_of
 from factorlib.runner.plan import Planned, Step
-from factorlib.runner.shared import shared_store
-from factorlib.runner.store import lock
-from factorlib.runner.survey import Survey
-from factorlib.runner.worker import Code, Outcome, Task, run_step
+from factorlib.runner.results_folder import begin_run, claim, label, view_of
+from factorlib.runner.store import lock, sound_lines
+from factorlib.runner.worker import Cluster, Code, Outcome, Processes, Task, run_step
 from factorlib.wholefile import append_text, write_bytes, write_text
 
 POLL = 0.1  # seconds between two looks at what the workers say
@@ -46,25 +43,23 @@ class Running:
 def run(survey: Survey, display: Display) -> Run:
     """Run whatever of the plan must run; the results are in the store and under build/<dataset>/ afterwards."""
     claim(survey.project, survey.home, survey.data.folder)
-    with tenant(survey.store, display.say) as folder:
+    folder, held = begin_run(survey.store, display.say)
+    with contextlib.ExitStack() as after:
+        after.callback(shutil.rmtree, folder, ignore_errors=True)
         work = Run(survey, display, folder)
+        after.callback(lambda: work.pools.close())
+        after.callback(os.close, held)  # the first of these, at which processes end that are not done
         work.refused = survey.wrong_values(survey.planned())
         if work.refused:
             return work
-        if survey.spec.pipeline.executor != "processes":
-            from factorlib.runner.cluster import Cluster  # which is loaded only then
-
-            work.pools = Cluster(survey.spec.pipeline.executor, folder, display.say)
+        if (executor := survey.spec.pipeline.executor) != "processes":
+            work.pools = Cluster(executor, folder, display.say)
         try:
             work.go()
-        except BaseException:
-            work.pools.close(kill=True)
-            raise
         finally:
             for running in work.running.values():
                 os.close(running.lock)
-            show(survey, survey.planned(frozenset()))
-        work.pools.close()
+            survey.show(survey.planned(frozenset()))
     return work
 
 
@@ -75,9 +70,8 @@ class Run:
     """
 
     def __init__(self, survey: Survey, display: Display, folder: Path):
-        self.survey, self.display, self.folder, self.pools = survey, display, folder, Pools()
-        display.usual, display.cores = usual_costs(survey.home.log), self.pools.cores
-        self.store, self.shared = survey.store, shared_store(survey.store.root)
+        self.survey, self.display, self.folder, self.pools = survey, display, folder, Processes(folder)
+        self.store = survey.store
         self.refused: list[str] = []
         self.running: dict[Step, Running] = {}
         self.waiting: set[Step] = set()  # for another run, or for what is damaged to be made again
@@ -158,12 +152,11 @@ class Run:
             record=planned.record,
             temporary=temporary,
             events=temporary.with_name(f"{temporary.name}.events.jsonl"),
-            shared=self.shared,
             forced="forced" in planned.reasons,
         )
 
     def _folder(self, step: Step, name: str) -> Path:
-        """Where the files of the stage `name` are for this step."""
+        """Return the folder with the files of the stage `name` for this step."""
         stage, spec = self.survey.spec.pipeline.stages[name], self.survey.spec
         if not stage.over or step.photo is not None:
             return self.store.trees / self.planned[Step(name, step.photo if stage.over else None)].output
@@ -171,7 +164,7 @@ class Run:
         return self.store.trees / self.store.get(view_of(self.store, name, keys, stage.gather))
 
     def _log_above(self, step: Step, path: Path) -> Path:
-        """What the steps above cost and said when their present results were made, whichever run made them."""
+        """Write the log of the steps above, of their present results, whichever run made them."""
         above = set(self.survey.spec.pipeline.needed([step.stage])) - {step.stage}
         logs = [self.store.log(p.key) for p in self.planned.values() if p.step.stage in above and p.key]
         write_bytes(path, b"".join(line + b"\n" for log in logs for line in sound_lines(log)))
@@ -212,11 +205,9 @@ class Run:
         step, key = work.planned.step, work.task.key
         try:
             outcome = work.future.result()
-        except Exception as error:
-            name = type(error).__name__
-            outcome = Outcome(error=f"{name}: {error}", traceback="".join(traceback.format_exception(error)))
-            if isinstance(error, BrokenProcessPool | CancelledError) or name == "KilledWorker":  # which is Dask's
-                outcome = Outcome(error=DIED)
+        except Exception as error:  # of the executor: `run_step` raises nothing
+            known = isinstance(error, InputError)
+            outcome = Outcome(error=str(error) if known else f"{DIED} ({type(error).__name__})")
         os.close(work.lock)
         if outcome.error is not None:
             return self._fail(step, outcome)
@@ -227,7 +218,7 @@ class Run:
         self.ran.append(step)
         self.made.add(key)
         append_text(self.survey.home.log, self.store.log(key).read_text(encoding="utf-8"))
-        remember(self.survey, {str(step): key})
+        self.survey.remember({str(step): key})
         self.display.finish(step, outcome.seconds)
 
     def _fail(self, step: Step, outcome: Outcome) -> None:

@@ -16,6 +16,8 @@ from __future__ import annotations
 
 import contextlib
 import fcntl
+import hashlib
+import logging
 import os
 import shutil
 import stat
@@ -23,15 +25,88 @@ import time
 import uuid
 from collections.abc import Callable, Iterable, Mapping
 from functools import cached_property
-from pathlib import Path
+from pathlib import Path, PurePosixPath
+from typing import Annotated, Any, TypeVar
 
 import msgspec
 
 from factorlib.errors import InputError
 from factorlib.jsonfile import json_text
-from factorlib.runner.filehash import hash_of_file, left_over, read_cache, write_cache
-from factorlib.runner.plan import hash_of
+from factorlib.runner.plan import Record, hash_of
+from factorlib.runner.project import Shipping
 from factorlib.wholefile import replace_file, sync, sync_tree
+
+log = logging.getLogger("factorlib.runner")
+T = TypeVar("T")
+Hash = Annotated[str, msgspec.Meta(pattern="^[0-9a-f]{32}$")]
+FORMAT = 8  # of the cache; one of another format is made anew
+FRESH_NS = 2_000_000_000  # a file changed this recently may change again within its clock's grain: not remembered
+
+
+def hash_of_file(path: Path) -> str:
+    """First 128 bits of the SHA-256 of a file's content, as 32 hexadecimal digits."""
+    with open(path, "rb") as stream:
+        return hashlib.file_digest(stream, "sha256").hexdigest()[:32]
+
+
+def left_over(name: str) -> bool:
+    """Return whether a file or folder is what Python, editors and desktops leave: hidden, a backup, or compiled Python.
+
+    >>> [left_over(name) for name in (".a.c.swp", "a.c~", "#a.c#", "__pycache__", "a.pyc", "a.c")]
+    [True, True, True, True, True, False]
+    """
+    return name.startswith((".", "#")) or name.endswith(("~", ".pyc")) or name == "__pycache__"
+
+
+def read_cache(path: Path | None, type_: type[T]) -> T | None:
+    """Return what a cache holds; None where there is none, or it is damaged or of another kind."""
+    try:
+        return msgspec.json.decode(path.read_bytes(), type=type_) if path else None
+    except (OSError, msgspec.MsgspecError, UnicodeError, RecursionError):
+        return None
+
+
+def write_cache(path: Path, tables: Any) -> None:
+    """Replace a cache; where it cannot be written (a full disk, a read-only folder) the next run takes longer, no more."""
+    with contextlib.suppress(OSError):
+        path.parent.mkdir(parents=True, exist_ok=True)
+        replace_file(path, msgspec.json.encode(tables))
+
+
+class FileHashes:
+    """Values made of the contents of files, by kind and path, in a cache beside the store; `save` writes it.  cache: its file, None to keep nothing."""
+
+    def __init__(self, cache: Path | None):
+        self.cache, self._changed = cache, False
+        format_, tables = read_cache(cache, tuple[int, dict[str, dict[str, Any]]]) or (0, {})
+        self._tables = tables if format_ == FORMAT else {}
+
+    def content(self, path: Path) -> str:
+        """`hash_of_file`, from the cache where the file's size, times and inode are unchanged."""
+        return self.remembered("content", path, lambda: hash_of_file(path), Hash)
+
+    def remembered(self, kind: str, path: Path, make: Callable[[], T], type_: type[T]) -> T:
+        """Return what `make` makes of the content of a file, from the cache where that is unchanged; type_: what it is."""
+        stat, table = os.stat(path), self._tables.setdefault(kind, {})
+        now = stat.st_size, stat.st_mtime_ns, stat.st_ctime_ns, stat.st_ino
+        with contextlib.suppress(KeyError, OverflowError, msgspec.ValidationError):  # not there, or damaged
+            then, value = msgspec.convert(table[str(path)], tuple[tuple[int, int, int, int], Any])
+            if then == now:
+                return msgspec.convert(value, type_)
+        value, stat = make(), os.stat(path)
+        unchanged = now == (stat.st_size, stat.st_mtime_ns, stat.st_ctime_ns, stat.st_ino)
+        if unchanged and time.time_ns() - max(now[1], now[2]) > FRESH_NS:
+            table[str(path)], self._changed = (now, value), True
+        return value
+
+    def save(self) -> None:
+        """Write the cache, where there is anything new to write."""
+        if self._changed and self.cache is not None:
+            write_cache(self.cache, (FORMAT, self._tables))
+            self._changed = False
+
+
+# ── the store ─────────────────────────────────────────────────────────────────────────────────────────────────────────
 
 Say = Callable[[str], None]
 Stamp = tuple[int, int]  # size in bytes, time of the content in ns
@@ -41,7 +116,7 @@ NO_FILE: Stamp = (-1, 0)  # a link, a pipe: nothing that a stage writes
 
 
 class Entry(msgspec.Struct, frozen=True):
-    """What a key gave: the hash of the tree, the record that made the key, and each file's hash."""
+    """Result of a key: the hash of the tree, the record that made the key, and each file's hash."""
 
     output: str
     record: dict
@@ -65,17 +140,17 @@ class Store:
         self.changed = False
 
     def log(self, key: str) -> Path:
-        """The file with the log of the result of a key."""
+        """Return the file with the log of the result of a key."""
         return self.logs / f"{key}.jsonl"
 
     def entry(self, key: str) -> Entry | None:
-        """What is written of a key, None where it was never made; whether its tree is there and right `get` says."""
+        """Read the entry of a key, None where it was never made; whether its tree is there and right `get` says."""
         if key not in self._entries:  # what is not there yet may come
             try:
                 entry = msgspec.json.decode((self.keys / f"{key}.json").read_bytes(), type=Entry)
             except (OSError, msgspec.DecodeError):  # a folder in its place, say
                 return None
-            if hash_of(entry.files) != entry.output:
+            if hash_of(entry.files) != entry.output or hash_of(entry.record) != key:
                 return None
             self._entries[key] = entry
         return self._entries[key]
@@ -94,7 +169,7 @@ class Store:
             known.pop(key, None)
 
     def still(self, keys: Iterable[str]) -> bool:
-        """Whether those keys have the outputs they had, looked up again."""
+        """Return whether those keys have the outputs they had, looked up again."""
         before = {key: self._outputs.get(key) for key in keys}
         for key in before:
             self.forget(key)
@@ -106,7 +181,7 @@ class Store:
         return read_cache(self.cache / "trees.json", dict[str, dict[str, Stamp]]) or {}
 
     def damage(self, entry: Entry, read_all: bool = False) -> list[str]:
-        """What is wrong with the tree of an entry, a line each; read_all: whatever is remembered of it."""
+        """List the faults of the tree of an entry, a line each; read_all: whatever is remembered of it."""
         now, known = stamps_of(self.trees / entry.output), self.known.get(entry.output, {})
         if now and now == known and not read_all:
             return []
@@ -162,7 +237,7 @@ class Store:
 
 
 def lock(path: Path, wait: bool = False) -> int | None:
-    """A lock on a file, held until the descriptor is closed or the process ends; None where another process has it."""
+    """Lock a file until the descriptor is closed or the process ends; None where another process has it."""
     path.parent.mkdir(parents=True, exist_ok=True)
     descriptor = os.open(path, os.O_RDWR | os.O_CREAT, 0o666)
     try:
@@ -174,7 +249,7 @@ def lock(path: Path, wait: bool = False) -> int | None:
 
 
 def is_locked(path: Path) -> bool:
-    """Whether any process has that lock; looking needs no right to write."""
+    """Return whether any process has that lock; looking needs no right to write."""
     try:
         with open(path, "rb") as stream:
             fcntl.flock(stream, fcntl.LOCK_SH | fcntl.LOCK_NB)
@@ -215,7 +290,7 @@ def hashes_of_tree(folder: Path) -> dict[str, str]:
 
 
 def damage_of(folder: Path, files: Mapping[str, str], right: Mapping[str, Stamp] | None = None) -> list[str]:
-    """How a folder is not what `files` (relative path -> hash) says, a line each; contents are read but for stamps in `right`."""
+    """List how a folder is not what `files` (relative path -> hash) says, a line each; contents are read but for stamps in `right`."""
     lines, now = [], stamps_of(folder)
     for name in sorted(files):
         if (stamp := now.get(name)) in (None, NO_FILE):
@@ -226,3 +301,87 @@ def damage_of(folder: Path, files: Mapping[str, str], right: Mapping[str, Stamp]
             except OSError as error:
                 lines.append(f"{name}: cannot be read ({error.strerror})")
     return lines + [f"{name}: no file of this result" for name in sorted(now.keys() - files.keys())]
+
+
+def sound_lines(path: Path) -> list[bytes]:
+    """Read the lines of a log that are events, in order, none where there is no log; damaged ones are left out, with a warning."""
+    try:
+        lines = path.read_bytes().splitlines()
+    except FileNotFoundError:
+        return []
+    sound = []
+    for line in lines:
+        with contextlib.suppress(msgspec.MsgspecError, UnicodeError, RecursionError):
+            event = msgspec.json.decode(line, type=dict)
+            sound += [line] if isinstance(event.get("event"), str) else []
+    if len(sound) < len(lines):
+        words = "%s: %d damaged lines are left out; the results are not affected"
+        log.warning(words, path, len(lines) - len(sound))
+    return sound
+
+
+# ── results that ship with the source ────────────────────────────────────────────────────────────────────────────────────────────────
+
+MADE_FROM = "made_from.json"
+CURE = "restore it from the repository, or make the result anew with FORCE=1"
+
+
+def copied(tree: Path, draft: Path, files: dict[str, str]) -> bool:
+    """Copy the files of a tree; whether each is what its hash says.  No name may lead out of the draft."""
+    if any(PurePosixPath(name).is_absolute() or ".." in PurePosixPath(name).parts for name in files):
+        return False
+    shutil.rmtree(draft, ignore_errors=True)
+    draft.mkdir(parents=True)
+    for name in files:
+        (draft / name).parent.mkdir(parents=True, exist_ok=True)
+        with contextlib.suppress(FileNotFoundError):
+            shutil.copyfile(tree / name, draft / name, follow_symlinks=False)
+    return not damage_of(draft, files)
+
+
+class Shipped(msgspec.Struct, frozen=True):
+    """Content of made_from.json: the part of the record that the result depends on, and the hash of each file of it."""
+
+    record: Record
+    files: dict[str, str]
+
+
+def made_from(record: Record, modules: list[str]) -> Record:
+    """Return the part of a step's record that a result made by `modules` depends on.
+
+    >>> made_from({"param:steps": 3, "source:stages.train": "1", "package:torch": "2.13"}, ["stages.train"])
+    {'param:steps': 3, 'source:stages.train': '1'}
+    """
+    own = {f"source:{module}" for module in modules}
+    return {name: value for name, value in record.items() if name.startswith("param:") or name in own}
+
+
+def copy_shipped(roots: list[Path], shipping: Shipping | None, record: Record, out: Path) -> bool:
+    """Copy the shipped result of `record`, from below one of `roots`, to `out`; False where none was made from the same.
+
+    Raises InputError where the files are not those that were shipped.
+    """
+    for file in (root / shipping.folder / MADE_FROM for root in roots if shipping):
+        if not file.is_file():
+            continue
+        try:
+            shipped = msgspec.json.decode(file.read_bytes(), type=Shipped)
+        except msgspec.DecodeError as error:
+            words = f"does not say what the shipped files were made from ({error})"
+            raise InputError(words, file=file, cure=CURE) from None
+        if shipped.record == made_from(record, shipping.made_by):
+            if not copied(file.parent, out, shipped.files):
+                raise InputError("beside it are not the files that were shipped with the source", file=file, cure=CURE)
+            return True
+    return False
+
+
+def ship(result: Path, record: Record, root: Path, shipping: Shipping) -> Path:
+    """Put the files of `result`, a flat folder that `record` gave, into the package; returns where they are."""
+    target, hashes = root / shipping.folder, {}
+    target.mkdir(parents=True, exist_ok=True)
+    for path in sorted(result.iterdir()):
+        replace_file(target / path.name, path.read_bytes())
+        hashes[path.name] = hash_of_file(target / path.name)
+    replace_file(target / MADE_FROM, json_text(Shipped(made_from(record, shipping.made_by), hashes)).encode())
+    return target

@@ -2,32 +2,31 @@
 
 from __future__ import annotations
 
+import ast
+import inspect
 import os
+import signal
 import sys
 import textwrap
 import time
 from collections.abc import Sequence
 from importlib import import_module
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import msgspec
+from msgspec import inspect as types
 
 from factorlib.errors import InputError, did_you_mean
-from factorlib.runner import words
-from factorlib.runner.gc import homes_of
-from factorlib.runner.home import Home, claim, home_of, label, made_homes, show, sound_lines
-from factorlib.runner.pipeline import Pipeline, read_pipeline
+from factorlib.runner.dataset_state import Survey, survey
 from factorlib.runner.plan import Planned, Step, difference, in_short
-from factorlib.runner.project import RESERVED, Project, check_name
-from factorlib.runner.shared import shared_store
-from factorlib.runner.shared import ship as put_into_package
-from factorlib.runner.stop import INTERRUPTED, TERMINATED
-from factorlib.runner.store import Store, is_locked
-from factorlib.runner.survey import Survey, survey
-from factorlib.runner.worker import Code, load_stage
+from factorlib.runner.project import RESERVED, Code, Pipeline, Project, check_name, read_pipeline
+from factorlib.runner.results_folder import Home, claim, home_of, homes_of, label, made_homes
+from factorlib.runner.store import Store, is_locked, sound_lines
+from factorlib.runner.store import ship as put_into_package
 from factorlib.wholefile import write_text
 
+INTERRUPTED, TERMINATED = 128 + signal.SIGINT, 128 + signal.SIGTERM  # exit codes, as shells count
 VERDICT = "evaluate/verdict.txt"  # whose first line says whether the result is to be trusted
 UNTRUSTED, NO_TRUST = 3, "do not trust"  # the exit code under STRICT=1, and how that line begins then
 RESULTS = {  # what a user looks at first
@@ -39,7 +38,7 @@ RESULTS = {  # what a user looks at first
 
 
 class Wish(NamedTuple):
-    """What the command line asks for, as `survey` takes it.
+    """Request of the command line, as `survey` takes it.
 
     targets:  stages; None for all but those that run only when asked for
     settings: `stage.parameter=value`;  force: run the targets again, whatever the store holds
@@ -76,7 +75,7 @@ def make(project: Project, wish: Wish, strict: bool = False) -> int:
     planned = seen.planned()
     todo = [p.step for p in planned if p.status != "current"]
     if not todo:
-        show(seen, planned)
+        seen.show(planned)
         _say(seen, f"nothing to do, all {len(seen.records)} steps are current")
     elif faults := seen.faults(todo, new=True):
         return _refused(seen, faults)
@@ -98,10 +97,10 @@ def make(project: Project, wish: Wish, strict: bool = False) -> int:
 
 
 def _run(seen: Survey, started: float) -> int:
-    from factorlib.runner.display import display_for
+    from factorlib.runner.display import Display
     from factorlib.runner.run import run
 
-    display = display_for()
+    display = Display()
     try:
         ran = run(seen, display)
     except (KeyboardInterrupt, SystemExit) as stop:
@@ -112,12 +111,12 @@ def _run(seen: Survey, started: float) -> int:
     if ran.refused:
         return _refused(seen, ran.refused, "parameters")
     if failed := list(ran.failed):
-        _say(seen, f"{words.count(failed)} failed: {in_short(failed, words.NAMED, ', ')}")
+        _say(seen, f"{count(failed)} failed: {in_short(failed, NAMED, ', ')}")
         if ran.held_up:
             print(f"not run for that: {', '.join(dict.fromkeys(step.stage for step in ran.held_up))}")
         return 1
     current, seconds = len(seen.records) - len(ran.ran), time.perf_counter() - started
-    _say(seen, f"{words.count(ran.ran)} run, {current} current, {seconds:.1f} s")
+    _say(seen, f"{count(ran.ran)} run, {current} current, {seconds:.1f} s")
     return 0
 
 
@@ -125,7 +124,7 @@ def _refused(seen: Survey, faults: list[str], where: str = "files") -> int:
     """Print every fault at once, before anything has run."""
     for fault in faults:
         print(f"error: {fault}", file=sys.stderr)
-    print(f"{seen.data.folder.name}: {words.count(faults, 'fault')} in its {where}; nothing was run", file=sys.stderr)
+    print(f"{seen.data.folder.name}: {count(faults, 'fault')} in its {where}; nothing was run", file=sys.stderr)
     return 1
 
 
@@ -135,11 +134,7 @@ def show_plan(project: Project, wish: Wish, every_reason: bool = False) -> int:
     planned = seen.planned()
     if faults := seen.wrong_values(planned):
         return _refused(seen, faults, "parameters")
-    shared = Store(folder) if (folder := shared_store(seen.store.root)) else None
-    for number, p in enumerate(planned if shared else []):
-        if p.status != "current" and "forced" not in p.reasons and p.key and (shared.keys / f"{p.key}.json").is_file():
-            planned[number] = msgspec.structs.replace(p, reasons=[*p.reasons, "the shared store has it"])
-    print("\n".join(words.plan_lines(planned, every_reason)))
+    print("\n".join(plan_lines(planned, every_reason)))
     return 0
 
 
@@ -160,7 +155,7 @@ def show_status(project: Project, wish: Wish) -> int:
 
 
 def _events(seen: Survey, planned: Planned) -> list[dict]:
-    """The log of a step's current result."""
+    """Read the log of a step's current result."""
     lines = sound_lines(seen.store.log(planned.key)) if planned.status == "current" else []
     return [{"text": "", **msgspec.json.decode(line)} for line in lines]
 
@@ -193,17 +188,19 @@ def show_logs(project: Project, wish: Wish, photo: str | None) -> int:
     if not logged:
         cure = did_you_mean(str(photo), [*seen.data.photos, *seen.recipes])
         raise InputError(f"no step is of {photo!r}", key="PHOTO", cure=cure)
-    print("\n".join(words.log_lines(logged)))
+    print("\n".join(log_lines(logged)))
     return 0
 
 
 def show_params(project: Project, stages: list[str] | None) -> int:
     """Print every parameter of the stages, or of all, with default, range and meaning."""
+    from factorlib.runner.worker import load_stage
+
     for number, name in enumerate(stages or _pipeline(project).order()):
         check_stage(project, name, [])
         params = load_stage(Code(project.code_root, project.package, name, {}, project.pipeline_file)).Params
         lines = [""] * (number > 0)
-        for param, may_be, default, text in words.parameters(params):
+        for param, may_be, default, text in parameters(params):
             lines.append(f"{name}.{param} = {default}    ({may_be})")
             lines += textwrap.wrap(text, 100, initial_indent="    ", subsequent_indent="    ")
         print("\n".join(lines if any(lines) else [*lines, f"{name} has no parameters"]))
@@ -232,10 +229,10 @@ def validate(project: Project, dataset: str, settings: list[str], sheet: bool = 
 
 def _draw_sheet(project: Project, folder: Path) -> None:
     """Draw a data set, also one that is not finished, each photo beside its labels and meshes."""
-    from factorlib.runner.display import display_for
+    from factorlib.runner.display import Display
 
     claim(project, home := home_of(project, folder), folder)
-    path, step, started, display = home.folder / "sheet.png", Step("sheet"), time.monotonic(), display_for()
+    path, step, started, display = home.folder / "sheet.png", Step("sheet"), time.monotonic(), Display()
     draw = import_module("factorlib.sheet").write_sheet  # science, by its name as stages are
     display.start(step)
     try:
@@ -283,7 +280,7 @@ def compare(project: Project, first: Path | None, second: Path | None) -> int:
             known = [home.folder.name for home in made_homes(project)]
             cure = did_you_mean(str(named), known) if known else "make all DATASET=<name> makes one"
             raise InputError("there is no result here", file=named, key="compare", cure=cure)
-    (one, other), store, changes = (home.keys() for home in homes), Store(project.build / "store"), set()
+    (one, other), store, changes = (home.keys() for home in homes), Store(project.store), set()
     for step in one.keys() & other.keys():
         pair = store.entry(one[step]), store.entry(other[step])
         if None in pair:
@@ -324,3 +321,133 @@ def ship(project: Project, stage: str, dataset: str) -> int:
     folder = put_into_package(seen.store.trees / planned.output, planned.record, project.root, known[stage])
     print(f"{stage}: {project.shown(folder)}")
     return 0
+
+
+# ── in words ─────────────────────────────────────────────────────────────────────────────────────────────────────────
+
+SHOWN = 8  # reasons of one step that are written out
+NAMED = 20  # steps that have failed
+
+
+def plan_lines(planned: list[Planned], every_reason: bool = False) -> list[str]:
+    """Format what would run, one line for steps of a stage that share their reasons, the photo's own name aside.
+
+    every_reason: below it, a line each
+    """
+    groups: dict[tuple, list[Step]] = {}
+    for p in (p for p in planned if p.status != "current"):
+        reasons = tuple(_of_any_photo(reason, p.step) for reason in p.reasons)
+        groups.setdefault((p.step.stage, p.status, reasons), []).append(p.step)
+    lines = []
+    for (stage, status, reasons), steps in groups.items():
+        names = [step.of for step in steps if step.of]
+        items = ", ".join(names) if len(names) <= 3 else f"{len(names)} {'recipes' if steps[0].recipe else 'photos'}"
+        in_line = "" if every_reason else in_short(reasons, SHOWN)
+        lines.append(f"{stage:<10} {status:<7} {items:<24} {in_line}".rstrip())
+        lines += [f"    {reason}" for reason in reasons] if every_reason else []
+    current = sum(p.status == "current" for p in planned)
+    return [*lines, f"{current} of {len(planned)} steps are current" if lines else f"all {current} steps are current"]
+
+
+def _of_any_photo(reason: str, step: Step) -> str:
+    """`masks/kitchen` is `masks` to the step of the kitchen, `photos.kitchen.image` is `photos.*.image`.
+
+    >>> _of_any_photo("if masks/kitchen, train comes out different", Step("align", "kitchen"))
+    'if masks, train comes out different'
+    """
+    if step.photo and reason.startswith(("if ", "result of ")):
+        return reason.replace(f"/{step.photo}", "")
+    if step.photo and reason.startswith("dataset.yaml:"):
+        return reason.replace(f" photos.{step.photo}.", " photos.*.", 1)
+    return reason
+
+
+def count(items: list, one: str = "step") -> str:
+    """
+    >>> count(["a"]), count(["a", "b"], "fault")
+    ('1 step', '2 faults')
+    """
+    return f"{len(items)} {one}{'' if len(items) == 1 else 's'}"
+
+
+def log_lines(logged: list[tuple[Planned, list[dict], str | None]]) -> list[str]:
+    """Return what each step cost and warned of, and what all were made with, every version of it.
+
+    logged: steps with the events of their results' logs, and the file that says by which defect one failed
+    """
+    lines, made = [], {}
+    for planned, events, failed in logged:
+        lines.append(f"{planned.step!s:<26} {_cost(planned, events)}".rstrip())
+        lines += [f"    warning: {event['text']}" for event in events if event["event"] == "warning"]
+        lines += [f"    it failed by a defect of the program: {failed}"] if failed else []
+        for name, version in _made_with(planned, events).items():
+            made.setdefault(name, {})[version] = None
+    text = ", ".join(f"{name} {' or '.join(made[name])}" for name in sorted(made, key=str.lower))
+    indents = {"initial_indent": "    made with ", "subsequent_indent": "    "}
+    return lines + textwrap.wrap(text, 110, **indents)
+
+
+def _cost(planned: Planned, events: list[dict]) -> str:
+    done = next((event for event in reversed(events) if event["event"] == "done"), None)
+    if planned.status != "current":
+        return f"{planned.status}: {in_short(planned.reasons, SHOWN)}"
+    if done is None:
+        return "its log is not there"
+    cores = f"{done['threads']} thread{'s' * (done['threads'] > 1)} on {done['cores']} core{'s' * (done['cores'] > 1)}"
+    cost = f"{done['seconds']:8.1f} s {done['cpu_seconds']:8.1f} s processor {done['memory_mb']:7.0f} MB peak"
+    return f"{cost}   {cores}   {done['started'][:16].replace('T', ' ')} UTC"
+
+
+def _made_with(planned: Planned, events: list[dict]) -> dict[str, str]:
+    """Return the versions of Python and of the packages that count, and the machine's kind; nothing of no current result."""
+    if planned.status != "current":
+        return {}
+    machine = next((event["machine"] for event in reversed(events) if "machine" in event), {})
+    made = {"Python": machine["python"], machine["system"]: machine["processor"]} if machine else {}
+    return made | {n.removeprefix("package:"): v for n, v in planned.record.items() if n.startswith("package:")}
+
+
+def parameters(params: type) -> list[tuple[str, str, str, str]]:
+    """List the fields of a stage's `Params`, in its order: name, what is allowed, default as YAML has it, meaning.
+
+    The meaning is the string that follows a field.  One that is a struct stands for its own fields, with dotted names.
+    """
+    texts, table = {}, []
+    for cls in reversed(params.__mro__):
+        if issubclass(cls, msgspec.Struct) and cls is not msgspec.Struct:
+            body = ast.parse(textwrap.dedent(inspect.getsource(cls))).body[0].body
+            for field, text in zip(body, body[1:]):
+                match field, text:
+                    case ast.AnnAssign(ast.Name(name)), ast.Expr(ast.Constant(said)):
+                        texts[name] = " ".join(str(said).split())
+    for field in types.type_info(params).fields:
+        if isinstance(field.type, types.StructType):
+            table += [(f"{field.name}.{name}", *rest) for name, *rest in parameters(field.type.cls)]
+        else:
+            made = field.default is msgspec.NODEFAULT and callable(field.default_factory)
+            value = field.default_factory() if made else field.default
+            text = "none" if value is msgspec.NODEFAULT else msgspec.json.encode(value).decode().replace(",", ", ")
+            table.append((field.name, allowed(field.type), text, texts.get(field.name, "")))
+    return table
+
+
+def allowed(of: Any) -> str:
+    """Format what a value of a type, as `msgspec.inspect` has it, may be.
+
+    >>> allowed(types.type_info(int)), allowed(types.IntType(ge=1, le=1024)), allowed(types.FloatType(gt=0))
+    ('whole number', '1 … 1,024', 'number > 0')
+    """
+    if isinstance(of, types.IntType | types.FloatType):
+        if of.ge is not None and of.le is not None:
+            return f"{of.ge:,} … {of.le:,}"
+        bounds = ((">", of.gt), ("≥", of.ge), ("<", of.lt), ("≤", of.le))
+        words = " and ".join(f"{sign} {bound:,}" for sign, bound in bounds if bound is not None)
+        return f"{'whole number' if isinstance(of, types.IntType) else 'number'} {words}".strip()
+    if isinstance(of, types.LiteralType):
+        return ", ".join(str(value) for value in sorted(of.values, key=str))
+    if isinstance(of, types.UnionType):
+        return " or ".join(map(allowed, of.types))
+    if items := getattr(of, "item_types", None):
+        return f"{len(items)} of: {allowed(items[0])}"
+    words = {types.BoolType: "true, false", types.StrType: "text", types.NoneType: "null"}
+    return words.get(type(of), type(of).__name__)

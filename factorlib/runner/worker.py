@@ -1,7 +1,12 @@
-"""One step, in a worker: load its stage, run it in a temporary folder, check what it made, hand it to the store.
+"""Steps in processes: of this machine, or of the workers of a Dask cluster.
 
-A task carries keys and paths, never arrays, and whatever happens comes back as an `Outcome`: an executor needs no more
-than `submit`.  While it runs a step says how far it is, and what it warns of, in a file of events.
+How many threads a library uses, and in which order sets are walked, is fixed when a process starts, and results depend on it.
+So each process is started for one number of threads, in an environment of its own, with the modules that are on disk now, and
+runs one step at a time: a library that crashes, or a step that is killed for want of memory, ends that process alone.
+A process ends with the one that started it, and with its run, whose lock it watches.
+
+A task carries keys and paths, never arrays, and whatever happens comes back as an `Outcome`: an executor needs no more than
+`submit`.  While it runs a step says how far it is, and what it warns of, in a file of events.
 """
 
 from __future__ import annotations
@@ -11,61 +16,57 @@ import datetime
 import importlib
 import json
 import logging
+import multiprocessing
 import os
 import platform
 import resource
 import shutil
+import signal
 import sys
+import threading
 import time
 import traceback
+import uuid
 import warnings
 from collections.abc import Callable, Iterable
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import Future, ProcessPoolExecutor, ThreadPoolExecutor
+from concurrent.futures.process import BrokenProcessPool
 from functools import partial
+from importlib.util import find_spec
+from multiprocessing import resource_tracker
 from pathlib import Path
 from types import ModuleType
 from typing import Any, Self
 
 import msgspec
 
-from factorlib.disk import disk_error
 from factorlib.errors import InputError
 from factorlib.runner.closure import CODE, Sources
-from factorlib.runner.filehash import FileHashes, hash_of_file
-from factorlib.runner.home import sound_lines
-from factorlib.runner.pipeline import Stage
 from factorlib.runner.plan import difference
-from factorlib.runner.project import LIBRARY
-from factorlib.runner.shared import copy_shipped, fetch, offer
-from factorlib.runner.stop import take_sigterm_back
-from factorlib.runner.store import Entry, Stamp, Store, stamps_of
+from factorlib.runner.project import LIBRARY, Code, Stage, take_sigterm_back
+from factorlib.runner.store import (
+    LOCK,
+    Entry,
+    FileHashes,
+    Stamp,
+    Store,
+    copy_shipped,
+    hash_of_file,
+    is_locked,
+    stamps_of,
+)
 from factorlib.stage import Inputs, serial_map
-from factorlib.wholefile import append_text, replace_file
+from factorlib.wholefile import append_text, disk_error, replace_file
 from factorlib.yamlfile import convert
 
 EVERY = 0.2  # seconds between two words of progress
 
 
-class Code(msgspec.Struct, frozen=True):
-    """Which stage, where its module is found, the parameters given to it (in which file), and how much of the machine it has.
-
-    threads: of its libraries' numerics;  cores: that independent work is spread over
-    """
-
-    root: Path
-    package: str
-    stage: str
-    params: dict[str, Any]
-    settings: Path
-    threads: int = 1
-    cores: int = 1
-
-
 class Task(msgspec.Struct, frozen=True):
-    """All that a worker knows of a step.
+    """Description of a step for a worker.
 
     files:   by the name that the record has for each, whose hash it holds
-    shared:  a store that others use too: what it has is copied, what is made is offered to it;  forced: make it in any case
+    forced:  make it, whatever ships with the source
     """
 
     code: Code
@@ -79,12 +80,11 @@ class Task(msgspec.Struct, frozen=True):
     record: dict[str, Any]
     temporary: Path
     events: Path
-    shared: Path | None = None
     forced: bool = False
 
 
 class Outcome(msgspec.Struct, frozen=True):
-    """How a step ended.
+    """Result of a step that ended.
 
     output: hash of what was made;  error: what went wrong;  traceback: of a defect, None where a user can mend it
     code_changed: whether the stage's code is another than that of the key, so that further steps of it would fail alike
@@ -103,28 +103,21 @@ class CodeChanged(InputError):
 
 def run_step(task: Task) -> Outcome:
     """Run a task and keep its result in the store.  Raises nothing: an error of any kind is part of the outcome."""
+    temporary = task.temporary.with_name(f"{task.temporary.name}-{uuid.uuid4().hex[:8]}")
+    task = msgspec.structs.replace(task, temporary=temporary)  # another try of it may still be ending elsewhere
     meter, code, store = Meter(), task.code, Store(task.store)
-    shared = Store(task.shared) if task.shared else None
     with Events(task.events) as events:
         try:
-            fetched = shared and not task.forced and fetch(shared, store, task.key, task.temporary, events.say)
-            entry = fetched or _made(task, store, events)
-            if fetched:
-                for event in map(json.loads, sound_lines(store.log(task.key))):
-                    if event["event"] == "warning":
-                        events.say(str(event.get("text", "")))
-            else:
-                where = {name: task.record[name] for name in ("photo", "recipe") if name in task.record}
-                where |= {"stage": code.stage, "key": task.key}
-                lines = [where | {"event": "warning", "text": text} for text in events.warnings]
-                lines.append(where | {"event": "done", **meter.read(code.threads, code.cores)})
-                store.logs.mkdir(parents=True, exist_ok=True)
-                text = "".join(json.dumps(line, sort_keys=True) + "\n" for line in lines)
-                replace_file(store.log(task.key), text.encode())
+            entry = _made(task, store, events)
+            where = {name: task.record[name] for name in ("photo", "recipe") if name in task.record}
+            where |= {"stage": code.stage, "key": task.key}
+            lines = [where | {"event": "warning", "text": text} for text in events.warnings]
+            lines.append(where | {"event": "done", **meter.read(code.threads, code.cores)})
+            store.logs.mkdir(parents=True, exist_ok=True)
+            text = "".join(json.dumps(line, sort_keys=True) + "\n" for line in lines)
+            replace_file(store.log(task.key), text.encode())
             store.keep(task.key, entry)
             shutil.rmtree(store.unfinished / task.key, ignore_errors=True)
-            if shared and not fetched:
-                offer(store, shared, task.key, events.say)
             return Outcome(output=entry.output, seconds=meter.read()["seconds"])
         except BaseException as error:  # whatever it is, the parent reports it
             shutil.rmtree(task.temporary, ignore_errors=True)  # on a full disk there is room for a log then
@@ -147,12 +140,17 @@ def load_stage(code: Code) -> ModuleType:
 
 
 def params_of(code: Code) -> msgspec.Struct:
-    """The stage's parameters as its own struct.  Raises InputError where one is out of its bounds."""
+    """Convert the stage's parameters to its own struct.  Raises InputError where one is out of its bounds."""
     return convert(code.params, load_stage(code).Params, code.settings, f"stages.{code.stage}.params")
 
 
+def check_params(code: Code) -> None:
+    """Raise InputError where a parameter of a stage is out of its bounds; return nothing, which the stage's module defines."""
+    params_of(code)
+
+
 def spread(cores: int, function: Callable, items: Iterable) -> list:
-    """The function of every item, in order, on so many threads."""
+    """Apply the function to every item, in order, on so many threads."""
     if cores == 1:
         return serial_map(function, items)
     with ThreadPoolExecutor(cores) as pool:
@@ -200,7 +198,7 @@ def _check_inputs(task: Task, results: dict[Path, dict[str, Stamp]]) -> None:
 
 
 def _check_code(task: Task, hashes: FileHashes) -> None:
-    """The code that the key was made from is the code there is: the source of every module, and the package data."""
+    """Check that the key's code is the code there is: the source of every module, and the package data."""
     code = task.code
     closure = Sources([code.root, LIBRARY], hashes).closure(code.package, code.stage, code.settings)
     now, before = closure.record, {n: value for n, value in task.record.items() if n.startswith(CODE)}
@@ -213,7 +211,7 @@ def _check_code(task: Task, hashes: FileHashes) -> None:
 
 
 class Meter:
-    """What is spent since it was made: wall and processor seconds, and the most memory."""
+    """Meter of wall and processor seconds since it was made, and the most memory."""
 
     def __init__(self) -> None:
         with contextlib.suppress(OSError), open("/proc/self/clear_refs", "w") as stream:  # Linux counts the peak anew
@@ -288,3 +286,163 @@ class Events(logging.Handler):
     def _write(self, event: dict) -> None:
         with contextlib.suppress(OSError):  # on a full disk: the step itself fails there, or finds room again
             append_text(self.path, json.dumps(event) + "\n")
+
+
+# ── processes of this machine ────────────────────────────────────────────────────────────────────────────────────────
+
+THREAD_VARIABLES = [*(f"{of}_NUM_THREADS" for of in ("OMP", "MKL", "OPENBLAS", "NUMEXPR")), "VECLIB_MAXIMUM_THREADS"]
+FIXED = {
+    "PYTHONHASHSEED": "0",
+    "OMP_WAIT_POLICY": "PASSIVE",  # threads that wait by spinning stand in the way of others, and of each other
+    "MALLOC_TRIM_THRESHOLD_": None,  # Dask's nanny sets it; sums of 700 × 700 numbers then take three times as long
+}
+WATCH = 0.3  # seconds between two looks at whether the run goes on
+PATIENCE = 10  # seconds to reach a scheduler
+AHEAD = 2  # steps are handed to a cluster for so many times its cores, so that no worker waits for its next one
+TRIES = 3  # of a step whose process or worker dies, on a cluster
+_starting = threading.Lock()
+
+
+class Processes:
+    """Processes of this machine.  run: folder of the run, with whose lock they end; None where there is no run."""
+
+    def __init__(self, run: Path | None = None):
+        self.run, self.pools, self._busy = run, [], {}
+        can_say = hasattr(os, "sched_getaffinity")  # which cores this process may use
+        self._cores = len(os.sched_getaffinity(0)) if can_say else os.cpu_count() or 1
+
+    @property
+    def cores(self) -> int:
+        """Return the most cores that one step may have."""
+        return self._cores
+
+    @property
+    def capacity(self) -> int:
+        """Return the cores of the steps that may be started."""
+        return self._cores
+
+    def free(self, cores: int) -> bool:
+        """Return whether a step of `cores` cores may start now: the cores suffice, or nothing else runs."""
+        self._busy = {future: count for future, count in self._busy.items() if not future.done()}
+        return not self._busy or sum(self._busy.values()) + cores <= self.capacity
+
+    def submit(self, cores: int, threads: int, function: Callable, argument: Any) -> Future:
+        """Start `function(argument)` in a process of `threads` threads, which takes `cores` cores."""
+        with _starting:
+            future = self._submit(threads, function, argument)
+        self._busy[future] = cores
+        return future
+
+    def _submit(self, threads: int, function: Callable, argument: Any) -> Future:
+        idle = (pool for of, pool, last in self.pools if of == threads and last.done() and last.exception() is None)
+        if (pool := next(idle, None)) is None:
+            pool = ProcessPoolExecutor(1, multiprocessing.get_context("spawn"), _watch, (self.run,))
+        self.pools = [each for each in self.pools if each[1] is not pool]
+        resource_tracker.ensure_running()  # which unblocks SIGINT
+        masked = signal.pthread_sigmask(
+            signal.SIG_BLOCK, {signal.SIGINT}
+        )  # the process inherits that: it never sees one
+        fixed = FIXED | dict.fromkeys(THREAD_VARIABLES, str(threads))
+        before = {name: os.environ.get(name) for name in fixed}
+        try:
+            _set_environment(fixed)
+            future = pool.submit(function, argument)
+        except BrokenProcessPool:  # it was killed while it had nothing to do
+            return self._submit(threads, function, argument)
+        finally:
+            _set_environment(before)
+            signal.pthread_sigmask(signal.SIG_SETMASK, masked)
+        self.pools.append((threads, pool, future))
+        return future
+
+    def close(self) -> None:
+        """End the processes, once the run's lock is free at once, else when they have done what they do."""
+        for _, pool, _ in self.pools:
+            pool.shutdown()
+
+
+def _set_environment(values: dict[str, str | None]) -> None:
+    for name, value in values.items():
+        if value is None:
+            os.environ.pop(name, None)
+        else:
+            os.environ[name] = value
+
+
+def _watch(run: Path | None) -> None:
+    """Begin a process: no signal but its parent's end, or that of its run, stops it."""
+    for number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, signal.SIG_IGN)
+
+    def end_with_parent_and_run() -> None:
+        while multiprocessing.parent_process().is_alive() and (run is None or is_locked(run / LOCK)):
+            time.sleep(WATCH)
+        os._exit(1)
+
+    threading.Thread(target=end_with_parent_and_run, daemon=True).start()
+
+
+# ── on a cluster ─────────────────────────────────────────────────────────────────────────────────────────────────────
+
+
+class Cluster(Processes):
+    """Processes of the workers of a Dask scheduler.  Raises InputError where none answers at the address."""
+
+    def __init__(self, scheduler: str, run: Path, say: Callable[[str], None]):
+        if find_spec("distributed") is None:
+            cure = "make setup EXTRAS=dask, or pip install 'factorlib[dask]'"
+            raise InputError("Dask is not installed", key="executor", cure=cure)
+        from distributed import Client
+
+        super().__init__(run)
+        self.scheduler, self.say, self._asked = scheduler, say, False
+        for name in ("distributed", "distributed.client", "distributed.core", "distributed.comm"):
+            logging.getLogger(name).setLevel(logging.CRITICAL)  # what they say of a lost connection is in the outcome
+        say(f"connecting to {scheduler}")
+        try:
+            self.client = Client(scheduler, timeout=PATIENCE, set_as_default=False)
+        except Exception as error:  # what answers there may be anything: an HTTP server, garbage
+            cure = "start one: dask scheduler --port 8786; or leave the executor out, for processes of this machine"
+            words = f"no Dask scheduler answers at {scheduler} ({str(error) or f'nothing in {PATIENCE} s'})"
+            raise InputError(words, key="executor", cure=cure) from error
+        self._executor = self.client.get_executor(pure=False, retries=TRIES - 1)
+        self._workers = self.client.nthreads()
+
+    @property
+    def cores(self) -> int:
+        """Return the cores of the largest worker that is there now, 1 where none is."""
+        return max(self._workers.values(), default=1)
+
+    @property
+    def capacity(self) -> int:
+        """Return the cores of the steps that may be handed out; say once that there is no worker."""
+        with contextlib.suppress(Exception):  # of a scheduler that is gone, which ends the tasks too
+            self._workers = self.client.nthreads()
+        if not self._workers and not self._asked:
+            self._asked = True  # Dask keeps its tasks for workers that come
+            self.say(
+                f"waiting: there is no worker at {self.scheduler}; start one: .venv/bin/dask worker {self.scheduler}"
+            )
+        return AHEAD * sum(self._workers.values())
+
+    def _submit(self, threads: int, function: Callable, argument: Any) -> Future:
+        return self._executor.submit(_on_worker, self.run, threads, function, argument)
+
+    def close(self) -> None:
+        """Leave the cluster; tasks that are not finished are cancelled, and their processes have ended."""
+        if not all(future.done() for future in self._busy):
+            time.sleep(2 * WATCH)
+        self._executor.shutdown(wait=False)
+        self.client.close()
+
+
+_of_runs: dict[Path, Processes] = {}  # of a worker
+
+
+def _on_worker(run: Path, threads: int, function: Callable, argument: Any) -> Any:
+    """Compute `function(argument)` in a process of this worker, which itself was started by somebody else."""
+    if not run.is_dir():
+        cure = "keep build/ and the data on a file system that all machines mount at the same path"
+        raise InputError(f"the worker on {os.uname().nodename} does not see the run's folder", file=run, cure=cure)
+    multiprocessing.current_process().daemon = False  # those of Dask's nanny may start no process
+    return _of_runs.setdefault(run, Processes(run)).submit(1, threads, function, argument).result()

@@ -17,9 +17,9 @@ from typing import Any
 import msgspec
 
 from factorlib.errors import InputError, did_you_mean
-from factorlib.runner import gc, verbs
-from factorlib.runner.filehash import FileHashes
+from factorlib.runner import results_folder, verbs
 from factorlib.runner.project import LIBRARY, Data, Project, Provider
+from factorlib.runner.store import FileHashes
 from studies.study import FULL, QUICK, Scale, Study
 
 ORDER = (  # of the page
@@ -126,7 +126,7 @@ def forget(scale: Scale, names: list[str], root: Path = LIBRARY) -> int:
         shutil.rmtree(project.build / name / "pictures", ignore_errors=True)
         for file in FINISHED:
             (project.build / name / file).unlink(missing_ok=True)
-        gc.clean(project, name)
+        results_folder.clean(project, name)
     if project.build.is_dir():
         write_page(project)
     return 0
@@ -137,5 +137,5 @@ def collect(agreed: Callable[[], bool]) -> int:
     for project in (studies(FULL), studies(QUICK)):
         if (project.build / "store").is_dir():
             print(f"{project.shown(project.build)}:")
-            gc.collect(project, agreed)
+            results_folder.collect(project, agreed)
     return 0

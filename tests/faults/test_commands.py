@@ -12,7 +12,7 @@ from pathlib import Path
 import pytest
 
 from factorlib.errors import InputError
-from factorlib.runner import gc, verbs
+from factorlib.runner import results_folder, verbs
 from factorlib.runner.project import LIBRARY
 from tests.faults.battered import call
 from tests.runner import toy
@@ -48,7 +48,7 @@ def everything(project):
 def clean(project, dataset):
     """What `make clean` returns or refuses with."""
     try:
-        return gc.clean(project, dataset)
+        return results_folder.clean(project, dataset)
     except InputError as error:
         return str(error)
 

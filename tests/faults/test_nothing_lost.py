@@ -21,8 +21,8 @@ from pathlib import Path
 
 import pytest
 
-from factorlib.runner.gc import collect, verify
 from factorlib.runner.project import LIBRARY
+from factorlib.runner.results_folder import collect, verify
 from tests.runner import toy
 from tests.runner.toy import done, edit, files_of, make, new_runs, reasons, state, write
 
@@ -126,7 +126,7 @@ def kill(process, whom):
             os.killpg(process.pid, signal.SIGKILL)
         elif whom == "the run":
             os.kill(process.pid, signal.SIGKILL)
-        elif pids := members(process.pid, b"runner.child"):
+        elif pids := members(process.pid, b"--multiprocessing-fork"):
             os.kill(pids[-1], signal.SIGKILL)
 
 
@@ -198,7 +198,7 @@ def test_a_killed_worker_does_not_fail_the_step_beside_it(fresh, tmp_path):
     toy.wait_for(fresh, tmp_path / "go")
     process = start(fresh)
     assert wait_until(lambda: at_work(fresh, "upper-a") and at_work(fresh, "upper-b"))
-    os.kill(members(process.pid, b"runner.child")[0], signal.SIGKILL)
+    os.kill(members(process.pid, b"--multiprocessing-fork")[0], signal.SIGKILL)
     (tmp_path / "go").touch()
     code, text = end(process)
     assert code == 1 and text.count("process died") == 1 and "1 step failed" in text
@@ -267,7 +267,7 @@ SLOW_GC = """
 import os, sys, time
 from pathlib import Path
 from tests.runner import toy
-from factorlib.runner.gc import collect
+from factorlib.runner.results_folder import collect
 def slow(function):
     def wrapped(*words, **more):
         time.sleep(0.02)

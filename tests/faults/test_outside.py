@@ -20,8 +20,8 @@ from factorlib.dataset.read import read_dataset
 from factorlib.errors import InputError
 from factorlib.recipe.read import read_recipe
 from factorlib.runner import verbs
+from factorlib.runner.dataset_state import survey
 from factorlib.runner.project import LIBRARY, Project, photo_sets
-from factorlib.runner.survey import survey
 from factorlib.validation import Validation
 from tests.faults.battered import call
 from tests.faults.good import DATASET, TRUTH, edited, make_set, put

@@ -18,11 +18,10 @@ import pytest
 import yaml
 
 from factorlib.errors import InputError
-from factorlib.runner import words
-from factorlib.runner.pipeline import read_pipeline
+from factorlib.runner import verbs
+from factorlib.runner.dataset_state import survey
 from factorlib.runner.plan import Listing, plan
-from factorlib.runner.project import LIBRARY, photo_sets
-from factorlib.runner.survey import survey
+from factorlib.runner.project import LIBRARY, photo_sets, read_pipeline
 from tests.faults.battered import real_project
 from tests.faults.good import edited as edited_data
 from tests.runner import toy
@@ -226,7 +225,7 @@ def test_the_field_and_the_parameter_that_changed_are_named_with_old_and_new(rea
         return plan(seen.spec, seen.records, listing if made else Listing(Everything(), {}))
 
     def why(made, spec=SET, settings=()):
-        return "\n".join(words.plan_lines(planned_with(spec, settings, made), True))
+        return "\n".join(verbs.plan_lines(planned_with(spec, settings, made), True))
 
     made, lobes = planned_with(), ["solve.lobes=48"]
     for place, value, line in FIELDS:

@@ -14,7 +14,6 @@ import pytest
 import torch
 
 from factorlib.checkpoint import Checkpoint
-from factorlib.disk import disk_error
 from factorlib.errors import InputError
 from factorlib.export.gltf import write_glb
 from factorlib.export.materialx import materialx
@@ -31,7 +30,7 @@ from factorlib.reflection.network import Layers, write_layers
 from factorlib.results.materials import Reflectance
 from factorlib.runner.project import LIBRARY
 from factorlib.urm.observations import write_observations
-from factorlib.wholefile import bytes_of, replace_file, write_text
+from factorlib.wholefile import bytes_of, disk_error, replace_file, write_text
 from tests.faults import good
 
 RNG = np.random.default_rng

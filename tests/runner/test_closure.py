@@ -10,10 +10,9 @@ import pytest
 
 from factorlib.runner import verbs
 from factorlib.runner.closure import Sources, source_of
-from factorlib.runner.filehash import FileHashes
-from factorlib.runner.pipeline import read_pipeline
-from factorlib.runner.project import LIBRARY, Project, photo_sets
-from factorlib.runner.words import parameters
+from factorlib.runner.project import LIBRARY, Project, photo_sets, read_pipeline
+from factorlib.runner.store import FileHashes
+from factorlib.runner.verbs import parameters
 from tests.runner import toy
 
 FUNCTION = "def f(x):\n    return x + 1\n"

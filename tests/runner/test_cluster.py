@@ -12,24 +12,20 @@ import threading
 import time
 from pathlib import Path
 
-import msgspec
 import pytest
 
 pytest.importorskip("distributed", reason="make setup EXTRAS=dask")
 
 from factorlib.errors import InputError
-from factorlib.runner import cluster
-from factorlib.runner.child import TRIM
-from factorlib.runner.cluster import Site
-from factorlib.runner.pipeline import read_pipeline, with_settings
-from factorlib.runner.project import LIBRARY
+from factorlib.runner import worker
+from factorlib.runner.project import LIBRARY, read_pipeline, with_settings
 from tests.faults.test_nothing_lost import start, wait_until
 from tests.runner import toy
 from tests.runner.toy import files_of, make, write
 
 pytestmark = pytest.mark.skipif(not Path("/proc/self/stat").exists(), reason="looks for processes in /proc")
 
-FIXED = {"PYTHONHASHSEED": "0", "OMP_NUM_THREADS": "2", TRIM: None}  # of a step of two threads
+FIXED = {"PYTHONHASHSEED": "0", "OMP_NUM_THREADS": "2", "MALLOC_TRIM_THRESHOLD_": None}  # of a step of two threads
 PROOF = f"""
 import json, os
 import msgspec
@@ -112,23 +108,15 @@ class LiveCluster(contextlib.AbstractContextManager):
         self.close()
 
 
-def offspring(pid: int) -> list[int]:
-    """All processes below a process, parents first."""
-    below: dict[int, list[int]] = {}
+def started_by(pid: int) -> list[int]:
+    """The processes that Python's multiprocessing has started in a process: workers of a nanny, those of steps in a worker."""
+    children = []
     for stat in Path("/proc").glob("[0-9]*/stat"):
         with contextlib.suppress(OSError):
-            below.setdefault(int(stat.read_text().rpartition(")")[2].split()[1]), []).append(int(stat.parent.name))
-    pids = [pid]
-    for one in pids:
-        pids += below.get(one, [])
-    return pids[1:]
-
-
-def doing(pid: int, word: str) -> bool:
-    """Whether a process has that word on its command line."""
-    with contextlib.suppress(OSError):
-        return word.encode() in Path(f"/proc/{pid}/cmdline").read_bytes()
-    return False
+            parent = int(stat.read_text().rpartition(")")[2].split()[1])
+            if parent == pid and b"--multiprocessing-fork" in stat.with_name("cmdline").read_bytes():
+                children.append(int(stat.parent.name))
+    return children
 
 
 @pytest.fixture(scope="module")
@@ -212,23 +200,19 @@ def at_work(project, count):
     return len(list((project.build / "store" / "tmp").glob("run-*/upper-*/*.json"))) == count
 
 
-def of_run(project, pids):
-    """Those of the processes that compute for a run of the project."""
-    return [pid for pid in pids if doing(pid, "runner.child") and doing(pid, str(project.build))]
+def busy(live, whose):
+    """Of a cluster the workers that compute a step, or the processes of these in which they do."""
+    workers = [pid for process in live.processes for pid in started_by(process.pid)]
+    computing = {worker: started_by(worker) for worker in workers}
+    return [pid for worker, of in computing.items() for pid in ([worker] if whose == "worker" else of) if of]
 
 
-def of_live(live, word):
-    """Processes of the cluster with a word on their command line."""
-    return [pid for process in live.processes for pid in offspring(process.pid) if doing(pid, word)]
-
-
-@pytest.mark.parametrize("victim", ["spawn_main", pytest.param("runner.child", marks=pytest.mark.long)])
+@pytest.mark.parametrize("victim", ["worker", pytest.param("process", marks=pytest.mark.long)])
 def test_a_worker_or_child_killed_in_mid_step_costs_that_step_alone_and_no_bit(project, live, tmp_path, victim):
     go, tries = waiting_for_a_file(project, tmp_path)
     process = start(project, *live.settings)
     assert wait_until(lambda: at_work(project, 2))
-    busy = [pid for pid in of_live(live, victim) if of_run(project, [pid, *offspring(pid)])]
-    os.kill(busy[0], signal.SIGKILL)
+    os.kill(busy(live, victim)[0], signal.SIGKILL)
     assert wait_until(lambda: len(tries.read_text()) == 3)
     go.touch()
     assert "error" not in ended(process)
@@ -245,7 +229,7 @@ def test_a_run_that_is_stopped_leaves_no_step_running_and_the_cluster_to_others(
     go, _ = waiting_for_a_file(project, tmp_path)
     process = start(project, *live.settings)
     assert wait_until(lambda: at_work(project, 2))
-    computing = [pid for process in live.processes for pid in of_run(project, offspring(process.pid))]
+    computing = busy(live, "process")
     assert len(computing) == 2
     process.send_signal(number)
     text = ended(process, -9 if number == signal.SIGKILL else 128 + number)
@@ -260,11 +244,8 @@ def test_a_run_that_is_stopped_leaves_no_step_running_and_the_cluster_to_others(
 # ── what is refused ──────────────────────────────────────────────────────────────────────────────────────────────────
 
 
-def test_a_run_whose_workers_are_all_killed_says_so_and_goes_on_when_one_comes(
-    project, live, tmp_path, monkeypatch, capsys
-):
+def test_a_run_whose_workers_are_all_killed_says_so_and_goes_on_when_one_comes(project, live, tmp_path, capsys):
     """The last test of these workers."""
-    monkeypatch.setattr(cluster, "PATIENCE", 2)
     go, tries = waiting_for_a_file(project, tmp_path)
 
     def kill_all():
@@ -283,26 +264,21 @@ def test_a_run_whose_workers_are_all_killed_says_so_and_goes_on_when_one_comes(
     assert kept(project) == beside(project)
 
 
-@pytest.mark.parametrize("change, words, cure", [
-    ({"run": Path("/nowhere")}, "does not see the run's folder", "mount at the same path"),
-    ({"library": Path("/other")}, f"runs the code in {LIBRARY}", "cd /other && .venv/bin/dask worker"),
-])  # fmt: skip
-def test_a_worker_elsewhere_is_refused(tmp_path, change, words, cure):
-    good = Site(tmp_path)
-    assert good.fault() is None
-    fault = str(msgspec.structs.replace(good, **change).fault())
-    assert words in fault and cure in fault
+def test_a_worker_that_does_not_see_the_build_folder_is_refused():
+    with pytest.raises(InputError, match="does not see the run's folder") as refused:
+        worker._on_worker(Path("/nowhere"), 1, abs, -1)
+    assert "mount at the same path" in refused.value.cure
 
 
 def test_without_dask_the_cure_names_the_extra(project, monkeypatch):
-    monkeypatch.setattr(cluster, "find_spec", lambda name: None)
+    monkeypatch.setattr(worker, "find_spec", lambda name: None)
     with pytest.raises(InputError, match="EXTRAS=dask"):
         make(project, "executor=tcp://127.0.0.1:1")
 
 
 @pytest.mark.parametrize("address", ["tcp://127.0.0.1:9", "tls://127.0.0.1:9", "ucx://127.0.0.1:9"])
 def test_a_scheduler_out_of_reach_is_named(project, monkeypatch, address, capfd):
-    monkeypatch.setattr(cluster, "PATIENCE", 0.3)
+    monkeypatch.setattr(worker, "PATIENCE", 0.3)
     with pytest.raises(InputError, match=f"no Dask scheduler answers at {address}") as refused:
         make(project, f"executor={address}")
     assert "dask scheduler --port" in str(refused.value) and "Traceback" not in "".join(capfd.readouterr())

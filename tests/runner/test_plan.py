@@ -5,8 +5,8 @@ import pytest
 from hypothesis import given
 
 from factorlib.errors import InputError
-from factorlib.runner.pipeline import Pipeline, Stage, read_pipeline
 from factorlib.runner.plan import Listing, Spec, Step, difference, hash_of, plan
+from factorlib.runner.project import Pipeline, Stage, read_pipeline
 
 PIPELINE = Pipeline(
     1,

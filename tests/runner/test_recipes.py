@@ -7,10 +7,9 @@ import pytest
 
 from factorlib.errors import InputError
 from factorlib.runner import verbs
-from factorlib.runner.gc import clean, collect
-from factorlib.runner.home import made_homes
+from factorlib.runner.dataset_state import survey
 from factorlib.runner.project import Project, Provider, Recipe
-from factorlib.runner.survey import survey
+from factorlib.runner.results_folder import clean, collect, made_homes
 from tests.runner import toy
 from tests.runner.toy import write
 

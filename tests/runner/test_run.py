@@ -1,10 +1,11 @@
 """Real runs of a toy pipeline: what runs, what is kept, what is shown, what survives."""
 
+import io
 import json
 import os
 import re
 import shutil
-import threading
+import sys
 import time
 from functools import partial
 
@@ -12,11 +13,8 @@ import pytest
 
 from factorlib.errors import InputError
 from factorlib.runner import display, verbs
-from factorlib.runner.child import Pools
-from factorlib.runner.gc import clean, collect
-from factorlib.runner.home import usual_costs
-from factorlib.runner.plan import Step
-from factorlib.runner.survey import survey
+from factorlib.runner.plan import Planned, Step
+from factorlib.runner.results_folder import clean, collect
 from factorlib.runner.worker import Events
 from tests.faults.test_nothing_lost import start, wait_until
 from tests.runner import toy
@@ -182,26 +180,6 @@ def test_what_goes_wrong_in_a_stage_fails_its_step_and_the_next_run_resumes(
     assert new_runs(project) == []
 
 
-class Holding(Exception):
-    """An error that pickle cannot take apart."""
-
-
-def fail(text):
-    error = Holding(text)
-    error.lock = threading.Lock()
-    raise error
-
-
-def test_an_error_of_a_child_that_cannot_be_pickled_says_its_type_and_text_and_the_child_lives():
-    pools = Pools(1)
-    try:
-        with pytest.raises(RuntimeError, match="Holding: a lock"):
-            pools.submit(1, 1, fail, "a lock").result(30)
-        assert pools.submit(1, 1, abs, -1).result(30) == 1 and len(pools.children) == 1
-    finally:
-        pools.close(kill=True)
-
-
 # ── what is told ─────────────────────────────────────────────────────────────────────────────────────────────────────
 
 
@@ -240,27 +218,20 @@ def test_progress_that_moves_is_told_at_once_and_what_stands_is_not(tmp_path):
     assert [json.loads(line)["done"] for line in (tmp_path / "events.jsonl").read_text().splitlines()] == [0, 3, 0.5]
 
 
-def test_what_is_left_is_told_where_every_stage_ran_before_by_what_it_took(project, monkeypatch):
-    usual = usual_costs(project.build / "set" / "log.jsonl")
-    assert usual.keys() == {"upper", "count", "table", "total"} and usual["total"][1] == 2 and usual["upper"][0] < 60
-    seen, shown, now = survey(project, "set", None, ["upper.times=2"]), display.Display(), [100.0]
-    monkeypatch.setattr(display.time, "monotonic", lambda: now[0])
-    shown.plan(seen.planned())
-    assert shown.seconds_left() is None and display.in_words(None) == ""
-    shown.usual, shown.cores = {"upper": (8.0, 1), "count": (1.0, 1), "total": (10.0, 2)}, 2
-    assert shown.seconds_left() == pytest.approx((2 * 8 + 2 * 1 + 10 * 2) / 2)  # table is current
-    for photo in "ab":
-        shown.start(Step("upper", photo))
-    now[0] += 5
-    assert shown.seconds_left() == pytest.approx((2 * 3 + 2 * 1 + 10 * 2) / 2)
-    now[0] += 60  # longer than before: nothing is left of them
-    assert shown.seconds_left() == pytest.approx((2 * 1 + 10 * 2) / 2)
-    shown.finish(Step("upper", "a"), 65.0), shown.finish(Step("upper", "b"), 65.0)
-    assert shown.seconds_left() == pytest.approx((2 * 1 + 10 * 2) / 2)
-    shown.start(Step("table"))  # which never ran before, and whose result the plan found before its process ended
-    assert shown.seconds_left() is None
-    shown.finish(Step("table"), 1.0)
-    assert shown.seconds_left() == pytest.approx((2 * 1 + 10 * 2) / 2)
+def test_a_terminal_shows_a_bar_for_each_stage_and_lines_above_them(monkeypatch):
+    terminal, steps = io.StringIO(), [Step("upper", "a"), Step("upper", "b")]
+    terminal.isatty = lambda: True
+    monkeypatch.setattr(sys, "stderr", terminal)
+    shown = display.Display()
+    shown.plan([Planned(step, "to run", []) for step in steps])
+    for step in steps:
+        shown.start(step)
+    shown.progress(steps[0], 1, 2, "half\x1b[31m")
+    shown.warn(steps[1], "odd\x1b[31m")
+    shown.finish(steps[1], 1.0)
+    shown.close()
+    said = terminal.getvalue()
+    assert "warning: upper/b: odd\\x1b[31m" in said and "1/2" in said and "50% half\\x1b[31m" in said
 
 
 def test_gc_shows_by_stage_and_age_what_is_not_current_asks_and_deletes_that_alone(project, capsys):

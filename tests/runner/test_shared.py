@@ -1,26 +1,18 @@
-"""Results of others: a store that checkouts share, and results that ship with the source.
-
-Made once, copied by the others, and nobody's loss when it is damaged, read-only or gone.
-"""
+"""Results of others: a store that checkouts share, and results that ship with the source."""
 
 import json
 import os
 import shutil
-import subprocess
-import sys
 
 import pytest
 
 from factorlib.errors import InputError
 from factorlib.runner import verbs
-from factorlib.runner.filehash import hash_of_file
-from factorlib.runner.gc import verify
-from factorlib.runner.project import LIBRARY
-from factorlib.runner.shared import MADE_FROM, copied
-from factorlib.runner.store import hash_of
-from factorlib.runner.survey import survey
+from factorlib.runner.dataset_state import survey
+from factorlib.runner.results_folder import clean, collect, verify
+from factorlib.runner.store import MADE_FROM, copied, hash_of, hash_of_file
 from tests.runner import toy
-from tests.runner.toy import files_of, make, make_project, state, write
+from tests.runner.toy import files_of, make, make_project, new_runs, reasons, state, write
 
 COUNTED = "    (Path(__file__).parents[1] / 'computed').open('a').write('x')\n    (out"
 
@@ -38,7 +30,7 @@ def shared(tmp_path, monkeypatch):
 def one(tmp_path, shared):
     """A checkout that has made everything, and so has the shared store."""
     made = checkout(tmp_path / "one")
-    assert make(made) == 0 and computed(made) == 6 and trees(shared) == trees(made.build / "store")
+    assert make(made) == 0 and computed(made) == 6 and not (made.build / "store").exists()
     return made
 
 
@@ -63,30 +55,41 @@ def trees(store):
     return {e["output"]: files_of(store / "trees" / e["output"]) for e in entries if "view" not in e["record"]}
 
 
-def test_what_one_checkout_makes_the_other_copies_with_its_log(tmp_path, one, capsys):
+def test_what_one_checkout_makes_the_other_has(tmp_path, one, capsys):
     other = checkout(tmp_path / "other")
     verbs.show_plan(other, verbs.Wish("set"))
-    assert "not made yet; the shared store has it" in capsys.readouterr().out
+    assert "all 6 steps are current" in capsys.readouterr().out
     assert make(other) == 0 and computed(other) == 0
     assert files_of(other.build / "set" / "total") == files_of(one.build / "set" / "total")
     assert set(state(other).values()) == {"current"} and verify(other, None) == 0
-    assert len((other.build / "set" / "log.jsonl").read_text().splitlines()) == 6, "what it cost is known here too"
+    verbs.show_logs(other, verbs.Wish("set"), None)
+    assert "MB peak" in capsys.readouterr().out, "what it cost is known here too"
+
+
+def test_neither_gc_nor_clean_deletes_what_others_need(tmp_path, one, shared):
+    other, before = checkout(tmp_path / "other"), trees(shared)
+    with pytest.raises(InputError, match="other checkouts share this store"):
+        collect(other)
+    assert make(other) == 0 and clean(other, None) == 0
+    assert trees(shared) == before and not (other.build / "set").exists()
+    assert new_runs(one) == []
 
 
 @pytest.mark.parametrize("damage", ["other content", "missing", "a link", "no tree"])
-def test_a_damaged_result_is_made_here_and_mended_there(tmp_path, one, shared, capsys, damage):
+def test_a_damaged_result_is_made_here_and_mended_there(tmp_path, one, shared, damage):
     sound, other = trees(shared), checkout(tmp_path / "other")
     file = next((shared / "trees").glob("*/table.json"))
+    beside = shutil.copytree(file.parent, tmp_path / "beside")
     file.parent.chmod(0o755)
     file.unlink()
     if damage == "other content":
         file.write_text("7")
     elif damage == "a link":
-        file.symlink_to(next((one.build / "store" / "trees").glob("*/table.json")))
+        file.symlink_to(beside / "table.json")
     elif damage == "no tree":
         file.parent.rmdir()
+    assert reasons(other, "table")[0].startswith("its result is damaged: table.json: ")
     assert make(other, targets=["table"]) == 0 and computed(other) == 1
-    assert "the shared store's result is not as it was kept" in capsys.readouterr().err
     assert trees(shared) == sound
 
 
@@ -128,22 +131,6 @@ def test_one_that_is_not_there_is_said_before_anything_runs(tmp_path, monkeypatc
         assert "FACTORLIB_STORE" in str(caught.value)
         write(tmp_path / "shared", "")
     assert computed(project) == 0
-
-
-@pytest.mark.skipif(os.geteuid() == 0 and shutil.which("setpriv") is None, reason="root writes everywhere")
-def test_one_that_may_only_be_read_is_read(tmp_path, one, shared):
-    other = checkout(tmp_path / "other", a="Alpha", c="Gamma")
-    folders = [shared, *(path for path in shared.rglob("*") if path.is_dir())]
-    for folder in folders:
-        folder.chmod(0o555)
-    before, environment = files_of(shared), {**os.environ, "PYTHONPATH": str(LIBRARY)}
-    drop = ["setpriv", "--bounding-set", "-dac_override,-dac_read_search"] if os.geteuid() == 0 else []
-    command = [*drop, sys.executable, toy.__file__, str(other.root), "set"]
-    done = subprocess.run(command, env=environment, capture_output=True, text=True, timeout=120)
-    for folder in folders:
-        folder.chmod(0o755)
-    assert done.returncode == 0 and "warning" not in done.stderr, done.stderr
-    assert computed(other) == 3 and files_of(shared) == before  # upper/c, count/c, total
 
 
 # ── shipped with the source ──────────────────────────────────────────────────────────────────────────────────────────

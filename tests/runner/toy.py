@@ -13,8 +13,8 @@ from pathlib import Path
 import msgspec
 
 from factorlib.runner import verbs
+from factorlib.runner.dataset_state import survey
 from factorlib.runner.project import Data, Project, Provider
-from factorlib.runner.survey import survey
 
 LETTERS = '''
 """Counting."""

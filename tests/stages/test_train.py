@@ -9,9 +9,9 @@ from safetensors import safe_open
 from factorlib.__main__ import project
 from factorlib.reflection import reflection_operator
 from factorlib.reflection.network import SHIPPED
+from factorlib.runner.dataset_state import survey
 from factorlib.runner.project import LIBRARY
-from factorlib.runner.shared import copy_shipped
-from factorlib.runner.survey import survey
+from factorlib.runner.store import copy_shipped
 from factorlib.stage import Inputs, silent
 from stages import train
 

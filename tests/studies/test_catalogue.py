@@ -5,8 +5,8 @@ import pytest
 import yaml
 
 from factorlib.runner.closure import Sources
-from factorlib.runner.filehash import FileHashes
 from factorlib.runner.project import LIBRARY
+from factorlib.runner.store import FileHashes
 from stages.solve import Params
 from studies.catalogue import parts
 from studies.conclusion import MEASURES

@@ -8,8 +8,8 @@ import sys
 import msgspec
 import pytest
 
+from factorlib.runner.dataset_state import survey
 from factorlib.runner.project import LIBRARY
-from factorlib.runner.survey import survey
 from factorlib.stage import Inputs, silent
 from studies.run import STUDIES, data_of, studies
 from studies.run.page import conclude, write_page

@@ -11,22 +11,32 @@ from typing import Any, NamedTuple
 import msgspec
 
 from factorlib.errors import InputError, did_you_mean
+from factorlib.jsonfile import json_text
 from factorlib.reading import check_plain, reading
 from factorlib.runner.closure import Sources
-from factorlib.runner.filehash import FileHashes
-from factorlib.runner.home import Home, home_of
-from factorlib.runner.pipeline import DATASET, read_pipeline, said_of_settings, with_settings
 from factorlib.runner.plan import Listing, Planned, Record, Spec, Step, plan
-from factorlib.runner.project import ALL, LIBRARY, Data, Project, Recipe
-from factorlib.runner.store import Store
-from factorlib.runner.worker import Code, params_of
+from factorlib.runner.project import (
+    ALL,
+    DATASET,
+    LIBRARY,
+    Code,
+    Data,
+    Project,
+    Recipe,
+    read_pipeline,
+    said_of_settings,
+    with_settings,
+)
+from factorlib.runner.results_folder import Home, claim, home_of, label, point, view_of
+from factorlib.runner.store import FileHashes, Store
+from factorlib.wholefile import replace_file
 
 RENDER = "render"  # the stage whose pictures a recipe replaces
 READ = ("file:", "recipe file:", f"facts:{DATASET}")  # fields of a record: of the dataset and recipe, what a step reads
 
 
 class Handed(NamedTuple):
-    """What a step is handed besides results: facts of the dataset or recipe, and files by the name that its record has for them."""
+    """Facts of the dataset or recipe that a step is handed, and files by the name that its record has for them."""
 
     facts: dict[str, Any]
     files: dict[str, Path]
@@ -34,7 +44,7 @@ class Handed(NamedTuple):
 
 @dataclass
 class Survey:
-    """All that is known before anything runs; `planned` is what every verb shows.
+    """State of a dataset before anything runs; `planned` is what every verb shows.
 
     records:  each step's record but for the results it is handed
     handed:   facts and files of each step
@@ -55,18 +65,18 @@ class Survey:
     settings: list[str]
 
     def planned(self, forced: frozenset[Step] | None = None) -> list[Planned]:
-        """Every step with its state and the reason for it; `forced` replaces the spec's steps that must run."""
+        """Plan every step, with its state and the reason for it; `forced` replaces the spec's steps that must run."""
         spec = self.spec if forced is None else msgspec.structs.replace(self.spec, forced=forced)
         return plan(spec, self.records, Listing(self.store, self.previous, self.store.damaged))
 
     def code(self, name: str, cores: int = 1) -> Code:
-        """A stage with its parameters, as a worker loads it; cores: of the machine, of which it takes what it may."""
+        """Describe a stage with its parameters, as a worker loads it; cores: of the machine, of which it takes what it may."""
         stage, project = self.spec.pipeline.stages[name], self.project
         taken = cores if stage.cores == "all" else min(stage.cores, cores)
         return Code(project.code_root, project.package, name, stage.values, project.pipeline_file, stage.threads, taken)
 
     def faults(self, steps: Iterable[Step], new: bool = False) -> list[str]:
-        """What is wrong with the files that steps read, those of their recipes too, each fault once.
+        """List the faults of the files that steps read, those of their recipes too, each fault once.
 
         new: only where the step's part of the dataset, or a file of its recipe, is another than that of its last result
         """
@@ -90,17 +100,49 @@ class Survey:
         open_ = dict.fromkeys(p.step.stage for p in planned if p.status != "current")
         codes, faults = [self.code(name) for name in open_ if self.spec.pipeline.stages[name].values], []
         if codes:
-            from factorlib.runner.child import Pools
+            from factorlib.runner.worker import Processes, check_params  # a run with nothing to do need not load it
 
-            pools = Pools()
-            try:
-                for future in [pools.submit(1, code.threads, params_of, code) for code in codes]:
-                    error = future.exception()
-                    if isinstance(error, InputError):  # what cannot be loaded says so when it runs
+            with contextlib.closing(Processes()) as processes:
+                for future in [processes.submit(1, code.threads, check_params, code) for code in codes]:
+                    if isinstance(
+                        error := future.exception(), InputError
+                    ):  # what cannot be loaded says so when it runs
                         faults.append(str(said_of_settings(error, self.settings)))
-            finally:
-                pools.close(kill=True)
         return faults
+
+    def remember(self, made: dict[str, str]) -> None:
+        """Write down the keys that steps have now; steps of photos and stages that are no more are dropped."""
+        stages, before = self.spec.pipeline.stages, self.home.keys(lenient=True)
+        names = {*stages, *(str(step) for stage in stages for step in self.spec.steps_of(stage))}
+        asked_for_before = tuple(f"{name}/" for name, stage in stages.items() if stage.over == "recipe")
+        keys = {name: key for name, key in before.items() if name in names or name.startswith(asked_for_before)} | made
+        if keys != before:
+            claim(self.project, self.home, self.data.folder)
+            replace_file(self.home.keys_file, json_text(keys).encode())
+
+    def show(self, planned: list[Planned]) -> None:
+        """Write down what is current and point the links there: of a stage over photos, at one folder with all of them."""
+        home, store, stages = self.home, self.store, self.spec.pipeline.stages
+        current = {p.step: p for p in planned if p.status == "current"}
+        keys, of_photos = {str(step): p.key for step, p in current.items()}, {}
+        for step, p in current.items():
+            if step.photo:
+                of_photos.setdefault(step.stage, {})[step.photo] = p.key
+            else:
+                point(home.folder / str(step), store.trees / p.output, self.project.build)
+        for name, of in of_photos.items():
+            keys[name] = view_of(store, name, of, stages[name].gather)
+            point(home.folder / name, store.trees / store.get(keys[name]), self.project.build)
+        self.remember(keys)
+        for link in home.folder.glob("[!.]*"):  # hidden ones are drafts of links, of another run perhaps
+            if link.is_symlink() and link.name not in stages:
+                link.unlink(missing_ok=True)
+        failed = {label(step) for stage in stages for step in self.spec.steps_of(stage) if step not in current}
+        for path in (path for path in home.errors.glob("*.txt") if path.stem not in failed):
+            path.unlink(missing_ok=True)  # what is written of a failure goes with success, or with the step
+        with contextlib.suppress(OSError):  # what is not empty stays; another run may have removed the folder
+            home.errors.rmdir()
+        store.save()
 
 
 def survey(
@@ -136,7 +178,7 @@ def survey(
         for name in (name for name in targets or [] if name not in pipeline.stages):
             found = f"the stage {name!r} has nothing to do for this data set"
             raise InputError(found, file=data.folder, key=whole.stages[name].when, cure="leave it out")
-        home, store = home_of(project, data.folder), Store(project.build / "store")
+        home, store = home_of(project, data.folder), Store(project.store)
         asked = project.recipes(data, recipes or [])
         spec = Spec(pipeline, data.photos, targets, recipes=list(asked))
         if force:
@@ -156,7 +198,7 @@ def survey(
 def _records(
     project: Project, spec: Spec, data: Data, hashes: FileHashes, recipes: dict[str, Recipe]
 ) -> tuple[dict[Step, Record], dict[Step, Handed]]:
-    """Every step's own part of its record, and what it is handed; each file that is handed counts by its content."""
+    """Return every step's own part of its record, and what it is handed; each file that is handed counts by its content."""
     sources, records, handed = Sources([project.code_root, LIBRARY], hashes), {}, {}
     for name in spec.pipeline.needed(spec.targets):
         stage = spec.pipeline.stages[name]
