@@ -130,7 +130,7 @@ def disk_error(error: BaseException, folder: Path) -> InputError | None:
     while (cause := behind[-1].__cause__ or behind[-1].__context__) is not None and cause not in behind:
         behind.append(cause)
     full = next((each for each in behind if _code(each) in FULL), None)
-    words = FULL[_code(full)] if full else CLOSED.get(_code(error))
+    words = FULL[_code(full)] if full else CLOSED.get(_code(error))  # type: ignore[arg-type, index]
     if words is None:
         return None
     of = full or error
