@@ -14,6 +14,7 @@ from factorlib.generate.shapes import sphere
 from factorlib.images.exr import read_exr
 from factorlib.images.light_map import read_light_map
 from factorlib.images.tone import shown, straightened
+from factorlib.light.lobes import Lobes
 from factorlib.meshes.mesh import Mesh, scaled
 from factorlib.meshes.read import CREASE_DEG, MeshesOnce, read_mesh
 from factorlib.reading import check_plain
@@ -86,8 +87,9 @@ class SolvedSet:
         camera = poses.camera.camera(width, height)
         placed = tuple(self._placed(obj, objects.meshes[obj.mesh], poses) for obj in objects.objects)
         depth = ALL_BOUNCES if self.table.model.interreflection else DIRECT
-        light = light_of(self.inputs["export"], photo, self.lights[photo])
+        light = self.light(photo)
         if sun is not None:
+            assert isinstance(light, Lobes)  # a photo's, and no map of a file
             light = with_sun(light, self.sun_axis(photo, sun), sun.size, sun.strength)
         return PhotoScene(camera, placed, light, self.materials, depth, denoise)
 
