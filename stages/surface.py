@@ -20,7 +20,7 @@ from factorlib.images.exr import read_exr, write_exr
 from factorlib.inference.noise import Noise
 from factorlib.inference.observed import blocks_of_observations, usable
 from factorlib.inference.problem import JointProblem
-from factorlib.inference.start import from_nothing
+from factorlib.inference.start import from_nothing, own_cells
 from factorlib.inference.surface_attach import attached_pixels
 from factorlib.inference.surface_detail import Found, Surfaces, found
 from factorlib.inference.surface_turns import Attached, Detail, joined, no_detail
@@ -185,7 +185,7 @@ def _found(
         problem,
         surfaces,
         of_blocks,
-        from_nothing(len(inputs.facts["dataset.materials"])),
+        from_nothing(len(inputs.facts["dataset.materials"]), own_cells),
         params.seed,
         lambda share, what: progress(share, 1, what),
     )

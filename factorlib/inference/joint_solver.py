@@ -34,6 +34,7 @@ from factorlib.inference.model_selection import (
     effects_chosen,
     gained,
     observations_of,
+    observations_of_lights,
 )
 from factorlib.inference.options import Choices
 from factorlib.inference.problem import JointProblem
@@ -72,7 +73,7 @@ class Asked(msgspec.Struct, frozen=True):
     def all_(self, state: State) -> JointProblem:
         """Return the observations of any confidence that lights are fitted to, under the chosen effects."""
         problem = self.problem.with_effects(state.shadows.kept, state.bounces.kept)
-        return problem.sampled(observations_of(self.choices, state.splitting), self.choices.seed)
+        return problem.sampled(observations_of_lights(self.choices, state.splitting), self.choices.seed)
 
 
 class State(msgspec.Struct, frozen=True):

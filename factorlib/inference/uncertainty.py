@@ -49,7 +49,7 @@ from factorlib.inference.gauge import connected_components
 from factorlib.inference.history import Solution
 from factorlib.inference.likelihood import factorised, inverse_of
 from factorlib.inference.materials import ROUGHNESS, Materials, Point
-from factorlib.inference.model_selection import observations_of
+from factorlib.inference.model_selection import observations_of, observations_of_lights
 from factorlib.inference.options import Choices
 from factorlib.inference.priors import materials_of, unknowns_of
 from factorlib.inference.problem import JointProblem
@@ -95,8 +95,8 @@ def uncertainty_of(
     """
     problem = solution.shown(problem)
     prior = read_light_prior()
-    count = observations_of(choices, solution.splitting)
-    some, all_ = (of.sampled(count, choices.seed) for of in (sure_ones(problem), problem))
+    some = sure_ones(problem).sampled(observations_of(choices, solution.splitting), choices.seed)
+    all_ = problem.sampled(observations_of_lights(choices, solution.splitting), choices.seed)
     found, deviation = Posterior(some, solution.materials, prior, tick).standard_errors()
     fitted = solution.materials.point.materials
     materials = solution.point.materials
