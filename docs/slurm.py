@@ -1,7 +1,8 @@
 """A run on a Slurm cluster: `.venv/bin/python docs/slurm.py DATASET [SET words …]`, from the checkout, on a login node.
 
-Slurm starts the workers as its jobs (dask-jobqueue); the scheduler and the run live in this process, and so as long as it.
-The checkout, its .venv, its build/ and the data set must lie on a file system that all machines mount at the same path.
+Slurm starts the workers as its jobs (dask-jobqueue); the scheduler and the run live in this process, and so as long as
+it.  The checkout, its .venv, its build/ and the data set must lie on a file system that all machines mount at the same
+path.
 """
 
 from __future__ import annotations

@@ -111,10 +111,16 @@ def new_dataset(target: Path, photos: Path, masks: Path | None, meshes: Path | N
         missing += [f"photo {photo}: write which of the meshes it shows" for photo in named if not shown[photo]]
     if masks is None:
         missing.append(NO_MASKS)
-    missing += [f"photo {photo}: no mask called {photo}.png or {photo}_<material>.png"
-                for photo in named if masks is not None and photo not in of_photos]  # fmt: skip
-    missing += [f"photo {photo}: write another `name`: a file of the results is called {photo}"
-                for photo in named if photo in RESERVED_PHOTOS]  # fmt: skip
+    missing += [
+        f"photo {photo}: no mask called {photo}.png or {photo}_<material>.png"
+        for photo in named
+        if masks is not None and photo not in of_photos
+    ]
+    missing += [
+        f"photo {photo}: write another `name`: a file of the results is called {photo}"
+        for photo in named
+        if photo in RESERVED_PHOTOS
+    ]
     spec: dict = {"format": 1, "materials": materials or [UNKNOWN]}
     if not entries:
         parts = {"parts": {name: name for name in materials}}

@@ -34,8 +34,13 @@ FAILURES = (
 COPY_AGAIN = "is it whole, and of the kind its suffix says? copy it again from where it came"
 MOST_BYTES = 1 << 30  # largest file that is read as a whole
 MOST_WORDS = 200  # longest message of a parser, characters
-KINDS = {stat.S_IFDIR: "a folder", stat.S_IFIFO: "a pipe", stat.S_IFSOCK: "a socket", stat.S_IFCHR: "a device",
-         stat.S_IFBLK: "a device"}  # fmt: skip
+KINDS = {
+    stat.S_IFDIR: "a folder",
+    stat.S_IFIFO: "a pipe",
+    stat.S_IFSOCK: "a socket",
+    stat.S_IFCHR: "a device",
+    stat.S_IFBLK: "a device",
+}
 NO_RIGHT = "give yourself the right to read it, and to enter the folders above it (chmod u+rX)"
 NOT_THERE = "put it there, or correct the path"
 CURES = {

@@ -82,9 +82,13 @@ def main(params: Params, inputs: Inputs, out: Path, progress: Progress) -> None:
             write_exr(out / "photos" / f"{name}.exr", photo.detailed(surfaces, detail))
     by_mesh = [{name: values.tolist() for name, values in of.items()} for of in (displacements, factors)]
     table = SurfaceTable(
-        bool(displacements), Tried.of(result.evidence, result.stiffness.turn),
-        bool(factors), Tried.of(result.painted, result.stiffness.factor), result.gains, *by_mesh,
-    )  # fmt: skip
+        bool(displacements),
+        Tried.of(result.evidence, result.stiffness.turn),
+        bool(factors),
+        Tried.of(result.painted, result.stiffness.factor),
+        result.gains,
+        *by_mesh,
+    )
     write_json(out / FILE, table)
     write_json(out / BEGINNING, result.beginning)
     progress(1, 1)

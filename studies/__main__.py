@@ -1,7 +1,8 @@
-"""The command line: `python -m studies [study …] [--quick]`; all studies without a name.  Make passes STUDY and QUICK on.
+"""Command line of the studies: `python -m studies [study …] [--quick]`; all studies without a name.
 
-With --docs the tables of docs/studies.md are written anew afterwards; with --clean the results of studies are forgotten, with --gc
-those that no study names any more are deleted, quick ones among them.
+Make passes STUDY and QUICK on.
+With --docs the tables of docs/studies.md are written anew afterwards; with --clean the results of studies are
+forgotten, with --gc those that no study names any more are deleted, quick ones among them.
 """
 
 from __future__ import annotations

@@ -1,7 +1,8 @@
-"""The sphere of the comparison of methods, seen from the photos' side and from others, and the photos of it that all methods see.
+"""Sphere of the comparison of methods, seen from the photos' side and from others, and its photos.
 
-Points and normals of a sphere of radius 1 are the same, in the photo's light frame (x right, y up, z toward the viewer).  A camera that went
-around it is given by `turn`, view_from_photo, a rotation; the sphere and its light, a lat-long map, stay where they are.
+Points and normals of a sphere of radius 1 are the same, in the photo's light frame (x right, y up, z toward the
+viewer).  A camera that went around it is given by `turn`, view_from_photo, a rotation; the sphere and its light, a
+lat-long map, stay where they are.
 """
 
 from __future__ import annotations
@@ -27,21 +28,24 @@ Radiance = Float[np.ndarray, "n 3"]
 
 
 class View(msgspec.Struct, frozen=True):
-    """What a camera sees in a picture, in rows: its pixels `inside`.  normals: photo's light frame;  turn: view_from_photo"""
+    """Points that a camera sees in a picture, in rows: its pixels `inside`.
+
+    normals: photo's light frame;  turn: view_from_photo
+    """
 
     inside: Bool[np.ndarray, "h w"]
     normals: Float[np.ndarray, "n 3"]
     turn: Float[np.ndarray, "3 3"]
 
     def picture(self, radiance: Radiance) -> Float[np.ndarray, "h w 3"]:
-        """The points' radiance in their pixels, 0 elsewhere."""
+        """Return the points' radiance in their pixels, 0 elsewhere."""
         pixels = np.zeros((*self.inside.shape, 3))
         pixels[self.inside] = radiance
         return pixels
 
 
 def turn(azimuth_deg: float, elevation_deg: float) -> Float[np.ndarray, "3 3"]:
-    """view_from_photo of a camera that went to the right, then up, about the sphere.
+    """Return view_from_photo of a camera that went to the right, then up, about the sphere.
 
     >>> turn(90, 0).round(6).tolist()[2]
     [1.0, 0.0, 0.0]
@@ -50,16 +54,17 @@ def turn(azimuth_deg: float, elevation_deg: float) -> Float[np.ndarray, "3 3"]:
 
 
 def view(size: int, view_from_photo: Float[np.ndarray, "3 3"] = np.eye(3)) -> View:
-    """What a camera sees in a picture `size` pixels across; pixels that see the surface at a grazing angle are left out."""
+    """Return what a camera sees in a picture `size` pixels across, but for pixels at a grazing angle."""
     normals, inside = ball_normals(size)
     inside[inside] = kept = normals[:, 2] > GRAZING
     return View(inside, normals[kept] @ view_from_photo, view_from_photo)
 
 
 def shown(material: Reflectance, light: Map, view: View) -> Radiance:
-    """The sphere in a light, seen by a camera: by quadrature of the light's map, as in other studies.
+    """Render the sphere in a light, as a camera sees it: by quadrature of the light's map, as in other studies.
 
-    For a camera that went around both, the map is turned into the camera's own frame.  Truth and answers go through the same turn.
+    For a camera that went around both, the map is turned into the camera's own frame.  Truth and answers go through the
+    same turn.
     """
     ahead = np.array_equal(view.turn, np.eye(3))
     light = light if ahead else turned_map(light, view.turn, FINER)
@@ -67,26 +72,26 @@ def shown(material: Reflectance, light: Map, view: View) -> Radiance:
 
 
 class Photos(msgspec.Struct, frozen=True):
-    """What all methods see: the sphere as the photos' camera sees it, and its radiance there by material's name and light."""
+    """Photos that all methods see: the sphere from their camera, and its radiance by material's name and light."""
 
     view: View
     radiance: dict[tuple[str, int], Radiance]
 
     @property
     def materials(self) -> list[str]:
-        """By name, in order of their first photo."""
+        """Names of the materials, in order of their first photo."""
         return list(dict.fromkeys(name for name, _ in self.radiance))
 
     @property
     def lights(self) -> list[int]:
-        """By number."""
+        """Numbers of the lights, sorted."""
         return sorted({light for _, light in self.radiance})
 
 
 def photographed(
     case: Comparison, materials: Mapping[str, Reflectance], lights: Mapping[int, Map]
 ) -> tuple[Photos, dict[str, Observations]]:
-    """The photos of a case, and the same as the stage `urm` hands them to `solve`."""
+    """Return the photos of a case, and the same as the stage `urm` hands them to `solve`."""
     tables, radiance = observations_of(case, materials, {li: light_of_lat_long(lights[li]) for li in case.lights}), {}
     for li, table in zip(case.lights, tables.values(), strict=True):
         for m in np.unique(table.material):

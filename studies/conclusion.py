@@ -1,9 +1,9 @@
-"""From the scores of all cases to a table and its conclusions, which stand only where seeds leave no doubt.
+"""Table of a study and its conclusions from the scores of all cases, drawn only where seeds leave no doubt.
 
 Interval    mean ± t · s / √n, Student's t of n − 1 degrees of freedom, s the standard deviation over n seeds: 95 %.
-Difference  of two settings, seed by seed, because a seed shows the same materials in the same lights in both.  It is called shown
-            where the interval of the mean difference excludes 0 at 95 % for all comparisons of a study together (Bonferroni:
-            each at 1 − .05 / comparisons), over at least `LEAST_SEEDS`.
+Difference  of two settings, seed by seed, because a seed shows the same materials in the same lights in both.  It is
+            called shown where the interval of the mean difference excludes 0 at 95 % for all comparisons of a study
+            together (Bonferroni: each at 1 − .05 / comparisons), over at least `LEAST_SEEDS`.
 """
 
 from __future__ import annotations
@@ -56,12 +56,12 @@ MEASURES = {  # label, and the unit where there is one; lower is better where th
 
 
 def label(measure: str) -> str:
-    """The name of a measure, without its unit."""
+    """Return the name of a measure, without its unit."""
     return MEASURES[measure].partition("|")[0]
 
 
 def head(measure: str) -> str:
-    """The name of a measure and its unit, of tables and axes.
+    """Return the name of a measure and its unit, of tables and axes.
 
     >>> head("seconds"), head("roughness")
     ('processor time of a solve (s)', 'error of roughness')
@@ -94,7 +94,7 @@ class Spread(msgspec.Struct, frozen=True):
 
 
 def spread(values: Sequence[float], doubt: float = DOUBT) -> Spread:
-    """The mean and its interval of 1 − doubt.
+    """Return the mean and its interval of 1 − doubt.
 
     >>> s = spread([1.0, 2.0, 3.0])
     >>> s.mean, s.deviation, round(s.high - s.mean, 3)
@@ -109,8 +109,9 @@ def spread(values: Sequence[float], doubt: float = DOUBT) -> Spread:
 
 
 def difference(first: Mapping[int, float], second: Mapping[int, float], comparisons: int = 1) -> tuple[Spread, str]:
-    """The first setting minus the second over the seeds that both have, and what it shows of the first: lower, higher, …
+    """Return the first setting minus the second over the seeds that both have, and what it shows of the first.
 
+    The latter is `lower`, `higher`, `not shown` or `too few seeds`.
     comparisons: how many the study makes.  Raises ValueError where no seed has both.
 
     >>> better = {seed: 0.1 + 0.001 * seed for seed in range(5)}
@@ -140,11 +141,11 @@ class Cell(msgspec.Struct, frozen=True):
 
     @property
     def null(self) -> float | None:
-        """The mean over seeds of what a guess scores."""
+        """Mean over seeds of a guess's scores."""
         return sum(self.nulls.values()) / len(self.nulls) if self.nulls else None
 
     def __str__(self) -> str:
-        """The mean and the half width of its interval.
+        """Return the mean and the half width of its interval.
 
         >>> str(Cell(spread([0.1, 0.12]), {})), str(Cell(spread([0.1]), {}))
         ('.11 ± .13', '.1')
@@ -162,7 +163,10 @@ class Row(msgspec.Struct, frozen=True):
 
 
 class Outcome(msgspec.Struct, frozen=True):
-    """What the seeds say of a claim, and that as a sentence; difference: of its two sides;  paper: whether the paper makes it."""
+    """Verdict of the seeds on a claim, and its sentence.
+
+    difference: of its two sides;  paper: whether the paper makes it
+    """
 
     answer: str
     sentence: str
@@ -171,7 +175,7 @@ class Outcome(msgspec.Struct, frozen=True):
 
 
 class Conclusion(msgspec.Struct, frozen=True):
-    """All of a study's table.json.
+    """Content of a study's table.json.
 
     quick:    what stands beside everything that is shown of a quick study; empty of a full one
     over:     what intervals are over;  notes: sentences that are no claims
@@ -192,12 +196,16 @@ class Conclusion(msgspec.Struct, frozen=True):
 
     @property
     def sentences(self) -> list[str]:
-        """What the seeds say of each claim, then the notes."""
+        """Sentences on what the seeds say of each claim, then the notes."""
         return [tested.sentence for tested in self.claims] + self.notes
 
     @property
     def answer(self) -> str:
-        """Agrees where all claims of the paper are shown, in part where some are, disagrees where the opposite of one is."""
+        """Answer to the paper: agrees, agrees in part, or disagrees.
+
+        It agrees where all claims of the paper are shown, and in part where some are.
+        It disagrees where the opposite of one is shown.
+        """
         answers = [tested.answer for tested in self.claims if tested.paper]
         if self.quick:
             return f"not tested ({self.quick})"
@@ -210,7 +218,7 @@ class Conclusion(msgspec.Struct, frozen=True):
 
 
 def concluded(study: Study, scale: Scale, scores: Mapping[str, Score]) -> Conclusion:
-    """The table of a study and what its claims come to; scores: by the names of its cases."""
+    """Return the table of a study and what its claims come to; scores: by the names of its cases."""
     seeds, rows = study.numbers(scale), {}
     for s in study.settings(scale):
         of, cells = {n: scores[case_name(s.name, n)] for n in seeds}, {}
@@ -221,9 +229,18 @@ def concluded(study: Study, scale: Scale, scores: Mapping[str, Score]) -> Conclu
         rows[s.name] = Row(s.name, s.label, cells)
     tested = [] if scale.quick else [_outcome(c, rows, len(study.claims), study.over) for c in study.claims]
     table = Conclusion(
-        study.name, study.title, study.question, study.paper, study.varied, NO_CONCLUSION if scale.quick else "",
-        seeds, study.measures, list(rows.values()), tested, study.over,
-    )  # fmt: skip
+        study.name,
+        study.title,
+        study.question,
+        study.paper,
+        study.varied,
+        NO_CONCLUSION if scale.quick else "",
+        seeds,
+        study.measures,
+        list(rows.values()),
+        tested,
+        study.over,
+    )
     return msgspec.structs.replace(table, notes=study.notes(table))
 
 
@@ -235,7 +252,7 @@ def _by_seed(side: Side, measure: str, rows: Mapping[str, Row]) -> dict[int, flo
 
 
 def _outcome(claim: Claim, rows: Mapping[str, Row], comparisons: int, over: str) -> Outcome:
-    """What the seeds say of a claim, as a sentence too."""
+    """Judge a claim by the seeds, and put the outcome in a sentence."""
     sides = (claim.lower, claim.higher)
     s, verdict = difference(*(_by_seed(side, claim.measure, rows) for side in sides), comparisons)
     labels = [" to ".join(f"“{rows[name].label}”" for name in settings_of(side)) for side in sides]
@@ -257,7 +274,7 @@ HEAD = ("study", "setting", "label", "measure", "unit", "seeds", "mean", "deviat
 
 
 def csv_text(table: Conclusion) -> str:
-    """A line for each setting and measure."""
+    """Format a line for each setting and measure."""
     out = io.StringIO()
     writer = csv.writer(out, lineterminator="\n")
     writer.writerow(HEAD)
@@ -270,7 +287,7 @@ def csv_text(table: Conclusion) -> str:
 
 
 def paragraph(table: Conclusion) -> str:
-    """Markdown: the question, what the paper says, and what the seeds say of each claim."""
+    """Write the question, what the paper says, and what the seeds say of each claim, as Markdown."""
     quick = f" *{table.quick}.*" if table.quick else ""
     start = f"**{table.title}.** {table.question}{quick} The paper: {table.paper}"
     return "\n".join([start, "", *(f"- {sentence}" for sentence in table.sentences)]) + "\n"

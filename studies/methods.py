@@ -1,21 +1,26 @@
-"""What methods answer in the comparison, as predictions of photos that were not taken.
+"""Answers of the methods of the comparison, as predictions of photos that were not taken.
 
-Projective   Texturing: the photo's pixels are stuck on the sphere and carried to the new view.  It knows the sphere and the camera.  A point
-             that the photo saw has the photo's colour there, between pixels by inverse distance; one that it did not see that of the seen
-             points that are nearest.  A new light changes nothing: the colours are the mean of all photos of the material.
-Intrinsic    A decomposition in the spirit of SIRFS (Barron and Malik 2015): albedo × shading + highlight, albedos averaged over photos.
-             It knows the normals, and which pixels are of which material; each photo is decomposed by itself.
-   shading     S(n) = Σ e_lm Y_lm(n), nine spherical harmonics: what Lambert reflects of a distant light to within a few per cent
-               (Ramamoorthi and Hanrahan 2001).  All objects of a photo share it.
+Projective   Texturing: the photo's pixels are stuck on the sphere and carried to the new view.  It knows the sphere and
+             the camera.  A point that the photo saw has the photo's colour there, between pixels by inverse distance;
+             one that it did not see that of the seen points that are nearest.  A new light changes nothing: the colours
+             are the mean of all photos of the material.
+Intrinsic    A decomposition in the spirit of SIRFS (Barron and Malik 2015): albedo × shading + highlight, albedos
+             averaged over photos. It knows the normals, and which pixels are of which material; each photo is
+             decomposed by itself.
+   shading     S(n) = Σ e_lm Y_lm(n), nine spherical harmonics: what Lambert reflects of a distant light to within a few
+               per cent (Ramamoorthi and Hanrahan 2001).  All objects of a photo share it.
    albedo      a, one a material and channel: in turn with e by weighted least squares of I − a S.
-   highlight   max(I − a S, 0).  So that it does not pull at albedo and shading, a pixel's weight is 1 / (1 + (r/s)²) where its residual
-               r is positive in the mean over channels, s the median size of those that are negative, or `LEAST` of the mean if that is more.
-   average     a photo determines albedos but for a factor per channel: ln a_mi = α_m + β_i in least squares over photos i.  α is the
-               answer, β goes into the photo's shading.
-   new light   its own nine coefficients shade the albedo; the highlight stays on the surface as it is, the mean over photos.
-Grey         Every material is the same grey Lambert, every light is even, of its photo's mean colour: what does not beat it has recovered
-             nothing.
-rendered     The answer of a method that finds a reflectance for each material and a map for each light is rendered as the truth is.
+   highlight   max(I − a S, 0).  So that it does not pull at albedo and shading, a pixel's weight is 1 / (1 + (r/s)²)
+               where its residual r is positive in the mean over channels, s the median size of those that are negative,
+               or `LEAST` of the mean if that is more.
+   average     a photo determines albedos but for a factor per channel: ln a_mi = α_m + β_i in least squares over photos
+               i.  α is the answer, β goes into the photo's shading.
+   new light   its own nine coefficients shade the albedo; the highlight stays on the surface as it is, the mean over
+               photos.
+Grey         Every material is the same grey Lambert, every light is even, of its photo's mean colour: what does not
+             beat it has recovered nothing.
+rendered     The answer of a method that finds a reflectance for each material and a map for each light is rendered as
+             the truth is.
 
 Truths are handed to methods for the gauge alone: photos link all materials and all lights.
 """
@@ -48,10 +53,12 @@ Truths = Mapping[str, Reflectance]
 class Prediction(msgspec.Struct, frozen=True):
     """A method's answer.
 
-    materials:  reflectances that it states, by name, in the truth's gauge;  lights: maps that it states, by number, in that gauge
+    materials:  reflectances that it states, by name, in the truth's gauge;  lights: maps that it states, by number, in
+                that gauge
     lambertian: that it states no specular part, rather than none being there
-    of:         radiance of a material in a light as a camera sees it, one of which was not photographed: a photographed material by its name
-                or another one, the light of a photo by its number or another one; None where the method has nothing to say
+    of:         radiance of a material in a light as a camera sees it, one of which was not photographed: a photographed
+                material by its name or another one, the light of a photo by its number or another one; None where the
+                method has nothing to say
     """
 
     materials: dict[str, Reflectance]
@@ -61,12 +68,12 @@ class Prediction(msgspec.Struct, frozen=True):
 
 
 def lambertian_part(materials: Truths) -> dict[str, Reflectance]:
-    """Without specular parts."""
+    """Remove specular parts."""
     return {name: Reflectance(m.diffuse, (0.0, 0.0, 0.0), m.roughness) for name, m in materials.items()}
 
 
 def rendered(materials: dict[str, Reflectance], lights: dict[int, Map], lambertian: bool = False) -> Prediction:
-    """The answer of a method that finds a reflectance for each material and a map for each light."""
+    """Predict by the reflectance of each material and the map of each light that a method finds."""
 
     def of(material: str | Reflectance, light: int | Map, view: View) -> Radiance:
         material = materials[material] if isinstance(material, str) else material
@@ -76,9 +83,11 @@ def rendered(materials: dict[str, Reflectance], lights: dict[int, Map], lamberti
 
 
 def grey(photos: Photos, truths: Truths) -> Prediction:
-    """Of the photos' mean colours."""
+    """Predict by the photos' mean colours."""
     radiance, ball = photos.radiance, Reflectance((ALBEDO,) * 3, (0.0,) * 3, 1.0)
-    means = {li: np.mean([of.mean(axis=0) for (_, at), of in radiance.items() if at == li], axis=0) for li in photos.lights}  # fmt: skip
+    means = {
+        li: np.mean([of.mean(axis=0) for (_, at), of in radiance.items() if at == li], axis=0) for li in photos.lights
+    }
     lights = {li: np.broadcast_to(colour / ALBEDO, (ROWS, 2 * ROWS, 3)) for li, colour in means.items()}
     return rendered(*in_gauge(dict.fromkeys(photos.materials, ball), lights, truths), lambertian=True)
 
@@ -93,11 +102,14 @@ class Texture:
         self._tree, self._least = cKDTree(photo.normals), photo.normals[:, 2].min()
 
     def seen(self, view: View) -> Bool[np.ndarray, " n"]:
-        """Which of a view's points the photo sees: those whose normals are turned toward it."""
+        """Select the points of a view that the photo sees: those whose normals are turned toward it."""
         return view.normals[:, 2] >= self._least
 
     def at(self, view: View, values: Radiance, unseen: bool = True) -> Radiance:
-        """values: of the photo's points;  unseen: whether points that it does not see are filled, else they are 0."""
+        """Carry values from the photo's points to those of a view.
+
+        values: of the photo's points;  unseen: whether points that it does not see are filled, else they are 0
+        """
         there, colours = self.seen(view), np.zeros((len(view.normals), 3))
         for some, count in ((there, BETWEEN), (~there & unseen, NEAREST)):
             distance, index = self._tree.query(view.normals[some], count)
@@ -107,7 +119,7 @@ class Texture:
 
 
 def projective(photos: Photos, truths: Truths) -> Prediction:
-    """The photos as textures; a texture knows no light apart from its material."""
+    """Predict by the photos as textures; a texture knows no light apart from its material."""
     texture, radiance = Texture(photos.view), photos.radiance
 
     def of(material: str | Reflectance, light: int | Map, view: View) -> Radiance | None:
@@ -124,7 +136,7 @@ def projective(photos: Photos, truths: Truths) -> Prediction:
 
 
 def harmonics(directions: Float[np.ndarray, "*n 3"]) -> Float[np.ndarray, "*n 9"]:
-    """The nine real, orthonormal spherical harmonics of degree 0, 1 and 2."""
+    """Return the nine real, orthonormal spherical harmonics of degree 0, 1 and 2."""
     x, y, z = np.moveaxis(directions, -1, 0)
     one, two, three, four = np.sqrt(np.array([1, 3, 15, 5]) / (4 * np.pi))
     flat = [one * np.ones_like(x), two * y, two * z, two * x, three * x * y, three * y * z]
@@ -132,18 +144,21 @@ def harmonics(directions: Float[np.ndarray, "*n 3"]) -> Float[np.ndarray, "*n 9"
 
 
 def light_coefficients(light: Map) -> Coefficients:
-    """∫ L Y over the sphere."""
+    """Return ∫ L Y over the sphere."""
     size = light.shape[:2]
     return np.einsum("h,hwk,hwc->kc", lat_long_solid_angles(*size), harmonics(lat_long_directions(*size)), light)
 
 
 def light_map(shading: Coefficients) -> Map:
-    """The light of nine harmonics that shades so; what it has of negative light is cut."""
+    """Return the light of nine harmonics that shades so; what it has of negative light is cut."""
     return np.maximum(harmonics(lat_long_directions(ROWS, 2 * ROWS)) @ (shading / LAMBERT[:, None]), 0)
 
 
 class Decomposed(msgspec.Struct, frozen=True):
-    """A photo: shading's coefficients, and each material's albedo, but for one factor per channel between them; highlights [n, 3]."""
+    """Decomposed photo: shading's coefficients, each material's albedo, and highlights [n, 3].
+
+    One factor per channel is free between shading and albedos.
+    """
 
     shading: Coefficients
     albedo: dict[str, Float[np.ndarray, "3"]]
@@ -168,14 +183,14 @@ def decomposed(normals: Float[np.ndarray, "n 3"], radiance: Mapping[str, Radianc
 
 
 def _shading(basis: np.ndarray, image: np.ndarray, albedo: np.ndarray, weight: np.ndarray) -> Float[np.ndarray, "9"]:
-    """argmin Σ w (I − a Y·e)² of one channel."""
+    """Return argmin Σ w (I − a Y·e)² of one channel."""
     of_pixel = np.einsum("mn,m->n", weight, albedo**2)
     gram = (basis * of_pixel[:, None]).T @ basis
     return np.linalg.solve(gram, basis.T @ np.einsum("mn,m,mn->n", weight, albedo, image))
 
 
 def averaged(photos: Mapping[int, Decomposed]) -> tuple[dict[str, np.ndarray], dict[int, np.ndarray]]:
-    """exp α by material and exp β by photo, [3] each: a_mi ≈ exp(α_m + β_i)."""
+    """Return exp α by material and exp β by photo, [3] each: a_mi ≈ exp(α_m + β_i)."""
     names, numbers = sorted({n for p in photos.values() for n in p.albedo}), list(photos)
     pairs = [(names.index(n), k) for k, p in enumerate(photos.values()) for n in p.albedo]
     known = np.log([photos[numbers[k]].albedo[names[m]] for m, k in pairs])
@@ -189,8 +204,9 @@ def averaged(photos: Mapping[int, Decomposed]) -> tuple[dict[str, np.ndarray], d
 def intrinsic(photos: Photos, truths: Truths) -> Prediction:
     """Decompose each photo, average.  Truths count by their Lambertian parts, for it states only those.
 
-    New views have the average albedo, the photo's shading there, and its highlight, a texture, where the photo saw the point; new
-    lights their own shading and the mean highlight of the photos; new materials the light that nine harmonics of shading determine.
+    New views have the average albedo, the photo's shading there, and its highlight, a texture, where the photo saw the
+    point; new lights their own shading and the mean highlight of the photos; new materials the light that nine
+    harmonics of shading determine.
     """
     normals, radiance, texture = photos.view.normals, photos.radiance, Texture(photos.view)
     parts = {li: decomposed(normals, {n: v for (n, at), v in radiance.items() if at == li}) for li in photos.lights}

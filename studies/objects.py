@@ -1,7 +1,10 @@
-"""Cases of objects: bodies without symmetry, each turned at random before a camera far away, and perhaps thought to be elsewhere.
+"""Cases of objects: bodies without symmetry, each turned at random before a camera far away.
 
-The camera is so far that rays are parallel to a third of a degree at most: radiance is of one view direction, by the quadrature that
-spheres have.  Neither shadows nor light between surfaces are rendered, so that what is measured is what wrong geometry does and nothing else.
+The solve may be given another pose or mesh than the true one.
+
+The camera is so far that rays are parallel to a third of a degree at most: radiance is of one view direction, by the
+quadrature that spheres have.  Neither shadows nor light between surfaces are rendered, so that what is measured is what
+wrong geometry does and nothing else.
 
 Pixels     those that both the true body and the one of the perturbed pose and mesh show, as the stage `urm` takes them
 Noise      drawn for each pixel by itself: a perturbation leaves what a pixel shows as it is
@@ -41,7 +44,7 @@ CAMERA = Camera(SIDE, SIDE, FAR * SIDE, (SIDE / 2, SIDE / 2))
 
 @cache
 def body(name: str, triangles: int | None = None) -> Caster:
-    """A body of one material, or a mesh of few triangles that stands for it."""
+    """Return a body of one material, or a mesh of few triangles that stands for it."""
     parts = [(vertices, faces, 1) for vertices, faces, _ in shapes.SHAPES[name]()]
     if triangles is not None:
         total = sum(len(faces) for _, faces, _ in parts)
@@ -52,9 +55,9 @@ def body(name: str, triangles: int | None = None) -> Caster:
 def observed(
     case: Case, materials: Mapping[str, Reflectance], lights: Mapping[int, Light]
 ) -> tuple[dict[str, Observations], float]:
-    """One photo a light, by name, pixels of its entries numbered on; and the mean error of the normals given, degrees.
+    """Return one photo a light, by name, and the mean error of the normals given, degrees.
 
-    That of an entry is the median angle to the true ones.
+    Pixels of a photo's entries are numbered on.  The error of an entry is the median angle to the true normals.
     """
     table, photos, errors = list(materials.values()), {}, []
     for li in case.lights:
@@ -90,7 +93,7 @@ def _entry(case: Case, m: int, li: int, material: Reflectance, light: Light) -> 
 
 
 def perturbed(name: str, truth: Pose, how: Objects, rng: np.random.Generator) -> tuple[Caster, Pose]:
-    """The mesh and the pose that stand for a body whose true pose is `truth`."""
+    """Return the mesh and the pose that stand for a body whose true pose is `truth`."""
     whole, mesh = body(name), body(name, how.triangles)
     if how.larger:
         mesh = Caster(scaled(mesh.mesh, (1 + how.larger,) * 3))
@@ -108,6 +111,6 @@ def fitted(mesh: Caster, pose: Pose, outline: Silhouette) -> Pose:
 
 
 def angle_deg(first: Float[np.ndarray, "n 3"], second: Float[np.ndarray, "n 3"]) -> float:
-    """The median angle between unit vectors, degrees; 180 of none."""
+    """Return the median angle between unit vectors, degrees; 180 of none."""
     cosine = np.clip(np.sum(first * second, axis=1), -1, 1)
     return float(np.degrees(np.median(np.arccos(cosine)))) if len(cosine) else 180.0

@@ -1,16 +1,21 @@
-"""Pairs of pictures of a made set, `python -m studies.pairs build/eames …`: is a new object in a photograph told apart from a true one?
+"""Pairs of pictures of a made set: is a new object in a photograph told apart from a true one?
 
-One picture of a pair is made by what was recovered, the other by what is true. Written to build/studies/pairs: pairs.csv and pictures/.
+Usage: `python -m studies.pairs build/eames …`
 
-Both are made by the recipe `insert`, with the same mesh, samples, and pixel at which the object touches the ground.  True are the light of the
-photograph, infinitely far away as the recipe takes it, the materials, and the plane on which the true poses and lenses put the chairs.  So a pair
-shows what recovering costs, and not what the recipe leaves out, such as walls near by.
+One picture of a pair is made by what was recovered, the other by what is true. Written to build/studies/pairs:
+pairs.csv and pictures/.
 
-Observer   mean ΔE (CIE 1976, after a blur of σ = 1 pixel) over the object, or over the ground that either picture changes, whichever is larger.
-           A pair is told apart where it is above the just noticeable difference, 2.3 (Mahy, Van Eycken and Oosterlinck, 1994), and above the
-           floor: that of two truths of different noise, or of two pictures by what was recovered.
-Cause      the same with one factor recovered and the others true.  The factor per channel between materials and lights, which no photograph
-           tells, is first moved from the lights to the materials, so it counts as theirs.
+Both are made by the recipe `insert`, with the same mesh, samples, and pixel at which the object touches the ground.
+True are the light of the photograph, infinitely far away as the recipe takes it, the materials, and the plane on which
+the true poses and lenses put the chairs.  So a pair shows what recovering costs, and not what the recipe leaves out,
+such as walls near by.
+
+Observer   mean ΔE (CIE 1976, after a blur of σ = 1 pixel) over the object, or over the ground that either picture
+           changes, whichever is larger. A pair is told apart where it is above the just noticeable difference, 2.3
+           (Mahy, Van Eycken and Oosterlinck, 1994), and above the floor: that of two truths of different noise, or of
+           two pictures by what was recovered.
+Cause      the same with one factor recovered and the others true.  The factor per channel between materials and lights,
+           which no photograph tells, is first moved from the lights to the materials, so it counts as theirs.
 """
 
 from __future__ import annotations
@@ -60,14 +65,19 @@ NOTICED, CHANGED, BLUR = 2.3, 1.0, 1.0  # ΔE; ΔE; pixels
 AROUND, LEAST = 1.4, 60  # half a window's width in the object's larger extent, and in pixels at least
 PLACES = 100  # that are tried for an object
 FACTORS = ("light", "material", "ground")
-XYZ_OF_RGB = np.array([[0.4124564, 0.2126729, 0.0193339], [0.3575761, 0.7151522, 0.119192], [0.1804375, 0.072175, 0.9503041]])  # fmt: skip
+XYZ_OF_RGB = np.array(
+    [[0.4124564, 0.2126729, 0.0193339], [0.3575761, 0.7151522, 0.119192], [0.1804375, 0.072175, 0.9503041]]
+)
 Picture, Mask = Float[np.ndarray, "h w 3"], Bool[np.ndarray, "h w"]
 Both, Sets = tuple[Picture, Picture], tuple[SolvedSet, SolvedSet]  # by what was recovered, and by the truth
 replace = msgspec.structs.replace
 
 
 class Truth(SolvedSet):
-    """A set of `factorlib.generate eames` with its true materials, lights, poses and lenses; the meshes are the solve's."""
+    """Set of `factorlib.generate eames` with its true materials, lights, poses and lenses.
+
+    The meshes are the solve's.
+    """
 
     def __init__(self, inputs: Inputs, dataset: Dataset):
         super().__init__(inputs)
@@ -89,11 +99,11 @@ class Truth(SolvedSet):
             self.poses[photo] = replace(found, camera=camera, objects=objects)
 
     def light(self, name: str) -> Light:
-        """The true map of a photo's light."""
+        """Return the true map of a photo's light."""
         return read_true_light(self.folder / self.truth.illumination[name], name).astype(float)
 
     def ground(self, photo: str, neighbour: Placed) -> Ground:
-        """The plane y = 0 of a chair's own frame, on which it stands."""
+        """Return the plane y = 0 of a chair's own frame, on which it stands."""
         pose = self.truth.poses[photo][neighbour.name]
         normal = YUP_FROM_CAMERA @ np.array(pose.rotation)[:, 1]
         return Ground(Plane(normal, YUP_FROM_CAMERA @ np.array(pose.translation)))
@@ -109,10 +119,14 @@ def write_files(folder: Path) -> dict[str, Path]:
 
 
 def chosen(sets: Mapping[str, Sets], count: int, samples: int, seed: int) -> Iterator[tuple[str, str, Insert]]:
-    """Sets, photos and recipes of pairs, by a seed alone: photos, meshes and materials about equally often, places, sizes and turns at random.
+    """Draw sets, photos and recipes of pairs, by a seed alone.
 
-    sets: what was recovered, and the truth.  A place where the recipe would refuse or move the object in either is drawn anew; InputError
-    where that happens `PLACES` times.
+    Photos, meshes and materials are about equally often, places, sizes and turns at random.
+
+    sets: what was recovered, and the truth
+
+    A place where the recipe would refuse or move the object in either is drawn anew; InputError where that happens
+    `PLACES` times.
     """
     rng = np.random.default_rng(seed)
     shots, numbers = [(name, photo) for name, of in sets.items() for photo in of[0].photos], np.arange(count)
@@ -137,7 +151,10 @@ def chosen(sets: Mapping[str, Sets], count: int, samples: int, seed: int) -> Ite
 
 
 def drawn(photo: str, recipe: Insert, recovered: SolvedSet, truth: SolvedSet) -> tuple[Both, dict[str, Any]]:
-    """The window of the photo about the object, linear, by what was recovered and by the truth, and how they differ (`scores`)."""
+    """Return the window of the photo about the object, linear, by what was recovered and by the truth.
+
+    The second value is how they differ (`scores`).
+    """
     sets, ours = {True: recovered, False: truth}, standing(recipe, recovered, photo)
     true, factor = standing(recipe, truth, photo), factor_of(recovered.materials, truth.materials)
     materials = {name: times(m, factor) for name, m in ours.scene.materials.items()}
@@ -151,7 +168,7 @@ def drawn(photo: str, recipe: Insert, recovered: SolvedSet, truth: SolvedSet) ->
     window = slice(top, top + height), slice(left, left + width)
 
     def traced(light: bool, material: bool, ground: bool, seed: int = 1) -> tuple[Picture, Inserted]:
-        """The window with these factors recovered, the others true."""
+        """Trace the window with these factors recovered, the others true."""
         here, seen = places[ground], sets[light].straightened(photo)[window]
         lit = {"light": places[light].scene.light, "materials": places[material].scene.materials}
         scene = replace(here.scene, camera=here.scene.camera.window(left, top, 1.0, width, height), **lit)
@@ -169,7 +186,7 @@ def drawn(photo: str, recipe: Insert, recovered: SolvedSet, truth: SolvedSet) ->
 
 
 def scores(pair: Both, again: Both, parts: Mapping[str, Picture], photo: Picture, body: Mask) -> dict[str, Any]:
-    """How the pictures of a pair differ, by what was recovered and by the truth, in a window of the photo.
+    """Measure the difference of a pair's pictures, by what was recovered and by the truth, in a window of the photo.
 
     again: both with other noise;  parts: with one factor recovered, by name;  body: the object's pixels
     """
@@ -189,7 +206,7 @@ def scores(pair: Both, again: Both, parts: Mapping[str, Picture], photo: Picture
 
 
 def cielab(radiance: Picture) -> Picture:
-    """L*, a*, b* of what a screen shows of linear Rec. 709 (white D65), blurred as an eye does.
+    """Return L*, a*, b* of what a screen shows of linear Rec. 709 (white D65), blurred as an eye does.
 
     >>> cielab(np.ones((3, 3, 3)))[1, 1].round(2).tolist()
     [100.0, 0.0, 0.0]
@@ -200,7 +217,7 @@ def cielab(radiance: Picture) -> Picture:
 
 
 def difference(a: Picture, b: Picture) -> Float[np.ndarray, "h w"]:
-    """ΔE (CIE 1976) of each pixel of two pictures in CIELAB."""
+    """Return ΔE (CIE 1976) of each pixel of two pictures in CIELAB."""
     return np.linalg.norm(a - b, axis=-1)
 
 

@@ -1,12 +1,12 @@
-"""What a seed stands for: materials, lights, and spheres of the ones in the others; and what a case observes of them.
+"""Materials and lights of a seed, spheres of the ones in the others, and what a case observes of them.
 
 Materials  about those of `ABOUT`, each number times exp(.15 · normal).
-Lights     by the project's own generator (`factorlib.generate`): the first of a world is a street by day, the others are rooms.
-           Mean radiance 1.
+Lights     by the project's own generator (`factorlib.generate`): the first of a world is a street by day, the others
+           are rooms. Mean radiance 1.
 Radiance   by quadrature of the lights' maps (`factorlib.evaluate.ball`), not by the operator that solves: what a solve
            is judged on is not made by its own approximations.
-Noise      each radiance times 1 + noise · normal, .01 as a rule, drawn for each entry by itself, so that an entry that two cases show has
-           the same noise in both.
+Noise      each radiance times 1 + noise · normal, .01 as a rule, drawn for each entry by itself, so that an entry that
+           two cases show has the same noise in both.
 Normals    perturbed after rendering: the solve gets a normal that is not the pixel's.
 Labels     likewise: the pixel is of one material, its label names another one of the same photo.
 Facets     rendered so: a flat-sided object, whose normals are true but few.
@@ -47,13 +47,16 @@ CURVED = 0.1  # share of a face's normals that is the sphere's: no real face is 
 
 
 def materials_of(seed: int, names: Sequence[str] = SEVEN[:5]) -> dict[str, Reflectance]:
-    """The materials of a world by name."""
+    """Return the materials of a world by name."""
     drawn = random_materials(np.random.default_rng([11, seed]), SPREAD, {name: ABOUT[name] for name in names})
     return {name: Reflectance(m.diffuse, m.specular, m.roughness) for name, m in drawn.items()}
 
 
 def light_map(seed: int, light: int, rows: int, spp: int) -> Float[np.ndarray, "h w 3"]:
-    """Light number `light` of a world, lat-long in the camera's y-up frame, mean radiance 1; the same however many others there are."""
+    """Return light number `light` of a world, lat-long in the camera's y-up frame, mean radiance 1.
+
+    It is the same however many others there are.
+    """
     rng = np.random.default_rng([12, seed, light])
     world_from_camera = look(rng.uniform(-14, -6), rng.uniform(0, 360))
     lamps = 1 + light % 2 if light else 0  # none: by day
@@ -62,18 +65,21 @@ def light_map(seed: int, light: int, rows: int, spp: int) -> Float[np.ndarray, "
 
 
 def read_maps(worlds: Path, seed: int, lights: Iterable[int]) -> dict[int, Float[np.ndarray, "h w 3"]]:
-    """The maps of lights of a world by number, from the folder of the step `worlds`."""
+    """Read the maps of lights of a world, by number, from the folder of the step `worlds`."""
     return {li: read_rgb_exr(worlds / f"{seed}-{li}.exr") for li in lights}
 
 
 def sphere_normals(size: int) -> Float[np.ndarray, "n 3"]:
-    """Normals in the light's frame of a sphere `size` pixels across, seen orthographically; grazing ones are left out."""
+    """Return normals in the light's frame of a sphere `size` pixels across, seen orthographically.
+
+    Grazing ones are left out.
+    """
     normals, _ = ball_normals(size)
     return normals[normals[:, 2] > GRAZING]
 
 
 def in_camera(normals: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
-    """Normals of the light's frame in the camera's."""
+    """Turn normals of the light's frame into the camera's."""
     return normals @ YUP_FROM_CAMERA.T
 
 
@@ -83,7 +89,7 @@ def in_camera(normals: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
 def observations_of(
     case: Case, materials: Mapping[str, Reflectance], lights: Mapping[int, Light]
 ) -> dict[str, Observations]:
-    """One photo a light, by name, in the form in which the stage `urm` hands them to `solve`."""
+    """Return one photo a light, by name, in the form in which the stage `urm` hands them to `solve`."""
     return {light_name(li): _photo(case, li, list(materials.values()), lights[li]) for li in case.lights}
 
 
@@ -103,24 +109,41 @@ def _photo(case: Case, number: int, materials: Sequence[Reflectance], light: Lig
 
 
 def table_of(
-    case: Case, light: int, normal: np.ndarray, radiance: np.ndarray, material: np.ndarray, x: np.ndarray | None = None,
-    y: np.ndarray | None = None, confidence: np.ndarray | None = None,
-) -> Observations:  # fmt: skip
-    """Observations of one photo in one light, seen from the front; nothing is clipped.
+    case: Case,
+    light: int,
+    normal: np.ndarray,
+    radiance: np.ndarray,
+    material: np.ndarray,
+    x: np.ndarray | None = None,
+    y: np.ndarray | None = None,
+    confidence: np.ndarray | None = None,
+) -> Observations:
+    """Return observations of one photo in one light, seen from the front; nothing is clipped.
 
-    normal: camera's frame;  material: numbers among those of the case;  x, y: pixels;  confidence: of normals, which is their weight
+    normal: camera's frame;  material: numbers among those of the case;  x, y: pixels;  confidence: of normals, which is
+            their weight
     """
     n, zero, photo = len(normal), np.zeros(len(normal), int), (light_name(light),)
     return Observations(
-        normal=normal, view=np.tile(FRONT, (n, 1)), radiance=radiance, clipped=np.zeros((n, 3), bool), material=material,
-        photo=zero, illumination=zero, x=np.arange(n) if x is None else x, y=zero if y is None else y,
+        normal=normal,
+        view=np.tile(FRONT, (n, 1)),
+        radiance=radiance,
+        clipped=np.zeros((n, 3), bool),
+        material=material,
+        photo=zero,
+        illumination=zero,
+        x=np.arange(n) if x is None else x,
+        y=zero if y is None else y,
         weight=np.ones(n) if confidence is None else confidence,
-        materials=tuple(case.material_names), photos=photo, illuminations=photo, confidence=confidence,
-    )  # fmt: skip
+        materials=tuple(case.material_names),
+        photos=photo,
+        illuminations=photo,
+        confidence=confidence,
+    )
 
 
 def tilted(normals: Float[np.ndarray, "n 3"], degrees: float, rng: np.random.Generator) -> Float[np.ndarray, "n 3"]:
-    """Each normal turned by |N(0, degrees)| toward a random side, at most until it is seen at a grazing angle."""
+    """Turn each normal by |N(0, degrees)| toward a random side, at most until it is seen at a grazing angle."""
     side = np.cross(normals, rng.normal(size=normals.shape))
     side /= np.linalg.norm(side, axis=1, keepdims=True)
     angle = np.radians(degrees * np.abs(rng.normal(size=len(normals))))[:, None]
@@ -131,14 +154,14 @@ def tilted(normals: Float[np.ndarray, "n 3"], degrees: float, rng: np.random.Gen
 def mislabelled(
     n: int, label: int, labels: Sequence[int], share: float, rng: np.random.Generator
 ) -> Int[np.ndarray, " n"]:
-    """The label of each pixel: for `share` of them another one of `labels`, where there is any."""
+    """Return the label of each pixel: for `share` of them another one of `labels`, where there is any."""
     others = [other for other in labels if other != label]
     wrong = rng.random(n) < share
     return np.where(wrong, rng.choice(others, n), label) if others else np.full(n, label)
 
 
 def faceted(normals: Float[np.ndarray, "n 3"], facets: int | None) -> Float[np.ndarray, "n 3"]:
-    """Normals of a convex object that shows so many flat faces (`face_normals`).
+    """Return normals of a convex object that shows so many flat faces (`face_normals`).
 
     Each pixel has the normal of the face that is nearest to the sphere's, but for `CURVED` of the way.
     """
@@ -151,7 +174,10 @@ def faceted(normals: Float[np.ndarray, "n 3"], facets: int | None) -> Float[np.n
 
 
 def face_normals(facets: int) -> Float[np.ndarray, "k 3"]:
-    """Normals of faces spread evenly over the cap of n·z > `STEEPEST` about the viewer's z; one face alone looks straight at the viewer."""
+    """Return normals of faces spread evenly over the cap of n·z > `STEEPEST` about the viewer's z.
+
+    One face alone looks straight at the viewer.
+    """
     if facets == 1:
         return np.array([[0.0, 0.0, 1.0]])
     z = 1 - (1 - STEEPEST) * (np.arange(facets) + 0.5) / facets

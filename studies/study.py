@@ -1,4 +1,7 @@
-"""What a study says of itself: its size, its cases, its settings and its claims.  Nothing here imports science, for plans are made of it."""
+"""Declaration of a study: its size, its cases, its settings and its claims.
+
+Nothing here imports science, for plans are made of it.
+"""
 
 from __future__ import annotations
 
@@ -25,7 +28,8 @@ class Objects(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     triangles:   triangles of the mesh that stands for the body; None: all of its 20,000
     confidence:  whether the solve gets the confidence of each normal, as the stage `align` writes it
     refined:     whether every pose is first fitted to the outline of its mask, from the perturbed pose
-    warm:        whether it starts from the solution of all photos but the last (the parameter `start` of the stage `solve`)
+    warm:        whether it starts from the solution of all photos but the last (the parameter `start` of the stage
+                 `solve`)
     """
 
     pixels: int
@@ -82,7 +86,7 @@ class Case(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         return sorted({li for _, li in self.entries})
 
     def names_in(self, light: int) -> list[str]:
-        """The names of the materials that are observed in a light."""
+        """Return the names of the materials that are observed in a light."""
         return [self.names[m] for m, at in self.entries if at == light]
 
 
@@ -93,7 +97,7 @@ class Comparison(Case, frozen=True, forbid_unknown_fields=True):
 
 
 class World(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """How the lights of worlds are made: the seeds, the number of lights of each, rows and samples of their maps."""
+    """Seeds of worlds, the number of lights of each, and rows and samples of their maps."""
 
     seeds: tuple[int, ...]
     lights: int
@@ -108,17 +112,17 @@ class Score(msgspec.Struct, frozen=True):
     nulls: dict[str, float] = {}
 
     def __or__(self, other: Score) -> Score:
-        """The measures of both."""
+        """Return the measures of both."""
         return Score(self.values | other.values, self.nulls | other.nulls)
 
 
 def light_name(light: int) -> str:
-    """The name of an illumination, and of the photo that is in it."""
+    """Return the name of an illumination, and of the photo that is in it."""
     return f"light{light}"
 
 
 def case_name(setting: str, seed: int) -> str:
-    """The name of a case's files.
+    """Return the name of a case's files.
 
     >>> case_name("3x3", 0)
     '3x3-seed0'
@@ -127,7 +131,7 @@ def case_name(setting: str, seed: int) -> str:
 
 
 def full_matrix(materials: int, lights: int) -> list[Entry]:
-    """Every material in every light.
+    """Return every material in every light.
 
     >>> full_matrix(1, 2)
     [(0, 0), (0, 1)]
@@ -151,7 +155,7 @@ class Setting(msgspec.Struct, frozen=True):
 
 
 class Scale(msgspec.Struct, frozen=True):
-    """How large a study is: at most `largest` materials and lights; `side` of each where something else is varied."""
+    """Size of a study: at most `largest` materials and lights; `side` of each where something else is varied."""
 
     name: Literal["full", "quick"]
     seeds: tuple[int, ...]
@@ -164,27 +168,30 @@ class Scale(msgspec.Struct, frozen=True):
 
     @property
     def quick(self) -> bool:
-        """Whether it is the quick scale, which concludes nothing."""
+        """True for the quick scale, which concludes nothing."""
         return self.name == "quick"
 
     def case(self, seed: int, entries: Sequence[Entry], **fields: Any) -> Case:
-        """A case of this size with further `fields` of it; the scale's parameters of the solve are the joint solver's."""
+        """Return a case of this size with further `fields` of it.
+
+        The scale's parameters of the solve are the joint solver's.
+        """
         solve = fields.get("solve", {})
         if solve.get("solver", "joint") == "joint":
             solve = self.solve | solve
         return Case(seed, tuple(sorted(entries)), self.size, **fields | {"solve": solve})
 
     def setting(self, name: str, label: str, entries: Sequence[Entry] | None = None, **fields: Any) -> Setting:
-        """A setting of equal entries for all seeds; None: of `side` materials in as many lights."""
+        """Return a setting of equal entries for all seeds; None: of `side` materials in as many lights."""
         entries = full_matrix(self.side, self.side) if entries is None else entries
         return Setting(name, label, lambda seed: self.case(seed, entries, **fields))
 
     def matrix(self, materials: int, lights: int) -> Setting:
-        """All entries of so many materials in so many lights."""
+        """Return the setting of all entries of so many materials in so many lights."""
         return self.setting(f"{materials}x{lights}", f"{materials} × {lights}", full_matrix(materials, lights))
 
     def of_objects(self, name: str, label: str, entries: Sequence[Entry], solve: Any = None, **fields: Any) -> Setting:
-        """A setting of bodies, about as many observations of each as a sphere has; `fields` of `Objects`."""
+        """Return a setting of bodies, about as many observations of each as a sphere has; `fields` of `Objects`."""
         return self.setting(
             name, label, entries, solve=solve or {}, objects=Objects(round(0.77 * self.size**2), **fields)
         )
@@ -198,7 +205,8 @@ QUICK = Scale("quick", seeds=(0,), largest=3, side=2, size=16, solve=SMALL, ligh
 # ── claims ───────────────────────────────────────────────────────────────────────────────────────────────────────────
 
 # One side of a comparison: a setting; ("guess", setting): what a guess that knows mean colours alone scores in it; or
-# ("rise", start, end, per): how much the measure rises from one setting to another, for each of the `per` units between them.
+# ("rise", start, end, per): how much the measure rises from one setting to another, for each of the `per`
+# units between them.
 Side = str | tuple
 
 
@@ -216,17 +224,17 @@ class Claim(msgspec.Struct, frozen=True):
 
 
 def own(measure: str, lower: Side, higher: Side, words: str) -> Claim:
-    """A claim of this project, which the paper does not make."""
+    """Return a claim of this project, which the paper does not make."""
     return Claim(measure, lower, higher, words, paper=False)
 
 
 def settings_of(side: Side) -> list[str]:
-    """The names of the settings of one side of a claim."""
+    """Return the names of the settings of one side of a claim."""
     return [side] if isinstance(side, str) else list(side[1:3])
 
 
 class Study(msgspec.Struct, frozen=True, kw_only=True):
-    """What is varied and measured.
+    """Study: what it varies and what it measures.
 
     paper:     the paper's conclusion;  varied: what is varied, with its unit
     measures:  those of the page, the first the main one
@@ -254,9 +262,9 @@ class Study(msgspec.Struct, frozen=True, kw_only=True):
     notes: Callable[[Any], list[str]] = lambda conclusion: []
 
     def worlds(self, scale: Scale) -> World:
-        """The worlds that its cases show, equal for most studies of a scale, so that they are made once."""
+        """Return the worlds that its cases show, equal for most studies of a scale, so that they are made once."""
         return World(scale.seeds, scale.largest + self.lights, scale.light_rows, scale.light_spp)
 
     def cases(self, scale: Scale) -> dict[str, Any]:
-        """All cases by name: settings in order, each with all seeds."""
+        """Return all cases by name: settings in order, each with all seeds."""
         return {case_name(s.name, n): s.case(n) for s in self.settings(scale) for n in self.numbers(scale)}

@@ -69,9 +69,14 @@ def shot_of(photo: Channels, geometry: Channels, resynthesis: Picture) -> Shot:
     }
     satisfied = (resynthesis >= 0.98 * rgb)[bounds].all(axis=-1)
     return Shot(
-        rgb, resynthesis, label, pixels, white_of(rgb, pixels), {k: int(v.sum()) for k, v in counts.items()},
+        rgb,
+        resynthesis,
+        label,
+        pixels,
+        white_of(rgb, pixels),
+        {k: int(v.sum()) for k, v in counts.items()},
         float(satisfied.mean()) if bounds.any() else None,
-    )  # fmt: skip
+    )
 
 
 def agreeing_pixels(photo: Channels, geometry: Channels) -> Bool[np.ndarray, "h w"]:

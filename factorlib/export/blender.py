@@ -32,16 +32,22 @@ def write_script(folder: str | Path) -> None:
 def write_scene_json(path: str | Path, scene: Scene) -> None:
     """Write a photo's scene as JSON, with the materials that its shapes name."""
     camera = scene.camera
-    write_json(path, {
-        "camera": {
-            "width": camera.width, "height": camera.height, "focal_px": camera.focal, "principal_point": camera.centre,
+    write_json(
+        path,
+        {
+            "camera": {
+                "width": camera.width,
+                "height": camera.height,
+                "focal_px": camera.focal,
+                "principal_point": camera.centre,
+            },
+            "shapes": [_plain(shape, "name", "file", "material", "cam_from_object") for shape in scene.shapes],
+            "materials": {shape.material: scene.materials[shape.material] for shape in scene.shapes},
+            "light": _plain(scene.light, "file", "exposure", "camera_from_light"),
+            "suns": [_plain(sun, "direction", "irradiance", "angular_diameter_deg") for sun in scene.suns],
+            "max_depth": scene.max_depth,
         },
-        "shapes": [_plain(shape, "name", "file", "material", "cam_from_object") for shape in scene.shapes],
-        "materials": {shape.material: scene.materials[shape.material] for shape in scene.shapes},
-        "light": _plain(scene.light, "file", "exposure", "camera_from_light"),
-        "suns": [_plain(sun, "direction", "irradiance", "angular_diameter_deg") for sun in scene.suns],
-        "max_depth": scene.max_depth,
-    })  # fmt: skip
+    )
 
 
 def _plain(of: Shape | ExposedMap | Sun, *names: str) -> dict[str, Any]:

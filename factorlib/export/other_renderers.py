@@ -1,7 +1,7 @@
-"""Exported materials in other programs: their documented reflection models, and how far a ball of each is from the solved one.
+"""Reflection models of exported materials in other programs, and errors of a ball rendered by each.
 
-All are Lambert plus GGX of the same α.  They differ in shadowing, in Fresnel, and in the share that the specular part
-leaves for the diffuse one:
+All models are Lambert plus GGX of the same α.  They differ in shadowing, in Fresnel, and in the share that the specular
+part leaves for the diffuse one:
 
     solved                 k_d/π + k_s D V,  V = G1(n·i) G1(n·o) / (4 (n·i)(n·o))      (`factorlib.reflection.brdf`)
     blender                V of the height-correlated Smith term (Heitz 2014, eq. 99), as Cycles' Glossy BSDF "GGX"

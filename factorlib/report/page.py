@@ -21,8 +21,12 @@ from factorlib.results.poses import AS_IT_IS
 
 LOW_IOU = 0.85  # silhouette overlap below which a pose is doubted
 MEASURES = {
-    "median": "median", "p95": "95th percentile", "p99": "99th percentile", "worst": "worst", "samples": "samples",
-}  # fmt: skip
+    "median": "median",
+    "p95": "95th percentile",
+    "p99": "99th percentile",
+    "worst": "worst",
+    "samples": "samples",
+}
 FILES = {  # links of the page: stage and pattern of its files
     "materials.json": ("export", "materials.json"), "MaterialX": ("export", "*.mtlx"),
     "objects, glTF": ("export", "*.glb"),

@@ -28,8 +28,10 @@ def rendered(template: str, **context: Any) -> str:
     )
     environment.filters |= {each.__name__: each for each in (number, significant, percent, duration, css_colour)}
     environment.filters |= {
-        "in_script": _in_script, "plain": lambda value: f"{value:.6g}", "worst": lambda values: max(values, key=abs),
-    }  # fmt: skip
+        "in_script": _in_script,
+        "plain": lambda value: f"{value:.6g}",
+        "worst": lambda values: max(values, key=abs),
+    }
     environment.tests["of_a_parameter"] = lambda change: ": parameter " in change
     return environment.get_template(template).render(context)
 

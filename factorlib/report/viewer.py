@@ -135,14 +135,16 @@ def _shown(run: Artifacts, objects: Mapping[str, ObjectsSlice]) -> dict[str, lis
         mesh = kinds.index((each.mesh, each.scale))
         toward = -(YUP_FROM_CAMERA @ each.pose.apply(meshes[mesh][1][None])[0])
         length = np.linalg.norm(toward)
-        placed.append({
-            "photo": each.photo,
-            "name": each.name,
-            "mesh": mesh,
-            "materials": [own.get(each.variant, own[""]) for _, own in sorted(materials[each.mesh].items())],
-            "rotation": (YUP_FROM_CAMERA @ each.pose.rotation).ravel().tolist(),
-            "eye": (toward / length).tolist() if length > 0 else [0.0, 0.0, 1.0],
-        })  # fmt: skip
+        placed.append(
+            {
+                "photo": each.photo,
+                "name": each.name,
+                "mesh": mesh,
+                "materials": [own.get(each.variant, own[""]) for _, own in sorted(materials[each.mesh].items())],
+                "rotation": (YUP_FROM_CAMERA @ each.pose.rotation).ravel().tolist(),
+                "eye": (toward / length).tolist() if length > 0 else [0.0, 0.0, 1.0],
+            }
+        )
     return {
         "objects": placed,
         "meshes": [{"name": name, **mesh} for (name, _), (mesh, _) in zip(kinds, meshes, strict=True)],

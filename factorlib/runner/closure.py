@@ -1,14 +1,15 @@
 """The source a stage depends on: its module and everything of the project it imports, however far.
 
-Each module is hashed by its syntax tree without comments and docstrings, so that a remark reruns nothing.  Imports count
-wherever they stand; modules named only at run time (`import_module(name)`) are not seen.  So does every file beside an
-imported module, or in a folder beside it that is no package, but for what Python and editors leave there (`left_over`).
+Each module is hashed by its syntax tree without comments and docstrings, so that a remark reruns nothing.  Imports
+count wherever they stand; modules named only at run time (`import_module(name)`) are not seen.  So does every file
+beside an imported module, or in a folder beside it that is no package, but for what Python and editors leave there
+(`left_over`).
 
 What else a module's numbers depend on it declares in constants, which are read from its syntax tree:
 
     ENVIRONMENT = ("FACTORLIB_FUSED",)    environment variables; their values count
-    PROGRAMS = {"CC": "cc"}               programs by the variable that names them, and the usual one; whether it is there
-                                          counts, and its name, not where it lies
+    PROGRAMS = {"CC": "cc"}               programs by the variable that names them, and the usual one; whether it is
+                                          there counts, and its name, not where it lies
 """
 
 from __future__ import annotations
@@ -34,7 +35,7 @@ OURS = ("factorlib", "stages", "studies")  # packages; an installed one lies amo
 
 
 class Source(msgspec.Struct, frozen=True):
-    """Text of one module as far as it counts: a digest of its syntax tree, what it imports, and what it declares to depend on."""
+    """Digest of one module's syntax tree, its imports, and the dependencies that it declares."""
 
     digest: str = ""
     imports: list[str] = []
@@ -43,7 +44,10 @@ class Source(msgspec.Struct, frozen=True):
 
 
 class Closure(msgspec.Struct, frozen=True):
-    """Source, package data, versions and environment that a stage depends on, as a part of a step's record; and where its files lie."""
+    """Source, package data, versions and environment that a stage depends on, as a part of a step's record.
+
+    It also has the paths of these files.
+    """
 
     record: dict[str, str]
     files: dict[str, Path]
@@ -87,7 +91,7 @@ def _is_remark(item: ast.stmt) -> bool:
 
 
 class Sources:
-    """The modules below some root folders (the project, the library where it lies elsewhere), through a cache of file hashes."""
+    """Modules below some root folders (the project, the library where it lies elsewhere), by a cache of file hashes."""
 
     def __init__(self, roots: list[Path], hashes: FileHashes):
         self.roots, self.hashes = list(dict.fromkeys(roots)), hashes
@@ -96,8 +100,9 @@ class Sources:
         self._beside: dict[Path, list[Path]] = {}  # data files by folder
 
     def closure(self, package: str, stage: str, pipeline_file: Path) -> Closure:
-        """Return all modules of the project that `stage` imports, with their hashes, and the installed packages among its imports.
+        """Return all modules of the project that `stage` imports, with their hashes.
 
+        The installed packages among its imports are returned, too.
         Raises InputError where the stage has no module, or a module of the project cannot be parsed.
         """
         if self.find(f"{package}.{stage}") is None:

@@ -70,7 +70,10 @@ class Survey:
         return plan(spec, self.records, Listing(self.store, self.previous, self.store.damaged))
 
     def code(self, name: str, cores: int = 1) -> Code:
-        """Describe a stage with its parameters, as a worker loads it; cores: of the machine, of which it takes what it may."""
+        """Describe a stage with its parameters, as a worker loads it.
+
+        cores: of the machine, of which it takes what it may
+        """
         stage, project = self.spec.pipeline.stages[name], self.project
         taken = cores if stage.cores == "all" else min(stage.cores, cores)
         return Code(project.code_root, project.package, name, stage.values, project.pipeline_file, stage.threads, taken)
@@ -121,7 +124,7 @@ class Survey:
             replace_file(self.home.keys_file, json_text(keys).encode())
 
     def show(self, planned: list[Planned]) -> None:
-        """Write down what is current and point the links there: of a stage over photos, at one folder with all of them."""
+        """Record what is current, and make the links lead there: for a stage over photos, to one folder of them all."""
         home, store, stages = self.home, self.store, self.spec.pipeline.stages
         current = {p.step: p for p in planned if p.status == "current"}
         keys, of_photos = {str(step): p.key for step, p in current.items()}, {}
@@ -154,10 +157,12 @@ def survey(
     recipes: list[str] | None = None,
     look: bool = False,
 ) -> Survey:
-    """Read everything a plan needs; every InputError there is about pipeline, settings, dataset or recipes comes from here.
+    """Read everything a plan needs.
 
-    recipes: paths or names of those that are asked for, which adds the stages over them; without any, all if such a stage is
-             a target.  With the target `render` they are all that is wanted
+    Every InputError about pipeline, settings, dataset or recipes is raised here.
+
+    recipes: paths or names of those that are asked for, which adds the stages over them; without any, all if such a
+             stage is a target.  With the target `render` they are all that is wanted
     look: without running it: where recipes are named and no stage, of the recipes alone
     """
     file = project.pipeline_file
@@ -198,7 +203,7 @@ def survey(
 def _records(
     project: Project, spec: Spec, data: Data, hashes: FileHashes, recipes: dict[str, Recipe]
 ) -> tuple[dict[Step, Record], dict[Step, Handed]]:
-    """Return every step's own part of its record, and what it is handed; each file that is handed counts by its content."""
+    """Return every step's own part of its record, and its inputs; each file among these counts by its content."""
     sources, records, handed = Sources([project.code_root, LIBRARY], hashes), {}, {}
     for name in spec.pipeline.needed(spec.targets):
         stage = spec.pipeline.stages[name]

@@ -18,10 +18,10 @@ BEAT = 10.0  # seconds between two plain lines about the same step
 
 
 def printable(text: str) -> str:
-    """Replace every character that prints nothing, but for ends of lines, by the form that Python's literals have.
+    r"""Replace every character that prints nothing, but for ends of lines, by the form that Python's literals have.
 
-    >>> printable("a\\x1b[31mb\\u202ec\\n")
-    'a\\\\x1b[31mb\\\\u202ec\\n'
+    >>> printable("a\x1b[31mb\u202ec\n")
+    'a\\x1b[31mb\\u202ec\n'
     """
     return "".join(c if c.isprintable() or c == "\n" else ascii(c)[1:-1] for c in text)
 
@@ -103,7 +103,7 @@ class Display:
             self.say(f"{step}: waiting: another run is making it")
 
     def progress(self, step: Step, done: float, total: float, text: str) -> None:
-        """Note how far a running step is (`done` of `total`, in the step's own unit) and what it does; `tick` shows it."""
+        """Note a running step's progress (`done` of `total`, in its own unit) and what it does; `tick` shows it."""
         share = min(done / total, 1.0) if total else 0.0
         self.running[step][2:] = share, f"{f'{share:4.0%}' if total else ''} {printable(text)}".strip()
 

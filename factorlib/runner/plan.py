@@ -1,9 +1,9 @@
 """What must run, and why: a pure function of what is declared, what it all hashes to, and what the store holds.
 
 A step's record is a flat table of everything its result depends on: its name, the source of every module it imports,
-its parameters, what dataset.yaml says that it sees, its inputs' content hashes, versions.  No path outside the dataset and no time is in it.  Its key is
-the hash of that table, the difference of two tables is the reason for a rerun, and a step whose inputs are not made yet
-is a *maybe*: it reruns only if they come out different.
+its parameters, what dataset.yaml says that it sees, its inputs' content hashes, versions.  No path outside the dataset
+and no time is in it.  Its key is the hash of that table, the difference of two tables is the reason for a rerun, and a
+step whose inputs are not made yet is a *maybe*: it reruns only if they come out different.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ class Step(msgspec.Struct, frozen=True, order=True):
 
 
 class Spec(msgspec.Struct, frozen=True):
-    """The stages that are wanted, over which photos and recipes, and the steps that are to run whatever the store holds."""
+    """Stages that are wanted, with their photos and recipes, and the steps that run whatever the store holds."""
 
     pipeline: Pipeline
     photos: list[str]
@@ -58,7 +58,10 @@ class Spec(msgspec.Struct, frozen=True):
         return [Step(stage, photo) for photo in self.photos] if over else [Step(stage)]
 
     def above(self, step: Step) -> list[Step]:
-        """Return the steps whose results a step is handed: of its own photo, or of all for a step over the whole set or of a recipe."""
+        """Return the steps whose results a step takes.
+
+        These are of its own photo, or of all for a step over the whole set or of a recipe.
+        """
         upstream = self.pipeline.stages[step.stage].upstream
         if step.photo is None:
             return [found for name in upstream for found in self.steps_of(name)]
@@ -66,7 +69,7 @@ class Spec(msgspec.Struct, frozen=True):
 
 
 class Listing(msgspec.Struct, frozen=True):
-    """Contents of the store: output hash by key (asked by `get`); and the record each step had when it last was current here.
+    """Contents of the store: output hash by key (asked by `get`); and each step's record when it last was current here.
 
     damaged: by key, what is wrong with a result that is not as it was kept, and so has no output
     """
@@ -77,7 +80,10 @@ class Listing(msgspec.Struct, frozen=True):
 
 
 class Planned(msgspec.Struct, frozen=True):
-    """A step, what is to be done about it, why; its key and record where all its inputs are known, its output where made."""
+    """Step, what is done about it, and why.
+
+    It has its key and record where all its inputs are known, and its output where made.
+    """
 
     step: Step
     status: Status
@@ -120,7 +126,10 @@ def _planned(step: Step, forced: bool, own: Record, outputs: Mapping[Step, str |
 
 
 def hash_of(table: Record) -> str:
-    """Return the hash of a table, the same on any machine: a record's is its key, that of a tree's files is the tree's name."""
+    """Return the hash of a table, the same on any machine.
+
+    A record's hash is its key; that of a table of a tree's files is the tree's name.
+    """
     return hashlib.sha256(json.dumps(table, sort_keys=True).encode()).hexdigest()[:32]
 
 

@@ -30,19 +30,22 @@ ALL = "all"  # recipes
 
 
 class Recipe(msgspec.Struct, frozen=True):
-    """Content of a recipe.  facts: JSON-able, by field;  files: those it names, as they are written there -> absolute path"""
+    """Content of a recipe.
+
+    facts: JSON-able, by field;  files: those it names, as they are written there -> absolute path
+    """
 
     facts: dict[str, Any]
     files: dict[str, Path]
 
 
 class Data(msgspec.Struct, frozen=True):
-    """A dataset as the runner sees it: its folder, its photos, a slice of it by name and photo, and what is wrong with it.
+    """Dataset as the runner sees it: its folder, its photos, a slice of it by name and photo, and its faults.
 
     slice: has `facts`, JSON-able; `fields`, the same by their names in the dataset's file; and `files` that they name
     recipe: reads a recipe for this data set; InputError where it asks for what is not there
-    faults: of the files that a slice names, as far as looking at headers tells, by the parameters of the stage that takes
-            it and the file in which these stand
+    faults: of the files that a slice names, as far as looking at headers tells, by the parameters of the stage that
+            takes it and the file in which these stand
     recipe_faults: of the files that a recipe names;  cautions: what will run, but leave the answer open, as sentences
     """
 
@@ -100,7 +103,8 @@ def photo_sets() -> Provider:
 class Project(msgspec.Struct, frozen=True):
     """A checkout: pipeline.yaml, the package of its stages, data/ and build/.
 
-    shipped: the folder of the first two and of recipes, where the installed package brings them and `root` is any folder
+    shipped: the folder of the first two and of recipes, where the installed package brings them and `root` is any
+             folder
     """
 
     root: Path
@@ -125,7 +129,7 @@ class Project(msgspec.Struct, frozen=True):
 
     @property
     def store(self) -> Path:
-        """Return the folder of the store: in `build`, or that which FACTORLIB_STORE names.  InputError where there is none."""
+        """Return the folder of the store: in `build`, or FACTORLIB_STORE.  InputError where there is none."""
         if not (named := os.environ.get(SHARED)):
             return self.build / "store"
         if not os.path.isdir(folder := Path(named).expanduser()):
@@ -152,7 +156,10 @@ class Project(msgspec.Struct, frozen=True):
         raise InputError(f"there is no dataset {name!r}", key="DATASET", cure=cure)
 
     def find_dataset(self, name: str) -> Path | None:
-        """Find a dataset as `dataset_folder` does; None where it is not there, InputError for what can be no dataset's name or path."""
+        """Find a dataset as `dataset_folder` does.
+
+        Returns None where it is not there.  Raises InputError for what cannot be a dataset's name or path.
+        """
         by_name = "/" not in name or name.rstrip("/") in ("", ".", "..")
         if by_name:
             check_name(name, "a dataset", key="DATASET", reserved=RESERVED)
@@ -168,9 +175,10 @@ class Project(msgspec.Struct, frozen=True):
         return None
 
     def recipes(self, data: Data, words: list[str]) -> dict[str, Recipe]:
-        """Read the recipes that words name, by name: each a path, a name in recipes/ or recipes/<dataset>/, or `all` of these.
+        """Read the recipes that words name, by name.
 
-        InputError where one is not there, is not good, or two are called the same.
+        Each word is a path, a name in recipes/ or recipes/<dataset>/, or `all` of these.
+        Raises InputError where one is not there, is not good, or two are called the same.
         """
         roots = [root / "recipes" for root in dict.fromkeys([self.code_root, self.root])]
         folders = [*roots, *(root / data.folder.name for root in roots)]  # the latter go before
@@ -213,7 +221,7 @@ def check_name(
 
 
 class Code(msgspec.Struct, frozen=True):
-    """Name of a stage, where its module is found, the parameters given to it (in which file), and its share of the machine.
+    """Name of a stage, where its module is found, its parameters (and their file), and its share of the machine.
 
     threads: of its libraries' numerics;  cores: that independent work is spread over
     """
@@ -251,16 +259,18 @@ class Stage(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """One stage.
 
     inputs:  names of stages, or `dataset.<slice>`
-    over:    `photo` for a step per photo, `recipe` for one per recipe that is asked for; otherwise one step for the whole set
+    over:    `photo` for a step per photo, `recipe` for one per recipe that is asked for; otherwise one step for the
+             whole set
     gather:  in a stage over photos, the file that every `<photo>.json` is gathered into
     makes:   files each step must write, `{photo}` standing for the photo's name; glob patterns
     threads: threads of its libraries' numerics, part of what is computed (a sum depends on them), never the machine's
-    cores:   that it spreads independent work over by `Inputs.map`, `all` for those of the machine: they change no bit and no key
+    cores:   that it spreads independent work over by `Inputs.map`, `all` for those of the machine: they change no bit
+             and no key
     logs:    hand it the log of the steps above it (not part of its key)
     when:    a slice of the set: where that says nothing, the stage is not there, and none takes its results
     optional: run it only where it is asked for, or something that is asked for takes its results
-    given:   parameters that name a folder outside the dataset, and the files of it that the stage reads; the stage is handed
-             the folder among its inputs, and the key has the files' contents, not where they lie
+    given:   parameters that name a folder outside the dataset, and the files of it that the stage reads; the stage is
+             handed the folder among its inputs, and the key has the files' contents, not where they lie
     shipped: the stage's result that comes with the source, taken where it was made by the same modules and parameters
     """
 
@@ -294,7 +304,7 @@ class Stage(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
     @property
     def folders(self) -> dict[str, Path]:
-        """Return the folders that parameters name, from where the user stands; links are followed now, for results move on."""
+        """Return the folders that parameters name, from the user's folder; links are followed now, as results move."""
         named = {name: str(self.params[name]) for name in self.given if self.params.get(name) is not None}
         return {name: Path(os.path.realpath(folder.replace("\0", ""))) for name, folder in named.items()}
 
@@ -302,7 +312,8 @@ class Stage(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 class Pipeline(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """Content of pipeline.yaml.
 
-    executor: where steps run, which changes no bit and no key: `processes` of this machine, or the address of a Dask scheduler
+    executor: where steps run, which changes no bit and no key: `processes` of this machine, or the address of a Dask
+              scheduler
     """
 
     format: int
@@ -322,7 +333,10 @@ class Pipeline(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         return msgspec.structs.replace(self, stages=kept)
 
     def needed(self, targets: list[str] | None) -> list[str]:
-        """Return the targets and everything above them, in order; for None all stages but the optional ones that none of them takes."""
+        """Return the targets and everything above them, in order.
+
+        None stands for all stages but the optional ones that none of them takes.
+        """
         usual = [name for name, stage in self.stages.items() if not stage.optional]
         wanted, order = set(usual if targets is None else targets), self.order()
         for name in reversed(order):
@@ -367,7 +381,7 @@ def read_pipeline(path: Path, known_slices: tuple[str, ...]) -> Pipeline:
 
 
 def with_settings(pipeline: Pipeline, settings: list[str]) -> Pipeline:
-    """Replace values of the pipeline by words `stage.parameter=value` and `executor=…`; several words in one string are split.
+    """Replace values of the pipeline by words `stage.parameter=value` and `executor=…`; blanks separate several words.
 
     >>> with_settings(Pipeline(1, {"solve": Stage()}), ["solve.lobes=64 solve.tolerance=1e-3"]).stages["solve"].params
     {'lobes': 64, 'tolerance': 0.001}

@@ -7,9 +7,9 @@
     recipes/      links to the current pictures of each recipe
     dataset.txt   whose results these are: only a folder with this mark is one that the runner made
 
-A view is one more result: those of all photos of a stage in one folder, by hard links.  Each run has a folder in store/tmp and
-holds a lock in it while it lives; the operating system frees the lock of a run that was killed, so a folder whose lock nobody
-holds is rubbish, and no command is needed to unlock anything.
+A view is one more result: those of all photos of a stage in one folder, by hard links.  Each run has a folder in
+store/tmp and holds a lock in it while it lives; the operating system frees the lock of a run that was killed, so a
+folder whose lock nobody holds is rubbish, and no command is needed to unlock anything.
 """
 
 from __future__ import annotations
@@ -81,7 +81,7 @@ class Home(msgspec.Struct, frozen=True):
 
 
 def home_of(project: Project, dataset: Path, by_name: bool = False) -> Home:
-    """Return build/<name of the dataset's folder>; refuse it where that is a link, or holds the results of another folder.
+    """Return build/<name of the dataset's folder>; refuse it where that is a link, or has results of another folder.
 
     by_name: whoever's results it holds
     """
@@ -101,9 +101,11 @@ def home_of(project: Project, dataset: Path, by_name: bool = False) -> Home:
 
 
 def made_home(project: Project, dataset: str) -> Home | None:
-    """Find the home of a dataset that has results, by its name or path, which need not be there any more; None where it has none yet.
+    """Find the home of a dataset that has results, by its name or path; None where it has none yet.
 
-    A name is that of a home in build/; a path must be the one that the home was made for.  InputError for whatever else.
+    The dataset itself need not be there any more.
+    A name is that of a home in build/; a path must be the one that the home was made for.
+    Raises InputError for anything else.
     """
     there = project.find_dataset(dataset)
     home = home_of(project, there or Path(os.path.abspath(dataset)), by_name=there is None and "/" not in dataset)
@@ -150,7 +152,7 @@ def label(step: Step) -> str:
 
 
 def point(link: Path, target: Path, build: Path) -> None:
-    """Make `link` name the folder `target` from one moment to the next; relative within `build`, so that it can be moved."""
+    """Make `link` name the folder `target` in one atomic step; relative within `build`, so that it can be moved."""
     words = os.path.relpath(target, link.parent) if target.is_relative_to(build) else str(target)
     if link.is_symlink() and os.readlink(link) == words:
         return
@@ -164,8 +166,9 @@ def point(link: Path, target: Path, build: Path) -> None:
 
 
 def view_of(store: Store, stage: str, keys: dict[str, str], gather: str | None) -> str:
-    """Put the files of all photos of a stage ({photo: key}) into one folder, and each `<photo>.json` into `gather`; return its key.
+    """Put the files of all photos of a stage ({photo: key}) into one folder; return its key.
 
+    Each `<photo>.json` goes into `gather`, too.
     The folder is a result as those of steps are.  Its files are hard links to theirs.
     """
     entries = {photo: store.entry(key) for photo, key in sorted(keys.items())}
@@ -242,8 +245,9 @@ def _door(store: Store, say: Callable[[str], None]) -> Iterator[None]:
 
 
 def collect(project: Project, agreed: Callable[[], bool] = lambda: True) -> int:
-    """Show the results that are not current for any dataset, nor what such a one was made from; delete them if `agreed`.
+    """Show the results that are not current for any dataset, and that no current one is made from.
 
+    They are deleted if `agreed`.
     Raises InputError while a run goes on.
     """
     if (store := Store(project.store)).root != project.build / "store":
@@ -280,7 +284,8 @@ def collect(project: Project, agreed: Callable[[], bool] = lambda: True) -> int:
 
 
 def _age(seconds: float) -> str:
-    """
+    """Format an age in hours or days.
+
     >>> _age(30), _age(7200), _age(200000)
     ('less than an hour', '2 h', '2 days')
     """
@@ -289,7 +294,10 @@ def _age(seconds: float) -> str:
 
 
 def _dead(project: Project, store: Store) -> tuple[list[Path], list[Path], list[Path]]:
-    """List the store's entries that no result refers to: files of keys, trees of results, and the rest, drafts of killed writers too."""
+    """List the store's entries that no result refers to: files of keys, trees of results, and the rest.
+
+    Drafts of killed writers are among the rest.
+    """
     homes = [Home(path) for path in project.build.glob("*") if path.is_dir() and path.name != "store"]
     keys = _needed(store, {key for home in homes for key in home.keys().values()})
     trees = {entry.output for key in keys if (entry := store.entry(key))}
@@ -302,8 +310,8 @@ def _dead(project: Project, store: Store) -> tuple[list[Path], list[Path], list[
 def _needed(store: Store, current: set[str]) -> set[str]:
     """Return those keys, and of every result that they were made from, however far, the keys that gave it.
 
-    A step whose result is current is current only as long as what it was made from is there, though another run may have made
-    that anew in the meantime, with other parameters.
+    A step whose result is current is current only as long as what it was made from is there, though another run may
+    have made that anew in the meantime, with other parameters.
     """
     entries = {path.stem: entry for path in store.keys.glob("*.json") if (entry := store.entry(path.stem))}
     gave: dict[tuple[str, str], set[str]] = {}
@@ -364,7 +372,7 @@ def homes_of(project: Project, dataset: str, otherwise: str) -> list[Home]:
 
 
 def clean(project: Project, dataset: str | None) -> int:
-    """Forget the results of a dataset, or of all and the store with them; say what was deleted, and what else lies there.
+    """Forget the results of a dataset, or of all and the store with them; say what is deleted, and what else is there.
 
     What a dataset's links led to in the store goes with the next gc.
     """

@@ -1,8 +1,9 @@
 """Running a plan: start what is ready, take in what is done, plan again, until nothing is left that can run.
 
-Once all that was ready has been started and there are results, the same pure `plan` is asked anew, so an output that came
-out unchanged stops what follows there, and what another run made meanwhile is used.  A step that fails holds up only what
-depends on it; one that fails because its stage's code was edited meanwhile holds up the stage's further steps too.
+Once all that was ready has been started and there are results, the same pure `plan` is asked anew, so an output that
+came out unchanged stops what follows there, and what another run made meanwhile is used.  A step that fails holds up
+only what depends on it; one that fails because its stage's code was edited meanwhile holds up the stage's further steps
+too.
 """
 
 from __future__ import annotations

@@ -7,9 +7,9 @@
     build/store/damaged/          what stood where a result was made again, for it was not as it had been kept
     build/store/locks, tmp, cache
 
-A tree and a key appear by one rename each, the tree first; nothing half-written is ever visible.  A tree is right if its
-files are exactly those of its record, with their contents, but for what editors leave (`left_over`).  Sizes and times that
-it had when it was right are remembered, so that it is read once; `verify` reads it again.
+A tree and a key appear by one rename each, the tree first; nothing half-written is ever visible.  A tree is right if
+its files are exactly those of its record, with their contents, but for what editors leave (`left_over`).  Sizes and
+times that it had when it was right are remembered, so that it is read once; `verify` reads it again.
 """
 
 from __future__ import annotations
@@ -67,14 +67,17 @@ def read_cache(path: Path | None, type_: type[T]) -> T | None:
 
 
 def write_cache(path: Path, tables: Any) -> None:
-    """Replace a cache; where it cannot be written (a full disk, a read-only folder) the next run takes longer, no more."""
+    """Replace a cache; where it cannot be written (a full disk, a read-only folder) the next run only takes longer."""
     with contextlib.suppress(OSError):
         path.parent.mkdir(parents=True, exist_ok=True)
         replace_file(path, msgspec.json.encode(tables))
 
 
 class FileHashes:
-    """Values made of the contents of files, by kind and path, in a cache beside the store; `save` writes it.  cache: its file, None to keep nothing."""
+    """Values made of the contents of files, by kind and path, in a cache beside the store; `save` writes it.
+
+    cache: its file, None to keep nothing
+    """
 
     def __init__(self, cache: Path | None):
         self.cache, self._changed = cache, False
@@ -86,7 +89,7 @@ class FileHashes:
         return self.remembered("content", path, lambda: hash_of_file(path), Hash)
 
     def remembered(self, kind: str, path: Path, make: Callable[[], T], type_: type[T]) -> T:
-        """Return what `make` makes of the content of a file, from the cache where that is unchanged; type_: what it is."""
+        """Return what `make` makes of a file's content, from the cache where that is unchanged; type_: its type."""
         stat, table = os.stat(path), self._tables.setdefault(kind, {})
         now = stat.st_size, stat.st_mtime_ns, stat.st_ctime_ns, stat.st_ino
         with contextlib.suppress(KeyError, OverflowError, msgspec.ValidationError):  # not there, or damaged
@@ -203,7 +206,8 @@ class Store:
         """Take the files of `folder` in, as what `record` gave; the folder is gone afterwards.
 
         files: their hashes, where these are known and the files are read-only and on disk
-        Where the same tree stands already it stays if it is right, every content read; else it is set aside, which is said.
+        Where the same tree stands already it stays if it is right, every content read; else it is set aside, with a
+        message.
         """
         if files is None:
             files = hashes_of_tree(folder)
@@ -290,7 +294,10 @@ def hashes_of_tree(folder: Path) -> dict[str, str]:
 
 
 def damage_of(folder: Path, files: Mapping[str, str], right: Mapping[str, Stamp] | None = None) -> list[str]:
-    """List how a folder is not what `files` (relative path -> hash) says, a line each; contents are read but for stamps in `right`."""
+    """List how a folder differs from `files` (relative path -> hash), a line each.
+
+    Contents are read but for stamps in `right`.
+    """
     lines, now = [], stamps_of(folder)
     for name in sorted(files):
         if (stamp := now.get(name)) in (None, NO_FILE):
@@ -304,7 +311,10 @@ def damage_of(folder: Path, files: Mapping[str, str], right: Mapping[str, Stamp]
 
 
 def sound_lines(path: Path) -> list[bytes]:
-    """Read the lines of a log that are events, in order, none where there is no log; damaged ones are left out, with a warning."""
+    """Read the lines of a log that are events, in order; damaged ones are left out, with a warning.
+
+    Returns none where there is no log.
+    """
     try:
         lines = path.read_bytes().splitlines()
     except FileNotFoundError:
@@ -320,7 +330,7 @@ def sound_lines(path: Path) -> list[bytes]:
     return sound
 
 
-# ── results that ship with the source ────────────────────────────────────────────────────────────────────────────────────────────────
+# ── results that ship with the source ────────────────────────────────────────────────────────────────────────────────
 
 MADE_FROM = "made_from.json"
 CURE = "restore it from the repository, or make the result anew with FORCE=1"
@@ -357,7 +367,7 @@ def made_from(record: Record, modules: list[str]) -> Record:
 
 
 def copy_shipped(roots: list[Path], shipping: Shipping | None, record: Record, out: Path) -> bool:
-    """Copy the shipped result of `record`, from below one of `roots`, to `out`; False where none was made from the same.
+    """Copy the shipped result of `record` from below one of `roots` to `out`; False where none has the same record.
 
     Raises InputError where the files are not those that were shipped.
     """

@@ -70,7 +70,10 @@ def _say(seen: Survey, text: str) -> None:
 
 
 def make(project: Project, wish: Wish, strict: bool = False) -> int:
-    """Run the stages that are wanted and what they need, as far as anything must run; strict: return UNTRUSTED for a result not to be trusted."""
+    """Run the stages that are wanted and what they need, as far as anything must run.
+
+    strict: return UNTRUSTED for a result not to be trusted
+    """
     started, seen = time.perf_counter(), survey(project, *wish)
     planned = seen.planned()
     todo = [p.step for p in planned if p.status != "current"]
@@ -161,8 +164,10 @@ def _events(seen: Survey, planned: Planned) -> list[dict]:
 
 
 def show_graph(project: Project, mermaid: bool = False) -> int:
-    """Print the stages in the order they run, each with what it takes; or a Mermaid diagram, where stages over photos or recipes
-    have double frames."""
+    """Print the stages in the order they run, each with what it takes; or a Mermaid diagram.
+
+    In the diagram stages over photos or recipes have double frames.
+    """
     pipeline = _pipeline(project)
     stages = {name: pipeline.stages[name] for name in pipeline.order()}
     if mermaid:
@@ -363,7 +368,8 @@ def _of_any_photo(reason: str, step: Step) -> str:
 
 
 def count(items: list, one: str = "step") -> str:
-    """
+    """Write a number of items with their unit.
+
     >>> count(["a"]), count(["a", "b"], "fault")
     ('1 step', '2 faults')
     """
@@ -399,7 +405,10 @@ def _cost(planned: Planned, events: list[dict]) -> str:
 
 
 def _made_with(planned: Planned, events: list[dict]) -> dict[str, str]:
-    """Return the versions of Python and of the packages that count, and the machine's kind; nothing of no current result."""
+    """Return the versions of Python and of the packages that count, and the machine's kind.
+
+    Nothing is returned where there is no current result.
+    """
     if planned.status != "current":
         return {}
     machine = next((event["machine"] for event in reversed(events) if "machine" in event), {})

@@ -1,12 +1,12 @@
 """Steps in processes: of this machine, or of the workers of a Dask cluster.
 
-How many threads a library uses, and in which order sets are walked, is fixed when a process starts, and results depend on it.
-So each process is started for one number of threads, in an environment of its own, with the modules that are on disk now, and
-runs one step at a time: a library that crashes, or a step that is killed for want of memory, ends that process alone.
-A process ends with the one that started it, and with its run, whose lock it watches.
+How many threads a library uses, and in which order sets are walked, is fixed when a process starts, and results depend
+on it. So each process is started for one number of threads, in an environment of its own, with the modules that are on
+disk now, and runs one step at a time: a library that crashes, or a step that is killed for want of memory, ends that
+process alone. A process ends with the one that started it, and with its run, whose lock it watches.
 
-A task carries keys and paths, never arrays, and whatever happens comes back as an `Outcome`: an executor needs no more than
-`submit`.  While it runs a step says how far it is, and what it warns of, in a file of events.
+A task carries keys and paths, never arrays, and whatever happens comes back as an `Outcome`: an executor needs no more
+than `submit`.  While it runs a step says how far it is, and what it warns of, in a file of events.
 """
 
 from __future__ import annotations
@@ -145,7 +145,7 @@ def params_of(code: Code) -> msgspec.Struct:
 
 
 def check_params(code: Code) -> None:
-    """Raise InputError where a parameter of a stage is out of its bounds; return nothing, which the stage's module defines."""
+    """Raise InputError where a parameter of a stage is out of the bounds that the stage's module defines."""
     params_of(code)
 
 
@@ -273,7 +273,10 @@ class Events(logging.Handler):
             self.say(text)
 
     def progress(self, done: float, total: float, text: str = "") -> None:
-        """Report that `done` of `total` is done; dropped within EVERY seconds of the last that was not, unless the share has changed by a hundredth."""
+        """Report that `done` of `total` is done.
+
+        A report within EVERY seconds of the last is dropped, unless the share has changed by a hundredth.
+        """
         share = done / total if total else 0.0
         if (now := time.monotonic()) - self._last >= EVERY or abs(share - self._share) >= 0.01:
             self._last, self._share = now, share

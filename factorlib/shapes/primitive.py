@@ -1,8 +1,8 @@
 """Spheres, boxes and cylinders, with proportions fitted to outlines.
 
 A sphere has no free proportion, a box has two, a cylinder (about y) one. They are factors of the axes, which
-`shapes.proportions` fits to the outlines together with the poses of all photos. The fit starts from several shapes, each
-placed on the `PHOTOS` photos that show most pixels. The shape of the largest overlap is kept.
+`shapes.proportions` fits to the outlines together with the poses of all photos. The fit starts from several shapes,
+each placed on the `PHOTOS` photos that show most pixels. The shape of the largest overlap is kept.
 """
 
 from collections.abc import Callable, Sequence

@@ -1,4 +1,7 @@
-"""Alignment error: how much do wrong poses and meshes cost, and what helps?  Treatments are there where a claim compares them."""
+"""Alignment error: how much do wrong poses and meshes cost, and what helps?
+
+Treatments are there where a claim compares them.
+"""
 
 from __future__ import annotations
 
@@ -19,7 +22,7 @@ QUICK = ("exact", "turned-5", "turned-20")
 
 
 def settings(scale: Scale) -> list[Setting]:
-    """Each perturbation, with its treatments beside it."""
+    """Return a setting for each perturbation, with its treatments beside it."""
     entries, made = full_matrix(scale.side, scale.side), []
     for name in QUICK if scale.quick else PERTURBED:
         label, how, beside = PERTURBED[name]
@@ -35,14 +38,21 @@ STUDY = Study(
     name="alignment-error",
     title="Alignment error",
     question="How much do wrong poses and meshes cost, and what helps?",
-    paper="Poses off by up to 20°, shifts, wrong scales and coarse meshes raise the error. (How much is not taken over from the paper.)",
+    paper="Poses off by up to 20°, shifts, wrong scales and coarse meshes raise the error. "
+    "(How much is not taken over from the paper.)",
     varied="what is wrong with every object, and what is done",
     measures=("entries", "new_light", "normals", "diffuse", "specular", "roughness", "glossy"),
     settings=settings,
     claims=(
         *(Claim("entries", "exact", p, f"“{PERTURBED[p][0]}” raises the error") for p in COSTLY),
-        *(own("entries", f"{p}-outline", p, f"fitting the outline helps where objects are {PERTURBED[p][0]}") for p in OUTLINE),
-        *(own("entries", p, f"{p}-even", f"knowing how sure normals are helps where objects are {PERTURBED[p][0]}") for p in EVEN),
+        *(
+            own("entries", f"{p}-outline", p, f"fitting the outline helps where objects are {PERTURBED[p][0]}")
+            for p in OUTLINE
+        ),
+        *(
+            own("entries", p, f"{p}-even", f"knowing how sure normals are helps where objects are {PERTURBED[p][0]}")
+            for p in EVEN
+        ),
     ),
     lights=1,
-)  # fmt: skip
+)

@@ -16,7 +16,7 @@ PAPERS = (("view", "light"), ("intrinsic", "projective"))
 
 
 def case(scale: Scale, seed: int, method: str) -> Comparison:
-    """All of `side` materials in as many lights, by a method."""
+    """Return the case of `side` materials in as many lights, by a method."""
     return Comparison(seed, tuple(full_matrix(scale.side, scale.side)), SIZES[scale.name], scale.solve, method=method)
 
 
@@ -24,20 +24,38 @@ STUDY = Study(
     name="comparison",
     title="Comparison",
     question="Does a joint solve predict photos that were not taken better than methods that do less?",
-    paper="The joint solve is nearer to the truth than projective texturing and than an intrinsic decomposition (SIRFS), averaged over photos.",
+    paper="The joint solve is nearer to the truth than projective texturing and than an intrinsic decomposition "
+    "(SIRFS), averaged over photos.",
     varied="method",
     measures=(
-        "novel_view", "novel_light", "novel_material", "processor", "novel_view_balanced", "novel_light_balanced", "novel_material_balanced",
-        "diffuse", "specular", "roughness", "mirror", "glossy", "lambertian",
+        "novel_view",
+        "novel_light",
+        "novel_material",
+        "processor",
+        "novel_view_balanced",
+        "novel_light_balanced",
+        "novel_material_balanced",
+        "diffuse",
+        "specular",
+        "roughness",
+        "mirror",
+        "glossy",
+        "lambertian",
     ),
     settings=lambda scale: [
         Setting(m, label, lambda seed, m=m: case(scale, seed, m)) for m, (label, _) in METHODS.items()
     ],
     claims=tuple(
-        Claim(f"novel_{kind}", "ours", m, f"{what} are predicted better than by {words}", kind in PAPERS[0] and m in PAPERS[1])
+        Claim(
+            f"novel_{kind}",
+            "ours",
+            m,
+            f"{what} are predicted better than by {words}",
+            kind in PAPERS[0] and m in PAPERS[1],
+        )
         for kind, what in ASKED.items()
         for m, (_, words) in METHODS.items()
         if m != "ours" and (kind, m) != ("material", "projective")
     ),
     steps=("worlds", "answer", "compare"),
-)  # fmt: skip
+)

@@ -9,7 +9,7 @@ GUESS = ("guess", "faces-9")
 
 
 def settings(scale: Scale) -> list[Setting]:
-    """From one face to a sphere."""
+    """Return settings from one face to a sphere."""
     few = [scale.setting(f"faces-{k}", str(k), facets=k) for k in FACES[scale.name]]
     return [*few, scale.setting(f"{scale.side}x{scale.side}", "sphere")]
 
@@ -23,11 +23,26 @@ STUDY = Study(
     measures=("new_light", "entries", "roughness", "stated_roughness", "diffuse", "specular", "stated_reflectance"),
     settings=settings,
     claims=(
-        Claim("new_light", "faces-9", GUESS, "materials of nine faces are predicted in every light better than by a guess of mean colours"),
-        Claim("entries", "faces-9", GUESS, "all entries are predicted from nine faces better than by a guess of mean colours"),
+        Claim(
+            "new_light",
+            "faces-9",
+            GUESS,
+            "materials of nine faces are predicted in every light better than by a guess of mean colours",
+        ),
+        Claim(
+            "entries",
+            "faces-9",
+            GUESS,
+            "all entries are predicted from nine faces better than by a guess of mean colours",
+        ),
         Claim("new_light", "faces-9", "faces-1", "nine faces tell more of materials than one"),
         own("new_light", "3x3", "faces-9", "a sphere tells more than nine faces"),
         own("roughness", "3x3", "faces-1", "roughness is known better of a sphere than of one face"),
-        own("stated_roughness", "3x3", "faces-1", "the solve states a smaller error of roughness for a sphere than for one face"),
+        own(
+            "stated_roughness",
+            "3x3",
+            "faces-1",
+            "the solve states a smaller error of roughness for a sphere than for one face",
+        ),
     ),
-)  # fmt: skip
+)

@@ -9,7 +9,7 @@ LABELS = {"full": (2, 10, 20), "quick": (20,)}
 
 
 def settings(scale: Scale) -> list[Setting]:
-    """Unperturbed, then each perturbation by itself."""
+    """Return the unperturbed setting, then one for each perturbation by itself."""
     return [
         scale.setting(f"{scale.side}x{scale.side}", "none"),
         *(scale.setting(f"normals-{d}deg", f"{d}°", normal_deg=float(d)) for d in NORMALS[scale.name]),

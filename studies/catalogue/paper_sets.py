@@ -1,6 +1,7 @@
 """The paper's sets: which entries of its photo sets' matrices can be predicted?
 
-How its Docksta photos share materials is read from its description (seven materials, six photos, one linking chair), not from the photos.
+How its Docksta photos share materials is read from its description (seven materials, six photos, one linking chair),
+not from the photos.
 """
 
 from __future__ import annotations
@@ -9,7 +10,7 @@ from studies.study import Claim, Entry, Scale, Setting, Study, full_matrix, own
 
 
 def patterns(scale: Scale) -> dict[str, list[Entry]]:
-    """Entries by the names of the sets.
+    """Return the entries of each set, by its name.
 
     >>> from studies.study import QUICK
     >>> patterns(QUICK)["docksta"]
@@ -26,7 +27,7 @@ def patterns(scale: Scale) -> dict[str, list[Entry]]:
 
 
 def settings(scale: Scale) -> list[Setting]:
-    """A set each."""
+    """Return a setting for each set."""
     sets = patterns(scale).items()
     return [scale.of_objects(f"set-{name}", name.replace("-unlinked", " without chair"), of) for name, of in sets]
 
@@ -37,7 +38,8 @@ STUDY = Study(
     name="paper-sets",
     title="Sets of the paper",
     question="Which entries of the matrices of the paper's photo sets can be predicted?",
-    paper="Sets as sparse as Docksta (one linking chair) and as small as LAPD (two materials) are factored, as are full ones.",
+    paper="Sets as sparse as Docksta (one linking chair) and as small as LAPD (two materials) are factored, "
+    "as are full ones.",
     varied="observation pattern of a set",
     measures=("unobserved", "observed", "entries", "new_light", "diffuse", "specular", "roughness"),
     settings=settings,

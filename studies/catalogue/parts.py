@@ -1,4 +1,7 @@
-"""Parts: what is each part of the model worth?  Clipping is taken away in two ways: values as they are, or their pixels left out."""
+"""Parts: what is each part of the model worth?
+
+Clipping is taken away in two ways: values as they are, or their pixels left out.
+"""
 
 from __future__ import annotations
 
@@ -20,7 +23,7 @@ QUICK = ("as-it-is", "bounce", "clipped-left-out")
 
 
 def settings(scale: Scale) -> list[Setting]:
-    """As it is, then without each part."""
+    """Return the setting of the whole model, then one without each part."""
     cases = {
         n: {"change": WITHOUT[n][2], "solve": scale.solve | WITHOUT[n][3]} for n in (QUICK if scale.quick else WITHOUT)
     }
@@ -28,7 +31,10 @@ def settings(scale: Scale) -> list[Setting]:
 
 
 def sets(scale: Scale) -> dict[str, Any]:
-    """The rendered sets of chairs, one a seed: so many shots of so many pixels; small ones, since a study is of many solves."""
+    """Return the rendered sets of chairs, one a seed: so many shots of so many pixels.
+
+    They are small, since a study is of many solves.
+    """
     size = (2, 120, 90, 16, 32) if scale.quick else (4, 240, 180, 64, 64)
     return {"seeds": scale.seeds, **dict(zip(("shots", "width", "height", "spp", "light_rows"), size, strict=True))}
 

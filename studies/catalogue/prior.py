@@ -8,7 +8,7 @@ WEIGHTS = {"full": (0.0, 0.1, 1.0, 10.0), "quick": (0.1,)}
 
 
 def settings(scale: Scale) -> list[Setting]:
-    """Weights of the paper's prior in the paper's solver, then natural light's prior in the joint solver."""
+    """Return settings: weights of the paper's prior in its solver, then natural light's prior in the joint solver."""
     how = {"solver": "paper", "operator": "network"}
     return [
         *(
@@ -25,7 +25,17 @@ STUDY = Study(
     question="What is the weight of the paper's prior on lights worth, and is natural light's worth more?",
     paper="As the weight grows from 0 to 10 the light's chromaticity falls; 0.1 is a good trade-off.",
     varied="weight of the paper's prior on tint, in its own solver; natural: natural light's",
-    measures=("chromaticity", "true_chromaticity", "entries", "new_light", "colour", "diffuse", "specular", "roughness", "tint"),
+    measures=(
+        "chromaticity",
+        "true_chromaticity",
+        "entries",
+        "new_light",
+        "colour",
+        "diffuse",
+        "specular",
+        "roughness",
+        "tint",
+    ),
     settings=settings,
     claims=(
         Claim("chromaticity", "paper-0p1", "paper-0", "lights are less coloured at 0.1 than at 0"),
@@ -36,4 +46,4 @@ STUDY = Study(
         own("entries", "natural", "paper-0p1", "natural light's prior predicts better than 0.1"),
         own("colour", "natural", "paper-0p1", "natural light's prior gives lights truer colours than 0.1"),
     ),
-)  # fmt: skip
+)

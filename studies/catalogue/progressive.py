@@ -6,7 +6,7 @@ from studies.study import Claim, Scale, Setting, Study, full_matrix, own
 
 
 def settings(scale: Scale) -> list[Setting]:
-    """Photos one by one; then the same from the solution before."""
+    """Return settings of more and more photos, then of the same from the solution before."""
     n, entries = scale.largest, [full_matrix(scale.side, k) for k in range(scale.largest + 1)]
     cold = [scale.of_objects(f"photos-{k}", str(k), entries[k]) for k in range(1, n + 1)]
     return cold + [scale.of_objects(f"photos-{k}-warm", f"{k} warm", entries[k], warm=True) for k in range(2, n + 1)]

@@ -1,8 +1,8 @@
 """Speed against error: both solvers, the operators and every reduction of the joint solver on the same sets.
 
-Varied     cells, splittings and observations of the joint solver, its operator, the merging of observations that are alike, and the
-           paper's solver.  Sets are of 2 × 2, full ones too: there are eleven settings, and the paper's solver with its own networks is
-           slow.  The operator `reference` is left out: it takes hours.
+Varied     cells, splittings and observations of the joint solver, its operator, the merging of observations that are
+           alike, and the paper's solver.  Sets are of 2 × 2, full ones too: there are eleven settings, and the paper's
+           solver with its own networks is slow.  The operator `reference` is left out: it takes hours.
 Measured   processor time of the stage `solve`, and what it predicts.
 """
 
@@ -29,7 +29,7 @@ QUICK = ("default", "closed-form", "merge-4", "paper")
 
 
 def settings(scale: Scale) -> list[Setting]:
-    """All of `VARIANTS`; of a quick study, those of `QUICK`."""
+    """Return all of `VARIANTS`; of a quick study, those of `QUICK`."""
     variants = {name: VARIANTS[name] for name in (QUICK if scale.quick else VARIANTS)}
     return [scale.setting(name, label, full_matrix(2, 2), solve=how) for name, (label, how) in variants.items()]
 

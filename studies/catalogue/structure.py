@@ -9,7 +9,7 @@ from studies.study import Entry, Scale, Setting, Study, full_matrix, own
 
 
 def random(n: int, seed: int) -> list[Entry]:
-    """As many entries as a star has; drawn again until each material and each light is among them."""
+    """Draw as many entries as a star has, again until each material and each light is among them."""
     rng, every = Random(seed), full_matrix(n, n)
     while True:
         drawn = sorted(rng.sample(every, 2 * n - 1))
@@ -28,7 +28,7 @@ PATTERNS: dict[str, Callable[[int, int], list[Entry]]] = {
 
 
 def settings(scale: Scale) -> list[Setting]:
-    """A pattern each; the full matrix is the same case in other studies."""
+    """Return a setting for each pattern; the full matrix is the same case in other studies."""
     n = scale.largest
     return [
         Setting(f"{n}x{n}" if name == "full" else f"{name}-{n}", name, lambda seed, p=p: scale.case(seed, p(n, seed)))
@@ -40,7 +40,8 @@ STUDY = Study(
     name="structure",
     title="Structure of the matrix",
     question="Which links between photos matter?",
-    paper="Photo sets need links: shared materials or shared lights. (A ranking of patterns is not taken over from the paper.)",
+    paper="Photo sets need links: shared materials or shared lights. "
+    "(A ranking of patterns is not taken over from the paper.)",
     varied="observed entries",
     measures=("unobserved", "observed", "entries", "new_light", "diffuse", "specular", "roughness"),
     settings=settings,

@@ -1,11 +1,13 @@
 """Poses against rendered truth: success, doubts, time.  `make results ONLY=align`.
 
-Photographed are the shapes of `studies/scenes/shapes.py`, whose pose is known.  Rotations are uniform over SO(3), focal lengths
-log-uniform (`FOCALS`), sizes and places uniform where the frame cuts nothing; a pose is searched without any of these.
+Photographed are the shapes of `studies/scenes/shapes.py`, whose pose is known.  Rotations are uniform over SO(3), focal
+lengths log-uniform (`FOCALS`), sizes and places uniform where the frame cuts nothing; a pose is searched without any of
+these.
 
     exact      the mesh that was photographed                   rough          500 triangles, warped by 3 %
     wrong mesh      the mesh of another shape                   wrong mask     a random blot where the object was
-    mirrored mask   left and right exchanged                    tiny mask      the object so far away that some 20 pixels show it
+    mirrored mask   left and right exchanged                    tiny mask      the object so far away that some 20
+                    pixels show it
 """
 
 from __future__ import annotations
@@ -42,7 +44,10 @@ Key = tuple[str, str, int, int]  # kind, shape, seed, number
 
 
 class Case(NamedTuple):
-    """A photo at a known pose, and what is given of it: a mask with labels [h, w] (0 is background), and a mesh.  truth: what is seen"""
+    """Photo at a known pose, with a mask with labels [h, w] (0 is background) and a mesh.
+
+    truth: what is seen
+    """
 
     camera: Camera
     pose: Pose
@@ -52,7 +57,7 @@ class Case(NamedTuple):
 
 
 def case(kind: str, shape: str, seed: int, number: int) -> Case:
-    """The photo of that kind; the same one for the same arguments."""
+    """Return the photo of that kind; the same one for the same arguments."""
     rng, given = np.random.default_rng(zlib.crc32(f"{kind} {shape} {seed} {number}".encode())), shape
     fill = TINY_FILL if kind == "tiny mask" else rng.uniform(*FILLS)
     camera, pose, label = photographed(shapes.mesh(shape), rng, fill)
@@ -69,7 +74,7 @@ def case(kind: str, shape: str, seed: int, number: int) -> Case:
 
 
 def photographed(mesh: Mesh, rng: np.random.Generator, fill: float) -> tuple[Camera, Pose, Int[np.ndarray, "h w"]]:
-    """A camera, a pose that the frame does not cut, and the labels of what is seen."""
+    """Return a camera, a pose that the frame does not cut, and the labels of what is seen."""
     focal = WIDTH * float(np.exp(rng.uniform(*np.log(FOCALS))))
     camera = Camera(WIDTH, HEIGHT, focal, (WIDTH / 2, HEIGHT / 2))
     rotation = Rotation.random(rng=rng).as_matrix()
@@ -83,7 +88,7 @@ def photographed(mesh: Mesh, rng: np.random.Generator, fill: float) -> tuple[Cam
 
 
 def _blot(label: np.ndarray, labels: tuple[int, ...], rng: np.random.Generator) -> np.ndarray:
-    """A star-shaped region of about the mask's area about its middle, with a straight border between its materials."""
+    """Return a star-shaped region of about the mask's area and middle, with a straight border between its materials."""
     rows, columns = np.nonzero(label)
     y, x = np.mgrid[:HEIGHT, :WIDTH] + 0.5
     y, x = y - rows.mean(), x - columns.mean()
@@ -96,7 +101,10 @@ def _blot(label: np.ndarray, labels: tuple[int, ...], rng: np.random.Generator) 
 
 
 def measured(key: Key) -> dict:
-    """Seconds of the search, memory (the most that the process held so far), doubts and, where a pose can be right, errors of normals."""
+    """Measure time and memory of a search, its doubts and, where a pose can be right, errors of normals.
+
+    Time is in seconds, memory the most that the process held so far.
+    """
     kind, given = key[0], case(*key)
     caster = Caster(given.mesh)
     truth, blind, clock = given.truth, Camera(WIDTH, HEIGHT, 1.0, given.camera.centre), Clock()
@@ -106,8 +114,14 @@ def measured(key: Key) -> dict:
     seen, trust = rasterise(caster, result.camera, result.poses[0]), trust_in(obj, result, 0)
     taken, megabytes = clock.taken(), resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
     fit = silhouette_iou(silhouette, seen.label), label_agreement(silhouette, seen.label)
-    row = {"kind": kind, "shape": key[1], "wall_s": taken.wall, "processor_s": taken.processor, "memory_mb": megabytes,
-           "doubts": doubts(*fit, trust, result.found[0])}  # fmt: skip
+    row = {
+        "kind": kind,
+        "shape": key[1],
+        "wall_s": taken.wall,
+        "processor_s": taken.processor,
+        "memory_mb": megabytes,
+        "doubts": doubts(*fit, trust, result.found[0]),
+    }
     if kind in RIGHT_DEG:
         row["normal_error_deg"] = normal_error_deg(truth, seen)
         row["of_the_mesh_deg"] = normal_error_deg(truth, rasterise(caster, given.camera, given.pose))
@@ -116,13 +130,13 @@ def measured(key: Key) -> dict:
 
 
 def normal_error_deg(truth: Maps, found: Maps) -> float:
-    """Median angle between normals over the true mask; a pixel without the found mesh counts as 180°."""
+    """Return the median angle between normals over the true mask; a pixel without the found mesh counts as 180°."""
     cosine = np.clip(np.sum(truth.normal * found.normal, axis=-1), -1, 1)
     return float(np.median(np.where(found.label > 0, np.rad2deg(np.arccos(cosine)), 180.0)[truth.label > 0]))
 
 
 def share(flags: list[bool]) -> str:
-    """How many of the flags are set.
+    """Count the flags that are set.
 
     >>> share([True, False]), share([])
     ('1 of 2', '–')
@@ -131,21 +145,21 @@ def share(flags: list[bool]) -> str:
 
 
 def rows() -> Tables:
-    """Success by kind and shape, doubts about what was provoked, time and memory by kind."""
+    """Return tables of success by kind and shape, doubts about what was provoked, time and memory by kind."""
     keys = [(k, shape, s, n) for k in VIEWS for s in range(SEEDS) for shape in SHAPES for n in range(VIEWS[k])]
     with ProcessPoolExecutor(JOBS, mp_context=get_context("spawn")) as pool:
         return tables_of(list(tqdm(pool.map(measured, keys), total=len(keys), desc="poses")))
 
 
 def tables_of(measures: list[dict]) -> Tables:
-    """The tables of all photos that were measured."""
+    """Return the tables of all photos that were measured."""
 
     def doubted(of: list[dict]) -> str:
-        """How many of these are."""
+        """Count the rows that have doubts."""
         return share([bool(row["doubts"]) for row in of])
 
     def quantiles(of: list[dict], measure: str, *levels: float) -> str:
-        """Of a measure."""
+        """Format quantiles of a measure."""
         return exacts(np.quantile([row[measure] for row in of], levels))
 
     success, flags, times = [], [], []
@@ -167,6 +181,7 @@ def tables_of(measures: list[dict]) -> Tables:
         "Success": [["case", *of_errors.split("|"), "right but flagged", "wrong and flagged"], *success],
         "Provoked failures": [["provoked", "flagged", *SHAPES], *flags],
         "From mask to pose with all that says how far to believe it, 640×480": [
-            ["case", "processor: median, worst (s)", "wall: median, worst (s)", "memory (MB)"], *times,
+            ["case", "processor: median, worst (s)", "wall: median, worst (s)", "memory (MB)"],
+            *times,
         ],
-    }  # fmt: skip
+    }

@@ -1,13 +1,17 @@
-"""How right lights and materials are on data/eames, and on sets made alike: `make results ONLY=eames_like [LIGHTS="FOLDER …"]`.
+"""Errors of lights and materials on data/eames, and on sets made alike.
+
+Measured by `make results ONLY=eames_like [LIGHTS="FOLDER …"]`:
 
 data/eames  the set that settings were chosen on
-made        `python -m factorlib.generate eames --seed N`: other materials, views and lights; no setting was chosen on them
-captured    with LIGHTS, folders of captured lat-long maps: the same of the next seeds, each lit by six maps that are drawn from the folders'
-            by its seed.  The prior on lights of such a set is fitted to the other maps alone, in a copy of the project
+made        `python -m factorlib.generate eames --seed N`: other materials, views and lights; no setting was chosen on
+            them
+captured    with LIGHTS, folders of captured lat-long maps: the same of the next seeds, each lit by six maps that are
+            drawn from the folders' by its seed.  The prior on lights of such a set is fitted to the other maps alone,
+            in a copy of the project
 
-Each set runs through the pipeline once with the default seed of the solve; what is current is not run again.  Sets lie in
-build/bench/eames-like, results in build/ (of captured ones in the copies).  `python -m studies.measured.eames_like [seed …]` prints the table of
-data/eames and of sets of these seeds, in made light or, with LIGHTS, in captured light.
+Each set runs through the pipeline once with the default seed of the solve; what is current is not run again.  Sets lie
+in build/bench/eames-like, results in build/ (of captured ones in the copies).  `python -m studies.measured.eames_like
+[seed …]` prints the table of data/eames and of sets of these seeds, in made light or, with LIGHTS, in captured light.
 """
 
 from __future__ import annotations
@@ -40,7 +44,10 @@ LIGHT, BALLS, PSNR = "light.mean.channel_per_photo", "relighting.mean.channel_pe
 
 
 class Quantity(NamedTuple):
-    """A row of the table.  path, null: dotted, in metrics.json;  digits: behind the point;  unit, scale: as it is printed."""
+    """Row of the table.
+
+    path, null: dotted, in metrics.json;  digits: behind the point;  unit, scale: as it is printed
+    """
 
     meaning: str
     path: str
@@ -50,7 +57,7 @@ class Quantity(NamedTuple):
     scale: float = 1.0
 
     def text(self, value: float) -> str:
-        """The value with its unit.
+        """Return the value with its unit.
 
         >>> Quantity("k_d", "", None, 0, " %", 100).text(0.163), Quantity("roughness", "", None, 3).text(0.0412)
         ('16 %', '.041')
@@ -90,7 +97,7 @@ class Set(NamedTuple):
     results: Path
 
     def value(self, path: str) -> float:
-        """A number of the results.  InputError where it is missing."""
+        """Return a number of the results.  InputError where it is missing."""
         if (value := value_at(self.metrics, path)) is None:
             file = self.results / "evaluate/metrics.json"
             raise InputError(
@@ -100,7 +107,7 @@ class Set(NamedTuple):
 
 
 def made(seed: int, lights: Path | None = None) -> Path:
-    """The folder of the set of that seed, made where it is missing or where factorlib/generate is not as it was."""
+    """Return the folder of the set of that seed, made where it is missing or factorlib/generate has changed."""
     sources = sorted(path for path in (ROOT / "factorlib/generate").iterdir() if path.is_file())
     digest = hashlib.sha256(b"".join(path.read_bytes() for path in sources)).hexdigest()[:8]
     folder = PLACE / digest / ("captured" if lights else "made") / f"eames-like-{seed}"
@@ -111,7 +118,10 @@ def made(seed: int, lights: Path | None = None) -> Path:
 
 
 def drawn(maps: Sequence[Path], seed: int) -> tuple[list[Path], list[Path]]:
-    """The maps that light the set of that seed, and all others.  InputError where no two are left for a prior."""
+    """Return the maps that light the set of that seed, and all others.
+
+    Raises InputError where no two are left for a prior.
+    """
     if len(maps) < MAPS + 2:
         cure = f"{MAPS} light a set and the prior needs two more: name folders with {MAPS + 2}"
         raise InputError(f"{len(maps)} maps", key="LIGHTS", cure=cure)
@@ -120,7 +130,7 @@ def drawn(maps: Sequence[Path], seed: int) -> tuple[list[Path], list[Path]]:
 
 
 def folder_of(maps: Sequence[Path], folder: Path) -> Path:
-    """A folder with links to these maps alone; they keep their order."""
+    """Return a folder with links to these maps alone; they keep their order."""
     shutil.rmtree(folder, ignore_errors=True)
     folder.mkdir(parents=True)
     for number, path in enumerate(maps):
@@ -129,7 +139,10 @@ def folder_of(maps: Sequence[Path], folder: Path) -> Path:
 
 
 def project_with_prior(maps: Sequence[Path], folder: Path) -> Path:
-    """A copy of the project whose prior on lights is fitted to these maps.  Its results and its store, in build/, stay from run to run."""
+    """Copy the project, with the prior on lights fitted to these maps.
+
+    Its results and its store, in build/, stay from run to run.
+    """
     for name in COPIED:
         whole, copy = ROOT / name, folder / name
         if whole.is_dir():
@@ -142,13 +155,13 @@ def project_with_prior(maps: Sequence[Path], folder: Path) -> Path:
 
 
 def solved(name: str, dataset: Path, root: Path = ROOT) -> Set:
-    """What the pipeline below `root` finds on a data set; name: of the set in the table."""
+    """Return what the pipeline below `root` finds on a data set; name: of the set in the table."""
     (store := ROOT / "build/store").mkdir(parents=True, exist_ok=True)
     return Set(name, evaluated(dataset, root, FACTORLIB_STORE=str(store)), root / "build" / dataset.name)
 
 
 def captured(seed: int, folders: Sequence[Path]) -> Set:
-    """The set of that seed in captured lights, solved under a prior that knows none of them."""
+    """Return the set of that seed in captured lights, solved under a prior that knows none of them."""
     here = PLACE / f"captured-{seed}"
     maps, others = drawn(maps_in(folders), seed)
     print(f"set {seed} is lit by {', '.join(m.name for m in maps)}", flush=True)
@@ -157,13 +170,16 @@ def captured(seed: int, folders: Sequence[Path]) -> Set:
 
 
 def within(one: Set) -> dict[str, np.ndarray]:
-    """|estimate − truth| over the standard error: of materials, by part, and of the lights' log radiances."""
+    """Return |estimate − truth| over the standard error: of materials, by part, and of the lights' log radiances."""
     parts = [*material_deviations(one.results, None).values(), light_deviations(one.results, None)]
     return dict(zip(WITHIN, parts, strict=True))
 
 
 def rows_of(sets: Sequence[Set], unchosen: Sequence[Set]) -> list[list[str]]:
-    """A column for each set, and mean and standard deviation over those that no setting was chosen on; in brackets what the null scores."""
+    """Return a column for each set, and mean and standard deviation over those that no setting was chosen on.
+
+    Brackets hold the null's score.
+    """
     rows = [["", *(one.name for one in sets), "mean ± spread of those that no setting was chosen on"]]
     for quantity in QUANTITIES:
         nulls = {one.name: one.value(quantity.null) for one in sets} if quantity.null else {}

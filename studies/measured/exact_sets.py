@@ -1,7 +1,7 @@
 """Exact sets: spheres whose normals are true and whose lights are maps, solved by the joint solver.
 
-Materials and lights are those of the studies' world `SEED`; spheres are rendered by quadrature of the maps, not by the operator that solves,
-with .2 % of noise.  `make results ONLY=exact_sets` (10 min of one core).
+Materials and lights are those of the studies' world `SEED`; spheres are rendered by quadrature of the maps, not by the
+operator that solves, with .2 % of noise.  `make results ONLY=exact_sets` (10 min of one core).
 """
 
 from __future__ import annotations

@@ -24,7 +24,8 @@ HEAD = """# Gallery
 
 Every recipe with its pictures of `data/eames`. `make results ONLY=gallery` makes this page.
 
-A recipe says which pictures to make of a result; [recipes](recipes.md) has all its fields. Where it makes pictures of every photograph, this page shows
+A recipe says which pictures to make of a result; [recipes](recipes.md) has all its fields. Where it makes pictures \
+of every photograph, this page shows
 those of the `terrace`. Where these are four or more, such as the frames of an animation, it shows four of them.
 """
 FIGURE = """<figure markdown="0" style="margin: 0">
@@ -37,7 +38,7 @@ GRID = (
 
 
 def write() -> Path:
-    """Make the pictures of all recipes, as far as they are not made, and write the page and its pictures; returns the page."""
+    """Make the pictures of all recipes that are not made, write the page and its pictures, and return the page."""
     environment = {name: value for name, value in os.environ.items() if name not in ("SET", "FORCE", "STAGE")}
     environment |= {"DATASET": DATASET, "RECIPE": "all", "PYTHONPATH": str(ROOT)}
     if subprocess.run([sys.executable, "-m", "factorlib", "render"], cwd=ROOT, env=environment, check=False).returncode:
@@ -50,8 +51,9 @@ def write() -> Path:
 
 
 def figure(recipe: Path) -> str:
-    """Write the picture of a recipe; returns its HTML. The caption is the recipe's first line, a comment, and what the picture's parts are.
+    """Write the picture of a recipe; return its HTML.
 
+    The caption is the recipe's first line, a comment, and what the picture's parts are.
     Raises InputError where the first line is no comment.
     """
     first = recipe.read_text("utf-8").partition("\n")[0]
@@ -69,7 +71,10 @@ def figure(recipe: Path) -> str:
 
 
 def parts_of(folder: Path, shown: list[Path]) -> str:
-    """Which rows and columns a grid has, or which lights the pictures `shown` are in; nothing of frames and of single pictures."""
+    """Name the rows and columns of a grid, or the lights of the pictures `shown`.
+
+    Frames and single pictures have no such names.
+    """
     if (folder / "grid.txt").exists():
         rows, columns = (folder / "grid.txt").read_text("utf-8").splitlines()[:2]
         return f" R{rows[1:]}; {columns}."
@@ -78,7 +83,7 @@ def parts_of(folder: Path, shown: list[Path]) -> str:
 
 
 def sheet(files: list[Path]) -> Image.Image:
-    """One picture, or four of one size two by two: what is not transparent in any of them, on white."""
+    """Return one picture, or four of one size two by two: what is not transparent in any of them, on white."""
     pictures, side = [Image.open(file).convert("RGBA") for file in files], SIDE * (2 if len(files) == 1 else 1)
     boxes = np.array([box for picture in pictures if (box := picture.getchannel("A").getbbox())])
     shown = (*boxes[:, :2].min(0).tolist(), *boxes[:, 2:].max(0).tolist())

@@ -2,17 +2,20 @@
 
     python -m studies.measured.light_prior FOLDER… [--out factorlib/light/prior.json]
 
-Each map is a sample. Its area means over cells of equal area (a map's own texels are too fine, and smaller toward the poles) are the u of
-`factorlib.light.prior`. y_0, y_1 and y_2 are fitted each by itself, over n cells and m maps. Maps differ in contrast as a whole: a circus has a
-hundred times the variance of colour of a grey studio. So each map is drawn from Student's t of ν degrees of freedom (Lange, Little and Taylor,
-"Robust statistical modeling using the t distribution", 1989), in which a map of much contrast has little weight w:
+Each map is a sample. Its area means over cells of equal area (a map's own texels are too fine, and smaller toward the
+poles) are the u of `factorlib.light.prior`. y_0, y_1 and y_2 are fitted each by itself, over n cells and m maps. Maps
+differ in contrast as a whole: a circus has a hundred times the variance of colour of a grey studio. So each map is
+drawn from Student's t of ν degrees of freedom (Lange, Little and Taylor, "Robust statistical modeling using the t
+distribution", 1989), in which a map of much contrast has little weight w:
 
-    −log L = Σ_m [log|πνK|/2 + (ν+n)/2 log(1 + d_m/ν) + log Γ(ν/2) − log Γ((ν+n)/2)],   d_m = r_mᵀ K⁻¹ r_m,   r_m = y_m − X β      (1)
-    β = (Xᵀ K⁻¹ X)⁻¹ Xᵀ K⁻¹ Σ_m w_m y_m / Σ_m w_m,   w_m = (ν + n) / (ν + d_m)                                                 (2)
-    ∂(−log L)/∂t = 1/2 Σ_m tr[(K⁻¹ − w_m K⁻¹ r_m r_mᵀ K⁻¹) ∂K/∂t]   (β is optimal, so its own derivative drops out)              (3)
+    −log L = Σ_m [log|πνK|/2 + (ν+n)/2 log(1 + d_m/ν) + log Γ(ν/2) − log Γ((ν+n)/2)],   d_m = r_mᵀ K⁻¹ r_m,   r_m = y_m
+    − X β      (1) β = (Xᵀ K⁻¹ X)⁻¹ Xᵀ K⁻¹ Σ_m w_m y_m / Σ_m w_m,   w_m = (ν + n) / (ν + d_m)
+    (2) ∂(−log L)/∂t = 1/2 Σ_m tr[(K⁻¹ − w_m K⁻¹ r_m r_mᵀ K⁻¹) ∂K/∂t]   (β is optimal, so its own derivative drops out)
+    (3)
 
-over t = log of variance, decay, nugget, level and ν. X holds the profile's polynomials, and for y_0 a one: its mean is the maps' mean exposure, which
-is no property of light. For the same reason the level of y_0 is not fitted but wide, EXPOSURE_VARIANCE.
+over t = log of variance, decay, nugget, level and ν. X holds the profile's polynomials, and for y_0 a one: its mean is
+the maps' mean exposure, which is no property of light. For the same reason the level of y_0 is not fitted but wide,
+EXPOSURE_VARIANCE.
 """
 
 from __future__ import annotations
@@ -56,7 +59,10 @@ Logs = Float[np.ndarray, "3 m n"]  # y_0, y_1, y_2 of m maps in n cells
 
 
 def prior_of(paths: Sequence[Path], scored: bool = True) -> LightPrior:
-    """The prior of the maps in some files, as it is shipped; scored: with its leave-one-out scores, which take most of the time."""
+    """Fit the prior to the maps in some files, as it is shipped.
+
+    scored: with its leave-one-out scores, which take most of the time
+    """
     cells = fibonacci_sphere(CELLS)
     logs = log_cells(np.stack([cell_means(read_light_map(path), cells) for path in tqdm(paths, desc="reading")]))
     sources = tuple(Source(path.name, hashlib.sha256(read_bytes(path, "a light map")).hexdigest()) for path in paths)
@@ -65,7 +71,7 @@ def prior_of(paths: Sequence[Path], scored: bool = True) -> LightPrior:
 
 
 def cell_means(lat_long: Float[np.ndarray, "h w 3"], cells: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
-    """Mean radiance over each cell: the directions nearest to one of the unit directions `cells`.
+    """Return the mean radiance over each cell: the directions nearest to one of the unit directions `cells`.
 
     Raises ValueError for a map so coarse that a cell has no texel.
     """
@@ -80,26 +86,27 @@ def cell_means(lat_long: Float[np.ndarray, "h w 3"], cells: Float[np.ndarray, "n
 
 
 def log_cells(means: Float[np.ndarray, "m n 3"]) -> Logs:
-    """y of the mean radiances (linear Rec. 709, finite, no map black) of cells of some maps."""
+    """Return y of the mean radiances (linear Rec. 709, finite, no map black) of cells of some maps."""
     floor = FLOOR * means.mean(axis=(1, 2), keepdims=True)
     return np.einsum("kc,mnc->kmn", MIX, np.log(np.maximum(means, floor)))
 
 
 def legendre(sine: Float[np.ndarray, " p"]) -> Float[np.ndarray, "p 3"]:
-    """P_1, P_2, P_3; over the sphere their means are zero, so they leave the level alone."""
+    """Return P_1, P_2, P_3; over the sphere their means are zero, so they leave the level alone."""
     return np.polynomial.legendre.legvander(sine, 3)[:, 1:]
 
 
 def mean_of(prior: LightPrior, cells: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "3 n"]:
-    """Mean of y in unit directions of the maps' frame: equation (3) of `factorlib.light.prior`."""
+    """Return the mean of y in unit directions of the maps' frame: equation (3) of `factorlib.light.prior`."""
     return np.array(prior.profile) @ legendre(cells @ UP).T
 
 
 def fitted(
     logs: Logs, cells: Float[np.ndarray, "n 3"], profile: bool = True, start: LightPrior | None = None
 ) -> LightPrior:
-    """The prior of greatest likelihood of `logs`, y of some maps in unit directions `cells` of the maps' frame (+y is up).
+    """Fit the prior of greatest likelihood to `logs`, y of some maps.
 
+    cells: unit directions of the maps' frame (+y is up)
     profile: whether the mean depends on elevation;  start: where to begin the search
     """
     numbers, coefficients, angle = [], [], angles(cells)
@@ -127,7 +134,7 @@ def _cost(
     design: Float[np.ndarray, "n q"],
     values: Float[np.ndarray, "m n"],
 ) -> tuple[float, Float[np.ndarray, "5"], Float[np.ndarray, " q"]]:
-    """−log L per map, its gradient by t, and β: equations (1) to (3)."""
+    """Return −log L per map, its gradient by t, and β: equations (1) to (3)."""
     variance, decay, nugget, level, freedom = np.exp(t)
     alike, count = variance * correlation(angle, decay), len(angle)
     factor = cho_factor(alike + level + nugget * np.eye(count), lower=True)
@@ -150,7 +157,10 @@ def _weighted_means(
     values: Float[np.ndarray, "m n"],
     freedom: float,
 ) -> tuple[Float[np.ndarray, " q"], Float[np.ndarray, " m"]]:
-    """β, and the weight of each map: equation (2).  d is quadratic in β, so what is summed over cells is summed once."""
+    """Return β, and the weight of each map: equation (2).
+
+    d is quadratic in β, so what is summed over cells is summed once.
+    """
     count, weight = values.shape[1], np.ones(len(values))
     towards = inverse @ design
     gram, along, own = design.T @ towards, values @ towards, np.sum(values @ inverse * values, axis=1)
@@ -163,7 +173,7 @@ def _weighted_means(
 def _log_density(
     root: Float[np.ndarray, "n n"], square: Float[np.ndarray, " m"], freedom: float
 ) -> Float[np.ndarray, " m"]:
-    """Of Student's t: `root` is the lower Cholesky factor of K, `square` is d."""
+    """Return the log density of Student's t: `root` is the lower Cholesky factor of K, `square` is d."""
     count = len(root)
     gammas = gammaln((freedom + count) / 2) - gammaln(freedom / 2)
     constant = gammas - count / 2 * np.log(np.pi * freedom) - np.log(np.diag(root)).sum()
@@ -171,7 +181,7 @@ def _log_density(
 
 
 def log_likelihood(prior: LightPrior, logs: Logs, cells: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, " m"]:
-    """Log density of y of each map under a prior, nats."""
+    """Return the log density of y of each map under a prior, nats."""
     total = np.zeros(logs.shape[1])
     for k, residual in enumerate(logs - mean_of(prior, cells)[:, None]):
         root = np.linalg.cholesky(prior.covariance(k, cells))
@@ -181,13 +191,13 @@ def log_likelihood(prior: LightPrior, logs: Logs, cells: Float[np.ndarray, "n 3"
 
 
 def white_noise(prior: LightPrior) -> LightPrior:
-    """The same variance of a cell, level and profile, but cells are independent."""
+    """Return a prior with the variance of a cell, the level and the profile of another, but independent cells."""
     nugget = tuple(v + n for v, n in zip(prior.variance, prior.nugget, strict=True))
     return msgspec.structs.replace(prior, variance=(0.0, 0.0, 0.0), nugget=nugget)
 
 
 def leave_one_out(logs: Logs, cells: Float[np.ndarray, "n 3"]) -> LeaveOneOut:
-    """Each map under a prior fitted to the others, and under two nulls fitted to them."""
+    """Score each map under a prior fitted to the others, and under two nulls fitted to them; return the means."""
     whole, flat, scores = fitted(logs, cells), fitted(logs, cells, profile=False), []
     for m in tqdm(range(logs.shape[1]), desc="leaving one out"):
         rest, one = np.delete(logs, m, axis=1), logs[:, m : m + 1]
@@ -198,10 +208,10 @@ def leave_one_out(logs: Logs, cells: Float[np.ndarray, "n 3"]) -> LeaveOneOut:
 
 
 def rounded(prior: LightPrior) -> LightPrior:
-    """To the digits that a table needs."""
+    """Round to the digits that a table needs."""
 
     def short(value: float | tuple) -> float | tuple:
-        """To DIGITS digits."""
+        """Round to DIGITS digits."""
         return tuple(map(short, value)) if isinstance(value, tuple) else float(f"{value:.{DIGITS}g}")
 
     names, scores = ("variance", "decay_deg", "level", "nugget", "freedom", "profile", "cell_deg"), prior.leave_one_out
@@ -211,7 +221,7 @@ def rounded(prior: LightPrior) -> LightPrior:
 
 
 def main(folders: list[Path], out: Annotated[Path | None, typer.Option(help="File to write to.")] = None) -> None:
-    """Fit the prior on natural light to the lat-long maps (.hdr, .exr) in some folders; print it, or write it to a file."""
+    """Fit the prior on natural light to the lat-long maps (.hdr, .exr) in some folders; print it, or write a file."""
     prior = prior_of(maps_in(folders))
     print(json_text(prior)) if out is None else write_json(out, prior)
 

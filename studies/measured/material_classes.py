@@ -1,8 +1,10 @@
-"""python -m studies.measured.material_classes FILE [--out factorlib/inference/material_classes.json]: the classes of the prior on materials, fitted to a table of measured materials.
+"""Classes of the prior on materials, fitted to a table of measured materials.
 
-FILE is a .csv with a row a material: its name in `material`, and the Lambert + GGX that was fitted to it: `k_s` and `roughness`, and `k_s_r`, `k_s_g`
-and `k_s_b`, whose ratios are the tint.
-The class of a row is that whose words its name has: METALS, FIBROUS, or else dielectric.
+Usage: python -m studies.measured.material_classes FILE [--out factorlib/inference/material_classes.json]
+
+FILE is a .csv with a row a material: its name in `material`, and the Lambert + GGX that was fitted to it: `k_s` and
+`roughness`, and `k_s_r`, `k_s_g` and `k_s_b`, whose ratios are the tint.  The class of a row is that whose words its
+name has: METALS, FIBROUS, or else dielectric.
 """
 
 import csv
@@ -26,14 +28,20 @@ METALS = (
     r"|satin|aurora|pearl|solo_m"
 )
 # Of fibres or powder: rough all through, which GGX imitates by a specular part of roughness .6 to 1.
-FIBROUS = r"(?<!specular-)fabric|felt|cloth|foam|paper_|cardboard_rgb|latex|ceiling|spectralon|colodur_(azure|napoli)|polyethylene"
+FIBROUS = (
+    r"(?<!specular-)fabric|felt|cloth|foam|paper_|cardboard_rgb|latex|ceiling|spectralon|"
+    r"colodur_(azure|napoli)|polyethylene"
+)
 LEAST = 1e-3  # of k_s: what a fit calls nil
 RAYLEIGH = np.sqrt(2 * np.log(2))  # the median length of a Gaussian vector of two dimensions, in standard deviations
 COLUMNS = ("material", "k_s_r", "k_s_g", "k_s_b", "k_s", "roughness")
 
 
 def classes_of(path: Path) -> Classes:
-    """Means and covariances of the three classes; InputError where the file has not the columns, or a class no four rows."""
+    """Return means and covariances of the three classes.
+
+    Raises InputError where the file has not the columns, or a class no four rows.
+    """
     content = read_bytes(path, "a table of materials")
     rows = list(csv.DictReader(io.StringIO(content.decode("utf-8", "replace"))))
     if not rows or (missing := [name for name in COLUMNS if rows[0].get(name) is None]):

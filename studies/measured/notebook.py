@@ -1,4 +1,7 @@
-"""docs/result.ipynb with its outputs, run on data/eames: `make results ONLY=notebook`, which takes `make setup EXTRAS=notebook`."""
+"""Outputs of docs/result.ipynb, run on data/eames: `make results ONLY=notebook`.
+
+It takes `make setup EXTRAS=notebook`.
+"""
 
 from __future__ import annotations
 

@@ -1,9 +1,10 @@
 """Time, error and stability of every reflection operator: `make results ONLY=operator`.
 
-Error      of values |R − S| / (S + E/100), of gradients |∂R − ∂S| / (|∂S| + S + E/100); S by quadrature, E the lobe's integral
-Time       of one evaluation, that is, one observation and one lobe, diffuse and specular: processor time of one thread, the operators in
-           turn within each repeat, so that whatever else the machine does falls on all of them; the least and the median of the repeats.
-           Ratios between operators hold; absolute times are the machine's.
+Error      of values |R − S| / (S + E/100), of gradients |∂R − ∂S| / (|∂S| + S + E/100); S by quadrature, E the lobe's
+           integral
+Time       of one evaluation, that is, one observation and one lobe, diffuse and specular: processor time of one thread,
+           the operators in turn within each repeat, so that whatever else the machine does falls on all of them; the
+           least and the median of the repeats. Ratios between operators hold; absolute times are the machine's.
 """
 
 from __future__ import annotations
@@ -48,7 +49,7 @@ LOBES, REPEATS = 64, 7
 
 
 def made(name: str, dtype: str, *, compiled: bool = True) -> Operator | None:
-    """The operator in this precision; None where there is no such one, or nothing of it is compiled to leave out."""
+    """Return the operator in this precision; None where there is none, or nothing of it is compiled to leave out."""
     with patch.dict(os.environ, {} if compiled else {"FACTORLIB_FUSED": "0"}):
         try:
             operator = reflection_operator(name, dtype=dtype)
@@ -58,7 +59,10 @@ def made(name: str, dtype: str, *, compiled: bool = True) -> Operator | None:
 
 
 def variants() -> dict[str, Operator]:
-    """Fast operators by label, e.g. "network float32"; "network float32 torch" is its torch path where C is there too."""
+    """Return fast operators by label, e.g. "network float32".
+
+    "network float32 torch" is its torch path where C is there too.
+    """
     operators: dict[str, Operator | None] = {}
     for name in FAST:
         operators |= {f"{name} {dtype}": made(name, dtype) for dtype in ("float32", "float64")}
@@ -68,7 +72,7 @@ def variants() -> dict[str, Operator]:
 
 
 def label_of(label: str) -> str:
-    """The label as tables have it."""
+    """Return the label as tables have it."""
     return label.replace("_", " ").replace("float", "f")
 
 
@@ -76,7 +80,10 @@ def label_of(label: str) -> str:
 
 
 def specular_errors(operator: Operator, samples: Samples) -> dict:
-    """Quantiles of the error over all samples, and by roughness, sharpness, cosine of the view and angle from the mirror direction."""
+    """Return quantiles of the error over all samples, and by several inputs.
+
+    These are roughness, sharpness, cosine of the view and angle from the mirror direction.
+    """
     a, lam, no, nz, oz = (t.to(operator.dtype) for t in samples.inputs())
     with torch.no_grad():
         value = operator.specular(a.sqrt()[:, None], lam[:, None], no, nz[:, None], oz[:, None])[:, 0].double()
@@ -85,7 +92,7 @@ def specular_errors(operator: Operator, samples: Samples) -> dict:
 
 
 def diffuse_errors(operator: Operator, samples: DiffuseSamples) -> dict:
-    """Quantiles of the error over all samples, and by sharpness and the lobe's angle from the normal."""
+    """Return quantiles of the error over all samples, and by sharpness and the lobe's angle from the normal."""
     sharpness, nz = (t[:, None].to(operator.dtype) for t in (samples.sharpness, samples.nz))
     with torch.no_grad():
         value = operator.diffuse(sharpness, nz)[:, 0].double()
@@ -94,13 +101,13 @@ def diffuse_errors(operator: Operator, samples: DiffuseSamples) -> dict:
 
 
 def _of_finite(table: Callable[[Tensor], dict], value: Tensor) -> dict:
-    """The table of the samples whose value is finite, and how many are not, if any."""
+    """Return the table of the samples whose value is finite, and how many are not, if any."""
     some = value.isfinite()
     return (table(some) if some.any() else {}) | ({} if some.all() else {"not finite": int((~some).sum())})
 
 
 def gradient_errors(operator: Operator, true: list[Tensor]) -> dict:
-    """Quantiles of the error by input; true: `gradients` of the reference."""
+    """Return quantiles of the error by input; true: `gradients` of the reference."""
     scale = true[0] + lobe_integral(specular_inputs(GRADIENTS, 5)[1]) / 100
     pairs = zip(SLOPES, gradients(operator)[1:], true[1:], strict=True)
     errors = {name: (a - b) / (b.abs() + scale) for name, a, b in pairs}
@@ -108,7 +115,7 @@ def gradient_errors(operator: Operator, true: list[Tensor]) -> dict:
 
 
 def gradients(operator: Operator) -> list[Tensor]:
-    """Value and derivatives of samples that share nothing, each a problem of one lobe and one point; float64."""
+    """Compute value and derivatives of samples that share nothing, float64; each is one lobe and one point."""
     alpha, sharpness, no, nz, oz = specular_inputs(GRADIENTS, 5)
     inputs = (alpha.sqrt(), sharpness.log(), no, nz, oz)
     leaves = [t.to(operator.dtype)[:, None].clone().requires_grad_() for t in inputs]
@@ -120,7 +127,7 @@ def gradients(operator: Operator) -> list[Tensor]:
 
 
 def point(operator: Operator, count: int) -> tuple[Tensor, ...]:
-    """Roughness, λ, n·o, n·z, o·z of random points under `LOBES` lobes of sharpness .3 to 3000."""
+    """Draw roughness, λ, n·o, n·z, o·z of random points under `LOBES` lobes of sharpness .3 to 3000."""
     g = torch.Generator().manual_seed(0)
     n, o, z = (normalize(torch.randn(k, 3, generator=g, dtype=torch.float64), dim=1) for k in (count, count, LOBES))
     o = torch.where(((n * o).sum(1) > 0)[:, None], o, -o)
@@ -143,7 +150,7 @@ def gradient(operator: Operator, *inputs: Tensor) -> None:
 def microseconds(
     operators: dict[str, Operator], rows: int = 1024, repeats: int = REPEATS
 ) -> dict[str, list[list[float]]]:
-    """Of all repeats, of values alone and of values with all derivatives, by operator."""
+    """Time all repeats, of values alone and of values with all derivatives, by operator."""
     counts = {label: 8 if label in TOLERANCES else rows for label in operators}
     inputs = {label: point(operator, counts[label]) for label, operator in operators.items()}
     taken: dict[str, list[list[float]]] = {label: [[], []] for label in operators}
@@ -156,11 +163,14 @@ def microseconds(
     return {label: [of[1:] for of in pair] for label, pair in taken.items()}  # the first one compiles
 
 
-# ── Special cases and laws of `studies/scenes/operators.py`, which `tests/reflection/test_stability.py` has bounds for ─────────────────────
+# ── Special cases and laws of `studies/scenes/operators.py`; `tests/reflection/test_stability.py` has bounds ────────
 
 
 def measures(given: laws.Pairs, fast: dict[str, Operator], with_reference: bool = True) -> dict[str, dict[str, float]]:
-    """Worst errors of every operator in float32 of `fast`: of values against the reference, and by rounding against its float64."""
+    """Return the worst errors of every operator in float32 of `fast`.
+
+    They are of values against the reference, and by rounding against its float64.
+    """
     exactly = {label.split()[0]: laws.answers(o, given) for label, o in fast.items() if label.endswith("float64")}
     true, table = laws.reference_values(given) if with_reference else None, {}
     for label, operator in fast.items():
@@ -188,7 +198,7 @@ LAWS: dict[str, Callable[[Operator], tuple[float, ...]]] = {
 
 
 def special(fast: dict[str, Operator]) -> Tables:
-    """Rounding and errors of values in special cases, and how far each operator breaks the laws."""
+    """Return rounding and errors of values in special cases, and how far each operator breaks the laws."""
     single = {label_of(label).replace(" f32", ""): o for label, o in fast.items() if "float64" not in label}
     cases = {name: list(measures(laws.case(name), fast, name != laws.ALL).values()) for name in (*laws.CASES, laws.ALL)}
     broken = [
@@ -198,20 +208,24 @@ def special(fast: dict[str, Operator]) -> Tables:
     return {
         "Worst error of float32 against float64 in the same operator: of values / of derivatives": [
             ["changed", *single],
-            *([name, *(f"{exact(e['value_rounding'])} / {exact(e['gradient_rounding'])}" for e in row)] for name, row in cases.items()),
+            *(
+                [name, *(f"{exact(e['value_rounding'])} / {exact(e['gradient_rounding'])}" for e in row)]
+                for name, row in cases.items()
+            ),
         ],
         "Worst error of values against the reference": [
-            ["changed", *single], *([name, *(exact(e["value"]) for e in row)] for name, row in cases.items() if name != laws.ALL),
+            ["changed", *single],
+            *([name, *(exact(e["value"]) for e in row)] for name, row in cases.items() if name != laws.ALL),
         ],
         "Laws: 99th percentile / worst, or the worst alone": [["law", *single], *broken],
-    }  # fmt: skip
+    }
 
 
 # ── Tables ───────────────────────────────────────────────────────────────────────────────────────────────────────────
 
 
 def rows() -> Tables:
-    """Time of all operators, errors of their values and derivatives, of values by what is asked."""
+    """Return tables of all operators: time, errors of values and derivatives, and of values by what is asked."""
     fast, references = variants(), {label: Reference(tolerance=tolerance) for label, tolerance in TOLERANCES.items()}
     times = microseconds(fast | references)
     specular, diffuse = specular_samples(SAMPLES, 99, tolerance=1e-7), diffuse_samples(SAMPLES, 98)
@@ -238,7 +252,7 @@ def rows() -> Tables:
         "Errors of values": [["operator", *QUANTILES], *whole],
         "Errors of derivatives": [["operator", *QUANTILES], *slopes],
         "Specular errors by what is asked: median, p95": [["asked", *map(label_of, single)], *by_input],
-    } | special(fast)  # fmt: skip
+    } | special(fast)
 
 
 def _percents(errors: dict) -> list[str]:

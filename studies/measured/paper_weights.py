@@ -1,7 +1,7 @@
-"""Make the weights of the paper's operator again: `python -m studies.measured.paper_weights`.
+"""Training of the weights of the paper's operator: `python -m studies.measured.paper_weights`.
 
-200,000 pixels of 4000 spheres rendered by Mitsuba, two networks, a few minutes of one core.  The errors against the reference over
-`factorlib.reflection.samples` are written beside the weights, in paper_accuracy.json.
+200,000 pixels of 4000 spheres rendered by Mitsuba, two networks, a few minutes of one core.  The errors against the
+reference over `factorlib.reflection.samples` are written beside the weights, in paper_accuracy.json.
 """
 
 from __future__ import annotations

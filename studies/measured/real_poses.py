@@ -1,12 +1,12 @@
 """Real photographs whose poses are known from elsewhere: `make results ONLY=real_poses REAL="FOLDER …"`.
 
-Each folder is a data set with a `reference_poses.json` in the layout of align's poses.json.  Every photo is aligned by the stages
-`masks` and `align` with all that is said of cameras and poses withheld; EXIF belongs to the photo and stays.
+Each folder is a data set with a `reference_poses.json` in the layout of align's poses.json.  Every photo is aligned by
+the stages `masks` and `align` with all that is said of cameras and poses withheld; EXIF belongs to the photo and stays.
 
 Not every turn between the two answers is an error of the alignment.  Taken off, one at a time:
 
-    the ray's turn     a longer lens from further away shows nearly the same picture, and every ray to the object leans less:
-                       the turn of the ray to the object's middle follows from the focal length, not from the mask
+    the ray's turn     a longer lens from further away shows nearly the same picture, and every ray to the object leans
+                       less: the turn of the ray to the object's middle follows from the focal length, not from the mask
     the common turn    of all photos of a set, about the mesh's axes: how the mesh lies in the reference's frame
 """
 
@@ -45,20 +45,23 @@ ANGLES = {
 
 
 class Reference(PhotoPoses, frozen=True):
-    """A photo's entry of reference_poses.json; silhouette_iou: of all its objects together, None where it is not known."""
+    """Entry of a photo in reference_poses.json.
+
+    silhouette_iou: of all its objects together, None where it is not known
+    """
 
     silhouette_iou: float | None = None
 
 
 def references(folder: Path) -> dict[str, Reference]:
-    """The known poses by photo.  InputError for a folder without any."""
+    """Return the known poses by photo.  InputError for a folder without any."""
     if not (folder / REFERENCE).is_file():
         raise InputError(f"there is no {REFERENCE}", file=folder, cure=CURE)
     return read_result(folder / REFERENCE, dict[str, Reference], "align", CURE)
 
 
 def withheld(dataset: Dataset) -> Dataset:
-    """The dataset without cameras, poses, keypoints and what a source of cameras says."""
+    """Return the dataset without cameras, poses, keypoints and what a source of cameras says."""
     replace = msgspec.structs.replace
     bare = [[replace(obj, pose=None, keypoints=[]) for obj in photo.objects] for photo in dataset.spec.photos]
     photos = [replace(p, camera=None, objects=of) for p, of in zip(dataset.spec.photos, bare, strict=True)]
@@ -66,7 +69,7 @@ def withheld(dataset: Dataset) -> Dataset:
 
 
 def measured(folder: Path, photo: str) -> list[dict]:
-    """One row per object of the photo: errors against the reference, and what the stage itself says of the pose."""
+    """Return one row per object of the photo: errors against the reference, and the stage's own words on the pose."""
     dataset, reference = withheld(read_dataset(folder)), references(folder)[photo]
     with TemporaryDirectory() as made:
         clock = Clock()
@@ -80,25 +83,38 @@ def measured(folder: Path, photo: str) -> list[dict]:
         caster, pose, true = Caster(mesh), said.pose, reference.objects[obj.name].pose
         camera, true_camera = (entry.camera.camera(picture.width, picture.height) for entry in (answer, reference))
         normals = rasterise(caster, true_camera, true), rasterise(caster, camera, pose)
-        rows.append({
-            "set": folder.resolve().name, "photo": photo, "object": obj.name, "wall_s": taken.wall, "processor_s": taken.processor,
-            "turn": Rotation.from_matrix(true.rotation.T @ pose.rotation).as_rotvec().tolist(),
-            "rotation_error_deg": angle_between(pose.rotation, true.rotation), "normal_error_deg": normal_error_deg(*normals),
-            "about_the_ray_deg": angle_between(*(about_the_ray(p, caster.centre) for p in (pose, true))),
-            "focal_ratio": camera.focal / true_camera.focal, "focal_source": answer.camera.focal_source,
-            "reference_iou": reference.silhouette_iou, "silhouette_iou": said.silhouette_iou, "doubts": said.doubts,
-        })  # fmt: skip
+        rows.append(
+            {
+                "set": folder.resolve().name,
+                "photo": photo,
+                "object": obj.name,
+                "wall_s": taken.wall,
+                "processor_s": taken.processor,
+                "turn": Rotation.from_matrix(true.rotation.T @ pose.rotation).as_rotvec().tolist(),
+                "rotation_error_deg": angle_between(pose.rotation, true.rotation),
+                "normal_error_deg": normal_error_deg(*normals),
+                "about_the_ray_deg": angle_between(*(about_the_ray(p, caster.centre) for p in (pose, true))),
+                "focal_ratio": camera.focal / true_camera.focal,
+                "focal_source": answer.camera.focal_source,
+                "reference_iou": reference.silhouette_iou,
+                "silhouette_iou": said.silhouette_iou,
+                "doubts": said.doubts,
+            }
+        )
     return rows
 
 
 def about_the_ray(pose: Pose, centre: Float[np.ndarray, "3"]) -> Float[np.ndarray, "3 3"]:
-    """The rotation as a camera sees it that looks straight at the object's centre: cam_from_object less the ray's turn."""
+    """Return the rotation in the frame of a camera that looks straight at the object's centre.
+
+    It is cam_from_object less the ray's turn.
+    """
     middle = pose.apply(centre[None])[0]
     return toward(middle[:2] / middle[2]).T @ pose.rotation
 
 
 def common_turn(turns: list[list[float]]) -> tuple[float, list[float]]:
-    """Angle of the mean of rotation vectors, and what is left of each without it, degrees.
+    """Return the angle of the mean of rotation vectors, and what is left of each without it, degrees.
 
     >>> [round(float(angle), 6) for angle in common_turn([[0, 0, 0.1], [0, 0, 0.3]])[1]]
     [5.729578, 5.729578]
@@ -108,14 +124,14 @@ def common_turn(turns: list[list[float]]) -> tuple[float, list[float]]:
 
 
 def rows() -> Tables:
-    """Sets with medians and worst values, and all photos."""
+    """Return tables of sets with medians and worst values, and of all photos."""
     folders = [Path(word) for word in needed("REAL", "folders of photographs with known poses")]
     photos = [(f, p.name) for f in folders for p in read_dataset(f).spec.photos if p.name in references(f)]
     return tables_of([row for key in photos for row in measured(*key)])
 
 
 def tables_of(measures: list[dict]) -> Tables:
-    """The tables of all photos that were measured."""
+    """Return the tables of all photos that were measured."""
     sets, photos = [], []
     for name in dict.fromkeys((row["set"], row["object"]) for row in measures):
         of = [row for row in measures if (row["set"], row["object"]) == name]

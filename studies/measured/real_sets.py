@@ -1,8 +1,8 @@
 """Photo sets of which nothing is known but the photographs: `make results ONLY=real_sets REAL="FOLDER …"`.
 
-There is no truth of photographs: all that can be said is how well the answer gives back the photos it was solved from.  So DSSIM and
-PSNR of the re-synthesis stand beside that of flat colours, each material of each photo in its own mean colour, which nothing solved knows of.
-The pipeline runs first, as `make evaluate` does, as far as anything must run.
+There is no truth of photographs: all that can be said is how well the answer gives back the photos it was solved from.
+So DSSIM and PSNR of the re-synthesis stand beside that of flat colours, each material of each photo in its own mean
+colour, which nothing solved knows of. The pipeline runs first, as `make evaluate` does, as far as anything must run.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ HEAD = ["set: photo", "DSSIM of the re-synthesis", FLAT, PSNR, FLAT]
 
 
 def rows_of(name: str, metrics: Metrics) -> list[list[str]]:
-    """A row for each photo, and the mean: DSSIM and PSNR of the re-synthesis, each beside that of flat colours."""
+    """Return rows of each photo and of the mean: DSSIM and PSNR of the re-synthesis, beside those of flat colours."""
     scored = {photo: errors.gauges["none"] for photo, errors in metrics.resynthesis.photos.items() if errors.gauges}
     scored |= {"mean": metrics.resynthesis.mean["none"]} if metrics.resynthesis.mean else {}
     both = {photo: (errors.estimate, errors.null) for photo, errors in scored.items()}
@@ -30,7 +30,7 @@ def rows_of(name: str, metrics: Metrics) -> list[list[str]]:
 
 
 def rows() -> Tables:
-    """Of all folders.  InputError where none is named."""
+    """Return the rows of all folders.  InputError where none is named."""
     folders = [Path(word).resolve() for word in needed("REAL", "folders of photographs")]
     lines = [row for f in folders for row in rows_of(f.name, msgspec.convert(evaluated(f), Metrics))]
     return {"Re-synthesis": [HEAD, *lines]}

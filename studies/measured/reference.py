@@ -1,14 +1,18 @@
-"""The numbers of data/synthetic that a run must reproduce: `python -m studies.measured.reference "why they changed"` writes them anew.
+"""Numbers of data/synthetic that a run must reproduce.
 
-It runs the pipeline on data/synthetic with `SEEDS` seeds of the solve (what is current is not run again), as it is and SMALL, and writes
-synthetic.json and small.json in tests/regression: of each number its value with the default seed, its range and deviation over seeds, the
-tolerance that follows, and the reasons of all refreshes with what each changed.  `make test` runs the default seed SMALL and compares,
-`make test-long` runs it as it is.  Of SMALL the files of each stage count too, so that a change is named where it begins.
+`python -m studies.measured.reference "why they changed"` writes them anew.
 
-Tolerance    t · √2 · s, s the standard deviation over seeds and t Student's of n − 1 degrees of freedom at 1 − DOUBT / 2: two runs that
-             differ by nothing but their seeds lie further apart once in 1 / DOUBT times, a number.  On the processors of
-             docs/reproducibility.md a run gives the same bits, so that any change at all is one of the sources; a change within
-             the tolerance is as small as another seed's.  What knows no seed has ROUNDING of itself.
+It runs the pipeline on data/synthetic with `SEEDS` seeds of the solve (what is current is not run again), as it is and
+SMALL, and writes synthetic.json and small.json in tests/regression: of each number its value with the default seed, its
+range and deviation over seeds, the tolerance that follows, and the reasons of all refreshes with what each changed.
+`make test` runs the default seed SMALL and compares, `make test-long` runs it as it is.  Of SMALL the files of each
+stage count too, so that a change is named where it begins.
+
+Tolerance    t · √2 · s, s the standard deviation over seeds and t Student's of n − 1 degrees of freedom at
+             1 − DOUBT / 2: two runs that differ by nothing but their seeds lie further apart once in
+             1 / DOUBT times, a number.  On the processors of docs/reproducibility.md a run gives the same bits, so that
+             any change at all is one of the sources; a change within the tolerance is as small as another seed's.
+             What knows no seed has ROUNDING of itself.
 """
 
 from __future__ import annotations
@@ -34,7 +38,8 @@ DATASET, SEEDS, DOUBT, ROUNDING = "synthetic", 5, 0.01, 1e-5
 FOLDER = ROOT / "tests" / "regression"
 COMMAND = '.venv/bin/python -m studies.measured.reference "why the numbers changed"'
 SMALL = ("masks.pixels=3000", "solve.cells=150", "solve.splittings=1", "export.height=64", "export.mitsuba_height=64")
-# dotted path in metrics.json -> lowest, highest, meaning; a quarter beyond the worst of five trained networks × two seeds of the solve
+# dotted path in metrics.json -> lowest, highest, meaning; a quarter beyond the worst of five trained networks × two
+# seeds of the solve
 SPHERE, RMS = "light.mean.channel_per_photo.{}.estimate.rmse", "sphere, of the truth's RMS"
 BOUNDS = {
     "materials.worst_roughness": (0.0, 0.040, "roughness, worst material"),
@@ -64,7 +69,10 @@ FILES = {  # stage -> those of its files that are images and tables of numbers
 
 
 class Number(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """value: of the default seed;  low, high, deviation: over seeds;  tolerance: in the number's own unit, either way."""
+    """Stored number and its tolerance.
+
+    value: of the default seed;  low, high, deviation: over seeds;  tolerance: in the number's own unit, either way
+    """
 
     meaning: str
     value: float
@@ -75,14 +83,17 @@ class Number(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class Refresh(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """Why numbers were written anew, and those that became others: path -> (old, new)."""
+    """Reason for writing numbers anew, and those that changed: path -> (old, new)."""
 
     reason: str
     changed: dict[str, tuple[float, float]]
 
 
 class Stored(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """The whole file.  numbers: by their dotted path in metrics.json, or stage and channel;  refreshes: the newest first."""
+    """Content of a file of stored numbers.
+
+    numbers: by their dotted path in metrics.json, or stage and channel;  refreshes: the newest first
+    """
 
     dataset: str
     seeds: int
@@ -92,7 +103,7 @@ class Stored(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 def tolerance(values: Sequence[float], doubt: float = DOUBT) -> float:
-    """The tolerance of a number that has these values with some seeds.
+    """Return the tolerance of a number that has these values with some seeds.
 
     >>> round(tolerance([0.0, 1.0, 2.0, 3.0, 4.0]), 3)
     10.295
@@ -101,12 +112,12 @@ def tolerance(values: Sequence[float], doubt: float = DOUBT) -> float:
 
 
 def of_metrics(metrics: object) -> dict[str, float | None]:
-    """The NUMBERS in what a metrics.json holds; None for each that is missing."""
+    """Return the NUMBERS in what a metrics.json holds; None for each that is missing."""
     return {path: value_at(metrics, path) for path in NUMBERS}
 
 
 def of_stages(folder: Path) -> dict[str, float]:
-    """{"stage.channel": root mean square over all FILES of that stage} of the results of a run."""
+    """Return {"stage.channel": root mean square over all FILES of that stage} of the results of a run."""
     values: dict[str, list[np.ndarray]] = {}
     for stage, pattern in FILES.items():
         for path in sorted((folder / stage).glob(pattern)):
@@ -116,7 +127,7 @@ def of_stages(folder: Path) -> dict[str, float]:
 
 
 def _columns(path: Path) -> dict[str, np.ndarray]:
-    """The columns of a table, each as one array; of columns of bytes, the bytes."""
+    """Return the columns of a table, each as one array; of columns of bytes, the bytes."""
     columns = {}
     for name, rows in pq.read_table(path).to_pydict().items():
         columns[name] = np.frombuffer(b"".join(rows), np.uint8) if isinstance(rows[0], bytes) else np.array(rows)
@@ -124,7 +135,7 @@ def _columns(path: Path) -> dict[str, np.ndarray]:
 
 
 def run_small(root: Path, seed: int = 0) -> dict[str, float | None]:
-    """The numbers of data/synthetic run SMALL, by a project of its own in the folder `root`."""
+    """Run data/synthetic SMALL and return its numbers, by a project of its own in the folder `root`."""
     for name in ("pipeline.yaml", "stages", "factorlib", "data"):
         if not (root / name).exists():
             (root / name).symlink_to(ROOT / name)
@@ -136,7 +147,10 @@ def run_small(root: Path, seed: int = 0) -> dict[str, float | None]:
 
 
 def differences(values: dict[str, float | None], stored: Stored) -> dict[str, str]:
-    """Path -> a line for people, of each number that is missing or further from the stored one than its tolerance, for better or worse."""
+    """Describe each number that is missing or further from the stored one than its tolerance, better or worse.
+
+    The result is path -> a line for people.
+    """
     lines = {}
     for path, old in stored.numbers.items():
         new = values.get(path)
@@ -147,23 +161,29 @@ def differences(values: dict[str, float | None], stored: Stored) -> dict[str, st
 
 
 def complaint(lines: dict[str, str]) -> str:
-    """The differences, and what to do about them."""
+    """Describe the differences, and what to do about them."""
     listed = "\n".join(f"  {line}" for line in lines.values())
-    return f"{len(lines)} number(s) of data/{DATASET} are not those stored:\n{listed}\nif that is meant, store them: {COMMAND}"
+    return (
+        f"{len(lines)} number(s) of data/{DATASET} are not those stored:\n{listed}\n"
+        f"if that is meant, store them: {COMMAND}"
+    )
 
 
 def read_stored(name: str = DATASET) -> Stored:
-    """The stored numbers of a run: `synthetic`, as it is, or `small`."""
+    """Return the stored numbers of a run: `synthetic`, as it is, or `small`."""
     return msgspec.convert(read_json(FOLDER / f"{name}.json"), Stored)
 
 
 def stored(runs: Sequence[dict[str, float | None]], reason: str, before: Stored | None) -> Stored:
-    """The numbers of runs with several seeds, the default one first.  InputError where a number is missing."""
+    """Return the numbers of runs with several seeds, the default one first.  InputError where a number is missing."""
     values = {path: [run.get(path) for run in runs] for path in runs[0]}
     if missing := [path for path, of in values.items() if None in of]:
         raise InputError(
-            "there is no such number", file=Path("metrics.json"), key=missing[0], cure="correct NUMBERS in studies/measured/reference.py"
-        )  # fmt: skip
+            "there is no such number",
+            file=Path("metrics.json"),
+            key=missing[0],
+            cure="correct NUMBERS in studies/measured/reference.py",
+        )
     numbers = {path: _number(path, of) for path, of in values.items()}
     old = before.numbers if before else {}
     changed = {p: (old[p].value, n.value) for p, n in numbers.items() if p in old and old[p].value != n.value}
@@ -178,7 +198,7 @@ def _number(path: str, values: list[float]) -> Number:
 
 
 def rows() -> Tables:
-    """The stored numbers, which `make test` holds the pipeline to."""
+    """Return the stored numbers, which `make test` holds the pipeline to."""
     kept = read_stored()
     lines = [[n.meaning, *(f"{v:.4g}" for v in (n.value, n.low, n.high))] for n in kept.numbers.values()]
     return {

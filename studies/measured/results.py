@@ -1,8 +1,9 @@
-"""All measured tables, as docs/results.md: `make results`, or `make results ONLY="operator align"` for some of its sections.
+"""Measured tables of docs/results.md: `make results`, or `make results ONLY="operator align"` for some sections.
 
-A section is the function `rows()` of one module of `studies.measured`, which gives its tables.  On top of it stand the version, the commit, the
-date and the kind of machine that it was measured on.  A section that needs what is not here (LIGHTS, REAL: see its module)
-is left as it was, and named at the end.  All of it takes many hours.  It also makes docs/gallery.md and the outputs of docs/result.ipynb.
+A section is the function `rows()` of one module of `studies.measured`, which gives its tables.  On top of it stand the
+version, the commit, the date and the kind of machine that it was measured on.  A section that needs what is not here
+(LIGHTS, REAL: see its module) is left as it was, and named at the end.  All of it takes many hours.  It also makes
+docs/gallery.md and the outputs of docs/result.ipynb.
 """
 
 from __future__ import annotations
@@ -35,7 +36,7 @@ PAGES = ("gallery", "notebook")  # modules whose `write()` makes a page of its o
 
 
 def machine() -> str:
-    """The version, commit, date and kind of machine of this run."""
+    """Return the version, commit, date and kind of machine of this run."""
     version = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]["version"]
     git = subprocess.run(["git", "describe", "--always", "--dirty"], cwd=ROOT, capture_output=True, text=True)
     facts = Path("/proc/cpuinfo").read_text() if Path("/proc/cpuinfo").exists() else ""
@@ -45,13 +46,16 @@ def machine() -> str:
 
 
 def section(name: str, tables: Tables, measured: str) -> str:
-    """The Markdown of a section."""
+    """Return the Markdown of a section."""
     parts = [f"**{title}**\n\n{table(rows[0], rows[1:])}" for title, rows in tables.items()]
     return "\n\n".join([f"## {SECTIONS[name]}", f"*{measured}; `make results ONLY={name}`*", *parts])
 
 
 def main() -> int:
-    """Measure the sections that ONLY names, or all, and write each as soon as it is measured; 1 where one is left as it was."""
+    """Measure the sections that ONLY names, or all, and write each as soon as it is measured.
+
+    Returns 1 where one is left as it was.
+    """
     known = [*PAGES, *SECTIONS]
     wanted = os.environ.get("ONLY", "").split() or known
     for name in wanted:

@@ -1,9 +1,12 @@
-"""Whether standard errors say how wrong results are: `python -m studies.measured.standard_errors build/eames [build/…] [--other FOLDER]`.
+"""Share of results within one standard error of the truth.
 
-For each folder of results, which `make evaluate` made of a data set with a truth: the share of k_d, k_s, roughnesses and of the light
-maps' log radiances, in `CELLS` cells and after the factor per channel that is free, that lie within one standard error of the truth.
-Of a normal distribution it is 68 %.  With `--other FOLDER`, the results of another run of the same data set, such as one with another
-`solve.seed`, stand in for the truth: both runs see the same photographs, so that less than one standard error should lie between them.
+Usage: `python -m studies.measured.standard_errors build/eames [build/…] [--other FOLDER]`
+
+For each folder of results, which `make evaluate` made of a data set with a truth: the share of k_d, k_s, roughnesses
+and of the light maps' log radiances, in `CELLS` cells and after the factor per channel that is free, that lie within
+one standard error of the truth. Of a normal distribution it is 68 %.  With `--other FOLDER`, the results of another run
+of the same data set, such as one with another `solve.seed`, stand in for the truth: both runs see the same photographs,
+so that less than one standard error should lie between them.
 """
 
 from __future__ import annotations
@@ -28,9 +31,10 @@ PARTS = ("diffuse", "specular", "roughness")
 
 
 def material_deviations(build: Path, other: Path | None) -> dict[str, Float[np.ndarray, " n"]]:
-    """|estimate − truth| over the standard error by part, of all materials, after the factor per channel that is free.
+    """Return |estimate − truth| over the standard error by part, of all materials, after the free factor per channel.
 
-    other: results that stand in for the truth, of a data set of one connected component.  InputError where there is no truth
+    other: results that stand in for the truth, of a data set of one connected component.  InputError where there is no
+           truth
     """
     solved = read_materials(build / "export/materials.json").materials
     if other:
@@ -54,7 +58,7 @@ def material_deviations(build: Path, other: Path | None) -> dict[str, Float[np.n
 
 
 def light_deviations(build: Path, other: Path | None) -> Float[np.ndarray, " n"]:
-    """|Δ log radiance| over its standard error, of all lights, cells and channels, each channel's median taken out."""
+    """Return |Δ log radiance| over its standard error, of all lights, cells and channels, less channels' medians."""
     against, off = (other / "export/illumination") if other else (build / "evaluate/illumination"), []
     folders, cells = (build / "export/illumination", against, build / "export/coverage"), fibonacci_sphere(CELLS)
     for path in sorted(against.glob("*.exr")):

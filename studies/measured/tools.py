@@ -1,4 +1,4 @@
-"""What measurements and studies share: numbers and tables as text, text between marks of a page, time, processes."""
+"""Numbers, tables, marked parts of pages, times and processes, shared by measurements and studies."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ Tables = dict[str, list[list[str]]]  # title -> rows of cells, the head first
 
 
 def exact(value: float, digits: int = 2) -> str:
-    """The value with that many significant digits, and a power of ten where it is tiny or huge.
+    """Format the value with that many significant digits, and a power of ten where it is tiny or huge.
 
     >>> exact(0.00123), exact(0.000012), exact(0.0), exact(12.3), exact(48000.0)
     ('.0012', '1.2·10⁻⁵', '0', '12', '4.8·10⁴')
@@ -38,12 +38,12 @@ def exact(value: float, digits: int = 2) -> str:
 
 
 def exacts(values: Iterable[float]) -> str:
-    """Several numbers in one cell of a table."""
+    """Format several numbers for one cell of a table."""
     return ", ".join(exact(float(value)) for value in values)
 
 
 def table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
-    """A table in Markdown, its first column to the left.
+    """Format a table in Markdown, its first column to the left.
 
     >>> print(table(["case", "error"], [["all", "1 %"]]))
     | case | error |
@@ -55,7 +55,7 @@ def table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
 
 
 def value_at(metrics: Any, path: str) -> float | None:
-    """The number at a dotted path into metrics.json; None where there is nothing.
+    """Return the number at a dotted path into metrics.json; None where there is nothing.
 
     >>> value_at({"a": {"b": [1.5]}}, "a.b.0"), value_at({"a": None}, "a.b")
     (1.5, None)
@@ -69,7 +69,10 @@ def value_at(metrics: Any, path: str) -> float | None:
 
 
 def refresh(path: Path, parts: dict[str, str]) -> None:
-    """Write each part into the file, between `<!-- begin name -->` and `<!-- end name -->`.  InputError where these marks are missing."""
+    """Write each part into the file, between `<!-- begin name -->` and `<!-- end name -->`.
+
+    Raises InputError where these marks are missing.
+    """
     text = path.read_text(encoding="utf-8")
     for name, inner in parts.items():
         begin, end = f"<!-- begin {name} -->\n", f"<!-- end {name} -->"
@@ -80,14 +83,20 @@ def refresh(path: Path, parts: dict[str, str]) -> None:
 
 
 def needed(name: str, what: str) -> list[str]:
-    """The words of the environment variable of that name.  InputError where there are none; what: they stand for."""
+    """Return the words of the environment variable of that name; what: they stand for.
+
+    Raises InputError where there are none.
+    """
     if not (words := os.environ.get(name, "").split()):
         raise InputError(f"no {what} are named", key=name, cure=f'add {name}="… …"')
     return words
 
 
 def evaluated(dataset: Path | str, root: Path = ROOT, **variables: str) -> dict[str, Any]:
-    """The metrics of a data set, as `make evaluate` of the project below `root` makes them with these variables (SET, …)."""
+    """Return a data set's metrics, as `make evaluate` of the project below `root` makes them.
+
+    variables: handed to make (SET, …)
+    """
     environment = {name: value for name, value in os.environ.items() if name not in ("SET", "FORCE", "STAGE")}
     environment |= {"DATASET": str(dataset), "PYTHONPATH": str(root), **variables}
     command = [sys.executable, "-m", "factorlib", "evaluate"]
@@ -104,11 +113,14 @@ class Taken(NamedTuple):
 
 
 class Clock:
-    """A clock that runs from its making. Other work on the machine lengthens the wall time, and hardly the processor time."""
+    """Clock that runs from its making.
+
+    Other work on the machine lengthens the wall time, and hardly the processor time.
+    """
 
     def __init__(self):
         self._wall, self._processor = time.perf_counter(), time.process_time()
 
     def taken(self) -> Taken:
-        """The time until now."""
+        """Return the time until now."""
         return Taken(round(time.perf_counter() - self._wall, 3), round(time.process_time() - self._processor, 3))

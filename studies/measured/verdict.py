@@ -1,11 +1,16 @@
-"""What the verdict says, beside the truth it does not know: `python -m studies.measured.verdict fit test`, with LIGHTS="FOLDER …" of captured maps.
+"""Verdicts on results, beside the truth that they do not know.
 
-fit    44 sets: data/eames and seeds 111 to 120 of `studies.measured.eames_like`, from 116 on in captured light, four times each, spoilt in ways of
-       `studies.scenes.spoilt`.  The weights of `factorlib.evaluate.verdict` are fitted to them anew, and printed
-test   20 others of seeds 201 to 205, the last two in captured light, each way once: what is expected with the weights as they stand
+`python -m studies.measured.verdict fit test`, with LIGHTS="FOLDER …" of captured maps:
 
-Sets lie in build/bench/verdict, results in build/.  Printed of each that is named: every set, rank correlations (Spearman), and the deviation; of `fit` also
-with each set left out of the fit.  Expected and true scores of all that are named are in build/bench/verdict/calibration.csv.
+fit    44 sets: data/eames and seeds 111 to 120 of `studies.measured.eames_like`, from 116 on in captured light, four
+       times each, spoilt in ways of `studies.scenes.spoilt`.  The weights of `factorlib.evaluate.verdict` are fitted to
+       them anew, and printed
+test   20 others of seeds 201 to 205, the last two in captured light, each way once: what is expected with the weights
+       as they stand
+
+Sets lie in build/bench/verdict, results in build/.  Printed of each that is named: every set, rank correlations
+(Spearman), and the deviation; of `fit` also with each set left out of the fit.  Expected and true scores of all that
+are named are in build/bench/verdict/calibration.csv.
 """
 
 from __future__ import annotations
@@ -59,13 +64,20 @@ def judged(which: str) -> list[Judged]:
         metrics = evaluated(folder)
         verdict = metrics["verdict"]
         signs = [verdict["terms"][name] / weight for name, weight in WEIGHTS.items()]
-        sets.append(Judged(", ".join(ways[number]) or "nothing", metrics["relit_set"]["mean_psnr_db"],
-                           verdict["trust"], verdict["expected_relit_db"], signs))  # fmt: skip
+        sets.append(
+            Judged(
+                ", ".join(ways[number]) or "nothing",
+                metrics["relit_set"]["mean_psnr_db"],
+                verdict["trust"],
+                verdict["expected_relit_db"],
+                signs,
+            )
+        )
     return sets
 
 
 def base_of(seed: int | None) -> Path:
-    """The folder of the set that is spoilt."""
+    """Return the folder of the set that is spoilt."""
     if seed is None:
         return ROOT / "data/eames"
     if seed not in CAPTURED:
@@ -75,26 +87,32 @@ def base_of(seed: int | None) -> Path:
 
 
 def expected(weights: Float[np.ndarray, " 4"], signs: Float[np.ndarray, "n 4"]) -> Float[np.ndarray, " n"]:
-    """(1) of `factorlib.evaluate.verdict`, dB."""
+    """Return (1) of `factorlib.evaluate.verdict`, dB."""
     return -10 * np.log10(FLOOR + signs @ weights)
 
 
 def fitted(sets: list[Judged]) -> Float[np.ndarray, " 4"]:
-    """The weights with which the expected scores come nearest to the scores; outliers count less."""
+    """Fit the weights that bring the expected scores nearest to the scores; outliers count less."""
     signs, scores = np.array([one.signs for one in sets]), np.array([one.score for one in sets])
     start = np.log(list(WEIGHTS.values()))
     return np.exp(least_squares(lambda w: expected(np.exp(w), signs) - scores, start, loss="soft_l1").x)
 
 
 def told(sets: list[Judged]) -> str:
-    """Every set in a table, and how well scores are foreseen."""
-    rows = [[one.spoilt_by, f"{one.score:.1f}", f"{one.expected:.1f}", one.trust] for one in sorted(sets, key=lambda s: -s.expected)]  # fmt: skip
+    """Return every set in a table, and how well scores are foreseen."""
+    rows = [
+        [one.spoilt_by, f"{one.score:.1f}", f"{one.expected:.1f}", one.trust]
+        for one in sorted(sets, key=lambda s: -s.expected)
+    ]
     foreseen = np.array([one.expected for one in sets])
     return f"{table(['spoilt by', 'relit, dB', 'expected', 'verdict'], rows)}\n{agreement(foreseen, sets)}"
 
 
 def agreement(foreseen: Float[np.ndarray, " n"], sets: list[Judged]) -> str:
-    """Rank correlations of foreseen and true scores, of all sets and of those that are not hopeless, and the deviation."""
+    """Return rank correlations of foreseen and true scores, and the deviation.
+
+    Correlations are of all sets, and of those that are not hopeless.
+    """
     score = np.array([one.score for one in sets])
     some = score >= HOPELESS
     ranks = spearmanr(foreseen, score)[0], spearmanr(foreseen[some], score[some])[0]

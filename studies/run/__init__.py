@@ -1,9 +1,9 @@
-"""How the project's runner sees a study: a data set whose photos are the study's cases.
+"""Study as the project's runner sees it: a data set whose photos are the study's cases.
 
 Nothing is declared anew: steps, keys, the store, locks, resuming, progress and the pool of processes are the runner's
 (`factorlib.runner`).  Results of studies have a store of their own in build/studies, those of quick ones in
-build/studies/quick, so that neither `make gc` nor a reader takes one for the other.  What the cases come to is no step: it is
-written anew after each run (`studies.run.page`), for it takes a second.
+build/studies/quick, so that neither `make gc` nor a reader takes one for the other.  What the cases come to is no step:
+it is written anew after each run (`studies.run.page`), for it takes a second.
 """
 
 from __future__ import annotations
@@ -23,15 +23,15 @@ from factorlib.runner.store import FileHashes
 from studies.study import FULL, QUICK, Scale, Study
 
 ORDER = (  # of the page
-    "matrix-size row-and-column structure label-quality alignment-error progressive leave-one-out paper-sets gauss-sphere comparison "
-    "prior speed parts"
+    "matrix-size row-and-column structure label-quality alignment-error progressive leave-one-out paper-sets "
+    "gauss-sphere comparison prior speed parts"
 )
 STUDIES: dict[str, Study] = {n: import_module(f"studies.catalogue.{n.replace('-', '_')}").STUDY for n in ORDER.split()}
 SLICES = ("case", "worlds", "sets")
 
 
 class Slice(msgspec.Struct, frozen=True):
-    """What a step sees of the study."""
+    """Facts that a step sees of the study."""
 
     facts: Any
     fields: dict[str, Any]
@@ -55,7 +55,7 @@ class Studies(Project, frozen=True):
         return folder / "quick" if self.scale.quick else folder
 
     def dataset_folder(self, name: str) -> Path:
-        """A folder that stands for a study; nothing lies there.  InputError where no study is called so."""
+        """Return a folder that stands for a study; nothing lies there.  InputError where no study is called so."""
         if name not in STUDIES:
             raise InputError(f"there is no study {name!r}", key="STUDY", cure=did_you_mean(name, STUDIES))
         return self.root / "studies" / name
@@ -64,17 +64,17 @@ class Studies(Project, frozen=True):
 
 
 def studies(scale: Scale = FULL, root: Path = LIBRARY) -> Studies:
-    """The project of the studies of a scale."""
+    """Return the project of the studies of a scale."""
     return Studies(root, Provider(SLICES, lambda folder: data_of(folder, scale)), "studies.steps", scale=scale)
 
 
 def data_of(folder: Path, scale: Scale) -> Data:
-    """A study as the runner reads it."""
+    """Return a study as the runner reads it."""
     study = STUDIES[folder.name]
     cases = study.cases(scale)
 
     def slice_(name: str, case: str | None) -> Slice:
-        """The facts of a slice; its fields are what a change is reported by."""
+        """Return the facts of a slice; its fields are what a change is reported by."""
         facts = {"worlds": study.worlds, "sets": lambda scale: sets_of(study, scale), "case": lambda _: cases[case]}
         plain = msgspec.to_builtins(facts[name](scale))
         return Slice(plain, {f"{name}.{field}": value for field, value in plain.items()})
@@ -83,7 +83,7 @@ def data_of(folder: Path, scale: Scale) -> Data:
 
 
 def sets_of(study: Study, scale: Scale) -> dict[str, Any]:
-    """The data sets of a study, and what one of this checkout contains, so that a step's key has it."""
+    """Return the data sets of a study, and what one of this checkout contains, so that a step's key has it."""
     facts = study.sets(scale)
     if "folder" not in facts:
         return facts
@@ -95,7 +95,9 @@ def sets_of(study: Study, scale: Scale) -> dict[str, Any]:
 def make(
     scale: Scale, names: list[str], force: bool = False, settings: list[str] | None = None, root: Path = LIBRARY
 ) -> int:
-    """Run studies as far as anything must run; their results and the page of all that are done lie in build/studies afterwards.
+    """Run studies as far as anything must run.
+
+    Their results and the page of all that are done lie in build/studies afterwards.
 
     settings: where their steps run, as `executor=tcp://…`
 

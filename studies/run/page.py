@@ -28,7 +28,11 @@ def conclude(study: Study, scale: Scale, scores: Path, home: Path) -> None:
     scores: the folder of its last step, with scores.json, and <case>.png of some cases
     """
     result = concluded(study, scale, msgspec.convert(read_json(scores / "scores.json"), dict[str, Score]))
-    cases = {case_name(s.name, n): f"{s.label}, {study.over.removesuffix('s')} {n}" for s in study.settings(scale) for n in study.numbers(scale)}  # fmt: skip
+    cases = {
+        case_name(s.name, n): f"{s.label}, {study.over.removesuffix('s')} {n}"
+        for s in study.settings(scale)
+        for n in study.numbers(scale)
+    }
     pictures = {f"{case}.png": caption for case, caption in cases.items() if (scores / f"{case}.png").is_file()}
     shown = [f"![{caption}](pictures/{file})\n" for file, caption in pictures.items()]
     page = "\n".join([paragraph(result), numbers(result, len(result.measures)), "", *shown])
@@ -51,7 +55,7 @@ def write_page(project: Project) -> Path:
 
 
 def done_of(project: Project) -> dict[str, Conclusion]:
-    """What studies came to, by name; a table that another version of the project wrote in another form is left out."""
+    """Read the conclusions of studies, by name; one that another version of the project wrote otherwise is left out."""
     done = {}
     for name in STUDIES:
         if (file := project.build / name / "table.json").is_file():
@@ -77,7 +81,7 @@ def refresh_docs(names: Sequence[str]) -> None:
 
 
 def against_the_paper(answers: Mapping[str, str], text: str = "") -> str:
-    """The table of the answers of all studies; of those that are not here, what the page's text has."""
+    """Return the table of the answers of all studies; of those that are not here, what the page's text has."""
     rows = []
     for name, study in STUDIES.items():
         title = f"[{study.title}](#{study.title.lower().replace(' ', '-')})"

@@ -1,8 +1,10 @@
-"""Special cases of the reflection operators and laws of theirs, which tests hold them to and `studies.measured.operator` measures.
+"""Special cases of the reflection operators, and laws of theirs.
 
-Errors are |R − S| / (S + E/100); of gradients |∂R − ∂S| / (|∂S| + S + E/100), as lobe, view and normal turn.  Formulas break at
-grazing views, mirrors, lobes of no width or of all, and lobes along every special direction: a case differs from the ordinary in one
-respect, the last one in all of them.
+Tests hold the operators to them, and `studies.measured.operator` measures them.
+
+Errors are |R − S| / (S + E/100); of gradients |∂R − ∂S| / (|∂S| + S + E/100), as lobe, view and normal turn.  Formulas
+break at grazing views, mirrors, lobes of no width or of all, and lobes along every special direction: a case differs
+from the ordinary in one respect, the last one in all of them.
 """
 
 from __future__ import annotations
@@ -25,8 +27,11 @@ from factorlib.reflection.samples import specular_inputs
 # ── Special cases ────────────────────────────────────────────────────────────────────────────────────────────────────
 
 ORDINARY = {
-    "roughness": (0.1, 0.3, 0.6), "sharpness": (1.0, 10.0, 100.0, 1000.0), "no": (0.1, 0.4, 0.7, 0.95), "place": ("front",),
-}  # fmt: skip
+    "roughness": (0.1, 0.3, 0.6),
+    "sharpness": (1.0, 10.0, 100.0, 1000.0),
+    "no": (0.1, 0.4, 0.7, 0.95),
+    "place": ("front",),
+}
 CASES: dict[str, dict] = {
     "none: ordinary": {},
     "lobe behind the surface": {"place": ("behind",)},
@@ -60,17 +65,17 @@ class Pairs(msgspec.Struct, frozen=True):
         return len(self.roughness)
 
     def scale(self) -> Float[Tensor, " k"]:
-        """E/100, what errors are measured in beside the value itself."""
+        """Return E/100, what errors are measured in beside the value itself."""
         return lobe_integral(self.sharpness) / 100
 
     def groups(self) -> list[tuple[float, float, Tensor]]:
-        """(roughness, sharpness, rows) of those that share both."""
+        """Return (roughness, sharpness, rows) of those that share both."""
         keys = torch.stack([self.roughness, self.sharpness], 1).unique(dim=0).tolist()
         return [(r, lam, ((self.roughness == r) & (self.sharpness == lam)).nonzero()[:, 0]) for r, lam in keys]
 
 
 def case(name: str) -> Pairs:
-    """The pairs of a case: every combination of its values."""
+    """Return the pairs of a case: every combination of its values."""
     together = [*CASES.values(), ORDINARY] if name == ALL else [ORDINARY | CASES[name]]
     choices = {key: tuple(dict.fromkeys(v for c in together for v in c.get(key, ()))) for key in ORDINARY}
     rows, n = [], torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64)
@@ -98,7 +103,9 @@ def _unit(count: int, g: torch.Generator) -> Float[Tensor, "count 3"]:
 
 
 class Answers(msgspec.Struct, frozen=True):
-    """What an operator says of pairs, float64: every field of its Response, and the specular gradient by three directions.
+    """Answers of an operator for pairs, float64.
+
+    They are every field of its Response, and the specular gradient by three directions.
 
     Derivatives by n·o, n·z and o·z mean little alone: at the mirror direction no unit vectors change one and not the
     others.  What counts is how the value changes as lobe, view or normal turn, formed in the operator's own precision:
@@ -109,12 +116,12 @@ class Answers(msgspec.Struct, frozen=True):
     turning: Float[Tensor, "k 3 3"]  # by lobe, view, normal
 
     def finite(self) -> bool:
-        """Whether all of it is."""
+        """Tell whether all answers are finite."""
         return all(bool(t.isfinite().all()) for t in (*self.fields.values(), self.turning))
 
 
 def answers(operator: Operator, given: Pairs) -> Answers:
-    """Values and derivatives of all pairs."""
+    """Compute values and derivatives of all pairs."""
     fields: dict[str, Tensor] = {}
     turning = torch.empty(len(given), 3, 3, dtype=torch.float64)
     n, o, z = (t.to(operator.dtype) for t in (given.normal, given.view, given.axis))
@@ -134,13 +141,13 @@ def answers(operator: Operator, given: Pairs) -> Answers:
 
 
 def value_error(a: Answers, b: Answers, given: Pairs) -> Float[Tensor, " k"]:
-    """|a − b| / (b + E/100), the greater of diffuse and specular."""
+    """Return |a − b| / (b + E/100), the greater of diffuse and specular."""
     parts = [(a.fields[p] - b.fields[p]).abs() / (b.fields[p] + given.scale()) for p in ("diffuse", "specular")]
     return torch.maximum(*parts)
 
 
 def gradient_error(a: Answers, b: Answers, given: Pairs) -> Float[Tensor, " k"]:
-    """|∂a − ∂b| / (|∂b| + b + E/100): the greatest of all derivatives that mean something alone."""
+    """Return |∂a − ∂b| / (|∂b| + b + E/100): the greatest of all derivatives that mean something alone."""
     worst = torch.zeros(len(given), dtype=torch.float64)
     for name in ("diffuse_by_log_sharpness", "diffuse_by_nz", "specular_by_roughness", "specular_by_log_sharpness"):
         base = b.fields[name.partition("_")[0]] + given.scale()
@@ -150,7 +157,7 @@ def gradient_error(a: Answers, b: Answers, given: Pairs) -> Float[Tensor, " k"]:
 
 
 def reference_values(given: Pairs, some: slice = slice(None)) -> dict[str, Tensor]:
-    """Diffuse and specular by quadrature, of some of the pairs."""
+    """Compute diffuse and specular by quadrature, of some of the pairs."""
     reference, n, o, z = reflection_operator("reference"), given.normal[some], given.view[some], given.axis[some]
     no, nz, oz = (n * o).sum(1), (n * z).sum(1)[:, None], (o * z).sum(1)[:, None]
     sharpness, roughness = given.sharpness[some, None], given.roughness[some, None]
@@ -159,7 +166,9 @@ def reference_values(given: Pairs, some: slice = slice(None)) -> dict[str, Tenso
         return {"diffuse": reference.diffuse(sharpness, nz)[:, 0], "specular": specular}
 
 
-# ── Laws, which hold exactly for the true reflection: 0 ≤ D, S ≤ 1 of unit lobes, for k_d = 1 or k_s = 1 reflects no more than arrives ─
+# ── Laws, which hold exactly for the true reflection ─────────────────────────────────────────────────────────────────
+#
+# 0 ≤ D, S ≤ 1 of unit lobes, for k_d = 1 or k_s = 1 reflects no more than arrives.
 
 
 class Domain(msgspec.Struct, frozen=True):
@@ -173,13 +182,13 @@ USUAL, WIDER, WHOLE = Domain(0.1, 0.02), Domain(0.1, 1e-4), Domain(0.03, 1e-4)
 
 
 def drawn(domain: Domain, count: int) -> tuple[Tensor, ...]:
-    """α, λ, n·o, n·z, o·z: those of `samples`, over the domain; half of the views crowd at the least n·o."""
+    """Draw α, λ, n·o, n·z, o·z: those of `samples`, over the domain; half of the views crowd at the least n·o."""
     ranges = {"alpha": (domain.least_roughness**2, 1.0), "sharpness": (1e-4, 1e6), "least_no": domain.least_no}
     return specular_inputs(count, 17, **ranges)
 
 
 def grazing(domain: Domain, count: int) -> tuple[Tensor, ...]:
-    """As `drawn`, all at the least n·o, the lobe about the mirror direction."""
+    """Draw pairs like `drawn`, all at the least n·o, the lobe about the mirror direction."""
     alpha, lam, _, nz, _ = drawn(domain, count)
     turn = torch.linspace(-1, 1, count, dtype=torch.float64)  # of the axis about n, from the mirror direction
     so, sz = math.sqrt(1 - domain.least_no**2), torch.sqrt(1 - nz**2)
@@ -188,42 +197,45 @@ def grazing(domain: Domain, count: int) -> tuple[Tensor, ...]:
 
 
 def each(operator: Operator, *scalars: Float[Tensor, " k"]) -> Float[Tensor, " k"]:
-    """The specular part of α, λ, n·o, n·z, o·z that share nothing."""
+    """Return the specular part of α, λ, n·o, n·z, o·z that share nothing."""
     a, lam, no, nz, oz = (t.to(operator.dtype) for t in scalars)
     with torch.no_grad():
         return operator.specular(a.sqrt()[:, None], lam[:, None], no, nz[:, None], oz[:, None])[:, 0].double()
 
 
 def tail(error: Float[Tensor, " k"]) -> tuple[float, float]:
-    """The 99th percentile and the largest."""
+    """Return the 99th percentile and the largest."""
     return float(error.quantile(0.99)), float(error.max())
 
 
 def unit_lobes(operator: Operator, domain: Domain, count: int = 16384) -> tuple[float, float]:
-    """S of unit lobes, p99 and largest; exactly at most 1."""
+    """Return S of unit lobes, p99 and largest; exactly at most 1."""
     return tail(torch.cat([each(operator, *make(domain, count)) for make in (drawn, grazing)]))
 
 
 def least_reflected(operator: Operator, count: int = 16384) -> tuple[float]:
-    """The least S of unit lobes; exactly at least 0."""
+    """Return the least S of unit lobes; exactly at least 0."""
     return (min(float(each(operator, *make(WHOLE, count)).min()) for make in (drawn, grazing)),)
 
 
 def white_lambert(operator: Operator, count: int = 512) -> tuple[float]:
-    """Largest |D − 1| under constant light of radiance 1 (λ = 10⁻⁴)."""
+    """Return the largest |D − 1| under constant light of radiance 1 (λ = 10⁻⁴)."""
     lam, nz = torch.tensor([1e-4], dtype=operator.dtype), torch.linspace(-1, 1, count, dtype=operator.dtype)
     with torch.no_grad():
         return (float((operator.diffuse(lam, nz[:, None]) - 1).abs().max()),)
 
 
 def constant_light(operator: Operator, count: int = 2048) -> tuple[float, float]:
-    """S under constant light of radiance 1 (λ = 10⁻⁴), p99 and largest; exactly at most 1."""
+    """Return S under constant light of radiance 1 (λ = 10⁻⁴), p99 and largest; exactly at most 1."""
     alpha, lam, no, nz, oz = drawn(USUAL, count)
     return tail(each(operator, alpha, torch.full_like(lam, 1e-4), no, nz, oz))
 
 
 def point_light(operator: Operator, count: int = 4096) -> tuple[float, float]:
-    """|S − E f| / (E f + E/100), f the BRDF times n·i, at λ = 10⁶ for roughness ≥ .3, n·o, n·z ≥ .1; exactly below 10⁻³."""
+    """Return |S − E f| / (E f + E/100), f the BRDF times n·i, at λ = 10⁶; exactly below 10⁻³.
+
+    Roughness is at least .3, n·o and n·z at least .1.
+    """
     alpha, lam, no, nz, oz = drawn(Domain(0.3, 0.1), count)
     alpha, no, nz, oz = (t[nz >= 0.1] for t in (alpha, no, nz, oz))
     lam = torch.full_like(alpha, 1e6)
@@ -232,7 +244,10 @@ def point_light(operator: Operator, count: int = 4096) -> tuple[float, float]:
 
 
 def scene(seed: int, points: int = 32, lobes: int = 6, sharpness: tuple[float, float] = (0.0, 3.0)) -> tuple:
-    """A light, a material and points that face the viewer at 60° or less, float64; sharpness from 10 to the power of its range."""
+    """Draw a light, a material and points that face the viewer at 60° or less, float64.
+
+    sharpness: 10 to the power of this range
+    """
     g = torch.Generator().manual_seed(seed)
     axis, spread = _unit(lobes, g), torch.logspace(*sharpness, lobes, dtype=torch.float64)
     light = SimpleNamespace(axis=axis, sharpness=spread, weight=torch.rand(lobes, 3, generator=g).double())
@@ -243,7 +258,7 @@ def scene(seed: int, points: int = 32, lobes: int = 6, sharpness: tuple[float, f
 
 
 def turned(operator: Operator) -> tuple[float]:
-    """Largest difference after everything was turned, over the largest radiance."""
+    """Return the largest difference after everything was turned, over the largest radiance."""
     light, material, normals, views = scene(0)
     turn = torch.linalg.qr(torch.randn(3, 3, generator=torch.Generator().manual_seed(4)).double()).Q
     before = operator(light, material, normals, views)
@@ -252,7 +267,7 @@ def turned(operator: Operator) -> tuple[float]:
 
 
 def scaled(operator: Operator, factor: float = 1e6) -> tuple[float]:
-    """Largest relative difference between `factor` times the radiance and the radiance of weights times `factor`."""
+    """Return the largest relative difference of `factor` times the radiance and that of weights times `factor`."""
     light, material, normals, views = scene(0)
     before = operator(light, material, normals, views).double()
     light.weight = factor * light.weight

@@ -1,4 +1,7 @@
-"""Joint problems whose answer is known: spheres of given materials under lights made of lobes, rendered by the operator itself."""
+"""Joint problems of known answer: spheres of given materials under lights made of lobes.
+
+The operator itself renders them.
+"""
 
 import msgspec
 import numpy as np
@@ -16,7 +19,7 @@ MATERIALS = Materials(
 
 
 def sphere_normals(size: int) -> np.ndarray:
-    """Normals of a sphere seen from the front, one per pixel of a `size`² picture, grazing ones left out."""
+    """Return normals of a sphere seen from the front, one per pixel of a `size`² picture, grazing ones left out."""
     y, x = (np.mgrid[:size, :size] + 0.5) / size * 2 - 1
     inside = x**2 + y**2 < 0.95
     x, y = x[inside], y[inside]
@@ -24,7 +27,7 @@ def sphere_normals(size: int) -> np.ndarray:
 
 
 def random_light(rng, lobes: int, photos: int = 1, sharpest: float = 4.5, contrast: float = 0.7) -> Light:
-    """Lobes of random directions, of log sharpness up to `sharpest`; the exposures of photos but the first."""
+    """Return lobes of random directions, of log sharpness up to `sharpest`; the exposures of photos but the first."""
     axis = rng.normal(size=(lobes, 3))
     log_sharpness = rng.uniform(0, sharpest, lobes)
     weight = (
@@ -35,18 +38,25 @@ def random_light(rng, lobes: int, photos: int = 1, sharpest: float = 4.5, contra
 
 
 def block(name: str, light: Light, materials: Materials, shown, operator, size: int = 24, seed: int = 0) -> Block:
-    """One illumination that shows the materials `shown`, a sphere of each in each of its photos."""
+    """Return one illumination that shows the materials `shown`, a sphere of each in each of its photos."""
     normals = sphere_normals(size)
     photos, n = len(light.log_exposure), len(normals)
     material = np.repeat(sorted(shown), n * photos)
     photo = np.tile(np.repeat(np.arange(photos), n), len(shown))
     rows = len(material)
     empty = Block(
-        name=name, photos=tuple(f"{name}_{k}" for k in range(photos)), unit=1.0,
-        normal=np.tile(normals, (photos * len(shown), 1)), view=np.tile([0.0, 0.0, -1.0], (rows, 1)),
-        radiance=np.zeros((rows, 3)), clipped=np.zeros((rows, 3), bool), precision=np.ones((rows, 3)),
-        material=material, photo=photo, held_out=np.random.default_rng(seed).random(rows) < 0.1,
-    )  # fmt: skip
+        name=name,
+        photos=tuple(f"{name}_{k}" for k in range(photos)),
+        unit=1.0,
+        normal=np.tile(normals, (photos * len(shown), 1)),
+        view=np.tile([0.0, 0.0, -1.0], (rows, 1)),
+        radiance=np.zeros((rows, 3)),
+        clipped=np.zeros((rows, 3), bool),
+        precision=np.ones((rows, 3)),
+        material=material,
+        photo=photo,
+        held_out=np.random.default_rng(seed).random(rows) < 0.1,
+    )
     radiance = Illumination(empty, light, materials, operator).radiance()
     scaled = radiance / radiance.mean()
     return msgspec.structs.replace(
@@ -55,5 +65,5 @@ def block(name: str, light: Light, materials: Materials, shown, operator, size: 
 
 
 def factor_between(found: Materials, true: Materials) -> np.ndarray:
-    """The factor per channel that takes `found` reflectances to `true` ones."""
+    """Return the factor per channel that takes `found` reflectances to `true` ones."""
     return (true.diffuse + true.specular).sum(0) / (found.diffuse + found.specular).sum(0)

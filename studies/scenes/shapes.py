@@ -1,11 +1,13 @@
-"""Five shapes without any symmetry, of some 20,000 triangles each, and coarse, warped copies of them: photographs of them have one right pose.
+"""Five shapes without any symmetry, of some 20,000 triangles each, and coarse, warped copies of them.
+
+Photographs of them have one right pose.
 
 blob    a smooth body with broad bumps                  hook    a tapering tube along a space curve
 stack   three boxes, each turned and moved, sharp edges
 chair   a chair with one arm: shell 1, legs and arm 2   jug     body 1, handle and spout 2
 
-None looks the same from two sides. But a smooth body of one material and its mirror image have the same outline when seen
-from opposite sides from far away, so a mirrored mask of the first three is hard to tell.
+None looks the same from two sides. But a smooth body of one material and its mirror image have the same outline when
+seen from opposite sides from far away, so a mirrored mask of the first three is hard to tell.
 """
 
 from __future__ import annotations
@@ -34,7 +36,7 @@ BODY = ((0.0, 0.5), (0.20, 0.5), (0.22, 0.45), (0.17, 0.34), (0.26, 0.15), (0.34
 
 
 def blob() -> list[Part]:
-    """A ball with the bumps of data/synthetic's blob."""
+    """Return a ball with the bumps of data/synthetic's blob."""
     theta = np.arange(1, ROWS) / ROWS * np.pi
     phi = np.arange(COLUMNS) / COLUMNS * 2 * np.pi
     sin = np.sin(theta)[:, None]
@@ -51,7 +53,7 @@ def blob() -> list[Part]:
 
 
 def hook() -> list[Part]:
-    """A tube whose radius falls from .17 to .06."""
+    """Return a tube whose radius falls from .17 to .06."""
     t = np.linspace(0, 1, ROWS + 1)
     angle, height = 4.2 * t**1.3, 0.9 * t**2 - 0.4 + 0.15 * np.sin(5 * t)
     curve = np.stack([0.5 * np.cos(angle), height, (0.5 - 0.3 * t) * np.sin(angle)], axis=1)
@@ -59,12 +61,12 @@ def hook() -> list[Part]:
 
 
 def stack() -> list[Part]:
-    """Three boxes."""
+    """Return three boxes."""
     return [_box(np.array(size), np.array(place, float), turn) for size, place, turn in BOXES]
 
 
 def jug() -> list[Part]:
-    """A solid of revolution with a handle on one side and a spout on another."""
+    """Return a solid of revolution with a handle on one side and a spout on another."""
     t = np.linspace(0, 1, 24)
     handle = np.stack([0.2 + 0.32 * np.sin(np.pi * t), 0.4 - 0.55 * t, 0 * t], axis=1)
     spout = np.stack([-0.05 * t, 0.02 + 0.4 * t**1.5, 0.2 + 0.36 * t], axis=1)
@@ -74,7 +76,7 @@ def jug() -> list[Part]:
 
 
 def chair() -> list[Part]:
-    """The chair of data/eames, of fewer triangles, with an arm on one side."""
+    """Return the chair of data/eames, of fewer triangles, with an arm on one side."""
     arm, post = ((0.2, 0.62, -0.2), (0.22, 0.64, 0.15)), ((0.21, 0.43, 0.1), (0.22, 0.66, 0.12))
     rods = [(*dowel(np.array(a), np.array(b), (0.018, 0.02, 0.016), 20, 12), 2) for a, b in (arm, post)]
     return [(*shell(48, 72), 1), (*legs(20, 12), 2), *rods]
@@ -84,7 +86,7 @@ SHAPES: dict[str, Callable[[], list[Part]]] = {"blob": blob, "hook": hook, "stac
 
 
 def tube(curve: Float[np.ndarray, "n 3"], radius: Float[np.ndarray, " n"], label: int) -> Part:
-    """A closed tube of varying radius about a curve, its rings turned as little as can be from one to the next."""
+    """Return a closed tube of varying radius about a curve, its rings turned as little as possible."""
     along = np.gradient(curve, axis=0)
     along /= np.linalg.norm(along, axis=1, keepdims=True)
     across, side = np.empty_like(curve), np.eye(3)[np.argmin(np.abs(along[0]))]
@@ -102,7 +104,7 @@ def _grid(points: np.ndarray, top: np.ndarray, bottom: np.ndarray, label: int) -
 
 
 def _box(size: np.ndarray, place: np.ndarray, turn: float, side: int = 24) -> Part:
-    """A box whose six faces are grids, turned about y."""
+    """Return a box whose six faces are grids, turned about y."""
     u, v = (a.reshape(-1) for a in np.meshgrid(np.linspace(-0.5, 0.5, side + 1), np.linspace(-0.5, 0.5, side + 1)))
     index = np.arange((side + 1) ** 2).reshape(side + 1, side + 1)
     a, b, c, d = index[:-1, :-1], index[:-1, 1:], index[1:, :-1], index[1:, 1:]
@@ -121,13 +123,13 @@ def _box(size: np.ndarray, place: np.ndarray, turn: float, side: int = 24) -> Pa
 
 @cache
 def mesh(shape: str) -> Mesh:
-    """The shape as it is photographed, read as a file of it would be."""
+    """Return the shape as it is photographed, read as a file of it would be."""
     return mesh_of(SHAPES[shape](), shape)
 
 
 @cache
 def rough(shape: str, seed: int) -> Mesh:
-    """The shape of ROUGH_TRIANGLES, warped: each vertex moved by a smooth field, at most by WARP of the extent."""
+    """Warp the shape of ROUGH_TRIANGLES: each vertex is moved by a smooth field, at most by WARP of the extent."""
     parts = SHAPES[shape]()
     total = sum(len(faces) for _, faces, _ in parts)
     coarse = [decimated(part, max(round(ROUGH_TRIANGLES * len(part[1]) / total), 8)) for part in parts]
@@ -144,7 +146,7 @@ def rough(shape: str, seed: int) -> Mesh:
 
 
 def decimated(part: Part, triangles: int) -> Part:
-    """The part of about so many triangles, by quadric error metrics (Garland and Heckbert 1997) as Open3D does it."""
+    """Decimate the part to about so many triangles, by Open3D's quadric error metrics (Garland and Heckbert 1997)."""
     vertices, faces, label = part
     whole = o3d.geometry.TriangleMesh(o3d.utility.Vector3dVector(vertices), o3d.utility.Vector3iVector(faces))
     few = whole.remove_duplicated_vertices().simplify_quadric_decimation(triangles)
@@ -152,7 +154,7 @@ def decimated(part: Part, triangles: int) -> Part:
 
 
 def mesh_of(parts: list[Part], name: str) -> Mesh:
-    """The parts as one mesh; name: what an error calls it."""
+    """Return the parts as one mesh; name: what an error calls it."""
     first = np.cumsum([0] + [len(vertices) for vertices, _, _ in parts])
     faces = np.concatenate([faces + offset for (_, faces, _), offset in zip(parts, first)]).astype(np.int64)
     label = np.repeat([label for _, _, label in parts], [len(faces) for _, faces, _ in parts])

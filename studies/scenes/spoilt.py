@@ -1,5 +1,6 @@
-"""Made sets of very different quality, from good to hopeless: a set of chairs, of which photos, mesh, masks or links are spoilt.
+"""Made sets of very different quality, from good to hopeless: sets of chairs.
 
+Photos, mesh, masks or links of each are spoilt.
 What is spoilt, and by how much, is drawn by the set's number.  The truth stays with the set.
 """
 
@@ -110,7 +111,7 @@ def developed(folder: Path, spec: Spec, rng: Rng) -> None:
     """Give every photo another contrast and tint, and sharpen it: what phones and programs do."""
 
     def change(linear: Float[np.ndarray, "h w 3"]) -> Float[np.ndarray, "h w 3"]:
-        """One photo."""
+        """Change one photo."""
         return np.maximum(linear, 0) ** rng.uniform(0.5, 1.8) * np.exp(rng.normal(0, 0.2, 3))
 
     each_photo(folder, spec, change, ImageFilter.UnsharpMask(8, 150))
@@ -137,12 +138,27 @@ def tiny(folder: Path, spec: Spec, rng: Rng) -> None:
 
 KINDS: dict[str, Callable[[Path, Spec, Rng], None]] = {
     of.__name__: of
-    for of in (exact, rough, rougher, another_chair, few, one_photo, unlinked, miscalled, clipped, dark, noisy, developed, tiny)
-}  # fmt: skip
+    for of in (
+        exact,
+        rough,
+        rougher,
+        another_chair,
+        few,
+        one_photo,
+        unlinked,
+        miscalled,
+        clipped,
+        dark,
+        noisy,
+        developed,
+        tiny,
+    )
+}
 # What a set is spoilt by, one way after the other; each is dealt equally often.
 MIXED = (
-    [], [], ["exact"], ["exact"], ["few"], ["exact", "few"], ["rough"], ["rough", "few"], ["rougher"], ["another_chair"], ["one_photo"],
-    ["one_photo", "exact"], ["unlinked"], ["miscalled"], ["clipped"], ["exact", "dark"], ["noisy"], ["developed"], ["tiny"], ["few", "tiny", "rougher"],
+    [], [], ["exact"], ["exact"], ["few"], ["exact", "few"], ["rough"], ["rough", "few"], ["rougher"],
+    ["another_chair"], ["one_photo"], ["one_photo", "exact"], ["unlinked"], ["miscalled"], ["clipped"],
+    ["exact", "dark"], ["noisy"], ["developed"], ["tiny"], ["few", "tiny", "rougher"],
 )  # fmt: skip
 
 
@@ -162,7 +178,7 @@ def spoilt(base: Path, folder: Path, kinds: list[str], seed: int) -> None:
 
 
 def truth_of(spec: Spec, truth: Spec) -> Spec:
-    """The truth of the photos and materials that are left: what no photo shows is not to be scored."""
+    """Return the truth of the photos and materials that are left: what no photo shows is not to be scored."""
     names = [photo["name"] for photo in spec["photos"]]
     shown = {m for photo in spec["photos"] for own in photo["objects"] for m in ("wood", *own["materials"].values())}
     materials = {
@@ -190,7 +206,7 @@ def exposed(folder: Path, spec: Spec, factor: float) -> None:
 
 
 def focal_of(picture: Image.Image) -> int | None:
-    """The focal length that the picture's EXIF gives, of 35 mm film; None where it gives none."""
+    """Return the focal length that the picture's EXIF gives, of 35 mm film; None where it gives none."""
     return picture.getexif().get_ifd(0x8769).get(0xA405)
 
 

@@ -1,4 +1,4 @@
-"""Write what the stage `solve` answers in the comparison: <case>/materials.json, a map for each light, seconds.json.
+"""Answer of the stage `solve` in the comparison: <case>/materials.json, a map for each light, seconds.json.
 
 Other methods take no time: `studies.steps.compare` runs them itself.
 """

@@ -1,10 +1,10 @@
-"""How far the predicted chairs of a photo are from the photo: writes <case>.json and <case>.png, the photo's chairs above the predicted.
+"""Errors of the predicted chairs of a photo: writes <case>.json and <case>.png, the photo's chairs above these.
 
-A chair is left out as the pixels of its shell in one photo; the rest of all photos is solved by the stage `solve`, for each shell anew.
-Nothing is scaled in `chair`: the photo's exposure has to follow from the rest of it.  `chair_scaled` takes one factor per channel
-out first.  The null is the shell's own mean colour, which nobody knows who has not seen it; scaled or not, it is the same picture.
-Predicted pixels have the photo's shadows of meshes, but no light from other surfaces where the chair is left out, for that light is read
-off the photo itself.
+A chair is left out as the pixels of its shell in one photo; the rest of all photos is solved by the stage `solve`, for
+each shell anew. Nothing is scaled in `chair`: the photo's exposure has to follow from the rest of it.  `chair_scaled`
+takes one factor per channel out first.  The null is the shell's own mean colour, which nobody knows who has not seen
+it; scaled or not, it is the same picture. Predicted pixels have the photo's shadows of meshes, but no light from other
+surfaces where the chair is left out, for that light is read off the photo itself.
 """
 
 from __future__ import annotations
@@ -52,7 +52,7 @@ class Chair(msgspec.Struct, frozen=True):
         return white_of(self.truth, self.mask)
 
     def beside(self, image: Image) -> UInt8[np.ndarray, "h w 3"]:
-        """A picture of the photo's shell above that of another image, exposed alike."""
+        """Return a picture of the photo's shell above that of another image, exposed alike."""
         rows, columns = (slice(max(at.min() - MARGIN, 0), at.max() + MARGIN) for at in np.nonzero(self.mask))
         pair = (picture(of[rows, columns], 1 / self.white) for of in (self.truth, image))
         return np.concatenate([np.where(self.mask[rows, columns][..., None], of, np.uint8(255)) for of in pair])
@@ -81,29 +81,32 @@ def main(params: Params, inputs: Inputs, out: Path, progress: Progress) -> None:
                 solved(seen, case["solve"], alone, folder, progress)
             images.append(predicted(folder, chair, case["photo"], channels, geometry, tables[case["photo"]], observed))
     write_json(out / f"{inputs.photo}.json", score_of(list(chairs.values()), images))
-    write_png(out / f"{inputs.photo}.png", side_by_side([c.beside(of) for c, of in zip(chairs.values(), images, strict=True)]))  # fmt: skip
+    write_png(
+        out / f"{inputs.photo}.png", side_by_side([c.beside(of) for c, of in zip(chairs.values(), images, strict=True)])
+    )
 
 
 def without(table: Observations, material: str) -> Observations:
-    """A photo's observations but for those of a material."""
+    """Return a photo's observations but for those of a material."""
     return table.take(table.material != table.materials.index(material))
 
 
 def chair_of(label: int, channels: Mapping[str, Any], geometry: Mapping[str, Any]) -> Chair:
-    """channels, geometry: as the stages `masks` and `align` write them."""
+    """Return the chair of a label; channels, geometry: as the stages `masks` and `align` write them."""
     mesh = np.abs(np.stack([geometry[f"normal.{a}"] for a in "xyz"])).max(axis=0) > 0
     mask = (np.rint(channels["label"]) == label + 1) & (channels["valid"] > 0.5) & mesh
     return Chair(np.stack([channels[c] for c in "RGB"], axis=-1).astype(float), mask)
 
 
 def flat_colour(tables: dict[str, Observations], photo: str, shell: str, beside: str) -> Float[np.ndarray, "3"]:
-    """The shell's mean colour in the other photos, over that of `beside` there, times that of `beside` here: RGB radiance.
+    """Return the shell's mean colour in the other photos, over that of `beside` there, times that of `beside` here.
 
+    The result is RGB radiance.
     What can be said of a left-out chair without any model of light: `beside` (the wood of the legs) is in all photos.
     """
 
     def of(table: Observations, material: str) -> Float[np.ndarray, "n 3"]:
-        """Radiances of a material."""
+        """Return radiances of a material."""
         return table.radiance[table.material == table.materials.index(material)].astype(float)
 
     others = [t for name, t in tables.items() if name != photo and len(of(t, shell)) and len(of(t, beside))]
@@ -112,9 +115,17 @@ def flat_colour(tables: dict[str, Observations], photo: str, shell: str, beside:
 
 
 def predicted(
-    folder: Path, chair: Chair, photo: str, channels: Mapping[str, Any], geometry: Mapping[str, Any], table: Observations, bounces: bool
-) -> Image:  # fmt: skip
-    """The shell's pixels by the materials, the photo's light, its exposure and its tone curve of a solve; zero elsewhere.
+    folder: Path,
+    chair: Chair,
+    photo: str,
+    channels: Mapping[str, Any],
+    geometry: Mapping[str, Any],
+    table: Observations,
+    bounces: bool,
+) -> Image:
+    """Predict the shell's pixels by a solve's materials and the photo's light, exposure and tone curve.
+
+    Other pixels are zero.
 
     bounces: whether light that surfaces send each other is added, if the solve had it: it is read off the photo
     """
@@ -133,7 +144,7 @@ def predicted(
 
 
 def score_of(chairs: Sequence[Chair], images: Sequence[Image]) -> Score:
-    """The mean over a photo's chairs."""
+    """Return the mean over a photo's chairs."""
     pairs = list(zip(chairs, images, strict=True))
     flat = [(c, np.broadcast_to(c.truth[c.mask].mean(0), c.truth.shape)) for c in chairs]
     values = {"chair": _dssim(pairs), "chair_scaled": _dssim((c, image * _factor(c, image)) for c, image in pairs)}
@@ -145,13 +156,13 @@ def _dssim(pairs: Iterable[tuple[Chair, Image]]) -> float:
 
 
 def _factor(chair: Chair, image: Image) -> Float[np.ndarray, "3"]:
-    """The least-squares factor of each channel, over pixels that the photo's picture does not cut."""
+    """Return the least-squares factor of each channel, over pixels that the photo's picture does not cut."""
     kept = chair.mask & (chair.truth.max(axis=2) <= chair.white)
     return (image[kept] * chair.truth[kept]).sum(0) / np.maximum((image[kept] ** 2).sum(0), 1e-30)
 
 
 def side_by_side(pictures: Sequence[np.ndarray]) -> UInt8[np.ndarray, "h w 3"]:
-    """Pictures in a row, white below the lower ones."""
+    """Lay pictures in a row, white below the lower ones."""
     height = max(len(p) for p in pictures)
     padded = [np.pad(p, ((0, height - len(p)), (4, 4), (0, 0)), constant_values=255) for p in pictures]
     return np.concatenate(padded, axis=1)

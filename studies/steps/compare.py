@@ -1,18 +1,24 @@
-"""How far a method's predictions are from photos that were not taken: writes <case>.json, and into <case>/ pictures and shots.json.
+"""Errors of a method's predictions of photos that were not taken: writes <case>.json.
 
-Three kinds of pictures of the sphere, each compared with the truth by DSSIM inside the sphere's outline, after the tone map of
-`factorlib.evaluate.picture` at an exposure that takes the truth's white to 1:
+Pictures and shots.json go into <case>/.
 
-    novel_view      every photographed entry, from `VIEWS`: the first shares a part of what it sees with the photo, the second little
-    novel_light     every photographed material in the true lights of the world that no photo was taken in, from the photos' side
-    novel_material  every material of the world that was not photographed, in the light of every photo, from the photos' side
+Three kinds of pictures of the sphere, each compared with the truth by DSSIM inside the sphere's outline, after the tone
+map of `factorlib.evaluate.picture` at an exposure that takes the truth's white to 1:
 
-each in the three gauges of `factorlib.evaluate.gauge`: nothing scaled beyond the one factor that no photo tells, which the true
-materials fix; one number for all pictures of the kind (`_scaled`); one for each channel and picture (`_balanced`).
+    novel_view      every photographed entry, from `VIEWS`: the first shares a part of what it sees with the photo, the
+                    second little
+    novel_light     every photographed material in the true lights of the world that no photo was taken in, from the
+                    photos' side
+    novel_material  every material of the world that was not photographed, in the light of every photo, from the photos'
+                    side
 
-The rest are the errors of the reflectances that a method states, those of three spheres in the lights that it states, and the
-processor seconds that it took.  What a method does not state has no score.  <shot>.png is a prediction, <shot>-truth.png the truth
-beside it; shots.json has their DSSIM.  <case>.png: some of them, the truth above.
+each in the three gauges of `factorlib.evaluate.gauge`: nothing scaled beyond the one factor that no photo tells, which
+the true materials fix; one number for all pictures of the kind (`_scaled`); one for each channel and picture
+(`_balanced`).
+
+The rest are the errors of the reflectances that a method states, those of three spheres in the lights that it states,
+and the processor seconds that it took.  What a method does not state has no score.  <shot>.png is a prediction,
+<shot>-truth.png the truth beside it; shots.json has their DSSIM.  <case>.png: some of them, the truth above.
 """
 
 from __future__ import annotations
@@ -57,7 +63,7 @@ class Shot(msgspec.Struct, frozen=True):
 
     @property
     def name(self) -> str:
-        """The name of its picture's file."""
+        """Name of its picture's file."""
         return f"{self.kind}-{self.material}-light{self.light}-{self.view}"
 
 
@@ -71,12 +77,12 @@ class Taken(msgspec.Struct, frozen=True):
     white: float
 
     def dssim(self, factor: np.ndarray | float = 1.0) -> float:
-        """Of the prediction times a factor."""
+        """Return the DSSIM of the prediction times a factor."""
         pictures = (self.view.picture(radiance) for radiance in (self.predicted * factor, self.truth))
         return picture_error(*pictures, self.view.inside, self.white).dssim
 
     def picture(self, radiance: Radiance) -> np.ndarray:
-        """8-bit sRGB, white where there is nothing."""
+        """Return 8-bit sRGB, white where there is nothing."""
         pixels = picture(self.view.picture(np.maximum(radiance, 0)), 1 / self.white)
         pixels[~self.view.inside] = 255
         return pixels
@@ -109,14 +115,17 @@ def main(params: Params, inputs: Inputs, out: Path, progress: Progress) -> None:
 
 
 def read_shots(folder: Path) -> list[tuple[Shot, float]]:
-    """The shots.json of a case: shots, and DSSIM with nothing scaled."""
+    """Read the shots.json of a case: shots, and DSSIM with nothing scaled."""
     return msgspec.convert(read_json(folder / "shots.json"), list[tuple[Shot, float]])
 
 
 def answer(
     case: Comparison, photos: Photos, folder: Path, truths: Mapping[str, Reflectance]
 ) -> tuple[Prediction, float]:
-    """A method's answer, and the processor seconds that it took; folder: what the step `answer` wrote, where it takes more than an instant."""
+    """Return a method's answer, and the processor seconds that it took.
+
+    folder: what the step `answer` wrote, where it takes more than an instant
+    """
     if case.method in INSTANT:
         start = time.process_time()
         return INSTANT[case.method](photos, truths), round(time.process_time() - start, 3)
@@ -126,21 +135,23 @@ def answer(
 
 
 def shots(case: Comparison, world: World, prediction: Prediction) -> list[Taken]:
-    """All that is asked, and answered."""
+    """Return all shots that are asked, with what the method answers."""
     cameras, taken = {name: view(case.size, turn(*at)) for name, at in (VIEWS | FRONT).items()}, []
     for shot in asked(case, world):
         camera, material, light = cameras[shot.view], world.materials[shot.material], world.lights[shot.light]
         truth = shown(material, light, camera)
         predicted = prediction.of(
-            material if shot.kind == "novel_material" else shot.material, light if shot.kind == "novel_light" else shot.light, camera
-        )  # fmt: skip
+            material if shot.kind == "novel_material" else shot.material,
+            light if shot.kind == "novel_light" else shot.light,
+            camera,
+        )
         if predicted is not None:
             taken.append(Taken(shot, camera, truth, predicted, white_of(camera.picture(truth), camera.inside)))
     return taken
 
 
 def asked(case: Comparison, world: World) -> Iterator[Shot]:
-    """What is asked of all methods in a case."""
+    """Yield what is asked of all methods in a case."""
     names, unseen = list(world.materials), sorted(world.lights.keys() - set(case.lights))
     others = [name for name in names if name not in case.material_names]
     yield from (Shot("novel_view", names[m], li, side) for side in VIEWS for m, li in case.entries)
@@ -149,7 +160,10 @@ def asked(case: Comparison, world: World) -> Iterator[Shot]:
 
 
 def score_of(world: World, prediction: Prediction, taken: Sequence[Taken], seconds: float) -> Score:
-    """taken: as `shots` makes them;  seconds: of the processor, that the answer took."""
+    """Score a method.
+
+    taken: as `shots` makes them;  seconds: of the processor, that the answer took
+    """
     score = Score({"processor": seconds})
     for kind in KINDS:
         if of_kind := [of for of in taken if of.shot.kind == kind]:

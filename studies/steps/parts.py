@@ -1,4 +1,4 @@
-"""A rendered set solved by the stage `solve` with one part of the model switched off, and how far that is from the truth: writes <case>.json."""
+"""Error of a rendered set that `solve` solves with one part of the model switched off: writes <case>.json."""
 
 from __future__ import annotations
 

@@ -1,8 +1,10 @@
-"""What photos of data sets show, by the stages `masks`, `align` and `urm` themselves: writes <set>/ with a folder for each stage.
+"""Observations of photos of data sets, by the stages `masks`, `align` and `urm` themselves.
 
-Sets are one of this checkout, or rendered sets of chairs of all seeds, as `factorlib.generate` makes them, which <set>/data keeps: photographs
-have all bounces, a mesh coarser than what was photographed, clipped pixels.
-Mitsuba's scalar variant traces, which every machine has.
+Each stage writes into a folder of its own in <set>/.
+
+Sets are one of this checkout, or rendered sets of chairs of all seeds, as `factorlib.generate` makes them, which
+<set>/data keeps: photographs have all bounces, a mesh coarser than what was photographed, clipped pixels. Mitsuba's
+scalar variant traces, which every machine has.
 """
 
 from __future__ import annotations
@@ -30,7 +32,7 @@ CHECKOUT = Path(__file__).resolve().parents[2]
 
 
 def main(params: Params, inputs: Inputs, out: Path, progress: Progress) -> None:
-    """All rendered sets, or some photos of a data set of this checkout; poses are searched as in every run."""
+    """Observe all rendered sets, or some photos of a data set of this checkout; poses are searched as in every run."""
     facts = inputs.facts["dataset.sets"]
     if "folder" in facts:
         folder = CHECKOUT / facts["folder"]
@@ -46,11 +48,16 @@ def main(params: Params, inputs: Inputs, out: Path, progress: Progress) -> None:
 
 
 def run_stages(
-    dataset: Dataset, out: Path, stages: Sequence[ModuleType], params: Mapping[str, dict[str, Any]] = {}, photos: Sequence[str] | None = None
-) -> None:  # fmt: skip
+    dataset: Dataset,
+    out: Path,
+    stages: Sequence[ModuleType],
+    params: Mapping[str, dict[str, Any]] = {},
+    photos: Sequence[str] | None = None,
+) -> None:
     """Run stages, of which the first is `masks`, on a data set, each into out/<stage>/, without the runner.
 
-    What each takes is read in pipeline.yaml.  params: by stage, those that differ from their defaults;  photos: None for all of the set
+    What each takes is read in pipeline.yaml.  params: by stage, those that differ from their defaults;  photos: None
+    for all of the set
     """
     said = yaml.safe_load((CHECKOUT / "pipeline.yaml").read_text(encoding="utf-8"))
     photos = [photo.name for photo in dataset.spec.photos] if photos is None else photos

@@ -1,24 +1,28 @@
-"""How far a case's answer is from the truth of its world: writes <case>.json.
+"""Errors of a case's answer against the truth of its world: writes <case>.json.
 
-Pictures are spheres, whatever was observed: all normals of the half sphere toward the viewer.  They are compared by DSSIM inside the
-disc after the tone map of `factorlib.evaluate.picture`, nothing scaled but for the gauge (`studies.errors`).
+Pictures are spheres, whatever was observed: all normals of the half sphere toward the viewer.  They are compared by
+DSSIM inside the disc after the tone map of `factorlib.evaluate.picture`, nothing scaled but for the gauge
+(`studies.errors`).
 
-    entries        recovered materials in recovered lights: every entry of the observed rows and columns; observed, unobserved: those
-                   entries alone; no factor is in it where a material and a light are connected
+    entries        recovered materials in recovered lights: every entry of the observed rows and columns; observed,
+                   unobserved: those entries alone; no factor is in it where a material and a light are connected
     new_light      recovered materials in all true lights of the world, those that the case never saw among them
     new_material   all true materials of the world in the recovered lights, those that the case never saw among them
-    first_material, first_light   of those, the material 0 and the light 0 of the world alone, which cases of all sizes share
+    first_material, first_light   of those, the material 0 and the light 0 of the world alone, which cases of all sizes
+                                  share
 
-The rest are errors of the materials' numbers, of three spheres in the recovered lights, the standard errors that the solve states, the
-seconds that it took, and how coloured lights are, which is what the paper's prior acts on:
+The rest are errors of the materials' numbers, of three spheres in the recovered lights, the standard errors that the
+solve states, the seconds that it took, and how coloured lights are, which is what the paper's prior acts on:
 
-    chromaticity   of lights: deviation over the three channels of their mean radiances, over the mean of these.  Before that each channel
-                   is divided by its geometric mean over the case's lights, the gauge, in answers and truths alike
+    chromaticity   of lights: deviation over the three channels of their mean radiances, over the mean of these.  Before
+                   that each channel is divided by its geometric mean over the case's lights, the gauge, in answers and
+                   truths alike
     colour         mean angle between the colours of a mirror sphere in the recovered and in the true light
     tint           deviation over channels of the log of the factor that takes recovered reflectances to true ones
 
-Nulls: what a guess scores that knows nothing but mean colours.  Of objects, for the first seed, <case>.png shows all materials (rows) in all
-lights, the truth and, right of it, what was recovered; entries that were observed have a bright frame.
+Nulls: what a guess scores that knows nothing but mean colours.  Of objects, for the first seed, <case>.png shows all
+materials (rows) in all lights, the truth and, right of it, what was recovered; entries that were observed have a bright
+frame.
 """
 
 from __future__ import annotations
@@ -60,12 +64,11 @@ def main(params: Params, inputs: Inputs, out: Path, progress: Progress) -> None:
         write_png(out / f"{inputs.photo}.png", np.concatenate([spheres.matrix(true=True), spheres.matrix()], axis=1))
 
 
-def scored(
-    case: Case, truths: Table, maps: Maps, table: Mapping[str, Solved], own: Maps
-) -> tuple[Spheres, Score]:  # fmt: skip
-    """The spheres that are compared, and all scores.
+def scored(case: Case, truths: Table, maps: Maps, table: Mapping[str, Solved], own: Maps) -> tuple[Spheres, Score]:
+    """Return the spheres that are compared, and all scores.
 
-    truths, maps: all true materials and lights of the world;  table, own: those that were solved, in the solve's own gauge
+    truths, maps: all true materials and lights of the world;  table, own: those that were solved, in the solve's own
+                  gauge
     """
     component = connected_components({light_name(li): case.names_in(li) for li in case.lights})
     solved = {n: table[n].reflectance for n in component}
@@ -79,21 +82,26 @@ def scored(
     score = spheres.score() | material_errors(solved, truths, component) | stated_errors([table[n] for n in component])
     errors = light_errors(lights, maps)
     if len(set(component.values())) > 1:  # each component has a tint of its own
-        return spheres, score | Score(*({k: v for k, v in of.items() if k != "colour"} for of in (errors.values, errors.nulls)))  # fmt: skip
+        return spheres, score | Score(
+            *({k: v for k, v in of.items() if k != "colour"} for of in (errors.values, errors.nulls))
+        )
     colours = {"chromaticity": chromaticity(own), "true_chromaticity": chromaticity({li: maps[li] for li in own})}
     tint = float(np.std(np.log(factor_of(solved, truths))))
     return spheres, score | errors | Score({**colours, "tint": tint})
 
 
 def stated_errors(table: Iterable[Solved]) -> Score:
-    """Means over materials of the standard errors that the solve states: of roughness, and of k_d + k_s relative to it."""
+    """Return means over materials of the standard errors that the solve states.
+
+    They are of roughness, and of k_d + k_s relative to it.
+    """
     sums = [(np.maximum(np.add(m.diffuse, m.specular), LEAST), m.stderr) for m in table]
     relative = [np.mean(np.hypot(stderr.diffuse, stderr.specular) / whole) for whole, stderr in sums]
     return Score({"stated_roughness": _mean(e.roughness for _, e in sums), "stated_reflectance": _mean(relative)})
 
 
 def chromaticity(lights: Maps) -> float:
-    """Of lights that share materials; 0 where all have one colour.
+    """Return the chromaticity of lights that share materials; 0 where all have one colour.
 
     >>> one = {k: np.full((8, 16, 3), c) for k, c in enumerate(((1.0, 2.0, 3.0), (2.0, 4.0, 6.0)))}
     >>> round(chromaticity(one), 6)
@@ -115,7 +123,7 @@ class Spheres:
         self.own = {li: Appearances(light_of_lat_long(light)) for li, light in lights.items()}
 
     def score(self) -> Score:
-        """DSSIM of what is predicted, and of what nulls predict: mean colours, grey materials, constant lights."""
+        """Return DSSIM of the predictions, and of those of nulls: mean colours, grey materials, constant lights."""
         names, every, own, true = self.case.material_names, self.truths.items(), self.own, self.true
         pairs = [(n, li) for n in names for li in own]
         seen = {(self.case.names[m], li) for m, li in self.case.entries}
@@ -141,7 +149,7 @@ class Spheres:
         return picture_error(_disc(predicted), truth, INSIDE, white_of(truth, INSIDE)).dssim
 
     def matrix(self, true: bool = False) -> UInt8[np.ndarray, "h w 3"]:
-        """All materials (rows) in all lights, recovered or true, each exposed for its truth."""
+        """Draw all materials (rows) in all lights, recovered or true, each exposed for its truth."""
         rows = []
         for m in self.case.materials:
             name, row = self.case.names[m], []

@@ -1,8 +1,8 @@
 """The stage `solve` itself on what a case observes: writes into <case>/ what that stage writes, and measured.json.
 
-measured.json holds the processor seconds of the solve, of all threads, from observations as they lie on disk to materials and lights as
-they lie there, and of objects the mean error of the normals given.  Seconds are a measurement: they differ from run to run.  What
-was solved to start from does not count in them.
+measured.json holds the processor seconds of the solve, of all threads, from observations as they lie on disk to
+materials and lights as they lie there, and of objects the mean error of the normals given.  Seconds are a measurement:
+they differ from run to run.  What was solved to start from does not count in them.
 """
 
 from __future__ import annotations
@@ -28,7 +28,10 @@ from studies.study import Case
 
 
 def main(params: Params, inputs: Inputs, out: Path, progress: Progress) -> None:
-    """Render, perturb, and solve with the parameters that the case names, from nothing or from the solution of all photos but the last."""
+    """Render, perturb, and solve with the parameters that the case names.
+
+    The solve starts from nothing, or from the solution of all photos but the last.
+    """
     case, home, measured = msgspec.convert(inputs.facts["dataset.case"], Case), out / inputs.photo, {}
     maps = spheres.read_maps(inputs["worlds"], case.seed, case.lights)
     of = spheres.materials_of(case.seed, case.names), {li: light_of_lat_long(light) for li, light in maps.items()}
@@ -48,9 +51,17 @@ def main(params: Params, inputs: Inputs, out: Path, progress: Progress) -> None:
 
 
 def solved(
-    tables: Mapping[str, Observations], how: dict[str, Any], inputs: Inputs, out: Path, progress: Progress, **start: Path
-) -> float:  # fmt: skip
-    """Solve observations, each photo in a light of its own; the processor seconds that it took.  how: parameters of the stage."""
+    tables: Mapping[str, Observations],
+    how: dict[str, Any],
+    inputs: Inputs,
+    out: Path,
+    progress: Progress,
+    **start: Path,
+) -> float:
+    """Solve observations, each photo in a light of its own; return the processor seconds that it took.
+
+    how: parameters of the stage
+    """
     lights = {name: msgspec.to_builtins(LightSlice(name, None)) for name in tables}
     facts = {"dataset.materials": list(next(iter(tables.values())).materials), "dataset.light": lights}
     with TemporaryDirectory() as folder:

@@ -142,8 +142,14 @@ def _poses(photo: PhotoEntry, shot: Shot, source: CameraSource, hulls: set[str],
                 cure = f"give the pose of {obj.name!r} in photos: cam_R_m2c and cam_t_m2c of its instance"
                 refuse(f"cameras.obj_ids.{obj.mesh}", fault, cure)
             if not instances:
-                log.warning("%s: cameras.bop knows no obj_id %d in image %s: the pose of %s in %s is searched",
-                            refuse.file, obj_id, shot.image, obj.name, photo.name)  # fmt: skip
+                log.warning(
+                    "%s: cameras.bop knows no obj_id %d in image %s: the pose of %s in %s is searched",
+                    refuse.file,
+                    obj_id,
+                    shot.image,
+                    obj.name,
+                    photo.name,
+                )
             for pose in instances:
                 poses[obj.name] = Pose(pose.rotation, _divided(pose.translation, source.mesh_unit_mm))
         return poses
