@@ -20,7 +20,7 @@ from factorlib.images.exr import read_exr, write_exr
 from factorlib.inference.noise import Noise
 from factorlib.inference.observed import blocks_of_observations, usable
 from factorlib.inference.problem import JointProblem
-from factorlib.inference.start import from_nothing, own_cells
+from factorlib.inference.start import from_nothing
 from factorlib.inference.surface_attach import attached_pixels
 from factorlib.inference.surface_detail import Found, Surfaces, found
 from factorlib.inference.surface_turns import Attached, Detail, joined, no_detail
@@ -82,13 +82,9 @@ def main(params: Params, inputs: Inputs, out: Path, progress: Progress) -> None:
             write_exr(out / "photos" / f"{name}.exr", photo.detailed(surfaces, detail))
     by_mesh = [{name: values.tolist() for name, values in of.items()} for of in (displacements, factors)]
     table = SurfaceTable(
-        bool(displacements),
-        Tried.of(result.evidence, result.stiffness.turn),
-        bool(factors),
-        Tried.of(result.painted, result.stiffness.factor),
-        result.gains,
-        *by_mesh,
-    )
+        bool(displacements), Tried.of(result.evidence, result.stiffness.turn),
+        bool(factors), Tried.of(result.painted, result.stiffness.factor), result.gains, *by_mesh,
+    )  # fmt: skip
     write_json(out / FILE, table)
     write_json(out / BEGINNING, result.beginning)
     progress(1, 1)
@@ -189,7 +185,7 @@ def _found(
         problem,
         surfaces,
         of_blocks,
-        from_nothing(len(inputs.facts["dataset.materials"]), own_cells),
+        from_nothing(len(inputs.facts["dataset.materials"])),
         params.seed,
         lambda share, what: progress(share, 1, what),
     )

@@ -50,26 +50,9 @@ LEAST_RADIANCE = 1e-6  # least radiance, as a share of a block's mean
 
 # Function of a problem and a number of cells a light; the best of its fits continues.
 Start = Callable[[JointProblem, int], list[Fit]]
-Cells = Callable[[str, int], UnitLobes]  # so many cells of an illumination, by its name
 
 
-def own_cells(name: str, count: int) -> UnitLobes:
-    """Return `count` even cells, rotated at random by the name of the illumination.
-
-    The blur of the cells therefore differs from light to light.
-    """
-    cells = even_cells(count)
-    seed = crc32(name.encode())
-    turn = Rotation.random(rng=np.random.default_rng(seed)).as_matrix()
-    return msgspec.structs.replace(cells, axis=cells.axis @ turn.T)
-
-
-def common_cells(name: str, count: int) -> UnitLobes:
-    """Return `count` even cells, the same for every illumination."""
-    return even_cells(count)
-
-
-def from_nothing(materials: int, cells_of: Cells = common_cells) -> Start:
+def from_nothing(materials: int) -> Start:
     """Return the start from mean radiances alone; with few materials, from several roughnesses."""
 
     def fits(problem: JointProblem, cells: int) -> list[Fit]:
@@ -77,7 +60,7 @@ def from_nothing(materials: int, cells_of: Cells = common_cells) -> Start:
         blocks = problem.blocks
         roughness = STARTS if materials <= FEW else STARTS[1:2]
         begun = [starting_materials(blocks, materials, one) for one in roughness]
-        return [start_of(Point(of, [constant_light(block, of, cells, cells_of) for block in blocks])) for of in begun]
+        return [start_of(Point(of, [constant_light(block, of, cells) for block in blocks])) for of in begun]
 
     return fits
 
@@ -123,7 +106,7 @@ class Beginning(msgspec.Struct, frozen=True):
 
 
 def from_beginning(begun: Beginning) -> Start:
-    """Return the start from a fit; a light with other photos than the fit's is constant."""
+    """Return the start from a fit; a light with other cells or other photos than the fit's is constant."""
 
     def fits(problem: JointProblem, cells: int) -> list[Fit]:
         """Return the fit in the units of the problem."""
@@ -133,11 +116,9 @@ def from_beginning(begun: Beginning) -> Start:
         for block in problem.blocks:
             one = begun.lights.get(block.name)
             light = constant_light(block, materials, cells)
-            if one and len(one.log_exposure) == len(block.photos):
-                lobes = own_cells(block.name, len(one.weight))
-                weight = np.array(one.weight) / block.unit
-                fitted = Light(lobes.axis, np.log(lobes.sharpness), weight, np.array(one.log_exposure))
-                light = resampled(fitted, common_cells(block.name, cells))
+            if one and (len(one.weight), len(one.log_exposure)) == (cells, len(block.photos)):
+                values = {"weight": np.array(one.weight) / block.unit, "log_exposure": np.array(one.log_exposure)}
+                light = msgspec.structs.replace(light, **values)
             lights.append(light)
             counts.append(one.hyperparameters if one else Hyperparameters())
         return [Fit(Point(materials, lights), counts, begun.value)]
@@ -238,7 +219,7 @@ def mean_albedo(blocks: Sequence[Block], count: int) -> Float[np.ndarray, "m 3"]
     return BRIGHTEST_AT_START * np.exp(logs - logs.max())
 
 
-def constant_light(block: Block, materials: Materials, cells: int, cells_of: Cells = common_cells) -> Light:
+def constant_light(block: Block, materials: Materials, cells: int) -> Light:
     """Return the constant light that explains the mean radiance of a block's first photo.
 
     The exposures of the other photos explain their mean radiances.
@@ -249,12 +230,23 @@ def constant_light(block: Block, materials: Materials, cells: int, cells_of: Cel
     # log of each photo's mean radiance over reflectance
     levels = np.zeros((len(block.photos), 3))
     levels[shown] = [np.log(np.mean(np.exp(logs[block.photo == k]), axis=0)) for k in shown]
-    lobes = cells_of(block.name, cells)
+    lobes = own_cells(block.name, cells)
     light = Light(lobes.axis, np.log(lobes.sharpness), np.ones((cells, 3)), (levels - levels[0]).mean(1))
     return light.with_log_radiance(np.repeat(levels[0][:, None], cells, axis=1))
 
 
-def on_cells(fit: Fit, count: int, problem: JointProblem, cells_of: Cells = common_cells) -> Fit:
+def own_cells(name: str, count: int) -> UnitLobes:
+    """Return `count` even cells, rotated at random by the name of the illumination.
+
+    The blur of the cells therefore differs from light to light.
+    """
+    cells = even_cells(count)
+    seed = crc32(name.encode())
+    turn = Rotation.random(rng=np.random.default_rng(seed)).as_matrix()
+    return msgspec.structs.replace(cells, axis=cells.axis @ turn.T)
+
+
+def on_cells(fit: Fit, count: int, problem: JointProblem) -> Fit:
     """Return a fit with its lights on `count` cells.
 
     Known lights, and lights with suns or with at least `count` cells, keep their own.
@@ -262,16 +254,12 @@ def on_cells(fit: Fit, count: int, problem: JointProblem, cells_of: Cells = comm
     lights = []
     for light, block in zip(fit.point.lights, problem.blocks, strict=True):
         if len(light) < count and not light.held.any() and not light.suns.any():
-            light = resampled(light, cells_of(block.name, count))
+            cells = own_cells(block.name, count)
+            radiance = light.lobes.radiance(cells.axis)
+            on = {"axis": cells.axis, "log_sharpness": np.log(cells.sharpness), "weight": radiance}
+            light = msgspec.structs.replace(light, **on).with_log_radiance(np.log(np.maximum(radiance, 1e-12)).T)
         lights.append(light)
     return fit.with_lights(lights)
-
-
-def resampled(light: Light, cells: UnitLobes) -> Light:
-    """Return the light on other cells, each with the radiance in its direction."""
-    radiance = light.lobes.radiance(cells.axis)
-    on = {"axis": cells.axis, "log_sharpness": np.log(cells.sharpness), "weight": radiance}
-    return msgspec.structs.replace(light, **on).with_log_radiance(np.log(np.maximum(radiance, 1e-12)).T)
 
 
 def known_point(problem: JointProblem, earlier: Earlier, names: Sequence[str], cells: int) -> Point:

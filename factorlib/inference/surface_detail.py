@@ -39,7 +39,7 @@ from factorlib.inference.model_selection import TRIAL, TRIAL_CELLS, effects_chos
 from factorlib.inference.optimizer import light_descended
 from factorlib.inference.options import Choices
 from factorlib.inference.problem import JointProblem
-from factorlib.inference.start import Beginning, Start, on_cells, own_cells
+from factorlib.inference.start import Beginning, Start, on_cells
 from factorlib.inference.surface_turns import Attached, Detail, Part, Stiffness, no_detail, part_of, step
 from factorlib.light.prior import LightPrior, read_light_prior
 from factorlib.meshes.fine import Fine
@@ -427,8 +427,7 @@ def trial_of(
     choices = Choices(self_shadowing="on", interreflection="on", seed=seed)
     effects = effects_chosen(sure, start(sure, TRIAL_CELLS), choices, fitting)
     problem = effects.of(problem)
-    begun = on_cells(effects.fit, CELLS, problem, own_cells)
-    fit = fitted(problem.sampled(OBSERVATIONS, seed), begun, prior, SETTLE, tick)
+    fit = fitted(problem.sampled(OBSERVATIONS, seed), on_cells(effects.fit, CELLS, problem), prior, SETTLE, tick)
     return Trial(problem, fit, *surface, prior), Beginning.of(effects.fit, problem.blocks)
 
 

@@ -12,7 +12,7 @@ from factorlib.inference.likelihood import LightLikelihood
 from factorlib.inference.materials import Materials, Point
 from factorlib.inference.noise import Loss
 from factorlib.inference.problem import JointProblem
-from factorlib.inference.start import constant_light
+from factorlib.inference.start import constant_light, own_cells
 from factorlib.light.prior import MIX, read_light_prior
 from factorlib.reflection import reflection_operator
 from studies.scenes.problems import MATERIALS, block
@@ -33,9 +33,9 @@ def drawn(seed: int, cells: int) -> np.ndarray:
     return np.linalg.solve(MIX, fields)
 
 
-def on_even_cells(u: np.ndarray, log_exposure=(0.0,), log_tone=()) -> Light:
-    """The light of log radiance u [3, p] on even cells, which are those of a solve."""
-    lobes = even_cells(u.shape[1])
+def on_even_cells(u: np.ndarray, log_exposure=(0.0,), log_tone=(), name=None) -> Light:
+    """The light of log radiance u [3, p] on even cells, turned as a solve turns those of the illumination `name`, where it is given."""
+    lobes = even_cells(u.shape[1]) if name is None else own_cells(name, u.shape[1])
     return Light(lobes.axis, np.log(lobes.sharpness), PEAK * np.exp(u.T), np.array(log_exposure), np.array(log_tone))
 
 

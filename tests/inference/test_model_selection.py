@@ -137,7 +137,7 @@ def test_shadows_that_are_none_are_given_up_and_those_that_change_nothing_stay(s
 def rooms(photos=1, size=12):
     rng = np.random.default_rng(3)
     exposures = [np.concatenate([[0.0], rng.normal(0, 0.5, photos - 1)]) for _ in range(3)]
-    lights = [on_even_cells(drawn(30 + k, 60), e) for k, e in enumerate(exposures)]
+    lights = [on_even_cells(drawn(30 + k, 60), e, name=f"room{k}") for k, e in enumerate(exposures)]
     return spheres(lights, size=size, noise=0.05).blocks
 
 
