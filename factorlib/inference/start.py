@@ -106,22 +106,27 @@ class Beginning(msgspec.Struct, frozen=True):
 
 
 def from_beginning(begun: Beginning) -> Start:
-    """Return the start from a fit; a light with other cells or other photos than the fit's is constant."""
+    """Return the start from a fit.
+
+    A light with other cells or other photos than the fit's is constant, and the start then counts as no fit: its value
+    is infinite, and it is descended from as from mean radiances.
+    """
 
     def fits(problem: JointProblem, cells: int) -> list[Fit]:
         """Return the fit in the units of the problem."""
         materials = Materials.of_rows(np.array(begun.materials))
-        lights = []
-        counts = []
-        for block in problem.blocks:
+        lights = [constant_light(block, materials, cells) for block in problem.blocks]
+        hyperparameters = [Hyperparameters() for _ in lights]
+        value = begun.value
+        for k, block in enumerate(problem.blocks):
             one = begun.lights.get(block.name)
-            light = constant_light(block, materials, cells)
-            if one and (len(one.weight), len(one.log_exposure)) == (cells, len(block.photos)):
-                values = {"weight": np.array(one.weight) / block.unit, "log_exposure": np.array(one.log_exposure)}
-                light = msgspec.structs.replace(light, **values)
-            lights.append(light)
-            counts.append(one.hyperparameters if one else Hyperparameters())
-        return [Fit(Point(materials, lights), counts, begun.value)]
+            if one is None or (len(one.weight), len(one.log_exposure)) != (cells, len(block.photos)):
+                value = float("inf")
+                continue
+            values = {"weight": np.array(one.weight) / block.unit, "log_exposure": np.array(one.log_exposure)}
+            lights[k] = msgspec.structs.replace(lights[k], **values)
+            hyperparameters[k] = one.hyperparameters
+        return [Fit(Point(materials, lights), hyperparameters, value)]
 
     return fits
 

@@ -203,6 +203,7 @@ def test_a_light_of_other_cells_or_photos_than_the_fit_had_begins_constant():
     begun = from_beginning(Beginning.of(fit, problem.blocks))
     (coarse,) = begun(problem, 30)
     assert all(np.ptp(light.log_radiance, axis=1).max() < 0.2 for light in coarse.point.lights)
+    assert coarse.value == np.inf  # so that it is descended from as from nothing
     two = msgspec.structs.replace(problem.blocks[0], photos=("room0", "another"))
     light = begun(problem.of([two, *problem.blocks[1:]]), FEW)[0].point.lights[0]
     assert len(light.log_exposure) == 2 and np.ptp(light.log_radiance, axis=1).max() < 0.2
