@@ -91,9 +91,17 @@ class Case(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class Comparison(Case, frozen=True, forbid_unknown_fields=True):
-    """The photos that a method sees; `size` is in pixels across a photo."""
+    """The photos that a method sees; `size` is in pixels across a photo.
 
-    method: Literal["ours", "intrinsic", "projective", "grey"] = "ours"
+    Attributes:
+        method: Method that answers.
+        pixels: Pixels across the pictures of Mitsuba's optimisation.
+        steps: Largest number of its steps.
+    """
+
+    method: Literal["ours", "mitsuba", "intrinsic", "projective", "grey"] = "ours"
+    pixels: int = 48
+    steps: int = 2000
 
 
 class World(msgspec.Struct, frozen=True, forbid_unknown_fields=True):

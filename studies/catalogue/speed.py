@@ -3,6 +3,7 @@
 Varied     cells, splittings and observations of the joint solver, its operator, the merging of observations that are
            alike, and the paper's solver.  Sets are of 2 × 2, full ones too: there are eleven settings, and the paper's
            solver with its own networks is slow.  The operator `reference` is left out: it takes hours.
+           Mitsuba's joint optimisation is in the study of comparisons.
 Measured   processor time of the stage `solve`, and what it predicts.
 """
 

@@ -1,11 +1,16 @@
 """The comparison: scores of the truth and of a grey ball, and scores by its steps."""
 
+import os
+import subprocess
+import sys
+
 import numpy as np
 import pytest
 
 from factorlib.conventions import lat_long_directions
 from factorlib.evaluate.materials import compare_materials
 from studies.body import photographed
+from studies.catalogue import comparison
 from studies.errors import in_gauge, times
 from studies.methods import (
     grey,
@@ -31,9 +36,9 @@ def light(seed, rows=32):
     return sky
 
 
-def case(side=3, size=24, seed=0, method="ours"):
+def case(side=3, size=24, seed=0, method="ours", steps=2):
     """All of so many materials in as many lights."""
-    return Comparison(seed, tuple(full_matrix(side, side)), size, method=method)
+    return Comparison(seed, tuple(full_matrix(side, side)), size, method=method, pixels=12, steps=steps)
 
 
 def lights(seed, count=4):
@@ -85,10 +90,15 @@ def test_the_truth_in_any_gauge_scores_nothing_a_grey_ball_does_and_what_is_not_
 
 
 def test_from_worlds_to_pictures(tmp_path, monkeypatch):
-    """By its steps."""
+    """By its steps, Mitsuba's two steps of a tiny optimisation in a process of their own included."""
+    environment = {name: value for name, value in os.environ.items() if name != "FACTORLIB_MITSUBA"}
+    words = [sys.executable, "-c", "from factorlib.tracing.variant import mitsuba; print(mitsuba().variant())"]
+    if "llvm_ad_rgb" not in subprocess.run(words, env=environment, capture_output=True, text=True).stdout:
+        pytest.skip("Mitsuba has no derivatives here: its joint optimisation needs LLVM")
+    monkeypatch.setitem(comparison.SIZES, "quick", (12, 12, 2))
     table, out = concluded(tmp_path, "comparison", data_of(tmp_path / "comparison", TINY), TINY, [answer, compare])
     cells = {row["name"]: {m: c["spread"]["mean"] for m, c in row["cells"].items()} for row in table["rows"]}
-    assert list(cells) == ["ours", "intrinsic", "projective", "grey"] and table["quick"]
+    assert list(cells) == ["ours", "mitsuba", "intrinsic", "projective", "grey"] and table["quick"]
     assert all({"novel_view", "novel_light", "processor"} <= of.keys() for of in cells.values())
     assert cells["ours"]["novel_view"] < cells["grey"]["novel_view"] and "novel_material" not in cells["projective"]
     assert {path.stem for path in (out / "pictures").iterdir()} == {f"{method}-seed0" for method in cells}
