@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 
 from factorlib.errors import InputError
+from factorlib.inference.fit import Fit, start_of
 from factorlib.inference.forward import Illumination
 from factorlib.inference.gauge import connected_components
 from factorlib.inference.history import Solution
@@ -302,12 +303,12 @@ def random_start(count: int, seed: int):
     rng = np.random.default_rng(seed)
     roughness, share = rng.uniform(0.15, 0.9, count), rng.uniform(0.05, 0.6, count)
 
-    def points(problem: JointProblem, cells: int) -> list[Point]:
+    def fits(problem: JointProblem, cells: int) -> list[Fit]:
         albedo, grey = mean_albedo(problem.blocks, count), np.full((count, 3), BRIGHTEST_AT_START / 2)
         materials = Materials(albedo * (1 - share)[:, None], grey * share[:, None], roughness)
-        return [Point(materials, [constant_light(block, materials, cells) for block in problem.blocks])]
+        return [start_of(Point(materials, [constant_light(block, materials, cells) for block in problem.blocks]))]
 
-    return points
+    return fits
 
 
 @pytest.mark.long
