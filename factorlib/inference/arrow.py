@@ -78,7 +78,7 @@ class Arrow:
     def __init__(self, systems: Sequence[System], prior: Matrix, free: Bool[np.ndarray, " k"], damping: float = 0.0):
         self.systems = systems
         self.free = np.flatnonzero(free)
-        self.coupling = [solved(part.factor, part.cross_hessian.T) for part in systems]  # L⁻¹Cᵀ
+        self.coupling = [solve_cholesky(part.factor, part.cross_hessian.T) for part in systems]  # L⁻¹Cᵀ
         # M − Σ C_i L_i⁻¹ C_iᵀ, (1), damped
         schur = prior.copy()
         for part, coupling in zip(systems, self.coupling, strict=True):
@@ -97,7 +97,7 @@ class Arrow:
     def solve(self, by_materials: Vector, by_lights: Sequence[Vector]) -> tuple[Vector, list[Vector]]:
         """Return H⁻¹ g, by (1)."""
         # L_i⁻¹ g_i, then dm by the Schur complement, then L_i⁻¹ (g_i − C_iᵀ dm)
-        alone = [solved(part.factor, g) for part, g in zip(self.systems, by_lights, strict=True)]
+        alone = [solve_cholesky(part.factor, g) for part, g in zip(self.systems, by_lights, strict=True)]
         reduced = by_materials.copy()
         step = np.zeros_like(by_materials)
         for part, own in zip(self.systems, alone, strict=True):
@@ -107,7 +107,7 @@ class Arrow:
         return step, [own - coupling @ step[part.places] for part, own, coupling in lights]
 
 
-def solved(factor: Float[np.ndarray, "l l"], right: Float[np.ndarray, "l ..."]) -> Float[np.ndarray, "l ..."]:
+def solve_cholesky(factor: Float[np.ndarray, "l l"], right: Float[np.ndarray, "l ..."]) -> Float[np.ndarray, "l ..."]:
     """Return L⁻¹ of a vector or of columns, L given by its lower Cholesky factor."""
     return cho_solve((factor, True), right, check_finite=False)
 
@@ -126,7 +126,7 @@ def information(systems: Sequence[System], size: int) -> tuple[Matrix, list[Floa
     hessian = np.zeros((size, size))
     scores = []
     for part in systems:
-        coupling = solved(part.factor, part.cross_hessian.T)
+        coupling = solve_cholesky(part.factor, part.cross_hessian.T)
         # Σ M − C_i L_i⁻¹ C_iᵀ
         hessian[np.ix_(part.places, part.places)] += part.material_hessian - part.cross_hessian @ coupling
         if part.scores is not None:

@@ -71,7 +71,7 @@ class Block(msgspec.Struct, frozen=True):
         values = ((name, getattr(self, name)) for name in PER_OBSERVATION)
         return msgspec.structs.replace(self, **{name: of[rows] for name, of in values if of is not None})
 
-    def fitted(self) -> Block:
+    def without_held_out(self) -> Block:
         """Return the observations that are not held out."""
         return self.take(~self.held_out) if self.held_out.any() else self
 
@@ -79,7 +79,7 @@ class Block(msgspec.Struct, frozen=True):
         """Return the same observations, none held out."""
         return msgspec.structs.replace(self, held_out=np.zeros(len(self), bool))
 
-    def sampled(self, count: int, seed: int) -> Block:
+    def subsample(self, count: int, seed: int) -> Block:
         """Return at most `count` fitted and `count` held-out observations, drawn at random, in their order."""
         random = np.random.default_rng(seed)
         kept = [random.permutation(np.flatnonzero(rows))[:count] for rows in (~self.held_out, self.held_out)]

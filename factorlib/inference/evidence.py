@@ -29,9 +29,9 @@ from factorlib.results.materials import Decision
 LEAST_LOSS = 1e-4  # added to every loss, in σ² of the noise model: two losses far below it count as equal
 # Thresholds, in standard errors.  Shadows are dropped only if the evidence is clearly against them.  Interreflection
 # and tone curves need clear evidence.  Smaller cells obey the same prior as larger ones: one standard error is enough.
-AGAINST = -2.0
-FOR = 2.0
-FINER = 1.0
+CLEARLY_AGAINST = -2.0
+CLEARLY_FOR = 2.0
+WEAKLY_FOR = 1.0
 
 
 class Losses(NamedTuple):
@@ -41,14 +41,14 @@ class Losses(NamedTuple):
     clusters: list[Int[np.ndarray, " n"]]
 
 
-def losses_of(problem: JointProblem, point: Point) -> Losses:
+def held_out_losses(problem: JointProblem, point: Point) -> Losses:
     """Return the losses of the held-out observations at a point; of every observation if none is held out."""
     none = problem.none_held_out
     judged = [block.take(block.held_out | none) for block in problem.blocks]
     return Losses(problem.held_out_losses(point), [block.clusters() for block in judged])
 
 
-def compare(without: Losses, richer: Losses, least: float) -> Decision:
+def compare_models(without: Losses, richer: Losses, least: float) -> Decision:
     """Compare two models: keep the richer one if d of (1) exceeds `least` standard errors.
 
     Without held-out observations the richer model is not kept.

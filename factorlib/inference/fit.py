@@ -14,8 +14,9 @@ Every light has its own T, so that a photo with a badly fitting mesh counts less
 descent.  So are the factors that scale the light's contrast and colour relative to a typical light (equation (4) of
 `factorlib.light.prior`).
 
-Materials are fitted to the observations with reliable normals (`sure_ones`).  A highlight at a wrong normal makes the
-material look rougher than it is, however little it weighs.  Given those materials, lights are fitted once more to all
+Materials are fitted to the observations with reliable normals (`reliable_observations`).  A highlight at a wrong normal
+makes the material look rougher than it is, however little it weighs.  Given those materials, lights are fitted once
+more to all
 observations: rims and thin parts show directions that nothing else shows.
 """
 
@@ -29,23 +30,23 @@ from factorlib.inference.arrow import System
 from factorlib.inference.blocks import Block
 from factorlib.inference.forward import Illumination
 from factorlib.inference.lights import Light
-from factorlib.inference.likelihood import LightLikelihood, inverse_of
+from factorlib.inference.likelihood import LightLikelihood, cholesky_inverse
 from factorlib.inference.materials import Materials, Point
-from factorlib.inference.noise import Loss
-from factorlib.inference.optimizer import Descent, Report
-from factorlib.inference.priors import MaterialPrior, materials_of, unknowns_of
+from factorlib.inference.noise import RobustLoss
+from factorlib.inference.optimizer import Descent, LossReport
+from factorlib.inference.priors import MaterialPrior, material_unknowns, materials_from_unknowns
 from factorlib.inference.problem import JointProblem
-from factorlib.inference.responses import Tables
+from factorlib.inference.responses import ResponseCache
 from factorlib.light.prior import LightPrior
 
-SURE = 0.6  # least confidence of a normal, as a share of its material's median
-DARK = 0.2  # factor on the noise model's absolute part where normals are reliable
-ROBUST = Loss(3.0)  # beyond 3 σ of the noise model a residual is an outlier
+RELIABLE = 0.6  # least confidence of a normal, as a share of its material's median
+DARK_NOISE = 0.2  # factor on the noise model's absolute part where normals are reliable
+ROBUST = RobustLoss(3.0)  # beyond 3 σ of the noise model a residual is an outlier
 START_TEMPERATURE = 10.0
 # Standard deviation of a sun's log radiance: in lights captured outdoors its energy is a third to twice the sky's.
-SUNS = 1.0
+SUN_DEVIATION = 1.0
 # Least reflectance at the start.  The derivative with respect to the logarithm of a smaller one is nearly zero.
-LEAST_AT_START = 0.01
+LEAST_START_REFLECTANCE = 0.01
 
 
 class Hyperparameters(msgspec.Struct, frozen=True):
@@ -72,7 +73,7 @@ class Fit(msgspec.Struct, frozen=True):
         return msgspec.structs.replace(self, point=Point(self.point.materials, lights))
 
 
-class Schedule(msgspec.Struct, frozen=True):
+class FitSchedule(msgspec.Struct, frozen=True):
     """Number of steps of a fit.
 
     Attributes:
@@ -97,12 +98,12 @@ class Schedule(msgspec.Struct, frozen=True):
         return self.lights + 1 + sum(iterations + 1 for iterations in self.together)
 
 
-def fitted(
+def fit_problem(
     problem: JointProblem,
     start: Fit,
     prior: LightPrior,
-    schedule: Schedule,
-    report: Report = lambda loss: None,
+    schedule: FitSchedule,
+    report: LossReport = lambda loss: None,
 ) -> Fit:
     """Fit materials and lights to the observations that are not held out.
 
@@ -116,10 +117,10 @@ def fitted(
     Returns:
         The fit, with the value of its objective.
     """
-    problem = problem.fitted()
+    problem = problem.without_held_out()
     given = schedule.given
     hyperparameters = start.hyperparameters
-    materials = start.point.materials if given else problem.known.put(above_zero(start.point.materials))
+    materials = start.point.materials if given else problem.known.insert_into(raise_reflectances(start.point.materials))
     prior_on_materials = MaterialPrior(materials, problem.blocks, problem.known)
     descent = Descent(prior_on_materials, problem.spread, report, problem.known.free(len(materials)))
     illuminations = problem.illuminations(Point(materials, start.point.lights))
@@ -127,30 +128,34 @@ def fitted(
 
     def likelihood(pair: tuple[Illumination, Hyperparameters]) -> LightLikelihood:
         """Return the likelihood of one light, with a table of responses."""
-        return likelihood_of(*pair, prior, given, problem.tables)
+        return light_likelihood(*pair, prior, given, problem.tables)
 
     likelihoods = list(problem.spread(likelihood, pairs))
-    state = descent.of_lights(likelihoods, unknowns_of(materials), schedule.lights)
+    state = descent.descend_lights(likelihoods, material_unknowns(materials), schedule.lights)
     for number, iterations in enumerate(schedule.together):
         if number or schedule.estimate:
             systems = list(zip(state.likelihoods, state.systems, strict=True))
-            hyperparameters = list(problem.spread(lambda each: estimated(each[0], each[1], schedule.least), systems))
+            hyperparameters = list(
+                problem.spread(lambda each: estimate_hyperparameters(each[0], each[1], schedule.least), systems)
+            )
             both = zip(state.likelihoods, hyperparameters, strict=True)
-            state = state._replace(likelihoods=[recounted(*each) for each in both])
+            state = state._replace(likelihoods=[with_hyperparameters(*each) for each in both])
         if given:
-            state = descent.of_lights(state.likelihoods, state.theta, iterations)
+            state = descent.descend_lights(state.likelihoods, state.theta, iterations)
         else:
-            state = descent.of_all(state, iterations)
+            state = descent.descend_jointly(state, iterations)
     lights = [one.light for one in state.likelihoods]
-    return Fit(Point(materials if given else materials_of(state.theta), lights), hyperparameters, state.value)
+    return Fit(
+        Point(materials if given else materials_from_unknowns(state.theta), lights), hyperparameters, state.value
+    )
 
 
-def likelihood_of(
+def light_likelihood(
     illumination: Illumination,
     one: Hyperparameters,
     prior: LightPrior,
     materials_given: bool = False,
-    tables: Tables | None = None,
+    tables: ResponseCache | None = None,
 ) -> LightLikelihood:
     """Return the likelihood of one light, with its table of responses and the given hyperparameters.
 
@@ -163,12 +168,12 @@ def likelihood_of(
     """
     given = illumination.materials.roughness if materials_given else None
     of = illumination.block, illumination.light.unit_lobes, illumination.operator
-    table = (tables or Tables()).of(*of, given)
+    table = (tables or ResponseCache()).get(*of, given)
     tabulated = msgspec.structs.replace(illumination, table=table)
-    return recounted(LightLikelihood(tabulated, prior, np.zeros(0), np.zeros((0, 0)), 0.0, 1.0, ROBUST), one)
+    return with_hyperparameters(LightLikelihood(tabulated, prior, np.zeros(0), np.zeros((0, 0)), 0.0, 1.0, ROBUST), one)
 
 
-def recounted(likelihood: LightLikelihood, one: Hyperparameters) -> LightLikelihood:
+def with_hyperparameters(likelihood: LightLikelihood, one: Hyperparameters) -> LightLikelihood:
     """Return the likelihood with other hyperparameters."""
     light = likelihood.light
     # Q of the cells, under the scale factors s_k²
@@ -176,16 +181,16 @@ def recounted(likelihood: LightLikelihood, one: Hyperparameters) -> LightLikelih
     if light.suns.any():  # the prior on cells does not cover suns: each has an independent Gaussian
         own = np.tile(light.suns, 3)
         cells = Q
-        Q = np.diag(np.where(own, SUNS**-2.0, 0.0))
+        Q = np.diag(np.where(own, SUN_DEVIATION**-2.0, 0.0))
         Q[np.ix_(~own, ~own)] = cells
-    if light.held.any():  # Q of the free cells given the held ones is their block of Q
+    if light.fixed.any():  # Q of the free cells given the held ones is their block of Q
         free = np.tile(light.free, 3)
         log_determinant = float(np.linalg.slogdet(Q[np.ix_(free, free)])[1])
     counts = {"precision": Q, "log_determinant": log_determinant, "temperature": one.temperature}
     return msgspec.structs.replace(likelihood, log_peaks=np.log(light.peaks), **counts)
 
 
-def estimated(likelihood: LightLikelihood, system: System, least: float) -> Hyperparameters:
+def estimate_hyperparameters(likelihood: LightLikelihood, system: System, least: float) -> Hyperparameters:
     """Return the hyperparameters estimated from the residuals and the light at the end of a descent.
 
     Args:
@@ -197,16 +202,16 @@ def estimated(likelihood: LightLikelihood, system: System, least: float) -> Hype
     cells, free = (np.flatnonzero(np.tile(which, 3)) for which in (~light.suns, light.free))
     # covariance of u: H⁻¹ of the free cells, 0 of the held ones, without suns
     covariance = np.zeros((3 * len(light), 3 * len(light)))
-    covariance[np.ix_(free, free)] = inverse_of(system.factor[: len(free), : len(free)])
+    covariance[np.ix_(free, free)] = cholesky_inverse(system.factor[: len(free), : len(free)])
     covariance = covariance[np.ix_(cells, cells)]
     factors = likelihood.prior.likeliest_factors(
         light.axis[~light.suns], light.log_radiance[:, ~light.suns], covariance
     )
     residual = likelihood.illumination.residuals()
-    return Hyperparameters(temperature(likelihood.illumination.block, residual, least), factors)
+    return Hyperparameters(estimate_temperature(likelihood.illumination.block, residual, least), factors)
 
 
-def temperature(block: Block, residual: Float[np.ndarray, "n 3"], least: float = 1.0) -> float:
+def estimate_temperature(block: Block, residual: Float[np.ndarray, "n 3"], least: float = 1.0) -> float:
     """Return T of (1) from whitened residuals."""
     number = block.clusters()
     bounded = residual.clip(-ROBUST.robust_scale, ROBUST.robust_scale)
@@ -214,21 +219,25 @@ def temperature(block: Block, residual: Float[np.ndarray, "n 3"], least: float =
     return max(float(np.square(sums).sum()) / max(residual.size, 1), least)
 
 
-def above_zero(materials: Materials) -> Materials:
-    """Return the materials with reflectances raised to at least `LEAST_AT_START`."""
+def raise_reflectances(materials: Materials) -> Materials:
+    """Return the materials with reflectances raised to at least `LEAST_START_REFLECTANCE`."""
     rows = materials.rows()
-    rows[:, :6] = np.maximum(rows[:, :6], LEAST_AT_START)
-    return Materials.of_rows(rows)
+    rows[:, :6] = np.maximum(rows[:, :6], LEAST_START_REFLECTANCE)
+    return Materials.from_rows(rows)
 
 
-def sure_ones(problem: JointProblem) -> JointProblem:
+def reliable_observations(problem: JointProblem) -> JointProblem:
     """Return the observations that materials are fitted to: reliable normals, with less noise in the dark."""
-    noises = [msgspec.structs.replace(block.noise, absolute=DARK * block.noise.absolute) for block in problem.blocks]
-    return problem.of([b.take(sure(b)).with_noise(noise) for b, noise in zip(problem.blocks, noises, strict=True)])
+    noises = [
+        msgspec.structs.replace(block.noise, absolute=DARK_NOISE * block.noise.absolute) for block in problem.blocks
+    ]
+    return problem.with_blocks(
+        [b.take(reliable_mask(b)).with_noise(noise) for b, noise in zip(problem.blocks, noises, strict=True)]
+    )
 
 
-def sure(block: Block) -> Bool[np.ndarray, " n"]:
-    """Return a mask of the normals whose confidence is at least `SURE` times the weighted median of their material.
+def reliable_mask(block: Block) -> Bool[np.ndarray, " n"]:
+    """Return a mask of the normals whose confidence is at least `RELIABLE` times the weighted median of their material.
 
     The median is taken over the material's observations in this light.
     """
@@ -239,10 +248,10 @@ def sure(block: Block) -> Bool[np.ndarray, " n"]:
     for m in np.unique(block.material):
         rows = block.material == m
         typical = np.quantile(block.confidence[rows], 0.5, weights=weight[rows], method="inverted_cdf")
-        result[rows] = block.confidence[rows] >= SURE * typical
+        result[rows] = block.confidence[rows] >= RELIABLE * typical
     return result
 
 
-def start_of(point: Point) -> Fit:
+def initial_fit(point: Point) -> Fit:
     """Return the fit of a point before any descent."""
     return Fit(point, [Hyperparameters() for _ in point.lights])

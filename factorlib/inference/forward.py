@@ -27,12 +27,12 @@ from factorlib.images.tone import by_log_exponent
 from factorlib.inference.blocks import Block
 from factorlib.inference.lights import Light, UnitLobes
 from factorlib.inference.materials import Materials
-from factorlib.inference.noise import Loss
-from factorlib.inference.responses import CHUNK, Reflected, Table, diffuse_response, specular_response
+from factorlib.inference.noise import RobustLoss
+from factorlib.inference.responses import CHUNK, ResponseLookup, Responses, diffuse_response, specular_response
 from factorlib.reflection.operator import Operator
 
 
-class Shown(NamedTuple):
+class Prediction(NamedTuple):
     """Prediction of the model for n observations.
 
     Attributes:
@@ -49,7 +49,7 @@ class Shown(NamedTuple):
     by_roughness: Float[np.ndarray, "n 3"]
     linear: Float[np.ndarray, "n 3"]
     radiance: Float[np.ndarray, "n 3"]
-    responses: list[tuple[int, slice, Reflected]]
+    responses: list[tuple[int, slice, Responses]]
 
 
 class Linearised(NamedTuple):
@@ -106,18 +106,18 @@ class Illumination(msgspec.Struct, frozen=True):
     light: Light
     materials: Materials
     operator: Operator
-    table: Table | None = None
+    table: ResponseLookup | None = None
 
     @property
     def exposure(self) -> Float[np.ndarray, "n 1"]:
         """Exposure of each observation's photo, a factor on the light."""
         return np.exp(self.light.log_exposure)[self.block.photo][:, None]
 
-    def fitted(self) -> Illumination:
+    def without_held_out(self) -> Illumination:
         """Return the illumination without its held-out observations."""
-        return msgspec.structs.replace(self, block=self.block.fitted())
+        return msgspec.structs.replace(self, block=self.block.without_held_out())
 
-    def shown(self) -> Shown:
+    def predict(self) -> Prediction:
         """Return the predicted radiance and its components."""
         block = self.block
         kd = self.materials.diffuse
@@ -135,7 +135,7 @@ class Illumination(msgspec.Struct, frozen=True):
         else:
             for m in np.unique(block.material).tolist():
                 rows = self.table.rows(m)
-                of = self.table.at(m, roughness[m])
+                of = self.table.interpolate(m, roughness[m])
                 diffuse[rows], specular[rows], by_roughness[rows] = of.radiance(weight)
                 responses.append((m, rows, of))
         diffuse, specular, by_roughness = (part * self.exposure for part in (diffuse, specular, by_roughness))
@@ -144,22 +144,22 @@ class Illumination(msgspec.Struct, frozen=True):
             specular = specular + block.bounced[:, 3:]
         # ℓ and y
         linear = kd[block.material] * diffuse + ks[block.material] * specular
-        toned = self.light.toned(linear, block.photo)
-        return Shown(diffuse, specular, by_roughness, linear, toned, responses)
+        toned = self.light.apply_tone(linear, block.photo)
+        return Prediction(diffuse, specular, by_roughness, linear, toned, responses)
 
     def radiance(self) -> Float[np.ndarray, "n 3"]:
         """Return y, the predicted radiance of every observation."""
-        return self.shown().radiance
+        return self.predict().radiance
 
     def residuals(self) -> Float[np.ndarray, "n 3"]:
         """Return r, in σ of the noise model."""
         return self.block.residuals(self.radiance())
 
-    def losses(self, loss: Loss) -> Float[np.ndarray, " n"]:
+    def losses(self, loss: RobustLoss) -> Float[np.ndarray, " n"]:
         """Return the robust loss of every observation, averaged over its channels."""
-        return loss.of_residuals(self.residuals()).mean(1)
+        return loss.evaluate(self.residuals()).mean(1)
 
-    def atoms(self, rows: Int[np.ndarray, " n"], lobes: UnitLobes) -> Float[np.ndarray, "3 n q"]:
+    def unit_responses(self, rows: Int[np.ndarray, " n"], lobes: UnitLobes) -> Float[np.ndarray, "3 n q"]:
         """Return the whitened response at `rows` to q further lobes of weight one, per channel."""
         block = self.block
         materials = self.materials
@@ -169,7 +169,7 @@ class Illumination(msgspec.Struct, frozen=True):
             response[0, of] = diffuse_response(block, rows[of], lobes, self.operator)
             response[1, of] = specular_response(block, rows[of], lobes, float(materials.roughness[m]), self.operator)
         # A = (k_d D + k_s S) e τ'/σ, linearised at the observed radiance
-        slope = self.light.slope_at(block.radiance[rows], block.photo[rows])
+        slope = self.light.tone_slope(block.radiance[rows], block.photo[rows])
         scale = block.precision[rows] * slope * self.exposure[rows]
         kd = materials.diffuse[block.material[rows]]
         ks = materials.specular[block.material[rows]]
@@ -177,17 +177,17 @@ class Illumination(msgspec.Struct, frozen=True):
             [scale[:, c, None] * (kd[:, c, None] * response[0] + ks[:, c, None] * response[1]) for c in range(3)]
         )
 
-    def pull(
-        self, residual: Float[np.ndarray, "n 3"], loss: Loss, temperature: float = 1.0
+    def root_weights(
+        self, residual: Float[np.ndarray, "n 3"], loss: RobustLoss, temperature: float = 1.0
     ) -> Float[np.ndarray, "n 3"]:
         """Return the root of each residual's weight in the robust loss divided by T.
 
         It is 0 for held-out observations, and for clipped channels that are predicted bright enough.
         """
         counts = ~self.block.held_out[:, None] & ~(self.block.clipped & (residual >= 0))
-        return np.sqrt(counts * loss.trust(residual) / temperature)
+        return np.sqrt(counts * loss.weights(residual) / temperature)
 
-    def gradient(self, loss: Loss, temperature: float) -> Gradient:
+    def gradient(self, loss: RobustLoss, temperature: float) -> Gradient:
         """Return Σ ρ(r)/T of the fitted observations and half its gradient, without a Jacobian.
 
         The cost is two products of the responses with three columns.
@@ -195,12 +195,12 @@ class Illumination(msgspec.Struct, frozen=True):
         block = self.block
         light = self.light
         materials = self.materials
-        shown = self.shown()
+        shown = self.predict()
         residual = block.residuals(shown.radiance)
-        value = float(loss.of_residuals(residual)[~block.held_out].sum()) / temperature
+        value = float(loss.evaluate(residual)[~block.held_out].sum()) / temperature
         # a = ½ ∂(Σ ρ/T)/∂ℓ; `lit` is the part of ℓ that is proportional to the light
-        by_radiance = self.pull(residual, loss, temperature) ** 2 * residual * block.precision
-        by_linear = by_radiance * light.slope_at(shown.radiance, block.photo)
+        by_radiance = self.root_weights(residual, loss, temperature) ** 2 * residual * block.precision
+        by_linear = by_radiance * light.tone_slope(shown.radiance, block.photo)
         lit = shown.linear - self.bounced
         # Σ a ∂ℓ/∂(log k_d, log k_s, roughness), and Dᵀ a e k_d + Sᵀ a e k_s with respect to w
         by_materials = np.zeros((len(materials), 7))
@@ -235,7 +235,7 @@ class Illumination(msgspec.Struct, frozen=True):
         ks = materials.specular[block.material]
         return kd * block.bounced[:, :3] + ks * block.bounced[:, 3:]
 
-    def linearise(self, shown: Shown, loss: Loss, temperature: float = 1.0) -> Iterator[Linearised]:
+    def linearise(self, shown: Prediction, loss: RobustLoss, temperature: float = 1.0) -> Iterator[Linearised]:
         """Yield residuals and derivatives, by material and channel.
 
         Held-out observations have weight 0.
@@ -249,11 +249,11 @@ class Illumination(msgspec.Struct, frozen=True):
         light = self.light
         materials = self.materials
         residual = block.residuals(shown.radiance)
-        pull = self.pull(residual, loss, temperature)
+        pull = self.root_weights(residual, loss, temperature)
         scale = pull * block.precision
-        rising = scale * light.slope_at(shown.radiance, block.photo)  # ∂r/∂ℓ
+        rising = scale * light.tone_slope(shown.radiance, block.photo)  # ∂r/∂ℓ
         by_photos = self._by_photos(shown, scale, rising)
-        free = light.free if light.held.any() else slice(None)
+        free = light.free if light.fixed.any() else slice(None)
         for m, rows, of in shown.responses:
             of_specular = of.specular
             of_roughness = of.by_roughness
@@ -268,7 +268,7 @@ class Illumination(msgspec.Struct, frozen=True):
                 specular = of_specular * (ks * bright)
                 by_photo = by_photos[c][rows]
                 if light.scale_free:  # ∂r/∂ log of the factor on held cells
-                    by_photo = np.hstack([by_photo, (diffuse + specular)[:, light.held].sum(1, keepdims=True)])
+                    by_photo = np.hstack([by_photo, (diffuse + specular)[:, light.fixed].sum(1, keepdims=True)])
                 yield Linearised(
                     c,
                     rows,
@@ -282,7 +282,7 @@ class Illumination(msgspec.Struct, frozen=True):
                 )
 
     def _by_photos(
-        self, shown: Shown, scale: Float[np.ndarray, "n 3"], rising: Float[np.ndarray, "n 3"]
+        self, shown: Prediction, scale: Float[np.ndarray, "n 3"], rising: Float[np.ndarray, "n 3"]
     ) -> list[Float[np.ndarray, "n q"]]:
         """Return ∂r/∂log e = τ' (ℓ − bounced)/σ and ∂r/∂log g of each channel, by the photos' exposures and exponents.
 

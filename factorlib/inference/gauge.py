@@ -24,7 +24,7 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components as components_of_graph
 
 from factorlib.inference.blocks import Block
-from factorlib.inference.known import Known
+from factorlib.inference.known import KnownValues
 from factorlib.inference.materials import Materials, Point
 
 BRIGHTEST = 0.9
@@ -73,7 +73,7 @@ def connected_components(blocks: Sequence[Block], materials: int) -> list[Compon
     )
 
 
-def in_gauge(point: Point, blocks: Sequence[Block], known: Known = Known()) -> Point:
+def fix_gauge(point: Point, blocks: Sequence[Block], known: KnownValues = KnownValues()) -> Point:
     """Return the point in the gauge of this module; it predicts the same radiance.
 
     Args:
@@ -88,7 +88,7 @@ def in_gauge(point: Point, blocks: Sequence[Block], known: Known = Known()) -> P
     names = [block.name for block in blocks]
     for members, illuminations in connected_components(blocks, len(materials)):
         own = [names.index(name) for name in illuminations]
-        factors = known.factors(members, illuminations) if is_free(blocks, illuminations) else 0
+        factors = known.free_factors(members, illuminations) if has_free_factor(blocks, illuminations) else 0
         if not own or not factors:
             continue
         rows = list(members)
@@ -105,6 +105,6 @@ def in_gauge(point: Point, blocks: Sequence[Block], known: Known = Known()) -> P
     return Point(Materials(diffuse, specular, materials.roughness), lights)
 
 
-def is_free(blocks: Sequence[Block], illuminations: Sequence[str]) -> bool:
+def has_free_factor(blocks: Sequence[Block], illuminations: Sequence[str]) -> bool:
     """Return True if no block of these illuminations has interreflection, so that their component has a free factor."""
     return all(block.bounced is None for block in blocks if block.name in illuminations)

@@ -8,7 +8,7 @@ import msgspec
 
 from factorlib.inference.fit import Fit
 from factorlib.inference.materials import Point
-from factorlib.inference.options import Choices
+from factorlib.inference.options import SolveOptions
 from factorlib.inference.problem import JointProblem
 from factorlib.results.materials import Decision
 
@@ -35,7 +35,7 @@ class Event(msgspec.Struct, frozen=True):
     lobes: int
 
 
-Report = Callable[[Event], None]
+EventReport = Callable[[Event], None]
 Progress = Callable[[float, float, str], None]  # amount done, total amount, and the current activity
 # Typical number of evaluations of each phase, and the cost of one relative to the first phase's, on data/eames.
 PHASES = {
@@ -50,7 +50,7 @@ SPLITTING = (7, 9)
 LAST = {"lights": (3, 14), "suns": (4, 10)}
 
 
-def unreported(event: Event) -> None:
+def ignore_event(event: Event) -> None:
     """Ignore an event."""
 
 
@@ -81,12 +81,12 @@ class Solution(msgspec.Struct, frozen=True):
     splitting: list[Decision] = []
     suns: list[Decision] = []
 
-    def shown(self, problem: JointProblem) -> JointProblem:
+    def effective_problem(self, problem: JointProblem) -> JointProblem:
         """Return the problem that the answer solves: with or without shadows and interreflection."""
         return problem.with_effects(self.shadows.kept, self.interreflection.kept)
 
 
-def of_subsets(progress: Progress, subsets: int) -> Report:
+def subset_progress(progress: Progress, subsets: int) -> EventReport:
     """Return a report that converts events of the paper's solver to progress in `subsets` reported subsets."""
 
     def report(event: Event) -> None:
@@ -98,7 +98,7 @@ def of_subsets(progress: Progress, subsets: int) -> Report:
     return report
 
 
-def of_parts(progress: Progress, choices: Choices) -> Report:
+def solve_progress(progress: Progress, choices: SolveOptions) -> EventReport:
     """Return a report that converts events of the joint solve to progress, in evaluations of the first phase.
 
     Progress moves with every evaluation.  It never goes back, even if several starts enter a phase several times.

@@ -15,19 +15,19 @@ from jaxtyping import Float
 from factorlib.geometry.sphere import mirror_directions
 from factorlib.inference.answer import Answer
 from factorlib.inference.blocks import Block
-from factorlib.inference.gauge import LEAST_ENERGY, connected_components, is_free
+from factorlib.inference.gauge import LEAST_ENERGY, connected_components, has_free_factor
 from factorlib.inference.materials import ROUGHNESS, Materials, Point
 from factorlib.inference.observed import PhotoObservations
 from factorlib.inference.problem import JointProblem
 
-FEW = 40  # observations: a few for each of 7 unknowns of a material and some lobes of 6
-FLAT_DEG = 15.0  # mirror directions within this angle of their mean show one patch of the light
+FEW_OBSERVATIONS = 40  # observations: a few for each of 7 unknowns of a material and some lobes of 6
+LEAST_SPREAD_DEG = 15.0  # mirror directions within this angle of their mean show one patch of the light
 CLIPPED = 0.5  # share of clipped channel values
 ROUGHNESS_ERROR = 0.1  # largest standard error that still separates dull from glossy
 SHARE_ERROR = 0.25  # largest standard error, as a share of a material's diffuse + specular reflectance
-DARK = 0.1  # largest bound on reflectance that still means 'dark'
+DARK_BOUND = 0.1  # largest bound on reflectance that still means 'dark'
 # Largest mean |log R/G| or |log B/G|: three standard deviations of the colour of one light (docs/light-prior.md).
-TINTED = 0.6
+LARGEST_TINT = 0.6
 EXPOSURE_DIFFERS = 1.5  # largest factor between estimated and EXIF exposure without a warning
 OUTLIER = 3.0  # residual in σ of the noise model
 OUTLIERS = 0.1  # largest share of such residuals without a warning
@@ -59,7 +59,7 @@ def before_solving(names: Sequence[str], photos: Sequence[str], problem: JointPr
     dark = sorted(set(photos) - {photo for block in blocks for photo in block.photos})
     said += [f"photo '{photo}' has no valid observation and gets no light" for photo in dark]
     linked = [component for component in connected_components(blocks, len(names)) if component.illuminations]
-    if len(linked) > 1 and any(known.factors(*component) for component in linked):
+    if len(linked) > 1 and any(known.free_factors(*component) for component in linked):
         pairs = ((", ".join(lights), ", ".join(names[m] for m in members)) for members, lights in linked)
         groups = "; ".join(f"{lights} (with {materials})" for lights, materials in pairs)
         said.append(
@@ -81,9 +81,9 @@ def undetermined_by_observations(names: Sequence[str], problem: JointProblem) ->
     said = [f"illumination '{name}' is black in every photo: it tells nothing" for name in black]
     for m, name in enumerate(names):
         shown = [block.take(block.material == m) for block in blocks if (block.material == m).any()]
-        said += _of_material(name, shown) if shown and m not in known.materials else []
+        said += _material_warnings(name, shown) if shown and m not in known.materials else []
     for members, lights in connected_components(blocks, len(names)):
-        if len(members) == 1 and lights and known.factors(members, lights) == 3:
+        if len(members) == 1 and lights and known.free_factors(members, lights) == 3:
             alone = (
                 ", and a smooth material in a soft light looks like a rough one in a sharp light. "
                 "A photo of it in other light"
@@ -96,15 +96,15 @@ def undetermined_by_observations(names: Sequence[str], problem: JointProblem) ->
     return said
 
 
-def _of_material(name: str, shown: Sequence[Block]) -> Iterator[str]:
+def _material_warnings(name: str, shown: Sequence[Block]) -> Iterator[str]:
     """Yield sentences about one material from its observations in each light."""
     count = sum(map(len, shown))
-    if count < FEW:
+    if count < FEW_OBSERVATIONS:
         yield (
-            f"material '{name}' has {count} observation(s), fewer than {FEW}: its reflectance is uncertain, and its "
-            "roughness more so. A photo from nearer would help"
+            f"material '{name}' has {count} observation(s), fewer than {FEW_OBSERVATIONS}: its reflectance is "
+            "uncertain, and its roughness more so. A photo from nearer would help"
         )
-    if all(_spread(block) < FLAT_DEG for block in shown):
+    if all(_spread(block) < LEAST_SPREAD_DEG for block in shown):
         yield (
             f"material '{name}' is flat: in every light it mirrors one direction only, so its roughness and what of "
             "it is specular cannot be determined. A photo of a curved part, or several of it turned in a light that "
@@ -127,7 +127,7 @@ def _spread(block: Block) -> float:
 
 def after_solving(answer: Answer) -> list[str]:
     """Return sentences about quantities that the answer leaves open or explains badly."""
-    problem = answer.solution.shown(answer.problem)
+    problem = answer.solution.effective_problem(answer.problem)
     point = answer.solution.point
     return [
         *undetermined_by_answer(answer.names, problem, point.materials, answer.errors.materials),
@@ -151,15 +151,15 @@ def undetermined_by_answer(
         errors: Their standard errors.
     """
     seen = sorted({int(m) for block in problem.blocks for m in np.unique(block.material)})
-    return [sentence for m in seen for sentence in _of_answer(names[m], found.rows()[m], errors.rows()[m])]
+    return [sentence for m in seen for sentence in _error_warnings(names[m], found.rows()[m], errors.rows()[m])]
 
 
-def _of_answer(name: str, found: Float[np.ndarray, "7"], error: Float[np.ndarray, "7"]) -> Iterator[str]:
+def _error_warnings(name: str, found: Float[np.ndarray, "7"], error: Float[np.ndarray, "7"]) -> Iterator[str]:
     """Yield sentences about one material from its estimate and standard errors, both (k_d, k_s, roughness)."""
     whole = (found[:3] + found[3:6]).max()
     largest = error[:6].max()
     specular = found[3:6]
-    if whole < largest <= DARK:
+    if whole < largest <= DARK_BOUND:
         yield (
             f"material '{name}' is so dark that of its reflectance only a bound, about {whole + 2 * largest:.2g}, "
             "can be given. A photo of longer exposure would help"
@@ -200,7 +200,7 @@ def poorly_explained(problem: JointProblem, radiance: Sequence[Float[np.ndarray,
 def unlikely_curves(problem: JointProblem, point: Point) -> Iterator[str]:
     """Yield a sentence for each light whose tone curves end near the bounds of real cameras."""
     for block, light in zip(problem.blocks, point.lights, strict=True):
-        if light.beyond_cameras:
+        if light.implausible_tone:
             exponents = ", ".join(f"{g:.2g}" for g in np.exp(light.log_tone))
             yield (
                 f"the tone curves of illumination '{block.name}' have exponents of {exponents}, more than a camera "
@@ -217,12 +217,16 @@ def tinted_alike(problem: JointProblem, point: Point) -> Iterator[str]:
     """
     blocks = problem.blocks
     for members, illuminations in connected_components(blocks, len(point.materials)):
-        if not illuminations or problem.known.factors(members, illuminations) < 3 or is_free(blocks, illuminations):
+        if (
+            not illuminations
+            or problem.known.free_factors(members, illuminations) < 3
+            or has_free_factor(blocks, illuminations)
+        ):
             continue
         pairs = zip(blocks, point.lights, strict=True)
         sums = np.array([light.energy.sum(0) for block, light in pairs if block.name in illuminations])
         level = np.log(np.maximum(sums, LEAST_ENERGY * sums.max(1, keepdims=True))).mean(0)
-        if np.abs(level - level[1]).max() > TINTED:
+        if np.abs(level - level[1]).max() > LARGEST_TINT:
             colour = " : ".join(f"{c:.2g}" for c in np.exp(level - level.mean()))
             yield (
                 f"the lights of {', '.join(illuminations)} are R : G : B = {colour} on average, as interreflection "
@@ -235,7 +239,7 @@ def _brighter_than_white(answer: Answer) -> Iterator[str]:
     """Yield a sentence for each material brighter than white beside known ones."""
     found = answer.solution.point.materials
     for name, whole in zip(answer.names, (found.diffuse.max(1) + found.specular.max(1)).tolist(), strict=True):
-        if whole > 1 and not answer.problem.known.nothing:
+        if whole > 1 and not answer.problem.known.is_empty:
             yield (
                 f"material '{name}' comes out with diffuse + specular = {whole:.2f} beside what is known, more than "
                 "falls on it: are the known reflectances right, and of materials that the same light falls on?"
@@ -244,7 +248,7 @@ def _brighter_than_white(answer: Answer) -> Iterator[str]:
 
 def _exposures_unlike_exif(answer: Answer) -> Iterator[str]:
     """Yield a sentence for each photo whose estimated exposure differs from its EXIF."""
-    for photo, factor in answer.found_exposures().items():
+    for photo, factor in answer.estimated_exposures().items():
         by_exif = answer.relative[photo]
         if by_exif != 1 and abs(np.log(factor)) > np.log(EXPOSURE_DIFFERS):
             yield (

@@ -5,9 +5,9 @@
 
 B_ik is the radiance of the surface that hides direction k from observation i.  It is taken from the photo itself: the
 mean radiance of the observations of that material whose normals lie in that bin.  Few observations give an uncertain
-mean.  It is therefore shrunk, with the weight of `PSEUDO` observations, toward the mean of the whole material with
-weights exp(NEARNESS n·b).  A bin without observations gets the radiance of the nearest normals.  An unknown surface, or
-a material that the photo does not show, sends the photo's mean radiance.
+mean.  It is therefore shrunk, with the weight of `PSEUDO_COUNT` observations, toward the mean of the whole material
+with weights exp(NEARNESS n·b).  A bin without observations gets the radiance of the nearest normals.  An unknown
+surface, or a material that the photo does not show, sends the photo's mean radiance.
 
 B contains all bounces and is known, so G does not depend on materials or lights.  The model assumes that surfaces send
 the same radiance toward the camera and toward each other.  Absolute reflectances become observable, because G does not
@@ -28,10 +28,12 @@ from factorlib.light.visibility import cosine_weights, widest_sharpness
 from factorlib.reflection.brdf import specular
 from factorlib.urm.observations import Observations
 
-ROUGHNESS = 0.35  # roughness of the highlight that reflects hidden surfaces, for all materials; most have a few tenths
-PSEUDO = 3.0  # weight of the expected mean, in observations
+HIGHLIGHT_ROUGHNESS = (
+    0.35  # roughness of the highlight that reflects hidden surfaces, for all materials; most have a few tenths
+)
+PSEUDO_COUNT = 3.0  # weight of the expected mean, in observations
 NEARNESS = 4.0  # sharpness of the weights by normal
-ROWS = 1024  # observations whose weights are in memory at once
+CHUNK_ROWS = 1024  # observations whose weights are in memory at once
 
 
 def bounced_light(seen: Observations, radiance: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 6"] | None:
@@ -47,25 +49,25 @@ def bounced_light(seen: Observations, radiance: Float[np.ndarray, "n 3"]) -> Flo
         rows = np.flatnonzero(seen.photo == photo)
         surfaces = radiance_by_code(seen.take(rows), radiance[rows])
         shadowed = rows[hidden[rows]]
-        for some in np.split(shadowed, range(ROWS, len(shadowed), ROWS)):
-            sent[some] = _sent_to(seen.take(some), surfaces)
+        for some in np.split(shadowed, range(CHUNK_ROWS, len(shadowed), CHUNK_ROWS)):
+            sent[some] = _received_from(seen.take(some), surfaces)
     return sent
 
 
 def radiance_by_code(shown: Observations, radiance: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "c+1 3"]:
     """Return B of every code of `Observations.met` in one photo; the last row is the radiance of an unknown surface."""
-    normal = unit(shown.normal)
+    normal = unit_vectors(shown.normal)
     bins = fibonacci_sphere(BINS)
     everything = np.average(radiance, axis=0, weights=shown.weight)
     found = np.tile(everything, (len(shown.materials) * BINS + 1, 1))
     for m in np.unique(shown.material):
         of = shown.material == m
         codes = slice(m * BINS, (m + 1) * BINS)
-        found[codes] = _by_bin(normal[of] @ bins.T, radiance[of], shown.weight[of].astype(float))
+        found[codes] = _mean_by_bin(normal[of] @ bins.T, radiance[of], shown.weight[of].astype(float))
     return found
 
 
-def _by_bin(
+def _mean_by_bin(
     cosine: Float[np.ndarray, "n b"], radiance: Float[np.ndarray, "n 3"], weight: Float[np.ndarray, " n"]
 ) -> Float[np.ndarray, "b 3"]:
     """Return the mean radiance of one material by bin of its normals.
@@ -86,10 +88,10 @@ def _by_bin(
     )
     # mean of the bin, shrunk toward the expected one
     count = np.bincount(own, minlength=bins)[:, None]
-    return (count * mean + PSEUDO * expected) / (count + PSEUDO)
+    return (count * mean + PSEUDO_COUNT * expected) / (count + PSEUDO_COUNT)
 
 
-def _sent_to(seen: Observations, surfaces: Float[np.ndarray, "c+1 3"]) -> Float[np.ndarray, "n 6"]:
+def _received_from(seen: Observations, surfaces: Float[np.ndarray, "c+1 3"]) -> Float[np.ndarray, "n 6"]:
     """Return (1) at observations of one photo.
 
     The highlight is at least as wide as the spacing of the directions, as in `factorlib.light.visibility`.
@@ -100,9 +102,9 @@ def _sent_to(seen: Observations, surfaces: Float[np.ndarray, "c+1 3"]) -> Float[
     count = visibility.shape[1]
     unknown = len(surfaces) - 1
     directions = torch.from_numpy(fibonacci_sphere(count)).float()
-    normal, view = (torch.from_numpy(unit(v)).float() for v in (seen.normal, seen.view))
+    normal, view = (torch.from_numpy(unit_vectors(v)).float() for v in (seen.normal, seen.view))
     hidden = 1 - torch.from_numpy(visibility).float() / 255
-    alpha = torch.tensor(math.sqrt(ROUGHNESS**4 + 1 / widest_sharpness(count)))
+    alpha = torch.tensor(math.sqrt(HIGHLIGHT_ROUGHNESS**4 + 1 / widest_sharpness(count)))
     # GGX reflectance D G1 G1 / (4 n·o), times Ω
     nd = normal @ directions.T
     no = (normal * view).sum(1, keepdim=True)
@@ -115,7 +117,7 @@ def _sent_to(seen: Observations, surfaces: Float[np.ndarray, "c+1 3"]) -> Float[
     return np.column_stack([(weight * sent).sum(1).double().numpy() for weight in weights for sent in by_channel])
 
 
-def unit(vectors: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
+def unit_vectors(vectors: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
     """Return the vectors with length 1, as float64."""
     vectors = vectors.astype(float)
     return vectors / np.linalg.norm(vectors, axis=1, keepdims=True)

@@ -9,7 +9,7 @@ splitting   The cells with most of each light's energy split in four while held-
 lights      Given the materials, lights are fitted to observations of any confidence.
 suns        Each light is compared with one that has a sun in place of its brightest cells (`factorlib.inference.suns`).
 
-Every step is a function of the previous state, and `Run` saves each state (`factorlib.inference.resume`).
+Every step is a function of the previous state, and `FitRunner` saves each state (`factorlib.inference.resume`).
 """
 
 from __future__ import annotations
@@ -19,39 +19,39 @@ from collections.abc import Callable
 import msgspec
 import numpy as np
 
-from factorlib.inference.evidence import FINER, compare, losses_of
-from factorlib.inference.fit import Fit, Schedule, sure_ones
-from factorlib.inference.gauge import in_gauge
+from factorlib.inference.evidence import WEAKLY_FOR, compare_models, held_out_losses
+from factorlib.inference.fit import Fit, FitSchedule, reliable_observations
+from factorlib.inference.gauge import fix_gauge
 from factorlib.inference.history import Solution
 from factorlib.inference.materials import Point
 from factorlib.inference.model_selection import (
-    MUCH,
+    LARGE_GAIN,
+    LEAST_GAIN,
     TRIAL_CELLS,
-    WORTH,
-    Chosen,
-    curves_chosen,
-    distances_chosen,
-    effects_chosen,
-    gained,
-    observations_of,
-    observations_of_lights,
+    Selection,
+    gain_exceeds,
+    light_observation_count,
+    observation_count,
+    select_distances,
+    select_effects,
+    select_tone_curves,
 )
-from factorlib.inference.options import Choices
+from factorlib.inference.options import SolveOptions
 from factorlib.inference.problem import JointProblem
-from factorlib.inference.resume import Run
-from factorlib.inference.start import Start, on_cells, with_known
-from factorlib.inference.suns import suns_chosen
+from factorlib.inference.resume import FitRunner
+from factorlib.inference.start import Start, insert_known, refine_cells
+from factorlib.inference.suns import select_suns
 from factorlib.results.materials import Decision
 
-MATERIALS = Schedule(lights=2, together=(5, 4))
-AFTER_SPLITTING = Schedule(lights=2, together=(3, 2), estimate=False)
-LIGHTS = Schedule(together=(0, 2, 2), least=0.1, given=True)
-SPLIT = 24  # number of a light's cells that split at once
+MATERIALS = FitSchedule(lights=2, together=(5, 4))
+AFTER_SPLITTING = FitSchedule(lights=2, together=(3, 2), estimate=False)
+LIGHTS = FitSchedule(together=(0, 2, 2), least=0.1, given=True)
+SPLIT_CELLS = 24  # number of a light's cells that split at once
 # Least distance between cells, degrees: the sun's width.  A cell splits only if its neighbours are twice as far.
-SMALLEST = 0.5
+LEAST_SPACING_DEG = 0.5
 
 
-class Asked(msgspec.Struct, frozen=True):
+class SolveRequest(msgspec.Struct, frozen=True):
     """Question that a solve answers.
 
     Attributes:
@@ -63,20 +63,20 @@ class Asked(msgspec.Struct, frozen=True):
 
     problem: JointProblem
     start: Start
-    choices: Choices
-    run: Run
+    options: SolveOptions
+    run: FitRunner
 
-    def sure(self, state: State) -> JointProblem:
+    def reliable_problem(self, state: SolveState) -> JointProblem:
         """Return the observations with reliable normals, under the chosen effects."""
-        return sure_ones(self.problem).with_effects(state.shadows.kept, state.bounces.kept)
+        return reliable_observations(self.problem).with_effects(state.shadows.kept, state.bounces.kept)
 
-    def all_(self, state: State) -> JointProblem:
+    def light_problem(self, state: SolveState) -> JointProblem:
         """Return the observations of any confidence that lights are fitted to, under the chosen effects."""
         problem = self.problem.with_effects(state.shadows.kept, state.bounces.kept)
-        return problem.sampled(observations_of_lights(self.choices, state.splitting), self.choices.seed)
+        return problem.subsample(light_observation_count(self.options, state.splitting), self.options.seed)
 
 
-class State(msgspec.Struct, frozen=True):
+class SolveState(msgspec.Struct, frozen=True):
     """State of a solve after some of its steps.
 
     Attributes:
@@ -99,12 +99,14 @@ class State(msgspec.Struct, frozen=True):
     splitting: list[Decision] = []
     suns: list[Decision] = []
 
-    def after(self, fit: Fit, **decided: Decision | list[Decision]) -> State:
+    def with_fit(self, fit: Fit, **decided: Decision | list[Decision]) -> SolveState:
         """Return the state after a step that fitted materials and lights."""
         return msgspec.structs.replace(self, fit=fit, materials=fit, **decided)
 
 
-def solve(problem: JointProblem, start: Start, choices: Choices = Choices(), run: Run | None = None) -> Solution:
+def solve(
+    problem: JointProblem, start: Start, choices: SolveOptions = SolveOptions(), run: FitRunner | None = None
+) -> Solution:
     """Solve the problem and return the answer, in the gauge of `factorlib.inference.gauge`.
 
     Args:
@@ -113,13 +115,13 @@ def solve(problem: JointProblem, start: Start, choices: Choices = Choices(), run
         choices: Options of the user.
         run: Runner that saves states and reports events; None for one without a file.
     """
-    run = run or Run()
-    asked = Asked(problem, start, choices, run)
-    begun = beginnings(asked)[0]
-    state = run.completed(STEPS, asked, State(begun, begun))
-    answer = in_gauge(state.fit.point, problem.blocks, problem.known)
+    run = run or FitRunner()
+    asked = SolveRequest(problem, start, choices, run)
+    begun = initial_fits(asked)[0]
+    state = run.run_steps(STEPS, asked, SolveState(begun, begun))
+    answer = fix_gauge(state.fit.point, problem.blocks, problem.known)
     return Solution(
-        Point(problem.known.put(answer.materials), answer.lights),
+        Point(problem.known.insert_into(answer.materials), answer.lights),
         run.history,
         materials=state.materials,
         lights=state.fit,
@@ -132,57 +134,59 @@ def solve(problem: JointProblem, start: Start, choices: Choices = Choices(), run
     )
 
 
-def beginnings(asked: Asked) -> list[Fit]:
+def initial_fits(asked: SolveRequest) -> list[Fit]:
     """Return the initial fits of the first trial, of which the best one continues."""
-    sure = sure_ones(asked.problem)
-    cells = min(TRIAL_CELLS, asked.choices.cells)
+    sure = reliable_observations(asked.problem)
+    cells = min(TRIAL_CELLS, asked.options.cells)
     begun = asked.start(sure, cells)
-    return [msgspec.structs.replace(fit, point=with_known(fit.point, sure)) for fit in begun]
+    return [msgspec.structs.replace(fit, point=insert_known(fit.point, sure)) for fit in begun]
 
 
-def choose_effects(asked: Asked, state: State) -> State:
+def choose_effects(asked: SolveRequest, state: SolveState) -> SolveState:
     """Choose shadows and interreflection."""
-    chosen = effects_chosen(sure_ones(asked.problem), beginnings(asked), asked.choices, asked.run.fit)
-    return state.after(chosen.fit, shadows=chosen.shadows, bounces=chosen.bounces)
+    chosen = select_effects(reliable_observations(asked.problem), initial_fits(asked), asked.options, asked.run.fit)
+    return state.with_fit(chosen.fit, shadows=chosen.shadows, bounces=chosen.bounces)
 
 
-def choose_tone(asked: Asked, state: State) -> State:
+def choose_tone(asked: SolveRequest, state: SolveState) -> SolveState:
     """Choose tone curves."""
-    chosen = curves_chosen(asked.sure(state), state.fit, asked.choices, asked.run.fit)
-    return state.after(chosen.fit, tone=chosen.evidence)
+    chosen = select_tone_curves(asked.reliable_problem(state), state.fit, asked.options, asked.run.fit)
+    return state.with_fit(chosen.fit, tone=chosen.evidence)
 
 
-def choose_distances(asked: Asked, state: State) -> State:
+def choose_distances(asked: SolveRequest, state: SolveState) -> SolveState:
     """Choose distances of lights."""
-    chosen = distances_chosen(asked.sure(state), state.fit, asked.choices, asked.run.fit)
-    return state.after(chosen.fit, distances=chosen.evidence)
+    chosen = select_distances(asked.reliable_problem(state), state.fit, asked.options, asked.run.fit)
+    return state.with_fit(chosen.fit, distances=chosen.evidence)
 
 
-def fit_materials(asked: Asked, state: State) -> State:
+def fit_materials(asked: SolveRequest, state: SolveState) -> SolveState:
     """Fit materials and lights on all cells."""
-    some = asked.sure(state).sampled(asked.choices.observations, asked.choices.seed)
-    begun = on_cells(state.fit, asked.choices.cells, some)
-    return state.after(asked.run.judged("materials and lights", some, begun, MATERIALS))
+    some = asked.reliable_problem(state).subsample(asked.options.observations, asked.options.seed)
+    begun = refine_cells(state.fit, asked.options.cells, some)
+    return state.with_fit(asked.run.fit_and_report("materials and lights", some, begun, MATERIALS))
 
 
-def split_cells(asked: Asked, state: State) -> State:
+def split_cells(asked: SolveRequest, state: SolveState) -> SolveState:
     """Split the cells with most energy while held-out observations gain."""
-    chosen = split_while_gaining(asked.sure(state), state.fit, asked.choices, asked.run)
-    return state.after(chosen.fit, splitting=chosen.evidence)
+    chosen = split_while_gaining(asked.reliable_problem(state), state.fit, asked.options, asked.run)
+    return state.with_fit(chosen.fit, splitting=chosen.evidence)
 
 
-def fit_lights(asked: Asked, state: State) -> State:
+def fit_lights(asked: SolveRequest, state: SolveState) -> SolveState:
     """Fit lights to observations of any confidence, materials given."""
-    return msgspec.structs.replace(state, fit=asked.run.judged("lights", asked.all_(state), state.fit, LIGHTS))
+    return msgspec.structs.replace(
+        state, fit=asked.run.fit_and_report("lights", asked.light_problem(state), state.fit, LIGHTS)
+    )
 
 
-def choose_suns(asked: Asked, state: State) -> State:
+def choose_suns(asked: SolveRequest, state: SolveState) -> SolveState:
     """Choose suns, materials given."""
-    chosen = suns_chosen(asked.all_(state), state.fit, asked.run)
+    chosen = select_suns(asked.light_problem(state), state.fit, asked.run)
     return msgspec.structs.replace(state, fit=chosen.fit, suns=chosen.evidence)
 
 
-STEPS: dict[str, Callable[[Asked, State], State]] = {
+STEPS: dict[str, Callable[[SolveRequest, SolveState], SolveState]] = {
     "effects": choose_effects,
     "tone": choose_tone,
     "distances": choose_distances,
@@ -193,7 +197,7 @@ STEPS: dict[str, Callable[[Asked, State], State]] = {
 }
 
 
-def split_while_gaining(problem: JointProblem, fit: Fit, choices: Choices, run: Run) -> Chosen:
+def split_while_gaining(problem: JointProblem, fit: Fit, choices: SolveOptions, run: FitRunner) -> Selection:
     """Split cells at most `Choices.splittings` times.
 
     A splitting is undone, and the last, unless it explains held-out observations better by more than FINER standard
@@ -206,23 +210,26 @@ def split_while_gaining(problem: JointProblem, fit: Fit, choices: Choices, run: 
         choices: Options of the user.
         run: Runner of the fits.
     """
-    some = problem.sampled(choices.observations, choices.seed)
+    some = problem.subsample(choices.observations, choices.seed)
     evidence = []
-    before = losses_of(some, fit.point)
+    before = held_out_losses(some, fit.point)
     for number in range(0 if problem.none_held_out else choices.splittings):
         phase = f"splitting {number + 1}"
-        smallest = 2 * np.radians(SMALLEST)
-        lights = [one if one.held.any() else one.split(one.brightest(SPLIT, smallest)) for one in fit.point.lights]
-        trial = run.judged(phase, some, fit.with_lights(lights), AFTER_SPLITTING)
-        after = losses_of(some, trial.point)
-        evidence.append(one := compare(before, after, FINER))
+        smallest = 2 * np.radians(LEAST_SPACING_DEG)
+        lights = [
+            one if one.fixed.any() else one.split(one.brightest_cells(SPLIT_CELLS, smallest))
+            for one in fit.point.lights
+        ]
+        trial = run.fit_and_report(phase, some, fit.with_lights(lights), AFTER_SPLITTING)
+        after = held_out_losses(some, trial.point)
+        evidence.append(one := compare_models(before, after, WEAKLY_FOR))
         if one.kept:
             fit = trial
             before = after
-        if not gained(one, WORTH):
+        if not gain_exceeds(one, LEAST_GAIN):
             break
-        if number == 0 and gained(one, MUCH):
-            some = problem.sampled(observations_of(choices, evidence), choices.seed)
-            fit = run.judged(phase, some, fit, AFTER_SPLITTING)
-            before = losses_of(some, fit.point)
-    return Chosen(fit, evidence)
+        if number == 0 and gain_exceeds(one, LARGE_GAIN):
+            some = problem.subsample(observation_count(choices, evidence), choices.seed)
+            fit = run.fit_and_report(phase, some, fit, AFTER_SPLITTING)
+            before = held_out_losses(some, fit.point)
+    return Selection(fit, evidence)

@@ -21,7 +21,7 @@ are known exactly.  With Σ = H⁻¹
 
 The second acts on materials through the light that they imply, du/dθ = −L⁻¹Cᵀ (`factorlib.inference.arrow`).  Without
 it, all reflectances would fall: a brighter light under darker materials has the same J.  The Gauss–Newton Hessian of
-the first, Σ_i ∂J_i Σ ∂J_iᵀ, only steers the steps of a descent.  Every `SPARSE`-th row therefore stands for its
+the first, Σ_i ∂J_i Σ ∂J_iᵀ, only steers the steps of a descent.  Every `HESSIAN_STRIDE`-th row therefore stands for its
 neighbours.
 
 Materials enter as log k_d, log k_s (RGB each) and roughness, 7 unknowns θ each.  Exposures and tone exponents belong to
@@ -46,12 +46,12 @@ from factorlib.inference.arrow import System
 from factorlib.inference.forward import Gradient, Illumination, Linearised
 from factorlib.inference.lights import DARKEST, Light
 from factorlib.inference.materials import Materials
-from factorlib.inference.noise import Loss
+from factorlib.inference.noise import RobustLoss
 from factorlib.light.prior import LightPrior
 
-SPARSE = 8  # one row in so many enters the Hessian of the determinant
-EXPOSURE = 3.0  # standard deviation of a log exposure
-TONE = 0.3  # standard deviation of a log tone exponent
+HESSIAN_STRIDE = 8  # one row in so many enters the Hessian of the determinant
+EXPOSURE_DEVIATION = 3.0  # standard deviation of a log exposure
+TONE_DEVIATION = 0.3  # standard deviation of a log tone exponent
 
 
 class LightLikelihood(msgspec.Struct, frozen=True):
@@ -73,14 +73,14 @@ class LightLikelihood(msgspec.Struct, frozen=True):
     precision: Float[np.ndarray, "3p 3p"]
     log_determinant: float
     temperature: float
-    loss: Loss
+    loss: RobustLoss
 
     @property
     def light(self) -> Light:
         """Light of this likelihood."""
         return self.illumination.light
 
-    def at(self, light: Light | None = None, materials: Materials | None = None) -> LightLikelihood:
+    def with_point(self, light: Light | None = None, materials: Materials | None = None) -> LightLikelihood:
         """Return the same likelihood at another light or other materials, with the same table."""
         one = self.illumination
         moved = msgspec.structs.replace(one, light=light or one.light, materials=materials or one.materials)
@@ -100,7 +100,7 @@ class LightLikelihood(msgspec.Struct, frozen=True):
             clusters: Number of each observation's cluster, from 0, for `System.scores`.
         """
         one = self.illumination
-        shown = one.shown()
+        shown = one.predict()
         p = int(one.light.free.sum())
         places = (7 * np.unique(one.block.material)[:, None] + np.arange(7)).reshape(-1)
         k = len(places)
@@ -117,7 +117,7 @@ class LightLikelihood(msgspec.Struct, frozen=True):
             own = slice(part.channel * p, (part.channel + 1) * p)
             at = np.searchsorted(places, part.places)
             J = part.diffuse + part.specular
-            L[own, own] += gram(J)
+            L[own, own] += gram_matrix(J)
             g_l[own] += J.T @ part.residual
             M[np.ix_(at, at)] += part.by_material.T @ part.by_material
             g_m[at] += part.by_material.T @ part.residual
@@ -129,13 +129,13 @@ class LightLikelihood(msgspec.Struct, frozen=True):
                 towards = part.by_photo.T @ J
                 L[photos, own] += towards
                 L[own, photos] += towards.T
-        loss = float(self.loss.of_residuals(one.block.residuals(shown.radiance))[~one.block.held_out].sum())
-        factor = factorised(L)
+        loss = float(self.loss.evaluate(one.block.residuals(shown.radiance))[~one.block.held_out].sum())
+        factor = cholesky_factor(L)
         determinant = (np.zeros(k), np.zeros((k, k)), np.zeros(size))
         value += loss / self.temperature
         if not materials_given:
             value += self._determinants(factor)
-            determinant = _of_determinants(parts, inverse_of(factor[: 3 * p, : 3 * p]), places, size)
+            determinant = _determinant_derivatives(parts, cholesky_inverse(factor[: 3 * p, : 3 * p]), places, size)
         scores = None if clusters is None else _scores(parts, clusters, places, size)
         return System(value, loss, places, g_m, M, g_l, C, L, factor, *determinant, scores)
 
@@ -152,7 +152,7 @@ class LightLikelihood(msgspec.Struct, frozen=True):
         """Return uᵀQu plus the Gaussian priors of exposures and tones, and half the gradient."""
         light = self.light
         u = (np.log(np.maximum(light.weight.T, DARKEST)) - self.log_peaks).reshape(-1)
-        others, width = self._others()
+        others, width = self._photo_unknowns()
         slope = self.precision @ u
         free = np.tile(light.free, 3)
         gradient = [slope[free], others / width**2]
@@ -165,7 +165,7 @@ class LightLikelihood(msgspec.Struct, frozen=True):
         light = self.light
         Q = self.precision
         free = np.tile(light.free, 3)
-        _, width = self._others()
+        _, width = self._photo_unknowns()
         p = int(free.sum())
         hessian = np.zeros((light.unknowns, light.unknowns))
         hessian[:p, :p] = Q if free.all() else Q[np.ix_(free, free)]
@@ -176,11 +176,13 @@ class LightLikelihood(msgspec.Struct, frozen=True):
             hessian[-1, -1] = together[~free].sum()
         return hessian
 
-    def _others(self) -> tuple[Float[np.ndarray, " q"], Float[np.ndarray, " q"]]:
+    def _photo_unknowns(self) -> tuple[Float[np.ndarray, " q"], Float[np.ndarray, " q"]]:
         """Return the free log exposures and log tone exponents, and their standard deviations."""
         light = self.light
         others = [light.log_exposure[len(light.log_exposure) - light.free_exposures :], light.log_tone]
-        return np.concatenate(others), np.repeat([EXPOSURE, TONE], [light.free_exposures, len(light.log_tone)])
+        return np.concatenate(others), np.repeat(
+            [EXPOSURE_DEVIATION, TONE_DEVIATION], [light.free_exposures, len(light.log_tone)]
+        )
 
 
 def _scores(
@@ -206,7 +208,7 @@ def _scores(
     return scores
 
 
-def _of_determinants(
+def _determinant_derivatives(
     parts: Sequence[Linearised], covariance: Float[np.ndarray, "3p 3p"], places: Int[np.ndarray, " k"], size: int
 ) -> tuple[Float[np.ndarray, " k"], Float[np.ndarray, "k k"], Float[np.ndarray, " l"]]:
     """Return (2) summed over channels and materials: the first part, its Hessian, and the second part.
@@ -225,14 +227,14 @@ def _of_determinants(
     for part in parts:
         own = slice(part.channel * p, (part.channel + 1) * p)
         at = np.searchsorted(places, part.places)
-        gradient, hessian, by_cells = _of_determinant(part, covariance[own, own].astype(np.float32))
+        gradient, hessian, by_cells = _channel_determinant(part, covariance[own, own].astype(np.float32))
         by_materials[at] += gradient
         by_materials_twice[np.ix_(at, at)] += hessian
         by_light[own] += by_cells
     return by_materials, by_materials_twice, by_light
 
 
-def _of_determinant(
+def _channel_determinant(
     part: Linearised, covariance: Float[np.ndarray, "p p"]
 ) -> tuple[list[float], Float[np.ndarray, "3 3"], Float[np.ndarray, " p"]]:
     """Return (2) of one channel of one material: the first part, its Hessian, and the second part.
@@ -243,19 +245,19 @@ def _of_determinant(
     slopes = (part.diffuse, part.specular, part.by_roughness)
     J = part.diffuse + part.specular
     spread = J @ covariance
-    few = [slope[::SPARSE] for slope in slopes]
+    few = [slope[::HESSIAN_STRIDE] for slope in slopes]
     many = len(spread) / max(len(few[0]), 1)
     hessian = np.array([[float(np.vdot(a @ covariance, b)) for b in few] for a in few])
     return [float(np.vdot(spread, slope)) for slope in slopes], many * hessian, (spread * J).sum(0)
 
 
-def gram(J: Float[np.ndarray, "n p"]) -> Float[np.ndarray, "p p"]:
+def gram_matrix(J: Float[np.ndarray, "n p"]) -> Float[np.ndarray, "p p"]:
     """Return JᵀJ; BLAS computes one triangle of it."""
     lower = ssyrk(1.0, J.T, lower=1)
     return lower + np.tril(lower, -1).T
 
 
-def factorised(matrix: Float[np.ndarray, "n n"]) -> Float[np.ndarray, "n n"]:
+def cholesky_factor(matrix: Float[np.ndarray, "n n"]) -> Float[np.ndarray, "n n"]:
     """Return the lower Cholesky factor of a symmetric positive definite matrix.
 
     Raises:
@@ -269,7 +271,7 @@ def factorised(matrix: Float[np.ndarray, "n n"]) -> Float[np.ndarray, "n n"]:
     return factor
 
 
-def inverse_of(factor: Float[np.ndarray, "n n"]) -> Float[np.ndarray, "n n"]:
+def cholesky_inverse(factor: Float[np.ndarray, "n n"]) -> Float[np.ndarray, "n n"]:
     """Return the inverse of the matrix whose lower Cholesky factor is given, exactly symmetric.
 
     >>> inverse_of(factorised(np.array([[4.0, 0.0], [0.0, 0.25]]))).tolist()

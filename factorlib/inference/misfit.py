@@ -23,12 +23,14 @@ from factorlib.inference.problem import JointProblem
 from factorlib.results.materials import Misfit
 
 REGION = 0.3  # side of the cells of mirror directions, about 17°
-SURE = 0.3  # least confidence of a normal, exclusive
-LEAST = 4  # least number of observations in a group
-MOST = 3.0  # upper limit of an unexplained share
+LEAST_CONFIDENCE = 0.3  # least confidence of a normal, exclusive
+LEAST_GROUP = 4  # least number of observations in a group
+LARGEST_SHARE = 3.0  # upper limit of an unexplained share
 
 
-def misfit(problem: JointProblem, radiance: Sequence[Float[np.ndarray, "n 3"]]) -> tuple[float, dict[str, Misfit]]:
+def unexplained_shares(
+    problem: JointProblem, radiance: Sequence[Float[np.ndarray, "n 3"]]
+) -> tuple[float, dict[str, Misfit]]:
     """Return the unexplained share of the whole set, and unexplained and clipped shares by photo."""
     energies = {}
     clipped = {}
@@ -45,7 +47,7 @@ def _energies(
     block: Block, shown: Float[np.ndarray, "n 3"], own: Bool[np.ndarray, " n"]
 ) -> Iterator[tuple[float, float]]:
     """Yield E(r) and E(v) of each material in a photo."""
-    sure = own & ~block.clipped.any(1) & (True if block.confidence is None else block.confidence > SURE)
+    sure = own & ~block.clipped.any(1) & (True if block.confidence is None else block.confidence > LEAST_CONFIDENCE)
     for material in np.unique(block.material[sure]):
         rows = sure & (block.material == material)
         mean = np.maximum(block.radiance[rows].mean(0), 1e-12)
@@ -54,11 +56,11 @@ def _energies(
         )
         left = (block.radiance[rows] - shown[rows]) / mean
         whole = block.radiance[rows] / mean - 1
-        yield energy(left, group), energy(whole, group)
+        yield correlated_energy(left, group), correlated_energy(whole, group)
 
 
-def energy(values: Float[np.ndarray, "n 3"], group: Int[np.ndarray, " n"]) -> float:
-    """Return E of (1); groups of fewer than `LEAST` observations are left out.
+def correlated_energy(values: Float[np.ndarray, "n 3"], group: Int[np.ndarray, " n"]) -> float:
+    """Return E of (1); groups of fewer than `LEAST_GROUP` observations are left out.
 
     >>> alike, noise = np.full((8, 3), 0.1), np.tile([[0.1], [-0.1]], (4, 3))
     >>> round(energy(alike, np.zeros(8, int)), 9), energy(noise, np.zeros(8, int))
@@ -70,10 +72,10 @@ def energy(values: Float[np.ndarray, "n 3"], group: Int[np.ndarray, " n"]) -> fl
         # mean and s² of each group, then n max(mean² − s²/n, 0)
         mean = np.bincount(group, of) / count
         variance = np.bincount(group, (of - mean[group]) ** 2) / np.maximum(count - 1, 1)
-        total += float(np.sum((count * np.maximum(mean**2 - variance / count, 0))[count >= LEAST]))
+        total += float(np.sum((count * np.maximum(mean**2 - variance / count, 0))[count >= LEAST_GROUP]))
     return total
 
 
 def _share(left: float, whole: float) -> float:
-    """Return the ratio of two energies, at most `MOST`, rounded to nine digits."""
-    return round(float(min(left / max(whole, 1e-12), MOST)), 9) if left > 0 else 0.0
+    """Return the ratio of two energies, at most `LARGEST_SHARE`, rounded to nine digits."""
+    return round(float(min(left / max(whole, 1e-12), LARGEST_SHARE)), 9) if left > 0 else 0.0

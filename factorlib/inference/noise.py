@@ -36,7 +36,7 @@ class Noise(msgspec.Struct, frozen=True):
         return np.sqrt(limited)[:, None] / self.sigma(radiance)
 
 
-class Loss(msgspec.Struct, frozen=True):
+class RobustLoss(msgspec.Struct, frozen=True):
     """Pseudo-Huber loss, Σ 2k² (√(1 + r²/k²) − 1) of whitened residuals r.
 
     It bounds the influence of wrong normals and mask borders.
@@ -47,10 +47,10 @@ class Loss(msgspec.Struct, frozen=True):
 
     robust_scale: float = 10.0
 
-    def of_residuals(self, residual: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
+    def evaluate(self, residual: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
         """Return the loss of each whitened residual."""
         return 2 * self.robust_scale**2 * (np.sqrt(1 + (residual / self.robust_scale) ** 2) - 1)
 
-    def trust(self, residual: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
+    def weights(self, residual: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
         """Return weights in ]0, 1] of the squared residuals, for least-squares steps of this loss."""
         return 1 / np.sqrt(1 + (residual / self.robust_scale) ** 2)

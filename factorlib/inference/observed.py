@@ -43,7 +43,7 @@ class PhotoObservations(msgspec.Struct, frozen=True):
     unusable: int
 
 
-def gathered(
+def gather_observations(
     files: Sequence[Path],
     degrees: float,
     spread: Spread,
@@ -63,7 +63,7 @@ def gathered(
     def merged(path: Path) -> PhotoObservations:
         """Return the usable observations of one file, merged."""
         read = on_surface(read_observations(path), surface)
-        seen = usable(read)
+        seen = usable_observations(read)
         tick()
         return PhotoObservations(merge(seen, degrees), len(read), len(read) - len(seen))
 
@@ -90,7 +90,7 @@ def blocks_of_observations(
     Raises:
         InputError: If no usable observation is left, or all are black.
     """
-    seen = usable(observations)
+    seen = usable_observations(observations)
     if len(seen) == 0:
         raise InputError(
             "no valid observation in any photo", cure="look at the overlays of `align`: masks and meshes must overlap"
@@ -106,7 +106,7 @@ def blocks_of_observations(
     return sorted(blocks, key=lambda block: block.name)
 
 
-def usable(observations: Observations) -> Observations:
+def usable_observations(observations: Observations) -> Observations:
     """Return the observations with finite radiance, finite and non-zero directions, and finite positive weight."""
     vectors = np.stack([observations.radiance, observations.normal, observations.view])
     directed = (observations.normal != 0).any(1) & (observations.view != 0).any(1)
@@ -128,7 +128,7 @@ def _block(
     seen = seen.take(order)
     local = local[order]
     turned = {photo: np.asarray(of, dtype=float) for photo, of in rotations.items() if of is not None}
-    normal, view = (_in_frame(vectors, seen, turned) for vectors in (seen.normal, seen.view))
+    normal, view = (_rotate_units(vectors, seen, turned) for vectors in (seen.normal, seen.view))
     radiance = seen.radiance.astype(float)
     # radiance in units of the weighted mean
     unit = max(float(np.average(radiance.mean(1), weights=seen.weight)), 1e-30)
@@ -147,20 +147,22 @@ def _block(
         seen.material.astype(np.int64), local, held_out, visibility, directions,
         bounced if bounced is not None and bounced.any() else None, noise,
         None if seen.confidence is None else seen.confidence.astype(float),
-        None if seen.place is None else _turned(seen.place, seen, turned), rows[order],
+        None if seen.place is None else _rotate(seen.place, seen, turned), rows[order],
     )  # fmt: skip
     if seen.detail is None or (seen.detail == 1).all():
         return block
     return block.on_surface(block.normal, seen.detail.astype(float))
 
 
-def _in_frame(vectors: Float[np.ndarray, "n 3"], seen: Observations, rotations: Rotations) -> Float[np.ndarray, "n 3"]:
+def _rotate_units(
+    vectors: Float[np.ndarray, "n 3"], seen: Observations, rotations: Rotations
+) -> Float[np.ndarray, "n 3"]:
     """Return unit vectors in the illumination's frame."""
-    turned = _turned(vectors, seen, rotations)
+    turned = _rotate(vectors, seen, rotations)
     return turned / np.linalg.norm(turned, axis=1, keepdims=True)
 
 
-def _turned(vectors: Float[np.ndarray, "n 3"], seen: Observations, rotations: Rotations) -> Float[np.ndarray, "n 3"]:
+def _rotate(vectors: Float[np.ndarray, "n 3"], seen: Observations, rotations: Rotations) -> Float[np.ndarray, "n 3"]:
     """Return vectors in the illumination's frame: each photo's rotated by its world_from_camera."""
     turned = vectors.astype(float)
     for i, photo in enumerate(seen.photos):

@@ -12,7 +12,7 @@ Bounds       They come from the parametrisation: reflectances and roughness thro
              sigmoid onto `SHARPNESS`, weights through softplus, axes as unnormalised vectors.
 Start        Reflectances come from mean radiances (`start`).  Lobes are white, evenly spread over the sphere, and as
              wide as they are apart.
-Subset       A subset has `SUBSET` observations of all illuminations together.
+Subset       A subset has `SUBSET_SIZE` observations of all illuminations together.
 Curvature    A pair (step, change of gradient) is measured on one subset, at both ends of the step.  The change of
              subset is therefore not mistaken for curvature (Schraudolph, Yu and Günter 2007, "A stochastic quasi-Newton
              method for online convex optimization").  Pairs outlive their subset.
@@ -41,9 +41,9 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from factorlib.geometry.sphere import fibonacci_sphere
-from factorlib.inference.fit import start_of
-from factorlib.inference.gauge import in_gauge
-from factorlib.inference.history import Event, Report, Solution, unreported
+from factorlib.inference.fit import initial_fit
+from factorlib.inference.gauge import fix_gauge
+from factorlib.inference.history import Event, EventReport, Solution, ignore_event
 from factorlib.inference.lights import Light
 from factorlib.inference.materials import ROUGHNESS, SHARPNESS, Materials, Point
 from factorlib.inference.optimizer import inverse_hessian_times
@@ -61,13 +61,13 @@ SUFFICIENT = 1e-4  # least decrease in a line search, as a share of the slope
 HALVINGS = 12  # most halvings of a step
 LOG_SHARPNESS = (math.log(SHARPNESS[0]), math.log(SHARPNESS[1]))
 REPORTS = 20  # reports in a run
-SUBSET = 512  # observations of a subset
+SUBSET_SIZE = 512  # observations of a subset
 
 Samplings = Annotated[float, msgspec.Meta(gt=0)]
 Prior = Annotated[float, msgspec.Meta(ge=0)]
 
 
-class Paper(msgspec.Struct, frozen=True):
+class PaperOptions(msgspec.Struct, frozen=True):
     """Options of the paper's solver.
 
     Attributes:
@@ -83,7 +83,7 @@ class Paper(msgspec.Struct, frozen=True):
     seed: Seed = 0
 
 
-def solve(problem: JointProblem, materials: int, paper: Paper, report: Report = unreported) -> Solution:
+def solve(problem: JointProblem, materials: int, paper: PaperOptions, report: EventReport = ignore_event) -> Solution:
     """Solve the problem as the paper does, in the gauge of `factorlib.inference.gauge`.
 
     The unknowns are those of the joint solver: materials 0 … `materials`−1 and one light per block.
@@ -99,24 +99,24 @@ def solve(problem: JointProblem, materials: int, paper: Paper, report: Report = 
     history = list[Event]()
     blocks = problem.blocks
     rows = [np.flatnonzero(~block.held_out) for block in blocks]
-    iterations = math.ceil(paper.samplings * sum(map(len, rows)) / SUBSET)
+    iterations = math.ceil(paper.samplings * sum(map(len, rows)) / SUBSET_SIZE)
     every = max(1, iterations // REPORTS)
     lobes = paper.lobes * len(blocks)
     x = objective.start()
     random = np.random.default_rng(paper.seed)
     pairs: Pairs = deque(maxlen=MEMORY)
     for iteration in range(iterations):
-        subset = drawn(rows, SUBSET, random)
-        x, value = stepped(partial(objective.at, subset=subset), x, pairs)
+        subset = draw_subset(rows, SUBSET_SIZE, random)
+        x, value = take_step(partial(objective.objective_on, subset=subset), x, pairs)
         if (iteration + 1) % every == 0 or iteration + 1 == iterations:
             held_out = problem.held_out_loss(objective.point(x))
             history.append(Event((iteration + 1) // every - 1, "subset", iteration, value, held_out, lobes))
             report(history[-1])
-    fit = start_of(objective.point(x))
-    return Solution(in_gauge(fit.point, blocks), history, materials=fit, lights=fit)
+    fit = initial_fit(objective.point(x))
+    return Solution(fix_gauge(fit.point, blocks), history, materials=fit, lights=fit)
 
 
-def drawn(
+def draw_subset(
     rows: Sequence[Int[np.ndarray, " _"]], count: int, random: np.random.Generator
 ) -> list[Int[np.ndarray, " _"]]:
     """Return `count` of all rows, drawn without replacement, as a list per block."""
@@ -127,7 +127,7 @@ def drawn(
     ]
 
 
-def stepped(objective: Objective, x: Tensor, pairs: Pairs) -> tuple[Tensor, float]:
+def take_step(objective: Objective, x: Tensor, pairs: Pairs) -> tuple[Tensor, float]:
     """Return x after one step on one subset, and the objective there.
 
     The measured pair is added to `pairs`.  Without a sufficient decrease, x stays and `pairs` is cleared.
@@ -166,18 +166,18 @@ class PaperObjective:
     The vector has 7 entries a material, then for each light 7 a lobe (axis 3, sharpness, weight 3) and its exposures.
     """
 
-    def __init__(self, problem: JointProblem, materials: int, paper: Paper):
+    def __init__(self, problem: JointProblem, materials: int, paper: PaperOptions):
         blocks = problem.blocks
         self.blocks = blocks
         self.operator = problem.operator
-        self.paper = paper
-        self.begin = starting_materials(blocks, materials)
+        self.options = paper
+        self.start_materials = starting_materials(blocks, materials)
         self.sizes = [7 * materials] + [7 * paper.lobes + len(block.photos) - 1 for block in blocks]
 
     def start(self) -> Float[Tensor, " k"]:
         """Return even lobes under which materials reflect the block's mean radiance, 1."""
-        p = self.paper.lobes
-        begin = self.begin
+        p = self.options.lobes
+        begin = self.start_materials
         roughness = _unbounded(begin.roughness, ROUGHNESS)
         parts = [np.column_stack([_unbounded(begin.diffuse), _unbounded(begin.specular), roughness]).reshape(-1)]
         level = np.full((p, 1), _unbounded(np.log(p / 2), LOG_SHARPNESS))  # λ of lobes whose variances cover 4π
@@ -188,7 +188,7 @@ class PaperObjective:
             parts += [lobes.reshape(-1), np.zeros(len(block.photos) - 1)]
         return torch.from_numpy(np.concatenate(parts))
 
-    def unpacked(self, x: Tensor) -> tuple[tuple[Tensor, ...], list[tuple[Tensor, ...]]]:
+    def unpack(self, x: Tensor) -> tuple[tuple[Tensor, ...], list[tuple[Tensor, ...]]]:
         """Return (diffuse, specular, roughness) and, of each light, (axis, log sharpness, weight, log exposure)."""
         of_materials, *of_lights = torch.split(x, self.sizes)
         bounded = torch.sigmoid(of_materials.reshape(-1, 7))
@@ -196,8 +196,8 @@ class PaperObjective:
         (least, most) = LOG_SHARPNESS
         lights: list[tuple[Tensor, ...]] = []
         for part in of_lights:
-            rows = part[: 7 * self.paper.lobes].reshape(-1, 7)
-            others = part[7 * self.paper.lobes :]
+            rows = part[: 7 * self.options.lobes].reshape(-1, 7)
+            others = part[7 * self.options.lobes :]
             axis = torch.nn.functional.normalize(rows[:, :3], dim=1)
             log_sharpness = least + (most - least) * torch.sigmoid(rows[:, 3])
             weight = torch.nn.functional.softplus(rows[:, 4:])
@@ -206,16 +206,16 @@ class PaperObjective:
 
     def point(self, x: Tensor) -> Point:
         """Return the materials and lights that x encodes."""
-        (diffuse, specular, roughness), lights = self.unpacked(x)
+        (diffuse, specular, roughness), lights = self.unpack(x)
         vector = torch.cat([diffuse, specular, roughness[:, None]], 1).reshape(-1).numpy()
         arrays = [[part.numpy() for part in light] for light in lights]
         found = [Light(axis, sharpness, weight, exposure) for axis, sharpness, weight, exposure in arrays]
-        return Point(Materials.of_vector(vector), found)
+        return Point(Materials.from_vector(vector), found)
 
-    def at(self, x: Tensor, subset: Sequence[Int[np.ndarray, " _"]]) -> tuple[float, Tensor]:
+    def objective_on(self, x: Tensor, subset: Sequence[Int[np.ndarray, " _"]]) -> tuple[float, Tensor]:
         """Return the value and the gradient on the subset."""
         x = x.detach().requires_grad_()
-        (diffuse, specular, roughness), lights = self.unpacked(x)
+        (diffuse, specular, roughness), lights = self.unpack(x)
         squares = x.new_zeros(())
         values = 0
         prior = x.new_zeros(())
@@ -237,7 +237,7 @@ class PaperObjective:
                 difference = (predicted - radiance) * precision
                 squares = squares + (difference.masked_fill(clipped & (difference > 0), 0.0) ** 2).sum()
                 values += difference.numel()
-        value = squares / max(values, 1) + self.paper.prior * prior / len(self.blocks)
+        value = squares / max(values, 1) + self.options.prior * prior / len(self.blocks)
         (gradient,) = torch.autograd.grad(value, x)
         return float(value.detach()), gradient
 

@@ -15,8 +15,8 @@ import numpy as np
 import torch
 
 from factorlib.checkpoint import Checkpoint
-from factorlib.inference.fit import Fit, Schedule, fitted
-from factorlib.inference.history import Event, Report, unreported
+from factorlib.inference.fit import Fit, FitSchedule, fit_problem
+from factorlib.inference.history import Event, EventReport, ignore_event
 from factorlib.inference.problem import JointProblem
 from factorlib.light.prior import LightPrior, read_light_prior
 
@@ -24,26 +24,26 @@ T = TypeVar("T")
 Q = TypeVar("Q")
 
 
-def plain(value: Any) -> Any:
+def to_tensors(value: Any) -> Any:
     """Return a structure with structs as dictionaries and arrays as independent tensors."""
     if isinstance(value, msgspec.Struct):
-        return {name: plain(getattr(value, name)) for name in value.__struct_fields__}
+        return {name: to_tensors(getattr(value, name)) for name in value.__struct_fields__}
     if isinstance(value, np.ndarray):
         return torch.from_numpy(np.array(value, order="C"))
-    return [plain(item) for item in value] if isinstance(value, list) else value
+    return [to_tensors(item) for item in value] if isinstance(value, list) else value
 
 
-def restored(type_: Any, value: Any) -> Any:
-    """Return the value of a given type from its `plain` form."""
+def from_tensors(type_: Any, value: Any) -> Any:
+    """Return the value of a given type from its `to_tensors` form."""
     if isinstance(value, torch.Tensor):
         return value.numpy().copy()
     if isinstance(value, dict):
         hints = get_type_hints(type_)
-        return type_(**{name: restored(hints[name], item) for name, item in value.items()})
-    return [restored(get_args(type_)[0], item) for item in value] if isinstance(value, list) else value
+        return type_(**{name: from_tensors(hints[name], item) for name, item in value.items()})
+    return [from_tensors(get_args(type_)[0], item) for item in value] if isinstance(value, list) else value
 
 
-class Run:
+class FitRunner:
     """Runner of fits under one prior, which saves, reports and remembers states and events.
 
     Args:
@@ -53,15 +53,18 @@ class Run:
     """
 
     def __init__(
-        self, checkpoint: Checkpoint = Checkpoint(None), report: Report = unreported, prior: LightPrior | None = None
+        self,
+        checkpoint: Checkpoint = Checkpoint(None),
+        report: EventReport = ignore_event,
+        prior: LightPrior | None = None,
     ):
         self.report = report
         self.prior = prior or read_light_prior()
         self.history = list[Event]()
         self._checkpoint = checkpoint
-        self._kept = checkpoint.load() or {}
+        self._states = checkpoint.load() or {}
 
-    def completed(self, steps: Mapping[str, Callable[[Q, T], T]], asked: Q, state: T) -> T:
+    def run_steps(self, steps: Mapping[str, Callable[[Q, T], T]], asked: Q, state: T) -> T:
         """Return the state after all steps; steps that an earlier run completed are read.
 
         Args:
@@ -70,18 +73,18 @@ class Run:
             state: Initial state.
         """
         for name, step in steps.items():
-            if name in self._kept:
-                for event in restored(list[Event], self._kept[f"{name}, events"]):
-                    self._happened(event)
+            if name in self._states:
+                for event in from_tensors(list[Event], self._states[f"{name}, events"]):
+                    self._record(event)
             else:
                 before = len(self.history)
                 after = step(asked, state)
-                self._kept |= {f"{name}, events": plain(self.history[before:]), name: plain(after)}
-                self._checkpoint.save(self._kept)
-            state = restored(type(state), self._kept[name])
+                self._states |= {f"{name}, events": to_tensors(self.history[before:]), name: to_tensors(after)}
+                self._checkpoint.save(self._states)
+            state = from_tensors(type(state), self._states[name])
         return state
 
-    def fit(self, phase: str, problem: JointProblem, start: Fit, schedule: Schedule) -> Fit:
+    def fit(self, phase: str, problem: JointProblem, start: Fit, schedule: FitSchedule) -> Fit:
         """Fit under the prior on lights, and report every evaluated point as an event of the phase.
 
         Args:
@@ -97,12 +100,12 @@ class Run:
         def tell(loss: float) -> None:
             """Report one evaluated point."""
             nonlocal iteration
-            self._happened(Event(number, phase, iteration, loss, float("nan"), cells))
+            self._record(Event(number, phase, iteration, loss, float("nan"), cells))
             iteration += 1
 
-        return fitted(problem, start, self.prior, schedule, tell)
+        return fit_problem(problem, start, self.prior, schedule, tell)
 
-    def judged(self, phase: str, problem: JointProblem, start: Fit, schedule: Schedule) -> Fit:
+    def fit_and_report(self, phase: str, problem: JointProblem, start: Fit, schedule: FitSchedule) -> Fit:
         """Fit, and report the held-out loss as the end of the phase (iteration −1).
 
         Args:
@@ -113,10 +116,10 @@ class Run:
         """
         fit = self.fit(phase, problem, start, schedule)
         held_out = problem.held_out_loss(fit.point)
-        self._happened(msgspec.structs.replace(self.history[-1], iteration=-1, held_out=held_out))
+        self._record(msgspec.structs.replace(self.history[-1], iteration=-1, held_out=held_out))
         return fit
 
-    def _happened(self, event: Event) -> None:
+    def _record(self, event: Event) -> None:
         """Remember and report an event."""
         self.history.append(event)
         self.report(event)

@@ -4,7 +4,7 @@ Nothing   The median radiance of material m in photo i is roughly light_i · ref
           with gaps.  Its logarithm is fitted as a sum by least squares.  Exposures follow from mean radiances, and
           lights are constant.
 Surface   The stage `surface` fits the same materials and lights to the meshes as they are.  A solve continues from that
-          fit (`Beginning`).
+          fit (`InitialFit`).
 Earlier   Materials are identified by name, and lights by the name of their illumination.  Mean radiances give all
           materials, known or new, one relative scale (`mean_albedo`).  One factor per channel brings each gauge of the
           earlier solution to that scale: the geometric mean over its materials.  Its lights get the inverse factor.
@@ -28,45 +28,45 @@ from jaxtyping import Float
 from scipy.spatial.transform import Rotation
 
 from factorlib.inference.blocks import Block
-from factorlib.inference.fit import Fit, Hyperparameters, start_of
+from factorlib.inference.fit import Fit, Hyperparameters, initial_fit
 from factorlib.inference.forward import Illumination
 from factorlib.inference.gauge import connected_components
-from factorlib.inference.lights import TONE, Light, UnitLobes, even_cells
+from factorlib.inference.lights import TONE_RANGE, Light, UnitLobes, fibonacci_cells
 from factorlib.inference.materials import LEAST_REFLECTANCE, SHARPNESS, Materials, Point
-from factorlib.inference.noise import Loss
-from factorlib.inference.options import Choices
+from factorlib.inference.noise import RobustLoss
+from factorlib.inference.options import SolveOptions
 from factorlib.inference.problem import JointProblem
 from factorlib.results.solution import Earlier
 
 log = logging.getLogger("factorlib.inference")
 BRIGHTEST_AT_START = 0.7  # reflectance of the brightest material at the start
 # Start of every material.
-ROUGHNESS = 0.4
+START_ROUGHNESS = 0.4
 SPECULAR_SHARE = 0.2
 # With at most FEW materials, a solve starts from each roughness of STARTS.
-FEW = 2
-STARTS = (0.15, 0.4, 0.8)
+FEW_MATERIALS = 2
+START_ROUGHNESSES = (0.15, 0.4, 0.8)
 LEAST_RADIANCE = 1e-6  # least radiance, as a share of a block's mean
 
 # Function of a problem and a number of cells a light; the best of its fits continues.
 Start = Callable[[JointProblem, int], list[Fit]]
 
 
-def from_nothing(materials: int) -> Start:
+def start_from_photos(materials: int) -> Start:
     """Return the start from mean radiances alone; with few materials, from several roughnesses."""
 
     def fits(problem: JointProblem, cells: int) -> list[Fit]:
         """Return one fit per roughness, with constant lights."""
         blocks = problem.blocks
-        roughness = STARTS if materials <= FEW else STARTS[1:2]
+        roughness = START_ROUGHNESSES if materials <= FEW_MATERIALS else START_ROUGHNESSES[1:2]
         begun = [starting_materials(blocks, materials, one) for one in roughness]
-        return [start_of(Point(of, [constant_light(block, of, cells) for block in blocks])) for of in begun]
+        return [initial_fit(Point(of, [constant_light(block, of, cells) for block in blocks])) for of in begun]
 
     return fits
 
 
-class BegunLight(msgspec.Struct, frozen=True):
-    """Light on the first p of `own_cells`.
+class InitialLight(msgspec.Struct, frozen=True):
+    """Light on the first p of `rotated_cells`.
 
     Attributes:
         weight: Weights of the cells, RGB, in scene radiance.
@@ -79,7 +79,7 @@ class BegunLight(msgspec.Struct, frozen=True):
     hyperparameters: Hyperparameters
 
 
-class Beginning(msgspec.Struct, frozen=True):
+class InitialFit(msgspec.Struct, frozen=True):
     """Materials and lights that were fitted to the meshes as they are.
 
     Attributes:
@@ -89,23 +89,23 @@ class Beginning(msgspec.Struct, frozen=True):
     """
 
     materials: list[list[float]]
-    lights: dict[str, BegunLight]
+    lights: dict[str, InitialLight]
     value: float
 
     @staticmethod
-    def of(fit: Fit, blocks: Sequence[Block]) -> Beginning:
+    def from_fit(fit: Fit, blocks: Sequence[Block]) -> InitialFit:
         """Return the serialisable form of a fit of these blocks.
 
         Its lights are infinitely far away and have no tone curves.
         """
         lights = {
-            block.name: BegunLight((light.weight * block.unit).tolist(), light.log_exposure.tolist(), hyperparameters)
+            block.name: InitialLight((light.weight * block.unit).tolist(), light.log_exposure.tolist(), hyperparameters)
             for block, light, hyperparameters in zip(blocks, fit.point.lights, fit.hyperparameters, strict=True)
         }
-        return Beginning(fit.point.materials.rows().tolist(), lights, fit.value)
+        return InitialFit(fit.point.materials.rows().tolist(), lights, fit.value)
 
 
-def from_beginning(begun: Beginning) -> Start:
+def start_from_surface(begun: InitialFit) -> Start:
     """Return the start from a fit.
 
     A light with other cells or other photos than the fit's is constant, and the start then counts as no fit: its value
@@ -114,7 +114,7 @@ def from_beginning(begun: Beginning) -> Start:
 
     def fits(problem: JointProblem, cells: int) -> list[Fit]:
         """Return the fit in the units of the problem."""
-        materials = Materials.of_rows(np.array(begun.materials))
+        materials = Materials.from_rows(np.array(begun.materials))
         lights = [constant_light(block, materials, cells) for block in problem.blocks]
         hyperparameters = [Hyperparameters() for _ in lights]
         value = begun.value
@@ -131,22 +131,28 @@ def from_beginning(begun: Beginning) -> Start:
     return fits
 
 
-def with_known(point: Point, problem: JointProblem) -> Point:
+def insert_known(point: Point, problem: JointProblem) -> Point:
     """Return the point with known values inserted, and the rest of each component at their scale."""
     known = problem.known
     materials = point.materials
     lights = list(point.lights)
-    if known.nothing:
+    if known.is_empty:
         return point
     names = [block.name for block in problem.blocks]
     rows = materials.rows()
-    given = np.maximum(known.put(materials).rows(), LEAST_REFLECTANCE)
+    given = np.maximum(known.insert_into(materials).rows(), LEAST_REFLECTANCE)
     for members, illuminations in connected_components(problem.blocks, len(materials)):
         lit = [names.index(name) for name in illuminations]
         own = {i: known.lights[names[i]] for i in lit if names[i] in known.lights}
         # log factor on reflectances: of the known materials, else of the known lights, else 0
-        logs = [np.log((given[m, :3] + given[m, 3:6]) / (rows[m, :3] + rows[m, 3:6])) for m in known.of(members)]
-        brighter = {i: level(lights[i]) - level(one) + np.log(problem.blocks[i].unit) for i, one in own.items()}
+        logs = [
+            np.log((given[m, :3] + given[m, 3:6]) / (rows[m, :3] + rows[m, 3:6]))
+            for m in known.known_materials(members)
+        ]
+        brighter = {
+            i: log_mean_radiance(lights[i]) - log_mean_radiance(one) + np.log(problem.blocks[i].unit)
+            for i, one in own.items()
+        }
         logs = logs or [by - by.mean() * own[i].scale_free for i, by in brighter.items()] or [np.zeros(3)]
         factor = np.mean(logs, axis=0)  # on reflectances
         rows[list(members), :6] *= np.tile(np.exp(factor), 2)
@@ -156,28 +162,28 @@ def with_known(point: Point, problem: JointProblem) -> Point:
             if one := own.get(i):
                 scale = (brighter[i] - factor).mean() * one.scale_free - np.log(problem.blocks[i].unit)
                 weight = one.weight * np.exp(scale)
-                held = {"held": one.held, "scale_free": one.scale_free}
+                held = {"fixed": one.fixed, "scale_free": one.scale_free}
                 parts = {"axis": one.axis, "log_sharpness": one.log_sharpness, **held}
             if names[i] in known.exposures:
-                parts |= {"log_exposure": np.zeros_like(lights[i].log_exposure), "exposures_held": True}
+                parts |= {"log_exposure": np.zeros_like(lights[i].log_exposure), "exposures_fixed": True}
             lights[i] = msgspec.structs.replace(lights[i], weight=weight, **parts)
-    return Point(known.put(Materials.of_rows(rows)), lights)
+    return Point(known.insert_into(Materials.from_rows(rows)), lights)
 
 
-def level(light: Light) -> Float[np.ndarray, "3"]:
+def log_mean_radiance(light: Light) -> Float[np.ndarray, "3"]:
     """Return the logarithm of a light's mean radiance."""
     return np.log(np.maximum(light.energy.sum(0) / 2, LEAST_RADIANCE))  # `energy` is over 2π, a mean over 4π
 
 
-def from_earlier(earlier: Earlier, names: Sequence[str]) -> Start:
+def start_from_earlier(earlier: Earlier, names: Sequence[str]) -> Start:
     """Return the start from an earlier solution, for materials called `names`.
 
     Lights of the earlier solution keep their cells.
     """
-    return lambda problem, cells: [start_of(known_point(problem, earlier, names, cells))]
+    return lambda problem, cells: [initial_fit(point_from_earlier(problem, earlier, names, cells))]
 
 
-def with_decided(choices: Choices, earlier: Earlier) -> Choices:
+def with_earlier_decisions(choices: SolveOptions, earlier: Earlier) -> SolveOptions:
     """Return the choices with shadows and interreflection as decided before.
 
     A decision counts only if both alternatives had been compared.
@@ -188,7 +194,7 @@ def with_decided(choices: Choices, earlier: Earlier) -> Choices:
     return choices
 
 
-def starting_materials(blocks: Sequence[Block], count: int, roughness: float = ROUGHNESS) -> Materials:
+def starting_materials(blocks: Sequence[Block], count: int, roughness: float = START_ROUGHNESS) -> Materials:
     """Return materials whose diffuse part explains the median radiances and whose specular part is grey."""
     albedo = mean_albedo(blocks, count)
     diffuse = np.maximum(albedo * (1 - SPECULAR_SHARE), 10 * LEAST_REFLECTANCE)
@@ -235,31 +241,31 @@ def constant_light(block: Block, materials: Materials, cells: int) -> Light:
     # log of each photo's mean radiance over reflectance
     levels = np.zeros((len(block.photos), 3))
     levels[shown] = [np.log(np.mean(np.exp(logs[block.photo == k]), axis=0)) for k in shown]
-    lobes = own_cells(block.name, cells)
+    lobes = rotated_cells(block.name, cells)
     light = Light(lobes.axis, np.log(lobes.sharpness), np.ones((cells, 3)), (levels - levels[0]).mean(1))
     return light.with_log_radiance(np.repeat(levels[0][:, None], cells, axis=1))
 
 
-def own_cells(name: str, count: int) -> UnitLobes:
+def rotated_cells(name: str, count: int) -> UnitLobes:
     """Return `count` even cells, rotated at random by the name of the illumination.
 
     The blur of the cells therefore differs from light to light.
     """
-    cells = even_cells(count)
+    cells = fibonacci_cells(count)
     seed = crc32(name.encode())
     turn = Rotation.random(rng=np.random.default_rng(seed)).as_matrix()
     return msgspec.structs.replace(cells, axis=cells.axis @ turn.T)
 
 
-def on_cells(fit: Fit, count: int, problem: JointProblem) -> Fit:
+def refine_cells(fit: Fit, count: int, problem: JointProblem) -> Fit:
     """Return a fit with its lights on `count` cells.
 
     Known lights, and lights with suns or with at least `count` cells, keep their own.
     """
     lights = []
     for light, block in zip(fit.point.lights, problem.blocks, strict=True):
-        if len(light) < count and not light.held.any() and not light.suns.any():
-            cells = own_cells(block.name, count)
+        if len(light) < count and not light.fixed.any() and not light.suns.any():
+            cells = rotated_cells(block.name, count)
             radiance = light.lobes.radiance(cells.axis)
             on = {"axis": cells.axis, "log_sharpness": np.log(cells.sharpness), "weight": radiance}
             light = msgspec.structs.replace(light, **on).with_log_radiance(np.log(np.maximum(radiance, 1e-12)).T)
@@ -267,7 +273,7 @@ def on_cells(fit: Fit, count: int, problem: JointProblem) -> Fit:
     return fit.with_lights(lights)
 
 
-def known_point(problem: JointProblem, earlier: Earlier, names: Sequence[str], cells: int) -> Point:
+def point_from_earlier(problem: JointProblem, earlier: Earlier, names: Sequence[str], cells: int) -> Point:
     """Return the point from which a solve with an earlier solution starts.
 
     Each component of the earlier gauge is brought to the scale of `mean_albedo` by a geometric mean.  The mean is over
@@ -294,7 +300,7 @@ def known_point(problem: JointProblem, earlier: Earlier, names: Sequence[str], c
         for m, one in known.items():
             rows[m] = [*(one.diffuse * factor), *(one.specular * factor), one.roughness]
         factors[c] = factor
-    materials = Materials.of_vector(rows.reshape(-1))
+    materials = Materials.from_vector(rows.reshape(-1))
     lights = []
     for block in blocks:
         light = constant_light(block, materials, cells)
@@ -302,12 +308,14 @@ def known_point(problem: JointProblem, earlier: Earlier, names: Sequence[str], c
         if own:
             factor = factors[max(set(own), key=lambda c: (own.count(c), -c))]
             lit = Illumination(block, light, materials, problem.operator)
-            light = earlier_light(lit, earlier, factor, problem.loss)
+            light = light_from_earlier(lit, earlier, factor, problem.loss)
         lights.append(light)
     return Point(materials, lights)
 
 
-def earlier_light(constant: Illumination, earlier: Earlier, factor: Float[np.ndarray, "3"], loss: Loss) -> Light:
+def light_from_earlier(
+    constant: Illumination, earlier: Earlier, factor: Float[np.ndarray, "3"], loss: RobustLoss
+) -> Light:
     """Return the earlier light of a block, in the block's unit and the start's gauge.
 
     The constant light is returned if there is no earlier one, or if that explains the block worse.  A photo that the
@@ -335,7 +343,7 @@ def earlier_light(constant: Illumination, earlier: Earlier, factor: Float[np.nda
         np.log(np.maximum(lobes.sharpness, SHARPNESS[0])),
         np.maximum(lobes.weight, 0) / block.unit / factor * np.exp(exposure[0]),
         exposure - exposure[0],
-        np.log(np.clip(tone, *TONE)) if len(tone) == len(block.photos) else np.zeros(0),
+        np.log(np.clip(tone, *TONE_RANGE)) if len(tone) == len(block.photos) else np.zeros(0),
         model.curvature(block.name),
     )
     lit = msgspec.structs.replace(constant, light=light)

@@ -13,7 +13,7 @@ from factorlib.meshes.mesh import scaled
 from factorlib.results.poses import ObjectEntry
 
 
-def attached_pixels(
+def attach_pixels(
     pixels: Int[np.ndarray, "n 2"],
     shown: Int[np.ndarray, " n"],
     camera: Camera,
@@ -46,7 +46,7 @@ def attached_pixels(
         rows = rows[hits.face >= 0]
         face = hits.face[hits.face >= 0]
         uv = hits.uv[hits.face >= 0]
-        node[rows] = surfaces.first[mesh] + fine.faces[face]
+        node[rows] = surfaces.first_nodes[mesh] + fine.faces[face]
         share[rows] = np.column_stack([1 - uv.sum(1), uv])
         # R of (1) of `surface_turns`, with its sign changed where the surface is seen from behind
         toward = face_normals(solid, face) @ entry.pose.rotation.T

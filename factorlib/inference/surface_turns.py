@@ -31,16 +31,16 @@ from scipy.sparse import block_diag, csr_array, diags_array, eye_array, hstack, 
 from scipy.sparse.linalg import LinearOperator, cg
 
 from factorlib.inference.blocks import Block
-from factorlib.inference.fit import ROBUST, Hyperparameters, likelihood_of
+from factorlib.inference.fit import ROBUST, Hyperparameters, light_likelihood
 from factorlib.inference.forward import Illumination
 from factorlib.light.prior import LightPrior
 
-STEP = 0.02  # step of a normal for finite differences: about 1°
-MOST = 0.6  # largest |n' − n|: 35°
-GRAZING = 0.05  # least n'·o: a normal that would turn further stays as it is
-PULL = 0.06  # b/a, which fixes nodes without observations nearby
-ACCURACY = 3e-3  # relative tolerance of conjugate gradients
-ITERATIONS = 150  # most iterations of conjugate gradients
+NORMAL_STEP = 0.02  # step of a normal for finite differences: about 1°
+LARGEST_TURN = 0.6  # largest |n' − n|: 35°
+LEAST_VIEW_COSINE = 0.05  # least n'·o: a normal that would turn further stays as it is
+PULL_SHARE = 0.06  # b/a, which fixes nodes without observations nearby
+CG_TOLERANCE = 3e-3  # relative tolerance of conjugate gradients
+CG_ITERATIONS = 150  # most iterations of conjugate gradients
 
 
 class Attached(msgspec.Struct, frozen=True):
@@ -60,7 +60,7 @@ class Attached(msgspec.Struct, frozen=True):
         """Return the observations `rows` alone."""
         return Attached(self.node[rows], self.share[rows], self.frame[rows])
 
-    def in_frame(self, rotation: Float[np.ndarray, "3 3"]) -> Attached:
+    def rotated(self, rotation: Float[np.ndarray, "3 3"]) -> Attached:
         """Return the same positions for normals in another frame; `rotation` turns the present one into it."""
         return msgspec.structs.replace(self, frame=rotation @ self.frame)
 
@@ -76,12 +76,12 @@ class Attached(msgspec.Struct, frozen=True):
         """Return the factors on diffuse reflectance."""
         return np.exp(np.sum(self.share * log_factor[self.node], axis=1))
 
-    def turned(
+    def turn_normals(
         self, normal: Float[np.ndarray, "n 3"], view: Float[np.ndarray, "n 3"], turn: Float[np.ndarray, "v 3"]
     ) -> Float[np.ndarray, "n 3"]:
         """Return n' of (1), unit.
 
-        |n' − n| is at most `MOST` before normalisation, and no normal turns away from the viewer.
+        |n' − n| is at most `LARGEST_TURN` before normalisation, and no normal turns away from the viewer.
 
         Args:
             normal: n, unit, in the light's frame.
@@ -92,12 +92,12 @@ class Attached(msgspec.Struct, frozen=True):
         moved = np.einsum("nij,nkj,nk->ni", self.frame, turn[self.node], self.share)
         moved -= normal * np.sum(moved * normal, 1, keepdims=True)
         length = np.linalg.norm(moved, axis=1, keepdims=True)
-        moved = normal + moved * np.minimum(1, MOST / np.maximum(length, 1e-12))
+        moved = normal + moved * np.minimum(1, LARGEST_TURN / np.maximum(length, 1e-12))
         moved /= np.linalg.norm(moved, axis=1, keepdims=True)
-        return np.where(np.sum(moved * view, 1, keepdims=True) < GRAZING, normal, moved)
+        return np.where(np.sum(moved * view, 1, keepdims=True) < LEAST_VIEW_COSINE, normal, moved)
 
 
-def joined(parts: Sequence[Attached]) -> Attached:
+def concatenate_attached(parts: Sequence[Attached]) -> Attached:
     """Return the observations of several parts, one after the other."""
     return Attached(*(np.concatenate([getattr(part, name) for part in parts]) for name in Attached.__struct_fields__))
 
@@ -113,18 +113,18 @@ class Detail(msgspec.Struct, frozen=True):
     turn: Float[np.ndarray, "v 3"]
     log_factor: Float[np.ndarray, " v"]
 
-    def on(self, block: Block, attached: Attached) -> Block:
+    def apply_to(self, block: Block, attached: Attached) -> Block:
         """Return the block, which has no detail, with this detail."""
-        normal = attached.turned(block.normal, block.view, self.turn)
+        normal = attached.turn_normals(block.normal, block.view, self.turn)
         return block.on_surface(normal, attached.factor(self.log_factor))
 
 
-def no_detail(nodes: int) -> Detail:
+def zero_detail(nodes: int) -> Detail:
     """Return the detail of the mesh itself, all zero."""
     return Detail(np.zeros((nodes, 3)), np.zeros(nodes))
 
 
-class Part(msgspec.Struct, frozen=True, dict=True):
+class LightTerms(msgspec.Struct, frozen=True, dict=True):
     """Terms of one light in (2).
 
     Attributes:
@@ -152,9 +152,9 @@ class Part(msgspec.Struct, frozen=True, dict=True):
     @property
     def unexplained(self) -> Float[np.ndarray, " 3n"]:
         """Residual r − U H⁻¹ g with the light at its own optimum."""
-        return self.residual - self.of_light(cho_solve(self.factor, self.gradient))
+        return self.residual - self.residual_change(cho_solve(self.factor, self.gradient))
 
-    def without(self, gone: Bool[np.ndarray, " n"]) -> Part:
+    def drop_observations(self, gone: Bool[np.ndarray, " n"]) -> LightTerms:
         """Return the terms of the same light without the observations `gone`."""
         rest = np.repeat(~gone, 3)
         hessian = self.hessian.copy()
@@ -162,31 +162,31 @@ class Part(msgspec.Struct, frozen=True, dict=True):
         for c, U in enumerate(self.by_light[:, gone].astype(float)):
             places = np.concatenate([np.arange(c * p, (c + 1) * p), np.arange(3 * p, len(hessian))])
             hessian[np.ix_(places, places)] -= U.T @ U
-        gradient = self.gradient - self.to_light(np.where(rest, 0.0, self.residual))
+        gradient = self.gradient - self.light_gradient(np.where(rest, 0.0, self.residual))
         slopes = self.slopes[np.flatnonzero(rest)]
-        return Part(slopes, self.residual[rest], self.by_light[:, ~gone], hessian, gradient, p)
+        return LightTerms(slopes, self.residual[rest], self.by_light[:, ~gone], hessian, gradient, p)
 
-    def of_light(self, unknowns: Float[np.ndarray, " l"]) -> Float[np.ndarray, " 3n"]:
+    def residual_change(self, unknowns: Float[np.ndarray, " l"]) -> Float[np.ndarray, " 3n"]:
         """Return U times a change of the light."""
         own = unknowns[: 3 * self.cells].reshape(3, -1)
         shared = unknowns[3 * self.cells :]
         each = [U @ np.append(u, shared).astype(np.float32) for U, u in zip(self.by_light, own, strict=True)]
         return np.stack(each, axis=1).reshape(-1).astype(float)
 
-    def to_light(self, change: Float[np.ndarray, " 3n"]) -> Float[np.ndarray, " l"]:
+    def light_gradient(self, change: Float[np.ndarray, " 3n"]) -> Float[np.ndarray, " l"]:
         """Return Uᵀ times a change of the residuals."""
         each = [U.T @ r.astype(np.float32) for U, r in zip(self.by_light, change.reshape(-1, 3).T, strict=True)]
         own = [of[: self.cells] for of in each]
         return np.concatenate([*own, np.sum([of[self.cells :] for of in each], axis=0)]).astype(float)
 
-    def without_light(self, change: Float[np.ndarray, " 3n"]) -> Float[np.ndarray, " 3n"]:
+    def project_out_light(self, change: Float[np.ndarray, " 3n"]) -> Float[np.ndarray, " 3n"]:
         """Return (1 − U H⁻¹ Uᵀ) times a change of the residuals."""
-        return change - self.of_light(cho_solve(self.factor, self.to_light(change)))
+        return change - self.residual_change(cho_solve(self.factor, self.light_gradient(change)))
 
 
-def part_of(
+def linearise_light(
     illumination: Illumination, counts: Hyperparameters, prior: LightPrior, attached: Attached, nodes: int
-) -> Part:
+) -> LightTerms:
     """Linearise one light at its block's normals and detail.
 
     Held-out observations have weight 0.
@@ -198,12 +198,12 @@ def part_of(
         attached: Attachment of the block's observations.
         nodes: Number of all nodes.
     """
-    likelihood = likelihood_of(illumination, counts, prior, materials_given=True)
+    likelihood = light_likelihood(illumination, counts, prior, materials_given=True)
     own = likelihood.illumination
     block = illumination.block
     n = len(block)
     p = len(own.light)
-    shown = own.shown()
+    shown = own.predict()
     residual = np.zeros((n, 3))
     by_light = np.zeros((3, n, own.light.unknowns - 2 * p), np.float32)
     by_factor = np.zeros((n, 3))
@@ -213,24 +213,24 @@ def part_of(
         by_factor[line.rows, line.channel] = line.by_material[:, 0]  # ∂r/∂log k_d
         by_light[line.channel, line.rows] = np.hstack([line.diffuse + line.specular, line.by_photo])
     system = likelihood.normal_equations(materials_given=True)
-    weight = own.pull(block.residuals(shown.radiance), ROBUST, counts.temperature)
+    weight = own.root_weights(block.residuals(shown.radiance), ROBUST, counts.temperature)
     # J = [∂r/∂n R b, ∂r/∂log k_d b]
-    slopes = (_by_normal(illumination) * weight[:, :, None]).reshape(3 * n, 3)
+    slopes = (_normal_derivatives(illumination) * weight[:, :, None]).reshape(3 * n, 3)
     factors = np.repeat(attached.share, 3, axis=0) * by_factor.reshape(-1, 1)
     rows = (np.arange(3 * n).repeat(3), attached.node.repeat(3, axis=0).reshape(-1))
     painted = csr_array((factors.reshape(-1), rows), (3 * n, nodes))
-    turning = csr_array(hstack([_rows(slopes) @ attached.operator(nodes), painted]))
-    return Part(turning, residual.reshape(-1), by_light, system.light_hessian, system.light_gradient, p)
+    turning = csr_array(hstack([_block_diagonal(slopes) @ attached.operator(nodes), painted]))
+    return LightTerms(turning, residual.reshape(-1), by_light, system.light_hessian, system.light_gradient, p)
 
 
-def _rows(slopes: Float[np.ndarray, "3n 3"]) -> csr_array:
+def _block_diagonal(slopes: Float[np.ndarray, "3n 3"]) -> csr_array:
     """Return the derivatives of three channels by three axes of their own observation as a sparse matrix, [3n, 3n]."""
     rows = np.arange(len(slopes))
     columns = 3 * (rows // 3)[:, None] + np.arange(3)
     return csr_array((slopes.reshape(-1), (np.repeat(rows, 3), columns.reshape(-1))), (len(slopes), len(slopes)))
 
 
-def _by_normal(illumination: Illumination) -> Float[np.ndarray, "n 3 3"]:
+def _normal_derivatives(illumination: Illumination) -> Float[np.ndarray, "n 3 3"]:
     """Return ∂r/∂n of each observation, channel by axis, in the tangent plane of the normal."""
     block = illumination.block
     normal = block.normal
@@ -240,10 +240,10 @@ def _by_normal(illumination: Illumination) -> Float[np.ndarray, "n 3 3"]:
     first /= np.linalg.norm(first, axis=1, keepdims=True)
     result = np.zeros((len(block), 3, 3))
     for tangent in (first, np.cross(normal, first)):
-        moved = normal + STEP * tangent
+        moved = normal + NORMAL_STEP * tangent
         moved /= np.linalg.norm(moved, axis=1, keepdims=True)
         after = msgspec.structs.replace(illumination, block=msgspec.structs.replace(block, normal=moved)).residuals()
-        result += ((after - before) / STEP)[:, :, None] * tangent[:, None, :]
+        result += ((after - before) / NORMAL_STEP)[:, :, None] * tangent[:, None, :]
     return result
 
 
@@ -259,8 +259,8 @@ class Stiffness(msgspec.Struct, frozen=True):
     factor: float | None = None
 
 
-def step(
-    parts: Sequence[Part],
+def solve_detail(
+    parts: Sequence[LightTerms],
     laplacian: csr_array,
     stiffness: Stiffness,
     at: Detail,
@@ -277,7 +277,7 @@ def step(
     """
     v = len(at.log_factor)
     both = np.concatenate([at.turn.reshape(-1), at.log_factor])
-    roughness = csr_array(laplacian + PULL * eye_array(v))
+    roughness = csr_array(laplacian + PULL_SHARE * eye_array(v))
     # a L + b 1 for turns (three axes) and log factors, (2)
     prior = block_diag([kron((stiffness.turn or 0) * roughness, np.eye(3)), (stiffness.factor or 0) * roughness])
     turning = np.repeat(np.ones(v, bool) if moving is None else moving, 3) & (stiffness.turn is not None)
@@ -293,10 +293,12 @@ def step(
 
     def system(x: Float[np.ndarray, " k"]) -> Float[np.ndarray, " k"]:
         """Return the Hessian of (2) times a step."""
-        return prior @ x + sum(J.T @ part.without_light(J @ x) for part, J in zip(parts, slopes, strict=True))
+        return prior @ x + sum(J.T @ part.project_out_light(J @ x) for part, J in zip(parts, slopes, strict=True))
 
     size = 2 * (len(right),)
     preconditioner = diags_array(1 / diagonal)
-    found, _ = cg(LinearOperator(size, system, dtype=float), right, rtol=ACCURACY, maxiter=ITERATIONS, M=preconditioner)
+    found, _ = cg(
+        LinearOperator(size, system, dtype=float), right, rtol=CG_TOLERANCE, maxiter=CG_ITERATIONS, M=preconditioner
+    )
     both[free] += found
     return Detail(both[: 3 * v].reshape(-1, 3), both[3 * v :])

@@ -43,15 +43,15 @@ from scipy.stats import t as student_t
 
 from factorlib.conventions import YUP_FROM_CAMERA, lat_long_directions
 from factorlib.inference.arrow import System, information
-from factorlib.inference.fit import Fit, Hyperparameters, likelihood_of, sure_ones
+from factorlib.inference.fit import Fit, Hyperparameters, light_likelihood, reliable_observations
 from factorlib.inference.forward import Illumination
 from factorlib.inference.gauge import connected_components
 from factorlib.inference.history import Solution
-from factorlib.inference.likelihood import factorised, inverse_of
+from factorlib.inference.likelihood import cholesky_factor, cholesky_inverse
 from factorlib.inference.materials import ROUGHNESS, Materials, Point
-from factorlib.inference.model_selection import observations_of, observations_of_lights
-from factorlib.inference.options import Choices
-from factorlib.inference.priors import materials_of, unknowns_of
+from factorlib.inference.model_selection import light_observation_count, observation_count
+from factorlib.inference.options import SolveOptions
+from factorlib.inference.priors import material_unknowns, materials_from_unknowns
 from factorlib.inference.problem import JointProblem
 from factorlib.light.lobes import squared_distances
 from factorlib.light.prior import LightPrior, read_light_prior
@@ -66,11 +66,11 @@ WIDTHS = (*[1.0] * 6, ROUGHNESS[1] - ROUGHNESS[0])  # widths of the ranges of a 
 # (data/eames and the synthetic sets of seeds 11, 12 and 13); without them 35, 32, 45 and 57 % do.
 MODEL_ERROR = np.array([0.09] * 3 + [0.25] * 3 + [0.07])
 LIGHT_ERROR = 0.7
-ROWS = 32  # rows of the maps of a light's relative standard errors
-LARGEST = 1000.0  # upper limit in these maps
+COVERAGE_ROWS = 32  # rows of the maps of a light's relative standard errors
+LARGEST_RELATIVE_ERROR = 1000.0  # upper limit in these maps
 
 
-class StandardErrors(NamedTuple):
+class MaterialErrors(NamedTuple):
     """Standard errors of the material unknowns.
 
     Attributes:
@@ -82,9 +82,9 @@ class StandardErrors(NamedTuple):
     deviation: float
 
 
-def uncertainty_of(
-    solution: Solution, problem: JointProblem, choices: Choices, tick: Callable[[], None] = lambda: None
-) -> tuple[StandardErrors, dict[str, Float[np.ndarray, "h w 3"]]]:
+def estimate_uncertainty(
+    solution: Solution, problem: JointProblem, choices: SolveOptions, tick: Callable[[], None] = lambda: None
+) -> tuple[MaterialErrors, dict[str, Float[np.ndarray, "h w 3"]]]:
     """Return the standard errors of the materials in the gauge of the answer, and maps of each light's relative errors.
 
     Args:
@@ -93,16 +93,16 @@ def uncertainty_of(
         choices: Options of the user.
         tick: Called after each of two systems for each light.
     """
-    problem = solution.shown(problem)
+    problem = solution.effective_problem(problem)
     prior = read_light_prior()
-    some = sure_ones(problem).sampled(observations_of(choices, solution.splitting), choices.seed)
-    all_ = problem.sampled(observations_of_lights(choices, solution.splitting), choices.seed)
+    some = reliable_observations(problem).subsample(observation_count(choices, solution.splitting), choices.seed)
+    all_ = problem.subsample(light_observation_count(choices, solution.splitting), choices.seed)
     found, deviation = Posterior(some, solution.materials, prior, tick).standard_errors()
     fitted = solution.materials.point.materials
     materials = solution.point.materials
     diffuse = found.diffuse * materials.diffuse / fitted.diffuse
     specular = found.specular * materials.specular / fitted.specular
-    errors = StandardErrors(Materials(diffuse, specular, found.roughness), deviation)
+    errors = MaterialErrors(Materials(diffuse, specular, found.roughness), deviation)
     return errors, Posterior(all_, solution.lights, prior, tick).relative_standard_errors()
 
 
@@ -121,7 +121,7 @@ class Posterior:
         self.fit = fit
         self.prior = prior
         self.tick = tick
-        self.materials = materials_of(unknowns_of(fit.point.materials))  # reflectances above zero
+        self.materials = materials_from_unknowns(material_unknowns(fit.point.materials))  # reflectances above zero
 
     def systems(self, with_scores: bool) -> list[System]:
         """Return the system of φ of each illumination, with scores of clusters of observations if requested."""
@@ -129,16 +129,16 @@ class Posterior:
         def system(one: tuple[Illumination, Hyperparameters]) -> System:
             """Return the system of one illumination."""
             clusters = one[0].block.clusters() if with_scores else None
-            made = likelihood_of(*one, self.prior, not with_scores, self.problem.tables).normal_equations(
+            made = light_likelihood(*one, self.prior, not with_scores, self.problem.tables).normal_equations(
                 materials_given=True, clusters=clusters
             )
             self.tick()
             return made
 
-        illuminations = self.problem.fitted().illuminations(Point(self.materials, self.fit.point.lights))
+        illuminations = self.problem.without_held_out().illuminations(Point(self.materials, self.fit.point.lights))
         return list(self.problem.spread(system, list(zip(illuminations, self.fit.hyperparameters, strict=True))))
 
-    def standard_errors(self) -> StandardErrors:
+    def standard_errors(self) -> MaterialErrors:
         """Return the standard error of every material unknown."""
         problem = self.problem
         materials = self.materials
@@ -150,7 +150,7 @@ class Posterior:
         variance = largest_variance(known * np.outer(by_log, by_log), scores, materials, problem)
         deviation = residual_deviation(problem, self.fit.point)
         variance += ((deviation * MODEL_ERROR * values) ** 2).reshape(-1)
-        return _errors(np.where(problem.known.free(len(materials)), variance, 0.0), deviation)
+        return _limit_errors(np.where(problem.known.free(len(materials)), variance, 0.0), deviation)
 
     def relative_standard_errors(self) -> dict[str, Float[np.ndarray, "h w 3"]]:
         """Return maps of each light's standard error relative to its mean radiance, by illumination.
@@ -166,7 +166,7 @@ class Posterior:
             free = light.free
             errors = np.empty((len(directions), 3))
             p = int(free.sum())
-            covariance = inverse_of(system.factor[: 3 * p, : 3 * p])
+            covariance = cholesky_inverse(system.factor[: 3 * p, : 3 * p])
             overlap = np.exp(-0.5 * light.sharpness * squared_distances(directions, light.axis))
             for c in range(3):
                 own = slice(c * p, (c + 1) * p)
@@ -175,13 +175,15 @@ class Posterior:
                 variance = np.maximum(np.sum(slope @ covariance[own, own] * slope, axis=1), 0)
                 errors[:, c] = np.hypot(np.sqrt(variance), model_error * slope.sum(1))
             mean = light.energy.sum(0) / 2  # `energy` is over 2π, a mean over 4π
-            maps[block.name] = np.minimum(errors / mean, LARGEST).reshape(ROWS, 2 * ROWS, 3)
+            maps[block.name] = np.minimum(errors / mean, LARGEST_RELATIVE_ERROR).reshape(
+                COVERAGE_ROWS, 2 * COVERAGE_ROWS, 3
+            )
         return maps
 
 
 def map_directions() -> Float[np.ndarray, "d 3"]:
     """Return the directions of the texels of a map of ROWS rows, in the frame of the blocks."""
-    return (lat_long_directions(ROWS, 2 * ROWS) @ YUP_FROM_CAMERA).reshape(-1, 3)
+    return (lat_long_directions(COVERAGE_ROWS, 2 * COVERAGE_ROWS) @ YUP_FROM_CAMERA).reshape(-1, 3)
 
 
 def residual_deviation(problem: JointProblem, point: Point) -> float:
@@ -221,15 +223,15 @@ def largest_variance(
     own = (vectors * np.maximum(values, 0.0)) @ vectors.T + np.diag(
         np.tile(WIDTHS, len(materials))[free] ** -2.0 / scale**2
     )
-    inverse[np.ix_(free, free)] = inverse_of(factorised(own)) / scales
+    inverse[np.ix_(free, free)] = cholesky_inverse(cholesky_factor(own)) / scales
     whole = np.array([s.sum(0) for s in scores])
     covariances = inverse, sandwich(inverse, np.vstack(scores)), sandwich(inverse, whole)
-    return np.max([np.diag(in_gauge(each, materials, problem)) for each in covariances], axis=0).clip(0)
+    return np.max([np.diag(project_to_gauge(each, materials, problem)) for each in covariances], axis=0).clip(0)
 
 
-def _errors(variance: Float[np.ndarray, " 7m"], deviation: float) -> StandardErrors:
+def _limit_errors(variance: Float[np.ndarray, " 7m"], deviation: float) -> MaterialErrors:
     """Return standard errors that are at most the width of each unknown's range."""
-    return StandardErrors(Materials.of_rows(np.minimum(np.sqrt(variance).reshape(-1, 7), WIDTHS)), deviation)
+    return MaterialErrors(Materials.from_rows(np.minimum(np.sqrt(variance).reshape(-1, 7), WIDTHS)), deviation)
 
 
 def sandwich(inverse: Float[np.ndarray, "k k"], scores: Float[np.ndarray, "g k"]) -> Float[np.ndarray, "k k"]:
@@ -245,7 +247,7 @@ def sandwich(inverse: Float[np.ndarray, "k k"], scores: Float[np.ndarray, "g k"]
     return few**2 * inverse @ (scores.T @ scores) @ inverse * count / (count - 1)
 
 
-def in_gauge(
+def project_to_gauge(
     covariance: Float[np.ndarray, "k k"], materials: Materials, problem: JointProblem
 ) -> Float[np.ndarray, "k k"]:
     """Return the covariance with the sum of each component fixed in as many channels as have a free factor.
@@ -257,7 +259,7 @@ def in_gauge(
     """
     rows = materials.rows()
     for members, illuminations in connected_components(problem.blocks, len(materials)):
-        factors = problem.known.factors(members, illuminations)
+        factors = problem.known.free_factors(members, illuminations)
         for columns in {3: [[0, 3], [1, 4], [2, 5]], 1: [[*range(6)]], 0: []}[factors]:
             g = np.zeros(rows.shape)
             h = np.zeros(rows.shape)

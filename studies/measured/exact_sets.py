@@ -17,7 +17,7 @@ from factorlib.inference.joint_solver import solve
 from factorlib.inference.noise import Noise
 from factorlib.inference.observed import blocks_of_observations
 from factorlib.inference.problem import JointProblem
-from factorlib.inference.start import from_nothing
+from factorlib.inference.start import start_from_photos
 from factorlib.reflection import reflection_operator
 from factorlib.results.materials import Reflectance
 from factorlib.urm.merge import merge
@@ -49,7 +49,7 @@ def rows() -> Tables:
         blocks = blocks_of_observations(concatenate([merge(photo, MERGE_DEGREES) for photo in photos]), Noise())
         problem = JointProblem(blocks, operator)  # one thread: seconds are those of the work itself
         clock = Clock()
-        solution = solve(problem, from_nothing(len(truth)))
+        solution = solve(problem, start_from_photos(len(truth)))
         seconds = f"{clock.taken().processor:.0f}"
         table.append([name, seconds, *_errors(solution, truth, problem, whole)])
         print(*table[-1], sep="; ", flush=True)
