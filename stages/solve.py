@@ -21,16 +21,15 @@ from factorlib.images.exr import LAT_LONG, write_rgb_exr
 from factorlib.images.light_map import read_light_map
 from factorlib.inference import options
 from factorlib.inference.answer import Answer
-from factorlib.inference.history import Event, Solution, solve_progress, subset_progress
+from factorlib.inference.blocks import Noise, RobustLoss
+from factorlib.inference.fit_runner import Event, FitRunner, Solution, solve_progress, subset_progress
 from factorlib.inference.identifiability import after_solving, before_solving, unusable_observations
 from factorlib.inference.joint_solver import solve
 from factorlib.inference.known import extract_known
-from factorlib.inference.noise import Noise, RobustLoss
 from factorlib.inference.observed import blocks_of_observations, gather_observations, usable_observations
 from factorlib.inference.paper_solver import REPORTS, PaperOptions, Prior, Samplings
 from factorlib.inference.paper_solver import solve as solve_as_the_paper
 from factorlib.inference.problem import JointProblem
-from factorlib.inference.resume import FitRunner
 from factorlib.inference.start import (
     InitialFit,
     Start,
@@ -86,7 +85,7 @@ def main(params: Params, inputs: Inputs, out: Path, progress: Progress) -> None:
     progress(0, 1, "observations")
     read = count(1)
     _refuse_options_of_the_other_solver(params)
-    given = _known_values(params, inputs)
+    declared = _known_values(params, inputs)
     files = sorted(inputs["urm"].glob("*.parquet"))
     surface = inputs.folders.get("surface")
     photos = gather_observations(
@@ -97,11 +96,11 @@ def main(params: Params, inputs: Inputs, out: Path, progress: Progress) -> None:
         lambda: progress(READING * next(read) / len(files), 1, "observations"),
     )
     _warn(unusable_observations(photos))
-    seen = urm.with_exposures(urm.concatenate([photo.merged for photo in photos]), given.exposure)
-    relative = urm.relative_exposures(seen)
+    observations = urm.with_exposures(urm.concatenate([photo.merged for photo in photos]), declared.exposure)
+    relative = urm.relative_exposures(observations)
     earlier = read_earlier(inputs["start"]).beside(relative) if "start" in inputs.folders else None
-    problem = _build_problem(params, inputs, given, seen, relative)
-    _warn(before_solving(names, seen.photos, problem))
+    problem = _build_problem(params, inputs, declared, observations, relative)
+    _warn(before_solving(names, observations.photos, problem))
     solution = _run_solver(params, problem, earlier, inputs, partial(_share, progress))
     systems = 2 * len(problem.blocks)
     made = count(1)
@@ -159,30 +158,30 @@ def _share(progress: Progress, done: float, total: float, text: str = "") -> Non
 
 
 def _build_problem(
-    params: Params, inputs: Inputs, given: KnownSlice, seen: urm.Observations, relative: dict[str, float]
+    params: Params, inputs: Inputs, declared: KnownSlice, observations: urm.Observations, relative: dict[str, float]
 ) -> JointProblem:
     """Return the problem: blocks of observations at one exposure, operator, loss and known quantities.
 
     Args:
         params: Parameters of the stage.
         inputs: Inputs of the stage.
-        given: Known quantities of dataset.yaml.
-        seen: Observations of all photos.
+        declared: Known quantities of dataset.yaml.
+        observations: Observations of all photos.
         relative: Relative exposures, by photo.
     """
     lights = msgspec.convert(inputs.facts["dataset.light"], dict[str, LightSlice])
     worlds = {photo: light.world_from_camera for photo, light in lights.items()}
-    maps = {name: read_light_map(inputs.file(file)) for name, file in given.maps.items()}
-    tables = {name: inputs["urm"] / f"{ball.photo}.parquet" for name, ball in given.balls.items()}
+    maps = {name: read_light_map(inputs.file(file)) for name, file in declared.maps.items()}
+    tables = {name: inputs["urm"] / f"{ball.photo}.parquet" for name, ball in declared.balls.items()}
     balls = {
         name: urm.at_one_exposure(usable_observations(urm.read_observations(t)), relative) for name, t in tables.items()
     }
-    seen, known = extract_known(given, maps, balls, urm.at_one_exposure(seen, relative), lights)
+    observations, known = extract_known(declared, maps, balls, urm.at_one_exposure(observations, relative), lights)
     if params.solver == "paper":  # its materials are uniform
-        seen = msgspec.structs.replace(seen, detail=None)
+        observations = msgspec.structs.replace(observations, detail=None)
     rotations = {photo: np.array(world) for photo, world in worlds.items() if world is not None}
     blocks = blocks_of_observations(
-        seen, Noise(), held_out=params.held_out, world_from_camera=rotations, seed=params.seed
+        observations, Noise(), held_out=params.held_out, world_from_camera=rotations, seed=params.seed
     )
     automatic: Name = "paper_network" if params.solver == "paper" else "network"
     operator = automatic if params.operator == "auto" else params.operator

@@ -17,13 +17,19 @@ from jaxtyping import Int
 
 from factorlib.dataset.schema import LightSlice, ObjectsSlice
 from factorlib.images.exr import read_exr, write_exr
-from factorlib.inference.noise import Noise
+from factorlib.inference.blocks import Noise
 from factorlib.inference.observed import blocks_of_observations, usable_observations
 from factorlib.inference.problem import JointProblem
 from factorlib.inference.start import start_from_photos
-from factorlib.inference.surface_attach import attach_pixels
-from factorlib.inference.surface_detail import SurfaceEstimate, Surfaces, estimate_surface
-from factorlib.inference.surface_turns import Attached, Detail, concatenate_attached, zero_detail
+from factorlib.inference.surface_detail import SurfaceEstimate, estimate_surface
+from factorlib.inference.surface_turns import (
+    Attached,
+    Detail,
+    Surfaces,
+    attach_pixels,
+    concatenate_attached,
+    zero_detail,
+)
 from factorlib.jsonfile import write_json
 from factorlib.meshes.fine import fine
 from factorlib.meshes.read import CREASE_DEG, MeshesOnce
@@ -64,9 +70,9 @@ def main(params: Params, inputs: Inputs, out: Path, progress: Progress) -> None:
     if not surfaces.meshes:
         write_json(out / FILE, SurfaceTable())
         return
-    seen = {name: draw_observations(inputs["urm"] / f"{name}.parquet", params) for name in photos}
-    attached = {name: photos[name].attach(np.column_stack([of.x, of.y]), surfaces) for name, of in seen.items()}
-    result = _estimate_surface(params, inputs, seen, attached, surfaces, progress)
+    observations = {name: draw_observations(inputs["urm"] / f"{name}.parquet", params) for name in photos}
+    attached = {name: photos[name].attach(np.column_stack([of.x, of.y]), surfaces) for name, of in observations.items()}
+    result = _estimate_surface(params, inputs, observations, attached, surfaces, progress)
     displacements, factors = (
         {name: values.astype("f4") for name, values in of.items()} for of in (result.displacements, result.log_factors)
     )
@@ -100,9 +106,9 @@ class AlignedPhoto(msgspec.Struct, frozen=True):
     def attach(self, pixels: Int[np.ndarray, "n 2"], surfaces: Surfaces) -> Attached:
         """Return the positions of pixels (x, y) on the surfaces."""
         height, width = self.geometry["object"].shape
-        objects = {own.name: (own.mesh, self.poses.objects[own.name]) for own in self.objects.objects}
-        shown = np.rint(self.geometry["object"][pixels[:, 1], pixels[:, 0]]).astype(int)
-        return attach_pixels(pixels, shown, self.poses.camera.camera(width, height), objects, surfaces)
+        objects = {entry.name: (entry.mesh, self.poses.objects[entry.name]) for entry in self.objects.objects}
+        object_number = np.rint(self.geometry["object"][pixels[:, 1], pixels[:, 0]]).astype(int)
+        return attach_pixels(pixels, object_number, self.poses.camera.camera(width, height), objects, surfaces)
 
     def detail_channels(self, surfaces: Surfaces, detail: Detail) -> Channels:
         """Return the channels normal.x, .y, .z (camera frame) and detail (factor on the diffuse reflectance).
@@ -139,23 +145,23 @@ def read_surfaces(inputs: Inputs, slices: dict[str, ObjectsSlice]) -> Surfaces:
     read = MeshesOnce(inputs.mesh, inputs.facts["dataset.materials"], CREASE_DEG)
     meshes = {}
     for slice_ in slices.values():
-        for own in slice_.objects:
-            if own.mesh not in meshes and not slice_.meshes[own.mesh].revolved:
-                meshes[own.mesh] = fine(read.mesh(own.mesh, slice_.meshes[own.mesh], own.materials))
+        for entry in slice_.objects:
+            if entry.mesh not in meshes and not slice_.meshes[entry.mesh].revolved:
+                meshes[entry.mesh] = fine(read.mesh(entry.mesh, slice_.meshes[entry.mesh], entry.materials))
     return Surfaces(dict(sorted(meshes.items())))
 
 
 def draw_observations(file: Path, params: Params) -> Observations:
     """Return at most `params.observations` usable observations of a photo, drawn at random, in their order."""
-    seen = usable_observations(read_observations(file))
-    chosen = np.random.default_rng(params.seed).permutation(len(seen))[: params.observations]
-    return seen.take(np.sort(chosen))
+    usable = usable_observations(read_observations(file))
+    rows = np.random.default_rng(params.seed).permutation(len(usable))[: params.observations]
+    return usable.take(np.sort(rows))
 
 
 def _estimate_surface(
     params: Params,
     inputs: Inputs,
-    seen: dict[str, Observations],
+    observations: dict[str, Observations],
     attached: dict[str, Attached],
     surfaces: Surfaces,
     progress: Progress,
@@ -165,17 +171,19 @@ def _estimate_surface(
     Args:
         params: Parameters of the stage.
         inputs: Inputs of the stage.
-        seen: Observations, by photo.
+        observations: Observations, by photo.
         attached: Nodes under the observations, by photo.
         surfaces: Subdivided meshes.
         progress: Receiver of progress.
     """
     lights = msgspec.convert(inputs.facts["dataset.light"], dict[str, LightSlice])
-    worlds = {name: np.array(of.world_from_camera) for name, of in lights.items() if of.world_from_camera is not None}
-    every = concatenate(list(seen.values()))
-    every = at_one_exposure(every, relative_exposures(every))
-    blocks = blocks_of_observations(every, Noise(), world_from_camera=worlds, seed=params.seed)
-    in_frame = [of.rotated(worlds.get(name, np.eye(3))) for name, of in attached.items()]
+    worlds = {
+        name: np.array(light.world_from_camera) for name, light in lights.items() if light.world_from_camera is not None
+    }
+    merged = concatenate(list(observations.values()))
+    merged = at_one_exposure(merged, relative_exposures(merged))
+    blocks = blocks_of_observations(merged, Noise(), world_from_camera=worlds, seed=params.seed)
+    in_frame = [light.rotated(worlds.get(name, np.eye(3))) for name, light in attached.items()]
     problem = JointProblem(blocks, reflection_operator("network", weights=inputs["train"]), spread=inputs.map)
     nodes = concatenate_attached(in_frame)
     of_blocks = []

@@ -15,8 +15,8 @@ from msgspec import UNSET, UnsetType
 
 from factorlib.inference import uncertainty
 from factorlib.inference.blocks import Block
+from factorlib.inference.fit_runner import Solution
 from factorlib.inference.gauge import DETERMINED, GIVEN, RULE, UP_TO_SCALE, connected_components
-from factorlib.inference.history import Solution
 from factorlib.inference.lights import Light
 from factorlib.inference.materials import LEAST_REFLECTANCE, Materials
 from factorlib.inference.misfit import unexplained_shares
@@ -91,18 +91,17 @@ class Answer(msgspec.Struct, frozen=True, dict=True):
 
     def _known_rule(self) -> str:
         """Return a sentence that names what fixes scale and white balance; empty if nothing is known beforehand."""
-        known = self.problem.known
-        fixed = [self.names[m] for m in sorted(known.materials)]
-        fixed += sorted(name for name, light in known.lights.items() if not light.scale_free)
-        tinted = sorted(name for name, light in known.lights.items() if light.scale_free)
-        pairs = ((GIVEN, fixed), (UP_TO_SCALE, tinted))
-        return "".join(rule.format(", ".join(names)) for rule, names in pairs if names)
+        fixed = [self.names[m] for m in sorted(self.problem.known.materials)]
+        fixed += sorted(name for name, light in self.problem.known.lights.items() if not light.scale_free)
+        tinted = sorted(name for name, light in self.problem.known.lights.items() if light.scale_free)
+        sentences = ((GIVEN, fixed), (UP_TO_SCALE, tinted))
+        return "".join(rule.format(", ".join(names)) for rule, names in sentences if names)
 
     def _known_parts(self, m: int) -> list[str] | UnsetType:
         """Return the parts of a material that were known beforehand; UNSET for a material without any."""
         values = self.problem.known.materials.get(m)
         parts = zip(("diffuse", "specular", "roughness"), (0, 3, 6), strict=True)
-        return UNSET if values is None else [part for part, first in parts if not np.isnan(values[first])]
+        return UNSET if values is None else [part for part, column in parts if not np.isnan(values[column])]
 
     def _gauge_of_errors(self) -> str:
         """Return the sentence that states the gauge of the standard errors."""
@@ -136,22 +135,23 @@ class Answer(msgspec.Struct, frozen=True, dict=True):
 
     def estimated_exposures(self) -> dict[str, float]:
         """Return each photo's factor on its light, relative to its EXIF exposure."""
-        pairs = (pair for b, light in self.illuminations() for pair in zip(b.photos, light.log_exposure, strict=True))
-        return {photo: float(np.exp(log_exposure)) for photo, log_exposure in pairs}
+        exposures = (
+            exposure for b, light in self.illuminations() for exposure in zip(b.photos, light.log_exposure, strict=True)
+        )
+        return {photo: float(np.exp(log_exposure)) for photo, log_exposure in exposures}
 
     def model(self) -> table.Model:
         """Return the model choices and their evidence; the pivots of tone curves are in scene radiance."""
-        names = self.names
         solution = self.solution
-        lit = self.illuminations()
+        illuminations = self.illuminations()
         started: table.Started | UnsetType = UNSET
-        lights = [block.name for block, _ in lit]
+        lights = [block.name for block, _ in illuminations]
         if self.earlier is not None:
-            known = set(names) & set(self.earlier.table.materials), set(lights) & set(self.earlier.lights)
+            known = set(self.names) & set(self.earlier.table.materials), set(lights) & set(self.earlier.lights)
             started = table.Started(*map(sorted, known))
         return table.Model(
             solver=self.solver,
-            lobes={block.name: len(light) for block, light in lit},
+            lobes={block.name: len(light) for block, light in illuminations},
             lobes_chosen_by=LOBES_CHOSEN_BY[self.solver],
             held_out_loss=[event.held_out for event in solution.history if event.phase == "subset"],
             self_shadowing=solution.shadows.kept,
@@ -163,11 +163,11 @@ class Answer(msgspec.Struct, frozen=True, dict=True):
             suns_chosen_by=dict(zip(lights, solution.suns)),
             tone={
                 photo: table.Tone(float(np.exp(log_tone)), block.unit * self.relative[photo])
-                for block, light in lit
+                for block, light in illuminations
                 for photo, log_tone in zip(block.photos, light.log_tone, strict=False)
             },
             tone_chosen_by=dict(zip(lights, solution.tone)),
-            distance={block.name: 1 / light.curvature for block, light in lit if light.curvature > 0},
+            distance={block.name: 1 / light.curvature for block, light in illuminations if light.curvature > 0},
             distance_chosen_by=dict(zip(lights, solution.distances)),
             started_from=started,
         )

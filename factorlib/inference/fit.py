@@ -26,13 +26,11 @@ import msgspec
 import numpy as np
 from jaxtyping import Bool, Float
 
-from factorlib.inference.arrow import System
-from factorlib.inference.blocks import Block
+from factorlib.inference.blocks import Block, RobustLoss
 from factorlib.inference.forward import Illumination
 from factorlib.inference.lights import Light
-from factorlib.inference.likelihood import LightLikelihood, cholesky_inverse
+from factorlib.inference.likelihood import LightLikelihood, System, cholesky_inverse
 from factorlib.inference.materials import Materials, Point
-from factorlib.inference.noise import RobustLoss
 from factorlib.inference.optimizer import Descent, LossReport
 from factorlib.inference.priors import MaterialPrior, material_unknowns, materials_from_unknowns
 from factorlib.inference.problem import JointProblem
@@ -118,9 +116,13 @@ def fit_problem(
         The fit, with the value of its objective.
     """
     problem = problem.without_held_out()
-    given = schedule.given
+    materials_fixed = schedule.given
     hyperparameters = start.hyperparameters
-    materials = start.point.materials if given else problem.known.insert_into(raise_reflectances(start.point.materials))
+    materials = (
+        start.point.materials
+        if materials_fixed
+        else problem.known.insert_into(raise_reflectances(start.point.materials))
+    )
     prior_on_materials = MaterialPrior(materials, problem.blocks, problem.known)
     descent = Descent(prior_on_materials, problem.spread, report, problem.known.free(len(materials)))
     illuminations = problem.illuminations(Point(materials, start.point.lights))
@@ -128,7 +130,7 @@ def fit_problem(
 
     def likelihood(pair: tuple[Illumination, Hyperparameters]) -> LightLikelihood:
         """Return the likelihood of one light, with a table of responses."""
-        return light_likelihood(*pair, prior, given, problem.tables)
+        return light_likelihood(*pair, prior, materials_fixed, problem.tables)
 
     likelihoods = list(problem.spread(likelihood, pairs))
     state = descent.descend_lights(likelihoods, material_unknowns(materials), schedule.lights)
@@ -140,19 +142,21 @@ def fit_problem(
             )
             both = zip(state.likelihoods, hyperparameters, strict=True)
             state = state._replace(likelihoods=[with_hyperparameters(*each) for each in both])
-        if given:
+        if materials_fixed:
             state = descent.descend_lights(state.likelihoods, state.theta, iterations)
         else:
             state = descent.descend_jointly(state, iterations)
-    lights = [one.light for one in state.likelihoods]
+    lights = [likelihood_of_light.light for likelihood_of_light in state.likelihoods]
     return Fit(
-        Point(materials if given else materials_from_unknowns(state.theta), lights), hyperparameters, state.value
+        Point(materials if materials_fixed else materials_from_unknowns(state.theta), lights),
+        hyperparameters,
+        state.value,
     )
 
 
 def light_likelihood(
     illumination: Illumination,
-    one: Hyperparameters,
+    hyperparameters: Hyperparameters,
     prior: LightPrior,
     materials_given: bool = False,
     tables: ResponseCache | None = None,
@@ -161,32 +165,34 @@ def light_likelihood(
 
     Args:
         illumination: Observations, light and materials.
-        one: Hyperparameters.
+        hyperparameters: Hyperparameters.
         prior: Prior on lights.
         materials_given: True if the materials do not change.
         tables: Cache of response tables; None for a new one.
     """
-    given = illumination.materials.roughness if materials_given else None
-    of = illumination.block, illumination.light.unit_lobes, illumination.operator
-    table = (tables or ResponseCache()).get(*of, given)
+    roughness = illumination.materials.roughness if materials_given else None
+    arguments = illumination.block, illumination.light.unit_lobes, illumination.operator
+    table = (tables or ResponseCache()).get(*arguments, roughness)
     tabulated = msgspec.structs.replace(illumination, table=table)
-    return with_hyperparameters(LightLikelihood(tabulated, prior, np.zeros(0), np.zeros((0, 0)), 0.0, 1.0, ROBUST), one)
+    return with_hyperparameters(
+        LightLikelihood(tabulated, prior, np.zeros(0), np.zeros((0, 0)), 0.0, 1.0, ROBUST), hyperparameters
+    )
 
 
-def with_hyperparameters(likelihood: LightLikelihood, one: Hyperparameters) -> LightLikelihood:
+def with_hyperparameters(likelihood: LightLikelihood, hyperparameters: Hyperparameters) -> LightLikelihood:
     """Return the likelihood with other hyperparameters."""
     light = likelihood.light
     # Q of the cells, under the scale factors s_k²
-    Q, log_determinant = likelihood.prior.precision(light.axis[~light.suns], one.factors)
+    Q, log_determinant = likelihood.prior.precision(light.axis[~light.suns], hyperparameters.factors)
     if light.suns.any():  # the prior on cells does not cover suns: each has an independent Gaussian
-        own = np.tile(light.suns, 3)
+        is_sun = np.tile(light.suns, 3)
         cells = Q
-        Q = np.diag(np.where(own, SUN_DEVIATION**-2.0, 0.0))
-        Q[np.ix_(~own, ~own)] = cells
+        Q = np.diag(np.where(is_sun, SUN_DEVIATION**-2.0, 0.0))
+        Q[np.ix_(~is_sun, ~is_sun)] = cells
     if light.fixed.any():  # Q of the free cells given the held ones is their block of Q
         free = np.tile(light.free, 3)
         log_determinant = float(np.linalg.slogdet(Q[np.ix_(free, free)])[1])
-    counts = {"precision": Q, "log_determinant": log_determinant, "temperature": one.temperature}
+    counts = {"precision": Q, "log_determinant": log_determinant, "temperature": hyperparameters.temperature}
     return msgspec.structs.replace(likelihood, log_peaks=np.log(light.peaks), **counts)
 
 
@@ -199,7 +205,7 @@ def estimate_hyperparameters(likelihood: LightLikelihood, system: System, least:
         least: Least temperature.
     """
     light = likelihood.light
-    cells, free = (np.flatnonzero(np.tile(which, 3)) for which in (~light.suns, light.free))
+    cells, free = (np.flatnonzero(np.tile(mask, 3)) for mask in (~light.suns, light.free))
     # covariance of u: H⁻¹ of the free cells, 0 of the held ones, without suns
     covariance = np.zeros((3 * len(light), 3 * len(light)))
     covariance[np.ix_(free, free)] = cholesky_inverse(system.factor[: len(free), : len(free)])

@@ -51,23 +51,21 @@ def before_solving(names: Sequence[str], photos: Sequence[str], problem: JointPr
         photos: Names of all photos.
         problem: Observations.
     """
-    blocks = problem.blocks
-    known = problem.known
-    shown = {int(m) for block in blocks for m in np.unique(block.material)}
-    unseen = [name for m, name in enumerate(names) if m not in shown and m not in known.materials]
-    said = [f"material '{name}' is observed in no photo: its reflectance is only a guess" for name in unseen]
-    dark = sorted(set(photos) - {photo for block in blocks for photo in block.photos})
-    said += [f"photo '{photo}' has no valid observation and gets no light" for photo in dark]
-    linked = [component for component in connected_components(blocks, len(names)) if component.illuminations]
-    if len(linked) > 1 and any(known.free_factors(*component) for component in linked):
-        pairs = ((", ".join(lights), ", ".join(names[m] for m in members)) for members, lights in linked)
-        groups = "; ".join(f"{lights} (with {materials})" for lights, materials in pairs)
-        said.append(
+    observed = {int(m) for block in problem.blocks for m in np.unique(block.material)}
+    unseen = [name for m, name in enumerate(names) if m not in observed and m not in problem.known.materials]
+    sentences = [f"material '{name}' is observed in no photo: its reflectance is only a guess" for name in unseen]
+    dark = sorted(set(photos) - {photo for block in problem.blocks for photo in block.photos})
+    sentences += [f"photo '{photo}' has no valid observation and gets no light" for photo in dark]
+    linked = [component for component in connected_components(problem.blocks, len(names)) if component.illuminations]
+    if len(linked) > 1 and any(problem.known.free_factors(*component) for component in linked):
+        linked_names = ((", ".join(lights), ", ".join(names[m] for m in members)) for members, lights in linked)
+        groups = "; ".join(f"{lights} (with {materials})" for lights, materials in linked_names)
+        sentences.append(
             f"the photos fall into {len(linked)} sets that share no material, so their reflectances cannot be "
             f"compared: {groups}. An object that is left out of the solve may link them, once its pose is good; else "
             "a photo that shows a material of each would"
         )
-    return said + undetermined_by_observations(names, problem)
+    return sentences + undetermined_by_observations(names, problem)
 
 
 def undetermined_by_observations(names: Sequence[str], problem: JointProblem) -> list[str]:
@@ -75,42 +73,40 @@ def undetermined_by_observations(names: Sequence[str], problem: JointProblem) ->
 
     Known materials and materials without observations are left out.
     """
-    blocks = problem.blocks
-    known = problem.known
-    black = [block.name for block in blocks if (block.radiance <= 0).all()]
-    said = [f"illumination '{name}' is black in every photo: it tells nothing" for name in black]
+    black = [block.name for block in problem.blocks if (block.radiance <= 0).all()]
+    sentences = [f"illumination '{name}' is black in every photo: it tells nothing" for name in black]
     for m, name in enumerate(names):
-        shown = [block.take(block.material == m) for block in blocks if (block.material == m).any()]
-        said += _material_warnings(name, shown) if shown and m not in known.materials else []
-    for members, lights in connected_components(blocks, len(names)):
-        if len(members) == 1 and lights and known.free_factors(members, lights) == 3:
-            alone = (
+        observations = [block.take(block.material == m) for block in problem.blocks if (block.material == m).any()]
+        sentences += _material_warnings(name, observations) if observations and m not in problem.known.materials else []
+    for members, lights in connected_components(problem.blocks, len(names)):
+        if len(members) == 1 and lights and problem.known.free_factors(members, lights) == 3:
+            consequence = (
                 ", and a smooth material in a soft light looks like a rough one in a sharp light. "
                 "A photo of it in other light"
             )
-            said.append(
+            sentences.append(
                 f"material '{names[members[0]]}' shares no light with another: its colour and brightness are "
-                f"separated from the light's by convention only{alone if len(lights) == 1 else '. A photo'} that "
+                f"separated from the light's by convention only{consequence if len(lights) == 1 else '. A photo'} that "
                 "shows another material too would help"
             )
-    return said
+    return sentences
 
 
-def _material_warnings(name: str, shown: Sequence[Block]) -> Iterator[str]:
+def _material_warnings(name: str, observations: Sequence[Block]) -> Iterator[str]:
     """Yield sentences about one material from its observations in each light."""
-    count = sum(map(len, shown))
+    count = sum(map(len, observations))
     if count < FEW_OBSERVATIONS:
         yield (
             f"material '{name}' has {count} observation(s), fewer than {FEW_OBSERVATIONS}: its reflectance is "
             "uncertain, and its roughness more so. A photo from nearer would help"
         )
-    if all(_spread(block) < LEAST_SPREAD_DEG for block in shown):
+    if all(_spread(block) < LEAST_SPREAD_DEG for block in observations):
         yield (
             f"material '{name}' is flat: in every light it mirrors one direction only, so its roughness and what of "
             "it is specular cannot be determined. A photo of a curved part, or several of it turned in a light that "
             "is fixed to the world, would help"
         )
-    clipped = np.concatenate([block.clipped for block in shown]).mean()
+    clipped = np.concatenate([block.clipped for block in observations]).mean()
     if clipped >= CLIPPED:
         yield (
             f"{clipped:.0%} of the values of material '{name}' are clipped and say 'at least' only: its reflectance "
@@ -128,45 +124,44 @@ def _spread(block: Block) -> float:
 def after_solving(answer: Answer) -> list[str]:
     """Return sentences about quantities that the answer leaves open or explains badly."""
     problem = answer.solution.effective_problem(answer.problem)
-    point = answer.solution.point
     return [
-        *undetermined_by_answer(answer.names, problem, point.materials, answer.errors.materials),
+        *undetermined_by_answer(answer.names, problem, answer.solution.point.materials, answer.errors.materials),
         *poorly_explained(problem, answer.radiance),
-        *unlikely_curves(problem, point),
-        *tinted_alike(problem, point),
+        *unlikely_curves(problem, answer.solution.point),
+        *tinted_alike(problem, answer.solution.point),
         *_brighter_than_white(answer),
         *_exposures_unlike_exif(answer),
     ]
 
 
 def undetermined_by_answer(
-    names: Sequence[str], problem: JointProblem, found: Materials, errors: Materials
+    names: Sequence[str], problem: JointProblem, estimate: Materials, errors: Materials
 ) -> list[str]:
     """Return sentences about observed materials that the data leave uncertain.
 
     Args:
         names: Names of all materials, by number.
         problem: Observations.
-        found: Estimated materials.
+        estimate: Estimated materials.
         errors: Their standard errors.
     """
-    seen = sorted({int(m) for block in problem.blocks for m in np.unique(block.material)})
-    return [sentence for m in seen for sentence in _error_warnings(names[m], found.rows()[m], errors.rows()[m])]
+    observed = sorted({int(m) for block in problem.blocks for m in np.unique(block.material)})
+    return [sentence for m in observed for sentence in _error_warnings(names[m], estimate.rows()[m], errors.rows()[m])]
 
 
-def _error_warnings(name: str, found: Float[np.ndarray, "7"], error: Float[np.ndarray, "7"]) -> Iterator[str]:
+def _error_warnings(name: str, estimate: Float[np.ndarray, "7"], error: Float[np.ndarray, "7"]) -> Iterator[str]:
     """Yield sentences about one material from its estimate and standard errors, both (k_d, k_s, roughness)."""
-    whole = (found[:3] + found[3:6]).max()
+    reflectance = (estimate[:3] + estimate[3:6]).max()
     largest = error[:6].max()
-    specular = found[3:6]
-    if whole < largest <= DARK_BOUND:
+    specular = estimate[3:6]
+    if reflectance < largest <= DARK_BOUND:
         yield (
-            f"material '{name}' is so dark that of its reflectance only a bound, about {whole + 2 * largest:.2g}, "
-            "can be given. A photo of longer exposure would help"
+            f"material '{name}' is so dark that of its reflectance only a bound, about "
+            f"{reflectance + 2 * largest:.2g}, can be given. A photo of longer exposure would help"
         )
-    elif not largest <= SHARE_ERROR * whole:
+    elif not largest <= SHARE_ERROR * reflectance:
         yield (
-            f"the reflectance of material '{name}' is known to ±{largest:.2g} only, of {whole:.2g}: diffuse and "
+            f"the reflectance of material '{name}' is known to ±{largest:.2g} only, of {reflectance:.2g}: diffuse and "
             "specular part look alike here. A photo in light with a small bright source, or next to a brighter "
             "material, would help"
         )
@@ -178,7 +173,7 @@ def _error_warnings(name: str, found: Float[np.ndarray, "7"], error: Float[np.nd
             "shape and photos disagree too much. A photo in light with a small bright source, or a better mesh, "
             "would help"
         )
-    elif found[6] <= ROUGHNESS[0] + 1e-9 and error[6] > 0:
+    elif estimate[6] <= ROUGHNESS[0] + 1e-9 and error[6] > 0:
         yield (
             f"the roughness of material '{name}' is at {ROUGHNESS[0]:g}, the least the model knows: it may be smoother"
         )
@@ -215,15 +210,14 @@ def tinted_alike(problem: JointProblem, point: Point) -> Iterator[str]:
     There is none where the gauge of `factorlib.inference.gauge` makes lights grey, or where a material or a light is
     known.
     """
-    blocks = problem.blocks
-    for members, illuminations in connected_components(blocks, len(point.materials)):
+    for members, illuminations in connected_components(problem.blocks, len(point.materials)):
         if (
             not illuminations
             or problem.known.free_factors(members, illuminations) < 3
-            or has_free_factor(blocks, illuminations)
+            or has_free_factor(problem.blocks, illuminations)
         ):
             continue
-        pairs = zip(blocks, point.lights, strict=True)
+        pairs = zip(problem.blocks, point.lights, strict=True)
         sums = np.array([light.energy.sum(0) for block, light in pairs if block.name in illuminations])
         level = np.log(np.maximum(sums, LEAST_ENERGY * sums.max(1, keepdims=True))).mean(0)
         if np.abs(level - level[1]).max() > LARGEST_TINT:
@@ -237,12 +231,13 @@ def tinted_alike(problem: JointProblem, point: Point) -> Iterator[str]:
 
 def _brighter_than_white(answer: Answer) -> Iterator[str]:
     """Yield a sentence for each material brighter than white beside known ones."""
-    found = answer.solution.point.materials
-    for name, whole in zip(answer.names, (found.diffuse.max(1) + found.specular.max(1)).tolist(), strict=True):
-        if whole > 1 and not answer.problem.known.is_empty:
+    materials = answer.solution.point.materials
+    reflectances = (materials.diffuse.max(1) + materials.specular.max(1)).tolist()
+    for name, reflectance in zip(answer.names, reflectances, strict=True):
+        if reflectance > 1 and not answer.problem.known.is_empty:
             yield (
-                f"material '{name}' comes out with diffuse + specular = {whole:.2f} beside what is known, more than "
-                "falls on it: are the known reflectances right, and of materials that the same light falls on?"
+                f"material '{name}' comes out with diffuse + specular = {reflectance:.2f} beside what is known, more "
+                "than falls on it: are the known reflectances right, and of materials that the same light falls on?"
             )
 
 

@@ -140,17 +140,19 @@ def light_from_map(lat_long: Float[np.ndarray, "h w 3"]) -> Light:
     """
     height, width = lat_long.shape[:2]
     rows = min(height, MAP_ROWS)
-    first = [-(-np.arange(count) * size // count) for count, size in ((rows, height), (2 * rows, width))]
+    edges = [-(-np.arange(count) * size // count) for count, size in ((rows, height), (2 * rows, width))]
     angle = np.repeat(lat_long_solid_angles(height, width)[:, None], width, axis=1)
     # radiance averaged over blocks of texels, weighted by solid angle
     sums = (angle[..., None] * lat_long, angle[..., None])
-    energy, angle = (np.add.reduceat(np.add.reduceat(of, first[0], axis=0), first[1], axis=1) for of in sums)
+    energy, angle = (np.add.reduceat(np.add.reduceat(values, edges[0], axis=0), edges[1], axis=1) for values in sums)
     directions = (lat_long_directions(rows, 2 * rows) @ YUP_FROM_CAMERA).reshape(-1, 3)
     light = fit_known_light(directions, (energy / angle).reshape(-1, 3), angle.reshape(-1))
     return msgspec.structs.replace(light, scale_free=True)
 
 
-def light_from_ball(seen: Observations, specular: Float[np.ndarray, "3"], rotation: Float[np.ndarray, "3 3"]) -> Light:
+def light_from_ball(
+    observations: Observations, specular: Float[np.ndarray, "3"], rotation: Float[np.ndarray, "3 3"]
+) -> Light:
     """Return the light that a mirror ball shows, in the radiance of its photo.
 
     The ball's diffuse reflectance is neglected.  All its pixels stand for the same solid angle, because from afar the
@@ -158,73 +160,77 @@ def light_from_ball(seen: Observations, specular: Float[np.ndarray, "3"], rotati
     object are not used.
 
     Args:
-        seen: Observations of the ball.
+        observations: Observations of the ball.
         specular: k_s of the ball.
         rotation: light_from_camera.
     """
-    mirror = mirror_directions(seen.normal.astype(float), seen.view.astype(float))
-    weight = seen.weight / np.maximum(1.0 if seen.confidence is None else seen.confidence, LEAST_SOLID_ANGLE)
-    usable = ~seen.clipped.any(1)
+    mirror = mirror_directions(observations.normal.astype(float), observations.view.astype(float))
+    weight = observations.weight / np.maximum(
+        1.0 if observations.confidence is None else observations.confidence, LEAST_SOLID_ANGLE
+    )
+    usable = ~observations.clipped.any(1)
     # keep pixels whose mirrored direction is not hidden by another object
-    if seen.visibility is not None:
-        nearest = np.argmax(mirror @ fibonacci_sphere(seen.visibility.shape[1]).T, axis=1)
-        usable &= seen.visibility[np.arange(len(seen)), nearest] == 255
+    if observations.visibility is not None:
+        nearest = np.argmax(mirror @ fibonacci_sphere(observations.visibility.shape[1]).T, axis=1)
+        usable &= observations.visibility[np.arange(len(observations)), nearest] == 255
     # equal-area projection: solid angle in proportion to pixels
     angle = 4 * np.pi * weight / weight.sum()
-    return fit_known_light(mirror[usable] @ rotation.T, seen.radiance[usable] / specular, angle[usable])
+    return fit_known_light(mirror[usable] @ rotation.T, observations.radiance[usable] / specular, angle[usable])
 
 
 def extract_known(
-    given: KnownSlice,
+    declared: KnownSlice,
     maps: Mapping[str, Float[np.ndarray, "h w 3"]],
-    shown: Mapping[str, Observations],
-    seen: Observations,
+    balls: Mapping[str, Observations],
+    observations: Observations,
     photos: Mapping[str, LightSlice],
 ) -> tuple[Observations, KnownValues]:
     """Return the observations without mirror balls, and the known values that the solver holds fixed.
 
     Args:
-        given: Known values in dataset.yaml.
+        declared: Known values in dataset.yaml.
         maps: Lat-long maps by illumination.
-        shown: All usable pixels of each ball's photo, at one exposure, by illumination.
-        seen: Observations.
+        balls: All usable pixels of each ball's photo, at one exposure, by illumination.
+        observations: Observations.
         photos: Illumination of each photo.
 
     Raises:
         InputError: If no observation shows a known material, or a ball's photo shows too little of the ball or nothing
             else.
     """
-    number = list(seen.materials).index
-    rows = {number(name): row for name, row in _known_rows(given, seen).items()}
+    number = list(observations.materials).index
+    rows = {number(name): row for name, row in _known_rows(declared, observations).items()}
     lights = {name: light_from_map(lat_long) for name, lat_long in maps.items()}
-    for name, ball in given.balls.items():
+    for name, ball in declared.balls.items():
         m = number(ball.material)
-        of_photo = seen.photo == seen.photos.index(ball.photo)
-        pixels = shown[name].take(shown[name].material == m)
-        rest = ~(of_photo & (seen.material == m))
-        if len(pixels) < LEAST_BALL_PIXELS or not (of_photo & rest).any():
+        of_photo = observations.photo == observations.photos.index(ball.photo)
+        pixels = balls[name].take(balls[name].material == m)
+        others = ~(of_photo & (observations.material == m))
+        if len(pixels) < LEAST_BALL_PIXELS or not (of_photo & others).any():
             fault = (
                 f"photo '{ball.photo}' shows {len(pixels)} pixels of the ball, "
-                f"and {(of_photo & rest).sum()} observations of other objects"
+                f"and {(of_photo & others).sum()} observations of other objects"
             )
             cure = f"the ball needs {LEAST_BALL_PIXELS}, and something beside it: look at the overlay of `align`"
             raise InputError(fault, key=f"known.illumination.{name}.chrome", cure=cure)
         world = photos[ball.photo].world_from_camera
         lights[name] = light_from_ball(pixels, rows[m][3:6], np.eye(3) if world is None else np.array(world))
-        seen = seen.take(rest)
-    return seen, KnownValues(rows, lights, tuple(sorted({photos[photo].illumination for photo in given.exposure})))
+        observations = observations.take(others)
+    return observations, KnownValues(
+        rows, lights, tuple(sorted({photos[photo].illumination for photo in declared.exposure}))
+    )
 
 
-def _known_rows(given: KnownSlice, seen: Observations) -> dict[str, Float[np.ndarray, "7"]]:
+def _known_rows(declared: KnownSlice, observations: Observations) -> dict[str, Float[np.ndarray, "7"]]:
     """Return k_d, k_s and roughness of the known materials, NaN where unknown.
 
     Raises:
         InputError: If no observation shows a known material.
     """
-    chrome = {ball.material for ball in given.balls.values()}
+    chrome = {ball.material for ball in declared.balls.values()}
     rows = {}
-    for name, known in given.materials.items():
-        if not (seen.material == list(seen.materials).index(name)).any():
+    for name, known in declared.materials.items():
+        if not (observations.material == list(observations.materials).index(name)).any():
             cure = "look at its mask and at the overlays of `align`: both must show it at the same place"
             raise InputError(f"no observation shows material '{name}'", key=f"known.materials.{name}", cure=cure)
         roughness = known.roughness or (ROUGHNESS[0] if name in chrome else np.nan)

@@ -131,22 +131,17 @@ class Light(msgspec.Struct, frozen=True):
         """
         axis = self.axis[~self.suns]
         peaks = np.full(len(self), PEAK)[~self.suns]
-        all_ = np.full(len(self), SUN_PEAK)
+        result = np.full(len(self), SUN_PEAK)
         overlap = np.exp(self.sharpness[~self.suns] * (axis @ axis.T - 1))
         for _ in range(SCALINGS):
             peaks /= np.sqrt(overlap @ peaks)
-        all_[~self.suns] = peaks
-        return all_
-
-    @property
-    def unit_energy(self) -> Float[np.ndarray, " p"]:
-        """Energy of each lobe at weight one, over 2π; steradians."""
-        return lobe_integral(self.sharpness) / (2 * np.pi)
+        result[~self.suns] = peaks
+        return result
 
     @property
     def energy(self) -> Float[np.ndarray, "p 3"]:
         """Energy of each lobe over 2π, in the illumination's radiance unit times steradians."""
-        return self.weight * self.unit_energy[:, None]
+        return self.weight * (lobe_integral(self.sharpness) / (2 * np.pi))[:, None]
 
     @property
     def unknowns(self) -> int:
@@ -175,9 +170,9 @@ class Light(msgspec.Struct, frozen=True):
             weight=np.vstack([self.weight, weight]),
         )
 
-    def take(self, which: Bool[np.ndarray, " p"] | slice) -> Light:
+    def take(self, selected: Bool[np.ndarray, " p"] | slice) -> Light:
         """Return the light of the selected lobes."""
-        lobes = {name: getattr(self, name)[which] for name in ("axis", "log_sharpness", "weight")}
+        lobes = {name: getattr(self, name)[selected] for name in ("axis", "log_sharpness", "weight")}
         return msgspec.structs.replace(self, **lobes)
 
     def brightest_cells(self, count: int, spacing: float) -> Bool[np.ndarray, " p"]:
@@ -188,36 +183,34 @@ class Light(msgspec.Struct, frozen=True):
         energy = np.where(self.spacing > spacing, self.energy.sum(1), 0.0)
         return np.isin(np.arange(len(self)), np.argsort(-energy, kind="stable")[:count]) & (energy > 0)
 
-    def split(self, which: Bool[np.ndarray, " p"]) -> Light:
+    def split(self, selected: Bool[np.ndarray, " p"]) -> Light:
         """Return the light with each selected cell replaced by smaller cells of its radiance.
 
         The smaller cells follow all others.  The module docstring states the rule.
         """
-        count = np.where(which, np.rint(self.sharpness * 4 * np.pi * WIDTH**2), 0).astype(int)
+        count = np.where(selected, np.rint(self.sharpness * 4 * np.pi * WIDTH**2), 0).astype(int)
         parents = [np.zeros(0, int)]
         finer = [UnitLobes(np.zeros((0, 3)), np.zeros(0))]
-        for n in np.unique(count[which]).tolist():
+        for n in np.unique(count[selected]).tolist():
             cells = fibonacci_cells(4 * n)
-            own = np.flatnonzero(count == n)
+            parents_of_size = np.flatnonzero(count == n)
             # even cells near a splitting cell; each one replaces the cell that is nearest in spacings
-            near = cells.axis[(cells.axis @ self.axis[own].T).max(1) > 1 - 2 * 4 * np.pi / n]  # within two spacings
-            nearest = np.argmin(self.sharpness * (1 - near @ self.axis.T), axis=1)
+            candidates = cells.axis[
+                (cells.axis @ self.axis[parents_of_size].T).max(1) > 1 - 2 * 4 * np.pi / n
+            ]  # within two spacings
+            nearest = np.argmin(self.sharpness * (1 - candidates @ self.axis.T), axis=1)
             parents.append(nearest[count[nearest] == n])
-            finer.append(UnitLobes(near[count[nearest] == n], np.full(len(parents[-1]), cells.sharpness[0])))
+            finer.append(UnitLobes(candidates[count[nearest] == n], np.full(len(parents[-1]), cells.sharpness[0])))
         parent = np.concatenate(parents)
         u = self.log_radiance
-        kept = ~np.isin(np.arange(len(self)), parent)
+        unsplit = ~np.isin(np.arange(len(self)), parent)
         light = msgspec.structs.replace(
             self,
-            axis=np.vstack([self.axis[kept], *(cells.axis for cells in finer)]),
-            log_sharpness=np.log(np.concatenate([self.sharpness[kept], *(cells.sharpness for cells in finer)])),
-            weight=np.zeros((kept.sum() + len(parent), 3)),
+            axis=np.vstack([self.axis[unsplit], *(cells.axis for cells in finer)]),
+            log_sharpness=np.log(np.concatenate([self.sharpness[unsplit], *(cells.sharpness for cells in finer)])),
+            weight=np.zeros((unsplit.sum() + len(parent), 3)),
         )
-        return light.with_log_radiance(np.hstack([u[:, kept], u[:, parent]]))
-
-    def with_curves(self) -> Light:
-        """Return the light with a tone curve for each photo, initially the identity."""
-        return msgspec.structs.replace(self, log_tone=np.zeros_like(self.log_exposure))
+        return light.with_log_radiance(np.hstack([u[:, unsplit], u[:, parent]]))
 
     @property
     def implausible_tone(self) -> bool:

@@ -27,14 +27,15 @@ from typing import NamedTuple
 import msgspec
 import numpy as np
 from jaxtyping import Bool, Float, Int
+from scipy.linalg import cho_factor, cho_solve
 
-from factorlib.inference.arrow import Arrow, System, solve_cholesky
 from factorlib.inference.lights import TONE_RANGE, Light
-from factorlib.inference.likelihood import LightLikelihood
+from factorlib.inference.likelihood import LightLikelihood, System, solve_cholesky
 from factorlib.inference.materials import LEAST_REFLECTANCE, ROUGHNESS
 from factorlib.inference.priors import MaterialPrior, PriorTerms, materials_from_unknowns
 from factorlib.inference.problem import Spread
 
+FLOOR = 1e-9  # share of the largest diagonal entry that is added to every diagonal entry
 LARGEST_CHANGE = np.array([0.7] * 6 + [0.1])  # largest change of a material's unknowns on one factorisation
 LARGEST_STEP = 1.5  # largest change of an unknown in one cheap step
 LEAST_SLOPE_SHARE = 0.1  # least share of the slope that a clipped direction must keep
@@ -53,8 +54,61 @@ DECREMENT_SHARE = 0.02
 SUFFICIENT = 1e-4  # least decrease in a line search, as a share of the slope
 SHORTEST = 1e-3  # a line search ends below this share of the step
 
+Vector = Float[np.ndarray, " k"]
 LossReport = Callable[[float], None]  # called at every factorisation, with the mean robust loss there
 Objective = Callable[[np.ndarray], tuple[float, np.ndarray]]  # value and half the gradient
+
+
+class Arrow:
+    """Factorised H of many lights; H⁻¹ of a vector costs two triangular solves a light.
+
+    H = [[M, C_1 … C_k], [C_iᵀ, L_i]] has arrow shape: each light is coupled to the materials it illuminates, and to no
+    other light.  The gradients are g_m and g_i.  Eliminating every light leaves
+
+        (M − Σ C_i L_i⁻¹ C_iᵀ) dm = −(g_m − Σ C_i L_i⁻¹ (g_i + d_i)),      dl_i = −L_i⁻¹ (g_i + C_iᵀ dm)            (3)
+
+    d_i is a gradient with respect to the light that acts on the materials only (`factorlib.inference.likelihood`).
+    C_i has rows only for the materials that light i illuminates.  Rows and columns of known unknowns and of unknowns
+    at a bound are removed.  Damping multiplies the diagonal, so that a step does not depend on the units of an unknown.
+
+    Args:
+        systems: Contribution of each light.
+        prior: Half the Hessian of the prior on materials.
+        free: Mask of the material unknowns that may move.
+        damping: Multiple of the materials' diagonal that is added to it.
+    """
+
+    def __init__(
+        self,
+        systems: Sequence[System],
+        prior: Float[np.ndarray, "k k"],
+        free: Bool[np.ndarray, " k"],
+        damping: float = 0.0,
+    ):
+        self.systems = systems
+        self.free = np.flatnonzero(free)
+        self.coupling = [solve_cholesky(part.factor, part.cross_hessian.T) for part in systems]  # L⁻¹Cᵀ
+        # M − Σ C_i L_i⁻¹ C_iᵀ, (3), damped
+        schur = prior.copy()
+        self.diagonal = np.zeros(len(prior))
+        for part, coupling in zip(systems, self.coupling, strict=True):
+            schur[np.ix_(part.places, part.places)] += part.material_hessian - part.cross_hessian @ coupling
+            self.diagonal[part.places] += np.diag(part.material_hessian)
+        self.diagonal += np.diag(prior)
+        schur += np.diag(damping * self.diagonal + FLOOR * self.diagonal.max(initial=1e-30))
+        self.schur = cho_factor(((schur + schur.T) / 2)[np.ix_(self.free, self.free)], check_finite=False)
+
+    def solve(self, by_materials: Vector, by_lights: Sequence[Vector]) -> tuple[Vector, list[Vector]]:
+        """Return H⁻¹ g, by (3)."""
+        # L_i⁻¹ g_i, then dm by the Schur complement, then L_i⁻¹ (g_i − C_iᵀ dm)
+        light_steps = [solve_cholesky(part.factor, g) for part, g in zip(self.systems, by_lights, strict=True)]
+        reduced = by_materials.copy()
+        step = np.zeros_like(by_materials)
+        for part, light_step in zip(self.systems, light_steps, strict=True):
+            reduced[part.places] -= part.cross_hessian @ light_step
+        step[self.free] = cho_solve(self.schur, reduced[self.free], check_finite=False)
+        lights = zip(self.systems, light_steps, self.coupling, strict=True)
+        return step, [light_step - coupling @ step[part.places] for part, light_step, coupling in lights]
 
 
 class DescentState(NamedTuple):
@@ -116,7 +170,7 @@ class Descent(msgspec.Struct, frozen=True):
     def linearise(self, likelihoods: Sequence[LightLikelihood], theta: Float[np.ndarray, "m 7"]) -> DescentState:
         """Return the normal equations of all lights at some materials, determinants included."""
         materials = materials_from_unknowns(theta)
-        moved = [one.with_point(materials=materials) for one in likelihoods]
+        moved = [likelihood.with_point(materials=materials) for likelihood in likelihoods]
         return self._state(theta, moved, list(self.spread(LightLikelihood.normal_equations, moved)))
 
     def _state(
@@ -124,7 +178,7 @@ class Descent(msgspec.Struct, frozen=True):
     ) -> DescentState:
         """Return the state with these systems, and report its mean robust loss."""
         prior = self.prior.evaluate(theta)
-        values = sum(3 * int((~one.illumination.block.held_out).sum()) for one in likelihoods)
+        values = sum(3 * int((~likelihood.illumination.block.held_out).sum()) for likelihood in likelihoods)
         self.report(sum(system.loss for system in systems) / max(values, 1))
         return DescentState(theta, likelihoods, sum(system.value for system in systems) + prior.value, systems, prior)
 
@@ -150,18 +204,19 @@ class Descent(msgspec.Struct, frozen=True):
             """Return θ and the lights after a step of all unknowns."""
             of_materials, *of_lights = np.split(step, ends)
             change = of_materials.reshape(-1, 7).clip(-LARGEST_CHANGE, LARGEST_CHANGE)
-            there = (state.theta + change).clip(LOWER_BOUNDS, UPPER_BOUNDS)
-            pairs = zip(state.likelihoods, of_lights, strict=True)
-            return there, [
-                one.with_point(step_light(one.light, own), materials_from_unknowns(there)) for one, own in pairs
+            theta = (state.theta + change).clip(LOWER_BOUNDS, UPPER_BOUNDS)
+            light_steps = zip(state.likelihoods, of_lights, strict=True)
+            return theta, [
+                likelihood.with_point(step_light(likelihood.light, light_step), materials_from_unknowns(theta))
+                for likelihood, light_step in light_steps
             ]
 
         def objective(step: np.ndarray) -> tuple[float, np.ndarray]:
             """Return (2) and half its gradient."""
-            there, likelihoods = moved(step)
-            prior = self.prior.evaluate(there)
+            theta, likelihoods = moved(step)
+            prior = self.prior.evaluate(theta)
             parts = list(self.spread(LightLikelihood.gradient, likelihoods))
-            off = (there - state.theta).reshape(-1)
+            off = (theta - state.theta).reshape(-1)
             value = prior.value + sum(part.value for part in parts) + off @ (2 * by_determinant + penalty @ off)
             slope = prior.gradient + by_determinant + penalty @ off
             slope = slope + sum(part.by_materials for part in parts).reshape(-1)
@@ -178,27 +233,27 @@ class Descent(msgspec.Struct, frozen=True):
         return likelihoods, theta
 
 
-def descend_light(one: LightLikelihood, iterations: int) -> tuple[LightLikelihood, System]:
+def descend_light(likelihood: LightLikelihood, iterations: int) -> tuple[LightLikelihood, System]:
     """Return a light at the minimum of φ, materials given, and its normal equations there."""
-    system = one.normal_equations(materials_given=True)
+    system = likelihood.normal_equations(materials_given=True)
     for _ in range(iterations):
 
-        def objective(step: np.ndarray, begun: LightLikelihood = one) -> tuple[float, np.ndarray]:
+        def objective(step: np.ndarray, start: LightLikelihood = likelihood) -> tuple[float, np.ndarray]:
             """Return φ and half its gradient."""
-            there = begun.with_point(step_light(begun.light, step)).gradient()
-            return there.value, there.by_light
+            gradient = start.with_point(step_light(start.light, step)).gradient()
+            return gradient.value, gradient.by_light
 
         def metric(slope: np.ndarray, factor: np.ndarray = system.factor) -> np.ndarray:
             """Return H⁻¹ times a gradient."""
             return solve_cholesky(factor, slope)
 
         step = minimise_lbfgs(objective, len(system.light_gradient), metric)
-        one = one.with_point(step_light(one.light, step))
-        before = system.value
-        system = one.normal_equations(materials_given=True)
-        if before - system.value < TOLERANCE * abs(before):
+        likelihood = likelihood.with_point(step_light(likelihood.light, step))
+        previous = system.value
+        system = likelihood.normal_equations(materials_given=True)
+        if previous - system.value < TOLERANCE * abs(previous):
             break
-    return one, system
+    return likelihood, system
 
 
 def determinant_terms(systems: Sequence[System], size: int) -> tuple[Float[np.ndarray, " k"], Float[np.ndarray, "k k"]]:

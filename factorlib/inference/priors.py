@@ -117,11 +117,11 @@ class Mixture:
     def __init__(
         self, classes: Sequence[MaterialClass], relative: float = 0.0, rough: float = CLASS_ROUGHNESS_DEVIATION
     ):
-        self.names = [one.name for one in classes]
+        self.names = [material_class.name for material_class in classes]
         slack = np.diag([SCALE_DEVIATION**2 + relative**2, rough**2])
-        covariances = [np.array(one.covariance) + slack for one in classes]
-        tints = np.array([one.tint**2 + WHITE_DEVIATION**2 + relative**2 for one in classes])
-        self.mean = np.array([[one.mean[0]] * 3 + [one.mean[1]] for one in classes])
+        covariances = [np.array(material_class.covariance) + slack for material_class in classes]
+        tints = np.array([material_class.tint**2 + WHITE_DEVIATION**2 + relative**2 for material_class in classes])
+        self.mean = np.array([[material_class.mean[0]] * 3 + [material_class.mean[1]] for material_class in classes])
         self.precision = np.zeros((len(classes), 4, 4))
         # precision of (log k_s, roughness), [4, 4] a class
         for P, covariance, variance in zip(self.precision, covariances, tints, strict=True):
@@ -130,7 +130,7 @@ class Mixture:
             P[:3, 3] = P[3, :3] = inverse[0, 1] / 3
             P[3, 3] = inverse[1, 1]
         determinants = np.array([np.linalg.slogdet(covariance)[1] for covariance in covariances])
-        shares = np.array([one.share for one in classes])
+        shares = np.array([material_class.share for material_class in classes])
         self.constant = determinants + 2 * np.log(tints) - 2 * np.log(shares)
 
     def evaluate(
@@ -183,8 +183,8 @@ class MaterialPrior:
         gradient = off * self.wide
         hessians = np.tile(np.diag(self.wide), (len(theta), 1, 1))
         for m in self.specular:
-            more, slope, curvature, _ = self.mixture.evaluate(theta[m, 3:])
-            value = value + more
+            energy, slope, curvature, _ = self.mixture.evaluate(theta[m, 3:])
+            value = value + energy
             gradient[m, 3:] = gradient[m, 3:] + slope
             hessians[m, 3:, 3:] += curvature
         gradient = gradient.reshape(-1)

@@ -16,11 +16,10 @@ import msgspec
 import numpy as np
 from jaxtyping import Float
 
-from factorlib.inference.blocks import Block
+from factorlib.inference.blocks import Block, RobustLoss
 from factorlib.inference.forward import Illumination
 from factorlib.inference.known import KnownValues
 from factorlib.inference.materials import Point
-from factorlib.inference.noise import RobustLoss
 from factorlib.inference.responses import ResponseCache
 from factorlib.reflection.operator import Operator
 from factorlib.stage import serial_map
@@ -66,17 +65,17 @@ class JointProblem(msgspec.Struct, frozen=True):
         """Return whitened residuals of all observations, block by block, one-sided where clipped."""
         return [illumination.residuals() for illumination in self.illuminations(point)]
 
-    def held_out_losses(self, point: Point) -> list[Float[np.ndarray, " n"]]:
-        """Return the robust loss of each held-out observation, block by block.
+    def held_out(self) -> JointProblem:
+        """Return the problem of the held-out observations; of all of them if none is held out."""
+        return self.with_blocks([block.take(block.held_out | self.none_held_out) for block in self.blocks])
 
-        If no observation is held out, return the loss of each observation.
-        """
-        judged = self.with_blocks([block.take(block.held_out | self.none_held_out) for block in self.blocks])
-        return [illumination.losses(self.loss) for illumination in judged.illuminations(point)]
+    def losses(self, point: Point) -> list[Float[np.ndarray, " n"]]:
+        """Return the robust loss of each observation, block by block."""
+        return [illumination.losses(self.loss) for illumination in self.illuminations(point)]
 
     def held_out_loss(self, point: Point) -> float:
         """Return the mean robust loss per held-out channel value; of all values if none is held out."""
-        losses = np.concatenate(self.held_out_losses(point))
+        losses = np.concatenate(self.held_out().losses(point))
         return float(losses.mean()) if len(losses) else 0.0
 
     @property
@@ -108,10 +107,6 @@ class JointProblem(msgspec.Struct, frozen=True):
     def with_effects(self, shadows: bool, bounces: bool) -> JointProblem:
         """Return the problem with shadows or interreflection switched off where the argument is False."""
         return self.with_blocks([block.with_effects(shadows, bounces) for block in self.blocks])
-
-    def with_none_held_out(self) -> JointProblem:
-        """Return the problem with no observation held out."""
-        return self.with_blocks([block.with_none_held_out() for block in self.blocks])
 
     def with_blocks(self, blocks: list[Block]) -> JointProblem:
         """Return the problem with other observations."""

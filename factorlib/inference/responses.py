@@ -54,8 +54,8 @@ def diffuse_response(block: Block, rows: Rows, lobes: UnitLobes, operator: Opera
     nz, _, larger = lobe_cosines(block, rows, lobes)
     with torch.no_grad():
         response = operator.diffuse(_tensor(lobes.sharpness, operator), _tensor(nz, operator))
-        seen = larger * apply_shadows(response, block, rows, lobes).double().numpy()
-        return seen if block.detail is None else seen * block.detail[rows][:, None]
+        shadowed = larger * apply_shadows(response, block, rows, lobes).double().numpy()
+        return shadowed if block.detail is None else shadowed * block.detail[rows][:, None]
 
 
 def specular_response(
@@ -122,17 +122,17 @@ def apply_shadows(
     )
     for k in np.unique(photo[hidden]):
         directions = torch.from_numpy(block.directions[k]).float()
-        own = np.flatnonzero(hidden & (photo == k))
-        lit = kernel(directions, axis, sharpness)
+        shadowed = np.flatnonzero(hidden & (photo == k))
+        lobe_values = kernel(directions, axis, sharpness)
         # v of (1) or u of (2) of factorlib.light.visibility, for as many observations as fit in the cache
-        for some in np.split(own, range(SHADOW_ROWS, len(own), SHADOW_ROWS)):
+        for chunk in np.split(shadowed, range(SHADOW_ROWS, len(shadowed), SHADOW_ROWS)):
             weights = (
-                cosine_weights(normal[some], directions)
+                cosine_weights(normal[chunk], directions)
                 if roughness is None
-                else highlight_weights(normal[some], view[some], directions, float(roughness))
+                else highlight_weights(normal[chunk], view[chunk], directions, float(roughness))
             )
-            share = visible_share(torch.from_numpy(visibility[some]).float() / 255, weights, lit)
-            response[some] *= share.to(response.dtype)
+            share = visible_share(torch.from_numpy(visibility[chunk]).float() / 255, weights, lobe_values)
+            response[chunk] *= share.to(response.dtype)
     return response
 
 
@@ -217,8 +217,8 @@ class ResponseTable:
 
     def rows(self, m: int) -> slice:
         """Return the rows of material m, which are contiguous."""
-        first, last = np.searchsorted(self.block.material, [m, m + 1])
-        return slice(int(first), int(last))
+        start, stop = np.searchsorted(self.block.material, [m, m + 1])
+        return slice(int(start), int(stop))
 
     def interpolate(self, m: int, roughness: float) -> Responses:
         """Return the responses of material m at a roughness."""
@@ -227,12 +227,12 @@ class ResponseTable:
                 self._stacks[m] = 0, np.stack([self._diffuse_of(m), self._evaluate(m, roughness)])
             return Responses(self._stacks[m][1], np.ones(1), np.zeros(1))
         # cubic interpolation between the four nearest nodes, in log roughness
-        first = int(np.clip(np.searchsorted(self.nodes, roughness) - 2, 0, len(self.nodes) - DEGREE - 1))
-        nodes = self.nodes[first : first + DEGREE + 1]
+        start = int(np.clip(np.searchsorted(self.nodes, roughness) - 2, 0, len(self.nodes) - DEGREE - 1))
+        nodes = self.nodes[start : start + DEGREE + 1]
         share, slope = lagrange_weights(np.log(nodes), float(np.log(roughness)))
-        if self._stacks.get(m, (None,))[0] != first:
-            known = [self._specular_at_node(m, first + k) for k in range(DEGREE + 1)]
-            self._stacks[m] = first, np.stack([self._diffuse_of(m), *known])
+        if self._stacks.get(m, (None,))[0] != start:
+            known = [self._specular_at_node(m, start + k) for k in range(DEGREE + 1)]
+            self._stacks[m] = start, np.stack([self._diffuse_of(m), *known])
         return Responses(self._stacks[m][1], share, slope / roughness)
 
     def _diffuse_of(self, m: int) -> Float[np.ndarray, "n p"]:
@@ -243,12 +243,12 @@ class ResponseTable:
 
     def _specular_at_node(self, m: int, node: int) -> Float[np.ndarray, "n p"]:
         """Return S of material m at a node; the `CACHED_NODES` nearest nodes stay in memory."""
-        kept = self._specular.setdefault(m, {})
-        if node not in kept:
-            for far in sorted(kept, key=lambda k: abs(k - node))[CACHED_NODES - 1 :]:
-                del kept[far]
-            kept[node] = self._evaluate(m, float(self.nodes[node]))
-        return kept[node]
+        cached = self._specular.setdefault(m, {})
+        if node not in cached:
+            for distant in sorted(cached, key=lambda k: abs(k - node))[CACHED_NODES - 1 :]:
+                del cached[distant]
+            cached[node] = self._evaluate(m, float(self.nodes[node]))
+        return cached[node]
 
     def _evaluate(self, m: int, roughness: float | None) -> Float[np.ndarray, "n p"]:
         """Return S of material m at a roughness, or D if that is None."""
@@ -274,7 +274,7 @@ class ResponseCache:
         self._lock = Lock()  # lights are spread over threads
 
     def get(
-        self, block: Block, lobes: UnitLobes, operator: Operator, given: Float[np.ndarray, " m"] | None = None
+        self, block: Block, lobes: UnitLobes, operator: Operator, fixed_roughness: Float[np.ndarray, " m"] | None = None
     ) -> ResponseTable:
         """Return the table of a block.
 
@@ -282,16 +282,22 @@ class ResponseCache:
             block: Observations.
             lobes: Lobes of weight one.
             operator: Reflection operator.
-            given: Roughness of all materials if it does not change; otherwise None.
+            fixed_roughness: Roughness of all materials if it does not change; otherwise None.
         """
-        optional = (block.visibility, block.directions, block.detail, block.place if lobes.curvature else None, given)
+        optional = (
+            block.visibility,
+            block.directions,
+            block.detail,
+            block.place if lobes.curvature else None,
+            fixed_roughness,
+        )
         arrays = [block.normal, block.view, block.material, block.photo, lobes.axis, lobes.sharpness, *optional]
         digest = blake2b(repr((id(operator), lobes.curvature, [of is None for of in optional])).encode())
         for array in arrays:
             digest.update(b"" if array is None else np.ascontiguousarray(array).data)
         key = digest.digest()
         with self._lock:
-            table = self._tables.pop(key, None) or ResponseTable(block, lobes, operator, given is not None)
+            table = self._tables.pop(key, None) or ResponseTable(block, lobes, operator, fixed_roughness is not None)
             self._tables[key] = table
             while len(self._tables) > CACHED_TABLES:
                 self._tables.popitem(last=False)
@@ -310,8 +316,11 @@ def lagrange_weights(
     slope = []
     points = nodes.tolist()
     for a, node in enumerate(points):
-        others = points[:a] + points[a + 1 :]
-        below = prod(node - other for other in others)
-        value.append(prod(x - other for other in others) / below)
-        slope.append(sum(prod(x - other for other in others[:b] + others[b + 1 :]) for b in range(len(others))) / below)
+        other_nodes = points[:a] + points[a + 1 :]
+        below = prod(node - node_b for node_b in other_nodes)
+        value.append(prod(x - node_b for node_b in other_nodes) / below)
+        slope.append(
+            sum(prod(x - node_b for node_b in other_nodes[:b] + other_nodes[b + 1 :]) for b in range(len(other_nodes)))
+            / below
+        )
     return np.array(value), np.array(slope)

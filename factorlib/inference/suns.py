@@ -26,15 +26,14 @@ import numpy as np
 from jaxtyping import Float
 
 from factorlib.geometry.sphere import fibonacci_sphere
-from factorlib.inference.evidence import CLEARLY_AGAINST, WEAKLY_FOR, Losses, compare_models
+from factorlib.inference.blocks import RobustLoss
 from factorlib.inference.fit import ROBUST, Fit, FitSchedule
+from factorlib.inference.fit_runner import FitRunner
 from factorlib.inference.forward import Illumination
 from factorlib.inference.lights import Light, UnitLobes
 from factorlib.inference.materials import Point
-from factorlib.inference.model_selection import Selection
-from factorlib.inference.noise import RobustLoss
+from factorlib.inference.model_selection import CLEARLY_AGAINST, WEAKLY_FOR, Losses, Selection, compare_models
 from factorlib.inference.problem import JointProblem
-from factorlib.inference.resume import FitRunner
 from factorlib.light.lobes import SUN
 from factorlib.results.materials import Decision
 
@@ -59,24 +58,26 @@ def select_suns(problem: JointProblem, fit: Fit, run: FitRunner) -> Selection:
         fit: Fit of the lights.
         run: Runner of the fits.
     """
-    before = problem.illuminations(fit.point)
-    tried = list(problem.spread(partial(replace_brightest, sharpness=SUN), before))
-    evidence = [Decision(bool(one.light.suns.any())) for one in before]
-    if all(light is one.light for light, one in zip(tried, before, strict=True)):
+    without_suns = problem.illuminations(fit.point)
+    candidates = list(problem.spread(partial(replace_brightest, sharpness=SUN), without_suns))
+    evidence = [Decision(bool(one.light.suns.any())) for one in without_suns]
+    if all(light is one.light for light, one in zip(candidates, without_suns, strict=True)):
         return Selection(fit, evidence)
-    trial = run.fit_and_report("suns", problem, fit.with_lights(tried), AROUND_SUNS)
-    after = problem.illuminations(trial.point)
-    for k, (cells, sun) in enumerate(zip(before, after, strict=True)):
-        if tried[k] is not cells.light:
+    trial = run.fit_and_report("suns", problem, fit.with_lights(candidates), AROUND_SUNS)
+    with_suns = problem.illuminations(trial.point)
+    for k, (cells, sun) in enumerate(zip(without_suns, with_suns, strict=True)):
+        if candidates[k] is not cells.light:
             evidence[k] = accept_sun(cells, sun)
-    asked = [k for k, one in enumerate(evidence) if one.kept and one.margin is not None]
-    if asked:
-        wide = list(problem.spread(partial(replace_brightest, sharpness=WIDE_SHARPNESS), [before[k] for k in asked]))
-        begun = Fit(Point(fit.point.materials, wide), [fit.hyperparameters[k] for k in asked])
-        problem = problem.select_lights(asked)
-        other = problem.illuminations(run.fit_and_report("suns", problem, begun, AROUND_SUNS).point)
-        for k, one in zip(asked, other, strict=True):
-            narrow = compare_illuminations(one, after[k], CLEARLY_AGAINST)
+    accepted = [k for k, one in enumerate(evidence) if one.kept and one.margin is not None]
+    if accepted:
+        wide = list(
+            problem.spread(partial(replace_brightest, sharpness=WIDE_SHARPNESS), [without_suns[k] for k in accepted])
+        )
+        start = Fit(Point(fit.point.materials, wide), [fit.hyperparameters[k] for k in accepted])
+        problem = problem.select_lights(accepted)
+        wide_lights = problem.illuminations(run.fit_and_report("suns", problem, start, AROUND_SUNS).point)
+        for k, one in zip(accepted, wide_lights, strict=True):
+            narrow = compare_illuminations(one, with_suns[k], CLEARLY_AGAINST)
             evidence[k] = evidence[k] if narrow.kept else narrow
     lights, hyperparameters = (
         [new if one.kept else old for one, new, old in zip(evidence, *both, strict=True)]
@@ -91,8 +92,7 @@ def replace_brightest(illumination: Illumination, sharpness: float) -> Light:
     The light is unchanged if it already has a sun, if it is known, or if its cells are larger than `RING_RADIUS`.
     """
     light = illumination.light
-    block = illumination.block
-    if light.suns.any() or light.fixed.any() or not len(block):
+    if light.suns.any() or light.fixed.any() or not len(illumination.block):
         return light
     # brightest direction z of the blurred light, and the ring about it
     overlap = np.exp(BLUR_SHARPNESS * (light.axis @ light.axis.T - 1))
@@ -104,33 +104,33 @@ def replace_brightest(illumination: Illumination, sharpness: float) -> Light:
         return light
     # replace the brightest cells by the median of the ring
     u[:, away < DISC_RADIUS] = np.median(u[:, ring], axis=1)[:, None]
-    without = msgspec.structs.replace(illumination, light=light.with_log_radiance(u))
-    residual = without.residuals()
-    whole = illumination.residuals()
-    trust = np.sqrt(ROBUST.weights(whole) * ~(block.clipped & (whole >= 0)))
+    dimmed = msgspec.structs.replace(illumination, light=light.with_log_radiance(u))
+    residual = dimmed.residuals()
+    original_residual = illumination.residuals()
+    trust = np.sqrt(ROBUST.weights(original_residual) * ~(illumination.block.clipped & (original_residual >= 0)))
     # (1): for each z of the grid, w = max(−Σ t² A r, 0)/Σ t² A² by channel
     for radius, step in GRIDS:
         grid = UnitLobes(axes := _grid_around(z, radius, step), np.full(len(axes), sharpness), light.curvature)
-        A = without.unit_responses(np.arange(len(block)), grid) * trust.T[:, :, None]  # [3, n, q]
+        A = dimmed.unit_responses(np.arange(len(illumination.block)), grid) * trust.T[:, :, None]  # [3, n, q]
         along = np.einsum("cnq,nc->cq", A, trust * residual)
         size = np.einsum("cnq,cnq->cq", A, A)
         weight = np.maximum(-along, 0) / np.maximum(size, 1e-30)
         best = int(np.argmax((weight**2 * size).sum(0)))  # decrease of (1)
         z = axes[best]
         w = weight[:, best]
-    return without.light.with_lobes(UnitLobes(z[None], np.array([sharpness])), w)
+    return dimmed.light.with_lobes(UnitLobes(z[None], np.array([sharpness])), w)
 
 
-def compare_illuminations(without: Illumination, richer: Illumination, least: float) -> Decision:
+def compare_illuminations(simpler: Illumination, richer: Illumination, least: float) -> Decision:
     """Return the evidence of all observations for one light against another.
 
     Args:
-        without: Observations in the simpler light.
+        simpler: Observations in the simpler light.
         richer: Observations in the richer light.
         least: Threshold in standard errors.
     """
     number = richer.block.clusters()
-    losses = [Losses([one.losses(RobustLoss())], [number]) for one in (without, richer)]
+    losses = [Losses([illumination.losses(RobustLoss())], [number]) for illumination in (simpler, richer)]
     return compare_models(losses[0], losses[1], least)
 
 
@@ -143,9 +143,9 @@ def accept_sun(cells: Illumination, sun: Illumination) -> Decision:
     evidence = compare_illuminations(cells, sun, WEAKLY_FOR)
     clear = (evidence.held_out_loss_without or 0.0) > (1 + LEAST_SUN_GAIN) * (evidence.held_out_loss_with or 0.0)
     energy = sun.light.energy[sun.light.suns].sum(0)
-    all_ = sun.light.energy.sum(0)
-    strong = energy.sum() >= LEAST_SUN_SHARE * all_.sum()
-    warm = energy[2] * all_[0] <= all_[2] * energy[0]
+    total = sun.light.energy.sum(0)
+    strong = energy.sum() >= LEAST_SUN_SHARE * total.sum()
+    warm = energy[2] * total[0] <= total[2] * energy[0]
     return msgspec.structs.replace(evidence, kept=bool(evidence.kept and clear and strong and warm))
 
 

@@ -10,8 +10,8 @@ stiffness   For each of `TURN_STIFFNESSES`, from stiff to soft, and for every fo
             normals could turn toward the cells' centres in all photos at once.
 decision    Turns are kept under two conditions: the likelihood is higher than without them, and they explain the
             photos' held-out observations better by more than `CLEARLY_FOR` standard errors over clusters
-            (`factorlib.inference.evidence`).  Of several meshes, one stays as it is if its turns alone do not improve
-            both.
+            (`factorlib.inference.model_selection`).  Of several meshes, one stays as it is if its turns alone do not
+            improve both.
 paint       Factors on the diffuse reflectance are chosen likewise, with a stiffness of `FACTOR_STIFFNESSES`, in
             addition to the turns.  They are kept if the likelihood is higher by more than `CLEARLY_FOR` standard errors
             over photos and held-out observations are explained better.  The likelihood is the finer measure.  It
@@ -23,19 +23,27 @@ surface     The result is the displacement whose normals are nearest to the turn
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Sequence
 from itertools import count
 from typing import NamedTuple
 
 import msgspec
 import numpy as np
-from jaxtyping import Bool, Float
-from scipy.sparse import block_diag, csr_array
+from jaxtyping import Float
+from scipy.sparse import csr_array
 
-from factorlib.inference.evidence import CLEARLY_AGAINST, CLEARLY_FOR, Losses, compare_models, held_out_losses
 from factorlib.inference.fit import Fit, FitSchedule, fit_problem, light_likelihood, reliable_observations
 from factorlib.inference.materials import Point
-from factorlib.inference.model_selection import TRIAL, TRIAL_CELLS, select_effects
+from factorlib.inference.model_selection import (
+    CLEARLY_AGAINST,
+    CLEARLY_FOR,
+    TRIAL,
+    TRIAL_CELLS,
+    Losses,
+    compare_models,
+    held_out_losses,
+    select_effects,
+)
 from factorlib.inference.optimizer import descend_light
 from factorlib.inference.options import SolveOptions
 from factorlib.inference.problem import JointProblem
@@ -45,12 +53,12 @@ from factorlib.inference.surface_turns import (
     Detail,
     LightTerms,
     Stiffness,
+    Surfaces,
     linearise_light,
     solve_detail,
     zero_detail,
 )
 from factorlib.light.prior import LightPrior, read_light_prior
-from factorlib.meshes.fine import Fine
 from factorlib.results.materials import Decision
 
 # Stiffness of turns: a of `factorlib.inference.surface_turns`; b is a share of it.
@@ -63,53 +71,6 @@ OBSERVATIONS = 1000  # fitted observations of a light, or of a held-out photo
 START_SCHEDULE = FitSchedule(lights=2, together=(3, 2), estimate=False)
 ROUND_SCHEDULE = FitSchedule(together=(2,), estimate=False)
 LIGHT_STEPS = 2  # factorisations in the fit of a held-out photo's light
-
-
-class Surfaces(msgspec.Struct, frozen=True):
-    """Subdivided meshes of a set by name, in the order of their nodes' numbers."""
-
-    meshes: dict[str, Fine]
-
-    @property
-    def first_nodes(self) -> dict[str, int]:
-        """Number of each mesh's first node."""
-        counts = [mesh.nodes for mesh in self.meshes.values()]
-        return dict(zip(self.meshes, np.cumsum([0, *counts[:-1]]).tolist()))
-
-    @property
-    def nodes(self) -> int:
-        """Number of all nodes."""
-        return sum(mesh.nodes for mesh in self.meshes.values())
-
-    def laplacian(self) -> csr_array:
-        """Return the Laplacian of all meshes, [v, v]."""
-        return csr_array(block_diag([mesh.laplacian() for mesh in self.meshes.values()]))
-
-    def displacements(
-        self, turn: Float[np.ndarray, "v 3"], attached: Sequence[Attached]
-    ) -> dict[str, Float[np.ndarray, " n"]]:
-        """Return the displacement of each mesh that best explains the turns of its nodes, in extents.
-
-        Nodes count by the observations attached to them (`Fine.displacement`).
-        """
-        weight = sum(np.bincount(of.node.reshape(-1), of.share.reshape(-1), self.nodes) for of in attached)
-        turns = self.by_mesh(turn)
-        seen = self.by_mesh(np.minimum(weight, 1.0))
-        return {name: mesh.displacement(turns[name], seen[name]) for name, mesh in self.meshes.items()}
-
-    def by_mesh(self, values: np.ndarray) -> dict[str, np.ndarray]:
-        """Return the values of each mesh's nodes."""
-        return {name: values[k : k + self.meshes[name].nodes] for name, k in self.first_nodes.items()}
-
-    def turns_from_displacements(self, displacements: dict[str, Float[np.ndarray, " n"]]) -> Float[np.ndarray, "v 3"]:
-        """Return the turns that displacements imply; a mesh without a displacement has none."""
-        still = {name: np.zeros((mesh.nodes, 3)) for name, mesh in self.meshes.items()}
-        moved = {name: self.meshes[name].turn_of(of) for name, of in displacements.items()}
-        return np.vstack(list((still | moved).values()))
-
-    def node_mask(self, names: Iterable[str]) -> Bool[np.ndarray, " v"]:
-        """Return a mask of the nodes of these meshes."""
-        return np.concatenate([np.full(mesh.nodes, name in names) for name, mesh in self.meshes.items()])
 
 
 class SurfaceEstimate(msgspec.Struct, frozen=True):
@@ -149,23 +110,23 @@ class PhotoScores(msgspec.Struct, frozen=True):
     values: Float[np.ndarray, " f"]
     losses: Losses
 
-    def gain_over(self, other: PhotoScores) -> float:
+    def gain_over(self, reference: PhotoScores) -> float:
         """Return the mean decrease of the values, in standard errors over photos."""
-        gains = other.values - self.values
+        gains = reference.values - self.values
         return float(gains.mean() / max(gains.std(ddof=1) / np.sqrt(len(gains)), 1e-12))
 
 
-def decide_detail(after: PhotoScores, before: PhotoScores, held_out: float, likelihood: float) -> Decision:
+def decide_detail(scores: PhotoScores, reference: PhotoScores, held_out: float, likelihood: float) -> Decision:
     """Return the decision on detail: kept if both measures gain more than their thresholds.
 
     Args:
-        after: Scores with the detail.
-        before: Scores without it.
+        scores: Scores with the detail.
+        reference: Scores without it.
         held_out: Threshold of the held-out losses, in standard errors.
         likelihood: Threshold of the marginal likelihood, in standard errors.
     """
-    evidence = compare_models(before.losses, after.losses, held_out)
-    return msgspec.structs.replace(evidence, kept=evidence.kept and after.gain_over(before) > likelihood)
+    evidence = compare_models(reference.losses, scores.losses, held_out)
+    return msgspec.structs.replace(evidence, kept=evidence.kept and scores.gain_over(reference) > likelihood)
 
 
 class DetailTrial(msgspec.Struct, frozen=True):
@@ -180,7 +141,7 @@ class DetailTrial(msgspec.Struct, frozen=True):
     def with_detail(self, detail: Detail) -> JointProblem:
         """Return the problem on a surface with detail."""
         pairs = zip(self.problem.blocks, self.attached, strict=True)
-        return self.problem.with_blocks([detail.apply_to(block, at) for block, at in pairs])
+        return self.problem.with_blocks([detail.apply_to(block, positions) for block, positions in pairs])
 
     def linearise(self, detail: Detail, fit: Fit) -> list[LightTerms]:
         """Linearise every light on a surface with detail."""
@@ -310,7 +271,7 @@ class DetailSearch(msgspec.Struct, frozen=True):
     tick: Tick
 
     def select_stiffness(
-        self, tried: Sequence[Stiffness], before: PhotoScores, held_out: float, likelihood: float
+        self, candidates: Sequence[Stiffness], reference: PhotoScores, held_out: float, likelihood: float
     ) -> StiffnessChoice:
         """Return the likeliest stiffness.
 
@@ -318,47 +279,47 @@ class DetailSearch(msgspec.Struct, frozen=True):
         with clear evidence against the detail.
 
         Args:
-            tried: Stiffnesses, from stiff to soft.
-            before: Scores without this detail.
+            candidates: Stiffnesses, from stiff to soft.
+            reference: Scores without this detail.
             held_out: Threshold of the held-out losses, in standard errors.
             likelihood: Threshold of the marginal likelihood, in standard errors.
         """
-        found: StiffnessChoice | None = None
-        for one in tried:
-            details = self.trial.fit_folds(self.linearise, self.laplacian, one, self.tick)
-            judged = self.trial.score_photos(details, self.tick, self.plain)
-            if found is not None and round(float(judged.values.sum() - found.scores.values.sum()), 3) >= 0:
+        best: StiffnessChoice | None = None
+        for stiffness in candidates:
+            details = self.trial.fit_folds(self.linearise, self.laplacian, stiffness, self.tick)
+            scores = self.trial.score_photos(details, self.tick, self.plain)
+            if best is not None and round(float(scores.values.sum() - best.scores.values.sum()), 3) >= 0:
                 break
-            found = StiffnessChoice(one, details, judged, decide_detail(judged, before, held_out, likelihood))
-            if judged.gain_over(before) < CLEARLY_AGAINST:
+            best = StiffnessChoice(stiffness, details, scores, decide_detail(scores, reference, held_out, likelihood))
+            if scores.gain_over(reference) < CLEARLY_AGAINST:
                 break
-        assert found is not None
-        return found
+        assert best is not None
+        return best
 
     def select_turns(self) -> tuple[StiffnessChoice, set[str]]:
         """Return the likeliest turns, and the meshes that gain from their turns alone."""
-        trial = self.trial
-        plain = self.plain
-        turned = self.select_stiffness([Stiffness(a) for a in TURN_STIFFNESSES], plain, CLEARLY_FOR, 0.0)
-        moving = self.select_meshes(turned.details) if turned.scores.gain_over(plain) > 0 else set()
-        if 0 < len(moving) < len(trial.surfaces.meshes):
-            judged = trial.score_photos([trial.restrict_turns(of, moving) for of in turned.details], self.tick, plain)
-            turned = turned._replace(scores=judged, evidence=decide_detail(judged, plain, CLEARLY_FOR, 0.0))
-        return turned, moving
+        turned = self.select_stiffness([Stiffness(a) for a in TURN_STIFFNESSES], self.plain, CLEARLY_FOR, 0.0)
+        movable = self.select_meshes(turned.details) if turned.scores.gain_over(self.plain) > 0 else set()
+        if 0 < len(movable) < len(self.trial.surfaces.meshes):
+            scores = self.trial.score_photos(
+                [self.trial.restrict_turns(detail, movable) for detail in turned.details], self.tick, self.plain
+            )
+            turned = turned._replace(scores=scores, evidence=decide_detail(scores, self.plain, CLEARLY_FOR, 0.0))
+        return turned, movable
 
-    def fit_all_photos(self, stiffness: Stiffness, moving: set[str], pieces: ProgressSections, seed: int) -> Detail:
+    def fit_all_photos(self, stiffness: Stiffness, movable: set[str], pieces: ProgressSections, seed: int) -> Detail:
         """Return the detail from all photos, with materials and lights fitted again between its steps.
 
         Args:
             stiffness: Stiffness of the detail.
-            moving: Meshes whose normals may turn.
+            movable: Meshes whose normals may turn.
             pieces: Report of progress.
             seed: Seed of the drawn observations.
         """
         trial = self.trial
         parts = self.linearise
         fit = self.trial.fit
-        nodes = trial.surfaces.node_mask(moving)
+        nodes = trial.surfaces.node_mask(movable)
         detail = zero_detail(trial.surfaces.nodes)
         for number in range(ROUNDS):
             begin = 0.85 + 0.05 * number
@@ -376,9 +337,9 @@ class DetailSearch(msgspec.Struct, frozen=True):
         names = self.trial.surfaces.meshes
         if len(names) == 1:
             return set(names)
-        moving = [(name, [self.trial.restrict_turns(of, {name}) for of in turned]) for name in names]
-        judged = {name: self.trial.score_photos(details, self.tick, self.plain) for name, details in moving}
-        return {name for name, one in judged.items() if decide_detail(one, self.plain, 0.0, 0.0).kept}
+        restricted = [(name, [self.trial.restrict_turns(detail, {name}) for detail in turned]) for name in names]
+        scores = {name: self.trial.score_photos(details, self.tick, self.plain) for name, details in restricted}
+        return {name for name, mesh_scores in scores.items() if decide_detail(mesh_scores, self.plain, 0.0, 0.0).kept}
 
 
 def estimate_surface(
@@ -402,29 +363,29 @@ def estimate_surface(
     pieces = ProgressSections(report)
     plain = zero_detail(surfaces.nodes)
     tick = pieces.section(0.0, 0.3, TRIAL.points + START_SCHEDULE.points, "materials and lights")
-    trial, begun = fit_trial(problem, start, seed, (surfaces, attached), tick)
+    trial, initial = fit_trial(problem, start, seed, (surfaces, attached), tick)
     photos = len(trial.photos)
     if photos < 2 or problem.none_held_out:
-        return SurfaceEstimate(begun, Decision(False))
+        return SurfaceEstimate(initial, Decision(False))
     tick = pieces.section(0.3, 0.85, 4 * len(TURN_STIFFNESSES) * photos, "left-out photos")
-    given = trial.score_photos([plain] * photos, tick)
-    search = DetailSearch(trial, trial.linearise(plain, trial.fit), surfaces.laplacian(), given, tick)
-    turned, moving = search.select_turns()
-    kept = (
-        turned if turned.evidence.kept else StiffnessChoice(Stiffness(None), [plain] * photos, given, turned.evidence)
+    scores = trial.score_photos([plain] * photos, tick)
+    search = DetailSearch(trial, trial.linearise(plain, trial.fit), surfaces.laplacian(), scores, tick)
+    turned, movable = search.select_turns()
+    chosen = (
+        turned if turned.evidence.kept else StiffnessChoice(Stiffness(None), [plain] * photos, scores, turned.evidence)
     )
     painted = search.select_stiffness(
-        [Stiffness(kept.stiffness.turn, a) for a in FACTOR_STIFFNESSES], kept.scores, 0.0, CLEARLY_FOR
+        [Stiffness(chosen.stiffness.turn, a) for a in FACTOR_STIFFNESSES], chosen.scores, 0.0, CLEARLY_FOR
     )
-    kept = painted if painted.evidence.kept else kept
+    chosen = painted if painted.evidence.kept else chosen
     if not (turned.evidence.kept or painted.evidence.kept):
-        return SurfaceEstimate(begun, turned.evidence, painted.evidence)
-    gains = dict(zip(trial.names, (given.values - kept.scores.values).tolist(), strict=True))
-    detail = search.fit_all_photos(kept.stiffness, moving, pieces, seed)
+        return SurfaceEstimate(initial, turned.evidence, painted.evidence)
+    gains = dict(zip(trial.names, (scores.values - chosen.scores.values).tolist(), strict=True))
+    detail = search.fit_all_photos(chosen.stiffness, movable, pieces, seed)
     displacements = surfaces.displacements(detail.turn, attached) if turned.evidence.kept else {}
-    displacements = {name: of for name, of in displacements.items() if name in moving}
+    displacements = {name: displacement for name, displacement in displacements.items() if name in movable}
     factors = surfaces.by_mesh(detail.log_factor) if painted.evidence.kept else {}
-    return SurfaceEstimate(begun, turned.evidence, painted.evidence, kept.stiffness, gains, displacements, factors)
+    return SurfaceEstimate(initial, turned.evidence, painted.evidence, chosen.stiffness, gains, displacements, factors)
 
 
 def fit_trial(
@@ -442,14 +403,14 @@ def fit_trial(
         tick: Called at every evaluated point.
     """
     prior = read_light_prior()
-    sure = reliable_observations(problem)
+    reliable = reliable_observations(problem)
 
-    def fitting(name: str, some: JointProblem, begun: Fit, schedule: FitSchedule) -> Fit:
+    def fitting(name: str, sample: JointProblem, start_fit: Fit, schedule: FitSchedule) -> Fit:
         """Fit under the prior on lights."""
-        return fit_problem(some, begun, prior, schedule, tick)
+        return fit_problem(sample, start_fit, prior, schedule, tick)
 
     choices = SolveOptions(self_shadowing="on", interreflection="on", seed=seed)
-    effects = select_effects(sure, start(sure, TRIAL_CELLS), choices, fitting)
+    effects = select_effects(reliable, start(reliable, TRIAL_CELLS), choices, fitting)
     problem = effects.effective_problem(problem)
     fit = fit_problem(
         problem.subsample(OBSERVATIONS, seed), refine_cells(effects.fit, CELLS, problem), prior, START_SCHEDULE, tick

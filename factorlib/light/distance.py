@@ -40,7 +40,7 @@ def finite_distance_cosines(place: A, normal: A, view: A, axis: A, curvature: fl
     # d = |z − X|, then (1)
     along = X @ axis.T
     d = (1 - 2 * along + (X * X).sum(1)[:, None]) ** 0.5
-    nz, oz = ((of @ axis.T - (of * X).sum(1)[:, None]) / d for of in (normal, view))
+    nz, oz = ((vectors @ axis.T - (vectors * X).sum(1)[:, None]) / d for vectors in (normal, view))
     return nz.clip(-1.0, 1.0), oz.clip(-1.0, 1.0), (1 - along) / d**3
 
 

@@ -56,9 +56,9 @@ def lattice_of_lobes(
     result = np.zeros((height, width, 3))
     lobes = lobes.turned(YUP_FROM_CAMERA)
     row, column = lat_long_of_direction(lobes.axis)
-    lit = lobes.weight.any(axis=1)
+    bright = lobes.weight.any(axis=1)
     for theta, phi, sharpness, weight in zip(
-        np.pi * row[lit], 2 * np.pi * column[lit], lobes.sharpness[lit], lobes.weight[lit], strict=True
+        np.pi * row[bright], 2 * np.pi * column[bright], lobes.sharpness[bright], lobes.weight[bright], strict=True
     ):
         rows, columns, mean = _means(theta, phi, sharpness, *nodes(sharpness))
         result[rows[:, None], columns] += mean[..., None] * weight

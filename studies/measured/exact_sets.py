@@ -10,11 +10,10 @@ import numpy as np
 
 from factorlib.evaluate.ball import light_of_lat_long
 from factorlib.evaluate.materials import common_factor
-from factorlib.inference.blocks import Block
+from factorlib.inference.blocks import Block, Noise
+from factorlib.inference.fit_runner import Solution
 from factorlib.inference.forward import Illumination
-from factorlib.inference.history import Solution
 from factorlib.inference.joint_solver import solve
-from factorlib.inference.noise import Noise
 from factorlib.inference.observed import blocks_of_observations
 from factorlib.inference.problem import JointProblem
 from factorlib.inference.start import start_from_photos

@@ -6,7 +6,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from factorlib.inference.evidence import (
+from factorlib.inference.materials import Point
+from factorlib.inference.model_selection import (
     CLEARLY_AGAINST,
     CLEARLY_FOR,
     LEAST_LOSS,
@@ -14,8 +15,8 @@ from factorlib.inference.evidence import (
     compare_models,
     held_out_losses,
 )
-from factorlib.inference.materials import Point
 from studies.scenes.problems import MATERIALS
+from tests.inference.made import none_held_out
 from tests.inference.made_lights import photographed
 
 
@@ -110,7 +111,7 @@ def test_each_light_counts_relative_to_itself():
 
 def test_losses_are_those_of_held_out_observations_or_of_all():
     problem, true = photographed(0, 2, cells=30, size=8)
-    for some in (problem, problem.with_none_held_out()):
+    for some in (problem, problem.with_blocks([none_held_out(b) for b in problem.blocks])):
         found = held_out_losses(some, Point(MATERIALS, true))
         for values, clusters, block in zip(found.values, found.clusters, some.blocks, strict=True):
             assert len(values) == len(clusters) == (block.held_out.sum() or len(block))

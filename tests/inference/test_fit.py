@@ -4,6 +4,7 @@ import msgspec
 import numpy as np
 import pytest
 
+from factorlib.inference.blocks import Noise
 from factorlib.inference.fit import (
     DARK_NOISE,
     Fit,
@@ -15,7 +16,6 @@ from factorlib.inference.fit import (
 from factorlib.inference.lights import Light, fibonacci_cells
 from factorlib.inference.likelihood import cholesky_factor, cholesky_inverse
 from factorlib.inference.materials import Materials
-from factorlib.inference.noise import Noise
 from factorlib.inference.priors import BRIGHTNESS_DEVIATION, MEDIAN_BRIGHTNESS
 from factorlib.inference.problem import JointProblem
 from studies.scenes.problems import MATERIALS, factor_between

@@ -13,15 +13,15 @@ import numpy as np
 import pytest
 
 from factorlib.errors import InputError
+from factorlib.inference.blocks import Noise
 from factorlib.inference.fit import Fit, initial_fit
+from factorlib.inference.fit_runner import Solution
 from factorlib.inference.forward import Illumination
 from factorlib.inference.gauge import connected_components
-from factorlib.inference.history import Solution
 from factorlib.inference.identifiability import poorly_explained, undetermined_by_answer, undetermined_by_observations
 from factorlib.inference.joint_solver import solve
 from factorlib.inference.lights import Light
 from factorlib.inference.materials import Materials, Point
-from factorlib.inference.noise import Noise
 from factorlib.inference.observed import blocks_of_observations
 from factorlib.inference.options import SolveOptions
 from factorlib.inference.problem import JointProblem

@@ -6,11 +6,11 @@ import pytest
 
 from factorlib.geometry.met import UNMET, met_codes
 from factorlib.geometry.sphere import fibonacci_sphere
+from factorlib.inference.blocks import Noise
 from factorlib.inference.forward import Illumination
 from factorlib.inference.gauge import fix_gauge
 from factorlib.inference.interreflection import bounced_light
 from factorlib.inference.materials import Point
-from factorlib.inference.noise import Noise
 from factorlib.inference.observed import blocks_of_observations
 from factorlib.inference.problem import JointProblem
 from factorlib.urm.observations import Observations

@@ -8,6 +8,7 @@ from factorlib.inference.likelihood import EXPOSURE_DEVIATION, TONE_DEVIATION
 from factorlib.inference.priors import material_unknowns, materials_from_unknowns
 from factorlib.inference.problem import JointProblem
 from studies.scenes.problems import MATERIALS
+from tests.inference.made import none_held_out
 from tests.inference.made_lights import OPERATOR, PRIOR, drawn, likelihood, on_even_cells, photographed, spheres
 
 CELLS = 50
@@ -129,7 +130,7 @@ def settled(one, steps=15):
 def test_the_determinant_is_needed_for_roughness(seed):
     """With it the likelihood of a roughness is highest at the true one; the loss and the prior alone prefer far smoother materials."""
     problem, true = photographed(seed, 1, cells=100, size=14, noise=1.0)
-    block = problem.blocks[0].take(problem.blocks[0].material == 1).with_none_held_out()
+    block = none_held_out(problem.blocks[0].take(problem.blocks[0].material == 1))
     one = likelihood(JointProblem([block], OPERATOR), true[0], temperature=1.0)
     tried, found = (0.15, 0.25, 0.4, 0.55), []
     for roughness in tried:

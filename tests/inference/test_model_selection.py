@@ -9,14 +9,19 @@ import pytest
 from factorlib.geometry.met import UNMET, met_codes
 from factorlib.geometry.sphere import fibonacci_sphere
 from factorlib.images.tone import curve
-from factorlib.inference.evidence import CLEARLY_AGAINST, CLEARLY_FOR
+from factorlib.inference.blocks import Noise
 from factorlib.inference.forward import Illumination
 from factorlib.inference.identifiability import unlikely_curves
 from factorlib.inference.interreflection import bounced_light
 from factorlib.inference.joint_solver import solve
 from factorlib.inference.materials import Point
-from factorlib.inference.model_selection import LEAST_DISTANCE_MARGIN, LEAST_TONE_GAIN, distance_share
-from factorlib.inference.noise import Noise
+from factorlib.inference.model_selection import (
+    CLEARLY_AGAINST,
+    CLEARLY_FOR,
+    LEAST_DISTANCE_MARGIN,
+    LEAST_TONE_GAIN,
+    distance_share,
+)
 from factorlib.inference.observed import blocks_of_observations
 from factorlib.inference.options import SolveOptions
 from factorlib.inference.problem import JointProblem
@@ -24,7 +29,7 @@ from factorlib.inference.start import start_from_photos
 from factorlib.results.materials import Decision
 from factorlib.urm.observations import Observations
 from studies.scenes.problems import MATERIALS, factor_between, sphere_normals
-from tests.inference.made import bowls, rough_light
+from tests.inference.made import bowls, none_held_out, rough_light
 from tests.inference.made_lights import OPERATOR, drawn, on_even_cells, spheres
 
 QUICK = SolveOptions(cells=60, splittings=0, observations=300)
@@ -204,7 +209,7 @@ def test_an_exponent_near_its_bounds_is_named():
 
 def test_without_held_out_observations_shadows_stay_and_nothing_further_is_decided(lit):
     """All would be judged by the observations that they were fitted to, which more always explains better."""
-    found = solved([block.with_none_held_out() for block in lit], QUICK, cells=24, observations=100)
+    found = solved([none_held_out(block) for block in lit], QUICK, cells=24, observations=100)
     assert found.shadows.kept and found.shadows.margin is None
     assert not found.interreflection.kept and found.interreflection.margin is None
     assert not any(one.kept for one in found.tone) and found.splitting == []

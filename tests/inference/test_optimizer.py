@@ -3,9 +3,8 @@
 import numpy as np
 import pytest
 
-from factorlib.inference.arrow import Arrow
 from factorlib.inference.fit import fit_problem
-from factorlib.inference.optimizer import Descent, determinant_terms, minimise_lbfgs
+from factorlib.inference.optimizer import Arrow, Descent, determinant_terms, minimise_lbfgs
 from factorlib.inference.priors import MaterialPrior, material_unknowns
 from tests.inference.made_lights import PRIOR, WHOLE, begun, likelihood, photographed
 

@@ -4,11 +4,11 @@ import msgspec
 import numpy as np
 import pytest
 
+from factorlib.inference.blocks import Noise
 from factorlib.inference.forward import Illumination
 from factorlib.inference.gauge import BRIGHTEST, connected_components, fix_gauge
 from factorlib.inference.lights import UnitLobes
 from factorlib.inference.materials import Materials, Point
-from factorlib.inference.noise import Noise
 from factorlib.inference.observed import blocks_of_observations
 from factorlib.light.lobes import lobe_integral
 from factorlib.reflection import reflection_operator

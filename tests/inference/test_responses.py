@@ -7,10 +7,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from factorlib.geometry.sphere import fibonacci_sphere
+from factorlib.inference.blocks import RobustLoss
 from factorlib.inference.forward import Illumination
 from factorlib.inference.lights import UnitLobes, fibonacci_cells
 from factorlib.inference.materials import Materials
-from factorlib.inference.noise import RobustLoss
 from factorlib.inference.responses import NODES, ResponseTable, diffuse_response, specular_response
 from studies.scenes.problems import MATERIALS, block
 from tests.inference.made_lights import OPERATOR, drawn, on_even_cells

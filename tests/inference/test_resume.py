@@ -8,11 +8,10 @@ from factorlib.checkpoint import Checkpoint
 from factorlib.geometry.sphere import fibonacci_sphere
 from factorlib.inference import joint_solver, model_selection
 from factorlib.inference.fit import FitSchedule
-from factorlib.inference.history import PHASES, Event, solve_progress
+from factorlib.inference.fit_runner import PHASES, Event, FitRunner, solve_progress
 from factorlib.inference.joint_solver import solve
 from factorlib.inference.options import SolveOptions
 from factorlib.inference.problem import JointProblem
-from factorlib.inference.resume import FitRunner
 from factorlib.inference.start import start_from_photos
 from factorlib.stage import serial_map
 from studies.scenes.problems import MATERIALS, block, random_light

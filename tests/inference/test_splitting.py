@@ -3,12 +3,13 @@
 import numpy as np
 import pytest
 
-from factorlib.inference.evidence import WEAKLY_FOR
 from factorlib.inference.fit import FitSchedule, fit_problem
+from factorlib.inference.fit_runner import FitRunner
 from factorlib.inference.joint_solver import SPLIT_CELLS, split_while_gaining
+from factorlib.inference.model_selection import WEAKLY_FOR
 from factorlib.inference.options import SolveOptions
-from factorlib.inference.resume import FitRunner
 from studies.scenes.problems import MATERIALS
+from tests.inference.made import none_held_out
 from tests.inference.made_lights import PRIOR, begun, light_of, spheres
 
 CELLS, SHOWN = 60, [1, 2]
@@ -52,6 +53,9 @@ def test_a_constant_light_needs_no_finer_cells():
 
 def test_nothing_splits_where_nothing_is_held_out_or_nobody_asks(lamps):
     problem, fit, _ = lamps
-    for some, choices in ((problem.with_none_held_out(), ONCE), (problem, SolveOptions(splittings=0))):
+    for some, choices in (
+        (problem.with_blocks([none_held_out(b) for b in problem.blocks]), ONCE),
+        (problem, SolveOptions(splittings=0)),
+    ):
         found = split_while_gaining(some, fit, choices, FitRunner())
         assert found.evidence == [] and found.fit is fit

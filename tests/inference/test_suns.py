@@ -7,10 +7,10 @@ import numpy as np
 import pytest
 
 from factorlib.inference import suns
-from factorlib.inference.evidence import CLEARLY_AGAINST
 from factorlib.inference.fit import FitSchedule, fit_problem
+from factorlib.inference.fit_runner import FitRunner
 from factorlib.inference.lights import UnitLobes
-from factorlib.inference.resume import FitRunner
+from factorlib.inference.model_selection import CLEARLY_AGAINST
 from factorlib.inference.suns import WIDE_SHARPNESS, accept_sun, compare_illuminations, replace_brightest, select_suns
 from factorlib.light.lobes import SUN, lobe_integral
 from factorlib.results.materials import Decision

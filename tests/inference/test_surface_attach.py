@@ -6,8 +6,7 @@ import numpy as np
 from factorlib.generate.shapes import sphere
 from factorlib.geometry.camera import Camera, Pose
 from factorlib.geometry.raster import rasterise
-from factorlib.inference.surface_attach import attach_pixels
-from factorlib.inference.surface_detail import Surfaces
+from factorlib.inference.surface_turns import Surfaces, attach_pixels
 from factorlib.meshes.fine import fine
 from factorlib.meshes.mesh import Mesh, scaled
 from factorlib.results.poses import ObjectEntry, entry_of

@@ -11,7 +11,7 @@ from factorlib.inference.fit import ROBUST, Hyperparameters, light_likelihood
 from factorlib.inference.materials import Point
 from factorlib.inference.problem import JointProblem
 from factorlib.inference.start import start_from_photos
-from factorlib.inference.surface_detail import SurfaceEstimate, Surfaces, estimate_surface
+from factorlib.inference.surface_detail import SurfaceEstimate, estimate_surface
 from factorlib.inference.surface_turns import (
     LARGEST_TURN,
     LEAST_VIEW_COSINE,
@@ -19,6 +19,7 @@ from factorlib.inference.surface_turns import (
     Attached,
     Detail,
     Stiffness,
+    Surfaces,
     linearise_light,
     solve_detail,
 )

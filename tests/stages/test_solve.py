@@ -10,8 +10,8 @@ import pytest
 from factorlib.errors import InputError
 from factorlib.geometry.sphere import mirror_directions
 from factorlib.images.exr import LAT_LONG, write_rgb_exr
+from factorlib.inference.blocks import Noise
 from factorlib.inference.forward import Illumination
-from factorlib.inference.noise import Noise
 from factorlib.inference.observed import blocks_of_observations
 from factorlib.jsonfile import read_json
 from factorlib.light.latlong import lat_long_of_lobes

@@ -11,7 +11,7 @@ from factorlib.errors import InputError
 from factorlib.export.gltf import write_glb
 from factorlib.generate.shapes import sphere
 from factorlib.images.exr import write_exr
-from factorlib.inference.noise import Noise
+from factorlib.inference.blocks import Noise
 from factorlib.inference.observed import blocks_of_observations, gather_observations
 from factorlib.meshes.fine import fine
 from factorlib.meshes.ply import write_ply
