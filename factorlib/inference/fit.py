@@ -75,25 +75,25 @@ class FitSchedule(msgspec.Struct, frozen=True):
     """Number of steps of a fit.
 
     Attributes:
-        lights: Steps of the lights alone, materials given, before the others.
-        together: Steps of each descent of lights and, unless they are given, materials; hyperparameters are estimated
-            anew before each descent but the first.
-        estimate: True to estimate them before the first descent too; right after a splitting, residuals reflect the
-            splitting and not the noise.
-        least: Least temperature of (1).
-        given: True to keep the materials fixed.
+        light_steps: Steps of the lights alone, materials given, before the others.
+        joint_steps: Steps of each descent of lights and, unless they are given, materials; hyperparameters are
+            estimated anew before each descent but the first.
+        estimate_first: True to estimate them before the first descent too; right after a splitting, residuals reflect
+            the splitting and not the noise.
+        least_temperature: Least temperature of (1).
+        materials_fixed: True to keep the materials fixed.
     """
 
-    lights: int = 0
-    together: tuple[int, ...] = ()
-    estimate: bool = True
-    least: float = 1.0
-    given: bool = False
+    light_steps: int = 0
+    joint_steps: tuple[int, ...] = ()
+    estimate_first: bool = True
+    least_temperature: float = 1.0
+    materials_fixed: bool = False
 
     @property
     def points(self) -> int:
         """Largest number of points that a fit evaluates."""
-        return self.lights + 1 + sum(iterations + 1 for iterations in self.together)
+        return self.light_steps + 1 + sum(iterations + 1 for iterations in self.joint_steps)
 
 
 def fit_problem(
@@ -116,39 +116,38 @@ def fit_problem(
         The fit, with the value of its objective.
     """
     problem = problem.without_held_out()
-    materials_fixed = schedule.given
     hyperparameters = start.hyperparameters
-    materials = (
-        start.point.materials
-        if materials_fixed
-        else problem.known.insert_into(raise_reflectances(start.point.materials))
+    materials = start.point.materials
+    if not schedule.materials_fixed:
+        materials = problem.known.insert_into(raise_reflectances(materials))
+    descent = Descent(
+        MaterialPrior(materials, problem.blocks, problem.known),
+        problem.spread,
+        report,
+        problem.known.free(len(materials)),
     )
-    prior_on_materials = MaterialPrior(materials, problem.blocks, problem.known)
-    descent = Descent(prior_on_materials, problem.spread, report, problem.known.free(len(materials)))
-    illuminations = problem.illuminations(Point(materials, start.point.lights))
-    pairs = list(zip(illuminations, hyperparameters, strict=True))
 
     def likelihood(pair: tuple[Illumination, Hyperparameters]) -> LightLikelihood:
         """Return the likelihood of one light, with a table of responses."""
-        return light_likelihood(*pair, prior, materials_fixed, problem.tables)
+        return light_likelihood(*pair, prior, schedule.materials_fixed, problem.tables)
 
-    likelihoods = list(problem.spread(likelihood, pairs))
-    state = descent.descend_lights(likelihoods, material_unknowns(materials), schedule.lights)
-    for number, iterations in enumerate(schedule.together):
-        if number or schedule.estimate:
-            systems = list(zip(state.likelihoods, state.systems, strict=True))
-            hyperparameters = list(
-                problem.spread(lambda each: estimate_hyperparameters(each[0], each[1], schedule.least), systems)
-            )
-            both = zip(state.likelihoods, hyperparameters, strict=True)
-            state = state._replace(likelihoods=[with_hyperparameters(*each) for each in both])
-        if materials_fixed:
+    illuminations = problem.illuminations(Point(materials, start.point.lights))
+    likelihoods = list(problem.spread(likelihood, list(zip(illuminations, hyperparameters, strict=True))))
+    state = descent.descend_lights(likelihoods, material_unknowns(materials), schedule.light_steps)
+    least = schedule.least_temperature
+    for number, iterations in enumerate(schedule.joint_steps):
+        if number or schedule.estimate_first:
+            # T of (1) and s_k² of each light, from the previous descent
+            pairs = list(zip(state.likelihoods, state.systems, strict=True))
+            hyperparameters = list(problem.spread(lambda pair: estimate_hyperparameters(*pair, least), pairs))
+            state = state._replace(likelihoods=list(map(with_hyperparameters, state.likelihoods, hyperparameters)))
+        if schedule.materials_fixed:
             state = descent.descend_lights(state.likelihoods, state.theta, iterations)
         else:
             state = descent.descend_jointly(state, iterations)
-    lights = [likelihood_of_light.light for likelihood_of_light in state.likelihoods]
+    lights = [descended.light for descended in state.likelihoods]
     return Fit(
-        Point(materials if materials_fixed else materials_from_unknowns(state.theta), lights),
+        Point(materials if schedule.materials_fixed else materials_from_unknowns(state.theta), lights),
         hyperparameters,
         state.value,
     )

@@ -43,9 +43,9 @@ from factorlib.inference.problem import JointProblem
 from factorlib.inference.start import Start, insert_known, refine_cells
 from factorlib.inference.suns import select_suns
 
-MATERIALS = FitSchedule(lights=2, together=(5, 4))
-AFTER_SPLITTING = FitSchedule(lights=2, together=(3, 2), estimate=False)
-LIGHTS = FitSchedule(together=(0, 2, 2), least=0.1, given=True)
+MATERIALS = FitSchedule(light_steps=2, joint_steps=(5, 4))
+AFTER_SPLITTING = FitSchedule(light_steps=2, joint_steps=(3, 2), estimate_first=False)
+LIGHTS = FitSchedule(joint_steps=(0, 2, 2), least_temperature=0.1, materials_fixed=True)
 SPLIT_CELLS = 24  # number of a light's cells that split at once
 # Least distance between cells, degrees: the sun's width.  A cell splits only if its neighbours are twice as far.
 LEAST_SPACING_DEG = 0.5

@@ -53,9 +53,9 @@ WEAKLY_FOR = 1.0
 # Observations and cells of a light in comparisons of models.
 TRIAL_OBSERVATIONS = 1000
 TRIAL_CELLS = 180
-TRIAL = FitSchedule(lights=3, together=(6, 4))
-CONTINUED_TRIAL = FitSchedule(lights=2, together=(4, 2), estimate=False)
-TONE_SCHEDULE = FitSchedule(together=(8,), estimate=False)
+TRIAL = FitSchedule(light_steps=3, joint_steps=(6, 4))
+CONTINUED_TRIAL = FitSchedule(light_steps=2, joint_steps=(4, 2), estimate_first=False)
+TONE_SCHEDULE = FitSchedule(joint_steps=(8,), estimate_first=False)
 # Least relative gain of the held-out loss.  Under two standard errors alone, a photo with a wrong pose got a curve
 # (margin 3.0, captured set of seed 7), and k_d was 30 % wrong instead of 13 %.
 LEAST_TONE_GAIN = 0.25
@@ -65,7 +65,7 @@ LEAST_DISTANCE_MARGIN = (
 # Curvatures of lights 20, 10 and 5 RMS distances away.  A chair's points are 0.4 m from their centre, and a room's
 # walls and lamps 2 to 8 m.
 CURVATURES = (0.05, 0.1, 0.2)
-DISTANCE_SCHEDULE = FitSchedule(lights=2, together=(2,), estimate=False)
+DISTANCE_SCHEDULE = FitSchedule(light_steps=2, joint_steps=(2,), estimate_first=False)
 OBSERVATION_FACTOR = 8  # factor on the number of observations
 LIGHT_OBSERVATION_FACTOR = (
     2  # factor on it where materials are given: +0.25 dB on data/eames, +0.27 on the made set of seed 101
@@ -74,7 +74,7 @@ LARGE_GAIN = 0.2  # least relative gain of the first splitting for that factor
 # Least relative gain of a splitting for another one.  After a splitting that gained 3 %, two more gained 3.6 and 1 % on
 # data/eames, and materials did not improve.
 LEAST_GAIN = 0.05
-LIGHTS_ONLY = FitSchedule(lights=2, estimate=False, given=True)
+LIGHTS_ONLY = FitSchedule(light_steps=2, estimate_first=False, materials_fixed=True)
 
 Fitting = Callable[[str, JointProblem, Fit, FitSchedule], Fit]  # phase, problem, start and schedule
 

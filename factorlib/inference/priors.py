@@ -7,10 +7,11 @@ A material is dielectric, metal or fabric, with shares π_c.  Let l = log k_s of
 
 The last factor is over the two dimensions of l − l̄.  μ_c, S_c and τ_c are those of measured materials
 (`studies.measured.material_classes`, material_classes.json).  S_c and τ_c are widened by the unknown scale of
-reflectances and the unknown white balance of photos (SCALE, ROUGHNESS_SLACK, WHITE).  Dielectrics reflect ((n − 1)/(n +
-1))² of a ray along the normal, 0.02 to 0.08, equally in all colours.  Metals reflect more, with a tint.  Fabrics
-scatter within, and GGX shows this as a strong and very rough part.  A smooth surface with k_s = 0.3 is therefore metal,
-and a k_s of 0.2 at roughness 1 is fabric; neither is inferred without evidence.
+reflectances and the unknown white balance of photos (`SCALE_DEVIATION`, `CLASS_ROUGHNESS_DEVIATION`,
+`WHITE_DEVIATION`).  Dielectrics reflect ((n − 1)/(n + 1))² of a ray along the normal, 0.02 to 0.08, equally in all
+colours.  Metals reflect more, with a tint.  Fabrics scatter within, and GGX shows this as a strong and very rough part.
+A smooth surface with k_s = 0.3 is therefore metal, and a k_s of 0.2 at roughness 1 is fabric; neither is inferred
+without evidence.
 
 Let r_c be the share of class c in the sum (1).  Half the gradient of −2 log p is Σ_c r_c P_c (x − μ_c), P_c the class's
 precision.  Half the Hessian is approximated by Σ_c r_c P_c, the Hessian of the bound of expectation maximisation, which
@@ -20,7 +21,8 @@ A factor per channel is free between the materials and the lights of a connected
 other.  Then it is known only as well as the model of interreflection holds.  So the brightest material of a component
 is expected to be of ordinary brightness.  Let b be the mean over channels of its k_d + k_s:
 
-    (log b − log BRIGHTEST)²/BRIGHTNESS²                                                                             (2)
+    (log b − log MEDIAN_BRIGHTNESS)²/BRIGHTNESS_DEVIATION²
+    (2)
 
 b lies between 0.5 and 0.95 within two standard deviations.  (2) does not apply where a material or a light of the
 component is known.  The prior on lights, whose mean is grey, settles the tint.  A very wide Gaussian about the start

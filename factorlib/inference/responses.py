@@ -292,7 +292,7 @@ class ResponseCache:
             fixed_roughness,
         )
         arrays = [block.normal, block.view, block.material, block.photo, lobes.axis, lobes.sharpness, *optional]
-        digest = blake2b(repr((id(operator), lobes.curvature, [of is None for of in optional])).encode())
+        digest = blake2b(repr((id(operator), lobes.curvature, [array is None for array in optional])).encode())
         for array in arrays:
             digest.update(b"" if array is None else np.ascontiguousarray(array).data)
         key = digest.digest()

@@ -352,6 +352,6 @@ def light_from_earlier(
     illumination = msgspec.structs.replace(constant, light=light)
     if illumination.losses(loss).mean() <= constant.losses(loss).mean():
         return light
-    said = "illumination '%s' starts anew: what the earlier solution says of it explains less than a constant light"
-    log.warning(said, block.name)
+    message = "illumination '%s' starts anew: a constant light explains its photos better than the earlier solution's"
+    log.warning(message, block.name)
     return constant.light

@@ -47,7 +47,7 @@ GRIDS = ((15.0, 3.0), (4.0, 0.8), (1.0, 0.2))
 # and 13, true suns hold 9 % of the light or more and lower the loss by 1.2 to 15 %.
 LEAST_SUN_GAIN = 0.01
 LEAST_SUN_SHARE = 0.07
-AROUND_SUNS = FitSchedule(together=(0, 2), least=0.1, given=True)
+AROUND_SUNS = FitSchedule(joint_steps=(0, 2), least_temperature=0.1, materials_fixed=True)
 
 
 def select_suns(problem: JointProblem, fit: Fit, run: FitRunner) -> Selection:
@@ -60,29 +60,29 @@ def select_suns(problem: JointProblem, fit: Fit, run: FitRunner) -> Selection:
     """
     without_suns = problem.illuminations(fit.point)
     candidates = list(problem.spread(partial(replace_brightest, sharpness=SUN), without_suns))
-    evidence = [Decision(bool(one.light.suns.any())) for one in without_suns]
-    if all(light is one.light for light, one in zip(candidates, without_suns, strict=True)):
+    evidence = [Decision(bool(cells.light.suns.any())) for cells in without_suns]
+    changed = [k for k, cells in enumerate(without_suns) if candidates[k] is not cells.light]
+    if not changed:
         return Selection(fit, evidence)
+    # cells are fitted anew around each sun
     trial = run.fit_and_report("suns", problem, fit.with_lights(candidates), AROUND_SUNS)
     with_suns = problem.illuminations(trial.point)
-    for k, (cells, sun) in enumerate(zip(without_suns, with_suns, strict=True)):
-        if candidates[k] is not cells.light:
-            evidence[k] = accept_sun(cells, sun)
-    accepted = [k for k, one in enumerate(evidence) if one.kept and one.margin is not None]
+    for k in changed:
+        evidence[k] = accept_sun(without_suns[k], with_suns[k])
+    accepted = [k for k in changed if evidence[k].kept]
     if accepted:
-        wide = list(
-            problem.spread(partial(replace_brightest, sharpness=WIDE_SHARPNESS), [without_suns[k] for k in accepted])
-        )
+        # a wide lobe in place of each accepted sun
+        replace_widely = partial(replace_brightest, sharpness=WIDE_SHARPNESS)
+        wide = list(problem.spread(replace_widely, [without_suns[k] for k in accepted]))
         start = Fit(Point(fit.point.materials, wide), [fit.hyperparameters[k] for k in accepted])
         problem = problem.select_lights(accepted)
-        wide_lights = problem.illuminations(run.fit_and_report("suns", problem, start, AROUND_SUNS).point)
-        for k, one in zip(accepted, wide_lights, strict=True):
-            narrow = compare_illuminations(one, with_suns[k], CLEARLY_AGAINST)
-            evidence[k] = evidence[k] if narrow.kept else narrow
-    lights, hyperparameters = (
-        [new if one.kept else old for one, new, old in zip(evidence, *both, strict=True)]
-        for both in ((trial.point.lights, fit.point.lights), (trial.hyperparameters, fit.hyperparameters))
-    )
+        wide_fit = run.fit_and_report("suns", problem, start, AROUND_SUNS)
+        for k, with_wide_lobe in zip(accepted, problem.illuminations(wide_fit.point), strict=True):
+            decision = compare_illuminations(with_wide_lobe, with_suns[k], CLEARLY_AGAINST)
+            evidence[k] = evidence[k] if decision.kept else decision
+    fits = [trial if decision.kept else fit for decision in evidence]
+    lights = [chosen.point.lights[k] for k, chosen in enumerate(fits)]
+    hyperparameters = [chosen.hyperparameters[k] for k, chosen in enumerate(fits)]
     return Selection(msgspec.structs.replace(fit.with_lights(lights), hyperparameters=hyperparameters), evidence)
 
 

@@ -68,8 +68,8 @@ ROUNDS = 3
 CELLS = 250  # cells of a light
 FOLDS = 4  # folds of photos
 OBSERVATIONS = 1000  # fitted observations of a light, or of a held-out photo
-START_SCHEDULE = FitSchedule(lights=2, together=(3, 2), estimate=False)
-ROUND_SCHEDULE = FitSchedule(together=(2,), estimate=False)
+START_SCHEDULE = FitSchedule(light_steps=2, joint_steps=(3, 2), estimate_first=False)
+ROUND_SCHEDULE = FitSchedule(joint_steps=(2,), estimate_first=False)
 LIGHT_STEPS = 2  # factorisations in the fit of a held-out photo's light
 
 
@@ -177,29 +177,32 @@ class DetailTrial(msgspec.Struct, frozen=True):
             plain: Scores without detail, used for a photo whose detail is zero; None to compute all.
         """
 
-        def alone(of: tuple[int, tuple[int, int], Detail]) -> tuple[float, Losses]:
+        def score(task: tuple[int, tuple[int, int], Detail]) -> tuple[float, Losses]:
             """Return one photo's value and losses."""
-            at, (k, number), detail = of
-            own = self.problem.blocks[k].photo == number
-            here = self.attached[k].take(own)
-            if plain is not None and not (np.any(detail.turn[here.node]) or np.any(detail.log_factor[here.node])):
+            index, (k, number), detail = task
+            rows = self.problem.blocks[k].photo == number
+            positions = self.attached[k].take(rows)
+            if plain is not None and not (
+                np.any(detail.turn[positions.node]) or np.any(detail.log_factor[positions.node])
+            ):
                 tick()
-                return plain.values[at], Losses([plain.losses.values[at]], [plain.losses.clusters[at]])
-            seen = msgspec.structs.replace(self.problem.blocks[k].take(own), row=np.arange(own.sum()))
-            seen = seen.subsample(OBSERVATIONS, 0)
-            assert seen.row is not None
-            problem = self.problem.with_blocks([detail.apply_to(seen, here.take(seen.row))])
-            begun = Point(self.fit.point.materials, [self.fit.point.lights[k]])
-            (one,) = problem.without_held_out().illuminations(begun)
-            likelihood = light_likelihood(one, self.fit.hyperparameters[k], self.prior, materials_given=True)
+                return plain.values[index], Losses([plain.losses.values[index]], [plain.losses.clusters[index]])
+            photo = msgspec.structs.replace(self.problem.blocks[k].take(rows), row=np.arange(rows.sum()))
+            photo = photo.subsample(OBSERVATIONS, 0)
+            assert photo.row is not None
+            problem = self.problem.with_blocks([detail.apply_to(photo, positions.take(photo.row))])
+            # the photo's own light, from the light of its illumination
+            start = Point(self.fit.point.materials, [self.fit.point.lights[k]])
+            (illumination,) = problem.without_held_out().illuminations(start)
+            likelihood = light_likelihood(illumination, self.fit.hyperparameters[k], self.prior, materials_given=True)
             likelihood, system = descend_light(likelihood, LIGHT_STEPS)
-            losses = held_out_losses(problem, Point(begun.materials, [likelihood.light]))
+            losses = held_out_losses(problem, Point(start.materials, [likelihood.light]))
             tick()
             return likelihood.marginal(system), losses
 
-        each = [(at, *pair) for at, pair in enumerate(zip(self.photos, details, strict=True))]
-        values, losses = zip(*self.problem.spread(alone, each), strict=True)
-        return PhotoScores(np.array(values), Losses(*([of[i][0] for of in losses] for i in (0, 1))))
+        tasks = [(index, *task) for index, task in enumerate(zip(self.photos, details, strict=True))]
+        values, losses = zip(*self.problem.spread(score, tasks), strict=True)
+        return PhotoScores(np.array(values), Losses(*([photo[i][0] for photo in losses] for i in (0, 1))))
 
     def fit_folds(
         self, parts: list[LightTerms], laplacian: csr_array, stiffness: Stiffness, tick: Tick
@@ -217,23 +220,23 @@ class DetailTrial(msgspec.Struct, frozen=True):
         photos = self.photos
         folds = min(FOLDS, len(self.photos))
 
-        def others(fold: int) -> Detail:
+        def detail_without(fold: int) -> Detail:
             """Return the detail that is estimated without the photos of one fold."""
-            gone = [
-                np.isin(block.photo, [j for at, j in photos[fold::folds] if at == k])
+            left_out = [
+                np.isin(block.photo, [j for n, j in photos[fold::folds] if n == k])
                 for k, block in enumerate(self.problem.blocks)
             ]
-            rest = [
-                part.drop_observations(rows) if rows.any() else part for part, rows in zip(parts, gone, strict=True)
-            ]
-            rest = [part for part in rest if len(part.residual)]
-            found = solve_detail(rest, laplacian, stiffness, zero_detail(self.surfaces.nodes))
-            seen = [of.take(~rows) for of, rows in zip(self.attached, gone, strict=True)]
-            moved = self.surfaces.displacements(found.turn, seen)
+            pairs = zip(parts, left_out, strict=True)
+            used = [part.drop_observations(rows) if rows.any() else part for part, rows in pairs]
+            used = [part for part in used if len(part.residual)]
+            detail = solve_detail(used, laplacian, stiffness, zero_detail(self.surfaces.nodes))
+            positions = [positions.take(~rows) for positions, rows in zip(self.attached, left_out, strict=True)]
+            # only turns that a displacement explains
+            displacements = self.surfaces.displacements(detail.turn, positions)
             tick()
-            return Detail(self.surfaces.turns_from_displacements(moved), found.log_factor)
+            return Detail(self.surfaces.turns_from_displacements(displacements), detail.log_factor)
 
-        by_fold = list(self.problem.spread(others, range(folds)))
+        by_fold = list(self.problem.spread(detail_without, range(folds)))
         return [by_fold[number % folds] for number in range(len(photos))]
 
 

@@ -19,7 +19,9 @@ from tests.inference.made_lights import FEW, PRIOR, begun, drawn, on_even_cells,
 
 TOWARDS = np.array([0.36, -0.48, -0.8])
 SUN_LOBE = UnitLobes(TOWARDS[None], np.array([SUN]))
-LIGHTS, AROUND = (FitSchedule(together=together, least=0.1, given=True) for together in ((0, 8, 6), (0, 8)))
+LIGHTS, AROUND = (
+    FitSchedule(joint_steps=together, least_temperature=0.1, materials_fixed=True) for together in ((0, 8, 6), (0, 8))
+)
 
 
 @cache
