@@ -130,7 +130,7 @@ def _refuse_options_of_the_other_solver(params: Params) -> None:
         if owner != params.solver and getattr(params, field.name) != field.default:
             cure = f"leave it out, or set solve.solver={owner}"
             raise InputError(
-                f"{field.name} is an option of the solver {owner}, and the solver is {params.solver}",
+                f"solve.{field.name} is an option of solve.solver={owner}, but solve.solver={params.solver} is chosen",
                 key=f"solve.{field.name}",
                 cure=cure,
             )
@@ -145,10 +145,16 @@ def _known_values(params: Params, inputs: Inputs) -> KnownSlice:
     known = msgspec.convert(inputs.facts.get("dataset.known", {}), KnownSlice)
     if params.solver == "paper" and known != KnownSlice():
         cure = "leave `known` out of dataset.yaml, or set solve.solver=joint"
-        raise InputError(f"the solver {params.solver} finds everything itself", key="known", cure=cure)
+        raise InputError(
+            f"`known` is given, but solve.solver={params.solver} cannot hold quantities fixed", key="known", cure=cure
+        )
     if params.solver == "paper" and "start" in inputs.folders:
         cure = "leave it out, or set solve.solver=joint"
-        raise InputError(f"the solver {params.solver} starts from nothing", key="solve.start", cure=cure)
+        raise InputError(
+            f"an earlier solution is given, but solve.solver={params.solver} always starts from the photos alone",
+            key="solve.start",
+            cure=cure,
+        )
     return known
 
 

@@ -70,6 +70,14 @@ class Fit(msgspec.Struct, frozen=True):
         """Return the start of another fit, in other lights."""
         return msgspec.structs.replace(self, point=Point(self.point.materials, lights))
 
+    def with_curvatures(self, curvatures: dict[int, float]) -> Fit:
+        """Return the start of another fit, with other curvatures of some lights, by number of the light."""
+        lights = [
+            msgspec.structs.replace(light, curvature=curvatures.get(k, light.curvature))
+            for k, light in enumerate(self.point.lights)
+        ]
+        return self.with_lights(lights)
+
 
 class FitSchedule(msgspec.Struct, frozen=True):
     """Number of steps of a fit.
@@ -103,7 +111,7 @@ def fit_problem(
     schedule: FitSchedule,
     report: LossReport = lambda loss: None,
 ) -> Fit:
-    """Fit materials and lights to the observations that are not held out.
+    """Fit materials and lights to the observations that are not held out, and return the fit with its objective.
 
     Args:
         problem: Observations and model.
@@ -111,27 +119,20 @@ def fit_problem(
         prior: Prior on lights.
         schedule: Number of steps.
         report: Called at every point that is evaluated, with the mean robust loss of the fitted observations.
-
-    Returns:
-        The fit, with the value of its objective.
     """
     problem = problem.without_held_out()
     hyperparameters = start.hyperparameters
     materials = start.point.materials
     if not schedule.materials_fixed:
         materials = problem.known.insert_into(raise_reflectances(materials))
-    descent = Descent(
-        MaterialPrior(materials, problem.blocks, problem.known),
-        problem.spread,
-        report,
-        problem.known.free(len(materials)),
-    )
+    prior_on_materials = MaterialPrior(materials, problem.blocks, problem.known)
+    descent = Descent(prior_on_materials, problem.spread, report, problem.known.free(len(materials)))
+    illuminations = problem.illuminations(Point(materials, start.point.lights))
 
     def likelihood(pair: tuple[Illumination, Hyperparameters]) -> LightLikelihood:
         """Return the likelihood of one light, with a table of responses."""
         return light_likelihood(*pair, prior, schedule.materials_fixed, problem.tables)
 
-    illuminations = problem.illuminations(Point(materials, start.point.lights))
     likelihoods = list(problem.spread(likelihood, list(zip(illuminations, hyperparameters, strict=True))))
     state = descent.descend_lights(likelihoods, material_unknowns(materials), schedule.light_steps)
     least = schedule.least_temperature
@@ -145,12 +146,10 @@ def fit_problem(
             state = descent.descend_lights(state.likelihoods, state.theta, iterations)
         else:
             state = descent.descend_jointly(state, iterations)
+    if not schedule.materials_fixed:
+        materials = materials_from_unknowns(state.theta)
     lights = [descended.light for descended in state.likelihoods]
-    return Fit(
-        Point(materials if schedule.materials_fixed else materials_from_unknowns(state.theta), lights),
-        hyperparameters,
-        state.value,
-    )
+    return Fit(Point(materials, lights), hyperparameters, state.value)
 
 
 def light_likelihood(

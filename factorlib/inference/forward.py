@@ -151,6 +151,10 @@ class Illumination(msgspec.Struct, frozen=True):
         """Return the robust loss of every observation, averaged over its channels."""
         return loss.evaluate(self.residuals()).mean(1)
 
+    def fitted_loss(self, residual: Float[np.ndarray, "n 3"], loss: RobustLoss) -> float:
+        """Return Σ ρ(r), the robust loss summed over the fitted observations."""
+        return float(loss.evaluate(residual)[~self.block.held_out].sum())
+
     def unit_responses(self, rows: Int[np.ndarray, " n"], lobes: UnitLobes) -> Float[np.ndarray, "3 n q"]:
         """Return the whitened response at `rows` to q further lobes of weight one, per channel."""
         block = self.block
@@ -189,7 +193,7 @@ class Illumination(msgspec.Struct, frozen=True):
         light = self.light
         prediction = self.predict()
         residual = block.residuals(prediction.radiance)
-        value = float(loss.evaluate(residual)[~block.held_out].sum()) / temperature
+        value = self.fitted_loss(residual, loss) / temperature
         # a = ½ ∂(Σ ρ/T)/∂ℓ; `lit` is the part of ℓ that is proportional to the light
         by_radiance = self.root_weights(residual, loss, temperature) ** 2 * residual * block.precision
         by_linear = by_radiance * light.tone_slope(prediction.radiance, block.photo)
@@ -252,14 +256,12 @@ class Illumination(msgspec.Struct, frozen=True):
                 # ∂r/∂u = τ' e (k_d D + k_s S) w/σ, and its derivative by roughness
                 bright = ((rising[rows, c] * self.exposure[rows, 0])[:, None] * light.weight[:, c]).astype(np.float32)
                 by_roughness = of_roughness * (ks * bright)
-                by_reflectances = [
-                    kd * prediction.diffuse[rows, c] * rising[rows, c],
-                    ks * prediction.specular[rows, c] * rising[rows, c],
-                ]
+                factors = ((kd, prediction.diffuse), (ks, prediction.specular), (ks, prediction.by_roughness))
+                by_material = np.column_stack([k * values[rows, c] * rising[rows, c] for k, values in factors])
                 diffuse = lookup.diffuse * (kd * bright)
                 specular = of_specular * (ks * bright)
                 by_photo = by_photos[c][rows]
-                if light.scale_free:  # ∂r/∂ log of the factor on held cells
+                if light.scale_free:  # ∂r/∂ log of the factor on known cells
                     by_photo = np.hstack([by_photo, (diffuse + specular)[:, light.fixed].sum(1, keepdims=True)])
                 yield Linearised(
                     c,
@@ -268,9 +270,7 @@ class Illumination(msgspec.Struct, frozen=True):
                     diffuse[:, free],
                     specular[:, free],
                     by_roughness[:, free],
-                    np.column_stack([*by_reflectances, ks * prediction.by_roughness[rows, c] * rising[rows, c]]).astype(
-                        np.float32
-                    ),
+                    by_material.astype(np.float32),
                     by_photo.astype(np.float32),
                     (residual * pull)[rows, c].astype(np.float32),
                 )

@@ -168,9 +168,7 @@ class LightLikelihood(msgspec.Struct, frozen=True):
                 photo_cells = part.by_photo.T @ J
                 L[photos, cells] += photo_cells
                 L[cells, photos] += photo_cells.T
-        loss = float(
-            self.loss.evaluate(illumination.block.residuals(prediction.radiance))[~illumination.block.held_out].sum()
-        )
+        loss = illumination.fitted_loss(illumination.block.residuals(prediction.radiance), self.loss)
         factor = cholesky_factor(L)
         determinant = (np.zeros(k), np.zeros((k, k)), np.zeros(size))
         value += loss / self.temperature

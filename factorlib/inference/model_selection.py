@@ -269,21 +269,16 @@ def select_distances(problem: JointProblem, before: Fit, options: SolveOptions, 
         options: Options of the user.
         run_fit: Function that fits a model.
     """
-    pairs = zip(before.point.lights, problem.blocks, strict=True)
-    settled = [light.curvature > 0 or light.fixed.any() or block.place is None for light, block in pairs]
-    evidence = [Decision(light.curvature > 0) for light in before.point.lights]
-    if options.distance == "off" or problem.none_held_out or all(settled):
+    pairs = enumerate(zip(before.point.lights, problem.blocks, strict=True))
+    candidates = [k for k, (light, block) in pairs if not (light.is_near or light.fixed.any() or block.place is None)]
+    evidence = [Decision(light.is_near) for light in before.point.lights]
+    if options.distance == "off" or problem.none_held_out or not candidates:
         return Selection(before, evidence)
     sample = comparison_sample(problem, options)
-    candidates = [k for k, is_settled in enumerate(settled) if not is_settled]
 
     def fit_at(curvatures: dict[int, float], start: Fit = before, schedule: FitSchedule = DISTANCE_SCHEDULE) -> Fit:
         """Return the fit with lights of these curvatures, by number of the light."""
-        placed = [
-            msgspec.structs.replace(light, curvature=curvatures.get(k, light.curvature))
-            for k, light in enumerate(start.point.lights)
-        ]
-        return run_fit("distances", sample, start.with_lights(placed), schedule)
+        return run_fit("distances", sample, start.with_curvatures(curvatures), schedule)
 
     # each fit continues from the previous one: far away, then nearer and nearer
     losses = []

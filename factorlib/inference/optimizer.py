@@ -190,13 +190,9 @@ class Descent(msgspec.Struct, frozen=True):
         gradient = state.prior.gradient + by_determinant
         for system in state.systems:
             gradient[system.places] += system.material_gradient
-        theta = state.theta.reshape(-1)
-        outward = -gradient
-        at_bound = ((theta <= np.resize(LOWER_BOUNDS, size)) & (outward < 0)) | (
-            (theta >= np.resize(UPPER_BOUNDS, size)) & (outward > 0)
-        )
+        free = self.free & ~pushed_outward(state.theta.reshape(-1), -gradient)
         # H with D and the damping μ
-        arrow = Arrow(state.systems, state.prior.hessian + hessian, self.free & ~at_bound, damping)
+        arrow = Arrow(state.systems, state.prior.hessian + hessian, free, damping)
         penalty = hessian + damping * np.diag(arrow.diagonal)
         ends = np.cumsum([size, *(len(system.light_gradient) for system in state.systems)])[:-1]
 
@@ -205,11 +201,9 @@ class Descent(msgspec.Struct, frozen=True):
             of_materials, *of_lights = np.split(step, ends)
             change = of_materials.reshape(-1, 7).clip(-LARGEST_CHANGE, LARGEST_CHANGE)
             theta = (state.theta + change).clip(LOWER_BOUNDS, UPPER_BOUNDS)
-            light_steps = zip(state.likelihoods, of_lights, strict=True)
-            return theta, [
-                likelihood.with_point(step_light(likelihood.light, light_step), materials_from_unknowns(theta))
-                for likelihood, light_step in light_steps
-            ]
+            materials = materials_from_unknowns(theta)
+            steps = zip(state.likelihoods, of_lights, strict=True)
+            return theta, [old.with_point(step_light(old.light, step), materials) for old, step in steps]
 
         def objective(step: np.ndarray) -> tuple[float, np.ndarray]:
             """Return (2) and half its gradient."""
@@ -220,7 +214,7 @@ class Descent(msgspec.Struct, frozen=True):
             value = prior.value + sum(part.value for part in parts) + off @ (2 * by_determinant + penalty @ off)
             slope = prior.gradient + by_determinant + penalty @ off
             slope = slope + sum(part.by_materials for part in parts).reshape(-1)
-            slope[~(self.free & ~at_bound)] = 0.0
+            slope[~free] = 0.0
             return value, np.concatenate([slope, *(part.by_light for part in parts)])
 
         def metric(slope: np.ndarray) -> np.ndarray:
@@ -231,6 +225,13 @@ class Descent(msgspec.Struct, frozen=True):
 
         theta, likelihoods = moved(minimise_lbfgs(objective, ends[-1] + len(state.systems[-1].light_gradient), metric))
         return likelihoods, theta
+
+
+def pushed_outward(theta: Vector, direction: Vector) -> Bool[np.ndarray, " k"]:
+    """Return a mask of the unknowns at a bound that a direction would push beyond it."""
+    lower = (theta <= np.resize(LOWER_BOUNDS, theta.size)) & (direction < 0)
+    upper = (theta >= np.resize(UPPER_BOUNDS, theta.size)) & (direction > 0)
+    return lower | upper
 
 
 def descend_light(likelihood: LightLikelihood, iterations: int) -> tuple[LightLikelihood, System]:

@@ -171,7 +171,7 @@ def errors(normals: np.ndarray, true: np.ndarray) -> float:
 def test_dents_that_the_object_has_not_are_found_in_three_lights():
     what, body, given, true = on_spheres(3, 0.15, 1)
     assert what.evidence.kept and sum(what.gains.values()) > 0 and not what.painted.kept
-    turn = body.turns_of(what.displacements)
+    turn = body.turns_from_displacements(what.displacements)
     for block, exact in zip(given.blocks, true.blocks, strict=True):
         at = attached_to(exact.normal, body)
         before = errors(block.normal, exact.normal)
@@ -194,8 +194,8 @@ def test_of_two_meshes_the_one_with_dents_is_moved_and_the_exact_one_stays():
         at.append(msgspec.structs.replace(own, node=own.node + one.nodes * exact[:, None]))
     what = estimate_surface(problem.with_blocks(given), body, at, start_from_photos(3))
     assert what.evidence.kept and set(what.displacements) == {"dented"}
-    turn = body.turns_of(what.displacements)
-    assert turn[body.nodes_of({"dented"})].any() and not turn[body.nodes_of({"exact"})].any()
+    turn = body.turns_from_displacements(what.displacements)
+    assert turn[body.node_mask({"dented"})].any() and not turn[body.node_mask({"exact"})].any()
     for block, shown, own in zip(problem.blocks, given, at, strict=True):
         dented = block.material < block.material.max()
         after = own.turn_normals(shown.normal, shown.view, turn)
