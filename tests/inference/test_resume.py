@@ -67,7 +67,7 @@ def answer(blocks, checkpoint=Checkpoint(None), spread=serial_map):
         found.distances,
         found.splitting,
     ]
-    hyper = [[one.value, one.hyperparameters] for one in (found.materials, found.lights)]
+    hyper = [[one.value, one.hyperparameters] for one in (found.materials, found.fit)]
     return np.concatenate(parts).tobytes() + msgspec.json.encode([decided, hyper]), events
 
 
