@@ -71,10 +71,14 @@ def main(params: Params, inputs: Inputs, out: Path, progress: Progress) -> None:
         write_json(out / FILE, SurfaceTable())
         return
     observations = {name: draw_observations(inputs["urm"] / f"{name}.parquet", params) for name in photos}
-    attached = {name: photos[name].attach(np.column_stack([of.x, of.y]), surfaces) for name, of in observations.items()}
+    attached = {
+        name: photos[name].attach(np.column_stack([pixels.x, pixels.y]), surfaces)
+        for name, pixels in observations.items()
+    }
     result = _estimate_surface(params, inputs, observations, attached, surfaces, progress)
     displacements, factors = (
-        {name: values.astype("f4") for name, values in of.items()} for of in (result.displacements, result.log_factors)
+        {name: values.astype("f4") for name, values in values_by_mesh.items()}
+        for values_by_mesh in (result.displacements, result.log_factors)
     )
     # turns of normals and log albedo factors at the nodes of all meshes
     detail = zero_detail(surfaces.nodes)
@@ -86,7 +90,10 @@ def main(params: Params, inputs: Inputs, out: Path, progress: Progress) -> None:
         (out / "photos").mkdir()
         for name, photo in photos.items():
             write_exr(out / "photos" / f"{name}.exr", photo.detail_channels(surfaces, detail))
-    by_mesh = [{name: values.tolist() for name, values in of.items()} for of in (displacements, factors)]
+    by_mesh = [
+        {name: values.tolist() for name, values in values_by_mesh.items()}
+        for values_by_mesh in (displacements, factors)
+    ]
     table = SurfaceTable(
         bool(displacements), Tried.of(result.evidence, result.stiffness.turn),
         bool(factors), Tried.of(result.painted, result.stiffness.factor), result.gains, *by_mesh,

@@ -7,8 +7,8 @@ is the temperature T, which divides squared residuals:
     T = Σ_k (Σ_{i in k} r_i)² / Σ_k n_k, at least `least`                                                           (1)
 
 The clusters k hold nearby mirror directions; r is in σ and clipped at 3.  `least` is 1 while materials are fitted:
-cells are always a little too coarse, and with T below 1 the materials would
-absorb that error.  Given the materials, lights may fit as closely as the residuals allow.
+cells are always a little too coarse, and with T below 1 the materials would absorb that error.  Given the materials,
+lights may fit as closely as the residuals allow.
 
 Every light has its own T, so that a photo with a badly fitting mesh counts less.  T is estimated anew before each
 descent.  So are the factors that scale the light's contrast and colour relative to a typical light (equation (4) of

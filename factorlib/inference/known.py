@@ -205,17 +205,17 @@ def extract_known(
         m = number(ball.material)
         of_photo = observations.photo == observations.photos.index(ball.photo)
         pixels = balls[name].take(balls[name].material == m)
-        others = ~(of_photo & (observations.material == m))
-        if len(pixels) < LEAST_BALL_PIXELS or not (of_photo & others).any():
+        beside_ball = ~(of_photo & (observations.material == m))
+        if len(pixels) < LEAST_BALL_PIXELS or not (of_photo & beside_ball).any():
             fault = (
                 f"photo '{ball.photo}' shows {len(pixels)} pixels of the ball, "
-                f"and {(of_photo & others).sum()} observations of other objects"
+                f"and {(of_photo & beside_ball).sum()} observations of other objects"
             )
             cure = f"the ball needs {LEAST_BALL_PIXELS}, and something beside it: look at the overlay of `align`"
             raise InputError(fault, key=f"known.illumination.{name}.chrome", cure=cure)
         world = photos[ball.photo].world_from_camera
         lights[name] = light_from_ball(pixels, rows[m][3:6], np.eye(3) if world is None else np.array(world))
-        observations = observations.take(others)
+        observations = observations.take(beside_ball)
     return observations, KnownValues(
         rows, lights, tuple(sorted({photos[photo].illumination for photo in declared.exposure}))
     )

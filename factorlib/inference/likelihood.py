@@ -302,7 +302,7 @@ def cholesky_factor(matrix: Float[np.ndarray, "n n"]) -> Float[np.ndarray, "n n"
 def cholesky_inverse(factor: Float[np.ndarray, "n n"]) -> Float[np.ndarray, "n n"]:
     """Return the inverse of the matrix whose lower Cholesky factor is given, exactly symmetric.
 
-    >>> inverse_of(factorised(np.array([[4.0, 0.0], [0.0, 0.25]]))).tolist()
+    >>> cholesky_inverse(cholesky_factor(np.array([[4.0, 0.0], [0.0, 0.25]]))).tolist()
     [[0.25, 0.0], [0.0, 4.0]]
     """
     if not len(factor):

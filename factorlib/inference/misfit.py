@@ -65,7 +65,7 @@ def correlated_energy(values: Float[np.ndarray, "n 3"], group: Int[np.ndarray, "
     """Return E of (1); groups of fewer than `LEAST_GROUP` observations are left out.
 
     >>> alike, noise = np.full((8, 3), 0.1), np.tile([[0.1], [-0.1]], (4, 3))
-    >>> round(energy(alike, np.zeros(8, int)), 9), energy(noise, np.zeros(8, int))
+    >>> round(correlated_energy(alike, np.zeros(8, int)), 9), correlated_energy(noise, np.zeros(8, int))
     (0.24, 0.0)
     """
     count = np.bincount(group).astype(float)

@@ -148,8 +148,8 @@ class Descent(msgspec.Struct, frozen=True):
         self, likelihoods: Sequence[LightLikelihood], theta: Float[np.ndarray, "m 7"], iterations: int
     ) -> DescentState:
         """Return the state after at most `iterations` factorisations of each light, materials given."""
-        fitted = list(self.spread(lambda one: descend_light(one, iterations), likelihoods))
-        return self._state(theta, [one for one, _ in fitted], [system for _, system in fitted])
+        fitted = list(self.spread(lambda likelihood: descend_light(likelihood, iterations), likelihoods))
+        return self._state(theta, [likelihood for likelihood, _ in fitted], [system for _, system in fitted])
 
     def descend_jointly(self, state: DescentState, iterations: int) -> DescentState:
         """Return the state after at most `iterations` factorisations, of materials and lights together."""

@@ -211,8 +211,8 @@ class PaperObjective:
         (diffuse, specular, roughness), lights = self.unpack(x)
         vector = torch.cat([diffuse, specular, roughness[:, None]], 1).reshape(-1).numpy()
         arrays = [[part.numpy() for part in light] for light in lights]
-        found = [Light(axis, sharpness, weight, exposure) for axis, sharpness, weight, exposure in arrays]
-        return Point(Materials.from_vector(vector), found)
+        light_list = [Light(axis, sharpness, weight, exposure) for axis, sharpness, weight, exposure in arrays]
+        return Point(Materials.from_vector(vector), light_list)
 
     def objective_on(self, x: Tensor, subset: Sequence[Int[np.ndarray, " _"]]) -> tuple[float, Tensor]:
         """Return the value and the gradient on the subset."""

@@ -21,8 +21,7 @@ A factor per channel is free between the materials and the lights of a connected
 other.  Then it is known only as well as the model of interreflection holds.  So the brightest material of a component
 is expected to be of ordinary brightness.  Let b be the mean over channels of its k_d + k_s:
 
-    (log b − log MEDIAN_BRIGHTNESS)²/BRIGHTNESS_DEVIATION²
-    (2)
+    (log b − log MEDIAN_BRIGHTNESS)²/BRIGHTNESS_DEVIATION²                                                       (2)
 
 b lies between 0.5 and 0.95 within two standard deviations.  (2) does not apply where a material or a light of the
 component is known.  The prior on lights, whose mean is grey, settles the tint.  A very wide Gaussian about the start

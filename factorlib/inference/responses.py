@@ -309,7 +309,7 @@ def lagrange_weights(
 ) -> tuple[Float[np.ndarray, " k"], Float[np.ndarray, " k"]]:
     """Return the weights of values at `nodes` in the interpolating polynomial at x, and in its derivative.
 
-    >>> [w.tolist() for w in lagrange(np.array([0.0, 1.0, 2.0]), 0.25)]
+    >>> [w.tolist() for w in lagrange_weights(np.array([0.0, 1.0, 2.0]), 0.25)]
     [[0.65625, 0.4375, -0.09375], [-1.25, 1.5, -0.25]]
     """
     value = []

@@ -140,15 +140,15 @@ class DetailTrial(msgspec.Struct, frozen=True):
 
     def with_detail(self, detail: Detail) -> JointProblem:
         """Return the problem on a surface with detail."""
-        pairs = zip(self.problem.blocks, self.attached, strict=True)
-        return self.problem.with_blocks([detail.apply_to(block, positions) for block, positions in pairs])
+        blocks = zip(self.problem.blocks, self.attached, strict=True)
+        return self.problem.with_blocks([detail.apply_to(block, positions) for block, positions in blocks])
 
     def linearise(self, detail: Detail, fit: Fit) -> list[LightTerms]:
         """Linearise every light on a surface with detail."""
-        each = zip(self.with_detail(detail).illuminations(fit.point), fit.hyperparameters, self.attached, strict=True)
+        tasks = zip(self.with_detail(detail).illuminations(fit.point), fit.hyperparameters, self.attached, strict=True)
         nodes = self.surfaces.nodes
         return list(
-            self.problem.spread(lambda one: linearise_light(one[0], one[1], self.prior, one[2], nodes), list(each))
+            self.problem.spread(lambda task: linearise_light(task[0], task[1], self.prior, task[2], nodes), list(tasks))
         )
 
     def restrict_turns(self, detail: Detail, meshes: set[str]) -> Detail:

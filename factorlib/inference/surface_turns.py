@@ -330,10 +330,10 @@ def _normal_derivatives(illumination: Illumination) -> Float[np.ndarray, "n 3 3"
     """Return ∂r/∂n of each observation, channel by axis, in the tangent plane of the normal."""
     residual_before = illumination.residuals()
     # two tangents, and finite differences of the residuals along each
-    first = np.cross(illumination.block.normal, np.eye(3)[np.abs(illumination.block.normal).argmin(1)])
-    first /= np.linalg.norm(first, axis=1, keepdims=True)
+    tangent_1 = np.cross(illumination.block.normal, np.eye(3)[np.abs(illumination.block.normal).argmin(1)])
+    tangent_1 /= np.linalg.norm(tangent_1, axis=1, keepdims=True)
     result = np.zeros((len(illumination.block), 3, 3))
-    for tangent in (first, np.cross(illumination.block.normal, first)):
+    for tangent in (tangent_1, np.cross(illumination.block.normal, tangent_1)):
         turned = illumination.block.normal + NORMAL_STEP * tangent
         turned /= np.linalg.norm(turned, axis=1, keepdims=True)
         residual_after = msgspec.structs.replace(
