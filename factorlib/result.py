@@ -33,7 +33,7 @@ from factorlib.images.exr import LAT_LONG, read_rgb_exr, write_hdr, write_rgb_ex
 from factorlib.images.light_map import read_light_map
 from factorlib.images.picture import picture
 from factorlib.jsonfile import read_json
-from factorlib.light.latlong import turned_map
+from factorlib.light.latlong import rotate_map
 from factorlib.reading import check_plain
 from factorlib.recipe import schema
 from factorlib.recipe.read import check_recipe, files_of
@@ -321,7 +321,7 @@ class Environment(msgspec.Struct, frozen=True):
     def rotate(self, degrees: float) -> Environment:
         """Return the map turned about the upright axis; at 90° the viewer's side (+z) goes to the right (+x)."""
         rotation = rotation_of_vector(np.radians(degrees) * np.array([0.0, 1.0, 0.0]))
-        return Environment(turned_map(self.lat_long, rotation))
+        return Environment(rotate_map(self.lat_long, rotation))
 
     def to_exr(self, path: str | Path) -> None:
         """Write the map as OpenEXR's lat-long environment."""

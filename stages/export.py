@@ -36,7 +36,7 @@ from factorlib.export.scene import ALL_BOUNCES, DIRECT, ExposedMap, Scene, Sun, 
 from factorlib.export.usd import SUFFIX, write_usd_scene
 from factorlib.images.exr import LAT_LONG, read_rgb_exr, write_hdr, write_rgb_exr
 from factorlib.jsonfile import write_json
-from factorlib.light.latlong import lat_long_of_lobes, sampled
+from factorlib.light.latlong import lat_long_of_lobes, sample_map
 from factorlib.light.lobes import Lobes, no_lobes
 from factorlib.meshes.ply import write_ply
 from factorlib.meshes.read import CREASE_DEG
@@ -175,7 +175,7 @@ def _write_light(out: Path, name: str, light: Lobes, coverage: Path, params: Par
     _write_mitsuba_map(out / "scenes" / "light" / f"{name}.exr", sky, params)
     if coverage.exists():
         directions = lat_long_directions(params.height, 2 * params.height)
-        write_rgb_exr(out / "coverage" / f"{name}.exr", sampled(read_rgb_exr(coverage), directions), LAT_LONG)
+        write_rgb_exr(out / "coverage" / f"{name}.exr", sample_map(read_rgb_exr(coverage), directions), LAT_LONG)
 
 
 def _sun(sun: Sun) -> dict[str, Any]:

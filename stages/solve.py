@@ -21,18 +21,24 @@ from factorlib.images.exr import LAT_LONG, write_rgb_exr
 from factorlib.images.light_map import read_light_map
 from factorlib.inference import options
 from factorlib.inference.answer import Answer
-from factorlib.inference.history import Event, Solution, of_parts, of_subsets
+from factorlib.inference.blocks import Noise, RobustLoss
+from factorlib.inference.fit_runner import Event, FitRunner, Solution, solve_progress, subset_progress
 from factorlib.inference.identifiability import after_solving, before_solving, unusable_observations
 from factorlib.inference.joint_solver import solve
-from factorlib.inference.known import what_is_known
-from factorlib.inference.noise import Loss, Noise
-from factorlib.inference.observed import blocks_of_observations, gathered, usable
-from factorlib.inference.paper_solver import REPORTS, Paper, Prior, Samplings
+from factorlib.inference.known import extract_known
+from factorlib.inference.observed import blocks_of_observations, gather_observations, usable_observations
+from factorlib.inference.paper_solver import REPORTS, PaperOptions, Prior, Samplings
 from factorlib.inference.paper_solver import solve as solve_as_the_paper
 from factorlib.inference.problem import JointProblem
-from factorlib.inference.resume import Run
-from factorlib.inference.start import Beginning, Start, from_beginning, from_earlier, from_nothing, with_decided
-from factorlib.inference.uncertainty import uncertainty_of
+from factorlib.inference.start import (
+    InitialFit,
+    Start,
+    start_from_earlier,
+    start_from_photos,
+    start_from_surface,
+    with_earlier_decisions,
+)
+from factorlib.inference.uncertainty import estimate_uncertainty
 from factorlib.jsonfile import read_result, write_json
 from factorlib.parquetfile import write_rows
 from factorlib.reflection import reflection_operator
@@ -44,13 +50,13 @@ from factorlib.stage import Inputs, Progress
 from factorlib.urm import observations as urm
 
 log = logging.getLogger("factorlib.inference")
-PAPER = Paper()  # defaults of the paper's solver
+PAPER = PaperOptions()  # defaults of the paper's solver
 # Shares of the stage's time on data/eames.
 READING = 0.03
 ERRORS = 0.07  # standard errors
 
 
-class Params(options.Choices, frozen=True, forbid_unknown_fields=True):
+class Params(options.SolveOptions, frozen=True, forbid_unknown_fields=True):
     """Parameters of the joint solver, of the paper's solver (paper_…), and of both.
 
     The optional folder `start` holds an earlier solution.  Materials and lights of the same names start from it.
@@ -79,10 +85,10 @@ def main(params: Params, inputs: Inputs, out: Path, progress: Progress) -> None:
     progress(0, 1, "observations")
     read = count(1)
     _refuse_options_of_the_other_solver(params)
-    given = _given(params, inputs)
+    declared = _known_values(params, inputs)
     files = sorted(inputs["urm"].glob("*.parquet"))
     surface = inputs.folders.get("surface")
-    photos = gathered(
+    photos = gather_observations(
         files,
         params.merge_degrees,
         inputs.map,
@@ -90,12 +96,12 @@ def main(params: Params, inputs: Inputs, out: Path, progress: Progress) -> None:
         lambda: progress(READING * next(read) / len(files), 1, "observations"),
     )
     _warn(unusable_observations(photos))
-    seen = urm.with_exposures(urm.concatenate([photo.merged for photo in photos]), given.exposure)
-    relative = urm.relative_exposures(seen)
+    observations = urm.with_exposures(urm.concatenate([photo.merged for photo in photos]), declared.exposure)
+    relative = urm.relative_exposures(observations)
     earlier = read_earlier(inputs["start"]).beside(relative) if "start" in inputs.folders else None
-    problem = _problem(params, inputs, given, seen, relative)
-    _warn(before_solving(names, seen.photos, problem))
-    solution = _solved(params, problem, earlier, inputs, partial(_share, progress))
+    problem = _build_problem(params, inputs, declared, observations, relative)
+    _warn(before_solving(names, observations.photos, problem))
+    solution = _run_solver(params, problem, earlier, inputs, partial(_share, progress))
     systems = 2 * len(problem.blocks)
     made = count(1)
 
@@ -103,7 +109,7 @@ def main(params: Params, inputs: Inputs, out: Path, progress: Progress) -> None:
         """Report that one more system of normal equations for the standard errors is done."""
         progress(1 - ERRORS + ERRORS * next(made) / systems, 1, "standard errors")
 
-    errors, coverages = uncertainty_of(solution, problem, params, tick)
+    errors, coverages = estimate_uncertainty(solution, problem, params, tick)
     answer = Answer(names, problem, solution, errors, relative, params.solver, earlier)
     _warn(after_solving(answer))
     write_json(out / "materials.json", answer.material_table())
@@ -118,19 +124,19 @@ def main(params: Params, inputs: Inputs, out: Path, progress: Progress) -> None:
 
 def _refuse_options_of_the_other_solver(params: Params) -> None:
     """Raise InputError if an option that only the other solver reads differs from its default."""
-    joint = set(options.Choices.__struct_fields__) - {"seed"}
+    joint = set(options.SolveOptions.__struct_fields__) - {"seed"}
     for field in msgspec.structs.fields(Params):
         owner = "paper" if field.name.startswith("paper_") else "joint" if field.name in joint else params.solver
         if owner != params.solver and getattr(params, field.name) != field.default:
             cure = f"leave it out, or set solve.solver={owner}"
             raise InputError(
-                f"{field.name} is an option of the solver {owner}, and the solver is {params.solver}",
+                f"solve.{field.name} is an option of solve.solver={owner}, but solve.solver={params.solver} is chosen",
                 key=f"solve.{field.name}",
                 cure=cure,
             )
 
 
-def _given(params: Params, inputs: Inputs) -> KnownSlice:
+def _known_values(params: Params, inputs: Inputs) -> KnownSlice:
     """Return the known materials, lights and exposures of dataset.yaml.
 
     Raises:
@@ -139,10 +145,16 @@ def _given(params: Params, inputs: Inputs) -> KnownSlice:
     known = msgspec.convert(inputs.facts.get("dataset.known", {}), KnownSlice)
     if params.solver == "paper" and known != KnownSlice():
         cure = "leave `known` out of dataset.yaml, or set solve.solver=joint"
-        raise InputError(f"the solver {params.solver} finds everything itself", key="known", cure=cure)
+        raise InputError(
+            f"`known` is given, but solve.solver={params.solver} cannot hold quantities fixed", key="known", cure=cure
+        )
     if params.solver == "paper" and "start" in inputs.folders:
         cure = "leave it out, or set solve.solver=joint"
-        raise InputError(f"the solver {params.solver} starts from nothing", key="solve.start", cure=cure)
+        raise InputError(
+            f"an earlier solution is given, but solve.solver={params.solver} always starts from the photos alone",
+            key="solve.start",
+            cure=cure,
+        )
     return known
 
 
@@ -151,37 +163,39 @@ def _share(progress: Progress, done: float, total: float, text: str = "") -> Non
     progress(READING * total + (1 - READING - ERRORS) * done, total, text)
 
 
-def _problem(
-    params: Params, inputs: Inputs, given: KnownSlice, seen: urm.Observations, relative: dict[str, float]
+def _build_problem(
+    params: Params, inputs: Inputs, declared: KnownSlice, observations: urm.Observations, relative: dict[str, float]
 ) -> JointProblem:
     """Return the problem: blocks of observations at one exposure, operator, loss and known quantities.
 
     Args:
         params: Parameters of the stage.
         inputs: Inputs of the stage.
-        given: Known quantities of dataset.yaml.
-        seen: Observations of all photos.
+        declared: Known quantities of dataset.yaml.
+        observations: Observations of all photos.
         relative: Relative exposures, by photo.
     """
     lights = msgspec.convert(inputs.facts["dataset.light"], dict[str, LightSlice])
     worlds = {photo: light.world_from_camera for photo, light in lights.items()}
-    maps = {name: read_light_map(inputs.file(file)) for name, file in given.maps.items()}
-    tables = {name: inputs["urm"] / f"{ball.photo}.parquet" for name, ball in given.balls.items()}
-    balls = {name: urm.at_one_exposure(usable(urm.read_observations(t)), relative) for name, t in tables.items()}
-    seen, known = what_is_known(given, maps, balls, urm.at_one_exposure(seen, relative), lights)
+    maps = {name: read_light_map(inputs.file(file)) for name, file in declared.maps.items()}
+    tables = {name: inputs["urm"] / f"{ball.photo}.parquet" for name, ball in declared.balls.items()}
+    balls = {
+        name: urm.at_one_exposure(usable_observations(urm.read_observations(t)), relative) for name, t in tables.items()
+    }
+    observations, known = extract_known(declared, maps, balls, urm.at_one_exposure(observations, relative), lights)
     if params.solver == "paper":  # its materials are uniform
-        seen = msgspec.structs.replace(seen, detail=None)
+        observations = msgspec.structs.replace(observations, detail=None)
     rotations = {photo: np.array(world) for photo, world in worlds.items() if world is not None}
     blocks = blocks_of_observations(
-        seen, Noise(), held_out=params.held_out, world_from_camera=rotations, seed=params.seed
+        observations, Noise(), held_out=params.held_out, world_from_camera=rotations, seed=params.seed
     )
     automatic: Name = "paper_network" if params.solver == "paper" else "network"
     operator = automatic if params.operator == "auto" else params.operator
     reflection = reflection_operator(operator, weights=inputs["train"])
-    return JointProblem(blocks, reflection, Loss(), inputs.map, known)
+    return JointProblem(blocks, reflection, RobustLoss(), inputs.map, known)
 
 
-def _solved(
+def _run_solver(
     params: Params, problem: JointProblem, earlier: Earlier | None, inputs: Inputs, progress: Progress
 ) -> Solution:
     """Return the solution of the chosen solver.
@@ -195,20 +209,24 @@ def _solved(
     """
     names = inputs.facts["dataset.materials"]
     if params.solver == "paper":
-        paper = Paper(params.paper_lobes, params.paper_samplings, params.paper_prior, params.seed)
-        return solve_as_the_paper(problem, len(names), paper, of_subsets(progress, REPORTS))
+        paper = PaperOptions(params.paper_lobes, params.paper_samplings, params.paper_prior, params.seed)
+        return solve_as_the_paper(problem, len(names), paper, subset_progress(progress, REPORTS))
     unfinished = Checkpoint(inputs.unfinished / "solve.pt" if inputs.unfinished else None)
-    start = from_earlier(earlier, names) if earlier else _beginning(inputs, problem) or from_nothing(len(names))
-    choices = with_decided(params, earlier) if earlier else params
-    return solve(problem, start, choices, Run(unfinished, of_parts(progress, choices)))
+    start = (
+        start_from_earlier(earlier, names)
+        if earlier
+        else _surface_start(inputs, problem) or start_from_photos(len(names))
+    )
+    choices = with_earlier_decisions(params, earlier) if earlier else params
+    return solve(problem, start, choices, FitRunner(unfinished, solve_progress(progress, choices)))
 
 
-def _beginning(inputs: Inputs, problem: JointProblem) -> Start | None:
+def _surface_start(inputs: Inputs, problem: JointProblem) -> Start | None:
     """Return the start at the fit of `surface`; None without one, or with known quantities, which it ignores."""
     surface = inputs.folders.get("surface")
-    if surface is None or not problem.known.nothing or not (surface / BEGINNING).is_file():
+    if surface is None or not problem.known.is_empty or not (surface / BEGINNING).is_file():
         return None
-    return from_beginning(read_result(surface / BEGINNING, Beginning, "surface"))
+    return start_from_surface(read_result(surface / BEGINNING, InitialFit, "surface"))
 
 
 def _warn(sentences: Iterable[str]) -> None:

@@ -17,13 +17,19 @@ from jaxtyping import Int
 
 from factorlib.dataset.schema import LightSlice, ObjectsSlice
 from factorlib.images.exr import read_exr, write_exr
-from factorlib.inference.noise import Noise
-from factorlib.inference.observed import blocks_of_observations, usable
+from factorlib.inference.blocks import Noise
+from factorlib.inference.observed import blocks_of_observations, usable_observations
 from factorlib.inference.problem import JointProblem
-from factorlib.inference.start import from_nothing
-from factorlib.inference.surface_attach import attached_pixels
-from factorlib.inference.surface_detail import Found, Surfaces, found
-from factorlib.inference.surface_turns import Attached, Detail, joined, no_detail
+from factorlib.inference.start import start_from_photos
+from factorlib.inference.surface_detail import SurfaceEstimate, estimate_surface
+from factorlib.inference.surface_turns import (
+    Attached,
+    Detail,
+    Surfaces,
+    attach_pixels,
+    concatenate_attached,
+    zero_detail,
+)
 from factorlib.jsonfile import write_json
 from factorlib.meshes.fine import fine
 from factorlib.meshes.read import CREASE_DEG, MeshesOnce
@@ -60,27 +66,34 @@ def main(params: Params, inputs: Inputs, out: Path, progress: Progress) -> None:
         return
     slices = msgspec.convert(inputs.facts["dataset.objects"], dict[str, ObjectsSlice])
     photos = _photos(inputs, slices)
-    surfaces = surfaces_of(inputs, slices)
+    surfaces = read_surfaces(inputs, slices)
     if not surfaces.meshes:
         write_json(out / FILE, SurfaceTable())
         return
-    seen = {name: drawn(inputs["urm"] / f"{name}.parquet", params) for name in photos}
-    attached = {name: photos[name].attached(np.column_stack([of.x, of.y]), surfaces) for name, of in seen.items()}
-    result = _found(params, inputs, seen, attached, surfaces, progress)
+    observations = {name: draw_observations(inputs["urm"] / f"{name}.parquet", params) for name in photos}
+    attached = {
+        name: photos[name].attach(np.column_stack([pixels.x, pixels.y]), surfaces)
+        for name, pixels in observations.items()
+    }
+    result = _estimate_surface(params, inputs, observations, attached, surfaces, progress)
     displacements, factors = (
-        {name: values.astype("f4") for name, values in of.items()} for of in (result.displacements, result.log_factors)
+        {name: values.astype("f4") for name, values in values_by_mesh.items()}
+        for values_by_mesh in (result.displacements, result.log_factors)
     )
     # turns of normals and log albedo factors at the nodes of all meshes
-    detail = no_detail(surfaces.nodes)
+    detail = zero_detail(surfaces.nodes)
     if displacements:
-        detail = msgspec.structs.replace(detail, turn=surfaces.turns_of(displacements))
+        detail = msgspec.structs.replace(detail, turn=surfaces.turns_from_displacements(displacements))
     if factors:
         detail = msgspec.structs.replace(detail, log_factor=np.concatenate([factors[name] for name in surfaces.meshes]))
     if displacements or factors:
         (out / "photos").mkdir()
         for name, photo in photos.items():
-            write_exr(out / "photos" / f"{name}.exr", photo.detailed(surfaces, detail))
-    by_mesh = [{name: values.tolist() for name, values in of.items()} for of in (displacements, factors)]
+            write_exr(out / "photos" / f"{name}.exr", photo.detail_channels(surfaces, detail))
+    by_mesh = [
+        {name: values.tolist() for name, values in values_by_mesh.items()}
+        for values_by_mesh in (displacements, factors)
+    ]
     table = SurfaceTable(
         bool(displacements), Tried.of(result.evidence, result.stiffness.turn),
         bool(factors), Tried.of(result.painted, result.stiffness.factor), result.gains, *by_mesh,
@@ -90,21 +103,21 @@ def main(params: Params, inputs: Inputs, out: Path, progress: Progress) -> None:
     progress(1, 1)
 
 
-class Photo(msgspec.Struct, frozen=True):
+class AlignedPhoto(msgspec.Struct, frozen=True):
     """Photo as written by `align`: its maps, its objects and their poses."""
 
     geometry: Channels
     objects: ObjectsSlice
     poses: PhotoPoses
 
-    def attached(self, pixels: Int[np.ndarray, "n 2"], surfaces: Surfaces) -> Attached:
+    def attach(self, pixels: Int[np.ndarray, "n 2"], surfaces: Surfaces) -> Attached:
         """Return the positions of pixels (x, y) on the surfaces."""
         height, width = self.geometry["object"].shape
-        objects = {own.name: (own.mesh, self.poses.objects[own.name]) for own in self.objects.objects}
-        shown = np.rint(self.geometry["object"][pixels[:, 1], pixels[:, 0]]).astype(int)
-        return attached_pixels(pixels, shown, self.poses.camera.camera(width, height), objects, surfaces)
+        objects = {entry.name: (entry.mesh, self.poses.objects[entry.name]) for entry in self.objects.objects}
+        object_number = np.rint(self.geometry["object"][pixels[:, 1], pixels[:, 0]]).astype(int)
+        return attach_pixels(pixels, object_number, self.poses.camera.camera(width, height), objects, surfaces)
 
-    def detailed(self, surfaces: Surfaces, detail: Detail) -> Channels:
+    def detail_channels(self, surfaces: Surfaces, detail: Detail) -> Channels:
         """Return the channels normal.x, .y, .z (camera frame) and detail (factor on the diffuse reflectance).
 
         All are 0 at pixels without a mesh.
@@ -114,22 +127,23 @@ class Photo(msgspec.Struct, frozen=True):
             np.stack([self.geometry[f"{kind}.{a}"][y, x] for a in "xyz"], axis=-1).astype(float)
             for kind in ("normal", "view")
         )
-        attached = self.attached(np.column_stack([x, y]), surfaces)
+        attached = self.attach(np.column_stack([x, y]), surfaces)
         picture = np.zeros((*self.geometry["object"].shape, 4), np.float32)
-        picture[y, x, :3] = attached.turned(normal, view, detail.turn)
+        picture[y, x, :3] = attached.turn_normals(normal, view, detail.turn)
         picture[y, x, 3] = attached.factor(detail.log_factor)
         return dict(zip(("normal.x", "normal.y", "normal.z", "detail"), np.moveaxis(picture, -1, 0)))
 
 
-def _photos(inputs: Inputs, slices: dict[str, ObjectsSlice]) -> dict[str, Photo]:
+def _photos(inputs: Inputs, slices: dict[str, ObjectsSlice]) -> dict[str, AlignedPhoto]:
     """Return all photos as written by `align`, sorted by name."""
     poses = read_poses(inputs["align"] / POSES)
     return {
-        name: Photo(read_exr(inputs["align"] / f"{name}.exr"), slices[name], poses[name]) for name in sorted(slices)
+        name: AlignedPhoto(read_exr(inputs["align"] / f"{name}.exr"), slices[name], poses[name])
+        for name in sorted(slices)
     }
 
 
-def surfaces_of(inputs: Inputs, slices: dict[str, ObjectsSlice]) -> Surfaces:
+def read_surfaces(inputs: Inputs, slices: dict[str, ObjectsSlice]) -> Surfaces:
     """Return the subdivided meshes that photos show.
 
     Bodies of revolution that were estimated from outlines are left out, because their rotation about the axis is
@@ -138,54 +152,56 @@ def surfaces_of(inputs: Inputs, slices: dict[str, ObjectsSlice]) -> Surfaces:
     read = MeshesOnce(inputs.mesh, inputs.facts["dataset.materials"], CREASE_DEG)
     meshes = {}
     for slice_ in slices.values():
-        for own in slice_.objects:
-            if own.mesh not in meshes and not slice_.meshes[own.mesh].revolved:
-                meshes[own.mesh] = fine(read.mesh(own.mesh, slice_.meshes[own.mesh], own.materials))
+        for entry in slice_.objects:
+            if entry.mesh not in meshes and not slice_.meshes[entry.mesh].revolved:
+                meshes[entry.mesh] = fine(read.mesh(entry.mesh, slice_.meshes[entry.mesh], entry.materials))
     return Surfaces(dict(sorted(meshes.items())))
 
 
-def drawn(file: Path, params: Params) -> Observations:
+def draw_observations(file: Path, params: Params) -> Observations:
     """Return at most `params.observations` usable observations of a photo, drawn at random, in their order."""
-    seen = usable(read_observations(file))
-    chosen = np.random.default_rng(params.seed).permutation(len(seen))[: params.observations]
-    return seen.take(np.sort(chosen))
+    usable = usable_observations(read_observations(file))
+    rows = np.random.default_rng(params.seed).permutation(len(usable))[: params.observations]
+    return usable.take(np.sort(rows))
 
 
-def _found(
+def _estimate_surface(
     params: Params,
     inputs: Inputs,
-    seen: dict[str, Observations],
+    observations: dict[str, Observations],
     attached: dict[str, Attached],
     surfaces: Surfaces,
     progress: Progress,
-) -> Found:
+) -> SurfaceEstimate:
     """Return the surface detail estimated from all photos.
 
     Args:
         params: Parameters of the stage.
         inputs: Inputs of the stage.
-        seen: Observations, by photo.
+        observations: Observations, by photo.
         attached: Nodes under the observations, by photo.
         surfaces: Subdivided meshes.
         progress: Receiver of progress.
     """
     lights = msgspec.convert(inputs.facts["dataset.light"], dict[str, LightSlice])
-    worlds = {name: np.array(of.world_from_camera) for name, of in lights.items() if of.world_from_camera is not None}
-    every = concatenate(list(seen.values()))
-    every = at_one_exposure(every, relative_exposures(every))
-    blocks = blocks_of_observations(every, Noise(), world_from_camera=worlds, seed=params.seed)
-    in_frame = [of.in_frame(worlds.get(name, np.eye(3))) for name, of in attached.items()]
+    worlds = {
+        name: np.array(light.world_from_camera) for name, light in lights.items() if light.world_from_camera is not None
+    }
+    merged = concatenate(list(observations.values()))
+    merged = at_one_exposure(merged, relative_exposures(merged))
+    blocks = blocks_of_observations(merged, Noise(), world_from_camera=worlds, seed=params.seed)
+    in_frame = [light.rotated(worlds.get(name, np.eye(3))) for name, light in attached.items()]
     problem = JointProblem(blocks, reflection_operator("network", weights=inputs["train"]), spread=inputs.map)
-    nodes = joined(in_frame)
+    nodes = concatenate_attached(in_frame)
     of_blocks = []
     for block in blocks:
         assert block.row is not None  # `blocks_of_observations` numbers the observations
         of_blocks.append(nodes.take(block.row))
-    return found(
+    return estimate_surface(
         problem,
         surfaces,
         of_blocks,
-        from_nothing(len(inputs.facts["dataset.materials"])),
+        start_from_photos(len(inputs.facts["dataset.materials"])),
         params.seed,
         lambda share, what: progress(share, 1, what),
     )

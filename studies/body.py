@@ -16,7 +16,7 @@ from scipy.spatial.transform import Rotation
 
 from factorlib.evaluate.ball import ball, light_of_lat_long
 from factorlib.geometry.sphere import ball_normals
-from factorlib.light.latlong import turned_map
+from factorlib.light.latlong import rotate_map
 from factorlib.results.materials import Reflectance
 from factorlib.urm.observations import Observations
 from studies.errors import Map
@@ -67,7 +67,7 @@ def shown(material: Reflectance, light: Map, view: View) -> Radiance:
     same turn.
     """
     ahead = np.array_equal(view.turn, np.eye(3))
-    light = light if ahead else turned_map(light, view.turn, FINER)
+    light = light if ahead else rotate_map(light, view.turn, FINER)
     return ball(light_of_lat_long(light), material, view.normals @ view.turn.T)
 
 

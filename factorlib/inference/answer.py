@@ -15,14 +15,14 @@ from msgspec import UNSET, UnsetType
 
 from factorlib.inference import uncertainty
 from factorlib.inference.blocks import Block
+from factorlib.inference.fit_runner import Solution
 from factorlib.inference.gauge import DETERMINED, GIVEN, RULE, UP_TO_SCALE, connected_components
-from factorlib.inference.history import Solution
 from factorlib.inference.lights import Light
 from factorlib.inference.materials import LEAST_REFLECTANCE, Materials
-from factorlib.inference.misfit import misfit
-from factorlib.inference.priors import class_of
+from factorlib.inference.misfit import unexplained_shares
+from factorlib.inference.priors import likeliest_class
 from factorlib.inference.problem import JointProblem
-from factorlib.inference.uncertainty import ABSOLUTE, GAUGE, StandardErrors
+from factorlib.inference.uncertainty import ABSOLUTE, GAUGE, MaterialErrors
 from factorlib.light.lobes import Lobes
 from factorlib.results import materials as table
 from factorlib.results.materials import Decision, Uncertainty
@@ -50,7 +50,7 @@ class Answer(msgspec.Struct, frozen=True, dict=True):
     names: list[str]
     problem: JointProblem
     solution: Solution
-    errors: StandardErrors
+    errors: MaterialErrors
     relative: dict[str, float]
     solver: Literal["joint", "paper"]
     earlier: Earlier | None = None
@@ -58,7 +58,7 @@ class Answer(msgspec.Struct, frozen=True, dict=True):
     @cached_property
     def radiance(self) -> list[Float[np.ndarray, "n 3"]]:
         """Predicted radiance of all observations, block by block, in the block's unit."""
-        return self.solution.shown(self.problem).radiance(self.solution.point)
+        return self.solution.effective_problem(self.problem).radiance(self.solution.point)
 
     def material_table(self) -> table.MaterialTable:
         """Return the content of materials.json."""
@@ -66,13 +66,13 @@ class Answer(msgspec.Struct, frozen=True, dict=True):
         stderr = self._errors()
         kinds = self._kinds()
         solved = {
-            name: table.solved(table.Reflectance(*row), stderr[name], kind, self._given(m))
+            name: table.solved(table.Reflectance(*row), stderr[name], kind, self._known_parts(m))
             for m, (name, row, kind) in enumerate(zip(self.names, rows, kinds, strict=True))
         }
         components = connected_components(self.problem.blocks, len(self.names))
         component = {self.names[m]: k for k, (members, _) in enumerate(components) for m in members}
         absolute = self.solution.interreflection.kept
-        gauge = table.Gauge(RULE + DETERMINED * absolute + self._given_rule(), component, self._gauge_of_errors())
+        gauge = table.Gauge(RULE + DETERMINED * absolute + self._known_rule(), component, self._gauge_of_errors())
         return table.MaterialTable(solved, gauge, self.model())
 
     def _kinds(self) -> list[table.Kind | UnsetType]:
@@ -87,22 +87,21 @@ class Answer(msgspec.Struct, frozen=True, dict=True):
         relative = errors.specular.mean(1) / np.maximum(materials.specular.mean(1), LEAST_REFLECTANCE)
         specular = self.solution.materials.point.materials.specular
         rows = zip(specular, materials.roughness.tolist(), relative.tolist(), errors.roughness.tolist(), strict=True)
-        return [table.Kind(*class_of(*row)) for row in rows]
+        return [table.Kind(*likeliest_class(*row)) for row in rows]
 
-    def _given_rule(self) -> str:
+    def _known_rule(self) -> str:
         """Return a sentence that names what fixes scale and white balance; empty if nothing is known beforehand."""
-        known = self.problem.known
-        fixed = [self.names[m] for m in sorted(known.materials)]
-        fixed += sorted(name for name, light in known.lights.items() if not light.scale_free)
-        tinted = sorted(name for name, light in known.lights.items() if light.scale_free)
-        pairs = ((GIVEN, fixed), (UP_TO_SCALE, tinted))
-        return "".join(rule.format(", ".join(names)) for rule, names in pairs if names)
+        fixed = [self.names[m] for m in sorted(self.problem.known.materials)]
+        fixed += sorted(name for name, light in self.problem.known.lights.items() if not light.scale_free)
+        tinted = sorted(name for name, light in self.problem.known.lights.items() if light.scale_free)
+        sentences = ((GIVEN, fixed), (UP_TO_SCALE, tinted))
+        return "".join(rule.format(", ".join(names)) for rule, names in sentences if names)
 
-    def _given(self, m: int) -> list[str] | UnsetType:
+    def _known_parts(self, m: int) -> list[str] | UnsetType:
         """Return the parts of a material that were known beforehand; UNSET for a material without any."""
         values = self.problem.known.materials.get(m)
         parts = zip(("diffuse", "specular", "roughness"), (0, 3, 6), strict=True)
-        return UNSET if values is None else [part for part, first in parts if not np.isnan(values[first])]
+        return UNSET if values is None else [part for part, column in parts if not np.isnan(values[column])]
 
     def _gauge_of_errors(self) -> str:
         """Return the sentence that states the gauge of the standard errors."""
@@ -114,7 +113,7 @@ class Answer(msgspec.Struct, frozen=True, dict=True):
 
     def uncertainty(self) -> Uncertainty:
         """Return the content of uncertainty.json."""
-        unexplained = misfit(self.problem, self.radiance)
+        unexplained = unexplained_shares(self.problem, self.radiance)
         return Uncertainty(self.errors.deviation, self._errors(), self._gauge_of_errors(), *unexplained)
 
     def _errors(self) -> dict[str, table.StandardErrors]:
@@ -122,52 +121,53 @@ class Answer(msgspec.Struct, frozen=True, dict=True):
         rows = zip(self.names, _rows(self.errors.materials), strict=True)
         return {name: table.StandardErrors(*row) for name, row in rows}
 
-    def lit(self) -> list[tuple[Block, Light]]:
+    def illuminations(self) -> list[tuple[Block, Light]]:
         """Return each illumination with its light."""
         return list(zip(self.problem.blocks, self.solution.point.lights, strict=True))
 
     def lights(self) -> dict[str, Lobes]:
         """Return the lobes by illumination, in scene radiance."""
-        return {block.name: light.lobes.scaled(block.unit) for block, light in self.lit()}
+        return {block.name: light.lobes.scaled(block.unit) for block, light in self.illuminations()}
 
     def exposures(self) -> dict[str, table.Channels]:
         """Return each photo's factor on its light, per channel."""
-        return {photo: (factor * self.relative[photo],) * 3 for photo, factor in self.found_exposures().items()}
+        return {photo: (factor * self.relative[photo],) * 3 for photo, factor in self.estimated_exposures().items()}
 
-    def found_exposures(self) -> dict[str, float]:
+    def estimated_exposures(self) -> dict[str, float]:
         """Return each photo's factor on its light, relative to its EXIF exposure."""
-        pairs = (pair for b, light in self.lit() for pair in zip(b.photos, light.log_exposure, strict=True))
-        return {photo: float(np.exp(log_exposure)) for photo, log_exposure in pairs}
+        exposures = (
+            exposure for b, light in self.illuminations() for exposure in zip(b.photos, light.log_exposure, strict=True)
+        )
+        return {photo: float(np.exp(log_exposure)) for photo, log_exposure in exposures}
 
     def model(self) -> table.Model:
         """Return the model choices and their evidence; the pivots of tone curves are in scene radiance."""
-        names = self.names
         solution = self.solution
-        lit = self.lit()
+        illuminations = self.illuminations()
         started: table.Started | UnsetType = UNSET
-        lights = [block.name for block, _ in lit]
+        lights = [block.name for block, _ in illuminations]
         if self.earlier is not None:
-            known = set(names) & set(self.earlier.table.materials), set(lights) & set(self.earlier.lights)
+            known = set(self.names) & set(self.earlier.table.materials), set(lights) & set(self.earlier.lights)
             started = table.Started(*map(sorted, known))
         return table.Model(
             solver=self.solver,
-            lobes={block.name: len(light) for block, light in lit},
+            lobes={block.name: len(light) for block, light in illuminations},
             lobes_chosen_by=LOBES_CHOSEN_BY[self.solver],
             held_out_loss=[event.held_out for event in solution.history if event.phase == "subset"],
             self_shadowing=solution.shadows.kept,
-            self_shadowing_chosen_by=_tried(solution.shadows),
+            self_shadowing_chosen_by=_comparison(solution.shadows),
             interreflection=solution.interreflection.kept,
-            interreflection_chosen_by=_tried(solution.interreflection),
+            interreflection_chosen_by=_comparison(solution.interreflection),
             light_prior=self.solver == "joint",
             splitting_chosen_by=solution.splitting,
             suns_chosen_by=dict(zip(lights, solution.suns)),
             tone={
                 photo: table.Tone(float(np.exp(log_tone)), block.unit * self.relative[photo])
-                for block, light in lit
+                for block, light in illuminations
                 for photo, log_tone in zip(block.photos, light.log_tone, strict=False)
             },
             tone_chosen_by=dict(zip(lights, solution.tone)),
-            distance={block.name: 1 / light.curvature for block, light in lit if light.curvature > 0},
+            distance={block.name: 1 / light.curvature for block, light in illuminations if light.curvature > 0},
             distance_chosen_by=dict(zip(lights, solution.distances)),
             started_from=started,
         )
@@ -178,6 +178,6 @@ def _rows(materials: Materials) -> list[tuple[table.Channels, table.Channels, fl
     return [((a, b, c), (d, e, f), r) for a, b, c, d, e, f, r in materials.rows().tolist()]
 
 
-def _tried(decision: Decision) -> dict[str, float]:
+def _comparison(decision: Decision) -> dict[str, float]:
     """Return the held-out losses of the models that were compared, and the margin."""
     return {k: value for k, value in msgspec.structs.asdict(decision).items() if k != "kept" and value is not None}

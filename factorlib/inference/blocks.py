@@ -1,4 +1,4 @@
-"""Observations under one illumination, in that illumination's frame and radiance unit."""
+"""Observations under one illumination, in that illumination's frame and radiance unit; their noise model and loss."""
 
 from __future__ import annotations
 
@@ -7,13 +7,61 @@ import numpy as np
 from jaxtyping import Bool, Float, Int, UInt8
 
 from factorlib.geometry.sphere import mirror_cells
-from factorlib.inference.noise import Noise
 
 PER_OBSERVATION = (
     *("normal", "view", "radiance", "clipped", "precision", "material", "photo", "held_out"),
     *("visibility", "bounced", "confidence", "place", "row", "detail"),  # optional columns
 )
 CLUSTER = 0.35  # side of a cluster's cell of mirror directions: 20°
+
+
+class Noise(msgspec.Struct, frozen=True):
+    """Noise model σ² = absolute² + (relative · radiance)², in units of a block's mean radiance.
+
+    The relative part covers errors that grow with brightness: of a photo's tone curve, of normals, and of too coarse
+    cells.
+
+    Attributes:
+        absolute: σ in the dark.
+        relative: Part of σ that is proportional to radiance, per radiance.
+        most_weight: Limit of the number of independent observations that a merged one counts for.
+    """
+
+    absolute: float = 0.05
+    relative: float = 0.05
+    most_weight: float = 8.0
+
+    def sigma(self, radiance: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
+        """Return σ of one pixel."""
+        return np.sqrt(self.absolute**2 + (self.relative * radiance) ** 2)
+
+    def precision(
+        self, radiance: Float[np.ndarray, "n 3"], weight: Float[np.ndarray, " n"]
+    ) -> Float[np.ndarray, "n 3"]:
+        """Return √weight/σ of observations, with their weights limited."""
+        # smooth limit of the weight
+        limited = weight / (1 + weight / self.most_weight)
+        return np.sqrt(limited)[:, None] / self.sigma(radiance)
+
+
+class RobustLoss(msgspec.Struct, frozen=True):
+    """Pseudo-Huber loss, Σ 2k² (√(1 + r²/k²) − 1) of whitened residuals r.
+
+    It bounds the influence of wrong normals and mask borders.
+
+    Attributes:
+        robust_scale: k, in σ.
+    """
+
+    robust_scale: float = 10.0
+
+    def evaluate(self, residual: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
+        """Return the loss of each whitened residual."""
+        return 2 * self.robust_scale**2 * (np.sqrt(1 + (residual / self.robust_scale) ** 2) - 1)
+
+    def weights(self, residual: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
+        """Return weights in ]0, 1] of the squared residuals, for least-squares steps of this loss."""
+        return 1 / np.sqrt(1 + (residual / self.robust_scale) ** 2)
 
 
 class Block(msgspec.Struct, frozen=True):
@@ -69,21 +117,19 @@ class Block(msgspec.Struct, frozen=True):
     def take(self, rows: np.ndarray | slice) -> Block:
         """Return the observations `rows` (indices or a mask) alone."""
         values = ((name, getattr(self, name)) for name in PER_OBSERVATION)
-        return msgspec.structs.replace(self, **{name: of[rows] for name, of in values if of is not None})
+        return msgspec.structs.replace(
+            self, **{name: values_of_column[rows] for name, values_of_column in values if values_of_column is not None}
+        )
 
-    def fitted(self) -> Block:
+    def without_held_out(self) -> Block:
         """Return the observations that are not held out."""
         return self.take(~self.held_out) if self.held_out.any() else self
 
-    def with_none_held_out(self) -> Block:
-        """Return the same observations, none held out."""
-        return msgspec.structs.replace(self, held_out=np.zeros(len(self), bool))
-
-    def sampled(self, count: int, seed: int) -> Block:
+    def subsample(self, count: int, seed: int) -> Block:
         """Return at most `count` fitted and `count` held-out observations, drawn at random, in their order."""
         random = np.random.default_rng(seed)
-        kept = [random.permutation(np.flatnonzero(rows))[:count] for rows in (~self.held_out, self.held_out)]
-        return self.take(np.sort(np.concatenate(kept)))
+        samples = [random.permutation(np.flatnonzero(rows))[:count] for rows in (~self.held_out, self.held_out)]
+        return self.take(np.sort(np.concatenate(samples)))
 
     def with_effects(self, shadows: bool, bounces: bool) -> Block:
         """Return the same observations with shadows or interreflection switched off where the argument is False.

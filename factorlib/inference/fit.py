@@ -7,15 +7,16 @@ is the temperature T, which divides squared residuals:
     T = Σ_k (Σ_{i in k} r_i)² / Σ_k n_k, at least `least`                                                           (1)
 
 The clusters k hold nearby mirror directions; r is in σ and clipped at 3.  `least` is 1 while materials are fitted:
-cells are always a little too coarse, and with T below 1 the materials would
-absorb that error.  Given the materials, lights may fit as closely as the residuals allow.
+cells are always a little too coarse, and with T below 1 the materials would absorb that error.  Given the materials,
+lights may fit as closely as the residuals allow.
 
 Every light has its own T, so that a photo with a badly fitting mesh counts less.  T is estimated anew before each
 descent.  So are the factors that scale the light's contrast and colour relative to a typical light (equation (4) of
 `factorlib.light.prior`).
 
-Materials are fitted to the observations with reliable normals (`sure_ones`).  A highlight at a wrong normal makes the
-material look rougher than it is, however little it weighs.  Given those materials, lights are fitted once more to all
+Materials are fitted to the observations with reliable normals (`reliable_observations`).  A highlight at a wrong normal
+makes the material look rougher than it is, however little it weighs.  Given those materials, lights are fitted once
+more to all
 observations: rims and thin parts show directions that nothing else shows.
 """
 
@@ -25,27 +26,25 @@ import msgspec
 import numpy as np
 from jaxtyping import Bool, Float
 
-from factorlib.inference.arrow import System
-from factorlib.inference.blocks import Block
+from factorlib.inference.blocks import Block, RobustLoss
 from factorlib.inference.forward import Illumination
 from factorlib.inference.lights import Light
-from factorlib.inference.likelihood import LightLikelihood, inverse_of
+from factorlib.inference.likelihood import LightLikelihood, System, cholesky_inverse
 from factorlib.inference.materials import Materials, Point
-from factorlib.inference.noise import Loss
-from factorlib.inference.optimizer import Descent, Report
-from factorlib.inference.priors import MaterialPrior, materials_of, unknowns_of
+from factorlib.inference.optimizer import Descent, LossReport
+from factorlib.inference.priors import MaterialPrior, material_unknowns, materials_from_unknowns
 from factorlib.inference.problem import JointProblem
-from factorlib.inference.responses import Tables
+from factorlib.inference.responses import ResponseCache
 from factorlib.light.prior import LightPrior
 
-SURE = 0.6  # least confidence of a normal, as a share of its material's median
-DARK = 0.2  # factor on the noise model's absolute part where normals are reliable
-ROBUST = Loss(3.0)  # beyond 3 σ of the noise model a residual is an outlier
+RELIABLE = 0.6  # least confidence of a normal, as a share of its material's median
+DARK_NOISE = 0.2  # factor on the noise model's absolute part where normals are reliable
+ROBUST = RobustLoss(3.0)  # beyond 3 σ of the noise model a residual is an outlier
 START_TEMPERATURE = 10.0
 # Standard deviation of a sun's log radiance: in lights captured outdoors its energy is a third to twice the sky's.
-SUNS = 1.0
+SUN_DEVIATION = 1.0
 # Least reflectance at the start.  The derivative with respect to the logarithm of a smaller one is nearly zero.
-LEAST_AT_START = 0.01
+LEAST_START_REFLECTANCE = 0.01
 
 
 class Hyperparameters(msgspec.Struct, frozen=True):
@@ -71,40 +70,48 @@ class Fit(msgspec.Struct, frozen=True):
         """Return the start of another fit, in other lights."""
         return msgspec.structs.replace(self, point=Point(self.point.materials, lights))
 
+    def with_curvatures(self, curvatures: dict[int, float]) -> Fit:
+        """Return the start of another fit, with other curvatures of some lights, by number of the light."""
+        lights = [
+            msgspec.structs.replace(light, curvature=curvatures.get(k, light.curvature))
+            for k, light in enumerate(self.point.lights)
+        ]
+        return self.with_lights(lights)
 
-class Schedule(msgspec.Struct, frozen=True):
+
+class FitSchedule(msgspec.Struct, frozen=True):
     """Number of steps of a fit.
 
     Attributes:
-        lights: Steps of the lights alone, materials given, before the others.
-        together: Steps of each descent of lights and, unless they are given, materials; hyperparameters are estimated
-            anew before each descent but the first.
-        estimate: True to estimate them before the first descent too; right after a splitting, residuals reflect the
-            splitting and not the noise.
-        least: Least temperature of (1).
-        given: True to keep the materials fixed.
+        light_steps: Steps of the lights alone, materials given, before the others.
+        joint_steps: Steps of each descent of lights and, unless they are given, materials; hyperparameters are
+            estimated anew before each descent but the first.
+        estimate_first: True to estimate them before the first descent too; right after a splitting, residuals reflect
+            the splitting and not the noise.
+        least_temperature: Least temperature of (1).
+        materials_fixed: True to keep the materials fixed.
     """
 
-    lights: int = 0
-    together: tuple[int, ...] = ()
-    estimate: bool = True
-    least: float = 1.0
-    given: bool = False
+    light_steps: int = 0
+    joint_steps: tuple[int, ...] = ()
+    estimate_first: bool = True
+    least_temperature: float = 1.0
+    materials_fixed: bool = False
 
     @property
     def points(self) -> int:
         """Largest number of points that a fit evaluates."""
-        return self.lights + 1 + sum(iterations + 1 for iterations in self.together)
+        return self.light_steps + 1 + sum(iterations + 1 for iterations in self.joint_steps)
 
 
-def fitted(
+def fit_problem(
     problem: JointProblem,
     start: Fit,
     prior: LightPrior,
-    schedule: Schedule,
-    report: Report = lambda loss: None,
+    schedule: FitSchedule,
+    report: LossReport = lambda loss: None,
 ) -> Fit:
-    """Fit materials and lights to the observations that are not held out.
+    """Fit materials and lights to the observations that are not held out, and return the fit with its objective.
 
     Args:
         problem: Observations and model.
@@ -112,80 +119,82 @@ def fitted(
         prior: Prior on lights.
         schedule: Number of steps.
         report: Called at every point that is evaluated, with the mean robust loss of the fitted observations.
-
-    Returns:
-        The fit, with the value of its objective.
     """
-    problem = problem.fitted()
-    given = schedule.given
+    problem = problem.without_held_out()
     hyperparameters = start.hyperparameters
-    materials = start.point.materials if given else problem.known.put(above_zero(start.point.materials))
+    materials = start.point.materials
+    if not schedule.materials_fixed:
+        materials = problem.known.insert_into(raise_reflectances(materials))
     prior_on_materials = MaterialPrior(materials, problem.blocks, problem.known)
     descent = Descent(prior_on_materials, problem.spread, report, problem.known.free(len(materials)))
     illuminations = problem.illuminations(Point(materials, start.point.lights))
-    pairs = list(zip(illuminations, hyperparameters, strict=True))
 
     def likelihood(pair: tuple[Illumination, Hyperparameters]) -> LightLikelihood:
         """Return the likelihood of one light, with a table of responses."""
-        return likelihood_of(*pair, prior, given, problem.tables)
+        return light_likelihood(*pair, prior, schedule.materials_fixed, problem.tables)
 
-    likelihoods = list(problem.spread(likelihood, pairs))
-    state = descent.of_lights(likelihoods, unknowns_of(materials), schedule.lights)
-    for number, iterations in enumerate(schedule.together):
-        if number or schedule.estimate:
-            systems = list(zip(state.likelihoods, state.systems, strict=True))
-            hyperparameters = list(problem.spread(lambda each: estimated(each[0], each[1], schedule.least), systems))
-            both = zip(state.likelihoods, hyperparameters, strict=True)
-            state = state._replace(likelihoods=[recounted(*each) for each in both])
-        if given:
-            state = descent.of_lights(state.likelihoods, state.theta, iterations)
+    likelihoods = list(problem.spread(likelihood, list(zip(illuminations, hyperparameters, strict=True))))
+    state = descent.descend_lights(likelihoods, material_unknowns(materials), schedule.light_steps)
+    least = schedule.least_temperature
+    for number, iterations in enumerate(schedule.joint_steps):
+        if number or schedule.estimate_first:
+            # T of (1) and s_k² of each light, from the previous descent
+            pairs = list(zip(state.likelihoods, state.systems, strict=True))
+            hyperparameters = list(problem.spread(lambda pair: estimate_hyperparameters(*pair, least), pairs))
+            state = state._replace(likelihoods=list(map(with_hyperparameters, state.likelihoods, hyperparameters)))
+        if schedule.materials_fixed:
+            state = descent.descend_lights(state.likelihoods, state.theta, iterations)
         else:
-            state = descent.of_all(state, iterations)
-    lights = [one.light for one in state.likelihoods]
-    return Fit(Point(materials if given else materials_of(state.theta), lights), hyperparameters, state.value)
+            state = descent.descend_jointly(state, iterations)
+    if not schedule.materials_fixed:
+        materials = materials_from_unknowns(state.theta)
+    lights = [descended.light for descended in state.likelihoods]
+    return Fit(Point(materials, lights), hyperparameters, state.value)
 
 
-def likelihood_of(
+def light_likelihood(
     illumination: Illumination,
-    one: Hyperparameters,
+    hyperparameters: Hyperparameters,
     prior: LightPrior,
     materials_given: bool = False,
-    tables: Tables | None = None,
+    tables: ResponseCache | None = None,
 ) -> LightLikelihood:
     """Return the likelihood of one light, with its table of responses and the given hyperparameters.
 
     Args:
         illumination: Observations, light and materials.
-        one: Hyperparameters.
+        hyperparameters: Hyperparameters.
         prior: Prior on lights.
         materials_given: True if the materials do not change.
         tables: Cache of response tables; None for a new one.
     """
-    given = illumination.materials.roughness if materials_given else None
-    of = illumination.block, illumination.light.unit_lobes, illumination.operator
-    table = (tables or Tables()).of(*of, given)
+    roughness = illumination.materials.roughness if materials_given else None
+    arguments = illumination.block, illumination.light.unit_lobes, illumination.operator
+    table = (tables or ResponseCache()).get(*arguments, roughness)
     tabulated = msgspec.structs.replace(illumination, table=table)
-    return recounted(LightLikelihood(tabulated, prior, np.zeros(0), np.zeros((0, 0)), 0.0, 1.0, ROBUST), one)
+    return with_hyperparameters(
+        LightLikelihood(tabulated, prior, np.zeros(0), np.zeros((0, 0)), 0.0, 1.0, ROBUST), hyperparameters
+    )
 
 
-def recounted(likelihood: LightLikelihood, one: Hyperparameters) -> LightLikelihood:
+def with_hyperparameters(likelihood: LightLikelihood, hyperparameters: Hyperparameters) -> LightLikelihood:
     """Return the likelihood with other hyperparameters."""
     light = likelihood.light
     # Q of the cells, under the scale factors s_k²
-    Q, log_determinant = likelihood.prior.precision(light.axis[~light.suns], one.factors)
+    Q, log_determinant = likelihood.prior.precision(light.axis[~light.suns], hyperparameters.factors)
     if light.suns.any():  # the prior on cells does not cover suns: each has an independent Gaussian
-        own = np.tile(light.suns, 3)
+        is_sun = np.tile(light.suns, 3)
         cells = Q
-        Q = np.diag(np.where(own, SUNS**-2.0, 0.0))
-        Q[np.ix_(~own, ~own)] = cells
-    if light.held.any():  # Q of the free cells given the held ones is their block of Q
+        Q = np.diag(np.where(is_sun, SUN_DEVIATION**-2.0, 0.0))
+        Q[np.ix_(~is_sun, ~is_sun)] = cells
+    if light.fixed.any():  # Q of the free cells given the held ones is their block of Q
         free = np.tile(light.free, 3)
         log_determinant = float(np.linalg.slogdet(Q[np.ix_(free, free)])[1])
-    counts = {"precision": Q, "log_determinant": log_determinant, "temperature": one.temperature}
+    counts = {"precision": Q, "log_determinant": log_determinant, "temperature": hyperparameters.temperature}
     return msgspec.structs.replace(likelihood, log_peaks=np.log(light.peaks), **counts)
 
 
-def estimated(likelihood: LightLikelihood, system: System, least: float) -> Hyperparameters:
+def estimate_hyperparameters(likelihood: LightLikelihood, system: System, least: float) -> Hyperparameters:
     """Return the hyperparameters estimated from the residuals and the light at the end of a descent.
 
     Args:
@@ -194,19 +203,19 @@ def estimated(likelihood: LightLikelihood, system: System, least: float) -> Hype
         least: Least temperature.
     """
     light = likelihood.light
-    cells, free = (np.flatnonzero(np.tile(which, 3)) for which in (~light.suns, light.free))
+    cells, free = (np.flatnonzero(np.tile(mask, 3)) for mask in (~light.suns, light.free))
     # covariance of u: H⁻¹ of the free cells, 0 of the held ones, without suns
     covariance = np.zeros((3 * len(light), 3 * len(light)))
-    covariance[np.ix_(free, free)] = inverse_of(system.factor[: len(free), : len(free)])
+    covariance[np.ix_(free, free)] = cholesky_inverse(system.factor[: len(free), : len(free)])
     covariance = covariance[np.ix_(cells, cells)]
     factors = likelihood.prior.likeliest_factors(
         light.axis[~light.suns], light.log_radiance[:, ~light.suns], covariance
     )
     residual = likelihood.illumination.residuals()
-    return Hyperparameters(temperature(likelihood.illumination.block, residual, least), factors)
+    return Hyperparameters(estimate_temperature(likelihood.illumination.block, residual, least), factors)
 
 
-def temperature(block: Block, residual: Float[np.ndarray, "n 3"], least: float = 1.0) -> float:
+def estimate_temperature(block: Block, residual: Float[np.ndarray, "n 3"], least: float = 1.0) -> float:
     """Return T of (1) from whitened residuals."""
     number = block.clusters()
     bounded = residual.clip(-ROBUST.robust_scale, ROBUST.robust_scale)
@@ -214,21 +223,25 @@ def temperature(block: Block, residual: Float[np.ndarray, "n 3"], least: float =
     return max(float(np.square(sums).sum()) / max(residual.size, 1), least)
 
 
-def above_zero(materials: Materials) -> Materials:
-    """Return the materials with reflectances raised to at least `LEAST_AT_START`."""
+def raise_reflectances(materials: Materials) -> Materials:
+    """Return the materials with reflectances raised to at least `LEAST_START_REFLECTANCE`."""
     rows = materials.rows()
-    rows[:, :6] = np.maximum(rows[:, :6], LEAST_AT_START)
-    return Materials.of_rows(rows)
+    rows[:, :6] = np.maximum(rows[:, :6], LEAST_START_REFLECTANCE)
+    return Materials.from_rows(rows)
 
 
-def sure_ones(problem: JointProblem) -> JointProblem:
+def reliable_observations(problem: JointProblem) -> JointProblem:
     """Return the observations that materials are fitted to: reliable normals, with less noise in the dark."""
-    noises = [msgspec.structs.replace(block.noise, absolute=DARK * block.noise.absolute) for block in problem.blocks]
-    return problem.of([b.take(sure(b)).with_noise(noise) for b, noise in zip(problem.blocks, noises, strict=True)])
+    noises = [
+        msgspec.structs.replace(block.noise, absolute=DARK_NOISE * block.noise.absolute) for block in problem.blocks
+    ]
+    return problem.with_blocks(
+        [b.take(reliable_mask(b)).with_noise(noise) for b, noise in zip(problem.blocks, noises, strict=True)]
+    )
 
 
-def sure(block: Block) -> Bool[np.ndarray, " n"]:
-    """Return a mask of the normals whose confidence is at least `SURE` times the weighted median of their material.
+def reliable_mask(block: Block) -> Bool[np.ndarray, " n"]:
+    """Return a mask of the normals whose confidence is at least `RELIABLE` times the weighted median of their material.
 
     The median is taken over the material's observations in this light.
     """
@@ -239,10 +252,10 @@ def sure(block: Block) -> Bool[np.ndarray, " n"]:
     for m in np.unique(block.material):
         rows = block.material == m
         typical = np.quantile(block.confidence[rows], 0.5, weights=weight[rows], method="inverted_cdf")
-        result[rows] = block.confidence[rows] >= SURE * typical
+        result[rows] = block.confidence[rows] >= RELIABLE * typical
     return result
 
 
-def start_of(point: Point) -> Fit:
+def initial_fit(point: Point) -> Fit:
     """Return the fit of a point before any descent."""
     return Fit(point, [Hyperparameters() for _ in point.lights])

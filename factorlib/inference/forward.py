@@ -24,15 +24,14 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from factorlib.images.tone import by_log_exponent
-from factorlib.inference.blocks import Block
+from factorlib.inference.blocks import Block, RobustLoss
 from factorlib.inference.lights import Light, UnitLobes
 from factorlib.inference.materials import Materials
-from factorlib.inference.noise import Loss
-from factorlib.inference.responses import CHUNK, Reflected, Table, diffuse_response, specular_response
+from factorlib.inference.responses import CHUNK, ResponseLookup, Responses, diffuse_response, specular_response
 from factorlib.reflection.operator import Operator
 
 
-class Shown(NamedTuple):
+class Prediction(NamedTuple):
     """Prediction of the model for n observations.
 
     Attributes:
@@ -49,7 +48,7 @@ class Shown(NamedTuple):
     by_roughness: Float[np.ndarray, "n 3"]
     linear: Float[np.ndarray, "n 3"]
     radiance: Float[np.ndarray, "n 3"]
-    responses: list[tuple[int, slice, Reflected]]
+    responses: list[tuple[int, slice, Responses]]
 
 
 class Linearised(NamedTuple):
@@ -106,119 +105,116 @@ class Illumination(msgspec.Struct, frozen=True):
     light: Light
     materials: Materials
     operator: Operator
-    table: Table | None = None
+    table: ResponseLookup | None = None
 
     @property
     def exposure(self) -> Float[np.ndarray, "n 1"]:
         """Exposure of each observation's photo, a factor on the light."""
         return np.exp(self.light.log_exposure)[self.block.photo][:, None]
 
-    def fitted(self) -> Illumination:
-        """Return the illumination without its held-out observations."""
-        return msgspec.structs.replace(self, block=self.block.fitted())
-
-    def shown(self) -> Shown:
+    def predict(self) -> Prediction:
         """Return the predicted radiance and its components."""
         block = self.block
-        kd = self.materials.diffuse
-        ks = self.materials.specular
         responses = []
         # D w, S w and (∂S/∂roughness) w, material by material
         diffuse, specular, by_roughness = np.zeros((3, len(block), 3))
-        weight = self.light.weight
         roughness = self.materials.roughness.tolist()
         if self.table is None:
             lobes = self.light.unit_lobes
             for m, rows in material_slices(block):
-                diffuse[rows] = diffuse_response(block, rows, lobes, self.operator) @ weight
-                specular[rows] = specular_response(block, rows, lobes, roughness[m], self.operator) @ weight
+                diffuse[rows] = diffuse_response(block, rows, lobes, self.operator) @ self.light.weight
+                specular[rows] = specular_response(block, rows, lobes, roughness[m], self.operator) @ self.light.weight
         else:
             for m in np.unique(block.material).tolist():
                 rows = self.table.rows(m)
-                of = self.table.at(m, roughness[m])
-                diffuse[rows], specular[rows], by_roughness[rows] = of.radiance(weight)
-                responses.append((m, rows, of))
+                lookup = self.table.interpolate(m, roughness[m])
+                diffuse[rows], specular[rows], by_roughness[rows] = lookup.radiance(self.light.weight)
+                responses.append((m, rows, lookup))
         diffuse, specular, by_roughness = (part * self.exposure for part in (diffuse, specular, by_roughness))
         if block.bounced is not None:
             diffuse = diffuse + block.bounced[:, :3]
             specular = specular + block.bounced[:, 3:]
         # ℓ and y
-        linear = kd[block.material] * diffuse + ks[block.material] * specular
-        toned = self.light.toned(linear, block.photo)
-        return Shown(diffuse, specular, by_roughness, linear, toned, responses)
+        linear = self.materials.diffuse[block.material] * diffuse + self.materials.specular[block.material] * specular
+        toned = self.light.apply_tone(linear, block.photo)
+        return Prediction(diffuse, specular, by_roughness, linear, toned, responses)
 
     def radiance(self) -> Float[np.ndarray, "n 3"]:
         """Return y, the predicted radiance of every observation."""
-        return self.shown().radiance
+        return self.predict().radiance
 
     def residuals(self) -> Float[np.ndarray, "n 3"]:
         """Return r, in σ of the noise model."""
         return self.block.residuals(self.radiance())
 
-    def losses(self, loss: Loss) -> Float[np.ndarray, " n"]:
+    def losses(self, loss: RobustLoss) -> Float[np.ndarray, " n"]:
         """Return the robust loss of every observation, averaged over its channels."""
-        return loss.of_residuals(self.residuals()).mean(1)
+        return loss.evaluate(self.residuals()).mean(1)
 
-    def atoms(self, rows: Int[np.ndarray, " n"], lobes: UnitLobes) -> Float[np.ndarray, "3 n q"]:
+    def fitted_loss(self, residual: Float[np.ndarray, "n 3"], loss: RobustLoss) -> float:
+        """Return Σ ρ(r), the robust loss summed over the fitted observations."""
+        return float(loss.evaluate(residual)[~self.block.held_out].sum())
+
+    def unit_responses(self, rows: Int[np.ndarray, " n"], lobes: UnitLobes) -> Float[np.ndarray, "3 n q"]:
         """Return the whitened response at `rows` to q further lobes of weight one, per channel."""
         block = self.block
-        materials = self.materials
         response = np.empty((2, len(rows), len(lobes)))
         for m in np.unique(block.material[rows]).tolist():
-            of = block.material[rows] == m
-            response[0, of] = diffuse_response(block, rows[of], lobes, self.operator)
-            response[1, of] = specular_response(block, rows[of], lobes, float(materials.roughness[m]), self.operator)
+            selected = block.material[rows] == m
+            response[0, selected] = diffuse_response(block, rows[selected], lobes, self.operator)
+            response[1, selected] = specular_response(
+                block, rows[selected], lobes, float(self.materials.roughness[m]), self.operator
+            )
         # A = (k_d D + k_s S) e τ'/σ, linearised at the observed radiance
-        slope = self.light.slope_at(block.radiance[rows], block.photo[rows])
+        slope = self.light.tone_slope(block.radiance[rows], block.photo[rows])
         scale = block.precision[rows] * slope * self.exposure[rows]
-        kd = materials.diffuse[block.material[rows]]
-        ks = materials.specular[block.material[rows]]
+        kd = self.materials.diffuse[block.material[rows]]
+        ks = self.materials.specular[block.material[rows]]
         return np.stack(
             [scale[:, c, None] * (kd[:, c, None] * response[0] + ks[:, c, None] * response[1]) for c in range(3)]
         )
 
-    def pull(
-        self, residual: Float[np.ndarray, "n 3"], loss: Loss, temperature: float = 1.0
+    def root_weights(
+        self, residual: Float[np.ndarray, "n 3"], loss: RobustLoss, temperature: float = 1.0
     ) -> Float[np.ndarray, "n 3"]:
         """Return the root of each residual's weight in the robust loss divided by T.
 
         It is 0 for held-out observations, and for clipped channels that are predicted bright enough.
         """
         counts = ~self.block.held_out[:, None] & ~(self.block.clipped & (residual >= 0))
-        return np.sqrt(counts * loss.trust(residual) / temperature)
+        return np.sqrt(counts * loss.weights(residual) / temperature)
 
-    def gradient(self, loss: Loss, temperature: float) -> Gradient:
+    def gradient(self, loss: RobustLoss, temperature: float) -> Gradient:
         """Return Σ ρ(r)/T of the fitted observations and half its gradient, without a Jacobian.
 
         The cost is two products of the responses with three columns.
         """
         block = self.block
         light = self.light
-        materials = self.materials
-        shown = self.shown()
-        residual = block.residuals(shown.radiance)
-        value = float(loss.of_residuals(residual)[~block.held_out].sum()) / temperature
+        prediction = self.predict()
+        residual = block.residuals(prediction.radiance)
+        value = self.fitted_loss(residual, loss) / temperature
         # a = ½ ∂(Σ ρ/T)/∂ℓ; `lit` is the part of ℓ that is proportional to the light
-        by_radiance = self.pull(residual, loss, temperature) ** 2 * residual * block.precision
-        by_linear = by_radiance * light.slope_at(shown.radiance, block.photo)
-        lit = shown.linear - self.bounced
+        by_radiance = self.root_weights(residual, loss, temperature) ** 2 * residual * block.precision
+        by_linear = by_radiance * light.tone_slope(prediction.radiance, block.photo)
+        from_light = prediction.linear - self.bounced
         # Σ a ∂ℓ/∂(log k_d, log k_s, roughness), and Dᵀ a e k_d + Sᵀ a e k_s with respect to w
-        by_materials = np.zeros((len(materials), 7))
+        by_materials = np.zeros((len(self.materials), 7))
         by_weight = np.zeros((len(light), 3))
-        for m, rows, of in shown.responses:
-            kd = materials.diffuse[m]
-            ks = materials.specular[m]
+        for m, rows, lookup in prediction.responses:
+            kd = self.materials.diffuse[m]
+            ks = self.materials.specular[m]
             a = by_linear[rows]
-            by_materials[m, :3] = kd * (a * shown.diffuse[rows]).sum(0)
-            by_materials[m, 3:6] = ks * (a * shown.specular[rows]).sum(0)
-            by_materials[m, 6] = float((ks * a * shown.by_roughness[rows]).sum())
-            by_weight += of.by_weight(a * self.exposure[rows] * kd, a * self.exposure[rows] * ks)
+            by_materials[m, :3] = kd * (a * prediction.diffuse[rows]).sum(0)
+            by_materials[m, 3:6] = ks * (a * prediction.specular[rows]).sum(0)
+            by_materials[m, 6] = float((ks * a * prediction.by_roughness[rows]).sum())
+            by_weight += lookup.by_weight(a * self.exposure[rows] * kd, a * self.exposure[rows] * ks)
         # gradient by log radiance of free cells, log exposures, log tone exponents and the log factor on held cells
         by_cells = by_weight * light.weight
-        by_photo = np.bincount(block.photo, (by_linear * lit).sum(1), len(light.log_exposure))
+        by_photo = np.bincount(block.photo, (by_linear * from_light).sum(1), len(light.log_exposure))
         parts = [by_cells[light.free].T.reshape(-1), by_photo[len(by_photo) - light.free_exposures :]]
         if len(light.log_tone):
-            by_tone = by_radiance * by_log_exponent(np.maximum(shown.linear, 0), light.exponents(block.photo))
+            by_tone = by_radiance * by_log_exponent(np.maximum(prediction.linear, 0), light.exponents(block.photo))
             parts.append(np.bincount(block.photo, by_tone.sum(1), len(light.log_tone)))
         if light.scale_free:
             parts.append(by_cells[~light.free].sum(keepdims=True).reshape(1))
@@ -228,47 +224,45 @@ class Illumination(msgspec.Struct, frozen=True):
     def bounced(self) -> Float[np.ndarray, "n 3"] | float:
         """Part of ℓ that other surfaces send."""
         block = self.block
-        materials = self.materials
         if block.bounced is None:
             return 0.0
-        kd = materials.diffuse[block.material]
-        ks = materials.specular[block.material]
+        kd = self.materials.diffuse[block.material]
+        ks = self.materials.specular[block.material]
         return kd * block.bounced[:, :3] + ks * block.bounced[:, 3:]
 
-    def linearise(self, shown: Shown, loss: Loss, temperature: float = 1.0) -> Iterator[Linearised]:
+    def linearise(self, prediction: Prediction, loss: RobustLoss, temperature: float = 1.0) -> Iterator[Linearised]:
         """Yield residuals and derivatives, by material and channel.
 
         Held-out observations have weight 0.
 
         Args:
-            shown: Prediction of this illumination by its table.
+            prediction: Prediction of this illumination by its table.
             loss: Robust loss.
             temperature: T, which divides squared residuals.
         """
-        block = self.block
         light = self.light
-        materials = self.materials
-        residual = block.residuals(shown.radiance)
-        pull = self.pull(residual, loss, temperature)
-        scale = pull * block.precision
-        rising = scale * light.slope_at(shown.radiance, block.photo)  # ∂r/∂ℓ
-        by_photos = self._by_photos(shown, scale, rising)
-        free = light.free if light.held.any() else slice(None)
-        for m, rows, of in shown.responses:
-            of_specular = of.specular
-            of_roughness = of.by_roughness
+        residual = self.block.residuals(prediction.radiance)
+        pull = self.root_weights(residual, loss, temperature)
+        scale = pull * self.block.precision
+        rising = scale * light.tone_slope(prediction.radiance, self.block.photo)  # ∂r/∂ℓ
+        by_photos = self._by_photos(prediction, scale, rising)
+        free = light.free if light.fixed.any() else slice(None)
+        for m, rows, lookup in prediction.responses:
+            of_specular = lookup.specular
+            of_roughness = lookup.by_roughness
             for c in range(3):
-                kd = np.float32(materials.diffuse[m, c])
-                ks = np.float32(materials.specular[m, c])
+                kd = np.float32(self.materials.diffuse[m, c])
+                ks = np.float32(self.materials.specular[m, c])
                 # ∂r/∂u = τ' e (k_d D + k_s S) w/σ, and its derivative by roughness
                 bright = ((rising[rows, c] * self.exposure[rows, 0])[:, None] * light.weight[:, c]).astype(np.float32)
                 by_roughness = of_roughness * (ks * bright)
-                own = [kd * shown.diffuse[rows, c] * rising[rows, c], ks * shown.specular[rows, c] * rising[rows, c]]
-                diffuse = of.diffuse * (kd * bright)
+                factors = ((kd, prediction.diffuse), (ks, prediction.specular), (ks, prediction.by_roughness))
+                by_material = np.column_stack([k * values[rows, c] * rising[rows, c] for k, values in factors])
+                diffuse = lookup.diffuse * (kd * bright)
                 specular = of_specular * (ks * bright)
                 by_photo = by_photos[c][rows]
-                if light.scale_free:  # ∂r/∂ log of the factor on held cells
-                    by_photo = np.hstack([by_photo, (diffuse + specular)[:, light.held].sum(1, keepdims=True)])
+                if light.scale_free:  # ∂r/∂ log of the factor on known cells
+                    by_photo = np.hstack([by_photo, (diffuse + specular)[:, light.fixed].sum(1, keepdims=True)])
                 yield Linearised(
                     c,
                     rows,
@@ -276,30 +270,29 @@ class Illumination(msgspec.Struct, frozen=True):
                     diffuse[:, free],
                     specular[:, free],
                     by_roughness[:, free],
-                    np.column_stack([*own, ks * shown.by_roughness[rows, c] * rising[rows, c]]).astype(np.float32),
+                    by_material.astype(np.float32),
                     by_photo.astype(np.float32),
                     (residual * pull)[rows, c].astype(np.float32),
                 )
 
     def _by_photos(
-        self, shown: Shown, scale: Float[np.ndarray, "n 3"], rising: Float[np.ndarray, "n 3"]
+        self, prediction: Prediction, scale: Float[np.ndarray, "n 3"], rising: Float[np.ndarray, "n 3"]
     ) -> list[Float[np.ndarray, "n q"]]:
         """Return ∂r/∂log e = τ' (ℓ − bounced)/σ and ∂r/∂log g of each channel, by the photos' exposures and exponents.
 
         Args:
-            shown: Prediction of this illumination.
+            prediction: Prediction of this illumination.
             scale: ∂r/∂y.
             rising: ∂r/∂ℓ.
         """
-        block = self.block
         light = self.light
-        photos = np.eye(len(light.log_exposure))[block.photo]
-        by_exposure = (shown.linear - self.bounced) * rising
+        photos = np.eye(len(light.log_exposure))[self.block.photo]
+        by_exposure = (prediction.linear - self.bounced) * rising
         free = photos[:, len(light.log_exposure) - light.free_exposures :]
         columns = [free * by_exposure[:, c, None] for c in range(3)]
         if len(light.log_tone):
-            by_tone = scale * by_log_exponent(np.maximum(shown.linear, 0), light.exponents(block.photo))
-            columns = [np.hstack([one, photos * by_tone[:, c, None]]) for c, one in enumerate(columns)]
+            by_tone = scale * by_log_exponent(np.maximum(prediction.linear, 0), light.exponents(self.block.photo))
+            columns = [np.hstack([column, photos * by_tone[:, c, None]]) for c, column in enumerate(columns)]
         return columns
 
 

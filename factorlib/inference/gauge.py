@@ -24,7 +24,7 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components as components_of_graph
 
 from factorlib.inference.blocks import Block
-from factorlib.inference.known import Known
+from factorlib.inference.known import KnownValues
 from factorlib.inference.materials import Materials, Point
 
 BRIGHTEST = 0.9
@@ -57,11 +57,11 @@ def connected_components(blocks: Sequence[Block], materials: int) -> list[Compon
 
     Two materials are linked if one light illuminates both.  In each component one factor per channel is undetermined.
     """
-    shown = [(m, materials + i) for i, block in enumerate(blocks) for m in np.unique(block.material).tolist()]
-    first, second = np.array(shown, dtype=int).reshape(-1, 2).T
+    edges = [(m, materials + i) for i, block in enumerate(blocks) for m in np.unique(block.material).tolist()]
+    material_nodes, light_nodes = np.array(edges, dtype=int).reshape(-1, 2).T
     size = materials + len(blocks)
     _, label = components_of_graph(
-        coo_array((np.ones(len(first)), (first, second)), shape=(size, size)), directed=False
+        coo_array((np.ones(len(material_nodes)), (material_nodes, light_nodes)), shape=(size, size)), directed=False
     )
     members = [np.flatnonzero(label == k).tolist() for k in np.unique(label)]
     return sorted(
@@ -73,7 +73,7 @@ def connected_components(blocks: Sequence[Block], materials: int) -> list[Compon
     )
 
 
-def in_gauge(point: Point, blocks: Sequence[Block], known: Known = Known()) -> Point:
+def fix_gauge(point: Point, blocks: Sequence[Block], known: KnownValues = KnownValues()) -> Point:
     """Return the point in the gauge of this module; it predicts the same radiance.
 
     Args:
@@ -81,30 +81,29 @@ def in_gauge(point: Point, blocks: Sequence[Block], known: Known = Known()) -> P
         blocks: Observations by illumination.
         known: Unknowns with given values.
     """
-    materials = point.materials
     lights = list(point.lights)
-    diffuse = materials.diffuse.copy()
-    specular = materials.specular.copy()
+    diffuse = point.materials.diffuse.copy()
+    specular = point.materials.specular.copy()
     names = [block.name for block in blocks]
-    for members, illuminations in connected_components(blocks, len(materials)):
-        own = [names.index(name) for name in illuminations]
-        factors = known.factors(members, illuminations) if is_free(blocks, illuminations) else 0
-        if not own or not factors:
+    for members, illuminations in connected_components(blocks, len(point.materials)):
+        linked_lights = [names.index(name) for name in illuminations]
+        factors = known.free_factors(members, illuminations) if has_free_factor(blocks, illuminations) else 0
+        if not linked_lights or not factors:
             continue
         rows = list(members)
         # log s_c from the geometric means of E_ic; reflectances take 1/s_c and the scale of BRIGHTEST
-        sums = np.array([lights[i].energy.sum(0) for i in own])
+        sums = np.array([lights[i].energy.sum(0) for i in linked_lights])
         level = np.log(np.maximum(sums, LEAST_ENERGY * np.maximum(sums.max(1, keepdims=True), 1e-300)))
         tint = (level.mean(1, keepdims=True) - level).mean(0) if factors == 3 else np.zeros(3)
         factor = 1 / np.exp(tint)  # multiplies reflectances
         factor = factor * BRIGHTEST / (factor * (diffuse[rows] + specular[rows])).max()
         diffuse[rows] = diffuse[rows] * factor
         specular[rows] = specular[rows] * factor
-        for i in own:
+        for i in linked_lights:
             lights[i] = msgspec.structs.replace(lights[i], weight=lights[i].weight / factor)
-    return Point(Materials(diffuse, specular, materials.roughness), lights)
+    return Point(Materials(diffuse, specular, point.materials.roughness), lights)
 
 
-def is_free(blocks: Sequence[Block], illuminations: Sequence[str]) -> bool:
+def has_free_factor(blocks: Sequence[Block], illuminations: Sequence[str]) -> bool:
     """Return True if no block of these illuminations has interreflection, so that their component has a free factor."""
     return all(block.bounced is None for block in blocks if block.name in illuminations)

@@ -15,19 +15,19 @@ from jaxtyping import Float
 from factorlib.geometry.sphere import mirror_directions
 from factorlib.inference.answer import Answer
 from factorlib.inference.blocks import Block
-from factorlib.inference.gauge import LEAST_ENERGY, connected_components, is_free
+from factorlib.inference.gauge import LEAST_ENERGY, connected_components, has_free_factor
 from factorlib.inference.materials import ROUGHNESS, Materials, Point
 from factorlib.inference.observed import PhotoObservations
 from factorlib.inference.problem import JointProblem
 
-FEW = 40  # observations: a few for each of 7 unknowns of a material and some lobes of 6
-FLAT_DEG = 15.0  # mirror directions within this angle of their mean show one patch of the light
+FEW_OBSERVATIONS = 40  # observations: a few for each of 7 unknowns of a material and some lobes of 6
+LEAST_SPREAD_DEG = 15.0  # mirror directions within this angle of their mean show one patch of the light
 CLIPPED = 0.5  # share of clipped channel values
 ROUGHNESS_ERROR = 0.1  # largest standard error that still separates dull from glossy
 SHARE_ERROR = 0.25  # largest standard error, as a share of a material's diffuse + specular reflectance
-DARK = 0.1  # largest bound on reflectance that still means 'dark'
+DARK_BOUND = 0.1  # largest bound on reflectance that still means 'dark'
 # Largest mean |log R/G| or |log B/G|: three standard deviations of the colour of one light (docs/light-prior.md).
-TINTED = 0.6
+LARGEST_TINT = 0.6
 EXPOSURE_DIFFERS = 1.5  # largest factor between estimated and EXIF exposure without a warning
 OUTLIER = 3.0  # residual in σ of the noise model
 OUTLIERS = 0.1  # largest share of such residuals without a warning
@@ -51,23 +51,21 @@ def before_solving(names: Sequence[str], photos: Sequence[str], problem: JointPr
         photos: Names of all photos.
         problem: Observations.
     """
-    blocks = problem.blocks
-    known = problem.known
-    shown = {int(m) for block in blocks for m in np.unique(block.material)}
-    unseen = [name for m, name in enumerate(names) if m not in shown and m not in known.materials]
-    said = [f"material '{name}' is observed in no photo: its reflectance is only a guess" for name in unseen]
-    dark = sorted(set(photos) - {photo for block in blocks for photo in block.photos})
-    said += [f"photo '{photo}' has no valid observation and gets no light" for photo in dark]
-    linked = [component for component in connected_components(blocks, len(names)) if component.illuminations]
-    if len(linked) > 1 and any(known.factors(*component) for component in linked):
-        pairs = ((", ".join(lights), ", ".join(names[m] for m in members)) for members, lights in linked)
-        groups = "; ".join(f"{lights} (with {materials})" for lights, materials in pairs)
-        said.append(
+    observed = {int(m) for block in problem.blocks for m in np.unique(block.material)}
+    unseen = [name for m, name in enumerate(names) if m not in observed and m not in problem.known.materials]
+    sentences = [f"material '{name}' is observed in no photo: its reflectance is only a guess" for name in unseen]
+    dark = sorted(set(photos) - {photo for block in problem.blocks for photo in block.photos})
+    sentences += [f"photo '{photo}' has no valid observation and gets no light" for photo in dark]
+    linked = [component for component in connected_components(problem.blocks, len(names)) if component.illuminations]
+    if len(linked) > 1 and any(problem.known.free_factors(*component) for component in linked):
+        linked_names = ((", ".join(lights), ", ".join(names[m] for m in members)) for members, lights in linked)
+        groups = "; ".join(f"{lights} (with {materials})" for lights, materials in linked_names)
+        sentences.append(
             f"the photos fall into {len(linked)} sets that share no material, so their reflectances cannot be "
             f"compared: {groups}. An object that is left out of the solve may link them, once its pose is good; else "
             "a photo that shows a material of each would"
         )
-    return said + undetermined_by_observations(names, problem)
+    return sentences + undetermined_by_observations(names, problem)
 
 
 def undetermined_by_observations(names: Sequence[str], problem: JointProblem) -> list[str]:
@@ -75,42 +73,40 @@ def undetermined_by_observations(names: Sequence[str], problem: JointProblem) ->
 
     Known materials and materials without observations are left out.
     """
-    blocks = problem.blocks
-    known = problem.known
-    black = [block.name for block in blocks if (block.radiance <= 0).all()]
-    said = [f"illumination '{name}' is black in every photo: it tells nothing" for name in black]
+    black = [block.name for block in problem.blocks if (block.radiance <= 0).all()]
+    sentences = [f"illumination '{name}' is black in every photo: it tells nothing" for name in black]
     for m, name in enumerate(names):
-        shown = [block.take(block.material == m) for block in blocks if (block.material == m).any()]
-        said += _of_material(name, shown) if shown and m not in known.materials else []
-    for members, lights in connected_components(blocks, len(names)):
-        if len(members) == 1 and lights and known.factors(members, lights) == 3:
-            alone = (
+        observations = [block.take(block.material == m) for block in problem.blocks if (block.material == m).any()]
+        sentences += _material_warnings(name, observations) if observations and m not in problem.known.materials else []
+    for members, lights in connected_components(problem.blocks, len(names)):
+        if len(members) == 1 and lights and problem.known.free_factors(members, lights) == 3:
+            consequence = (
                 ", and a smooth material in a soft light looks like a rough one in a sharp light. "
                 "A photo of it in other light"
             )
-            said.append(
+            sentences.append(
                 f"material '{names[members[0]]}' shares no light with another: its colour and brightness are "
-                f"separated from the light's by convention only{alone if len(lights) == 1 else '. A photo'} that "
+                f"separated from the light's by convention only{consequence if len(lights) == 1 else '. A photo'} that "
                 "shows another material too would help"
             )
-    return said
+    return sentences
 
 
-def _of_material(name: str, shown: Sequence[Block]) -> Iterator[str]:
+def _material_warnings(name: str, observations: Sequence[Block]) -> Iterator[str]:
     """Yield sentences about one material from its observations in each light."""
-    count = sum(map(len, shown))
-    if count < FEW:
+    count = sum(map(len, observations))
+    if count < FEW_OBSERVATIONS:
         yield (
-            f"material '{name}' has {count} observation(s), fewer than {FEW}: its reflectance is uncertain, and its "
-            "roughness more so. A photo from nearer would help"
+            f"material '{name}' has {count} observation(s), fewer than {FEW_OBSERVATIONS}: its reflectance is "
+            "uncertain, and its roughness more so. A photo from nearer would help"
         )
-    if all(_spread(block) < FLAT_DEG for block in shown):
+    if all(_spread(block) < LEAST_SPREAD_DEG for block in observations):
         yield (
             f"material '{name}' is flat: in every light it mirrors one direction only, so its roughness and what of "
             "it is specular cannot be determined. A photo of a curved part, or several of it turned in a light that "
             "is fixed to the world, would help"
         )
-    clipped = np.concatenate([block.clipped for block in shown]).mean()
+    clipped = np.concatenate([block.clipped for block in observations]).mean()
     if clipped >= CLIPPED:
         yield (
             f"{clipped:.0%} of the values of material '{name}' are clipped and say 'at least' only: its reflectance "
@@ -127,46 +123,45 @@ def _spread(block: Block) -> float:
 
 def after_solving(answer: Answer) -> list[str]:
     """Return sentences about quantities that the answer leaves open or explains badly."""
-    problem = answer.solution.shown(answer.problem)
-    point = answer.solution.point
+    problem = answer.solution.effective_problem(answer.problem)
     return [
-        *undetermined_by_answer(answer.names, problem, point.materials, answer.errors.materials),
+        *undetermined_by_answer(answer.names, problem, answer.solution.point.materials, answer.errors.materials),
         *poorly_explained(problem, answer.radiance),
-        *unlikely_curves(problem, point),
-        *tinted_alike(problem, point),
+        *unlikely_curves(problem, answer.solution.point),
+        *tinted_alike(problem, answer.solution.point),
         *_brighter_than_white(answer),
         *_exposures_unlike_exif(answer),
     ]
 
 
 def undetermined_by_answer(
-    names: Sequence[str], problem: JointProblem, found: Materials, errors: Materials
+    names: Sequence[str], problem: JointProblem, estimate: Materials, errors: Materials
 ) -> list[str]:
     """Return sentences about observed materials that the data leave uncertain.
 
     Args:
         names: Names of all materials, by number.
         problem: Observations.
-        found: Estimated materials.
+        estimate: Estimated materials.
         errors: Their standard errors.
     """
-    seen = sorted({int(m) for block in problem.blocks for m in np.unique(block.material)})
-    return [sentence for m in seen for sentence in _of_answer(names[m], found.rows()[m], errors.rows()[m])]
+    observed = sorted({int(m) for block in problem.blocks for m in np.unique(block.material)})
+    return [sentence for m in observed for sentence in _error_warnings(names[m], estimate.rows()[m], errors.rows()[m])]
 
 
-def _of_answer(name: str, found: Float[np.ndarray, "7"], error: Float[np.ndarray, "7"]) -> Iterator[str]:
+def _error_warnings(name: str, estimate: Float[np.ndarray, "7"], error: Float[np.ndarray, "7"]) -> Iterator[str]:
     """Yield sentences about one material from its estimate and standard errors, both (k_d, k_s, roughness)."""
-    whole = (found[:3] + found[3:6]).max()
+    reflectance = (estimate[:3] + estimate[3:6]).max()
     largest = error[:6].max()
-    specular = found[3:6]
-    if whole < largest <= DARK:
+    specular = estimate[3:6]
+    if reflectance < largest <= DARK_BOUND:
         yield (
-            f"material '{name}' is so dark that of its reflectance only a bound, about {whole + 2 * largest:.2g}, "
-            "can be given. A photo of longer exposure would help"
+            f"material '{name}' is so dark that of its reflectance only a bound, about "
+            f"{reflectance + 2 * largest:.2g}, can be given. A photo of longer exposure would help"
         )
-    elif not largest <= SHARE_ERROR * whole:
+    elif not largest <= SHARE_ERROR * reflectance:
         yield (
-            f"the reflectance of material '{name}' is known to ±{largest:.2g} only, of {whole:.2g}: diffuse and "
+            f"the reflectance of material '{name}' is known to ±{largest:.2g} only, of {reflectance:.2g}: diffuse and "
             "specular part look alike here. A photo in light with a small bright source, or next to a brighter "
             "material, would help"
         )
@@ -178,7 +173,7 @@ def _of_answer(name: str, found: Float[np.ndarray, "7"], error: Float[np.ndarray
             "shape and photos disagree too much. A photo in light with a small bright source, or a better mesh, "
             "would help"
         )
-    elif found[6] <= ROUGHNESS[0] + 1e-9 and error[6] > 0:
+    elif estimate[6] <= ROUGHNESS[0] + 1e-9 and error[6] > 0:
         yield (
             f"the roughness of material '{name}' is at {ROUGHNESS[0]:g}, the least the model knows: it may be smoother"
         )
@@ -200,7 +195,7 @@ def poorly_explained(problem: JointProblem, radiance: Sequence[Float[np.ndarray,
 def unlikely_curves(problem: JointProblem, point: Point) -> Iterator[str]:
     """Yield a sentence for each light whose tone curves end near the bounds of real cameras."""
     for block, light in zip(problem.blocks, point.lights, strict=True):
-        if light.beyond_cameras:
+        if light.implausible_tone:
             exponents = ", ".join(f"{g:.2g}" for g in np.exp(light.log_tone))
             yield (
                 f"the tone curves of illumination '{block.name}' have exponents of {exponents}, more than a camera "
@@ -215,14 +210,17 @@ def tinted_alike(problem: JointProblem, point: Point) -> Iterator[str]:
     There is none where the gauge of `factorlib.inference.gauge` makes lights grey, or where a material or a light is
     known.
     """
-    blocks = problem.blocks
-    for members, illuminations in connected_components(blocks, len(point.materials)):
-        if not illuminations or problem.known.factors(members, illuminations) < 3 or is_free(blocks, illuminations):
+    for members, illuminations in connected_components(problem.blocks, len(point.materials)):
+        if (
+            not illuminations
+            or problem.known.free_factors(members, illuminations) < 3
+            or has_free_factor(problem.blocks, illuminations)
+        ):
             continue
-        pairs = zip(blocks, point.lights, strict=True)
+        pairs = zip(problem.blocks, point.lights, strict=True)
         sums = np.array([light.energy.sum(0) for block, light in pairs if block.name in illuminations])
         level = np.log(np.maximum(sums, LEAST_ENERGY * sums.max(1, keepdims=True))).mean(0)
-        if np.abs(level - level[1]).max() > TINTED:
+        if np.abs(level - level[1]).max() > LARGEST_TINT:
             colour = " : ".join(f"{c:.2g}" for c in np.exp(level - level.mean()))
             yield (
                 f"the lights of {', '.join(illuminations)} are R : G : B = {colour} on average, as interreflection "
@@ -233,18 +231,19 @@ def tinted_alike(problem: JointProblem, point: Point) -> Iterator[str]:
 
 def _brighter_than_white(answer: Answer) -> Iterator[str]:
     """Yield a sentence for each material brighter than white beside known ones."""
-    found = answer.solution.point.materials
-    for name, whole in zip(answer.names, (found.diffuse.max(1) + found.specular.max(1)).tolist(), strict=True):
-        if whole > 1 and not answer.problem.known.nothing:
+    materials = answer.solution.point.materials
+    reflectances = (materials.diffuse.max(1) + materials.specular.max(1)).tolist()
+    for name, reflectance in zip(answer.names, reflectances, strict=True):
+        if reflectance > 1 and not answer.problem.known.is_empty:
             yield (
-                f"material '{name}' comes out with diffuse + specular = {whole:.2f} beside what is known, more than "
-                "falls on it: are the known reflectances right, and of materials that the same light falls on?"
+                f"material '{name}' comes out with diffuse + specular = {reflectance:.2f} beside what is known, more "
+                "than falls on it: are the known reflectances right, and of materials that the same light falls on?"
             )
 
 
 def _exposures_unlike_exif(answer: Answer) -> Iterator[str]:
     """Yield a sentence for each photo whose estimated exposure differs from its EXIF."""
-    for photo, factor in answer.found_exposures().items():
+    for photo, factor in answer.estimated_exposures().items():
         by_exif = answer.relative[photo]
         if by_exif != 1 and abs(np.log(factor)) > np.log(EXPOSURE_DIFFERS):
             yield (

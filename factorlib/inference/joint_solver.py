@@ -9,7 +9,7 @@ splitting   The cells with most of each light's energy split in four while held-
 lights      Given the materials, lights are fitted to observations of any confidence.
 suns        Each light is compared with one that has a sun in place of its brightest cells (`factorlib.inference.suns`).
 
-Every step is a function of the previous state, and `Run` saves each state (`factorlib.inference.resume`).
+Every step is a function of the previous state, and `FitRunner` saves each state (`factorlib.inference.fit_runner`).
 """
 
 from __future__ import annotations
@@ -19,170 +19,136 @@ from collections.abc import Callable
 import msgspec
 import numpy as np
 
-from factorlib.inference.evidence import FINER, compare, losses_of
-from factorlib.inference.fit import Fit, Schedule, sure_ones
-from factorlib.inference.gauge import in_gauge
-from factorlib.inference.history import Solution
+from factorlib.inference.fit import Fit, FitSchedule, reliable_observations
+from factorlib.inference.fit_runner import FitRunner, Solution, SolveState
+from factorlib.inference.gauge import fix_gauge
 from factorlib.inference.materials import Point
 from factorlib.inference.model_selection import (
-    MUCH,
+    LARGE_GAIN,
+    LEAST_GAIN,
     TRIAL_CELLS,
-    WORTH,
-    Chosen,
-    curves_chosen,
-    distances_chosen,
-    effects_chosen,
-    gained,
-    observations_of,
-    observations_of_lights,
+    WEAKLY_FOR,
+    Selection,
+    compare_models,
+    gain_exceeds,
+    held_out_losses,
+    light_observation_count,
+    observation_count,
+    select_distances,
+    select_effects,
+    select_tone_curves,
 )
-from factorlib.inference.options import Choices
+from factorlib.inference.options import SolveOptions
 from factorlib.inference.problem import JointProblem
-from factorlib.inference.resume import Run
-from factorlib.inference.start import Start, on_cells, with_known
-from factorlib.inference.suns import suns_chosen
-from factorlib.results.materials import Decision
+from factorlib.inference.start import Start, insert_known, refine_cells
+from factorlib.inference.suns import select_suns
 
-MATERIALS = Schedule(lights=2, together=(5, 4))
-AFTER_SPLITTING = Schedule(lights=2, together=(3, 2), estimate=False)
-LIGHTS = Schedule(together=(0, 2, 2), least=0.1, given=True)
-SPLIT = 24  # number of a light's cells that split at once
+MATERIALS = FitSchedule(light_steps=2, joint_steps=(5, 4))
+AFTER_SPLITTING = FitSchedule(light_steps=2, joint_steps=(3, 2), estimate_first=False)
+LIGHTS = FitSchedule(joint_steps=(0, 2, 2), least_temperature=0.1, materials_fixed=True)
+SPLIT_CELLS = 24  # number of a light's cells that split at once
 # Least distance between cells, degrees: the sun's width.  A cell splits only if its neighbours are twice as far.
-SMALLEST = 0.5
+LEAST_SPACING_DEG = 0.5
 
 
-class Asked(msgspec.Struct, frozen=True):
+class SolveRequest(msgspec.Struct, frozen=True):
     """Question that a solve answers.
 
     Attributes:
         problem: All observations; its loss judges the held-out ones.
         start: Maker of the initial fits.
-        choices: Options of the user.
+        options: Options of the user.
         run: Runner of the fits.
     """
 
     problem: JointProblem
     start: Start
-    choices: Choices
-    run: Run
+    options: SolveOptions
+    run: FitRunner
 
-    def sure(self, state: State) -> JointProblem:
+    def reliable_problem(self, state: SolveState) -> JointProblem:
         """Return the observations with reliable normals, under the chosen effects."""
-        return sure_ones(self.problem).with_effects(state.shadows.kept, state.bounces.kept)
+        return state.effective_problem(reliable_observations(self.problem))
 
-    def all_(self, state: State) -> JointProblem:
+    def light_problem(self, state: SolveState) -> JointProblem:
         """Return the observations of any confidence that lights are fitted to, under the chosen effects."""
-        problem = self.problem.with_effects(state.shadows.kept, state.bounces.kept)
-        return problem.sampled(observations_of_lights(self.choices, state.splitting), self.choices.seed)
+        count = light_observation_count(self.options, state.splitting)
+        return state.effective_problem(self.problem).subsample(count, self.options.seed)
 
 
-class State(msgspec.Struct, frozen=True):
-    """State of a solve after some of its steps.
-
-    Attributes:
-        fit: Fit of the last step.
-        materials: Fit of the last step that fitted materials.
-        shadows: Decision on shadows.
-        bounces: Decision on interreflection.
-        tone: Decision on each light's tone curves.
-        distances: Decision on each light's distance.
-        splitting: Decision on each splitting.
-        suns: Decision on each light's sun.
-    """
-
-    fit: Fit
-    materials: Fit
-    shadows: Decision = Decision(False)
-    bounces: Decision = Decision(False)
-    tone: list[Decision] = []
-    distances: list[Decision] = []
-    splitting: list[Decision] = []
-    suns: list[Decision] = []
-
-    def after(self, fit: Fit, **decided: Decision | list[Decision]) -> State:
-        """Return the state after a step that fitted materials and lights."""
-        return msgspec.structs.replace(self, fit=fit, materials=fit, **decided)
-
-
-def solve(problem: JointProblem, start: Start, choices: Choices = Choices(), run: Run | None = None) -> Solution:
+def solve(
+    problem: JointProblem, start: Start, options: SolveOptions = SolveOptions(), run: FitRunner | None = None
+) -> Solution:
     """Solve the problem and return the answer, in the gauge of `factorlib.inference.gauge`.
 
     Args:
         problem: Observations and model.
         start: Maker of the initial fits.
-        choices: Options of the user.
+        options: Options of the user.
         run: Runner that saves states and reports events; None for one without a file.
     """
-    run = run or Run()
-    asked = Asked(problem, start, choices, run)
-    begun = beginnings(asked)[0]
-    state = run.completed(STEPS, asked, State(begun, begun))
-    answer = in_gauge(state.fit.point, problem.blocks, problem.known)
-    return Solution(
-        Point(problem.known.put(answer.materials), answer.lights),
-        run.history,
-        materials=state.materials,
-        lights=state.fit,
-        shadows=state.shadows,
-        interreflection=state.bounces,
-        tone=state.tone,
-        distances=state.distances,
-        splitting=state.splitting,
-        suns=state.suns,
-    )
+    run = run or FitRunner()
+    request = SolveRequest(problem, start, options, run)
+    start_fit = initial_fits(request)[0]
+    state = run.run_steps(STEPS, request, SolveState(start_fit, start_fit))
+    answer = fix_gauge(state.fit.point, problem.blocks, problem.known)
+    point = Point(problem.known.insert_into(answer.materials), answer.lights)
+    steps = {name: getattr(state, name) for name in SolveState.__struct_fields__}
+    return Solution(**steps, point=point, history=run.history)
 
 
-def beginnings(asked: Asked) -> list[Fit]:
+def initial_fits(request: SolveRequest) -> list[Fit]:
     """Return the initial fits of the first trial, of which the best one continues."""
-    sure = sure_ones(asked.problem)
-    cells = min(TRIAL_CELLS, asked.choices.cells)
-    begun = asked.start(sure, cells)
-    return [msgspec.structs.replace(fit, point=with_known(fit.point, sure)) for fit in begun]
+    problem = reliable_observations(request.problem)
+    cells = min(TRIAL_CELLS, request.options.cells)
+    fits = request.start(problem, cells)
+    return [msgspec.structs.replace(fit, point=insert_known(fit.point, problem)) for fit in fits]
 
 
-def choose_effects(asked: Asked, state: State) -> State:
+def choose_effects(request: SolveRequest, state: SolveState) -> SolveState:
     """Choose shadows and interreflection."""
-    chosen = effects_chosen(sure_ones(asked.problem), beginnings(asked), asked.choices, asked.run.fit)
-    return state.after(chosen.fit, shadows=chosen.shadows, bounces=chosen.bounces)
+    problem = reliable_observations(request.problem)
+    return select_effects(problem, initial_fits(request), request.options, request.run.fit)
 
 
-def choose_tone(asked: Asked, state: State) -> State:
+def choose_tone(request: SolveRequest, state: SolveState) -> SolveState:
     """Choose tone curves."""
-    chosen = curves_chosen(asked.sure(state), state.fit, asked.choices, asked.run.fit)
-    return state.after(chosen.fit, tone=chosen.evidence)
+    chosen = select_tone_curves(request.reliable_problem(state), state.fit, request.options, request.run.fit)
+    return state.with_fit(chosen.fit, tone=chosen.evidence)
 
 
-def choose_distances(asked: Asked, state: State) -> State:
+def choose_distances(request: SolveRequest, state: SolveState) -> SolveState:
     """Choose distances of lights."""
-    chosen = distances_chosen(asked.sure(state), state.fit, asked.choices, asked.run.fit)
-    return state.after(chosen.fit, distances=chosen.evidence)
+    chosen = select_distances(request.reliable_problem(state), state.fit, request.options, request.run.fit)
+    return state.with_fit(chosen.fit, distances=chosen.evidence)
 
 
-def fit_materials(asked: Asked, state: State) -> State:
+def fit_materials(request: SolveRequest, state: SolveState) -> SolveState:
     """Fit materials and lights on all cells."""
-    some = asked.sure(state).sampled(asked.choices.observations, asked.choices.seed)
-    begun = on_cells(state.fit, asked.choices.cells, some)
-    return state.after(asked.run.judged("materials and lights", some, begun, MATERIALS))
+    sample = request.reliable_problem(state).subsample(request.options.observations, request.options.seed)
+    start_fit = refine_cells(state.fit, request.options.cells, sample)
+    return state.with_fit(request.run.fit_and_report("materials and lights", sample, start_fit, MATERIALS))
 
 
-def split_cells(asked: Asked, state: State) -> State:
+def split_cells(request: SolveRequest, state: SolveState) -> SolveState:
     """Split the cells with most energy while held-out observations gain."""
-    chosen = split_while_gaining(asked.sure(state), state.fit, asked.choices, asked.run)
-    return state.after(chosen.fit, splitting=chosen.evidence)
+    chosen = split_while_gaining(request.reliable_problem(state), state.fit, request.options, request.run)
+    return state.with_fit(chosen.fit, splitting=chosen.evidence)
 
 
-def fit_lights(asked: Asked, state: State) -> State:
+def fit_lights(request: SolveRequest, state: SolveState) -> SolveState:
     """Fit lights to observations of any confidence, materials given."""
-    return msgspec.structs.replace(state, fit=asked.run.judged("lights", asked.all_(state), state.fit, LIGHTS))
+    fit = request.run.fit_and_report("lights", request.light_problem(state), state.fit, LIGHTS)
+    return msgspec.structs.replace(state, fit=fit)
 
 
-def choose_suns(asked: Asked, state: State) -> State:
+def choose_suns(request: SolveRequest, state: SolveState) -> SolveState:
     """Choose suns, materials given."""
-    chosen = suns_chosen(asked.all_(state), state.fit, asked.run)
+    chosen = select_suns(request.light_problem(state), state.fit, request.run)
     return msgspec.structs.replace(state, fit=chosen.fit, suns=chosen.evidence)
 
 
-STEPS: dict[str, Callable[[Asked, State], State]] = {
+STEPS: dict[str, Callable[[SolveRequest, SolveState], SolveState]] = {
     "effects": choose_effects,
     "tone": choose_tone,
     "distances": choose_distances,
@@ -193,36 +159,40 @@ STEPS: dict[str, Callable[[Asked, State], State]] = {
 }
 
 
-def split_while_gaining(problem: JointProblem, fit: Fit, choices: Choices, run: Run) -> Chosen:
-    """Split cells at most `Choices.splittings` times.
+def split_while_gaining(problem: JointProblem, fit: Fit, options: SolveOptions, run: FitRunner) -> Selection:
+    """Split cells at most `SolveOptions.splittings` times.
 
-    A splitting is undone, and the last, unless it explains held-out observations better by more than FINER standard
-    errors.  A splitting that lowers their loss by less than WORTH is kept, but is the last.  After a first splitting
-    that lowers it by MUCH, the fit uses MORE times as many observations.
+    A splitting is undone, and the last, unless it explains held-out observations better by more than `WEAKLY_FOR`
+    standard errors.  A splitting that lowers their loss by less than `LEAST_GAIN` is kept, but is the last.  After a
+    first splitting that lowers it by `LARGE_GAIN`, the fit uses `OBSERVATION_FACTOR` times as many observations.
 
     Args:
         problem: Observations with reliable normals.
         fit: Fit of materials and lights.
-        choices: Options of the user.
+        options: Options of the user.
         run: Runner of the fits.
     """
-    some = problem.sampled(choices.observations, choices.seed)
+    sample = problem.subsample(options.observations, options.seed)
     evidence = []
-    before = losses_of(some, fit.point)
-    for number in range(0 if problem.none_held_out else choices.splittings):
+    losses_before = held_out_losses(sample, fit.point)
+    spacing = 2 * np.radians(LEAST_SPACING_DEG)
+    for number in range(0 if problem.none_held_out else options.splittings):
         phase = f"splitting {number + 1}"
-        smallest = 2 * np.radians(SMALLEST)
-        lights = [one if one.held.any() else one.split(one.brightest(SPLIT, smallest)) for one in fit.point.lights]
-        trial = run.judged(phase, some, fit.with_lights(lights), AFTER_SPLITTING)
-        after = losses_of(some, trial.point)
-        evidence.append(one := compare(before, after, FINER))
-        if one.kept:
+        lights = [
+            light if light.fixed.any() else light.split(light.brightest_cells(SPLIT_CELLS, spacing))
+            for light in fit.point.lights
+        ]
+        trial = run.fit_and_report(phase, sample, fit.with_lights(lights), AFTER_SPLITTING)
+        losses_after = held_out_losses(sample, trial.point)
+        decision = compare_models(losses_before, losses_after, WEAKLY_FOR)
+        evidence.append(decision)
+        if decision.kept:
             fit = trial
-            before = after
-        if not gained(one, WORTH):
+            losses_before = losses_after
+        if not gain_exceeds(decision, LEAST_GAIN):
             break
-        if number == 0 and gained(one, MUCH):
-            some = problem.sampled(observations_of(choices, evidence), choices.seed)
-            fit = run.judged(phase, some, fit, AFTER_SPLITTING)
-            before = losses_of(some, fit.point)
-    return Chosen(fit, evidence)
+        if number == 0 and gain_exceeds(decision, LARGE_GAIN):
+            sample = problem.subsample(observation_count(options, evidence), options.seed)
+            fit = run.fit_and_report(phase, sample, fit, AFTER_SPLITTING)
+            losses_before = held_out_losses(sample, fit.point)
+    return Selection(fit, evidence)

@@ -11,9 +11,9 @@ known in directions d_i, each with a solid angle ω_i.  The cells' weights w ≥
     w_p ← w_p Σ_i ω_i φ_p(d_i) y_i/(Σ_q w_q φ_q(d_i)) / Σ_i ω_i φ_p(d_i)                                            (1)
 
 It keeps w ≥ 0 and the energy Σ_i ω_i y_i.  Even cells come first.  Then the cells with most energy split repeatedly, as
-in a solve, down to `FINEST` spacings of the directions.  A cell that too few directions cover is not known, and the
-solve estimates it.  A ball does not show the directions behind itself; its pixels that are clipped or that mirror other
-objects are left out.
+in a solve, down to `FINEST_CELL` spacings of the directions.  A cell that too few directions cover is not known, and
+the solve estimates it.  A ball does not show the directions behind itself; its pixels that are clipped or that mirror
+other objects are left out.
 """
 
 from __future__ import annotations
@@ -29,31 +29,33 @@ from factorlib.conventions import YUP_FROM_CAMERA, lat_long_directions, lat_long
 from factorlib.dataset.schema import KnownSlice, LightSlice
 from factorlib.errors import InputError
 from factorlib.geometry.sphere import fibonacci_sphere, mirror_directions
-from factorlib.inference.lights import Light, even_cells
+from factorlib.inference.lights import Light, fibonacci_cells
 from factorlib.inference.materials import ROUGHNESS, Materials
 from factorlib.light.lobes import lobe_integral, squared_distances
 from factorlib.urm.observations import Observations
 
-CELLS = 400  # even cells at the start
-SPLIT = 48  # cells that split at once
-SPLITTINGS = 4  # number of splittings
-FINEST = 1.0  # least size of cells in spacings of the directions: finer cells turn the sums of (1) into poor integrals
+START_CELLS = 400  # even cells at the start
+SPLIT_CELLS = 48  # cells that split at once
+SPLITTING_ROUNDS = 4  # number of splittings
+FINEST_CELL = (
+    1.0  # least size of cells in spacings of the directions: finer cells turn the sums of (1) into poor integrals
+)
 ITERATIONS = 60  # iterations of (1) after the last splitting
-BETWEEN = 15  # iterations of (1) before each splitting
-COVERED = 0.5  # least covered share of a known cell's integral
+ITERATIONS_BETWEEN = 15  # iterations of (1) before each splitting
+LEAST_COVERAGE = 0.5  # least covered share of a known cell's integral
 # Both keep (1) from dividing by 0.
-DARK = 1e-6  # least radiance, as a share of the mean
-LEAST = 1e-12  # least solid angle, steradians
-ROWS = 128  # most rows of a map; a larger one is averaged down
-LEAST_OF_A_BALL = 1000  # pixels: they mirror directions 6° apart, and cells are 10° wide
+LEAST_RELATIVE_RADIANCE = 1e-6  # least radiance, as a share of the mean
+LEAST_SOLID_ANGLE = 1e-12  # least solid angle, steradians
+MAP_ROWS = 128  # most rows of a map; a larger one is averaged down
+LEAST_BALL_PIXELS = 1000  # pixels: they mirror directions 6° apart, and cells are 10° wide
 
 
-class Known(msgspec.Struct, frozen=True):
+class KnownValues(msgspec.Struct, frozen=True):
     """Known values of materials, lights and exposures.
 
     Attributes:
         materials: k_d, k_s (RGB each) and roughness by number of the material; NaN for an unknown value.
-        lights: Light by illumination, in the radiance of its photos, with its known cells (`Light.held`).
+        lights: Light by illumination, in the radiance of its photos, with its known cells (`Light.fixed`).
         exposures: Illuminations whose photos have known exposures; radiance has been divided by them.
     """
 
@@ -62,18 +64,18 @@ class Known(msgspec.Struct, frozen=True):
     exposures: tuple[str, ...] = ()
 
     @property
-    def nothing(self) -> bool:
+    def is_empty(self) -> bool:
         """True if nothing is known."""
         return not (self.materials or self.lights or self.exposures)
 
-    def put(self, materials: Materials) -> Materials:
+    def insert_into(self, materials: Materials) -> Materials:
         """Return the materials with their known values inserted."""
         if not self.materials:
             return materials
         rows = materials.rows()
         for m, values in self.materials.items():
             rows[m] = np.where(np.isnan(values), rows[m], values)
-        return Materials.of_rows(rows)
+        return Materials.from_rows(rows)
 
     def free(self, count: int) -> Bool[np.ndarray, " 7m"]:
         """Return a mask of the unknowns of `count` materials that are to be estimated."""
@@ -82,27 +84,27 @@ class Known(msgspec.Struct, frozen=True):
             free[m] = np.isnan(values)
         return free.reshape(-1)
 
-    def factors(self, members: Iterable[int], illuminations: Iterable[str]) -> Literal[0, 1, 3]:
+    def free_factors(self, members: Iterable[int], illuminations: Iterable[str]) -> Literal[0, 1, 3]:
         """Return the number of free factors between reflectances and lights of a component.
 
         It is 3 (one a channel), 1 (one for all channels) or 0.
         """
         lights = [self.lights[name] for name in illuminations if name in self.lights]
-        if self.of(members) or not all(light.scale_free for light in lights):
+        if self.known_materials(members) or not all(light.scale_free for light in lights):
             return 0
         return 1 if lights else 3
 
-    def of(self, members: Iterable[int]) -> list[int]:
+    def known_materials(self, members: Iterable[int]) -> list[int]:
         """Return the known ones among some materials."""
         return [m for m in members if m in self.materials]
 
 
-def known_light(
+def fit_known_light(
     directions: Float[np.ndarray, "n 3"], radiance: Float[np.ndarray, "n 3"], solid_angle: Float[np.ndarray, " n"]
 ) -> Light:
     """Return the light with a given radiance in given directions, by (1).
 
-    Cells that the directions cover are `held`.
+    Cells that the directions cover are `fixed`.
 
     Args:
         directions: Unit vectors, in the light's frame.
@@ -110,43 +112,47 @@ def known_light(
         solid_angle: ω of each direction, steradians.
     """
     mean = solid_angle @ radiance / solid_angle.sum()
-    floored = np.maximum(radiance, DARK * mean.mean())
+    floored = np.maximum(radiance, LEAST_RELATIVE_RADIANCE * mean.mean())
     energy_of = (solid_angle[:, None] * floored).astype(np.float32)
-    lobes = even_cells(CELLS)
+    lobes = fibonacci_cells(START_CELLS)
     spacing = np.sqrt(np.median(solid_angle))
-    light = Light(lobes.axis, np.log(lobes.sharpness), np.ones((CELLS, 3)), np.zeros(1))
-    light = light.with_log_radiance(np.tile(np.log(np.maximum(mean, DARK * mean.mean()))[:, None], CELLS))
-    for number in range(SPLITTINGS + 1):
+    light = Light(lobes.axis, np.log(lobes.sharpness), np.ones((START_CELLS, 3)), np.zeros(1))
+    light = light.with_log_radiance(
+        np.tile(np.log(np.maximum(mean, LEAST_RELATIVE_RADIANCE * mean.mean()))[:, None], START_CELLS)
+    )
+    for number in range(SPLITTING_ROUNDS + 1):
         if number:
-            light = light.split(light.brightest(SPLIT, 2 * FINEST * spacing))
+            light = light.split(light.brightest_cells(SPLIT_CELLS, 2 * FINEST_CELL * spacing))
         response = np.exp(-0.5 * light.sharpness * squared_distances(directions, light.axis)).astype(np.float32)
         covered = response.T @ solid_angle.astype(np.float32)
         weight = light.weight.astype(np.float32)
         # Richardson–Lucy iterations, (1)
-        for _ in range(ITERATIONS if number == SPLITTINGS else BETWEEN):
-            weight *= response.T @ (energy_of / (response @ weight)) / np.maximum(covered, LEAST)[:, None]
+        for _ in range(ITERATIONS if number == SPLITTING_ROUNDS else ITERATIONS_BETWEEN):
+            weight *= response.T @ (energy_of / (response @ weight)) / np.maximum(covered, LEAST_SOLID_ANGLE)[:, None]
         light = msgspec.structs.replace(light, weight=weight.astype(float))
-    return msgspec.structs.replace(light, held=covered >= COVERED * lobe_integral(light.sharpness))
+    return msgspec.structs.replace(light, fixed=covered >= LEAST_COVERAGE * lobe_integral(light.sharpness))
 
 
-def light_of_map(lat_long: Float[np.ndarray, "h w 3"]) -> Light:
+def light_from_map(lat_long: Float[np.ndarray, "h w 3"]) -> Light:
     """Return the light of a lat-long map, known up to one factor.
 
     The map has the layout of the exported ones.  The light is in the frame that these are turned from.
     """
     height, width = lat_long.shape[:2]
-    rows = min(height, ROWS)
-    first = [-(-np.arange(count) * size // count) for count, size in ((rows, height), (2 * rows, width))]
+    rows = min(height, MAP_ROWS)
+    edges = [-(-np.arange(count) * size // count) for count, size in ((rows, height), (2 * rows, width))]
     angle = np.repeat(lat_long_solid_angles(height, width)[:, None], width, axis=1)
     # radiance averaged over blocks of texels, weighted by solid angle
     sums = (angle[..., None] * lat_long, angle[..., None])
-    energy, angle = (np.add.reduceat(np.add.reduceat(of, first[0], axis=0), first[1], axis=1) for of in sums)
+    energy, angle = (np.add.reduceat(np.add.reduceat(values, edges[0], axis=0), edges[1], axis=1) for values in sums)
     directions = (lat_long_directions(rows, 2 * rows) @ YUP_FROM_CAMERA).reshape(-1, 3)
-    light = known_light(directions, (energy / angle).reshape(-1, 3), angle.reshape(-1))
+    light = fit_known_light(directions, (energy / angle).reshape(-1, 3), angle.reshape(-1))
     return msgspec.structs.replace(light, scale_free=True)
 
 
-def light_of_ball(seen: Observations, specular: Float[np.ndarray, "3"], rotation: Float[np.ndarray, "3 3"]) -> Light:
+def light_from_ball(
+    observations: Observations, specular: Float[np.ndarray, "3"], rotation: Float[np.ndarray, "3 3"]
+) -> Light:
     """Return the light that a mirror ball shows, in the radiance of its photo.
 
     The ball's diffuse reflectance is neglected.  All its pixels stand for the same solid angle, because from afar the
@@ -154,73 +160,77 @@ def light_of_ball(seen: Observations, specular: Float[np.ndarray, "3"], rotation
     object are not used.
 
     Args:
-        seen: Observations of the ball.
+        observations: Observations of the ball.
         specular: k_s of the ball.
         rotation: light_from_camera.
     """
-    mirror = mirror_directions(seen.normal.astype(float), seen.view.astype(float))
-    weight = seen.weight / np.maximum(1.0 if seen.confidence is None else seen.confidence, LEAST)
-    usable = ~seen.clipped.any(1)
+    mirror = mirror_directions(observations.normal.astype(float), observations.view.astype(float))
+    weight = observations.weight / np.maximum(
+        1.0 if observations.confidence is None else observations.confidence, LEAST_SOLID_ANGLE
+    )
+    usable = ~observations.clipped.any(1)
     # keep pixels whose mirrored direction is not hidden by another object
-    if seen.visibility is not None:
-        nearest = np.argmax(mirror @ fibonacci_sphere(seen.visibility.shape[1]).T, axis=1)
-        usable &= seen.visibility[np.arange(len(seen)), nearest] == 255
+    if observations.visibility is not None:
+        nearest = np.argmax(mirror @ fibonacci_sphere(observations.visibility.shape[1]).T, axis=1)
+        usable &= observations.visibility[np.arange(len(observations)), nearest] == 255
     # equal-area projection: solid angle in proportion to pixels
     angle = 4 * np.pi * weight / weight.sum()
-    return known_light(mirror[usable] @ rotation.T, seen.radiance[usable] / specular, angle[usable])
+    return fit_known_light(mirror[usable] @ rotation.T, observations.radiance[usable] / specular, angle[usable])
 
 
-def what_is_known(
-    given: KnownSlice,
+def extract_known(
+    declared: KnownSlice,
     maps: Mapping[str, Float[np.ndarray, "h w 3"]],
-    shown: Mapping[str, Observations],
-    seen: Observations,
+    balls: Mapping[str, Observations],
+    observations: Observations,
     photos: Mapping[str, LightSlice],
-) -> tuple[Observations, Known]:
+) -> tuple[Observations, KnownValues]:
     """Return the observations without mirror balls, and the known values that the solver holds fixed.
 
     Args:
-        given: Known values in dataset.yaml.
+        declared: Known values in dataset.yaml.
         maps: Lat-long maps by illumination.
-        shown: All usable pixels of each ball's photo, at one exposure, by illumination.
-        seen: Observations.
+        balls: All usable pixels of each ball's photo, at one exposure, by illumination.
+        observations: Observations.
         photos: Illumination of each photo.
 
     Raises:
         InputError: If no observation shows a known material, or a ball's photo shows too little of the ball or nothing
             else.
     """
-    number = list(seen.materials).index
-    rows = {number(name): row for name, row in _known_rows(given, seen).items()}
-    lights = {name: light_of_map(lat_long) for name, lat_long in maps.items()}
-    for name, ball in given.balls.items():
+    number = list(observations.materials).index
+    rows = {number(name): row for name, row in _known_rows(declared, observations).items()}
+    lights = {name: light_from_map(lat_long) for name, lat_long in maps.items()}
+    for name, ball in declared.balls.items():
         m = number(ball.material)
-        of_photo = seen.photo == seen.photos.index(ball.photo)
-        pixels = shown[name].take(shown[name].material == m)
-        rest = ~(of_photo & (seen.material == m))
-        if len(pixels) < LEAST_OF_A_BALL or not (of_photo & rest).any():
+        of_photo = observations.photo == observations.photos.index(ball.photo)
+        pixels = balls[name].take(balls[name].material == m)
+        beside_ball = ~(of_photo & (observations.material == m))
+        if len(pixels) < LEAST_BALL_PIXELS or not (of_photo & beside_ball).any():
             fault = (
                 f"photo '{ball.photo}' shows {len(pixels)} pixels of the ball, "
-                f"and {(of_photo & rest).sum()} observations of other objects"
+                f"and {(of_photo & beside_ball).sum()} observations of other objects"
             )
-            cure = f"the ball needs {LEAST_OF_A_BALL}, and something beside it: look at the overlay of `align`"
+            cure = f"the ball needs {LEAST_BALL_PIXELS}, and something beside it: look at the overlay of `align`"
             raise InputError(fault, key=f"known.illumination.{name}.chrome", cure=cure)
         world = photos[ball.photo].world_from_camera
-        lights[name] = light_of_ball(pixels, rows[m][3:6], np.eye(3) if world is None else np.array(world))
-        seen = seen.take(rest)
-    return seen, Known(rows, lights, tuple(sorted({photos[photo].illumination for photo in given.exposure})))
+        lights[name] = light_from_ball(pixels, rows[m][3:6], np.eye(3) if world is None else np.array(world))
+        observations = observations.take(beside_ball)
+    return observations, KnownValues(
+        rows, lights, tuple(sorted({photos[photo].illumination for photo in declared.exposure}))
+    )
 
 
-def _known_rows(given: KnownSlice, seen: Observations) -> dict[str, Float[np.ndarray, "7"]]:
+def _known_rows(declared: KnownSlice, observations: Observations) -> dict[str, Float[np.ndarray, "7"]]:
     """Return k_d, k_s and roughness of the known materials, NaN where unknown.
 
     Raises:
         InputError: If no observation shows a known material.
     """
-    chrome = {ball.material for ball in given.balls.values()}
+    chrome = {ball.material for ball in declared.balls.values()}
     rows = {}
-    for name, known in given.materials.items():
-        if not (seen.material == list(seen.materials).index(name)).any():
+    for name, known in declared.materials.items():
+        if not (observations.material == list(observations.materials).index(name)).any():
             cure = "look at its mask and at the overlays of `align`: both must show it at the same place"
             raise InputError(f"no observation shows material '{name}'", key=f"known.materials.{name}", cure=cure)
         roughness = known.roughness or (ROUGHNESS[0] if name in chrome else np.nan)

@@ -34,7 +34,7 @@ PEAK = 1 / (2 * np.pi * WIDTH**2)  # weight of a cell of radiance 1
 SCALINGS = 5  # iterations for peaks: five make split cells constant to 3 % (RMS), more reach 2.7 % at best
 SUN_PEAK = np.pi / float(lobe_integral(np.array([SUN]))[0])
 DARKEST = 1e-12  # weight below which a lobe counts as dark, for its logarithm
-TONE = (0.6, 1.7)  # range of the exponents of tone curves
+TONE_RANGE = (0.6, 1.7)  # range of the exponents of tone curves
 NEAR_BOUNDS = 0.8  # share of the logarithms of that range: exponents of cameras lie well within
 
 
@@ -55,7 +55,7 @@ class UnitLobes(msgspec.Struct, frozen=True):
         return len(self.sharpness)
 
 
-def even_cells(count: int) -> UnitLobes:
+def fibonacci_cells(count: int) -> UnitLobes:
     """Return `count` cells of one size, by (1)."""
     return UnitLobes(fibonacci_sphere(count), np.full(count, count / (4 * np.pi * WIDTH**2)))
 
@@ -81,9 +81,9 @@ class Light(msgspec.Struct, frozen=True):
     log_exposure: Float[np.ndarray, " f"]
     log_tone: Float[np.ndarray, " f"] = msgspec.field(default_factory=lambda: np.zeros(0))
     curvature: float = 0.0
-    held: Bool[np.ndarray, " p"] = msgspec.field(default_factory=lambda: np.zeros(0, bool))
+    fixed: Bool[np.ndarray, " p"] = msgspec.field(default_factory=lambda: np.zeros(0, bool))
     scale_free: bool = False
-    exposures_held: bool = False
+    exposures_fixed: bool = False
 
     def __len__(self) -> int:
         return len(self.log_sharpness)
@@ -91,7 +91,12 @@ class Light(msgspec.Struct, frozen=True):
     @property
     def free(self) -> Bool[np.ndarray, " p"]:
         """Mask of the cells that are to be estimated."""
-        return ~self.held if len(self.held) else np.ones(len(self), bool)
+        return ~self.fixed if len(self.fixed) else np.ones(len(self), bool)
+
+    @property
+    def is_near(self) -> bool:
+        """True if the light is at a finite distance."""
+        return self.curvature > 0
 
     @property
     def sharpness(self) -> Float[np.ndarray, " p"]:
@@ -131,22 +136,17 @@ class Light(msgspec.Struct, frozen=True):
         """
         axis = self.axis[~self.suns]
         peaks = np.full(len(self), PEAK)[~self.suns]
-        all_ = np.full(len(self), SUN_PEAK)
+        result = np.full(len(self), SUN_PEAK)
         overlap = np.exp(self.sharpness[~self.suns] * (axis @ axis.T - 1))
         for _ in range(SCALINGS):
             peaks /= np.sqrt(overlap @ peaks)
-        all_[~self.suns] = peaks
-        return all_
-
-    @property
-    def unit_energy(self) -> Float[np.ndarray, " p"]:
-        """Energy of each lobe at weight one, over 2π; steradians."""
-        return lobe_integral(self.sharpness) / (2 * np.pi)
+        result[~self.suns] = peaks
+        return result
 
     @property
     def energy(self) -> Float[np.ndarray, "p 3"]:
         """Energy of each lobe over 2π, in the illumination's radiance unit times steradians."""
-        return self.weight * self.unit_energy[:, None]
+        return self.weight * (lobe_integral(self.sharpness) / (2 * np.pi))[:, None]
 
     @property
     def unknowns(self) -> int:
@@ -160,7 +160,7 @@ class Light(msgspec.Struct, frozen=True):
     @property
     def free_exposures(self) -> int:
         """Number of exposures that are to be estimated: all photos' but the first's, or none."""
-        return 0 if self.exposures_held else len(self.log_exposure) - 1
+        return 0 if self.exposures_fixed else len(self.log_exposure) - 1
 
     def with_log_radiance(self, u: Float[np.ndarray, "3 p"]) -> Light:
         """Return the same cells with log radiance `u`."""
@@ -175,12 +175,12 @@ class Light(msgspec.Struct, frozen=True):
             weight=np.vstack([self.weight, weight]),
         )
 
-    def take(self, which: Bool[np.ndarray, " p"] | slice) -> Light:
+    def take(self, selected: Bool[np.ndarray, " p"] | slice) -> Light:
         """Return the light of the selected lobes."""
-        lobes = {name: getattr(self, name)[which] for name in ("axis", "log_sharpness", "weight")}
+        lobes = {name: getattr(self, name)[selected] for name in ("axis", "log_sharpness", "weight")}
         return msgspec.structs.replace(self, **lobes)
 
-    def brightest(self, count: int, spacing: float) -> Bool[np.ndarray, " p"]:
+    def brightest_cells(self, count: int, spacing: float) -> Bool[np.ndarray, " p"]:
         """Return a mask of the `count` cells with most energy.
 
         Only cells farther than `spacing` radians from their neighbours count.
@@ -188,52 +188,50 @@ class Light(msgspec.Struct, frozen=True):
         energy = np.where(self.spacing > spacing, self.energy.sum(1), 0.0)
         return np.isin(np.arange(len(self)), np.argsort(-energy, kind="stable")[:count]) & (energy > 0)
 
-    def split(self, which: Bool[np.ndarray, " p"]) -> Light:
+    def split(self, selected: Bool[np.ndarray, " p"]) -> Light:
         """Return the light with each selected cell replaced by smaller cells of its radiance.
 
         The smaller cells follow all others.  The module docstring states the rule.
         """
-        count = np.where(which, np.rint(self.sharpness * 4 * np.pi * WIDTH**2), 0).astype(int)
+        count = np.where(selected, np.rint(self.sharpness * 4 * np.pi * WIDTH**2), 0).astype(int)
         parents = [np.zeros(0, int)]
         finer = [UnitLobes(np.zeros((0, 3)), np.zeros(0))]
-        for n in np.unique(count[which]).tolist():
-            cells = even_cells(4 * n)
-            own = np.flatnonzero(count == n)
+        for n in np.unique(count[selected]).tolist():
+            cells = fibonacci_cells(4 * n)
+            parents_of_size = np.flatnonzero(count == n)
             # even cells near a splitting cell; each one replaces the cell that is nearest in spacings
-            near = cells.axis[(cells.axis @ self.axis[own].T).max(1) > 1 - 2 * 4 * np.pi / n]  # within two spacings
-            nearest = np.argmin(self.sharpness * (1 - near @ self.axis.T), axis=1)
+            candidates = cells.axis[
+                (cells.axis @ self.axis[parents_of_size].T).max(1) > 1 - 2 * 4 * np.pi / n
+            ]  # within two spacings
+            nearest = np.argmin(self.sharpness * (1 - candidates @ self.axis.T), axis=1)
             parents.append(nearest[count[nearest] == n])
-            finer.append(UnitLobes(near[count[nearest] == n], np.full(len(parents[-1]), cells.sharpness[0])))
+            finer.append(UnitLobes(candidates[count[nearest] == n], np.full(len(parents[-1]), cells.sharpness[0])))
         parent = np.concatenate(parents)
         u = self.log_radiance
-        kept = ~np.isin(np.arange(len(self)), parent)
+        unsplit = ~np.isin(np.arange(len(self)), parent)
         light = msgspec.structs.replace(
             self,
-            axis=np.vstack([self.axis[kept], *(cells.axis for cells in finer)]),
-            log_sharpness=np.log(np.concatenate([self.sharpness[kept], *(cells.sharpness for cells in finer)])),
-            weight=np.zeros((kept.sum() + len(parent), 3)),
+            axis=np.vstack([self.axis[unsplit], *(cells.axis for cells in finer)]),
+            log_sharpness=np.log(np.concatenate([self.sharpness[unsplit], *(cells.sharpness for cells in finer)])),
+            weight=np.zeros((unsplit.sum() + len(parent), 3)),
         )
-        return light.with_log_radiance(np.hstack([u[:, kept], u[:, parent]]))
-
-    def with_curves(self) -> Light:
-        """Return the light with a tone curve for each photo, initially the identity."""
-        return msgspec.structs.replace(self, log_tone=np.zeros_like(self.log_exposure))
+        return light.with_log_radiance(np.hstack([u[:, unsplit], u[:, parent]]))
 
     @property
-    def beyond_cameras(self) -> bool:
+    def implausible_tone(self) -> bool:
         """True if the exponent of a tone curve is near the bounds of real cameras."""
-        low, high = NEAR_BOUNDS * np.log(TONE)
+        low, high = NEAR_BOUNDS * np.log(TONE_RANGE)
         return bool(((self.log_tone < low) | (self.log_tone > high)).any())
 
     def exponents(self, photo: Int[np.ndarray, " n"]) -> Float[np.ndarray, "n 1"]:
         """Return the tone exponent of each observation's photo."""
         return np.exp(self.log_tone)[photo][:, None]
 
-    def toned(self, linear: Float[np.ndarray, "n c"], photo: Int[np.ndarray, " n"]) -> Float[np.ndarray, "n c"]:
+    def apply_tone(self, linear: Float[np.ndarray, "n c"], photo: Int[np.ndarray, " n"]) -> Float[np.ndarray, "n c"]:
         """Return the tone curves applied to linear radiance; the identity for a light without curves."""
         return tone.curve(np.maximum(linear, 0.0), self.exponents(photo)) if len(self.log_tone) else linear
 
-    def slope_at(
+    def tone_slope(
         self, radiance: Float[np.ndarray, "n c"], photo: Int[np.ndarray, " n"]
     ) -> Float[np.ndarray, "n c"] | float:
         """Return the derivative of the observed by the linear radiance, where the observed one is `radiance`."""

@@ -19,10 +19,10 @@ are known exactly.  With Σ = H⁻¹
 
     ½ ∂ log det H/∂θ = Σ_i J_i Σ (∂J_i/∂θ)ᵀ / T,      ½ ∂ log det H/∂u_j = Σ_i (J_i Σ)_j J_ij / T.                  (2)
 
-The second acts on materials through the light that they imply, du/dθ = −L⁻¹Cᵀ (`factorlib.inference.arrow`).  Without
-it, all reflectances would fall: a brighter light under darker materials has the same J.  The Gauss–Newton Hessian of
-the first, Σ_i ∂J_i Σ ∂J_iᵀ, only steers the steps of a descent.  Every `SPARSE`-th row therefore stands for its
-neighbours.
+The second acts on materials through the light that they imply, du/dθ = −L⁻¹Cᵀ (`factorlib.inference.optimizer`).
+Without it, all reflectances would fall: a brighter light under darker materials has the same J.  The Gauss–Newton
+Hessian of the first, Σ_i ∂J_i Σ ∂J_iᵀ, only steers the steps of a descent.  Every `HESSIAN_STRIDE`-th row therefore
+stands for its neighbours.
 
 Materials enter as log k_d, log k_s (RGB each) and roughness, 7 unknowns θ each.  Exposures and tone exponents belong to
 the light's block but are not integrated out.  They have wide Gaussian priors about 0.
@@ -34,24 +34,61 @@ given the held ones.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import NamedTuple
 
 import msgspec
 import numpy as np
 from jaxtyping import Float, Int
-from scipy.linalg import LinAlgError
+from scipy.linalg import LinAlgError, cho_solve
 from scipy.linalg.blas import ssyrk
 from scipy.linalg.lapack import dpotrf, dpotri
 
-from factorlib.inference.arrow import System
+from factorlib.inference.blocks import RobustLoss
 from factorlib.inference.forward import Gradient, Illumination, Linearised
 from factorlib.inference.lights import DARKEST, Light
 from factorlib.inference.materials import Materials
-from factorlib.inference.noise import Loss
 from factorlib.light.prior import LightPrior
 
-SPARSE = 8  # one row in so many enters the Hessian of the determinant
-EXPOSURE = 3.0  # standard deviation of a log exposure
-TONE = 0.3  # standard deviation of a log tone exponent
+HESSIAN_STRIDE = 8  # one row in so many enters the Hessian of the determinant
+EXPOSURE_DEVIATION = 3.0  # standard deviation of a log exposure
+TONE_DEVIATION = 0.3  # standard deviation of a log tone exponent
+
+
+class System(NamedTuple):
+    """Contribution of one illumination to the objective, half its gradient and half its Gauss–Newton Hessian.
+
+    The k unknowns of the materials are those the block shows; the light has l unknowns.
+
+    Attributes:
+        value: Contribution to the objective.
+        loss: Sum of the robust losses in `value`.
+        places: Indices of the block's material unknowns, ascending.
+        material_gradient: g_m.
+        material_hessian: M.
+        light_gradient: g_i.
+        cross_hessian: C_i.
+        light_hessian: L_i.
+        factor: Lower Cholesky factor of L_i.
+        determinant_by_materials: Half the gradient of log det H with respect to materials.
+        determinant_hessian: Half its Hessian with respect to materials.
+        determinant_by_light: d_i of (3) of `factorlib.inference.optimizer`, half the second part of (2).
+        scores: Contributions to the gradient, materials then light, one row a cluster of observations; None if not
+            requested.
+    """
+
+    value: float
+    loss: float
+    places: Int[np.ndarray, " k"]
+    material_gradient: Float[np.ndarray, " k"]
+    material_hessian: Float[np.ndarray, "k k"]
+    light_gradient: Float[np.ndarray, " l"]
+    cross_hessian: Float[np.ndarray, "k l"]
+    light_hessian: Float[np.ndarray, "l l"]
+    factor: Float[np.ndarray, "l l"]
+    determinant_by_materials: Float[np.ndarray, " k"]
+    determinant_hessian: Float[np.ndarray, "k k"]
+    determinant_by_light: Float[np.ndarray, " l"]
+    scores: Float[np.ndarray, "g k+l"] | None = None
 
 
 class LightLikelihood(msgspec.Struct, frozen=True):
@@ -73,18 +110,20 @@ class LightLikelihood(msgspec.Struct, frozen=True):
     precision: Float[np.ndarray, "3p 3p"]
     log_determinant: float
     temperature: float
-    loss: Loss
+    loss: RobustLoss
 
     @property
     def light(self) -> Light:
         """Light of this likelihood."""
         return self.illumination.light
 
-    def at(self, light: Light | None = None, materials: Materials | None = None) -> LightLikelihood:
+    def with_point(self, light: Light | None = None, materials: Materials | None = None) -> LightLikelihood:
         """Return the same likelihood at another light or other materials, with the same table."""
-        one = self.illumination
-        moved = msgspec.structs.replace(one, light=light or one.light, materials=materials or one.materials)
-        return msgspec.structs.replace(self, illumination=moved)
+        current = self.illumination
+        illumination = msgspec.structs.replace(
+            current, light=light or current.light, materials=materials or current.materials
+        )
+        return msgspec.structs.replace(self, illumination=illumination)
 
     def gradient(self) -> Gradient:
         """Return φ and half its gradient, by materials and by the light."""
@@ -99,43 +138,43 @@ class LightLikelihood(msgspec.Struct, frozen=True):
             materials_given: True to return φ instead of (1), without the costly derivatives of the determinants.
             clusters: Number of each observation's cluster, from 0, for `System.scores`.
         """
-        one = self.illumination
-        shown = one.shown()
-        p = int(one.light.free.sum())
-        places = (7 * np.unique(one.block.material)[:, None] + np.arange(7)).reshape(-1)
+        illumination = self.illumination
+        prediction = illumination.predict()
+        p = int(illumination.light.free.sum())
+        places = (7 * np.unique(illumination.block.material)[:, None] + np.arange(7)).reshape(-1)
         k = len(places)
-        size = one.light.unknowns
+        size = illumination.light.unknowns
         value, g_l = self._prior()
         g_m = np.zeros(k)
         M = np.zeros((k, k))
         C = np.zeros((k, size))
         L = self._prior_hessian()
-        parts = list(one.linearise(shown, self.loss, self.temperature))
+        parts = list(illumination.linearise(prediction, self.loss, self.temperature))
         photos = slice(3 * p, size)  # behind u, the first 3p unknowns of the light
         # H = JᵀJ/T + Q, (1), block by block: L = H of the light, M of the materials, C between them
         for part in parts:
-            own = slice(part.channel * p, (part.channel + 1) * p)
-            at = np.searchsorted(places, part.places)
+            cells = slice(part.channel * p, (part.channel + 1) * p)
+            rows = np.searchsorted(places, part.places)
             J = part.diffuse + part.specular
-            L[own, own] += gram(J)
-            g_l[own] += J.T @ part.residual
-            M[np.ix_(at, at)] += part.by_material.T @ part.by_material
-            g_m[at] += part.by_material.T @ part.residual
-            C[at, own] += part.by_material.T @ J
+            L[cells, cells] += gram_matrix(J)
+            g_l[cells] += J.T @ part.residual
+            M[np.ix_(rows, rows)] += part.by_material.T @ part.by_material
+            g_m[rows] += part.by_material.T @ part.residual
+            C[rows, cells] += part.by_material.T @ J
             if size > 3 * p:
                 L[photos, photos] += part.by_photo.T @ part.by_photo
                 g_l[photos] += part.by_photo.T @ part.residual
-                C[at, photos] += part.by_material.T @ part.by_photo
-                towards = part.by_photo.T @ J
-                L[photos, own] += towards
-                L[own, photos] += towards.T
-        loss = float(self.loss.of_residuals(one.block.residuals(shown.radiance))[~one.block.held_out].sum())
-        factor = factorised(L)
+                C[rows, photos] += part.by_material.T @ part.by_photo
+                photo_cells = part.by_photo.T @ J
+                L[photos, cells] += photo_cells
+                L[cells, photos] += photo_cells.T
+        loss = illumination.fitted_loss(illumination.block.residuals(prediction.radiance), self.loss)
+        factor = cholesky_factor(L)
         determinant = (np.zeros(k), np.zeros((k, k)), np.zeros(size))
         value += loss / self.temperature
         if not materials_given:
             value += self._determinants(factor)
-            determinant = _of_determinants(parts, inverse_of(factor[: 3 * p, : 3 * p]), places, size)
+            determinant = _determinant_derivatives(parts, cholesky_inverse(factor[: 3 * p, : 3 * p]), places, size)
         scores = None if clusters is None else _scores(parts, clusters, places, size)
         return System(value, loss, places, g_m, M, g_l, C, L, factor, *determinant, scores)
 
@@ -150,37 +189,36 @@ class LightLikelihood(msgspec.Struct, frozen=True):
 
     def _prior(self) -> tuple[float, Float[np.ndarray, " l"]]:
         """Return uᵀQu plus the Gaussian priors of exposures and tones, and half the gradient."""
-        light = self.light
-        u = (np.log(np.maximum(light.weight.T, DARKEST)) - self.log_peaks).reshape(-1)
-        others, width = self._others()
+        u = (np.log(np.maximum(self.light.weight.T, DARKEST)) - self.log_peaks).reshape(-1)
+        photo_values, width = self._photo_unknowns()
         slope = self.precision @ u
-        free = np.tile(light.free, 3)
-        gradient = [slope[free], others / width**2]
-        if light.scale_free:  # the derivative of all held cells together
+        free = np.tile(self.light.free, 3)
+        gradient = [slope[free], photo_values / width**2]
+        if self.light.scale_free:  # the derivative of all held cells together
             gradient.append(slope[~free].sum(keepdims=True))
-        return float(u @ slope + np.sum((others / width) ** 2)), np.concatenate(gradient)
+        return float(u @ slope + np.sum((photo_values / width) ** 2)), np.concatenate(gradient)
 
     def _prior_hessian(self) -> Float[np.ndarray, "l l"]:
         """Return half the Hessian of `_prior`."""
-        light = self.light
-        Q = self.precision
-        free = np.tile(light.free, 3)
-        _, width = self._others()
+        free = np.tile(self.light.free, 3)
+        _, width = self._photo_unknowns()
         p = int(free.sum())
-        hessian = np.zeros((light.unknowns, light.unknowns))
-        hessian[:p, :p] = Q if free.all() else Q[np.ix_(free, free)]
+        hessian = np.zeros((self.light.unknowns, self.light.unknowns))
+        hessian[:p, :p] = self.precision if free.all() else self.precision[np.ix_(free, free)]
         hessian[range(p, p + len(width)), range(p, p + len(width))] = width**-2
-        if light.scale_free:
-            together = Q[~free].sum(0)
-            hessian[-1, :p] = hessian[:p, -1] = together[free]
-            hessian[-1, -1] = together[~free].sum()
+        if self.light.scale_free:
+            fixed_rows = self.precision[~free].sum(0)
+            hessian[-1, :p] = hessian[:p, -1] = fixed_rows[free]
+            hessian[-1, -1] = fixed_rows[~free].sum()
         return hessian
 
-    def _others(self) -> tuple[Float[np.ndarray, " q"], Float[np.ndarray, " q"]]:
+    def _photo_unknowns(self) -> tuple[Float[np.ndarray, " q"], Float[np.ndarray, " q"]]:
         """Return the free log exposures and log tone exponents, and their standard deviations."""
         light = self.light
-        others = [light.log_exposure[len(light.log_exposure) - light.free_exposures :], light.log_tone]
-        return np.concatenate(others), np.repeat([EXPOSURE, TONE], [light.free_exposures, len(light.log_tone)])
+        values = [light.log_exposure[len(light.log_exposure) - light.free_exposures :], light.log_tone]
+        return np.concatenate(values), np.repeat(
+            [EXPOSURE_DEVIATION, TONE_DEVIATION], [light.free_exposures, len(light.log_tone)]
+        )
 
 
 def _scores(
@@ -198,15 +236,15 @@ def _scores(
     scores = np.zeros((int(clusters.max(initial=-1)) + 1, k + size))
     for part in parts:
         p = part.diffuse.shape[1]
-        first = k + part.channel * p
+        start = k + part.channel * p
         summing = (clusters[part.rows] == np.arange(len(scores))[:, None]) * part.residual
         scores[:, np.searchsorted(places, part.places)] += summing @ part.by_material
-        scores[:, first : first + p] += summing @ (part.diffuse + part.specular)
+        scores[:, start : start + p] += summing @ (part.diffuse + part.specular)
         scores[:, k + 3 * p :] += summing @ part.by_photo
     return scores
 
 
-def _of_determinants(
+def _determinant_derivatives(
     parts: Sequence[Linearised], covariance: Float[np.ndarray, "3p 3p"], places: Int[np.ndarray, " k"], size: int
 ) -> tuple[Float[np.ndarray, " k"], Float[np.ndarray, "k k"], Float[np.ndarray, " l"]]:
     """Return (2) summed over channels and materials: the first part, its Hessian, and the second part.
@@ -223,39 +261,31 @@ def _of_determinants(
     by_materials_twice = np.zeros((k, k))
     by_light = np.zeros(size)
     for part in parts:
-        own = slice(part.channel * p, (part.channel + 1) * p)
-        at = np.searchsorted(places, part.places)
-        gradient, hessian, by_cells = _of_determinant(part, covariance[own, own].astype(np.float32))
-        by_materials[at] += gradient
-        by_materials_twice[np.ix_(at, at)] += hessian
-        by_light[own] += by_cells
+        cells = slice(part.channel * p, (part.channel + 1) * p)
+        rows = np.searchsorted(places, part.places)
+        Σ = covariance[cells, cells].astype(np.float32)
+        # ∂J by log k_d, log k_s and roughness; the first two are the two parts of J
+        slopes = (part.diffuse, part.specular, part.by_roughness)
+        J = part.diffuse + part.specular
+        # Σ_i J_i Σ ∂J_iᵀ and Σ_i (J_i Σ)_j J_ij, (2)
+        JΣ = J @ Σ
+        by_materials[rows] += [float(np.vdot(JΣ, slope)) for slope in slopes]
+        by_light[cells] += (JΣ * J).sum(0)
+        # Σ_i ∂J_i Σ ∂J_iᵀ, from every HESSIAN_STRIDE-th row
+        sparse = [slope[::HESSIAN_STRIDE] for slope in slopes]
+        stride = len(J) / max(len(sparse[0]), 1)
+        hessian = np.array([[float(np.vdot(a @ Σ, b)) for b in sparse] for a in sparse])
+        by_materials_twice[np.ix_(rows, rows)] += stride * hessian
     return by_materials, by_materials_twice, by_light
 
 
-def _of_determinant(
-    part: Linearised, covariance: Float[np.ndarray, "p p"]
-) -> tuple[list[float], Float[np.ndarray, "3 3"], Float[np.ndarray, " p"]]:
-    """Return (2) of one channel of one material: the first part, its Hessian, and the second part.
-
-    ∂J/∂log k_d and ∂J/∂log k_s are the two parts of J.
-    """
-    # J Σ, and ∂J by the three material unknowns; every SPARSE-th row for the Hessian
-    slopes = (part.diffuse, part.specular, part.by_roughness)
-    J = part.diffuse + part.specular
-    spread = J @ covariance
-    few = [slope[::SPARSE] for slope in slopes]
-    many = len(spread) / max(len(few[0]), 1)
-    hessian = np.array([[float(np.vdot(a @ covariance, b)) for b in few] for a in few])
-    return [float(np.vdot(spread, slope)) for slope in slopes], many * hessian, (spread * J).sum(0)
-
-
-def gram(J: Float[np.ndarray, "n p"]) -> Float[np.ndarray, "p p"]:
+def gram_matrix(J: Float[np.ndarray, "n p"]) -> Float[np.ndarray, "p p"]:
     """Return JᵀJ; BLAS computes one triangle of it."""
     lower = ssyrk(1.0, J.T, lower=1)
     return lower + np.tril(lower, -1).T
 
 
-def factorised(matrix: Float[np.ndarray, "n n"]) -> Float[np.ndarray, "n n"]:
+def cholesky_factor(matrix: Float[np.ndarray, "n n"]) -> Float[np.ndarray, "n n"]:
     """Return the lower Cholesky factor of a symmetric positive definite matrix.
 
     Raises:
@@ -269,10 +299,10 @@ def factorised(matrix: Float[np.ndarray, "n n"]) -> Float[np.ndarray, "n n"]:
     return factor
 
 
-def inverse_of(factor: Float[np.ndarray, "n n"]) -> Float[np.ndarray, "n n"]:
+def cholesky_inverse(factor: Float[np.ndarray, "n n"]) -> Float[np.ndarray, "n n"]:
     """Return the inverse of the matrix whose lower Cholesky factor is given, exactly symmetric.
 
-    >>> inverse_of(factorised(np.array([[4.0, 0.0], [0.0, 0.25]]))).tolist()
+    >>> cholesky_inverse(cholesky_factor(np.array([[4.0, 0.0], [0.0, 0.25]]))).tolist()
     [[0.25, 0.0], [0.0, 4.0]]
     """
     if not len(factor):
@@ -280,3 +310,8 @@ def inverse_of(factor: Float[np.ndarray, "n n"]) -> Float[np.ndarray, "n n"]:
     inverse, _ = dpotri(factor, lower=1)
     lower = np.tril(inverse, -1)
     return lower + lower.T + np.diag(np.diag(inverse))
+
+
+def solve_cholesky(factor: Float[np.ndarray, "l l"], values: Float[np.ndarray, "l ..."]) -> Float[np.ndarray, "l ..."]:
+    """Return L⁻¹ of a vector or of columns, L given by its lower Cholesky factor."""
+    return cho_solve((factor, True), values, check_finite=False)

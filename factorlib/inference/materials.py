@@ -41,12 +41,12 @@ class Materials(msgspec.Struct, frozen=True):
         return self.vector().reshape(-1, 7)
 
     @staticmethod
-    def of_rows(rows: Float[np.ndarray, "m 7"]) -> Materials:
+    def from_rows(rows: Float[np.ndarray, "m 7"]) -> Materials:
         """Return the materials with these rows of unknowns."""
         return Materials(rows[:, :3], rows[:, 3:6], rows[:, 6])
 
     @staticmethod
-    def of_vector(vector: Float[np.ndarray, " 7m"]) -> Materials:
+    def from_vector(vector: Float[np.ndarray, " 7m"]) -> Materials:
         """Return the nearest materials within bounds."""
         rows = vector.reshape(-1, 7)
         reflectance = np.maximum(rows[:, :6], LEAST_REFLECTANCE)
@@ -59,6 +59,6 @@ class Point(msgspec.Struct, frozen=True):
     materials: Materials
     lights: list[Light]
 
-    def restricted(self, lights: Sequence[int]) -> Point:
+    def select_lights(self, lights: Sequence[int]) -> Point:
         """Return the same materials with the selected lights alone."""
         return Point(self.materials, [self.lights[k] for k in lights])

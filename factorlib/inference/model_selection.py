@@ -4,7 +4,7 @@ effects     No shadows, shadows of the given meshes, or shadows with interreflec
             The first model is fitted from every start, the others from its result.  Shadows stay unless the evidence is
             against them.  Interreflection needs evidence and shadows.
 tone        Exponents of tone curves are freed for all photos.  A light keeps its curves under three conditions: the
-            evidence supports them, the loss without them is more than `CURVED_GAIN` higher, and they end within the
+            evidence supports them, the loss without them is more than `LEAST_TONE_GAIN` higher, and they end within the
             range of real cameras.  An exponent also fits some errors of the rest of the model, such as wrong normals.
 distance    A light gets the curvature of `CURVATURES` that explains held-out observations best, if the evidence
             supports it.  Otherwise the light is infinitely far away.
@@ -12,131 +12,205 @@ roughness   With few materials, the start decides which local minimum a fit reac
             looks like a rough one in sharp light.  Of the fits from several starts, the one of least held-out loss
             continues.
 
-All choices but the last use `factorlib.inference.evidence`, on observations with reliable normals.
+All choices but the last compare two models that are fitted to the same observations with reliable normals, by
+held-out observations.  These are whole cells of mirror directions (`factorlib.inference.observed`).  Let a_i and b_i be
+the mean robust losses of light i without and with the richer part, and n_i the number of its held-out observations.
+Then
+
+    d = Σ_i n_i (log a_i − log b_i) / Σ_i n_i                                                                      (1)
+
+is the difference of the logarithms of geometric means over lights.  It is a log likelihood ratio for residuals whose
+unknown variance differs from light to light.  A light with wrong normals has many times the loss of another, and in a
+plain sum its change would outweigh all others.
+
+Neighbouring residuals are correlated, so the standard error of d is taken over clusters.  Let A_k and B_k be the summed
+losses of cluster k of light i, and K the number of clusters.  By the delta method, log a_i − log b_i has the variance
+K/(K−1) Σ_k (A_k/ΣA − B_k/ΣB)².
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from typing import NamedTuple
 
 import msgspec
 import numpy as np
+from jaxtyping import Float, Int
 
-from factorlib.inference.evidence import AGAINST, FOR, Losses, compare, losses_of
-from factorlib.inference.fit import Fit, Schedule
-from factorlib.inference.options import Choices
+from factorlib.inference.fit import Fit, FitSchedule
+from factorlib.inference.fit_runner import SolveState
+from factorlib.inference.materials import Point
+from factorlib.inference.options import SolveOptions
 from factorlib.inference.problem import JointProblem
 from factorlib.results.materials import Decision
 
+LEAST_LOSS = 1e-4  # added to every loss, in σ² of the noise model: two losses far below it count as equal
+# Thresholds, in standard errors.  Shadows are dropped only if the evidence is clearly against them.  Interreflection
+# and tone curves need clear evidence.  Smaller cells obey the same prior as larger ones: one standard error is enough.
+CLEARLY_AGAINST = -2.0
+CLEARLY_FOR = 2.0
+WEAKLY_FOR = 1.0
 # Observations and cells of a light in comparisons of models.
 TRIAL_OBSERVATIONS = 1000
 TRIAL_CELLS = 180
-TRIAL = Schedule(lights=3, together=(6, 4))
-AGAIN = Schedule(lights=2, together=(4, 2), estimate=False)
-CURVED = Schedule(together=(8,), estimate=False)
+TRIAL = FitSchedule(light_steps=3, joint_steps=(6, 4))
+CONTINUED_TRIAL = FitSchedule(light_steps=2, joint_steps=(4, 2), estimate_first=False)
+TONE_SCHEDULE = FitSchedule(joint_steps=(8,), estimate_first=False)
 # Least relative gain of the held-out loss.  Under two standard errors alone, a photo with a wrong pose got a curve
 # (margin 3.0, captured set of seed 7), and k_d was 30 % wrong instead of 13 %.
-CURVED_GAIN = 0.25
-NEARER_FROM = 1.0  # standard errors from which a light comes nearer; at `FOR` it has its estimated distance
+LEAST_TONE_GAIN = 0.25
+LEAST_DISTANCE_MARGIN = (
+    1.0  # standard errors from which a light comes nearer; at `CLEARLY_FOR` it has its estimated distance
+)
 # Curvatures of lights 20, 10 and 5 RMS distances away.  A chair's points are 0.4 m from their centre, and a room's
 # walls and lamps 2 to 8 m.
 CURVATURES = (0.05, 0.1, 0.2)
-NEARER = Schedule(lights=2, together=(2,), estimate=False)
-MORE = 8  # factor on the number of observations
-MORE_OF_LIGHTS = 2  # factor on it where materials are given: +0.25 dB on data/eames, +0.27 on the made set of seed 101
-MUCH = 0.2  # least relative gain of the first splitting for that factor
+DISTANCE_SCHEDULE = FitSchedule(light_steps=2, joint_steps=(2,), estimate_first=False)
+OBSERVATION_FACTOR = 8  # factor on the number of observations
+LIGHT_OBSERVATION_FACTOR = (
+    2  # factor on it where materials are given: +0.25 dB on data/eames, +0.27 on the made set of seed 101
+)
+LARGE_GAIN = 0.2  # least relative gain of the first splitting for that factor
 # Least relative gain of a splitting for another one.  After a splitting that gained 3 %, two more gained 3.6 and 1 % on
 # data/eames, and materials did not improve.
-WORTH = 0.05
-GIVEN = Schedule(lights=2, estimate=False, given=True)
+LEAST_GAIN = 0.05
+LIGHTS_ONLY = FitSchedule(light_steps=2, estimate_first=False, materials_fixed=True)
 
-Fitting = Callable[[str, JointProblem, Fit, Schedule], Fit]  # phase, problem, start and schedule
-
-
-class Effects(msgspec.Struct, frozen=True):
-    """Chosen effects, the evidence for them, and the fit of the chosen model on few observations."""
-
-    fit: Fit
-    shadows: Decision
-    bounces: Decision
-
-    def of(self, problem: JointProblem) -> JointProblem:
-        """Return the problem under the chosen effects."""
-        return problem.with_effects(self.shadows.kept, self.bounces.kept)
+Fitting = Callable[[str, JointProblem, Fit, FitSchedule], Fit]  # phase, problem, start and schedule
 
 
-class Chosen(msgspec.Struct, frozen=True):
+class Losses(NamedTuple):
+    """Robust losses of each light's held-out observations, and their cluster numbers."""
+
+    values: list[Float[np.ndarray, " n"]]
+    clusters: list[Int[np.ndarray, " n"]]
+
+
+def held_out_losses(problem: JointProblem, point: Point) -> Losses:
+    """Return the losses of the held-out observations at a point; of every observation if none is held out."""
+    held_out = problem.held_out()
+    return Losses(held_out.losses(point), [block.clusters() for block in held_out.blocks])
+
+
+def compare_models(simpler: Losses, richer: Losses, least: float) -> Decision:
+    """Compare two models: keep the richer one if d of (1) exceeds `least` standard errors.
+
+    Without held-out observations the richer model is not kept.
+
+    Args:
+        simpler: Losses of the simpler model.
+        richer: Losses of the richer model, of the same observations.
+        least: Threshold in standard errors.
+
+    >>> same = Losses([np.array([1.0, 2.0, 3.0])], [np.array([0, 1, 2])])
+    >>> compare_models(same, same, CLEARLY_FOR).kept, compare_models(same, same, CLEARLY_AGAINST).kept
+    (False, True)
+    """
+    counts = np.array([len(values) for values in richer.values])
+    if not counts.sum():
+        return Decision(False)
+    variances = []
+    logs = []
+    for a, b, cluster in zip(simpler.values, richer.values, richer.clusters, strict=True):
+        # A_k and B_k, then log a_i − log b_i and its variance over clusters
+        sums_pair = [np.bincount(cluster, losses + LEAST_LOSS) for losses in (a, b)]
+        shares = [sums / max(float(sums.sum()), 1e-300) for sums in sums_pair]
+        logs.append([np.log(np.mean(losses) + LEAST_LOSS) if len(losses) else 0.0 for losses in (a, b)])
+        number = len(sums_pair[0])
+        variances.append(number / max(number - 1, 1) * float(np.sum((shares[0] - shares[1]) ** 2)))
+    share = counts / counts.sum()
+    # d of (1) and its standard error
+    d = float(share @ [log_pair[0] - log_pair[1] for log_pair in logs])
+    error = float(np.sqrt(share**2 @ variances))
+    margin = d / max(error, 1e-12)
+    loss_with, loss_without = (float(np.exp(share @ [log_pair[k] for log_pair in logs])) for k in (1, 0))
+    return Decision(margin > least, loss_with, loss_without, margin)
+
+
+class Selection(msgspec.Struct, frozen=True):
     """Fit after a choice, and the evidence for each light or each splitting."""
 
     fit: Fit
     evidence: list[Decision]
 
 
-def gained(splitting: Decision, share: float) -> bool:
-    """Return True if a splitting was kept and lowers the held-out loss by more than a share of the new loss."""
-    gain = (splitting.held_out_loss_without or 0.0) / max(splitting.held_out_loss_with or 1.0, 1e-12) - 1
-    return splitting.kept and gain > share
+def relative_gain(decision: Decision) -> float:
+    """Return the decrease of the held-out loss by the richer model, as a share of the new loss."""
+    return (decision.held_out_loss_without or 0.0) / max(decision.held_out_loss_with or 1.0, 1e-12) - 1
 
 
-def observations_of(choices: Choices, splittings: Sequence[Decision]) -> int:
+def gain_exceeds(splitting: Decision, share: float) -> bool:
+    """Return True if a splitting was kept and its relative gain exceeds a share."""
+    return splitting.kept and relative_gain(splitting) > share
+
+
+def observation_count(options: SolveOptions, splittings: Sequence[Decision]) -> int:
     """Return the number of a light's observations to fit: more where smaller cells gain much.
 
     Errors of the model are small there, and those of few observations matter: k_d of data/synthetic is 13 % wrong with
     1,000 observations, 2.6 % with 4,000 and 1.0 % with 8,000.
     """
-    return MORE * choices.observations if splittings and gained(splittings[0], MUCH) else choices.observations
+    return (
+        OBSERVATION_FACTOR * options.observations
+        if splittings and gain_exceeds(splittings[0], LARGE_GAIN)
+        else options.observations
+    )
 
 
-def observations_of_lights(choices: Choices, splittings: Sequence[Decision]) -> int:
+def light_observation_count(options: SolveOptions, splittings: Sequence[Decision]) -> int:
     """Return the number of a light's observations to fit where materials are given and a fit is cheap."""
-    return MORE_OF_LIGHTS * observations_of(choices, splittings)
+    return LIGHT_OBSERVATION_FACTOR * observation_count(options, splittings)
 
 
-def sample_of(problem: JointProblem, choices: Choices) -> JointProblem:
+def comparison_sample(problem: JointProblem, options: SolveOptions) -> JointProblem:
     """Return the observations on which models are compared."""
-    return problem.sampled(min(TRIAL_OBSERVATIONS, choices.observations), choices.seed)
+    return problem.subsample(min(TRIAL_OBSERVATIONS, options.observations), options.seed)
 
 
-def effects_chosen(problem: JointProblem, starts: list[Fit], choices: Choices, fit: Fitting) -> Effects:
+def select_effects(problem: JointProblem, starts: list[Fit], options: SolveOptions, run_fit: Fitting) -> SolveState:
     """Choose shadows and interreflection.
 
     Args:
         problem: Observations with reliable normals.
         starts: Initial fits; the best result continues.
-        choices: Options of the user.
-        fit: Function that fits a model.
+        options: Options of the user.
+        run_fit: Function that fits a model.
     """
-    sample = sample_of(problem, choices)
+    sample = comparison_sample(problem, options)
     hidden = any(block.visibility is not None for block in problem.blocks)
     # without held-out observations, shadows are on and interreflection is off
     unjudged = problem.none_held_out
-    shadows = ("on" if unjudged else "auto") if choices.self_shadowing == "auto" else choices.self_shadowing
-    bounces = ("off" if unjudged else "auto") if choices.interreflection == "auto" else choices.interreflection
+    shadows = ("on" if unjudged else "auto") if options.self_shadowing == "auto" else options.self_shadowing
+    bounces = ("off" if unjudged else "auto") if options.interreflection == "auto" else options.interreflection
     shadows = shadows if hidden else "off"
     bounces = bounces if problem.has_bounces else "off"
-    tried: dict[tuple[bool, bool], tuple[Fit, Losses]] = {}
+    trials: dict[tuple[bool, bool], tuple[Fit, Losses]] = {}
 
     def trial(with_shadows: bool, with_bounces: bool) -> tuple[Fit, Losses]:
         """Return the fit of one model and its losses, from every start at first and then from the best result."""
-        if (with_shadows, with_bounces) not in tried:
+        if (with_shadows, with_bounces) not in trials:
             name = "shadows and bounces" if with_bounces else "shadows" if with_shadows else "no shadows"
             model = sample.with_effects(with_shadows, with_bounces)
-            begun = [fit for fit, _ in list(tried.values())[:1]] or starts
-            fits = [fit(name, model, one, AGAIN if np.isfinite(one.value) else TRIAL) for one in begun]
-            trials = [(one, losses_of(model, one.point)) for one in fits]
-            tried[with_shadows, with_bounces] = min(trials, key=lambda one: _geometric_mean(one[1]))
-        return tried[with_shadows, with_bounces]
+            first_fits = [fit for fit, _ in list(trials.values())[:1]] or starts
+            fits = [
+                run_fit(name, model, fit, CONTINUED_TRIAL if np.isfinite(fit.value) else TRIAL) for fit in first_fits
+            ]
+            results = [(fit, held_out_losses(model, fit.point)) for fit in fits]
+            trials[with_shadows, with_bounces] = min(results, key=lambda result: _geometric_mean(result[1]))
+        return trials[with_shadows, with_bounces]
 
     trial(shadows != "off", shadows != "off" and bounces == "on")
-    said = Decision(shadows == "on")
-    lit = Decision(bounces == "on")
+    shadow_decision = Decision(shadows == "on")
+    bounce_decision = Decision(bounces == "on")
     if shadows == "auto":
-        said = compare(trial(False, False)[1], trial(True, False)[1], AGAINST)
-    if not said.kept:
-        return Effects(trial(False, False)[0], said, Decision(False))
+        shadow_decision = compare_models(trial(False, False)[1], trial(True, False)[1], CLEARLY_AGAINST)
+    if not shadow_decision.kept:
+        fit = trial(False, False)[0]
+        return SolveState(fit, fit, shadow_decision)
     if bounces == "auto":
-        lit = compare(trial(True, False)[1], trial(True, True)[1], FOR)
-    return Effects(trial(True, lit.kept)[0], said, lit)
+        bounce_decision = compare_models(trial(True, False)[1], trial(True, True)[1], CLEARLY_FOR)
+    fit = trial(True, bounce_decision.kept)[0]
+    return SolveState(fit, fit, shadow_decision, bounce_decision)
 
 
 def _geometric_mean(losses: Losses) -> float:
@@ -149,38 +223,40 @@ def _geometric_mean(losses: Losses) -> float:
     return round(float(np.dot(counts, logs)) / max(sum(counts), 1), 6)
 
 
-def curves_chosen(problem: JointProblem, before: Fit, choices: Choices, fit: Fitting) -> Chosen:
+def select_tone_curves(problem: JointProblem, start: Fit, options: SolveOptions, run_fit: Fitting) -> Selection:
     """Choose tone curves.
 
     Args:
         problem: Observations with reliable normals, under the chosen effects.
-        before: Fit of few of them.
-        choices: Options of the user.
-        fit: Function that fits a model.
+        start: Fit of few of them.
+        options: Options of the user.
+        run_fit: Function that fits a model.
     """
-    lights = before.point.lights
-    had = [len(light.log_tone) > 0 for light in lights]
-    if choices.tone == "off" or problem.none_held_out:
-        return Chosen(before, [Decision(has) for has in had])
-    sample = sample_of(problem, choices)
-    freed = [light if has else light.with_curves() for light, has in zip(lights, had, strict=True)]
-    curved = fit("tone curves", sample, before.with_lights(freed), CURVED)
-    without, richer = (losses_of(sample, one.point) for one in (before, curved))
+    curved_before = [len(light.log_tone) > 0 for light in start.point.lights]
+    if options.tone == "off" or problem.none_held_out:
+        return Selection(start, [Decision(has) for has in curved_before])
+    sample = comparison_sample(problem, options)
+    freed = [
+        light if has else msgspec.structs.replace(light, log_tone=np.zeros_like(light.log_exposure))
+        for light, has in zip(start.point.lights, curved_before, strict=True)
+    ]
+    curved = run_fit("tone curves", sample, start.with_lights(freed), TONE_SCHEDULE)
+    losses_without, losses_with = (held_out_losses(sample, fit.point) for fit in (start, curved))
     evidence = []
     for k, light in enumerate(curved.point.lights):
-        one = _evidence_of_light(k, without, richer)
-        gain = (one.held_out_loss_without or 0.0) / max(one.held_out_loss_with or 1.0, 1e-12) - 1
-        kept = one.kept and gain > CURVED_GAIN and not light.beyond_cameras
-        evidence.append(Decision(True) if had[k] else msgspec.structs.replace(one, kept=kept))
-    if all(one.kept for one in evidence):
-        return Chosen(curved, evidence)
-    if not any(one.kept and not has for one, has in zip(evidence, had, strict=True)):
-        return Chosen(before, evidence)
-    mixed = [new if one.kept else old for new, old, one in zip(curved.point.lights, lights, evidence, strict=True)]
-    return Chosen(fit("tone curves", sample, before.with_lights(mixed), CURVED), evidence)
+        decision = _compare_light(k, losses_without, losses_with)
+        accepted = decision.kept and relative_gain(decision) > LEAST_TONE_GAIN and not light.implausible_tone
+        evidence.append(Decision(True) if curved_before[k] else msgspec.structs.replace(decision, kept=accepted))
+    if all(decision.kept for decision in evidence):
+        return Selection(curved, evidence)
+    if not any(decision.kept and not has for decision, has in zip(evidence, curved_before, strict=True)):
+        return Selection(start, evidence)
+    pairs = zip(curved.point.lights, start.point.lights, strict=True)
+    mixed = [pair[0 if decision.kept else 1] for pair, decision in zip(pairs, evidence, strict=True)]
+    return Selection(run_fit("tone curves", sample, start.with_lights(mixed), TONE_SCHEDULE), evidence)
 
 
-def distances_chosen(problem: JointProblem, before: Fit, choices: Choices, fit: Fitting) -> Chosen:
+def select_distances(problem: JointProblem, before: Fit, options: SolveOptions, run_fit: Fitting) -> Selection:
     """Choose distances of lights.
 
     Materials and all lights are fitted at each distance: those fitted in far lights make up for errors of these.  A
@@ -190,60 +266,61 @@ def distances_chosen(problem: JointProblem, before: Fit, choices: Choices, fit: 
     Args:
         problem: Observations with reliable normals, under the chosen effects.
         before: Fit of few of them.
-        choices: Options of the user.
-        fit: Function that fits a model.
+        options: Options of the user.
+        run_fit: Function that fits a model.
     """
-    lights = before.point.lights
-    pairs = zip(lights, problem.blocks, strict=True)
-    known = [light.curvature > 0 or light.held.any() or block.place is None for light, block in pairs]
-    evidence = [Decision(light.curvature > 0) for light in lights]
-    if choices.distance == "off" or problem.none_held_out or all(known):
-        return Chosen(before, evidence)
-    sample = sample_of(problem, choices)
-    asked = [k for k, one in enumerate(known) if not one]
+    pairs = enumerate(zip(before.point.lights, problem.blocks, strict=True))
+    candidates = [k for k, (light, block) in pairs if not (light.is_near or light.fixed.any() or block.place is None)]
+    evidence = [Decision(light.is_near) for light in before.point.lights]
+    if options.distance == "off" or problem.none_held_out or not candidates:
+        return Selection(before, evidence)
+    sample = comparison_sample(problem, options)
 
-    def fit_at(curvatures: dict[int, float], start: Fit = before, schedule: Schedule = NEARER) -> Fit:
+    def fit_at(curvatures: dict[int, float], start: Fit = before, schedule: FitSchedule = DISTANCE_SCHEDULE) -> Fit:
         """Return the fit with lights of these curvatures, by number of the light."""
-        placed = list(start.point.lights)
-        for k, c in curvatures.items():
-            placed[k] = msgspec.structs.replace(placed[k], curvature=c)
-        return fit("distances", sample, start.with_lights(placed), schedule)
+        return run_fit("distances", sample, start.with_curvatures(curvatures), schedule)
 
-    losses, last = [], before  # each fit goes on from the one before
+    # each fit continues from the previous one: far away, then nearer and nearer
+    losses = []
+    current = before
     for c in (0.0, *CURVATURES):
-        last = fit_at(dict.fromkeys(asked, c), last)
-        losses.append(losses_of(sample, last.point))
-    likeliest = {k: _likeliest_curvature(k, losses) for k in asked}
-    evidence = [likeliest[k][1] if k in likeliest else one for k, one in enumerate(evidence)]
-    curvature = {k: c for k, (c, one) in likeliest.items() if one.kept}
+        current = fit_at(dict.fromkeys(candidates, c), current)
+        losses.append(held_out_losses(sample, current.point))
+    curvature = {}
+    for k in candidates:
+        c, evidence[k] = _select_curvature(k, losses)
+        if evidence[k].kept:
+            curvature[k] = c
     if not curvature:
-        return Chosen(before, evidence)
+        return Selection(before, evidence)
+    # given the materials of the nearer lights, compare near and far ones again
     chosen = fit_at(curvature)
-    both = (dict.fromkeys(curvature, 0.0), curvature)
-    far, there = (losses_of(sample, fit_at(one, chosen, GIVEN).point) for one in both)
+    alternatives = (dict.fromkeys(curvature, 0.0), curvature)
+    far, near = (held_out_losses(sample, fit_at(c, chosen, LIGHTS_ONLY).point) for c in alternatives)
     for k in curvature:
-        given = _evidence_of_light(k, far, there, NEARER_FROM)
-        evidence[k] = min(evidence[k], given, key=lambda one: one.margin or 0.0)
-    kept = {k: c * believed(evidence[k]) for k, c in curvature.items() if evidence[k].kept}
-    return Chosen(fit_at(kept) if kept else before, evidence)
+        decision = _compare_light(k, far, near, LEAST_DISTANCE_MARGIN)
+        evidence[k] = min(evidence[k], decision, key=lambda decision: decision.margin or 0.0)
+    accepted = {k: c * distance_share(evidence[k]) for k, c in curvature.items() if evidence[k].kept}
+    return Selection(fit_at(accepted) if accepted else before, evidence)
 
 
-def _likeliest_curvature(k: int, losses: Sequence[Losses]) -> tuple[float, Decision]:
+def _select_curvature(k: int, losses: Sequence[Losses]) -> tuple[float, Decision]:
     """Return the best of `CURVATURES` for light k and the evidence for it; losses: far away, then at each of them."""
-    tried = [_evidence_of_light(k, losses[0], near, NEARER_FROM) for near in losses[1:]]
-    best = min(range(len(tried)), key=lambda i: (not tried[i].kept, tried[i].held_out_loss_with or 0.0))
-    return CURVATURES[best], tried[best]
+    decisions = [_compare_light(k, losses[0], near_losses, LEAST_DISTANCE_MARGIN) for near_losses in losses[1:]]
+    best = min(range(len(decisions)), key=lambda i: (not decisions[i].kept, decisions[i].held_out_loss_with or 0.0))
+    return CURVATURES[best], decisions[best]
 
 
-def believed(evidence: Decision) -> float:
-    """Return the weight of the richer model, from 0 at `NEARER_FROM` standard errors to 1 at `FOR`.
+def distance_share(evidence: Decision) -> float:
+    """Return the weight of the richer model, from 0 at `LEAST_DISTANCE_MARGIN` standard errors to 1 at `CLEARLY_FOR`.
 
     It is continuous, so that rounding does not decide.
     """
-    return float(np.clip(((evidence.margin or 0.0) - NEARER_FROM) / (FOR - NEARER_FROM), 0.0, 1.0))
+    share = ((evidence.margin or 0.0) - LEAST_DISTANCE_MARGIN) / (CLEARLY_FOR - LEAST_DISTANCE_MARGIN)
+    return float(np.clip(share, 0.0, 1.0))
 
 
-def _evidence_of_light(k: int, without: Losses, richer: Losses, least: float = FOR) -> Decision:
+def _compare_light(k: int, simpler: Losses, richer: Losses, least: float = CLEARLY_FOR) -> Decision:
     """Return the evidence of light k alone for the richer model."""
-    losses = [Losses([of.values[k]], [of.clusters[k]]) for of in (without, richer)]
-    return compare(losses[0], losses[1], least)
+    pair = [Losses([losses.values[k]], [losses.clusters[k]]) for losses in (simpler, richer)]
+    return compare_models(*pair, least)

@@ -15,9 +15,8 @@ from jaxtyping import Bool, Float, Int
 
 from factorlib.errors import InputError
 from factorlib.geometry.sphere import fibonacci_sphere, mirror_cells
-from factorlib.inference.blocks import Block
+from factorlib.inference.blocks import Block, Noise
 from factorlib.inference.interreflection import bounced_light
-from factorlib.inference.noise import Noise
 from factorlib.inference.problem import Spread
 from factorlib.urm.geometry import on_surface
 from factorlib.urm.merge import merge
@@ -43,7 +42,7 @@ class PhotoObservations(msgspec.Struct, frozen=True):
     unusable: int
 
 
-def gathered(
+def gather_observations(
     files: Sequence[Path],
     degrees: float,
     spread: Spread,
@@ -63,9 +62,9 @@ def gathered(
     def merged(path: Path) -> PhotoObservations:
         """Return the usable observations of one file, merged."""
         read = on_surface(read_observations(path), surface)
-        seen = usable(read)
+        usable = usable_observations(read)
         tick()
-        return PhotoObservations(merge(seen, degrees), len(read), len(read) - len(seen))
+        return PhotoObservations(merge(usable, degrees), len(read), len(read) - len(usable))
 
     return list(spread(merged, files))
 
@@ -90,23 +89,23 @@ def blocks_of_observations(
     Raises:
         InputError: If no usable observation is left, or all are black.
     """
-    seen = usable(observations)
-    if len(seen) == 0:
+    usable = usable_observations(observations)
+    if len(usable) == 0:
         raise InputError(
             "no valid observation in any photo", cure="look at the overlays of `align`: masks and meshes must overlap"
         )
-    if (seen.radiance <= 0).all():
+    if (usable.radiance <= 0).all():
         raise InputError(
             "every observation is black",
             cure="look at the photos that `masks` wrote: exposure, `encoding`, label masks",
         )
     block = partial(_block, noise=noise, share=held_out, rotations=world_from_camera or {}, seed=seed)
-    shown = [np.flatnonzero(seen.illumination == i) for i in range(len(seen.illuminations))]
-    blocks = [block(seen, rows) for rows in shown if len(rows)]
+    rows_by_light = [np.flatnonzero(usable.illumination == i) for i in range(len(usable.illuminations))]
+    blocks = [block(usable, rows) for rows in rows_by_light if len(rows)]
     return sorted(blocks, key=lambda block: block.name)
 
 
-def usable(observations: Observations) -> Observations:
+def usable_observations(observations: Observations) -> Observations:
     """Return the observations with finite radiance, finite and non-zero directions, and finite positive weight."""
     vectors = np.stack([observations.radiance, observations.normal, observations.view])
     directed = (observations.normal != 0).any(1) & (observations.view != 0).any(1)
@@ -116,56 +115,67 @@ def usable(observations: Observations) -> Observations:
 
 
 def _block(
-    every: Observations, rows: Int[np.ndarray, " n"], noise: Noise, share: float, rotations: Rotations, seed: int
+    all_observations: Observations,
+    rows: Int[np.ndarray, " n"],
+    noise: Noise,
+    share: float,
+    rotations: Rotations,
+    seed: int,
 ) -> Block:
     """Return the block of the observations `rows` of one illumination."""
-    seen = every.take(rows)
-    name = every.illuminations[every.illumination[rows[0]]]
-    photos = sorted({seen.photos[i] for i in np.unique(seen.photo)})
-    local = np.array([photos.index(p) if p in photos else -1 for p in seen.photos])[seen.photo]
+    observations = all_observations.take(rows)
+    name = all_observations.illuminations[all_observations.illumination[rows[0]]]
+    photos = sorted({observations.photos[i] for i in np.unique(observations.photo)})
+    local = np.array([photos.index(p) if p in photos else -1 for p in observations.photos])[observations.photo]
     # order by material, photo, row and column
-    order = np.lexsort((seen.x, seen.y, local, seen.material))
-    seen = seen.take(order)
+    order = np.lexsort((observations.x, observations.y, local, observations.material))
+    observations = observations.take(order)
     local = local[order]
-    turned = {photo: np.asarray(of, dtype=float) for photo, of in rotations.items() if of is not None}
-    normal, view = (_in_frame(vectors, seen, turned) for vectors in (seen.normal, seen.view))
-    radiance = seen.radiance.astype(float)
+    turned = {photo: np.asarray(rotation, dtype=float) for photo, rotation in rotations.items() if rotation is not None}
+    normal, view = (
+        _rotate_units(vectors, observations, turned) for vectors in (observations.normal, observations.view)
+    )
+    radiance = observations.radiance.astype(float)
     # radiance in units of the weighted mean
-    unit = max(float(np.average(radiance.mean(1), weights=seen.weight)), 1e-30)
+    unit = max(float(np.average(radiance.mean(1), weights=observations.weight)), 1e-30)
     scaled = radiance / unit
     # whole cells of mirror directions are held out
-    held_out = held_out_by_cells(mirror_cells(normal, view, HELD_OUT_CELL), seen.material, share, seed)
+    held_out = held_out_by_cells(mirror_cells(normal, view, HELD_OUT_CELL), observations.material, share, seed)
     visibility = directions = None
-    if seen.visibility is not None and (seen.visibility < 255).any():
-        sphere = fibonacci_sphere(seen.visibility.shape[1])
-        visibility = seen.visibility
+    if observations.visibility is not None and (observations.visibility < 255).any():
+        sphere = fibonacci_sphere(observations.visibility.shape[1])
+        visibility = observations.visibility
         directions = np.stack([sphere @ turned.get(p, np.eye(3)).T for p in photos])
-    bounced = bounced_light(seen, scaled)
+    bounced = bounced_light(observations, scaled)
     block = Block(
         name, tuple(photos), unit, normal, view, scaled,
-        seen.clipped.astype(bool), noise.precision(scaled, seen.weight),
-        seen.material.astype(np.int64), local, held_out, visibility, directions,
+        observations.clipped.astype(bool), noise.precision(scaled, observations.weight),
+        observations.material.astype(np.int64), local, held_out, visibility, directions,
         bounced if bounced is not None and bounced.any() else None, noise,
-        None if seen.confidence is None else seen.confidence.astype(float),
-        None if seen.place is None else _turned(seen.place, seen, turned), rows[order],
+        None if observations.confidence is None else observations.confidence.astype(float),
+        None if observations.place is None else _rotate(observations.place, observations, turned), rows[order],
     )  # fmt: skip
-    if seen.detail is None or (seen.detail == 1).all():
+    if observations.detail is None or (observations.detail == 1).all():
         return block
-    return block.on_surface(block.normal, seen.detail.astype(float))
+    return block.on_surface(block.normal, observations.detail.astype(float))
 
 
-def _in_frame(vectors: Float[np.ndarray, "n 3"], seen: Observations, rotations: Rotations) -> Float[np.ndarray, "n 3"]:
+def _rotate_units(
+    vectors: Float[np.ndarray, "n 3"], observations: Observations, rotations: Rotations
+) -> Float[np.ndarray, "n 3"]:
     """Return unit vectors in the illumination's frame."""
-    turned = _turned(vectors, seen, rotations)
+    turned = _rotate(vectors, observations, rotations)
     return turned / np.linalg.norm(turned, axis=1, keepdims=True)
 
 
-def _turned(vectors: Float[np.ndarray, "n 3"], seen: Observations, rotations: Rotations) -> Float[np.ndarray, "n 3"]:
+def _rotate(
+    vectors: Float[np.ndarray, "n 3"], observations: Observations, rotations: Rotations
+) -> Float[np.ndarray, "n 3"]:
     """Return vectors in the illumination's frame: each photo's rotated by its world_from_camera."""
     turned = vectors.astype(float)
-    for i, photo in enumerate(seen.photos):
+    for i, photo in enumerate(observations.photos):
         if photo in rotations:
-            turned[seen.photo == i] = turned[seen.photo == i] @ rotations[photo].T
+            turned[observations.photo == i] = turned[observations.photo == i] @ rotations[photo].T
     return turned
 
 

@@ -27,37 +27,91 @@ from typing import NamedTuple
 import msgspec
 import numpy as np
 from jaxtyping import Bool, Float, Int
+from scipy.linalg import cho_factor, cho_solve
 
-from factorlib.inference.arrow import Arrow, System, solved
-from factorlib.inference.lights import TONE, Light
-from factorlib.inference.likelihood import LightLikelihood
+from factorlib.inference.lights import TONE_RANGE, Light
+from factorlib.inference.likelihood import LightLikelihood, System, solve_cholesky
 from factorlib.inference.materials import LEAST_REFLECTANCE, ROUGHNESS
-from factorlib.inference.priors import Gaussian, MaterialPrior, materials_of
+from factorlib.inference.priors import MaterialPrior, PriorTerms, materials_from_unknowns
 from factorlib.inference.problem import Spread
 
-MOST_CHANGE = np.array([0.7] * 6 + [0.1])  # largest change of a material's unknowns on one factorisation
-MOST_STEP = 1.5  # largest change of an unknown in one cheap step
-UPHILL = 0.1  # least share of the slope that a clipped direction must keep
-LOWEST = np.array([np.log(LEAST_REFLECTANCE)] * 6 + [ROUGHNESS[0]])
-HIGHEST = np.array([np.inf] * 6 + [ROUGHNESS[1]])
+FLOOR = 1e-9  # share of the largest diagonal entry that is added to every diagonal entry
+LARGEST_CHANGE = np.array([0.7] * 6 + [0.1])  # largest change of a material's unknowns on one factorisation
+LARGEST_STEP = 1.5  # largest change of an unknown in one cheap step
+LEAST_SLOPE_SHARE = 0.1  # least share of the slope that a clipped direction must keep
+LOWER_BOUNDS = np.array([np.log(LEAST_REFLECTANCE)] * 6 + [ROUGHNESS[0]])
+UPPER_BOUNDS = np.array([np.inf] * 6 + [ROUGHNESS[1]])
 FIRST_DAMPING = 0.1  # μ after the first rejected step
-LOWER = 0.25  # factor on μ after an accepted step
-HIGHER = 8.0  # factor on μ after a rejected step
-MOST_DAMPING = 1e3  # a descent ends beyond this μ
+DAMPING_DECREASE = 0.25  # factor on μ after an accepted step
+DAMPING_INCREASE = 8.0  # factor on μ after a rejected step
+LARGEST_DAMPING = 1e3  # a descent ends beyond this μ
 TOLERANCE = 2e-4  # a descent ends if (1) falls by less than this share of its value
 MEMORY = 10  # pairs of L-BFGS
-STEPS = 12  # most steps of L-BFGS on one factorisation
+LBFGS_STEPS = 12  # most steps of L-BFGS on one factorisation
 # L-BFGS ends if gᵀH⁻¹g, the predicted decrease, falls below DECREMENT or below SHARE of its first value.
 DECREMENT = 0.05
-SHARE = 0.02
+DECREMENT_SHARE = 0.02
 SUFFICIENT = 1e-4  # least decrease in a line search, as a share of the slope
 SHORTEST = 1e-3  # a line search ends below this share of the step
 
-Report = Callable[[float], None]  # called at every factorisation, with the mean robust loss there
+Vector = Float[np.ndarray, " k"]
+LossReport = Callable[[float], None]  # called at every factorisation, with the mean robust loss there
 Objective = Callable[[np.ndarray], tuple[float, np.ndarray]]  # value and half the gradient
 
 
-class State(NamedTuple):
+class Arrow:
+    """Factorised H of many lights; H⁻¹ of a vector costs two triangular solves a light.
+
+    H = [[M, C_1 … C_k], [C_iᵀ, L_i]] has arrow shape: each light is coupled to the materials it illuminates, and to no
+    other light.  The gradients are g_m and g_i.  Eliminating every light leaves
+
+        (M − Σ C_i L_i⁻¹ C_iᵀ) dm = −(g_m − Σ C_i L_i⁻¹ (g_i + d_i)),      dl_i = −L_i⁻¹ (g_i + C_iᵀ dm)            (3)
+
+    d_i is a gradient with respect to the light that acts on the materials only (`factorlib.inference.likelihood`).
+    C_i has rows only for the materials that light i illuminates.  Rows and columns of known unknowns and of unknowns
+    at a bound are removed.  Damping multiplies the diagonal, so that a step does not depend on the units of an unknown.
+
+    Args:
+        systems: Contribution of each light.
+        prior: Half the Hessian of the prior on materials.
+        free: Mask of the material unknowns that may move.
+        damping: Multiple of the materials' diagonal that is added to it.
+    """
+
+    def __init__(
+        self,
+        systems: Sequence[System],
+        prior: Float[np.ndarray, "k k"],
+        free: Bool[np.ndarray, " k"],
+        damping: float = 0.0,
+    ):
+        self.systems = systems
+        self.free = np.flatnonzero(free)
+        self.coupling = [solve_cholesky(part.factor, part.cross_hessian.T) for part in systems]  # L⁻¹Cᵀ
+        # M − Σ C_i L_i⁻¹ C_iᵀ, (3), damped
+        schur = prior.copy()
+        self.diagonal = np.zeros(len(prior))
+        for part, coupling in zip(systems, self.coupling, strict=True):
+            schur[np.ix_(part.places, part.places)] += part.material_hessian - part.cross_hessian @ coupling
+            self.diagonal[part.places] += np.diag(part.material_hessian)
+        self.diagonal += np.diag(prior)
+        schur += np.diag(damping * self.diagonal + FLOOR * self.diagonal.max(initial=1e-30))
+        self.schur = cho_factor(((schur + schur.T) / 2)[np.ix_(self.free, self.free)], check_finite=False)
+
+    def solve(self, by_materials: Vector, by_lights: Sequence[Vector]) -> tuple[Vector, list[Vector]]:
+        """Return H⁻¹ g, by (3)."""
+        # L_i⁻¹ g_i, then dm by the Schur complement, then L_i⁻¹ (g_i − C_iᵀ dm)
+        light_steps = [solve_cholesky(part.factor, g) for part, g in zip(self.systems, by_lights, strict=True)]
+        reduced = by_materials.copy()
+        step = np.zeros_like(by_materials)
+        for part, light_step in zip(self.systems, light_steps, strict=True):
+            reduced[part.places] -= part.cross_hessian @ light_step
+        step[self.free] = cho_solve(self.schur, reduced[self.free], check_finite=False)
+        lights = zip(self.systems, light_steps, self.coupling, strict=True)
+        return step, [light_step - coupling @ step[part.places] for part, light_step, coupling in lights]
+
+
+class DescentState(NamedTuple):
     """Unknowns of the materials and lights, and the normal equations there.
 
     Attributes:
@@ -72,7 +126,7 @@ class State(NamedTuple):
     likelihoods: list[LightLikelihood]
     value: float
     systems: list[System]
-    prior: Gaussian
+    prior: PriorTerms
 
 
 class Descent(msgspec.Struct, frozen=True):
@@ -87,83 +141,80 @@ class Descent(msgspec.Struct, frozen=True):
 
     prior: MaterialPrior
     spread: Spread
-    report: Report
+    report: LossReport
     free: Bool[np.ndarray, " 7m"]
 
-    def of_lights(
+    def descend_lights(
         self, likelihoods: Sequence[LightLikelihood], theta: Float[np.ndarray, "m 7"], iterations: int
-    ) -> State:
+    ) -> DescentState:
         """Return the state after at most `iterations` factorisations of each light, materials given."""
-        fitted = list(self.spread(lambda one: light_descended(one, iterations), likelihoods))
-        return self._state(theta, [one for one, _ in fitted], [system for _, system in fitted])
+        fitted = list(self.spread(lambda likelihood: descend_light(likelihood, iterations), likelihoods))
+        return self._state(theta, [likelihood for likelihood, _ in fitted], [system for _, system in fitted])
 
-    def of_all(self, state: State, iterations: int) -> State:
+    def descend_jointly(self, state: DescentState, iterations: int) -> DescentState:
         """Return the state after at most `iterations` factorisations, of materials and lights together."""
-        state = self.at(state.likelihoods, state.theta)
+        state = self.linearise(state.likelihoods, state.theta)
         damping = 0.0
         for _ in range(iterations):
-            trial = self.at(*self._stepped(state, damping))
+            trial = self.linearise(*self._step(state, damping))
             gain = state.value - trial.value
             if gain > 0:
                 state = trial
-                damping = damping * LOWER
-            if abs(gain) < TOLERANCE * abs(state.value) or damping > MOST_DAMPING:
+                damping = damping * DAMPING_DECREASE
+            if abs(gain) < TOLERANCE * abs(state.value) or damping > LARGEST_DAMPING:
                 break
             if gain < 0:
-                damping = max(damping * HIGHER, FIRST_DAMPING)
+                damping = max(damping * DAMPING_INCREASE, FIRST_DAMPING)
         return state
 
-    def at(self, likelihoods: Sequence[LightLikelihood], theta: Float[np.ndarray, "m 7"]) -> State:
+    def linearise(self, likelihoods: Sequence[LightLikelihood], theta: Float[np.ndarray, "m 7"]) -> DescentState:
         """Return the normal equations of all lights at some materials, determinants included."""
-        materials = materials_of(theta)
-        moved = [one.at(materials=materials) for one in likelihoods]
+        materials = materials_from_unknowns(theta)
+        moved = [likelihood.with_point(materials=materials) for likelihood in likelihoods]
         return self._state(theta, moved, list(self.spread(LightLikelihood.normal_equations, moved)))
 
     def _state(
         self, theta: Float[np.ndarray, "m 7"], likelihoods: list[LightLikelihood], systems: list[System]
-    ) -> State:
+    ) -> DescentState:
         """Return the state with these systems, and report its mean robust loss."""
-        prior = self.prior.at(theta)
-        values = sum(3 * int((~one.illumination.block.held_out).sum()) for one in likelihoods)
+        prior = self.prior.evaluate(theta)
+        values = sum(3 * int((~likelihood.illumination.block.held_out).sum()) for likelihood in likelihoods)
         self.report(sum(system.loss for system in systems) / max(values, 1))
-        return State(theta, likelihoods, sum(system.value for system in systems) + prior.value, systems, prior)
+        return DescentState(theta, likelihoods, sum(system.value for system in systems) + prior.value, systems, prior)
 
-    def _stepped(self, state: State, damping: float) -> tuple[list[LightLikelihood], Float[np.ndarray, "m 7"]]:
+    def _step(self, state: DescentState, damping: float) -> tuple[list[LightLikelihood], Float[np.ndarray, "m 7"]]:
         """Return lights and materials at the minimum of (2)."""
         size = state.theta.size
-        by_determinant, hessian = determinant_of(state.systems, size)
+        by_determinant, hessian = determinant_terms(state.systems, size)
         # half the gradient of (1) by materials; unknowns at a bound that it would push outward are fixed
         gradient = state.prior.gradient + by_determinant
         for system in state.systems:
             gradient[system.places] += system.material_gradient
-        theta = state.theta.reshape(-1)
-        outward = -gradient
-        at_bound = ((theta <= np.resize(LOWEST, size)) & (outward < 0)) | (
-            (theta >= np.resize(HIGHEST, size)) & (outward > 0)
-        )
+        free = self.free & ~pushed_outward(state.theta.reshape(-1), -gradient)
         # H with D and the damping μ
-        arrow = Arrow(state.systems, state.prior.hessian + hessian, self.free & ~at_bound, damping)
+        arrow = Arrow(state.systems, state.prior.hessian + hessian, free, damping)
         penalty = hessian + damping * np.diag(arrow.diagonal)
         ends = np.cumsum([size, *(len(system.light_gradient) for system in state.systems)])[:-1]
 
         def moved(step: np.ndarray) -> tuple[np.ndarray, list[LightLikelihood]]:
             """Return θ and the lights after a step of all unknowns."""
             of_materials, *of_lights = np.split(step, ends)
-            change = of_materials.reshape(-1, 7).clip(-MOST_CHANGE, MOST_CHANGE)
-            there = (state.theta + change).clip(LOWEST, HIGHEST)
-            pairs = zip(state.likelihoods, of_lights, strict=True)
-            return there, [one.at(moved_light(one.light, own), materials_of(there)) for one, own in pairs]
+            change = of_materials.reshape(-1, 7).clip(-LARGEST_CHANGE, LARGEST_CHANGE)
+            theta = (state.theta + change).clip(LOWER_BOUNDS, UPPER_BOUNDS)
+            materials = materials_from_unknowns(theta)
+            steps = zip(state.likelihoods, of_lights, strict=True)
+            return theta, [old.with_point(step_light(old.light, step), materials) for old, step in steps]
 
         def objective(step: np.ndarray) -> tuple[float, np.ndarray]:
             """Return (2) and half its gradient."""
-            there, likelihoods = moved(step)
-            prior = self.prior.at(there)
+            theta, likelihoods = moved(step)
+            prior = self.prior.evaluate(theta)
             parts = list(self.spread(LightLikelihood.gradient, likelihoods))
-            off = (there - state.theta).reshape(-1)
+            off = (theta - state.theta).reshape(-1)
             value = prior.value + sum(part.value for part in parts) + off @ (2 * by_determinant + penalty @ off)
             slope = prior.gradient + by_determinant + penalty @ off
             slope = slope + sum(part.by_materials for part in parts).reshape(-1)
-            slope[~(self.free & ~at_bound)] = 0.0
+            slope[~free] = 0.0
             return value, np.concatenate([slope, *(part.by_light for part in parts)])
 
         def metric(slope: np.ndarray) -> np.ndarray:
@@ -172,47 +223,54 @@ class Descent(msgspec.Struct, frozen=True):
             step, lights = arrow.solve(of_materials, of_lights)
             return np.concatenate([step, *lights])
 
-        theta, likelihoods = moved(minimised(objective, ends[-1] + len(state.systems[-1].light_gradient), metric))
+        theta, likelihoods = moved(minimise_lbfgs(objective, ends[-1] + len(state.systems[-1].light_gradient), metric))
         return likelihoods, theta
 
 
-def light_descended(one: LightLikelihood, iterations: int) -> tuple[LightLikelihood, System]:
+def pushed_outward(theta: Vector, direction: Vector) -> Bool[np.ndarray, " k"]:
+    """Return a mask of the unknowns at a bound that a direction would push beyond it."""
+    lower = (theta <= np.resize(LOWER_BOUNDS, theta.size)) & (direction < 0)
+    upper = (theta >= np.resize(UPPER_BOUNDS, theta.size)) & (direction > 0)
+    return lower | upper
+
+
+def descend_light(likelihood: LightLikelihood, iterations: int) -> tuple[LightLikelihood, System]:
     """Return a light at the minimum of φ, materials given, and its normal equations there."""
-    system = one.normal_equations(materials_given=True)
+    system = likelihood.normal_equations(materials_given=True)
     for _ in range(iterations):
 
-        def objective(step: np.ndarray, begun: LightLikelihood = one) -> tuple[float, np.ndarray]:
+        def objective(step: np.ndarray, start: LightLikelihood = likelihood) -> tuple[float, np.ndarray]:
             """Return φ and half its gradient."""
-            there = begun.at(moved_light(begun.light, step)).gradient()
-            return there.value, there.by_light
+            gradient = start.with_point(step_light(start.light, step)).gradient()
+            return gradient.value, gradient.by_light
 
         def metric(slope: np.ndarray, factor: np.ndarray = system.factor) -> np.ndarray:
             """Return H⁻¹ times a gradient."""
-            return solved(factor, slope)
+            return solve_cholesky(factor, slope)
 
-        step = minimised(objective, len(system.light_gradient), metric)
-        one = one.at(moved_light(one.light, step))
-        before = system.value
-        system = one.normal_equations(materials_given=True)
-        if before - system.value < TOLERANCE * abs(before):
+        step = minimise_lbfgs(objective, len(system.light_gradient), metric)
+        likelihood = likelihood.with_point(step_light(likelihood.light, step))
+        previous = system.value
+        system = likelihood.normal_equations(materials_given=True)
+        if previous - system.value < TOLERANCE * abs(previous):
             break
-    return one, system
+    return likelihood, system
 
 
-def determinant_of(systems: Sequence[System], size: int) -> tuple[Float[np.ndarray, " k"], Float[np.ndarray, "k k"]]:
+def determinant_terms(systems: Sequence[System], size: int) -> tuple[Float[np.ndarray, " k"], Float[np.ndarray, "k k"]]:
     """Return a and D of (2), summed over lights."""
     gradient = np.zeros(size)
     hessian = np.zeros((size, size))
     for system in systems:
         # (du/dθ)ᵀ ∂/∂u = −C L⁻¹ ∂/∂u
-        by_light = system.cross_hessian @ solved(system.factor, system.determinant_by_light)
+        by_light = system.cross_hessian @ solve_cholesky(system.factor, system.determinant_by_light)
         gradient[system.places] += system.determinant_by_materials - by_light
-        P = without_factors(system.places)
+        P = gauge_projection(system.places)
         hessian[np.ix_(system.places, system.places)] += P @ system.determinant_hessian @ P
     return gradient, hessian
 
 
-def without_factors(places: Int[np.ndarray, " k"]) -> Float[np.ndarray, "k k"]:
+def gauge_projection(places: Int[np.ndarray, " k"]) -> Float[np.ndarray, "k k"]:
     """Return the projection that removes a factor per channel from a step of the materials of a light.
 
     J and the determinant do not change if all reflectances are multiplied by a factor and the light is divided by it.
@@ -222,7 +280,9 @@ def without_factors(places: Int[np.ndarray, " k"]) -> Float[np.ndarray, "k k"]:
     return np.eye(len(places)) - factors / factors.sum(0) @ factors.T
 
 
-def minimised(objective: Objective, size: int, metric: Callable[[np.ndarray], np.ndarray]) -> Float[np.ndarray, " n"]:
+def minimise_lbfgs(
+    objective: Objective, size: int, metric: Callable[[np.ndarray], np.ndarray]
+) -> Float[np.ndarray, " n"]:
     """Minimise a function by L-BFGS and return the step from 0.
 
     Args:
@@ -234,13 +294,13 @@ def minimised(objective: Objective, size: int, metric: Callable[[np.ndarray], np
     value, gradient = objective(x)
     pairs: deque[tuple[np.ndarray, np.ndarray]] = deque(maxlen=MEMORY)
     least = 0.0
-    for _ in range(STEPS):
+    for _ in range(LBFGS_STEPS):
         direction = -inverse_hessian_times(gradient, pairs, metric)
         decrement = -float(gradient @ direction)
-        least = least or max(DECREMENT, SHARE * decrement)
+        least = least or max(DECREMENT, DECREMENT_SHARE * decrement)
         if decrement < least:
             break
-        direction = bounded(direction, gradient)
+        direction = clip_direction(direction, gradient)
         slope = float(gradient @ direction)
         length = 1.0
         # backtracking line search (Armijo); the gradient is half the true one
@@ -261,16 +321,16 @@ def minimised(objective: Objective, size: int, metric: Callable[[np.ndarray], np
     return x
 
 
-def bounded(direction: Float[np.ndarray, " n"], gradient: Float[np.ndarray, " n"]) -> Float[np.ndarray, " n"]:
-    """Return a direction with no element larger than `MOST_STEP`.
+def clip_direction(direction: Float[np.ndarray, " n"], gradient: Float[np.ndarray, " n"]) -> Float[np.ndarray, " n"]:
+    """Return a direction with no element larger than `LARGEST_STEP`.
 
     Each element is clipped by itself, because otherwise a dark cell would limit all others.  If clipping turns the
     direction uphill or nearly so, the whole direction is scaled instead.
     """
-    clipped = direction.clip(-MOST_STEP, MOST_STEP)
-    if gradient @ clipped < UPHILL * (gradient @ direction):
+    clipped = direction.clip(-LARGEST_STEP, LARGEST_STEP)
+    if gradient @ clipped < LEAST_SLOPE_SHARE * (gradient @ direction):
         return clipped
-    return direction * min(1.0, MOST_STEP / float(np.abs(direction).max()))
+    return direction * min(1.0, LARGEST_STEP / float(np.abs(direction).max()))
 
 
 def inverse_hessian_times(gradient, pairs, metric):  # noqa: ANN001, ANN201  (arrays or tensors)
@@ -292,7 +352,7 @@ def inverse_hessian_times(gradient, pairs, metric):  # noqa: ANN001, ANN201  (ar
     return q
 
 
-def moved_light(light: Light, step: Float[np.ndarray, " l"]) -> Light:
+def step_light(light: Light, step: Float[np.ndarray, " l"]) -> Light:
     """Return the light after a step of its unknowns, with tone exponents within their range."""
     counts = 3 * int(light.free.sum()), light.free_exposures, len(light.log_tone)
     cells, exposures, tones, scale = np.split(step, np.cumsum(counts))
@@ -300,7 +360,7 @@ def moved_light(light: Light, step: Float[np.ndarray, " l"]) -> Light:
     brighter[light.free] = np.exp(cells.reshape(3, -1).T)
     brighter[~light.free] = np.exp(scale.sum())
     exposures = np.concatenate([np.zeros(len(light.log_exposure) - len(exposures)), exposures])
-    tone = np.clip(light.log_tone + tones, *np.log(TONE))
+    tone = np.clip(light.log_tone + tones, *np.log(TONE_RANGE))
     return msgspec.structs.replace(
         light, weight=light.weight * brighter, log_exposure=light.log_exposure + exposures, log_tone=tone
     )

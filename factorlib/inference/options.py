@@ -10,7 +10,7 @@ Lobes = Annotated[int, Meta(ge=1, le=1024)]
 Seed = Annotated[int, Meta(ge=0)]
 
 
-class Choices(Struct, frozen=True):
+class SolveOptions(Struct, frozen=True):
     """Options of the joint solve."""
 
     cells: Annotated[int, Meta(ge=12, le=1600)] = 400

@@ -12,7 +12,7 @@ Bounds       They come from the parametrisation: reflectances and roughness thro
              sigmoid onto `SHARPNESS`, weights through softplus, axes as unnormalised vectors.
 Start        Reflectances come from mean radiances (`start`).  Lobes are white, evenly spread over the sphere, and as
              wide as they are apart.
-Subset       A subset has `SUBSET` observations of all illuminations together.
+Subset       A subset has `SUBSET_SIZE` observations of all illuminations together.
 Curvature    A pair (step, change of gradient) is measured on one subset, at both ends of the step.  The change of
              subset is therefore not mistaken for curvature (Schraudolph, Yu and Günter 2007, "A stochastic quasi-Newton
              method for online convex optimization").  Pairs outlive their subset.
@@ -41,9 +41,9 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from factorlib.geometry.sphere import fibonacci_sphere
-from factorlib.inference.fit import start_of
-from factorlib.inference.gauge import in_gauge
-from factorlib.inference.history import Event, Report, Solution, unreported
+from factorlib.inference.fit import initial_fit
+from factorlib.inference.fit_runner import Event, EventReport, Solution, ignore_event
+from factorlib.inference.gauge import fix_gauge
 from factorlib.inference.lights import Light
 from factorlib.inference.materials import ROUGHNESS, SHARPNESS, Materials, Point
 from factorlib.inference.optimizer import inverse_hessian_times
@@ -61,13 +61,13 @@ SUFFICIENT = 1e-4  # least decrease in a line search, as a share of the slope
 HALVINGS = 12  # most halvings of a step
 LOG_SHARPNESS = (math.log(SHARPNESS[0]), math.log(SHARPNESS[1]))
 REPORTS = 20  # reports in a run
-SUBSET = 512  # observations of a subset
+SUBSET_SIZE = 512  # observations of a subset
 
 Samplings = Annotated[float, msgspec.Meta(gt=0)]
 Prior = Annotated[float, msgspec.Meta(ge=0)]
 
 
-class Paper(msgspec.Struct, frozen=True):
+class PaperOptions(msgspec.Struct, frozen=True):
     """Options of the paper's solver.
 
     Attributes:
@@ -83,7 +83,7 @@ class Paper(msgspec.Struct, frozen=True):
     seed: Seed = 0
 
 
-def solve(problem: JointProblem, materials: int, paper: Paper, report: Report = unreported) -> Solution:
+def solve(problem: JointProblem, materials: int, options: PaperOptions, report: EventReport = ignore_event) -> Solution:
     """Solve the problem as the paper does, in the gauge of `factorlib.inference.gauge`.
 
     The unknowns are those of the joint solver: materials 0 … `materials`−1 and one light per block.
@@ -91,43 +91,44 @@ def solve(problem: JointProblem, materials: int, paper: Paper, report: Report = 
     Args:
         problem: Observations and model; shadows and interreflection are ignored.
         materials: Number of materials.
-        paper: Options.
+        options: Options.
         report: Called with each reported subset.
     """
     problem = problem.with_effects(False, False)
-    objective = PaperObjective(problem, materials, paper)
+    objective = PaperObjective(problem, materials, options)
     history = list[Event]()
     blocks = problem.blocks
     rows = [np.flatnonzero(~block.held_out) for block in blocks]
-    iterations = math.ceil(paper.samplings * sum(map(len, rows)) / SUBSET)
-    every = max(1, iterations // REPORTS)
-    lobes = paper.lobes * len(blocks)
+    iterations = math.ceil(options.samplings * sum(map(len, rows)) / SUBSET_SIZE)
+    report_interval = max(1, iterations // REPORTS)
+    lobes = options.lobes * len(blocks)
     x = objective.start()
-    random = np.random.default_rng(paper.seed)
+    random = np.random.default_rng(options.seed)
     pairs: Pairs = deque(maxlen=MEMORY)
     for iteration in range(iterations):
-        subset = drawn(rows, SUBSET, random)
-        x, value = stepped(partial(objective.at, subset=subset), x, pairs)
-        if (iteration + 1) % every == 0 or iteration + 1 == iterations:
+        subset = draw_subset(rows, SUBSET_SIZE, random)
+        x, value = take_step(partial(objective.objective_on, subset=subset), x, pairs)
+        if (iteration + 1) % report_interval == 0 or iteration + 1 == iterations:
             held_out = problem.held_out_loss(objective.point(x))
-            history.append(Event((iteration + 1) // every - 1, "subset", iteration, value, held_out, lobes))
+            history.append(Event((iteration + 1) // report_interval - 1, "subset", iteration, value, held_out, lobes))
             report(history[-1])
-    fit = start_of(objective.point(x))
-    return Solution(in_gauge(fit.point, blocks), history, materials=fit, lights=fit)
+    fit = initial_fit(objective.point(x))
+    return Solution(fit, fit, point=fix_gauge(fit.point, blocks), history=history)
 
 
-def drawn(
+def draw_subset(
     rows: Sequence[Int[np.ndarray, " _"]], count: int, random: np.random.Generator
 ) -> list[Int[np.ndarray, " _"]]:
     """Return `count` of all rows, drawn without replacement, as a list per block."""
     starts = np.cumsum([0, *map(len, rows)])
     chosen = np.sort(random.choice(starts[-1], min(count, starts[-1]), replace=False))
     return [
-        own[chosen[(chosen >= a) & (chosen < b)] - a] for own, a, b in zip(rows, starts[:-1], starts[1:], strict=True)
+        block_rows[chosen[(chosen >= a) & (chosen < b)] - a]
+        for block_rows, a, b in zip(rows, starts[:-1], starts[1:], strict=True)
     ]
 
 
-def stepped(objective: Objective, x: Tensor, pairs: Pairs) -> tuple[Tensor, float]:
+def take_step(objective: Objective, x: Tensor, pairs: Pairs) -> tuple[Tensor, float]:
     """Return x after one step on one subset, and the objective there.
 
     The measured pair is added to `pairs`.  Without a sufficient decrease, x stays and `pairs` is cleared.
@@ -166,29 +167,30 @@ class PaperObjective:
     The vector has 7 entries a material, then for each light 7 a lobe (axis 3, sharpness, weight 3) and its exposures.
     """
 
-    def __init__(self, problem: JointProblem, materials: int, paper: Paper):
-        blocks = problem.blocks
-        self.blocks = blocks
+    def __init__(self, problem: JointProblem, materials: int, options: PaperOptions):
+        self.blocks = problem.blocks
         self.operator = problem.operator
-        self.paper = paper
-        self.begin = starting_materials(blocks, materials)
-        self.sizes = [7 * materials] + [7 * paper.lobes + len(block.photos) - 1 for block in blocks]
+        self.options = options
+        self.start_materials = starting_materials(problem.blocks, materials)
+        self.sizes = [7 * materials] + [7 * options.lobes + len(block.photos) - 1 for block in problem.blocks]
 
     def start(self) -> Float[Tensor, " k"]:
         """Return even lobes under which materials reflect the block's mean radiance, 1."""
-        p = self.paper.lobes
-        begin = self.begin
-        roughness = _unbounded(begin.roughness, ROUGHNESS)
-        parts = [np.column_stack([_unbounded(begin.diffuse), _unbounded(begin.specular), roughness]).reshape(-1)]
+        p = self.options.lobes
+        materials = self.start_materials
+        roughness = _unbounded(materials.roughness, ROUGHNESS)
+        parts = [
+            np.column_stack([_unbounded(materials.diffuse), _unbounded(materials.specular), roughness]).reshape(-1)
+        ]
         level = np.full((p, 1), _unbounded(np.log(p / 2), LOG_SHARPNESS))  # λ of lobes whose variances cover 4π
         for block in self.blocks:
-            reflectance = (begin.diffuse + begin.specular)[block.material].mean(0)
+            reflectance = (materials.diffuse + materials.specular)[block.material].mean(0)
             weight = np.tile(block.radiance.mean(0) / np.maximum(reflectance, 1e-3), (p, 1))
             lobes = np.hstack([fibonacci_sphere(p), level, np.log(np.expm1(weight))])
             parts += [lobes.reshape(-1), np.zeros(len(block.photos) - 1)]
         return torch.from_numpy(np.concatenate(parts))
 
-    def unpacked(self, x: Tensor) -> tuple[tuple[Tensor, ...], list[tuple[Tensor, ...]]]:
+    def unpack(self, x: Tensor) -> tuple[tuple[Tensor, ...], list[tuple[Tensor, ...]]]:
         """Return (diffuse, specular, roughness) and, of each light, (axis, log sharpness, weight, log exposure)."""
         of_materials, *of_lights = torch.split(x, self.sizes)
         bounded = torch.sigmoid(of_materials.reshape(-1, 7))
@@ -196,26 +198,26 @@ class PaperObjective:
         (least, most) = LOG_SHARPNESS
         lights: list[tuple[Tensor, ...]] = []
         for part in of_lights:
-            rows = part[: 7 * self.paper.lobes].reshape(-1, 7)
-            others = part[7 * self.paper.lobes :]
+            rows = part[: 7 * self.options.lobes].reshape(-1, 7)
+            log_exposures = part[7 * self.options.lobes :]
             axis = torch.nn.functional.normalize(rows[:, :3], dim=1)
             log_sharpness = least + (most - least) * torch.sigmoid(rows[:, 3])
             weight = torch.nn.functional.softplus(rows[:, 4:])
-            lights.append((axis, log_sharpness, weight, torch.cat([part.new_zeros(1), others])))
+            lights.append((axis, log_sharpness, weight, torch.cat([part.new_zeros(1), log_exposures])))
         return (bounded[:, :3], bounded[:, 3:6], low + (high - low) * bounded[:, 6]), lights
 
     def point(self, x: Tensor) -> Point:
         """Return the materials and lights that x encodes."""
-        (diffuse, specular, roughness), lights = self.unpacked(x)
+        (diffuse, specular, roughness), lights = self.unpack(x)
         vector = torch.cat([diffuse, specular, roughness[:, None]], 1).reshape(-1).numpy()
         arrays = [[part.numpy() for part in light] for light in lights]
-        found = [Light(axis, sharpness, weight, exposure) for axis, sharpness, weight, exposure in arrays]
-        return Point(Materials.of_vector(vector), found)
+        light_list = [Light(axis, sharpness, weight, exposure) for axis, sharpness, weight, exposure in arrays]
+        return Point(Materials.from_vector(vector), light_list)
 
-    def at(self, x: Tensor, subset: Sequence[Int[np.ndarray, " _"]]) -> tuple[float, Tensor]:
+    def objective_on(self, x: Tensor, subset: Sequence[Int[np.ndarray, " _"]]) -> tuple[float, Tensor]:
         """Return the value and the gradient on the subset."""
         x = x.detach().requires_grad_()
-        (diffuse, specular, roughness), lights = self.unpacked(x)
+        (diffuse, specular, roughness), lights = self.unpack(x)
         squares = x.new_zeros(())
         values = 0
         prior = x.new_zeros(())
@@ -223,21 +225,28 @@ class PaperObjective:
             sums = weight.sum(0)
             prior = prior + ((sums / sums.mean() - 1) ** 2).mean()  # Var_c(W_c) / W̄²
             for m in np.unique(block.material[rows]).tolist():
-                own = rows[block.material[rows] == m]
+                selected = rows[block.material[rows] == m]
                 normal, view, photo, radiance, precision, clipped = (
-                    torch.from_numpy(of[own])
-                    for of in (block.normal, block.view, block.photo, block.radiance, block.precision, block.clipped)
+                    torch.from_numpy(column[selected])
+                    for column in (
+                        block.normal,
+                        block.view,
+                        block.photo,
+                        block.radiance,
+                        block.precision,
+                        block.clipped,
+                    )
                 )
-                seen = (normal * view).sum(1), normal @ axis.T, view @ axis.T  # n·o, n·z and o·z
+                cosines = (normal * view).sum(1), normal @ axis.T, view @ axis.T  # n·o, n·z and o·z
                 # y = e (k_d D w + k_s S w), one-sided where clipped
-                lit = UnitReflection.apply(self.operator, roughness[m], log_sharpness, *seen)
-                by_diffuse, by_specular = (part @ weight for part in lit)
+                responses = UnitReflection.apply(self.operator, roughness[m], log_sharpness, *cosines)
+                by_diffuse, by_specular = (part @ weight for part in responses)
                 exposure = torch.exp(log_exposure)[photo][:, None]
                 predicted = exposure * (diffuse[m] * by_diffuse + specular[m] * by_specular)
                 difference = (predicted - radiance) * precision
                 squares = squares + (difference.masked_fill(clipped & (difference > 0), 0.0) ** 2).sum()
                 values += difference.numel()
-        value = squares / max(values, 1) + self.paper.prior * prior / len(self.blocks)
+        value = squares / max(values, 1) + self.options.prior * prior / len(self.blocks)
         (gradient,) = torch.autograd.grad(value, x)
         return float(value.detach()), gradient
 

@@ -7,10 +7,11 @@ A material is dielectric, metal or fabric, with shares π_c.  Let l = log k_s of
 
 The last factor is over the two dimensions of l − l̄.  μ_c, S_c and τ_c are those of measured materials
 (`studies.measured.material_classes`, material_classes.json).  S_c and τ_c are widened by the unknown scale of
-reflectances and the unknown white balance of photos (SCALE, ROUGHNESS_SLACK, WHITE).  Dielectrics reflect ((n − 1)/(n +
-1))² of a ray along the normal, 0.02 to 0.08, equally in all colours.  Metals reflect more, with a tint.  Fabrics
-scatter within, and GGX shows this as a strong and very rough part.  A smooth surface with k_s = 0.3 is therefore metal,
-and a k_s of 0.2 at roughness 1 is fabric; neither is inferred without evidence.
+reflectances and the unknown white balance of photos (`SCALE_DEVIATION`, `CLASS_ROUGHNESS_DEVIATION`,
+`WHITE_DEVIATION`).  Dielectrics reflect ((n − 1)/(n + 1))² of a ray along the normal, 0.02 to 0.08, equally in all
+colours.  Metals reflect more, with a tint.  Fabrics scatter within, and GGX shows this as a strong and very rough part.
+A smooth surface with k_s = 0.3 is therefore metal, and a k_s of 0.2 at roughness 1 is fabric; neither is inferred
+without evidence.
 
 Let r_c be the share of class c in the sum (1).  Half the gradient of −2 log p is Σ_c r_c P_c (x − μ_c), P_c the class's
 precision.  Half the Hessian is approximated by Σ_c r_c P_c, the Hessian of the bound of expectation maximisation, which
@@ -20,7 +21,7 @@ A factor per channel is free between the materials and the lights of a connected
 other.  Then it is known only as well as the model of interreflection holds.  So the brightest material of a component
 is expected to be of ordinary brightness.  Let b be the mean over channels of its k_d + k_s:
 
-    (log b − log BRIGHTEST)²/BRIGHTNESS²                                                                             (2)
+    (log b − log MEDIAN_BRIGHTNESS)²/BRIGHTNESS_DEVIATION²                                                       (2)
 
 b lies between 0.5 and 0.95 within two standard deviations.  (2) does not apply where a material or a light of the
 component is known.  The prior on lights, whose mean is grey, settles the tint.  A very wide Gaussian about the start
@@ -42,21 +43,21 @@ from scipy.linalg import block_diag
 
 from factorlib.inference.blocks import Block
 from factorlib.inference.gauge import connected_components
-from factorlib.inference.known import Known
+from factorlib.inference.known import KnownValues
 from factorlib.inference.materials import LEAST_REFLECTANCE, ROUGHNESS, Materials
 from factorlib.jsonfile import read_json
 from factorlib.reading import reading
 
 SHIPPED = Path(__file__).with_name("material_classes.json")
-DIFFUSE = 3.0  # standard deviation of log k_d about the start
-ROUGH = 1.0  # standard deviation of roughness about the start
+DIFFUSE_DEVIATION = 3.0  # standard deviation of log k_d about the start
+ROUGHNESS_DEVIATION = 1.0  # standard deviation of roughness about the start
 # Standard deviations that are added in quadrature to those of l̄, roughness and l − l̄.
-SCALE = 0.5
-ROUGHNESS_SLACK = 0.2
-WHITE = 0.1
+SCALE_DEVIATION = 0.5
+CLASS_ROUGHNESS_DEVIATION = 0.2
+WHITE_DEVIATION = 0.1
 # Median of b, and standard deviation of log b, in (2).
-BRIGHTEST = 0.69
-BRIGHTNESS = 0.16
+MEDIAN_BRIGHTNESS = 0.69
+BRIGHTNESS_DEVIATION = 0.16
 # Projections of l on its mean and on the difference from it.
 MEAN = np.full((3, 3), 1 / 3)
 TINTS = np.eye(3) - 1 / 3
@@ -114,12 +115,14 @@ class Mixture:
         rough: Standard deviation that is added to that of roughness, in quadrature.
     """
 
-    def __init__(self, classes: Sequence[MaterialClass], relative: float = 0.0, rough: float = ROUGHNESS_SLACK):
-        self.names = [one.name for one in classes]
-        slack = np.diag([SCALE**2 + relative**2, rough**2])
-        covariances = [np.array(one.covariance) + slack for one in classes]
-        tints = np.array([one.tint**2 + WHITE**2 + relative**2 for one in classes])
-        self.mean = np.array([[one.mean[0]] * 3 + [one.mean[1]] for one in classes])
+    def __init__(
+        self, classes: Sequence[MaterialClass], relative: float = 0.0, rough: float = CLASS_ROUGHNESS_DEVIATION
+    ):
+        self.names = [material_class.name for material_class in classes]
+        slack = np.diag([SCALE_DEVIATION**2 + relative**2, rough**2])
+        covariances = [np.array(material_class.covariance) + slack for material_class in classes]
+        tints = np.array([material_class.tint**2 + WHITE_DEVIATION**2 + relative**2 for material_class in classes])
+        self.mean = np.array([[material_class.mean[0]] * 3 + [material_class.mean[1]] for material_class in classes])
         self.precision = np.zeros((len(classes), 4, 4))
         # precision of (log k_s, roughness), [4, 4] a class
         for P, covariance, variance in zip(self.precision, covariances, tints, strict=True):
@@ -128,10 +131,10 @@ class Mixture:
             P[:3, 3] = P[3, :3] = inverse[0, 1] / 3
             P[3, 3] = inverse[1, 1]
         determinants = np.array([np.linalg.slogdet(covariance)[1] for covariance in covariances])
-        shares = np.array([one.share for one in classes])
+        shares = np.array([material_class.share for material_class in classes])
         self.constant = determinants + 2 * np.log(tints) - 2 * np.log(shares)
 
-    def at(
+    def evaluate(
         self, x: Float[np.ndarray, "4"]
     ) -> tuple[float, Float[np.ndarray, "4"], Float[np.ndarray, "4 4"], Float[np.ndarray, " c"]]:
         """Return −2 log p, half its gradient, half its Hessian and the class probabilities.
@@ -148,7 +151,7 @@ class Mixture:
         return value, probability @ slope, np.einsum("c,cij->ij", probability, self.precision), probability
 
 
-class Gaussian(NamedTuple):
+class PriorTerms(NamedTuple):
     """Minus twice a log density, half its gradient and half its Gauss–Newton Hessian by the material unknowns."""
 
     value: float
@@ -162,18 +165,18 @@ class MaterialPrior:
     Materials without a specular part at the start have no prior on it.
     """
 
-    def __init__(self, start: Materials, blocks: Sequence[Block], known: Known = Known()):
-        self.mean = unknowns_of(start)
-        self.wide = np.array([DIFFUSE**-2.0] * 3 + [0.0] * 3 + [ROUGH**-2.0])
+    def __init__(self, start: Materials, blocks: Sequence[Block], known: KnownValues = KnownValues()):
+        self.mean = material_unknowns(start)
+        self.wide = np.array([DIFFUSE_DEVIATION**-2.0] * 3 + [0.0] * 3 + [ROUGHNESS_DEVIATION**-2.0])
         self.specular = np.flatnonzero((start.specular > LEAST_REFLECTANCE).any(1)).tolist()
         self.mixture = Mixture(shipped_classes().classes)
         self.members = [
             list(members)
             for members, lights in connected_components(blocks, len(start))
-            if members and lights and known.factors(members, lights)
+            if members and lights and known.free_factors(members, lights)
         ]
 
-    def at(self, theta: Float[np.ndarray, "m 7"]) -> Gaussian:
+    def evaluate(self, theta: Float[np.ndarray, "m 7"]) -> PriorTerms:
         """Evaluate the prior at the materials' unknowns."""
         # wide Gaussian about the start, then (1)
         off = theta - self.mean
@@ -181,8 +184,8 @@ class MaterialPrior:
         gradient = off * self.wide
         hessians = np.tile(np.diag(self.wide), (len(theta), 1, 1))
         for m in self.specular:
-            more, slope, curvature, _ = self.mixture.at(theta[m, 3:])
-            value = value + more
+            energy, slope, curvature, _ = self.mixture.evaluate(theta[m, 3:])
+            value = value + energy
             gradient[m, 3:] = gradient[m, 3:] + slope
             hessians[m, 3:, 3:] += curvature
         gradient = gradient.reshape(-1)
@@ -193,15 +196,17 @@ class MaterialPrior:
             brightest = members[int(reflectance[members].sum(1).argmax())]
             total = reflectance[brightest].sum()
             slope = np.zeros_like(theta)
-            slope[brightest, :6] = reflectance[brightest] / (total * BRIGHTNESS)
-            residual = (np.log(total / 3) - np.log(BRIGHTEST)) / BRIGHTNESS
+            slope[brightest, :6] = reflectance[brightest] / (total * BRIGHTNESS_DEVIATION)
+            residual = (np.log(total / 3) - np.log(MEDIAN_BRIGHTNESS)) / BRIGHTNESS_DEVIATION
             value = value + residual**2
             gradient = gradient + residual * slope.reshape(-1)
             hessian += np.outer(slope, slope)
-        return Gaussian(float(value), gradient, hessian)
+        return PriorTerms(float(value), gradient, hessian)
 
 
-def class_of(specular: Float[np.ndarray, "3"], roughness: float, relative: float, rough: float) -> tuple[str, float]:
+def likeliest_class(
+    specular: Float[np.ndarray, "3"], roughness: float, relative: float, rough: float
+) -> tuple[str, float]:
     """Return the likeliest class of a material and its probability.
 
     Args:
@@ -212,17 +217,17 @@ def class_of(specular: Float[np.ndarray, "3"], roughness: float, relative: float
     """
     mixture = Mixture(shipped_classes().classes, relative, rough)
     x = np.append(np.log(np.maximum(specular, LEAST_REFLECTANCE)), roughness)
-    probability = mixture.at(x)[3]
+    probability = mixture.evaluate(x)[3]
     best = int(probability.argmax())
     return mixture.names[best], float(probability[best])
 
 
-def unknowns_of(materials: Materials) -> Float[np.ndarray, "m 7"]:
+def material_unknowns(materials: Materials) -> Float[np.ndarray, "m 7"]:
     """Return log k_d, log k_s and roughness."""
     reflectance = np.maximum(np.column_stack([materials.diffuse, materials.specular]), LEAST_REFLECTANCE)
     return np.column_stack([np.log(reflectance), np.clip(materials.roughness, *ROUGHNESS)])
 
 
-def materials_of(theta: Float[np.ndarray, "m 7"]) -> Materials:
-    """Return the materials with these unknowns, the inverse of `unknowns_of`."""
+def materials_from_unknowns(theta: Float[np.ndarray, "m 7"]) -> Materials:
+    """Return the materials with these unknowns, the inverse of `material_unknowns`."""
     return Materials(np.exp(theta[:, :3]), np.exp(theta[:, 3:6]), theta[:, 6])

@@ -16,12 +16,11 @@ import msgspec
 import numpy as np
 from jaxtyping import Float
 
-from factorlib.inference.blocks import Block
+from factorlib.inference.blocks import Block, RobustLoss
 from factorlib.inference.forward import Illumination
-from factorlib.inference.known import Known
+from factorlib.inference.known import KnownValues
 from factorlib.inference.materials import Point
-from factorlib.inference.noise import Loss
-from factorlib.inference.responses import Tables
+from factorlib.inference.responses import ResponseCache
 from factorlib.reflection.operator import Operator
 from factorlib.stage import serial_map
 
@@ -42,10 +41,10 @@ class JointProblem(msgspec.Struct, frozen=True):
 
     blocks: list[Block]
     operator: Operator
-    loss: Loss = Loss()
+    loss: RobustLoss = RobustLoss()
     spread: Spread = serial_map
-    known: Known = Known()
-    tables: Tables = msgspec.field(default_factory=Tables)
+    known: KnownValues = KnownValues()
+    tables: ResponseCache = msgspec.field(default_factory=ResponseCache)
 
     def illuminations(self, point: Point) -> list[Illumination]:
         """Return each block with its light.
@@ -66,17 +65,17 @@ class JointProblem(msgspec.Struct, frozen=True):
         """Return whitened residuals of all observations, block by block, one-sided where clipped."""
         return [illumination.residuals() for illumination in self.illuminations(point)]
 
-    def held_out_losses(self, point: Point) -> list[Float[np.ndarray, " n"]]:
-        """Return the robust loss of each held-out observation, block by block.
+    def held_out(self) -> JointProblem:
+        """Return the problem of the held-out observations; of all of them if none is held out."""
+        return self.with_blocks([block.take(block.held_out | self.none_held_out) for block in self.blocks])
 
-        If no observation is held out, return the loss of each observation.
-        """
-        judged = self.of([block.take(block.held_out | self.none_held_out) for block in self.blocks])
-        return [illumination.losses(self.loss) for illumination in judged.illuminations(point)]
+    def losses(self, point: Point) -> list[Float[np.ndarray, " n"]]:
+        """Return the robust loss of each observation, block by block."""
+        return [illumination.losses(self.loss) for illumination in self.illuminations(point)]
 
     def held_out_loss(self, point: Point) -> float:
         """Return the mean robust loss per held-out channel value; of all values if none is held out."""
-        losses = np.concatenate(self.held_out_losses(point))
+        losses = np.concatenate(self.held_out().losses(point))
         return float(losses.mean()) if len(losses) else 0.0
 
     @property
@@ -89,30 +88,26 @@ class JointProblem(msgspec.Struct, frozen=True):
         """True if all observations are fitted, so that none can select a model."""
         return not any(block.held_out.any() for block in self.blocks)
 
-    def sampled(self, count: int | Sequence[int], seed: int) -> JointProblem:
+    def subsample(self, count: int | Sequence[int], seed: int) -> JointProblem:
         """Return the problem with at most `count` fitted and `count` held-out observations of each block.
 
         `count` is one number, or one a block.
         """
         counts = [count] * len(self.blocks) if isinstance(count, int) else count
-        return self.of([block.sampled(most, seed) for block, most in zip(self.blocks, counts, strict=True)])
+        return self.with_blocks([block.subsample(most, seed) for block, most in zip(self.blocks, counts, strict=True)])
 
-    def fitted(self) -> JointProblem:
+    def without_held_out(self) -> JointProblem:
         """Return the problem without its held-out observations."""
-        return self.of([block.fitted() for block in self.blocks])
+        return self.with_blocks([block.without_held_out() for block in self.blocks])
 
-    def restricted(self, lights: Sequence[int]) -> JointProblem:
+    def select_lights(self, lights: Sequence[int]) -> JointProblem:
         """Return the problem with the selected blocks alone."""
-        return self.of([self.blocks[k] for k in lights])
+        return self.with_blocks([self.blocks[k] for k in lights])
 
     def with_effects(self, shadows: bool, bounces: bool) -> JointProblem:
         """Return the problem with shadows or interreflection switched off where the argument is False."""
-        return self.of([block.with_effects(shadows, bounces) for block in self.blocks])
+        return self.with_blocks([block.with_effects(shadows, bounces) for block in self.blocks])
 
-    def with_none_held_out(self) -> JointProblem:
-        """Return the problem with no observation held out."""
-        return self.of([block.with_none_held_out() for block in self.blocks])
-
-    def of(self, blocks: list[Block]) -> JointProblem:
+    def with_blocks(self, blocks: list[Block]) -> JointProblem:
         """Return the problem with other observations."""
         return msgspec.structs.replace(self, blocks=blocks)

@@ -7,10 +7,10 @@ a is the block's detail of reflectance, where it has one.  v and u are the share
 leave: (1) and (2) of `factorlib.light.visibility`, and 1 without visibility.
 
 The cells of a light stay in place during a descent, so responses depend on materials through their roughness alone.
-`Reflections` computes them at the `NODES` when they are first needed.  It interpolates between nodes by cubic
+`ResponseTable` computes them at the `NODES` when they are first needed.  It interpolates between nodes by cubic
 polynomials of log roughness.  The peak of a sharp cell's highlight falls with roughness⁻⁴.  Between nodes a factor h
 apart, the interpolation error is (9/384)(4 ln h)⁴ of the peak at worst: 0.17 % for the nodes' factor 1.136.  Cells no
-sharper than `WIDE` blur highlights, and every second node is enough.
+sharper than `COARSE_SHARPNESS` blur highlights, and every second node is enough.
 """
 
 from __future__ import annotations
@@ -28,17 +28,17 @@ from torch import Tensor
 
 from factorlib.inference.blocks import Block
 from factorlib.inference.lights import UnitLobes
-from factorlib.light.distance import met_from
-from factorlib.light.visibility import cosine_weights, highlight_weights, kernel, seen_share
+from factorlib.light.distance import finite_distance_cosines
+from factorlib.light.visibility import cosine_weights, highlight_weights, kernel, visible_share
 from factorlib.reflection.operator import Operator
 
 CHUNK = 4096  # observations whose responses are computed at once
-TOGETHER = 512  # observations whose visibility a processor's cache holds
+SHADOW_ROWS = 512  # observations whose visibility a processor's cache holds
 NODES = np.geomspace(0.1, 1.0, 19)  # roughness of the nodes
-WIDE = 200.0  # λ up to which every second node is enough
+COARSE_SHARPNESS = 200.0  # λ up to which every second node is enough
 DEGREE = 3  # of the polynomials between nodes
-KEPT = 6  # nodes of a material whose responses stay in memory
-KEPT_TABLES = 16  # tables that stay in memory, about 400 MB
+CACHED_NODES = 6  # nodes of a material whose responses stay in memory
+CACHED_TABLES = 16  # tables that stay in memory, about 400 MB
 Rows = slice | Int[np.ndarray, " n"]
 
 
@@ -51,11 +51,11 @@ def diffuse_response(block: Block, rows: Rows, lobes: UnitLobes, operator: Opera
         lobes: Lobes of weight one.
         operator: Reflection operator.
     """
-    nz, _, larger = met_cosines(block, rows, lobes)
+    nz, _, larger = lobe_cosines(block, rows, lobes)
     with torch.no_grad():
         response = operator.diffuse(_tensor(lobes.sharpness, operator), _tensor(nz, operator))
-        seen = larger * shadowed(response, block, rows, lobes).double().numpy()
-        return seen if block.detail is None else seen * block.detail[rows][:, None]
+        shadowed = larger * apply_shadows(response, block, rows, lobes).double().numpy()
+        return shadowed if block.detail is None else shadowed * block.detail[rows][:, None]
 
 
 def specular_response(
@@ -70,14 +70,14 @@ def specular_response(
         roughness: Roughness of the material.
         operator: Reflection operator.
     """
-    nz, oz, larger = met_cosines(block, rows, lobes)
+    nz, oz, larger = lobe_cosines(block, rows, lobes)
     no = (block.normal[rows] * block.view[rows]).sum(1)
     inputs = (_tensor(v, operator) for v in (np.array(roughness), lobes.sharpness, no, nz, oz))
     with torch.no_grad():
-        return larger * shadowed(operator.specular(*inputs), block, rows, lobes, roughness).double().numpy()
+        return larger * apply_shadows(operator.specular(*inputs), block, rows, lobes, roughness).double().numpy()
 
 
-def met_cosines(block: Block, rows: Rows, lobes: UnitLobes) -> tuple[np.ndarray, np.ndarray, np.ndarray | float]:
+def lobe_cosines(block: Block, rows: Rows, lobes: UnitLobes) -> tuple[np.ndarray, np.ndarray, np.ndarray | float]:
     """Return n·z', o·z' and w'/w of (1) of `factorlib.light.distance`, each [n, p].
 
     Shadows do not use them: for visibility the light is infinitely far away.
@@ -91,7 +91,7 @@ def met_cosines(block: Block, rows: Rows, lobes: UnitLobes) -> tuple[np.ndarray,
     view = block.view[rows]
     if lobes.curvature == 0 or block.place is None:
         return normal @ lobes.axis.T, view @ lobes.axis.T, 1.0
-    return met_from(block.place[rows], normal, view, lobes.axis, lobes.curvature)
+    return finite_distance_cosines(block.place[rows], normal, view, lobes.axis, lobes.curvature)
 
 
 def _tensor(values: np.ndarray, operator: Operator) -> Tensor:
@@ -99,7 +99,7 @@ def _tensor(values: np.ndarray, operator: Operator) -> Tensor:
     return torch.as_tensor(values).to(operator.dtype)
 
 
-def shadowed(
+def apply_shadows(
     response: Float[Tensor, "n p"], block: Block, rows: Rows, lobes: UnitLobes, roughness: float | None = None
 ) -> Float[Tensor, "n p"]:
     """Return the response at `rows` with shadows.
@@ -122,21 +122,21 @@ def shadowed(
     )
     for k in np.unique(photo[hidden]):
         directions = torch.from_numpy(block.directions[k]).float()
-        own = np.flatnonzero(hidden & (photo == k))
-        lit = kernel(directions, axis, sharpness)
+        shadowed = np.flatnonzero(hidden & (photo == k))
+        lobe_values = kernel(directions, axis, sharpness)
         # v of (1) or u of (2) of factorlib.light.visibility, for as many observations as fit in the cache
-        for some in np.split(own, range(TOGETHER, len(own), TOGETHER)):
+        for chunk in np.split(shadowed, range(SHADOW_ROWS, len(shadowed), SHADOW_ROWS)):
             weights = (
-                cosine_weights(normal[some], directions)
+                cosine_weights(normal[chunk], directions)
                 if roughness is None
-                else highlight_weights(normal[some], view[some], directions, float(roughness))
+                else highlight_weights(normal[chunk], view[chunk], directions, float(roughness))
             )
-            share = seen_share(torch.from_numpy(visibility[some]).float() / 255, weights, lit)
-            response[some] *= share.to(response.dtype)
+            share = visible_share(torch.from_numpy(visibility[chunk]).float() / 255, weights, lobe_values)
+            response[chunk] *= share.to(response.dtype)
     return response
 
 
-class Reflected(NamedTuple):
+class Responses(NamedTuple):
     """Responses of n observations of one material to p lobes of weight one.
 
     Attributes:
@@ -157,14 +157,14 @@ class Reflected(NamedTuple):
     @property
     def specular(self) -> Float[np.ndarray, "n p"]:
         """Specular response S."""
-        return self._weighted(self.share)
+        return self._interpolate(self.share)
 
     @property
     def by_roughness(self) -> Float[np.ndarray, "n p"]:
         """Derivative ∂S/∂roughness."""
-        return self._weighted(self.slope)
+        return self._interpolate(self.slope)
 
-    def _weighted(self, weights: Float[np.ndarray, " k"]) -> Float[np.ndarray, "n p"]:
+    def _interpolate(self, weights: Float[np.ndarray, " k"]) -> Float[np.ndarray, "n p"]:
         """Return the weighted sum over nodes."""
         return np.tensordot(weights.astype(np.float32), self.stack[1:], axes=1)
 
@@ -182,19 +182,19 @@ class Reflected(NamedTuple):
         return (self.stack.reshape(-1, self.stack.shape[2]).T @ slopes.reshape(-1, 3)).astype(float)
 
 
-class Table(Protocol):
+class ResponseLookup(Protocol):
     """Responses of a block, material by material."""
 
     def rows(self, m: int) -> slice:
         """Return the rows of material m."""
         ...
 
-    def at(self, m: int, roughness: float) -> Reflected:
+    def interpolate(self, m: int, roughness: float) -> Responses:
         """Return the responses of material m at a roughness."""
         ...
 
 
-class Reflections:
+class ResponseTable:
     """Responses of a block's observations to some lobes, material by material, float32; values at nodes are kept.
 
     Args:
@@ -210,47 +210,47 @@ class Reflections:
         self.operator = operator
         self.lobes = lobes
         self.materials_given = materials_given
-        self.nodes = NODES[::2] if lobes.sharpness.max(initial=0) <= WIDE else NODES
+        self.nodes = NODES[::2] if lobes.sharpness.max(initial=0) <= COARSE_SHARPNESS else NODES
         self._diffuse: dict[int, np.ndarray] = {}  # by material
         self._specular: dict[int, dict[int, np.ndarray]] = {}  # by material and node
         self._stacks: dict[int, tuple[int, np.ndarray]] = {}  # by material: the first node, and the stack from there on
 
     def rows(self, m: int) -> slice:
         """Return the rows of material m, which are contiguous."""
-        first, last = np.searchsorted(self.block.material, [m, m + 1])
-        return slice(int(first), int(last))
+        start, stop = np.searchsorted(self.block.material, [m, m + 1])
+        return slice(int(start), int(stop))
 
-    def at(self, m: int, roughness: float) -> Reflected:
+    def interpolate(self, m: int, roughness: float) -> Responses:
         """Return the responses of material m at a roughness."""
         if self.materials_given:
             if m not in self._stacks:
-                self._stacks[m] = 0, np.stack([self._diffuse_of(m), self._computed(m, roughness)])
-            return Reflected(self._stacks[m][1], np.ones(1), np.zeros(1))
+                self._stacks[m] = 0, np.stack([self._diffuse_of(m), self._evaluate(m, roughness)])
+            return Responses(self._stacks[m][1], np.ones(1), np.zeros(1))
         # cubic interpolation between the four nearest nodes, in log roughness
-        first = int(np.clip(np.searchsorted(self.nodes, roughness) - 2, 0, len(self.nodes) - DEGREE - 1))
-        nodes = self.nodes[first : first + DEGREE + 1]
-        share, slope = lagrange(np.log(nodes), float(np.log(roughness)))
-        if self._stacks.get(m, (None,))[0] != first:
-            known = [self._specular_at(m, first + k) for k in range(DEGREE + 1)]
-            self._stacks[m] = first, np.stack([self._diffuse_of(m), *known])
-        return Reflected(self._stacks[m][1], share, slope / roughness)
+        start = int(np.clip(np.searchsorted(self.nodes, roughness) - 2, 0, len(self.nodes) - DEGREE - 1))
+        nodes = self.nodes[start : start + DEGREE + 1]
+        share, slope = lagrange_weights(np.log(nodes), float(np.log(roughness)))
+        if self._stacks.get(m, (None,))[0] != start:
+            known = [self._specular_at_node(m, start + k) for k in range(DEGREE + 1)]
+            self._stacks[m] = start, np.stack([self._diffuse_of(m), *known])
+        return Responses(self._stacks[m][1], share, slope / roughness)
 
     def _diffuse_of(self, m: int) -> Float[np.ndarray, "n p"]:
         """Return D of material m, computed once."""
         if m not in self._diffuse:
-            self._diffuse[m] = self._computed(m, None)
+            self._diffuse[m] = self._evaluate(m, None)
         return self._diffuse[m]
 
-    def _specular_at(self, m: int, node: int) -> Float[np.ndarray, "n p"]:
-        """Return S of material m at a node; the `KEPT` nearest nodes stay in memory."""
-        kept = self._specular.setdefault(m, {})
-        if node not in kept:
-            for far in sorted(kept, key=lambda k: abs(k - node))[KEPT - 1 :]:
-                del kept[far]
-            kept[node] = self._computed(m, float(self.nodes[node]))
-        return kept[node]
+    def _specular_at_node(self, m: int, node: int) -> Float[np.ndarray, "n p"]:
+        """Return S of material m at a node; the `CACHED_NODES` nearest nodes stay in memory."""
+        cached = self._specular.setdefault(m, {})
+        if node not in cached:
+            for distant in sorted(cached, key=lambda k: abs(k - node))[CACHED_NODES - 1 :]:
+                del cached[distant]
+            cached[node] = self._evaluate(m, float(self.nodes[node]))
+        return cached[node]
 
-    def _computed(self, m: int, roughness: float | None) -> Float[np.ndarray, "n p"]:
+    def _evaluate(self, m: int, roughness: float | None) -> Float[np.ndarray, "n p"]:
         """Return S of material m at a roughness, or D if that is None."""
         rows = self.rows(m)
         parts = []
@@ -263,53 +263,64 @@ class Reflections:
         return np.vstack(parts).astype(np.float32)
 
 
-class Tables:
-    """Cache of response tables, shared by fits; it keeps the `KEPT_TABLES` last used.
+class ResponseCache:
+    """Cache of response tables, shared by fits; it keeps the `CACHED_TABLES` last used.
 
     Fits that compare models have the same observations and lobes.  Only radiance, materials and weights differ.
     """
 
     def __init__(self) -> None:
-        self._known: OrderedDict[bytes, Reflections] = OrderedDict()
+        self._tables: OrderedDict[bytes, ResponseTable] = OrderedDict()
         self._lock = Lock()  # lights are spread over threads
 
-    def of(
-        self, block: Block, lobes: UnitLobes, operator: Operator, given: Float[np.ndarray, " m"] | None = None
-    ) -> Reflections:
+    def get(
+        self, block: Block, lobes: UnitLobes, operator: Operator, fixed_roughness: Float[np.ndarray, " m"] | None = None
+    ) -> ResponseTable:
         """Return the table of a block.
 
         Args:
             block: Observations.
             lobes: Lobes of weight one.
             operator: Reflection operator.
-            given: Roughness of all materials if it does not change; otherwise None.
+            fixed_roughness: Roughness of all materials if it does not change; otherwise None.
         """
-        optional = (block.visibility, block.directions, block.detail, block.place if lobes.curvature else None, given)
+        optional = (
+            block.visibility,
+            block.directions,
+            block.detail,
+            block.place if lobes.curvature else None,
+            fixed_roughness,
+        )
         arrays = [block.normal, block.view, block.material, block.photo, lobes.axis, lobes.sharpness, *optional]
-        digest = blake2b(repr((id(operator), lobes.curvature, [of is None for of in optional])).encode())
+        digest = blake2b(repr((id(operator), lobes.curvature, [array is None for array in optional])).encode())
         for array in arrays:
             digest.update(b"" if array is None else np.ascontiguousarray(array).data)
         key = digest.digest()
         with self._lock:
-            table = self._known.pop(key, None) or Reflections(block, lobes, operator, given is not None)
-            self._known[key] = table
-            while len(self._known) > KEPT_TABLES:
-                self._known.popitem(last=False)
+            table = self._tables.pop(key, None) or ResponseTable(block, lobes, operator, fixed_roughness is not None)
+            self._tables[key] = table
+            while len(self._tables) > CACHED_TABLES:
+                self._tables.popitem(last=False)
         return table
 
 
-def lagrange(nodes: Float[np.ndarray, " k"], x: float) -> tuple[Float[np.ndarray, " k"], Float[np.ndarray, " k"]]:
+def lagrange_weights(
+    nodes: Float[np.ndarray, " k"], x: float
+) -> tuple[Float[np.ndarray, " k"], Float[np.ndarray, " k"]]:
     """Return the weights of values at `nodes` in the interpolating polynomial at x, and in its derivative.
 
-    >>> [w.tolist() for w in lagrange(np.array([0.0, 1.0, 2.0]), 0.25)]
+    >>> [w.tolist() for w in lagrange_weights(np.array([0.0, 1.0, 2.0]), 0.25)]
     [[0.65625, 0.4375, -0.09375], [-1.25, 1.5, -0.25]]
     """
     value = []
     slope = []
     points = nodes.tolist()
     for a, node in enumerate(points):
-        others = points[:a] + points[a + 1 :]
-        below = prod(node - other for other in others)
-        value.append(prod(x - other for other in others) / below)
-        slope.append(sum(prod(x - other for other in others[:b] + others[b + 1 :]) for b in range(len(others))) / below)
+        other_nodes = points[:a] + points[a + 1 :]
+        below = prod(node - node_b for node_b in other_nodes)
+        value.append(prod(x - node_b for node_b in other_nodes) / below)
+        slope.append(
+            sum(prod(x - node_b for node_b in other_nodes[:b] + other_nodes[b + 1 :]) for b in range(len(other_nodes)))
+            / below
+        )
     return np.array(value), np.array(slope)

@@ -4,7 +4,7 @@ Nothing   The median radiance of material m in photo i is roughly light_i · ref
           with gaps.  Its logarithm is fitted as a sum by least squares.  Exposures follow from mean radiances, and
           lights are constant.
 Surface   The stage `surface` fits the same materials and lights to the meshes as they are.  A solve continues from that
-          fit (`Beginning`).
+          fit (`InitialFit`).
 Earlier   Materials are identified by name, and lights by the name of their illumination.  Mean radiances give all
           materials, known or new, one relative scale (`mean_albedo`).  One factor per channel brings each gauge of the
           earlier solution to that scale: the geometric mean over its materials.  Its lights get the inverse factor.
@@ -27,46 +27,47 @@ import numpy as np
 from jaxtyping import Float
 from scipy.spatial.transform import Rotation
 
-from factorlib.inference.blocks import Block
-from factorlib.inference.fit import Fit, Hyperparameters, start_of
+from factorlib.inference.blocks import Block, RobustLoss
+from factorlib.inference.fit import Fit, Hyperparameters, initial_fit
 from factorlib.inference.forward import Illumination
 from factorlib.inference.gauge import connected_components
-from factorlib.inference.lights import TONE, Light, UnitLobes, even_cells
+from factorlib.inference.lights import TONE_RANGE, Light, UnitLobes, fibonacci_cells
 from factorlib.inference.materials import LEAST_REFLECTANCE, SHARPNESS, Materials, Point
-from factorlib.inference.noise import Loss
-from factorlib.inference.options import Choices
+from factorlib.inference.options import SolveOptions
 from factorlib.inference.problem import JointProblem
 from factorlib.results.solution import Earlier
 
 log = logging.getLogger("factorlib.inference")
 BRIGHTEST_AT_START = 0.7  # reflectance of the brightest material at the start
 # Start of every material.
-ROUGHNESS = 0.4
+START_ROUGHNESS = 0.4
 SPECULAR_SHARE = 0.2
 # With at most FEW materials, a solve starts from each roughness of STARTS.
-FEW = 2
-STARTS = (0.15, 0.4, 0.8)
+FEW_MATERIALS = 2
+START_ROUGHNESSES = (0.15, 0.4, 0.8)
 LEAST_RADIANCE = 1e-6  # least radiance, as a share of a block's mean
 
 # Function of a problem and a number of cells a light; the best of its fits continues.
 Start = Callable[[JointProblem, int], list[Fit]]
 
 
-def from_nothing(materials: int) -> Start:
+def start_from_photos(materials: int) -> Start:
     """Return the start from mean radiances alone; with few materials, from several roughnesses."""
 
     def fits(problem: JointProblem, cells: int) -> list[Fit]:
         """Return one fit per roughness, with constant lights."""
-        blocks = problem.blocks
-        roughness = STARTS if materials <= FEW else STARTS[1:2]
-        begun = [starting_materials(blocks, materials, one) for one in roughness]
-        return [start_of(Point(of, [constant_light(block, of, cells) for block in blocks])) for of in begun]
+        roughness = START_ROUGHNESSES if materials <= FEW_MATERIALS else START_ROUGHNESSES[1:2]
+        candidates = [starting_materials(problem.blocks, materials, value) for value in roughness]
+        return [
+            initial_fit(Point(candidate, [constant_light(block, candidate, cells) for block in problem.blocks]))
+            for candidate in candidates
+        ]
 
     return fits
 
 
-class BegunLight(msgspec.Struct, frozen=True):
-    """Light on the first p of `own_cells`.
+class InitialLight(msgspec.Struct, frozen=True):
+    """Light on the first p of `rotated_cells`.
 
     Attributes:
         weight: Weights of the cells, RGB, in scene radiance.
@@ -79,7 +80,7 @@ class BegunLight(msgspec.Struct, frozen=True):
     hyperparameters: Hyperparameters
 
 
-class Beginning(msgspec.Struct, frozen=True):
+class InitialFit(msgspec.Struct, frozen=True):
     """Materials and lights that were fitted to the meshes as they are.
 
     Attributes:
@@ -89,23 +90,23 @@ class Beginning(msgspec.Struct, frozen=True):
     """
 
     materials: list[list[float]]
-    lights: dict[str, BegunLight]
+    lights: dict[str, InitialLight]
     value: float
 
     @staticmethod
-    def of(fit: Fit, blocks: Sequence[Block]) -> Beginning:
+    def from_fit(fit: Fit, blocks: Sequence[Block]) -> InitialFit:
         """Return the serialisable form of a fit of these blocks.
 
         Its lights are infinitely far away and have no tone curves.
         """
         lights = {
-            block.name: BegunLight((light.weight * block.unit).tolist(), light.log_exposure.tolist(), hyperparameters)
+            block.name: InitialLight((light.weight * block.unit).tolist(), light.log_exposure.tolist(), hyperparameters)
             for block, light, hyperparameters in zip(blocks, fit.point.lights, fit.hyperparameters, strict=True)
         }
-        return Beginning(fit.point.materials.rows().tolist(), lights, fit.value)
+        return InitialFit(fit.point.materials.rows().tolist(), lights, fit.value)
 
 
-def from_beginning(begun: Beginning) -> Start:
+def start_from_surface(initial: InitialFit) -> Start:
     """Return the start from a fit.
 
     A light with other cells or other photos than the fit's is constant, and the start then counts as no fit: its value
@@ -114,81 +115,90 @@ def from_beginning(begun: Beginning) -> Start:
 
     def fits(problem: JointProblem, cells: int) -> list[Fit]:
         """Return the fit in the units of the problem."""
-        materials = Materials.of_rows(np.array(begun.materials))
+        materials = Materials.from_rows(np.array(initial.materials))
         lights = [constant_light(block, materials, cells) for block in problem.blocks]
         hyperparameters = [Hyperparameters() for _ in lights]
-        value = begun.value
+        value = initial.value
         for k, block in enumerate(problem.blocks):
-            one = begun.lights.get(block.name)
-            if one is None or (len(one.weight), len(one.log_exposure)) != (cells, len(block.photos)):
+            light = initial.lights.get(block.name)
+            if light is None or (len(light.weight), len(light.log_exposure)) != (cells, len(block.photos)):
                 value = float("inf")
                 continue
-            values = {"weight": np.array(one.weight) / block.unit, "log_exposure": np.array(one.log_exposure)}
+            values = {"weight": np.array(light.weight) / block.unit, "log_exposure": np.array(light.log_exposure)}
             lights[k] = msgspec.structs.replace(lights[k], **values)
-            hyperparameters[k] = one.hyperparameters
+            hyperparameters[k] = light.hyperparameters
         return [Fit(Point(materials, lights), hyperparameters, value)]
 
     return fits
 
 
-def with_known(point: Point, problem: JointProblem) -> Point:
+def insert_known(point: Point, problem: JointProblem) -> Point:
     """Return the point with known values inserted, and the rest of each component at their scale."""
     known = problem.known
-    materials = point.materials
     lights = list(point.lights)
-    if known.nothing:
+    if known.is_empty:
         return point
     names = [block.name for block in problem.blocks]
-    rows = materials.rows()
-    given = np.maximum(known.put(materials).rows(), LEAST_REFLECTANCE)
-    for members, illuminations in connected_components(problem.blocks, len(materials)):
-        lit = [names.index(name) for name in illuminations]
-        own = {i: known.lights[names[i]] for i in lit if names[i] in known.lights}
+    rows = point.materials.rows()
+    known_rows = np.maximum(known.insert_into(point.materials).rows(), LEAST_REFLECTANCE)
+    for members, illuminations in connected_components(problem.blocks, len(point.materials)):
+        linked_lights = [names.index(name) for name in illuminations]
+        known_lights = {i: known.lights[names[i]] for i in linked_lights if names[i] in known.lights}
         # log factor on reflectances: of the known materials, else of the known lights, else 0
-        logs = [np.log((given[m, :3] + given[m, 3:6]) / (rows[m, :3] + rows[m, 3:6])) for m in known.of(members)]
-        brighter = {i: level(lights[i]) - level(one) + np.log(problem.blocks[i].unit) for i, one in own.items()}
-        logs = logs or [by - by.mean() * own[i].scale_free for i, by in brighter.items()] or [np.zeros(3)]
+        logs = [
+            np.log((known_rows[m, :3] + known_rows[m, 3:6]) / (rows[m, :3] + rows[m, 3:6]))
+            for m in known.known_materials(members)
+        ]
+        brighter = {
+            i: log_mean_radiance(lights[i]) - log_mean_radiance(known_light) + np.log(problem.blocks[i].unit)
+            for i, known_light in known_lights.items()
+        }
+        logs = (
+            logs
+            or [ratio - ratio.mean() * known_lights[i].scale_free for i, ratio in brighter.items()]
+            or [np.zeros(3)]
+        )
         factor = np.mean(logs, axis=0)  # on reflectances
         rows[list(members), :6] *= np.tile(np.exp(factor), 2)
-        for i in lit:
+        for i in linked_lights:
             weight = lights[i].weight / np.exp(factor)
             parts = {}
-            if one := own.get(i):
-                scale = (brighter[i] - factor).mean() * one.scale_free - np.log(problem.blocks[i].unit)
-                weight = one.weight * np.exp(scale)
-                held = {"held": one.held, "scale_free": one.scale_free}
-                parts = {"axis": one.axis, "log_sharpness": one.log_sharpness, **held}
+            if known_light := known_lights.get(i):
+                scale = (brighter[i] - factor).mean() * known_light.scale_free - np.log(problem.blocks[i].unit)
+                weight = known_light.weight * np.exp(scale)
+                held = {"fixed": known_light.fixed, "scale_free": known_light.scale_free}
+                parts = {"axis": known_light.axis, "log_sharpness": known_light.log_sharpness, **held}
             if names[i] in known.exposures:
-                parts |= {"log_exposure": np.zeros_like(lights[i].log_exposure), "exposures_held": True}
+                parts |= {"log_exposure": np.zeros_like(lights[i].log_exposure), "exposures_fixed": True}
             lights[i] = msgspec.structs.replace(lights[i], weight=weight, **parts)
-    return Point(known.put(Materials.of_rows(rows)), lights)
+    return Point(known.insert_into(Materials.from_rows(rows)), lights)
 
 
-def level(light: Light) -> Float[np.ndarray, "3"]:
+def log_mean_radiance(light: Light) -> Float[np.ndarray, "3"]:
     """Return the logarithm of a light's mean radiance."""
     return np.log(np.maximum(light.energy.sum(0) / 2, LEAST_RADIANCE))  # `energy` is over 2π, a mean over 4π
 
 
-def from_earlier(earlier: Earlier, names: Sequence[str]) -> Start:
+def start_from_earlier(earlier: Earlier, names: Sequence[str]) -> Start:
     """Return the start from an earlier solution, for materials called `names`.
 
     Lights of the earlier solution keep their cells.
     """
-    return lambda problem, cells: [start_of(known_point(problem, earlier, names, cells))]
+    return lambda problem, cells: [initial_fit(point_from_earlier(problem, earlier, names, cells))]
 
 
-def with_decided(choices: Choices, earlier: Earlier) -> Choices:
+def with_earlier_decisions(options: SolveOptions, earlier: Earlier) -> SolveOptions:
     """Return the choices with shadows and interreflection as decided before.
 
     A decision counts only if both alternatives had been compared.
     """
     for name in ("self_shadowing", "interreflection"):
-        if getattr(choices, name) == "auto" and getattr(earlier, name):
-            choices = msgspec.structs.replace(choices, **{name: getattr(earlier, name)})
-    return choices
+        if getattr(options, name) == "auto" and getattr(earlier, name):
+            options = msgspec.structs.replace(options, **{name: getattr(earlier, name)})
+    return options
 
 
-def starting_materials(blocks: Sequence[Block], count: int, roughness: float = ROUGHNESS) -> Materials:
+def starting_materials(blocks: Sequence[Block], count: int, roughness: float = START_ROUGHNESS) -> Materials:
     """Return materials whose diffuse part explains the median radiances and whose specular part is grey."""
     albedo = mean_albedo(blocks, count)
     diffuse = np.maximum(albedo * (1 - SPECULAR_SHARE), 10 * LEAST_REFLECTANCE)
@@ -202,25 +212,25 @@ def mean_albedo(blocks: Sequence[Block], count: int) -> Float[np.ndarray, "m 3"]
     Materials that no block shows get the median.
     """
     rows = []
-    right = []
+    targets = []
     weight = []
-    first = count
+    offset = count
     # one equation per photo and material: log median radiance = log reflectance + log light, weighted by √count
     for block in blocks:
         for k in range(len(block.photos)):
             for m in np.unique(block.material[block.photo == k]):
-                of = (block.material == m) & (block.photo == k)
+                selected = (block.material == m) & (block.photo == k)
                 row = np.zeros(count + sum(len(b.photos) for b in blocks))
-                row[[m, first + k]] = 1
+                row[[m, offset + k]] = 1
                 rows.append(row)
-                right.append(np.log(np.maximum(np.median(block.radiance[of], axis=0), LEAST_RADIANCE)))
-                weight.append(np.sqrt(of.sum()))
-        first += len(block.photos)
+                targets.append(np.log(np.maximum(np.median(block.radiance[selected], axis=0), LEAST_RADIANCE)))
+                weight.append(np.sqrt(selected.sum()))
+        offset += len(block.photos)
     # weighted least squares; the scale is fixed by the brightest material
     weighted = np.array(rows) * np.array(weight)[:, None]
-    logs = np.linalg.lstsq(weighted, np.array(right) * np.array(weight)[:, None], rcond=None)[0][:count]
-    seen = np.array(rows)[:, :count].any(0)
-    logs[~seen] = np.median(logs[seen], axis=0)
+    logs = np.linalg.lstsq(weighted, np.array(targets) * np.array(weight)[:, None], rcond=None)[0][:count]
+    observed = np.array(rows)[:, :count].any(0)
+    logs[~observed] = np.median(logs[observed], axis=0)
     return BRIGHTEST_AT_START * np.exp(logs - logs.max())
 
 
@@ -231,43 +241,43 @@ def constant_light(block: Block, materials: Materials, cells: int) -> Light:
     """
     reflectance = np.maximum((materials.diffuse + materials.specular)[block.material], LEAST_REFLECTANCE)
     logs = np.log(np.maximum(block.radiance, LEAST_RADIANCE) / reflectance)
-    shown = [k for k in range(len(block.photos)) if (block.photo == k).any()]
+    observed = [k for k in range(len(block.photos)) if (block.photo == k).any()]
     # log of each photo's mean radiance over reflectance
     levels = np.zeros((len(block.photos), 3))
-    levels[shown] = [np.log(np.mean(np.exp(logs[block.photo == k]), axis=0)) for k in shown]
-    lobes = own_cells(block.name, cells)
+    levels[observed] = [np.log(np.mean(np.exp(logs[block.photo == k]), axis=0)) for k in observed]
+    lobes = rotated_cells(block.name, cells)
     light = Light(lobes.axis, np.log(lobes.sharpness), np.ones((cells, 3)), (levels - levels[0]).mean(1))
     return light.with_log_radiance(np.repeat(levels[0][:, None], cells, axis=1))
 
 
-def own_cells(name: str, count: int) -> UnitLobes:
+def rotated_cells(name: str, count: int) -> UnitLobes:
     """Return `count` even cells, rotated at random by the name of the illumination.
 
     The blur of the cells therefore differs from light to light.
     """
-    cells = even_cells(count)
+    cells = fibonacci_cells(count)
     seed = crc32(name.encode())
     turn = Rotation.random(rng=np.random.default_rng(seed)).as_matrix()
     return msgspec.structs.replace(cells, axis=cells.axis @ turn.T)
 
 
-def on_cells(fit: Fit, count: int, problem: JointProblem) -> Fit:
+def refine_cells(fit: Fit, count: int, problem: JointProblem) -> Fit:
     """Return a fit with its lights on `count` cells.
 
     Known lights, and lights with suns or with at least `count` cells, keep their own.
     """
     lights = []
     for light, block in zip(fit.point.lights, problem.blocks, strict=True):
-        if len(light) < count and not light.held.any() and not light.suns.any():
-            cells = own_cells(block.name, count)
+        if len(light) < count and not light.fixed.any() and not light.suns.any():
+            cells = rotated_cells(block.name, count)
             radiance = light.lobes.radiance(cells.axis)
-            on = {"axis": cells.axis, "log_sharpness": np.log(cells.sharpness), "weight": radiance}
-            light = msgspec.structs.replace(light, **on).with_log_radiance(np.log(np.maximum(radiance, 1e-12)).T)
+            lobes = {"axis": cells.axis, "log_sharpness": np.log(cells.sharpness), "weight": radiance}
+            light = msgspec.structs.replace(light, **lobes).with_log_radiance(np.log(np.maximum(radiance, 1e-12)).T)
         lights.append(light)
     return fit.with_lights(lights)
 
 
-def known_point(problem: JointProblem, earlier: Earlier, names: Sequence[str], cells: int) -> Point:
+def point_from_earlier(problem: JointProblem, earlier: Earlier, names: Sequence[str], cells: int) -> Point:
     """Return the point from which a solve with an earlier solution starts.
 
     Each component of the earlier gauge is brought to the scale of `mean_albedo` by a geometric mean.  The mean is over
@@ -279,35 +289,36 @@ def known_point(problem: JointProblem, earlier: Earlier, names: Sequence[str], c
         names: Names of the materials, by number.
         cells: Number of cells of a new light.
     """
-    blocks = problem.blocks
     component = [earlier.table.gauge.component.get(name) for name in names]
-    albedo = mean_albedo(blocks, len(names))
-    rows = starting_materials(blocks, len(names)).rows()
-    shown = {int(m) for block in blocks for m in np.unique(block.material)}
+    albedo = mean_albedo(problem.blocks, len(names))
+    rows = starting_materials(problem.blocks, len(names)).rows()
+    observed = {int(m) for block in problem.blocks for m in np.unique(block.material)}
     factors = {}
     for c in sorted({c for c in component if c is not None}):
         members = [m for m in range(len(names)) if component[m] == c]
         known = {m: earlier.table.materials[names[m]] for m in members}
-        judged = [m for m in members if m in shown] or members
-        whole = np.array([np.array(known[m].diffuse) + np.array(known[m].specular) for m in judged])
-        factor = np.exp(np.mean(np.log(albedo[judged]) - np.log(np.maximum(whole, LEAST_RADIANCE)), axis=0))
-        for m, one in known.items():
-            rows[m] = [*(one.diffuse * factor), *(one.specular * factor), one.roughness]
+        references = [m for m in members if m in observed] or members
+        sums = np.array([np.array(known[m].diffuse) + np.array(known[m].specular) for m in references])
+        factor = np.exp(np.mean(np.log(albedo[references]) - np.log(np.maximum(sums, LEAST_RADIANCE)), axis=0))
+        for m, reflectance in known.items():
+            rows[m] = [*(reflectance.diffuse * factor), *(reflectance.specular * factor), reflectance.roughness]
         factors[c] = factor
-    materials = Materials.of_vector(rows.reshape(-1))
+    materials = Materials.from_vector(rows.reshape(-1))
     lights = []
-    for block in blocks:
+    for block in problem.blocks:
         light = constant_light(block, materials, cells)
-        own = [component[m] for m in np.unique(block.material) if component[m] is not None]
-        if own:
-            factor = factors[max(set(own), key=lambda c: (own.count(c), -c))]
-            lit = Illumination(block, light, materials, problem.operator)
-            light = earlier_light(lit, earlier, factor, problem.loss)
+        components = [component[m] for m in np.unique(block.material) if component[m] is not None]
+        if components:
+            factor = factors[max(set(components), key=lambda c: (components.count(c), -c))]
+            constant = Illumination(block, light, materials, problem.operator)
+            light = light_from_earlier(constant, earlier, factor, problem.loss)
         lights.append(light)
     return Point(materials, lights)
 
 
-def earlier_light(constant: Illumination, earlier: Earlier, factor: Float[np.ndarray, "3"], loss: Loss) -> Light:
+def light_from_earlier(
+    constant: Illumination, earlier: Earlier, factor: Float[np.ndarray, "3"], loss: RobustLoss
+) -> Light:
     """Return the earlier light of a block, in the block's unit and the start's gauge.
 
     The constant light is returned if there is no earlier one, or if that explains the block worse.  A photo that the
@@ -321,26 +332,26 @@ def earlier_light(constant: Illumination, earlier: Earlier, factor: Float[np.nda
     """
     block = constant.block
     model = earlier.table.model
-    before = constant.light.log_exposure
+    constant_exposure = constant.light.log_exposure
     lobes = earlier.lights.get(block.name)
     exposure = np.array([np.log(np.mean(earlier.exposures.get(photo, (np.nan,) * 3))) for photo in block.photos])
-    new = np.isnan(exposure)
-    if not lobes or new.all():
+    is_new = np.isnan(exposure)
+    if not lobes or is_new.all():
         return constant.light
     # a new photo has its exposure in the constant light, relative to the known photos
-    exposure = np.where(new, before + np.mean(exposure[~new] - before[~new]), exposure)
+    exposure = np.where(is_new, constant_exposure + np.mean(exposure[~is_new] - constant_exposure[~is_new]), exposure)
     tone = [model.tone[photo].exponent for photo in block.photos if photo in model.tone]
     light = Light(
         lobes.axis / np.linalg.norm(lobes.axis, axis=1, keepdims=True),
         np.log(np.maximum(lobes.sharpness, SHARPNESS[0])),
         np.maximum(lobes.weight, 0) / block.unit / factor * np.exp(exposure[0]),
         exposure - exposure[0],
-        np.log(np.clip(tone, *TONE)) if len(tone) == len(block.photos) else np.zeros(0),
+        np.log(np.clip(tone, *TONE_RANGE)) if len(tone) == len(block.photos) else np.zeros(0),
         model.curvature(block.name),
     )
-    lit = msgspec.structs.replace(constant, light=light)
-    if lit.losses(loss).mean() <= constant.losses(loss).mean():
+    illumination = msgspec.structs.replace(constant, light=light)
+    if illumination.losses(loss).mean() <= constant.losses(loss).mean():
         return light
-    said = "illumination '%s' starts anew: what the earlier solution says of it explains less than a constant light"
-    log.warning(said, block.name)
+    message = "illumination '%s' starts anew: a constant light explains its photos better than the earlier solution's"
+    log.warning(message, block.name)
     return constant.light

@@ -3,18 +3,18 @@
 The sun's disc is half a degree wide and holds a quarter to two thirds of the light where it shines.  Cells spread that
 energy over all directions that the observations cannot distinguish, ten degrees and more.  An object in such a light
 has no crisp shadow.  The observations determine direction and energy far better than width, and the width of the sun is
-known.  Two lights are therefore compared (`candidate`).  In both, cells within `DISC` of the brightest direction take
-the radiance of their surroundings, and one lobe is added.  The lobe is as narrow as the sun, or as wide (`WIDE`) as a
-window or a lamp.  Its direction z and its weight w ≥ 0 minimise
+known.  Two lights are therefore compared (`replace_brightest`).  In both, cells within `DISC_RADIUS` of the brightest
+direction take the radiance of their surroundings, and one lobe is added.  The lobe is as narrow as the sun, or as wide
+(`WIDE_SHARPNESS`) as a window or a lamp.  Its direction z and its weight w ≥ 0 minimise
 
     Σ_i t_i² (r_i + A_i(z) w)²                                                                                       (1)
 
 channel by channel, with t² the weight of the robust loss and A the whitened response.  The residual is linear in w; z
 is searched over grids, coarse and then fine.  Then cells are fitted anew around either lobe.  The sun is kept if its
-light explains the observations better than cells alone (`clearly_better`).  Natural light has suns, so the comparison
-with the wide lobe rejects one only if the evidence is clearly against it (`AGAINST`).  Air scatters blue light from the
-sun into the sky, so no sun is bluer than the light as a whole.  All observations decide: a sun has five unknowns and
-replaces those of dozens of cells, so it cannot overfit.
+light explains the observations better than cells alone (`accept_sun`).  Natural light has suns, so the comparison
+with the wide lobe rejects one only if the evidence is clearly against it (`CLEARLY_AGAINST`).  Air scatters blue light
+from the sun into the sky, so no sun is bluer than the light as a whole.  All observations decide: a sun has five
+unknowns and replaces those of dozens of cells, so it cannot overfit.
 """
 
 from __future__ import annotations
@@ -26,32 +26,31 @@ import numpy as np
 from jaxtyping import Float
 
 from factorlib.geometry.sphere import fibonacci_sphere
-from factorlib.inference.evidence import AGAINST, FINER, Losses, compare
-from factorlib.inference.fit import ROBUST, Fit, Schedule
+from factorlib.inference.blocks import RobustLoss
+from factorlib.inference.fit import ROBUST, Fit, FitSchedule
+from factorlib.inference.fit_runner import FitRunner
 from factorlib.inference.forward import Illumination
 from factorlib.inference.lights import Light, UnitLobes
 from factorlib.inference.materials import Point
-from factorlib.inference.model_selection import Chosen
-from factorlib.inference.noise import Loss
+from factorlib.inference.model_selection import CLEARLY_AGAINST, WEAKLY_FOR, Losses, Selection, compare_models
 from factorlib.inference.problem import JointProblem
-from factorlib.inference.resume import Run
 from factorlib.light.lobes import SUN
 from factorlib.results.materials import Decision
 
 # Radii about the brightest direction: of the cells that a sun replaces, and of those whose radiance they take.
-DISC, SURROUNDINGS = np.radians([14, 28])
-WIDE = 1 / np.radians(4) ** 2  # λ of a lobe of 8° between its inflections
-BLUR = 1 / np.radians(5) ** 2  # λ of the blur under which the brightest direction is found
+DISC_RADIUS, RING_RADIUS = np.radians([14, 28])
+WIDE_SHARPNESS = 1 / np.radians(4) ** 2  # λ of a lobe of 8° between its inflections
+BLUR_SHARPNESS = 1 / np.radians(5) ** 2  # λ of the blur under which the brightest direction is found
 # Radius and step of the searches, degrees; each is centred on the best direction of the previous one.
 GRIDS = ((15.0, 3.0), (4.0, 0.8), (1.0, 0.2))
 # Least relative gain of the loss, and least share of the light.  On data/eames and the synthetic sets of seeds 11, 12
 # and 13, true suns hold 9 % of the light or more and lower the loss by 1.2 to 15 %.
-CLEAR = 0.01
-SHARE = 0.07
-AROUND_SUNS = Schedule(together=(0, 2), least=0.1, given=True)
+LEAST_SUN_GAIN = 0.01
+LEAST_SUN_SHARE = 0.07
+AROUND_SUNS = FitSchedule(joint_steps=(0, 2), least_temperature=0.1, materials_fixed=True)
 
 
-def suns_chosen(problem: JointProblem, fit: Fit, run: Run) -> Chosen:
+def select_suns(problem: JointProblem, fit: Fit, run: FitRunner) -> Selection:
     """Choose suns; lights without one stay as they are.
 
     Args:
@@ -59,97 +58,98 @@ def suns_chosen(problem: JointProblem, fit: Fit, run: Run) -> Chosen:
         fit: Fit of the lights.
         run: Runner of the fits.
     """
-    before = problem.illuminations(fit.point)
-    tried = list(problem.spread(partial(candidate, sharpness=SUN), before))
-    evidence = [Decision(bool(one.light.suns.any())) for one in before]
-    if all(light is one.light for light, one in zip(tried, before, strict=True)):
-        return Chosen(fit, evidence)
-    trial = run.judged("suns", problem, fit.with_lights(tried), AROUND_SUNS)
-    after = problem.illuminations(trial.point)
-    for k, (cells, sun) in enumerate(zip(before, after, strict=True)):
-        if tried[k] is not cells.light:
-            evidence[k] = clearly_better(cells, sun)
-    asked = [k for k, one in enumerate(evidence) if one.kept and one.margin is not None]
-    if asked:
-        wide = list(problem.spread(partial(candidate, sharpness=WIDE), [before[k] for k in asked]))
-        begun = Fit(Point(fit.point.materials, wide), [fit.hyperparameters[k] for k in asked])
-        problem = problem.restricted(asked)
-        other = problem.illuminations(run.judged("suns", problem, begun, AROUND_SUNS).point)
-        for k, one in zip(asked, other, strict=True):
-            narrow = compared(one, after[k], AGAINST)
-            evidence[k] = evidence[k] if narrow.kept else narrow
-    lights, hyperparameters = (
-        [new if one.kept else old for one, new, old in zip(evidence, *both, strict=True)]
-        for both in ((trial.point.lights, fit.point.lights), (trial.hyperparameters, fit.hyperparameters))
-    )
-    return Chosen(msgspec.structs.replace(fit.with_lights(lights), hyperparameters=hyperparameters), evidence)
+    without_suns = problem.illuminations(fit.point)
+    candidates = list(problem.spread(partial(replace_brightest, sharpness=SUN), without_suns))
+    evidence = [Decision(bool(cells.light.suns.any())) for cells in without_suns]
+    changed = [k for k, cells in enumerate(without_suns) if candidates[k] is not cells.light]
+    if not changed:
+        return Selection(fit, evidence)
+    # cells are fitted anew around each sun
+    trial = run.fit_and_report("suns", problem, fit.with_lights(candidates), AROUND_SUNS)
+    with_suns = problem.illuminations(trial.point)
+    for k in changed:
+        evidence[k] = accept_sun(without_suns[k], with_suns[k])
+    accepted = [k for k in changed if evidence[k].kept]
+    if accepted:
+        # a wide lobe in place of each accepted sun
+        replace_widely = partial(replace_brightest, sharpness=WIDE_SHARPNESS)
+        wide = list(problem.spread(replace_widely, [without_suns[k] for k in accepted]))
+        start = Fit(Point(fit.point.materials, wide), [fit.hyperparameters[k] for k in accepted])
+        problem = problem.select_lights(accepted)
+        wide_fit = run.fit_and_report("suns", problem, start, AROUND_SUNS)
+        for k, with_wide_lobe in zip(accepted, problem.illuminations(wide_fit.point), strict=True):
+            decision = compare_illuminations(with_wide_lobe, with_suns[k], CLEARLY_AGAINST)
+            evidence[k] = evidence[k] if decision.kept else decision
+    fits = [trial if decision.kept else fit for decision in evidence]
+    lights = [chosen.point.lights[k] for k, chosen in enumerate(fits)]
+    hyperparameters = [chosen.hyperparameters[k] for k, chosen in enumerate(fits)]
+    return Selection(msgspec.structs.replace(fit.with_lights(lights), hyperparameters=hyperparameters), evidence)
 
 
-def candidate(illumination: Illumination, sharpness: float) -> Light:
+def replace_brightest(illumination: Illumination, sharpness: float) -> Light:
     """Return the light with one lobe of the given sharpness in place of its brightest cells.
 
-    The light is unchanged if it already has a sun, if it is known, or if its cells are larger than `SURROUNDINGS`.
+    The light is unchanged if it already has a sun, if it is known, or if its cells are larger than `RING_RADIUS`.
     """
     light = illumination.light
-    block = illumination.block
-    if light.suns.any() or light.held.any() or not len(block):
+    if light.suns.any() or light.fixed.any() or not len(illumination.block):
         return light
     # brightest direction z of the blurred light, and the ring about it
-    overlap = np.exp(BLUR * (light.axis @ light.axis.T - 1))
+    overlap = np.exp(BLUR_SHARPNESS * (light.axis @ light.axis.T - 1))
     z = light.axis[int(np.argmax(overlap @ light.energy.sum(1)))]
     away = np.arccos(np.clip(light.axis @ z, -1, 1))
     u = light.log_radiance
-    ring = (away >= DISC) & (away < SURROUNDINGS)
+    ring = (away >= DISC_RADIUS) & (away < RING_RADIUS)
     if not ring.any():
         return light
     # replace the brightest cells by the median of the ring
-    u[:, away < DISC] = np.median(u[:, ring], axis=1)[:, None]
-    without = msgspec.structs.replace(illumination, light=light.with_log_radiance(u))
-    residual = without.residuals()
-    whole = illumination.residuals()
-    trust = np.sqrt(ROBUST.trust(whole) * ~(block.clipped & (whole >= 0)))
+    u[:, away < DISC_RADIUS] = np.median(u[:, ring], axis=1)[:, None]
+    dimmed = msgspec.structs.replace(illumination, light=light.with_log_radiance(u))
+    residual = dimmed.residuals()
+    original_residual = illumination.residuals()
+    trust = np.sqrt(ROBUST.weights(original_residual) * ~(illumination.block.clipped & (original_residual >= 0)))
     # (1): for each z of the grid, w = max(−Σ t² A r, 0)/Σ t² A² by channel
     for radius, step in GRIDS:
-        grid = UnitLobes(axes := _near(z, radius, step), np.full(len(axes), sharpness), light.curvature)
-        A = without.atoms(np.arange(len(block)), grid) * trust.T[:, :, None]  # [3, n, q]
+        grid = UnitLobes(axes := _grid_around(z, radius, step), np.full(len(axes), sharpness), light.curvature)
+        A = dimmed.unit_responses(np.arange(len(illumination.block)), grid) * trust.T[:, :, None]  # [3, n, q]
         along = np.einsum("cnq,nc->cq", A, trust * residual)
         size = np.einsum("cnq,cnq->cq", A, A)
         weight = np.maximum(-along, 0) / np.maximum(size, 1e-30)
         best = int(np.argmax((weight**2 * size).sum(0)))  # decrease of (1)
         z = axes[best]
         w = weight[:, best]
-    return without.light.with_lobes(UnitLobes(z[None], np.array([sharpness])), w)
+    return dimmed.light.with_lobes(UnitLobes(z[None], np.array([sharpness])), w)
 
 
-def compared(without: Illumination, richer: Illumination, least: float) -> Decision:
+def compare_illuminations(simpler: Illumination, richer: Illumination, least: float) -> Decision:
     """Return the evidence of all observations for one light against another.
 
     Args:
-        without: Observations in the simpler light.
+        simpler: Observations in the simpler light.
         richer: Observations in the richer light.
         least: Threshold in standard errors.
     """
     number = richer.block.clusters()
-    losses = [Losses([one.losses(Loss())], [number]) for one in (without, richer)]
-    return compare(losses[0], losses[1], least)
+    losses = [Losses([illumination.losses(RobustLoss())], [number]) for illumination in (simpler, richer)]
+    return compare_models(losses[0], losses[1], least)
 
 
-def clearly_better(cells: Illumination, sun: Illumination) -> Decision:
+def accept_sun(cells: Illumination, sun: Illumination) -> Decision:
     """Return the evidence for a sun; it is kept if the light with it is clearly better than cells alone.
 
-    The gain must exceed `FINER` standard errors and the share `CLEAR` of the loss.  The sun must hold at least the
-    share `SHARE` of the light and be no bluer than all of it.
+    The gain must exceed `WEAKLY_FOR` standard errors and the share `LEAST_SUN_GAIN` of the loss.  The sun must hold at
+    least the share `LEAST_SUN_SHARE` of the light and be no bluer than all of it.
     """
-    evidence = compared(cells, sun, FINER)
-    clear = (evidence.held_out_loss_without or 0.0) > (1 + CLEAR) * (evidence.held_out_loss_with or 0.0)
+    evidence = compare_illuminations(cells, sun, WEAKLY_FOR)
+    clear = (evidence.held_out_loss_without or 0.0) > (1 + LEAST_SUN_GAIN) * (evidence.held_out_loss_with or 0.0)
     energy = sun.light.energy[sun.light.suns].sum(0)
-    all_ = sun.light.energy.sum(0)
-    strong = energy.sum() >= SHARE * all_.sum()
-    warm = energy[2] * all_[0] <= all_[2] * energy[0]
+    total = sun.light.energy.sum(0)
+    strong = energy.sum() >= LEAST_SUN_SHARE * total.sum()
+    warm = energy[2] * total[0] <= total[2] * energy[0]
     return msgspec.structs.replace(evidence, kept=bool(evidence.kept and clear and strong and warm))
 
 
-def _near(z: Float[np.ndarray, "3"], radius: float, step: float) -> Float[np.ndarray, "q 3"]:
+def _grid_around(z: Float[np.ndarray, "3"], radius: float, step: float) -> Float[np.ndarray, "q 3"]:
     """Return the directions of a lattice within `radius` of z; radius and spacing `step` are in degrees."""
     lattice = fibonacci_sphere(round(4 * np.pi / np.radians(step) ** 2))
     return lattice[lattice @ z >= np.cos(np.radians(radius))]

@@ -20,7 +20,7 @@ gradients solve the system.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from functools import cached_property
 
 import msgspec
@@ -30,17 +30,22 @@ from scipy.linalg import cho_factor, cho_solve
 from scipy.sparse import block_diag, csr_array, diags_array, eye_array, hstack, kron
 from scipy.sparse.linalg import LinearOperator, cg
 
+from factorlib.geometry.camera import Camera
+from factorlib.geometry.raster import Caster, face_normals
 from factorlib.inference.blocks import Block
-from factorlib.inference.fit import ROBUST, Hyperparameters, likelihood_of
+from factorlib.inference.fit import ROBUST, Hyperparameters, light_likelihood
 from factorlib.inference.forward import Illumination
 from factorlib.light.prior import LightPrior
+from factorlib.meshes.fine import Fine
+from factorlib.meshes.mesh import scaled
+from factorlib.results.poses import ObjectEntry
 
-STEP = 0.02  # step of a normal for finite differences: about 1°
-MOST = 0.6  # largest |n' − n|: 35°
-GRAZING = 0.05  # least n'·o: a normal that would turn further stays as it is
-PULL = 0.06  # b/a, which fixes nodes without observations nearby
-ACCURACY = 3e-3  # relative tolerance of conjugate gradients
-ITERATIONS = 150  # most iterations of conjugate gradients
+NORMAL_STEP = 0.02  # step of a normal for finite differences: about 1°
+LARGEST_TURN = 0.6  # largest |n' − n|: 35°
+LEAST_VIEW_COSINE = 0.05  # least n'·o: a normal that would turn further stays as it is
+PULL_SHARE = 0.06  # b/a, which fixes nodes without observations nearby
+CG_TOLERANCE = 3e-3  # relative tolerance of conjugate gradients
+CG_ITERATIONS = 150  # most iterations of conjugate gradients
 
 
 class Attached(msgspec.Struct, frozen=True):
@@ -60,7 +65,7 @@ class Attached(msgspec.Struct, frozen=True):
         """Return the observations `rows` alone."""
         return Attached(self.node[rows], self.share[rows], self.frame[rows])
 
-    def in_frame(self, rotation: Float[np.ndarray, "3 3"]) -> Attached:
+    def rotated(self, rotation: Float[np.ndarray, "3 3"]) -> Attached:
         """Return the same positions for normals in another frame; `rotation` turns the present one into it."""
         return msgspec.structs.replace(self, frame=rotation @ self.frame)
 
@@ -69,19 +74,19 @@ class Attached(msgspec.Struct, frozen=True):
         values = self.share[:, None, :, None] * self.frame[:, :, None, :]  # observation, axis, node, its axis
         rows = (3 * np.arange(len(self.node))[:, None] + np.arange(3))[:, :, None, None]
         columns = (3 * self.node[:, :, None] + np.arange(3))[:, None]
-        rows, columns = (np.broadcast_to(of, values.shape).reshape(-1) for of in (rows, columns))
+        rows, columns = (np.broadcast_to(index, values.shape).reshape(-1) for index in (rows, columns))
         return csr_array((values.reshape(-1), (rows, columns)), (3 * len(self.node), 3 * nodes))
 
     def factor(self, log_factor: Float[np.ndarray, " v"]) -> Float[np.ndarray, " n"]:
         """Return the factors on diffuse reflectance."""
         return np.exp(np.sum(self.share * log_factor[self.node], axis=1))
 
-    def turned(
+    def turn_normals(
         self, normal: Float[np.ndarray, "n 3"], view: Float[np.ndarray, "n 3"], turn: Float[np.ndarray, "v 3"]
     ) -> Float[np.ndarray, "n 3"]:
         """Return n' of (1), unit.
 
-        |n' − n| is at most `MOST` before normalisation, and no normal turns away from the viewer.
+        |n' − n| is at most `LARGEST_TURN` before normalisation, and no normal turns away from the viewer.
 
         Args:
             normal: n, unit, in the light's frame.
@@ -89,17 +94,108 @@ class Attached(msgspec.Struct, frozen=True):
             turn: δ at all nodes.
         """
         # P R Σ_k b_k δ_{v_k}, of (1)
-        moved = np.einsum("nij,nkj,nk->ni", self.frame, turn[self.node], self.share)
-        moved -= normal * np.sum(moved * normal, 1, keepdims=True)
-        length = np.linalg.norm(moved, axis=1, keepdims=True)
-        moved = normal + moved * np.minimum(1, MOST / np.maximum(length, 1e-12))
-        moved /= np.linalg.norm(moved, axis=1, keepdims=True)
-        return np.where(np.sum(moved * view, 1, keepdims=True) < GRAZING, normal, moved)
+        turned = np.einsum("nij,nkj,nk->ni", self.frame, turn[self.node], self.share)
+        turned -= normal * np.sum(turned * normal, 1, keepdims=True)
+        length = np.linalg.norm(turned, axis=1, keepdims=True)
+        turned = normal + turned * np.minimum(1, LARGEST_TURN / np.maximum(length, 1e-12))
+        turned /= np.linalg.norm(turned, axis=1, keepdims=True)
+        return np.where(np.sum(turned * view, 1, keepdims=True) < LEAST_VIEW_COSINE, normal, turned)
 
 
-def joined(parts: Sequence[Attached]) -> Attached:
+def concatenate_attached(parts: Sequence[Attached]) -> Attached:
     """Return the observations of several parts, one after the other."""
     return Attached(*(np.concatenate([getattr(part, name) for part in parts]) for name in Attached.__struct_fields__))
+
+
+class Surfaces(msgspec.Struct, frozen=True):
+    """Subdivided meshes of a set by name, in the order of their nodes' numbers."""
+
+    meshes: dict[str, Fine]
+
+    @property
+    def first_nodes(self) -> dict[str, int]:
+        """Number of each mesh's first node."""
+        counts = [mesh.nodes for mesh in self.meshes.values()]
+        return dict(zip(self.meshes, np.cumsum([0, *counts[:-1]]).tolist()))
+
+    @property
+    def nodes(self) -> int:
+        """Number of all nodes."""
+        return sum(mesh.nodes for mesh in self.meshes.values())
+
+    def laplacian(self) -> csr_array:
+        """Return the Laplacian of all meshes, [v, v]."""
+        return csr_array(block_diag([mesh.laplacian() for mesh in self.meshes.values()]))
+
+    def displacements(
+        self, turn: Float[np.ndarray, "v 3"], attached: Sequence[Attached]
+    ) -> dict[str, Float[np.ndarray, " n"]]:
+        """Return the displacement of each mesh that best explains the turns of its nodes, in extents.
+
+        Nodes count by the observations attached to them (`Fine.displacement`).
+        """
+        weight = sum(
+            np.bincount(positions.node.reshape(-1), positions.share.reshape(-1), self.nodes) for positions in attached
+        )
+        turns = self.by_mesh(turn)
+        observed = self.by_mesh(np.minimum(weight, 1.0))
+        return {name: mesh.displacement(turns[name], observed[name]) for name, mesh in self.meshes.items()}
+
+    def by_mesh(self, values: np.ndarray) -> dict[str, np.ndarray]:
+        """Return the values of each mesh's nodes."""
+        return {name: values[k : k + self.meshes[name].nodes] for name, k in self.first_nodes.items()}
+
+    def turns_from_displacements(self, displacements: dict[str, Float[np.ndarray, " n"]]) -> Float[np.ndarray, "v 3"]:
+        """Return the turns that displacements imply; a mesh without a displacement has none."""
+        zero = {name: np.zeros((mesh.nodes, 3)) for name, mesh in self.meshes.items()}
+        turns = {name: self.meshes[name].turn_of(displacement) for name, displacement in displacements.items()}
+        return np.vstack(list((zero | turns).values()))
+
+    def node_mask(self, names: Iterable[str]) -> Bool[np.ndarray, " v"]:
+        """Return a mask of the nodes of these meshes."""
+        return np.concatenate([np.full(mesh.nodes, name in names) for name, mesh in self.meshes.items()])
+
+
+def attach_pixels(
+    pixels: Int[np.ndarray, "n 2"],
+    object_number: Int[np.ndarray, " n"],
+    camera: Camera,
+    objects: Mapping[str, tuple[str, ObjectEntry]],
+    surfaces: Surfaces,
+) -> Attached:
+    """Return the nodes under pixels (x, y), in the camera's frame.
+
+    Args:
+        pixels: Integer pixel coordinates.
+        object_number: Object in each pixel, numbered from 1 as in `align`; 0 for none.
+        camera: Camera of the photo.
+        objects: Mesh name and pose of each object, in the order of their numbers.
+        surfaces: Subdivided meshes; objects with other meshes are not attached.
+    """
+    along = camera.rays_through(pixels + 0.5)
+    count = len(pixels)
+    node = np.zeros((count, 3), np.int64)
+    share = np.zeros((count, 3))
+    frame = np.zeros((count, 3, 3))
+    for number, (mesh, entry) in enumerate(objects.values(), start=1):
+        if mesh not in surfaces.meshes:
+            continue
+        rows = np.flatnonzero(object_number == number)
+        fine = surfaces.meshes[mesh]
+        scale = np.array(entry.scale)
+        solid = scaled(fine.mesh, entry.scale)
+        # first hits of the pixels' rays, their triangles and barycentric coordinates
+        hits = Caster(solid).cast_along(along[rows], entry.pose)
+        rows = rows[hits.face >= 0]
+        face = hits.face[hits.face >= 0]
+        uv = hits.uv[hits.face >= 0]
+        node[rows] = surfaces.first_nodes[mesh] + fine.faces[face]
+        share[rows] = np.column_stack([1 - uv.sum(1), uv])
+        # R of (1), with its sign changed where the surface is seen from behind
+        toward = face_normals(solid, face) @ entry.pose.rotation.T
+        side = np.where(np.sum(toward * along[rows], 1) > 0, -1.0, 1.0)
+        frame[rows] = side[:, None, None] * entry.pose.rotation * (scale.mean() / scale)
+    return Attached(node, share, frame)
 
 
 class Detail(msgspec.Struct, frozen=True):
@@ -113,18 +209,18 @@ class Detail(msgspec.Struct, frozen=True):
     turn: Float[np.ndarray, "v 3"]
     log_factor: Float[np.ndarray, " v"]
 
-    def on(self, block: Block, attached: Attached) -> Block:
+    def apply_to(self, block: Block, attached: Attached) -> Block:
         """Return the block, which has no detail, with this detail."""
-        normal = attached.turned(block.normal, block.view, self.turn)
+        normal = attached.turn_normals(block.normal, block.view, self.turn)
         return block.on_surface(normal, attached.factor(self.log_factor))
 
 
-def no_detail(nodes: int) -> Detail:
+def zero_detail(nodes: int) -> Detail:
     """Return the detail of the mesh itself, all zero."""
     return Detail(np.zeros((nodes, 3)), np.zeros(nodes))
 
 
-class Part(msgspec.Struct, frozen=True, dict=True):
+class LightTerms(msgspec.Struct, frozen=True, dict=True):
     """Terms of one light in (2).
 
     Attributes:
@@ -152,98 +248,98 @@ class Part(msgspec.Struct, frozen=True, dict=True):
     @property
     def unexplained(self) -> Float[np.ndarray, " 3n"]:
         """Residual r − U H⁻¹ g with the light at its own optimum."""
-        return self.residual - self.of_light(cho_solve(self.factor, self.gradient))
+        return self.residual - self.residual_change(cho_solve(self.factor, self.gradient))
 
-    def without(self, gone: Bool[np.ndarray, " n"]) -> Part:
-        """Return the terms of the same light without the observations `gone`."""
-        rest = np.repeat(~gone, 3)
+    def drop_observations(self, dropped: Bool[np.ndarray, " n"]) -> LightTerms:
+        """Return the terms of the same light without the observations `dropped`."""
+        remaining = np.repeat(~dropped, 3)
         hessian = self.hessian.copy()
         p = self.cells
-        for c, U in enumerate(self.by_light[:, gone].astype(float)):
+        for c, U in enumerate(self.by_light[:, dropped].astype(float)):
             places = np.concatenate([np.arange(c * p, (c + 1) * p), np.arange(3 * p, len(hessian))])
             hessian[np.ix_(places, places)] -= U.T @ U
-        gradient = self.gradient - self.to_light(np.where(rest, 0.0, self.residual))
-        slopes = self.slopes[np.flatnonzero(rest)]
-        return Part(slopes, self.residual[rest], self.by_light[:, ~gone], hessian, gradient, p)
+        gradient = self.gradient - self.light_gradient(np.where(remaining, 0.0, self.residual))
+        slopes = self.slopes[np.flatnonzero(remaining)]
+        return LightTerms(slopes, self.residual[remaining], self.by_light[:, ~dropped], hessian, gradient, p)
 
-    def of_light(self, unknowns: Float[np.ndarray, " l"]) -> Float[np.ndarray, " 3n"]:
+    def residual_change(self, unknowns: Float[np.ndarray, " l"]) -> Float[np.ndarray, " 3n"]:
         """Return U times a change of the light."""
-        own = unknowns[: 3 * self.cells].reshape(3, -1)
+        cells = unknowns[: 3 * self.cells].reshape(3, -1)
         shared = unknowns[3 * self.cells :]
-        each = [U @ np.append(u, shared).astype(np.float32) for U, u in zip(self.by_light, own, strict=True)]
-        return np.stack(each, axis=1).reshape(-1).astype(float)
+        changes = [U @ np.append(u, shared).astype(np.float32) for U, u in zip(self.by_light, cells, strict=True)]
+        return np.stack(changes, axis=1).reshape(-1).astype(float)
 
-    def to_light(self, change: Float[np.ndarray, " 3n"]) -> Float[np.ndarray, " l"]:
+    def light_gradient(self, change: Float[np.ndarray, " 3n"]) -> Float[np.ndarray, " l"]:
         """Return Uᵀ times a change of the residuals."""
-        each = [U.T @ r.astype(np.float32) for U, r in zip(self.by_light, change.reshape(-1, 3).T, strict=True)]
-        own = [of[: self.cells] for of in each]
-        return np.concatenate([*own, np.sum([of[self.cells :] for of in each], axis=0)]).astype(float)
+        gradients = [U.T @ r.astype(np.float32) for U, r in zip(self.by_light, change.reshape(-1, 3).T, strict=True)]
+        cells = [channel[: self.cells] for channel in gradients]
+        return np.concatenate([*cells, np.sum([channel[self.cells :] for channel in gradients], axis=0)]).astype(float)
 
-    def without_light(self, change: Float[np.ndarray, " 3n"]) -> Float[np.ndarray, " 3n"]:
+    def project_out_light(self, change: Float[np.ndarray, " 3n"]) -> Float[np.ndarray, " 3n"]:
         """Return (1 − U H⁻¹ Uᵀ) times a change of the residuals."""
-        return change - self.of_light(cho_solve(self.factor, self.to_light(change)))
+        return change - self.residual_change(cho_solve(self.factor, self.light_gradient(change)))
 
 
-def part_of(
-    illumination: Illumination, counts: Hyperparameters, prior: LightPrior, attached: Attached, nodes: int
-) -> Part:
+def linearise_light(
+    illumination: Illumination, hyperparameters: Hyperparameters, prior: LightPrior, attached: Attached, nodes: int
+) -> LightTerms:
     """Linearise one light at its block's normals and detail.
 
     Held-out observations have weight 0.
 
     Args:
         illumination: Observations and light.
-        counts: Hyperparameters of the light.
+        hyperparameters: Hyperparameters of the light.
         prior: Prior on the light.
         attached: Attachment of the block's observations.
         nodes: Number of all nodes.
     """
-    likelihood = likelihood_of(illumination, counts, prior, materials_given=True)
-    own = likelihood.illumination
-    block = illumination.block
-    n = len(block)
-    p = len(own.light)
-    shown = own.shown()
+    likelihood = light_likelihood(illumination, hyperparameters, prior, materials_given=True)
+    tabulated = likelihood.illumination
+    n = len(illumination.block)
+    p = len(tabulated.light)
+    prediction = tabulated.predict()
     residual = np.zeros((n, 3))
-    by_light = np.zeros((3, n, own.light.unknowns - 2 * p), np.float32)
+    by_light = np.zeros((3, n, tabulated.light.unknowns - 2 * p), np.float32)
     by_factor = np.zeros((n, 3))
     # r, ∂r/∂log k_d and U, row by row
-    for line in own.linearise(shown, ROBUST, counts.temperature):
+    for line in tabulated.linearise(prediction, ROBUST, hyperparameters.temperature):
         residual[line.rows, line.channel] = line.residual
         by_factor[line.rows, line.channel] = line.by_material[:, 0]  # ∂r/∂log k_d
         by_light[line.channel, line.rows] = np.hstack([line.diffuse + line.specular, line.by_photo])
     system = likelihood.normal_equations(materials_given=True)
-    weight = own.pull(block.residuals(shown.radiance), ROBUST, counts.temperature)
+    whitened = illumination.block.residuals(prediction.radiance)
+    weight = tabulated.root_weights(whitened, ROBUST, hyperparameters.temperature)
     # J = [∂r/∂n R b, ∂r/∂log k_d b]
-    slopes = (_by_normal(illumination) * weight[:, :, None]).reshape(3 * n, 3)
+    slopes = (_normal_derivatives(illumination) * weight[:, :, None]).reshape(3 * n, 3)
     factors = np.repeat(attached.share, 3, axis=0) * by_factor.reshape(-1, 1)
     rows = (np.arange(3 * n).repeat(3), attached.node.repeat(3, axis=0).reshape(-1))
     painted = csr_array((factors.reshape(-1), rows), (3 * n, nodes))
-    turning = csr_array(hstack([_rows(slopes) @ attached.operator(nodes), painted]))
-    return Part(turning, residual.reshape(-1), by_light, system.light_hessian, system.light_gradient, p)
+    turning = csr_array(hstack([_block_diagonal(slopes) @ attached.operator(nodes), painted]))
+    return LightTerms(turning, residual.reshape(-1), by_light, system.light_hessian, system.light_gradient, p)
 
 
-def _rows(slopes: Float[np.ndarray, "3n 3"]) -> csr_array:
+def _block_diagonal(slopes: Float[np.ndarray, "3n 3"]) -> csr_array:
     """Return the derivatives of three channels by three axes of their own observation as a sparse matrix, [3n, 3n]."""
     rows = np.arange(len(slopes))
     columns = 3 * (rows // 3)[:, None] + np.arange(3)
     return csr_array((slopes.reshape(-1), (np.repeat(rows, 3), columns.reshape(-1))), (len(slopes), len(slopes)))
 
 
-def _by_normal(illumination: Illumination) -> Float[np.ndarray, "n 3 3"]:
+def _normal_derivatives(illumination: Illumination) -> Float[np.ndarray, "n 3 3"]:
     """Return ∂r/∂n of each observation, channel by axis, in the tangent plane of the normal."""
-    block = illumination.block
-    normal = block.normal
-    before = illumination.residuals()
+    residual_before = illumination.residuals()
     # two tangents, and finite differences of the residuals along each
-    first = np.cross(normal, np.eye(3)[np.abs(normal).argmin(1)])
-    first /= np.linalg.norm(first, axis=1, keepdims=True)
-    result = np.zeros((len(block), 3, 3))
-    for tangent in (first, np.cross(normal, first)):
-        moved = normal + STEP * tangent
-        moved /= np.linalg.norm(moved, axis=1, keepdims=True)
-        after = msgspec.structs.replace(illumination, block=msgspec.structs.replace(block, normal=moved)).residuals()
-        result += ((after - before) / STEP)[:, :, None] * tangent[:, None, :]
+    tangent_1 = np.cross(illumination.block.normal, np.eye(3)[np.abs(illumination.block.normal).argmin(1)])
+    tangent_1 /= np.linalg.norm(tangent_1, axis=1, keepdims=True)
+    result = np.zeros((len(illumination.block), 3, 3))
+    for tangent in (tangent_1, np.cross(illumination.block.normal, tangent_1)):
+        turned = illumination.block.normal + NORMAL_STEP * tangent
+        turned /= np.linalg.norm(turned, axis=1, keepdims=True)
+        residual_after = msgspec.structs.replace(
+            illumination, block=msgspec.structs.replace(illumination.block, normal=turned)
+        ).residuals()
+        result += ((residual_after - residual_before) / NORMAL_STEP)[:, :, None] * tangent[:, None, :]
     return result
 
 
@@ -259,12 +355,12 @@ class Stiffness(msgspec.Struct, frozen=True):
     factor: float | None = None
 
 
-def step(
-    parts: Sequence[Part],
+def solve_detail(
+    parts: Sequence[LightTerms],
     laplacian: csr_array,
     stiffness: Stiffness,
-    at: Detail,
-    moving: Bool[np.ndarray, " v"] | None = None,
+    detail: Detail,
+    movable: Bool[np.ndarray, " v"] | None = None,
 ) -> Detail:
     """Return the detail that minimises (2).
 
@@ -272,31 +368,33 @@ def step(
         parts: Linearised lights.
         laplacian: Laplacian of all meshes.
         stiffness: Stiffness of the detail.
-        at: Detail at which the parts were linearised.
-        moving: Mask of the nodes whose normals may turn; None for all.
+        detail: Detail at which the parts were linearised.
+        movable: Mask of the nodes whose normals may turn; None for all.
     """
-    v = len(at.log_factor)
-    both = np.concatenate([at.turn.reshape(-1), at.log_factor])
-    roughness = csr_array(laplacian + PULL * eye_array(v))
+    v = len(detail.log_factor)
+    unknowns = np.concatenate([detail.turn.reshape(-1), detail.log_factor])
+    roughness = csr_array(laplacian + PULL_SHARE * eye_array(v))
     # a L + b 1 for turns (three axes) and log factors, (2)
     prior = block_diag([kron((stiffness.turn or 0) * roughness, np.eye(3)), (stiffness.factor or 0) * roughness])
-    turning = np.repeat(np.ones(v, bool) if moving is None else moving, 3) & (stiffness.turn is not None)
+    turning = np.repeat(np.ones(v, bool) if movable is None else movable, 3) & (stiffness.turn is not None)
     free = np.append(turning, np.full(v, stiffness.factor is not None))
     slopes = [part.slopes[:, free] for part in parts]
     prior = prior.tocsr()[free][:, free]
     # −gradient, and the diagonal of the Hessian for the Jacobi preconditioner
-    right = -(prior @ both[free])
+    target = -(prior @ unknowns[free])
     diagonal = prior.diagonal()
     for part, J in zip(parts, slopes, strict=True):
-        right -= J.T @ part.unexplained
+        target -= J.T @ part.unexplained
         diagonal = diagonal + J.multiply(J).sum(0)
 
     def system(x: Float[np.ndarray, " k"]) -> Float[np.ndarray, " k"]:
         """Return the Hessian of (2) times a step."""
-        return prior @ x + sum(J.T @ part.without_light(J @ x) for part, J in zip(parts, slopes, strict=True))
+        return prior @ x + sum(J.T @ part.project_out_light(J @ x) for part, J in zip(parts, slopes, strict=True))
 
-    size = 2 * (len(right),)
+    size = 2 * (len(target),)
     preconditioner = diags_array(1 / diagonal)
-    found, _ = cg(LinearOperator(size, system, dtype=float), right, rtol=ACCURACY, maxiter=ITERATIONS, M=preconditioner)
-    both[free] += found
-    return Detail(both[: 3 * v].reshape(-1, 3), both[3 * v :])
+    step, _ = cg(
+        LinearOperator(size, system, dtype=float), target, rtol=CG_TOLERANCE, maxiter=CG_ITERATIONS, M=preconditioner
+    )
+    unknowns[free] += step
+    return Detail(unknowns[: 3 * v].reshape(-1, 3), unknowns[3 * v :])

@@ -42,16 +42,15 @@ from scipy.stats import norm
 from scipy.stats import t as student_t
 
 from factorlib.conventions import YUP_FROM_CAMERA, lat_long_directions
-from factorlib.inference.arrow import System, information
-from factorlib.inference.fit import Fit, Hyperparameters, likelihood_of, sure_ones
+from factorlib.inference.fit import Fit, Hyperparameters, light_likelihood, reliable_observations
+from factorlib.inference.fit_runner import Solution
 from factorlib.inference.forward import Illumination
 from factorlib.inference.gauge import connected_components
-from factorlib.inference.history import Solution
-from factorlib.inference.likelihood import factorised, inverse_of
+from factorlib.inference.likelihood import System, cholesky_factor, cholesky_inverse, solve_cholesky
 from factorlib.inference.materials import ROUGHNESS, Materials, Point
-from factorlib.inference.model_selection import observations_of, observations_of_lights
-from factorlib.inference.options import Choices
-from factorlib.inference.priors import materials_of, unknowns_of
+from factorlib.inference.model_selection import light_observation_count, observation_count
+from factorlib.inference.options import SolveOptions
+from factorlib.inference.priors import material_unknowns, materials_from_unknowns
 from factorlib.inference.problem import JointProblem
 from factorlib.light.lobes import squared_distances
 from factorlib.light.prior import LightPrior, read_light_prior
@@ -66,11 +65,11 @@ WIDTHS = (*[1.0] * 6, ROUGHNESS[1] - ROUGHNESS[0])  # widths of the ranges of a 
 # (data/eames and the synthetic sets of seeds 11, 12 and 13); without them 35, 32, 45 and 57 % do.
 MODEL_ERROR = np.array([0.09] * 3 + [0.25] * 3 + [0.07])
 LIGHT_ERROR = 0.7
-ROWS = 32  # rows of the maps of a light's relative standard errors
-LARGEST = 1000.0  # upper limit in these maps
+COVERAGE_ROWS = 32  # rows of the maps of a light's relative standard errors
+LARGEST_RELATIVE_ERROR = 1000.0  # upper limit in these maps
 
 
-class StandardErrors(NamedTuple):
+class MaterialErrors(NamedTuple):
     """Standard errors of the material unknowns.
 
     Attributes:
@@ -82,28 +81,28 @@ class StandardErrors(NamedTuple):
     deviation: float
 
 
-def uncertainty_of(
-    solution: Solution, problem: JointProblem, choices: Choices, tick: Callable[[], None] = lambda: None
-) -> tuple[StandardErrors, dict[str, Float[np.ndarray, "h w 3"]]]:
+def estimate_uncertainty(
+    solution: Solution, problem: JointProblem, options: SolveOptions, tick: Callable[[], None] = lambda: None
+) -> tuple[MaterialErrors, dict[str, Float[np.ndarray, "h w 3"]]]:
     """Return the standard errors of the materials in the gauge of the answer, and maps of each light's relative errors.
 
     Args:
         solution: Result of the solver.
         problem: All observations of the solve.
-        choices: Options of the user.
+        options: Options of the user.
         tick: Called after each of two systems for each light.
     """
-    problem = solution.shown(problem)
+    problem = solution.effective_problem(problem)
     prior = read_light_prior()
-    some = sure_ones(problem).sampled(observations_of(choices, solution.splitting), choices.seed)
-    all_ = problem.sampled(observations_of_lights(choices, solution.splitting), choices.seed)
-    found, deviation = Posterior(some, solution.materials, prior, tick).standard_errors()
-    fitted = solution.materials.point.materials
-    materials = solution.point.materials
-    diffuse = found.diffuse * materials.diffuse / fitted.diffuse
-    specular = found.specular * materials.specular / fitted.specular
-    errors = StandardErrors(Materials(diffuse, specular, found.roughness), deviation)
-    return errors, Posterior(all_, solution.lights, prior, tick).relative_standard_errors()
+    material_sample = reliable_observations(problem).subsample(
+        observation_count(options, solution.splitting), options.seed
+    )
+    light_sample = problem.subsample(light_observation_count(options, solution.splitting), options.seed)
+    errors_of_fit, deviation = Posterior(material_sample, solution.materials, prior, tick).standard_errors()
+    diffuse = errors_of_fit.diffuse * solution.point.materials.diffuse / solution.materials.point.materials.diffuse
+    specular = errors_of_fit.specular * solution.point.materials.specular / solution.materials.point.materials.specular
+    errors = MaterialErrors(Materials(diffuse, specular, errors_of_fit.roughness), deviation)
+    return errors, Posterior(light_sample, solution.fit, prior, tick).relative_standard_errors()
 
 
 class Posterior:
@@ -121,43 +120,45 @@ class Posterior:
         self.fit = fit
         self.prior = prior
         self.tick = tick
-        self.materials = materials_of(unknowns_of(fit.point.materials))  # reflectances above zero
+        self.materials = materials_from_unknowns(material_unknowns(fit.point.materials))  # reflectances above zero
 
     def systems(self, with_scores: bool) -> list[System]:
         """Return the system of φ of each illumination, with scores of clusters of observations if requested."""
 
-        def system(one: tuple[Illumination, Hyperparameters]) -> System:
+        def system(pair: tuple[Illumination, Hyperparameters]) -> System:
             """Return the system of one illumination."""
-            clusters = one[0].block.clusters() if with_scores else None
-            made = likelihood_of(*one, self.prior, not with_scores, self.problem.tables).normal_equations(
+            clusters = pair[0].block.clusters() if with_scores else None
+            result = light_likelihood(*pair, self.prior, not with_scores, self.problem.tables).normal_equations(
                 materials_given=True, clusters=clusters
             )
             self.tick()
-            return made
+            return result
 
-        illuminations = self.problem.fitted().illuminations(Point(self.materials, self.fit.point.lights))
+        illuminations = self.problem.without_held_out().illuminations(Point(self.materials, self.fit.point.lights))
         return list(self.problem.spread(system, list(zip(illuminations, self.fit.hyperparameters, strict=True))))
 
-    def standard_errors(self) -> StandardErrors:
+    def standard_errors(self) -> MaterialErrors:
         """Return the standard error of every material unknown."""
-        problem = self.problem
         materials = self.materials
         values = np.column_stack([materials.diffuse, materials.specular, np.ones(len(materials))])
         by_log = 1 / values.reshape(-1)  # ∂ log k/∂k
         # S and s_k, from logarithms to reflectances
         known, scores = information(self.systems(with_scores=True), len(by_log))
         scores = [of_light * by_log for of_light in scores]
-        variance = largest_variance(known * np.outer(by_log, by_log), scores, materials, problem)
-        deviation = residual_deviation(problem, self.fit.point)
+        variance = largest_variance(known * np.outer(by_log, by_log), scores, materials, self.problem)
+        deviation = residual_deviation(self.problem, self.fit.point)
         variance += ((deviation * MODEL_ERROR * values) ** 2).reshape(-1)
-        return _errors(np.where(problem.known.free(len(materials)), variance, 0.0), deviation)
+        variance = np.where(self.problem.known.free(len(materials)), variance, 0.0)
+        # an error is at most the width of its unknown's range
+        return MaterialErrors(Materials.from_rows(np.minimum(np.sqrt(variance).reshape(-1, 7), WIDTHS)), deviation)
 
     def relative_standard_errors(self) -> dict[str, Float[np.ndarray, "h w 3"]]:
         """Return maps of each light's standard error relative to its mean radiance, by illumination.
 
         The maps are lat-long, of ROWS rows, in the frame of the exported ones; values are at most LARGEST.
         """
-        directions = map_directions()
+        # directions of the maps' texels, in the frame of the blocks
+        directions = (lat_long_directions(COVERAGE_ROWS, 2 * COVERAGE_ROWS) @ YUP_FROM_CAMERA).reshape(-1, 3)
         maps = {}
         model_error = residual_deviation(self.problem, self.fit.point) * LIGHT_ERROR
         for block, light, system in zip(
@@ -166,22 +167,46 @@ class Posterior:
             free = light.free
             errors = np.empty((len(directions), 3))
             p = int(free.sum())
-            covariance = inverse_of(system.factor[: 3 * p, : 3 * p])
+            covariance = cholesky_inverse(system.factor[: 3 * p, : 3 * p])
             overlap = np.exp(-0.5 * light.sharpness * squared_distances(directions, light.axis))
             for c in range(3):
-                own = slice(c * p, (c + 1) * p)
+                cells = slice(c * p, (c + 1) * p)
                 slope = (overlap * light.weight[:, c])[:, free]
                 # gᵀ Σ g plus LIGHT_ERROR in quadrature
-                variance = np.maximum(np.sum(slope @ covariance[own, own] * slope, axis=1), 0)
+                variance = np.maximum(np.sum(slope @ covariance[cells, cells] * slope, axis=1), 0)
                 errors[:, c] = np.hypot(np.sqrt(variance), model_error * slope.sum(1))
             mean = light.energy.sum(0) / 2  # `energy` is over 2π, a mean over 4π
-            maps[block.name] = np.minimum(errors / mean, LARGEST).reshape(ROWS, 2 * ROWS, 3)
+            maps[block.name] = np.minimum(errors / mean, LARGEST_RELATIVE_ERROR).reshape(
+                COVERAGE_ROWS, 2 * COVERAGE_ROWS, 3
+            )
         return maps
 
 
-def map_directions() -> Float[np.ndarray, "d 3"]:
-    """Return the directions of the texels of a map of ROWS rows, in the frame of the blocks."""
-    return (lat_long_directions(ROWS, 2 * ROWS) @ YUP_FROM_CAMERA).reshape(-1, 3)
+def information(
+    systems: Sequence[System], size: int
+) -> tuple[Float[np.ndarray, "k k"], list[Float[np.ndarray, "g k"]]]:
+    """Return the materials' information and the scores of clusters, with the lights eliminated.
+
+    Args:
+        systems: Contribution of each light.
+        size: Number of material unknowns.
+
+    Returns:
+        The left side of (3) [size, size], and for each light with scores their values [g, size] less the part that the
+        light absorbs.
+    """
+    hessian = np.zeros((size, size))
+    scores = []
+    for part in systems:
+        coupling = solve_cholesky(part.factor, part.cross_hessian.T)
+        # Σ M − C_i L_i⁻¹ C_iᵀ
+        hessian[np.ix_(part.places, part.places)] += part.material_hessian - part.cross_hessian @ coupling
+        if part.scores is not None:
+            k = len(part.places)
+            scores.append(np.zeros((len(part.scores), size)))
+            # s_m − s_l L_i⁻¹ C_iᵀ
+            scores[-1][:, part.places] = part.scores[:, :k] - part.scores[:, k:] @ coupling
+    return (hessian + hessian.T) / 2, scores
 
 
 def residual_deviation(problem: JointProblem, point: Point) -> float:
@@ -190,8 +215,8 @@ def residual_deviation(problem: JointProblem, point: Point) -> float:
     Clipped values are left out, because a satisfied bound has no residual.
     """
     pairs = list(zip(problem.residuals(point), problem.blocks, strict=True))
-    whole = np.concatenate([residual[~block.clipped] for residual, block in pairs])
-    return robust_deviation(whole if len(whole) else np.concatenate([residual for residual, _ in pairs]))
+    residuals = np.concatenate([residual[~block.clipped] for residual, block in pairs])
+    return robust_deviation(residuals if len(residuals) else np.concatenate([residual for residual, _ in pairs]))
 
 
 def largest_variance(
@@ -218,18 +243,15 @@ def largest_variance(
     scales = np.outer(scale, scale)
     # S, made positive definite by the ranges of the unknowns, and its inverse
     values, vectors = np.linalg.eigh(information[np.ix_(free, free)] / scales)
-    own = (vectors * np.maximum(values, 0.0)) @ vectors.T + np.diag(
+    regularised = (vectors * np.maximum(values, 0.0)) @ vectors.T + np.diag(
         np.tile(WIDTHS, len(materials))[free] ** -2.0 / scale**2
     )
-    inverse[np.ix_(free, free)] = inverse_of(factorised(own)) / scales
-    whole = np.array([s.sum(0) for s in scores])
-    covariances = inverse, sandwich(inverse, np.vstack(scores)), sandwich(inverse, whole)
-    return np.max([np.diag(in_gauge(each, materials, problem)) for each in covariances], axis=0).clip(0)
-
-
-def _errors(variance: Float[np.ndarray, " 7m"], deviation: float) -> StandardErrors:
-    """Return standard errors that are at most the width of each unknown's range."""
-    return StandardErrors(Materials.of_rows(np.minimum(np.sqrt(variance).reshape(-1, 7), WIDTHS)), deviation)
+    inverse[np.ix_(free, free)] = cholesky_inverse(cholesky_factor(regularised)) / scales
+    light_sums = np.array([s.sum(0) for s in scores])
+    covariances = inverse, sandwich(inverse, np.vstack(scores)), sandwich(inverse, light_sums)
+    return np.max(
+        [np.diag(project_to_gauge(covariance, materials, problem)) for covariance in covariances], axis=0
+    ).clip(0)
 
 
 def sandwich(inverse: Float[np.ndarray, "k k"], scores: Float[np.ndarray, "g k"]) -> Float[np.ndarray, "k k"]:
@@ -241,11 +263,11 @@ def sandwich(inverse: Float[np.ndarray, "k k"], scores: Float[np.ndarray, "g k"]
     if count < 2:
         return np.zeros_like(inverse)
     # S⁻¹ (Σ_k s_k s_kᵀ · K/(K − 1)) S⁻¹, (1), times the squared t quantile of one standard deviation
-    few = float(student_t.ppf(norm.cdf(1), count - 1))
-    return few**2 * inverse @ (scores.T @ scores) @ inverse * count / (count - 1)
+    quantile = float(student_t.ppf(norm.cdf(1), count - 1))
+    return quantile**2 * inverse @ (scores.T @ scores) @ inverse * count / (count - 1)
 
 
-def in_gauge(
+def project_to_gauge(
     covariance: Float[np.ndarray, "k k"], materials: Materials, problem: JointProblem
 ) -> Float[np.ndarray, "k k"]:
     """Return the covariance with the sum of each component fixed in as many channels as have a free factor.
@@ -257,13 +279,13 @@ def in_gauge(
     """
     rows = materials.rows()
     for members, illuminations in connected_components(problem.blocks, len(materials)):
-        factors = problem.known.factors(members, illuminations)
+        factors = problem.known.free_factors(members, illuminations)
         for columns in {3: [[0, 3], [1, 4], [2, 5]], 1: [[*range(6)]], 0: []}[factors]:
             g = np.zeros(rows.shape)
             h = np.zeros(rows.shape)
-            own = np.ix_(members, columns)
-            g[own] = rows[own]
-            h[own] = 1
+            entries = np.ix_(members, columns)
+            g[entries] = rows[entries]
+            h[entries] = 1
             # P = I − g hᵀ / (hᵀ g)
             P = np.eye(rows.size) - np.outer(g, h) / np.vdot(h, g)
             covariance = P @ covariance @ P.T

@@ -22,7 +22,7 @@ LONGEST = 0.5  # largest |X|: a point more than halfway to the light is treated 
 A = Any  # np.ndarray or torch.Tensor
 
 
-def met_from(place: A, normal: A, view: A, axis: A, curvature: float) -> tuple[A, A, A]:
+def finite_distance_cosines(place: A, normal: A, view: A, axis: A, curvature: float) -> tuple[A, A, A]:
     """Return n·z', o·z' and w'/w of (1), each [n, p].
 
     All vectors are in one frame; n, o and z are unit.  |X| is limited to `LONGEST`.
@@ -40,11 +40,11 @@ def met_from(place: A, normal: A, view: A, axis: A, curvature: float) -> tuple[A
     # d = |z − X|, then (1)
     along = X @ axis.T
     d = (1 - 2 * along + (X * X).sum(1)[:, None]) ** 0.5
-    nz, oz = ((of @ axis.T - (of * X).sum(1)[:, None]) / d for of in (normal, view))
+    nz, oz = ((vectors @ axis.T - (vectors * X).sum(1)[:, None]) / d for vectors in (normal, view))
     return nz.clip(-1.0, 1.0), oz.clip(-1.0, 1.0), (1 - along) / d**3
 
 
-def places_of(
+def relative_positions(
     view: Float[np.ndarray, "n 3"], depth: Float[np.ndarray, " n"], weight: Float[np.ndarray, " n"]
 ) -> Float[np.ndarray, "n 3"]:
     """Return x of the n points of a photo, in the camera frame.

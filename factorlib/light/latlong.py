@@ -56,9 +56,9 @@ def lattice_of_lobes(
     result = np.zeros((height, width, 3))
     lobes = lobes.turned(YUP_FROM_CAMERA)
     row, column = lat_long_of_direction(lobes.axis)
-    lit = lobes.weight.any(axis=1)
+    bright = lobes.weight.any(axis=1)
     for theta, phi, sharpness, weight in zip(
-        np.pi * row[lit], 2 * np.pi * column[lit], lobes.sharpness[lit], lobes.weight[lit], strict=True
+        np.pi * row[bright], 2 * np.pi * column[bright], lobes.sharpness[bright], lobes.weight[bright], strict=True
     ):
         rows, columns, mean = _means(theta, phi, sharpness, *nodes(sharpness))
         result[rows[:, None], columns] += mean[..., None] * weight
@@ -96,7 +96,7 @@ def map_energy(lat_long: Map) -> Float[np.ndarray, "3"]:
     return np.einsum("h,hwc->c", lat_long_solid_angles(*lat_long.shape[:2]), lat_long)
 
 
-def sampled(lat_long: Map, directions: Float[np.ndarray, "*n 3"]) -> Float[np.ndarray, "*n 3"]:
+def sample_map(lat_long: Map, directions: Float[np.ndarray, "*n 3"]) -> Float[np.ndarray, "*n 3"]:
     """Interpolate a map bilinearly between texel centres.
 
     The directions are unit vectors in the map's frame.  The result is continuous over the poles.
@@ -122,7 +122,7 @@ def _texel(lat_long: Map, i: np.ndarray, j: np.ndarray) -> np.ndarray:
     return lat_long[i, (j + np.where(beyond, width // 2, 0)) % width]
 
 
-def turned_map(lat_long: Map, rotation: Float[np.ndarray, "3 3"], finer: int = 4) -> Map:
+def rotate_map(lat_long: Map, rotation: Float[np.ndarray, "3 3"], finer: int = 4) -> Map:
     """Return the map in another frame, each texel the mean of finer × finer samples.
 
     Args:
@@ -133,7 +133,7 @@ def turned_map(lat_long: Map, rotation: Float[np.ndarray, "3 3"], finer: int = 4
     height, width = lat_long.shape[:2]
     directions = lat_long_directions(finer * height, finer * width)
     weight = np.repeat(lat_long_solid_angles(finer * height, finer * width)[:, None], finer * width, axis=1)
-    fine = sampled(lat_long, directions @ np.asarray(rotation)) * weight[..., None]
+    fine = sample_map(lat_long, directions @ np.asarray(rotation)) * weight[..., None]
 
     def cells(values: np.ndarray) -> np.ndarray:
         """Return sums over the finer texels of each texel."""

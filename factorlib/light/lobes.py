@@ -48,9 +48,9 @@ class Lobes(msgspec.Struct, frozen=True):
         """Mask of the lobes that are as narrow as the sun."""
         return self.sharpness > 0.9 * SUN
 
-    def take(self, which: Bool[np.ndarray, " p"]) -> Lobes:
+    def take(self, selected: Bool[np.ndarray, " p"]) -> Lobes:
         """Return the light of the selected lobes."""
-        return Lobes(self.axis[which], self.sharpness[which], self.weight[which])
+        return Lobes(self.axis[selected], self.sharpness[selected], self.weight[selected])
 
     @property
     def energy(self) -> Float[np.ndarray, "3"]:

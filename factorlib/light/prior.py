@@ -41,7 +41,7 @@ SHIPPED = Path(__file__).with_name("prior.json")
 Three = tuple[float, float, float]
 
 
-class Source(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+class SourceMap(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """Map that a prior was fitted to.
 
     Attributes:
@@ -91,7 +91,7 @@ class LightPrior(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     profile: tuple[Three, Three, Three]
     cell_deg: float
     freedom: Three = (1e4, 1e4, 1e4)
-    made_from: tuple[Source, ...] = ()
+    made_from: tuple[SourceMap, ...] = ()
     leave_one_out: LeaveOneOut | None = None
 
     def covariance(self, k: int, directions: Float[np.ndarray, "p 3"]) -> Float[np.ndarray, "p p"]:

@@ -72,15 +72,15 @@ def kernel(
         sharpness: λ of the lobes.
     """
     distance = torch.cdist(directions, axis, compute_mode="donot_use_mm_for_euclid_dist")
-    return torch.exp((-0.5 * widened(sharpness, len(directions)) * distance**2).clamp_min(FAINTEST))
+    return torch.exp((-0.5 * widened_sharpness(sharpness, len(directions)) * distance**2).clamp_min(FAINTEST))
 
 
-def widened(sharpness: Float[Tensor, " p"], count: int) -> Float[Tensor, " p"]:
+def widened_sharpness(sharpness: Float[Tensor, " p"], count: int) -> Float[Tensor, " p"]:
     """Return κ of lobes sampled at `count` directions."""
     return 1 / (1 / sharpness + 1 / widest_sharpness(count))
 
 
-def seen_share(
+def visible_share(
     visibility: Float[Tensor, "n k"], weights: Float[Tensor, "n k"], lobes: Float[Tensor, "k p"]
 ) -> Float[Tensor, "n p"]:
     """Return v of (1) and (2), the share of each lobe's reflected light that is visible.

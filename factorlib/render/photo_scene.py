@@ -16,7 +16,7 @@ from factorlib.conventions import YUP_FROM_CAMERA
 from factorlib.export.environment import NARROWEST, mitsuba_map
 from factorlib.export.scene import ALL_BOUNCES, DIRECT
 from factorlib.geometry.camera import Camera, rotation_of_vector
-from factorlib.light.latlong import turned_map
+from factorlib.light.latlong import rotate_map
 from factorlib.light.lobes import Lobes, lobe_integral
 from factorlib.meshes.mesh import Mesh
 from factorlib.meshes.ply import submesh
@@ -246,4 +246,4 @@ def turned_light(light: Light, angle_deg: float) -> Light:
     turn = rotation_of_vector(np.radians(angle_deg) * UP)
     if isinstance(light, Lobes):
         return light.turned(YUP_FROM_CAMERA @ turn @ YUP_FROM_CAMERA)
-    return turned_map(light, turn, finer=2)
+    return rotate_map(light, turn, finer=2)

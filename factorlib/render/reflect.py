@@ -14,9 +14,9 @@ from jaxtyping import Float, UInt8
 from torch import Tensor
 
 from factorlib.geometry.sphere import fibonacci_sphere
-from factorlib.light.distance import met_from
+from factorlib.light.distance import finite_distance_cosines
 from factorlib.light.lobes import Lobes
-from factorlib.light.visibility import cosine_weights, highlight_weights, kernel, seen_share
+from factorlib.light.visibility import cosine_weights, highlight_weights, kernel, visible_share
 from factorlib.reflection import Operator
 from factorlib.results.materials import Reflectance
 
@@ -97,7 +97,7 @@ class Reflector:
         oz = (views @ self.axis.T).clamp(-1, 1)
         shares = [1.0, 1.0] if visibility is None else self._seen(visibility, normals, views, float(roughness))
         if place is not None and self.curvature > 0:
-            nz, oz, larger = met_from(place, normals, views, self.axis, self.curvature)
+            nz, oz, larger = finite_distance_cosines(place, normals, views, self.axis, self.curvature)
             shares = [larger * share for share in shares]
         # diffuse part plus specular part, summed over lobes
         radiance = kd * ((shares[0] * self.operator.diffuse(self.sharpness, nz)) @ self.weight)
@@ -114,4 +114,4 @@ class Reflector:
         visibility, normals, views = visibility.float() / 255, normals.float(), views.float()
         lobes = kernel(directions, self.axis.float(), self.sharpness.float())
         weights = cosine_weights(normals, directions), highlight_weights(normals, views, directions, roughness)
-        return [seen_share(visibility, weight, lobes).to(self.operator.dtype) for weight in weights]
+        return [visible_share(visibility, weight, lobes).to(self.operator.dtype) for weight in weights]

@@ -20,7 +20,7 @@ from jaxtyping import Float
 
 from factorlib.conventions import lat_long_directions, lat_long_solid_angles
 from factorlib.geometry.camera import Camera
-from factorlib.light.latlong import sampled
+from factorlib.light.latlong import sample_map
 from factorlib.meshes.mesh import Mesh
 from factorlib.meshes.ply import write_ply
 from factorlib.results.materials import Reflectance
@@ -216,7 +216,7 @@ def rendered(
 def envmap(lat_long: Float[np.ndarray, "h w 3"], finer: int = ENVMAP_FINER) -> dict[str, Any]:
     """Return an emitter of a lat-long map in the world's frame, bilinear between the map's texel centres."""
     height, width = lat_long.shape[:2]
-    return envmap_of_nodes(sampled(lat_long, node_directions(finer * height + 1, finer * width)))
+    return envmap_of_nodes(sample_map(lat_long, node_directions(finer * height + 1, finer * width)))
 
 
 def envmap_of_nodes(radiance: Float[np.ndarray, "h w 3"]) -> dict[str, Any]:

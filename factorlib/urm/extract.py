@@ -12,7 +12,7 @@ import msgspec
 import numpy as np
 from jaxtyping import Bool, Float
 
-from factorlib.light.distance import places_of
+from factorlib.light.distance import relative_positions
 from factorlib.urm.observations import Observations
 
 Channels = Mapping[str, Float[np.ndarray, "h w"]]
@@ -75,7 +75,7 @@ def observations_of_photo(
 
     normal, view = (gather(geometry, [f"{name}.{axis}" for axis in "xyz"]) for name in ("normal", "view"))
     normal, view = (v / np.maximum(np.linalg.norm(v, axis=-1, keepdims=True), 1e-12) for v in (normal, view))
-    place = places_of(view, geometry["depth"][seen].astype(float), sure)
+    place = relative_positions(view, geometry["depth"][seen].astype(float), sure)
     return Observations(
         normal,
         view,

@@ -10,14 +10,13 @@ import numpy as np
 
 from factorlib.evaluate.ball import light_of_lat_long
 from factorlib.evaluate.materials import common_factor
-from factorlib.inference.blocks import Block
+from factorlib.inference.blocks import Block, Noise
+from factorlib.inference.fit_runner import Solution
 from factorlib.inference.forward import Illumination
-from factorlib.inference.history import Solution
 from factorlib.inference.joint_solver import solve
-from factorlib.inference.noise import Noise
 from factorlib.inference.observed import blocks_of_observations
 from factorlib.inference.problem import JointProblem
-from factorlib.inference.start import from_nothing
+from factorlib.inference.start import start_from_photos
 from factorlib.reflection import reflection_operator
 from factorlib.results.materials import Reflectance
 from factorlib.urm.merge import merge
@@ -49,7 +48,7 @@ def rows() -> Tables:
         blocks = blocks_of_observations(concatenate([merge(photo, MERGE_DEGREES) for photo in photos]), Noise())
         problem = JointProblem(blocks, operator)  # one thread: seconds are those of the work itself
         clock = Clock()
-        solution = solve(problem, from_nothing(len(truth)))
+        solution = solve(problem, start_from_photos(len(truth)))
         seconds = f"{clock.taken().processor:.0f}"
         table.append([name, seconds, *_errors(solution, truth, problem, whole)])
         print(*table[-1], sep="; ", flush=True)

@@ -40,7 +40,7 @@ from factorlib.conventions import lat_long_directions, lat_long_solid_angles
 from factorlib.geometry.sphere import fibonacci_sphere
 from factorlib.images.light_map import maps_in, read_light_map
 from factorlib.jsonfile import json_text, write_json
-from factorlib.light.prior import MIX, LeaveOneOut, LightPrior, Source, angles, correlation
+from factorlib.light.prior import MIX, LeaveOneOut, LightPrior, SourceMap, angles, correlation
 from factorlib.reading import read_bytes
 
 CELLS = 400  # cells of equal area, some 10° apart
@@ -65,7 +65,7 @@ def prior_of(paths: Sequence[Path], scored: bool = True) -> LightPrior:
     """
     cells = fibonacci_sphere(CELLS)
     logs = log_cells(np.stack([cell_means(read_light_map(path), cells) for path in tqdm(paths, desc="reading")]))
-    sources = tuple(Source(path.name, hashlib.sha256(read_bytes(path, "a light map")).hexdigest()) for path in paths)
+    sources = tuple(SourceMap(path.name, hashlib.sha256(read_bytes(path, "a light map")).hexdigest()) for path in paths)
     scores = leave_one_out(logs, cells) if scored and len(paths) > 1 else None
     return rounded(msgspec.structs.replace(fitted(logs, cells), made_from=sources, leave_one_out=scores))
 

@@ -21,7 +21,7 @@ from factorlib.export.usd import write_usd_mesh
 from factorlib.generate.folder import write_codes, write_obj, write_yaml
 from factorlib.images.exr import LAT_LONG, write_exr, write_rgb_exr
 from factorlib.images.picture import write_png
-from factorlib.inference.history import Event
+from factorlib.inference.fit_runner import Event
 from factorlib.jsonfile import write_json
 from factorlib.meshes.mesh import Mesh
 from factorlib.meshes.ply import write_ply

@@ -14,7 +14,7 @@ from factorlib.generate.chair import chair, labelled
 from factorlib.images.exr import read_exr, read_rgb_exr, write_rgb_exr
 from factorlib.images.photo import read_photo
 from factorlib.images.picture import read_png
-from factorlib.light.latlong import sampled
+from factorlib.light.latlong import sample_map
 from factorlib.meshes.read import read_mesh
 from tests.runner.toy import files_of
 
@@ -67,7 +67,7 @@ def test_a_matte_pixel_is_its_irradiance(small):
 def irradiance_of(normal, light):
     """∫ L max(n·i, 0) di over the texels of a map in the normals' frame, [n, 3]."""
     height, width = 64, 128
-    light = sampled(light, lat_long_directions(height, width))
+    light = sample_map(light, lat_long_directions(height, width))
     cosine = np.maximum(np.einsum("nd,hwd->nhw", normal, lat_long_directions(height, width)), 0)
     return np.einsum("nhw,hwc,h->nc", cosine, light, lat_long_solid_angles(height, width))
 

@@ -18,6 +18,11 @@ from tests.integral import reflected
 OPERATOR = reflection_operator("closed_form", dtype="float64")
 
 
+def none_held_out(block: Block) -> Block:
+    """The same observations, none held out."""
+    return msgspec.structs.replace(block, held_out=np.zeros(len(block), bool))
+
+
 def guessed(rng: np.random.Generator, data, curves: bool) -> Illumination:
     """A block of two photos in a wrong light of four lobes, with tone curves or without."""
     guess, tone = random_light(rng, 4, photos=2), np.log([1.3, 0.8]) if curves else np.zeros(0)

@@ -5,14 +5,14 @@ from functools import cache
 import msgspec
 import numpy as np
 
-from factorlib.inference.fit import Fit, Hyperparameters, Schedule, fitted, likelihood_of, start_of
+from factorlib.inference.blocks import RobustLoss
+from factorlib.inference.fit import Fit, FitSchedule, Hyperparameters, fit_problem, initial_fit, light_likelihood
 from factorlib.inference.forward import Illumination
-from factorlib.inference.lights import PEAK, Light, even_cells
+from factorlib.inference.lights import PEAK, Light, fibonacci_cells
 from factorlib.inference.likelihood import LightLikelihood
 from factorlib.inference.materials import Materials, Point
-from factorlib.inference.noise import Loss
 from factorlib.inference.problem import JointProblem
-from factorlib.inference.start import constant_light, own_cells
+from factorlib.inference.start import constant_light, rotated_cells
 from factorlib.light.prior import MIX, read_light_prior
 from factorlib.reflection import reflection_operator
 from studies.scenes.problems import MATERIALS, block
@@ -21,12 +21,12 @@ from tests.inference.made import in_units_of
 FEW = 120  # cells, so that tests are quick
 OPERATOR, PRIOR = reflection_operator("network"), read_light_prior()
 START = Materials(np.full((3, 3), 0.3), np.full((3, 3), 0.1), np.full(3, 0.4))
-WHOLE = Schedule(4, (14, 10))
+WHOLE = FitSchedule(4, (14, 10))
 
 
 def drawn(seed: int, cells: int) -> np.ndarray:
     """Log radiance [3, p] drawn from the prior, without the level of its exposure."""
-    rng, axis, fields = np.random.default_rng(seed), even_cells(cells).axis, []
+    rng, axis, fields = np.random.default_rng(seed), fibonacci_cells(cells).axis, []
     for k in range(3):
         covariance = PRIOR.covariance(k, axis) - (PRIOR.level[0] if k == 0 else 0.0)
         fields.append(np.linalg.cholesky(covariance + 1e-9 * np.eye(cells)) @ rng.normal(size=cells))
@@ -35,7 +35,7 @@ def drawn(seed: int, cells: int) -> np.ndarray:
 
 def on_even_cells(u: np.ndarray, log_exposure=(0.0,), log_tone=(), name=None) -> Light:
     """The light of log radiance u [3, p] on even cells, turned as a solve turns those of the illumination `name`, where it is given."""
-    lobes = even_cells(u.shape[1]) if name is None else own_cells(name, u.shape[1])
+    lobes = fibonacci_cells(u.shape[1]) if name is None else rotated_cells(name, u.shape[1])
     return Light(lobes.axis, np.log(lobes.sharpness), PEAK * np.exp(u.T), np.array(log_exposure), np.array(log_tone))
 
 
@@ -54,7 +54,7 @@ def spheres(lights, materials=MATERIALS, shown=(0, 1, 2), size=14, noise=0.3, se
         clean = block(f"room{k}", light, materials, list(shown), OPERATOR, size=size, seed=k)
         noisy = clean.radiance + noise * rng.normal(size=clean.radiance.shape) / clean.precision
         blocks.append(msgspec.structs.replace(clean, radiance=np.maximum(noisy, 0.0)))
-    return JointProblem(blocks, OPERATOR, Loss())
+    return JointProblem(blocks, OPERATOR, RobustLoss())
 
 
 def photographed(seed: int, lights: int, cells: int = FEW, **how) -> tuple[JointProblem, list[Light]]:
@@ -66,17 +66,17 @@ def photographed(seed: int, lights: int, cells: int = FEW, **how) -> tuple[Joint
 
 def begun(problem: JointProblem, cells: int = FEW, materials: Materials = START) -> Fit:
     """The start of a fit: wrong materials in constant lights."""
-    return start_of(Point(materials, [constant_light(one, materials, cells) for one in problem.blocks]))
+    return initial_fit(Point(materials, [constant_light(one, materials, cells) for one in problem.blocks]))
 
 
 @cache
 def natural() -> tuple[JointProblem, list[Light], Fit]:
     """Spheres in three lights drawn from the prior, the lights, and the fit."""
     problem, true = photographed(5, 3)
-    return problem, true, fitted(problem, begun(problem), PRIOR, WHOLE)
+    return problem, true, fit_problem(problem, begun(problem), PRIOR, WHOLE)
 
 
 def likelihood(problem, light, materials=MATERIALS, temperature=2.0, prior=PRIOR) -> LightLikelihood:
     """That of the first illumination, without outliers."""
     one = Illumination(problem.blocks[0], light, materials, OPERATOR)
-    return msgspec.structs.replace(likelihood_of(one, Hyperparameters(temperature), prior), loss=Loss(1e3))
+    return msgspec.structs.replace(light_likelihood(one, Hyperparameters(temperature), prior), loss=RobustLoss(1e3))

@@ -6,9 +6,17 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from factorlib.inference.evidence import AGAINST, FOR, LEAST_LOSS, Losses, compare, losses_of
 from factorlib.inference.materials import Point
+from factorlib.inference.model_selection import (
+    CLEARLY_AGAINST,
+    CLEARLY_FOR,
+    LEAST_LOSS,
+    Losses,
+    compare_models,
+    held_out_losses,
+)
 from studies.scenes.problems import MATERIALS
+from tests.inference.made import none_held_out
 from tests.inference.made_lights import photographed
 
 
@@ -33,7 +41,7 @@ FEW_EXAMPLES = settings(max_examples=25, deadline=None, derandomize=True)
 @given(**ANY, factor=st.floats(0.5, 1000))
 def test_models_swapped_change_the_sign_and_the_order_of_lights_and_the_scale_of_a_light_nothing(factor, **how):
     without, richer = made(**how)
-    one, other = compare(without, richer, FOR), compare(richer, without, FOR)
+    one, other = compare_models(without, richer, CLEARLY_FOR), compare_models(richer, without, CLEARLY_FOR)
     assert one.margin == pytest.approx(-other.margin, rel=1e-9, abs=1e-9)
     assert one.held_out_loss_with == other.held_out_loss_without
     assert one.held_out_loss_without == other.held_out_loss_with
@@ -42,27 +50,27 @@ def test_models_swapped_change_the_sign_and_the_order_of_lights_and_the_scale_of
         return Losses([factor * v if k in which else v for k, v in enumerate(losses.values)], losses.clusters)
 
     turned = (Losses(losses.values[::-1], losses.clusters[::-1]) for losses in (without, richer))
-    assert compare(*turned, FOR).margin == pytest.approx(one.margin, rel=1e-9)
+    assert compare_models(*turned, CLEARLY_FOR).margin == pytest.approx(one.margin, rel=1e-9)
     for which in ({0}, set(range(5))):
-        found = compare(scaled(without, which), scaled(richer, which), FOR).margin
+        found = compare_models(scaled(without, which), scaled(richer, which), CLEARLY_FOR).margin
         assert found == pytest.approx(one.margin, rel=0.01, abs=1e-3)
 
 
 @pytest.mark.parametrize("lights", [1, 3])
 def test_no_gain_is_no_evidence_either_way(lights):
     same, _ = made(0, lights)
-    found = compare(same, same, FOR)
-    assert not found.kept and found.margin == 0 and compare(same, same, AGAINST).kept
+    found = compare_models(same, same, CLEARLY_FOR)
+    assert not found.kept and found.margin == 0 and compare_models(same, same, CLEARLY_AGAINST).kept
 
 
 def test_nothing_held_out_decides_nothing():
     nothing, (one, better) = np.zeros(0), made(0, 1, gain=1.0)
     numbers = nothing.astype(int)
-    for least in (FOR, AGAINST):
-        found = compare(Losses([nothing], [numbers]), Losses([nothing], [numbers]), least)
+    for least in (CLEARLY_FOR, CLEARLY_AGAINST):
+        found = compare_models(Losses([nothing], [numbers]), Losses([nothing], [numbers]), least)
         assert not found.kept and found.margin is None and found.held_out_loss_with is None
     both = [Losses([nothing, *of.values], [numbers, *of.clusters]) for of in (one, better)]
-    assert compare(*both, FOR).margin == pytest.approx(compare(one, better, FOR).margin)
+    assert compare_models(*both, CLEARLY_FOR).margin == pytest.approx(compare_models(one, better, CLEARLY_FOR).margin)
 
 
 def test_chance_is_rarely_evidence_though_residuals_are_alike():
@@ -77,9 +85,9 @@ def test_chance_is_rarely_evidence_though_residuals_are_alike():
             Losses([v * e[k][c] for v, e, c in zip(same.values, err, same.clusters, strict=True)], same.clusters)
             for k in (0, 1)
         ]
-        kept.append(compare(*both, FOR).kept)
+        kept.append(compare_models(*both, CLEARLY_FOR).kept)
         alone = [Losses(of.values, [np.arange(len(v)) for v in of.values]) for of in both]
-        singly.append(compare(*alone, FOR).kept)
+        singly.append(compare_models(*alone, CLEARLY_FOR).kept)
     assert np.mean(kept) < 0.05 and np.mean(singly) > 3 * np.mean(kept), (np.mean(kept), np.mean(singly))
 
 
@@ -89,21 +97,24 @@ def test_each_light_counts_relative_to_itself():
     without, richer = [one, one, 100 * other], [one / 2, one / 2, 101 * other]
     assert sum(losses.sum() for losses in richer) > sum(losses.sum() for losses in without)
     numbers = [np.arange(len(v)) for v in without]
-    found = compare(Losses(without, numbers), Losses(richer, numbers), FOR)
-    assert found.kept and not compare(Losses(richer, numbers), Losses(without, numbers), FOR).kept
+    found = compare_models(Losses(without, numbers), Losses(richer, numbers), CLEARLY_FOR)
+    assert found.kept and not compare_models(Losses(richer, numbers), Losses(without, numbers), CLEARLY_FOR).kept
     logarithms = np.log([[1, 1, 200], [0.5, 0.5, 202]]) @ [0.25, 0.25, 0.5]  # by their counts
     np.testing.assert_allclose([found.held_out_loss_without, found.held_out_loss_with], np.exp(logarithms), rtol=1e-3)
     exact, numbers = np.full(5, 1e-9), [np.arange(5)]
     noisy = exact * np.array([1.0, 2.0, 3.0, 1.0, 2.0])
-    assert compare(Losses([2 * noisy], numbers), Losses([noisy], numbers), FOR).held_out_loss_with < 2 * LEAST_LOSS
+    assert (
+        compare_models(Losses([2 * noisy], numbers), Losses([noisy], numbers), CLEARLY_FOR).held_out_loss_with
+        < 2 * LEAST_LOSS
+    )
 
 
 def test_losses_are_those_of_held_out_observations_or_of_all():
     problem, true = photographed(0, 2, cells=30, size=8)
-    for some in (problem, problem.with_none_held_out()):
-        found = losses_of(some, Point(MATERIALS, true))
+    for some in (problem, problem.with_blocks([none_held_out(b) for b in problem.blocks])):
+        found = held_out_losses(some, Point(MATERIALS, true))
         for values, clusters, block in zip(found.values, found.clusters, some.blocks, strict=True):
             assert len(values) == len(clusters) == (block.held_out.sum() or len(block))
     worse = msgspec.structs.replace(MATERIALS, diffuse=2 * MATERIALS.diffuse)
-    richer, without = (losses_of(problem, Point(materials, true)) for materials in (MATERIALS, worse))
-    assert compare(without, richer, FOR).kept
+    richer, without = (held_out_losses(problem, Point(materials, true)) for materials in (MATERIALS, worse))
+    assert compare_models(without, richer, CLEARLY_FOR).kept

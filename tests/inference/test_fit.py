@@ -4,12 +4,19 @@ import msgspec
 import numpy as np
 import pytest
 
-from factorlib.inference.fit import DARK, Fit, Schedule, fitted, sure_ones, temperature
-from factorlib.inference.lights import Light, even_cells
-from factorlib.inference.likelihood import factorised, inverse_of
+from factorlib.inference.blocks import Noise
+from factorlib.inference.fit import (
+    DARK_NOISE,
+    Fit,
+    FitSchedule,
+    estimate_temperature,
+    fit_problem,
+    reliable_observations,
+)
+from factorlib.inference.lights import Light, fibonacci_cells
+from factorlib.inference.likelihood import cholesky_factor, cholesky_inverse
 from factorlib.inference.materials import Materials
-from factorlib.inference.noise import Noise
-from factorlib.inference.priors import BRIGHTEST, BRIGHTNESS
+from factorlib.inference.priors import BRIGHTNESS_DEVIATION, MEDIAN_BRIGHTNESS
 from factorlib.inference.problem import JointProblem
 from studies.scenes.problems import MATERIALS, factor_between
 from tests.inference.made_lights import (
@@ -27,11 +34,11 @@ from tests.inference.made_lights import (
     spheres,
 )
 
-QUICK, LIGHTS = Schedule(4, (8, 6)), Schedule(together=(0, 10, 10), given=True)
+QUICK, LIGHTS = FitSchedule(4, (8, 6)), FitSchedule(joint_steps=(0, 10, 10), materials_fixed=True)
 
 
 def materials_in(problem, cells=FEW, start=START, schedule=WHOLE) -> Fit:
-    return fitted(problem, begun(problem, cells, start), PRIOR, schedule)
+    return fit_problem(problem, begun(problem, cells, start), PRIOR, schedule)
 
 
 @pytest.fixture(scope="module")
@@ -53,18 +60,21 @@ def test_the_gauge_is_where_the_brightest_material_is_of_ordinary_brightness(sol
     bright = Materials(10 * START.diffuse, START.specular, START.roughness)
     for one in (found, materials_in(problem, start=bright)):
         reflectance = (one.point.materials.diffuse + one.point.materials.specular).mean(1)
-        assert abs(np.log(reflectance.max() / BRIGHTEST)) < 2 * BRIGHTNESS
+        assert abs(np.log(reflectance.max() / MEDIAN_BRIGHTNESS)) < 2 * BRIGHTNESS_DEVIATION
 
 
 def test_a_fit_lowers_its_value(solved):
     """Of materials and lights together, and of lights alone.  The prior on k_d is about the start, so the value of a fit that goes on is
     another, by little."""
     problem, _, found = solved
-    again = fitted(problem, found, PRIOR, Schedule(together=(0,), estimate=False)).value
-    given = fitted(problem, found, PRIOR, Schedule(given=True)).value
+    again = fit_problem(problem, found, PRIOR, FitSchedule(joint_steps=(0,), estimate_first=False)).value
+    given = fit_problem(problem, found, PRIOR, FitSchedule(materials_fixed=True)).value
     assert again == pytest.approx(found.value, rel=1e-3) and np.isfinite(found.value)
-    for step, before in ((Schedule(together=(3,), estimate=False), again), (Schedule(lights=3, given=True), given)):
-        assert fitted(problem, found, PRIOR, step).value <= before + 1e-9 * abs(before)
+    for step, before in (
+        (FitSchedule(joint_steps=(3,), estimate_first=False), again),
+        (FitSchedule(light_steps=3, materials_fixed=True), given),
+    ):
+        assert fit_problem(problem, found, PRIOR, step).value <= before + 1e-9 * abs(before)
 
 
 def test_what_starts_nil_is_found_too():
@@ -78,10 +88,10 @@ def test_what_starts_nil_is_found_too():
 
 def test_lights_from_the_observations_that_they_were_found_from_stay(solved):
     problem, _, found = solved
-    again = fitted(problem, found, PRIOR, LIGHTS)
+    again = fit_problem(problem, found, PRIOR, LIGHTS)
     assert np.array_equal(again.point.materials.vector(), found.point.materials.vector())
     for one, how, light, after in zip(
-        problem.fitted().blocks, found.hyperparameters, found.point.lights, again.point.lights, strict=True
+        problem.without_held_out().blocks, found.hyperparameters, found.point.lights, again.point.lights, strict=True
     ):
         alone = likelihood(JointProblem([one], OPERATOR), light, found.point.materials, how.temperature)
         deviation = np.sqrt(np.diag(np.linalg.inv(alone.normal_equations(materials_given=True).light_hessian))).reshape(
@@ -96,23 +106,23 @@ def test_lights_from_the_observations_that_they_were_found_from_stay(solved):
 def test_correlated_residuals_count_less():
     one, rng = photographed(4, 1, cells=50, size=16)[0].blocks[0], np.random.default_rng(0)
     independent = rng.normal(size=one.radiance.shape)
-    assert temperature(one, independent) == pytest.approx(1.0, abs=0.35)
-    assert temperature(one, np.ones_like(independent)) > 5
-    assert temperature(one, 0.1 * independent) == Schedule().least
-    assert temperature(one, 1e9 * np.ones_like(independent)) == temperature(
+    assert estimate_temperature(one, independent) == pytest.approx(1.0, abs=0.35)
+    assert estimate_temperature(one, np.ones_like(independent)) > 5
+    assert estimate_temperature(one, 0.1 * independent) == FitSchedule().least
+    assert estimate_temperature(one, 1e9 * np.ones_like(independent)) == estimate_temperature(
         one, 3 * np.ones_like(independent)
     )  # outliers
-    assert 2 < temperature(one, 2 * independent) < 4
+    assert 2 < estimate_temperature(one, 2 * independent) < 4
 
 
 def test_the_contrast_of_a_light_is_found(solved):
     """Of one that has four times the variance the factor of the prior is larger."""
     problem, true, found = solved
     more = [light.with_log_radiance(2 * light.log_radiance) for light in true]
-    other = materials_in(spheres(more, size=16), schedule=Schedule(4, (8, 4, 4, 4)))
+    other = materials_in(spheres(more, size=16), schedule=FitSchedule(4, (8, 4, 4, 4)))
     for one, larger in zip(found.hyperparameters, other.hyperparameters, strict=True):
         assert 0.3 < one.factors[0] < 2.5 and larger.factors[0] > 1.5 * one.factors[0]
-        assert Schedule().least <= one.temperature < 3  # noise is less than the noise model says
+        assert FitSchedule().least <= one.temperature < 3  # noise is less than the noise model says
 
 
 # ── sure normals ─────────────────────────────────────────────────────────────────────────────────────────────────────
@@ -123,9 +133,9 @@ def test_materials_are_found_from_sure_normals_with_less_noise_in_the_dark():
     one = msgspec.structs.replace(one, precision=one.noise.precision(one.radiance, np.ones(len(one))))
     unsure = np.arange(len(one)) % 3 == 0
     rated = msgspec.structs.replace(one, confidence=np.where(unsure, 0.3, 0.9))
-    (kept,) = sure_ones(JointProblem([rated], OPERATOR)).blocks
+    (kept,) = reliable_observations(JointProblem([rated], OPERATOR)).blocks
     assert np.array_equal(kept.normal, one.normal[~unsure]) and np.array_equal(kept.radiance, one.radiance[~unsure])
-    noise = Noise(DARK * one.noise.absolute, one.noise.relative)
+    noise = Noise(DARK_NOISE * one.noise.absolute, one.noise.relative)
     assert kept.precision == pytest.approx(noise.precision(kept.radiance, np.ones(len(kept))))
 
 
@@ -148,7 +158,7 @@ def test_a_constant_light_stays_nearly_constant():
 
 
 def test_one_photo_of_one_material():
-    light = on_even_cells(np.tile(1.5 * np.sin(3 * even_cells(FEW).axis[:, 0] + 1), (3, 1)))
+    light = on_even_cells(np.tile(1.5 * np.sin(3 * fibonacci_cells(FEW).axis[:, 0] + 1), (3, 1)))
     found = found_in([light], (2,)).point
     assert all(np.isfinite(part).all() for part in (found.materials.vector(), found.lights[0].weight))
     assert contrast(found.lights[0]) < 3
@@ -157,8 +167,8 @@ def test_one_photo_of_one_material():
 def test_an_inverse_is_numpys_and_exactly_symmetric():
     root = np.random.default_rng(0).normal(size=(60, 60))
     matrix = root @ root.T + np.eye(60)
-    factor = factorised(matrix)
-    inverse = inverse_of(factor)
+    factor = cholesky_factor(matrix)
+    inverse = cholesky_inverse(factor)
     np.testing.assert_allclose(inverse, np.linalg.inv(matrix), rtol=1e-9, atol=1e-12)
     np.testing.assert_allclose(factor @ factor.T, matrix, rtol=1e-12, atol=1e-12)
     assert (inverse == inverse.T).all()
@@ -169,4 +179,4 @@ def test_what_is_not_positive_definite_is_an_error(spoilt):
     matrix = np.eye(4)
     matrix[2, 2] = spoilt
     with pytest.raises(np.linalg.LinAlgError, match="not positive definite"):
-        factorised(matrix)
+        cholesky_factor(matrix)

@@ -13,20 +13,20 @@ import numpy as np
 import pytest
 
 from factorlib.errors import InputError
-from factorlib.inference.fit import Fit, start_of
+from factorlib.inference.blocks import Noise
+from factorlib.inference.fit import Fit, initial_fit
+from factorlib.inference.fit_runner import Solution
 from factorlib.inference.forward import Illumination
 from factorlib.inference.gauge import connected_components
-from factorlib.inference.history import Solution
 from factorlib.inference.identifiability import poorly_explained, undetermined_by_answer, undetermined_by_observations
 from factorlib.inference.joint_solver import solve
 from factorlib.inference.lights import Light
 from factorlib.inference.materials import Materials, Point
-from factorlib.inference.noise import Noise
 from factorlib.inference.observed import blocks_of_observations
-from factorlib.inference.options import Choices
+from factorlib.inference.options import SolveOptions
 from factorlib.inference.problem import JointProblem
-from factorlib.inference.start import BRIGHTEST_AT_START, constant_light, from_nothing, mean_albedo
-from factorlib.inference.uncertainty import uncertainty_of
+from factorlib.inference.start import BRIGHTEST_AT_START, constant_light, mean_albedo, start_from_photos
+from factorlib.inference.uncertainty import estimate_uncertainty
 from factorlib.jsonfile import read_json
 from factorlib.urm.observations import Observations
 from studies.scenes.problems import sphere_normals
@@ -35,7 +35,7 @@ from tests.inference.made_lights import OPERATOR, light_of
 from tests.stages.test_solve import NAMES as STAGE_NAMES
 from tests.stages.test_solve import run
 
-CHOICES = Choices(cells=120, splittings=2)
+CHOICES = SolveOptions(cells=120, splittings=2)
 SEEDS = (0, 1, 2)  # of lights and noise, of the page; tests take the first
 NAMES = (*STAGE_NAMES, "white", "black")
 FRONT = np.array([0.0, 0.0, -1.0])
@@ -96,7 +96,7 @@ POINT = light_of([[0.3, -0.5, -0.8]], 2000.0, 3000.0)
 
 def observed(rows, lights, seed=0, normals=NORMALS, shows=None, noise=0.02) -> Scene:
     """Materials [m, 7], of which light k shows those of numbers `shows[k]`, or all."""
-    truth, n = Materials.of_rows(np.array(rows)), len(normals)
+    truth, n = Materials.from_rows(np.array(rows)), len(normals)
     shows = shows or [list(range(len(truth)))] * len(lights)
     material = np.concatenate([np.repeat(some, n) for some in shows])
     photo = np.repeat(np.arange(len(lights)), [n * len(some) for some in shows])
@@ -181,7 +181,7 @@ class Case(NamedTuple):
     roughness: float | None
     radiance: float
     says: tuple[str, ...] = ()
-    choices: Choices = CHOICES
+    choices: SolveOptions = CHOICES
 
 
 def open_(what: str, *names: str) -> tuple[str, ...]:
@@ -217,7 +217,7 @@ CASES = {
     "all Lambertian": Case(lambda s: observed(LAMBERTIAN, rooms(s), s), 0.14, None, 0.0018, open_("roughness", *BOTH)),
     "all mirror-like: roughness 0.1": Case(lambda s: observed(MIRRORS, rooms(s), s), 0.017, 0.23, 0.011),
     "a black material": Case(lambda s: observed(BLACK, rooms(s), s), 0.007, 0.1, 0.0059, ("'red' is so dark", *open_("roughness", "red"))),
-    "a light of one point": Case(lambda s: observed(TWO, [POINT], s), 0.016, 0.0027, 0.0058, choices=Choices(cells=300, splittings=3)),
+    "a light of one point": Case(lambda s: observed(TWO, [POINT], s), 0.016, 0.0027, 0.0058, choices=SolveOptions(cells=300, splittings=3)),
     "constant light": Case(lambda s: observed(TWO, [CONSTANT] * 2, s), None, None, 0.0019, open_("roughness", *BOTH)),
     "radiances × 10⁻⁴": Case(lambda s: in_another_unit(s, 1e-4), 0.031, 0.11, 0.0057),
     "radiances × 10⁴": Case(lambda s: in_another_unit(s, 1e4), 0.031, 0.11, 0.0057),
@@ -240,16 +240,16 @@ CASES = {
 QUICK = ("flat objects", "an object of 30 pixels", "a single pixel", "1 material × 1 light", "all values clipped")
 
 
-def solved(scene: Scene, choices: Choices) -> tuple[JointProblem, Solution, list[str]]:
+def solved(scene: Scene, choices: SolveOptions) -> tuple[JointProblem, Solution, list[str]]:
     """The problem, its solution, and what is said of both."""
     names, problem = (
         scene.observations.materials,
         JointProblem(blocks_of_observations(scene.observations, Noise()), OPERATOR),
     )
-    solution = solve(problem, from_nothing(len(names)), choices)
-    errors, _ = uncertainty_of(solution, problem, choices)
+    solution = solve(problem, start_from_photos(len(names)), choices)
+    errors, _ = estimate_uncertainty(solution, problem, choices)
     said = undetermined_by_observations(names, problem)
-    said += poorly_explained(problem, solution.shown(problem).radiance(solution.point))
+    said += poorly_explained(problem, solution.predict(problem).radiance(solution.point))
     said += undetermined_by_answer(names, problem, solution.point.materials, errors.materials)
     return problem, solution, said
 
@@ -306,7 +306,7 @@ def random_start(count: int, seed: int):
     def fits(problem: JointProblem, cells: int) -> list[Fit]:
         albedo, grey = mean_albedo(problem.blocks, count), np.full((count, 3), BRIGHTEST_AT_START / 2)
         materials = Materials(albedo * (1 - share)[:, None], grey * share[:, None], roughness)
-        return [start_of(Point(materials, [constant_light(block, materials, cells) for block in problem.blocks]))]
+        return [initial_fit(Point(materials, [constant_light(block, materials, cells) for block in problem.blocks]))]
 
     return fits
 

@@ -6,11 +6,11 @@ import pytest
 
 from factorlib.geometry.met import UNMET, met_codes
 from factorlib.geometry.sphere import fibonacci_sphere
+from factorlib.inference.blocks import Noise
 from factorlib.inference.forward import Illumination
-from factorlib.inference.gauge import in_gauge
+from factorlib.inference.gauge import fix_gauge
 from factorlib.inference.interreflection import bounced_light
 from factorlib.inference.materials import Point
-from factorlib.inference.noise import Noise
 from factorlib.inference.observed import blocks_of_observations
 from factorlib.inference.problem import JointProblem
 from factorlib.urm.observations import Observations
@@ -76,5 +76,5 @@ def test_nothing_hidden_sends_nothing_and_brighter_photos_send_more_in_their_own
 
 def test_what_interreflection_determines_the_gauge_leaves(given):
     point = Point(MATERIALS, [given.light])
-    np.testing.assert_array_equal(in_gauge(point, [given.block]).materials.diffuse, MATERIALS.diffuse)
-    assert (in_gauge(point, [given.block.with_effects(True, False)]).materials.diffuse != MATERIALS.diffuse).any()
+    np.testing.assert_array_equal(fix_gauge(point, [given.block]).materials.diffuse, MATERIALS.diffuse)
+    assert (fix_gauge(point, [given.block.with_effects(True, False)]).materials.diffuse != MATERIALS.diffuse).any()

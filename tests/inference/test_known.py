@@ -8,16 +8,15 @@ from factorlib.conventions import YUP_FROM_CAMERA, lat_long_directions
 from factorlib.geometry.camera import rotation_of_vector
 from factorlib.geometry.sphere import fibonacci_sphere, mirror_directions
 from factorlib.inference import optimizer
-from factorlib.inference.fit import Schedule, fitted, start_of
-from factorlib.inference.gauge import BRIGHTEST, in_gauge
-from factorlib.inference.known import Known, light_of_ball, light_of_map
+from factorlib.inference.fit import FitSchedule, fit_problem, initial_fit
+from factorlib.inference.gauge import BRIGHTEST, fix_gauge
+from factorlib.inference.known import KnownValues, light_from_ball, light_from_map
 from factorlib.inference.lights import Light
 from factorlib.inference.materials import LEAST_REFLECTANCE
-from factorlib.inference.optimizer import Descent, moved_light
-from factorlib.inference.priors import Gaussian, MaterialPrior, unknowns_of
-from factorlib.inference.start import with_known
-from factorlib.inference.uncertainty import Posterior
-from factorlib.inference.uncertainty import in_gauge as covariance_in_gauge
+from factorlib.inference.optimizer import Descent, step_light
+from factorlib.inference.priors import MaterialPrior, PriorTerms, material_unknowns
+from factorlib.inference.start import insert_known
+from factorlib.inference.uncertainty import Posterior, project_to_gauge
 from factorlib.light.latlong import map_energy
 from studies.scenes.problems import MATERIALS, sphere_normals
 from tests.inference.made import seen_from_the_front
@@ -34,15 +33,15 @@ from tests.inference.made_lights import (
     spheres,
 )
 
-LAMP, QUICK = np.array([0.48, -0.6, -0.64]), Schedule(2, (3,))
-CARD = Known({1: MATERIALS.rows()[1]})
+LAMP, QUICK = np.array([0.48, -0.6, -0.64]), FitSchedule(2, (3,))
+CARD = KnownValues({1: MATERIALS.rows()[1]})
 
 
 @pytest.fixture(scope="module")
 def solved():
     problem, _ = photographed(5, 3)
     problem = msgspec.structs.replace(problem, known=CARD)
-    return problem, fitted(problem, start_of(with_known(begun(problem).point, problem)), PRIOR, WHOLE)
+    return problem, fit_problem(problem, initial_fit(insert_known(begun(problem).point, problem)), PRIOR, WHOLE)
 
 
 def test_a_known_material_stays_and_gives_the_others_their_scale_and_colour(solved):
@@ -50,7 +49,7 @@ def test_a_known_material_stays_and_gives_the_others_their_scale_and_colour(solv
     materials = found.point.materials
     np.testing.assert_allclose(materials.rows()[1], MATERIALS.rows()[1], rtol=1e-12)
     np.testing.assert_allclose(materials.diffuse, MATERIALS.diffuse, rtol=0.03)  # in absolute scale
-    in_place, moved = (in_gauge(found.point, problem.blocks, known).materials for known in (CARD, Known()))
+    in_place, moved = (fix_gauge(found.point, problem.blocks, known).materials for known in (CARD, KnownValues()))
     assert (in_place.vector() == materials.vector()).all() and (moved.diffuse != materials.diffuse).any()
 
 
@@ -59,21 +58,21 @@ def test_a_descent_with_known_unknowns_is_that_of_a_prior_that_holds_them(monkey
     monkeypatch.setattr(optimizer, "TOLERANCE", 1e-9)
     monkeypatch.setattr(optimizer, "DECREMENT", 1e-6)
     problem, _ = photographed(5, 1, cells=40, size=10)
-    known = Known({1: np.array([0.2, 0.4, 0.25, np.nan, np.nan, np.nan, 0.4])})
-    free, theta = known.free(3), unknowns_of(START)
+    known = KnownValues({1: np.array([0.2, 0.4, 0.25, np.nan, np.nan, np.nan, 0.4])})
+    free, theta = known.free(3), material_unknowns(START)
     stiffness = np.where(free, 0, 1e7)
 
     class Stiff(MaterialPrior):
-        def at(self, theta):
-            value, gradient, hessian = super().at(theta)
+        def evaluate(self, theta):
+            value, gradient, hessian = super().evaluate(theta)
             off = (theta - self.mean).reshape(-1)
-            return Gaussian(value + stiffness @ off**2, gradient + stiffness * off, hessian + np.diag(stiffness))
+            return PriorTerms(value + stiffness @ off**2, gradient + stiffness * off, hessian + np.diag(stiffness))
 
     prior, stiff = (of(START, problem.blocks, known) for of in (MaterialPrior, Stiff))
     one, ends = likelihood(problem, begun(problem, 40).point.lights[0], START), []
     for of, moving in ((prior, free), (stiff, np.ones(21, bool))):
         descent = Descent(of, problem.spread, lambda loss: None, moving)
-        ends.append(descent.of_all(descent.at([one], theta), 40))
+        ends.append(descent.descend_jointly(descent.linearise([one], theta), 40))
     assert (ends[0].theta.reshape(-1)[~free] == theta.reshape(-1)[~free]).all() and (ends[0].theta != theta).any()
     np.testing.assert_allclose(ends[0].theta, ends[1].theta, atol=5e-3)
 
@@ -83,23 +82,23 @@ def test_what_is_known_has_no_error_and_nothing_else_is_held_fixed(solved):
     problem, found = solved
     errors = Posterior(problem, found, PRIOR).standard_errors().materials
     assert (errors.rows()[1] == 0).all() and (errors.rows()[[0, 2]] > 0).all()
-    light = msgspec.structs.replace(found.point.lights[0], held=np.ones(FEW, bool), scale_free=True)
+    light = msgspec.structs.replace(found.point.lights[0], fixed=np.ones(FEW, bool), scale_free=True)
     root = np.random.default_rng(0).normal(size=(21, 21))
     for known, fixed in (
         (CARD, [False, False]),
-        (Known(), [True, True]),
-        (Known(lights={"room0": light}), [False, True]),
+        (KnownValues(), [True, True]),
+        (KnownValues(lights={"room0": light}), [False, True]),
     ):
-        covariance = covariance_in_gauge(root @ root.T, MATERIALS, msgspec.structs.replace(problem, known=known))
+        covariance = project_to_gauge(root @ root.T, MATERIALS, msgspec.structs.replace(problem, known=known))
         one, all_ = (np.tile(np.isin(np.arange(7), list(of)), 3) for of in ([0, 3], range(6)))  # a channel; all
         assert [abs(of @ covariance @ of) < 1e-9 for of in (one, all_)] == fixed
 
 
 def test_a_known_reflectance_of_nil_stays_nil_and_nothing_is_expected_of_brightness_beside_it(solved):
     problem, _ = solved
-    known = Known({1: np.array([0.2, 0.4, 0.25, 0, 0, 0, np.nan])})
+    known = KnownValues({1: np.array([0.2, 0.4, 0.25, 0, 0, 0, np.nan])})
     problem = msgspec.structs.replace(problem, known=known)
-    found = fitted(problem, start_of(with_known(begun(problem).point, problem)), PRIOR, QUICK).point.materials
+    found = fit_problem(problem, initial_fit(insert_known(begun(problem).point, problem)), PRIOR, QUICK).point.materials
     assert found.specular[1].max() <= LEAST_REFLECTANCE * (1 + 1e-9)
     assert not MaterialPrior(MATERIALS, problem.blocks, known).members
     assert MaterialPrior(MATERIALS, problem.blocks).members
@@ -107,9 +106,9 @@ def test_a_known_reflectance_of_nil_stays_nil_and_nothing_is_expected_of_brightn
 
 def test_a_start_comes_to_the_scale_of_what_is_known_and_shows_the_same(solved):
     problem, _ = solved
-    known = Known({0: np.array([*(3 * START.diffuse[0]), *(3 * START.specular[0]), np.nan])})
+    known = KnownValues({0: np.array([*(3 * START.diffuse[0]), *(3 * START.specular[0]), np.nan])})
     point = begun(problem).point
-    there = with_known(point, msgspec.structs.replace(problem, known=known))
+    there = insert_known(point, msgspec.structs.replace(problem, known=known))
     np.testing.assert_allclose(there.materials.diffuse, 3 * START.diffuse)
     for one, other in zip(problem.radiance(there), problem.radiance(point), strict=True):
         np.testing.assert_allclose(one, other, rtol=1e-12)
@@ -121,7 +120,7 @@ def test_a_start_comes_to_the_scale_of_what_is_known_and_shows_the_same(solved):
 def known_but(light: Light, unit: float, held: np.ndarray, scale_free: bool) -> Light:
     """The light as a user knows it: in the photo's radiance, or in units of their own."""
     weight = light.weight * (7.0 if scale_free else unit)
-    return msgspec.structs.replace(light, weight=weight, held=held, scale_free=scale_free)
+    return msgspec.structs.replace(light, weight=weight, fixed=held, scale_free=scale_free)
 
 
 @pytest.mark.parametrize("scale_free", [True, False])
@@ -129,21 +128,21 @@ def test_the_slope_of_a_light_that_is_known_in_part_is_that_of_its_value(scale_f
     """Against finite differences along a step of its unknowns, of which known cells have at most their common factor."""
     problem, (true,) = photographed(5, 1, cells=30, size=10)
     held, curves = true.axis[:, 2] < 0, {"log_tone": np.array([0.1])}
-    one = likelihood(problem, msgspec.structs.replace(true, held=held, scale_free=scale_free, **curves))
+    one = likelihood(problem, msgspec.structs.replace(true, fixed=held, scale_free=scale_free, **curves))
     system = one.normal_equations(materials_given=True)
     step = np.random.default_rng(0).normal(size=one.light.unknowns)
     assert len(step) == 3 * (~held).sum() + 1 + scale_free == len(system.light_gradient)
-    lights = [moved_light(one.light, s * step) for s in (1e-3, -1e-3)]
-    ahead, behind = (one.at(light).normal_equations(materials_given=True).value for light in lights)
+    lights = [step_light(one.light, s * step) for s in (1e-3, -1e-3)]
+    ahead, behind = (one.with_point(light).normal_equations(materials_given=True).value for light in lights)
     assert (ahead - behind) / 4e-3 == pytest.approx(system.light_gradient @ step, rel=1e-3)
     nothing = msgspec.structs.replace(problem, blocks=[problem.blocks[0].take(slice(0))])
     prior = likelihood(nothing, one.light)  # which is quadratic, so that its Hessian is no approximation
-    ahead, behind = (prior.at(light).normal_equations(materials_given=True).light_gradient for light in lights)
+    ahead, behind = (prior.with_point(light).normal_equations(materials_given=True).light_gradient for light in lights)
     hessian = prior.normal_equations(materials_given=True).light_hessian
     np.testing.assert_allclose((ahead - behind) / 2e-3, hessian @ step, rtol=1e-6, atol=1e-8)
     free = np.tile(~held, 3)
     assert one.log_determinant == pytest.approx(np.linalg.slogdet(one.precision[np.ix_(free, free)])[1])
-    after = moved_light(one.light, 1e-3 * step).weight[held] / true.weight[held]
+    after = step_light(one.light, 1e-3 * step).weight[held] / true.weight[held]
     assert np.ptp(after) < 1e-12 and (after[0, 0] != 1) == scale_free
 
 
@@ -153,12 +152,12 @@ def test_a_light_that_is_known_gives_materials_their_absolute_scale_and_one_up_t
     tint = MATERIALS.diffuse / MATERIALS.diffuse.mean(1, keepdims=True)
     for scale_free, held in ((False, np.ones(FEW, bool)), (True, true[0].axis[:, 2] > -0.8)):
         light = known_but(true[0], problem.blocks[0].unit, held, scale_free)
-        one = msgspec.structs.replace(problem, known=Known(lights={"room0": light}))
-        start = with_known(begun(one).point, one)
+        one = msgspec.structs.replace(problem, known=KnownValues(lights={"room0": light}))
+        start = insert_known(begun(one).point, one)
         change = np.log(start.materials.diffuse / START.diffuse)
         assert (abs(change.mean()) < 1e-9) == scale_free and np.abs(change).max() > 0.01
-        found = fitted(one, start_of(start), PRIOR, WHOLE).point
-        answer = in_gauge(found, one.blocks, one.known)
+        found = fit_problem(one, initial_fit(start), PRIOR, WHOLE).point
+        answer = fix_gauge(found, one.blocks, one.known)
         np.testing.assert_allclose(
             answer.materials.diffuse / answer.materials.diffuse.mean(1, keepdims=True), tint, rtol=0.05
         )
@@ -174,10 +173,12 @@ def test_a_light_that_is_known_gives_materials_their_absolute_scale_and_one_up_t
 
 def test_exposures_that_are_known_stay_and_have_no_unknowns():
     light = on_even_cells(drawn(3, 40), (0.0, 0.0))
-    problem = msgspec.structs.replace(spheres([light], size=10), known=Known(exposures=("room0",)))
-    found = fitted(problem, start_of(with_known(begun(problem, 40).point, problem)), PRIOR, QUICK).point.lights[0]
+    problem = msgspec.structs.replace(spheres([light], size=10), known=KnownValues(exposures=("room0",)))
+    found = fit_problem(
+        problem, initial_fit(insert_known(begun(problem, 40).point, problem)), PRIOR, QUICK
+    ).point.lights[0]
     assert (found.log_exposure == 0).all() and found.unknowns == 3 * 40
-    free = fitted(problem, begun(problem, 40), PRIOR, QUICK).point.lights[0]
+    free = fit_problem(problem, begun(problem, 40), PRIOR, QUICK).point.lights[0]
     assert free.log_exposure[1] != 0 and free.unknowns == 3 * 40 + 1
 
 
@@ -196,13 +197,13 @@ def off_lamp(light: Light) -> float:
 
 
 def test_a_map_becomes_a_light_of_its_energy_in_its_directions(monkeypatch):
-    monkeypatch.setattr("factorlib.inference.known.ROWS", 50)
+    monkeypatch.setattr("factorlib.inference.known.MAP_ROWS", 50)
     directions = lat_long_directions(50, 100) @ YUP_FROM_CAMERA
     radiance = lamp(directions.reshape(-1, 3)).reshape(50, 100, 3)
-    light = light_of_map(radiance)
+    light = light_from_map(radiance)
     np.testing.assert_allclose(2 * np.pi * light.energy.sum(0), map_energy(radiance), rtol=1e-3)
-    assert light.held.all() and light.scale_free and off_lamp(light) < 0.3
-    larger = light_of_map(np.repeat(np.repeat(radiance, 6, 0), 6, 1))  # more rows than are used
+    assert light.fixed.all() and light.scale_free and off_lamp(light) < 0.3
+    larger = light_from_map(np.repeat(np.repeat(radiance, 6, 0), 6, 1))  # more rows than are used
     np.testing.assert_allclose(larger.energy.sum(0), light.energy.sum(0), rtol=1e-2)
 
 
@@ -216,14 +217,14 @@ def test_what_a_mirror_ball_shows_is_the_light_but_behind_it_where_another_objec
     radiance, zero = 0.5 * lamp(mirror @ turn.T), np.zeros(len(view), int)
     seen = seen_from_the_front(normals, radiance, zero, ("chrome",), clipped=clipped, visibility=sees)
     seen.radiance[mirror[:, 0] > 0.88] = 1e3  # of the other object
-    light = light_of_ball(seen, np.full(3, 0.5), turn)
+    light = light_from_ball(seen, np.full(3, 0.5), turn)
     out = {"behind": [0, 0, 1], "object": [1, 0, 0], "clipped": [0, 1, 0]}
-    assert not any(light.held[np.argmax(light.axis @ turn @ axis)] for axis in out.values())
+    assert not any(light.fixed[np.argmax(light.axis @ turn @ axis)] for axis in out.values())
 
     def far(directions: np.ndarray) -> np.ndarray:
         return np.all([directions @ turn @ axis < np.cos(np.radians(45)) for axis in out.values()], axis=0)
 
-    assert light.held[far(light.axis)].all() and not light.scale_free
+    assert light.fixed[far(light.axis)].all() and not light.scale_free
     there = (everywhere := fibonacci_sphere(4000))[far(everywhere)]
     radiance = light.lobes.radiance(there)
     np.testing.assert_allclose(radiance.mean(0), lamp(there).mean(0), rtol=0.02)

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 from factorlib.inference.forward import Illumination
-from factorlib.inference.joint_solver import SMALLEST, SPLIT
-from factorlib.inference.lights import Light, even_cells
+from factorlib.inference.joint_solver import LEAST_SPACING_DEG, SPLIT_CELLS
+from factorlib.inference.lights import Light, fibonacci_cells
 from studies.scenes.problems import MATERIALS, block
 from tests.inference.made_lights import OPERATOR, drawn, on_even_cells
 
@@ -18,7 +18,9 @@ def shown(light: Light, directions=DIRECTIONS) -> np.ndarray:
 
 
 def smooth(cells: int) -> Light:
-    return on_even_cells(np.array([[0.5], [0.3], [0.4]]) * (even_cells(cells).axis @ np.array([0.6, 0.8, 0.0]) + 1))
+    return on_even_cells(
+        np.array([[0.5], [0.3], [0.4]]) * (fibonacci_cells(cells).axis @ np.array([0.6, 0.8, 0.0]) + 1)
+    )
 
 
 @pytest.mark.parametrize("count", [200, 400])
@@ -61,10 +63,10 @@ def test_split_cells_leave_no_dark_or_bright_spots(scattered):
 
 
 def test_the_brightest_split_but_none_that_is_too_small():
-    light, how = on_even_cells(drawn(1, 200)), (SPLIT, 2 * np.radians(SMALLEST))
-    which = light.brightest(*how)
-    assert which.sum() == SPLIT and light.energy.sum(1)[which].min() >= light.energy.sum(1)[~which].max()
+    light, how = on_even_cells(drawn(1, 200)), (SPLIT_CELLS, 2 * np.radians(LEAST_SPACING_DEG))
+    which = light.brightest_cells(*how)
+    assert which.sum() == SPLIT_CELLS and light.energy.sum(1)[which].min() >= light.energy.sum(1)[~which].max()
     for _ in range(8):
-        light = light.split(light.brightest(*how))
-    assert np.degrees(2 / np.sqrt(light.sharpness)).min() > SMALLEST
-    assert on_even_cells(np.zeros((3, 12))).brightest(*how).all()
+        light = light.split(light.brightest_cells(*how))
+    assert np.degrees(2 / np.sqrt(light.sharpness)).min() > LEAST_SPACING_DEG
+    assert on_even_cells(np.zeros((3, 12))).brightest_cells(*how).all()

@@ -9,32 +9,39 @@ import pytest
 from factorlib.geometry.met import UNMET, met_codes
 from factorlib.geometry.sphere import fibonacci_sphere
 from factorlib.images.tone import curve
-from factorlib.inference.evidence import AGAINST, FOR
+from factorlib.inference.blocks import Noise
 from factorlib.inference.forward import Illumination
 from factorlib.inference.identifiability import unlikely_curves
 from factorlib.inference.interreflection import bounced_light
 from factorlib.inference.joint_solver import solve
 from factorlib.inference.materials import Point
-from factorlib.inference.model_selection import CURVED_GAIN, NEARER_FROM, believed
-from factorlib.inference.noise import Noise
+from factorlib.inference.model_selection import (
+    CLEARLY_AGAINST,
+    CLEARLY_FOR,
+    LEAST_DISTANCE_MARGIN,
+    LEAST_TONE_GAIN,
+    distance_share,
+)
 from factorlib.inference.observed import blocks_of_observations
-from factorlib.inference.options import Choices
+from factorlib.inference.options import SolveOptions
 from factorlib.inference.problem import JointProblem
-from factorlib.inference.start import from_nothing
+from factorlib.inference.start import start_from_photos
 from factorlib.results.materials import Decision
 from factorlib.urm.observations import Observations
 from studies.scenes.problems import MATERIALS, factor_between, sphere_normals
-from tests.inference.made import bowls, rough_light
+from tests.inference.made import bowls, none_held_out, rough_light
 from tests.inference.made_lights import OPERATOR, drawn, on_even_cells, spheres
 
-QUICK = Choices(cells=60, splittings=0, observations=300)
+QUICK = SolveOptions(cells=60, splittings=0, observations=300)
 OF_SHAPES = msgspec.structs.replace(QUICK, cells=48, observations=240, tone="off")  # shadows and bounces
-MORE = msgspec.structs.replace(QUICK, observations=1000)  # an exponent that all photos share is known less
+OBSERVATION_FACTOR = msgspec.structs.replace(
+    QUICK, observations=1000
+)  # an exponent that all photos share is known less
 
 
 def solved(blocks, choices=QUICK, **others):
     choices = msgspec.structs.replace(choices, **others)
-    return solve(JointProblem(blocks, OPERATOR), from_nothing(len(MATERIALS)), choices)
+    return solve(JointProblem(blocks, OPERATOR), start_from_photos(len(MATERIALS)), choices)
 
 
 # ── shadows and bounces, on bowls ────────────────────────────────────────────────────────────────────────────────────
@@ -78,7 +85,7 @@ def test_materials_of_bowls_are_better_with_self_shadowing_and_the_solve_finds_t
         factor = factor_between(found, MATERIALS)
         off = found.diffuse * factor / MATERIALS.diffuse - 1, found.roughness - MATERIALS.roughness
         error[choice] = [np.abs(each).mean() for each in off]
-    assert solution.shadows.kept and solution.shadows.margin > FOR
+    assert solution.shadows.kept and solution.shadows.margin > CLEARLY_FOR
     assert solution.shadows.held_out_loss_with < 0.5 * solution.shadows.held_out_loss_without
     assert error["auto"][0] < 0.5 * error["off"][0], error
     assert error["auto"][1] < error["off"][1] + 0.01, error
@@ -90,7 +97,7 @@ def test_the_solve_finds_out_that_bowls_light_themselves_and_how_bright_they_are
         solution = solved(lit, OF_SHAPES, self_shadowing="on", interreflection=choice)
         off = solution.point.materials.diffuse / MATERIALS.diffuse - 1  # absolute: no factor is taken out
         error[choice] = np.abs(off).mean()
-    assert solution.interreflection.kept and solution.interreflection.margin > FOR
+    assert solution.interreflection.kept and solution.interreflection.margin > CLEARLY_FOR
     assert solution.interreflection.held_out_loss_with < solution.interreflection.held_out_loss_without
     assert error["auto"] < 0.5 * error["off"], error
 
@@ -126,7 +133,7 @@ def test_shadows_that_are_none_are_given_up_and_those_that_change_nothing_stay(s
     wrong = hiding(lambda b: 255 * (rng.random((len(b), 96)) < 0.5))
     few = {"cells": 24, "observations": 150, "tone": "off"}
     found = solved(wrong, **few)
-    assert not found.shadows.kept and found.shadows.margin < AGAINST
+    assert not found.shadows.kept and found.shadows.margin < CLEARLY_AGAINST
     assert solved(wrong, **few, self_shadowing="on").shadows.kept
     assert solved(hiding(lambda b: np.full((len(b), 96), 255)), **few).shadows.kept
 
@@ -162,7 +169,7 @@ def curved():
 
 
 def test_curves_are_found_and_spare_the_materials_by_evidence_that_held_out_losses_fall(curved):
-    found, without = (solved(curved, MORE, tone=tone) for tone in ("auto", "off"))
+    found, without = (solved(curved, OBSERVATION_FACTOR, tone=tone) for tone in ("auto", "off"))
     exponents = [float(e[0]) if len(e) else 1.0 for e in exponents_of(found)]
     off = np.log(exponents) - np.log((1.3, 0.8, 1.0))
     assert (
@@ -172,12 +179,14 @@ def test_curves_are_found_and_spare_the_materials_by_evidence_that_held_out_loss
     assert error_of(found) < 0.4 * error_of(without), (error_of(found), error_of(without))
     assert [one.kept for one in found.tone][:2] == [True, True]
     for one in found.tone:
-        assert one.kept == (one.margin > FOR and one.held_out_loss_without > (1 + CURVED_GAIN) * one.held_out_loss_with)
+        assert one.kept == (
+            one.margin > CLEARLY_FOR and one.held_out_loss_without > (1 + LEAST_TONE_GAIN) * one.held_out_loss_with
+        )
 
 
 def test_photos_of_one_light_have_a_curve_each():
     blocks = [through(data, 1.0, 1.3) if k == 0 else data for k, data in enumerate(rooms(photos=2, size=14))]
-    np.testing.assert_allclose(exponents_of(solved(blocks, MORE))[0], (1.0, 1.3), rtol=0.05)
+    np.testing.assert_allclose(exponents_of(solved(blocks, OBSERVATION_FACTOR))[0], (1.0, 1.3), rtol=0.05)
 
 
 def test_a_curve_that_no_camera_has_is_not_believed():
@@ -200,7 +209,7 @@ def test_an_exponent_near_its_bounds_is_named():
 
 def test_without_held_out_observations_shadows_stay_and_nothing_further_is_decided(lit):
     """All would be judged by the observations that they were fitted to, which more always explains better."""
-    found = solved([block.with_none_held_out() for block in lit], QUICK, cells=24, observations=100)
+    found = solved([none_held_out(block) for block in lit], QUICK, cells=24, observations=100)
     assert found.shadows.kept and found.shadows.margin is None
     assert not found.interreflection.kept and found.interreflection.margin is None
     assert not any(one.kept for one in found.tone) and found.splitting == []
@@ -208,8 +217,8 @@ def test_without_held_out_observations_shadows_stay_and_nothing_further_is_decid
 
 def test_few_materials_start_from_several_roughnesses_and_many_from_one():
     problem = JointProblem(rooms(), OPERATOR)
-    assert [len(from_nothing(n)(problem, 30)) for n in (3, 40)] == [1, 1]
-    fits = from_nothing(2)(problem.of([block.take(block.material < 2) for block in problem.blocks]), 30)
+    assert [len(start_from_photos(n)(problem, 30)) for n in (3, 40)] == [1, 1]
+    fits = start_from_photos(2)(problem.with_blocks([block.take(block.material < 2) for block in problem.blocks]), 30)
     points = [fit.point for fit in fits]
     assert len({float(p.materials.roughness[0]) for p in points}) == 3 and {len(p.lights[0]) for p in points} == {30}
 
@@ -235,14 +244,14 @@ def photographed_at(*curvatures):
 
 def test_near_lights_are_found_and_spare_the_materials_and_far_ones_stay_far():
     blocks = photographed_at(0.2, 0.0, 0.2)
-    found, far = (solved(blocks, MORE, tone="off", distance=distance) for distance in ("auto", "off"))
+    found, far = (solved(blocks, OBSERVATION_FACTOR, tone="off", distance=distance) for distance in ("auto", "off"))
     assert [one.kept for one in found.distances] == [True, False, True]
     assert [light.curvature for light in found.point.lights] == [0.2, 0, 0.2]
-    assert all(one.margin > FOR for one in found.distances if one.kept)
+    assert all(one.margin > CLEARLY_FOR for one in found.distances if one.kept)
     assert [light.curvature for light in far.point.lights] == [0, 0, 0]
     assert error_of(found) < 0.5 * error_of(far), (error_of(found), error_of(far))
 
 
 def test_how_near_a_light_comes_follows_the_evidence_without_a_jump():
-    shares = [believed(Decision(True, margin=m)) for m in (-3, NEARER_FROM, 1.25, 1.5, FOR, 9)]
-    assert shares == [0, 0, 0.25, 0.5, 1, 1] and believed(Decision(False)) == 0
+    shares = [distance_share(Decision(True, margin=m)) for m in (-3, LEAST_DISTANCE_MARGIN, 1.25, 1.5, CLEARLY_FOR, 9)]
+    assert shares == [0, 0, 0.25, 0.5, 1, 1] and distance_share(Decision(False)) == 0

@@ -3,16 +3,15 @@
 import numpy as np
 import pytest
 
-from factorlib.inference.arrow import Arrow
-from factorlib.inference.fit import fitted
-from factorlib.inference.optimizer import Descent, determinant_of, minimised
-from factorlib.inference.priors import MaterialPrior, unknowns_of
+from factorlib.inference.fit import fit_problem
+from factorlib.inference.optimizer import Arrow, Descent, determinant_terms, minimise_lbfgs
+from factorlib.inference.priors import MaterialPrior, material_unknowns
 from tests.inference.made_lights import PRIOR, WHOLE, begun, likelihood, photographed
 
 
 def test_the_arrow_is_solved_as_the_dense_system_is():
     problem, lights = photographed(5, 2, cells=20, size=8)
-    systems = [likelihood(problem.restricted([k]), lights[k]).normal_equations() for k in (0, 1)]
+    systems = [likelihood(problem.select_lights([k]), lights[k]).normal_equations() for k in (0, 1)]
     size, prior = 21, np.eye(21)
     free = np.arange(size) != 3
     ends = np.cumsum([size, *(len(one.light_gradient) for one in systems)])
@@ -51,7 +50,7 @@ def valley(x):
 def test_minima_that_are_known_are_found(objective, size, metric):
     x = np.zeros(size)
     for _ in range(16):  # each begins at the end of the one before, as on a new factorisation
-        x = x + minimised(lambda step, begun=x: objective(begun + step), size, metric)
+        x = x + minimise_lbfgs(lambda step, begun=x: objective(begun + step), size, metric)
     np.testing.assert_allclose(x, 1.0, atol=1e-2)
 
 
@@ -59,7 +58,7 @@ def test_where_a_descent_ends_the_likelihood_has_no_slope_left():
     """Of (1) of the optimizer, in directions that matter: by far less than at the start."""
     problem, _ = photographed(5, 2, cells=40, size=10)
     start = begun(problem, 40)
-    found = fitted(problem, start, PRIOR, WHOLE)
+    found = fit_problem(problem, start, PRIOR, WHOLE)
     prior = MaterialPrior(start.point.materials, problem.blocks)
     descent = Descent(prior, problem.spread, lambda loss: None, np.ones(21, bool))
     sizes = []
@@ -67,12 +66,15 @@ def test_where_a_descent_ends_the_likelihood_has_no_slope_left():
         lights = fit.point.lights
         ones = [
             likelihood(
-                problem.fitted().restricted([k]), lights[k], fit.point.materials, fit.hyperparameters[k].temperature
+                problem.without_held_out().select_lights([k]),
+                lights[k],
+                fit.point.materials,
+                fit.hyperparameters[k].temperature,
             )
             for k in range(2)
         ]
-        state = descent.at(ones, unknowns_of(fit.point.materials))
-        slope = state.prior.gradient + determinant_of(state.systems, 21)[0]
+        state = descent.linearise(ones, material_unknowns(fit.point.materials))
+        slope = state.prior.gradient + determinant_terms(state.systems, 21)[0]
         for one in state.systems:
             slope[one.places] += one.material_gradient
         sizes.append(np.abs(slope).max())

@@ -3,14 +3,14 @@ import numpy as np
 import pytest
 import torch
 
-from factorlib.inference.paper_solver import Paper, PaperObjective, drawn, solve
+from factorlib.inference.paper_solver import PaperObjective, PaperOptions, draw_subset, solve
 from factorlib.inference.problem import JointProblem
 from factorlib.reflection import reflection_operator
 from studies.scenes.problems import MATERIALS, block, factor_between, random_light
 
 OPERATOR = reflection_operator("network")
 EXACT = reflection_operator("closed_form", dtype="float64")
-QUICK = Paper(lobes=8, samplings=200)
+QUICK = PaperOptions(lobes=8, samplings=200)
 
 
 def rooms(photos=1, size=16):
@@ -57,11 +57,13 @@ def test_the_same_seed_gives_the_same_answer_and_scaling_a_photo_scales_its_ligh
 def test_gradient_is_the_finite_difference():
     """Along random directions, each of which moves every unknown."""
     blocks, random = rooms(photos=2, size=8), torch.Generator().manual_seed(0)
-    objective = PaperObjective(JointProblem(blocks, EXACT), 3, Paper(lobes=3))
-    subset = drawn([np.arange(len(b)) for b in blocks], 60, np.random.default_rng(0))
+    objective = PaperObjective(JointProblem(blocks, EXACT), 3, PaperOptions(lobes=3))
+    subset = draw_subset([np.arange(len(b)) for b in blocks], 60, np.random.default_rng(0))
     start = objective.start()
     x = start + 0.3 * torch.randn(len(start), generator=random, dtype=torch.float64)
-    _, gradient = objective.at(x, subset)
+    _, gradient = objective.objective_on(x, subset)
     for move in torch.randn(6, len(start), generator=random, dtype=torch.float64):
-        slope = (objective.at(x + 1e-6 * move, subset)[0] - objective.at(x - 1e-6 * move, subset)[0]) / 2e-6
+        slope = (
+            objective.objective_on(x + 1e-6 * move, subset)[0] - objective.objective_on(x - 1e-6 * move, subset)[0]
+        ) / 2e-6
         assert float(gradient @ move) == pytest.approx(float(slope), rel=1e-4)

@@ -4,11 +4,11 @@ import msgspec
 import numpy as np
 import pytest
 
+from factorlib.inference.blocks import Noise
 from factorlib.inference.forward import Illumination
-from factorlib.inference.gauge import BRIGHTEST, connected_components, in_gauge
+from factorlib.inference.gauge import BRIGHTEST, connected_components, fix_gauge
 from factorlib.inference.lights import UnitLobes
 from factorlib.inference.materials import Materials, Point
-from factorlib.inference.noise import Noise
 from factorlib.inference.observed import blocks_of_observations
 from factorlib.light.lobes import lobe_integral
 from factorlib.reflection import reflection_operator
@@ -38,7 +38,7 @@ def test_radiance_is_linear_in_light_and_atoms_are_what_a_lobe_adds_to_the_resid
     rows = np.flatnonzero(~clipped.block.clipped.any(1))
     more = msgspec.structs.replace(straight, light=straight.light.with_lobes(lobe, weight))
     added = (more.residuals() - straight.residuals())[rows]
-    atoms = straight.atoms(rows, lobe)[:, :, 0].T
+    atoms = straight.unit_responses(rows, lobe)[:, :, 0].T
     np.testing.assert_allclose(atoms * weight, added, atol=1e-9 * np.abs(added).max())
 
 
@@ -85,7 +85,7 @@ def test_the_gauge_changes_no_radiance_and_a_shifted_point_comes_to_the_same_one
     materials = Materials(point.materials.diffuse * factor, point.materials.specular * factor, MATERIALS.roughness)
     lights = [msgspec.structs.replace(light, weight=light.weight / factor) for light in point.lights]
     shifted = Point(materials, lights)
-    settled = [in_gauge(p, problem.blocks) for p in (point, shifted)]
+    settled = [fix_gauge(p, problem.blocks) for p in (point, shifted)]
     np.testing.assert_allclose(settled[0].materials.vector(), settled[1].materials.vector(), rtol=1e-12)
     for at in (*settled, shifted):
         for found, expected in zip(problem.radiance(at), problem.radiance(point), strict=True):
@@ -99,7 +99,7 @@ def test_a_single_light_comes_out_grey_and_a_lobe_made_sharper_at_its_energy_mov
     sharper = light.log_sharpness + np.array([2.0, 0, 0, 0])
     kept = lobe_integral(light.sharpness) / lobe_integral(np.exp(sharper))
     other = msgspec.structs.replace(light, log_sharpness=sharper, weight=light.weight * kept[:, None])
-    first, second = (in_gauge(Point(MATERIALS, [li]), [data]) for li in (light, other))
+    first, second = (fix_gauge(Point(MATERIALS, [li]), [data]) for li in (light, other))
     np.testing.assert_allclose(first.materials.vector(), second.materials.vector(), rtol=1e-12)
     assert abs((first.materials.diffuse + first.materials.specular).max() - BRIGHTEST) < 1e-12
     (grey,) = first.lights

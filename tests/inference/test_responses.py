@@ -7,15 +7,15 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from factorlib.geometry.sphere import fibonacci_sphere
+from factorlib.inference.blocks import RobustLoss
 from factorlib.inference.forward import Illumination
-from factorlib.inference.lights import UnitLobes, even_cells
+from factorlib.inference.lights import UnitLobes, fibonacci_cells
 from factorlib.inference.materials import Materials
-from factorlib.inference.noise import Loss
-from factorlib.inference.responses import NODES, Reflections, diffuse_response, specular_response
+from factorlib.inference.responses import NODES, ResponseTable, diffuse_response, specular_response
 from studies.scenes.problems import MATERIALS, block
 from tests.inference.made_lights import OPERATOR, drawn, on_even_cells
 
-CELLS, ALL = 60, Loss(1e6)  # no outliers
+CELLS, ALL = 60, RobustLoss(1e6)  # no outliers
 
 
 def made(seed, photos=1, toned=False, hidden=False, bounced=False, clipped=False, near=False) -> Illumination:
@@ -40,7 +40,7 @@ def made(seed, photos=1, toned=False, hidden=False, bounced=False, clipped=False
         data = msgspec.structs.replace(data, clipped=rng.random((n, 3)) < 0.3)
     off = np.exp(rng.normal(0, 0.2, data.radiance.shape))
     one = Illumination(msgspec.structs.replace(data, radiance=data.radiance * off), light, materials, OPERATOR)
-    return msgspec.structs.replace(one, table=Reflections(one.block, light.unit_lobes, OPERATOR))
+    return msgspec.structs.replace(one, table=ResponseTable(one.block, light.unit_lobes, OPERATOR))
 
 
 ANY = {
@@ -60,13 +60,13 @@ def test_the_table_shows_what_the_operator_shows(**how):
     one = made(**how)
     by_operator = msgspec.structs.replace(one, table=None)
     np.testing.assert_allclose(one.radiance(), by_operator.radiance(), atol=0.01)  # a block's mean is 1
-    assert one.shown().responses and not by_operator.shown().responses
+    assert one.predict().responses and not by_operator.predict().responses
 
 
 def linear(one: Illumination, of, change) -> np.ndarray:
     """What `of` (a part of a Linearised) says of a change, for all residuals."""
     result = np.zeros((len(one.block), 3))
-    for part in one.linearise(one.shown(), ALL):
+    for part in one.linearise(one.predict(), ALL):
         result[part.rows, part.channel] = of(part, change)
     return result
 
@@ -125,15 +125,15 @@ def test_derivatives_are_finite_differences_where_channels_are_clipped(toned):
     idle = one.block.clipped & (one.residuals() >= 0)
     assert idle.sum() > 20
     check_derivatives(one)
-    for part in one.linearise(one.shown(), ALL):
+    for part in one.linearise(one.predict(), ALL):
         none = idle[part.rows, part.channel]
         assert not part.diffuse[none].any() and not part.by_material[none].any() and not part.residual[none].any()
 
 
 def test_outliers_and_temperature_are_factors_on_residual_and_derivatives():
     one = made(4)
-    plain, weighed = (list(one.linearise(one.shown(), loss, T)) for loss, T in ((ALL, 1.0), (Loss(0.5), 4.0)))
-    trust = np.sqrt(Loss(0.5).trust(one.residuals()))
+    plain, weighed = (list(one.linearise(one.predict(), loss, T)) for loss, T in ((ALL, 1.0), (RobustLoss(0.5), 4.0)))
+    trust = np.sqrt(RobustLoss(0.5).weights(one.residuals()))
     for a, b in zip(plain, weighed, strict=True):
         factor = trust[a.rows, a.channel] / 2
         for name in ("diffuse", "by_roughness", "by_material"):
@@ -144,16 +144,16 @@ def test_outliers_and_temperature_are_factors_on_residual_and_derivatives():
 @pytest.mark.parametrize("sharpness", [None, 500.0])  # None: of the cells; 500: every node is needed
 def test_responses_between_nodes_are_those_of_the_operator(sharpness):
     data = block("room", on_even_cells(drawn(0, CELLS)), MATERIALS, [0, 1, 2], OPERATOR, size=10)
-    cells = even_cells(CELLS)
+    cells = fibonacci_cells(CELLS)
     lobes = cells if sharpness is None else UnitLobes(cells.axis, np.full(CELLS, sharpness))
-    table = Reflections(data, lobes, OPERATOR)
+    table = ResponseTable(data, lobes, OPERATOR)
     rows = table.rows(1)
     assert (data.material[rows] == 1).all() and (data.material == 1).sum() == rows.stop - rows.start
     for roughness in (0.1, 0.28, 0.55, float(NODES[3]), 1.0):
-        found = table.at(1, roughness)
+        found = table.interpolate(1, roughness)
         assert np.allclose(found.diffuse, diffuse_response(data, rows, lobes, OPERATOR), rtol=1e-5, atol=1e-7)
         specular = specular_response(data, rows, lobes, roughness, OPERATOR)
         assert np.abs(found.specular - specular).max() < 0.01 * specular.max()
     step = 1e-3
-    slope = (table.at(1, 0.28 + step).specular - table.at(1, 0.28 - step).specular) / (2 * step)
-    assert np.allclose(table.at(1, 0.28).by_roughness, slope, rtol=0.02, atol=1e-3 * np.abs(slope).max())
+    slope = (table.interpolate(1, 0.28 + step).specular - table.interpolate(1, 0.28 - step).specular) / (2 * step)
+    assert np.allclose(table.interpolate(1, 0.28).by_roughness, slope, rtol=0.02, atol=1e-3 * np.abs(slope).max())

@@ -7,18 +7,17 @@ import pytest
 from factorlib.checkpoint import Checkpoint
 from factorlib.geometry.sphere import fibonacci_sphere
 from factorlib.inference import joint_solver, model_selection
-from factorlib.inference.fit import Schedule
-from factorlib.inference.history import PHASES, Event, of_parts
+from factorlib.inference.fit import FitSchedule
+from factorlib.inference.fit_runner import PHASES, Event, FitRunner, solve_progress
 from factorlib.inference.joint_solver import solve
-from factorlib.inference.options import Choices
+from factorlib.inference.options import SolveOptions
 from factorlib.inference.problem import JointProblem
-from factorlib.inference.resume import Run
-from factorlib.inference.start import from_nothing
+from factorlib.inference.start import start_from_photos
 from factorlib.stage import serial_map
 from studies.scenes.problems import MATERIALS, block, random_light
 from tests.inference.made_lights import OPERATOR
 
-CHOICES = Choices(cells=24, splittings=1, observations=100)
+CHOICES = SolveOptions(cells=24, splittings=1, observations=100)
 PARTS = ("effects", "tone", "distances", "materials", "splitting", "lights", "suns")
 ALL = (*PHASES, "splitting 1", "lights", "suns")
 
@@ -31,12 +30,12 @@ class Killed(Exception):
 def short():
     """Where a descent ends does not matter here."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(model_selection, "TRIAL", Schedule(2, (3,)))
-        patch.setattr(model_selection, "NEARER", Schedule(together=(2,), estimate=False))
-        patch.setattr(model_selection, "CURVED", Schedule(together=(2,), estimate=False))
-        patch.setattr(joint_solver, "MATERIALS", Schedule(2, (2,)))
-        patch.setattr(joint_solver, "AFTER_SPLITTING", Schedule(1, (2,)))
-        patch.setattr(joint_solver, "LIGHTS", Schedule(together=(0, 2), given=True))
+        patch.setattr(model_selection, "TRIAL", FitSchedule(2, (3,)))
+        patch.setattr(model_selection, "DISTANCE_SCHEDULE", FitSchedule(joint_steps=(2,), estimate_first=False))
+        patch.setattr(model_selection, "TONE_SCHEDULE", FitSchedule(joint_steps=(2,), estimate_first=False))
+        patch.setattr(joint_solver, "MATERIALS", FitSchedule(2, (2,)))
+        patch.setattr(joint_solver, "AFTER_SPLITTING", FitSchedule(1, (2,)))
+        patch.setattr(joint_solver, "LIGHTS", FitSchedule(joint_steps=(0, 2), materials_fixed=True))
         yield
 
 
@@ -56,8 +55,8 @@ def answer(blocks, checkpoint=Checkpoint(None), spread=serial_map):
     """All numbers of an answer, and the events reported."""
     events = []
 
-    parts = Run(checkpoint, events.append)
-    found = solve(JointProblem(blocks, OPERATOR, spread=spread), from_nothing(3), CHOICES, parts)
+    parts = FitRunner(checkpoint, events.append)
+    found = solve(JointProblem(blocks, OPERATOR, spread=spread), start_from_photos(3), CHOICES, parts)
     p = found.point
     parts = [p.materials.vector(), *(np.ravel(getattr(li, f)) for li in p.lights for f in li.__struct_fields__)]
     decided = [
@@ -68,7 +67,7 @@ def answer(blocks, checkpoint=Checkpoint(None), spread=serial_map):
         found.distances,
         found.splitting,
     ]
-    hyper = [[one.value, one.hyperparameters] for one in (found.materials, found.lights)]
+    hyper = [[one.value, one.hyperparameters] for one in (found.materials, found.fit)]
     return np.concatenate(parts).tobytes() + msgspec.json.encode([decided, hyper]), events
 
 
@@ -127,7 +126,7 @@ def test_what_was_done_is_not_done_again_but_a_file_that_cannot_be_read_starts_t
 def test_progress_never_goes_back_moves_with_every_point_and_is_whole_only_at_the_end():
     """With three starts each model is fitted three times: the first phases are entered anew."""
     said, effects, later = [], list(PHASES)[:3], [*list(PHASES)[3:], "splitting 1", "splitting 2", "lights", "suns"]
-    report = of_parts(lambda done, total, text: said.append(done / total), Choices(splittings=2))
+    report = solve_progress(lambda done, total, text: said.append(done / total), SolveOptions(splittings=2))
     for phase in [*(one for one in effects for _ in range(3)), *later]:
         for iteration in (*range(12), -1):
             report(Event(0, phase, iteration, 1.0, float("nan"), 400))

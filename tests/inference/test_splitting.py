@@ -3,16 +3,17 @@
 import numpy as np
 import pytest
 
-from factorlib.inference.evidence import FINER
-from factorlib.inference.fit import Schedule, fitted
-from factorlib.inference.joint_solver import SPLIT, split_while_gaining
-from factorlib.inference.options import Choices
-from factorlib.inference.resume import Run
+from factorlib.inference.fit import FitSchedule, fit_problem
+from factorlib.inference.fit_runner import FitRunner
+from factorlib.inference.joint_solver import SPLIT_CELLS, split_while_gaining
+from factorlib.inference.model_selection import WEAKLY_FOR
+from factorlib.inference.options import SolveOptions
 from studies.scenes.problems import MATERIALS
+from tests.inference.made import none_held_out
 from tests.inference.made_lights import PRIOR, begun, light_of, spheres
 
 CELLS, SHOWN = 60, [1, 2]
-ONCE = Choices(splittings=1)
+ONCE = SolveOptions(splittings=1)
 
 
 def lamp(x: float):
@@ -23,8 +24,8 @@ def lamp(x: float):
 def splitting_of(lights):
     """The fit on cells of one size, and what comes of splitting."""
     problem = spheres(lights, size=18, shown=SHOWN)
-    fit = fitted(problem, begun(problem, CELLS), PRIOR, Schedule(4, (10, 8)))
-    return problem, fit, split_while_gaining(problem, fit, ONCE, Run())
+    fit = fit_problem(problem, begun(problem, CELLS), PRIOR, FitSchedule(4, (10, 8)))
+    return problem, fit, split_while_gaining(problem, fit, ONCE, FitRunner())
 
 
 @pytest.fixture(scope="module")
@@ -35,10 +36,12 @@ def lamps():
 def test_around_a_lamp_cells_split_and_what_they_hid_of_roughness_comes_out(lamps):
     problem, before, after = lamps
     (evidence,) = after.evidence
-    assert evidence.kept and evidence.margin > FINER and evidence.held_out_loss_with < evidence.held_out_loss_without
+    assert (
+        evidence.kept and evidence.margin > WEAKLY_FOR and evidence.held_out_loss_with < evidence.held_out_loss_without
+    )
     errors = [np.abs(fit.point.materials.roughness - MATERIALS.roughness)[SHOWN] for fit in (before, after.fit)]
     assert errors[1].sum() < 0.6 * errors[0].sum() and (errors[1] < errors[0]).all(), errors
-    assert [len(light) for light in after.fit.point.lights] == pytest.approx([CELLS + 3 * SPLIT] * 2, rel=0.1)
+    assert [len(light) for light in after.fit.point.lights] == pytest.approx([CELLS + 3 * SPLIT_CELLS] * 2, rel=0.1)
     assert problem.held_out_loss(after.fit.point) < problem.held_out_loss(before.point)
 
 
@@ -50,6 +53,9 @@ def test_a_constant_light_needs_no_finer_cells():
 
 def test_nothing_splits_where_nothing_is_held_out_or_nobody_asks(lamps):
     problem, fit, _ = lamps
-    for some, choices in ((problem.with_none_held_out(), ONCE), (problem, Choices(splittings=0))):
-        found = split_while_gaining(some, fit, choices, Run())
+    for some, choices in (
+        (problem.with_blocks([none_held_out(b) for b in problem.blocks]), ONCE),
+        (problem, SolveOptions(splittings=0)),
+    ):
+        found = split_while_gaining(some, fit, choices, FitRunner())
         assert found.evidence == [] and found.fit is fit

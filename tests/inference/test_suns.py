@@ -7,11 +7,11 @@ import numpy as np
 import pytest
 
 from factorlib.inference import suns
-from factorlib.inference.evidence import AGAINST
-from factorlib.inference.fit import Schedule, fitted
+from factorlib.inference.fit import FitSchedule, fit_problem
+from factorlib.inference.fit_runner import FitRunner
 from factorlib.inference.lights import UnitLobes
-from factorlib.inference.resume import Run
-from factorlib.inference.suns import WIDE, candidate, clearly_better, compared, suns_chosen
+from factorlib.inference.model_selection import CLEARLY_AGAINST
+from factorlib.inference.suns import WIDE_SHARPNESS, accept_sun, compare_illuminations, replace_brightest, select_suns
 from factorlib.light.lobes import SUN, lobe_integral
 from factorlib.results.materials import Decision
 from studies.scenes.problems import MATERIALS
@@ -19,7 +19,9 @@ from tests.inference.made_lights import FEW, PRIOR, begun, drawn, on_even_cells,
 
 TOWARDS = np.array([0.36, -0.48, -0.8])
 SUN_LOBE = UnitLobes(TOWARDS[None], np.array([SUN]))
-LIGHTS, AROUND = (Schedule(together=together, least=0.1, given=True) for together in ((0, 8, 6), (0, 8)))
+LIGHTS, AROUND = (
+    FitSchedule(joint_steps=together, least_temperature=0.1, materials_fixed=True) for together in ((0, 8, 6), (0, 8))
+)
 
 
 @cache
@@ -30,7 +32,7 @@ def solved(irradiance: float, seed: int):
     energy = irradiance * sky.energy.sum(0) * 2 * np.pi / lobe_integral(np.array([SUN]))
     light = sky.with_lobes(SUN_LOBE, energy) if irradiance else sky
     problem = spheres([light], size=24, seed=seed)
-    fit = fitted(problem, begun(problem, 2 * FEW, MATERIALS), PRIOR, LIGHTS)
+    fit = fit_problem(problem, begun(problem, 2 * FEW, MATERIALS), PRIOR, LIGHTS)
     (one,) = problem.illuminations(fit.point)
     return problem, energy * lobe_integral(np.array([SUN])) / problem.blocks[0].unit, one, fit
 
@@ -38,7 +40,10 @@ def solved(irradiance: float, seed: int):
 def tried(irradiance: float, seed: int):
     """The fits in cells alone, with a sun, and with a wide lobe."""
     problem, _, one, fit = solved(irradiance, seed)
-    fits = [fitted(problem, fit.with_lights([candidate(one, of)]), PRIOR, AROUND) for of in (SUN, WIDE)]
+    fits = [
+        fit_problem(problem, fit.with_lights([replace_brightest(one, of)]), PRIOR, AROUND)
+        for of in (SUN, WIDE_SHARPNESS)
+    ]
     return [one, *(problem.illuminations(around.point)[0] for around in fits)]
 
 
@@ -46,7 +51,7 @@ def tried(irradiance: float, seed: int):
 def test_a_sun_is_found_with_its_direction_and_its_irradiance(seed):
     cells, sun, wide = tried(0.5, seed)
     light, irradiance = sun.light, solved(0.5, seed)[1]
-    assert clearly_better(cells, sun).kept and compared(wide, sun, AGAINST).kept
+    assert accept_sun(cells, sun).kept and compare_illuminations(wide, sun, CLEARLY_AGAINST).kept
     assert light.suns.sum() == 1 and np.arccos(light.axis[light.suns][0] @ TOWARDS) < cells.light.spacing[0] / 4
     np.testing.assert_allclose(2 * np.pi * light.energy[light.suns][0], irradiance, rtol=0.3)
 
@@ -54,17 +59,17 @@ def test_a_sun_is_found_with_its_direction_and_its_irradiance(seed):
 @pytest.mark.parametrize("seed", [1, 2, 3])
 def test_no_sun_is_found_in_a_sky_without_one(seed):
     cells, sun, wide = tried(0.0, seed)
-    assert not (clearly_better(cells, sun).kept and compared(wide, sun, AGAINST).kept)
+    assert not (accept_sun(cells, sun).kept and compare_illuminations(wide, sun, CLEARLY_AGAINST).kept)
 
 
 def test_the_solve_keeps_suns_of_lights_that_have_one():
     problem, *_, fit = solved(0.5, 1)
-    found = suns_chosen(problem, fit, Run())
+    found = select_suns(problem, fit, FitRunner())
     assert found.evidence[0].kept and found.fit.point.lights[0].suns.any()
-    again = suns_chosen(problem, found.fit, Run())
+    again = select_suns(problem, found.fit, FitRunner())
     assert again.fit is found.fit and again.evidence[0].kept
     cloudy, *_, fit = solved(0.0, 1)
-    none = suns_chosen(cloudy, fit, Run())
+    none = select_suns(cloudy, fit, FitRunner())
     assert not none.evidence[0].kept and none.fit.point.lights[0] is fit.point.lights[0]
 
 
@@ -73,9 +78,9 @@ def test_the_solve_keeps_suns_of_lights_that_have_one():
 )
 def test_a_sun_is_strong_and_no_bluer_than_its_light(monkeypatch, colour, share, kept):
     """Whatever the observations say."""
-    monkeypatch.setattr(suns, "compared", lambda *_: Decision(True, 1.0, 2.0, 9.0))
+    monkeypatch.setattr(suns, "compare_illuminations", lambda *_: Decision(True, 1.0, 2.0, 9.0))
     one = solved(0.0, 1)[2]
     total = one.light.energy.sum() * 2 * np.pi / lobe_integral(np.array([SUN]))[0]
     weight = total * share * np.array(colour) / sum(colour)
     lit = msgspec.structs.replace(one, light=one.light.with_lobes(SUN_LOBE, weight))
-    assert clearly_better(one, lit).kept == kept
+    assert accept_sun(one, lit).kept == kept

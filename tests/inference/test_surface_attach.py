@@ -6,8 +6,7 @@ import numpy as np
 from factorlib.generate.shapes import sphere
 from factorlib.geometry.camera import Camera, Pose
 from factorlib.geometry.raster import rasterise
-from factorlib.inference.surface_attach import attached_pixels
-from factorlib.inference.surface_detail import Surfaces
+from factorlib.inference.surface_turns import Surfaces, attach_pixels
 from factorlib.meshes.fine import fine
 from factorlib.meshes.mesh import Mesh, scaled
 from factorlib.results.poses import ObjectEntry, entry_of
@@ -36,14 +35,14 @@ def test_pixels_of_two_objects_know_their_nodes_and_their_pose():
     surfaces = Surfaces({name: fine(mesh) for name, mesh in meshes.items()})
     objects = {"a": ("apple", entry(poses[0])), "b": ("pear", entry(poses[1], scale))}
     y, x = np.nonzero(maps.object >= 0)
-    at = attached_pixels(np.column_stack([x, y]), maps.object[y, x], CAMERA, objects, surfaces)
+    at = attach_pixels(np.column_stack([x, y]), maps.object[y, x], CAMERA, objects, surfaces)
     place = np.zeros((surfaces.nodes, 3))
     for name, own in surfaces.meshes.items():
-        place[surfaces.first[name] + own.node] = own.mesh.vertices * (scale if name == "pear" else 1)
+        place[surfaces.first_nodes[name] + own.node] = own.mesh.vertices * (scale if name == "pear" else 1)
     met = np.einsum("nk,nkd->nd", at.share, place[at.node])
     for number, (pose, name) in enumerate(zip(poses, meshes), start=1):
         rows = (maps.object[y, x] == number) & at.share.any(1)
-        assert rows.sum() > 100 and (at.node[rows] >= surfaces.first[name]).all()
+        assert rows.sum() > 100 and (at.node[rows] >= surfaces.first_nodes[name]).all()
         seen = pose.apply(met[rows])
         np.testing.assert_allclose(seen[:, 2], maps.depth[y, x][rows], atol=1e-4)
         np.testing.assert_allclose(at.share[rows].sum(1), 1)

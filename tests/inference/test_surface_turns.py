@@ -7,12 +7,22 @@ import trimesh
 from scipy.linalg import block_diag
 
 from factorlib.inference import surface_turns
-from factorlib.inference.fit import ROBUST, Hyperparameters, likelihood_of
+from factorlib.inference.fit import ROBUST, Hyperparameters, light_likelihood
 from factorlib.inference.materials import Point
 from factorlib.inference.problem import JointProblem
-from factorlib.inference.start import from_nothing
-from factorlib.inference.surface_detail import Found, Surfaces, found
-from factorlib.inference.surface_turns import GRAZING, MOST, PULL, Attached, Detail, Stiffness, part_of, step
+from factorlib.inference.start import start_from_photos
+from factorlib.inference.surface_detail import SurfaceEstimate, estimate_surface
+from factorlib.inference.surface_turns import (
+    LARGEST_TURN,
+    LEAST_VIEW_COSINE,
+    PULL_SHARE,
+    Attached,
+    Detail,
+    Stiffness,
+    Surfaces,
+    linearise_light,
+    solve_detail,
+)
 from factorlib.meshes.fine import Fine
 from factorlib.meshes.mesh import Mesh
 from studies.scenes.problems import MATERIALS
@@ -52,21 +62,21 @@ def wrong(normal: np.ndarray, size: float) -> np.ndarray:
 
 def with_wrong_normals(problem: JointProblem, size: float) -> JointProblem:
     """What the photos show is as it was; the mesh has dents that the object has not."""
-    return problem.of([msgspec.structs.replace(b, normal=wrong(b.normal, size)) for b in problem.blocks])
+    return problem.with_blocks([msgspec.structs.replace(b, normal=wrong(b.normal, size)) for b in problem.blocks])
 
 
 @pytest.mark.parametrize("kind", ["clipped", "bounced", "hidden"])
 def test_slopes_are_those_of_the_forward_model(kind, monkeypatch):
-    monkeypatch.setattr(surface_turns, "STEP", 1e-3)  # the step in use smooths what is sharper than a degree
+    monkeypatch.setattr(surface_turns, "NORMAL_STEP", 1e-3)  # the step in use smooths what is sharper than a degree
     one, body = photos_in_a_wrong_light(kind), surfaces()
     at, random = attached_to(one.block.normal, body), np.random.default_rng(0)
     turn, log_factor = random.normal(size=(body.nodes, 3)), random.normal(size=body.nodes)
-    part = part_of(one, COUNTS, PRIOR, at, body.nodes)
-    own = likelihood_of(one, COUNTS, PRIOR, True).illumination
-    residual = own.block.residuals(own.shown().radiance)
-    weight = one.pull(residual, ROBUST, COUNTS.temperature)
+    part = linearise_light(one, COUNTS, PRIOR, at, body.nodes)
+    own = light_likelihood(one, COUNTS, PRIOR, True).illumination
+    residual = own.block.residuals(own.predict().radiance)
+    weight = one.root_weights(residual, ROBUST, COUNTS.temperature)
     after, before = (
-        msgspec.structs.replace(one, block=Detail(s * turn, s * log_factor).on(one.block, at)).residuals()
+        msgspec.structs.replace(one, block=Detail(s * turn, s * log_factor).apply_to(one.block, at)).residuals()
         for s in (1e-3, -1e-3)
     )
     inside = np.sum(one.block.normal * one.block.view, 1) > 0.2
@@ -80,17 +90,17 @@ def test_slopes_are_those_of_the_forward_model(kind, monkeypatch):
 @pytest.mark.parametrize("stiffness", [Stiffness(50.0), Stiffness(50.0, 20.0), Stiffness(None, 20.0)])
 def test_a_step_is_that_of_the_dense_system_of_detail_and_lights(stiffness, monkeypatch):
     # the accuracy in use leaves what lights explain as well: all factors together
-    monkeypatch.setattr(surface_turns, "ACCURACY", 1e-7)
-    monkeypatch.setattr(surface_turns, "ITERATIONS", 2000)
+    monkeypatch.setattr(surface_turns, "CG_TOLERANCE", 1e-7)
+    monkeypatch.setattr(surface_turns, "CG_ITERATIONS", 2000)
     problem, _, body = *photographed(2, 2, size=9), surfaces(1)
     problem = with_wrong_normals(problem, 0.1)
     fit, random = begun(problem), np.random.default_rng(1)
     start = Detail(0.02 * random.normal(size=(body.nodes, 3)), 0.02 * random.normal(size=body.nodes))
     parts = [
-        part_of(one, COUNTS, PRIOR, attached_to(one.block.normal, body), body.nodes)
+        linearise_light(one, COUNTS, PRIOR, attached_to(one.block.normal, body), body.nodes)
         for one in problem.illuminations(fit.point)
     ]
-    rough = body.laplacian().toarray() + PULL * np.eye(body.nodes)
+    rough = body.laplacian().toarray() + PULL_SHARE * np.eye(body.nodes)
     prior = block_diag((stiffness.turn or 0) * np.kron(rough, np.eye(3)), (stiffness.factor or 0) * rough)
     free = np.repeat([stiffness.turn is not None, stiffness.factor is not None], [3 * body.nodes, body.nodes])
     before = np.concatenate([start.turn.reshape(-1), start.log_factor])
@@ -102,10 +112,10 @@ def test_a_step_is_that_of_the_dense_system_of_detail_and_lights(stiffness, monk
     for part, one, size in zip(parts, problem.illuminations(fit.point), sizes, strict=True):
         own = slice(first, first + size)
         J = part.slopes.toarray()[:, free]
-        U = np.stack([part.of_light(e) for e in np.eye(size)], axis=1)
-        likelihood = likelihood_of(one, COUNTS, PRIOR, True)
-        residual = likelihood.illumination.block.residuals(likelihood.illumination.shown().radiance)
-        r = (residual * one.pull(residual, ROBUST, COUNTS.temperature)).reshape(-1)
+        U = np.stack([part.residual_change(e) for e in np.eye(size)], axis=1)
+        likelihood = light_likelihood(one, COUNTS, PRIOR, True)
+        residual = likelihood.illumination.block.residuals(likelihood.illumination.predict().radiance)
+        r = (residual * one.root_weights(residual, ROBUST, COUNTS.temperature)).reshape(-1)
         Q, u = likelihood.precision, one.light.log_radiance.reshape(-1)
         system[:v, :v] += J.T @ J
         system[:v, own], system[own, :v], system[own, own] = J.T @ U, U.T @ J, U.T @ U + Q
@@ -114,7 +124,7 @@ def test_a_step_is_that_of_the_dense_system_of_detail_and_lights(stiffness, monk
         first += size
     expected = before.copy()
     expected[free] -= np.linalg.solve(system, gradient)[:v]
-    given = step(parts, body.laplacian(), stiffness, start)
+    given = solve_detail(parts, body.laplacian(), stiffness, start)
     given = np.concatenate([given.turn.reshape(-1), given.log_factor])
     assert np.linalg.norm(given - expected) < 0.02 * np.linalg.norm(expected - before)
     assert np.array_equal(given[~free], before[~free])
@@ -125,18 +135,20 @@ def test_turned_normals_are_unit_bounded_and_never_leave_the_viewer():
     normal = random.normal(size=(500, 3))
     normal /= np.linalg.norm(normal, axis=1, keepdims=True)
     view = np.tile([0.0, 0.0, 1.0], (500, 1))
-    normal[:, 2] = np.abs(normal[:, 2]) + GRAZING
+    normal[:, 2] = np.abs(normal[:, 2]) + LEAST_VIEW_COSINE
     normal /= np.linalg.norm(normal, axis=1, keepdims=True)
     at = attached_to(normal, body)
-    after = at.turned(normal, view, random.normal(size=(body.nodes, 3)))
+    after = at.turn_normals(normal, view, random.normal(size=(body.nodes, 3)))
     np.testing.assert_allclose(np.linalg.norm(after, axis=1), 1)
-    assert (np.sum(after * normal, 1) > 1 / np.hypot(1, MOST) - 1e-9).all() and (after[:, 2] >= GRAZING).all()
-    np.testing.assert_allclose(at.turned(normal, view, np.zeros((body.nodes, 3))), normal)
+    assert (np.sum(after * normal, 1) > 1 / np.hypot(1, LARGEST_TURN) - 1e-9).all() and (
+        after[:, 2] >= LEAST_VIEW_COSINE
+    ).all()
+    np.testing.assert_allclose(at.turn_normals(normal, view, np.zeros((body.nodes, 3))), normal)
     nowhere = msgspec.structs.replace(at, share=np.zeros_like(at.share))
-    np.testing.assert_allclose(nowhere.turned(normal, view, np.ones((body.nodes, 3))), normal)
+    np.testing.assert_allclose(nowhere.turn_normals(normal, view, np.ones((body.nodes, 3))), normal)
 
 
-def on_spheres(lights: int, size: float, seed: int = 0) -> tuple[Found, Surfaces, JointProblem, JointProblem]:
+def on_spheres(lights: int, size: float, seed: int = 0) -> tuple[SurfaceEstimate, Surfaces, JointProblem, JointProblem]:
     """What is found of a ball whose mesh has dents of that size, in so many lights."""
     true = [on_even_cells(drawn(100 * seed + k, 120)) for k in range(lights)]
     problem, body = spheres(true, size=18, seed=seed), surfaces()
@@ -144,7 +156,7 @@ def on_spheres(lights: int, size: float, seed: int = 0) -> tuple[Found, Surfaces
     at = [attached_to(block.normal, body) for block in problem.blocks]
     told = Rising()
     return (
-        found(given, body, at, from_nothing(3), report=lambda share, what: told(share, 1, what)),
+        estimate_surface(given, body, at, start_from_photos(3), report=lambda share, what: told(share, 1, what)),
         body,
         given,
         problem,
@@ -159,11 +171,11 @@ def errors(normals: np.ndarray, true: np.ndarray) -> float:
 def test_dents_that_the_object_has_not_are_found_in_three_lights():
     what, body, given, true = on_spheres(3, 0.15, 1)
     assert what.evidence.kept and sum(what.gains.values()) > 0 and not what.painted.kept
-    turn = body.turns_of(what.displacements)
+    turn = body.turns_from_displacements(what.displacements)
     for block, exact in zip(given.blocks, true.blocks, strict=True):
         at = attached_to(exact.normal, body)
         before = errors(block.normal, exact.normal)
-        after = errors(at.turned(block.normal, block.view, turn), exact.normal)
+        after = errors(at.turn_normals(block.normal, block.view, turn), exact.normal)
         assert after < 0.6 * before, (before, after)
 
 
@@ -180,13 +192,13 @@ def test_of_two_meshes_the_one_with_dents_is_moved_and_the_exact_one_stays():
         )
         own = attached_to(block.normal, surfaces())
         at.append(msgspec.structs.replace(own, node=own.node + one.nodes * exact[:, None]))
-    what = found(problem.of(given), body, at, from_nothing(3))
+    what = estimate_surface(problem.with_blocks(given), body, at, start_from_photos(3))
     assert what.evidence.kept and set(what.displacements) == {"dented"}
-    turn = body.turns_of(what.displacements)
-    assert turn[body.nodes_of({"dented"})].any() and not turn[body.nodes_of({"exact"})].any()
+    turn = body.turns_from_displacements(what.displacements)
+    assert turn[body.node_mask({"dented"})].any() and not turn[body.node_mask({"exact"})].any()
     for block, shown, own in zip(problem.blocks, given, at, strict=True):
         dented = block.material < block.material.max()
-        after = own.turned(shown.normal, shown.view, turn)
+        after = own.turn_normals(shown.normal, shown.view, turn)
         assert errors(after[dented], block.normal[dented]) < 0.7 * errors(shown.normal[dented], block.normal[dented])
         np.testing.assert_allclose(after[~dented], shown.normal[~dented], atol=1e-12)
 
@@ -198,15 +210,17 @@ def test_patina_is_found_in_three_lights_and_is_not_taken_for_dents():
     log_factor = 0.4 * np.sin(4 * one.mesh.vertices[:, 0]) * np.cos(3 * one.mesh.vertices[:, 1] + 1)
     painted = Detail(np.zeros((body.nodes, 3)), log_factor)
     at = [attached_to(block.normal, body) for block in problem.blocks]
-    clean = problem.of([msgspec.structs.replace(b, precision=np.ones_like(b.precision)) for b in problem.blocks])
+    clean = problem.with_blocks(
+        [msgspec.structs.replace(b, precision=np.ones_like(b.precision)) for b in problem.blocks]
+    )
     point = Point(MATERIALS, in_units_of(problem.blocks, true))
-    shown = clean.of([painted.on(b, a) for b, a in zip(clean.blocks, at, strict=True)]).radiance(point)
+    shown = clean.with_blocks([painted.apply_to(b, a) for b, a in zip(clean.blocks, at, strict=True)]).radiance(point)
     plain = clean.radiance(point)
     blocks = [
         msgspec.structs.replace(b, radiance=b.radiance * y / np.maximum(x, 1e-9))
         for b, x, y in zip(problem.blocks, plain, shown, strict=True)
     ]
-    what = found(problem.of(blocks), body, at, from_nothing(3))
+    what = estimate_surface(problem.with_blocks(blocks), body, at, start_from_photos(3))
     assert what.painted.kept
     seen = np.bincount(np.concatenate([of.node.reshape(-1) for of in at]), minlength=body.nodes) > 0
     assert np.corrcoef(what.log_factors["ball"][seen], log_factor[seen])[0, 1] > 0.8
@@ -227,5 +241,5 @@ def test_an_exact_surface_stays_in_sharp_lights(lights, shown, seed):
     """Cells blur what is sharper than they are, and turned normals must not take that up."""
     problem, body = spheres([sharp(10 * seed + k) for k in range(lights)], shown=shown, size=22, noise=0.1), surfaces()
     at = [attached_to(block.normal, body) for block in problem.blocks]
-    what = found(problem, body, at, from_nothing(3))
+    what = estimate_surface(problem, body, at, start_from_photos(3))
     assert not what.evidence.kept and not what.displacements

@@ -6,9 +6,9 @@ import pytest
 
 from factorlib.inference.identifiability import tinted_alike
 from factorlib.inference.materials import Point
-from factorlib.inference.misfit import misfit
+from factorlib.inference.misfit import unexplained_shares
 from factorlib.inference.problem import JointProblem
-from factorlib.inference.uncertainty import LARGEST, Posterior
+from factorlib.inference.uncertainty import LARGEST_RELATIVE_ERROR, Posterior
 from factorlib.reflection import reflection_operator
 from studies.scenes.problems import MATERIALS, block, factor_between, random_light
 from tests.inference.made import in_units_of
@@ -47,7 +47,7 @@ def test_lights_lie_within_their_standard_errors(fit):
     assert 0.5 < np.mean(within) < 0.9 and len(made) == len(true)  # a tick a light
     maps = posterior.relative_standard_errors()
     assert set(maps) == {"room0", "room1", "room2"}
-    assert all(((m > 0) & (m <= LARGEST)).all() and np.isfinite(m).all() for m in maps.values())
+    assert all(((m > 0) & (m <= LARGEST_RELATIVE_ERROR)).all() and np.isfinite(m).all() for m in maps.values())
 
 
 # ── what is said of the lights' colour ──────────────────────────────────────────────────────────────────────────────
@@ -98,7 +98,7 @@ def changed(exact, **columns):
 
 def unexplained(problem, point):
     """The misfit of a point."""
-    return misfit(problem, problem.radiance(point))
+    return unexplained_shares(problem, problem.radiance(point))
 
 
 def test_the_truth_leaves_nothing_and_noise_next_to_nothing(exact):

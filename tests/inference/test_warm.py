@@ -9,16 +9,23 @@ import pytest
 from factorlib.inference.forward import Illumination
 from factorlib.inference.joint_solver import solve
 from factorlib.inference.materials import Materials
-from factorlib.inference.options import Choices
+from factorlib.inference.options import SolveOptions
 from factorlib.inference.problem import JointProblem
-from factorlib.inference.start import Beginning, from_beginning, from_earlier, from_nothing, known_point, with_decided
+from factorlib.inference.start import (
+    InitialFit,
+    point_from_earlier,
+    start_from_earlier,
+    start_from_photos,
+    start_from_surface,
+    with_earlier_decisions,
+)
 from factorlib.results.materials import Gauge, MaterialTable, Model, Reflectance, Tone
 from factorlib.results.solution import Earlier
 from studies.scenes.problems import MATERIALS, factor_between
 from tests.inference.made_lights import FEW, OPERATOR, drawn, natural, on_even_cells, spheres
 
 NAMES, CELLS = ["red", "green", "blue"], 40
-QUICK = Choices(cells=CELLS, splittings=0, observations=200, tone="off")
+QUICK = SolveOptions(cells=CELLS, splittings=0, observations=200, tone="off")
 REFLECTANCE, ROUGHNESS, RADIANCE = 0.01, 0.02, 0.01  # how near two answers are, after one factor per channel
 
 
@@ -36,7 +43,7 @@ def truth(*numbers, shown=(0, 1, 2), photos=1, noise=0.0, size=10):
 
 
 def first(materials: Materials, count: int) -> Materials:
-    return Materials.of_rows(materials.rows()[:count])
+    return Materials.from_rows(materials.rows()[:count])
 
 
 def written(blocks, materials: Materials, lights, names=NAMES, component=(0, 0, 0)) -> Earlier:
@@ -51,7 +58,7 @@ def written(blocks, materials: Materials, lights, names=NAMES, component=(0, 0, 
 
 
 def start_from(earlier, blocks, names=NAMES):
-    point = from_earlier(earlier, names)(JointProblem(blocks, OPERATOR), CELLS)[0].point
+    point = start_from_earlier(earlier, names)(JointProblem(blocks, OPERATOR), CELLS)[0].point
     return point.materials, point.lights
 
 
@@ -140,7 +147,7 @@ def test_tone_curves_are_taken_over_where_all_photos_of_a_light_have_one():
     earlier = written(blocks, MATERIALS, lights)
     model = msgspec.structs.replace(earlier.table.model, tone={blocks[0].photos[0]: Tone(1.1, blocks[0].unit)})
     earlier = msgspec.structs.replace(earlier, table=msgspec.structs.replace(earlier.table, model=model))
-    point = known_point(JointProblem(blocks, OPERATOR), earlier, NAMES, CELLS)
+    point = point_from_earlier(JointProblem(blocks, OPERATOR), earlier, NAMES, CELLS)
     np.testing.assert_allclose(np.exp(point.lights[0].log_tone), [1.1])
     assert len(point.lights[1].log_tone) == 0
 
@@ -151,18 +158,18 @@ def test_shadows_and_bounces_stay_as_they_were_decided_where_both_were_tried(kep
     chosen = {"self_shadowing_chosen_by": losses, "interreflection_chosen_by": losses}
     model = Model(self_shadowing=kept, interreflection=not kept, **chosen)
     earlier = Earlier(MaterialTable({}, Gauge(), model), {}, {})
-    found, names = with_decided(Choices(), earlier), ["off", "on"]
+    found, names = with_earlier_decisions(SolveOptions(), earlier), ["off", "on"]
     expected = [names[kept], names[not kept]] if tried else ["auto", "auto"]
     assert [found.self_shadowing, found.interreflection] == expected
-    asked = Choices(self_shadowing="off", interreflection="on")
-    assert with_decided(asked, earlier) == asked
+    asked = SolveOptions(self_shadowing="off", interreflection="on")
+    assert with_earlier_decisions(asked, earlier) == asked
 
 
 # ── whole answers ────────────────────────────────────────────────────────────────────────────────────────────────────
 
 
 def answer(blocks, start=None):
-    return solve(JointProblem(blocks, OPERATOR), start or from_nothing(3), QUICK)
+    return solve(JointProblem(blocks, OPERATOR), start or start_from_photos(3), QUICK)
 
 
 def check_same(cold, warm, blocks):
@@ -180,17 +187,17 @@ def test_with_a_further_material_the_answer_is_the_one_from_nothing():
     """As it is with a further light: `tests/stages/test_solve.py`."""
     blocks, _ = truth(0, 1, noise=0.3, size=8)
     fewer, count = [b.take(b.material < 2) for b in blocks], 2
-    before = solve(JointProblem(fewer, OPERATOR), from_nothing(count), QUICK)
+    before = solve(JointProblem(fewer, OPERATOR), start_from_photos(count), QUICK)
     earlier = written(fewer, before.point.materials, before.point.lights, NAMES[:count], (0,) * count)
-    check_same(answer(blocks), answer(blocks, from_earlier(earlier, NAMES)), blocks)
+    check_same(answer(blocks), answer(blocks, start_from_earlier(earlier, NAMES)), blocks)
 
 
 def test_a_solve_goes_on_from_the_fit_that_surface_wrote_in_whatever_unit_a_block_has():
     problem, _, fit = natural()
-    written = msgspec.json.decode(msgspec.json.encode(Beginning.of(fit, problem.blocks)), type=Beginning)
+    written = msgspec.json.decode(msgspec.json.encode(InitialFit.from_fit(fit, problem.blocks)), type=InitialFit)
     block = problem.blocks[0]
     brighter = msgspec.structs.replace(block, unit=4 * block.unit)
-    (found,) = from_beginning(written)(problem.of([brighter, *problem.blocks[1:]]), FEW)
+    (found,) = start_from_surface(written)(problem.with_blocks([brighter, *problem.blocks[1:]]), FEW)
     assert (found.hyperparameters, found.value) == (fit.hyperparameters, fit.value)
     for light, before, factor in zip(found.point.lights, fit.point.lights, (4, 1, 1), strict=True):
         np.testing.assert_allclose(light.weight * factor, before.weight, rtol=1e-12)
@@ -200,10 +207,10 @@ def test_a_solve_goes_on_from_the_fit_that_surface_wrote_in_whatever_unit_a_bloc
 
 def test_a_light_of_other_cells_or_photos_than_the_fit_had_begins_constant():
     problem, _, fit = natural()
-    begun = from_beginning(Beginning.of(fit, problem.blocks))
+    begun = start_from_surface(InitialFit.from_fit(fit, problem.blocks))
     (coarse,) = begun(problem, 30)
     assert all(np.ptp(light.log_radiance, axis=1).max() < 0.2 for light in coarse.point.lights)
     assert coarse.value == np.inf  # so that it is descended from as from nothing
     two = msgspec.structs.replace(problem.blocks[0], photos=("room0", "another"))
-    light = begun(problem.of([two, *problem.blocks[1:]]), FEW)[0].point.lights[0]
+    light = begun(problem.with_blocks([two, *problem.blocks[1:]]), FEW)[0].point.lights[0]
     assert len(light.log_exposure) == 2 and np.ptp(light.log_radiance, axis=1).max() < 0.2

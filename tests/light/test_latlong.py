@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from factorlib.conventions import YUP_FROM_CAMERA, lat_long_directions, lat_long_solid_angles
-from factorlib.light.latlong import lat_long_of_lobes, map_energy, sampled
+from factorlib.light.latlong import lat_long_of_lobes, map_energy, sample_map
 from factorlib.light.lobes import Lobes
 
 AXES = {
@@ -63,7 +63,7 @@ def test_lobe_lies_where_the_fixed_layout_says(camera_axis, row, column):
 
 def test_sampling_at_texel_centres_gives_the_texels_also_beyond_the_poles():
     lat_long = np.random.default_rng(0).uniform(size=(6, 12, 3))
-    np.testing.assert_allclose(sampled(lat_long, lat_long_directions(6, 12)), lat_long, atol=1e-9)
+    np.testing.assert_allclose(sample_map(lat_long, lat_long_directions(6, 12)), lat_long, atol=1e-9)
     np.testing.assert_allclose(
-        sampled(lat_long, np.array([[1e-9, 1.0, 0.0]])), lat_long[None, 0, [2, 3, 8, 9]].mean(1), atol=1e-6
+        sample_map(lat_long, np.array([[1e-9, 1.0, 0.0]])), lat_long[None, 0, [2, 3, 8, 9]].mean(1), atol=1e-6
     )

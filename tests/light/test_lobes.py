@@ -6,9 +6,9 @@ import torch
 from scipy.integrate import quad
 
 from factorlib.geometry.sphere import fibonacci_sphere
-from factorlib.light.distance import met_from
+from factorlib.light.distance import finite_distance_cosines
 from factorlib.light.lobes import Lobes, lobe_integral, no_lobes
-from factorlib.light.visibility import cosine_weights, highlight_weights, kernel, seen_share
+from factorlib.light.visibility import cosine_weights, highlight_weights, kernel, visible_share
 from factorlib.results.lobes import read_lobes, write_lobes
 
 
@@ -80,8 +80,8 @@ def test_who_sees_everything_sees_all_of_every_lobe_and_shares_lie_between_none_
     (normals, views), d = points(), directions()
     lobes = kernel(d, unit(50), torch.logspace(-1, 3.3, 50).double())
     weights, some = weights_of(part, normals, views, d), torch.from_numpy((RNG.random((30, 256)) > 0.5).astype(float))
-    np.testing.assert_array_equal(seen_share(torch.ones(30, 256).double(), weights, lobes), 1)
-    share = seen_share(some, weights_of(part, normals, views, d, 0.1), lobes)
+    np.testing.assert_array_equal(visible_share(torch.ones(30, 256).double(), weights, lobes), 1)
+    share = visible_share(some, weights_of(part, normals, views, d, 0.1), lobes)
     assert share.min() >= 0 and share.max() <= 1 + 1e-12
 
 
@@ -91,7 +91,9 @@ def test_constant_light_is_seen_through_the_cosine_weighted_open_part_of_the_hem
     tilt = torch.linspace(0, 1.5, 40).double()[:, None]
     across = torch.linalg.cross(normals, unit(40))
     edge = torch.cos(tilt) * normals + torch.sin(tilt) * across / across.norm(dim=1, keepdim=True)
-    share = seen_share(behind(edge, d), cosine_weights(normals, d), kernel(d, unit(1), torch.tensor([1e-3]).double()))
+    share = visible_share(
+        behind(edge, d), cosine_weights(normals, d), kernel(d, unit(1), torch.tensor([1e-3]).double())
+    )
     np.testing.assert_allclose(share, (1 + torch.cos(tilt)) / 2, atol=0.02)
 
 
@@ -120,7 +122,7 @@ def irradiance(cosine, larger):
 
 def test_irradiance_beside_the_middle_is_that_of_rays_to_the_sphere_of_light(places):
     place, normal, view = places
-    nz, _, larger = met_from(place, normal, view, AXES, CURVATURE)
+    nz, _, larger = finite_distance_cosines(place, normal, view, AXES, CURVATURE)
     X = CURVATURE * place
     along = X @ AXES.T  # of rays in directions AXES from X, t is where they meet the unit sphere
     t = -along + np.sqrt(along**2 + 1 - (X**2).sum(1)[:, None])

@@ -11,8 +11,8 @@ from factorlib.errors import InputError
 from factorlib.export.gltf import write_glb
 from factorlib.generate.shapes import sphere
 from factorlib.images.exr import write_exr
-from factorlib.inference.noise import Noise
-from factorlib.inference.observed import blocks_of_observations, gathered
+from factorlib.inference.blocks import Noise
+from factorlib.inference.observed import blocks_of_observations, gather_observations
 from factorlib.meshes.fine import fine
 from factorlib.meshes.ply import write_ply
 from factorlib.meshes.read import CREASE_DEG, MeshesOnce, read_mesh
@@ -69,7 +69,7 @@ def test_observations_and_maps_have_the_normals_and_the_detail_of_the_surface(tm
 def test_the_solve_merges_only_what_has_one_detail_and_its_blocks_reflect_by_it(tmp_path):
     written(tmp_path / "surface")
     write_observations(tmp_path / "a.parquet", observations())
-    (photo,) = gathered([tmp_path / "a.parquet"], 2.0, serial_map, tmp_path / "surface")
+    (photo,) = gather_observations([tmp_path / "a.parquet"], 2.0, serial_map, tmp_path / "surface")
     assert sorted(set(photo.merged.detail.tolist())) == [0.5, 1.0]
     (block,) = blocks_of_observations(photo.merged, Noise())
     assert np.array_equal(np.sort(block.detail), np.sort(photo.merged.detail))

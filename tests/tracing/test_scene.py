@@ -5,7 +5,7 @@ import pytest
 
 from factorlib.conventions import YUP_FROM_CAMERA, lat_long_directions, lat_long_solid_angles
 from factorlib.geometry.camera import Camera
-from factorlib.light.latlong import sampled
+from factorlib.light.latlong import sample_map
 from factorlib.tracing import scene as tracing
 from tests.integral import reflected
 
@@ -28,7 +28,7 @@ def test_mitsuba_evaluates_lambert_and_ggx_of_the_design(material):
     depth = 4.0 - np.sqrt(1 - 0.6**2 - 0.3**2)  # of the ball where the camera's axis meets it
     normal, view = np.array([0, 0, depth]) - BALL, np.array([0, 0, -1.0])
     incoming = lat_long_directions(512, 1024) @ YUP_FROM_CAMERA
-    texels = sampled(light, incoming @ YUP_FROM_CAMERA) * lat_long_solid_angles(512, 1024)[:, None, None]
+    texels = sample_map(light, incoming @ YUP_FROM_CAMERA) * lat_long_solid_angles(512, 1024)[:, None, None]
     expected = reflected(material, normal[None], view[None], incoming.reshape(-1, 3), texels.reshape(-1, 3))
     assert image == pytest.approx(expected[0], rel=0.006)
 
@@ -43,4 +43,4 @@ def test_the_light_seen_is_the_light_there():
     light = smooth_light(16)
     turn = tracing.look(20, 130) @ YUP_FROM_CAMERA
     seen = tracing.light_seen({"light": tracing.envmap(light)}, tracing.rigid(turn, (0, 0, 0)), 16, 4, 1)
-    assert seen == pytest.approx(sampled(light, lat_long_directions(16, 32) @ turn.T), rel=0.02, abs=0.05)
+    assert seen == pytest.approx(sample_map(light, lat_long_directions(16, 32) @ turn.T), rel=0.02, abs=0.05)

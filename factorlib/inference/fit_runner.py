@@ -1,0 +1,250 @@
+"""Run of a solver: fits with reported events and checkpoints, progress, and the final state.
+
+A killed solve resumes and ends in the same bytes.  Every step (the choice of effects, the fit of materials, the
+splittings, …) is a deterministic function of the previous state, so a saved state need not be computed again.  The
+solve continues from the saved form even without an interruption.  The memory layout of an array can change the order of
+a sum, and with it the last bits.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from typing import Any, get_args, get_type_hints
+
+import msgspec
+import numpy as np
+import torch
+
+from factorlib.checkpoint import Checkpoint
+from factorlib.inference.fit import Fit, FitSchedule, fit_problem
+from factorlib.inference.materials import Point
+from factorlib.inference.options import SolveOptions
+from factorlib.inference.problem import JointProblem
+from factorlib.light.prior import LightPrior, read_light_prior
+from factorlib.results.materials import Decision
+
+
+class Event(msgspec.Struct, frozen=True):
+    """Evaluation of one point, or the end of a phase.
+
+    The last event of a phase has iteration −1 and states the held-out loss, which is NaN in all others.
+
+    Attributes:
+        round: Number of the fit.
+        phase: Name of the phase.
+        iteration: Number of the evaluation in this fit.
+        loss: Whitened loss per fitted channel value; 1 means explained to the noise model.
+        held_out: Held-out loss.
+        lobes: Number of lobes or cells.
+    """
+
+    round: int
+    phase: str
+    iteration: int
+    loss: float
+    held_out: float
+    lobes: int
+
+
+EventReport = Callable[[Event], None]
+Progress = Callable[[float, float, str], None]  # amount done, total amount, and the current activity
+# Typical number of evaluations of each phase, and the cost of one relative to the first phase's, on data/eames.
+PHASES = {
+    "shadows": (13, 1),
+    "no shadows": (8, 1),
+    "shadows and bounces": (8, 1),
+    "tone curves": (6, 1),
+    "distances": (24, 1.5),
+    "materials and lights": (11, 7),
+}
+SPLITTING = (7, 9)
+LAST = {"lights": (3, 14), "suns": (4, 10)}
+
+
+def ignore_event(event: Event) -> None:
+    """Ignore an event."""
+
+
+class SolveState(msgspec.Struct, frozen=True):
+    """State of a solve after some of its steps.
+
+    Attributes:
+        fit: Fit of the last step.
+        materials: Fit of the last step that fitted materials, to observations with reliable normals.
+        shadows: Decision on the use of visibility.
+        interreflection: Decision on light that surfaces send each other.
+        tone: Decision on each light's tone curves; empty if not tried.
+        distances: Decision on each light's distance; empty if not tried.
+        splitting: Decision on each splitting of the lights' cells.
+        suns: Decision on each light's sun.
+    """
+
+    fit: Fit
+    materials: Fit
+    shadows: Decision = Decision(False)
+    interreflection: Decision = Decision(False)
+    tone: list[Decision] = []
+    distances: list[Decision] = []
+    splitting: list[Decision] = []
+    suns: list[Decision] = []
+
+    def with_fit(self, fit: Fit, **decisions: list[Decision]) -> SolveState:
+        """Return the state after a step that fitted materials and lights."""
+        return msgspec.structs.replace(self, fit=fit, materials=fit, **decisions)
+
+    def effective_problem(self, problem: JointProblem) -> JointProblem:
+        """Return the problem under the chosen effects: with or without shadows and interreflection."""
+        return problem.with_effects(self.shadows.kept, self.interreflection.kept)
+
+
+class Solution(SolveState, frozen=True, kw_only=True):
+    """Result of a solver: its last state, the answer and all evaluations.
+
+    Attributes:
+        point: Materials and lights, in the gauge of `factorlib.inference.gauge`.
+        history: All evaluations.
+    """
+
+    point: Point
+    history: list[Event]
+
+
+def subset_progress(progress: Progress, subsets: int) -> EventReport:
+    """Return a report that converts events of the paper's solver to progress in `subsets` reported subsets."""
+
+    def report(event: Event) -> None:
+        """Report the number of subsets done."""
+        progress(
+            event.round, subsets + 1, f"{event.phase} {event.iteration}: loss {event.loss:.3g}, {event.lobes} lobes"
+        )
+
+    return report
+
+
+def solve_progress(progress: Progress, options: SolveOptions) -> EventReport:
+    """Return a report that converts events of the joint solve to progress, in evaluations of the first phase.
+
+    Progress moves with every evaluation.  It never goes back, even if several starts enter a phase several times.
+    """
+    phases = PHASES | {f"splitting {k + 1}": SPLITTING for k in range(options.splittings)} | LAST
+    costs = {phase: points * cost for phase, (points, cost) in phases.items()}
+    evaluations = dict.fromkeys(phases, 0)
+    total = sum(costs.values())
+    furthest = 0.0
+
+    def report(event: Event) -> None:
+        """Report the work done.
+
+        A phase counts as three quarters done after its usual number of evaluations, because there may be more.
+        """
+        nonlocal furthest
+        evaluations[event.phase] += 1
+        within = 1.0 if event.iteration < 0 else 1 - 0.25 ** (evaluations[event.phase] / phases[event.phase][0])
+        cost_before = sum(costs[phase] for phase in list(phases)[: list(phases).index(event.phase)])
+        furthest = max(furthest, min(cost_before + within * costs[event.phase], 0.999 * total))
+        progress(furthest, total, f"{event.phase} {event.iteration}: loss {event.loss:.3g}")
+
+    return report
+
+
+def to_tensors(value: Any) -> Any:
+    """Return a structure with structs as dictionaries and arrays as independent tensors."""
+    if isinstance(value, msgspec.Struct):
+        return {name: to_tensors(getattr(value, name)) for name in value.__struct_fields__}
+    if isinstance(value, np.ndarray):
+        return torch.from_numpy(np.array(value, order="C"))
+    return [to_tensors(item) for item in value] if isinstance(value, list) else value
+
+
+def from_tensors(type_: Any, value: Any) -> Any:
+    """Return the value of a given type from its `to_tensors` form."""
+    if isinstance(value, torch.Tensor):
+        return value.numpy().copy()
+    if isinstance(value, dict):
+        hints = get_type_hints(type_)
+        return type_(**{name: from_tensors(hints[name], item) for name, item in value.items()})
+    return [from_tensors(get_args(type_)[0], item) for item in value] if isinstance(value, list) else value
+
+
+class FitRunner:
+    """Runner of fits under one prior, which saves, reports and remembers states and events.
+
+    Args:
+        checkpoint: File of the states; without a file nothing outlives the process (a notebook, a test).
+        report: Called at every evaluated point.
+        prior: Prior on lights; None for the shipped one.
+    """
+
+    def __init__(
+        self,
+        checkpoint: Checkpoint = Checkpoint(None),
+        report: EventReport = ignore_event,
+        prior: LightPrior | None = None,
+    ):
+        self.report = report
+        self.prior = prior or read_light_prior()
+        self.history = list[Event]()
+        self._checkpoint = checkpoint
+        self._states = checkpoint.load() or {}
+
+    def run_steps(
+        self, steps: Mapping[str, Callable[[Any, SolveState], SolveState]], request: Any, state: SolveState
+    ) -> SolveState:
+        """Return the state after all steps; steps that an earlier run completed are read.
+
+        Args:
+            steps: Steps by name, each a function of the question and the state.
+            request: Question.
+            state: Initial state.
+        """
+        for name, step in steps.items():
+            if name in self._states:
+                for event in from_tensors(list[Event], self._states[f"{name}, events"]):
+                    self._record(event)
+            else:
+                event_count = len(self.history)
+                new_state = step(request, state)
+                self._states |= {f"{name}, events": to_tensors(self.history[event_count:]), name: to_tensors(new_state)}
+                self._checkpoint.save(self._states)
+            state = from_tensors(type(state), self._states[name])
+        return state
+
+    def fit(self, phase: str, problem: JointProblem, start: Fit, schedule: FitSchedule) -> Fit:
+        """Fit under the prior on lights, and report every evaluated point as an event of the phase.
+
+        Args:
+            phase: Name of the phase.
+            problem: Observations and model.
+            start: Initial fit.
+            schedule: Number of steps.
+        """
+        number = self.history[-1].round + 1 if self.history else 0
+        iteration = 0
+        cells = sum(map(len, start.point.lights))
+
+        def tell(loss: float) -> None:
+            """Report one evaluated point."""
+            nonlocal iteration
+            self._record(Event(number, phase, iteration, loss, float("nan"), cells))
+            iteration += 1
+
+        return fit_problem(problem, start, self.prior, schedule, tell)
+
+    def fit_and_report(self, phase: str, problem: JointProblem, start: Fit, schedule: FitSchedule) -> Fit:
+        """Fit, and report the held-out loss as the end of the phase (iteration −1).
+
+        Args:
+            phase: Name of the phase.
+            problem: Observations and model.
+            start: Initial fit.
+            schedule: Number of steps.
+        """
+        fit = self.fit(phase, problem, start, schedule)
+        held_out = problem.held_out_loss(fit.point)
+        self._record(msgspec.structs.replace(self.history[-1], iteration=-1, held_out=held_out))
+        return fit
+
+    def _record(self, event: Event) -> None:
+        """Remember and report an event."""
+        self.history.append(event)
+        self.report(event)
