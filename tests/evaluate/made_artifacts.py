@@ -12,7 +12,7 @@ import trimesh
 from factorlib.conventions import YUP_FROM_CAMERA, lat_long_directions
 from factorlib.evaluate.ball import ball, light_of_lat_long
 from factorlib.export.gltf import write_glb
-from factorlib.generate.shapes import sphere
+from factorlib.generate.solids import sphere
 from factorlib.geometry.sphere import ball_normals
 from factorlib.images.exr import LAT_LONG, read_exr, write_exr, write_rgb_exr
 from factorlib.images.picture import write_png

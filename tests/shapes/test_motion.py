@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from factorlib.errors import InputError
-from factorlib.generate.shapes import SHAPES
+from factorlib.generate.solids import SHAPES
 from factorlib.geometry.camera import angle_between
 from factorlib.shapes.hull import hull_overlap
 from factorlib.shapes.motion import LEAST_AGREEMENT, cameras_by_motion

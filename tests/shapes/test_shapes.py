@@ -6,7 +6,7 @@ import pytest
 import trimesh
 
 from factorlib.errors import InputError
-from factorlib.generate.shapes import SHAPES
+from factorlib.generate.solids import SHAPES
 from factorlib.geometry import open3d
 from factorlib.shapes.hull import surface_nets, visual_hull
 from factorlib.shapes.lathe import body_of_revolution
