@@ -19,9 +19,9 @@ from factorlib.inference.blocks import Block
 from factorlib.inference.interreflection import bounced_light
 from factorlib.inference.noise import Noise
 from factorlib.inference.problem import Spread
-from factorlib.urm.geometry import on_surface
 from factorlib.urm.merge import merge
 from factorlib.urm.observations import Observations, read_observations
+from factorlib.urm.surface_maps import with_surface_normals
 
 Rotations = Mapping[str, Float[np.ndarray, "3 3"]]  # world_from_camera, by the name of a photo
 
@@ -62,7 +62,7 @@ def gathered(
 
     def merged(path: Path) -> PhotoObservations:
         """Return the usable observations of one file, merged."""
-        read = on_surface(read_observations(path), surface)
+        read = with_surface_normals(read_observations(path), surface)
         seen = usable(read)
         tick()
         return PhotoObservations(merge(seen, degrees), len(read), len(read) - len(seen))

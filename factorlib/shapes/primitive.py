@@ -49,16 +49,16 @@ def primitive(
     best: tuple[float, Float[np.ndarray, "3"]] = -1.0, np.ones(3)
     for done, start in enumerate(starts):
         report(done / len(starts))
-        mesh = unit(kind, np.array(start, float)).as_mesh()
+        mesh = unit_shape(kind, np.array(start, float)).as_mesh()
         caster = Caster(mesh)
         states = [estimate_pose(caster, outline.view, SEARCH).state for outline in outlines]
         factors, score = fit_proportions(mesh, targets, states, STEPS, FREE_FACTORS.get(kind, np.zeros((3, 0))))
         if score > best[0]:
             best = score, factors * start
-    return msgspec.structs.replace(unit(kind, best[1]).of_size(1.0), overlap=best[0])
+    return msgspec.structs.replace(unit_shape(kind, best[1]).of_size(1.0), overlap=best[0])
 
 
-def unit(kind: str, factors: Float[np.ndarray, "3"]) -> Triangles:
+def unit_shape(kind: str, factors: Float[np.ndarray, "3"]) -> Triangles:
     """Return the unit shape of a kind, with its axes scaled by `factors`."""
     if kind == "ball":
         solid = trimesh.creation.icosphere(subdivisions=5)

@@ -9,7 +9,7 @@ from factorlib.generate.solids import SHAPES
 from factorlib.geometry.camera import angle_between
 from factorlib.shapes.hull import hull_overlap
 from factorlib.shapes.motion import LEAST_AGREEMENT, cameras_by_motion
-from factorlib.shapes.primitive import unit
+from factorlib.shapes.primitive import unit_shape
 from tests.shapes.outlines import looking_from, outline, views_of
 
 BLOB = SHAPES["blob"]()
@@ -47,7 +47,7 @@ def test_of_a_body_that_turns_before_a_camera_at_rest_the_ground_that_stands_sti
 
 
 def test_a_hull_agrees_with_its_masks_where_cameras_move_with_the_body_alone():
-    bar = unit("box", np.array([1.0, 0.3, 0.3])).as_mesh()
+    bar = unit_shape("box", np.array([1.0, 0.3, 0.3])).as_mesh()
     moving = [outline(bar, pose, True) for pose in POSES]
     still = [msgspec.structs.replace(one, pose=POSES[0]) for one in moving]
     barely = [msgspec.structs.replace(one, pose=looking_from(20, 0.2 * k)) for k, one in enumerate(moving)]
