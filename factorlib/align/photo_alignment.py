@@ -103,18 +103,17 @@ def align_photo(
 ) -> PhotoAlignment:
     """Estimate the poses of all objects of a photo.
 
-    The focal length, where `known` does not give it, is estimated with the object that covers most pixels.
-
     Args:
         objects: The objects.
         camera: The photo's camera; its focal length is not used.
         known: Prior knowledge of the focal length.
         photo: Name of the photo.
         search: Effort of the search.
-        report: Function called now and then with the number of objects that are done, fractions included.
+        report: Function called now and then with the number of searches that are done, fractions included.
 
     Returns:
-        The camera and the poses.
+        The camera and the poses. The focal length, where `known` does not give it, is estimated with the object that
+        covers most pixels.
 
     Raises:
         InputError: If the mask of an object to search has no pixel, or if its keypoints do not agree.
@@ -122,12 +121,10 @@ def align_photo(
     prior = with_prior_focal(camera, known.focal, known.source)
     focal = _initial_focal(objects, known, *prior)
     estimates: dict[int, PoseEstimate] = {}
-    most_first = sorted(range(len(objects)), key=lambda k: (-int(objects[k].silhouette.inside.sum()), k))
-    for done, k in enumerate(most_first):
+    searched = [k for k, obj in enumerate(objects) if obj.pose is None]
+    for done, k in enumerate(sorted(searched, key=lambda k: -int(objects[k].silhouette.inside.sum()))):
         report(done)
         obj = objects[k]
-        if obj.pose is not None:
-            continue
         view = ObjectView(obj.silhouette, focal.camera, focal.prior_sigma)
         estimates[k] = _estimate_object(obj, view, photo, search, lambda share, done=done: report(done + share))
         if view.focal_sigma > 0:
@@ -185,10 +182,10 @@ def _estimate_object(
         return PoseEstimate(start, score, 0.0, obj.earlier.runner_up, source="refined")
     if obj.keypoints is None:
         return estimate_pose(obj.caster, view, search, report)
-    return refine_near(obj.caster, view, state_of_keypoints(obj, obj.keypoints, view, photo), search)
+    return refine_near(obj.caster, view, keypoint_state(obj, obj.keypoints, view, photo), search)
 
 
-def state_of_keypoints(obj: ObjectToAlign, keypoints: Keypoints, view: ObjectView, photo: str) -> PoseState:
+def keypoint_state(obj: ObjectToAlign, keypoints: Keypoints, view: ObjectView, photo: str) -> PoseState:
     """Return the state in which most keypoints of `obj` agree.
 
     It is COLMAP's robust absolute pose (LO-RANSAC over P3P, or over P4Pf with an unknown focal length), then refined.

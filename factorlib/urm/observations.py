@@ -65,9 +65,7 @@ class Observations(msgspec.Struct, frozen=True):
     photos: tuple[str, ...]
     illuminations: tuple[str, ...]
     visibility: UInt8[np.ndarray, "n k"] | None = None  # 255: the direction is visible; None: all are
-    met: UInt16[np.ndarray, "n k"] | None = (
-        None  # codes of hiding surfaces (geometry.occluder_codes); needs `visibility`
-    )
+    met: UInt16[np.ndarray, "n k"] | None = None  # codes of `geometry.occluder_codes`; needs `visibility`
     exposures: tuple[float | None, ...] = ()  # t·S/N² of `photos` from EXIF, None if unknown; empty if all are unknown
     confidence: Float[np.ndarray, " n"] | None = None  # confidence of the normal, 0 to 1; None: all are equal
     place: Float[np.ndarray, "n 3"] | None = None  # camera frame, about the photo's middle, RMS 1 (light.distance)
@@ -168,11 +166,9 @@ def _check(observations: Observations) -> None:
         if len(index) and not 0 <= index.min() <= index.max() < len(known):
             raise ValueError(f"column {name!r} points beyond the names of the metadata")
     if observations.exposures and len(observations.exposures) != len(observations.photos):
-        raise ValueError("its exposures are not one a photo")
-    if (
-        observations.confidence is not None
-        and not ((observations.confidence >= 0) & (observations.confidence <= 1)).all()
-    ):
+        raise ValueError("the metadata have not one exposure for each photo")
+    confidence = observations.confidence
+    if confidence is not None and not ((confidence >= 0) & (confidence <= 1)).all():
         raise ValueError("column 'confidence' is not between 0 and 1")
     if observations.place is not None and not np.isfinite(observations.place).all():
         raise ValueError("column 'place' is not finite")
