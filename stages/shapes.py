@@ -72,8 +72,8 @@ def main(params: Params, inputs: Inputs, out: Path, progress: Progress) -> None:
         shapes[name] = ShapeEntry(kind_of(entry), extent, len(shape.faces), used, shape.overlap)
         if shape.overlap < GOOD:
             log.warning(
-                "mesh '%s': the %s covers its outlines by %.0f %% only (IoU): is it of that kind, "
-                "and are its masks whole?",
+                "mesh '%s': the %s covers its outlines by %.0f %% only (IoU): check that the object is of that kind "
+                "and that its masks are whole",
                 name,
                 kind_of(entry),
                 100 * shape.overlap,
@@ -125,14 +125,13 @@ def estimate_shape(
         InputError: If no photo shows the mesh.
     """
     if not outlines:
-        cure = "is its material that of a label in the masks? Else take it out"
+        cure = "give its material a label in the masks, or remove the mesh"
         raise InputError("no photo's mask shows it", cure=cure)
     if entry.hull:
         posed = [outline for outline in outlines if outline.pose is not None]
         if 2 <= len(posed) < FEW:
             words = (
-                "a hull of %d outlines is larger than the body wherever they do not show it: "
-                "more photos, from more sides"
+                "a hull of %d outlines is larger than the body where no outline limits it: add photos from more sides"
             )
             log.warning(words, len(posed))
         return visual_hull(posed, params.cells, len(parts_of(entry)), report)

@@ -173,7 +173,7 @@ def _estimate_object(
         InputError: If no pixel shows the object, or if its keypoints do not agree.
     """
     if not obj.silhouette.inside.any():
-        cure = "remove the object from this photo, or check its mask and materials"
+        cure = "remove the object from this photo, or correct its mask or its materials"
         fault = f"no pixel of the mask shows object {obj.name!r}"
         raise InputError(fault, file="dataset.yaml", key=photo, cure=cure)
     if obj.earlier is not None:  # keep the earlier pose and its runner-up; compute the score again
@@ -227,8 +227,8 @@ def keypoint_state(obj: ObjectToAlign, keypoints: Keypoints, view: ObjectView, p
         f"only {agreeing} of the {len(keypoints.pixel)} keypoints of '{obj.name}' agree on a pose",
         file="dataset.yaml",
         key=f"{photo}.{obj.name}.keypoints",
-        cure=f"at least {LEAST_AGREEING} must, within {MOST_ERROR:.1%} of the photo's longer side: is each pixel (x, "
-        "y) beside its own point?",
+        cure=f"at least {LEAST_AGREEING} must, within {MOST_ERROR:.1%} of the photo's longer side: check that each "
+        "pixel (x, y) belongs to its point",
     )
 
 

@@ -56,8 +56,8 @@ def visual_hull(
     if len(outlines) < 2:
         fault = f"{'only one photo' if outlines else 'no photo'} with a known camera shows it"
         cure = (
-            "a hull needs two at least, better ten: `cameras: {sfm: true}` finds them where photos overlap, or use "
-            "lathe or primitive"
+            "a hull needs at least two such photos, better ten: estimate cameras with `cameras: {sfm: true}` where "
+            "photos overlap, or use lathe or primitive"
         )
         raise InputError(fault, cure=cure)
     middle, radius = _bounding_ball(outlines)
@@ -73,8 +73,8 @@ def visual_hull(
         inside = np.argwhere(field > least)
         if not len(inside):
             cure = (
-                "are masks and cameras of the same photos, and does each photo show the whole object or say by 255 "
-                "what hides it?"
+                "check that masks and cameras belong to the same photos; give pixels of whatever hides the object the "
+                "label 255"
             )
             raise InputError("no body fits into the outlines of all photos", cure=cure)
         low = origin + step * (inside.min(axis=0) - 1)
@@ -150,15 +150,15 @@ def _bounding_ball(outlines: Sequence[Outline]) -> tuple[Float[np.ndarray, "3"],
         right = right + across @ centre
         rays.append((centre, ray))
     if np.linalg.cond(left) > 1e8:
-        cure = "a hull needs photos from different sides"
+        cure = "add photos from other sides: a hull needs them"
         raise InputError("all photos see it from the same side", cure=cure)
     middle = np.linalg.solve(left, right)
     radii = []
     for outline, (centre, ray) in zip(outlines, rays, strict=True):
         depth = float((middle - centre) @ ray)
         if depth <= 0:
-            cure = "are its masks and cameras of the same photos?"
-            raise InputError(f"what the photos look at lies behind the camera of '{outline.photo}'", cure=cure)
+            cure = "check that its mask and its camera belong to the same photo"
+            raise InputError(f"the object lies behind the camera of photo '{outline.photo}'", cure=cure)
         radii.append(depth * bounding_box(outline.view.silhouette)[2] / outline.camera.focal)
     return middle, min(radii)
 

@@ -100,14 +100,14 @@ def body_of_revolution(outlines: Sequence[Outline], report: Callable[[float], No
     starts = [(outline, bodies) for outline in outlines[:REFERENCES] if (bodies := _plausible_bodies(outline))]
     if not starts:
         cure = (
-            "does a photo show the whole outline, from the side, cut by nothing? Give pixels of whatever hides it the "
+            "add a photo that shows the whole outline from the side; give pixels of whatever hides the object the "
             "label 255"
         )
         raise InputError("no outline is mirrored onto itself, as that of a body of revolution is", cure=cure)
     if len(outlines) == 1:
         log.warning(
-            "%s: one outline does not say how the axis is tilted: the strongest tilt that explains it is taken; "
-            "a second photo from another height says it",
+            "%s: one outline does not determine the tilt of the axis: the strongest tilt that explains it is taken; "
+            "add a second photo from another height",
             outlines[0].photo,
         )
         best = max(starts[0][1], key=lambda body: abs(body.tilt_deg))
@@ -171,8 +171,8 @@ def _choose_tilt(
     ]
     if max(alike) - min(alike) > UNTOLD_DEG:
         log.warning(
-            "%s: tilts of the axis from %.0f to %.0f° explain the outlines alike, so its profile is not sure: a photo "
-            "from higher up, or from lower down, says it",
+            "%s: tilts of the axis from %.0f to %.0f° explain the outlines alike, so its profile is uncertain: add a "
+            "photo from higher up or from lower down",
             best.outline.photo,
             min(alike),
             max(alike),
@@ -340,7 +340,7 @@ def mesh_of_profile(profile: Profile) -> Triangles:
         InputError: If the profile has fewer than three heights.
     """
     if len(profile) < 3:
-        cure = "are its masks and poses of the same object, and is it turned about the y of its poses?"
+        cure = "check that its masks and poses belong to one object, and that the y of its poses is its axis"
         raise InputError("no body of revolution fits into its outlines", cure=cure)
     angle = np.arange(COLUMNS) * 2 * np.pi / COLUMNS
     height = profile[::-1, :1]  # by descending height
