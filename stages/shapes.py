@@ -59,11 +59,8 @@ def main(params: Params, inputs: Inputs, out: Path, progress: Progress) -> None:
     for done, (name, entry) in enumerate(sorted(slice_.meshes.items())):
         outlines = [each for photo in photos.values() for each in photo.outlines(name, entry, cameras.get(photo.name))]
         outlines = [outline for outline in outlines if outline.is_visible]
-        begin = begun + part * done
         try:
-            shape = estimate_shape(
-                entry, outlines, params, lambda share, begin=begin, name=name: progress(begin + part * share, 1, name)
-            )
+            shape = estimate_shape(entry, outlines, params, _share(begun + part * done, part, name, progress))
         except InputError as error:
             raise InputError(error.found, file="dataset.yaml", key=f"meshes.{name}", cure=error.cure) from error
         write_obj(out / "meshes" / f"{name}.obj", shape, parts_of(entry))
@@ -80,6 +77,11 @@ def main(params: Params, inputs: Inputs, out: Path, progress: Progress) -> None:
             )
     write_json(out / FILE, ShapesTable(cameras, shapes))
     progress(1, 1)
+
+
+def _share(begin: float, part: float, name: str, progress: Progress) -> Callable[[float], None]:
+    """Return the report of one mesh, whose share of the work begins at `begin` and is `part`."""
+    return lambda share: progress(begin + part * share, 1, name)
 
 
 def estimate_cameras(

@@ -126,7 +126,7 @@ def align_photo(
         report(done)
         obj = objects[k]
         view = ObjectView(obj.silhouette, focal.camera, focal.prior_sigma)
-        estimates[k] = _estimate_object(obj, view, photo, search, lambda share, done=done: report(done + share))
+        estimates[k] = _estimate_object(obj, view, photo, search, _report_after(done, report))
         if view.focal_sigma > 0:
             source = "estimated"
             if focal.source == "exif":
@@ -139,6 +139,11 @@ def align_photo(
     ]
     in_order = [estimates.get(k) for k in range(len(objects))]
     return PhotoAlignment(focal.camera, focal.source or "estimated", focal.stderr, poses, in_order, prior)
+
+
+def _report_after(done: int, report: Report) -> Report:
+    """Return the report of the next search, which follows `done` others."""
+    return lambda share: report(done + share)
 
 
 def _initial_focal(objects: Sequence[ObjectToAlign], known: KnownFocal, camera: Camera, sigma: float) -> Focal:

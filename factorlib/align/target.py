@@ -109,7 +109,8 @@ def _region(inside: Mask, known: Mask) -> Region:
     # signed distance to the border, 0 on unknown pixels, and its gradient
     distance = np.where(inside, 0.5 - distance_to(~inside), distance_to(inside | ~known) - 0.5)
     distance[~known] = 0.0
-    slope = np.stack(np.gradient(distance)[::-1], axis=-1)
+    by_y, by_x = np.gradient(distance)
+    slope = np.stack([by_x, by_y], axis=-1)
     # contour points between neighbouring pixels, with their normals
     a, b = border_pairs(inside, known & ~inside)
     normal = slope[a[:, 0], a[:, 1]] + slope[b[:, 0], b[:, 1]]

@@ -224,8 +224,8 @@ def surface_nets(field: Float[np.ndarray, "x y z"]) -> tuple[Points, Int[np.ndar
     quad = np.concatenate(quads)
     used, index = np.unique(quad, return_inverse=True)
     quad = index.reshape(-1, 4)
-    index = np.unravel_index(used, cells)
-    vertices = total[index] / count[index][:, None]
+    used_cells = np.unravel_index(used, cells)
+    vertices = total[used_cells] / count[used_cells][:, None]
     return vertices, np.concatenate([quad[:, [0, 1, 2]], quad[:, [0, 2, 3]]])
 
 

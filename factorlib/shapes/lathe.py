@@ -158,11 +158,11 @@ def _choose_tilt(
     for change in FINER_DEG:
         pose = best.body.pose
         tilt = best.body.tilt_deg + change
-        body = _body_at_tilt(best.outline, pose.rotation[:, 0], pose.translation, tilt)
-        if body is not None:
+        finer = _body_at_tilt(best.outline, pose.rotation[:, 0], pose.translation, tilt)
+        if finer is not None:
             near = zip(judges, best.poses, strict=True)
-            poses = [body if judge is best.outline else fit_pose(judge, body.profile, start) for judge, start in near]
-            trials.append(TiltTrial(best.outline, body, poses))
+            poses = [finer if judge is best.outline else fit_pose(judge, finer.profile, start) for judge, start in near]
+            trials.append(TiltTrial(best.outline, finer, poses))
     best = max(trials, key=lambda trial: trial.overlap)
     alike = [
         trial.body.tilt_deg
