@@ -24,7 +24,7 @@ import msgspec
 import numpy as np
 from PIL import Image
 
-from factorlib.align.pairing import HIDDEN, pair
+from factorlib.align.pairing import HIDDEN, match_parts
 from factorlib.align.silhouette import UNKNOWN as HIDES
 from factorlib.align.silhouette import Silhouette
 from factorlib.dataset.check import IMAGES, MESHES, RESERVED_PHOTOS
@@ -260,7 +260,7 @@ def _match(spec: dict, file: Callable[[str], Path], missing: list[str]) -> None:
                         silhouettes.append(_silhouette(photo, obj, materials, file))
                         objects.append((photo["name"], obj))
         mesh = read_mesh(file(entry["file"]), list(of), {part: part for part in of})
-        told = pair(mesh, len(of), silhouettes)
+        told = match_parts(mesh, len(of), silhouettes)
         for k, part in [(k, part) for k, part in enumerate(of) if of[part] == UNKNOWN]:
             ranked = [paired.labels[k] if paired else [] for paired in told]
             margins = [paired.margins[k] if paired else 0.0 for paired in told]

@@ -4,6 +4,7 @@ Writes <photo>.json (camera and poses), <photo>.exr (maps in the camera frame) a
 """
 
 import logging
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Annotated
 
@@ -11,11 +12,11 @@ import msgspec
 import numpy as np
 
 from factorlib.align.confidence import confidence, overlay
-from factorlib.align.given import camera_of, check_before_camera, warn_of_camera, warn_of_materials
-from factorlib.align.place import Keypoints, ObjectToPlace, Placed, placed
-from factorlib.align.search import Search
+from factorlib.align.input_checks import camera_of_photo, check_before_camera, warn_of_camera, warn_of_materials
+from factorlib.align.photo_alignment import Keypoints, ObjectToAlign, PhotoAlignment, align_photo
+from factorlib.align.reliability import Thresholds, find_doubts, measure_reliability
+from factorlib.align.search import SearchOptions
 from factorlib.align.silhouette import label_agreement, silhouette_iou, silhouette_of_object, silhouette_of_photo
-from factorlib.align.trust import Standards, doubts, trust_in
 from factorlib.dataset.schema import SOURCES, ObjectsSlice
 from factorlib.errors import InputError
 from factorlib.geometry.camera import Pose
@@ -28,7 +29,7 @@ from factorlib.meshes.limits import Limits
 from factorlib.meshes.mesh import scaled
 from factorlib.meshes.read import CREASE_DEG, read_mesh
 from factorlib.results.photos import read_photo_facts
-from factorlib.results.poses import AS_IT_IS, FILE, CameraEntry, ObjectEntry, PhotoPoses, RunnerUp, entry_of, read_poses
+from factorlib.results.poses import AS_IT_IS, FILE, CameraEntry, ObjectEntry, PhotoPoses, entry_of, read_poses
 from factorlib.results.shapes import read_shapes
 from factorlib.stage import Inputs, Progress
 
@@ -37,12 +38,12 @@ CURE = (
     "look at its overlay: is the mask whole there? Where it is, give the object's keypoints or pose, or the photo's "
     "camera.focal_px, in dataset.yaml"
 )
-EXTERNAL = (
+EXTERNAL_CURE = (
     "look at its overlay; does the source show this photo, and is the mesh where world_from_object or obj_ids say?"
 )
 
 
-class Params(Standards, frozen=True, forbid_unknown_fields=True):
+class Params(Thresholds, frozen=True, forbid_unknown_fields=True):
     """Parameters of mesh reading and pose search, and the handling of doubtful poses."""
 
     crease_deg: Annotated[float, msgspec.Meta(gt=0, le=180)] = CREASE_DEG
@@ -52,64 +53,74 @@ class Params(Standards, frozen=True, forbid_unknown_fields=True):
     keep_doubtful: bool = False
     """Use objects with a doubtful estimated pose in the solve; otherwise they are left out."""
     limits: Limits = Limits()
-    search: Search = Search()
+    search: SearchOptions = SearchOptions()
 
 
 def main(params: Params, inputs: Inputs, out: Path, progress: Progress) -> None:
     """Align the meshes of one photo and write its maps, its poses and the overlay."""
     name = inputs.photo
     assert name is not None  # a stage over one photo
-    materials = inputs.facts["dataset.materials"]
     slice_ = msgspec.convert(inputs.facts["dataset.objects"], ObjectsSlice)
     if by_motion := read_shapes(inputs.folders.get("shapes")).cameras.get(name):
         slice_ = msgspec.structs.replace(slice_, external=by_motion)
     channels = read_exr(inputs["masks"] / f"{name}.exr")
     facts = read_photo_facts(inputs["masks"] / f"{name}.json")
     earlier = read_poses(inputs["poses"] / FILE).get(name) if "poses" in inputs.folders else None
-    objects = objects_of(slice_, channels, inputs, params, facts.factor, earlier)
-    camera, known = camera_of(slice_, facts, name)
+    objects = read_objects(slice_, channels, inputs, params, facts.factor, earlier)
+    camera, known = camera_of_photo(slice_, facts, name)
     external = slice_.external.source if slice_.external else None
-    sources = ["given" if own.pose else external for own in slice_.objects]
+    sources = ["given" if entry.pose else external for entry in slice_.objects]
     # given data: refuse objects behind the camera, warn of materials that do not match and of an unlikely camera
-    for each, source in zip(objects, sources, strict=True):
-        if each.pose is not None:
+    for obj, source in zip(objects, sources, strict=True):
+        if obj.pose is not None:
             given_by = "dataset" if source is None or source == "given" else source
-            check_before_camera(each.caster.mesh, each.pose, name, each.name, given_by)
-    warn_of_materials(channels["label"], [each.caster.mesh.labels for each in objects], materials, name)
+            check_before_camera(obj.caster.mesh, obj.pose, name, obj.name, given_by)
+    object_labels = [obj.caster.mesh.labels for obj in objects]
+    warn_of_materials(channels["label"], object_labels, inputs.facts["dataset.materials"], name)
     warn_of_camera(known.focal, camera.centre, (camera.width, camera.height), name)
-    # focal length of an earlier run, in pixels of this one: the two may have reduced the photo by different factors
-    before = None
-    if earlier:
+    if earlier:  # its focal length in pixels of this run: the two may have reduced the photo by different factors
         focal = earlier.camera.focal_px * (earlier.camera.factor / facts.factor)
         before = msgspec.structs.replace(earlier.camera, focal_px=focal, factor=facts.factor)
+        known = msgspec.structs.replace(known, earlier=before)
     pieces = 2 * len(objects)  # a pose and a check of it for each object
-    result = placed(objects, camera, known, name, params.search, before, lambda done: progress(done, pieces, name))
-    camera = result.camera
-    maps = rasterise([each.caster for each in objects], result.camera, result.poses)
-    whole = silhouette_of_photo(channels)
-    write_png(out / f"{name}_overlay.png", overlay(np.stack([channels[c] for c in "RGB"], axis=-1), maps, whole))
-    entries = []
-    for k, each in enumerate(objects):
-        progress(len(objects) + k, pieces, f"{name}: how sure {each.name} is")
-        entries.append(entry(each, k, result, maps, params, sources[k]))
-    for each, of_each in zip(objects, entries, strict=True):
-        complain(name, each.name, of_each, params.strict)
-    # maps of the photo; pixels of objects that are left out have confidence 0
-    left_out = np.isin(maps.object, [k for k, of_each in enumerate(entries, start=1) if of_each.left_out])
-    channels = {f"{kind}.{a}": getattr(maps, kind)[..., k] for kind in ("normal", "view") for k, a in enumerate("xyz")}
-    channels |= {kind: getattr(maps, kind) for kind in ("depth", "label", "object")}
-    certainty = np.where(left_out, 0.0, confidence(maps, whole))
-    write_exr(out / f"{name}.exr", {**channels, "confidence": certainty, "back": maps.back})
-    centre = float(camera.centre[0]), float(camera.centre[1])
-    of_camera = CameraEntry(float(camera.focal), centre, result.focal_source, result.log_focal_sigma, facts.factor)
-    poses = {each.name: of_each for each, of_each in zip(objects, entries, strict=True)}
-    write_json(out / f"{name}.json", PhotoPoses(of_camera, poses))
+    result = align_photo(objects, camera, known, name, params.search, lambda done: progress(done, pieces, name))
+    maps = rasterise([obj.caster for obj in objects], result.camera, result.poses)
+    entries = {}
+    for k, obj in enumerate(objects):
+        progress(len(objects) + k, pieces, f"{name}: how sure {obj.name} is")
+        entries[obj.name] = object_entry(obj, k, result, maps, params, sources[k])
+    for obj_name, entry in entries.items():
+        report_doubts(name, obj_name, entry, params.strict)
+    write_maps(out, name, channels, maps, [entry.left_out for entry in entries.values()])
+    x, y = result.camera.centre
+    focal = float(result.camera.focal)
+    camera_entry = CameraEntry(focal, (float(x), float(y)), result.focal_source, result.log_focal_sigma, facts.factor)
+    write_json(out / f"{name}.json", PhotoPoses(camera_entry, entries))
 
 
-def objects_of(
+def write_maps(out: Path, name: str, channels: Mapping[str, np.ndarray], maps: Maps, left_out: Sequence[bool]) -> None:
+    """Write the maps of a photo and the overlay; pixels of objects that are left out have confidence 0.
+
+    Args:
+        out: Folder of the results.
+        name: Name of the photo.
+        channels: Channels of the EXR that `masks` writes.
+        maps: Maps of the rasterised objects.
+        left_out: True for each object that is left out.
+    """
+    mask = silhouette_of_photo(channels)
+    write_png(out / f"{name}_overlay.png", overlay(np.stack([channels[c] for c in "RGB"], axis=-1), maps, mask))
+    layers = {f"{kind}.{a}": getattr(maps, kind)[..., k] for kind in ("normal", "view") for k, a in enumerate("xyz")}
+    layers |= {kind: getattr(maps, kind) for kind in ("depth", "label", "object")}
+    excluded = np.isin(maps.object, np.flatnonzero(left_out) + 1)
+    sure = np.where(excluded, 0.0, confidence(maps, mask))
+    write_exr(out / f"{name}.exr", {**layers, "confidence": sure, "back": maps.back})
+
+
+def read_objects(
     slice_: ObjectsSlice, channels: dict, inputs: Inputs, params: Params, factor: int, earlier: PhotoPoses | None
-) -> list[ObjectToPlace]:
-    """Return every object of the photo, with its mesh, its silhouette and what is known of its pose.
+) -> list[ObjectToAlign]:
+    """Read every object of the photo, with its mesh, its silhouette and its pose or keypoints, if they are known.
 
     A pose in dataset.yaml or in its camera source takes precedence over one of an earlier run, and that over keypoints.
 
@@ -123,29 +134,31 @@ def objects_of(
     """
     objects = []
     materials = inputs.facts["dataset.materials"]
-    for number, own in enumerate(slice_.objects, start=1):
-        mesh = slice_.meshes[own.mesh]
-        given = own.pose
+    for number, entry in enumerate(slice_.objects, start=1):
+        mesh_entry = slice_.meshes[entry.mesh]
+        given = entry.pose
         keypoints = None
         if given is None and slice_.external:
-            given = slice_.external.poses.get(own.name)
-        before = earlier.objects.get(own.name) if earlier and given is None else None
-        file = inputs.mesh(own.mesh, mesh.file)
+            given = slice_.external.poses.get(entry.name)
+        before = earlier.objects.get(entry.name) if earlier and given is None else None
+        file = inputs.mesh(entry.mesh, mesh_entry.file)
         scale = before.scale if before else AS_IT_IS
-        read = read_mesh(file, materials, mesh.made_of, own.materials, params.crease_deg, params.limits)
-        silhouette = silhouette_of_object(channels, number, read.labels, own.mask is not None)
+        mesh = read_mesh(file, materials, mesh_entry.made_of, entry.materials, params.crease_deg, params.limits)
+        silhouette = silhouette_of_object(channels, number, mesh.labels, entry.mask is not None)
         pose = Pose(np.array(given.rotation), np.array(given.translation)) if given is not None else None
-        if own.keypoints:  # pixels of the file, to undistorted pixels of the reduced photo
-            pixels, points = (np.array([getattr(k, of) for k in own.keypoints]) for of in ("pixel", "point"))
-            pixels = pixels / factor
+        if entry.keypoints:  # pixels of the file, to undistorted pixels of the reduced photo
+            pixels = np.array([keypoint.pixel for keypoint in entry.keypoints]) / factor
+            points = np.array([keypoint.point for keypoint in entry.keypoints])
             lens = lens_of(slice_.camera, factor, *channels["label"].shape[::-1])
             keypoints = Keypoints(lens.undistorted(pixels) if lens else pixels, points)
-        caster = Caster(scaled(read, scale))
-        objects.append(ObjectToPlace(own.name, caster, silhouette, pose, keypoints, before, scale))
+        caster = Caster(scaled(mesh, scale))
+        objects.append(ObjectToAlign(entry.name, caster, silhouette, pose, keypoints, before, scale))
     return objects
 
 
-def entry(obj: ObjectToPlace, k: int, result: Placed, maps: Maps, params: Params, source: str | None) -> ObjectEntry:
+def object_entry(
+    obj: ObjectToAlign, k: int, result: PhotoAlignment, maps: Maps, params: Params, source: str | None
+) -> ObjectEntry:
     """Return the entry of one object in poses.json.
 
     A pose without `doubts` is reliable.  An object with a doubtful estimated pose is left out of the solve.
@@ -161,38 +174,32 @@ def entry(obj: ObjectToPlace, k: int, result: Placed, maps: Maps, params: Params
     label = np.where(maps.object == k + 1, maps.label, 0)
     iou = silhouette_iou(obj.silhouette, label)
     agreement = label_agreement(obj.silhouette, label)
-    found = result.found[k]
-    trust = trust_in(obj, result, k)
-    runner_up = None
-    reasons = doubts(iou, agreement, trust, found, params)
-    if found is not None:
-        source = "refined" if found.earlier else "keypoints" if found.by_keypoints else "found"
-        if other := found.runner_up:
-            pose = entry_of(other.state.pose(obj.caster))
-            runner_up = RunnerUp(**pose, score=other.score, normal_difference_deg=other.normal_difference_deg)
+    estimate = result.estimates[k]
+    measures = measure_reliability(obj, result, k)
+    reasons = find_doubts(iou, agreement, measures, estimate, params)
     return ObjectEntry(
         **entry_of(result.poses[k]),
         scale=obj.scale,
         silhouette_iou=iou,
         label_agreement=agreement,
-        source=source,
-        score=found.score if found else None,
-        runner_up=runner_up,
-        contour_error=trust.contour_error,
-        normal_stderr_deg=trust.normal_stderr_deg,
-        mirrored_score=trust.mirrored_score,
+        source=estimate.source if estimate else source,
+        score=estimate.score if estimate else None,
+        runner_up=estimate.runner_up if estimate else None,
+        contour_error=measures.contour_error,
+        normal_stderr_deg=measures.normal_stderr_deg,
+        mirrored_score=measures.mirrored_score,
         doubts=reasons,
-        left_out=bool(reasons) and found is not None and not params.keep_doubtful,
+        left_out=bool(reasons) and estimate is not None and not params.keep_doubtful,
     )
 
 
-def complain(photo: str, name: str, entry: ObjectEntry, strict: bool) -> None:
+def report_doubts(photo: str, name: str, entry: ObjectEntry, strict: bool) -> None:
     """Warn of each doubt about a pose.
 
     Raises:
         InputError: With `strict`, for the first doubt.
     """
-    cure = EXTERNAL if entry.source in (*SOURCES, "sfm") else CURE
+    cure = EXTERNAL_CURE if entry.source in (*SOURCES, "sfm") else CURE
     for reason in entry.doubts:
         if strict:
             raise InputError(reason, file="dataset.yaml", key=f"{photo}.{name}", cure=cure)

@@ -28,7 +28,7 @@ from factorlib.results.photos import read_photos
 from factorlib.results.poses import read_poses
 from factorlib.stage import Inputs, Progress
 from factorlib.urm.extract import observed_pixels
-from factorlib.urm.geometry import read_geometry
+from factorlib.urm.surface_maps import read_geometry
 from factorlib.wholefile import write_text
 
 NO_TRUTH = "the dataset names no truth"

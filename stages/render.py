@@ -25,8 +25,8 @@ from factorlib.results.lobes import light_of
 from factorlib.results.materials import Gauge, Model, in_order, read_materials
 from factorlib.stage import Inputs, Progress
 from factorlib.urm.extract import observed_pixels
-from factorlib.urm.geometry import on_surface, read_geometry
 from factorlib.urm.observations import read_observations
+from factorlib.urm.surface_maps import read_geometry, with_surface_normals
 
 Size = Annotated[int, msgspec.Meta(ge=8, le=2048)]
 RING = (255, 255, 255)
@@ -92,7 +92,9 @@ def surroundings(inputs: Inputs, model: Model, gauge: Gauge) -> Surroundings | N
     """
     if not (model.self_shadowing or model.distance):
         return None
-    seen = on_surface(read_observations(inputs["urm"] / f"{inputs.photo}.parquet"), inputs.folders.get("surface"))
+    seen = with_surface_normals(
+        read_observations(inputs["urm"] / f"{inputs.photo}.parquet"), inputs.folders.get("surface")
+    )
     if not model.self_shadowing:
         seen = msgspec.structs.replace(seen, visibility=None, met=None)
     sent = bounced_light(seen, seen.radiance.astype(float)) if model.interreflection else None

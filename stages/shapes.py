@@ -12,10 +12,9 @@ from typing import Annotated
 import msgspec
 import numpy as np
 
-from factorlib.align.given import camera_of
-from factorlib.align.refine import FocalPrior
-from factorlib.align.search import focal_prior
+from factorlib.align.input_checks import camera_of_photo
 from factorlib.align.silhouette import UNKNOWN, silhouette_of_object
+from factorlib.align.view import with_prior_focal
 from factorlib.dataset.check import ALL_OF_IT
 from factorlib.dataset.schema import ExternalCamera, MeshEntry, ObjectEntry, ObjectsSlice, Pose, ShapesSlice
 from factorlib.errors import InputError
@@ -29,7 +28,7 @@ from factorlib.results.poses import entry_of
 from factorlib.results.shapes import FILE, ShapeEntry, ShapesTable
 from factorlib.shapes.hull import visual_hull
 from factorlib.shapes.lathe import body_of_revolution
-from factorlib.shapes.motion import Registered, View, cameras_by_motion
+from factorlib.shapes.motion import PhotoForMotion, RegisteredCamera, cameras_by_motion
 from factorlib.shapes.outline import Outline, Triangles, write_obj
 from factorlib.shapes.primitive import primitive
 from factorlib.stage import Inputs, Progress
@@ -49,54 +48,58 @@ class Params(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 def main(params: Params, inputs: Inputs, out: Path, progress: Progress) -> None:
     """Estimate cameras, then shapes, and write both."""
     slice_ = msgspec.convert(inputs.facts["dataset.shapes"], ShapesSlice)
-    photos = {name: Photo(inputs, name, own) for name, own in sorted(slice_.photos.items())}
+    photos = {name: MaskedPhoto(inputs, name, entry) for name, entry in sorted(slice_.photos.items())}
     cameras: dict[str, ExternalCamera] = {}
     if slice_.sfm:
-        views = {name: photo.view() for name, photo in photos.items()}
-        placed = cameras_by_motion(views, lambda share, what: progress(0.5 * share, 1, what))
-        cameras = {name: photos[name].external(camera, slice_.meshes) for name, camera in placed.items()}
-        for name, camera in placed.items():
-            if camera.bent:
-                focal = camera.bent[0] * photos[name].facts.factor
-                k = camera.bent[1]
-                log.warning(
-                    "%s: its lens bends straight lines; give the photo "
-                    "`camera: {focal_px: %.0f, distortion: [%.4f, 0]}` and the picture is straightened",
-                    name,
-                    focal,
-                    k,
-                )
+        cameras = estimate_cameras(photos, slice_.meshes, lambda share, step: progress(0.5 * share, 1, step))
     begun = 0.5 if slice_.sfm else 0.0
-    found = {}
+    part = (1 - begun) / max(len(slice_.meshes), 1)
+    shapes = {}
     (out / "meshes").mkdir()
     for done, (name, entry) in enumerate(sorted(slice_.meshes.items())):
-        outlines = [one for photo in photos.values() for one in photo.outlines(name, entry, cameras.get(photo.name))]
-        outlines = [one for one in outlines if one.is_seen]
-        at = begun + (1 - begun) * done / len(slice_.meshes)
-        part = (1 - begun) / len(slice_.meshes)
+        outlines = [each for photo in photos.values() for each in photo.outlines(name, entry, cameras.get(photo.name))]
+        outlines = [outline for outline in outlines if outline.is_visible]
         try:
-            shape = shape_of(entry, outlines, params, _share(at, part, name, progress))
+            shape = estimate_shape(entry, outlines, params, _share(begun + part * done, part, name, progress))
         except InputError as error:
             raise InputError(error.found, file="dataset.yaml", key=f"meshes.{name}", cure=error.cure) from error
         write_obj(out / "meshes" / f"{name}.obj", shape, parts_of(entry))
         extent = tuple(np.ptp(shape.vertices, axis=0).tolist())
-        used = sorted({one.photo for one in outlines})
-        found[name] = ShapeEntry(kind_of(entry), extent, len(shape.faces), used, shape.overlap)
+        used = sorted({outline.photo for outline in outlines})
+        shapes[name] = ShapeEntry(kind_of(entry), extent, len(shape.faces), used, shape.overlap)
         if shape.overlap < GOOD:
             log.warning(
-                "mesh '%s': the %s covers its outlines by %.0f %% only (IoU): is it of that kind, "
-                "and are its masks whole?",
+                "mesh '%s': the %s covers its outlines by %.0f %% only (IoU): check that the object is of that kind "
+                "and that its masks are whole",
                 name,
                 kind_of(entry),
                 100 * shape.overlap,
             )
-    write_json(out / FILE, ShapesTable(cameras, found))
+    write_json(out / FILE, ShapesTable(cameras, shapes))
     progress(1, 1)
 
 
 def _share(begin: float, part: float, name: str, progress: Progress) -> Callable[[float], None]:
     """Return the report of one mesh, whose share of the work begins at `begin` and is `part`."""
     return lambda share: progress(begin + part * share, 1, name)
+
+
+def estimate_cameras(
+    photos: Mapping[str, "MaskedPhoto"], meshes: dict[str, MeshEntry], report: Callable[[float, str], None]
+) -> dict[str, ExternalCamera]:
+    """Return the cameras of structure from motion by photo; warn of lenses that bend straight lines."""
+    registered = cameras_by_motion({name: photo.for_motion() for name, photo in photos.items()}, report)
+    for name, camera in registered.items():
+        if camera.distortion:
+            focal, k = camera.distortion
+            log.warning(
+                "%s: its lens bends straight lines; give the photo "
+                "`camera: {focal_px: %.0f, distortion: [%.4f, 0]}` and the picture is straightened",
+                name,
+                focal * photos[name].facts.factor,
+                k,
+            )
+    return {name: photos[name].external(camera, meshes) for name, camera in registered.items()}
 
 
 def kind_of(entry: MeshEntry) -> str:
@@ -109,7 +112,9 @@ def parts_of(entry: MeshEntry) -> list[str]:
     return list(entry.parts or [ALL_OF_IT])
 
 
-def shape_of(entry: MeshEntry, outlines: list[Outline], params: Params, report: Callable[[float], None]) -> Triangles:
+def estimate_shape(
+    entry: MeshEntry, outlines: list[Outline], params: Params, report: Callable[[float], None]
+) -> Triangles:
     """Return the shape of a mesh, estimated from its outlines.
 
     Args:
@@ -122,36 +127,35 @@ def shape_of(entry: MeshEntry, outlines: list[Outline], params: Params, report: 
         InputError: If no photo shows the mesh.
     """
     if not outlines:
-        cure = "is its material that of a label in the masks? Else take it out"
+        cure = "give its material a label in the masks, or remove the mesh"
         raise InputError("no photo's mask shows it", cure=cure)
     if entry.hull:
-        known = [one for one in outlines if one.pose is not None]
-        if 2 <= len(known) < FEW:
+        posed = [outline for outline in outlines if outline.pose is not None]
+        if 2 <= len(posed) < FEW:
             words = (
-                "a hull of %d outlines is larger than the body wherever they do not show it: "
-                "more photos, from more sides"
+                "a hull of %d outlines is larger than the body where no outline limits it: add photos from more sides"
             )
-            log.warning(words, len(known))
-        return visual_hull(known, params.cells, len(parts_of(entry)), report)
+            log.warning(words, len(posed))
+        return visual_hull(posed, params.cells, len(parts_of(entry)), report)
     if entry.lathe:
         shape = body_of_revolution(outlines, report)
-        given = any(one.pose is not None for one in outlines)
-        return shape if given else msgspec.structs.replace(shape, vertices=shape.vertices * entry.size)
+        is_posed = any(outline.pose is not None for outline in outlines)
+        return shape if is_posed else msgspec.structs.replace(shape, vertices=shape.vertices * entry.size)
     assert entry.primitive is not None  # the reader accepts no other mesh without a file
     return primitive(entry.primitive, outlines, report).of_size(entry.size)
 
 
-class Photo:
+class MaskedPhoto:
     """Photo as written by `masks`, with its objects."""
 
-    def __init__(self, inputs: Inputs, name: str, own: ObjectsSlice):
+    def __init__(self, inputs: Inputs, name: str, entries: ObjectsSlice):
         self.name = name
-        self.own = own
+        self.entries = entries
         self.materials = inputs.facts["dataset.materials"]
         self.path = inputs["masks"] / f"{name}.exr"
         self.facts = read_photo_facts(inputs["masks"] / f"{name}.json")
 
-    def view(self) -> View:
+    def for_motion(self) -> PhotoForMotion:
         """Return the input of structure from motion: sRGB grey values, mask of objects, left-out pixels, camera."""
         channels = read_exr(self.path)
         # grey values, with the 99th percentile of radiance as white
@@ -160,22 +164,22 @@ class Photo:
         grey = srgb_encode(np.clip(np.nan_to_num(radiance) / white, 0, 1))
         pixels = np.round(grey * 255).astype(np.uint8)
         objects = channels["label"] > 0.5
-        return View(pixels, objects, channels["left_out"] > 0.5, *self.camera(None))
+        return PhotoForMotion(pixels, objects, channels["left_out"] > 0.5, *self.camera(None))
 
-    def camera(self, external: ExternalCamera | None) -> tuple[Camera, FocalPrior]:
-        """Return the camera at the most probable focal length, and the prior on that."""
-        camera, known = camera_of(msgspec.structs.replace(self.own, external=external), self.facts, self.name)
-        prior = focal_prior(known.focal, known.source, camera.width, camera.height)
-        return msgspec.structs.replace(camera, focal=prior.focal), prior
+    def camera(self, external: ExternalCamera | None) -> tuple[Camera, float]:
+        """Return the camera at the most probable focal length, and the standard deviation of its logarithm."""
+        entries = msgspec.structs.replace(self.entries, external=external)
+        camera, known = camera_of_photo(entries, self.facts, self.name)
+        return with_prior_focal(camera, known.focal, known.source)
 
-    def external(self, placed: Registered, meshes: dict[str, MeshEntry]) -> ExternalCamera:
+    def external(self, registered: RegisteredCamera, meshes: dict[str, MeshEntry]) -> ExternalCamera:
         """Return the camera in pixels of the photo's file, with the poses of hulls.
 
         Hulls are made in the world frame, so cam_from_world is their pose.
         """
-        pose = Pose(**entry_of(placed.pose))
-        poses = {obj.name: pose for obj in self.own.objects if obj.mesh in meshes and meshes[obj.mesh].hull}
-        return ExternalCamera("sfm", placed.focal * self.facts.factor, None, None, poses)
+        pose = Pose(**entry_of(registered.pose))
+        poses = {obj.name: pose for obj in self.entries.objects if obj.mesh in meshes and meshes[obj.mesh].hull}
+        return ExternalCamera("sfm", registered.focal * self.facts.factor, None, None, poses)
 
     def outlines(self, mesh: str, entry: MeshEntry, by_motion: ExternalCamera | None) -> list[Outline]:
         """Return the outline of each of the photo's objects with that mesh.
@@ -187,16 +191,16 @@ class Photo:
         """
         outlines = []
         channels = None
-        for number, obj in enumerate(self.own.objects, start=1):
+        for number, obj in enumerate(self.entries.objects, start=1):
             if obj.mesh == mesh:
                 channels = channels or read_exr(self.path)
                 labels = self._labels(obj, entry)
-                external = by_motion or self.own.external
+                external = by_motion or self.entries.external
                 label = silhouette_of_object(channels, number, sorted(set(labels)), obj.mask is not None).label
                 # number, from 1, of the shape's part at each pixel; the first, where parts share a label
                 part = np.where(label == UNKNOWN, UNKNOWN, 0)
-                for k, own in reversed(list(enumerate(labels, start=1))):
-                    part[label == own] = k
+                for k, part_label in reversed(list(enumerate(labels, start=1))):
+                    part[label == part_label] = k
                 part[(label > 0) & (part == 0)] = UNKNOWN
                 pose = obj.pose or (external.poses.get(obj.name) if external else None)
                 arrays = PoseArrays(np.array(pose.rotation), np.array(pose.translation)) if pose else None

@@ -13,14 +13,14 @@ import msgspec
 import numpy as np
 
 from factorlib.dataset.schema import ObjectsSlice
-from factorlib.geometry.visibility import Occluders, sight
+from factorlib.geometry.visibility import Occluders
 from factorlib.images.exr import read_exr
 from factorlib.meshes.mesh import scaled
 from factorlib.meshes.read import CREASE_DEG, MeshesOnce
 from factorlib.results.photos import read_photo_facts
 from factorlib.results.poses import ObjectEntry, read_photo_poses
 from factorlib.stage import Inputs, Progress
-from factorlib.urm.extract import Taken, observations_of_photo
+from factorlib.urm.extract import PhotoSource, extract_observations
 from factorlib.urm.merge import merge
 from factorlib.urm.observations import write_observations
 from factorlib.urm.sample import sample
@@ -50,29 +50,34 @@ def main(params: Params, inputs: Inputs, out: Path, progress: Progress) -> None:
     facts = inputs.facts
     photo, geometry = (read_exr(inputs[stage] / f"{name}.exr") for stage in ("masks", "align"))
     exposure = read_photo_facts(inputs["masks"] / f"{name}.json").exposure
-    taken = Taken(name, facts["dataset.light"]["illumination"], exposure)
-    seen = observations_of_photo(photo, geometry, taken, facts["dataset.materials"], params.least_confidence)
-    if len(seen) == 0:
+    source = PhotoSource(name, facts["dataset.light"]["illumination"], exposure)
+    materials = facts["dataset.materials"]
+    observations = extract_observations(photo, geometry, source, materials, params.least_confidence)
+    if len(observations) == 0:
         log.warning("%s: no pixel where mask and mesh agree: the photo tells nothing; see its overlay in align", name)
-    seen = sample(seen, params.most)
+    observations = sample(observations, params.most)
     # visibility: rays from observations past all meshes of the photo
-    if params.directions and len(seen):
+    if params.directions and len(observations):
         poses = read_photo_poses(inputs["align"] / f"{name}.json")
         height, width = photo["label"].shape
-        occluders = occluders_of(inputs, poses.objects)
-        pixels = np.column_stack([seen.x, seen.y])
-        camera = poses.camera.camera(width, height)
-        report = partial(progress, text=f"{name}: visibility")
-        past = sight(occluders, camera, pixels, seen.normal, params.directions, params.cast_points, report)
-        if past:
-            seen = msgspec.structs.replace(seen, visibility=past.visibility, met=past.met)
-    write_observations(out / f"{name}.parquet", merge(seen, params.merge_degrees))
+        visibility = read_occluders(inputs, poses.objects).visibility_at(
+            poses.camera.camera(width, height),
+            np.column_stack([observations.x, observations.y]),
+            observations.normal,
+            params.directions,
+            params.cast_points,
+            partial(progress, text=f"{name}: visibility"),
+        )
+        if visibility:
+            observations = msgspec.structs.replace(observations, **msgspec.structs.asdict(visibility))
+    write_observations(out / f"{name}.parquet", merge(observations, params.merge_degrees))
 
 
-def occluders_of(inputs: Inputs, poses: dict[str, ObjectEntry]) -> Occluders:
-    """Return the meshes of the photo's objects at the poses that `align` estimated."""
+def read_occluders(inputs: Inputs, poses: dict[str, ObjectEntry]) -> Occluders:
+    """Read the meshes of the photo's objects, at the poses that `align` estimated."""
     slice_ = msgspec.convert(inputs.facts["dataset.objects"], ObjectsSlice)
     read = MeshesOnce(inputs.mesh, inputs.facts["dataset.materials"], CREASE_DEG)
-    meshes = [read.mesh(own.mesh, slice_.meshes[own.mesh], own.materials) for own in slice_.objects]
-    placed = [poses[own.name] for own in slice_.objects]
-    return Occluders([scaled(mesh, at.scale) for mesh, at in zip(meshes, placed)], [at.pose for at in placed])
+    entries = [poses[obj.name] for obj in slice_.objects]
+    meshes = [read.mesh(obj.mesh, slice_.meshes[obj.mesh], obj.materials) for obj in slice_.objects]
+    scaled_meshes = [scaled(mesh, entry.scale) for mesh, entry in zip(meshes, entries)]
+    return Occluders(scaled_meshes, [entry.pose for entry in entries])

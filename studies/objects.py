@@ -22,10 +22,11 @@ from jaxtyping import Float
 from scipy.spatial.transform import Rotation
 
 from factorlib.align.confidence import confidence
-from factorlib.align.refine import FocalPrior, refined
+from factorlib.align.refine import refine
 from factorlib.align.silhouette import Silhouette
-from factorlib.align.state import state_of
-from factorlib.align.target import target_of
+from factorlib.align.state import pose_state
+from factorlib.align.target import make_target
+from factorlib.align.view import ObjectView
 from factorlib.conventions import FRONT, YUP_FROM_CAMERA
 from factorlib.evaluate.ball import Light, ball
 from factorlib.geometry.camera import Camera, Pose, rotation_of_vector
@@ -105,9 +106,8 @@ def perturbed(name: str, truth: Pose, how: Objects, rng: np.random.Generator) ->
 
 def fitted(mesh: Caster, pose: Pose, outline: Silhouette) -> Pose:
     """Return the pose nearby whose contours lie on those of the mask, as the stage `align` ends a search."""
-    target = target_of(outline, mesh.mesh.labels, 200, 0.1)
-    start = state_of(pose, CAMERA, mesh)
-    return refined(mesh, target, CAMERA, start, FocalPrior(CAMERA.focal, 0.0), 12).state.pose(mesh)
+    target = make_target(ObjectView(outline, CAMERA), mesh.mesh.labels, 200, 0.1)
+    return refine(mesh, target, pose_state(pose, CAMERA, mesh), 12).state.pose(mesh)
 
 
 def angle_deg(first: Float[np.ndarray, "n 3"], second: Float[np.ndarray, "n 3"]) -> float:

@@ -42,7 +42,7 @@ from factorlib.errors import InputError
 from factorlib.evaluate.truth import read_true_light
 from factorlib.generate.eames import SET
 from factorlib.generate.folder import focal_px_of_35mm, write_obj
-from factorlib.generate.shapes import SHAPES
+from factorlib.generate.solids import SHAPES
 from factorlib.images.picture import picture, png_bytes
 from factorlib.jsonfile import write_json
 from factorlib.reading import read_text

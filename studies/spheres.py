@@ -22,7 +22,7 @@ from jaxtyping import Float, Int
 
 from factorlib.conventions import FRONT, YUP_FROM_CAMERA
 from factorlib.evaluate.ball import Light, ball
-from factorlib.generate.lights import random_materials
+from factorlib.generate.surroundings import random_materials
 from factorlib.generate.synthetic import light_of
 from factorlib.geometry.sphere import ball_normals
 from factorlib.images.exr import read_rgb_exr

@@ -19,8 +19,9 @@ from scipy import ndimage
 from scipy.fft import irfft2, rfft2
 
 from factorlib.align.silhouette import Silhouette
-from factorlib.align.state import State
-from factorlib.align.target import extent_of
+from factorlib.align.state import PoseState
+from factorlib.align.target import bounding_box
+from factorlib.align.view import ObjectView
 from factorlib.geometry.camera import Camera, rotation_of_vector
 from factorlib.geometry.raster import Caster
 from factorlib.geometry.sphere import fibonacci_sphere
@@ -35,7 +36,7 @@ BROAD = 0.03  # share of the mask's extent: narrower unknown bands, as along a c
 Rotation = Float[np.ndarray, "3 3"]
 
 
-class Guess(msgspec.Struct, frozen=True):
+class TemplateMatch(msgspec.Struct, frozen=True):
     """Placement of a template on the photo.
 
     error   wrong pixels, as a share of the mask's
@@ -52,7 +53,7 @@ class Guess(msgspec.Struct, frozen=True):
     focal: float
 
 
-def looking_along(direction: Float[np.ndarray, "3"]) -> Rotation:
+def rotation_to_axis(direction: Float[np.ndarray, "3"]) -> Rotation:
     """Return the smallest rotation that takes `direction`, unit and not (0, 0, −1), to the optical axis."""
     x, y, z = direction
     near = 1 + z
@@ -61,7 +62,7 @@ def looking_along(direction: Float[np.ndarray, "3"]) -> Rotation:
 
 def is_cut(silhouette: Silhouette) -> bool:
     """Return whether the frame, left-out pixels or other objects hide a substantial part of the mask's contour."""
-    reach = max(int(BROAD * extent_of(silhouette)[2] / 2), 1)
+    reach = max(int(BROAD * bounding_box(silhouette)[2] / 2), 1)
     pad = 2 * reach + 2
     # unknown pixels, also beyond the frame, by morphological opening without bands narrower than 2 · reach
     unknown = np.pad(~silhouette.known, pad, constant_values=True)
@@ -71,15 +72,14 @@ def is_cut(silhouette: Silhouette) -> bool:
     return bool(np.count_nonzero(border & unknown) > CUT_SHARE * np.count_nonzero(border))
 
 
-def candidates(
-    caster: Caster, silhouette: Silhouette, camera: Camera, views: int, rolls: int, keep: int, apart_deg: float
-) -> list[State]:
+def initial_states(
+    caster: Caster, view: ObjectView, views: int, rolls: int, keep: int, apart_deg: float
+) -> list[PoseState]:
     """Return the best initial states that differ in rotation, best first.
 
     Args:
         caster: The mesh.
-        silhouette: The mask, with at least one pixel of the object.
-        camera: The photo's camera.
+        view: The mask, with at least one pixel of the object, and the camera.
         views: Number of directions of view, spread evenly over the sphere.
         rolls: Number of rotations of the photo, spread evenly over 360°.
         keep: Greatest number of states.
@@ -88,33 +88,35 @@ def candidates(
     Returns:
         States, best first.
     """
-    guesses, middle, pixel, distance = guesses_of(caster, silhouette, camera, views, rolls)
+    camera = view.camera
+    matches, middle, pixel, distance = match_templates(caster, view, views, rolls)
     states = []
-    for guess in _apart(guesses, keep, apart_deg):
-        # undo shift and roll: slopes of the ray to the object's centre, log depth and log focal length
-        slope = (middle + pixel * guess.roll[:2, :2] @ guess.shift - np.array(camera.centre)) / camera.focal
-        numbers = *slope, np.log(camera.focal * distance / (guess.focal * pixel)), np.log(camera.focal)
-        states.append(State(toward(slope) @ guess.roll @ guess.turn, *map(float, numbers)))
+    for match in _select_distinct(matches, keep, apart_deg):
+        # undo shift and roll: slopes of the ray to the object's centre, and the log depth
+        slope = (middle + pixel * match.roll[:2, :2] @ match.shift - np.array(camera.centre)) / camera.focal
+        log_depth = np.log(camera.focal * distance / (match.focal * pixel))
+        rotation = rotation_to_ray(slope) @ match.roll @ match.turn
+        states.append(PoseState(rotation, *map(float, (*slope, log_depth, np.log(camera.focal)))))
     return states
 
 
-def guesses_of(
-    caster: Caster, silhouette: Silhouette, camera: Camera, views: int, rolls: int
-) -> tuple[list[Guess], np.ndarray, float, float]:
-    """Return the best placement of the mesh for each view, roll and size.
+def match_templates(
+    caster: Caster, view: ObjectView, views: int, rolls: int
+) -> tuple[list[TemplateMatch], np.ndarray, float, float]:
+    """Return the best placement of the mesh for each direction of view, roll and size.
 
     Args:
         caster: The mesh.
-        silhouette: The mask, with at least one pixel of the object.
-        camera: The photo's camera.
+        view: The mask, with at least one pixel of the object, and the camera.
         views: Number of directions of view, spread evenly over the sphere.
         rolls: Number of rotations of the photo, spread evenly over 360°.
 
     Returns:
-        The guesses, the mask's centre (x, y) in photo pixels, the size of a grid pixel in photo pixels, and the
-        distance from which the templates are seen, in units of the mesh.
+        The matches, the mask's centre (x, y) in photo pixels, the size of a grid pixel in photo pixels, and the
+        distance from which the templates are rendered, in units of the mesh.
     """
-    low, high, extent = extent_of(silhouette)
+    silhouette = view.silhouette
+    low, high, extent = bounding_box(silhouette)
     cut = is_cut(silhouette)
     pixel = extent / (CUT if cut else WHOLE)
     middle = (low + high) / 2
@@ -123,11 +125,11 @@ def guesses_of(
     # spectra of E_l for every roll
     costs = _cost_images(silhouette, caster.mesh.labels, middle, pixel, angles)
     spectra = rfft2(costs, axes=(-2, -1)).astype(np.complex64)  # [rolls, labels, GRID, GRID//2+1]
-    guesses = []
-    undone = rotation_of_vector(np.outer(-angles, [0, 0, 1]))
-    distance = np.clip(camera.focal / (extent / 2), 2.5, 30.0) * caster.radius
+    matches = []
+    inverse_rolls = rotation_of_vector(np.outer(-angles, [0, 0, 1]))
+    distance = np.clip(view.camera.focal / (extent / 2), 2.5, 30.0) * caster.radius
     for direction in fibonacci_sphere(views):
-        turn = looking_along(direction)
+        turn = rotation_to_axis(direction)
         for template, focal in _templates(caster, turn, distance, area, SIZES_OF_CUT if cut else SIZES_OF_WHOLE):
             # Σ_l Σ_p T_l(p − t) E_l(p) of (1) for every shift t, by correlation; the best shift of every roll
             spectrum = rfft2(template, axes=(-2, -1)).astype(np.complex64)
@@ -135,8 +137,8 @@ def guesses_of(
             best = errors.argmin(axis=1)
             error = 1 + errors[np.arange(rolls), best] / area
             shift = (np.stack([best % GRID, best // GRID], axis=1) + GRID // 2) % GRID - GRID // 2
-            guesses += [Guess(error[k], turn, undone[k], shift[k], focal) for k in range(rolls)]
-    return guesses, middle, pixel, distance
+            matches += [TemplateMatch(error[k], turn, inverse_rolls[k], shift[k], focal) for k in range(rolls)]
+    return matches, middle, pixel, distance
 
 
 def _cost_images(
@@ -149,18 +151,19 @@ def _cost_images(
     means = []
     for label in labels:
         cost = np.zeros((height, width))
-        of_photo = np.where(silhouette.label == 0, 1.0, np.where(silhouette.label == label, -1.0, 0.0))
-        cost[: len(of_photo), : of_photo.shape[1]] = of_photo
+        pixel_costs = np.where(silhouette.label == 0, 1.0, np.where(silhouette.label == label, -1.0, 0.0))
+        cost[: len(pixel_costs), : pixel_costs.shape[1]] = pixel_costs
         means.append(cost.reshape(height // step, step, width // step, step).mean(axis=(1, 3)))
     # sample it on the grid rotated about the centre
     offset = np.arange(GRID) + 0.5 - GRID / 2
     x, y = np.meshgrid(offset * pixel, offset * pixel)
     images = np.empty((len(angles), len(labels), GRID, GRID), np.float32)
     for k, angle in enumerate(angles):
-        cos, sin = np.cos(angle), np.sin(angle)
-        place = [(middle[1] - sin * x + cos * y) / step - 0.5, (middle[0] + cos * x + sin * y) / step - 0.5]
+        cos = np.cos(angle)
+        sin = np.sin(angle)
+        position = [(middle[1] - sin * x + cos * y) / step - 0.5, (middle[0] + cos * x + sin * y) / step - 0.5]
         for n, image in enumerate(means):
-            images[k, n] = ndimage.map_coordinates(image, place, order=1, cval=0.0)
+            images[k, n] = ndimage.map_coordinates(image, position, order=1, cval=0.0)
     return images
 
 
@@ -171,35 +174,36 @@ def _templates(
 
     The images are scaled about the centre by nearest-neighbour sampling.
     """
-    pose = State(turn, 0.0, 0.0, np.log(distance), 0.0).pose(caster)
+    pose = PoseState(turn, 0.0, 0.0, np.log(distance), 0.0).pose(caster)
     focal = 0.48 * GRID * distance / caster.radius
     image = caster.labels(caster.cast(Camera(GRID, GRID, focal, (GRID / 2, GRID / 2)), pose))
     for size in sizes:
         zoom = np.sqrt(area / max(int(np.count_nonzero(image)), 1)) * size
         if zoom < 4:  # otherwise the mesh is seen edge-on and cannot be the mask
             index = np.floor((np.arange(GRID) + 0.5 - GRID / 2) / zoom + GRID / 2).astype(int)
-            there = (index >= 0) & (index < GRID)
+            inside = (index >= 0) & (index < GRID)
             index = np.clip(index, 0, GRID - 1)
-            sized = np.where(there[:, None] & there, image[np.ix_(index, index)], 0)
-            yield np.stack([sized == label for label in caster.mesh.labels]).astype(np.float32), focal * zoom
+            resized = np.where(inside[:, None] & inside, image[np.ix_(index, index)], 0)
+            yield np.stack([resized == label for label in caster.mesh.labels]).astype(np.float32), focal * zoom
 
 
-def _apart(guesses: list[Guess], keep: int, apart_deg: float) -> list[Guess]:
-    """Select the best guesses such that none is within `apart_deg` of a better one."""
-    order = np.argsort(np.array([guess.error for guess in guesses]), kind="stable")[: 60 * keep]
-    rotations = np.stack([guesses[k].roll @ guesses[k].turn for k in order])
-    chosen: list[Guess] = []
+def _select_distinct(matches: list[TemplateMatch], keep: int, apart_deg: float) -> list[TemplateMatch]:
+    """Select the best matches such that none is within `apart_deg` of a better one."""
+    order = np.argsort(np.array([match.error for match in matches]), kind="stable")[: 60 * keep]
+    rotations = np.stack([matches[k].roll @ matches[k].turn for k in order])
+    chosen: list[TemplateMatch] = []
+    # tr RᵢᵀRⱼ = 1 + 2 cos(angle)
     closest = 1 + 2 * np.cos(np.deg2rad(apart_deg))
     free = np.ones(len(order), bool)
     while free.any() and len(chosen) < keep:
         k = int(np.argmax(free))
-        chosen.append(guesses[order[k]])
+        chosen.append(matches[order[k]])
         free &= np.einsum("nij,ij->n", rotations, rotations[k]) < closest
         free[k] = False
     return chosen
 
 
-def toward(slope: Float[np.ndarray, "2"]) -> Rotation:
+def rotation_to_ray(slope: Float[np.ndarray, "2"]) -> Rotation:
     """Return the smallest rotation that takes the optical axis to the ray (slope, 1)."""
     ray = np.array([*slope, 1.0])
-    return looking_along(ray / np.linalg.norm(ray)).T
+    return rotation_to_axis(ray / np.linalg.norm(ray)).T

@@ -48,12 +48,12 @@ def confidence(maps: Maps, silhouette: Silhouette) -> Float[np.ndarray, "h w"]:
     extent = max(np.ptp(where) for where in np.nonzero(agree)) + 1
     distance = distance_transform_edt(np.pad(agree, 1, mode="edge"))[1:-1, 1:-1]
     result = np.clip(distance / max(FULL_DISTANCE * extent, 1.0), 0, 1) * np.clip(maps.edge / FULL_COSINE, 0, 1)
-    unsure = (maps.facet / FACET) ** 2 + (turns(maps) / TURN) ** 2  # (1) less 1
+    unsure = (maps.facet / FACET) ** 2 + (normal_spread(maps) / TURN) ** 2  # (1) less 1
     return result * np.where(maps.back, INSIDE_OF_SHELL, 1.0) * ~maps.bent / (1 + unsure)
 
 
-def turns(maps: Maps) -> Float[np.ndarray, "h w"]:
-    """Return turn of (1) in radians, over those of the 3 × 3 pixels that show a mesh."""
+def normal_spread(maps: Maps) -> Float[np.ndarray, "h w"]:
+    """Return turn of (1) in radians: the spread of the normals of the 3 × 3 pixels that show a mesh."""
     mesh = (maps.label > 0).astype(float)
     share = np.maximum(uniform_filter(mesh, 3, mode="constant"), 1e-12)
     sums = [uniform_filter(n, 3, mode="constant") for n in np.moveaxis(maps.normal, -1, 0)]
@@ -68,7 +68,9 @@ def _depth_jumps(maps: Maps) -> Bool[np.ndarray, "h w"]:
     result = np.zeros(mesh.shape, bool)
     limit = DEPTH_JUMP * max(float(np.ptp(maps.depth[mesh])), 1e-12) if mesh.any() else np.inf
     for axis in (0, 1):
-        first, second = (slice(None),) * axis + (slice(None, -1),), (slice(None),) * axis + (slice(1, None),)
+        first = (slice(None),) * axis + (slice(None, -1),)
+        second = (slice(None),) * axis + (slice(1, None),)
+        # steps of depth larger than the limit and much larger than the neighbouring steps
         both = mesh[first] & mesh[second]
         step = np.where(both, np.abs(maps.depth[first] - maps.depth[second]), np.inf)
         padded = np.pad(step, [(1, 1) if k == axis else (0, 0) for k in range(2)], constant_values=np.inf)

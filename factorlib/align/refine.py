@@ -23,7 +23,7 @@ from scipy.ndimage import map_coordinates
 from scipy.spatial import cKDTree
 
 from factorlib.align.silhouette import labelled_iou
-from factorlib.align.state import State
+from factorlib.align.state import PoseState
 from factorlib.align.target import Target, border_pairs
 from factorlib.geometry.camera import Camera
 from factorlib.geometry.raster import Caster, Hits
@@ -39,22 +39,10 @@ STILL = 0.03  # a step of fewer standard errors ends the iteration
 Points = Float[np.ndarray, "n 2"]
 
 
-class FocalPrior(msgspec.Struct, frozen=True):
-    """Prior of the focal length, log f ~ Normal(log `focal`, `sigma`); a sigma of 0 means that f is known."""
-
-    focal: float
-    sigma: float
-
-    @property
-    def free(self) -> int:
-        """Number of unknowns of `State.moved` that may move; the last one is the focal length."""
-        return 7 if self.sigma > 0 else 6
-
-
-class Refined(msgspec.Struct, frozen=True):
+class RefinedState(msgspec.Struct, frozen=True):
     """State, its labelled IoU in the window, and the information matrix of the normal equations there."""
 
-    state: State
+    state: PoseState
     score: float
     information: Float[np.ndarray, "7 7"]
 
@@ -63,36 +51,28 @@ class Refined(msgspec.Struct, frozen=True):
         return float(np.sqrt(max(np.linalg.pinv(self.information)[6, 6], 0.0)))
 
 
-class Rendered(msgspec.Struct, frozen=True):
+class Rendering(msgspec.Struct, frozen=True):
     """Mesh in a state, rendered in a target's window: the camera of the window, and the hits of its pixels' rays."""
 
     caster: Caster
-    state: State
+    target: Target
+    state: PoseState
     window: Camera
     hits: Hits
 
-    def score(self, target: Target) -> float:
-        """Return the labelled IoU with the target's mask."""
-        return labelled_iou(target.silhouette, self.caster.labels(self.hits))
+    @property
+    def score(self) -> float:
+        """Labelled IoU with the target's mask."""
+        return labelled_iou(self.target.silhouette, self.caster.labels(self.hits))
 
 
-def rendered(caster: Caster, target: Target, camera: Camera, state: State) -> Rendered:
-    """Cast the mesh in `state` into the target's window of the photo.
-
-    Args:
-        caster: The mesh.
-        target: Window about the mask.
-        camera: The photo's camera.
-        state: State of the mesh.
-
-    Returns:
-        The camera of the window and its hits.
-    """
-    window = target.camera(state.camera(camera))
-    return Rendered(caster, state, window, caster.cast(window, state.pose(caster)))
+def render(caster: Caster, target: Target, state: PoseState) -> Rendering:
+    """Cast the mesh in `state` into the target's window of the photo."""
+    window = target.window(state.focal)
+    return Rendering(caster, target, state, window, caster.cast(window, state.pose(caster)))
 
 
-def refined(caster: Caster, target: Target, camera: Camera, start: State, prior: FocalPrior, steps: int) -> Refined:
+def refine(caster: Caster, target: Target, start: PoseState, steps: int) -> RefinedState:
     """Refine `start` by Gauss–Newton and return the state of the best score.
 
     It ends early if a step is short or if three steps in a row gain nothing.
@@ -100,57 +80,56 @@ def refined(caster: Caster, target: Target, camera: Camera, start: State, prior:
     Args:
         caster: The mesh.
         target: Window about the mask.
-        camera: The photo's camera.
         start: Initial state.
-        prior: Prior of the focal length.
         steps: Greatest number of steps.
 
     Returns:
         The best of all states on the way, `start` included.
     """
     state = start
-    free = prior.free
-    ran: list[Refined] = []
+    free = target.view.free
+    visited: list[RefinedState] = []
     for _ in range(steps + 1):
-        seen = rendered(caster, target, camera, state)
-        information, gradient = normal_equations(seen, target, prior)
-        ran.append(Refined(state, seen.score(target), information))
+        rendering = render(caster, target, state)
+        information, gradient = normal_equations(rendering)
+        visited.append(RefinedState(state, rendering.score, information))
         # damped Gauss–Newton step of the free unknowns
         step = np.zeros(7)
         step[:free] = -np.linalg.solve((information + np.diag(DAMPING))[:free, :free], gradient[:free])
         step = np.clip(step, -LARGEST_STEP, LARGEST_STEP)
-        scores = [result.score for result in ran]
+        scores = [result.score for result in visited]
         if step @ information @ step < STILL**2 or max(scores[-3:]) < max(scores):
             break
         state = state.moved(step)
-    return max(ran, key=lambda result: result.score)
+    return max(visited, key=lambda result: result.score)
 
 
 def normal_equations(
-    seen: Rendered, target: Target, prior: FocalPrior, jacobian_of: Callable[..., np.ndarray] = State.jacobian
+    rendering: Rendering, image_jacobian: Callable[..., np.ndarray] = PoseState.jacobian
 ) -> tuple[Float[np.ndarray, "k k"], Float[np.ndarray, " k"]]:
     """Return information matrix and gradient of the contours' residuals, robustly weighted, prior included.
 
     Args:
-        seen: The rendered mesh.
-        target: Window about the mask.
-        prior: Prior of the focal length.
-        jacobian_of: Derivative of image points by all unknowns, from the state and the points' offsets, as
-            `State.jacobian`.
+        rendering: The rendered mesh.
+        image_jacobian: Derivative of image points by all unknowns, from the state and the points' offsets, as
+            `PoseState.jacobian`.
 
     Returns:
-        Information and gradient; the first seven unknowns are those of `State.moved`.
+        Information and gradient; the first seven unknowns are those of `PoseState.moved`.
     """
+    target = rendering.target
+    state = rendering.state
+    view = target.view
     residuals = [np.zeros(0)]
-    rows = [np.zeros((0, jacobian_of(seen.state, np.zeros((0, 3))).shape[-1]))]
-    for name, region in target.regions.items():
-        points, arms = contour_of(seen, name)
+    rows = [np.zeros((0, image_jacobian(state, np.zeros((0, 3))).shape[-1]))]
+    for label, region in target.regions.items():
+        points, arms = mesh_contour(rendering, label)
         if len(points) == 0:
             continue
         # mesh → mask: signed distance, and its slope times the Jacobian of the image points
-        jacobian = jacobian_of(seen.state, arms) / target.pixel
-        slope_x, slope_y = (at_points(region.slope[..., k], points)[:, None] for k in (0, 1))
-        residuals.append(at_points(region.distance, points))
+        jacobian = image_jacobian(state, arms) / target.pixel
+        slope_x, slope_y = (interpolate(region.slope[..., k], points)[:, None] for k in (0, 1))
+        residuals.append(interpolate(region.distance, points))
         rows.append(slope_x * jacobian[:, 0] + slope_y * jacobian[:, 1])
         # mask → mesh: distance along the mask's normal to the nearest contour point of the mesh
         if len(region.contour):
@@ -165,14 +144,14 @@ def normal_equations(
     # information JᵀWJ and gradient JᵀWr, with the prior of log focal length
     information = (row * weight[:, None]).T @ row
     gradient = row.T @ (weight * residual)
-    if prior.sigma > 0:
-        information[6, 6] += prior.sigma**-2
-        gradient[6] += (seen.state.log_focal - np.log(prior.focal)) / prior.sigma**2
+    if view.focal_sigma > 0:
+        information[6, 6] += view.focal_sigma**-2
+        gradient[6] += (state.log_focal - np.log(view.camera.focal)) / view.focal_sigma**2
     return information, gradient
 
 
-def contour_of(seen: Rendered, name: int) -> tuple[Points, Float[np.ndarray, "n 3"]]:
-    """Return the contour of the mesh's part of label `name` and the surface points that move it.
+def mesh_contour(rendering: Rendering, label: int) -> tuple[Points, Float[np.ndarray, "n 3"]]:
+    """Return the contour of the mesh's part of that label and the surface points that move it.
 
     Where another part covers this one, the contour moves with the nearer surface.
 
@@ -180,25 +159,25 @@ def contour_of(seen: Rendered, name: int) -> tuple[Points, Float[np.ndarray, "n 
         Points (x, y) of the contour in window pixels, and offsets from the mesh's centre to their surface points
         (camera axes, mesh units).
     """
-    caster = seen.caster
-    window = seen.window
-    hits = seen.hits
-    inside = caster.labels(hits) == name
+    caster = rendering.caster
+    window = rendering.window
+    hits = rendering.hits
+    inside = caster.labels(hits) == label
     pixel_in, pixel_out = border_pairs(inside, ~inside)
     depth = np.minimum(hits.depth[tuple(pixel_in.T)], hits.depth[tuple(pixel_out.T)])
     near = pixel_in[:, ::-1] + 0.5
     far = pixel_out[:, ::-1] + 0.5
-    pose = seen.state.pose(caster)
+    pose = rendering.state.pose(caster)
     # bisect between the pixel inside and the pixel outside
     for _ in range(HALVINGS):
         middle = (near + far) / 2
-        within = (caster.labels(caster.cast_along(window.rays_through(middle), pose)) == name)[:, None]
+        within = (caster.labels(caster.cast_along(window.rays_through(middle), pose)) == label)[:, None]
         near = np.where(within, middle, near)
         far = np.where(within, far, middle)
     points = (near + far) / 2
-    return points, window.rays_through(points) * depth[:, None] - seen.state.middle()
+    return points, window.rays_through(points) * depth[:, None] - rendering.state.middle()
 
 
-def at_points(image: Float[np.ndarray, "h w"], points: Points) -> Float[np.ndarray, " n"]:
+def interpolate(image: Float[np.ndarray, "h w"], points: Points) -> Float[np.ndarray, " n"]:
     """Return an image's values at points (x, y), pixel centres at 0.5, by bilinear interpolation."""
     return map_coordinates(image, points.T[::-1] - 0.5, order=1, mode="nearest")

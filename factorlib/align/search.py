@@ -1,7 +1,7 @@
 """Search for the pose of one object in one photo from its mask alone.
 
 Rotation, place and distance are unknown, and the focal length where it is not given. The search is coarse to fine:
-every view and roll at thumbnail size (`coarse`), the best of them refined on contours (`refine`) at three resolutions,
+every view and roll at thumbnail size (`coarse`), the best of them refined on contours (`refine`) at four resolutions,
 fewer at each. A survivor rotated by more than DISTINCT_DEG against the winner is refined as finely and becomes the
 runner-up. Its score and the difference of its normals tell how far the answer can be trusted.
 """
@@ -12,32 +12,26 @@ from typing import Annotated
 import msgspec
 import numpy as np
 
-from factorlib.align.coarse import candidates, is_cut
-from factorlib.align.refine import FocalPrior, Refined, refined
-from factorlib.align.silhouette import Silhouette
-from factorlib.align.state import State
-from factorlib.align.target import Target, target_of
-from factorlib.geometry.camera import Camera, angle_between
+from factorlib.align.coarse import initial_states, is_cut
+from factorlib.align.refine import RefinedState, refine
+from factorlib.align.state import PoseState
+from factorlib.align.target import Target, make_target
+from factorlib.align.view import ObjectView
+from factorlib.geometry.camera import angle_between
 from factorlib.geometry.raster import Caster, Maps, rasterise
+from factorlib.results.poses import RunnerUp, entry_of
 
 Count = Annotated[int, msgspec.Meta(ge=1)]
 Report = Callable[[float], None]
 SAME_DEG = 6.0  # refined poses with a smaller angle between them are the same
 DISTINCT_DEG = 15.0  # least angle of a runner-up
 UNLIKELY_FOCAL = 0.001  # penalty on the score for a focal length one sigma from the expected one
-UNKNOWN_FOCAL = FocalPrior(1.5, 0.5)  # in units of the photo's longer side: wide angle 0.7, normal 1.4, portrait 2.5
-EXIF_SIGMA = 0.05  # log: EXIF rounds to whole millimetres and ignores focus
 # a pose is given up if its unexplained share exceeds this multiple of the best one's, and this absolute share
 GIVEN_UP_RATIO = 4.0
 GIVEN_UP_UNEXPLAINED = 0.04
 
 
-def after(done: float, report: Report) -> Report:
-    """Return a report of the share of the next piece of work, which follows `done` pieces."""
-    return lambda share: report(done + share)
-
-
-class Search(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+class SearchOptions(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """Effort of the search; the tuples hold one number per round of refinement, in order.
 
     Most guesses are dropped in the first round.
@@ -63,180 +57,139 @@ class Search(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """Number of dropped guesses that are refined to the end, to find a runner-up."""
 
 
-class RunnerUp(msgspec.Struct, frozen=True):
-    """Best pose that is rotated by more than DISTINCT_DEG against the winner."""
+class PoseEstimate(msgspec.Struct, frozen=True):
+    """Estimated pose.
 
-    state: State
-    score: float
-    normal_difference_deg: float  # median over common pixels; small for a symmetric object
+    score             labelled IoU at the finest resolution
+    log_focal_sigma   standard error of the log focal length
+    runner_up         best pose that is rotated by more than DISTINCT_DEG against this one
+    source            found (by search), keypoints (refined from the user's keypoints), refined (an earlier result)
+    """
 
-
-class Found(msgspec.Struct, frozen=True):
-    """Estimated pose, its labelled IoU at the finest resolution, the standard error of log focal, and the runner-up."""
-
-    state: State
+    state: PoseState
     score: float
     log_focal_sigma: float
-    runner_up: RunnerUp | None
-    by_keypoints: bool = False  # refined from the pose of the user's keypoints, without a search
-    earlier: bool = False  # copied from an earlier result
+    runner_up: RunnerUp | None = None
+    source: str = "found"
 
 
-def focal_prior(camera_focal: float | None, source: str | None, width: int, height: int) -> FocalPrior:
-    """Return the prior of the focal length: exact if it is given, narrow if from EXIF, else broad.
-
-    Args:
-        camera_focal: Focal length in pixels; None if it is unknown.
-        source: Source of the length; "exif" makes it uncertain.
-        width: Width of the photo.
-        height: Height of the photo.
-
-    Returns:
-        The prior.
-    """
-    if camera_focal is None:
-        return FocalPrior(UNKNOWN_FOCAL.focal * max(width, height), UNKNOWN_FOCAL.sigma)
-    return FocalPrior(camera_focal, EXIF_SIGMA if source == "exif" else 0.0)
-
-
-def find(
-    caster: Caster,
-    silhouette: Silhouette,
-    camera: Camera,
-    prior: FocalPrior,
-    search: Search = Search(),
-    report: Report = lambda share: None,
-) -> Found:
-    """Find the pose whose labelled silhouette agrees best with the photo's.
+def estimate_pose(
+    caster: Caster, view: ObjectView, search: SearchOptions = SearchOptions(), report: Report = lambda share: None
+) -> PoseEstimate:
+    """Search for the pose whose labelled silhouette agrees best with the photo's.
 
     Args:
         caster: The mesh.
-        silhouette: The mask, with at least one pixel of the object.
-        camera: The photo's camera; the prior replaces its focal length.
-        prior: Prior of the focal length.
+        view: The mask, with at least one pixel of the object, and the camera.
         search: Effort of the search.
         report: Function of the share of the search that is done, called after the first guesses and after each round.
 
     Returns:
         The pose with its score and runner-up.
     """
-    camera = msgspec.structs.replace(camera, focal=prior.focal)
-    effort = search.cut_effort if is_cut(silhouette) else 1
-    states = candidates(
-        caster, silhouette, camera, effort * search.views, search.rolls, effort * search.keep[0], search.apart_deg
+    effort = search.cut_effort if is_cut(view.silhouette) else 1
+    states = initial_states(
+        caster, view, search.views * effort, search.rolls, search.keep[0] * effort, search.apart_deg
     )
+    report(1 / (len(search.keep) + 2))
     # rounds of refinement, each finer and with fewer states
-    others: list[Refined] = []
+    ranked: list[RefinedState] = []
+    coarser: list[RefinedState] = []
     rounds = zip(search.keep, search.steps, search.resolution, search.margin)
-    for number, (keep, steps, size, margin) in enumerate(rounds, start=1):
-        report(number / (len(search.keep) + 2))
-        states = states[: keep if others else effort * keep]
-        target = target_of(silhouette, caster.mesh.labels, size, margin)
-        ranked = _distinct([refined(caster, target, camera, state, prior, steps) for state in states], prior)
+    for number, (keep, steps, size, margin) in enumerate(rounds, start=2):
+        states = states[: keep if ranked else effort * keep]
+        target = make_target(view, caster.mesh.labels, size, margin)
+        coarser = ranked + coarser
+        ranked = _rank([refine(caster, target, state, steps) for state in states], view)
         most = max(GIVEN_UP_RATIO * (1 - ranked[0].score), GIVEN_UP_UNEXPLAINED)
         states = [result.state for result in ranked if 1 - result.score <= most]
-        others = ranked + others
-    report(1 - 1 / (len(search.keep) + 2))
-    rivals: list[Refined] = []
-    for other in others[len(ranked) :]:
+        report(number / (len(search.keep) + 2))
+    # refine rivals at the finest resolution, since scores of different resolutions do not compare
+    rivals: list[RefinedState] = []
+    for other in coarser:
         if len(rivals) < search.rivals and _is_apart(other, (ranked[0], *rivals), DISTINCT_DEG):
             rivals.append(other)
-    # refine the rivals at the finest resolution, since scores of different resolutions do not compare
-    again = [refined(caster, target, camera, rival.state, prior, search.steps[-1]) for rival in rivals]
-    best, *others = _distinct(ranked + again, prior)
-    runners_up = (
-        RunnerUp(
-            other.state,
-            other.score,
-            normal_difference(*(seen_in(caster, target, camera, of.state) for of in (best, other))),
-        )
-        for other in others
-        if _is_apart(other, [best], DISTINCT_DEG)
-    )
-    return Found(best.state, best.score, best.log_focal_sigma(), next(runners_up, None))
+    again = [refine(caster, target, rival.state, search.steps[-1]) for rival in rivals]
+    best, *others = _rank(ranked + again, view)
+    runner_up = next((other for other in others if _is_apart(other, [best], DISTINCT_DEG)), None)
+    second = _describe_runner_up(caster, target, best, runner_up) if runner_up else None
+    return PoseEstimate(best.state, best.score, best.log_focal_sigma(), second)
 
 
-def found_near(
-    caster: Caster, silhouette: Silhouette, camera: Camera, start: State, prior: FocalPrior, search: Search = Search()
-) -> Found:
+def _describe_runner_up(caster: Caster, target: Target, best: RefinedState, runner_up: RefinedState) -> RunnerUp:
+    """Return the pose of the runner-up, its score, and the angle between its normals and those of the best pose."""
+    maps = (render_maps(caster, target, result.state) for result in (best, runner_up))
+    pose = entry_of(runner_up.state.pose(caster))
+    return RunnerUp(**pose, score=runner_up.score, normal_difference_deg=normal_difference(*maps))
+
+
+def refine_near(
+    caster: Caster, view: ObjectView, start: PoseState, search: SearchOptions = SearchOptions()
+) -> PoseEstimate:
     """Refine the pose from `start` at the two finest resolutions; keep `start` if refinement leads far away.
 
     Args:
         caster: The mesh.
-        silhouette: The mask.
-        camera: The photo's camera; the prior replaces its focal length.
-        start: Initial state.
-        prior: Prior of the focal length.
+        view: The mask and the camera.
+        start: Initial state, as from keypoints.
         search: Effort of the search.
 
     Returns:
         The pose, without a runner-up.
     """
-    camera = msgspec.structs.replace(camera, focal=prior.focal)
     state = start
     for steps, size, margin in zip(search.steps[-2:], search.resolution[-2:], search.margin[-2:]):
-        target = target_of(silhouette, caster.mesh.labels, size, margin)
-        result = refined(caster, target, camera, state, prior, steps)
+        target = make_target(view, caster.mesh.labels, size, margin)
+        result = refine(caster, target, state, steps)
         if angle_between(result.state.rotation, start.rotation) > DISTINCT_DEG:
-            result = refined(caster, target, camera, start, prior, 0)
+            result = refine(caster, target, start, 0)
         state = result.state
-    return Found(result.state, result.score, result.log_focal_sigma(), None, by_keypoints=True)
+    return PoseEstimate(result.state, result.score, result.log_focal_sigma(), source="keypoints")
 
 
-def refined_finest(
-    caster: Caster, silhouette: Silhouette, camera: Camera, start: State, prior: FocalPrior, search: Search, steps: int
-) -> Refined:
+def refine_finest(
+    caster: Caster, view: ObjectView, start: PoseState, search: SearchOptions, steps: int
+) -> RefinedState:
     """Refine `start` at the finest resolution of the search; with 0 steps, only score it.
 
     Args:
         caster: The mesh.
-        silhouette: The mask.
-        camera: The photo's camera.
+        view: The mask and the camera.
         start: Initial state.
-        prior: Prior of the focal length.
         search: Effort of the search, whose last resolution is used.
         steps: Gauss–Newton steps.
 
     Returns:
         The best state.
     """
-    target = target_of(silhouette, caster.mesh.labels, search.resolution[-1], search.margin[-1])
-    return refined(caster, target, camera, start, prior, steps)
+    target = make_target(view, caster.mesh.labels, search.resolution[-1], search.margin[-1])
+    return refine(caster, target, start, steps)
 
 
-def _distinct(results: list[Refined], prior: FocalPrior) -> list[Refined]:
+def _rank(results: list[RefinedState], view: ObjectView) -> list[RefinedState]:
     """Sort the results, best first, and drop those whose rotation is near that of a better one."""
 
-    def value(result: Refined) -> float:
+    def value(result: RefinedState) -> float:
         """Return the score less a penalty for an unlikely focal length."""
-        off = (result.state.log_focal - np.log(prior.focal)) / prior.sigma if prior.sigma else 0.0
+        sigma = view.focal_sigma
+        off = (result.state.log_focal - np.log(view.camera.focal)) / sigma if sigma else 0.0
         return result.score - UNLIKELY_FOCAL * off**2
 
-    distinct: list[Refined] = []
+    distinct: list[RefinedState] = []
     for result in sorted(results, key=lambda result: -value(result)):
         if _is_apart(result, distinct, SAME_DEG):
             distinct.append(result)
     return distinct
 
 
-def _is_apart(one: Refined, others: Iterable[Refined], degrees: float) -> bool:
-    """Return whether `one` is rotated by more than `degrees` against each of the others."""
-    return all(angle_between(one.state.rotation, other.state.rotation) > degrees for other in others)
+def _is_apart(result: RefinedState, others: Iterable[RefinedState], degrees: float) -> bool:
+    """Return whether `result` is rotated by more than `degrees` against each of the others."""
+    return all(angle_between(result.state.rotation, other.state.rotation) > degrees for other in others)
 
 
-def seen_in(caster: Caster, target: Target, camera: Camera, state: State) -> Maps:
-    """Render the maps of the mesh in a state, in the target's window.
-
-    Args:
-        caster: The mesh.
-        target: Window about the mask.
-        camera: The photo's camera.
-        state: State of the mesh.
-
-    Returns:
-        The maps.
-    """
-    return rasterise(caster, target.camera(state.camera(camera)), state.pose(caster))
+def render_maps(caster: Caster, target: Target, state: PoseState) -> Maps:
+    """Render the maps of the mesh in a state, in the target's window."""
+    return rasterise(caster, target.window(state.focal), state.pose(caster))
 
 
 def normal_difference(a: Maps, b: Maps) -> float:

@@ -11,6 +11,7 @@ from jaxtyping import Float, Int
 from scipy.ndimage import distance_transform_edt
 
 from factorlib.align.silhouette import UNKNOWN, Mask, Silhouette
+from factorlib.align.view import ObjectView
 from factorlib.geometry.camera import Camera
 
 
@@ -30,37 +31,46 @@ class Region(msgspec.Struct, frozen=True):
 
 
 class Target(msgspec.Struct, frozen=True):
-    """Window about the mask: its place in the photo, its labels, and a region per material of the mesh."""
+    """Window about the mask of a view.
 
+    left, top    corner of the window in the photo, photo pixels
+    pixel        photo pixels per window pixel
+    silhouette   the mask in the window
+    regions      region of each material of the mesh, by label
+    """
+
+    view: ObjectView
     left: float
     top: float
-    pixel: float  # photo pixels per window pixel
+    pixel: float
     silhouette: Silhouette
     regions: dict[int, Region]
 
-    def camera(self, photo_camera: Camera) -> Camera:
-        """Return the photo's camera restricted to the window, in the window's pixels."""
+    def window(self, focal: float) -> Camera:
+        """Return the photo's camera at a focal length, restricted to the window, in the window's pixels."""
         height, width = self.silhouette.label.shape
-        return photo_camera.window(self.left, self.top, self.pixel, width, height)
+        camera = msgspec.structs.replace(self.view.camera, focal=focal)
+        return camera.window(self.left, self.top, self.pixel, width, height)
 
     @property
     def extent(self) -> float:
         """Longer side of the mask's bounding box, window pixels."""
-        return extent_of(self.silhouette)[2]
+        return bounding_box(self.silhouette)[2]
 
 
-def extent_of(silhouette: Silhouette) -> tuple[np.ndarray, np.ndarray, float]:
+def bounding_box(silhouette: Silhouette) -> tuple[np.ndarray, np.ndarray, float]:
     """Return the lowest and highest (x, y) corner of the mask's bounding box, and its longer side, in pixels."""
     rows, columns = np.nonzero(silhouette.inside)
-    low, high = np.array([columns.min(), rows.min()], float), np.array([columns.max(), rows.max()], float) + 1
+    low = np.array([columns.min(), rows.min()], float)
+    high = np.array([columns.max(), rows.max()], float) + 1
     return low, high, float((high - low).max())
 
 
-def target_of(silhouette: Silhouette, labels: tuple[int, ...], resolution: int, margin: float = 0.2) -> Target:
-    """Cut out the silhouette with a margin around it and compute the region of each material.
+def make_target(view: ObjectView, labels: tuple[int, ...], resolution: int, margin: float = 0.2) -> Target:
+    """Cut out the mask with a margin around it and compute the region of each material.
 
     Args:
-        silhouette: The silhouette of the object.
+        view: The mask of the object and the photo's camera.
         labels: Labels of the mesh's materials.
         resolution: Pixels of the mask's longer side in the window; fewer if the photo has fewer.
         margin: Margin as a share of the mask's extent.
@@ -68,7 +78,8 @@ def target_of(silhouette: Silhouette, labels: tuple[int, ...], resolution: int, 
     Returns:
         The window.
     """
-    low, high, extent = extent_of(silhouette)
+    silhouette = view.silhouette
+    low, high, extent = bounding_box(silhouette)
     pixel = max(extent / resolution, 1.0)
     height, width = silhouette.label.shape
     # nearest photo pixel of each window pixel
@@ -80,12 +91,12 @@ def target_of(silhouette: Silhouette, labels: tuple[int, ...], resolution: int, 
     window = silhouette.label[np.ix_(y, x)]
     # one pixel around the window, unknown beyond the photo's frame
     padded = np.pad(window, 1, mode="edge")
-    at_frame = low[1] == 0, high[1] == height, low[0] == 0, high[0] == width
-    for touches, edge in zip(at_frame, (padded[0], padded[-1], padded[:, 0], padded[:, -1]), strict=True):
-        if touches:
+    borders = low[1] == 0, high[1] == height, low[0] == 0, high[0] == width
+    for is_frame, edge in zip(borders, (padded[0], padded[-1], padded[:, 0], padded[:, -1]), strict=True):
+        if is_frame:
             edge[:] = UNKNOWN
     regions = {label: _region(padded == label, padded != UNKNOWN) for label in labels}
-    return Target(float(low[0]), float(low[1]), pixel, Silhouette(window), regions)
+    return Target(view, float(low[0]), float(low[1]), pixel, Silhouette(window), regions)
 
 
 def _region(inside: Mask, known: Mask) -> Region:
@@ -104,9 +115,9 @@ def _region(inside: Mask, known: Mask) -> Region:
     a, b = border_pairs(inside, known & ~inside)
     normal = slope[a[:, 0], a[:, 1]] + slope[b[:, 0], b[:, 1]]
     length = np.linalg.norm(normal, axis=1)
-    good = length > 0.4  # a vanishing gradient has no direction
-    contour = ((a + b) / 2 + 0.5)[good][:, ::-1]
-    outward = normal[good] / length[good, None]
+    clear = length > 0.4  # a vanishing gradient has no direction
+    contour = ((a + b) / 2 + 0.5)[clear][:, ::-1]
+    outward = normal[clear] / length[clear, None]
     return Region(distance[1:-1, 1:-1], slope[1:-1, 1:-1], contour - 1.0, outward)
 
 
@@ -117,7 +128,8 @@ def border_pairs(inside: Mask, outside: Mask) -> tuple[Int[np.ndarray, "n 2"], I
     """
     pairs = []
     for axis in (0, 1):
-        low, high = (slice(None),) * axis + (slice(None, -1),), (slice(None),) * axis + (slice(1, None),)
+        low = (slice(None),) * axis + (slice(None, -1),)
+        high = (slice(None),) * axis + (slice(1, None),)
         step = np.eye(2, dtype=int)[axis]
         first = np.argwhere(inside[low] & outside[high])
         second = np.argwhere(outside[low] & inside[high])

@@ -37,7 +37,7 @@ def synthetic(seed: Seed = 0, out: Out = None, lights: Lights = None) -> None:
     """Generate three materials in three lights on exact shapes, with direct light only."""
     from factorlib.generate import synthetic as set_
 
-    _write(set_, out or Path("data/synthetic"), seed, lights, set_.Parameters())
+    _write(set_, out or Path("data/synthetic"), seed, lights, set_.SyntheticOptions())
 
 
 @app.command()
@@ -54,9 +54,9 @@ def eames(
     from factorlib.generate import eames as set_
 
     if (exact or distant or direct or rough) and out is None:
-        found = "data/eames is the set without --exact, --distant, --direct and --rough: name another folder"
-        raise typer.BadParameter(found, param_hint="--out")
-    parameters = set_.Parameters(exact=exact, distant=distant, direct=direct, rough=_rough(rough, exact))
+        fault = "data/eames is the set without --exact, --distant, --direct and --rough: name another folder"
+        raise typer.BadParameter(fault, param_hint="--out")
+    parameters = set_.ChairSetOptions(exact=exact, distant=distant, direct=direct, rough=_rough(rough, exact))
     _write(set_, out or Path("data/eames"), seed, lights, parameters)
 
 
@@ -70,8 +70,8 @@ def _rough(words: str | None, exact: bool) -> tuple[int, float] | None:
     except ValueError:
         numbers = 0, 0.0
     if exact or not (numbers[0] >= 20 and 0 <= numbers[1] <= 0.2):
-        found = "without --exact, 20 triangles or more and 0 to .2, as in --rough 500,.02"
-        raise typer.BadParameter(found, param_hint=f"--rough {words}")
+        expected = "without --exact, 20 triangles or more and 0 to .2, as in --rough 500,.02"
+        raise typer.BadParameter(expected, param_hint=f"--rough {words}")
     return numbers
 
 

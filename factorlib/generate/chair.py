@@ -24,7 +24,7 @@ Pair = tuple[float, float]
 Radii = tuple[float, float, float]
 
 
-class Shape(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+class ChairDimensions(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """Contents of chair.yaml, which explains each number."""
 
     profile: list[Pair]
@@ -41,7 +41,7 @@ class Shape(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     strut_radius: float
 
 
-SHAPE = read_yaml(Path(__file__).with_name("chair.yaml"), Shape)
+DIMENSIONS = read_yaml(Path(__file__).with_name("chair.yaml"), ChairDimensions)
 
 
 def chair() -> dict[str, Part]:
@@ -55,7 +55,7 @@ def rough_chair(rng: np.random.Generator) -> dict[str, Part]:
     phases = rng.uniform(0, 2 * np.pi, (4, 1))
     shifts = rng.normal(0, 0.002, (4, 3))
 
-    parts = {"shell": shell(14, 22), "legs": legs(7, 3, radii=SHAPE.rough_leg_radii)}
+    parts = {"shell": shell(14, 22), "legs": legs(7, 3, radii=DIMENSIONS.rough_leg_radii)}
     return {name: (v + np.sin(v @ axes.T + phases.T) @ shifts, faces) for name, (v, faces) in parts.items()}
 
 
@@ -93,7 +93,8 @@ def labelled(parts: dict[str, Part], labels: dict[str, int]) -> Mesh:
     """Join all parts to one mesh with material labels, smooth within each part."""
     meshes = [smooth(vertices, faces, labels[name]) for name, (vertices, faces) in parts.items()]
     vertices, faces = joined([(mesh.vertices, mesh.faces) for mesh in meshes])
-    normals, label = (np.concatenate([getattr(mesh, of) for mesh in meshes]) for of in ("normals", "face_label"))
+    normals = np.concatenate([mesh.normals for mesh in meshes])
+    label = np.concatenate([mesh.face_label for mesh in meshes])
     return Mesh(vertices, faces.astype(np.int32), normals, label)
 
 
@@ -107,14 +108,16 @@ def joined(parts: Sequence[Part]) -> Part:
 def shell(across: int, along: int) -> Part:
     """Return the shell: upper and lower sides, half a thickness off its middle surface, joined by a rounded rim."""
     s, t = np.meshgrid(np.linspace(-1, 1, across + 1), np.linspace(-1, 1, along + 1))
-    u, v = s * np.sqrt(1 - SHAPE.corners * t**2 / 2), t * np.sqrt(1 - SHAPE.corners * s**2 / 2)
+    u = s * np.sqrt(1 - DIMENSIONS.corners * t**2 / 2)
+    v = t * np.sqrt(1 - DIMENSIONS.corners * s**2 / 2)
     # normals of the middle surface, by central differences
     middle = middle_surface(u, v)
     step = 1e-4
     by_u = middle_surface(u + step, v) - middle_surface(u - step, v)
     normal = np.cross(by_u, middle_surface(u, v - step) - middle_surface(u, v + step))
     normal /= -np.linalg.norm(normal, axis=-1, keepdims=True)
-    upper, lower = middle + normal * SHAPE.thickness / 2, middle - normal * SHAPE.thickness / 2
+    upper = middle + normal * DIMENSIONS.thickness / 2
+    lower = middle - normal * DIMENSIONS.thickness / 2
     rows, columns = u.shape
     index = np.arange(rows * columns).reshape(rows, columns)
     border = np.concatenate([index[0, :-1], index[:-1, -1], index[-1, :0:-1], index[:0:-1, 0]])  # closed ring
@@ -123,7 +126,7 @@ def shell(across: int, along: int) -> Part:
     # rim: half a thickness outward from the border, in the surface
     out = np.cross(np.roll(middle, -1, axis=0) - np.roll(middle, 1, axis=0), normal)
     out *= np.sign(np.sum(out * (middle - middle.mean(axis=0)), axis=1).sum())
-    edge = middle + out / np.linalg.norm(out, axis=1, keepdims=True) * SHAPE.thickness / 2
+    edge = middle + out / np.linalg.norm(out, axis=1, keepdims=True) * DIMENSIONS.thickness / 2
     a, b, c, d = index[:-1, :-1], index[:-1, 1:], index[1:, :-1], index[1:, 1:]
     top = np.concatenate([np.stack([a, b, d], -1), np.stack([a, d, c], -1)]).reshape(-1, 3)
     rim = 2 * rows * columns + np.arange(len(border))
@@ -134,13 +137,16 @@ def shell(across: int, along: int) -> Part:
 
 def middle_surface(u: Float[np.ndarray, "*n"], v: Float[np.ndarray, "*n"]) -> Float[np.ndarray, "*n 3"]:
     """Return points of the shell: u from −1 to 1 across, v from −1 (front lip) to 1 (top of the back)."""
-    profile = np.array(SHAPE.profile)
+    profile = np.array(DIMENSIONS.profile)
     length = np.concatenate([[0], np.cumsum(np.linalg.norm(np.diff(profile, axis=0), axis=1))])
     curve = CubicSpline(length / length[-1], profile)
-    at = (v + 1) / 2
-    (z, y), (dz, dy) = np.moveaxis(curve(at), -1, 0), np.moveaxis(curve(at, 1), -1, 0)
+    position = (v + 1) / 2
+    z, y = np.moveaxis(curve(position), -1, 0)
+    dz, dy = np.moveaxis(curve(position, 1), -1, 0)
     speed = np.hypot(dz, dy)
-    width, rise = (PchipInterpolator(*np.array(table).T)(at) for table in (SHAPE.half_width, SHAPE.curl))
+    width, rise = (
+        PchipInterpolator(*np.array(table).T)(position) for table in (DIMENSIONS.half_width, DIMENSIONS.curl)
+    )
     lift = rise * np.abs(u) ** 2.4
     return np.stack([u * (width - 0.35 * lift), y - lift * dz / speed, z + lift * dy / speed], axis=-1)
 
@@ -151,7 +157,7 @@ def band(first: np.ndarray, second: np.ndarray) -> np.ndarray:
     return np.concatenate([np.stack([a, c, d], -1), np.stack([a, d, b], -1)])
 
 
-def legs(sides: int, rings: int, radii: Radii = SHAPE.leg_radii) -> Part:
+def legs(sides: int, rings: int, radii: Radii = DIMENSIONS.leg_radii) -> Part:
     """Return four legs and the struts between neighbours.
 
     Args:
@@ -162,12 +168,12 @@ def legs(sides: int, rings: int, radii: Radii = SHAPE.leg_radii) -> Part:
     Returns:
         Vertices and faces.
     """
-    top = [np.array([x, SHAPE.seat_y, z]) for x, z in SHAPE.tops]
-    foot = [np.array([x, 0.0, z]) for x, z in SHAPE.feet]
+    top = [np.array([x, DIMENSIONS.seat_y, z]) for x, z in DIMENSIONS.tops]
+    foot = [np.array([x, 0.0, z]) for x, z in DIMENSIONS.feet]
     dowels = [dowel(a, b, radii, sides, rings) for a, b in zip(top, foot, strict=True)]
-    for one, low, other, high in SHAPE.struts:
-        ends = top[one] + low * (foot[one] - top[one]), top[other] + high * (foot[other] - top[other])
-        dowels.append(dowel(*ends, (SHAPE.strut_radius,) * 3, max(5, sides // 2), 2))
+    for leg, low, other, high in DIMENSIONS.struts:
+        ends = top[leg] + low * (foot[leg] - top[leg]), top[other] + high * (foot[other] - top[other])
+        dowels.append(dowel(*ends, (DIMENSIONS.strut_radius,) * 3, max(5, sides // 2), 2))
     return joined(dowels)
 
 
@@ -189,9 +195,9 @@ def dowel(start: Float[np.ndarray, "3"], end: Float[np.ndarray, "3"], radii: Rad
     across /= np.linalg.norm(across)
     angle = np.arange(sides) / sides * 2 * np.pi
     circle = np.cos(angle)[:, None] * across + np.sin(angle)[:, None] * np.cross(axis, across)
-    at = np.linspace(0, 1, rings)
-    radius = PchipInterpolator([0, 0.5, 1], radii)(at)
-    points = start + at[:, None, None] * (end - start) + radius[:, None, None] * circle
+    share = np.linspace(0, 1, rings)
+    radius = PchipInterpolator([0, 0.5, 1], radii)(share)
+    points = start + share[:, None, None] * (end - start) + radius[:, None, None] * circle
     index = np.arange(rings * sides).reshape(rings, sides)
     tube = np.concatenate([band(index[k], index[k + 1]) for k in range(rings - 1)])
     (first, last), (right, right_last) = index[[0, -1]], np.roll(index, -1, axis=1)[[0, -1]]

@@ -16,12 +16,12 @@ from jaxtyping import Float
 
 from factorlib.conventions import YUP_FROM_CAMERA
 from factorlib.dataset.schema import LEFT_OUT
-from factorlib.generate import folder, lights
+from factorlib.generate import folder, surroundings
 from factorlib.generate.chair import bent_chair, chair, labelled, rough_chair
-from factorlib.generate.lights import EYE, Rng, SceneDict, random_materials
+from factorlib.generate.surroundings import EYE, Rng, SceneDict, random_materials
 from factorlib.geometry.camera import Camera, Pose
 from factorlib.geometry.raster import rasterise
-from factorlib.meshes.mesh import smooth
+from factorlib.meshes.mesh import Mesh, smooth
 from factorlib.meshes.ply import submesh
 from factorlib.tracing.scene import Material, bsdf, envmap, light_seen, look, rigid, shape, traced, transform
 from factorlib.yamlfile import read_yaml
@@ -30,8 +30,8 @@ Progress = Callable[[int, int, str], None]
 Maps = Sequence[Path]
 
 
-class Parameters(msgspec.Struct, frozen=True):
-    """Parameters of the set.
+class ChairSetOptions(msgspec.Struct, frozen=True):
+    """ChairSetOptions of the set.
 
     width, height    size of photos, pixels
     light_rows       rows of light maps
@@ -53,7 +53,7 @@ class Parameters(msgspec.Struct, frozen=True):
     rough: tuple[int, float] | None = None
 
 
-class Shot(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+class ChairShot(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """Photo: shell colours of its chairs, pose of the first chair, lens, and surroundings.
 
     facing_deg         0 faces the camera, positive turns the front to the photo's right
@@ -75,21 +75,26 @@ class Shot(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     lamps: int = 2
 
 
-class Set(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+class ChairSet(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """Contents of eames.yaml, which explains each number."""
 
     materials: dict[str, Material]
-    shots: list[Shot]
+    shots: list[ChairShot]
     clipped: float
     apart: float
     middle: float
 
 
-SET = read_yaml(Path(__file__).with_name("eames.yaml"), Set)
+SET = read_yaml(Path(__file__).with_name("eames.yaml"), ChairSet)
 
 
 def generate(
-    out: Path, seed: int, lat_longs: Maps, parameters: Parameters, progress: Progress, shots: Sequence[Shot] = SET.shots
+    out: Path,
+    seed: int,
+    lat_longs: Maps,
+    parameters: ChairSetOptions,
+    progress: Progress,
+    shots: Sequence[ChairShot] = SET.shots,
 ) -> None:
     """Write the data set into the empty folder `out`.
 
@@ -97,7 +102,7 @@ def generate(
         out: Empty folder.
         seed: Seed; 0 is the set in the repository.
         lat_longs: Light maps of the user, which replace the generated lights.
-        parameters: Parameters of the set.
+        parameters: ChairSetOptions of the set.
         progress: Function of the number of photos that are done, of their total, and of the current photo's name.
         shots: Photos.
     """
@@ -116,7 +121,7 @@ def generate(
     poses = {}
     for number, shot in enumerate(shots):
         progress(number, len(shots), shot.name)
-        scene = laid_out(shot, number, lat_longs, rng, spread, parameters)
+        scene = arrange_scene(shot, number, lat_longs, rng, spread, parameters)
         poses[shot.name] = scene.poses
         photos.append(write_shot(out, scene, materials, parameters, 1000 * seed + number))
     meshes = {"chair": {"file": "meshes/chair.obj", "parts": {"shell": "red", "legs": "wood"}}}
@@ -127,13 +132,13 @@ def generate(
     progress(len(shots), len(shots), "done")
 
 
-class Scene(msgspec.Struct, frozen=True):
+class ChairScene(msgspec.Struct, frozen=True):
     """Photo before it is rendered: surroundings, camera and chairs in the world.
 
     The world has y up, the floor at −EYE, and the chairs about x = z = 0.
     """
 
-    shot: Shot
+    shot: ChairShot
     surroundings: SceneDict
     camera: Camera
     world_from_camera: Float[np.ndarray, "4 4"]
@@ -146,7 +151,9 @@ class Scene(msgspec.Struct, frozen=True):
         return {name: Pose(matrix[:3, :3], matrix[:3, 3]) for name, matrix in matrices.items()}
 
 
-def laid_out(shot: Shot, number: int, lat_longs: Maps, rng: Rng, spread: float, parameters: Parameters) -> Scene:
+def arrange_scene(
+    shot: ChairShot, number: int, lat_longs: Maps, rng: Rng, spread: float, parameters: ChairSetOptions
+) -> ChairScene:
     """Place camera, chairs and surroundings of a shot; nothing is between camera and chairs.
 
     The surroundings are a sky, a room, or a user's map over a grey ground (without the ground if light is `distant`).
@@ -157,7 +164,7 @@ def laid_out(shot: Shot, number: int, lat_longs: Maps, rng: Rng, spread: float, 
         lat_longs: Light maps of the user.
         rng: Random generator.
         spread: Size of the random changes of chairs' rotations and camera position, from 0 to 1.
-        parameters: Parameters of the set.
+        parameters: ChairSetOptions of the set.
 
     Returns:
         The scene.
@@ -179,18 +186,20 @@ def laid_out(shot: Shot, number: int, lat_longs: Maps, rng: Rng, spread: float, 
         chairs[f"{colour}_chair"] = rigid(turn, aside * level[:, 0] + [0, -EYE, 0] + 0.15 * k * level[:, 2])
     camera = Camera(width, height, folder.focal_px_of_35mm(shot.focal_35mm, width, height), (width / 2, height / 2))
     if lat_longs:
-        around = {"light": envmap(lights.captured(lat_longs[number % len(lat_longs)], parameters.light_rows))}
+        around = {"light": envmap(surroundings.captured(lat_longs[number % len(lat_longs)], parameters.light_rows))}
         if not parameters.distant:
-            around["ground"] = lights.wall("-y", EYE, (6.0, 6.0), (0.35, 0.33, 0.3))
+            around["ground"] = surroundings.wall("-y", EYE, (6.0, 6.0), (0.35, 0.33, 0.3))
     elif shot.sun:
         up, aside = shot.sun
-        around = lights.daylight(rng, up, yaw + 180 + aside, shot.turbidity, rows=2 * parameters.light_rows)
+        around = surroundings.daylight(rng, up, yaw + 180 + aside, shot.turbidity, rows=2 * parameters.light_rows)
     else:
-        around = lights.room(rng, shot.windows, shot.lamps, clear_deg=yaw + 180, clear_half_deg=120)
-    return Scene(shot, around, camera, rigid(look(-down, yaw), place), chairs)
+        around = surroundings.room(rng, shot.windows, shot.lamps, clear_deg=yaw + 180, clear_half_deg=120)
+    return ChairScene(shot, around, camera, rigid(look(-down, yaw), place), chairs)
 
 
-def write_shot(out: Path, scene: Scene, materials: dict[str, Material], parameters: Parameters, seed: int) -> dict:
+def write_shot(
+    out: Path, scene: ChairScene, materials: dict[str, Material], parameters: ChairSetOptions, seed: int
+) -> dict:
     """Render, expose and write one photo, with its masks, its light in the photo's units, and its normals.
 
     Args:
@@ -211,38 +220,54 @@ def write_shot(out: Path, scene: Scene, materials: dict[str, Material], paramete
     wood = names.index("wood") + 1
     meshes = [labelled(chair(), {"shell": names.index(colour) + 1, "legs": wood}) for colour in shot.chairs]
     labels = folder.labels_of(meshes, camera, poses)
-    # light at the chairs' centre, without the chairs; if it is direct but not distant, only that of emitters
-    turn = scene.world_from_camera[:3, :3] @ YUP_FROM_CAMERA  # world_from_light
-    depth = 1 if parameters.direct and not parameters.distant else -1
-    place = rigid(turn, (0, SET.middle - EYE, 0))
-    rows = parameters.light_rows
-    spp = parameters.light_spp
-    light = light_seen(scene.surroundings, place, rows, spp, seed, depth)
-    around = scene.surroundings
-    if parameters.distant:
-        around = {"light": envmap(light) | {"to_world": transform(rigid(turn, (0, 0, 0)))}}
-    solids = {
-        f"{name}_{label}": shape(submesh(mesh, label), bsdf(materials[names[label - 1]]), world_from_object)
-        for mesh, (name, world_from_object) in zip(meshes, scene.chairs.items(), strict=True)
-        for label in mesh.labels
-    }
-    depth = 2 if parameters.direct else -1
-    radiance = traced(around | solids, camera, scene.world_from_camera, parameters.spp, seed, depth)
-    on_chair = (labels > 0) & (labels < LEFT_OUT)
+    light, radiance = render_shot(scene, meshes, list(materials.values()), parameters, seed)
     # exposure that clips the share `clipped` of the chairs' pixels
+    on_chair = (labels > 0) & (labels < LEFT_OUT)
     exposure = float(1 / np.quantile(radiance[on_chair].max(axis=-1), 1 - SET.clipped))
     exif = shot.focal_35mm if shot.focal_known_from == "exif" else None
     folder.write_photo(out / f"photos/{shot.name}.jpg", radiance * exposure, exif)
-    folder.write_shot(out, shot.name, labels, light * exposure, rasterise(meshes, camera, poses))
+    folder.write_mask_and_truth(out, shot.name, labels, light * exposure, rasterise(meshes, camera, poses))
     shells = zip(scene.chairs, shot.chairs, strict=True)
     objects: list[Any] = [{"name": name, "mesh": "chair", "materials": {"shell": colour}} for name, colour in shells]
     if len(meshes) > 1:  # a mask for each chair
-        for own, mask in zip(objects, folder.object_masks(meshes, camera, poses), strict=True):
-            own["mask"] = f"masks/{shot.name}_{own['name']}.png"
-            folder.write_labels(out / own["mask"], np.where(mask, 255, 0))
+        for obj, mask in zip(objects, folder.object_masks(meshes, camera, poses), strict=True):
+            obj["mask"] = f"masks/{shot.name}_{obj['name']}.png"
+            folder.write_labels(out / obj["mask"], np.where(mask, 255, 0))
     if parameters.exact:
-        objects = [own | {"pose": folder.pose_entry(pose)} for own, pose in zip(objects, poses, strict=True)]
+        objects = [obj | {"pose": folder.pose_entry(pose)} for obj, pose in zip(objects, poses, strict=True)]
     entry: dict[str, Any] = {"name": shot.name, "image": f"photos/{shot.name}.jpg", "masks": f"masks/{shot.name}.png"}
     if parameters.exact or shot.focal_known_from == "given":
         entry["camera"] = {"focal_px": round(camera.focal, 2)}
     return entry | {"objects": objects}
+
+
+def render_shot(
+    scene: ChairScene, meshes: Sequence[Mesh], materials: Sequence[Material], parameters: ChairSetOptions, seed: int
+) -> tuple[Float[np.ndarray, "h w 3"], Float[np.ndarray, "h w 3"]]:
+    """Render the light at the chairs' centre, without the chairs, and the photo.
+
+    Args:
+        scene: The scene.
+        meshes: Mesh of each chair.
+        materials: Materials in the order of their labels.
+        parameters: Parameters of the set.
+        seed: Seed of the renderer.
+
+    Returns:
+        The light's map in the camera's y-up frame, and the photo's radiance.
+    """
+    around = scene.surroundings
+    # light that is direct but not distant is that of emitters alone
+    world_from_light = scene.world_from_camera[:3, :3] @ YUP_FROM_CAMERA
+    depth = 1 if parameters.direct and not parameters.distant else -1
+    place = rigid(world_from_light, (0, SET.middle - EYE, 0))
+    light = light_seen(around, place, parameters.light_rows, parameters.light_spp, seed, depth)
+    if parameters.distant:
+        around = {"light": envmap(light) | {"to_world": transform(rigid(world_from_light, (0, 0, 0)))}}
+    solids = {
+        f"{name}_{label}": shape(submesh(mesh, label), bsdf(materials[label - 1]), world_from_object)
+        for mesh, (name, world_from_object) in zip(meshes, scene.chairs.items(), strict=True)
+        for label in mesh.labels
+    }
+    depth = 2 if parameters.direct else -1
+    return light, traced(around | solids, scene.camera, scene.world_from_camera, parameters.spp, seed, depth)

@@ -89,7 +89,7 @@ def write_normals(path: Path, normal: Image) -> None:
     write_exr(path, {f"normal.{axis}": normal[..., k] for k, axis in enumerate("xyz")})
 
 
-def write_shot(out: Path, name: str, labels: Int[np.ndarray, "h w"], light: Image, maps: Maps) -> None:
+def write_mask_and_truth(out: Path, name: str, labels: Int[np.ndarray, "h w"], light: Image, maps: Maps) -> None:
     """Write the mask of one photo and its truth: light and normals.
 
     Args:
@@ -165,7 +165,9 @@ def whole_pixels(fine: Int[np.ndarray, "hh ww"]) -> Int[np.ndarray, "h w"]:
     windows = np.lib.stride_tricks.sliding_window_view(fine, (SUBPIXELS + 2, SUBPIXELS + 2))
     windows = windows[SUBPIXELS - 1 :: SUBPIXELS, SUBPIXELS - 1 :: SUBPIXELS]
     height, width = (n // SUBPIXELS - 2 for n in fine.shape)
-    low, high = (of(windows[:height, :width], axis=(-2, -1)) for of in (np.min, np.max))
+    windows = windows[:height, :width]
+    low = windows.min(axis=(-2, -1))
+    high = windows.max(axis=(-2, -1))
     return np.where(low == high, low, LEFT_OUT)
 
 

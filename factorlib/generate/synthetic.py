@@ -17,8 +17,8 @@ from scipy.ndimage import distance_transform_edt
 from factorlib.conventions import YUP_FROM_CAMERA
 from factorlib.dataset.schema import LEFT_OUT
 from factorlib.generate import folder
-from factorlib.generate.lights import Rng, Rotation, captured, daylight, random_materials, room
-from factorlib.generate.shapes import SHAPES
+from factorlib.generate.solids import SHAPES
+from factorlib.generate.surroundings import Rng, Rotation, captured, daylight, random_materials, room
 from factorlib.geometry.camera import Camera, Pose, rotation_of_vector
 from factorlib.geometry.raster import rasterise
 from factorlib.meshes.mesh import Mesh
@@ -34,7 +34,7 @@ MATERIALS = {
 }
 
 
-class Parameters(msgspec.Struct, frozen=True):
+class SyntheticOptions(msgspec.Struct, frozen=True):
     """Parameters of the set.
 
     width, height    size of photos, pixels
@@ -51,7 +51,7 @@ class Parameters(msgspec.Struct, frozen=True):
     light_spp: int = 48
 
 
-class Placed(msgspec.Struct, frozen=True):
+class Placement(msgspec.Struct, frozen=True):
     """Shape of a material in a photo.
 
     x      position across, at the distance DISTANCE
@@ -73,63 +73,63 @@ class Placed(msgspec.Struct, frozen=True):
         return f"{self.material}_{self.shape}"
 
 
-class Shot(msgspec.Struct, frozen=True):
+class SyntheticShot(msgspec.Struct, frozen=True):
     """Photo: suffix of its file, its objects, and the fraction of object pixels that is clipped (None: nothing)."""
 
     name: str
     suffix: str
-    placed: tuple[Placed, ...]
+    placements: tuple[Placement, ...]
     clipped: float | None = None
 
 
 SHOTS = (
-    Shot(
+    SyntheticShot(
         "garden",
         ".exr",
-        (Placed("sphere", "red", -1.22), Placed("vase", "green", 0.0), Placed("blob", "blue", 1.22, 0.6)),
+        (Placement("sphere", "red", -1.22), Placement("vase", "green", 0.0), Placement("blob", "blue", 1.22, 0.6)),
     ),
-    Shot(
+    SyntheticShot(
         "parlour",
         ".png",
-        (Placed("bottle", "green", -1.22), Placed("sphere", "blue", 0.0), Placed("vase", "red", 1.22)),
+        (Placement("bottle", "green", -1.22), Placement("sphere", "blue", 0.0), Placement("vase", "red", 1.22)),
     ),
-    Shot(
+    SyntheticShot(
         "study",
         ".jpg",
         (
-            Placed("blob", "red", -1.22, 2.2, (0.2, -0.3), posed=False),
-            Placed("bottle", "blue", 0.0, 0.0, (0.25, 0.15)),
-            Placed("sphere", "green", 1.22),
+            Placement("blob", "red", -1.22, 2.2, (0.2, -0.3), posed=False),
+            Placement("bottle", "blue", 0.0, 0.0, (0.25, 0.15)),
+            Placement("sphere", "green", 1.22),
         ),
         clipped=0.03,
     ),
 )
 
 
-class Scene(msgspec.Struct, frozen=True):
+class SyntheticScene(msgspec.Struct, frozen=True):
     """Contents of one photo: objects in one light.
 
     light       lat-long map in the camera's y-up frame, radiance in its own unit
     materials   materials by name, in the order of their labels
     meshes      meshes by shape
-    poses       cam_from_object by the object's name, in the order of `shot.placed`
+    poses       cam_from_object by the object's name, in the order of `shot.placements`
     """
 
-    shot: Shot
+    shot: SyntheticShot
     light: Float[np.ndarray, "h w 3"]
     materials: dict[str, Material]
     meshes: dict[str, Mesh]
     poses: dict[str, Pose]
 
 
-def generate(out: Path, seed: int, lat_longs: Sequence[Path], parameters: Parameters, progress: Progress) -> None:
+def generate(out: Path, seed: int, lat_longs: Sequence[Path], parameters: SyntheticOptions, progress: Progress) -> None:
     """Write the data set into the empty folder `out`.
 
     Args:
         out: Empty folder.
         seed: Seed; 0 is the set in the repository.
         lat_longs: Light maps of the user, which replace the generated lights.
-        parameters: Parameters of the set.
+        parameters: SyntheticOptions of the set.
         progress: Function of the number of steps that are done, of their total, and of the current step.
     """
     for name in ("photos", "masks", "meshes", "truth"):
@@ -147,9 +147,11 @@ def generate(out: Path, seed: int, lat_longs: Sequence[Path], parameters: Parame
         world_from_camera = look(rng.uniform(-14, -6), rng.uniform(0, 360))
         light = light_of(number, world_from_camera, lat_longs, rng, parameters.light_rows, parameters.light_spp)
         progress(2 * number + 1, 2 * len(SHOTS), f"photo {shot.name}")
-        poses[shot.name] = placements(shot, world_from_camera, rng, spread)
-        photos.append(write_shot(out, Scene(shot, light, materials, meshes, poses[shot.name]), parameters, seed))
-    used = {placed.name: placed for shot in SHOTS for placed in shot.placed}
+        poses[shot.name] = place_objects(shot, world_from_camera, rng, spread)
+        photos.append(
+            write_shot(out, SyntheticScene(shot, light, materials, meshes, poses[shot.name]), parameters, seed)
+        )
+    used = {placement.name: placement for shot in SHOTS for placement in shot.placements}
     entries = {name: {"file": f"meshes/{p.shape}.ply", "material": p.material} for name, p in used.items()}
     comment = "Generated: python -m factorlib.generate synthetic"
     folder.write_records(out, comment, materials, entries, photos, poses)
@@ -188,7 +190,9 @@ def light_of(
     return light_seen(scene, rigid(world_from_camera @ YUP_FROM_CAMERA, (0, 0, 0)), rows, spp, seed)
 
 
-def placements(shot: Shot, world_from_camera: Rotation, rng: np.random.Generator, spread: float) -> dict[str, Pose]:
+def place_objects(
+    shot: SyntheticShot, world_from_camera: Rotation, rng: np.random.Generator, spread: float
+) -> dict[str, Pose]:
     """Return cam_from_object of each object, upright in the world but for its tilt.
 
     Args:
@@ -201,21 +205,21 @@ def placements(shot: Shot, world_from_camera: Rotation, rng: np.random.Generator
         Poses by the object's name.
     """
     poses = {}
-    for placed in shot.placed:
-        turn = rotation_of_vector(np.array([0, placed.turn + spread * rng.uniform(-np.pi, np.pi), 0]))
-        tilt = np.array([placed.tilt[0], 0, placed.tilt[1]])
+    for placement in shot.placements:
+        turn = rotation_of_vector(np.array([0, placement.turn + spread * rng.uniform(-np.pi, np.pi), 0]))
+        tilt = np.array([placement.tilt[0], 0, placement.tilt[1]])
         tilt = rotation_of_vector(tilt + spread * np.array([1, 0, 1]) * rng.uniform(-0.2, 0.2, 3))
-        poses[placed.name] = Pose(world_from_camera.T @ tilt @ turn, np.array([placed.x, 0.02, DISTANCE]))
+        poses[placement.name] = Pose(world_from_camera.T @ tilt @ turn, np.array([placement.x, 0.02, DISTANCE]))
     return poses
 
 
-def write_shot(out: Path, scene: Scene, parameters: Parameters, seed: int) -> dict:
+def write_shot(out: Path, scene: SyntheticScene, parameters: SyntheticOptions, seed: int) -> dict:
     """Render, expose and write one photo, with its mask, its light in the photo's units, and its normals.
 
     Args:
         out: Folder of the data set.
         scene: The scene.
-        parameters: Parameters of the set.
+        parameters: SyntheticOptions of the set.
         seed: Seed of the renderer.
 
     Returns:
@@ -227,23 +231,23 @@ def write_shot(out: Path, scene: Scene, parameters: Parameters, seed: int) -> di
     width, height = parameters.width, parameters.height
     camera = Camera(width, height, parameters.focal_px, (width / 2, height / 2))
     labelled = []
-    for placed in shot.placed:
-        mesh = scene.meshes[placed.shape]
-        label = np.full(len(mesh.faces), order.index(placed.material) + 1, np.int16)
+    for placement in shot.placements:
+        mesh = scene.meshes[placement.shape]
+        label = np.full(len(mesh.faces), order.index(placement.material) + 1, np.int16)
         labelled.append(msgspec.structs.replace(mesh, face_label=label))
     labels = folder.labels_of(labelled, camera, poses)
-    radiance = composed(scene, camera, parameters.spp, seed)
+    radiance = compose_photo(scene, camera, parameters.spp, seed)
     # exposure that clips the given fraction of object pixels, or just none; a float file gets a mean of ¼
     brightest = radiance[(labels > 0) & (labels < LEFT_OUT)].max(axis=-1)
     exposure = float(1 / np.quantile(brightest, 1 - shot.clipped) if shot.clipped else 0.95 / brightest.max())
     if shot.suffix == ".exr":
         exposure = float(0.25 / brightest.mean())
     folder.write_photo(out / f"photos/{shot.name}{shot.suffix}", radiance * exposure, quality=98)
-    folder.write_shot(out, shot.name, labels, scene.light * exposure, rasterise(labelled, camera, poses))
-    objects: list[dict[str, Any]] = [{"name": p.name, "mesh": p.name} for p in shot.placed]
-    for own, placed in zip(objects, shot.placed, strict=True):
-        if placed.posed:
-            own["pose"] = folder.pose_entry(scene.poses[placed.name])
+    folder.write_mask_and_truth(out, shot.name, labels, scene.light * exposure, rasterise(labelled, camera, poses))
+    objects: list[dict[str, Any]] = [{"name": p.name, "mesh": p.name} for p in shot.placements]
+    for entry, placement in zip(objects, shot.placements, strict=True):
+        if placement.posed:
+            entry["pose"] = folder.pose_entry(scene.poses[placement.name])
     return {
         "name": shot.name,
         "image": f"photos/{shot.name}{shot.suffix}",
@@ -253,7 +257,7 @@ def write_shot(out: Path, scene: Scene, parameters: Parameters, seed: int) -> di
     }
 
 
-def composed(scene: Scene, camera: Camera, spp: int, seed: int) -> Float[np.ndarray, "h w 3"]:
+def compose_photo(scene: SyntheticScene, camera: Camera, spp: int, seed: int) -> Float[np.ndarray, "h w 3"]:
     """Compose the photo: each pixel is taken from the render of the nearest object alone.
 
     The background is the same in all renders.
@@ -272,15 +276,16 @@ def composed(scene: Scene, camera: Camera, spp: int, seed: int) -> Float[np.ndar
     poses = list(scene.poses.values())
     radiance = np.zeros((camera.height, camera.width, 3))
     world = rigid(YUP_FROM_CAMERA, np.zeros(3))
-    silhouettes = folder.object_masks([meshes[placed.shape] for placed in shot.placed], camera, poses)
+    silhouettes = folder.object_masks([meshes[placement.shape] for placement in shot.placements], camera, poses)
     nearest = np.argmin([distance_transform_edt(~inside) for inside in silhouettes], axis=0)
-    for number, (placed, pose) in enumerate(zip(shot.placed, poses, strict=True)):
+    for number, (placement, pose) in enumerate(zip(shot.placements, poses, strict=True)):
         place = world @ rigid(pose.rotation, pose.translation)
-        solid = shape(meshes[placed.shape], bsdf(scene.materials[placed.material]), place)
-        own = nearest == number
-        columns = slice(np.flatnonzero(own.any(axis=0))[0], np.flatnonzero(own.any(axis=0))[-1] + 1)
+        solid = shape(meshes[placement.shape], bsdf(scene.materials[placement.material]), place)
+        mask = nearest == number
+        used = np.flatnonzero(mask.any(axis=0))
+        columns = slice(used[0], used[-1] + 1)
         entries = {"shape": solid, "light": envmap(scene.light)}
         view = sensor(camera, world, columns)
         alone = rendered(entries, view, spp, 100 * seed + number, max_depth=2)
-        radiance[:, columns][own[:, columns]] = alone[own[:, columns]]
+        radiance[:, columns][mask[:, columns]] = alone[mask[:, columns]]
     return radiance

@@ -107,9 +107,9 @@ class Caster:
         rays = np.empty((*directions.shape[:-1], 6), np.float32)
         rays[..., :3] = (-pose.rotation.T @ pose.translation - self.centre) / self.radius
         rays[..., 3:] = directions @ (pose.rotation / self.radius)
-        found = self.scene.cast_rays(o3d.core.Tensor(rays), nthreads=1)
-        face = found["primitive_ids"].numpy()
-        depth, uv = (found[name].numpy().astype(float) for name in ("t_hit", "primitive_uvs"))
+        hits = self.scene.cast_rays(o3d.core.Tensor(rays), nthreads=1)
+        face = hits["primitive_ids"].numpy()
+        depth, uv = (hits[name].numpy().astype(float) for name in ("t_hit", "primitive_uvs"))
         return Hits(depth, np.where(face == NO_FACE, -1, face.astype(np.int64)), uv)
 
     def labels(self, hits: Hits) -> Int[np.ndarray, "*n"]:
@@ -132,41 +132,56 @@ def rasterise(meshes: Mesh | Caster | Sequence, camera: Camera, poses: Pose | Se
     places = [poses] if isinstance(poses, Pose) else poses
     shape = camera.height, camera.width
     maps = Maps(
-        np.zeros((*shape, 3)),
-        np.zeros((*shape, 3)),
-        np.zeros(shape),
-        np.zeros(shape, np.int32),
-        np.zeros(shape, np.int32),
-        np.zeros(shape, bool),
-        np.zeros(shape, bool),
-        np.zeros(shape),
-        np.zeros(shape),
+        normal=np.zeros((*shape, 3)),
+        view=np.zeros((*shape, 3)),
+        depth=np.zeros(shape),
+        label=np.zeros(shape, np.int32),
+        object=np.zeros(shape, np.int32),
+        back=np.zeros(shape, bool),
+        bent=np.zeros(shape, bool),
+        edge=np.zeros(shape),
+        facet=np.zeros(shape),
     )
     nearest = np.full(shape, np.inf)
     view = -unit(camera.rays())
     for number, (mesh, pose) in enumerate(zip(solids, places, strict=True), start=1):
         caster = mesh if isinstance(mesh, Caster) else Caster(mesh)
         hits = caster.cast(camera, pose)
-        wins = (hits.face >= 0) & (hits.depth < nearest)
-        nearest[wins] = hits.depth[wins]
-        maps.depth[wins] = hits.depth[wins]
-        maps.view[wins] = view[wins]
-        maps.object[wins] = number
-        mesh = caster.mesh
-        face = hits.face[wins]
-        seen_along = view[wins]
-        # shading normals on the viewer's side of the face
-        own = face_normals(mesh, face)
-        facing = np.sum((own @ pose.rotation.T) * seen_along, axis=1)
-        side = np.where(facing < 0, -1.0, 1.0)[:, None]
-        smooth = unit(smooth_normals(mesh, face, hits.uv[wins]) @ pose.rotation.T) * side
-        maps.normal[wins], maps.bent[wins] = toward_viewer(smooth, seen_along)
-        maps.label[wins] = mesh.face_label[face]
-        maps.back[wins] = facing < 0
-        maps.edge[wins] = np.abs(facing)
-        cosines = np.abs(np.einsum("nkd,nd->nk", mesh.normals[mesh.faces[face]], own))
-        maps.facet[wins] = np.arccos(np.minimum(cosines.min(1), 1.0))
+        pixels = (hits.face >= 0) & (hits.depth < nearest)
+        nearest[pixels] = hits.depth[pixels]
+        maps.depth[pixels] = hits.depth[pixels]
+        maps.view[pixels] = view[pixels]
+        maps.object[pixels] = number
+        _draw_surface(maps, pixels, caster.mesh, hits, pose.rotation)
     return maps
+
+
+def _draw_surface(
+    maps: Maps, pixels: Bool[np.ndarray, "h w"], mesh: Mesh, hits: Hits, rotation: Float[np.ndarray, "3 3"]
+) -> None:
+    """Fill in normals, labels and the measures of the faces that are visible at `pixels`.
+
+    Args:
+        maps: Maps, whose view directions are filled in.
+        pixels: Pixels that show the mesh.
+        mesh: The mesh.
+        hits: Hits of the pixels' rays.
+        rotation: Rotation cam_from_object.
+    """
+    face = hits.face[pixels]
+    view = maps.view[pixels]
+    flat = face_normals(mesh, face)
+    facing = np.sum((flat @ rotation.T) * view, axis=1)
+    # shading normals on the viewer's side of the face
+    side = np.where(facing < 0, -1.0, 1.0)[:, None]
+    smooth = unit(smooth_normals(mesh, face, hits.uv[pixels]) @ rotation.T) * side
+    maps.normal[pixels], maps.bent[pixels] = toward_viewer(smooth, view)
+    maps.label[pixels] = mesh.face_label[face]
+    maps.back[pixels] = facing < 0
+    maps.edge[pixels] = np.abs(facing)
+    # largest angle between the face's normal and those of its corners
+    cosines = np.abs(np.einsum("nkd,nd->nk", mesh.normals[mesh.faces[face]], flat))
+    maps.facet[pixels] = np.arccos(np.minimum(cosines.min(1), 1.0))
 
 
 def toward_viewer(normal: Vectors, view: Vectors) -> tuple[Vectors, Bool[np.ndarray, " n"]]:

@@ -55,8 +55,9 @@ def ball_normals(size: int) -> tuple[Float[np.ndarray, "n 3"], Bool[np.ndarray, 
     >>> ball_normals(1)[0].tolist()
     [[0.0, -0.0, 1.0]]
     """
-    at = (np.arange(size) + 0.5) / size * 2 - 1
-    x, y = np.meshgrid(at, -at)
+    centres = (np.arange(size) + 0.5) / size * 2 - 1
+    x, y = np.meshgrid(centres, -centres)
     inside = x * x + y * y < 1
-    x, y = x[inside], y[inside]
+    x = x[inside]
+    y = y[inside]
     return np.stack([x, y, np.sqrt(1 - x * x - y * y)], axis=-1), inside

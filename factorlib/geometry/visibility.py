@@ -8,7 +8,7 @@ cast and count as visible; nothing is reflected from there.
 If there are more than `most_points` points, an evenly spread subset is cast. The other points take the visibility of
 the nearest cast point, near in position and in normal alike.
 
-For a ray that is not free, the surface that it hits is recorded too, as a code of `factorlib.geometry.met`.
+For a ray that is not free, the surface that it hits is recorded too, as a code of `factorlib.geometry.occluder_codes`.
 """
 
 from collections.abc import Callable, Iterator, Sequence
@@ -20,7 +20,7 @@ from scipy.spatial import cKDTree
 
 from factorlib.geometry import open3d as o3d
 from factorlib.geometry.camera import Camera, Pose
-from factorlib.geometry.met import UNMET, met_codes
+from factorlib.geometry.occluder_codes import NO_OCCLUDER, occluder_codes
 from factorlib.geometry.raster import Caster, unit
 from factorlib.geometry.sphere import fibonacci_sphere
 from factorlib.meshes.mesh import Mesh, area_vectors
@@ -34,15 +34,18 @@ Report = Callable[[int, int], None]
 NORMAL_WEIGHT = 10.0  # a difference of 1 between normals counts as this many spacings of cast points
 
 
-class Points(msgspec.Struct, frozen=True):
-    """Surface points under pixels: position and face normal (camera frame, facing the camera), and their existence."""
+class SurfacePoints(msgspec.Struct, frozen=True):
+    """Surface points under pixels: position and face normal (camera frame, facing the camera).
+
+    valid: False for a pixel whose ray hits nothing
+    """
 
     place: Float[np.ndarray, "n 3"]  # mesh units, lifted off the surface
     face_normal: Float[np.ndarray, "n 3"]
-    found: Bool[np.ndarray, " n"]
+    valid: Bool[np.ndarray, " n"]
 
 
-class Sight(msgspec.Struct, frozen=True):
+class Visibility(msgspec.Struct, frozen=True):
     """Visibility of k directions from n points.
 
     visibility  255 where a direction is free of the objects, 0 where not
@@ -67,7 +70,7 @@ class Occluders(Caster):
         self.normal = unit(area_vectors(self.mesh.vertices, faces))  # face normals
         self.lift = LIFT * np.repeat([mesh.radius for mesh in meshes], [len(mesh.faces) for mesh in meshes])
 
-    def points_under(self, camera: Camera, x: Int[np.ndarray, " n"], y: Int[np.ndarray, " n"]) -> Points:
+    def points_under(self, camera: Camera, x: Int[np.ndarray, " n"], y: Int[np.ndarray, " n"]) -> SurfacePoints:
         """Return the surface points that the rays through the centres of pixels (x, y) hit first.
 
         Args:
@@ -80,22 +83,59 @@ class Occluders(Caster):
         """
         along = camera.rays_through(np.column_stack([x, y]) + 0.5)
         distance, face, behind = self._first(self._rays(np.zeros_like(along), along))
-        found = np.isfinite(distance)
-        depth = np.where(found, distance * self.radius, 0.0)
-        normal = self.turned(face, behind)
-        return Points(depth[:, None] * along + self.lift[face][:, None] * normal, normal, found)
+        valid = np.isfinite(distance)
+        depth = np.where(valid, distance * self.radius, 0.0)
+        normal = self.hit_normals(face, behind)
+        return SurfacePoints(depth[:, None] * along + self.lift[face][:, None] * normal, normal, valid)
 
-    def turned(self, face: Int[np.ndarray, " n"], behind: Bool[np.ndarray, " n"]) -> Vectors:
+    def hit_normals(self, face: Int[np.ndarray, " n"], behind: Bool[np.ndarray, " n"]) -> Vectors:
         """Return the normals of faces, flipped where the face is hit from `behind`."""
         return np.where(behind[:, None], -self.normal[face], self.normal[face])
 
-    def seen_from(
+    def visibility_at(
         self,
-        points: Points,
+        camera: Camera,
+        pixels: Int[np.ndarray, "n 2"],
+        shading_normal: Vectors,
+        directions: int,
+        most_points: int,
+        report: Report = lambda done, total: None,
+    ) -> Visibility | None:
+        """Compute the visibility of the directions `fibonacci_sphere(directions)` from the points under pixels.
+
+        Args:
+            camera: Camera.
+            pixels: Pixels (x, y).
+            shading_normal: Unit shading normals of the pixels.
+            directions: Number of directions.
+            most_points: Greatest number of points to cast from, approximately.
+            report: Function, called now and then, of the number of cast points that are done and of their total.
+
+        Returns:
+            Visibility and codes; None if all directions are visible from all points.
+        """
+        x, y = pixels.T
+        points = self.points_under(camera, x, y)
+        subset = spread_subset(x, y, most_points)
+        cast = SurfacePoints(*(getattr(points, name)[subset] for name in points.__struct_fields__))
+        visibility = self.visibility_from(cast, shading_normal[subset], fibonacci_sphere(directions), report)
+        if (visibility.visibility == 255).all():
+            return None
+        if len(subset) == len(x):
+            return visibility
+        # nearest cast point, in position (in units of their spacing) and in normal
+        spacing = max(float(np.median(cKDTree(cast.place).query(cast.place, k=2)[0][:, 1])), 1e-12)
+        places = np.column_stack([points.place / spacing, NORMAL_WEIGHT * shading_normal])
+        nearest = cKDTree(places[subset]).query(places)[1]
+        return Visibility(visibility.visibility[nearest], visibility.met[nearest])
+
+    def visibility_from(
+        self,
+        points: SurfacePoints,
         shading_normal: Vectors,
         directions: Float[np.ndarray, "k 3"],
         report: Report = lambda done, total: None,
-    ) -> Sight:
+    ) -> Visibility:
         """Compute the visibility of directions from points.
 
         Args:
@@ -107,18 +147,18 @@ class Occluders(Caster):
         Returns:
             Visibility and codes of the hiding surfaces.
         """
-        seen = np.full((len(shading_normal), len(directions)), 255, np.uint8)
-        met = np.full(seen.shape, UNMET, np.uint16)
+        visibility = np.full((len(shading_normal), len(directions)), 255, np.uint8)
+        met = np.full(visibility.shape, NO_OCCLUDER, np.uint16)
         material = self.mesh.face_label.astype(np.int64) - 1
-        codes = np.array([[*met_codes(material, normal), UNMET] for normal in (self.normal, -self.normal)])
+        codes = np.array([[*occluder_codes(material, normal), NO_OCCLUDER] for normal in (self.normal, -self.normal)])
         for row, k, face, behind in self.hidden_from(points, shading_normal, directions, report):
-            seen[row, k] = 0
+            visibility[row, k] = 0
             met[row, k] = codes[behind.astype(int), face]
-        return Sight(seen, met)
+        return Visibility(visibility, met)
 
     def hidden_from(
         self,
-        points: Points,
+        points: SurfacePoints,
         shading_normal: Vectors,
         directions: Float[np.ndarray, "k 3"],
         report: Report = lambda done, total: None,
@@ -138,7 +178,7 @@ class Occluders(Caster):
         for i in range(0, len(shading_normal), ROWS):
             report(i, len(shading_normal))
             rows = slice(i, i + ROWS)
-            row, k = np.nonzero((shading_normal[rows] @ directions.T > BELOW) & points.found[rows, None])
+            row, k = np.nonzero((shading_normal[rows] @ directions.T > BELOW) & points.valid[rows, None])
             # bend directions below the face's horizon up to it
             normal = points.face_normal[rows]
             below = np.maximum(GRAZING - normal @ directions.T, 0)[row, k]
@@ -157,45 +197,6 @@ class Occluders(Caster):
     def _rays(self, start: np.ndarray, along: np.ndarray) -> Float[np.ndarray, "n 6"]:
         """Return rays in the scene's frame; `along` keeps its length, so that distances are in units of the radius."""
         return np.hstack([(start - self.centre) / self.radius, along], dtype=np.float32, casting="same_kind")
-
-
-def sight(
-    occluders: Occluders,
-    camera: Camera,
-    pixels: Int[np.ndarray, "n 2"],
-    shading_normal: Vectors,
-    directions: int,
-    most_points: int,
-    report: Report = lambda done, total: None,
-) -> Sight | None:
-    """Compute the visibility of the directions `fibonacci_sphere(directions)` from the points under pixels.
-
-    Args:
-        occluders: Objects of the photo.
-        camera: Camera.
-        pixels: Pixels (x, y).
-        shading_normal: Unit shading normals of the pixels.
-        directions: Number of directions.
-        most_points: Greatest number of points to cast from, approximately.
-        report: Function, called now and then, of the number of cast points that are done and of their total.
-
-    Returns:
-        Visibility and codes; None if all directions are visible from all points.
-    """
-    x, y = pixels.T
-    points = occluders.points_under(camera, x, y)
-    cast = spread_subset(x, y, most_points)
-    some = Points(*(getattr(points, name)[cast] for name in points.__struct_fields__))
-    seen = occluders.seen_from(some, shading_normal[cast], fibonacci_sphere(directions), report)
-    if (seen.visibility == 255).all():
-        return None
-    if len(cast) == len(x):
-        return seen
-    # nearest cast point, in position (in units of their spacing) and in normal
-    spacing = max(float(np.median(cKDTree(some.place).query(some.place, k=2)[0][:, 1])), 1e-12)
-    places = np.column_stack([points.place / spacing, NORMAL_WEIGHT * shading_normal])
-    near = cKDTree(places[cast]).query(places)[1]
-    return Sight(seen.visibility[near], seen.met[near])
 
 
 def spread_subset(x: Int[np.ndarray, " n"], y: Int[np.ndarray, " n"], most: int) -> Int[np.ndarray, " m"]:

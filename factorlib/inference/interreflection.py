@@ -22,7 +22,7 @@ import numpy as np
 import torch
 from jaxtyping import Float
 
-from factorlib.geometry.met import BINS, UNMET
+from factorlib.geometry.occluder_codes import BINS, NO_OCCLUDER
 from factorlib.geometry.sphere import fibonacci_sphere
 from factorlib.light.visibility import cosine_weights, widest_sharpness
 from factorlib.reflection.brdf import specular
@@ -114,7 +114,7 @@ def _received_from(observations: Observations, surfaces: Float[np.ndarray, "c+1 
     od = view @ directions.T
     nh = ((nd + no) / (2 + 2 * od).clamp_min(1e-6).sqrt()).clamp(0, 1)
     highlight = specular(alpha, nd, no, nh) * (4 * math.pi / count)
-    code = np.where((hit_code == UNMET) | (hit_code >= unknown), unknown, hit_code).astype(np.int64)
+    code = np.where((hit_code == NO_OCCLUDER) | (hit_code >= unknown), unknown, hit_code).astype(np.int64)
     by_channel = [torch.from_numpy(surfaces[:, c]).float()[torch.from_numpy(code)] for c in range(3)]
     weights = [hidden * reflectance for reflectance in (cosine_weights(normal, directions), highlight)]
     return np.column_stack([(weight * sent).sum(1).double().numpy() for weight in weights for sent in by_channel])

@@ -18,9 +18,9 @@ from factorlib.geometry.sphere import fibonacci_sphere, mirror_cells
 from factorlib.inference.blocks import Block, Noise
 from factorlib.inference.interreflection import bounced_light
 from factorlib.inference.problem import Spread
-from factorlib.urm.geometry import on_surface
 from factorlib.urm.merge import merge
 from factorlib.urm.observations import Observations, read_observations
+from factorlib.urm.surface_maps import with_surface_normals
 
 Rotations = Mapping[str, Float[np.ndarray, "3 3"]]  # world_from_camera, by the name of a photo
 
@@ -61,7 +61,7 @@ def gather_observations(
 
     def merged(path: Path) -> PhotoObservations:
         """Return the usable observations of one file, merged."""
-        read = on_surface(read_observations(path), surface)
+        read = with_surface_normals(read_observations(path), surface)
         usable = usable_observations(read)
         tick()
         return PhotoObservations(merge(usable, degrees), len(read), len(read) - len(usable))

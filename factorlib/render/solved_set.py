@@ -10,7 +10,7 @@ from factorlib.conventions import YUP_FROM_CAMERA
 from factorlib.dataset.schema import GroundSlice, LightSlice, MeshEntry, ObjectEntry, ObjectsSlice
 from factorlib.errors import InputError, did_you_mean
 from factorlib.export.scene import ALL_BOUNCES, DIRECT
-from factorlib.generate.shapes import sphere
+from factorlib.generate.solids import sphere
 from factorlib.images.exr import read_exr
 from factorlib.images.light_map import read_light_map
 from factorlib.images.tone import shown, straightened

@@ -25,8 +25,8 @@ from factorlib.report.artifacts import Artifacts, Channels, Picture
 from factorlib.results.lobes import read_lobes
 from factorlib.results.materials import Reflectance
 from factorlib.results.metrics import PhotoErrors, ScoredLight
-from factorlib.urm.geometry import on_surface
 from factorlib.urm.observations import Observations, read_observations
+from factorlib.urm.surface_maps import with_surface_normals
 
 FIRST_SAMPLES = 64  # samples per pixel of the first screen's pictures, which take some seconds
 AMPLIFICATION = 4  # factor on the difference between photo and re-synthesis
@@ -358,7 +358,7 @@ def reflectance_maps(run: Artifacts, photo: str, exposure: float) -> list[Cell]:
     """
     cells = []
     observations = run.read(read_observations, "urm", f"{photo}.parquet")
-    observations = observations and on_surface(observations, run.folders.get("surface"))
+    observations = observations and with_surface_normals(observations, run.folders.get("surface"))
     for index, name in enumerate(run.set.materials):
         channels = run.exr("render", f"reflectance_maps/{photo}/{name}")
         seen = observations and observations.take(observations.material == index)

@@ -25,7 +25,7 @@ from factorlib.geometry import open3d as o3d
 from factorlib.geometry.camera import Pose
 from factorlib.geometry.raster import unit
 from factorlib.geometry.sphere import fibonacci_sphere
-from factorlib.geometry.visibility import LIFT, Occluders, Points
+from factorlib.geometry.visibility import LIFT, Occluders, SurfacePoints
 from factorlib.light.lobes import Lobes
 from factorlib.meshes.fine import subdivided
 from factorlib.meshes.mesh import Mesh, area_vectors
@@ -242,12 +242,12 @@ def _sight(mesh: Mesh, sides: Mesh) -> dict[str, Any]:
     outward = np.zeros_like(sides.vertices)
     np.add.at(outward, sides.faces.T, area_vectors(sides.vertices, sides.faces))
     outward = unit(outward * np.where(np.sum(outward * sides.normals, 1, keepdims=True) < 0, -1, 1))
-    points = Points(sides.vertices + LIFT * mesh.radius * outward, outward, np.ones(len(outward), bool))
+    points = SurfacePoints(sides.vertices + LIFT * mesh.radius * outward, outward, np.ones(len(outward), bool))
     pairs = []
     for vertex, k, face, turned in occluders.hidden_from(points, sides.normals, directions):
         met = mesh.faces[face, 0].astype(np.int64)
         # a hit on the back of a triangle is on the mesh's other side, or inside a closed mesh, which is black
-        behind = np.sum(occluders.turned(face, turned) * mesh.normals[met], 1) < 0
+        behind = np.sum(occluders.hit_normals(face, turned) * mesh.normals[met], 1) < 0
         met = np.where((face < 0) | behind & (not mesh.open), len(outward), met + np.where(behind, single, 0))
         pairs.append(np.stack([vertex, k, met])[:, np.sum(sides.normals[vertex] * directions[k], 1) > 0])
     vertex, k, met = np.concatenate(pairs, axis=1)

@@ -46,7 +46,7 @@ class RunnerUp(PoseEntry, frozen=True):
 
 
 class ObjectEntry(PoseEntry, frozen=True):
-    """An object's pose and its measures of confidence (`factorlib.align.trust`); None for what was not measured.
+    """An object's pose and its measures of confidence (`factorlib.align.reliability`); None for what was not measured.
 
     Attributes:
         scale: factors on the mesh's axes

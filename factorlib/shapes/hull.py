@@ -20,13 +20,13 @@ from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
 from factorlib.align.silhouette import Silhouette, labelled_iou
-from factorlib.align.target import extent_of, target_of
+from factorlib.align.target import bounding_box, make_target
 from factorlib.errors import InputError
 from factorlib.geometry.raster import Caster, rasterise
 from factorlib.meshes.mesh import area_vectors
 from factorlib.shapes.outline import FREE, Outline, Triangles
 
-FIRST = 32  # cells of the longest side of the first grid, which locates the body
+COARSE_CELLS = 32  # cells of the longest side of the first grid, which locates the body
 LEAST_SHARE = 0.02  # share of the largest piece's faces: smaller pieces are removed
 SMOOTHINGS = (10, 40, 160, 640)  # rounds of smoothing; the most that keep the outlines are taken
 SMOOTHED_AWAY = 0.004  # overlap (IoU) that smoothing may cost
@@ -56,116 +56,133 @@ def visual_hull(
     if len(outlines) < 2:
         fault = f"{'only one photo' if outlines else 'no photo'} with a known camera shows it"
         cure = (
-            "a hull needs two at least, better ten: `cameras: {sfm: true}` finds them where photos overlap, or use "
-            "lathe or primitive"
+            "a hull needs at least two such photos, better ten: estimate cameras with `cameras: {sfm: true}` where "
+            "photos overlap, or use lathe or primitive"
         )
         raise InputError(fault, cure=cure)
-    middle, radius = _about(outlines)
+    middle, radius = _bounding_ball(outlines)
     low = middle - radius
     high = middle + radius
     # sample f on a coarse grid to locate the body, then on a fine one about it
-    for count in (FIRST, cells):
+    for count in (COARSE_CELLS, cells):
         step = float((high - low).max()) / count
         shape = np.ceil((high - low) / step).astype(int) + 3
         origin = (low + high) / 2 - step * (shape - 1) / 2
-        field = _sampled(outlines, origin, step, shape, report)
-        least = -step if count == FIRST != cells else 0  # the coarse grid also keeps parts thinner than a cell
+        field = _sample(outlines, origin, step, shape, report)
+        least = -step if count == COARSE_CELLS != cells else 0  # the coarse grid also keeps parts thinner than a cell
         inside = np.argwhere(field > least)
         if not len(inside):
             cure = (
-                "are masks and cameras of the same photos, and does each photo show the whole object or say by 255 "
-                "what hides it?"
+                "check that masks and cameras belong to the same photos; give pixels of whatever hides the object the "
+                "label 255"
             )
             raise InputError("no body fits into the outlines of all photos", cure=cure)
         low = origin + step * (inside.min(axis=0) - 1)
         high = origin + step * (inside.max(axis=0) + 1)
-    vertices, faces = surface_nets(unambiguous(np.pad(field, 1, constant_values=-step)))
-    vertices, faces = _largest(vertices, faces)
+    body = _smooth_mesh(field, origin, step, outlines)
+    return msgspec.structs.replace(body, part=_vote_parts(body.vertices, body.faces, outlines, parts))
+
+
+def _smooth_mesh(
+    field: Float[np.ndarray, "x y z"], origin: Float[np.ndarray, "3"], step: float, outlines: Sequence[Outline]
+) -> Triangles:
+    """Mesh the surface f = 0 of a sampled field and smooth it in stages; take the last stage that keeps the overlap.
+
+    Args:
+        field: Samples of f.
+        origin: Place of the first sample.
+        step: Distance of samples.
+        outlines: Outlines, all with poses.
+
+    Returns:
+        The mesh with its overlap.
+    """
+    vertices, faces = surface_nets(fill_ambiguous(np.pad(field, 1, constant_values=-step)))
+    vertices, faces = _remove_small_pieces(vertices, faces)
     mesh = trimesh.Trimesh(origin + step * (vertices - 1), faces, process=False)
     smoothed = []
-    # smooth in stages; take the last stage that keeps the overlap
     for more in np.diff(SMOOTHINGS, prepend=0):
         trimesh.smoothing.filter_taubin(mesh, iterations=int(more))
         body = Triangles(np.array(mesh.vertices), faces)
         smoothed.append(msgspec.structs.replace(body, overlap=overlap(body, outlines)))
-    body = [each for each in smoothed if each.overlap >= smoothed[0].overlap - SMOOTHED_AWAY][-1]
-    return msgspec.structs.replace(body, part=_parts_of(body.vertices, faces, outlines, parts))
+    return [each for each in smoothed if each.overlap >= smoothed[0].overlap - SMOOTHED_AWAY][-1]
 
 
 def overlap(shape: Triangles, outlines: Sequence[Outline]) -> float:
     """Return the mean IoU of a shape with the outlines; all must have poses."""
     caster = Caster(shape.as_mesh())
     overlaps = []
-    for one in outlines:
-        target = target_of(one.silhouette, (1,), 200)
+    for outline in outlines:
+        target = make_target(outline.view, (1,), 200)
         whole = Silhouette(np.where(target.silhouette.label > 0, 1, target.silhouette.label))
-        overlaps.append(labelled_iou(whole, rasterise(caster, target.camera(one.camera), one.known_pose).label))
+        maps = rasterise(caster, target.window(outline.camera.focal), outline.known_pose)
+        overlaps.append(labelled_iou(whole, maps.label))
     return float(np.mean(overlaps))
 
 
-def agreement(outlines: Sequence[Outline]) -> float:
+def hull_overlap(outlines: Sequence[Outline]) -> float:
     """Return the overlap of a coarse hull with its outlines, 0 if nothing fits.
 
     It is high if the cameras move with the objects that the outlines show.
     """
     try:
-        return visual_hull(outlines, FIRST).overlap
+        return visual_hull(outlines, COARSE_CELLS).overlap
     except InputError:
         return 0.0
 
 
-def _about(outlines: Sequence[Outline]) -> tuple[Float[np.ndarray, "3"], float]:
+def _bounding_ball(outlines: Sequence[Outline]) -> tuple[Float[np.ndarray, "3"], float]:
     """Return the point nearest to the rays through the outlines' centres, and a radius about it.
 
     The radius is the least extent of an outline, projected back to that point.
     """
     left = np.zeros((3, 3))
     right = np.zeros(3)
-    places = []
+    rays = []
     for outline in outlines:
         rotation = outline.known_pose.rotation
-        centre = -outline.known_pose.rotation.T @ outline.known_pose.translation
+        centre = -rotation.T @ outline.known_pose.translation
         ray = rotation.T @ outline.camera.rays_through(outline.middle[None])[0]
         ray /= np.linalg.norm(ray)
         # normal equations of the point nearest to all rays: Σ (I − d dᵀ)(x − c) = 0
         across = np.eye(3) - np.outer(ray, ray)
         left = left + across
         right = right + across @ centre
-        places.append((centre, ray))
+        rays.append((centre, ray))
     if np.linalg.cond(left) > 1e8:
-        cure = "a hull needs photos from different sides"
+        cure = "add photos from other sides: a hull needs them"
         raise InputError("all photos see it from the same side", cure=cure)
     middle = np.linalg.solve(left, right)
     radii = []
-    for outline, (centre, ray) in zip(outlines, places, strict=True):
+    for outline, (centre, ray) in zip(outlines, rays, strict=True):
         depth = float((middle - centre) @ ray)
         if depth <= 0:
-            cure = "are its masks and cameras of the same photos?"
-            raise InputError(f"what the photos look at lies behind the camera of '{outline.photo}'", cure=cure)
-        radii.append(depth * extent_of(outline.silhouette)[2] / outline.camera.focal)
+            cure = "check that its mask and its camera belong to the same photo"
+            raise InputError(f"the object lies behind the camera of photo '{outline.photo}'", cure=cure)
+        radii.append(depth * bounding_box(outline.view.silhouette)[2] / outline.camera.focal)
     return middle, min(radii)
 
 
-def inside_all(outlines: Sequence[Outline], points: Points) -> Float[np.ndarray, " n"]:
+def signed_distance(outlines: Sequence[Outline], points: Points) -> Float[np.ndarray, " n"]:
     """Return f at points of the object's frame, in its units; points behind a camera are outside."""
     least = np.full(len(points), np.inf)
     for outline in outlines:
-        seen = outline.known_pose.apply(points)
-        depth = np.maximum(seen[:, 2], LEAST_Z)
-        inner = outline.inner(outline.camera.project(np.column_stack([seen[:, :2], depth])))
+        x, y, z = outline.known_pose.apply(points).T
+        depth = np.maximum(z, LEAST_Z)
+        inner = outline.inner(outline.camera.project(np.column_stack([x, y, depth])))
         inner = np.minimum(inner, FREE) * depth / outline.camera.focal
-        least = np.minimum(least, np.where(seen[:, 2] > LEAST_Z, inner, -1.0))
+        least = np.minimum(least, np.where(z > LEAST_Z, inner, -1.0))
     return least
 
 
-def _sampled(
+def _sample(
     outlines: Sequence[Outline], origin: np.ndarray, step: float, shape: np.ndarray, report: Callable[[float], None]
 ) -> Float[np.ndarray, "x y z"]:
     """Sample f on a grid."""
     field = np.empty(int(np.prod(shape)))
     for start in range(0, len(field), SLAB):
         index = np.stack(np.unravel_index(np.arange(start, min(start + SLAB, len(field))), shape), axis=-1)
-        field[start : start + SLAB] = inside_all(outlines, origin + step * index)
+        field[start : start + SLAB] = signed_distance(outlines, origin + step * index)
         report(start / len(field))
     return field.reshape(shape)
 
@@ -186,32 +203,33 @@ def surface_nets(field: Float[np.ndarray, "x y z"]) -> tuple[Points, Int[np.ndar
         first = tuple(slice(0, -1) if k == axis else slice(None) for k in range(3))
         second = tuple(slice(1, None) if k == axis else slice(None) for k in range(3))
         crossed = np.argwhere(inside[first] != inside[second])
-        a, b = field[first][tuple(crossed.T)], field[second][tuple(crossed.T)]
+        a = field[first][tuple(crossed.T)]
+        b = field[second][tuple(crossed.T)]
         # crossing of each edge, by linear interpolation; each of the four cells about the edge averages its crossings
-        place = crossed.astype(float)
-        place[:, axis] += a / (a - b)
+        crossing = crossed.astype(float)
+        crossing[:, axis] += a / (a - b)
         around = []
         for down in ((0, 0), (1, 0), (1, 1), (0, 1)):
             cell = crossed.copy()
             cell[:, other] -= down
-            held = ((cell >= 0) & (cell < cells)).all(axis=1)
-            np.add.at(total, tuple(cell[held].T), place[held])
-            np.add.at(count, tuple(cell[held].T), 1)
-            around.append(np.where(held, np.ravel_multi_index(np.clip(cell, 0, cells - 1).T, cells), -1))
+            valid = ((cell >= 0) & (cell < cells)).all(axis=1)
+            np.add.at(total, tuple(cell[valid].T), crossing[valid])
+            np.add.at(count, tuple(cell[valid].T), 1)
+            around.append(np.where(valid, np.ravel_multi_index(np.clip(cell, 0, cells - 1).T, cells), -1))
         corner = np.stack(around, axis=1)
         # orient the quads; for axis y the other axes are x, z, which are left-handed
-        turned = (a > 0) == (axis == 1)
-        corner = np.where(turned[:, None], corner[:, ::-1], corner)
+        reversed_ = (a > 0) == (axis == 1)
+        corner = np.where(reversed_[:, None], corner[:, ::-1], corner)
         quads.append(corner[(corner >= 0).all(axis=1)])
     quad = np.concatenate(quads)
     used, index = np.unique(quad, return_inverse=True)
     quad = index.reshape(-1, 4)
-    at = tuple(np.array(np.unravel_index(used, cells)))
-    vertices = total[at] / count[at][:, None]
+    used_cells = np.unravel_index(used, cells)
+    vertices = total[used_cells] / count[used_cells][:, None]
     return vertices, np.concatenate([quad[:, [0, 1, 2]], quad[:, [0, 2, 3]]])
 
 
-def unambiguous(field: Float[np.ndarray, "x y z"]) -> Float[np.ndarray, "x y z"]:
+def fill_ambiguous(field: Float[np.ndarray, "x y z"]) -> Float[np.ndarray, "x y z"]:
     """Fill grid points so that no edge of the net has four faces.
 
     That happens where two opposite corners of a square are inside and the other two outside.
@@ -221,17 +239,20 @@ def unambiguous(field: Float[np.ndarray, "x y z"]) -> Float[np.ndarray, "x y z"]
     while True:
         filled = False
         for axis in range(3):
-            of = np.moveaxis(field, axis, 0)
-            inside = of > 0
+            slices = np.moveaxis(field, axis, 0)
+            inside = slices > 0
+            # corners of each square, in order
             a, b, c, d = inside[:, :-1, :-1], inside[:, 1:, :-1], inside[:, 1:, 1:], inside[:, :-1, 1:]
-            of[:, 1:, :-1][a & c & ~b & ~d] = least
-            of[:, :-1, :-1][b & d & ~a & ~c] = least
-            filled |= bool(((a & c & ~b & ~d) | (b & d & ~a & ~c)).any())
+            first_diagonal = a & c & ~b & ~d
+            second_diagonal = b & d & ~a & ~c
+            slices[:, 1:, :-1][first_diagonal] = least
+            slices[:, :-1, :-1][second_diagonal] = least
+            filled |= bool((first_diagonal | second_diagonal).any())
         if not filled:
             return field
 
 
-def _largest(vertices: Points, faces: Int[np.ndarray, "f 3"]) -> tuple[Points, Int[np.ndarray, "f 3"]]:
+def _remove_small_pieces(vertices: Points, faces: Int[np.ndarray, "f 3"]) -> tuple[Points, Int[np.ndarray, "f 3"]]:
     """Remove small pieces beside the largest one."""
     edges = np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]]])
     graph = coo_array((np.ones(len(edges)), edges.T), shape=(len(vertices), len(vertices)))
@@ -241,7 +262,7 @@ def _largest(vertices: Points, faces: Int[np.ndarray, "f 3"]) -> tuple[Points, I
     return vertices[used], index.reshape(-1, 3)
 
 
-def _parts_of(
+def _vote_parts(
     vertices: Points, faces: Int[np.ndarray, "f 3"], outlines: Sequence[Outline], parts: int
 ) -> Int[np.ndarray, " f"]:
     """Return the part of each face, by majority among the photos that see it.
@@ -255,17 +276,17 @@ def _parts_of(
         centre = vertices[faces].mean(axis=1)
         for outline in outlines:
             hits = caster.cast(outline.camera, outline.known_pose)
-            seen = outline.known_pose.apply(centre)
-            facing = np.einsum("nd,nd->n", area @ outline.known_pose.rotation.T, seen) < 0
+            point = outline.known_pose.apply(centre)
+            facing = np.einsum("nd,nd->n", area @ outline.known_pose.rotation.T, point) < 0
             # faces toward the camera that lie on the first surface hit, within their own size
-            x, y = np.floor(outline.camera.project(np.where(seen[:, 2:] > LEAST_Z, seen, 1.0))).astype(int).T
+            x, y = np.floor(outline.camera.project(np.where(point[:, 2:] > LEAST_Z, point, 1.0))).astype(int).T
             height, width = outline.part.shape
-            near = np.flatnonzero(facing & (seen[:, 2] > LEAST_Z) & (x >= 0) & (x < width) & (y >= 0) & (y < height))
+            near = np.flatnonzero(facing & (point[:, 2] > LEAST_Z) & (x >= 0) & (x < width) & (y >= 0) & (y < height))
             pixel = y[near], x[near]
             reach = 2 * np.sqrt(np.linalg.norm(area[near], axis=1))
-            there = (np.abs(hits.depth[pixel] - seen[near, 2]) <= reach) & (outline.part[pixel] > 0)
-            np.add.at(votes, (near[there], outline.part[pixel][there] - 1), 1)
-        told = votes.any(axis=1)
-        if told.any():
-            votes[~told] = votes[told][cKDTree(centre[told]).query(centre[~told])[1]]
+            visible = (np.abs(hits.depth[pixel] - point[near, 2]) <= reach) & (outline.part[pixel] > 0)
+            np.add.at(votes, (near[visible], outline.part[pixel][visible] - 1), 1)
+        has_votes = votes.any(axis=1)
+        if has_votes.any():
+            votes[~has_votes] = votes[has_votes][cKDTree(centre[has_votes]).query(centre[~has_votes])[1]]
     return votes.argmax(axis=1)

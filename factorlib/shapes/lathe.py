@@ -23,10 +23,9 @@ from scipy.interpolate import UnivariateSpline
 from scipy.ndimage import binary_fill_holes
 from scipy.optimize import minimize
 
-from factorlib.align.refine import FocalPrior
-from factorlib.align.search import Search, find, found_near
-from factorlib.align.state import state_of
-from factorlib.align.target import target_of
+from factorlib.align.search import SearchOptions, estimate_pose, refine_near
+from factorlib.align.state import pose_state
+from factorlib.align.target import make_target
 from factorlib.errors import InputError
 from factorlib.geometry.camera import Camera, Pose
 from factorlib.geometry.raster import Caster
@@ -50,20 +49,34 @@ MASK_ERROR = 0.2  # error of a mask's contour, pixels
 ROUNDS = 2  # number of alternations of carving and fitting poses
 COLUMNS = 96  # number of the mesh's vertices about the axis
 RIM = 0.02  # share of the largest radius: thinner ends are cut off
-SEARCH = Search(views=200, keep=(24, 8, 4, 2))
+SEARCH = SearchOptions(views=200, keep=(24, 8, 4, 2))
 log = logging.getLogger("factorlib.shapes")
 
 Profile = Float[np.ndarray, "n 2"]  # (height, radius), by ascending height
+NO_PROFILE = np.zeros((0, 2))
 
 
-class Turned(msgspec.Struct, frozen=True):
+class BodyView(msgspec.Struct, frozen=True):
     """Body of revolution in a photo: profile, cam_from_body, camera of its fit, and overlap (IoU) with the outline."""
 
     profile: Profile
     pose: Pose
     camera: Camera
-    overlap: float
+    overlap: float = 0.0
     tilt_deg: float = 0.0
+
+
+class TiltTrial(msgspec.Struct, frozen=True):
+    """Body that one outline gives at one tilt, and its poses in all judging photos."""
+
+    outline: Outline
+    body: BodyView
+    poses: list[BodyView]
+
+    @property
+    def overlap(self) -> float:
+        """Mean IoU over the judging photos."""
+        return float(np.mean([pose.overlap for pose in self.poses]))
 
 
 def body_of_revolution(outlines: Sequence[Outline], report: Callable[[float], None] = lambda share: None) -> Triangles:
@@ -79,134 +92,126 @@ def body_of_revolution(outlines: Sequence[Outline], report: Callable[[float], No
     Raises:
         InputError: If no photo shows the object completely enough to determine its axis.
     """
-    outlines = sorted(map(_without_holes, outlines), key=lambda one: -int((one.part > 0).sum()))
-    given = [Turned(np.zeros((0, 2)), one.pose, one.camera, 0.0) for one in outlines if one.pose is not None]
-    if given:
-        known = [one for one in outlines if one.pose is not None]
-        shape = mesh_of(carved_by_all(known, given, _span(known, given)))
-        return msgspec.structs.replace(shape, overlap=overlap(shape, known))
-    begun = []
-    for one in outlines[:REFERENCES]:
-        turned = sorted(tilted(one), key=lambda each: -each.overlap)
-        if turned:
-            good = [each for each in turned if each.overlap >= turned[0].overlap - AS_GOOD]
-            begun.append((one, _spread(good)))
-    if not begun:
+    outlines = sorted(map(_without_holes, outlines), key=lambda outline: -int((outline.part > 0).sum()))
+    if posed := [outline for outline in outlines if outline.pose is not None]:
+        poses = [BodyView(NO_PROFILE, outline.known_pose, outline.camera) for outline in posed]
+        shape = mesh_of_profile(carve(posed, poses, _axis_range(posed, poses)))
+        return msgspec.structs.replace(shape, overlap=overlap(shape, posed))
+    starts = [(outline, bodies) for outline in outlines[:REFERENCES] if (bodies := _plausible_bodies(outline))]
+    if not starts:
         cure = (
-            "does a photo show the whole outline, from the side, cut by nothing? Leave out by 255 what is in front of "
-            "it"
+            "add a photo that shows the whole outline from the side; give pixels of whatever hides the object the "
+            "label 255"
         )
         raise InputError("no outline is mirrored onto itself, as that of a body of revolution is", cure=cure)
     if len(outlines) == 1:
-        one, turned = begun[0]
         log.warning(
-            "%s: one outline does not say how the axis is tilted: the strongest tilt that explains it is taken; "
-            "a second photo from another height says it",
-            one.photo,
+            "%s: one outline does not determine the tilt of the axis: the strongest tilt that explains it is taken; "
+            "add a second photo from another height",
+            outlines[0].photo,
         )
-        best = max(turned, key=lambda each: abs(each.tilt_deg))
-        return msgspec.structs.replace(mesh_of(best.profile).of_size(1.0), overlap=best.overlap)
-    poses = _tilt_chosen(begun, outlines[:JUDGES], report)
+        best = max(starts[0][1], key=lambda body: abs(body.tilt_deg))
+        return msgspec.structs.replace(mesh_of_profile(best.profile).of_size(1.0), overlap=best.overlap)
+    poses = _choose_tilt(starts, outlines[:JUDGES], report)
     profile = poses[0].profile
-    poses += [laid_on(one, profile) for one in outlines[JUDGES:]]
+    poses += [fit_pose(outline, profile) for outline in outlines[JUDGES:]]
     for k in range(ROUNDS):
         report(0.8 + 0.2 * k / ROUNDS)
-        profile = carved_by_all(outlines, poses, (profile[0, 0], profile[-1, 0]))
-        poses = [laid_on(one, profile, pose) for one, pose in zip(outlines, poses, strict=True)]
-    shown = float(np.mean([pose.overlap for pose in poses]))
-    return msgspec.structs.replace(mesh_of(profile).of_size(1.0), overlap=shown)
+        profile = carve(outlines, poses, (profile[0, 0], profile[-1, 0]))
+        poses = [fit_pose(outline, profile, pose) for outline, pose in zip(outlines, poses, strict=True)]
+    mean_overlap = float(np.mean([pose.overlap for pose in poses]))
+    return msgspec.structs.replace(mesh_of_profile(profile).of_size(1.0), overlap=mean_overlap)
 
 
-def _without_holes(one: Outline) -> Outline:
+def _without_holes(outline: Outline) -> Outline:
     """Fill holes of the outline, such as a highlight that a mask lacks; no body of revolution has holes."""
-    return msgspec.structs.replace(one, part=np.where(binary_fill_holes(one.part) & (one.part == 0), 1, one.part))
+    filled = np.where(binary_fill_holes(outline.part) & (outline.part == 0), 1, outline.part)
+    return msgspec.structs.replace(outline, part=filled)
 
 
-class Laid(msgspec.Struct, frozen=True):
-    """Body from the outline `of` at one tilt, and its poses in all judging photos."""
-
-    of: Outline
-    begun: Turned
-    poses: list[Turned]
-
-    @property
-    def overlap(self) -> float:
-        """Mean IoU over the judging photos."""
-        return float(np.mean([pose.overlap for pose in self.poses]))
+def _plausible_bodies(outline: Outline) -> list[BodyView]:
+    """Return at most TRIED bodies that explain the outline as well as the best one, evenly over their tilts."""
+    bodies = sorted(tilted_bodies(outline), key=lambda body: -body.overlap)
+    plausible = [body for body in bodies if body.overlap >= bodies[0].overlap - AS_GOOD]
+    ordered = sorted(plausible, key=lambda body: body.tilt_deg)
+    # indices spread evenly, without repetition
+    indices = np.unique(np.linspace(0, len(ordered) - 1, TRIED).round().astype(int))
+    return [ordered[k] for k in indices] if ordered else []
 
 
-def _tilt_chosen(
-    begun: Sequence[tuple[Outline, Sequence[Turned]]], judges: Sequence[Outline], report: Callable[[float], None]
-) -> list[Turned]:
+def _choose_tilt(
+    starts: Sequence[tuple[Outline, Sequence[BodyView]]], judges: Sequence[Outline], report: Callable[[float], None]
+) -> list[BodyView]:
     """Choose the body whose tilt explains the outlines best and return its poses in the judging photos.
 
-    A warning is logged if a wide range of tilts explains the outlines alike. `begun` holds outlines and bodies of
+    A warning is logged if a wide range of tilts explains the outlines alike. `starts` holds outlines and bodies of
     different tilts that explain each.
     """
-    tried = [(one, each) for one, turned in begun for each in turned]
-    laid = []
-    for done, (one, each) in enumerate(tried):
-        report(0.7 * done / len(tried))
-        laid.append(Laid(one, each, [each if other is one else laid_on(other, each.profile) for other in judges]))
-    best = max(laid, key=lambda each: each.overlap)
-    for turn in FINER_DEG:
-        pose = best.begun.pose
-        tilt = best.begun.tilt_deg + turn
-        tilted = _at_tilt(best.of, best.begun.camera, pose.rotation[:, 0], pose.translation, tilt)
-        if tilted is not None:
+    bodies = [(outline, body) for outline, of_outline in starts for body in of_outline]
+    trials = []
+    for done, (outline, body) in enumerate(bodies):
+        report(0.7 * done / len(bodies))
+        poses = [body if judge is outline else fit_pose(judge, body.profile) for judge in judges]
+        trials.append(TiltTrial(outline, body, poses))
+    best = max(trials, key=lambda trial: trial.overlap)
+    # finer tilts about the best one, from its poses
+    for change in FINER_DEG:
+        pose = best.body.pose
+        tilt = best.body.tilt_deg + change
+        finer = _body_at_tilt(best.outline, pose.rotation[:, 0], pose.translation, tilt)
+        if finer is not None:
             near = zip(judges, best.poses, strict=True)
-            poses = [tilted if one is best.of else laid_on(one, tilted.profile, pose) for one, pose in near]
-            laid.append(Laid(best.of, tilted, poses))
-    best = max(laid, key=lambda each: each.overlap)
-    alike = [e.begun.tilt_deg for e in laid if e.of is best.of and e.overlap >= best.overlap - AS_GOOD]
+            poses = [finer if judge is best.outline else fit_pose(judge, finer.profile, start) for judge, start in near]
+            trials.append(TiltTrial(best.outline, finer, poses))
+    best = max(trials, key=lambda trial: trial.overlap)
+    alike = [
+        trial.body.tilt_deg
+        for trial in trials
+        if trial.outline is best.outline and trial.overlap >= best.overlap - AS_GOOD
+    ]
     if max(alike) - min(alike) > UNTOLD_DEG:
         log.warning(
-            "%s: tilts of the axis from %.0f to %.0f° explain the outlines alike, so its profile is not sure: a photo "
-            "from higher up, or from lower down, says it",
-            best.of.photo,
+            "%s: tilts of the axis from %.0f to %.0f° explain the outlines alike, so its profile is uncertain: add a "
+            "photo from higher up or from lower down",
+            best.outline.photo,
             min(alike),
             max(alike),
         )
     return best.poses
 
 
-def _spread(turned: Sequence[Turned]) -> list[Turned]:
-    """Select at most TRIED bodies, evenly over their tilts."""
-    ordered = sorted(turned, key=lambda each: each.tilt_deg)
-    return [ordered[k] for k in np.unique(np.linspace(0, len(ordered) - 1, TRIED).round().astype(int))]
-
-
-def tilted(one: Outline) -> Iterator[Turned]:
+def tilted_bodies(outline: Outline) -> Iterator[BodyView]:
     """Yield the largest body that fits, for each mirror plane of the outline and each tilt in it."""
-    camera = msgspec.structs.replace(one.camera, focal=one.prior.focal)
-    for normal in mirrors(one, camera):
-        ray = camera.rays_through(one.middle[None])[0]
+    for normal in mirror_planes(outline):
+        ray = outline.camera.rays_through(outline.middle[None])[0]
         ahead = ray - (ray @ normal) * normal
-        yield from filter(None, (_at_tilt(one, camera, normal, ahead, float(tilt)) for tilt in TILTS_DEG))
+        yield from filter(None, (_body_at_tilt(outline, normal, ahead, float(tilt)) for tilt in TILTS_DEG))
 
 
-def _at_tilt(
-    one: Outline, camera: Camera, normal: Float[np.ndarray, "3"], ahead: Float[np.ndarray, "3"], tilt_deg: float
-) -> Turned | None:
+def _body_at_tilt(
+    outline: Outline, normal: Float[np.ndarray, "3"], ahead: Float[np.ndarray, "3"], tilt_deg: float
+) -> BodyView | None:
     """Return the largest body about an axis through `ahead` in the plane of that normal; None if none fits."""
     ahead = ahead / np.linalg.norm(ahead)
     tilt = np.deg2rad(tilt_deg)
     axis = np.cos(tilt) * np.cross(normal, ahead) + np.sin(tilt) * ahead
     pose = Pose(np.stack([normal, axis, np.cross(normal, axis)], axis=1), ahead)
-    view = Turned(np.zeros((0, 2)), pose, camera, 0.0, tilt_deg)
-    profile = carved_by_all([one], [view], _span([one], [view]))
+    body = BodyView(NO_PROFILE, pose, outline.camera, tilt_deg=tilt_deg)
+    profile = carve([outline], [body], _axis_range([outline], [body]))
     if len(profile) < 3:
         return None
-    return msgspec.structs.replace(view, profile=profile, overlap=overlap(mesh_of(profile), [at(one, view)]))
+    posed = msgspec.structs.replace(outline, pose=pose)
+    return msgspec.structs.replace(body, profile=profile, overlap=overlap(mesh_of_profile(profile), [posed]))
 
 
-def mirrors(one: Outline, camera: Camera) -> list[Float[np.ndarray, "3"]]:
+def mirror_planes(outline: Outline) -> list[Float[np.ndarray, "3"]]:
     """Find the normals of planes through the camera that mirror the outline onto itself, best first."""
     # a random sample of the outline's rays, and a frame about their mean
-    target = target_of(one.silhouette, (1,), 200)
-    rows, columns = np.nonzero(one.part > 0)
-    some = np.random.default_rng(0).permutation(len(rows))[:3000]
-    rays = camera.rays_through(np.column_stack([columns[some], rows[some]]) + 0.5)
+    camera = outline.camera
+    target = make_target(outline.view, (1,), 200)
+    rows, columns = np.nonzero(outline.part > 0)
+    sample = np.random.default_rng(0).permutation(len(rows))[:3000]
+    rays = camera.rays_through(np.column_stack([columns[sample], rows[sample]]) + 0.5)
     rays /= np.linalg.norm(rays, axis=1, keepdims=True)
     ray = rays.mean(axis=0) / np.linalg.norm(rays.mean(axis=0))
     x = np.cross([0.0, 1.0, 0.0], ray)
@@ -225,7 +230,7 @@ def mirrors(one: Outline, camera: Camera) -> list[Float[np.ndarray, "3"]]:
         mirrored = rays - 2 * (rays @ n)[:, None] * n
         if (mirrored[:, 2] <= 0).any():
             return 1e6
-        return float(np.mean(np.minimum(one.inner(camera.project(mirrored)), 0.0) ** 2)) / target.pixel**2
+        return float(np.mean(np.minimum(outline.inner(camera.project(mirrored)), 0.0) ** 2)) / target.pixel**2
 
     # a grid over angle and offset, then Nelder–Mead from its best local minima
     angles = np.arange(MIRRORS) * np.pi / MIRRORS
@@ -234,34 +239,35 @@ def mirrors(one: Outline, camera: Camera) -> list[Float[np.ndarray, "3"]]:
     minima = [k for k in range(MIRRORS) if cost[k] <= min(cost[k - 1], cost[(k + 1) % MIRRORS])]
     starts = sorted(minima, key=lambda k: cost[k])[:4]
     options = {"xatol": 1e-4, "fatol": 1e-5}
-    found = [minimize(outside, [angles[k], least[k][1]], method="Nelder-Mead", options=options) for k in starts]
-    good = [each for each in found if each.fun <= max(MIRRORED_PX**2, 4 * min(each.fun for each in found))]
-    if not good or min(each.fun for each in good) > 4 * MIRRORED_PX**2:
+    planes = [minimize(outside, [angles[k], least[k][1]], method="Nelder-Mead", options=options) for k in starts]
+    planes.sort(key=lambda plane: plane.fun)
+    if not planes or planes[0].fun > 4 * MIRRORED_PX**2:
         return []
-    return [normal(*each.x) for each in sorted(good, key=lambda each: each.fun)[:2]]
+    return [normal(*plane.x) for plane in planes[:2] if plane.fun <= max(MIRRORED_PX**2, 4 * planes[0].fun)]
 
 
-def _span(outlines: Sequence[Outline], poses: Sequence[Turned]) -> tuple[float, float]:
+def _axis_range(outlines: Sequence[Outline], poses: Sequence[BodyView]) -> tuple[float, float]:
     """Return the range of heights on the axis in which the axis lies inside all outlines.
 
     It contains the body, because the centre of every disc lies inside the outlines.
     """
     lows: list[float] = []
     highs: list[float] = []
-    for one, view in zip(outlines, poses, strict=True):
-        distance = float(np.linalg.norm(view.pose.translation))
-        half = distance * 4 * one.silhouette.inside.sum() ** 0.5 / view.camera.focal
+    for outline, body in zip(outlines, poses, strict=True):
+        distance = float(np.linalg.norm(body.pose.translation))
+        half = distance * 4 * (outline.part > 0).sum() ** 0.5 / body.camera.focal
         heights = np.linspace(-half, half, 1001)
-        points = view.pose.apply(np.column_stack([0 * heights, heights, 0 * heights]))
+        points = body.pose.apply(np.column_stack([0 * heights, heights, 0 * heights]))
         ahead = points[:, 2] > 1e-3 * distance
-        inner = one.inner(view.camera.project(np.where(ahead[:, None], points, [0.0, 0.0, 1.0])))
-        held = heights[ahead & (inner > 0) & (inner < 1e8)]
-        if len(held):
-            lows, highs = [*lows, held.min()], [*highs, held.max()]
+        inner = outline.inner(body.camera.project(np.where(ahead[:, None], points, [0.0, 0.0, 1.0])))
+        inside = heights[ahead & (inner > 0) & (inner < 1e8)]
+        if len(inside):
+            lows.append(inside.min())
+            highs.append(inside.max())
     return (max(lows), min(highs)) if lows else (0.0, 0.0)
 
 
-def carved_by_all(outlines: Sequence[Outline], poses: Sequence[Turned], span: tuple[float, float]) -> Profile:
+def carve(outlines: Sequence[Outline], poses: Sequence[BodyView], span: tuple[float, float]) -> Profile:
     """Return the profile of the largest discs that fit into every outline, smoothed as far as pixels allow.
 
     Ends of negligible radius are cut off.
@@ -278,33 +284,34 @@ def carved_by_all(outlines: Sequence[Outline], poses: Sequence[Turned], span: tu
     if not high > low:
         return np.zeros((0, 2))
     heights = low + (np.arange(HEIGHTS) + 0.5) / HEIGHTS * (high - low)
-    radius = np.min([largest_discs(one, view, heights) for one, view in zip(outlines, poses, strict=True)], axis=0)
+    pairs = zip(outlines, poses, strict=True)
+    radius = np.min([largest_discs(outline, body, heights) for outline, body in pairs], axis=0)
     used = np.flatnonzero(radius > RIM * radius.max())
     if len(used) < 5:
         return np.zeros((0, 2))
     part = slice(used[0], used[-1] + 1)
     # smoothing spline whose residuals are those of the masks' contours
-    pixel = min(float(np.linalg.norm(view.pose.translation)) / view.camera.focal for view in poses)
+    pixel = min(float(np.linalg.norm(body.pose.translation)) / body.camera.focal for body in poses)
     spline = UnivariateSpline(heights[part], radius[part], s=len(used) / len(poses) * (MASK_ERROR * pixel) ** 2)
     return np.column_stack([heights[part], np.maximum(spline(heights[part]), RIM * radius.max())])
 
 
-def largest_discs(one: Outline, view: Turned, heights: Float[np.ndarray, " n"]) -> Float[np.ndarray, " n"]:
+def largest_discs(outline: Outline, body: BodyView, heights: Float[np.ndarray, " n"]) -> Float[np.ndarray, " n"]:
     """Return r(z) of (1) for one outline, in the body's units.
 
     Args:
-        one: The outline.
-        view: Camera and pose of the body.
+        outline: The outline.
+        body: Camera and pose of the body.
         heights: Heights z of the discs.
 
     Returns:
         A radius for each height.
     """
-    pose = view.pose
-    camera = view.camera
+    pose = body.pose
+    camera = body.camera
     distance = float(np.linalg.norm(pose.translation))
     angle = np.arange(AROUND) * 2 * np.pi / AROUND
-    most = distance * 2 * one.silhouette.inside.sum() ** 0.5 / camera.focal + 1e-9
+    most = distance * 2 * (outline.part > 0).sum() ** 0.5 / camera.focal + 1e-9
     around = np.column_stack([np.cos(angle), 0 * angle, np.sin(angle)])
     low = np.zeros(len(heights))
     high = np.full(len(heights), most)
@@ -314,26 +321,26 @@ def largest_discs(one: Outline, view: Turned, heights: Float[np.ndarray, " n"]) 
         share = np.arange(RADII + 1) / RADII
         radii = low[:, None] + share * (high - low)[:, None]
         points = centres[:, None, None] + radii[..., None, None] * around
-        seen = points @ pose.rotation.T + pose.translation
-        ahead = seen[..., 2] > 1e-3 * distance
-        pixels = camera.project(np.where(ahead[..., None], seen, [0.0, 0.0, 1.0]))
-        left = ((one.inner(pixels) < 0) | ~ahead).any(axis=-1)
-        left[:, -1] = True
-        first = left.argmax(axis=1)
+        in_camera = points @ pose.rotation.T + pose.translation
+        ahead = in_camera[..., 2] > 1e-3 * distance
+        pixels = camera.project(np.where(ahead[..., None], in_camera, [0.0, 0.0, 1.0]))
+        outside = ((outline.inner(pixels) < 0) | ~ahead).any(axis=-1)
+        outside[:, -1] = True
+        first = outside.argmax(axis=1)
         rows = np.arange(len(heights))
         low = radii[rows, np.maximum(first - 1, 0)]
         high = radii[rows, first]
     return np.where(first == 0, 0.0, low)
 
 
-def mesh_of(profile: Profile) -> Triangles:
+def mesh_of_profile(profile: Profile) -> Triangles:
     """Mesh the body of a profile, closed by a disc at each end.
 
     Raises:
         InputError: If the profile has fewer than three heights.
     """
     if len(profile) < 3:
-        cure = "are its masks and poses of the same object, and is it turned about the y of its poses?"
+        cure = "check that its masks and poses belong to one object, and that the y of its poses is its axis"
         raise InputError("no body of revolution fits into its outlines", cure=cure)
     angle = np.arange(COLUMNS) * 2 * np.pi / COLUMNS
     height = profile[::-1, :1]  # by descending height
@@ -343,28 +350,22 @@ def mesh_of(profile: Profile) -> Triangles:
     return Triangles(mesh.vertices, mesh.faces)
 
 
-def at(one: Outline, view: Turned) -> Outline:
-    """Return the outline with the camera and the pose of a body's fit."""
-    return msgspec.structs.replace(one, camera=view.camera, pose=view.pose)
-
-
-def laid_on(one: Outline, profile: Profile, near: Turned | None = None) -> Turned:
+def fit_pose(outline: Outline, profile: Profile, near: BodyView | None = None) -> BodyView:
     """Fit the pose of the body to an outline.
 
     Args:
-        one: The outline.
+        outline: The outline.
         profile: Profile of the body.
         near: Initial pose and focal length; None searches all poses.
 
     Returns:
         The body with its pose, camera and overlap.
     """
-    caster = Caster(mesh_of(profile).as_mesh())
-    camera = one.camera
-    prior = one.prior
+    caster = Caster(mesh_of_profile(profile).as_mesh())
     if near is None:
-        found = find(caster, one.silhouette, camera, prior, SEARCH)
+        estimate = estimate_pose(caster, outline.view, SEARCH)
     else:
-        known = FocalPrior(near.camera.focal, prior.sigma)
-        found = found_near(caster, one.silhouette, near.camera, state_of(near.pose, near.camera, caster), known, SEARCH)
-    return Turned(profile, found.state.pose(caster), found.state.camera(camera), found.score)
+        view = msgspec.structs.replace(outline.view, camera=near.camera)
+        estimate = refine_near(caster, view, pose_state(near.pose, near.camera, caster), SEARCH)
+    camera = estimate.state.camera(outline.camera)
+    return BodyView(profile, estimate.state.pose(caster), camera, estimate.score)

@@ -8,7 +8,7 @@ so the same photos give the same cameras.
 """
 
 import logging
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from itertools import count
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -19,12 +19,11 @@ import pycolmap
 from jaxtyping import Bool, UInt8
 from PIL import Image
 
-from factorlib.align.refine import FocalPrior
-from factorlib.align.search import UNKNOWN_FOCAL
 from factorlib.align.silhouette import UNKNOWN
+from factorlib.align.view import TYPICAL_SIGMA
 from factorlib.errors import InputError
 from factorlib.geometry.camera import Camera, Pose
-from factorlib.shapes.hull import agreement
+from factorlib.shapes.hull import hull_overlap
 from factorlib.shapes.outline import Outline
 from factorlib.wholefile import write_text
 
@@ -33,175 +32,229 @@ LEAST_POINTS = 30  # least number of points of an accepted model
 LEAST_AGREEMENT = 0.75  # least overlap (IoU) of a coarse hull with the masks, for an accepted model
 MOST_SIDE = 1600
 MOST_FEATURES = 4000
-BENT = 2.0  # least distortion that counts, pixels
+LEAST_DISTORTION = 2.0  # least distortion that counts, pixels
 SEED = 0
+DATABASE = "features.db"
 log = logging.getLogger("factorlib.shapes")
 
 
-class View(msgspec.Struct, frozen=True):
+class PhotoForMotion(msgspec.Struct, frozen=True):
     """Photo as displayed, in 8 bits of grey, with its masks and prior camera.
 
-    objects    pixels that show objects
-    left_out   pixels that are not to be used
-    camera     camera whose principal point is used
-    prior      prior of the focal length in pixels of the photo; with a sigma of 0 it is kept
+    objects       pixels that show objects
+    left_out      pixels that are not to be used
+    camera        camera at its most probable focal length
+    focal_sigma   standard deviation of the logarithm of the focal length; with 0 the focal length is kept
     """
 
     grey: UInt8[np.ndarray, "h w"]
     objects: Bool[np.ndarray, "h w"]
     left_out: Bool[np.ndarray, "h w"]
     camera: Camera
-    prior: FocalPrior
+    focal_sigma: float
 
 
-class Registered(msgspec.Struct, frozen=True):
-    """Photo registered in the model: focal length in its pixels, and cam_from_world, of unknown scale.
+class RegisteredCamera(msgspec.Struct, frozen=True):
+    """Camera of a photo in the model: focal length in its pixels, and cam_from_world, of unknown scale.
 
-    bent: focal length and k1 of `bent_lenses`, if the lens distorts
+    distortion: focal length and k1 of `distorted_lenses`, if the lens distorts
     """
 
     focal: float
     pose: Pose
-    bent: tuple[float, float] | None = None
+    distortion: tuple[float, float] | None = None
 
 
 def cameras_by_motion(
-    views: Mapping[str, View], report: Callable[[float, str], None] = lambda share, what: None
-) -> dict[str, Registered]:
+    photos: Mapping[str, PhotoForMotion], report: Callable[[float, str], None] = lambda share, step: None
+) -> dict[str, RegisteredCamera]:
     """Estimate the cameras of photos that overlap; the others are named in a warning.
 
     Args:
-        views: Photos by name.
+        photos: Photos by name.
         report: Function of the share that is done and of the current step.
 
     Returns:
-        Registered photos by name.
+        Cameras of the registered photos by name.
 
     Raises:
         InputError: If fewer than three photos are registered.
     """
     models = {}
-    for done, (where, pixels) in enumerate((("on the objects", True), ("beside them", False))):
-        kept = {name: (view.objects if pixels else ~view.objects) & ~view.left_out for name, view in views.items()}
-        models[where] = _mapped(views, kept, _half(done, where, report))
-    where, (placed, points) = max(models.items(), key=lambda item: (len(item[1][0]), item[1][1]))
-    if len(placed) < LEAST_PHOTOS:
-        found = f"cameras of {len(placed)} of {len(views)} photos are found: too few of their features match"
+    for done, (region, on_objects) in enumerate((("on the objects", True), ("beside them", False))):
+        masks = {}
+        for name, photo in photos.items():
+            masks[name] = (photo.objects if on_objects else ~photo.objects) & ~photo.left_out
+        models[region] = _map_photos(photos, masks, _half_report(done, region, report))
+    region, (cameras, points) = max(models.items(), key=lambda item: (len(item[1][0]), item[1][1]))
+    if len(cameras) < LEAST_PHOTOS:
+        fault = f"cameras of {len(cameras)} of {len(photos)} photos are found: too few of their features match"
         cure = (
             "structure from motion needs photos of one scene, each 10 to 20° from the next, with texture on the object "
-            "or around it"
+            "or around it; without, give `file`, `lathe` or `primitive` meshes"
         )
-        cure += "; without, give `file`, `lathe` or `primitive` meshes"
-        raise InputError(found, file="dataset.yaml", key="cameras.sfm", cure=cure)
-    log.info("cameras of %d of %d photos by %d points %s", len(placed), len(views), points, where)
-    if missing := [name for name in views if name not in placed]:
+        raise InputError(fault, file="dataset.yaml", key="cameras.sfm", cure=cure)
+    log.info("cameras of %d of %d photos by %d points %s", len(cameras), len(photos), points, region)
+    if missing := [name for name in photos if name not in cameras]:
         log.warning(
             "structure from motion does not place %s: nothing overlaps with them; they are aligned by masks alone",
             ", ".join(missing),
         )
-    return placed
+    return cameras
 
 
-def _half(done: int, where: str, report: Callable[[float, str], None]) -> Callable[[float, str], None]:
+def _half_report(done: int, region: str, report: Callable[[float, str], None]) -> Callable[[float, str], None]:
     """Return the report of one of two models, after `done` others."""
-    return lambda share, what: report((done + share) / 2, f"{what} {where}")
+    return lambda share, step: report((done + share) / 2, f"{step} {region}")
 
 
-def _mapped(
-    views: Mapping[str, View], kept: Mapping[str, Bool[np.ndarray, "h w"]], report: Callable[[float, str], None]
-) -> tuple[dict[str, Registered], int]:
-    """Return the largest model of features at the pixels in `kept`, and its number of points."""
+def _map_photos(
+    photos: Mapping[str, PhotoForMotion],
+    masks: Mapping[str, Bool[np.ndarray, "h w"]],
+    report: Callable[[float, str], None],
+) -> tuple[dict[str, RegisteredCamera], int]:
+    """Build the largest model of features in the masks.
+
+    Args:
+        photos: Photos by name.
+        masks: Pixels of each photo where features are sought.
+        report: Function of the share that is done and of the current step.
+
+    Returns:
+        Cameras by photo, and the number of points; none if the cameras do not move with the objects.
+    """
     pycolmap.set_random_seed(SEED)
     pycolmap.logging.minloglevel = pycolmap.logging.FATAL.value  # failures are reported below
     with TemporaryDirectory() as folder:
         root = Path(folder)
-        database = root / "features.db"
-        images = root / "images"
-        masks = root / "masks"
-        for each in (images, masks):
-            each.mkdir()
-        extraction = pycolmap.FeatureExtractionOptions(num_threads=1, use_gpu=False, max_image_size=MOST_SIDE)
-        extraction.sift.max_num_features = MOST_FEATURES
-        groups: dict[tuple, list[str]] = {}
-        for name, view in views.items():
-            Image.fromarray(view.grey).save(images / f"{name}.png")
-            Image.fromarray(kept[name].astype(np.uint8) * 255).save(masks / f"{name}.png.png")
-            groups.setdefault((view.grey.shape, view.camera.centre, view.prior), []).append(name)
-        kept_focals = set()
-        done = count()
-        # one camera for all photos of one size, principal point and focal length; COLMAP numbers them from 1
-        for number, (((height, width), centre, prior), names) in enumerate(groups.items(), start=1):
-            reader = pycolmap.ImageReaderOptions(camera_model="SIMPLE_PINHOLE", mask_path=str(masks))
-            if prior.sigma < UNKNOWN_FOCAL.sigma or centre != (width / 2, height / 2):
-                reader.camera_params = f"{prior.focal},{centre[0]},{centre[1]}"
-            if prior.sigma == 0:
-                kept_focals.add(number)
-            for name in names:
-                report(0.2 * next(done) / len(views), "features")
-                pycolmap.extract_features(
-                    database,
-                    images,
-                    [f"{name}.png"],
-                    pycolmap.CameraMode.SINGLE,
-                    reader,
-                    extraction,
-                    pycolmap.Device.cpu,
-                )
-                reader.existing_camera_id = number
-        matching = pycolmap.FeatureMatchingOptions(num_threads=1, use_gpu=False)
-        verification = pycolmap.TwoViewGeometryOptions()
-        verification.ransac.random_seed = SEED
-        files = [f"{name}.png" for names in groups.values() for name in names]
-        pairing = pycolmap.ImportedPairingOptions(match_list_path=str(root / "pairs.txt"))
-        for k, file in enumerate(files[1:], start=1):  # match it with all photos before it
-            report(0.2 + 0.4 * k**2 / len(files) ** 2, "matches")
-            write_text(root / "pairs.txt", "".join(f"{other} {file}\n" for other in files[:k]))
-            pycolmap.match_image_pairs(database, matching, pairing, verification, pycolmap.Device.cpu)
-        done = count(2)  # the first two photos are registered together
-
-        def placed_one() -> None:
-            """Report that one more photo is registered."""
-            report(0.6 + 0.3 * min(next(done) / len(files), 1.0), "cameras")
-
-        report(0.6, "cameras")
-        options = pycolmap.IncrementalPipelineOptions(
-            num_threads=1,
-            random_seed=SEED,
-            multiple_models=False,
-            min_model_size=LEAST_PHOTOS,
-            extract_colors=False,
-            ba_refine_focal_length=True,
-            ba_refine_principal_point=False,
-            constant_cameras=kept_focals,
-        )
-        options.mapper.num_threads = 1
-        options.mapper.random_seed = SEED
-        options.triangulation.random_seed = SEED
-        models = pycolmap.incremental_mapping(
-            database, images, root / "models", options, next_image_callback=placed_one
-        )
-        best = max(models.values(), key=lambda model: (model.num_reg_images(), model.num_points3D()), default=None)
-        if best is None or best.num_points3D() < LEAST_POINTS:
-            return {}, 0
-        report(0.9, "hull of the masks")
-        placed = {}
-        bent = bent_lenses(best)
-        for image in best.images.values():
-            if image.has_pose:
-                motion = image.cam_from_world()
-                pose = Pose(motion.rotation.matrix(), np.array(motion.translation))
-                focal = float(best.cameras[image.camera_id].focal_length)
-                placed[Path(image.name).stem] = Registered(focal, pose, bent.get(image.camera_id))
-    outlines = [outline_of(name, views[name], camera) for name, camera in sorted(placed.items())]
-    if (overlap := agreement([one for one in outlines if one.is_seen])) < LEAST_AGREEMENT:
-        words = "cameras by %d points do not move with the objects (hull against masks: %.2f)"
-        log.info(words, best.num_points3D(), overlap)
+        files, known_focals = _extract_features(root, photos, masks, report)
+        _match_features(root, files, report)
+        model = _reconstruct(root, len(files), known_focals, report)
+    if model is None or model.num_points3D() < LEAST_POINTS:
         return {}, 0
-    return {name: placed[name] for name in views if name in placed}, best.num_points3D()
+    report(0.9, "hull of the masks")
+    cameras = _read_cameras(model)
+    outlines = [objects_outline(name, photos[name], camera) for name, camera in sorted(cameras.items())]
+    if (overlap := hull_overlap([outline for outline in outlines if outline.is_visible])) < LEAST_AGREEMENT:
+        words = "cameras by %d points do not move with the objects (hull against masks: %.2f)"
+        log.info(words, model.num_points3D(), overlap)
+        return {}, 0
+    return {name: cameras[name] for name in photos if name in cameras}, model.num_points3D()
 
 
-def bent_lenses(model: pycolmap.Reconstruction) -> dict[int, tuple[float, float]]:
-    """Find the cameras whose lens distortion moves an observed point by more than `BENT` pixels.
+def _extract_features(
+    root: Path,
+    photos: Mapping[str, PhotoForMotion],
+    masks: Mapping[str, Bool[np.ndarray, "h w"]],
+    report: Callable[[float, str], None],
+) -> tuple[list[str], set[int]]:
+    """Extract SIFT features of all photos into COLMAP's database in `root`.
+
+    All photos of one size, principal point and focal length share a camera; COLMAP numbers the cameras from 1.
+
+    Returns:
+        Names of the images, and numbers of the cameras whose focal length is known.
+    """
+    for name in ("images", "masks"):
+        (root / name).mkdir()
+    extraction = pycolmap.FeatureExtractionOptions(num_threads=1, use_gpu=False, max_image_size=MOST_SIDE)
+    extraction.sift.max_num_features = MOST_FEATURES
+    groups: dict[tuple, list[str]] = {}
+    for name, photo in photos.items():
+        Image.fromarray(photo.grey).save(root / "images" / f"{name}.png")
+        Image.fromarray(masks[name].astype(np.uint8) * 255).save(root / "masks" / f"{name}.png.png")
+        key = photo.grey.shape, photo.camera.centre, photo.camera.focal, photo.focal_sigma
+        groups.setdefault(key, []).append(f"{name}.png")
+    known_focals = set()
+    done = count()
+    for number, (((height, width), centre, focal, sigma), files) in enumerate(groups.items(), start=1):
+        reader = pycolmap.ImageReaderOptions(camera_model="SIMPLE_PINHOLE", mask_path=str(root / "masks"))
+        if sigma < TYPICAL_SIGMA or centre != (width / 2, height / 2):
+            reader.camera_params = f"{focal},{centre[0]},{centre[1]}"
+        if sigma == 0:
+            known_focals.add(number)
+        for file in files:
+            report(0.2 * next(done) / len(photos), "features")
+            pycolmap.extract_features(
+                root / DATABASE,
+                root / "images",
+                [file],
+                pycolmap.CameraMode.SINGLE,
+                reader,
+                extraction,
+                pycolmap.Device.cpu,
+            )
+            reader.existing_camera_id = number
+    return [file for files in groups.values() for file in files], known_focals
+
+
+def _match_features(root: Path, files: Sequence[str], report: Callable[[float, str], None]) -> None:
+    """Match each image with all images before it."""
+    matching = pycolmap.FeatureMatchingOptions(num_threads=1, use_gpu=False)
+    verification = pycolmap.TwoViewGeometryOptions()
+    verification.ransac.random_seed = SEED
+    pairing = pycolmap.ImportedPairingOptions(match_list_path=str(root / "pairs.txt"))
+    for k, file in enumerate(files[1:], start=1):
+        report(0.2 + 0.4 * k**2 / len(files) ** 2, "matches")
+        write_text(root / "pairs.txt", "".join(f"{other} {file}\n" for other in files[:k]))
+        pycolmap.match_image_pairs(root / DATABASE, matching, pairing, verification, pycolmap.Device.cpu)
+
+
+def _reconstruct(
+    root: Path, images: int, known_focals: set[int], report: Callable[[float, str], None]
+) -> pycolmap.Reconstruction | None:
+    """Return the largest model of COLMAP's incremental mapping, or None.
+
+    Args:
+        root: Folder of the database and the images.
+        images: Number of images.
+        known_focals: Numbers of the cameras whose focal length is kept.
+        report: Function of the share that is done and of the current step.
+
+    Returns:
+        The model.
+    """
+    done = count(2)  # the first two photos are registered together
+
+    def report_photo() -> None:
+        """Report that one more photo is registered."""
+        report(0.6 + 0.3 * min(next(done) / images, 1.0), "cameras")
+
+    report(0.6, "cameras")
+    options = pycolmap.IncrementalPipelineOptions(
+        num_threads=1,
+        random_seed=SEED,
+        multiple_models=False,
+        min_model_size=LEAST_PHOTOS,
+        extract_colors=False,
+        ba_refine_focal_length=True,
+        ba_refine_principal_point=False,
+        constant_cameras=known_focals,
+    )
+    options.mapper.num_threads = 1
+    options.mapper.random_seed = SEED
+    options.triangulation.random_seed = SEED
+    models = pycolmap.incremental_mapping(
+        root / DATABASE, root / "images", root / "models", options, next_image_callback=report_photo
+    )
+    return max(models.values(), key=lambda model: (model.num_reg_images(), model.num_points3D()), default=None)
+
+
+def _read_cameras(model: pycolmap.Reconstruction) -> dict[str, RegisteredCamera]:
+    """Return the camera of each registered photo, by name."""
+    cameras = {}
+    distortions = distorted_lenses(model)
+    for image in model.images.values():
+        if image.has_pose:
+            motion = image.cam_from_world()
+            pose = Pose(motion.rotation.matrix(), np.array(motion.translation))
+            focal = float(model.cameras[image.camera_id].focal_length)
+            cameras[Path(image.name).stem] = RegisteredCamera(focal, pose, distortions.get(image.camera_id))
+    return cameras
+
+
+def distorted_lenses(model: pycolmap.Reconstruction) -> dict[int, tuple[float, float]]:
+    """Find the cameras whose lens distortion moves an observed point by more than `LEAST_DISTORTION` pixels.
 
     The model of pinhole cameras is left unchanged. A copy is bundle-adjusted with one radial coefficient per camera.
 
@@ -216,28 +269,28 @@ def bent_lenses(model: pycolmap.Reconstruction) -> dict[int, tuple[float, float]
     options = pycolmap.BundleAdjustmentOptions(print_summary=False, refine_principal_point=False)
     options.ceres.solver_options.num_threads = 1
     pycolmap.bundle_adjustment(free, options)
-    bent = {}
+    distortions = {}
     for image in free.images.values():
         places = np.array([point.xy for point in image.points2D if point.has_point3D()]).reshape(-1, 2)
         focal, x, y, k = free.cameras[image.camera_id].params.tolist()
         # radial distortion f |k| r³ at the largest observed radius r, with r in units of f
         radius = np.hypot(*(places - (x, y)).T).max(initial=0.0) / focal
-        if focal * abs(k) * radius**3 > BENT:
-            bent[image.camera_id] = (focal, k)
-    return bent
+        if focal * abs(k) * radius**3 > LEAST_DISTORTION:
+            distortions[image.camera_id] = (focal, k)
+    return distortions
 
 
-def outline_of(name: str, view: View, placed: Registered) -> Outline:
+def objects_outline(name: str, photo: PhotoForMotion, registered: RegisteredCamera) -> Outline:
     """Return the outline of all objects together in a registered photo.
 
     Args:
         name: Name of the photo.
-        view: The photo.
-        placed: Its estimated camera.
+        photo: The photo.
+        registered: Its estimated camera.
 
     Returns:
         The outline.
     """
-    part = np.where(view.left_out, UNKNOWN, view.objects.astype(int))
-    camera = msgspec.structs.replace(view.camera, focal=placed.focal)
-    return Outline(name, part, camera, FocalPrior(placed.focal, 0.0), placed.pose)
+    part = np.where(photo.left_out, UNKNOWN, photo.objects.astype(int))
+    camera = msgspec.structs.replace(photo.camera, focal=registered.focal)
+    return Outline(name, part, camera, pose=registered.pose)

@@ -8,9 +8,9 @@ import numpy as np
 from jaxtyping import Float, Int
 from scipy.ndimage import distance_transform_edt, map_coordinates
 
-from factorlib.align.refine import FocalPrior
 from factorlib.align.silhouette import Silhouette
-from factorlib.align.target import extent_of
+from factorlib.align.target import bounding_box
+from factorlib.align.view import ObjectView
 from factorlib.geometry.camera import Camera, Pose
 from factorlib.meshes.mesh import Mesh
 from factorlib.wholefile import write_text
@@ -21,25 +21,27 @@ FREE = 1e9  # signed distance of places that the photo does not show, pixels: fa
 class Outline(msgspec.Struct, frozen=True, dict=True):
     """Object in a photo.
 
-    part   [h, w] number of the object's part that a pixel shows, from 1; 0 background, −1 unknown
-    prior  prior of the focal length;  pose  cam_from_object, if it is known
+    part          [h, w] number of the object's part that a pixel shows, from 1; 0 background, −1 unknown
+    camera        the photo's camera at its most probable focal length
+    focal_sigma   standard deviation of the logarithm of the focal length, 0 if it is known
+    pose          cam_from_object, if it is known
     """
 
     photo: str
     part: Int[np.ndarray, "h w"]
     camera: Camera
-    prior: FocalPrior
+    focal_sigma: float = 0.0
     pose: Pose | None = None
 
     @property
-    def silhouette(self) -> Silhouette:
-        """Silhouette with the parts as labels."""
-        return Silhouette(self.part)
+    def view(self) -> ObjectView:
+        """View of the object, with its parts as labels."""
+        return ObjectView(Silhouette(self.part), self.camera, self.focal_sigma)
 
     @property
     def middle(self) -> Float[np.ndarray, "2"]:
         """Centre (x, y) of the bounding box."""
-        low, high, _ = extent_of(self.silhouette)
+        low, high, _ = bounding_box(self.view.silhouette)
         return (low + high) / 2
 
     @property
@@ -50,7 +52,7 @@ class Outline(msgspec.Struct, frozen=True, dict=True):
         return self.pose
 
     @property
-    def is_seen(self) -> bool:
+    def is_visible(self) -> bool:
         """True if the photo shows any part of the object."""
         return bool((self.part > 0).any())
 
@@ -60,7 +62,7 @@ class Outline(msgspec.Struct, frozen=True, dict=True):
         Only background counts as outside: unknown pixels are inside. A point beyond the frame is outside if the nearest
         pixel of the frame is, at the sum of both distances; otherwise the value is FREE.
         """
-        x, y = pixels[..., 0], pixels[..., 1]
+        x, y = np.moveaxis(pixels, -1, 0)
         values = map_coordinates(self._distance, np.stack([y, x]) - 0.5, order=1, mode="nearest")
         height, width = self.part.shape
         beyond = np.hypot(np.maximum(np.maximum(-x, x - width), 0), np.maximum(np.maximum(-y, y - height), 0))

@@ -12,14 +12,14 @@ import numpy as np
 import trimesh
 from jaxtyping import Float
 
-from factorlib.align.search import Search, find
-from factorlib.align.target import target_of
+from factorlib.align.search import SearchOptions, estimate_pose
+from factorlib.align.target import make_target
 from factorlib.geometry.raster import Caster
 from factorlib.shapes.outline import Outline, Triangles
-from factorlib.shapes.proportions import BOX, ROUND, Sighting, fitted
+from factorlib.shapes.proportions import BOX, ROUND, fit_proportions
 
 # initial factors of the axes
-BEGUN = {
+STARTS = {
     "box": ((1, 1, 1), (1, 0.5, 1), (1, 2, 1), (1, 0.25, 0.5), (1, 0.1, 1), (1, 0.2, 0.8)),
     "cylinder": ((1, 0.3, 1), (1, 1, 1), (1, 3, 1)),
 }
@@ -27,7 +27,7 @@ FREE_FACTORS = {"box": BOX, "cylinder": ROUND}
 PHOTOS = 6  # greatest number of photos used
 STEPS = 20  # Gauss–Newton steps of factors and poses
 RESOLUTION = 200  # pixels of the mask's longer side
-SEARCH = Search(views=150, keep=(20, 8, 4, 2))
+SEARCH = SearchOptions(views=150, keep=(20, 8, 4, 2))
 
 
 def primitive(
@@ -43,29 +43,28 @@ def primitive(
     Returns:
         The mesh with its overlap.
     """
-    outlines = sorted(outlines, key=lambda one: -int((one.part > 0).sum()))[:PHOTOS]
+    outlines = sorted(outlines, key=lambda outline: -int((outline.part > 0).sum()))[:PHOTOS]
+    targets = [make_target(outline.view, (1,), RESOLUTION) for outline in outlines]
+    starts = STARTS.get(kind, ((1, 1, 1),))
     best: tuple[float, Float[np.ndarray, "3"]] = -1.0, np.ones(3)
-    for done, begun in enumerate(starts := BEGUN.get(kind, ((1, 1, 1),))):
+    for done, start in enumerate(starts):
         report(done / len(starts))
-        mesh = unit(kind, np.array(begun, float)).as_mesh()
-        sightings = []
-        for one in outlines:
-            state = find(Caster(mesh), one.silhouette, one.camera, one.prior, SEARCH).state
-            target = target_of(one.silhouette, (1,), RESOLUTION)
-            sightings.append(Sighting(mesh, target, one.camera, one.prior, state))
-        factors, _, score = fitted(sightings, STEPS, FREE_FACTORS.get(kind, np.zeros((3, 0))))
+        mesh = unit_shape(kind, np.array(start, float)).as_mesh()
+        caster = Caster(mesh)
+        states = [estimate_pose(caster, outline.view, SEARCH).state for outline in outlines]
+        factors, score = fit_proportions(mesh, targets, states, STEPS, FREE_FACTORS.get(kind, np.zeros((3, 0))))
         if score > best[0]:
-            best = score, factors * begun
-    return msgspec.structs.replace(unit(kind, best[1]).of_size(1.0), overlap=best[0])
+            best = score, factors * start
+    return msgspec.structs.replace(unit_shape(kind, best[1]).of_size(1.0), overlap=best[0])
 
 
-def unit(kind: str, factors: Float[np.ndarray, "3"]) -> Triangles:
+def unit_shape(kind: str, factors: Float[np.ndarray, "3"]) -> Triangles:
     """Return the unit shape of a kind, with its axes scaled by `factors`."""
     if kind == "ball":
-        made = trimesh.creation.icosphere(subdivisions=5)
+        solid = trimesh.creation.icosphere(subdivisions=5)
     elif kind == "box":
-        made = trimesh.creation.box((1.0, 1.0, 1.0))
+        solid = trimesh.creation.box((1.0, 1.0, 1.0))
     else:
-        made = trimesh.creation.cylinder(radius=0.5, height=1.0, sections=128)
-        made.apply_transform(trimesh.transformations.rotation_matrix(-np.pi / 2, (1, 0, 0)))
-    return Triangles(np.asarray(made.vertices) * factors, np.asarray(made.faces))
+        solid = trimesh.creation.cylinder(radius=0.5, height=1.0, sections=128)
+        solid.apply_transform(trimesh.transformations.rotation_matrix(-np.pi / 2, (1, 0, 0)))
+    return Triangles(np.asarray(solid.vertices) * factors, np.asarray(solid.faces))

@@ -4,86 +4,69 @@
 
 The normal equations of every observation's contours (`factorlib.align.refine`) get two more unknowns, which all
 observations share. As log s_k grows, a surface point at offset a from the mesh's centre moves by R e_k e_kᵀ Rᵀ a, and
-the contour moves with it. The observations' own unknowns are eliminated (Schur complement) and follow by
+the contour moves with it. The photos' own unknowns are eliminated (Schur complement) and follow by
 back-substitution.
 """
 
 from collections.abc import Sequence
 from functools import partial
 
-import msgspec
 import numpy as np
 from jaxtyping import Float
 
-from factorlib.align.refine import DAMPING as OF_POSES
-from factorlib.align.refine import FocalPrior, normal_equations, rendered
-from factorlib.align.state import State
+from factorlib.align.refine import DAMPING, normal_equations, render
+from factorlib.align.state import PoseState
 from factorlib.align.target import Target
-from factorlib.geometry.camera import Camera
 from factorlib.geometry.raster import Caster
 from factorlib.meshes.mesh import Mesh, scaled
 
 BOX = np.array([[2, -1, -1], [0, 1, -1]]).T / np.sqrt([6.0, 2.0])  # log s = BOX · d: all factors of product 1
 ROUND = np.array([[-1, 2, -1]]).T / 6.0**0.5  # factors that keep a body of revolution about y
-OF_FACTORS = 0.1**-2.0  # damping of d, as OF_POSES is that of poses
+FACTOR_DAMPING = 0.1**-2.0  # damping of d, as DAMPING is that of poses
 LARGEST_STEP = 0.15  # greatest step of d; twice as much for other unknowns
 STILL = 1e-4  # a smaller step of d ends the iteration
 Factors = Float[np.ndarray, "3"]
 
 
-class Sighting(msgspec.Struct, frozen=True):
-    """Observation of an object in a photo: mesh as read, with its own labels, target, camera and state."""
-
-    mesh: Mesh
-    target: Target
-    camera: Camera
-    prior: FocalPrior
-    state: State
-
-
-def fitted(
-    sightings: Sequence[Sighting], steps: int, free: Float[np.ndarray, "3 k"] = BOX
-) -> tuple[Factors, list[State], float]:
+def fit_proportions(
+    mesh: Mesh, targets: Sequence[Target], states: Sequence[PoseState], steps: int, free: Float[np.ndarray, "3 k"] = BOX
+) -> tuple[Factors, float]:
     """Fit factors of product 1 and states together by Gauss–Newton, starting from the mesh as it is.
 
     Args:
-        sightings: The observations.
+        mesh: The mesh.
+        targets: Windows about the masks of the photos.
+        states: Initial state in each photo.
         steps: Greatest number of steps.
         free: Directions in which the logarithms of the factors may move.
 
     Returns:
-        Factors, states and mean score of the best step.
+        Factors and mean score of the best step.
     """
     shape = np.zeros(free.shape[1])
-    states = [one.state for one in sightings]
-    most = -np.inf
-    best = np.ones(3), states
+    best = np.ones(3), -np.inf
+    jacobian = partial(jacobian_with_shape, free=free)
     for k in range(steps + 1):
-        equations = []
-        scores = []
         factors = np.exp(free @ shape)
-        for one, state in zip(sightings, states, strict=True):
-            seen = rendered(Caster(scaled(one.mesh, tuple(factors))), one.target, one.camera, state)
-            jacobian = partial(jacobian_with_shape, free=free)
-            equations.append(normal_equations(seen, one.target, one.prior, jacobian))
-            scores.append(seen.score(one.target))
-        if (score := float(np.mean(scores))) > most:
-            best = (factors, states)
-            most = score
+        caster = Caster(scaled(mesh, tuple(factors)))
+        renderings = [render(caster, target, state) for target, state in zip(targets, states, strict=True)]
+        if (score := float(np.mean([rendering.score for rendering in renderings]))) > best[1]:
+            best = factors, score
         if k == steps:
             break
-        by_shape, moves = _joint_step(equations, [one.prior.free for one in sightings])
+        equations = [normal_equations(rendering, jacobian) for rendering in renderings]
+        by_shape, moves = _joint_step(equations, [target.view.free for target in targets])
         shape = shape + by_shape
         states = [state.moved(move) for state, move in zip(states, moves, strict=True)]
         if np.abs(by_shape).max(initial=0.0) < STILL:
             break
-    return *best, most
+    return best
 
 
 def jacobian_with_shape(
-    state: State, arms: Float[np.ndarray, "n 3"], free: Float[np.ndarray, "3 k"] = BOX
+    state: PoseState, arms: Float[np.ndarray, "n 3"], free: Float[np.ndarray, "3 k"] = BOX
 ) -> Float[np.ndarray, "n 2 m"]:
-    """Return the derivative of image points, in photo pixels, by the seven unknowns of `State.moved` and by d.
+    """Return the derivative of image points, in photo pixels, by the seven unknowns of `PoseState.moved` and by d.
 
     Args:
         state: State of the mesh.
@@ -110,17 +93,20 @@ def _joint_step(
     """Return the damped step of d and the steps of each observation, whose first `free` unknowns move."""
     count = len(equations[0][1]) - 7
     # Schur complement of the observations' own unknowns
-    shared = OF_FACTORS * np.eye(count)
+    shared = FACTOR_DAMPING * np.eye(count)
     pull = np.zeros(count)
-    own = []
+    eliminated = []
     for (information, gradient), k in zip(equations, free, strict=True):
-        matrix = information + np.diag(np.append(OF_POSES, np.zeros(count)))
+        matrix = information + np.diag(np.append(DAMPING, np.zeros(count)))
         cross = matrix[:k, 7:]
         away = np.linalg.solve(matrix[:k, :k], np.column_stack([cross, gradient[:k]]))
         shared = shared + information[7:, 7:] - cross.T @ away[:, :count]
         pull = pull + gradient[7:] - cross.T @ away[:, count]
-        own.append(away)
-    # the step of d, then the own steps by back-substitution
+        eliminated.append(away)
+    # the step of d, then the photos' own steps by back-substitution
     by_shape = np.clip(-np.linalg.solve(shared, pull), -LARGEST_STEP, LARGEST_STEP)
-    steps = [np.clip(-away[:, count] - away[:, :count] @ by_shape, -2 * LARGEST_STEP, 2 * LARGEST_STEP) for away in own]
-    return by_shape, [np.append(step, np.zeros(7 - len(step))) for step in steps]
+    moves = []
+    for away in eliminated:
+        move = np.clip(-away[:, count] - away[:, :count] @ by_shape, -2 * LARGEST_STEP, 2 * LARGEST_STEP)
+        moves.append(np.append(move, np.zeros(7 - len(move))))
+    return by_shape, moves

@@ -19,7 +19,7 @@ Channels = Mapping[str, Float[np.ndarray, "h w"]]
 GRAZING = 0.05  # least n·o: beyond 87° neither the normal nor the pixel's footprint is reliable
 
 
-class Taken(msgspec.Struct, frozen=True):
+class PhotoSource(msgspec.Struct, frozen=True):
     """Name of a photo, its illumination, and its exposure from EXIF.
 
     The exposure is t·S/N² (time, ISO speed, f-number), None if it is unknown.
@@ -47,50 +47,48 @@ def observed_pixels(photo: Channels, geometry: Channels, least_confidence: float
     return labelled & agrees & facing & (photo["valid"] > 0.5) & (geometry["confidence"] > least_confidence)
 
 
-def observations_of_photo(
-    photo: Channels, geometry: Channels, taken: Taken, materials: Sequence[str], least_confidence: float = 0.0
+def extract_observations(
+    photo: Channels, geometry: Channels, source: PhotoSource, materials: Sequence[str], least_confidence: float = 0.0
 ) -> Observations:
     """Extract one observation per observed pixel, in row order.
-
-    `weight` and `confidence` are the confidence of the pixel's normal, from 0 to 1.
 
     Args:
         photo: Channels R, G, B, label, valid, clipped.R/G/B of the stage `masks`.
         geometry: Channels normal.x/y/z, view.x/y/z, depth, label, confidence of the stage `align`.
-        taken: Name, illumination and exposure of the photo.
+        source: Name, illumination and exposure of the photo.
         materials: Names of all materials, in the order of their labels.
         least_confidence: Pixels whose normals are less certain are excluded; from 0 to 1.
 
     Returns:
-        The observations.
+        The observations; `weight` and `confidence` are the confidence of the pixel's normal, from 0 to 1.
     """
-    seen = observed_pixels(photo, geometry, least_confidence)
-    y, x = np.nonzero(seen)
-    none = np.zeros(len(x), "i4")
-    sure = geometry["confidence"][seen]
+    pixels = observed_pixels(photo, geometry, least_confidence)
+    y, x = np.nonzero(pixels)
+    zero = np.zeros(len(x), "i4")
+    sure = geometry["confidence"][pixels]
 
     def gather(channels: Channels, names: Iterable[str]) -> np.ndarray:
         """Stack the named channels at the observed pixels."""
-        return np.stack([channels[n][seen] for n in names], axis=-1)
+        return np.stack([channels[n][pixels] for n in names], axis=-1)
 
     normal, view = (gather(geometry, [f"{name}.{axis}" for axis in "xyz"]) for name in ("normal", "view"))
     normal, view = (v / np.maximum(np.linalg.norm(v, axis=-1, keepdims=True), 1e-12) for v in (normal, view))
-    place = relative_positions(view, geometry["depth"][seen].astype(float), sure)
+    place = relative_positions(view, geometry["depth"][pixels].astype(float), sure)
     return Observations(
         normal,
         view,
         np.maximum(gather(photo, "RGB"), 0.0),
         gather(photo, [f"clipped.{c}" for c in "RGB"]) > 0.5,
-        material=np.rint(photo["label"][seen]).astype("i2") - 1,
-        photo=none,
-        illumination=none,
+        material=np.rint(photo["label"][pixels]).astype("i2") - 1,
+        photo=zero,
+        illumination=zero,
         x=x.astype("i4"),
         y=y.astype("i4"),
         weight=sure,
         confidence=sure,
         place=place.astype("f4"),
         materials=tuple(materials),
-        photos=(taken.photo,),
-        illuminations=(taken.illumination,),
-        exposures=(taken.exposure,),
+        photos=(source.photo,),
+        illuminations=(source.illumination,),
+        exposures=(source.exposure,),
     )

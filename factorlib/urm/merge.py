@@ -29,28 +29,27 @@ def merge(observations: Observations, degrees: float) -> Observations:
 
     `x`, `y` and `met` become those of the group's first pixel.
     """
-    seen = observations
-    if degrees <= 0 or len(seen) == 0:
-        return seen
+    if degrees <= 0 or len(observations) == 0:
+        return observations
     cell = np.radians(degrees)
-    mirror = mirror_directions(seen.normal, seen.view)
-    flags = seen.clipped @ np.array([1, 2, 4])
-    cells = [direction_cells(seen.normal, cell), direction_cells(mirror, 2 * cell)]
-    if seen.detail is not None:
-        cells.append(np.rint(np.log(np.maximum(seen.detail, 1e-3)) / DETAIL_CELL).astype(np.int64)[:, None])
-    if (visibility := seen.visibility) is not None:  # mean of hidden × direction
+    mirror = mirror_directions(observations.normal, observations.view)
+    flags = observations.clipped @ np.array([1, 2, 4])
+    cells = [direction_cells(observations.normal, cell), direction_cells(mirror, 2 * cell)]
+    if observations.detail is not None:
+        cells.append(np.rint(np.log(np.maximum(observations.detail, 1e-3)) / DETAIL_CELL).astype(np.int64)[:, None])
+    if (visibility := observations.visibility) is not None:  # mean of hidden × direction
         directions = fibonacci_sphere(visibility.shape[1]).astype("f4") / visibility.shape[1]
         chunks = (visibility[i : i + ROWS] for i in range(0, len(visibility), ROWS))
         hidden = [(255 - chunk).astype("f4") / 255 @ directions for chunk in chunks]
         cells.append(np.rint(np.vstack(hidden) / HIDDEN_CELL).astype(np.int64))
-    first, group = groups(np.column_stack([seen.photo, seen.material, flags, *cells]))
+    first, group = groups(np.column_stack([observations.photo, observations.material, flags, *cells]))
     # weighted mean of each column over each group
-    weight = np.maximum(seen.weight.astype(float), 1e-12)
+    weight = np.maximum(observations.weight.astype(float), 1e-12)
     total = np.bincount(group, weight)
 
     changed = {"weight": total.astype("f4")}
     for name in ("normal", "view", "radiance", "place"):
-        if (values := getattr(seen, name)) is None:
+        if (values := getattr(observations, name)) is None:
             continue
         mean = np.column_stack([np.bincount(group, weight * v) / total for v in values.T])
         length = 1 if name in ("radiance", "place") else np.linalg.norm(mean, axis=-1, keepdims=True)
@@ -60,9 +59,9 @@ def merge(observations: Observations, degrees: float) -> Observations:
         columns = [averaging @ visibility[:, i : i + 32].astype("f4") for i in range(0, visibility.shape[1], 32)]
         changed["visibility"] = np.rint(np.clip(np.hstack(columns), 0, 255)).astype("u1")
     for name in ("confidence", "detail"):
-        if (values := getattr(seen, name)) is not None:
+        if (values := getattr(observations, name)) is not None:
             changed[name] = (np.bincount(group, weight * values) / total).astype("f4")
-    return msgspec.structs.replace(seen.take(first), **changed)
+    return msgspec.structs.replace(observations.take(first), **changed)
 
 
 def groups(keys: Int[np.ndarray, "n k"]) -> tuple[Int[np.ndarray, " g"], Int[np.ndarray, " n"]]:

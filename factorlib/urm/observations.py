@@ -24,7 +24,7 @@ from jaxtyping import Bool, Float, Int, UInt8, UInt16
 
 from factorlib.conventions import half_of_normal_and_view
 from factorlib.errors import InputError
-from factorlib.geometry.met import BINS, UNMET
+from factorlib.geometry.occluder_codes import BINS, NO_OCCLUDER
 from factorlib.parquetfile import read_columns
 from factorlib.reading import reading
 from factorlib.wholefile import writing
@@ -38,7 +38,7 @@ VISIBILITY = (
 MET = (
     f"two bytes (uint16, little-endian) per direction k of `visibility`: the surface that hides it, number in "
     f"`materials` · {BINS} + number of the direction of {BINS}, placed as those of `visibility`, that is nearest to "
-    f"its normal; {UNMET}: none, or not known"
+    f"its normal; {NO_OCCLUDER}: none, or not known"
 )
 UNITS = {
     "frame": "camera: OpenCV, x right, y down, z forward; half = (2(n·o)n − o + (0,0,−1))/2; view points toward the "
@@ -65,7 +65,7 @@ class Observations(msgspec.Struct, frozen=True):
     photos: tuple[str, ...]
     illuminations: tuple[str, ...]
     visibility: UInt8[np.ndarray, "n k"] | None = None  # 255: the direction is visible; None: all are
-    met: UInt16[np.ndarray, "n k"] | None = None  # codes of hiding surfaces (geometry.met); needs `visibility`
+    met: UInt16[np.ndarray, "n k"] | None = None  # codes of `geometry.occluder_codes`; needs `visibility`
     exposures: tuple[float | None, ...] = ()  # t·S/N² of `photos` from EXIF, None if unknown; empty if all are unknown
     confidence: Float[np.ndarray, " n"] | None = None  # confidence of the normal, 0 to 1; None: all are equal
     place: Float[np.ndarray, "n 3"] | None = None  # camera frame, about the photo's middle, RMS 1 (light.distance)
@@ -110,7 +110,7 @@ NAMES = {
 # optional columns of K values a row: type, value if everything is visible, meaning
 WIDE: dict[str, tuple[np.dtype, int, str]] = {
     "visibility": (np.dtype("u1"), 255, VISIBILITY),
-    "met": (np.dtype("<u2"), UNMET, MET),
+    "met": (np.dtype("<u2"), NO_OCCLUDER, MET),
 }
 
 
@@ -147,7 +147,7 @@ def read_observations(path: str | Path) -> Observations:
     with reading(WHAT, path, cure=CURE):
         narrow = {name: dtype for name, dtype in (COLUMNS | OPTIONAL).items() if name in parts}
         fields: dict[str, Any] = {name: _array(parts[name], dtype, name in VECTORS) for name, dtype in narrow.items()}
-        fields |= {name: _of_bytes(parts[name], wide) for name, (wide, *_) in WIDE.items() if name in parts}
+        fields |= {name: _rows_of_bytes(parts[name], wide) for name, (wide, *_) in WIDE.items() if name in parts}
         fields |= {kind: tuple(msgspec.convert(about[kind], list[str])) for kind in NAMES}
         exposures = tuple(msgspec.convert(about.get("exposures", []), list[float | None]))
         observations = Observations(**fields, exposures=exposures)
@@ -155,27 +155,28 @@ def read_observations(path: str | Path) -> Observations:
     return observations
 
 
-def _check(seen: Observations) -> None:
+def _check(observations: Observations) -> None:
     """Raise ValueError for an index without a name or a value out of range.
 
     Values that are not finite, or of no weight, are allowed: the solve excludes and counts them.
     """
     for kind, name in NAMES.items():
-        index = getattr(seen, name)
-        known = getattr(seen, kind)
+        index = getattr(observations, name)
+        known = getattr(observations, kind)
         if len(index) and not 0 <= index.min() <= index.max() < len(known):
             raise ValueError(f"column {name!r} points beyond the names of the metadata")
-    if seen.exposures and len(seen.exposures) != len(seen.photos):
-        raise ValueError("its exposures are not one a photo")
-    if seen.confidence is not None and not ((seen.confidence >= 0) & (seen.confidence <= 1)).all():
+    if observations.exposures and len(observations.exposures) != len(observations.photos):
+        raise ValueError("the metadata have not one exposure for each photo")
+    confidence = observations.confidence
+    if confidence is not None and not ((confidence >= 0) & (confidence <= 1)).all():
         raise ValueError("column 'confidence' is not between 0 and 1")
-    if seen.place is not None and not np.isfinite(seen.place).all():
+    if observations.place is not None and not np.isfinite(observations.place).all():
         raise ValueError("column 'place' is not finite")
-    if seen.met is not None:
-        if seen.visibility is None or seen.visibility.shape != seen.met.shape:
+    if observations.met is not None:
+        if observations.visibility is None or observations.visibility.shape != observations.met.shape:
             raise ValueError("column 'met' has not the directions of a column 'visibility'")
-        known = seen.met[seen.met != UNMET]
-        if len(known) and known.max() >= BINS * len(seen.materials):
+        known = observations.met[observations.met != NO_OCCLUDER]
+        if len(known) and known.max() >= BINS * len(observations.materials):
             raise ValueError("column 'met' points beyond the names of the metadata")
 
 
@@ -197,8 +198,8 @@ def concatenate(parts: Sequence[Observations]) -> Observations:
     for kind, column in (("photos", "photo"), ("illuminations", "illumination")):
         fields[kind] = tuple(sorted({name for part in parts for name in getattr(part, kind)}))
         numbers = [np.array([fields[kind].index(name) for name in getattr(part, kind)], "i4") for part in parts]
-        own = [getattr(part, column) for part in parts]
-        renumbered = [number[index] if len(number) else index for number, index in zip(numbers, own, strict=True)]
+        indices = [getattr(part, column) for part in parts]
+        renumbered = [new[index] if len(new) else index for new, index in zip(numbers, indices, strict=True)]
         fields[column] = np.concatenate(renumbered).astype("i4")
     exposures = {photo: exposure for part in parts for photo, exposure in zip(part.photos, part.exposures)}
     fills = {name: (dtype, nothing) for name, (dtype, nothing, _) in WIDE.items()}
@@ -212,11 +213,12 @@ def concatenate(parts: Sequence[Observations]) -> Observations:
             raise InputError(f"reflectance maps whose {name} has {counts} directions", cure=cure)
         for shape in shapes:
             filled = [
-                np.full((len(part), *shape), fill, dtype) if own is None else own for part, own in zip(parts, given)
+                np.full((len(part), *shape), fill, dtype) if values is None else values
+                for part, values in zip(parts, given)
             ]
             fields[name] = np.concatenate(filled)
-    of_photos = tuple(exposures.get(photo) for photo in fields["photos"])
-    return Observations(**fields, materials=materials, exposures=of_photos)
+    fields["exposures"] = tuple(exposures.get(photo) for photo in fields["photos"])
+    return Observations(**fields, materials=materials)
 
 
 def with_exposures(observations: Observations, known: Mapping[str, float]) -> Observations:
@@ -225,7 +227,7 @@ def with_exposures(observations: Observations, known: Mapping[str, float]) -> Ob
         return observations
     exif = observations.exposures or (None,) * len(observations.photos)
     exposures = (
-        2.0 ** known[photo] if photo in known else of for photo, of in zip(observations.photos, exif, strict=True)
+        2.0 ** known[photo] if photo in known else value for photo, value in zip(observations.photos, exif, strict=True)
     )
     return msgspec.structs.replace(observations, exposures=tuple(exposures))
 
@@ -241,11 +243,12 @@ def relative_exposures(observations: Observations) -> dict[str, float]:
     known = dict(zip(observations.photos, observations.exposures))
     relative: dict[str, float] = {}
     for light in np.unique(observations.illumination):
-        of_light = np.unique(observations.photo[observations.illumination == light])
-        photos = sorted(observations.photos[k] for k in of_light)
-        said = [exposure for photo in photos if (exposure := known.get(photo)) is not None]
-        all_say = len(said) == len(photos) and said[0]
-        relative |= dict(zip(photos, [exposure / said[0] for exposure in said] if all_say else [1.0] * len(photos)))
+        numbers = np.unique(observations.photo[observations.illumination == light])
+        photos = sorted(observations.photos[k] for k in numbers)
+        exposures = [exposure for photo in photos if (exposure := known.get(photo)) is not None]
+        is_complete = len(exposures) == len(photos) and exposures[0]
+        ratios = [exposure / exposures[0] for exposure in exposures] if is_complete else [1.0] * len(photos)
+        relative |= dict(zip(photos, ratios))
     return relative
 
 
@@ -257,7 +260,7 @@ def at_one_exposure(observations: Observations, relative: dict[str, float]) -> O
     return msgspec.structs.replace(observations, radiance=observations.radiance / factors[observations.photo][:, None])
 
 
-def _of_bytes(column: pa.Array, dtype: np.dtype) -> np.ndarray:
+def _rows_of_bytes(column: pa.Array, dtype: np.dtype) -> np.ndarray:
     """Convert a column of fixed-size binaries to one row of values each; ValueError for a fraction of a value."""
     k, over = divmod(column.type.byte_width, dtype.itemsize)
     if over:

@@ -26,10 +26,11 @@ def sample(observations: Observations, most: int) -> Observations:
     if len(observations) <= most:
         return observations
     group = strata(observations, most)
-    kept = evenly_spread(group, shared_out(np.bincount(group), most))
-    part = observations.take(kept)
-    share = np.bincount(group, observations.weight) / np.bincount(group[kept], part.weight)
-    return msgspec.structs.replace(part, weight=(part.weight * share[group[kept]]).astype(np.float32))
+    rows = select_evenly(group, allot(np.bincount(group), most))
+    part = observations.take(rows)
+    # scale the weights so that the sum of each stratum is preserved
+    share = np.bincount(group, observations.weight) / np.bincount(group[rows], part.weight)
+    return msgspec.structs.replace(part, weight=(part.weight * share[group[rows]]).astype(np.float32))
 
 
 def strata(observations: Observations, most: int) -> Int[np.ndarray, " n"]:
@@ -37,19 +38,21 @@ def strata(observations: Observations, most: int) -> Int[np.ndarray, " n"]:
     kind = np.column_stack([observations.material, observations.clipped @ np.array([1, 2, 4])])
     cell = CELL
     while True:
-        of_normal = direction_cells(observations.normal, cell) if cell < np.pi else np.zeros((len(kind), 0), np.int64)
-        first, group = groups(np.column_stack([kind, of_normal]))
+        normal_cells = (
+            direction_cells(observations.normal, cell) if cell < np.pi else np.zeros((len(kind), 0), np.int64)
+        )
+        first, group = groups(np.column_stack([kind, normal_cells]))
         if len(first) <= most or cell >= np.pi:
             return group
         cell *= 2
 
 
-def shared_out(size: Int[np.ndarray, " g"], most: int) -> Int[np.ndarray, " g"]:
+def allot(size: Int[np.ndarray, " g"], most: int) -> Int[np.ndarray, " g"]:
     """Return the number of pixels that each stratum keeps: its size, up to a common limit; `most` in all.
 
     The limit differs by one between some strata, so that the sum is exact.
 
-    >>> shared_out(np.array([1, 5, 100, 80]), 27).tolist()
+    >>> allot(np.array([1, 5, 100, 80]), 27).tolist()
     [1, 5, 11, 10]
     """
     ascending = np.sort(size)
@@ -65,10 +68,10 @@ def shared_out(size: Int[np.ndarray, " g"], most: int) -> Int[np.ndarray, " g"]:
     return count
 
 
-def evenly_spread(group: Int[np.ndarray, " n"], count: Int[np.ndarray, " g"]) -> Int[np.ndarray, " m"]:
+def select_evenly(group: Int[np.ndarray, " n"], count: Int[np.ndarray, " g"]) -> Int[np.ndarray, " m"]:
     """Select `count` rows of each group at even steps through its rows; return them in ascending order.
 
-    >>> evenly_spread(np.array([0, 1, 0, 0, 0]), np.array([2, 1])).tolist()
+    >>> select_evenly(np.array([0, 1, 0, 0, 0]), np.array([2, 1])).tolist()
     [1, 2, 4]
     """
     # rank of each row in its group; select a row where ⌊rank · count / size⌋ steps up
@@ -76,5 +79,5 @@ def evenly_spread(group: Int[np.ndarray, " n"], count: Int[np.ndarray, " g"]) ->
     size = np.bincount(group, minlength=len(count))
     rank = np.arange(len(group)) - np.repeat(np.cumsum(size) - size, size)
     total = np.repeat(size, size)
-    wanted = np.repeat(count, size)
-    return np.sort(order[(rank + 1) * wanted // total > rank * wanted // total])
+    selected = np.repeat(count, size)
+    return np.sort(order[(rank + 1) * selected // total > rank * selected // total])

@@ -23,9 +23,9 @@ from jaxtyping import Int
 from scipy.spatial.transform import Rotation
 from tqdm import tqdm
 
-from factorlib.align.place import KnownFocal, ObjectToPlace, placed
+from factorlib.align.photo_alignment import KnownFocal, ObjectToAlign, align_photo
+from factorlib.align.reliability import find_doubts, measure_reliability
 from factorlib.align.silhouette import label_agreement, silhouette_iou, silhouette_of_object
-from factorlib.align.trust import doubts, trust_in
 from factorlib.geometry.camera import Camera, Pose
 from factorlib.geometry.raster import Caster, Maps, rasterise
 from factorlib.meshes.mesh import Mesh
@@ -109,9 +109,9 @@ def measured(key: Key) -> dict:
     caster = Caster(given.mesh)
     truth, blind, clock = given.truth, Camera(WIDTH, HEIGHT, 1.0, given.camera.centre), Clock()
     silhouette = silhouette_of_object({"label": given.label.astype(float)}, 1, caster.mesh.labels, own_mask=False)
-    obj = ObjectToPlace("object", caster, silhouette)
-    result = placed([obj], blind, KnownFocal(), " ".join(map(str, key)))
-    seen, trust = rasterise(caster, result.camera, result.poses[0]), trust_in(obj, result, 0)
+    obj = ObjectToAlign("object", caster, silhouette)
+    result = align_photo([obj], blind, KnownFocal(), " ".join(map(str, key)))
+    seen, trust = rasterise(caster, result.camera, result.poses[0]), measure_reliability(obj, result, 0)
     taken, megabytes = clock.taken(), resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
     fit = silhouette_iou(silhouette, seen.label), label_agreement(silhouette, seen.label)
     row = {
@@ -120,7 +120,7 @@ def measured(key: Key) -> dict:
         "wall_s": taken.wall,
         "processor_s": taken.processor,
         "memory_mb": megabytes,
-        "doubts": doubts(*fit, trust, result.found[0]),
+        "doubts": find_doubts(*fit, trust, result.estimates[0]),
     }
     if kind in RIGHT_DEG:
         row["normal_error_deg"] = normal_error_deg(truth, seen)

@@ -20,7 +20,7 @@ import numpy as np
 from jaxtyping import Float
 from scipy.spatial.transform import Rotation
 
-from factorlib.align.coarse import toward
+from factorlib.align.coarse import rotation_to_ray
 from factorlib.dataset.read import read_dataset
 from factorlib.dataset.schema import Dataset
 from factorlib.errors import InputError
@@ -110,7 +110,7 @@ def about_the_ray(pose: Pose, centre: Float[np.ndarray, "3"]) -> Float[np.ndarra
     It is cam_from_object less the ray's turn.
     """
     middle = pose.apply(centre[None])[0]
-    return toward(middle[:2] / middle[2]).T @ pose.rotation
+    return rotation_to_ray(middle[:2] / middle[2]).T @ pose.rotation
 
 
 def common_turn(turns: list[list[float]]) -> tuple[float, list[float]]:

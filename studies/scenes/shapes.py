@@ -19,7 +19,7 @@ import numpy as np
 from jaxtyping import Float
 
 from factorlib.generate.chair import dowel, legs, shell
-from factorlib.generate.shapes import BUMPS, revolved
+from factorlib.generate.solids import BUMPS, revolved
 from factorlib.geometry import open3d as o3d
 from factorlib.meshes.mesh import Mesh, closed_grid
 from factorlib.meshes.read import CREASE_DEG, usable

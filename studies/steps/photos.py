@@ -21,7 +21,7 @@ import yaml
 from factorlib.dataset.read import read_dataset
 from factorlib.dataset.schema import Dataset
 from factorlib.dataset.slices import dataset_slice
-from factorlib.generate.eames import SET, Parameters, generate
+from factorlib.generate.eames import SET, ChairSetOptions, generate
 from factorlib.jsonfile import read_json, write_json
 from factorlib.reflection.network import SHIPPED
 from factorlib.stage import Inputs, Progress, silent
@@ -38,7 +38,7 @@ def main(params: Params, inputs: Inputs, out: Path, progress: Progress) -> None:
         folder = CHECKOUT / facts["folder"]
         return run_stages(read_dataset(folder), out / folder.name, (masks, align, urm), photos=facts["photos"])
     os.environ["FACTORLIB_MITSUBA"] = "scalar_rgb"  # read where Mitsuba is first used
-    size = Parameters(**{field: facts[field] for field in ("width", "height", "light_rows", "spp")})
+    size = ChairSetOptions(**{field: facts[field] for field in ("width", "height", "light_rows", "spp")})
     for number, seed in enumerate(facts["seeds"]):
         progress(number, len(facts["seeds"]), f"set {seed}")
         (data := out / str(seed) / "data").mkdir(parents=True)

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from factorlib.align.pairing import HIDDEN, pair
+from factorlib.align.pairing import HIDDEN, match_parts
 from factorlib.align.silhouette import Silhouette
 from factorlib.geometry.camera import Camera, Pose
 from factorlib.geometry.raster import rasterise
@@ -38,7 +38,7 @@ def test_parts_get_the_labels_that_they_were_drawn_with_in_each_photo():
     drawn = [(1, 3), (2, 3), (1, 3), (2, 3), (4, 3)]
     sightings = [seen(LAMP, labels, seed) for seed, labels in enumerate(drawn)]
     unseen = 0
-    for sighting, labels, paired in zip(sightings, drawn, pair(LAMP, 2, sightings)):
+    for sighting, labels, paired in zip(sightings, drawn, match_parts(LAMP, 2, sightings)):
         for label, likely, margin in zip(labels, paired.labels, paired.margins):
             shown = (sighting.label == label).sum() > 0.02 * sighting.inside.sum()
             assert (likely[0] == label and margin > 0.5) if shown else (HIDDEN in likely[:2] and margin < 0.1)
@@ -47,16 +47,16 @@ def test_parts_get_the_labels_that_they_were_drawn_with_in_each_photo():
 
 
 def test_parts_that_look_alike_are_not_sure():
-    (paired,) = pair(TWINS, 2, [seen(TWINS, (1, 2), 3)])
+    (paired,) = match_parts(TWINS, 2, [seen(TWINS, (1, 2), 3)])
     assert max(paired.margins) < 0.1 and all(set(each) == {1, 2} for each in paired.labels)
 
 
 def test_a_part_of_the_same_material_is_told_from_one_that_is_hidden():
     of_one = seen(LAMP, (1, 1), 4)
-    (paired,) = pair(LAMP, 2, [of_one])
+    (paired,) = match_parts(LAMP, 2, [of_one])
     assert [each[0] for each in paired.labels] == [1, 1]
     label = seen(LAMP, (1, 2), 4).label
-    (paired,) = pair(LAMP, 2, [Silhouette(np.where(label == 2, np.int16(-1), label))])
+    (paired,) = match_parts(LAMP, 2, [Silhouette(np.where(label == 2, np.int16(-1), label))])
     assert HIDDEN in paired.labels[1][:2] and paired.margins[1] < 0.1
 
 
@@ -64,4 +64,4 @@ def test_a_part_of_the_same_material_is_told_from_one_that_is_hidden():
 def test_more_labels_than_parts_and_none_tell_nothing(kinds):
     label = seen(LAMP, (1, 1), 5).label
     stripes = (np.arange(label.shape[1]) % max(kinds, 1) + 1) * min(kinds, 1)
-    assert pair(LAMP, 2, [Silhouette(np.where(label > 0, stripes, 0).astype(np.int16))]) == [None]
+    assert match_parts(LAMP, 2, [Silhouette(np.where(label > 0, stripes, 0).astype(np.int16))]) == [None]

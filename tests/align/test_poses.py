@@ -8,21 +8,21 @@ import pytest
 import trimesh
 
 from factorlib.align.coarse import is_cut
-from factorlib.align.place import Keypoints, KnownFocal, ObjectToPlace, placed
-from factorlib.align.refine import FocalPrior
-from factorlib.align.search import Search, find, focal_prior
+from factorlib.align.photo_alignment import Keypoints, KnownFocal, ObjectToAlign, align_photo
+from factorlib.align.reliability import find_doubts, measure_reliability, mirrored_score, normal_stderr_deg
+from factorlib.align.search import SearchOptions, estimate_pose
 from factorlib.align.silhouette import UNKNOWN, Silhouette, label_agreement, silhouette_iou
-from factorlib.align.state import state_of
-from factorlib.align.target import target_of
-from factorlib.align.trust import doubts, mirrored_score, normal_stderr_deg, trust_in
+from factorlib.align.state import pose_state
+from factorlib.align.target import make_target
+from factorlib.align.view import ObjectView, with_prior_focal
 from factorlib.errors import InputError
 from factorlib.geometry.camera import angle_between
 from factorlib.geometry.raster import Caster, rasterise
 from tests.align.scenes import ball, blob, chair, dumbbell, mesh_of, normal_error_deg, photo_of, true_silhouette
 
-QUICK = Search(views=160, rolls=16, keep=(20, 8, 4, 2))  # for what does not need the full search
+QUICK = SearchOptions(views=160, rolls=16, keep=(20, 8, 4, 2))  # for what does not need the full search
 SMALL = {"width": 160, "height": 120}
-BRIEF = Search(views=120, rolls=12, keep=(14, 6, 3, 2), steps=(5, 6, 8, 6))
+BRIEF = SearchOptions(views=120, rolls=12, keep=(14, 6, 3, 2), steps=(5, 6, 8, 6))
 
 
 def searched(mesh, seed, mask=None, given=None, known=True, search=QUICK, **how):
@@ -30,8 +30,8 @@ def searched(mesh, seed, mask=None, given=None, known=True, search=QUICK, **how)
     caster, camera, pose = photo_of(mesh, seed, **how)
     silhouette, given = true_silhouette(caster, camera, pose), given or caster
     silhouette = mask(silhouette) if mask else silhouette
-    prior = focal_prior(camera.focal if known else None, "dataset", camera.width, camera.height)
-    found = find(given, silhouette, camera, prior, search, (shares := []).append)
+    view = ObjectView(silhouette, *with_prior_focal(camera, camera.focal if known else None, "dataset"))
+    found = estimate_pose(given, view, search, (shares := []).append)
     assert shares == sorted(set(shares)) and len(shares) == 5  # first guesses, and four rounds
     return found, normal_error_deg(caster, camera, pose, found.state.camera(camera), found.state.pose(given))
 
@@ -40,19 +40,19 @@ def answered(mesh, seed=21, mask=None, given=None, known=True, **how):
     """The median normal error of the pose that is placed, the doubts about it, and what was found."""
     caster, camera, pose = photo_of(mesh, seed, **how)
     silhouette, given = true_silhouette(caster, camera, pose), given or caster
-    obj = ObjectToPlace("chair", given, mask(silhouette) if mask else silhouette)
-    result = placed([obj], camera, KnownFocal(camera.focal, "dataset") if known else KnownFocal(), "photo", BRIEF)
+    obj = ObjectToAlign("chair", given, mask(silhouette) if mask else silhouette)
+    result = align_photo([obj], camera, KnownFocal(camera.focal, "dataset") if known else KnownFocal(), "photo", BRIEF)
     label = rasterise(given, result.camera, result.poses[0]).label
     iou, agreement = silhouette_iou(obj.silhouette, label), label_agreement(obj.silhouette, label)
-    reasons = doubts(iou, agreement, trust_in(obj, result, 0), result.found[0])
+    reasons = find_doubts(iou, agreement, measure_reliability(obj, result, 0), result.estimates[0])
     error = normal_error_deg(caster, camera, pose, result.camera, result.poses[0], given)
-    return error, reasons, result.found[0]
+    return error, reasons, result.estimates[0]
 
 
 @pytest.mark.parametrize("seed", [0, 1, 2])
 def test_any_rotation_with_the_focal_length_unknown(seed):
     mesh, focal = [blob(), chair()][seed % 2], [0.9, 1.4, 2.2][seed]
-    found, error = searched(mesh, seed, known=False, search=Search(), focal=focal, shift=(0.05, -0.04))
+    found, error = searched(mesh, seed, known=False, search=SearchOptions(), focal=focal, shift=(0.05, -0.04))
     assert error < 2 and found.score > 0.98
     assert abs(found.state.log_focal - np.log(focal * 320)) < max(3 * found.log_focal_sigma, 0.05)
 
@@ -110,8 +110,8 @@ def named(camera, pose, off, seed) -> Keypoints:
 
 
 def placed_by(caster, camera, keypoints, silhouette, focal):
-    obj = ObjectToPlace("chair", caster, silhouette, keypoints=keypoints)
-    return placed([obj], camera, KnownFocal(focal, "dataset" if focal else None), "photo")
+    obj = ObjectToAlign("chair", caster, silhouette, keypoints=keypoints)
+    return align_photo([obj], camera, KnownFocal(focal, "dataset" if focal else None), "photo")
 
 
 @pytest.mark.parametrize("known", [True, False])
@@ -121,7 +121,7 @@ def test_careless_keypoints_and_the_mask_give_the_pose(seed, known):
     keypoints, silhouette = named(camera, pose, off=2.0, seed=seed), true_silhouette(caster, camera, pose)
     result = placed_by(caster, camera, keypoints, silhouette, camera.focal if known else None)
     assert normal_error_deg(caster, camera, pose, result.camera, result.poses[0]) < 2
-    assert result.found[0].by_keypoints and result.found[0].runner_up is None
+    assert result.estimates[0].source == "keypoints" and result.estimates[0].runner_up is None
 
 
 def test_keypoints_that_do_not_agree_are_refused():
@@ -132,30 +132,24 @@ def test_keypoints_that_do_not_agree_are_refused():
     assert caught.value.key == "photo.chair.keypoints" and caught.value.cure
 
 
-KNOWN = FocalPrior(1.0, 0.0)
-
-
-def seen(mesh, **how):
-    """The caster, a target of the mask, the photo's camera, and the true state."""
+def seen(mesh, focal_sigma=0.0, **how):
+    """The caster, a target of the mask, and the true state."""
     caster, camera, pose = photo_of(mesh, 1, **how)
-    target = target_of(true_silhouette(caster, camera, pose), caster.mesh.labels, 200, 0.2)
-    return caster, target, camera, state_of(pose, camera, caster)
+    view = ObjectView(true_silhouette(caster, camera, pose), camera, focal_sigma)
+    return caster, make_target(view, caster.mesh.labels, 200), pose_state(pose, camera, caster)
 
 
 def test_fewer_pixels_and_an_unknown_focal_length_tell_normals_less_and_the_turn_of_a_ball_costs_nothing():
-    stderr = [normal_stderr_deg(*seen(chair(), fill=fill, width=640, height=480), KNOWN) for fill in (0.8, 0.2, 0.05)]
+    stderr = [normal_stderr_deg(*seen(chair(), fill=fill, width=640, height=480)) for fill in (0.8, 0.2, 0.05)]
     assert stderr[0] < 1 and stderr[0] < stderr[1] < stderr[2] and stderr[2] > 3
-    given = seen(chair())
-    assert normal_stderr_deg(*given, FocalPrior(given[2].focal, 0.5)) >= 0.99 * normal_stderr_deg(*given, KNOWN)
-    assert normal_stderr_deg(*seen(mesh_of([ball(subdivisions=5)])), KNOWN) < 2
+    assert normal_stderr_deg(*seen(chair(), 0.5)) >= 0.99 * normal_stderr_deg(*seen(chair()))
+    assert normal_stderr_deg(*seen(mesh_of([ball(subdivisions=5)]))) < 2
 
 
 def test_the_mirror_image_of_a_photo_off_centre_scores_as_the_photo_did():
     caster, camera, pose = photo_of(chair(), 21, focal=1.0, shift=(0.1, 0.05))
     camera = msgspec.structs.replace(camera, centre=(camera.centre[0] - 12.0, camera.centre[1] + 3.0))
     silhouette = true_silhouette(caster, camera, pose)
-    flipped = Silhouette(np.ascontiguousarray(silhouette.label[:, ::-1]))
-    mirrored = msgspec.structs.replace(camera, centre=(camera.width - camera.centre[0], camera.centre[1]))
-    prior = focal_prior(camera.focal, "dataset", camera.width, camera.height)
-    right, wrong = mirrored_score(caster, flipped, mirrored, prior), mirrored_score(caster, silhouette, camera, prior)
+    view = ObjectView(silhouette, camera)
+    right, wrong = mirrored_score(caster, view.mirrored()), mirrored_score(caster, view)
     assert right > 0.98 and 1 - right < (1 - wrong) / 2

@@ -7,9 +7,11 @@ import pytest
 
 from factorlib.align import silhouette as masks
 from factorlib.align.coarse import is_cut
-from factorlib.align.confidence import FACET, TURN, confidence, turns
+from factorlib.align.confidence import FACET, TURN, confidence, normal_spread
 from factorlib.align.silhouette import UNKNOWN, Silhouette
-from factorlib.align.target import target_of
+from factorlib.align.target import make_target
+from factorlib.align.view import ObjectView
+from factorlib.geometry.camera import Camera
 from factorlib.geometry.raster import rasterise
 from tests.align.scenes import at, ball, dumbbell, mesh_of, photo_of, true_silhouette
 
@@ -58,7 +60,8 @@ def test_cut_by_the_frame_or_a_broad_gap_but_not_by_a_thin_one():
 def test_distance_to_a_straight_border_is_exact():
     label = np.zeros((20, 30), np.int16)
     label[5:15, 8:22] = 1
-    target = target_of(Silhouette(label), (1,), 1000, margin=0.35)
+    view = ObjectView(Silhouette(label), Camera(30, 20, 1.0, (15.0, 10.0)))
+    target = make_target(view, (1,), 1000, margin=0.35)
     region = target.regions[1]
     row, column = int(10 - target.top), int(8 - target.left)
     assert target.pixel == 1 and region.distance[row, column - 1 : column + 2].tolist() == [0.5, -0.5, -1.5]
@@ -99,6 +102,6 @@ def test_normals_turn_by_the_angle_that_a_pixel_spans_and_are_believed_less(heig
     maps, sure = seen(fine, 3, width=2 * height, height=height, focal=40.0)
     middle, radius = (height // 2, height), 0.75 * height / 2  # pixels
     expected = np.sqrt(4 / 3) / radius  # of n = (x, y) / radius over 3 × 3 pixels
-    assert turns(maps)[middle] == pytest.approx(expected, rel=0.1)
+    assert normal_spread(maps)[middle] == pytest.approx(expected, rel=0.1)
     believed = 1 / (1 + (maps.facet[middle] / FACET) ** 2 + (expected / TURN) ** 2)
     assert sure[middle] == pytest.approx(believed, rel=0.02)

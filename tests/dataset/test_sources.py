@@ -9,7 +9,7 @@ import pytest
 import yaml
 from scipy.spatial.transform import Rotation
 
-from factorlib.align.given import focal_and_centre
+from factorlib.align.input_checks import convert_intrinsics
 from factorlib.dataset.read import read_dataset
 from factorlib.dataset.schema import ExternalCamera
 from factorlib.dataset.slices import dataset_slice
@@ -58,7 +58,7 @@ def refusal(folder, cameras, key, words, **options):
 
 def pixels(external, points, name="chair"):
     """Where the photo shows points of the mesh, by the external camera."""
-    focal, centre = focal_and_centre(external, *SIZE, "hall")
+    focal, centre = convert_intrinsics(external, *SIZE, "hall")
     pose = external.poses[name]
     return Camera(*SIZE, focal, centre).project(Pose(np.array(pose.rotation), np.array(pose.translation)).apply(points))
 
@@ -177,8 +177,8 @@ def test_a_field_of_view_is_a_focal_length_at_any_size_and_a_frames_own_lens_goe
     frames = [frame("hall", EYE, (0, 0, 5)), frame("attic", EYE, (0, 0, 5), w=200, h=150)]
     external = read(transforms(folder, frames, {"camera_angle_x": 2 * math.atan(100 / 300)}), OF_TRANSFORMS).external
     for name in PHOTOS:
-        assert focal_and_centre(external[name], 200, 150, name) == (pytest.approx(300), (100.0, 75.0))
-        assert focal_and_centre(external[name], 400, 300, name) == (pytest.approx(600), (200.0, 150.0))
+        assert convert_intrinsics(external[name], 200, 150, name) == (pytest.approx(300), (100.0, 75.0))
+        assert convert_intrinsics(external[name], 400, 300, name) == (pytest.approx(600), (200.0, 150.0))
     transforms(folder, [frame("hall", EYE, (0, 0, 5), fl_x=320.0), frame("attic", EYE, (0, 0, 5))])
     external = read(folder, OF_TRANSFORMS).external
     assert external["hall"].focal_px == 320.0 and external["attic"].focal_px == 300.0
@@ -240,7 +240,7 @@ EXTERNAL = ExternalCamera("colmap", 300.0, (104.0, 71.0), (200, 150), {})
 def test_the_same_picture_at_another_size_shows_a_point_at_the_same_place_and_another_is_refused():
     sizes = (200, 150, 0), (400, 300, 0), (100, 75, 0), (67, 50, 0.5), (133, 100, 0.5)
     for width, height, off in sizes:
-        focal, centre = focal_and_centre(EXTERNAL, width, height, "hall")
+        focal, centre = convert_intrinsics(EXTERNAL, width, height, "hall")
         place = np.array([104 + 300 * 0.2, 71 - 300 * 0.1]) / SIZE * (width, height)
         assert np.allclose(Camera(width, height, focal, centre).project(np.array([0.2, -0.1, 1.0])), place, atol=off)
     for external, width, height, words in (
@@ -249,5 +249,5 @@ def test_the_same_picture_at_another_size_shows_a_point_at_the_same_place_and_an
         (ExternalCamera("bop", 300.0, (104.0, 71.0), None, {}), 100, 75, "at the size that the source was made of"),
     ):
         with pytest.raises(InputError, match=words) as caught:
-            focal_and_centre(external, width, height, "hall")
+            convert_intrinsics(external, width, height, "hall")
         assert caught.value.key == f"cameras.{external.source}: hall" and caught.value.cure

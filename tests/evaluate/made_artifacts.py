@@ -12,7 +12,7 @@ import trimesh
 from factorlib.conventions import YUP_FROM_CAMERA, lat_long_directions
 from factorlib.evaluate.ball import ball, light_of_lat_long
 from factorlib.export.gltf import write_glb
-from factorlib.generate.shapes import sphere
+from factorlib.generate.solids import sphere
 from factorlib.geometry.sphere import ball_normals
 from factorlib.images.exr import LAT_LONG, read_exr, write_exr, write_rgb_exr
 from factorlib.images.picture import write_png
@@ -31,7 +31,7 @@ from factorlib.results.materials import (
     solved,
 )
 from factorlib.stage import Inputs
-from factorlib.urm.extract import Taken, observations_of_photo
+from factorlib.urm.extract import PhotoSource, extract_observations
 from factorlib.urm.observations import write_observations
 
 SIZE = 24
@@ -135,7 +135,7 @@ def _photo(made: Made, folders: dict, photo: str, materials: list[str], light_va
     write_png(folders["align"] / f"{photo}_overlay.png", overlay)
     channels = [read_exr(folders[stage] / f"{photo}.exr") for stage in ("masks", "align")]
     write_observations(
-        folders["urm"] / f"{photo}.parquet", observations_of_photo(*channels, Taken(photo, photo), materials)
+        folders["urm"] / f"{photo}.parquet", extract_observations(*channels, PhotoSource(photo, photo), materials)
     )
     width, counts = label.shape[1], {m: int((label == materials.index(m) + 1).sum()) for m in seen}
     write_json(folders["masks"] / f"{photo}.json", {

@@ -9,7 +9,7 @@ from scipy.spatial import cKDTree
 from factorlib.conventions import YUP_FROM_CAMERA, lat_long_directions, lat_long_solid_angles
 from factorlib.dataset.read import read_dataset
 from factorlib.errors import InputError
-from factorlib.generate import eames, folder, lights, synthetic
+from factorlib.generate import eames, folder, surroundings, synthetic
 from factorlib.generate.chair import chair, labelled
 from factorlib.images.exr import read_exr, read_rgb_exr, write_rgb_exr
 from factorlib.images.photo import read_photo
@@ -23,14 +23,14 @@ pytest.importorskip("mitsuba")
 
 def made(out: Path, seed: int) -> Path:
     """A small synthetic set."""
-    parameters = synthetic.Parameters(width=96, height=64, focal_px=125.0, light_rows=16, spp=64, light_spp=2)
+    parameters = synthetic.SyntheticOptions(width=96, height=64, focal_px=125.0, light_rows=16, spp=64, light_spp=2)
     synthetic.generate(out, seed, [], parameters, lambda done, total, text: None)
     return out
 
 
 def made_chairs(out: Path, names=("kitchen",), **easier: bool) -> Path:
     """A small chair set of seed 3."""
-    parameters = eames.Parameters(width=96, height=72, light_rows=16, spp=8, light_spp=2, **easier)
+    parameters = eames.ChairSetOptions(width=96, height=72, light_rows=16, spp=8, light_spp=2, **easier)
     shots = [shot for shot in eames.SET.shots if shot.name in names]
     eames.generate(out, 3, [], parameters, lambda done, total, text: None, shots)
     return out
@@ -76,13 +76,13 @@ def test_a_users_lights_replace_the_made_ones(tmp_path):
     light = np.ones((32, 64, 3)) * [1.0, 2.0, 3.0]
     light[3, 7] = 100
     write_rgb_exr(tmp_path / "sky.exr", light)
-    taken = lights.captured(tmp_path / "sky.exr", 16)
+    taken = surroundings.captured(tmp_path / "sky.exr", 16)
     assert taken.shape == (16, 32, 3)
     assert np.unravel_index(taken[..., 0].argmax(), (16, 32)) == (1, 3)
     assert taken.mean() == pytest.approx(1)
     write_rgb_exr(tmp_path / "square.exr", np.ones((8, 8, 3)))
     with pytest.raises(InputError, match="no lat-long"):
-        lights.captured(tmp_path / "square.exr", 8)
+        surroundings.captured(tmp_path / "square.exr", 8)
 
 
 def test_exact_geometry_is_the_photographed_mesh_at_its_pose(exact):

@@ -7,10 +7,10 @@ import trimesh
 from scipy.spatial.transform import Rotation
 
 from factorlib.geometry.camera import Camera, Pose
-from factorlib.geometry.met import BINS, UNMET
+from factorlib.geometry.occluder_codes import BINS, NO_OCCLUDER
 from factorlib.geometry.raster import rasterise
 from factorlib.geometry.sphere import fibonacci_sphere, mirror_directions
-from factorlib.geometry.visibility import Occluders, Points, sight
+from factorlib.geometry.visibility import Occluders, SurfacePoints
 from tests.align.scenes import ball, blob, mesh_of, photo_of
 
 CAMERA = Camera(64, 48, 80.0, (30.0, 25.0))
@@ -82,7 +82,7 @@ def pixels(meshes, poses):
 
 def seen_by(meshes, poses, count=256):
     x, y, normal, thing = pixels(meshes, poses)
-    found = sight(Occluders(meshes, poses), SQUARE, np.column_stack([x, y]), normal, count, 10_000)
+    found = Occluders(meshes, poses).visibility_at(SQUARE, np.column_stack([x, y]), normal, count, 10_000)
     return found and found.visibility, normal, thing
 
 
@@ -128,9 +128,9 @@ def test_codes_say_which_material_hides_a_direction_and_how_it_faces():
     occluders, directions = Occluders([floor, thing], poses), fibonacci_sphere(256)
     place = np.array([[1.5, 0.0, 5.99], [3.5, 0.0, 5.99]])
     up = np.tile([0.0, 0.0, -1.0], (2, 1))
-    past = occluders.seen_from(Points(place, up, np.ones(2, bool)), up, directions)
+    past = occluders.visibility_from(SurfacePoints(place, up, np.ones(2, bool)), up, directions)
     hidden = past.visibility == 0
-    assert hidden[0].any() and (past.met[~hidden] == UNMET).all()
+    assert hidden[0].any() and (past.met[~hidden] == NO_OCCLUDER).all()
     material, faces = np.divmod(past.met[hidden].astype(int), BINS)
     assert (material == 2).all()
     row, k = np.nonzero(hidden)

@@ -4,7 +4,7 @@ import msgspec
 import numpy as np
 import pytest
 
-from factorlib.geometry.met import UNMET, met_codes
+from factorlib.geometry.occluder_codes import NO_OCCLUDER, occluder_codes
 from factorlib.geometry.sphere import fibonacci_sphere
 from factorlib.inference.blocks import Noise
 from factorlib.inference.forward import Illumination
@@ -43,11 +43,11 @@ def bowl(albedo, depth=0.5, size=40, count=1024) -> Observations:
     d = fibonacci_sphere(count)
     out = -n[:, None] + 2 * (n @ d.T)[..., None] * d  # where a ray from −n leaves the sphere
     hidden = (out[..., 2] > 1 - 2 * depth) & (n @ d.T > 0)
-    codes = met_codes(np.zeros(hidden.size, int), -out.reshape(-1, 3)).reshape(hidden.shape)
+    codes = occluder_codes(np.zeros(hidden.size, int), -out.reshape(-1, 3)).reshape(hidden.shape)
     radiance = np.full((len(n), 3), albedo * (1 - depth) / (1 - albedo * depth))
     how = {
         "visibility": np.where(hidden, 0, 255).astype(np.uint8),
-        "met": np.where(hidden, codes, UNMET).astype(np.uint16),
+        "met": np.where(hidden, codes, NO_OCCLUDER).astype(np.uint16),
     }
     return seen_from_the_front(n, radiance, np.zeros(len(n), int), ("white",), **how)
 

@@ -6,7 +6,7 @@ import msgspec
 import numpy as np
 import pytest
 
-from factorlib.geometry.met import UNMET, met_codes
+from factorlib.geometry.occluder_codes import NO_OCCLUDER, occluder_codes
 from factorlib.geometry.sphere import fibonacci_sphere
 from factorlib.images.tone import curve
 from factorlib.inference.blocks import Noise
@@ -56,9 +56,9 @@ def lit_bowls(name, seed) -> Observations:
     """A bowl and a ball of each material, all bounces within a bowl as (1) has them: the fixed point of what it sends itself."""
     seen, normals, d = bowls(name, rough_light(seed), size=12, count=256), sphere_normals(12), fibonacci_sphere(256)
     exits = -normals[:, None] + 2 * (normals @ d.T)[..., None] * d
-    facing = met_codes(np.zeros(exits.shape[0] * 256, int), -exits.reshape(-1, 3)).reshape(-1, 256)
+    facing = occluder_codes(np.zeros(exits.shape[0] * 256, int), -exits.reshape(-1, 3)).reshape(-1, 256)
     met = np.vstack([facing + 64 * (k // 2) for k in range(6)])
-    seen = msgspec.structs.replace(seen, met=np.where(seen.visibility == 0, met, UNMET).astype(np.uint16))
+    seen = msgspec.structs.replace(seen, met=np.where(seen.visibility == 0, met, NO_OCCLUDER).astype(np.uint16))
     shown = seen.radiance
     for _ in range(8):
         sent = bounced_light(seen, shown)
@@ -111,7 +111,7 @@ def hull(seen: Observations) -> Observations:
         seen,
         normal=(shallow / np.linalg.norm(shallow, axis=1, keepdims=True)).astype(seen.normal.dtype),
         visibility=np.where(hidden, 0, 255).astype(np.uint8),
-        met=np.where(hidden, seen.met, UNMET).astype(np.uint16),
+        met=np.where(hidden, seen.met, NO_OCCLUDER).astype(np.uint16),
     )
 
 

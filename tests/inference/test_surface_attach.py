@@ -3,7 +3,7 @@
 import msgspec
 import numpy as np
 
-from factorlib.generate.shapes import sphere
+from factorlib.generate.solids import sphere
 from factorlib.geometry.camera import Camera, Pose
 from factorlib.geometry.raster import rasterise
 from factorlib.inference.surface_turns import Surfaces, attach_pixels

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from factorlib.conventions import YUP_FROM_CAMERA
-from factorlib.generate.shapes import sphere
+from factorlib.generate.solids import sphere
 from factorlib.geometry.camera import Camera
 from factorlib.light.lobes import Lobes
 from factorlib.meshes.mesh import Mesh

@@ -6,7 +6,7 @@ import pytest
 import trimesh
 
 from factorlib.errors import InputError
-from factorlib.generate.shapes import sphere
+from factorlib.generate.solids import sphere
 from factorlib.geometry.camera import Camera, rotation_of_vector
 from factorlib.light.latlong import lat_long_of_lobes
 from factorlib.light.lobes import Lobes

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from factorlib.errors import InputError
-from factorlib.generate.shapes import sphere
+from factorlib.generate.solids import sphere
 from factorlib.geometry.camera import Camera
 from factorlib.light.lobes import no_lobes
 from factorlib.meshes.mesh import Mesh, smooth

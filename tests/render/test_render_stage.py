@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from factorlib.conventions import FRONT
-from factorlib.geometry.met import UNMET
+from factorlib.geometry.occluder_codes import NO_OCCLUDER
 from factorlib.geometry.sphere import fibonacci_sphere
 from factorlib.images.exr import read_exr, read_rgb_exr, write_exr
 from factorlib.images.tone import curve
@@ -101,7 +101,7 @@ def test_what_is_hidden_is_lit_by_what_the_photo_shows_there(made, tmp_path):
     )  # the lower half is hidden, by nothing known
     normal, view = (np.stack([geometry[f"{kind}.{a}"][y, x] for a in "xyz"], axis=-1) for kind in ("normal", "view"))
     columns = {"view": view, "x": x, "y": y, "visibility": np.tile(visibility, (n, 1))}
-    columns |= {"met": np.full((n, 64), UNMET, np.uint16)}
+    columns |= {"met": np.full((n, 64), NO_OCCLUDER, np.uint16)}
     radiance, names = np.full((n, 3), 0.3), tuple(made_export.NAMES)
     seen = seen_from_the_front(normal, radiance, np.zeros(n, int), names, "front", **columns)
     (tmp_path / "urm").mkdir()

@@ -3,12 +3,11 @@
 import numpy as np
 from scipy.ndimage import map_coordinates
 
-from factorlib.align.refine import FocalPrior
-from factorlib.align.search import UNKNOWN_FOCAL
+from factorlib.align.view import with_prior_focal
 from factorlib.geometry.camera import Camera, Pose, rotation_of_vector
 from factorlib.geometry.raster import rasterise
 from factorlib.meshes.mesh import Mesh
-from factorlib.shapes.motion import View
+from factorlib.shapes.motion import PhotoForMotion
 from factorlib.shapes.outline import Outline
 
 CAMERA = Camera(320, 240, 400.0, (160.0, 120.0))
@@ -28,7 +27,7 @@ def looking_from(elevation_deg, azimuth_deg, distance=5.0, roll=0.2) -> Pose:
 def outline(mesh, pose, known, camera=CAMERA, name="p") -> Outline:
     """What a photo shows of a mesh, its labels as parts; known: whether the pose is."""
     part = rasterise(mesh, camera, pose).label.astype(int)
-    return Outline(name, part, camera, FocalPrior(camera.focal, 0.0), pose if known else None)
+    return Outline(name, part, camera, pose=pose if known else None)
 
 
 def plane(y) -> Mesh:
@@ -46,7 +45,7 @@ def grained(points) -> np.ndarray:
     )
 
 
-def views_of(mesh, poses, ground, size=320) -> dict[str, View]:
+def views_of(mesh, poses, ground, size=320) -> dict[str, PhotoForMotion]:
     """Photos of a grained body on a grained ground.  ground: cam_from_ground of each; what is not seen is black."""
     camera, views = Camera(size, size, 1.3 * size, (size / 2, size / 2)), {}
     for number, (pose, of_ground) in enumerate(zip(poses, ground, strict=True)):
@@ -56,6 +55,6 @@ def views_of(mesh, poses, ground, size=320) -> dict[str, View]:
             seen = maps.label == label
             grey[seen] = grained(scale * (places[seen] - own.translation) @ own.rotation)
         pixels = (np.clip(grey, 0, 1) * 255).astype(np.uint8)
-        unknown = FocalPrior(UNKNOWN_FOCAL.focal * size, UNKNOWN_FOCAL.sigma)
-        views[f"p{number}"] = View(pixels, maps.label == 1, np.zeros((size, size), bool), camera, unknown)
+        prior = with_prior_focal(camera, None, None)
+        views[f"p{number}"] = PhotoForMotion(pixels, maps.label == 1, np.zeros((size, size), bool), *prior)
     return views

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from factorlib.align.state import state_of
+from factorlib.align.state import pose_state
 from factorlib.shapes.proportions import BOX, jacobian_with_shape
 from tests.align.scenes import chair, photo_of
 
@@ -10,7 +10,7 @@ from tests.align.scenes import chair, photo_of
 def test_image_points_move_by_the_derivative():
     rng = np.random.default_rng(0)
     caster, camera, pose = photo_of(chair(), 1)
-    state = state_of(pose, camera, caster)
+    state = pose_state(pose, camera, caster)
     points = rng.normal(size=(30, 3))
 
     def image(step, shape):

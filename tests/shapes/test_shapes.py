@@ -6,12 +6,12 @@ import pytest
 import trimesh
 
 from factorlib.errors import InputError
-from factorlib.generate.shapes import SHAPES
+from factorlib.generate.solids import SHAPES
 from factorlib.geometry import open3d
 from factorlib.shapes.hull import surface_nets, visual_hull
 from factorlib.shapes.lathe import body_of_revolution
 from factorlib.shapes.outline import Triangles
-from factorlib.shapes.primitive import primitive, unit
+from factorlib.shapes.primitive import primitive, unit_shape
 from tests.shapes.outlines import looking_from, outline
 
 AROUND = [
@@ -109,7 +109,7 @@ def test_what_is_no_body_of_revolution_is_refused_or_overlaps_little():
     "kind, sides", [("box", (1.0, 0.4, 0.7)), ("cylinder", (1.0, 0.3, 1.0)), ("ball", (1.0, 1.0, 1.0))]
 )
 def test_proportions_of_primitives_are_found(kind, sides):
-    mesh = unit(kind, np.array(sides)).as_mesh()
+    mesh = unit_shape(kind, np.array(sides)).as_mesh()
     shape = primitive(kind, [outline(mesh, looking_from(25, 20), False), outline(mesh, looking_from(40, 60), False)])
     assert np.sort(np.ptp(shape.vertices, axis=0)) == pytest.approx(np.sort(sides), abs=0.02)
     assert shape.overlap > 0.97 and solid(shape).is_watertight and solid(shape).volume > 0

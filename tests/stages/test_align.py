@@ -7,8 +7,8 @@ import msgspec
 import numpy as np
 import pytest
 
-from factorlib.align.given import check_before_camera
-from factorlib.align.search import Search
+from factorlib.align.input_checks import check_before_camera
+from factorlib.align.search import SearchOptions
 from factorlib.dataset.schema import ObjectsSlice
 from factorlib.errors import InputError
 from factorlib.geometry.camera import Pose
@@ -21,7 +21,7 @@ from stages import align
 from tests.align.scenes import blob, chair, photo_of
 from tests.stages.made import Rising, chair_facts, entry_of, write_masks
 
-QUICK = Search(views=160, rolls=16, keep=(20, 8, 4, 2))
+QUICK = SearchOptions(views=160, rolls=16, keep=(20, 8, 4, 2))
 KNOWN = {"pose_given": True, "focal": 300.0, "source": "dataset"}
 
 
@@ -190,7 +190,7 @@ def test_keypoints_are_pixels_of_the_photo_before_its_lens_was_undone(tmp_path):
     channels, found = read_exr(inputs["masks"] / "a.exr"), []
     for camera in (known, known | {"distortion": None}):
         given = msgspec.convert({**slice_, "camera": camera}, ObjectsSlice)
-        found.append(align.objects_of(given, channels, inputs, align.Params(), 2, None)[0].keypoints.pixel)
+        found.append(align.read_objects(given, channels, inputs, align.Params(), 2, None)[0].keypoints.pixel)
     bent = (found[1] - [100.25, 75.0]) / 300
     assert np.abs(found[1] - found[0]).max() > 1
     straight = (found[0] - [100.25, 75.0]) / 300

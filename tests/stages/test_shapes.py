@@ -9,7 +9,7 @@ import yaml
 from factorlib.dataset.read import read_dataset
 from factorlib.dataset.slices import dataset_slice
 from factorlib.generate.folder import write_labels, write_photo
-from factorlib.generate.shapes import SHAPES
+from factorlib.generate.solids import SHAPES
 from factorlib.geometry.camera import Camera
 from factorlib.geometry.raster import rasterise
 from factorlib.images.exr import read_exr

@@ -9,7 +9,7 @@ import pytest
 from factorlib.dataset.schema import MeshEntry
 from factorlib.errors import InputError
 from factorlib.export.gltf import write_glb
-from factorlib.generate.shapes import sphere
+from factorlib.generate.solids import sphere
 from factorlib.images.exr import write_exr
 from factorlib.inference.blocks import Noise
 from factorlib.inference.observed import blocks_of_observations, gather_observations
@@ -19,8 +19,8 @@ from factorlib.meshes.read import CREASE_DEG, MeshesOnce, read_mesh
 from factorlib.results.materials import Reflectance
 from factorlib.results.surface import SurfaceTable, read_surface
 from factorlib.stage import Inputs, serial_map, silent
-from factorlib.urm.geometry import on_surface, read_geometry
 from factorlib.urm.observations import Observations, write_observations
+from factorlib.urm.surface_maps import read_geometry, with_surface_normals
 from stages import surface
 from tests.inference.made import seen_from_the_front
 
@@ -46,7 +46,7 @@ def written(folder) -> None:
 
 def test_observations_and_maps_have_the_normals_and_the_detail_of_the_surface(tmp_path):
     written(tmp_path / "surface")
-    seen = on_surface(observations(), tmp_path / "surface")
+    seen = with_surface_normals(observations(), tmp_path / "surface")
     first = seen.y == 0
     np.testing.assert_allclose(seen.normal[~first], np.tile([0.6, 0, -0.8], ((~first).sum(), 1)), atol=1e-6)
     assert (seen.normal[first] == [0, 0, -1]).all() and (seen.detail[first] == 1).all()
@@ -60,10 +60,13 @@ def test_observations_and_maps_have_the_normals_and_the_detail_of_the_surface(tm
     assert set(maps) == {"normal.x", "normal.y", "normal.z", "depth", "detail"}
     assert maps["normal.x"][3, 3] == np.float32(0.6)
     assert "detail" not in read_geometry(tmp_path / "align", None, "a")
-    assert on_surface(observations(), None) is not None and on_surface(observations(), None).detail is None
+    assert (
+        with_surface_normals(observations(), None) is not None
+        and with_surface_normals(observations(), None).detail is None
+    )
     wide = msgspec.structs.replace(observations(), x=observations().x + 1)
     with pytest.raises(InputError, match="12 × 12"):
-        on_surface(wide, tmp_path / "surface")
+        with_surface_normals(wide, tmp_path / "surface")
 
 
 def test_the_solve_merges_only_what_has_one_detail_and_its_blocks_reflect_by_it(tmp_path):

@@ -102,7 +102,7 @@ def test_urm_and_export_place_a_scaled_mesh_alike(tmp_path, two):
     entry = msgspec.convert({"rotation": turn.tolist(), "translation": shift, "scale": scale}, ObjectEntry)
     poses, given = dict.fromkeys(("left", "right"), entry), mesh_of([ball(1.0, 3)])
     there = (given.vertices * scale) @ turn.T + shift
-    assert np.allclose(urm.occluders_of(two, poses).centre, (there.min(0) + there.max(0)) / 2, atol=1e-4)
+    assert np.allclose(urm.read_occluders(two, poses).centre, (there.min(0) + there.max(0)) / 2, atol=1e-4)
     (tmp_path / "meshes").mkdir()
     own = msgspec.convert(two.facts["dataset.objects"], ObjectsSlice)
     shape = MeshFiles(two, tmp_path, ["white"], 60.0, {}).shapes(own.objects[0], own.meshes, poses)[0]

@@ -5,8 +5,8 @@ import numpy as np
 import pytest
 
 from factorlib.errors import InputError
-from factorlib.geometry.met import BINS, UNMET
-from factorlib.urm.extract import Taken, observations_of_photo
+from factorlib.geometry.occluder_codes import BINS, NO_OCCLUDER
+from factorlib.urm.extract import PhotoSource, extract_observations
 from factorlib.urm.merge import merge
 from factorlib.urm.observations import (
     COLUMNS,
@@ -38,7 +38,7 @@ def photo_and_geometry(size=64):
 
 def observations(name="kitchen", illumination="kitchen", **changed):
     photo, geometry = photo_and_geometry()
-    return observations_of_photo({**photo, **changed}, geometry, Taken(name, illumination), ("red", "white"))
+    return extract_observations({**photo, **changed}, geometry, PhotoSource(name, illumination), ("red", "white"))
 
 
 def test_a_pixel_is_observed_where_mask_and_mesh_agree():
@@ -60,7 +60,7 @@ def with_columns(name="kitchen", count=64):
     """Observations with every column that need not be there; what hides directions is of material 0 or 1."""
     seen, random = observations(name, name), np.random.default_rng(0)
     visibility = (random.integers(0, 2, (len(seen), count)) * 255).astype(np.uint8)
-    met = np.where(visibility == 0, random.integers(0, 2 * BINS, visibility.shape), UNMET).astype(np.uint16)
+    met = np.where(visibility == 0, random.integers(0, 2 * BINS, visibility.shape), NO_OCCLUDER).astype(np.uint16)
     sure = np.linspace(0, 1, len(seen)).astype("f4")
     return msgspec.structs.replace(seen, visibility=visibility, met=met, confidence=sure, exposures=(2.0,))
 

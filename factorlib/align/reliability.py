@@ -17,24 +17,23 @@ import msgspec
 import numpy as np
 from scipy.spatial import cKDTree
 
-from factorlib.align.place import ObjectToPlace, Placed
-from factorlib.align.refine import FocalPrior, at_points, contour_of, normal_equations, rendered
-from factorlib.align.search import Found, Search, find, normal_difference, seen_in
-from factorlib.align.silhouette import Silhouette
-from factorlib.align.state import State, state_of
-from factorlib.align.target import Target, target_of
-from factorlib.geometry.camera import Camera
+from factorlib.align.photo_alignment import ObjectToAlign, PhotoAlignment
+from factorlib.align.refine import interpolate, mesh_contour, normal_equations, render
+from factorlib.align.search import PoseEstimate, SearchOptions, estimate_pose, normal_difference, render_maps
+from factorlib.align.state import PoseState, pose_state
+from factorlib.align.target import Target, make_target
+from factorlib.align.view import ObjectView
 from factorlib.geometry.raster import Caster
 
 LARGEST_MOVE = 0.5  # greatest move of one unknown (radians or log) for which the normal equations hold
 FITS_TO_A_PIXEL = 0.995  # no other pose fits clearly better than a pose of this score
-QUICK = Search(views=200, rolls=16, keep=(10, 5, 2, 1), steps=(4, 8, 8, 6), rivals=0)
+QUICK = SearchOptions(views=200, rolls=16, keep=(10, 5, 2, 1), steps=(4, 8, 8, 6), rivals=0)
 LEAST_SCORE_LEAD = 0.001  # share of the mask's pixels: a smaller lead is noise, however little is left unexplained
 DIFFERENT_DEG = 5.0  # a runner-up is a different answer if the median angle of normals exceeds this
 Share = Annotated[float, msgspec.Meta(ge=0, le=1)]
 
 
-class Trust(msgspec.Struct, frozen=True):
+class Reliability(msgspec.Struct, frozen=True):
     """Measures of reliability; None stands for a measure that was not taken.
 
     contour_error is a share of the mask's extent, mirrored_score a labelled IoU.
@@ -45,7 +44,7 @@ class Trust(msgspec.Struct, frozen=True):
     mirrored_score: float | None = None
 
 
-class Standards(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+class Thresholds(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """Thresholds that a pose must reach."""
 
     least_iou: Share = 0.7
@@ -60,140 +59,116 @@ class Standards(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """Least lead over the runner-up, as a share of what that leaves unexplained; below, the pose is doubtful."""
 
 
-def doubts(
-    iou: float, agreement: float, trust: Trust, found: Found | None, standards: Standards = Standards()
+def find_doubts(
+    iou: float,
+    agreement: float,
+    measures: Reliability,
+    estimate: PoseEstimate | None,
+    thresholds: Thresholds = Thresholds(),
 ) -> list[str]:
     """Return one sentence for each threshold that the pose misses.
 
     Args:
         iou: Overlap of mesh and mask.
         agreement: Share of the pixels of both whose materials agree.
-        trust: Measures of reliability.
-        found: Result of the search; None for a given pose.
-        standards: Thresholds.
+        measures: Measures of reliability.
+        estimate: Result of the search; None for a given pose.
+        thresholds: Thresholds.
 
     Returns:
         Sentences; none for a pose without doubt.
     """
     reasons = []
-    if iou < standards.least_iou:
+    if iou < thresholds.least_iou:
         reasons.append(f"mesh and mask overlap by {iou:.2f} only")
-    if agreement < standards.least_agreement:
+    if agreement < thresholds.least_agreement:
         reasons.append(f"the materials of mesh and mask agree on {agreement:.2f} of the pixels only")
-    if trust.contour_error > standards.most_contour_error:
+    if measures.contour_error > thresholds.most_contour_error:
+        distance = f"{measures.contour_error:.1%} of the mask's extent"
+        reasons.append(f"half of the contours of mesh and mask lie {distance} apart, or more")
+    if measures.normal_stderr_deg is not None and measures.normal_stderr_deg > thresholds.most_normal_stderr_deg:
+        reasons.append(f"the mask tells normals to {measures.normal_stderr_deg:.1f}° only")
+    if estimate and measures.mirrored_score is not None and 1 - measures.mirrored_score < (1 - estimate.score) / 2:
         reasons.append(
-            f"half of the contours of mesh and mask lie {trust.contour_error:.1%} of the mask's extent apart, or more"
-        )
-    if trust.normal_stderr_deg is not None and trust.normal_stderr_deg > standards.most_normal_stderr_deg:
-        reasons.append(f"the mask tells normals to {trust.normal_stderr_deg:.1f}° only")
-    if found and trust.mirrored_score is not None and 1 - trust.mirrored_score < (1 - found.score) / 2:
-        reasons.append(
-            f"the mirror image of the mask fits better ({trust.mirrored_score:.3f}, {found.score:.3f}): "
+            f"the mirror image of the mask fits better ({measures.mirrored_score:.3f}, {estimate.score:.3f}): "
             "was it mirrored?"
         )
-    if found and (other := found.runner_up) and other.normal_difference_deg > DIFFERENT_DEG:
-        lead = max(standards.least_lead * (1 - other.score), LEAST_SCORE_LEAD)
-        if found.score - other.score < lead:
+    if estimate and (other := estimate.runner_up) and other.normal_difference_deg > DIFFERENT_DEG:
+        lead = max(thresholds.least_lead * (1 - other.score), LEAST_SCORE_LEAD)
+        if estimate.score - other.score < lead:
             reasons.append(
                 f"another pose, its normals {other.normal_difference_deg:.0f}° away, fits as well "
-                f"({other.score:.3f}, {found.score:.3f})"
+                f"({other.score:.3f}, {estimate.score:.3f})"
             )
     return reasons
 
 
-def trust_in(obj: ObjectToPlace, placed: Placed, number: int) -> Trust:
+def measure_reliability(obj: ObjectToAlign, alignment: PhotoAlignment, number: int) -> Reliability:
     """Measure the reliability of the pose of `obj`; for a given pose, only the contours are compared.
 
     Args:
         obj: The object.
-        placed: Camera and poses of the photo.
-        number: Index of the object in `placed`.
+        alignment: Camera and poses of the photo.
+        number: Index of the object in `alignment`.
 
     Returns:
         The measures.
     """
-    found = placed.found[number]
+    estimate = alignment.estimates[number]
     caster = obj.caster
-    silhouette = obj.silhouette
-    camera = placed.camera
-    if not silhouette.inside.any():
-        return Trust(1.0)
-    target = target_of(silhouette, caster.mesh.labels, resolution=200)
-    if found is None:
-        return Trust(contour_error(caster, target, camera, state_of(placed.poses[number], camera, caster)))
-    may_be_mirrored = found.score < FITS_TO_A_PIXEL and not found.by_keypoints
-    return Trust(
-        contour_error(caster, target, camera, found.state),
-        normal_stderr_deg(caster, target, camera, found.state, placed.prior),
-        mirrored_score(caster, silhouette, camera, placed.prior) if may_be_mirrored else None,
+    if not obj.silhouette.inside.any():
+        return Reliability(1.0)
+    # the focal length counts as uncertain as it was before alignment
+    view = ObjectView(obj.silhouette, *alignment.prior)
+    target = make_target(view, caster.mesh.labels, resolution=200)
+    if estimate is None:
+        return Reliability(contour_error(caster, target, pose_state(alignment.poses[number], alignment.camera, caster)))
+    may_be_mirrored = estimate.score < FITS_TO_A_PIXEL and estimate.source != "keypoints"
+    return Reliability(
+        contour_error(caster, target, estimate.state),
+        normal_stderr_deg(caster, target, estimate.state),
+        mirrored_score(caster, view) if may_be_mirrored else None,
     )
 
 
-def contour_error(caster: Caster, target: Target, camera: Camera, state: State) -> float:
+def contour_error(caster: Caster, target: Target, state: PoseState) -> float:
     """Return the median distance between the contours of mesh and mask, as a share of the mask's extent.
 
-    Args:
-        caster: The mesh.
-        target: Window about the mask.
-        camera: The photo's camera.
-        state: State of the mesh.
-
-    Returns:
-        The median; 1 if there are no contours.
+    It is 1 if there are no contours.
     """
-    seen = rendered(caster, target, camera, state)
+    rendering = render(caster, target, state)
     distances = [np.zeros(0)]
-    for name, region in target.regions.items():
-        points, _ = contour_of(seen, name)
-        distances.append(np.abs(at_points(region.distance, points)))
+    for label, region in target.regions.items():
+        points, _ = mesh_contour(rendering, label)
+        # mesh → mask: signed distance; mask → mesh: distance to the nearest point
+        distances.append(np.abs(interpolate(region.distance, points)))
         if len(points) and len(region.contour):
             distances.append(cKDTree(points).query(region.contour)[0])
         else:
             distances.append(np.full(len(region.contour), target.extent))
-    every = np.concatenate(distances)
-    return float(np.median(every) / target.extent) if len(every) else 1.0
+    together = np.concatenate(distances)
+    return float(np.median(together) / target.extent) if len(together) else 1.0
 
 
-def normal_stderr_deg(caster: Caster, target: Target, camera: Camera, state: State, prior: FocalPrior) -> float:
+def normal_stderr_deg(caster: Caster, target: Target, state: PoseState) -> float:
     """Return the standard error of the normals in degrees.
 
     It is the root of summed squares, over the independent directions of the unknowns, of the normals' median rotation
     by one standard error.
-
-    Args:
-        caster: The mesh.
-        target: Window about the mask.
-        camera: The photo's camera.
-        state: State of the mesh.
-        prior: Prior of the focal length.
-
-    Returns:
-        An angle.
     """
-    information, _ = normal_equations(rendered(caster, target, camera, state), target, prior)
-    turns = []
-    free = prior.free
-    unmoved = seen_in(caster, target, camera, state)
+    information, _ = normal_equations(render(caster, target, state))
+    angles = []
+    free = target.view.free
+    unmoved = render_maps(caster, target, state)
     # move the state by one standard error along each eigenvector of the information
     precisions, directions = np.linalg.eigh(information[:free, :free])
     for precision, direction in zip(precisions, directions.T, strict=True):
         move = direction * min(max(precision, 1e-12) ** -0.5, LARGEST_MOVE / np.abs(direction).max())
         moved = state.moved(np.append(move, np.zeros(7 - free)))
-        turns.append(normal_difference(unmoved, seen_in(caster, target, camera, moved)))
-    return float(np.sqrt(np.sum(np.square(turns))))
+        angles.append(normal_difference(unmoved, render_maps(caster, target, moved)))
+    return float(np.sqrt(np.sum(np.square(angles))))
 
 
-def mirrored_score(caster: Caster, silhouette: Silhouette, camera: Camera, prior: FocalPrior) -> float:
-    """Return the best score for the photo with left and right exchanged.
-
-    Args:
-        caster: The mesh.
-        silhouette: The mask.
-        camera: The photo's camera.
-        prior: Prior of the focal length.
-
-    Returns:
-        A labelled IoU.
-    """
-    camera = msgspec.structs.replace(camera, centre=(camera.width - camera.centre[0], camera.centre[1]))
-    return find(caster, Silhouette(np.ascontiguousarray(silhouette.label[:, ::-1])), camera, prior, QUICK).score
+def mirrored_score(caster: Caster, view: ObjectView) -> float:
+    """Return the best score for the photo with left and right exchanged, a labelled IoU."""
+    return estimate_pose(caster, view.mirrored(), QUICK).score

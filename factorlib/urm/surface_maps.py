@@ -27,7 +27,7 @@ def read_geometry(align: Path, surface: Path | None, photo: str) -> dict[str, Fl
     return {**read_exr(align / f"{photo}.exr"), **_normals(surface, photo)}
 
 
-def on_surface(seen: Observations, surface: Path | None) -> Observations:
+def with_surface_normals(observations: Observations, surface: Path | None) -> Observations:
     """Replace normals and detail of one photo's observations by those in the folder of `surface`, if it has any.
 
     A merged observation gets the normal of the first pixel of its group.
@@ -35,19 +35,19 @@ def on_surface(seen: Observations, surface: Path | None) -> Observations:
     Raises:
         InputError: If the maps have another size than the photo.
     """
-    if not seen.photos or not (maps := _normals(surface, seen.photos[0])):
-        return seen
+    if not observations.photos or not (maps := _normals(surface, observations.photos[0])):
+        return observations
     height, width = maps["normal.x"].shape
-    if len(seen) and (seen.x.max() >= width or seen.y.max() >= height):
+    if len(observations) and (observations.x.max() >= width or observations.y.max() >= height):
         cure = "run the stage `surface` again"
         raise InputError(
-            f"its normals are of a picture of {width} × {height}", file=surface, key=seen.photos[0], cure=cure
+            f"its normals are of a picture of {width} × {height}", file=surface, key=observations.photos[0], cure=cure
         )
-    normal = np.stack([maps[f"normal.{axis}"][seen.y, seen.x] for axis in "xyz"], axis=-1)
+    normal = np.stack([maps[f"normal.{axis}"][observations.y, observations.x] for axis in "xyz"], axis=-1)
     known = (normal != 0).any(1, keepdims=True)
-    detail = np.where(known[:, 0], maps["detail"][seen.y, seen.x], 1.0).astype(np.float32)
-    normal = np.where(known, normal, seen.normal).astype(np.float32)
-    return msgspec.structs.replace(seen, normal=normal, detail=detail)
+    detail = np.where(known[:, 0], maps["detail"][observations.y, observations.x], 1.0).astype(np.float32)
+    normal = np.where(known, normal, observations.normal).astype(np.float32)
+    return msgspec.structs.replace(observations, normal=normal, detail=detail)
 
 
 def _normals(surface: Path | None, photo: str) -> dict[str, Float[np.ndarray, "h w"]]:

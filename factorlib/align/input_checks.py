@@ -10,7 +10,7 @@ from collections.abc import Iterable, Sequence
 import numpy as np
 from jaxtyping import Float
 
-from factorlib.align.place import KnownFocal
+from factorlib.align.photo_alignment import KnownFocal
 from factorlib.dataset.schema import ExternalCamera, ObjectsSlice, Vec2
 from factorlib.errors import InputError
 from factorlib.geometry.camera import Camera, Pose
@@ -41,9 +41,9 @@ def check_before_camera(mesh: Mesh, pose: Pose, photo: str, name: str, source: s
     depth = pose.apply(mesh.vertices)[:, 2]
     middle = float(pose.apply(mesh.centre[None])[0, 2])
     if depth.max() <= 0 or middle <= 0:
-        what = f"object {name!r}" if depth.max() <= 0 else f"the middle of object {name!r}"
+        subject = f"object {name!r}" if depth.max() <= 0 else f"the middle of object {name!r}"
         raise InputError(
-            f"{what} is not before the camera: z = {middle:.4g}",
+            f"{subject} is not before the camera: z = {middle:.4g}",
             file="dataset.yaml",
             key=f"photos[{photo}].objects[{name}].pose"
             if source == "dataset"
@@ -64,18 +64,18 @@ def check_before_camera(mesh: Mesh, pose: Pose, photo: str, name: str, source: s
 
 
 def warn_of_materials(
-    label: Float[np.ndarray, "h w"], of_objects: Iterable[Sequence[int]], materials: Sequence[str], photo: str
+    label: Float[np.ndarray, "h w"], object_labels: Iterable[Sequence[int]], materials: Sequence[str], photo: str
 ) -> None:
     """Warn of materials of the mask that no object of the photo has; their pixels get no normals and are not used.
 
     Args:
         label: Label of each pixel; k stands for `materials[k - 1]`, 0 for background.
-        of_objects: Labels of the materials of each object.
+        object_labels: Labels of the materials of each object.
         materials: Names of all materials.
         photo: Name of the photo.
     """
     labels, counts = np.unique(np.round(label[label > 0.5]).astype(int), return_counts=True)
-    known = {int(k) for labels_of_one in of_objects for k in labels_of_one}
+    known = {int(k) for each in object_labels for k in each}
     for k, count in zip(labels.tolist(), counts.tolist()):
         if k not in known:
             log.warning(
@@ -118,7 +118,7 @@ def warn_of_camera(focal: float | None, centre: tuple[float, float], size: tuple
             )
 
 
-def focal_and_centre(external: ExternalCamera, width: int, height: int, photo: str) -> tuple[float, Vec2]:
+def convert_intrinsics(external: ExternalCamera, width: int, height: int, photo: str) -> tuple[float, Vec2]:
     """Convert focal length and principal point of an external source's image to pixels of the photo, as displayed.
 
     Args:
@@ -135,32 +135,16 @@ def focal_and_centre(external: ExternalCamera, width: int, height: int, photo: s
     """
     size = external.size
     point = external.principal_point
-    fault = None
-
-    def is_resized(size: tuple[float, float]) -> bool:
-        """Return whether the ratio of the longer sides gives the shorter one to within a pixel."""
-        (long, short), (longer, shorter) = (size, (width, height)) if width >= height else (size[::-1], (height, width))
-        return abs(short * longer / long - shorter) <= MOST_ROUNDED_PX
-
+    fault = cure = None
     # photo pixels per image pixel across and down: equal but for the rounding of the photo's shorter side
     across = down = 1.0 if size is None else width / size[0]
-    if size is not None and (tall := size[1]) is not None:
-        down = height / tall
-        image = (size[0], tall)
-        sizes = f"the photo has {width}×{height} pixels, its image in the source {size[0]:g}×{tall:g}"
-        if not is_resized(image):
-            cure = "give the image itself, or the same at another size, and masks of it"
-            fault = f"{sizes}: it was cropped or squeezed"
-            if is_resized(image[::-1]):
-                fault = f"{sizes}: it was made of the photo before its EXIF orientation was applied"
-                cure = (
-                    "turn the photo's own pixels upright (ImageMagick: mogrify -auto-orient) and make the source of "
-                    "those"
-                )
+    if size is not None and size[1] is not None:
+        down = height / size[1]
+        fault, cure = _compare_sizes((size[0], size[1]), (width, height))
     centre = (width / 2, height / 2) if point is None else (point[0] * across, point[1] * down)
     if size is None and not all(INNER[0] * side <= c <= INNER[1] * side for side, c in zip((width, height), centre)):
-        where = f"({centre[0]:.0f}, {centre[1]:.0f}) is far from the middle of the photo's {width}×{height} pixels"
-        fault = f"its principal point {where}"
+        position = f"({centre[0]:.0f}, {centre[1]:.0f}) is far from the middle of the photo's {width}×{height} pixels"
+        fault = f"its principal point {position}"
         cure = (
             "give the photo at the size that the source was made of, or its camera in dataset.yaml (camera, and pose "
             "of its objects)"
@@ -170,7 +154,27 @@ def focal_and_centre(external: ExternalCamera, width: int, height: int, photo: s
     return external.focal_px * (across if width >= height else down), centre
 
 
-def camera_of(slice_: ObjectsSlice, facts: PhotoFacts, photo: str) -> tuple[Camera, KnownFocal]:
+def _compare_sizes(image: tuple[float, float], photo: tuple[int, int]) -> tuple[str | None, str | None]:
+    """Return fault and cure if a photo cannot be an image at another size, by width and height; else None twice."""
+
+    def is_resized(size: tuple[float, float]) -> bool:
+        """Return whether the ratio of the longer sides gives the shorter one to within a pixel."""
+        (long, short), (longer, shorter) = (size, photo) if photo[0] >= photo[1] else (size[::-1], photo[::-1])
+        return abs(short * longer / long - shorter) <= MOST_ROUNDED_PX
+
+    if is_resized(image):
+        return None, None
+    sizes = f"the photo has {photo[0]}×{photo[1]} pixels, its image in the source {image[0]:g}×{image[1]:g}"
+    if is_resized(image[::-1]):
+        return (
+            f"{sizes}: it was made of the photo before its EXIF orientation was applied",
+            "turn the photo's own pixels upright (ImageMagick: mogrify -auto-orient) and make the source of those",
+        )
+    cure = "give the image itself, or the same at another size, and masks of it"
+    return f"{sizes}: it was cropped or squeezed", cure
+
+
+def camera_of_photo(slice_: ObjectsSlice, facts: PhotoFacts, photo: str) -> tuple[Camera, KnownFocal]:
     """Return the photo's camera without its focal length, and the prior knowledge of the focal length.
 
     dataset.yaml takes precedence over the dataset's source of cameras, which takes precedence over EXIF and the photo's
@@ -190,7 +194,7 @@ def camera_of(slice_: ObjectsSlice, facts: PhotoFacts, photo: str) -> tuple[Came
     source = facts.focal_source
     centre = (width / 2, height / 2)
     if slice_.external is not None and (source != "dataset" or slice_.camera.principal_point is None):
-        external_focal, centre = focal_and_centre(slice_.external, width, height, photo)
+        external_focal, centre = convert_intrinsics(slice_.external, width, height, photo)
         if source != "dataset":
             focal = external_focal / factor
             source = slice_.external.source

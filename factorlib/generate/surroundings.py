@@ -82,8 +82,8 @@ def daylight(rng: Rng, elevation_deg: float, azimuth_deg: float, turbidity: floa
         "sun_direction": [float(c) for c in sun],
         "to_world": transform(Y_UP_FROM_Z_UP),
     }
-    seen = light_seen({"sky": sky}, np.eye(4), rows, 4, 0, max_depth=2)
-    scene = {"sky": envmap(seen, finer=2), "ground": wall("-y", EYE, (200, 200), GROUND)}
+    sky_map = light_seen({"sky": sky}, np.eye(4), rows, 4, 0, max_depth=2)
+    scene = {"sky": envmap(sky_map, finer=2), "ground": wall("-y", EYE, (200, 200), GROUND)}
     for k in range(4):  # coloured blocks some metres away, none in front of the sun
         angle = np.radians(azimuth_deg + 60 + 80 * k + rng.uniform(-20, 20))
         size = np.array([rng.uniform(1.5, 3), rng.uniform(1, 3), rng.uniform(1, 2)])
@@ -123,7 +123,8 @@ def room(rng: Rng, windows: int, lamps: int, clear_deg: float = 0.0, clear_half_
     for k, side in enumerate(rng.permutation(sides)[:windows]):
         distance = (half[0] if side[1] == "x" else half[2]) - 0.03
         day = rng.uniform(9, 16) * np.array([0.85, 1.0, 1.15])
-        pane, shift = (rng.uniform(0.5, 0.9), 0.7), (rng.uniform(-1, 1), 0.45)
+        pane = rng.uniform(0.5, 0.9), 0.7
+        shift = rng.uniform(-1, 1), 0.45
         scene[f"window_{k}"] = wall(side, distance, pane, 0, shift, glow=day)
     for k in range(lamps):
         across = rng.uniform(0.5, 0.8) * half[0] * rng.choice([-1, 1])
