@@ -25,8 +25,8 @@ from factorlib.inference.surface_attach import attached_pixels
 from factorlib.inference.surface_detail import Found, Surfaces, found
 from factorlib.inference.surface_turns import Attached, Detail, joined, no_detail
 from factorlib.jsonfile import write_json
-from factorlib.meshes.fine import fine
 from factorlib.meshes.read import CREASE_DEG, MeshesOnce
+from factorlib.meshes.subdivision import subdivided_mesh
 from factorlib.reflection import reflection_operator
 from factorlib.results.poses import FILE as POSES
 from factorlib.results.poses import PhotoPoses, read_poses
@@ -140,7 +140,7 @@ def surfaces_of(inputs: Inputs, slices: dict[str, ObjectsSlice]) -> Surfaces:
     for slice_ in slices.values():
         for own in slice_.objects:
             if own.mesh not in meshes and not slice_.meshes[own.mesh].revolved:
-                meshes[own.mesh] = fine(read.mesh(own.mesh, slice_.meshes[own.mesh], own.materials))
+                meshes[own.mesh] = subdivided_mesh(read.mesh(own.mesh, slice_.meshes[own.mesh], own.materials))
     return Surfaces(dict(sorted(meshes.items())))
 
 

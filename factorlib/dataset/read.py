@@ -12,7 +12,7 @@ from pathlib import Path, PurePosixPath
 from typing import Any
 
 from factorlib.dataset.check import check_dataset, check_lights, check_truth
-from factorlib.dataset.gltf import buffer_path, read_header
+from factorlib.dataset.gltf_header import buffer_path, read_header
 from factorlib.dataset.paths import Refusal, is_there
 from factorlib.dataset.schema import Dataset, DatasetFile, ExternalCamera, TruthFile
 from factorlib.errors import InputError, raise_all

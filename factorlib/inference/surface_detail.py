@@ -42,7 +42,7 @@ from factorlib.inference.problem import JointProblem
 from factorlib.inference.start import Beginning, Start, on_cells
 from factorlib.inference.surface_turns import Attached, Detail, Part, Stiffness, no_detail, part_of, step
 from factorlib.light.prior import LightPrior, read_light_prior
-from factorlib.meshes.fine import Fine
+from factorlib.meshes.subdivision import SubdividedMesh
 from factorlib.results.materials import Decision
 
 # Stiffness of turns: a of `factorlib.inference.surface_turns`; b is a share of it.
@@ -60,7 +60,7 @@ OWN_LIGHT = 2  # factorisations in the fit of a held-out photo's light
 class Surfaces(msgspec.Struct, frozen=True):
     """Subdivided meshes of a set by name, in the order of their nodes' numbers."""
 
-    meshes: dict[str, Fine]
+    meshes: dict[str, SubdividedMesh]
 
     @property
     def first(self) -> dict[str, int]:
@@ -82,7 +82,7 @@ class Surfaces(msgspec.Struct, frozen=True):
     ) -> dict[str, Float[np.ndarray, " n"]]:
         """Return the displacement of each mesh that best explains the turns of its nodes, in extents.
 
-        Nodes count by the observations attached to them (`Fine.displacement`).
+        Nodes count by the observations attached to them (`SubdividedMesh.displacement`).
         """
         weight = sum(np.bincount(of.node.reshape(-1), of.share.reshape(-1), self.nodes) for of in attached)
         turns = self.by_mesh(turn)

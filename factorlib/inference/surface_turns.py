@@ -1,6 +1,6 @@
 """Turns of normals that all photos of a mesh share, and one Gauss–Newton step of them with the lights eliminated.
 
-Node v of a subdivided mesh (`factorlib.meshes.fine`) has a turn δ_v, in the object's frame.  An observation whose pixel
+Node v of a subdivided mesh (`meshes.subdivision`) has a turn δ_v, in the object's frame.  An observation whose pixel
 shows the nodes v_1, v_2, v_3 with barycentric coordinates b_k has the normal
 
     n' = unit(n + P R Σ_k b_k δ_{v_k}),     R: light's frame from object's, P = 1 − n nᵀ                             (1)

@@ -12,14 +12,14 @@ import numpy as np
 
 from factorlib.errors import InputError
 from factorlib.meshes.limits import Limits
-from factorlib.meshes.soup import Soup, lines_of, quoted
+from factorlib.meshes.triangle_soup import TriangleSoup, lines_of, quoted
 
 MOST = 2**31  # greatest index in any file
 COUNTED_EVERY = 4096  # number of lines between two checks of the number of triangles
 CONTINUED = re.compile(rb"\\(\r\n|\r|\n|\Z)")  # line that continues in the next
 
 
-def read_obj(path: Path, content: bytes, limits: Limits) -> Soup:
+def read_obj(path: Path, content: bytes, limits: Limits) -> TriangleSoup:
     """Read the triangles of an OBJ file, with parts named by (usemtl, groups…, object).
 
     Args:
@@ -78,7 +78,7 @@ def read_obj(path: Path, content: bytes, limits: Limits) -> Soup:
     index[(index < 0) | (index >= len(normals))] = len(normals) - 1
     vertices = np.array(table["v"], dtype=float).reshape(-1, 3)
     triangles = np.array(faces, dtype=np.int64).reshape(-1, 3)
-    return Soup(vertices, triangles, np.array(part, dtype=np.int64), list(parts), normals[index])
+    return TriangleSoup(vertices, triangles, np.array(part, dtype=np.int64), list(parts), normals[index])
 
 
 def _index(word: str, count: int) -> int:

@@ -12,7 +12,7 @@ import numpy as np
 from factorlib.errors import InputError
 from factorlib.meshes.limits import Limits
 from factorlib.meshes.mesh import Mesh
-from factorlib.meshes.soup import Soup, fans, floats, lines_of, numbers_in, of_one_part, quoted
+from factorlib.meshes.triangle_soup import TriangleSoup, fans, floats, lines_of, numbers_in, quoted, single_part_soup
 from factorlib.wholefile import write_bytes
 
 TYPES = {
@@ -38,7 +38,7 @@ Properties = dict[str, tuple[str, str | None]]  # NumPy types of the numbers, an
 Column = tuple[np.ndarray, np.ndarray]  # the numbers of all rows, concatenated, and the count of each row
 
 
-def read_ply(path: Path, content: bytes, limits: Limits) -> Soup:
+def read_ply(path: Path, content: bytes, limits: Limits) -> TriangleSoup:
     """Read vertices, polygons and, if all of nx, ny, nz are present, normals of a PLY file; textures are ignored.
 
     Args:
@@ -72,7 +72,7 @@ def read_ply(path: Path, content: bytes, limits: Limits) -> Soup:
     points = np.stack([numbers[n] for n in "xyz"], axis=1)
     of_normals = "nx", "ny", "nz"
     normals = np.stack([numbers[n] for n in of_normals], axis=1) if set(of_normals) <= numbers.keys() else None
-    return of_one_part(points, fans(sizes, corners), path.stem, normals)
+    return single_part_soup(points, fans(sizes, corners), path.stem, normals)
 
 
 def _header(path: Path, content: bytes) -> tuple[str, dict[str, tuple[int, Properties]], int]:

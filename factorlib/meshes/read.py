@@ -14,15 +14,15 @@ import numpy as np
 
 from factorlib.dataset.schema import MeshEntry
 from factorlib.errors import InputError, did_you_mean
-from factorlib.meshes.fine import fine
-from factorlib.meshes.gltf import check_count, read_gltf
+from factorlib.meshes.gltf_mesh import read_gltf
 from factorlib.meshes.limits import NO_LIMITS, Limits
 from factorlib.meshes.mesh import Mesh, area_vectors
 from factorlib.meshes.normals import consistently_wound, corner_normals, welded
 from factorlib.meshes.obj import read_obj
 from factorlib.meshes.ply import read_ply
-from factorlib.meshes.soup import Soup, check
-from factorlib.meshes.stl import read_off, read_stl
+from factorlib.meshes.stl_off import read_off, read_stl
+from factorlib.meshes.subdivision import subdivided_mesh
+from factorlib.meshes.triangle_soup import TriangleSoup, check
 from factorlib.reading import one_line, read_bytes, reading
 
 WITHIN = {".obj": read_obj, ".ply": read_ply, ".stl": read_stl, ".off": read_off}  # formats of a single file
@@ -113,7 +113,7 @@ class MeshesOnce:
             file = self.path(name, entry.file)
             mesh = read_mesh(file, self.materials, entry.made_of, overrides, self.crease_deg, NO_LIMITS)
             if name in self.displacements or name in self.log_factors:
-                dense = fine(mesh)
+                dense = subdivided_mesh(mesh)
                 still = np.zeros(dense.nodes)
                 moves, factors = (np.array(of.get(name, still)) for of in (self.displacements, self.log_factors))
                 if not len(moves) == len(factors) == dense.nodes:
@@ -126,19 +126,19 @@ class MeshesOnce:
         return self._meshes[key]
 
 
-def _soup(path: str | Path, limits: Limits | None) -> Soup:
+def _soup(path: str | Path, limits: Limits | None) -> TriangleSoup:
     """Read a file by its format and check the result."""
     path = Path(path)
     limits = limits or Limits()
     suffix = path.suffix.lower()
     if suffix not in FORMATS:
         raise InputError(f"unknown mesh format {path.suffix!r}", file=path, cure="use one of " + ", ".join(FORMATS))
-    with reading(f"a mesh ({suffix[1:].upper()})", path, cure=CURE):
+    with reading(f"a mesh ({suffix[1:].upper()})", path, cure=CURE, also=(NameError,)):  # trimesh
         if suffix in WITHIN:
             soup = WITHIN[suffix](path, read_bytes(path, "a mesh", most_bytes=limits.bytes), limits)
         else:
             soup = read_gltf(path, limits)
-    check_count(len(soup.parts), path)
+    limits.check_parts(len(soup.parts), path)
     return check(soup, path)
 
 
@@ -192,7 +192,7 @@ def part_labels(
     return np.array(labels, dtype=np.int16)
 
 
-def usable(soup: Soup, face_label: np.ndarray, crease_deg: float, file: str | Path) -> Mesh:
+def usable(soup: TriangleSoup, face_label: np.ndarray, crease_deg: float, file: str | Path) -> Mesh:
     """Weld vertices, drop zero-area and duplicate faces, orient the faces consistently, and compute normals.
 
     Args:
@@ -230,7 +230,7 @@ def usable(soup: Soup, face_label: np.ndarray, crease_deg: float, file: str | Pa
     )
 
 
-def solid(soup: Soup, file: str | Path) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def solid(soup: TriangleSoup, file: str | Path) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return welded vertices, the faces on them, and a mask of the faces that have an area and are no duplicates.
 
     The others are counted in the log.

@@ -13,8 +13,8 @@ from factorlib.inference.problem import JointProblem
 from factorlib.inference.start import from_nothing
 from factorlib.inference.surface_detail import Found, Surfaces, found
 from factorlib.inference.surface_turns import GRAZING, MOST, PULL, Attached, Detail, Stiffness, part_of, step
-from factorlib.meshes.fine import Fine
 from factorlib.meshes.mesh import Mesh
+from factorlib.meshes.subdivision import SubdividedMesh
 from studies.scenes.problems import MATERIALS
 from tests.inference.made import in_units_of, photos_in_a_wrong_light
 from tests.inference.made_lights import PRIOR, begun, drawn, light_of, on_even_cells, photographed, spheres
@@ -28,7 +28,9 @@ def surfaces(subdivisions: int = 3) -> Surfaces:
     """A ball of radius 1, no finer than the icosphere."""
     solid = trimesh.creation.icosphere(subdivisions)
     vertices, faces, label = np.array(solid.vertices), np.array(solid.faces), np.ones(len(solid.faces), np.int16)
-    return Surfaces({"ball": Fine(Mesh(vertices, faces, vertices, label), np.arange(len(vertices)), faces, 2.0)})
+    return Surfaces(
+        {"ball": SubdividedMesh(Mesh(vertices, faces, vertices, label), np.arange(len(vertices)), faces, 2.0)}
+    )
 
 
 def attached_to(normal: np.ndarray, body: Surfaces) -> Attached:

@@ -13,9 +13,9 @@ from factorlib.generate.shapes import sphere
 from factorlib.images.exr import write_exr
 from factorlib.inference.noise import Noise
 from factorlib.inference.observed import blocks_of_observations, gathered
-from factorlib.meshes.fine import fine
 from factorlib.meshes.ply import write_ply
 from factorlib.meshes.read import CREASE_DEG, MeshesOnce, read_mesh
+from factorlib.meshes.subdivision import subdivided_mesh
 from factorlib.results.materials import Reflectance
 from factorlib.results.surface import SurfaceTable, read_surface
 from factorlib.stage import Inputs, serial_map, silent
@@ -85,7 +85,7 @@ def test_off_writes_a_table_of_nothing_and_needs_nothing(tmp_path):
 
 def test_meshes_are_moved_and_painted_wherever_they_are_read(tmp_path):
     write_ply(tmp_path / "ball.ply", sphere(1.0))
-    dense = fine(read_mesh(tmp_path / "ball.ply", ["red"], "red"))
+    dense = subdivided_mesh(read_mesh(tmp_path / "ball.ply", ["red"], "red"))
     table = {"ball": np.full(dense.nodes, 0.05).tolist()}
     once = MeshesOnce(lambda _, file: tmp_path / file, ["red"], CREASE_DEG, table, table)
     mesh = once.mesh("ball", MeshEntry("ball.ply", material="red"))

@@ -22,7 +22,7 @@ QUOTED = 80  # number of characters of a line in a message
 LONGEST = 2_000_000  # number of characters of a line; each of its words becomes an object
 
 
-class Soup(msgspec.Struct, frozen=True):
+class TriangleSoup(msgspec.Struct, frozen=True):
     """Triangles as read from a file.
 
     vertices  [V, 3] float64
@@ -46,7 +46,9 @@ def floats(values: np.ndarray) -> Float[np.ndarray, "..."]:
         return np.asarray(values, dtype=float)
 
 
-def of_one_part(vertices: np.ndarray, faces: np.ndarray, name: str, normals: np.ndarray | None = None) -> Soup:
+def single_part_soup(
+    vertices: np.ndarray, faces: np.ndarray, name: str, normals: np.ndarray | None = None
+) -> TriangleSoup:
     """Build a soup whose faces are all one part.
 
     Args:
@@ -59,8 +61,10 @@ def of_one_part(vertices: np.ndarray, faces: np.ndarray, name: str, normals: np.
         The soup.
     """
     faces = np.asarray(faces, np.int64).reshape(-1, 3)
-    of_corners = no_normals(len(faces)) if normals is None else at_corners(normals, faces)
-    return Soup(floats(vertices).reshape(-1, 3), faces, np.zeros(len(faces), np.int64), [(name,)], of_corners)
+    corner_normals = no_normals(len(faces)) if normals is None else normals_at_corners(normals, faces)
+    return TriangleSoup(
+        floats(vertices).reshape(-1, 3), faces, np.zeros(len(faces), np.int64), [(name,)], corner_normals
+    )
 
 
 def no_normals(faces: int) -> Float[np.ndarray, "f 3 3"]:
@@ -68,7 +72,7 @@ def no_normals(faces: int) -> Float[np.ndarray, "f 3 3"]:
     return np.full((faces, 3, 3), np.nan)
 
 
-def at_corners(normals: Float[np.ndarray, "v 3"], faces: Int[np.ndarray, "f 3"]) -> Float[np.ndarray, "f 3 3"]:
+def normals_at_corners(normals: Float[np.ndarray, "v 3"], faces: Int[np.ndarray, "f 3"]) -> Float[np.ndarray, "f 3 3"]:
     """Convert normals by vertex to normals by corner, NaN where a face's index is out of range."""
     exists = (faces >= 0) & (faces < len(normals))
     table = np.concatenate([floats(normals), np.full((1, 3), np.nan)])
@@ -89,7 +93,7 @@ def fans(counts: Int[np.ndarray, " n"], corners: Int[np.ndarray, " c"]) -> Int[n
     return np.stack([corners[first], corners[first + within + 1], corners[first + within + 2]], axis=1).astype(np.int64)
 
 
-def check(soup: Soup, file: str | Path) -> Soup:
+def check(soup: TriangleSoup, file: str | Path) -> TriangleSoup:
     """Check a soup and return it.
 
     Raises:

@@ -20,7 +20,7 @@ LEVEL = 1e-3  # weight that keeps the mean displacement at zero, relative to the
 UNSEEN = 0.05  # weight of the gradient where no photo sees the surface
 
 
-def subdivided(mesh: Mesh, longest: float) -> Mesh:
+def subdivide(mesh: Mesh, longest: float) -> Mesh:
     """Subdivide the mesh until every edge is at most `longest` long, in units of the mesh.
 
     New vertices lie on the old triangles and have interpolated normals.
@@ -68,7 +68,7 @@ PIECES = {
 }
 
 
-class Fine(msgspec.Struct, frozen=True):
+class SubdividedMesh(msgspec.Struct, frozen=True):
     """Subdivided mesh and its v nodes.
 
     mesh    subdivided mesh, which may have several vertices at one position
@@ -167,9 +167,9 @@ class Fine(msgspec.Struct, frozen=True):
         return msgspec.structs.replace(self.mesh, vertices=place, normals=normal)
 
 
-def fine(mesh: Mesh) -> Fine:
+def subdivided_mesh(mesh: Mesh) -> SubdividedMesh:
     """Subdivide the mesh to edges of `LONGEST` times its extent."""
     extent = float(np.ptp(mesh.vertices[np.unique(mesh.faces)], axis=0).max())
-    dense = subdivided(mesh, LONGEST * extent)
+    dense = subdivide(mesh, LONGEST * extent)
     node = welded(dense.vertices)
-    return Fine(dense, node, node[dense.faces], extent)
+    return SubdividedMesh(dense, node, node[dense.faces], extent)
