@@ -21,7 +21,7 @@ from factorlib.errors import InputError
 from factorlib.geometry.camera import Pose
 from factorlib.geometry.raster import Caster, Maps, rasterise
 from factorlib.images.exr import read_exr, write_exr
-from factorlib.images.lens import lens_of
+from factorlib.images.lens import radial_lens
 from factorlib.images.picture import write_png
 from factorlib.jsonfile import write_json
 from factorlib.meshes.limits import Limits
@@ -132,13 +132,13 @@ def objects_of(
         before = earlier.objects.get(own.name) if earlier and given is None else None
         file = inputs.mesh(own.mesh, mesh.file)
         scale = before.scale if before else AS_IT_IS
-        read = read_mesh(file, materials, mesh.made_of, own.materials, params.crease_deg, params.limits)
+        read = read_mesh(file, materials, mesh.part_materials, own.materials, params.crease_deg, params.limits)
         silhouette = silhouette_of_object(channels, number, read.labels, own.mask is not None)
         pose = Pose(np.array(given.rotation), np.array(given.translation)) if given is not None else None
         if own.keypoints:  # pixels of the file, to undistorted pixels of the reduced photo
             pixels, points = (np.array([getattr(k, of) for k in own.keypoints]) for of in ("pixel", "point"))
             pixels = pixels / factor
-            lens = lens_of(slice_.camera, factor, *channels["label"].shape[::-1])
+            lens = radial_lens(slice_.camera, factor, *channels["label"].shape[::-1])
             keypoints = Keypoints(lens.undistorted(pixels) if lens else pixels, points)
         caster = Caster(scaled(read, scale))
         objects.append(ObjectToPlace(own.name, caster, silhouette, pose, keypoints, before, scale))

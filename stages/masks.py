@@ -15,10 +15,10 @@ from factorlib.dataset.schema import LEFT_OUT, PhotoSlice
 from factorlib.errors import InputError
 from factorlib.images.boxes import box_majority, least_factor
 from factorlib.images.exr import write_exr
-from factorlib.images.lens import Undistorted, lens_of
+from factorlib.images.lens import Undistorted, radial_lens
 from factorlib.images.limits import MOST_MEGAPIXELS, check_pixels
 from factorlib.images.photo import Photo, check_bright, decoded, open_photo
-from factorlib.images.processing import HALO, camera_says, halo
+from factorlib.images.processing import HALO, halo, reported_processing
 from factorlib.images.raw import is_raw
 from factorlib.jsonfile import write_json
 from factorlib.labels.labels import Labels, read_labels, read_objects
@@ -60,30 +60,30 @@ def main(params: Params, inputs: Inputs, out: Path, progress: Progress = silent)
     materials = inputs.facts["dataset.materials"]
     path = inputs.file(facts.image)
     entry = f"photos[{name}]"
-    stored = open_photo(path, f"{entry}.image")
-    height, width = stored.size
+    opened = open_photo(path, f"{entry}.image")
+    height, width = opened.size
     key = f"{entry}.masks"
-    check_pixels(stored.size, params.most_megapixels, path, f"{entry}.image")
+    check_pixels(opened.size, params.most_megapixels, path, f"{entry}.image")
     progress(0, 3, f"{name}: masks")  # read first: they give the factor by which the photo is reduced while it is read
-    labels = read_labels(facts.masks, inputs.file, materials, stored.size, facts.image, key)
+    labels = read_labels(facts.masks, inputs.file, materials, opened.size, facts.image, key)
     own_masks = [(o.name, o.mask) for o in facts.objects]
-    objects = read_objects(own_masks, inputs.file, stored.size, f"{entry}.objects")
+    objects = read_objects(own_masks, inputs.file, opened.size, f"{entry}.objects")
     # smallest integer factor at which materials and frame fit their limits
     materials_fit = least_factor(int(np.count_nonzero(labels.label)), params.pixels)
     factor = min(max(materials_fit, least_factor(height * width, params.frame)), height, width)
     labels = reduced(labels, factor, path, key)
     objects = box_majority(objects, factor)
     progress(1, 3, f"{name}: photo")
-    photo = decoded(stored, facts.encoding, factor, path)
+    photo = decoded(opened, facts.encoding, factor, path)
     # remove lens distortion
-    if lens := lens_of(facts.camera, photo.factor, photo.width, photo.height):
+    if lens := radial_lens(facts.camera, photo.factor, photo.width, photo.height):
         lens.check(photo.width, photo.height, "dataset.yaml", f"{entry}.camera.distortion")
         straight = Undistorted(lens, photo.height, photo.width)
         photo = straight.photo(photo)
         objects = straight.nearest(objects)
         labels = Labels(straight.nearest(labels.label), straight.nearest(labels.left_out) | ~straight.inside)
     valid = valid_pixels(photo, labels, path, f"{entry}.image")
-    warn_of_processing(stored.exif, photo, labels, path)
+    warn_of_processing(opened.exif, photo, labels, path)
     progress(2, 3, f"{name}: writing")
     colours = {c: photo.radiance[..., k] for k, c in enumerate("RGB")}
     clipped = {f"clipped.{c}": photo.clipped[..., k] for k, c in enumerate("RGB")}
@@ -126,7 +126,7 @@ def reduced(labels: Labels, factor: int, path: Path, key: str) -> Labels:
 
 def warn_of_processing(exif: Mapping[str, Any], photo: Photo, labels: Labels, path: Path) -> None:
     """Warn of processing that no tone curve undoes, from EXIF and from halos at the masks' contours."""
-    if (says := camera_says(exif)) and not is_raw(path):
+    if (says := reported_processing(exif)) and not is_raw(path):
         log.warning("%s: the camera processed it (%s): %s", path, says, CURE)
     if (overshoot := halo(photo.radiance, labels.label > 0, ~labels.left_out)) > HALO:
         words = (

@@ -17,10 +17,9 @@ from factorlib.align.refine import FocalPrior
 from factorlib.align.search import focal_prior
 from factorlib.align.silhouette import UNKNOWN, silhouette_of_object
 from factorlib.dataset.check import ALL_OF_IT
-from factorlib.dataset.schema import ExternalCamera, MeshEntry, ObjectEntry, ObjectsSlice, Pose, ShapesSlice
+from factorlib.dataset.schema import ExternalCamera, MeshEntry, MeshInstance, ObjectsSlice, RigidTransform, ShapesSlice
 from factorlib.errors import InputError
-from factorlib.geometry.camera import Camera
-from factorlib.geometry.camera import Pose as PoseArrays
+from factorlib.geometry.camera import Camera, Pose
 from factorlib.images.exr import read_exr
 from factorlib.images.transfer import srgb_encode
 from factorlib.jsonfile import write_json
@@ -173,7 +172,7 @@ class Photo:
 
         Hulls are made in the world frame, so cam_from_world is their pose.
         """
-        pose = Pose(**entry_of(placed.pose))
+        pose = RigidTransform(**entry_of(placed.pose))
         poses = {obj.name: pose for obj in self.own.objects if obj.mesh in meshes and meshes[obj.mesh].hull}
         return ExternalCamera("sfm", placed.focal * self.facts.factor, None, None, poses)
 
@@ -199,11 +198,11 @@ class Photo:
                     part[label == own] = k
                 part[(label > 0) & (part == 0)] = UNKNOWN
                 pose = obj.pose or (external.poses.get(obj.name) if external else None)
-                arrays = PoseArrays(np.array(pose.rotation), np.array(pose.translation)) if pose else None
+                arrays = Pose(np.array(pose.rotation), np.array(pose.translation)) if pose else None
                 outlines.append(Outline(self.name, part, *self.camera(external), arrays))
         return outlines
 
-    def _labels(self, obj: ObjectEntry, entry: MeshEntry) -> list[int]:
+    def _labels(self, obj: MeshInstance, entry: MeshEntry) -> list[int]:
         """Return the label of each part of the shape in this photo."""
         made_of: Mapping[str, str | None] = entry.parts or {ALL_OF_IT: entry.material}
         return [self.materials.index({**made_of, **obj.materials}[part]) + 1 for part in parts_of(entry)]

@@ -25,7 +25,7 @@ from factorlib.inference.surface_attach import attached_pixels
 from factorlib.inference.surface_detail import Found, Surfaces, found
 from factorlib.inference.surface_turns import Attached, Detail, joined, no_detail
 from factorlib.jsonfile import write_json
-from factorlib.meshes.read import CREASE_DEG, MeshesOnce
+from factorlib.meshes.read import CREASE_DEG, MeshCache
 from factorlib.meshes.subdivision import subdivided_mesh
 from factorlib.reflection import reflection_operator
 from factorlib.results.poses import FILE as POSES
@@ -135,7 +135,7 @@ def surfaces_of(inputs: Inputs, slices: dict[str, ObjectsSlice]) -> Surfaces:
     Bodies of revolution that were estimated from outlines are left out, because their rotation about the axis is
     unknown.  Objects may give the parts of a mesh different materials; vertices do not depend on them.
     """
-    read = MeshesOnce(inputs.mesh, inputs.facts["dataset.materials"], CREASE_DEG)
+    read = MeshCache(inputs.mesh, inputs.facts["dataset.materials"], CREASE_DEG)
     meshes = {}
     for slice_ in slices.values():
         for own in slice_.objects:

@@ -16,7 +16,7 @@ from factorlib.dataset.schema import ObjectsSlice
 from factorlib.geometry.visibility import Occluders, sight
 from factorlib.images.exr import read_exr
 from factorlib.meshes.mesh import scaled
-from factorlib.meshes.read import CREASE_DEG, MeshesOnce
+from factorlib.meshes.read import CREASE_DEG, MeshCache
 from factorlib.results.photos import read_photo_facts
 from factorlib.results.poses import ObjectEntry, read_photo_poses
 from factorlib.stage import Inputs, Progress
@@ -72,7 +72,7 @@ def main(params: Params, inputs: Inputs, out: Path, progress: Progress) -> None:
 def occluders_of(inputs: Inputs, poses: dict[str, ObjectEntry]) -> Occluders:
     """Return the meshes of the photo's objects at the poses that `align` estimated."""
     slice_ = msgspec.convert(inputs.facts["dataset.objects"], ObjectsSlice)
-    read = MeshesOnce(inputs.mesh, inputs.facts["dataset.materials"], CREASE_DEG)
+    read = MeshCache(inputs.mesh, inputs.facts["dataset.materials"], CREASE_DEG)
     meshes = [read.mesh(own.mesh, slice_.meshes[own.mesh], own.materials) for own in slice_.objects]
     placed = [poses[own.name] for own in slice_.objects]
     return Occluders([scaled(mesh, at.scale) for mesh, at in zip(meshes, placed)], [at.pose for at in placed])

@@ -14,10 +14,10 @@ from factorlib.dataset.schema import (
     SOURCES,
     CameraSource,
     DatasetFile,
-    Ground,
+    GroundEntry,
     MeshEntry,
+    MeshInstance,
     MirrorBall,
-    ObjectEntry,
     PhotoEntry,
     TruthFile,
 )
@@ -41,22 +41,22 @@ def check_dataset(spec: DatasetFile, file: Path) -> None:
     refuse = Refusal(file, file.parent)
     for index, name in enumerate(spec.materials):
         if name in spec.materials[:index]:
-            with refuse.noting():
+            with refuse.collecting():
                 cure = "label k is the k-th material: name each once"
                 refuse(f"materials[{index}]", f"material {name!r} is named twice", cure)
     for name, mesh in spec.meshes.items():
-        with refuse.noting():
+        with refuse.collecting():
             _check_mesh(f"meshes.{name}", mesh, spec.materials, refuse)
             if mesh.hull and spec.cameras is None:
                 _check_hull(name, spec, refuse)
-    with refuse.noting():
+    with refuse.collecting():
         refuse.once("photos", (photo.name for photo in spec.photos), "photo")
     for index, photo in enumerate(spec.photos):
         _check_photo(f"photos[{index}]", photo, spec, refuse)
-    with refuse.noting():
+    with refuse.collecting():
         if spec.cameras is not None:
             _check_source(spec.cameras, spec, refuse)
-    with refuse.noting():
+    with refuse.collecting():
         if spec.truth is not None:
             refuse.path("truth", spec.truth, (".yaml", ".yml"), must_exist=False)
     raise_all(refuse.faults)
@@ -151,41 +151,41 @@ def _check_parts(key: str, parts: dict[str, str], mesh: MeshEntry, materials: li
 
 
 def _check_photo(key: str, photo: PhotoEntry, spec: DatasetFile, refuse: Refusal) -> None:
-    with refuse.noting():
+    with refuse.collecting():
         if photo.name in RESERVED_PHOTOS:
             refuse(f"{key}.name", f"the name {photo.name!r} is taken by a file of the results", "rename the photo")
-    with refuse.noting():
+    with refuse.collecting():
         refuse.path(f"{key}.image", photo.image, IMAGES)
-    with refuse.noting():
+    with refuse.collecting():
         if photo.world_from_camera is not None:
             refuse.rotation(f"{key}.world_from_camera", photo.world_from_camera)
-    with refuse.noting():
+    with refuse.collecting():
         if photo.ground is not None:
             _check_ground(f"{key}.ground.normal", photo.ground, refuse)
-    with refuse.noting():
+    with refuse.collecting():
         if photo.camera and photo.camera.distortion and photo.camera.focal_px is None:
             cure = "give focal_px beside it"
             refuse(f"{key}.camera.distortion", "its unit is the focal length, which is not given", cure)
-    with refuse.noting():
+    with refuse.collecting():
         if not photo.masks:
             refuse(f"{key}.masks", "names no mask", "give a label PNG, a COCO json, or {material: mask.png, …}")
         if isinstance(photo.masks, str):
             refuse.path(f"{key}.masks", photo.masks, MASKS)
     for material, path in {} if isinstance(photo.masks, str) else photo.masks.items():
-        with refuse.noting():
+        with refuse.collecting():
             refuse.known(f"{key}.masks.{material}", material, spec.materials, "material")
             refuse.path(f"{key}.masks.{material}", path, (".png",))
-    with refuse.noting():
+    with refuse.collecting():
         if not photo.objects:
             cure = "add {name: …, mesh: …}: a mesh gives its pixels their normals"
             refuse(f"{key}.objects", f"photo {photo.name!r} has no objects", cure)
         refuse.once(f"{key}.objects", (obj.name for obj in photo.objects), "object")
     for index, obj in enumerate(photo.objects):
-        with refuse.noting():
+        with refuse.collecting():
             _check_object(f"{key}.objects[{index}]", obj, spec, refuse)
 
 
-def _check_object(of: str, obj: ObjectEntry, spec: DatasetFile, refuse: Refusal) -> None:
+def _check_object(of: str, obj: MeshInstance, spec: DatasetFile, refuse: Refusal) -> None:
     refuse.known(f"{of}.mesh", obj.mesh, spec.meshes, "mesh")
     mesh = spec.meshes[obj.mesh]
     _check_parts(f"{of}.materials", obj.materials, mesh, spec.materials, refuse)
@@ -207,9 +207,9 @@ def _check_object(of: str, obj: ObjectEntry, spec: DatasetFile, refuse: Refusal)
 
 def _check_known(spec: DatasetFile, refuse: Refusal) -> None:
     """Check that known materials occur on objects, and reflect some light but no more than arrives."""
-    shown = {m for photo in spec.photos for obj in photo.objects for m in made_of(obj, spec)}
+    shown = {m for photo in spec.photos for obj in photo.objects for m in instance_materials(obj, spec)}
     for name, of in spec.known.materials.items():
-        with refuse.noting():
+        with refuse.collecting():
             key = f"known.materials.{name}"
             refuse.known(key, name, spec.materials, "material")
             if name not in shown:
@@ -234,7 +234,7 @@ def _check_known_lights(spec: DatasetFile, refuse: Refusal) -> None:
     for photo in spec.photos:
         shots.setdefault(photo.light, []).append(photo)
     for name in spec.known.exposure:
-        with refuse.noting():
+        with refuse.collecting():
             key = f"known.exposure.{name}"
             refuse.known(key, name, [photo.name for photo in spec.photos], "photo")
             own = next(shot for shot in shots.values() if name in [photo.name for photo in shot])
@@ -243,7 +243,7 @@ def _check_known_lights(spec: DatasetFile, refuse: Refusal) -> None:
             if len(own) == 1:
                 refuse(key, "no other photo shares its light, whose brightness holds it", "leave it out")
     for name, of in spec.known.illumination.items():
-        with refuse.noting():
+        with refuse.collecting():
             key = f"known.illumination.{name}"
             refuse.known(key, name, shots, "illumination")
             if isinstance(of, str):
@@ -254,11 +254,11 @@ def _check_known_lights(spec: DatasetFile, refuse: Refusal) -> None:
             if not balls:
                 refuse.known(key, of.chrome, [obj.name for photo in shots[name] for obj in photo.objects], "object")
             photo, ball = balls[0]
-            material = min(made_of(ball, spec))
+            material = min(instance_materials(ball, spec))
             mesh = spec.meshes[ball.mesh]
-            if len(made_of(ball, spec)) > 1 or not (mesh.file or mesh.primitive == "ball"):
+            if len(instance_materials(ball, spec)) > 1 or not (mesh.file or mesh.primitive == "ball"):
                 refuse(key, f"mesh {ball.mesh!r} is no ball of one material", "give a mesh file, or `primitive: ball`")
-            if any(material in made_of(obj, spec) for obj in photo.objects if obj is not ball):
+            if any(material in instance_materials(obj, spec) for obj in photo.objects if obj is not ball):
                 cure = "give the ball a material of its own"
                 refuse(key, f"another object of photo {photo.name!r} is made of {material!r} too", cure)
             known = spec.known.materials.get(material)
@@ -273,7 +273,7 @@ def _check_known_lights(spec: DatasetFile, refuse: Refusal) -> None:
                 refuse(key, f"{len(shots[name])} photos of unknown exposures share the light", cure)
 
 
-def mirror_balls(spec: DatasetFile, illumination: str, ball: MirrorBall) -> Iterator[tuple[PhotoEntry, ObjectEntry]]:
+def mirror_balls(spec: DatasetFile, illumination: str, ball: MirrorBall) -> Iterator[tuple[PhotoEntry, MeshInstance]]:
     """Yield the photos in an illumination that show a mirror ball, each with the ball's object.
 
     Args:
@@ -286,13 +286,13 @@ def mirror_balls(spec: DatasetFile, illumination: str, ball: MirrorBall) -> Iter
             yield from ((photo, obj) for obj in photo.objects if obj.name == ball.chrome)
 
 
-def made_of(obj: ObjectEntry, spec: DatasetFile) -> set[str]:
+def instance_materials(obj: MeshInstance, spec: DatasetFile) -> set[str]:
     """Return the materials of an object's parts."""
-    own = spec.meshes[obj.mesh].made_of
+    own = spec.meshes[obj.mesh].part_materials
     return set((own | obj.materials).values() if isinstance(own, dict) else obj.materials.values() or [own or ""])
 
 
-def _check_ground(key: str, ground: Ground, refuse: Refusal) -> None:
+def _check_ground(key: str, ground: GroundEntry, refuse: Refusal) -> None:
     if not any(ground.normal):
         refuse(key, "a normal of length 0", "write the direction that points up from the ground, in the camera's axes")
     if sum(n * p for n, p in zip(ground.normal, ground.point, strict=True)) >= 0:
@@ -300,7 +300,7 @@ def _check_ground(key: str, ground: Ground, refuse: Refusal) -> None:
         refuse(key, fault, "turn its sign: it points toward the objects")
 
 
-def _check_keypoints(key: str, obj: ObjectEntry, refuse: Refusal) -> None:
+def _check_keypoints(key: str, obj: MeshInstance, refuse: Refusal) -> None:
     """Check that keypoints are enough, distinct, and not collinear, which would leave a rotation free."""
     if obj.pose is not None:
         cure = "keep one: a pose is used as it is, keypoints are where the search begins"

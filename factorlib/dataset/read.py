@@ -13,7 +13,7 @@ from typing import Any
 
 from factorlib.dataset.check import check_dataset, check_lights, check_truth
 from factorlib.dataset.gltf_header import buffer_path, read_header
-from factorlib.dataset.paths import Refusal, is_there
+from factorlib.dataset.paths import Refusal, file_exists
 from factorlib.dataset.schema import Dataset, DatasetFile, ExternalCamera, TruthFile
 from factorlib.errors import InputError, raise_all
 from factorlib.reading import check_plain, path_inside, read_text, reading
@@ -38,7 +38,7 @@ def read_dataset(path: str | Path) -> Dataset:
     """
     with reading("a dataset", path, "DATASET"):
         file = Path(path) / FILE if Path(path).is_dir() else Path(path)
-    if not is_there(file, "DATASET"):
+    if not file_exists(file, "DATASET"):
         raise InputError("there is no such dataset", file=file, cure=f"name a folder with a {FILE} in it")
     folder = Path(os.path.abspath(file)).parent
     if folder.name in RESERVED:
@@ -51,7 +51,7 @@ def read_dataset(path: str | Path) -> Dataset:
     files = {name: mesh.file for name, mesh in spec.meshes.items() if mesh.file}
     companions = {name: _companions(path, f"meshes.{name}.file", refuse) for name, path in files.items()}
     if spec.cameras is not None and not spec.cameras.sfm:
-        from factorlib.dataset.sources.external import external_cameras
+        from factorlib.dataset.sources.external_cameras import external_cameras
 
         spec, external = external_cameras(spec, file)
     check_lights(spec.photos, file)
@@ -120,13 +120,13 @@ def _read_truth(spec: DatasetFile, file: Path) -> TruthFile | None:
     if spec.truth is None:
         return None
     truth_file = file.parent / spec.truth
-    if not is_there(truth_file, "truth"):
+    if not file_exists(truth_file, "truth"):
         log.warning("%s: truth: there is no %s: nothing is compared with the truth", file, spec.truth)
         return None
     truth = read_yaml(truth_file, TruthFile)
     check_truth(truth, spec, truth_file, file.parent)
     for path in truth.maps:
-        if not is_there(file.parent / path, "truth"):
+        if not file_exists(file.parent / path, "truth"):
             log.warning("%s: there is no %s: nothing is compared with the truth", truth_file, path)
             return None
     return truth

@@ -10,12 +10,12 @@ from typing import Any
 import msgspec
 
 from factorlib.dataset import schema
-from factorlib.dataset.check import made_of, mirror_balls
+from factorlib.dataset.check import instance_materials, mirror_balls
 from factorlib.dataset.schema import Dataset, PhotoEntry
 from factorlib.errors import did_you_mean
 
 
-class Slice(msgspec.Struct, frozen=True):
+class DatasetSlice(msgspec.Struct, frozen=True):
     """A slice of a dataset.
 
     Attributes:
@@ -29,7 +29,7 @@ class Slice(msgspec.Struct, frozen=True):
     fields: dict[str, Any]
 
 
-def dataset_slice(dataset: Dataset, name: str, photo: str | None = None) -> Slice:
+def dataset_slice(dataset: Dataset, name: str, photo: str | None = None) -> DatasetSlice:
     """Return a slice of one photo, or of the set.
 
     The slices photo, objects, light and ground are per photo.  The slices materials, set, shapes, known and truth are
@@ -61,7 +61,7 @@ def dataset_slice(dataset: Dataset, name: str, photo: str | None = None) -> Slic
         facts = facts if photo is None else facts[photo]
     else:
         raise KeyError(f"no slice 'dataset.{name}': {did_you_mean(name, SLICES)}")
-    return Slice(facts=facts, files=sorted(set(files)), fields=fields)
+    return DatasetSlice(facts=facts, files=sorted(set(files)), fields=fields)
 
 
 def _photo(dataset: Dataset, photo: PhotoEntry) -> tuple[schema.PhotoSlice, list[str]]:
@@ -81,7 +81,7 @@ def _photo(dataset: Dataset, photo: PhotoEntry) -> tuple[schema.PhotoSlice, list
 def _objects(dataset: Dataset, photo: PhotoEntry) -> tuple[schema.ObjectsSlice, list[str]]:
     meshes = {obj.mesh: dataset.spec.meshes[obj.mesh] for obj in photo.objects}
     external = dataset.external.get(photo.name)
-    facts = schema.ObjectsSlice(photo.camera or schema.Camera(), photo.objects, meshes, external)
+    facts = schema.ObjectsSlice(photo.camera or schema.Intrinsics(), photo.objects, meshes, external)
     files = [mesh.file for mesh in meshes.values() if mesh.file]
     companions = [path for name in meshes for path in dataset.companions.get(name, ())]
     return facts, files + companions + _object_masks(photo)
@@ -98,7 +98,7 @@ def _known(dataset: Dataset) -> tuple[schema.KnownSlice, list[str]]:
     for name, of in known.illumination.items():
         if isinstance(of, schema.MirrorBall):
             photo, obj = next(mirror_balls(dataset.spec, name, of))
-            balls[name] = schema.BallSlice(photo.name, *made_of(obj, dataset.spec))
+            balls[name] = schema.BallSlice(photo.name, *instance_materials(obj, dataset.spec))
     maps = {name: of for name, of in known.illumination.items() if isinstance(of, str)}
     return schema.KnownSlice(known.materials, maps, balls, known.exposure), list(maps.values())
 

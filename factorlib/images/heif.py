@@ -15,8 +15,8 @@ from jaxtyping import Shaped
 from PIL import ImageCms
 
 from factorlib.errors import InputError
-from factorlib.images.exif import exif_of
-from factorlib.images.scanlines import COPY, Stored
+from factorlib.images.exif import read_exif
+from factorlib.images.scanlines import COPY, OpenPhoto
 
 BRANDS = {b"heic", b"heix", b"heim", b"heis", b"hevc", b"hevx", b"mif1", b"msf1", b"mif2"}
 VIDEO = {16: "PQ", 18: "HLG"}  # transfer characteristics of ITU-T H.273 for HDR video
@@ -34,7 +34,7 @@ def is_heif(path: str | Path) -> bool:
     return head[4:8] == b"ftyp" and head[8:12] in BRANDS
 
 
-def open_heif(path: str | Path, key: str | None) -> Stored:
+def open_heif(path: str | Path, key: str | None) -> OpenPhoto:
     """Open a HEIF photo.
 
     Raises:
@@ -76,7 +76,7 @@ def open_heif(path: str | Path, key: str | None) -> Stored:
         codes = codes[..., None] if codes.ndim == 2 else codes
         return codes[..., :3] if codes.shape[2] >= 3 else np.broadcast_to(codes[..., :1], (height, width, 3))
 
-    exif = exif_of(info.get("exif"))
+    exif = read_exif(info.get("exif"))
     across, down = (exif.get(name) for name in SIZES)
     if across and down and (across > down) != (width > height):  # EXIF has the size before rotation
         exif |= dict(zip(SIZES, (down, across)))
@@ -84,7 +84,7 @@ def open_heif(path: str | Path, key: str | None) -> Stored:
     with suppress(OSError, ImageCms.PyCMSError):
         if icc := info.get("icc_profile"):
             profile = ImageCms.getProfileDescription(ImageCms.ImageCmsProfile(io.BytesIO(icc))).strip()
-    return Stored(
+    return OpenPhoto(
         width=width,
         height=height,
         exif=exif,

@@ -12,12 +12,12 @@ import pycolmap
 from jaxtyping import Bool, Float, Shaped
 from scipy.ndimage import map_coordinates
 
-from factorlib.dataset.schema import Camera
+from factorlib.dataset.schema import Intrinsics
 from factorlib.errors import InputError
 from factorlib.images.photo import Photo
 
 
-class Lens(msgspec.Struct, frozen=True):
+class RadialLens(msgspec.Struct, frozen=True):
     """Lens of one focal length, in pixels whose centres are at 0.5; coefficients are k₁ and k₂."""
 
     focal: float
@@ -61,11 +61,11 @@ class Lens(msgspec.Struct, frozen=True):
             raise InputError(found, file=file, key=key, cure=cure)
 
 
-def lens_of(camera: Camera | None, factor: int, width: int, height: int) -> Lens | None:
+def radial_lens(camera: Intrinsics | None, factor: int, width: int, height: int) -> RadialLens | None:
     """Return the lens of a photo that was downsampled; None if dataset.yaml gives no distortion.
 
     Args:
-        camera: Camera of the photo in dataset.yaml.
+        camera: Intrinsics of the photo in dataset.yaml.
         factor: Factor of the downsampling.
         width: Width of the downsampled photo.
         height: Height of the downsampled photo.
@@ -77,7 +77,7 @@ def lens_of(camera: Camera | None, factor: int, width: int, height: int) -> Lens
         return None
     assert camera.focal_px is not None  # the reader refuses distortion without it
     centre = camera.principal_point or (factor * width / 2, factor * height / 2)
-    return Lens(camera.focal_px / factor, (centre[0] / factor, centre[1] / factor), camera.distortion)
+    return RadialLens(camera.focal_px / factor, (centre[0] / factor, centre[1] / factor), camera.distortion)
 
 
 class Undistorted:
@@ -86,7 +86,7 @@ class Undistorted:
     The attribute `inside` is the mask of pixels that the photo shows.
     """
 
-    def __init__(self, lens: Lens, height: int, width: int):
+    def __init__(self, lens: RadialLens, height: int, width: int):
         x, y = np.meshgrid(np.arange(width) + 0.5, np.arange(height) + 0.5)
         place = lens.distorted(np.stack([x, y], axis=-1).reshape(-1, 2)).reshape(height, width, 2) - 0.5
         self.rows = place[..., 1]

@@ -53,8 +53,8 @@ def read_light_map(path: Path, key: str | None = None) -> Float[np.ndarray, "h w
     """
     check_plain(path, "a light", key, most_bytes=None)
     check_values(path, key=key)
-    stored = open_photo(path, key)
-    height, width = stored.size
+    opened = open_photo(path, key)
+    height, width = opened.size
     if width != 2 * height:
         fault = f"{width} × {height} pixels is no lat-long map"
         raise InputError(fault, file=path, key=key, cure="its width must be twice its height")
@@ -63,7 +63,7 @@ def read_light_map(path: Path, key: str | None = None) -> Float[np.ndarray, "h w
     lost = 0
 
     def look(linear: Float[np.ndarray, "r w 3"]) -> None:
-        """Accumulate statistics of some rows of the map as stored."""
+        """Accumulate statistics of some rows of the map as opened."""
         nonlocal least, total, lost
         usable = np.isfinite(linear) & (np.abs(linear) <= LARGEST)
         lost += int((~usable.all(axis=-1)).sum())
@@ -73,7 +73,7 @@ def read_light_map(path: Path, key: str | None = None) -> Float[np.ndarray, "h w
 
     factor = least_factor(height * width, MOST_TEXELS)
     factor = next((divisor for divisor in range(factor, 2 * factor) if height % divisor == 0), factor)
-    radiance = decoded(stored, "linear", factor, path, look).radiance
+    radiance = decoded(opened, "linear", factor, path, look).radiance
     if lost:
         fault = f"{lost} pixels are no numbers, or infinite (more than {LARGEST:g})"
         raise InputError(fault, file=path, key=key, cure=CURE)

@@ -28,12 +28,12 @@ LEAST_PLACES = 100  # least number of contour pixels
 HALO = 0.08
 
 
-def camera_says(exif: Mapping[str, Any]) -> str | None:
+def reported_processing(exif: Mapping[str, Any]) -> str | None:
     """Return EXIF's description of irreversible processing (CustomRendered, also with Apple's values, and Sharpness).
 
     It is None if there is none.
 
-    >>> camera_says({"Exif:CustomRendered": 3}), camera_says({"Exif:Sharpness": 0})
+    >>> reported_processing({"Exif:CustomRendered": 3}), reported_processing({"Exif:Sharpness": 0})
     ('HDR', None)
     """
     kinds = [

@@ -17,8 +17,8 @@ from scipy.ndimage import maximum_filter
 
 from factorlib.dataset.schema import RAW
 from factorlib.errors import InputError
-from factorlib.images.exif import exif_of
-from factorlib.images.scanlines import CLIPPED, Stored
+from factorlib.images.exif import read_exif
+from factorlib.images.scanlines import CLIPPED, OpenPhoto
 
 ORIENTATION = {0: 1, 3: 3, 5: 8, 6: 6}  # EXIF's orientation for LibRaw's `flip`
 AROUND = 5  # side of the square from which demosaicing interpolates a pixel
@@ -28,10 +28,10 @@ TAGS = ("ExposureTime", "FNumber", "Exif:PhotographicSensitivity", "Exif:FocalLe
 
 def is_raw(path: str | Path) -> bool:
     """Return whether the suffix is that of a raw file, or the file is a DNG, whose first picture is only a preview."""
-    return Path(path).suffix.lower() in RAW or "DNG" in exif_of(path)
+    return Path(path).suffix.lower() in RAW or "DNG" in read_exif(path)
 
 
-def open_raw(path: str | Path, key: str | None) -> Stored:
+def open_raw(path: str | Path, key: str | None) -> OpenPhoto:
     """Open a raw photo.
 
     Raises:
@@ -89,11 +89,11 @@ def open_raw(path: str | Path, key: str | None) -> Stored:
             full = np.logical_or.reduce(full, axis=2) if full.ndim == 3 else maximum_filter(full, size=AROUND)
             return pixels[inner], full[inner]
 
-    return Stored(
+    return OpenPhoto(
         width=width,
         height=height,
         orientation=ORIENTATION.get(sizes.flip, 1),
-        exif={**dict(zip(TAGS, camera)), **exif_of(path)},
+        exif={**dict(zip(TAGS, camera)), **read_exif(path)},
         white=WHITE,
         encoding="linear",
         rows=lambda begin, end: developed()[0][begin:end],

@@ -27,7 +27,7 @@ from jaxtyping import UInt8
 from PIL import Image
 
 from factorlib.dataset.check import IMAGES
-from factorlib.dataset.paths import Refusal, is_there
+from factorlib.dataset.paths import Refusal, file_exists
 from factorlib.dataset.read import FILE, UNKNOWN
 from factorlib.dataset.schema import LEFT_OUT, AtLeastOne, Name, OneOf254
 from factorlib.errors import InputError
@@ -52,7 +52,7 @@ HEADERS = {"Cache-Control": "no-store", "Referrer-Policy": "no-referrer", "Conte
 NO_FILE = "none"  # version of a mask that does not exist yet
 
 
-class Entry(msgspec.Struct, frozen=True):
+class LabelledPhoto(msgspec.Struct, frozen=True):
     """Keys of a photo in dataset.yaml that labelling needs."""
 
     name: Name
@@ -61,11 +61,11 @@ class Entry(msgspec.Struct, frozen=True):
     encoding: Literal["srgb", "linear", "gamma2.2"] | None = None
 
 
-class Spec(msgspec.Struct, frozen=True):
+class LabelledSet(msgspec.Struct, frozen=True):
     """Keys of dataset.yaml that labelling needs; the rest may be unfinished."""
 
     materials: Annotated[list[Name], OneOf254]
-    photos: Annotated[list[Entry], AtLeastOne]
+    photos: Annotated[list[LabelledPhoto], AtLeastOne]
 
 
 class MaskSet:
@@ -83,9 +83,9 @@ class MaskSet:
         self.yaml = folder.resolve() / FILE
         self.files = []
         self.sizes = []
-        if not is_there(self.yaml, "DATASET") or not self.yaml.resolve().is_relative_to(self.folder):
+        if not file_exists(self.yaml, "DATASET") or not self.yaml.resolve().is_relative_to(self.folder):
             raise InputError("there is no such file in this folder", file=self.yaml, cure="`make new` begins one")
-        spec = read_yaml(self.yaml, Spec)
+        spec = read_yaml(self.yaml, LabelledSet)
         refuse = Refusal(self.yaml, self.folder)
         self.materials, self.photos = spec.materials, spec.photos
         refuse.once("photos", (photo.name for photo in self.photos), "photo")
@@ -145,7 +145,7 @@ class MaskSet:
         """Return dataset.yaml with the mask's path in place of the photo's `?`, or None if there is no `?`."""
         text = read_text(self.yaml, "a YAML file")
         mask = f"masks/{photo}.png"
-        photos = read_yaml(self.yaml, Spec).photos
+        photos = read_yaml(self.yaml, LabelledSet).photos
         index = next((k for k, each in enumerate(photos) if (each.name, each.masks) == (photo, UNKNOWN)), None)
         if index is None:
             return None
@@ -160,7 +160,7 @@ class MaskSet:
 
     def version(self, index: int) -> str:
         """Return the hash of a mask's file, or NO_FILE if it does not exist."""
-        there = is_there(self.files[index], "masks")
+        there = file_exists(self.files[index], "masks")
         return hashlib.sha256(read_bytes(self.files[index], "a PNG")).hexdigest() if there else NO_FILE
 
     def _known(self, labels: np.ndarray, index: int) -> np.ndarray:

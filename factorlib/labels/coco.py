@@ -113,7 +113,7 @@ def read_coco(
                 raise InputError(fault, file=path, key=at, cure=CURE)
             for counts in shapes:
                 with reading("RLE", path, at, CURE):
-                    borders = np.cumsum(runs_of(counts, len(edges) - 1))
+                    borders = np.cumsum(run_lengths(counts, len(edges) - 1))
                 np.add.at(edges, borders[0::2], 1)
                 np.add.at(edges, borders[1::2], -1)
         inside = np.cumsum(edges[:-1], dtype=np.int32) > 0
@@ -121,7 +121,7 @@ def read_coco(
     return masks
 
 
-def runs_of(counts: list[int] | str, pixels: int) -> Int[np.ndarray, " n"]:
+def run_lengths(counts: list[int] | str, pixels: int) -> Int[np.ndarray, " n"]:
     """Return run lengths, decompressed if they are a string.
 
     In the compressed form, a character holds 5 bits (+48). Its sixth bit means that more characters follow, and the
@@ -130,7 +130,7 @@ def runs_of(counts: list[int] | str, pixels: int) -> Int[np.ndarray, " n"]:
     Raises:
         ValueError: If the runs do not fill the pixels exactly.
 
-    >>> runs_of([1, 2, 1], 4).tolist(), runs_of("R47g1", 192).tolist()
+    >>> run_lengths([1, 2, 1], 4).tolist(), run_lengths("R47g1", 192).tolist()
     ([1, 2, 1], [130, 7, 55])
     """
     if isinstance(counts, str):

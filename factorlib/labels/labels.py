@@ -112,7 +112,7 @@ def read_objects(
 def check_materials(
     labels: Labels,
     objects: UInt16[np.ndarray, "h w"],
-    made_of: list[tuple[str, set[str]]],
+    object_materials: list[tuple[str, set[str]]],
     materials: list[str],
     path: Path,
     key: str = "objects",
@@ -125,7 +125,7 @@ def check_materials(
     Args:
         labels: Labels of the photo.
         objects: Result of `read_objects`; objects without a mask of their own share the rest of the photo.
-        made_of: Name and materials of each object.
+        object_materials: Name and materials of each object.
         materials: Materials of the dataset, in order.
         path: Path of the mask, to name in errors.
         key: Key of the objects, to name in errors.
@@ -133,15 +133,15 @@ def check_materials(
     Raises:
         InputError: If both faults occur.
     """
-    groups = [([k], objects == k + 1) for k in range(len(made_of)) if (objects == k + 1).any()]
-    alone = [k for k in range(len(made_of)) if not (objects == k + 1).any()]
+    groups = [([k], objects == k + 1) for k in range(len(object_materials)) if (objects == k + 1).any()]
+    alone = [k for k in range(len(object_materials)) if not (objects == k + 1).any()]
     for members, region in [*groups, (alone, objects == 0)] if alone else groups:
         counts = np.bincount(labels.label[region], minlength=len(materials) + 1)[1:]
-        own = set().union(*(made_of[k][1] for k in members))
+        own = set().union(*(object_materials[k][1] for k in members))
         strange = [k for k, count in enumerate(counts) if count >= MUCH * counts.sum() > 0 and materials[k] not in own]
         missing = [name for name in materials if name in own and not counts[materials.index(name)]]
         if strange and missing:
-            names = ", ".join(repr(made_of[k][0]) for k in members)
+            names = ", ".join(repr(object_materials[k][0]) for k in members)
             most = max(strange, key=counts.__getitem__)
             fault = (
                 f"the mask shows {materials[most]!r} in {counts[most] / counts.sum():.0%} of the pixels of {names}, "

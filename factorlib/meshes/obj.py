@@ -12,7 +12,7 @@ import numpy as np
 
 from factorlib.errors import InputError
 from factorlib.meshes.limits import Limits
-from factorlib.meshes.triangle_soup import TriangleSoup, lines_of, quoted
+from factorlib.meshes.triangle_soup import TriangleSoup, quoted, text_lines
 
 MOST = 2**31  # greatest index in any file
 COUNTED_EVERY = 4096  # number of lines between two checks of the number of triangles
@@ -41,7 +41,7 @@ def read_obj(path: Path, content: bytes, limits: Limits) -> TriangleSoup:
     names: dict[str, tuple[str, ...]] = {"usemtl": (), "g": (), "o": ()}  # names of the faces that follow
     current: int | None = None  # part of these faces; None until the first of them
     number = counted = 0
-    for line in lines_of(CONTINUED.sub(b"\v", content) if b"\\" in content else content):
+    for line in text_lines(CONTINUED.sub(b"\v", content) if b"\\" in content else content):
         number += 1 + line.count("\v")
         key, *words = line.split("#", 1)[0].split() or [""]
         try:

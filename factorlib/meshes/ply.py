@@ -12,7 +12,15 @@ import numpy as np
 from factorlib.errors import InputError
 from factorlib.meshes.limits import Limits
 from factorlib.meshes.mesh import Mesh
-from factorlib.meshes.triangle_soup import TriangleSoup, fans, floats, lines_of, numbers_in, quoted, single_part_soup
+from factorlib.meshes.triangle_soup import (
+    TriangleSoup,
+    fans,
+    floats,
+    parse_numbers,
+    quoted,
+    single_part_soup,
+    text_lines,
+)
 from factorlib.wholefile import write_bytes
 
 TYPES = {
@@ -55,7 +63,7 @@ def read_ply(path: Path, content: bytes, limits: Limits) -> TriangleSoup:
     order, elements, start = _header(path, content)
     counts = {name: count for name, (count, _) in elements.items()}
     limits.check(counts.get("vertex", 0), counts.get("face", 0), path)
-    content, at, columns = (content, start, {}) if order else (numbers_in(content[start:]).tobytes(), 0, {})
+    content, at, columns = (content, start, {}) if order else (parse_numbers(content[start:]).tobytes(), 0, {})
     for name, (count, properties) in elements.items():
         columns[name], at = _columns(content, at, order, count, properties)
     # corners of the faces: the list of a known name, or the only one
@@ -90,7 +98,7 @@ def _header(path: Path, content: bytes) -> tuple[str, dict[str, tuple[int, Prope
     elements: dict[str, tuple[int, Properties]] = {}
     start = end.end() - data_begins
     properties: Properties | None = None  # of the last element
-    for line in lines_of(content[3 : end.start()]):
+    for line in text_lines(content[3 : end.start()]):
         try:
             match line.split():
                 case [] | ["comment" | "obj_info", *_]:

@@ -35,7 +35,7 @@ log = logging.getLogger("factorlib.meshes")
 def read_mesh(
     path: str | Path,
     materials: Sequence[str],
-    made_of: Mapping[str, str] | str | None = None,
+    part_materials: Mapping[str, str] | str | None = None,
     overrides: Mapping[str, str] | None = None,
     crease_deg: float = CREASE_DEG,
     limits: Limits | None = None,
@@ -45,8 +45,8 @@ def read_mesh(
     Args:
         path: File of the mesh.
         materials: Materials of the dataset, in order: label k is the k-th, from 1.
-        made_of: Material of each part, or of the whole mesh.
-        overrides: Material of some parts, with precedence over `made_of`.
+        part_materials: Material of each part, or of the whole mesh.
+        overrides: Material of some parts, with precedence over `part_materials`.
         crease_deg: Edges of a greater angle stay sharp in the normals.
         limits: Limits on the size.
 
@@ -58,7 +58,7 @@ def read_mesh(
             finite; if a part has no material; if a named part is not in the mesh, or a material not in the dataset.
     """
     soup = _soup(path, limits)
-    label = part_labels(soup.parts, materials, made_of, overrides or {}, path)
+    label = part_labels(soup.parts, materials, part_materials, overrides or {}, path)
     return usable(soup, label[soup.part], crease_deg, path)
 
 
@@ -69,7 +69,7 @@ def read_parts(path: str | Path, limits: Limits | None = None) -> list[tuple[str
     return soup.parts
 
 
-class MeshesOnce:
+class MeshCache:
     """Cache of a dataset's meshes, each read once for each choice of materials; an earlier stage checked the sizes.
 
     path            path of a mesh, by its name and, if it has one, its file in dataset.yaml (`Inputs.mesh`)
@@ -111,7 +111,7 @@ class MeshesOnce:
         key = (name, *sorted(overrides.items()))
         if key not in self._meshes:
             file = self.path(name, entry.file)
-            mesh = read_mesh(file, self.materials, entry.made_of, overrides, self.crease_deg, NO_LIMITS)
+            mesh = read_mesh(file, self.materials, entry.part_materials, overrides, self.crease_deg, NO_LIMITS)
             if name in self.displacements or name in self.log_factors:
                 dense = subdivided_mesh(mesh)
                 still = np.zeros(dense.nodes)
@@ -145,7 +145,7 @@ def _soup(path: str | Path, limits: Limits | None) -> TriangleSoup:
 def part_labels(
     names: Sequence[tuple[str, ...]],
     materials: Sequence[str],
-    made_of: Mapping[str, str] | str | None,
+    part_materials: Mapping[str, str] | str | None,
     overrides: Mapping[str, str],
     file: str | Path,
 ) -> np.ndarray:
@@ -154,8 +154,8 @@ def part_labels(
     Args:
         names: Names of each part.
         materials: Materials of the dataset, in order.
-        made_of: Material of each part, or of all parts.
-        overrides: Material of some parts, with precedence over `made_of`.
+        part_materials: Material of each part, or of all parts.
+        overrides: Material of some parts, with precedence over `part_materials`.
         file: File to name in errors.
 
     Returns:
@@ -164,12 +164,12 @@ def part_labels(
     Raises:
         InputError: If a part is unknown, or has no material or several; if a material is unknown.
 
-    >>> made_of = {"shell": "red", "wood": "oak"}
-    >>> part_labels([("shell",), ("legs", "wood")], ["red", "oak"], made_of, {}, "a.obj").tolist()
+    >>> part_materials = {"shell": "red", "wood": "oak"}
+    >>> part_labels([("shell",), ("legs", "wood")], ["red", "oak"], part_materials, {}, "a.obj").tolist()
     [1, 2]
     """
     known = sorted({name for each in names for name in each})
-    parts, default = ({}, made_of) if isinstance(made_of, str) else (made_of or {}, None)
+    parts, default = ({}, part_materials) if isinstance(part_materials, str) else (part_materials or {}, None)
     for part, material in [*parts.items(), *overrides.items(), *([(None, default)] if default is not None else [])]:
         if part is not None and part not in known:
             cure = did_you_mean(part, [one_line(name) for name in known])

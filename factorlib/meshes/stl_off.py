@@ -14,7 +14,7 @@ import numpy as np
 
 from factorlib.errors import InputError
 from factorlib.meshes.limits import Limits
-from factorlib.meshes.triangle_soup import TriangleSoup, floats, lines_of, single_part_soup
+from factorlib.meshes.triangle_soup import TriangleSoup, floats, single_part_soup, text_lines
 
 VERTEX = re.compile(rb"^[ \t]*vertex\b", re.MULTILINE | re.IGNORECASE)
 COUNTS = re.compile(r"(?:(?:ST)?C?N?OFF)?\s*([0-9]+)\s+([0-9]+)[^\n]*")  # OFF itself is optional
@@ -53,7 +53,7 @@ def read_off(path: Path, content: bytes, limits: Limits) -> TriangleSoup:
     """
     from trimesh.exchange.off import load_off
 
-    lines = [line for line in (line.split("#", 1)[0].strip() for line in lines_of(content)) if line]
+    lines = [line for line in (line.split("#", 1)[0].strip() for line in text_lines(content)) if line]
     counts = COUNTS.match("\n".join(lines[:2]))
     if counts is None:
         fault = "does not begin with OFF and the numbers of its vertices and faces"

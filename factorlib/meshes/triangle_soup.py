@@ -128,13 +128,13 @@ def check(soup: TriangleSoup, file: str | Path) -> TriangleSoup:
     return soup
 
 
-def lines_of(content: bytes) -> Iterator[str]:
+def text_lines(content: bytes) -> Iterator[str]:
     r"""Yield the lines of a text with any of the three line ends.
 
     Other characters that Python treats as line ends do not count.
     ValueError is raised for a line of more than LONGEST characters.
 
-    >>> list(lines_of("Stühle\r\nb\rc\x0cd\n".encode("utf-8-sig"))), list(lines_of("Stühle".encode("latin-1")))
+    >>> list(text_lines("Stühle\r\nb\rc\x0cd\n".encode("utf-8-sig"))), list(text_lines("Stühle".encode("latin-1")))
     (['Stühle', 'b', 'c\x0cd'], ['Stühle'])
     """
     try:
@@ -149,10 +149,10 @@ def lines_of(content: bytes) -> Iterator[str]:
             yield line.rstrip("\n")
 
 
-def numbers_in(text: str | bytes) -> Float[np.ndarray, " n"]:
+def parse_numbers(text: str | bytes) -> Float[np.ndarray, " n"]:
     r"""Parse all numbers of a text, separated by white space; ValueError for anything else in it.
 
-    >>> numbers_in("1 2.5\n-3e2").tolist()
+    >>> parse_numbers("1 2.5\n-3e2").tolist()
     [1.0, 2.5, -300.0]
     """
     with warnings.catch_warnings():

@@ -16,7 +16,7 @@ import pycolmap
 
 from factorlib.dataset.paths import Refusal
 from factorlib.dataset.schema import LARGEST
-from factorlib.dataset.sources.shot import DAMAGED, Shot, colmap_camera
+from factorlib.dataset.sources.source_image import DAMAGED, SourceImage, colmap_camera
 from factorlib.reading import one_line, reading
 
 KEY = "cameras.colmap"
@@ -30,11 +30,11 @@ ImageLine = tuple[str, int, tuple[float, ...]]
 Line = TypeVar("Line", CameraLine, ImageLine)
 
 
-def colmap_shots(path: str, refuse: Refusal) -> list[Shot]:
+def read_colmap(path: str, refuse: Refusal) -> list[SourceImage]:
     """Read the registered images of the model in the dataset's folder `path`, sorted by name."""
     refuse.subfolder(KEY, path)
     cameras_and_images = [
-        (refuse.file_of(KEY, path, f"cameras{suffix}"), refuse.file_of(KEY, path, f"images{suffix}"))
+        (refuse.file_in(KEY, path, f"cameras{suffix}"), refuse.file_in(KEY, path, f"images{suffix}"))
         for suffix in (".bin", ".txt")
     ]
     for camera_file, image_file in cameras_and_images:
@@ -52,16 +52,16 @@ def colmap_shots(path: str, refuse: Refusal) -> list[Shot]:
                 raise ValueError(f"a {model} camera has {_count_of(model)} parameters, not {len(params)}")
     with reading("a COLMAP model", image_file, KEY, CURE):
         image_lines = _text_images(image_file) if is_text else _records(image_file, _binary_image)
-        images = sorted(image_lines, key=lambda line: line[0])
-        for name, camera_id, _ in images:
+        registered = sorted(image_lines, key=lambda line: line[0])
+        for name, camera_id, _ in registered:
             if camera_id not in cameras:
                 raise ValueError(f"image {name!r} has camera {camera_id}, which {camera_file.name} lacks")
     made = {
         number: colmap_camera(f"{KEY}: camera {number}", model, width, height, params, refuse)
         for number, model, width, height, params in cameras.values()
     }
-    shots = []
-    for name, camera_id, (*quaternion, x, y, z) in images:
+    images = []
+    for name, camera_id, (*quaternion, x, y, z) in registered:
         key = f"{KEY}: {one_line(name)}"
         camera = made[camera_id]
         length = math.hypot(*quaternion)
@@ -69,8 +69,8 @@ def colmap_shots(path: str, refuse: Refusal) -> list[Shot]:
             refuse(key, "is no pose: its numbers are zero, not finite or too large", DAMAGED)
         unit = [value / length for value in (*quaternion[1:], quaternion[0])]
         motion = pycolmap.Rigid3d(pycolmap.Rotation3d(unit), [x, y, z])
-        shots.append(Shot(name, camera, (camera.width, camera.height), key, cam_from_world=motion))
-    return shots
+        images.append(SourceImage(name, camera, (camera.width, camera.height), key, cam_from_world=motion))
+    return images
 
 
 def _count_of(model: str) -> int:

@@ -1,4 +1,4 @@
-"""Common form of every source of cameras: one shot per image, with its camera in COLMAP's terms."""
+"""Common form of every source of cameras: each of its images, with a camera in COLMAP's terms."""
 
 import json
 import math
@@ -11,7 +11,7 @@ import msgspec
 import pycolmap
 
 from factorlib.dataset.paths import Refusal
-from factorlib.dataset.schema import CENTRE_PX, FOCAL_PX, LARGEST, Mat3, Pose, Vec2, Vec3
+from factorlib.dataset.schema import CENTRE_PX, FOCAL_PX, LARGEST, Mat3, RigidTransform, Vec2, Vec3
 from factorlib.reading import read_text, reading
 from factorlib.yamlfile import convert
 
@@ -22,11 +22,11 @@ MOST_BYTES = 256_000_000  # largest size of a JSON file; a scene of BOP has some
 DAMAGED = "the file is damaged: copy it again from where it came"
 
 
-class Shot(msgspec.Struct, frozen=True):
+class SourceImage(msgspec.Struct, frozen=True):
     """An image of a source, with its camera and the poses of objects.
 
     Attributes:
-        image: name or id
+        name: name or id
         size: size of the image in pixels, as in `schema.ExternalCamera`
         key: place in the source, for messages
         centred: True if the source does not give the principal point
@@ -34,13 +34,13 @@ class Shot(msgspec.Struct, frozen=True):
         poses: cam_from_object of each instance by obj_id, in millimetres
     """
 
-    image: str | int
+    name: str | int
     camera: pycolmap.Camera
     size: tuple[float, float | None] | None
     key: str
     centred: bool = False
     cam_from_world: pycolmap.Rigid3d | None = None
-    poses: dict[int, list[Pose]] = {}
+    poses: dict[int, list[RigidTransform]] = {}
 
 
 def read_source(file: Path, type_: type, key: str | None = None) -> Any:
