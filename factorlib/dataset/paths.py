@@ -100,8 +100,8 @@ class Refusal:
                 names = [entry.name for entry in target.parent.iterdir() if entry.is_file()]
             except OSError:
                 names = []
-            near = did_you_mean(target.name, names)
-            cure = near if near.startswith("did") else f"put it at {target}, or correct the path"
+            suggestion = did_you_mean(target.name, names)
+            cure = suggestion if suggestion.startswith("did") else f"put it at {target}, or correct the path"
             self(key, f"there is no file {path!r}", cure)
 
     def subfolder(self, key: str, path: str) -> None:

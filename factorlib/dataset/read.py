@@ -74,11 +74,11 @@ def read_draft(file: Path) -> tuple[DatasetFile, list[InputError]]:
     value = _filled(value, "", places)
     faults = []
     if places:
-        named = ", ".join(places[:MOST_NAMED]) + f" and {len(places) - MOST_NAMED} more" * (len(places) > MOST_NAMED)
-        found = f"{len(places)} places are left open" if len(places) > 1 else "one place is left open"
-        drawn = "; `make label` draws masks" if any(place.endswith(".masks") for place in places) else ""
-        cure = f"write what belongs there, in place of `?`{drawn}"
-        faults.append(InputError(f"{found}: {named}", file=file, key=places[0], cure=cure))
+        listed = ", ".join(places[:MOST_NAMED]) + f" and {len(places) - MOST_NAMED} more" * (len(places) > MOST_NAMED)
+        fault = f"{len(places)} places are left open" if len(places) > 1 else "one place is left open"
+        hint = "; `make label` draws masks" if any(place.endswith(".masks") for place in places) else ""
+        cure = f"write what belongs there, in place of `?`{hint}"
+        faults.append(InputError(f"{fault}: {listed}", file=file, key=places[0], cure=cure))
     try:
         spec = convert(value, DatasetFile, file, text=text)
     except InputError as error:
@@ -142,34 +142,34 @@ def _companions(path: str, key: str, refuse: Refusal) -> list[str]:
     file = refuse.folder / path
     suffix = Path(path).suffix.lower()
     is_obj = suffix == ".obj"
-    named = []
+    names = []
     if is_obj and check_plain(file, "an OBJ", key):
         with (
             reading("an OBJ", file, key),
             file.open("rb") as stream,
             mmap.mmap(stream.fileno(), 0, access=mmap.ACCESS_READ) as text,
         ):
-            names = MTLLIB.finditer(text) if text.find(b"mtllib") >= 0 else ()
-            named = [match.group(1).decode("utf-8", "replace").strip() for match in names]
+            matches = MTLLIB.finditer(text) if text.find(b"mtllib") >= 0 else ()
+            names = [match.group(1).decode("utf-8", "replace").strip() for match in matches]
     elif suffix in (".gltf", ".glb"):
         header = read_header(file, key)
         try:
             paths = [buffer_path(buffer.uri) for buffer in header.buffers if buffer.uri is not None]
         except ValueError as error:
             refuse(key, f"{file.name} {error}", "export it again, with its buffers beside it or as one .glb")
-        named = [path for path in paths if path is not None]
-    near = sorted({str(PurePosixPath(path).parent / name.replace("\\", "/")) for name in named})
-    for companion in near:
+        names = [path for path in paths if path is not None]
+    companions = sorted({str(PurePosixPath(path).parent / name.replace("\\", "/")) for name in names})
+    for companion in companions:
         try:
             path_inside(refuse.folder, companion)
         except ValueError as error:
-            words = "is outside the dataset" if "outside" in str(error) else str(error)
-            refuse(key, f"{file.name} names {companion[:80]!r}, which {words}", "copy that file beside the mesh")
+            reason = "is outside the dataset" if "outside" in str(error) else str(error)
+            refuse(key, f"{file.name} names {companion[:80]!r}, which {reason}", "copy that file beside the mesh")
     if is_obj:
-        near = [companion for companion in near if os.path.isfile(refuse.folder / companion)]
-    for companion in near:
+        companions = [companion for companion in companions if os.path.isfile(refuse.folder / companion)]
+    for companion in companions:
         if not os.path.lexists(refuse.folder / companion):
             cure = "copy it beside the mesh, or export one .glb"
             refuse(key, f"the mesh names {companion!r}, which is not there", cure)
         check_plain(refuse.folder / companion, "an .mtl" if is_obj else "a glTF buffer", key)
-    return near
+    return companions

@@ -46,7 +46,7 @@ def read_exif(source: bytes | str | Path | None) -> dict[str, float | int]:
     DNG and most raw files begin so. Missing or damaged tags are left out. `DNG` is True for a DNG.
     """
     exif = Image.Exif()
-    named: dict[str, float | int] = {}
+    values: dict[str, float | int] = {}
     numbers = {}
     with (
         suppress(*DAMAGED),
@@ -57,7 +57,7 @@ def read_exif(source: bytes | str | Path | None) -> dict[str, float | int]:
             exif.load_from_fp(stream)
         elif isinstance(source, bytes | None):
             exif.load(source or b"")
-        named |= {"DNG": True} if DNG_VERSION in exif else {}
+        values |= {"DNG": True} if DNG_VERSION in exif else {}
         tags = exif.get_ifd(EXIF_IFD)
         for tag in NAMES.keys() & tags.keys():
             try:
@@ -66,8 +66,8 @@ def read_exif(source: bytes | str | Path | None) -> dict[str, float | int]:
                 continue
             if math.isfinite(number):
                 numbers[NAMES[tag]] = round(number) if tag in WHOLE else number
-        named |= numbers
-    return named
+        values |= numbers
+    return values
 
 
 def exif_exposure(exif: Mapping[str, Any]) -> float | None:

@@ -56,9 +56,9 @@ class RadialLens(msgspec.Struct, frozen=True):
         r2 = np.square((corners - self.centre) / self.focal).sum(1).max() * np.linspace(0, 1, 100)
         k1, k2 = self.coefficients
         if (1 + 3 * k1 * r2 + 5 * k2 * r2**2 <= 0).any():
-            found = f"k1 = {k1:g}, k2 = {k2:g} fold the picture before its corner"
+            fault = f"k1 = {k1:g}, k2 = {k2:g} map two rays within the picture to one point of the photo"
             cure = "give the coefficients of COLMAP's RADIAL or OpenCV's model for this focal length"
-            raise InputError(found, file=file, key=key, cure=cure)
+            raise InputError(fault, file=file, key=key, cure=cure)
 
 
 def radial_lens(camera: Intrinsics | None, factor: int, width: int, height: int) -> RadialLens | None:
@@ -92,11 +92,16 @@ class Undistorted:
         self.rows = place[..., 1]
         self.columns = place[..., 0]
         ends = ((self.rows, height), (self.columns, width))
-        self.inside: Bool[np.ndarray, "h w"] = np.logical_and.reduce([(of >= 0) & (of <= n - 1) for of, n in ends])
+        self.inside: Bool[np.ndarray, "h w"] = np.logical_and.reduce(
+            [(places >= 0) & (places <= n - 1) for places, n in ends]
+        )
 
     def nearest(self, picture: Shaped[np.ndarray, "h w"]) -> Shaped[np.ndarray, "h w"]:
         """Resample by the nearest pixels, 0 outside the photo."""
-        y, x = (np.clip(np.rint(of), 0, n - 1).astype(int) for of, n in zip((self.rows, self.columns), picture.shape))
+        y, x = (
+            np.clip(np.rint(places), 0, n - 1).astype(int)
+            for places, n in zip((self.rows, self.columns), picture.shape)
+        )
         return np.where(self.inside, picture[y, x], np.zeros((), picture.dtype))
 
     def between(self, picture: Shaped[np.ndarray, "h w"]) -> Float[np.ndarray, "h w"]:

@@ -126,9 +126,6 @@ def decoded(
         factor: Factor of the downsampling.
         path: File to name in warnings.
         look: Function of all linear values of the file, some rows at a time, before they are averaged.
-
-    Returns:
-        The photo.
     """
     encoding = encoding or opened.encoding
     height, width = (n // factor for n in (opened.height, opened.width))
@@ -136,36 +133,17 @@ def decoded(
     clipped = np.empty((height, width, 3), bool)
     finite = np.empty((height, width), bool)
     for rows, codes, cut in _strips(opened, factor, path):
-        # linear values: computed for floats and wide codes, looked up for codes of up to 16 bits
-        if (white := opened.white) is None:
-            with np.errstate(over="ignore", invalid="ignore"):
-                linear = np.array(decoder(encoding)(codes.astype(np.float32)), dtype=np.float32)
-        elif white >= 2**16:
-            linear = decoder(encoding)(codes / white).astype(np.float32)
-        else:
-            linear = decoder(encoding)(np.arange(white + 1) / white).astype(np.float32)[codes]
+        linear = _linear(codes, opened.white, encoding)
         look(linear)
-        numbers = (
-            np.logical_and.reduce(np.isfinite(linear), -1) if opened.white is None else np.ones(linear.shape[:2], bool)
-        )
+        numbers = np.logical_and.reduce(np.isfinite(linear), -1)
         linear[~numbers] = 0
-        if factor == 1:
-            radiance[rows] = linear
-            finite[rows] = numbers
-            clipped[rows] = cut
-        else:
-            radiance[rows], finite[rows] = box_mean(linear, numbers, factor)
-            clipped[rows] = box_any(cut, factor)
+        radiance[rows], finite[rows] = box_mean(linear, numbers, factor) if factor > 1 else (linear, numbers)
+        clipped[rows] = box_any(cut, factor)
     profile = opened.profile
     if profile and "srgb" not in profile.lower() and "709" not in profile:
-        words = "its primaries are taken for Rec. 709: convert it to sRGB for exact colours"
-        log.warning("%s: its colour profile is %r; %s", path, profile, words)
-    swapped = opened.orientation >= 5
-    back = [-1 if flip else 1 for flip in _flipped(opened.orientation)]
-    radiance, clipped, finite = (
-        np.ascontiguousarray((pixels.swapaxes(0, 1) if swapped else pixels)[:: back[0], :: back[1]])
-        for pixels in (radiance, clipped, finite)
-    )
+        advice = "its primaries are taken for Rec. 709: convert it to sRGB for exact colours"
+        log.warning("%s: its colour profile is %r; %s", path, profile, advice)
+    radiance, clipped, finite = (_displayed(pixels, opened.orientation) for pixels in (radiance, clipped, finite))
     focal_px = exif_focal_px(opened.exif, opened.width, opened.height, path)
     return Photo(
         radiance,
@@ -180,6 +158,24 @@ def decoded(
     )
 
 
+def _linear(codes: Shaped[np.ndarray, "r w 3"], white: int | None, encoding: str) -> Float[np.ndarray, "r w 3"]:
+    """Decode codes to linear values: computed for floats and wide codes, looked up for codes of up to 16 bits."""
+    decode = decoder(encoding)
+    if white is None:
+        with np.errstate(over="ignore", invalid="ignore"):
+            return np.array(decode(codes.astype(np.float32)), dtype=np.float32)
+    if white >= 2**16:
+        return decode(codes / white).astype(np.float32)
+    return decode(np.arange(white + 1) / white).astype(np.float32)[codes]
+
+
+def _displayed(pixels: Shaped[np.ndarray, "h w *c"], orientation: int) -> Shaped[np.ndarray, "i j *c"]:
+    """Rotate and mirror stored pixels as their EXIF orientation demands."""
+    rows, columns = (-1 if flip else 1 for flip in _flipped(orientation))
+    turned = pixels.swapaxes(0, 1) if orientation >= 5 else pixels
+    return np.ascontiguousarray(turned[::rows, ::columns])
+
+
 def _strips(
     opened: OpenPhoto, factor: int, path: str | Path
 ) -> Iterator[tuple[slice, Shaped[np.ndarray, "r w 3"], Bool[np.ndarray, "r w 3"]]]:
@@ -189,7 +185,7 @@ def _strips(
     """
     flips = _flipped(opened.orientation)
     turned = flips[::-1] if opened.orientation >= 5 else flips
-    top, left = (n % factor if back else 0 for n, back in zip((opened.height, opened.width), turned))
+    top, left = (n % factor if reversed_axis else 0 for n, reversed_axis in zip((opened.height, opened.width), turned))
     columns = slice(left, left + opened.width // factor * factor)
     height = opened.height // factor
     step = max(1, READ_AT_ONCE // (factor * opened.width))

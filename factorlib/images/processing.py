@@ -71,17 +71,19 @@ def halo(
     length = np.linalg.norm(normal, axis=0)
     normal = normal / np.maximum(length, 1e-9)
 
-    def at(picture: np.ndarray, far: float) -> Float[np.ndarray, " n"]:
+    def sample(picture: np.ndarray, distance_px: float) -> Float[np.ndarray, " n"]:
         """Sample the picture at a distance from each contour pixel."""
-        places = y + far * normal[0], x + far * normal[1]
+        places = y + distance_px * normal[0], x + distance_px * normal[1]
         return map_coordinates(picture.astype(float), places, order=1, mode="nearest")
 
     # usable contour pixels: no corner, no other contour within reach, a sufficient step
     clear = length > 0.8
-    for far in (-FAR, FAR):
-        clear &= (at(distance, far) * np.sign(far) > 0.7 * FAR) & (at(known, far) > 0.99)
-    step = at(encoded, FAR) - at(encoded, -FAR)
+    for distance_px in (-FAR, FAR):
+        clear &= (sample(distance, distance_px) * np.sign(distance_px) > 0.7 * FAR) & (
+            sample(known, distance_px) > 0.99
+        )
+    step = sample(encoded, FAR) - sample(encoded, -FAR)
     clear &= np.abs(step) > LEAST_STEP
     if clear.sum() < LEAST_PLACES:
         return 0.0
-    return float(np.median((at(encoded, NEAR) - at(encoded, FAR))[clear] / step[clear]))
+    return float(np.median((sample(encoded, NEAR) - sample(encoded, FAR))[clear] / step[clear]))

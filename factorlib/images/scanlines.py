@@ -78,12 +78,14 @@ def open_scanlines(path: str | Path, key: str | None) -> OpenPhoto:
     Raises:
         InputError: If the file is no image, or has neither grey nor RGB.
     """
-    wish = oiio.ImageSpec()
-    wish.attribute("oiio:UnassociatedAlpha", 1)
-    source = oiio.ImageInput.open(str(path), wish)
+    config = oiio.ImageSpec()
+    config.attribute("oiio:UnassociatedAlpha", 1)
+    source = oiio.ImageInput.open(str(path), config)
     if source is None:
         fault = f"not readable as an image ({one_line(oiio.geterror())})"
-        raise InputError(fault, file=path, key=key, cure="is it whole, and of the kind its suffix says?")
+        raise InputError(
+            fault, file=path, key=key, cure="the file is damaged or has a wrong suffix: copy or export it again"
+        )
     spec = source.spec()
     colours = _colours(spec, path, key)
     first = min(colours)

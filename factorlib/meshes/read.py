@@ -115,11 +115,11 @@ class MeshCache:
             if name in self.displacements or name in self.log_factors:
                 dense = subdivided_mesh(mesh)
                 still = np.zeros(dense.nodes)
-                moves, factors = (np.array(of.get(name, still)) for of in (self.displacements, self.log_factors))
+                moves, factors = (np.array(table.get(name, still)) for table in (self.displacements, self.log_factors))
                 if not len(moves) == len(factors) == dense.nodes:
-                    found = "it is not the mesh that the stage `surface` moved"
+                    fault = "this is not the mesh whose surface the stage `surface` estimated"
                     cure = "run `surface` again"
-                    raise InputError(found, file=file, cure=cure)
+                    raise InputError(fault, file=file, cure=cure)
                 detail = np.exp(factors)[dense.node] if name in self.log_factors else None
                 mesh = msgspec.structs.replace(dense.moved(moves), detail=detail)
             self._meshes[key] = mesh
@@ -158,9 +158,6 @@ def part_labels(
         overrides: Material of some parts, with precedence over `part_materials`.
         file: File to name in errors.
 
-    Returns:
-        A label for each part.
-
     Raises:
         InputError: If a part is unknown, or has no material or several; if a material is unknown.
 
@@ -178,16 +175,16 @@ def part_labels(
             cure = did_you_mean(material, materials)
             raise InputError(f"unknown material {material!r}", file=file, key=part, cure=cure)
     labels = []
-    for goes_by in names:
-        chosen = next(filter(None, ({m[n] for n in goes_by if n in m} for m in (overrides, parts))), {default})
-        called = one_line(" / ".join(goes_by)) or "(unnamed)"
+    for part_names in names:
+        chosen = next(filter(None, ({m[n] for n in part_names if n in m} for m in (overrides, parts))), {default})
+        title = one_line(" / ".join(part_names)) or "(unnamed)"
         if len(chosen) > 1:
-            fault = f"part {called} gets several materials: {', '.join(sorted(filter(None, chosen)))}"
-            raise InputError(fault, file=file, cure="name it once")
+            fault = f"part {title} gets several materials: {', '.join(sorted(filter(None, chosen)))}"
+            raise InputError(fault, file=file, cure="give a material to one of its names only")
         if None in chosen:
-            example = f"add it to `parts`, e.g. {one_line(goes_by[0])}: {materials[0]}" if goes_by else None
-            cure = example or "name it in an editor"
-            raise InputError(f"part {called} has no material", file=file, key=called, cure=cure)
+            example = f"add it to `parts`, e.g. {one_line(part_names[0])}: {materials[0]}" if part_names else None
+            cure = example or "name the part in a mesh editor"
+            raise InputError(f"part {title} has no material", file=file, key=title, cure=cure)
         labels.append(list(materials).index(*chosen) + 1)
     return np.array(labels, dtype=np.int16)
 
@@ -251,17 +248,21 @@ def solid(soup: TriangleSoup, file: str | Path) -> tuple[np.ndarray, np.ndarray,
         if count:
             log.info("%s: %d %s faces dropped", file, count, what)
     if not (solid & single).any():
-        raise InputError("every face has zero area", file=file, cure="is the mesh flat to a line, or its scale zero?")
+        raise InputError(
+            "every face has zero area",
+            file=file,
+            cure="look at it in an editor: it is flattened to a line or a point, or its scale is zero",
+        )
     return vertices, faces, solid & single
 
 
-def merged_normals(own: np.ndarray, supplied: np.ndarray, area: np.ndarray) -> np.ndarray:
+def merged_normals(computed: np.ndarray, supplied: np.ndarray, area: np.ndarray) -> np.ndarray:
     """Return the file's corner normals where they are sane, else the computed ones.
 
     Sane normals have unit length and are within 75° of the face's normal.
 
     Args:
-        own: Computed normals, [F, 3, 3].
+        computed: Computed normals, [F, 3, 3].
         supplied: Normals of the file, [F, 3, 3], NaN if there are none.
         area: Area vectors of the faces, [F, 3].
 
@@ -274,4 +275,4 @@ def merged_normals(own: np.ndarray, supplied: np.ndarray, area: np.ndarray) -> n
         face = (area / np.linalg.norm(area, axis=1, keepdims=True))[:, None, :]
         right_length = np.isfinite(unit).all(axis=-1) & (np.abs(length[..., 0] - 1) < 0.05)
         sane = right_length & (np.sum(unit * face, axis=-1) > 0.26)
-    return np.where(sane[..., None], unit, own)
+    return np.where(sane[..., None], unit, computed)

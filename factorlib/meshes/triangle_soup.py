@@ -110,13 +110,13 @@ def check(soup: TriangleSoup, file: str | Path) -> TriangleSoup:
     low, high = int(soup.faces.min()), int(soup.faces.max())
     if low < 0 or high >= len(soup.vertices):
         fault = f"a face uses vertex {(low if low < 0 else high) + 1} of {len(soup.vertices)}"
-        refuse(fault, "is the file whole?")
+        refuse(fault, "the file is damaged: copy or export it again")
     bad = ~np.isfinite(soup.vertices).all(axis=1)
     if bad.any():
         fault = f"{int(bad.sum())} vertices are not finite, first is number {int(np.argmax(bad)) + 1}"
         refuse(fault, "remove them in a mesh editor, or export the mesh again")
     corners = soup.vertices[soup.faces.reshape(-1)]
-    cure = "give it in another unit, about its own origin"
+    cure = "move the mesh to its origin, or export it in another unit"
     largest = float(np.abs(corners).max())
     extent = float(np.ptp(corners, axis=0).max())
     if largest > LARGEST:
@@ -124,7 +124,7 @@ def check(soup: TriangleSoup, file: str | Path) -> TriangleSoup:
     if 0 < extent < LEAST_EXTENT:
         refuse(f"is {extent:.3g} across, less than {LEAST_EXTENT:.0e}", cure)
     if 0 < extent < LEAST_SHARE * largest:
-        refuse(f"is {extent:.3g} across and {largest:.3g} from its origin: its shape is lost in that", cure)
+        refuse(f"is {extent:.3g} across but {largest:.3g} from its origin: too few digits are left for its shape", cure)
     return soup
 
 

@@ -70,7 +70,7 @@ def test_obj_parts_go_by_group_or_usemtl_without_a_material_file(tmp_path, parts
 @pytest.mark.parametrize("parts, words, cure", [
     ({"shell": "red"}, "legs.*no material", "legs: red|wood: red"),
     ({"shel": "red", "legs": "oak"}, "no part 'shel'", "did you mean 'shell'?"),
-    ({"shell": "red", "plastic": "oak", "legs": "oak"}, "several materials", "name it once"),
+    ({"shell": "red", "plastic": "oak", "legs": "oak"}, "several materials", "one of its names only"),
     ({"shell": "red", "legs": "ok"}, "unknown material 'ok'", "did you mean 'oak'?"),
 ])  # fmt: skip
 def test_parts_and_materials_that_do_not_fit_are_named(tmp_path, parts, words, cure):

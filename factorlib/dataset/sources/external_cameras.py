@@ -113,16 +113,20 @@ def matched(spec: DatasetFile, kind: str, images: list[SourceImage], refuse: Ref
         number = int(path.stem) if path.stem.isascii() and path.stem.isdigit() else None
         tails = [("path", *path.parts[-length:]) for length in range(1, len(path.parts) + 1)]
         ways = ([("id", number)], tails, [("file", path.name)], [("stem", path.stem)])  # the strictest first
-        like_it = next(filter(None, ([image for way in each for image in alike.get(way, [])] for each in ways)), [])
-        if len(like_it) > 1:
-            names = ", ".join(repr(image.name) for image in like_it[:3])
-            refuse(key, f"{photo.image!r} could be {names}", f"say which: cameras.images: {{{photo.name}: …}}")
-        if like_it:
-            result[photo.name] = like_it[0]
+        candidates = next(filter(None, ([image for way in each for image in alike.get(way, [])] for each in ways)), [])
+        if len(candidates) > 1:
+            names = ", ".join(repr(image.name) for image in candidates[:3])
+            refuse(
+                key,
+                f"{photo.image!r} matches several images of the source: {names}",
+                f"choose one: cameras.images: {{{photo.name}: …}}",
+            )
+        if candidates:
+            result[photo.name] = candidates[0]
     if not result:
-        some = ", ".join(repr(image.name) for image in images[:3]) or "none at all"
-        cure = "say which is which: cameras.images: {photo: image, …}"
-        refuse(f"cameras.{kind}", f"none of its {len(images)} images ({some}) is named as a photo", cure)
+        examples = ", ".join(repr(image.name) for image in images[:3]) or "none at all"
+        cure = "assign images to photos: cameras.images: {photo: image, …}"
+        refuse(f"cameras.{kind}", f"none of its {len(images)} images ({examples}) has the name of a photo", cure)
     return result
 
 
@@ -155,8 +159,8 @@ def _poses(
             for pose in instances:
                 poses[obj.name] = RigidTransform(pose.rotation, _divided(pose.translation, source.mesh_unit_mm))
         return poses
-    here = {name: Similarity() for name in hulls} | source.world_from_object
-    placed = {obj.name: here[obj.name] for obj in objects if obj.name in here}
+    similarities = {name: Similarity() for name in hulls} | source.world_from_object
+    placed = {obj.name: similarities[obj.name] for obj in objects if obj.name in similarities}
     scales = sorted({similarity.scale for similarity in placed.values()})
     if len(scales) > 1:
         fault = f"photo {photo.name!r} shows objects of different scales, {', '.join(f'{s:g}' for s in scales)}"

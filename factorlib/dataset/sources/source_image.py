@@ -109,9 +109,9 @@ def pinhole(camera: pycolmap.Camera, key: str, refuse: Refusal) -> tuple[float, 
         slopes = camera.cam_from_img(pixels)
         assert slopes is not None  # as of a single point; rows of many points are NaN
         focal = float((slopes * places).sum() / (slopes * slopes).sum())
-        off = float((((places - focal * slopes) ** 2).sum(axis=1) ** 0.5).max())
-    if not off <= MOST_OFF_PX:  # NaN where a pixel has no ray
-        far = f"by {off:.1f} px" if off == off else "so much that some pixels have no ray"
+        error = float((((places - focal * slopes) ** 2).sum(axis=1) ** 0.5).max())
+    if not error <= MOST_OFF_PX:  # NaN where a pixel has no ray
+        extent = f"by {error:.1f} px" if error == error else "so much that some pixels have no ray"
         how = "the camera's lens distorts"
         cure = (
             "give the photo's camera.focal_px, principal_point and distortion: [k1, k2] in dataset.yaml; "
@@ -124,7 +124,7 @@ def pinhole(camera: pycolmap.Camera, key: str, refuse: Refusal) -> tuple[float, 
                 "or resample photos and masks to square pixels"
             )
         limit = f"up to {MOST_OFF_PX} px would not matter"
-        refuse(key, f"{how}: it differs from a pinhole of one focal length {far}; {limit}", cure)
+        refuse(key, f"{how}: it differs from a pinhole of one focal length {extent}; {limit}", cure)
     return focal, centre
 
 

@@ -63,15 +63,17 @@ def read_transforms(path: str, refuse: Refusal) -> list[SourceImage]:
     for index, frame in enumerate(content.frames):
         key = f"frames[{index}]"
         names = FrameCamera.__struct_fields__
-        own = {name: getattr(frame, name) for name in names}
-        lens = FrameCamera(**{name: getattr(content, name) if own[name] is None else own[name] for name in names})
+        frame_values = {name: getattr(frame, name) for name in names}
+        lens = FrameCamera(
+            **{name: getattr(content, name) if frame_values[name] is None else frame_values[name] for name in names}
+        )
         camera, size = _camera(key, lens, refuse)
         centred = lens.cx is None or lens.cy is None
-        of = f"{key}.transform_matrix"
+        matrix_key = f"{key}.transform_matrix"
         rows = frame.transform_matrix
         if len(rows) not in (3, 4) or (len(rows) == 4 and tuple(rows[3]) != (0, 0, 0, 1)):
-            refuse(of, "is not a rigid matrix", "give the rows [R | t], and [0, 0, 0, 1] below them or nothing")
-        refuse.rotation(of, tuple(row[:3] for row in rows[:3]))
+            refuse(matrix_key, "is not a rigid matrix", "give the rows [R | t], and [0, 0, 0, 1] below them or nothing")
+        refuse.rotation(matrix_key, tuple(row[:3] for row in rows[:3]))
         right, down, forward = ((x, -y, -z) for x, y, z, _ in rows[:3])  # OpenGL's camera axes to OpenCV's
         cam_from_world = rigid((right, down, forward), (rows[0][3], rows[1][3], rows[2][3])).inverse()
         images.append(SourceImage(frame.file_path, camera, size, f"{file.name}: {key}", centred, cam_from_world))
