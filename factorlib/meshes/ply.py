@@ -43,7 +43,7 @@ CURE = "is it whole, and a PLY? export it again"
 
 
 Properties = dict[str, tuple[str, str | None]]  # NumPy types of the numbers, and of the length before a list of them
-Column = tuple[np.ndarray, np.ndarray]  # the numbers of all rows, concatenated, and the count of each row
+Columns = dict[str, tuple[np.ndarray, np.ndarray]]  # numbers of all rows, concatenated, and the count of each row
 
 
 def read_ply(path: Path, content: bytes, limits: Limits) -> TriangleSoup:
@@ -139,9 +139,7 @@ def _check_room(elements: dict[str, tuple[int, Properties]], order: str, room: i
         raise InputError(fault, file=path, cure=CURE)
 
 
-def _columns(
-    content: bytes, offset: int, order: str, count: int, properties: Properties
-) -> tuple[dict[str, Column], int]:
+def _columns(content: bytes, offset: int, order: str, count: int, properties: Properties) -> tuple[Columns, int]:
     """Return the columns of an element's rows, and the offset of their end.
 
     Consecutive rows with lists of equal lengths are read together. `order` is the byte order; "" means that every

@@ -94,33 +94,27 @@ def matched(spec: DatasetFile, kind: str, images: list[SourceImage], refuse: Ref
     """
     assert spec.cameras is not None
     by_name = {image.name: image for image in images}
-    result = {}
     alike: dict[tuple, list[SourceImage]] = {}  # images by each name that may match a photo's
     for image in images:
         path = PurePosixPath(str(image.name).replace("\\", "/"))
         stem = path.stem if path.suffix.lower() in SUFFIXES else path.name
-        for way in (("id", image.name), ("path", *path.parts), ("file", path.name), ("stem", stem)):
-            alike.setdefault(way, []).append(image)
+        for pattern in (("id", image.name), ("path", *path.parts), ("file", path.name), ("stem", stem)):
+            alike.setdefault(pattern, []).append(image)
+    result = {}
     for photo in spec.photos:
         key = f"cameras.images.{photo.name}"
-        path = PurePosixPath(photo.image)
         if photo.name in spec.cameras.images:
             name = spec.cameras.images[photo.name]
             if name not in by_name:
                 refuse(key, f"the source has no image {name!r}", did_you_mean(str(name), by_name))
             result[photo.name] = by_name[name]
             continue
-        number = int(path.stem) if path.stem.isascii() and path.stem.isdigit() else None
-        tails = [("path", *path.parts[-length:]) for length in range(1, len(path.parts) + 1)]
-        ways = ([("id", number)], tails, [("file", path.name)], [("stem", path.stem)])  # the strictest first
-        candidates = next(filter(None, ([image for way in each for image in alike.get(way, [])] for each in ways)), [])
+        matches = ([image for pattern in each for image in alike.get(pattern, [])] for each in _patterns(photo))
+        candidates = next(filter(None, matches), [])
         if len(candidates) > 1:
             names = ", ".join(repr(image.name) for image in candidates[:3])
-            refuse(
-                key,
-                f"{photo.image!r} matches several images of the source: {names}",
-                f"choose one: cameras.images: {{{photo.name}: …}}",
-            )
+            fault = f"{photo.image!r} matches several images of the source: {names}"
+            refuse(key, fault, f"choose one: cameras.images: {{{photo.name}: …}}")
         if candidates:
             result[photo.name] = candidates[0]
     if not result:
@@ -128,6 +122,14 @@ def matched(spec: DatasetFile, kind: str, images: list[SourceImage], refuse: Ref
         cure = "assign images to photos: cameras.images: {photo: image, …}"
         refuse(f"cameras.{kind}", f"none of its {len(images)} images ({examples}) has the name of a photo", cure)
     return result
+
+
+def _patterns(photo: PhotoEntry) -> list[list[tuple]]:
+    """Return the names under which a photo may stand in a source, the strictest first."""
+    path = PurePosixPath(photo.image)
+    number = int(path.stem) if path.stem.isascii() and path.stem.isdigit() else None
+    tails: list[tuple] = [("path", *path.parts[-length:]) for length in range(1, len(path.parts) + 1)]
+    return [[("id", number)], tails, [("file", path.name)], [("stem", path.stem)]]
 
 
 def _poses(
