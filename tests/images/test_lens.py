@@ -55,7 +55,7 @@ def test_points_go_there_and_back_and_the_distortion_is_the_one_that_is_written_
 
 def test_coefficients_of_no_lens_are_refused_and_no_distortion_is_no_lens():
     folded = radial_lens(Intrinsics(focal_px=140.0, distortion=(-3.0, 0.0)), 2, W, H)
-    with pytest.raises(InputError, match="fold the picture"):
+    with pytest.raises(InputError, match="map two rays"):
         folded.check(W, H, "dataset.yaml", "photos[a].camera.distortion")
     LENS.check(W, H, "dataset.yaml", "photos[a].camera.distortion")
     assert radial_lens(None, 1, W, H) is None and radial_lens(Intrinsics(focal_px=140.0), 1, W, H) is None
