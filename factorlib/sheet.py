@@ -75,7 +75,7 @@ def write_sheet(folder: Path, path: Path, report: Callable[[int, int], None] = l
             if entry is None or entry.file is None:  # left open, or reconstructed from the masks
                 continue
             with suppress(InputError, ValueError):
-                mesh = read_mesh(path_inside(folder, entry.file), names, entry.made_of, obj.materials)
+                mesh = read_mesh(path_inside(folder, entry.file), names, entry.part_materials, obj.materials)
                 named.append((obj.name, drawn(mesh, colours)))
         titled = []
         for title, each in named:

@@ -12,8 +12,8 @@ from typing import Any
 
 import numpy as np
 
-from factorlib.dataset.check import MESHES, made_of, mirror_balls
-from factorlib.dataset.schema import Dataset, ObjectEntry, PhotoEntry
+from factorlib.dataset.check import MESHES, instance_materials, mirror_balls
+from factorlib.dataset.schema import Dataset, MeshInstance, PhotoEntry
 from factorlib.errors import InputError
 from factorlib.evaluate.gauge import connected_components
 from factorlib.evaluate.truth import read_true_light, read_true_normals
@@ -66,7 +66,9 @@ class Validation:
         """Return warnings about what no photo can determine, from the materials that dataset.yaml names."""
         together: dict[str, set[str]] = {}
         for photo in self.spec.photos:
-            together.setdefault(photo.light, set()).update(*(made_of(obj, self.spec) for obj in photo.objects))
+            together.setdefault(photo.light, set()).update(
+                *(instance_materials(obj, self.spec) for obj in photo.objects)
+            )
         component = connected_components({light: sorted(names) for light, names in together.items() if names})
         if (groups := len(set(component.values()))) < 2:
             return []
@@ -106,11 +108,11 @@ class Validation:
             for name, path in self.dataset.truth.normals.items():
                 yield f"normals {name}", partial(self._normals, name, self.file(path))
 
-    def _ball(self, obj: ObjectEntry, key: str) -> None:
+    def _ball(self, obj: MeshInstance, key: str) -> None:
         """Check that a mirror ball is round: its vertices are equally far from the centre of its bounding box."""
         if (file := self.spec.meshes[obj.mesh].file) is None:
             return
-        made = self.spec.meshes[obj.mesh].made_of
+        made = self.spec.meshes[obj.mesh].part_materials
         points = read_mesh(self.file(file), self.spec.materials, made, obj.materials).vertices
         radius = np.linalg.norm(points - (points.min(0) + points.max(0)) / 2, axis=1)
         if np.ptp(radius) > NOT_ROUND * radius.max():
@@ -130,11 +132,11 @@ class Validation:
         check_values(path, most_megapixels, f"{key}.image")
         labels = read_labels(entry.masks, self.file, self.spec.materials, size, entry.image, f"{key}.masks")
         objects = read_objects([(obj.name, obj.mask) for obj in entry.objects], self.file, size, f"{key}.objects")
-        own = [(obj.name, made_of(obj, self.spec)) for obj in entry.objects]
+        own = [(obj.name, instance_materials(obj, self.spec)) for obj in entry.objects]
         masks = entry.masks if isinstance(entry.masks, str) else next(iter(entry.masks.values()))
         check_materials(labels, objects, own, self.spec.materials, self.file(masks), f"{key}.objects")
 
-    def _object(self, obj: ObjectEntry, relative: str, limits: Limits) -> None:
+    def _object(self, obj: MeshInstance, relative: str, limits: Limits) -> None:
         """Check the parts of a mesh file, which is read once; a failure is raised again for every object."""
         file = self.file(relative)
         if relative not in self._parts:
@@ -144,7 +146,7 @@ class Validation:
                 self._parts[relative] = error
         if isinstance(parts := self._parts[relative], InputError):
             raise parts
-        part_labels(parts, self.spec.materials, self.spec.meshes[obj.mesh].made_of, obj.materials, file)
+        part_labels(parts, self.spec.materials, self.spec.meshes[obj.mesh].part_materials, obj.materials, file)
 
 
 def _faults(checks: Iterable[Check]) -> list[InputError]:

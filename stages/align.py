@@ -22,7 +22,7 @@ from factorlib.errors import InputError
 from factorlib.geometry.camera import Pose
 from factorlib.geometry.raster import Caster, Maps, rasterise
 from factorlib.images.exr import read_exr, write_exr
-from factorlib.images.lens import lens_of
+from factorlib.images.lens import radial_lens
 from factorlib.images.picture import write_png
 from factorlib.jsonfile import write_json
 from factorlib.meshes.limits import Limits
@@ -143,13 +143,13 @@ def read_objects(
         before = earlier.objects.get(entry.name) if earlier and given is None else None
         file = inputs.mesh(entry.mesh, mesh_entry.file)
         scale = before.scale if before else AS_IT_IS
-        mesh = read_mesh(file, materials, mesh_entry.made_of, entry.materials, params.crease_deg, params.limits)
+        mesh = read_mesh(file, materials, mesh_entry.part_materials, entry.materials, params.crease_deg, params.limits)
         silhouette = silhouette_of_object(channels, number, mesh.labels, entry.mask is not None)
         pose = Pose(np.array(given.rotation), np.array(given.translation)) if given is not None else None
         if entry.keypoints:  # pixels of the file, to undistorted pixels of the reduced photo
             pixels = np.array([keypoint.pixel for keypoint in entry.keypoints]) / factor
             points = np.array([keypoint.point for keypoint in entry.keypoints])
-            lens = lens_of(slice_.camera, factor, *channels["label"].shape[::-1])
+            lens = radial_lens(slice_.camera, factor, *channels["label"].shape[::-1])
             keypoints = Keypoints(lens.undistorted(pixels) if lens else pixels, points)
         caster = Caster(scaled(mesh, scale))
         objects.append(ObjectToAlign(entry.name, caster, silhouette, pose, keypoints, before, scale))

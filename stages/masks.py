@@ -15,10 +15,10 @@ from factorlib.dataset.schema import LEFT_OUT, PhotoSlice
 from factorlib.errors import InputError
 from factorlib.images.boxes import box_majority, least_factor
 from factorlib.images.exr import write_exr
-from factorlib.images.lens import Undistorted, lens_of
+from factorlib.images.lens import Undistorted, radial_lens
 from factorlib.images.limits import MOST_MEGAPIXELS, check_pixels
 from factorlib.images.photo import Photo, check_bright, decoded, open_photo
-from factorlib.images.processing import HALO, camera_says, halo
+from factorlib.images.processing import HALO, halo, reported_processing
 from factorlib.images.raw import is_raw
 from factorlib.jsonfile import write_json
 from factorlib.labels.labels import Labels, read_labels, read_objects
@@ -60,50 +60,74 @@ def main(params: Params, inputs: Inputs, out: Path, progress: Progress = silent)
     materials = inputs.facts["dataset.materials"]
     path = inputs.file(facts.image)
     entry = f"photos[{name}]"
-    stored = open_photo(path, f"{entry}.image")
-    height, width = stored.size
+    opened = open_photo(path, f"{entry}.image")
+    height, width = opened.size
     key = f"{entry}.masks"
-    check_pixels(stored.size, params.most_megapixels, path, f"{entry}.image")
+    check_pixels(opened.size, params.most_megapixels, path, f"{entry}.image")
     progress(0, 3, f"{name}: masks")  # read first: they give the factor by which the photo is reduced while it is read
-    labels = read_labels(facts.masks, inputs.file, materials, stored.size, facts.image, key)
-    own_masks = [(o.name, o.mask) for o in facts.objects]
-    objects = read_objects(own_masks, inputs.file, stored.size, f"{entry}.objects")
+    labels = read_labels(facts.masks, inputs.file, materials, opened.size, facts.image, key)
+    object_masks = [(o.name, o.mask) for o in facts.objects]
+    objects = read_objects(object_masks, inputs.file, opened.size, f"{entry}.objects")
     # smallest integer factor at which materials and frame fit their limits
-    materials_fit = least_factor(int(np.count_nonzero(labels.label)), params.pixels)
-    factor = min(max(materials_fit, least_factor(height * width, params.frame)), height, width)
+    factor = max(
+        least_factor(int(np.count_nonzero(labels.label)), params.pixels), least_factor(height * width, params.frame)
+    )
+    factor = min(factor, height, width)
     labels = reduced(labels, factor, path, key)
     objects = box_majority(objects, factor)
     progress(1, 3, f"{name}: photo")
-    photo = decoded(stored, facts.encoding, factor, path)
-    # remove lens distortion
-    if lens := lens_of(facts.camera, photo.factor, photo.width, photo.height):
-        lens.check(photo.width, photo.height, "dataset.yaml", f"{entry}.camera.distortion")
-        straight = Undistorted(lens, photo.height, photo.width)
-        photo = straight.photo(photo)
-        objects = straight.nearest(objects)
-        labels = Labels(straight.nearest(labels.label), straight.nearest(labels.left_out) | ~straight.inside)
+    photo = decoded(opened, facts.encoding, factor, path)
+    photo, labels, objects = undistorted(photo, labels, objects, facts, f"{entry}.camera.distortion")
     valid = valid_pixels(photo, labels, path, f"{entry}.image")
-    warn_of_processing(stored.exif, photo, labels, path)
+    warn_of_processing(opened.exif, photo, labels, path)
     progress(2, 3, f"{name}: writing")
     colours = {c: photo.radiance[..., k] for k, c in enumerate("RGB")}
     clipped = {f"clipped.{c}": photo.clipped[..., k] for k, c in enumerate("RGB")}
     channels = {"label": labels.label, "valid": valid, "left_out": labels.left_out, "object": objects}
     write_exr(out / f"{name}.exr", {**colours, **channels, **clipped})
-    summary = PhotoFacts(
+    pixels = {material: int((labels.label[valid] == k).sum()) for k, material in enumerate(materials, 1)}
+    write_json(out / f"{name}.json", photo_facts(photo, facts, (width, height), pixels, valid))
+    progress(3, 3, name)
+
+
+def photo_facts(
+    photo: Photo, facts: PhotoSlice, original_size: tuple[int, int], pixels: dict[str, int], valid: np.ndarray
+) -> PhotoFacts:
+    """Summarise a photo.
+
+    Args:
+        photo: The photo, as written.
+        facts: The photo's keys in dataset.yaml.
+        original_size: Width and height of the photo's file as displayed.
+        pixels: Number of valid pixels by material.
+        valid: Mask of valid pixels.
+    """
+    return PhotoFacts(
         width=photo.width,
         height=photo.height,
         factor=photo.factor,
-        original_size=(width, height),
+        original_size=original_size,
         focal_px=facts.focal_px / photo.factor if facts.focal_px else photo.focal_px,
         focal_source="dataset" if facts.focal_px else "exif" if photo.focal_px else None,
         encoding=photo.encoding,
         exposure=photo.exposure,
         illumination=facts.illumination,
-        pixels={material: int((labels.label[valid] == k).sum()) for k, material in enumerate(materials, 1)},
+        pixels=pixels,
         clipped_fraction=float(photo.clipped[valid].any(axis=-1).mean()),
     )
-    write_json(out / f"{name}.json", summary)
-    progress(3, 3, name)
+
+
+def undistorted(
+    photo: Photo, labels: Labels, objects: np.ndarray, facts: PhotoSlice, key: str
+) -> tuple[Photo, Labels, np.ndarray]:
+    """Remove the distortion that dataset.yaml gives; InputError if it is not invertible within the picture."""
+    lens = radial_lens(facts.camera, photo.factor, photo.width, photo.height)
+    if lens is None:
+        return photo, labels, objects
+    lens.check(photo.width, photo.height, "dataset.yaml", key)
+    pinhole = Undistorted(lens, photo.height, photo.width)
+    labels = Labels(pinhole.nearest(labels.label), pinhole.nearest(labels.left_out) | ~pinhole.inside)
+    return pinhole.photo(photo), labels, pinhole.nearest(objects)
 
 
 def reduced(labels: Labels, factor: int, path: Path, key: str) -> Labels:
@@ -126,14 +150,14 @@ def reduced(labels: Labels, factor: int, path: Path, key: str) -> Labels:
 
 def warn_of_processing(exif: Mapping[str, Any], photo: Photo, labels: Labels, path: Path) -> None:
     """Warn of processing that no tone curve undoes, from EXIF and from halos at the masks' contours."""
-    if (says := camera_says(exif)) and not is_raw(path):
-        log.warning("%s: the camera processed it (%s): %s", path, says, CURE)
+    if (processing := reported_processing(exif)) and not is_raw(path):
+        log.warning("%s: the camera processed it (%s): %s", path, processing, CURE)
     if (overshoot := halo(photo.radiance, labels.label > 0, ~labels.left_out)) > HALO:
-        words = (
+        fault = (
             "beside contours the background overshoots by %.0f %% of the step across them, "
             "as after sharpening or local tone mapping"
         )
-        log.warning("%s: " + words + ": %s", path, 100 * overshoot, CURE)
+        log.warning("%s: " + fault + ": %s", path, 100 * overshoot, CURE)
 
 
 def valid_pixels(photo: Photo, labels: Labels, path: Path, key: str) -> np.ndarray:

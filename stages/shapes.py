@@ -16,10 +16,9 @@ from factorlib.align.input_checks import camera_of_photo
 from factorlib.align.silhouette import UNKNOWN, silhouette_of_object
 from factorlib.align.view import with_prior_focal
 from factorlib.dataset.check import ALL_OF_IT
-from factorlib.dataset.schema import ExternalCamera, MeshEntry, ObjectEntry, ObjectsSlice, Pose, ShapesSlice
+from factorlib.dataset.schema import ExternalCamera, MeshEntry, MeshInstance, ObjectsSlice, RigidTransform, ShapesSlice
 from factorlib.errors import InputError
-from factorlib.geometry.camera import Camera
-from factorlib.geometry.camera import Pose as PoseArrays
+from factorlib.geometry.camera import Camera, Pose
 from factorlib.images.exr import read_exr
 from factorlib.images.transfer import srgb_encode
 from factorlib.jsonfile import write_json
@@ -177,7 +176,7 @@ class MaskedPhoto:
 
         Hulls are made in the world frame, so cam_from_world is their pose.
         """
-        pose = Pose(**entry_of(registered.pose))
+        pose = RigidTransform(**entry_of(registered.pose))
         poses = {obj.name: pose for obj in self.entries.objects if obj.mesh in meshes and meshes[obj.mesh].hull}
         return ExternalCamera("sfm", registered.focal * self.facts.factor, None, None, poses)
 
@@ -203,11 +202,11 @@ class MaskedPhoto:
                     part[label == part_label] = k
                 part[(label > 0) & (part == 0)] = UNKNOWN
                 pose = obj.pose or (external.poses.get(obj.name) if external else None)
-                arrays = PoseArrays(np.array(pose.rotation), np.array(pose.translation)) if pose else None
+                arrays = Pose(np.array(pose.rotation), np.array(pose.translation)) if pose else None
                 outlines.append(Outline(self.name, part, *self.camera(external), arrays))
         return outlines
 
-    def _labels(self, obj: ObjectEntry, entry: MeshEntry) -> list[int]:
+    def _labels(self, obj: MeshInstance, entry: MeshEntry) -> list[int]:
         """Return the label of each part of the shape in this photo."""
         made_of: Mapping[str, str | None] = entry.parts or {ALL_OF_IT: entry.material}
         return [self.materials.index({**made_of, **obj.materials}[part]) + 1 for part in parts_of(entry)]

@@ -31,8 +31,8 @@ from factorlib.inference.surface_turns import (
     zero_detail,
 )
 from factorlib.jsonfile import write_json
-from factorlib.meshes.fine import fine
-from factorlib.meshes.read import CREASE_DEG, MeshesOnce
+from factorlib.meshes.read import CREASE_DEG, MeshCache
+from factorlib.meshes.subdivision import subdivided_mesh
 from factorlib.reflection import reflection_operator
 from factorlib.results.poses import FILE as POSES
 from factorlib.results.poses import PhotoPoses, read_poses
@@ -149,12 +149,12 @@ def read_surfaces(inputs: Inputs, slices: dict[str, ObjectsSlice]) -> Surfaces:
     Bodies of revolution that were estimated from outlines are left out, because their rotation about the axis is
     unknown.  Objects may give the parts of a mesh different materials; vertices do not depend on them.
     """
-    read = MeshesOnce(inputs.mesh, inputs.facts["dataset.materials"], CREASE_DEG)
+    read = MeshCache(inputs.mesh, inputs.facts["dataset.materials"], CREASE_DEG)
     meshes = {}
     for slice_ in slices.values():
         for entry in slice_.objects:
             if entry.mesh not in meshes and not slice_.meshes[entry.mesh].revolved:
-                meshes[entry.mesh] = fine(read.mesh(entry.mesh, slice_.meshes[entry.mesh], entry.materials))
+                meshes[entry.mesh] = subdivided_mesh(read.mesh(entry.mesh, slice_.meshes[entry.mesh], entry.materials))
     return Surfaces(dict(sorted(meshes.items())))
 
 

@@ -16,7 +16,7 @@ from factorlib.dataset.schema import ObjectsSlice
 from factorlib.geometry.visibility import Occluders
 from factorlib.images.exr import read_exr
 from factorlib.meshes.mesh import scaled
-from factorlib.meshes.read import CREASE_DEG, MeshesOnce
+from factorlib.meshes.read import CREASE_DEG, MeshCache
 from factorlib.results.photos import read_photo_facts
 from factorlib.results.poses import ObjectEntry, read_photo_poses
 from factorlib.stage import Inputs, Progress
@@ -76,7 +76,7 @@ def main(params: Params, inputs: Inputs, out: Path, progress: Progress) -> None:
 def read_occluders(inputs: Inputs, poses: dict[str, ObjectEntry]) -> Occluders:
     """Read the meshes of the photo's objects, at the poses that `align` estimated."""
     slice_ = msgspec.convert(inputs.facts["dataset.objects"], ObjectsSlice)
-    read = MeshesOnce(inputs.mesh, inputs.facts["dataset.materials"], CREASE_DEG)
+    read = MeshCache(inputs.mesh, inputs.facts["dataset.materials"], CREASE_DEG)
     entries = [poses[obj.name] for obj in slice_.objects]
     meshes = [read.mesh(obj.mesh, slice_.meshes[obj.mesh], obj.materials) for obj in slice_.objects]
     scaled_meshes = [scaled(mesh, entry.scale) for mesh, entry in zip(meshes, entries)]

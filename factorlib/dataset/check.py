@@ -14,10 +14,10 @@ from factorlib.dataset.schema import (
     SOURCES,
     CameraSource,
     DatasetFile,
-    Ground,
+    GroundEntry,
     MeshEntry,
+    MeshInstance,
     MirrorBall,
-    ObjectEntry,
     PhotoEntry,
     TruthFile,
 )
@@ -41,22 +41,22 @@ def check_dataset(spec: DatasetFile, file: Path) -> None:
     refuse = Refusal(file, file.parent)
     for index, name in enumerate(spec.materials):
         if name in spec.materials[:index]:
-            with refuse.noting():
+            with refuse.collecting():
                 cure = "label k is the k-th material: name each once"
                 refuse(f"materials[{index}]", f"material {name!r} is named twice", cure)
     for name, mesh in spec.meshes.items():
-        with refuse.noting():
+        with refuse.collecting():
             _check_mesh(f"meshes.{name}", mesh, spec.materials, refuse)
             if mesh.hull and spec.cameras is None:
                 _check_hull(name, spec, refuse)
-    with refuse.noting():
+    with refuse.collecting():
         refuse.once("photos", (photo.name for photo in spec.photos), "photo")
     for index, photo in enumerate(spec.photos):
         _check_photo(f"photos[{index}]", photo, spec, refuse)
-    with refuse.noting():
+    with refuse.collecting():
         if spec.cameras is not None:
             _check_source(spec.cameras, spec, refuse)
-    with refuse.noting():
+    with refuse.collecting():
         if spec.truth is not None:
             refuse.path("truth", spec.truth, (".yaml", ".yml"), must_exist=False)
     raise_all(refuse.faults)
@@ -99,7 +99,7 @@ def check_lights(photos: list[PhotoEntry], file: Path) -> None:
         other = first.setdefault(photo.light, photo)
         if (other.world_from_camera is None) != (photo.world_from_camera is None):
             names = f"{other.name!r} and {photo.name!r}"
-            fault = f"of the photos in illumination {photo.light!r}, only one of {names} has it"
+            fault = f"photos {names} share illumination {photo.light!r}, but only one of them has this key"
             cure = "give it for every photo that shares a light fixed to the world, or for none (fixed to the camera)"
             Refusal(file, file.parent)(f"photos[{index}].world_from_camera", fault, cure)
 
@@ -108,13 +108,15 @@ def _check_mesh(key: str, mesh: MeshEntry, materials: list[str], refuse: Refusal
     kinds = [kind for kind in ("file", "hull", "lathe", "primitive") if getattr(mesh, kind)]
     if len(kinds) != 1:
         cure = "give exactly one of file: <path>, hull: true, lathe: true, primitive: ball | box | cylinder"
-        refuse(key, f"has {' and '.join(kinds) or 'neither a file nor a shape to be found'}", cure)
+        refuse(key, f"has {' and '.join(kinds) or 'neither a file nor a shape to be estimated'}", cure)
     if mesh.file:
         refuse.path(f"{key}.file", mesh.file, MESHES)
     if mesh.size != 1.0 and kinds[0] in ("file", "hull"):
-        refuse(f"{key}.size", f"does not go with {kinds[0]}", "leave it out: its own numbers say how large it is")
+        refuse(
+            f"{key}.size", f"cannot be combined with {kinds[0]}", "leave it out: its own numbers say how large it is"
+        )
     if mesh.parts and kinds[0] in ("lathe", "primitive"):
-        refuse(f"{key}.parts", f"does not go with {kinds[0]}, which has one part", "write `material: …`")
+        refuse(f"{key}.parts", f"cannot be combined with {kinds[0]}, which has one part", "write `material: …`")
     if mesh.parts and mesh.material is not None:
         cure = "keep `parts: {part: material, …}`, or `material:` for a mesh of one"
         refuse(key, "has both parts and a material", cure)
@@ -126,13 +128,13 @@ def _check_mesh(key: str, mesh: MeshEntry, materials: list[str], refuse: Refusal
 
 
 def _check_hull(name: str, spec: DatasetFile, refuse: Refusal) -> None:
-    shown = [obj for photo in spec.photos for obj in photo.objects if obj.mesh == name]
-    known = sum(obj.pose is not None for obj in shown)
+    instances = [obj for photo in spec.photos for obj in photo.objects if obj.mesh == name]
+    known = sum(obj.pose is not None for obj in instances)
     if known < LEAST_OUTLINES:
         cure = (
             "add `cameras: {sfm: true}`, another source of cameras, or each object's `pose`; or use lathe or primitive"
         )
-        fault = f"of {len(shown)} photos of it {known} have a known camera, a hull needs two"
+        fault = f"of {len(instances)} photos of it {known} have a known camera, a hull needs two"
         refuse(f"meshes.{name}.hull", fault, cure)
 
 
@@ -151,75 +153,79 @@ def _check_parts(key: str, parts: dict[str, str], mesh: MeshEntry, materials: li
 
 
 def _check_photo(key: str, photo: PhotoEntry, spec: DatasetFile, refuse: Refusal) -> None:
-    with refuse.noting():
+    with refuse.collecting():
         if photo.name in RESERVED_PHOTOS:
-            refuse(f"{key}.name", f"the name {photo.name!r} is taken by a file of the results", "rename the photo")
-    with refuse.noting():
+            refuse(f"{key}.name", f"the name {photo.name!r} is reserved for a file of the results", "rename the photo")
+    with refuse.collecting():
         refuse.path(f"{key}.image", photo.image, IMAGES)
-    with refuse.noting():
+    with refuse.collecting():
         if photo.world_from_camera is not None:
             refuse.rotation(f"{key}.world_from_camera", photo.world_from_camera)
-    with refuse.noting():
+    with refuse.collecting():
         if photo.ground is not None:
             _check_ground(f"{key}.ground.normal", photo.ground, refuse)
-    with refuse.noting():
+    with refuse.collecting():
         if photo.camera and photo.camera.distortion and photo.camera.focal_px is None:
             cure = "give focal_px beside it"
             refuse(f"{key}.camera.distortion", "its unit is the focal length, which is not given", cure)
-    with refuse.noting():
+    with refuse.collecting():
         if not photo.masks:
-            refuse(f"{key}.masks", "names no mask", "give a label PNG, a COCO json, or {material: mask.png, …}")
+            refuse(f"{key}.masks", "no mask is named", "give a label PNG, a COCO json, or {material: mask.png, …}")
         if isinstance(photo.masks, str):
             refuse.path(f"{key}.masks", photo.masks, MASKS)
     for material, path in {} if isinstance(photo.masks, str) else photo.masks.items():
-        with refuse.noting():
+        with refuse.collecting():
             refuse.known(f"{key}.masks.{material}", material, spec.materials, "material")
             refuse.path(f"{key}.masks.{material}", path, (".png",))
-    with refuse.noting():
+    with refuse.collecting():
         if not photo.objects:
             cure = "add {name: …, mesh: …}: a mesh gives its pixels their normals"
             refuse(f"{key}.objects", f"photo {photo.name!r} has no objects", cure)
         refuse.once(f"{key}.objects", (obj.name for obj in photo.objects), "object")
     for index, obj in enumerate(photo.objects):
-        with refuse.noting():
+        with refuse.collecting():
             _check_object(f"{key}.objects[{index}]", obj, spec, refuse)
 
 
-def _check_object(of: str, obj: ObjectEntry, spec: DatasetFile, refuse: Refusal) -> None:
-    refuse.known(f"{of}.mesh", obj.mesh, spec.meshes, "mesh")
+def _check_object(key: str, obj: MeshInstance, spec: DatasetFile, refuse: Refusal) -> None:
+    refuse.known(f"{key}.mesh", obj.mesh, spec.meshes, "mesh")
     mesh = spec.meshes[obj.mesh]
-    _check_parts(f"{of}.materials", obj.materials, mesh, spec.materials, refuse)
+    _check_parts(f"{key}.materials", obj.materials, mesh, spec.materials, refuse)
     if obj.mask is not None:
-        refuse.path(f"{of}.mask", obj.mask, (".png",))
+        refuse.path(f"{key}.mask", obj.mask, (".png",))
     if obj.pose is not None:
-        refuse.rotation(f"{of}.pose.rotation", obj.pose.rotation)
+        refuse.rotation(f"{key}.pose.rotation", obj.pose.rotation)
         if mesh.primitive:
-            cure = "leave it out: it is found"
-            refuse(f"{of}.pose", "does not go with a primitive, whose size it would have to fit", cure)
+            cure = "leave it out: the pose is estimated"
+            refuse(f"{key}.pose", "cannot be given for a primitive, whose size is estimated with its pose", cure)
         if mesh.lathe and mesh.size != 1.0:
-            refuse(f"{of}.pose", f"does not go with meshes.{obj.mesh}.size: poses say how large it is", "keep one")
+            refuse(
+                f"{key}.pose",
+                f"cannot be combined with meshes.{obj.mesh}.size: the pose determines the size",
+                "keep one",
+            )
     if obj.keypoints and not mesh.file:
         cure = "leave them out, or give the mesh's file"
-        refuse(f"{of}.keypoints", "its mesh has no file, so no points are known on it", cure)
+        refuse(f"{key}.keypoints", "its mesh has no file, so no points are known on it", cure)
     if obj.keypoints:
-        _check_keypoints(f"{of}.keypoints", obj, refuse)
+        _check_keypoints(f"{key}.keypoints", obj, refuse)
 
 
 def _check_known(spec: DatasetFile, refuse: Refusal) -> None:
     """Check that known materials occur on objects, and reflect some light but no more than arrives."""
-    shown = {m for photo in spec.photos for obj in photo.objects for m in made_of(obj, spec)}
-    for name, of in spec.known.materials.items():
-        with refuse.noting():
+    used = {m for photo in spec.photos for obj in photo.objects for m in instance_materials(obj, spec)}
+    for name, reflectance in spec.known.materials.items():
+        with refuse.collecting():
             key = f"known.materials.{name}"
             refuse.known(key, name, spec.materials, "material")
-            if name not in shown:
+            if name not in used:
                 refuse(key, f"no object is made of material {name!r}", "leave it out, or add the object that shows it")
-            specular = of.specular or (0.0, 0.0, 0.0)
-            if not min(map(sum, zip(of.diffuse, specular, strict=True))) > 0:
+            specular = reflectance.specular or (0.0, 0.0, 0.0)
+            if not min(map(sum, zip(reflectance.diffuse, specular, strict=True))) > 0:
                 cure = "give what it reflects in every channel, or leave it out"
-                refuse(key, "it reflects nothing in some channel, so that light cannot be told from it", cure)
-            if max(of.diffuse) + max(specular) > 1:
-                fault = f"diffuse and specular reflectance are {max(of.diffuse) + max(specular):.3g} together"
+                refuse(key, "it reflects nothing in some channel, so that the light cannot be derived from it", cure)
+            if max(reflectance.diffuse) + max(specular) > 1:
+                fault = f"diffuse and specular reflectance are {max(reflectance.diffuse) + max(specular):.3g} together"
                 cure = "their largest channels may be 1 together: no more light is reflected than falls on it"
                 refuse(key, fault, cure)
     _check_known_lights(spec, refuse)
@@ -234,31 +240,31 @@ def _check_known_lights(spec: DatasetFile, refuse: Refusal) -> None:
     for photo in spec.photos:
         shots.setdefault(photo.light, []).append(photo)
     for name in spec.known.exposure:
-        with refuse.noting():
+        with refuse.collecting():
             key = f"known.exposure.{name}"
             refuse.known(key, name, [photo.name for photo in spec.photos], "photo")
-            own = next(shot for shot in shots.values() if name in [photo.name for photo in shot])
-            if lacking := [photo.name for photo in own if photo.name not in spec.known.exposure]:
-                refuse(key, f"{lacking[0]!r} shares its light and has none", "give the EV of every photo of a light")
-            if len(own) == 1:
+            sharing = next(shot for shot in shots.values() if name in [photo.name for photo in shot])
+            if without := [photo.name for photo in sharing if photo.name not in spec.known.exposure]:
+                refuse(key, f"{without[0]!r} shares its light and has none", "give the EV of every photo of a light")
+            if len(sharing) == 1:
                 refuse(key, "no other photo shares its light, whose brightness holds it", "leave it out")
-    for name, of in spec.known.illumination.items():
-        with refuse.noting():
+    for name, light in spec.known.illumination.items():
+        with refuse.collecting():
             key = f"known.illumination.{name}"
             refuse.known(key, name, shots, "illumination")
-            if isinstance(of, str):
-                refuse.path(key, of, MAPS)
+            if isinstance(light, str):
+                refuse.path(key, light, MAPS)
                 continue
             key = f"{key}.chrome"
-            balls = list(mirror_balls(spec, name, of))
+            balls = list(mirror_balls(spec, name, light))
             if not balls:
-                refuse.known(key, of.chrome, [obj.name for photo in shots[name] for obj in photo.objects], "object")
+                refuse.known(key, light.chrome, [obj.name for photo in shots[name] for obj in photo.objects], "object")
             photo, ball = balls[0]
-            material = min(made_of(ball, spec))
+            material = min(instance_materials(ball, spec))
             mesh = spec.meshes[ball.mesh]
-            if len(made_of(ball, spec)) > 1 or not (mesh.file or mesh.primitive == "ball"):
+            if len(instance_materials(ball, spec)) > 1 or not (mesh.file or mesh.primitive == "ball"):
                 refuse(key, f"mesh {ball.mesh!r} is no ball of one material", "give a mesh file, or `primitive: ball`")
-            if any(material in made_of(obj, spec) for obj in photo.objects if obj is not ball):
+            if any(material in instance_materials(obj, spec) for obj in photo.objects if obj is not ball):
                 cure = "give the ball a material of its own"
                 refuse(key, f"another object of photo {photo.name!r} is made of {material!r} too", cure)
             known = spec.known.materials.get(material)
@@ -267,13 +273,13 @@ def _check_known_lights(spec: DatasetFile, refuse: Refusal) -> None:
                     f"write known.materials.{material}: "
                     "{diffuse: [0, 0, 0], specular: [.55, .55, .55]}, as chrome's is"
                 )
-                refuse(key, f"how much of the light {material!r} mirrors is not known", cure)
+                refuse(key, f"the specular reflectance of {material!r} is not known, or it is not a mirror", cure)
             if len(shots[name]) > 1 and photo.name not in spec.known.exposure:
                 cure = "give known.exposure of its photos, or the light of one photo alone"
                 refuse(key, f"{len(shots[name])} photos of unknown exposures share the light", cure)
 
 
-def mirror_balls(spec: DatasetFile, illumination: str, ball: MirrorBall) -> Iterator[tuple[PhotoEntry, ObjectEntry]]:
+def mirror_balls(spec: DatasetFile, illumination: str, ball: MirrorBall) -> Iterator[tuple[PhotoEntry, MeshInstance]]:
     """Yield the photos in an illumination that show a mirror ball, each with the ball's object.
 
     Args:
@@ -286,28 +292,32 @@ def mirror_balls(spec: DatasetFile, illumination: str, ball: MirrorBall) -> Iter
             yield from ((photo, obj) for obj in photo.objects if obj.name == ball.chrome)
 
 
-def made_of(obj: ObjectEntry, spec: DatasetFile) -> set[str]:
+def instance_materials(obj: MeshInstance, spec: DatasetFile) -> set[str]:
     """Return the materials of an object's parts."""
-    own = spec.meshes[obj.mesh].made_of
-    return set((own | obj.materials).values() if isinstance(own, dict) else obj.materials.values() or [own or ""])
+    materials = spec.meshes[obj.mesh].part_materials
+    return set(
+        (materials | obj.materials).values()
+        if isinstance(materials, dict)
+        else obj.materials.values() or [materials or ""]
+    )
 
 
-def _check_ground(key: str, ground: Ground, refuse: Refusal) -> None:
+def _check_ground(key: str, ground: GroundEntry, refuse: Refusal) -> None:
     if not any(ground.normal):
         refuse(key, "a normal of length 0", "write the direction that points up from the ground, in the camera's axes")
     if sum(n * p for n, p in zip(ground.normal, ground.point, strict=True)) >= 0:
         fault = "it points away from the camera, or the camera lies in the plane"
-        refuse(key, fault, "turn its sign: it points toward the objects")
+        refuse(key, fault, "negate it: the normal points toward the objects")
 
 
-def _check_keypoints(key: str, obj: ObjectEntry, refuse: Refusal) -> None:
+def _check_keypoints(key: str, obj: MeshInstance, refuse: Refusal) -> None:
     """Check that keypoints are enough, distinct, and not collinear, which would leave a rotation free."""
     if obj.pose is not None:
         cure = "keep one: a pose is used as it is, keypoints are where the search begins"
         refuse(key, "has both a pose and keypoints", cure)
     if len(obj.keypoints) < LEAST_KEYPOINTS:
         cure = f"give {LEAST_KEYPOINTS} or more; {GOOD_KEYPOINTS} where the focal length is unknown"
-        refuse(key, f"{len(obj.keypoints)} keypoints do not settle a pose", cure)
+        refuse(key, f"{len(obj.keypoints)} keypoints do not determine a pose", cure)
     for name in ("pixel", "point"):
         places = [getattr(keypoint, name) for keypoint in obj.keypoints]
         first: dict[tuple[float, ...], int] = {}
@@ -319,25 +329,27 @@ def _check_keypoints(key: str, obj: ObjectEntry, refuse: Refusal) -> None:
         longest = max(arms, key=lambda arm: math.hypot(*arm))
         unit = [x / math.hypot(*longest) for x in longest]
         along = [sum(x * u for x, u in zip(arm, unit)) for arm in arms]
-        off = [math.hypot(*(x - length * u for x, u in zip(arm, unit))) for arm, length in zip(arms, along)]
-        if max(off) < LEAST_OFF_LINE * math.hypot(*longest):
+        distances = [math.hypot(*(x - length * u for x, u in zip(arm, unit))) for arm, length in zip(arms, along)]
+        if max(distances) < LEAST_OFF_LINE * math.hypot(*longest):
             cure = "name places in different directions: about a line the object could turn"
             refuse(key, f"every {name} lies on one line", cure)
 
 
 def _check_source(source: CameraSource, spec: DatasetFile, refuse: Refusal) -> None:
     """Check that there is one source of cameras, with a path inside the folder and known names."""
-    named = [kind for kind in (*SOURCES, "sfm") if getattr(source, kind)]
-    if len(named) != 1:
+    kinds = [kind for kind in (*SOURCES, "sfm") if getattr(source, kind)]
+    if len(kinds) != 1:
         cure = f"name one of {', '.join(SOURCES)}, or `sfm: true`"
-        refuse("cameras", f"names {' and '.join(named) or 'no source'}", cure)
+        refuse("cameras", f"names {' and '.join(kinds) or 'no source'}", cure)
     if source.sfm:
         for key in ("images", "world_from_object", "world_from_camera", "obj_ids", "mesh_unit_mm"):
             if getattr(source, key) != getattr(CameraSource(), key):
-                refuse(f"cameras.{key}", "does not go with sfm, whose world is not known beforehand", "leave it out")
+                refuse(
+                    f"cameras.{key}", "cannot be combined with sfm, whose world is not known beforehand", "leave it out"
+                )
         return
-    kind = named[0]
-    path = getattr(source, named[0])
+    kind = kinds[0]
+    path = getattr(source, kinds[0])
     if kind == "transforms":
         refuse.path("cameras.transforms", path, (".json",))
     else:
@@ -345,12 +357,12 @@ def _check_source(source: CameraSource, spec: DatasetFile, refuse: Refusal) -> N
     cure = "a BOP scene gives poses by obj_ids" if kind == "bop" else "for this source, world_from_object gives poses"
     for key in ("world_from_object", "world_from_camera") if kind == "bop" else ("obj_ids", "mesh_unit_mm"):
         if getattr(source, key) != getattr(CameraSource(), key):
-            refuse(f"cameras.{key}", f"does not go with {kind}", f"leave it out: {cure}")
+            refuse(f"cameras.{key}", f"cannot be combined with {kind}", f"leave it out: {cure}")
     photos = [photo.name for photo in spec.photos]
     objects = {obj.name for photo in spec.photos for obj in photo.objects}
     keys = {"images": (photos, "photo"), "world_from_object": (objects, "object"), "obj_ids": (spec.meshes, "mesh")}
-    for key, (known, of) in keys.items():
+    for key, (known, noun) in keys.items():
         for name in getattr(source, key):
-            refuse.known(f"cameras.{key}.{name}", name, known, of)
+            refuse.known(f"cameras.{key}.{name}", name, known, noun)
     for name, similarity in source.world_from_object.items():
         refuse.rotation(f"cameras.world_from_object.{name}.rotation", similarity.rotation)

@@ -35,7 +35,7 @@ class Refusal:
         raise InputError(fault, file=self.file, key=key, cure=cure)
 
     @contextmanager
-    def noting(self) -> Iterator[None]:
+    def collecting(self) -> Iterator[None]:
         """Collect an InputError raised within in `faults`, so that checking continues."""
         try:
             yield
@@ -93,15 +93,15 @@ class Refusal:
         target = self._followed(key, path, "file")
         if target.suffix.lower() not in suffixes:
             self(key, f"{path!r} has a suffix that is not read here", f"expected one of {', '.join(suffixes)}")
-        if is_there(target, key):
+        if file_exists(target, key):
             self._plain(key, path, target)
         elif must_exist:
             try:
                 names = [entry.name for entry in target.parent.iterdir() if entry.is_file()]
             except OSError:
                 names = []
-            near = did_you_mean(target.name, names)
-            cure = near if near.startswith("did") else f"put it at {target}, or correct the path"
+            suggestion = did_you_mean(target.name, names)
+            cure = suggestion if suggestion.startswith("did") else f"put it at {target}, or correct the path"
             self(key, f"there is no file {path!r}", cure)
 
     def subfolder(self, key: str, path: str) -> None:
@@ -112,7 +112,7 @@ class Refusal:
                 self(key, f"there is no folder {path!r}", "copy it there, or correct the path")
             os.scandir(folder).close()
 
-    def file_of(self, key: str, folder: str, name: str) -> Path | None:
+    def file_in(self, key: str, folder: str, name: str) -> Path | None:
         """Return the path of a file in a folder inside the dataset's; None if it does not exist.
 
         Args:
@@ -121,7 +121,7 @@ class Refusal:
             name: name of the file, which may not lead outside either
         """
         target = self._followed(key, f"{folder}/{name}", "file")
-        if not is_there(target, key):
+        if not file_exists(target, key):
             return None
         self._plain(key, f"{folder}/{name}", target)
         return target
@@ -154,7 +154,7 @@ class Refusal:
             self(key, fault, f"copy the {kind} into {self.folder.resolve()} and name it relative to that folder")
 
 
-def is_there(target: Path, key: str) -> bool:
+def file_exists(target: Path, key: str) -> bool:
     """Return True if the path exists; InputError if that cannot be determined."""
     with reading("a file", target, key):
         try:

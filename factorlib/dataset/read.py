@@ -12,8 +12,8 @@ from pathlib import Path, PurePosixPath
 from typing import Any
 
 from factorlib.dataset.check import check_dataset, check_lights, check_truth
-from factorlib.dataset.gltf import buffer_path, read_header
-from factorlib.dataset.paths import Refusal, is_there
+from factorlib.dataset.gltf_header import buffer_path, read_header
+from factorlib.dataset.paths import Refusal, file_exists
 from factorlib.dataset.schema import Dataset, DatasetFile, ExternalCamera, TruthFile
 from factorlib.errors import InputError, raise_all
 from factorlib.reading import check_plain, path_inside, read_text, reading
@@ -38,7 +38,7 @@ def read_dataset(path: str | Path) -> Dataset:
     """
     with reading("a dataset", path, "DATASET"):
         file = Path(path) / FILE if Path(path).is_dir() else Path(path)
-    if not is_there(file, "DATASET"):
+    if not file_exists(file, "DATASET"):
         raise InputError("there is no such dataset", file=file, cure=f"name a folder with a {FILE} in it")
     folder = Path(os.path.abspath(file)).parent
     if folder.name in RESERVED:
@@ -51,7 +51,7 @@ def read_dataset(path: str | Path) -> Dataset:
     files = {name: mesh.file for name, mesh in spec.meshes.items() if mesh.file}
     companions = {name: _companions(path, f"meshes.{name}.file", refuse) for name, path in files.items()}
     if spec.cameras is not None and not spec.cameras.sfm:
-        from factorlib.dataset.sources.external import external_cameras
+        from factorlib.dataset.sources.external_cameras import external_cameras
 
         spec, external = external_cameras(spec, file)
     check_lights(spec.photos, file)
@@ -74,11 +74,11 @@ def read_draft(file: Path) -> tuple[DatasetFile, list[InputError]]:
     value = _filled(value, "", places)
     faults = []
     if places:
-        named = ", ".join(places[:MOST_NAMED]) + f" and {len(places) - MOST_NAMED} more" * (len(places) > MOST_NAMED)
-        found = f"{len(places)} places are left open" if len(places) > 1 else "one place is left open"
-        drawn = "; `make label` draws masks" if any(place.endswith(".masks") for place in places) else ""
-        cure = f"write what belongs there, in place of `?`{drawn}"
-        faults.append(InputError(f"{found}: {named}", file=file, key=places[0], cure=cure))
+        listed = ", ".join(places[:MOST_NAMED]) + f" and {len(places) - MOST_NAMED} more" * (len(places) > MOST_NAMED)
+        fault = f"{len(places)} places are left open" if len(places) > 1 else "one place is left open"
+        hint = "; `make label` draws masks" if any(place.endswith(".masks") for place in places) else ""
+        cure = f"write what belongs there, in place of `?`{hint}"
+        faults.append(InputError(f"{fault}: {listed}", file=file, key=places[0], cure=cure))
     try:
         spec = convert(value, DatasetFile, file, text=text)
     except InputError as error:
@@ -120,13 +120,13 @@ def _read_truth(spec: DatasetFile, file: Path) -> TruthFile | None:
     if spec.truth is None:
         return None
     truth_file = file.parent / spec.truth
-    if not is_there(truth_file, "truth"):
+    if not file_exists(truth_file, "truth"):
         log.warning("%s: truth: there is no %s: nothing is compared with the truth", file, spec.truth)
         return None
     truth = read_yaml(truth_file, TruthFile)
     check_truth(truth, spec, truth_file, file.parent)
     for path in truth.maps:
-        if not is_there(file.parent / path, "truth"):
+        if not file_exists(file.parent / path, "truth"):
             log.warning("%s: there is no %s: nothing is compared with the truth", truth_file, path)
             return None
     return truth
@@ -142,34 +142,34 @@ def _companions(path: str, key: str, refuse: Refusal) -> list[str]:
     file = refuse.folder / path
     suffix = Path(path).suffix.lower()
     is_obj = suffix == ".obj"
-    named = []
+    names = []
     if is_obj and check_plain(file, "an OBJ", key):
         with (
             reading("an OBJ", file, key),
             file.open("rb") as stream,
             mmap.mmap(stream.fileno(), 0, access=mmap.ACCESS_READ) as text,
         ):
-            names = MTLLIB.finditer(text) if text.find(b"mtllib") >= 0 else ()
-            named = [match.group(1).decode("utf-8", "replace").strip() for match in names]
+            matches = MTLLIB.finditer(text) if text.find(b"mtllib") >= 0 else ()
+            names = [match.group(1).decode("utf-8", "replace").strip() for match in matches]
     elif suffix in (".gltf", ".glb"):
         header = read_header(file, key)
         try:
             paths = [buffer_path(buffer.uri) for buffer in header.buffers if buffer.uri is not None]
         except ValueError as error:
             refuse(key, f"{file.name} {error}", "export it again, with its buffers beside it or as one .glb")
-        named = [path for path in paths if path is not None]
-    near = sorted({str(PurePosixPath(path).parent / name.replace("\\", "/")) for name in named})
-    for companion in near:
+        names = [path for path in paths if path is not None]
+    companions = sorted({str(PurePosixPath(path).parent / name.replace("\\", "/")) for name in names})
+    for companion in companions:
         try:
             path_inside(refuse.folder, companion)
         except ValueError as error:
-            words = "is outside the dataset" if "outside" in str(error) else str(error)
-            refuse(key, f"{file.name} names {companion[:80]!r}, which {words}", "copy that file beside the mesh")
+            reason = "is outside the dataset" if "outside" in str(error) else str(error)
+            refuse(key, f"{file.name} names {companion[:80]!r}, which {reason}", "copy that file beside the mesh")
     if is_obj:
-        near = [companion for companion in near if os.path.isfile(refuse.folder / companion)]
-    for companion in near:
+        companions = [companion for companion in companions if os.path.isfile(refuse.folder / companion)]
+    for companion in companions:
         if not os.path.lexists(refuse.folder / companion):
             cure = "copy it beside the mesh, or export one .glb"
             refuse(key, f"the mesh names {companion!r}, which is not there", cure)
         check_plain(refuse.folder / companion, "an .mtl" if is_obj else "a glTF buffer", key)
-    return near
+    return companions

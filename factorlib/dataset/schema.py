@@ -71,7 +71,7 @@ class MeshEntry(_Format, frozen=True):
     material: str | None = None
 
     @property
-    def made_of(self) -> dict[str, str] | str | None:
+    def part_materials(self) -> dict[str, str] | str | None:
         """The material of each part, or of the whole; None if the entry names none, which the reader rejects."""
         return self.parts or self.material
 
@@ -81,7 +81,7 @@ class MeshEntry(_Format, frozen=True):
         return self.lathe or self.primitive in ("ball", "cylinder")
 
 
-class Camera(_Format, frozen=True):
+class Intrinsics(_Format, frozen=True):
     """Intrinsics in pixels of the photo as displayed, pixel centres at 0.5; missing ones are estimated.
 
     Attributes:
@@ -93,7 +93,7 @@ class Camera(_Format, frozen=True):
     distortion: tuple[Bend, Bend] | None = None
 
 
-class Pose(_Format, frozen=True):
+class RigidTransform(_Format, frozen=True):
     """The pose cam_from_object: x_cam = rotation · x_object + translation, in the mesh's units."""
 
     rotation: Mat3
@@ -107,7 +107,7 @@ class Keypoint(_Format, frozen=True):
     point: Vec3
 
 
-class ObjectEntry(_Format, frozen=True):
+class MeshInstance(_Format, frozen=True):
     """One instance of a mesh in a photo.
 
     Attributes:
@@ -119,11 +119,11 @@ class ObjectEntry(_Format, frozen=True):
     mesh: str
     materials: dict[str, str] = {}
     mask: str | None = None
-    pose: Pose | None = None
+    pose: RigidTransform | None = None
     keypoints: list[Keypoint] = []
 
 
-class Ground(_Format, frozen=True):
+class GroundEntry(_Format, frozen=True):
     """The plane that a photo's objects stand on, in its camera frame and the poses' units.
 
     Attributes:
@@ -150,9 +150,9 @@ class PhotoEntry(_Format, frozen=True):
     encoding: Literal["srgb", "linear", "gamma2.2"] | None = None
     illumination: Name | None = None
     world_from_camera: Mat3 | None = None
-    camera: Camera | None = None
-    objects: list[ObjectEntry] = []
-    ground: Ground | None = None
+    camera: Intrinsics | None = None
+    objects: list[MeshInstance] = []
+    ground: GroundEntry | None = None
 
     @property
     def light(self) -> str:
@@ -210,7 +210,7 @@ class MirrorBall(_Format, frozen=True):
     chrome: Name
 
 
-class Known(_Format, frozen=True):
+class KnownValues(_Format, frozen=True):
     """Known quantities: reflectances by material, lights by illumination, exposures by photo.
 
     Attributes:
@@ -232,7 +232,7 @@ class DatasetFile(_Format, frozen=True):
     photos: Annotated[list[PhotoEntry], AtLeastOne]
     meshes: dict[Name, MeshEntry] = {}
     cameras: CameraSource | None = None
-    known: Known = Known()
+    known: KnownValues = KnownValues()
     truth: str | None = None
 
 
@@ -250,7 +250,7 @@ class TruthFile(_Format, frozen=True):
     materials: dict[str, TrueMaterial] = {}
     illumination: dict[str, str] = {}
     normals: dict[str, str] = {}
-    poses: dict[str, dict[str, Pose]] = {}
+    poses: dict[str, dict[str, RigidTransform]] = {}
 
     @property
     def maps(self) -> list[str]:
@@ -271,7 +271,7 @@ class ExternalCamera(msgspec.Struct, frozen=True):
     focal_px: float
     principal_point: Vec2 | None
     size: tuple[float, float | None] | None
-    poses: dict[str, Pose]
+    poses: dict[str, RigidTransform]
 
 
 class Dataset(msgspec.Struct, frozen=True, dict=True):
@@ -322,14 +322,14 @@ class PhotoSlice(msgspec.Struct, frozen=True):
     focal_px: float | None
     illumination: str
     objects: list[ObjectMask]
-    camera: Camera | None = None
+    camera: Intrinsics | None = None
 
 
 class ObjectsSlice(msgspec.Struct, frozen=True):
     """Slice for placing meshes over a photo: its camera, its objects, their meshes, and the external camera."""
 
-    camera: Camera
-    objects: list[ObjectEntry]
+    camera: Intrinsics
+    objects: list[MeshInstance]
     meshes: dict[str, MeshEntry]
     external: ExternalCamera | None = None
 
@@ -356,7 +356,7 @@ class LightSlice(msgspec.Struct, frozen=True):
 class GroundSlice(msgspec.Struct, frozen=True):
     """The ground of a photo, if dataset.yaml gives it."""
 
-    ground: Ground | None
+    ground: GroundEntry | None
 
 
 class BallSlice(msgspec.Struct, frozen=True):

@@ -10,12 +10,12 @@ from typing import Any
 import msgspec
 
 from factorlib.dataset import schema
-from factorlib.dataset.check import made_of, mirror_balls
+from factorlib.dataset.check import instance_materials, mirror_balls
 from factorlib.dataset.schema import Dataset, PhotoEntry
 from factorlib.errors import did_you_mean
 
 
-class Slice(msgspec.Struct, frozen=True):
+class DatasetSlice(msgspec.Struct, frozen=True):
     """A slice of a dataset.
 
     Attributes:
@@ -29,7 +29,7 @@ class Slice(msgspec.Struct, frozen=True):
     fields: dict[str, Any]
 
 
-def dataset_slice(dataset: Dataset, name: str, photo: str | None = None) -> Slice:
+def dataset_slice(dataset: Dataset, name: str, photo: str | None = None) -> DatasetSlice:
     """Return a slice of one photo, or of the set.
 
     The slices photo, objects, light and ground are per photo.  The slices materials, set, shapes, known and truth are
@@ -44,14 +44,14 @@ def dataset_slice(dataset: Dataset, name: str, photo: str | None = None) -> Slic
         KeyError: There is no such slice.
     """
     fields: dict[str, Any] = {}
-    if name in _OF_SET:
-        facts, files = _OF_SET[name](dataset)
+    if name in _SET_SLICES:
+        facts, files = _SET_SLICES[name](dataset)
         facts = _json_able(facts)
         for key, part in facts.items() if name == "set" else [(name, facts)]:
             fields |= _fields(part, "the folder's name" if (name, key) == ("set", "name") else key)
-    elif name in _OF_PHOTO:
+    elif name in _PHOTO_SLICES:
         names = [photo] if photo is not None else [entry.name for entry in dataset.spec.photos]
-        slices = {each: _OF_PHOTO[name](dataset, dataset.photo(each)) for each in names}
+        slices = {each: _PHOTO_SLICES[name](dataset, dataset.photo(each)) for each in names}
         files = [file for _, own in slices.values() for file in own]
         facts = {each: _json_able(own) for each, (own, _) in slices.items()}
         for each, own in facts.items():
@@ -61,7 +61,7 @@ def dataset_slice(dataset: Dataset, name: str, photo: str | None = None) -> Slic
         facts = facts if photo is None else facts[photo]
     else:
         raise KeyError(f"no slice 'dataset.{name}': {did_you_mean(name, SLICES)}")
-    return Slice(facts=facts, files=sorted(set(files)), fields=fields)
+    return DatasetSlice(facts=facts, files=sorted(set(files)), fields=fields)
 
 
 def _photo(dataset: Dataset, photo: PhotoEntry) -> tuple[schema.PhotoSlice, list[str]]:
@@ -81,7 +81,7 @@ def _photo(dataset: Dataset, photo: PhotoEntry) -> tuple[schema.PhotoSlice, list
 def _objects(dataset: Dataset, photo: PhotoEntry) -> tuple[schema.ObjectsSlice, list[str]]:
     meshes = {obj.mesh: dataset.spec.meshes[obj.mesh] for obj in photo.objects}
     external = dataset.external.get(photo.name)
-    facts = schema.ObjectsSlice(photo.camera or schema.Camera(), photo.objects, meshes, external)
+    facts = schema.ObjectsSlice(photo.camera or schema.Intrinsics(), photo.objects, meshes, external)
     files = [mesh.file for mesh in meshes.values() if mesh.file]
     companions = [path for name in meshes for path in dataset.companions.get(name, ())]
     return facts, files + companions + _object_masks(photo)
@@ -95,11 +95,11 @@ def _set(dataset: Dataset) -> tuple[schema.SetSlice, list[str]]:
 def _known(dataset: Dataset) -> tuple[schema.KnownSlice, list[str]]:
     known = dataset.spec.known
     balls = {}
-    for name, of in known.illumination.items():
-        if isinstance(of, schema.MirrorBall):
-            photo, obj = next(mirror_balls(dataset.spec, name, of))
-            balls[name] = schema.BallSlice(photo.name, *made_of(obj, dataset.spec))
-    maps = {name: of for name, of in known.illumination.items() if isinstance(of, str)}
+    for name, light in known.illumination.items():
+        if isinstance(light, schema.MirrorBall):
+            photo, obj = next(mirror_balls(dataset.spec, name, light))
+            balls[name] = schema.BallSlice(photo.name, *instance_materials(obj, dataset.spec))
+    maps = {name: light for name, light in known.illumination.items() if isinstance(light, str)}
     return schema.KnownSlice(known.materials, maps, balls, known.exposure), list(maps.values())
 
 
@@ -136,17 +136,17 @@ def _fields(value: Any, name: str) -> dict[str, Any]:
     return {key: leaf for inner, item in items for key, leaf in _fields(item, inner).items()}
 
 
-_OF_PHOTO: dict[str, Callable[[Dataset, PhotoEntry], tuple[Any, list[str]]]] = {
+_PHOTO_SLICES: dict[str, Callable[[Dataset, PhotoEntry], tuple[Any, list[str]]]] = {
     "photo": _photo,
     "objects": _objects,
     "light": lambda dataset, photo: (schema.LightSlice(photo.light, photo.world_from_camera), []),
     "ground": lambda dataset, photo: (schema.GroundSlice(photo.ground), []),
 }
-_OF_SET: dict[str, Callable[[Dataset], tuple[Any, list[str]]]] = {
+_SET_SLICES: dict[str, Callable[[Dataset], tuple[Any, list[str]]]] = {
     "materials": lambda dataset: (dataset.spec.materials, []),
     "set": _set,
     "shapes": _shapes,
     "known": _known,
     "truth": lambda dataset: (dataset.truth, dataset.truth.maps if dataset.truth else []),
 }
-SLICES = (*_OF_PHOTO, *_OF_SET)
+SLICES = (*_PHOTO_SLICES, *_SET_SLICES)

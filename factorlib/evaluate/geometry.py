@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from factorlib.conventions import FRONT
-from factorlib.dataset.schema import Pose
+from factorlib.dataset.schema import RigidTransform
 from factorlib.images.boxes import box_sum
 from factorlib.results.metrics import AngleError, NormalError, PoseError
 from factorlib.results.poses import PoseEntry
@@ -58,7 +58,7 @@ def angles_deg(a: Float[np.ndarray, "n 3"], b: Float[np.ndarray, "n 3"]) -> Floa
     return np.degrees(2 * np.arctan2(np.linalg.norm(a - b, axis=-1), np.linalg.norm(a + b, axis=-1)))
 
 
-def pose_error(estimate: PoseEntry | Pose, truth: Pose) -> PoseError:
+def pose_error(estimate: PoseEntry | RigidTransform, truth: RigidTransform) -> PoseError:
     """Return the difference of two cam_from_object; the translations are in one unit."""
     moved = np.linalg.norm(np.subtract(estimate.translation, truth.translation))
     distance = float(np.linalg.norm(truth.translation)) or 1.0

@@ -10,7 +10,7 @@ from factorlib.dataset.schema import MeshEntry
 from factorlib.export.scene import Shape
 from factorlib.export.usd import SUFFIX, colours, write_usd_mesh
 from factorlib.meshes.ply import submesh, write_ply
-from factorlib.meshes.read import MeshesOnce
+from factorlib.meshes.read import MeshCache
 from factorlib.results.materials import Reflectance
 from factorlib.results.poses import ObjectEntry
 from factorlib.results.surface import read_surface
@@ -41,11 +41,11 @@ class MeshFiles:
         self.materials = materials
         self.solved = solved
         own = read_surface(inputs.folders.get("surface"))
-        self.read = MeshesOnce(inputs.mesh, materials, crease_deg, own.displacements, own.log_factors)
+        self.read = MeshCache(inputs.mesh, materials, crease_deg, own.displacements, own.log_factors)
         self._stems: dict[tuple, str] = {}  # file names up to the material, relative to the scenes
 
     def shapes(
-        self, obj: schema.ObjectEntry, meshes: Mapping[str, MeshEntry], poses: Mapping[str, ObjectEntry]
+        self, obj: schema.MeshInstance, meshes: Mapping[str, MeshEntry], poses: Mapping[str, ObjectEntry]
     ) -> list[Shape]:
         """Return one shape per material of the object, and write its files if they are new.
 

@@ -40,13 +40,13 @@ UNIT_MM = {2: 25.4, 3: 10.0, 4: 1.0, 5: 1e-3}  # EXIF FocalPlaneResolutionUnit
 log = logging.getLogger("factorlib.images")
 
 
-def exif_of(source: bytes | str | Path | None) -> dict[str, float | int]:
+def read_exif(source: bytes | str | Path | None) -> dict[str, float | int]:
     """Read the tags of a block in HEIF's form ("Exif", two zeros, a TIFF), or of a file that begins as a TIFF does.
 
     DNG and most raw files begin so. Missing or damaged tags are left out. `DNG` is True for a DNG.
     """
     exif = Image.Exif()
-    named: dict[str, float | int] = {}
+    values: dict[str, float | int] = {}
     numbers = {}
     with (
         suppress(*DAMAGED),
@@ -57,7 +57,7 @@ def exif_of(source: bytes | str | Path | None) -> dict[str, float | int]:
             exif.load_from_fp(stream)
         elif isinstance(source, bytes | None):
             exif.load(source or b"")
-        named |= {"DNG": True} if DNG_VERSION in exif else {}
+        values |= {"DNG": True} if DNG_VERSION in exif else {}
         tags = exif.get_ifd(EXIF_IFD)
         for tag in NAMES.keys() & tags.keys():
             try:
@@ -66,16 +66,16 @@ def exif_of(source: bytes | str | Path | None) -> dict[str, float | int]:
                 continue
             if math.isfinite(number):
                 numbers[NAMES[tag]] = round(number) if tag in WHOLE else number
-        named |= numbers
-    return named
+        values |= numbers
+    return values
 
 
-def exposure_of_exif(exif: Mapping[str, Any]) -> float | None:
+def exif_exposure(exif: Mapping[str, Any]) -> float | None:
     """Return t · S / N², exposure time (s) times ISO sensitivity over the squared f-number; None if one is missing.
 
     The values that a camera records of the same light are proportional to it.
 
-    >>> exposure_of_exif({"ExposureTime": 0.01, "FNumber": 2.0, "Exif:PhotographicSensitivity": 100})
+    >>> exif_exposure({"ExposureTime": 0.01, "FNumber": 2.0, "Exif:PhotographicSensitivity": 100})
     0.25
     """
     time, aperture, iso = (_positive(exif, n) for n in ("ExposureTime", "FNumber", "Exif:PhotographicSensitivity"))
@@ -85,7 +85,7 @@ def exposure_of_exif(exif: Mapping[str, Any]) -> float | None:
     return exposure if 0 < exposure < math.inf else None
 
 
-def focal_px_of_exif(exif: Mapping[str, Any], width: int, height: int, file: str | Path = "") -> float | None:
+def exif_focal_px(exif: Mapping[str, Any], width: int, height: int, file: str | Path = "") -> float | None:
     """Return the focal length in pixels of a photo by its EXIF data.
 
     There are two ways, and the first that works is taken. `FocalLengthIn35mmFilm` f₃₅ has, by the convention of CIPA
@@ -102,9 +102,9 @@ def focal_px_of_exif(exif: Mapping[str, Any], width: int, height: int, file: str
     Returns:
         The focal length; None if EXIF does not give it, or if the photo is a crop.
 
-    >>> round(focal_px_of_exif({"Exif:FocalLengthIn35mmFilm": 50}, 6000, 4000), 1)
+    >>> round(exif_focal_px({"Exif:FocalLengthIn35mmFilm": 50}, 6000, 4000), 1)
     8333.3
-    >>> focal_px_of_exif({"Exif:FocalLengthIn35mmFilm": 50}, 4000, 4000) is None
+    >>> exif_focal_px({"Exif:FocalLengthIn35mmFilm": 50}, 4000, 4000) is None
     True
     """
     lens = "FocalLengthIn35mmFilm", "FocalLength", "FocalPlaneXResolution"

@@ -115,7 +115,11 @@ def read_exr(path: str | Path) -> dict[str, Float[np.ndarray, "h w"]]:
     check_plain(path, "an image", most_bytes=None)
     source = oiio.ImageInput.open(str(path))
     if source is None:
-        raise InputError(f"not readable as an image ({oiio.geterror()})", file=path, cure="is it whole, and an EXR?")
+        raise InputError(
+            f"not readable as an image ({oiio.geterror()})",
+            file=path,
+            cure="the file is damaged or not an EXR: restore or export it again",
+        )
     names = list(source.spec().channelnames)
     pixels = source.read_image(oiio.FLOAT)
     error = source.geterror()

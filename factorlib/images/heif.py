@@ -15,8 +15,8 @@ from jaxtyping import Shaped
 from PIL import ImageCms
 
 from factorlib.errors import InputError
-from factorlib.images.exif import exif_of
-from factorlib.images.scanlines import COPY, Stored
+from factorlib.images.exif import read_exif
+from factorlib.images.scanlines import COPY, OpenPhoto
 
 BRANDS = {b"heic", b"heix", b"heim", b"heis", b"hevc", b"hevx", b"mif1", b"msf1", b"mif2"}
 VIDEO = {16: "PQ", 18: "HLG"}  # transfer characteristics of ITU-T H.273 for HDR video
@@ -34,23 +34,16 @@ def is_heif(path: str | Path) -> bool:
     return head[4:8] == b"ftyp" and head[8:12] in BRANDS
 
 
-def open_heif(path: str | Path, key: str | None) -> Stored:
-    """Open a HEIF photo.
-
-    Raises:
-        InputError: If the file cannot be decoded, or has a transfer function of HDR video.
-    """
+def open_heif(path: str | Path, key: str | None) -> OpenPhoto:
+    """Open a HEIF photo; InputError if it cannot be decoded, or has a transfer function of HDR video."""
 
     def refused(fault: str, cure: str) -> InputError:
         """Return an InputError for this file."""
         return InputError(fault, file=path, key=key, cure=cure)
 
     convert = f"convert it: magick {Path(path).name} {Path(path).stem}.png"
-    try:
-        import pillow_heif
-    except ImportError as error:
-        fault = f"HEIF is read by pillow-heif, which cannot be imported ({error})"
-        raise refused(fault, convert) from None
+    import pillow_heif
+
     try:
         file = pillow_heif.open_heif(path, convert_hdr_to_8bit=False, hdr_to_16bit=False)
         picture = file[file.primary_index]
@@ -71,25 +64,34 @@ def open_heif(path: str | Path, key: str | None) -> Stored:
         except FAILURES as error:
             raise refused(f"truncated or damaged ({error})", COPY) from None
         if codes.shape[:2] != (height, width):
-            real = f"the picture in it has {codes.shape[1]}×{codes.shape[0]}"
-            raise refused(f"truncated or damaged (its header says {width}×{height} pixels, {real})", COPY)
+            sizes = f"{codes.shape[1]}×{codes.shape[0]} pixels instead of the {width}×{height} of its header"
+            raise refused(f"truncated or damaged ({sizes})", COPY)
         codes = codes[..., None] if codes.ndim == 2 else codes
         return codes[..., :3] if codes.shape[2] >= 3 else np.broadcast_to(codes[..., :1], (height, width, 3))
 
-    exif = exif_of(info.get("exif"))
-    across, down = (exif.get(name) for name in SIZES)
-    if across and down and (across > down) != (width > height):  # EXIF has the size before rotation
-        exif |= dict(zip(SIZES, (down, across)))
-    profile = ""
-    with suppress(OSError, ImageCms.PyCMSError):
-        if icc := info.get("icc_profile"):
-            profile = ImageCms.getProfileDescription(ImageCms.ImageCmsProfile(io.BytesIO(icc))).strip()
-    return Stored(
+    return OpenPhoto(
         width=width,
         height=height,
-        exif=exif,
-        profile=profile,
+        exif=_upright_exif(info.get("exif"), width > height),
+        profile=_profile_name(info.get("icc_profile")),
         white=2 ** info["bit_depth"] - 1,
         encoding="srgb",
         rows=lambda begin, end: pixels()[begin:end],
     )
+
+
+def _upright_exif(block: bytes | None, is_wide: bool) -> dict[str, float | int]:
+    """Return the tags of an EXIF block; its size, which is that before rotation, is turned to match the picture."""
+    exif = read_exif(block)
+    across, down = (exif.get(name) for name in SIZES)
+    if across and down and (across > down) != is_wide:
+        exif |= dict(zip(SIZES, (down, across)))
+    return exif
+
+
+def _profile_name(profile: bytes | None) -> str:
+    """Return the name of an ICC profile, "" for a damaged one or none."""
+    with suppress(OSError, ImageCms.PyCMSError):
+        if profile:
+            return ImageCms.getProfileDescription(ImageCms.ImageCmsProfile(io.BytesIO(profile))).strip()
+    return ""

@@ -12,12 +12,12 @@ import pycolmap
 from jaxtyping import Bool, Float, Shaped
 from scipy.ndimage import map_coordinates
 
-from factorlib.dataset.schema import Camera
+from factorlib.dataset.schema import Intrinsics
 from factorlib.errors import InputError
 from factorlib.images.photo import Photo
 
 
-class Lens(msgspec.Struct, frozen=True):
+class RadialLens(msgspec.Struct, frozen=True):
     """Lens of one focal length, in pixels whose centres are at 0.5; coefficients are k₁ and k₂."""
 
     focal: float
@@ -56,16 +56,16 @@ class Lens(msgspec.Struct, frozen=True):
         r2 = np.square((corners - self.centre) / self.focal).sum(1).max() * np.linspace(0, 1, 100)
         k1, k2 = self.coefficients
         if (1 + 3 * k1 * r2 + 5 * k2 * r2**2 <= 0).any():
-            found = f"k1 = {k1:g}, k2 = {k2:g} fold the picture before its corner"
+            fault = f"k1 = {k1:g}, k2 = {k2:g} map two rays within the picture to one point of the photo"
             cure = "give the coefficients of COLMAP's RADIAL or OpenCV's model for this focal length"
-            raise InputError(found, file=file, key=key, cure=cure)
+            raise InputError(fault, file=file, key=key, cure=cure)
 
 
-def lens_of(camera: Camera | None, factor: int, width: int, height: int) -> Lens | None:
+def radial_lens(camera: Intrinsics | None, factor: int, width: int, height: int) -> RadialLens | None:
     """Return the lens of a photo that was downsampled; None if dataset.yaml gives no distortion.
 
     Args:
-        camera: Camera of the photo in dataset.yaml.
+        camera: Intrinsics of the photo in dataset.yaml.
         factor: Factor of the downsampling.
         width: Width of the downsampled photo.
         height: Height of the downsampled photo.
@@ -77,7 +77,7 @@ def lens_of(camera: Camera | None, factor: int, width: int, height: int) -> Lens
         return None
     assert camera.focal_px is not None  # the reader refuses distortion without it
     centre = camera.principal_point or (factor * width / 2, factor * height / 2)
-    return Lens(camera.focal_px / factor, (centre[0] / factor, centre[1] / factor), camera.distortion)
+    return RadialLens(camera.focal_px / factor, (centre[0] / factor, centre[1] / factor), camera.distortion)
 
 
 class Undistorted:
@@ -86,17 +86,22 @@ class Undistorted:
     The attribute `inside` is the mask of pixels that the photo shows.
     """
 
-    def __init__(self, lens: Lens, height: int, width: int):
+    def __init__(self, lens: RadialLens, height: int, width: int):
         x, y = np.meshgrid(np.arange(width) + 0.5, np.arange(height) + 0.5)
         place = lens.distorted(np.stack([x, y], axis=-1).reshape(-1, 2)).reshape(height, width, 2) - 0.5
         self.rows = place[..., 1]
         self.columns = place[..., 0]
         ends = ((self.rows, height), (self.columns, width))
-        self.inside: Bool[np.ndarray, "h w"] = np.logical_and.reduce([(of >= 0) & (of <= n - 1) for of, n in ends])
+        self.inside: Bool[np.ndarray, "h w"] = np.logical_and.reduce(
+            [(places >= 0) & (places <= n - 1) for places, n in ends]
+        )
 
     def nearest(self, picture: Shaped[np.ndarray, "h w"]) -> Shaped[np.ndarray, "h w"]:
         """Resample by the nearest pixels, 0 outside the photo."""
-        y, x = (np.clip(np.rint(of), 0, n - 1).astype(int) for of, n in zip((self.rows, self.columns), picture.shape))
+        y, x = (
+            np.clip(np.rint(places), 0, n - 1).astype(int)
+            for places, n in zip((self.rows, self.columns), picture.shape)
+        )
         return np.where(self.inside, picture[y, x], np.zeros((), picture.dtype))
 
     def between(self, picture: Shaped[np.ndarray, "h w"]) -> Float[np.ndarray, "h w"]:

@@ -16,7 +16,7 @@ MOST_TEXELS = 4096 * 2048  # they take 250 MB when read, and more in a renderer
 LEAST = -1e-3  # least radiance, in units of the mean magnitude: resampling leaves small negative values
 LARGEST = 1e15  # greatest radiance: the sun's disc is 1e9 times as bright as a room
 SUFFIXES = (".hdr", ".exr")
-CURE = "mend or remove this map"
+CURE = "correct or remove this map"
 
 
 def maps_in(folders: Sequence[Path]) -> list[Path]:
@@ -25,16 +25,16 @@ def maps_in(folders: Sequence[Path]) -> list[Path]:
     Raises:
         InputError: If a folder does not exist or has no map.
     """
-    found = []
+    paths = []
     for folder in folders:
         if not folder.is_dir():
             raise InputError("no such folder", file=folder, cure="name folders of lat-long maps (.hdr, .exr)")
-        here = sorted(path for path in folder.iterdir() if path.suffix.lower() in SUFFIXES)
-        if not here:
+        maps = sorted(path for path in folder.iterdir() if path.suffix.lower() in SUFFIXES)
+        if not maps:
             cure = "name a folder of lat-long maps; folders within it count by themselves"
             raise InputError("no .hdr or .exr in this folder", file=folder, cure=cure)
-        found += here
-    return found
+        paths += maps
+    return paths
 
 
 def read_light_map(path: Path, key: str | None = None) -> Float[np.ndarray, "h w 3"]:
@@ -53,8 +53,8 @@ def read_light_map(path: Path, key: str | None = None) -> Float[np.ndarray, "h w
     """
     check_plain(path, "a light", key, most_bytes=None)
     check_values(path, key=key)
-    stored = open_photo(path, key)
-    height, width = stored.size
+    opened = open_photo(path, key)
+    height, width = opened.size
     if width != 2 * height:
         fault = f"{width} × {height} pixels is no lat-long map"
         raise InputError(fault, file=path, key=key, cure="its width must be twice its height")
@@ -63,7 +63,7 @@ def read_light_map(path: Path, key: str | None = None) -> Float[np.ndarray, "h w
     lost = 0
 
     def look(linear: Float[np.ndarray, "r w 3"]) -> None:
-        """Accumulate statistics of some rows of the map as stored."""
+        """Accumulate statistics of some rows of the map as opened."""
         nonlocal least, total, lost
         usable = np.isfinite(linear) & (np.abs(linear) <= LARGEST)
         lost += int((~usable.all(axis=-1)).sum())
@@ -73,7 +73,7 @@ def read_light_map(path: Path, key: str | None = None) -> Float[np.ndarray, "h w
 
     factor = least_factor(height * width, MOST_TEXELS)
     factor = next((divisor for divisor in range(factor, 2 * factor) if height % divisor == 0), factor)
-    radiance = decoded(stored, "linear", factor, path, look).radiance
+    radiance = decoded(opened, "linear", factor, path, look).radiance
     if lost:
         fault = f"{lost} pixels are no numbers, or infinite (more than {LARGEST:g})"
         raise InputError(fault, file=path, key=key, cure=CURE)

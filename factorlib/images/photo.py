@@ -20,10 +20,10 @@ from jaxtyping import Bool, Float, Shaped
 
 from factorlib.errors import InputError
 from factorlib.images.boxes import box_any, box_mean
-from factorlib.images.exif import exposure_of_exif, focal_px_of_exif
+from factorlib.images.exif import exif_exposure, exif_focal_px
 from factorlib.images.heif import is_heif, open_heif
 from factorlib.images.raw import is_raw, open_raw
-from factorlib.images.scanlines import Stored, open_scanlines
+from factorlib.images.scanlines import OpenPhoto, open_scanlines
 from factorlib.images.transfer import decoder
 from factorlib.reading import reading
 
@@ -56,7 +56,7 @@ class Photo(msgspec.Struct, frozen=True):
     exposure: float | None = None
 
 
-def open_photo(path: str | Path, key: str | None = None) -> Stored:
+def open_photo(path: str | Path, key: str | None = None) -> OpenPhoto:
     """Open a photo (JPEG, PNG, TIFF, EXR, HDR, HEIC, DNG or raw) and read its header, not its pixels.
 
     The format is determined by the contents: a DNG is a TIFF whose first picture is a small preview.
@@ -112,7 +112,7 @@ def check_bright(photo: Photo, where: Bool[np.ndarray, "h w"], path: str | Path,
 
 
 def decoded(
-    stored: Stored,
+    opened: OpenPhoto,
     encoding: str | None,
     factor: int,
     path: str | Path,
@@ -121,52 +121,30 @@ def decoded(
     """Decode an open photo as displayed, downsampled by `factor`.
 
     Args:
-        stored: The open photo.
+        opened: The open photo.
         encoding: Encoding of its values; None takes what the format implies.
         factor: Factor of the downsampling.
         path: File to name in warnings.
         look: Function of all linear values of the file, some rows at a time, before they are averaged.
-
-    Returns:
-        The photo.
     """
-    encoding = encoding or stored.encoding
-    height, width = (n // factor for n in (stored.height, stored.width))
+    encoding = encoding or opened.encoding
+    height, width = (n // factor for n in (opened.height, opened.width))
     radiance = np.empty((height, width, 3), np.float32)
     clipped = np.empty((height, width, 3), bool)
     finite = np.empty((height, width), bool)
-    for rows, codes, cut in _strips(stored, factor, path):
-        # linear values: computed for floats and wide codes, looked up for codes of up to 16 bits
-        if (white := stored.white) is None:
-            with np.errstate(over="ignore", invalid="ignore"):
-                linear = np.array(decoder(encoding)(codes.astype(np.float32)), dtype=np.float32)
-        elif white >= 2**16:
-            linear = decoder(encoding)(codes / white).astype(np.float32)
-        else:
-            linear = decoder(encoding)(np.arange(white + 1) / white).astype(np.float32)[codes]
+    for rows, codes, cut in _strips(opened, factor, path):
+        linear = _linear(codes, opened.white, encoding)
         look(linear)
-        numbers = (
-            np.logical_and.reduce(np.isfinite(linear), -1) if stored.white is None else np.ones(linear.shape[:2], bool)
-        )
+        numbers = np.logical_and.reduce(np.isfinite(linear), -1)
         linear[~numbers] = 0
-        if factor == 1:
-            radiance[rows] = linear
-            finite[rows] = numbers
-            clipped[rows] = cut
-        else:
-            radiance[rows], finite[rows] = box_mean(linear, numbers, factor)
-            clipped[rows] = box_any(cut, factor)
-    profile = stored.profile
+        radiance[rows], finite[rows] = box_mean(linear, numbers, factor) if factor > 1 else (linear, numbers)
+        clipped[rows] = box_any(cut, factor)
+    profile = opened.profile
     if profile and "srgb" not in profile.lower() and "709" not in profile:
-        words = "its primaries are taken for Rec. 709: convert it to sRGB for exact colours"
-        log.warning("%s: its colour profile is %r; %s", path, profile, words)
-    swapped = stored.orientation >= 5
-    back = [-1 if flip else 1 for flip in _flipped(stored.orientation)]
-    radiance, clipped, finite = (
-        np.ascontiguousarray((pixels.swapaxes(0, 1) if swapped else pixels)[:: back[0], :: back[1]])
-        for pixels in (radiance, clipped, finite)
-    )
-    focal_px = focal_px_of_exif(stored.exif, stored.width, stored.height, path)
+        advice = "its primaries are taken for Rec. 709: convert it to sRGB for exact colours"
+        log.warning("%s: its colour profile is %r; %s", path, profile, advice)
+    radiance, clipped, finite = (_displayed(pixels, opened.orientation) for pixels in (radiance, clipped, finite))
+    focal_px = exif_focal_px(opened.exif, opened.width, opened.height, path)
     return Photo(
         radiance,
         clipped,
@@ -176,33 +154,51 @@ def decoded(
         finite.shape[0],
         encoding,
         factor,
-        exposure_of_exif(stored.exif),
+        exif_exposure(opened.exif),
     )
 
 
+def _linear(codes: Shaped[np.ndarray, "r w 3"], white: int | None, encoding: str) -> Float[np.ndarray, "r w 3"]:
+    """Decode codes to linear values: computed for floats and wide codes, looked up for codes of up to 16 bits."""
+    decode = decoder(encoding)
+    if white is None:
+        with np.errstate(over="ignore", invalid="ignore"):
+            return np.array(decode(codes.astype(np.float32)), dtype=np.float32)
+    if white >= 2**16:
+        return decode(codes / white).astype(np.float32)
+    return decode(np.arange(white + 1) / white).astype(np.float32)[codes]
+
+
+def _displayed(pixels: Shaped[np.ndarray, "h w *c"], orientation: int) -> Shaped[np.ndarray, "i j *c"]:
+    """Rotate and mirror stored pixels as their EXIF orientation demands."""
+    rows, columns = (-1 if flip else 1 for flip in _flipped(orientation))
+    turned = pixels.swapaxes(0, 1) if orientation >= 5 else pixels
+    return np.ascontiguousarray(turned[::rows, ::columns])
+
+
 def _strips(
-    stored: Stored, factor: int, path: str | Path
+    opened: OpenPhoto, factor: int, path: str | Path
 ) -> Iterator[tuple[slice, Shaped[np.ndarray, "r w 3"], Bool[np.ndarray, "r w 3"]]]:
     """Yield whole rows of boxes, some at a time: indices of the rows, the codes in them, and their clipped values.
 
     Boxes count from the displayed corner, so the remainder is at the other end of an axis that display reverses.
     """
-    flips = _flipped(stored.orientation)
-    turned = flips[::-1] if stored.orientation >= 5 else flips
-    top, left = (n % factor if back else 0 for n, back in zip((stored.height, stored.width), turned))
-    columns = slice(left, left + stored.width // factor * factor)
-    height = stored.height // factor
-    step = max(1, READ_AT_ONCE // (factor * stored.width))
+    flips = _flipped(opened.orientation)
+    turned = flips[::-1] if opened.orientation >= 5 else flips
+    top, left = (n % factor if reversed_axis else 0 for n, reversed_axis in zip((opened.height, opened.width), turned))
+    columns = slice(left, left + opened.width // factor * factor)
+    height = opened.height // factor
+    step = max(1, READ_AT_ONCE // (factor * opened.width))
     for first in range(0, height, step):
         last = min(first + step, height)
         begin, end = top + first * factor, top + last * factor
         with reading("an image", path):
-            codes = stored.rows(begin, end)
-            clipped = stored.clipped(begin, end, codes)
+            codes = opened.rows(begin, end)
+            clipped = opened.clipped(begin, end, codes)
         yield slice(first, last), codes[:, columns], clipped[:, columns]
-    if end < stored.height:
+    if end < opened.height:
         with reading("an image", path):
-            stored.rows(end, stored.height)  # a file that is truncated in the remainder must raise too
+            opened.rows(end, opened.height)  # a file that is truncated in the remainder must raise too
 
 
 def _flipped(orientation: int) -> tuple[bool, bool]:

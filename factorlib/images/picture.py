@@ -5,10 +5,11 @@ from pathlib import Path
 import numpy as np
 import OpenImageIO as oiio
 from jaxtyping import Bool, Float, UInt8
+from PIL import Image
 
-from factorlib.errors import InputError
 from factorlib.images.exr import encoded
 from factorlib.images.transfer import srgb_encode
+from factorlib.reading import reading
 from factorlib.wholefile import write_bytes
 
 PERCENTILE = 99.0
@@ -49,8 +50,8 @@ def picture(radiance: Float[np.ndarray, "*batch 3"], exposure: float | None = No
     [[0, 118, 255]]
     """
     exposure = exposure_of(radiance) if exposure is None else exposure
-    shown = np.clip(np.nan_to_num(np.asarray(radiance) * exposure, nan=0.0, posinf=1.0, neginf=0.0), 0, 1)
-    return np.rint(255 * srgb_encode(shown)).astype(np.uint8)
+    exposed = np.clip(np.nan_to_num(np.asarray(radiance) * exposure, nan=0.0, posinf=1.0, neginf=0.0), 0, 1)
+    return np.rint(255 * srgb_encode(exposed)).astype(np.uint8)
 
 
 def write_png(path: str | Path, pixels: UInt8[np.ndarray, "h w c"]) -> None:
@@ -69,11 +70,5 @@ def png_bytes(pixels: UInt8[np.ndarray, "h w c"]) -> bytes:
 
 def read_png(path: str | Path) -> UInt8[np.ndarray, "h w c"]:
     """Read the 8-bit pixels of a PNG of `write_png`; InputError if the file cannot be read."""
-    wish = oiio.ImageSpec()
-    wish.attribute("oiio:UnassociatedAlpha", 1)
-    source = oiio.ImageInput.open(str(path), wish)
-    pixels = source.read_image(oiio.UINT8) if source is not None else None
-    if pixels is None:
-        error = oiio.geterror() if source is None else source.geterror()
-        raise InputError(f"not readable as a PNG ({error.strip()})", file=path, cure="is it whole?")
-    return pixels
+    with reading("a PNG", path), Image.open(path, formats=["PNG"]) as image:
+        return np.atleast_3d(np.asarray(image))

@@ -28,12 +28,12 @@ LEAST_PLACES = 100  # least number of contour pixels
 HALO = 0.08
 
 
-def camera_says(exif: Mapping[str, Any]) -> str | None:
+def reported_processing(exif: Mapping[str, Any]) -> str | None:
     """Return EXIF's description of irreversible processing (CustomRendered, also with Apple's values, and Sharpness).
 
     It is None if there is none.
 
-    >>> camera_says({"Exif:CustomRendered": 3}), camera_says({"Exif:Sharpness": 0})
+    >>> reported_processing({"Exif:CustomRendered": 3}), reported_processing({"Exif:Sharpness": 0})
     ('HDR', None)
     """
     kinds = [
@@ -71,17 +71,19 @@ def halo(
     length = np.linalg.norm(normal, axis=0)
     normal = normal / np.maximum(length, 1e-9)
 
-    def at(picture: np.ndarray, far: float) -> Float[np.ndarray, " n"]:
+    def sample(picture: np.ndarray, distance_px: float) -> Float[np.ndarray, " n"]:
         """Sample the picture at a distance from each contour pixel."""
-        places = y + far * normal[0], x + far * normal[1]
+        places = y + distance_px * normal[0], x + distance_px * normal[1]
         return map_coordinates(picture.astype(float), places, order=1, mode="nearest")
 
     # usable contour pixels: no corner, no other contour within reach, a sufficient step
     clear = length > 0.8
-    for far in (-FAR, FAR):
-        clear &= (at(distance, far) * np.sign(far) > 0.7 * FAR) & (at(known, far) > 0.99)
-    step = at(encoded, FAR) - at(encoded, -FAR)
+    for distance_px in (-FAR, FAR):
+        clear &= (sample(distance, distance_px) * np.sign(distance_px) > 0.7 * FAR) & (
+            sample(known, distance_px) > 0.99
+        )
+    step = sample(encoded, FAR) - sample(encoded, -FAR)
     clear &= np.abs(step) > LEAST_STEP
     if clear.sum() < LEAST_PLACES:
         return 0.0
-    return float(np.median((at(encoded, NEAR) - at(encoded, FAR))[clear] / step[clear]))
+    return float(np.median((sample(encoded, NEAR) - sample(encoded, FAR))[clear] / step[clear]))

@@ -4,7 +4,7 @@ A camera's 48 megapixels are 576 MB as floating-point radiance. So a file is ope
 rows are read in order, in chunks of any height.
 
 For the formats of OpenImageIO (JPEG, PNG, TIFF, EXR, HDR), one channel is grey, and repeated; alpha is dropped. Integer
-colours are taken as stored, not premultiplied by alpha; float colours (EXR) are premultiplied by convention.
+colours are taken as opened, not premultiplied by alpha; float colours (EXR) are premultiplied by convention.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ COPY = "copy it again from where it came"
 log = logging.getLogger("factorlib.images")
 
 
-class Stored(msgspec.Struct, frozen=True, kw_only=True):
+class OpenPhoto(msgspec.Struct, frozen=True, kw_only=True):
     """Open photo.
 
     width, height  size as stored
@@ -72,18 +72,16 @@ class Stored(msgspec.Struct, frozen=True, kw_only=True):
         return np.zeros(codes.shape, bool) if self.white is None else codes >= CLIPPED * self.white
 
 
-def open_scanlines(path: str | Path, key: str | None) -> Stored:
-    """Open a photo of a format that OpenImageIO reads.
-
-    Raises:
-        InputError: If the file is no image, or has neither grey nor RGB.
-    """
-    wish = oiio.ImageSpec()
-    wish.attribute("oiio:UnassociatedAlpha", 1)
-    source = oiio.ImageInput.open(str(path), wish)
+def open_scanlines(path: str | Path, key: str | None) -> OpenPhoto:
+    """Open a photo of a format that OpenImageIO reads; InputError if it is no image, or has neither grey nor RGB."""
+    config = oiio.ImageSpec()
+    config.attribute("oiio:UnassociatedAlpha", 1)
+    source = oiio.ImageInput.open(str(path), config)
     if source is None:
         fault = f"not readable as an image ({one_line(oiio.geterror())})"
-        raise InputError(fault, file=path, key=key, cure="is it whole, and of the kind its suffix says?")
+        raise InputError(
+            fault, file=path, key=key, cure="the file is damaged or has a wrong suffix: copy or export it again"
+        )
     spec = source.spec()
     colours = _colours(spec, path, key)
     first = min(colours)
@@ -108,7 +106,7 @@ def open_scanlines(path: str | Path, key: str | None) -> Stored:
 
     orientation = spec.get_int_attribute("Orientation", 1)
     white = WHITE.get(spec.format.basetype)
-    return Stored(
+    return OpenPhoto(
         width=spec.width,
         height=spec.height,
         orientation=orientation if 1 <= orientation <= 8 else 1,

@@ -1,6 +1,6 @@
 """Turns of normals that all photos of a mesh share, and one Gauss–Newton step of them with the lights eliminated.
 
-Node v of a subdivided mesh (`factorlib.meshes.fine`) has a turn δ_v, in the object's frame.  An observation whose pixel
+Node v of a subdivided mesh (`meshes.subdivision`) has a turn δ_v, in the object's frame.  An observation whose pixel
 shows the nodes v_1, v_2, v_3 with barycentric coordinates b_k has the normal
 
     n' = unit(n + P R Σ_k b_k δ_{v_k}),     R: light's frame from object's, P = 1 − n nᵀ                             (1)
@@ -36,8 +36,8 @@ from factorlib.inference.blocks import Block
 from factorlib.inference.fit import ROBUST, Hyperparameters, light_likelihood
 from factorlib.inference.forward import Illumination
 from factorlib.light.prior import LightPrior
-from factorlib.meshes.fine import Fine
 from factorlib.meshes.mesh import scaled
+from factorlib.meshes.subdivision import SubdividedMesh
 from factorlib.results.poses import ObjectEntry
 
 NORMAL_STEP = 0.02  # step of a normal for finite differences: about 1°
@@ -110,7 +110,7 @@ def concatenate_attached(parts: Sequence[Attached]) -> Attached:
 class Surfaces(msgspec.Struct, frozen=True):
     """Subdivided meshes of a set by name, in the order of their nodes' numbers."""
 
-    meshes: dict[str, Fine]
+    meshes: dict[str, SubdividedMesh]
 
     @property
     def first_nodes(self) -> dict[str, int]:
@@ -132,7 +132,7 @@ class Surfaces(msgspec.Struct, frozen=True):
     ) -> dict[str, Float[np.ndarray, " n"]]:
         """Return the displacement of each mesh that best explains the turns of its nodes, in extents.
 
-        Nodes count by the observations attached to them (`Fine.displacement`).
+        Nodes count by the observations attached to them (`SubdividedMesh.displacement`).
         """
         weight = sum(
             np.bincount(positions.node.reshape(-1), positions.share.reshape(-1), self.nodes) for positions in attached

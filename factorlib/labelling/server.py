@@ -27,7 +27,7 @@ from jaxtyping import UInt8
 from PIL import Image
 
 from factorlib.dataset.check import IMAGES
-from factorlib.dataset.paths import Refusal, is_there
+from factorlib.dataset.paths import Refusal, file_exists
 from factorlib.dataset.read import FILE, UNKNOWN
 from factorlib.dataset.schema import LEFT_OUT, AtLeastOne, Name, OneOf254
 from factorlib.errors import InputError
@@ -52,7 +52,7 @@ HEADERS = {"Cache-Control": "no-store", "Referrer-Policy": "no-referrer", "Conte
 NO_FILE = "none"  # version of a mask that does not exist yet
 
 
-class Entry(msgspec.Struct, frozen=True):
+class LabelledPhoto(msgspec.Struct, frozen=True):
     """Keys of a photo in dataset.yaml that labelling needs."""
 
     name: Name
@@ -61,11 +61,11 @@ class Entry(msgspec.Struct, frozen=True):
     encoding: Literal["srgb", "linear", "gamma2.2"] | None = None
 
 
-class Spec(msgspec.Struct, frozen=True):
+class LabelledSet(msgspec.Struct, frozen=True):
     """Keys of dataset.yaml that labelling needs; the rest may be unfinished."""
 
     materials: Annotated[list[Name], OneOf254]
-    photos: Annotated[list[Entry], AtLeastOne]
+    photos: Annotated[list[LabelledPhoto], AtLeastOne]
 
 
 class MaskSet:
@@ -83,9 +83,9 @@ class MaskSet:
         self.yaml = folder.resolve() / FILE
         self.files = []
         self.sizes = []
-        if not is_there(self.yaml, "DATASET") or not self.yaml.resolve().is_relative_to(self.folder):
-            raise InputError("there is no such file in this folder", file=self.yaml, cure="`make new` begins one")
-        spec = read_yaml(self.yaml, Spec)
+        if not file_exists(self.yaml, "DATASET") or not self.yaml.resolve().is_relative_to(self.folder):
+            raise InputError("there is no such file in this folder", file=self.yaml, cure="create one with `make new`")
+        spec = read_yaml(self.yaml, LabelledSet)
         refuse = Refusal(self.yaml, self.folder)
         self.materials, self.photos = spec.materials, spec.photos
         refuse.once("photos", (photo.name for photo in self.photos), "photo")
@@ -145,7 +145,7 @@ class MaskSet:
         """Return dataset.yaml with the mask's path in place of the photo's `?`, or None if there is no `?`."""
         text = read_text(self.yaml, "a YAML file")
         mask = f"masks/{photo}.png"
-        photos = read_yaml(self.yaml, Spec).photos
+        photos = read_yaml(self.yaml, LabelledSet).photos
         index = next((k for k, each in enumerate(photos) if (each.name, each.masks) == (photo, UNKNOWN)), None)
         if index is None:
             return None
@@ -156,18 +156,23 @@ class MaskSet:
             if parse_yaml(text) == value:
                 return text
         cure = f"write masks: {mask}, and save again; nothing was written"
-        raise InputError("an anchor is in the way", file=self.yaml, key=f"photos[{index}].masks", cure=cure)
+        raise InputError(
+            "its `?` has an anchor that other keys use, so it cannot be replaced automatically",
+            file=self.yaml,
+            key=f"photos[{index}].masks",
+            cure=cure,
+        )
 
     def version(self, index: int) -> str:
         """Return the hash of a mask's file, or NO_FILE if it does not exist."""
-        there = is_there(self.files[index], "masks")
-        return hashlib.sha256(read_bytes(self.files[index], "a PNG")).hexdigest() if there else NO_FILE
+        exists = file_exists(self.files[index], "masks")
+        return hashlib.sha256(read_bytes(self.files[index], "a PNG")).hexdigest() if exists else NO_FILE
 
     def _known(self, labels: np.ndarray, index: int) -> np.ndarray:
         """Return the labels; InputError if one has no material."""
-        if strange := {*np.unique(labels).tolist()} - {*range(len(self.materials) + 1), LEFT_OUT}:
+        if unknown := {*np.unique(labels).tolist()} - {*range(len(self.materials) + 1), LEFT_OUT}:
             cure = f"known are 0 background, 1 to {len(self.materials)} the materials, {LEFT_OUT} leave out"
-            raise InputError(f"unknown label {min(strange)}", file=self.files[index], cure=cure)
+            raise InputError(f"unknown label {min(unknown)}", file=self.files[index], cure=cure)
         return labels
 
 
@@ -189,10 +194,10 @@ class Server(ThreadingHTTPServer):
         self.host = f"127.0.0.1:{self.server_port}"
         self.url = f"http://{self.host}/?token={self.token}"
 
-    def handle_error(self, *of: Any) -> None:
+    def handle_error(self, *args: Any) -> None:
         """Ignore a browser that has closed the connection; report other errors."""
         if not isinstance(sys.exception(), OSError):
-            super().handle_error(*of)
+            super().handle_error(*args)
 
 
 class _Request(BaseHTTPRequestHandler):
@@ -206,10 +211,10 @@ class _Request(BaseHTTPRequestHandler):
         query = {name: values[0] for name, values in parse_qs(url.query).items()}
         is_page = (self.command, url.path) == ("GET", "/")
         token = query.get("token", "") if is_page else self.headers.get("X-Token", "")
-        own = self.headers.get_all("Host") == [server.host]
-        own = own and self.headers.get("Origin", f"http://{server.host}") == f"http://{server.host}"
+        is_local = self.headers.get_all("Host") == [server.host]
+        is_local = is_local and self.headers.get("Origin", f"http://{server.host}") == f"http://{server.host}"
         try:
-            if own and secrets.compare_digest(token.encode(), server.token.encode()):
+            if is_local and secrets.compare_digest(token.encode(), server.token.encode()):
                 return self._send(200, *self._answer(url.path, query))
             self._send(403, b"open the address that `make label` has written")
         except InputError as error:
@@ -219,7 +224,7 @@ class _Request(BaseHTTPRequestHandler):
 
     do_PUT = do_POST = do_GET
 
-    def log_message(self, *of: Any) -> None:
+    def log_message(self, *args: Any) -> None:
         """Log nothing about requests."""
 
     def _send(self, status: int, body: bytes, kind: str = "text/plain; charset=utf-8", version: str = "") -> None:
@@ -233,10 +238,10 @@ class _Request(BaseHTTPRequestHandler):
         """Return body, type and version of the requested resource."""
         masks = self.server.masks
         data = "application/octet-stream"
-        named = re.fullmatch(r"/(photo|mask|grow|unsaved)/([0-9]{1,9})", path)
-        index = int(named[2]) if named else 0
+        resource = re.fullmatch(r"/(photo|mask|grow|unsaved)/([0-9]{1,9})", path)
+        index = int(resource[2]) if resource else 0
         height, width = masks.sizes[index] if index < len(masks.sizes) else (0, 0)
-        match self.command, named[1] if named and height else path:
+        match self.command, resource[1] if resource and height else path:
             case "GET", "/":
                 return (files("factorlib.labelling") / "page.html").read_bytes(), "text/html; charset=utf-8"
             case "GET", "/set":
@@ -263,12 +268,12 @@ class _Request(BaseHTTPRequestHandler):
             case "POST", "unsaved":
                 (self.server.unsaved.add if self._body(1) == b"1" else self.server.unsaved.discard)(index)
                 return b"", data
-        raise InputError("there is nothing of that name")
+        raise InputError("the server has no such page")
 
     def _body(self, length: int) -> bytes:
         """Return the request's body; InputError if it does not have the expected length."""
         if self.headers.get("Content-Length") != str(length) or len(body := self.rfile.read(length)) < length:
-            raise InputError(f"{length} bytes are expected: nothing was written")
+            raise InputError(f"the request has not the expected {length} bytes: nothing was written")
         return body
 
 
@@ -282,7 +287,8 @@ def serve(folder: Path, port: int = 0) -> None:
     try:
         server = Server(masks, port)
     except (OSError, OverflowError) as error:
-        raise InputError(f"{port} cannot be had ({error})", key="PORT", cure="leave it out, or give another") from error
+        fault = f"port {port} cannot be used ({error})"
+        raise InputError(fault, key="PORT", cure="choose another with PORT=…, or leave it out") from error
     print(f"{folder.name}: open {server.url}\n  Ctrl-C ends it", flush=True)
     try:
         server.serve_forever()

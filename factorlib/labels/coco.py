@@ -1,8 +1,9 @@
 """Reader of COCO annotations as masks: polygons, and RLE as counts or compressed, by category and file name.
 
 pycocotools fills the polygons. It needs memory for every pixel of an outline, so the length of outlines is checked
-first. Run lengths are decoded here, because pycocotools does not validate them. Several shapes give their union, at the
-cost of the number of runs and one picture. The shapes of other photos in the file are left as text.
+first. Run lengths are decoded here: pycocotools makes a mask of random memory of runs that are cut short. Several
+shapes give their union, at the cost of the number of runs and one picture. The shapes of other photos in the file are
+left as text.
 """
 
 from pathlib import Path, PurePosixPath
@@ -19,7 +20,7 @@ from factorlib.reading import read_bytes, reading
 OVERSHOOT = 2.0  # a polygon may leave the image by this many pixels
 MOST_BYTES = 512_000_000  # greatest size of a file; a hundred thousand outlines take half of it
 LONGEST = 200  # greatest length of an outline, in half perimeters of the photo
-LONGEST_OF_ALL = 5000  # greatest length of all outlines of a photo together
+LONGEST_TOGETHER = 5000  # greatest length of all outlines of a photo together
 MOST_DIGITS = 7  # greatest number of 5-bit digits of a compressed run length: no picture has 2**35 pixels
 CURE = "export the file again"
 
@@ -76,9 +77,6 @@ def read_coco(
         size: Height and width of the photo.
         key: Key to name in errors.
 
-    Returns:
-        Masks by material.
-
     Raises:
         InputError: If an annotation is invalid, or if the image has another size.
     """
@@ -88,40 +86,48 @@ def read_coco(
     entry = _entry(coco, image, path)
     check_size((entry.height or size[0], entry.width or size[1]), size, path, key)
     names = {category.id: category.name for category in coco.categories}
-    of_material: dict[str, list[tuple[str, msgspec.Raw]]] = {}
+    segmentations: dict[str, list[tuple[str, msgspec.Raw]]] = {}  # by material, with their keys
     for index, annotation in enumerate(coco.annotations):
         if annotation.image_id != entry.id:
             continue
-        at = f"annotations[{index}]"
+        place = f"annotations[{index}]"
         name = names.get(annotation.category_id)
         if name is None:
-            fault = f"category_id {annotation.category_id!r} is not in categories"
-            raise InputError(fault, file=path, key=at, cure=CURE)
+            raise InputError(f"no category has id {annotation.category_id!r}", file=path, key=place, cure=CURE)
         if name not in materials:
             cure = did_you_mean(name, materials) + " (categories are the dataset's materials)"
-            raise InputError(f"category {name!r} is no material", file=path, key=at, cure=cure)
-        of_material.setdefault(name, []).append((f"{at}.segmentation", annotation.segmentation))
-    masks = {}  # of all outlines
-    length = 0.0
-    for name, own in of_material.items():
-        edges = np.zeros(size[0] * size[1] + 1, np.int32)  # number of shapes that begin at a pixel, less those that end
-        for at, segmentation in own:
-            shapes, longer = _shapes(segmentation, size, path, at)
+            raise InputError(f"category {name!r} is no material", file=path, key=place, cure=cure)
+        segmentations.setdefault(name, []).append((f"{place}.segmentation", annotation.segmentation))
+    masks = {}
+    length = 0.0  # of all outlines
+    for name, entries in segmentations.items():
+        shapes = []
+        for place, segmentation in entries:
+            runs, longer = _shapes(segmentation, size, path, place)
+            shapes += [(place, counts) for counts in runs]
             length += longer
-            if length > LONGEST_OF_ALL * sum(size):
-                fault = "the outlines of this photo are longer than any drawing"
-                raise InputError(fault, file=path, key=at, cure=CURE)
-            for counts in shapes:
-                with reading("RLE", path, at, CURE):
-                    borders = np.cumsum(runs_of(counts, len(edges) - 1))
-                np.add.at(edges, borders[0::2], 1)
-                np.add.at(edges, borders[1::2], -1)
-        inside = np.cumsum(edges[:-1], dtype=np.int32) > 0
-        masks[name] = np.ascontiguousarray(inside.reshape(size[::-1]).T)
+            if length > LONGEST_TOGETHER * sum(size):
+                fault = f"the outlines of this photo are {length:.3g} pixels long together, longer than any drawing"
+                raise InputError(fault, file=path, key=place, cure=CURE)
+        masks[name] = _union(shapes, size, path)
     return masks
 
 
-def runs_of(counts: list[int] | str, pixels: int) -> Int[np.ndarray, " n"]:
+def _union(
+    shapes: list[tuple[str, list[int] | str]], size: tuple[int, int], path: str | Path
+) -> Bool[np.ndarray, "h w"]:
+    """Return the union of shapes that are given as run lengths, each with its key."""
+    edges = np.zeros(size[0] * size[1] + 1, np.int32)  # number of shapes that begin at a pixel, less those that end
+    for key, counts in shapes:
+        with reading("RLE", path, key, CURE):
+            borders = np.cumsum(run_lengths(counts, len(edges) - 1))
+        np.add.at(edges, borders[0::2], 1)
+        np.add.at(edges, borders[1::2], -1)
+    inside = np.cumsum(edges[:-1], dtype=np.int32) > 0
+    return np.ascontiguousarray(inside.reshape(size[::-1]).T)
+
+
+def run_lengths(counts: list[int] | str, pixels: int) -> Int[np.ndarray, " n"]:
     """Return run lengths, decompressed if they are a string.
 
     In the compressed form, a character holds 5 bits (+48). Its sixth bit means that more characters follow, and the
@@ -130,7 +136,7 @@ def runs_of(counts: list[int] | str, pixels: int) -> Int[np.ndarray, " n"]:
     Raises:
         ValueError: If the runs do not fill the pixels exactly.
 
-    >>> runs_of([1, 2, 1], 4).tolist(), runs_of("R47g1", 192).tolist()
+    >>> run_lengths([1, 2, 1], 4).tolist(), run_lengths("R47g1", 192).tolist()
     ([1, 2, 1], [130, 7, 55])
     """
     if isinstance(counts, str):
@@ -178,8 +184,8 @@ def _shapes(text: msgspec.Raw, shape: tuple[int, int], path: str | Path, key: st
         raise InputError("is empty: the annotation has only a box", file=path, key=key, cure=cure)
     if isinstance(segmentation, Rle):
         if tuple(segmentation.size) != shape:
-            words = f"its RLE is {_wh(segmentation.size)} pixels, the image {_wh(shape)}"
-            raise InputError(words, file=path, key=key, cure="export it at the photo's own size")
+            fault = f"its RLE is {_wh(segmentation.size)} pixels, the image {_wh(shape)}"
+            raise InputError(fault, file=path, key=key, cure="export it at the photo's own size")
         return [segmentation.counts], 0.0
     polygons = []
     length = 0.0

@@ -4,6 +4,8 @@ A walker starts at a pixel, seldom crosses an edge of the photo, and stops at a 
 which it most likely stops (Grady 2006). It may also stop anywhere, at a label that has such colours (Grady 2005). The
 colours are learnt from the strokes, a little from the first guess, and then twice more from the result, as in GrabCut
 (Rother et al. 2004).
+
+scikit-image's random walker has no prior on colours, and needs a stroke of every label: a box alone gives none.
 """
 
 from math import ceil
@@ -45,44 +47,49 @@ def grow(
         label: Labels; inside the box, a first guess.
         sure: Mask of fixed pixels.
         most_pixels: Greatest number of pixels of the random walk.
-
-    Returns:
-        Labels of the picture.
     """
     x0, y0, x1, y1 = box
-    inside = np.zeros_like(sure)
-    inside[y0:y1, x0:x1] = True
-    stays = ~inside
-    # fix the connected regions of other labels that lie mostly outside the box
-    for kind in set(np.unique(label[inside]).tolist()) - {0, fill}:
-        bodies = ndimage.label(label == kind)[0]
-        pixels_of = np.bincount(bodies.ravel())
-        pixels_in = np.bincount(bodies[inside], minlength=bodies.max() + 1)
-        stays |= (2 * pixels_in < pixels_of)[bodies] & (bodies > 0)
-    own = np.isin(label, [0, fill, *np.unique(label[sure & ~stays])])
-    sure = stays | (inside & sure)
-    first = np.where(own, label, np.where(stays, 0, fill)).astype(np.uint8)
-    result = np.where(sure, label, first)
+    guess, sure = _guess(box, fill, label, sure)
+    result = np.where(sure, label, guess)
     beside = max(4, round(BESIDE * max(x1 - x0, y1 - y0)))
     part = np.s_[max(0, y0 - beside) : y1 + beside, max(0, x0 - beside) : x1 + beside]
     pixels = pixels[part]
-    label = first[part]
+    label = guess[part]
     sure = sure[part]
     factor = ceil((label.size / most_pixels) ** 0.5)
-    some = np.s_[factor // 2 :: factor, factor // 2 :: factor]
+    sampled = np.s_[factor // 2 :: factor, factor // 2 :: factor]
     # downsample labels and colours; the maximum keeps thin strokes
-    strokes = ndimage.maximum_filter(np.where(sure, label + 1.0, 0), factor)[some]
-    coarse = np.where(strokes > 0, strokes - 1, label[some]).astype(np.uint8)
+    strokes = ndimage.maximum_filter(np.where(sure, label + 1.0, 0), factor)[sampled]
+    coarse = np.where(strokes > 0, strokes - 1, label[sampled]).astype(np.uint8)
     fixed = strokes > 0
     kinds = np.unique(coarse)
     if fixed.all() or len(kinds) == 1:
         return result
-    colour = ndimage.uniform_filter(pixels / np.float32(255), (factor, factor, 0))[some]
+    colour = ndimage.uniform_filter(pixels / np.float32(255), (factor, factor, 0))[sampled]
     chances = _walk(colour, kinds, coarse, fixed).astype(np.float32)
     scale = (1, *(n / m for n, m in zip(label.shape, coarse.shape)))
     grown = kinds[ndimage.zoom(chances, scale, order=1, mode="nearest", grid_mode=True).argmax(axis=0)]
     result[part] = np.where(sure, result[part], grown)
     return result
+
+
+def _guess(
+    box: tuple[int, int, int, int], fill: int, label: UInt8[np.ndarray, "h w"], sure: Bool[np.ndarray, "h w"]
+) -> tuple[UInt8[np.ndarray, "h w"], Bool[np.ndarray, "h w"]]:
+    """Return the labels from which the walk starts, and the mask of pixels that keep the label of the picture."""
+    x0, y0, x1, y1 = box
+    inside = np.zeros_like(sure)
+    inside[y0:y1, x0:x1] = True
+    fixed = ~inside
+    # fix the connected regions of other labels that lie mostly outside the box
+    for kind in set(np.unique(label[inside]).tolist()) - {0, fill}:
+        regions = ndimage.label(label == kind)[0]
+        sizes = np.bincount(regions.ravel())
+        sizes_inside = np.bincount(regions[inside], minlength=regions.max() + 1)
+        fixed |= (2 * sizes_inside < sizes)[regions] & (regions > 0)
+    growing = np.isin(label, [0, fill, *np.unique(label[sure & ~fixed])])
+    guess = np.where(growing, label, np.where(fixed, 0, fill)).astype(np.uint8)
+    return guess, fixed | (inside & sure)
 
 
 def _walk(
@@ -98,13 +105,13 @@ def _walk(
     number = np.arange(label.size).reshape(label.shape)
     colour = pixels.reshape(-1, 3)
     edges = []
-    for here, there in ((np.s_[:, :-1], np.s_[:, 1:]), (np.s_[:-1], np.s_[1:])):
-        edges.append((number[here].ravel(), number[there].ravel()))
-    one, other = np.concatenate(edges, axis=1)
+    for start, end in ((np.s_[:, :-1], np.s_[:, 1:]), (np.s_[:-1], np.s_[1:])):
+        edges.append((number[start].ravel(), number[end].ravel()))
+    first, second = np.concatenate(edges, axis=1)
     # L, with weights that fall with the difference of colours between neighbours
-    step = np.square(colour[one] - colour[other]).sum(axis=1)
+    step = np.square(colour[first] - colour[second]).sum(axis=1)
     weight = np.exp(-step / max(2 * step.mean(), 1e-12)) + CROSSING
-    weights = sparse.coo_array((weight, (one, other)), shape=(label.size, label.size)).tocsr()
+    weights = sparse.coo_array((weight, (first, second)), shape=(label.size, label.size)).tocsr()
     weights = weights + weights.T
     laplacian = (sparse.diags_array(weights.sum(axis=1)) - weights).tocsr()
     known = fixed.ravel()
@@ -119,8 +126,10 @@ def _walk(
     learnt = known if np.isin(kinds, current[known]).all() else np.ones_like(known)
     for _ in range(ROUNDS):
         # p from the histograms of colours, then (L + γ) x = γ p for each label
-        some, every = ([_histogram(bins[which & (current == kind)]) for kind in kinds] for which in (learnt, True))
-        prior = (np.array(some) + GUESSED * np.array(every))[:, bins]
+        histograms = [
+            _histogram(bins[learnt & (current == kind)]) + GUESSED * _histogram(bins[current == kind]) for kind in kinds
+        ]
+        prior = np.array(histograms)[:, bins]
         prior /= prior.sum(axis=0)
         for k, kind in enumerate(kinds):
             chances[k, known] = current[known] == kind

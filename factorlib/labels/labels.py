@@ -61,12 +61,12 @@ def read_labels(
     where = file(masks if isinstance(masks, str) else next(iter(masks.values())))
     if not isinstance(masks, str):
         places = {name: (file(masks[name]), f"{key}.{name}") for name in sorted(masks, key=materials.index)}
-        labels = _merged({name: read_inside(*at, size) for name, at in places.items()}, materials, places, edge=0)
+        labels = _merged({name: read_inside(*place, size) for name, place in places.items()}, materials, places, edge=0)
     elif masks.lower().endswith(".json"):
         inside = read_coco(where, image, materials, size, key)
         labels = _merged(inside, materials, dict.fromkeys(inside, (where, key)), edge=DRAWN_EDGE)
     else:
-        labels = _of_values(read_values(where, key, size), where, materials, key)
+        labels = _labels_of_png(read_values(where, key, size), where, materials, key)
     if labels is None or not labels.label.any():
         fault = "the mask is empty: no pixel has a material"
         raise InputError(fault, file=where, key=key, cure="paint at least one material, or drop the photo")
@@ -112,7 +112,7 @@ def read_objects(
 def check_materials(
     labels: Labels,
     objects: UInt16[np.ndarray, "h w"],
-    made_of: list[tuple[str, set[str]]],
+    object_materials: list[tuple[str, set[str]]],
     materials: list[str],
     path: Path,
     key: str = "objects",
@@ -125,7 +125,7 @@ def check_materials(
     Args:
         labels: Labels of the photo.
         objects: Result of `read_objects`; objects without a mask of their own share the rest of the photo.
-        made_of: Name and materials of each object.
+        object_materials: Name and materials of each object.
         materials: Materials of the dataset, in order.
         path: Path of the mask, to name in errors.
         key: Key of the objects, to name in errors.
@@ -133,25 +133,28 @@ def check_materials(
     Raises:
         InputError: If both faults occur.
     """
-    groups = [([k], objects == k + 1) for k in range(len(made_of)) if (objects == k + 1).any()]
-    alone = [k for k in range(len(made_of)) if not (objects == k + 1).any()]
+    groups = [([k], objects == k + 1) for k in range(len(object_materials)) if (objects == k + 1).any()]
+    alone = [k for k in range(len(object_materials)) if not (objects == k + 1).any()]
     for members, region in [*groups, (alone, objects == 0)] if alone else groups:
         counts = np.bincount(labels.label[region], minlength=len(materials) + 1)[1:]
-        own = set().union(*(made_of[k][1] for k in members))
-        strange = [k for k, count in enumerate(counts) if count >= MUCH * counts.sum() > 0 and materials[k] not in own]
-        missing = [name for name in materials if name in own and not counts[materials.index(name)]]
-        if strange and missing:
-            names = ", ".join(repr(made_of[k][0]) for k in members)
-            most = max(strange, key=counts.__getitem__)
+        expected = set().union(*(object_materials[k][1] for k in members))
+        unexpected = [
+            k for k, count in enumerate(counts) if count >= MUCH * counts.sum() > 0 and materials[k] not in expected
+        ]
+        missing = [name for name in materials if name in expected and not counts[materials.index(name)]]
+        if unexpected and missing:
+            owners = ", ".join(repr(object_materials[k][0]) for k in members)
+            most = max(unexpected, key=counts.__getitem__)
             fault = (
-                f"the mask shows {materials[most]!r} in {counts[most] / counts.sum():.0%} of the pixels of {names}, "
+                f"the mask shows {materials[most]!r} in {counts[most] / counts.sum():.0%} of the pixels of {owners}, "
                 f"but no {missing[0]!r}"
             )
-            cure = f"correct the materials in dataset.yaml (there {', '.join(sorted(own))}), or the labels of the mask"
+            names = ", ".join(sorted(expected))
+            cure = f"correct the materials in dataset.yaml (there {names}), or the labels of the mask"
             raise InputError(fault, file=path, key=f"{key}[{members[0]}].materials", cure=cure)
 
 
-def _of_values(values: UInt16[np.ndarray, "h w"], path: Path, materials: list[str], key: str) -> Labels:
+def _labels_of_png(values: UInt16[np.ndarray, "h w"], path: Path, materials: list[str], key: str) -> Labels:
     """Convert the values of a label PNG to labels; InputError for an unknown value."""
     present, counts = np.unique(values, return_counts=True)
     if set(present.tolist()) <= {0, LEFT_OUT} and LEFT_OUT in present:
@@ -180,16 +183,16 @@ def _merged(
     for number, material in ((k, name) for k, name in enumerate(materials, 1) if name in inside):
         path, key = where[material]
         for other in np.unique(label[inside[material] & (label > 0)]).tolist():
-            both = inside[material] & (label == other)
-            also = where[materials[other - 1]][0]
-            fault = f"materials {materials[other - 1]!r} and {material!r} share {int(both.sum())} pixels"
-            fault += f" with {also.name}" if also != path else ""
+            shared = inside[material] & (label == other)
+            other_path = where[materials[other - 1]][0]
+            fault = f"materials {materials[other - 1]!r} and {material!r} share {int(shared.sum())} pixels"
+            fault += f" with {other_path.name}" if other_path != path else ""
             square = (edge + 1, edge + 1)
-            if min(both.shape) > edge and sliding_window_view(both, square).all((2, 3)).any():
+            if min(shared.shape) > edge and sliding_window_view(shared, square).all((2, 3)).any():
                 cure = "a pixel shows one material: erase it from the one behind"
                 raise InputError(fault, file=path, key=key, cure=cure)
             log.warning("%s: %s: %s along their outlines: these are left out", path, key, fault)
-            left_out |= both
+            left_out |= shared
         label[inside[material]] = number
     label[left_out] = 0
     return Labels(label=label, left_out=left_out)

@@ -8,6 +8,7 @@ import msgspec
 from factorlib.errors import InputError
 
 VERTICES_A_TRIANGLE = 3
+MOST_PARTS = 100_000  # greatest number of parts of one file
 
 
 class Limits(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -39,6 +40,13 @@ class Limits(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
             if count > most:
                 cure = f'simplify it; at most {most:,} {what} are read (SET="align.limits.triangles=…")'
                 raise InputError(f"has {count:,} {what}", file=file, cure=cure)
+
+    @staticmethod
+    def check_parts(parts: int, file: str | Path) -> None:
+        """Raise InputError for more than MOST_PARTS parts in one file."""
+        if parts > MOST_PARTS:
+            cure = f"join parts that have the same material: at most {MOST_PARTS:,} parts are read"
+            raise InputError(f"has {parts:,} parts", file=file, cure=cure)
 
 
 NO_LIMITS = Limits(megabytes=1e6, triangles=10**9)  # for meshes that an earlier stage has checked

@@ -88,9 +88,9 @@ def corner_normals(
     area = area_vectors(vertices, faces)
     normal = area / np.maximum(np.linalg.norm(area, axis=1, keepdims=True), 1e-300)
     corner = vertices[faces]
-    onward, back = np.roll(corner, -1, axis=1) - corner, np.roll(corner, 1, axis=1) - corner
+    onward, backward = np.roll(corner, -1, axis=1) - corner, np.roll(corner, 1, axis=1) - corner
     # angle of each corner, the weight of its face
-    angle = np.arctan2(np.linalg.norm(np.cross(onward, back), axis=-1), np.einsum("fkd,fkd->fk", onward, back))
+    angle = np.arctan2(np.linalg.norm(np.cross(onward, backward), axis=-1), np.einsum("fkd,fkd->fk", onward, backward))
     weight = angle.reshape(-1)
     order = np.argsort(faces.reshape(-1), kind="stable")  # corners, grouped by vertex
     vertex = faces.reshape(-1)[order]
@@ -102,10 +102,10 @@ def corner_normals(
     for group in _chunks(counts.astype(np.int64) ** 2):
         mine, theirs = _pairs(starts[group], counts[group])
         own = normal[order[mine] // 3]
-        others = normal[order[theirs] // 3]
-        share = weight[order[theirs]] * (np.einsum("pd,pd->p", own, others) >= threshold - 1e-12)
+        other_normals = normal[order[theirs] // 3]
+        share = weight[order[theirs]] * (np.einsum("pd,pd->p", own, other_normals) >= threshold - 1e-12)
         low, high = starts[group][0], starts[group][-1] + counts[group][-1]
-        summed = [np.bincount(mine - low, share * others[:, d], high - low) for d in range(3)]
+        summed = [np.bincount(mine - low, share * other_normals[:, d], high - low) for d in range(3)]
         result[order[low:high]] = np.stack(summed, axis=1)
     length = np.linalg.norm(result, axis=1, keepdims=True)
     own = np.repeat(normal, 3, axis=0)

@@ -12,14 +12,61 @@ import numpy as np
 
 from factorlib.errors import InputError
 from factorlib.meshes.limits import Limits
-from factorlib.meshes.soup import Soup, lines_of, quoted
+from factorlib.meshes.triangle_soup import TriangleSoup, quoted, text_lines
 
 MOST = 2**31  # greatest index in any file
 COUNTED_EVERY = 4096  # number of lines between two checks of the number of triangles
 CONTINUED = re.compile(rb"\\(\r\n|\r|\n|\Z)")  # line that continues in the next
 
 
-def read_obj(path: Path, content: bytes, limits: Limits) -> Soup:
+class _Tables:
+    """Contents of an OBJ file that have been read so far."""
+
+    def __init__(self) -> None:
+        self.coordinates = {"v": array("d"), "vn": array("d")}
+        self.faces = array("q")  # indices from 0; −1 for no normal
+        self.face_normals = array("q")
+        self.part = array("q")
+        self.parts: dict[tuple[str, ...], int] = {}
+        self.names: dict[str, tuple[str, ...]] = {"usemtl": (), "g": (), "o": ()}  # names of the faces that follow
+
+    def read_line(self, key: str, words: list[str]) -> None:
+        """Add a line; ValueError for one that is not OBJ."""
+        if key in self.coordinates:
+            if len(words) < 3:
+                raise ValueError("three numbers are expected")
+            self.coordinates[key].extend([float(word) for word in words[:3]])
+        elif key == "f":
+            self._read_face(words)
+        elif key in self.names:
+            self.names[key] = tuple(words) if key == "g" else (" ".join(words),)
+
+    def _read_face(self, words: list[str]) -> None:
+        vertices = len(self.coordinates["v"]) // 3
+        normals = len(self.coordinates["vn"]) // 3
+        corners = []
+        for vertex, _, normal in ((word.split("/") + ["", ""])[:3] for word in words):
+            corners.append((_index(vertex, vertices), _index(normal, normals) if normal else -1))
+        if len(corners) < 3:
+            raise ValueError("a face has at least three corners")
+        names = tuple(dict.fromkeys(name for kind in self.names.values() for name in kind if name))
+        part = self.parts.setdefault(names, len(self.parts))
+        for second, third in zip(corners[1:], corners[2:]):
+            self.faces.extend((corners[0][0], second[0], third[0]))
+            self.face_normals.extend((corners[0][1], second[1], third[1]))
+            self.part.append(part)
+
+    def soup(self) -> TriangleSoup:
+        """Return the triangles."""
+        normals = np.concatenate([np.array(self.coordinates["vn"]), np.full(3, np.nan)]).reshape(-1, 3)
+        index = np.array(self.face_normals, dtype=np.int64).reshape(-1, 3)
+        index[(index < 0) | (index >= len(normals))] = len(normals) - 1
+        vertices = np.array(self.coordinates["v"], dtype=float).reshape(-1, 3)
+        triangles = np.array(self.faces, dtype=np.int64).reshape(-1, 3)
+        return TriangleSoup(vertices, triangles, np.array(self.part, dtype=np.int64), list(self.parts), normals[index])
+
+
+def read_obj(path: Path, content: bytes, limits: Limits) -> TriangleSoup:
     """Read the triangles of an OBJ file, with parts named by (usemtl, groups…, object).
 
     Args:
@@ -27,58 +74,25 @@ def read_obj(path: Path, content: bytes, limits: Limits) -> Soup:
         content: Content of the file.
         limits: Limits on its size.
 
-    Returns:
-        The triangles.
-
     Raises:
         InputError: If a line cannot be read or the mesh is too large.
     """
-    table = {"v": array("d"), "vn": array("d")}
-    faces = array("q")  # indices from 0; −1 for no normal
-    face_normals = array("q")
-    part = array("q")
-    parts: dict[tuple[str, ...], int] = {}
-    names: dict[str, tuple[str, ...]] = {"usemtl": (), "g": (), "o": ()}  # names of the faces that follow
-    current: int | None = None  # part of these faces; None until the first of them
-    number = counted = 0
-    for line in lines_of(CONTINUED.sub(b"\v", content) if b"\\" in content else content):
+    tables = _Tables()
+    number = 0
+    next_check = COUNTED_EVERY
+    for line in text_lines(CONTINUED.sub(b"\v", content) if b"\\" in content else content):
         number += 1 + line.count("\v")
         key, *words = line.split("#", 1)[0].split() or [""]
         try:
-            if key in table:
-                if len(words) < 3:
-                    raise ValueError("three numbers expected")
-                table[key].extend([float(word) for word in words[:3]])
-            elif key == "f":
-                corners = []
-                for vertex, _, normal in ((word.split("/") + ["", ""])[:3] for word in words):
-                    of_normal = _index(normal, len(table["vn"]) // 3) if normal else -1
-                    corners.append((_index(vertex, len(table["v"]) // 3), of_normal))
-                if len(corners) < 3:
-                    raise ValueError("a face has three corners at least")
-                if current is None:
-                    own = tuple(dict.fromkeys(name for kind in names.values() for name in kind if name))
-                    current = parts.setdefault(own, len(parts))
-                for second, third in zip(corners[1:], corners[2:]):
-                    faces.extend((corners[0][0], second[0], third[0]))
-                    face_normals.extend((corners[0][1], second[1], third[1]))
-                    part.append(current)
-            elif key in names:
-                names[key] = tuple(words) if key == "g" else (" ".join(words),)
-                current = None
+            tables.read_line(key, words)
         except (ValueError, IndexError, OverflowError) as error:
             fault = f"line {number}: {quoted(line)} cannot be read ({quoted(str(error))[1:-1]})"
-            raise InputError(fault, file=path, cure="is it a text OBJ?") from error
-        if number - counted >= COUNTED_EVERY:
-            counted = number
-            limits.check(len(table["v"]) // 3, len(part), path)
-    limits.check(len(table["v"]) // 3, len(part), path)
-    normals = np.concatenate([np.array(table["vn"]), np.full(3, np.nan)]).reshape(-1, 3)
-    index = np.array(face_normals, dtype=np.int64).reshape(-1, 3)
-    index[(index < 0) | (index >= len(normals))] = len(normals) - 1
-    vertices = np.array(table["v"], dtype=float).reshape(-1, 3)
-    triangles = np.array(faces, dtype=np.int64).reshape(-1, 3)
-    return Soup(vertices, triangles, np.array(part, dtype=np.int64), list(parts), normals[index])
+            raise InputError(fault, file=path, cure="correct the line, or export the mesh again, as OBJ") from error
+        if number >= next_check:
+            next_check = number + COUNTED_EVERY
+            limits.check(len(tables.coordinates["v"]) // 3, len(tables.part), path)
+    limits.check(len(tables.coordinates["v"]) // 3, len(tables.part), path)
+    return tables.soup()
 
 
 def _index(word: str, count: int) -> int:

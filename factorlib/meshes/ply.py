@@ -12,7 +12,15 @@ import numpy as np
 from factorlib.errors import InputError
 from factorlib.meshes.limits import Limits
 from factorlib.meshes.mesh import Mesh
-from factorlib.meshes.soup import Soup, fans, floats, lines_of, numbers_in, of_one_part, quoted
+from factorlib.meshes.triangle_soup import (
+    TriangleSoup,
+    fans,
+    floats,
+    parse_numbers,
+    quoted,
+    single_part_soup,
+    text_lines,
+)
 from factorlib.wholefile import write_bytes
 
 TYPES = {
@@ -35,10 +43,10 @@ CURE = "is it whole, and a PLY? export it again"
 
 
 Properties = dict[str, tuple[str, str | None]]  # NumPy types of the numbers, and of the length before a list of them
-Column = tuple[np.ndarray, np.ndarray]  # the numbers of all rows, concatenated, and the count of each row
+Columns = dict[str, tuple[np.ndarray, np.ndarray]]  # numbers of all rows, concatenated, and the count of each row
 
 
-def read_ply(path: Path, content: bytes, limits: Limits) -> Soup:
+def read_ply(path: Path, content: bytes, limits: Limits) -> TriangleSoup:
     """Read vertices, polygons and, if all of nx, ny, nz are present, normals of a PLY file; textures are ignored.
 
     Args:
@@ -55,9 +63,9 @@ def read_ply(path: Path, content: bytes, limits: Limits) -> Soup:
     order, elements, start = _header(path, content)
     counts = {name: count for name, (count, _) in elements.items()}
     limits.check(counts.get("vertex", 0), counts.get("face", 0), path)
-    content, at, columns = (content, start, {}) if order else (numbers_in(content[start:]).tobytes(), 0, {})
+    content, offset, columns = (content, start, {}) if order else (parse_numbers(content[start:]).tobytes(), 0, {})
     for name, (count, properties) in elements.items():
-        columns[name], at = _columns(content, at, order, count, properties)
+        columns[name], offset = _columns(content, offset, order, count, properties)
     # corners of the faces: the list of a known name, or the only one
     faces = columns.get("face", {})
     chosen = next((name for name in CORNERS if name in faces), next(iter(faces)) if len(faces) == 1 else None)
@@ -65,14 +73,14 @@ def read_ply(path: Path, content: bytes, limits: Limits) -> Soup:
     limits.check(0, int(np.maximum(sizes - 2, 0).sum()), path)
     whole = values.dtype.kind != "f" or (np.abs(values) < 2**53).all()
     if not whole or ((corners := values.astype(np.int64)) != values).any():
-        raise InputError("a corner of a face is no whole number", file=path, cure=CURE)
-    numbers = {name: floats(own) for name, (own, each) in columns.get("vertex", {}).items() if (each == 1).all()}
+        raise InputError("a face names a vertex by a number that is not whole", file=path, cure=CURE)
+    numbers = {name: floats(column) for name, (column, each) in columns.get("vertex", {}).items() if (each == 1).all()}
     if not {"x", "y", "z"} <= numbers.keys():
         raise InputError("its vertices have no x, y, z", file=path, cure=CURE)
     points = np.stack([numbers[n] for n in "xyz"], axis=1)
-    of_normals = "nx", "ny", "nz"
-    normals = np.stack([numbers[n] for n in of_normals], axis=1) if set(of_normals) <= numbers.keys() else None
-    return of_one_part(points, fans(sizes, corners), path.stem, normals)
+    normal_names = "nx", "ny", "nz"
+    normals = np.stack([numbers[n] for n in normal_names], axis=1) if set(normal_names) <= numbers.keys() else None
+    return single_part_soup(points, fans(sizes, corners), path.stem, normals)
 
 
 def _header(path: Path, content: bytes) -> tuple[str, dict[str, tuple[int, Properties]], int]:
@@ -90,7 +98,7 @@ def _header(path: Path, content: bytes) -> tuple[str, dict[str, tuple[int, Prope
     elements: dict[str, tuple[int, Properties]] = {}
     start = end.end() - data_begins
     properties: Properties | None = None  # of the last element
-    for line in lines_of(content[3 : end.start()]):
+    for line in text_lines(content[3 : end.start()]):
         try:
             match line.split():
                 case [] | ["comment" | "obj_info", *_]:
@@ -109,24 +117,29 @@ def _header(path: Path, content: bytes) -> tuple[str, dict[str, tuple[int, Prope
                 case _:
                     raise ValueError("not a line of PLY, or a second one of that name")
         except (ValueError, LookupError, TypeError) as error:
-            fault = f"its header says {quoted(' '.join(line.split()))} ({quoted(str(error))[1:-1]})"
+            fault = f"its header has the line {quoted(' '.join(line.split()))} ({quoted(str(error))[1:-1]})"
             raise InputError(fault, file=path, cure=CURE) from error
     if order is None:
-        raise InputError("its header does not say its format", file=path, cure=CURE)
+        raise InputError("its header has no line `format`", file=path, cure=CURE)
+    _check_room(elements, order, len(content) - start, path)
+    return order, elements, start
+
+
+def _check_room(elements: dict[str, tuple[int, Properties]], order: str, room: int, path: Path) -> None:
+    """Raise InputError if the header announces more rows than fit into the `room` bytes that follow it."""
     # least size of a row: every list is empty; in text, each number is a digit and a space
     sizes = [
         sum(np.dtype(length or kind).itemsize if order else 2 for kind, length in properties.values())
         for _, properties in elements.values()
     ]
     needed = sum(count * size for (count, _), size in zip(elements.values(), sizes))
-    if needed > len(content) - start + 1:  # text may end without a line end
+    if needed > room + 1:  # text may end without a line end
         counts = ", ".join(f"{count:,} {quoted(name)[1:-1]}" for name, (count, _) in elements.items())
-        fault = f"its header says {counts}: {needed:,} bytes at least; {len(content) - start:,} follow"
+        fault = f"its header announces {counts}, which take {needed:,} bytes at least, but {room:,} bytes follow"
         raise InputError(fault, file=path, cure=CURE)
-    return order, elements, start
 
 
-def _columns(content: bytes, at: int, order: str, count: int, properties: Properties) -> tuple[dict[str, Column], int]:
+def _columns(content: bytes, offset: int, order: str, count: int, properties: Properties) -> tuple[Columns, int]:
     """Return the columns of an element's rows, and the offset of their end.
 
     Consecutive rows with lists of equal lengths are read together. `order` is the byte order; "" means that every
@@ -143,32 +156,34 @@ def _columns(content: bytes, at: int, order: str, count: int, properties: Proper
         # layout of the next row, whose lists have their lengths in the file
         lengths = []
         fields: list[tuple[str, np.dtype, tuple[int, ...]]] = []
-        place = at
+        place = offset
         for number, (kind, counter) in enumerate(kinds):
             if counter:
                 fields.append((f"n{number}", counter, ()))
                 length = np.frombuffer(content, counter, 1, place)[0].item()
                 if length < 0 or length != int(length):
-                    raise ValueError(f"a list of {length} numbers")
+                    raise ValueError(f"a list has the length {length}")
                 place += counter.itemsize
             lengths.append(int(length) if counter else 1)
             fields.append((f"v{number}", kind, (lengths[-1],)))
             place += lengths[-1] * kind.itemsize
             if place > len(content):
-                raise ValueError("its rows end early")
+                raise ValueError("the file ends in the middle of its rows")
         # read ahead as many rows as have lists of the same lengths
         layout = np.dtype(fields)
-        rows = np.frombuffer(content, layout, min(ahead, count - row, (len(content) - at) // layout.itemsize), at)
-        others = [rows[name] != lengths[int(name[1:])] for name in layout.names or () if name[0] == "n"]
-        other = np.logical_or.reduce(others) if others else np.zeros(len(rows), bool)
-        rows, ahead = (rows[: np.argmax(other)], 64) if other.any() else (rows, 2 * ahead)
+        rows = np.frombuffer(
+            content, layout, min(ahead, count - row, (len(content) - offset) // layout.itemsize), offset
+        )
+        differences = [rows[name] != lengths[int(name[1:])] for name in layout.names or () if name[0] == "n"]
+        differs = np.logical_or.reduce(differences) if differences else np.zeros(len(rows), bool)
+        rows, ahead = (rows[: np.argmax(differs)], 64) if differs.any() else (rows, 2 * ahead)
         for number, (values, sizes) in enumerate(pieces):
             values.append(rows[f"v{number}"].reshape(-1))
             sizes.append(np.full(len(rows), lengths[number]))
         row = row + len(rows)
-        at = at + len(rows) * layout.itemsize
+        offset = offset + len(rows) * layout.itemsize
     joined = [(np.concatenate(values[1:] or values), np.concatenate(sizes)) for values, sizes in pieces]
-    return dict(zip(properties, joined)), at
+    return dict(zip(properties, joined)), offset
 
 
 def write_ply(path: str | Path, mesh: Mesh, colours: np.ndarray | None = None) -> None:

@@ -14,15 +14,15 @@ import numpy as np
 
 from factorlib.dataset.schema import MeshEntry
 from factorlib.errors import InputError, did_you_mean
-from factorlib.meshes.fine import fine
-from factorlib.meshes.gltf import check_count, read_gltf
+from factorlib.meshes.gltf_mesh import read_gltf
 from factorlib.meshes.limits import NO_LIMITS, Limits
 from factorlib.meshes.mesh import Mesh, area_vectors
 from factorlib.meshes.normals import consistently_wound, corner_normals, welded
 from factorlib.meshes.obj import read_obj
 from factorlib.meshes.ply import read_ply
-from factorlib.meshes.soup import Soup, check
-from factorlib.meshes.stl import read_off, read_stl
+from factorlib.meshes.stl_off import read_off, read_stl
+from factorlib.meshes.subdivision import subdivided_mesh
+from factorlib.meshes.triangle_soup import TriangleSoup, check
 from factorlib.reading import one_line, read_bytes, reading
 
 WITHIN = {".obj": read_obj, ".ply": read_ply, ".stl": read_stl, ".off": read_off}  # formats of a single file
@@ -35,7 +35,7 @@ log = logging.getLogger("factorlib.meshes")
 def read_mesh(
     path: str | Path,
     materials: Sequence[str],
-    made_of: Mapping[str, str] | str | None = None,
+    part_materials: Mapping[str, str] | str | None = None,
     overrides: Mapping[str, str] | None = None,
     crease_deg: float = CREASE_DEG,
     limits: Limits | None = None,
@@ -45,8 +45,8 @@ def read_mesh(
     Args:
         path: File of the mesh.
         materials: Materials of the dataset, in order: label k is the k-th, from 1.
-        made_of: Material of each part, or of the whole mesh.
-        overrides: Material of some parts, with precedence over `made_of`.
+        part_materials: Material of each part, or of the whole mesh.
+        overrides: Material of some parts, with precedence over `part_materials`.
         crease_deg: Edges of a greater angle stay sharp in the normals.
         limits: Limits on the size.
 
@@ -58,7 +58,7 @@ def read_mesh(
             finite; if a part has no material; if a named part is not in the mesh, or a material not in the dataset.
     """
     soup = _soup(path, limits)
-    label = part_labels(soup.parts, materials, made_of, overrides or {}, path)
+    label = part_labels(soup.parts, materials, part_materials, overrides or {}, path)
     return usable(soup, label[soup.part], crease_deg, path)
 
 
@@ -69,7 +69,7 @@ def read_parts(path: str | Path, limits: Limits | None = None) -> list[tuple[str
     return soup.parts
 
 
-class MeshesOnce:
+class MeshCache:
     """Cache of a dataset's meshes, each read once for each choice of materials; an earlier stage checked the sizes.
 
     path            path of a mesh, by its name and, if it has one, its file in dataset.yaml (`Inputs.mesh`)
@@ -111,41 +111,41 @@ class MeshesOnce:
         key = (name, *sorted(overrides.items()))
         if key not in self._meshes:
             file = self.path(name, entry.file)
-            mesh = read_mesh(file, self.materials, entry.made_of, overrides, self.crease_deg, NO_LIMITS)
+            mesh = read_mesh(file, self.materials, entry.part_materials, overrides, self.crease_deg, NO_LIMITS)
             if name in self.displacements or name in self.log_factors:
-                dense = fine(mesh)
+                dense = subdivided_mesh(mesh)
                 still = np.zeros(dense.nodes)
-                moves, factors = (np.array(of.get(name, still)) for of in (self.displacements, self.log_factors))
+                moves, factors = (np.array(table.get(name, still)) for table in (self.displacements, self.log_factors))
                 if not len(moves) == len(factors) == dense.nodes:
-                    found = "it is not the mesh that the stage `surface` moved"
+                    fault = "this is not the mesh whose surface the stage `surface` estimated"
                     cure = "run `surface` again"
-                    raise InputError(found, file=file, cure=cure)
+                    raise InputError(fault, file=file, cure=cure)
                 detail = np.exp(factors)[dense.node] if name in self.log_factors else None
                 mesh = msgspec.structs.replace(dense.moved(moves), detail=detail)
             self._meshes[key] = mesh
         return self._meshes[key]
 
 
-def _soup(path: str | Path, limits: Limits | None) -> Soup:
+def _soup(path: str | Path, limits: Limits | None) -> TriangleSoup:
     """Read a file by its format and check the result."""
     path = Path(path)
     limits = limits or Limits()
     suffix = path.suffix.lower()
     if suffix not in FORMATS:
         raise InputError(f"unknown mesh format {path.suffix!r}", file=path, cure="use one of " + ", ".join(FORMATS))
-    with reading(f"a mesh ({suffix[1:].upper()})", path, cure=CURE):
+    with reading(f"a mesh ({suffix[1:].upper()})", path, cure=CURE, also=(NameError,)):  # trimesh
         if suffix in WITHIN:
             soup = WITHIN[suffix](path, read_bytes(path, "a mesh", most_bytes=limits.bytes), limits)
         else:
             soup = read_gltf(path, limits)
-    check_count(len(soup.parts), path)
+    limits.check_parts(len(soup.parts), path)
     return check(soup, path)
 
 
 def part_labels(
     names: Sequence[tuple[str, ...]],
     materials: Sequence[str],
-    made_of: Mapping[str, str] | str | None,
+    part_materials: Mapping[str, str] | str | None,
     overrides: Mapping[str, str],
     file: str | Path,
 ) -> np.ndarray:
@@ -154,22 +154,19 @@ def part_labels(
     Args:
         names: Names of each part.
         materials: Materials of the dataset, in order.
-        made_of: Material of each part, or of all parts.
-        overrides: Material of some parts, with precedence over `made_of`.
+        part_materials: Material of each part, or of all parts.
+        overrides: Material of some parts, with precedence over `part_materials`.
         file: File to name in errors.
-
-    Returns:
-        A label for each part.
 
     Raises:
         InputError: If a part is unknown, or has no material or several; if a material is unknown.
 
-    >>> made_of = {"shell": "red", "wood": "oak"}
-    >>> part_labels([("shell",), ("legs", "wood")], ["red", "oak"], made_of, {}, "a.obj").tolist()
+    >>> part_materials = {"shell": "red", "wood": "oak"}
+    >>> part_labels([("shell",), ("legs", "wood")], ["red", "oak"], part_materials, {}, "a.obj").tolist()
     [1, 2]
     """
     known = sorted({name for each in names for name in each})
-    parts, default = ({}, made_of) if isinstance(made_of, str) else (made_of or {}, None)
+    parts, default = ({}, part_materials) if isinstance(part_materials, str) else (part_materials or {}, None)
     for part, material in [*parts.items(), *overrides.items(), *([(None, default)] if default is not None else [])]:
         if part is not None and part not in known:
             cure = did_you_mean(part, [one_line(name) for name in known])
@@ -178,21 +175,21 @@ def part_labels(
             cure = did_you_mean(material, materials)
             raise InputError(f"unknown material {material!r}", file=file, key=part, cure=cure)
     labels = []
-    for goes_by in names:
-        chosen = next(filter(None, ({m[n] for n in goes_by if n in m} for m in (overrides, parts))), {default})
-        called = one_line(" / ".join(goes_by)) or "(unnamed)"
+    for part_names in names:
+        chosen = next(filter(None, ({m[n] for n in part_names if n in m} for m in (overrides, parts))), {default})
+        title = one_line(" / ".join(part_names)) or "(unnamed)"
         if len(chosen) > 1:
-            fault = f"part {called} gets several materials: {', '.join(sorted(filter(None, chosen)))}"
-            raise InputError(fault, file=file, cure="name it once")
+            fault = f"part {title} gets several materials: {', '.join(sorted(filter(None, chosen)))}"
+            raise InputError(fault, file=file, cure="give a material to one of its names only")
         if None in chosen:
-            example = f"add it to `parts`, e.g. {one_line(goes_by[0])}: {materials[0]}" if goes_by else None
-            cure = example or "name it in an editor"
-            raise InputError(f"part {called} has no material", file=file, key=called, cure=cure)
+            example = f"add it to `parts`, e.g. {one_line(part_names[0])}: {materials[0]}" if part_names else None
+            cure = example or "name the part in a mesh editor"
+            raise InputError(f"part {title} has no material", file=file, key=title, cure=cure)
         labels.append(list(materials).index(*chosen) + 1)
     return np.array(labels, dtype=np.int16)
 
 
-def usable(soup: Soup, face_label: np.ndarray, crease_deg: float, file: str | Path) -> Mesh:
+def usable(soup: TriangleSoup, face_label: np.ndarray, crease_deg: float, file: str | Path) -> Mesh:
     """Weld vertices, drop zero-area and duplicate faces, orient the faces consistently, and compute normals.
 
     Args:
@@ -230,7 +227,7 @@ def usable(soup: Soup, face_label: np.ndarray, crease_deg: float, file: str | Pa
     )
 
 
-def solid(soup: Soup, file: str | Path) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def solid(soup: TriangleSoup, file: str | Path) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return welded vertices, the faces on them, and a mask of the faces that have an area and are no duplicates.
 
     The others are counted in the log.
@@ -251,17 +248,21 @@ def solid(soup: Soup, file: str | Path) -> tuple[np.ndarray, np.ndarray, np.ndar
         if count:
             log.info("%s: %d %s faces dropped", file, count, what)
     if not (solid & single).any():
-        raise InputError("every face has zero area", file=file, cure="is the mesh flat to a line, or its scale zero?")
+        raise InputError(
+            "every face has zero area",
+            file=file,
+            cure="look at it in an editor: it is flattened to a line or a point, or its scale is zero",
+        )
     return vertices, faces, solid & single
 
 
-def merged_normals(own: np.ndarray, supplied: np.ndarray, area: np.ndarray) -> np.ndarray:
+def merged_normals(computed: np.ndarray, supplied: np.ndarray, area: np.ndarray) -> np.ndarray:
     """Return the file's corner normals where they are sane, else the computed ones.
 
     Sane normals have unit length and are within 75° of the face's normal.
 
     Args:
-        own: Computed normals, [F, 3, 3].
+        computed: Computed normals, [F, 3, 3].
         supplied: Normals of the file, [F, 3, 3], NaN if there are none.
         area: Area vectors of the faces, [F, 3].
 
@@ -274,4 +275,4 @@ def merged_normals(own: np.ndarray, supplied: np.ndarray, area: np.ndarray) -> n
         face = (area / np.linalg.norm(area, axis=1, keepdims=True))[:, None, :]
         right_length = np.isfinite(unit).all(axis=-1) & (np.abs(length[..., 0] - 1) < 0.05)
         sane = right_length & (np.sum(unit * face, axis=-1) > 0.26)
-    return np.where(sane[..., None], unit, own)
+    return np.where(sane[..., None], unit, computed)

@@ -9,7 +9,7 @@ from pathlib import Path
 
 from factorlib.dataset.check import MESHES
 from factorlib.dataset.paths import Refusal
-from factorlib.dataset.schema import Dataset, ObjectEntry
+from factorlib.dataset.schema import Dataset, MeshInstance
 from factorlib.errors import InputError, did_you_mean
 from factorlib.recipe import schema
 from factorlib.recipe.schema import BALL, KINDS, AnyRecipe, is_light_file, is_mesh_file, read_table
@@ -30,7 +30,7 @@ def read_recipe(path: Path, dataset: Dataset) -> AnyRecipe:
 
 
 def check_recipe(
-    recipe: AnyRecipe, path: Path, objects: Mapping[str, Sequence[ObjectEntry]], materials: list[str]
+    recipe: AnyRecipe, path: Path, objects: Mapping[str, Sequence[MeshInstance]], materials: list[str]
 ) -> None:
     """Check a recipe against a data set.
 

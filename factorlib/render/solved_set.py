@@ -7,7 +7,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from factorlib.conventions import YUP_FROM_CAMERA
-from factorlib.dataset.schema import GroundSlice, LightSlice, MeshEntry, ObjectEntry, ObjectsSlice
+from factorlib.dataset.schema import GroundSlice, LightSlice, MeshEntry, MeshInstance, ObjectsSlice
 from factorlib.errors import InputError, did_you_mean
 from factorlib.export.scene import ALL_BOUNCES, DIRECT
 from factorlib.generate.solids import sphere
@@ -16,7 +16,7 @@ from factorlib.images.light_map import read_light_map
 from factorlib.images.tone import shown, straightened
 from factorlib.light.lobes import Lobes
 from factorlib.meshes.mesh import Mesh, scaled
-from factorlib.meshes.read import CREASE_DEG, MeshesOnce, read_mesh
+from factorlib.meshes.read import CREASE_DEG, MeshCache, read_mesh
 from factorlib.reading import check_plain
 from factorlib.recipe.schema import BALL, AssumedSun, is_light_file, is_mesh_file, read_table
 from factorlib.render.ground import Plane, resting_plane
@@ -59,7 +59,7 @@ class SolvedSet:
         self.materials = reflectances(self.table)
         self.photos = list(self.objects)
         own = read_surface(inputs.folders.get("surface"))
-        self._meshes = MeshesOnce(inputs.mesh, self.names, crease_deg, own.displacements, own.log_factors)
+        self._meshes = MeshCache(inputs.mesh, self.names, crease_deg, own.displacements, own.log_factors)
         self._pixels: dict[str, dict[str, np.ndarray]] = {}
 
     def scene(self, photo: str, sun: AssumedSun | None = None, denoise: bool = False) -> PhotoScene:
@@ -202,7 +202,7 @@ class SolvedSet:
             raise InputError(f"the mesh {name!r} has no height", key="mesh", cure=cure)
         return mesh, materials, upward
 
-    def _objects_of(self, mesh: str) -> list[tuple[str, ObjectEntry]]:
+    def _objects_of(self, mesh: str) -> list[tuple[str, MeshInstance]]:
         """Return all objects of a mesh with their photos, sorted by photo name, independent of dataset.yaml's order."""
         return [
             (photo, obj) for photo, each in sorted(self.objects.items()) for obj in each.objects if obj.mesh == mesh
@@ -214,7 +214,7 @@ class SolvedSet:
         trusted = [pose for pose in poses if not pose.left_out] or poses
         return np.stack([np.array(pose.rotation).T @ YUP_FROM_CAMERA[1] for pose in trusted])
 
-    def _placed(self, obj: ObjectEntry, entry: MeshEntry, poses: PhotoPoses) -> Placed:
+    def _placed(self, obj: MeshInstance, entry: MeshEntry, poses: PhotoPoses) -> Placed:
         pose = poses.objects[obj.name]
         mesh = self._meshes.mesh(obj.mesh, entry, obj.materials)
         place = rigid(YUP_FROM_CAMERA @ np.array(pose.rotation), YUP_FROM_CAMERA @ np.array(pose.translation))

@@ -27,8 +27,8 @@ from factorlib.geometry.raster import unit
 from factorlib.geometry.sphere import fibonacci_sphere
 from factorlib.geometry.visibility import LIFT, Occluders, SurfacePoints
 from factorlib.light.lobes import Lobes
-from factorlib.meshes.fine import subdivided
 from factorlib.meshes.mesh import Mesh, area_vectors
+from factorlib.meshes.subdivision import subdivide
 from factorlib.report.artifacts import Artifacts
 from factorlib.results.lobes import read_lobes
 from factorlib.results.poses import AS_IT_IS
@@ -200,7 +200,7 @@ def _fine(mesh: Mesh) -> Mesh:
     """Subdivide the mesh so that shadows fall between its vertices, less finely if there would be too many."""
     longest = LONGEST * np.ptp(mesh.vertices, axis=0).max()
     most = max(MOST_VERTICES // (1 + mesh.open), len(mesh.vertices))
-    while len((fine := subdivided(mesh, longest)).vertices) > most:
+    while len((fine := subdivide(mesh, longest)).vertices) > most:
         longest *= 2
     return fine
 

@@ -42,7 +42,7 @@ class SurfaceTable(msgspec.Struct, frozen=True):
         painted_by: evidence for it
         gains: by photo: decrease of minus twice the log marginal likelihood of its observations, without a part in the
             surface
-        displacements: by mesh: along the normal at each node of the subdivided mesh (`factorlib.meshes.fine`), in
+        displacements: by mesh: along the normal at each node of the subdivided mesh (`meshes.subdivision`), in
             extents
         log_factors: by mesh: log factor on diffuse reflectance at each node
     """

@@ -79,7 +79,7 @@ def measured(folder: Path, photo: str) -> list[dict]:
     rows = []
     for obj in dataset.photo(photo).objects:
         file, said = dataset.spec.meshes[obj.mesh], answer.objects[obj.name]
-        mesh = read_mesh(dataset.folder / file.file, dataset.spec.materials, file.made_of, obj.materials)
+        mesh = read_mesh(dataset.folder / file.file, dataset.spec.materials, file.part_materials, obj.materials)
         caster, pose, true = Caster(mesh), said.pose, reference.objects[obj.name].pose
         camera, true_camera = (entry.camera.camera(picture.width, picture.height) for entry in (answer, reference))
         normals = rasterise(caster, true_camera, true), rasterise(caster, camera, pose)

@@ -11,7 +11,7 @@ from factorlib.geometry.camera import Camera, Pose
 from factorlib.geometry.raster import Caster, rasterise
 from factorlib.meshes.mesh import Mesh
 from factorlib.meshes.read import usable
-from factorlib.meshes.soup import Soup, no_normals
+from factorlib.meshes.triangle_soup import TriangleSoup, no_normals
 
 
 def mesh_of(parts: list, labels: list[int] | None = None, crease_deg: float = 40.0) -> Mesh:
@@ -19,7 +19,9 @@ def mesh_of(parts: list, labels: list[int] | None = None, crease_deg: float = 40
     labels = labels or [1] * len(parts)
     whole = trimesh.util.concatenate(parts)
     label = np.repeat(labels, [len(p.faces) for p in parts])
-    soup = Soup(np.array(whole.vertices), np.array(whole.faces), label * 0, [("all",)], no_normals(len(whole.faces)))
+    soup = TriangleSoup(
+        np.array(whole.vertices), np.array(whole.faces), label * 0, [("all",)], no_normals(len(whole.faces))
+    )
     return usable(soup, label, crease_deg, "test")
 
 

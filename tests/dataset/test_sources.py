@@ -120,7 +120,7 @@ def test_a_photo_is_matched_by_path_then_file_name_then_that_without_suffix_or_a
         images = colmap(folder, names)
         assert is_pose_of(read(folder, PLACED).external["hall"], images[match])
     images = colmap(folder, names=("x/hall.png", "y/hall.png"))
-    refusal(folder, PLACED, "cameras.images.hall", "could be 'x/hall.png', 'y/hall.png'")
+    refusal(folder, PLACED, "cameras.images.hall", "several images of the source: 'x/hall.png', 'y/hall.png'")
     external = read(folder, PLACED | {"images": {"hall": "y/hall.png", "attic": "x/hall.png"}}).external
     assert is_pose_of(external["hall"], images["y/hall.png"])
     (folder / "photos/r_0.5.png").write_text("")  # what follows this dot is no suffix

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from factorlib.dataset.schema import Pose
+from factorlib.dataset.schema import RigidTransform
 from factorlib.evaluate.ball import light_of_lat_long
 from factorlib.evaluate.geometry import normal_error, pose_error
 from factorlib.evaluate.lights import compare_lights, light_error, rgb_angle
@@ -21,7 +21,7 @@ from tests.evaluate.made_artifacts import TRUE, light_map, perturbed, scaled
 def test_the_error_of_a_pose_is_its_turn_and_its_shift_over_the_true_distance(degrees):
     base = Rotation.random(rng=np.random.default_rng(0)).as_matrix()
     turn = Rotation.from_rotvec(np.radians(degrees) * np.array([0.6, 0.0, 0.8])).as_matrix()
-    error = pose_error(Pose(turn @ base, (0, 0, 4.4)), Pose(base, (0, 0, 4.0)))
+    error = pose_error(RigidTransform(turn @ base, (0, 0, 4.4)), RigidTransform(base, (0, 0, 4.0)))
     assert error.rotation_deg == pytest.approx(degrees, abs=1e-5) and error.translation_relative == pytest.approx(0.1)
 
 

@@ -13,7 +13,7 @@ H, W = 48, 64
 SMOOTH = np.linspace(0.05, 0.8, W)[None, :, None] * np.linspace(0.6, 1, H)[:, None, None] * np.array([1.0, 0.9, 0.7])
 
 
-def exif_of(orientation=1) -> bytes:
+def read_exif(orientation=1) -> bytes:
     exif = Image.Exif()
     exif[0x112] = orientation
     exif.get_ifd(0x8769).update({0x829A: IFDRational(1, 50), 0x829D: IFDRational(2, 1), 0x8827: 200, 0xA405: 26})
@@ -44,7 +44,7 @@ def test_heif_is_the_radiance_that_was_written_in_all_its_bits_and_top_codes_are
 
 @pytest.mark.parametrize("orientation, turns", [(1, 0), (3, 2), (6, 3), (8, 1)])
 def test_orientation_is_applied_once_and_what_the_camera_wrote_is_read(tmp_path, orientation, turns):
-    path, turned = save(tmp_path / "a.heic", SMOOTH, exif=exif_of(orientation)), np.rot90(SMOOTH, turns)
+    path, turned = save(tmp_path / "a.heic", SMOOTH, exif=read_exif(orientation)), np.rot90(SMOOTH, turns)
     photo, small = read_photo(path), decoded(open_photo(path), None, 4, path)
     assert photo.radiance.shape == turned.shape and open_photo(path).size == turned.shape[:2]
     np.testing.assert_allclose(photo.radiance, turned, atol=0.015)

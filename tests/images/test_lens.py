@@ -3,14 +3,14 @@
 import numpy as np
 import pytest
 
-from factorlib.dataset.schema import Camera
+from factorlib.dataset.schema import Intrinsics
 from factorlib.errors import InputError
-from factorlib.images.lens import Undistorted, lens_of
+from factorlib.images.lens import Undistorted, radial_lens
 from factorlib.images.photo import Photo
 
 W, H = 90, 60
-CAMERA = Camera(focal_px=140.0, principal_point=(86.0, 64.0), distortion=(-0.2, 0.05))
-LENS = lens_of(CAMERA, 2, W, H)
+CAMERA = Intrinsics(focal_px=140.0, principal_point=(86.0, 64.0), distortion=(-0.2, 0.05))
+LENS = radial_lens(CAMERA, 2, W, H)
 
 
 def scene(points):
@@ -39,7 +39,7 @@ def test_it_is_the_picture_of_a_pinhole_and_says_where_it_has_none():
     assert bent > 0.3, "the lens is one that matters"
     (y, x), (v, u) = (np.argwhere(of).mean(0) + 0.5 for of in (photo.clipped[..., 1], straight.inside & ~photo.finite))
     np.testing.assert_allclose(LENS.distorted(np.array([[x, y], [u, v]])), [[40.5, 30.5], [20.5, 20.5]], atol=0.6)
-    barrel = lens_of(Camera(focal_px=140.0, distortion=(0.2, 0.0)), 2, W, H)
+    barrel = radial_lens(Intrinsics(focal_px=140.0, distortion=(0.2, 0.0)), 2, W, H)
     edge = Undistorted(barrel, H, W)
     assert not edge.inside[0, 0] and edge.inside[H // 2, W // 2]
     assert not edge.nearest(np.ones((H, W), bool))[~edge.inside].any()
@@ -54,8 +54,8 @@ def test_points_go_there_and_back_and_the_distortion_is_the_one_that_is_written_
 
 
 def test_coefficients_of_no_lens_are_refused_and_no_distortion_is_no_lens():
-    folded = lens_of(Camera(focal_px=140.0, distortion=(-3.0, 0.0)), 2, W, H)
-    with pytest.raises(InputError, match="fold the picture"):
+    folded = radial_lens(Intrinsics(focal_px=140.0, distortion=(-3.0, 0.0)), 2, W, H)
+    with pytest.raises(InputError, match="map two rays"):
         folded.check(W, H, "dataset.yaml", "photos[a].camera.distortion")
     LENS.check(W, H, "dataset.yaml", "photos[a].camera.distortion")
-    assert lens_of(None, 1, W, H) is None and lens_of(Camera(focal_px=140.0), 1, W, H) is None
+    assert radial_lens(None, 1, W, H) is None and radial_lens(Intrinsics(focal_px=140.0), 1, W, H) is None

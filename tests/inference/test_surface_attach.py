@@ -7,8 +7,8 @@ from factorlib.generate.solids import sphere
 from factorlib.geometry.camera import Camera, Pose
 from factorlib.geometry.raster import rasterise
 from factorlib.inference.surface_turns import Surfaces, attach_pixels
-from factorlib.meshes.fine import fine
 from factorlib.meshes.mesh import Mesh, scaled
+from factorlib.meshes.subdivision import subdivided_mesh
 from factorlib.results.poses import ObjectEntry, entry_of
 
 CAMERA = Camera(60, 50, 80.0, (30.0, 25.0))
@@ -32,7 +32,7 @@ def test_pixels_of_two_objects_know_their_nodes_and_their_pose():
     poses = [Pose(turns[0], np.array([-1.2, 0, 5.0])), Pose(turns[1], np.array([1.3, 0.2, 6.0]))]
     meshes, scale = {"apple": ball(), "pear": ball(0.3)}, (1.0, 1.2, 0.8)
     maps = rasterise([meshes["apple"], scaled(meshes["pear"], scale)], CAMERA, poses)
-    surfaces = Surfaces({name: fine(mesh) for name, mesh in meshes.items()})
+    surfaces = Surfaces({name: subdivided_mesh(mesh) for name, mesh in meshes.items()})
     objects = {"a": ("apple", entry(poses[0])), "b": ("pear", entry(poses[1], scale))}
     y, x = np.nonzero(maps.object >= 0)
     at = attach_pixels(np.column_stack([x, y]), maps.object[y, x], CAMERA, objects, surfaces)

@@ -23,8 +23,8 @@ from factorlib.inference.surface_turns import (
     linearise_light,
     solve_detail,
 )
-from factorlib.meshes.fine import Fine
 from factorlib.meshes.mesh import Mesh
+from factorlib.meshes.subdivision import SubdividedMesh
 from studies.scenes.problems import MATERIALS
 from tests.inference.made import in_units_of, photos_in_a_wrong_light
 from tests.inference.made_lights import PRIOR, begun, drawn, light_of, on_even_cells, photographed, spheres
@@ -38,7 +38,9 @@ def surfaces(subdivisions: int = 3) -> Surfaces:
     """A ball of radius 1, no finer than the icosphere."""
     solid = trimesh.creation.icosphere(subdivisions)
     vertices, faces, label = np.array(solid.vertices), np.array(solid.faces), np.ones(len(solid.faces), np.int16)
-    return Surfaces({"ball": Fine(Mesh(vertices, faces, vertices, label), np.arange(len(vertices)), faces, 2.0)})
+    return Surfaces(
+        {"ball": SubdividedMesh(Mesh(vertices, faces, vertices, label), np.arange(len(vertices)), faces, 2.0)}
+    )
 
 
 def attached_to(normal: np.ndarray, body: Surfaces) -> Attached:

@@ -9,7 +9,7 @@ from PIL import Image
 from pycocotools import mask as pycocomask
 
 from factorlib.errors import InputError
-from factorlib.labels.coco import runs_of
+from factorlib.labels.coco import run_lengths
 from factorlib.labels.labels import Labels, check_materials, read_labels, read_objects
 from factorlib.labels.png import read_values
 
@@ -120,8 +120,8 @@ def test_rle_is_decoded_as_pycocotools_does_and_so_are_millions_of_runs():
     for seed in range(20):
         rng = np.random.default_rng(seed)
         inside = rng.random((rng.integers(1, 40), rng.integers(1, 40))) < rng.random()
-        assert runs_of(compressed(inside), inside.size).tolist() == counts_of(inside)
-    assert len(runs_of("10" * 500_000, 1 + 499_999 * 500_000 // 2)) == 1_000_000
+        assert run_lengths(compressed(inside), inside.size).tolist() == counts_of(inside)
+    assert len(run_lengths("10" * 500_000, 1 + 499_999 * 500_000 // 2)) == 1_000_000
 
 
 def test_masks_that_are_empty_or_overlap(tmp_path):
@@ -156,8 +156,8 @@ def test_objects_are_numbered_in_their_order_and_bad_masks_of_them_are_refused(t
 def test_objects_of_other_materials_than_the_mask_shows_are_refused_and_what_is_hidden_or_has_no_mesh_is_not(tmp_path):
     shown, none = Labels(LABEL, LABEL > 9), np.zeros((H, W), np.uint16)
 
-    def check(objects, *made_of):
-        check_materials(shown, objects, list(made_of), MATERIALS, tmp_path / "m.png", "photos[x].objects")
+    def check(objects, *object_materials):
+        check_materials(shown, objects, list(object_materials), MATERIALS, tmp_path / "m.png", "photos[x].objects")
 
     for fine in ({"red", "wood"}, {"wood"}, {"red", "white", "wood"}):
         check(none, ("chair", fine))

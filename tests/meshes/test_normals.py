@@ -7,13 +7,13 @@ import trimesh
 
 from factorlib.meshes.normals import consistently_wound, corner_normals
 from factorlib.meshes.read import merged_normals, usable
-from factorlib.meshes.soup import Soup, no_normals
+from factorlib.meshes.triangle_soup import TriangleSoup, no_normals
 
 
 def mesh_of(vertices, faces, normals=None, crease_deg=60.0):
     faces = np.asarray(faces)
     supplied = no_normals(len(faces)) if normals is None else normals
-    soup = Soup(np.asarray(vertices, float), faces, np.zeros(len(faces), int), [("a",)], supplied)
+    soup = TriangleSoup(np.asarray(vertices, float), faces, np.zeros(len(faces), int), [("a",)], supplied)
     return usable(soup, np.ones(len(faces), int), crease_deg, "m")
 
 

@@ -14,7 +14,19 @@ from factorlib.meshes.limits import Limits
 from factorlib.meshes.mesh import area_vectors
 from factorlib.meshes.ply import submesh, write_ply
 from factorlib.meshes.read import read_mesh
-from tests.faults.good import DATA, MESHES, VERTICES, glb, gltf_header, put
+from tests.faults.good import (
+    DATA,
+    MESHES,
+    OFF,
+    PLY,
+    PLY_FACES,
+    PLY_TEXT,
+    STL_TEXT,
+    VERTICES,
+    glb,
+    gltf_header,
+    put,
+)
 
 MATERIALS = ["red", "oak"]
 PARTS = {"shell": "red", "legs": "oak"}
@@ -58,7 +70,7 @@ def test_obj_parts_go_by_group_or_usemtl_without_a_material_file(tmp_path, parts
 @pytest.mark.parametrize("parts, words, cure", [
     ({"shell": "red"}, "legs.*no material", "legs: red|wood: red"),
     ({"shel": "red", "legs": "oak"}, "no part 'shel'", "did you mean 'shell'?"),
-    ({"shell": "red", "plastic": "oak", "legs": "oak"}, "several materials", "name it once"),
+    ({"shell": "red", "plastic": "oak", "legs": "oak"}, "several materials", "one of its names only"),
     ({"shell": "red", "legs": "ok"}, "unknown material 'ok'", "did you mean 'oak'?"),
 ])  # fmt: skip
 def test_parts_and_materials_that_do_not_fit_are_named(tmp_path, parts, words, cure):
@@ -135,23 +147,62 @@ def test_the_tetrahedron_is_the_same_in_every_format_and_no_larger_than_allowed(
     assert "simplify" in caught.value.cure
 
 
-def test_gltf_strips_fans_sparse_accessors_and_repeated_primitives_are_read(tmp_path):
+def test_gltf_strips_and_repeated_primitives_are_read_and_fans_and_sparse_accessors_refused(tmp_path):
     header = gltf_header()
     header["accessors"][1]["count"] = 4
-    for mode in (5, 6):
-        header["meshes"][0]["primitives"][0]["mode"] = mode
-        data = DATA[:48] + np.array([0, 1, 2, 3], "<u2").tobytes().ljust(24, b"\0")
-        assert len(read_all(tmp_path / "a.glb", glb(header, data)).faces) == 2
+    header["meshes"][0]["primitives"][0]["mode"] = 5
+    data = DATA[:48] + np.array([0, 1, 2, 3], "<u2").tobytes().ljust(24, b"\0")
+    assert len(read_all(tmp_path / "a.glb", glb(header, data)).faces) == 2
+    header["meshes"][0]["primitives"][0]["mode"] = 6
+    assert not trimesh_faces(glb(header, data), "glb")
+    with pytest.raises(InputError, match="triangle fan"):
+        read_all(tmp_path / "a.glb", glb(header, data))
     header = gltf_header()
-    indices, values = {"bufferView": 2, "componentType": 5121}, {"bufferView": 3}
+    indices, values = {"bufferView": 1, "componentType": 5121}, {"bufferView": 0}
     header["accessors"][0]["sparse"] = {"count": 1, "indices": indices, "values": values}
-    header["bufferViews"] += [
-        {"buffer": 0, "byteOffset": at, "byteLength": length} for at, length in ((72, 1), (76, 12))
-    ]
-    header["buffers"][0]["byteLength"] = 88
-    data = DATA + b"\3\0\0\0" + np.array([0, 0, 5], "<f4").tobytes()
-    assert read_all(tmp_path / "a.glb", glb(header, data)).vertices[:, 2].max() == 5
+    with pytest.raises(InputError, match="sparse accessor"):
+        read_all(tmp_path / "a.glb", glb(header))
     header = gltf_header()
     header["meshes"][0]["primitives"] *= 3
     header["nodes"] = [{"children": [1, 2]}, {"mesh": 0}, {"mesh": 0, "translation": [3, 0, 0]}]
     assert len(read_all(tmp_path / "a.glb", glb(header)).faces) == 8
+
+
+def test_gltf_positions_of_normalized_integers_are_fractions(tmp_path):
+    header = gltf_header()
+    header["accessors"][0] |= {"componentType": 5123, "normalized": True}
+    header["bufferViews"][0] |= {"byteStride": 12}
+    data = np.pad((VERTICES * 65535).astype("<u2"), ((0, 0), (0, 3))).tobytes() + DATA[48:]
+    assert read_all(tmp_path / "a.glb", glb(header, data)).vertices.max() == 1
+
+
+def trimesh_faces(content: bytes, kind: str) -> int:
+    scene = trimesh.load_scene(trimesh.util.wrap_as_stream(content), file_type=kind)
+    return sum(len(mesh.faces) for mesh in scene.geometry.values())
+
+
+def binary_ply_of(*polygons):
+    faces = b"".join(bytes([len(polygon)]) + np.array(polygon, "<i4").tobytes() for polygon in polygons)
+    return PLY[: -len(PLY_FACES)].replace(b"face 4", b"face %d" % len(polygons)) + faces
+
+
+SQUARE_AND_TWO = ((0, 1, 3, 2), (0, 1, 2), (1, 2, 3))
+CUT = {"a.off": OFF[:-8], "a.ply": PLY_TEXT[:-8], "a.stl": STL_TEXT + STL_TEXT[:-40]}
+
+
+@pytest.mark.parametrize("name", CUT)
+def test_a_truncated_text_is_refused_that_trimesh_reads_as_a_smaller_mesh(tmp_path, name):
+    assert trimesh_faces(CUT[name].encode(), name[2:]) in (3, 4)
+    with pytest.raises(InputError):
+        read_all(tmp_path / name, CUT[name])
+
+
+def test_polygons_of_different_lengths_in_a_binary_ply_are_read_which_trimesh_refuses(tmp_path):
+    with pytest.raises(ValueError, match="unexpected length"):
+        trimesh_faces(binary_ply_of(*SQUARE_AND_TWO), "ply")
+    assert len(read_all(tmp_path / "a.ply", binary_ply_of(*SQUARE_AND_TWO)).faces) == 4
+
+
+def test_names_of_obj_groups_are_read_which_trimesh_drops():
+    scene = trimesh.load_scene(trimesh.util.wrap_as_stream(QUADS), file_type="obj")
+    assert not {"shell", "legs"} & {*scene.geometry, *scene.graph.nodes}

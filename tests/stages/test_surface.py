@@ -13,9 +13,9 @@ from factorlib.generate.solids import sphere
 from factorlib.images.exr import write_exr
 from factorlib.inference.blocks import Noise
 from factorlib.inference.observed import blocks_of_observations, gather_observations
-from factorlib.meshes.fine import fine
 from factorlib.meshes.ply import write_ply
-from factorlib.meshes.read import CREASE_DEG, MeshesOnce, read_mesh
+from factorlib.meshes.read import CREASE_DEG, MeshCache, read_mesh
+from factorlib.meshes.subdivision import subdivided_mesh
 from factorlib.results.materials import Reflectance
 from factorlib.results.surface import SurfaceTable, read_surface
 from factorlib.stage import Inputs, serial_map, silent
@@ -88,9 +88,9 @@ def test_off_writes_a_table_of_nothing_and_needs_nothing(tmp_path):
 
 def test_meshes_are_moved_and_painted_wherever_they_are_read(tmp_path):
     write_ply(tmp_path / "ball.ply", sphere(1.0))
-    dense = fine(read_mesh(tmp_path / "ball.ply", ["red"], "red"))
+    dense = subdivided_mesh(read_mesh(tmp_path / "ball.ply", ["red"], "red"))
     table = {"ball": np.full(dense.nodes, 0.05).tolist()}
-    once = MeshesOnce(lambda _, file: tmp_path / file, ["red"], CREASE_DEG, table, table)
+    once = MeshCache(lambda _, file: tmp_path / file, ["red"], CREASE_DEG, table, table)
     mesh = once.mesh("ball", MeshEntry("ball.ply", material="red"))
     radius = np.linalg.norm(mesh.vertices, axis=1).max()
     assert abs(radius - 1 - 0.05 * dense.extent) < 1e-3 and np.allclose(mesh.detail, np.exp(0.05))
@@ -103,6 +103,6 @@ def test_meshes_are_moved_and_painted_wherever_they_are_read(tmp_path):
     assert "COLOR_0" in tree["meshes"][0]["primitives"][0]["attributes"]
     base = tree["materials"][0]["pbrMetallicRoughness"]["baseColorFactor"]
     np.testing.assert_allclose(base[:3], np.exp(0.05) * np.array([0.2, 0.1, 0.1]), rtol=1e-6)
-    other = MeshesOnce(lambda _, file: tmp_path / file, ["red"], CREASE_DEG, {"ball": [0.0] * 7})
+    other = MeshCache(lambda _, file: tmp_path / file, ["red"], CREASE_DEG, {"ball": [0.0] * 7})
     with pytest.raises(InputError, match="surface"):
         other.mesh("ball", MeshEntry("ball.ply", material="red"))

@@ -9,8 +9,8 @@ from typing import Annotated
 import msgspec
 
 from factorlib.dataset.paths import Refusal
-from factorlib.dataset.schema import Number, Pose, Vec3
-from factorlib.dataset.sources.shot import Shot, colmap_camera, read_source
+from factorlib.dataset.schema import Number, RigidTransform, Vec3
+from factorlib.dataset.sources.source_image import SourceImage, colmap_camera, read_source
 
 KEY = "cameras.bop"
 CAMERAS = "scene_camera.json"
@@ -34,31 +34,31 @@ class SceneObject(msgspec.Struct, frozen=True):
     cam_t_m2c: Vec3
 
 
-def bop_shots(path: str, refuse: Refusal) -> list[Shot]:
+def read_bop(path: str, refuse: Refusal) -> list[SourceImage]:
     """Read the images of the scene in the dataset's folder `path`, sorted by id.
 
     The size of an image is assumed to be twice its principal point.
     """
-    camera_file, pose_file = (refuse.file_of(KEY, path, name) for name in (CAMERAS, POSES))
+    camera_file, pose_file = (refuse.file_in(KEY, path, name) for name in (CAMERAS, POSES))
     if camera_file is None:
         refuse(KEY, f"there is no {CAMERAS} in {path!r}", "name the folder of one scene, such as test/000001")
     cameras = read_source(camera_file, dict[ImageId, SceneCamera], KEY)
     poses = read_source(pose_file, dict[str, list[SceneObject]], KEY) if pose_file else {}
-    of_cameras, of_poses = (Refusal(refuse.folder / path / name, refuse.folder) for name in (CAMERAS, POSES))
-    shots = []
+    camera_refusal, pose_refusal = (Refusal(refuse.folder / path / name, refuse.folder) for name in (CAMERAS, POSES))
+    images = []
     for image, camera in sorted(cameras.items(), key=lambda item: int(item[0])):
         fx, skew, cx, _, fy, cy, _, _, _ = camera.cam_K
         if skew != 0 or min(fx, fy, cx, cy) <= 0:
             cure = "give [fx, 0, cx, 0, fy, cy, 0, 0, 1] in pixels"
-            of_cameras(f"{image}.cam_K", "is not the camera of square axes", cure)
+            camera_refusal(f"{image}.cam_K", "is not the camera of square axes", cure)
         # pixel centres from whole numbers to 0.5
         size = (2 * cx + 1, 2 * cy + 1)
         params = [fx, fy, cx + 0.5, cy + 0.5]
-        pinhole = colmap_camera(f"{image}.cam_K", "PINHOLE", *size, params, of_cameras)
-        instances: dict[int, list[Pose]] = {}
+        pinhole = colmap_camera(f"{image}.cam_K", "PINHOLE", *size, params, camera_refusal)
+        instances: dict[int, list[RigidTransform]] = {}
         for index, obj in enumerate(poses.get(image, [])):
             rows = tuple(obj.cam_R_m2c[k : k + 3] for k in (0, 3, 6))
-            of_poses.rotation(f"{image}[{index}].cam_R_m2c", rows)
-            instances.setdefault(obj.obj_id, []).append(Pose(rows, obj.cam_t_m2c))
-        shots.append(Shot(int(image), pinhole, None, f"{CAMERAS}: {image}", poses=instances))
-    return shots
+            pose_refusal.rotation(f"{image}[{index}].cam_R_m2c", rows)
+            instances.setdefault(obj.obj_id, []).append(RigidTransform(rows, obj.cam_t_m2c))
+        images.append(SourceImage(int(image), pinhole, None, f"{CAMERAS}: {image}", poses=instances))
+    return images

@@ -16,7 +16,7 @@ import pycolmap
 
 from factorlib.dataset.paths import Refusal
 from factorlib.dataset.schema import LARGEST
-from factorlib.dataset.sources.shot import DAMAGED, Shot, colmap_camera
+from factorlib.dataset.sources.source_image import DAMAGED, SourceImage, colmap_camera
 from factorlib.reading import one_line, reading
 
 KEY = "cameras.colmap"
@@ -30,11 +30,11 @@ ImageLine = tuple[str, int, tuple[float, ...]]
 Line = TypeVar("Line", CameraLine, ImageLine)
 
 
-def colmap_shots(path: str, refuse: Refusal) -> list[Shot]:
+def read_colmap(path: str, refuse: Refusal) -> list[SourceImage]:
     """Read the registered images of the model in the dataset's folder `path`, sorted by name."""
     refuse.subfolder(KEY, path)
     cameras_and_images = [
-        (refuse.file_of(KEY, path, f"cameras{suffix}"), refuse.file_of(KEY, path, f"images{suffix}"))
+        (refuse.file_in(KEY, path, f"cameras{suffix}"), refuse.file_in(KEY, path, f"images{suffix}"))
         for suffix in (".bin", ".txt")
     ]
     for camera_file, image_file in cameras_and_images:
@@ -48,20 +48,20 @@ def colmap_shots(path: str, refuse: Refusal) -> list[Shot]:
         camera_lines = _text_cameras(camera_file) if is_text else _records(camera_file, _binary_camera)
         cameras = {line[0]: line for line in camera_lines}
         for _, model, _, _, params in cameras.values():
-            if len(params) != _count_of(model):
-                raise ValueError(f"a {model} camera has {_count_of(model)} parameters, not {len(params)}")
+            if len(params) != _parameter_count(model):
+                raise ValueError(f"a {model} camera has {_parameter_count(model)} parameters, not {len(params)}")
     with reading("a COLMAP model", image_file, KEY, CURE):
         image_lines = _text_images(image_file) if is_text else _records(image_file, _binary_image)
-        images = sorted(image_lines, key=lambda line: line[0])
-        for name, camera_id, _ in images:
+        registered = sorted(image_lines, key=lambda line: line[0])
+        for name, camera_id, _ in registered:
             if camera_id not in cameras:
                 raise ValueError(f"image {name!r} has camera {camera_id}, which {camera_file.name} lacks")
     made = {
         number: colmap_camera(f"{KEY}: camera {number}", model, width, height, params, refuse)
         for number, model, width, height, params in cameras.values()
     }
-    shots = []
-    for name, camera_id, (*quaternion, x, y, z) in images:
+    images = []
+    for name, camera_id, (*quaternion, x, y, z) in registered:
         key = f"{KEY}: {one_line(name)}"
         camera = made[camera_id]
         length = math.hypot(*quaternion)
@@ -69,11 +69,11 @@ def colmap_shots(path: str, refuse: Refusal) -> list[Shot]:
             refuse(key, "is no pose: its numbers are zero, not finite or too large", DAMAGED)
         unit = [value / length for value in (*quaternion[1:], quaternion[0])]
         motion = pycolmap.Rigid3d(pycolmap.Rotation3d(unit), [x, y, z])
-        shots.append(Shot(name, camera, (camera.width, camera.height), key, cam_from_world=motion))
-    return shots
+        images.append(SourceImage(name, camera, (camera.width, camera.height), key, cam_from_world=motion))
+    return images
 
 
-def _count_of(model: str) -> int:
+def _parameter_count(model: str) -> int:
     """Return the number of parameters of a camera model."""
     if model not in MODELS.values():
         raise ValueError(f"{one_line(model)!r} is no camera model")
@@ -87,37 +87,37 @@ def _records(file: Path, record: Callable[[mmap.mmap, int], tuple[Line, int]]) -
     """
     with file.open("rb") as stream, mmap.mmap(stream.fileno(), 0, access=mmap.ACCESS_READ) as content:
         (count,) = struct.unpack_from("<Q", content)
-        at = 8
+        offset = 8
         for _ in range(count):
-            entry, at = record(content, at)
+            entry, offset = record(content, offset)
             yield entry
 
 
-def _binary_camera(content: mmap.mmap, at: int) -> tuple[CameraLine, int]:
-    number, model, width, height = struct.unpack_from("<IiQQ", content, at)
+def _binary_camera(content: mmap.mmap, offset: int) -> tuple[CameraLine, int]:
+    number, model, width, height = struct.unpack_from("<IiQQ", content, offset)
     if model not in MODELS:
         raise ValueError(f"{model} is no camera model")
-    count = _count_of(MODELS[model])
-    params = struct.unpack_from(f"<{count}d", content, at + 24)
-    return (number, MODELS[model], width, height, params), at + 24 + 8 * count
+    count = _parameter_count(MODELS[model])
+    params = struct.unpack_from(f"<{count}d", content, offset + 24)
+    return (number, MODELS[model], width, height, params), offset + 24 + 8 * count
 
 
-def _binary_image(content: mmap.mmap, at: int) -> tuple[ImageLine, int]:
+def _binary_image(content: mmap.mmap, offset: int) -> tuple[ImageLine, int]:
     """Decode a pose and a zero-terminated name, and skip the points."""
-    _, *pose, camera_id = struct.unpack_from("<I7dI", content, at)
-    end = content.find(b"\0", at + 64, at + 64 + MOST_NAME)
+    _, *pose, camera_id = struct.unpack_from("<I7dI", content, offset)
+    end = content.find(b"\0", offset + 64, offset + 64 + MOST_NAME)
     if end < 0:
         raise ValueError("the name of an image does not end")
     (points,) = struct.unpack_from("<Q", content, end + 1)
     behind = end + 9 + points * struct.calcsize("<2dQ")
     if behind > len(content):
         raise ValueError("it ends in the middle of an image")
-    return (content[at + 64 : end].decode("utf-8"), camera_id, tuple(pose)), behind
+    return (content[offset + 64 : end].decode("utf-8"), camera_id, tuple(pose)), behind
 
 
 def _text_cameras(file: Path) -> Iterator[CameraLine]:
     with file.open(encoding="utf-8") as lines:
-        for line in filter(_says_something, lines):
+        for line in filter(_has_content, lines):
             number, model, width, height, *params = line.split()
             yield int(number), model, int(width), int(height), tuple(map(float, params))
 
@@ -125,7 +125,7 @@ def _text_cameras(file: Path) -> Iterator[CameraLine]:
 def _text_images(file: Path) -> Iterator[ImageLine]:
     """Yield images of two lines each; the second, of points, may be empty."""
     with file.open(encoding="utf-8") as lines:
-        for line in filter(_says_something, lines):
+        for line in filter(_has_content, lines):
             words = line.strip().split(maxsplit=9)
             if len(words) != 10:
                 raise ValueError(f"{one_line(line)!r} is no line of an image: it has {len(words)} words of 10")
@@ -133,5 +133,5 @@ def _text_images(file: Path) -> Iterator[ImageLine]:
             yield words[9], int(words[8]), tuple(map(float, words[1:8]))
 
 
-def _says_something(line: str) -> bool:
+def _has_content(line: str) -> bool:
     return bool(line.strip()) and not line.lstrip().startswith("#")

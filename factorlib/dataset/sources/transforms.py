@@ -11,7 +11,7 @@ import pycolmap
 
 from factorlib.dataset.paths import Refusal
 from factorlib.dataset.schema import FOCAL_PX, Centre, Focal, Number
-from factorlib.dataset.sources.shot import SIDE_PX, Shot, colmap_camera, read_source, rigid
+from factorlib.dataset.sources.source_image import SIDE_PX, SourceImage, colmap_camera, read_source, rigid
 from factorlib.reading import one_line
 
 FISHEYE = "OPENCV_FISHEYE"
@@ -21,7 +21,7 @@ Side = Annotated[float, msgspec.Meta(ge=1, le=SIDE_PX, description="an image has
 Row4 = tuple[Number, Number, Number, Number]
 
 
-class Lens(msgspec.Struct, frozen=True):
+class FrameCamera(msgspec.Struct, frozen=True):
     """The camera of all frames, or of one; pixels, centres at 0.5."""
 
     camera_model: str | None = None
@@ -41,44 +41,46 @@ class Lens(msgspec.Struct, frozen=True):
     p2: Number | None = None
 
 
-class Frame(Lens, frozen=True, kw_only=True):
+class Frame(FrameCamera, frozen=True, kw_only=True):
     """A frame; transform_matrix is world_from_camera, OpenGL, with 3 or 4 rows."""
 
     file_path: str
     transform_matrix: list[Row4]
 
 
-class TransformsFile(Lens, frozen=True, kw_only=True):
+class TransformsFile(FrameCamera, frozen=True, kw_only=True):
     """Content of transforms.json: the lens that its frames share, and the frames."""
 
     frames: list[Frame]
 
 
-def transforms_shots(path: str, refuse: Refusal) -> list[Shot]:
+def read_transforms(path: str, refuse: Refusal) -> list[SourceImage]:
     """Read the frames of the dataset's file `path`, in its order; a frame's own lens overrides the file's."""
     file = refuse.folder / path
     content = read_source(file, TransformsFile)
     refuse = Refusal(file, refuse.folder)
-    shots = []
+    images = []
     for index, frame in enumerate(content.frames):
         key = f"frames[{index}]"
-        names = Lens.__struct_fields__
-        own = {name: getattr(frame, name) for name in names}
-        lens = Lens(**{name: getattr(content, name) if own[name] is None else own[name] for name in names})
+        names = FrameCamera.__struct_fields__
+        frame_values = {name: getattr(frame, name) for name in names}
+        lens = FrameCamera(
+            **{name: getattr(content, name) if frame_values[name] is None else frame_values[name] for name in names}
+        )
         camera, size = _camera(key, lens, refuse)
         centred = lens.cx is None or lens.cy is None
-        of = f"{key}.transform_matrix"
+        matrix_key = f"{key}.transform_matrix"
         rows = frame.transform_matrix
         if len(rows) not in (3, 4) or (len(rows) == 4 and tuple(rows[3]) != (0, 0, 0, 1)):
-            refuse(of, "is not a rigid matrix", "give the rows [R | t], and [0, 0, 0, 1] below them or nothing")
-        refuse.rotation(of, tuple(row[:3] for row in rows[:3]))
+            refuse(matrix_key, "is not a rigid matrix", "give the rows [R | t], and [0, 0, 0, 1] below them or nothing")
+        refuse.rotation(matrix_key, tuple(row[:3] for row in rows[:3]))
         right, down, forward = ((x, -y, -z) for x, y, z, _ in rows[:3])  # OpenGL's camera axes to OpenCV's
         cam_from_world = rigid((right, down, forward), (rows[0][3], rows[1][3], rows[2][3])).inverse()
-        shots.append(Shot(frame.file_path, camera, size, f"{file.name}: {key}", centred, cam_from_world))
-    return shots
+        images.append(SourceImage(frame.file_path, camera, size, f"{file.name}: {key}", centred, cam_from_world))
+    return images
 
 
-def _camera(key: str, lens: Lens, refuse: Refusal) -> tuple[pycolmap.Camera, tuple[float, float | None] | None]:
+def _camera(key: str, lens: FrameCamera, refuse: Refusal) -> tuple[pycolmap.Camera, tuple[float, float | None] | None]:
     """Return the camera with the size of its image.
 
     Without `w`, a field of view gives the focal length of an image of width ANY_WIDTH.

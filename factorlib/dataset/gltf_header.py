@@ -1,4 +1,4 @@
-"""The header of a glTF file: its buffers, and the layout of its triangles in them.  No buffer is opened here.
+"""The header of a glTF file: its buffers, meshes and nodes.  No buffer is opened here.
 
 Only the fields that geometry needs are decoded; textures, animations and the like are skipped.  Field names are glTF
 2.0's.
@@ -16,7 +16,6 @@ from factorlib.errors import InputError
 from factorlib.reading import MOST_BYTES, check_plain, reading
 
 Count = Annotated[int, msgspec.Meta(ge=0, lt=1 << 53)]
-Positive = Annotated[int, msgspec.Meta(gt=0, lt=1 << 53)]
 Numbers3 = tuple[float, float, float]
 Numbers4 = tuple[float, float, float, float]
 WHAT = "glTF"
@@ -40,41 +39,12 @@ class Buffer(msgspec.Struct, frozen=True):
     uri: str | None = None
 
 
-class View(msgspec.Struct, frozen=True):
-    """A range of a buffer; without a stride, elements are contiguous."""
-
-    buffer: Count
-    byteLength: Count
-    byteOffset: Count = 0
-    byteStride: Positive | None = None
-
-
-class Place(msgspec.Struct, frozen=True):
-    """Start of an array in a view; only indices have a component type."""
-
-    bufferView: Count
-    byteOffset: Count = 0
-    componentType: int | None = None
-
-
-class Sparse(msgspec.Struct, frozen=True):
-    """Elements of an accessor, `count` of them, that differ from its view or, without a view, from zero."""
-
-    count: Count
-    indices: Place
-    values: Place
-
-
 class Accessor(msgspec.Struct, frozen=True):
-    """An array of `count` elements of `type` (SCALAR, VEC3, …), of numbers of `componentType`; zeros without a view."""
+    """An array of `count` elements; `normalized` integers stand for fractions, and `sparse` ones differ from a base."""
 
-    componentType: int
     count: Count
-    type: str
-    bufferView: Count | None = None
-    byteOffset: Count = 0
     normalized: bool = False
-    sparse: Sparse | None = None
+    sparse: dict | None = None
 
 
 class Primitive(msgspec.Struct, frozen=True):
@@ -91,20 +61,20 @@ class Primitive(msgspec.Struct, frozen=True):
     mode: int = 4  # triangles
 
 
-class Geometry(msgspec.Struct, frozen=True):
+class GltfMesh(msgspec.Struct, frozen=True):
     """A mesh of primitives."""
 
     primitives: list[Primitive]
     name: str | None = None
 
 
-class Material(msgspec.Struct, frozen=True):
+class GltfMaterial(msgspec.Struct, frozen=True):
     """A material, whose name `parts` in dataset.yaml may use."""
 
     name: str | None = None
 
 
-class Node(msgspec.Struct, frozen=True):
+class GltfNode(msgspec.Struct, frozen=True):
     """A node of the scene graph: a mesh and its transform to the parent.
 
     The transform is a matrix (by columns), or translation, rotation (quaternion x y z w) and scale.
@@ -119,14 +89,14 @@ class Node(msgspec.Struct, frozen=True):
     scale: Numbers3 = (1.0, 1.0, 1.0)
 
 
-class Scene(msgspec.Struct, frozen=True):
+class GltfScene(msgspec.Struct, frozen=True):
     """The root nodes of a scene."""
 
     nodes: list[Count] = []
 
 
-class Header(msgspec.Struct, frozen=True):
-    """The JSON of a glTF file, as far as it describes triangles.
+class GltfHeader(msgspec.Struct, frozen=True):
+    """The JSON of a glTF file, as far as it names parts and places them.
 
     Attributes:
         scene: index of the scene to read, None for the first
@@ -134,17 +104,16 @@ class Header(msgspec.Struct, frozen=True):
 
     asset: Asset
     buffers: list[Buffer] = []
-    bufferViews: list[View] = []
     accessors: list[Accessor] = []
-    materials: list[Material] = []
-    meshes: list[Geometry] = []
-    nodes: list[Node] = []
-    scenes: list[Scene] = []
+    materials: list[GltfMaterial] = []
+    meshes: list[GltfMesh] = []
+    nodes: list[GltfNode] = []
+    scenes: list[GltfScene] = []
     scene: Count | None = None
     extensionsRequired: list[str] = []
 
 
-def read_header(file: Path, key: str | None = None, most_bytes: int = MOST_BYTES) -> Header:
+def read_header(file: Path, key: str | None = None, most_bytes: int = MOST_BYTES) -> GltfHeader:
     """Read the header of a .gltf or .glb.
 
     Args:
@@ -173,7 +142,7 @@ def read_header(file: Path, key: str | None = None, most_bytes: int = MOST_BYTES
         if text.count(b",") > MOST_VALUES:
             cure = "export the geometry alone, with its data in a .bin file or as .glb"
             raise refused(f"its header has more than {MOST_VALUES:,} values", cure)
-        header = msgspec.json.decode(text, type=Header)
+        header = msgspec.json.decode(text, type=GltfHeader)
     if header.asset.version.split(".")[0] != "2":
         raise refused(f"is glTF {header.asset.version[:20]}", "export it again, as glTF 2.0")
     for name in COMPRESSED:

@@ -1,4 +1,4 @@
-"""Common form of every source of cameras: one shot per image, with its camera in COLMAP's terms."""
+"""Common form of every source of cameras: each of its images, with a camera in COLMAP's terms."""
 
 import json
 import math
@@ -11,7 +11,7 @@ import msgspec
 import pycolmap
 
 from factorlib.dataset.paths import Refusal
-from factorlib.dataset.schema import CENTRE_PX, FOCAL_PX, LARGEST, Mat3, Pose, Vec2, Vec3
+from factorlib.dataset.schema import CENTRE_PX, FOCAL_PX, LARGEST, Mat3, RigidTransform, Vec2, Vec3
 from factorlib.reading import read_text, reading
 from factorlib.yamlfile import convert
 
@@ -22,11 +22,11 @@ MOST_BYTES = 256_000_000  # largest size of a JSON file; a scene of BOP has some
 DAMAGED = "the file is damaged: copy it again from where it came"
 
 
-class Shot(msgspec.Struct, frozen=True):
+class SourceImage(msgspec.Struct, frozen=True):
     """An image of a source, with its camera and the poses of objects.
 
     Attributes:
-        image: name or id
+        name: name or id
         size: size of the image in pixels, as in `schema.ExternalCamera`
         key: place in the source, for messages
         centred: True if the source does not give the principal point
@@ -34,13 +34,13 @@ class Shot(msgspec.Struct, frozen=True):
         poses: cam_from_object of each instance by obj_id, in millimetres
     """
 
-    image: str | int
+    name: str | int
     camera: pycolmap.Camera
     size: tuple[float, float | None] | None
     key: str
     centred: bool = False
     cam_from_world: pycolmap.Rigid3d | None = None
-    poses: dict[int, list[Pose]] = {}
+    poses: dict[int, list[RigidTransform]] = {}
 
 
 def read_source(file: Path, type_: type, key: str | None = None) -> Any:
@@ -109,9 +109,9 @@ def pinhole(camera: pycolmap.Camera, key: str, refuse: Refusal) -> tuple[float, 
         slopes = camera.cam_from_img(pixels)
         assert slopes is not None  # as of a single point; rows of many points are NaN
         focal = float((slopes * places).sum() / (slopes * slopes).sum())
-        off = float((((places - focal * slopes) ** 2).sum(axis=1) ** 0.5).max())
-    if not off <= MOST_OFF_PX:  # NaN where a pixel has no ray
-        far = f"by {off:.1f} px" if off == off else "so much that some pixels have no ray"
+        error = float((((places - focal * slopes) ** 2).sum(axis=1) ** 0.5).max())
+    if not error <= MOST_OFF_PX:  # NaN where a pixel has no ray
+        extent = f"by {error:.1f} px" if error == error else "so much that some pixels have no ray"
         how = "the camera's lens distorts"
         cure = (
             "give the photo's camera.focal_px, principal_point and distortion: [k1, k2] in dataset.yaml; "
@@ -124,7 +124,7 @@ def pinhole(camera: pycolmap.Camera, key: str, refuse: Refusal) -> tuple[float, 
                 "or resample photos and masks to square pixels"
             )
         limit = f"up to {MOST_OFF_PX} px would not matter"
-        refuse(key, f"{how}: it differs from a pinhole of one focal length {far}; {limit}", cure)
+        refuse(key, f"{how}: it differs from a pinhole of one focal length {extent}; {limit}", cure)
     return focal, centre
 
 

@@ -18,18 +18,18 @@ from factorlib.dataset.schema import (
     DatasetFile,
     ExternalCamera,
     PhotoEntry,
-    Pose,
+    RigidTransform,
     Similarity,
     Vec3,
 )
-from factorlib.dataset.sources.bop import bop_shots
-from factorlib.dataset.sources.colmap import colmap_shots
-from factorlib.dataset.sources.shot import Shot, as_rows, pinhole, rigid
-from factorlib.dataset.sources.transforms import transforms_shots
+from factorlib.dataset.sources.bop import read_bop
+from factorlib.dataset.sources.colmap import read_colmap
+from factorlib.dataset.sources.source_image import SourceImage, as_rows, pinhole, rigid
+from factorlib.dataset.sources.transforms import read_transforms
 from factorlib.errors import did_you_mean
 
 SUFFIXES = (*IMAGES, ".webp", ".bmp")  # Other suffixes are part of a name: transforms.json may say "r_0.5".
-READERS = {"colmap": colmap_shots, "transforms": transforms_shots, "bop": bop_shots}
+READERS = {"colmap": read_colmap, "transforms": read_transforms, "bop": read_bop}
 log = logging.getLogger("factorlib.dataset")
 
 
@@ -48,10 +48,10 @@ def external_cameras(spec: DatasetFile, file: Path) -> tuple[DatasetFile, dict[s
     external = {}
     photos = []
     kind = next(kind for kind in SOURCES if getattr(source, kind) is not None)
-    shots = matched(spec, kind, READERS[kind](getattr(source, kind), refuse), refuse)
+    images = matched(spec, kind, READERS[kind](getattr(source, kind), refuse), refuse)
     for photo in spec.photos:
-        shot = shots.get(photo.name)
-        if shot is None:
+        image = images.get(photo.name)
+        if image is None:
             log.warning(
                 "%s: cameras.%s has no image of photo %r: it is aligned as if there were none; "
                 "if it has one, name it: cameras.images: {%s: …}",
@@ -62,23 +62,23 @@ def external_cameras(spec: DatasetFile, file: Path) -> tuple[DatasetFile, dict[s
             )
         else:
             hulls = {obj.name for obj in photo.objects if spec.meshes[obj.mesh].hull}
-            poses = _poses(photo, shot, source, hulls, refuse)
+            poses = _poses(photo, image, source, hulls, refuse)
             given = photo.camera
             if given is not None and given.focal_px is not None and given.principal_point is not None:
                 camera = ExternalCamera(kind, given.focal_px, given.principal_point, None, poses)
             else:
-                focal, centre = pinhole(shot.camera, shot.key, refuse)
-                camera = ExternalCamera(kind, focal, None if shot.centred else centre, shot.size, poses)
+                focal, centre = pinhole(image.camera, image.key, refuse)
+                camera = ExternalCamera(kind, focal, None if image.centred else centre, image.size, poses)
             external[photo.name] = camera
             if source.world_from_camera and photo.world_from_camera is None:
-                assert shot.cam_from_world is not None  # world_from_camera does not go with bop, which has no world
-                world_from_camera = as_rows(shot.cam_from_world.inverse().rotation)
+                assert image.cam_from_world is not None  # world_from_camera does not go with bop, which has no world
+                world_from_camera = as_rows(image.cam_from_world.inverse().rotation)
                 photo = msgspec.structs.replace(photo, world_from_camera=world_from_camera)
         photos.append(photo)
     return msgspec.structs.replace(spec, photos=photos), external
 
 
-def matched(spec: DatasetFile, kind: str, shots: list[Shot], refuse: Refusal) -> dict[str, Shot]:
+def matched(spec: DatasetFile, kind: str, images: list[SourceImage], refuse: Refusal) -> dict[str, SourceImage]:
     """Match the photos to images of the source.
 
     The match is by `images`, else by path, by file name, or by file name without suffix; for BOP it is by id.
@@ -86,47 +86,55 @@ def matched(spec: DatasetFile, kind: str, shots: list[Shot], refuse: Refusal) ->
     Args:
         spec: content of dataset.yaml
         kind: kind of the source
-        shots: images of the source
+        images: images of the source
         refuse: raises errors
 
     Returns:
         The matching image by photo.
     """
     assert spec.cameras is not None
-    by_name = {shot.image: shot for shot in shots}
-    result = {}
-    alike: dict[tuple, list[Shot]] = {}  # shots by each name that may match a photo's
-    for shot in shots:
-        path = PurePosixPath(str(shot.image).replace("\\", "/"))
+    by_name = {image.name: image for image in images}
+    alike: dict[tuple, list[SourceImage]] = {}  # images by each name that may match a photo's
+    for image in images:
+        path = PurePosixPath(str(image.name).replace("\\", "/"))
         stem = path.stem if path.suffix.lower() in SUFFIXES else path.name
-        for way in (("id", shot.image), ("path", *path.parts), ("file", path.name), ("stem", stem)):
-            alike.setdefault(way, []).append(shot)
+        for pattern in (("id", image.name), ("path", *path.parts), ("file", path.name), ("stem", stem)):
+            alike.setdefault(pattern, []).append(image)
+    result = {}
     for photo in spec.photos:
         key = f"cameras.images.{photo.name}"
-        path = PurePosixPath(photo.image)
         if photo.name in spec.cameras.images:
-            image = spec.cameras.images[photo.name]
-            if image not in by_name:
-                refuse(key, f"the source has no image {image!r}", did_you_mean(str(image), by_name))
-            result[photo.name] = by_name[image]
+            name = spec.cameras.images[photo.name]
+            if name not in by_name:
+                refuse(key, f"the source has no image {name!r}", did_you_mean(str(name), by_name))
+            result[photo.name] = by_name[name]
             continue
-        number = int(path.stem) if path.stem.isascii() and path.stem.isdigit() else None
-        tails = [("path", *path.parts[-length:]) for length in range(1, len(path.parts) + 1)]
-        ways = ([("id", number)], tails, [("file", path.name)], [("stem", path.stem)])  # the strictest first
-        like_it = next(filter(None, ([shot for way in each for shot in alike.get(way, [])] for each in ways)), [])
-        if len(like_it) > 1:
-            names = ", ".join(repr(shot.image) for shot in like_it[:3])
-            refuse(key, f"{photo.image!r} could be {names}", f"say which: cameras.images: {{{photo.name}: …}}")
-        if like_it:
-            result[photo.name] = like_it[0]
+        matches = ([image for pattern in each for image in alike.get(pattern, [])] for each in _patterns(photo))
+        candidates = next(filter(None, matches), [])
+        if len(candidates) > 1:
+            names = ", ".join(repr(image.name) for image in candidates[:3])
+            fault = f"{photo.image!r} matches several images of the source: {names}"
+            refuse(key, fault, f"choose one: cameras.images: {{{photo.name}: …}}")
+        if candidates:
+            result[photo.name] = candidates[0]
     if not result:
-        some = ", ".join(repr(shot.image) for shot in shots[:3]) or "none at all"
-        cure = "say which is which: cameras.images: {photo: image, …}"
-        refuse(f"cameras.{kind}", f"none of its {len(shots)} images ({some}) is named as a photo", cure)
+        examples = ", ".join(repr(image.name) for image in images[:3]) or "none at all"
+        cure = "assign images to photos: cameras.images: {photo: image, …}"
+        refuse(f"cameras.{kind}", f"none of its {len(images)} images ({examples}) has the name of a photo", cure)
     return result
 
 
-def _poses(photo: PhotoEntry, shot: Shot, source: CameraSource, hulls: set[str], refuse: Refusal) -> dict[str, Pose]:
+def _patterns(photo: PhotoEntry) -> list[list[tuple]]:
+    """Return the names under which a photo may stand in a source, the strictest first."""
+    path = PurePosixPath(photo.image)
+    number = int(path.stem) if path.stem.isascii() and path.stem.isdigit() else None
+    tails: list[tuple] = [("path", *path.parts[-length:]) for length in range(1, len(path.parts) + 1)]
+    return [[("id", number)], tails, [("file", path.name)], [("stem", path.stem)]]
+
+
+def _poses(
+    photo: PhotoEntry, image: SourceImage, source: CameraSource, hulls: set[str], refuse: Refusal
+) -> dict[str, RigidTransform]:
     """Return poses by object, for objects that the source places and dataset.yaml does not.
 
     Objects in `hulls` are in the source's frame unless it says otherwise.
@@ -136,9 +144,9 @@ def _poses(photo: PhotoEntry, shot: Shot, source: CameraSource, hulls: set[str],
     if source.bop is not None:  # pose of the one instance of the object's mesh, in units of the mesh
         for obj in (obj for obj in objects if obj.mesh in source.obj_ids):
             obj_id = source.obj_ids[obj.mesh]
-            instances = shot.poses.get(obj_id, [])
+            instances = image.poses.get(obj_id, [])
             if len(instances) > 1:
-                fault = f"image {shot.image} of photo {photo.name!r} shows obj_id {obj_id} {len(instances)} times"
+                fault = f"image {image.name} of photo {photo.name!r} shows obj_id {obj_id} {len(instances)} times"
                 cure = f"give the pose of {obj.name!r} in photos: cam_R_m2c and cam_t_m2c of its instance"
                 refuse(f"cameras.obj_ids.{obj.mesh}", fault, cure)
             if not instances:
@@ -146,24 +154,24 @@ def _poses(photo: PhotoEntry, shot: Shot, source: CameraSource, hulls: set[str],
                     "%s: cameras.bop knows no obj_id %d in image %s: the pose of %s in %s is searched",
                     refuse.file,
                     obj_id,
-                    shot.image,
+                    image.name,
                     obj.name,
                     photo.name,
                 )
             for pose in instances:
-                poses[obj.name] = Pose(pose.rotation, _divided(pose.translation, source.mesh_unit_mm))
+                poses[obj.name] = RigidTransform(pose.rotation, _divided(pose.translation, source.mesh_unit_mm))
         return poses
-    here = {name: Similarity() for name in hulls} | source.world_from_object
-    placed = {obj.name: here[obj.name] for obj in objects if obj.name in here}
+    similarities = {name: Similarity() for name in hulls} | source.world_from_object
+    placed = {obj.name: similarities[obj.name] for obj in objects if obj.name in similarities}
     scales = sorted({similarity.scale for similarity in placed.values()})
     if len(scales) > 1:
         fault = f"photo {photo.name!r} shows objects of different scales, {', '.join(f'{s:g}' for s in scales)}"
         refuse("cameras.world_from_object", fault, "objects of one photo share its unit: scale the meshes' files alike")
     for name, similarity in placed.items():  # The mesh's unit replaces the source's, which changes no picture.
-        assert shot.cam_from_world is not None  # only bop has no world
-        cam_from_object = shot.cam_from_world * rigid(similarity.rotation, similarity.translation)
+        assert image.cam_from_world is not None  # only bop has no world
+        cam_from_object = image.cam_from_world * rigid(similarity.rotation, similarity.translation)
         translation = _divided(cam_from_object.translation, similarity.scale)
-        poses[name] = Pose(as_rows(cam_from_object.rotation), translation)
+        poses[name] = RigidTransform(as_rows(cam_from_object.rotation), translation)
     return poses
 
 

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 import trimesh
 
-from factorlib.meshes.fine import Fine, fine, subdivided
 from factorlib.meshes.mesh import Mesh, area_vectors
+from factorlib.meshes.subdivision import SubdividedMesh, subdivide, subdivided_mesh
 
 
 def mesh_of(solid: trimesh.Trimesh, factors=(1.0, 1.0, 1.0)) -> Mesh:
@@ -32,7 +32,7 @@ SOLIDS = {
 @pytest.mark.parametrize("longest", [0.5, 0.11, 0.05])
 def test_a_closed_mesh_stays_closed_and_keeps_its_area_its_labels_and_its_winding(name, longest):
     mesh = SOLIDS[name]
-    dense = subdivided(mesh, longest)
+    dense = subdivide(mesh, longest)
     ends = dense.vertices[np.stack([dense.faces, np.roll(dense.faces, -1, axis=1)])]
     assert np.linalg.norm(ends[0] - ends[1], axis=-1).max() <= longest
     edges = np.stack([dense.faces, np.roll(dense.faces, -1, axis=1)], axis=-1).reshape(-1, 2)
@@ -48,7 +48,7 @@ def test_a_closed_mesh_stays_closed_and_keeps_its_area_its_labels_and_its_windin
         np.testing.assert_allclose(*areas)
 
 
-def smooth(body: Fine, size: float) -> np.ndarray:
+def smooth(body: SubdividedMesh, size: float) -> np.ndarray:
     """A displacement of waves, of mean 0."""
     place = np.zeros((body.nodes, 3))
     place[body.node] = body.mesh.vertices / body.extent
@@ -57,7 +57,7 @@ def smooth(body: Fine, size: float) -> np.ndarray:
 
 
 def test_a_displacement_is_found_from_the_turns_that_it_means():
-    body = fine(ball(3))
+    body = subdivided_mesh(ball(3))
     true = smooth(body, 0.02)
     found = body.displacement(body.turn_of(true), np.ones(body.nodes))
     assert np.std(found - found.mean() - true) < 0.05 * np.std(true)
@@ -65,7 +65,7 @@ def test_a_displacement_is_found_from_the_turns_that_it_means():
 
 def test_a_ball_that_was_given_as_an_ellipsoid_gets_its_normals_back():
     given = ball(3, (1.0, 1.12, 0.9))
-    body = fine(given)
+    body = subdivided_mesh(given)
     true = body.mesh.vertices / np.array([1.0, 1.12, 0.9])  # of the ball that each point stands for
     true /= np.linalg.norm(true, axis=1, keepdims=True)
     turn = np.zeros((body.nodes, 3))

@@ -22,7 +22,7 @@ QUOTED = 80  # number of characters of a line in a message
 LONGEST = 2_000_000  # number of characters of a line; each of its words becomes an object
 
 
-class Soup(msgspec.Struct, frozen=True):
+class TriangleSoup(msgspec.Struct, frozen=True):
     """Triangles as read from a file.
 
     vertices  [V, 3] float64
@@ -46,7 +46,9 @@ def floats(values: np.ndarray) -> Float[np.ndarray, "..."]:
         return np.asarray(values, dtype=float)
 
 
-def of_one_part(vertices: np.ndarray, faces: np.ndarray, name: str, normals: np.ndarray | None = None) -> Soup:
+def single_part_soup(
+    vertices: np.ndarray, faces: np.ndarray, name: str, normals: np.ndarray | None = None
+) -> TriangleSoup:
     """Build a soup whose faces are all one part.
 
     Args:
@@ -59,8 +61,10 @@ def of_one_part(vertices: np.ndarray, faces: np.ndarray, name: str, normals: np.
         The soup.
     """
     faces = np.asarray(faces, np.int64).reshape(-1, 3)
-    of_corners = no_normals(len(faces)) if normals is None else at_corners(normals, faces)
-    return Soup(floats(vertices).reshape(-1, 3), faces, np.zeros(len(faces), np.int64), [(name,)], of_corners)
+    corner_normals = no_normals(len(faces)) if normals is None else normals_at_corners(normals, faces)
+    return TriangleSoup(
+        floats(vertices).reshape(-1, 3), faces, np.zeros(len(faces), np.int64), [(name,)], corner_normals
+    )
 
 
 def no_normals(faces: int) -> Float[np.ndarray, "f 3 3"]:
@@ -68,7 +72,7 @@ def no_normals(faces: int) -> Float[np.ndarray, "f 3 3"]:
     return np.full((faces, 3, 3), np.nan)
 
 
-def at_corners(normals: Float[np.ndarray, "v 3"], faces: Int[np.ndarray, "f 3"]) -> Float[np.ndarray, "f 3 3"]:
+def normals_at_corners(normals: Float[np.ndarray, "v 3"], faces: Int[np.ndarray, "f 3"]) -> Float[np.ndarray, "f 3 3"]:
     """Convert normals by vertex to normals by corner, NaN where a face's index is out of range."""
     exists = (faces >= 0) & (faces < len(normals))
     table = np.concatenate([floats(normals), np.full((1, 3), np.nan)])
@@ -89,7 +93,7 @@ def fans(counts: Int[np.ndarray, " n"], corners: Int[np.ndarray, " c"]) -> Int[n
     return np.stack([corners[first], corners[first + within + 1], corners[first + within + 2]], axis=1).astype(np.int64)
 
 
-def check(soup: Soup, file: str | Path) -> Soup:
+def check(soup: TriangleSoup, file: str | Path) -> TriangleSoup:
     """Check a soup and return it.
 
     Raises:
@@ -106,13 +110,13 @@ def check(soup: Soup, file: str | Path) -> Soup:
     low, high = int(soup.faces.min()), int(soup.faces.max())
     if low < 0 or high >= len(soup.vertices):
         fault = f"a face uses vertex {(low if low < 0 else high) + 1} of {len(soup.vertices)}"
-        refuse(fault, "is the file whole?")
+        refuse(fault, "the file is damaged: copy or export it again")
     bad = ~np.isfinite(soup.vertices).all(axis=1)
     if bad.any():
         fault = f"{int(bad.sum())} vertices are not finite, first is number {int(np.argmax(bad)) + 1}"
         refuse(fault, "remove them in a mesh editor, or export the mesh again")
     corners = soup.vertices[soup.faces.reshape(-1)]
-    cure = "give it in another unit, about its own origin"
+    cure = "move the mesh to its origin, or export it in another unit"
     largest = float(np.abs(corners).max())
     extent = float(np.ptp(corners, axis=0).max())
     if largest > LARGEST:
@@ -120,17 +124,17 @@ def check(soup: Soup, file: str | Path) -> Soup:
     if 0 < extent < LEAST_EXTENT:
         refuse(f"is {extent:.3g} across, less than {LEAST_EXTENT:.0e}", cure)
     if 0 < extent < LEAST_SHARE * largest:
-        refuse(f"is {extent:.3g} across and {largest:.3g} from its origin: its shape is lost in that", cure)
+        refuse(f"is {extent:.3g} across but {largest:.3g} from its origin: too few digits are left for its shape", cure)
     return soup
 
 
-def lines_of(content: bytes) -> Iterator[str]:
+def text_lines(content: bytes) -> Iterator[str]:
     r"""Yield the lines of a text with any of the three line ends.
 
     Other characters that Python treats as line ends do not count.
     ValueError is raised for a line of more than LONGEST characters.
 
-    >>> list(lines_of("Stühle\r\nb\rc\x0cd\n".encode("utf-8-sig"))), list(lines_of("Stühle".encode("latin-1")))
+    >>> list(text_lines("Stühle\r\nb\rc\x0cd\n".encode("utf-8-sig"))), list(text_lines("Stühle".encode("latin-1")))
     (['Stühle', 'b', 'c\x0cd'], ['Stühle'])
     """
     try:
@@ -145,10 +149,10 @@ def lines_of(content: bytes) -> Iterator[str]:
             yield line.rstrip("\n")
 
 
-def numbers_in(text: str | bytes) -> Float[np.ndarray, " n"]:
+def parse_numbers(text: str | bytes) -> Float[np.ndarray, " n"]:
     r"""Parse all numbers of a text, separated by white space; ValueError for anything else in it.
 
-    >>> numbers_in("1 2.5\n-3e2").tolist()
+    >>> parse_numbers("1 2.5\n-3e2").tolist()
     [1.0, 2.5, -300.0]
     """
     with warnings.catch_warnings():

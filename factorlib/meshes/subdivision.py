@@ -20,7 +20,7 @@ LEVEL = 1e-3  # weight that keeps the mean displacement at zero, relative to the
 UNSEEN = 0.05  # weight of the gradient where no photo sees the surface
 
 
-def subdivided(mesh: Mesh, longest: float) -> Mesh:
+def subdivide(mesh: Mesh, longest: float) -> Mesh:
     """Subdivide the mesh until every edge is at most `longest` long, in units of the mesh.
 
     New vertices lie on the old triangles and have interpolated normals.
@@ -40,21 +40,21 @@ def subdivided(mesh: Mesh, longest: float) -> Mesh:
         pairs, number = np.unique(np.sort(ends[too_long], axis=1), axis=0, return_inverse=True)
         middle = np.full(faces.shape, -1)
         middle[too_long] = len(vertices) + number.reshape(-1)
-        between = normals[pairs].sum(1)
-        length = np.linalg.norm(between, axis=1, keepdims=True)
-        between = np.where(length > 1e-9, between / np.maximum(length, 1e-9), normals[pairs[:, 0]])
-        vertices, normals = np.vstack([vertices, vertices[pairs].mean(1)]), np.vstack([normals, between])
+        middle_normals = normals[pairs].sum(1)
+        length = np.linalg.norm(middle_normals, axis=1, keepdims=True)
+        middle_normals = np.where(length > 1e-9, middle_normals / np.maximum(length, 1e-9), normals[pairs[:, 0]])
+        vertices, normals = np.vstack([vertices, vertices[pairs].mean(1)]), np.vstack([normals, middle_normals])
         count = too_long.sum(1)
         parts = [faces[~too_long.any(1)]]
         labels = [label[~too_long.any(1)]]
         # rotate the corners of each triangle so that its long edges come first, then split it
         for long_edges, pieces in PIECES.items():
-            some = count == long_edges
-            first = too_long[some].argmax(1) if long_edges == 1 else (too_long[some].argmin(1) + 1) % 3
+            chosen = count == long_edges
+            first = too_long[chosen].argmax(1) if long_edges == 1 else (too_long[chosen].argmin(1) + 1) % 3
             turn = (first[:, None] + np.arange(3)) % 3
-            corners = np.hstack([np.take_along_axis(of[some], turn, 1) for of in (faces, middle)])
+            corners = np.hstack([np.take_along_axis(table[chosen], turn, 1) for table in (faces, middle)])
             parts.append(corners[:, pieces].reshape(-1, 3))
-            labels.append(np.repeat(label[some], len(pieces)))
+            labels.append(np.repeat(label[chosen], len(pieces)))
         faces = np.vstack(parts)
         label = np.concatenate(labels)
 
@@ -68,7 +68,7 @@ PIECES = {
 }
 
 
-class Fine(msgspec.Struct, frozen=True):
+class SubdividedMesh(msgspec.Struct, frozen=True):
     """Subdivided mesh and its v nodes.
 
     mesh    subdivided mesh, which may have several vertices at one position
@@ -167,9 +167,9 @@ class Fine(msgspec.Struct, frozen=True):
         return msgspec.structs.replace(self.mesh, vertices=place, normals=normal)
 
 
-def fine(mesh: Mesh) -> Fine:
+def subdivided_mesh(mesh: Mesh) -> SubdividedMesh:
     """Subdivide the mesh to edges of `LONGEST` times its extent."""
     extent = float(np.ptp(mesh.vertices[np.unique(mesh.faces)], axis=0).max())
-    dense = subdivided(mesh, LONGEST * extent)
+    dense = subdivide(mesh, LONGEST * extent)
     node = welded(dense.vertices)
-    return Fine(dense, node, node[dense.faces], extent)
+    return SubdividedMesh(dense, node, node[dense.faces], extent)

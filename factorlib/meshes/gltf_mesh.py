@@ -1,0 +1,203 @@
+"""Reader of glTF and GLB: the triangles of every node of the scene, in the scene's frame; each primitive is a part.
+
+The names of a part are that of its primitive (its mesh's, numbered from the second on: `chair`, `chair_1`), that of its
+node if the mesh has no other primitive, and that of its material. Sizes in the header are checked before any buffer is
+opened. trimesh decodes the buffers; it is imported on first use, which takes a third of a second. It would skip fans
+and take sparse accessors for zeros, so both are refused here.
+"""
+
+import io
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float
+
+from factorlib.dataset.gltf_header import CURE, GltfHeader, GltfNode, Primitive, buffer_path, read_header
+from factorlib.errors import InputError
+from factorlib.meshes.limits import Limits
+from factorlib.meshes.triangle_soup import TriangleSoup, floats, no_normals, normals_at_corners
+from factorlib.reading import read_bytes
+
+POINTS, LINES, TRIANGLES, STRIP, FAN = 0, 1, 4, 5, 6  # modes of primitives
+DECODED = (POINTS, LINES, TRIANGLES, STRIP)  # modes to which trimesh gives a name and an array of vertices
+UNNAMED = "GLTF"
+
+
+Part = tuple[Primitive, tuple[str, ...], Float[np.ndarray, "4 4"]]  # primitive, its names, world_from_node
+
+
+def read_gltf(path: Path, limits: Limits) -> TriangleSoup:
+    """Read a glTF or GLB file.
+
+    Raises:
+        InputError: If the file is malformed or too large.
+        ValueError: If its nodes are no tree; other exceptions of trimesh are possible too.
+    """
+    header = read_header(path, most_bytes=limits.bytes)
+    try:
+        return _read_parts(header, path, limits)
+    except (LookupError, AssertionError) as error:
+        fault = f"its header names a node, an array or a part of a buffer that the file does not have ({error!r})"
+        raise InputError(fault, file=path, cure=CURE) from error
+
+
+def _read_parts(header: GltfHeader, path: Path, limits: Limits) -> TriangleSoup:
+    """Check the sizes in the header, then decode the primitives and join them."""
+    from trimesh.exchange.gltf import load_glb, load_gltf
+
+    instances = [node.mesh for node in header.nodes if node.mesh is not None]
+    limits.check_parts(sum(len(header.meshes[mesh].primitives) for mesh in instances), path)
+    parts = _parts(header)
+    sizes = np.array([_size(primitive, header, path) for primitive, _, _ in parts], object).reshape(-1, 2)
+    vertices, triangles = sizes.sum(axis=0).tolist()
+    limits.check(vertices, triangles, path)
+    content = io.BytesIO(read_bytes(path, "glTF", most_bytes=limits.bytes))
+    load = load_glb if path.suffix.lower() == ".glb" else load_gltf
+    with np.errstate(all="ignore"):  # values that are not finite are refused later
+        decoded = load(content, resolver=_BufferFiles(header, path, limits), skip_materials=True)["geometry"].values()
+        primitives = [primitive for mesh in header.meshes for primitive in mesh.primitives if primitive.mode in DECODED]
+        arrays = {id(primitive): array for primitive, array in zip(primitives, decoded, strict=True)}
+        return _joined([part for part, size in zip(parts, sizes) if size[1]], arrays, header)
+
+
+class _BufferFiles(dict[str, bytes]):
+    """Files of a glTF's buffers as trimesh asks for them, all together within the limits."""
+
+    def __init__(self, header: GltfHeader, path: Path, limits: Limits):
+        super().__init__()
+        self.buffers = header.buffers
+        self.path = path
+        self.bytes_left = limits.bytes
+
+    def __missing__(self, uri: str) -> bytes:
+        """Return the content of the file at `uri`; InputError if it is shorter than the header states, or too large."""
+        name = buffer_path(uri)
+        if name is None:
+            raise ValueError("a buffer's data: URI is not base64")
+        content = read_bytes(self.path.parent / name, "a glTF buffer", most_bytes=max(self.bytes_left, 0))
+        self.bytes_left -= len(content)
+        index, length = max(((k, b.byteLength) for k, b in enumerate(self.buffers) if b.uri == uri), key=lambda k: k[1])
+        if len(content) < length:
+            raise InputError(f"buffer {index} has {len(content)} of {length} bytes", file=self.path, cure=CURE)
+        return content
+
+
+def _parts(header: GltfHeader) -> list[Part]:
+    """Return the primitives of the scene's nodes, in the order of the nodes; ValueError if the nodes are no tree."""
+    from trimesh.util import unique_name
+
+    used: dict[str, None] = {}
+    counts: dict[str | None, int] = {}
+    names: list[list[str]] = []
+    for mesh in header.meshes:
+        names.append([])
+        for _ in mesh.primitives:
+            names[-1].append(unique_name(mesh.name or UNNAMED, used, counts))
+            used[names[-1][-1]] = None
+    parts = []
+    for index, world_from_node in sorted(_world_from_nodes(header).items()):
+        node = header.nodes[index]
+        if node.mesh is None:
+            continue
+        primitives = header.meshes[node.mesh].primitives
+        node_name = (node.name or str(index)) if len(primitives) == 1 else None
+        for name, primitive in zip(names[node.mesh], primitives):
+            material = header.materials[primitive.material].name if primitive.material is not None else None
+            known = dict.fromkeys(filter(None, (name, node_name, material)))
+            parts.append((primitive, tuple(known), world_from_node))
+    return parts
+
+
+def _world_from_nodes(header: GltfHeader) -> dict[int, Float[np.ndarray, "4 4"]]:
+    """Return world_from_node of every node of the scene; without scenes, of every node."""
+    if header.scenes:
+        roots = header.scenes[header.scene or 0].nodes
+    else:
+        below = {child for node in header.nodes for child in node.children}
+        roots = [index for index in range(len(header.nodes)) if index not in below]
+    places: dict[int, np.ndarray] = {}
+    waiting = [(index, np.eye(4)) for index in roots]
+    while waiting:
+        index, world_from_parent = waiting.pop()
+        if index in places:
+            raise ValueError(f"its node {index} is below two others, or below itself")
+        with np.errstate(all="ignore"):  # values that are not finite are refused with the vertices
+            places[index] = world_from_parent @ _parent_from_node(header.nodes[index])
+        waiting += [(child, places[index]) for child in header.nodes[index].children]
+    return places
+
+
+def _parent_from_node(node: GltfNode) -> Float[np.ndarray, "4 4"]:
+    """Return parent_from_node.
+
+    It is the node's matrix (stored by columns), or scale, then rotation (quaternion x y z w), then translation.
+    """
+    from trimesh.transformations import quaternion_matrix
+
+    if node.matrix is not None:
+        return np.array(node.matrix, float).reshape(4, 4).T
+    if not any(node.rotation):
+        raise ValueError("the rotation of a node is the quaternion 0 0 0 0")
+    x, y, z, w = node.rotation
+    matrix = quaternion_matrix([w, x, y, z])
+    matrix[:3, :3] *= node.scale
+    matrix[:3, 3] = node.translation
+    return matrix
+
+
+def _size(primitive: Primitive, header: GltfHeader, path: Path) -> tuple[int, int]:
+    """Return the numbers of vertices and triangles by the header; 0 for lines and points."""
+    if primitive.mode == FAN:
+        raise InputError("has a triangle fan, which is not read", file=path, cure="export it again, as triangles")
+    if primitive.mode not in (TRIANGLES, STRIP):
+        return 0, 0
+    if "POSITION" not in primitive.attributes:
+        raise InputError("a primitive has no POSITION", file=path, cure=CURE)
+    used = [
+        header.accessors[primitive.attributes[name]] for name in ("POSITION", "NORMAL") if name in primitive.attributes
+    ]
+    corners = used[0] if primitive.indices is None else header.accessors[primitive.indices]
+    if any(accessor.sparse is not None for accessor in (*used, corners)):
+        cure = "export it again, without sparse accessors"
+        raise InputError("stores its triangles in a sparse accessor, which is not read", file=path, cure=cure)
+    vertices = used[0].count
+    if used[-1].count != vertices:
+        raise InputError("a primitive has another number of NORMAL than of POSITION", file=path, cure=CURE)
+    return vertices, corners.count // 3 if primitive.mode == TRIANGLES else max(corners.count - 2, 0)
+
+
+def _joined(parts: list[Part], arrays: dict[int, dict], header: GltfHeader) -> TriangleSoup:
+    """Join all primitives in the scene's frame; normals transform by the cofactors of the linear part.
+
+    Args:
+        parts: Primitives with triangles.
+        arrays: Arrays of a primitive as trimesh decodes them, by its `id`.
+        header: Header of the file.
+    """
+    vertices = [np.empty((0, 3))]
+    faces = [np.empty((0, 3), np.int64)]
+    normals = [no_normals(0)]
+    offset = 0
+    for primitive, _, world_from_node in parts:
+        array = arrays[id(primitive)]
+        points = _vectors(array["vertices"], header.accessors[primitive.attributes["POSITION"]].normalized)
+        corners = array["faces"].astype(np.int64)
+        linear, shift = world_from_node[:3, :3], world_from_node[:3, 3]
+        vertices.append(points @ linear.T + shift)
+        cofactor = np.cross(np.roll(linear, -1, axis=0), np.roll(linear, -2, axis=0))
+        if "NORMAL" in primitive.attributes:
+            normals.append(normals_at_corners(_vectors(array["vertex_normals"], True) @ cofactor.T, corners))
+        else:
+            normals.append(no_normals(len(corners)))
+        faces.append(np.where((corners >= 0) & (corners < len(points)), corners + offset, -1))
+        offset += len(points)
+    part = np.repeat(np.arange(len(parts)), [len(each) for each in faces[1:]])
+    names = [names for _, names, _ in parts]
+    return TriangleSoup(np.concatenate(vertices), np.concatenate(faces), part, names, np.concatenate(normals))
+
+
+def _vectors(values: np.ndarray, normalized: bool) -> Float[np.ndarray, "v 3"]:
+    """Convert vectors to floats; normalized integers, which trimesh leaves as they are, to at most 1."""
+    if values.ndim != 2 or values.shape[1] != 3:
+        raise ValueError(f"a position or normal has {values.shape[-1]} numbers, not 3")
+    return floats(values) / (np.iinfo(values.dtype).max if normalized and values.dtype.kind in "iu" else 1)
