@@ -35,13 +35,13 @@ from factorlib.images.picture import picture
 from factorlib.jsonfile import read_json
 from factorlib.light.latlong import turned_map
 from factorlib.reading import check_plain
-from factorlib.recipe import schema
+from factorlib.recipe import kinds
+from factorlib.recipe.kinds import KINDS, AnyRecipe, is_light_file
 from factorlib.recipe.read import check_recipe, files_of
-from factorlib.recipe.schema import KINDS, is_light_file
-from factorlib.render.drawing import draw
-from factorlib.render.photo_scene import Light, PhotoScene, orbit, resized, traced_photo
+from factorlib.render.photo_scene import DistantLight, PhotoScene, orbit, resized, traced_photo
+from factorlib.render.recipe_pictures import draw
 from factorlib.render.solved_set import SolvedSet
-from factorlib.render.traced import Traced, as_it_is
+from factorlib.render.traced_picture import TracedPicture, as_it_is
 from factorlib.report.pictures import data_uri
 from factorlib.results.materials import Solved
 from factorlib.stage import Inputs, silent
@@ -182,7 +182,7 @@ class Result:
             InputError: The photo is unknown, or a number is out of range.
         """
         photo = self._photo(view)
-        _check(schema.View, azimuth=azimuth, elevation=elevation, zoom=zoom, width=width, samples=samples)
+        _check(kinds.ViewRecipe, azimuth=azimuth, elevation=elevation, zoom=zoom, width=width, samples=samples)
         scene = resized(self._solved.scene(photo), width)
         traced = traced_photo(scene, samples, world_from_camera=orbit(scene, azimuth, elevation, zoom))
         return Picture(traced, self._solved.tone(photo), photo)
@@ -205,7 +205,7 @@ class Result:
         """
         photo, one = self._object(name)
         light = str(light) if isinstance(light, Path) else light
-        _check(schema.Relight, width=width, samples=samples)
+        _check(kinds.RelightRecipe, width=width, samples=samples)
         scene = resized(self._solved.scene(photo), width)
         objects = tuple(each for each in scene.objects if each.name == one)
         traced = traced_photo(msgspec.structs.replace(scene, objects=objects, light=self._light(light)), samples)
@@ -280,7 +280,7 @@ class Result:
             log.warning("'%s' is %s: that of '%s' is taken", name, " and ".join(others), found[0])
         return found
 
-    def _light(self, light: str | Environment) -> Light:
+    def _light(self, light: str | Environment) -> DistantLight:
         if isinstance(light, Environment):
             return light.lat_long
         if isinstance(light, str) and is_light_file(light):
@@ -303,10 +303,10 @@ class Result:
         return f"<p>{about}</p><table>{table}</table>"
 
 
-def _check(kind: type[T], **fields: Any) -> T:
+def _check(kind: type[AnyRecipe], **fields: Any) -> AnyRecipe:
     """Return the recipe with these fields; InputError for an unknown name and a value out of range."""
     plain = {key: value.item() if isinstance(value, np.generic) else value for key, value in fields.items()}
-    return convert(plain, kind, kind.__name__.lower())
+    return convert(plain, kind, str(kind.__struct_config__.tag))
 
 
 class Environment(msgspec.Struct, frozen=True):
@@ -339,7 +339,7 @@ class Environment(msgspec.Struct, frozen=True):
         return _image(picture(self.lat_long))
 
 
-class Picture(Traced, frozen=True):
+class Picture(TracedPicture, frozen=True):
     """A path-traced picture that notebooks display, darkened if it would be overexposed.
 
     Attributes:

@@ -28,8 +28,17 @@ from factorlib.meshes.limits import Limits
 from factorlib.meshes.mesh import scaled
 from factorlib.meshes.read import CREASE_DEG, read_mesh
 from factorlib.results.photos import read_photo_facts
-from factorlib.results.poses import AS_IT_IS, FILE, CameraEntry, ObjectEntry, PhotoPoses, RunnerUp, entry_of, read_poses
-from factorlib.results.shapes import read_shapes
+from factorlib.results.poses import (
+    AS_IT_IS,
+    FILE,
+    CameraEntry,
+    ObjectPose,
+    PhotoPoses,
+    RunnerUpPose,
+    entry_of,
+    read_poses,
+)
+from factorlib.results.shape_table import read_shapes
 from factorlib.stage import Inputs, Progress
 
 log = logging.getLogger("factorlib.align")
@@ -145,7 +154,7 @@ def objects_of(
     return objects
 
 
-def entry(obj: ObjectToPlace, k: int, result: Placed, maps: Maps, params: Params, source: str | None) -> ObjectEntry:
+def entry(obj: ObjectToPlace, k: int, result: Placed, maps: Maps, params: Params, source: str | None) -> ObjectPose:
     """Return the entry of one object in poses.json.
 
     A pose without `doubts` is reliable.  An object with a doubtful estimated pose is left out of the solve.
@@ -169,8 +178,8 @@ def entry(obj: ObjectToPlace, k: int, result: Placed, maps: Maps, params: Params
         source = "refined" if found.earlier else "keypoints" if found.by_keypoints else "found"
         if other := found.runner_up:
             pose = entry_of(other.state.pose(obj.caster))
-            runner_up = RunnerUp(**pose, score=other.score, normal_difference_deg=other.normal_difference_deg)
-    return ObjectEntry(
+            runner_up = RunnerUpPose(**pose, score=other.score, normal_difference_deg=other.normal_difference_deg)
+    return ObjectPose(
         **entry_of(result.poses[k]),
         scale=obj.scale,
         silhouette_iou=iou,
@@ -186,7 +195,7 @@ def entry(obj: ObjectToPlace, k: int, result: Placed, maps: Maps, params: Params
     )
 
 
-def complain(photo: str, name: str, entry: ObjectEntry, strict: bool) -> None:
+def complain(photo: str, name: str, entry: ObjectPose, strict: bool) -> None:
     """Warn of each doubt about a pose.
 
     Raises:

@@ -11,15 +11,15 @@ import msgspec
 import numpy as np
 
 from factorlib.dataset.schema import LightSlice, TruthFile
-from factorlib.evaluate.ball import Light, light_of_lat_long
-from factorlib.evaluate.gauge import connected_components
-from factorlib.evaluate.geometry import averaged_normals, normal_error, pose_error
-from factorlib.evaluate.lights import compare_lights, mirrored_directions, sphere_row
-from factorlib.evaluate.materials import compare_materials
+from factorlib.evaluate.ball import OctahedralLight, octahedral_light
+from factorlib.evaluate.comparison_gauge import connected_components
+from factorlib.evaluate.geometry_errors import averaged_normals, normal_error, pose_error
+from factorlib.evaluate.light_errors import compare_lights, mirrored_directions, sphere_row
+from factorlib.evaluate.material_errors import compare_materials
+from factorlib.evaluate.photo_errors import ComparedPhoto, compare_photos, compared_photo
 from factorlib.evaluate.relighting import compare_relighting, compare_relit_set
-from factorlib.evaluate.resynthesis import Shot, compare_photos, shot_of
 from factorlib.evaluate.truth import read_true_light, read_true_normals
-from factorlib.evaluate.verdict import Signs, material_errors, text_of, verdict
+from factorlib.evaluate.verdict import VerdictInputs, ball_changes, text_of, verdict
 from factorlib.images.exr import LAT_LONG, read_exr, read_rgb_exr, write_rgb_exr
 from factorlib.jsonfile import write_json
 from factorlib.results.materials import Reflectance, read_materials, read_uncertainty, reflectances
@@ -55,12 +55,12 @@ def main(params: Params, inputs: Inputs, out: Path, progress: Progress) -> None:
     done = count()
     total = 2 * len(lights) + (len(MISSING) if truth else 0) + 1
 
-    def shot(name: str) -> Shot:
+    def shot(name: str) -> ComparedPhoto:
         """Return a photo and its re-synthesis; `compare_photos` reads each twice."""
         progress(next(done), total, f"re-synthesis of {name}")
         photo = read_exr(inputs["masks"] / f"{name}.exr")
         geometry = read_geometry(inputs["align"], inputs.folders.get("surface"), name)
-        return shot_of(photo, geometry, read_rgb_exr(inputs["render"] / "resynthesis" / f"{name}.exr"))
+        return compared_photo(photo, geometry, read_rgb_exr(inputs["render"] / "resynthesis" / f"{name}.exr"))
 
     resynthesis = compare_photos(lights, materials, shot)
     # observed materials of each light, and the connected components of the graph of materials and lights
@@ -109,26 +109,28 @@ def _verdict(inputs: Inputs, seen: dict[str, list[str]]) -> Verdict | None:
     shown = {m for names in seen.values() for m in names}
     files = inputs["export"] / "illumination"
     materials = {name: solved for name, solved in table.materials.items() if name in shown}
-    lights = {name: light_of_lat_long(read_rgb_exr(files / f"{name}.exr")) for name, names in seen.items() if names}
+    lights = {name: octahedral_light(read_rgb_exr(files / f"{name}.exr")) for name, names in seen.items() if names}
     if not (materials and uncertainty.photos):
         return None
     contours = {
         photo: {name: own.contour_error for name, own in entry.objects.items() if own.contour_error is not None}
         for photo, entry in read_poses(inputs["align"] / "poses.json").items()
     }
-    errors = material_errors(materials, lights)
+    errors = ball_changes(materials, lights)
     misfit = (uncertainty.unexplained, uncertainty.photos)
-    return verdict(Signs(errors, *misfit, contours, uncertainty.residual_sigma))
+    return verdict(VerdictInputs(errors, *misfit, contours, uncertainty.residual_sigma))
 
 
-def _lights(inputs: Inputs, truth: TruthFile, out: Path) -> tuple[dict[str, Light], dict[str, Light]]:
+def _lights(
+    inputs: Inputs, truth: TruthFile, out: Path
+) -> tuple[dict[str, OctahedralLight], dict[str, OctahedralLight]]:
     """Return the true lights and those of them that are estimated, and write maps and spheres of the latter."""
     true = {}
     estimated = {}
     for name, path in truth.illumination.items():
-        true[name] = light_of_lat_long(read_true_light(inputs.file(path), name))
+        true[name] = octahedral_light(read_true_light(inputs.file(path), name))
         if (file := inputs["export"] / "illumination" / f"{name}.exr").exists():
-            estimated[name] = light_of_lat_long(read_rgb_exr(file))
+            estimated[name] = octahedral_light(read_rgb_exr(file))
             for kind in ("illumination", "spheres"):
                 (out / kind).mkdir(exist_ok=True)
             write_rgb_exr(out / "illumination" / f"{name}.exr", read_rgb_exr(inputs.file(path)), LAT_LONG)

@@ -26,13 +26,13 @@ from factorlib.dataset.schema import LightSlice, ObjectsSlice
 from factorlib.errors import InputError
 from factorlib.export.blender import write_scene_json, write_script
 from factorlib.export.environment import mitsuba_map
-from factorlib.export.gltf import variant_name, write_glb, write_suns
-from factorlib.export.materials import headroom_factor, table_in_gauge
+from factorlib.export.exported_scene import ALL_BOUNCES, DIRECT, ExportedScene, ExposedMap, Sun, suns_of
+from factorlib.export.gltf_writer import variant_name, write_glb, write_suns
 from factorlib.export.materialx import materialx
 from factorlib.export.mesh_files import MeshFiles
 from factorlib.export.mitsuba import write_scene
 from factorlib.export.other_renderers import write_losses
-from factorlib.export.scene import ALL_BOUNCES, DIRECT, ExposedMap, Scene, Sun, suns_of
+from factorlib.export.reflectance_limit import headroom_factor, table_in_gauge
 from factorlib.export.usd import SUFFIX, write_usd_scene
 from factorlib.images.exr import LAT_LONG, read_rgb_exr, write_hdr, write_rgb_exr
 from factorlib.jsonfile import write_json
@@ -40,7 +40,7 @@ from factorlib.light.latlong import lat_long_of_lobes, sampled
 from factorlib.light.lobes import Lobes, no_lobes
 from factorlib.meshes.ply import write_ply
 from factorlib.meshes.read import CREASE_DEG
-from factorlib.results.lobes import read_lobes, write_lobes
+from factorlib.results.lobe_table import read_lobes, write_lobes
 from factorlib.results.materials import read_exposures, read_materials, reflectances
 from factorlib.results.poses import read_poses
 from factorlib.stage import Inputs, Progress
@@ -127,7 +127,9 @@ def main(params: Params, inputs: Inputs, out: Path, progress: Progress) -> None:
         own_meshes = objects[photo].meshes
         placed = poses[photo].objects
         shapes = [s for own in objects[photo].objects for s in files.shapes(own, own_meshes, placed)]
-        scene = Scene(camera, shapes, materials, exposed, ALL_BOUNCES if table.model.interreflection else DIRECT)
+        scene = ExportedScene(
+            camera, shapes, materials, exposed, ALL_BOUNCES if table.model.interreflection else DIRECT
+        )
         write_usd_scene(out / "scenes" / f"{photo}{SUFFIX}", scene)
         scene = msgspec.structs.replace(scene, light=sky, suns=own_suns)
         write_scene_json(out / "scenes" / f"{photo}.json", scene)

@@ -18,7 +18,7 @@ from factorlib.images.exr import read_exr
 from factorlib.meshes.mesh import scaled
 from factorlib.meshes.read import CREASE_DEG, MeshesOnce
 from factorlib.results.photos import read_photo_facts
-from factorlib.results.poses import ObjectEntry, read_photo_poses
+from factorlib.results.poses import ObjectPose, read_photo_poses
 from factorlib.stage import Inputs, Progress
 from factorlib.urm.extract import Taken, observations_of_photo
 from factorlib.urm.merge import merge
@@ -69,7 +69,7 @@ def main(params: Params, inputs: Inputs, out: Path, progress: Progress) -> None:
     write_observations(out / f"{name}.parquet", merge(seen, params.merge_degrees))
 
 
-def occluders_of(inputs: Inputs, poses: dict[str, ObjectEntry]) -> Occluders:
+def occluders_of(inputs: Inputs, poses: dict[str, ObjectPose]) -> Occluders:
     """Return the meshes of the photo's objects at the poses that `align` estimated."""
     slice_ = msgspec.convert(inputs.facts["dataset.objects"], ObjectsSlice)
     read = MeshesOnce(inputs.mesh, inputs.facts["dataset.materials"], CREASE_DEG)

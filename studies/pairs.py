@@ -46,11 +46,11 @@ from factorlib.generate.shapes import SHAPES
 from factorlib.images.picture import picture, png_bytes
 from factorlib.jsonfile import write_json
 from factorlib.reading import read_text
-from factorlib.recipe.schema import Insert
-from factorlib.render.drawing import standing
+from factorlib.recipe.kinds import InsertRecipe
 from factorlib.render.ground import Plane
-from factorlib.render.insertion import Ground, Inserted, inserted
-from factorlib.render.photo_scene import Light, Placed
+from factorlib.render.insertion import GroundSurface, InsertionResult, inserted
+from factorlib.render.photo_scene import DistantLight, PlacedMesh
+from factorlib.render.recipe_pictures import standing
 from factorlib.render.solved_set import SolvedSet
 from factorlib.results.materials import Reflectance
 from factorlib.results.poses import AS_IT_IS
@@ -98,15 +98,15 @@ class Truth(SolvedSet):
             objects = {name: replace(found.objects[name], **place) for name, place in places.items()}
             self.poses[photo] = replace(found, camera=camera, objects=objects)
 
-    def light(self, name: str) -> Light:
+    def light(self, name: str) -> DistantLight:
         """Return the true map of a photo's light."""
         return read_true_light(self.folder / self.truth.illumination[name], name).astype(float)
 
-    def ground(self, photo: str, neighbour: Placed) -> Ground:
+    def ground(self, photo: str, neighbour: PlacedMesh) -> GroundSurface:
         """Return the plane y = 0 of a chair's own frame, on which it stands."""
         pose = self.truth.poses[photo][neighbour.name]
         normal = YUP_FROM_CAMERA @ np.array(pose.rotation)[:, 1]
-        return Ground(Plane(normal, YUP_FROM_CAMERA @ np.array(pose.translation)))
+        return GroundSurface(Plane(normal, YUP_FROM_CAMERA @ np.array(pose.translation)))
 
 
 def write_files(folder: Path) -> dict[str, Path]:
@@ -118,7 +118,7 @@ def write_files(folder: Path) -> dict[str, Path]:
     return {f"recipe file:{name}": path for name, path in files.items()}
 
 
-def chosen(sets: Mapping[str, Sets], count: int, samples: int, seed: int) -> Iterator[tuple[str, str, Insert]]:
+def chosen(sets: Mapping[str, Sets], count: int, samples: int, seed: int) -> Iterator[tuple[str, str, InsertRecipe]]:
     """Draw sets, photos and recipes of pairs, by a seed alone.
 
     Photos, meshes and materials are about equally often, places, sizes and turns at random.
@@ -138,7 +138,7 @@ def chosen(sets: Mapping[str, Sets], count: int, samples: int, seed: int) -> Ite
         for _ in range(PLACES):
             at = rng.uniform((0.15, 0.6), (0.85, 0.95)) * (camera.width, camera.height) * factor
             size, turn = rng.uniform((0.3, 0.0), (0.5, 360.0)).tolist()
-            recipe = Insert(**what, at=tuple(at.tolist()), size=size, turn=turn, samples=samples)
+            recipe = InsertRecipe(**what, at=tuple(at.tolist()), size=size, turn=turn, samples=samples)
             try:
                 if any(standing(recipe, of, photo).moved for of in sets[name]):
                     continue
@@ -150,7 +150,7 @@ def chosen(sets: Mapping[str, Sets], count: int, samples: int, seed: int) -> Ite
             raise InputError(f"photo '{photo}' has no place for an object", key="photos", cure="name another set")
 
 
-def drawn(photo: str, recipe: Insert, recovered: SolvedSet, truth: SolvedSet) -> tuple[Both, dict[str, Any]]:
+def drawn(photo: str, recipe: InsertRecipe, recovered: SolvedSet, truth: SolvedSet) -> tuple[Both, dict[str, Any]]:
     """Return the window of the photo about the object, linear, by what was recovered and by the truth.
 
     The second value is how they differ (`scores`).
@@ -167,7 +167,7 @@ def drawn(photo: str, recipe: Insert, recovered: SolvedSet, truth: SolvedSet) ->
     (left, top), (width, height) = ends[0].tolist(), (ends[1] - ends[0]).tolist()
     window = slice(top, top + height), slice(left, left + width)
 
-    def traced(light: bool, material: bool, ground: bool, seed: int = 1) -> tuple[Picture, Inserted]:
+    def traced(light: bool, material: bool, ground: bool, seed: int = 1) -> tuple[Picture, InsertionResult]:
         """Trace the window with these factors recovered, the others true."""
         here, seen = places[ground], sets[light].straightened(photo)[window]
         lit = {"light": places[light].scene.light, "materials": places[material].scene.materials}

@@ -15,7 +15,7 @@ from factorlib.images.exr import read_exr, read_rgb_exr
 from factorlib.images.light_map import read_light_map
 from factorlib.images.picture import read_png
 from factorlib.pack import pack
-from factorlib.recipe import schema
+from factorlib.recipe import kinds
 from factorlib.runner.project import LIBRARY
 from factorlib.stage import silent
 from stages import recipes
@@ -187,10 +187,10 @@ def test_an_object_in_another_light_is_that_lights_colour(result, tmp_path):
 
 FRONT = {"photos": ["front"], "samples": 1}
 ASKED = [
-    (schema.Insert(**FRONT), lambda r: r.insert("front", samples=np.int64(1))),
-    (schema.Turntable(**FRONT, frames=2), lambda r: r.turntable("front", frames=2, samples=1)),
+    (kinds.InsertRecipe(**FRONT), lambda r: r.insert("front", samples=np.int64(1))),
+    (kinds.TurntableRecipe(**FRONT, frames=2), lambda r: r.turntable("front", frames=2, samples=1)),
     (
-        schema.Transfer(**FRONT, materials={"red": "unseen"}),
+        kinds.TransferRecipe(**FRONT, materials={"red": "unseen"}),
         lambda r: r.transfer("front", {"red": "unseen"}, samples=1),
     ),
 ]

@@ -21,8 +21,8 @@ from collections.abc import Iterator, Mapping
 import msgspec
 import numpy as np
 
-from factorlib.evaluate.ball import Light
-from factorlib.evaluate.picture import tone_mapped
+from factorlib.evaluate.ball import OctahedralLight
+from factorlib.evaluate.picture_errors import tone_mapped
 from factorlib.evaluate.relighting import MEAN_SHOWN, Appearances
 from factorlib.inference.materials import ROUGHNESS
 from factorlib.results.materials import Misfit, Reflectance, Solved
@@ -42,7 +42,7 @@ MUCH = 0.1  # unexplained share from which an input is wrong and not only inaccu
 TELLING = 0.2  # least share of e² for a term to be a reason
 
 
-def material_errors(materials: Mapping[str, Solved], lights: Mapping[str, Light]) -> dict[str, float]:
+def ball_changes(materials: Mapping[str, Solved], lights: Mapping[str, OctahedralLight]) -> dict[str, float]:
     """Return m² of each material, mean over lights.
 
     Both arguments are in one gauge, and the materials have standard errors.
@@ -72,11 +72,11 @@ def _others(solved: Solved) -> Iterator[Reflectance]:
         yield msgspec.structs.replace(own, roughness=roughness)
 
 
-class Signs(msgspec.Struct, frozen=True):
+class VerdictInputs(msgspec.Struct, frozen=True):
     """The measured quantities of (1).
 
     Attributes:
-        materials: m² of each material that a photo shows (`material_errors`)
+        materials: m² of each material that a photo shows (`ball_changes`)
         unexplained: u of the set
         photos: unexplained share and clipped share of each photo
         contours: d of each object with a compared outline, by photo and object
@@ -100,7 +100,7 @@ class Signs(msgspec.Struct, frozen=True):
         }
 
 
-def verdict(signs: Signs) -> Verdict:
+def verdict(signs: VerdictInputs) -> Verdict:
     """Return the expected score of (1), the reasons that limit it, and the next step."""
     terms = signs.terms()
     whole = FLOOR + sum(terms.values())
@@ -131,7 +131,7 @@ def _percent(share: float) -> str:
     return f"{share:.0%}" if share >= 0.01 else f"{100 * share:.1g}%"
 
 
-def _of_materials(signs: Signs) -> tuple[str, str]:
+def _of_materials(signs: VerdictInputs) -> tuple[str, str]:
     """Return the reason and the next step if materials limit the score."""
     name = max(signs.materials, key=signs.materials.__getitem__)
     why = f"uncertain reflectances, most of all that of '{name}'"
@@ -142,14 +142,14 @@ def _of_materials(signs: Signs) -> tuple[str, str]:
     return why, f"add a photo of '{name}' {bright}"
 
 
-def _of_clipped(signs: Signs) -> tuple[str, str]:
+def _of_clipped(signs: VerdictInputs) -> tuple[str, str]:
     """Return the reason and the next step if clipped values limit the score."""
     name = max(signs.photos, key=lambda photo: signs.photos[photo].clipped)
     why = f"clipped values, in '{name}' {_percent(signs.photos[name].clipped)} of all: they say 'at least' only"
     return why, f"expose '{name}' less, or give the camera's raw file"
 
 
-def _of_contour(signs: Signs) -> tuple[str, str]:
+def _of_contour(signs: VerdictInputs) -> tuple[str, str]:
     """Return the reason and the next step if outlines limit the score."""
     each = {(photo, name): error for photo, own in signs.contours.items() for name, error in own.items()}
     photo, name = max(each, key=each.__getitem__)
@@ -158,7 +158,7 @@ def _of_contour(signs: Signs) -> tuple[str, str]:
     return f"outlines of meshes and masks that differ, most of all those of '{name}' in '{photo}'", next_
 
 
-def _of_unexplained(signs: Signs) -> tuple[str, str]:
+def _of_unexplained(signs: VerdictInputs) -> tuple[str, str]:
     """Return the reason and the next step if unexplained shading limits the score."""
     name = max(signs.photos, key=lambda photo: signs.photos[photo].unexplained)
     share = min(signs.photos[name].unexplained, 1)

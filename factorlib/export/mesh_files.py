@@ -5,14 +5,13 @@ from pathlib import Path
 
 import numpy as np
 
-from factorlib.dataset import schema
-from factorlib.dataset.schema import MeshEntry
-from factorlib.export.scene import Shape
+from factorlib.dataset.schema import MeshEntry, ObjectEntry
+from factorlib.export.exported_scene import ExportedShape
 from factorlib.export.usd import SUFFIX, colours, write_usd_mesh
 from factorlib.meshes.ply import submesh, write_ply
 from factorlib.meshes.read import MeshesOnce
 from factorlib.results.materials import Reflectance
-from factorlib.results.poses import ObjectEntry
+from factorlib.results.poses import ObjectPose
 from factorlib.results.surface import read_surface
 from factorlib.stage import Inputs
 from factorlib.tracing.scene import paint
@@ -45,8 +44,8 @@ class MeshFiles:
         self._stems: dict[tuple, str] = {}  # file names up to the material, relative to the scenes
 
     def shapes(
-        self, obj: schema.ObjectEntry, meshes: Mapping[str, MeshEntry], poses: Mapping[str, ObjectEntry]
-    ) -> list[Shape]:
+        self, obj: ObjectEntry, meshes: Mapping[str, MeshEntry], poses: Mapping[str, ObjectPose]
+    ) -> list[ExportedShape]:
         """Return one shape per material of the object, and write its files if they are new.
 
         Files of a mesh's second choice of materials are called <mesh>.2.
@@ -75,4 +74,6 @@ class MeshFiles:
                 write_usd_mesh(f"{file}{SUFFIX}", part, shades)
         stem = self._stems[key]
         painted = mesh.detail is not None
-        return [Shape(f"{obj.name}.{m}", f"{stem}.{m}.ply", m, place, mesh.open, painted) for m in names.values()]
+        return [
+            ExportedShape(f"{obj.name}.{m}", f"{stem}.{m}.ply", m, place, mesh.open, painted) for m in names.values()
+        ]

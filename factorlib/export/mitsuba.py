@@ -15,7 +15,7 @@ from typing import Any
 
 import numpy as np
 
-from factorlib.export.scene import Scene
+from factorlib.export.exported_scene import ExportedScene
 from factorlib.results.materials import Reflectance
 from factorlib.tracing.scene import bsdf
 from factorlib.wholefile import write_text
@@ -25,7 +25,7 @@ SAMPLES = 256  # default samples per pixel
 KINDS = {bool: "boolean", int: "integer", float: "float", str: "string"}
 
 
-def write_scene(path: str | Path, scene: Scene) -> None:
+def write_scene(path: str | Path, scene: ExportedScene) -> None:
     """Write the scene as XML; the light's exposure is grey, and its file is a map for Mitsuba."""
     root = ET.Element("scene", version=VERSION)
     for name, value in {"spp": SAMPLES, "max_depth": scene.max_depth}.items():
@@ -57,7 +57,7 @@ def material_xml(name: str, material: Reflectance) -> str:
     return ET.tostring(element, encoding="unicode").strip()
 
 
-def _sensor(scene: Scene) -> dict[str, Any]:
+def _sensor(scene: ExportedScene) -> dict[str, Any]:
     (cx, cy), (w, h), (near, far) = scene.camera.centre, (scene.camera.width, scene.camera.height), scene.clip_distances
     film = {"type": "hdrfilm", "width": w, "height": h, "pixel_format": "rgb", "component_format": "float32"}
     return {

@@ -33,7 +33,7 @@ import msgspec
 import numpy as np
 from jaxtyping import Float
 
-from factorlib.export.gltf import DIELECTRIC, EXTENSION, gltf_material
+from factorlib.export.gltf_writer import DIELECTRIC, EXTENSION, gltf_material
 from factorlib.export.materialx import mixture
 from factorlib.export.usd import shader_inputs, with_roughness_of_file
 from factorlib.geometry.sphere import ball_normals
@@ -208,7 +208,7 @@ MODELS: dict[str, Model] = {
 # differences
 
 
-class Loss(msgspec.Struct, frozen=True):
+class RelativeDifference(msgspec.Struct, frozen=True):
     """Mean and largest relative difference."""
 
     mean: float
@@ -220,7 +220,7 @@ def write_losses(path: str | Path, materials: Mapping[str, Reflectance]) -> None
     write_json(path, {name: losses(material) for name, material in materials.items()})
 
 
-def losses(material: Reflectance) -> dict[str, Loss]:
+def losses(material: Reflectance) -> dict[str, RelativeDifference]:
     """Return the loss of each of `MODELS` against the solved model, rounded to 5 digits.
 
     The losses of a black material are 0.
@@ -231,9 +231,13 @@ def losses(material: Reflectance) -> dict[str, Loss]:
     return {name: _loss(np.concatenate(ball(filed[name], model)), true) for name, model in MODELS.items()}
 
 
-def _loss(shown: Float[np.ndarray, "n 3"], true: Float[np.ndarray, "n 3"]) -> Loss:
+def _loss(shown: Float[np.ndarray, "n 3"], true: Float[np.ndarray, "n 3"]) -> RelativeDifference:
     relative = (np.abs(shown - true) / np.maximum(true, FLOOR))[(true > 0) | (shown > 0)]
-    return Loss(round(float(relative.mean()), 5), round(float(relative.max()), 5)) if relative.size else Loss(0.0, 0.0)
+    return (
+        RelativeDifference(round(float(relative.mean()), 5), round(float(relative.max()), 5))
+        if relative.size
+        else RelativeDifference(0.0, 0.0)
+    )
 
 
 def ball(material: Reflectance, model: Model) -> list[Float[np.ndarray, "n 3"]]:

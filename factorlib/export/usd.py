@@ -2,9 +2,8 @@
 
     /scene/camera, light, materials/<material>, objects/<object>/<material>;  /Render/photo: the size in pixels
 
-Frame     The frame of `factorlib.export.scene`, in the poses' units; the camera looks along −z, as every USD camera
-          does.
-          USD multiplies row vectors from the left, so matrices are written transposed.
+Frame     The frame of `factorlib.export.exported_scene`, in the poses' units; the camera looks along −z, as every USD
+          camera does.  USD multiplies row vectors from the left, so matrices are written transposed.
 Camera    Apertures are fractions of FILM; their offset is the picture's middle, right of and above the principal point.
 Light     A dome light's map has OpenEXR's layout, as the exported maps have it.
 Material  UsdPreviewSurface: GGX of α = roughness², Schlick's F from F0 to F90, diffuseColor × (1 − F) per channel
@@ -23,7 +22,7 @@ import msgspec
 import numpy as np
 from jaxtyping import Float
 
-from factorlib.export.scene import ExposedMap, Scene, Shape
+from factorlib.export.exported_scene import ExportedScene, ExportedShape, ExposedMap
 from factorlib.meshes.mesh import Mesh
 from factorlib.results.materials import Reflectance
 from factorlib.wholefile import write_text
@@ -37,7 +36,7 @@ UP_AXIS = ["metersPerUnit = 1", 'upAxis = "Y"']  # The size of a unit of the pos
 ESCAPES = {"\\": "\\\\", '"': '\\"', "\n": "\\n", "\r": "\\r", "\t": "\\t"}
 
 
-def write_usd_scene(path: str | Path, scene: Scene) -> None:
+def write_usd_scene(path: str | Path, scene: ExportedScene) -> None:
     """Write a photo's scene with the materials that its shapes name.
 
     It refers to the files that `write_usd_mesh` writes beside the shapes' own.
@@ -120,7 +119,7 @@ def identifiers(names: Iterable[str]) -> dict[str, str]:
 # parts of a scene ----------------------------------------------------------------------------------------------------
 
 
-def _camera(scene: Scene) -> list[str]:
+def _camera(scene: ExportedScene) -> list[str]:
     camera = scene.camera
     pixel = FILM / scene.camera.width
     (cx, cy), (w, h) = camera.centre, (camera.width, camera.height)
@@ -148,7 +147,7 @@ def _light(light: ExposedMap) -> list[str]:
     return _prim('DomeLight "light"', [*lines, *_transform(light.world_from_light)])
 
 
-def _materials(scene: Scene, named: Mapping[str, str]) -> list[str]:
+def _materials(scene: ExportedScene, named: Mapping[str, str]) -> list[str]:
     lines = []
     for name, identifier in named.items():
         shader = ['uniform token info:id = "UsdPreviewSurface"']
@@ -170,9 +169,9 @@ def _materials(scene: Scene, named: Mapping[str, str]) -> list[str]:
     return _prim('Scope "materials"', lines)
 
 
-def _objects(shapes: Sequence[Shape], materials: Mapping[str, str]) -> list[str]:
+def _objects(shapes: Sequence[ExportedShape], materials: Mapping[str, str]) -> list[str]:
     """Return an Xform per object, and in it a mesh per material."""
-    objects: dict[str, list[Shape]] = {}
+    objects: dict[str, list[ExportedShape]] = {}
     for shape in shapes:
         objects.setdefault(shape.name.removesuffix(f".{shape.material}"), []).append(shape)
     lines = []

@@ -23,7 +23,8 @@ from factorlib.geometry.camera import Camera, Pose
 from factorlib.geometry.raster import rasterise
 from factorlib.meshes.mesh import smooth
 from factorlib.meshes.ply import submesh
-from factorlib.tracing.scene import Material, bsdf, envmap, light_seen, look, rigid, shape, traced, transform
+from factorlib.results.materials import Reflectance
+from factorlib.tracing.scene import bsdf, envmap, light_seen, look, rigid, shape, traced, transform
 from factorlib.yamlfile import read_yaml
 
 Progress = Callable[[int, int, str], None]
@@ -78,7 +79,7 @@ class Shot(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 class Set(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """Contents of eames.yaml, which explains each number."""
 
-    materials: dict[str, Material]
+    materials: dict[str, Reflectance]
     shots: list[Shot]
     clipped: float
     apart: float
@@ -190,7 +191,7 @@ def laid_out(shot: Shot, number: int, lat_longs: Maps, rng: Rng, spread: float, 
     return Scene(shot, around, camera, rigid(look(-down, yaw), place), chairs)
 
 
-def write_shot(out: Path, scene: Scene, materials: dict[str, Material], parameters: Parameters, seed: int) -> dict:
+def write_shot(out: Path, scene: Scene, materials: dict[str, Reflectance], parameters: Parameters, seed: int) -> dict:
     """Render, expose and write one photo, with its masks, its light in the photo's units, and its normals.
 
     Args:

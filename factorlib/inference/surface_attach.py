@@ -10,14 +10,14 @@ from factorlib.geometry.raster import Caster, face_normals
 from factorlib.inference.surface_detail import Surfaces
 from factorlib.inference.surface_turns import Attached
 from factorlib.meshes.mesh import scaled
-from factorlib.results.poses import ObjectEntry
+from factorlib.results.poses import ObjectPose
 
 
 def attached_pixels(
     pixels: Int[np.ndarray, "n 2"],
     shown: Int[np.ndarray, " n"],
     camera: Camera,
-    objects: Mapping[str, tuple[str, ObjectEntry]],
+    objects: Mapping[str, tuple[str, ObjectPose]],
     surfaces: Surfaces,
 ) -> Attached:
     """Return the nodes under pixels (x, y), in the camera's frame.

@@ -11,8 +11,8 @@ from factorlib.dataset.check import MESHES
 from factorlib.dataset.paths import Refusal
 from factorlib.dataset.schema import Dataset, ObjectEntry
 from factorlib.errors import InputError, did_you_mean
-from factorlib.recipe import schema
-from factorlib.recipe.schema import BALL, KINDS, AnyRecipe, is_light_file, is_mesh_file, read_table
+from factorlib.recipe import kinds
+from factorlib.recipe.kinds import BALL, KINDS, AnyRecipe, is_light_file, is_mesh_file, read_table
 from factorlib.yamlfile import load_yaml, read_yaml
 
 
@@ -59,33 +59,33 @@ def check_recipe(
         if not file.is_file():
             cure = f"files are relative to the recipe; meshes that need no file: {', '.join([BALL, *meshes])}"
             raise InputError(f"there is no file {name!r}", file=path, cure=cure)
-    if recipe.denoise and find_spec(schema.DENOISER) is None:
+    if recipe.denoise and find_spec(kinds.DENOISER) is None:
         cure = "make setup EXTRAS=denoise (outside a checkout: pip install mitsuba-oidn), or leave it out"
         refuse("denoise", "the denoiser is not installed", cure)
-    if isinstance(recipe, schema.OfPhotos):
+    if isinstance(recipe, kinds.PhotoRecipe):
         check("photos", recipe.photos, photos, "photo", once=True)
         if recipe.sun is not None:
-            if isinstance(recipe, schema.Relight):
+            if isinstance(recipe, kinds.RelightRecipe):
                 refuse("sun", "a relighting shows lights that are given", "leave it out")
             if len(recipe.photos) != 1:
                 cure = "name one photo: `photos: [...]`"
                 refuse("sun.direction", "a direction holds in the light of one photo", cure)
             if not any(recipe.sun.direction):
                 refuse("sun.direction", "it has no length", "name another")
-    if isinstance(recipe, schema.Relight | schema.Grid):
+    if isinstance(recipe, kinds.RelightRecipe | kinds.GridRecipe):
         check("lights", [name for name in recipe.lights if not is_light_file(name)], photos, "photo")
-    if isinstance(recipe, schema.Relight):
+    if isinstance(recipe, kinds.RelightRecipe):
         lights = [Path(name).stem for name in recipe.lights]
         check("lights", lights, lights, "light", once=True)
         if not lights and len(photos) == 1:
             refuse("lights", "there is no other photo whose light could be used", "name a file (.hdr, .exr)")
-    if isinstance(recipe, schema.Transfer | schema.Grid):
+    if isinstance(recipe, kinds.TransferRecipe | kinds.GridRecipe):
         check("materials", recipe.materials, materials, "material")
-    if isinstance(recipe, schema.Transfer | schema.Insert):
+    if isinstance(recipe, kinds.TransferRecipe | kinds.InsertRecipe):
         known = [*materials, *(read_table(path.parent / recipe.table) if recipe.table is not None else [])]
-    if isinstance(recipe, schema.Transfer):
+    if isinstance(recipe, kinds.TransferRecipe):
         check("materials", recipe.materials.values(), known, "material")
-    if isinstance(recipe, schema.Insert):
+    if isinstance(recipe, kinds.InsertRecipe):
         if isinstance(recipe.material, dict):
             check("material", recipe.material.values(), known, "material")
             if recipe.mesh not in meshes:

@@ -12,7 +12,7 @@ import trimesh
 from jaxtyping import Float
 
 from factorlib.errors import InputError
-from factorlib.render.photo_scene import Placed
+from factorlib.render.photo_scene import PlacedMesh
 
 # Largest mean angle between the object's upright axis and the cameras': photos look down, and are held askew.
 MOST_TILT_DEG = 50.0
@@ -41,7 +41,7 @@ class Plane(msgspec.Struct, frozen=True):
         return np.where((distance > 0) & (down < 0), distance, np.nan)[:, None] * rays
 
 
-def resting_plane(placed: Placed, uprights: Float[np.ndarray, "k 3"] | None = None) -> Plane:
+def resting_plane(placed: PlacedMesh, uprights: Float[np.ndarray, "k 3"] | None = None) -> Plane:
     """Return the plane, in the world, on which an object rests.
 
     Args:
@@ -71,6 +71,6 @@ def resting_plane(placed: Placed, uprights: Float[np.ndarray, "k 3"] | None = No
     return Plane(normal / np.linalg.norm(normal), lowest)
 
 
-def height_over(plane: Plane, placed: Placed) -> float:
+def height_over(plane: Plane, placed: PlacedMesh) -> float:
     """Return the height of an object's highest vertex above the plane."""
     return float(((placed.vertices - plane.point) @ plane.normal).max())

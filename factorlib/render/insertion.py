@@ -34,11 +34,11 @@ from scipy.ndimage import binary_erosion, distance_transform_edt
 
 from factorlib.conventions import YUP_FROM_CAMERA
 from factorlib.errors import InputError
-from factorlib.export.scene import ALL_BOUNCES
+from factorlib.export.exported_scene import ALL_BOUNCES
 from factorlib.meshes.mesh import Mesh
 from factorlib.meshes.ply import submesh
 from factorlib.render.ground import Plane, height_over
-from factorlib.render.photo_scene import PhotoScene, Placed, light_entries, shapes
+from factorlib.render.photo_scene import PhotoScene, PlacedMesh, light_entries, shapes
 from factorlib.render.placement import RADIUS, Spot, rotation_between
 from factorlib.results.materials import Reflectance, vec3
 from factorlib.tracing.denoise import denoised
@@ -64,7 +64,7 @@ NEW = "+"  # prefix of the new object and its materials: no name in dataset.yaml
 Picture = Float[np.ndarray, "h w 3"]
 
 
-class Ground(msgspec.Struct, frozen=True):
+class GroundSurface(msgspec.Struct, frozen=True):
     """The plane that objects stand on, and its reflectance.
 
     Attributes:
@@ -77,7 +77,7 @@ class Ground(msgspec.Struct, frozen=True):
     polish: Reflectance | None = None
 
 
-class Standing(msgspec.Struct, frozen=True):
+class InsertionScene(msgspec.Struct, frozen=True):
     """A photo's scene with the new object in place; its materials include the new object's.
 
     Attributes:
@@ -88,8 +88,8 @@ class Standing(msgspec.Struct, frozen=True):
     """
 
     scene: PhotoScene
-    ground: Ground
-    new: Placed
+    ground: GroundSurface
+    new: PlacedMesh
     spot: Spot
     found: Spot
     moved: str
@@ -123,7 +123,7 @@ class ShadowMatch(msgspec.Struct, frozen=True):
         return words if self.correlation >= BELIEVED else f"{words} So the shadow is not to be believed."
 
 
-class Inserted(msgspec.Struct, frozen=True):
+class InsertionResult(msgspec.Struct, frozen=True):
     """A photo with the new object.
 
     Attributes:
@@ -142,14 +142,14 @@ class Inserted(msgspec.Struct, frozen=True):
 
 
 def inserted(
-    there: Standing,
+    there: InsertionScene,
     photo: Picture,
     covered: Bool[np.ndarray, "h w"],
     samples: int,
     report: Callable[[int], None] = lambda done: None,
     seed: int = 1,
     compared: bool = True,
-) -> Inserted:
+) -> InsertionResult:
     """Return the photo with the new object.
 
     Args:
@@ -226,7 +226,7 @@ def inserted(
         mirrored = traced({**polished, **more}) - traced(polished)
         composite = np.maximum(composite + mirrored * shows_ground[..., None] * beside * near, 0)
     report(STEPS)
-    return Inserted(composite, coverage, shadow, np.asarray(diffuse), match)
+    return InsertionResult(composite, coverage, shadow, np.asarray(diffuse), match)
 
 
 def _ground_colour(lit: Picture, photo: Picture, shows_ground: Bool[np.ndarray, "h w"]) -> tuple[float, float, float]:
@@ -256,7 +256,7 @@ def _disc(spot: Spot, material: Reflectance) -> dict[str, Any]:
     return {GROUND: {"type": "disk", "to_world": transform(frame), "bsdf": bsdf(material)}}
 
 
-def _coverage(scene: PhotoScene, new: Placed, camera: dict[str, Any], samples: int) -> Float[np.ndarray, "h w"]:
+def _coverage(scene: PhotoScene, new: PlacedMesh, camera: dict[str, Any], samples: int) -> Float[np.ndarray, "h w"]:
     """Render the new object with radiance 1 and all else black, so that a pixel is the object's share of it."""
     sides = [(label, side) for label in new.mesh.labels for side in range(1 + new.mesh.open)]
     glowing = {f"{new.name}_{label}_{side}": _emitter(new, label, side) for label, side in sides}
@@ -265,7 +265,7 @@ def _coverage(scene: PhotoScene, new: Placed, camera: dict[str, Any], samples: i
     return np.clip(picture[..., 0], 0, 1)
 
 
-def _emitter(new: Placed, label: int, side: int) -> Any:
+def _emitter(new: PlacedMesh, label: int, side: int) -> Any:
     """Return one side of the new object's part as an area light.
 
     Area lights emit on the side of their normals alone.  An open mesh gets a second light, flipped and slightly behind.

@@ -14,7 +14,7 @@ from jaxtyping import Float
 
 from factorlib.conventions import YUP_FROM_CAMERA
 from factorlib.export.environment import NARROWEST, mitsuba_map
-from factorlib.export.scene import ALL_BOUNCES, DIRECT
+from factorlib.export.exported_scene import ALL_BOUNCES, DIRECT
 from factorlib.geometry.camera import Camera, rotation_of_vector
 from factorlib.light.latlong import turned_map
 from factorlib.light.lobes import Lobes, lobe_integral
@@ -30,10 +30,10 @@ FAR = 3e3  # distance of suns, in sizes of the scene
 LOBE_ROWS = 256  # rows of Mitsuba's map of lobes
 MAP_ROWS = 1024  # rows of Mitsuba's map of a lat-long map
 
-Light = Lobes | Float[np.ndarray, "h w 3"]
+DistantLight = Lobes | Float[np.ndarray, "h w 3"]
 
 
-class Placed(msgspec.Struct, frozen=True):
+class PlacedMesh(msgspec.Struct, frozen=True):
     """A mesh and its pose in the world.
 
     Attributes:
@@ -61,8 +61,8 @@ class PhotoScene(msgspec.Struct, frozen=True):
     """
 
     camera: Camera
-    objects: tuple[Placed, ...]
-    light: Light
+    objects: tuple[PlacedMesh, ...]
+    light: DistantLight
     materials: Mapping[str, Reflectance]
     max_depth: int = ALL_BOUNCES
     denoise: bool = False
@@ -103,7 +103,7 @@ def with_sun(light: Lobes, axis: Float[np.ndarray, "3"], diameter_deg: float, sh
     return Lobes(np.vstack([rest.axis, axis]), sharpness, np.vstack([factor * rest.weight, weight]))
 
 
-def light_entries(light: Light, size: float) -> dict[str, Any]:
+def light_entries(light: DistantLight, size: float) -> dict[str, Any]:
     """Return the light as Mitsuba's `envmap`, with lobes too narrow for one as spheres far beyond the scene.
 
     `size` is the size of the scene, as in `PhotoScene.size`.
@@ -127,7 +127,7 @@ def light_entries(light: Light, size: float) -> dict[str, Any]:
 
 
 def shapes(
-    objects: Sequence[Placed], materials: Mapping[str, Reflectance], black: Sequence[str] = ()
+    objects: Sequence[PlacedMesh], materials: Mapping[str, Reflectance], black: Sequence[str] = ()
 ) -> dict[str, Any]:
     """Return a Mitsuba shape for each material of each object.
 
@@ -181,7 +181,7 @@ def traced_photo(
 
 
 def lit_ball(
-    light: Light, material: Reflectance, size: int, samples: int, denoise: bool = False
+    light: DistantLight, material: Reflectance, size: int, samples: int, denoise: bool = False
 ) -> Float[np.ndarray, "h w 4"]:
     """Render a ball that fills the picture, seen from the front.
 
@@ -239,7 +239,7 @@ def orbit(
     return rigid(turn @ YUP_FROM_CAMERA, middle - turn @ middle / zoom)
 
 
-def turned_light(light: Light, angle_deg: float) -> Light:
+def turned_light(light: DistantLight, angle_deg: float) -> DistantLight:
     """Return the light turned about the upright axis of the world."""
     if angle_deg == 0:
         return light  # resampling would blur a map

@@ -22,7 +22,7 @@ from factorlib.geometry.camera import rotation_of_vector
 from factorlib.geometry.raster import Caster
 from factorlib.meshes.mesh import Mesh
 from factorlib.render.ground import Plane, height_over
-from factorlib.render.photo_scene import PhotoScene, Placed
+from factorlib.render.photo_scene import PhotoScene, PlacedMesh
 
 RADIUS = 8.0  # radius of the ground about the new object, in its heights
 GAP = 0.15  # gap between the objects, in heights of the new one
@@ -40,7 +40,9 @@ class Spot(msgspec.Struct, frozen=True):
     height: float
 
 
-def spot_beside(scene: PhotoScene, plane: Plane, neighbour: Placed, relative_height: float, slenderness: float) -> Spot:
+def spot_beside(
+    scene: PhotoScene, plane: Plane, neighbour: PlacedMesh, relative_height: float, slenderness: float
+) -> Spot:
     """Return the place beside an object, on the side with more room in the picture.
 
     Args:
@@ -73,7 +75,7 @@ def spot_beside(scene: PhotoScene, plane: Plane, neighbour: Placed, relative_hei
 
 
 def spot_at(
-    scene: PhotoScene, plane: Plane, neighbour: Placed, pixel: tuple[float, float], relative_height: float
+    scene: PhotoScene, plane: Plane, neighbour: PlacedMesh, pixel: tuple[float, float], relative_height: float
 ) -> Spot:
     """Return the place on the ground that a pixel shows.
 
@@ -97,7 +99,7 @@ def spot_at(
 
 def stood(
     name: str, mesh: Mesh, materials: tuple[str, ...], up: Float[np.ndarray, "3"], turn_deg: float, spot: Spot
-) -> Placed:
+) -> PlacedMesh:
     """Return a mesh standing on a spot.
 
     Args:
@@ -119,13 +121,13 @@ def stood(
     matrix = np.eye(4)
     matrix[:3, :3] = scale * rotation
     matrix[:3, 3] = spot.point - scale * foot
-    return Placed(name, mesh, materials, matrix)
+    return PlacedMesh(name, mesh, materials, matrix)
 
 
 class Solid(Caster):
     """Mesh of an object in the world, for intersection tests against others."""
 
-    def __init__(self, placed: Placed):
+    def __init__(self, placed: PlacedMesh):
         self.name = placed.name
         self.vertices = placed.vertices
         super().__init__(msgspec.structs.replace(placed.mesh, vertices=self.vertices))
@@ -170,7 +172,7 @@ class Solid(Caster):
 class Room:
     """Free space on the ground for a new object about its spot."""
 
-    def __init__(self, scene: PhotoScene, new: Placed, spot: Spot):
+    def __init__(self, scene: PhotoScene, new: PlacedMesh, spot: Spot):
         self.camera = scene.camera
         self.spot = spot
         self.new = Solid(new)
@@ -225,8 +227,8 @@ class Room:
 
 
 def stood_free(
-    scene: PhotoScene, stand: Callable[[Spot], Placed], spot: Spot, asked: bool, factor: int = 1
-) -> tuple[Placed, Spot, str]:
+    scene: PhotoScene, stand: Callable[[Spot], PlacedMesh], spot: Spot, asked: bool, factor: int = 1
+) -> tuple[PlacedMesh, Spot, str]:
     """Place a new object where it intersects none of the photo's objects and is visible.
 
     Args:

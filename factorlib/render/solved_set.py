@@ -9,7 +9,7 @@ from jaxtyping import Bool, Float
 from factorlib.conventions import YUP_FROM_CAMERA
 from factorlib.dataset.schema import GroundSlice, LightSlice, MeshEntry, ObjectEntry, ObjectsSlice
 from factorlib.errors import InputError, did_you_mean
-from factorlib.export.scene import ALL_BOUNCES, DIRECT
+from factorlib.export.exported_scene import ALL_BOUNCES, DIRECT
 from factorlib.generate.shapes import sphere
 from factorlib.images.exr import read_exr
 from factorlib.images.light_map import read_light_map
@@ -18,12 +18,12 @@ from factorlib.light.lobes import Lobes
 from factorlib.meshes.mesh import Mesh, scaled
 from factorlib.meshes.read import CREASE_DEG, MeshesOnce, read_mesh
 from factorlib.reading import check_plain
-from factorlib.recipe.schema import BALL, AssumedSun, is_light_file, is_mesh_file, read_table
+from factorlib.recipe.kinds import BALL, AssumedSun, is_light_file, is_mesh_file, read_table
 from factorlib.render.ground import Plane, resting_plane
-from factorlib.render.insertion import Ground
-from factorlib.render.photo_scene import Light, PhotoScene, Placed, with_sun
-from factorlib.render.traced import Tone, as_it_is
-from factorlib.results.lobes import light_of
+from factorlib.render.insertion import GroundSurface
+from factorlib.render.photo_scene import DistantLight, PhotoScene, PlacedMesh, with_sun
+from factorlib.render.traced_picture import Tone, as_it_is
+from factorlib.results.lobe_table import light_of
 from factorlib.results.materials import MaterialTable, Reflectance, read_materials, reflectances
 from factorlib.results.poses import PhotoPoses, read_poses
 from factorlib.results.surface import read_surface
@@ -128,7 +128,7 @@ class SolvedSet:
         tone = self.table.model.tone.get(photo)
         return (lambda radiance: shown(radiance, tone.exponent, tone.pivot)) if tone else as_it_is
 
-    def light(self, name: str) -> Light:
+    def light(self, name: str) -> DistantLight:
         """Return a photo's light in its camera's axes, or the light of a file."""
         if is_light_file(name):
             return read_light_map(self.inputs.file(f"recipe file:{name}"))
@@ -141,14 +141,16 @@ class SolvedSet:
         own = read_table(self.inputs.file(f"recipe file:{table}")).items()
         return self.materials | {name: Reflectance(m.diffuse, m.specular, m.roughness) for name, m in own}
 
-    def ground(self, photo: str, neighbour: Placed) -> Ground:
+    def ground(self, photo: str, neighbour: PlacedMesh) -> GroundSurface:
         """Return the ground given with the photo, or the plane that the neighbour rests on."""
         given = self.grounds[photo].ground
         if given is None:
             mesh = next(obj.mesh for obj in self.objects[photo].objects if obj.name == neighbour.name)
-            return Ground(resting_plane(neighbour, self._uprights(mesh)))
+            return GroundSurface(resting_plane(neighbour, self._uprights(mesh)))
         normal = YUP_FROM_CAMERA @ np.array(given.normal)
-        return Ground(Plane(normal / np.linalg.norm(normal), YUP_FROM_CAMERA @ np.array(given.point)), given.diffuse)
+        return GroundSurface(
+            Plane(normal / np.linalg.norm(normal), YUP_FROM_CAMERA @ np.array(given.point)), given.diffuse
+        )
 
     def mesh(
         self, name: str, material: str | dict[str, str] | None, up: str
@@ -214,11 +216,11 @@ class SolvedSet:
         trusted = [pose for pose in poses if not pose.left_out] or poses
         return np.stack([np.array(pose.rotation).T @ YUP_FROM_CAMERA[1] for pose in trusted])
 
-    def _placed(self, obj: ObjectEntry, entry: MeshEntry, poses: PhotoPoses) -> Placed:
+    def _placed(self, obj: ObjectEntry, entry: MeshEntry, poses: PhotoPoses) -> PlacedMesh:
         pose = poses.objects[obj.name]
         mesh = self._meshes.mesh(obj.mesh, entry, obj.materials)
         place = rigid(YUP_FROM_CAMERA @ np.array(pose.rotation), YUP_FROM_CAMERA @ np.array(pose.translation))
-        return Placed(obj.name, scaled(mesh, pose.scale), tuple(self.names), place)
+        return PlacedMesh(obj.name, scaled(mesh, pose.scale), tuple(self.names), place)
 
     def _masks(self, photo: str) -> dict[str, np.ndarray]:
         if photo not in self._pixels:

@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Float
 
 from factorlib.errors import InputError
-from factorlib.export.scene import DIRECT
+from factorlib.export.exported_scene import DIRECT
 from factorlib.render.ground import Plane
 from factorlib.render.photo_scene import PhotoScene, traced_photo
 from factorlib.render.placement import rotation_between

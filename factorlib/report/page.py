@@ -7,7 +7,7 @@ from itertools import groupby
 from typing import Any
 from urllib.parse import quote
 
-from factorlib.export.gltf import EXTENSION, gltf_material
+from factorlib.export.gltf_writer import EXTENSION, gltf_material
 from factorlib.export.materialx import materialx
 from factorlib.export.mitsuba import material_xml
 from factorlib.images.picture import read_png
@@ -150,7 +150,7 @@ def forms(name: str, material: Reflectance) -> dict[str, str]:
     }
 
 
-def _materials(run: Artifacts, cells: list[list[pictures.Cell]]) -> list[dict[str, Any]]:
+def _materials(run: Artifacts, cells: list[list[pictures.LitMaterial]]) -> list[dict[str, Any]]:
     """Return the table's row of each solved material; its ball is in the light of the photo that shows it most."""
     solved = run.solved.materials
     exported = run.exported

@@ -14,15 +14,15 @@ from scipy.sparse import csr_array
 
 from factorlib.conventions import lat_long_solid_angles
 from factorlib.dataset.schema import ObjectsSlice
-from factorlib.evaluate.resynthesis import agreeing_pixels
+from factorlib.evaluate.photo_errors import agreeing_pixels
 from factorlib.images.palette import nearest_tags
 from factorlib.images.picture import exposure_of, picture, png_bytes
 from factorlib.images.transfer import srgb_encode
 from factorlib.render.photo_scene import traced_photo, turned_light
 from factorlib.render.solved_set import SolvedSet
-from factorlib.render.traced import Traced
+from factorlib.render.traced_picture import TracedPicture
 from factorlib.report.artifacts import Artifacts, Channels, Picture
-from factorlib.results.lobes import read_lobes
+from factorlib.results.lobe_table import read_lobes
 from factorlib.results.materials import Reflectance
 from factorlib.results.metrics import PhotoErrors, ScoredLight
 from factorlib.urm.geometry import on_surface
@@ -189,11 +189,11 @@ def first_pictures(run: Artifacts, rows: Sequence[PhotoRow], results: SolvedSet)
     pixel = max(1.0, max(height, width) / longest_side(len(run.set.photos)))
     camera = scene.camera.window(left, top, pixel, ceil(width / pixel), ceil(height / pixel))
     scene = msgspec.structs.replace(scene, camera=camera)
-    own = Traced(traced_photo(scene, FIRST_SAMPLES), results.tone(row.name))
+    own = TracedPicture(traced_photo(scene, FIRST_SAMPLES), results.tone(row.name))
     others = [p for p in run.set.photos if run.illumination_of(p) in lit - {row.illumination}]
     other = others[0] if others else None
     light = results.light(other) if other else turned_light(scene.light, 180.0)
-    relit = Traced(traced_photo(msgspec.structs.replace(scene, light=light), FIRST_SAMPLES))
+    relit = TracedPicture(traced_photo(msgspec.structs.replace(scene, light=light), FIRST_SAMPLES))
     exposure = row.errors.exposure if row.errors else 1.0
     words = f"in the light of {other}" if other else "in its own light, turned half around"
     return [
@@ -317,7 +317,7 @@ def _fitted(pixels: Pixels, height: int, width: int) -> Pixels:
 # ── Materials in lights ──────────────────────────────────────────────────────────────────────────────────────────────
 
 
-class Cell(msgspec.Struct, frozen=True):
+class LitMaterial(msgspec.Struct, frozen=True):
     """A material in a photo's light.
 
     Attributes:
@@ -333,7 +333,7 @@ class Cell(msgspec.Struct, frozen=True):
     measured: str | None = None
 
 
-def ball_cell(run: Artifacts, material: str, photo: str, exposure: float) -> Cell:
+def ball_cell(run: Artifacts, material: str, photo: str, exposure: float) -> LitMaterial:
     """Return the ball of a material in a photo's light.
 
     Args:
@@ -345,10 +345,10 @@ def ball_cell(run: Artifacts, material: str, photo: str, exposure: float) -> Cel
     observed = photo in run.photo_facts and run.photo_facts[photo].pixels.get(material, 0) > 0
     radiance = run.rgb("render", f"materials/{photo}/{material}")
     uri = None if radiance is None else data_uri(disc(reduced(radiance, 96), exposure))
-    return Cell(material, photo, observed, uri)
+    return LitMaterial(material, photo, observed, uri)
 
 
-def reflectance_maps(run: Artifacts, photo: str, exposure: float) -> list[Cell]:
+def reflectance_maps(run: Artifacts, photo: str, exposure: float) -> list[LitMaterial]:
     """Return one cell per material: the solved map with the observed normals outlined, and the measured map.
 
     Args:
@@ -364,7 +364,7 @@ def reflectance_maps(run: Artifacts, photo: str, exposure: float) -> list[Cell]:
         seen = observations and observations.take(observations.material == index)
         measured = data_uri(measured_map(seen, exposure)) if seen else None
         uri = None if channels is None else data_uri(_ringed(channels, exposure))
-        cells.append(Cell(name, photo, bool(seen), uri, measured))
+        cells.append(LitMaterial(name, photo, bool(seen), uri, measured))
     return cells
 
 

@@ -20,7 +20,7 @@ from trimesh.visual.texture import TextureVisuals
 from factorlib.conventions import YUP_FROM_CAMERA
 from factorlib.dataset.schema import LightSlice, ObjectsSlice
 from factorlib.export.environment import sharpened
-from factorlib.export.gltf import read_part_materials, variant_name
+from factorlib.export.gltf_writer import read_part_materials, variant_name
 from factorlib.geometry import open3d as o3d
 from factorlib.geometry.camera import Pose
 from factorlib.geometry.raster import unit
@@ -30,7 +30,7 @@ from factorlib.light.lobes import Lobes
 from factorlib.meshes.fine import subdivided
 from factorlib.meshes.mesh import Mesh, area_vectors
 from factorlib.report.artifacts import Artifacts
-from factorlib.results.lobes import read_lobes
+from factorlib.results.lobe_table import read_lobes
 from factorlib.results.poses import AS_IT_IS
 
 MOST_TRIANGLES = 150_000  # triangles of all meshes together: about 3 MB of page
@@ -96,7 +96,7 @@ def spacing_of(face: int) -> float:
 # ── Meshes ───────────────────────────────────────────────────────────────────────────────────────────────────────────
 
 
-class Shown(msgspec.Struct, frozen=True):
+class ViewedObject(msgspec.Struct, frozen=True):
     """An object of a photo, or a mesh with its own materials that no photo shows in a trusted pose."""
 
     photo: str | None
@@ -124,8 +124,8 @@ def _shown(run: Artifacts, objects: Mapping[str, ObjectsSlice]) -> dict[str, lis
             entry = run.poses[photo].objects.get(obj.name)
             if obj.mesh in files and entry is not None and not entry.left_out:
                 variant = variant_name(obj.materials)
-                shown.append(Shown(photo, obj.name, obj.mesh, variant, entry.scale, entry.pose))
-    shown += [Shown(None, name, name) for name in files if all(name != each.mesh for each in shown)]
+                shown.append(ViewedObject(photo, obj.name, obj.mesh, variant, entry.scale, entry.pose))
+    shown += [ViewedObject(None, name, name) for name in files if all(name != each.mesh for each in shown)]
     kinds = sorted({(each.mesh, each.scale) for each in shown})
     triangles = sum(len(part.faces) for name, _ in kinds for part in loaded[name].values())
     share = min(1.0, MOST_TRIANGLES / max(1, triangles))

@@ -7,7 +7,7 @@ import numpy as np
 
 from factorlib.errors import InputError
 from factorlib.light.lobes import Lobes
-from factorlib.results.lobes import read_lobes
+from factorlib.results.lobe_table import read_lobes
 from factorlib.results.materials import Channels, MaterialTable, read_exposures, read_materials
 
 FILES = ("materials.json", "lobes.parquet", "exposures.json")

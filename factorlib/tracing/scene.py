@@ -14,7 +14,6 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
 
-import msgspec
 import numpy as np
 from jaxtyping import Float
 
@@ -37,15 +36,7 @@ Image = Float[np.ndarray, "h w c"]
 FACE_LOOKS = {"+x": (0, 90), "-x": (0, -90), "+y": (90, 0), "-y": (-90, 0), "+z": (0, 0), "-z": (0, 180)}
 
 
-class Material(msgspec.Struct, frozen=True):
-    """Lambert k_d, GGX k_s (linear Rec. 709, k_d + k_s < 1 in the largest channels) and roughness; α = roughness²."""
-
-    diffuse: tuple[float, float, float]
-    specular: tuple[float, float, float]
-    roughness: float
-
-
-def bsdf(material: Material | Reflectance, painted: bool = False) -> dict[str, Any]:
+def bsdf(material: Reflectance, painted: bool = False) -> dict[str, Any]:
     """Return Mitsuba's `blendbsdf` that evaluates to k_d/π + k_s D G / (4 (n·i)(n·o)), without Fresnel.
 
     If `painted`, the diffuse part has the colours of the mesh's vertices, which `paint` computes.
@@ -65,7 +56,7 @@ def bsdf(material: Material | Reflectance, painted: bool = False) -> dict[str, A
     return {"type": "blendbsdf", "weight": float(share), "bsdf_0": lambertian, "bsdf_1": conductor}
 
 
-def paint(material: Material | Reflectance, detail: Float[np.ndarray, " v"]) -> Float[np.ndarray, "v 3"]:
+def paint(material: Reflectance, detail: Float[np.ndarray, " v"]) -> Float[np.ndarray, "v 3"]:
     """Return the vertex colours for `bsdf` of a mesh with `detail`, at most 1.
 
     Mitsuba's diffuse BSDF has no reflectance above 1.
@@ -75,7 +66,7 @@ def paint(material: Material | Reflectance, detail: Float[np.ndarray, " v"]) -> 
     return np.minimum(detail[:, None] * colour, 1.0)
 
 
-def _share(material: Material | Reflectance) -> float:
+def _share(material: Reflectance) -> float:
     """Return the weight of the specular part in the blend; 0 if nothing is reflected."""
     diffuse = max(material.diffuse)
     specular = max(material.specular)

@@ -8,8 +8,8 @@ import pytest
 from factorlib.dataset.read import read_dataset
 from factorlib.errors import InputError
 from factorlib.jsonfile import write_json
+from factorlib.recipe.kinds import KINDS, InsertRecipe, recipe_of
 from factorlib.recipe.read import files_of, read_recipe
-from factorlib.recipe.schema import KINDS, Insert, recipe_of
 from factorlib.results.materials import MaterialTable, Reflectance, StandardErrors, solved
 from factorlib.runner.project import LIBRARY
 from factorlib.yamlfile import load_yaml, read_yaml
@@ -83,7 +83,7 @@ def test_files_are_relative_to_the_recipe_and_a_table_adds_materials(dataset, tm
     write_json(tmp_path / "own.json", MaterialTable({"gold": one}))
     path = written(tmp_path, "kind: insert\nmesh: bunny.obj\nmaterial: gold\ntable: own.json")
     recipe = read_recipe(path, dataset)
-    assert isinstance(recipe, Insert) and recipe.material == "gold"
+    assert isinstance(recipe, InsertRecipe) and recipe.material == "gold"
     assert files_of(recipe, path) == {"own.json": tmp_path / "own.json", "bunny.obj": tmp_path / "bunny.obj"}
 
 

@@ -10,8 +10,8 @@ from factorlib.geometry.camera import Camera
 from factorlib.light.lobes import Lobes
 from factorlib.meshes.mesh import Mesh
 from factorlib.render.ground import Plane
-from factorlib.render.insertion import NEW, Ground, Standing, inserted, shadow_match
-from factorlib.render.photo_scene import ALL_BOUNCES, PhotoScene, Placed, light_entries, shapes
+from factorlib.render.insertion import NEW, GroundSurface, InsertionScene, inserted, shadow_match
+from factorlib.render.photo_scene import ALL_BOUNCES, PhotoScene, PlacedMesh, light_entries, shapes
 from factorlib.render.placement import Spot, stood
 from factorlib.results.materials import Reflectance
 from factorlib.tracing.scene import bsdf, rendered, rigid, sensor, transform
@@ -23,8 +23,8 @@ SPOT = Spot(GROUND, np.array([-0.9, -1.0, -6.0]), 1.2)
 STRIPES = (0.2, 0.5)
 
 
-def stands(scene: PhotoScene, placed: Placed | None = None, polish: Reflectance | None = None) -> Standing:
-    return Standing(scene, Ground(GROUND, polish=polish), placed or new(), SPOT, SPOT, "")
+def stands(scene: PhotoScene, placed: PlacedMesh | None = None, polish: Reflectance | None = None) -> InsertionScene:
+    return InsertionScene(scene, GroundSurface(GROUND, polish=polish), placed or new(), SPOT, SPOT, "")
 
 
 def light() -> Lobes:
@@ -32,7 +32,7 @@ def light() -> Lobes:
     return Lobes(axis / np.linalg.norm(axis, axis=1, keepdims=True), np.array([1.0, 80.0]), weight)
 
 
-THERE = Placed("there", sphere(1.0), ("grey",), rigid(np.eye(3), (0.9, 0, -6.5)))
+THERE = PlacedMesh("there", sphere(1.0), ("grey",), rigid(np.eye(3), (0.9, 0, -6.5)))
 SCENE = PhotoScene(CAMERA, (THERE,), light(), MATERIALS)
 OPEN = np.zeros((CAMERA.height, CAMERA.width), bool)  # nothing covers the ground
 
@@ -47,7 +47,7 @@ def true_photo(objects, samples=1024):
     return rendered(entries, sensor(CAMERA, rigid(YUP_FROM_CAMERA, np.zeros(3))), samples, 7, ALL_BOUNCES)
 
 
-def new(material="red") -> Placed:
+def new(material="red") -> PlacedMesh:
     return stood("new", sphere(1.0), (material,), np.array([0, 1.0, 0]), 0.0, SPOT)
 
 
@@ -96,7 +96,7 @@ def test_an_open_mesh_is_seen_from_either_side_and_hidden_by_what_stands_before_
     for where in (-8.0, -4.0):
         matrix = 0.3 * np.eye(4)
         matrix[:, 3] = (-0.9 * -where / 6, -0.6 * -where / 6, where, 1)
-        before = Placed("new", sphere(1.0), ("grey",), matrix)
+        before = PlacedMesh("new", sphere(1.0), ("grey",), matrix)
         scene = PhotoScene(CAMERA, (before,), light(), MATERIALS)
         placed = stood(NEW, quad, ("red",), np.array([0, 1.0, 0]), turn, SPOT)
         photo = np.ones((CAMERA.height, CAMERA.width, 3))

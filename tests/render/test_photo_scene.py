@@ -14,7 +14,7 @@ from factorlib.meshes.mesh import Mesh
 from factorlib.render.ground import Plane, resting_plane
 from factorlib.render.photo_scene import (
     PhotoScene,
-    Placed,
+    PlacedMesh,
     lit_ball,
     orbit,
     traced_photo,
@@ -37,8 +37,8 @@ def lobes() -> Lobes:
     return Lobes(axis / np.linalg.norm(axis, axis=1, keepdims=True), np.array([2.0, 20.0]), weight)
 
 
-def placed(name, mesh, where, rotation=np.eye(3)) -> Placed:
-    return Placed(name, mesh, ("red",), rigid(rotation, where))
+def placed(name, mesh, where, rotation=np.eye(3)) -> PlacedMesh:
+    return PlacedMesh(name, mesh, ("red",), rigid(rotation, where))
 
 
 def box(width: float, height: float, depth: float) -> Mesh:

@@ -9,7 +9,7 @@ from factorlib.geometry.camera import Camera
 from factorlib.light.lobes import no_lobes
 from factorlib.meshes.mesh import Mesh, smooth
 from factorlib.render.ground import Plane
-from factorlib.render.photo_scene import PhotoScene, Placed
+from factorlib.render.photo_scene import PhotoScene, PlacedMesh
 from factorlib.render.placement import STEP, Spot, spot_at, stood, stood_free
 from factorlib.tracing.scene import rigid
 
@@ -20,16 +20,16 @@ SIDES = [[0, 1, 3, 2], [4, 6, 7, 5], [0, 4, 5, 1], [2, 3, 7, 6], [0, 2, 6, 4], [
 BOX = smooth(CORNERS, np.array([[q[0], q[k], q[k + 1]] for q in SIDES for k in (1, 2)]))
 
 
-def at(mesh: Mesh, place, size=1.0, turn=None) -> Placed:
+def at(mesh: Mesh, place, size=1.0, turn=None) -> PlacedMesh:
     rotation = np.eye(3) if turn is None else turn
-    return Placed("there", mesh, ("grey",), rigid(size * rotation, place))
+    return PlacedMesh("there", mesh, ("grey",), rigid(size * rotation, place))
 
 
-def scene(*objects: Placed) -> PhotoScene:
+def scene(*objects: PlacedMesh) -> PhotoScene:
     return PhotoScene(CAMERA, objects, no_lobes(), {})
 
 
-def stand(spot: Spot) -> Placed:
+def stand(spot: Spot) -> PlacedMesh:
     return stood("new", sphere(1.0), ("red",), UP, 0.0, spot)
 
 
@@ -55,7 +55,7 @@ def test_an_object_that_touches_nothing_stays_where_it_is_asked_for():
     assert words == "" and there is spot and new.vertices[:, 1].min() == pytest.approx(-1.0)
 
 
-WALL = Placed("wall", BOX, ("grey",), np.diag([1.0, 1.0, 0.1, 1.0]) + np.outer([0, 0, -4.5, 0], [0, 0, 0, 1]))
+WALL = PlacedMesh("wall", BOX, ("grey",), np.diag([1.0, 1.0, 0.1, 1.0]) + np.outer([0, 0, -4.5, 0], [0, 0, 0, 1]))
 CASES = [
     (at(sphere(0.2), (1.5, -0.8, -6)), (3.5, -1.0, -6.0), "outside the picture", "the nearest free place is `at: ["),
     (WALL, (0.0, -1.0, -6.0), "hidden behind other objects", "the nearest free place is `at: ["),

@@ -19,14 +19,14 @@ from scipy.ndimage import binary_dilation
 from factorlib.conventions import YUP_FROM_CAMERA, lat_long_of_direction
 from factorlib.evaluate.ball import (
     WIDE_SIDE,
-    Light,
+    OctahedralLight,
     constant_light,
     mirror_ball,
     octahedral_directions,
 )
-from factorlib.evaluate.gauge import GAUGES, errors_by_gauge
-from factorlib.evaluate.geometry import angles_deg
-from factorlib.evaluate.picture import mean_scored
+from factorlib.evaluate.comparison_gauge import GAUGES, errors_by_gauge
+from factorlib.evaluate.geometry_errors import angles_deg
+from factorlib.evaluate.picture_errors import mean_scored
 from factorlib.evaluate.relighting import BALL_SIZE, INSIDE, NORMALS, appearances
 from factorlib.geometry.sphere import mirror_directions
 from factorlib.results.metrics import LightError, LightErrors, ScoredLight
@@ -37,7 +37,7 @@ COVERAGE_DILATION = 1  # texels by which the mask grows
 
 Samples = Float[np.ndarray, "_ 3"]
 SPHERES = ("mirror", "glossy", "lambertian")
-VIEWS: dict[str, Callable[[Light], Samples]] = {
+VIEWS: dict[str, Callable[[OctahedralLight], Samples]] = {
     "mirror": lambda light: mirror_ball(light, NORMALS, BALL_SIZE),
     "glossy": lambda light: appearances(light).glossy(GLOSSY_ROUGHNESS),
     "lambertian": lambda light: appearances(light).diffuse,
@@ -67,7 +67,9 @@ def rgb_angle(estimate: Samples, truth: Samples) -> float:
 
 
 def compare_lights(
-    estimates: Mapping[str, Light], truths: Mapping[str, Light], mirrored: Mapping[str, Bool[np.ndarray, "h w"]]
+    estimates: Mapping[str, OctahedralLight],
+    truths: Mapping[str, OctahedralLight],
+    mirrored: Mapping[str, Bool[np.ndarray, "h w"]],
 ) -> LightErrors | None:
     """Return the errors of the lights that have a truth; None if there are none.
 
@@ -111,7 +113,7 @@ def mirrored_directions(
     return binary_dilation(wide, np.ones((3, 3)), iterations=COVERAGE_DILATION)[:, 1:-1]
 
 
-def sphere_row(light: Light) -> Float[np.ndarray, "s w 3"]:
+def sphere_row(light: OctahedralLight) -> Float[np.ndarray, "s w 3"]:
     """Render the three spheres side by side, black around them."""
     row = np.zeros((len(SPHERES), *INSIDE.shape, 3))
     for picture, name in zip(row, SPHERES, strict=True):
@@ -126,9 +128,9 @@ def _at(mask: Bool[np.ndarray, "h w"]) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _scored_view(
-    render: Callable[[Light], Samples],
-    estimates: Mapping[str, Light],
-    truths: Mapping[str, Light],
+    render: Callable[[OctahedralLight], Samples],
+    estimates: Mapping[str, OctahedralLight],
+    truths: Mapping[str, OctahedralLight],
     shown: Mapping[str, Bool[np.ndarray, "*t"]],
 ) -> dict[str, dict[str, ScoredLight]]:
     """Return the errors of each light by gauge; `shown` selects the samples that count, by light."""

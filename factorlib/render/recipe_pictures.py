@@ -21,14 +21,14 @@ from factorlib.images.exr import write_rgb_exr
 from factorlib.images.film import write_gif, write_mp4
 from factorlib.images.picture import picture, write_png
 from factorlib.jsonfile import write_json
-from factorlib.recipe import schema
-from factorlib.recipe.schema import AnyRecipe, is_light_file
-from factorlib.render.insertion import NEW, STEPS, Standing, inserted
+from factorlib.recipe import kinds
+from factorlib.recipe.kinds import AnyRecipe, is_light_file
+from factorlib.render.insertion import NEW, STEPS, InsertionScene, inserted
 from factorlib.render.photo_scene import PhotoScene, lit_ball, orbit, resized, traced_photo, turned_light
 from factorlib.render.placement import spot_at, spot_beside, stood, stood_free
 from factorlib.render.solved_set import SolvedSet
 from factorlib.render.studio import on_floor
-from factorlib.render.traced import Traced
+from factorlib.render.traced_picture import TracedPicture
 from factorlib.results.materials import Reflectance
 from factorlib.stage import Progress
 from factorlib.tracing.denoise import denoiser
@@ -54,7 +54,7 @@ def draw(recipe: AnyRecipe, results: SolvedSet, out: Path, progress: Progress) -
     Raises:
         InputError: None of the recipe's photos can be rendered, or one that the recipe names cannot.
     """
-    if isinstance(recipe, schema.Grid):
+    if isinstance(recipe, kinds.GridRecipe):
         return write_grid(recipe, results, out, progress)
     photos = recipe.photos or results.photos
     refusals = []
@@ -91,7 +91,7 @@ Report = Callable[[float], None]
 
 
 def resynthesis(
-    recipe: schema.Resynthesis | schema.Transfer, results: SolvedSet, photo: str, out: Path, report: Report
+    recipe: kinds.ResynthesisRecipe | kinds.TransferRecipe, results: SolvedSet, photo: str, out: Path, report: Report
 ) -> None:
     """Write a photo with its objects path-traced over it, with other materials if the recipe replaces some.
 
@@ -104,7 +104,7 @@ def resynthesis(
     """
     report(0)
     scene = results.scene(photo, recipe.sun, recipe.denoise)
-    if isinstance(recipe, schema.Transfer):
+    if isinstance(recipe, kinds.TransferRecipe):
         known = results.known(recipe.table)
         other = recipe.materials
         materials = {name: known[other[name]] if name in other else own for name, own in scene.materials.items()}
@@ -113,11 +113,11 @@ def resynthesis(
             words = "%s: no object has %s, so the picture shows nothing new; there are %s"
             log.warning(words, photo, ", ".join(map(repr, sorted(other))), ", ".join(sorted(worn)))
         scene = msgspec.structs.replace(scene, materials=materials)
-    traced = Traced(traced_photo(scene, recipe.samples), results.tone(photo))
+    traced = TracedPicture(traced_photo(scene, recipe.samples), results.tone(photo))
     _write(out / photo, traced.over(results.photo(photo)))
 
 
-def standing(recipe: schema.Insert, results: SolvedSet, photo: str) -> Standing:
+def standing(recipe: kinds.InsertRecipe, results: SolvedSet, photo: str) -> InsertionScene:
     """Place the new object of a recipe on the ground of a photo.
 
     Args:
@@ -162,10 +162,10 @@ def standing(recipe: schema.Insert, results: SolvedSet, photo: str) -> Standing:
     stand = partial(stood, NEW, mesh, labels, up, recipe.turn)
     new, found, moved = stood_free(scene, stand, spot, recipe.at is not None, factor)
     scene = msgspec.structs.replace(scene, materials={**scene.materials, **own})
-    return Standing(scene, ground, new, spot, found, moved)
+    return InsertionScene(scene, ground, new, spot, found, moved)
 
 
-def insertion(recipe: schema.Insert, results: SolvedSet, photo: str, out: Path, report: Report) -> dict[str, Any]:
+def insertion(recipe: kinds.InsertRecipe, results: SolvedSet, photo: str, out: Path, report: Report) -> dict[str, Any]:
     """Write a photo with a further object inserted on the ground of an existing one.
 
     Args:
@@ -200,7 +200,7 @@ def insertion(recipe: schema.Insert, results: SolvedSet, photo: str, out: Path, 
 
 
 def staged(
-    recipe: schema.Backdropped,
+    recipe: kinds.BackgroundRecipe,
     results: SolvedSet,
     photo: str,
     scene: PhotoScene,
@@ -233,7 +233,7 @@ def staged(
     )
 
 
-def view(recipe: schema.View, results: SolvedSet, photo: str, out: Path, report: Report) -> None:
+def view(recipe: kinds.ViewRecipe, results: SolvedSet, photo: str, out: Path, report: Report) -> None:
     """Write the objects alone, from another view.
 
     Args:
@@ -246,11 +246,11 @@ def view(recipe: schema.View, results: SolvedSet, photo: str, out: Path, report:
     report(0)
     scene = resized(results.scene(photo, recipe.sun, recipe.denoise), recipe.width)
     traced = staged(recipe, results, photo, scene, recipe.azimuth, recipe.elevation, recipe.zoom)
-    _write_alone(out / photo, Traced(traced, results.tone(photo)))
+    _write_alone(out / photo, TracedPicture(traced, results.tone(photo)))
 
 
 def animation(
-    recipe: schema.Turntable | schema.MovingLight, results: SolvedSet, photo: str, out: Path, report: Report
+    recipe: kinds.TurntableRecipe | kinds.MovingLightRecipe, results: SolvedSet, photo: str, out: Path, report: Report
 ) -> None:
     """Write an animation in which the camera or the light turns once.
 
@@ -268,12 +268,12 @@ def animation(
     for k in range(recipe.frames):
         report(k / recipe.frames)
         degrees = 360 * k / recipe.frames
-        if isinstance(recipe, schema.Turntable):
+        if isinstance(recipe, kinds.TurntableRecipe):
             traced = staged(recipe, results, photo, scene, degrees)
         else:
             turned = msgspec.structs.replace(scene, light=turned_light(scene.light, degrees))
             traced = traced_photo(turned, recipe.samples)
-        pixels.append(Traced(traced, results.tone(photo)).rgba())
+        pixels.append(TracedPicture(traced, results.tone(photo)).rgba())
     (out / photo).mkdir(parents=True)
     for k, each in enumerate(pixels):
         write_png(out / photo / f"{k:03}.png", each)
@@ -281,7 +281,7 @@ def animation(
     write_mp4(out / f"{photo}.mp4", pixels, recipe.seconds)
 
 
-def relight(recipe: schema.Relight, results: SolvedSet, photo: str, out: Path, report: Report) -> None:
+def relight(recipe: kinds.RelightRecipe, results: SolvedSet, photo: str, out: Path, report: Report) -> None:
     """Write the objects in the lights of other photos or of files.
 
     The light of a photo comes with that photo's tone curve.  The light of a file is exposed for the objects.
@@ -299,22 +299,22 @@ def relight(recipe: schema.Relight, results: SolvedSet, photo: str, out: Path, r
         report(k / len(lights))
         lit = msgspec.structs.replace(scene, light=turned_light(results.light(name), recipe.rotate))
         traced = staged(recipe, results, photo, lit, 0.0)
-        shown = Traced(traced).exposed() if is_light_file(name) else Traced(traced, results.tone(name))
+        shown = TracedPicture(traced).exposed() if is_light_file(name) else TracedPicture(traced, results.tone(name))
         _write_alone(out / photo / Path(name).stem, shown)
 
 
 DRAWN: dict[type, Callable[[Any, SolvedSet, str, Path, Report], dict[str, Any] | None]] = {
-    schema.Resynthesis: resynthesis,
-    schema.Transfer: resynthesis,
-    schema.Insert: insertion,
-    schema.View: view,
-    schema.Turntable: animation,
-    schema.MovingLight: animation,
-    schema.Relight: relight,
+    kinds.ResynthesisRecipe: resynthesis,
+    kinds.TransferRecipe: resynthesis,
+    kinds.InsertRecipe: insertion,
+    kinds.ViewRecipe: view,
+    kinds.TurntableRecipe: animation,
+    kinds.MovingLightRecipe: animation,
+    kinds.RelightRecipe: relight,
 }
 
 
-def write_grid(recipe: schema.Grid, results: SolvedSet, out: Path, progress: Progress) -> None:
+def write_grid(recipe: kinds.GridRecipe, results: SolvedSet, out: Path, progress: Progress) -> None:
     """Write balls of materials (rows) in lights (columns), each column at one exposure.
 
     Args:
@@ -333,8 +333,8 @@ def write_grid(recipe: schema.Grid, results: SolvedSet, out: Path, progress: Pro
         for j, material in enumerate(materials):
             progress(k * len(materials) + j, total, f"{material}, {name}")
             balls.append(lit_ball(light, results.materials[material], recipe.size, recipe.samples, recipe.denoise))
-        columns.append(Traced(np.concatenate(balls)).exposed().pixels)
-    _write_alone(out / "grid", Traced(np.concatenate(columns, axis=1)))
+        columns.append(TracedPicture(np.concatenate(balls)).exposed().pixels)
+    _write_alone(out / "grid", TracedPicture(np.concatenate(columns, axis=1)))
     said = f"denoised: {denoiser()}\n" if recipe.denoise else ""
     write_text(out / "grid.txt", f"rows: {', '.join(materials)}\ncolumns: {', '.join(lights)}\n{said}")
     progress(total, total)
@@ -347,7 +347,7 @@ def _write(stem: Path, radiance: np.ndarray) -> None:
     write_png(stem.with_name(stem.name + ".png"), picture(radiance, 1.0))
 
 
-def _write_alone(stem: Path, traced: Traced) -> None:
+def _write_alone(stem: Path, traced: TracedPicture) -> None:
     """Write objects as EXR and PNG, transparent outside them."""
     stem.parent.mkdir(parents=True, exist_ok=True)
     traced.to_exr(stem.with_name(stem.name + ".exr"))

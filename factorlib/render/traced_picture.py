@@ -21,7 +21,7 @@ def as_it_is(radiance: Radiance) -> Radiance:
     return radiance
 
 
-class Traced(msgspec.Struct, frozen=True):
+class TracedPicture(msgspec.Struct, frozen=True):
     """A path-traced picture.
 
     Attributes:
@@ -48,9 +48,9 @@ class Traced(msgspec.Struct, frozen=True):
         """The display exposure for the covered pixels."""
         return exposure_of(self.shown, self.pixels[..., 3] > 0.5)
 
-    def exposed(self) -> Traced:
+    def exposed(self) -> TracedPicture:
         """Return the picture times its own exposure, without a tone curve."""
-        return Traced(self.pixels * np.array([self.exposure] * 3 + [1.0]))
+        return TracedPicture(self.pixels * np.array([self.exposure] * 3 + [1.0]))
 
     def over(self, photo: Radiance) -> Radiance:
         """Composite the picture, after its tone curve, over a photo."""

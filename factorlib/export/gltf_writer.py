@@ -27,7 +27,7 @@ from jaxtyping import Int
 from trimesh.visual.material import PBRMaterial
 from trimesh.visual.texture import TextureVisuals
 
-from factorlib.export.scene import Sun
+from factorlib.export.exported_scene import Sun
 from factorlib.jsonfile import write_json
 from factorlib.meshes.mesh import Mesh
 from factorlib.meshes.ply import submesh

@@ -20,7 +20,7 @@ DIRECT = 2  # max_depth of direct light alone
 ALL_BOUNCES = -1  # max_depth of all bounces
 
 
-class Shape(msgspec.Struct, frozen=True):
+class ExportedShape(msgspec.Struct, frozen=True):
     """A PLY file of one material, and its pose.
 
     Attributes:
@@ -81,7 +81,7 @@ def suns_of(lobes: Lobes, rotation: Float[np.ndarray, "3 3"]) -> list[Sun]:
     return [Sun(axis, energy) for axis, energy in zip(suns.axis @ rotation.T, energies, strict=True)]
 
 
-class Scene(msgspec.Struct, frozen=True):
+class ExportedScene(msgspec.Struct, frozen=True):
     """A photo's camera, shapes, materials and light.
 
     Attributes:
@@ -91,7 +91,7 @@ class Scene(msgspec.Struct, frozen=True):
     """
 
     camera: Camera
-    shapes: Sequence[Shape]
+    shapes: Sequence[ExportedShape]
     materials: Mapping[str, Reflectance]
     light: ExposedMap
     max_depth: int = DIRECT
