@@ -38,7 +38,7 @@ from factorlib.reading import check_plain
 from factorlib.recipe import kinds
 from factorlib.recipe.kinds import KINDS, AnyRecipe, is_light_file
 from factorlib.recipe.read import check_recipe, files_of
-from factorlib.render.photo_scene import DistantLight, PhotoScene, orbit, resized, traced_photo
+from factorlib.render.photo_scene import DistantLight, Orbit, PhotoScene, resized, traced_photo
 from factorlib.render.recipe_pictures import draw
 from factorlib.render.solved_set import SolvedSet
 from factorlib.render.traced_picture import TracedPicture, as_it_is
@@ -184,7 +184,7 @@ class Result:
         photo = self._photo(view)
         _check(kinds.ViewRecipe, azimuth=azimuth, elevation=elevation, zoom=zoom, width=width, samples=samples)
         scene = resized(self._solved.scene(photo), width)
-        traced = traced_photo(scene, samples, world_from_camera=orbit(scene, azimuth, elevation, zoom))
+        traced = traced_photo(scene, samples, Orbit(azimuth, elevation, zoom).world_from_camera(scene))
         return Picture(traced, self._solved.tone(photo), photo)
 
     def relight(

@@ -31,7 +31,7 @@ from factorlib.export.gltf_writer import variant_name, write_glb, write_suns
 from factorlib.export.materialx import materialx
 from factorlib.export.mesh_files import MeshFiles
 from factorlib.export.mitsuba import write_scene
-from factorlib.export.other_renderers import write_losses
+from factorlib.export.other_renderers import differences
 from factorlib.export.reflectance_limit import headroom_factor, table_in_gauge
 from factorlib.export.usd import SUFFIX, write_usd_scene
 from factorlib.images.exr import LAT_LONG, read_rgb_exr, write_hdr, write_rgb_exr
@@ -83,7 +83,7 @@ def main(params: Params, inputs: Inputs, out: Path, progress: Progress) -> None:
     write_json(out / "exposures.json", exposures)
     write_lobes(out / "lobes.parquet", lobes)
     write_text(out / "materials.mtlx", materialx(materials))
-    write_losses(out / "losses.json", materials)
+    write_json(out / "losses.json", {name: differences(material) for name, material in materials.items()})
     _write_dataset(out, inputs)
     for folder in ("illumination", "coverage", "meshes", "scenes/light", "scenes/meshes"):
         (out / folder).mkdir(parents=True)

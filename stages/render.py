@@ -92,11 +92,12 @@ def surroundings(inputs: Inputs, model: Model, gauge: Gauge) -> Surroundings | N
     """
     if not (model.self_shadowing or model.distance):
         return None
-    seen = on_surface(read_observations(inputs["urm"] / f"{inputs.photo}.parquet"), inputs.folders.get("surface"))
+    table = read_observations(inputs["urm"] / f"{inputs.photo}.parquet")
+    table = on_surface(table, inputs.folders.get("surface"))
     if not model.self_shadowing:
-        seen = msgspec.structs.replace(seen, visibility=None, met=None)
-    sent = bounced_light(seen, seen.radiance.astype(float)) if model.interreflection else None
-    return Surroundings(seen, None if sent is None else sent / (gauge.export_factor or 1.0))
+        table = msgspec.structs.replace(table, visibility=None, met=None)
+    bounced = bounced_light(table, table.radiance.astype(float)) if model.interreflection else None
+    return Surroundings(table, None if bounced is None else bounced / (gauge.export_factor or 1.0))
 
 
 def _write(stem: Path, radiance: np.ndarray, exposure: float, ball: bool, observed: np.ndarray | None = None) -> None:

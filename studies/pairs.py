@@ -50,7 +50,7 @@ from factorlib.recipe.kinds import InsertRecipe
 from factorlib.render.ground import Plane
 from factorlib.render.insertion import GroundSurface, InsertionResult, inserted
 from factorlib.render.photo_scene import DistantLight, PlacedMesh
-from factorlib.render.recipe_pictures import standing
+from factorlib.render.recipe_pictures import insertion_scene
 from factorlib.render.solved_set import SolvedSet
 from factorlib.results.materials import Reflectance
 from factorlib.results.poses import AS_IT_IS
@@ -140,7 +140,7 @@ def chosen(sets: Mapping[str, Sets], count: int, samples: int, seed: int) -> Ite
             size, turn = rng.uniform((0.3, 0.0), (0.5, 360.0)).tolist()
             recipe = InsertRecipe(**what, at=tuple(at.tolist()), size=size, turn=turn, samples=samples)
             try:
-                if any(standing(recipe, of, photo).moved for of in sets[name]):
+                if any(insertion_scene(recipe, of, photo).moved for of in sets[name]):
                     continue
             except InputError:
                 continue
@@ -155,8 +155,8 @@ def drawn(photo: str, recipe: InsertRecipe, recovered: SolvedSet, truth: SolvedS
 
     The second value is how they differ (`scores`).
     """
-    sets, ours = {True: recovered, False: truth}, standing(recipe, recovered, photo)
-    true, factor = standing(recipe, truth, photo), factor_of(recovered.materials, truth.materials)
+    sets, ours = {True: recovered, False: truth}, insertion_scene(recipe, recovered, photo)
+    true, factor = insertion_scene(recipe, truth, photo), factor_of(recovered.materials, truth.materials)
     materials = {name: times(m, factor) for name, m in ours.scene.materials.items()}
     scene = replace(ours.scene, materials=materials, light=ours.scene.light.scaled(1 / factor))
     places = {True: replace(ours, scene=scene), False: true}
@@ -173,7 +173,7 @@ def drawn(photo: str, recipe: InsertRecipe, recovered: SolvedSet, truth: SolvedS
         lit = {"light": places[light].scene.light, "materials": places[material].scene.materials}
         scene = replace(here.scene, camera=here.scene.camera.window(left, top, 1.0, width, height), **lit)
         covered = recovered.covered(photo)[window]
-        found = inserted(replace(here, scene=scene), seen, covered, recipe.samples, seed=seed, compared=False)
+        found = inserted(replace(here, scene=scene), seen, covered, recipe.samples, seed=seed)
         return sets[light].tone(photo)(found.composite), found
 
     (mine, found), (right, other) = traced(True, True, True), traced(False, False, False)

@@ -14,7 +14,7 @@ from factorlib.results.materials import Reflectance
 from factorlib.results.poses import ObjectPose
 from factorlib.results.surface import read_surface
 from factorlib.stage import Inputs
-from factorlib.tracing.scene import paint
+from factorlib.tracing.scene import paint, rigid
 
 
 class MeshFiles:
@@ -39,8 +39,8 @@ class MeshFiles:
         self.scenes = scenes
         self.materials = materials
         self.solved = solved
-        own = read_surface(inputs.folders.get("surface"))
-        self.read = MeshesOnce(inputs.mesh, materials, crease_deg, own.displacements, own.log_factors)
+        surface = read_surface(inputs.folders.get("surface"))
+        self.read = MeshesOnce(inputs.mesh, materials, crease_deg, surface.displacements, surface.log_factors)
         self._stems: dict[tuple, str] = {}  # file names up to the material, relative to the scenes
 
     def shapes(
@@ -57,9 +57,7 @@ class MeshFiles:
         """
         mesh = self.read.mesh(obj.mesh, meshes[obj.mesh], obj.materials)
         pose = poses[obj.name]
-        place = np.eye(4)
-        place[:3, :3] = np.array(pose.rotation) * pose.scale
-        place[:3, 3] = pose.translation
+        cam_from_object = rigid(np.array(pose.rotation) * pose.scale, pose.translation)
         names = {label: self.materials[label - 1] for label in mesh.labels}
         key = (obj.mesh, *sorted(obj.materials.items()))
         if key not in self._stems:
@@ -75,5 +73,6 @@ class MeshFiles:
         stem = self._stems[key]
         painted = mesh.detail is not None
         return [
-            ExportedShape(f"{obj.name}.{m}", f"{stem}.{m}.ply", m, place, mesh.open, painted) for m in names.values()
+            ExportedShape(f"{obj.name}.{name}", f"{stem}.{name}.ply", name, cam_from_object, mesh.open, painted)
+            for name in names.values()
         ]

@@ -24,7 +24,7 @@ from factorlib.geometry.raster import rasterise
 from factorlib.meshes.mesh import smooth
 from factorlib.meshes.ply import submesh
 from factorlib.results.materials import Reflectance
-from factorlib.tracing.scene import bsdf, envmap, light_seen, look, rigid, shape, traced, transform
+from factorlib.tracing.scene import bsdf, envmap, incident_light, look, rigid, shape, traced, transform
 from factorlib.yamlfile import read_yaml
 
 Progress = Callable[[int, int, str], None]
@@ -218,7 +218,7 @@ def write_shot(out: Path, scene: Scene, materials: dict[str, Reflectance], param
     place = rigid(turn, (0, SET.middle - EYE, 0))
     rows = parameters.light_rows
     spp = parameters.light_spp
-    light = light_seen(scene.surroundings, place, rows, spp, seed, depth)
+    light = incident_light(scene.surroundings, place, rows, spp, seed, depth)
     around = scene.surroundings
     if parameters.distant:
         around = {"light": envmap(light) | {"to_world": transform(rigid(turn, (0, 0, 0)))}}

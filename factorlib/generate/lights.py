@@ -16,7 +16,7 @@ from jaxtyping import Float
 from factorlib.errors import InputError
 from factorlib.images.light_map import read_light_map
 from factorlib.results.materials import Reflectance, vec3
-from factorlib.tracing.scene import envmap, light_seen, rgb, transform
+from factorlib.tracing.scene import envmap, incident_light, rgb, transform
 from factorlib.tracing.variant import mitsuba
 
 EYE = 1.2  # height of the origin above the ground
@@ -82,7 +82,7 @@ def daylight(rng: Rng, elevation_deg: float, azimuth_deg: float, turbidity: floa
         "sun_direction": [float(c) for c in sun],
         "to_world": transform(Y_UP_FROM_Z_UP),
     }
-    seen = light_seen({"sky": sky}, np.eye(4), rows, 4, 0, max_depth=2)
+    seen = incident_light({"sky": sky}, np.eye(4), rows, 4, 0, max_depth=2)
     scene = {"sky": envmap(seen, finer=2), "ground": wall("-y", EYE, (200, 200), GROUND)}
     for k in range(4):  # coloured blocks some metres away, none in front of the sun
         angle = np.radians(azimuth_deg + 60 + 80 * k + rng.uniform(-20, 20))

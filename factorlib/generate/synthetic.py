@@ -24,7 +24,7 @@ from factorlib.geometry.raster import rasterise
 from factorlib.meshes.mesh import Mesh
 from factorlib.meshes.ply import write_ply
 from factorlib.results.materials import Reflectance
-from factorlib.tracing.scene import bsdf, envmap, light_seen, look, rendered, rigid, sensor, shape
+from factorlib.tracing.scene import bsdf, envmap, incident_light, look, rendered, rigid, sensor, shape
 
 Progress = Callable[[int, int, str], None]
 DISTANCE = 5.0
@@ -186,7 +186,7 @@ def light_of(
         up = rng.uniform(30, 50)
         turn = rng.choice([-1, 1]) * rng.uniform(35, 70)
         scene = daylight(rng, up, forward + 180 + turn, rows=2 * rows)
-    return light_seen(scene, rigid(world_from_camera @ YUP_FROM_CAMERA, (0, 0, 0)), rows, spp, seed)
+    return incident_light(scene, rigid(world_from_camera @ YUP_FROM_CAMERA, (0, 0, 0)), rows, spp, seed)
 
 
 def placements(shot: Shot, world_from_camera: Rotation, rng: np.random.Generator, spread: float) -> dict[str, Pose]:

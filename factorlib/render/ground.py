@@ -25,7 +25,7 @@ class Plane(msgspec.Struct, frozen=True):
     point: Float[np.ndarray, "3"]
 
     @property
-    def seen_from_above(self) -> bool:
+    def below_camera(self) -> bool:
         """True if the camera, at the origin, is on the objects' side of the plane."""
         return float(self.point @ self.normal) < 0
 
@@ -63,8 +63,8 @@ def resting_plane(placed: PlacedMesh, uprights: Float[np.ndarray, "k 3"] | None 
     normals = poses[:, 2, :3]  # z of the resting pose, in the object's frame
     upright = (normals @ uprights.T).mean(axis=1) > np.cos(np.radians(MOST_TILT_DEG))
     if not upright.any():
-        found = f"the object '{placed.name}' rests on no side that looks down in its photos"
-        raise InputError(found, key="beside", cure="name another object, or give the photo's `ground` in dataset.yaml")
+        fault = f"no stable pose of the object '{placed.name}' is upright in its photos, so its ground is unknown"
+        raise InputError(fault, key="beside", cure="name another object, or give the photo's `ground` in dataset.yaml")
     # the likeliest pose among the upright ones; the plane touches the lowest vertex
     normal = rotation @ normals[np.argmax(np.where(upright, chances, -1))]
     lowest = placed.vertices[np.argmin(placed.vertices @ normal)]

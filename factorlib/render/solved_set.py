@@ -54,12 +54,12 @@ class SolvedSet:
         self.table: MaterialTable = read_materials(file)
         for name, material in self.table.materials.items():
             if material.total > 1:
-                found = f"max diffuse + max specular = {material.total:.4g}: more light is reflected than arrives"
-                raise InputError(found, file=file, key=f"materials.{name}", cure="run the stage `export` again")
+                fault = f"max diffuse + max specular = {material.total:.4g}: more light is reflected than arrives"
+                raise InputError(fault, file=file, key=f"materials.{name}", cure="run the stage `export` again")
         self.materials = reflectances(self.table)
         self.photos = list(self.objects)
-        own = read_surface(inputs.folders.get("surface"))
-        self._meshes = MeshesOnce(inputs.mesh, self.names, crease_deg, own.displacements, own.log_factors)
+        surface = read_surface(inputs.folders.get("surface"))
+        self._meshes = MeshesOnce(inputs.mesh, self.names, crease_deg, surface.displacements, surface.log_factors)
         self._pixels: dict[str, dict[str, np.ndarray]] = {}
 
     def scene(self, photo: str, sun: AssumedSun | None = None, denoise: bool = False) -> PhotoScene:
@@ -76,13 +76,13 @@ class SolvedSet:
         poses = self.poses[photo]
         objects = self.objects[photo]
         if not objects.objects:
-            found = f"photo '{photo}' has no objects to draw"
+            fault = f"photo '{photo}' has no objects to render"
             cure = "name other photos in the recipe"
-            raise InputError(found, key=f"photos.{photo}.objects", cure=cure)
+            raise InputError(fault, key=f"photos.{photo}.objects", cure=cure)
         for obj in objects.objects:
             if poses.objects[obj.name].left_out:
-                words = "%s: the pose of '%s' was too doubtful to solve with, and so is its place in pictures: %s"
-                log.warning(words, photo, obj.name, "; ".join(poses.objects[obj.name].doubts))
+                text = "%s: the pose of '%s' is doubtful, so the solve left it out, and pictures may misplace it: %s"
+                log.warning(text, photo, obj.name, "; ".join(poses.objects[obj.name].doubts))
         height, width = self._masks(photo)["label"].shape
         camera = poses.camera.camera(width, height)
         placed = tuple(self._placed(obj, objects.meshes[obj.mesh], poses) for obj in objects.objects)
@@ -109,14 +109,14 @@ class SolvedSet:
         tone = self.table.model.tone.get(photo)
         return straightened(self.photo(photo), tone.exponent, tone.pivot) if tone else self.photo(photo)
 
-    def pixel(self, photo: str, at: tuple[float, float]) -> tuple[float, float]:
+    def pixel(self, photo: str, pixel: tuple[float, float]) -> tuple[float, float]:
         """Convert a pixel of the photo to pixels of the picture from `masks`; InputError if it lies outside."""
         height, width = self._masks(photo)["label"].shape
         factor = self.poses[photo].camera.factor
-        if not (0 <= at[0] <= factor * width and 0 <= at[1] <= factor * height):
-            found = f"pixel {at} is not in photo '{photo}', of {factor * width} × {factor * height} pixels"
-            raise InputError(found, key="at", cure="name one that shows the ground")
-        return at[0] / factor, at[1] / factor
+        if not (0 <= pixel[0] <= factor * width and 0 <= pixel[1] <= factor * height):
+            fault = f"pixel {pixel} lies outside photo '{photo}', of {factor * width} × {factor * height} pixels"
+            raise InputError(fault, key="at", cure="name a pixel that shows the ground")
+        return pixel[0] / factor, pixel[1] / factor
 
     def covered(self, photo: str) -> Bool[np.ndarray, "h w"]:
         """Return a mask of the pixels that are not background."""
@@ -134,12 +134,12 @@ class SolvedSet:
             return read_light_map(self.inputs.file(f"recipe file:{name}"))
         return light_of(self.inputs["export"], name, self.lights[name])
 
-    def known(self, table: str | None) -> dict[str, Reflectance]:
+    def with_table(self, table: str | None) -> dict[str, Reflectance]:
         """Return the solved materials, replaced and extended by those of a table file."""
         if table is None:
             return self.materials
-        own = read_table(self.inputs.file(f"recipe file:{table}")).items()
-        return self.materials | {name: Reflectance(m.diffuse, m.specular, m.roughness) for name, m in own}
+        entries = read_table(self.inputs.file(f"recipe file:{table}")).items()
+        return self.materials | {name: Reflectance(m.diffuse, m.specular, m.roughness) for name, m in entries}
 
     def ground(self, photo: str, neighbour: PlacedMesh) -> GroundSurface:
         """Return the ground given with the photo, or the plane that the neighbour rests on."""
@@ -169,40 +169,47 @@ class SolvedSet:
             InputError: The mesh does not exist or has no height, or lacks a material to be replaced.
         """
         upward = np.eye(3)["xyz".index(up)]
-        wanted = material if isinstance(material, str) else self.names[0]
-        materials: tuple[str, ...] = (wanted,)
+        first = material if isinstance(material, str) else self.names[0]
+        materials: tuple[str, ...] = (first,)
         if name == BALL:
             mesh = sphere(1.0)
         elif is_mesh_file(name):
             file = self.inputs.file(f"recipe file:{name}")
-            mesh = read_mesh(file, [wanted], wanted, {}, self._meshes.crease_deg)
-        elif not (shown := self._objects_of(name)):
-            known = [BALL, *sorted({obj.mesh for each in self.objects.values() for obj in each.objects})]
-            raise InputError(f"there is no mesh {name!r}", key="mesh", cure=did_you_mean(name, known))
+            mesh = read_mesh(file, [first], first, {}, self._meshes.crease_deg)
         else:
-            # The mesh's own materials come first, then those of each object; the first that has all `asked` is taken.
-            plain = [(p, msgspec.structs.replace(obj, materials={})) for p, obj in shown[:1]]
-            each = [(p, self._placed(obj, self.objects[p].meshes[name], self.poses[p])) for p, obj in plain + shown]
-            asked = set(material) if isinstance(material, dict) else set()
-            worn = [{self.names[label - 1] for label in one.mesh.labels} for _, one in each]
-            suited = [one for one, has in zip(each, worn, strict=True) if asked <= has]
-            photo, placed = (suited or each)[0]
+            photo, placed = self._placed_with(name, set(material) if isinstance(material, dict) else set())
             upward = placed.world_from_object[:3, :3].T @ self.ground(photo, placed).plane.normal
             mesh = placed.mesh
             materials = placed.materials
             if isinstance(material, str):
                 materials = (material,) * len(materials)
             elif material is not None:
-                if not suited:
-                    has = set().union(*worn)
-                    found = f"no {name!r} has the materials {', '.join(sorted(asked))}"
-                    wrong = min(asked - has, default=min(asked))
-                    raise InputError(found, key="material", cure=did_you_mean(wrong, sorted(has)))
                 materials = tuple(material.get(each, each) for each in materials)
         if np.ptp(mesh.vertices @ upward) < LEAST_HEIGHT * mesh.radius:
             cure = "say which axis of the file points upward, as in `up: z`, or name a mesh that is not flat"
             raise InputError(f"the mesh {name!r} has no height", key="mesh", cure=cure)
         return mesh, materials, upward
+
+    def _placed_with(self, name: str, required: set[str]) -> tuple[str, PlacedMesh]:
+        """Return the first photo with an object of a mesh that has the required materials, and that object.
+
+        The mesh with its materials of `meshes` comes first, then every object of it with its own.
+        """
+        objects = self._objects_of(name)
+        if not objects:
+            known = [BALL, *sorted({obj.mesh for each in self.objects.values() for obj in each.objects})]
+            raise InputError(f"there is no mesh {name!r}", key="mesh", cure=did_you_mean(name, known))
+        plain = [(photo, msgspec.structs.replace(obj, materials={})) for photo, obj in objects[:1]]
+        present: set[str] = set()
+        for photo, obj in plain + objects:
+            placed = self._placed(obj, self.objects[photo].meshes[name], self.poses[photo])
+            materials = {self.names[label - 1] for label in placed.mesh.labels}
+            if required <= materials:
+                return photo, placed
+            present |= materials
+        fault = f"no object of the mesh {name!r} has the materials {', '.join(sorted(required))}"
+        wrong = min(required - present, default=min(required))
+        raise InputError(fault, key="material", cure=did_you_mean(wrong, sorted(present)))
 
     def _objects_of(self, mesh: str) -> list[tuple[str, ObjectEntry]]:
         """Return all objects of a mesh with their photos, sorted by photo name, independent of dataset.yaml's order."""

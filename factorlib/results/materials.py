@@ -43,6 +43,16 @@ class Reflectance(msgspec.Struct, frozen=True):
         """The sum max k_d + max k_s."""
         return max(self.diffuse) + max(self.specular)
 
+    @property
+    def mixture(self) -> tuple[float, Vec3, Vec3]:
+        """The weight w of the specular part in a blend of two BSDFs, and their colours k_d/(1 − w) and k_s/w.
+
+        A part of weight 0 is black.
+        """
+        weight = max(self.specular) / self.total if self.total > 0 else 0.0
+        diffuse = vec3(value / (1 - weight) if weight < 1 else 0.0 for value in self.diffuse)
+        return weight, diffuse, vec3(value / weight if weight > 0 else 0.0 for value in self.specular)
+
 
 class StandardErrors(msgspec.Struct, frozen=True):
     """Standard errors of a reflectance, in the gauge that the file's `gauge.stderr` names."""

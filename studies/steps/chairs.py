@@ -138,7 +138,7 @@ def predicted(
     reflectances = in_order(answer, list(table.materials), folder / "materials.json")
     alone = {**channels, "label": np.where(chair.mask, channels["label"], 0.0)}
     reflector = Reflector(reflection_operator("network"), lobes, curvature=answer.model.curvature(photo))
-    image = resynthesised(reflector, reflectances, alone, geometry, around=around)
+    image = resynthesised(reflector, reflectances, alone, geometry, surroundings=around)
     tone = answer.model.tone.get(photo)
     return shown(image, tone.exponent, tone.pivot) if tone else image
 

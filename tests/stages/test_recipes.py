@@ -84,7 +84,7 @@ def test_a_part_of_an_inserted_mesh_gets_another_material_and_the_rest_keeps_its
     results = SolvedSet(grounded)
     mesh, materials, _ = results.mesh("egg", {"brass": "unseen"}, "y")
     assert [materials[label - 1] for label in mesh.labels] == ["red", "unseen"]
-    with pytest.raises(InputError, match="no 'egg' has the materials unseen") as error:
+    with pytest.raises(InputError, match="no object of the mesh 'egg' has the materials unseen") as error:
         results.mesh("egg", {"unseen": "red"}, "y")
     assert error.value.key == "material"
 
@@ -131,7 +131,7 @@ def test_the_light_of_a_file_is_used_as_it_lies(made, tmp_path):
 def test_a_photo_without_objects_is_refused_or_left_out_with_a_warning_where_nobody_named_it(made, tmp_path, caplog):
     nothing = {"camera": {}, "objects": [], "meshes": {}}
     some = changed(made, "dataset.objects", {**made.facts["dataset.objects"], "front": nothing})
-    with pytest.raises(InputError, match="'front' has no objects to draw"):
+    with pytest.raises(InputError, match="'front' has no objects to render"):
         drawn(some, tmp_path / "named", kinds.ResynthesisRecipe(photos=["front"]))
     assert sorted(drawn(some, tmp_path / "out", kinds.ResynthesisRecipe(samples=1))) == PICTURES["side"]
     assert "front: left out" in caplog.text

@@ -42,5 +42,5 @@ def test_the_light_seen_is_the_light_there():
     """A map, seen from inside by six cameras in a turned frame, comes back as that map turned."""
     light = smooth_light(16)
     turn = tracing.look(20, 130) @ YUP_FROM_CAMERA
-    seen = tracing.light_seen({"light": tracing.envmap(light)}, tracing.rigid(turn, (0, 0, 0)), 16, 4, 1)
+    seen = tracing.incident_light({"light": tracing.envmap(light)}, tracing.rigid(turn, (0, 0, 0)), 16, 4, 1)
     assert seen == pytest.approx(sampled(light, lat_long_directions(16, 32) @ turn.T), rel=0.02, abs=0.05)
