@@ -55,19 +55,19 @@ def main(params: Params, inputs: Inputs, out: Path, progress: Progress) -> None:
     done = count()
     total = 2 * len(lights) + (len(MISSING) if truth else 0) + 1
 
-    def shot(name: str) -> ComparedPhoto:
+    def read_photo(name: str) -> ComparedPhoto:
         """Return a photo and its re-synthesis; `compare_photos` reads each twice."""
         progress(next(done), total, f"re-synthesis of {name}")
         photo = read_exr(inputs["masks"] / f"{name}.exr")
         geometry = read_geometry(inputs["align"], inputs.folders.get("surface"), name)
         return compared_photo(photo, geometry, read_rgb_exr(inputs["render"] / "resynthesis" / f"{name}.exr"))
 
-    resynthesis = compare_photos(lights, materials, shot)
+    resynthesis = compare_photos(lights, materials, read_photo)
     # observed materials of each light, and the connected components of the graph of materials and lights
-    seen: dict[str, list[str]] = {slice_.illumination: [] for slice_ in lights.values()}
+    observed: dict[str, dict[str, None]] = {slice_.illumination: {} for slice_ in lights.values()}
     for name, photo in resynthesis.photos.items():
-        row = seen[lights[name].illumination]
-        row.extend(m for m in photo.materials if m not in row)
+        observed[lights[name].illumination] |= dict.fromkeys(photo.materials)
+    seen = {light: list(names) for light, names in observed.items()}
     component = connected_components({light: names for light, names in seen.items() if names})
     sections = dict.fromkeys(MISSING)
     if truth:

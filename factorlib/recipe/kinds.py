@@ -233,7 +233,7 @@ def read_table(path: Path) -> dict[str, TableMaterial]:
         content = msgspec.json.decode(text)
     materials = content.get("materials") if isinstance(content, dict) else None
     if not isinstance(materials, dict) or not materials:
-        raise InputError("it holds no materials", file=path, key="materials", cure=CURE)
+        raise InputError("the table has no materials", file=path, key="materials", cure=CURE)
     table = {}
     for name, entry in materials.items():
         key = f"materials.{name}"
@@ -243,6 +243,6 @@ def read_table(path: Path) -> dict[str, TableMaterial]:
             raise InputError(str(error), file=path, key=key, cure=CURE) from None
         total = max(table[name].diffuse) + max(table[name].specular)
         if total > MOST_REFLECTED:
-            found = f"max diffuse + max specular = {total:.3f}: more light is reflected than arrives"
-            raise InputError(found, file=path, key=key, cure=f"at most {MOST_REFLECTED}")
+            fault = f"max diffuse + max specular = {total:.3f}: more light is reflected than arrives"
+            raise InputError(fault, file=path, key=key, cure=f"reduce the sum to at most {MOST_REFLECTED}")
     return table
