@@ -19,7 +19,7 @@ from factorlib.evaluate.material_errors import compare_materials
 from factorlib.evaluate.photo_errors import ComparedPhoto, compare_photos, compared_photo
 from factorlib.evaluate.relighting import compare_relighting, compare_relit_set
 from factorlib.evaluate.truth import read_true_light, read_true_normals
-from factorlib.evaluate.verdict import VerdictInputs, ball_changes, text_of, verdict
+from factorlib.evaluate.verdict import VerdictInputs, ball_changes, verdict, verdict_text
 from factorlib.images.exr import LAT_LONG, read_exr, read_rgb_exr, write_rgb_exr
 from factorlib.jsonfile import write_json
 from factorlib.results.materials import Reflectance, read_materials, read_uncertainty, reflectances
@@ -32,7 +32,7 @@ from factorlib.urm.geometry import read_geometry
 from factorlib.wholefile import write_text
 
 NO_TRUTH = "the dataset names no truth"
-NOTHING_SHOWN = "no photo shows a material"
+NO_MATERIAL = "no photo shows a material"
 MISSING = {
     "materials": "the truth says nothing about materials that were seen",
     "relighting": "the truth lacks materials or lights",
@@ -64,11 +64,11 @@ def main(params: Params, inputs: Inputs, out: Path, progress: Progress) -> None:
 
     resynthesis = compare_photos(lights, materials, read_photo)
     # observed materials of each light, and the connected components of the graph of materials and lights
-    observed: dict[str, dict[str, None]] = {slice_.illumination: {} for slice_ in lights.values()}
+    unique: dict[str, dict[str, None]] = {slice_.illumination: {} for slice_ in lights.values()}
     for name, photo in resynthesis.photos.items():
-        observed[lights[name].illumination] |= dict.fromkeys(photo.materials)
-    seen = {light: list(names) for light, names in observed.items()}
-    component = connected_components({light: names for light, names in seen.items() if names})
+        unique[lights[name].illumination] |= dict.fromkeys(photo.materials)
+    observed = {light: list(names) for light, names in unique.items()}
+    component = connected_components({light: names for light, names in observed.items() if names})
     sections = dict.fromkeys(MISSING)
     if truth:
         true = {n: Reflectance(m.diffuse, m.specular, m.roughness) for n, m in truth.materials.items()}
@@ -76,7 +76,7 @@ def main(params: Params, inputs: Inputs, out: Path, progress: Progress) -> None:
         true_lights, estimated_lights = _lights(inputs, truth, out)
         compute = {
             "materials": lambda: compare_materials(estimates, true, component),
-            "relighting": lambda: compare_relighting(estimates, true, estimated_lights, true_lights, seen),
+            "relighting": lambda: compare_relighting(estimates, true, estimated_lights, true_lights, observed),
             "relit_set": lambda: compare_relit_set(estimates, true, estimated_lights, true_lights),
             "light": lambda: compare_lights(estimated_lights, true_lights, _mirrored(inputs, lights)),
             "normals": lambda: _normals(inputs, truth, lights),
@@ -86,34 +86,34 @@ def main(params: Params, inputs: Inputs, out: Path, progress: Progress) -> None:
             progress(next(done), total, name)
             sections[name] = section()
     progress(next(done), total, "verdict")
-    sections["verdict"] = _verdict(inputs, seen)
-    counts = Counts(len(lights), len(materials), len(seen), len(set(component.values())))
+    sections["verdict"] = _verdict(inputs, observed)
+    counts = Counts(len(lights), len(materials), len(observed), len(set(component.values())))
     reasons = {name: why if truth else NO_TRUTH for name, why in MISSING.items() if not sections[name]}
     if not sections["verdict"]:
-        reasons["verdict"] = NOTHING_SHOWN
+        reasons["verdict"] = NO_MATERIAL
     write_json(out / "metrics.json", Metrics(set=counts, resynthesis=resynthesis, **sections, reasons=reasons))
     if sections["verdict"]:
-        write_text(out / "verdict.txt", text_of(sections["verdict"]))
+        write_text(out / "verdict.txt", verdict_text(sections["verdict"]))
     progress(total, total)
 
 
-def _verdict(inputs: Inputs, seen: dict[str, list[str]]) -> Verdict | None:
+def _verdict(inputs: Inputs, observed: dict[str, list[str]]) -> Verdict | None:
     """Return the verdict on the result's reliability; None without observed materials.
 
     Args:
         inputs: Inputs of the stage.
-        seen: Names of the observed materials, by light.
+        observed: Names of the observed materials, by light.
     """
     table = read_materials(inputs["export"] / "materials.json")
     uncertainty = read_uncertainty(inputs["solve"] / "uncertainty.json")
-    shown = {m for names in seen.values() for m in names}
+    names_observed = {m for names in observed.values() for m in names}
     files = inputs["export"] / "illumination"
-    materials = {name: solved for name, solved in table.materials.items() if name in shown}
-    lights = {name: octahedral_light(read_rgb_exr(files / f"{name}.exr")) for name, names in seen.items() if names}
+    materials = {name: solved for name, solved in table.materials.items() if name in names_observed}
+    lights = {name: octahedral_light(read_rgb_exr(files / f"{name}.exr")) for name, names in observed.items() if names}
     if not (materials and uncertainty.photos):
         return None
     contours = {
-        photo: {name: own.contour_error for name, own in entry.objects.items() if own.contour_error is not None}
+        photo: {name: obj.contour_error for name, obj in entry.objects.items() if obj.contour_error is not None}
         for photo, entry in read_poses(inputs["align"] / "poses.json").items()
     }
     errors = ball_changes(materials, lights)
@@ -134,8 +134,8 @@ def _lights(
             for kind in ("illumination", "spheres"):
                 (out / kind).mkdir(exist_ok=True)
             write_rgb_exr(out / "illumination" / f"{name}.exr", read_rgb_exr(inputs.file(path)), LAT_LONG)
-            for which, light in (("truth", true[name]), ("estimate", estimated[name])):
-                write_rgb_exr(out / "spheres" / f"{name}_{which}.exr", sphere_row(light))
+            for kind, light in (("truth", true[name]), ("estimate", estimated[name])):
+                write_rgb_exr(out / "spheres" / f"{name}_{kind}.exr", sphere_row(light))
     return true, estimated
 
 

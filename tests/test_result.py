@@ -80,8 +80,8 @@ def test_a_folder_that_is_no_result_is_refused_with_those_that_are(folder, tmp_p
     for name, found, cure in [
         ("build/sett", "there is no result here", "did you mean 'build/set'"),
         ("data/set", "there is no result here", "build/set"),
-        ("build/set/export", "this lies inside a result", 'load_result("build/set")'),
-        ("build/set/export/materials.json", "this lies inside a result", 'load_result("build/set")'),
+        ("build/set/export", "this is a part of a result", 'load_result("build/set")'),
+        ("build/set/export/materials.json", "this is a part of a result", 'load_result("build/set")'),
         ("build/set/exprt", "there is no result here", "build/set"),
     ]:
         with pytest.raises(InputError, match=found) as error:

@@ -104,11 +104,13 @@ def texel_weights(
     below = np.minimum(level.astype(int), last - 1)
     row, column = _texel(direction)
     offsets = np.cumsum([0] + [(SIDE >> k) ** 2 for k in range(last + 1)])
-    at = [(offsets[k] + (row >> k) * (SIDE >> k) + (column >> k)).astype(np.int32) for k in (below, below + 1)]
+    texels = [(offsets[k] + (row >> k) * (SIDE >> k) + (column >> k)).astype(np.int32) for k in (below, below + 1)]
     share = level - below  # weight of the coarser level
     terms = np.hstack([weight * (1 - share), weight * share])
     starts = np.arange(len(terms) + 1) * terms.shape[1]
-    return csr_array((terms.astype(np.float32).ravel(), np.hstack(at).ravel(), starts), shape=(len(terms), offsets[-1]))
+    return csr_array(
+        (terms.astype(np.float32).ravel(), np.hstack(texels).ravel(), starts), shape=(len(terms), offsets[-1])
+    )
 
 
 def diffuse_lobe(normals: Float[np.ndarray, "n 3"]) -> Reflected:
@@ -158,8 +160,8 @@ def mirror_ball(light: OctahedralLight, normals: Float[np.ndarray, "n 3"], size:
         size: width of the ball in pixels; every pixel covers 16 / size² steradians of reflected directions
     """
     mirrored = 2 * normals[:, None, 2:] * normals[:, None] - VIEW
-    one = np.ones((len(normals), 1))
-    return texel_weights(mirrored, 16 / size**2 * one, one) @ light.texels
+    weight = np.ones((len(normals), 1))
+    return texel_weights(mirrored, 16 / size**2 * weight, weight) @ light.texels
 
 
 def ball(light: OctahedralLight, material: Reflectance, normals: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
@@ -237,8 +239,8 @@ def _texel(direction: Float[np.ndarray, "*n 3"]) -> tuple[Int[np.ndarray, "*n"],
 
 def octahedral_directions(side: int) -> Float[np.ndarray, "t 3"]:
     """Return the directions of the octahedral texels' centres, row by row: the inverse of `_texel`."""
-    at = (np.arange(side) + 0.5) / side * 2 - 1
-    v, u = (t.reshape(-1) for t in np.meshgrid(at, at, indexing="ij"))
+    centres = (np.arange(side) + 0.5) / side * 2 - 1
+    v, u = (t.reshape(-1) for t in np.meshgrid(centres, centres, indexing="ij"))
     inside = 1 - np.abs(u) - np.abs(v)
     radius = 1 - np.abs(inside)
     near = np.where(inside >= 0, np.abs(v), 1 - np.abs(u))

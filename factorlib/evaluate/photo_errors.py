@@ -88,7 +88,7 @@ def agreeing_pixels(photo: Channels, geometry: Channels) -> Bool[np.ndarray, "h 
 
 
 def compare_photos(
-    names: Iterable[str], materials: list[str], shot: Callable[[str], ComparedPhoto]
+    names: Iterable[str], materials: list[str], read: Callable[[str], ComparedPhoto]
 ) -> ResynthesisErrors:
     """Return the errors of all photos.
 
@@ -97,10 +97,10 @@ def compare_photos(
     Args:
         names: names of the photos
         materials: names by label, from 1
-        shot: reads a photo by name
+        read: reads a photo by name
     """
-    factors = _factors(list(names), shot)
-    photos = {name: _photo_errors(shot(name), materials, factor) for name, factor in factors.items()}
+    factors = _factors(list(names), read)
+    photos = {name: _photo_errors(read(name), materials, factor) for name, factor in factors.items()}
     scored = [p.gauges for p in photos.values() if p.gauges]
     if not scored:
         return ResynthesisErrors(photos, None, None, None)
@@ -109,47 +109,47 @@ def compare_photos(
     return ResynthesisErrors(photos, mean, *worst)
 
 
-def flat_materials(shot: ComparedPhoto) -> Picture:
+def flat_materials(photo: ComparedPhoto) -> Picture:
     """Return the null: every material of the photo in its mean colour."""
-    flat = np.zeros_like(shot.photo)
-    for label in np.unique(shot.label[shot.pixels]):
-        of_material = shot.pixels & (shot.label == label)
-        flat[of_material] = shot.photo[of_material].mean(axis=0)
+    flat = np.zeros_like(photo.photo)
+    for label in np.unique(photo.label[photo.pixels]):
+        pixels = photo.pixels & (photo.label == label)
+        flat[pixels] = photo.photo[pixels].mean(axis=0)
     return flat
 
 
-def _factors(names: list[str], shot: Callable[[str], ComparedPhoto]) -> dict[str, dict[str, Float[np.ndarray, "3"]]]:
+def _factors(names: list[str], read: Callable[[str], ComparedPhoto]) -> dict[str, dict[str, Float[np.ndarray, "3"]]]:
     estimates = []
     truths = []
     whites = []
     for name in names:
-        s = shot(name)
-        estimates.append(s.resynthesis[s.pixels])
-        truths.append(s.photo[s.pixels])
-        whites.append(s.white)
+        photo = read(name)
+        estimates.append(photo.resynthesis[photo.pixels])
+        truths.append(photo.photo[photo.pixels])
+        whites.append(photo.white)
     factors = gauge_factors(estimates, truths, whites, below_white=True)
     return {name: {g: factors[g][i] for g in GAUGES} for i, name in enumerate(names)}
 
 
-def _photo_errors(shot: ComparedPhoto, materials: list[str], factor: dict[str, Float[np.ndarray, "3"]]) -> PhotoErrors:
-    regions = {m: shot.pixels & (shot.label == k) for k, m in enumerate(materials, start=1)}
-    null = _scored(flat_materials(shot), shot, regions)
-    found = {g: _scored(shot.resynthesis * factor[g], shot, regions) for g in GAUGES}
+def _photo_errors(photo: ComparedPhoto, materials: list[str], factor: dict[str, Float[np.ndarray, "3"]]) -> PhotoErrors:
+    regions = {m: photo.pixels & (photo.label == k) for k, m in enumerate(materials, start=1)}
+    null = _scored(flat_materials(photo), photo, regions)
+    errors = {g: _scored(photo.resynthesis * factor[g], photo, regions) for g in GAUGES}
 
     def scores(region: str) -> dict[str, ScoredPicture]:
         """Return the scores of a region in each gauge."""
-        return {g: ScoredPicture(found[g][region], null[region]) for g in GAUGES}
+        return {g: ScoredPicture(errors[g][region], null[region]) for g in GAUGES}
 
     return PhotoErrors(
-        exposure=1 / shot.white,
-        **shot.counts,
-        clipped_satisfied=shot.clipped_satisfied,
+        exposure=1 / photo.white,
+        **photo.counts,
+        clipped_satisfied=photo.clipped_satisfied,
         factor={g: vec3(f) for g, f in factor.items()},
-        gauges=scores("") if shot.pixels.any() else None,
+        gauges=scores("") if photo.pixels.any() else None,
         materials={m: scores(m) for m in materials if regions[m].any()},
     )
 
 
-def _scored(estimate: Picture, shot: ComparedPhoto, regions: dict) -> dict[str, PictureError]:
+def _scored(estimate: Picture, photo: ComparedPhoto, regions: dict) -> dict[str, PictureError]:
     estimate = np.nan_to_num(estimate, posinf=0.0, neginf=0.0)
-    return picture_errors(estimate, shot.photo, {"": shot.pixels, **regions}, shot.white)
+    return picture_errors(estimate, photo.photo, {"": photo.pixels, **regions}, photo.white)

@@ -50,6 +50,6 @@ def write_scene_json(path: str | Path, scene: ExportedScene) -> None:
     )
 
 
-def _plain(of: ExportedShape | ExposedMap | Sun, *names: str) -> dict[str, Any]:
-    values = {name: getattr(of, name) for name in names}
+def _plain(item: ExportedShape | ExposedMap | Sun, *names: str) -> dict[str, Any]:
+    values = {name: getattr(item, name) for name in names}
     return {name: value.tolist() if isinstance(value, np.ndarray) else value for name, value in values.items()}

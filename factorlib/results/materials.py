@@ -260,8 +260,8 @@ def in_order(table: MaterialTable, names: Sequence[str], path: str | Path) -> li
     """
     for name in names:
         if name not in table.materials:
-            found = f"not the materials of this set: {name!r} is missing"
-            raise InputError(found, file=path, cure="run the stage `solve` again")
+            fault = f"the material {name!r} of the data set is missing"
+            raise InputError(fault, file=path, key="materials", cure="run the stage `solve` again")
     return [table.materials[name] for name in names]
 
 
@@ -271,5 +271,5 @@ def read_exposures(path: str | Path, cure: str = "") -> dict[str, Channels]:
     for photo, channels in exposures.items():
         if min(channels) <= 0:
             cure = cure or "run the stage `solve` again"
-            raise InputError("an exposure is not a positive number", file=path, key=photo, cure=cure)
+            raise InputError("an exposure is not positive", file=path, key=photo, cure=cure)
     return exposures

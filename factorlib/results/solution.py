@@ -59,7 +59,7 @@ def read_earlier(folder: Path) -> Earlier:
         finite = all(np.isfinite(part).all() for part in (light.axis, light.sharpness, light.weight))
         shaped = (light.sharpness > 0).all() and (np.linalg.norm(light.axis, axis=1) > 0.5).all()
         if not (finite and shaped and (light.weight >= 0).all()):
-            fault = f"illumination '{name}' has a lobe that is none: not finite, negative, or without axis"
+            fault = f"a lobe of illumination '{name}' is not finite, is negative, or has no axis"
     if fault:
-        raise InputError(f"no earlier solution to start from: {fault}", file=path, cure=CURE)
+        raise InputError(f"no solution to start from: {fault}", file=path, cure=CURE)
     return earlier

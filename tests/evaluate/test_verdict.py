@@ -8,7 +8,7 @@ import pytest
 
 from factorlib.evaluate.ball import ball, constant_light, octahedral_light
 from factorlib.evaluate.relighting import MEAN_SHOWN, NORMALS
-from factorlib.evaluate.verdict import GOOD, POOR, VerdictInputs, ball_changes, text_of, verdict
+from factorlib.evaluate.verdict import GOOD, POOR, VerdictInputs, ball_changes, verdict, verdict_text
 from factorlib.results.materials import Misfit, Reflectance, StandardErrors, solved
 from factorlib.results.metrics import Verdict
 from factorlib.runner.verbs import NO_TRUST
@@ -78,6 +78,6 @@ def test_a_materials_error_is_the_mean_square_of_what_random_errors_of_that_size
 
 def test_the_text_begins_with_the_word_that_the_runner_looks_for():
     spoilt = msgspec.structs.replace(CLEAN, unexplained=2.0)
-    first, *others = text_of(verdict(spoilt)).splitlines()
+    first, *others = verdict_text(verdict(spoilt)).splitlines()
     assert first.startswith(NO_TRUST) and NO_TRUST in get_args(get_type_hints(Verdict)["trust"])
     assert others[0].startswith("limited by: ") and others[-1].startswith("next: ")

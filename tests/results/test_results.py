@@ -81,6 +81,6 @@ def test_a_missing_material_is_named(tmp_path):
 def test_a_mirrored_pose_is_refused(tmp_path):
     mirrored = (EYE[0], EYE[1], (0.0, 0.0, -1.0))
     write_json(tmp_path / "a.json", PhotoPoses(HALL.camera, {"vase": ObjectPose(mirrored, (0.0, 0.0, 2.0))}))
-    with pytest.raises(InputError, match="no rotation and translation") as caught:
+    with pytest.raises(InputError, match="no rotation matrix") as caught:
         read_photo_poses(tmp_path / "a.json")
     assert caught.value.key == "objects.vase"
