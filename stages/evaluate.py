@@ -23,7 +23,7 @@ from factorlib.evaluate.verdict import VerdictInputs, ball_changes, verdict, ver
 from factorlib.images.exr import LAT_LONG, read_exr, read_rgb_exr, write_rgb_exr
 from factorlib.jsonfile import write_json
 from factorlib.results.materials import Reflectance, read_materials, read_uncertainty, reflectances
-from factorlib.results.metrics import Counts, Metrics, NormalError, PoseError, Verdict
+from factorlib.results.metrics import Counts, Metrics, NormalError, PoseError, ResynthesisErrors, Verdict
 from factorlib.results.photos import read_photos
 from factorlib.results.poses import read_poses
 from factorlib.stage import Inputs, Progress
@@ -63,11 +63,8 @@ def main(params: Params, inputs: Inputs, out: Path, progress: Progress) -> None:
         return compared_photo(photo, geometry, read_rgb_exr(inputs["render"] / "resynthesis" / f"{name}.exr"))
 
     resynthesis = compare_photos(lights, materials, read_photo)
-    # observed materials of each light, and the connected components of the graph of materials and lights
-    unique: dict[str, dict[str, None]] = {slice_.illumination: {} for slice_ in lights.values()}
-    for name, photo in resynthesis.photos.items():
-        unique[lights[name].illumination] |= dict.fromkeys(photo.materials)
-    observed = {light: list(names) for light, names in unique.items()}
+    # connected components of the graph of materials and lights
+    observed = _observed_materials(resynthesis, lights)
     component = connected_components({light: names for light, names in observed.items() if names})
     sections = dict.fromkeys(MISSING)
     if truth:
@@ -95,6 +92,14 @@ def main(params: Params, inputs: Inputs, out: Path, progress: Progress) -> None:
     if sections["verdict"]:
         write_text(out / "verdict.txt", verdict_text(sections["verdict"]))
     progress(total, total)
+
+
+def _observed_materials(resynthesis: ResynthesisErrors, lights: dict[str, LightSlice]) -> dict[str, list[str]]:
+    """Return the observed materials of each light."""
+    materials: dict[str, dict[str, None]] = {slice_.illumination: {} for slice_ in lights.values()}
+    for name, photo in resynthesis.photos.items():
+        materials[lights[name].illumination] |= dict.fromkeys(photo.materials)
+    return {light: list(names) for light, names in materials.items()}
 
 
 def _verdict(inputs: Inputs, observed: dict[str, list[str]]) -> Verdict | None:

@@ -24,7 +24,7 @@ from factorlib.geometry.raster import rasterise
 from factorlib.meshes.mesh import smooth
 from factorlib.meshes.ply import submesh
 from factorlib.results.materials import Reflectance
-from factorlib.tracing.scene import bsdf, envmap, incident_light, look, rigid, shape, traced, transform
+from factorlib.tracing.scene import bsdf, envmap, incident_light, look, rendered, rigid, sensor, shape, transform
 from factorlib.yamlfile import read_yaml
 
 Progress = Callable[[int, int, str], None]
@@ -228,7 +228,7 @@ def write_shot(out: Path, scene: Scene, materials: dict[str, Reflectance], param
         for label in mesh.labels
     }
     depth = 2 if parameters.direct else -1
-    radiance = traced(around | solids, camera, scene.world_from_camera, parameters.spp, seed, depth)
+    radiance = rendered(around | solids, sensor(camera, scene.world_from_camera), parameters.spp, seed, depth)
     on_chair = (labels > 0) & (labels < LEFT_OUT)
     # exposure that clips the share `clipped` of the chairs' pixels
     exposure = float(1 / np.quantile(radiance[on_chair].max(axis=-1), 1 - SET.clipped))

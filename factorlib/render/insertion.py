@@ -58,7 +58,7 @@ FEWEST = 100  # least number of pixels for a comparison of shadows
 # and 0.09.
 BELIEVED = 0.3
 GROUND = "+ground"
-STEPS = 5
+STEPS = 4
 NEW = "+"  # prefix of the new object and its materials: no name in dataset.yaml has it
 
 Picture = Float[np.ndarray, "h w 3"]
@@ -161,6 +161,7 @@ class InsertionRenderer:
         self.camera = sensor(scene.camera, rigid(YUP_FROM_CAMERA, np.zeros(3)), near=scene.near)
         self.light = light_entries(scene.light, scene.size)
         self.objects = shapes(scene.objects, scene.materials)
+        self.denoise = scene.denoise
         self.samples = samples
         self.seed = seed
 
@@ -205,38 +206,24 @@ def inserted(
     Raises:
         InputError: The new object is not visible.
     """
-    scene = insertion.scene
     spot = insertion.spot
     polish = insertion.ground.polish
     renderer = InsertionRenderer(insertion, samples, seed)
-    new = shapes([insertion.new], scene.materials)
-    coverage = _coverage(scene, insertion.new, renderer.camera, samples)
+    new = shapes([insertion.new], insertion.scene.materials)
+    coverage = _coverage(insertion.scene, insertion.new, renderer.camera, samples)
     if not coverage.any():
         fault = "the new object is invisible: it stands outside the picture, or other objects hide it"
         raise InputError(fault, key="at", cure="name a visible place, `at: [x, y]`, or a smaller `size`")
     report(1)
     distance = insertion.distance
     shows_ground = (distance < 1) & ~covered
-    diffuse = insertion.ground.diffuse
-    if diffuse is None:
-        grey = renderer.radiance(_disc(spot, Reflectance((GREY,) * 3, (0.0,) * 3, 1.0)), FIT_SAMPLES)
-        diffuse = _ground_colour(grey, photo, shows_ground)
+    diffuse = insertion.ground.diffuse or _ground_colour(renderer, spot, photo, shows_ground)
     report(2)
-    # L₀ and L₁, the scene without and with the new object, and s of (1)
-    disc = _disc(spot, Reflectance(diffuse, (0.0,) * 3, 1.0))
-    without, guides_without = np.split(renderer.radiance(disc, guides=scene.denoise), [3], axis=-1)
-    report(3)
-    with_, guides_with = np.split(renderer.radiance(disc | new, guides=scene.denoise), [3], axis=-1)
-    report(4)
     fade = _fade(distance)
     beside = (1 - coverage)[..., None]
-    shadow = _shadow(without, with_, coverage, fade)
-    if scene.denoise:  # not the photo, nor pixels whose paths miss the object
-        clean, with_ = (
-            denoised(np.concatenate([noisy, np.ones_like(beside), guides], axis=-1))[..., :3]
-            for noisy, guides in ((shadow, guides_without), (with_, guides_with))
-        )
-        shadow = np.where(shadow == 1, 1, clean)
+    disc = _disc(spot, Reflectance(diffuse, (0.0,) * 3, 1.0))
+    without, with_, shadow = _lighting(renderer, disc, new, coverage, fade)
+    report(3)
     # (2)
     composite = beside * shadow * photo + np.maximum(with_ - beside * shadow * without, 0) * (beside < 1)
     # change of the ground's specular part: the object's reflection in it
@@ -246,6 +233,26 @@ def inserted(
         composite = np.maximum(composite + mirrored * shows_ground[..., None] * beside * fade, 0)
     report(STEPS)
     return InsertionResult(composite, coverage, shadow, np.asarray(diffuse), without)
+
+
+def _lighting(
+    renderer: InsertionRenderer,
+    disc: dict[str, Any],
+    new: dict[str, Any],
+    coverage: Float[np.ndarray, "h w"],
+    fade: Float[np.ndarray, "h w 1"],
+) -> tuple[Picture, Picture, Picture]:
+    """Return L₀ and L₁, the scene without and with the new object, and s of (1)."""
+    without, guides_without = np.split(renderer.radiance(disc, guides=renderer.denoise), [3], axis=-1)
+    with_, guides_with = np.split(renderer.radiance(disc | new, guides=renderer.denoise), [3], axis=-1)
+    shadow = _shadow(without, with_, coverage, fade)
+    if renderer.denoise:  # not the photo, nor pixels whose paths miss the object
+        clean, with_ = (
+            denoised(np.concatenate([noisy, np.ones_like(fade), guides], axis=-1))[..., :3]
+            for noisy, guides in ((shadow, guides_without), (with_, guides_with))
+        )
+        shadow = np.where(shadow == 1, 1, clean)
+    return without, with_, shadow
 
 
 def compared_shadow(
@@ -283,11 +290,11 @@ def _fade(distance: Float[np.ndarray, "h w"]) -> Float[np.ndarray, "h w 1"]:
     return (t * t * (3 - 2 * t))[..., None]
 
 
-def _ground_colour(lit: Picture, photo: Picture, shows_ground: Bool[np.ndarray, "h w"]) -> tuple[float, float, float]:
-    """Return the diffuse reflectance at which the ground matches the photo: the median over its pixels.
-
-    `lit` is the scene on ground of reflectance GREY.
-    """
+def _ground_colour(
+    renderer: InsertionRenderer, spot: Spot, photo: Picture, shows_ground: Bool[np.ndarray, "h w"]
+) -> tuple[float, float, float]:
+    """Return the diffuse reflectance at which the ground matches the photo: the median over its pixels."""
+    lit = renderer.radiance(_disc(spot, Reflectance((GREY,) * 3, (0.0,) * 3, 1.0)), FIT_SAMPLES)
     usable = shows_ground & (lit.min(axis=-1) > 0)
     if not usable.any():
         return (GREY,) * 3

@@ -72,16 +72,10 @@ def resynthesised(
 
     for k, material in enumerate(materials, start=1):
         pixels = label == k
-        # unit normals and views of this material's pixels
-        normals, views = (vectors[pixels].astype(float) for vectors in (normal, view))
-        normals, views = (each / np.linalg.norm(each, axis=-1, keepdims=True) for each in (normals, views))
+        normals, views = (_unit(vectors[pixels].astype(float)) for vectors in (normal, view))
         detail = geometry["detail"][pixels].astype(float) if "detail" in geometry else np.ones(len(normals))
-        effects = PointEffects(detail=detail)
-        bounced = None
-        if surroundings is not None:
-            visibility, bounced, place = nearest_surroundings(surroundings, k - 1, *np.nonzero(pixels))
-            effects = PointEffects(visibility, place, detail)
-        radiance = reflector(material, normals, views, report_pixels, effects)
+        visibility, bounced, place = nearest_surroundings(surroundings, k - 1, *np.nonzero(pixels))
+        radiance = reflector(material, normals, views, report_pixels, PointEffects(visibility, place, detail))
         # radiance of bounces: k_d G_d + k_s G_s
         if bounced is not None:
             diffuse, specular = bounced[:, :3], bounced[:, 3:]
@@ -92,13 +86,17 @@ def resynthesised(
     return picture
 
 
+def _unit(vectors: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
+    return vectors / np.linalg.norm(vectors, axis=-1, keepdims=True)
+
+
 def nearest_surroundings(
-    surroundings: Surroundings, material: int, y: Int[np.ndarray, " n"], x: Int[np.ndarray, " n"]
+    surroundings: Surroundings | None, material: int, y: Int[np.ndarray, " n"], x: Int[np.ndarray, " n"]
 ) -> tuple[UInt8[np.ndarray, "n k"] | None, Float[np.ndarray, "n 6"] | None, Float[np.ndarray, "n 3"] | None]:
     """Look up visibility, bounced radiance and position of the nearest observed pixel of the same material.
 
     Args:
-        surroundings: the photo's observations
+        surroundings: the photo's observations; None if the model has neither occlusion nor bounces
         material: index of the material, from 0
         y: rows of the pixels
         x: columns of the pixels
@@ -106,6 +104,8 @@ def nearest_surroundings(
     Returns:
         Visibility, bounced radiance and position; each is None if it is unknown.
     """
+    if surroundings is None:
+        return None, None, None
     observations = surroundings.observations
     rows = np.flatnonzero(observations.material == material)
     if len(rows) == 0 or len(x) == 0:

@@ -62,9 +62,6 @@ def page(
     exposure = pictures.exposures(run)
     photos = run.set.photos
     cells = [[pictures.ball_cell(run, m, p, exposure[p]) for p in photos] for m in run.set.materials]
-    errors = metrics.light.lights if metrics.light else {}
-    lights = [pictures.light_row(run, name, photos, errors.get(name)) for name, photos in run.illuminations().items()]
-    reasons = sorted((why, section) for section, why in metrics.reasons.items())
     return rendered(
         "index.html",
         set=run.set,
@@ -79,8 +76,8 @@ def page(
         materials=_materials(run, cells),
         cells=cells,
         maps=[(p, pictures.reflectance_maps(run, p, exposure[p])) for p in photos],
-        lights=[row for row in lights if row],
-        missing={why: [section for _, section in group] for why, group in groupby(reasons, lambda pair: pair[0])},
+        lights=_lights(run, metrics),
+        missing=_missing(metrics),
         surface=run.surface,
         surfaces=surfaces,
         training=_training(run),
@@ -89,6 +86,19 @@ def page(
         **_solution(run),
         **_poses(run),
     )
+
+
+def _missing(metrics: Metrics) -> dict[str, list[str]]:
+    """Return the sections without numbers by the reason for it, both sorted."""
+    reasons = sorted((why, section) for section, why in metrics.reasons.items())
+    return {why: [section for _, section in group] for why, group in groupby(reasons, lambda pair: pair[0])}
+
+
+def _lights(run: Artifacts, metrics: Metrics) -> list[dict[str, Any]]:
+    """Return the page's row of each exported light."""
+    errors = metrics.light.lights if metrics.light else {}
+    rows = (pictures.light_row(run, name, photos, errors.get(name)) for name, photos in run.illuminations().items())
+    return [row for row in rows if row]
 
 
 def _solution(run: Artifacts) -> dict[str, Any]:

@@ -140,23 +140,6 @@ def sensor(
     }
 
 
-def traced(entries: Entry, camera: Camera, world_from_camera: Matrix, spp: int, seed: int, max_depth: int) -> Image:
-    """Render the radiance of a scene by a camera; see `rendered`.
-
-    Args:
-        entries: Mitsuba objects by name.
-        camera: Camera.
-        world_from_camera: Transform of the camera.
-        spp: Least number of samples per pixel.
-        seed: Seed.
-        max_depth: 2 for direct light alone, −1 for all bounces.
-
-    Returns:
-        Radiance.
-    """
-    return rendered(entries, sensor(camera, world_from_camera), spp, seed, max_depth)
-
-
 class Channels(msgspec.Struct, frozen=True):
     """Choice of the light and the channels of a rendering.
 
@@ -244,7 +227,7 @@ def incident_light(
     faces = {}
     for number, (name, (pitch, yaw)) in enumerate(FACE_LOOKS.items()):
         world_from_camera = rigid(world_from_light[:3, :3] @ look(pitch, yaw), world_from_light[:3, 3])
-        faces[name] = traced(entries, camera, world_from_camera, spp, 6 * seed + number, max_depth)
+        faces[name] = rendered(entries, sensor(camera, world_from_camera), spp, 6 * seed + number, max_depth)
     fine = 8 * height, 16 * height
     directions = lat_long_directions(*fine)
     weight = lat_long_solid_angles(*fine)[:, None, None]
