@@ -207,7 +207,6 @@ def inserted(
         InputError: The new object is not visible.
     """
     spot = insertion.spot
-    polish = insertion.ground.polish
     renderer = InsertionRenderer(insertion, samples, seed)
     new = shapes([insertion.new], insertion.scene.materials)
     coverage = _coverage(insertion.scene, insertion.new, renderer.camera, samples)
@@ -215,11 +214,10 @@ def inserted(
         fault = "the new object is invisible: it stands outside the picture, or other objects hide it"
         raise InputError(fault, key="at", cure="name a visible place, `at: [x, y]`, or a smaller `size`")
     report(1)
-    distance = insertion.distance
-    shows_ground = (distance < 1) & ~covered
+    shows_ground = (insertion.distance < 1) & ~covered
     diffuse = insertion.ground.diffuse or _ground_colour(renderer, spot, photo, shows_ground)
     report(2)
-    fade = _fade(distance)
+    fade = _fade(insertion.distance)
     beside = (1 - coverage)[..., None]
     disc = _disc(spot, Reflectance(diffuse, (0.0,) * 3, 1.0))
     without, with_, shadow = _lighting(renderer, disc, new, coverage, fade)
@@ -227,8 +225,8 @@ def inserted(
     # (2)
     composite = beside * shadow * photo + np.maximum(with_ - beside * shadow * without, 0) * (beside < 1)
     # change of the ground's specular part: the object's reflection in it
-    if polish is not None:
-        polished = _disc(spot, polish)
+    if insertion.ground.polish is not None:
+        polished = _disc(spot, insertion.ground.polish)
         mirrored = renderer.radiance(polished | new) - renderer.radiance(polished)
         composite = np.maximum(composite + mirrored * shows_ground[..., None] * beside * fade, 0)
     report(STEPS)

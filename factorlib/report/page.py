@@ -60,8 +60,7 @@ def page(
     metrics = run.metrics
     assert metrics is not None
     exposure = pictures.exposures(run)
-    photos = run.set.photos
-    cells = [[pictures.ball_cell(run, m, p, exposure[p]) for p in photos] for m in run.set.materials]
+    cells = [[pictures.ball_cell(run, m, p, exposure[p]) for p in run.set.photos] for m in run.set.materials]
     return rendered(
         "index.html",
         set=run.set,
@@ -75,7 +74,7 @@ def page(
         tags=tags,
         materials=_materials(run, cells),
         cells=cells,
-        maps=[(p, pictures.reflectance_maps(run, p, exposure[p])) for p in photos],
+        maps=[(p, pictures.reflectance_maps(run, p, exposure[p])) for p in run.set.photos],
         lights=_lights(run, metrics),
         missing=_missing(metrics),
         surface=run.surface,
