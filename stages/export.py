@@ -85,9 +85,9 @@ def main(params: Params, inputs: Inputs, out: Path, progress: Progress) -> None:
     materials = reflectances(solution.table)
     _write_tables(out, solution)
     _write_dataset(out, inputs)
-    for name, light in solution.lights.items():
+    for name, lobes in solution.lights.items():
         progress(next(done), total, f"light of {name}")
-        _write_light(out, name, light, inputs["solve"] / "coverage" / f"{name}.exr", params)
+        _write_light(out, name, lobes, inputs["solve"] / "coverage" / f"{name}.exr", params)
     files = MeshFiles(inputs, out / "scenes", names, params.crease_deg, materials)
     for name, mesh in meshes.items():
         progress(next(done), total, f"mesh {name}")
