@@ -260,7 +260,7 @@ def in_order(table: MaterialTable, names: Sequence[str], path: str | Path) -> li
     """
     for name in names:
         if name not in table.materials:
-            fault = f"the material {name!r} of the data set is missing"
+            fault = f"the materials are not those of the data set: {name!r} is missing"
             raise InputError(fault, file=path, key="materials", cure="run the stage `solve` again")
     return [table.materials[name] for name in names]
 

@@ -118,7 +118,7 @@ def test_the_shadow_of_the_photo_is_recognised_whatever_its_exposure_and_not_whe
     where[:, 3:] = False
     spoiled = np.where(where[..., None], lit, rng.uniform(0.1, 1, lit.shape))
     few = shadow_match(spoiled, lit, constant, where)
-    assert few.correlation is None and few.pixels == 60 and "too little is seen of the ground" in str(few)
+    assert few.correlation is None and few.pixels == 60 and "too little of the ground" in str(few)
     where[:, 3:8] = True
     assert shadow_match(np.where(where[..., None], lit, 0.5), lit, constant, where).correlation == pytest.approx(1)
     assert shadow_match(lit, np.ones_like(lit), constant, where).correlation is None
