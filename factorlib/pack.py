@@ -43,22 +43,24 @@ def pack(home: Path, out: Path, replace: bool = False) -> int:
     """
     if missing := [path for path in (*NEEDED, "export/dataset.json") if not (home / path).exists()]:
         cure = f"make all DATASET={home.name}"
-        raise InputError(f"the result is not whole: {missing[0]} is missing", file=home, cure=cure)
+        raise InputError(f"the result is incomplete: {missing[0]} is missing", file=home, cure=cure)
     if out.suffix != ".zip" or out.is_dir() or not out.absolute().parent.is_dir():
-        cure = "name a file in a folder that is there: OUT=<name>.zip"
-        raise InputError("is no name for a zip file", file=out, key="OUT", cure=cure)
+        cure = "name a .zip file in an existing folder: OUT=<name>.zip"
+        raise InputError("a zip file cannot be written here", file=out, key="OUT", cure=cure)
     if out.exists() and not replace:
-        raise InputError("is there already", file=out, key="OUT", cure="name another, or add FORCE=1")
+        raise InputError(
+            "the file exists already", file=out, key="OUT", cure="name another file, or add FORCE=1 to replace it"
+        )
     files = [home / "dataset.txt", *(path for stage in STAGES for path in files_below(home / stage))]
-    found = {f"{home.name}/{path.relative_to(home).as_posix()}": path for path in files}
+    entries = {f"{home.name}/{path.relative_to(home).as_posix()}": path for path in files}
     draft = out.with_name(f".{out.name}.{os.getpid()}")
     with writing(draft):
         with zipfile.ZipFile(draft, "w", zipfile.ZIP_DEFLATED) as archive:
             archive.writestr(_entry(f"{home.name}/READ_ME.txt"), READ_ME)
-            for name, path in sorted(found.items()):
+            for name, path in sorted(entries.items()):
                 archive.writestr(_entry(name), path.read_bytes())
         os.replace(draft, out)
-    return len(found) + 1
+    return len(entries) + 1
 
 
 def files_below(folder: Path) -> list[Path]:

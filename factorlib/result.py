@@ -35,13 +35,13 @@ from factorlib.images.picture import picture
 from factorlib.jsonfile import read_json
 from factorlib.light.latlong import rotate_map
 from factorlib.reading import check_plain
-from factorlib.recipe import schema
+from factorlib.recipe import kinds
+from factorlib.recipe.kinds import KINDS, AnyRecipe, is_light_file
 from factorlib.recipe.read import check_recipe, files_of
-from factorlib.recipe.schema import KINDS, is_light_file
-from factorlib.render.drawing import draw
-from factorlib.render.photo_scene import Light, PhotoScene, orbit, resized, traced_photo
+from factorlib.render.photo_scene import DistantLight, Orbit, PhotoScene, resized, traced_photo
+from factorlib.render.recipe_pictures import draw
 from factorlib.render.solved_set import SolvedSet
-from factorlib.render.traced import Traced, as_it_is
+from factorlib.render.traced_picture import TracedPicture, as_it_is
 from factorlib.report.pictures import data_uri
 from factorlib.results.materials import Solved
 from factorlib.stage import Inputs, silent
@@ -59,7 +59,7 @@ SLICES = {
 }
 MARK = "dataset.txt"
 SAMPLES = 64  # default samples per pixel
-SHOWN = 480  # longer side of a photo in a notebook, pixels
+LONGEST_SIDE = 480  # longer side of a photo in a notebook, pixels
 log = logging.getLogger("factorlib.result")
 
 
@@ -78,28 +78,29 @@ def load_result(folder: str | Path) -> Result:
     # the current folder and those above it, because a notebook runs in its own folder
     places = [Path(*k * [".."]) for k in range(len(Path.cwd().parts))]
     candidates = [path for place in places for path in (place / folder, place / "build" / folder)]
-    found = next((path for path in candidates if os.path.isfile(path / MARK)), None)
-    if found is None:
+    result = next((path for path in candidates if os.path.isfile(path / MARK)), None)
+    if result is None:
         inside = (parent for path in candidates if os.path.exists(path) for parent in path.parents)
         if whole := next((parent for parent in inside if os.path.isfile(parent / MARK)), None):
-            raise InputError("this lies inside a result", file=folder, cure=f'load_result("{whole}") loads it')
+            raise InputError("this is a part of a result", file=folder, cure=f'load_result("{whole}") loads the whole')
         results = (sorted(str(path.parent) for path in place.glob(f"build/*/{MARK}")) for place in places)
         known = next(filter(None, results), None)
         cure = did_you_mean(str(folder), known) if known else "make all DATASET=<name> makes one"
         raise InputError("there is no result here", file=folder, cure=cure)
-    missing = [stage for stage in STAGES if not (found / stage).is_dir()]
+    missing = [stage for stage in STAGES if not (result / stage).is_dir()]
     if missing:
-        cure = f"make export DATASET={found.name}"
-        raise InputError(f"the result is not whole: {missing[0]} is missing", file=found, cure=cure)
-    folders = {stage: (found / stage).resolve() for stage in (*STAGES, "shapes", "surface") if (found / stage).is_dir()}
-    file = found / "export" / "dataset.json"
+        cure = f"make export DATASET={result.name}"
+        raise InputError(f"the result is incomplete: {missing[0]} is missing", file=result, cure=cure)
+    stages = [stage for stage in (*STAGES, "shapes", "surface") if (result / stage).is_dir()]
+    folders = {stage: (result / stage).resolve() for stage in stages}
+    file = result / "export" / "dataset.json"
     source = folders["export"] / "source"
     facts = read_json(file) if file.is_file() else {}
     if not (isinstance(facts, dict) and facts.keys() >= SLICES):
-        cure = f"make export DATASET={found.name}"
-        raise InputError("the result does not say what its data set was", file=file, cure=cure)
+        cure = f"make export DATASET={result.name}"
+        raise InputError("the result lacks the facts of its data set", file=file, cure=cure)
     files = {path.relative_to(source).as_posix(): path for path in sorted(source.rglob("*")) if path.is_file()}
-    return Result(found, SolvedSet(Inputs(folders, facts, files)))
+    return Result(result, SolvedSet(Inputs(folders, facts, files)))
 
 
 class UnknownName(InputError, KeyError):
@@ -182,9 +183,9 @@ class Result:
             InputError: The photo is unknown, or a number is out of range.
         """
         photo = self._photo(view)
-        _check(schema.View, azimuth=azimuth, elevation=elevation, zoom=zoom, width=width, samples=samples)
+        _check(kinds.ViewRecipe, azimuth=azimuth, elevation=elevation, zoom=zoom, width=width, samples=samples)
         scene = resized(self._solved.scene(photo), width)
-        traced = traced_photo(scene, samples, world_from_camera=orbit(scene, azimuth, elevation, zoom))
+        traced = traced_photo(scene, samples, Orbit(azimuth, elevation, zoom).world_from_camera(scene))
         return Picture(traced, self._solved.tone(photo), photo)
 
     def relight(
@@ -203,14 +204,14 @@ class Result:
         Raises:
             InputError: A name is unknown, a file is not a light map, or a number is out of range.
         """
-        photo, one = self._object(name)
+        photo, obj = self._object(name)
         light = str(light) if isinstance(light, Path) else light
-        _check(schema.Relight, width=width, samples=samples)
+        _check(kinds.RelightRecipe, width=width, samples=samples)
         scene = resized(self._solved.scene(photo), width)
-        objects = tuple(each for each in scene.objects if each.name == one)
+        objects = tuple(each for each in scene.objects if each.name == obj)
         traced = traced_photo(msgspec.structs.replace(scene, objects=objects, light=self._light(light)), samples)
         of_photo = light if isinstance(light, str) and light in self.photos else None
-        about = f"{photo}/{one} in {light if isinstance(light, str) else 'a given light'}"
+        about = f"{photo}/{obj} in {light if isinstance(light, str) else 'a given light'}"
         return Picture(traced, as_it_is if of_photo is None else self._solved.tone(of_photo), about)
 
     def insert(self, photo: str, **fields: Any) -> Drawn:
@@ -256,7 +257,7 @@ class Result:
         recipe = _check(KINDS[kind], photos=[photo], **fields)
         path = Path(kind)
         inputs = self._solved.inputs
-        objects = {name: own.objects for name, own in self._solved.objects.items()}
+        objects = {name: each.objects for name, each in self._solved.objects.items()}
         check_recipe(recipe, path, objects, self._solved.names)
         given = {f"recipe file:{name}": file for name, file in files_of(recipe, path).items()}
         solved = SolvedSet(msgspec.structs.replace(inputs, files=inputs.files | given))
@@ -273,14 +274,14 @@ class Result:
         return Named("photo", {photo: photo for photo in self.photos})[name]
 
     def _object(self, name: str) -> tuple[str, str]:
-        known = {f"{photo}/{one}": (photo, one) for photo, one in (each.split("/") for each in self.objects)}
-        short = {one: (photo, one) for photo, one in reversed(known.values())}  # keeps the first photo that has it
-        found = Named("object", {**short, **known})[name]
-        if name not in known and len(others := [each for each, (_, one) in known.items() if one == name]) > 1:
-            log.warning("'%s' is %s: that of '%s' is taken", name, " and ".join(others), found[0])
-        return found
+        known = {f"{photo}/{obj}": (photo, obj) for photo, obj in (each.split("/") for each in self.objects)}
+        short = {obj: (photo, obj) for photo, obj in reversed(known.values())}  # keeps the first photo that has it
+        place = Named("object", {**short, **known})[name]
+        if name not in known and len(others := [each for each, (_, obj) in known.items() if obj == name]) > 1:
+            log.warning("'%s' could be %s: that of '%s' is used", name, " or ".join(others), place[0])
+        return place
 
-    def _light(self, light: str | Environment) -> Light:
+    def _light(self, light: str | Environment) -> DistantLight:
         if isinstance(light, Environment):
             return light.lat_long
         if isinstance(light, str) and is_light_file(light):
@@ -294,8 +295,8 @@ class Result:
         parts = ("diffuse", "specular", "roughness")
         rows = []
         for name, material in self.materials.items():
-            of = [[np.atleast_1d(getattr(each, part)) for each in (material, material.stderr)] for part in parts]
-            cells = [", ".join(f"{value:.3f} ± {error:.3f}" for value, error in zip(*pair, strict=True)) for pair in of]
+            pairs = [[np.atleast_1d(getattr(each, part)) for each in (material, material.stderr)] for part in parts]
+            cells = [", ".join(f"{value:.3f} ± {error:.3f}" for value, error in zip(*p, strict=True)) for p in pairs]
             rows.append((html.escape(name), *cells))
         lines = [("th", ("material", *parts)), *(("td", row) for row in rows)]
         table = "".join(f"<tr>{''.join(f'<{tag}>{cell}</{tag}>' for cell in cells)}</tr>" for tag, cells in lines)
@@ -303,10 +304,10 @@ class Result:
         return f"<p>{about}</p><table>{table}</table>"
 
 
-def _check(kind: type[T], **fields: Any) -> T:
+def _check(kind: type[AnyRecipe], **fields: Any) -> AnyRecipe:
     """Return the recipe with these fields; InputError for an unknown name and a value out of range."""
     plain = {key: value.item() if isinstance(value, np.generic) else value for key, value in fields.items()}
-    return convert(plain, kind, kind.__name__.lower())
+    return convert(plain, kind, str(kind.__struct_config__.tag))
 
 
 class Environment(msgspec.Struct, frozen=True):
@@ -339,7 +340,7 @@ class Environment(msgspec.Struct, frozen=True):
         return _image(picture(self.lat_long))
 
 
-class Picture(Traced, frozen=True):
+class Picture(TracedPicture, frozen=True):
     """A path-traced picture that notebooks display, darkened if it would be overexposed.
 
     Attributes:
@@ -375,11 +376,11 @@ class Drawn(dict[str, bytes]):
         kind = name[-3:]
         data = self[name]
         if kind == "png":  # a photo at full size, reduced for the notebook
-            shown = Image.open(BytesIO(data)).convert("RGB")
+            reduced = Image.open(BytesIO(data)).convert("RGB")
             memory = BytesIO()
             kind = "jpeg"
-            shown.thumbnail((SHOWN, SHOWN))
-            shown.save(memory, "JPEG", quality=90)
+            reduced.thumbnail((LONGEST_SIDE, LONGEST_SIDE))
+            reduced.save(memory, "JPEG", quality=90)
             data = memory.getvalue()
         image = f'<img src="data:image/{kind};base64,{base64.b64encode(data).decode("ascii")}">'
         return f"{image}<br>{html.escape(repr(self))}"

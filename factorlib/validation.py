@@ -15,7 +15,7 @@ import numpy as np
 from factorlib.dataset.check import MESHES, instance_materials, mirror_balls
 from factorlib.dataset.schema import Dataset, MeshInstance, PhotoEntry
 from factorlib.errors import InputError
-from factorlib.evaluate.gauge import connected_components
+from factorlib.evaluate.comparison_gauge import connected_components
 from factorlib.evaluate.truth import read_true_light, read_true_normals
 from factorlib.images.light_map import read_light_map
 from factorlib.images.limits import MOST_MEGAPIXELS, check_pixels, check_values
@@ -23,7 +23,7 @@ from factorlib.images.photo import open_photo
 from factorlib.labels.labels import check_materials, read_labels, read_objects
 from factorlib.meshes.limits import Limits
 from factorlib.meshes.read import part_labels, read_mesh, read_parts
-from factorlib.recipe.schema import is_light_file
+from factorlib.recipe.kinds import is_light_file
 from factorlib.yamlfile import convert
 
 Check = Callable[[], object]

@@ -29,8 +29,8 @@ from factorlib.meshes.limits import Limits
 from factorlib.meshes.mesh import scaled
 from factorlib.meshes.read import CREASE_DEG, read_mesh
 from factorlib.results.photos import read_photo_facts
-from factorlib.results.poses import AS_IT_IS, FILE, CameraEntry, ObjectEntry, PhotoPoses, entry_of, read_poses
-from factorlib.results.shapes import read_shapes
+from factorlib.results.poses import AS_IT_IS, FILE, CameraEntry, ObjectPose, PhotoPoses, entry_of, read_poses
+from factorlib.results.shape_table import read_shapes
 from factorlib.stage import Inputs, Progress
 
 log = logging.getLogger("factorlib.align")
@@ -158,7 +158,7 @@ def read_objects(
 
 def object_entry(
     obj: ObjectToAlign, k: int, result: PhotoAlignment, maps: Maps, params: Params, source: str | None
-) -> ObjectEntry:
+) -> ObjectPose:
     """Return the entry of one object in poses.json.
 
     A pose without `doubts` is reliable.  An object with a doubtful estimated pose is left out of the solve.
@@ -177,7 +177,7 @@ def object_entry(
     estimate = result.estimates[k]
     measures = measure_reliability(obj, result, k)
     reasons = find_doubts(iou, agreement, measures, estimate, params)
-    return ObjectEntry(
+    return ObjectPose(
         **entry_of(result.poses[k]),
         scale=obj.scale,
         silhouette_iou=iou,
@@ -193,7 +193,7 @@ def object_entry(
     )
 
 
-def report_doubts(photo: str, name: str, entry: ObjectEntry, strict: bool) -> None:
+def report_doubts(photo: str, name: str, entry: ObjectPose, strict: bool) -> None:
     """Warn of each doubt about a pose.
 
     Raises:

@@ -11,19 +11,19 @@ import msgspec
 import numpy as np
 
 from factorlib.dataset.schema import LightSlice, TruthFile
-from factorlib.evaluate.ball import Light, light_of_lat_long
-from factorlib.evaluate.gauge import connected_components
-from factorlib.evaluate.geometry import averaged_normals, normal_error, pose_error
-from factorlib.evaluate.lights import compare_lights, mirrored_directions, sphere_row
-from factorlib.evaluate.materials import compare_materials
+from factorlib.evaluate.ball import OctahedralLight, octahedral_light
+from factorlib.evaluate.comparison_gauge import connected_components
+from factorlib.evaluate.geometry_errors import averaged_normals, normal_error, pose_error
+from factorlib.evaluate.light_errors import compare_lights, mirrored_directions, sphere_row
+from factorlib.evaluate.material_errors import compare_materials
+from factorlib.evaluate.photo_errors import ComparedPhoto, compare_photos, compared_photo
 from factorlib.evaluate.relighting import compare_relighting, compare_relit_set
-from factorlib.evaluate.resynthesis import Shot, compare_photos, shot_of
 from factorlib.evaluate.truth import read_true_light, read_true_normals
-from factorlib.evaluate.verdict import Signs, material_errors, text_of, verdict
+from factorlib.evaluate.verdict import VerdictInputs, ball_changes, verdict, verdict_text
 from factorlib.images.exr import LAT_LONG, read_exr, read_rgb_exr, write_rgb_exr
 from factorlib.jsonfile import write_json
 from factorlib.results.materials import Reflectance, read_materials, read_uncertainty, reflectances
-from factorlib.results.metrics import Counts, Metrics, NormalError, PoseError, Verdict
+from factorlib.results.metrics import Counts, Metrics, NormalError, PoseError, ResynthesisErrors, Verdict
 from factorlib.results.photos import read_photos
 from factorlib.results.poses import read_poses
 from factorlib.stage import Inputs, Progress
@@ -32,7 +32,7 @@ from factorlib.urm.surface_maps import read_geometry
 from factorlib.wholefile import write_text
 
 NO_TRUTH = "the dataset names no truth"
-NOTHING_SHOWN = "no photo shows a material"
+NO_MATERIAL = "no photo shows a material"
 MISSING = {
     "materials": "the truth says nothing about materials that were seen",
     "relighting": "the truth lacks materials or lights",
@@ -55,20 +55,17 @@ def main(params: Params, inputs: Inputs, out: Path, progress: Progress) -> None:
     done = count()
     total = 2 * len(lights) + (len(MISSING) if truth else 0) + 1
 
-    def shot(name: str) -> Shot:
+    def read_photo(name: str) -> ComparedPhoto:
         """Return a photo and its re-synthesis; `compare_photos` reads each twice."""
         progress(next(done), total, f"re-synthesis of {name}")
         photo = read_exr(inputs["masks"] / f"{name}.exr")
         geometry = read_geometry(inputs["align"], inputs.folders.get("surface"), name)
-        return shot_of(photo, geometry, read_rgb_exr(inputs["render"] / "resynthesis" / f"{name}.exr"))
+        return compared_photo(photo, geometry, read_rgb_exr(inputs["render"] / "resynthesis" / f"{name}.exr"))
 
-    resynthesis = compare_photos(lights, materials, shot)
-    # observed materials of each light, and the connected components of the graph of materials and lights
-    seen: dict[str, list[str]] = {slice_.illumination: [] for slice_ in lights.values()}
-    for name, photo in resynthesis.photos.items():
-        row = seen[lights[name].illumination]
-        row.extend(m for m in photo.materials if m not in row)
-    component = connected_components({light: names for light, names in seen.items() if names})
+    resynthesis = compare_photos(lights, materials, read_photo)
+    # connected components of the graph of materials and lights
+    observed = _observed_materials(resynthesis, lights)
+    component = connected_components({light: names for light, names in observed.items() if names})
     sections = dict.fromkeys(MISSING)
     if truth:
         true = {n: Reflectance(m.diffuse, m.specular, m.roughness) for n, m in truth.materials.items()}
@@ -76,7 +73,7 @@ def main(params: Params, inputs: Inputs, out: Path, progress: Progress) -> None:
         true_lights, estimated_lights = _lights(inputs, truth, out)
         compute = {
             "materials": lambda: compare_materials(estimates, true, component),
-            "relighting": lambda: compare_relighting(estimates, true, estimated_lights, true_lights, seen),
+            "relighting": lambda: compare_relighting(estimates, true, estimated_lights, true_lights, observed),
             "relit_set": lambda: compare_relit_set(estimates, true, estimated_lights, true_lights),
             "light": lambda: compare_lights(estimated_lights, true_lights, _mirrored(inputs, lights)),
             "normals": lambda: _normals(inputs, truth, lights),
@@ -86,54 +83,64 @@ def main(params: Params, inputs: Inputs, out: Path, progress: Progress) -> None:
             progress(next(done), total, name)
             sections[name] = section()
     progress(next(done), total, "verdict")
-    sections["verdict"] = _verdict(inputs, seen)
-    counts = Counts(len(lights), len(materials), len(seen), len(set(component.values())))
+    sections["verdict"] = _verdict(inputs, observed)
+    counts = Counts(len(lights), len(materials), len(observed), len(set(component.values())))
     reasons = {name: why if truth else NO_TRUTH for name, why in MISSING.items() if not sections[name]}
     if not sections["verdict"]:
-        reasons["verdict"] = NOTHING_SHOWN
+        reasons["verdict"] = NO_MATERIAL
     write_json(out / "metrics.json", Metrics(set=counts, resynthesis=resynthesis, **sections, reasons=reasons))
     if sections["verdict"]:
-        write_text(out / "verdict.txt", text_of(sections["verdict"]))
+        write_text(out / "verdict.txt", verdict_text(sections["verdict"]))
     progress(total, total)
 
 
-def _verdict(inputs: Inputs, seen: dict[str, list[str]]) -> Verdict | None:
+def _observed_materials(resynthesis: ResynthesisErrors, lights: dict[str, LightSlice]) -> dict[str, list[str]]:
+    """Return the observed materials of each light."""
+    materials: dict[str, dict[str, None]] = {slice_.illumination: {} for slice_ in lights.values()}
+    for name, photo in resynthesis.photos.items():
+        materials[lights[name].illumination] |= dict.fromkeys(photo.materials)
+    return {light: list(names) for light, names in materials.items()}
+
+
+def _verdict(inputs: Inputs, observed: dict[str, list[str]]) -> Verdict | None:
     """Return the verdict on the result's reliability; None without observed materials.
 
     Args:
         inputs: Inputs of the stage.
-        seen: Names of the observed materials, by light.
+        observed: Names of the observed materials, by light.
     """
     table = read_materials(inputs["export"] / "materials.json")
     uncertainty = read_uncertainty(inputs["solve"] / "uncertainty.json")
-    shown = {m for names in seen.values() for m in names}
+    names_observed = {m for names in observed.values() for m in names}
     files = inputs["export"] / "illumination"
-    materials = {name: solved for name, solved in table.materials.items() if name in shown}
-    lights = {name: light_of_lat_long(read_rgb_exr(files / f"{name}.exr")) for name, names in seen.items() if names}
+    materials = {name: solved for name, solved in table.materials.items() if name in names_observed}
+    lights = {name: octahedral_light(read_rgb_exr(files / f"{name}.exr")) for name, names in observed.items() if names}
     if not (materials and uncertainty.photos):
         return None
     contours = {
-        photo: {name: own.contour_error for name, own in entry.objects.items() if own.contour_error is not None}
+        photo: {name: obj.contour_error for name, obj in entry.objects.items() if obj.contour_error is not None}
         for photo, entry in read_poses(inputs["align"] / "poses.json").items()
     }
-    errors = material_errors(materials, lights)
+    errors = ball_changes(materials, lights)
     misfit = (uncertainty.unexplained, uncertainty.photos)
-    return verdict(Signs(errors, *misfit, contours, uncertainty.residual_sigma))
+    return verdict(VerdictInputs(errors, *misfit, contours, uncertainty.residual_sigma))
 
 
-def _lights(inputs: Inputs, truth: TruthFile, out: Path) -> tuple[dict[str, Light], dict[str, Light]]:
+def _lights(
+    inputs: Inputs, truth: TruthFile, out: Path
+) -> tuple[dict[str, OctahedralLight], dict[str, OctahedralLight]]:
     """Return the true lights and those of them that are estimated, and write maps and spheres of the latter."""
     true = {}
     estimated = {}
     for name, path in truth.illumination.items():
-        true[name] = light_of_lat_long(read_true_light(inputs.file(path), name))
+        true[name] = octahedral_light(read_true_light(inputs.file(path), name))
         if (file := inputs["export"] / "illumination" / f"{name}.exr").exists():
-            estimated[name] = light_of_lat_long(read_rgb_exr(file))
+            estimated[name] = octahedral_light(read_rgb_exr(file))
             for kind in ("illumination", "spheres"):
                 (out / kind).mkdir(exist_ok=True)
             write_rgb_exr(out / "illumination" / f"{name}.exr", read_rgb_exr(inputs.file(path)), LAT_LONG)
-            for which, light in (("truth", true[name]), ("estimate", estimated[name])):
-                write_rgb_exr(out / "spheres" / f"{name}_{which}.exr", sphere_row(light))
+            for kind, light in (("truth", true[name]), ("estimate", estimated[name])):
+                write_rgb_exr(out / "spheres" / f"{name}_{kind}.exr", sphere_row(light))
     return true, estimated
 
 

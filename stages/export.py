@@ -12,9 +12,9 @@ dataset.json, source/            Facts and meshes of the dataset, for new pictur
 """
 
 import logging
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from itertools import count
-from pathlib import Path
+from pathlib import Path, PurePosixPath
 from typing import Annotated, Any
 
 import msgspec
@@ -26,13 +26,13 @@ from factorlib.dataset.schema import LightSlice, ObjectsSlice
 from factorlib.errors import InputError
 from factorlib.export.blender import write_scene_json, write_script
 from factorlib.export.environment import mitsuba_map
-from factorlib.export.gltf import variant_name, write_glb, write_suns
-from factorlib.export.materials import headroom_factor, table_in_gauge
+from factorlib.export.exported_scene import ALL_BOUNCES, DIRECT, ExportedScene, ExposedMap, Sun, suns_of
+from factorlib.export.gltf_writer import variant_name, write_glb, write_suns
 from factorlib.export.materialx import materialx
 from factorlib.export.mesh_files import MeshFiles
 from factorlib.export.mitsuba import write_scene
-from factorlib.export.other_renderers import write_losses
-from factorlib.export.scene import ALL_BOUNCES, DIRECT, ExposedMap, Scene, Sun, suns_of
+from factorlib.export.other_renderers import differences
+from factorlib.export.reflectance_limit import headroom_factor, table_in_gauge
 from factorlib.export.usd import SUFFIX, write_usd_scene
 from factorlib.images.exr import LAT_LONG, read_rgb_exr, write_hdr, write_rgb_exr
 from factorlib.jsonfile import write_json
@@ -40,8 +40,8 @@ from factorlib.light.latlong import lat_long_of_lobes, sample_map
 from factorlib.light.lobes import Lobes, no_lobes
 from factorlib.meshes.ply import write_ply
 from factorlib.meshes.read import CREASE_DEG
-from factorlib.results.lobes import read_lobes, write_lobes
-from factorlib.results.materials import read_exposures, read_materials, reflectances
+from factorlib.results.lobe_table import read_lobes, write_lobes
+from factorlib.results.materials import MaterialTable, Vec3, read_exposures, read_materials, reflectances
 from factorlib.results.poses import read_poses
 from factorlib.stage import Inputs, Progress
 from factorlib.wholefile import write_bytes, write_text
@@ -62,82 +62,121 @@ class Params(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """Crease angle, in degrees: an edge whose two triangles differ by more in their normals stays sharp."""
 
 
+class SolutionInGauge(msgspec.Struct, frozen=True):
+    """A solution in the gauge that Mitsuba needs: materials, and lights and exposures by name."""
+
+    table: MaterialTable
+    lights: dict[str, Lobes]
+    exposures: dict[str, Vec3]
+
+
 def main(params: Params, inputs: Inputs, out: Path, progress: Progress) -> None:
     """Write materials, lights, coverage and scenes in the formats of other programs."""
     names = inputs.facts["dataset.materials"]
-    solved = inputs["solve"]
-    lights = msgspec.convert(inputs.facts["dataset.light"], dict[str, LightSlice])
+    slices = msgspec.convert(inputs.facts["dataset.light"], dict[str, LightSlice])
     objects = msgspec.convert(inputs.facts["dataset.objects"], dict[str, ObjectsSlice])
     meshes = dict(sorted({n: m for each in objects.values() for n, m in each.meshes.items()}.items()))
-    total = 1 + len({light.illumination for light in lights.values()}) + len(meshes) + len(lights)
+    total = 1 + len({light.illumination for light in slices.values()}) + len(meshes) + len(slices)
     done = count()
     progress(next(done), total, "materials")
-    table = read_materials(solved / "materials.json")
-    exposures = read_exposures(solved / "exposures.json")
-    # gauge of Mitsuba, max k_d + max k_s < 1: one factor multiplies all reflectances and divides all lights
-    factor = headroom_factor(table.materials)
-    table = table_in_gauge(table, factor)
-    materials = reflectances(table)
-    lobes = {n: light.scaled(1 / factor) for n, light in _solved_lights(solved / "lobes.parquet", lights).items()}
-    write_json(out / "materials.json", table)
-    write_json(out / "exposures.json", exposures)
-    write_lobes(out / "lobes.parquet", lobes)
-    write_text(out / "materials.mtlx", materialx(materials))
-    write_losses(out / "losses.json", materials)
-    _write_dataset(out, inputs)
     for folder in ("illumination", "coverage", "meshes", "scenes/light", "scenes/meshes"):
         (out / folder).mkdir(parents=True)
-    suns = {name: [_sun(one) for one in suns_of(light, YUP_FROM_CAMERA)] for name, light in lobes.items()}
-    if clash := [name for name in lobes if name.endswith(SKY) and suns.get(name.removesuffix(SKY))]:
-        raise InputError(
-            f"'{clash[0]}' is the name of another illumination's sky", key="illumination", cure="call it otherwise"
-        )
-    write_json(out / "lights.json", suns)
-    for name, light in lobes.items():
+    solution = _solution_in_gauge(inputs["solve"], slices)
+    materials = reflectances(solution.table)
+    _write_tables(out, solution)
+    _write_dataset(out, inputs)
+    for name, lobes in solution.lights.items():
         progress(next(done), total, f"light of {name}")
-        _write_light(out, name, light, solved / "coverage" / f"{name}.exr", params)
+        _write_light(out, name, lobes, inputs["solve"] / "coverage" / f"{name}.exr", params)
     files = MeshFiles(inputs, out / "scenes", names, params.crease_deg, materials)
     for name, mesh in meshes.items():
         progress(next(done), total, f"mesh {name}")
+        overrides = [o.materials for each in objects.values() for o in each.objects if o.mesh == name and o.materials]
+        labels = {variant_name(each): files.read.mesh(name, mesh, each).face_label for each in overrides}
         whole = files.read.mesh(name, mesh)
-        worn = [
-            obj.materials for each in objects.values() for obj in each.objects if obj.mesh == name and obj.materials
-        ]
-        labels = {variant_name(each): files.read.mesh(name, mesh, each).face_label for each in worn}
         write_glb(out / f"{name}.glb", whole, names, materials, dict(sorted(labels.items())))
         write_ply(out / "meshes" / f"{name}.ply", whole)
     write_script(out / "scenes")
     poses = read_poses(inputs["align"] / "poses.json")
-    for photo, entry in lights.items():
+    depth = ALL_BOUNCES if solution.table.model.interreflection else DIRECT
+    for photo, slice_ in slices.items():
         progress(next(done), total, f"scene of {photo}")
-        maps = oiio.ImageInput.open(str(inputs["align"] / f"{photo}.exr"))
-        assert maps is not None  # `align` wrote it
-        size = maps.spec()  # from the header
-        camera = poses[photo].camera.camera(size.width, size.height)
-        exposure = np.array(exposures.get(photo, [1.0] * 3))
-        camera_from_light = np.eye(3) if entry.world_from_camera is None else np.array(entry.world_from_camera).T
-        own_lobes = lobes[entry.illumination]
-        own_suns = suns_of(own_lobes.scaled(exposure), YUP_FROM_CAMERA @ camera_from_light)
-        exposed = ExposedMap(f"../illumination/{entry.illumination}.exr", exposure, camera_from_light)
-        sky = (
-            msgspec.structs.replace(exposed, file=f"../illumination/{entry.illumination}{SKY}.exr")
-            if own_suns
-            else exposed
-        )
-        own_meshes = objects[photo].meshes
-        placed = poses[photo].objects
-        shapes = [s for own in objects[photo].objects for s in files.shapes(own, own_meshes, placed)]
-        scene = Scene(camera, shapes, materials, exposed, ALL_BOUNCES if table.model.interreflection else DIRECT)
-        write_usd_scene(out / "scenes" / f"{photo}{SUFFIX}", scene)
-        scene = msgspec.structs.replace(scene, light=sky, suns=own_suns)
-        write_scene_json(out / "scenes" / f"{photo}.json", scene)
-        if np.ptp(exposure) == 0:
-            own = msgspec.structs.replace(exposed, file=f"light/{entry.illumination}.exr")
-        else:  # Mitsuba scales all channels alike, so the photo gets its own map; no illumination has a dot in its name
-            own = ExposedMap(f"light/{photo}.exposed.exr", np.ones(3), camera_from_light)
-            _write_mitsuba_map(out / "scenes" / own.file, own_lobes.take(~own_lobes.suns).scaled(exposure), params)
-        write_scene(out / "scenes" / f"{photo}.xml", msgspec.structs.replace(scene, light=own))
+        camera = poses[photo].camera.camera(*_image_size(inputs["align"] / f"{photo}.exr"))
+        placed = objects[photo]
+        shapes = [s for obj in placed.objects for s in files.shapes(obj, placed.meshes, poses[photo].objects)]
+        light = _exposed_map(slice_, solution.exposures.get(photo, (1.0,) * 3))
+        scene = ExportedScene(camera, shapes, materials, light, depth)
+        _write_scenes(out / "scenes", photo, scene, solution.lights[slice_.illumination], params)
     progress(total, total)
+
+
+def _solution_in_gauge(folder: Path, slices: Mapping[str, LightSlice]) -> SolutionInGauge:
+    """Read the solution in the gauge of Mitsuba, max k_d + max k_s < 1.
+
+    One factor multiplies all reflectances and divides all lights.
+    """
+    table = read_materials(folder / "materials.json")
+    factor = headroom_factor(table.materials)
+    lights = {n: light.scaled(1 / factor) for n, light in _solved_lights(folder / "lobes.parquet", slices).items()}
+    return SolutionInGauge(table_in_gauge(table, factor), lights, read_exposures(folder / "exposures.json"))
+
+
+def _write_tables(out: Path, solution: SolutionInGauge) -> None:
+    """Write the tables of materials, exposures, lobes and suns."""
+    materials = reflectances(solution.table)
+    write_json(out / "materials.json", solution.table)
+    write_json(out / "exposures.json", solution.exposures)
+    write_lobes(out / "lobes.parquet", solution.lights)
+    write_text(out / "materials.mtlx", materialx(materials))
+    write_json(out / "losses.json", {name: differences(material) for name, material in materials.items()})
+    suns = {name: [_sun(sun) for sun in suns_of(light, YUP_FROM_CAMERA)] for name, light in solution.lights.items()}
+    if clash := [name for name in suns if name.endswith(SKY) and suns.get(name.removesuffix(SKY))]:
+        fault = f"the files of illumination '{clash[0]}' would replace the sky of '{clash[0].removesuffix(SKY)}'"
+        raise InputError(fault, key="illumination", cure=f"rename it, so that it does not end in {SKY}")
+    write_json(out / "lights.json", suns)
+
+
+def _image_size(path: Path) -> tuple[int, int]:
+    """Read width and height from the header of an EXR."""
+    source = oiio.ImageInput.open(str(path))
+    assert source is not None  # `align` wrote it
+    spec = source.spec()
+    return spec.width, spec.height
+
+
+def _exposed_map(slice_: LightSlice, exposure: Sequence[float]) -> ExposedMap:
+    """Return the exported map of a photo's light, suns included, at the photo's exposure."""
+    world = slice_.world_from_camera
+    camera_from_light = np.eye(3) if world is None else np.array(world).T
+    return ExposedMap(f"../illumination/{slice_.illumination}.exr", np.array(exposure), camera_from_light)
+
+
+def _write_scenes(folder: Path, photo: str, scene: ExportedScene, lobes: Lobes, params: Params) -> None:
+    """Write a photo's scene for OpenUSD, Blender and Mitsuba.
+
+    OpenUSD's has the suns in its map, the others have them beside it.
+
+    Args:
+        folder: Folder of the scenes.
+        photo: Name of the photo.
+        scene: Scene with the whole light as a map.
+        lobes: The light, without the photo's exposure.
+        params: Parameters of the stage.
+    """
+    write_usd_scene(folder / f"{photo}{SUFFIX}", scene)
+    light = scene.light
+    exposure = light.exposure
+    suns = suns_of(lobes.scaled(exposure), YUP_FROM_CAMERA @ light.camera_from_light)
+    name = PurePosixPath(light.file).stem
+    sky = f"../illumination/{name}{SKY}.exr" if suns else light.file
+    scene = msgspec.structs.replace(scene, light=msgspec.structs.replace(light, file=sky), suns=suns)
+    write_scene_json(folder / f"{photo}.json", scene)
+    if np.ptp(exposure) == 0:
+        light = msgspec.structs.replace(light, file=f"light/{name}.exr")
+    else:  # Mitsuba scales all channels alike, so the photo gets its own map; no illumination has a dot in its name
+        light = ExposedMap(f"light/{photo}.exposed.exr", np.ones(3), light.camera_from_light)
+        _write_mitsuba_map(folder / light.file, lobes.take(~lobes.suns).scaled(exposure), params)
+    write_scene(folder / f"{photo}.xml", msgspec.structs.replace(scene, light=light))
 
 
 def _solved_lights(file: Path, lights: Mapping[str, LightSlice]) -> dict[str, Lobes]:
@@ -146,8 +185,8 @@ def _solved_lights(file: Path, lights: Mapping[str, LightSlice]) -> dict[str, Lo
     names = sorted({light.illumination for light in lights.values()})
     for name in names:
         if name not in solved:
-            why = "no pixel in it was observed: it is written as black"
-            log.warning("illumination '%s' was not solved for, because %s", name, why)
+            text = "illumination '%s' is exported as black: no pixel in it was observed, so it was not solved"
+            log.warning(text, name)
     return {name: solved.get(name, no_lobes()) for name in names}
 
 

@@ -1,4 +1,4 @@
-"""Pictures of one recipe; `factorlib.render.drawing` lists the files."""
+"""Pictures of one recipe; `factorlib.render.recipe_pictures` lists the files."""
 
 from pathlib import Path
 from typing import Annotated
@@ -6,8 +6,8 @@ from typing import Annotated
 import msgspec
 
 from factorlib.meshes.read import CREASE_DEG
-from factorlib.recipe.schema import recipe_of
-from factorlib.render.drawing import draw
+from factorlib.recipe.kinds import recipe_of
+from factorlib.render.recipe_pictures import draw
 from factorlib.render.solved_set import SolvedSet
 from factorlib.stage import Inputs, Progress
 

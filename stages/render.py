@@ -21,7 +21,7 @@ from factorlib.inference.interreflection import bounced_light
 from factorlib.reflection import reflection_operator
 from factorlib.render.reflect import Reflector
 from factorlib.render.resynthesis import Surroundings, balls, observed_cells, resynthesised
-from factorlib.results.lobes import light_of
+from factorlib.results.lobe_table import light_of
 from factorlib.results.materials import Gauge, Model, in_order, read_materials
 from factorlib.stage import Inputs, Progress
 from factorlib.urm.extract import observed_pixels
@@ -92,13 +92,12 @@ def surroundings(inputs: Inputs, model: Model, gauge: Gauge) -> Surroundings | N
     """
     if not (model.self_shadowing or model.distance):
         return None
-    seen = with_surface_normals(
-        read_observations(inputs["urm"] / f"{inputs.photo}.parquet"), inputs.folders.get("surface")
-    )
+    table = read_observations(inputs["urm"] / f"{inputs.photo}.parquet")
+    table = with_surface_normals(table, inputs.folders.get("surface"))
     if not model.self_shadowing:
-        seen = msgspec.structs.replace(seen, visibility=None, met=None)
-    sent = bounced_light(seen, seen.radiance.astype(float)) if model.interreflection else None
-    return Surroundings(seen, None if sent is None else sent / (gauge.export_factor or 1.0))
+        table = msgspec.structs.replace(table, visibility=None, met=None)
+    bounced = bounced_light(table, table.radiance.astype(float)) if model.interreflection else None
+    return Surroundings(table, None if bounced is None else bounced / (gauge.export_factor or 1.0))
 
 
 def _write(stem: Path, radiance: np.ndarray, exposure: float, ball: bool, observed: np.ndarray | None = None) -> None:

@@ -24,7 +24,7 @@ from factorlib.images.transfer import srgb_encode
 from factorlib.jsonfile import write_json
 from factorlib.results.photos import read_photo_facts
 from factorlib.results.poses import entry_of
-from factorlib.results.shapes import FILE, ShapeEntry, ShapesTable
+from factorlib.results.shape_table import FILE, ShapeEntry, ShapesTable
 from factorlib.shapes.hull import visual_hull
 from factorlib.shapes.lathe import body_of_revolution
 from factorlib.shapes.motion import PhotoForMotion, RegisteredCamera, cameras_by_motion

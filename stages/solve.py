@@ -43,7 +43,7 @@ from factorlib.jsonfile import read_result, write_json
 from factorlib.parquetfile import write_rows
 from factorlib.reflection import reflection_operator
 from factorlib.reflection.operator import Name
-from factorlib.results.lobes import write_lobes
+from factorlib.results.lobe_table import write_lobes
 from factorlib.results.solution import Earlier, read_earlier
 from factorlib.results.surface import BEGINNING
 from factorlib.stage import Inputs, Progress

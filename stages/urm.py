@@ -18,7 +18,7 @@ from factorlib.images.exr import read_exr
 from factorlib.meshes.mesh import scaled
 from factorlib.meshes.read import CREASE_DEG, MeshCache
 from factorlib.results.photos import read_photo_facts
-from factorlib.results.poses import ObjectEntry, read_photo_poses
+from factorlib.results.poses import ObjectPose, read_photo_poses
 from factorlib.stage import Inputs, Progress
 from factorlib.urm.extract import PhotoSource, extract_observations
 from factorlib.urm.merge import merge
@@ -73,7 +73,7 @@ def main(params: Params, inputs: Inputs, out: Path, progress: Progress) -> None:
     write_observations(out / f"{name}.parquet", merge(observations, params.merge_degrees))
 
 
-def read_occluders(inputs: Inputs, poses: dict[str, ObjectEntry]) -> Occluders:
+def read_occluders(inputs: Inputs, poses: dict[str, ObjectPose]) -> Occluders:
     """Read the meshes of the photo's objects, at the poses that `align` estimated."""
     slice_ = msgspec.convert(inputs.facts["dataset.objects"], ObjectsSlice)
     read = MeshCache(inputs.mesh, inputs.facts["dataset.materials"], CREASE_DEG)

@@ -14,7 +14,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 from scipy.spatial.transform import Rotation
 
-from factorlib.evaluate.ball import ball, light_of_lat_long
+from factorlib.evaluate.ball import ball, octahedral_light
 from factorlib.geometry.sphere import ball_normals
 from factorlib.light.latlong import rotate_map
 from factorlib.results.materials import Reflectance
@@ -68,7 +68,7 @@ def shown(material: Reflectance, light: Map, view: View) -> Radiance:
     """
     ahead = np.array_equal(view.turn, np.eye(3))
     light = light if ahead else rotate_map(light, view.turn, FINER)
-    return ball(light_of_lat_long(light), material, view.normals @ view.turn.T)
+    return ball(octahedral_light(light), material, view.normals @ view.turn.T)
 
 
 class Photos(msgspec.Struct, frozen=True):
@@ -92,7 +92,7 @@ def photographed(
     case: Comparison, materials: Mapping[str, Reflectance], lights: Mapping[int, Map]
 ) -> tuple[Photos, dict[str, Observations]]:
     """Return the photos of a case, and the same as the stage `urm` hands them to `solve`."""
-    tables, radiance = observations_of(case, materials, {li: light_of_lat_long(lights[li]) for li in case.lights}), {}
+    tables, radiance = observations_of(case, materials, {li: octahedral_light(lights[li]) for li in case.lights}), {}
     for li, table in zip(case.lights, tables.values(), strict=True):
         for m in np.unique(table.material):
             radiance[table.materials[m], li] = table.radiance[table.material == m]

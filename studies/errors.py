@@ -12,11 +12,11 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float
 
-from factorlib.evaluate.ball import light_of_lat_long
-from factorlib.evaluate.lights import SPHERES, compare_lights
-from factorlib.evaluate.materials import common_factor, compare_materials
+from factorlib.evaluate.ball import octahedral_light
+from factorlib.evaluate.light_errors import SPHERES, compare_lights
+from factorlib.evaluate.material_errors import common_factor, compare_materials
 from factorlib.light.latlong import lat_long_of_lobes
-from factorlib.results.lobes import read_lobes
+from factorlib.results.lobe_table import read_lobes
 from factorlib.results.materials import Reflectance
 from studies.study import Score, light_name
 
@@ -68,9 +68,10 @@ def light_errors(
 
     The null is constant light of the true mean.
 
-    gauge: of `factorlib.evaluate.gauge`;  to these a mirror sphere's angle between true and recovered colours: `colour`
+    gauge: of `factorlib.evaluate.comparison_gauge`;  to these a mirror sphere's angle between true and recovered
+    colours: `colour`
     """
-    both = ({str(name): light_of_lat_long(of[name]) for name in lights} for of in (lights, truths))
+    both = ({str(name): octahedral_light(of[name]) for name in lights} for of in (lights, truths))
     errors = compare_lights(*both, {}).mean[gauge]
     scores = ({s: getattr(errors[s], w).rmse for s in spheres} for w in ("estimate", "null"))
     colours = ({"colour": getattr(errors["mirror"], w).rgb_angle_deg} for w in ("estimate", "null"))

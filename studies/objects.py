@@ -28,7 +28,7 @@ from factorlib.align.state import pose_state
 from factorlib.align.target import make_target
 from factorlib.align.view import ObjectView
 from factorlib.conventions import FRONT, YUP_FROM_CAMERA
-from factorlib.evaluate.ball import Light, ball
+from factorlib.evaluate.ball import OctahedralLight, ball
 from factorlib.geometry.camera import Camera, Pose, rotation_of_vector
 from factorlib.geometry.raster import Caster, rasterise
 from factorlib.meshes.mesh import scaled
@@ -54,7 +54,7 @@ def body(name: str, triangles: int | None = None) -> Caster:
 
 
 def observed(
-    case: Case, materials: Mapping[str, Reflectance], lights: Mapping[int, Light]
+    case: Case, materials: Mapping[str, Reflectance], lights: Mapping[int, OctahedralLight]
 ) -> tuple[dict[str, Observations], float]:
     """Return one photo a light, by name, and the mean error of the normals given, degrees.
 
@@ -69,7 +69,7 @@ def observed(
     return photos, float(np.mean(errors))
 
 
-def _entry(case: Case, m: int, li: int, material: Reflectance, light: Light) -> tuple[Observations, float]:
+def _entry(case: Case, m: int, li: int, material: Reflectance, light: OctahedralLight) -> tuple[Observations, float]:
     how, rng, name = case.objects, np.random.default_rng([14, case.seed, m, li]), BODIES[(m + li) % len(BODIES)]
     # the body's middle in the middle of the picture, which it fills
     whole, rotation = body(name), Rotation.random(rng=rng).as_matrix()

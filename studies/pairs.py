@@ -46,11 +46,11 @@ from factorlib.generate.solids import SHAPES
 from factorlib.images.picture import picture, png_bytes
 from factorlib.jsonfile import write_json
 from factorlib.reading import read_text
-from factorlib.recipe.schema import Insert
-from factorlib.render.drawing import standing
+from factorlib.recipe.kinds import InsertRecipe
 from factorlib.render.ground import Plane
-from factorlib.render.insertion import Ground, Inserted, inserted
-from factorlib.render.photo_scene import Light, Placed
+from factorlib.render.insertion import GroundSurface, InsertionResult, inserted
+from factorlib.render.photo_scene import DistantLight, PlacedMesh
+from factorlib.render.recipe_pictures import insertion_scene
 from factorlib.render.solved_set import SolvedSet
 from factorlib.results.materials import Reflectance
 from factorlib.results.poses import AS_IT_IS
@@ -98,15 +98,15 @@ class Truth(SolvedSet):
             objects = {name: replace(found.objects[name], **place) for name, place in places.items()}
             self.poses[photo] = replace(found, camera=camera, objects=objects)
 
-    def light(self, name: str) -> Light:
+    def light(self, name: str) -> DistantLight:
         """Return the true map of a photo's light."""
         return read_true_light(self.folder / self.truth.illumination[name], name).astype(float)
 
-    def ground(self, photo: str, neighbour: Placed) -> Ground:
+    def ground(self, photo: str, neighbour: PlacedMesh) -> GroundSurface:
         """Return the plane y = 0 of a chair's own frame, on which it stands."""
         pose = self.truth.poses[photo][neighbour.name]
         normal = YUP_FROM_CAMERA @ np.array(pose.rotation)[:, 1]
-        return Ground(Plane(normal, YUP_FROM_CAMERA @ np.array(pose.translation)))
+        return GroundSurface(Plane(normal, YUP_FROM_CAMERA @ np.array(pose.translation)))
 
 
 def write_files(folder: Path) -> dict[str, Path]:
@@ -118,7 +118,7 @@ def write_files(folder: Path) -> dict[str, Path]:
     return {f"recipe file:{name}": path for name, path in files.items()}
 
 
-def chosen(sets: Mapping[str, Sets], count: int, samples: int, seed: int) -> Iterator[tuple[str, str, Insert]]:
+def chosen(sets: Mapping[str, Sets], count: int, samples: int, seed: int) -> Iterator[tuple[str, str, InsertRecipe]]:
     """Draw sets, photos and recipes of pairs, by a seed alone.
 
     Photos, meshes and materials are about equally often, places, sizes and turns at random.
@@ -138,9 +138,9 @@ def chosen(sets: Mapping[str, Sets], count: int, samples: int, seed: int) -> Ite
         for _ in range(PLACES):
             at = rng.uniform((0.15, 0.6), (0.85, 0.95)) * (camera.width, camera.height) * factor
             size, turn = rng.uniform((0.3, 0.0), (0.5, 360.0)).tolist()
-            recipe = Insert(**what, at=tuple(at.tolist()), size=size, turn=turn, samples=samples)
+            recipe = InsertRecipe(**what, at=tuple(at.tolist()), size=size, turn=turn, samples=samples)
             try:
-                if any(standing(recipe, of, photo).moved for of in sets[name]):
+                if any(insertion_scene(recipe, of, photo).moved for of in sets[name]):
                     continue
             except InputError:
                 continue
@@ -150,13 +150,13 @@ def chosen(sets: Mapping[str, Sets], count: int, samples: int, seed: int) -> Ite
             raise InputError(f"photo '{photo}' has no place for an object", key="photos", cure="name another set")
 
 
-def drawn(photo: str, recipe: Insert, recovered: SolvedSet, truth: SolvedSet) -> tuple[Both, dict[str, Any]]:
+def drawn(photo: str, recipe: InsertRecipe, recovered: SolvedSet, truth: SolvedSet) -> tuple[Both, dict[str, Any]]:
     """Return the window of the photo about the object, linear, by what was recovered and by the truth.
 
     The second value is how they differ (`scores`).
     """
-    sets, ours = {True: recovered, False: truth}, standing(recipe, recovered, photo)
-    true, factor = standing(recipe, truth, photo), factor_of(recovered.materials, truth.materials)
+    sets, ours = {True: recovered, False: truth}, insertion_scene(recipe, recovered, photo)
+    true, factor = insertion_scene(recipe, truth, photo), factor_of(recovered.materials, truth.materials)
     materials = {name: times(m, factor) for name, m in ours.scene.materials.items()}
     scene = replace(ours.scene, materials=materials, light=ours.scene.light.scaled(1 / factor))
     places = {True: replace(ours, scene=scene), False: true}
@@ -167,13 +167,13 @@ def drawn(photo: str, recipe: Insert, recovered: SolvedSet, truth: SolvedSet) ->
     (left, top), (width, height) = ends[0].tolist(), (ends[1] - ends[0]).tolist()
     window = slice(top, top + height), slice(left, left + width)
 
-    def traced(light: bool, material: bool, ground: bool, seed: int = 1) -> tuple[Picture, Inserted]:
+    def traced(light: bool, material: bool, ground: bool, seed: int = 1) -> tuple[Picture, InsertionResult]:
         """Trace the window with these factors recovered, the others true."""
         here, seen = places[ground], sets[light].straightened(photo)[window]
         lit = {"light": places[light].scene.light, "materials": places[material].scene.materials}
         scene = replace(here.scene, camera=here.scene.camera.window(left, top, 1.0, width, height), **lit)
         covered = recovered.covered(photo)[window]
-        found = inserted(replace(here, scene=scene), seen, covered, recipe.samples, seed=seed, compared=False)
+        found = inserted(replace(here, scene=scene), seen, covered, recipe.samples, seed=seed)
         return sets[light].tone(photo)(found.composite), found
 
     (mine, found), (right, other) = traced(True, True, True), traced(False, False, False)

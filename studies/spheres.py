@@ -21,24 +21,24 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from factorlib.conventions import FRONT, YUP_FROM_CAMERA
-from factorlib.evaluate.ball import Light, ball
+from factorlib.evaluate.ball import OctahedralLight, ball
 from factorlib.generate.surroundings import random_materials
 from factorlib.generate.synthetic import light_of
 from factorlib.geometry.sphere import ball_normals
 from factorlib.images.exr import read_rgb_exr
 from factorlib.results.materials import Reflectance
-from factorlib.tracing.scene import Material, look
+from factorlib.tracing.scene import look
 from factorlib.urm.observations import Observations
 from studies.study import SEVEN, Case, light_name
 
 ABOUT = {  # by the names of `SEVEN`
-    "brick": Material((0.5, 0.12, 0.1), (0.08, 0.08, 0.08), 0.6),
-    "leaf": Material((0.1, 0.35, 0.14), (0.25, 0.25, 0.25), 0.35),
-    "lacquer": Material((0.12, 0.16, 0.24), (0.4, 0.4, 0.4), 0.22),
-    "chalk": Material((0.6, 0.58, 0.52), (0.04, 0.04, 0.04), 0.7),
-    "gold": Material((0.15, 0.1, 0.04), (0.6, 0.45, 0.2), 0.3),
-    "tile": Material((0.34, 0.4, 0.5), (0.15, 0.15, 0.15), 0.45),
-    "bronze": Material((0.2, 0.13, 0.06), (0.5, 0.34, 0.14), 0.38),
+    "brick": Reflectance((0.5, 0.12, 0.1), (0.08, 0.08, 0.08), 0.6),
+    "leaf": Reflectance((0.1, 0.35, 0.14), (0.25, 0.25, 0.25), 0.35),
+    "lacquer": Reflectance((0.12, 0.16, 0.24), (0.4, 0.4, 0.4), 0.22),
+    "chalk": Reflectance((0.6, 0.58, 0.52), (0.04, 0.04, 0.04), 0.7),
+    "gold": Reflectance((0.15, 0.1, 0.04), (0.6, 0.45, 0.2), 0.3),
+    "tile": Reflectance((0.34, 0.4, 0.5), (0.15, 0.15, 0.15), 0.45),
+    "bronze": Reflectance((0.2, 0.13, 0.06), (0.5, 0.34, 0.14), 0.38),
 }
 SPREAD = 0.15
 GRAZING = 0.15  # n·o below which no pixel is observed
@@ -48,8 +48,7 @@ CURVED = 0.1  # share of a face's normals that is the sphere's: no real face is 
 
 def materials_of(seed: int, names: Sequence[str] = SEVEN[:5]) -> dict[str, Reflectance]:
     """Return the materials of a world by name."""
-    drawn = random_materials(np.random.default_rng([11, seed]), SPREAD, {name: ABOUT[name] for name in names})
-    return {name: Reflectance(m.diffuse, m.specular, m.roughness) for name, m in drawn.items()}
+    return random_materials(np.random.default_rng([11, seed]), SPREAD, {name: ABOUT[name] for name in names})
 
 
 def light_map(seed: int, light: int, rows: int, spp: int) -> Float[np.ndarray, "h w 3"]:
@@ -87,13 +86,13 @@ def in_camera(normals: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
 
 
 def observations_of(
-    case: Case, materials: Mapping[str, Reflectance], lights: Mapping[int, Light]
+    case: Case, materials: Mapping[str, Reflectance], lights: Mapping[int, OctahedralLight]
 ) -> dict[str, Observations]:
     """Return one photo a light, by name, in the form in which the stage `urm` hands them to `solve`."""
     return {light_name(li): _photo(case, li, list(materials.values()), lights[li]) for li in case.lights}
 
 
-def _photo(case: Case, number: int, materials: Sequence[Reflectance], light: Light) -> Observations:
+def _photo(case: Case, number: int, materials: Sequence[Reflectance], light: OctahedralLight) -> Observations:
     rows = [m for m, li in case.entries if li == number]
     normals, index = faceted(sphere_normals(case.size), case.facets), case.materials.index
 

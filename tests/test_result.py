@@ -15,7 +15,7 @@ from factorlib.images.exr import read_exr, read_rgb_exr
 from factorlib.images.light_map import read_light_map
 from factorlib.images.picture import read_png
 from factorlib.pack import pack
-from factorlib.recipe import schema
+from factorlib.recipe import kinds
 from factorlib.runner.project import LIBRARY
 from factorlib.stage import silent
 from stages import recipes
@@ -80,8 +80,8 @@ def test_a_folder_that_is_no_result_is_refused_with_those_that_are(folder, tmp_p
     for name, found, cure in [
         ("build/sett", "there is no result here", "did you mean 'build/set'"),
         ("data/set", "there is no result here", "build/set"),
-        ("build/set/export", "this lies inside a result", 'load_result("build/set")'),
-        ("build/set/export/materials.json", "this lies inside a result", 'load_result("build/set")'),
+        ("build/set/export", "this is a part of a result", 'load_result("build/set")'),
+        ("build/set/export/materials.json", "this is a part of a result", 'load_result("build/set")'),
         ("build/set/exprt", "there is no result here", "build/set"),
     ]:
         with pytest.raises(InputError, match=found) as error:
@@ -123,7 +123,7 @@ def test_a_packed_result_is_the_same_file_twice_and_loads_where_it_is_unpacked(c
 def test_a_pack_is_whole_or_not_there_and_replaces_nothing_unasked(copy, tmp_path, monkeypatch):
     home, file = copy / "build" / "set", tmp_path / "a.zip"
     (home / "report").mkdir()
-    for name, words in (("a.tar", "no name for a zip"), ("none/a.zip", "no name for a zip")):
+    for name, words in (("a.tar", "cannot be written here"), ("none/a.zip", "cannot be written here")):
         with pytest.raises(InputError, match=words):
             pack(home, tmp_path / name)
     pack(home, file)
@@ -138,7 +138,7 @@ def test_a_pack_is_whole_or_not_there_and_replaces_nothing_unasked(copy, tmp_pat
 
 @pytest.mark.parametrize("path, text, words", [
     ("export", None, ["export is missing", "make export DATASET=set"]),
-    ("export/dataset.json", None, ["what its data set was", "make export DATASET=set"]),
+    ("export/dataset.json", None, ["lacks the facts of its data set", "make export DATASET=set"]),
     ("export/dataset.json", "[]", ["dataset.json", "make export DATASET=set"]),
     ("export/dataset.json", "", ["dataset.json", "run its stage again"]),
 ])  # fmt: skip
@@ -187,10 +187,10 @@ def test_an_object_in_another_light_is_that_lights_colour(result, tmp_path):
 
 FRONT = {"photos": ["front"], "samples": 1}
 ASKED = [
-    (schema.Insert(**FRONT), lambda r: r.insert("front", samples=np.int64(1))),
-    (schema.Turntable(**FRONT, frames=2), lambda r: r.turntable("front", frames=2, samples=1)),
+    (kinds.InsertRecipe(**FRONT), lambda r: r.insert("front", samples=np.int64(1))),
+    (kinds.TurntableRecipe(**FRONT, frames=2), lambda r: r.turntable("front", frames=2, samples=1)),
     (
-        schema.Transfer(**FRONT, materials={"red": "unseen"}),
+        kinds.TransferRecipe(**FRONT, materials={"red": "unseen"}),
         lambda r: r.transfer("front", {"red": "unseen"}, samples=1),
     ),
 ]

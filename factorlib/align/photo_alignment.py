@@ -17,7 +17,7 @@ from factorlib.align.view import ObjectView, with_prior_focal
 from factorlib.errors import InputError
 from factorlib.geometry.camera import Camera, Pose
 from factorlib.geometry.raster import Caster, rasterise
-from factorlib.results.poses import AS_IT_IS, CameraEntry, ObjectEntry
+from factorlib.results.poses import AS_IT_IS, CameraEntry, ObjectPose
 
 RELIABLE_SCORE = 0.9  # least score of a pose that can judge EXIF's focal length
 CLEARLY_BETTER = 0.01  # lead in score that another focal length needs over EXIF's
@@ -59,7 +59,7 @@ class ObjectToAlign(msgspec.Struct, frozen=True):
     silhouette: Silhouette
     pose: Pose | None = None
     keypoints: Keypoints | None = None
-    earlier: ObjectEntry | None = None
+    earlier: ObjectPose | None = None
     scale: tuple[float, float, float] = AS_IT_IS  # factors of the caster's mesh against the file's
 
 

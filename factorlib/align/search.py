@@ -19,7 +19,7 @@ from factorlib.align.target import Target, make_target
 from factorlib.align.view import ObjectView
 from factorlib.geometry.camera import angle_between
 from factorlib.geometry.raster import Caster, Maps, rasterise
-from factorlib.results.poses import RunnerUp, entry_of
+from factorlib.results.poses import RunnerUpPose, entry_of
 
 Count = Annotated[int, msgspec.Meta(ge=1)]
 Report = Callable[[float], None]
@@ -69,7 +69,7 @@ class PoseEstimate(msgspec.Struct, frozen=True):
     state: PoseState
     score: float
     log_focal_sigma: float
-    runner_up: RunnerUp | None = None
+    runner_up: RunnerUpPose | None = None
     source: str = "found"
 
 
@@ -116,11 +116,11 @@ def estimate_pose(
     return PoseEstimate(best.state, best.score, best.log_focal_sigma(), second)
 
 
-def _describe_runner_up(caster: Caster, target: Target, best: RefinedState, runner_up: RefinedState) -> RunnerUp:
+def _describe_runner_up(caster: Caster, target: Target, best: RefinedState, runner_up: RefinedState) -> RunnerUpPose:
     """Return the pose of the runner-up, its score, and the angle between its normals and those of the best pose."""
     maps = (render_maps(caster, target, result.state) for result in (best, runner_up))
     pose = entry_of(runner_up.state.pose(caster))
-    return RunnerUp(**pose, score=runner_up.score, normal_difference_deg=normal_difference(*maps))
+    return RunnerUpPose(**pose, score=runner_up.score, normal_difference_deg=normal_difference(*maps))
 
 
 def refine_near(

@@ -33,7 +33,7 @@ GOLDEN = (np.sqrt(5) - 1) / 2
 VIEW = np.array([0.0, 0.0, 1.0])
 
 
-class Light(msgspec.Struct, frozen=True, eq=False):
+class OctahedralLight(msgspec.Struct, frozen=True, eq=False):
     """Radiance averaged over octahedral texels, finest level first: [128, 128, 3], [64, 64, 3], …, [1, 1, 3]."""
 
     levels: tuple[Float[np.ndarray, "s s 3"], ...]
@@ -54,10 +54,10 @@ class Light(msgspec.Struct, frozen=True, eq=False):
         return self.levels[(SIDE // WIDE_SIDE).bit_length() - 1].reshape(-1, 3)
 
 
-Reflected = Callable[[Light], Float[np.ndarray, "*n 3"]]  # maps a light to the radiance of points
+Reflected = Callable[[OctahedralLight], Float[np.ndarray, "*n 3"]]  # maps a light to the radiance of points
 
 
-def light_of_lat_long(radiance: Float[np.ndarray, "h w 3"]) -> Light:
+def octahedral_light(radiance: Float[np.ndarray, "h w 3"]) -> OctahedralLight:
     """Return the pyramid of a lat-long map (layout of `factorlib.conventions`)."""
     # Repeat texels to at least 512 rows and 1024 columns, so that every octahedral texel receives several.
     times = max(1, -(-1024 // radiance.shape[1]), -(-512 // radiance.shape[0]))
@@ -68,7 +68,9 @@ def light_of_lat_long(radiance: Float[np.ndarray, "h w 3"]) -> Light:
     texel = _octahedral_texels(height, width)
     total = np.bincount(texel, area, SIDE * SIDE)
     sums = [np.bincount(texel, area * channel, SIDE * SIDE) for channel in fine.reshape(-1, 3).T]
-    return Light(_pyramid(np.stack([s / total for s in sums], axis=-1).reshape(SIDE, SIDE, 3).astype(np.float32)))
+    return OctahedralLight(
+        _pyramid(np.stack([s / total for s in sums], axis=-1).reshape(SIDE, SIDE, 3).astype(np.float32))
+    )
 
 
 @lru_cache(maxsize=2)
@@ -77,9 +79,9 @@ def _octahedral_texels(height: int, width: int) -> Int[np.ndarray, " hw"]:
     return np.ravel_multi_index(_texel(lat_long_directions(height, width).reshape(-1, 3)), (SIDE, SIDE))
 
 
-def constant_light(colour: Float[np.ndarray, "3"]) -> Light:
+def constant_light(colour: Float[np.ndarray, "3"]) -> OctahedralLight:
     """Return a light of the same radiance from every direction."""
-    return Light(_pyramid(np.broadcast_to(np.asarray(colour, np.float32), (SIDE, SIDE, 3))))
+    return OctahedralLight(_pyramid(np.broadcast_to(np.asarray(colour, np.float32), (SIDE, SIDE, 3))))
 
 
 def texel_weights(
@@ -102,11 +104,13 @@ def texel_weights(
     below = np.minimum(level.astype(int), last - 1)
     row, column = _texel(direction)
     offsets = np.cumsum([0] + [(SIDE >> k) ** 2 for k in range(last + 1)])
-    at = [(offsets[k] + (row >> k) * (SIDE >> k) + (column >> k)).astype(np.int32) for k in (below, below + 1)]
+    texels = [(offsets[k] + (row >> k) * (SIDE >> k) + (column >> k)).astype(np.int32) for k in (below, below + 1)]
     share = level - below  # weight of the coarser level
     terms = np.hstack([weight * (1 - share), weight * share])
     starts = np.arange(len(terms) + 1) * terms.shape[1]
-    return csr_array((terms.astype(np.float32).ravel(), np.hstack(at).ravel(), starts), shape=(len(terms), offsets[-1]))
+    return csr_array(
+        (terms.astype(np.float32).ravel(), np.hstack(texels).ravel(), starts), shape=(len(terms), offsets[-1])
+    )
 
 
 def diffuse_lobe(normals: Float[np.ndarray, "n 3"]) -> Reflected:
@@ -147,7 +151,7 @@ def _narrow_lobe(normals: Float[np.ndarray, "n 3"], alpha: float) -> Reflected:
     return lambda light: weights @ light.texels
 
 
-def mirror_ball(light: Light, normals: Float[np.ndarray, "n 3"], size: int) -> Float[np.ndarray, "n 3"]:
+def mirror_ball(light: OctahedralLight, normals: Float[np.ndarray, "n 3"], size: int) -> Float[np.ndarray, "n 3"]:
     """Return the radiance of a perfect mirror ball.
 
     Args:
@@ -156,11 +160,11 @@ def mirror_ball(light: Light, normals: Float[np.ndarray, "n 3"], size: int) -> F
         size: width of the ball in pixels; every pixel covers 16 / size² steradians of reflected directions
     """
     mirrored = 2 * normals[:, None, 2:] * normals[:, None] - VIEW
-    one = np.ones((len(normals), 1))
-    return texel_weights(mirrored, 16 / size**2 * one, one) @ light.texels
+    weight = np.ones((len(normals), 1))
+    return texel_weights(mirrored, 16 / size**2 * weight, weight) @ light.texels
 
 
-def ball(light: Light, material: Reflectance, normals: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
+def ball(light: OctahedralLight, material: Reflectance, normals: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
     """Return the reflected radiance of k_d/π + k_s · D G / (4 (n·i)(n·o)) in a light.
 
     Args:
@@ -173,7 +177,7 @@ def ball(light: Light, material: Reflectance, normals: Float[np.ndarray, "n 3"])
     return value + specular * glossy_lobe(normals, material.roughness)(light) if specular.any() else value
 
 
-def _summed(response: Float[np.ndarray, "n t"], light: Light) -> Float[np.ndarray, "n 3"]:
+def _summed(response: Float[np.ndarray, "n t"], light: OctahedralLight) -> Float[np.ndarray, "n 3"]:
     """Return ∫ L · response over the texels of the level of `WIDE_SIDE`."""
     return response @ light.wide.astype(response.dtype) * (4 * np.pi / WIDE_SIDE**2)
 
@@ -235,8 +239,8 @@ def _texel(direction: Float[np.ndarray, "*n 3"]) -> tuple[Int[np.ndarray, "*n"],
 
 def octahedral_directions(side: int) -> Float[np.ndarray, "t 3"]:
     """Return the directions of the octahedral texels' centres, row by row: the inverse of `_texel`."""
-    at = (np.arange(side) + 0.5) / side * 2 - 1
-    v, u = (t.reshape(-1) for t in np.meshgrid(at, at, indexing="ij"))
+    centres = (np.arange(side) + 0.5) / side * 2 - 1
+    v, u = (t.reshape(-1) for t in np.meshgrid(centres, centres, indexing="ij"))
     inside = 1 - np.abs(u) - np.abs(v)
     radius = 1 - np.abs(inside)
     near = np.where(inside >= 0, np.abs(v), 1 - np.abs(u))

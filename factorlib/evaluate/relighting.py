@@ -29,9 +29,9 @@ from functools import cache, lru_cache
 import numpy as np
 from jaxtyping import Float
 
-from factorlib.evaluate.ball import Light, Reflected, diffuse_lobe, glossy_lobe
-from factorlib.evaluate.gauge import GAUGES, errors_by_gauge
-from factorlib.evaluate.picture import mean_error, picture_error, psnr, tone_mapped, white_of
+from factorlib.evaluate.ball import OctahedralLight, Reflected, diffuse_lobe, glossy_lobe
+from factorlib.evaluate.comparison_gauge import GAUGES, errors_by_gauge
+from factorlib.evaluate.picture_errors import mean_error, picture_error, psnr, tone_mapped, white_of
 from factorlib.geometry.sphere import ball_normals
 from factorlib.results.materials import Reflectance, Vec3, vec3
 from factorlib.results.metrics import Kinds, PictureError, Relighting, RelitBall, RelitSet
@@ -59,7 +59,7 @@ def matte_lobe() -> Reflected:
 class Appearances:
     """Balls of many materials in one light, with each part of the reflection rendered once."""
 
-    def __init__(self, light: Light):
+    def __init__(self, light: OctahedralLight):
         self.diffuse = matte_lobe()(light)
         self.glossy = cache(lambda roughness: lobe_of(roughness)(light))
 
@@ -72,7 +72,7 @@ class Appearances:
 
 
 @lru_cache(maxsize=64)
-def appearances(light: Light) -> Appearances:
+def appearances(light: OctahedralLight) -> Appearances:
     """Return the balls in a light, cached because several scores use them."""
     return Appearances(light)
 
@@ -80,8 +80,8 @@ def appearances(light: Light) -> Appearances:
 def compare_relighting(
     estimates: Mapping[str, Reflectance],
     truths: Mapping[str, Reflectance],
-    estimated_lights: Mapping[str, Light],
-    true_lights: Mapping[str, Light],
+    estimated_lights: Mapping[str, OctahedralLight],
+    true_lights: Mapping[str, OctahedralLight],
     seen: Mapping[str, Sequence[str]],
 ) -> Relighting | None:
     """Compare every material with a truth in every light with a truth; None if there is no such pair.
@@ -134,8 +134,8 @@ def _mean(balls: list[RelitBall]) -> dict[str, Kinds]:
 def compare_relit_set(
     estimates: Mapping[str, Reflectance],
     truths: Mapping[str, Reflectance],
-    estimated_lights: Mapping[str, Light],
-    true_lights: Mapping[str, Light],
+    estimated_lights: Mapping[str, OctahedralLight],
+    true_lights: Mapping[str, OctahedralLight],
 ) -> RelitSet | None:
     """Return the score over every pair of a material and a light that have a truth and an estimate; None without any.
 

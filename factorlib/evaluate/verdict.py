@@ -21,8 +21,8 @@ from collections.abc import Iterator, Mapping
 import msgspec
 import numpy as np
 
-from factorlib.evaluate.ball import Light
-from factorlib.evaluate.picture import tone_mapped
+from factorlib.evaluate.ball import OctahedralLight
+from factorlib.evaluate.picture_errors import tone_mapped
 from factorlib.evaluate.relighting import MEAN_SHOWN, Appearances
 from factorlib.inference.materials import ROUGHNESS
 from factorlib.results.materials import Misfit, Reflectance, Solved
@@ -39,16 +39,16 @@ GOOD = 24.0  # least expected score of a good result, dB
 POOR = 19.0  # least expected score of a usable result, dB
 DISAGREES = 3.0  # residuals above which shapes and photos disagree, in units of their noise
 MUCH = 0.1  # unexplained share from which an input is wrong and not only inaccurate
-TELLING = 0.2  # least share of e² for a term to be a reason
+LEAST_SHARE = 0.2  # least share of e² for a term to be a reason
 
 
-def material_errors(materials: Mapping[str, Solved], lights: Mapping[str, Light]) -> dict[str, float]:
+def ball_changes(materials: Mapping[str, Solved], lights: Mapping[str, OctahedralLight]) -> dict[str, float]:
     """Return m² of each material, mean over lights.
 
     Both arguments are in one gauge, and the materials have standard errors.
     """
     lit = [Appearances(light) for light in lights.values()]
-    return {name: float(np.mean([_change(solved, own) for own in lit])) for name, solved in materials.items()}
+    return {name: float(np.mean([_change(solved, balls) for balls in lit])) for name, solved in materials.items()}
 
 
 def _change(solved: Solved, lit: Appearances) -> float:
@@ -62,21 +62,21 @@ def _change(solved: Solved, lit: Appearances) -> float:
 
 def _others(solved: Solved) -> Iterator[Reflectance]:
     """Yield the reflectance with each of its parts one standard error lower and higher."""
-    own = solved.reflectance
+    estimate = solved.reflectance
     errors = solved.stderr
     for sign in (-1, 1):
         for part in ("diffuse", "specular"):
-            moved = np.clip(np.array(getattr(own, part)) + sign * np.array(getattr(errors, part)), 0, 1)
-            yield msgspec.structs.replace(own, **{part: tuple(moved.tolist())})
-        roughness = float(np.clip(own.roughness + sign * errors.roughness, *ROUGHNESS))
-        yield msgspec.structs.replace(own, roughness=roughness)
+            moved = np.clip(np.array(getattr(estimate, part)) + sign * np.array(getattr(errors, part)), 0, 1)
+            yield msgspec.structs.replace(estimate, **{part: tuple(moved.tolist())})
+        roughness = float(np.clip(estimate.roughness + sign * errors.roughness, *ROUGHNESS))
+        yield msgspec.structs.replace(estimate, roughness=roughness)
 
 
-class Signs(msgspec.Struct, frozen=True):
+class VerdictInputs(msgspec.Struct, frozen=True):
     """The measured quantities of (1).
 
     Attributes:
-        materials: m² of each material that a photo shows (`material_errors`)
+        materials: m² of each material that a photo shows (`ball_changes`)
         unexplained: u of the set
         photos: unexplained share and clipped share of each photo
         contours: d of each object with a compared outline, by photo and object
@@ -91,7 +91,7 @@ class Signs(msgspec.Struct, frozen=True):
 
     def terms(self) -> dict[str, float]:
         """Return the terms of (1) except the first."""
-        contours = [error for own in self.contours.values() for error in own.values()]
+        contours = [error for errors in self.contours.values() for error in errors.values()]
         return {
             "materials": MATERIALS * float(np.mean(list(self.materials.values()))),
             "clipped": CLIPPED * float(np.mean([photo.clipped for photo in self.photos.values()])) ** 2,
@@ -100,20 +100,20 @@ class Signs(msgspec.Struct, frozen=True):
         }
 
 
-def verdict(signs: Signs) -> Verdict:
+def verdict(inputs: VerdictInputs) -> Verdict:
     """Return the expected score of (1), the reasons that limit it, and the next step."""
-    terms = signs.terms()
+    terms = inputs.terms()
     whole = FLOOR + sum(terms.values())
     expected = round(float(-10 * np.log10(whole)), 3)
     trust: Trust = "good" if expected >= GOOD else "usable with care" if expected >= POOR else "do not trust"
     ranked = sorted(terms, key=terms.__getitem__, reverse=True)
-    telling = [name for name in ranked if terms[name] >= TELLING * whole] or ranked[:1]
-    said = [SENTENCES[name](signs) for name in telling]
+    limiting = [name for name in ranked if terms[name] >= LEAST_SHARE * whole] or ranked[:1]
+    explained = [EXPLANATIONS[name](inputs) for name in limiting]
     rounded = {name: float(f"{term:.6g}") for name, term in terms.items()}
-    return Verdict(trust, expected, DEVIATION, [why for why, _ in said], said[0][1], rounded)
+    return Verdict(trust, expected, DEVIATION, [why for why, _ in explained], explained[0][1], rounded)
 
 
-def text_of(verdict: Verdict) -> str:
+def verdict_text(verdict: Verdict) -> str:
     """Format the verdict for a terminal, conclusion first."""
     head = (
         f"{verdict.trust}: relit pictures are expected to reach "
@@ -131,37 +131,37 @@ def _percent(share: float) -> str:
     return f"{share:.0%}" if share >= 0.01 else f"{100 * share:.1g}%"
 
 
-def _of_materials(signs: Signs) -> tuple[str, str]:
+def _explain_materials(inputs: VerdictInputs) -> tuple[str, str]:
     """Return the reason and the next step if materials limit the score."""
-    name = max(signs.materials, key=signs.materials.__getitem__)
+    name = max(inputs.materials, key=inputs.materials.__getitem__)
     why = f"uncertain reflectances, most of all that of '{name}'"
-    if signs.deviation > DISAGREES:
-        why += f", for shapes and photos disagree by {signs.deviation:.0f} times their noise"
-        return why, _of_unexplained(signs)[1]
+    if inputs.deviation > DISAGREES:
+        why += f", for shapes and photos disagree by {inputs.deviation:.0f} times their noise"
+        return why, _explain_unexplained(inputs)[1]
     bright = "in light with a small bright source, or in which it stands beside a material that is surer"
     return why, f"add a photo of '{name}' {bright}"
 
 
-def _of_clipped(signs: Signs) -> tuple[str, str]:
+def _explain_clipped(inputs: VerdictInputs) -> tuple[str, str]:
     """Return the reason and the next step if clipped values limit the score."""
-    name = max(signs.photos, key=lambda photo: signs.photos[photo].clipped)
-    why = f"clipped values, in '{name}' {_percent(signs.photos[name].clipped)} of all: they say 'at least' only"
+    name = max(inputs.photos, key=lambda photo: inputs.photos[photo].clipped)
+    why = f"clipped values, in '{name}' {_percent(inputs.photos[name].clipped)} of all: they say 'at least' only"
     return why, f"expose '{name}' less, or give the camera's raw file"
 
 
-def _of_contour(signs: Signs) -> tuple[str, str]:
+def _explain_contour(inputs: VerdictInputs) -> tuple[str, str]:
     """Return the reason and the next step if outlines limit the score."""
-    each = {(photo, name): error for photo, own in signs.contours.items() for name, error in own.items()}
-    photo, name = max(each, key=each.__getitem__)
+    errors = {(photo, name): error for photo, each in inputs.contours.items() for name, error in each.items()}
+    photo, name = max(errors, key=errors.__getitem__)
     mend = "mend masks that have holes or lack a piece; else give a mesh that is nearer to it, or a larger photo"
     next_ = f"look at the overlays of '{name}': {mend}; if its pose in '{photo}' is wrong, give keypoints"
     return f"outlines of meshes and masks that differ, most of all those of '{name}' in '{photo}'", next_
 
 
-def _of_unexplained(signs: Signs) -> tuple[str, str]:
+def _explain_unexplained(inputs: VerdictInputs) -> tuple[str, str]:
     """Return the reason and the next step if unexplained shading limits the score."""
-    name = max(signs.photos, key=lambda photo: signs.photos[photo].unexplained)
-    share = min(signs.photos[name].unexplained, 1)
+    name = max(inputs.photos, key=lambda photo: inputs.photos[photo].unexplained)
+    share = min(inputs.photos[name].unexplained, 1)
     next_ = "a mesh that is nearer to the objects"
     if share >= MUCH:
         wrong = "its mesh, pose, masks or the names of its materials are wrong, or a program has changed the picture"
@@ -169,4 +169,9 @@ def _of_unexplained(signs: Signs) -> tuple[str, str]:
     return f"shading that stays unexplained, in '{name}' {_percent(share)} of it", next_
 
 
-SENTENCES = {"materials": _of_materials, "clipped": _of_clipped, "unexplained": _of_unexplained, "contour": _of_contour}
+EXPLANATIONS = {
+    "materials": _explain_materials,
+    "clipped": _explain_clipped,
+    "unexplained": _explain_unexplained,
+    "contour": _explain_contour,
+}

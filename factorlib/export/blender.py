@@ -1,8 +1,8 @@
 """Export of a photo's scene to Blender: a script that is the same for every set, and the scene as JSON.
 
 The script (`blender.py.txt` in this package, exported as `blender.py`) needs nothing but Blender.  A `.blend` file
-would need Blender to be written and would not be the same bytes twice.  The JSON is a `factorlib.export.scene.Scene` in
-plain numbers:
+would need Blender to be written and would not be the same bytes twice.  The JSON is a
+`factorlib.export.exported_scene.ExportedScene` in plain numbers:
 
     camera     width, height, focal_px, principal_point in pixels, centres at 0.5
     shapes     name, file (relative), material, cam_from_object: 4 × 4, rows, mesh units, OpenCV's camera axes
@@ -18,7 +18,7 @@ from typing import Any
 
 import numpy as np
 
-from factorlib.export.scene import ExposedMap, Scene, Shape, Sun
+from factorlib.export.exported_scene import ExportedScene, ExportedShape, ExposedMap, Sun
 from factorlib.jsonfile import write_json
 from factorlib.wholefile import write_text
 
@@ -29,7 +29,7 @@ def write_script(folder: str | Path) -> None:
     write_text(Path(folder) / "blender.py", script)
 
 
-def write_scene_json(path: str | Path, scene: Scene) -> None:
+def write_scene_json(path: str | Path, scene: ExportedScene) -> None:
     """Write a photo's scene as JSON, with the materials that its shapes name."""
     camera = scene.camera
     write_json(
@@ -50,6 +50,6 @@ def write_scene_json(path: str | Path, scene: Scene) -> None:
     )
 
 
-def _plain(of: Shape | ExposedMap | Sun, *names: str) -> dict[str, Any]:
-    values = {name: getattr(of, name) for name in names}
+def _plain(item: ExportedShape | ExposedMap | Sun, *names: str) -> dict[str, Any]:
+    values = {name: getattr(item, name) for name in names}
     return {name: value.tolist() if isinstance(value, np.ndarray) else value for name, value in values.items()}

@@ -23,8 +23,8 @@ def sharpened(lobes: Lobes, spacing: float) -> Lobes:
     """
     # variance 1/λ − h²/6, at the same energy
     variance = np.maximum(1 / lobes.sharpness - spacing**2 / 6, NARROWEST * spacing**2)
-    kept = np.asarray(lobe_integral(lobes.sharpness) / lobe_integral(1 / variance))
-    return Lobes(lobes.axis, 1 / variance, lobes.weight * kept[:, None])
+    factor = np.asarray(lobe_integral(lobes.sharpness) / lobe_integral(1 / variance))
+    return Lobes(lobes.axis, 1 / variance, lobes.weight * factor[:, None])
 
 
 def mitsuba_map(lobes: Lobes, height: int, width: int) -> Float[np.ndarray, "h w 3"]:
@@ -38,7 +38,7 @@ def mitsuba_map(lobes: Lobes, height: int, width: int) -> Float[np.ndarray, "h w
     Returns:
         Radiance at the nodes, in the lobes' frame turned y-up.
     """
-    at_nodes = sharpened(lobes, np.pi / (height - 1))
+    narrowed = sharpened(lobes, np.pi / (height - 1))
     theta = np.arange(height)[:, None] / (height - 1) * np.pi
     phi = (np.arange(width)[:, None] + 0.5) / width * 2 * np.pi
-    return lattice_of_lobes(at_nodes, height, width, lambda _: (theta, phi, np.ones(1)))
+    return lattice_of_lobes(narrowed, height, width, lambda _: (theta, phi, np.ones(1)))

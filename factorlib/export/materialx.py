@@ -14,9 +14,7 @@ for the energy of multiple scattering (measured by `factorlib.export.other_rende
 """
 
 import xml.etree.ElementTree as ET
-from collections.abc import Mapping
-
-import numpy as np
+from collections.abc import Mapping, Sequence
 
 from factorlib.results.materials import Reflectance
 
@@ -31,27 +29,20 @@ def materialx(materials: Mapping[str, Reflectance]) -> str:
     document = ET.Element("materialx", version="1.39", colorspace="lin_rec709")
     for name, material in materials.items():
         prefix = f"m_{name.replace('-', '_')}"
-        for add, end, shown in (
+        for add_shader, end, title in (
             (_add_nodes, "", name),
             (_add_standard, "_standard_surface", f"{name}, standard surface"),
         ):
-            add(document, prefix + end, material)
+            add_shader(document, prefix + end, material)
             shader = _add(document, "surfacematerial", prefix + end, "material")
-            shader.set("uiname", shown)
+            shader.set("uiname", title)
             _input(shader, "surfaceshader", "surfaceshader", nodename=f"{prefix}{end}_surface")
     ET.indent(document, " ")
     return '<?xml version="1.0"?>\n' + ET.tostring(document, encoding="unicode") + "\n"
 
 
-def mixture(material: Reflectance) -> tuple[float, np.ndarray, np.ndarray]:
-    """Return the weight w of the specular part, and the colours k_d/(1 − w) and k_s/w of the parts."""
-    weight = max(material.specular) / material.total if material.total > 0 else 0.0
-    diffuse = [v / (1 - weight) if weight < 1 else 0.0 for v in material.diffuse]
-    return weight, np.array(diffuse), np.array([v / weight if weight > 0 else 0.0 for v in material.specular])
-
-
 def _add_nodes(document: ET.Element, prefix: str, material: Reflectance) -> None:
-    weight, diffuse, specular = mixture(material)
+    weight, diffuse, specular = material.mixture
     _add(document, "oren_nayar_diffuse_bsdf", f"{prefix}_diffuse", "BSDF", color=diffuse, roughness=0.0)
     colours = {"color0": specular, "color90": specular}
     schlick = _add(document, "generalized_schlick_bsdf", f"{prefix}_specular", "BSDF", **colours)
@@ -65,17 +56,17 @@ def _add_nodes(document: ET.Element, prefix: str, material: Reflectance) -> None
 
 def _add_standard(document: ET.Element, prefix: str, material: Reflectance) -> None:
     brightest = max(material.specular)
-    base = np.array(material.diffuse) / (1 - brightest)
-    tint = np.array(material.specular) / (brightest or 1)
+    base = [value / (1 - brightest) for value in material.diffuse]
+    tint = [value / (brightest or 1) for value in material.specular]
     numbers = {"specular": brightest, "specular_roughness": material.roughness, "specular_IOR": NO_FRESNEL}
     colours = {"base_color": base, "specular_color": tint}
     _add(document, "standard_surface", f"{prefix}_surface", "surfaceshader", base=1.0, **colours, **numbers)
 
 
-def _add(document: ET.Element, category: str, name: str, kind: str, **inputs: float | np.ndarray) -> ET.Element:
+def _add(document: ET.Element, category: str, name: str, kind: str, **inputs: float | Sequence[float]) -> ET.Element:
     node = ET.SubElement(document, category, name=name, type=kind)
     for key, value in inputs.items():
-        if isinstance(value, np.ndarray):
+        if isinstance(value, Sequence):
             _input(node, key, "color3", value=", ".join(repr(float(v)) for v in value))
         else:
             _input(node, key, "float", value=repr(float(value)))

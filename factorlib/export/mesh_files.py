@@ -5,17 +5,16 @@ from pathlib import Path
 
 import numpy as np
 
-from factorlib.dataset import schema
-from factorlib.dataset.schema import MeshEntry
-from factorlib.export.scene import Shape
+from factorlib.dataset.schema import MeshEntry, MeshInstance
+from factorlib.export.exported_scene import ExportedShape
 from factorlib.export.usd import SUFFIX, colours, write_usd_mesh
 from factorlib.meshes.ply import submesh, write_ply
 from factorlib.meshes.read import MeshCache
 from factorlib.results.materials import Reflectance
-from factorlib.results.poses import ObjectEntry
+from factorlib.results.poses import ObjectPose
 from factorlib.results.surface import read_surface
 from factorlib.stage import Inputs
-from factorlib.tracing.scene import paint
+from factorlib.tracing.scene import paint, rigid
 
 
 class MeshFiles:
@@ -40,13 +39,13 @@ class MeshFiles:
         self.scenes = scenes
         self.materials = materials
         self.solved = solved
-        own = read_surface(inputs.folders.get("surface"))
-        self.read = MeshCache(inputs.mesh, materials, crease_deg, own.displacements, own.log_factors)
+        surface = read_surface(inputs.folders.get("surface"))
+        self.read = MeshCache(inputs.mesh, materials, crease_deg, surface.displacements, surface.log_factors)
         self._stems: dict[tuple, str] = {}  # file names up to the material, relative to the scenes
 
     def shapes(
-        self, obj: schema.MeshInstance, meshes: Mapping[str, MeshEntry], poses: Mapping[str, ObjectEntry]
-    ) -> list[Shape]:
+        self, obj: MeshInstance, meshes: Mapping[str, MeshEntry], poses: Mapping[str, ObjectPose]
+    ) -> list[ExportedShape]:
         """Return one shape per material of the object, and write its files if they are new.
 
         Files of a mesh's second choice of materials are called <mesh>.2.
@@ -58,9 +57,7 @@ class MeshFiles:
         """
         mesh = self.read.mesh(obj.mesh, meshes[obj.mesh], obj.materials)
         pose = poses[obj.name]
-        place = np.eye(4)
-        place[:3, :3] = np.array(pose.rotation) * pose.scale
-        place[:3, 3] = pose.translation
+        cam_from_object = rigid(np.array(pose.rotation) * pose.scale, pose.translation)
         names = {label: self.materials[label - 1] for label in mesh.labels}
         key = (obj.mesh, *sorted(obj.materials.items()))
         if key not in self._stems:
@@ -75,4 +72,7 @@ class MeshFiles:
                 write_usd_mesh(f"{file}{SUFFIX}", part, shades)
         stem = self._stems[key]
         painted = mesh.detail is not None
-        return [Shape(f"{obj.name}.{m}", f"{stem}.{m}.ply", m, place, mesh.open, painted) for m in names.values()]
+        return [
+            ExportedShape(f"{obj.name}.{name}", f"{stem}.{name}.ply", name, cam_from_object, mesh.open, painted)
+            for name in names.values()
+        ]

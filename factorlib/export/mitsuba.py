@@ -15,7 +15,7 @@ from typing import Any
 
 import numpy as np
 
-from factorlib.export.scene import Scene
+from factorlib.export.exported_scene import ExportedScene
 from factorlib.results.materials import Reflectance
 from factorlib.tracing.scene import bsdf
 from factorlib.wholefile import write_text
@@ -25,7 +25,7 @@ SAMPLES = 256  # default samples per pixel
 KINDS = {bool: "boolean", int: "integer", float: "float", str: "string"}
 
 
-def write_scene(path: str | Path, scene: Scene) -> None:
+def write_scene(path: str | Path, scene: ExportedScene) -> None:
     """Write the scene as XML; the light's exposure is grey, and its file is a map for Mitsuba."""
     root = ET.Element("scene", version=VERSION)
     for name, value in {"spp": SAMPLES, "max_depth": scene.max_depth}.items():
@@ -57,8 +57,10 @@ def material_xml(name: str, material: Reflectance) -> str:
     return ET.tostring(element, encoding="unicode").strip()
 
 
-def _sensor(scene: Scene) -> dict[str, Any]:
-    (cx, cy), (w, h), (near, far) = scene.camera.centre, (scene.camera.width, scene.camera.height), scene.clip_distances
+def _sensor(scene: ExportedScene) -> dict[str, Any]:
+    cx, cy = scene.camera.centre
+    w, h = scene.camera.width, scene.camera.height
+    near, far = scene.clip_distances
     film = {"type": "hdrfilm", "width": w, "height": h, "pixel_format": "rgb", "component_format": "float32"}
     return {
         "type": "perspective",
@@ -82,12 +84,12 @@ def _matrix(matrix: np.ndarray) -> tuple[str, dict[str, str]]:
     return "matrix", {"value": _numbers(matrix.reshape(-1))}
 
 
-def _add(parent: ET.Element, kind: str, entry: dict[str, Any], **attributes: str) -> ET.Element:
+def _add(parent: ET.Element, tag: str, entry: dict[str, Any], **attributes: str) -> ET.Element:
     """Add Mitsuba's dictionary of a plugin as an element, with a child for each value.
 
     A value "$…" refers to a default and is an integer.
     """
-    element = ET.SubElement(parent, kind, {"type": entry["type"], **attributes})
+    element = ET.SubElement(parent, tag, {"type": entry["type"], **attributes})
     for name, value in entry.items():
         if isinstance(value, tuple):
             ET.SubElement(ET.SubElement(element, "transform", name=name), *value)
@@ -102,9 +104,9 @@ def _add(parent: ET.Element, kind: str, entry: dict[str, Any], **attributes: str
         elif isinstance(value, dict):
             _add(element, name.partition("_")[0], value)
         elif name != "type":
-            words = _numbers([value]) if isinstance(value, float) else str(value)
-            of = "integer" if words.startswith("$") else KINDS[type(value)]
-            ET.SubElement(element, of, name=name, value=words.lower() if of == "boolean" else words)
+            text = _numbers([value]) if isinstance(value, float) else str(value)
+            kind = "integer" if text.startswith("$") else KINDS[type(value)]
+            ET.SubElement(element, kind, name=name, value=text.lower() if kind == "boolean" else text)
     return element
 
 

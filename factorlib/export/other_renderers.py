@@ -21,23 +21,20 @@ A material written as a metal has F0 = k_s and F90 = 1 in all three models of gl
 Ball        Radius 1, seen from far away in PIXELS × PIXELS; pixels with n·o under LEAST_COSINE are left out.
 Lights      A sky of constant radiance; a lamp above the viewer's left shoulder; a lamp behind the ball, to the right.
             The last one grazes the ball, where shadowing and Fresnel differ most.  White, without shadows.
-Difference  |shown − solved| / max(solved, 0.001), per channel; a white Lambertian ball in the sky has radiance 1.
+Difference  |model − solved| / max(solved, 0.001), per channel; a white Lambertian ball in the sky has radiance 1.
             "mean" and "worst" are over all lit pixels, channels and lights.
 """
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from functools import cache, partial
-from pathlib import Path
 
 import msgspec
 import numpy as np
 from jaxtyping import Float
 
-from factorlib.export.gltf import DIELECTRIC, EXTENSION, gltf_material
-from factorlib.export.materialx import mixture
+from factorlib.export.gltf_writer import DIELECTRIC, EXTENSION, gltf_material
 from factorlib.export.usd import shader_inputs, with_roughness_of_file
 from factorlib.geometry.sphere import ball_normals
-from factorlib.jsonfile import write_json
 from factorlib.results.materials import Reflectance
 
 ALBEDO_NODES = 64  # cosines in the table of albedos
@@ -84,34 +81,37 @@ def solved(material: Reflectance, angles: Angles) -> Parts:
 
 def mtlx(material: Reflectance, angles: Angles) -> Parts:
     """Evaluate the nodes of `factorlib.export.materialx`."""
-    weight, diffuse, specular = mixture(material)
-    escaped = 1 / albedo(material.alpha, angles.no) - 1
-    brighter = 1 + specular * escaped[..., None]
-    return _parts(angles, (1 - weight) * diffuse, weight * specular * brighter, correlated(material.alpha, angles))
+    weight, _, specular = material.mixture
+    brighter = 1 + np.multiply.outer(1 / albedo(material.alpha, angles.no) - 1, specular)
+    return _parts(angles, material.diffuse, weight * np.array(specular) * brighter, correlated(material.alpha, angles))
 
 
 def mtlx_standard_surface(material: Reflectance, angles: Angles) -> Parts:
     """Evaluate the standard surface of `factorlib.export.materialx`; for its F of 1, E · (1 + (1 − E)/E) = 1."""
-    brighter = 1 / albedo(material.alpha, angles.no)
-    specular = np.multiply.outer(brighter, material.specular)
+    specular = np.multiply.outer(1 / albedo(material.alpha, angles.no), material.specular)
     return _parts(angles, material.diffuse, specular, correlated(material.alpha, angles))
 
 
 def usd(material: Reflectance, angles: Angles) -> Parts:
     """Evaluate UsdPreviewSurface with the inputs in the file, at the roughness of `material`.
 
-    `losses` passes the material with the roughness of the file.
+    `differences` passes the material with the roughness of the file.
     """
     inputs = shader_inputs(material)
     base = np.asarray(inputs["diffuseColor"])
+    visibility = separable(material.alpha, angles)
     if not inputs["useSpecularWorkflow"]:  # a metal
-        return _parts(angles, np.zeros(3), base, separable(material.alpha, angles))
-    f0 = np.asarray(inputs["specularColor"])
-    fresnel = f0 + np.multiply.outer((1 - angles.oh) ** 5, 1 - f0)
-    return _parts(angles, base * (1 - fresnel), fresnel, separable(material.alpha, angles))
+        return _parts(angles, np.zeros(3), base, visibility)
+    fresnel = schlick(np.asarray(inputs["specularColor"]), 1.0, angles)
+    return _parts(angles, base * (1 - fresnel), fresnel, visibility)
 
 
 # terms ---------------------------------------------------------------------------------------------------------------
+
+
+def schlick(f0: Float[np.ndarray, "3"], f90: float, angles: Angles) -> Float[np.ndarray, "*n 3"]:
+    """Return Schlick's Fresnel term, F0 at normal and F90 at grazing incidence."""
+    return f0 + np.multiply.outer((1 - angles.oh) ** 5, f90 - f0)
 
 
 def separable(alpha: float, angles: Angles) -> Float[np.ndarray, "*n"]:
@@ -173,17 +173,14 @@ def _gltf(material: Reflectance, angles: Angles, shadowing: Shadowing, extension
     """Evaluate a model of glTF with the numbers in the file."""
     entry = gltf_material(material)
     base = np.array(entry["pbrMetallicRoughness"]["baseColorFactor"][:3])
-    schlick = (1 - angles.oh) ** 5
+    visibility = shadowing(material.alpha, angles)
     if entry["pbrMetallicRoughness"]["metallicFactor"]:
-        fresnel = base + np.multiply.outer(schlick, 1 - base)
-        return _parts(angles, np.zeros(3), fresnel, shadowing(material.alpha, angles))
-    plain = {"specularFactor": 1.0, "specularColorFactor": [1.0] * 3}
-    specular = entry["extensions"][EXTENSION] if extension else plain
+        return _parts(angles, np.zeros(3), schlick(base, 1.0, angles), visibility)
+    specular = entry["extensions"][EXTENSION] if extension else {"specularFactor": 1.0, "specularColorFactor": 1.0}
     f90 = specular["specularFactor"]
-    f0 = f90 * np.minimum(DIELECTRIC * np.array(specular["specularColorFactor"]), 1)
-    fresnel = f0 + np.multiply.outer(schlick, f90 - f0)
-    diffuse = base * (1 - fresnel.max(axis=-1, keepdims=True))
-    return _parts(angles, diffuse, fresnel, shadowing(material.alpha, angles))
+    f0 = f90 * np.minimum(DIELECTRIC * np.broadcast_to(specular["specularColorFactor"], 3), 1)
+    fresnel = schlick(f0, f90, angles)
+    return _parts(angles, base * (1 - fresnel.max(axis=-1, keepdims=True)), fresnel, visibility)
 
 
 def _parts(
@@ -205,65 +202,50 @@ MODELS: dict[str, Model] = {
 }
 
 
-# differences
+# differences ---------------------------------------------------------------------------------------------------------
 
 
-class Loss(msgspec.Struct, frozen=True):
+class RelativeDifference(msgspec.Struct, frozen=True):
     """Mean and largest relative difference."""
 
     mean: float
     worst: float
 
 
-def write_losses(path: str | Path, materials: Mapping[str, Reflectance]) -> None:
-    """Write {material: {model of `MODELS`: mean, worst}}."""
-    write_json(path, {name: losses(material) for name, material in materials.items()})
-
-
-def losses(material: Reflectance) -> dict[str, Loss]:
-    """Return the loss of each of `MODELS` against the solved model, rounded to 5 digits.
-
-    The losses of a black material are 0.
-    """
+def differences(material: Reflectance) -> dict[str, RelativeDifference]:
+    """Return the difference of each of `MODELS` from the solved model, rounded to 5 digits; 0 for a black material."""
     material = msgspec.structs.replace(material, roughness=max(material.roughness, LEAST_ROUGHNESS))
-    filed = {name: with_roughness_of_file(material) if name == "usd" else material for name in MODELS}
-    true = np.concatenate(ball(material, solved))
-    return {name: _loss(np.concatenate(ball(filed[name], model)), true) for name, model in MODELS.items()}
+    written = {name: with_roughness_of_file(material) if name == "usd" else material for name in MODELS}
+    expected = ball(material, solved)
+    result = {}
+    for name, model in MODELS.items():
+        rendered = ball(written[name], model)
+        relative = (np.abs(rendered - expected) / np.maximum(expected, FLOOR))[(expected > 0) | (rendered > 0)]
+        numbers = (relative.mean(), relative.max()) if relative.size else (0.0, 0.0)
+        result[name] = RelativeDifference(*(round(float(value), 5) for value in numbers))
+    return result
 
 
-def _loss(shown: Float[np.ndarray, "n 3"], true: Float[np.ndarray, "n 3"]) -> Loss:
-    relative = (np.abs(shown - true) / np.maximum(true, FLOOR))[(true > 0) | (shown > 0)]
-    return Loss(round(float(relative.mean()), 5), round(float(relative.max()), 5)) if relative.size else Loss(0.0, 0.0)
+def ball(material: Reflectance, model: Model) -> Float[np.ndarray, "n 3"]:
+    """Return the radiance of the ball's pixels in all lights: in a sky of radiance 1, and under lamps of irradiance π.
 
-
-def ball(material: Reflectance, model: Model) -> list[Float[np.ndarray, "n 3"]]:
-    """Return the radiance of the ball's pixels in each light: sky of radiance 1, lamps of irradiance π."""
+    Under a lamp it is f · n·i · π.
+    """
     normals = ball_normals(PIXELS)[0]
     normals = normals[normals[:, 2] >= LEAST_COSINE]
     nodes = np.linspace(LEAST_COSINE, 1.0, SKY_NODES)
     sky = in_sky(material, model, nodes)
-    in_the_sky = np.stack([np.interp(normals[:, 2], nodes, sky[:, c]) for c in range(3)], axis=-1)
-    return [in_the_sky, *(in_lamp(material, model, normals, np.array(lamp)) for lamp in LAMPS.values())]
-
-
-def in_lamp(
-    material: Reflectance, model: Model, normals: Float[np.ndarray, "n 3"], lamp: Float[np.ndarray, "3"]
-) -> Float[np.ndarray, "n 3"]:
-    """Return f · n·i · π, the radiance in the light of a distant lamp.
-
-    Args:
-        material: the reflectance
-        model: the reflection model
-        normals: unit normals; x right, y up, z toward the viewer
-        lamp: direction to the lamp, of any length
-    """
+    pictures = [np.stack([np.interp(normals[:, 2], nodes, channel) for channel in sky.T], axis=-1)]
     view = np.array([0.0, 0.0, 1.0])
-    light = lamp / np.linalg.norm(lamp)
-    half = (view + light) / np.linalg.norm(view + light)
-    ni = (normals @ light).clip(0)
-    angles = Angles(ni, normals[:, 2], (normals @ half).clip(0), np.full(len(normals), view @ half))
-    parts = model(material, angles)
-    return np.pi * ni[:, None] * (parts.diffuse + distribution(material.alpha, angles.nh)[:, None] * parts.lobe)
+    for lamp in LAMPS.values():
+        light = np.array(lamp) / np.linalg.norm(lamp)
+        half = (view + light) / np.linalg.norm(view + light)
+        ni = (normals @ light).clip(0)
+        angles = Angles(ni, normals[:, 2], (normals @ half).clip(0), np.full(len(normals), view @ half))
+        parts = model(material, angles)
+        brdf = parts.diffuse + distribution(material.alpha, angles.nh)[:, None] * parts.lobe
+        pictures.append(np.pi * ni[:, None] * brdf)
+    return np.concatenate(pictures)
 
 
 def in_sky(material: Reflectance, model: Model, no: Float[np.ndarray, " n"]) -> Float[np.ndarray, "n 3"]:

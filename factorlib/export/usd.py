@@ -2,9 +2,8 @@
 
     /scene/camera, light, materials/<material>, objects/<object>/<material>;  /Render/photo: the size in pixels
 
-Frame     The frame of `factorlib.export.scene`, in the poses' units; the camera looks along −z, as every USD camera
-          does.
-          USD multiplies row vectors from the left, so matrices are written transposed.
+Frame     The frame of `factorlib.export.exported_scene`, in the poses' units; the camera looks along −z, as every USD
+          camera does.  USD multiplies row vectors from the left, so matrices are written transposed.
 Camera    Apertures are fractions of FILM; their offset is the picture's middle, right of and above the principal point.
 Light     A dome light's map has OpenEXR's layout, as the exported maps have it.
 Material  UsdPreviewSurface: GGX of α = roughness², Schlick's F from F0 to F90, diffuseColor × (1 − F) per channel
@@ -23,7 +22,7 @@ import msgspec
 import numpy as np
 from jaxtyping import Float
 
-from factorlib.export.scene import ExposedMap, Scene, Shape
+from factorlib.export.exported_scene import ExportedScene, ExportedShape, ExposedMap
 from factorlib.meshes.mesh import Mesh
 from factorlib.results.materials import Reflectance
 from factorlib.wholefile import write_text
@@ -37,7 +36,7 @@ UP_AXIS = ["metersPerUnit = 1", 'upAxis = "Y"']  # The size of a unit of the pos
 ESCAPES = {"\\": "\\\\", '"': '\\"', "\n": "\\n", "\r": "\\r", "\t": "\\t"}
 
 
-def write_usd_scene(path: str | Path, scene: Scene) -> None:
+def write_usd_scene(path: str | Path, scene: ExportedScene) -> None:
     """Write a photo's scene with the materials that its shapes name.
 
     It refers to the files that `write_usd_mesh` writes beside the shapes' own.
@@ -81,7 +80,8 @@ def shader_inputs(material: Reflectance) -> dict[str, float | np.ndarray]:
     The specular workflow has F0 = specularColor = k_s, F90 = 1 and diffuseColor = k_d / (1 − k_s), which gives k_d and
     k_s at normal incidence.  A material without k_d is a metal, whose F is diffuseColor = k_s at every angle.
     """
-    diffuse, specular = np.array(material.diffuse, dtype=float), np.array(material.specular, dtype=float)
+    diffuse = np.array(material.diffuse, dtype=float)
+    specular = np.array(material.specular, dtype=float)
     roughness = with_roughness_of_file(material).roughness
     if specular.any() and not diffuse.any():
         return {"diffuseColor": specular, "metallic": 1.0, "roughness": roughness, "useSpecularWorkflow": 0}
@@ -110,20 +110,21 @@ def identifiers(names: Iterable[str]) -> dict[str, str]:
     {'red_1': 'red_1', 'red-1': 'red_1_2', '2': '_2', '': '_'}
     """
     plain = {name: re.sub(r"^(?=[0-9]|$)", "_", re.sub(r"[^A-Za-z0-9_]", "_", name)) for name in names}
-    found: dict[str, str] = {}
+    distinct: dict[str, str] = {}
     for name in sorted(plain, key=lambda name: plain[name] != name):
         choices = chain([plain[name]], (f"{plain[name]}_{number}" for number in count(2)))
-        found[name] = next(each for each in choices if each not in found.values())
-    return found
+        distinct[name] = next(each for each in choices if each not in distinct.values())
+    return distinct
 
 
 # parts of a scene ----------------------------------------------------------------------------------------------------
 
 
-def _camera(scene: Scene) -> list[str]:
+def _camera(scene: ExportedScene) -> list[str]:
     camera = scene.camera
     pixel = FILM / scene.camera.width
-    (cx, cy), (w, h) = camera.centre, (camera.width, camera.height)
+    cx, cy = camera.centre
+    w, h = camera.width, camera.height
     numbers = {
         "focalLength": camera.focal * pixel,
         "horizontalAperture": w * pixel,
@@ -148,7 +149,7 @@ def _light(light: ExposedMap) -> list[str]:
     return _prim('DomeLight "light"', [*lines, *_transform(light.world_from_light)])
 
 
-def _materials(scene: Scene, named: Mapping[str, str]) -> list[str]:
+def _materials(scene: ExportedScene, named: Mapping[str, str]) -> list[str]:
     lines = []
     for name, identifier in named.items():
         shader = ['uniform token info:id = "UsdPreviewSurface"']
@@ -166,13 +167,13 @@ def _materials(scene: Scene, named: Mapping[str, str]) -> list[str]:
         if name.endswith(PAINTED):
             read = ['uniform token info:id = "UsdPrimvarReader_float3"', 'string inputs:varname = "displayColor"']
             about += _prim('Shader "colours"', [*read, "float3 outputs:result"])
-        lines += _prim(f'Material "{identifier}"', about, _shown(name))
+        lines += _prim(f'Material "{identifier}"', about, _display_name(name))
     return _prim('Scope "materials"', lines)
 
 
-def _objects(shapes: Sequence[Shape], materials: Mapping[str, str]) -> list[str]:
+def _objects(shapes: Sequence[ExportedShape], materials: Mapping[str, str]) -> list[str]:
     """Return an Xform per object, and in it a mesh per material."""
-    objects: dict[str, list[Shape]] = {}
+    objects: dict[str, list[ExportedShape]] = {}
     for shape in shapes:
         objects.setdefault(shape.name.removesuffix(f".{shape.material}"), []).append(shape)
     lines = []
@@ -182,9 +183,9 @@ def _objects(shapes: Sequence[Shape], materials: Mapping[str, str]) -> list[str]
             material = materials[shape.material + PAINTED * shape.painted]
             file = PurePosixPath(shape.file).with_suffix(SUFFIX)
             references = f"prepend references = {_asset(f'./{file}')}"
-            head = ['prepend apiSchemas = ["MaterialBindingAPI"]', *_shown(shape.material), references]
+            head = ['prepend apiSchemas = ["MaterialBindingAPI"]', *_display_name(shape.material), references]
             about += _prim(f'Mesh "{material}"', [f"rel material:binding = </scene/materials/{material}>"], head)
-        lines += _prim(f'Xform "{identifier}"', about, _shown(name))
+        lines += _prim(f'Xform "{identifier}"', about, _display_name(name))
     return _prim('Scope "objects"', lines)
 
 
@@ -210,7 +211,7 @@ def _indented(lines: Sequence[str]) -> list[str]:
     return [INDENT + line for line in lines]
 
 
-def _shown(name: str) -> list[str]:
+def _display_name(name: str) -> list[str]:
     plain = {c: c if c.isprintable() or ord(c) >= 128 else f"\\x{ord(c):02x}" for c in name} | ESCAPES
     return ['displayName = "' + "".join(plain[c] for c in name) + '"']
 

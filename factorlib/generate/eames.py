@@ -23,7 +23,8 @@ from factorlib.geometry.camera import Camera, Pose
 from factorlib.geometry.raster import rasterise
 from factorlib.meshes.mesh import Mesh, smooth
 from factorlib.meshes.ply import submesh
-from factorlib.tracing.scene import Material, bsdf, envmap, light_seen, look, rigid, shape, traced, transform
+from factorlib.results.materials import Reflectance
+from factorlib.tracing.scene import bsdf, envmap, incident_light, look, rendered, rigid, sensor, shape, transform
 from factorlib.yamlfile import read_yaml
 
 Progress = Callable[[int, int, str], None]
@@ -78,7 +79,7 @@ class ChairShot(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 class ChairSet(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """Contents of eames.yaml, which explains each number."""
 
-    materials: dict[str, Material]
+    materials: dict[str, Reflectance]
     shots: list[ChairShot]
     clipped: float
     apart: float
@@ -198,7 +199,7 @@ def arrange_scene(
 
 
 def write_shot(
-    out: Path, scene: ChairScene, materials: dict[str, Material], parameters: ChairSetOptions, seed: int
+    out: Path, scene: ChairScene, materials: dict[str, Reflectance], parameters: ChairSetOptions, seed: int
 ) -> dict:
     """Render, expose and write one photo, with its masks, its light in the photo's units, and its normals.
 
@@ -242,7 +243,7 @@ def write_shot(
 
 
 def render_shot(
-    scene: ChairScene, meshes: Sequence[Mesh], materials: Sequence[Material], parameters: ChairSetOptions, seed: int
+    scene: ChairScene, meshes: Sequence[Mesh], materials: Sequence[Reflectance], parameters: ChairSetOptions, seed: int
 ) -> tuple[Float[np.ndarray, "h w 3"], Float[np.ndarray, "h w 3"]]:
     """Render the light at the chairs' centre, without the chairs, and the photo.
 
@@ -261,7 +262,7 @@ def render_shot(
     world_from_light = scene.world_from_camera[:3, :3] @ YUP_FROM_CAMERA
     depth = 1 if parameters.direct and not parameters.distant else -1
     place = rigid(world_from_light, (0, SET.middle - EYE, 0))
-    light = light_seen(around, place, parameters.light_rows, parameters.light_spp, seed, depth)
+    light = incident_light(around, place, parameters.light_rows, parameters.light_spp, seed, depth)
     if parameters.distant:
         around = {"light": envmap(light) | {"to_world": transform(rigid(world_from_light, (0, 0, 0)))}}
     solids = {
@@ -270,4 +271,5 @@ def render_shot(
         for label in mesh.labels
     }
     depth = 2 if parameters.direct else -1
-    return light, traced(around | solids, scene.camera, scene.world_from_camera, parameters.spp, seed, depth)
+    film = sensor(scene.camera, scene.world_from_camera)
+    return light, rendered(around | solids, film, parameters.spp, seed, depth)

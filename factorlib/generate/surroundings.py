@@ -15,8 +15,8 @@ from jaxtyping import Float
 
 from factorlib.errors import InputError
 from factorlib.images.light_map import read_light_map
-from factorlib.results.materials import vec3
-from factorlib.tracing.scene import Material, envmap, light_seen, rgb, transform
+from factorlib.results.materials import Reflectance, vec3
+from factorlib.tracing.scene import envmap, incident_light, rgb, transform
 from factorlib.tracing.variant import mitsuba
 
 EYE = 1.2  # height of the origin above the ground
@@ -33,7 +33,7 @@ SceneDict = dict[str, Any]  # shapes and emitters by name, as Mitsuba's `load_di
 TURNS = {"+x": (0, 90), "-x": (0, -90), "+z": (0, 0), "-z": (0, 180), "+y": (-90, 0), "-y": (90, 0)}
 
 
-def random_materials(rng: np.random.Generator, spread: float, about: dict[str, Material]) -> dict[str, Material]:
+def random_materials(rng: np.random.Generator, spread: float, about: dict[str, Reflectance]) -> dict[str, Reflectance]:
     """Vary materials at random: each number times exp(spread · normal), within k_d + k_s ≤ 0.95, to four digits.
 
     Args:
@@ -51,7 +51,7 @@ def random_materials(rng: np.random.Generator, spread: float, about: dict[str, M
         colours *= min(1.0, 0.95 / (colours[0].max() + colours[1].max()))
         roughness = float(np.clip(material.roughness * factor[4], 0.15, 0.8))
         diffuse, specular = (vec3(round(float(v), 4) for v in colour) for colour in colours)
-        result[name] = Material(diffuse, specular, round(roughness, 4))
+        result[name] = Reflectance(diffuse, specular, round(roughness, 4))
     return result
 
 
@@ -82,7 +82,7 @@ def daylight(rng: Rng, elevation_deg: float, azimuth_deg: float, turbidity: floa
         "sun_direction": [float(c) for c in sun],
         "to_world": transform(Y_UP_FROM_Z_UP),
     }
-    sky_map = light_seen({"sky": sky}, np.eye(4), rows, 4, 0, max_depth=2)
+    sky_map = incident_light({"sky": sky}, np.eye(4), rows, 4, 0, max_depth=2)
     scene = {"sky": envmap(sky_map, finer=2), "ground": wall("-y", EYE, (200, 200), GROUND)}
     for k in range(4):  # coloured blocks some metres away, none in front of the sun
         angle = np.radians(azimuth_deg + 60 + 80 * k + rng.uniform(-20, 20))

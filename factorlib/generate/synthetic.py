@@ -23,14 +23,15 @@ from factorlib.geometry.camera import Camera, Pose, rotation_of_vector
 from factorlib.geometry.raster import rasterise
 from factorlib.meshes.mesh import Mesh
 from factorlib.meshes.ply import write_ply
-from factorlib.tracing.scene import Material, bsdf, envmap, light_seen, look, rendered, rigid, sensor, shape
+from factorlib.results.materials import Reflectance
+from factorlib.tracing.scene import bsdf, envmap, incident_light, look, rendered, rigid, sensor, shape
 
 Progress = Callable[[int, int, str], None]
 DISTANCE = 5.0
 MATERIALS = {
-    "red": Material((0.5, 0.12, 0.1), (0.08, 0.08, 0.08), 0.6),
-    "green": Material((0.1, 0.35, 0.14), (0.25, 0.25, 0.25), 0.35),
-    "blue": Material((0.12, 0.16, 0.24), (0.4, 0.4, 0.4), 0.22),
+    "red": Reflectance((0.5, 0.12, 0.1), (0.08, 0.08, 0.08), 0.6),
+    "green": Reflectance((0.1, 0.35, 0.14), (0.25, 0.25, 0.25), 0.35),
+    "blue": Reflectance((0.12, 0.16, 0.24), (0.4, 0.4, 0.4), 0.22),
 }
 
 
@@ -117,7 +118,7 @@ class SyntheticScene(msgspec.Struct, frozen=True):
 
     shot: SyntheticShot
     light: Float[np.ndarray, "h w 3"]
-    materials: dict[str, Material]
+    materials: dict[str, Reflectance]
     meshes: dict[str, Mesh]
     poses: dict[str, Pose]
 
@@ -187,7 +188,7 @@ def light_of(
         up = rng.uniform(30, 50)
         turn = rng.choice([-1, 1]) * rng.uniform(35, 70)
         scene = daylight(rng, up, forward + 180 + turn, rows=2 * rows)
-    return light_seen(scene, rigid(world_from_camera @ YUP_FROM_CAMERA, (0, 0, 0)), rows, spp, seed)
+    return incident_light(scene, rigid(world_from_camera @ YUP_FROM_CAMERA, (0, 0, 0)), rows, spp, seed)
 
 
 def place_objects(

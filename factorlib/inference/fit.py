@@ -140,7 +140,9 @@ def fit_problem(
         if number or schedule.estimate_first:
             # T of (1) and s_k² of each light, from the previous descent
             pairs = list(zip(state.likelihoods, state.systems, strict=True))
-            hyperparameters = list(problem.spread(lambda pair: estimate_hyperparameters(*pair, least), pairs))
+            hyperparameters = list(
+                problem.spread(lambda pair: estimate_hyperparameters(pair[0], pair[1], least), pairs)
+            )
             state = state._replace(likelihoods=list(map(with_hyperparameters, state.likelihoods, hyperparameters)))
         if schedule.materials_fixed:
             state = descent.descend_lights(state.likelihoods, state.theta, iterations)

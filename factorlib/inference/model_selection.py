@@ -322,5 +322,5 @@ def distance_share(evidence: Decision) -> float:
 
 def _compare_light(k: int, simpler: Losses, richer: Losses, least: float = CLEARLY_FOR) -> Decision:
     """Return the evidence of light k alone for the richer model."""
-    pair = [Losses([losses.values[k]], [losses.clusters[k]]) for losses in (simpler, richer)]
-    return compare_models(*pair, least)
+    alone, other = (Losses([losses.values[k]], [losses.clusters[k]]) for losses in (simpler, richer))
+    return compare_models(alone, other, least)

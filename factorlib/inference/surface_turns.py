@@ -38,7 +38,7 @@ from factorlib.inference.forward import Illumination
 from factorlib.light.prior import LightPrior
 from factorlib.meshes.mesh import scaled
 from factorlib.meshes.subdivision import SubdividedMesh
-from factorlib.results.poses import ObjectEntry
+from factorlib.results.poses import ObjectPose
 
 NORMAL_STEP = 0.02  # step of a normal for finite differences: about 1°
 LARGEST_TURN = 0.6  # largest |n' − n|: 35°
@@ -160,7 +160,7 @@ def attach_pixels(
     pixels: Int[np.ndarray, "n 2"],
     object_number: Int[np.ndarray, " n"],
     camera: Camera,
-    objects: Mapping[str, tuple[str, ObjectEntry]],
+    objects: Mapping[str, tuple[str, ObjectPose]],
     surfaces: Surfaces,
 ) -> Attached:
     """Return the nodes under pixels (x, y), in the camera's frame.

@@ -191,7 +191,7 @@ def _shapes(text: msgspec.Raw, shape: tuple[int, int], path: str | Path, key: st
     length = 0.0
     limit = np.array(shape[::-1])
     for index, polygon in enumerate(segmentation):
-        fault = None
+        fault = ""
         corners = np.array(polygon)
         cure = "a polygon is [x1, y1, x2, y2, x3, y3, …], three corners or more"
         if len(corners) < 6 or len(corners) % 2 or not np.isfinite(corners).all():

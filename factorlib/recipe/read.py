@@ -11,19 +11,19 @@ from factorlib.dataset.check import MESHES
 from factorlib.dataset.paths import Refusal
 from factorlib.dataset.schema import Dataset, MeshInstance
 from factorlib.errors import InputError, did_you_mean
-from factorlib.recipe import schema
-from factorlib.recipe.schema import BALL, KINDS, AnyRecipe, is_light_file, is_mesh_file, read_table
+from factorlib.recipe import kinds
+from factorlib.recipe.kinds import BALL, KINDS, AnyRecipe, is_light_file, is_mesh_file, read_table
 from factorlib.yamlfile import load_yaml, read_yaml
 
 
 def read_recipe(path: Path, dataset: Dataset) -> AnyRecipe:
     """Read the recipe in a file; InputError if it is invalid or refers to something that the data set lacks."""
     refuse = Refusal(path, path.parent)
-    written = load_yaml(path)
-    kind = written.get("kind") if isinstance(written, dict) else None
+    content = load_yaml(path)
+    kind = content.get("kind") if isinstance(content, dict) else None
     if not isinstance(kind, str) or kind not in KINDS:
-        found = "it does not say what kind of picture to make" if kind is None else f"there is no kind {kind!r}"
-        refuse("kind", found, did_you_mean(str(kind), KINDS))
+        fault = "the recipe does not say what kind of picture to make" if kind is None else f"there is no kind {kind!r}"
+        refuse("kind", fault, did_you_mean(str(kind), KINDS))
     recipe = read_yaml(path, KINDS[kind])
     check_recipe(recipe, path, {photo.name: photo.objects for photo in dataset.spec.photos}, dataset.spec.materials)
     return recipe
@@ -45,65 +45,87 @@ def check_recipe(
     """
     refuse = Refusal(path, path.parent)
     photos = list(objects)
-    meshes = sorted({obj.mesh for own in objects.values() for obj in own})
-
-    def check(key: str, names: Iterable[str], known: list[str], what: str, once: bool = False) -> None:
-        """Check that names are known and, if `once`, distinct."""
-        for name in (names := list(names)):
-            refuse.known(key, name, known, what)
-            if once and names.count(name) > 1:
-                fault = f"the {what} {name!r} is named twice: one picture would replace the other"
-                refuse(key, fault, "name it once")
-
+    meshes = sorted({obj.mesh for each in objects.values() for obj in each})
     for name, file in files_of(recipe, path).items():
         if not file.is_file():
-            cure = f"files are relative to the recipe; meshes that need no file: {', '.join([BALL, *meshes])}"
+            cure = f"paths are relative to the recipe; meshes without a file are {', '.join([BALL, *meshes])}"
             raise InputError(f"there is no file {name!r}", file=path, cure=cure)
-    if recipe.denoise and find_spec(schema.DENOISER) is None:
-        cure = "make setup EXTRAS=denoise (outside a checkout: pip install mitsuba-oidn), or leave it out"
+    if recipe.denoise and find_spec(kinds.DENOISER) is None:
+        cure = "make setup EXTRAS=denoise (outside a checkout: pip install mitsuba-oidn), or remove `denoise`"
         refuse("denoise", "the denoiser is not installed", cure)
-    if isinstance(recipe, schema.OfPhotos):
-        check("photos", recipe.photos, photos, "photo", once=True)
-        if recipe.sun is not None:
-            if isinstance(recipe, schema.Relight):
-                refuse("sun", "a relighting shows lights that are given", "leave it out")
-            if len(recipe.photos) != 1:
-                cure = "name one photo: `photos: [...]`"
-                refuse("sun.direction", "a direction holds in the light of one photo", cure)
-            if not any(recipe.sun.direction):
-                refuse("sun.direction", "it has no length", "name another")
-    if isinstance(recipe, schema.Relight | schema.Grid):
-        check("lights", [name for name in recipe.lights if not is_light_file(name)], photos, "photo")
-    if isinstance(recipe, schema.Relight):
-        lights = [Path(name).stem for name in recipe.lights]
-        check("lights", lights, lights, "light", once=True)
-        if not lights and len(photos) == 1:
+    if isinstance(recipe, kinds.PhotoRecipe):
+        _check_photos(recipe, photos, refuse)
+    if isinstance(recipe, kinds.RelightRecipe | kinds.GridRecipe):
+        _check_names(refuse, "lights", [name for name in recipe.lights if not is_light_file(name)], photos, "photo")
+    if isinstance(recipe, kinds.RelightRecipe):
+        _check_distinct(refuse, "lights", [Path(name).stem for name in recipe.lights], "light")
+        if not recipe.lights and len(photos) == 1:
             refuse("lights", "there is no other photo whose light could be used", "name a file (.hdr, .exr)")
-    if isinstance(recipe, schema.Transfer | schema.Grid):
-        check("materials", recipe.materials, materials, "material")
-    if isinstance(recipe, schema.Transfer | schema.Insert):
-        known = [*materials, *(read_table(path.parent / recipe.table) if recipe.table is not None else [])]
-    if isinstance(recipe, schema.Transfer):
-        check("materials", recipe.materials.values(), known, "material")
-    if isinstance(recipe, schema.Insert):
-        if isinstance(recipe.material, dict):
-            check("material", recipe.material.values(), known, "material")
-            if recipe.mesh not in meshes:
-                refuse("material", "parts are told apart in a mesh of the data set", "name one material")
-        elif recipe.material is not None:
-            check("material", [recipe.material], known, "material")
-        if not is_mesh_file(recipe.mesh):
-            check("mesh", [recipe.mesh], [BALL, *meshes], "mesh")
-        elif Path(recipe.mesh).suffix.lower() not in MESHES:
-            refuse("mesh", f"{recipe.mesh!r} is no mesh that is read here", f"one of {', '.join(MESHES)}")
-        for photo in (recipe.photos or photos) if recipe.beside is not None else ():
-            names = [obj.name for obj in objects[photo]]
-            if recipe.beside not in names:
-                found = (
-                    f"there is no object {recipe.beside!r} in photo '{photo}', "
-                    f"whose objects are: {', '.join(names) or 'none'}"
-                )
-                refuse("beside", found, "name the photos that have it: `photos: [...]`")
+    if isinstance(recipe, kinds.TransferRecipe | kinds.GridRecipe):
+        _check_names(refuse, "materials", recipe.materials, materials, "material")
+    if isinstance(recipe, kinds.TransferRecipe | kinds.InsertRecipe):
+        table = read_table(path.parent / recipe.table) if recipe.table is not None else {}
+        materials = [*materials, *table]
+    if isinstance(recipe, kinds.TransferRecipe):
+        _check_names(refuse, "materials", recipe.materials.values(), materials, "material")
+    if isinstance(recipe, kinds.InsertRecipe):
+        _check_new_object(recipe, meshes, materials, refuse)
+        if recipe.beside is not None:
+            _check_neighbour(recipe, {photo: objects[photo] for photo in recipe.photos or photos}, refuse)
+
+
+def _check_names(refuse: Refusal, key: str, names: Iterable[str], known: list[str], kind: str) -> None:
+    for name in names:
+        refuse.known(key, name, known, kind)
+
+
+def _check_distinct(refuse: Refusal, key: str, names: list[str], kind: str) -> None:
+    for name in names:
+        if names.count(name) > 1:
+            fault = f"the {kind} {name!r} is named twice: one picture would replace the other"
+            refuse(key, fault, "name it once")
+
+
+def _check_photos(recipe: kinds.PhotoRecipe, photos: list[str], refuse: Refusal) -> None:
+    """Check the photos and the assumed sun of a recipe."""
+    _check_names(refuse, "photos", recipe.photos, photos, "photo")
+    _check_distinct(refuse, "photos", recipe.photos, "photo")
+    if recipe.sun is None:
+        return
+    if isinstance(recipe, kinds.RelightRecipe):
+        refuse("sun", "a recipe of kind relight takes its lights from `lights`", "remove `sun`: leave it out")
+    if len(recipe.photos) != 1:
+        fault = f"the direction is relative to the light of one photo, and the recipe has {len(recipe.photos) or 'all'}"
+        refuse("sun.direction", fault, "name one photo: `photos: [...]`")
+    if not any(recipe.sun.direction):
+        refuse("sun.direction", "the direction has no length", "give a vector other than [0, 0, 0]")
+
+
+def _check_new_object(recipe: kinds.InsertRecipe, meshes: list[str], materials: list[str], refuse: Refusal) -> None:
+    """Check the mesh and the materials of a new object."""
+    if isinstance(recipe.material, dict):
+        _check_names(refuse, "material", recipe.material.values(), materials, "material")
+        if recipe.mesh not in meshes:
+            fault = f"materials of parts can be replaced in a mesh of the data set only, and {recipe.mesh!r} is none"
+            refuse("material", fault, "name one material")
+    elif recipe.material is not None:
+        refuse.known("material", recipe.material, materials, "material")
+    if not is_mesh_file(recipe.mesh):
+        refuse.known("mesh", recipe.mesh, [BALL, *meshes], "mesh")
+    elif Path(recipe.mesh).suffix.lower() not in MESHES:
+        refuse("mesh", f"{recipe.mesh!r} is no mesh file that can be read", f"give one of {', '.join(MESHES)}")
+
+
+def _check_neighbour(
+    recipe: kinds.InsertRecipe, objects: Mapping[str, Sequence[MeshInstance]], refuse: Refusal
+) -> None:
+    """Check that every photo has the object beside which the new one stands."""
+    for photo, entries in objects.items():
+        names = [obj.name for obj in entries]
+        if recipe.beside not in names:
+            known = ", ".join(names) or "none"
+            fault = f"there is no object {recipe.beside!r} in photo '{photo}', whose objects are: {known}"
+            refuse("beside", fault, "name the photos that have it: `photos: [...]`")
 
 
 def files_of(recipe: AnyRecipe, path: Path) -> dict[str, Path]:

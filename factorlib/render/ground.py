@@ -12,7 +12,7 @@ import trimesh
 from jaxtyping import Float
 
 from factorlib.errors import InputError
-from factorlib.render.photo_scene import Placed
+from factorlib.render.photo_scene import PlacedMesh
 
 # Largest mean angle between the object's upright axis and the cameras': photos look down, and are held askew.
 MOST_TILT_DEG = 50.0
@@ -25,7 +25,7 @@ class Plane(msgspec.Struct, frozen=True):
     point: Float[np.ndarray, "3"]
 
     @property
-    def seen_from_above(self) -> bool:
+    def below_camera(self) -> bool:
         """True if the camera, at the origin, is on the objects' side of the plane."""
         return float(self.point @ self.normal) < 0
 
@@ -41,7 +41,7 @@ class Plane(msgspec.Struct, frozen=True):
         return np.where((distance > 0) & (down < 0), distance, np.nan)[:, None] * rays
 
 
-def resting_plane(placed: Placed, uprights: Float[np.ndarray, "k 3"] | None = None) -> Plane:
+def resting_plane(placed: PlacedMesh, uprights: Float[np.ndarray, "k 3"] | None = None) -> Plane:
     """Return the plane, in the world, on which an object rests.
 
     Args:
@@ -63,14 +63,14 @@ def resting_plane(placed: Placed, uprights: Float[np.ndarray, "k 3"] | None = No
     normals = poses[:, 2, :3]  # z of the resting pose, in the object's frame
     upright = (normals @ uprights.T).mean(axis=1) > np.cos(np.radians(MOST_TILT_DEG))
     if not upright.any():
-        found = f"the object '{placed.name}' rests on no side that looks down in its photos"
-        raise InputError(found, key="beside", cure="name another object, or give the photo's `ground` in dataset.yaml")
+        fault = f"no stable pose of the object '{placed.name}' is upright in its photos, so its ground is unknown"
+        raise InputError(fault, key="beside", cure="name another object, or give the photo's `ground` in dataset.yaml")
     # the likeliest pose among the upright ones; the plane touches the lowest vertex
     normal = rotation @ normals[np.argmax(np.where(upright, chances, -1))]
     lowest = placed.vertices[np.argmin(placed.vertices @ normal)]
     return Plane(normal / np.linalg.norm(normal), lowest)
 
 
-def height_over(plane: Plane, placed: Placed) -> float:
+def height_over(plane: Plane, placed: PlacedMesh) -> float:
     """Return the height of an object's highest vertex above the plane."""
     return float(((placed.vertices - plane.point) @ plane.normal).max())

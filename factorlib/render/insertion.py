@@ -34,15 +34,15 @@ from scipy.ndimage import binary_erosion, distance_transform_edt
 
 from factorlib.conventions import YUP_FROM_CAMERA
 from factorlib.errors import InputError
-from factorlib.export.scene import ALL_BOUNCES
+from factorlib.export.exported_scene import ALL_BOUNCES
 from factorlib.meshes.mesh import Mesh
 from factorlib.meshes.ply import submesh
 from factorlib.render.ground import Plane, height_over
-from factorlib.render.photo_scene import PhotoScene, Placed, light_entries, shapes
-from factorlib.render.placement import RADIUS, Spot, rotation_between
+from factorlib.render.photo_scene import PhotoScene, PlacedMesh, light_entries, shapes
+from factorlib.render.placement import RADIUS, Spot, disk
 from factorlib.results.materials import Reflectance, vec3
 from factorlib.tracing.denoise import denoised
-from factorlib.tracing.scene import bsdf, rendered, rgb, rigid, sensor, shape, transform
+from factorlib.tracing.scene import Channels, rendered, rgb, rigid, sensor, shape
 
 FADE = 0.5  # outer share of the disc's radius in which shadows fade
 FIT_SAMPLES = 16
@@ -58,13 +58,13 @@ FEWEST = 100  # least number of pixels for a comparison of shadows
 # and 0.09.
 BELIEVED = 0.3
 GROUND = "+ground"
-STEPS = 5
+STEPS = 4
 NEW = "+"  # prefix of the new object and its materials: no name in dataset.yaml has it
 
 Picture = Float[np.ndarray, "h w 3"]
 
 
-class Ground(msgspec.Struct, frozen=True):
+class GroundSurface(msgspec.Struct, frozen=True):
     """The plane that objects stand on, and its reflectance.
 
     Attributes:
@@ -77,22 +77,34 @@ class Ground(msgspec.Struct, frozen=True):
     polish: Reflectance | None = None
 
 
-class Standing(msgspec.Struct, frozen=True):
+class InsertionScene(msgspec.Struct, frozen=True):
     """A photo's scene with the new object in place; its materials include the new object's.
 
     Attributes:
         ground: the ground under the new object
-        spot: the requested place
-        found: the actual place
+        requested: the requested place
+        spot: the actual place
         moved: a sentence that says why the two differ, or an empty string
     """
 
     scene: PhotoScene
-    ground: Ground
-    new: Placed
+    ground: GroundSurface
+    new: PlacedMesh
+    requested: Spot
     spot: Spot
-    found: Spot
     moved: str
+
+    @property
+    def ground_points(self) -> Float[np.ndarray, "h w 3"]:
+        """The point of the ground that each pixel shows, in the world; NaN above the horizon."""
+        rays = self.scene.camera.rays() @ YUP_FROM_CAMERA
+        return self.spot.plane.hit(rays.reshape(-1, 3)).reshape(rays.shape)
+
+    @property
+    def distance(self) -> Float[np.ndarray, "h w"]:
+        """The distance of each pixel's point of the ground from the spot, in radii of the disc; infinite above it."""
+        distance = np.linalg.norm(self.ground_points - self.spot.point, axis=-1) / (RADIUS * self.spot.height)
+        return np.nan_to_num(distance, nan=np.inf)
 
 
 class ShadowMatch(msgspec.Struct, frozen=True):
@@ -111,7 +123,7 @@ class ShadowMatch(msgspec.Struct, frozen=True):
     def __str__(self) -> str:
         if self.correlation is None:
             return (
-                "Shadows were not compared: too little is seen of the ground near the photo's objects "
+                "Shadows were not compared: too little of the ground near the photo's objects is visible "
                 f"({self.pixels} pixels)."
             )
         light = f"{self.correlation:.2f}"
@@ -120,10 +132,10 @@ class ShadowMatch(msgspec.Struct, frozen=True):
             f"The photo's shading of the ground correlates with the predicted one by {light}; "
             f"with that of a constant light by {shape}."
         )
-        return words if self.correlation >= BELIEVED else f"{words} So the shadow is not to be believed."
+        return words if self.correlation >= BELIEVED else f"{words} So do not trust the shadow."
 
 
-class Inserted(msgspec.Struct, frozen=True):
+class InsertionResult(msgspec.Struct, frozen=True):
     """A photo with the new object.
 
     Attributes:
@@ -131,141 +143,178 @@ class Inserted(msgspec.Struct, frozen=True):
         coverage: α
         shadow: s of (1)
         ground: diffuse reflectance used for the ground
-        match: comparison of the photo's own shadow with the predicted one
+        without: L₀
     """
 
     composite: Picture
     coverage: Float[np.ndarray, "h w"]
     shadow: Picture
     ground: Float[np.ndarray, "3"]
-    match: ShadowMatch
+    without: Picture
+
+
+class InsertionRenderer:
+    """Renderer of the scene of an insertion, with the same random numbers for every rendering."""
+
+    def __init__(self, insertion: InsertionScene, samples: int, seed: int = 1):
+        scene = insertion.scene
+        self.camera = sensor(scene.camera, rigid(YUP_FROM_CAMERA, np.zeros(3)), near=scene.near)
+        self.light = light_entries(scene.light, scene.size)
+        self.objects = shapes(scene.objects, scene.materials)
+        self.denoise = scene.denoise
+        self.samples = samples
+        self.seed = seed
+
+    def radiance(
+        self,
+        entries: dict[str, Any],
+        samples: int | None = None,
+        light: dict[str, Any] | None = None,
+        guides: bool = False,
+    ) -> Float[np.ndarray, "h w c"]:
+        """Render the photo's objects with further entries.
+
+        Args:
+            entries: Mitsuba objects by name
+            samples: replaces the samples per pixel
+            light: replaces the photo's light
+            guides: add the guides of the denoiser
+        """
+        whole = (light or self.light) | self.objects | entries
+        channels = Channels(hide_emitters=True, guides=guides)
+        return rendered(whole, self.camera, samples or self.samples, self.seed, ALL_BOUNCES, channels)
 
 
 def inserted(
-    there: Standing,
+    insertion: InsertionScene,
     photo: Picture,
     covered: Bool[np.ndarray, "h w"],
     samples: int,
     report: Callable[[int], None] = lambda done: None,
     seed: int = 1,
-    compared: bool = True,
-) -> Inserted:
+) -> InsertionResult:
     """Return the photo with the new object.
 
     Args:
-        there: the scene and the new object's place
+        insertion: the scene and the new object's place
         photo: linear radiance, with the tone curve undone
         covered: pixels that show something other than the ground
         samples: samples per pixel
         report: receives the number of steps done, of STEPS
         seed: seed of the random numbers, which all renderings share
-        compared: compare the photo's own shadow with the predicted one; if False, `match` has no pixels
 
     Raises:
         InputError: The new object is not visible.
     """
-    scene = there.scene
-    new = there.new
-    spot = there.found
-    ground = there.ground
-    camera = sensor(scene.camera, rigid(YUP_FROM_CAMERA, np.zeros(3)), near=scene.near)
-    old = shapes(scene.objects, scene.materials)
-    light = light_entries(scene.light, scene.size)
-    more = shapes([new], scene.materials)
-
-    def traced(
-        entries: dict[str, Any], samples: int = samples, light: dict[str, Any] = light, guides: bool = False
-    ) -> Float[np.ndarray, "h w c"]:
-        """Render with the same random numbers each time."""
-        return rendered({**light, **old, **entries}, camera, samples, seed, ALL_BOUNCES, True, guides)
-
-    rays = scene.camera.rays() @ YUP_FROM_CAMERA
-    points = spot.plane.hit(rays.reshape(-1, 3)).reshape(rays.shape)  # points of the ground; NaN above the horizon
-    distance = np.nan_to_num(np.linalg.norm(points - spot.point, axis=-1) / (RADIUS * spot.height), nan=np.inf)
-    # fade: 1 near the spot, smoothly to 0 at the rim of the disc; 1 above the horizon, where only objects are seen
-    t = np.clip((1 - np.where(np.isinf(distance), 0, distance)) / (1 - FADE), 0, 1)
-    near = (t * t * (3 - 2 * t))[..., None]
-    shows_ground = (distance < 1) & ~covered
-    coverage = _coverage(scene, new, camera, samples)
+    spot = insertion.spot
+    renderer = InsertionRenderer(insertion, samples, seed)
+    new = shapes([insertion.new], insertion.scene.materials)
+    coverage = _coverage(insertion.scene, insertion.new, renderer.camera, samples)
     if not coverage.any():
-        found = "the new object is not seen: it stands outside the picture, or something hides it"
-        raise InputError(found, key="at", cure="say where it stands, `at: [x, y]`, or make it smaller")
+        fault = "the new object is invisible: it stands outside the picture, or other objects hide it"
+        raise InputError(fault, key="at", cure="name a visible place, `at: [x, y]`, or a smaller `size`")
     report(1)
-    # diffuse reflectance of the ground, estimated if dataset.yaml does not give it
-    diffuse = ground.diffuse
-    if diffuse is None:
-        grey = traced(_disc(spot, Reflectance((GREY,) * 3, (0.0,) * 3, 1.0)), FIT_SAMPLES)
-        diffuse = _ground_colour(grey, photo, shows_ground)
+    shows_ground = (insertion.distance < 1) & ~covered
+    diffuse = insertion.ground.diffuse or _ground_colour(renderer, spot, photo, shows_ground)
     report(2)
-    # L₀, the scene without the new object, and the photo's own shadow against it
-    disc = _disc(spot, Reflectance(diffuse, (0.0,) * 3, 1.0))
-    without, guides_without = np.split(traced(disc, guides=scene.denoise), [3], axis=-1)
-    match = ShadowMatch(None, None, 0)
-    if compared:
-        constant = traced(disc, light={"light": {"type": "constant", "radiance": rgb(1.0)}})
-        close = np.any([np.linalg.norm(points - foot, axis=-1) < far for foot, far in _feet(scene, spot.plane)], axis=0)
-        match = shadow_match(photo, without, constant, binary_erosion(shows_ground & close, iterations=RIM))
-    report(3)
-    # L₁, the scene with the new object, and s of (1)
-    with_, guides_with = np.split(traced({**disc, **more}, guides=scene.denoise), [3], axis=-1)
-    report(4)
+    fade = _fade(insertion.distance)
     beside = (1 - coverage)[..., None]
-    shadow = _shadow(without, with_, coverage, near)
-    if scene.denoise:  # not the photo, nor pixels whose paths miss the object
+    disc = _disc(spot, Reflectance(diffuse, (0.0,) * 3, 1.0))
+    without, with_, shadow = _lighting(renderer, disc, new, coverage, fade)
+    report(3)
+    # (2)
+    composite = beside * shadow * photo + np.maximum(with_ - beside * shadow * without, 0) * (beside < 1)
+    # change of the ground's specular part: the object's reflection in it
+    if insertion.ground.polish is not None:
+        polished = _disc(spot, insertion.ground.polish)
+        mirrored = renderer.radiance(polished | new) - renderer.radiance(polished)
+        composite = np.maximum(composite + mirrored * shows_ground[..., None] * beside * fade, 0)
+    report(STEPS)
+    return InsertionResult(composite, coverage, shadow, np.asarray(diffuse), without)
+
+
+def _lighting(
+    renderer: InsertionRenderer,
+    disc: dict[str, Any],
+    new: dict[str, Any],
+    coverage: Float[np.ndarray, "h w"],
+    fade: Float[np.ndarray, "h w 1"],
+) -> tuple[Picture, Picture, Picture]:
+    """Return L₀ and L₁, the scene without and with the new object, and s of (1)."""
+    without, guides_without = np.split(renderer.radiance(disc, guides=renderer.denoise), [3], axis=-1)
+    with_, guides_with = np.split(renderer.radiance(disc | new, guides=renderer.denoise), [3], axis=-1)
+    shadow = _shadow(without, with_, coverage, fade)
+    if renderer.denoise:  # not the photo, nor pixels whose paths miss the object
         clean, with_ = (
-            denoised(np.concatenate([noisy, np.ones_like(beside), guides], axis=-1))[..., :3]
+            denoised(np.concatenate([noisy, np.ones_like(fade), guides], axis=-1))[..., :3]
             for noisy, guides in ((shadow, guides_without), (with_, guides_with))
         )
         shadow = np.where(shadow == 1, 1, clean)
-    # (2)
-    own = np.maximum(with_ - beside * shadow * without, 0) * (beside < 1)
-    composite = beside * shadow * photo + own
-    # change of the ground's specular part: the object's reflection in it
-    if ground.polish is not None:
-        polished = _disc(spot, ground.polish)
-        mirrored = traced({**polished, **more}) - traced(polished)
-        composite = np.maximum(composite + mirrored * shows_ground[..., None] * beside * near, 0)
-    report(STEPS)
-    return Inserted(composite, coverage, shadow, np.asarray(diffuse), match)
+    return without, with_, shadow
 
 
-def _ground_colour(lit: Picture, photo: Picture, shows_ground: Bool[np.ndarray, "h w"]) -> tuple[float, float, float]:
-    """Return the diffuse reflectance at which the ground matches the photo: the median over its pixels.
+def compared_shadow(
+    insertion: InsertionScene, result: InsertionResult, photo: Picture, covered: Bool[np.ndarray, "h w"], samples: int
+) -> ShadowMatch:
+    """Compare the photo's own shadow with L₀, on the ground near its objects.
 
-    `lit` is the scene on ground of reflectance GREY.
+    Args:
+        insertion: the scene and the new object's place
+        result: its rendering
+        photo: linear radiance, with the tone curve undone
+        covered: pixels that show something other than the ground
+        samples: samples per pixel of the rendering
     """
+    plane = insertion.spot.plane
+    points = insertion.ground_points
+    near = [
+        np.linalg.norm(points - plane.onto(each.vertices.mean(axis=0)[None])[0], axis=-1)
+        < NEAR * height_over(plane, each)
+        for each in insertion.scene.objects
+    ]
+    shows_ground = (insertion.distance < 1) & ~covered & np.any(near, axis=0)
+    disc = _disc(insertion.spot, Reflectance(vec3(result.ground), (0.0,) * 3, 1.0))
+    sky = {"light": {"type": "constant", "radiance": rgb(1.0)}}
+    constant = InsertionRenderer(insertion, samples).radiance(disc, light=sky)
+    return shadow_match(photo, result.without, constant, binary_erosion(shows_ground, iterations=RIM))
+
+
+def _fade(distance: Float[np.ndarray, "h w"]) -> Float[np.ndarray, "h w 1"]:
+    """Return a weight that falls smoothly from 1 near the spot to 0 at the rim of the disc.
+
+    It is 1 above the horizon, where only objects are visible.
+    """
+    t = np.clip((1 - np.where(np.isinf(distance), 0, distance)) / (1 - FADE), 0, 1)
+    return (t * t * (3 - 2 * t))[..., None]
+
+
+def _ground_colour(
+    renderer: InsertionRenderer, spot: Spot, photo: Picture, shows_ground: Bool[np.ndarray, "h w"]
+) -> tuple[float, float, float]:
+    """Return the diffuse reflectance at which the ground matches the photo: the median over its pixels."""
+    lit = renderer.radiance(_disc(spot, Reflectance((GREY,) * 3, (0.0,) * 3, 1.0)), FIT_SAMPLES)
     usable = shows_ground & (lit.min(axis=-1) > 0)
     if not usable.any():
         return (GREY,) * 3
-    found = GREY * np.median(photo[usable] / lit[usable], axis=0)
-    return vec3(np.clip(found, DARKEST, BRIGHTEST))
-
-
-def _feet(scene: PhotoScene, plane: Plane) -> list[tuple[Float[np.ndarray, "3"], float]]:
-    """Return the foot of each object's centroid on the ground, and the radius of its shadow's neighbourhood."""
-    return [
-        (plane.onto(each.vertices.mean(axis=0)[None])[0], NEAR * height_over(plane, each)) for each in scene.objects
-    ]
+    return vec3(np.clip(GREY * np.median(photo[usable] / lit[usable], axis=0), DARKEST, BRIGHTEST))
 
 
 def _disc(spot: Spot, material: Reflectance) -> dict[str, Any]:
     """Return the ground about the spot as a Mitsuba disk."""
-    frame = np.eye(4)
-    frame[:3, :3] = RADIUS * spot.height * rotation_between(np.array([0.0, 0.0, 1.0]), spot.plane.normal)
-    frame[:3, 3] = spot.point - HAIR * spot.height * spot.plane.normal
-    return {GROUND: {"type": "disk", "to_world": transform(frame), "bsdf": bsdf(material)}}
+    normal = spot.plane.normal
+    return {GROUND: disk(spot.point - HAIR * spot.height * normal, normal, RADIUS * spot.height, material)}
 
 
-def _coverage(scene: PhotoScene, new: Placed, camera: dict[str, Any], samples: int) -> Float[np.ndarray, "h w"]:
+def _coverage(scene: PhotoScene, new: PlacedMesh, camera: dict[str, Any], samples: int) -> Float[np.ndarray, "h w"]:
     """Render the new object with radiance 1 and all else black, so that a pixel is the object's share of it."""
     sides = [(label, side) for label in new.mesh.labels for side in range(1 + new.mesh.open)]
     glowing = {f"{new.name}_{label}_{side}": _emitter(new, label, side) for label, side in sides}
     black = shapes(scene.objects, scene.materials, black=[each.name for each in scene.objects])
-    picture = rendered({**black, **glowing}, camera, samples, 1, 1)
+    picture = rendered(black | glowing, camera, samples, 1, 1)
     return np.clip(picture[..., 0], 0, 1)
 
 
-def _emitter(new: Placed, label: int, side: int) -> Any:
+def _emitter(new: PlacedMesh, label: int, side: int) -> Any:
     """Return one side of the new object's part as an area light.
 
     Area lights emit on the side of their normals alone.  An open mesh gets a second light, flipped and slightly behind.
@@ -280,7 +329,7 @@ def _emitter(new: Placed, label: int, side: int) -> Any:
 
 
 def _shadow(
-    without: Picture, with_: Picture, coverage: Float[np.ndarray, "h w"], near: Float[np.ndarray, "h w 1"]
+    without: Picture, with_: Picture, coverage: Float[np.ndarray, "h w"], fade: Float[np.ndarray, "h w 1"]
 ) -> Picture:
     """Return s of (1), taken from the nearest pixel beside the object for pixels under it.
 
@@ -292,22 +341,22 @@ def _shadow(
     if beside.any():
         row, column = distance_transform_edt(~beside, return_distances=False, return_indices=True)
         shadow = shadow[row, column]
-    return 1 + (shadow - 1) * near
+    return 1 + (shadow - 1) * fade
 
 
-def shadow_match(photo: Picture, lit: Picture, constant: Picture, where: Bool[np.ndarray, "h w"]) -> ShadowMatch:
+def shadow_match(photo: Picture, lit: Picture, constant: Picture, mask: Bool[np.ndarray, "h w"]) -> ShadowMatch:
     """Return the correlation of the photo's shading of the ground with two predictions of it.
 
     Args:
         photo: linear radiance
         lit: the ground with the photo's objects in the recovered light
         constant: the ground with the photo's objects in a constant light
-        where: pixels that show ground
+        mask: pixels that show ground
     """
     luminances = [picture @ LUMINANCE for picture in (photo, lit, constant)]
-    where = where & np.all([luminance > 0 for luminance in luminances], axis=0)
-    logs = [np.log(luminance[where]) for luminance in luminances]
-    if where.sum() < FEWEST or min(map(np.ptp, logs)) == 0:
-        return ShadowMatch(None, None, int(where.sum()))
+    mask = mask & np.all([luminance > 0 for luminance in luminances], axis=0)
+    logs = [np.log(luminance[mask]) for luminance in luminances]
+    if mask.sum() < FEWEST or min(map(np.ptp, logs)) == 0:
+        return ShadowMatch(None, None, int(mask.sum()))
     recovered, shape = (float(np.corrcoef(logs[0], other)[0, 1]) for other in logs[1:])
-    return ShadowMatch(recovered, shape, int(where.sum()))
+    return ShadowMatch(recovered, shape, int(mask.sum()))

@@ -14,7 +14,7 @@ from jaxtyping import Float
 
 from factorlib.conventions import YUP_FROM_CAMERA
 from factorlib.export.environment import NARROWEST, mitsuba_map
-from factorlib.export.scene import ALL_BOUNCES, DIRECT
+from factorlib.export.exported_scene import ALL_BOUNCES, DIRECT
 from factorlib.geometry.camera import Camera, rotation_of_vector
 from factorlib.light.latlong import rotate_map
 from factorlib.light.lobes import Lobes, lobe_integral
@@ -22,7 +22,7 @@ from factorlib.meshes.mesh import Mesh
 from factorlib.meshes.ply import submesh
 from factorlib.results.materials import Reflectance
 from factorlib.tracing.denoise import denoised
-from factorlib.tracing.scene import bsdf, envmap, envmap_of_nodes, paint, rendered, rgb, rigid, sensor, shape
+from factorlib.tracing.scene import Channels, bsdf, envmap, envmap_of_nodes, paint, rendered, rgb, rigid, sensor, shape
 
 UP = np.array([0.0, 1.0, 0.0])
 NEAR = 1e-3  # near clipping distance, in distances of the objects
@@ -30,10 +30,10 @@ FAR = 3e3  # distance of suns, in sizes of the scene
 LOBE_ROWS = 256  # rows of Mitsuba's map of lobes
 MAP_ROWS = 1024  # rows of Mitsuba's map of a lat-long map
 
-Light = Lobes | Float[np.ndarray, "h w 3"]
+DistantLight = Lobes | Float[np.ndarray, "h w 3"]
 
 
-class Placed(msgspec.Struct, frozen=True):
+class PlacedMesh(msgspec.Struct, frozen=True):
     """A mesh and its pose in the world.
 
     Attributes:
@@ -61,8 +61,8 @@ class PhotoScene(msgspec.Struct, frozen=True):
     """
 
     camera: Camera
-    objects: tuple[Placed, ...]
-    light: Light
+    objects: tuple[PlacedMesh, ...]
+    light: DistantLight
     materials: Mapping[str, Reflectance]
     max_depth: int = ALL_BOUNCES
     denoise: bool = False
@@ -103,7 +103,7 @@ def with_sun(light: Lobes, axis: Float[np.ndarray, "3"], diameter_deg: float, sh
     return Lobes(np.vstack([rest.axis, axis]), sharpness, np.vstack([factor * rest.weight, weight]))
 
 
-def light_entries(light: Light, size: float) -> dict[str, Any]:
+def light_entries(light: DistantLight, size: float) -> dict[str, Any]:
     """Return the light as Mitsuba's `envmap`, with lobes too narrow for one as spheres far beyond the scene.
 
     `size` is the size of the scene, as in `PhotoScene.size`.
@@ -127,7 +127,7 @@ def light_entries(light: Light, size: float) -> dict[str, Any]:
 
 
 def shapes(
-    objects: Sequence[Placed], materials: Mapping[str, Reflectance], black: Sequence[str] = ()
+    objects: Sequence[PlacedMesh], materials: Mapping[str, Reflectance], black: Sequence[str] = ()
 ) -> dict[str, Any]:
     """Return a Mitsuba shape for each material of each object.
 
@@ -136,7 +136,7 @@ def shapes(
         materials: reflectances by name
         black: names of objects that reflect nothing
     """
-    found = {}
+    entries = {}
     for each in objects:
         for label in each.mesh.labels:
             name = each.materials[label - 1]
@@ -145,8 +145,8 @@ def shapes(
             colours = None if part.detail is None else paint(material, part.detail)
             surface = bsdf(material, painted=colours is not None)
             surface = {"type": "twosided", "bsdf": surface} if each.mesh.open else surface
-            found[f"{each.name}_{label}"] = shape(part, surface, each.world_from_object, colours=colours)
-    return found
+            entries[f"{each.name}_{label}"] = shape(part, surface, each.world_from_object, colours=colours)
+    return entries
 
 
 def traced_photo(
@@ -170,18 +170,19 @@ def traced_photo(
     Returns:
         Linear radiance times coverage, and coverage: the share of a pixel that objects, or the visible light, fill.
     """
-    own = rigid(YUP_FROM_CAMERA, np.zeros(3)) if world_from_camera is None else world_from_camera
+    pose = rigid(YUP_FROM_CAMERA, np.zeros(3)) if world_from_camera is None else world_from_camera
     entries = {**light_entries(scene.light, scene.size), **shapes(scene.objects, scene.materials), **beside}
-    view = sensor(scene.camera, own, near=scene.near, alpha=True)
+    view = sensor(scene.camera, pose, near=scene.near, alpha=True)
     depth = scene.max_depth if max_depth is None else max_depth
-    picture = rendered(entries, view, samples, 0, depth, hide_emitters=not with_light, guides=scene.denoise)
+    channels = Channels(hide_emitters=not with_light, guides=scene.denoise)
+    picture = rendered(entries, view, samples, 0, depth, channels)
     if with_light:
         picture[..., 3] = 1
     return denoised(picture) if scene.denoise else picture
 
 
 def lit_ball(
-    light: Light, material: Reflectance, size: int, samples: int, denoise: bool = False
+    light: DistantLight, material: Reflectance, size: int, samples: int, denoise: bool = False
 ) -> Float[np.ndarray, "h w 4"]:
     """Render a ball that fills the picture, seen from the front.
 
@@ -202,7 +203,7 @@ def lit_ball(
     sphere = {"type": "sphere", "center": [0.0, 0.0, -distance], "radius": 1.0, "bsdf": bsdf(material)}
     view = sensor(camera, rigid(YUP_FROM_CAMERA, np.zeros(3)), alpha=True)
     entries = {**light_entries(light, distance), "ball": sphere}
-    picture = rendered(entries, view, samples, 0, DIRECT, hide_emitters=True, guides=denoise)
+    picture = rendered(entries, view, samples, 0, DIRECT, Channels(hide_emitters=True, guides=denoise))
     return denoised(picture) if denoise else picture
 
 
@@ -215,31 +216,31 @@ def resized(scene: PhotoScene, width: int | None) -> PhotoScene:
     return msgspec.structs.replace(scene, camera=camera)
 
 
-def orbit(
-    scene: PhotoScene,
-    azimuth_deg: float,
-    elevation_deg: float = 0.0,
-    zoom: float = 1.0,
-    up: Float[np.ndarray, "3"] = UP,
-) -> Float[np.ndarray, "4 4"]:
-    """Return world_from_camera of the photo's camera moved about the middle of the objects.
+class Orbit(msgspec.Struct, frozen=True):
+    """A view from the photo's camera moved about the middle of the objects.
 
-    Args:
-        scene: the scene
-        azimuth_deg: angle to the right, about `up`; degrees
-        elevation_deg: angle upward; degrees
+    Attributes:
+        azimuth_deg: angle to the right, degrees
+        elevation_deg: angle upward, degrees
         zoom: magnification, by a shorter distance
-        up: unit axis of the azimuth, in the world
     """
-    middle = scene.middle
-    right = np.cross(up, -middle)
-    right /= np.linalg.norm(right)
-    # rotation about the middle; the distance is divided by the zoom
-    turn = rotation_of_vector(np.radians(azimuth_deg) * up) @ rotation_of_vector(-np.radians(elevation_deg) * right)
-    return rigid(turn @ YUP_FROM_CAMERA, middle - turn @ middle / zoom)
+
+    azimuth_deg: float = 0.0
+    elevation_deg: float = 0.0
+    zoom: float = 1.0
+
+    def world_from_camera(self, scene: PhotoScene, up: Float[np.ndarray, "3"] = UP) -> Float[np.ndarray, "4 4"]:
+        """Return the pose of the moved camera; `up` is the unit axis of the azimuth, in the world."""
+        middle = scene.middle
+        right = np.cross(up, -middle)
+        right /= np.linalg.norm(right)
+        # rotation about the middle; the distance is divided by the zoom
+        upward = rotation_of_vector(-np.radians(self.elevation_deg) * right)
+        turn = rotation_of_vector(np.radians(self.azimuth_deg) * up) @ upward
+        return rigid(turn @ YUP_FROM_CAMERA, middle - turn @ middle / self.zoom)
 
 
-def turned_light(light: Light, angle_deg: float) -> Light:
+def turned_light(light: DistantLight, angle_deg: float) -> DistantLight:
     """Return the light turned about the upright axis of the world."""
     if angle_deg == 0:
         return light  # resampling would blur a map

@@ -7,6 +7,7 @@ height. If none within eight heights is free, a coarser lattice follows.
 """
 
 from collections.abc import Callable, Iterator
+from typing import Any
 
 import msgspec
 import numpy as np
@@ -22,14 +23,16 @@ from factorlib.geometry.camera import rotation_of_vector
 from factorlib.geometry.raster import Caster
 from factorlib.meshes.mesh import Mesh
 from factorlib.render.ground import Plane, height_over
-from factorlib.render.photo_scene import PhotoScene, Placed
+from factorlib.render.photo_scene import PhotoScene, PlacedMesh
+from factorlib.results.materials import Reflectance
+from factorlib.tracing.scene import bsdf, rigid, transform
 
 RADIUS = 8.0  # radius of the ground about the new object, in its heights
 GAP = 0.15  # gap between the objects, in heights of the new one
 STEP = 0.1  # spacing of candidate places, in heights
 COARSER = 8  # factor on spacing and radius if the first lattice has no free place
 ENOUGH = 500  # vertices of the new object that are tested for visibility
-SEEN = 0.5  # least share of the new object's vertices that are visible at the place it is moved to
+LEAST_VISIBLE = 0.5  # least share of the new object's vertices that are visible at the place it is moved to
 
 
 class Spot(msgspec.Struct, frozen=True):
@@ -40,7 +43,9 @@ class Spot(msgspec.Struct, frozen=True):
     height: float
 
 
-def spot_beside(scene: PhotoScene, plane: Plane, neighbour: Placed, relative_height: float, slenderness: float) -> Spot:
+def spot_beside(
+    scene: PhotoScene, plane: Plane, neighbour: PlacedMesh, relative_height: float, slenderness: float
+) -> Spot:
     """Return the place beside an object, on the side with more room in the picture.
 
     Args:
@@ -73,7 +78,7 @@ def spot_beside(scene: PhotoScene, plane: Plane, neighbour: Placed, relative_hei
 
 
 def spot_at(
-    scene: PhotoScene, plane: Plane, neighbour: Placed, pixel: tuple[float, float], relative_height: float
+    scene: PhotoScene, plane: Plane, neighbour: PlacedMesh, pixel: tuple[float, float], relative_height: float
 ) -> Spot:
     """Return the place on the ground that a pixel shows.
 
@@ -90,14 +95,14 @@ def spot_at(
     ray = scene.camera.rays_through(np.array([pixel])) @ YUP_FROM_CAMERA
     point = plane.hit(ray)[0]
     if not np.isfinite(point).all():
-        found = f"pixel {pixel} shows no ground: it lies above the horizon"
-        raise InputError(found, key="at", cure="name a pixel further down")
+        fault = f"pixel {pixel} shows no ground: it lies above the horizon"
+        raise InputError(fault, key="at", cure="name a pixel below the horizon")
     return Spot(plane, point, relative_height * height_over(plane, neighbour))
 
 
-def stood(
+def standing_mesh(
     name: str, mesh: Mesh, materials: tuple[str, ...], up: Float[np.ndarray, "3"], turn_deg: float, spot: Spot
-) -> Placed:
+) -> PlacedMesh:
     """Return a mesh standing on a spot.
 
     Args:
@@ -116,16 +121,13 @@ def stood(
     scale = spot.height / np.ptp(along)
     middle = (vertices.min(axis=0) + vertices.max(axis=0)) / 2
     foot = middle + (along.min() - middle @ spot.plane.normal) * spot.plane.normal
-    matrix = np.eye(4)
-    matrix[:3, :3] = scale * rotation
-    matrix[:3, 3] = spot.point - scale * foot
-    return Placed(name, mesh, materials, matrix)
+    return PlacedMesh(name, mesh, materials, rigid(scale * rotation, spot.point - scale * foot))
 
 
 class Solid(Caster):
     """Mesh of an object in the world, for intersection tests against others."""
 
-    def __init__(self, placed: Placed):
+    def __init__(self, placed: PlacedMesh):
         self.name = placed.name
         self.vertices = placed.vertices
         super().__init__(msgspec.structs.replace(placed.mesh, vertices=self.vertices))
@@ -140,7 +142,7 @@ class Solid(Caster):
         used = self.vertices[np.unique(faces)]
         self.box = used.min(axis=0), used.max(axis=0)
 
-    def crossed(self, start: Float[np.ndarray, "n 3"], along: Float[np.ndarray, "n 3"]) -> np.ndarray:
+    def crosses(self, start: Float[np.ndarray, "n 3"], along: Float[np.ndarray, "n 3"]) -> np.ndarray:
         """Return a mask of the segments from `start` to `start + along` that cross the surface."""
         # Only segments whose boxes meet the mesh's are cast, in units of the mesh's radius.
         low, high = start + np.minimum(along, 0), start + np.maximum(along, 0)
@@ -150,49 +152,49 @@ class Solid(Caster):
         crossed[crossed] = hits["t_hit"].numpy() < 1
         return crossed
 
-    def holds(self, points: Float[np.ndarray, "n 3"]) -> bool:
+    def contains(self, points: Float[np.ndarray, "n 3"]) -> bool:
         """Return True if one of the points lies within the mesh; an open mesh contains nothing."""
         query = o3d.core.Tensor(((points - self.centre) / self.radius).astype(np.float32))
         return not self.mesh.open and bool(self.scene.compute_occupancy(query, nthreads=1, nsamples=3).numpy().any())
 
-    def meets(self, other: "Solid", move: Float[np.ndarray, "3"]) -> bool:
+    def intersects(self, other: "Solid", move: Float[np.ndarray, "3"]) -> bool:
         """Return True if the mesh, moved by `move`, intersects another."""
         if (self.box[0] + move > other.box[1]).any() or (self.box[1] + move < other.box[0]).any():
             return False
         return bool(
-            other.crossed(self.start + move, self.along).any()
-            or self.crossed(other.start - move, other.along).any()
-            or other.holds(self.pieces + move)
-            or self.holds(other.pieces - move)
+            other.crosses(self.start + move, self.along).any()
+            or self.crosses(other.start - move, other.along).any()
+            or other.contains(self.pieces + move)
+            or self.contains(other.pieces - move)
         )
 
 
-class Room:
+class FreeSpace:
     """Free space on the ground for a new object about its spot."""
 
-    def __init__(self, scene: PhotoScene, new: Placed, spot: Spot):
+    def __init__(self, scene: PhotoScene, new: PlacedMesh, spot: Spot):
         self.camera = scene.camera
         self.spot = spot
         self.new = Solid(new)
         self.others = [Solid(each) for each in scene.objects]
 
-    def pierced(self, move: Float[np.ndarray, "3"] = np.zeros(3)) -> Iterator[str]:
+    def intersected(self, move: Float[np.ndarray, "3"] = np.zeros(3)) -> Iterator[str]:
         """Yield the names of what the moved object would intersect: objects, or the camera."""
-        yield from (f"'{other.name}'" for other in self.others if self.new.meets(other, move))
-        if self.new.holds(-move[None]):
+        yield from (f"'{other.name}'" for other in self.others if self.new.intersects(other, move))
+        if self.new.contains(-move[None]):
             yield "the camera"
 
-    def seen(self, move: Float[np.ndarray, "3"] = np.zeros(3), every: int = 1) -> tuple[float, float]:
+    def visible_shares(self, move: Float[np.ndarray, "3"] = np.zeros(3), every: int = 1) -> tuple[float, float]:
         """Return the shares of the moved object's vertices that are in the picture, and that are also unoccluded.
 
         Only every `every`-th vertex is tested.
         """
         points = self.new.vertices[::every] + move
         inside = points[self._in_picture(points)]
-        hidden = [other.crossed(np.zeros_like(inside), inside) for other in self.others]
+        hidden = [other.crosses(np.zeros_like(inside), inside) for other in self.others]
         return len(inside) / len(points), float((~np.any(hidden, axis=0)).sum()) / len(points)
 
-    def nearest(self) -> Float[np.ndarray, "3"] | None:
+    def nearest_move(self) -> Float[np.ndarray, "3"] | None:
         """Return the shortest move to a place where the object is free and visible; None if there is none."""
         plane = self.spot.plane
         every = max(1, len(self.new.vertices) // ENOUGH)
@@ -204,11 +206,11 @@ class Room:
         finest = lattice[order] @ rotation_between(np.array([0.0, 1.0, 0.0]), plane.normal).T
         for moves in (finest, COARSER * finest):
             for move in moves[self._in_picture(self.spot.point + moves)]:
-                if self.seen(move, every)[1] >= SEEN and not any(self.pierced(move)):
+                if self.visible_shares(move, every)[1] >= LEAST_VISIBLE and not any(self.intersected(move)):
                     return move
         return None
 
-    def at(self, move: Float[np.ndarray, "3"], factor: int) -> str:
+    def pixel_text(self, move: Float[np.ndarray, "3"], factor: int) -> str:
         """Return the pixel where the moved object touches the ground, as a recipe writes it.
 
         `factor` is the number of the photo's pixels per pixel of the scene's camera.
@@ -224,9 +226,9 @@ class Room:
         return ahead & ((pixel >= 0) & (pixel <= [self.camera.width, self.camera.height])).all(axis=1)
 
 
-def stood_free(
-    scene: PhotoScene, stand: Callable[[Spot], Placed], spot: Spot, asked: bool, factor: int = 1
-) -> tuple[Placed, Spot, str]:
+def free_placement(
+    scene: PhotoScene, stand: Callable[[Spot], PlacedMesh], spot: Spot, asked: bool, factor: int = 1
+) -> tuple[PlacedMesh, Spot, str]:
     """Place a new object where it intersects none of the photo's objects and is visible.
 
     Args:
@@ -243,32 +245,48 @@ def stood_free(
         InputError: There is no free place, or the object would be invisible at the place that the recipe names.
     """
     new = stand(spot)
-    room = Room(scene, new, spot)
-    pierced = list(room.pierced())
-    inside, seen = room.seen()
-    if not pierced and seen > 0:
+    space = FreeSpace(scene, new, spot)
+    intersected = list(space.intersected())
+    inside, visible = space.visible_shares()
+    if not intersected and visible > 0:
         return new, spot, ""
-    unseen = "it would be hidden behind other objects" if inside else "it would be outside the picture"
-    why = f"it would intersect {' and '.join(pierced)}" if pierced else unseen
-    if (move := room.nearest()) is None:
+    reason = "it would be hidden behind other objects" if inside else "it would be outside the picture"
+    if intersected:
+        reason = f"it would intersect {' and '.join(intersected)}"
+    if (move := space.nearest_move()) is None:
         cure = "name another photo, object or place"
         for share in (0.5, 0.25, 0.125):
             small = msgspec.structs.replace(spot, height=share * spot.height)
-            if (move := (less := Room(scene, stand(small), small)).nearest()) is not None:
-                cure = f"at {share} of its size it would be free at {less.at(move, factor)}"
+            smaller = FreeSpace(scene, stand(small), small)
+            if (move := smaller.nearest_move()) is not None:
+                cure = f"at {share} of its size it is free at {smaller.pixel_text(move, factor)}"
                 break
-        raise InputError(
-            f"the new object has no free place in the picture: {why}", key="at" if asked else "size", cure=cure
-        )
-    if asked and not pierced:
-        found = f"the new object would not be seen: {why}"
-        raise InputError(found, key="at", cure=f"the nearest free place is {room.at(move, factor)}")
-    there = msgspec.structs.replace(spot, point=spot.point + move)
-    far = np.linalg.norm(move) / spot.height
-    moved = f"The new object was moved by {far:.1f} of its heights, to {room.at(move, factor)}, because {why}."
-    return stand(there), there, moved
+        fault = f"the new object has no free place in the picture: {reason}"
+        raise InputError(fault, key="at" if asked else "size", cure=cure)
+    place = space.pixel_text(move, factor)
+    if asked and not intersected:
+        raise InputError(f"the new object is invisible: {reason}", key="at", cure=f"the nearest free place is {place}")
+    free = msgspec.structs.replace(spot, point=spot.point + move)
+    heights = np.linalg.norm(move) / spot.height
+    moved = f"The new object was moved by {heights:.1f} of its heights, to {place}, because {reason}."
+    return stand(free), free, moved
 
 
 def rotation_between(first: Float[np.ndarray, "3"], second: Float[np.ndarray, "3"]) -> Float[np.ndarray, "3 3"]:
     """Return the smallest rotation of one unit vector into another."""
     return Rotation.align_vectors(second[None], first[None])[0].as_matrix()
+
+
+def disk(
+    centre: Float[np.ndarray, "3"], normal: Float[np.ndarray, "3"], radius: float, material: Reflectance
+) -> dict[str, Any]:
+    """Return a disk as Mitsuba's dictionary.
+
+    Args:
+        centre: its centre, in the world
+        normal: unit normal of its upper side
+        radius: its radius
+        material: its reflectance
+    """
+    frame = rigid(radius * rotation_between(np.array([0.0, 0.0, 1.0]), normal), centre)
+    return {"type": "disk", "to_world": transform(frame), "bsdf": bsdf(material)}

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
+import msgspec
 import numpy as np
 import torch
 from jaxtyping import Float, UInt8
@@ -27,6 +28,20 @@ Report = Callable[[float, float], None]  # points done, their total
 
 def silently(done: float, total: float) -> None:
     """Ignore a progress report."""
+
+
+class PointEffects(msgspec.Struct, frozen=True):
+    """Effects that differ between points of a surface; None where a model has none.
+
+    Attributes:
+        visibility: visibility of the directions of `fibonacci_sphere(k)`, 0 hidden to 255 visible; None is all visible
+        place: position relative to the middle, as `factorlib.light.distance` takes it; None is the middle
+        detail: factor on the diffuse reflectance; None is 1
+    """
+
+    visibility: UInt8[np.ndarray, "n k"] | None = None
+    place: Float[np.ndarray, "n 3"] | None = None
+    detail: Float[np.ndarray, " n"] | None = None
 
 
 class Reflector:
@@ -49,9 +64,7 @@ class Reflector:
         normals: Float[np.ndarray, "n 3"],
         views: Float[np.ndarray, "n 3"],
         report: Report = silently,
-        visibility: UInt8[np.ndarray, "n k"] | None = None,
-        place: Float[np.ndarray, "n 3"] | None = None,
-        detail: Float[np.ndarray, " n"] | None = None,
+        effects: PointEffects = PointEffects(),
     ) -> Float[np.ndarray, "n 3"]:
         """Return the radiance that points reflect toward the viewer; float64, zero where a normal faces away.
 
@@ -60,19 +73,16 @@ class Reflector:
             normals: unit normals
             views: unit directions toward the viewer
             report: receives the number of points done and their total
-            visibility: visibility of the directions of `fibonacci_sphere(k)`, 0 hidden to 255 visible; None is all
-                visible
-            place: position relative to the middle, as `factorlib.light.distance` takes it; None is the middle
-            detail: factor on the diffuse reflectance; None is 1
+            effects: visibility, position and detail of the points
         """
         result = np.zeros((len(normals), 3))
         step = max(1, PAIRS_AT_ONCE // max(len(self.sharpness), 1))
-        optional = visibility, place, detail
+        optional = msgspec.structs.astuple(effects)
         with torch.no_grad():
             for i in range(0, len(normals) if len(self.sharpness) else 0, step):
                 rows = slice(i, i + step)
-                some = (None if of is None else self._tensor(of[rows]) for of in optional)
-                radiance = self._radiance(material, self._tensor(normals[rows]), self._tensor(views[rows]), *some)
+                tensors = (None if values is None else self._tensor(values[rows]) for values in optional)
+                radiance = self._radiance(material, self._tensor(normals[rows]), self._tensor(views[rows]), *tensors)
                 result[rows] = radiance.double().numpy()
                 report(min(i + step, len(normals)), len(normals))
         return result
@@ -89,13 +99,15 @@ class Reflector:
         place: Float[Tensor, "n 3"] | None,
         detail: Float[Tensor, " n"] | None,
     ) -> Float[Tensor, "n 3"]:
-        of_material = material.diffuse, material.specular, material.roughness
-        kd, ks, roughness = (torch.tensor(of, dtype=self.operator.dtype) for of in of_material)
+        parts = material.diffuse, material.specular, material.roughness
+        kd, ks, roughness = (torch.tensor(part, dtype=self.operator.dtype) for part in parts)
         # cosines n·o per point, n·z and o·z per point and lobe; shares of each lobe that a point receives
         no = (normals * views).sum(-1)
         nz = (normals @ self.axis.T).clamp(-1, 1)
         oz = (views @ self.axis.T).clamp(-1, 1)
-        shares = [1.0, 1.0] if visibility is None else self._seen(visibility, normals, views, float(roughness))
+        shares = (
+            [1.0, 1.0] if visibility is None else self._visible_shares(visibility, normals, views, float(roughness))
+        )
         if place is not None and self.curvature > 0:
             nz, oz, larger = finite_distance_cosines(place, normals, views, self.axis, self.curvature)
             shares = [larger * share for share in shares]
@@ -108,7 +120,9 @@ class Reflector:
             radiance = radiance + ks * ((shares[1] * specular) @ self.weight)
         return torch.where(no[:, None] > 0, radiance, torch.zeros_like(radiance))
 
-    def _seen(self, visibility: Tensor, normals: Tensor, views: Tensor, roughness: float) -> list[Float[Tensor, "n p"]]:
+    def _visible_shares(
+        self, visibility: Tensor, normals: Tensor, views: Tensor, roughness: float
+    ) -> list[Float[Tensor, "n p"]]:
         """Return the visible shares of the diffuse and of the specular reflection of each lobe."""
         directions = torch.from_numpy(fibonacci_sphere(visibility.shape[1])).float()
         visibility, normals, views = visibility.float() / 255, normals.float(), views.float()

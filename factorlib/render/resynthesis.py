@@ -15,7 +15,7 @@ from scipy.spatial import cKDTree
 
 from factorlib.conventions import FRONT
 from factorlib.geometry.sphere import ball_normals
-from factorlib.render.reflect import Reflector, Report, silently
+from factorlib.render.reflect import PointEffects, Reflector, Report, silently
 from factorlib.results.materials import Reflectance
 from factorlib.urm.observations import Observations
 
@@ -32,13 +32,13 @@ class Surroundings(msgspec.Struct, frozen=True):
     """Visibility, position and bounced radiance of a photo's n observations.
 
     Attributes:
-        seen: the observations, with their visibility
-        sent: G_d and G_s of `factorlib.inference.interreflection`, in the unit of the picture over the factor of the
+        observations: the observations, with their visibility
+        bounced: G_d and G_s of `factorlib.inference.interreflection`, in the unit of the picture over the factor of the
             materials' gauge; None is zero
     """
 
-    seen: Observations
-    sent: Float[np.ndarray, "n 6"] | None = None
+    observations: Observations
+    bounced: Float[np.ndarray, "n 6"] | None = None
 
 
 def resynthesised(
@@ -47,7 +47,7 @@ def resynthesised(
     photo: Channels,
     geometry: Channels,
     report: Report = silently,
-    around: Surroundings | None = None,
+    surroundings: Surroundings | None = None,
 ) -> Float[np.ndarray, "h w 3"]:
     """Return the photo's linear radiance; zero outside the mask and where no mesh lies under it.
 
@@ -57,7 +57,7 @@ def resynthesised(
         photo: channel label
         geometry: channels normal.x/y/z, view.x/y/z and, if diffuse reflectance has detail, detail
         report: receives the number of pixels done and their total
-        around: occlusion and bounces; None for neither
+        surroundings: occlusion and bounces; None for neither
     """
     label = np.rint(photo["label"]).astype(int)
     normal, view = (np.stack([geometry[f"{kind}.{a}"] for a in "xyz"], axis=-1) for kind in ("normal", "view"))
@@ -66,36 +66,37 @@ def resynthesised(
     total = int((label > 0).sum())
     before = 0
 
-    def of_all(done: float, _: float) -> None:
+    def report_pixels(done: float, _: float) -> None:
         """Report progress over all materials."""
         report(before + done, total)
 
     for k, material in enumerate(materials, start=1):
         pixels = label == k
-        # unit normals and views of this material's pixels
-        unit = [of[pixels].astype(float) for of in (normal, view)]
-        unit = [of / np.linalg.norm(of, axis=-1, keepdims=True) for of in unit]
-        visibility, sent, place = (None,) * 3 if around is None else around_pixels(around, k - 1, *np.nonzero(pixels))
-        detail = geometry["detail"][pixels].astype(float) if "detail" in geometry else np.ones(len(unit[0]))
-        shown = reflector(material, unit[0], unit[1], of_all, visibility, place, detail)
+        normals, views = (_unit(vectors[pixels].astype(float)) for vectors in (normal, view))
+        detail = geometry["detail"][pixels].astype(float) if "detail" in geometry else np.ones(len(normals))
+        visibility, bounced, place = nearest_surroundings(surroundings, k - 1, *np.nonzero(pixels))
+        radiance = reflector(material, normals, views, report_pixels, PointEffects(visibility, place, detail))
         # radiance of bounces: k_d G_d + k_s G_s
-        if sent is not None:
-            bounced = (
-                np.array(material.diffuse) * detail[:, None] * sent[:, :3] + np.array(material.specular) * sent[:, 3:]
-            )
-            shown += bounced * (np.sum(unit[0] * unit[1], 1, keepdims=True) > 0)
-        picture[pixels] = shown
+        if bounced is not None:
+            diffuse, specular = bounced[:, :3], bounced[:, 3:]
+            bounced = np.array(material.diffuse) * detail[:, None] * diffuse + np.array(material.specular) * specular
+            radiance += bounced * (np.sum(normals * views, 1, keepdims=True) > 0)
+        picture[pixels] = radiance
         before += int(pixels.sum())
     return picture
 
 
-def around_pixels(
-    around: Surroundings, material: int, y: Int[np.ndarray, " n"], x: Int[np.ndarray, " n"]
+def _unit(vectors: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
+    return vectors / np.linalg.norm(vectors, axis=-1, keepdims=True)
+
+
+def nearest_surroundings(
+    surroundings: Surroundings | None, material: int, y: Int[np.ndarray, " n"], x: Int[np.ndarray, " n"]
 ) -> tuple[UInt8[np.ndarray, "n k"] | None, Float[np.ndarray, "n 6"] | None, Float[np.ndarray, "n 3"] | None]:
     """Look up visibility, bounced radiance and position of the nearest observed pixel of the same material.
 
     Args:
-        around: the photo's observations
+        surroundings: the photo's observations; None if the model has neither occlusion nor bounces
         material: index of the material, from 0
         y: rows of the pixels
         x: columns of the pixels
@@ -103,14 +104,17 @@ def around_pixels(
     Returns:
         Visibility, bounced radiance and position; each is None if it is unknown.
     """
-    rows = np.flatnonzero(around.seen.material == material)
-    of = around.seen.take(rows)
-    if len(of) == 0 or len(x) == 0:
+    if surroundings is None:
         return None, None, None
-    nearest = cKDTree(np.column_stack([of.x, of.y])).query(np.column_stack([x, y]))[1]
-    sent = None if around.sent is None else around.sent[rows[nearest]]
-    place = None if of.place is None else of.place[nearest]
-    return None if of.visibility is None else of.visibility[nearest], sent, place
+    observations = surroundings.observations
+    rows = np.flatnonzero(observations.material == material)
+    if len(rows) == 0 or len(x) == 0:
+        return None, None, None
+    pixels = np.column_stack([observations.x[rows], observations.y[rows]])
+    nearest = rows[cKDTree(pixels).query(np.column_stack([x, y]))[1]]
+    values = observations.visibility, surroundings.bounced, observations.place
+    visibility, bounced, place = (None if each is None else each[nearest] for each in values)
+    return visibility, bounced, place
 
 
 def balls(reflector: Reflector, material: Reflectance, sizes: Sequence[int]) -> list[Float[np.ndarray, "size size 3"]]:
@@ -125,7 +129,7 @@ def balls(reflector: Reflector, material: Reflectance, sizes: Sequence[int]) -> 
         A picture of radiance per size; zero outside the ball.
     """
     shapes = [ball_normals(size) for size in sizes]
-    normals = np.concatenate([own for own, _ in shapes]) * (1, -1, -1)  # in the camera's frame
+    normals = np.concatenate([each for each, _ in shapes]) * (1, -1, -1)  # in the camera's frame
     radiance = front_radiance(reflector, material, normals)
     pictures = []
     for _, inside in shapes:
@@ -153,7 +157,7 @@ def front_radiance(
     if 4 * rings**2 >= len(normals):
         return reflector(material, normals, np.broadcast_to(FRONT, normals.shape))
     narrow = reflector.lobes.sharpness > NARROW
-    wide, sharp = (Reflector(reflector.operator, reflector.lobes.take(of)) for of in (~narrow, narrow))
+    wide, sharp = (Reflector(reflector.operator, reflector.lobes.take(part)) for part in (~narrow, narrow))
     # nodes: θ = h/2, 3h/2, …, RIM, and φ from 0 to 2π
     theta = (np.arange(rings) + 0.5) / (rings - 0.5) * RIM
     phi = np.arange(4 * rings) * (np.pi / 2 / rings)
@@ -165,9 +169,9 @@ def front_radiance(
     values = np.pad(np.concatenate([across, values]), ((0, 0), (MARGIN, MARGIN), (0, 0)), mode="wrap")
     theta = np.concatenate([-theta[MARGIN - 1 :: -1], theta])
     phi = np.arange(-MARGIN, 4 * rings + MARGIN) * (np.pi / 2 / rings)
-    at = np.arccos(-normals[:, 2]), np.arctan2(normals[:, 1], normals[:, 0]) % (2 * np.pi)
+    angles = np.arccos(-normals[:, 2]), np.arctan2(normals[:, 1], normals[:, 0]) % (2 * np.pi)
     splines = [RectBivariateSpline(theta, phi, channel, s=0) for channel in np.moveaxis(values, -1, 0)]
-    smooth = np.stack([spline.ev(*at) for spline in splines], axis=-1).clip(0)
+    smooth = np.stack([spline.ev(*angles) for spline in splines], axis=-1).clip(0)
     return smooth + sharp(material, normals, np.broadcast_to(FRONT, normals.shape))
 
 

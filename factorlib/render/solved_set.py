@@ -9,7 +9,7 @@ from jaxtyping import Bool, Float
 from factorlib.conventions import YUP_FROM_CAMERA
 from factorlib.dataset.schema import GroundSlice, LightSlice, MeshEntry, MeshInstance, ObjectsSlice
 from factorlib.errors import InputError, did_you_mean
-from factorlib.export.scene import ALL_BOUNCES, DIRECT
+from factorlib.export.exported_scene import ALL_BOUNCES, DIRECT
 from factorlib.generate.solids import sphere
 from factorlib.images.exr import read_exr
 from factorlib.images.light_map import read_light_map
@@ -18,12 +18,12 @@ from factorlib.light.lobes import Lobes
 from factorlib.meshes.mesh import Mesh, scaled
 from factorlib.meshes.read import CREASE_DEG, MeshCache, read_mesh
 from factorlib.reading import check_plain
-from factorlib.recipe.schema import BALL, AssumedSun, is_light_file, is_mesh_file, read_table
+from factorlib.recipe.kinds import BALL, AssumedSun, is_light_file, is_mesh_file, read_table
 from factorlib.render.ground import Plane, resting_plane
-from factorlib.render.insertion import Ground
-from factorlib.render.photo_scene import Light, PhotoScene, Placed, with_sun
-from factorlib.render.traced import Tone, as_it_is
-from factorlib.results.lobes import light_of
+from factorlib.render.insertion import GroundSurface
+from factorlib.render.photo_scene import DistantLight, PhotoScene, PlacedMesh, with_sun
+from factorlib.render.traced_picture import Tone, as_it_is
+from factorlib.results.lobe_table import light_of
 from factorlib.results.materials import MaterialTable, Reflectance, read_materials, reflectances
 from factorlib.results.poses import PhotoPoses, read_poses
 from factorlib.results.surface import read_surface
@@ -54,12 +54,12 @@ class SolvedSet:
         self.table: MaterialTable = read_materials(file)
         for name, material in self.table.materials.items():
             if material.total > 1:
-                found = f"max diffuse + max specular = {material.total:.4g}: more light is reflected than arrives"
-                raise InputError(found, file=file, key=f"materials.{name}", cure="run the stage `export` again")
+                fault = f"max diffuse + max specular = {material.total:.4g}: more light is reflected than arrives"
+                raise InputError(fault, file=file, key=f"materials.{name}", cure="run the stage `export` again")
         self.materials = reflectances(self.table)
         self.photos = list(self.objects)
-        own = read_surface(inputs.folders.get("surface"))
-        self._meshes = MeshCache(inputs.mesh, self.names, crease_deg, own.displacements, own.log_factors)
+        surface = read_surface(inputs.folders.get("surface"))
+        self._meshes = MeshCache(inputs.mesh, self.names, crease_deg, surface.displacements, surface.log_factors)
         self._pixels: dict[str, dict[str, np.ndarray]] = {}
 
     def scene(self, photo: str, sun: AssumedSun | None = None, denoise: bool = False) -> PhotoScene:
@@ -76,13 +76,13 @@ class SolvedSet:
         poses = self.poses[photo]
         objects = self.objects[photo]
         if not objects.objects:
-            found = f"photo '{photo}' has no objects to draw"
+            fault = f"photo '{photo}' has no objects to render"
             cure = "name other photos in the recipe"
-            raise InputError(found, key=f"photos.{photo}.objects", cure=cure)
+            raise InputError(fault, key=f"photos.{photo}.objects", cure=cure)
         for obj in objects.objects:
             if poses.objects[obj.name].left_out:
-                words = "%s: the pose of '%s' was too doubtful to solve with, and so is its place in pictures: %s"
-                log.warning(words, photo, obj.name, "; ".join(poses.objects[obj.name].doubts))
+                text = "%s: the pose of '%s' is doubtful, so the solve left it out, and pictures may misplace it: %s"
+                log.warning(text, photo, obj.name, "; ".join(poses.objects[obj.name].doubts))
         height, width = self._masks(photo)["label"].shape
         camera = poses.camera.camera(width, height)
         placed = tuple(self._placed(obj, objects.meshes[obj.mesh], poses) for obj in objects.objects)
@@ -109,14 +109,14 @@ class SolvedSet:
         tone = self.table.model.tone.get(photo)
         return straightened(self.photo(photo), tone.exponent, tone.pivot) if tone else self.photo(photo)
 
-    def pixel(self, photo: str, at: tuple[float, float]) -> tuple[float, float]:
+    def pixel(self, photo: str, pixel: tuple[float, float]) -> tuple[float, float]:
         """Convert a pixel of the photo to pixels of the picture from `masks`; InputError if it lies outside."""
         height, width = self._masks(photo)["label"].shape
         factor = self.poses[photo].camera.factor
-        if not (0 <= at[0] <= factor * width and 0 <= at[1] <= factor * height):
-            found = f"pixel {at} is not in photo '{photo}', of {factor * width} × {factor * height} pixels"
-            raise InputError(found, key="at", cure="name one that shows the ground")
-        return at[0] / factor, at[1] / factor
+        if not (0 <= pixel[0] <= factor * width and 0 <= pixel[1] <= factor * height):
+            fault = f"pixel {pixel} lies outside photo '{photo}', of {factor * width} × {factor * height} pixels"
+            raise InputError(fault, key="at", cure="name a pixel that shows the ground")
+        return pixel[0] / factor, pixel[1] / factor
 
     def covered(self, photo: str) -> Bool[np.ndarray, "h w"]:
         """Return a mask of the pixels that are not background."""
@@ -128,27 +128,29 @@ class SolvedSet:
         tone = self.table.model.tone.get(photo)
         return (lambda radiance: shown(radiance, tone.exponent, tone.pivot)) if tone else as_it_is
 
-    def light(self, name: str) -> Light:
+    def light(self, name: str) -> DistantLight:
         """Return a photo's light in its camera's axes, or the light of a file."""
         if is_light_file(name):
             return read_light_map(self.inputs.file(f"recipe file:{name}"))
         return light_of(self.inputs["export"], name, self.lights[name])
 
-    def known(self, table: str | None) -> dict[str, Reflectance]:
+    def with_table(self, table: str | None) -> dict[str, Reflectance]:
         """Return the solved materials, replaced and extended by those of a table file."""
         if table is None:
             return self.materials
-        own = read_table(self.inputs.file(f"recipe file:{table}")).items()
-        return self.materials | {name: Reflectance(m.diffuse, m.specular, m.roughness) for name, m in own}
+        entries = read_table(self.inputs.file(f"recipe file:{table}")).items()
+        return self.materials | {name: Reflectance(m.diffuse, m.specular, m.roughness) for name, m in entries}
 
-    def ground(self, photo: str, neighbour: Placed) -> Ground:
+    def ground(self, photo: str, neighbour: PlacedMesh) -> GroundSurface:
         """Return the ground given with the photo, or the plane that the neighbour rests on."""
         given = self.grounds[photo].ground
         if given is None:
             mesh = next(obj.mesh for obj in self.objects[photo].objects if obj.name == neighbour.name)
-            return Ground(resting_plane(neighbour, self._uprights(mesh)))
+            return GroundSurface(resting_plane(neighbour, self._uprights(mesh)))
         normal = YUP_FROM_CAMERA @ np.array(given.normal)
-        return Ground(Plane(normal / np.linalg.norm(normal), YUP_FROM_CAMERA @ np.array(given.point)), given.diffuse)
+        return GroundSurface(
+            Plane(normal / np.linalg.norm(normal), YUP_FROM_CAMERA @ np.array(given.point)), given.diffuse
+        )
 
     def mesh(
         self, name: str, material: str | dict[str, str] | None, up: str
@@ -167,40 +169,47 @@ class SolvedSet:
             InputError: The mesh does not exist or has no height, or lacks a material to be replaced.
         """
         upward = np.eye(3)["xyz".index(up)]
-        wanted = material if isinstance(material, str) else self.names[0]
-        materials: tuple[str, ...] = (wanted,)
+        first = material if isinstance(material, str) else self.names[0]
+        materials: tuple[str, ...] = (first,)
         if name == BALL:
             mesh = sphere(1.0)
         elif is_mesh_file(name):
             file = self.inputs.file(f"recipe file:{name}")
-            mesh = read_mesh(file, [wanted], wanted, {}, self._meshes.crease_deg)
-        elif not (shown := self._objects_of(name)):
-            known = [BALL, *sorted({obj.mesh for each in self.objects.values() for obj in each.objects})]
-            raise InputError(f"there is no mesh {name!r}", key="mesh", cure=did_you_mean(name, known))
+            mesh = read_mesh(file, [first], first, {}, self._meshes.crease_deg)
         else:
-            # The mesh's own materials come first, then those of each object; the first that has all `asked` is taken.
-            plain = [(p, msgspec.structs.replace(obj, materials={})) for p, obj in shown[:1]]
-            each = [(p, self._placed(obj, self.objects[p].meshes[name], self.poses[p])) for p, obj in plain + shown]
-            asked = set(material) if isinstance(material, dict) else set()
-            worn = [{self.names[label - 1] for label in one.mesh.labels} for _, one in each]
-            suited = [one for one, has in zip(each, worn, strict=True) if asked <= has]
-            photo, placed = (suited or each)[0]
+            photo, placed = self._placed_with(name, set(material) if isinstance(material, dict) else set())
             upward = placed.world_from_object[:3, :3].T @ self.ground(photo, placed).plane.normal
             mesh = placed.mesh
             materials = placed.materials
             if isinstance(material, str):
                 materials = (material,) * len(materials)
             elif material is not None:
-                if not suited:
-                    has = set().union(*worn)
-                    found = f"no {name!r} has the materials {', '.join(sorted(asked))}"
-                    wrong = min(asked - has, default=min(asked))
-                    raise InputError(found, key="material", cure=did_you_mean(wrong, sorted(has)))
                 materials = tuple(material.get(each, each) for each in materials)
         if np.ptp(mesh.vertices @ upward) < LEAST_HEIGHT * mesh.radius:
             cure = "say which axis of the file points upward, as in `up: z`, or name a mesh that is not flat"
             raise InputError(f"the mesh {name!r} has no height", key="mesh", cure=cure)
         return mesh, materials, upward
+
+    def _placed_with(self, name: str, required: set[str]) -> tuple[str, PlacedMesh]:
+        """Return the first photo with an object of a mesh that has the required materials, and that object.
+
+        The mesh with its materials of `meshes` comes first, then every object of it with its own.
+        """
+        objects = self._objects_of(name)
+        if not objects:
+            known = [BALL, *sorted({obj.mesh for each in self.objects.values() for obj in each.objects})]
+            raise InputError(f"there is no mesh {name!r}", key="mesh", cure=did_you_mean(name, known))
+        plain = [(photo, msgspec.structs.replace(obj, materials={})) for photo, obj in objects[:1]]
+        present: set[str] = set()
+        for photo, obj in plain + objects:
+            placed = self._placed(obj, self.objects[photo].meshes[name], self.poses[photo])
+            materials = {self.names[label - 1] for label in placed.mesh.labels}
+            if required <= materials:
+                return photo, placed
+            present |= materials
+        fault = f"no object of the mesh {name!r} has the materials {', '.join(sorted(required))}"
+        wrong = min(required - present, default=min(required))
+        raise InputError(fault, key="material", cure=did_you_mean(wrong, sorted(present)))
 
     def _objects_of(self, mesh: str) -> list[tuple[str, MeshInstance]]:
         """Return all objects of a mesh with their photos, sorted by photo name, independent of dataset.yaml's order."""
@@ -214,11 +223,11 @@ class SolvedSet:
         trusted = [pose for pose in poses if not pose.left_out] or poses
         return np.stack([np.array(pose.rotation).T @ YUP_FROM_CAMERA[1] for pose in trusted])
 
-    def _placed(self, obj: MeshInstance, entry: MeshEntry, poses: PhotoPoses) -> Placed:
+    def _placed(self, obj: MeshInstance, entry: MeshEntry, poses: PhotoPoses) -> PlacedMesh:
         pose = poses.objects[obj.name]
         mesh = self._meshes.mesh(obj.mesh, entry, obj.materials)
         place = rigid(YUP_FROM_CAMERA @ np.array(pose.rotation), YUP_FROM_CAMERA @ np.array(pose.translation))
-        return Placed(obj.name, scaled(mesh, pose.scale), tuple(self.names), place)
+        return PlacedMesh(obj.name, scaled(mesh, pose.scale), tuple(self.names), place)
 
     def _masks(self, photo: str) -> dict[str, np.ndarray]:
         if photo not in self._pixels:

@@ -12,12 +12,11 @@ import numpy as np
 from jaxtyping import Float
 
 from factorlib.errors import InputError
-from factorlib.export.scene import DIRECT
+from factorlib.export.exported_scene import DIRECT
 from factorlib.render.ground import Plane
 from factorlib.render.photo_scene import PhotoScene, traced_photo
-from factorlib.render.placement import rotation_between
+from factorlib.render.placement import disk
 from factorlib.results.materials import Reflectance
-from factorlib.tracing.scene import bsdf, transform
 
 REACH = 3.0  # radius of the floor, in half extents of the objects
 SOLID = 0.3  # share of the radius within which the floor does not fade
@@ -54,24 +53,17 @@ def on_floor(
     points = np.concatenate([each.vertices for each in scene.objects])
     extent = float(np.ptp(points, axis=0).max()) / 2
     foot = plane.onto(scene.middle[None])[0]
-    frame = np.eye(4)
-    frame[:3, :3] = REACH * extent * rotation_between(np.array([0.0, 0.0, 1.0]), plane.normal)
-    frame[:3, 3] = foot - HAIR * extent * plane.normal
-    floor = {
-        "type": "disk",
-        "to_world": transform(frame),
-        "bsdf": bsdf(Reflectance((reflectance,) * 3, (0.0,) * 3, 1.0)),
-    }
+    grey = Reflectance((reflectance,) * 3, (0.0,) * 3, 1.0)
+    floor = disk(foot - HAIR * extent * plane.normal, plane.normal, REACH * extent, grey)
     # L₀, L₁ and W
     without = traced_photo(scene, samples, world_from_camera, with_light)
     with_ = traced_photo(scene, samples, world_from_camera, with_light, {"floor": floor})
     alone = traced_photo(scene, COVERAGE_SAMPLES, world_from_camera, max_depth=DIRECT)[..., 3]
     # f, from the distance between the foot of the objects and the floor point of each pixel
     eye = world_from_camera[:3, 3]
-    seen = Plane(plane.normal, plane.point - eye).hit(
-        (scene.camera.rays() @ world_from_camera[:3, :3].T).reshape(-1, 3)
-    )
-    far = np.linalg.norm(seen + eye - foot, axis=-1).reshape(alone.shape) / (REACH * extent)
-    t = np.clip((1 - np.nan_to_num(far, nan=np.inf)) / (1 - SOLID), 0, 1)
+    rays = (scene.camera.rays() @ world_from_camera[:3, :3].T).reshape(-1, 3)
+    points = Plane(plane.normal, plane.point - eye).hit(rays) + eye
+    distance = np.linalg.norm(points - foot, axis=-1).reshape(alone.shape) / (REACH * extent)
+    t = np.clip((1 - np.nan_to_num(distance, nan=np.inf)) / (1 - SOLID), 0, 1)
     weight = np.maximum(alone, t * t * (3 - 2 * t))[..., None]
     return weight * with_ + (1 - weight) * without

@@ -33,14 +33,15 @@ def comparison(first: Path, second: Path, changes: Sequence[str] | None) -> str:
     Raises:
         InputError: A run is incomplete, or the two have no material and no photo in common.
     """
-    one, two = runs = [_run(folder) for folder in (first, second)]
+    runs = [_read_run(folder) for folder in (first, second)]
     tables = [read_materials(f / MATERIALS, f"make export DATASET={_dataset_of(f)}") for f in (first, second)]
-    photos = [name for name in one.set.photos if name in two.set.photos]
+    photos = [name for name in runs[0].set.photos if name in runs[1].set.photos]
     materials = [name for name in tables[0].materials if name in tables[1].materials]
     if not photos and not materials:
-        cure = "name runs of one data set, or of sets that share some"
-        raise InputError("the two have no photo and no material in common", file=second, cure=cure)
-    lights = dict.fromkeys(one.illumination_of(p) for p in photos if one.illumination_of(p) == two.illumination_of(p))
+        cure = "name results of one data set, or of sets that share photos or materials"
+        raise InputError(f"has no photo and no material in common with {first}", file=second, cure=cure)
+    names = [{run.illumination_of(photo) for run in runs} for photo in photos]
+    lights = dict.fromkeys(name for pair in names if len(pair) == 1 for name in pair)
 
     def pairs(stage: str, kind: str, names: Sequence[str]) -> list[dict[str, str | None]]:
         """Return both runs' pictures of a kind, by name."""
@@ -58,13 +59,13 @@ def comparison(first: Path, second: Path, changes: Sequence[str] | None) -> str:
     )
 
 
-def _run(folder: Path) -> Artifacts:
+def _read_run(folder: Path) -> Artifacts:
     """Return the results of a run; InputError if it did not reach `export`."""
     for file in (PHOTOS, MATERIALS):
         if not (folder / file).is_file():
             stage, _, name = file.partition("/")
-            found = f"there is no whole result here: the stage {stage!r} has made no {name}"
-            raise InputError(found, file=folder, cure=f"make all DATASET={_dataset_of(folder)}")
+            fault = f"the result is incomplete: {name} of the stage {stage!r} is missing"
+            raise InputError(fault, file=folder, cure=f"make all DATASET={_dataset_of(folder)}")
     photo_set = SimpleNamespace(name=folder.name, photos=list(read_photos(folder / PHOTOS)))
     return Artifacts({stage: folder / stage for stage in STAGES}, photo_set)
 
@@ -78,8 +79,8 @@ def _dataset_of(folder: Path) -> str:
 def _numbers(runs: list[Artifacts]) -> list[tuple[str, list[str]]]:
     """Return the headlines of both runs by label; a dash if one has none."""
     metrics = [run.metrics for run in runs]
-    both = [{h.label: f"{h.value} {h.unit}".strip() for h in headlines(m)} if m else {} for m in metrics]
-    return [(label, [each.get(label, DASH) for each in both]) for label in dict.fromkeys([*both[0], *both[1]])]
+    values = [{h.label: f"{h.value} {h.unit}".strip() for h in headlines(m)} if m else {} for m in metrics]
+    return [(label, [run.get(label, DASH) for run in values]) for label in dict.fromkeys([*values[0], *values[1]])]
 
 
 def _rows(tables: list[MaterialTable], names: list[str]) -> list[dict[str, Any]]:
@@ -94,8 +95,8 @@ def _rows(tables: list[MaterialTable], names: list[str]) -> list[dict[str, Any]]
     factor: dict[str, np.ndarray] = {}
     first, second = (table.materials for table in tables)
     for group in groups.values():
-        both = ([table.materials[name] for name in group] for table in tables)
-        sums = [np.sum([np.add(m.diffuse, m.specular) for m in each], axis=0) for each in both]
+        pair = ([table.materials[name] for name in group] for table in tables)
+        sums = [np.sum([np.add(m.diffuse, m.specular) for m in each], axis=0) for each in pair]
         factor |= dict.fromkeys(group, np.divide(sums[0], sums[1], out=np.ones(3), where=sums[1] > 0))
     parts = ("diffuse", "specular", "roughness")
     return [_row(name, part, first[name], second[name], factor[name]) for name in names for part in parts]
@@ -108,7 +109,7 @@ def _row(name: str, part: str, first: Solved, second: Solved, factor: Float[np.n
     """
     scales = 1.0, factor if part != "roughness" else 1.0
     values, errors = (
-        [np.atleast_1d(getattr(of, part)) * scale for of, scale in zip(each, scales)]
+        [np.atleast_1d(getattr(result, part)) * scale for result, scale in zip(each, scales)]
         for each in ((first, second), (first.stderr, second.stderr))
     )
     off = [float(d / e) if e > 0 else None for d, e in zip(values[1] - values[0], np.hypot(*errors), strict=True)]

@@ -7,7 +7,7 @@ from itertools import groupby
 from typing import Any
 from urllib.parse import quote
 
-from factorlib.export.gltf import EXTENSION, gltf_material
+from factorlib.export.gltf_writer import EXTENSION, gltf_material
 from factorlib.export.materialx import materialx
 from factorlib.export.mitsuba import material_xml
 from factorlib.images.picture import read_png
@@ -58,16 +58,9 @@ def page(
         first: pictures of the first screen: title, `data:` URI, caption
     """
     metrics = run.metrics
-    exposure = pictures.exposures(run)
-    facts = run.photo_facts
-    solved = run.solved
     assert metrics is not None
-    photos = run.set.photos
-    poses = run.poses
-    cells = [[pictures.ball_cell(run, m, p, exposure[p]) for p in photos] for m in run.set.materials]
-    errors = metrics.light.lights if metrics.light else {}
-    lights = [pictures.light_row(run, name, photos, errors.get(name)) for name, photos in run.illuminations().items()]
-    reasons = sorted((why, section) for section, why in metrics.reasons.items())
+    exposure = pictures.exposures(run)
+    cells = [[pictures.ball_cell(run, m, p, exposure[p]) for p in run.set.photos] for m in run.set.materials]
     return rendered(
         "index.html",
         set=run.set,
@@ -81,38 +74,67 @@ def page(
         tags=tags,
         materials=_materials(run, cells),
         cells=cells,
-        maps=[(p, pictures.reflectance_maps(run, p, exposure[p])) for p in photos],
-        lights=[row for row in lights if row],
-        missing={why: [section for _, section in group] for why, group in groupby(reasons, lambda pair: pair[0])},
-        gauge=solved.gauge,
-        groups=[
-            [m for m, k in solved.gauge.component.items() if k == n] for n in sorted({*solved.gauge.component.values()})
-        ],
-        choices=sentences("choices.txt", model=solved.model),
-        exposures={p: f for p, f in run.exposures.items() if any(abs(c - 1) > 1e-9 for c in f)},
-        poses=[(p, _overlay(run, p), poses[p], facts.get(p)) for p in photos if p in poses],
-        doubted=any(o.doubts or o.left_out for photo in poses.values() for o in photo.objects.values()),
+        maps=[(p, pictures.reflectance_maps(run, p, exposure[p])) for p in run.set.photos],
+        lights=_lights(run, metrics),
+        missing=_missing(metrics),
         surface=run.surface,
         surfaces=surfaces,
-        low_iou=LOW_IOU,
-        as_it_is=AS_IT_IS,
         training=_training(run),
         cost=cost_of(run.events(), STAGES),
         viewed=viewed,
+        **_solution(run),
+        **_poses(run),
     )
+
+
+def _missing(metrics: Metrics) -> dict[str, list[str]]:
+    """Return the sections without numbers by the reason for it, both sorted."""
+    reasons = sorted((why, section) for section, why in metrics.reasons.items())
+    return {why: [section for _, section in group] for why, group in groupby(reasons, lambda pair: pair[0])}
+
+
+def _lights(run: Artifacts, metrics: Metrics) -> list[dict[str, Any]]:
+    """Return the page's row of each exported light."""
+    errors = metrics.light.lights if metrics.light else {}
+    rows = (pictures.light_row(run, name, photos, errors.get(name)) for name, photos in run.illuminations().items())
+    return [row for row in rows if row]
+
+
+def _solution(run: Artifacts) -> dict[str, Any]:
+    """Return the page's facts about the solve: gauge, connected components, choices of the model, exposures."""
+    gauge = run.solved.gauge
+    numbers = sorted(set(gauge.component.values()))
+    return {
+        "gauge": gauge,
+        "groups": [[name for name, k in gauge.component.items() if k == number] for number in numbers],
+        "choices": sentences("choices.txt", model=run.solved.model),
+        "exposures": {p: f for p, f in run.exposures.items() if any(abs(c - 1) > 1e-9 for c in f)},
+    }
+
+
+def _poses(run: Artifacts) -> dict[str, Any]:
+    """Return the page's facts about poses."""
+    poses = run.poses
+    facts = run.photo_facts
+    return {
+        "poses": [(p, _overlay(run, p), poses[p], facts.get(p)) for p in run.set.photos if p in poses],
+        "doubted": any(obj.doubts or obj.left_out for photo in poses.values() for obj in photo.objects.values()),
+        "low_iou": LOW_IOU,
+        "as_it_is": AS_IT_IS,
+    }
 
 
 def links(run: Artifacts) -> dict[str, list[tuple[str, str]]]:
     """Return the existing files by kind: their names, and their paths relative to the page's folder."""
-    found = {}
+    files = {}
     names = run.illuminations()
     for kind, (stage, pattern) in FILES.items():
         paths = sorted(run.folders[stage].glob(pattern))
         if kind.endswith(", EXR"):  # A light's own name may end in _sky.
             paths = [path for path in paths if (path.stem in names) == (kind == "lights, EXR")]
         if paths:
-            found[kind] = [(p.stem, f"../{stage}/{quote(p.relative_to(run.folders[stage]).as_posix())}") for p in paths]
-    return found
+            files[kind] = [(p.stem, f"../{stage}/{quote(p.relative_to(run.folders[stage]).as_posix())}") for p in paths]
+    return files
 
 
 def cautions(run: Artifacts, metrics: Metrics) -> list[str]:
@@ -150,7 +172,7 @@ def forms(name: str, material: Reflectance) -> dict[str, str]:
     }
 
 
-def _materials(run: Artifacts, cells: list[list[pictures.Cell]]) -> list[dict[str, Any]]:
+def _materials(run: Artifacts, cells: list[list[pictures.LitMaterial]]) -> list[dict[str, Any]]:
     """Return the table's row of each solved material; its ball is in the light of the photo that shows it most."""
     solved = run.solved.materials
     exported = run.exported
@@ -161,7 +183,7 @@ def _materials(run: Artifacts, cells: list[list[pictures.Cell]]) -> list[dict[st
             counts = {photo: fact.pixels.get(name, 0) for photo, fact in facts.items()}
             ball = max((c for c in row if c.uri), key=lambda c: counts.get(c.photo, 0), default=None)
             copies = forms(name, exported.get(name, solved[name]).reflectance)
-            rows.append({"name": name, "found": solved[name], "ball": ball, "counts": counts, "forms": copies})
+            rows.append({"name": name, "estimate": solved[name], "ball": ball, "counts": counts, "forms": copies})
     return rows
 
 

@@ -14,15 +14,15 @@ from scipy.sparse import csr_array
 
 from factorlib.conventions import lat_long_solid_angles
 from factorlib.dataset.schema import ObjectsSlice
-from factorlib.evaluate.resynthesis import agreeing_pixels
+from factorlib.evaluate.photo_errors import agreeing_pixels
 from factorlib.images.palette import nearest_tags
 from factorlib.images.picture import exposure_of, picture, png_bytes
 from factorlib.images.transfer import srgb_encode
 from factorlib.render.photo_scene import traced_photo, turned_light
 from factorlib.render.solved_set import SolvedSet
-from factorlib.render.traced import Traced
+from factorlib.render.traced_picture import TracedPicture
 from factorlib.report.artifacts import Artifacts, Channels, Picture
-from factorlib.results.lobes import read_lobes
+from factorlib.results.lobe_table import read_lobes
 from factorlib.results.materials import Reflectance
 from factorlib.results.metrics import PhotoErrors, ScoredLight
 from factorlib.urm.observations import Observations, read_observations
@@ -185,21 +185,21 @@ def first_pictures(run: Artifacts, rows: Sequence[PhotoRow], results: SolvedSet)
     # camera cropped to the objects, and enlarged to the panel's size
     scene = results.scene(row.name)
     box = box_of(np.rint(run.channels("masks", row.name)["label"]) > 0)
-    (top, left), (height, width) = (of.start for of in box), (of.stop - of.start for of in box)
+    (top, left), (height, width) = (span.start for span in box), (span.stop - span.start for span in box)
     pixel = max(1.0, max(height, width) / longest_side(len(run.set.photos)))
     camera = scene.camera.window(left, top, pixel, ceil(width / pixel), ceil(height / pixel))
     scene = msgspec.structs.replace(scene, camera=camera)
-    own = Traced(traced_photo(scene, FIRST_SAMPLES), results.tone(row.name))
+    again = TracedPicture(traced_photo(scene, FIRST_SAMPLES), results.tone(row.name))
     others = [p for p in run.set.photos if run.illumination_of(p) in lit - {row.illumination}]
     other = others[0] if others else None
     light = results.light(other) if other else turned_light(scene.light, 180.0)
-    relit = Traced(traced_photo(msgspec.structs.replace(scene, light=light), FIRST_SAMPLES))
+    relit = TracedPicture(traced_photo(msgspec.structs.replace(scene, light=light), FIRST_SAMPLES))
     exposure = row.errors.exposure if row.errors else 1.0
-    words = f"in the light of {other}" if other else "in its own light, turned half around"
+    caption = f"in the light of {other}" if other else "in its own light, turned half around"
     return [
         photo,
-        ("re-synthesis", data_uri(own.rgba(exposure)), "path-traced from what was recovered"),
-        ("relit", data_uri(relit.exposed().rgba()), words),
+        ("re-synthesis", data_uri(again.rgba(exposure)), "path-traced from what was recovered"),
+        ("relit", data_uri(relit.exposed().rgba()), caption),
     ]
 
 
@@ -234,25 +234,25 @@ def surface_rows(run: Artifacts, objects: Mapping[str, ObjectsSlice]) -> list[Su
     rows = []
     table = run.surface
     for mesh in sorted(table.displacements | table.log_factors):
-        shown = {}
+        masks = {}
         for photo, slice_ in objects.items():
-            numbers = [number for number, own in enumerate(slice_.objects, start=1) if own.mesh == mesh]
-            shown[photo] = np.isin(np.rint(run.channels("align", photo)["object"]), numbers or [-1])
-        photo = max(shown, key=lambda name: int(shown[name].sum()))
+            numbers = [number for number, obj in enumerate(slice_.objects, start=1) if obj.mesh == mesh]
+            masks[photo] = np.isin(np.rint(run.channels("align", photo)["object"]), numbers or [-1])
+        photo = max(masks, key=lambda name: int(masks[name].sum()))
         maps = {"as given": run.channels("align", photo), "by shading": run.channels("surface", f"photos/{photo}")}
-        normals = {which: np.stack([of[f"normal.{a}"] for a in "xyz"], axis=-1) for which, of in maps.items()}
+        normals = {kind: np.stack([each[f"normal.{a}"] for a in "xyz"], axis=-1) for kind, each in maps.items()}
         panels = {
-            f"clay, {which}": srgb_encode(0.03 + 0.5 * np.maximum(n @ CLAY_LIGHT, 0)) for which, n in normals.items()
+            f"clay, {kind}": srgb_encode(0.03 + 0.5 * np.maximum(n @ CLAY_LIGHT, 0)) for kind, n in normals.items()
         }
-        panels |= {f"normals, {which}": 0.5 + 0.5 * n * (1, -1, -1) for which, n in normals.items()}
+        panels |= {f"normals, {kind}": 0.5 + 0.5 * n * (1, -1, -1) for kind, n in normals.items()}
         if mesh in table.log_factors:
             panels["detail of reflectance"] = srgb_encode(np.clip(0.4 * maps["by shading"]["detail"], 0, 1))
         uris = {}
-        box = box_of(shown[photo])
+        box = box_of(masks[photo])
         longest = longest_side(len(run.set.photos))
         for title, panel in panels.items():
             colour = panel if panel.ndim == 3 else panel[..., None].repeat(3, 2)
-            small = reduced(np.where(shown[photo][..., None], colour, 1.0)[box].astype(np.float32), longest)
+            small = reduced(np.where(masks[photo][..., None], colour, 1.0)[box].astype(np.float32), longest)
             uris[title] = data_uri(np.rint(255 * np.clip(small, 0, 1)).astype(np.uint8))
         # RMS and largest displacement, relative to the extent
         size = np.abs(table.displacements.get(mesh, [0.0]))
@@ -292,9 +292,9 @@ def _column(run: Artifacts, row: PhotoRow, exposure: float, height: int) -> Pixe
     light = run.rgb("export", f"illumination/{row.illumination}")
     if light is not None:
         cells.append(_fitted(picture(light, exposure_of(light, percentile=95.0)), COLUMN // 2, COLUMN))
-    found = [run.rgb("render", f"materials/{row.name}/{material}") for material in run.set.materials]
+    radiances = [run.rgb("render", f"materials/{row.name}/{material}") for material in run.set.materials]
     size = COLUMN // 2 - GAP, COLUMN // 2 - GAP // 2
-    balls = [_fitted(disc(ball, exposure), *size) for ball in found if ball is not None]
+    balls = [_fitted(disc(ball, exposure), *size) for ball in radiances if ball is not None]
     for k in range(0, len(balls), 2):
         pair = np.concatenate(balls[k : k + 2], axis=1)
         cells.append(_whitened(pair, 0, COLUMN - pair.shape[1]))
@@ -317,7 +317,7 @@ def _fitted(pixels: Pixels, height: int, width: int) -> Pixels:
 # ── Materials in lights ──────────────────────────────────────────────────────────────────────────────────────────────
 
 
-class Cell(msgspec.Struct, frozen=True):
+class LitMaterial(msgspec.Struct, frozen=True):
     """A material in a photo's light.
 
     Attributes:
@@ -333,7 +333,7 @@ class Cell(msgspec.Struct, frozen=True):
     measured: str | None = None
 
 
-def ball_cell(run: Artifacts, material: str, photo: str, exposure: float) -> Cell:
+def ball_cell(run: Artifacts, material: str, photo: str, exposure: float) -> LitMaterial:
     """Return the ball of a material in a photo's light.
 
     Args:
@@ -345,10 +345,10 @@ def ball_cell(run: Artifacts, material: str, photo: str, exposure: float) -> Cel
     observed = photo in run.photo_facts and run.photo_facts[photo].pixels.get(material, 0) > 0
     radiance = run.rgb("render", f"materials/{photo}/{material}")
     uri = None if radiance is None else data_uri(disc(reduced(radiance, 96), exposure))
-    return Cell(material, photo, observed, uri)
+    return LitMaterial(material, photo, observed, uri)
 
 
-def reflectance_maps(run: Artifacts, photo: str, exposure: float) -> list[Cell]:
+def reflectance_maps(run: Artifacts, photo: str, exposure: float) -> list[LitMaterial]:
     """Return one cell per material: the solved map with the observed normals outlined, and the measured map.
 
     Args:
@@ -361,10 +361,10 @@ def reflectance_maps(run: Artifacts, photo: str, exposure: float) -> list[Cell]:
     observations = observations and with_surface_normals(observations, run.folders.get("surface"))
     for index, name in enumerate(run.set.materials):
         channels = run.exr("render", f"reflectance_maps/{photo}/{name}")
-        seen = observations and observations.take(observations.material == index)
-        measured = data_uri(measured_map(seen, exposure)) if seen else None
+        samples = observations and observations.take(observations.material == index)
+        measured = data_uri(measured_map(samples, exposure)) if samples else None
         uri = None if channels is None else data_uri(_ringed(channels, exposure))
-        cells.append(Cell(name, photo, bool(seen), uri, measured))
+        cells.append(LitMaterial(name, photo, bool(samples), uri, measured))
     return cells
 
 
@@ -464,7 +464,7 @@ def _true_map(true: Picture, estimate: Picture, exposure: float) -> str:
 
 def _spheres(run: Artifacts, name: str) -> str | None:
     """Return the spheres of the truth above those of the estimate, which is scaled to the truth's mean."""
-    truth, estimate = (run.rgb("evaluate", f"spheres/{name}_{which}") for which in ("truth", "estimate"))
+    truth, estimate = (run.rgb("evaluate", f"spheres/{name}_{kind}") for kind in ("truth", "estimate"))
     if truth is None or estimate is None:
         return None
     exposure = exposure_of(truth, truth.max(-1) > 0, 97.0)

@@ -20,7 +20,7 @@ from trimesh.visual.texture import TextureVisuals
 from factorlib.conventions import YUP_FROM_CAMERA
 from factorlib.dataset.schema import LightSlice, ObjectsSlice
 from factorlib.export.environment import sharpened
-from factorlib.export.gltf import read_part_materials, variant_name
+from factorlib.export.gltf_writer import read_part_materials, variant_name
 from factorlib.geometry import open3d as o3d
 from factorlib.geometry.camera import Pose
 from factorlib.geometry.raster import unit
@@ -30,7 +30,7 @@ from factorlib.light.lobes import Lobes
 from factorlib.meshes.mesh import Mesh, area_vectors
 from factorlib.meshes.subdivision import subdivide
 from factorlib.report.artifacts import Artifacts
-from factorlib.results.lobes import read_lobes
+from factorlib.results.lobe_table import read_lobes
 from factorlib.results.poses import AS_IT_IS
 
 MOST_TRIANGLES = 150_000  # triangles of all meshes together: about 3 MB of page
@@ -49,8 +49,8 @@ def viewed(
 
     Strings of numbers are base64, little-endian.
 
-    objects    see `_shown`
-    meshes     see `_shown`
+    objects    see `_objects`
+    meshes     see `_objects`
     materials  reflectances by name
     lights     by name: face, texels across a face of the cube map; lobes, float32, 7 per lobe: axis (y-up), sharpness,
                weight
@@ -74,7 +74,7 @@ def viewed(
         photo = {"name": name, "light": lights[name].illumination, "rotation": turn.ravel().tolist()}
         photos.append(photo | {"gain": run.exposures.get(name, (1.0,) * 3), "exposure": exposure[name]})
     drawn = {name: _light(each) for name, each in lobes.items()}
-    return {**_shown(run, objects), "materials": materials, "lights": drawn, "photos": photos}
+    return {**_objects(run, objects), "materials": materials, "lights": drawn, "photos": photos}
 
 
 def _light(lobes: Lobes) -> dict[str, Any]:
@@ -96,7 +96,7 @@ def spacing_of(face: int) -> float:
 # ── Meshes ───────────────────────────────────────────────────────────────────────────────────────────────────────────
 
 
-class Shown(msgspec.Struct, frozen=True):
+class ViewedObject(msgspec.Struct, frozen=True):
     """An object of a photo, or a mesh with its own materials that no photo shows in a trusted pose."""
 
     photo: str | None
@@ -107,31 +107,30 @@ class Shown(msgspec.Struct, frozen=True):
     pose: Pose = Pose(YUP_FROM_CAMERA.T, np.zeros(3))
 
 
-def _shown(run: Artifacts, objects: Mapping[str, ObjectsSlice]) -> dict[str, list[dict[str, Any]]]:
+def _objects(run: Artifacts, objects: Mapping[str, ObjectsSlice]) -> dict[str, list[dict[str, Any]]]:
     """Return all objects that can be viewed, and their meshes.
 
     objects  photo, name; mesh, its index; materials, by part; rotation, y-up camera from object, row by row; eye, unit
-             vector
-             from the object to that camera
+             vector from the object to that camera
     meshes   name and `_mesh`; poses that scale a mesh by different factors have a mesh each
     """
     files = {name: file for name in sorted(run.set.meshes) if (file := run.folders["export"] / f"{name}.glb").exists()}
     materials = {name: read_part_materials(file) for name, file in files.items()}
     loaded = {name: trimesh.load_scene(file, process=False).geometry for name, file in files.items()}
-    shown = []
+    entries = []
     for photo in (name for name in run.set.photos if name in run.poses):
         for obj in objects[photo].objects:
             entry = run.poses[photo].objects.get(obj.name)
             if obj.mesh in files and entry is not None and not entry.left_out:
                 variant = variant_name(obj.materials)
-                shown.append(Shown(photo, obj.name, obj.mesh, variant, entry.scale, entry.pose))
-    shown += [Shown(None, name, name) for name in files if all(name != each.mesh for each in shown)]
-    kinds = sorted({(each.mesh, each.scale) for each in shown})
+                entries.append(ViewedObject(photo, obj.name, obj.mesh, variant, entry.scale, entry.pose))
+    entries += [ViewedObject(None, name, name) for name in files if all(name != each.mesh for each in entries)]
+    kinds = sorted({(each.mesh, each.scale) for each in entries})
     triangles = sum(len(part.faces) for name, _ in kinds for part in loaded[name].values())
     share = min(1.0, MOST_TRIANGLES / max(1, triangles))
     meshes = [_mesh(loaded[name], np.array(scale), share) for name, scale in kinds]
     placed = []
-    for each in shown:
+    for each in entries:
         mesh = kinds.index((each.mesh, each.scale))
         toward = -(YUP_FROM_CAMERA @ each.pose.apply(meshes[mesh][1][None])[0])
         length = np.linalg.norm(toward)
@@ -140,7 +139,7 @@ def _shown(run: Artifacts, objects: Mapping[str, ObjectsSlice]) -> dict[str, lis
                 "photo": each.photo,
                 "name": each.name,
                 "mesh": mesh,
-                "materials": [own.get(each.variant, own[""]) for _, own in sorted(materials[each.mesh].items())],
+                "materials": [part.get(each.variant, part[""]) for _, part in sorted(materials[each.mesh].items())],
                 "rotation": (YUP_FROM_CAMERA @ each.pose.rotation).ravel().tolist(),
                 "eye": (toward / length).tolist() if length > 0 else [0.0, 0.0, 1.0],
             }
@@ -230,8 +229,7 @@ def _sight(mesh: Mesh, sides: Mesh) -> dict[str, Any]:
     counts      uint16, per vertex: its number of pairs, for directions in front of it alone
     hidden      uint8, per pair: index of the direction
     met         uint16, or uint32 for many vertices, per pair: index of a vertex at the occluder; the number of vertices
-                if
-                it is the inside of the mesh, which is black
+                if it is the inside of the mesh, which is black
     """
     directions = fibonacci_sphere(
         int(np.clip(MOST_DIRECTIONS * MOST_VERTICES // len(sides.vertices), LEAST_DIRECTIONS, MOST_DIRECTIONS))

@@ -43,6 +43,16 @@ class Reflectance(msgspec.Struct, frozen=True):
         """The sum max k_d + max k_s."""
         return max(self.diffuse) + max(self.specular)
 
+    @property
+    def mixture(self) -> tuple[float, Vec3, Vec3]:
+        """The weight w of the specular part in a blend of two BSDFs, and their colours k_d/(1 − w) and k_s/w.
+
+        A part of weight 0 is black.
+        """
+        weight = max(self.specular) / self.total if self.total > 0 else 0.0
+        diffuse = vec3(value / (1 - weight) if weight < 1 else 0.0 for value in self.diffuse)
+        return weight, diffuse, vec3(value / weight if weight > 0 else 0.0 for value in self.specular)
+
 
 class StandardErrors(msgspec.Struct, frozen=True):
     """Standard errors of a reflectance, in the gauge that the file's `gauge.stderr` names."""
@@ -250,8 +260,8 @@ def in_order(table: MaterialTable, names: Sequence[str], path: str | Path) -> li
     """
     for name in names:
         if name not in table.materials:
-            found = f"not the materials of this set: {name!r} is missing"
-            raise InputError(found, file=path, cure="run the stage `solve` again")
+            fault = f"the materials are not those of the data set: {name!r} is missing"
+            raise InputError(fault, file=path, key="materials", cure="run the stage `solve` again")
     return [table.materials[name] for name in names]
 
 
@@ -261,5 +271,5 @@ def read_exposures(path: str | Path, cure: str = "") -> dict[str, Channels]:
     for photo, channels in exposures.items():
         if min(channels) <= 0:
             cure = cure or "run the stage `solve` again"
-            raise InputError("an exposure is not a positive number", file=path, key=photo, cure=cure)
+            raise InputError("an exposure is not positive", file=path, key=photo, cure=cure)
     return exposures

@@ -4,17 +4,18 @@ Keys are stable, and every number is finite.  A section that cannot be computed 
 section.
 
 set          counts of photos, materials, illuminations and connected components of the observation matrix
-resynthesis  always present: `factorlib.evaluate.resynthesis`
-materials    `factorlib.evaluate.materials`
+resynthesis  always present: `factorlib.evaluate.photo_errors`
+materials    `factorlib.evaluate.material_errors`
 relighting   `factorlib.evaluate.relighting`
 relit_set    the relit set score of `factorlib.evaluate.relighting`
-light        `factorlib.evaluate.lights`
-normals      photo -> `NormalError`; see `factorlib.evaluate.geometry`
+light        `factorlib.evaluate.light_errors`
+normals      photo -> `NormalError`; see `factorlib.evaluate.geometry_errors`
 poses        photo -> object -> `PoseError`
 verdict      trust in the result, with or without truth; null if no photo shows a material
 
-Gauges are none, scalar_per_set and channel_per_photo (`factorlib.evaluate.gauge`).  PSNR is in dB, in linear radiance
-relative to the truth's white and after the tone map.  DSSIM is after the tone map (`factorlib.evaluate.picture`).
+Gauges are none, scalar_per_set and channel_per_photo (`factorlib.evaluate.comparison_gauge`).  PSNR is in dB, in linear
+radiance relative to the truth's white and after the tone map.  DSSIM is after the tone map
+(`factorlib.evaluate.picture_errors`).
 """
 
 from pathlib import Path
@@ -94,7 +95,7 @@ class PhotoErrors(msgspec.Struct, frozen=True):
     materials: dict[str, dict[str, ScoredPicture]]
 
 
-class Resynthesis(msgspec.Struct, frozen=True):
+class ResynthesisErrors(msgspec.Struct, frozen=True):
     """Errors of the re-synthesis of all photos.
 
     Attributes:
@@ -292,7 +293,7 @@ class Metrics(msgspec.Struct, frozen=True):
     """Content of metrics.json."""
 
     set: Counts
-    resynthesis: Resynthesis
+    resynthesis: ResynthesisErrors
     materials: MaterialErrors | None
     relighting: Relighting | None
     light: LightErrors | None

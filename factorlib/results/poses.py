@@ -33,7 +33,7 @@ class PoseEntry(msgspec.Struct, frozen=True):
         return Pose(np.array(self.rotation), np.array(self.translation))
 
 
-class RunnerUp(PoseEntry, frozen=True):
+class RunnerUpPose(PoseEntry, frozen=True):
     """The second-best pose.
 
     Attributes:
@@ -45,7 +45,7 @@ class RunnerUp(PoseEntry, frozen=True):
     normal_difference_deg: float
 
 
-class ObjectEntry(PoseEntry, frozen=True):
+class ObjectPose(PoseEntry, frozen=True):
     """An object's pose and its measures of confidence (`factorlib.align.reliability`); None for what was not measured.
 
     Attributes:
@@ -60,7 +60,7 @@ class ObjectEntry(PoseEntry, frozen=True):
     label_agreement: float | None = None
     source: str | None = None
     score: float | None = None
-    runner_up: RunnerUp | None = None
+    runner_up: RunnerUpPose | None = None
     contour_error: float | None = None
     normal_stderr_deg: float | None = None
     mirrored_score: float | None = None
@@ -90,7 +90,7 @@ class PhotoPoses(msgspec.Struct, frozen=True):
     """Camera and object poses of one photo."""
 
     camera: CameraEntry
-    objects: dict[str, ObjectEntry]
+    objects: dict[str, ObjectPose]
 
 
 class PoseFields(TypedDict):
@@ -125,5 +125,5 @@ def _check(photo: PhotoPoses, path: str | Path, key: str, cure: str) -> None:
     for name, obj in photo.objects.items():
         for entry in (obj, obj.runner_up):
             if entry is not None and not is_pose(np.array(entry.rotation), np.array(entry.translation)):
-                found = "a pose that is no rotation and translation"
-                raise InputError(found, file=path, key=f"{key}.{name}", cure=cure)
+                fault = "the pose is invalid: its rotation is no rotation matrix, or a number is not finite"
+                raise InputError(fault, file=path, key=f"{key}.{name}", cure=cure)

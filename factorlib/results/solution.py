@@ -7,7 +7,7 @@ import numpy as np
 
 from factorlib.errors import InputError
 from factorlib.light.lobes import Lobes
-from factorlib.results.lobes import read_lobes
+from factorlib.results.lobe_table import read_lobes
 from factorlib.results.materials import Channels, MaterialTable, read_exposures, read_materials
 
 FILES = ("materials.json", "lobes.parquet", "exposures.json")
@@ -59,7 +59,7 @@ def read_earlier(folder: Path) -> Earlier:
         finite = all(np.isfinite(part).all() for part in (light.axis, light.sharpness, light.weight))
         shaped = (light.sharpness > 0).all() and (np.linalg.norm(light.axis, axis=1) > 0.5).all()
         if not (finite and shaped and (light.weight >= 0).all()):
-            fault = f"illumination '{name}' has a lobe that is none: not finite, negative, or without axis"
+            fault = f"a lobe of illumination '{name}' is not finite, is negative, or has no axis"
     if fault:
-        raise InputError(f"no earlier solution to start from: {fault}", file=path, cure=CURE)
+        raise InputError(f"no solution to start from: {fault}", file=path, cure=CURE)
     return earlier

@@ -37,55 +37,29 @@ Image = Float[np.ndarray, "h w c"]
 FACE_LOOKS = {"+x": (0, 90), "-x": (0, -90), "+y": (90, 0), "-y": (-90, 0), "+z": (0, 0), "-z": (0, 180)}
 
 
-class Material(msgspec.Struct, frozen=True):
-    """Lambert k_d, GGX k_s (linear Rec. 709, k_d + k_s < 1 in the largest channels) and roughness; α = roughness²."""
-
-    diffuse: tuple[float, float, float]
-    specular: tuple[float, float, float]
-    roughness: float
-
-
-def bsdf(material: Material | Reflectance, painted: bool = False) -> dict[str, Any]:
+def bsdf(material: Reflectance, painted: bool = False) -> dict[str, Any]:
     """Return Mitsuba's `blendbsdf` that evaluates to k_d/π + k_s D G / (4 (n·i)(n·o)), without Fresnel.
 
     If `painted`, the diffuse part has the colours of the mesh's vertices, which `paint` computes.
     """
-    diffuse = np.array(material.diffuse)
-    specular = np.array(material.specular)
-    if not diffuse.any() and not specular.any():
-        return {"type": "diffuse", "reflectance": rgb(0.0)}
-    share = _share(material)
+    share, diffuse, specular = material.mixture
+    conductor = {"type": "roughconductor", "material": "none", "distribution": "ggx", "alpha": material.alpha}
+    conductor |= {"specular_reflectance": rgb(specular)}
     if share == 1:
-        return _conductor(specular, material.roughness)
-    colour = {"type": "mesh_attribute", "name": "vertex_color"} if painted else rgb(diffuse / (1 - share))
+        return conductor
+    colour = {"type": "mesh_attribute", "name": "vertex_color"} if painted else rgb(diffuse)
     lambertian = {"type": "diffuse", "reflectance": colour}
     if share == 0:
         return lambertian
-    conductor = _conductor(specular / share, material.roughness)
-    return {"type": "blendbsdf", "weight": float(share), "bsdf_0": lambertian, "bsdf_1": conductor}
+    return {"type": "blendbsdf", "weight": share, "bsdf_0": lambertian, "bsdf_1": conductor}
 
 
-def paint(material: Material | Reflectance, detail: Float[np.ndarray, " v"]) -> Float[np.ndarray, "v 3"]:
+def paint(material: Reflectance, detail: Float[np.ndarray, " v"]) -> Float[np.ndarray, "v 3"]:
     """Return the vertex colours for `bsdf` of a mesh with `detail`, at most 1.
 
     Mitsuba's diffuse BSDF has no reflectance above 1.
     """
-    share = _share(material)
-    colour = np.array(material.diffuse) / (1 - share) if share < 1 else np.zeros(3)
-    return np.minimum(detail[:, None] * colour, 1.0)
-
-
-def _share(material: Material | Reflectance) -> float:
-    """Return the weight of the specular part in the blend; 0 if nothing is reflected."""
-    diffuse = max(material.diffuse)
-    specular = max(material.specular)
-    return specular / (diffuse + specular) if diffuse + specular > 0 else 0.0
-
-
-def _conductor(reflectance: Float[np.ndarray, "3"], roughness: float) -> dict[str, Any]:
-    """Return Mitsuba's GGX `roughconductor` without Fresnel."""
-    ggx = {"type": "roughconductor", "material": "none", "distribution": "ggx", "alpha": roughness**2}
-    return ggx | {"specular_reflectance": rgb(reflectance)}
+    return np.minimum(detail[:, None] * np.array(material.mixture[1]), 1.0)
 
 
 def rgb(value: float | Sequence[float] | Float[np.ndarray, "3"]) -> dict[str, Any]:
@@ -148,7 +122,9 @@ def sensor(
     """
     left, right, _ = columns.indices(camera.width)
     crop = {"crop_offset_x": left, "crop_offset_y": 0, "crop_width": right - left, "crop_height": camera.height}
-    (cx, cy), (w, h), kind = camera.centre, (camera.width, camera.height), "rgba" if alpha else "rgb"
+    cx, cy = camera.centre
+    w, h = camera.width, camera.height
+    kind = "rgba" if alpha else "rgb"
     offset = {"x": (w / 2 - cx) / w, "y": (h / 2 - cy) / h}  # along the axes of the picture, not of the sensor
     film = {"type": "hdrfilm", "width": w, "height": h, "rfilter": {"type": "box"}, "pixel_format": kind, **crop}
     return {
@@ -164,25 +140,20 @@ def sensor(
     }
 
 
-def traced(entries: Entry, camera: Camera, world_from_camera: Matrix, spp: int, seed: int, max_depth: int) -> Image:
-    """Render the radiance of a scene by a camera; see `rendered`.
+class Channels(msgspec.Struct, frozen=True):
+    """Choice of the light and the channels of a rendering.
 
-    Args:
-        entries: Mitsuba objects by name.
-        camera: Camera.
-        world_from_camera: Transform of the camera.
-        spp: Least number of samples per pixel.
-        seed: Seed.
-        max_depth: 2 for direct light alone, −1 for all bounces.
-
-    Returns:
-        Radiance.
+    Attributes:
+        hide_emitters: hide the light itself, where alpha is then 0
+        guides: add six channels, albedo and normal, which guide a denoiser
     """
-    return rendered(entries, sensor(camera, world_from_camera), spp, seed, max_depth)
+
+    hide_emitters: bool = False
+    guides: bool = False
 
 
 def rendered(
-    entries: Entry, view: Entry, spp: int, seed: int, max_depth: int, hide_emitters: bool = False, guides: bool = False
+    entries: Entry, view: Entry, spp: int, seed: int, max_depth: int, channels: Channels = Channels()
 ) -> Image:
     """Render the radiance of a scene in the picture of a `sensor`.
 
@@ -194,18 +165,16 @@ def rendered(
         spp: Least number of samples per pixel.
         seed: Seed.
         max_depth: 2 for direct light alone, −1 for all bounces.
-        hide_emitters: Hide the light itself, where alpha is then 0.
-        guides: Add six channels, albedo and normal.
+        channels: Choice of the light and the channels.
 
     Returns:
         Radiance and further channels.
     """
     mi = mitsuba()
     # load objects one by one: the lights of a nested dictionary come in a random order, which changes the noise
-    plain = {name: entry for name, entry in entries.items() if isinstance(entry, dict)}
-    loaded = entries | {name: mi.load_dict(entry, parallel=False) for name, entry in plain.items()}
-    integrator = {"type": "path", "max_depth": max_depth, **({"hide_emitters": True} if hide_emitters else {})}
-    if guides:
+    loaded = {n: mi.load_dict(e, parallel=False) if isinstance(e, dict) else e for n, e in entries.items()}
+    integrator: Entry = {"type": "path", "max_depth": max_depth, "hide_emitters": channels.hide_emitters}
+    if channels.guides:
         integrator = {"type": "aov", "aovs": "albedo:albedo,normal:sh_normal", "picture": integrator}
     scene = mi.load_dict({"type": "scene", "integrator": integrator, "sensor": view, **loaded}, parallel=False)
     passes = -(-spp * view["film"]["crop_height"] * view["film"]["crop_width"] // SAMPLES_PER_PASS)
@@ -235,7 +204,7 @@ def node_directions(height: int, width: int) -> Float[np.ndarray, "h w 3"]:
     return np.stack(np.broadcast_arrays(sin * np.sin(phi), np.cos(theta)[:, None], sin * np.cos(phi)), axis=-1)
 
 
-def light_seen(
+def incident_light(
     entries: Entry, world_from_light: Matrix, height: int, spp: int, seed: int, max_depth: int = -1
 ) -> Image:
     """Render the radiance that arrives at the origin of the light frame (y-up) as a lat-long map of [height, 2·height].
@@ -258,15 +227,15 @@ def light_seen(
     faces = {}
     for number, (name, (pitch, yaw)) in enumerate(FACE_LOOKS.items()):
         world_from_camera = rigid(world_from_light[:3, :3] @ look(pitch, yaw), world_from_light[:3, 3])
-        faces[name] = traced(entries, camera, world_from_camera, spp, 6 * seed + number, max_depth)
+        faces[name] = rendered(entries, sensor(camera, world_from_camera), spp, 6 * seed + number, max_depth)
     fine = 8 * height, 16 * height
     directions = lat_long_directions(*fine)
     weight = lat_long_solid_angles(*fine)[:, None, None]
-    sums = (
+    weighted, total = (
         array.reshape(height, 8, 2 * height, 8, -1).sum(axis=(1, 3))
-        for array in (looked_up(faces, directions) * weight, np.broadcast_to(weight, (*fine, 1)))
+        for array in (cube_map_lookup(faces, directions) * weight, np.broadcast_to(weight, (*fine, 1)))
     )
-    return np.divide(*sums)
+    return weighted / total
 
 
 def look(pitch_deg: float, yaw_deg: float) -> Float[np.ndarray, "3 3"]:
@@ -277,7 +246,7 @@ def look(pitch_deg: float, yaw_deg: float) -> Float[np.ndarray, "3 3"]:
     return np.stack([right, np.cross(forward, right), forward], axis=-1)
 
 
-def looked_up(faces: dict[str, np.ndarray], directions: Float[np.ndarray, "*n 3"]) -> Float[np.ndarray, "*n 3"]:
+def cube_map_lookup(faces: dict[str, np.ndarray], directions: Float[np.ndarray, "*n 3"]) -> Float[np.ndarray, "*n 3"]:
     """Look up each direction in the faces of a cube map, by the nearest pixel."""
     largest = np.abs(directions).argmax(axis=-1)
     values = np.zeros(directions.shape)

@@ -8,8 +8,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from factorlib.evaluate.ball import light_of_lat_long
-from factorlib.evaluate.materials import common_factor
+from factorlib.evaluate.ball import octahedral_light
+from factorlib.evaluate.material_errors import common_factor
 from factorlib.inference.blocks import Block, Noise
 from factorlib.inference.fit_runner import Solution
 from factorlib.inference.forward import Illumination
@@ -40,7 +40,7 @@ HEAD = ["set", "processor, s", "k_d: mean, worst", "k_s: mean, worst", "roughnes
 def rows() -> Tables:
     """Return the errors on each set: materials after one factor a channel, pictures of all pixels without any."""
     materials, table, operator = materials_of(SEED), [HEAD], reflection_operator("network")
-    lights = {li: light_of_lat_long(light_map(SEED, li, 128, 64)) for li in range(5)}
+    lights = {li: octahedral_light(light_map(SEED, li, 128, 64)) for li in range(5)}
     for name, shown in SETS.items():
         case = Case(SEED, tuple((m, li) for li, some in shown.items() for m in some), SIZE, noise=NOISE)
         photos, truth = observations_of(case, materials, lights).values(), [materials[n] for n in case.material_names]

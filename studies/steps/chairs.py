@@ -18,7 +18,7 @@ import msgspec
 import numpy as np
 from jaxtyping import Bool, Float, UInt8
 
-from factorlib.evaluate.picture import picture_error, white_of
+from factorlib.evaluate.picture_errors import picture_error, white_of
 from factorlib.images.exr import read_exr
 from factorlib.images.picture import picture, write_png
 from factorlib.images.tone import shown
@@ -27,7 +27,7 @@ from factorlib.jsonfile import write_json
 from factorlib.reflection import reflection_operator
 from factorlib.render.reflect import Reflector
 from factorlib.render.resynthesis import Surroundings, resynthesised
-from factorlib.results.lobes import read_lobes
+from factorlib.results.lobe_table import read_lobes
 from factorlib.results.materials import in_order, read_exposures, read_materials
 from factorlib.stage import Inputs, Progress
 from factorlib.urm.observations import Observations, read_observations
@@ -138,7 +138,7 @@ def predicted(
     reflectances = in_order(answer, list(table.materials), folder / "materials.json")
     alone = {**channels, "label": np.where(chair.mask, channels["label"], 0.0)}
     reflector = Reflector(reflection_operator("network"), lobes, curvature=answer.model.curvature(photo))
-    image = resynthesised(reflector, reflectances, alone, geometry, around=around)
+    image = resynthesised(reflector, reflectances, alone, geometry, surroundings=around)
     tone = answer.model.tone.get(photo)
     return shown(image, tone.exponent, tone.pivot) if tone else image
 

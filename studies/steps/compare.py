@@ -3,7 +3,7 @@
 Pictures and shots.json go into <case>/.
 
 Three kinds of pictures of the sphere, each compared with the truth by DSSIM inside the sphere's outline, after the tone
-map of `factorlib.evaluate.picture` at an exposure that takes the truth's white to 1:
+map of `factorlib.evaluate.picture_errors` at an exposure that takes the truth's white to 1:
 
     novel_view      every photographed entry, from `VIEWS`: the first shares a part of what it sees with the photo, the
                     second little
@@ -12,9 +12,9 @@ map of `factorlib.evaluate.picture` at an exposure that takes the truth's white 
     novel_material  every material of the world that was not photographed, in the light of every photo, from the photos'
                     side
 
-each in the three gauges of `factorlib.evaluate.gauge`: nothing scaled beyond the one factor that no photo tells, which
-the true materials fix; one number for all pictures of the kind (`_scaled`); one for each channel and picture
-(`_balanced`).
+each in the three gauges of `factorlib.evaluate.comparison_gauge`: nothing scaled beyond the one factor that no photo
+tells, which the true materials fix; one number for all pictures of the kind (`_scaled`); one for each channel and
+picture (`_balanced`).
 
 The rest are the errors of the reflectances that a method states, those of three spheres in the lights that it states,
 and the processor seconds that it took.  What a method does not state has no score.  <shot>.png is a prediction,
@@ -30,8 +30,8 @@ from pathlib import Path
 import msgspec
 import numpy as np
 
-from factorlib.evaluate.gauge import gauge_factors
-from factorlib.evaluate.picture import picture_error, white_of
+from factorlib.evaluate.comparison_gauge import gauge_factors
+from factorlib.evaluate.picture_errors import picture_error, white_of
 from factorlib.images.exr import read_rgb_exr
 from factorlib.images.picture import picture, write_png
 from factorlib.jsonfile import read_json, write_json

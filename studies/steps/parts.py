@@ -12,7 +12,7 @@ from factorlib.dataset.read import read_dataset
 from factorlib.images.exr import read_rgb_exr
 from factorlib.jsonfile import write_json
 from factorlib.light.latlong import lat_long_of_lobes
-from factorlib.results.lobes import read_lobes
+from factorlib.results.lobe_table import read_lobes
 from factorlib.results.materials import Reflectance, read_materials
 from factorlib.stage import Inputs, Progress
 from factorlib.urm.observations import read_observations

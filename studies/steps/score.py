@@ -1,7 +1,7 @@
 """Errors of a case's answer against the truth of its world: writes <case>.json.
 
 Pictures are spheres, whatever was observed: all normals of the half sphere toward the viewer.  They are compared by
-DSSIM inside the disc after the tone map of `factorlib.evaluate.picture`, nothing scaled but for the gauge
+DSSIM inside the disc after the tone map of `factorlib.evaluate.picture_errors`, nothing scaled but for the gauge
 (`studies.errors`).
 
     entries        recovered materials in recovered lights: every entry of the observed rows and columns; observed,
@@ -34,10 +34,10 @@ import msgspec
 import numpy as np
 from jaxtyping import Float, UInt8
 
-from factorlib.evaluate.ball import constant_light, light_of_lat_long
-from factorlib.evaluate.gauge import connected_components
-from factorlib.evaluate.materials import GREY
-from factorlib.evaluate.picture import picture_error, white_of
+from factorlib.evaluate.ball import constant_light, octahedral_light
+from factorlib.evaluate.comparison_gauge import connected_components
+from factorlib.evaluate.material_errors import GREY
+from factorlib.evaluate.picture_errors import picture_error, white_of
 from factorlib.evaluate.relighting import INSIDE, Appearances
 from factorlib.images.picture import picture, write_png
 from factorlib.jsonfile import read_json, write_json
@@ -107,7 +107,7 @@ def chromaticity(lights: Maps) -> float:
     >>> round(chromaticity(one), 6)
     0.0
     """
-    means = np.stack([light_of_lat_long(light).mean for light in lights.values()]).clip(1e-9)
+    means = np.stack([octahedral_light(light).mean for light in lights.values()]).clip(1e-9)
     free = means / np.exp(np.log(means).mean(axis=0))
     return float(np.mean(free.std(axis=1) / free.mean(axis=1)))
 
@@ -117,10 +117,10 @@ class Spheres:
 
     def __init__(self, case: Case, materials: Table, lights: Maps, truths: Table, maps: Maps):
         self.case, self.materials, self.truths = case, materials, truths
-        true = {li: light_of_lat_long(light) for li, light in maps.items()}
+        true = {li: octahedral_light(light) for li, light in maps.items()}
         self.true = {li: Appearances(light) for li, light in true.items()}
         self.true_means = {li: light.mean for li, light in true.items()}
-        self.own = {li: Appearances(light_of_lat_long(light)) for li, light in lights.items()}
+        self.own = {li: Appearances(octahedral_light(light)) for li, light in lights.items()}
 
     def score(self) -> Score:
         """Return DSSIM of the predictions, and of those of nulls: mean colours, grey materials, constant lights."""

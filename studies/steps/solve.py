@@ -16,7 +16,7 @@ from typing import Any
 import msgspec
 
 from factorlib.dataset.schema import LightSlice
-from factorlib.evaluate.ball import light_of_lat_long
+from factorlib.evaluate.ball import octahedral_light
 from factorlib.jsonfile import write_json
 from factorlib.reflection.network import SHIPPED
 from factorlib.stage import Inputs, Progress
@@ -34,7 +34,7 @@ def main(params: Params, inputs: Inputs, out: Path, progress: Progress) -> None:
     """
     case, home, measured = msgspec.convert(inputs.facts["dataset.case"], Case), out / inputs.photo, {}
     maps = spheres.read_maps(inputs["worlds"], case.seed, case.lights)
-    of = spheres.materials_of(case.seed, case.names), {li: light_of_lat_long(light) for li, light in maps.items()}
+    of = spheres.materials_of(case.seed, case.names), {li: octahedral_light(light) for li, light in maps.items()}
     if case.objects:
         tables, measured["normals"] = objects.observed(case, *of)
     else:

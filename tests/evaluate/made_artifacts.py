@@ -10,8 +10,8 @@ import numpy as np
 import trimesh
 
 from factorlib.conventions import YUP_FROM_CAMERA, lat_long_directions
-from factorlib.evaluate.ball import ball, light_of_lat_long
-from factorlib.export.gltf import write_glb
+from factorlib.evaluate.ball import ball, octahedral_light
+from factorlib.export.gltf_writer import write_glb
 from factorlib.generate.solids import sphere
 from factorlib.geometry.sphere import ball_normals
 from factorlib.images.exr import LAT_LONG, read_exr, write_exr, write_rgb_exr
@@ -19,7 +19,7 @@ from factorlib.images.picture import write_png
 from factorlib.jsonfile import read_json, write_json
 from factorlib.light.lobes import Lobes
 from factorlib.reflection.network import SHIPPED
-from factorlib.results.lobes import write_lobes
+from factorlib.results.lobe_table import write_lobes
 from factorlib.results.materials import (
     Gauge,
     MaterialTable,
@@ -120,7 +120,7 @@ def _balls(names: list[str], make) -> np.ndarray:
 
 
 def _photo(made: Made, folders: dict, photo: str, materials: list[str], light_values: np.ndarray) -> None:
-    light, seen = light_of_lat_long(light_values), made.seen[photo]
+    light, seen = octahedral_light(light_values), made.seen[photo]
     rgb = _balls(seen, lambda m, n: ball(light, TRUE[m], n))
     label = _balls(seen, lambda m, n: np.full((len(n), 1), materials.index(m) + 1))[..., 0]
     normal, inside = _balls(seen, lambda m, n: n @ YUP_FROM_CAMERA), (label > 0).astype(float)

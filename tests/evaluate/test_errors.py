@@ -5,12 +5,12 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from factorlib.dataset.schema import RigidTransform
-from factorlib.evaluate.ball import light_of_lat_long
-from factorlib.evaluate.geometry import normal_error, pose_error
-from factorlib.evaluate.lights import compare_lights, light_error, rgb_angle
-from factorlib.evaluate.materials import compare_materials
-from factorlib.evaluate.picture import WINDOW, picture_error, psnr, ssim_map, tone_mapped, white_of
-from factorlib.evaluate.resynthesis import shot_of
+from factorlib.evaluate.ball import octahedral_light
+from factorlib.evaluate.geometry_errors import normal_error, pose_error
+from factorlib.evaluate.light_errors import compare_lights, light_error, rgb_angle
+from factorlib.evaluate.material_errors import compare_materials
+from factorlib.evaluate.photo_errors import compared_photo
+from factorlib.evaluate.picture_errors import WINDOW, picture_error, psnr, ssim_map, tone_mapped, white_of
 from factorlib.results.materials import Reflectance
 from tests.evaluate.made_artifacts import TRUE, light_map, perturbed, scaled
 
@@ -73,11 +73,11 @@ def test_unseen_and_untold_materials_are_left_out_and_black_has_no_infinite_erro
 # ── lights ───────────────────────────────────────────────────────────────────────────────────────────────────────────
 
 MAPS = {"a": light_map(1), "b": light_map(2)}
-TRUTHS = {name: light_of_lat_long(value) for name, value in MAPS.items()}
+TRUTHS = {name: octahedral_light(value) for name, value in MAPS.items()}
 
 
 def compared(transform):
-    estimates = {name: light_of_lat_long(transform(name, value)) for name, value in MAPS.items()}
+    estimates = {name: octahedral_light(transform(name, value)) for name, value in MAPS.items()}
     return compare_lights(estimates, TRUTHS, {})
 
 
@@ -155,7 +155,7 @@ def test_what_is_left_out_is_counted_and_clipped_pixels_are_bounds(channels):
     photo, geometry, radiance = channels
     photo["clipped.R"][0, :4], photo["valid"][1, :3] = 1, 0
     geometry["label"][2, :2], geometry["confidence"][3, :7] = 0, 0
-    shot = shot_of(photo, geometry, radiance)
+    shot = compared_photo(photo, geometry, radiance)
     assert shot.counts == {"pixels": 600 - 9, "unused": 7, "clipped": 4, "invalid": 3, "uncovered": 2}
-    satisfied = [shot_of(photo, geometry, factor * radiance).clipped_satisfied for factor in (1.5, 0.5)]
+    satisfied = [compared_photo(photo, geometry, factor * radiance).clipped_satisfied for factor in (1.5, 0.5)]
     assert satisfied == [1.0, 0.0]

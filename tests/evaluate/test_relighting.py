@@ -3,20 +3,22 @@
 import numpy as np
 import pytest
 
-from factorlib.evaluate.ball import Light, light_of_lat_long
+from factorlib.evaluate.ball import OctahedralLight, octahedral_light
 from factorlib.evaluate.relighting import compare_relighting, compare_relit_set
 from tests.evaluate.made_artifacts import TRUE as ALL
 from tests.evaluate.made_artifacts import light_map, perturbed, scaled
 
 TRUE = {name: ALL[name] for name in ("red", "brass")}
-LIGHTS = {name: light_of_lat_long(light_map(seed)) for seed, name in enumerate("ab")}
+LIGHTS = {name: octahedral_light(light_map(seed)) for seed, name in enumerate("ab")}
 SEEN = {"a": ["red"], "b": ["red", "brass"]}
 WRONG = {n: perturbed(m, 3) for n, m in TRUE.items()}
 
 
 def lit(factor):
     """The lights times a factor."""
-    return {n: Light(tuple(v * np.asarray(factor, v.dtype) for v in light.levels)) for n, light in LIGHTS.items()}
+    return {
+        n: OctahedralLight(tuple(v * np.asarray(factor, v.dtype) for v in light.levels)) for n, light in LIGHTS.items()
+    }
 
 
 def test_the_truth_is_perfect_and_beats_its_nulls_and_unseen_pairs_are_told_apart():

@@ -6,16 +6,16 @@ import msgspec
 import numpy as np
 import pytest
 
-from factorlib.evaluate.ball import ball, constant_light, light_of_lat_long
+from factorlib.evaluate.ball import ball, constant_light, octahedral_light
 from factorlib.evaluate.relighting import MEAN_SHOWN, NORMALS
-from factorlib.evaluate.verdict import GOOD, POOR, Signs, material_errors, text_of, verdict
+from factorlib.evaluate.verdict import GOOD, POOR, VerdictInputs, ball_changes, verdict, verdict_text
 from factorlib.results.materials import Misfit, Reflectance, StandardErrors, solved
 from factorlib.results.metrics import Verdict
 from factorlib.runner.verbs import NO_TRUST
 from tests.evaluate.made_artifacts import TRUE, light_map
 
-LIGHT = light_of_lat_long(light_map(1))
-CLEAN = Signs(
+LIGHT = octahedral_light(light_map(1))
+CLEAN = VerdictInputs(
     {"red": 1e-4, "wood": 2e-4}, 1e-4, {"day": Misfit(1e-4, 0.01), "dusk": Misfit(2e-4, 0.0)}, {"day": {"chair": 1e-4}}
 )
 WORSE = {
@@ -41,7 +41,7 @@ def test_a_worse_sign_never_raises_what_is_expected():
     levels = np.linspace(0, 1, 6)
     for name in ("materials", "unexplained", "clipped", "contours"):
         signs = [
-            Signs(
+            VerdictInputs(
                 {"red": 1e-3 + 0.1 * v * (name == "materials")},
                 1e-3 + v * (name == "unexplained"),
                 {"day": Misfit(1e-3, v * (name == "clipped"))},
@@ -54,7 +54,7 @@ def test_a_worse_sign_never_raises_what_is_expected():
 
 def test_a_materials_error_is_the_mean_square_of_what_random_errors_of_that_size_change():
     errors = StandardErrors((0.01, 0.004, 0.004), (0.004,) * 3, 0.01)
-    (found,) = material_errors({"red": solved(TRUE["red"], errors)}, {"day": LIGHT}).values()
+    (found,) = ball_changes({"red": solved(TRUE["red"], errors)}, {"day": LIGHT}).values()
 
     def shown(material: Reflectance) -> np.ndarray:
         return np.clip(ball(LIGHT, material, NORMALS) * exposure, 0, 1) ** (1 / 2.2)
@@ -71,13 +71,13 @@ def test_a_materials_error_is_the_mean_square_of_what_random_errors_of_that_size
         squares.append(np.mean((shown(moved) - shown(TRUE["red"])) ** 2))
     assert found == pytest.approx(np.mean(squares), rel=4 / np.sqrt(60))
     nothing = StandardErrors((0.0,) * 3, (0.0,) * 3, 0.0)
-    assert material_errors(
-        {"red": solved(TRUE["red"], nothing)}, {"day": LIGHT, "grey": constant_light(np.ones(3))}
-    ) == {"red": 0.0}
+    assert ball_changes({"red": solved(TRUE["red"], nothing)}, {"day": LIGHT, "grey": constant_light(np.ones(3))}) == {
+        "red": 0.0
+    }
 
 
 def test_the_text_begins_with_the_word_that_the_runner_looks_for():
     spoilt = msgspec.structs.replace(CLEAN, unexplained=2.0)
-    first, *others = text_of(verdict(spoilt)).splitlines()
+    first, *others = verdict_text(verdict(spoilt)).splitlines()
     assert first.startswith(NO_TRUST) and NO_TRUST in get_args(get_type_hints(Verdict)["trust"])
     assert others[0].startswith("limited by: ") and others[-1].startswith("next: ")

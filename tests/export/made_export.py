@@ -20,7 +20,7 @@ from factorlib.jsonfile import write_json
 from factorlib.light.lobes import SUN, Lobes, lobe_integral
 from factorlib.meshes.read import read_mesh
 from factorlib.reflection.network import SHIPPED
-from factorlib.results.lobes import write_lobes
+from factorlib.results.lobe_table import write_lobes
 from factorlib.stage import Inputs
 from stages import export
 from tests.stages.made import Rising

@@ -12,7 +12,7 @@ from factorlib.images.exr import read_rgb_exr
 from factorlib.jsonfile import read_json, write_json
 from factorlib.light.latlong import map_energy
 from factorlib.reflection import reflection_operator
-from factorlib.results.lobes import read_lobes, write_lobes
+from factorlib.results.lobe_table import read_lobes, write_lobes
 from factorlib.results.materials import read_materials
 from factorlib.stage import silent
 from stages import export

@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 import trimesh
 
-from factorlib.export.gltf import read_part_materials, write_glb
-from factorlib.export.materials import headroom_factor, table_in_gauge
+from factorlib.export.gltf_writer import read_part_materials, write_glb
 from factorlib.export.materialx import materialx
+from factorlib.export.reflectance_limit import headroom_factor, table_in_gauge
 from factorlib.meshes.mesh import Mesh
 from factorlib.results.materials import Gauge, MaterialTable, Reflectance, StandardErrors, solved
 

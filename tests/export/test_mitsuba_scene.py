@@ -8,18 +8,18 @@ from scipy.ndimage import binary_erosion
 from factorlib.conventions import YUP_FROM_CAMERA
 from factorlib.dataset.schema import LightSlice
 from factorlib.export.environment import mitsuba_map, sharpened
+from factorlib.export.exported_scene import DIRECT, ExportedScene, ExportedShape, ExposedMap
 from factorlib.export.mitsuba import write_scene
-from factorlib.export.scene import DIRECT, ExposedMap, Scene, Shape
 from factorlib.geometry.camera import Camera
 from factorlib.images.exr import LAT_LONG, read_exr, write_rgb_exr
 from factorlib.light.lobes import Lobes
 from factorlib.meshes.ply import write_ply
 from factorlib.meshes.read import read_mesh
 from factorlib.reflection.reference import Reference
-from factorlib.render.photo_scene import PhotoScene, Placed, traced_photo
+from factorlib.render.photo_scene import PhotoScene, PlacedMesh, traced_photo
 from factorlib.render.reflect import Reflector
 from factorlib.render.resynthesis import resynthesised
-from factorlib.results.lobes import light_of
+from factorlib.results.lobe_table import light_of
 from factorlib.results.materials import Reflectance, read_materials
 from factorlib.tracing.scene import node_directions, paint, rigid
 from factorlib.tracing.variant import mitsuba
@@ -87,9 +87,9 @@ def folder(tmp_path_factory):
 def ball_scene(folder, material: Reflectance, lobes: Lobes, two_sided: bool = False, camera_from_light=np.eye(3)):
     """A ball in front of a square camera, through a scene file."""
     write_rgb_exr(folder / "light.exr", mitsuba_map(lobes, 64, 128), LAT_LONG)
-    shape = Shape("ball", "ball.red.ply", "red", PLACE, two_sided)
+    shape = ExportedShape("ball", "ball.red.ply", "red", PLACE, two_sided)
     light = ExposedMap("light.exr", np.ones(3), camera_from_light)
-    write_scene(folder / "scene.xml", Scene(SQUARE, [shape], {"red": material}, light))
+    write_scene(folder / "scene.xml", ExportedScene(SQUARE, [shape], {"red": material}, light))
     return folder / "scene.xml"
 
 
@@ -152,10 +152,10 @@ def test_detail_of_reflectance_is_a_factor_on_the_diffuse_part_in_scenes_that_ar
     path.write_text(path.read_text().replace("ball.red.ply", "painted.ply"))
     plain = rendered(path, spp=256)  # colours that no material asks for change nothing
     np.testing.assert_allclose(plain[10:22, 10:22].mean((0, 1)), whole[10:22, 10:22].mean((0, 1)), rtol=0.01)
-    shape = Shape("ball", "painted.ply", "red", PLACE, False, painted=True)
-    write_scene(path, Scene(SQUARE, [shape], {"red": material}, ExposedMap("light.exr", np.ones(3), np.eye(3))))
+    shape = ExportedShape("ball", "painted.ply", "red", PLACE, False, painted=True)
+    write_scene(path, ExportedScene(SQUARE, [shape], {"red": material}, ExposedMap("light.exr", np.ones(3), np.eye(3))))
     written = rendered(path, spp=256)
-    placed = Placed(
+    placed = PlacedMesh(
         "ball", msgspec.structs.replace(ball, detail=detail), ("red",), rigid(YUP_FROM_CAMERA, [0.0, 0.0, -5.0])
     )
     traced = traced_photo(PhotoScene(SQUARE, (placed,), light, {"red": material}, DIRECT), 256)[..., :3]

@@ -4,13 +4,13 @@ import numpy as np
 import pytest
 
 from factorlib.conventions import YUP_FROM_CAMERA, lat_long_directions
-from factorlib.export.scene import ExposedMap, Scene, Shape
+from factorlib.export.exported_scene import ExportedScene, ExportedShape, ExposedMap
 from factorlib.export.usd import shader_inputs, write_usd_scene
 from factorlib.geometry.camera import Camera
 from factorlib.images.exr import read_rgb_exr
 from factorlib.meshes.ply import submesh
 from factorlib.meshes.read import read_mesh
-from factorlib.results.lobes import read_lobes
+from factorlib.results.lobe_table import read_lobes
 from factorlib.results.materials import Reflectance
 from tests.export import made_export
 
@@ -32,9 +32,9 @@ def text_of(tmp_path):
     def written(objects=("chair",), materials=("red",), file="meshes/a.ply", exposure=(2.0, 1.0, 0.5)) -> str:
         place = np.arange(16.0).reshape(4, 4)
         place[3] = [0, 0, 0, 1]
-        shapes = [Shape(f"{name}.{each}", file, each, place, False) for name in objects for each in materials]
+        shapes = [ExportedShape(f"{name}.{each}", file, each, place, False) for name in objects for each in materials]
         light = ExposedMap("../illumination/a.exr", np.array(exposure), np.eye(3))
-        scene = Scene(Camera(64, 48, 100.0, (30.0, 20.0)), shapes, dict.fromkeys(materials, GLOSSY), light)
+        scene = ExportedScene(Camera(64, 48, 100.0, (30.0, 20.0)), shapes, dict.fromkeys(materials, GLOSSY), light)
         write_usd_scene(tmp_path / "scene.usda", scene)
         return (tmp_path / "scene.usda").read_text()
 

@@ -28,7 +28,7 @@ from factorlib.jsonfile import read_json
 from factorlib.labels.labels import read_labels
 from factorlib.light.lobes import Lobes
 from factorlib.meshes.read import read_mesh
-from factorlib.results.lobes import read_lobes, write_lobes
+from factorlib.results.lobe_table import read_lobes, write_lobes
 from factorlib.results.poses import read_poses
 from factorlib.results.solution import read_earlier
 from factorlib.stage import Inputs

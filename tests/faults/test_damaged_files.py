@@ -31,7 +31,7 @@ from factorlib.errors import InputError
 from factorlib.images.exr import write_exr, write_rgb_exr
 from factorlib.light.lobes import Lobes
 from factorlib.meshes.read import read_mesh
-from factorlib.results.lobes import write_lobes
+from factorlib.results.lobe_table import write_lobes
 from factorlib.runner import verbs
 from factorlib.urm.observations import write_observations
 from tests.faults import good

@@ -15,7 +15,7 @@ import torch
 
 from factorlib.checkpoint import Checkpoint
 from factorlib.errors import InputError
-from factorlib.export.gltf import write_glb
+from factorlib.export.gltf_writer import write_glb
 from factorlib.export.materialx import materialx
 from factorlib.export.usd import write_usd_mesh
 from factorlib.generate.folder import write_codes, write_obj, write_yaml

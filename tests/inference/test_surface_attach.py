@@ -9,7 +9,7 @@ from factorlib.geometry.raster import rasterise
 from factorlib.inference.surface_turns import Surfaces, attach_pixels
 from factorlib.meshes.mesh import Mesh, scaled
 from factorlib.meshes.subdivision import subdivided_mesh
-from factorlib.results.poses import ObjectEntry, entry_of
+from factorlib.results.poses import ObjectPose, entry_of
 
 CAMERA = Camera(60, 50, 80.0, (30.0, 25.0))
 
@@ -20,9 +20,9 @@ def ball(offset=0.0) -> Mesh:
     return msgspec.structs.replace(whole, vertices=whole.vertices + [offset, 0, 0])
 
 
-def entry(pose: Pose, scale=(1.0, 1.0, 1.0)) -> ObjectEntry:
+def entry(pose: Pose, scale=(1.0, 1.0, 1.0)) -> ObjectPose:
     """An entry of poses.json."""
-    return ObjectEntry(**entry_of(pose), scale=scale)
+    return ObjectPose(**entry_of(pose), scale=scale)
 
 
 def test_pixels_of_two_objects_know_their_nodes_and_their_pose():

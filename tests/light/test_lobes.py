@@ -9,7 +9,7 @@ from factorlib.geometry.sphere import fibonacci_sphere
 from factorlib.light.distance import finite_distance_cosines
 from factorlib.light.lobes import Lobes, lobe_integral, no_lobes
 from factorlib.light.visibility import cosine_weights, highlight_weights, kernel, visible_share
-from factorlib.results.lobes import read_lobes, write_lobes
+from factorlib.results.lobe_table import read_lobes, write_lobes
 
 
 def some_lobes(count: int = 6, seed: int = 0) -> Lobes:

@@ -8,8 +8,8 @@ import pytest
 from factorlib.dataset.read import read_dataset
 from factorlib.errors import InputError
 from factorlib.jsonfile import write_json
+from factorlib.recipe.kinds import KINDS, InsertRecipe, recipe_of
 from factorlib.recipe.read import files_of, read_recipe
-from factorlib.recipe.schema import KINDS, Insert, recipe_of
 from factorlib.results.materials import MaterialTable, Reflectance, StandardErrors, solved
 from factorlib.runner.project import LIBRARY
 from factorlib.yamlfile import load_yaml, read_yaml
@@ -52,7 +52,7 @@ def test_recipes_that_come_with_the_project_are_good_and_of_every_kind_and_survi
     ("kind: insert\nphotos: [kitchen]\nbeside: red_chair", ["no object 'red_chair' in photo 'kitchen'", "yellow_chair", "name the photos"]),
     ("kind: insert\nsize: 0", ["one.yaml:2: size"]),
     ("kind: insert\nmesh: read.py", ["there is no file", "read.py"]),
-    ("kind: insert\nmesh: one.yaml", ["'one.yaml' is no mesh", ".obj"]),
+    ("kind: insert\nmesh: one.yaml", ["'one.yaml' is no mesh file", ".obj"]),
     ("kind: relight\nphotos: [kitchen, kitchen]", ["photos", "'kitchen' is named twice"]),
     ("kind: relight\nlights: [hall, hall]", ["lights", "'hall' is named twice"]),
     ("kind: turntable\nseconds: .inf", ["one.yaml:2: seconds"]),
@@ -83,7 +83,7 @@ def test_files_are_relative_to_the_recipe_and_a_table_adds_materials(dataset, tm
     write_json(tmp_path / "own.json", MaterialTable({"gold": one}))
     path = written(tmp_path, "kind: insert\nmesh: bunny.obj\nmaterial: gold\ntable: own.json")
     recipe = read_recipe(path, dataset)
-    assert isinstance(recipe, Insert) and recipe.material == "gold"
+    assert isinstance(recipe, InsertRecipe) and recipe.material == "gold"
     assert files_of(recipe, path) == {"own.json": tmp_path / "own.json", "bunny.obj": tmp_path / "bunny.obj"}
 
 

@@ -10,9 +10,9 @@ from factorlib.geometry.camera import Camera
 from factorlib.light.lobes import Lobes
 from factorlib.meshes.mesh import Mesh
 from factorlib.render.ground import Plane
-from factorlib.render.insertion import NEW, Ground, Standing, inserted, shadow_match
-from factorlib.render.photo_scene import ALL_BOUNCES, PhotoScene, Placed, light_entries, shapes
-from factorlib.render.placement import Spot, stood
+from factorlib.render.insertion import NEW, GroundSurface, InsertionScene, compared_shadow, inserted, shadow_match
+from factorlib.render.photo_scene import ALL_BOUNCES, PhotoScene, PlacedMesh, light_entries, shapes
+from factorlib.render.placement import Spot, standing_mesh
 from factorlib.results.materials import Reflectance
 from factorlib.tracing.scene import bsdf, rendered, rigid, sensor, transform
 
@@ -23,8 +23,8 @@ SPOT = Spot(GROUND, np.array([-0.9, -1.0, -6.0]), 1.2)
 STRIPES = (0.2, 0.5)
 
 
-def stands(scene: PhotoScene, placed: Placed | None = None, polish: Reflectance | None = None) -> Standing:
-    return Standing(scene, Ground(GROUND, polish=polish), placed or new(), SPOT, SPOT, "")
+def stands(scene: PhotoScene, placed: PlacedMesh | None = None, polish: Reflectance | None = None) -> InsertionScene:
+    return InsertionScene(scene, GroundSurface(GROUND, polish=polish), placed or new(), SPOT, SPOT, "")
 
 
 def light() -> Lobes:
@@ -32,7 +32,7 @@ def light() -> Lobes:
     return Lobes(axis / np.linalg.norm(axis, axis=1, keepdims=True), np.array([1.0, 80.0]), weight)
 
 
-THERE = Placed("there", sphere(1.0), ("grey",), rigid(np.eye(3), (0.9, 0, -6.5)))
+THERE = PlacedMesh("there", sphere(1.0), ("grey",), rigid(np.eye(3), (0.9, 0, -6.5)))
 SCENE = PhotoScene(CAMERA, (THERE,), light(), MATERIALS)
 OPEN = np.zeros((CAMERA.height, CAMERA.width), bool)  # nothing covers the ground
 
@@ -47,14 +47,18 @@ def true_photo(objects, samples=1024):
     return rendered(entries, sensor(CAMERA, rigid(YUP_FROM_CAMERA, np.zeros(3))), samples, 7, ALL_BOUNCES)
 
 
-def new(material="red") -> Placed:
-    return stood("new", sphere(1.0), (material,), np.array([0, 1.0, 0]), 0.0, SPOT)
+def new(material="red") -> PlacedMesh:
+    return standing_mesh("new", sphere(1.0), (material,), np.array([0, 1.0, 0]), 0.0, SPOT)
 
 
 @pytest.fixture(scope="module")
 def made():
     photo = true_photo([THERE])
     return photo, inserted(stands(SCENE), photo, OPEN, 512)
+
+
+def match_of(scene, photo):
+    return compared_shadow(stands(scene), inserted(stands(scene), photo, OPEN, 64), photo, OPEN, 64)
 
 
 def blocks(picture):
@@ -96,9 +100,9 @@ def test_an_open_mesh_is_seen_from_either_side_and_hidden_by_what_stands_before_
     for where in (-8.0, -4.0):
         matrix = 0.3 * np.eye(4)
         matrix[:, 3] = (-0.9 * -where / 6, -0.6 * -where / 6, where, 1)
-        before = Placed("new", sphere(1.0), ("grey",), matrix)
+        before = PlacedMesh("new", sphere(1.0), ("grey",), matrix)
         scene = PhotoScene(CAMERA, (before,), light(), MATERIALS)
-        placed = stood(NEW, quad, ("red",), np.array([0, 1.0, 0]), turn, SPOT)
+        placed = standing_mesh(NEW, quad, ("red",), np.array([0, 1.0, 0]), turn, SPOT)
         photo = np.ones((CAMERA.height, CAMERA.width, 3))
         seen.append(inserted(stands(scene, placed), photo, OPEN, 16).coverage.sum())
     assert seen[0] > 100 and seen[1] < 0.9 * seen[0]
@@ -114,7 +118,7 @@ def test_the_shadow_of_the_photo_is_recognised_whatever_its_exposure_and_not_whe
     where[:, 3:] = False
     spoiled = np.where(where[..., None], lit, rng.uniform(0.1, 1, lit.shape))
     few = shadow_match(spoiled, lit, constant, where)
-    assert few.correlation is None and few.pixels == 60 and "too little is seen of the ground" in str(few)
+    assert few.correlation is None and few.pixels == 60 and "too little of the ground" in str(few)
     where[:, 3:8] = True
     assert shadow_match(np.where(where[..., None], lit, 0.5), lit, constant, where).correlation == pytest.approx(1)
     assert shadow_match(lit, np.ones_like(lit), constant, where).correlation is None
@@ -123,9 +127,9 @@ def test_the_shadow_of_the_photo_is_recognised_whatever_its_exposure_and_not_whe
         {**light_entries(light(), 6.0), **shapes([THERE], MATERIALS), "ground": floor()},
         sensor(CAMERA, rigid(YUP_FROM_CAMERA, np.zeros(3))), 128, 7, ALL_BOUNCES,
     )  # fmt: skip
-    match = inserted(stands(SCENE), plain, OPEN, 64).match
+    match = match_of(SCENE, plain)
     turned = msgspec.structs.replace(SCENE, light=Lobes(light().axis * [-1, 1, -1], light().sharpness, light().weight))
-    other = inserted(stands(turned), plain, OPEN, 64).match
+    other = match_of(turned, plain)
     assert match.correlation > 0.9 > match.constant_light > other.correlation and match.pixels == other.pixels > 500
 
 

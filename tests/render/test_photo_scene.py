@@ -13,15 +13,15 @@ from factorlib.light.lobes import Lobes
 from factorlib.meshes.mesh import Mesh
 from factorlib.render.ground import Plane, resting_plane
 from factorlib.render.photo_scene import (
+    Orbit,
     PhotoScene,
-    Placed,
+    PlacedMesh,
     lit_ball,
-    orbit,
     traced_photo,
     turned_light,
     with_sun,
 )
-from factorlib.render.placement import spot_at, spot_beside, stood
+from factorlib.render.placement import spot_at, spot_beside, standing_mesh
 from factorlib.results.materials import Reflectance
 from factorlib.tracing.scene import rigid
 
@@ -37,8 +37,8 @@ def lobes() -> Lobes:
     return Lobes(axis / np.linalg.norm(axis, axis=1, keepdims=True), np.array([2.0, 20.0]), weight)
 
 
-def placed(name, mesh, where, rotation=np.eye(3)) -> Placed:
-    return Placed(name, mesh, ("red",), rigid(rotation, where))
+def placed(name, mesh, where, rotation=np.eye(3)) -> PlacedMesh:
+    return PlacedMesh(name, mesh, ("red",), rigid(rotation, where))
 
 
 def box(width: float, height: float, depth: float) -> Mesh:
@@ -64,12 +64,14 @@ def about(axis, degrees):
 
 
 def test_the_camera_goes_right_and_up_and_keeps_its_distance_and_no_turn_is_the_photo_itself(scene):
-    moved, near = orbit(scene, 30, 20)[:3, 3], orbit(scene, 0, zoom=2)[:3, 3]
+    moved, near = Orbit(30, 20).world_from_camera(scene)[:3, 3], Orbit(0, zoom=2).world_from_camera(scene)[:3, 3]
     far = np.linalg.norm(scene.middle)
     assert moved[0] > 0 and moved[1] > 0 and np.linalg.norm(moved - scene.middle) == pytest.approx(far)
     assert np.linalg.norm(near - scene.middle) == pytest.approx(far / 2)
-    assert np.allclose(orbit(scene, 0), orbit(scene, 360), atol=1e-9)
-    assert np.array_equal(traced_photo(scene, 4), traced_photo(scene, 4, world_from_camera=orbit(scene, 0)))
+    assert np.allclose(Orbit(0).world_from_camera(scene), Orbit(360).world_from_camera(scene), atol=1e-9)
+    assert np.array_equal(
+        traced_photo(scene, 4), traced_photo(scene, 4, world_from_camera=Orbit(0).world_from_camera(scene))
+    )
 
 
 def test_turning_camera_objects_and_light_together_changes_nothing(scene):
@@ -79,7 +81,13 @@ def test_turning_camera_objects_and_light_together_changes_nothing(scene):
         msgspec.structs.replace(each, world_from_object=whole @ each.world_from_object) for each in scene.objects
     ]
     other = msgspec.structs.replace(scene, objects=tuple(objects), light=turned_light(scene.light, 50))
-    assert differ(traced_photo(scene, 256), traced_photo(other, 256, world_from_camera=whole @ orbit(scene, 0))) < 0.02
+    assert (
+        differ(
+            traced_photo(scene, 256),
+            traced_photo(other, 256, world_from_camera=whole @ Orbit(0).world_from_camera(scene)),
+        )
+        < 0.02
+    )
 
 
 @pytest.mark.parametrize("angle", [0, 70])
@@ -131,7 +139,7 @@ def test_a_new_object_stands_on_the_plane_as_high_as_asked_turned_and_upright(sc
     left = scene.objects[0]
     plane = resting_plane(left)
     spot = spot_beside(scene, plane, left, 0.5, 1.0)
-    new = stood("new", box(0.2, 0.3, 3.0), ("red",), np.array([0, 0, 1.0]), 40, spot)
+    new = standing_mesh("new", box(0.2, 0.3, 3.0), ("red",), np.array([0, 0, 1.0]), 40, spot)
     along = (new.vertices - plane.point) @ plane.normal
     assert along.min() == pytest.approx(0, abs=1e-9) and along.max() == pytest.approx(0.7)
     foot = plane.onto(((new.vertices.min(axis=0) + new.vertices.max(axis=0)) / 2)[None])[0]

@@ -11,7 +11,7 @@ from factorlib.light.latlong import lat_long_of_lobes
 from factorlib.light.lobes import Lobes, no_lobes
 from factorlib.reflection import reflection_operator
 from factorlib.reflection.reference import Reference
-from factorlib.render.reflect import Reflector
+from factorlib.render.reflect import PointEffects, Reflector
 from factorlib.render.resynthesis import balls
 from factorlib.results.materials import Reflectance
 from tests.integral import reflected
@@ -93,21 +93,21 @@ def test_darkness_is_black_and_so_is_what_faces_away(lit, facing):
 def test_shadows_that_hide_nothing_change_nothing_and_those_that_hide_all_leave_darkness():
     reflector, (normals, views) = Reflector(reflection_operator("closed_form"), light()), points(40)
     for level, factor in ((255, 1.0), (0, 0.0)):
-        found = reflector(GLOSSY, normals, views, visibility=np.full((40, 256), level, np.uint8))
+        found = reflector(GLOSSY, normals, views, effects=PointEffects(visibility=np.full((40, 256), level, np.uint8)))
         np.testing.assert_allclose(found, factor * reflector(GLOSSY, normals, views), rtol=1e-5, atol=2e-3)
 
 
 def test_a_near_light_is_to_each_point_a_far_one_of_moved_lobes():
     operator, lobes, (normals, views) = reflection_operator("closed_form", dtype="float64"), light(), points(20)
     place, curvature = 1.5 * unit(20, 5), 0.2
-    near = Reflector(operator, lobes, curvature)(GLOSSY, normals, views, place=place)
+    near = Reflector(operator, lobes, curvature)(GLOSSY, normals, views, effects=PointEffects(place=place))
     for k, x in enumerate(curvature * place):
         to = lobes.axis - x
         d = np.linalg.norm(to, axis=1, keepdims=True)
         moved = Lobes(to / d, lobes.sharpness, lobes.weight * (1 - lobes.axis @ x)[:, None] / d**3)
         far = Reflector(operator, moved)(GLOSSY, normals[k : k + 1], views[k : k + 1])[0]
         np.testing.assert_allclose(near[k], far, rtol=1e-4)
-    middle = Reflector(operator, lobes, curvature)(GLOSSY, normals, views, place=0 * place)
+    middle = Reflector(operator, lobes, curvature)(GLOSSY, normals, views, effects=PointEffects(place=0 * place))
     np.testing.assert_allclose(middle, Reflector(operator, lobes)(GLOSSY, normals, views), rtol=1e-9)
     assert np.abs(near / middle - 1).max() > 0.1
 
@@ -118,5 +118,9 @@ def test_detail_is_a_factor_on_the_diffuse_part_alone():
     diffuse, specular = (Reflectance(kd, ks, 0.4) for kd, ks in ((GLOSSY.diffuse, black), (black, GLOSSY.specular)))
     parts = [reflector(of, normals, views) for of in (diffuse, specular)]
     expected = detail[:, None] * parts[0] + parts[1]
-    np.testing.assert_allclose(reflector(GLOSSY, normals, views, detail=detail), expected, rtol=0.03, atol=1e-3)
-    np.testing.assert_allclose(reflector(diffuse, normals, views, detail=detail), detail[:, None] * parts[0], rtol=1e-5)
+    np.testing.assert_allclose(
+        reflector(GLOSSY, normals, views, effects=PointEffects(detail=detail)), expected, rtol=0.03, atol=1e-3
+    )
+    np.testing.assert_allclose(
+        reflector(diffuse, normals, views, effects=PointEffects(detail=detail)), detail[:, None] * parts[0], rtol=1e-5
+    )

@@ -14,7 +14,7 @@ from factorlib.inference.interreflection import bounced_light
 from factorlib.jsonfile import read_json, write_json
 from factorlib.light.lobes import no_lobes
 from factorlib.reflection import reflection_operator
-from factorlib.results.lobes import write_lobes
+from factorlib.results.lobe_table import write_lobes
 from factorlib.results.materials import read_materials
 from factorlib.stage import silent
 from factorlib.urm.observations import write_observations

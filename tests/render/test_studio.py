@@ -5,7 +5,7 @@ import pytest
 
 from factorlib.geometry.camera import Camera
 from factorlib.render.ground import Plane
-from factorlib.render.photo_scene import PhotoScene, orbit, traced_photo
+from factorlib.render.photo_scene import Orbit, PhotoScene, traced_photo
 from factorlib.render.studio import on_floor
 from tests.render.test_photo_scene import MATERIALS, lobes, placed, sphere
 
@@ -20,7 +20,7 @@ def scene():
 
 
 def test_a_shadow_lies_beneath_the_ball_and_nothing_far_from_it(scene):
-    view = orbit(scene, 0, 25)
+    view = Orbit(0, 25).world_from_camera(scene)
     plain, dark, pale = (
         traced_photo(scene, 64, view) if share is None else on_floor(scene, PLANE, share, 64, view)
         for share in (None, 0.0, 0.8)
@@ -41,6 +41,6 @@ def test_a_shadow_lies_beneath_the_ball_and_nothing_far_from_it(scene):
 
 def test_about_a_tilted_normal_the_camera_keeps_its_height_and_its_distance(scene):
     up = np.array([0.0, 0.8, 0.6])
-    places = np.array([orbit(scene, azimuth, up=up)[:3, 3] - scene.middle for azimuth in (0, 90, 180)])
+    places = np.array([Orbit(azimuth).world_from_camera(scene, up)[:3, 3] - scene.middle for azimuth in (0, 90, 180)])
     np.testing.assert_allclose(places @ up, np.full(3, places[0] @ up), atol=1e-9)
     np.testing.assert_allclose(np.linalg.norm(places, axis=1), np.linalg.norm(scene.middle), atol=1e-9)

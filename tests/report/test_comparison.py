@@ -105,7 +105,7 @@ def test_a_result_that_is_not_whole_is_refused_with_the_stage_and_the_cure(folde
     result(folders[0]), result(folders[1])
     shutil.rmtree(folders[1] / missing)
     (folders[1] / "dataset.txt").write_text("data/chairs\n")  # b is a copy
-    with pytest.raises(InputError, match="no whole result") as error:
+    with pytest.raises(InputError, match="the result is incomplete") as error:
         comparison(*folders, [])
     words = f"the stage {missing!r}", "make all DATASET=chairs", str(folders[1])
     assert all(word in str(error.value) for word in words)

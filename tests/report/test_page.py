@@ -12,7 +12,7 @@ import pytest
 from factorlib.images.picture import read_png
 from factorlib.jsonfile import read_json, write_json
 from factorlib.light.lobes import no_lobes
-from factorlib.results.lobes import write_lobes
+from factorlib.results.lobe_table import write_lobes
 from factorlib.stage import Inputs
 from stages import evaluate, report
 from tests.evaluate.made_artifacts import Made, lobes_of, make_artifacts

@@ -14,7 +14,7 @@ from PIL import Image
 
 from factorlib.conventions import YUP_FROM_CAMERA, lat_long_solid_angles
 from factorlib.dataset.schema import LightSlice, ObjectsSlice, SetSlice
-from factorlib.export.gltf import write_glb
+from factorlib.export.gltf_writer import write_glb
 from factorlib.generate.solids import sphere
 from factorlib.images.exr import write_rgb_exr
 from factorlib.images.picture import picture

@@ -18,16 +18,16 @@ from factorlib.results.materials import (
     read_materials,
     solved,
 )
-from factorlib.results.metrics import Counts, Metrics, Resynthesis, read_metrics
+from factorlib.results.metrics import Counts, Metrics, ResynthesisErrors, read_metrics
 from factorlib.results.photos import PhotoFacts, read_photo_facts
-from factorlib.results.poses import CameraEntry, ObjectEntry, PhotoPoses, read_photo_poses, read_poses
+from factorlib.results.poses import CameraEntry, ObjectPose, PhotoPoses, read_photo_poses, read_poses
 
 ERRORS = StandardErrors((0.01, 0.02, 0.03), (0.1, 0.1, 0.1), 0.05)
 RED = solved(Reflectance((0.5, 0.1, 0.1), (0.05, 0.05, 0.05), 0.3), ERRORS)
 TABLE = MaterialTable({"red": RED}, Gauge("white light", {"red": 0}, "by hand"), Model(tone={"hall": Tone(1.2, 0.4)}))
 EYE = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
-HALL = PhotoPoses(CameraEntry(300.0, (8.0, 6.0)), {"vase": ObjectEntry(EYE, (0.0, 0.0, 2.0), source="found")})
-RESYNTHESIS = Resynthesis({}, None, None, None)
+HALL = PhotoPoses(CameraEntry(300.0, (8.0, 6.0)), {"vase": ObjectPose(EYE, (0.0, 0.0, 2.0), source="found")})
+RESYNTHESIS = ResynthesisErrors({}, None, None, None)
 FILES = {
     "materials.json": (read_materials, TABLE),
     "exposures.json": (read_exposures, {"hall": (1.0, 2.0, 0.5)}),
@@ -80,7 +80,7 @@ def test_a_missing_material_is_named(tmp_path):
 
 def test_a_mirrored_pose_is_refused(tmp_path):
     mirrored = (EYE[0], EYE[1], (0.0, 0.0, -1.0))
-    write_json(tmp_path / "a.json", PhotoPoses(HALL.camera, {"vase": ObjectEntry(mirrored, (0.0, 0.0, 2.0))}))
-    with pytest.raises(InputError, match="no rotation and translation") as caught:
+    write_json(tmp_path / "a.json", PhotoPoses(HALL.camera, {"vase": ObjectPose(mirrored, (0.0, 0.0, 2.0))}))
+    with pytest.raises(InputError, match="no rotation matrix") as caught:
         read_photo_poses(tmp_path / "a.json")
     assert caught.value.key == "objects.vase"

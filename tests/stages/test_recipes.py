@@ -11,7 +11,7 @@ from factorlib.errors import InputError
 from factorlib.images.exr import read_exr, write_rgb_exr
 from factorlib.images.picture import picture, read_png
 from factorlib.jsonfile import write_json
-from factorlib.recipe import schema
+from factorlib.recipe import kinds
 from factorlib.render.solved_set import SolvedSet
 from factorlib.results.materials import MaterialTable, Reflectance, StandardErrors, solved
 from factorlib.stage import Inputs, silent
@@ -50,16 +50,16 @@ PICTURES = {"front": ["front.exr", "front.png"], "side": ["side.exr", "side.png"
 FRONT = {"photos": ["front"], "samples": 1}
 ANIMATED = ["front.gif", "front.mp4"] if find_spec("av") else ["front.gif"]
 KINDS = [
-    (schema.Resynthesis(samples=1), PICTURES["front"] + PICTURES["side"]),
-    (schema.View(photos=["side"], samples=1, width=32, background="light"), PICTURES["side"]),
-    (schema.View(photos=["side"], samples=1, azimuth=180, floor=0.5), PICTURES["side"]),
-    (schema.Turntable(**FRONT, frames=3), [*ANIMATED, *(f"front/00{k}.png" for k in range(3))]),
-    (schema.MovingLight(**FRONT, frames=2, width=16), [*ANIMATED, "front/000.png", "front/001.png"]),
-    (schema.Relight(samples=1, rotate=30.0, photos=["side"]), [f"side/{name}" for name in PICTURES["front"]]),
-    (schema.Transfer(materials={"red": "unseen"}, **FRONT), PICTURES["front"]),
-    (schema.Insert(**FRONT), [*PICTURES["front"], "front.json"]),
-    (schema.Insert(**FRONT, mesh="egg", material="brass", at=(40.0, 50.0)), [*PICTURES["front"], "front.json"]),
-    (schema.Grid(samples=1, size=16), ["grid.exr", "grid.png", "grid.txt"]),
+    (kinds.ResynthesisRecipe(samples=1), PICTURES["front"] + PICTURES["side"]),
+    (kinds.ViewRecipe(photos=["side"], samples=1, width=32, background="light"), PICTURES["side"]),
+    (kinds.ViewRecipe(photos=["side"], samples=1, azimuth=180, floor=0.5), PICTURES["side"]),
+    (kinds.TurntableRecipe(**FRONT, frames=3), [*ANIMATED, *(f"front/00{k}.png" for k in range(3))]),
+    (kinds.MovingLightRecipe(**FRONT, frames=2, width=16), [*ANIMATED, "front/000.png", "front/001.png"]),
+    (kinds.RelightRecipe(samples=1, rotate=30.0, photos=["side"]), [f"side/{name}" for name in PICTURES["front"]]),
+    (kinds.TransferRecipe(materials={"red": "unseen"}, **FRONT), PICTURES["front"]),
+    (kinds.InsertRecipe(**FRONT), [*PICTURES["front"], "front.json"]),
+    (kinds.InsertRecipe(**FRONT, mesh="egg", material="brass", at=(40.0, 50.0)), [*PICTURES["front"], "front.json"]),
+    (kinds.GridRecipe(samples=1, size=16), ["grid.exr", "grid.png", "grid.txt"]),
 ]  # fmt: skip
 
 
@@ -72,7 +72,7 @@ def test_files_of_every_kind_and_the_same_bytes_again(grounded, tmp_path, recipe
 @pytest.mark.parametrize("photo", made_export.MESHES)
 def test_an_assumed_sun_stands_in_the_frame_of_the_exported_light(made, photo):
     """Also where that is fixed to the world: the map of the light with the sun is brightest in the direction that the recipe says."""
-    results, sun = SolvedSet(made), schema.AssumedSun((0.5, 0.7, -0.4), 0.99, 20.0)
+    results, sun = SolvedSet(made), kinds.AssumedSun((0.5, 0.7, -0.4), 0.99, 20.0)
     world = results.lights[photo].world_from_camera
     own = results.scene(photo, sun).light.turned(YUP_FROM_CAMERA @ (np.eye(3) if world is None else np.array(world)))
     directions = lat_long_directions(64, 128).reshape(-1, 3)
@@ -84,13 +84,13 @@ def test_a_part_of_an_inserted_mesh_gets_another_material_and_the_rest_keeps_its
     results = SolvedSet(grounded)
     mesh, materials, _ = results.mesh("egg", {"brass": "unseen"}, "y")
     assert [materials[label - 1] for label in mesh.labels] == ["red", "unseen"]
-    with pytest.raises(InputError, match="no 'egg' has the materials unseen") as error:
+    with pytest.raises(InputError, match="no object of the mesh 'egg' has the materials unseen") as error:
         results.mesh("egg", {"unseen": "red"}, "y")
     assert error.value.key == "material"
 
 
 def test_the_photo_stays_where_no_object_is(made, tmp_path):
-    drawn(made, tmp_path / "out", schema.Resynthesis(photos=["front"], samples=4))
+    drawn(made, tmp_path / "out", kinds.ResynthesisRecipe(photos=["front"], samples=4))
     masks = read_exr(made["masks"] / "front.exr")
     photo = picture(np.stack([masks[c] for c in "RGB"], axis=-1), 1.0)
     found, empty = read_png(tmp_path / "out" / "front.png"), read_exr(made["align"] / "front.exr")["label"] == 0
@@ -100,7 +100,7 @@ def test_the_photo_stays_where_no_object_is(made, tmp_path):
 
 def own_material(made, tmp_path, material):
     write_json(tmp_path / "own.json", MaterialTable({"own": solved(material, ERROR)}))
-    recipe = schema.Transfer(photos=["front"], materials={"red": "own"}, table="own.json", samples=4)
+    recipe = kinds.TransferRecipe(photos=["front"], materials={"red": "own"}, table="own.json", samples=4)
     drawn(made, tmp_path / "out", recipe, **{"own.json": tmp_path / "own.json"})
 
 
@@ -120,7 +120,7 @@ def test_the_light_of_a_file_is_used_as_it_lies(made, tmp_path):
     lat_long = np.full((16, 32, 3), 0.01)
     lat_long[6:10, 7:9] = 50.0
     write_rgb_exr(tmp_path / "lamp.exr", lat_long)
-    recipe = schema.Relight(photos=["front"], lights=["lamp.exr"], samples=64)
+    recipe = kinds.RelightRecipe(photos=["front"], lights=["lamp.exr"], samples=64)
     drawn(made, tmp_path / "out", recipe, **{"lamp.exr": tmp_path / "lamp.exr"})
     picture = read_exr(tmp_path / "out" / "front" / "lamp.exr")
     columns = np.nonzero(picture["A"].max(axis=0))[0]
@@ -131,17 +131,17 @@ def test_the_light_of_a_file_is_used_as_it_lies(made, tmp_path):
 def test_a_photo_without_objects_is_refused_or_left_out_with_a_warning_where_nobody_named_it(made, tmp_path, caplog):
     nothing = {"camera": {}, "objects": [], "meshes": {}}
     some = changed(made, "dataset.objects", {**made.facts["dataset.objects"], "front": nothing})
-    with pytest.raises(InputError, match="'front' has no objects to draw"):
-        drawn(some, tmp_path / "named", schema.Resynthesis(photos=["front"]))
-    assert sorted(drawn(some, tmp_path / "out", schema.Resynthesis(samples=1))) == PICTURES["side"]
+    with pytest.raises(InputError, match="'front' has no objects to render"):
+        drawn(some, tmp_path / "named", kinds.ResynthesisRecipe(photos=["front"]))
+    assert sorted(drawn(some, tmp_path / "out", kinds.ResynthesisRecipe(samples=1))) == PICTURES["side"]
     assert "front: left out" in caplog.text
     none = changed(made, "dataset.objects", dict.fromkeys(made_export.MESHES, nothing))
     with pytest.raises(InputError, match="no objects"):
-        drawn(none, tmp_path / "none", schema.Resynthesis())
+        drawn(none, tmp_path / "none", kinds.ResynthesisRecipe())
 
 
 def test_nothing_is_put_on_a_ground_that_is_seen_from_below(made, tmp_path):
     above = {"ground": {"point": [0, -1, 4], "normal": [0, -1, 0]}}  # y is down
     below = {**made.facts["dataset.ground"], "front": above}
     with pytest.raises(InputError, match="'front' was taken from below"):
-        drawn(changed(made, "dataset.ground", below), tmp_path / "out", schema.Insert(photos=["front"], samples=1))
+        drawn(changed(made, "dataset.ground", below), tmp_path / "out", kinds.InsertRecipe(photos=["front"], samples=1))

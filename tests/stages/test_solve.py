@@ -18,7 +18,7 @@ from factorlib.light.latlong import lat_long_of_lobes
 from factorlib.light.lobes import Lobes
 from factorlib.reflection import reflection_operator
 from factorlib.reflection.network import SHIPPED
-from factorlib.results.lobes import read_lobes
+from factorlib.results.lobe_table import read_lobes
 from factorlib.stage import Inputs, silent
 from factorlib.urm.observations import Observations, write_observations
 from stages import solve

@@ -8,7 +8,7 @@ import pytest
 
 from factorlib.dataset.schema import MeshEntry
 from factorlib.errors import InputError
-from factorlib.export.gltf import write_glb
+from factorlib.export.gltf_writer import write_glb
 from factorlib.generate.solids import sphere
 from factorlib.images.exr import write_exr
 from factorlib.inference.blocks import Noise

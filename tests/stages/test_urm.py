@@ -12,7 +12,7 @@ from factorlib.geometry.raster import rasterise
 from factorlib.images.exr import write_exr
 from factorlib.jsonfile import write_json
 from factorlib.meshes.ply import write_ply
-from factorlib.results.poses import ObjectEntry
+from factorlib.results.poses import ObjectPose
 from factorlib.stage import Inputs
 from factorlib.urm.observations import read_observations
 from factorlib.urm.sample import sample
@@ -99,7 +99,7 @@ def test_of_many_pixels_a_weighted_sample_is_written_with_its_visibility(tmp_pat
 def test_urm_and_export_place_a_scaled_mesh_alike(tmp_path, two):
     """x_cam = R (s ∘ x) + t, whatever frame a vertex is in."""
     turn, scale, shift = Rotation.from_rotvec([0.3, -0.5, 0.2]).as_matrix(), (1.0, 1.2, 0.8), (0.1, 0.2, 6.0)
-    entry = msgspec.convert({"rotation": turn.tolist(), "translation": shift, "scale": scale}, ObjectEntry)
+    entry = msgspec.convert({"rotation": turn.tolist(), "translation": shift, "scale": scale}, ObjectPose)
     poses, given = dict.fromkeys(("left", "right"), entry), mesh_of([ball(1.0, 3)])
     there = (given.vertices * scale) @ turn.T + shift
     assert np.allclose(urm.read_occluders(two, poses).centre, (there.min(0) + there.max(0)) / 2, atol=1e-4)

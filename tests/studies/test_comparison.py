@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from factorlib.conventions import lat_long_directions
-from factorlib.evaluate.materials import compare_materials
+from factorlib.evaluate.material_errors import compare_materials
 from studies.body import photographed
 from studies.catalogue import comparison
 from studies.errors import in_gauge, times

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from factorlib.recipe.schema import Insert
+from factorlib.recipe.kinds import InsertRecipe
 from factorlib.render.solved_set import SolvedSet
 from factorlib.results.materials import Reflectance
 from factorlib.stage import Inputs
@@ -43,7 +43,7 @@ WRONG = [({}, ""), (HALF, ""), ({"light": 0.4}, "light"), ({"materials": mixed},
 
 @pytest.mark.parametrize("how, cause", WRONG, ids=["same", "gauge", "light", "material", "ground"])
 def test_what_is_right_is_not_told_apart_and_what_is_wrong_is_named(inputs, how, cause):
-    recipe = Insert(mesh="ball", material="red", at=(46.0, 45.0), size=0.5, samples=4)
+    recipe = InsertRecipe(mesh="ball", material="red", at=(46.0, 45.0), size=0.5, samples=4)
     (ours, truth), of = scene.drawn("front", recipe, SolvedSet(inputs), altered(inputs, **how))
     assert ours.shape == truth.shape and of["floor"] > 0
     assert of["told_apart"] == bool(cause) and (of["cause"] == cause or not cause)

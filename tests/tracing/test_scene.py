@@ -24,7 +24,7 @@ def test_mitsuba_evaluates_lambert_and_ggx_of_the_design(material):
     pose = tracing.rigid(YUP_FROM_CAMERA, YUP_FROM_CAMERA @ BALL)
     ball = {"type": "sphere", "to_world": tracing.transform(pose), "bsdf": tracing.bsdf(material)}
     scene = {"ball": ball, "light": tracing.envmap(light)}
-    image = tracing.traced(scene, PIXEL, AT_ORIGIN, 200_000, 2, 2)[0, 0]
+    image = tracing.rendered(scene, tracing.sensor(PIXEL, AT_ORIGIN), 200_000, 2, 2)[0, 0]
     depth = 4.0 - np.sqrt(1 - 0.6**2 - 0.3**2)  # of the ball where the camera's axis meets it
     normal, view = np.array([0, 0, depth]) - BALL, np.array([0, 0, -1.0])
     incoming = lat_long_directions(512, 1024) @ YUP_FROM_CAMERA
@@ -42,5 +42,5 @@ def test_the_light_seen_is_the_light_there():
     """A map, seen from inside by six cameras in a turned frame, comes back as that map turned."""
     light = smooth_light(16)
     turn = tracing.look(20, 130) @ YUP_FROM_CAMERA
-    seen = tracing.light_seen({"light": tracing.envmap(light)}, tracing.rigid(turn, (0, 0, 0)), 16, 4, 1)
+    seen = tracing.incident_light({"light": tracing.envmap(light)}, tracing.rigid(turn, (0, 0, 0)), 16, 4, 1)
     assert seen == pytest.approx(sample_map(light, lat_long_directions(16, 32) @ turn.T), rel=0.02, abs=0.05)

@@ -15,17 +15,17 @@ import msgspec
 import numpy as np
 from jaxtyping import Bool, Float
 
-from factorlib.evaluate.gauge import GAUGES, gauge_factors
-from factorlib.evaluate.picture import mean_scored, picture_errors, white_of
+from factorlib.evaluate.comparison_gauge import GAUGES, gauge_factors
+from factorlib.evaluate.picture_errors import mean_scored, picture_errors, white_of
 from factorlib.results.materials import vec3
-from factorlib.results.metrics import PhotoErrors, PictureError, Resynthesis, ScoredPicture
+from factorlib.results.metrics import PhotoErrors, PictureError, ResynthesisErrors, ScoredPicture
 from factorlib.urm.extract import observed_pixels
 
 Picture = Float[np.ndarray, "h w 3"]
 Channels = Mapping[str, Float[np.ndarray, "h w"]]
 
 
-class Shot(msgspec.Struct, frozen=True):
+class ComparedPhoto(msgspec.Struct, frozen=True):
     """One photo with its re-synthesis.
 
     Attributes:
@@ -45,7 +45,7 @@ class Shot(msgspec.Struct, frozen=True):
     clipped_satisfied: float | None
 
 
-def shot_of(photo: Channels, geometry: Channels, resynthesis: Picture) -> Shot:
+def compared_photo(photo: Channels, geometry: Channels, resynthesis: Picture) -> ComparedPhoto:
     """Combine a photo with its re-synthesis.
 
     Args:
@@ -68,7 +68,7 @@ def shot_of(photo: Channels, geometry: Channels, resynthesis: Picture) -> Shot:
         "invalid": left_out | ((label > 0.5) & ~valid),
     }
     satisfied = (resynthesis >= 0.98 * rgb)[bounds].all(axis=-1)
-    return Shot(
+    return ComparedPhoto(
         rgb,
         resynthesis,
         label,
@@ -87,7 +87,9 @@ def agreeing_pixels(photo: Channels, geometry: Channels) -> Bool[np.ndarray, "h 
     return observed_pixels(photo, {**geometry, "confidence": np.ones_like(geometry["confidence"])})
 
 
-def compare_photos(names: Iterable[str], materials: list[str], shot: Callable[[str], Shot]) -> Resynthesis:
+def compare_photos(
+    names: Iterable[str], materials: list[str], read: Callable[[str], ComparedPhoto]
+) -> ResynthesisErrors:
     """Return the errors of all photos.
 
     Only one photo is in memory at a time, apart from the samples of the counted pixels.
@@ -95,59 +97,59 @@ def compare_photos(names: Iterable[str], materials: list[str], shot: Callable[[s
     Args:
         names: names of the photos
         materials: names by label, from 1
-        shot: reads a photo by name
+        read: reads a photo by name
     """
-    factors = _factors(list(names), shot)
-    photos = {name: _photo_errors(shot(name), materials, factor) for name, factor in factors.items()}
+    factors = _factors(list(names), read)
+    photos = {name: _photo_errors(read(name), materials, factor) for name, factor in factors.items()}
     scored = [p.gauges for p in photos.values() if p.gauges]
     if not scored:
-        return Resynthesis(photos, None, None, None)
+        return ResynthesisErrors(photos, None, None, None)
     mean = {g: mean_scored([s[g] for s in scored]) for g in GAUGES}
     worst = [min(getattr(s["none"].estimate, f"psnr_{kind}_db") for s in scored) for kind in ("linear", "tonemapped")]
-    return Resynthesis(photos, mean, *worst)
+    return ResynthesisErrors(photos, mean, *worst)
 
 
-def flat_materials(shot: Shot) -> Picture:
+def flat_materials(photo: ComparedPhoto) -> Picture:
     """Return the null: every material of the photo in its mean colour."""
-    flat = np.zeros_like(shot.photo)
-    for label in np.unique(shot.label[shot.pixels]):
-        of_material = shot.pixels & (shot.label == label)
-        flat[of_material] = shot.photo[of_material].mean(axis=0)
+    flat = np.zeros_like(photo.photo)
+    for label in np.unique(photo.label[photo.pixels]):
+        pixels = photo.pixels & (photo.label == label)
+        flat[pixels] = photo.photo[pixels].mean(axis=0)
     return flat
 
 
-def _factors(names: list[str], shot: Callable[[str], Shot]) -> dict[str, dict[str, Float[np.ndarray, "3"]]]:
+def _factors(names: list[str], read: Callable[[str], ComparedPhoto]) -> dict[str, dict[str, Float[np.ndarray, "3"]]]:
     estimates = []
     truths = []
     whites = []
     for name in names:
-        s = shot(name)
-        estimates.append(s.resynthesis[s.pixels])
-        truths.append(s.photo[s.pixels])
-        whites.append(s.white)
+        photo = read(name)
+        estimates.append(photo.resynthesis[photo.pixels])
+        truths.append(photo.photo[photo.pixels])
+        whites.append(photo.white)
     factors = gauge_factors(estimates, truths, whites, below_white=True)
     return {name: {g: factors[g][i] for g in GAUGES} for i, name in enumerate(names)}
 
 
-def _photo_errors(shot: Shot, materials: list[str], factor: dict[str, Float[np.ndarray, "3"]]) -> PhotoErrors:
-    regions = {m: shot.pixels & (shot.label == k) for k, m in enumerate(materials, start=1)}
-    null = _scored(flat_materials(shot), shot, regions)
-    found = {g: _scored(shot.resynthesis * factor[g], shot, regions) for g in GAUGES}
+def _photo_errors(photo: ComparedPhoto, materials: list[str], factor: dict[str, Float[np.ndarray, "3"]]) -> PhotoErrors:
+    regions = {m: photo.pixels & (photo.label == k) for k, m in enumerate(materials, start=1)}
+    null = _scored(flat_materials(photo), photo, regions)
+    errors = {g: _scored(photo.resynthesis * factor[g], photo, regions) for g in GAUGES}
 
     def scores(region: str) -> dict[str, ScoredPicture]:
         """Return the scores of a region in each gauge."""
-        return {g: ScoredPicture(found[g][region], null[region]) for g in GAUGES}
+        return {g: ScoredPicture(errors[g][region], null[region]) for g in GAUGES}
 
     return PhotoErrors(
-        exposure=1 / shot.white,
-        **shot.counts,
-        clipped_satisfied=shot.clipped_satisfied,
+        exposure=1 / photo.white,
+        **photo.counts,
+        clipped_satisfied=photo.clipped_satisfied,
         factor={g: vec3(f) for g, f in factor.items()},
-        gauges=scores("") if shot.pixels.any() else None,
+        gauges=scores("") if photo.pixels.any() else None,
         materials={m: scores(m) for m in materials if regions[m].any()},
     )
 
 
-def _scored(estimate: Picture, shot: Shot, regions: dict) -> dict[str, PictureError]:
+def _scored(estimate: Picture, photo: ComparedPhoto, regions: dict) -> dict[str, PictureError]:
     estimate = np.nan_to_num(estimate, posinf=0.0, neginf=0.0)
-    return picture_errors(estimate, shot.photo, {"": shot.pixels, **regions}, shot.white)
+    return picture_errors(estimate, photo.photo, {"": photo.pixels, **regions}, photo.white)

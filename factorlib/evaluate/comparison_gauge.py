@@ -6,8 +6,7 @@ photo is unknown.  An error is therefore reported in three gauges:
 none               nothing is scaled
 scalar_per_set     one number scales everything in the set
 channel_per_photo  one number for each channel and each photo (light, relit picture): the most lenient, where even a
-                   grey
-                   ball scores well, so it is never to be reported alone
+                   grey ball scores well, so it is never to be reported alone
 
 Each factor is the least-squares one, Σ e·t / Σ e².  Every picture has the weight 1 / white², so that a bright photo
 does not outweigh a dark one.  For pictures, samples brighter than white in estimate or truth are left out.  The tone
@@ -39,8 +38,8 @@ def gauge_factors(
         below_white: leave out samples brighter than white
     """
     if below_white:
-        kept = [np.maximum(e, t).max(axis=-1) <= w for e, t, w in zip(estimates, truths, whites, strict=True)]
-        estimates, truths = ([s[k] for s, k in zip(samples, kept, strict=True)] for samples in (estimates, truths))
+        dark = [np.maximum(e, t).max(axis=-1) <= w for e, t, w in zip(estimates, truths, whites, strict=True)]
+        estimates, truths = ([s[k] for s, k in zip(samples, dark, strict=True)] for samples in (estimates, truths))
     cross = np.array([(e * t).sum(axis=0) / w**2 for e, t, w in zip(estimates, truths, whites)]).reshape(-1, 3)
     square = np.array([(e * e).sum(axis=0) / w**2 for e, w in zip(estimates, whites)]).reshape(-1, 3)
     return {
@@ -66,9 +65,9 @@ def errors_by_gauge(
         error: error of the scaled estimate of the photo with the given index
         below_white: leave out samples brighter than white
     """
-    factors = {kind: gauge_factors(of, truths, whites, below_white) for kind, of in estimates.items()}
+    factors = {kind: gauge_factors(samples, truths, whites, below_white) for kind, samples in estimates.items()}
     return [
-        {g: {kind: error(of[i] * factors[kind][g][i], i) for kind, of in estimates.items()} for g in GAUGES}
+        {g: {kind: error(e[i] * factors[kind][g][i], i) for kind, e in estimates.items()} for g in GAUGES}
         for i in range(len(truths))
     ]
 

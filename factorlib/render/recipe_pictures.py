@@ -21,14 +21,14 @@ from factorlib.images.exr import write_rgb_exr
 from factorlib.images.film import write_gif, write_mp4
 from factorlib.images.picture import picture, write_png
 from factorlib.jsonfile import write_json
-from factorlib.recipe import schema
-from factorlib.recipe.schema import AnyRecipe, is_light_file
-from factorlib.render.insertion import NEW, STEPS, Standing, inserted
-from factorlib.render.photo_scene import PhotoScene, lit_ball, orbit, resized, traced_photo, turned_light
-from factorlib.render.placement import spot_at, spot_beside, stood, stood_free
+from factorlib.recipe import kinds
+from factorlib.recipe.kinds import AnyRecipe, is_light_file
+from factorlib.render.insertion import NEW, STEPS, InsertionScene, compared_shadow, inserted
+from factorlib.render.photo_scene import Orbit, PhotoScene, lit_ball, resized, traced_photo, turned_light
+from factorlib.render.placement import free_placement, spot_at, spot_beside, standing_mesh
 from factorlib.render.solved_set import SolvedSet
 from factorlib.render.studio import on_floor
-from factorlib.render.traced import Traced
+from factorlib.render.traced_picture import TracedPicture
 from factorlib.results.materials import Reflectance
 from factorlib.stage import Progress
 from factorlib.tracing.denoise import denoiser
@@ -54,14 +54,14 @@ def draw(recipe: AnyRecipe, results: SolvedSet, out: Path, progress: Progress) -
     Raises:
         InputError: None of the recipe's photos can be rendered, or one that the recipe names cannot.
     """
-    if isinstance(recipe, schema.Grid):
+    if isinstance(recipe, kinds.GridRecipe):
         return write_grid(recipe, results, out, progress)
     photos = recipe.photos or results.photos
     refusals = []
     for done, photo in enumerate(photos):
         try:
-            report = partial(_report, progress, done, len(photos), photo)
-            facts = DRAWN[type(recipe)](recipe, results, photo, out, report) or {}
+            report = partial(_report_photo, progress, done, len(photos), photo)
+            facts = WRITERS[type(recipe)](recipe, results, photo, out, report) or {}
             captions = [facts.pop("caption")] if facts else []
             if recipe.sun is not None:
                 facts["assumed_sun"] = msgspec.to_builtins(recipe.sun)
@@ -74,15 +74,15 @@ def draw(recipe: AnyRecipe, results: SolvedSet, out: Path, progress: Progress) -
         except InputError as error:
             if recipe.photos:
                 raise
-            # The recipe names no photos: a photo that cannot be drawn is skipped.
-            log.warning("%s: left out: %s", photo, error.found)
+            # The recipe names no photos: a photo that cannot be rendered is skipped.
+            log.warning("%s: no picture of this photo: %s", photo, error.found)
             refusals.append(error)
     if len(refusals) == len(photos):
         raise refusals[0]
     progress(len(photos), len(photos))
 
 
-def _report(progress: Progress, done: int, total: int, photo: str, share: float) -> None:
+def _report_photo(progress: Progress, done: int, total: int, photo: str, share: float) -> None:
     """Report the progress within one photo; `share`, in [0, 1], is the part of it that is done."""
     progress(done + share, total, photo)
 
@@ -90,8 +90,8 @@ def _report(progress: Progress, done: int, total: int, photo: str, share: float)
 Report = Callable[[float], None]
 
 
-def resynthesis(
-    recipe: schema.Resynthesis | schema.Transfer, results: SolvedSet, photo: str, out: Path, report: Report
+def write_resynthesis(
+    recipe: kinds.ResynthesisRecipe | kinds.TransferRecipe, results: SolvedSet, photo: str, out: Path, report: Report
 ) -> None:
     """Write a photo with its objects path-traced over it, with other materials if the recipe replaces some.
 
@@ -104,20 +104,19 @@ def resynthesis(
     """
     report(0)
     scene = results.scene(photo, recipe.sun, recipe.denoise)
-    if isinstance(recipe, schema.Transfer):
-        known = results.known(recipe.table)
-        other = recipe.materials
-        materials = {name: known[other[name]] if name in other else own for name, own in scene.materials.items()}
-        worn = {each.materials[label - 1] for each in scene.objects for label in each.mesh.labels}
-        if recipe.photos and not worn & other.keys():
-            words = "%s: no object has %s, so the picture shows nothing new; there are %s"
-            log.warning(words, photo, ", ".join(map(repr, sorted(other))), ", ".join(sorted(worn)))
-        scene = msgspec.structs.replace(scene, materials=materials)
-    traced = Traced(traced_photo(scene, recipe.samples), results.tone(photo))
-    _write(out / photo, traced.over(results.photo(photo)))
+    if isinstance(recipe, kinds.TransferRecipe):
+        table = results.with_table(recipe.table)
+        replaced = {old: table[new] for old, new in recipe.materials.items()}
+        present = {each.materials[label - 1] for each in scene.objects for label in each.mesh.labels}
+        if recipe.photos and not present & replaced.keys():
+            text = "%s: no object has the material %s, so the picture equals the re-synthesis; its objects have %s"
+            log.warning(text, photo, ", ".join(map(repr, sorted(replaced))), ", ".join(sorted(present)))
+        scene = msgspec.structs.replace(scene, materials={**scene.materials, **replaced})
+    traced = TracedPicture(traced_photo(scene, recipe.samples), results.tone(photo))
+    _write_opaque(out / photo, traced.over(results.photo(photo)))
 
 
-def standing(recipe: schema.Insert, results: SolvedSet, photo: str) -> Standing:
+def insertion_scene(recipe: kinds.InsertRecipe, results: SolvedSet, photo: str) -> InsertionScene:
     """Place the new object of a recipe on the ground of a photo.
 
     Args:
@@ -133,39 +132,40 @@ def standing(recipe: schema.Insert, results: SolvedSet, photo: str) -> Standing:
     """
     scene = results.scene(photo, recipe.sun, recipe.denoise)
     neighbour = next((each for each in scene.objects if each.name == recipe.beside), scene.objects[0])
-    given = recipe.ground
     polish = None
-    if any(given.specular):
-        polish = Reflectance((0.0,) * 3, given.specular, given.roughness)
+    if any(recipe.ground.specular):
+        polish = Reflectance((0.0,) * 3, recipe.ground.specular, recipe.ground.roughness)
     ground = msgspec.structs.replace(results.ground(photo, neighbour), polish=polish)
-    if not ground.plane.seen_from_above:
+    if not ground.plane.below_camera:
         fault = (
             f"photo '{photo}' was taken from below the plane that '{neighbour.name}' stands on, "
-            "so that no shadow on it can be seen"
+            "so a shadow on it would be invisible"
         )
         raise InputError(fault, key="photos", cure="name other photos, or give the photo's `ground` in dataset.yaml")
     if recipe.sun is not None and results.sun_axis(photo, recipe.sun) @ YUP_FROM_CAMERA @ ground.plane.normal <= 0:
-        fault = "the sun stands below the ground of the photo"
-        raise InputError(fault, key="sun.direction", cure="y of the direction points upward in the photo")
-    # materials of the new object, under names of their own
-    own = {f"{NEW}{name}": material for name, material in results.known(recipe.table).items()}
+        fault = f"the assumed sun is below the ground of photo '{photo}'"
+        raise InputError(fault, key="sun.direction", cure="give a direction that points upward: y is up in the photo")
+    # materials of the new object, under names with a prefix
+    new_materials = {f"{NEW}{name}": material for name, material in results.with_table(recipe.table).items()}
     mesh, names, up = results.mesh(recipe.mesh, recipe.material, recipe.up)
     if recipe.at is not None:
-        spot = spot_at(scene, ground.plane, neighbour, results.pixel(photo, recipe.at), recipe.size)
+        requested = spot_at(scene, ground.plane, neighbour, results.pixel(photo, recipe.at), recipe.size)
     else:
         # extent along the upright axis, and diameter about it
         tall = np.ptp(mesh.vertices @ up)
         wide = 2 * float(np.linalg.norm(np.cross(mesh.vertices - mesh.centre, up), axis=1).max())
-        spot = spot_beside(scene, ground.plane, neighbour, recipe.size, wide / tall)
+        requested = spot_beside(scene, ground.plane, neighbour, recipe.size, wide / tall)
     labels = tuple(f"{NEW}{name}" for name in names)
     factor = results.poses[photo].camera.factor
-    stand = partial(stood, NEW, mesh, labels, up, recipe.turn)
-    new, found, moved = stood_free(scene, stand, spot, recipe.at is not None, factor)
-    scene = msgspec.structs.replace(scene, materials={**scene.materials, **own})
-    return Standing(scene, ground, new, spot, found, moved)
+    stand = partial(standing_mesh, NEW, mesh, labels, up, recipe.turn)
+    new, spot, moved = free_placement(scene, stand, requested, recipe.at is not None, factor)
+    scene = msgspec.structs.replace(scene, materials={**scene.materials, **new_materials})
+    return InsertionScene(scene, ground, new, requested, spot, moved)
 
 
-def insertion(recipe: schema.Insert, results: SolvedSet, photo: str, out: Path, report: Report) -> dict[str, Any]:
+def write_insertion(
+    recipe: kinds.InsertRecipe, results: SolvedSet, photo: str, out: Path, report: Report
+) -> dict[str, Any]:
     """Write a photo with a further object inserted on the ground of an existing one.
 
     Args:
@@ -178,35 +178,35 @@ def insertion(recipe: schema.Insert, results: SolvedSet, photo: str, out: Path, 
     Returns:
         The facts that accompany the picture: place in pixels, displacement in object heights, shadow match, caption.
     """
-    there = standing(recipe, results, photo)
-    if there.moved:
-        log.warning("%s: %s", photo, there.moved)
-    seen = results.straightened(photo), results.covered(photo)
-    found = inserted(there, *seen, recipe.samples, lambda done: report(done / STEPS))
+    insertion = insertion_scene(recipe, results, photo)
+    if insertion.moved:
+        log.warning("%s: %s", photo, insertion.moved)
+    linear = results.straightened(photo)
+    covered = results.covered(photo)
+    result = inserted(insertion, linear, covered, recipe.samples, lambda done: report(done / STEPS))
+    match = compared_shadow(insertion, result, linear, covered, recipe.samples)
     # Pixels that the new object does not change keep the photo's values exactly.
-    same = (found.coverage[..., None] == 0) & (found.shadow == 1) & (there.ground.polish is None)
-    _write(out / photo, np.where(same, results.photo(photo), results.tone(photo)(found.composite)))
-    at = results.poses[photo].camera.factor * there.scene.camera.project(there.found.point @ YUP_FROM_CAMERA)
-    given = "that of dataset.yaml"
+    same = (result.coverage[..., None] == 0) & (result.shadow == 1) & (insertion.ground.polish is None)
+    _write_opaque(out / photo, np.where(same, results.photo(photo), results.tone(photo)(result.composite)))
+    pixel = results.poses[photo].camera.factor * insertion.scene.camera.project(insertion.spot.point @ YUP_FROM_CAMERA)
+    source = "that of dataset.yaml"
     if results.grounds[photo].ground is None:
-        neighbour = recipe.beside or there.scene.objects[0].name
-        given = f"where '{neighbour}' would come to rest"
+        source = f"where '{recipe.beside or insertion.scene.objects[0].name}' would come to rest"
+    moved = np.linalg.norm(insertion.spot.point - insertion.requested.point) / insertion.spot.height
     return {
-        "at": at.round(1).tolist(),
-        "moved": float(np.linalg.norm(there.found.point - there.spot.point) / there.spot.height),
-        "shadow": msgspec.to_builtins(found.match),
-        "caption": f"{there.moved} The ground is {given}. {found.match}".strip(),
+        "at": pixel.round(1).tolist(),
+        "moved": float(moved),
+        "shadow": msgspec.to_builtins(match),
+        "caption": f"{insertion.moved} The ground is {source}. {match}".strip(),
     }
 
 
 def staged(
-    recipe: schema.Backdropped,
+    recipe: kinds.BackgroundRecipe,
     results: SolvedSet,
     photo: str,
     scene: PhotoScene,
-    azimuth: float,
-    elevation: float = 0.0,
-    zoom: float = 1.0,
+    orbit: Orbit = Orbit(),
 ) -> Float[np.ndarray, "h w 4"]:
     """Render the objects from another view, before the light or a transparent background, on a floor if asked.
 
@@ -217,23 +217,20 @@ def staged(
         results: the solved data set
         photo: name of the photo
         scene: the photo's scene
-        azimuth: see `orbit`; degrees
-        elevation: see `orbit`; degrees
-        zoom: see `orbit`
+        orbit: the view
 
     Returns:
         Linear radiance times coverage, and coverage.
     """
     lit = recipe.background == "light"
     if recipe.floor is None:
-        return traced_photo(scene, recipe.samples, orbit(scene, azimuth, elevation, zoom), lit)
+        return traced_photo(scene, recipe.samples, orbit.world_from_camera(scene), lit)
     plane = results.ground(photo, scene.objects[0]).plane
-    return on_floor(
-        scene, plane, recipe.floor, recipe.samples, orbit(scene, azimuth, elevation, zoom, plane.normal), lit
-    )
+    world_from_camera = orbit.world_from_camera(scene, plane.normal)
+    return on_floor(scene, plane, recipe.floor, recipe.samples, world_from_camera, lit)
 
 
-def view(recipe: schema.View, results: SolvedSet, photo: str, out: Path, report: Report) -> None:
+def write_view(recipe: kinds.ViewRecipe, results: SolvedSet, photo: str, out: Path, report: Report) -> None:
     """Write the objects alone, from another view.
 
     Args:
@@ -245,12 +242,12 @@ def view(recipe: schema.View, results: SolvedSet, photo: str, out: Path, report:
     """
     report(0)
     scene = resized(results.scene(photo, recipe.sun, recipe.denoise), recipe.width)
-    traced = staged(recipe, results, photo, scene, recipe.azimuth, recipe.elevation, recipe.zoom)
-    _write_alone(out / photo, Traced(traced, results.tone(photo)))
+    traced = staged(recipe, results, photo, scene, Orbit(recipe.azimuth, recipe.elevation, recipe.zoom))
+    _write_transparent(out / photo, TracedPicture(traced, results.tone(photo)))
 
 
-def animation(
-    recipe: schema.Turntable | schema.MovingLight, results: SolvedSet, photo: str, out: Path, report: Report
+def write_animation(
+    recipe: kinds.TurntableRecipe | kinds.MovingLightRecipe, results: SolvedSet, photo: str, out: Path, report: Report
 ) -> None:
     """Write an animation in which the camera or the light turns once.
 
@@ -268,12 +265,12 @@ def animation(
     for k in range(recipe.frames):
         report(k / recipe.frames)
         degrees = 360 * k / recipe.frames
-        if isinstance(recipe, schema.Turntable):
-            traced = staged(recipe, results, photo, scene, degrees)
+        if isinstance(recipe, kinds.TurntableRecipe):
+            traced = staged(recipe, results, photo, scene, Orbit(degrees))
         else:
             turned = msgspec.structs.replace(scene, light=turned_light(scene.light, degrees))
             traced = traced_photo(turned, recipe.samples)
-        pixels.append(Traced(traced, results.tone(photo)).rgba())
+        pixels.append(TracedPicture(traced, results.tone(photo)).rgba())
     (out / photo).mkdir(parents=True)
     for k, each in enumerate(pixels):
         write_png(out / photo / f"{k:03}.png", each)
@@ -281,7 +278,7 @@ def animation(
     write_mp4(out / f"{photo}.mp4", pixels, recipe.seconds)
 
 
-def relight(recipe: schema.Relight, results: SolvedSet, photo: str, out: Path, report: Report) -> None:
+def write_relit(recipe: kinds.RelightRecipe, results: SolvedSet, photo: str, out: Path, report: Report) -> None:
     """Write the objects in the lights of other photos or of files.
 
     The light of a photo comes with that photo's tone curve.  The light of a file is exposed for the objects.
@@ -298,23 +295,24 @@ def relight(recipe: schema.Relight, results: SolvedSet, photo: str, out: Path, r
     for k, name in enumerate(lights):
         report(k / len(lights))
         lit = msgspec.structs.replace(scene, light=turned_light(results.light(name), recipe.rotate))
-        traced = staged(recipe, results, photo, lit, 0.0)
-        shown = Traced(traced).exposed() if is_light_file(name) else Traced(traced, results.tone(name))
-        _write_alone(out / photo / Path(name).stem, shown)
+        traced = staged(recipe, results, photo, lit)
+        file = is_light_file(name)
+        relit = TracedPicture(traced).exposed() if file else TracedPicture(traced, results.tone(name))
+        _write_transparent(out / photo / Path(name).stem, relit)
 
 
-DRAWN: dict[type, Callable[[Any, SolvedSet, str, Path, Report], dict[str, Any] | None]] = {
-    schema.Resynthesis: resynthesis,
-    schema.Transfer: resynthesis,
-    schema.Insert: insertion,
-    schema.View: view,
-    schema.Turntable: animation,
-    schema.MovingLight: animation,
-    schema.Relight: relight,
+WRITERS: dict[type, Callable[[Any, SolvedSet, str, Path, Report], dict[str, Any] | None]] = {
+    kinds.ResynthesisRecipe: write_resynthesis,
+    kinds.TransferRecipe: write_resynthesis,
+    kinds.InsertRecipe: write_insertion,
+    kinds.ViewRecipe: write_view,
+    kinds.TurntableRecipe: write_animation,
+    kinds.MovingLightRecipe: write_animation,
+    kinds.RelightRecipe: write_relit,
 }
 
 
-def write_grid(recipe: schema.Grid, results: SolvedSet, out: Path, progress: Progress) -> None:
+def write_grid(recipe: kinds.GridRecipe, results: SolvedSet, out: Path, progress: Progress) -> None:
     """Write balls of materials (rows) in lights (columns), each column at one exposure.
 
     Args:
@@ -333,21 +331,21 @@ def write_grid(recipe: schema.Grid, results: SolvedSet, out: Path, progress: Pro
         for j, material in enumerate(materials):
             progress(k * len(materials) + j, total, f"{material}, {name}")
             balls.append(lit_ball(light, results.materials[material], recipe.size, recipe.samples, recipe.denoise))
-        columns.append(Traced(np.concatenate(balls)).exposed().pixels)
-    _write_alone(out / "grid", Traced(np.concatenate(columns, axis=1)))
-    said = f"denoised: {denoiser()}\n" if recipe.denoise else ""
-    write_text(out / "grid.txt", f"rows: {', '.join(materials)}\ncolumns: {', '.join(lights)}\n{said}")
+        columns.append(TracedPicture(np.concatenate(balls)).exposed().pixels)
+    _write_transparent(out / "grid", TracedPicture(np.concatenate(columns, axis=1)))
+    denoised = f"denoised: {denoiser()}\n" if recipe.denoise else ""
+    write_text(out / "grid.txt", f"rows: {', '.join(materials)}\ncolumns: {', '.join(lights)}\n{denoised}")
     progress(total, total)
 
 
-def _write(stem: Path, radiance: np.ndarray) -> None:
+def _write_opaque(stem: Path, radiance: np.ndarray) -> None:
     """Write an opaque picture as EXR and PNG, at the photo's own exposure."""
     stem.parent.mkdir(parents=True, exist_ok=True)
     write_rgb_exr(stem.with_name(stem.name + ".exr"), radiance)
     write_png(stem.with_name(stem.name + ".png"), picture(radiance, 1.0))
 
 
-def _write_alone(stem: Path, traced: Traced) -> None:
+def _write_transparent(stem: Path, traced: TracedPicture) -> None:
     """Write objects as EXR and PNG, transparent outside them."""
     stem.parent.mkdir(parents=True, exist_ok=True)
     traced.to_exr(stem.with_name(stem.name + ".exr"))

@@ -1,8 +1,7 @@
 """Errors of recovered light.
 
 Three spheres  A white `mirror`, a `glossy` (GGX, roughness 0.4) and a `lambertian` sphere, rendered in the estimated
-and
-               in the true light, as in LeGendre et al. 2019 ("DeepLight").
+               and in the true light, as in LeGendre et al. 2019 ("DeepLight").
 Env map        The maps themselves, averaged to texels of equal solid angle about 3° across: over all directions, over
                those that an observed pixel mirrors toward the camera (within about 6°), and over the rest.
 Errors         rmse: √mean (e − t)² over √mean t²; black scores 1.  rmse_scale_invariant: rmse after the best
@@ -19,14 +18,14 @@ from scipy.ndimage import binary_dilation
 from factorlib.conventions import YUP_FROM_CAMERA, lat_long_of_direction
 from factorlib.evaluate.ball import (
     WIDE_SIDE,
-    Light,
+    OctahedralLight,
     constant_light,
     mirror_ball,
     octahedral_directions,
 )
-from factorlib.evaluate.gauge import GAUGES, errors_by_gauge
-from factorlib.evaluate.geometry import angles_deg
-from factorlib.evaluate.picture import mean_scored
+from factorlib.evaluate.comparison_gauge import GAUGES, errors_by_gauge
+from factorlib.evaluate.geometry_errors import angles_deg
+from factorlib.evaluate.picture_errors import mean_scored
 from factorlib.evaluate.relighting import BALL_SIZE, INSIDE, NORMALS, appearances
 from factorlib.geometry.sphere import mirror_directions
 from factorlib.results.metrics import LightError, LightErrors, ScoredLight
@@ -37,7 +36,7 @@ COVERAGE_DILATION = 1  # texels by which the mask grows
 
 Samples = Float[np.ndarray, "_ 3"]
 SPHERES = ("mirror", "glossy", "lambertian")
-VIEWS: dict[str, Callable[[Light], Samples]] = {
+VIEWS: dict[str, Callable[[OctahedralLight], Samples]] = {
     "mirror": lambda light: mirror_ball(light, NORMALS, BALL_SIZE),
     "glossy": lambda light: appearances(light).glossy(GLOSSY_ROUGHNESS),
     "lambertian": lambda light: appearances(light).diffuse,
@@ -67,7 +66,9 @@ def rgb_angle(estimate: Samples, truth: Samples) -> float:
 
 
 def compare_lights(
-    estimates: Mapping[str, Light], truths: Mapping[str, Light], mirrored: Mapping[str, Bool[np.ndarray, "h w"]]
+    estimates: Mapping[str, OctahedralLight],
+    truths: Mapping[str, OctahedralLight],
+    mirrored: Mapping[str, Bool[np.ndarray, "h w"]],
 ) -> LightErrors | None:
     """Return the errors of the lights that have a truth; None if there are none.
 
@@ -80,15 +81,15 @@ def compare_lights(
     if not names:
         return None
     lights: dict[str, dict[str, dict[str, ScoredLight]]] = {n: {gauge: {} for gauge in GAUGES} for n in names}
-    seen = {n: mirrored[n][_at(mirrored[n])] for n in names if n in mirrored}
-    parts = {"map_mirrored": seen, "map_unmirrored": {n: ~hit for n, hit in seen.items()}}
+    hits = {n: mirrored[n][_texels_of_octahedron(mirrored[n])] for n in names if n in mirrored}
+    parts = {"map_mirrored": hits, "map_unmirrored": {n: ~hit for n, hit in hits.items()}}
     for view, render in VIEWS.items():
-        shown = {n: part for n, part in parts.get(view, dict.fromkeys(names, np.True_)).items() if part.any()}
-        for name, scored in _scored_view(render, estimates, truths, shown).items():
+        samples = {n: part for n, part in parts.get(view, dict.fromkeys(names, np.True_)).items() if part.any()}
+        for name, scored in _scored_view(render, estimates, truths, samples).items():
             for gauge, score in scored.items():
                 lights[name][gauge][view] = score
     mean = {g: _mean([lights[n][g] for n in names]) for g in GAUGES}
-    fraction = {n: float(np.mean(seen[n])) if n in seen else None for n in names}
+    fraction = {n: float(np.mean(hits[n])) if n in hits else None for n in names}
     return LightErrors(lights, mean, fraction)
 
 
@@ -111,7 +112,7 @@ def mirrored_directions(
     return binary_dilation(wide, np.ones((3, 3)), iterations=COVERAGE_DILATION)[:, 1:-1]
 
 
-def sphere_row(light: Light) -> Float[np.ndarray, "s w 3"]:
+def sphere_row(light: OctahedralLight) -> Float[np.ndarray, "s w 3"]:
     """Render the three spheres side by side, black around them."""
     row = np.zeros((len(SPHERES), *INSIDE.shape, 3))
     for picture, name in zip(row, SPHERES, strict=True):
@@ -119,29 +120,29 @@ def sphere_row(light: Light) -> Float[np.ndarray, "s w 3"]:
     return np.concatenate(list(row), axis=1)
 
 
-def _at(mask: Bool[np.ndarray, "h w"]) -> tuple[np.ndarray, np.ndarray]:
+def _texels_of_octahedron(mask: Bool[np.ndarray, "h w"]) -> tuple[np.ndarray, np.ndarray]:
     """Return the texels of a lat-long mask at the centres of the octahedral texels."""
     row, column = lat_long_of_direction(octahedral_directions(WIDE_SIDE))
     return tuple(np.minimum((t * n).astype(int), n - 1) for t, n in zip((row, column), mask.shape))
 
 
 def _scored_view(
-    render: Callable[[Light], Samples],
-    estimates: Mapping[str, Light],
-    truths: Mapping[str, Light],
-    shown: Mapping[str, Bool[np.ndarray, "*t"]],
+    render: Callable[[OctahedralLight], Samples],
+    estimates: Mapping[str, OctahedralLight],
+    truths: Mapping[str, OctahedralLight],
+    samples: Mapping[str, Bool[np.ndarray, "*t"]],
 ) -> dict[str, dict[str, ScoredLight]]:
-    """Return the errors of each light by gauge; `shown` selects the samples that count, by light."""
-    true = [render(truths[n])[part].reshape(-1, 3) for n, part in shown.items()]
+    """Return the errors of each light by gauge; `samples` selects the samples that count, by light."""
+    true = [render(truths[n])[part].reshape(-1, 3) for n, part in samples.items()]
     kinds = {
-        "estimate": [render(estimates[n])[part].reshape(-1, 3) for n, part in shown.items()],
-        "null": [render(constant_light(truths[n].mean))[part].reshape(-1, 3) for n, part in shown.items()],
+        "estimate": [render(estimates[n])[part].reshape(-1, 3) for n, part in samples.items()],
+        "null": [render(constant_light(truths[n].mean))[part].reshape(-1, 3) for n, part in samples.items()],
     }
     whites = [float(np.sqrt(np.mean(t**2))) or 1.0 for t in true]
-    errors = errors_by_gauge(kinds, true, whites, lambda samples, i: light_error(samples, true[i]))
-    return {n: {g: ScoredLight(**of) for g, of in each.items()} for n, each in zip(shown, errors, strict=True)}
+    errors = errors_by_gauge(kinds, true, whites, lambda scaled, i: light_error(scaled, true[i]))
+    return {n: {g: ScoredLight(**kind) for g, kind in each.items()} for n, each in zip(samples, errors, strict=True)}
 
 
 def _mean(scored: list[dict[str, ScoredLight]]) -> dict[str, ScoredLight]:
     by_view = {v: [s[v] for s in scored if v in s] for v in VIEWS}
-    return {v: mean_scored(of, 9) for v, of in by_view.items() if of}
+    return {v: mean_scored(scores, 9) for v, scores in by_view.items() if scores}

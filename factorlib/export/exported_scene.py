@@ -15,12 +15,13 @@ from factorlib.conventions import YUP_FROM_CAMERA
 from factorlib.geometry.camera import Camera
 from factorlib.light.lobes import SUN_DEG, Lobes, lobe_integral
 from factorlib.results.materials import Reflectance
+from factorlib.tracing.scene import rigid
 
 DIRECT = 2  # max_depth of direct light alone
 ALL_BOUNCES = -1  # max_depth of all bounces
 
 
-class Shape(msgspec.Struct, frozen=True):
+class ExportedShape(msgspec.Struct, frozen=True):
     """A PLY file of one material, and its pose.
 
     Attributes:
@@ -39,7 +40,7 @@ class Shape(msgspec.Struct, frozen=True):
     @property
     def world_from_object(self) -> Float[np.ndarray, "4 4"]:
         """The transform into the y-up camera frame."""
-        return _turn(YUP_FROM_CAMERA) @ self.cam_from_object
+        return rigid(YUP_FROM_CAMERA, (0, 0, 0)) @ self.cam_from_object
 
 
 class ExposedMap(msgspec.Struct, frozen=True):
@@ -58,7 +59,7 @@ class ExposedMap(msgspec.Struct, frozen=True):
     @property
     def world_from_light(self) -> Float[np.ndarray, "4 4"]:
         """The rotation of the map's own axes into the y-up camera frame."""
-        return _turn(YUP_FROM_CAMERA @ self.camera_from_light @ YUP_FROM_CAMERA)
+        return rigid(YUP_FROM_CAMERA @ self.camera_from_light @ YUP_FROM_CAMERA, (0, 0, 0))
 
 
 class Sun(msgspec.Struct, frozen=True):
@@ -81,7 +82,7 @@ def suns_of(lobes: Lobes, rotation: Float[np.ndarray, "3 3"]) -> list[Sun]:
     return [Sun(axis, energy) for axis, energy in zip(suns.axis @ rotation.T, energies, strict=True)]
 
 
-class Scene(msgspec.Struct, frozen=True):
+class ExportedScene(msgspec.Struct, frozen=True):
     """A photo's camera, shapes, materials and light.
 
     Attributes:
@@ -91,7 +92,7 @@ class Scene(msgspec.Struct, frozen=True):
     """
 
     camera: Camera
-    shapes: Sequence[Shape]
+    shapes: Sequence[ExportedShape]
     materials: Mapping[str, Reflectance]
     light: ExposedMap
     max_depth: int = DIRECT
@@ -102,9 +103,3 @@ class Scene(msgspec.Struct, frozen=True):
         """The near and far clipping distances, generous because the meshes' extents are unknown here."""
         distances = [float(np.linalg.norm(shape.cam_from_object[:3, 3])) for shape in self.shapes] or [1.0]
         return 1e-3 * min(distances), 1e3 * max(distances)
-
-
-def _turn(rotation: Float[np.ndarray, "3 3"]) -> Float[np.ndarray, "4 4"]:
-    matrix = np.eye(4)
-    matrix[:3, :3] = rotation
-    return matrix

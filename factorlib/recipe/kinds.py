@@ -36,7 +36,7 @@ CURE = (
 )
 
 
-class Recipe(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True, tag_field="kind"):
+class BaseRecipe(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True, tag_field="kind"):
     """Fields of every kind."""
 
     samples: Samples = 256
@@ -58,7 +58,7 @@ class AssumedSun(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """Angular diameter in degrees."""
 
 
-class OfPhotos(Recipe, frozen=True, kw_only=True):
+class PhotoRecipe(BaseRecipe, frozen=True, kw_only=True):
     """Fields of kinds that make pictures of each photo."""
 
     photos: list[str] = []
@@ -67,14 +67,14 @@ class OfPhotos(Recipe, frozen=True, kw_only=True):
     """An assumed sun in the light of the one photo that the recipe names."""
 
 
-class Sized(OfPhotos, frozen=True, kw_only=True):
+class ResizedRecipe(PhotoRecipe, frozen=True, kw_only=True):
     """Fields of kinds whose pictures may differ from the photo in size."""
 
     width: Pixels | None = None
     """Width of the pictures; by default that of the photo after downsampling by the pipeline."""
 
 
-class Backdropped(Sized, frozen=True, kw_only=True):
+class BackgroundRecipe(ResizedRecipe, frozen=True, kw_only=True):
     """Fields of kinds that show a background beside the objects."""
 
     background: Literal["none", "light"] = "none"
@@ -83,11 +83,11 @@ class Backdropped(Sized, frozen=True, kw_only=True):
     """Reflectance of a grey floor that receives the objects' shadow and fades out around them; by default no floor."""
 
 
-class Resynthesis(OfPhotos, frozen=True, kw_only=True, tag="resynthesis"):
+class ResynthesisRecipe(PhotoRecipe, frozen=True, kw_only=True, tag="resynthesis"):
     """The photo with its objects replaced by path-traced ones."""
 
 
-class View(Backdropped, frozen=True, kw_only=True, tag="view"):
+class ViewRecipe(BackgroundRecipe, frozen=True, kw_only=True, tag="view"):
     """The objects from another view: the camera moves about their middle; the light stays."""
 
     azimuth: Degrees = 30.0
@@ -98,7 +98,7 @@ class View(Backdropped, frozen=True, kw_only=True, tag="view"):
     """Magnification of the objects in the picture."""
 
 
-class Turntable(Backdropped, frozen=True, kw_only=True, tag="turntable"):
+class TurntableRecipe(BackgroundRecipe, frozen=True, kw_only=True, tag="turntable"):
     """An animation once around the objects; the light stays."""
 
     frames: Frames = 24
@@ -107,7 +107,7 @@ class Turntable(Backdropped, frozen=True, kw_only=True, tag="turntable"):
     """Duration of the whole turn."""
 
 
-class MovingLight(Sized, frozen=True, kw_only=True, tag="moving_light"):
+class MovingLightRecipe(ResizedRecipe, frozen=True, kw_only=True, tag="moving_light"):
     """An animation in which the light turns once about the camera's upright axis, so that highlights move."""
 
     frames: Frames = 24
@@ -116,7 +116,7 @@ class MovingLight(Sized, frozen=True, kw_only=True, tag="moving_light"):
     """Duration of the whole turn."""
 
 
-class Relight(Backdropped, frozen=True, kw_only=True, tag="relight"):
+class RelightRecipe(BackgroundRecipe, frozen=True, kw_only=True, tag="relight"):
     """The photo's objects in other lights."""
 
     lights: list[str] = []
@@ -125,7 +125,7 @@ class Relight(Backdropped, frozen=True, kw_only=True, tag="relight"):
     """Rotation of those lights about the camera's upright axis."""
 
 
-class Transfer(OfPhotos, frozen=True, kw_only=True, tag="transfer"):
+class TransferRecipe(PhotoRecipe, frozen=True, kw_only=True, tag="transfer"):
     """The photo with other materials on its objects."""
 
     materials: dict[str, str]
@@ -143,7 +143,7 @@ class Polish(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """Roughness of that reflection."""
 
 
-class Insert(OfPhotos, frozen=True, kw_only=True, tag="insert"):
+class InsertRecipe(PhotoRecipe, frozen=True, kw_only=True, tag="insert"):
     """A further object in the photo, standing beside an existing one, with its shadow."""
 
     mesh: str = "ball"
@@ -168,7 +168,7 @@ class Insert(OfPhotos, frozen=True, kw_only=True, tag="insert"):
     """Specular reflection of the ground beside its diffuse colour."""
 
 
-class Grid(Recipe, frozen=True, kw_only=True, tag="grid"):
+class GridRecipe(BaseRecipe, frozen=True, kw_only=True, tag="grid"):
     """Balls of every material (rows) in every light (columns), including pairs that no photo shows."""
 
     materials: list[str] = []
@@ -179,7 +179,16 @@ class Grid(Recipe, frozen=True, kw_only=True, tag="grid"):
     """Width of a ball's picture."""
 
 
-AnyRecipe = Resynthesis | View | Turntable | MovingLight | Relight | Transfer | Insert | Grid
+AnyRecipe = (
+    ResynthesisRecipe
+    | ViewRecipe
+    | TurntableRecipe
+    | MovingLightRecipe
+    | RelightRecipe
+    | TransferRecipe
+    | InsertRecipe
+    | GridRecipe
+)
 KINDS = {kind.__struct_config__.tag: kind for kind in AnyRecipe.__args__}
 
 
@@ -202,7 +211,7 @@ def is_mesh_file(name: str) -> bool:
     return "." in name
 
 
-class OwnMaterial(msgspec.Struct, frozen=True):
+class TableMaterial(msgspec.Struct, frozen=True):
     """Lambert k_d and GGX k_s per channel (linear Rec. 709), and roughness with α = roughness².
 
     Other fields of the file are ignored.
@@ -213,7 +222,7 @@ class OwnMaterial(msgspec.Struct, frozen=True):
     roughness: Share
 
 
-def read_table(path: Path) -> dict[str, OwnMaterial]:
+def read_table(path: Path) -> dict[str, TableMaterial]:
     """Read the materials of a table by name.
 
     Raises:
@@ -224,16 +233,16 @@ def read_table(path: Path) -> dict[str, OwnMaterial]:
         content = msgspec.json.decode(text)
     materials = content.get("materials") if isinstance(content, dict) else None
     if not isinstance(materials, dict) or not materials:
-        raise InputError("it holds no materials", file=path, key="materials", cure=CURE)
+        raise InputError("the table has no materials", file=path, key="materials", cure=CURE)
     table = {}
     for name, entry in materials.items():
         key = f"materials.{name}"
         try:
-            table[name] = msgspec.convert(entry, OwnMaterial)
+            table[name] = msgspec.convert(entry, TableMaterial)
         except msgspec.ValidationError as error:
             raise InputError(str(error), file=path, key=key, cure=CURE) from None
         total = max(table[name].diffuse) + max(table[name].specular)
         if total > MOST_REFLECTED:
-            found = f"max diffuse + max specular = {total:.3f}: more light is reflected than arrives"
-            raise InputError(found, file=path, key=key, cure=f"at most {MOST_REFLECTED}")
+            fault = f"max diffuse + max specular = {total:.3f}: more light is reflected than arrives"
+            raise InputError(fault, file=path, key=key, cure=f"reduce the sum to at most {MOST_REFLECTED}")
     return table

@@ -21,7 +21,7 @@ def as_it_is(radiance: Radiance) -> Radiance:
     return radiance
 
 
-class Traced(msgspec.Struct, frozen=True):
+class TracedPicture(msgspec.Struct, frozen=True):
     """A path-traced picture.
 
     Attributes:
@@ -38,7 +38,7 @@ class Traced(msgspec.Struct, frozen=True):
         return np.clip(self.pixels[..., 3:], 0, 1)
 
     @property
-    def shown(self) -> Radiance:
+    def toned(self) -> Radiance:
         """The radiance after the tone curve, with coverage divided out."""
         share = self.pixels[..., 3:]
         return self.tone(self.pixels[..., :3] / np.where(share > 0, share, 1))
@@ -46,19 +46,19 @@ class Traced(msgspec.Struct, frozen=True):
     @property
     def exposure(self) -> float:
         """The display exposure for the covered pixels."""
-        return exposure_of(self.shown, self.pixels[..., 3] > 0.5)
+        return exposure_of(self.toned, self.pixels[..., 3] > 0.5)
 
-    def exposed(self) -> Traced:
+    def exposed(self) -> TracedPicture:
         """Return the picture times its own exposure, without a tone curve."""
-        return Traced(self.pixels * np.array([self.exposure] * 3 + [1.0]))
+        return TracedPicture(self.pixels * np.array([self.exposure] * 3 + [1.0]))
 
     def over(self, photo: Radiance) -> Radiance:
         """Composite the picture, after its tone curve, over a photo."""
-        return (1 - self.coverage) * photo + self.coverage * self.shown
+        return (1 - self.coverage) * photo + self.coverage * self.toned
 
     def rgba(self, exposure: float = 1.0) -> UInt8[np.ndarray, "h w 4"]:
         """Return 8-bit sRGB with coverage as alpha."""
-        return np.concatenate([picture(self.shown, exposure), np.rint(255 * self.coverage).astype(np.uint8)], axis=-1)
+        return np.concatenate([picture(self.toned, exposure), np.rint(255 * self.coverage).astype(np.uint8)], axis=-1)
 
     def to_exr(self, path: str | Path) -> None:
         """Write linear radiance times coverage, and coverage as channel A."""

@@ -34,10 +34,10 @@ def table_in_gauge(table: MaterialTable, factor: float) -> MaterialTable:
     """Return the table with reflectances and standard errors times `factor`, which `gauge` records."""
     gauge = msgspec.structs.replace(table.gauge, export_factor=factor, export_rule=RULE)
 
-    def scaled(of: Solved | StandardErrors) -> Solved | StandardErrors:
+    def scaled(values: Solved | StandardErrors) -> Solved | StandardErrors:
         """Return the diffuse and specular values times the factor."""
-        diffuse, specular = (tuple(factor * value for value in colour) for colour in (of.diffuse, of.specular))
-        return msgspec.structs.replace(of, diffuse=diffuse, specular=specular)
+        diffuse, specular = (tuple(factor * v for v in colour) for colour in (values.diffuse, values.specular))
+        return msgspec.structs.replace(values, diffuse=diffuse, specular=specular)
 
     materials = {n: msgspec.structs.replace(scaled(m), stderr=scaled(m.stderr)) for n, m in table.materials.items()}
     return msgspec.structs.replace(table, materials=materials, gauge=gauge)

@@ -27,7 +27,7 @@ from jaxtyping import Int
 from trimesh.visual.material import PBRMaterial
 from trimesh.visual.texture import TextureVisuals
 
-from factorlib.export.scene import Sun
+from factorlib.export.exported_scene import Sun
 from factorlib.jsonfile import write_json
 from factorlib.meshes.mesh import Mesh
 from factorlib.meshes.ply import submesh
@@ -68,12 +68,12 @@ def write_glb(
     parts = {}
     for label in split.labels:
         part = submesh(split, label)
-        chosen = [names[k - 1] for k in choices[:, label - 1]]
-        name = chosen[0] if chosen[0] not in parts else f"{chosen[0]} {label}"
+        selected = [names[k - 1] for k in choices[:, label - 1]]
+        name = selected[0] if selected[0] not in parts else f"{selected[0]} {label}"
         visual = TextureVisuals(material=PBRMaterial(name=name))
         factor = 1.0
         if part.detail is not None:
-            cores = [gltf_material(materials[each], True)["pbrMetallicRoughness"] for each in chosen]
+            cores = [gltf_material(materials[each], True)["pbrMetallicRoughness"] for each in selected]
             # vertex colours in [0, 1]; the base colour takes their largest value, up to 1 itself
             bases = [core["baseColorFactor"][:3] for core in cores]
             factor = min(float(part.detail.max()), 1 / max(float(np.max(bases)), 1e-9))
@@ -82,7 +82,7 @@ def write_glb(
         geometry = trimesh.Trimesh(part.vertices, part.faces, vertex_normals=part.normals, visual=visual, process=False)
         scene.add_geometry(geometry, geom_name=name, node_name=name)
         painted = part.detail is not None
-        parts[name] = [_entry(each, materials[each], mesh.open, painted, factor) for each in chosen]
+        parts[name] = [_entry(each, materials[each], mesh.open, painted, factor) for each in selected]
     exact = partial(_set_materials, parts=parts, variants=list(variants))
     write_bytes(path, scene.export(file_type="glb", include_normals=True, tree_postprocessor=exact))
 
@@ -103,13 +103,13 @@ def _set_materials(
     The mesh library rounds numbers to eight bits and knows no variants.  `parts` gives the materials of each mesh by
     name: its own first, then one per variant.
     """
-    tree["materials"] = found = []
+    tree["materials"] = materials = []
     for mesh in tree["meshes"]:
         numbers = []
         for entry in parts[mesh["name"]]:
-            if entry not in found:
-                found.append(entry)
-            numbers.append(found.index(entry))
+            if entry not in materials:
+                materials.append(entry)
+            numbers.append(materials.index(entry))
         (primitive,) = mesh["primitives"]
         primitive["material"] = numbers[0]
         if variants:
@@ -120,7 +120,7 @@ def _set_materials(
             primitive["extensions"] = {VARIANTS: {"mappings": mappings}}
     if variants:
         tree["extensions"] = {VARIANTS: {"variants": [{"name": name} for name in variants]}}
-    extensions = {*tree.get("extensionsUsed", []), *(name for each in found for name in each.get("extensions", ()))}
+    extensions = {*tree.get("extensionsUsed", []), *(name for each in materials for name in each.get("extensions", ()))}
     if used := sorted(extensions | ({VARIANTS} if variants else set())):
         tree["extensionsUsed"] = used
 
@@ -141,14 +141,14 @@ def read_part_materials(path: str | Path) -> dict[str, dict[str, str]]:
     """
     data = read_bytes(path, "a glTF file")
     tree = json.loads(data[20 : 20 + int.from_bytes(data[12:16], "little")])  # the JSON chunk
-    called = [entry["name"] for entry in tree["materials"]]
+    names = [entry["name"] for entry in tree["materials"]]
     variants = [entry["name"] for entry in tree.get("extensions", {}).get(VARIANTS, {}).get("variants", [])]
     parts = {}
     for mesh in tree["meshes"]:
         (primitive,) = mesh["primitives"]
-        parts[mesh["name"]] = {"": called[primitive["material"]]}
+        parts[mesh["name"]] = {"": names[primitive["material"]]}
         for each in primitive.get("extensions", {}).get(VARIANTS, {}).get("mappings", []):
-            parts[mesh["name"]] |= {variants[v]: called[each["material"]] for v in each["variants"]}
+            parts[mesh["name"]] |= {variants[v]: names[each["material"]] for v in each["variants"]}
     return parts
 
 

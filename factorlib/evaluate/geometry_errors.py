@@ -3,8 +3,7 @@
 Normals  Angle between estimated and true normal over the pixels where both are known; null: every normal faces the
          camera.
 Poses    Geodesic angle of rotation_estimateᵀ · rotation_truth, and the distance of the translations relative to the
-         true
-         distance from the camera.  The null is a random rotation, with a mean error of 126.5° (90° + 114.6° / π).
+         true distance from the camera.  The null is a random rotation, with a mean error of 126.5° (90° + 114.6° / π).
          A symmetric shape can have a large rotation error and yet match every pixel; the normals show it.
 """
 

@@ -72,9 +72,9 @@ def _error(estimate: Reflectance, truth: Reflectance, factor: Vec3) -> MaterialE
 
 
 def _summary(compared: Mapping[str, ComparedMaterial]) -> dict[str, float]:
-    found: dict[str, float] = {}
+    summary: dict[str, float] = {}
     for part in ("roughness", "diffuse", "specular"):
         errors, null = (np.abs([getattr(getattr(m, k), part) for m in compared.values()]) for k in ("error", "null"))
-        found |= {f"mean_{part}": float(errors.mean()), f"worst_{part}": float(errors.max())}
-        found[f"null_mean_{part}"] = float(null.mean())
-    return found
+        summary |= {f"mean_{part}": float(errors.mean()), f"worst_{part}": float(errors.max())}
+        summary[f"null_mean_{part}"] = float(null.mean())
+    return summary
