@@ -126,9 +126,18 @@ class Block(msgspec.Struct, frozen=True):
         return self.take(~self.held_out) if self.held_out.any() else self
 
     def subsample(self, count: int, seed: int) -> Block:
-        """Return at most `count` fitted and `count` held-out observations, drawn at random, in their order."""
+        """Return at most `count` fitted and `count` held-out observations, in their order.
+
+        The sample is systematic (Madow and Madow 1944): observations are ordered by material and cluster, at random
+        within one, and drawn at even steps from a random start.  So each region of the light has its share of the
+        sample, where an independent draw leaves some without.
+        """
         random = np.random.default_rng(seed)
-        samples = [random.permutation(np.flatnonzero(rows))[:count] for rows in (~self.held_out, self.held_out)]
+        order = np.lexsort((random.random(len(self)), self.clusters(), self.material))
+        samples = []
+        for rows in (order[~self.held_out[order]], order[self.held_out[order]]):
+            steps = np.arange(count) * len(rows) + random.integers(max(len(rows), 1))
+            samples.append(rows[steps // count] if len(rows) > count else rows)
         return self.take(np.sort(np.concatenate(samples)))
 
     def with_effects(self, shadows: bool, bounces: bool) -> Block:

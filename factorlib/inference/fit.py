@@ -60,11 +60,19 @@ class Hyperparameters(msgspec.Struct, frozen=True):
 
 
 class Fit(msgspec.Struct, frozen=True):
-    """Point, the hyperparameters of each light there, and minus twice the log marginal likelihood."""
+    """Result of a fit.
+
+    Attributes:
+        point: Materials and lights.
+        hyperparameters: Weights of each light's observations and prior.
+        value: Objective.
+        light_values: Part of each light in it: minus twice its log marginal likelihood.
+    """
 
     point: Point
     hyperparameters: list[Hyperparameters]
     value: float = float("inf")
+    light_values: list[float] = []
 
     def with_lights(self, lights: list[Light]) -> Fit:
         """Return the start of another fit, in other lights."""
@@ -151,7 +159,10 @@ def fit_problem(
     if not schedule.materials_fixed:
         materials = materials_from_unknowns(state.theta)
     lights = [descended.light for descended in state.likelihoods]
-    return Fit(Point(materials, lights), hyperparameters, state.value)
+    light_values = [system.value for system in state.systems]
+    if schedule.materials_fixed:  # those are φ
+        light_values = list(map(LightLikelihood.marginal, state.likelihoods, state.systems))
+    return Fit(Point(materials, lights), hyperparameters, state.value, light_values)
 
 
 def light_likelihood(

@@ -122,12 +122,14 @@ class Decision(msgspec.Struct, frozen=True):
 
     Attributes:
         margin: increase of the loss without it, in standard errors
+        log_bayes_factor: log marginal likelihood with it, less that without it
     """
 
     kept: bool
     held_out_loss_with: float | None = None
     held_out_loss_without: float | None = None
     margin: float | None = None
+    log_bayes_factor: float | None = None
 
 
 class Started(msgspec.Struct, frozen=True):

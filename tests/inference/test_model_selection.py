@@ -18,15 +18,14 @@ from factorlib.inference.materials import Point
 from factorlib.inference.model_selection import (
     CLEARLY_AGAINST,
     CLEARLY_FOR,
-    LEAST_DISTANCE_MARGIN,
     LEAST_TONE_GAIN,
-    distance_share,
+    VERY_STRONG,
+    near_share,
 )
 from factorlib.inference.observed import blocks_of_observations
 from factorlib.inference.options import SolveOptions
 from factorlib.inference.problem import JointProblem
 from factorlib.inference.start import start_from_photos
-from factorlib.results.materials import Decision
 from factorlib.urm.observations import Observations
 from studies.scenes.problems import MATERIALS, factor_between, sphere_normals
 from tests.inference.made import bowls, none_held_out, rough_light
@@ -34,9 +33,8 @@ from tests.inference.made_lights import OPERATOR, drawn, on_even_cells, spheres
 
 QUICK = SolveOptions(cells=60, splittings=0, observations=300)
 OF_SHAPES = msgspec.structs.replace(QUICK, cells=48, observations=240, tone="off")  # shadows and bounces
-OBSERVATION_FACTOR = msgspec.structs.replace(
-    QUICK, observations=1000
-)  # an exponent that all photos share is known less
+# an exponent that all photos share is known less
+MANY = msgspec.structs.replace(QUICK, observations=1000)
 
 
 def solved(blocks, choices=QUICK, **others):
@@ -169,7 +167,7 @@ def curved():
 
 
 def test_curves_are_found_and_spare_the_materials_by_evidence_that_held_out_losses_fall(curved):
-    found, without = (solved(curved, OBSERVATION_FACTOR, tone=tone) for tone in ("auto", "off"))
+    found, without = (solved(curved, MANY, tone=tone) for tone in ("auto", "off"))
     exponents = [float(e[0]) if len(e) else 1.0 for e in exponents_of(found)]
     off = np.log(exponents) - np.log((1.3, 0.8, 1.0))
     assert (
@@ -186,12 +184,12 @@ def test_curves_are_found_and_spare_the_materials_by_evidence_that_held_out_loss
 
 def test_photos_of_one_light_have_a_curve_each():
     blocks = [through(data, 1.0, 1.3) if k == 0 else data for k, data in enumerate(rooms(photos=2, size=14))]
-    np.testing.assert_allclose(exponents_of(solved(blocks, OBSERVATION_FACTOR))[0], (1.0, 1.3), rtol=0.05)
+    np.testing.assert_allclose(exponents_of(solved(blocks, MANY))[0], (1.0, 1.3), rtol=0.05)
 
 
 def test_a_curve_that_no_camera_has_is_not_believed():
     """What else is wrong would be explained by an exponent at its bounds."""
-    blocks = [through(data, 4.0) if k == 0 else data for k, data in enumerate(rooms())]
+    blocks = [through(data, 6.0) if k == 0 else data for k, data in enumerate(rooms())]
     solution = solved(blocks, cells=40, observations=200)
     assert len(exponents_of(solution)[0]) == 0
     (one, *_) = solution.tone
@@ -244,14 +242,15 @@ def photographed_at(*curvatures):
 
 def test_near_lights_are_found_and_spare_the_materials_and_far_ones_stay_far():
     blocks = photographed_at(0.2, 0.0, 0.2)
-    found, far = (solved(blocks, OBSERVATION_FACTOR, tone="off", distance=distance) for distance in ("auto", "off"))
+    found, far = (solved(blocks, MANY, tone="off", distance=distance) for distance in ("auto", "off"))
     assert [one.kept for one in found.distances] == [True, False, True]
     assert [light.curvature for light in found.point.lights] == [0.2, 0, 0.2]
-    assert all(one.margin > CLEARLY_FOR for one in found.distances if one.kept)
+    assert all(one.kept == (one.log_bayes_factor > VERY_STRONG) for one in found.distances)
     assert [light.curvature for light in far.point.lights] == [0, 0, 0]
     assert error_of(found) < 0.5 * error_of(far), (error_of(found), error_of(far))
 
 
 def test_how_near_a_light_comes_follows_the_evidence_without_a_jump():
-    shares = [distance_share(Decision(True, margin=m)) for m in (-3, LEAST_DISTANCE_MARGIN, 1.25, 1.5, CLEARLY_FOR, 9)]
-    assert shares == [0, 0, 0.25, 0.5, 1, 1] and distance_share(Decision(False)) == 0
+    shares = [near_share(VERY_STRONG + t) for t in np.linspace(-9, 20, 2901)]
+    assert shares[0] == near_share(VERY_STRONG) == 0 and shares[-1] == pytest.approx(1)
+    assert (np.diff(shares) >= 0).all() and np.diff(shares).max() < 0.01
