@@ -5,8 +5,6 @@ With --docs the tables of docs/studies.md are written anew afterwards; with --cl
 forgotten, with --gc those that no study names any more are deleted, quick ones among them.
 """
 
-from __future__ import annotations
-
 import os
 import sys
 from typing import Annotated

@@ -6,8 +6,6 @@ Difference  of two settings, seed by seed, because a seed shows the same materia
             together (Bonferroni: each at 1 − .05 / comparisons), over at least `LEAST_SEEDS`.
 """
 
-from __future__ import annotations
-
 import csv
 import io
 from collections.abc import Mapping, Sequence

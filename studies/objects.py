@@ -11,8 +11,6 @@ Noise      drawn for each pixel by itself: a perturbation leaves what a pixel sh
 Normals    of the mesh that is given, at the pose that is given: perturbed, or fitted to the outline from there
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from functools import cache
 
@@ -32,8 +30,8 @@ from factorlib.geometry.camera import Camera, Pose, rotation_of_vector
 from factorlib.geometry.raster import Caster, rasterise
 from factorlib.meshes.mesh import scaled
 from factorlib.results.materials import Reflectance
+from factorlib.scenes import bodies
 from factorlib.urm.observations import Observations, concatenate
-from studies.scenes import shapes
 from studies.spheres import GRAZING, table_of
 from studies.study import Case, Objects, light_name
 
@@ -45,11 +43,11 @@ CAMERA = Camera(SIDE, SIDE, FAR * SIDE, (SIDE / 2, SIDE / 2))
 @cache
 def body(name: str, triangles: int | None = None) -> Caster:
     """Return a body of one material, or a mesh of few triangles that stands for it."""
-    parts = [(vertices, faces, 1) for vertices, faces, _ in shapes.SHAPES[name]()]
+    parts = [(vertices, faces, 1) for vertices, faces, _ in bodies.SHAPES[name]()]
     if triangles is not None:
         total = sum(len(faces) for _, faces, _ in parts)
-        parts = [shapes.decimated(part, max(round(triangles * len(part[1]) / total), 8)) for part in parts]
-    return Caster(shapes.mesh_of(parts, name))
+        parts = [bodies.decimated(part, max(round(triangles * len(part[1]) / total), 8)) for part in parts]
+    return Caster(bodies.mesh_of(parts, name))
 
 
 def observed(

@@ -12,8 +12,6 @@ Labels     likewise: the pixel is of one material, its label names another one o
 Facets     rendered so: a flat-sided object, whose normals are true but few.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 

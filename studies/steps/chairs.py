@@ -7,8 +7,6 @@ it; scaled or not, it is the same picture. Predicted pixels have the photo's sha
 surfaces where the chair is left out, for that light is read off the photo itself.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from tempfile import TemporaryDirectory

@@ -21,8 +21,6 @@ and the processor seconds that it took.  What a method does not state has no sco
 <shot>-truth.png the truth beside it; shots.json has their DSSIM.  <case>.png: some of them, the truth above.
 """
 
-from __future__ import annotations
-
 import time
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path

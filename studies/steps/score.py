@@ -25,8 +25,6 @@ materials (rows) in all lights, the truth and, right of it, what was recovered; 
 frame.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Mapping
 from pathlib import Path
 
@@ -64,7 +62,7 @@ def main(params: Params, inputs: Inputs, out: Path, progress: Progress) -> None:
         write_png(out / f"{inputs.photo}.png", np.concatenate([spheres.matrix(true=True), spheres.matrix()], axis=1))
 
 
-def scored(case: Case, truths: Table, maps: Maps, table: Mapping[str, Solved], own: Maps) -> tuple[Spheres, Score]:
+def scored(case: Case, truths: Table, maps: Maps, table: Mapping[str, Solved], own: Maps) -> "tuple[Spheres, Score]":
     """Return the spheres that are compared, and all scores.
 
     truths, maps: all true materials and lights of the world;  table, own: those that were solved, in the solve's own

@@ -11,8 +11,8 @@ from factorlib.inference.materials import Point
 from factorlib.inference.problem import JointProblem
 from factorlib.reflection import reflection_operator
 from factorlib.results.materials import Reflectance
+from factorlib.scenes.joint_problems import MATERIALS, block, random_light, sphere_normals
 from factorlib.urm.observations import Observations
-from studies.scenes.problems import MATERIALS, block, random_light, sphere_normals
 from tests.integral import reflected
 
 OPERATOR = reflection_operator("closed_form", dtype="float64")
@@ -52,9 +52,7 @@ def three_rooms() -> tuple[JointProblem, Point]:
     """Three materials in three lights, and a wrong point."""
     rng = np.random.default_rng(4)
     lights = [random_light(rng, 3) for _ in range(3)]
-    blocks = [
-        block(f"room{k}", light, MATERIALS, [0, 1, 2], OPERATOR, size=10, seed=k) for k, light in enumerate(lights)
-    ]
+    blocks = [block(f"room{k}", light, MATERIALS, [0, 1, 2], OPERATOR, size=10) for k, light in enumerate(lights)]
     guess = [random_light(rng, 4) for _ in range(3)]
     return JointProblem(blocks, OPERATOR), Point(
         MATERIALS, [msgspec.structs.replace(li, weight=li.weight / 10) for li in guess]

@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 
 from factorlib.inference.evidence import AGAINST, FOR, LEAST_LOSS, Losses, compare, losses_of
 from factorlib.inference.materials import Point
-from studies.scenes.problems import MATERIALS
+from factorlib.scenes.joint_problems import MATERIALS
 from tests.inference.made_lights import photographed
 
 

@@ -11,7 +11,7 @@ from factorlib.inference.materials import Materials
 from factorlib.inference.noise import Noise
 from factorlib.inference.priors import BRIGHTEST, BRIGHTNESS
 from factorlib.inference.problem import JointProblem
-from studies.scenes.problems import MATERIALS, factor_between
+from factorlib.scenes.joint_problems import MATERIALS, factor_between
 from tests.inference.made_lights import (
     FEW,
     OPERATOR,

@@ -19,7 +19,7 @@ from factorlib.inference.start import with_known
 from factorlib.inference.uncertainty import Posterior
 from factorlib.inference.uncertainty import in_gauge as covariance_in_gauge
 from factorlib.light.latlong import map_energy
-from studies.scenes.problems import MATERIALS, sphere_normals
+from factorlib.scenes.joint_problems import MATERIALS, sphere_normals
 from tests.inference.made import seen_from_the_front
 from tests.inference.made_lights import (
     FEW,

@@ -6,7 +6,7 @@ import pytest
 from factorlib.inference.forward import Illumination
 from factorlib.inference.joint_solver import SMALLEST, SPLIT
 from factorlib.inference.lights import Light, even_cells
-from studies.scenes.problems import MATERIALS, block
+from factorlib.scenes.joint_problems import MATERIALS, block
 from tests.inference.made_lights import OPERATOR, drawn, on_even_cells
 
 DIRECTIONS = np.random.default_rng(1).normal(size=(2000, 3))

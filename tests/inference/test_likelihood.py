@@ -7,7 +7,7 @@ import pytest
 from factorlib.inference.likelihood import EXPOSURE, TONE
 from factorlib.inference.priors import materials_of, unknowns_of
 from factorlib.inference.problem import JointProblem
-from studies.scenes.problems import MATERIALS
+from factorlib.scenes.joint_problems import MATERIALS
 from tests.inference.made_lights import OPERATOR, PRIOR, drawn, likelihood, on_even_cells, photographed, spheres
 
 CELLS = 50

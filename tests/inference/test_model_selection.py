@@ -22,8 +22,8 @@ from factorlib.inference.options import Choices
 from factorlib.inference.problem import JointProblem
 from factorlib.inference.start import from_nothing
 from factorlib.results.materials import Decision
+from factorlib.scenes.joint_problems import MATERIALS, factor_between, sphere_normals
 from factorlib.urm.observations import Observations
-from studies.scenes.problems import MATERIALS, factor_between, sphere_normals
 from tests.inference.made import bowls, rough_light
 from tests.inference.made_lights import OPERATOR, drawn, on_even_cells, spheres
 

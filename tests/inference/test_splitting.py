@@ -8,7 +8,7 @@ from factorlib.inference.fit import Schedule, fitted
 from factorlib.inference.joint_solver import SPLIT, split_while_gaining
 from factorlib.inference.options import Choices
 from factorlib.inference.resume import Run
-from studies.scenes.problems import MATERIALS
+from factorlib.scenes.joint_problems import MATERIALS
 from tests.inference.made_lights import PRIOR, begun, light_of, spheres
 
 CELLS, SHOWN = 60, [1, 2]

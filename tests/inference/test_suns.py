@@ -14,7 +14,7 @@ from factorlib.inference.resume import Run
 from factorlib.inference.suns import WIDE, candidate, clearly_better, compared, suns_chosen
 from factorlib.light.lobes import SUN, lobe_integral
 from factorlib.results.materials import Decision
-from studies.scenes.problems import MATERIALS
+from factorlib.scenes.joint_problems import MATERIALS
 from tests.inference.made_lights import FEW, PRIOR, begun, drawn, on_even_cells, spheres
 
 TOWARDS = np.array([0.36, -0.48, -0.8])

@@ -10,7 +10,7 @@ import pytest
 from factorlib.conventions import lat_long_directions
 from factorlib.evaluate.materials import compare_materials
 from studies.body import photographed
-from studies.catalogue import comparison
+from studies.catalogue import methods as comparison
 from studies.errors import in_gauge, times
 from studies.methods import (
     grey,

@@ -3,6 +3,9 @@
 The operator itself renders them.
 """
 
+import zlib
+from collections.abc import Sequence
+
 import msgspec
 import numpy as np
 
@@ -10,6 +13,7 @@ from factorlib.inference.blocks import Block
 from factorlib.inference.forward import Illumination
 from factorlib.inference.lights import Light
 from factorlib.inference.materials import Materials
+from factorlib.reflection import Operator
 
 MATERIALS = Materials(
     diffuse=np.array([[0.5, 0.1, 0.1], [0.2, 0.4, 0.25], [0.1, 0.12, 0.2]]),
@@ -26,36 +30,47 @@ def sphere_normals(size: int) -> np.ndarray:
     return np.column_stack([x, y, -np.sqrt(1 - x**2 - y**2)])
 
 
-def random_light(rng, lobes: int, photos: int = 1, sharpest: float = 4.5, contrast: float = 0.7) -> Light:
-    """Return lobes of random directions, of log sharpness up to `sharpest`; the exposures of photos but the first."""
+def random_light(
+    rng: np.random.Generator, lobes: int, photos: int = 1, sharpest: float = 4.5, contrast: float = 0.7
+) -> Light:
+    """Draw lobes of random directions, of log sharpness up to `sharpest`, and the exposures of all photos but one."""
     axis = rng.normal(size=(lobes, 3))
     log_sharpness = rng.uniform(0, sharpest, lobes)
-    weight = (
-        rng.lognormal(0, contrast, (lobes, 1)) * rng.lognormal(0, 0.2, (lobes, 3)) * np.exp(log_sharpness / 2)[:, None]
-    )
+    level = rng.lognormal(0, contrast, (lobes, 1))
+    weight = level * rng.lognormal(0, 0.2, (lobes, 3)) * np.exp(log_sharpness / 2)[:, None]
     exposure = np.concatenate([[0.0], rng.normal(0, 0.5, photos - 1)])
     return Light(axis / np.linalg.norm(axis, axis=1, keepdims=True), log_sharpness, weight, exposure)
 
 
-def block(name: str, light: Light, materials: Materials, shown, operator, size: int = 24, seed: int = 0) -> Block:
-    """Return one illumination that shows the materials `shown`, a sphere of each in each of its photos."""
+def block(
+    name: str, light: Light, materials: Materials, numbers: Sequence[int], operator: Operator, size: int = 24
+) -> Block:
+    """Return an illumination's observations: in each of its photos a sphere of each material.
+
+    Args:
+        name: Name of the illumination; it decides which tenth of the observations is held out.
+        light: Light, with an exposure for each photo.
+        materials: Materials of the problem.
+        numbers: Numbers of the materials in the photos.
+        operator: Reflection operator that renders them.
+        size: Pixels across a sphere.
+    """
     normals = sphere_normals(size)
     photos, n = len(light.log_exposure), len(normals)
-    material = np.repeat(sorted(shown), n * photos)
-    photo = np.tile(np.repeat(np.arange(photos), n), len(shown))
+    material = np.repeat(sorted(numbers), n * photos)
     rows = len(material)
     empty = Block(
         name=name,
         photos=tuple(f"{name}_{k}" for k in range(photos)),
         unit=1.0,
-        normal=np.tile(normals, (photos * len(shown), 1)),
+        normal=np.tile(normals, (photos * len(numbers), 1)),
         view=np.tile([0.0, 0.0, -1.0], (rows, 1)),
         radiance=np.zeros((rows, 3)),
         clipped=np.zeros((rows, 3), bool),
         precision=np.ones((rows, 3)),
         material=material,
-        photo=photo,
-        held_out=np.random.default_rng(seed).random(rows) < 0.1,
+        photo=np.tile(np.repeat(np.arange(photos), n), len(numbers)),
+        held_out=np.random.default_rng(zlib.crc32(name.encode())).random(rows) < 0.1,
     )
     radiance = Illumination(empty, light, materials, operator).radiance()
     scaled = radiance / radiance.mean()
@@ -64,6 +79,6 @@ def block(name: str, light: Light, materials: Materials, shown, operator, size: 
     )
 
 
-def factor_between(found: Materials, true: Materials) -> np.ndarray:
-    """Return the factor per channel that takes `found` reflectances to `true` ones."""
-    return (true.diffuse + true.specular).sum(0) / (found.diffuse + found.specular).sum(0)
+def factor_between(estimate: Materials, truth: Materials) -> np.ndarray:
+    """Return the factor per channel that takes estimated reflectances to the true ones."""
+    return (truth.diffuse + truth.specular).sum(0) / (estimate.diffuse + estimate.specular).sum(0)

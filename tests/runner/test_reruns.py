@@ -5,8 +5,6 @@ code another library says (grimp, of import-linter).  `make test` takes a sample
 `make test-long` every module, file and package.
 """
 
-from __future__ import annotations
-
 import contextlib
 import os
 import random
@@ -22,10 +20,9 @@ from factorlib.runner import verbs
 from factorlib.runner.dataset_state import survey
 from factorlib.runner.plan import Listing, plan
 from factorlib.runner.project import LIBRARY, photo_sets, read_pipeline
-from tests.faults.battered import real_project
-from tests.faults.good import edited as edited_data
+from tests.faults.sample import edited as edited_data
 from tests.runner import toy
-from tests.runner.toy import make, reasons, state, write
+from tests.runner.toy import make, real_project, reasons, state, write
 
 PIPELINE = read_pipeline(LIBRARY / "pipeline.yaml", photo_sets().slices).for_data(lambda _: True)
 STAGES = list(PIPELINE.stages)

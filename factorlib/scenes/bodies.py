@@ -109,7 +109,8 @@ def _box(size: np.ndarray, place: np.ndarray, turn: float, side: int = 24) -> Pa
     index = np.arange((side + 1) ** 2).reshape(side + 1, side + 1)
     a, b, c, d = index[:-1, :-1], index[:-1, 1:], index[1:, :-1], index[1:, 1:]
     quad = np.concatenate([np.stack([a, b, d], -1), np.stack([a, d, c], -1)]).reshape(-1, 3)
-    vertices, faces = [], []
+    vertices: list[np.ndarray] = []
+    faces: list[np.ndarray] = []
     for axis in range(3):
         for sign in (-1, 1):
             points = np.zeros((len(u), 3))
