@@ -31,8 +31,9 @@ from factorlib.geometry.raster import Caster, rasterise
 from factorlib.meshes.mesh import scaled
 from factorlib.results.materials import Reflectance
 from factorlib.scenes import bodies
+from factorlib.scenes.joint_problems import observations_from_front
 from factorlib.urm.observations import Observations, concatenate
-from studies.spheres import GRAZING, table_of
+from studies.spheres import GRAZING
 from studies.study import Case, Objects, light_name
 
 BODIES = ("blob", "jug", "hook")
@@ -82,12 +83,11 @@ def _entry(case: Case, m: int, li: int, material: Reflectance, light: Light) -> 
     true, given = (of.normal.reshape(-1, 3)[pixels] for of in (true_maps, maps))
     radiance = ball(light, material, true @ YUP_FROM_CAMERA.T)
     noise = np.random.default_rng([13, case.seed, li, m, 0]).standard_normal((maps.label.size, 3))[pixels]
-    labels = np.full(len(pixels), case.materials.index(m))
-    zero = np.zeros(len(pixels), int)
-    table = table_of(
-        case, li, given, radiance * (1 + case.noise * noise), labels, pixels, zero, sure.reshape(-1)[pixels]
-    )
-    return table, angle_deg(true, given)
+    labels, names = np.full(len(pixels), case.materials.index(m)), tuple(case.material_names)
+    weight = sure.reshape(-1)[pixels]
+    columns = {"x": pixels, "y": np.zeros(len(pixels), int), "weight": weight, "confidence": weight}
+    noisy = radiance * (1 + case.noise * noise)
+    return observations_from_front(given, noisy, labels, names, light_name(li), **columns), angle_deg(true, given)
 
 
 def perturbed(name: str, truth: Pose, how: Objects, rng: np.random.Generator) -> tuple[Caster, Pose]:

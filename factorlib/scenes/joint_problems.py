@@ -3,8 +3,9 @@
 The operator itself renders them.
 """
 
-import zlib
 from collections.abc import Sequence
+from string import digits
+from typing import Any
 
 import msgspec
 import numpy as np
@@ -14,6 +15,7 @@ from factorlib.inference.forward import Illumination
 from factorlib.inference.lights import Light
 from factorlib.inference.materials import Materials
 from factorlib.reflection import Operator
+from factorlib.urm.observations import Observations
 
 MATERIALS = Materials(
     diffuse=np.array([[0.5, 0.1, 0.1], [0.2, 0.4, 0.25], [0.1, 0.12, 0.2]]),
@@ -48,7 +50,7 @@ def block(
     """Return an illumination's observations: in each of its photos a sphere of each material.
 
     Args:
-        name: Name of the illumination; it decides which tenth of the observations is held out.
+        name: Name of the illumination; a number at its end is the seed by which a tenth is held out.
         light: Light, with an exposure for each photo.
         materials: Materials of the problem.
         numbers: Numbers of the materials in the photos.
@@ -59,6 +61,7 @@ def block(
     photos, n = len(light.log_exposure), len(normals)
     material = np.repeat(sorted(numbers), n * photos)
     rows = len(material)
+    seed = int("0" + name[len(name.rstrip(digits)) :])
     empty = Block(
         name=name,
         photos=tuple(f"{name}_{k}" for k in range(photos)),
@@ -70,13 +73,46 @@ def block(
         precision=np.ones((rows, 3)),
         material=material,
         photo=np.tile(np.repeat(np.arange(photos), n), len(numbers)),
-        held_out=np.random.default_rng(zlib.crc32(name.encode())).random(rows) < 0.1,
+        held_out=np.random.default_rng(seed).random(rows) < 0.1,
     )
     radiance = Illumination(empty, light, materials, operator).radiance()
     scaled = radiance / radiance.mean()
     return msgspec.structs.replace(
         empty, radiance=scaled, unit=float(radiance.mean()), precision=1 / np.hypot(0.05, 0.05 * scaled)
     )
+
+
+def observations_from_front(
+    normal: np.ndarray,
+    radiance: np.ndarray,
+    material: np.ndarray,
+    names: tuple[str, ...],
+    photo: str = "room",
+    **columns: Any,
+) -> Observations:
+    """Return one photo's observations of surfaces seen from the front, in a light of the photo's name.
+
+    Args:
+        normal: Normals in the camera's frame.
+        radiance: Linear radiance.
+        material: Numbers of the materials among `names`.
+        names: Names of the materials.
+        photo: Name of the photo.
+        columns: Columns that are others than usual: nothing is clipped, every weight is 1.
+    """
+    n, zero = len(normal), np.zeros(len(normal), int)
+    usual = {
+        "view": np.tile([0.0, 0.0, -1.0], (n, 1)),
+        "clipped": np.zeros((n, 3), bool),
+        "photo": zero,
+        "illumination": zero,
+        "x": np.arange(n),
+        "y": zero,
+        "weight": np.ones(n),
+        "photos": (photo,),
+        "illuminations": (photo,),
+    }
+    return Observations(normal=normal, radiance=radiance, material=material, materials=names, **usual | columns)
 
 
 def factor_between(estimate: Materials, truth: Materials) -> np.ndarray:

@@ -12,6 +12,7 @@ from factorlib.inference.problem import JointProblem
 from factorlib.reflection import reflection_operator
 from factorlib.results.materials import Reflectance
 from factorlib.scenes.joint_problems import MATERIALS, block, random_light, sphere_normals
+from factorlib.scenes.joint_problems import observations_from_front as seen_from_the_front
 from factorlib.urm.observations import Observations
 from tests.integral import reflected
 
@@ -76,19 +77,6 @@ def traced(normals, sees, light: Light, material: int, count=12_000):
     incoming = np.exp(light.sharpness * (d @ light.axis.T - 1)) @ light.weight * 4 * np.pi / count
     views, one = np.tile([0.0, 0.0, -1.0], (len(normals), 1)), Reflectance(row[:3], row[3:6], row[6])
     return reflected(one, normals, views, d, incoming, sees(normals, d))
-
-
-def seen_from_the_front(normal, radiance, material, names, name="room", **more) -> Observations:
-    """What one photo shows of surfaces of those normals; more: columns that are others than usual."""
-    n, zero = len(normal), np.zeros(len(normal), int)
-    usual = {
-        "view": np.tile([0.0, 0.0, -1.0], (n, 1)),
-        "clipped": np.zeros((n, 3), bool),
-        "photo": zero,
-        "illumination": zero,
-    }
-    usual |= {"x": np.arange(n), "y": zero, "weight": np.ones(n), "photos": (name,), "illuminations": (name,)}
-    return Observations(normal=normal, radiance=radiance, material=material, materials=names, **usual | more)
 
 
 def bowls(name, light, size=16, count=512) -> Observations:
