@@ -7,11 +7,10 @@ import numpy as np
 import pytest
 
 from factorlib.inference.forward import Illumination
-from factorlib.inference.joint_solver import solve
 from factorlib.inference.materials import Materials
 from factorlib.inference.options import Choices
 from factorlib.inference.problem import JointProblem
-from factorlib.inference.start import Beginning, from_beginning, from_earlier, from_nothing, known_point, with_decided
+from factorlib.inference.start import Beginning, from_beginning, from_earlier, known_point, with_decided
 from factorlib.results.materials import Gauge, MaterialTable, Model, Reflectance, Tone
 from factorlib.results.solution import Earlier
 from factorlib.scenes.joint_problems import MATERIALS, factor_between
@@ -158,31 +157,7 @@ def test_shadows_and_bounces_stay_as_they_were_decided_where_both_were_tried(kep
     assert with_decided(asked, earlier) == asked
 
 
-# ── whole answers ────────────────────────────────────────────────────────────────────────────────────────────────────
-
-
-def answer(blocks, start=None):
-    return solve(JointProblem(blocks, OPERATOR), start or from_nothing(3), QUICK)
-
-
-def check_same(cold, warm, blocks):
-    one, other = warm.point, cold.point
-    factor = factor_between(one.materials, other.materials)
-    np.testing.assert_allclose(one.materials.diffuse * factor, other.materials.diffuse, atol=REFLECTANCE)
-    np.testing.assert_allclose(one.materials.specular * factor, other.materials.specular, atol=REFLECTANCE)
-    np.testing.assert_allclose(one.materials.roughness, other.materials.roughness, atol=ROUGHNESS)
-    for b, light, before in zip(blocks, one.lights, other.lights, strict=True):
-        a, c = (Illumination(b, li, p.materials, OPERATOR).radiance() for li, p in ((light, one), (before, other)))
-        assert np.sqrt(np.mean(((a - c) / (c + 1)) ** 2)) < RADIANCE
-
-
-def test_with_a_further_material_the_answer_is_the_one_from_nothing():
-    """As it is with a further light: `tests/stages/test_solve.py`."""
-    blocks, _ = truth(0, 1, noise=0.3, size=8)
-    fewer, count = [b.take(b.material < 2) for b in blocks], 2
-    before = solve(JointProblem(fewer, OPERATOR), from_nothing(count), QUICK)
-    earlier = written(fewer, before.point.materials, before.point.lights, NAMES[:count], (0,) * count)
-    check_same(answer(blocks), answer(blocks, from_earlier(earlier, NAMES)), blocks)
+# ── the fit of the stage surface ─────────────────────────────────────────────────────────────────────────────────────────
 
 
 def test_a_solve_goes_on_from_the_fit_that_surface_wrote_in_whatever_unit_a_block_has():
