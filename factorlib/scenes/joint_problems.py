@@ -58,7 +58,8 @@ def block(
         size: Pixels across a sphere.
     """
     normals = sphere_normals(size)
-    photos, n = len(light.log_exposure), len(normals)
+    photos = len(light.log_exposure)
+    n = len(normals)
     material = np.repeat(sorted(numbers), n * photos)
     rows = len(material)
     seed = int("0" + name[len(name.rstrip(digits)) :])
@@ -100,7 +101,8 @@ def observations_from_front(
         photo: Name of the photo.
         columns: Columns that are others than usual: nothing is clipped, every weight is 1.
     """
-    n, zero = len(normal), np.zeros(len(normal), int)
+    n = len(normal)
+    zero = np.zeros(len(normal), int)
     usual = {
         "view": np.tile([0.0, 0.0, -1.0], (n, 1)),
         "clipped": np.zeros((n, 3), bool),

@@ -92,7 +92,8 @@ def case(name: str) -> Pairs:
     """Return the pairs of a case: every combination of its values."""
     together = [*CASES.values(), ORDINARY] if name == ALL else [ORDINARY | CASES[name]]
     choices = {key: tuple(dict.fromkeys(v for c in together for v in c.get(key, ()))) for key in ORDINARY}
-    rows, n = [], torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64)
+    rows = []
+    n = torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64)
     for r, lam, cosine in itertools.product(choices["roughness"], choices["sharpness"], choices["no"]):
         o = torch.tensor([math.sqrt(1 - cosine**2), 0.0, cosine], dtype=torch.float64)
         z = torch.cat([_directions(place, n, o) for place in choices["place"]])
@@ -141,7 +142,8 @@ def answers(operator: Operator, given: Pairs) -> Answers:
     n, o, z = (t.to(operator.dtype) for t in (given.normal, given.view, given.axis))
     no, nz, oz = ((a * b).sum(1) for a, b in ((n, o), (n, z), (o, z)))
     for r, lam, rows in given.groups():
-        roughness, sharpness = torch.tensor(r, dtype=operator.dtype), torch.tensor([lam], dtype=operator.dtype)
+        roughness = torch.tensor(r, dtype=operator.dtype)
+        sharpness = torch.tensor([lam], dtype=operator.dtype)
         response = operator.response(roughness, sharpness, no[rows], nz[rows, None], oz[rows, None])
         for name in response.__struct_fields__:
             column = getattr(response, name)[:, 0].double()
@@ -172,9 +174,13 @@ def gradient_error(a: Answers, b: Answers, given: Pairs) -> Float[Tensor, " k"]:
 
 def reference_values(given: Pairs, some: slice = slice(None)) -> dict[str, Tensor]:
     """Compute diffuse and specular by quadrature, of some of the pairs."""
-    reference, n, o, z = reflection_operator("reference"), given.normal[some], given.view[some], given.axis[some]
+    reference = reflection_operator("reference")
+    n = given.normal[some]
+    o = given.view[some]
+    z = given.axis[some]
     no, nz, oz = (n * o).sum(1), (n * z).sum(1)[:, None], (o * z).sum(1)[:, None]
-    sharpness, roughness = given.sharpness[some, None], given.roughness[some, None]
+    sharpness = given.sharpness[some, None]
+    roughness = given.roughness[some, None]
     with torch.no_grad():
         specular = reference.specular(roughness, sharpness, no, nz, oz)[:, 0]
         return {"diffuse": reference.diffuse(sharpness, nz)[:, 0], "specular": specular}
@@ -205,7 +211,8 @@ def draw_grazing_inputs(domain: Domain, count: int) -> tuple[Tensor, ...]:
     """Draw pairs like `draw_inputs`, all at the least n·o, the lobe about the mirror direction."""
     alpha, lam, _, nz, _ = draw_inputs(domain, count)
     turn = torch.linspace(-1, 1, count, dtype=torch.float64)  # of the axis about n, from the mirror direction
-    so, sz = math.sqrt(1 - domain.least_no**2), torch.sqrt(1 - nz**2)
+    so = math.sqrt(1 - domain.least_no**2)
+    sz = torch.sqrt(1 - nz**2)
     no = torch.full_like(alpha, domain.least_no)
     return alpha, lam, no, nz, domain.least_no * nz - so * sz * torch.cos(turn)
 
@@ -238,7 +245,8 @@ def least_reflection(operator: Operator, count: int = 16384) -> tuple[float]:
 
 def white_lambert_error(operator: Operator, count: int = 512) -> tuple[float]:
     """Return the largest |D − 1| under constant light of radiance 1 (λ = 10⁻⁴)."""
-    lam, nz = torch.tensor([1e-4], dtype=operator.dtype), torch.linspace(-1, 1, count, dtype=operator.dtype)
+    lam = torch.tensor([1e-4], dtype=operator.dtype)
+    nz = torch.linspace(-1, 1, count, dtype=operator.dtype)
     with torch.no_grad():
         return (float((operator.diffuse(lam, nz[:, None]) - 1).abs().max()),)
 
@@ -269,7 +277,8 @@ def scene(seed: int, points: int = 32, lobes: int = 6, sharpness: tuple[float, f
     sharpness: 10 to the power of this range
     """
     g = torch.Generator().manual_seed(seed)
-    axis, spread = _unit(lobes, g), torch.logspace(*sharpness, lobes, dtype=torch.float64)
+    axis = _unit(lobes, g)
+    spread = torch.logspace(*sharpness, lobes, dtype=torch.float64)
     light = SimpleNamespace(axis=axis, sharpness=spread, weight=torch.rand(lobes, 3, generator=g).double())
     diffuse, specular, roughness = (torch.tensor(v).double() for v in ([0.3, 0.2, 0.1], [0.2, 0.3, 0.4], 0.4))
     normals = _unit(points, g)
