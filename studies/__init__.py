@@ -2,7 +2,7 @@
 
 A study solves made sets of observations in many settings and compares the answers with what the sets were made of.
 
-catalogue   a module for each study: what it varies, what it measures, what the paper says; begin there, and in `study`,
+catalogue   all studies: what each varies, what it measures, what the paper says; begin there, and in `study`,
             to add one
 steps       what is done for each case, as steps that the project's runner keeps and resumes; on `spheres`, `objects`,
             `body`, `methods`

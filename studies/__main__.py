@@ -1,11 +1,9 @@
 """Command line of the studies: `python -m studies [study …] [--quick]`; all studies without a name.
 
-Make passes STUDY and QUICK on.
+Make passes STUDY, QUICK and FORCE on.
 With --docs the tables of docs/studies.md are written anew afterwards; with --clean the results of studies are
 forgotten, with --gc those that no study names any more are deleted, quick ones among them.
 """
-
-from __future__ import annotations
 
 import os
 import sys
@@ -24,16 +22,15 @@ def run(
     names: Annotated[list[str] | None, typer.Argument(help="studies; all without it; else STUDY")] = None,
     quick: Annotated[bool, typer.Option("--quick", help="one seed, smallest sets; as QUICK=1")] = False,
     one: Annotated[bool, typer.Option("--one", help="a study must be named")] = False,
-    force: Annotated[bool, typer.Option("--force", help="run again, whatever the store holds; as FORCE=1")] = False,
     docs: Annotated[
         bool, typer.Option("--docs", help="also write the tables of docs/studies.md anew, of full studies")
     ] = False,
     clean: Annotated[bool, typer.Option("--clean", help="forget results instead")] = False,
     gc: Annotated[bool, typer.Option("--gc", help="delete results that no study names any more instead")] = False,
 ) -> None:
-    """Run studies, as far as anything must run; SET="executor=tcp://…" says where."""
+    """Run studies, as far as anything must run, with FORCE=1 all of it; SET="executor=tcp://…" says where."""
     if gc:
-        raise typer.Exit(collect(lambda: agreed(force)))
+        raise typer.Exit(collect(lambda: agreed(False)))
     named = names or (os.environ.get("STUDY", "").split() if one else [])
     if one and not named:
         raise InputError("no study is named", key="STUDY", cure="add STUDY=<name>; " + did_you_mean("", STUDIES))
@@ -42,7 +39,7 @@ def run(
         studies(scale).dataset_folder(name)
     if clean:
         raise typer.Exit(forget(scale, named or list(STUDIES)))
-    code = make(scale, named or list(STUDIES), switched_on("FORCE", force), [os.environ.get("SET", "")])
+    code = make(scale, named or list(STUDIES), switched_on("FORCE", False), [os.environ.get("SET", "")])
     if docs and code == 0 and not scale.quick:
         from studies.run.page import refresh_docs
 

@@ -5,8 +5,6 @@ viewer).  A camera that went around it is given by `turn`, view_from_photo, a ro
 lat-long map, stay where they are.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 
 import msgspec

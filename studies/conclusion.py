@@ -6,8 +6,6 @@ Difference  of two settings, seed by seed, because a seed shows the same materia
             together (Bonferroni: each at 1 − .05 / comparisons), over at least `LEAST_SEEDS`.
 """
 
-from __future__ import annotations
-
 import csv
 import io
 from collections.abc import Mapping, Sequence
@@ -27,7 +25,6 @@ MEASURES = {  # label, and the unit where there is one; lower is better where th
     "observed": "DSSIM, observed entries",
     "unobserved": "DSSIM, unobserved entries",
     "new_light": "DSSIM, recovered materials, in every light",
-    "new_material": "DSSIM, every material, in recovered lights",
     "first_material": "DSSIM, material 0 in every light",
     "first_light": "DSSIM, every material in light 0",
     "diffuse": "error of k_d|relative to the truth",

@@ -4,8 +4,6 @@ The gauge is what no observation tells, a factor per channel between the materia
 component.  The true materials fix it.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 

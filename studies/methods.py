@@ -25,8 +25,6 @@ rendered     The answer of a method that finds a reflectance for each material a
 Truths are handed to methods for the gauge alone: photos link all materials and all lights.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping
 
 import msgspec

@@ -11,8 +11,6 @@ Noise      drawn for each pixel by itself: a perturbation leaves what a pixel sh
 Normals    of the mesh that is given, at the pose that is given: perturbed, or fitted to the outline from there
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from functools import cache
 
@@ -33,9 +31,10 @@ from factorlib.geometry.camera import Camera, Pose, rotation_of_vector
 from factorlib.geometry.raster import Caster, rasterise
 from factorlib.meshes.mesh import scaled
 from factorlib.results.materials import Reflectance
+from factorlib.scenes import bodies
+from factorlib.scenes.joint_problems import observations_from_front
 from factorlib.urm.observations import Observations, concatenate
-from studies.scenes import shapes
-from studies.spheres import GRAZING, table_of
+from studies.spheres import GRAZING
 from studies.study import Case, Objects, light_name
 
 BODIES = ("blob", "jug", "hook")
@@ -46,11 +45,11 @@ CAMERA = Camera(SIDE, SIDE, FAR * SIDE, (SIDE / 2, SIDE / 2))
 @cache
 def body(name: str, triangles: int | None = None) -> Caster:
     """Return a body of one material, or a mesh of few triangles that stands for it."""
-    parts = [(vertices, faces, 1) for vertices, faces, _ in shapes.SHAPES[name]()]
+    parts = [(vertices, faces, 1) for vertices, faces, _ in bodies.SHAPES[name]()]
     if triangles is not None:
         total = sum(len(faces) for _, faces, _ in parts)
-        parts = [shapes.decimated(part, max(round(triangles * len(part[1]) / total), 8)) for part in parts]
-    return Caster(shapes.mesh_of(parts, name))
+        parts = [bodies.decimated(part, max(round(triangles * len(part[1]) / total), 8)) for part in parts]
+    return Caster(bodies.mesh_of(parts, name))
 
 
 def observed(
@@ -85,12 +84,11 @@ def _entry(case: Case, m: int, li: int, material: Reflectance, light: Octahedral
     true, given = (of.normal.reshape(-1, 3)[pixels] for of in (true_maps, maps))
     radiance = ball(light, material, true @ YUP_FROM_CAMERA.T)
     noise = np.random.default_rng([13, case.seed, li, m, 0]).standard_normal((maps.label.size, 3))[pixels]
-    labels = np.full(len(pixels), case.materials.index(m))
-    zero = np.zeros(len(pixels), int)
-    table = table_of(
-        case, li, given, radiance * (1 + case.noise * noise), labels, pixels, zero, sure.reshape(-1)[pixels]
-    )
-    return table, angle_deg(true, given)
+    labels, names = np.full(len(pixels), case.materials.index(m)), tuple(case.material_names)
+    weight = sure.reshape(-1)[pixels]
+    columns = {"x": pixels, "y": np.zeros(len(pixels), int), "weight": weight, "confidence": weight}
+    noisy = radiance * (1 + case.noise * noise)
+    return observations_from_front(given, noisy, labels, names, light_name(li), **columns), angle_deg(true, given)
 
 
 def perturbed(name: str, truth: Pose, how: Objects, rng: np.random.Generator) -> tuple[Caster, Pose]:

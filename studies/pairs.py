@@ -18,8 +18,6 @@ Cause      the same with one factor recovered and the others true.  The factor p
            which no photograph tells, is first moved from the lights to the materials, so it counts as theirs.
 """
 
-from __future__ import annotations
-
 import csv
 import io
 import sys

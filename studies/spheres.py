@@ -12,8 +12,6 @@ Labels     likewise: the pixel is of one material, its label names another one o
 Facets     rendered so: a flat-sided object, whose normals are true but few.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 
@@ -27,6 +25,7 @@ from factorlib.generate.synthetic import light_of
 from factorlib.geometry.sphere import ball_normals
 from factorlib.images.exr import read_rgb_exr
 from factorlib.results.materials import Reflectance
+from factorlib.scenes.joint_problems import observations_from_front
 from factorlib.tracing.scene import look
 from factorlib.urm.observations import Observations
 from studies.study import SEVEN, Case, light_name
@@ -104,41 +103,8 @@ def _photo(case: Case, number: int, materials: Sequence[Reflectance], light: Oct
     turned = [tilted(in_camera(normals), case.normal_deg, rng(m, "normals")) for m in rows]
     others = [index(m) for m in rows]
     labels = [mislabelled(len(normals), index(m), others, case.wrong_labels, rng(m, "labels")) for m in rows]
-    return table_of(case, number, np.concatenate(turned), np.concatenate(noisy), np.concatenate(labels))
-
-
-def table_of(
-    case: Case,
-    light: int,
-    normal: np.ndarray,
-    radiance: np.ndarray,
-    material: np.ndarray,
-    x: np.ndarray | None = None,
-    y: np.ndarray | None = None,
-    confidence: np.ndarray | None = None,
-) -> Observations:
-    """Return observations of one photo in one light, seen from the front; nothing is clipped.
-
-    normal: camera's frame;  material: numbers among those of the case;  x, y: pixels;  confidence: of normals, which is
-            their weight
-    """
-    n, zero, photo = len(normal), np.zeros(len(normal), int), (light_name(light),)
-    return Observations(
-        normal=normal,
-        view=np.tile(FRONT, (n, 1)),
-        radiance=radiance,
-        clipped=np.zeros((n, 3), bool),
-        material=material,
-        photo=zero,
-        illumination=zero,
-        x=np.arange(n) if x is None else x,
-        y=zero if y is None else y,
-        weight=np.ones(n) if confidence is None else confidence,
-        materials=tuple(case.material_names),
-        photos=photo,
-        illuminations=photo,
-        confidence=confidence,
-    )
+    columns = (np.concatenate(turned), np.concatenate(noisy), np.concatenate(labels))
+    return observations_from_front(*columns, tuple(case.material_names), light_name(number))
 
 
 def tilted(normals: Float[np.ndarray, "n 3"], degrees: float, rng: np.random.Generator) -> Float[np.ndarray, "n 3"]:

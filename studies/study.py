@@ -3,8 +3,6 @@
 Nothing here imports science, for plans are made of it.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from typing import Any, Literal
 
@@ -119,7 +117,7 @@ class Score(msgspec.Struct, frozen=True):
     values: dict[str, float]
     nulls: dict[str, float] = {}
 
-    def __or__(self, other: Score) -> Score:
+    def __or__(self, other: "Score") -> "Score":
         """Return the measures of both."""
         return Score(self.values | other.values, self.nulls | other.nulls)
 

@@ -18,7 +18,6 @@ SCIENCE = {"numpy", "torch", "scipy", "OpenImageIO", "PIL"}
     ("import factorlib.__main__; from factorlib.runner.project import photo_sets; photo_sets(); from factorlib.runner import dataset_state",
      {*SCIENCE, "rich", "filelock", "typer", "pydantic"}),
     (f"{READ}; d = read_dataset('data/eames'); [dataset_slice(d, s) for s in SLICES]", SCIENCE),
-    ("from studies.run import STUDIES; from studies.study import FULL; [s.cases(FULL) for s in STUDIES.values()]", SCIENCE),
     ("from factorlib.reflection import reflection_operator; reflection_operator('paper_network')", {"mitsuba"}),
 ])  # fmt: skip
 def test_what_must_start_quickly_loads_nothing_heavy(code, heavy):

@@ -1,4 +1,1 @@
-"""The studies, a module each; `studies.run` lists them.  docs/studies.md says of each what is varied and measured.
-
-What is done for each case are the steps in `studies.steps`.  No module imports science at its top.
-"""
+"""Studies: what each varies, what it measures, what the paper says, and what a full run tests."""

@@ -1,16 +1,14 @@
 """Poses against rendered truth: success, doubts, time.  `make results ONLY=align`.
 
-Photographed are the shapes of `studies/scenes/shapes.py`, whose pose is known.  Rotations are uniform over SO(3), focal
-lengths log-uniform (`FOCALS`), sizes and places uniform where the frame cuts nothing; a pose is searched without any of
-these.
+Photographed are the bodies of `factorlib/scenes/bodies.py`, whose pose is known.  Rotations are uniform over SO(3),
+focal lengths log-uniform (`FOCALS`), sizes and places uniform where the frame cuts nothing; a pose is searched without
+any of these.
 
     exact      the mesh that was photographed                   rough          500 triangles, warped by 3 %
     wrong mesh      the mesh of another shape                   wrong mask     a random blot where the object was
     mirrored mask   left and right exchanged                    tiny mask      the object so far away that some 20
                     pixels show it
 """
-
-from __future__ import annotations
 
 import resource
 import zlib
@@ -29,9 +27,9 @@ from factorlib.align.silhouette import label_agreement, silhouette_iou, silhouet
 from factorlib.geometry.camera import Camera, Pose
 from factorlib.geometry.raster import Caster, Maps, rasterise
 from factorlib.meshes.mesh import Mesh
+from factorlib.scenes import bodies
+from factorlib.scenes.bodies import SHAPES
 from studies.measured.tools import Clock, Tables, exacts
-from studies.scenes import shapes
-from studies.scenes.shapes import SHAPES
 
 WIDTH, HEIGHT = 640, 480
 FOCALS = (0.8, 2.5)  # of the width
@@ -60,16 +58,16 @@ def case(kind: str, shape: str, seed: int, number: int) -> Case:
     """Return the photo of that kind; the same one for the same arguments."""
     rng, given = np.random.default_rng(zlib.crc32(f"{kind} {shape} {seed} {number}".encode())), shape
     fill = TINY_FILL if kind == "tiny mask" else rng.uniform(*FILLS)
-    camera, pose, label = photographed(shapes.mesh(shape), rng, fill)
+    camera, pose, label = photographed(bodies.mesh(shape), rng, fill)
     if kind == "mirrored mask":
         label = label[:, ::-1]
     if kind == "wrong mask":
-        label = _blot(label, shapes.mesh(shape).labels, rng)
+        label = _blot(label, bodies.mesh(shape).labels, rng)
     if kind == "wrong mesh":
         given = str(rng.choice([other for other in SHAPES if other != shape]))
-        label = np.minimum(label, max(shapes.mesh(given).labels))
-    mesh = shapes.rough(given, seed) if kind == "rough" else shapes.mesh(given)
-    truth = rasterise(shapes.mesh(shape), camera, pose)
+        label = np.minimum(label, max(bodies.mesh(given).labels))
+    mesh = bodies.rough(given, seed) if kind == "rough" else bodies.mesh(given)
+    truth = rasterise(bodies.mesh(shape), camera, pose)
     return Case(camera, pose, np.ascontiguousarray(label), mesh, truth)
 
 

@@ -14,8 +14,6 @@ in build/bench/eames-like, results in build/ (of captured ones in the copies).  
 [seed …]` prints the table of data/eames and of sets of these seeds, in made light or, with LIGHTS, in captured light.
 """
 
-from __future__ import annotations
-
 import hashlib
 import os
 import shutil

@@ -4,8 +4,6 @@ Materials and lights are those of the studies' world `SEED`; spheres are rendere
 operator that solves, with .2 % of noise.  `make results ONLY=exact_sets` (10 min of one core).
 """
 
-from __future__ import annotations
-
 import numpy as np
 
 from factorlib.evaluate.ball import octahedral_light

@@ -3,8 +3,6 @@
 Recipes are the files in recipes/ and recipes/eames/: a new one appears by itself.
 """
 
-from __future__ import annotations
-
 import os
 import subprocess
 import sys

@@ -18,8 +18,6 @@ the maps' mean exposure, which is no property of light. For the same reason the 
 EXPOSURE_VARIANCE.
 """
 
-from __future__ import annotations
-
 import hashlib
 from collections.abc import Sequence
 from functools import partial

@@ -3,8 +3,6 @@
 It takes `make setup EXTRAS=notebook`.
 """
 
-from __future__ import annotations
-
 from pathlib import Path
 
 from factorlib.errors import InputError

@@ -7,20 +7,15 @@ Time       of one evaluation, that is, one observation and one lobe, diffuse and
            least and the median of the repeats. Ratios between operators hold; absolute times are the machine's.
 """
 
-from __future__ import annotations
-
-import os
 import statistics
 import time
 from collections.abc import Callable
-from unittest.mock import patch
 
 import torch
 from torch import Tensor
 from torch.nn.functional import normalize
 
-from factorlib.errors import InputError
-from factorlib.reflection import Operator, reflection_operator
+from factorlib.reflection import Operator
 from factorlib.reflection.lobe import lobe_integral
 from factorlib.reflection.operator import NAMES
 from factorlib.reflection.reference import Reference
@@ -35,8 +30,8 @@ from factorlib.reflection.samples import (
     specular_samples,
     specular_table,
 )
+from factorlib.scenes import operator_cases as laws
 from studies.measured.tools import Tables, exact
-from studies.scenes import operators as laws
 
 REFERENCE, FAST = "reference", [name for name in NAMES if name != "reference"]
 TOLERANCES = {"reference 10⁻²": 1e-2, "reference 10⁻⁴": 1e-4, REFERENCE: 1e-7}
@@ -48,16 +43,6 @@ LOBES, REPEATS = 64, 7
 # ── The operators as they can be run ─────────────────────────────────────────────────────────────────────────────────
 
 
-def made(name: str, dtype: str, *, compiled: bool = True) -> Operator | None:
-    """Return the operator in this precision; None where there is none, or nothing of it is compiled to leave out."""
-    with patch.dict(os.environ, {} if compiled else {"FACTORLIB_FUSED": "0"}):
-        try:
-            operator = reflection_operator(name, dtype=dtype)
-        except InputError:
-            return None
-    return operator if compiled or hasattr(operator, "fused") else None
-
-
 def variants() -> dict[str, Operator]:
     """Return fast operators by label, e.g. "network float32".
 
@@ -65,9 +50,9 @@ def variants() -> dict[str, Operator]:
     """
     operators: dict[str, Operator | None] = {}
     for name in FAST:
-        operators |= {f"{name} {dtype}": made(name, dtype) for dtype in ("float32", "float64")}
+        operators |= {f"{name} {dtype}": laws.operator_variant(name, dtype) for dtype in ("float32", "float64")}
         if any(getattr(operators[f"{name} float32"], "fused", {}).values()):
-            operators[f"{name} float32 torch"] = made(name, "float32", compiled=False)
+            operators[f"{name} float32 torch"] = laws.operator_variant(name, "float32", compiled=False)
     return {label: operator for label, operator in operators.items() if operator is not None}
 
 
@@ -163,7 +148,7 @@ def microseconds(
     return {label: [of[1:] for of in pair] for label, pair in taken.items()}  # the first one compiles
 
 
-# ── Special cases and laws of `studies/scenes/operators.py`; `tests/reflection/test_stability.py` has bounds ────────
+# ── Special cases and laws ───────────────────────────────────────────────────────────────────────────────────────────
 
 
 def measures(given: laws.Pairs, fast: dict[str, Operator], with_reference: bool = True) -> dict[str, dict[str, float]]:
@@ -185,15 +170,17 @@ def measures(given: laws.Pairs, fast: dict[str, Operator], with_reference: bool 
 
 
 LAWS: dict[str, Callable[[Operator], tuple[float, ...]]] = {
-    "reflection of a unit lobe, at most 1: roughness ≥ .1, n·o ≥ .02": lambda o: laws.unit_lobes(o, laws.USUAL),
-    "… roughness ≥ .1, n·o ≥ 10⁻⁴": lambda o: laws.unit_lobes(o, laws.WIDER),
-    "… roughness ≥ .03, n·o ≥ 10⁻⁴": lambda o: laws.unit_lobes(o, laws.WHOLE),
-    "least of it, at least 0": laws.least_reflected,
-    "GGX of k_s = 1 under constant light, at most 1": laws.constant_light,
-    "white Lambert under constant light, distance from 1": laws.white_lambert,
-    "point light (λ = 10⁶), distance from the BRDF": laws.point_light,
-    "everything turned: change over the largest radiance": laws.turned,
-    "weights times 10⁶: relative change of radiance / 10⁶": laws.scaled,
+    "reflection of a unit lobe, at most 1: roughness ≥ .1, n·o ≥ .02": lambda o: laws.reflection_of_unit_lobes(
+        o, laws.USUAL
+    ),
+    "… roughness ≥ .1, n·o ≥ 10⁻⁴": lambda o: laws.reflection_of_unit_lobes(o, laws.WIDER),
+    "… roughness ≥ .03, n·o ≥ 10⁻⁴": lambda o: laws.reflection_of_unit_lobes(o, laws.WHOLE),
+    "least of it, at least 0": laws.least_reflection,
+    "GGX of k_s = 1 under constant light, at most 1": laws.reflection_of_constant_light,
+    "white Lambert under constant light, distance from 1": laws.white_lambert_error,
+    "point light (λ = 10⁶), distance from the BRDF": laws.point_light_error,
+    "everything turned: change over the largest radiance": laws.rotation_error,
+    "weights times 10⁶: relative change of radiance / 10⁶": laws.scaling_error,
 }
 
 

@@ -4,8 +4,6 @@
 reference over `factorlib.reflection.samples` are written beside the weights, in paper_accuracy.json.
 """
 
-from __future__ import annotations
-
 import numpy as np
 import torch
 

@@ -10,8 +10,6 @@ Not every turn between the two answers is an error of the alignment.  Taken off,
     the common turn    of all photos of a set, about the mesh's axes: how the mesh lies in the reference's frame
 """
 
-from __future__ import annotations
-
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
@@ -30,10 +28,10 @@ from factorlib.jsonfile import read_result
 from factorlib.meshes.read import read_mesh
 from factorlib.results.photos import read_photo_facts
 from factorlib.results.poses import PhotoPoses, read_photo_poses
+from factorlib.scenes.stage_runs import run_stages
 from stages import align, masks
 from studies.measured.align import normal_error_deg, share
 from studies.measured.tools import Clock, Tables, needed
-from studies.steps.photos import run_stages
 
 REFERENCE = "reference_poses.json"
 CURE = "name a dataset whose poses are known, as align's poses.json has them"

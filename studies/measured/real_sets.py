@@ -5,8 +5,6 @@ So DSSIM and PSNR of the re-synthesis stand beside that of flat colours, each ma
 colour, which nothing solved knows of. The pipeline runs first, as `make evaluate` does, as far as anything must run.
 """
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import msgspec

@@ -3,7 +3,8 @@
 `python -m studies.measured.reference "why they changed"` writes them anew.
 
 It runs the pipeline on data/synthetic with `SEEDS` seeds of the solve (what is current is not run again), as it is and
-SMALL, and writes synthetic.json and small.json in tests/regression: of each number its value with the default seed, its
+SMALL, and writes synthetic.json and small.json in tests/studies/regression: of each number its
+value with the default seed, its
 range and deviation over seeds, the tolerance that follows, and the reasons of all refreshes with what each changed.
 `make test` runs the default seed SMALL and compares, `make test-long` runs it as it is.  Of SMALL the files of each
 stage count too, so that a change is named where it begins.
@@ -14,8 +15,6 @@ Tolerance    t · √2 · s, s the standard deviation over seeds and t Student's
              any change at all is one of the sources; a change within the tolerance is as small as another seed's.
              What knows no seed has ROUNDING of itself.
 """
-
-from __future__ import annotations
 
 import sys
 import tempfile
@@ -35,7 +34,7 @@ from factorlib.runner.project import Project, photo_sets
 from studies.measured.tools import ROOT, Tables, evaluated, value_at
 
 DATASET, SEEDS, DOUBT, ROUNDING = "synthetic", 5, 0.01, 1e-5
-FOLDER = ROOT / "tests" / "regression"
+FOLDER = ROOT / "tests" / "studies" / "regression"
 COMMAND = '.venv/bin/python -m studies.measured.reference "why the numbers changed"'
 SMALL = ("masks.pixels=3000", "solve.cells=150", "solve.splittings=1", "export.height=64", "export.mitsuba_height=64")
 # dotted path in metrics.json -> lowest, highest, meaning; a quarter beyond the worst of five trained networks × two

@@ -6,8 +6,6 @@ version, the commit, the date and the kind of machine that it was measured on.  
 docs/gallery.md and the outputs of docs/result.ipynb.
 """
 
-from __future__ import annotations
-
 import os
 import subprocess
 import sys

@@ -9,8 +9,6 @@ of the same data set, such as one with another `solve.seed`, stand in for the tr
 so that less than one standard error should lie between them.
 """
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Annotated
 

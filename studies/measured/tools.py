@@ -1,7 +1,5 @@
 """Numbers, tables, marked parts of pages, times and processes, shared by measurements and studies."""
 
-from __future__ import annotations
-
 import os
 import re
 import subprocess

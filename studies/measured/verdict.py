@@ -3,8 +3,8 @@
 `python -m studies.measured.verdict fit test`, with LIGHTS="FOLDER …" of captured maps:
 
 fit    44 sets: data/eames and seeds 111 to 120 of `studies.measured.eames_like`, from 116 on in captured light, four
-       times each, spoilt in ways of `studies.scenes.spoilt`.  The weights of `factorlib.evaluate.verdict` are fitted to
-       them anew, and printed
+       times each, spoilt in ways of `studies.measured.degradations`.  The weights of `factorlib.evaluate.verdict` are
+       fitted to them anew, and printed
 test   20 others of seeds 201 to 205, the last two in captured light, each way once: what is expected with the weights
        as they stand
 
@@ -12,8 +12,6 @@ Sets lie in build/bench/verdict, results in build/.  Printed of each that is nam
 (Spearman), and the deviation; of `fit` also with each set left out of the fit.  Expected and true scores of all that
 are named are in build/bench/verdict/calibration.csv.
 """
-
-from __future__ import annotations
 
 import sys
 from pathlib import Path
@@ -27,9 +25,9 @@ from scipy.stats import spearmanr
 from factorlib.evaluate.verdict import CLIPPED, CONTOUR, FLOOR, MATERIALS, UNEXPLAINED
 from factorlib.images.light_map import maps_in
 from factorlib.wholefile import write_text
+from studies.measured.degradations import MIXED, spoilt
 from studies.measured.eames_like import drawn, folder_of, made
 from studies.measured.tools import ROOT, evaluated, needed, table
-from studies.scenes.spoilt import MIXED, spoilt
 
 PLACE = ROOT / "build/bench/verdict"
 CAPTURED = (116, 117, 118, 119, 120, 204, 205)

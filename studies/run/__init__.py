@@ -6,11 +6,8 @@ build/studies/quick, so that neither `make gc` nor a reader takes one for the ot
 it is written anew after each run (`studies.run.page`), for it takes a second.
 """
 
-from __future__ import annotations
-
 import shutil
 from collections.abc import Callable
-from importlib import import_module
 from pathlib import Path
 from typing import Any
 
@@ -20,13 +17,27 @@ from factorlib.errors import InputError, did_you_mean
 from factorlib.runner import results_folder, verbs
 from factorlib.runner.project import LIBRARY, Data, Project, Provider
 from factorlib.runner.store import FileHashes
+from studies.catalogue import input_errors, matrices, methods
 from studies.study import FULL, QUICK, Scale, Study
 
-ORDER = (  # of the page
-    "matrix-size row-and-column structure label-quality alignment-error progressive leave-one-out paper-sets "
-    "gauss-sphere comparison prior speed parts"
-)
-STUDIES: dict[str, Study] = {n: import_module(f"studies.catalogue.{n.replace('-', '_')}").STUDY for n in ORDER.split()}
+STUDIES: dict[str, Study] = {
+    study.name: study
+    for study in (  # in the order of the page
+        matrices.MATRIX_SIZE,
+        matrices.ROW_AND_COLUMN,
+        matrices.STRUCTURE,
+        input_errors.LABEL_QUALITY,
+        input_errors.ALIGNMENT_ERROR,
+        input_errors.PROGRESSIVE,
+        methods.LEAVE_ONE_OUT,
+        matrices.PAPER_SETS,
+        input_errors.GAUSS_SPHERE,
+        methods.COMPARISON,
+        methods.PRIOR,
+        methods.SPEED,
+        methods.PARTS,
+    )
+}
 SLICES = ("case", "worlds", "sets")
 
 

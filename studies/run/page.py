@@ -1,7 +1,5 @@
 """Pages of studies: paragraph.md and tables of each, index.md of all, and the tables of docs/studies.md."""
 
-from __future__ import annotations
-
 import re
 import shutil
 from collections.abc import Mapping, Sequence

@@ -6,8 +6,6 @@ photos                 data sets of photos, rendered or the checkout's own, as f
 parts, chairs          parts switched off; chairs left out
 """
 
-from __future__ import annotations
-
 import msgspec
 
 

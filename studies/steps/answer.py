@@ -15,8 +15,6 @@ End      The mean loss of the last `FLAT` steps is not 1 % below that of as many
 Process  A process of its own with one thread: a process has one variant of Mitsuba, and sums are the same in every run.
 """
 
-from __future__ import annotations
-
 import logging
 import os
 import subprocess

@@ -7,12 +7,10 @@ it; scaled or not, it is the same picture. Predicted pixels have the photo's sha
 surfaces where the chair is left out, for that light is read off the photo itself.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import Any
+from typing import Any, NamedTuple
 
 import msgspec
 import numpy as np
@@ -40,6 +38,15 @@ MARGIN = 8  # pixels about a chair, in pictures
 Image = Float[np.ndarray, "h w 3"]
 
 
+class Photo(NamedTuple):
+    """Photo of the set: its observations, and the channels that the stages `masks` and `align` write."""
+
+    name: str
+    table: Observations
+    channels: Mapping[str, Any]
+    geometry: Mapping[str, Any]
+
+
 class Chair(msgspec.Struct, frozen=True):
     """The photo, and which of its pixels show a shell with a mesh below it."""
 
@@ -63,23 +70,23 @@ def main(params: Params, inputs: Inputs, out: Path, progress: Progress) -> None:
     case = inputs.facts["dataset.case"]
     (photos,) = inputs["photos"].iterdir()
     tables = {file.stem: read_observations(file) for file in sorted((photos / "urm").glob("*.parquet"))}
-    channels, geometry = (read_exr(photos / stage / f"{case['photo']}.exr") for stage in ("masks", "align"))
-    materials = list(tables[case["photo"]].materials)
-    chairs = {shell: chair_of(materials.index(shell), channels, geometry) for shell in case["shells"]}
+    channels = (read_exr(photos / stage / f"{case['photo']}.exr") for stage in ("masks", "align"))
+    photo = Photo(case["photo"], tables[case["photo"]], *channels)
+    chairs = {shell: chair_of(photo.table.materials.index(shell), photo) for shell in case["shells"]}
     alone = msgspec.structs.replace(inputs, unfinished=None)  # solves must not resume each other's
     images, folder = [], Path()
     with TemporaryDirectory() as solves:
         for number, (shell, chair) in enumerate(chairs.items()):
             if case["prediction"] == "flat":
-                colour = flat_colour(tables, case["photo"], shell, LEGS)
+                colour = flat_colour(tables, photo.name, shell, LEGS)
                 images.append(np.broadcast_to(colour, chair.truth.shape))
                 continue
             observed = case["prediction"] == "observed"
             if not (observed and number):  # what is observed is solved once
-                seen = tables if observed else tables | {case["photo"]: without(tables[case["photo"]], shell)}
+                seen = tables if observed else tables | {photo.name: without(photo.table, shell)}
                 (folder := Path(solves) / shell).mkdir()
                 solved(seen, case["solve"], alone, folder, progress)
-            images.append(predicted(folder, chair, case["photo"], channels, geometry, tables[case["photo"]], observed))
+            images.append(predicted(folder, chair, photo, observed))
     write_json(out / f"{inputs.photo}.json", score_of(list(chairs.values()), images))
     write_png(
         out / f"{inputs.photo}.png", side_by_side([c.beside(of) for c, of in zip(chairs.values(), images, strict=True)])
@@ -91,9 +98,9 @@ def without(table: Observations, material: str) -> Observations:
     return table.take(table.material != table.materials.index(material))
 
 
-def chair_of(label: int, channels: Mapping[str, Any], geometry: Mapping[str, Any]) -> Chair:
-    """Return the chair of a label; channels, geometry: as the stages `masks` and `align` write them."""
-    mesh = np.abs(np.stack([geometry[f"normal.{a}"] for a in "xyz"])).max(axis=0) > 0
+def chair_of(label: int, photo: Photo) -> Chair:
+    """Return the chair of a label."""
+    channels, mesh = photo.channels, np.abs(np.stack([photo.geometry[f"normal.{a}"] for a in "xyz"])).max(axis=0) > 0
     mask = (np.rint(channels["label"]) == label + 1) & (channels["valid"] > 0.5) & mesh
     return Chair(np.stack([channels[c] for c in "RGB"], axis=-1).astype(float), mask)
 
@@ -114,15 +121,7 @@ def flat_colour(tables: dict[str, Observations], photo: str, shell: str, beside:
     return of(tables[photo], beside).mean(0) * np.exp(ratio)
 
 
-def predicted(
-    folder: Path,
-    chair: Chair,
-    photo: str,
-    channels: Mapping[str, Any],
-    geometry: Mapping[str, Any],
-    table: Observations,
-    bounces: bool,
-) -> Image:
+def predicted(folder: Path, chair: Chair, photo: Photo, bounces: bool) -> Image:
     """Predict the shell's pixels by a solve's materials and the photo's light, exposure and tone curve.
 
     Other pixels are zero.
@@ -130,16 +129,17 @@ def predicted(
     bounces: whether light that surfaces send each other is added, if the solve had it: it is read off the photo
     """
     answer, around = read_materials(folder / "materials.json"), None
-    exposure = np.array(read_exposures(folder / "exposures.json").get(photo, 1.0))
-    lobes = read_lobes(folder / "lobes.parquet")[photo].scaled(exposure)
+    exposure = np.array(read_exposures(folder / "exposures.json").get(photo.name, 1.0))
+    lobes = read_lobes(folder / "lobes.parquet")[photo.name].scaled(exposure)
     if answer.model.self_shadowing:
         with_bounces = bounces and answer.model.interreflection
-        around = Surroundings(table, bounced_light(table, table.radiance.astype(float)) if with_bounces else None)
-    reflectances = in_order(answer, list(table.materials), folder / "materials.json")
-    alone = {**channels, "label": np.where(chair.mask, channels["label"], 0.0)}
-    reflector = Reflector(reflection_operator("network"), lobes, curvature=answer.model.curvature(photo))
-    image = resynthesised(reflector, reflectances, alone, geometry, surroundings=around)
-    tone = answer.model.tone.get(photo)
+        sent = bounced_light(photo.table, photo.table.radiance.astype(float)) if with_bounces else None
+        around = Surroundings(photo.table, sent)
+    reflectances = in_order(answer, list(photo.table.materials), folder / "materials.json")
+    alone = {**photo.channels, "label": np.where(chair.mask, photo.channels["label"], 0.0)}
+    reflector = Reflector(reflection_operator("network"), lobes, curvature=answer.model.curvature(photo.name))
+    image = resynthesised(reflector, reflectances, alone, photo.geometry, surroundings=around)
+    tone = answer.model.tone.get(photo.name)
     return shown(image, tone.exponent, tone.pivot) if tone else image
 
 

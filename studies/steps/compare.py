@@ -1,6 +1,6 @@
-"""Errors of a method's predictions of photos that were not taken: writes <case>.json.
+"""Errors of a method's predictions of photos that were not taken.
 
-Pictures and shots.json go into <case>/.
+Writes <case>.json, and <case>.png with some of the predictions, the truth above each.
 
 Three kinds of pictures of the sphere, each compared with the truth by DSSIM inside the sphere's outline, after the tone
 map of `factorlib.evaluate.picture_errors` at an exposure that takes the truth's white to 1:
@@ -17,11 +17,8 @@ tells, which the true materials fix; one number for all pictures of the kind (`_
 picture (`_balanced`).
 
 The rest are the errors of the reflectances that a method states, those of three spheres in the lights that it states,
-and the processor seconds that it took.  What a method does not state has no score.  <shot>.png is a prediction,
-<shot>-truth.png the truth beside it; shots.json has their DSSIM.  <case>.png: some of them, the truth above.
+and the processor seconds that it took.  What a method does not state has no score.
 """
-
-from __future__ import annotations
 
 import time
 from collections.abc import Iterator, Mapping, Sequence
@@ -61,11 +58,6 @@ class Shot(msgspec.Struct, frozen=True):
     light: int
     view: str
 
-    @property
-    def name(self) -> str:
-        """Name of its picture's file."""
-        return f"{self.kind}-{self.material}-light{self.light}-{self.view}"
-
 
 class Taken(msgspec.Struct, frozen=True):
     """The true photo and the predicted one, as radiance; white: radiance that both are shown with as white."""
@@ -99,24 +91,14 @@ def main(params: Params, inputs: Inputs, out: Path, progress: Progress) -> None:
     """Compare with the truth."""
     case = msgspec.convert(inputs.facts["dataset.case"], Comparison)
     numbers = range(msgspec.convert(inputs.facts["dataset.worlds"], Lights).lights)
-    world, home = World(materials_of(case.seed), read_maps(inputs["worlds"], case.seed, numbers)), out / inputs.photo
+    world = World(materials_of(case.seed), read_maps(inputs["worlds"], case.seed, numbers))
     photos, _ = photographed(case, world.materials, world.lights)
     prediction, seconds = answer(case, photos, inputs["answer"] / inputs.photo, world.materials)
     taken = shots(case, world, prediction)
     write_json(out / f"{inputs.photo}.json", score_of(world, prediction, taken, seconds))
-    home.mkdir()
-    for of in taken:
-        write_png(home / f"{of.shot.name}-truth.png", of.picture(of.truth))
-        write_png(home / f"{of.shot.name}.png", of.picture(of.predicted))
-    write_json(home / "shots.json", [(of.shot, of.dssim()) for of in taken])
     some = [taken[k] for k in np.unique(np.linspace(0, len(taken) - 1, COLUMNS).round().astype(int))]
     pairs = [np.concatenate([of.picture(of.truth), of.picture(of.predicted)]) for of in some]
     write_png(out / f"{inputs.photo}.png", np.concatenate(pairs, axis=1))
-
-
-def read_shots(folder: Path) -> list[tuple[Shot, float]]:
-    """Read the shots.json of a case: shots, and DSSIM with nothing scaled."""
-    return msgspec.convert(read_json(folder / "shots.json"), list[tuple[Shot, float]])
 
 
 def answer(

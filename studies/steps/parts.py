@@ -1,7 +1,5 @@
 """Error of a rendered set that `solve` solves with one part of the model switched off: writes <case>.json."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from tempfile import TemporaryDirectory
 

@@ -7,9 +7,8 @@ DSSIM inside the disc after the tone map of `factorlib.evaluate.picture_errors`,
     entries        recovered materials in recovered lights: every entry of the observed rows and columns; observed,
                    unobserved: those entries alone; no factor is in it where a material and a light are connected
     new_light      recovered materials in all true lights of the world, those that the case never saw among them
-    new_material   all true materials of the world in the recovered lights, those that the case never saw among them
-    first_material, first_light   of those, the material 0 and the light 0 of the world alone, which cases of all sizes
-                                  share
+    first_material   the recovered material 0 in all true lights; first_light: all true materials in the recovered light
+                     0.  Cases of all sizes share these two
 
 The rest are errors of the materials' numbers, of three spheres in the recovered lights, the standard errors that the
 solve states, the seconds that it took, and how coloured lights are, which is what the paper's prior acts on:
@@ -25,8 +24,6 @@ materials (rows) in all lights, the truth and, right of it, what was recovered; 
 frame.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Mapping
 from pathlib import Path
 
@@ -34,7 +31,7 @@ import msgspec
 import numpy as np
 from jaxtyping import Float, UInt8
 
-from factorlib.evaluate.ball import constant_light, octahedral_light
+from factorlib.evaluate.ball import octahedral_light
 from factorlib.evaluate.comparison_gauge import connected_components
 from factorlib.evaluate.material_errors import GREY
 from factorlib.evaluate.picture_errors import picture_error, white_of
@@ -64,7 +61,7 @@ def main(params: Params, inputs: Inputs, out: Path, progress: Progress) -> None:
         write_png(out / f"{inputs.photo}.png", np.concatenate([spheres.matrix(true=True), spheres.matrix()], axis=1))
 
 
-def scored(case: Case, truths: Table, maps: Maps, table: Mapping[str, Solved], own: Maps) -> tuple[Spheres, Score]:
+def scored(case: Case, truths: Table, maps: Maps, table: Mapping[str, Solved], own: Maps) -> "tuple[Spheres, Score]":
     """Return the spheres that are compared, and all scores.
 
     truths, maps: all true materials and lights of the world;  table, own: those that were solved, in the solve's own
@@ -117,14 +114,12 @@ class Spheres:
 
     def __init__(self, case: Case, materials: Table, lights: Maps, truths: Table, maps: Maps):
         self.case, self.materials, self.truths = case, materials, truths
-        true = {li: octahedral_light(light) for li, light in maps.items()}
-        self.true = {li: Appearances(light) for li, light in true.items()}
-        self.true_means = {li: light.mean for li, light in true.items()}
+        self.true = {li: Appearances(octahedral_light(light)) for li, light in maps.items()}
         self.own = {li: Appearances(octahedral_light(light)) for li, light in lights.items()}
 
     def score(self) -> Score:
         """Return DSSIM of the predictions, and of those of nulls: mean colours, grey materials, constant lights."""
-        names, every, own, true = self.case.material_names, self.truths.items(), self.own, self.true
+        names, own, true = self.case.material_names, self.own, self.true
         pairs = [(n, li) for n in names for li in own]
         seen = {(self.case.names[m], li) for m, li in self.case.entries}
         parts = {"entries": pairs, "observed": seen, "unobserved": [e for e in pairs if e not in seen]}
@@ -134,15 +129,13 @@ class Spheres:
         }
         score = Score(*({p: _mean(of[e] for e in es) for p, es in parts.items() if es} for of in (errors, flat)))
         of_names = {n: _mean(self._dssim(true[li].ball(self.materials[n]), n, li) for li in true) for n in names}
-        of_lights = {li: _mean(self._dssim(own[li].ball(m), n, li) for n, m in every) for li in own}
-        values = {"new_light": _mean(of_names.values()), "new_material": _mean(of_lights.values())}
+        values = {"new_light": _mean(of_names.values())}
         values |= {"first_material": of_names[first]} if (first := self.case.names[0]) in of_names else {}
-        values |= {"first_light": of_lights[0]} if 0 in of_lights else {}
+        if 0 in own:
+            values["first_light"] = _mean(self._dssim(own[0].ball(m), n, 0) for n, m in self.truths.items())
         grey = times(GREY, factor_of(dict.fromkeys(names, GREY), self.truths))
-        white = Appearances(constant_light(np.ones(3)))
         greys = (self._dssim(true[li].ball(grey), n, li) for n in names for li in true)
-        constants = (self._dssim(white.ball(m) * self.true_means[li], n, li) for n, m in every for li in own)
-        return score | Score(values, {"new_light": _mean(greys), "new_material": _mean(constants)})
+        return score | Score(values, {"new_light": _mean(greys)})
 
     def _dssim(self, predicted: Float[np.ndarray, "_ 3"], name: str, light: int) -> float:
         truth = _disc(self.true[light].ball(self.truths[name]))

@@ -5,8 +5,6 @@ materials and lights as they lie there, and of objects the mean error of the nor
 they differ from run to run.  What was solved to start from does not count in them.
 """
 
-from __future__ import annotations
-
 import time
 from collections.abc import Mapping
 from pathlib import Path

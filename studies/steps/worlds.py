@@ -3,8 +3,6 @@
 Mitsuba's scalar variant traces, which every machine has: the faster one gives other noise, and so other worlds.
 """
 
-from __future__ import annotations
-
 import os
 from pathlib import Path
 

@@ -9,13 +9,13 @@ from factorlib.images.picture import read_png
 from factorlib.runner import verbs
 from factorlib.runner.project import LIBRARY, Project, photo_sets
 from factorlib.sheet import HEAD, MARGIN, MESH_SIDE, write_sheet
-from tests.faults import good
+from tests.faults import sample
 
 
 def test_validate_writes_a_row_for_each_photo_with_its_labels_and_meshes_always_the_same(tmp_path, capsys):
     (tmp_path / "pipeline.yaml").write_text((LIBRARY / "pipeline.yaml").read_text())
     (tmp_path / "stages").symlink_to(LIBRARY / "stages")
-    folder = good.make_set(tmp_path / "data" / "set")
+    folder = sample.make_set(tmp_path / "data" / "set")
     project, sheet, done = Project(tmp_path, photo_sets()), tmp_path / "build" / "set" / "sheet.png", []
     assert verbs.validate(project, str(folder), [], sheet=True) == 0 and "contact sheet" in capsys.readouterr().out
     write_sheet(folder, tmp_path / "again.png", lambda k, total: done.append((k, total)))
@@ -28,4 +28,4 @@ def test_validate_writes_a_row_for_each_photo_with_its_labels_and_meshes_always_
     assert len(unfinished) == len(read_png(tmp_path / "again.png")) and (unfinished != 255).any()
     (tmp_path / "again.png").replace(sheet)
     height = HEAD + 2 * MARGIN + 2 * (MESH_SIDE + HEAD + MARGIN)
-    assert read_png(sheet).shape == (height, 2 * (good.W + MARGIN) + 2 * (MESH_SIDE + MARGIN), 3)
+    assert read_png(sheet).shape == (height, 2 * (sample.W + MARGIN) + 2 * (MESH_SIDE + MARGIN), 3)

@@ -11,8 +11,9 @@ from factorlib.inference.materials import Point
 from factorlib.inference.problem import JointProblem
 from factorlib.reflection import reflection_operator
 from factorlib.results.materials import Reflectance
+from factorlib.scenes.joint_problems import MATERIALS, block, random_light, sphere_normals
+from factorlib.scenes.joint_problems import observations_from_front as seen_from_the_front
 from factorlib.urm.observations import Observations
-from studies.scenes.problems import MATERIALS, block, random_light, sphere_normals
 from tests.integral import reflected
 
 OPERATOR = reflection_operator("closed_form", dtype="float64")
@@ -57,9 +58,7 @@ def three_rooms() -> tuple[JointProblem, Point]:
     """Three materials in three lights, and a wrong point."""
     rng = np.random.default_rng(4)
     lights = [random_light(rng, 3) for _ in range(3)]
-    blocks = [
-        block(f"room{k}", light, MATERIALS, [0, 1, 2], OPERATOR, size=10, seed=k) for k, light in enumerate(lights)
-    ]
+    blocks = [block(f"room{k}", light, MATERIALS, [0, 1, 2], OPERATOR, size=10) for k, light in enumerate(lights)]
     guess = [random_light(rng, 4) for _ in range(3)]
     return JointProblem(blocks, OPERATOR), Point(
         MATERIALS, [msgspec.structs.replace(li, weight=li.weight / 10) for li in guess]
@@ -83,19 +82,6 @@ def traced(normals, sees, light: Light, material: int, count=12_000):
     incoming = np.exp(light.sharpness * (d @ light.axis.T - 1)) @ light.weight * 4 * np.pi / count
     views, one = np.tile([0.0, 0.0, -1.0], (len(normals), 1)), Reflectance(row[:3], row[3:6], row[6])
     return reflected(one, normals, views, d, incoming, sees(normals, d))
-
-
-def seen_from_the_front(normal, radiance, material, names, name="room", **more) -> Observations:
-    """What one photo shows of surfaces of those normals; more: columns that are others than usual."""
-    n, zero = len(normal), np.zeros(len(normal), int)
-    usual = {
-        "view": np.tile([0.0, 0.0, -1.0], (n, 1)),
-        "clipped": np.zeros((n, 3), bool),
-        "photo": zero,
-        "illumination": zero,
-    }
-    usual |= {"x": np.arange(n), "y": zero, "weight": np.ones(n), "photos": (name,), "illuminations": (name,)}
-    return Observations(normal=normal, radiance=radiance, material=material, materials=names, **usual | more)
 
 
 def bowls(name, light, size=16, count=512) -> Observations:

@@ -15,7 +15,7 @@ from factorlib.inference.model_selection import (
     compare_models,
     held_out_losses,
 )
-from studies.scenes.problems import MATERIALS
+from factorlib.scenes.joint_problems import MATERIALS
 from tests.inference.made import none_held_out
 from tests.inference.made_lights import photographed
 

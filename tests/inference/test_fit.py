@@ -18,7 +18,7 @@ from factorlib.inference.likelihood import cholesky_factor, cholesky_inverse
 from factorlib.inference.materials import Materials
 from factorlib.inference.priors import BRIGHTNESS_DEVIATION, MEDIAN_BRIGHTNESS
 from factorlib.inference.problem import JointProblem
-from studies.scenes.problems import MATERIALS, factor_between
+from factorlib.scenes.joint_problems import MATERIALS, factor_between
 from tests.inference.made_lights import (
     FEW,
     OPERATOR,

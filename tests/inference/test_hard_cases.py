@@ -28,8 +28,8 @@ from factorlib.inference.problem import JointProblem
 from factorlib.inference.start import BRIGHTEST_AT_START, constant_light, mean_albedo, start_from_photos
 from factorlib.inference.uncertainty import estimate_uncertainty
 from factorlib.jsonfile import read_json
+from factorlib.scenes.joint_problems import sphere_normals
 from factorlib.urm.observations import Observations
-from studies.scenes.problems import sphere_normals
 from tests.inference.made import seen_from_the_front
 from tests.inference.made_lights import OPERATOR, light_of
 from tests.stages.test_solve import NAMES as STAGE_NAMES

@@ -13,8 +13,8 @@ from factorlib.inference.interreflection import bounced_light
 from factorlib.inference.materials import Point
 from factorlib.inference.observed import blocks_of_observations
 from factorlib.inference.problem import JointProblem
+from factorlib.scenes.joint_problems import MATERIALS
 from factorlib.urm.observations import Observations
-from studies.scenes.problems import MATERIALS
 from tests.inference.made import OPERATOR, photos_in_a_wrong_light, seen_from_the_front
 
 

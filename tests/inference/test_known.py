@@ -18,7 +18,7 @@ from factorlib.inference.priors import MaterialPrior, PriorTerms, material_unkno
 from factorlib.inference.start import insert_known
 from factorlib.inference.uncertainty import Posterior, project_to_gauge
 from factorlib.light.latlong import map_energy
-from studies.scenes.problems import MATERIALS, sphere_normals
+from factorlib.scenes.joint_problems import MATERIALS, sphere_normals
 from tests.inference.made import seen_from_the_front
 from tests.inference.made_lights import (
     FEW,

@@ -6,7 +6,7 @@ import pytest
 from factorlib.inference.forward import Illumination
 from factorlib.inference.joint_solver import LEAST_SPACING_DEG, SPLIT_CELLS
 from factorlib.inference.lights import Light, fibonacci_cells
-from studies.scenes.problems import MATERIALS, block
+from factorlib.scenes.joint_problems import MATERIALS, block
 from tests.inference.made_lights import OPERATOR, drawn, on_even_cells
 
 DIRECTIONS = np.random.default_rng(1).normal(size=(2000, 3))

@@ -7,7 +7,7 @@ import pytest
 from factorlib.inference.likelihood import EXPOSURE_DEVIATION, TONE_DEVIATION
 from factorlib.inference.priors import material_unknowns, materials_from_unknowns
 from factorlib.inference.problem import JointProblem
-from studies.scenes.problems import MATERIALS
+from factorlib.scenes.joint_problems import MATERIALS
 from tests.inference.made import none_held_out
 from tests.inference.made_lights import OPERATOR, PRIOR, drawn, likelihood, on_even_cells, photographed, spheres
 

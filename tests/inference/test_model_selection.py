@@ -26,8 +26,8 @@ from factorlib.inference.observed import blocks_of_observations
 from factorlib.inference.options import SolveOptions
 from factorlib.inference.problem import JointProblem
 from factorlib.inference.start import start_from_photos
+from factorlib.scenes.joint_problems import MATERIALS, factor_between, sphere_normals
 from factorlib.urm.observations import Observations
-from studies.scenes.problems import MATERIALS, factor_between, sphere_normals
 from tests.inference.made import bowls, none_held_out, rough_light
 from tests.inference.made_lights import OPERATOR, drawn, on_even_cells, spheres
 

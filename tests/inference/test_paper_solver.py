@@ -6,7 +6,7 @@ import torch
 from factorlib.inference.paper_solver import PaperObjective, PaperOptions, draw_subset, solve
 from factorlib.inference.problem import JointProblem
 from factorlib.reflection import reflection_operator
-from studies.scenes.problems import MATERIALS, block, factor_between, random_light
+from factorlib.scenes.joint_problems import MATERIALS, block, factor_between, random_light
 
 OPERATOR = reflection_operator("network")
 EXACT = reflection_operator("closed_form", dtype="float64")
@@ -16,8 +16,7 @@ QUICK = PaperOptions(lobes=8, samplings=200)
 def rooms(photos=1, size=16):
     rng = np.random.default_rng(3)
     return [
-        block(f"room{i}", random_light(rng, 3, photos), MATERIALS, [0, 1, 2], OPERATOR, size=size, seed=i)
-        for i in range(2)
+        block(f"room{i}", random_light(rng, 3, photos), MATERIALS, [0, 1, 2], OPERATOR, size=size) for i in range(2)
     ]
 
 

@@ -1,8 +1,5 @@
 """The prior on materials: what classes it knows, what they cost, and how they are fitted."""
 
-import csv
-
-import msgspec
 import numpy as np
 import pytest
 
@@ -11,16 +8,13 @@ from factorlib.inference.priors import (
     BRIGHTNESS_DEVIATION,
     DIFFUSE_DEVIATION,
     MEDIAN_BRIGHTNESS,
-    Classes,
     MaterialPrior,
     Mixture,
     likeliest_class,
     material_unknowns,
     shipped_classes,
 )
-from factorlib.jsonfile import read_json
-from studies.measured import material_classes
-from studies.scenes.problems import MATERIALS
+from factorlib.scenes.joint_problems import MATERIALS
 from tests.inference.made_lights import photographed
 
 PLASTIC, GOLD, FELT = ([0.03] * 3, 0.2), ([0.3, 0.21, 0.09], 0.2), ([0.22] * 3, 0.9)
@@ -77,22 +71,3 @@ def test_gloss_ten_times_too_strong_at_roughness_1_is_not_expected():
     assert cost([0.3] * 3, 1.0) > cost(*PLASTIC) + 6
     assert cost([0.03] * 3, 1.0) > cost(*PLASTIC) + 6
     assert cost(*PLASTIC) + 3 < cost([0.3] * 3, 0.2) < cost([0.3] * 3, 1.0)
-
-
-def test_classes_are_fitted_to_a_table(tmp_path):
-    """Of five plastics, five steels, five felts."""
-    rng, file, out = np.random.default_rng(0), tmp_path / "measured.csv", tmp_path / "classes.json"
-    with file.open("w", newline="") as written:
-        rows = csv.writer(written)
-        rows.writerow(material_classes.COLUMNS)
-        for name, level, roughness in (("plastic", 0.03, 0.3), ("steel", 0.1, 0.2), ("felt", 0.2, 0.8)):
-            for k in range(5):
-                factor = np.exp(0.1 * rng.normal())
-                rows.writerow([f"{name}-{k}", *[level * factor] * 4, roughness + 0.01 * k])
-    material_classes.main(file, out)
-    classes = msgspec.convert(read_json(out), Classes)
-    assert classes == material_classes.classes_of(file) and classes.made_from == "measured.csv"
-    assert [(one.name, one.share) for one in classes.classes] == [(n, 0.333) for n in ("dielectric", "metal", "fabric")]
-    for one, level, roughness in zip(classes.classes, (0.03, 0.1, 0.2), (0.32, 0.22, 0.82), strict=True):
-        assert one.mean == pytest.approx((np.log(level), roughness), abs=0.15)
-        assert one.tint == 0

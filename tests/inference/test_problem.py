@@ -12,7 +12,7 @@ from factorlib.inference.materials import Materials, Point
 from factorlib.inference.observed import blocks_of_observations
 from factorlib.light.lobes import lobe_integral
 from factorlib.reflection import reflection_operator
-from studies.scenes.problems import MATERIALS, block, random_light
+from factorlib.scenes.joint_problems import MATERIALS, block, random_light
 from tests.inference.made import OPERATOR, bowls, photos_in_a_wrong_light, rough_light, three_rooms
 
 

@@ -12,7 +12,7 @@ from factorlib.inference.forward import Illumination
 from factorlib.inference.lights import UnitLobes, fibonacci_cells
 from factorlib.inference.materials import Materials
 from factorlib.inference.responses import NODES, ResponseTable, diffuse_response, specular_response
-from studies.scenes.problems import MATERIALS, block
+from factorlib.scenes.joint_problems import MATERIALS, block
 from tests.inference.made_lights import OPERATOR, drawn, on_even_cells
 
 CELLS, ALL = 60, RobustLoss(1e6)  # no outliers
@@ -24,7 +24,7 @@ def made(seed, photos=1, toned=False, hidden=False, bounced=False, clipped=False
     exposure = [0.0, *rng.normal(0, 0.5, photos - 1)]
     light = on_even_cells(drawn(seed, CELLS) * 0.6, exposure, rng.uniform(-0.25, 0.25, photos) if toned else ())
     materials = Materials(rng.uniform(0.05, 0.6, (2, 3)), rng.uniform(0.03, 0.4, (2, 3)), rng.uniform(0.12, 0.9, 2))
-    data = block("room", light, materials, [0, 1], OPERATOR, size=8, seed=seed)
+    data = block(f"room{seed}", light, materials, [0, 1], OPERATOR, size=8)
     light = light.with_log_radiance(light.log_radiance - np.log(data.unit))
     n = len(data)
     if hidden:

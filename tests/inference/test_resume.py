@@ -13,8 +13,8 @@ from factorlib.inference.joint_solver import solve
 from factorlib.inference.options import SolveOptions
 from factorlib.inference.problem import JointProblem
 from factorlib.inference.start import start_from_photos
+from factorlib.scenes.joint_problems import MATERIALS, block, random_light
 from factorlib.stage import serial_map
-from studies.scenes.problems import MATERIALS, block, random_light
 from tests.inference.made_lights import OPERATOR
 
 CHOICES = SolveOptions(cells=24, splittings=1, observations=100)
@@ -44,7 +44,7 @@ def blocks():
     """Two lights with two photos each, some of which is hidden, and some sent by other surfaces, as is made up."""
     rng, directions = np.random.default_rng(4), np.stack([fibonacci_sphere(96)] * 2)
     lights = [random_light(rng, 2, photos=2) for _ in range(2)]
-    made = [block(f"room{i}", li, MATERIALS, [0, 1, 2], OPERATOR, size=6, seed=i) for i, li in enumerate(lights)]
+    made = [block(f"room{i}", li, MATERIALS, [0, 1, 2], OPERATOR, size=6) for i, li in enumerate(lights)]
     seen = [(255 * (rng.random((len(b), 96)) < 0.95)).astype(np.uint8) for b in made]
     hidden = [msgspec.structs.replace(b, visibility=v, directions=directions) for b, v in zip(made, seen)]
     bounced = [msgspec.structs.replace(b, bounced=0.01 * rng.random((len(b), 6))) for b in hidden]

@@ -8,7 +8,7 @@ from factorlib.inference.fit_runner import FitRunner
 from factorlib.inference.joint_solver import SPLIT_CELLS, split_while_gaining
 from factorlib.inference.model_selection import WEAKLY_FOR
 from factorlib.inference.options import SolveOptions
-from studies.scenes.problems import MATERIALS
+from factorlib.scenes.joint_problems import MATERIALS
 from tests.inference.made import none_held_out
 from tests.inference.made_lights import PRIOR, begun, light_of, spheres
 

@@ -14,7 +14,7 @@ from factorlib.inference.model_selection import CLEARLY_AGAINST
 from factorlib.inference.suns import WIDE_SHARPNESS, accept_sun, compare_illuminations, replace_brightest, select_suns
 from factorlib.light.lobes import SUN, lobe_integral
 from factorlib.results.materials import Decision
-from studies.scenes.problems import MATERIALS
+from factorlib.scenes.joint_problems import MATERIALS
 from tests.inference.made_lights import FEW, PRIOR, begun, drawn, on_even_cells, spheres
 
 TOWARDS = np.array([0.36, -0.48, -0.8])

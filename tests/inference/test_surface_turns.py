@@ -25,7 +25,7 @@ from factorlib.inference.surface_turns import (
 )
 from factorlib.meshes.mesh import Mesh
 from factorlib.meshes.subdivision import SubdividedMesh
-from studies.scenes.problems import MATERIALS
+from factorlib.scenes.joint_problems import MATERIALS
 from tests.inference.made import in_units_of, photos_in_a_wrong_light
 from tests.inference.made_lights import PRIOR, begun, drawn, light_of, on_even_cells, photographed, spheres
 from tests.stages.made import Rising

@@ -10,7 +10,7 @@ from factorlib.inference.misfit import unexplained_shares
 from factorlib.inference.problem import JointProblem
 from factorlib.inference.uncertainty import LARGEST_RELATIVE_ERROR, Posterior
 from factorlib.reflection import reflection_operator
-from studies.scenes.problems import MATERIALS, block, factor_between, random_light
+from factorlib.scenes.joint_problems import MATERIALS, block, factor_between, random_light
 from tests.inference.made import in_units_of
 from tests.inference.made_lights import PRIOR, natural
 

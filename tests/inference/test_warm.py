@@ -21,7 +21,7 @@ from factorlib.inference.start import (
 )
 from factorlib.results.materials import Gauge, MaterialTable, Model, Reflectance, Tone
 from factorlib.results.solution import Earlier
-from studies.scenes.problems import MATERIALS, factor_between
+from factorlib.scenes.joint_problems import MATERIALS, factor_between
 from tests.inference.made_lights import FEW, OPERATOR, drawn, natural, on_even_cells, spheres
 
 NAMES, CELLS = ["red", "green", "blue"], 40

@@ -14,19 +14,7 @@ from factorlib.meshes.limits import Limits
 from factorlib.meshes.mesh import area_vectors
 from factorlib.meshes.ply import submesh, write_ply
 from factorlib.meshes.read import read_mesh
-from tests.faults.good import (
-    DATA,
-    MESHES,
-    OFF,
-    PLY,
-    PLY_FACES,
-    PLY_TEXT,
-    STL_TEXT,
-    VERTICES,
-    glb,
-    gltf_header,
-    put,
-)
+from tests.faults.sample import DATA, MESHES, OFF, PLY, PLY_FACES, PLY_TEXT, STL_TEXT, VERTICES, glb, gltf_header, put
 
 MATERIALS = ["red", "oak"]
 PARTS = {"shell": "red", "legs": "oak"}

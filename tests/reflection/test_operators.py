@@ -14,7 +14,7 @@ from factorlib.reflection.network import FEATURES, SHIPPED, Layers, read_layers,
 from factorlib.reflection.operator import Operator
 from factorlib.reflection.reference import diffuse_quadrature
 from factorlib.reflection.samples import diffuse_samples, quantiles, specular_samples
-from studies.scenes.operators import scene
+from factorlib.scenes.operator_cases import scene
 
 FAST = {
     (name, dtype): reflection_operator(name, dtype=dtype)

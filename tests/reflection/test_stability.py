@@ -10,13 +10,12 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from factorlib.reflection import reflection_operator
-from studies.measured.operator import made
-from studies.scenes import operators as laws
-from studies.scenes.operators import ALL, CASES, answers, case, gradient_error, reference_values, value_error
+from factorlib.scenes import operator_cases as laws
+from factorlib.scenes.operator_cases import ALL, CASES, answers, case, gradient_error, reference_values, value_error
 
 FAST = {
     "closed_form": reflection_operator("closed_form"), "network": reflection_operator("network"),
-    "network in torch": made("network", "float32", compiled=False),
+    "network in torch": laws.operator_variant("network", "float32", compiled=False),
     "closed_form float64": reflection_operator("closed_form", dtype="float64"),
     "network float64": reflection_operator("network", dtype="float64"),
 }  # fmt: skip
@@ -159,11 +158,11 @@ def test_nan_reaches_every_value_that_depends_on_it_and_no_other(name, bad):
 @single
 @pytest.mark.parametrize("domain", [laws.USUAL, laws.WIDER, laws.WHOLE], ids=["usual", "wider", "whole"])
 def test_a_unit_lobe_is_reflected_no_brighter_than_it_is(name, domain):
-    assert laws.unit_lobes(FAST[name], domain, 1024)[1] <= BRIGHTEST
-    assert laws.least_reflected(FAST[name], 1024)[0] >= 0
+    assert laws.reflection_of_unit_lobes(FAST[name], domain, 1024)[1] <= BRIGHTEST
+    assert laws.least_reflection(FAST[name], 1024)[0] >= 0
 
 
 @fast
 def test_constant_light_comes_back_from_white(name):
-    assert laws.white_lambert(FAST[name])[0] < 1e-3
-    assert laws.constant_light(FAST[name], 512)[1] < 1.01
+    assert laws.white_lambert_error(FAST[name])[0] < 1e-3
+    assert laws.reflection_of_constant_light(FAST[name], 512)[1] < 1.01

@@ -19,7 +19,7 @@ pytest.importorskip("distributed", reason="make setup EXTRAS=dask")
 from factorlib.errors import InputError
 from factorlib.runner import worker
 from factorlib.runner.project import LIBRARY, read_pipeline, with_settings
-from tests.faults.test_nothing_lost import start, wait_until
+from tests.faults.test_kills import start, wait_until
 from tests.runner import toy
 from tests.runner.toy import files_of, make, write
 

@@ -16,7 +16,7 @@ from factorlib.runner import display, verbs
 from factorlib.runner.plan import Planned, Step
 from factorlib.runner.results_folder import clean, collect
 from factorlib.runner.worker import Events
-from tests.faults.test_nothing_lost import start, wait_until
+from tests.faults.test_kills import start, wait_until
 from tests.runner import toy
 from tests.runner.toy import done, edit, files_of, make, new_runs, reasons, state, write
 

@@ -1,20 +1,20 @@
-"""A project of four small stages over text files, in a folder of its own, with a provider of its own.
+"""A project of four small stages over text files, in a folder and with a provider of its own; and this project in another folder.
 
 `python toy.py <root> <dataset> [setting …]` runs it as a user would, in a process that can be killed.
 """
-
-from __future__ import annotations
 
 import json
 import shutil
 import sys
 from pathlib import Path
+from unittest.mock import patch
 
 import msgspec
 
+from factorlib import __main__ as command_line
 from factorlib.runner import verbs
 from factorlib.runner.dataset_state import survey
-from factorlib.runner.project import Data, Project, Provider
+from factorlib.runner.project import LIBRARY, Data, Project, Provider, photo_sets
 
 LETTERS = '''
 """Counting."""
@@ -165,6 +165,28 @@ def reasons(project: Project, step: str, dataset: str = "set", settings: tuple[s
 def copy(project: Project, target: Path) -> Project:
     shutil.copytree(project.root, target, symlinks=True)
     return toy(target)
+
+
+def real_project(root: Path, *copied: str) -> Project:
+    """This project below a folder: links to what it is made of, copies of those parts that a test will edit."""
+    root.mkdir(parents=True, exist_ok=True)
+    for name in ("pipeline.yaml", "stages", "factorlib", "recipes", "data"):
+        if name in copied and (LIBRARY / name).is_dir():
+            shutil.copytree(LIBRARY / name, root / name, ignore=shutil.ignore_patterns("__pycache__"))
+        elif name in copied:
+            shutil.copy(LIBRARY / name, root)
+        else:
+            (root / name).symlink_to(LIBRARY / name)
+    return Project(root, photo_sets())
+
+
+def call(project: Project, *words: str) -> int | str:
+    """What `python -m factorlib` with these words ends with: an exit code, or its last words."""
+    with patch.object(command_line, "project", lambda: project), patch.object(sys, "argv", ["factorlib", *words]):
+        try:
+            command_line.main()
+        except SystemExit as end:
+            return end.code
 
 
 if __name__ == "__main__":

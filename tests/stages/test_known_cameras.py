@@ -12,8 +12,8 @@ from factorlib.geometry.camera import Camera, Pose, rotation_of_vector
 from factorlib.geometry.raster import Caster, rasterise
 from factorlib.jsonfile import read_json
 from factorlib.meshes.ply import write_ply
+from factorlib.scenes.stage_runs import run_stages
 from stages import align, masks
-from studies.steps.photos import run_stages
 from tests.align.scenes import blob, chair, normal_error_deg
 
 CAMERA = Camera(200, 150, 300.0, (104.0, 71.0))

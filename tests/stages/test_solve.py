@@ -19,10 +19,10 @@ from factorlib.light.lobes import Lobes
 from factorlib.reflection import reflection_operator
 from factorlib.reflection.network import SHIPPED
 from factorlib.results.lobe_table import read_lobes
+from factorlib.scenes.joint_problems import MATERIALS, random_light, sphere_normals
 from factorlib.stage import Inputs, silent
 from factorlib.urm.observations import Observations, write_observations
 from stages import solve
-from studies.scenes.problems import MATERIALS, random_light, sphere_normals
 from tests.inference.made import seen_from_the_front
 from tests.runner.toy import files_of
 from tests.stages.made import Rising

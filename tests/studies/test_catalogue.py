@@ -1,5 +1,8 @@
 """The studies: settings, claims, cases and steps fit together; what those measure that are measured in their own module."""
 
+import subprocess
+import sys
+
 import msgspec
 import pytest
 import yaml
@@ -8,7 +11,7 @@ from factorlib.runner.closure import Sources
 from factorlib.runner.project import LIBRARY
 from factorlib.runner.store import FileHashes
 from stages.solve import Params
-from studies.catalogue import parts
+from studies.catalogue import methods
 from studies.conclusion import MEASURES
 from studies.run import STUDIES, studies
 from studies.steps.parts import CHANGES
@@ -51,9 +54,15 @@ def test_every_step_has_a_module_and_takes_what_was_made_before_it():
     assert used == stages.keys()
 
 
+def test_a_plan_of_studies_loads_no_science():
+    code = "import sys; from studies.run import STUDIES; from studies.study import FULL; [s.cases(FULL) for s in STUDIES.values()]"
+    code += "; sys.exit(', '.join({'numpy', 'torch', 'scipy', 'OpenImageIO', 'PIL'} & set(sys.modules)) or 0)"
+    assert subprocess.run([sys.executable, "-c", code], cwd=LIBRARY, check=False).returncode == 0
+
+
 # ── settings ─────────────────────────────────────────────────────────────────────────────────────────────────────────
 
 
 def test_options_of_parts_are_options():
-    for _, _, change, how in parts.WITHOUT.values():
+    for _, _, change, how in methods.WITHOUT.values():
         assert change in CHANGES and msgspec.convert(how, Params)

@@ -10,7 +10,7 @@ import pytest
 from factorlib.conventions import lat_long_directions
 from factorlib.evaluate.material_errors import compare_materials
 from studies.body import photographed
-from studies.catalogue import comparison
+from studies.catalogue import methods as comparison
 from studies.errors import in_gauge, times
 from studies.methods import (
     grey,
@@ -80,7 +80,7 @@ def test_the_truth_in_any_gauge_scores_nothing_a_grey_ball_does_and_what_is_not_
 
     score, taken = scores(true)
     assert {of.shot.kind for of in taken} == set(compare.KINDS)
-    assert len({of.shot.name for of in taken}) == len(taken) == 8 + 2 + 6
+    assert len({of.shot for of in taken}) == len(taken) == 8 + 2 + 6
     measures = [kind + suffix for kind in compare.KINDS for suffix in compare.SUFFIXES.values()]
     assert max(score.values[m] for m in (*measures, "mirror")) < 1e-6 and score.values["roughness"] == 0
     worse, _ = scores(lambda world: grey(photos(side=2, size=12), world.materials))
@@ -102,4 +102,3 @@ def test_from_worlds_to_pictures(tmp_path, monkeypatch):
     assert all({"novel_view", "novel_light", "processor"} <= of.keys() for of in cells.values())
     assert cells["ours"]["novel_view"] < cells["grey"]["novel_view"] and "novel_material" not in cells["projective"]
     assert {path.stem for path in (out / "pictures").iterdir()} == {f"{method}-seed0" for method in cells}
-    assert compare.read_shots(tmp_path / "compare/ours-seed0")[0][1] > 0

@@ -1,5 +1,6 @@
-"""The fit of the prior on natural light: it finds the prior from which maps were drawn, and the command writes what it was made from."""
+"""Fits of the priors on light and on materials: they find what data were drawn from, and name what they were made from."""
 
+import csv
 import hashlib
 
 import msgspec
@@ -10,9 +11,10 @@ from scipy.optimize import approx_fprime
 from factorlib.errors import InputError
 from factorlib.geometry.sphere import fibonacci_sphere
 from factorlib.images.exr import write_rgb_exr
+from factorlib.inference.priors import Classes
 from factorlib.jsonfile import read_json
 from factorlib.light.prior import LightPrior, angles
-from studies.measured import light_prior
+from studies.measured import light_prior, material_classes
 from studies.measured.light_prior import _cost, cell_means, fitted, log_cells, maps_in, mean_of, rounded
 from tests.light.test_prior import KNOWN
 
@@ -71,3 +73,22 @@ def test_the_table_says_what_it_was_made_from_and_how_good_it_is(tmp_path, monke
     assert prior.profile[0][0] > 0.5 and np.isfinite(prior.leave_one_out.prior)
     with pytest.raises(InputError, match="no .hdr or .exr"):
         maps_in([tmp_path])
+
+
+def test_classes_are_fitted_to_a_table(tmp_path):
+    """Of five plastics, five steels, five felts."""
+    rng, file, out = np.random.default_rng(0), tmp_path / "measured.csv", tmp_path / "classes.json"
+    with file.open("w", newline="") as written:
+        rows = csv.writer(written)
+        rows.writerow(material_classes.COLUMNS)
+        for name, level, roughness in (("plastic", 0.03, 0.3), ("steel", 0.1, 0.2), ("felt", 0.2, 0.8)):
+            for k in range(5):
+                factor = np.exp(0.1 * rng.normal())
+                rows.writerow([f"{name}-{k}", *[level * factor] * 4, roughness + 0.01 * k])
+    material_classes.main(file, out)
+    classes = msgspec.convert(read_json(out), Classes)
+    assert classes == material_classes.classes_of(file) and classes.made_from == "measured.csv"
+    assert [(one.name, one.share) for one in classes.classes] == [(n, 0.333) for n in ("dielectric", "metal", "fabric")]
+    for one, level, roughness in zip(classes.classes, (0.03, 0.1, 0.2), (0.32, 0.22, 0.82), strict=True):
+        assert one.mean == pytest.approx((np.log(level), roughness), abs=0.15)
+        assert one.tint == 0

@@ -41,7 +41,7 @@ def test_wrong_names_and_words_are_answered(words, environment, said):
             NAME,
             "solve",
             ["stages.solve", "factorlib.inference.joint_solver"],
-            ["errors", "steps.score", "catalogue.matrix_size"],
+            ["errors", "steps.score", "catalogue.matrices"],
         ),
         ("comparison", "answer", ["stages.solve"], ["steps.compare", "methods"]),
     ],

@@ -6,12 +6,13 @@ import pytest
 from factorlib.conventions import YUP_FROM_CAMERA, lat_long_directions, lat_long_solid_angles
 from factorlib.geometry.camera import Camera
 from factorlib.light.latlong import sample_map
+from factorlib.results.materials import Reflectance
 from factorlib.tracing import scene as tracing
 from tests.integral import reflected
 
 pytest.importorskip("mitsuba")
-GREEN = tracing.Material((0.1, 0.4, 0.15), (0.25, 0.25, 0.2), 0.35)
-RED = tracing.Material((0.5, 0.12, 0.1), (0.08, 0.08, 0.08), 0.6)
+GREEN = Reflectance((0.1, 0.4, 0.15), (0.25, 0.25, 0.2), 0.35)
+RED = Reflectance((0.5, 0.12, 0.1), (0.08, 0.08, 0.08), 0.6)
 PIXEL = Camera(1, 1, 400.0, (0.5, 0.5))
 BALL = np.array([0.6, -0.3, 4.0])  # centre, camera frame; radius 1
 AT_ORIGIN = tracing.rigid(YUP_FROM_CAMERA, np.zeros(3))

@@ -1,9 +1,8 @@
-"""Whatever befalls a run or its results, what was finished is kept and the next run ends in the same bytes.
+"""Kills at random moments, resumed: what was finished is kept and the next run ends in the same bytes.
 
-Kills, clocks and places are tried with real processes and a seed for each try; `make test-long` kills a hundred times.
+The same holds of what changes or is damaged meanwhile, and of a disk without room.  Processes are real, with a seed for each try;
+`make test-long` kills a hundred times.
 """
-
-from __future__ import annotations
 
 import contextlib
 import json
@@ -16,7 +15,6 @@ import subprocess
 import sys
 import tempfile
 import time
-from functools import partial
 from pathlib import Path
 
 import pytest
@@ -28,7 +26,7 @@ from tests.runner.toy import done, edit, files_of, make, new_runs, reasons, stat
 
 STAGES = ("upper", "count", "table", "total")
 SLOWLY = """
-import pathlib, time
+import os, pathlib, sys, time
 def write_text(self, text, *_):
     with open(self, "w") as stream:
         for k in range(8):
@@ -36,6 +34,10 @@ def write_text(self, text, *_):
             stream.flush()
             time.sleep({0})
 pathlib.Path.write_text = write_text
+if "gc" in sys.argv:
+    def slow(function):
+        return lambda *words, **more: (time.sleep(0.02), function(*words, **more))[1]
+    os.unlink, os.rmdir, os.rename = map(slow, (os.unlink, os.rmdir, os.rename))
 """
 PAUSE = 0.008  # seconds for a piece, where something is to happen meanwhile
 COMMAND = (  # `python -m factorlib` on the toy in the folder that is the first word
@@ -44,7 +46,10 @@ COMMAND = (  # `python -m factorlib` on the toy in the folder that is the first 
 )
 
 pytestmark = pytest.mark.skipif(not Path("/proc/self/stat").exists(), reason="looks for processes in /proc")
-WHOM = ("all of its processes", "the run", "one that is at work")
+WHOM = {  # who gets SIGKILL -> ids of processes, or of a group
+    "all of its processes": lambda run: [-run.pid], "the run": lambda run: [run.pid],
+    "a process that is at work": lambda run: members(run.pid, b"--multiprocessing-fork")[-1:],
+}  # fmt: skip
 LONG = pytest.mark.long
 
 
@@ -68,19 +73,20 @@ def is_said(text, *words):
     return all(word in text for word in words) and "Traceback" not in text and "defect" not in text
 
 
-def start(project, *settings, python="", without_rights=False, first=None):
-    """`make all` in a group of processes of its own, all of which write texts slowly and begin by running some Python."""
-    words = [sys.executable, "-c", COMMAND, str(project.root), "all", "--dataset", "set"]
-    words += [f"--set={setting}" for setting in settings]
+def start(project, *settings, verb="all", without_rights=False, first=None):
+    """A verb of the command line in a group of processes of its own, which write texts and delete slowly."""
+    words = [sys.executable, "-c", COMMAND, str(project.root), verb]
+    if verb == "all":
+        words += ["--dataset", "set", *(f"--set={setting}" for setting in settings)]
     if without_rights and os.geteuid() == 0:
         if shutil.which("setpriv") is None:
             pytest.skip("setpriv is not there, and root may write everywhere")
         words = ["setpriv", "--bounding-set", "-all", "--inh-caps", "-all", *words]
-    site = project.root.parent / "site" / "sitecustomize.py"
-    write(site, SLOWLY.format(PAUSE) + python)
-    set_ = {**os.environ, "PYTHONPATH": f"{site.parent}{os.pathsep}{LIBRARY}", "PYTHONDONTWRITEBYTECODE": "1"}
-    pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.STDOUT, "text": True}
-    return subprocess.Popen(words, env=set_, start_new_session=True, preexec_fn=first, **pipes)
+    site = project.root.parent / "site"
+    write(site / "sitecustomize.py", SLOWLY.format(PAUSE))
+    environment = {**os.environ, "PYTHONPATH": f"{site}{os.pathsep}{LIBRARY}", "PYTHONDONTWRITEBYTECODE": "1"}
+    pipes = {"stdin": subprocess.DEVNULL, "stdout": subprocess.PIPE, "stderr": subprocess.STDOUT, "text": True}
+    return subprocess.Popen(words, env=environment, start_new_session=True, preexec_fn=first, **pipes)
 
 
 def wait_until(true, seconds=60, every=0.001):
@@ -120,14 +126,9 @@ def end(process):
 
 
 def kill(process, whom):
-    """SIGKILL to all processes of a run, to the run alone, or to one that is at work on a step."""
     with contextlib.suppress(ProcessLookupError):
-        if whom == "all of its processes":
-            os.killpg(process.pid, signal.SIGKILL)
-        elif whom == "the run":
-            os.kill(process.pid, signal.SIGKILL)
-        elif pids := members(process.pid, b"--multiprocessing-fork"):
-            os.kill(pids[-1], signal.SIGKILL)
+        for pid in WHOM[whom](process):
+            os.kill(pid, signal.SIGKILL)
 
 
 def results(project):
@@ -139,14 +140,14 @@ def results(project):
 def entries(project):
     """Entry by key, of every result in the store."""
     store = project.build / "store"
-    found = {path.stem: json.loads(path.read_bytes()) for path in (store / "keys").glob("*.json")}
-    return {key: entry for key, entry in found.items() if (store / "trees" / entry["output"]).is_dir()}
+    listed = {path.stem: json.loads(path.read_bytes()) for path in (store / "keys").glob("*.json")}
+    return {key: entry for key, entry in listed.items() if (store / "trees" / entry["output"]).is_dir()}
 
 
-def kept(project):
+def stored(project):
     """Step by key, of every result in the store."""
     records = {key: entry["record"] for key, entry in entries(project).items()}
-    return {key: "/".join(filter(None, (of["stage"], of["photo"]))) for key, of in records.items()}
+    return {key: "/".join(filter(None, (record["stage"], record["photo"]))) for key, record in records.items()}
 
 
 def is_sound(project, dataset=None):
@@ -155,7 +156,7 @@ def is_sound(project, dataset=None):
 
 def lost_in(project, wanted, *settings):
     """What a fault cost: the next run must be accepted, make only what is missing, and end in the same bytes."""
-    before, already = set(kept(project).values()), len(done(project))
+    before, already = set(stored(project).values()), len(done(project))
     losses = [] if is_sound(project) else ["something that is damaged is taken for a result"]
     losses += [] if make(project, *settings) == 0 else ["the next run failed"]
     losses += [f"made twice: {step}" for step in sorted(before & set(done(project)[already:]))]
@@ -173,21 +174,21 @@ def test_a_kill_at_any_moment_loses_nothing_that_was_finished(fresh, made_once, 
     wanted, hits = results(made_once), dict.fromkeys(STAGES, 0)
     for seed in seeds:
         project = again(fresh)
-        for stage in struck(project, seed, WHOM[seed % 3]):
+        for stage in strike(project, seed, [*WHOM][seed % 3]):
             hits[stage] += 1
         assert lost_in(project, wanted) == [], seed
         shutil.rmtree(project.root)
     assert len(seeds) < 50 or min(hits.values()) >= 5, hits
 
 
-def struck(project, seed, whom="all of its processes"):
-    """A run that is killed; the stages that were writing just then."""
+def strike(project, seed, whom="all of its processes"):
+    """Kill a run; the stages that were writing just then."""
     chance, process = random.Random(seed), start(project)
     stage = STAGES[seed // 3 % 4] if seed % 9 < 6 else None
     if stage is not None:
         assert wait_until(lambda: stage in at_work(project) or process.poll() is not None)
     time.sleep(chance.uniform(0, 6 * PAUSE if stage else 3))
-    writing = at_work(project) - ({step.partition("/")[0] for step in kept(project).values()} - {stage})
+    writing = at_work(project) - ({step.partition("/")[0] for step in stored(project).values()} - {stage})
     kill(process, whom)
     end(process)
     return writing
@@ -245,7 +246,7 @@ def test_what_changes_while_a_step_runs_is_named_and_costs_that_step(fresh, made
     assert make(fresh) == 1
     assert is_said(capfd.readouterr().err, *words)
     step = f"{stage}/a" if stage in ("upper", "count") else stage  # the view of a stage over photos holds the others'
-    assert step not in kept(fresh).values()
+    assert step not in stored(fresh).values()
     for path, text in usual.items():
         write(path, text)
     assert make(fresh) == 0 and is_sound(fresh) and results(fresh) == results(made_once)
@@ -263,38 +264,19 @@ def test_a_folder_of_results_that_is_deleted_is_made_again(project):
 
 # ── gc ───────────────────────────────────────────────────────────────────────────────────────────────────────────────
 
-SLOW_GC = """
-import os, sys, time
-from pathlib import Path
-from tests.runner import toy
-from factorlib.runner.results_folder import collect
-def slow(function):
-    def wrapped(*words, **more):
-        time.sleep(0.02)
-        return function(*words, **more)
-    return wrapped
-os.unlink, os.rmdir, os.rename = map(slow, (os.unlink, os.rmdir, os.rename))
-collect(toy.toy(Path(sys.argv[1])))
-"""
 
-
-def test_gc_that_is_killed_leaves_what_is_current_and_is_finished_by_the_next(made_once, again, capfd):
-    several, more = again(made_once), ("table.scale=5", "upper.times=5")
-    assert make(several, "table.scale=3", "upper.times=3") == 0 and make(several, *more) == 0
-    other = results(several)
-    assert make(several) == 0
-    project = again(several)
-    keys, command = len(kept(project)), [sys.executable, "-c", SLOW_GC, str(project.root)]
-    process = subprocess.Popen(command, env={**os.environ, "PYTHONPATH": str(LIBRARY)})
-    assert wait_until(lambda: len(kept(project)) < keys)
-    process.kill()
-    process.wait()
-    assert len(kept(project)) > len(kept(made_once)), "it was to be killed before its end"
+def test_gc_that_is_killed_leaves_what_is_current_and_is_finished_by_the_next(made_once, again):
+    project = again(made_once)
+    assert make(project, "table.scale=3", "upper.times=3") == 0 and make(project) == 0
+    keys = len(stored(project))
+    process = start(project, verb="gc")
+    assert wait_until(lambda: len(stored(project)) < keys)
+    kill(process, "the run")
+    end(process)
+    assert len(stored(project)) > len(stored(made_once)), "it was to be killed before its end"
     assert lost_in(project, results(made_once)) == []
     collect(project)
-    assert sorted(kept(project)) == sorted(kept(made_once)) and not list((project.build / "store/tmp").glob("gc-*"))
-    capfd.readouterr()
-    assert make(project, *more) == 0 and results(project) == other and "damaged" not in capfd.readouterr().err
+    assert sorted(stored(project)) == sorted(stored(made_once)) and not list((project.build / "store/tmp").glob("gc-*"))
 
 
 def test_gc_keeps_what_a_current_result_was_made_from(project):
@@ -310,37 +292,28 @@ def test_gc_keeps_what_a_current_result_was_made_from(project):
 # ── damage in the store ──────────────────────────────────────────────────────────────────────────────────────────────
 
 
-def overwrite(path, text, keep_times=False):
+def overwrite(path, text="OTHER", keep_times=False):
     """In place, as an editor that writes into the file: every hard link to it changes."""
-    stat = path.stat()
+    times = path.stat().st_atime_ns, path.stat().st_mtime_ns
     path.chmod(0o644)
-    with open(path, "r+") as stream:
-        stream.truncate(0)
-        stream.write(text)
+    path.write_text(text)
     path.chmod(0o444)
     if keep_times:
-        os.utime(path, ns=(stat.st_atime_ns, stat.st_mtime_ns))
+        os.utime(path, ns=times)
 
 
 def link_elsewhere(path):
-    path.rename(path.parent.parent / "elsewhere")
-    path.symlink_to(path.parent.parent / "elsewhere")
+    path.symlink_to(shutil.move(path, path.parent.parent / "elsewhere"))
 
 
-def tree_of(project, stage, file):
+def in_store(project, stage, file):
     """The file of a stage's result where it lies in the store's trees."""
-    of = (e for e in entries(project).values() if e["record"]["stage"] == stage and file in e["files"])
-    return project.build / "store" / "trees" / next(of)["output"] / file
-
-
-def in_set(project, name):
-    """The file of a result where a user finds it."""
-    stage, file = name.split("/")
-    return (project.build / "set" / stage).resolve() / file
+    outputs = (e["output"] for e in entries(project).values() if e["record"]["stage"] == stage and file in e["files"])
+    return project.build / "store" / "trees" / next(outputs) / file
 
 
 DAMAGES = {
-    "other content": lambda path: overwrite(path, "OTHER"), "one too many": lambda path: write(path.with_name("more.txt"), "1"),
+    "other content": overwrite, "one too many": lambda path: write(path.with_name("more.txt"), "1"),
     "a link": link_elsewhere, "all gone": lambda path: shutil.rmtree(path.parent),
 }  # fmt: skip
 
@@ -348,24 +321,25 @@ DAMAGES = {
 @pytest.mark.parametrize("damage", DAMAGES)
 def test_a_damaged_result_is_made_again_and_nothing_else_is_and_a_damaged_view_too(project, damage):
     before = results(project)
-    DAMAGES[damage](tree_of(project, "total", "total.txt"))
+    DAMAGES[damage](in_store(project, "total", "total.txt"))
     assert "damaged" in reasons(project, "total")[0]
     assert [step for step, status in state(project).items() if status == "to run"] == ["total"]
     assert new_runs(project) == ["total"] and results(project) == before
-    DAMAGES[damage](in_set(project, "upper/a.txt"))  # where a user finds it
+    DAMAGES[damage]((project.build / "set" / "upper").resolve() / "a.txt")  # where a user finds it
     assert make(project) == 0 and new_runs(project) == [] and results(project) == before and is_sound(project)
 
 
-def test_damage_under_the_same_size_and_time_is_found_by_verify_or_replaced_by_force(project, capsys):
-    before, spoil = results(project), partial(overwrite, text="total: 19", keep_times=True)
-    spoil(tree_of(project, "total", "total.txt"))
+@pytest.mark.parametrize("cure", ["verify", "force"])
+def test_damage_under_the_same_size_and_time_is_found_by_verify_or_replaced_by_force(project, capsys, cure):
+    before = results(project)
+    overwrite(in_store(project, "total", "total.txt"), "total: 19", keep_times=True)
     assert set(state(project).values()) == {"current"}, "size and time are those that were found right"
-    assert not is_sound(project)
-    text = capsys.readouterr().out
-    assert "total (set)" in text and "total.txt: other content" in text and "build/store/trees" in text
-    assert new_runs(project) == ["total"] and results(project) == before and is_sound(project)
-    spoil(tree_of(project, "total", "total.txt"))
-    assert make(project, force=True) == 0 and results(project) == before and is_sound(project)
+    if cure == "verify":
+        assert not is_sound(project)
+        text = capsys.readouterr().out
+        assert "total (set)" in text and "total.txt: other content" in text and "build/store/trees" in text
+        assert new_runs(project) == ["total"]
+    assert make(project, force=cure == "force") == 0 and results(project) == before and is_sound(project)
 
 
 # ── no room ──────────────────────────────────────────────────────────────────────────────────────────────────────────
@@ -384,10 +358,12 @@ def test_no_room_is_said_as_what_it_is_and_with_room_the_run_goes_on(fresh, agai
     doing(project, stage, HEAVY)
     usual = again(project)
     assert make(usual) == 0 and make(project, targets=["count"]) == 0
-    before = set(kept(project).values())
+    before = set(stored(project).values())
     code, said = end(start(project, without_rights=True, first=limited))
     assert code == 1 and is_said(said, f"error: {stage}", "no file may become that large", "MB are free"), said
-    assert before <= set(kept(project).values()) and stage not in {s.partition("/")[0] for s in kept(project).values()}
+    assert before <= set(stored(project).values()) and stage not in {
+        s.partition("/")[0] for s in stored(project).values()
+    }
     assert not any((project.build / "store" / "tmp").iterdir()) and not list((project.build / "set").glob("errors/*"))
     assert lost_in(project, results(usual)) == []
 
@@ -399,9 +375,9 @@ def test_a_checkout_that_is_moved_and_its_store_on_another_file_system_change_no
     place, moved = Path(tempfile.mkdtemp(dir="/dev/shm")), toy.toy(tmp_path / "moved")
     try:
         fresh.build.symlink_to(place)
-        struck(fresh, 5)
+        strike(fresh, 5)
         shutil.move(fresh.root, moved.root)
-        assert lost_in(moved, results(made_once)) == [] and set(kept(moved)) == set(kept(made_once))
+        assert lost_in(moved, results(made_once)) == [] and set(stored(moved)) == set(stored(made_once))
         assert (moved.build / "store").resolve().is_relative_to(place)
     finally:
         shutil.rmtree(place)

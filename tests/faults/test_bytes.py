@@ -1,41 +1,58 @@
-"""Readers and damaged files: a file is refused with file, place and cure, soon and in little memory; what is odd but legal is read.
+"""Bytes × readers: whatever a file holds, it is read, or refused with file, place and cure, soon and in little memory.
 
-A table holds what was found before. Beyond it files of every kind are spoiled at random: `make test` spoils some hundred, always the same;
-the long test goes on for FUZZ_SECONDS (600), shared by its parts, each time with others.
+Tables hold what was found before, among it what means harm: the promises of docs/security.md. Beyond them files of every kind are
+spoiled at random: `make test` spoils some hundred, always the same; the long test goes on for FUZZ_SECONDS (600), shared by its
+parts, each time with others. A last table has the writers, which find no room.
 """
 
-from __future__ import annotations
-
+import ast
+import contextlib
 import copy
+import errno
 import json
 import logging
 import os
 import re
 import resource
 import struct
+import tempfile
 import time
 import tracemalloc
 import warnings
 import zlib
+from pathlib import Path
 
 import msgspec
 import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
+import torch
 import yaml
 from hypothesis import HealthCheck, Phase, given, seed, settings
 from hypothesis import strategies as st
+from PIL import Image
 
+from factorlib.checkpoint import Checkpoint
+from factorlib.dataset.read import read_dataset
 from factorlib.errors import InputError
+from factorlib.generate.folder import write_codes
 from factorlib.images.exr import write_exr, write_rgb_exr
+from factorlib.images.picture import write_png
+from factorlib.jsonfile import write_json
 from factorlib.light.lobes import Lobes
 from factorlib.meshes.read import read_mesh
+from factorlib.recipe.read import read_recipe
+from factorlib.reflection.network import Layers, write_layers
 from factorlib.results.lobe_table import write_lobes
 from factorlib.runner import verbs
+from factorlib.runner.dataset_state import survey
+from factorlib.runner.project import LIBRARY, Project, photo_sets
 from factorlib.urm.observations import write_observations
-from tests.faults import good
-from tests.faults.good import (
+from factorlib.validation import Validation
+from factorlib.wholefile import bytes_of, disk_error, replace_file
+from tests.faults import sample
+from tests.faults.sample import (
     DATA,
     DATASET,
     MESHES,
@@ -48,45 +65,78 @@ from tests.faults.good import (
     SOURCES,
     STL,
     STL_TEXT,
+    TRUTH,
     H,
     W,
     coco,
+    edited,
     glb,
+    make_set,
     png,
     png_header,
+    put,
 )
+from tests.report.test_page import page_of, run
+from tests.runner.toy import call, real_project
 
+PATHS = {  # every path that dataset.yaml and truth.yaml may hold, and the suffix it has
+    ("photos", 0, "image"): ".png", ("photos", 1, "masks"): ".png", ("photos", 0, "masks", "red"): ".png",
+    ("photos", 0, "objects", 0, "mask"): ".png", ("meshes", "vase", "file"): ".ply", ("truth",): ".yaml",
+    ("cameras", "colmap"): "", ("cameras", "transforms"): ".json", ("cameras", "bop"): "",
+    ("illumination", "hall"): ".exr", ("normals", "room"): ".exr",
+}  # fmt: skip
 MOST_MEMORY = 60_000_000  # bytes: what a file of some kB may take
 MOST_SECONDS = 10.0  # of processor time
 HUGE, LONG = 10**12, "9" * 5000
 NAN, SIGNALLING, ONE = struct.pack("<f", float("nan")), b"\x01\x00\xa0\x7f", struct.pack("<f", 1)
 DEEP = "[" * 100_000
+NOBODY = 65534
 JSONS = (DEEP, '{"a":' * 500 + "1" + "}" * 500, "", "\x00", "[]", "null")
 
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory):
-    folder = good.make_set(tmp_path_factory.mktemp("hostile") / "set")
-    (folder / "m/circle").symlink_to("circle")
-    os.mkfifo(folder / "pipe.png")
-    (folder / "link.png").symlink_to("/etc/passwd")
-    (folder / "x").symlink_to("x")
-    (folder / "m/out").symlink_to("/etc/passwd")
+    """The good data set with links that lead out, in a circle, or to what never ends, and beside it a secret."""
+    folder = make_set(tmp_path_factory.mktemp("hostile") / "set")
+    links = {
+        "circle": "circle",
+        "m/circle": "circle",
+        "link.png": "/etc/passwd",
+        "m/out": "/etc/passwd",
+        "up": folder.parent,
+    }
+    for suffix in filter(None, {*PATHS.values()}):
+        put(folder.parent / f"secret{suffix}", "secret")
+        links |= {
+            f"link{suffix}": f"../secret{suffix}",
+            f"m/link{suffix}": f"../../secret{suffix}",
+            f"twice{suffix}": f"link{suffix}",
+        }
+        os.mkfifo(folder / f"pipe{suffix}")
+    (folder.parent / "secret").mkdir()
+    for name, target in ({"link": "../secret", "m/link": "../../secret", "twice": "link"} | links).items():
+        (folder / name).symlink_to(target)
     os.mkfifo(folder / "m/pipe")
-    with open(folder / "m/sparse", "wb") as stream:
-        stream.truncate(1 << 40)
+    put(folder / "m/sparse", b"")
+    os.truncate(folder / "m/sparse", 1 << 40)
     return folder
+
+
+@pytest.fixture(scope="module")
+def linked(tmp_path_factory):
+    """This project with a build/ of its own."""
+    return real_project(tmp_path_factory.mktemp("project"))
 
 
 # ── contents ─────────────────────────────────────────────────────────────────────────────────────────────────────────
 
 
 def header_of(**changes) -> bytes:
-    return glb(good.gltf_header() | changes)
+    return glb(sample.gltf_header() | changes)
 
 
 def of_buffer(uri: object) -> str:
-    return json.dumps(good.gltf_header() | {"buffers": [{"byteLength": len(DATA), "uri": uri}]})
+    return json.dumps(sample.gltf_header() | {"buffers": [{"byteLength": len(DATA), "uri": uri}]})
 
 
 def accessors(**changes) -> bytes:
@@ -99,19 +149,19 @@ def nodes(*of: dict) -> bytes:
 
 def rows(row: bytes, width: int = W, height: int = H, kind: int = 0, before: bytes = b"") -> bytes:
     """A PNG all of whose rows are the same."""
-    return good.png(good.png_header(width, height, kind=kind), zlib.compress((b"\0" + row) * height), before=before)
+    return sample.png(sample.png_header(width, height, kind=kind), zlib.compress((b"\0" + row) * height), before=before)
 
 
 def long_png(kind: int = 0) -> bytes:
     """A PNG whose header promises much, long enough to be believed; whoever looks at its pixels finds none."""
-    return good.png(good.png_header(30_000, 30_000, kind=kind), b"").ljust(20_000_000, b"\0")
+    return sample.png(sample.png_header(30_000, 30_000, kind=kind), b"").ljust(20_000_000, b"\0")
 
 
 def rewritten(name, column=None):
     """Observations of which a column is another, or gone."""
 
     def write(path):
-        write_observations(path, good.observations())
+        write_observations(path, sample.observations())
         table = pq.read_table(path)
         at = table.column_names.index(name)
         pq.write_table(table.drop_columns(name) if column is None else table.set_column(at, name, column), path)
@@ -120,7 +170,7 @@ def rewritten(name, column=None):
 
 
 def with_values(**values):
-    return lambda path: write_observations(path, msgspec.structs.replace(good.observations(), **values))
+    return lambda path: write_observations(path, msgspec.structs.replace(sample.observations(), **values))
 
 
 def many_rows(path):
@@ -162,16 +212,16 @@ def widened(width: int, height: int, **values):
     return write
 
 
-def transforms(matrix=good.MATRIX, **lens) -> dict:
-    return {**good.LENS, **lens, "frames": [{"file_path": "7.png", "transform_matrix": matrix}]}
+def transforms(matrix=sample.MATRIX, **lens) -> dict:
+    return {**sample.LENS, **lens, "frames": [{"file_path": "7.png", "transform_matrix": matrix}]}
 
 
 def frame_of(angle: float, **size) -> dict:
-    return {**size, "camera_angle_x": angle, "frames": [{"file_path": "7.png", "transform_matrix": good.MATRIX}]}
+    return {**size, "camera_angle_x": angle, "frames": [{"file_path": "7.png", "transform_matrix": sample.MATRIX}]}
 
 
 def gt(**changes) -> dict:
-    return {"7": [good.GT | changes]}
+    return {"7": [sample.GT | changes]}
 
 
 TRIANGLE = "v 0 0 0\nv 1 0 0\nv 0 1 0\n"
@@ -220,17 +270,17 @@ REFUSED = {
         (PLY.replace(ONE, NAN), "not finite"), PLY[:-1], PLY.replace(b"face 4", b"face %d" % HUGE),
         PLY.replace(b"uchar int", b"uint int")[:-52] + b"\xff\xff\xff\xff" * 13,
     ],
-    ("mesh", "a.ply"): [PLY_TEXT[:-9], good.PLY_HEADER.format("ascii").replace("end_header\n", ""),
+    ("mesh", "a.ply"): [PLY_TEXT[:-9], sample.PLY_HEADER.format("ascii").replace("end_header\n", ""),
     *(PLY_TEXT.replace(old, new) for old, new in (
         ("vertex 4", f"vertex {HUGE}"), ("vertex 4", "vertex -4"), ("3 0 2 1", "3 0 two 1"),
         ("3 0 2 1", f"3 0 2 {'9' * 30}"),
         ("float x", f"{LONG} x"), ("float x", "float w"), ("float y", "float x"),
     ))],
     ("mesh", "a.gltf"): [
-        '{"extras": ' + DEEP, good.gltf_text().replace("shell", "stühle").encode("latin-1"),
+        '{"extras": ' + DEEP, sample.gltf_text().replace("shell", "stühle").encode("latin-1"),
         (of_buffer("m/pipe"), "is a pipe"), *JSONS,
-        (good.gltf_text(extensionsRequired=["KHR_draco_mesh_compression"]), "compress"),
-        (good.gltf_text(nodes=[]).replace('"nodes": []', '"nodes": [{}' + ",{}" * 2_000_001 + "]", 1), "more than"),
+        (sample.gltf_text(extensionsRequired=["KHR_draco_mesh_compression"]), "compress"),
+        (sample.gltf_text(nodes=[]).replace('"nodes": []', '"nodes": [{}' + ",{}" * 2_000_001 + "]", 1), "more than"),
         *(of_buffer(uri) for uri in ("data:;base64,!!!", "http://x/y.bin", "a%00b", "m/circle")),
     ],
     ("mesh", "a.glb"): [
@@ -238,7 +288,7 @@ REFUSED = {
         glb(DEEP),
         (glb(data=DATA.replace(ONE, SIGNALLING)), "not finite"),
         *(accessors(**change) for change in ({"count": HUGE}, {"count": -1}, {"componentType": 7}, {"bufferView": 9})),
-        header_of(accessors=[good.gltf_header()["accessors"][0],
+        header_of(accessors=[sample.gltf_header()["accessors"][0],
         {"componentType": 5125, "count": HUGE, "type": "SCALAR"}]), header_of(accessors=[]),
         header_of(buffers=None),
         header_of(bufferViews=[{"buffer": 7, "byteLength": 48}] * 2),
@@ -264,10 +314,10 @@ REFUSED = {
         ("format: *none", "no &none above"),
         ("format: 1\n---\nformat: 2\n", "a second document"), ("format: \x07", "not YAML"),
         ("\x00\x00\x00", "not YAML"),
-        (yaml.safe_dump(good.DATASET) + "results: {red: 1}\n", "results"),
-        *(yaml.safe_dump(good.DATASET | {key: 1}) for key in ("x` - at `$.b[3]", "a\n\nb", "x" * 100_000)),
+        (yaml.safe_dump(DATASET) + "results: {red: 1}\n", "results"),
+        *(yaml.safe_dump(DATASET | {key: 1}) for key in ("x` - at `$.b[3]", "a\n\nb", "x" * 100_000)),
     ],
-    ("set", "truth.yaml"): [(good.edited(good.TRUTH, *place, value=value), words) for *place, value, words in (
+    ("set", "truth.yaml"): [(edited(TRUTH, *place, value=value), words) for *place, value, words in (
         ("materials", "red", "roughness", -7, "0 to 1|roughness"),
         ("materials", "red", "specular", [1.5, 0.1, 0.1], "specular"),
         ("materials", "red", "diffuse", [0.5, -0.1, 0.1], "diffuse"),
@@ -275,9 +325,9 @@ REFUSED = {
         ("poses", "hall", "vase", "rotation", [[2, 0, 0]] * 3, "rotation"),
     )],
     ("mask", "mask.png"): [
-        *((content, "not readable as a PNG") for content in (b"", b"GIF89a", good.MASK[:40],
-        good.MASK[:16] + bytes(99))),
-        (good.MASK[:33] + good.chunk(b"zTXt", TEXT) + good.MASK[33:], "not readable as a PNG"),
+        *((content, "not readable as a PNG") for content in (b"", b"GIF89a", sample.MASK[:40],
+        sample.MASK[:16] + bytes(99))),
+        (sample.MASK[:33] + sample.chunk(b"zTXt", TEXT) + sample.MASK[33:], "not readable as a PNG"),
         (long_png(), "the mask is 30000 × 30000 pixels, the photo 16 × 12"), (rows(bytes(range(48)), kind=2), "colour"),
         (rows(bytes([7] * W)), "unknown label 7"), (rows(bytes(W)), "the mask is empty"),
     ],
@@ -287,7 +337,7 @@ REFUSED = {
         *(coco([[2, 2, 8, 2, 8, 8]], image=i) for i in ({"file_name": 5}, {"id": None}, {"width": 10**15})), *JSONS,
         '{"images": 5}',
     ],
-    ("masks", "7.png"): [(long_png(kind=2), "900 megapixels; at most 200"), (good.PHOTO[:-30], "truncated or damaged")],
+    ("masks", "7.png"): [(long_png(kind=2), "900 megapixels; at most 200"), (sample.PHOTO[:-30], "truncated or damaged")],
     ("masks", "a.exr"): [(widened(60_000, 30_000), "megapixels|million values")],
     ("photo", "8.png"): [(b"no photo", "8.png"), (long_png(kind=2), "megapixels")],
     ("photo", "mask.png"): [(rows(bytes(W), height=H + 1), "the mask is 16 × 13 pixels, the photo 16 × 12")],
@@ -302,23 +352,23 @@ REFUSED = {
         (widened(2000, 1500, R=1, G=1, B=1, **{f"C{k:03}": 0 for k in range(900)}), "million values"),
     ],
     ("colmap", "model/cameras.bin"): [
-        *((good.cameras_bin(cameras=n), NO_MODEL) for n in (2, 2**40, 2**64 - 1)),
-        (good.cameras_bin(params=(300.0,)), NO_MODEL),
-        (good.cameras_bin(model=77), "77 is no camera model"), (good.cameras_bin(width=0), "is no camera"),
-        (good.cameras_bin(params=(float("nan"), 104.0, 71.0)), "is no camera"),
-        *((good.cameras_bin(params=params), "no photo's") for params in ((1e-300, 104.0, 71.0), (300.0, 1e9, 71.0))),
+        *((sample.cameras_bin(cameras=n), NO_MODEL) for n in (2, 2**40, 2**64 - 1)),
+        (sample.cameras_bin(params=(300.0,)), NO_MODEL),
+        (sample.cameras_bin(model=77), "77 is no camera model"), (sample.cameras_bin(width=0), "is no camera"),
+        (sample.cameras_bin(params=(float("nan"), 104.0, 71.0)), "is no camera"),
+        *((sample.cameras_bin(params=params), "no photo's") for params in ((1e-300, 104.0, 71.0), (300.0, 1e9, 71.0))),
     ],
     ("colmap", "model/images.bin"): [
-        *((good.images_bin(images=n), NO_MODEL) for n in (2, 2**40, 2**64 - 1)),
-        (good.images_bin(points=2**63), NO_MODEL),
-        *((good.images_bin(numbers=numbers), "is no pose") for numbers in ((0.0,) * 7, (*good.POSE[:6], float("inf")))),
-        (good.images_bin(camera_id=9), "has camera 9"),
+        *((sample.images_bin(images=n), NO_MODEL) for n in (2, 2**40, 2**64 - 1)),
+        (sample.images_bin(points=2**63), NO_MODEL),
+        *((sample.images_bin(numbers=numbers), "is no pose") for numbers in ((0.0,) * 7, (*sample.POSE[:6], float("inf")))),
+        (sample.images_bin(camera_id=9), "has camera 9"),
     ],
     ("colmap text", "text/cameras.txt"): [
-        b"1", *(good.CAMERAS_TXT.replace(old, new) for old, new in ((b" 300 ", b" "), (b"SIMPLE_PINHOLE", b"NONE"),
+        b"1", *(sample.CAMERAS_TXT.replace(old, new) for old, new in ((b" 300 ", b" "), (b"SIMPLE_PINHOLE", b"NONE"),
         (b"200", LONG.encode()))),
     ],
-    ("colmap text", "text/images.txt"): [b"\xff\xfe\x00", *(good.IMAGES_TXT.replace(b".7 ", new) for new in (b"nan ",
+    ("colmap text", "text/images.txt"): [b"\xff\xfe\x00", *(sample.IMAGES_TXT.replace(b".7 ", new) for new in (b"nan ",
     b"one "))],
     ("transforms", "t.json"): [
         *JSONS, '{"frames": null}', '{"w": ' + LONG + "}", '{"frames": [[]]}',
@@ -330,12 +380,12 @@ REFUSED = {
         (transforms(camera_model="X" * 10_000), "camera_model"),
     ],
     ("bop", "model/scene_camera.json"): [
-        *(({name: {"cam_K": good.CAM_K}}, "not the id of an image") for name in ("²", "", "-1", LONG)), [],
+        *(({name: {"cam_K": sample.CAM_K}}, "not the id of an image") for name in ("²", "", "-1", LONG)), [],
         ({"7": {"cam_K": [1e300, 0, 103.5, 0, 1e300, 70.5, 0, 0, 1.0]}}, "cam_K"),
         ({"7": {"cam_K": [300, 0, 1e9, 0, 300, 70.5, 0, 0, 1.0]}}, "cam_K"),
     ],
     ("bop", "model/scene_gt.json"): [(gt(cam_t_m2c=[0, 0, 1e300]), "cam_t_m2c"), (gt(obj_id="5"), "obj_id"),
-    {"7": good.GT}],
+    {"7": sample.GT}],
     ("true light", "light.exr"): [(light_of(value), "hall") for value in (np.nan, np.inf, -7.0, -0.1)],
     ("true normals", "n.exr"): [
         (channels(R=0, G=0), "has no channel B"), (channels(**{"normal.x": 0, "normal.y": 0}),
@@ -371,7 +421,7 @@ def work(folder, reader, name):
         warnings.simplefilter("error")
         began = time.process_time()
         try:
-            good.READERS[reader](folder, name)
+            sample.READERS[reader](folder, name)
         finally:
             assert time.process_time() - began < MOST_SECONDS
 
@@ -380,7 +430,7 @@ def work(folder, reader, name):
 def test_it_is_refused_by_name_soon_and_in_little_memory(folder, reader, name):
     for case in REFUSED[reader, name]:
         content, words = case if isinstance(case, tuple) else (case, ".")
-        with good.changed(folder, name, content) as path:
+        with sample.changed(folder, name, content) as path:
             size = path.stat().st_size if path.exists() else 0
             tracemalloc.start()
             try:
@@ -396,7 +446,7 @@ def test_it_is_refused_by_name_soon_and_in_little_memory(folder, reader, name):
 GOOD = [
     ("set", "dataset.yaml"), ("set", "truth.yaml"), ("set", "m/box.gltf"), ("mask", "mask.png"), ("mask", "coco.json"),
     ("photo", "7.png"), ("observations", "observations.parquet"), ("lobes", "solve/lobes.parquet"),
-    ("poses", "poses.json"), ("objects", "m/chair.obj"), *(("mesh", name) for name in good.MESHES),
+    ("poses", "poses.json"), ("objects", "m/chair.obj"), *(("mesh", name) for name in sample.MESHES),
 ]  # fmt: skip
 OF_CAMERAS = [
     ("colmap", "model/cameras.bin"), ("colmap", "model/images.bin"), ("colmap text", "text/images.txt"),
@@ -416,19 +466,27 @@ def test_a_good_file_is_read_and_what_is_no_plain_file_of_a_sane_size_is_never_o
     for reader, name in GOOD + OF_CAMERAS:
         work(folder, reader, name)
         for kind in KINDS if reader in ("set", "mask", "mesh", "objects") else list(KINDS)[:-1]:
-            with good.changed(folder, name, KINDS[kind]), pytest.raises(InputError) as caught:
+            with sample.changed(folder, name, KINDS[kind]), pytest.raises(InputError) as caught:
                 work(folder, reader, name)
             assert caught.value.file and caught.value.cure, (reader, name, kind)
 
 
-def test_what_another_user_may_not_read_says_so(open_folder, as_other_user):
-    folder = good.make_set(open_folder / "set")
-    for reader, name in GOOD:
-        good.READERS[reader](folder, name)  # loads what another user may not: Python may lie in root's home
-        (folder / name).chmod(0)
-        with as_other_user(), pytest.raises(InputError, match="Permission denied"):
-            work(folder, reader, name)
-        (folder / name).chmod(0o644)
+@pytest.mark.skipif(os.geteuid() != 0, reason="only root can become another user")
+def test_what_another_user_may_not_read_says_so():
+    with tempfile.TemporaryDirectory() as home:
+        os.chmod(home, 0o755)
+        folder = make_set(Path(home) / "set")
+        for reader, name in GOOD:
+            READERS[reader](folder, name)  # loads what another user may not: Python may lie in root's home
+            (folder / name).chmod(0)
+            os.seteuid(NOBODY)
+            try:
+                if os.access(__file__, os.R_OK, effective_ids=True):  # of a checkout that is closed to others
+                    with pytest.raises(InputError, match="Permission denied"):
+                        work(folder, reader, name)
+            finally:
+                os.seteuid(0)
+            (folder / name).chmod(0o644)
 
 
 TEXTURED = {
@@ -444,22 +502,22 @@ READ = [  # what is odd and legal: reader, file, what is in it
     ("mesh", "a.off", OFF.replace("OFF\n", "OFF\n# Möbel\n").encode("latin-1")),
     ("mesh", "a.stl", STL_TEXT.replace("chair", "Stühle").encode("latin-1")),
     ("mesh", "a.ply", PLY_TEXT.replace("TextureFile a", "Möbel").encode("latin-1")),
-    ("mesh", "a.gltf", good.gltf_text(**TEXTURED)), ("mesh", "a.gltf", of_buffer("buffers/b%201.bin")),
-    ("mesh", "a.glb", glb(good.gltf_header("m/../buffers/b%201.bin") | TEXTURED, b"")),
+    ("mesh", "a.gltf", sample.gltf_text(**TEXTURED)), ("mesh", "a.gltf", of_buffer("buffers/b%201.bin")),
+    ("mesh", "a.glb", glb(sample.gltf_header("m/../buffers/b%201.bin") | TEXTURED, b"")),
     ("set", "m/a.mtl", "newmtl red\nmap_Kd m/pipe\nmap_Ks |touch pwned\nmap_Ns ../../../etc/passwd\n"),
-    ("set", "m/box.gltf", good.gltf_text(**TEXTURED)), ("mask", "coco.json", coco(*DOTS, [[2, 2, 8, 2, 8, 8]])),
+    ("set", "m/box.gltf", sample.gltf_text(**TEXTURED)), ("mask", "coco.json", coco(*DOTS, [[2, 2, 8, 2, 8, 8]])),
     ("mask", "coco.json", {**json.loads(coco([[2, 2, 8, 2, 8, 8]])), "more": OTHERS_SHAPE}),
     ("transforms", "t.json", transforms(stamp=1.7e18, note=[[[]]])),
     ("true light", "light.exr", light_of(-1e-4)),  # what resampling leaves
     ("true normals", "n.exr", channels(**{f"normal.{axis}": np.nan for axis in "xyz"})),
-    ("masks", "7.png", good.PHOTO), ("true maps", "light.exr", lambda path: None),
-    ("solution", "solve/materials.json", lambda path: None), ("json", "coco.json", good.COCO),
+    ("masks", "7.png", sample.PHOTO), ("true maps", "light.exr", lambda path: None),
+    ("solution", "solve/materials.json", lambda path: None), ("json", "coco.json", sample.COCO),
 ]  # fmt: skip
 
 
 def test_what_is_odd_and_legal_is_read_soon_and_opens_no_texture(folder):
     for reader, name, content in READ:
-        with good.changed(folder, name, content):
+        with sample.changed(folder, name, content):
             work(folder, reader, name)
 
 
@@ -483,12 +541,12 @@ FAULTS = {  # file -> what is in it, and words of the error
 
 
 def test_all_faults_are_said_at_once_and_each_once_without_running_anything(linked, tmp_path, capsys):
-    folder = good.make_set(tmp_path / "set")
+    folder = make_set(tmp_path / "set")
     look = lambda *settings: verbs.validate(linked, str(folder), list(settings))  # noqa: E731
     assert look("align.limits.triangles=4") == 0
     assert "4 triangles" in refusal(lambda: look("align.limits.triangles=3"), capsys)
     for name, (content, _) in FAULTS.items():
-        good.put(folder / name, content)
+        put(folder / name, content)
     for verb in (look, lambda: verbs.make(linked, verbs.Wish(str(folder)))):
         text = refusal(verb, capsys)
         assert all(words in text for _, words in FAULTS.values())
@@ -507,11 +565,11 @@ OF_RECIPES = {
 
 
 def test_a_file_of_a_recipe_is_refused_before_anything_runs(linked, tmp_path, capsys):
-    folder = good.make_set(tmp_path / "set")
+    folder = make_set(tmp_path / "set")
     for name, (content, words) in OF_RECIPES.items():
-        write_rgb_exr(folder / name, content) if isinstance(content, np.ndarray) else good.put(folder / name, content)
+        write_rgb_exr(folder / name, content) if isinstance(content, np.ndarray) else put(folder / name, content)
         wanted = f"lights: [{name}]\nkind: relight" if name.endswith(("hdr", "exr")) else f"mesh: {name}\nkind: insert"
-        wish = verbs.Wish(str(folder), ["render"], recipes=[str(good.put(folder / "own.yaml", wanted))])
+        wish = verbs.Wish(str(folder), ["render"], recipes=[str(put(folder / "own.yaml", wanted))])
         text = refusal(lambda wish=wish: verbs.make(linked, wish), capsys)
         assert re.search(words, text, re.DOTALL) and str(folder / name) in text and "\n  " in text, text
     assert not list((linked.root / "build").glob("set/*")), "something was run"
@@ -522,8 +580,6 @@ def test_a_file_of_a_recipe_is_refused_before_anything_runs(linked, tmp_path, ca
 FUZZ_SECONDS = float(os.environ.get("FUZZ_SECONDS", "600"))
 FEW, MANY = 8, 200
 MOST_ADDRESSES = 16 << 30  # of addresses, libraries included
-
-# ── spoiling ─────────────────────────────────────────────────────────────────────────────────────────────────────────
 
 NUMBERS = [0, -1, 255, 2**31, 2**63, 2**64, 10**30, 10**400, 1e300, -1e300, 1e-300, 5e-324, -0.0, 5126, 5123]
 WORDS = [
@@ -614,13 +670,13 @@ def read_usable_mesh(folder, name: str) -> None:
 def spoiled_mesh(name: str) -> st.SearchStrategy:
     if name not in ("a.gltf", "a.glb"):
         return spoiled_bytes(MESHES[name])
-    header = spoiled(json.loads(good.gltf_text())).map(json.dumps)
-    return header.map(good.glb if name == "a.glb" else str.encode) | spoiled_bytes(MESHES[name])
+    header = spoiled(json.loads(sample.gltf_text())).map(json.dumps)
+    return header.map(sample.glb if name == "a.glb" else str.encode) | spoiled_bytes(MESHES[name])
 
 
 # ── what is spoiled, and who reads it ────────────────────────────────────────────────────────────────────────────────
 
-PARTS_OF_PNG = (png_header(W, H, kind=3), good.PIXELS, bytes(range(9)))
+PARTS_OF_PNG = (png_header(W, H, kind=3), sample.PIXELS, bytes(range(9)))
 A_PNG = st.builds(png, *(spoiled_bytes(part) | st.just(part) for part in PARTS_OF_PNG))
 PNG_KINDS = st.tuples(
     st.sampled_from([1, 2, 4, 8, 16]), st.sampled_from([0, 2, 3, 4, 6]), st.binary(min_size=50, max_size=800)
@@ -683,7 +739,7 @@ def fuzz(folder, part: str, **options) -> None:
     @settings(deadline=None, database=None, suppress_health_check=list(HealthCheck), print_blob=False, **options)
     @given(contents)
     def spoil(content):
-        with good.changed(folder, file, content):
+        with sample.changed(folder, file, content):
             check(read, folder, file)
 
     if not options.get("derandomize"):
@@ -702,3 +758,224 @@ def test_thousands_of_spoiled_files_are_read_or_refused(folder, little_memory, p
     end = time.monotonic() + FUZZ_SECONDS / len(PARTS)
     while time.monotonic() < end:
         fuzz(folder, part, max_examples=MANY)
+
+
+# ── what means harm: it reads and writes nothing outside itself, runs no code and forges no report ───────────────────────
+
+EVIL_HTML = "<script>alert(1)</script><img src=x onerror=alert(2)>"
+EVIL_ANSI = "\x1b]0;owned\x07\x1b[2J\x1b[31mall is well\r\u202e"
+CONTROL = re.compile(r"[\x00-\x09\x0b-\x1f\x7f-\x9f\u202a-\u202e\u2066-\u2069]")
+
+
+def refused(folder, spec=DATASET, truth=TRUTH) -> InputError:
+    files = {"dataset.yaml": spec, "truth.yaml": truth}
+    with contextlib.ExitStack() as stack, pytest.raises(InputError) as caught:
+        for name, content in files.items():
+            stack.enter_context(sample.changed(folder, name, yaml.safe_dump(content)))
+        read_dataset(folder)
+    assert caught.value.cure and caught.value.file and len(str(caught.value)) < 1000
+    return caught.value
+
+
+# ── it reads nothing outside itself, and nothing that never ends ─────────────────────────────────────────────────────
+
+OUT, NOWHERE = "outside the dataset", "no path that can be followed"
+WAYS = {
+    "../secret{}": OUT, "m/../../secret{}": OUT, "{folder}/../secret{}": OUT, "link{}": OUT, "m/link{}": OUT, "twice{}": OUT,
+    "up/secret{}": OUT, "circle/a{}": NOWHERE, "x\0y{}": NOWHERE, "é" * 200 + "{}": NOWHERE,
+    "z/" * 4000 + "{}": NOWHERE, "pipe{}": "is a pipe, not a file|there is no folder|no folder",
+}  # fmt: skip
+
+
+def test_no_path_leads_out_or_nowhere(folder):
+    """Above, absolute, by a link, a link to a link or a folder that is one; in circles, or longer than names may be."""
+    for place, (way, words) in ((place, each) for place in PATHS for each in WAYS.items()):
+        path = way.format(PATHS[place], folder=folder)
+        if place[0] not in TRUTH:
+            error = refused(folder, edited(DATASET, *place, value=path))
+            assert error.key == ".".join(map(str, place)).replace(".0", "[0]").replace(".1", "[1]")
+        elif words == OUT:  # what is not there of a truth is a warning
+            error = refused(folder, truth=edited(TRUTH, *place, value=path))
+        else:
+            continue
+        assert re.search(words, error.found), (place, way, error)
+
+
+def test_a_given_folder_and_a_recipe_open_no_pipe_and_no_device(tmp_path):
+    dataset = read_dataset(make_set(tmp_path / "set"))
+    for kind in ("pipe", "device"):
+        given = tmp_path / kind
+        given.mkdir()
+        for name in ("poses.json", "odd.obj", "odd.hdr", "odd.json"):
+            os.mkfifo(given / name) if kind == "pipe" else (given / name).symlink_to("/dev/zero")
+        with pytest.raises(InputError, match=f"is a {kind}"):
+            survey(Project(LIBRARY, photo_sets()), "synthetic", ["align"], [f"align.poses={given}"])
+        for text in ("mesh: odd.obj\nkind: insert", "kind: relight\nlights: [odd.hdr]"):
+            with pytest.raises(InputError, match="there is no file"):
+                read_recipe(put(given / "own.yaml", text), dataset)
+
+
+# ── it writes nothing outside build/ ─────────────────────────────────────────────────────────────────────────────────
+
+NAMES = [
+    "../up", "a/b", ".", "", "a\0b", "a b", "~", "$(touch x)", "é", "a\n", "CON:", EVIL_HTML, "\x1b[31m", "n" * 101,
+]  # fmt: skip
+NAMED = [("photos", 0, "name"), ("photos", 0, "illumination"), ("photos", 0, "objects", 0, "name"), ("materials", 0)]
+
+
+def test_names_that_become_names_of_files_are_plain_words_of_100_characters(folder):
+    for place, name in ((place, name) for place in NAMED for name in NAMES):
+        error = refused(folder, edited(DATASET, *place, value=name))
+        assert error.key and not CONTROL.search(str(error).replace("\n", "")), (place, name)
+
+
+def test_a_run_writes_nothing_but_results(linked, tmp_path):
+    """Of the stage that reads what a stranger sends, over a data set whose folder has an odd name."""
+    odd = make_set(tmp_path / "it's $(touch pwned) <b>&amp; `touch pwned`")
+
+    def times():
+        paths = {*tmp_path.rglob("*"), *linked.root.iterdir()} - {linked.build}
+        return {path: path.lstat().st_mtime_ns for path in paths}
+
+    before = times()
+    assert verbs.make(linked, verbs.Wish(str(odd), ["masks"])) == 0
+    assert times() == before and (linked.build / odd.name / "masks" / "photos.json").exists()
+
+
+# ── it runs no code ──────────────────────────────────────────────────────────────────────────────────────────────────
+
+
+class Bomb:
+    def __init__(self, path):
+        self.path = path
+
+    def __reduce__(self):
+        return os.mkdir, (str(self.path),)
+
+
+def test_a_checkpoint_and_text_in_a_photo_are_never_run(tmp_path, caplog):
+    torch.save({"a": Bomb(tmp_path / "pwned")}, tmp_path / "a.pt")
+    assert Checkpoint(tmp_path / "a.pt").load() is None and "cannot be read" in caplog.text
+    folder, exif = make_set(tmp_path / "set"), Image.Exif()
+    for tag in (0x010E, 0x010F, 0x0110, 0x013B, 0x8298):
+        exif[tag] = f"$(touch {tmp_path}/pwned) `touch {tmp_path}/pwned` {EVIL_HTML} {EVIL_ANSI}"
+    Image.new("RGB", (16, 12), (90, 80, 70)).save(folder / "7.png", exif=exif)
+    assert Validation(read_dataset(folder)).faults("photo", "hall", {}, folder) == []
+    assert not (tmp_path / "pwned").exists()
+
+
+# ── it forges no report ──────────────────────────────────────────────────────────────────────────────────────────────
+
+
+@pytest.mark.parametrize("verb, of", [("validate", "name"), ("masks", "name"), ("validate", "key")])
+def test_no_name_of_a_file_and_no_key_moves_the_cursor_or_sets_a_colour(linked, tmp_path, capfd, verb, of):
+    folder = make_set(tmp_path / "set")
+    put(folder / f"x{EVIL_ANSI}.png", "none")
+    key, value = ("image", f"x{EVIL_ANSI}.png") if of == "name" else (f"key{EVIL_ANSI}", EVIL_ANSI)
+    put(folder / "dataset.yaml", yaml.safe_dump(edited(DATASET, "photos", 0, key, value=value)))
+    last = call(linked, verb, "--dataset", str(folder))
+    text = f"{last}{''.join(capfd.readouterr())}"
+    assert not CONTROL.search(text) and "Traceback" not in text and "\\x1b[31mall is well" in text
+
+
+def test_names_and_warnings_are_text_in_the_report(tmp_path):
+    text = f"{EVIL_HTML}{EVIL_ANSI}.jpg: its colour profile is {EVIL_HTML!r}"
+    inputs, usual = run(tmp_path, log=[], seen={"day": ["red"], "noon": ["red"]})
+    facts = {**inputs.facts, "dataset.set": {**inputs.facts["dataset.set"], "name": EVIL_HTML}}
+    put(tmp_path / "log.jsonl", json.dumps({"event": "warning", "stage": "masks", "photo": "day", "text": text}))
+    page = page_of(msgspec.structs.replace(inputs, facts=facts), tmp_path / "evil")
+    assert "<script>alert" not in page and "<img src=x" not in page and page.count("&lt;script&gt;alert(1)") >= 3
+    assert page.count("<script") == usual.count("<script")
+
+
+# ── writers that find no room ────────────────────────────────────────────────────────────────────────────────────────────
+
+PIXELS = np.random.default_rng(0).random((48, 64, 3), dtype=np.float32)
+CODES = (255 * PIXELS).astype(np.uint8)
+LAYERS = Layers(torch.zeros(8), torch.ones(8), [torch.ones(32, 8), torch.ones(1, 32)], [torch.ones(32), torch.ones(1)])
+WRITERS = {  # file -> who writes it, one for each way that bytes reach a disk; what stands after a blank tells those of one kind apart
+    "a.exr": lambda path: write_exr(path, {f"n.{k}": PIXELS[..., 0] for k in range(7)}),
+    "a.png": lambda path: write_png(path, CODES),
+    "a.jpg": lambda path: write_codes(path, CODES, {"Compression": "jpeg:95"}),
+    "a.json": lambda path: write_json(path, {"a": PIXELS.tolist()}),
+    "a.json of the runner": lambda path: replace_file(path, b"{}" * 2000),
+    "a.parquet": lambda path: write_observations(path, sample.observations(2000)),
+    "a.safetensors": lambda path: write_layers(path, LAYERS),
+    "a.pt": lambda path: Checkpoint(path).save({"a": torch.arange(3000.0)}),
+}  # fmt: skip
+
+
+@contextlib.contextmanager
+def largest_file(size: int):
+    before = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (size, before[1]))
+    try:
+        yield
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, before)
+
+
+def unlimited(write):
+    with largest_file(resource.RLIM_INFINITY):
+        return bytes_of(write)
+
+
+@pytest.mark.parametrize("kind", WRITERS)
+def test_a_file_that_finds_no_room_is_an_error_is_not_there_and_leaves_whole_what_it_would_replace(
+    tmp_path, monkeypatch, kind
+):
+    path, write = tmp_path / kind.partition(" ")[0], WRITERS[kind]
+    if (
+        path.suffix == ".jpg"
+    ):  # libjpeg ends the process where it finds no room, so it must never write to a disk itself
+        monkeypatch.setattr("factorlib.images.exr.bytes_of", unlimited)
+    write(path)
+    size = path.stat().st_size
+    for room in (size - 1, size // 2, 1):
+        path.unlink()
+        with largest_file(room), pytest.raises(Exception) as caught:
+            write(path)
+        assert not list(tmp_path.iterdir()), "a cut file is left behind"
+        known = disk_error(caught.value, tmp_path)
+        assert isinstance(known, InputError) and known.file == tmp_path and "MB are free" in known.found, caught.value
+        write(path)
+        assert path.stat().st_size == size
+    if kind in ("a.json of the runner", "a.pt"):
+        path.write_bytes(b"old")
+        with largest_file(size // 2), pytest.raises(OSError):
+            write(path)
+        assert path.read_bytes() == b"old" and list(tmp_path.iterdir()) == [path]
+
+
+def test_a_quota_and_a_full_disk_in_a_librarys_words_are_the_users_to_mend(tmp_path):
+    error = RuntimeError("a library: I/O error: No space left on device (os error 28)")
+    assert "the disk is full" in disk_error(error, tmp_path).found
+    assert "quota is used up" in disk_error(OSError(errno.EDQUOT, "Disk quota exceeded"), tmp_path).found
+    assert disk_error(RuntimeError("another"), tmp_path) is None
+
+
+# calls that write to a path, and who may: the writers themselves, what is no result, and logs of processes
+WRITING = r"\.(write_text|write_bytes|save_file|savefig|imwrite|tofile|savez|save_image)$"
+STREAMS = r"(\.write_table|ImageOutput\.create|torch\.save)$"
+OWN = ("wholefile.py", "images/exr.py", "setup.py", "reflection/fused.py", "runner/worker.py")
+
+
+def test_nothing_is_written_past_the_writers_that_check():
+    files = {p for folder in ("factorlib", "stages", "studies") for p in (LIBRARY / folder).rglob("*.py")}
+    for path in files - {LIBRARY / "factorlib" / name for name in OWN}:
+        tree = ast.parse(path.read_text())
+        within = [w for w in ast.walk(tree) if isinstance(w, ast.With) and "writing(" in ast.unparse(w.items[0])]
+        inside = {id(node) for with_ in within for node in ast.walk(with_)}
+        calls = [node for node in ast.walk(tree) if isinstance(node, ast.Call) and id(node) not in inside]
+        assert not [f"{path}:{call.lineno}" for call in calls if _writes_past(call)]
+
+
+def _writes_past(call: ast.Call) -> bool:
+    name, text = ast.unparse(call.func), ast.unparse(call)
+    if name in ("open", "os.fdopen"):
+        return (
+            bool(re.search(r"""['"](?=\w*[wax+])[rwaxbt+]+['"]""", text))
+            and "/proc/" not in text
+            and "events" not in text
+        )
+    return bool(re.search(WRITING, name) or (re.search(STREAMS, name) and "stream" not in text))

@@ -27,8 +27,10 @@ from factorlib.meshes.triangle_soup import TriangleSoup, no_normals
 
 Part = tuple[np.ndarray, np.ndarray, int]  # vertices [V, 3], faces [F, 3], label
 
-ROWS, COLUMNS = 100, 100
-ROUGH_TRIANGLES, WARP = 500, 0.03  # WARP: the largest shift of a vertex, in the mesh's extent
+ROWS = 100
+COLUMNS = 100
+ROUGH_TRIANGLES = 500
+WARP = 0.03  # the largest shift of a vertex, in the mesh's extent
 BOXES = (((1.0, 0.45, 0.7), (0, 0, 0), 0.0), ((0.55, 0.5, 0.45), (-0.2, 0.42, 0.1), 0.5),
          ((0.3, 0.6, 0.25), (0.3, 0.3, -0.2), -0.3))  # size, place, turn about y  # fmt: skip
 BODY = ((0.0, 0.5), (0.20, 0.5), (0.22, 0.45), (0.17, 0.34), (0.26, 0.15), (0.34, -0.1), (0.30, -0.34), (0.2, -0.45),
@@ -43,6 +45,7 @@ def blob() -> list[Part]:
     direction = np.stack(np.broadcast_arrays(sin * np.sin(phi), np.cos(theta)[:, None], sin * np.cos(phi)), axis=-1)
 
     def surface(direction: Float[np.ndarray, "*n 3"]) -> Float[np.ndarray, "*n 3"]:
+        """Return the points of the surface in these unit directions."""
         size = np.full(direction.shape[:-1], 0.42)
         for axis, height, sharpness in BUMPS:
             size += 0.45 * height * np.exp(sharpness * (direction @ (np.array(axis) / np.linalg.norm(axis)) - 1))
@@ -55,7 +58,8 @@ def blob() -> list[Part]:
 def hook() -> list[Part]:
     """Return a tube whose radius falls from .17 to .06."""
     t = np.linspace(0, 1, ROWS + 1)
-    angle, height = 4.2 * t**1.3, 0.9 * t**2 - 0.4 + 0.15 * np.sin(5 * t)
+    angle = 4.2 * t**1.3
+    height = 0.9 * t**2 - 0.4 + 0.15 * np.sin(5 * t)
     curve = np.stack([0.5 * np.cos(angle), height, (0.5 - 0.3 * t) * np.sin(angle)], axis=1)
     return [tube(curve, np.interp(t, (0, 0.35, 1), (0.17, 0.11, 0.06)), 1)]
 
@@ -77,7 +81,8 @@ def jug() -> list[Part]:
 
 def chair() -> list[Part]:
     """Return the chair of data/eames, of fewer triangles, with an arm on one side."""
-    arm, post = ((0.2, 0.62, -0.2), (0.22, 0.64, 0.15)), ((0.21, 0.43, 0.1), (0.22, 0.66, 0.12))
+    arm = ((0.2, 0.62, -0.2), (0.22, 0.64, 0.15))
+    post = ((0.21, 0.43, 0.1), (0.22, 0.66, 0.12))
     rods = [(*dowel(np.array(a), np.array(b), (0.018, 0.02, 0.016), 20, 12), 2) for a, b in (arm, post)]
     return [(*shell(48, 72), 1), (*legs(20, 12), 2), *rods]
 
@@ -89,7 +94,8 @@ def tube(curve: Float[np.ndarray, "n 3"], radius: Float[np.ndarray, " n"], label
     """Return a closed tube of varying radius about a curve, its rings turned as little as possible."""
     along = np.gradient(curve, axis=0)
     along /= np.linalg.norm(along, axis=1, keepdims=True)
-    across, side = np.empty_like(curve), np.eye(3)[np.argmin(np.abs(along[0]))]
+    across = np.empty_like(curve)
+    side = np.eye(3)[np.argmin(np.abs(along[0]))]
     for k, direction in enumerate(along):
         side = side - (side @ direction) * direction
         across[k] = side = side / np.linalg.norm(side)
@@ -109,7 +115,8 @@ def _box(size: np.ndarray, place: np.ndarray, turn: float, side: int = 24) -> Pa
     index = np.arange((side + 1) ** 2).reshape(side + 1, side + 1)
     a, b, c, d = index[:-1, :-1], index[:-1, 1:], index[1:, :-1], index[1:, 1:]
     quad = np.concatenate([np.stack([a, b, d], -1), np.stack([a, d, c], -1)]).reshape(-1, 3)
-    vertices, faces = [], []
+    vertices: list[np.ndarray] = []
+    faces: list[np.ndarray] = []
     for axis in range(3):
         for sign in (-1, 1):
             points = np.zeros((len(u), 3))
@@ -136,9 +143,12 @@ def rough(shape: str, seed: int) -> Mesh:
     vertices = np.concatenate([part[0] for part in coarse])
     extent = float(np.ptp(vertices, axis=0).max())
     rng = np.random.default_rng(seed)
-    waves, phases, shifts = rng.normal(0, 4 / extent, (4, 3)), rng.uniform(0, 2 * np.pi, 4), rng.normal(0, 1, (4, 3))
+    waves = rng.normal(0, 4 / extent, (4, 3))
+    phases = rng.uniform(0, 2 * np.pi, 4)
+    shifts = rng.normal(0, 1, (4, 3))
 
     def field(points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
+        """Return the shift at each point."""
         return np.sin(points @ waves.T + phases) @ shifts
 
     scale = WARP * extent / np.linalg.norm(field(vertices), axis=1).max()

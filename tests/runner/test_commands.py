@@ -14,9 +14,8 @@ import pytest
 from factorlib.errors import InputError
 from factorlib.runner import results_folder, verbs
 from factorlib.runner.project import LIBRARY
-from tests.faults.battered import call
 from tests.runner import toy
-from tests.runner.toy import files_of, make, state, write
+from tests.runner.toy import call, files_of, make, state, write
 
 # ── DATASET ──────────────────────────────────────────────────────────────────────────────────────────────────────────
 

@@ -11,7 +11,9 @@ from __future__ import annotations
 
 import itertools
 import math
+import os
 from types import SimpleNamespace
+from unittest.mock import patch
 
 import msgspec
 import torch
@@ -19,10 +21,22 @@ from jaxtyping import Float
 from torch import Tensor
 from torch.nn.functional import normalize
 
-from factorlib.reflection import Operator, reflection_operator
+from factorlib.errors import InputError
+from factorlib.reflection import Name, Operator, reflection_operator
 from factorlib.reflection.brdf import specular as brdf
 from factorlib.reflection.lobe import lobe_integral
 from factorlib.reflection.samples import specular_inputs
+
+
+def operator_variant(name: Name, dtype: str, *, compiled: bool = True) -> Operator | None:
+    """Return the operator in this precision; None where there is none, or nothing of it is compiled to leave out."""
+    with patch.dict(os.environ, {} if compiled else {"FACTORLIB_FUSED": "0"}):
+        try:
+            operator = reflection_operator(name, dtype=dtype)
+        except InputError:
+            return None
+    return operator if compiled or hasattr(operator, "fused") else None
+
 
 # ── Special cases ────────────────────────────────────────────────────────────────────────────────────────────────────
 
@@ -78,7 +92,8 @@ def case(name: str) -> Pairs:
     """Return the pairs of a case: every combination of its values."""
     together = [*CASES.values(), ORDINARY] if name == ALL else [ORDINARY | CASES[name]]
     choices = {key: tuple(dict.fromkeys(v for c in together for v in c.get(key, ()))) for key in ORDINARY}
-    rows, n = [], torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64)
+    rows = []
+    n = torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64)
     for r, lam, cosine in itertools.product(choices["roughness"], choices["sharpness"], choices["no"]):
         o = torch.tensor([math.sqrt(1 - cosine**2), 0.0, cosine], dtype=torch.float64)
         z = torch.cat([_directions(place, n, o) for place in choices["place"]])
@@ -127,7 +142,8 @@ def answers(operator: Operator, given: Pairs) -> Answers:
     n, o, z = (t.to(operator.dtype) for t in (given.normal, given.view, given.axis))
     no, nz, oz = ((a * b).sum(1) for a, b in ((n, o), (n, z), (o, z)))
     for r, lam, rows in given.groups():
-        roughness, sharpness = torch.tensor(r, dtype=operator.dtype), torch.tensor([lam], dtype=operator.dtype)
+        roughness = torch.tensor(r, dtype=operator.dtype)
+        sharpness = torch.tensor([lam], dtype=operator.dtype)
         response = operator.response(roughness, sharpness, no[rows], nz[rows, None], oz[rows, None])
         for name in response.__struct_fields__:
             column = getattr(response, name)[:, 0].double()
@@ -136,7 +152,7 @@ def answers(operator: Operator, given: Pairs) -> Answers:
         turns = ((z, n, by_nz), (z, o, by_oz)), ((o, n, by_no), (o, z, by_oz)), ((n, o, by_no), (n, z, by_nz))
         for k, parts in enumerate(turns):
             across = [(slope, other - (axis * other).sum(1, keepdim=True) * axis) for axis, other, slope in parts]
-            turning[rows, k] = sum(slope * vector[rows] for slope, vector in across).double()
+            turning[rows, k] = torch.stack([slope * vector[rows] for slope, vector in across]).sum(0).double()
     return Answers(fields, turning)
 
 
@@ -158,9 +174,13 @@ def gradient_error(a: Answers, b: Answers, given: Pairs) -> Float[Tensor, " k"]:
 
 def reference_values(given: Pairs, some: slice = slice(None)) -> dict[str, Tensor]:
     """Compute diffuse and specular by quadrature, of some of the pairs."""
-    reference, n, o, z = reflection_operator("reference"), given.normal[some], given.view[some], given.axis[some]
+    reference = reflection_operator("reference")
+    n = given.normal[some]
+    o = given.view[some]
+    z = given.axis[some]
     no, nz, oz = (n * o).sum(1), (n * z).sum(1)[:, None], (o * z).sum(1)[:, None]
-    sharpness, roughness = given.sharpness[some, None], given.roughness[some, None]
+    sharpness = given.sharpness[some, None]
+    roughness = given.roughness[some, None]
     with torch.no_grad():
         specular = reference.specular(roughness, sharpness, no, nz, oz)[:, 0]
         return {"diffuse": reference.diffuse(sharpness, nz)[:, 0], "specular": specular}
@@ -181,66 +201,74 @@ class Domain(msgspec.Struct, frozen=True):
 USUAL, WIDER, WHOLE = Domain(0.1, 0.02), Domain(0.1, 1e-4), Domain(0.03, 1e-4)
 
 
-def drawn(domain: Domain, count: int) -> tuple[Tensor, ...]:
+def draw_inputs(domain: Domain, count: int) -> tuple[Tensor, ...]:
     """Draw α, λ, n·o, n·z, o·z: those of `samples`, over the domain; half of the views crowd at the least n·o."""
-    ranges = {"alpha": (domain.least_roughness**2, 1.0), "sharpness": (1e-4, 1e6), "least_no": domain.least_no}
-    return specular_inputs(count, 17, **ranges)
+    alpha = (domain.least_roughness**2, 1.0)
+    return specular_inputs(count, 17, alpha=alpha, sharpness=(1e-4, 1e6), least_no=domain.least_no)
 
 
-def grazing(domain: Domain, count: int) -> tuple[Tensor, ...]:
-    """Draw pairs like `drawn`, all at the least n·o, the lobe about the mirror direction."""
-    alpha, lam, _, nz, _ = drawn(domain, count)
+def draw_grazing_inputs(domain: Domain, count: int) -> tuple[Tensor, ...]:
+    """Draw pairs like `draw_inputs`, all at the least n·o, the lobe about the mirror direction."""
+    alpha, lam, _, nz, _ = draw_inputs(domain, count)
     turn = torch.linspace(-1, 1, count, dtype=torch.float64)  # of the axis about n, from the mirror direction
-    so, sz = math.sqrt(1 - domain.least_no**2), torch.sqrt(1 - nz**2)
+    so = math.sqrt(1 - domain.least_no**2)
+    sz = torch.sqrt(1 - nz**2)
     no = torch.full_like(alpha, domain.least_no)
     return alpha, lam, no, nz, domain.least_no * nz - so * sz * torch.cos(turn)
 
 
-def each(operator: Operator, *scalars: Float[Tensor, " k"]) -> Float[Tensor, " k"]:
+def specular_values(operator: Operator, *scalars: Float[Tensor, " k"]) -> Float[Tensor, " k"]:
     """Return the specular part of α, λ, n·o, n·z, o·z that share nothing."""
     a, lam, no, nz, oz = (t.to(operator.dtype) for t in scalars)
     with torch.no_grad():
         return operator.specular(a.sqrt()[:, None], lam[:, None], no, nz[:, None], oz[:, None])[:, 0].double()
 
 
-def tail(error: Float[Tensor, " k"]) -> tuple[float, float]:
+def p99_and_worst(error: Float[Tensor, " k"]) -> tuple[float, float]:
     """Return the 99th percentile and the largest."""
     return float(error.quantile(0.99)), float(error.max())
 
 
-def unit_lobes(operator: Operator, domain: Domain, count: int = 16384) -> tuple[float, float]:
+def reflection_of_unit_lobes(operator: Operator, domain: Domain, count: int = 16384) -> tuple[float, float]:
     """Return S of unit lobes, p99 and largest; exactly at most 1."""
-    return tail(torch.cat([each(operator, *make(domain, count)) for make in (drawn, grazing)]))
+    return p99_and_worst(
+        torch.cat([specular_values(operator, *make(domain, count)) for make in (draw_inputs, draw_grazing_inputs)])
+    )
 
 
-def least_reflected(operator: Operator, count: int = 16384) -> tuple[float]:
+def least_reflection(operator: Operator, count: int = 16384) -> tuple[float]:
     """Return the least S of unit lobes; exactly at least 0."""
-    return (min(float(each(operator, *make(WHOLE, count)).min()) for make in (drawn, grazing)),)
+    return (
+        min(float(specular_values(operator, *make(WHOLE, count)).min()) for make in (draw_inputs, draw_grazing_inputs)),
+    )
 
 
-def white_lambert(operator: Operator, count: int = 512) -> tuple[float]:
+def white_lambert_error(operator: Operator, count: int = 512) -> tuple[float]:
     """Return the largest |D − 1| under constant light of radiance 1 (λ = 10⁻⁴)."""
-    lam, nz = torch.tensor([1e-4], dtype=operator.dtype), torch.linspace(-1, 1, count, dtype=operator.dtype)
+    lam = torch.tensor([1e-4], dtype=operator.dtype)
+    nz = torch.linspace(-1, 1, count, dtype=operator.dtype)
     with torch.no_grad():
         return (float((operator.diffuse(lam, nz[:, None]) - 1).abs().max()),)
 
 
-def constant_light(operator: Operator, count: int = 2048) -> tuple[float, float]:
+def reflection_of_constant_light(operator: Operator, count: int = 2048) -> tuple[float, float]:
     """Return S under constant light of radiance 1 (λ = 10⁻⁴), p99 and largest; exactly at most 1."""
-    alpha, lam, no, nz, oz = drawn(USUAL, count)
-    return tail(each(operator, alpha, torch.full_like(lam, 1e-4), no, nz, oz))
+    alpha, lam, no, nz, oz = draw_inputs(USUAL, count)
+    return p99_and_worst(specular_values(operator, alpha, torch.full_like(lam, 1e-4), no, nz, oz))
 
 
-def point_light(operator: Operator, count: int = 4096) -> tuple[float, float]:
+def point_light_error(operator: Operator, count: int = 4096) -> tuple[float, float]:
     """Return |S − E f| / (E f + E/100), f the BRDF times n·i, at λ = 10⁶; exactly below 10⁻³.
 
     Roughness is at least .3, n·o and n·z at least .1.
     """
-    alpha, lam, no, nz, oz = drawn(Domain(0.3, 0.1), count)
+    alpha, lam, no, nz, oz = draw_inputs(Domain(0.3, 0.1), count)
     alpha, no, nz, oz = (t[nz >= 0.1] for t in (alpha, no, nz, oz))
     lam = torch.full_like(alpha, 1e6)
     expected = lobe_integral(lam) * brdf(alpha, nz, no, (no + nz) / torch.sqrt(2 + 2 * oz))
-    return tail((each(operator, alpha, lam, no, nz, oz) - expected).abs() / (expected + lobe_integral(lam) / 100))
+    return p99_and_worst(
+        (specular_values(operator, alpha, lam, no, nz, oz) - expected).abs() / (expected + lobe_integral(lam) / 100)
+    )
 
 
 def scene(seed: int, points: int = 32, lobes: int = 6, sharpness: tuple[float, float] = (0.0, 3.0)) -> tuple:
@@ -249,7 +277,8 @@ def scene(seed: int, points: int = 32, lobes: int = 6, sharpness: tuple[float, f
     sharpness: 10 to the power of this range
     """
     g = torch.Generator().manual_seed(seed)
-    axis, spread = _unit(lobes, g), torch.logspace(*sharpness, lobes, dtype=torch.float64)
+    axis = _unit(lobes, g)
+    spread = torch.logspace(*sharpness, lobes, dtype=torch.float64)
     light = SimpleNamespace(axis=axis, sharpness=spread, weight=torch.rand(lobes, 3, generator=g).double())
     diffuse, specular, roughness = (torch.tensor(v).double() for v in ([0.3, 0.2, 0.1], [0.2, 0.3, 0.4], 0.4))
     normals = _unit(points, g)
@@ -257,7 +286,7 @@ def scene(seed: int, points: int = 32, lobes: int = 6, sharpness: tuple[float, f
     return light, material, normals, normalize(normals + 0.8 * _unit(points, g), dim=1)
 
 
-def turned(operator: Operator) -> tuple[float]:
+def rotation_error(operator: Operator) -> tuple[float]:
     """Return the largest difference after everything was turned, over the largest radiance."""
     light, material, normals, views = scene(0)
     turn = torch.linalg.qr(torch.randn(3, 3, generator=torch.Generator().manual_seed(4)).double()).Q
@@ -266,7 +295,7 @@ def turned(operator: Operator) -> tuple[float]:
     return (float((operator(light, material, normals @ turn.T, views @ turn.T) - before).abs().max() / before.max()),)
 
 
-def scaled(operator: Operator, factor: float = 1e6) -> tuple[float]:
+def scaling_error(operator: Operator, factor: float = 1e6) -> tuple[float]:
     """Return the largest relative difference of `factor` times the radiance and that of weights times `factor`."""
     light, material, normals, views = scene(0)
     before = operator(light, material, normals, views).double()

@@ -4,8 +4,6 @@ Photos, mesh, masks or links of each are spoilt.
 What is spoilt, and by how much, is drawn by the set's number.  The truth stays with the set.
 """
 
-from __future__ import annotations
-
 import shutil
 from collections.abc import Callable
 from pathlib import Path

@@ -5,13 +5,10 @@ code another library says (grimp, of import-linter).  `make test` takes a sample
 `make test-long` every module, file and package.
 """
 
-from __future__ import annotations
-
 import contextlib
 import os
 import random
 from functools import cache
-from pathlib import Path
 
 import grimp
 import pytest
@@ -22,10 +19,9 @@ from factorlib.runner import verbs
 from factorlib.runner.dataset_state import survey
 from factorlib.runner.plan import Listing, plan
 from factorlib.runner.project import LIBRARY, photo_sets, read_pipeline
-from tests.faults.battered import real_project
-from tests.faults.good import edited as edited_data
+from tests.faults.sample import edited as edited_data
 from tests.runner import toy
-from tests.runner.toy import make, reasons, state, write
+from tests.runner.toy import make, real_project, reasons, state, write
 
 PIPELINE = read_pipeline(LIBRARY / "pipeline.yaml", photo_sets().slices).for_data(lambda _: True)
 STAGES = list(PIPELINE.stages)
@@ -99,34 +95,27 @@ def _takes(step, above):
 
 @cache
 def imports():
-    return grimp.build_graph("factorlib", "stages", include_external_packages=True, cache_dir=None)
+    """What imports what; a module also imports the packages above it, which Python runs first."""
+    graph = grimp.build_graph("factorlib", "stages", cache_dir=None)
+    for name in (name for name in graph.modules if "." in name):
+        graph.add_import(importer=name, imported=name.rpartition(".")[0])
+    return graph
 
 
 @cache
 def reached_by(stage):
-    """The modules that a stage imports, however far, and the packages above each, which Python runs first."""
-    found, stack = set(), [f"stages.{stage}"]
-    while stack:
-        name = stack.pop()
-        for part in (".".join(name.split(".")[: k + 1]) for k in range(name.count(".") + 1)):
-            if part not in found and part in imports().modules:
-                found.add(part)
-                stack += imports().find_modules_directly_imported_by(part)
-    return found
-
-
-@cache
-def modules():
-    """{name: file within the project} of the modules that any stage runs."""
-    paths = {name: Path(*name.split(".")) for name in sorted(set().union(*map(reached_by, STAGES)))}
-    files = {name: (path.with_suffix(".py"), path / "__init__.py") for name, path in paths.items()}
-    return {name: str(file) for name, both in files.items() for file in both if (LIBRARY / file).is_file()}
+    """The modules that a stage imports, however far."""
+    return {f"stages.{stage}", *imports().find_upstream_modules(f"stages.{stage}")}
 
 
 def whole_modules():
-    """Each module's file, an addition to it, and the stages that run it."""
-    for name, file in modules().items():
-        yield file, b"\nNEW = 1\n", {stage for stage in STAGES if name in reached_by(stage)}
+    """The file of each module that any stage runs, an addition to it, and the stages that run it."""
+    for path in sorted(
+        path.relative_to(LIBRARY) for top in ("factorlib", "stages") for path in (LIBRARY / top).rglob("*.py")
+    ):
+        name = ".".join(path.with_suffix("").parts).removesuffix(".__init__")
+        if stages := {stage for stage in STAGES if name in reached_by(stage)}:
+            yield str(path), b"\nNEW = 1\n", stages
 
 
 def files_of_packages():
