@@ -145,7 +145,7 @@ class Cell(msgspec.Struct, frozen=True):
         """Return the mean and the half width of its interval.
 
         >>> str(Cell(spread([0.1, 0.12]), {})), str(Cell(spread([0.1]), {}))
-        ('.11 ± .13', '.1')
+        ('0.11 ± 0.13', '0.1')
         """
         mean, high = exact(self.spread.mean, 3), self.spread.high
         return mean if high is None else f"{mean} ± {exact(high - self.spread.mean)}"

@@ -103,7 +103,7 @@ def observations_from_front(
     """
     n = len(normal)
     zero = np.zeros(len(normal), int)
-    usual = {
+    usual: dict[str, Any] = {
         "view": np.tile([0.0, 0.0, -1.0], (n, 1)),
         "clipped": np.zeros((n, 3), bool),
         "photo": zero,

@@ -58,10 +58,9 @@ class Quantity(NamedTuple):
         """Return the value with its unit.
 
         >>> Quantity("k_d", "", None, 0, " %", 100).text(0.163), Quantity("roughness", "", None, 3).text(0.0412)
-        ('16 %', '.041')
+        ('16 %', '0.041')
         """
-        text = f"{self.scale * value:.{self.digits}f}"
-        return (text[1:] if text.startswith("0.") else text) + self.unit
+        return f"{self.scale * value:.{self.digits}f}{self.unit}"
 
 
 def _light(meaning: str, view: str, measure: str = "rmse", digits: int = 3, unit: str = "") -> Quantity:

@@ -20,11 +20,16 @@ DATASET, PHOTO = "eames", "terrace"  # whose pictures are shown where a recipe m
 SIDE = 240  # pixels of the longer side of one of four pictures; twice as many of a single one
 HEAD = """# Gallery
 
-Every recipe with its pictures of `data/eames`. `make results ONLY=gallery` makes this page.
+The first command makes every picture of this page from a result of `data/eames`, the second one of them:
 
-A recipe says which pictures to make of a result; [recipes](recipes.md) has all its fields. Where it makes pictures \
-of every photograph, this page shows
-those of the `terrace`. Where these are four or more, such as the frames of an animation, it shows four of them.
+```
+make render DATASET=eames RECIPE=all
+make render DATASET=eames RECIPE=insert
+```
+
+Pictures are written to `build/eames/recipes/<recipe>/`; [recipes](recipes.md) describes their fields. Of a recipe \
+for every photograph this page shows the `terrace`,
+of four pictures or more, such as frames of an animation, four. `make results ONLY=gallery` writes the page.
 """
 FIGURE = """<figure markdown="0" style="margin: 0">
 <img src="gallery/{name}.jpg" alt="{says}" width="{width}" height="{height}">

@@ -84,18 +84,13 @@ def measured(folder: Path, photo: str) -> list[dict]:
         rows.append(
             {
                 "set": folder.resolve().name,
-                "photo": photo,
                 "object": obj.name,
-                "wall_s": taken.wall,
                 "processor_s": taken.processor,
                 "turn": Rotation.from_matrix(true.rotation.T @ pose.rotation).as_rotvec().tolist(),
                 "rotation_error_deg": angle_between(pose.rotation, true.rotation),
                 "normal_error_deg": normal_error_deg(*normals),
                 "about_the_ray_deg": angle_between(*(about_the_ray(p, caster.centre) for p in (pose, true))),
                 "focal_ratio": camera.focal / true_camera.focal,
-                "focal_source": answer.camera.focal_source,
-                "reference_iou": reference.silhouette_iou,
-                "silhouette_iou": said.silhouette_iou,
                 "doubts": said.doubts,
             }
         )
@@ -122,15 +117,15 @@ def common_turn(turns: list[list[float]]) -> tuple[float, list[float]]:
 
 
 def rows() -> Tables:
-    """Return tables of sets with medians and worst values, and of all photos."""
+    """Return the table of sets, with medians and worst values over photos."""
     folders = [Path(word) for word in needed("REAL", "folders of photographs with known poses")]
     photos = [(f, p.name) for f in folders for p in read_dataset(f).spec.photos if p.name in references(f)]
     return tables_of([row for key in photos for row in measured(*key)])
 
 
 def tables_of(measures: list[dict]) -> Tables:
-    """Return the tables of all photos that were measured."""
-    sets, photos = [], []
+    """Return the table of the sets whose photos were measured."""
+    sets = []
     for name in dict.fromkeys((row["set"], row["object"]) for row in measures):
         of = [row for row in measures if (row["set"], row["object"]) == name]
         common, left = common_turn([row["turn"] for row in of])
@@ -139,13 +134,5 @@ def tables_of(measures: list[dict]) -> Tables:
         cells = [f"{common:.1f}", f"{np.median(left):.1f}, {max(left):.1f}", f"{min(ratios):.2f} to {max(ratios):.2f}"]
         cells += [share([bool(row["doubts"]) for row in of]), f"{np.median(seconds):.0f}, {max(seconds):.0f}"]
         sets.append([" ".join(name), str(len(of)), *angles, *cells])
-    for row in measures:
-        known = f" ({row['reference_iou']:.3f})" if row["reference_iou"] is not None else ""
-        cells = [f"{row['focal_ratio']:.2f} ({row['focal_source']})", f"{row['silhouette_iou']:.3f}{known}"]
-        cells += ["; ".join(row["doubts"]) or "–", f"{row['processor_s']:.0f}, {row['wall_s']:.0f}"]
-        photos.append([f"{row['set']}, {row['photo']}", *(f"{row[key]:.1f}" for key in ANGLES), *cells])
-    focal = "focal length, of the reference's"
-    more = ["common turn (°)", "less that (°)", focal, "doubtful", "processor (s)"]
-    head = ["set, object", "photos", *ANGLES.values(), *more]
-    each = ["photo", *ANGLES.values(), focal, "IoU (the reference's)", "doubts", "processor, wall (s)"]
-    return {"Sets: median, worst": [head, *sets], "Photographs": [each, *photos]}
+    more = ["common turn (°)", "less that (°)", "focal length, of the reference's", "doubtful", "processor (s)"]
+    return {"Sets: median, worst": [["set, object", "photos", *ANGLES.values(), *more], *sets]}

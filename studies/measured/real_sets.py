@@ -13,18 +13,16 @@ from factorlib.results.metrics import Metrics
 from studies.measured.tools import Tables, evaluated, exact, needed
 
 PSNR, FLAT = "PSNR, tone-mapped, of the re-synthesis (dB)", "of flat colours"
-HEAD = ["set: photo", "DSSIM of the re-synthesis", FLAT, PSNR, FLAT]
+HEAD = ["set, mean over photos", "DSSIM of the re-synthesis", FLAT, PSNR, FLAT]
 
 
 def rows_of(name: str, metrics: Metrics) -> list[list[str]]:
-    """Return rows of each photo and of the mean: DSSIM and PSNR of the re-synthesis, beside those of flat colours."""
-    scored = {photo: errors.gauges["none"] for photo, errors in metrics.resynthesis.photos.items() if errors.gauges}
-    scored |= {"mean": metrics.resynthesis.mean["none"]} if metrics.resynthesis.mean else {}
-    both = {photo: (errors.estimate, errors.null) for photo, errors in scored.items()}
-    return [
-        [f"{name}: {photo}", *(exact(e.dssim, 3) for e in of), *(f"{e.psnr_tonemapped_db:.1f}" for e in of)]
-        for photo, of in both.items()
-    ]
+    """Return the row of a set: mean DSSIM and PSNR of the re-synthesis, beside those of flat colours."""
+    if not metrics.resynthesis.mean:
+        return []
+    errors = metrics.resynthesis.mean["none"]
+    both = errors.estimate, errors.null
+    return [[name, *(exact(e.dssim, 3) for e in both), *(f"{e.psnr_tonemapped_db:.1f}" for e in both)]]
 
 
 def rows() -> Tables:

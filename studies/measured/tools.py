@@ -1,7 +1,6 @@
 """Numbers, tables, marked parts of pages, times and processes, shared by measurements and studies."""
 
 import os
-import re
 import subprocess
 import sys
 import time
@@ -23,14 +22,13 @@ def exact(value: float, digits: int = 2) -> str:
     """Format the value with that many significant digits, and a power of ten where it is tiny or huge.
 
     >>> exact(0.00123), exact(0.000012), exact(0.0), exact(12.3), exact(48000.0)
-    ('.0012', '1.2·10⁻⁵', '0', '12', '4.8·10⁴')
+    ('0.0012', '1.2·10⁻⁵', '0', '12', '4.8·10⁴')
     """
     if value == 0:
         return "0"
     value = float(f"{value:.{digits}g}")
     if 1e-3 <= abs(value) < 1e4:
-        text = f"{value:.10f}".rstrip("0").rstrip(".")
-        return re.sub(r"^(-?)0\.", r"\1.", text)
+        return f"{value:.10f}".rstrip("0").rstrip(".")
     mantissa, exponent = f"{value:.{digits - 1}e}".split("e")
     return f"{mantissa}·10{str(int(exponent)).translate(str.maketrans('-0123456789', '⁻⁰¹²³⁴⁵⁶⁷⁸⁹'))}"
 

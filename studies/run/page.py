@@ -17,6 +17,7 @@ from studies.study import FULL, Scale, Score, Study, case_name
 
 DOCS = LIBRARY / "docs" / "studies.md"
 COLUMNS = 4  # measures of a study that the documentation has
+HEADS = {"agrees": "Shown", "disagrees": "The opposite is shown", "no difference is shown": "No difference is shown"}
 FINISHED = ("table.csv", "table.json", "paragraph.md")
 
 
@@ -70,11 +71,9 @@ def done_of(project: Project) -> dict[str, Conclusion]:
 
 
 def refresh_docs(names: Sequence[str]) -> None:
-    """Write the tables of full studies, and that of all answers to the paper, into docs/studies.md."""
+    """Write tables and answers of full studies, and the table of all answers to the paper, into docs/studies.md."""
     done, text = done_of(studies(FULL)), DOCS.read_text(encoding="utf-8")
-    parts = {}
-    for name in [name for name in names if name in done]:
-        parts[name] = "\n".join([numbers(done[name], COLUMNS), "", *(f"- {words}" for words in done[name].sentences)])
+    parts = {name: f"{numbers(done[name], COLUMNS)}\n\n{claims(done[name])}" for name in names if name in done}
     refresh(DOCS, {"conclusions": against_the_paper({name: c.answer for name, c in done.items()}, text)} | parts)
 
 
@@ -86,6 +85,14 @@ def against_the_paper(answers: Mapping[str, str], text: str = "") -> str:
         line = re.search(rf"^\| {re.escape(title)} \|.* \| (.*) \|$", text, re.MULTILINE)
         rows.append([title, study.paper, answers.get(name, line[1] if line else "not run")])
     return table(["study", "the paper", "here"], rows)
+
+
+def claims(c: Conclusion) -> str:
+    """Return a line for each answer that seeds give, with the claims that they answer so."""
+    words: dict[str, list[str]] = {}
+    for claim in c.claims:
+        words.setdefault(HEADS.get(claim.answer, claim.answer), []).append(claim.sentence.partition(": ")[0])
+    return "\n".join(f"- **{head}**: {'; '.join(these)}." for head, these in words.items())
 
 
 def numbers(c: Conclusion, most: int) -> str:
