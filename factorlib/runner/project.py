@@ -223,7 +223,7 @@ def check_name(
 class Code(msgspec.Struct, frozen=True):
     """Name of a stage, where its module is found, its parameters (and their file), and its share of the machine.
 
-    threads: of its libraries' numerics;  cores: that independent work is spread over
+    threads: of its libraries' numerics;  cores: the most that independent work is spread over
     """
 
     root: Path
@@ -238,6 +238,7 @@ class Code(msgspec.Struct, frozen=True):
 # ── pipeline.yaml ────────────────────────────────────────────────────────────────────────────────────────────────────
 
 FORMAT = 1
+MOST_CORES = 1024
 SHOWN = 80  # characters of a setting that messages repeat
 LONGEST_SETTING, DEEPEST = 5000, 16  # characters of a setting, parts of its name: a path may have 4096
 NAME = re.compile("[a-z][a-z0-9_]*")
@@ -279,7 +280,7 @@ class Stage(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     gather: str | None = None
     makes: list[str] = []
     threads: Annotated[int, msgspec.Meta(ge=1, le=64)] = 1
-    cores: Annotated[int, msgspec.Meta(ge=1, le=1024)] | Literal["all"] = 1
+    cores: Annotated[int, msgspec.Meta(ge=1, le=MOST_CORES)] | Literal["all"] = 1
     logs: bool = False
     when: str | None = None
     optional: bool = False
