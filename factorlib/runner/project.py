@@ -132,8 +132,12 @@ class Project(msgspec.Struct, frozen=True):
         """Return the folder of the store: in `build`, or FACTORLIB_STORE.  InputError where there is none."""
         if not (named := os.environ.get(SHARED)):
             return self.build / "store"
-        if not os.path.isdir(folder := Path(named).expanduser()):
-            cure = "make it, or name another that you may write; it may be empty"
+        folder = Path(named).expanduser()
+        if os.path.lexists(folder) and not os.path.isdir(folder):
+            cure = "name a folder instead; it may be empty"
+            raise InputError("is a file, where a folder is expected", file=named[:100], key=SHARED, cure=cure)
+        if not os.path.isdir(folder):
+            cure = f"make it (mkdir -p {shlex.quote(named[:100])}), or name another folder that you may write to"
             raise InputError("there is no such folder", file=named[:100], key=SHARED, cure=cure)
         return folder.resolve()
 
@@ -183,7 +187,8 @@ class Project(msgspec.Struct, frozen=True):
         roots = [root / "recipes" for root in dict.fromkeys([self.code_root, self.root])]
         folders = [*roots, *(root / data.folder.name for root in roots)]  # the latter go before
         known = {path.stem: path for folder in folders for path in sorted(folder.glob("*.yaml"))}
-        paths, recipes = [], {}
+        paths: list[Path] = []
+        recipes: dict[str, Recipe] = {}
         for word in words:
             path = Path(os.path.abspath(word))
             if word != ALL and word not in known and not path.is_file():

@@ -109,7 +109,7 @@ def run_step(task: Task) -> Outcome:
     with Events(task.events) as events:
         try:
             entry = _made(task, store, events)
-            where = {name: task.record[name] for name in ("photo", "recipe") if name in task.record}
+            where: dict[str, Any] = {name: task.record[name] for name in ("photo", "recipe") if name in task.record}
             where |= {"stage": code.stage, "key": task.key}
             lines = [where | {"event": "warning", "text": text} for text in events.warnings]
             lines.append(where | {"event": "done", **meter.read(code.threads, min(code.cores, usable_cores()))})
@@ -252,7 +252,10 @@ class Events(logging.Handler):
 
     def __init__(self, path: Path):
         super().__init__(logging.WARNING)
-        self.path, self.warnings, self._last, self._share = path, [], 0.0, 0.0
+        self.path = path
+        self.warnings: list[str] = []
+        self._last = 0.0
+        self._share = 0.0
 
     def __enter__(self) -> Self:
         logging.captureWarnings(True)
