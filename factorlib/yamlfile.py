@@ -85,7 +85,13 @@ def _compose(text: str, name: str | Path) -> yaml.Node | None:
     """Return the root node of the text's one document, None for an empty text; InputError if it is not YAML."""
     try:
         depth = 0
+        anchors = set()
         for event in yaml.parse(text, Loader=_Loader):  # first: composing is recursive, and would overflow the stack
+            if isinstance(event, yaml.AliasEvent) and event.anchor not in anchors:
+                fault = f"there is no &{event.anchor} above this alias"
+                cure = "correct its name, or write the value out"
+                raise InputError(fault, file=f"{name}:{event.start_mark.line + 1}", cure=cure)
+            anchors.add(getattr(event, "anchor", None))
             depth += isinstance(event, yaml.CollectionStartEvent) - isinstance(event, yaml.CollectionEndEvent)
             if depth > MOST_DEPTH:
                 fault = f"lists and maps are nested more than {MOST_DEPTH} deep"
