@@ -1,6 +1,6 @@
 """YAML files as typed structs: scalars as in YAML 1.2, no duplicate or unknown key, errors with file, line and key.
 
-PyYAML reads `1e-3` as a string and `no` as False, and silently accepts a duplicate key, so only its events are used.
+PyYAML reads `1e-3` as a string and `no` as False, and silently accepts a duplicate key, so only its nodes are used.
 Nesting, growth through aliases and size have limits, so that an error comes before memory or the stack is full.
 msgspec converts the value to its type, whose `Meta` states the valid numbers or names and the cure for others.
 """
@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterator
+from itertools import count
 from pathlib import Path
 from types import UnionType
 from typing import Annotated, Any, Literal, NoReturn, TypeVar, Union, get_args, get_origin
@@ -21,19 +22,26 @@ from factorlib.reading import one_line, read_text
 
 T = TypeVar("T")
 Keys = tuple[str | int, ...]  # path to a value: mapping keys and list indices from the root
-_CORE = re.compile(  # YAML 1.2.2, section 10.3.2
-    r"(?P<null>~|null|Null|NULL|)|(?P<bool>true|True|TRUE|false|False|FALSE)|(?P<int>[-+]?[0-9]+|0o[0-7]+|0x[0-9a-fA-F]+)"
-    r"|(?P<float>[-+]?(?:\.[0-9]+|[0-9]+(?:\.[0-9]*)?)(?:[eE][-+]?[0-9]+)?|[-+]?\.(?:inf|Inf|INF)|\.(?:nan|NaN|NAN))"
-)
-_Parser = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
-_FIELD = re.compile(r"(?P<fault>unknown|missing required) field `(?P<name>.*)`", re.DOTALL)
-
-
 # limits of a file, far above a dataset of ten thousand photos
 MOST_BYTES = 64_000_000
 MOST_VALUES = 2_000_000  # scalars, lists and maps; those that aliases repeat count each time
 MOST_DEPTH = 64  # nesting of lists and maps
-MOST_DIGITS = 300  # characters of a number
+TOO_DEEP = "is a bracket missing, an indent too much, or does an alias (*name) stand inside its anchor (&name)?"
+_CORE = re.compile(  # YAML 1.2.2, section 10.3.2; a number of more than 300 digits is a word
+    r"(?P<null>~|null|Null|NULL|)|(?P<bool>true|True|TRUE|false|False|FALSE)"
+    r"|(?P<int>[-+]?[0-9]{1,300}|0o[0-7]{1,300}|0x[0-9a-fA-F]{1,300})"
+    r"|(?P<float>[-+]?(?:\.[0-9]{1,300}|[0-9]{1,300}(?:\.[0-9]{0,300})?)(?:[eE][-+]?[0-9]{1,300})?"
+    r"|[-+]?\.(?:inf|Inf|INF)|\.(?:nan|NaN|NAN))"
+)
+_FIELD = re.compile(r"(?P<fault>unknown|missing required) field `(?P<name>.*)`", re.DOTALL)
+
+
+class _Loader(getattr(yaml, "CBaseLoader", yaml.BaseLoader)):  # type: ignore[misc]
+    """PyYAML's parser without its own types: the tag of a node is empty unless the file writes one."""
+
+    def resolve(self, kind: type, value: Any, implicit: Any) -> str:
+        """Return the tag of a node without one."""
+        return ""
 
 
 def read_yaml(path: str | Path, type_: type[T], most_values: int = MOST_VALUES) -> T:
@@ -70,116 +78,78 @@ def parse_yaml(text: str, name: str | Path = "", most_values: int = MOST_VALUES)
     >>> parse_yaml("{a: 1e-3, b: no, c: [1, ~, true]}")
     {'a': 0.001, 'b': 'no', 'c': [1, None, True]}
     """
-    return _Document(text, name, most_values).value()
+    return _plain(_compose(text, name), name, most_values)
 
 
-class _Document:
-    """One pass over the events of a text that builds its value and counts its parts."""
-
-    def __init__(self, text: str, name: str | Path, most_values: int):
-        self.text = text
-        self.name = name
-        self.most_values = most_values
-        self.events = self._events()
-        self.count = 0
-        self.anchors: dict[str | None, Any] = {}
-        self.unfinished: set[str | None] = set()
-
-    def value(self) -> Any:
-        """Return the value of the text's one document, None for an empty text; InputError for a second document."""
-        next(self.events)  # the stream
-        if isinstance(next(self.events), yaml.StreamEndEvent):
-            return None
-        value = self._node(next(self.events), ())
-        next(self.events)  # the document's end
-        if not isinstance(after := next(self.events), yaml.StreamEndEvent):
-            self._refuse("there is a second document", after, (), "delete it, and the --- before it")
-        return value
-
-    def _events(self) -> Iterator[yaml.Event]:
-        try:
-            yield from yaml.parse(self.text, Loader=_Parser)
-        except yaml.YAMLError as error:
-            mark = getattr(error, "problem_mark", None)
-            context = getattr(error, "context", None)
-            words = [one_line(part) for part in (getattr(error, "problem", None) or str(error), context) if part]
-            cure = "look for a bracket, quote, colon or indent on or above this line"
-            file = f"{self.name}:{mark.line + 1}" if mark else self.name
-            raise InputError(f"not YAML: {' '.join(words)}", file=file, cure=cure) from error
-
-    def _node(self, event: yaml.Event, keys: Keys) -> Any:
-        if isinstance(event, yaml.AliasEvent):
-            if event.anchor in self.unfinished:
-                self._refuse("an alias that contains itself", event, keys, "write the value out")
-            if event.anchor not in self.anchors:
+def _compose(text: str, name: str | Path) -> yaml.Node | None:
+    """Return the root node of the text's one document, None for an empty text; InputError if it is not YAML."""
+    try:
+        depth = 0
+        anchors = set()
+        for event in yaml.parse(text, Loader=_Loader):  # first: composing is recursive, and would overflow the stack
+            if isinstance(event, yaml.AliasEvent) and event.anchor not in anchors:
+                fault = f"there is no &{event.anchor} above this alias"
                 cure = "correct its name, or write the value out"
-                self._refuse(f"there is no &{event.anchor} above this alias", event, keys, cure)
-            return self._copy(self.anchors[event.anchor], event, keys, 0)
-        self._count(event, keys, 0)
-        if event.tag not in (None, "!"):
-            self._refuse(f"the tag {one_line(repr(event.tag))} is not known", event, keys, "delete the tag")
-        self.unfinished.add(event.anchor)
-        if isinstance(event, yaml.ScalarEvent):
-            value = self._scalar(event, keys)
-        elif isinstance(event, yaml.SequenceStartEvent):
-            value = []
-            while not isinstance(item := next(self.events), yaml.SequenceEndEvent):
-                value.append(self._node(item, (*keys, len(value))))
-        else:
-            value = self._map(keys)
-        self.unfinished.discard(event.anchor)
-        self.anchors[event.anchor] = value
-        return value
+                raise InputError(fault, file=f"{name}:{event.start_mark.line + 1}", cure=cure)
+            anchors.add(getattr(event, "anchor", None))
+            depth += isinstance(event, yaml.CollectionStartEvent) - isinstance(event, yaml.CollectionEndEvent)
+            if depth > MOST_DEPTH:
+                fault = f"lists and maps are nested more than {MOST_DEPTH} deep"
+                raise InputError(fault, file=f"{name}:{event.start_mark.line + 1}", cure=TOO_DEEP)
+        return yaml.compose(text, Loader=_Loader)
+    except yaml.YAMLError as error:
+        mark = getattr(error, "problem_mark", None)
+        words = [getattr(error, part, None) for part in ("context", "problem")]
+        fault = ": ".join(one_line(part) for part in words if part) or one_line(str(error))
+        cure = "look for a bracket, quote, colon or indent on or above this line"
+        raise InputError(f"not YAML: {fault}", file=f"{name}:{mark.line + 1}" if mark else name, cure=cure) from error
 
-    def _map(self, keys: Keys) -> dict[str, Any]:
+
+def _plain(root: yaml.Node | None, name: str | Path, most_values: int) -> Any:
+    """Convert a node to dicts, lists and scalars; InputError for duplicate keys, tags, and what exceeds the limits."""
+    number = count(1)
+
+    def refuse(fault: str, node: yaml.Node, keys: Keys, cure: str) -> NoReturn:
+        raise InputError(fault, file=f"{name}:{node.start_mark.line + 1}", key=key_path(keys), cure=cure)
+
+    def plain(node: yaml.Node, keys: Keys) -> Any:
+        if next(number) > most_values:
+            cure = "is it the right file? an alias (*name) repeats all that its anchor (&name) holds"
+            refuse(f"holds more than {most_values:,} values", node, (), cure)
+        if len(keys) > MOST_DEPTH:
+            refuse(f"lists and maps are nested more than {MOST_DEPTH} deep", node, keys[:4], TOO_DEEP)
+        if node.tag:
+            refuse(f"the tag {one_line(repr(node.tag))} is not known", node, keys, "delete the tag")
+        if isinstance(node, yaml.ScalarNode):
+            return node.value if node.style else _scalar(node.value)
+        if isinstance(node, yaml.SequenceNode):
+            return [plain(item, (*keys, index)) for index, item in enumerate(node.value)]
         values: dict[str, Any] = {}
         lines: dict[str, int] = {}
-        while not isinstance(event := next(self.events), yaml.MappingEndEvent):
-            if not isinstance(event, yaml.ScalarEvent):
-                self._refuse("a key that is not a word", event, keys, "write key: value")
-            key = event.value
-            if key in values:
-                fault = f"the key {one_line(repr(key))} stands here twice, first on line {lines[key]}"
-                self._refuse(fault, event, (*keys, key), "delete or rename one of them")
-            lines[key] = event.start_mark.line + 1
-            values[key] = self._node(next(self.events), (*keys, key))
+        for word, item in node.value:
+            if not isinstance(word, yaml.ScalarNode):
+                refuse("a key that is not a word", word, keys, "write key: value")
+            if word.value in values:
+                fault = f"the key {one_line(repr(word.value))} stands here twice, first on line {lines[word.value]}"
+                refuse(fault, word, (*keys, word.value), "delete or rename one of them")
+            lines[word.value] = word.start_mark.line + 1
+            values[word.value] = plain(item, (*keys, word.value))
         return values
 
-    def _copy(self, value: Any, event: yaml.Event, keys: Keys, depth: int) -> Any:
-        """Copy the value that an alias repeats, and count its parts."""
-        self._count(event, keys, depth)
-        if isinstance(value, list):
-            return [self._copy(item, event, keys, depth + 1) for item in value]
-        if isinstance(value, dict):
-            return {key: self._copy(item, event, keys, depth + 1) for key, item in value.items()}
-        return value
+    return None if root is None else plain(root, ())
 
-    def _count(self, event: yaml.Event, keys: Keys, deeper: int) -> None:
-        self.count += 1
-        if self.count > self.most_values:
-            cure = "is it the right file? an alias (*name) repeats all that its anchor (&name) holds"
-            self._refuse(f"holds more than {self.most_values:,} values", event, (), cure)
-        if len(keys) + deeper > MOST_DEPTH:
-            fault = f"lists and maps are nested more than {MOST_DEPTH} deep"
-            self._refuse(fault, event, keys[:4], "is a bracket missing, or an indent too much?")
 
-    def _scalar(self, event: yaml.ScalarEvent, keys: Keys) -> Any:
-        text = event.value
-        match = _CORE.fullmatch(event.value)
-        kind = match.lastgroup if match and event.tag is None and event.implicit[0] else "str"
-        if kind in ("int", "float") and len(text) > MOST_DIGITS:
-            cure = f"write it with {MOST_DIGITS} at most"
-            self._refuse(f"a number of {len(text)} characters", event, keys, cure)
-        if kind == "int":
-            return int(text, 0) if text[:2] in ("0o", "0x") else int(text)
-        if kind == "float":
-            return float(text.lower().replace(".inf", "inf").replace(".nan", "nan"))
-        if kind == "bool":
-            return text.lower() == "true"
-        return None if kind == "null" else text
-
-    def _refuse(self, fault: str, event: yaml.Event, keys: Keys, cure: str) -> NoReturn:
-        raise InputError(fault, file=f"{self.name}:{event.start_mark.line + 1}", key=key_path(keys), cure=cure)
+def _scalar(text: str) -> Any:
+    """Return the value of a scalar without quotes."""
+    match = _CORE.fullmatch(text)
+    kind = match.lastgroup if match else "str"
+    if kind == "int":
+        return int(text, 0) if text[:2] in ("0o", "0x") else int(text)
+    if kind == "float":
+        return float(text.lower().replace(".inf", "inf").replace(".nan", "nan"))
+    if kind == "bool":
+        return text.lower() == "true"
+    return None if kind == "null" else text
 
 
 def key_path(keys: Keys) -> str | None:
@@ -211,7 +181,7 @@ def convert(value: Any, type_: type[T], name: str | Path, prefix: str = "", text
         return msgspec.convert(value, type_)
     except msgspec.ValidationError as error:
         innermost = _innermost(error, value, type_)
-    root = yaml.compose(text, Loader=_Parser) if text is not None else None
+    root = _compose(text, name) if text is not None else None
     raise_all([_fault(*fault, name, prefix, root) for fault in innermost])
     raise AssertionError("a validation error has a fault")
 
@@ -248,13 +218,13 @@ def _innermost(
     for each in types:  # grows by the members of unions and the types inside `Annotated`
         types += get_args(each) if get_origin(each) in (Union, UnionType) else ()
         types += get_args(each)[:1] if get_origin(each) is Annotated else ()
-    found = []
+    inside = []
     for key, item, inner in (child for each in types for child in _children(value, each)):
         try:
             msgspec.convert(item, inner)
         except msgspec.ValidationError as below:
-            found += _innermost(below, item, inner, (*keys, key))
-    return found or [(str(error), value, types, keys)]
+            inside += _innermost(below, item, inner, (*keys, key))
+    return inside or [(str(error), value, types, keys)]
 
 
 def _children(value: Any, type_: Any) -> Iterator[tuple[str | int, Any, Any]]:
@@ -335,7 +305,7 @@ def with_value(text: str, keys: Keys, word: str) -> str:
         keys: path to the value
         word: the new value, as written
     """
-    node = yaml.compose(text, Loader=yaml.SafeLoader)
+    node = yaml.compose(text, Loader=_Loader)
     for key in keys:
         node = node.value[key] if isinstance(key, int) else next(item for name, item in node.value if name.value == key)
     return text[: node.start_mark.index] + word + text[node.end_mark.index :]

@@ -68,7 +68,7 @@ def source_of(text: str, module: str, is_package: bool) -> Source:
     programs = _declared(tree, "PROGRAMS", dict[str, str], '{"CC": "cc"}') or {}
     for node in ast.walk(tree):
         if (body := getattr(node, "body", None)) and isinstance(body, list):  # a lambda's is one expression
-            node.body = [item for item in body if not _is_remark(item)] or [ast.Pass()]
+            body[:] = [item for item in body if not _is_remark(item)] or [ast.Pass()]
     digest = hashlib.sha256(ast.dump(tree).encode()).hexdigest()[:32]
     return Source(digest, sorted(imports), environment, programs)
 
@@ -126,7 +126,7 @@ class Sources:
         sources = {name: self._source(name, file) for name, file in sorted(places.items()) if file.name.endswith(".py")}
         packages = {n if places[n].name == "__init__.py" else n.rpartition(".")[0]: places[n].parent for n in sources}
         packages.pop("", None)  # beside a module that is in no package lies anything
-        data = {}
+        data: dict[str, Path] = {}
         for name, folder in packages.items():
             if folder not in self._beside:
                 self._beside[folder] = list(_data_files(folder))
@@ -136,9 +136,9 @@ class Sources:
         for source in sources.values():
             record |= {f"environment:{name}": os.environ[name] for name in source.environment if name in os.environ}
             for name, default in source.programs.items():
-                words = os.environ.get(name, default).split() or [""]
-                if shutil.which(words[0]):  # without the folder it lies in
-                    record[f"program:{name}"] = " ".join([Path(words[0]).name, *words[1:]])
+                command = os.environ.get(name, default).split() or [""]
+                if shutil.which(command[0]):  # without the folder it lies in
+                    record[f"program:{name}"] = " ".join([Path(command[0]).name, *command[1:]])
         files = {f"source:{name}": places[name] for name in sources} | data
         for name in sorted(external - sys.stdlib_module_names):  # what belongs to no distribution is left out
             record |= {f"package:{each}": version for each, version in self.versions.get(name, {}).items()}

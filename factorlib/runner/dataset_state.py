@@ -19,6 +19,7 @@ from factorlib.runner.project import (
     ALL,
     DATASET,
     LIBRARY,
+    MOST_CORES,
     Code,
     Data,
     Project,
@@ -69,14 +70,11 @@ class Survey:
         spec = self.spec if forced is None else msgspec.structs.replace(self.spec, forced=forced)
         return plan(spec, self.records, Listing(self.store, self.previous, self.store.damaged))
 
-    def code(self, name: str, cores: int = 1) -> Code:
-        """Describe a stage with its parameters, as a worker loads it.
-
-        cores: of the machine, of which it takes what it may
-        """
+    def code(self, name: str) -> Code:
+        """Describe a stage with its parameters, as a worker loads it."""
         stage, project = self.spec.pipeline.stages[name], self.project
-        taken = cores if stage.cores == "all" else min(stage.cores, cores)
-        return Code(project.code_root, project.package, name, stage.values, project.pipeline_file, stage.threads, taken)
+        cores = MOST_CORES if stage.cores == "all" else stage.cores
+        return Code(project.code_root, project.package, name, stage.values, project.pipeline_file, stage.threads, cores)
 
     def faults(self, steps: Iterable[Step], new: bool = False) -> list[str]:
         """List the faults of the files that steps read, those of their recipes too, each fault once.
@@ -103,13 +101,12 @@ class Survey:
         open_ = dict.fromkeys(p.step.stage for p in planned if p.status != "current")
         codes, faults = [self.code(name) for name in open_ if self.spec.pipeline.stages[name].values], []
         if codes:
-            from factorlib.runner.worker import Processes, check_params  # a run with nothing to do need not load it
+            from factorlib.runner.worker import Workers, check_params  # A run with nothing to do does not load it.
 
-            with contextlib.closing(Processes()) as processes:
-                for future in [processes.submit(1, code.threads, check_params, code) for code in codes]:
-                    if isinstance(
-                        error := future.exception(), InputError
-                    ):  # what cannot be loaded says so when it runs
+            with contextlib.closing(Workers()) as workers:
+                for future in [workers.submit(1, code.threads, check_params, code) for code in codes]:
+                    error = future.exception()
+                    if isinstance(error, InputError):  # A module that cannot be loaded reports that when it runs.
                         faults.append(str(said_of_settings(error, self.settings)))
         return faults
 

@@ -61,7 +61,8 @@ class Display:
             Step, list
         ] = {}  # when it began and was last heard of, which share of it is done, what it does
         self._told: dict[str | Step, None] = {}  # stages that have begun, warnings, and steps that wait
-        self._bars, self._rows = None, {}
+        self._bars: Any = None
+        self._rows: dict[str, Any] = {}
         if sys.stderr.isatty():
             self._bars = _bars()
             self._bars.start()

@@ -109,12 +109,12 @@ def _planned(step: Step, forced: bool, own: Record, outputs: Mapping[Step, str |
     """
     unmade = [above for above, output in outputs.items() if output is None]
     record = own | {f"input:{above}": output for above, output in outputs.items() if output is not None}
-    whole, key = (None, None) if unmade else (record, hash_of(record))
+    whole, key = (None, None) if unmade else (record, step_key(record))
     if forced:
         return Planned(step, "to run", ["forced"], whole, key)
     if key and (output := listing.outputs.get(key)) is not None:
         return Planned(step, "current", [], whole, key, output)
-    if key in listing.damaged:
+    if key and key in listing.damaged:
         return Planned(step, "to run", [f"its result is damaged: {in_short(listing.damaged[key])}"], whole, key)
     if (before := listing.previous.get(str(step))) is None:
         return Planned(step, "to run", ["not made yet"], whole, key)
@@ -125,11 +125,13 @@ def _planned(step: Step, forced: bool, own: Record, outputs: Mapping[Step, str |
     return Planned(step, "to run", changes or ["its result is gone"], whole, key)
 
 
-def hash_of(table: Record) -> str:
-    """Return the hash of a table, the same on any machine.
+def step_key(record: Record) -> str:
+    """Return the key of a step: the hash of its record, the same on any machine."""
+    return hash_of(record)
 
-    A record's hash is its key; that of a table of a tree's files is the tree's name.
-    """
+
+def hash_of(table: Record) -> str:
+    """Return the hash of a table: of a step's record, or of the files of a tree, which is named by it."""
     return hashlib.sha256(json.dumps(table, sort_keys=True).encode()).hexdigest()[:32]
 
 

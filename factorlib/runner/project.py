@@ -132,8 +132,12 @@ class Project(msgspec.Struct, frozen=True):
         """Return the folder of the store: in `build`, or FACTORLIB_STORE.  InputError where there is none."""
         if not (named := os.environ.get(SHARED)):
             return self.build / "store"
-        if not os.path.isdir(folder := Path(named).expanduser()):
-            cure = "make it, or name another that you may write; it may be empty"
+        folder = Path(named).expanduser()
+        if os.path.lexists(folder) and not os.path.isdir(folder):
+            cure = "name a folder instead; it may be empty"
+            raise InputError("is a file, where a folder is expected", file=named[:100], key=SHARED, cure=cure)
+        if not os.path.isdir(folder):
+            cure = f"make it (mkdir -p {shlex.quote(named[:100])}), or name another folder that you may write to"
             raise InputError("there is no such folder", file=named[:100], key=SHARED, cure=cure)
         return folder.resolve()
 
@@ -183,7 +187,8 @@ class Project(msgspec.Struct, frozen=True):
         roots = [root / "recipes" for root in dict.fromkeys([self.code_root, self.root])]
         folders = [*roots, *(root / data.folder.name for root in roots)]  # the latter go before
         known = {path.stem: path for folder in folders for path in sorted(folder.glob("*.yaml"))}
-        paths, recipes = [], {}
+        paths: list[Path] = []
+        recipes: dict[str, Recipe] = {}
         for word in words:
             path = Path(os.path.abspath(word))
             if word != ALL and word not in known and not path.is_file():
@@ -223,7 +228,7 @@ def check_name(
 class Code(msgspec.Struct, frozen=True):
     """Name of a stage, where its module is found, its parameters (and their file), and its share of the machine.
 
-    threads: of its libraries' numerics;  cores: that independent work is spread over
+    threads: of its libraries' numerics;  cores: the most that independent work is spread over
     """
 
     root: Path
@@ -238,6 +243,7 @@ class Code(msgspec.Struct, frozen=True):
 # ── pipeline.yaml ────────────────────────────────────────────────────────────────────────────────────────────────────
 
 FORMAT = 1
+MOST_CORES = 1024
 SHOWN = 80  # characters of a setting that messages repeat
 LONGEST_SETTING, DEEPEST = 5000, 16  # characters of a setting, parts of its name: a path may have 4096
 NAME = re.compile("[a-z][a-z0-9_]*")
@@ -279,7 +285,7 @@ class Stage(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     gather: str | None = None
     makes: list[str] = []
     threads: Annotated[int, msgspec.Meta(ge=1, le=64)] = 1
-    cores: Annotated[int, msgspec.Meta(ge=1, le=1024)] | Literal["all"] = 1
+    cores: Annotated[int, msgspec.Meta(ge=1, le=MOST_CORES)] | Literal["all"] = 1
     logs: bool = False
     when: str | None = None
     optional: bool = False

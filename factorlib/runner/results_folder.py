@@ -35,13 +35,14 @@ from factorlib.runner.project import RESERVED, SHARED, Project, check_name
 from factorlib.runner.store import (
     LOCK,
     Entry,
+    Stamp,
     Store,
     damage_of,
     hash_of_file,
     is_locked,
     lock,
+    remove_killed_runs,
     stamps_of,
-    sweep,
 )
 from factorlib.wholefile import replace_file, write_text
 
@@ -171,12 +172,14 @@ def view_of(store: Store, stage: str, keys: dict[str, str], gather: str | None) 
     Each `<photo>.json` goes into `gather`, too.
     The folder is a result as those of steps are.  Its files are hard links to theirs.
     """
-    entries = {photo: store.entry(key) for photo, key in sorted(keys.items())}
+    entries = {photo: entry for photo, key in sorted(keys.items()) if (entry := store.entry(key))}
     record = {f"input:{stage}/{photo}": entry.output for photo, entry in entries.items()}
     record |= {"stage": stage, "photo": None, "view": gather}
     if store.get(key := hash_of(record)) is not None:
         return key
-    draft, files, right = store.tmp / f"view-{uuid.uuid4().hex[:8]}-{key}", {}, {}
+    draft = store.tmp / f"view-{uuid.uuid4().hex[:8]}-{key}"
+    files: dict[str, str] = {}
+    right: dict[str, Stamp] = {}
     draft.mkdir(parents=True)
     try:
         for photo, entry in entries.items():
@@ -235,7 +238,7 @@ def _door(store: Store, say: Callable[[str], None]) -> Iterator[None]:
         say("waiting: another command begins a run or cleans the store")
         door = lock(store.root / "door.lock", wait=True)
     try:
-        sweep(store.tmp)
+        remove_killed_runs(store.tmp)
         yield
     finally:
         os.close(door)

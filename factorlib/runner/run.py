@@ -23,7 +23,7 @@ from factorlib.runner.display import Display
 from factorlib.runner.plan import Planned, Step
 from factorlib.runner.results_folder import begin_run, claim, label, view_of
 from factorlib.runner.store import lock, sound_lines
-from factorlib.runner.worker import Cluster, Code, Outcome, Processes, Task, run_step
+from factorlib.runner.worker import Code, Outcome, Task, Workers, run_step
 from factorlib.wholefile import append_text, write_bytes, write_text
 
 POLL = 0.1  # seconds between two looks at what the workers say
@@ -45,35 +45,37 @@ def run(survey: Survey, display: Display) -> Run:
     """Run whatever of the plan must run; the results are in the store and under build/<dataset>/ afterwards."""
     claim(survey.project, survey.home, survey.data.folder)
     folder, held = begin_run(survey.store, display.say)
-    with contextlib.ExitStack() as after:
-        after.callback(shutil.rmtree, folder, ignore_errors=True)
-        work = Run(survey, display, folder)
-        after.callback(lambda: work.pools.close())
-        after.callback(os.close, held)  # the first of these, at which processes end that are not done
-        work.refused = survey.wrong_values(survey.planned())
-        if work.refused:
-            return work
-        if (executor := survey.spec.pipeline.executor) != "processes":
-            work.pools = Cluster(executor, folder, display.say)
+    workers = None
+    try:
+        workers = Workers(survey.spec.pipeline.executor, folder, display.say)
+        work = Run(survey, display, folder, workers)
         try:
             work.go()
         finally:
             for running in work.running.values():
                 os.close(running.lock)
             survey.show(survey.planned(frozenset()))
-    return work
+        return work
+    finally:
+        os.close(held)  # Processes whose step is not done end then.
+        if workers:
+            workers.close()
+        shutil.rmtree(folder, ignore_errors=True)
 
 
 class Run:
-    """The state of one run.
+    """State of one run.
 
-    refused: faults of parameters, for which nothing runs;  ran, failed, held_up: the steps that it came to
+    Attributes:
+        ran, failed, held_up: steps that succeeded, that failed, and that wait for a failed one
     """
 
-    def __init__(self, survey: Survey, display: Display, folder: Path):
-        self.survey, self.display, self.folder, self.pools = survey, display, folder, Processes(folder)
+    def __init__(self, survey: Survey, display: Display, folder: Path, workers: Workers):
+        self.survey = survey
+        self.display = display
+        self.folder = folder
+        self.workers = workers
         self.store = survey.store
-        self.refused: list[str] = []
         self.running: dict[Step, Running] = {}
         self.waiting: set[Step] = set()  # for another run, or for what is damaged to be made again
         self.ran: list[Step] = []
@@ -90,7 +92,7 @@ class Run:
         while True:
             self.waiting = set()
             self._start_planned()
-            while self.stale and self.pools.free(1):
+            while self.stale and self.workers.free(1):
                 self._plan()
                 self._start_planned()
             if not self.running and not self.waiting:
@@ -110,10 +112,10 @@ class Run:
                 continue
             if step in self.running or step in self.failed or step.stage in self.edited:
                 continue
-            if not self.pools.free(1):
+            if not self.workers.free(1):
                 return
-            code = self.survey.code(step.stage, self.pools.cores)
-            if self.pools.free(max(code.threads, code.cores)):
+            code = self.survey.code(step.stage)
+            if self.workers.free(max(code.threads, code.cores)):
                 self._start(step, planned, code)
 
     def _start(self, step: Step, planned: Planned, code: Code) -> None:
@@ -134,7 +136,7 @@ class Run:
         else:
             self.display.start(step)
             task = self._task(planned, code)
-            future = self.pools.submit(max(code.threads, code.cores), code.threads, run_step, task)
+            future = self.workers.submit(max(code.threads, code.cores), code.threads, run_step, task)
             self.running[step] = Running(planned, task, held, future)
 
     def _task(self, planned: Planned, code: Code) -> Task:

@@ -32,7 +32,7 @@ import msgspec
 
 from factorlib.errors import InputError
 from factorlib.jsonfile import json_text
-from factorlib.runner.plan import Record, hash_of
+from factorlib.runner.plan import Record, hash_of, step_key
 from factorlib.runner.project import Shipping
 from factorlib.wholefile import replace_file, sync, sync_tree
 
@@ -153,7 +153,7 @@ class Store:
                 entry = msgspec.json.decode((self.keys / f"{key}.json").read_bytes(), type=Entry)
             except (OSError, msgspec.DecodeError):  # a folder in its place, say
                 return None
-            if hash_of(entry.files) != entry.output or hash_of(entry.record) != key:
+            if hash_of(entry.files) != entry.output or step_key(entry.record) != key:
                 return None
             self._entries[key] = entry
         return self._entries[key]
@@ -262,8 +262,8 @@ def is_locked(path: Path) -> bool:
     return False
 
 
-def sweep(folder: Path) -> None:
-    """Delete what runs left in `folder` that are dead, and drafts to which nobody has written for a day."""
+def remove_killed_runs(folder: Path) -> None:
+    """Delete the folders of runs whose lock nobody holds, and drafts to which nobody has written for a day."""
     for path in (path for path in folder.iterdir() if path.is_dir() and not is_locked(path / LOCK)):
         with contextlib.suppress(FileNotFoundError):
             if path.name.startswith("run-") or time.time() - path.stat().st_mtime > ABANDONED:
@@ -379,7 +379,7 @@ def copy_shipped(roots: list[Path], shipping: Shipping | None, record: Record, o
         except msgspec.DecodeError as error:
             words = f"does not say what the shipped files were made from ({error})"
             raise InputError(words, file=file, cure=CURE) from None
-        if shipped.record == made_from(record, shipping.made_by):
+        if shipping and shipped.record == made_from(record, shipping.made_by):
             if not copied(file.parent, out, shipped.files):
                 raise InputError("beside it are not the files that were shipped with the source", file=file, cure=CURE)
             return True

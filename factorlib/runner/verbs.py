@@ -105,14 +105,14 @@ def _run(seen: Survey, started: float) -> int:
 
     display = Display()
     try:
+        if wrong := seen.wrong_values(seen.planned()):
+            return _refused(seen, wrong, "parameters")
         ran = run(seen, display)
     except (KeyboardInterrupt, SystemExit) as stop:
         display.say("stopped; what was finished is kept, the next run goes on from there")
         return INTERRUPTED if isinstance(stop, KeyboardInterrupt) else TERMINATED
     finally:
         display.close()
-    if ran.refused:
-        return _refused(seen, ran.refused, "parameters")
     if failed := list(ran.failed):
         _say(seen, f"{count(failed)} failed: {in_short(failed, NAMED, ', ')}")
         if ran.held_up:

@@ -28,7 +28,7 @@ import time
 import traceback
 import uuid
 import warnings
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import Future, ProcessPoolExecutor, ThreadPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
 from functools import partial
@@ -109,10 +109,10 @@ def run_step(task: Task) -> Outcome:
     with Events(task.events) as events:
         try:
             entry = _made(task, store, events)
-            where = {name: task.record[name] for name in ("photo", "recipe") if name in task.record}
+            where: dict[str, Any] = {name: task.record[name] for name in ("photo", "recipe") if name in task.record}
             where |= {"stage": code.stage, "key": task.key}
             lines = [where | {"event": "warning", "text": text} for text in events.warnings]
-            lines.append(where | {"event": "done", **meter.read(code.threads, code.cores)})
+            lines.append(where | {"event": "done", **meter.read(code.threads, min(code.cores, usable_cores()))})
             store.logs.mkdir(parents=True, exist_ok=True)
             text = "".join(json.dumps(line, sort_keys=True) + "\n" for line in lines)
             replace_file(store.log(task.key), text.encode())
@@ -145,8 +145,9 @@ def params_of(code: Code) -> msgspec.Struct:
 
 
 def check_params(code: Code) -> None:
-    """Raise InputError where a parameter of a stage is out of the bounds that the stage's module defines."""
-    params_of(code)
+    """Raise InputError if a parameter of a stage is out of its bounds, or if the stage's own `check(params)` does."""
+    params = params_of(code)
+    getattr(load_stage(code), "check", id)(params)
 
 
 def spread(cores: int, function: Callable, items: Iterable) -> list:
@@ -170,7 +171,7 @@ def _made(task: Task, store: Store, events: Events) -> Entry:
     results = {folder: stamps_of(folder) for folder in task.folders.values() if folder.is_relative_to(task.store)}
     unfinished = store.unfinished / task.key
     files = {field.removeprefix("file:"): path for field, path in task.files.items()}
-    map_ = partial(spread, task.code.cores)
+    map_ = partial(spread, min(task.code.cores, usable_cores()))
     inputs = Inputs(task.folders, task.facts, files, photo, map_, task.log, unfinished)
     try:
         module.main(params, inputs, out, events.progress)
@@ -251,7 +252,10 @@ class Events(logging.Handler):
 
     def __init__(self, path: Path):
         super().__init__(logging.WARNING)
-        self.path, self.warnings, self._last, self._share = path, [], 0.0, 0.0
+        self.path = path
+        self.warnings: list[str] = []
+        self._last = 0.0
+        self._share = 0.0
 
     def __enter__(self) -> Self:
         logging.captureWarnings(True)
@@ -291,161 +295,144 @@ class Events(logging.Handler):
             append_text(self.path, json.dumps(event) + "\n")
 
 
-# ── processes of this machine ────────────────────────────────────────────────────────────────────────────────────────
+# ── processes ────────────────────────────────────────────────────────────────────────────────────────────────────────
 
-THREAD_VARIABLES = [*(f"{of}_NUM_THREADS" for of in ("OMP", "MKL", "OPENBLAS", "NUMEXPR")), "VECLIB_MAXIMUM_THREADS"]
+THREAD_VARIABLES = [
+    "OMP_NUM_THREADS",
+    "MKL_NUM_THREADS",
+    "OPENBLAS_NUM_THREADS",
+    "NUMEXPR_NUM_THREADS",
+    "VECLIB_MAXIMUM_THREADS",
+]
 FIXED = {
     "PYTHONHASHSEED": "0",
+    "PYTHONWARNINGS": "ignore:resource_tracker",  # Python reports semaphores of a run that was killed as leaked.
     "OMP_WAIT_POLICY": "PASSIVE",  # threads that wait by spinning stand in the way of others, and of each other
     "MALLOC_TRIM_THRESHOLD_": None,  # Dask's nanny sets it; sums of 700 × 700 numbers then take three times as long
 }
 WATCH = 0.3  # seconds between two looks at whether the run goes on
 PATIENCE = 10  # seconds to reach a scheduler
-AHEAD = 2  # steps are handed to a cluster for so many times its cores, so that no worker waits for its next one
+AHEAD = 200  # most steps that a cluster is handed at a time: each holds an open lock file
 TRIES = 3  # of a step whose process or worker dies, on a cluster
-_starting = threading.Lock()
+_starting = threading.Lock()  # The environment is changed while a process starts.
+_of_thread = threading.local()  # the process of a thread, and the run and number of threads that it is for
 
 
-class Processes:
-    """Processes of this machine.  run: folder of the run, with whose lock they end; None where there is no run."""
+class Workers:
+    """Executor of steps, each in a process: on this machine, or on the workers of a Dask scheduler.
 
-    def __init__(self, run: Path | None = None):
-        self.run, self.pools, self._busy = run, [], {}
-        can_say = hasattr(os, "sched_getaffinity")  # which cores this process may use
-        self._cores = len(os.sched_getaffinity(0)) if can_say else os.cpu_count() or 1
+    Attributes:
+        capacity: number of cores (of a cluster: of steps) that may be busy at once
 
-    @property
-    def cores(self) -> int:
-        """Return the most cores that one step may have."""
-        return self._cores
+    Raises:
+        InputError: No scheduler answers, or Dask is not installed.
+    """
 
-    @property
-    def capacity(self) -> int:
-        """Return the cores of the steps that may be started."""
-        return self._cores
+    def __init__(self, where: str = "processes", run: Path | None = None, say: Callable[[str], None] = print):
+        self.run, self.client = run, None
+        self._busy: dict[Future, int] = {}
+        if where == "processes":
+            self.capacity = usable_cores()
+            self._executor: Any = ThreadPoolExecutor(self.capacity)
+        else:
+            self.capacity = AHEAD
+            self.client = connect(where)
+            self._executor = self.client.get_executor(pure=False, retries=TRIES - 1)
+            say(f"steps go to {where}; they wait there for a worker: .venv/bin/dask worker {where}")
 
     def free(self, cores: int) -> bool:
         """Return whether a step of `cores` cores may start now: the cores suffice, or nothing else runs."""
         self._busy = {future: count for future, count in self._busy.items() if not future.done()}
-        return not self._busy or sum(self._busy.values()) + cores <= self.capacity
+        return not self._busy or sum(self._busy.values()) + (1 if self.client else cores) <= self.capacity
 
     def submit(self, cores: int, threads: int, function: Callable, argument: Any) -> Future:
         """Start `function(argument)` in a process of `threads` threads, which takes `cores` cores."""
-        with _starting:
-            future = self._submit(threads, function, argument)
-        self._busy[future] = cores
-        return future
-
-    def _submit(self, threads: int, function: Callable, argument: Any) -> Future:
-        idle = (pool for of, pool, last in self.pools if of == threads and last.done() and last.exception() is None)
-        if (pool := next(idle, None)) is None:
-            pool = ProcessPoolExecutor(1, multiprocessing.get_context("spawn"), _watch, (self.run,))
-        self.pools = [each for each in self.pools if each[1] is not pool]
-        resource_tracker.ensure_running()  # which unblocks SIGINT
-        masked = signal.pthread_sigmask(
-            signal.SIG_BLOCK, {signal.SIGINT}
-        )  # the process inherits that: it never sees one
-        fixed = FIXED | dict.fromkeys(THREAD_VARIABLES, str(threads))
-        before = {name: os.environ.get(name) for name in fixed}
-        try:
-            _set_environment(fixed)
-            future = pool.submit(function, argument)
-        except BrokenProcessPool:  # it was killed while it had nothing to do
-            return self._submit(threads, function, argument)
-        finally:
-            _set_environment(before)
-            signal.pthread_sigmask(signal.SIG_SETMASK, masked)
-        self.pools.append((threads, pool, future))
+        future = self._executor.submit(compute_in_process, self.run, threads, function, argument)
+        self._busy[future] = 1 if self.client else cores
         return future
 
     def close(self) -> None:
-        """End the processes, once the run's lock is free at once, else when they have done what they do."""
-        for _, pool, _ in self.pools:
-            pool.shutdown()
-
-
-def _set_environment(values: dict[str, str | None]) -> None:
-    for name, value in values.items():
-        if value is None:
-            os.environ.pop(name, None)
-        else:
-            os.environ[name] = value
-
-
-def _watch(run: Path | None) -> None:
-    """Begin a process: no signal but its parent's end, or that of its run, stops it."""
-    for number in (signal.SIGINT, signal.SIGTERM):
-        signal.signal(number, signal.SIG_IGN)
-
-    def end_with_parent_and_run() -> None:
-        while multiprocessing.parent_process().is_alive() and (run is None or is_locked(run / LOCK)):
-            time.sleep(WATCH)
-        os._exit(1)
-
-    threading.Thread(target=end_with_parent_and_run, daemon=True).start()
-
-
-# ── on a cluster ─────────────────────────────────────────────────────────────────────────────────────────────────────
-
-
-class Cluster(Processes):
-    """Processes of the workers of a Dask scheduler.  Raises InputError where none answers at the address."""
-
-    def __init__(self, scheduler: str, run: Path, say: Callable[[str], None]):
-        if find_spec("distributed") is None:
-            cure = "make setup EXTRAS=dask, or pip install 'factorlib[dask]'"
-            raise InputError("Dask is not installed", key="executor", cure=cure)
-        from distributed import Client
-
-        super().__init__(run)
-        self.scheduler, self.say, self._asked = scheduler, say, False
-        for name in ("distributed", "distributed.client", "distributed.core", "distributed.comm"):
-            logging.getLogger(name).setLevel(logging.CRITICAL)  # what they say of a lost connection is in the outcome
-        say(f"connecting to {scheduler}")
-        try:
-            self.client = Client(scheduler, timeout=PATIENCE, set_as_default=False)
-        except Exception as error:  # what answers there may be anything: an HTTP server, garbage
-            cure = "start one: dask scheduler --port 8786; or leave the executor out, for processes of this machine"
-            words = f"no Dask scheduler answers at {scheduler} ({str(error) or f'nothing in {PATIENCE} s'})"
-            raise InputError(words, key="executor", cure=cure) from error
-        self._executor = self.client.get_executor(pure=False, retries=TRIES - 1)
-        self._workers = self.client.nthreads()
-
-    @property
-    def cores(self) -> int:
-        """Return the cores of the largest worker that is there now, 1 where none is."""
-        return max(self._workers.values(), default=1)
-
-    @property
-    def capacity(self) -> int:
-        """Return the cores of the steps that may be handed out; say once that there is no worker."""
-        with contextlib.suppress(Exception):  # of a scheduler that is gone, which ends the tasks too
-            self._workers = self.client.nthreads()
-        if not self._workers and not self._asked:
-            self._asked = True  # Dask keeps its tasks for workers that come
-            self.say(
-                f"waiting: there is no worker at {self.scheduler}; start one: .venv/bin/dask worker {self.scheduler}"
-            )
-        return AHEAD * sum(self._workers.values())
-
-    def _submit(self, threads: int, function: Callable, argument: Any) -> Future:
-        return self._executor.submit(_on_worker, self.run, threads, function, argument)
-
-    def close(self) -> None:
-        """Leave the cluster; tasks that are not finished are cancelled, and their processes have ended."""
+        """End the processes: at once if the run's lock is free, else after the steps that they run."""
+        if self.client is None:
+            return self._executor.shutdown()
         if not all(future.done() for future in self._busy):
             time.sleep(2 * WATCH)
         self._executor.shutdown(wait=False)
         self.client.close()
 
 
-_of_runs: dict[Path, Processes] = {}  # of a worker
+def usable_cores() -> int:
+    """Return the number of cores that this process may use."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
-def _on_worker(run: Path, threads: int, function: Callable, argument: Any) -> Any:
-    """Compute `function(argument)` in a process of this worker, which itself was started by somebody else."""
-    if not run.is_dir():
+def connect(scheduler: str) -> Any:
+    """Return a Dask client; InputError if Dask is not installed or no scheduler answers."""
+    if find_spec("distributed") is None:
+        cure = "make setup EXTRAS=dask, or pip install 'factorlib[dask]'"
+        raise InputError("Dask is not installed", key="executor", cure=cure)
+    from distributed import Client
+
+    for name in ("distributed", "distributed.client", "distributed.core", "distributed.comm"):
+        logging.getLogger(name).setLevel(logging.CRITICAL)  # The outcome of a step reports a lost connection.
+    try:
+        return Client(scheduler, timeout=PATIENCE, set_as_default=False)
+    except Exception as error:  # Anything may answer there: an HTTP server, garbage.
+        cure = "start one: dask scheduler --port 8786; or leave the executor out, for processes of this machine"
+        words = f"no Dask scheduler answers at {scheduler} ({str(error) or f'nothing in {PATIENCE} s'})"
+        raise InputError(words, key="executor", cure=cure) from error
+
+
+def compute_in_process(run: Path | None, threads: int, function: Callable, argument: Any) -> Any:
+    """Compute `function(argument)` in the process of this thread, which is started for a run and number of threads.
+
+    Raises:
+        InputError: This machine does not have the run's folder.
+    """
+    if run is not None and not run.is_dir():
         cure = "keep build/ and the data on a file system that all machines mount at the same path"
         raise InputError(f"the worker on {os.uname().nodename} does not see the run's folder", file=run, cure=cure)
-    multiprocessing.current_process().daemon = False  # those of Dask's nanny may start no process
-    return _of_runs.setdefault(run, Processes(run)).submit(1, threads, function, argument).result()
+    multiprocessing.current_process().daemon = False  # A process of Dask's nanny may start none.
+    future = None
+    if getattr(_of_thread, "started_for", None) == (run, threads):
+        with contextlib.suppress(BrokenProcessPool):  # The process died after its last step.
+            future = _of_thread.pool.submit(function, argument)
+    if future is None:
+        _of_thread.started_for = (run, threads)
+        _of_thread.pool = ProcessPoolExecutor(1, multiprocessing.get_context("spawn"), _begin_process, (run,))
+        with _starting, _environment(FIXED | dict.fromkeys(THREAD_VARIABLES, str(threads))):
+            resource_tracker.ensure_running()  # It unblocks SIGINT.
+            signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})  # The process inherits that: it never gets one.
+            future = _of_thread.pool.submit(function, argument)
+    return future.result()
+
+
+@contextlib.contextmanager
+def _environment(values: dict[str, str | None]) -> Iterator[None]:
+    """Set environment variables inside; None unsets one."""
+    before = {name: os.environ.get(name) for name in values}
+    try:
+        _set(values)
+        yield
+    finally:
+        _set(before)
+
+
+def _set(values: dict[str, str | None]) -> None:
+    os.environ.update({name: value for name, value in values.items() if value is not None})
+    for name in [name for name, value in values.items() if value is None]:
+        os.environ.pop(name, None)
+
+
+def _begin_process(run: Path | None) -> None:
+    """Begin a process: it ignores signals, and ends with its parent or with its run."""
+    for number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, signal.SIG_IGN)
+    parent = multiprocessing.parent_process()
+
+    def end_with_parent_and_run() -> None:
+        while parent is not None and parent.is_alive() and (run is None or is_locked(run / LOCK)):
+            time.sleep(WATCH)
+        os._exit(1)
+
+    threading.Thread(target=end_with_parent_and_run, daemon=True).start()

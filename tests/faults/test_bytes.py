@@ -309,10 +309,10 @@ REFUSED = {
     ],
     ("set", "dataset.yaml"): [
         *((text, "nested more than 64 deep") for text in (DEEP, "- " * 2000 + "a", "{a: " * 500 + "1" + "}" * 500)),
-        ("format: " + "1" * 5000, "a number of 5000 characters"), ("format: !!int 1", "the tag 'tag:yaml.org,2002:int' is not known"),
+        ("format: " + "1" * 5000, "expected `int`, got `str`"), ("format: !!int 1", "the tag 'tag:yaml.org,2002:int' is not known"),
         ("format: !!python/tuple [1]", "the tag 'tag:yaml.org,2002:python/tuple' is not known"),
         ("format: *none", "no &none above"),
-        ("format: 1\n---\nformat: 2\n", "a second document"), ("format: \x07", "not YAML"),
+        ("format: 1\n---\nformat: 2\n", "another document"), ("format: \x07", "not YAML"),
         ("\x00\x00\x00", "not YAML"),
         (yaml.safe_dump(DATASET) + "results: {red: 1}\n", "results"),
         *(yaml.safe_dump(DATASET | {key: 1}) for key in ("x` - at `$.b[3]", "a\n\nb", "x" * 100_000)),
