@@ -84,7 +84,7 @@ def main(params: Params, inputs: Inputs, out: Path, progress: Progress) -> None:
     names: list[str] = inputs.facts["dataset.materials"]
     progress(0, 1, "observations")
     read = count(1)
-    _refuse_options_of_the_other_solver(params)
+    check(params)
     declared = _known_values(params, inputs)
     files = sorted(inputs["urm"].glob("*.parquet"))
     surface = inputs.folders.get("surface")
@@ -122,7 +122,7 @@ def main(params: Params, inputs: Inputs, out: Path, progress: Progress) -> None:
         write_rgb_exr(out / "coverage" / f"{name}.exr", coverage, LAT_LONG)
 
 
-def _refuse_options_of_the_other_solver(params: Params) -> None:
+def check(params: Params) -> None:
     """Raise InputError if an option that only the other solver reads differs from its default."""
     joint = set(options.SolveOptions.__struct_fields__) - {"seed"}
     for field in msgspec.structs.fields(Params):
