@@ -19,7 +19,7 @@ class SolveOptions(Struct, frozen=True):
     """Largest number of splittings.  Each splits the 24 cells of a light with most energy in about four; held-out
     observations may stop it earlier."""
     observations: Annotated[int, Meta(ge=50)] = 1000
-    """Largest number of a light's observations that are fitted, drawn at random; eight times as many if splitting
+    """Largest number of a light's observations that are fitted, drawn evenly; eight times as many if splitting
     gains much more."""
     self_shadowing: Literal["auto", "on", "off"] = "auto"
     """Shadows of the meshes; auto: on, unless held-out observations are against them by two standard errors."""
@@ -30,7 +30,7 @@ class SolveOptions(Struct, frozen=True):
     """Tone curve of a photo beyond its encoding; auto: used if held-out observations support it by two standard errors
     and their loss is a quarter higher without it."""
     distance: Literal["auto", "off"] = "auto"
-    """Finite distance of a light; auto: used if held-out observations support it by two standard errors or, in part,
-    by more than one."""
+    """Finite distance of a light; auto: used if the marginal likelihood supports it very strongly (log Bayes factor
+    over 5)."""
     seed: Seed = 0
     """Seed of the held-out cells and of the observations that are drawn."""
