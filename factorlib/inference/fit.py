@@ -22,6 +22,8 @@ observations: rims and thin parts show directions that nothing else shows.
 
 from __future__ import annotations
 
+from functools import partial
+
 import msgspec
 import numpy as np
 from jaxtyping import Bool, Float
@@ -113,11 +115,7 @@ class FitSchedule(msgspec.Struct, frozen=True):
 
 
 def fit_problem(
-    problem: JointProblem,
-    start: Fit,
-    prior: LightPrior,
-    schedule: FitSchedule,
-    report: LossReport = lambda loss: None,
+    problem: JointProblem, start: Fit, prior: LightPrior, schedule: FitSchedule, report: LossReport = lambda loss: None
 ) -> Fit:
     """Fit materials and lights to the observations that are not held out, and return the fit with its objective.
 
@@ -136,21 +134,16 @@ def fit_problem(
     prior_on_materials = MaterialPrior(materials, problem.blocks, problem.known)
     descent = Descent(prior_on_materials, problem.spread, report, problem.known.free(len(materials)))
     illuminations = problem.illuminations(Point(materials, start.point.lights))
-
-    def likelihood(pair: tuple[Illumination, Hyperparameters]) -> LightLikelihood:
-        """Return the likelihood of one light, with a table of responses."""
-        return light_likelihood(*pair, prior, schedule.materials_fixed, problem.tables)
-
-    likelihoods = list(problem.spread(likelihood, list(zip(illuminations, hyperparameters, strict=True))))
+    with_table = partial(light_likelihood, prior=prior, materials_given=schedule.materials_fixed, tables=problem.tables)
+    pairs = list(zip(illuminations, hyperparameters, strict=True))
+    likelihoods = list(problem.spread(lambda pair: with_table(*pair), pairs))
     state = descent.descend_lights(likelihoods, material_unknowns(materials), schedule.light_steps)
-    least = schedule.least_temperature
+    estimate = partial(estimate_hyperparameters, least=schedule.least_temperature)
     for number, iterations in enumerate(schedule.joint_steps):
         if number or schedule.estimate_first:
             # T of (1) and s_k² of each light, from the previous descent
-            pairs = list(zip(state.likelihoods, state.systems, strict=True))
-            hyperparameters = list(
-                problem.spread(lambda pair: estimate_hyperparameters(pair[0], pair[1], least), pairs)
-            )
+            solved = list(zip(state.likelihoods, state.systems, strict=True))
+            hyperparameters = list(problem.spread(lambda pair: estimate(*pair), solved))
             state = state._replace(likelihoods=list(map(with_hyperparameters, state.likelihoods, hyperparameters)))
         if schedule.materials_fixed:
             state = descent.descend_lights(state.likelihoods, state.theta, iterations)
