@@ -88,17 +88,17 @@ def observations_from_front(
     radiance: np.ndarray,
     material: np.ndarray,
     names: tuple[str, ...],
-    photo: str = "room",
+    name: str = "room",
     **columns: Any,
 ) -> Observations:
-    """Return one photo's observations of surfaces seen from the front, in a light of the photo's name.
+    """Return one photo's observations of surfaces seen from the front, in a light of the same name.
 
     Args:
         normal: Normals in the camera's frame.
         radiance: Linear radiance.
         material: Numbers of the materials among `names`.
         names: Names of the materials.
-        photo: Name of the photo.
+        name: Name of the photo and of its light.
         columns: Columns that are others than usual: nothing is clipped, every weight is 1.
     """
     n = len(normal)
@@ -111,8 +111,8 @@ def observations_from_front(
         "x": np.arange(n),
         "y": zero,
         "weight": np.ones(n),
-        "photos": (photo,),
-        "illuminations": (photo,),
+        "photos": (name,),
+        "illuminations": (name,),
     }
     return Observations(normal=normal, radiance=radiance, material=material, materials=names, **usual | columns)
 

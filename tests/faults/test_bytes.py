@@ -396,7 +396,7 @@ REFUSED = {
     ("observations", "a.parquet"): [
         (with_values(material=np.full(5, 1)), "'material' points beyond the names"),
         (with_values(photo=np.full(5, -1)), "'photo' points beyond the names"),
-        (with_values(exposures=(1.0, 2.0)), "exposures"), (rewritten("weight"), "0 columns 'weight'"),
+        (with_values(exposures=(1.0, 2.0)), "exposure for each photo"), (rewritten("weight"), "0 columns 'weight'"),
         (rewritten("x", pa.array([HUGE] * 5)), "not readable"),
         (rewritten("weight", pa.array([1.0, None, 1.0, 1.0, 1.0])), "'weight' has empty places"),
         (rewritten("weight", pa.array(["a"] * 5)), "of type string"),

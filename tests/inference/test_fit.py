@@ -108,7 +108,7 @@ def test_correlated_residuals_count_less():
     independent = rng.normal(size=one.radiance.shape)
     assert estimate_temperature(one, independent) == pytest.approx(1.0, abs=0.35)
     assert estimate_temperature(one, np.ones_like(independent)) > 5
-    assert estimate_temperature(one, 0.1 * independent) == FitSchedule().least
+    assert estimate_temperature(one, 0.1 * independent) == FitSchedule().least_temperature
     assert estimate_temperature(one, 1e9 * np.ones_like(independent)) == estimate_temperature(
         one, 3 * np.ones_like(independent)
     )  # outliers
@@ -122,7 +122,7 @@ def test_the_contrast_of_a_light_is_found(solved):
     other = materials_in(spheres(more, size=16), schedule=FitSchedule(4, (8, 4, 4, 4)))
     for one, larger in zip(found.hyperparameters, other.hyperparameters, strict=True):
         assert 0.3 < one.factors[0] < 2.5 and larger.factors[0] > 1.5 * one.factors[0]
-        assert FitSchedule().least <= one.temperature < 3  # noise is less than the noise model says
+        assert FitSchedule().least_temperature <= one.temperature < 3  # noise is less than the noise model says
 
 
 # ── sure normals ─────────────────────────────────────────────────────────────────────────────────────────────────────

@@ -249,7 +249,7 @@ def solved(scene: Scene, choices: SolveOptions) -> tuple[JointProblem, Solution,
     solution = solve(problem, start_from_photos(len(names)), choices)
     errors, _ = estimate_uncertainty(solution, problem, choices)
     said = undetermined_by_observations(names, problem)
-    said += poorly_explained(problem, solution.predict(problem).radiance(solution.point))
+    said += poorly_explained(problem, solution.effective_problem(problem).radiance(solution.point))
     said += undetermined_by_answer(names, problem, solution.point.materials, errors.materials)
     return problem, solution, said
 

@@ -134,7 +134,7 @@ def test_a_photo_without_objects_is_refused_or_left_out_with_a_warning_where_nob
     with pytest.raises(InputError, match="'front' has no objects to render"):
         drawn(some, tmp_path / "named", kinds.ResynthesisRecipe(photos=["front"]))
     assert sorted(drawn(some, tmp_path / "out", kinds.ResynthesisRecipe(samples=1))) == PICTURES["side"]
-    assert "front: left out" in caplog.text
+    assert "front: no picture of this photo" in caplog.text
     none = changed(made, "dataset.objects", dict.fromkeys(made_export.MESHES, nothing))
     with pytest.raises(InputError, match="no objects"):
         drawn(none, tmp_path / "none", kinds.ResynthesisRecipe())

@@ -107,7 +107,7 @@ def test_lights_are_cells_with_errors_and_coverage_and_splittings_are_said(tmp_p
     out = run(tmp_path, linked, splittings=1)
     model = table(out)["model"]
     (splitting,) = model["splitting_chosen_by"]
-    assert set(splitting) == {"kept", "held_out_loss_with", "held_out_loss_without", "margin"}
+    assert set(splitting) == {"kept", "held_out_loss_with", "held_out_loss_without", "margin", "log_bayes_factor"}
     cells = {model["lobes"][name] - model["suns_chosen_by"][name]["kept"] for name in "ab"}
     assert model["light_prior"] and len(cells) == 1
     count = cells.pop()
