@@ -83,6 +83,10 @@ class Losses(NamedTuple):
     values: list[Float[np.ndarray, " n"]]
     clusters: list[Int[np.ndarray, " n"]]
 
+    def one_light(self, k: int) -> Losses:
+        """Return the losses of light k alone."""
+        return Losses([self.values[k]], [self.clusters[k]])
+
 
 def held_out_losses(problem: JointProblem, point: Point) -> Losses:
     """Return the losses of the held-out observations at a point; of every observation if none is held out."""
@@ -242,7 +246,7 @@ def select_tone_curves(problem: JointProblem, start: Fit, options: SolveOptions,
     losses_without, losses_with = (held_out_losses(sample, fit.point) for fit in (start, curved))
     evidence = []
     for k, light in enumerate(curved.point.lights):
-        decision = _compare_light(k, losses_without, losses_with)
+        decision = compare_models(losses_without.one_light(k), losses_with.one_light(k), CLEARLY_FOR)
         accepted = decision.kept and relative_gain(decision) > LEAST_TONE_GAIN and not light.implausible_tone
         evidence.append(Decision(True) if curved_before[k] else msgspec.structs.replace(decision, kept=accepted))
     if all(decision.kept for decision in evidence):
@@ -305,9 +309,3 @@ def near_share(log_bayes_factor: float) -> float:
     rounding does not decide.
     """
     return float(np.tanh(max(log_bayes_factor - VERY_STRONG, 0.0) / 2))
-
-
-def _compare_light(k: int, simpler: Losses, richer: Losses, least: float = CLEARLY_FOR) -> Decision:
-    """Return the evidence of light k alone for the richer model."""
-    alone, other = (Losses([losses.values[k]], [losses.clusters[k]]) for losses in (simpler, richer))
-    return compare_models(alone, other, least)

@@ -11,8 +11,7 @@ from factorlib.inference.materials import Point
 from factorlib.inference.problem import JointProblem
 from factorlib.reflection import reflection_operator
 from factorlib.results.materials import Reflectance
-from factorlib.scenes.joint_problems import MATERIALS, block, random_light, sphere_normals
-from factorlib.scenes.joint_problems import observations_from_front as seen_from_the_front
+from factorlib.scenes.joint_problems import MATERIALS, block, observations_from_front, random_light, sphere_normals
 from factorlib.urm.observations import Observations
 from tests.integral import reflected
 
@@ -93,7 +92,7 @@ def bowls(name, light, size=16, count=512) -> Observations:
             sees.append(seen(normals, directions))
     material, visibility = np.repeat([0, 0, 1, 1, 2, 2], len(normals)), 255 * np.vstack(sees).astype(np.uint8)
     normal, names = np.tile(normals, (6, 1)), ("red", "green", "blue")
-    return seen_from_the_front(normal, np.vstack(parts), material, names, name, visibility=visibility)
+    return observations_from_front(normal, np.vstack(parts), material, names, name, visibility=visibility)
 
 
 def rough_light(seed):

@@ -30,7 +30,7 @@ from factorlib.inference.uncertainty import estimate_uncertainty
 from factorlib.jsonfile import read_json
 from factorlib.scenes.joint_problems import sphere_normals
 from factorlib.urm.observations import Observations
-from tests.inference.made import seen_from_the_front
+from tests.inference.made import observations_from_front
 from tests.inference.made_lights import OPERATOR, light_of
 from tests.stages.test_solve import NAMES as STAGE_NAMES
 from tests.stages.test_solve import run
@@ -103,7 +103,7 @@ def observed(rows, lights, seed=0, normals=NORMALS, shows=None, noise=0.02) -> S
     names = tuple(f"room{k}" for k in range(len(lights)))
     where = {"photo": photo, "illumination": photo, "photos": names, "illuminations": names}
     normal = np.tile(normals, (len(material) // n, 1))
-    clean = seen_from_the_front(normal, np.ones(normal.shape), material, NAMES[: len(truth)], **where)
+    clean = observations_from_front(normal, np.ones(normal.shape), material, NAMES[: len(truth)], **where)
     for k, (block, light) in enumerate(zip(blocks_of_observations(clean, Noise()), lights, strict=True)):
         clean.radiance[photo == k] = Illumination(block, light, truth, OPERATOR).radiance()
     factor = 1 + noise * np.random.default_rng(seed).normal(size=clean.radiance.shape)

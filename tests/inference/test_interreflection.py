@@ -15,7 +15,7 @@ from factorlib.inference.observed import blocks_of_observations
 from factorlib.inference.problem import JointProblem
 from factorlib.scenes.joint_problems import MATERIALS
 from factorlib.urm.observations import Observations
-from tests.inference.made import OPERATOR, photos_in_a_wrong_light, seen_from_the_front
+from tests.inference.made import OPERATOR, observations_from_front, photos_in_a_wrong_light
 
 
 @pytest.fixture(scope="module", params=["linear", "toned"])
@@ -49,7 +49,7 @@ def bowl(albedo, depth=0.5, size=40, count=1024) -> Observations:
         "visibility": np.where(hidden, 0, 255).astype(np.uint8),
         "met": np.where(hidden, codes, NO_OCCLUDER).astype(np.uint16),
     }
-    return seen_from_the_front(n, radiance, np.zeros(len(n), int), ("white",), **how)
+    return observations_from_front(n, radiance, np.zeros(len(n), int), ("white",), **how)
 
 
 @pytest.mark.parametrize(("albedo", "depth"), [(0.3, 0.5), (0.9, 0.5), (0.9, 0.9)])

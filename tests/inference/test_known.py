@@ -19,7 +19,7 @@ from factorlib.inference.start import insert_known
 from factorlib.inference.uncertainty import Posterior, project_to_gauge
 from factorlib.light.latlong import map_energy
 from factorlib.scenes.joint_problems import MATERIALS, sphere_normals
-from tests.inference.made import seen_from_the_front
+from tests.inference.made import observations_from_front
 from tests.inference.made_lights import (
     FEW,
     PRIOR,
@@ -215,7 +215,7 @@ def test_what_a_mirror_ball_shows_is_the_light_but_behind_it_where_another_objec
     hidden = sphere[:, 0] > 0.9
     clipped, sees = np.tile(mirror[:, 1:2] > 0.9, 3), np.tile(np.where(hidden, 0, 255).astype(np.uint8), (len(view), 1))
     radiance, zero = 0.5 * lamp(mirror @ turn.T), np.zeros(len(view), int)
-    seen = seen_from_the_front(normals, radiance, zero, ("chrome",), clipped=clipped, visibility=sees)
+    seen = observations_from_front(normals, radiance, zero, ("chrome",), clipped=clipped, visibility=sees)
     seen.radiance[mirror[:, 0] > 0.88] = 1e3  # of the other object
     light = light_from_ball(seen, np.full(3, 0.5), turn)
     out = {"behind": [0, 0, 1], "object": [1, 0, 0], "clipped": [0, 1, 0]}

@@ -21,7 +21,7 @@ from factorlib.urm.observations import write_observations
 from stages import render
 from tests.export import made_export
 from tests.export.made_export import instead
-from tests.inference.made import seen_from_the_front
+from tests.inference.made import observations_from_front
 from tests.runner.toy import files_of
 
 FAST = render.Params(operator="closed_form", ball_size=33, map_size=32)
@@ -103,7 +103,7 @@ def test_what_is_hidden_is_lit_by_what_the_photo_shows_there(made, tmp_path):
     columns = {"view": view, "x": x, "y": y, "visibility": np.tile(visibility, (n, 1))}
     columns |= {"met": np.full((n, 64), NO_OCCLUDER, np.uint16)}
     radiance, names = np.full((n, 3), 0.3), tuple(made_export.NAMES)
-    seen = seen_from_the_front(normal, radiance, np.zeros(n, int), names, "front", **columns)
+    seen = observations_from_front(normal, radiance, np.zeros(n, int), names, "front", **columns)
     (tmp_path / "urm").mkdir()
     write_observations(tmp_path / "urm" / "front.parquet", seen)
     pictures, hidden = [], msgspec.structs.replace(made, folders={**made.folders, "urm": tmp_path / "urm"})

@@ -23,7 +23,7 @@ from factorlib.scenes.joint_problems import MATERIALS, random_light, sphere_norm
 from factorlib.stage import Inputs, silent
 from factorlib.urm.observations import Observations, write_observations
 from stages import solve
-from tests.inference.made import seen_from_the_front
+from tests.inference.made import observations_from_front
 from tests.runner.toy import files_of
 from tests.stages.made import Rising
 
@@ -34,7 +34,7 @@ def observations(photo: str, materials, seed: int, size: int = 16, unit: float =
     """A sphere of each of the materials under a light of two lobes, as `network` renders it."""
     normals = np.tile(sphere_normals(size), (len(materials), 1))
     material = np.repeat(materials, len(normals) // len(materials))
-    empty = seen_from_the_front(normals, np.ones(normals.shape), material, NAMES, photo)
+    empty = observations_from_front(normals, np.ones(normals.shape), material, NAMES, photo)
     (block,) = blocks_of_observations(empty, Noise())
     light = random_light(np.random.default_rng(seed), 2)
     radiance = Illumination(block, light, MATERIALS, reflection_operator("network")).radiance()

@@ -22,7 +22,7 @@ from factorlib.stage import Inputs, serial_map, silent
 from factorlib.urm.observations import Observations, write_observations
 from factorlib.urm.surface_maps import read_geometry, with_surface_normals
 from stages import surface
-from tests.inference.made import seen_from_the_front
+from tests.inference.made import observations_from_front
 
 SIZE = 12
 
@@ -31,7 +31,7 @@ def observations() -> Observations:
     """A pixel each of two rows, normals toward the camera."""
     x, y = (of.reshape(-1).astype("i4") for of in np.meshgrid(np.arange(SIZE), np.arange(SIZE)))
     front, none = np.tile(np.float32([0, 0, -1]), (len(x), 1)), np.zeros(len(x), int)
-    return seen_from_the_front(front, np.full((len(x), 3), 0.5, "f4"), none, ("red",), "a", x=x, y=y)
+    return observations_from_front(front, np.full((len(x), 3), 0.5, "f4"), none, ("red",), "a", x=x, y=y)
 
 
 def written(folder) -> None:
