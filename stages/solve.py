@@ -130,7 +130,7 @@ def check(params: Params) -> None:
         if owner != params.solver and getattr(params, field.name) != field.default:
             cure = f"leave it out, or set solve.solver={owner}"
             raise InputError(
-                f"solve.{field.name} is an option of solve.solver={owner}, but solve.solver={params.solver} is chosen",
+                f"this option belongs to solve.solver={owner}, but solve.solver={params.solver} is chosen",
                 key=f"solve.{field.name}",
                 cure=cure,
             )

@@ -1,4 +1,4 @@
-"""What each verb does: every one of them shows or runs the same plan, and returns the exit code."""
+"""Verbs of the command line.  Each shows or runs the same plan, and returns the exit code."""
 
 from __future__ import annotations
 
@@ -70,7 +70,7 @@ def _say(seen: Survey, text: str) -> None:
 
 
 def make(project: Project, wish: Wish, strict: bool = False) -> int:
-    """Run the stages that are wanted and what they need, as far as anything must run.
+    """Run the requested stages and those that they need, as far as they are not up to date.
 
     strict: return UNTRUSTED for a result not to be trusted
     """
@@ -132,7 +132,7 @@ def _refused(seen: Survey, faults: list[str], where: str = "files") -> int:
 
 
 def show_plan(project: Project, wish: Wish, every_reason: bool = False) -> int:
-    """Print what would run and why, in short or every reason; 1 where a value of a parameter would not do."""
+    """Print the steps that would run, with one reason or all; return 1 if a parameter has a wrong value."""
     seen = survey(project, *wish, look=True)
     planned = seen.planned()
     if faults := seen.wrong_values(planned):
@@ -142,7 +142,7 @@ def show_plan(project: Project, wish: Wish, every_reason: bool = False) -> int:
 
 
 def show_status(project: Project, wish: Wish) -> int:
-    """Print how far each stage is, and its warnings."""
+    """Print the progress of each stage, and its warnings."""
     seen, states, warnings = survey(project, *wish, look=True), {}, {}
     for p in seen.planned():
         running = p.key and p.status != "current" and is_locked(seen.store.locks / f"{p.key}.lock")
@@ -164,7 +164,7 @@ def _events(seen: Survey, planned: Planned) -> list[dict]:
 
 
 def show_graph(project: Project, mermaid: bool = False) -> int:
-    """Print the stages in the order they run, each with what it takes; or a Mermaid diagram.
+    """Print the stages in order of execution, each with its inputs; or a Mermaid diagram.
 
     In the diagram stages over photos or recipes have double frames.
     """
@@ -184,7 +184,7 @@ def show_graph(project: Project, mermaid: bool = False) -> int:
 
 
 def show_logs(project: Project, wish: Wish, photo: str | None) -> int:
-    """Print what the current results of stages cost, said and were made with; of one photo or recipe, or of all."""
+    """Print time, memory, warnings and versions of current results; of one photo or recipe, or of all."""
     seen, logged = survey(project, *wish, look=True), []
     for p in seen.planned():
         if p.step.stage in (wish.targets or [p.step.stage]) and photo in (None, p.step.of):
@@ -213,7 +213,7 @@ def show_params(project: Project, stages: list[str] | None) -> int:
 
 
 def validate(project: Project, dataset: str, settings: list[str], sheet: bool = False) -> int:
-    """Check pipeline.yaml, the settings, dataset.yaml and every file it names, of photos only their headers.
+    """Check pipeline.yaml, the settings, dataset.yaml and every file that it names (only the headers of photos).
 
     sheet: also write build/<dataset>/sheet.png, each photo beside its labels and meshes, whatever is wrong
     """
@@ -233,7 +233,7 @@ def validate(project: Project, dataset: str, settings: list[str], sheet: bool = 
 
 
 def _draw_sheet(project: Project, folder: Path) -> None:
-    """Draw a data set, also one that is not finished, each photo beside its labels and meshes."""
+    """Draw each photo of a dataset beside its labels and meshes; the dataset may be unfinished."""
     from factorlib.runner.display import Display
 
     claim(project, home := home_of(project, folder), folder)
@@ -249,7 +249,7 @@ def _draw_sheet(project: Project, folder: Path) -> None:
 
 
 def begin(project: Project, dataset: str, photos: Path | None, masks: Path | None, meshes: Path | None) -> int:
-    """Make a new dataset of folders of files, and say what is left to do."""
+    """Create a dataset from folders of files, and print what is left to do."""
     if photos is None:
         cure = "add PHOTOS=<folder>, and MASKS=… and MESHES=… where there are some"
         raise InputError("no folder of photos is named", key="PHOTOS", cure=cure)
@@ -276,7 +276,7 @@ def label_masks(project: Project, dataset: str, port: int) -> int:
 
 
 def compare(project: Project, first: Path | None, second: Path | None) -> int:
-    """Write a page that shows two results, folders such as build/eames, side by side."""
+    """Write a page that compares two results, folders such as build/eames."""
     if first is None or second is None:
         raise InputError("two results are to be named", key="compare", cure="make compare A=build/eames B=<another>")
     homes = [Home(path if path.is_dir() else project.build / path) for path in (first, second)]
@@ -303,7 +303,7 @@ def compare(project: Project, first: Path | None, second: Path | None) -> int:
 
 
 def pack(project: Project, dataset: str, out: Path | None, replace: bool) -> int:
-    """Put a dataset's results into one zip file, which needs neither this checkout nor the dataset."""
+    """Pack a dataset's results into one zip file, which needs neither this checkout nor the dataset."""
     from factorlib.pack import pack as pack_all
 
     if not (homes := homes_of(project, dataset, "pack")):
@@ -315,7 +315,7 @@ def pack(project: Project, dataset: str, out: Path | None, replace: bool) -> int
 
 
 def ship(project: Project, stage: str, dataset: str) -> int:
-    """Put the current result of a stage into the package, where pipeline.yaml says that it ships with the source."""
+    """Copy the current result of a stage into the package, if pipeline.yaml says that it ships with the source."""
     known = {name: found.shipped for name, found in _pipeline(project).stages.items() if found.shipped}
     if stage not in known:
         raise InputError(f"no result of {stage!r} ships with the source", key="ship", cure=did_you_mean(stage, known))
@@ -335,7 +335,7 @@ NAMED = 20  # steps that have failed
 
 
 def plan_lines(planned: list[Planned], every_reason: bool = False) -> list[str]:
-    """Format what would run, one line for steps of a stage that share their reasons, the photo's own name aside.
+    """Format the plan, with one line for all steps of a stage that have the same reasons but for the photo's name.
 
     every_reason: below it, a line each
     """
@@ -368,7 +368,7 @@ def _of_any_photo(reason: str, step: Step) -> str:
 
 
 def count(items: list, one: str = "step") -> str:
-    """Write a number of items with their unit.
+    """Format a number of items with their unit.
 
     >>> count(["a"]), count(["a", "b"], "fault")
     ('1 step', '2 faults')
@@ -377,7 +377,7 @@ def count(items: list, one: str = "step") -> str:
 
 
 def log_lines(logged: list[tuple[Planned, list[dict], str | None]]) -> list[str]:
-    """Return what each step cost and warned of, and what all were made with, every version of it.
+    """Return cost and warnings of each step, and all package versions that the steps were made with.
 
     logged: steps with the events of their results' logs, and the file that says by which defect one failed
     """
@@ -405,7 +405,7 @@ def _cost(planned: Planned, events: list[dict]) -> str:
 
 
 def _made_with(planned: Planned, events: list[dict]) -> dict[str, str]:
-    """Return the versions of Python and of the packages that count, and the machine's kind.
+    """Return the versions of Python and of the packages that enter keys, and the kind of machine.
 
     Nothing is returned where there is no current result.
     """
@@ -417,7 +417,7 @@ def _made_with(planned: Planned, events: list[dict]) -> dict[str, str]:
 
 
 def parameters(params: type) -> list[tuple[str, str, str, str]]:
-    """List the fields of a stage's `Params`, in its order: name, what is allowed, default as YAML has it, meaning.
+    """List the fields of a stage's `Params` in order: name, allowed values, default in YAML, meaning.
 
     The meaning is the string that follows a field.  One that is a struct stands for its own fields, with dotted names.
     """
@@ -441,7 +441,7 @@ def parameters(params: type) -> list[tuple[str, str, str, str]]:
 
 
 def allowed(of: Any) -> str:
-    """Format what a value of a type, as `msgspec.inspect` has it, may be.
+    """Format the allowed values of a type of `msgspec.inspect`.
 
     >>> allowed(types.type_info(int)), allowed(types.IntType(ge=1, le=1024)), allowed(types.FloatType(gt=0))
     ('whole number', '1 … 1,024', 'number > 0')

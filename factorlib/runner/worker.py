@@ -147,7 +147,8 @@ def params_of(code: Code) -> msgspec.Struct:
 def check_params(code: Code) -> None:
     """Raise InputError if a parameter of a stage is out of its bounds, or if the stage's own `check(params)` does."""
     params = params_of(code)
-    getattr(load_stage(code), "check", id)(params)
+    if check := getattr(load_stage(code), "check", None):
+        check(params)
 
 
 def spread(cores: int, function: Callable, items: Iterable) -> list:

@@ -104,3 +104,22 @@ def test_a_single_light_comes_out_grey_and_a_lobe_made_sharper_at_its_energy_mov
     assert abs((first.materials.diffuse + first.materials.specular).max() - BRIGHTEST) < 1e-12
     (grey,) = first.lights
     np.testing.assert_allclose(grey.energy.sum(0) / grey.energy.sum(), 1 / 3, rtol=1e-9)
+
+
+def test_a_sample_has_of_every_material_and_region_of_the_light_its_share():
+    light = random_light(np.random.default_rng(4), 3)
+    data = block("room1", light, MATERIALS, [0, 1, 2], OPERATOR, size=60)
+    data = msgspec.structs.replace(data, row=np.arange(len(data)))
+    every = list(zip(data.held_out.tolist(), data.material.tolist(), data.clusters().tolist(), strict=True))
+    for count in (1, 40, 900):
+        sample = data.subsample(count, 0)
+        drawn = [every[i] for i in sample.row]
+        assert (np.diff(sample.row) > 0).all()
+        for held_out in (False, True):
+            size = sum(group[0] == held_out for group in every)
+            share = min(count / size, 1.0)
+            assert sum(group[0] == held_out for group in drawn) == min(count, size) > 0
+            for group in {group for group in every if group[0] == held_out}:
+                assert abs(drawn.count(group) - share * every.count(group)) < 1, (count, group)
+    assert len(data.subsample(len(data), 0)) == len(data)
+    assert (data.subsample(40, 0).row[:40] != data.subsample(40, 1).row[:40]).any()

@@ -114,6 +114,18 @@ def test_a_setting_that_is_none_and_a_given_folder_that_leads_nowhere(checkout, 
         assert call(checkout, "plan", "--dataset", "set", "--set", f"table.start={path}").startswith("error: "), path
 
 
+def test_values_that_the_stage_itself_refuses_are_named_before_anything_runs(checkout, capsys):
+    before = state(checkout)
+    for verb in ("plan", "count"):
+        assert call(checkout, verb, "--dataset", "set", "--set", "upper.times=13") == 1
+        captured = capsys.readouterr()
+        assert (
+            "thirteen is unlucky" in captured.out + captured.err
+            and "take another number" in captured.out + captured.err
+        )
+    assert state(checkout) == before
+
+
 # ── what lies in build/ ──────────────────────────────────────────────────────────────────────────────────────────────
 
 DAMAGED = [

@@ -30,6 +30,9 @@ from factorlib.errors import InputError
 class Params(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     sleep: float = 0.0
     times: Annotated[int, msgspec.Meta(ge=1)] = 1
+def check(params):
+    if params.times == 13:
+        raise InputError("thirteen is unlucky", key="upper.times", cure="take another number")
 def main(params, inputs, out, progress):
     progress(0, 1, "reading")
     text = inputs.file(inputs.facts["dataset.photo"]["image"]).read_text()
