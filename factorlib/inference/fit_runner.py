@@ -77,6 +77,7 @@ class SolveState(msgspec.Struct, frozen=True):
         distances: Decision on each light's distance; empty if not tried.
         splitting: Decision on each splitting of the lights' cells.
         suns: Decision on each light's sun.
+        observations: Largest number of a light's observations that materials are fitted to.
     """
 
     fit: Fit
@@ -87,6 +88,7 @@ class SolveState(msgspec.Struct, frozen=True):
     distances: list[Decision] = []
     splitting: list[Decision] = []
     suns: list[Decision] = []
+    observations: int = 0
 
     def with_fit(self, fit: Fit, **decisions: list[Decision]) -> SolveState:
         """Return the state after a step that fitted materials and lights."""

@@ -12,7 +12,7 @@ roughness   With few materials, the start decides which local minimum a fit reac
             looks like a rough one in sharp light.  Of the fits from several starts, the one of least held-out loss
             continues.
 
-Effects, tone curves and splitting compare two models that are fitted to the same observations with reliable normals, by
+Effects and tone curves compare two models that are fitted to the same observations with reliable normals, by
 held-out observations.  These are whole cells of mirror directions (`factorlib.inference.observed`).  Let a_i and b_i be
 the mean robust losses of light i without and with the richer part, and n_i the number of its held-out observations.
 Then
@@ -30,7 +30,7 @@ K/(K−1) Σ_k (A_k/ΣA − B_k/ΣB)².
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from typing import NamedTuple
 
 import msgspec
@@ -65,14 +65,7 @@ VERY_STRONG = 5.0  # log Bayes factor of very strong evidence (Kass and Raftery 
 # walls and lamps 2 to 8 m.
 CURVATURES = (0.05, 0.1, 0.2)
 DISTANCE_SCHEDULE = FitSchedule(light_steps=2, joint_steps=(2,), estimate_first=False)
-OBSERVATION_FACTOR = 8  # factor on the number of observations
-# Factor on it where materials are given: +0.25 dB on data/eames, +0.27 on the made set of seed 101.
-LIGHT_OBSERVATION_FACTOR = 2
-LIGHTS_ONLY = FitSchedule(light_steps=2, estimate_first=False, materials_fixed=True)
-LARGE_GAIN = 0.2  # least relative gain of the first splitting for that factor
-# Least relative gain of a splitting for another one.  After a splitting that gained 3 %, two more gained 3.6 and 1 % on
-# data/eames, and materials did not improve.
-LEAST_GAIN = 0.05
+LIGHTS_ONLY = FitSchedule(light_steps=3, materials_fixed=True)
 
 Fitting = Callable[[str, JointProblem, Fit, FitSchedule], Fit]  # phase, problem, start and schedule
 
@@ -139,29 +132,6 @@ class Selection(msgspec.Struct, frozen=True):
 def relative_gain(decision: Decision) -> float:
     """Return the decrease of the held-out loss by the richer model, as a share of the new loss."""
     return (decision.held_out_loss_without or 0.0) / max(decision.held_out_loss_with or 1.0, 1e-12) - 1
-
-
-def gain_exceeds(splitting: Decision, share: float) -> bool:
-    """Return True if a splitting was kept and its relative gain exceeds a share."""
-    return splitting.kept and relative_gain(splitting) > share
-
-
-def observation_count(options: SolveOptions, splittings: Sequence[Decision]) -> int:
-    """Return the number of a light's observations to fit: more where smaller cells gain much.
-
-    Errors of the model are small there, and those of few observations matter: k_d of data/synthetic is 13 % wrong with
-    1,000 observations, 2.6 % with 4,000 and 1.0 % with 8,000.
-    """
-    return (
-        OBSERVATION_FACTOR * options.observations
-        if splittings and gain_exceeds(splittings[0], LARGE_GAIN)
-        else options.observations
-    )
-
-
-def light_observation_count(options: SolveOptions, splittings: Sequence[Decision]) -> int:
-    """Return the number of a light's observations to fit where materials are given and a fit is cheap."""
-    return LIGHT_OBSERVATION_FACTOR * observation_count(options, splittings)
 
 
 def comparison_sample(problem: JointProblem, options: SolveOptions) -> JointProblem:

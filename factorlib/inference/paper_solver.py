@@ -47,7 +47,7 @@ from factorlib.inference.gauge import fix_gauge
 from factorlib.inference.lights import Light
 from factorlib.inference.materials import ROUGHNESS, SHARPNESS, Materials, Point
 from factorlib.inference.optimizer import inverse_hessian_times
-from factorlib.inference.options import Lobes, Seed
+from factorlib.inference.options import Lobes, Seed, SolveOptions
 from factorlib.inference.problem import JointProblem
 from factorlib.inference.start import starting_materials
 from factorlib.reflection.operator import Operator
@@ -113,7 +113,8 @@ def solve(problem: JointProblem, materials: int, options: PaperOptions, report: 
             history.append(Event((iteration + 1) // report_interval - 1, "subset", iteration, value, held_out, lobes))
             report(history[-1])
     fit = initial_fit(objective.point(x))
-    return Solution(fit, fit, point=fix_gauge(fit.point, blocks), history=history)
+    point = fix_gauge(fit.point, blocks)
+    return Solution(fit, fit, observations=SolveOptions().observations, point=point, history=history)
 
 
 def draw_subset(

@@ -46,9 +46,9 @@ from factorlib.inference.fit import Fit, Hyperparameters, light_likelihood, reli
 from factorlib.inference.fit_runner import Solution
 from factorlib.inference.forward import Illumination
 from factorlib.inference.gauge import connected_components
+from factorlib.inference.joint_solver import LIGHT_OBSERVATION_FACTOR
 from factorlib.inference.likelihood import System, cholesky_factor, cholesky_inverse, solve_cholesky
 from factorlib.inference.materials import ROUGHNESS, Materials, Point
-from factorlib.inference.model_selection import light_observation_count, observation_count
 from factorlib.inference.options import SolveOptions
 from factorlib.inference.priors import material_unknowns, materials_from_unknowns
 from factorlib.inference.problem import JointProblem
@@ -94,10 +94,8 @@ def estimate_uncertainty(
     """
     problem = solution.effective_problem(problem)
     prior = read_light_prior()
-    material_sample = reliable_observations(problem).subsample(
-        observation_count(options, solution.splitting), options.seed
-    )
-    light_sample = problem.subsample(light_observation_count(options, solution.splitting), options.seed)
+    material_sample = reliable_observations(problem).subsample(solution.observations, options.seed)
+    light_sample = problem.subsample(LIGHT_OBSERVATION_FACTOR * solution.observations, options.seed)
     errors_of_fit, deviation = Posterior(material_sample, solution.materials, prior, tick).standard_errors()
     diffuse = errors_of_fit.diffuse * solution.point.materials.diffuse / solution.materials.point.materials.diffuse
     specular = errors_of_fit.specular * solution.point.materials.specular / solution.materials.point.materials.specular

@@ -6,7 +6,7 @@ import pytest
 
 from factorlib.checkpoint import Checkpoint
 from factorlib.geometry.sphere import fibonacci_sphere
-from factorlib.inference import joint_solver, model_selection
+from factorlib.inference import joint_solver, model_selection, splitting
 from factorlib.inference.fit import FitSchedule
 from factorlib.inference.fit_runner import PHASES, Event, FitRunner, solve_progress
 from factorlib.inference.joint_solver import solve
@@ -34,7 +34,7 @@ def short():
         patch.setattr(model_selection, "DISTANCE_SCHEDULE", FitSchedule(joint_steps=(2,), estimate_first=False))
         patch.setattr(model_selection, "TONE_SCHEDULE", FitSchedule(joint_steps=(2,), estimate_first=False))
         patch.setattr(joint_solver, "MATERIALS", FitSchedule(2, (2,)))
-        patch.setattr(joint_solver, "AFTER_SPLITTING", FitSchedule(1, (2,)))
+        patch.setattr(splitting, "AFTER_SPLITTING", FitSchedule(1, (2,)))
         patch.setattr(joint_solver, "LIGHTS", FitSchedule(joint_steps=(0, 2), materials_fixed=True))
         yield
 

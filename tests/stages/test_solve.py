@@ -108,10 +108,9 @@ def test_lights_are_cells_with_errors_and_coverage_and_splittings_are_said(tmp_p
     model = table(out)["model"]
     (splitting,) = model["splitting_chosen_by"]
     assert set(splitting) == {"kept", "held_out_loss_with", "held_out_loss_without", "margin", "log_bayes_factor"}
-    cells = {model["lobes"][name] - model["suns_chosen_by"][name]["kept"] for name in "ab"}
-    assert model["light_prior"] and len(cells) == 1
-    count = cells.pop()
-    assert (count - 24) % 3 == 0 and splitting["kept"] == (count > 24)
+    counts = [model["lobes"][name] - model["suns_chosen_by"][name]["kept"] for name in "ab"]
+    assert model["light_prior"] and splitting["kept"] == (max(counts) > 24)
+    assert all((count - 24) % 3 == 0 for count in counts)
     assert min(min(m["stderr"]["diffuse"]) for m in table(out)["materials"].values()) > 0
     assert {p.stem for p in (out / "coverage").glob("*.exr")} == {"a", "b"}
 

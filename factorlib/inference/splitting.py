@@ -1,0 +1,76 @@
+"""Cells of a light that split in four while the light's marginal likelihood rises.
+
+Smaller cells obey the same Gaussian process as larger ones.  So, given the materials and the hyperparameters, a light
+has a marginal likelihood with either, and lights are independent of each other.  Let φ be the objective of a light with
+its determinants, (1) of `factorlib.inference.likelihood`.  The log Bayes factor of light i for smaller cells is
+
+    log B_i = (φ_i(cells) − φ_i(smaller cells))/2                                                                  (1)
+
+The cells of a light split if log B_i exceeds `VERY_STRONG`; then materials and lights are fitted anew.  This uses all
+fitted observations.  The few that are held out decide differently from draw to draw: on three exact spheres they refuse
+the first splitting (margin −0.24), which (1) supports by 1,200.
+"""
+
+from __future__ import annotations
+
+import msgspec
+import numpy as np
+
+from factorlib.inference.fit import FitSchedule
+from factorlib.inference.fit_runner import FitRunner, SolveState
+from factorlib.inference.lights import Light
+from factorlib.inference.model_selection import LIGHTS_ONLY, VERY_STRONG
+from factorlib.inference.options import SolveOptions
+from factorlib.inference.problem import JointProblem
+from factorlib.results.materials import Decision
+
+AFTER_SPLITTING = FitSchedule(light_steps=2, joint_steps=(3, 2), estimate_first=False)
+SPLIT_CELLS = 24  # number of a light's cells that split at once
+# Least distance between cells, degrees: the sun's width.  A cell splits only if its neighbours are twice as far.
+LEAST_SPACING_DEG = 0.5
+# Where smaller cells gain much, errors of the model are small, and those of few observations matter: k_d of
+# data/synthetic is 13 % wrong with 1,000 observations, 2.6 % with 4,000 and 1.0 % with 8,000.
+OBSERVATION_FACTOR = 8  # factor on the number of observations there
+LARGE_BAYES_FACTOR = 0.2  # least mean log Bayes factor of an observation there
+
+
+def split_cells(problem: JointProblem, state: SolveState, options: SolveOptions, run: FitRunner) -> SolveState:
+    """Split the cells with most energy, at most `SolveOptions.splittings` times, while (1) of any light supports it.
+
+    If the first splitting has a log Bayes factor above `LARGE_BAYES_FACTOR` times the number of observations, all later
+    fits use `OBSERVATION_FACTOR` times as many.
+
+    Args:
+        problem: Observations with reliable normals, under the chosen effects.
+        state: State with a fit of materials and lights.
+        options: Options of the user.
+        run: Runner of the fits.
+    """
+    fit = state.fit
+    observations = state.observations
+    sample = problem.subsample(observations, options.seed)
+    evidence: list[Decision] = []
+    for number in range(options.splittings):
+        phase = f"splitting {number + 1}"
+        finer = [split_brightest(light) for light in fit.point.lights]
+        trial = run.fit(phase, sample, fit.with_lights(finer), LIGHTS_ONLY)
+        log_bayes_factor = (np.array(fit.light_values) - trial.light_values) / 2  # (1)
+        supported = log_bayes_factor > VERY_STRONG
+        total = float(log_bayes_factor.sum(where=supported))
+        evidence.append(Decision(bool(supported.any()), log_bayes_factor=total))
+        if not supported.any():
+            break
+        if number == 0 and total > LARGE_BAYES_FACTOR * sample.fitted_count:
+            observations = OBSERVATION_FACTOR * observations
+            sample = problem.subsample(observations, options.seed)
+        pairs = zip(fit.point.lights, finer, strict=True)
+        chosen = [pair[int(split)] for pair, split in zip(pairs, supported, strict=True)]
+        fit = run.fit_and_report(phase, sample, fit.with_lights(chosen), AFTER_SPLITTING)
+    return msgspec.structs.replace(state.with_fit(fit, splitting=evidence), observations=observations)
+
+
+def split_brightest(light: Light) -> Light:
+    """Return the light with its `SPLIT_CELLS` cells of most energy split; unchanged if some of its cells are known."""
+    if light.fixed.any():
+        return light
+    return light.split(light.brightest_cells(SPLIT_CELLS, 2 * np.radians(LEAST_SPACING_DEG)))
