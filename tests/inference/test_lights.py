@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 from factorlib.inference.forward import Illumination
-from factorlib.inference.splitting import LEAST_SPACING_DEG, SPLIT_CELLS
 from factorlib.inference.lights import Light, fibonacci_cells
+from factorlib.inference.splitting import LEAST_SPACING_DEG, SPLIT_CELLS
 from factorlib.scenes.joint_problems import MATERIALS, block
 from tests.inference.made_lights import OPERATOR, drawn, on_even_cells
 
