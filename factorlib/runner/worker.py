@@ -196,7 +196,7 @@ def _check_code(task: Task, store: Store) -> None:
     before = {name: value for name, value in task.record.items() if name.startswith(CODE)}
     if changes := difference(before, closure.record):
         names = sorted(name for name in closure.files if before.get(name) != closure.record[name])
-        fault = f"the code changed during the run ({'; '.join(changes)})"
+        fault = f"the code changed while the run went on ({'; '.join(changes)})"
         cure = "run again; a worker of a cluster needs the same checkout and the same packages"
         raise CodeChanged(fault, file=", ".join(str(closure.files[name]) for name in names) or None, cure=cure)
 

@@ -124,7 +124,7 @@ def test_the_command_says_what_changed_between_the_runs(tmp_path, capsys):
     assert verbs.compare(project, tmp_path / "before", project.build / "set") == 0
     page = (project.build / "compare" / "before-set" / "index.html").read_text()
     assert html.escape("upper: parameter times: default -> 2") in page and page.count("<li>") == 1
-    with pytest.raises(InputError, match="there is no result here\n  known are: 'set'"):
+    with pytest.raises(InputError, match="is no folder of results\n  known are: 'set'"):
         verbs.compare(project, tmp_path / "before", tmp_path / "nothing")
     project = Project(toy.make_project(tmp_path / "new").root, Provider(("photo",), toy.read))  # where nothing was run
     with pytest.raises(InputError, match="make all DATASET=<name> makes one"):

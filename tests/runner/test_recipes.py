@@ -123,8 +123,8 @@ def test_files_of_a_recipe_are_looked_at_before_anything_runs_and_only_where_the
         (["recipes/helo.yaml"], "did you mean 'hello'"),
         (["not"], "known are"),
         (["hello", "{}/hello.yaml"], "two recipes are called 'hello'"),
-        (["{}/" + "x" * 240 + ".yaml"], "give it another name"),
-        (["{}/two\nlines.yaml"], "give it another name"),
+        (["{}/" + "x" * 240 + ".yaml"], "rename it"),
+        (["{}/two\nlines.yaml"], "rename it"),
     ],
     ids=["a name", "a path", "of another set", "two of one name", "a long name", "two lines"],
 )
