@@ -287,7 +287,7 @@ def collect(project: Project, confirm: Callable[[], bool] = lambda: True) -> int
                 shutil.rmtree(aside)
             else:
                 path.unlink()
-    print(f"deleted {len(keys)} unused results, {freed:.1f} MB")
+    print(f"deleted {len(keys)} results that nothing uses, {freed:.1f} MB")
     return 0
 
 
