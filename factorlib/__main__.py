@@ -9,6 +9,7 @@ from __future__ import annotations
 import argparse
 import contextlib
 import errno
+import io
 import logging
 import os
 import signal
@@ -22,12 +23,13 @@ from typing import Any, NoReturn
 
 from factorlib.errors import InputError
 from factorlib.runner import results_folder, verbs
-from factorlib.runner.display import plain_streams, printable
+from factorlib.runner.dataset_state import Request
+from factorlib.runner.display import printable, printable_streams
 from factorlib.runner.project import LIBRARY, PIPELINE, Project, photo_sets
 
 SHIPPED = "share/factorlib"  # relative to the prefix of the installation: data-files of pyproject.toml
 # errors of the system that the user can fix
-NOT_OURS = {errno.EACCES, errno.EPERM, errno.EROFS, errno.ELOOP, errno.ENAMETOOLONG}
+USER_ERRORS = {errno.EACCES, errno.EPERM, errno.EROFS, errno.ELOOP, errno.ENAMETOOLONG}
 
 
 def project() -> Project:
@@ -36,12 +38,12 @@ def project() -> Project:
     Without a checkout, it is the current folder with the pipeline that pip installed with the package.
     """
     here = Path.cwd()
-    near = next((folder for folder in (LIBRARY, here, *here.parents) if (folder / PIPELINE).is_file()), None)
-    if not (root := os.environ.get("FACTORLIB_ROOT") or near):
+    checkout = next((folder for folder in (LIBRARY, here, *here.parents) if (folder / PIPELINE).is_file()), None)
+    if not (root := os.environ.get("FACTORLIB_ROOT") or checkout):
         for shipped in (folder / SHIPPED for folder in (LIBRARY, *LIBRARY.parents)):
             if (shipped / PIPELINE).is_file():
                 return Project(here, photo_sets(), shipped=shipped)
-        cure = f"run it in a checkout, or name one: FACTORLIB_ROOT=<a folder with {PIPELINE}, stages and data>"
+        cure = f"run it in a checkout, or name one: FACTORLIB_ROOT=<folder with {PIPELINE}, stages and data>"
         raise InputError(f"neither this folder nor one above it has a {PIPELINE}", file=here, cure=cure)
     return Project(Path(root).resolve(), photo_sets())
 
@@ -54,9 +56,8 @@ def _path(word: str) -> Path:
     return Path(word).expanduser()
 
 
-ON = {"action": "store_true"}
-MANY = {"action": "append"}
-FEW = {"nargs": "*"}
+FLAG = {"action": "store_true"}
+REPEATED = {"action": "append"}
 OPTIONS = {  # arguments of `ArgumentParser.add_argument`; `key` is the environment variable with the default
     "dataset": _option("--dataset", "-d", help="dataset: a name in data/ or a path to a folder; default: DATASET"),
     "set": _option(
@@ -64,15 +65,15 @@ OPTIONS = {  # arguments of `ArgumentParser.add_argument`; `key` is the environm
         dest="settings",
         metavar="X.Y=Z",
         help="set a parameter, as stage.parameter=value; default: SET",
-        **MANY,
+        **REPEATED,
     ),
-    "force": _option("--force", help="run again, or delete without asking; same as FORCE=1", **ON),
-    "strict": _option("--strict", help='return exit code 3 if the verdict is "do not trust"; same as STRICT=1', **ON),
+    "force": _option("--force", help="run again, or delete without asking; same as FORCE=1", **FLAG),
+    "strict": _option("--strict", help='return exit code 3 if the verdict is "do not trust"; same as STRICT=1', **FLAG),
     "recipe": _option(
-        "--recipe", dest="recipes", help="recipe: a path, a name in recipes/, or all; default: RECIPE", **MANY
+        "--recipe", dest="recipes", help="recipe: a path, a name in recipes/, or all; default: RECIPE", **REPEATED
     ),
-    "stages": _option("stages", help="stages; default: all", **FEW),
-    "mermaid": _option("--mermaid", help="print a Mermaid diagram", **ON),
+    "stages": _option("stages", help="stages; default: all", nargs="*"),
+    "mermaid": _option("--mermaid", help="print a Mermaid diagram", **FLAG),
     "photo": _option("--photo", key="PHOTO", help="name of a photo or a recipe; default: PHOTO"),
     "photos": _option("--photos", key="PHOTOS", type=_path, help="folder of photos; default: PHOTOS"),
     "masks": _option("--masks", key="MASKS", type=_path, help="folder of masks; default: MASKS"),
@@ -85,20 +86,20 @@ OPTIONS = {  # arguments of `ArgumentParser.add_argument`; `key` is the environm
     "out": _option(
         "--out", key="OUT", type=_path, help="zip file to write; default: OUT, or <dataset>.zip in this folder"
     ),
-    "sheet": _option("--sheet", help="also draw photos, labels and meshes; same as SHEET=1", **ON),
+    "sheet": _option("--sheet", help="also draw photos, labels and meshes; same as SHEET=1", **FLAG),
     "name": _option("name"),
 }
 
 
-def dataset_of(asked: Namespace, optional: bool = False) -> str | None:
-    """Return the dataset's name or path, from the option or the environment's DATASET.
-
-    Raises:
-        InputError: There is none, and it is not `optional`.
-    """
+def optional_dataset(arguments: Namespace) -> str | None:
+    """Return the dataset's name or path, from the option or the environment's DATASET; None without either."""
     # An empty name is not a missing one.
-    dataset = os.environ.get("DATASET") if asked.dataset is None else asked.dataset
-    if dataset is None and not optional:
+    return os.environ.get("DATASET") if arguments.dataset is None else arguments.dataset
+
+
+def dataset_of(arguments: Namespace) -> str:
+    """Return the dataset's name or path; InputError if none is given."""
+    if (dataset := optional_dataset(arguments)) is None:
         cure = "add DATASET=<a name in data/, or a path to a folder>"
         raise InputError("no dataset is named", key="DATASET", cure=cure)
     return dataset
@@ -112,48 +113,48 @@ def switched_on(key: str, option: bool) -> bool:
     return option or word == "1"
 
 
-def agreed(force: bool) -> bool:
+def confirm(force: bool) -> bool:
     """Return True to delete what was listed; a terminal is asked unless --force or FORCE=1 is given."""
     asks = not switched_on("FORCE", force) and sys.stdin.isatty()
     return not asks or input("delete them? [y/N] ").strip().lower() in ("y", "yes")
 
 
-def settings_of(asked: Namespace) -> list[str]:
+def settings_of(arguments: Namespace) -> list[str]:
     """Return parameters `stage.name=value` as written, from the options or the environment's SET."""
-    return asked.settings or [os.environ.get("SET", "")]
+    return arguments.settings or [os.environ.get("SET", "")]
 
 
-def wish(asked: Namespace, stages: list[str] | None = None) -> verbs.Wish:
+def request(arguments: Namespace, stages: list[str] | None = None) -> Request:
     """Return the request of the command line; without `stages` it is for all of them."""
-    recipes = asked.recipes or list(filter(None, [os.environ.get("RECIPE")]))
-    force = switched_on("FORCE", getattr(asked, "force", False))
-    return verbs.Wish(dataset_of(asked), stages or None, settings_of(asked), force, recipes)
+    recipes = arguments.recipes or list(filter(None, [os.environ.get("RECIPE")]))
+    force = switched_on("FORCE", getattr(arguments, "force", False))
+    return Request(dataset_of(arguments), stages or None, settings_of(arguments), force, recipes)
 
 
-def _stages(asked: Namespace) -> list[str] | None:
-    return asked.stages or os.environ.get("STAGE", "").split() or None
+def _stages(arguments: Namespace) -> list[str] | None:
+    return arguments.stages or os.environ.get("STAGE", "").split() or None
 
 
-def _stage(asked: Namespace) -> int:
-    verbs.check_stage(project(), asked.name, list(VERBS))
-    return verbs.make(project(), wish(asked, [asked.name]))
+def _stage(arguments: Namespace) -> int:
+    verbs.check_stage(project(), arguments.name, list(VERBS))
+    return verbs.make(project(), request(arguments, [arguments.name]))
 
 
-ASKED = "dataset set force recipe"
+COMMON = "dataset set force recipe"
 VERBS: dict[str, tuple[str, Callable[[Namespace], int], str]] = {  # options, function, help; in the order of `--help`
-    "all": (f"{ASKED} strict", lambda a: verbs.make(project(), wish(a), switched_on("STRICT", a.strict)),
+    "all": (f"{COMMON} strict", lambda a: verbs.make(project(), request(a), switched_on("STRICT", a.strict)),
             "Run all stages that are not up to date, and render the named recipes."),
-    "stage": (f"name {ASKED}", _stage,
+    "stage": (f"name {COMMON}", _stage,
               "Run one stage and the stages that it needs; `render` with a recipe renders that recipe only."),
-    "plan": (f"stages {ASKED}", lambda a: verbs.show_plan(project(), wish(a, a.stages)),
+    "plan": (f"stages {COMMON}", lambda a: verbs.show_plan(project(), request(a, a.stages)),
              "List the steps that would run; with a recipe and no stage, those of its pictures only."),
-    "why": (f"stages {ASKED}", lambda a: verbs.show_plan(project(), wish(a, a.stages), True),
+    "why": (f"stages {COMMON}", lambda a: verbs.show_plan(project(), request(a, a.stages), True),
             "List every reason why steps would run."),
-    "status": ("stages dataset set recipe", lambda a: verbs.show_status(project(), wish(a, a.stages)),
+    "status": ("stages dataset set recipe", lambda a: verbs.show_status(project(), request(a, a.stages)),
                "Print the progress of each stage, and the warnings of current results."),
     "graph": ("mermaid dataset", lambda a: verbs.show_graph(project(), a.mermaid),
               "Print the stages and their inputs, as text or as a Mermaid diagram."),
-    "logs": ("stages dataset set recipe photo", lambda a: verbs.show_logs(project(), wish(a, _stages(a)), a.photo),
+    "logs": ("stages dataset set recipe photo", lambda a: verbs.show_logs(project(), request(a, _stages(a)), a.photo),
              "Print time, memory and package versions of current results."),
     "params": ("stages", lambda a: verbs.show_params(project(), _stages(a)),
                "List the parameters of stages with default, range and meaning (make params STAGE=…)."),
@@ -168,11 +169,11 @@ VERBS: dict[str, tuple[str, Callable[[Namespace], int], str]] = {  # options, fu
                  "Check pipeline.yaml, settings and dataset without running anything."),
     "pack": ("dataset out force", lambda a: verbs.pack(project(), dataset_of(a), a.out, switched_on("FORCE", a.force)),
              "Pack a result into one zip file that does not need its dataset."),
-    "verify": ("dataset", lambda a: results_folder.verify(project(), dataset_of(a, True)),
+    "verify": ("dataset", lambda a: results_folder.verify(project(), optional_dataset(a)),
                "Read every stored result of a dataset, or of all, and list damaged ones."),
-    "clean": ("dataset", lambda a: results_folder.clean(project(), dataset_of(a, True)),
+    "clean": ("dataset", lambda a: results_folder.clean(project(), optional_dataset(a)),
               "Remove the results of a dataset; of all datasets if neither --dataset nor DATASET is given."),
-    "gc": ("force", lambda a: results_folder.collect(project(), lambda: agreed(a.force)),
+    "gc": ("force", lambda a: results_folder.collect(project(), lambda: confirm(a.force)),
            "List stored results that no dataset uses, and delete them after asking."),
     "ship": ("name dataset", lambda a: verbs.ship(project(), a.name, dataset_of(a)),
              "Copy a stage's current result into the package (for developers of the stage)."),
@@ -184,21 +185,22 @@ def run(words: list[str], program: str) -> int:
 
     A first word that is neither an option nor a verb is a stage.
     """
-    text = "Any other word is the name of a stage: it is run, and what it needs."
-    parser = argparse.ArgumentParser(program, description=text)
+    epilog = "Any other word is the name of a stage: it is run with the stages that it needs."
+    parser = argparse.ArgumentParser(program, description=epilog)
     parsers = parser.add_subparsers(title="verbs", metavar="verb", dest="verb", required=True)
     for name, (options, _, text) in VERBS.items():
-        one = parsers.add_parser(name, help=text, description=text, allow_abbrev=False)
+        verb = parsers.add_parser(name, help=text, description=text, allow_abbrev=False)
         for flags, key, more in (OPTIONS[option] for option in options.split()):
-            one.add_argument(*flags, **more, **({"default": os.environ.get(key) or None} if key else {}))
+            defaults: dict[str, Any] = {"default": os.environ.get(key) or None} if key else {}
+            verb.add_argument(*flags, **more, **defaults)
     if words and not words[0].startswith("-") and words[0] not in VERBS:
         words = ["stage", *words]
-    asked = parser.parse_args(words or ["--help"])
-    return VERBS[asked.verb][1](asked)
+    arguments = parser.parse_args(words or ["--help"])
+    return VERBS[arguments.verb][1](arguments)
 
 
 @contextlib.contextmanager
-def heed_stops() -> Iterator[None]:
+def raise_on_signals() -> Iterator[None]:
     """Raise SystemExit on SIGTERM and KeyboardInterrupt on SIGINT, once; later signals do not disturb cleaning up."""
     in_main_thread = threading.current_thread() is threading.main_thread()  # Python sets handlers in no other thread.
     numbers = [n for n in (signal.SIGINT, signal.SIGTERM) if in_main_thread and signal.getsignal(n) != signal.SIG_IGN]
@@ -218,9 +220,10 @@ def _stop(number: int, frame: FrameType | None = None) -> None:
 
 def main() -> NoReturn:
     """Run the verb of the command line; an error of the input ends the program with its message and exit code 1."""
-    sys.stdout.reconfigure(errors="backslashreplace")  # File names may contain anything.
+    if isinstance(sys.stdout, io.TextIOWrapper):
+        sys.stdout.reconfigure(errors="backslashreplace")  # File names may contain anything.
     try:
-        with plain_streams(), heed_stops():
+        with printable_streams(), raise_on_signals():
             logging.basicConfig(format="warning: %(message)s", level=logging.WARNING)
             sys.exit(run(sys.argv[1:], "factorlib" if Path(sys.argv[0]).name == "factorlib" else "python -m factorlib"))
     except InputError as error:
@@ -232,9 +235,9 @@ def main() -> NoReturn:
         from factorlib.wholefile import disk_error
 
         known = disk_error(error, project().build)
-        if known is None and error.errno in NOT_OURS:
-            cure = "check that the folder is there, and that you may read it and write to it"
-            known = InputError(error.strerror, file=error.filename, cure=cure)
+        if known is None and error.errno in USER_ERRORS:
+            cure = "check that the folder exists, and that you may read it and write to it"
+            known = InputError(error.strerror or str(error), file=error.filename, cure=cure)
         if known is None:
             raise
         sys.exit(printable(f"error: {known}"))

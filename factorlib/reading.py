@@ -94,8 +94,8 @@ def _fault(error: BaseException, what: str) -> str:
         return f"not readable as {what}: it does not fit into memory"
     if isinstance(error, OSError) and error.errno is not None and error.strerror:
         return f"cannot be read ({error.strerror})"
-    words, says_little = one_line(str(error)), (LookupError, TypeError, AttributeError, AssertionError)
-    if not words or isinstance(error, says_little):
+    words = one_line(str(error))
+    if not words or isinstance(error, LookupError | TypeError | AttributeError | AssertionError):  # terse messages
         words = ": ".join(filter(None, (type(error).__name__, words)))
     return f"not readable as {what} ({words})"
 

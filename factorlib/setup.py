@@ -61,7 +61,7 @@ def main() -> None:
         os.environ.pop("PYTHONDONTWRITEBYTECODE", None)  # Only loaded modules are compiled; pip would compile all.
         commands = [[str(PYTHON), "-c", f"import {names}"] for names in LOADED]
         if not run(commands, "loading the packages for the first time"):
-            sys.exit("set-up: the packages are installed, but one does not load: see above")
+            sys.exit("set-up: the packages are installed, but one does not load (reason above)")
         READY.write_text(digest)
         say(f"the environment is ready, after {time.monotonic() - started:.0f} s")
     READY.touch()
@@ -73,12 +73,12 @@ def install_extras() -> None:
     Those in ALONE are installed without dependencies.  The others change no locked package.
     """
     known = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["optional-dependencies"]
-    asked = os.environ.get("EXTRAS", "").replace(",", " ").split()
-    if unknown := [name for name in asked if name not in known]:
+    names = os.environ.get("EXTRAS", "").replace(",", " ").split()
+    if unknown := [name for name in names if name not in known]:
         sys.exit(f"set-up: there is no extra {unknown[0]!r} in pyproject.toml; there are {', '.join(known)}")
-    for how, alone in ((["--no-deps"], True), (["-c", str(LOCK)], False)):
-        if packages := [package for name in asked if (name in ALONE) == alone for package in known[name]]:
-            ended(run([with_pip([*how, *packages])], f"installing {', '.join(packages)}"))
+    for options, alone in ((["--no-deps"], True), (["-c", str(LOCK)], False)):
+        if packages := [package for name in names if (name in ALONE) == alone for package in known[name]]:
+            exit_unless(run([with_pip([*options, *packages])], f"installing {', '.join(packages)}"))
 
 
 def say(text: str) -> None:
@@ -86,18 +86,18 @@ def say(text: str) -> None:
     print(f"set-up: {text}", flush=True)
 
 
-def ended(well: bool) -> None:
+def exit_unless(success: bool) -> None:
     """End the program if an installation failed; the installer has printed the reason."""
-    if not well:
-        sys.exit("set-up: the packages could not be installed: see above; run make again when that is mended")
+    if not success:
+        sys.exit("set-up: the packages could not be installed (reason above); correct that and run make again")
 
 
 def make_venv() -> None:
     """Create .venv with pip, or replace one of another Python version; an unsupported Python ends the program."""
     version = f"{sys.version_info[0]}.{sys.version_info[1]}"
     if version not in ("3.11", "3.12"):
-        cure = "the pinned packages need 3.11 or 3.12: make PYTHON=python3.11 …"
-        sys.exit(f"set-up: Python {platform.python_version()} will not do, {cure}")
+        cure = "name one: make PYTHON=python3.11 …"
+        sys.exit(f"set-up: this is Python {platform.python_version()}; the pinned packages need 3.11 or 3.12: {cure}")
     if find_spec("ensurepip") is None:  # Debian has it in a separate package.
         sys.exit(f"set-up: this Python has no venv; install it: sudo apt-get install python{version}-venv")
     READY.unlink(missing_ok=True)
@@ -122,9 +122,9 @@ def install_packages() -> None:
     # Without an index, pip installs PyTorch, because it knows the user's own wheels.
     by_uv = [[*with_uv, *locked], [*with_uv, *pinned] if index else with_pip(pinned)]
     if not uv or not run(by_uv, words):
-        ended(run([with_pip(locked), with_pip(pinned)], words))
+        exit_unless(run([with_pip(locked), with_pip(pinned)], words))
     if index != TORCH_CPU:
-        ended(run([with_pip(["-c", str(LOCK), *torch])], "installing what PyTorch needs"))
+        exit_unless(run([with_pip(["-c", str(LOCK), *torch])], "installing what PyTorch needs"))
     # The path is relative, so that the checkout can be moved.  `import factorlib` then works from anywhere.
     site_packages().joinpath("factorlib.pth").write_text("../../../..\n")
 
@@ -140,13 +140,13 @@ def run(commands: list[list[str]], words: str) -> bool:
     `words` describes them.  Errors are printed as they occur.
     """
     running = [subprocess.Popen(command, cwd=ROOT, stdout=subprocess.DEVNULL) for command in commands]
-    started = shown = time.monotonic()
+    started = reported = time.monotonic()
     while any(process.poll() is None for process in running):
         time.sleep(0.1)
-        if (now := time.monotonic()) - shown >= BEAT:
-            shown = now
-            there = sum(1 for _ in site_packages().glob("*.dist-info"))
-            say(f"{words}: {now - started:.0f} s, {there} packages are there")
+        if (now := time.monotonic()) - reported >= BEAT:
+            reported = now
+            count = sum(1 for _ in site_packages().glob("*.dist-info"))
+            say(f"{words}: {now - started:.0f} s, {count} packages are installed")
     return not any(process.returncode for process in running)
 
 
@@ -170,21 +170,21 @@ def check_system() -> None:
     A missing library of NEEDED ends the program.  One of FASTER is only recommended.
     """
     apt = shutil.which("apt-get")
-    for libraries, why in ((NEEDED, ""), (FASTER, "renders are three times faster with it")):
+    for libraries, gain in ((NEEDED, ""), (FASTER, "renders are three times faster with it")):
         missing = [name for name in libraries if not loads(name)]
         packages = " ".join(libraries[name] for name in missing)
         if missing and os.geteuid() == 0 and apt:
-            say(f"installing {packages}{f': {why}' if why else ''}")
+            say(f"installing {packages}{f': {gain}' if gain else ''}")
             quiet = {**os.environ, "DEBIAN_FRONTEND": "noninteractive"}
             for words in ("update", f"install -y --no-install-recommends {packages}"):
-                command = ["apt-get", "-qq", *words.split()]
-                subprocess.run(command, env=quiet, check=False, stdout=subprocess.DEVNULL)
+                apt_get = ["apt-get", "-qq", *words.split()]
+                subprocess.run(apt_get, env=quiet, check=False, stdout=subprocess.DEVNULL)
             missing = [name for name in missing if not loads(name)]
-        how = f"sudo apt-get update && sudo apt-get install -y {packages}   (elsewhere: what holds these files)"
-        if missing and why:
-            say(f"{', '.join(missing)} is not there, and {why}; to install it:\n  {how}")
+        command = f"sudo apt-get update && sudo apt-get install -y {packages}   (elsewhere: packages with these files)"
+        if missing and gain:
+            say(f"{', '.join(missing)} is missing, and {gain}; to install it:\n  {command}")
         elif missing:
-            sys.exit(f"set-up: the system libraries {', '.join(missing)} are missing; install them:\n  {how}")
+            sys.exit(f"set-up: the system libraries {', '.join(missing)} are missing; install them:\n  {command}")
 
 
 def loads(library: str) -> bool:
@@ -203,20 +203,10 @@ HEAD = """\
 (factorlib/geometry/open3d.py).
 """
 # Requirements of a package that the parts in use do not need.
-LEFT_OUT = {
+NOT_NEEDED = {
     "open3d-cpu": {
-        *(
-            "addict",
-            "configargparse",
-            "dash",
-            "flask",
-            "ipywidgets",
-            "matplotlib",
-            "nbformat",
-            "pandas",
-            "pyquaternion",
-        ),
-        *("scikit-learn", "werkzeug"),
+        *("addict", "configargparse", "dash", "flask", "ipywidgets", "matplotlib"),
+        *("nbformat", "pandas", "pyquaternion", "scikit-learn", "werkzeug"),
     },
 }
 
@@ -242,7 +232,7 @@ def lock_text() -> str:
             continue
         lines[name] = f"{distribution(name).metadata['Name']}=={distribution(name).version}\n"
         needed = [Requirement(text) for text in requires(name) or []]
-        needed = [each for each in needed if canonicalize_name(each.name) not in LEFT_OUT.get(name, ())]
+        needed = [each for each in needed if canonicalize_name(each.name) not in NOT_NEEDED.get(name, ())]
         waiting += [(each, extra) for each in needed for extra in ("", *requirement.extras)]
     del lines["torch"]  # installed separately, from its own index
     return HEAD + "".join(sorted(lines.values(), key=str.lower))

@@ -66,7 +66,8 @@ def append_text(path: Path, text: str) -> None:
     """Append text to a file, whole or not at all, and create its folder if needed."""
     path.parent.mkdir(parents=True, exist_ok=True)
     with open(path, "ab", buffering=0) as stream:
-        before, data = stream.seek(0, os.SEEK_END), text.encode("utf-8")
+        before = stream.seek(0, os.SEEK_END)
+        data = text.encode("utf-8")
         try:
             while data:
                 data = data[stream.write(data) :]
@@ -118,7 +119,7 @@ FULL = {
     errno.EFBIG: "no file may become that large (ulimit -f)",
 }
 CLOSED = {errno.EROFS: "the folder is read-only", errno.EACCES: "permission denied", errno.EPERM: "permission denied"}
-ROOM = "make room there, for instance by `make gc`, which deletes results that nothing names any more, and run again"
+ROOM = "make room there, for instance by `make gc`, which deletes unused results, and run again"
 
 
 def disk_error(error: BaseException, folder: Path) -> InputError | None:
@@ -126,25 +127,25 @@ def disk_error(error: BaseException, folder: Path) -> InputError | None:
 
     `folder` is the folder being written to, for an error that does not name one.
     """
-    behind = [error]
-    while (cause := behind[-1].__cause__ or behind[-1].__context__) is not None and cause not in behind:
-        behind.append(cause)
-    full = next((each for each in behind if _code(each) in FULL), None)
+    chain = [error]
+    while (cause := chain[-1].__cause__ or chain[-1].__context__) is not None and cause not in chain:
+        chain.append(cause)
+    full = next((each for each in chain if _code(each) in FULL), None)
     words = FULL[_code(full)] if full else CLOSED.get(_code(error))  # type: ignore[arg-type, index]
     if words is None:
         return None
-    of = full or error
     name = getattr(error, "filename", None)
     if not full and isinstance(name, str) and os.path.isfile(name) and not os.access(name, os.R_OK):
-        return InputError(f"{words}: it may not be read", file=name, cure="give yourself the right to read it")
-    names = (getattr(of, "filename", None), getattr(of, "filename2", None))  # A copy has two; the last is written.
+        return InputError(f"{words}: it cannot be read", file=name, cure="give yourself the right to read it")
+    # A copy has two names; the last is that of the written file.
+    names = [getattr(full or error, attribute, None) for attribute in ("filename", "filename2")]
     paths = [Path(os.path.abspath(os.fsdecode(name))).parent for name in names if isinstance(name, str | bytes)]
     # nearest existing folders; `Path.is_dir` raises for a folder that it may not read
     folders = [next(p for p in (path, *path.parents) if os.path.isdir(p)) for path in paths or [folder.absolute()]]
     place = folders[-1] if full else next((path for path in folders if not os.access(path, os.W_OK)), folders[0])
     free = f"{shutil.disk_usage(place).free / 1e6:.1f} MB are free"
     if full:
-        return InputError(f"{words}: {free}", file=place, cure=f"{ROOM}: what is finished is kept")
+        return InputError(f"{words}: {free}", file=place, cure=f"{ROOM}: finished results are kept")
     cure = "give yourself the right to write there, or work in a copy elsewhere"
     return InputError(f"{words}: nothing can be written there ({free})", file=place, cure=cure)
 

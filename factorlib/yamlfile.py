@@ -12,7 +12,7 @@ from collections.abc import Iterator
 from itertools import count
 from pathlib import Path
 from types import UnionType
-from typing import Annotated, Any, Literal, NoReturn, TypeVar, Union, get_args, get_origin
+from typing import Annotated, Any, Literal, NamedTuple, NoReturn, TypeVar, Union, get_args, get_origin
 
 import msgspec
 import yaml
@@ -85,13 +85,7 @@ def _compose(text: str, name: str | Path) -> yaml.Node | None:
     """Return the root node of the text's one document, None for an empty text; InputError if it is not YAML."""
     try:
         depth = 0
-        anchors = set()
         for event in yaml.parse(text, Loader=_Loader):  # first: composing is recursive, and would overflow the stack
-            if isinstance(event, yaml.AliasEvent) and event.anchor not in anchors:
-                fault = f"there is no &{event.anchor} above this alias"
-                cure = "correct its name, or write the value out"
-                raise InputError(fault, file=f"{name}:{event.start_mark.line + 1}", cure=cure)
-            anchors.add(getattr(event, "anchor", None))
             depth += isinstance(event, yaml.CollectionStartEvent) - isinstance(event, yaml.CollectionEndEvent)
             if depth > MOST_DEPTH:
                 fault = f"lists and maps are nested more than {MOST_DEPTH} deep"
@@ -101,7 +95,7 @@ def _compose(text: str, name: str | Path) -> yaml.Node | None:
         mark = getattr(error, "problem_mark", None)
         words = [getattr(error, part, None) for part in ("context", "problem")]
         fault = ": ".join(one_line(part) for part in words if part) or one_line(str(error))
-        cure = "look for a bracket, quote, colon or indent on or above this line"
+        cure = "look on or above this line for a bracket, quote, colon, indent, or alias (*name) without anchor"
         raise InputError(f"not YAML: {fault}", file=f"{name}:{mark.line + 1}" if mark else name, cure=cure) from error
 
 
@@ -180,40 +174,48 @@ def convert(value: Any, type_: type[T], name: str | Path, prefix: str = "", text
     try:
         return msgspec.convert(value, type_)
     except msgspec.ValidationError as error:
-        innermost = _innermost(error, value, type_)
+        invalid = _innermost(error, value, type_)
     root = _compose(text, name) if text is not None else None
-    raise_all([_fault(*fault, name, prefix, root) for fault in innermost])
+    faults = []
+    for each in invalid:
+        fault, cure, keys = _describe(each)
+        file = name if root is None else f"{name}:{_line_of(root, keys)}"
+        key = ".".join(filter(None, (prefix, key_path(keys)))) or None
+        faults.append(InputError(fault, file=file, key=key, cure=cure))
+    raise_all(faults)
     raise AssertionError("a validation error has a fault")
 
 
-def _fault(words: str, value: Any, types: list, keys: Keys, name: str | Path, prefix: str, root: Any) -> InputError:
-    """Convert msgspec's error about a value to an InputError with key and cure."""
-    if field := _FIELD.search(words):
-        words = f"the key {field['name']!r} is missing"
-        cure = f"add {field['name']}: …"
-        if field["fault"] == "unknown":
-            known = [f.encode_name for each in types if _is_struct(each) for f in msgspec.structs.fields(each)]
-            words = f"unknown key {one_line(repr(field['name']))}"
-            cure = did_you_mean(field["name"], known)
-            keys = (*keys, field["name"])
-    else:
-        choices = [str(word) for each in types if get_origin(each) is Literal for word in get_args(each)]
-        described = [meta.description for each in types for meta in getattr(each, "__metadata__", ())]
-        one_of = f"one of {', '.join(choices)}" if choices else "write a value of that kind"
-        cure = next(filter(None, described), one_of)
-        if isinstance(value, int | float) and "xpected `str" in words:
-            cure = f'put it in quotes: "{one_line(str(value))}"'
-        words = f"{words[:1].lower()}{words[1:]}"
-        words += "" if isinstance(value, dict | list) else f": {one_line(repr(value))}"
-    file = name if root is None else f"{name}:{_line_of(root, keys)}"
-    key = ".".join(filter(None, (prefix, key_path(keys)))) or None
-    return InputError(words, file=file, key=key, cure=cure)
+class _Invalid(NamedTuple):
+    """Invalid value, with msgspec's message, its possible types and the path to it."""
+
+    message: str
+    value: Any
+    types: list
+    keys: Keys
 
 
-def _innermost(
-    error: msgspec.ValidationError, value: Any, type_: Any, keys: Keys = ()
-) -> list[tuple[str, Any, list, Keys]]:
-    """Return the error text, value, possible types and path of each innermost invalid value."""
+def _describe(invalid: _Invalid) -> tuple[str, str, Keys]:
+    """Return the fault and the cure of an invalid value, and the path to the faulty key."""
+    message, value, types, keys = invalid
+    if field := _FIELD.search(message):
+        name = field["name"]
+        if field["fault"] != "unknown":
+            return f"the key {name!r} is missing", f"add {name}: …", keys
+        known = [f.encode_name for each in types if _is_struct(each) for f in msgspec.structs.fields(each)]
+        return f"unknown key {one_line(repr(name))}", did_you_mean(name, known), (*keys, name)
+    choices = [str(word) for each in types if get_origin(each) is Literal for word in get_args(each)]
+    described = [meta.description for each in types for meta in getattr(each, "__metadata__", ())]
+    cure = f"write one of {', '.join(choices)}" if choices else "write a value of that kind"
+    cure = next(filter(None, described), cure)
+    if isinstance(value, int | float) and "xpected `str" in message:
+        cure = f'put it in quotes: "{one_line(str(value))}"'
+    shown = "" if isinstance(value, dict | list) else f": {one_line(repr(value))}"
+    return f"{message[:1].lower()}{message[1:]}{shown}", cure, keys
+
+
+def _innermost(error: msgspec.ValidationError, value: Any, type_: Any, keys: Keys = ()) -> list[_Invalid]:
+    """Return each innermost invalid value."""
     types = [type_]
     for each in types:  # grows by the members of unions and the types inside `Annotated`
         types += get_args(each) if get_origin(each) in (Union, UnionType) else ()
@@ -224,7 +226,7 @@ def _innermost(
             msgspec.convert(item, inner)
         except msgspec.ValidationError as below:
             inside += _innermost(below, item, inner, (*keys, key))
-    return inside or [(str(error), value, types, keys)]
+    return inside or [_Invalid(str(error), value, types, keys)]
 
 
 def _children(value: Any, type_: Any) -> Iterator[tuple[str | int, Any, Any]]:

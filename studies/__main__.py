@@ -11,7 +11,7 @@ from typing import Annotated
 
 import typer
 
-from factorlib.__main__ import agreed, heed_stops, switched_on
+from factorlib.__main__ import confirm, raise_on_signals, switched_on
 from factorlib.errors import InputError, did_you_mean
 from factorlib.wholefile import disk_error
 from studies.run import STUDIES, collect, forget, make, studies
@@ -30,7 +30,7 @@ def run(
 ) -> None:
     """Run studies, as far as anything must run, with FORCE=1 all of it; SET="executor=tcp://…" says where."""
     if gc:
-        raise typer.Exit(collect(lambda: agreed(False)))
+        raise typer.Exit(collect(lambda: confirm(False)))
     named = names or (os.environ.get("STUDY", "").split() if one else [])
     if one and not named:
         raise InputError("no study is named", key="STUDY", cure="add STUDY=<name>; " + did_you_mean("", STUDIES))
@@ -51,7 +51,7 @@ if __name__ == "__main__":
     app = typer.Typer(add_completion=False, pretty_exceptions_enable=False, rich_markup_mode=None)
     app.command()(run)
     try:
-        with heed_stops():
+        with raise_on_signals():
             app(prog_name="python -m studies")
     except InputError as error:
         sys.exit(f"error: {error}")

@@ -73,8 +73,8 @@ def installed(tmp_path_factory):
 RECORDS = """
 import json
 from factorlib.__main__ import project
-from factorlib.runner.dataset_state import survey
-records = survey(project(), "data/synthetic", None, []).records
+from factorlib.runner.dataset_state import Request, read_state
+records = read_state(project(), Request("data/synthetic")).records
 print(*(f"{step} {json.dumps(record, sort_keys=True, default=str)}" for step, record in records.items()), sep="\\n")
 """
 

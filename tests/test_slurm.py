@@ -40,9 +40,9 @@ def test_the_job_script_run_as_slurm_would_starts_a_worker_that_serves_a_run(clu
     )
     try:
         settings = [f"executor={cluster.scheduler_address}"]
-        assert verbs.make(project, verbs.Wish("set", settings=settings)) == 0
+        assert verbs.make(project, verbs.Request("set", settings=settings)) == 0
     finally:
         os.killpg(job.pid, signal.SIGTERM)
         job.wait(60)
-    assert verbs.make(other, verbs.Wish("set")) == 0
+    assert verbs.make(other, verbs.Request("set")) == 0
     assert files_of(project.build / "store" / "trees") == files_of(other.build / "store" / "trees")

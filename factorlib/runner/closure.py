@@ -1,15 +1,14 @@
-"""The source a stage depends on: its module and everything of the project it imports, however far.
+"""The source that a stage depends on: its module and all modules of the project that it imports, however indirectly.
 
 Each module is hashed by its syntax tree without comments and docstrings, so that a remark reruns nothing.  Imports
-count wherever they stand; modules named only at run time (`import_module(name)`) are not seen.  So does every file
-beside an imported module, or in a folder beside it that is no package, but for what Python and editors leave there
-(`left_over`).
+count wherever they stand; modules named only at run time (`import_module(name)`) are not found.  Every data file beside
+an imported module, or in a folder beside it that is no package, counts too, but for temporary ones (`is_temporary`).
 
-What else a module's numbers depend on it declares in constants, which are read from its syntax tree:
+A module declares what else its numbers depend on in constants, which are read from its syntax tree:
 
     ENVIRONMENT = ("FACTORLIB_FUSED",)    environment variables; their values count
-    PROGRAMS = {"CC": "cc"}               programs by the variable that names them, and the usual one; whether it is
-                                          there counts, and its name, not where it lies
+    PROGRAMS = {"CC": "cc"}               programs: the variable that names one, and its default; presence and name
+                                          count, the folder does not
 """
 
 from __future__ import annotations
@@ -27,11 +26,11 @@ from typing import Any
 import msgspec
 
 from factorlib.errors import InputError, did_you_mean
-from factorlib.runner.store import FileHashes, left_over
+from factorlib.runner.store import FileHashes, is_temporary
 
-# the fields of a record that a closure makes
+# fields of a record that come from a closure
 CODE = ("source:", "data:", "environment:", "program:", "package:", "python")
-OURS = ("factorlib", "stages", "studies")  # packages; an installed one lies among those of others
+OURS = ("factorlib", "stages", "studies")  # packages of this project; other folders beside an installed one are not
 
 
 class Source(msgspec.Struct, frozen=True):
@@ -44,9 +43,10 @@ class Source(msgspec.Struct, frozen=True):
 
 
 class Closure(msgspec.Struct, frozen=True):
-    """Source, package data, versions and environment that a stage depends on, as a part of a step's record.
+    """Source, package data, versions and environment that a stage depends on.
 
-    It also has the paths of these files.
+    record: fields of a step's record
+    files:  path of each field that is the hash of a file
     """
 
     record: dict[str, str]
@@ -54,7 +54,7 @@ class Closure(msgspec.Struct, frozen=True):
 
 
 def source_of(text: str, module: str, is_package: bool) -> Source:
-    """Read what a module's text says.  Raises SyntaxError, and InputError for a declaration that is none."""
+    """Parse the text of a module; SyntaxError if it is not Python, InputError for a malformed declaration."""
     tree = ast.parse(text)
     imports = set()
     for node in ast.walk(tree):
@@ -64,117 +64,122 @@ def source_of(text: str, module: str, is_package: bool) -> Source:
             above = module.split(".")[: None if is_package else -1] if node.level else []
             base = ".".join([*above[: len(above) - node.level + 1], *([node.module] if node.module else [])])
             imports |= {base, *(f"{base}.{alias.name}" for alias in node.names)}
-    environment = _declared(tree, "ENVIRONMENT", list[str], '("A_VARIABLE",)') or []
-    programs = _declared(tree, "PROGRAMS", dict[str, str], '{"CC": "cc"}') or {}
+    environment = _constant(tree, "ENVIRONMENT", list[str], '("A_VARIABLE",)') or []
+    programs = _constant(tree, "PROGRAMS", dict[str, str], '{"CC": "cc"}') or {}
     for node in ast.walk(tree):
-        if (body := getattr(node, "body", None)) and isinstance(body, list):  # a lambda's is one expression
-            body[:] = [item for item in body if not _is_remark(item)] or [ast.Pass()]
+        if (body := getattr(node, "body", None)) and isinstance(body, list):  # The body of a lambda is an expression.
+            body[:] = [item for item in body if not _is_docstring(item)] or [ast.Pass()]
     digest = hashlib.sha256(ast.dump(tree).encode()).hexdigest()[:32]
     return Source(digest, sorted(imports), environment, programs)
 
 
-def _declared(tree: ast.Module, name: str, type_: Any, example: str) -> Any:
-    """Return the value of the constant `name` of a module, without running it; None where it has none."""
+def _constant(tree: ast.Module, name: str, type_: Any, example: str) -> Any:
+    """Return the value of a module's constant without running the module; None if there is no such constant."""
     for node in tree.body:
         if isinstance(node, ast.Assign) and any(getattr(target, "id", None) == name for target in node.targets):
             try:
                 return msgspec.convert(ast.literal_eval(node.value), type_)
             except (ValueError, msgspec.ValidationError):
-                words = f"line {node.lineno}: {name} is read without running the module"
-                raise InputError(words, key=name, cure=f"write names as they stand: {example}") from None
+                fault = f"line {node.lineno}: {name} must be a literal, because it is read without running the module"
+                raise InputError(fault, key=name, cure=f"write {name} = {example}") from None
     return None
 
 
-def _is_remark(item: ast.stmt) -> bool:
-    """Return whether a statement is a string that stands alone: a docstring, or what is said of a field."""
+def _is_docstring(item: ast.stmt) -> bool:
+    """Return True for a string that is a statement of its own: a docstring, or the description of a field."""
     return isinstance(item, ast.Expr) and isinstance(item.value, ast.Constant) and isinstance(item.value.value, str)
 
 
 class Sources:
-    """Modules below some root folders (the project, the library where it lies elsewhere), by a cache of file hashes."""
+    """Modules below root folders: of the project, and of the library if that lies elsewhere."""
 
     def __init__(self, roots: list[Path], hashes: FileHashes):
-        self.roots, self.hashes = list(dict.fromkeys(roots)), hashes
-        self._places: dict[str, Path | None] = {}
-        self._read: dict[Path, Source] = {}  # each file is looked at once, however many stages import it
-        self._beside: dict[Path, list[Path]] = {}  # data files by folder
+        self.roots = list(dict.fromkeys(roots))
+        self.hashes = hashes
+        self._modules: dict[str, Path | None] = {}
+        self._sources: dict[Path, Source] = {}  # Each file is parsed once, however many stages import it.
+        self._data: dict[Path, list[Path]] = {}  # data files by folder
 
     def closure(self, package: str, stage: str, pipeline_file: Path) -> Closure:
-        """Return all modules of the project that `stage` imports, with their hashes.
+        """Return the closure of the module `package.stage`.
 
-        The installed packages among its imports are returned, too.
-        Raises InputError where the stage has no module, or a module of the project cannot be parsed.
+        Raises:
+            InputError: The stage has no module, or a module of the project is not Python.
         """
         if self.find(f"{package}.{stage}") is None:
             known = [p.stem for p in (self.roots[0] / package).glob("*.py") if p.stem != "__init__"]
-            words, cure = f"the stage {stage!r} has no module {package}/{stage}.py", did_you_mean(stage, known)
-            raise InputError(words, file=pipeline_file, key=f"stages.{stage}", cure=cure)
-        places: dict[str, Path] = {}
-        external: set[str] = set()
-        stack = [f"{package}.{stage}"]
-        while stack:
-            parts = stack.pop().split(".")
-            for part in (".".join(parts[: k + 1]) for k in range(len(parts))):
-                if part in places:
-                    continue
-                file = self.find(part)
-                if file is None:
-                    external |= {part} if part == parts[0] else set()
-                    break
-                places[part] = file
-                stack += self._source(part, file).imports
-        sources = {name: self._source(name, file) for name, file in sorted(places.items()) if file.name.endswith(".py")}
-        packages = {n if places[n].name == "__init__.py" else n.rpartition(".")[0]: places[n].parent for n in sources}
-        packages.pop("", None)  # beside a module that is in no package lies anything
+            fault = f"the stage {stage!r} has no module {package}/{stage}.py"
+            raise InputError(fault, file=pipeline_file, key=f"stages.{stage}", cure=did_you_mean(stage, known))
+        modules, external = self._reach(f"{package}.{stage}")
+        sources = {name: self._source(name, file) for name, file in modules.items() if file.name.endswith(".py")}
+        record = {f"source:{name}": source.digest for name, source in sources.items()}
+        packages = {n if modules[n].name == "__init__.py" else n.rpartition(".")[0]: modules[n].parent for n in sources}
+        packages.pop("", None)  # Beside a module that is in no package lie unrelated files.
         data: dict[str, Path] = {}
         for name, folder in packages.items():
-            if folder not in self._beside:
-                self._beside[folder] = list(_data_files(folder))
-            data |= {f"data:{name}:{path.relative_to(folder).as_posix()}": path for path in self._beside[folder]}
-        record = {f"source:{name}": source.digest for name, source in sources.items()}
+            if folder not in self._data:
+                self._data[folder] = list(_data_files(folder))
+            data |= {f"data:{name}:{path.relative_to(folder).as_posix()}": path for path in self._data[folder]}
         record |= {name: self.hashes.content(path) for name, path in data.items()}
         for source in sources.values():
             record |= {f"environment:{name}": os.environ[name] for name in source.environment if name in os.environ}
-            for name, default in source.programs.items():
-                command = os.environ.get(name, default).split() or [""]
-                if shutil.which(command[0]):  # without the folder it lies in
-                    record[f"program:{name}"] = " ".join([Path(command[0]).name, *command[1:]])
-        files = {f"source:{name}": places[name] for name in sources} | data
-        for name in sorted(external - sys.stdlib_module_names):  # what belongs to no distribution is left out
+            commands = {name: os.environ.get(name, usual).split() or [""] for name, usual in source.programs.items()}
+            for name, (program, *options) in commands.items():
+                if shutil.which(program):
+                    record[f"program:{name}"] = " ".join([Path(program).name, *options])
+        for name in sorted(external - sys.stdlib_module_names):  # A module of no distribution does not count.
             record |= {f"package:{each}": version for each, version in self.versions.get(name, {}).items()}
-        return Closure(record | {"python": f"{sys.version_info[0]}.{sys.version_info[1]}"}, files)
+        record["python"] = f"{sys.version_info[0]}.{sys.version_info[1]}"
+        return Closure(record, {f"source:{name}": modules[name] for name in sources} | data)
+
+    def _reach(self, root: str) -> tuple[dict[str, Path], set[str]]:
+        """Return the files of all modules of the project that `root` imports, by name, and external packages."""
+        modules: dict[str, Path] = {}
+        external: set[str] = set()
+        stack = [root]
+        while stack:
+            parts = stack.pop().split(".")
+            for part in (".".join(parts[: k + 1]) for k in range(len(parts))):
+                if part in modules:
+                    continue
+                if (file := self.find(part)) is None:
+                    external |= {part} if part == parts[0] else set()
+                    break
+                modules[part] = file
+                stack += self._source(part, file).imports
+        return dict(sorted(modules.items())), external
 
     @cached_property
     def versions(self) -> dict[str, dict[str, str]]:
-        """{name as imported: {distribution: version}}, looked up once per state of the folders of packages."""
+        """Versions as {imported name: {distribution: version}}, cached until a folder of packages changes."""
         folders = [path for path in sys.path if path.endswith("-packages") and os.path.isdir(path)]
         newest = max(folders, key=os.path.getmtime, default=sys.prefix)
-        return self.hashes.remembered("packages", Path(newest), _installed, dict[str, dict[str, str]])
+        return self.hashes.cached("packages", Path(newest), _installed, dict[str, dict[str, str]])
 
     def find(self, name: str) -> Path | None:
-        """Return the file of a module of the project; a folder without `__init__.py` stands for itself."""
-        if name not in self._places:
+        """Return the file of a module of the project, or the folder of a package without `__init__.py`."""
+        if name not in self._modules:
             parent, _, last = name.rpartition(".")
             bases = self.roots[: None if name in OURS else 1]
             if parent:
                 above = self.find(parent)
                 bases = [] if above is None else [above.parent if above.name == "__init__.py" else above]
-            self._places[name] = next((file for base in bases if (file := _module_in(base, last))), None)
-        return self._places[name]
+            self._modules[name] = next((file for base in bases if (file := _module_in(base, last))), None)
+        return self._modules[name]
 
     def _source(self, name: str, file: Path) -> Source:
         def parse() -> Source:
             try:
                 return source_of(file.read_text(encoding="utf-8"), name, file.name == "__init__.py")
             except SyntaxError as error:
-                where = f"{file}:{error.lineno}"
-                raise InputError(f"not Python: {error.msg}", file=where, cure="mend that line") from error
+                place = f"{file}:{error.lineno}"
+                raise InputError(f"not Python: {error.msg}", file=place, cure="correct that line") from error
             except InputError as error:
                 raise InputError(error.found, file=file, key=error.key, cure=error.cure) from error
 
-        if file not in self._read:
-            self._read[file] = Source() if file.is_dir() else self.hashes.remembered("source", file, parse, Source)
-        return self._read[file]
+        if file not in self._sources:
+            self._sources[file] = Source() if file.is_dir() else self.hashes.cached("source", file, parse, Source)
+        return self._sources[file]
 
 
 def _module_in(folder: Path, name: str) -> Path | None:
@@ -185,7 +190,7 @@ def _module_in(folder: Path, name: str) -> Path | None:
 
 
 def _data_files(folder: Path) -> Iterator[Path]:
-    for path in sorted(path for path in folder.iterdir() if not left_over(path.name)):
+    for path in sorted(path for path in folder.iterdir() if not is_temporary(path.name)):
         if path.is_dir():
             yield from () if (path / "__init__.py").exists() else _data_files(path)
         elif path.is_file() and path.suffix != ".py":
@@ -193,8 +198,8 @@ def _data_files(folder: Path) -> Iterator[Path]:
 
 
 def _installed() -> dict[str, dict[str, str]]:
-    """{name as imported: {distribution: version}} of all that is installed."""
+    """Return {imported name: {distribution: version}} of all installed packages."""
     from importlib.metadata import packages_distributions, version
 
-    found = packages_distributions()
-    return {name: {each: version(each) for each in sorted({*names})} for name, names in found.items()}
+    distributions = packages_distributions()
+    return {name: {each: version(each) for each in sorted({*names})} for name, names in distributions.items()}

@@ -1,7 +1,7 @@
-"""A run as a user sees it: plain lines, or on a terminal a bar for each stage; a long step always shows life.
+"""Display of a run on standard error: plain lines, or on a terminal a bar for each stage.
 
-A terminal is shown text alone.  Names of files and words of parsers stand in messages, and a data set may come from
-anywhere: none of it may move the cursor, set a colour or a title, or ring the bell.
+A terminal receives text alone.  Messages have names of files and texts of parsers, and a dataset may be anyone's:
+none of it may move the cursor, set a colour or a title, or ring the bell.
 """
 
 from __future__ import annotations
@@ -10,7 +10,8 @@ import contextlib
 import sys
 import time
 from collections.abc import Iterator
-from typing import Any, TextIO
+from dataclasses import dataclass, field
+from typing import Any, TextIO, cast
 
 from factorlib.runner.plan import Planned, Step
 
@@ -18,7 +19,7 @@ BEAT = 10.0  # seconds between two plain lines about the same step
 
 
 def printable(text: str) -> str:
-    r"""Replace every character that prints nothing, but for ends of lines, by the form that Python's literals have.
+    r"""Escape every character that is not printable, except for line breaks, as Python's literals do.
 
     >>> printable("a\x1b[31mb\u202ec\n")
     'a\\x1b[31mb\\u202ec\n'
@@ -26,14 +27,14 @@ def printable(text: str) -> str:
     return "".join(c if c.isprintable() or c == "\n" else ascii(c)[1:-1] for c in text)
 
 
-class Plain:
-    """A stream that writes printable text to another, which has all else."""
+class PrintableStream:
+    """Stream that writes printable text to another, which has all other attributes."""
 
     def __init__(self, stream: TextIO):
         self.stream = stream
 
     def write(self, text: str) -> int:
-        """Write text; a stream of text takes no bytes."""
+        """Write text; TypeError for bytes."""
         if not isinstance(text, str):
             raise TypeError(f"write() argument must be str, not {type(text).__name__}")
         return self.stream.write(printable(text))
@@ -43,39 +44,50 @@ class Plain:
 
 
 @contextlib.contextmanager
-def plain_streams() -> Iterator[None]:
-    """Within, standard output and standard error are plain."""
-    with contextlib.redirect_stdout(Plain(sys.stdout)), contextlib.redirect_stderr(Plain(sys.stderr)):
+def printable_streams() -> Iterator[None]:
+    """Make standard output and standard error printable inside."""
+    streams = [cast(TextIO, PrintableStream(stream)) for stream in (sys.stdout, sys.stderr)]
+    with contextlib.redirect_stdout(streams[0]), contextlib.redirect_stderr(streams[1]):
         yield
 
 
-class Display:
-    """Lines on standard error: what starts, what it warns of, how long it took.
+@dataclass
+class _Progress:
+    """Progress of a running step: times of its start and its last line, share done, and a description."""
 
-    On a terminal a bar for each stage stands below them, with the time that rich expects it to take still.
+    started: float = field(default_factory=time.monotonic)
+    reported: float = field(default_factory=time.monotonic)
+    share: float = 0.0
+    words: str = ""
+
+
+class Display:
+    """Lines on standard error: starts, warnings, times.
+
+    On a terminal a bar for each stage stands below them, with the remaining time that rich estimates.
+
+    Attributes:
+        stages: numbers of steps, and of those left, by stage
     """
 
     def __init__(self) -> None:
-        self.stages: dict[str, list[int]] = {}  # how many steps each has, and how many of them are left
-        self.running: dict[
-            Step, list
-        ] = {}  # when it began and was last heard of, which share of it is done, what it does
-        self._told: dict[str | Step, None] = {}  # stages that have begun, warnings, and steps that wait
-        self._bars: Any = None
+        self.stages: dict[str, tuple[int, int]] = {}
+        self._running: dict[Step, _Progress] = {}
+        self._reported: dict[str, None] = {}  # started stages, in order, and messages that are printed once
+        self._bars: Any = _bars() if sys.stderr.isatty() else None
         self._rows: dict[str, Any] = {}
-        if sys.stderr.isatty():
-            self._bars = _bars()
+        if self._bars:
             self._bars.start()
 
     def plan(self, planned: list[Planned]) -> None:
-        """Take over the state of the plan as it is now."""
-        self.stages = {p.step.stage: [0, 0] for p in planned}
+        """Show the state of a plan."""
+        self.stages = {}
         for p in planned:
-            self.stages[p.step.stage][0] += 1
-            self.stages[p.step.stage][1] += p.status != "current"
+            total, left = self.stages.get(p.step.stage, (0, 0))
+            self.stages[p.step.stage] = (total + 1, left + (p.status != "current"))
 
-    def say(self, text: str) -> None:
-        """Print a line, above the bars where there are any."""
+    def report(self, text: str) -> None:
+        """Print a line, above the bars if there are any."""
         if self._bars:
             self._bars.console.print(printable(text), markup=False, highlight=False, soft_wrap=True)
         else:
@@ -83,83 +95,88 @@ class Display:
 
     def _line(self, step: Step, text: str) -> None:
         if not self._bars:
-            self.say(f"{step.stage:<10} {text}".rstrip())
+            self.report(f"{step.stage:<10} {text}".rstrip())
 
-    def _first(self, what: str | Step) -> bool:
-        first = what not in self._told
-        self._told[what] = None
-        return first
+    def _is_new(self, message: str) -> bool:
+        before = len(self._reported)
+        self._reported[message] = None
+        return len(self._reported) > before
 
     def start(self, step: Step) -> None:
-        """Show that a step begins, of a stage the first only."""
-        self.running[step] = [time.monotonic(), time.monotonic(), 0.0, ""]
-        _, left = self.stages.setdefault(step.stage, [1, 1])
-        if self._first(step.stage):
+        """Show that a step begins; a line is printed for the first of a stage."""
+        self._running[step] = _Progress()
+        _, left = self.stages.setdefault(step.stage, (1, 1))
+        if self._is_new(step.stage):
             kind = "photo" if step.photo else "recipe"
-            self._line(step, "…" if step.of is None else f"{left} {kind}{'s' * (left > 1)} …")
+            self._line(step, f"{left} {kind}{'s' * (left > 1)} …" if step.item else "…")
 
-    def waits(self, step: Step) -> None:
-        """Say once that a step waits for another run to make its result."""
-        if self._first(step):
-            self.say(f"{step}: waiting: another run is making it")
+    def wait(self, step: Step) -> None:
+        """Print once that a step waits for another run to make its result."""
+        if self._is_new(f"waiting: {step}"):
+            self.report(f"{step}: waiting: another run is making it")
 
     def progress(self, step: Step, done: float, total: float, text: str) -> None:
-        """Note a running step's progress (`done` of `total`, in its own unit) and what it does; `tick` shows it."""
-        share = min(done / total, 1.0) if total else 0.0
-        self.running[step][2:] = share, f"{f'{share:4.0%}' if total else ''} {printable(text)}".strip()
+        """Set a running step's progress (`done` of `total`, in any unit) and description; `tick` shows it."""
+        progress = self._running[step]
+        progress.share = min(done / total, 1.0) if total else 0.0
+        progress.words = f"{f'{progress.share:4.0%}' if total else ''} {printable(text)}".strip()
 
     def tick(self) -> None:
-        """Show life: draw the bars anew, or print a line for every step that has been silent for BEAT seconds."""
+        """Draw the bars again, or print a line for every step that has been silent for BEAT seconds."""
         now = time.monotonic()
-        for step, (began, spoke, _, words) in self.running.items():
-            if not self._bars and now - spoke >= BEAT:
-                self.running[step][1] = now
-                self._line(step, f"{step.of or '':<16} {now - began:6.0f} s  {words}")
-        for stage in (stage for stage in self._told if self._bars and stage in self.stages):
+        for step, progress in self._running.items():
+            if not self._bars and now - progress.reported >= BEAT:
+                progress.reported = now
+                self._line(step, f"{step.item:<16} {now - progress.started:6.0f} s  {progress.words}")
+        for stage in (stage for stage in self._reported if self._bars and stage in self.stages):
             if stage not in self._rows:
                 self._rows[stage] = self._bars.add_task(stage, count="", words="")
             total, left = self.stages[stage]
-            live = {step: (share, words) for step, (_, _, share, words) in self.running.items() if step.stage == stage}
-            words = "; ".join(f"{step.of or ''} {words}".strip() for step, (_, words) in live.items())
-            done = total - left + sum(share for share, _ in live.values())
-            counted = {"completed": done, "total": total, "count": f"{total - left}/{total}", "words": words[:80]}
-            self._bars.update(self._rows[stage], **counted)
+            running = {step: progress for step, progress in self._running.items() if step.stage == stage}
+            words = "; ".join(f"{step.item} {progress.words}".strip() for step, progress in running.items())
+            done = total - left + sum(progress.share for progress in running.values())
+            columns = {"completed": done, "total": total, "count": f"{total - left}/{total}", "words": words[:80]}
+            self._bars.update(self._rows[stage], **columns)
 
     def warn(self, step: Step, text: str) -> None:
-        """Print a warning; one that was printed before is left out."""
-        if self._first(f"warning: {text}"):
-            self.say(f"warning: {step}: {text}")
+        """Print a warning, once for each text."""
+        if self._is_new(f"warning: {text}"):
+            self.report(f"warning: {step}: {text}")
 
     def finish(self, step: Step, seconds: float) -> None:
         """Show that a step is done, after `seconds`."""
-        self.stages[step.stage][1] = max(0, self.stages[step.stage][1] - 1)  # a plan may know already that it is made
-        self.running.pop(step, None)
-        self._line(step, f"{step.of or '':<16} {seconds:6.1f} s")
+        total, left = self.stages[step.stage]
+        self.stages[step.stage] = (total, max(0, left - 1))  # The plan may already know the result.
+        self._running.pop(step, None)
+        self._line(step, f"{step.item:<16} {seconds:6.1f} s")
 
     def fail(self, step: Step, error: str, traceback: str | None) -> None:
-        """Say with which error a step ended; `traceback` names the file with details of a defect of the program."""
-        self.running.pop(step, None)
-        self.say(f"error: {step}: {error}")
+        """Print the error of a step; `traceback` names the file with details of a defect of the program."""
+        self._running.pop(step, None)
+        self.report(f"error: {step}: {error}")
         if traceback:
-            self.say(f"  this is a defect of the program, not of your input; details: {traceback}")
+            self.report(f"  this is a defect of the program, not of your input; details: {traceback}")
 
     def close(self) -> None:
-        """Draw the bars a last time and give the terminal back."""
+        """Draw the bars a last time and release the terminal."""
         if self._bars:
             self.tick()
             self._bars.stop()
 
 
 def _bars() -> Any:
-    """Return rich's bars, which are loaded for a terminal only."""
+    """Return rich's progress bars; rich is loaded for a terminal only."""
     from rich import progress
     from rich.console import Console
 
-    stream = sys.stderr.stream if isinstance(sys.stderr, Plain) else sys.stderr  # rich moves the cursor itself
-    stage, words = (
-        progress.TextColumn(f"{{task.{text}}}", markup=False) for text in ("description:<10", "fields[words]")
+    stream = sys.stderr.stream if isinstance(sys.stderr, PrintableStream) else sys.stderr  # rich moves the cursor
+    columns = (
+        progress.SpinnerColumn(),
+        progress.TextColumn("{task.description:<10}", markup=False),
+        progress.BarColumn(24),
+        progress.TextColumn("{task.fields[count]:>7}"),
+        progress.TimeElapsedColumn(),
+        progress.TimeRemainingColumn(),
+        progress.TextColumn("{task.fields[words]}", markup=False),
     )
-    count = progress.TextColumn("{task.fields[count]:>7}")
-    times = progress.TimeElapsedColumn(), progress.TimeRemainingColumn()
-    columns = (progress.SpinnerColumn(), stage, progress.BarColumn(24), count, *times, words)
     return progress.Progress(*columns, console=Console(file=stream), speed_estimate_period=600)

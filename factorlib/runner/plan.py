@@ -1,9 +1,9 @@
-"""What must run, and why: a pure function of what is declared, what it all hashes to, and what the store holds.
+"""Plan of a run: the steps that must run, and why, as a pure function of declarations, hashes and the store's content.
 
 A step's record is a flat table of everything its result depends on: its name, the source of every module it imports,
-its parameters, what dataset.yaml says that it sees, its inputs' content hashes, versions.  No path outside the dataset
-and no time is in it.  Its key is the hash of that table, the difference of two tables is the reason for a rerun, and a
-step whose inputs are not made yet is a *maybe*: it reruns only if they come out different.
+its parameters, its part of dataset.yaml, the content hashes of its inputs, versions of packages.  The record has no
+time and no path outside the dataset.  The hash of the record is the step's key, and the difference of two records is
+the reason for a rerun.  A step whose inputs are not made yet is a *maybe*: it reruns only if they come out different.
 """
 
 from __future__ import annotations
@@ -29,16 +29,16 @@ class Step(msgspec.Struct, frozen=True, order=True):
     recipe: str | None = None
 
     @property
-    def of(self) -> str | None:
-        """Return the name of its photo or recipe."""
-        return self.photo or self.recipe
+    def item(self) -> str:
+        """Name of the photo or recipe; empty for a step over the whole set."""
+        return self.photo or self.recipe or ""
 
     def __str__(self) -> str:
-        return f"{self.stage}/{self.of}" if self.of else self.stage
+        return f"{self.stage}/{self.item}" if self.item else self.stage
 
 
 class Spec(msgspec.Struct, frozen=True):
-    """Stages that are wanted, with their photos and recipes, and the steps that run whatever the store holds."""
+    """Requested stages, with photos and recipes, and the steps that run whatever the store holds."""
 
     pipeline: Pipeline
     photos: list[str]
@@ -47,7 +47,7 @@ class Spec(msgspec.Struct, frozen=True):
     recipes: list[str] = []
 
     def steps(self) -> list[Step]:
-        """Return all steps of the wanted stages and of what they need, upstream first."""
+        """Return all steps of the requested stages and of those that they need, upstream first."""
         return [step for name in self.pipeline.needed(self.targets) for step in self.steps_of(name)]
 
     def steps_of(self, stage: str) -> list[Step]:
@@ -57,21 +57,20 @@ class Spec(msgspec.Struct, frozen=True):
             return [Step(stage, recipe=recipe) for recipe in self.recipes]
         return [Step(stage, photo) for photo in self.photos] if over else [Step(stage)]
 
-    def above(self, step: Step) -> list[Step]:
-        """Return the steps whose results a step takes.
-
-        These are of its own photo, or of all for a step over the whole set or of a recipe.
-        """
-        upstream = self.pipeline.stages[step.stage].upstream
+    def upstream(self, step: Step) -> list[Step]:
+        """Return the steps whose results a step takes: those of its photo, or of all photos for another step."""
+        names = self.pipeline.stages[step.stage].upstream
         if step.photo is None:
-            return [found for name in upstream for found in self.steps_of(name)]
-        return [Step(name, step.photo if self.pipeline.stages[name].over else None) for name in upstream]
+            return [above for name in names for above in self.steps_of(name)]
+        return [Step(name, step.photo if self.pipeline.stages[name].over else None) for name in names]
 
 
 class Listing(msgspec.Struct, frozen=True):
-    """Contents of the store: output hash by key (asked by `get`); and each step's record when it last was current here.
+    """Content of the store.
 
-    damaged: by key, what is wrong with a result that is not as it was kept, and so has no output
+    outputs:  output hash by key, asked by `get`
+    previous: each step's record when it last was current for this dataset
+    damaged:  by key, the faults of a result that no longer has the files it was stored with, and so has no output
     """
 
     outputs: Any
@@ -80,62 +79,58 @@ class Listing(msgspec.Struct, frozen=True):
 
 
 class Planned(msgspec.Struct, frozen=True):
-    """Step, what is done about it, and why.
+    """Step with its status and the reasons for it.
 
-    It has its key and record where all its inputs are known, and its output where made.
+    `record` and `key` are empty until all inputs are made, `output` until the step itself is.
     """
 
     step: Step
     status: Status
     reasons: list[str]
-    record: Record | None = None
-    key: str | None = None
-    output: str | None = None
+    record: Record = {}
+    key: str = ""
+    output: str = ""
 
 
 def plan(spec: Spec, hashes: Mapping[Step, Record], listing: Listing) -> list[Planned]:
-    """Plan every wanted step in order; `hashes` holds each step's record but for the results it is handed."""
+    """Plan every requested step in order; `hashes` holds each step's record without the results of other steps."""
     planned: dict[Step, Planned] = {}
     for step in spec.steps():
-        outputs = {above: planned[above].output for above in spec.above(step)}
-        planned[step] = _planned(step, step in spec.forced, hashes[step], outputs, listing)
+        outputs = {above: planned[above].output for above in spec.upstream(step)}
+        planned[step] = _plan_step(step, step in spec.forced, hashes[step], outputs, listing)
     return list(planned.values())
 
 
-def _planned(step: Step, forced: bool, own: Record, outputs: Mapping[Step, str | None], listing: Listing) -> Planned:
-    """Plan a step that is handed those outputs, None where one is still to be made.
+def _plan_step(step: Step, forced: bool, base: Record, outputs: Mapping[Step, str], listing: Listing) -> Planned:
+    """Plan a step that takes these outputs, empty where one is still to be made.
 
-    Under such a one it must run if what is known already changed; else that is open.
+    With such an input the step must run if something else of its record changed; otherwise that is open.
     """
-    unmade = [above for above, output in outputs.items() if output is None]
-    record = own | {f"input:{above}": output for above, output in outputs.items() if output is not None}
-    whole, key = (None, None) if unmade else (record, step_key(record))
+    missing = [above for above, output in outputs.items() if not output]
+    record = base | {f"input:{above}": output for above, output in outputs.items() if output}
+    whole: Record = {} if missing else record
+    key = "" if missing else hash_of(record)
     if forced:
         return Planned(step, "to run", ["forced"], whole, key)
     if key and (output := listing.outputs.get(key)) is not None:
-        return Planned(step, "current", [], whole, key, output)
+        return Planned(step, "current", [], record, key, output)
     if key and key in listing.damaged:
-        return Planned(step, "to run", [f"its result is damaged: {in_short(listing.damaged[key])}"], whole, key)
+        return Planned(step, "to run", [f"its result is damaged: {summarize(listing.damaged[key])}"], whole, key)
     if (before := listing.previous.get(str(step))) is None:
         return Planned(step, "to run", ["not made yet"], whole, key)
-    waiting = {f"input:{above}" for above in unmade}
-    changes = difference({name: value for name, value in before.items() if name not in waiting}, record)
-    if unmade and not changes:
-        return Planned(step, "maybe", [f"if {names(unmade)} comes out different"])
+    pending = {f"input:{above}" for above in missing}
+    changes = difference({name: value for name, value in before.items() if name not in pending}, record)
+    if missing and not changes:
+        return Planned(step, "maybe", [f"if {names(missing)} comes out different"])
     return Planned(step, "to run", changes or ["its result is gone"], whole, key)
 
 
-def step_key(record: Record) -> str:
-    """Return the key of a step: the hash of its record, the same on any machine."""
-    return hash_of(record)
-
-
 def hash_of(table: Record) -> str:
-    """Return the hash of a table: of a step's record, or of the files of a tree, which is named by it."""
+    """Return the hash of a step's record, which is its key, or of the files of a tree, which is its name."""
     return hashlib.sha256(json.dumps(table, sort_keys=True).encode()).hexdigest()[:32]
 
 
-_KIND = {
+_LABELS = {
     "source": "source of {}",
     "param": "parameter {}",
     "recipe": "recipe: {}",
@@ -150,52 +145,51 @@ _KIND = {
     "program": "program {}",
     "package": "package {}",
 }
-
-
 _ABSENT = object()
 _HASHED = ("source", "file", "recipe file", "given", "input", "data")
-_LONGEST = 80  # characters of a value that are shown
-_NAMED = 4  # names that came or went
+_LONGEST = 80  # characters of a value in a message
+_MOST_NAMES = 4  # items of a list in a message
 
 
 def difference(before: Record, after: Record) -> list[str]:
-    """List what changed between two records, in words, one line per cause."""
-    both = sorted(before.keys() | after.keys())
-    return [_change(name, before, after) for name in both if before.get(name, _ABSENT) != after.get(name, _ABSENT)]
+    """Describe the changes between two records, one line per field."""
+    fields = sorted(before.keys() | after.keys())
+    pairs = ((name, before.get(name, _ABSENT), after.get(name, _ABSENT)) for name in fields)
+    return [_change(name, old, new) for name, old, new in pairs if old != new]
 
 
-def _change(name: str, before: Record, after: Record) -> str:
-    kind, colon, what = name.partition(":")
-    label = _KIND.get(kind, "{}").format(what.removeprefix(DATASET) if kind == "facts" else what) if colon else name
-    old, new = before.get(name, _ABSENT), after.get(name, _ABSENT)
+def _change(name: str, old: Any, new: Any) -> str:
+    kind, colon, field = name.partition(":")
+    label = _LABELS.get(kind, "{}").format(field.removeprefix(DATASET) if kind == "facts" else field) if colon else name
     if kind in _HASHED:
         return f"{label}: " + ("new" if old is _ABSENT else "gone" if new is _ABSENT else "changed")
     if isinstance(old, list) and isinstance(new, list):
-        came, gone = [name for name in new if name not in old], [name for name in old if name not in new]
-        if came + gone and all(isinstance(name, str) for name in came + gone):
-            moved = [*(f"{name!r} came" for name in came[:_NAMED]), *(f"{name!r} went" for name in gone[:_NAMED])]
-            return f"{label}: {', '.join(moved)}"
-    return f"{label}: {_shown(old, kind)} -> {_shown(new, kind)}"
+        added = [item for item in new if item not in old]
+        removed = [item for item in old if item not in new]
+        if added + removed and all(isinstance(item, str) for item in added + removed):
+            words = [f"{item!r} added" for item in added[:_MOST_NAMES]]
+            return f"{label}: {', '.join(words + [f'{item!r} removed' for item in removed[:_MOST_NAMES]])}"
+    return f"{label}: {_format(old, kind)} -> {_format(new, kind)}"
 
 
-def _shown(value: Any, kind: str) -> str:
+def _format(value: Any, kind: str) -> str:
     if value is _ABSENT or (value is None and kind == "facts"):
         return {"facts": "not given", "param": "default"}.get(kind, "none")
     text = json.dumps(value, ensure_ascii=False)
     return text if len(text) <= _LONGEST else text[: _LONGEST - 1] + "…"
 
 
-def in_short(lines: Sequence[object], most: int = 3, between: str = "; ") -> str:
-    """Return the first lines, and how many more there are.
+def summarize(lines: Sequence[object], most: int = 3, separator: str = "; ") -> str:
+    """Join the first lines and the number of further ones.
 
-    >>> in_short(["a: missing", "b: missing", "c: missing", "d: missing"])
+    >>> summarize(["a: missing", "b: missing", "c: missing", "d: missing"])
     'a: missing; b: missing; c: missing; 1 more'
     """
-    return between.join([*map(str, lines[:most]), *([f"{len(lines) - most} more"] if len(lines) > most else [])])
+    return separator.join([*map(str, lines[:most]), *([f"{len(lines) - most} more"] if len(lines) > most else [])])
 
 
 def names(steps: Iterable[Step]) -> str:
-    """Format steps by the name of their stage, with the number of photos.
+    """Format steps by the names of their stages, with the number of photos.
 
     >>> names([Step("masks", "a"), Step("masks", "b"), Step("train")])
     'masks (2 photos), train'
@@ -203,5 +197,5 @@ def names(steps: Iterable[Step]) -> str:
     groups: dict[str, list[Step]] = {}
     for step in steps:
         groups.setdefault(step.stage, []).append(step)
-    kinds = {stage: "recipes" if found[0].recipe else "photos" for stage, found in groups.items()}
-    return ", ".join(str(f[0]) if len(f) == 1 else f"{s} ({len(f)} {kinds[s]})" for s, f in groups.items())
+    kinds = {stage: "recipes" if group[0].recipe else "photos" for stage, group in groups.items()}
+    return ", ".join(str(g[0]) if len(g) == 1 else f"{name} ({len(g)} {kinds[name]})" for name, g in groups.items())

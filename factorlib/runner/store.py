@@ -1,15 +1,15 @@
-"""Results on disk: each tree of files by the hash of its content, each key pointing at the tree it gave.
+"""Results on disk: each tree of files is stored by the hash of its content, and each key points at its tree.
 
-    build/store/trees/<output>/   the files of a result, read-only
-    build/store/keys/<key>.json   {"output", "record", "files"}: what the key gave
-    build/store/logs/<key>.jsonl  what making it cost and said (times and machine facts are only here)
-    build/store/unfinished/<key>/ what lets a step that was killed go on
-    build/store/damaged/          what stood where a result was made again, for it was not as it had been kept
+    build/store/trees/<output>/   files of a result, read-only
+    build/store/keys/<key>.json   {"output", "record", "files"}: the result of a key
+    build/store/logs/<key>.jsonl  cost and warnings of a result (times and machine facts are only here)
+    build/store/unfinished/<key>/ checkpoints of a step that was killed
+    build/store/damaged/          damaged trees that a new result has replaced
     build/store/locks, tmp, cache
 
-A tree and a key appear by one rename each, the tree first; nothing half-written is ever visible.  A tree is right if
-its files are exactly those of its record, with their contents, but for what editors leave (`left_over`).  Sizes and
-times that it had when it was right are remembered, so that it is read once; `verify` reads it again.
+A tree and a key appear by one rename each, the tree first, so that nothing half-written is ever visible.  A tree is
+sound if it has exactly the files of its record, with their contents, beside temporary ones (`is_temporary`).  The cache
+has sizes and times of sound trees, so that each is read once; `verify` reads all again.
 """
 
 from __future__ import annotations
@@ -25,189 +25,200 @@ import time
 import uuid
 from collections.abc import Callable, Iterable, Mapping
 from functools import cached_property
-from pathlib import Path, PurePosixPath
+from pathlib import Path
 from typing import Annotated, Any, TypeVar
 
 import msgspec
 
 from factorlib.errors import InputError
 from factorlib.jsonfile import json_text
-from factorlib.runner.plan import Record, hash_of, step_key
+from factorlib.runner.plan import Record, hash_of
 from factorlib.runner.project import Shipping
 from factorlib.wholefile import replace_file, sync, sync_tree
 
 log = logging.getLogger("factorlib.runner")
 T = TypeVar("T")
 Hash = Annotated[str, msgspec.Meta(pattern="^[0-9a-f]{32}$")]
-FORMAT = 8  # of the cache; one of another format is made anew
-FRESH_NS = 2_000_000_000  # a file changed this recently may change again within its clock's grain: not remembered
+Stamp = tuple[int, int]  # size in bytes, time of the content in ns
+FORMAT = 9  # of the cache; one of another format is ignored
+FRESH_NS = 2_000_000_000  # A file changed this recently may change again within its clock's grain: it is not cached.
+DECODE_ERRORS = (OSError, msgspec.MsgspecError, UnicodeError, RecursionError)
 
 
 def hash_of_file(path: Path) -> str:
-    """First 128 bits of the SHA-256 of a file's content, as 32 hexadecimal digits."""
+    """Return the first 128 bits of the SHA-256 of a file's content, as 32 hexadecimal digits."""
     with open(path, "rb") as stream:
         return hashlib.file_digest(stream, "sha256").hexdigest()[:32]
 
 
-def left_over(name: str) -> bool:
-    """Return whether a file or folder is what Python, editors and desktops leave: hidden, a backup, or compiled Python.
+def is_temporary(name: str) -> bool:
+    """Return True for what Python, editors and desktops leave: hidden, a backup, or compiled Python.
 
-    >>> [left_over(name) for name in (".a.c.swp", "a.c~", "#a.c#", "__pycache__", "a.pyc", "a.c")]
+    >>> [is_temporary(name) for name in (".a.c.swp", "a.c~", "#a.c#", "__pycache__", "a.pyc", "a.c")]
     [True, True, True, True, True, False]
     """
     return name.startswith((".", "#")) or name.endswith(("~", ".pyc")) or name == "__pycache__"
 
 
-def read_cache(path: Path | None, type_: type[T]) -> T | None:
-    """Return what a cache holds; None where there is none, or it is damaged or of another kind."""
-    try:
-        return msgspec.json.decode(path.read_bytes(), type=type_) if path else None
-    except (OSError, msgspec.MsgspecError, UnicodeError, RecursionError):
-        return None
+class _Cache(msgspec.Struct, array_like=True):
+    """Content of the cache: values by kind and path with the file's stamp, and stamps of sound trees."""
 
-
-def write_cache(path: Path, tables: Any) -> None:
-    """Replace a cache; where it cannot be written (a full disk, a read-only folder) the next run only takes longer."""
-    with contextlib.suppress(OSError):
-        path.parent.mkdir(parents=True, exist_ok=True)
-        replace_file(path, msgspec.json.encode(tables))
+    format: int = FORMAT
+    values: dict[str, dict[str, Any]] = {}
+    trees: dict[str, dict[str, Stamp]] = {}
 
 
 class FileHashes:
-    """Values made of the contents of files, by kind and path, in a cache beside the store; `save` writes it.
+    """Cache of values that are computed from files; `save` writes it.
 
-    cache: its file, None to keep nothing
+    file: of the cache, None for none
     """
 
-    def __init__(self, cache: Path | None):
-        self.cache, self._changed = cache, False
-        format_, tables = read_cache(cache, tuple[int, dict[str, dict[str, Any]]]) or (0, {})
-        self._tables = tables if format_ == FORMAT else {}
+    def __init__(self, file: Path | None):
+        self.file = file
+        self._changed = False
+        self._cache = _Cache()
+        with contextlib.suppress(*DECODE_ERRORS):
+            cache = msgspec.json.decode(file.read_bytes(), type=_Cache) if file else self._cache
+            self._cache = cache if cache.format == FORMAT else self._cache
 
     def content(self, path: Path) -> str:
-        """`hash_of_file`, from the cache where the file's size, times and inode are unchanged."""
-        return self.remembered("content", path, lambda: hash_of_file(path), Hash)
+        """Return `hash_of_file`, from the cache if the file's size, times and inode are unchanged."""
+        return self.cached("content", path, lambda: hash_of_file(path), Hash)
 
-    def remembered(self, kind: str, path: Path, make: Callable[[], T], type_: type[T]) -> T:
-        """Return what `make` makes of a file's content, from the cache where that is unchanged; type_: its type."""
-        stat, table = os.stat(path), self._tables.setdefault(kind, {})
-        now = stat.st_size, stat.st_mtime_ns, stat.st_ctime_ns, stat.st_ino
-        with contextlib.suppress(KeyError, OverflowError, msgspec.ValidationError):  # not there, or damaged
-            then, value = msgspec.convert(table[str(path)], tuple[tuple[int, int, int, int], Any])
-            if then == now:
+    def cached(self, kind: str, path: Path, compute: Callable[[], T], type_: Any) -> T:
+        """Return a value of a type that `compute` derives from a file, from the cache if the file is unchanged."""
+        table = self._cache.values.setdefault(kind, {})
+        before = _identity(path)
+        with contextlib.suppress(KeyError, OverflowError, msgspec.ValidationError):  # missing, or damaged
+            stamp, value = msgspec.convert(table[str(path)], tuple[tuple[int, int, int, int], Any])
+            if stamp == before:
                 return msgspec.convert(value, type_)
-        value, stat = make(), os.stat(path)
-        unchanged = now == (stat.st_size, stat.st_mtime_ns, stat.st_ctime_ns, stat.st_ino)
-        if unchanged and time.time_ns() - max(now[1], now[2]) > FRESH_NS:
-            table[str(path)], self._changed = (now, value), True
+        value = compute()
+        if before == _identity(path) and time.time_ns() - max(before[1:3]) > FRESH_NS:
+            table[str(path)] = (before, value)
+            self._changed = True
         return value
 
+    def sound_tree(self, output: str) -> dict[str, Stamp]:
+        """Return the stamps of a tree's files when they were last found sound; empty if never."""
+        return self._cache.trees.get(output, {})
+
+    def set_sound_tree(self, output: str, stamps: dict[str, Stamp]) -> None:
+        """Set the stamps of a sound tree; none for a damaged one."""
+        self._changed |= self.sound_tree(output) != stamps
+        self._cache.trees[output] = stamps
+
     def save(self) -> None:
-        """Write the cache, where there is anything new to write."""
-        if self._changed and self.cache is not None:
-            write_cache(self.cache, (FORMAT, self._tables))
+        """Write the cache if it changed; if that fails (full disk, read-only folder) the next run reads more."""
+        if self._changed and self.file is not None:
+            self._cache.trees = {output: stamps for output, stamps in self._cache.trees.items() if stamps}
+            with contextlib.suppress(OSError):
+                self.file.parent.mkdir(parents=True, exist_ok=True)
+                replace_file(self.file, msgspec.json.encode(self._cache))
             self._changed = False
+
+
+def _identity(path: Path) -> tuple[int, int, int, int]:
+    status = os.stat(path)
+    return status.st_size, status.st_mtime_ns, status.st_ctime_ns, status.st_ino
 
 
 # ── the store ─────────────────────────────────────────────────────────────────────────────────────────────────────────
 
-Say = Callable[[str], None]
-Stamp = tuple[int, int]  # size in bytes, time of the content in ns
-ABANDONED = 86400.0  # seconds after which what was being written outside a run is of a process that was killed
+Report = Callable[[str], None]
+ABANDONED = 86400.0  # seconds without a change after which a draft outside a run is of a killed process
 LOCK = "lock"  # in the folder of a run, which holds it
-NO_FILE: Stamp = (-1, 0)  # a link, a pipe: nothing that a stage writes
+NO_FILE: Stamp = (-1, 0)  # a link, a pipe: nothing that a stage may write
 
 
 class Entry(msgspec.Struct, frozen=True):
-    """Result of a key: the hash of the tree, the record that made the key, and each file's hash."""
+    """Result of a key: the hash of the tree, the record of the key, and each file's hash."""
 
     output: str
-    record: dict
+    record: dict[str, Any]
     files: dict[str, str]
 
 
 class Store:
-    """The store of one build folder.
+    """Store of one build folder.
 
-    damaged: by key, what is wrong with its tree, so that it has no output
+    damaged: faults of damaged trees, by key
     """
 
     def __init__(self, root: Path):
         self.root = root
-        self.trees, self.keys, self.logs = root / "trees", root / "keys", root / "logs"
-        self.unfinished, self.damaged_trees = root / "unfinished", root / "damaged"
-        self.locks, self.tmp, self.cache = root / "locks", root / "tmp", root / "cache"
+        self.trees = root / "trees"
+        self.keys = root / "keys"
+        self.logs = root / "logs"
+        self.unfinished = root / "unfinished"
+        self.locks = root / "locks"
+        self.tmp = root / "tmp"
         self.damaged: dict[str, list[str]] = {}
         self._outputs: dict[str, str | None] = {}
         self._entries: dict[str, Entry] = {}
-        self.changed = False
+
+    @cached_property
+    def hashes(self) -> FileHashes:
+        """Cache of the store and of the files of its datasets and sources."""
+        return FileHashes(self.root / "cache" / "files.json")
 
     def log(self, key: str) -> Path:
-        """Return the file with the log of the result of a key."""
+        """Return the file with the log of a key's result."""
         return self.logs / f"{key}.jsonl"
 
     def entry(self, key: str) -> Entry | None:
-        """Read the entry of a key, None where it was never made; whether its tree is there and right `get` says."""
-        if key not in self._entries:  # what is not there yet may come
-            try:
+        """Return the entry of a key, None if there is none or it is damaged; its tree may be damaged."""
+        if key not in self._entries:
+            with contextlib.suppress(*DECODE_ERRORS):  # Another process may add it later.
                 entry = msgspec.json.decode((self.keys / f"{key}.json").read_bytes(), type=Entry)
-            except (OSError, msgspec.DecodeError):  # a folder in its place, say
-                return None
-            if hash_of(entry.files) != entry.output or step_key(entry.record) != key:
-                return None
-            self._entries[key] = entry
-        return self._entries[key]
+                if hash_of(entry.files) == entry.output and hash_of(entry.record) == key:
+                    self._entries[key] = entry
+        return self._entries.get(key)
 
     def get(self, key: str) -> str | None:
-        """Tree hash of a key; None where there is no result, or its tree is damaged (then `damaged` says how)."""
+        """Return the tree hash of a key; None if there is no result, or its tree is damaged (see `damaged`)."""
         if key not in self._outputs and (entry := self.entry(key)):
-            if damage := self.damage(entry):
+            damage = self.damage(entry)
+            if damage:
                 self.damaged[key] = damage
             self._outputs[key] = None if damage else entry.output
         return self._outputs.get(key)
 
     def forget(self, key: str) -> None:
-        """Look `key` up again when it is asked for next."""
-        for known in (self._outputs, self._entries, self.damaged):
-            known.pop(key, None)
+        """Read `key` from disk when it is next asked for."""
+        self._outputs.pop(key, None)
+        self._entries.pop(key, None)
+        self.damaged.pop(key, None)
 
-    def still(self, keys: Iterable[str]) -> bool:
-        """Return whether those keys have the outputs they had, looked up again."""
+    def unchanged(self, keys: Iterable[str]) -> bool:
+        """Return True if the keys still have their outputs, read from disk again."""
         before = {key: self._outputs.get(key) for key in keys}
         for key in before:
             self.forget(key)
         return None not in before.values() and all(self.get(key) == output for key, output in before.items())
 
-    @cached_property
-    def known(self) -> dict[str, dict[str, Stamp]]:
-        """Return by tree the stamps of its files when contents were right."""
-        return read_cache(self.cache / "trees.json", dict[str, dict[str, Stamp]]) or {}
-
-    def damage(self, entry: Entry, read_all: bool = False) -> list[str]:
-        """List the faults of the tree of an entry, a line each; read_all: whatever is remembered of it."""
-        now, known = stamps_of(self.trees / entry.output), self.known.get(entry.output, {})
-        if now and now == known and not read_all:
+    def damage(self, entry: Entry, reread: bool = False) -> list[str]:
+        """List the faults of an entry's tree, a line each; `reread` ignores the cache."""
+        tree = self.trees / entry.output
+        stamps = stamps_of(tree)
+        sound = {} if reread else self.hashes.sound_tree(entry.output)
+        if stamps and stamps == sound:
             return []
-        damage = damage_of(self.trees / entry.output, entry.files, {} if read_all else known)
-        if damage:
-            self.changed |= self.known.pop(entry.output, None) is not None
-        else:
-            self.known[entry.output], self.changed = now, True
+        damage = damage_of(tree, entry.files, sound)
+        self.hashes.set_sound_tree(entry.output, {} if damage else stamps)
         return damage
 
-    def save(self) -> None:
-        """Write down which trees are known to be right, where there is anything new to write."""
-        if self.changed:
-            there = {output: stamps for output, stamps in self.known.items() if (self.trees / output).is_dir()}
-            write_cache(self.cache / "trees.json", there)
-            self.changed = False
+    def add_tree(self, record: Record, folder: Path, report: Report, files: dict[str, str] | None = None) -> Entry:
+        """Move a folder into the store as the tree of `record`.
 
-    def take_in(self, record: dict, folder: Path, say: Say, files: dict[str, str] | None = None) -> Entry:
-        """Take the files of `folder` in, as what `record` gave; the folder is gone afterwards.
+        A sound tree of the same content remains; a damaged one is set aside, with a message.
 
-        files: their hashes, where these are known and the files are read-only and on disk
-        Where the same tree stands already it stays if it is right, every content read; else it is set aside, with a
-        message.
+        Args:
+            record: record of the result
+            folder: the folder, which no longer exists afterwards
+            report: receives the message
+            files: hashes of the files, if these are known and the files are read-only and on disk
         """
         if files is None:
             files = hashes_of_tree(folder)
@@ -228,32 +239,32 @@ class Store:
             if not damage_of(target, files):
                 shutil.rmtree(folder)
                 return entry
-            self.damaged_trees.mkdir(parents=True, exist_ok=True)
-            aside = self.damaged_trees / f"{target.name}-{uuid.uuid4().hex[:8]}"
-            with contextlib.suppress(FileNotFoundError):  # another run was quicker
+            aside = self.root / "damaged" / f"{target.name}-{uuid.uuid4().hex[:8]}"
+            aside.parent.mkdir(parents=True, exist_ok=True)
+            with contextlib.suppress(FileNotFoundError):  # Another run was faster.
                 os.rename(target, aside)
-                say(f"its kept result was damaged and is replaced; what was there: {aside}")
+                report(f"its stored result was damaged and is replaced; the damaged files: {aside}")
 
-    def keep(self, key: str, entry: Entry) -> None:
-        """Make that the result of `key` from now on."""
+    def set_key(self, key: str, entry: Entry) -> None:
+        """Make an entry the result of `key`."""
         self.keys.mkdir(parents=True, exist_ok=True)
         replace_file(self.keys / f"{key}.json", json_text(entry).encode())
 
 
-def lock(path: Path, wait: bool = False) -> int | None:
-    """Lock a file until the descriptor is closed or the process ends; None where another process has it."""
+def lock(path: Path, wait: bool = False) -> int:
+    """Lock a file until the returned descriptor is closed or the process ends; BlockingIOError if it is locked."""
     path.parent.mkdir(parents=True, exist_ok=True)
     descriptor = os.open(path, os.O_RDWR | os.O_CREAT, 0o666)
     try:
         fcntl.flock(descriptor, fcntl.LOCK_EX | (0 if wait else fcntl.LOCK_NB))
-        return descriptor
     except BlockingIOError:
         os.close(descriptor)
-        return None
+        raise
+    return descriptor
 
 
 def is_locked(path: Path) -> bool:
-    """Return whether any process has that lock; looking needs no right to write."""
+    """Return True if any process holds the lock; this needs no right to write."""
     try:
         with open(path, "rb") as stream:
             fcntl.flock(stream, fcntl.LOCK_SH | fcntl.LOCK_NB)
@@ -263,113 +274,98 @@ def is_locked(path: Path) -> bool:
 
 
 def remove_killed_runs(folder: Path) -> None:
-    """Delete the folders of runs whose lock nobody holds, and drafts to which nobody has written for a day."""
+    """Delete the folders of runs whose lock is free, and drafts without a change for a day."""
     for path in (path for path in folder.iterdir() if path.is_dir() and not is_locked(path / LOCK)):
         with contextlib.suppress(FileNotFoundError):
             if path.name.startswith("run-") or time.time() - path.stat().st_mtime > ABANDONED:
                 shutil.rmtree(path, ignore_errors=True)
 
 
-def stamps_of(folder: str | Path, above: str = "") -> dict[str, Stamp]:
-    """{relative path: stamp} of what lies below a folder, with `above` before each path; empty where there is none."""
+def stamps_of(folder: str | Path, prefix: str = "") -> dict[str, Stamp]:
+    """Return {relative path: stamp} of the files below a folder, paths beginning with `prefix`; empty if it is gone."""
     stamps: dict[str, Stamp] = {}
     with contextlib.suppress(FileNotFoundError, NotADirectoryError):
-        for entry in [entry for entry in os.scandir(folder) if not left_over(entry.name)]:
+        for entry in [entry for entry in os.scandir(folder) if not is_temporary(entry.name)]:
             if entry.is_dir(follow_symlinks=False):
-                stamps |= stamps_of(entry.path, f"{above}{entry.name}/")
+                stamps |= stamps_of(entry.path, f"{prefix}{entry.name}/")
                 continue
             with contextlib.suppress(FileNotFoundError):
-                facts = entry.stat(follow_symlinks=False)
-                is_file = stat.S_ISREG(facts.st_mode)
-                stamps[above + entry.name] = (facts.st_size, facts.st_mtime_ns) if is_file else NO_FILE
+                status = entry.stat(follow_symlinks=False)
+                is_file = stat.S_ISREG(status.st_mode)
+                stamps[prefix + entry.name] = (status.st_size, status.st_mtime_ns) if is_file else NO_FILE
     return stamps
 
 
 def hashes_of_tree(folder: Path) -> dict[str, str]:
-    """{relative path: content hash} of every file below a folder, sorted; refuses links, which would lead out of it."""
+    """Return {relative path: content hash} of the files below a folder, sorted; InputError for a link or pipe."""
     stamps = sorted(stamps_of(folder).items())
     if other := next((name for name, stamp in stamps if stamp == NO_FILE), None):
-        raise InputError(f"a stage left {other!r}, which is no file", file=folder / other, cure="write a file")
+        fault = f"a stage wrote {other!r}, which is a link or a device"
+        raise InputError(fault, file=folder / other, cure="write a file")
     return {name: hash_of_file(folder / name) for name, _ in stamps}
 
 
-def damage_of(folder: Path, files: Mapping[str, str], right: Mapping[str, Stamp] | None = None) -> list[str]:
+def damage_of(folder: Path, files: Mapping[str, str], sound: Mapping[str, Stamp] | None = None) -> list[str]:
     """List how a folder differs from `files` (relative path -> hash), a line each.
 
-    Contents are read but for stamps in `right`.
+    A file with its stamp in `sound` is not read.
     """
-    lines, now = [], stamps_of(folder)
+    lines = []
+    stamps = stamps_of(folder)
     for name in sorted(files):
-        if (stamp := now.get(name)) in (None, NO_FILE):
+        if (stamp := stamps.get(name)) in (None, NO_FILE):
             lines.append(f"{name}: {'a link, or no file' if stamp else 'missing'}")
-        elif stamp != (right or {}).get(name):
+        elif stamp != (sound or {}).get(name):
             try:
                 lines += [] if hash_of_file(folder / name) == files[name] else [f"{name}: other content"]
             except OSError as error:
                 lines.append(f"{name}: cannot be read ({error.strerror})")
-    return lines + [f"{name}: no file of this result" for name in sorted(now.keys() - files.keys())]
+    return lines + [f"{name}: not a file of this result" for name in sorted(stamps.keys() - files.keys())]
 
 
-def sound_lines(path: Path) -> list[bytes]:
-    """Read the lines of a log that are events, in order; damaged ones are left out, with a warning.
-
-    Returns none where there is no log.
-    """
-    try:
-        lines = path.read_bytes().splitlines()
-    except FileNotFoundError:
-        return []
-    sound = []
+def read_events(path: Path) -> list[dict[str, Any]]:
+    """Read the events of a log in order; none if there is no log.  A warning tells the number of damaged lines."""
+    lines = path.read_bytes().splitlines() if path.is_file() else []
+    events = []
     for line in lines:
-        with contextlib.suppress(msgspec.MsgspecError, UnicodeError, RecursionError):
-            event = msgspec.json.decode(line, type=dict)
-            sound += [line] if isinstance(event.get("event"), str) else []
-    if len(sound) < len(lines):
-        words = "%s: %d damaged lines are left out; the results are not affected"
-        log.warning(words, path, len(lines) - len(sound))
-    return sound
+        with contextlib.suppress(*DECODE_ERRORS):
+            event = msgspec.json.decode(line, type=dict[str, Any])
+            events += [event] if isinstance(event.get("event"), str) else []
+    if len(events) < len(lines):
+        count = len(lines) - len(events)
+        log.warning("%s: %d damaged lines are ignored; the results are not affected", path, count)
+    return events
 
 
 # ── results that ship with the source ────────────────────────────────────────────────────────────────────────────────
 
 MADE_FROM = "made_from.json"
-CURE = "restore it from the repository, or make the result anew with FORCE=1"
-
-
-def copied(tree: Path, draft: Path, files: dict[str, str]) -> bool:
-    """Copy the files of a tree; whether each is what its hash says.  No name may lead out of the draft."""
-    if any(PurePosixPath(name).is_absolute() or ".." in PurePosixPath(name).parts for name in files):
-        return False
-    shutil.rmtree(draft, ignore_errors=True)
-    draft.mkdir(parents=True)
-    for name in files:
-        (draft / name).parent.mkdir(parents=True, exist_ok=True)
-        with contextlib.suppress(FileNotFoundError):
-            shutil.copyfile(tree / name, draft / name, follow_symlinks=False)
-    return not damage_of(draft, files)
+CURE = "restore it from the repository, or compute the result with FORCE=1"
+FileName = Annotated[str, msgspec.Meta(pattern=r"^\w[^/]*$")]
 
 
 class Shipped(msgspec.Struct, frozen=True):
-    """Content of made_from.json: the part of the record that the result depends on, and the hash of each file of it."""
+    """Content of made_from.json: the part of the record that the result depends on, and the hash of each file."""
 
     record: Record
-    files: dict[str, str]
+    files: dict[FileName, str]
 
 
-def made_from(record: Record, modules: list[str]) -> Record:
+def shipped_record(record: Record, modules: list[str]) -> Record:
     """Return the part of a step's record that a result made by `modules` depends on.
 
-    >>> made_from({"param:steps": 3, "source:stages.train": "1", "package:torch": "2.13"}, ["stages.train"])
+    >>> shipped_record({"param:steps": 3, "source:stages.train": "1", "package:torch": "2.13"}, ["stages.train"])
     {'param:steps': 3, 'source:stages.train': '1'}
     """
-    own = {f"source:{module}" for module in modules}
-    return {name: value for name, value in record.items() if name.startswith("param:") or name in own}
+    sources = {f"source:{module}" for module in modules}
+    return {name: value for name, value in record.items() if name.startswith("param:") or name in sources}
 
 
 def copy_shipped(roots: list[Path], shipping: Shipping | None, record: Record, out: Path) -> bool:
-    """Copy the shipped result of `record` from below one of `roots` to `out`; False where none has the same record.
+    """Copy the shipped result of `record` from below one of `roots` to `out`; return False if there is none.
 
-    Raises InputError where the files are not those that were shipped.
+    Raises:
+        InputError: The files are not those that were shipped.
     """
     for file in (root / shipping.folder / MADE_FROM for root in roots if shipping):
         if not file.is_file():
@@ -377,21 +373,24 @@ def copy_shipped(roots: list[Path], shipping: Shipping | None, record: Record, o
         try:
             shipped = msgspec.json.decode(file.read_bytes(), type=Shipped)
         except msgspec.DecodeError as error:
-            words = f"does not say what the shipped files were made from ({error})"
-            raise InputError(words, file=file, cure=CURE) from None
-        if shipping and shipped.record == made_from(record, shipping.made_by):
-            if not copied(file.parent, out, shipped.files):
-                raise InputError("beside it are not the files that were shipped with the source", file=file, cure=CURE)
+            fault = f"does not tell what the shipped files were made from ({error})"
+            raise InputError(fault, file=file, cure=CURE) from None
+        if shipping and shipped.record == shipped_record(record, shipping.made_by):
+            out.mkdir(parents=True)
+            for name in shipped.files:
+                with contextlib.suppress(FileNotFoundError):
+                    shutil.copyfile(file.parent / name, out / name)
+            if damage := damage_of(out, shipped.files):
+                fault = f"the files beside it are not the files that were shipped: {damage[0]}"
+                raise InputError(fault, file=file, cure=CURE)
             return True
     return False
 
 
-def ship(result: Path, record: Record, root: Path, shipping: Shipping) -> Path:
-    """Put the files of `result`, a flat folder that `record` gave, into the package; returns where they are."""
-    target, hashes = root / shipping.folder, {}
-    target.mkdir(parents=True, exist_ok=True)
-    for path in sorted(result.iterdir()):
-        replace_file(target / path.name, path.read_bytes())
-        hashes[path.name] = hash_of_file(target / path.name)
-    replace_file(target / MADE_FROM, json_text(Shipped(made_from(record, shipping.made_by), hashes)).encode())
-    return target
+def ship(store: Store, entry: Entry, folder: Path, made_by: list[str]) -> None:
+    """Copy the files of a result, which has no folders, into a folder of the package."""
+    folder.mkdir(parents=True, exist_ok=True)
+    for name in entry.files:
+        replace_file(folder / name, (store.trees / entry.output / name).read_bytes())
+    shipped = Shipped(shipped_record(entry.record, made_by), entry.files)
+    replace_file(folder / MADE_FROM, json_text(shipped).encode())

@@ -1,12 +1,12 @@
 """Steps in processes: of this machine, or of the workers of a Dask cluster.
 
-How many threads a library uses, and in which order sets are walked, is fixed when a process starts, and results depend
-on it. So each process is started for one number of threads, in an environment of its own, with the modules that are on
-disk now, and runs one step at a time: a library that crashes, or a step that is killed for want of memory, ends that
-process alone. A process ends with the one that started it, and with its run, whose lock it watches.
+The number of threads of a library and the order in which sets are walked are fixed when a process starts, and results
+depend on both.  Each process is therefore started for one number of threads, in an environment of its own, with the
+modules that are on disk at that time, and runs one step at a time.  A crash in a library or a lack of memory ends that
+process alone.  A process ends with the one that started it, and with its run, whose lock it watches.
 
-A task carries keys and paths, never arrays, and whatever happens comes back as an `Outcome`: an executor needs no more
-than `submit`.  While it runs a step says how far it is, and what it warns of, in a file of events.
+A task has keys and paths, never arrays, and its outcome is always an `Outcome`, so that an executor needs only
+`submit`.  A running step writes progress and warnings to a file of events.
 """
 
 from __future__ import annotations
@@ -43,33 +43,23 @@ import msgspec
 from factorlib.errors import InputError
 from factorlib.runner.closure import CODE, Sources
 from factorlib.runner.plan import difference
-from factorlib.runner.project import LIBRARY, Code, Stage, take_sigterm_back
-from factorlib.runner.store import (
-    LOCK,
-    Entry,
-    FileHashes,
-    Stamp,
-    Store,
-    copy_shipped,
-    hash_of_file,
-    is_locked,
-    stamps_of,
-)
+from factorlib.runner.project import LIBRARY, Stage, StageCode, restore_sigterm
+from factorlib.runner.store import LOCK, Entry, Stamp, Store, copy_shipped, hash_of_file, is_locked, stamps_of
 from factorlib.stage import Inputs, serial_map
 from factorlib.wholefile import append_text, disk_error, replace_file
 from factorlib.yamlfile import convert
 
-EVERY = 0.2  # seconds between two words of progress
+INTERVAL = 0.2  # seconds between two reports of progress
 
 
 class Task(msgspec.Struct, frozen=True):
     """Description of a step for a worker.
 
-    files:   by the name that the record has for each, whose hash it holds
-    forced:  make it, whatever ships with the source
+    files:  path by the field of the record that has the file's hash
+    forced: run the stage even if its result ships with the source
     """
 
-    code: Code
+    code: StageCode
     stage: Stage
     folders: dict[str, Path]
     facts: dict[str, Any]
@@ -84,10 +74,10 @@ class Task(msgspec.Struct, frozen=True):
 
 
 class Outcome(msgspec.Struct, frozen=True):
-    """Result of a step that ended.
+    """Outcome of a step.
 
-    output: hash of what was made;  error: what went wrong;  traceback: of a defect, None where a user can mend it
-    code_changed: whether the stage's code is another than that of the key, so that further steps of it would fail alike
+    output: hash of the result;  traceback: of a defect, None for an error that the user can fix
+    code_changed: the stage's code differs from that of the key, so that further steps of the stage would fail alike
     """
 
     output: str | None = None
@@ -98,40 +88,42 @@ class Outcome(msgspec.Struct, frozen=True):
 
 
 class CodeChanged(InputError):
-    """The code of a stage was edited while the run went on."""
+    """The code of a stage was edited during the run."""
 
 
 def run_step(task: Task) -> Outcome:
-    """Run a task and keep its result in the store.  Raises nothing: an error of any kind is part of the outcome."""
+    """Run a task and store its result; an error of any kind becomes part of the outcome."""
     temporary = task.temporary.with_name(f"{task.temporary.name}-{uuid.uuid4().hex[:8]}")
-    task = msgspec.structs.replace(task, temporary=temporary)  # another try of it may still be ending elsewhere
-    meter, code, store = Meter(), task.code, Store(task.store)
+    task = msgspec.structs.replace(task, temporary=temporary)  # Another try of it may still be ending elsewhere.
+    meter = Meter()
+    code = task.code
+    store = Store(task.store)
     with Events(task.events) as events:
         try:
-            entry = _made(task, store, events)
-            where: dict[str, Any] = {name: task.record[name] for name in ("photo", "recipe") if name in task.record}
-            where |= {"stage": code.stage, "key": task.key}
-            lines = [where | {"event": "warning", "text": text} for text in events.warnings]
-            lines.append(where | {"event": "done", **meter.read(code.threads, min(code.cores, usable_cores()))})
+            entry = _compute(task, store, events)
+            step: dict[str, Any] = {name: task.record[name] for name in ("photo", "recipe") if name in task.record}
+            step |= {"stage": code.stage, "key": task.key}
+            lines = [step | {"event": "warning", "text": text} for text in events.warnings]
+            lines.append(step | {"event": "done", **meter.read(code.threads, min(code.cores, usable_cores()))})
             store.logs.mkdir(parents=True, exist_ok=True)
             text = "".join(json.dumps(line, sort_keys=True) + "\n" for line in lines)
             replace_file(store.log(task.key), text.encode())
-            store.keep(task.key, entry)
+            store.set_key(task.key, entry)
             shutil.rmtree(store.unfinished / task.key, ignore_errors=True)
             return Outcome(output=entry.output, seconds=meter.read()["seconds"])
-        except BaseException as error:  # whatever it is, the parent reports it
-            shutil.rmtree(task.temporary, ignore_errors=True)  # on a full disk there is room for a log then
+        except BaseException as error:
+            shutil.rmtree(task.temporary, ignore_errors=True)  # makes room for a log on a full disk
             if known := error if isinstance(error, InputError) else disk_error(error, task.temporary.parent):
                 return Outcome(error=str(known), code_changed=isinstance(known, CodeChanged))
             return Outcome(error=f"{type(error).__name__}: {error}", traceback=traceback.format_exc())
 
 
-def load_stage(code: Code) -> ModuleType:
-    """Import a stage's module from the project; what was loaded with it has the stage's threads."""
+def load_stage(code: StageCode) -> ModuleType:
+    """Import a stage's module from the project and set the threads of the libraries that it loads."""
     if str(code.root) not in sys.path:
         sys.path.insert(0, str(code.root))
     module = importlib.import_module(f"{code.package}.{code.stage}")
-    take_sigterm_back()
+    restore_sigterm()
     if "torch" in sys.modules:
         sys.modules["torch"].set_num_threads(code.threads)
     if "OpenImageIO" in sys.modules:
@@ -139,90 +131,88 @@ def load_stage(code: Code) -> ModuleType:
     return module
 
 
-def params_of(code: Code) -> msgspec.Struct:
-    """Convert the stage's parameters to its own struct.  Raises InputError where one is out of its bounds."""
+def params_of(code: StageCode) -> msgspec.Struct:
+    """Convert the parameters to the stage's own struct; InputError if one is out of its range."""
     return convert(code.params, load_stage(code).Params, code.settings, f"stages.{code.stage}.params")
 
 
-def check_params(code: Code) -> None:
-    """Raise InputError if a parameter of a stage is out of its bounds, or if the stage's own `check(params)` does."""
+def check_params(code: StageCode) -> None:
+    """Raise InputError if a parameter is out of its range, or if the stage's own `check(params)` does."""
     params = params_of(code)
     if check := getattr(load_stage(code), "check", None):
         check(params)
 
 
-def spread(cores: int, function: Callable, items: Iterable) -> list:
-    """Apply the function to every item, in order, on so many threads."""
+def threaded_map(cores: int, function: Callable, items: Iterable) -> list:
+    """Apply a function to the items on `cores` threads and return all results in order."""
     if cores == 1:
         return serial_map(function, items)
     with ThreadPoolExecutor(cores) as pool:
         return list(pool.map(function, items))
 
 
-def _made(task: Task, store: Store, events: Events) -> Entry:
-    """Run the step, or copy its shipped result; its tree is in the store afterwards, its key is not."""
+def _compute(task: Task, store: Store, events: Events) -> Entry:
+    """Run the step, or copy its shipped result, and add the tree to the store, without a key."""
     roots = [task.code.root, LIBRARY]
     if not task.forced and copy_shipped(roots, task.stage.shipped, task.record, task.temporary):
-        return store.take_in(task.record, task.temporary, events.say)
-    module, params = load_stage(task.code), params_of(task.code)  # which takes seconds
-    photo, out = task.record["photo"], task.temporary
+        return store.add_tree(task.record, task.temporary, events.report)
+    module = load_stage(task.code)  # takes seconds
+    params = params_of(task.code)
+    photo = task.record["photo"]
+    out = task.temporary
     out.mkdir(parents=True)
-    hashes = FileHashes(store.cache / "files.json")
-    _check_code(task, hashes)
+    _check_code(task, store)
     results = {folder: stamps_of(folder) for folder in task.folders.values() if folder.is_relative_to(task.store)}
-    unfinished = store.unfinished / task.key
     files = {field.removeprefix("file:"): path for field, path in task.files.items()}
-    map_ = partial(spread, min(task.code.cores, usable_cores()))
-    inputs = Inputs(task.folders, task.facts, files, photo, map_, task.log, unfinished)
+    map_ = partial(threaded_map, min(task.code.cores, usable_cores()))
+    inputs = Inputs(task.folders, task.facts, files, photo, map_, task.log, store.unfinished / task.key)
     try:
         module.main(params, inputs, out, events.progress)
-    except Exception:
-        _check_inputs(task, results)  # of a file that was taken away or edited meanwhile: no defect of the stage
-        raise
-    _check_inputs(task, results)
-    _check_code(task, hashes)
+    finally:
+        _check_inputs(task, results)  # A missing or edited file is no defect of the stage.
+    _check_code(task, store)
     promised = [*task.stage.makes, *(["{photo}.json"] if task.stage.gather else [])] or ["**/*"]
     for pattern in (text.replace("{photo}", photo or "") for text in promised):
-        if not any(path.is_file() for path in out.glob(pattern)):  # to break its word is a defect
-            raise FileNotFoundError(f"the stage {task.code.stage!r} made no {pattern}")
-    return store.take_in(task.record, out, events.say)
+        if not any(path.is_file() for path in out.glob(pattern)):
+            raise FileNotFoundError(f"the stage {task.code.stage!r} did not write {pattern}")
+    return store.add_tree(task.record, out, events.report)
 
 
 def _check_inputs(task: Task, results: dict[Path, dict[str, Stamp]]) -> None:
-    """Somebody may replace a photo, or open a file of build/<dataset>/ in an editor, while it is read."""
+    """Raise InputError if someone replaced a photo or edited a result while the step read it."""
     changed = [p for name, p in task.files.items() if not p.is_file() or hash_of_file(p) != task.record[name]]
     for folder, before in results.items():
-        now = stamps_of(folder)
-        changed += [folder / name for name in sorted(before.keys() | now.keys()) if before.get(name) != now.get(name)]
+        after = stamps_of(folder)
+        changed += [folder / name for name in sorted(before.keys() | after) if before.get(name) != after.get(name)]
     if changed:
-        cure = "run again: what is needed is made again"
+        cure = "run again: the affected results are made again"
         raise InputError("the file changed while it was being read", file=changed[0], cure=cure)
 
 
-def _check_code(task: Task, hashes: FileHashes) -> None:
-    """Check that the key's code is the code there is: the source of every module, and the package data."""
+def _check_code(task: Task, store: Store) -> None:
+    """Raise CodeChanged if the sources and package data are not those of the key."""
     code = task.code
-    closure = Sources([code.root, LIBRARY], hashes).closure(code.package, code.stage, code.settings)
-    now, before = closure.record, {n: value for n, value in task.record.items() if n.startswith(CODE)}
-    if now != before:
-        changed = [name for name in sorted(before.keys() | now.keys()) if before.get(name) != now.get(name)]
-        files = [str(closure.files[name]) for name in changed if name in closure.files]
-        words = f"the code changed while the run went on ({'; '.join(difference(before, now))})"
+    closure = Sources([code.root, LIBRARY], store.hashes).closure(code.package, code.stage, code.settings)
+    before = {name: value for name, value in task.record.items() if name.startswith(CODE)}
+    if changes := difference(before, closure.record):
+        names = sorted(name for name in closure.files if before.get(name) != closure.record[name])
+        fault = f"the code changed while the run went on ({'; '.join(changes)})"
         cure = "run again; a worker of a cluster needs the same checkout and the same packages"
-        raise CodeChanged(words, file=", ".join(files) or None, cure=cure)
+        raise CodeChanged(fault, file=", ".join(str(closure.files[name]) for name in names) or None, cure=cure)
 
 
 class Meter:
-    """Meter of wall and processor seconds since it was made, and the most memory."""
+    """Meter of wall and processor seconds since its creation, and of peak memory."""
 
     def __init__(self) -> None:
-        with contextlib.suppress(OSError), open("/proc/self/clear_refs", "w") as stream:  # Linux counts the peak anew
+        with contextlib.suppress(OSError), open("/proc/self/clear_refs", "w") as stream:  # Linux resets the peak.
             stream.write("5")
         self.started = datetime.datetime.now(datetime.UTC).isoformat(timespec="milliseconds")
-        self.wall, self.cpu = time.perf_counter(), _cpu_seconds()
+        self.wall = time.perf_counter()
+        self.cpu = _cpu_seconds()
 
     def read(self, threads: int = 1, cores: int = 1) -> dict[str, Any]:
-        """Wall and processor seconds, peak memory in MB (2^20 bytes), and facts of the machine."""
+        """Return wall and processor seconds, peak memory in MB (2^20 bytes), and facts of the machine."""
         peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / (2**20 if platform.system() == "Darwin" else 2**10)
         with contextlib.suppress(OSError), open("/proc/self/status") as stream:
             peak = next(int(line.split()[1]) / 2**10 for line in stream if line.startswith("VmHWM"))
@@ -240,13 +230,16 @@ class Meter:
 
 def _cpu_seconds() -> float:
     usage = map(resource.getrusage, (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN))
-    return sum(one.ru_utime + one.ru_stime for one in usage)
+    return sum(each.ru_utime + each.ru_stime for each in usage)
 
 
 class Events(logging.Handler):
-    """Progress and warnings of one step, as JSON lines of a file that the parent reads while it runs.
+    """Progress and warnings of one step, as JSON lines of a file that the parent reads meanwhile.
 
-    Within, what the library and Python warn of comes here alone.  warnings: each text once
+    As a context it receives the warnings of the library and of Python.
+
+    Attributes:
+        warnings: each text once
     """
 
     LOGGERS = ("factorlib", "py.warnings")
@@ -255,7 +248,7 @@ class Events(logging.Handler):
         super().__init__(logging.WARNING)
         self.path = path
         self.warnings: list[str] = []
-        self._last = 0.0
+        self._time = 0.0
         self._share = 0.0
 
     def __enter__(self) -> Self:
@@ -271,52 +264,49 @@ class Events(logging.Handler):
             logger.removeHandler(self)
 
     def emit(self, record: logging.LogRecord) -> None:
-        """Take note of a warning (as a `logging.Handler`)."""
+        """Record a warning."""
         text = record.getMessage().strip()
         if text not in self.warnings:
             self.warnings.append(text)
-            self.say(text)
+            self.report(text)
 
     def progress(self, done: float, total: float, text: str = "") -> None:
         """Report that `done` of `total` is done.
 
-        A report within EVERY seconds of the last is dropped, unless the share has changed by a hundredth.
+        A report within INTERVAL seconds of the last is dropped, unless the share has changed by a hundredth.
         """
         share = done / total if total else 0.0
-        if (now := time.monotonic()) - self._last >= EVERY or abs(share - self._share) >= 0.01:
-            self._last, self._share = now, share
+        now = time.monotonic()
+        if now - self._time >= INTERVAL or abs(share - self._share) >= 0.01:
+            self._time = now
+            self._share = share
             self._write({"done": float(done), "total": float(total), "text": text})
 
-    def say(self, text: str) -> None:
-        """Report a warning, whether or not it is part of the result's log."""
+    def report(self, text: str) -> None:
+        """Report a warning that is not part of the result's log."""
         self._write({"warning": text})
 
     def _write(self, event: dict) -> None:
-        with contextlib.suppress(OSError):  # on a full disk: the step itself fails there, or finds room again
+        with contextlib.suppress(OSError):  # On a full disk the step itself fails, or finds room again.
             append_text(self.path, json.dumps(event) + "\n")
 
 
 # ── processes ────────────────────────────────────────────────────────────────────────────────────────────────────────
 
-THREAD_VARIABLES = [
-    "OMP_NUM_THREADS",
-    "MKL_NUM_THREADS",
-    "OPENBLAS_NUM_THREADS",
-    "NUMEXPR_NUM_THREADS",
-    "VECLIB_MAXIMUM_THREADS",
-]
+THREAD_VARIABLES = [f"{library}_NUM_THREADS" for library in ("OMP", "MKL", "OPENBLAS", "NUMEXPR")]
+THREAD_VARIABLES += ["VECLIB_MAXIMUM_THREADS"]
 FIXED = {
     "PYTHONHASHSEED": "0",
-    "PYTHONWARNINGS": "ignore:resource_tracker",  # Python reports semaphores of a run that was killed as leaked.
-    "OMP_WAIT_POLICY": "PASSIVE",  # threads that wait by spinning stand in the way of others, and of each other
-    "MALLOC_TRIM_THRESHOLD_": None,  # Dask's nanny sets it; sums of 700 × 700 numbers then take three times as long
+    "PYTHONWARNINGS": "ignore:resource_tracker",  # Python reports semaphores of a killed run as leaked.
+    "OMP_WAIT_POLICY": "PASSIVE",  # Threads that wait by spinning slow down others.
+    "MALLOC_TRIM_THRESHOLD_": None,  # Dask's nanny sets it; sums of 700 × 700 numbers then take three times as long.
 }
-WATCH = 0.3  # seconds between two looks at whether the run goes on
+WATCH = 0.3  # seconds between two checks that the run goes on
 PATIENCE = 10  # seconds to reach a scheduler
-AHEAD = 200  # most steps that a cluster is handed at a time: each holds an open lock file
+AHEAD = 200  # most steps submitted to a cluster at a time; each holds an open lock file
 TRIES = 3  # of a step whose process or worker dies, on a cluster
-_starting = threading.Lock()  # The environment is changed while a process starts.
-_of_thread = threading.local()  # the process of a thread, and the run and number of threads that it is for
+_starting = threading.Lock()  # held while a process starts, because the environment is changed
+_of_thread = threading.local()  # the process of a thread, and its run and number of threads
 
 
 class Workers:
@@ -329,20 +319,21 @@ class Workers:
         InputError: No scheduler answers, or Dask is not installed.
     """
 
-    def __init__(self, where: str = "processes", run: Path | None = None, say: Callable[[str], None] = print):
-        self.run, self.client = run, None
+    def __init__(self, address: str = "processes", run: Path | None = None, report: Callable[[str], None] = print):
+        self.run = run
+        self.client = None
         self._busy: dict[Future, int] = {}
-        if where == "processes":
+        if address == "processes":
             self.capacity = usable_cores()
             self._executor: Any = ThreadPoolExecutor(self.capacity)
         else:
             self.capacity = AHEAD
-            self.client = connect(where)
+            self.client = connect(address)
             self._executor = self.client.get_executor(pure=False, retries=TRIES - 1)
-            say(f"steps go to {where}; they wait there for a worker: .venv/bin/dask worker {where}")
+            report(f"steps go to {address} and wait there for a worker: .venv/bin/dask worker {address}")
 
     def free(self, cores: int) -> bool:
-        """Return whether a step of `cores` cores may start now: the cores suffice, or nothing else runs."""
+        """Return True if a step of `cores` cores may start: they are free, or no other step runs."""
         self._busy = {future: count for future, count in self._busy.items() if not future.done()}
         return not self._busy or sum(self._busy.values()) + (1 if self.client else cores) <= self.capacity
 
@@ -370,7 +361,7 @@ def usable_cores() -> int:
 def connect(scheduler: str) -> Any:
     """Return a Dask client; InputError if Dask is not installed or no scheduler answers."""
     if find_spec("distributed") is None:
-        cure = "make setup EXTRAS=dask, or pip install 'factorlib[dask]'"
+        cure = "install it: make setup EXTRAS=dask, or pip install 'factorlib[dask]'"
         raise InputError("Dask is not installed", key="executor", cure=cure)
     from distributed import Client
 
@@ -378,10 +369,10 @@ def connect(scheduler: str) -> Any:
         logging.getLogger(name).setLevel(logging.CRITICAL)  # The outcome of a step reports a lost connection.
     try:
         return Client(scheduler, timeout=PATIENCE, set_as_default=False)
-    except Exception as error:  # Anything may answer there: an HTTP server, garbage.
+    except Exception as error:  # Anything may answer there, such as an HTTP server.
         cure = "start one: dask scheduler --port 8786; or leave the executor out, for processes of this machine"
-        words = f"no Dask scheduler answers at {scheduler} ({str(error) or f'nothing in {PATIENCE} s'})"
-        raise InputError(words, key="executor", cure=cure) from error
+        fault = f"no Dask scheduler answers at {scheduler} ({str(error) or f'nothing in {PATIENCE} s'})"
+        raise InputError(fault, key="executor", cure=cure) from error
 
 
 def compute_in_process(run: Path | None, threads: int, function: Callable, argument: Any) -> Any:
@@ -421,7 +412,7 @@ def _environment(values: dict[str, str | None]) -> Iterator[None]:
 
 def _set(values: dict[str, str | None]) -> None:
     os.environ.update({name: value for name, value in values.items() if value is not None})
-    for name in [name for name, value in values.items() if value is None]:
+    for name in (name for name, value in values.items() if value is None):
         os.environ.pop(name, None)
 
 

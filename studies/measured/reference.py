@@ -139,7 +139,7 @@ def run_small(root: Path, seed: int = 0) -> dict[str, float | None]:
         if not (root / name).exists():
             (root / name).symlink_to(ROOT / name)
     project = Project(root, photo_sets())
-    if verbs.make(project, verbs.Wish(DATASET, settings=[*SMALL, f"solve.seed={seed}"])):
+    if verbs.make(project, verbs.Request(DATASET, settings=[*SMALL, f"solve.seed={seed}"])):
         raise SystemExit(1)  # it has said why
     build = project.build / DATASET
     return of_metrics(read_json(build / "evaluate" / "metrics.json")) | of_stages(build)

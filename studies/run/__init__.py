@@ -120,7 +120,7 @@ def make(
         if scale.quick:
             print(f"{name}: quick: one seed, smallest sets: no conclusion")
         targets = list(study.steps)
-        codes.append(verbs.make(project, verbs.Wish(name, targets=targets, settings=settings or [], force=force)))
+        codes.append(verbs.make(project, verbs.Request(name, targets=targets, settings=settings or [], force=force)))
         if codes[-1] == 0:
             from studies.run.page import conclude, write_page  # here: a plan must not pay for science
 

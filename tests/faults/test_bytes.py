@@ -46,7 +46,7 @@ from factorlib.recipe.read import read_recipe
 from factorlib.reflection.network import Layers, write_layers
 from factorlib.results.lobe_table import write_lobes
 from factorlib.runner import verbs
-from factorlib.runner.dataset_state import survey
+from factorlib.runner.dataset_state import Request, read_state
 from factorlib.runner.project import LIBRARY, Project, photo_sets
 from factorlib.urm.observations import write_observations
 from factorlib.validation import Validation
@@ -547,7 +547,7 @@ def test_all_faults_are_said_at_once_and_each_once_without_running_anything(link
     assert "4 triangles" in refusal(lambda: look("align.limits.triangles=3"), capsys)
     for name, (content, _) in FAULTS.items():
         put(folder / name, content)
-    for verb in (look, lambda: verbs.make(linked, verbs.Wish(str(folder)))):
+    for verb in (look, lambda: verbs.make(linked, verbs.Request(str(folder)))):
         text = refusal(verb, capsys)
         assert all(words in text for _, words in FAULTS.values())
         assert text.count("error: ") == 4 and "4 faults" in text
@@ -569,7 +569,7 @@ def test_a_file_of_a_recipe_is_refused_before_anything_runs(linked, tmp_path, ca
     for name, (content, words) in OF_RECIPES.items():
         write_rgb_exr(folder / name, content) if isinstance(content, np.ndarray) else put(folder / name, content)
         wanted = f"lights: [{name}]\nkind: relight" if name.endswith(("hdr", "exr")) else f"mesh: {name}\nkind: insert"
-        wish = verbs.Wish(str(folder), ["render"], recipes=[str(put(folder / "own.yaml", wanted))])
+        wish = verbs.Request(str(folder), ["render"], recipes=[str(put(folder / "own.yaml", wanted))])
         text = refusal(lambda wish=wish: verbs.make(linked, wish), capsys)
         assert re.search(words, text, re.DOTALL) and str(folder / name) in text and "\n  " in text, text
     assert not list((linked.root / "build").glob("set/*")), "something was run"
@@ -809,7 +809,7 @@ def test_a_given_folder_and_a_recipe_open_no_pipe_and_no_device(tmp_path):
         for name in ("poses.json", "odd.obj", "odd.hdr", "odd.json"):
             os.mkfifo(given / name) if kind == "pipe" else (given / name).symlink_to("/dev/zero")
         with pytest.raises(InputError, match=f"is a {kind}"):
-            survey(Project(LIBRARY, photo_sets()), "synthetic", ["align"], [f"align.poses={given}"])
+            read_state(Project(LIBRARY, photo_sets()), Request("synthetic", ["align"], [f"align.poses={given}"]))
         for text in ("mesh: odd.obj\nkind: insert", "kind: relight\nlights: [odd.hdr]"):
             with pytest.raises(InputError, match="there is no file"):
                 read_recipe(put(given / "own.yaml", text), dataset)
@@ -838,7 +838,7 @@ def test_a_run_writes_nothing_but_results(linked, tmp_path):
         return {path: path.lstat().st_mtime_ns for path in paths}
 
     before = times()
-    assert verbs.make(linked, verbs.Wish(str(odd), ["masks"])) == 0
+    assert verbs.make(linked, verbs.Request(str(odd), ["masks"])) == 0
     assert times() == before and (linked.build / odd.name / "masks" / "photos.json").exists()
 
 

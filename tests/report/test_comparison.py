@@ -114,9 +114,9 @@ def test_a_result_that_is_not_whole_is_refused_with_the_stage_and_the_cure(folde
 def test_the_command_says_what_changed_between_the_runs(tmp_path, capsys):
     project = toy.make_project(tmp_path / "root")
     project = Project(project.root, Provider(("photo",), toy.read))
-    assert verbs.make(project, verbs.Wish("set")) == 0
+    assert verbs.make(project, verbs.Request("set")) == 0
     shutil.copytree(project.build / "set", tmp_path / "before")
-    assert verbs.make(project, verbs.Wish("set", settings=["upper.times=2"])) == 0
+    assert verbs.make(project, verbs.Request("set", settings=["upper.times=2"])) == 0
     for folder in (tmp_path / "before", project.build / "set"):
         (folder / "masks").mkdir()
         (folder / "export").mkdir()
@@ -124,7 +124,7 @@ def test_the_command_says_what_changed_between_the_runs(tmp_path, capsys):
     assert verbs.compare(project, tmp_path / "before", project.build / "set") == 0
     page = (project.build / "compare" / "before-set" / "index.html").read_text()
     assert html.escape("upper: parameter times: default -> 2") in page and page.count("<li>") == 1
-    with pytest.raises(InputError, match="there is no result here\n  known are: 'set'"):
+    with pytest.raises(InputError, match="is no folder of results\n  known are: 'set'"):
         verbs.compare(project, tmp_path / "before", tmp_path / "nothing")
     project = Project(toy.make_project(tmp_path / "new").root, Provider(("photo",), toy.read))  # where nothing was run
     with pytest.raises(InputError, match="make all DATASET=<name> makes one"):

@@ -260,7 +260,7 @@ def test_a_run_whose_workers_are_all_killed_goes_on_when_one_comes(project, live
     assert make(project, *live.settings) == 0
     thread.join()
     text = "".join(capsys.readouterr())
-    assert text.count("they wait there for a worker") == 1 and f".venv/bin/dask worker {live.address}" in text
+    assert text.count("wait there for a worker") == 1 and f".venv/bin/dask worker {live.address}" in text
     assert kept(project) == beside(project)
 
 

@@ -211,7 +211,7 @@ def test_a_damaged_line_of_a_log_costs_that_line(project, caplog, capsys):
     for line in [b'{"event": "warning", "text": [1]}', *LINES]:
         for log, content in logs.items():
             log.write_bytes(line + b"\n" + content + line)
-        assert verbs.show_status(project, verbs.Wish("set")) == 0 and "a is odd" in capsys.readouterr().out, line
+        assert verbs.show_status(project, verbs.Request("set")) == 0 and "a is odd" in capsys.readouterr().out, line
     for log, content in logs.items():
         log.write_bytes(b"\n".join([*LINES, content, *LINES]))
     assert make(project, targets=["total"], force=True) == 0 and "damaged line" in caplog.text

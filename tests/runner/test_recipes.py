@@ -7,9 +7,9 @@ import pytest
 
 from factorlib.errors import InputError
 from factorlib.runner import verbs
-from factorlib.runner.dataset_state import survey
+from factorlib.runner.dataset_state import Request, read_state
 from factorlib.runner.project import Project, Provider, Recipe
-from factorlib.runner.results_folder import clean, collect, made_homes
+from factorlib.runner.results_folder import all_results, clean, collect
 from tests.runner import toy
 from tests.runner.toy import write
 
@@ -60,12 +60,12 @@ def said(project, recipe):
 
 
 def to_run(project, *recipes, targets=("shout",)):
-    seen = survey(project, "set", list(targets), [], recipes=list(recipes))
-    return [str(p.step) for p in seen.planned() if p.status != "current"]
+    seen = read_state(project, Request("set", list(targets), recipes=recipes))
+    return [str(p.step) for p in seen.plan() if p.status != "current"]
 
 
 def make(project, *recipes, targets=("render",), **more):
-    return verbs.make(project, verbs.Wish("set", targets and list(targets), recipes=list(recipes), **more))
+    return verbs.make(project, verbs.Request("set", targets and list(targets), recipes=list(recipes), **more))
 
 
 def test_every_recipe_is_a_step_with_a_folder_of_its_own_all_where_none_is_named_a_path_as_well(project, monkeypatch):
@@ -80,11 +80,11 @@ def test_every_recipe_is_a_step_with_a_folder_of_its_own_all_where_none_is_named
 def test_what_was_asked_for_before_stays_until_it_is_cleaned(project):
     assert make(project, "hello") == 0 and make(project, "bye") == 0
     assert said(project, "hello") and said(project, "bye") and to_run(project, "all") == []
-    assert verbs.make(project, verbs.Wish("set")) == 0  # without recipes
+    assert verbs.make(project, verbs.Request("set")) == 0  # without recipes
     collect(project)
     assert said(project, "hello") and to_run(project, "all") == []
     clean(project, "set")
-    assert made_homes(project) == [] and not (project.build / "set").exists()
+    assert all_results(project) == [] and not (project.build / "set").exists()
 
 
 def test_a_recipe_reruns_for_what_it_says_and_for_its_files_and_alone(project):
@@ -94,11 +94,11 @@ def test_a_recipe_reruns_for_what_it_says_and_for_its_files_and_alone(project):
     write(project.root / "recipes" / "hello.yaml", '{"word": "hi"}')
     assert to_run(project, "all") == ["shout/hello"]
     write(project.root / "recipes" / "set" / "more.txt", "and more")
-    reasons = [p.reasons for p in survey(project, "set", ["shout"], [], recipes=["all"]).planned()[-2:]]
+    reasons = [p.reasons for p in read_state(project, Request("set", ["shout"], recipes=["all"])).plan()[-2:]]
     assert reasons == [['recipe: word: "hello" -> "hi"'], ["file more.txt of the recipe: changed"]]
     assert make(project, "all") == 0
     toy.edit(project, "pipeline.yaml", "gather: sizes.json", "gather: all.json")
-    reasons = [p.reasons for p in survey(project, "set", ["shout"], [], recipes=["hello"]).planned()[-1:]]
+    reasons = [p.reasons for p in read_state(project, Request("set", ["shout"], recipes=["hello"])).plan()[-1:]]
     assert reasons == [['gathered file of upper: "sizes.json" -> "all.json"']]
 
 
@@ -123,8 +123,8 @@ def test_files_of_a_recipe_are_looked_at_before_anything_runs_and_only_where_the
         (["recipes/helo.yaml"], "did you mean 'hello'"),
         (["not"], "known are"),
         (["hello", "{}/hello.yaml"], "two recipes are called 'hello'"),
-        (["{}/" + "x" * 240 + ".yaml"], "give it another name"),
-        (["{}/two\nlines.yaml"], "give it another name"),
+        (["{}/" + "x" * 240 + ".yaml"], "rename it"),
+        (["{}/two\nlines.yaml"], "rename it"),
     ],
     ids=["a name", "a path", "of another set", "two of one name", "a long name", "two lines"],
 )

@@ -16,7 +16,7 @@ import yaml
 
 from factorlib.errors import InputError
 from factorlib.runner import verbs
-from factorlib.runner.dataset_state import survey
+from factorlib.runner.dataset_state import Request, read_state
 from factorlib.runner.plan import Listing, plan
 from factorlib.runner.project import LIBRARY, photo_sets, read_pipeline
 from tests.faults.sample import edited as edited_data
@@ -43,8 +43,8 @@ def real(tmp_path_factory):
 
 def planned(project, settings=()):
     """Every step, those of optional stages and of all recipes too, as planned were everything made."""
-    seen = survey(project, "synthetic", STAGES, list(settings), recipes=["all"])
-    return plan(seen.spec, seen.records, Listing(Everything(), {}))
+    state = read_state(project, Request("synthetic", STAGES, settings, recipes=["all"]))
+    return plan(state.spec, state.records, Listing(Everything(), {}))
 
 
 def keys(project, settings=()):
@@ -197,7 +197,7 @@ FIELDS = [  # where something is set, and the line that says so
     ("photos.1.objects.1.mask", "own.png", 'dataset.yaml: photos.*.objects[1].mask: not given -> "own.png"'),
     ("photos.1.objects.0.materials", {"legs": "red"}, 'photos.*.objects[0].materials.legs: not given -> "red"'),
     ("meshes.chair.parts.legs", "red", 'dataset.yaml: meshes.chair.parts.legs: "white" -> "red"'),
-    ("materials", ["red", "white", "wood"], "dataset.yaml: materials: 'wood' came"),
+    ("materials", ["red", "white", "wood"], "dataset.yaml: materials: 'wood' added"),
     ("materials", ["white", "red"], 'dataset.yaml: materials: ["red", "white"] -> ["white", "red"]'),
 ]  # fmt: skip
 
@@ -209,9 +209,9 @@ def test_the_field_and_the_parameter_that_changed_are_named_with_old_and_new(rea
 
     def planned_with(spec=SET, settings=(), made=()):
         write(tmp_path / "set" / "dataset.yaml", yaml.safe_dump(spec))
-        seen = survey(real, str(tmp_path / "set"), None, list(settings))
+        found = read_state(real, Request(str(tmp_path / "set"), settings=settings))
         listing = Listing({p.key: p.output for p in made}, {str(p.step): p.record for p in made})
-        return plan(seen.spec, seen.records, listing if made else Listing(Everything(), {}))
+        return plan(found.spec, found.records, listing if made else Listing(Everything(), {}))
 
     def why(made, spec=SET, settings=()):
         return "\n".join(verbs.plan_lines(planned_with(spec, settings, made), True))

@@ -85,11 +85,11 @@ def test_the_verdict_of_a_result_is_shown_and_only_when_asked_for_decides_the_ex
     assert make(project) == 0
     for text, code in (("good: indeed\n", 0), ("do not trust: 9 dB\nbecause of that\n", verbs.UNTRUSTED)):
         write(project.build / "set" / verbs.VERDICT, text)
-        assert verbs.make(project, verbs.Wish("set")) == 0
-        assert verbs.make(project, verbs.Wish("set"), strict=True) == code
+        assert verbs.make(project, verbs.Request("set")) == 0
+        assert verbs.make(project, verbs.Request("set"), strict=True) == code
         said = capsys.readouterr().out
         assert all(said.count(line) == 2 for line in text.splitlines())
-    assert verbs.make(project, verbs.Wish("set", ["upper"]), strict=True) == 0  # not of the whole
+    assert verbs.make(project, verbs.Request("set", ["upper"]), strict=True) == 0  # not of the whole
 
 
 def test_plan_why_and_graph_show_the_same_plan(project, capsys):
@@ -98,7 +98,7 @@ def test_plan_why_and_graph_show_the_same_plan(project, capsys):
         (verbs.show_plan, "upper      to run  a                        file a.txt: changed"),
         (partial(verbs.show_plan, every_reason=True), "upper      to run  a\n    file a.txt: changed"),
     ):
-        assert show(project, verbs.Wish("set")) == 0 and said in capsys.readouterr().out
+        assert show(project, verbs.Request("set")) == 0 and said in capsys.readouterr().out
     for mermaid, said in ((False, "total      whole set  <- count, table"), (True, "upper --> count")):
         assert verbs.show_graph(project, mermaid) == 0 and said in capsys.readouterr().out
 
@@ -113,7 +113,7 @@ def test_a_setting_nobody_takes_is_refused_at_once_and_said_of_the_setting(proje
         assert words in str(caught.value) and "pipeline.yaml" not in str(caught.value)
     for setting, words in (("table.scael=3", "did you mean 'scale'"), ("count.x=1", "unknown key 'x'")):
         for verb in (verbs.make, verbs.show_plan):
-            assert verb(project, verbs.Wish("set", settings=[setting])) == 1
+            assert verb(project, verbs.Request("set", settings=[setting])) == 1
             said = capsys.readouterr().err
             assert said.startswith(f"error: SET {setting}: ") and words in said and "nothing was run" in said
 
@@ -122,11 +122,11 @@ def test_a_setting_nobody_takes_is_refused_at_once_and_said_of_the_setting(proje
 def test_a_value_out_of_bounds_is_refused_before_anything_runs_and_says_who_gave_it(project, capsys, param, value):
     before = done(project)
     for verb in (verbs.make, verbs.show_plan):
-        assert verb(project, verbs.Wish("set", settings=[f"upper.{param}={value}"])) == 1
+        assert verb(project, verbs.Request("set", settings=[f"upper.{param}={value}"])) == 1
         said = capsys.readouterr()
         assert f": SET upper.{param}={value}: " in said.err and "pipeline.yaml" not in said.err and not said.out
     edit(project, "pipeline.yaml", "upper: {", f"upper: {{params: {{{param}: {value}}}, ")
-    assert verbs.show_plan(project, verbs.Wish("set")) == 1 and done(project) == before
+    assert verbs.show_plan(project, verbs.Request("set")) == 1 and done(project) == before
     said = capsys.readouterr().err
     assert "pipeline.yaml: " in said and f"stages.upper.params.{param}: " in said and "SET" not in said
 
@@ -134,12 +134,12 @@ def test_a_value_out_of_bounds_is_refused_before_anything_runs_and_says_who_gave
 def test_a_dataset_that_is_not_there_and_two_folders_of_one_name_are_refused(project, tmp_path):
     write(project.root / "data" / "set" / "dataset.yaml", "")
     with pytest.raises(InputError, match="no dataset 'sett'") as caught:
-        verbs.make(project, verbs.Wish("sett"))
+        verbs.make(project, verbs.Request("sett"))
     assert "did you mean 'set'" in caught.value.cure
     shutil.copytree(project.root / "data" / "set", tmp_path / "else" / "set")
     with pytest.raises(InputError, match="two datasets are called 'set'"):
-        verbs.make(project, verbs.Wish(str(tmp_path / "else" / "set")))
-    assert verbs.make(project, verbs.Wish(str(project.root / "data" / "set"))) == 0  # the same one by its path
+        verbs.make(project, verbs.Request(str(tmp_path / "else" / "set")))
+    assert verbs.make(project, verbs.Request(str(project.root / "data" / "set"))) == 0  # the same one by its path
 
 
 # ── what fails ───────────────────────────────────────────────────────────────────────────────────────────────────────
@@ -174,7 +174,7 @@ def test_what_goes_wrong_in_a_stage_fails_its_step_and_the_next_run_resumes(
     said = capsys.readouterr().err
     assert words in said and "Traceback" not in said
     assert [path.name for path in (project.build / "set").glob("errors/*")] == traced
-    verbs.show_logs(project, verbs.Wish("set"), None)
+    verbs.show_logs(project, verbs.Request("set"), None)
     assert not traced or re.search(rf"failed by a defect of the program: .*errors/{traced[0]}", capsys.readouterr().out)
     write(project.root / file, text)
     assert new_runs(project) == []
@@ -188,11 +188,11 @@ def test_logs_have_times_memory_and_what_a_step_was_made_with_warnings_once_and_
     edit(project, "stages/table.py", "import json", "import json, filelock")
 
     def logs(*stages, photo=None, settings=()):
-        assert verbs.show_logs(project, verbs.Wish("set", list(stages) or None, list(settings)), photo) == 0
+        assert verbs.show_logs(project, verbs.Request("set", list(stages) or None, list(settings)), photo) == 0
         return capsys.readouterr().out
 
     assert make(project) == 0 and capsys.readouterr().err.count("a is odd") == 1
-    assert verbs.show_status(project, verbs.Wish("set")) == 0 and "a is odd" in capsys.readouterr().out
+    assert verbs.show_status(project, verbs.Request("set")) == 0 and "a is odd" in capsys.readouterr().out
     said = logs()
     for step, threads in (("upper/a", "1 thread"), ("count/b", "1 thread"), ("total", "2 threads")):
         assert re.search("^" + step + COST.format(threads), said, re.M), said
@@ -204,7 +204,7 @@ def test_logs_have_times_memory_and_what_a_step_was_made_with_warnings_once_and_
     steps = [line.split()[0] for line in logs("upper").splitlines() if not line.startswith(" ")]
     assert steps == ["upper/a", "upper/b"]
     assert "count/b" in logs(photo="b") and "upper/a" not in logs(photo="b")
-    with pytest.raises(InputError, match=r"(?s)no step is of 'aa'") as caught:
+    with pytest.raises(InputError, match=r"no step is of the photo or recipe 'aa'") as caught:
         logs(photo="aa")
     assert caught.value.key == "PHOTO"
     said = logs("table", settings=["table.scale=3"])
@@ -267,7 +267,7 @@ def test_the_second_of_two_runs_waits_and_takes_the_firsts_result(project, capsy
     toy.wait_for(project, go)
     first = start(project)
     assert wait_until(lambda: sleeping(project))
-    verbs.show_status(project, verbs.Wish("set"))
+    verbs.show_status(project, verbs.Request("set"))
     assert re.search(r"^upper +[12] running", capsys.readouterr().out)
     with pytest.raises(InputError, match="a run is going on"):
         collect(project)

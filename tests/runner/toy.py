@@ -13,7 +13,8 @@ import msgspec
 
 from factorlib import __main__ as command_line
 from factorlib.runner import verbs
-from factorlib.runner.dataset_state import survey
+from factorlib.runner.dataset_state import Request, read_state
+from factorlib.runner.plan import Planned
 from factorlib.runner.project import LIBRARY, Data, Project, Provider, photo_sets
 
 LETTERS = '''
@@ -128,7 +129,7 @@ def write(path: Path, text: str) -> None:
 
 
 def make(project: Project, *settings: str, targets: list[str] | None = None, force: bool = False) -> int:
-    return verbs.make(project, verbs.Wish("set", targets, list(settings), force))
+    return verbs.make(project, verbs.Request("set", targets, list(settings), force))
 
 
 def done(project: Project) -> list[str]:
@@ -157,12 +158,16 @@ def files_of(folder: Path) -> dict[str, bytes]:
     return {str(path.relative_to(folder)): path.read_bytes() for path in sorted(folder.rglob("*")) if path.is_file()}
 
 
-def state(project: Project, dataset: str = "set", settings: tuple[str, ...] = (), **more) -> dict[str, str]:
-    return {str(p.step): p.status for p in survey(project, dataset, None, list(settings), **more).planned()}
+def planned(project: Project, dataset: str = "set", settings: tuple[str, ...] = ()) -> list[Planned]:
+    return read_state(project, Request(dataset, settings=settings)).plan()
+
+
+def state(project: Project, dataset: str = "set", settings: tuple[str, ...] = ()) -> dict[str, str]:
+    return {str(p.step): p.status for p in planned(project, dataset, settings)}
 
 
 def reasons(project: Project, step: str, dataset: str = "set", settings: tuple[str, ...] = ()) -> list[str]:
-    return next(p.reasons for p in survey(project, dataset, None, list(settings)).planned() if str(p.step) == step)
+    return next(p.reasons for p in planned(project, dataset, settings) if str(p.step) == step)
 
 
 def copy(project: Project, target: Path) -> Project:
@@ -193,4 +198,4 @@ def call(project: Project, *words: str) -> int | str:
 
 
 if __name__ == "__main__":
-    sys.exit(verbs.make(toy(Path(sys.argv[1])), verbs.Wish(sys.argv[2], settings=sys.argv[3:])))
+    sys.exit(verbs.make(toy(Path(sys.argv[1])), verbs.Request(sys.argv[2], settings=sys.argv[3:])))

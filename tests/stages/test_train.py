@@ -9,7 +9,7 @@ from safetensors import safe_open
 from factorlib.__main__ import project
 from factorlib.reflection import reflection_operator
 from factorlib.reflection.network import SHIPPED
-from factorlib.runner.dataset_state import survey
+from factorlib.runner.dataset_state import Request, read_state
 from factorlib.runner.project import LIBRARY
 from factorlib.runner.store import copy_shipped
 from factorlib.stage import Inputs, silent
@@ -69,6 +69,6 @@ def test_shipped_weights_are_of_this_stage_and_within_the_bounds(tmp_path):
     assert accuracy["specular"]["samples"] == train.Params().held_out
     assert accuracy["specular"]["median"] < 0.003 and accuracy["specular"]["p95"] < 0.02
     assert accuracy["diffuse"]["p95"] < 0.005
-    seen = survey(project(), "eames", ["train"], [])
+    seen = read_state(project(), Request("eames", ["train"]))
     shipping = seen.spec.pipeline.stages["train"].shipped
-    assert copy_shipped([LIBRARY], shipping, seen.planned()[0].record, tmp_path / "out")
+    assert copy_shipped([LIBRARY], shipping, seen.plan()[0].record, tmp_path / "out")

@@ -8,7 +8,7 @@ import sys
 import msgspec
 import pytest
 
-from factorlib.runner.dataset_state import survey
+from factorlib.runner.dataset_state import Request, read_state
 from factorlib.runner.project import LIBRARY
 from factorlib.stage import Inputs, silent
 from studies.run import STUDIES, data_of, studies
@@ -48,7 +48,7 @@ def test_wrong_names_and_words_are_answered(words, environment, said):
 )
 def test_a_change_of_the_scores_or_the_claims_solves_nothing_again(tmp_path, name, step, there, absent):
     """Neither what a study says nor how it is scored is in the key of a solve."""
-    records = survey(studies(TINY, tmp_path), name, list(STUDIES[name].steps), []).records
+    records = read_state(studies(TINY, tmp_path), Request(name, list(STUDIES[name].steps))).records
     record = next(record for key, record in records.items() if key.stage == step)
     assert {f"source:{module}" for module in there} <= record.keys()
     assert not {f"source:studies.{module}" for module in absent} & record.keys()
