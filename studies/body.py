@@ -90,7 +90,8 @@ def photographed(
     case: Comparison, materials: Mapping[str, Reflectance], lights: Mapping[int, Map]
 ) -> tuple[Photos, dict[str, Observations]]:
     """Return the photos of a case, and the same as the stage `urm` hands them to `solve`."""
-    tables, radiance = observations_of(case, materials, {li: octahedral_light(lights[li]) for li in case.lights}), {}
+    tables = observations_of(case, materials, {li: octahedral_light(lights[li]) for li in case.lights})
+    radiance = {}
     for li, table in zip(case.lights, tables.values(), strict=True):
         for m in np.unique(table.material):
             radiance[table.materials[m], li] = table.radiance[table.material == m]

@@ -97,7 +97,8 @@ def spread(values: Sequence[float], doubt: float = DOUBT) -> Spread:
     >>> s.mean, s.deviation, round(s.high - s.mean, 3)
     (2.0, 1.0, 2.484)
     """
-    n, mean = len(values), float(np.mean(values))
+    n = len(values)
+    mean = float(np.mean(values))
     if n < 2:
         return Spread(mean, n)
     deviation = float(np.std(values, ddof=1))
@@ -147,7 +148,8 @@ class Cell(msgspec.Struct, frozen=True):
         >>> str(Cell(spread([0.1, 0.12]), {})), str(Cell(spread([0.1]), {}))
         ('0.11 ± 0.13', '0.1')
         """
-        mean, high = exact(self.spread.mean, 3), self.spread.high
+        mean = exact(self.spread.mean, 3)
+        high = self.spread.high
         return mean if high is None else f"{mean} ± {exact(high - self.spread.mean)}"
 
 
@@ -216,9 +218,11 @@ class Conclusion(msgspec.Struct, frozen=True):
 
 def concluded(study: Study, scale: Scale, scores: Mapping[str, Score]) -> Conclusion:
     """Return the table of a study and what its claims come to; scores: by the names of its cases."""
-    seeds, rows = study.numbers(scale), {}
+    seeds = study.numbers(scale)
+    rows = {}
     for s in study.settings(scale):
-        of, cells = {n: scores[case_name(s.name, n)] for n in seeds}, {}
+        of = {n: scores[case_name(s.name, n)] for n in seeds}
+        cells = {}
         for m in MEASURES:
             values = {n: score.values[m] for n, score in of.items() if m in score.values}
             nulls = {n: score.nulls[m] for n, score in of.items() if m in score.nulls}
@@ -258,7 +262,8 @@ def _outcome(claim: Claim, rows: Mapping[str, Row], comparisons: int, over: str)
         words = f"not tested: {s.seeds} of at least {LEAST_SEEDS} {over} were run"
     else:
         said = {"lower": "shown", "higher": "the opposite is shown", "not shown": "no difference is shown"}[verdict]
-        name, rise = label(claim.measure), "the rise of " if claim.lower[0] == "rise" else ""
+        name = label(claim.measure)
+        rise = "the rise of " if claim.lower[0] == "rise" else ""
         subject = name.replace("DSSIM, ", "DSSIM of ") if name.startswith("DSSIM") else f"the {name}"
         words = f"{said} ({rise}{subject} in {first} against {second}: "
         words += f"{s.mean:+.2g}, {s.low:+.2g} to {s.high:+.2g} over {s.seeds} {over})"
@@ -277,7 +282,8 @@ def csv_text(table: Conclusion) -> str:
     writer.writerow(HEAD)
     for row in table.rows:
         for measure, cell in row.cells.items():
-            s, unit = cell.spread, MEASURES[measure].partition("|")[2]
+            s = cell.spread
+            unit = MEASURES[measure].partition("|")[2]
             numbers = ("" if v is None else f"{v:.6g}" for v in (s.mean, s.deviation, s.low, s.high, cell.null))
             writer.writerow([table.study, row.name, row.label, measure, unit, s.seeds, *numbers])
     return out.getvalue()

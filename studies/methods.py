@@ -41,7 +41,9 @@ BETWEEN = 4  # pixels of the photo that a point is between
 NEAREST = 12  # those that a point takes its colour from which no photo shows
 ALBEDO = 0.5  # of the grey ball
 LAMBERT = np.array([1, *[2 / 3] * 3, *[1 / 4] * 5])  # A_l / π: what a white Lambert surface reflects of each harmonic
-ITERATIONS, LEAST, DARKEST = 60, 0.01, 1e-4
+ITERATIONS = 60
+LEAST = 0.01
+DARKEST = 1e-4
 ROWS = 32  # of the maps of lights that shading determines, and of even ones
 
 Coefficients = Float[np.ndarray, "9 3"]
@@ -82,7 +84,8 @@ def rendered(materials: dict[str, Reflectance], lights: dict[int, Map], lamberti
 
 def grey(photos: Photos, truths: Truths) -> Prediction:
     """Predict by the photos' mean colours."""
-    radiance, ball = photos.radiance, Reflectance((ALBEDO,) * 3, (0.0,) * 3, 1.0)
+    radiance = photos.radiance
+    ball = Reflectance((ALBEDO,) * 3, (0.0,) * 3, 1.0)
     means = {
         li: np.mean([of.mean(axis=0) for (_, at), of in radiance.items() if at == li], axis=0) for li in photos.lights
     }
@@ -97,7 +100,8 @@ class Texture:
     """Values at the points that a photo sees, to be read from other views."""
 
     def __init__(self, photo: View):
-        self._tree, self._least = cKDTree(photo.normals), photo.normals[:, 2].min()
+        self._tree = cKDTree(photo.normals)
+        self._least = photo.normals[:, 2].min()
 
     def seen(self, view: View) -> Bool[np.ndarray, " n"]:
         """Select the points of a view that the photo sees: those whose normals are turned toward it."""
@@ -108,7 +112,8 @@ class Texture:
 
         values: of the photo's points;  unseen: whether points that it does not see are filled, else they are 0
         """
-        there, colours = self.seen(view), np.zeros((len(view.normals), 3))
+        there = self.seen(view)
+        colours = np.zeros((len(view.normals), 3))
         for some, count in ((there, BETWEEN), (~there & unseen, NEAREST)):
             distance, index = self._tree.query(view.normals[some], count)
             weight = 1 / (distance + 1e-9)
@@ -118,7 +123,8 @@ class Texture:
 
 def projective(photos: Photos, truths: Truths) -> Prediction:
     """Predict by the photos as textures; a texture knows no light apart from its material."""
-    texture, radiance = Texture(photos.view), photos.radiance
+    texture = Texture(photos.view)
+    radiance = photos.radiance
 
     def of(material: str | Reflectance, light: int | Map, view: View) -> Radiance | None:
         if isinstance(material, Reflectance):
@@ -165,8 +171,10 @@ class Decomposed(msgspec.Struct, frozen=True):
 
 def decomposed(normals: Float[np.ndarray, "n 3"], radiance: Mapping[str, Radiance]) -> Decomposed:
     """Decompose one photo; radiance: by material, at the same normals."""
-    basis, image = harmonics(normals), np.stack(list(radiance.values()))
-    weight, albedo = np.ones(image.shape[:2]), np.median(image, axis=1)
+    basis = harmonics(normals)
+    image = np.stack(list(radiance.values()))
+    weight = np.ones(image.shape[:2])
+    albedo = np.median(image, axis=1)
     for _ in range(ITERATIONS):
         shading = np.stack([_shading(basis, image[..., c], albedo[:, c], weight) for c in range(3)], axis=-1)
         lit = np.maximum(basis @ shading, DARKEST)
@@ -189,7 +197,8 @@ def _shading(basis: np.ndarray, image: np.ndarray, albedo: np.ndarray, weight: n
 
 def averaged(photos: Mapping[int, Decomposed]) -> tuple[dict[str, np.ndarray], dict[int, np.ndarray]]:
     """Return exp α by material and exp β by photo, [3] each: a_mi ≈ exp(α_m + β_i)."""
-    names, numbers = sorted({n for p in photos.values() for n in p.albedo}), list(photos)
+    names = sorted({n for p in photos.values() for n in p.albedo})
+    numbers = list(photos)
     pairs = [(names.index(n), k) for k, p in enumerate(photos.values()) for n in p.albedo]
     known = np.log([photos[numbers[k]].albedo[names[m]] for m, k in pairs])
     design = np.zeros((len(pairs), len(names) + len(numbers)))
@@ -206,7 +215,9 @@ def intrinsic(photos: Photos, truths: Truths) -> Prediction:
     point; new lights their own shading and the mean highlight of the photos; new materials the light that nine
     harmonics of shading determine.
     """
-    normals, radiance, texture = photos.view.normals, photos.radiance, Texture(photos.view)
+    normals = photos.view.normals
+    radiance = photos.radiance
+    texture = Texture(photos.view)
     parts = {li: decomposed(normals, {n: v for (n, at), v in radiance.items() if at == li}) for li in photos.lights}
     albedo, scale = averaged(parts)
     relative = {n: Reflectance(tuple(albedo[n].tolist()), (0.0,) * 3, 1.0) for n in photos.materials}
@@ -219,7 +230,8 @@ def intrinsic(photos: Photos, truths: Truths) -> Prediction:
         if isinstance(material, Reflectance):
             return shown(material, lights[light], view)
         if isinstance(light, int):
-            coefficients, highlight = shading[light], parts[light].highlight[material]
+            coefficients = shading[light]
+            highlight = parts[light].highlight[material]
         else:
             highlight = np.mean([p.highlight[material] for p in parts.values() if material in p.highlight], axis=0)
             coefficients = LAMBERT[:, None] * light_coefficients(light)

@@ -38,7 +38,9 @@ from studies.spheres import GRAZING
 from studies.study import Case, Objects, light_name
 
 BODIES = ("blob", "jug", "hook")
-SIDE, FILL, FAR = 160, 0.9, 100.0  # pixels of a picture; the mesh's diameter, the focal length over that
+SIDE = 160
+FILL = 0.9
+FAR = 100.0  # pixels of a picture; the mesh's diameter, the focal length over that
 CAMERA = Camera(SIDE, SIDE, FAR * SIDE, (SIDE / 2, SIDE / 2))
 
 
@@ -59,7 +61,9 @@ def observed(
 
     Pixels of a photo's entries are numbered on.  The error of an entry is the median angle to the true normals.
     """
-    table, photos, errors = list(materials.values()), {}, []
+    table = list(materials.values())
+    photos = {}
+    errors = []
     for li in case.lights:
         parts = [_entry(case, m, li, table[m], lights[li]) for m, at in case.entries if at == li]
         y = np.repeat(np.arange(len(parts)), [len(part) for part, _ in parts])
@@ -69,12 +73,16 @@ def observed(
 
 
 def _entry(case: Case, m: int, li: int, material: Reflectance, light: OctahedralLight) -> tuple[Observations, float]:
-    how, rng, name = case.objects, np.random.default_rng([14, case.seed, m, li]), BODIES[(m + li) % len(BODIES)]
+    how = case.objects
+    rng = np.random.default_rng([14, case.seed, m, li])
+    name = BODIES[(m + li) % len(BODIES)]
     # the body's middle in the middle of the picture, which it fills
-    whole, rotation = body(name), Rotation.random(rng=rng).as_matrix()
+    whole = body(name)
+    rotation = Rotation.random(rng=rng).as_matrix()
     middle = np.array([0.0, 0.0, 2 * CAMERA.focal * whole.radius / (FILL * SIDE)])
     truth = Pose(rotation, middle - rotation @ whole.centre)
-    true_maps, (mesh, pose) = rasterise(whole, CAMERA, truth), perturbed(name, truth, how, rng)
+    true_maps = rasterise(whole, CAMERA, truth)
+    mesh, pose = perturbed(name, truth, how, rng)
     outline = Silhouette(true_maps.label.astype(np.int16))
     maps = rasterise(mesh, CAMERA, fitted(mesh, pose, outline) if how.refined else pose)
     sure = confidence(maps, outline) if how.confidence else np.ones(maps.label.shape)
@@ -84,7 +92,8 @@ def _entry(case: Case, m: int, li: int, material: Reflectance, light: Octahedral
     true, given = (of.normal.reshape(-1, 3)[pixels] for of in (true_maps, maps))
     radiance = ball(light, material, true @ YUP_FROM_CAMERA.T)
     noise = np.random.default_rng([13, case.seed, li, m, 0]).standard_normal((maps.label.size, 3))[pixels]
-    labels, names = np.full(len(pixels), case.materials.index(m)), tuple(case.material_names)
+    labels = np.full(len(pixels), case.materials.index(m))
+    names = tuple(case.material_names)
     weight = sure.reshape(-1)[pixels]
     columns = {"x": pixels, "y": np.zeros(len(pixels), int), "weight": weight, "confidence": weight}
     noisy = radiance * (1 + case.noise * noise)
@@ -93,7 +102,8 @@ def _entry(case: Case, m: int, li: int, material: Reflectance, light: Octahedral
 
 def perturbed(name: str, truth: Pose, how: Objects, rng: np.random.Generator) -> tuple[Caster, Pose]:
     """Return the mesh and the pose that stand for a body whose true pose is `truth`."""
-    whole, mesh = body(name), body(name, how.triangles)
+    whole = body(name)
+    mesh = body(name, how.triangles)
     if how.larger:
         mesh = Caster(scaled(mesh.mesh, (1 + how.larger,) * 3))
     axis, side = (v / np.linalg.norm(v) for v in (rng.normal(size=3), np.append(rng.normal(size=2), 0.0)))

@@ -58,16 +58,22 @@ from studies.errors import factor_of, times
 from studies.measured.tools import ROOT
 
 GIVEN = {"chrome": Reflectance((0.0,) * 3, (0.7,) * 3, 0.15), "chalk": Reflectance((0.7,) * 3, (0.0,) * 3, 1.0)}
-TABLE, MESHES = "given.json", ("ball", "chair", "vase.obj", "blob.obj")  # the file of GIVEN, which nobody recovers
-NOTICED, CHANGED, BLUR = 2.3, 1.0, 1.0  # ΔE; ΔE; pixels
-AROUND, LEAST = 1.4, 60  # half a window's width in the object's larger extent, and in pixels at least
+TABLE = "given.json"
+MESHES = ("ball", "chair", "vase.obj", "blob.obj")  # the file of GIVEN, which nobody recovers
+NOTICED = 2.3
+CHANGED = 1.0
+BLUR = 1.0  # ΔE; ΔE; pixels
+AROUND = 1.4
+LEAST = 60  # half a window's width in the object's larger extent, and in pixels at least
 PLACES = 100  # that are tried for an object
 FACTORS = ("light", "material", "ground")
 XYZ_OF_RGB = np.array(
     [[0.4124564, 0.2126729, 0.0193339], [0.3575761, 0.7151522, 0.119192], [0.1804375, 0.072175, 0.9503041]]
 )
-Picture, Mask = Float[np.ndarray, "h w 3"], Bool[np.ndarray, "h w"]
-Both, Sets = tuple[Picture, Picture], tuple[SolvedSet, SolvedSet]  # by what was recovered, and by the truth
+Picture = Float[np.ndarray, "h w 3"]
+Mask = Bool[np.ndarray, "h w"]
+Both = tuple[Picture, Picture]
+Sets = tuple[SolvedSet, SolvedSet]  # by what was recovered, and by the truth
 replace = msgspec.structs.replace
 
 
@@ -82,14 +88,16 @@ class Truth(SolvedSet):
         if dataset.truth is None or set(dataset.spec.meshes) != {"chair"}:
             cure = "make one: python -m factorlib.generate eames --seed N --out FOLDER"
             raise InputError("it is no set of chairs with a truth", file=dataset.folder, cure=cure)
-        self.truth, self.folder = dataset.truth, dataset.folder
+        self.truth = dataset.truth
+        self.folder = dataset.folder
         lens = {shot.name: shot.focal_35mm for shot in SET.shots}
         self.table = replace(self.table, model=replace(self.table.model, tone={}))
         true = self.truth.materials.items()
         self.materials = {name: Reflectance(m.diffuse, m.specular, m.roughness) for name, m in true}
         for photo, found in self.poses.items():
             height, width = self._masks(photo)["label"].shape
-            focal, middle = focal_px_of_35mm(lens[photo], width, height), (width / 2, height / 2)
+            focal = focal_px_of_35mm(lens[photo], width, height)
+            middle = (width / 2, height / 2)
             camera = replace(found.camera, focal_px=focal, principal_point=middle)
             poses = self.truth.poses[photo].items()
             places = {n: {"rotation": p.rotation, "translation": p.translation, "scale": AS_IT_IS} for n, p in poses}
@@ -127,11 +135,14 @@ def chosen(sets: Mapping[str, Sets], count: int, samples: int, seed: int) -> Ite
     `PLACES` times.
     """
     rng = np.random.default_rng(seed)
-    shots, numbers = [(name, photo) for name, of in sets.items() for photo in of[0].photos], np.arange(count)
+    shots = [(name, photo) for name, of in sets.items() for photo in of[0].photos]
+    numbers = np.arange(count)
     for shot, mesh, number in np.column_stack([rng.permutation(numbers) for _ in range(3)]):
         name, photo = shots[shot % len(shots)]
-        results, materials = sets[name][0], [*sets[name][0].materials, *GIVEN]
-        camera, factor = results.scene(photo).camera, results.poses[photo].camera.factor
+        results = sets[name][0]
+        materials = [*sets[name][0].materials, *GIVEN]
+        camera = results.scene(photo).camera
+        factor = results.poses[photo].camera.factor
         what = {"mesh": MESHES[mesh % len(MESHES)], "material": materials[number % len(materials)], "table": TABLE}
         for _ in range(PLACES):
             at = rng.uniform((0.15, 0.6), (0.85, 0.95)) * (camera.width, camera.height) * factor
@@ -153,28 +164,35 @@ def drawn(photo: str, recipe: InsertRecipe, recovered: SolvedSet, truth: SolvedS
 
     The second value is how they differ (`scores`).
     """
-    sets, ours = {True: recovered, False: truth}, insertion_scene(recipe, recovered, photo)
-    true, factor = insertion_scene(recipe, truth, photo), factor_of(recovered.materials, truth.materials)
+    sets = {True: recovered, False: truth}
+    ours = insertion_scene(recipe, recovered, photo)
+    true = insertion_scene(recipe, truth, photo)
+    factor = factor_of(recovered.materials, truth.materials)
     materials = {name: times(m, factor) for name, m in ours.scene.materials.items()}
     scene = replace(ours.scene, materials=materials, light=ours.scene.light.scaled(1 / factor))
     places = {True: replace(ours, scene=scene), False: true}
     pixels = [of.scene.camera.project(of.new.vertices @ YUP_FROM_CAMERA) for of in (ours, true)]
-    low, high = np.concatenate(pixels).min(axis=0), np.concatenate(pixels).max(axis=0)
-    half, size = max(AROUND * (high - low).max(), LEAST), (scene.camera.width, scene.camera.height)
+    low = np.concatenate(pixels).min(axis=0)
+    high = np.concatenate(pixels).max(axis=0)
+    half = max(AROUND * (high - low).max(), LEAST)
+    size = (scene.camera.width, scene.camera.height)
     ends = np.clip(np.rint([(low + high) / 2 - half, (low + high) / 2 + half]), 0, size).astype(int)
-    (left, top), (width, height) = ends[0].tolist(), (ends[1] - ends[0]).tolist()
+    left, top = ends[0].tolist()
+    width, height = (ends[1] - ends[0]).tolist()
     window = slice(top, top + height), slice(left, left + width)
 
     def traced(light: bool, material: bool, ground: bool, seed: int = 1) -> tuple[Picture, InsertionResult]:
         """Trace the window with these factors recovered, the others true."""
-        here, seen = places[ground], sets[light].straightened(photo)[window]
+        here = places[ground]
+        seen = sets[light].straightened(photo)[window]
         lit = {"light": places[light].scene.light, "materials": places[material].scene.materials}
         scene = replace(here.scene, camera=here.scene.camera.window(left, top, 1.0, width, height), **lit)
         covered = recovered.covered(photo)[window]
         found = inserted(replace(here, scene=scene), seen, covered, recipe.samples, seed=seed)
         return sets[light].tone(photo)(found.composite), found
 
-    (mine, found), (right, other) = traced(True, True, True), traced(False, False, False)
+    mine, found = traced(True, True, True)
+    right, other = traced(False, False, False)
     for side, of in ((True, found), (False, other)):  # the reflectance of each ground, found in its own light
         places[side] = replace(places[side], ground=replace(places[side].ground, diffuse=tuple(of.ground.tolist())))
     parts = {name: traced(*(name == each for each in FACTORS))[0] for name in FACTORS}
@@ -188,7 +206,9 @@ def scores(pair: Both, again: Both, parts: Mapping[str, Picture], photo: Picture
 
     again: both with other noise;  parts: with one factor recovered, by name;  body: the object's pixels
     """
-    lab, true, before = cielab(pair[0]), cielab(pair[1]), cielab(photo)
+    lab = cielab(pair[0])
+    true = cielab(pair[1])
+    before = cielab(photo)
     changed = (difference(lab, before) > CHANGED) | (difference(true, before) > CHANGED)
     region = binary_dilation(body | changed, iterations=2)
     ground = region & ~binary_dilation(body)
@@ -226,7 +246,9 @@ def main(
     seed: Annotated[int, typer.Option(min=0, help="of what is inserted where")] = 39,
 ) -> None:
     """Make pairs, and a table of how they differ."""
-    home, rows, sets = ROOT / "build/studies/pairs", [], {}
+    home = ROOT / "build/studies/pairs"
+    rows = []
+    sets = {}
     (home / "pictures").mkdir(parents=True, exist_ok=True)
     with TemporaryDirectory() as folder:
         files = write_files(Path(folder))

@@ -93,7 +93,8 @@ def observations_of(
 
 def _photo(case: Case, number: int, materials: Sequence[Reflectance], light: OctahedralLight) -> Observations:
     rows = [m for m, li in case.entries if li == number]
-    normals, index = faceted(sphere_normals(case.size), case.facets), case.materials.index
+    normals = faceted(sphere_normals(case.size), case.facets)
+    index = case.materials.index
 
     def rng(m: int, what: str) -> np.random.Generator:
         return np.random.default_rng([13, case.seed, number, m, ("noise", "normals", "labels").index(what)])
@@ -146,5 +147,6 @@ def face_normals(facets: int) -> Float[np.ndarray, "k 3"]:
     if facets == 1:
         return np.array([[0.0, 0.0, 1.0]])
     z = 1 - (1 - STEEPEST) * (np.arange(facets) + 0.5) / facets
-    turn, radius = np.arange(facets) * np.pi * (3 - np.sqrt(5)), np.sqrt(1 - z**2)
+    turn = np.arange(facets) * np.pi * (3 - np.sqrt(5))
+    radius = np.sqrt(1 - z**2)
     return np.stack([radius * np.cos(turn), radius * np.sin(turn), z], axis=-1)

@@ -17,7 +17,8 @@ def label_quality_settings(scale: Scale) -> list[Setting]:
     ]
 
 
-LATE, EARLY = ("rise", "normals-10deg", "normals-20deg", 10), ("rise", "normals-5deg", "normals-10deg", 5)
+LATE = ("rise", "normals-10deg", "normals-20deg", 10)
+EARLY = ("rise", "normals-5deg", "normals-10deg", 5)
 LABEL_QUALITY = Study(
     name="label-quality",
     title="Label quality",
@@ -55,7 +56,8 @@ ALIGNMENT_ERROR_QUICK = ("exact", "turned-5", "turned-20")
 
 def alignment_error_settings(scale: Scale) -> list[Setting]:
     """Return a setting for each perturbation, with its treatments beside it."""
-    entries, made = full_matrix(scale.side, scale.side), []
+    entries = full_matrix(scale.side, scale.side)
+    made = []
     for name in ALIGNMENT_ERROR_QUICK if scale.quick else PERTURBED:
         label, how, beside = PERTURBED[name]
         made.append(scale.of_objects(name, label, entries, **how))
@@ -95,7 +97,8 @@ ALIGNMENT_ERROR = Study(
 
 def progressive_settings(scale: Scale) -> list[Setting]:
     """Return settings of more and more photos, then of the same from the solution before."""
-    n, entries = scale.largest, [full_matrix(scale.side, k) for k in range(scale.largest + 1)]
+    n = scale.largest
+    entries = [full_matrix(scale.side, k) for k in range(scale.largest + 1)]
     cold = [scale.of_objects(f"photos-{k}", str(k), entries[k]) for k in range(1, n + 1)]
     return cold + [scale.of_objects(f"photos-{k}-warm", f"{k} warm", entries[k], warm=True) for k in range(2, n + 1)]
 

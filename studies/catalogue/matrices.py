@@ -52,7 +52,8 @@ ROW_AND_COLUMN = Study(
 
 def random_entries(n: int, seed: int) -> list[Entry]:
     """Draw as many entries as a star has, again until each material and each light is among them."""
-    rng, every = Random(seed), full_matrix(n, n)
+    rng = Random(seed)
+    every = full_matrix(n, n)
     while True:
         drawn = sorted(rng.sample(every, 2 * n - 1))
         if len({m for m, _ in drawn}) == len({li for _, li in drawn}) == n:
@@ -123,7 +124,8 @@ def paper_sets_settings(scale: Scale) -> list[Setting]:
     return [scale.of_objects(f"set-{name}", name.replace("-unlinked", " without chair"), of) for name, of in sets]
 
 
-DOCKSTA, UNLINKED = "set-docksta", "set-docksta-unlinked"
+DOCKSTA = "set-docksta"
+UNLINKED = "set-docksta-unlinked"
 BETTER = "are predicted better than by a guess of mean colours"
 PAPER_SETS = Study(
     name="paper-sets",

@@ -31,12 +31,16 @@ from factorlib.scenes import bodies
 from factorlib.scenes.bodies import SHAPES
 from studies.measured.tools import Clock, Tables, exacts
 
-WIDTH, HEIGHT = 640, 480
+WIDTH = 640
+HEIGHT = 480
 FOCALS = (0.8, 2.5)  # of the width
-FILLS, TINY_FILL = (0.5, 0.9), 0.015  # bounding sphere's diameter in the image, of the height
+FILLS = (0.5, 0.9)
+TINY_FILL = 0.015  # bounding sphere's diameter in the image, of the height
 RIGHT_DEG = {"exact": 2.0, "rough": 6.0}  # a pose is right when its median normal error is no more
-RIGHT, WRONG = tuple(RIGHT_DEG), ("wrong mesh", "wrong mask", "mirrored mask", "tiny mask")
-SEEDS, JOBS = 3, 2
+RIGHT = tuple(RIGHT_DEG)
+WRONG = ("wrong mesh", "wrong mask", "mirrored mask", "tiny mask")
+SEEDS = 3
+JOBS = 2
 VIEWS = {"exact": 20, "rough": 4} | dict.fromkeys(WRONG, 1)  # photos of each shape and seed
 Key = tuple[str, str, int, int]  # kind, shape, seed, number
 
@@ -56,7 +60,8 @@ class Case(NamedTuple):
 
 def case(kind: str, shape: str, seed: int, number: int) -> Case:
     """Return the photo of that kind; the same one for the same arguments."""
-    rng, given = np.random.default_rng(zlib.crc32(f"{kind} {shape} {seed} {number}".encode())), shape
+    rng = np.random.default_rng(zlib.crc32(f"{kind} {shape} {seed} {number}".encode()))
+    given = shape
     fill = TINY_FILL if kind == "tiny mask" else rng.uniform(*FILLS)
     camera, pose, label = photographed(bodies.mesh(shape), rng, fill)
     if kind == "mirrored mask":
@@ -89,9 +94,12 @@ def _blot(label: np.ndarray, labels: tuple[int, ...], rng: np.random.Generator) 
     """Return a star-shaped region of about the mask's area and middle, with a straight border between its materials."""
     rows, columns = np.nonzero(label)
     y, x = np.mgrid[:HEIGHT, :WIDTH] + 0.5
-    y, x = y - rows.mean(), x - columns.mean()
-    angle, order = np.arctan2(y, x), np.arange(1, 6)[:, None, None]
-    height, phase = rng.normal(0, 0.35, (5, 1, 1)), rng.uniform(0, 6.3, (5, 1, 1))
+    y = y - rows.mean()
+    x = x - columns.mean()
+    angle = np.arctan2(y, x)
+    order = np.arange(1, 6)[:, None, None]
+    height = rng.normal(0, 0.35, (5, 1, 1))
+    phase = rng.uniform(0, 6.3, (5, 1, 1))
     wave = np.sum(height / order**0.5 * np.sin(order * angle + phase), axis=0)
     inside = np.hypot(x, y) < np.sqrt(len(rows) / np.pi) * np.exp(wave)
     turn = rng.uniform(0, 2 * np.pi)
@@ -103,14 +111,19 @@ def measured(key: Key) -> dict:
 
     Time is in seconds, memory the most that the process held so far.
     """
-    kind, given = key[0], case(*key)
+    kind = key[0]
+    given = case(*key)
     caster = Caster(given.mesh)
-    truth, blind, clock = given.truth, Camera(WIDTH, HEIGHT, 1.0, given.camera.centre), Clock()
+    truth = given.truth
+    blind = Camera(WIDTH, HEIGHT, 1.0, given.camera.centre)
+    clock = Clock()
     silhouette = silhouette_of_object({"label": given.label.astype(float)}, 1, caster.mesh.labels, own_mask=False)
     obj = ObjectToAlign("object", caster, silhouette)
     result = align_photo([obj], blind, KnownFocal(), " ".join(map(str, key)))
-    seen, trust = rasterise(caster, result.camera, result.poses[0]), measure_reliability(obj, result, 0)
-    taken, megabytes = clock.taken(), resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
+    seen = rasterise(caster, result.camera, result.poses[0])
+    trust = measure_reliability(obj, result, 0)
+    taken = clock.taken()
+    megabytes = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
     fit = silhouette_iou(silhouette, seen.label), label_agreement(silhouette, seen.label)
     row = {
         "kind": kind,
@@ -160,7 +173,9 @@ def tables_of(measures: list[dict]) -> Tables:
         """Format quantiles of a measure."""
         return exacts(np.quantile([row[measure] for row in of], levels))
 
-    success, flags, times = [], [], []
+    success = []
+    flags = []
+    times = []
     for kind, shape in ((kind, shape) for kind in RIGHT for shape in (*SHAPES, "all")):
         if of := [row for row in measures if row["kind"] == kind and shape in (row["shape"], "all")]:
             right, wrong = ([row for row in of if row["right"] is is_right] for is_right in (True, False))

@@ -22,7 +22,8 @@ from factorlib.meshes.mesh import smooth
 
 Rng = np.random.Generator
 Spec = dict[str, Any]  # the content of dataset.yaml
-MESH, TRUTH = "meshes/chair.obj", "truth/truth.yaml"
+MESH = "meshes/chair.obj"
+TRUTH = "truth/truth.yaml"
 
 
 def keep(spec: Spec, names: list[str]) -> None:
@@ -162,10 +163,12 @@ MIXED = (
 
 def spoilt(base: Path, folder: Path, kinds: list[str], seed: int) -> None:
     """Write the set in `base`, spoilt, as the folder, which is there when all of it is."""
-    whole, folder = folder, folder.with_name(f"{folder.name}.new")
+    whole = folder
+    folder = folder.with_name(f"{folder.name}.new")
     shutil.rmtree(folder, ignore_errors=True)
     shutil.copytree(base, folder)
-    spec, rng = yaml.safe_load((folder / "dataset.yaml").read_text()), np.random.default_rng([17, seed])
+    spec = yaml.safe_load((folder / "dataset.yaml").read_text())
+    rng = np.random.default_rng([17, seed])
     for kind in kinds:
         KINDS[kind](folder, spec, rng)
     write_yaml(folder / "dataset.yaml", spec, f"spoilt: {', '.join(kinds) or 'nothing'}")
@@ -212,7 +215,8 @@ def each_photo(folder: Path, spec: Spec, change: Callable, filtered: ImageFilter
     """Change the linear radiance of every photo, then its picture."""
     for photo in spec["photos"]:
         with Image.open(folder / photo["image"]) as picture:
-            focal, linear = focal_of(picture), np.clip(change(srgb_decode(np.asarray(picture) / 255.0)), 0, 1)
+            focal = focal_of(picture)
+            linear = np.clip(change(srgb_decode(np.asarray(picture) / 255.0)), 0, 1)
         if filtered:
             made = Image.fromarray((srgb_encode(linear) * 255 + 0.5).astype(np.uint8)).filter(filtered)
             linear = srgb_decode(np.asarray(made) / 255.0)

@@ -33,12 +33,15 @@ from studies.measured.standard_errors import light_deviations, material_deviatio
 from studies.measured.tools import ROOT, Tables, evaluated, table, value_at
 
 PLACE = ROOT / "build/bench/eames-like"
-SEEDS, CAPTURED_SEEDS = (101, 102, 103, 104, 105), (106, 107, 108, 109, 110)
+SEEDS = (101, 102, 103, 104, 105)
+CAPTURED_SEEDS = (106, 107, 108, 109, 110)
 MAPS = 6  # of a set: one for each photo
 PRIOR = Path("factorlib/light/prior.json")
 COPIED = ("factorlib", "stages", "recipes", "pipeline.yaml")
 WITHIN = ("k_d", "k_s", "roughness", "log radiance of lights")
-LIGHT, BALLS, PSNR = "light.mean.channel_per_photo", "relighting.mean.channel_per_photo", "psnr_tonemapped_db"
+LIGHT = "light.mean.channel_per_photo"
+BALLS = "relighting.mean.channel_per_photo"
+PSNR = "psnr_tonemapped_db"
 
 
 class Quantity(NamedTuple):
@@ -141,7 +144,8 @@ def project_with_prior(maps: Sequence[Path], folder: Path) -> Path:
     Its results and its store, in build/, stay from run to run.
     """
     for name in COPIED:
-        whole, copy = ROOT / name, folder / name
+        whole = ROOT / name
+        copy = folder / name
         if whole.is_dir():
             shutil.rmtree(copy, ignore_errors=True)
             shutil.copytree(whole, copy, ignore=shutil.ignore_patterns("__pycache__"))
@@ -197,14 +201,16 @@ def rows_of(sets: Sequence[Set], unchosen: Sequence[Set]) -> list[list[str]]:
 def rows(made_seeds: Sequence[int] = SEEDS, captured_seeds: Sequence[int] = CAPTURED_SEEDS) -> Tables:
     """Make the sets, run the pipeline on each, and compare with the truth."""
     folders = [Path(word) for word in os.environ.get("LIGHTS", "").split()]
-    eames, others = solved("data/eames", ROOT / "data/eames"), [solved(str(seed), made(seed)) for seed in made_seeds]
+    eames = solved("data/eames", ROOT / "data/eames")
+    others = [solved(str(seed), made(seed)) for seed in made_seeds]
     others += [captured(seed, folders) for seed in captured_seeds] if folders else []
     return {"Sets": rows_of([eames, *others], others)}
 
 
 if __name__ == "__main__":
     try:
-        numbers, lit = [int(word) for word in sys.argv[1:]], bool(os.environ.get("LIGHTS"))
+        numbers = [int(word) for word in sys.argv[1:]]
+        lit = bool(os.environ.get("LIGHTS"))
         found = rows(*([], numbers) if lit else (numbers, [])) if numbers else rows()
         print("\n\n".join(table(lines[0], lines[1:]) for lines in found.values()))
     except InputError as error:

@@ -23,7 +23,10 @@ from studies.measured.tools import Clock, Tables, exact
 from studies.spheres import light_map, materials_of, observations_of
 from studies.study import Case
 
-SEED, SIZE, NOISE, MERGE_DEGREES = 31, 72, 0.002, 2.0
+SEED = 31
+SIZE = 72
+NOISE = 0.002
+MERGE_DEGREES = 2.0
 MISSING = np.random.default_rng(SEED).random((5, 5)) < 0.4  # [material, light]
 np.fill_diagonal(MISSING, False)
 SETS: dict[str, dict[int, list[int]]] = {  # the materials in each light
@@ -37,11 +40,14 @@ HEAD = ["set", "processor, s", "k_d: mean, worst", "k_s: mean, worst", "roughnes
 
 def rows() -> Tables:
     """Return the errors on each set: materials after one factor a channel, pictures of all pixels without any."""
-    materials, table, operator = materials_of(SEED), [HEAD], reflection_operator("network")
+    materials = materials_of(SEED)
+    table = [HEAD]
+    operator = reflection_operator("network")
     lights = {li: octahedral_light(light_map(SEED, li, 128, 64)) for li in range(5)}
     for name, shown in SETS.items():
         case = Case(SEED, tuple((m, li) for li, some in shown.items() for m in some), SIZE, noise=NOISE)
-        photos, truth = observations_of(case, materials, lights).values(), [materials[n] for n in case.material_names]
+        photos = observations_of(case, materials, lights).values()
+        truth = [materials[n] for n in case.material_names]
         whole = blocks_of_observations(concatenate(list(photos)), Noise())
         blocks = blocks_of_observations(concatenate([merge(photo, MERGE_DEGREES) for photo in photos]), Noise())
         problem = JointProblem(blocks, operator)  # one thread: seconds are those of the work itself
@@ -58,7 +64,8 @@ def _errors(solution: Solution, truth: list[Reflectance], problem: JointProblem,
     values = zip(of.diffuse.tolist(), of.specular.tolist(), of.roughness.tolist(), strict=True)
     own = [Reflectance(tuple(diffuse), tuple(specular), roughness) for diffuse, specular, roughness in values]
     factor = np.array(common_factor(own, truth))
-    pairs, shares = list(zip(own, truth, strict=True)), []
+    pairs = list(zip(own, truth, strict=True))
+    shares = []
     for part in ("diffuse", "specular"):
         true = [np.array(getattr(b, part)) for _, b in pairs]
         off = [
@@ -71,6 +78,7 @@ def _errors(solution: Solution, truth: list[Reflectance], problem: JointProblem,
     for block, solved, own_light in zip(whole, problem.blocks, solution.point.lights, strict=True):
         radiance = Illumination(block, own_light, of, problem.operator).radiance() * solved.unit / block.unit
         for m in np.unique(block.material):
-            shown, expected = radiance[block.material == m], block.radiance[block.material == m]
+            shown = radiance[block.material == m]
+            expected = block.radiance[block.material == m]
             decibels.append(10 * np.log10(np.quantile(expected, 0.999) ** 2 / np.mean((shown - expected) ** 2)))
     return [*shares, f"{exact(np.mean(rough))}, {exact(max(rough))}", f"{np.mean(decibels):.1f}, {min(decibels):.1f}"]

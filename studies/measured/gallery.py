@@ -16,7 +16,8 @@ from factorlib.wholefile import write_text
 from studies.measured.tools import ROOT
 
 PAGE = ROOT / "docs" / "gallery.md"
-DATASET, PHOTO = "eames", "terrace"  # whose pictures are shown where a recipe makes them of all photos
+DATASET = "eames"
+PHOTO = "terrace"  # whose pictures are shown where a recipe makes them of all photos
 SIDE = 240  # pixels of the longer side of one of four pictures; twice as many of a single one
 HEAD = """# Gallery
 
@@ -87,7 +88,8 @@ def parts_of(folder: Path, shown: list[Path]) -> str:
 
 def sheet(files: list[Path]) -> Image.Image:
     """Return one picture, or four of one size two by two: what is not transparent in any of them, on white."""
-    pictures, side = [Image.open(file).convert("RGBA") for file in files], SIDE * (2 if len(files) == 1 else 1)
+    pictures = [Image.open(file).convert("RGBA") for file in files]
+    side = SIDE * (2 if len(files) == 1 else 1)
     boxes = np.array([box for picture in pictures if (box := picture.getchannel("A").getbbox())])
     shown = (*boxes[:, :2].min(0).tolist(), *boxes[:, 2:].max(0).tolist())
     pictures = [picture.crop(shown) for picture in pictures]

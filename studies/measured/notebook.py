@@ -23,7 +23,8 @@ def write() -> Path:
     except ImportError as error:
         raise InputError("what runs notebooks is not installed", cure="make setup EXTRAS=notebook") from error
     evaluated("eames", ROOT)
-    notebook, where = nbformat.read(PAGE, 4), {"metadata": {"path": str(PAGE.parent)}}
+    notebook = nbformat.read(PAGE, 4)
+    where = {"metadata": {"path": str(PAGE.parent)}}
     NotebookClient(notebook, kernel_name="python3", record_timing=False, timeout=None, resources=where).execute()
     notebook.metadata.language_info = {"name": "python"}
     write_text(PAGE, nbformat.writes(notebook) + "\n")

@@ -33,12 +33,15 @@ from factorlib.reflection.samples import (
 from factorlib.scenes import operator_cases as laws
 from studies.measured.tools import Tables, exact
 
-REFERENCE, FAST = "reference", [name for name in NAMES if name != "reference"]
+REFERENCE = "reference"
+FAST = [name for name in NAMES if name != "reference"]
 TOLERANCES = {"reference 10⁻²": 1e-2, "reference 10⁻⁴": 1e-4, REFERENCE: 1e-7}
 SLOPES = {"roughness": "roughness", "log_sharpness": "log λ", "no": "n·o", "nz": "n·z", "oz": "o·z"}
 INPUTS = ("roughness", "sharpness", "cosine of the view", "degrees from the mirror direction")
-SAMPLES, GRADIENTS = 16384, 512
-LOBES, REPEATS = 64, 7
+SAMPLES = 16384
+GRADIENTS = 512
+LOBES = 64
+REPEATS = 7
 
 # ── The operators as they can be run ─────────────────────────────────────────────────────────────────────────────────
 
@@ -157,10 +160,12 @@ def measures(given: laws.Pairs, fast: dict[str, Operator], with_reference: bool 
     They are of values against the reference, and by rounding against its float64.
     """
     exactly = {label.split()[0]: laws.answers(o, given) for label, o in fast.items() if label.endswith("float64")}
-    true, table = laws.reference_values(given) if with_reference else None, {}
+    true = laws.reference_values(given) if with_reference else None
+    table = {}
     for label, operator in fast.items():
         if "float64" not in label:
-            answer, wide = laws.answers(operator, given), exactly[label.split()[0]]
+            answer = laws.answers(operator, given)
+            wide = exactly[label.split()[0]]
             kinds = {"value": laws.value_error, "gradient": laws.gradient_error}
             errors = {f"{kind}_rounding": error(answer, wide, given) for kind, error in kinds.items()}
             if true:
@@ -213,13 +218,19 @@ def special(fast: dict[str, Operator]) -> Tables:
 
 def rows() -> Tables:
     """Return tables of all operators: time, errors of values and derivatives, and of values by what is asked."""
-    fast, references = variants(), {label: Reference(tolerance=tolerance) for label, tolerance in TOLERANCES.items()}
+    fast = variants()
+    references = {label: Reference(tolerance=tolerance) for label, tolerance in TOLERANCES.items()}
     times = microseconds(fast | references)
-    specular, diffuse = specular_samples(SAMPLES, 99, tolerance=1e-7), diffuse_samples(SAMPLES, 98)
+    specular = specular_samples(SAMPLES, 99, tolerance=1e-7)
+    diffuse = diffuse_samples(SAMPLES, 98)
     glossy = {label: specular_errors(o, specular) for label, o in (fast | references).items() if label != REFERENCE}
     matte = {label: diffuse_errors(operator, diffuse) for label, operator in fast.items()}
-    true, single = gradients(references[REFERENCE]), [label for label in fast if label.endswith("float32")]
-    fastest, costs, slopes, by_input = min(statistics.median(pair[1]) for pair in times.values()), [], [], []
+    true = gradients(references[REFERENCE])
+    single = [label for label in fast if label.endswith("float32")]
+    fastest = min(statistics.median(pair[1]) for pair in times.values())
+    costs = []
+    slopes = []
+    by_input = []
     for label, pair in times.items():
         cells = [f"{exact(min(of))}, {exact(statistics.median(of))}" for of in pair]
         costs.append([label_of(label), *cells, f"{exact(statistics.median(pair[1]) / fastest)} ×"])

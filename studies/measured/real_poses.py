@@ -68,17 +68,22 @@ def withheld(dataset: Dataset) -> Dataset:
 
 def measured(folder: Path, photo: str) -> list[dict]:
     """Return one row per object of the photo: errors against the reference, and the stage's own words on the pose."""
-    dataset, reference = withheld(read_dataset(folder)), references(folder)[photo]
+    dataset = withheld(read_dataset(folder))
+    reference = references(folder)[photo]
     with TemporaryDirectory() as made:
         clock = Clock()
         run_stages(dataset, Path(made), (masks, align), photos=[photo])
         picture = read_photo_facts(Path(made) / "masks" / f"{photo}.json")
-        answer, taken = read_photo_poses(Path(made) / "align" / f"{photo}.json"), clock.taken()
+        answer = read_photo_poses(Path(made) / "align" / f"{photo}.json")
+        taken = clock.taken()
     rows = []
     for obj in dataset.photo(photo).objects:
-        file, said = dataset.spec.meshes[obj.mesh], answer.objects[obj.name]
+        file = dataset.spec.meshes[obj.mesh]
+        said = answer.objects[obj.name]
         mesh = read_mesh(dataset.folder / file.file, dataset.spec.materials, file.part_materials, obj.materials)
-        caster, pose, true = Caster(mesh), said.pose, reference.objects[obj.name].pose
+        caster = Caster(mesh)
+        pose = said.pose
+        true = reference.objects[obj.name].pose
         camera, true_camera = (entry.camera.camera(picture.width, picture.height) for entry in (answer, reference))
         normals = rasterise(caster, true_camera, true), rasterise(caster, camera, pose)
         rows.append(

@@ -12,7 +12,8 @@ import msgspec
 from factorlib.results.metrics import Metrics
 from studies.measured.tools import Tables, evaluated, exact, needed
 
-PSNR, FLAT = "PSNR, tone-mapped, of the re-synthesis (dB)", "of flat colours"
+PSNR = "PSNR, tone-mapped, of the re-synthesis (dB)"
+FLAT = "of flat colours"
 HEAD = ["set, mean over photos", "DSSIM of the re-synthesis", FLAT, PSNR, FLAT]
 
 

@@ -33,13 +33,17 @@ from factorlib.runner import verbs
 from factorlib.runner.project import Project, photo_sets
 from studies.measured.tools import ROOT, Tables, evaluated, value_at
 
-DATASET, SEEDS, DOUBT, ROUNDING = "synthetic", 5, 0.01, 1e-5
+DATASET = "synthetic"
+SEEDS = 5
+DOUBT = 0.01
+ROUNDING = 1e-5
 FOLDER = ROOT / "tests" / "studies" / "regression"
 COMMAND = '.venv/bin/python -m studies.measured.reference "why the numbers changed"'
 SMALL = ("masks.pixels=3000", "solve.cells=150", "solve.splittings=1", "export.height=64", "export.mitsuba_height=64")
 # dotted path in metrics.json -> lowest, highest, meaning; a quarter beyond the worst of five trained networks × two
 # seeds of the solve
-SPHERE, RMS = "light.mean.channel_per_photo.{}.estimate.rmse", "sphere, of the truth's RMS"
+SPHERE = "light.mean.channel_per_photo.{}.estimate.rmse"
+RMS = "sphere, of the truth's RMS"
 BOUNDS = {
     "materials.worst_roughness": (0.0, 0.040, "roughness, worst material"),
     "materials.worst_diffuse": (0.0, 0.055, "diffuse, worst material and channel, relative"),

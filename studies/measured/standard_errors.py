@@ -57,8 +57,10 @@ def material_deviations(build: Path, other: Path | None) -> dict[str, Float[np.n
 
 def light_deviations(build: Path, other: Path | None) -> Float[np.ndarray, " n"]:
     """Return |Δ log radiance| over its standard error, of all lights, cells and channels, less channels' medians."""
-    against, off = (other / "export/illumination") if other else (build / "evaluate/illumination"), []
-    folders, cells = (build / "export/illumination", against, build / "export/coverage"), fibonacci_sphere(CELLS)
+    against = (other / "export/illumination") if other else (build / "evaluate/illumination")
+    off = []
+    folders = (build / "export/illumination", against, build / "export/coverage")
+    cells = fibonacci_sphere(CELLS)
     for path in sorted(against.glob("*.exr")):
         light, true, error = (cell_means(read_rgb_exr(folder / path.name), cells) for folder in folders)
         deviation = error * light.mean(0) / light  # coverage is relative to the light's mean radiance

@@ -71,7 +71,8 @@ def refresh(path: Path, parts: dict[str, str]) -> None:
     """
     text = path.read_text(encoding="utf-8")
     for name, inner in parts.items():
-        begin, end = f"<!-- begin {name} -->\n", f"<!-- end {name} -->"
+        begin = f"<!-- begin {name} -->\n"
+        end = f"<!-- end {name} -->"
         if begin not in text or end not in text:
             raise InputError(f"no place for the table '{name}'", file=path, cure=f"add {begin.strip()} and {end}")
         text = text.partition(begin)[0] + begin + inner + "\n" + end + text.partition(end)[2]
@@ -115,7 +116,8 @@ class Clock:
     """
 
     def __init__(self):
-        self._wall, self._processor = time.perf_counter(), time.process_time()
+        self._wall = time.perf_counter()
+        self._processor = time.process_time()
 
     def taken(self) -> Taken:
         """Return the time until now."""

@@ -51,7 +51,9 @@ class Judged(NamedTuple):
 
 def judged(which: str) -> list[Judged]:
     """Make the sets that are not there, run the pipeline on them, and read what came out."""
-    rng, ways, seeds = np.random.default_rng(ORDER[which]), [], SEEDS[which]
+    rng = np.random.default_rng(ORDER[which])
+    ways = []
+    seeds = SEEDS[which]
     while len(ways) < TIMES * len(seeds):
         ways += [MIXED[k] for k in rng.permutation(len(MIXED))]
     sets = []
@@ -91,7 +93,8 @@ def expected(weights: Float[np.ndarray, " 4"], signs: Float[np.ndarray, "n 4"]) 
 
 def fitted(sets: list[Judged]) -> Float[np.ndarray, " 4"]:
     """Fit the weights that bring the expected scores nearest to the scores; outliers count less."""
-    signs, scores = np.array([one.signs for one in sets]), np.array([one.score for one in sets])
+    signs = np.array([one.signs for one in sets])
+    scores = np.array([one.score for one in sets])
     start = np.log(list(WEIGHTS.values()))
     return np.exp(least_squares(lambda w: expected(np.exp(w), signs) - scores, start, loss="soft_l1").x)
 

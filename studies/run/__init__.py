@@ -98,7 +98,8 @@ def sets_of(study: Study, scale: Scale) -> dict[str, Any]:
     facts = study.sets(scale)
     if "folder" not in facts:
         return facts
-    hashes, folder = FileHashes(None), LIBRARY / facts["folder"]
+    hashes = FileHashes(None)
+    folder = LIBRARY / facts["folder"]
     files = [file for file in sorted(folder.rglob("*")) if file.is_file()]
     return facts | {"content": {str(file.relative_to(folder)): hashes.content(file) for file in files}}
 
@@ -116,7 +117,8 @@ def make(
     """
     codes = []
     for name in names:
-        project, study = studies(scale, root), STUDIES[name]
+        project = studies(scale, root)
+        study = STUDIES[name]
         if scale.quick:
             print(f"{name}: quick: one seed, smallest sets: no conclusion")
         targets = list(study.steps)

@@ -72,7 +72,8 @@ def done_of(project: Project) -> dict[str, Conclusion]:
 
 def refresh_docs(names: Sequence[str]) -> None:
     """Write tables and answers of full studies, and the table of all answers to the paper, into docs/studies.md."""
-    done, text = done_of(studies(FULL)), DOCS.read_text(encoding="utf-8")
+    done = done_of(studies(FULL))
+    text = DOCS.read_text(encoding="utf-8")
     parts = {name: f"{numbers(done[name], COLUMNS)}\n\n{claims(done[name])}" for name in names if name in done}
     refresh(DOCS, {"conclusions": against_the_paper({name: c.answer for name, c in done.items()}, text)} | parts)
 

@@ -56,7 +56,8 @@ MAP_ROWS = 64  # rows of the maps that are written
 
 def main(params: Params, inputs: Inputs, out: Path, progress: Progress) -> None:
     """Solve, or optimise until the loss is flat; other methods take no time."""
-    case, home = msgspec.convert(inputs.facts["dataset.case"], Comparison), out / inputs.photo
+    case = msgspec.convert(inputs.facts["dataset.case"], Comparison)
+    home = out / inputs.photo
     home.mkdir()
     write_json(home / "seconds.json", 0)
     if case.method == "ours":
@@ -85,7 +86,9 @@ class Joint:
     """
 
     def __init__(self, photos: Photos, pixels: int):
-        self.mi, self.materials, self.lights = mitsuba(), photos.materials, photos.lights
+        self.mi = mitsuba()
+        self.materials = photos.materials
+        self.lights = photos.lights
         self.mask = _squares(photos.view.inside, pixels).all(axis=(1, 3))
         pictures = {pair: _squares(photos.view.picture(of), pixels) for pair, of in photos.radiance.items()}
         self.shown = {pair: of.mean(axis=(1, 3)).astype(np.float32) for pair, of in pictures.items()}
@@ -120,13 +123,15 @@ class Joint:
 
     def begin(self, rate: float = RATE) -> None:
         """Start from grey materials under even lights of the pictures' mean radiance."""
-        mi, optimiser = self.mi, self.mi.ad.Adam(lr=rate)
+        mi = self.mi
+        optimiser = self.mi.ad.Adam(lr=rate)
         columns = np.array(next(iter(self.parameters.values()))["light.data"]).shape[1]
         for light in self.lights:
             level = np.mean([of[self.mask].mean() for (_, at), of in self.shown.items() if at == light]) / 0.4
             optimiser[f"light {light}"] = mi.TensorXf(np.full((ROWS, columns, 3), level, np.float32))
         for name in self.materials:
-            optimiser[f"diffuse {name}"], optimiser[f"specular {name}"] = mi.Color3f(0.3), mi.Color3f(0.1)
+            optimiser[f"diffuse {name}"] = mi.Color3f(0.3)
+            optimiser[f"specular {name}"] = mi.Color3f(0.1)
             optimiser[f"roughness {name}"] = mi.Float(0.4)
         self.optimiser = optimiser
 
@@ -134,7 +139,8 @@ class Joint:
         """Take one step of Adam within bounds, and return the mean loss of the pairs before it."""
         import drjit as dr
 
-        losses, mi = [], self.mi
+        losses = []
+        mi = self.mi
         for k, (pair, parameters) in enumerate(self.parameters.items()):
             self.set(pair)
             seed = 2 * (number * len(self.parameters) + k)
@@ -161,7 +167,8 @@ class Joint:
 
     def set(self, pair: tuple[str, int]) -> None:
         """Put the unknowns into a pair's scene."""
-        (material, light), parameters = pair, self.parameters[pair]
+        material, light = pair
+        parameters = self.parameters[pair]
         parameters["light.data"] = self.optimiser[f"light {light}"]
         parameters["ball.bsdf.bsdf_0.reflectance.value"] = 2 * self.optimiser[f"diffuse {material}"]
         parameters["ball.bsdf.bsdf_1.specular_reflectance.value"] = 2 * self.optimiser[f"specular {material}"]
@@ -203,7 +210,8 @@ def flat(losses: list[float]) -> bool:
 def optimised(case: Comparison, photos: Photos) -> tuple[list[float], Joint]:
     """Return the losses of all steps and the last unknowns; in a process of its own."""
     one_thread_with_derivatives()
-    joint, losses = Joint(photos, case.pixels), []
+    joint = Joint(photos, case.pixels)
+    losses = []
     joint.begin()
     while not flat(losses) and len(losses) < case.steps:
         losses.append(joint.step(len(losses)))

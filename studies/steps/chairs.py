@@ -74,7 +74,8 @@ def main(params: Params, inputs: Inputs, out: Path, progress: Progress) -> None:
     photo = Photo(case["photo"], tables[case["photo"]], *channels)
     chairs = {shell: chair_of(photo.table.materials.index(shell), photo) for shell in case["shells"]}
     alone = msgspec.structs.replace(inputs, unfinished=None)  # solves must not resume each other's
-    images, folder = [], Path()
+    images = []
+    folder = Path()
     with TemporaryDirectory() as solves:
         for number, (shell, chair) in enumerate(chairs.items()):
             if case["prediction"] == "flat":
@@ -100,7 +101,8 @@ def without(table: Observations, material: str) -> Observations:
 
 def chair_of(label: int, photo: Photo) -> Chair:
     """Return the chair of a label."""
-    channels, mesh = photo.channels, np.abs(np.stack([photo.geometry[f"normal.{a}"] for a in "xyz"])).max(axis=0) > 0
+    channels = photo.channels
+    mesh = np.abs(np.stack([photo.geometry[f"normal.{a}"] for a in "xyz"])).max(axis=0) > 0
     mask = (np.rint(channels["label"]) == label + 1) & (channels["valid"] > 0.5) & mesh
     return Chair(np.stack([channels[c] for c in "RGB"], axis=-1).astype(float), mask)
 
@@ -128,7 +130,8 @@ def predicted(folder: Path, chair: Chair, photo: Photo, bounces: bool) -> Image:
 
     bounces: whether light that surfaces send each other is added, if the solve had it: it is read off the photo
     """
-    answer, around = read_materials(folder / "materials.json"), None
+    answer = read_materials(folder / "materials.json")
+    around = None
     exposure = np.array(read_exposures(folder / "exposures.json").get(photo.name, 1.0))
     lobes = read_lobes(folder / "lobes.parquet")[photo.name].scaled(exposure)
     if answer.model.self_shadowing:

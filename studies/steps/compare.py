@@ -118,9 +118,12 @@ def answer(
 
 def shots(case: Comparison, world: World, prediction: Prediction) -> list[Taken]:
     """Return all shots that are asked, with what the method answers."""
-    cameras, taken = {name: view(case.size, turn(*at)) for name, at in (VIEWS | FRONT).items()}, []
+    cameras = {name: view(case.size, turn(*at)) for name, at in (VIEWS | FRONT).items()}
+    taken = []
     for shot in asked(case, world):
-        camera, material, light = cameras[shot.view], world.materials[shot.material], world.lights[shot.light]
+        camera = cameras[shot.view]
+        material = world.materials[shot.material]
+        light = world.lights[shot.light]
         truth = shown(material, light, camera)
         predicted = prediction.of(
             material if shot.kind == "novel_material" else shot.material,
@@ -134,7 +137,8 @@ def shots(case: Comparison, world: World, prediction: Prediction) -> list[Taken]
 
 def asked(case: Comparison, world: World) -> Iterator[Shot]:
     """Yield what is asked of all methods in a case."""
-    names, unseen = list(world.materials), sorted(world.lights.keys() - set(case.lights))
+    names = list(world.materials)
+    unseen = sorted(world.lights.keys() - set(case.lights))
     others = [name for name in names if name not in case.material_names]
     yield from (Shot("novel_view", names[m], li, side) for side in VIEWS for m, li in case.entries)
     yield from (Shot("novel_light", name, li, "front") for name in case.material_names for li in unseen)

@@ -31,7 +31,8 @@ def main(params: Params, inputs: Inputs, out: Path, progress: Progress) -> None:
     """Solve and compare."""
     case = inputs.facts["dataset.case"]
     home = inputs["photos"] / str(case["seed"])
-    dataset, photos = read_dataset(home / "data"), sorted((home / "urm").glob("*.parquet"))
+    dataset = read_dataset(home / "data")
+    photos = sorted((home / "urm").glob("*.parquet"))
     tables = {file.stem: CHANGES[case["change"]](read_observations(file)) for file in photos}
     with TemporaryDirectory() as folder:
         solved(tables, case["solve"], inputs, Path(folder), progress)

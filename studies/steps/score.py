@@ -53,8 +53,10 @@ Maps = Mapping[int, Map]
 def main(params: Params, inputs: Inputs, out: Path, progress: Progress) -> None:
     """Compare with all lights of the world."""
     case, world = (msgspec.convert(inputs.facts[f"dataset.{n}"], t) for n, t in (("case", Case), ("worlds", World)))
-    truths, solved = materials_of(case.seed, case.names), inputs["solve"] / inputs.photo
-    maps, table = read_maps(inputs["worlds"], case.seed, range(world.lights)), read_materials(solved / "materials.json")
+    truths = materials_of(case.seed, case.names)
+    solved = inputs["solve"] / inputs.photo
+    maps = read_maps(inputs["worlds"], case.seed, range(world.lights))
+    table = read_materials(solved / "materials.json")
     spheres, score = scored(case, truths, maps, table.materials, maps_of(solved, case.lights))
     write_json(out / f"{inputs.photo}.json", score | Score(read_json(solved / "measured.json")))
     if case.objects and case.seed == world.seeds[0]:
@@ -69,12 +71,14 @@ def scored(case: Case, truths: Table, maps: Maps, table: Mapping[str, Solved], o
     """
     component = connected_components({light_name(li): case.names_in(li) for li in case.lights})
     solved = {n: table[n].reflectance for n in component}
-    materials, lights = {}, {}
+    materials = {}
+    lights = {}
     for number in set(component.values()):  # each in the truth's gauge
         names = [n for n in case.material_names if component[n] == number]
         of = {li: own[li] for li in case.lights if component[case.names_in(li)[0]] == number}
         some, few = in_gauge({n: solved[n] for n in names}, of, truths)
-        materials, lights = materials | some, lights | few
+        materials = materials | some
+        lights = lights | few
     spheres = Spheres(case, materials, lights, truths, maps)
     score = spheres.score() | material_errors(solved, truths, component) | stated_errors([table[n] for n in component])
     errors = light_errors(lights, maps)
@@ -113,13 +117,17 @@ class Spheres:
     """Spheres of true and recovered materials in true and recovered lights, each rendered once."""
 
     def __init__(self, case: Case, materials: Table, lights: Maps, truths: Table, maps: Maps):
-        self.case, self.materials, self.truths = case, materials, truths
+        self.case = case
+        self.materials = materials
+        self.truths = truths
         self.true = {li: Appearances(octahedral_light(light)) for li, light in maps.items()}
         self.own = {li: Appearances(octahedral_light(light)) for li, light in lights.items()}
 
     def score(self) -> Score:
         """Return DSSIM of the predictions, and of those of nulls: mean colours, grey materials, constant lights."""
-        names, own, true = self.case.material_names, self.own, self.true
+        names = self.case.material_names
+        own = self.own
+        true = self.true
         pairs = [(n, li) for n in names for li in own]
         seen = {(self.case.names[m], li) for m, li in self.case.entries}
         parts = {"entries": pairs, "observed": seen, "unobserved": [e for e in pairs if e not in seen]}
@@ -145,13 +153,17 @@ class Spheres:
         """Draw all materials (rows) in all lights, recovered or true, each exposed for its truth."""
         rows = []
         for m in self.case.materials:
-            name, row = self.case.names[m], []
+            name = self.case.names[m]
+            row = []
             for li in self.case.lights:
                 truth = self.true[li].ball(self.truths[name])
                 shown = _disc(truth if true else self.own[li].ball(self.materials[name]))
                 cell = np.pad(picture(shown, 1 / white_of(_disc(truth), INSIDE)), ((3, 3), (3, 3), (0, 0)))
                 if (m, li) in self.case.entries:
-                    cell[:2], cell[-2:], cell[:, :2], cell[:, -2:] = 200, 200, 200, 200
+                    cell[:2] = 200
+                    cell[-2:] = 200
+                    cell[:, :2] = 200
+                    cell[:, -2:] = 200
                 row.append(cell)
             rows.append(np.concatenate(row, axis=1))
         return np.concatenate(rows)

@@ -30,7 +30,9 @@ def main(params: Params, inputs: Inputs, out: Path, progress: Progress) -> None:
 
     The solve starts from nothing, or from the solution of all photos but the last.
     """
-    case, home, measured = msgspec.convert(inputs.facts["dataset.case"], Case), out / inputs.photo, {}
+    case = msgspec.convert(inputs.facts["dataset.case"], Case)
+    home = out / inputs.photo
+    measured = {}
     maps = spheres.read_maps(inputs["worlds"], case.seed, case.lights)
     of = spheres.materials_of(case.seed, case.names), {li: octahedral_light(light) for li, light in maps.items()}
     if case.objects:
