@@ -1,12 +1,11 @@
-"""Answers of the methods of the comparison, as predictions of photos that were not taken.
+"""Methods of the comparison, as predictions of photos that were not taken.
 
-Projective   Texturing: the photo's pixels are stuck on the sphere and carried to the new view.  It knows the sphere and
-             the camera.  A point that the photo saw has the photo's colour there, between pixels by inverse distance;
-             one that it did not see that of the seen points that are nearest.  A new light changes nothing: the colours
+Projective   Texturing: the photo's pixels are projected onto the sphere and rendered from the new view, which needs the
+             sphere and the camera.  Points in the photo are interpolated by inverse distance between `BETWEEN` pixels;
+             points outside it take the colour of the `NEAREST` ones.  A new light changes nothing: the colours
              are the mean of all photos of the material.
 Intrinsic    A decomposition in the spirit of SIRFS (Barron and Malik 2015): albedo × shading + highlight, albedos
-             averaged over photos. It knows the normals, and which pixels are of which material; each photo is
-             decomposed by itself.
+             averaged over photos.  Given are the normals and the labels; each photo is decomposed by itself.
    shading     S(n) = Σ e_lm Y_lm(n), nine spherical harmonics: what Lambert reflects of a distant light to within a few
                per cent (Ramamoorthi and Hanrahan 2001).  All objects of a photo share it.
    albedo      a, one a material and channel: in turn with e by weighted least squares of I − a S.
@@ -17,10 +16,8 @@ Intrinsic    A decomposition in the spirit of SIRFS (Barron and Malik 2015): alb
                i.  α is the answer, β goes into the photo's shading.
    new light   its own nine coefficients shade the albedo; the highlight stays on the surface as it is, the mean over
                photos.
-Grey         Every material is the same grey Lambert, every light is even, of its photo's mean colour: what does not
-             beat it has recovered nothing.
-rendered     The answer of a method that finds a reflectance for each material and a map for each light is rendered as
-             the truth is.
+Grey         Every material is the same grey Lambert, every light is even, of its photo's mean colour: the null.
+Rendered     Reflectances and lights of a method that recovers both are rendered as the truth is.
 
 Truths are handed to methods for the gauge alone: photos link all materials and all lights.
 """
@@ -29,16 +26,16 @@ from collections.abc import Callable, Mapping
 
 import msgspec
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 from scipy.spatial import cKDTree
 
 from factorlib.conventions import lat_long_directions, lat_long_solid_angles
 from factorlib.results.materials import Reflectance
-from studies.body import Photos, Radiance, View, shown
-from studies.errors import Map, factor_of, in_gauge, times
+from studies.errors import Materials, gauge_factor, in_gauge, scale_reflectance
+from studies.spheres import Map, Photos, Radiance, SphereView
 
 BETWEEN = 4  # pixels of the photo that a point is between
-NEAREST = 12  # those that a point takes its colour from which no photo shows
+NEAREST = 12  # pixels that colour a point outside the photo
 ALBEDO = 0.5  # of the grey ball
 LAMBERT = np.array([1, *[2 / 3] * 3, *[1 / 4] * 5])  # A_l / π: what a white Lambert surface reflects of each harmonic
 ITERATIONS = 60
@@ -47,49 +44,48 @@ DARKEST = 1e-4
 ROWS = 32  # of the maps of lights that shading determines, and of even ones
 
 Coefficients = Float[np.ndarray, "9 3"]
-Truths = Mapping[str, Reflectance]
 
 
 class Prediction(msgspec.Struct, frozen=True):
     """A method's answer.
 
-    materials:  reflectances that it states, by name, in the truth's gauge;  lights: maps that it states, by number, in
-                that gauge
-    lambertian: that it states no specular part, rather than none being there
-    of:         radiance of a material in a light as a camera sees it, one of which was not photographed: a photographed
-                material by its name or another one, the light of a photo by its number or another one; None where the
-                method has nothing to say
+    Attributes:
+        materials: Reflectances that it states, by name, in the truth's gauge.
+        lights: Maps that it states, by number, in that gauge.
+        lambertian: True where it states no specular part.
+        render: Radiance of a material in a light as a camera sees it: a photographed material by its name, or a new
+            one; a photo's light by its number, or a new one; at most one of them is new.  None where the method has no
+            answer.
     """
 
     materials: dict[str, Reflectance]
     lights: dict[int, Map]
     lambertian: bool
-    of: Callable[[str | Reflectance, int | Map, View], Radiance | None]
+    render: Callable[[str | Reflectance, int | Map, SphereView], Radiance | None]
 
 
-def lambertian_part(materials: Truths) -> dict[str, Reflectance]:
+def lambertian_part(materials: Materials) -> dict[str, Reflectance]:
     """Remove specular parts."""
     return {name: Reflectance(m.diffuse, (0.0, 0.0, 0.0), m.roughness) for name, m in materials.items()}
 
 
 def rendered(materials: dict[str, Reflectance], lights: dict[int, Map], lambertian: bool = False) -> Prediction:
-    """Predict by the reflectance of each material and the map of each light that a method finds."""
+    """Predict by the reflectance of each material and the map of each light."""
 
-    def of(material: str | Reflectance, light: int | Map, view: View) -> Radiance:
+    def render(material: str | Reflectance, light: int | Map, view: SphereView) -> Radiance:
         material = materials[material] if isinstance(material, str) else material
-        return shown(material, lights[light] if isinstance(light, int) else light, view)
+        return view.render(material, lights[light] if isinstance(light, int) else light)
 
-    return Prediction(materials, lights, lambertian, of)
+    return Prediction(materials, lights, lambertian, render)
 
 
-def grey(photos: Photos, truths: Truths) -> Prediction:
+def grey(photos: Photos, truths: Materials) -> Prediction:
     """Predict by the photos' mean colours."""
-    radiance = photos.radiance
     ball = Reflectance((ALBEDO,) * 3, (0.0,) * 3, 1.0)
-    means = {
-        li: np.mean([of.mean(axis=0) for (_, at), of in radiance.items() if at == li], axis=0) for li in photos.lights
-    }
-    lights = {li: np.broadcast_to(colour / ALBEDO, (ROWS, 2 * ROWS, 3)) for li, colour in means.items()}
+    lights = {}
+    for li in photos.lights:
+        colour = np.mean([values.mean(axis=0) for (_, k), values in photos.radiance.items() if k == li], axis=0)
+        lights[li] = np.broadcast_to(colour / ALBEDO, (ROWS, 2 * ROWS, 3))
     return rendered(*in_gauge(dict.fromkeys(photos.materials, ball), lights, truths), lambertian=True)
 
 
@@ -97,43 +93,39 @@ def grey(photos: Photos, truths: Truths) -> Prediction:
 
 
 class Texture:
-    """Values at the points that a photo sees, to be read from other views."""
+    """Values at the points that a photo sees, to be rendered from other views."""
 
-    def __init__(self, photo: View):
+    def __init__(self, photo: SphereView):
         self._tree = cKDTree(photo.normals)
         self._least = photo.normals[:, 2].min()
 
-    def seen(self, view: View) -> Bool[np.ndarray, " n"]:
-        """Select the points of a view that the photo sees: those whose normals are turned toward it."""
-        return view.normals[:, 2] >= self._least
+    def render(self, view: SphereView, values: Radiance, fill: bool = True) -> Radiance:
+        """Return the values of the photo's points at those of a view.
 
-    def at(self, view: View, values: Radiance, unseen: bool = True) -> Radiance:
-        """Carry values from the photo's points to those of a view.
-
-        values: of the photo's points;  unseen: whether points that it does not see are filled, else they are 0
+        fill: extrapolate to points that the photo does not see, else they are 0
         """
-        there = self.seen(view)
+        visible = view.normals[:, 2] >= self._least
         colours = np.zeros((len(view.normals), 3))
-        for some, count in ((there, BETWEEN), (~there & unseen, NEAREST)):
-            distance, index = self._tree.query(view.normals[some], count)
+        for points, count in ((visible, BETWEEN), (~visible & fill, NEAREST)):
+            distance, index = self._tree.query(view.normals[points], count)
             weight = 1 / (distance + 1e-9)
-            colours[some] = np.einsum("nk,nkc->nc", weight / weight.sum(axis=1, keepdims=True), values[index])
+            colours[points] = np.einsum("nk,nkc->nc", weight / weight.sum(axis=1, keepdims=True), values[index])
         return colours
 
 
-def projective(photos: Photos, truths: Truths) -> Prediction:
+def projective(photos: Photos, truths: Materials) -> Prediction:
     """Predict by the photos as textures; a texture knows no light apart from its material."""
     texture = Texture(photos.view)
     radiance = photos.radiance
 
-    def of(material: str | Reflectance, light: int | Map, view: View) -> Radiance | None:
+    def render(material: str | Reflectance, light: int | Map, view: SphereView) -> Radiance | None:
         if isinstance(material, Reflectance):
             return None
         if isinstance(light, int):
-            return texture.at(view, radiance[material, light])
-        return texture.at(view, np.mean([of for (name, _), of in radiance.items() if name == material], axis=0))
+            return texture.render(view, radiance[material, light])
+        return texture.render(view, np.mean([v for (name, _), v in radiance.items() if name == material], axis=0))
 
-    return Prediction({}, {}, False, of)
+    return Prediction({}, {}, False, render)
 
 
 # ── intrinsic decomposition ──────────────────────────────────────────────────────────────────────────────────────────
@@ -153,12 +145,12 @@ def light_coefficients(light: Map) -> Coefficients:
     return np.einsum("h,hwk,hwc->kc", lat_long_solid_angles(*size), harmonics(lat_long_directions(*size)), light)
 
 
-def light_map(shading: Coefficients) -> Map:
+def light_of_shading(shading: Coefficients) -> Map:
     """Return the light of nine harmonics that shades so; what it has of negative light is cut."""
     return np.maximum(harmonics(lat_long_directions(ROWS, 2 * ROWS)) @ (shading / LAMBERT[:, None]), 0)
 
 
-class Decomposed(msgspec.Struct, frozen=True):
+class Decomposition(msgspec.Struct, frozen=True):
     """Decomposed photo: shading's coefficients, each material's albedo, and highlights [n, 3].
 
     One factor per channel is free between shading and albedos.
@@ -169,7 +161,7 @@ class Decomposed(msgspec.Struct, frozen=True):
     highlight: dict[str, Radiance]
 
 
-def decomposed(normals: Float[np.ndarray, "n 3"], radiance: Mapping[str, Radiance]) -> Decomposed:
+def decompose(normals: Float[np.ndarray, "n 3"], radiance: Mapping[str, Radiance]) -> Decomposition:
     """Decompose one photo; radiance: by material, at the same normals."""
     basis = harmonics(normals)
     image = np.stack(list(radiance.values()))
@@ -185,7 +177,7 @@ def decomposed(normals: Float[np.ndarray, "n 3"], radiance: Mapping[str, Radianc
         scale = np.maximum(size, LEAST * image.mean(axis=(1, 2)))[:, None]
         weight = np.where(r > 0, 1 / (1 + (r / scale) ** 2), 1.0)
     highlight = dict(zip(radiance, np.maximum(residual, 0), strict=True))
-    return Decomposed(shading, dict(zip(radiance, np.maximum(albedo, DARKEST), strict=True)), highlight)
+    return Decomposition(shading, dict(zip(radiance, np.maximum(albedo, DARKEST), strict=True)), highlight)
 
 
 def _shading(basis: np.ndarray, image: np.ndarray, albedo: np.ndarray, weight: np.ndarray) -> Float[np.ndarray, "9"]:
@@ -195,20 +187,19 @@ def _shading(basis: np.ndarray, image: np.ndarray, albedo: np.ndarray, weight: n
     return np.linalg.solve(gram, basis.T @ np.einsum("mn,m,mn->n", weight, albedo, image))
 
 
-def averaged(photos: Mapping[int, Decomposed]) -> tuple[dict[str, np.ndarray], dict[int, np.ndarray]]:
+def average_albedos(photos: Mapping[int, Decomposition]) -> tuple[dict[str, np.ndarray], dict[int, np.ndarray]]:
     """Return exp α by material and exp β by photo, [3] each: a_mi ≈ exp(α_m + β_i)."""
     names = sorted({n for p in photos.values() for n in p.albedo})
-    numbers = list(photos)
     pairs = [(names.index(n), k) for k, p in enumerate(photos.values()) for n in p.albedo]
-    known = np.log([photos[numbers[k]].albedo[names[m]] for m, k in pairs])
-    design = np.zeros((len(pairs), len(names) + len(numbers)))
+    albedos = np.log([albedo for p in photos.values() for albedo in p.albedo.values()])
+    design = np.zeros((len(pairs), len(names) + len(photos)))
     for row, (m, k) in enumerate(pairs):
         design[row, [m, len(names) + k]] = 1
-    parts = np.exp(np.linalg.lstsq(design, known, rcond=None)[0])
-    return dict(zip(names, parts[: len(names)], strict=True)), dict(zip(numbers, parts[len(names) :], strict=True))
+    parts = np.exp(np.linalg.lstsq(design, albedos, rcond=None)[0])
+    return dict(zip(names, parts, strict=False)), dict(zip(photos, parts[len(names) :], strict=True))
 
 
-def intrinsic(photos: Photos, truths: Truths) -> Prediction:
+def intrinsic(photos: Photos, truths: Materials) -> Prediction:
     """Decompose each photo, average.  Truths count by their Lambertian parts, for it states only those.
 
     New views have the average albedo, the photo's shading there, and its highlight, a texture, where the photo saw the
@@ -218,17 +209,17 @@ def intrinsic(photos: Photos, truths: Truths) -> Prediction:
     normals = photos.view.normals
     radiance = photos.radiance
     texture = Texture(photos.view)
-    parts = {li: decomposed(normals, {n: v for (n, at), v in radiance.items() if at == li}) for li in photos.lights}
-    albedo, scale = averaged(parts)
+    parts = {li: decompose(normals, {n: v for (n, k), v in radiance.items() if k == li}) for li in photos.lights}
+    albedo, scale = average_albedos(parts)
     relative = {n: Reflectance(tuple(albedo[n].tolist()), (0.0,) * 3, 1.0) for n in photos.materials}
-    factor = factor_of(relative, lambertian_part(truths))
+    factor = gauge_factor(relative, lambertian_part(truths))
     shading = {li: part.shading * scale[li] / factor for li, part in parts.items()}
-    materials = {n: times(m, factor) for n, m in relative.items()}
-    lights = {li: light_map(e) for li, e in shading.items()}
+    materials = {n: scale_reflectance(m, factor) for n, m in relative.items()}
+    lights = {li: light_of_shading(e) for li, e in shading.items()}
 
-    def of(material: str | Reflectance, light: int | Map, view: View) -> Radiance:
+    def render(material: str | Reflectance, light: int | Map, view: SphereView) -> Radiance:
         if isinstance(material, Reflectance):
-            return shown(material, lights[light], view)
+            return view.render(material, lights[light])
         if isinstance(light, int):
             coefficients = shading[light]
             highlight = parts[light].highlight[material]
@@ -236,6 +227,6 @@ def intrinsic(photos: Photos, truths: Truths) -> Prediction:
             highlight = np.mean([p.highlight[material] for p in parts.values() if material in p.highlight], axis=0)
             coefficients = LAMBERT[:, None] * light_coefficients(light)
         lit = np.maximum(harmonics(view.normals) @ coefficients, 0)
-        return np.array(materials[material].diffuse) * lit + texture.at(view, highlight, unseen=False)
+        return np.array(materials[material].diffuse) * lit + texture.render(view, highlight, fill=False)
 
-    return Prediction(materials, lights, True, of)
+    return Prediction(materials, lights, True, render)

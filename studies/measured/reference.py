@@ -31,7 +31,7 @@ from factorlib.images.exr import read_exr
 from factorlib.jsonfile import read_json, write_json
 from factorlib.runner import verbs
 from factorlib.runner.project import Project, photo_sets
-from studies.measured.tools import ROOT, Tables, evaluated, value_at
+from studies.measured.tools import ROOT, Tables, evaluate_dataset, value_at
 
 DATASET = "synthetic"
 SEEDS = 5
@@ -215,7 +215,7 @@ def main(reason: str) -> None:
         raise InputError("no reason is given", key="reason", cure=COMMAND)
     with tempfile.TemporaryDirectory() as folder:
         small = [run_small(Path(folder), seed) for seed in range(SEEDS)]
-    whole = [of_metrics(evaluated(DATASET, SET=f"solve.seed={seed}")) for seed in reversed(range(SEEDS))][::-1]
+    whole = [of_metrics(evaluate_dataset(DATASET, SET=f"solve.seed={seed}")) for seed in reversed(range(SEEDS))][::-1]
     for name, runs in (("small", small), (DATASET, whole)):
         write_json(FOLDER / f"{name}.json", new := stored(runs, reason, _before(name)))
         changed = [f"{new.numbers[p].meaning}: {a:.4g} -> {b:.4g}" for p, (a, b) in new.refreshes[0].changed.items()]

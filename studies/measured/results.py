@@ -18,13 +18,12 @@ from pathlib import Path
 import torch
 
 from factorlib.errors import InputError, did_you_mean
-from studies.measured.tools import ROOT, Tables, refresh, table
+from studies.measured.tools import ROOT, Tables, markdown_table, replace_sections
 
 PAGE = ROOT / "docs" / "results.md"
 SECTIONS = {  # module -> title
     "reference": "data/synthetic",
     "eames_like": "data/eames, and sets made alike",
-    "exact_sets": "Exact sets",
     "operator": "Reflection operators",
     "align": "Poses",
     "real_poses": "Poses of real photographs",
@@ -45,7 +44,7 @@ def machine() -> str:
 
 def section(name: str, tables: Tables, measured: str) -> str:
     """Return the Markdown of a section."""
-    parts = [f"**{title}**\n\n{table(rows[0], rows[1:])}" for title, rows in tables.items()]
+    parts = [f"**{title}**\n\n{markdown_table(rows[0], rows[1:])}" for title, rows in tables.items()]
     return "\n\n".join([f"## {SECTIONS[name]}", f"*{measured}; `make results ONLY={name}`*", *parts])
 
 
@@ -72,7 +71,7 @@ def main() -> int:
         except (InputError, SystemExit) as error:
             left[name] = error
             continue
-        refresh(PAGE, {name: section(name, tables, f"{machine()}, {time.perf_counter() - start:.0f} s")})
+        replace_sections(PAGE, {name: section(name, tables, f"{machine()}, {time.perf_counter() - start:.0f} s")})
         print(f"{PAGE}: {SECTIONS[name]}", flush=True)
     for name, error in left.items():
         print(f"'{SECTIONS.get(name, name)}' is left as it was: {error}", file=sys.stderr)
