@@ -160,7 +160,7 @@ class Row(msgspec.Struct, frozen=True):
     cells: dict[str, Cell]
 
 
-class Outcome(msgspec.Struct, frozen=True):
+class ClaimOutcome(msgspec.Struct, frozen=True):
     """Verdict of the seeds on a claim, and its sentence.
 
     difference: between its two sides;  paper: True where the paper makes it
@@ -187,7 +187,7 @@ class Conclusion(msgspec.Struct, frozen=True):
     seeds: tuple[int, ...]
     measures: tuple[str, ...]
     rows: list[Row]
-    claims: list[Outcome] = []
+    claims: list[ClaimOutcome] = []
 
     @property
     def answer(self) -> str:
@@ -230,7 +230,7 @@ def _by_seed(side: Side, measure: str, rows: Mapping[str, Row]) -> dict[int, flo
     return {seed: (last[0].values[seed] - value) / side[3] for seed, value in first.values.items()}
 
 
-def _outcome(claim: Claim, rows: Mapping[str, Row], comparisons: int) -> Outcome:
+def _outcome(claim: Claim, rows: Mapping[str, Row], comparisons: int) -> ClaimOutcome:
     """Judge a claim by the seeds, and put the outcome in a sentence."""
     sides = (claim.lower, claim.higher)
     s, verdict = difference(*(_by_seed(side, claim.measure, rows) for side in sides), comparisons)
@@ -243,7 +243,7 @@ def _outcome(claim: Claim, rows: Mapping[str, Row], comparisons: int) -> Outcome
         subject = name.replace("DSSIM, ", "DSSIM of ") if name.startswith("DSSIM") else f"the {name}"
         words = f"{HEADS[ANSWERS[verdict]].lower()} ({rise}{subject} in {first} against {second}: "
         words += f"{s.mean:+.2g}, {s.low:+.2g} to {s.high:+.2g} over {s.seeds} seeds)"
-    return Outcome(ANSWERS[verdict], f"{claim.words}: {words}.", s, claim.paper)
+    return ClaimOutcome(ANSWERS[verdict], f"{claim.words}: {words}.", s, claim.paper)
 
 
 # ── as text ──────────────────────────────────────────────────────────────────────────────────────────────────────────

@@ -52,8 +52,8 @@ from factorlib.results.materials import Reflectance
 from factorlib.results.poses import AS_IT_IS
 from factorlib.stage import Inputs
 from factorlib.wholefile import write_bytes, write_text
-from studies.errors import gauge_factor, scale_reflectance
 from studies.measured.tools import ROOT
+from studies.recovery_errors import gauge_factor, scale_reflectance
 
 GIVEN = {"chrome": Reflectance((0.0,) * 3, (0.7,) * 3, 0.15), "chalk": Reflectance((0.7,) * 3, (0.0,) * 3, 1.0)}
 TABLE = "given.json"  # the file of GIVEN, which nobody recovers
@@ -69,7 +69,6 @@ XYZ_OF_RGB = np.array(
     [[0.4124564, 0.2126729, 0.0193339], [0.3575761, 0.7151522, 0.119192], [0.1804375, 0.072175, 0.9503041]]
 )
 Image = Float[np.ndarray, "h w 3"]
-Mask = Bool[np.ndarray, "h w"]
 replace = msgspec.structs.replace
 
 
@@ -198,7 +197,9 @@ def _window(scenes: list) -> list[int]:
     return np.clip(corners, 0, (camera.width, camera.height)).astype(int).reshape(-1).tolist()
 
 
-def score(pair: Pair, repeated: Pair, parts: Mapping[str, Image], photo: Image, body: Mask) -> dict[str, Any]:
+def score(
+    pair: Pair, repeated: Pair, parts: Mapping[str, Image], photo: Image, body: Bool[np.ndarray, "h w"]
+) -> dict[str, Any]:
     """Measure the difference of a pair's images in a window of the photo.
 
     Args:

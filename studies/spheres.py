@@ -36,6 +36,7 @@ from factorlib.urm.observations import Observations
 from studies.study import SEVEN, Case, Comparison, light_name
 
 Map = Float[np.ndarray, "h w 3"]
+Maps = Mapping[int, Map]
 Normals = Float[np.ndarray, "n 3"]
 Radiance = Float[np.ndarray, "n 3"]
 TYPICAL = {  # by the names of `SEVEN`
@@ -202,7 +203,7 @@ class Photos(msgspec.Struct, frozen=True):
 
 
 def photograph(
-    case: Comparison, materials: Mapping[str, Reflectance], lights: Mapping[int, Map]
+    case: Comparison, materials: Mapping[str, Reflectance], lights: Maps
 ) -> tuple[Photos, dict[str, Observations]]:
     """Return the photos of a case, and the same as the stage `urm` hands them to `solve`."""
     tables = observe_spheres(case, materials, {li: octahedral_light(lights[li]) for li in case.lights})

@@ -91,7 +91,7 @@ class Case(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 class Comparison(Case, frozen=True, forbid_unknown_fields=True):
     """Photos of all methods, `size` pixels across, and the method that predicts others from them."""
 
-    method: Literal["ours", "intrinsic", "projective", "grey"] = "ours"
+    method: Literal["ours", "projective", "grey"] = "ours"
 
 
 class World(msgspec.Struct, frozen=True, forbid_unknown_fields=True):

@@ -67,8 +67,6 @@ def alignment_error_settings(scale: Scale) -> list[Setting]:
 
 
 COSTLY = ("turned-5", "turned-20", "shifted", "larger", "coarse")
-OUTLINE = ("turned-5", "turned-20", "larger")
-EVEN = ("turned-5", "coarse")
 ALIGNMENT_ERROR = Study(
     name="alignment-error",
     title="Alignment error",
@@ -84,13 +82,13 @@ ALIGNMENT_ERROR = Study(
             project_claim(
                 "entries", f"{p}-outline", p, f"fitting the outline helps where objects are {PERTURBED[p][0]}"
             )
-            for p in OUTLINE
+            for p in ("turned-5", "turned-20", "larger")
         ),
         *(
             project_claim(
                 "entries", p, f"{p}-even", f"knowing how sure normals are helps where objects are {PERTURBED[p][0]}"
             )
-            for p in EVEN
+            for p in ("turned-5", "coarse")
         ),
     ),
     lights=1,

@@ -3,7 +3,7 @@
 Nothing is declared anew: steps, keys, the store, locks, resuming, progress and the pool of processes are the runner's
 (`factorlib.runner`).  Results of studies have a store of their own in build/studies, those of quick ones in
 build/studies/quick, so that neither `make gc` nor a reader takes one for the other.  What the cases come to is no step:
-it is written anew after each run (`studies.run.page`), for it takes a second.
+it is written anew after each run (`studies.run.tables`), for it takes a second.
 """
 
 from collections.abc import Callable
@@ -110,7 +110,7 @@ def make(
         wish = verbs.Wish(name, targets=list(study.steps), settings=settings or [], force=force)
         codes.append(verbs.make(project, wish))
         if codes[-1] == 0:
-            from studies.run.page import write_index, write_study  # here: a plan must not pay for science
+            from studies.run.tables import write_index, write_study  # here: a plan must not pay for science
 
             folder = project.build / name
             write_study(study, scale, folder / study.steps[-1] / "scores.json", folder)
@@ -121,7 +121,7 @@ def make(
 
 def forget(scale: Scale, names: list[str], root: Path = LIBRARY) -> int:
     """Forget the results of studies; `collect` frees what they took.  Returns 0."""
-    from studies.run.page import FILES, write_index
+    from studies.run.tables import FILES, write_index
 
     project = studies(scale, root)
     for name in names:

@@ -2,7 +2,7 @@
 
 worlds, solve, score   sets of observations whose truth is known
 compare                methods that see the same photos
-photos, parts          rendered data sets, and parts of the model switched off
+rendered_sets, parts   rendered data sets, and parts of the model switched off
 """
 
 import msgspec

@@ -3,8 +3,8 @@
 Three kinds of pictures of the sphere, each compared with the truth by DSSIM inside the sphere's outline, after the tone
 map of `factorlib.evaluate.picture_errors` at an exposure that takes the truth's white to 1:
 
-    novel_view      every photographed entry, from `VIEWS`: the first shares a part of what it sees with the photo, the
-                    second little
+    novel_view      every photographed entry, from its side, a part of which is in the photo, and from its back, of which
+                    little is
     novel_light     every photographed material in the true lights of the world that no photo was taken in, from the
                     photos' side
     novel_material  every material of the world that was not photographed, in the light of every photo, from the photos'
@@ -19,7 +19,7 @@ and its processor seconds.  What a method does not state has no score.
 """
 
 import time
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from pathlib import Path
 
 import msgspec
@@ -30,21 +30,19 @@ from factorlib.evaluate.picture_errors import picture_error, white_of
 from factorlib.jsonfile import read_json, write_json
 from factorlib.results.materials import read_materials
 from factorlib.stage import Inputs, Progress
-from studies.errors import PARTS, Materials, in_gauge, light_errors, material_errors, read_recovered_maps
-from studies.methods import Prediction, grey, intrinsic, lambertian_part, projective, rendered
-from studies.spheres import Map, Radiance, SphereView, materials_of, photograph, read_maps, sphere_view
+from studies.baselines import MethodPrediction, grey, projective, rendered
+from studies.recovery_errors import PARTS, Materials, in_gauge, light_errors, material_errors, read_recovered_maps
+from studies.spheres import Maps, Radiance, SphereView, materials_of, photograph, read_maps, sphere_view
 from studies.steps import Params
 from studies.study import Comparison, Score, World
 
-VIEWS = {"side": (70.0, 15.0), "back": (160.0, -10.0)}  # azimuth and elevation of the camera, degrees
-FRONT = {"front": (0.0, 0.0)}  # the photos' own side
+VIEWS = {"side": (70.0, 15.0), "back": (160.0, -10.0), "front": (0.0, 0.0)}  # azimuth, elevation of a camera, degrees
 KINDS = ("novel_view", "novel_light", "novel_material")
 SUFFIXES = {"none": "", "scalar_per_set": "_scaled", "channel_per_photo": "_balanced"}
-INSTANT = {"projective": projective, "intrinsic": intrinsic, "grey": grey}  # methods that take less than a second
-Maps = Mapping[int, Map]
+INSTANT = {"projective": projective, "grey": grey}  # methods that take less than a second
 
 
-class Target(msgspec.Struct, frozen=True):
+class UnseenPhoto(msgspec.Struct, frozen=True):
     """A photo that was not taken: the kind of prediction, the material, the light, and the side it is seen from."""
 
     kind: str
@@ -53,10 +51,10 @@ class Target(msgspec.Struct, frozen=True):
     side: str
 
 
-class Picture(msgspec.Struct, frozen=True):
+class PredictedPhoto(msgspec.Struct, frozen=True):
     """The true picture of a target and the predicted one, as radiance; white: radiance that is shown as white."""
 
-    target: Target
+    target: UnseenPhoto
     view: SphereView
     truth: Radiance
     predicted: Radiance
@@ -90,9 +88,9 @@ def main(params: Params, inputs: Inputs, out: Path, progress: Progress) -> None:
     )
 
 
-def predict(case: Comparison, truths: Materials, maps: Maps, prediction: Prediction) -> list[Picture]:
+def predict(case: Comparison, truths: Materials, maps: Maps, prediction: MethodPrediction) -> list[PredictedPhoto]:
     """Return the pictures of all targets that the method predicts."""
-    cameras = {side: sphere_view(case.size, *angles) for side, angles in (VIEWS | FRONT).items()}
+    cameras = {side: sphere_view(case.size, *angles) for side, angles in VIEWS.items()}
     pictures = []
     for target in targets(case, truths, maps):
         view = cameras[target.side]
@@ -105,21 +103,21 @@ def predict(case: Comparison, truths: Materials, maps: Maps, prediction: Predict
             view,
         )
         if predicted is not None:
-            pictures.append(Picture(target, view, truth, predicted, white_of(view.picture(truth), view.inside)))
+            pictures.append(PredictedPhoto(target, view, truth, predicted, white_of(view.picture(truth), view.inside)))
     return pictures
 
 
-def targets(case: Comparison, truths: Materials, maps: Maps) -> Iterator[Target]:
+def targets(case: Comparison, truths: Materials, maps: Maps) -> Iterator[UnseenPhoto]:
     """Yield the targets of a case, the same for all methods."""
     names = list(truths)
-    yield from (Target("novel_view", names[m], li, side) for side in VIEWS for m, li in case.entries)
+    yield from (UnseenPhoto("novel_view", names[m], li, side) for side in ("side", "back") for m, li in case.entries)
     unobserved = sorted(maps.keys() - set(case.lights))
-    yield from (Target("novel_light", name, li, "front") for name in case.material_names for li in unobserved)
+    yield from (UnseenPhoto("novel_light", name, li, "front") for name in case.material_names for li in unobserved)
     others = [name for name in names if name not in case.material_names]
-    yield from (Target("novel_material", name, li, "front") for name in others for li in case.lights)
+    yield from (UnseenPhoto("novel_material", name, li, "front") for name in others for li in case.lights)
 
 
-def score_method(truths: Materials, maps: Maps, prediction: Prediction, pictures: list[Picture]) -> Score:
+def score_method(truths: Materials, maps: Maps, prediction: MethodPrediction, pictures: list[PredictedPhoto]) -> Score:
     """Score a method by its pictures, and by the materials and lights that it states."""
     score = Score({})
     for kind in KINDS:
@@ -128,8 +126,7 @@ def score_method(truths: Materials, maps: Maps, prediction: Prediction, pictures
             for gauge, factors in gauge_factors(*samples, below_white=True).items():
                 errors = [picture.dssim(factor) for picture, factor in zip(some, factors, strict=True)]
                 score |= Score({kind + SUFFIXES[gauge]: float(np.mean(errors))})
-    if prediction.materials:  # of a Lambertian method k_d alone, against the true k_d
-        truths = lambertian_part(truths) if prediction.lambertian else truths
-        parts = PARTS[:1] if prediction.lambertian else PARTS
-        score |= material_errors(prediction.materials, truths, dict.fromkeys(prediction.materials, 0), parts)
+    if materials := prediction.materials:  # of a Lambertian method k_d alone
+        parts = PARTS if any(any(m.specular) for m in materials.values()) else PARTS[:1]
+        score |= material_errors(materials, truths, dict.fromkeys(materials, 0), parts)
     return score | light_errors(prediction.lights, maps) if prediction.lights else score

@@ -14,7 +14,7 @@ from factorlib.results.lobe_table import read_lobes
 from factorlib.results.materials import Reflectance, read_materials
 from factorlib.stage import Inputs, Progress
 from factorlib.urm.observations import read_observations
-from studies.errors import ROWS, light_errors, material_errors
+from studies.recovery_errors import ROWS, light_errors, material_errors
 from studies.steps import Params
 from studies.steps.solve import run_solve
 
@@ -30,7 +30,7 @@ CHANGES = {  # of the observations
 def main(params: Params, inputs: Inputs, out: Path, progress: Progress) -> None:
     """Solve and compare."""
     case = inputs.facts["dataset.case"]
-    home = inputs["photos"] / str(case["seed"])
+    home = inputs["rendered_sets"] / str(case["seed"])
     dataset = read_dataset(home / "data")
     photos = sorted((home / "urm").glob("*.parquet"))
     tables = {file.stem: CHANGES[case["change"]](read_observations(file)) for file in photos}

@@ -2,7 +2,7 @@
 
 Pictures are spheres, whatever was observed: all normals of the half sphere toward the viewer.  They are compared by
 DSSIM inside the disc after the tone map of `factorlib.evaluate.picture_errors`, nothing scaled but for the gauge
-(`studies.errors`).
+(`studies.recovery_errors`).
 
     entries        recovered materials in recovered lights: every entry of the observed rows and columns; observed,
                    unobserved: those entries alone; no factor is in it where a material and a light are connected
@@ -37,7 +37,7 @@ from factorlib.evaluate.relighting import INSIDE, Appearances
 from factorlib.jsonfile import read_json, write_json
 from factorlib.results.materials import Solved, read_materials
 from factorlib.stage import Inputs, Progress
-from studies.errors import (
+from studies.recovery_errors import (
     Materials,
     gauge_factor,
     in_gauge,
@@ -46,12 +46,11 @@ from studies.errors import (
     read_recovered_maps,
     scale_reflectance,
 )
-from studies.spheres import Map, materials_of, read_maps
+from studies.spheres import Maps, materials_of, read_maps
 from studies.steps import Params
 from studies.study import Case, Score, World, light_name
 
 LEAST = 1e-3  # of a reflectance, below which a relative standard error means nothing
-Maps = Mapping[int, Map]
 
 
 def main(params: Params, inputs: Inputs, out: Path, progress: Progress) -> None:

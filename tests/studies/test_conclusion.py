@@ -17,7 +17,7 @@ from studies.conclusion import (
     spread,
 )
 from studies.run import studies
-from studies.run.page import write_index
+from studies.run.tables import write_index
 from studies.study import FULL, QUICK, Claim, Score, Setting, Study, case_name
 
 

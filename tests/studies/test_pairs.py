@@ -8,7 +8,7 @@ from factorlib.render.solved_set import SolvedSet
 from factorlib.results.materials import Reflectance
 from factorlib.stage import Inputs
 from studies import pairs as scene
-from studies.errors import scale_reflectance
+from studies.recovery_errors import scale_reflectance
 from tests.export import made_export
 
 GROUND = {"ground": {"point": [0, 1.2, 4], "normal": [0, -1, -0.2], "diffuse": [0.3, 0.3, 0.3]}}

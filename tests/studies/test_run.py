@@ -12,7 +12,7 @@ from factorlib.runner.dataset_state import survey
 from factorlib.runner.project import LIBRARY
 from factorlib.stage import Inputs, silent
 from studies.run import STUDIES, data_of, studies
-from studies.run.page import write_index, write_study
+from studies.run.tables import write_index, write_study
 from studies.steps import score, solve, worlds
 from studies.study import QUICK
 
@@ -41,9 +41,9 @@ def test_wrong_names_and_words_are_answered(words, environment, said):
             NAME,
             "solve",
             ["stages.solve", "factorlib.inference.joint_solver"],
-            ["errors", "steps.score", "catalogue.matrices"],
+            ["recovery_errors", "steps.score", "catalogue.matrices"],
         ),
-        ("comparison", "solve", ["stages.solve"], ["steps.compare", "methods"]),
+        ("comparison", "solve", ["stages.solve"], ["steps.compare", "baselines"]),
     ],
 )
 def test_a_change_of_the_scores_or_the_claims_solves_nothing_again(tmp_path, name, step, there, absent):
