@@ -1,4 +1,4 @@
-"""The prior on natural light, fitted to captured maps, and how well it foresees maps that it was not fitted to.
+"""Prior on natural light, fitted to captured maps, and its likelihood of maps that it was not fitted to.
 
     python -m studies.measured.light_prior FOLDER… [--out factorlib/light/prior.json]
 
@@ -169,10 +169,10 @@ def _weighted_means(
     towards = inverse @ design
     gram = design.T @ towards
     along = values @ towards
-    own = np.sum(values @ inverse * values, axis=1)
+    squares = np.sum(values @ inverse * values, axis=1)
     for _ in range(WEIGHTINGS):
         beta = np.linalg.solve(gram, weight @ along / weight.sum())
-        weight = (freedom + count) / (freedom + own - 2 * along @ beta + beta @ gram @ beta)
+        weight = (freedom + count) / (freedom + squares - 2 * along @ beta + beta @ gram @ beta)
     return beta, weight
 
 

@@ -1,6 +1,6 @@
 """Classes of the prior on materials, fitted to a table of measured materials.
 
-Usage: python -m studies.measured.material_classes FILE [--out factorlib/inference/material_classes.json]
+`python -m studies.measured.material_classes FILE [--out factorlib/inference/material_classes.json]` takes a second.
 
 FILE is a .csv with a row a material: its name in `material`, and the Lambert + GGX that was fitted to it: `k_s` and
 `roughness`, and `k_s_r`, `k_s_g` and `k_s_b`, whose ratios are the tint.  The class of a row is that whose words its

@@ -38,8 +38,7 @@ def machine() -> str:
     git = subprocess.run(["git", "describe", "--always", "--dirty"], cwd=ROOT, capture_output=True, text=True)
     facts = Path("/proc/cpuinfo").read_text() if Path("/proc/cpuinfo").exists() else ""
     model = next((line.partition(":")[2].strip() for line in facts.splitlines() if line.startswith("model name")), "?")
-    commit = git.stdout.strip() or "unknown"
-    return f"Version {version}, commit {commit}, {date.today()}, {os.cpu_count()} × {model}"
+    return f"Version {version}, commit {git.stdout.strip() or 'unknown'}, {date.today()}, {os.cpu_count()} × {model}"
 
 
 def section(name: str, tables: Tables, measured: str) -> str:

@@ -3,8 +3,8 @@
 Three kinds of pictures of the sphere, each compared with the truth by DSSIM inside the sphere's outline, after the tone
 map of `factorlib.evaluate.picture_errors` at an exposure that takes the truth's white to 1:
 
-    novel_view      every photographed entry, from its side, a part of which is in the photo, and from its back, of which
-                    little is
+    novel_view      every photographed entry, from its side, a part of which is in the photo, and from its back, little
+                    of which is
     novel_light     every photographed material in the true lights of the world that no photo was taken in, from the
                     photos' side
     novel_material  every material of the world that was not photographed, in the light of every photo, from the photos'
