@@ -40,12 +40,13 @@ def writes_set(options: Callable[..., tuple[ModuleType, msgspec.Struct]]) -> Cal
     `options` returns the set's module and its options from the command's own ones, which need another folder.
     """
 
-    def command(seed: Seed = 0, out: Out = None, lights: Lights = None, **own: bool | str | None) -> None:
-        if any(own.values()) and out is None:
-            *most, last = (f"--{name}" for name in own)
+    def command(seed: Seed = 0, out: Out = None, lights: Lights = None, **values: bool | str | None) -> None:
+        """Write the set."""
+        if any(values.values()) and out is None:
+            *most, last = (f"--{name}" for name in values)
             fault = f"data/{options.__name__} is the set without {', '.join(most)} and {last}: name another folder"
             raise typer.BadParameter(fault, param_hint="--out")
-        _write(*options(**own), out or Path("data", options.__name__), seed, lights)
+        _write(*options(**values), out or Path("data", options.__name__), seed, lights)
 
     shared = [each for each in signature(command).parameters.values() if each.kind is not each.VAR_KEYWORD]
     command.__signature__ = Signature([*shared, *signature(options).parameters.values()])  # type: ignore[attr-defined]

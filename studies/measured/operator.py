@@ -1,4 +1,6 @@
-"""Time and error of every reflection operator: `make results ONLY=operator` (a quarter of an hour of one core).
+"""Time and error of every reflection operator: `make results ONLY=operator`.
+
+Tables and the seconds of the measurement are written to docs/results.md.
 
 Error      of values |R − S| / (S + E/100), of gradients |∂R − ∂S| / (|∂S| + S + E/100); S by quadrature, E the lobe's
            integral
