@@ -51,7 +51,8 @@ def read_result(path: str | Path, type_: type[T], stage: str, cure: str = "") ->
     Raises:
         InputError: The file is not JSON, has another version, or does not fit the type; the error names the key.
     """
-    cure, text = cure or f"run the stage `{stage}` again", read_text(path, "JSON")
+    cure = cure or f"run the stage `{stage}` again"
+    text = read_text(path, "JSON")
     with reading("JSON", path, cure=cure):
         content = msgspec.json.decode(text)
         # a table called `version` is the entry of a photo of that name

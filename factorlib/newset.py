@@ -72,6 +72,20 @@ class Categories(msgspec.Struct):
     categories: list[Category]
 
 
+class Masks(msgspec.Struct):
+    """Masks of all photos.
+
+    Attributes:
+        materials: Names of the materials, label k the k-th, from 1.
+        by_photo: Path of a photo's mask with labels, or of the mask of each material.
+        silhouettes: Path of each object's mask, by photo and object, of photos with a mask with labels.
+    """
+
+    materials: list[str] = []
+    by_photo: dict[str, str | dict[str, str]] = {}
+    silhouettes: dict[str, dict[str, str]] = {}
+
+
 def new_dataset(target: Path, photos: Path, masks: Path | None, meshes: Path | None) -> list[str]:
     """Copy the files, write target/dataset.yaml, and return what is still missing, in words.
 
@@ -85,65 +99,94 @@ def new_dataset(target: Path, photos: Path, masks: Path | None, meshes: Path | N
         InputError: The target exists or cannot be created, or a folder is missing or has no photos.  It is also raised
             for a link, an unprintable file name, and too many pixels.
     """
+    above = _check_target(target)
+    images = _by_name(_files(photos, IMAGES, "PHOTOS"), "PHOTOS")
+    if not images:
+        fault = f"there are no photos ({', '.join(IMAGES[:6])}, …) in it"
+        raise InputError(fault, file=photos, key="PHOTOS", cure="name their folder")
+    mask_files = _files(masks, (".png", ".json"), "MASKS", deep=True) if masks is not None else []
+    mesh_files = _files(meshes, None, "MESHES", deep=True) if meshes is not None else []  # including .mtl and buffers
+    missing: list[str] = []
+    labelled = _masks(masks, mask_files, list(images), missing) if masks else Masks()
+    entries = _meshes(meshes, mesh_files, labelled.materials, missing) if meshes else {}
+    visible = _visible_meshes(list(images), entries, labelled, missing)
+    missing += _missing_masks(list(images), labelled) if masks is not None else [NO_MASKS]
+    missing += [
+        f"photo {photo}: write another `name`: a file of the results is called {photo}"
+        for photo in images
+        if photo in RESERVED_PHOTOS
+    ]
+    spec: dict = {"format": 1, "materials": labelled.materials or [UNKNOWN]}
+    if not entries:
+        several = {"parts": {name: name for name in labelled.materials}}
+        single = {"material": spec["materials"][0]}
+        entries = {HULL: {"hull": True, **(several if len(labelled.materials) > 1 else single)}}
+        spec["cameras"] = {"sfm": True}
+        visible = {photo: [HULL] for photo in images}
+        missing.append(NO_MESH)
+    if not labelled.materials and masks is not None:
+        missing.append("no mask names a material: write the names in `materials`, label k of a mask the k-th")
+    paths = {name: f"photos/{path.relative_to(photos)}" for name, path in images.items()}
+    spec |= {"meshes": entries, "photos": _photo_entries(paths, entries, visible, labelled)}
+    sources = {"photos": (photos, images.values()), "masks": (masks, mask_files), "meshes": (meshes, mesh_files)}
+    places = {name: (folder, files) for name, (folder, files) in sources.items() if folder is not None}
+    _match(spec, lambda name: places[name.partition("/")[0]][0] / name.partition("/")[2], missing)
+    _write(target, spec, places, above)
+    return missing
+
+
+def _check_target(target: Path) -> Path:
+    """Return the folder in which the target can be created.  Raises InputError where it cannot be."""
     if not target.name.isprintable():
         raise InputError(f"{target.name!a} cannot be printed", key="DATASET", cure="choose another name")
     if os.path.lexists(target):
         raise InputError("is there already", file=target, key="DATASET", cure="choose another name, or delete it")
     if not (above := next(path for path in target.absolute().parents if os.path.lexists(path))).is_dir():
         raise InputError("is no folder", file=above, key="DATASET", cure="name a folder that can be made")
-    named = _by_name(_files(photos, IMAGES, "PHOTOS"), "PHOTOS")
-    if not named:
-        fault = f"there are no photos ({', '.join(IMAGES[:6])}, …) in it"
-        raise InputError(fault, file=photos, key="PHOTOS", cure="name their folder")
-    missing: list[str] = []
-    of_masks = _files(masks, (".png", ".json"), "MASKS", deep=True) if masks is not None else []
-    of_meshes = _files(meshes, None, "MESHES", deep=True) if meshes is not None else []  # including .mtl and buffers
-    materials, of_photos, silhouettes = _masks(masks, of_masks, list(named), missing) if masks else ([], {}, {})
-    entries = _meshes(meshes, of_meshes, materials, missing) if meshes else {}
+    return above
+
+
+def _visible_meshes(
+    photos: list[str], entries: Mapping[str, dict[str, Any]], labelled: Masks, missing: list[str]
+) -> dict[str, list[str]]:
+    """Return the meshes that each photo shows, by the photo's name, else by the materials of its masks."""
     words = [(word, mesh) for mesh, entry in entries.items() for word in {mesh, *entry.get("parts", ())}]
     times = Counter(word for word, _ in words)
-    called = dict(words)
-    shown = {}
-    for photo in named:
-        own = of_photos[photo] if isinstance(of_photos.get(photo), dict) else ()
-        shown[photo] = _shown_in(photo, entries) or sorted({called[word] for word in own if times[word] == 1})
+    mesh_of = dict(words)
+    visible = {}
+    for photo in photos:
+        masks = labelled.by_photo.get(photo)
+        materials = masks if isinstance(masks, dict) else ()
+        visible[photo] = _shown_in(photo, entries) or sorted({mesh_of[word] for word in materials if times[word] == 1})
     if len(entries) > 1:
-        missing += [f"photo {photo}: write which of the meshes it shows" for photo in named if not shown[photo]]
-    if masks is None:
-        missing.append(NO_MASKS)
-    missing += [
-        f"photo {photo}: no mask called {photo}.png or {photo}_<material>.png"
-        for photo in named
-        if masks is not None and photo not in of_photos
-    ]
-    missing += [
-        f"photo {photo}: write another `name`: a file of the results is called {photo}"
-        for photo in named
-        if photo in RESERVED_PHOTOS
-    ]
-    spec: dict = {"format": 1, "materials": materials or [UNKNOWN]}
-    if not entries:
-        parts = {"parts": {name: name for name in materials}}
-        one = {"material": spec["materials"][0]}
-        entries = {HULL: {"hull": True, **(parts if len(materials) > 1 else one)}}
-        spec["cameras"] = {"sfm": True}
-        shown = {photo: [HULL] for photo in named}
-        missing.append(NO_MESH)
-    if not materials and masks is not None:
-        missing.append("no mask names a material: write the names in `materials`, label k of a mask the k-th")
-    spec |= {"meshes": entries, "photos": []}
-    for photo, path in named.items():
-        objects = [{"name": mesh, "mesh": mesh} for mesh in shown[photo] or [UNKNOWN] * bool(entries)]
-        if objects and silhouettes.get(photo):
+        missing += [f"photo {photo}: write which of the meshes it shows" for photo in photos if not visible[photo]]
+    return visible
+
+
+def _missing_masks(photos: list[str], labelled: Masks) -> list[str]:
+    """List the photos without a mask."""
+    without = [photo for photo in photos if photo not in labelled.by_photo]
+    return [f"photo {photo}: no mask called {photo}.png or {photo}_<material>.png" for photo in without]
+
+
+def _photo_entries(
+    paths: Mapping[str, str], entries: Collection[str], visible: Mapping[str, list[str]], labelled: Masks
+) -> list[dict[str, Any]]:
+    """Return `photos` of the dataset.yaml: each photo's picture, masks and objects."""
+    photos = []
+    for photo, path in paths.items():
+        objects = [{"name": mesh, "mesh": mesh} for mesh in visible[photo] or [UNKNOWN] * bool(entries)]
+        if objects and (silhouettes := labelled.silhouettes.get(photo)):
             only = objects[0]["mesh"] if len(objects) == 1 else UNKNOWN
-            mesh_of = {name: (_shown_in(name, entries) or [only])[0] for name in silhouettes[photo]}
-            objects = [{"name": name, "mesh": mesh_of[name], "mask": mask} for name, mask in silhouettes[photo].items()]
-        image = f"photos/{path.relative_to(photos)}"
-        mask = of_photos.get(photo, UNKNOWN)
-        spec["photos"].append({"name": photo, "image": image, "masks": mask, "objects": objects})
-    sources = {"photos": (photos, named.values()), "masks": (masks, of_masks), "meshes": (meshes, of_meshes)}
-    places = {name: (folder, files) for name, (folder, files) in sources.items() if folder is not None}
-    _match(spec, lambda name: places[name.partition("/")[0]][0] / name.partition("/")[2], missing)
+            mesh_of = {name: (_shown_in(name, entries) or [only])[0] for name in silhouettes}
+            objects = [{"name": name, "mesh": mesh_of[name], "mask": mask} for name, mask in silhouettes.items()]
+        mask = labelled.by_photo.get(photo, UNKNOWN)
+        photos.append({"name": photo, "image": path, "masks": mask, "objects": objects})
+    return photos
+
+
+def _write(target: Path, spec: dict, places: Mapping[str, tuple[Path, Iterable[Path]]], above: Path) -> None:
+    """Write the dataset.yaml and copies of the files into the folder `target`, which is there when all of it is."""
     text = re.sub(r'"([\w-]+|\?)\\x1F([^"]*)"', lambda m: f"{yaml_text(m[1]).split()[0]}  # {m[2]}", yaml_text(spec))
     try:
         target.parent.mkdir(parents=True, exist_ok=True)
@@ -157,7 +200,6 @@ def new_dataset(target: Path, photos: Path, masks: Path | None, meshes: Path | N
         cure = "name a folder that can be made"
         known = disk_error(error, target.parent)
         raise known or InputError("no folder can be made here", file=above, key="DATASET", cure=cure) from error
-    return missing
 
 
 def _copy(source: Path, target: Path, files: Iterable[Path]) -> None:
@@ -167,63 +209,73 @@ def _copy(source: Path, target: Path, files: Iterable[Path]) -> None:
         shutil.copyfile(path, place)
 
 
-def _masks(
-    folder: Path, paths: list[Path], photos: list[str], missing: list[str]
-) -> tuple[list[str], Mapping[str, str | dict[str, str]], dict[str, dict[str, str]]]:
-    """Return the materials, the masks by photo, and the silhouettes by photo and object.
-
-    A photo's mask is a path, or {material: path}.  Only photos with a mask of labels have silhouettes.
-    """
+def _masks(folder: Path, paths: list[Path], photos: list[str], missing: list[str]) -> Masks:
+    """Return the masks in a folder, of a COCO file or of PNGs."""
     file = {path: f"masks/{path.relative_to(folder)}" for path in paths}
-    names: dict[str, None] = {}
     if coco := [path for path in paths if path.suffix.lower() == ".json"]:
-        with reading("COCO", coco[0], cure="it needs images, annotations and categories"):
-            categories = msgspec.json.decode(read_bytes(coco[0], "COCO"), type=Categories).categories
-        for category in categories:
-            names[name := _word(category.name)] = None
-            if name != category.name:
-                letters = "names are made of A-Z a-z 0-9 _ and -"
-                missing.append(f"{file[coco[0]]}: rename its category {category.name!r} to {name!r}: {letters}")
+        materials = _coco_materials(coco[0], file[coco[0]], missing)
         missing += [f"{file[path]}: a second COCO file is not used" for path in coco[1:]]
-        return list(names), dict.fromkeys(photos, file[coco[0]]), {}
+        return Masks(materials, dict.fromkeys(photos, file[coco[0]]))
     labels = 0
-    of_photos: dict[str, str | dict[str, str]] = {}
-    silhouettes = {}
-    known = set(photos)
-    own: dict[str, Path] = {}
-    further: dict[str, dict[str, str]] = {photo: {} for photo in photos}
-    for path in paths:
-        name = _word(path.stem)
-        if name in known:  # Even kitchen_2.png may be the mask of a photo of that name.
-            if path.parent == folder:
-                own.setdefault(name, path)
-        elif path.parent == folder:
-            for cut in (k for k, letter in enumerate(name) if letter == "_"):
-                if name[:cut] in known:
-                    further[name[:cut]][name[cut + 1 :]] = file[path]
-        elif path.parent.parent == folder and path.parent.name in known:
-            further[path.parent.name][name] = file[path]
+    names: dict[str, None] = {}
+    masks = Masks()
+    whole, further = _masks_by_photo(folder, paths, photos)
     for photo in photos:
-        each = dict(sorted(further[photo].items()))
-        if whole := own.get(photo):
-            with (
-                reading("a PNG", whole, photo, "save the mask again, as PNG"),
-                Image.open(whole, formats=["PNG"]) as png,
-            ):
-                size = png.size
-            check_pixels(size, MOST_MEGAPIXELS, whole, photo)
-            values = set(np.unique(read_values(whole, photo)).tolist())
+        each = {name: file[path] for name, path in sorted(further[photo].items())}
+        if photo in whole:
+            values = _labels_in(whole[photo], photo)
             labels = max([labels, *(value for value in values if value <= MAX_MATERIALS)])
             if values <= {0, LEFT_OUT}:
                 cure = f"the mask of one material is called {photo}_<material>.png"
-                fault = f"{whole.name} has no label, for {LEFT_OUT} means left out"
+                fault = f"{whole[photo].name} has no label, for {LEFT_OUT} means left out"
                 missing.append(f"photo {photo}: {fault}; {cure}")
-            of_photos[photo] = file[whole]
-            silhouettes[photo] = each
+            masks.by_photo[photo] = file[whole[photo]]
+            masks.silhouettes[photo] = each
         elif each:
-            of_photos[photo] = each
+            masks.by_photo[photo] = each
             names |= dict.fromkeys(each)
-    return list(names) or [f"label_{k}" for k in range(1, labels + 1)], of_photos, silhouettes
+    masks.materials = list(names) or [f"label_{k}" for k in range(1, labels + 1)]
+    return masks
+
+
+def _coco_materials(path: Path, file: str, missing: list[str]) -> list[str]:
+    """Return the materials of a COCO file, by names that a dataset.yaml can have."""
+    with reading("COCO", path, cure="it needs images, annotations and categories"):
+        categories = msgspec.json.decode(read_bytes(path, "COCO"), type=Categories).categories
+    names = {category.name: _word(category.name) for category in categories}
+    for name, word in names.items():
+        if word != name:
+            letters = "names are made of A-Z a-z 0-9 _ and -"
+            missing.append(f"{file}: rename its category {name!r} to {word!r}: {letters}")
+    return list(dict.fromkeys(names.values()))
+
+
+def _masks_by_photo(
+    folder: Path, paths: list[Path], photos: list[str]
+) -> tuple[dict[str, Path], dict[str, dict[str, Path]]]:
+    """Return the mask with labels of each photo, and its masks of single materials or objects by their names."""
+    whole: dict[str, Path] = {}
+    further: dict[str, dict[str, Path]] = {photo: {} for photo in photos}
+    for path in paths:
+        name = _word(path.stem)
+        if name in further:  # Even kitchen_2.png may be the mask of a photo of that name.
+            if path.parent == folder:
+                whole.setdefault(name, path)
+        elif path.parent == folder:
+            for cut in (k for k, letter in enumerate(name) if letter == "_"):
+                if name[:cut] in further:
+                    further[name[:cut]][name[cut + 1 :]] = path
+        elif path.parent.parent == folder and path.parent.name in further:
+            further[path.parent.name][name] = path
+    return whole, further
+
+
+def _labels_in(path: Path, photo: str) -> set[int]:
+    """Return the values of the pixels of a mask.  Raises InputError for a file that is no PNG or too large."""
+    with reading("a PNG", path, photo, "save the mask again, as PNG"), Image.open(path, formats=["PNG"]) as png:
+        size = png.size
+    check_pixels(size, MOST_MEGAPIXELS, path, photo)
+    return set(np.unique(read_values(path, photo)).tolist())
 
 
 def _meshes(folder: Path, files: list[Path], materials: list[str], missing: list[str]) -> dict[str, dict[str, Any]]:

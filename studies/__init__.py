@@ -1,11 +1,11 @@
-"""Every experiment of the paper, and those beyond it, as commands: `make studies`, `make study STUDY=matrix-size`.
+"""Experiments of the paper, and those beyond it, as commands: `make studies`, `make study STUDY=matrix-size`.
 
-A study solves made sets of observations in many settings and compares the answers with what the sets were made of.
+A study solves sets of observations in many settings and compares the answers with the truth.
 
 catalogue   all studies: what each varies, what it measures, what the paper says; begin there, and in `study`,
             to add one
-steps       what is done for each case, as steps that the project's runner keeps and resumes; on `spheres`, `objects`,
-            `body`, `methods`
+steps       what is done for each case, as steps that the project's runner stores and resumes; on `spheres`, `objects`,
+            `baselines`, `recovery_errors`
 conclusion  measures, statistics over seeds, tables and sentences
-run         how the runner sees a study, and the page
+run         studies as the runner's data sets, and the page
 """

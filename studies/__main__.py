@@ -41,7 +41,7 @@ def run(
         raise typer.Exit(forget(scale, named or list(STUDIES)))
     code = make(scale, named or list(STUDIES), switched_on("FORCE", False), [os.environ.get("SET", "")])
     if docs and code == 0 and not scale.quick:
-        from studies.run.page import refresh_docs
+        from studies.run.tables import refresh_docs
 
         refresh_docs(named or list(STUDIES))
     raise typer.Exit(code)

@@ -14,7 +14,7 @@ import msgspec
 import numpy as np
 from scipy.stats import t as student
 
-from studies.measured.tools import exact
+from studies.measured.tools import format_number, markdown_table
 from studies.study import Claim, Scale, Score, Side, Study, case_name, settings_of
 
 # ── measures ─────────────────────────────────────────────────────────────────────────────────────────────────────────
@@ -33,8 +33,6 @@ MEASURES = {  # label, and the unit where there is one; lower is better where th
     "mirror": "error of a mirror sphere|RMSE over the truth's RMS",
     "glossy": "error of a glossy sphere|RMSE over the truth's RMS",
     "lambertian": "error of a Lambertian sphere|RMSE over the truth's RMS",
-    "chair": "DSSIM of a chair",
-    "chair_scaled": "DSSIM of a chair, a factor per channel taken out",
     "normals": "median error of the normals given|degrees",
     "seconds": "processor time of a solve|s",
     "stated_roughness": "stated standard error of roughness",
@@ -78,6 +76,7 @@ ANSWERS = {
     "not shown": "no difference is shown",
     "too few seeds": "not tested: too few seeds",
 }
+HEADS = {"agrees": "Shown", "disagrees": "The opposite is shown", "no difference is shown": "No difference is shown"}
 
 
 class Spread(msgspec.Struct, frozen=True):
@@ -97,7 +96,8 @@ def spread(values: Sequence[float], doubt: float = DOUBT) -> Spread:
     >>> s.mean, s.deviation, round(s.high - s.mean, 3)
     (2.0, 1.0, 2.484)
     """
-    n, mean = len(values), float(np.mean(values))
+    n = len(values)
+    mean = float(np.mean(values))
     if n < 2:
         return Spread(mean, n)
     deviation = float(np.std(values, ddof=1))
@@ -147,8 +147,9 @@ class Cell(msgspec.Struct, frozen=True):
         >>> str(Cell(spread([0.1, 0.12]), {})), str(Cell(spread([0.1]), {}))
         ('0.11 ± 0.13', '0.1')
         """
-        mean, high = exact(self.spread.mean, 3), self.spread.high
-        return mean if high is None else f"{mean} ± {exact(high - self.spread.mean)}"
+        mean = format_number(self.spread.mean, 3)
+        high = self.spread.high
+        return mean if high is None else f"{mean} ± {format_number(high - self.spread.mean)}"
 
 
 class Row(msgspec.Struct, frozen=True):
@@ -159,10 +160,10 @@ class Row(msgspec.Struct, frozen=True):
     cells: dict[str, Cell]
 
 
-class Outcome(msgspec.Struct, frozen=True):
+class ClaimOutcome(msgspec.Struct, frozen=True):
     """Verdict of the seeds on a claim, and its sentence.
 
-    difference: of its two sides;  paper: whether the paper makes it
+    difference: between its two sides;  paper: True where the paper makes it
     """
 
     answer: str
@@ -174,8 +175,7 @@ class Outcome(msgspec.Struct, frozen=True):
 class Conclusion(msgspec.Struct, frozen=True):
     """Content of a study's table.json.
 
-    quick:    what stands beside everything that is shown of a quick study; empty of a full one
-    over:     what intervals are over;  notes: sentences that are no claims
+    quick: caveat that stands beside everything of a quick study; empty for a full one
     """
 
     study: str
@@ -187,14 +187,7 @@ class Conclusion(msgspec.Struct, frozen=True):
     seeds: tuple[int, ...]
     measures: tuple[str, ...]
     rows: list[Row]
-    claims: list[Outcome] = []
-    over: str = "seeds"
-    notes: list[str] = []
-
-    @property
-    def sentences(self) -> list[str]:
-        """Sentences on what the seeds say of each claim, then the notes."""
-        return [tested.sentence for tested in self.claims] + self.notes
+    claims: list[ClaimOutcome] = []
 
     @property
     def answer(self) -> str:
@@ -203,42 +196,31 @@ class Conclusion(msgspec.Struct, frozen=True):
         It agrees where all claims of the paper are shown, and in part where some are.
         It disagrees where the opposite of one is shown.
         """
-        answers = [tested.answer for tested in self.claims if tested.paper]
+        answers = [outcome.answer for outcome in self.claims if outcome.paper]
         if self.quick:
             return f"not tested ({self.quick})"
         if not answers:
             return "the paper claims nothing that is tested here"
-        shown = answers.count("agrees")
-        if "disagrees" in answers or not 0 < shown < len(answers):
+        agreeing = answers.count("agrees")
+        if "disagrees" in answers or not 0 < agreeing < len(answers):
             return "disagrees" if "disagrees" in answers else answers[0]
-        return f"agrees in part: {shown} of {len(answers)} claims are shown"
+        return f"agrees in part: {agreeing} of {len(answers)} claims are shown"
 
 
-def concluded(study: Study, scale: Scale, scores: Mapping[str, Score]) -> Conclusion:
-    """Return the table of a study and what its claims come to; scores: by the names of its cases."""
-    seeds, rows = study.numbers(scale), {}
-    for s in study.settings(scale):
-        of, cells = {n: scores[case_name(s.name, n)] for n in seeds}, {}
+def conclude(study: Study, scale: Scale, scores: Mapping[str, Score]) -> Conclusion:
+    """Return the table of a study and the outcomes of its claims; scores: by the names of its cases."""
+    rows = {}
+    for setting in study.settings(scale):
+        by_seed = {seed: scores[case_name(setting.name, seed)] for seed in scale.seeds}
+        cells = {}
         for m in MEASURES:
-            values = {n: score.values[m] for n, score in of.items() if m in score.values}
-            nulls = {n: score.nulls[m] for n, score in of.items() if m in score.nulls}
+            values = {seed: score.values[m] for seed, score in by_seed.items() if m in score.values}
+            nulls = {seed: score.nulls[m] for seed, score in by_seed.items() if m in score.nulls}
             cells |= {m: Cell(spread(list(values.values())), values, nulls)} if values else {}
-        rows[s.name] = Row(s.name, s.label, cells)
-    tested = [] if scale.quick else [_outcome(c, rows, len(study.claims), study.over) for c in study.claims]
-    table = Conclusion(
-        study.name,
-        study.title,
-        study.question,
-        study.paper,
-        study.varied,
-        NO_CONCLUSION if scale.quick else "",
-        seeds,
-        study.measures,
-        list(rows.values()),
-        tested,
-        study.over,
-    )
-    return msgspec.structs.replace(table, notes=study.notes(table))
+        rows[setting.name] = Row(setting.name, setting.label, cells)
+    outcomes = [] if scale.quick else [_outcome(claim, rows, len(study.claims)) for claim in study.claims]
+    head = (study.name, study.title, study.question, study.paper, study.varied, NO_CONCLUSION if scale.quick else "")
+    return Conclusion(*head, scale.seeds, study.measures, list(rows.values()), outcomes)
 
 
 def _by_seed(side: Side, measure: str, rows: Mapping[str, Row]) -> dict[int, float]:
@@ -248,43 +230,71 @@ def _by_seed(side: Side, measure: str, rows: Mapping[str, Row]) -> dict[int, flo
     return {seed: (last[0].values[seed] - value) / side[3] for seed, value in first.values.items()}
 
 
-def _outcome(claim: Claim, rows: Mapping[str, Row], comparisons: int, over: str) -> Outcome:
+def _outcome(claim: Claim, rows: Mapping[str, Row], comparisons: int) -> ClaimOutcome:
     """Judge a claim by the seeds, and put the outcome in a sentence."""
     sides = (claim.lower, claim.higher)
     s, verdict = difference(*(_by_seed(side, claim.measure, rows) for side in sides), comparisons)
     labels = [" to ".join(f"“{rows[name].label}”" for name in settings_of(side)) for side in sides]
     first, second = ("a guess" if side[0] == "guess" else words for side, words in zip(sides, labels, strict=True))
     if verdict == "too few seeds":
-        words = f"not tested: {s.seeds} of at least {LEAST_SEEDS} {over} were run"
+        words = f"not tested: {s.seeds} of at least {LEAST_SEEDS} seeds were run"
     else:
-        said = {"lower": "shown", "higher": "the opposite is shown", "not shown": "no difference is shown"}[verdict]
         name, rise = label(claim.measure), "the rise of " if claim.lower[0] == "rise" else ""
         subject = name.replace("DSSIM, ", "DSSIM of ") if name.startswith("DSSIM") else f"the {name}"
-        words = f"{said} ({rise}{subject} in {first} against {second}: "
-        words += f"{s.mean:+.2g}, {s.low:+.2g} to {s.high:+.2g} over {s.seeds} {over})"
-    return Outcome(ANSWERS[verdict], f"{claim.words}: {words}.", s, claim.paper)
+        words = f"{HEADS[ANSWERS[verdict]].lower()} ({rise}{subject} in {first} against {second}: "
+        words += f"{s.mean:+.2g}, {s.low:+.2g} to {s.high:+.2g} over {s.seeds} seeds)"
+    return ClaimOutcome(ANSWERS[verdict], f"{claim.words}: {words}.", s, claim.paper)
 
 
 # ── as text ──────────────────────────────────────────────────────────────────────────────────────────────────────────
 
-HEAD = ("study", "setting", "label", "measure", "unit", "seeds", "mean", "deviation", "low_95", "high_95", "null_mean")
+COLUMNS = (
+    "study",
+    "setting",
+    "label",
+    "measure",
+    "unit",
+    "seeds",
+    "mean",
+    "deviation",
+    "low_95",
+    "high_95",
+    "null_mean",
+)
 
 
 def csv_text(table: Conclusion) -> str:
     """Format a line for each setting and measure."""
-    out = io.StringIO()
-    writer = csv.writer(out, lineterminator="\n")
-    writer.writerow(HEAD)
+    text = io.StringIO()
+    writer = csv.writer(text, lineterminator="\n")
+    writer.writerow(COLUMNS)
     for row in table.rows:
         for measure, cell in row.cells.items():
-            s, unit = cell.spread, MEASURES[measure].partition("|")[2]
+            s = cell.spread
             numbers = ("" if v is None else f"{v:.6g}" for v in (s.mean, s.deviation, s.low, s.high, cell.null))
+            unit = MEASURES[measure].partition("|")[2]
             writer.writerow([table.study, row.name, row.label, measure, unit, s.seeds, *numbers])
-    return out.getvalue()
+    return text.getvalue()
 
 
 def paragraph(table: Conclusion) -> str:
-    """Write the question, what the paper says, and what the seeds say of each claim, as Markdown."""
+    """Write the question, the paper's answer, the outcome of each claim, and the table, as Markdown."""
     quick = f" *{table.quick}.*" if table.quick else ""
     start = f"**{table.title}.** {table.question}{quick} The paper: {table.paper}"
-    return "\n".join([start, "", *(f"- {sentence}" for sentence in table.sentences)]) + "\n"
+    lines = [start, "", *(f"- {outcome.sentence}" for outcome in table.claims), "", numbers(table, len(table.measures))]
+    return "\n".join(lines) + "\n"
+
+
+def numbers(table: Conclusion, most: int) -> str:
+    """Return a Markdown table of the first measures of a study, at most so many."""
+    measures = table.measures[:most]
+    rows = [[row.label, *(str(row.cells.get(m, "–")) for m in measures)] for row in table.rows]
+    return markdown_table([table.varied, *map(head, measures)], rows)
+
+
+def claims(table: Conclusion) -> str:
+    """Return a line for each answer that seeds give, with the claims that have it."""
+    by_answer: dict[str, list[str]] = {}
+    for claim in table.claims:
+        by_answer.setdefault(HEADS.get(claim.answer, claim.answer), []).append(claim.sentence.partition(": ")[0])
+    return "\n".join(f"- **{answer}**: {'; '.join(sentences)}." for answer, sentences in by_answer.items())

@@ -3,12 +3,12 @@
 The solve may be given another pose or mesh than the true one.
 
 The camera is so far that rays are parallel to a third of a degree at most: radiance is of one view direction, by the
-quadrature that spheres have.  Neither shadows nor light between surfaces are rendered, so that what is measured is what
-wrong geometry does and nothing else.
+quadrature that spheres have.  Neither shadows nor light between surfaces are rendered, so that wrong geometry is the
+only source of errors.
 
-Pixels     those that both the true body and the one of the perturbed pose and mesh show, as the stage `urm` takes them
-Noise      drawn for each pixel by itself: a perturbation leaves what a pixel shows as it is
-Normals    of the mesh that is given, at the pose that is given: perturbed, or fitted to the outline from there
+Pixels     covered by both the true body and the one of the perturbed pose and mesh, as the stage `urm` takes them
+Noise      of each pixel by itself: a perturbation does not change it
+Normals    of the given mesh at the given pose: perturbed, or fitted to the outline from there
 """
 
 from collections.abc import Mapping
@@ -38,7 +38,9 @@ from studies.spheres import GRAZING
 from studies.study import Case, Objects, light_name
 
 BODIES = ("blob", "jug", "hook")
-SIDE, FILL, FAR = 160, 0.9, 100.0  # pixels of a picture; the mesh's diameter, the focal length over that
+SIDE = 160  # pixels of a picture
+FILL = 0.9  # share of it that the mesh's diameter takes
+FAR = 100.0  # focal length over the picture's side
 CAMERA = Camera(SIDE, SIDE, FAR * SIDE, (SIDE / 2, SIDE / 2))
 
 
@@ -52,16 +54,18 @@ def body(name: str, triangles: int | None = None) -> Caster:
     return Caster(bodies.mesh_of(parts, name))
 
 
-def observed(
+def observe_objects(
     case: Case, materials: Mapping[str, Reflectance], lights: Mapping[int, OctahedralLight]
 ) -> tuple[dict[str, Observations], float]:
-    """Return one photo a light, by name, and the mean error of the normals given, degrees.
+    """Return one photo a light, by name, and the mean error of the given normals, degrees.
 
-    Pixels of a photo's entries are numbered on.  The error of an entry is the median angle to the true normals.
+    An entry's row y is its number in the photo.  The error of an entry is the median angle to the true normals.
     """
-    table, photos, errors = list(materials.values()), {}, []
+    table = list(materials.values())
+    photos = {}
+    errors = []
     for li in case.lights:
-        parts = [_entry(case, m, li, table[m], lights[li]) for m, at in case.entries if at == li]
+        parts = [_entry(case, m, li, table[m], lights[li]) for m, light in case.entries if light == li]
         y = np.repeat(np.arange(len(parts)), [len(part) for part, _ in parts])
         photos[light_name(li)] = msgspec.structs.replace(concatenate([part for part, _ in parts]), y=y)
         errors += [error for _, error in parts]
@@ -69,40 +73,45 @@ def observed(
 
 
 def _entry(case: Case, m: int, li: int, material: Reflectance, light: OctahedralLight) -> tuple[Observations, float]:
-    how, rng, name = case.objects, np.random.default_rng([14, case.seed, m, li]), BODIES[(m + li) % len(BODIES)]
+    rng = np.random.default_rng([14, case.seed, m, li])
+    name = BODIES[(m + li) % len(BODIES)]
     # the body's middle in the middle of the picture, which it fills
-    whole, rotation = body(name), Rotation.random(rng=rng).as_matrix()
-    middle = np.array([0.0, 0.0, 2 * CAMERA.focal * whole.radius / (FILL * SIDE)])
-    truth = Pose(rotation, middle - rotation @ whole.centre)
-    true_maps, (mesh, pose) = rasterise(whole, CAMERA, truth), perturbed(name, truth, how, rng)
+    true_mesh = body(name)
+    rotation = Rotation.random(rng=rng).as_matrix()
+    middle = np.array([0.0, 0.0, 2 * CAMERA.focal * true_mesh.radius / (FILL * SIDE)])
+    true_pose = Pose(rotation, middle - rotation @ true_mesh.centre)
+    true_maps = rasterise(true_mesh, CAMERA, true_pose)
+    # the mesh, the pose and the confidence that the solve gets
+    mesh, pose = perturbed(name, true_pose, case.objects, rng)
     outline = Silhouette(true_maps.label.astype(np.int16))
-    maps = rasterise(mesh, CAMERA, fitted(mesh, pose, outline) if how.refined else pose)
-    sure = confidence(maps, outline) if how.confidence else np.ones(maps.label.shape)
-    both = (true_maps.label > 0) & (maps.label > 0) & (sure > 0) & (maps.normal @ FRONT > GRAZING)
-    pixels = np.flatnonzero(both.reshape(-1))
-    pixels = np.sort(rng.permutation(pixels)[: how.pixels])
-    true, given = (of.normal.reshape(-1, 3)[pixels] for of in (true_maps, maps))
-    radiance = ball(light, material, true @ YUP_FROM_CAMERA.T)
+    maps = rasterise(mesh, CAMERA, fit_outline(mesh, pose, outline) if case.objects.refined else pose)
+    weights = confidence(maps, outline) if case.objects.confidence else np.ones(maps.label.shape)
+    covered = (true_maps.label > 0) & (maps.label > 0) & (weights > 0) & (maps.normal @ FRONT > GRAZING)
+    pixels = np.sort(rng.permutation(np.flatnonzero(covered.reshape(-1)))[: case.objects.pixels])
+    true, normals = (each.normal.reshape(-1, 3)[pixels] for each in (true_maps, maps))
     noise = np.random.default_rng([13, case.seed, li, m, 0]).standard_normal((maps.label.size, 3))[pixels]
-    labels, names = np.full(len(pixels), case.materials.index(m)), tuple(case.material_names)
-    weight = sure.reshape(-1)[pixels]
+    radiance = ball(light, material, true @ YUP_FROM_CAMERA.T) * (1 + case.noise * noise)
+    labels = np.full(len(pixels), case.materials.index(m))
+    weight = weights.reshape(-1)[pixels]
     columns = {"x": pixels, "y": np.zeros(len(pixels), int), "weight": weight, "confidence": weight}
-    noisy = radiance * (1 + case.noise * noise)
-    return observations_from_front(given, noisy, labels, names, light_name(li), **columns), angle_deg(true, given)
+    names = tuple(case.material_names)
+    photo = observations_from_front(normals, radiance, labels, names, light_name(li), **columns)
+    return photo, angle_deg(true, normals)
 
 
-def perturbed(name: str, truth: Pose, how: Objects, rng: np.random.Generator) -> tuple[Caster, Pose]:
+def perturbed(name: str, truth: Pose, errors: Objects, rng: np.random.Generator) -> tuple[Caster, Pose]:
     """Return the mesh and the pose that stand for a body whose true pose is `truth`."""
-    whole, mesh = body(name), body(name, how.triangles)
-    if how.larger:
-        mesh = Caster(scaled(mesh.mesh, (1 + how.larger,) * 3))
+    true_mesh = body(name)
+    mesh = body(name, errors.triangles)
+    if errors.larger:
+        mesh = Caster(scaled(mesh.mesh, (1 + errors.larger,) * 3))
     axis, side = (v / np.linalg.norm(v) for v in (rng.normal(size=3), np.append(rng.normal(size=2), 0.0)))
-    rotation = rotation_of_vector(np.radians(how.turned_deg) * axis) @ truth.rotation
-    middle = truth.rotation @ whole.centre + truth.translation + how.shifted * 2 * whole.radius * side
-    return mesh, Pose(rotation, middle - rotation @ (whole.centre * (1 + how.larger)))
+    rotation = rotation_of_vector(np.radians(errors.turned_deg) * axis) @ truth.rotation
+    middle = truth.rotation @ true_mesh.centre + truth.translation + errors.shifted * 2 * true_mesh.radius * side
+    return mesh, Pose(rotation, middle - rotation @ (true_mesh.centre * (1 + errors.larger)))
 
 
-def fitted(mesh: Caster, pose: Pose, outline: Silhouette) -> Pose:
+def fit_outline(mesh: Caster, pose: Pose, outline: Silhouette) -> Pose:
     """Return the pose nearby whose contours lie on those of the mask, as the stage `align` ends a search."""
     target = make_target(ObjectView(outline, CAMERA), mesh.mesh.labels, 200, 0.1)
     return refine(mesh, target, pose_state(pose, CAMERA, mesh), 12).state.pose(mesh)

@@ -1,30 +1,28 @@
-"""Pairs of pictures of a made set: is a new object in a photograph told apart from a true one?
+"""Pairs of pictures of a rendered set: can an inserted object be told from a true one?
 
-Usage: `python -m studies.pairs build/eames …`
+`python -m studies.pairs build/eames` writes pairs.csv and pictures/ to build/studies/pairs.  It traces seven windows a
+pair.
 
-One picture of a pair is made by what was recovered, the other by what is true. Written to build/studies/pairs:
-pairs.csv and pictures/.
-
-Both are made by the recipe `insert`, with the same mesh, samples, and pixel at which the object touches the ground.
-True are the light of the photograph, infinitely far away as the recipe takes it, the materials, and the plane on which
-the true poses and lenses put the chairs.  So a pair shows what recovering costs, and not what the recipe leaves out,
-such as walls near by.
+One picture of a pair is made by the recovered light, materials and ground, the other by the true ones.  Both are made
+by the recipe `insert`, with the same mesh, samples, and pixel at which the object touches the ground.  The truth is the
+light of the photograph, infinitely far away as the recipe takes it, the materials, and the plane on which the true
+poses and lenses put the chairs.  So a pair shows the errors of recovery, and not the recipe's simplifications, such as
+walls near by.
 
 Observer   mean ΔE (CIE 1976, after a blur of σ = 1 pixel) over the object, or over the ground that either picture
            changes, whichever is larger. A pair is told apart where it is above the just noticeable difference, 2.3
-           (Mahy, Van Eycken and Oosterlinck, 1994), and above the floor: that of two truths of different noise, or of
-           two pictures by what was recovered.
+           (Mahy, Van Eycken and Oosterlinck, 1994), and above the floor: that of two pictures which differ by noise
+           alone.
 Cause      the same with one factor recovered and the others true.  The factor per channel between materials and lights,
            which no photograph tells, is first moved from the lights to the materials, so it counts as theirs.
 """
 
-import csv
-import io
 import sys
 from collections.abc import Iterator, Mapping
+from contextlib import suppress
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import Annotated, Any
+from typing import Annotated, Any, NamedTuple
 
 import msgspec
 import numpy as np
@@ -54,24 +52,34 @@ from factorlib.results.materials import Reflectance
 from factorlib.results.poses import AS_IT_IS
 from factorlib.stage import Inputs
 from factorlib.wholefile import write_bytes, write_text
-from studies.errors import factor_of, times
 from studies.measured.tools import ROOT
+from studies.recovery_errors import gauge_factor, scale_reflectance
 
 GIVEN = {"chrome": Reflectance((0.0,) * 3, (0.7,) * 3, 0.15), "chalk": Reflectance((0.7,) * 3, (0.0,) * 3, 1.0)}
-TABLE, MESHES = "given.json", ("ball", "chair", "vase.obj", "blob.obj")  # the file of GIVEN, which nobody recovers
-NOTICED, CHANGED, BLUR = 2.3, 1.0, 1.0  # ΔE; ΔE; pixels
-AROUND, LEAST = 1.4, 60  # half a window's width in the object's larger extent, and in pixels at least
-PLACES = 100  # that are tried for an object
+TABLE = "given.json"  # the file of GIVEN, which nobody recovers
+MESHES = ("ball", "chair", "vase.obj", "blob.obj")
+NOTICEABLE = 2.3  # ΔE
+CHANGED = 1.0  # ΔE
+BLUR = 1.0  # pixels
+AROUND = 1.4  # half a window's width in the object's larger extent
+LEAST = 60  # the same in pixels
+TRIALS = 100  # places that are tried for an object
 FACTORS = ("light", "material", "ground")
 XYZ_OF_RGB = np.array(
     [[0.4124564, 0.2126729, 0.0193339], [0.3575761, 0.7151522, 0.119192], [0.1804375, 0.072175, 0.9503041]]
 )
-Picture, Mask = Float[np.ndarray, "h w 3"], Bool[np.ndarray, "h w"]
-Both, Sets = tuple[Picture, Picture], tuple[SolvedSet, SolvedSet]  # by what was recovered, and by the truth
+Image = Float[np.ndarray, "h w 3"]
 replace = msgspec.structs.replace
 
 
-class Truth(SolvedSet):
+class Pair(NamedTuple):
+    """Images of one window: by the recovered light, materials and ground, and by the true ones."""
+
+    recovered: Image
+    true: Image
+
+
+class TrueSet(SolvedSet):
     """Set of `factorlib.generate eames` with its true materials, lights, poses and lenses.
 
     The meshes are the solve's.
@@ -82,19 +90,21 @@ class Truth(SolvedSet):
         if dataset.truth is None or set(dataset.spec.meshes) != {"chair"}:
             cure = "make one: python -m factorlib.generate eames --seed N --out FOLDER"
             raise InputError("it is no set of chairs with a truth", file=dataset.folder, cure=cure)
-        self.truth, self.folder = dataset.truth, dataset.folder
+        self.truth = dataset.truth
+        self.folder = dataset.folder
         lens = {shot.name: shot.focal_35mm for shot in SET.shots}
         self.table = replace(self.table, model=replace(self.table.model, tone={}))
         true = self.truth.materials.items()
         self.materials = {name: Reflectance(m.diffuse, m.specular, m.roughness) for name, m in true}
-        for photo, found in self.poses.items():
+        for photo, estimate in self.poses.items():
             height, width = self._masks(photo)["label"].shape
-            focal, middle = focal_px_of_35mm(lens[photo], width, height), (width / 2, height / 2)
-            camera = replace(found.camera, focal_px=focal, principal_point=middle)
-            poses = self.truth.poses[photo].items()
-            places = {n: {"rotation": p.rotation, "translation": p.translation, "scale": AS_IT_IS} for n, p in poses}
-            objects = {name: replace(found.objects[name], **place) for name, place in places.items()}
-            self.poses[photo] = replace(found, camera=camera, objects=objects)
+            focal = focal_px_of_35mm(lens[photo], width, height)
+            camera = replace(estimate.camera, focal_px=focal, principal_point=(width / 2, height / 2))
+            objects = {
+                n: replace(estimate.objects[n], rotation=p.rotation, translation=p.translation, scale=AS_IT_IS)
+                for n, p in self.truth.poses[photo].items()
+            }
+            self.poses[photo] = replace(estimate, camera=camera, objects=objects)
 
     def light(self, name: str) -> DistantLight:
         """Return the true map of a photo's light."""
@@ -108,7 +118,7 @@ class Truth(SolvedSet):
 
 
 def write_files(folder: Path) -> dict[str, Path]:
-    """Write what recipes of pairs name: the table of GIVEN, and the meshes that are no set's; as files of `Inputs`."""
+    """Write the recipes' table of GIVEN, and the meshes that no set has; return them as files of `Inputs`."""
     files = {name: folder / name for name in (TABLE, *MESHES) if "." in name}
     write_json(files[TABLE], {"materials": GIVEN})
     for body, path in ((SHAPES[path.stem](), path) for path in files.values() if path.stem in SHAPES):
@@ -116,95 +126,106 @@ def write_files(folder: Path) -> dict[str, Path]:
     return {f"recipe file:{name}": path for name, path in files.items()}
 
 
-def chosen(sets: Mapping[str, Sets], count: int, samples: int, seed: int) -> Iterator[tuple[str, str, InsertRecipe]]:
-    """Draw sets, photos and recipes of pairs, by a seed alone.
+def sample_recipes(
+    recovered: SolvedSet, truth: SolvedSet, count: int, samples: int, seed: int
+) -> Iterator[tuple[str, InsertRecipe]]:
+    """Draw photos and recipes of pairs, by a seed alone.
 
-    Photos, meshes and materials are about equally often, places, sizes and turns at random.
-
-    sets: what was recovered, and the truth
-
-    A place where the recipe would refuse or move the object in either is drawn anew; InputError where that happens
-    `PLACES` times.
+    Photos, meshes and materials are about equally often, places, sizes and turns at random.  A place where the recipe
+    would refuse or move the object in either is drawn anew; InputError where that happens `TRIALS` times.
     """
     rng = np.random.default_rng(seed)
-    shots, numbers = [(name, photo) for name, of in sets.items() for photo in of[0].photos], np.arange(count)
-    for shot, mesh, number in np.column_stack([rng.permutation(numbers) for _ in range(3)]):
-        name, photo = shots[shot % len(shots)]
-        results, materials = sets[name][0], [*sets[name][0].materials, *GIVEN]
-        camera, factor = results.scene(photo).camera, results.poses[photo].camera.factor
-        what = {"mesh": MESHES[mesh % len(MESHES)], "material": materials[number % len(materials)], "table": TABLE}
-        for _ in range(PLACES):
+    photos = list(recovered.photos)
+    materials = [*recovered.materials, *GIVEN]
+    for k, mesh, material in np.column_stack([rng.permutation(count) for _ in range(3)]):
+        photo = photos[k % len(photos)]
+        camera = recovered.scene(photo).camera
+        factor = recovered.poses[photo].camera.factor
+        fields = {"mesh": MESHES[mesh % len(MESHES)], "material": materials[material % len(materials)], "table": TABLE}
+        for _ in range(TRIALS):
             at = rng.uniform((0.15, 0.6), (0.85, 0.95)) * (camera.width, camera.height) * factor
             size, turn = rng.uniform((0.3, 0.0), (0.5, 360.0)).tolist()
-            recipe = InsertRecipe(**what, at=tuple(at.tolist()), size=size, turn=turn, samples=samples)
-            try:
-                if any(insertion_scene(recipe, of, photo).moved for of in sets[name]):
-                    continue
-            except InputError:
-                continue
-            yield name, photo, recipe
-            break
+            recipe = InsertRecipe(**fields, at=tuple(at.tolist()), size=size, turn=turn, samples=samples)
+            with suppress(InputError):
+                if not any(insertion_scene(recipe, solved, photo).moved for solved in (recovered, truth)):
+                    yield photo, recipe
+                    break
         else:
             raise InputError(f"photo '{photo}' has no place for an object", key="photos", cure="name another set")
 
 
-def drawn(photo: str, recipe: InsertRecipe, recovered: SolvedSet, truth: SolvedSet) -> tuple[Both, dict[str, Any]]:
-    """Return the window of the photo about the object, linear, by what was recovered and by the truth.
+def render_pair(
+    photo: str, recipe: InsertRecipe, recovered: SolvedSet, truth: SolvedSet
+) -> tuple[Pair, dict[str, Any]]:
+    """Return the window of the photo about the object, linear, and the scores of the pair (`score`)."""
+    sets = Pair(recovered, truth)
+    scenes = [insertion_scene(recipe, solved, photo) for solved in sets]
+    factor = gauge_factor(recovered.materials, truth.materials)
+    scene = scenes[0].scene
+    materials = {name: scale_reflectance(m, factor) for name, m in scene.materials.items()}
+    scenes[0] = replace(scenes[0], scene=replace(scene, materials=materials, light=scene.light.scaled(1 / factor)))
+    left, top, right, bottom = _window(scenes)
+    window = slice(top, bottom), slice(left, right)
 
-    The second value is how they differ (`scores`).
+    def trace(light: bool, material: bool, ground: bool, seed: int = 1) -> tuple[Image, InsertionResult]:
+        """Trace the window with these factors true, the others recovered."""
+        insertion = scenes[ground]
+        lit = {"light": scenes[light].scene.light, "materials": scenes[material].scene.materials}
+        camera = insertion.scene.camera.window(left, top, 1.0, right - left, bottom - top)
+        insertion = replace(insertion, scene=replace(insertion.scene, camera=camera, **lit))
+        background = sets[light].straightened(photo)[window]
+        result = inserted(insertion, background, recovered.covered(photo)[window], recipe.samples, seed=seed)
+        return sets[light].tone(photo)(result.composite), result
+
+    (image, result), (true_image, true_result) = trace(False, False, False), trace(True, True, True)
+    for k, each in enumerate((result, true_result)):  # the reflectance of each ground, estimated in its own light
+        scenes[k] = replace(scenes[k], ground=replace(scenes[k].ground, diffuse=tuple(each.ground.tolist())))
+    parts = {name: trace(*(name != each for each in FACTORS))[0] for name in FACTORS}
+    pair = Pair(image, true_image)
+    repeated = Pair(*(trace(true, true, true, seed=2)[0] for true in (False, True)))
+    body = np.maximum(result.coverage, true_result.coverage) > 0.5
+    return pair, score(pair, repeated, parts, recovered.photo(photo)[window], body)
+
+
+def _window(scenes: list) -> list[int]:
+    """Return left, top, right and bottom of a square about the objects of the scenes, inside the photo."""
+    camera = scenes[0].scene.camera
+    pixels = np.concatenate([s.scene.camera.project(s.new.vertices @ YUP_FROM_CAMERA) for s in scenes])
+    low, high = pixels.min(axis=0), pixels.max(axis=0)
+    half = max(AROUND * (high - low).max(), LEAST)
+    corners = np.rint([(low + high) / 2 - half, (low + high) / 2 + half])
+    return np.clip(corners, 0, (camera.width, camera.height)).astype(int).reshape(-1).tolist()
+
+
+def score(
+    pair: Pair, repeated: Pair, parts: Mapping[str, Image], photo: Image, body: Bool[np.ndarray, "h w"]
+) -> dict[str, Any]:
+    """Measure the difference of a pair's images in a window of the photo.
+
+    Args:
+        pair: Images of the pair.
+        repeated: The same with other noise.
+        parts: Images with one factor recovered, by its name.
+        photo: The photo without the object.
+        body: Pixels of the object.
     """
-    sets, ours = {True: recovered, False: truth}, insertion_scene(recipe, recovered, photo)
-    true, factor = insertion_scene(recipe, truth, photo), factor_of(recovered.materials, truth.materials)
-    materials = {name: times(m, factor) for name, m in ours.scene.materials.items()}
-    scene = replace(ours.scene, materials=materials, light=ours.scene.light.scaled(1 / factor))
-    places = {True: replace(ours, scene=scene), False: true}
-    pixels = [of.scene.camera.project(of.new.vertices @ YUP_FROM_CAMERA) for of in (ours, true)]
-    low, high = np.concatenate(pixels).min(axis=0), np.concatenate(pixels).max(axis=0)
-    half, size = max(AROUND * (high - low).max(), LEAST), (scene.camera.width, scene.camera.height)
-    ends = np.clip(np.rint([(low + high) / 2 - half, (low + high) / 2 + half]), 0, size).astype(int)
-    (left, top), (width, height) = ends[0].tolist(), (ends[1] - ends[0]).tolist()
-    window = slice(top, top + height), slice(left, left + width)
+    recovered, true, before = (cielab(image) for image in (*pair, photo))
+    changed = (difference(recovered, before) > CHANGED) | (difference(true, before) > CHANGED)
+    ground = binary_dilation(body | changed, iterations=2) & ~binary_dilation(body)
 
-    def traced(light: bool, material: bool, ground: bool, seed: int = 1) -> tuple[Picture, InsertionResult]:
-        """Trace the window with these factors recovered, the others true."""
-        here, seen = places[ground], sets[light].straightened(photo)[window]
-        lit = {"light": places[light].scene.light, "materials": places[material].scene.materials}
-        scene = replace(here.scene, camera=here.scene.camera.window(left, top, 1.0, width, height), **lit)
-        covered = recovered.covered(photo)[window]
-        found = inserted(replace(here, scene=scene), seen, covered, recipe.samples, seed=seed)
-        return sets[light].tone(photo)(found.composite), found
+    def error(image: Image, reference: Image) -> float:
+        errors = difference(cielab(image), reference)
+        return float(max(errors[region].mean() for region in (body, ground) if region.any()))
 
-    (mine, found), (right, other) = traced(True, True, True), traced(False, False, False)
-    for side, of in ((True, found), (False, other)):  # the reflectance of each ground, found in its own light
-        places[side] = replace(places[side], ground=replace(places[side].ground, diffuse=tuple(of.ground.tolist())))
-    parts = {name: traced(*(name == each for each in FACTORS))[0] for name in FACTORS}
-    again = traced(True, True, True, seed=2)[0], traced(False, False, False, seed=2)[0]
-    body = np.maximum(found.coverage, other.coverage) > 0.5
-    return (mine, right), scores((mine, right), again, parts, recovered.photo(photo)[window], body)
+    whole = error(pair.recovered, true)
+    floor = max(error(repeated.recovered, recovered), error(repeated.true, true))
+    errors = {name: error(image, true) for name, image in parts.items()}
+    verdict = {"told_apart": whole > max(NOTICEABLE, floor), "cause": max(errors, key=errors.__getitem__)}
+    return {"difference": whole, "floor": floor, **errors, **verdict}
 
 
-def scores(pair: Both, again: Both, parts: Mapping[str, Picture], photo: Picture, body: Mask) -> dict[str, Any]:
-    """Measure the difference of a pair's pictures, by what was recovered and by the truth, in a window of the photo.
-
-    again: both with other noise;  parts: with one factor recovered, by name;  body: the object's pixels
-    """
-    lab, true, before = cielab(pair[0]), cielab(pair[1]), cielab(photo)
-    changed = (difference(lab, before) > CHANGED) | (difference(true, before) > CHANGED)
-    region = binary_dilation(body | changed, iterations=2)
-    ground = region & ~binary_dilation(body)
-
-    def error(picture: Picture, than: Picture) -> float:
-        of = difference(cielab(picture), than)
-        return float(max(of[where].mean() for where in (body, ground) if where.any()))
-
-    by = {"difference": error(pair[0], true), "floor": max(error(again[0], lab), error(again[1], true))}
-    by |= {name: error(picture, true) for name, picture in parts.items()}
-    told = {"told_apart": by["difference"] > max(NOTICED, by["floor"])}
-    return by | told | {"cause": max(parts, key=by.__getitem__)}
-
-
-def cielab(radiance: Picture) -> Picture:
-    """Return L*, a*, b* of what a screen shows of linear Rec. 709 (white D65), blurred as an eye does.
+def cielab(radiance: Image) -> Image:
+    """Return L*, a*, b* of linear Rec. 709 (white D65) on a screen, blurred as by an eye.
 
     >>> cielab(np.ones((3, 3, 3)))[1, 1].round(2).tolist()
     [100.0, 0.0, 0.0]
@@ -214,40 +235,36 @@ def cielab(radiance: Picture) -> Picture:
     return np.stack([116 * f[..., 1] - 16, 500 * (f[..., 0] - f[..., 1]), 200 * (f[..., 1] - f[..., 2])], axis=-1)
 
 
-def difference(a: Picture, b: Picture) -> Float[np.ndarray, "h w"]:
+def difference(a: Image, b: Image) -> Float[np.ndarray, "h w"]:
     """Return ΔE (CIE 1976) of each pixel of two pictures in CIELAB."""
     return np.linalg.norm(a - b, axis=-1)
 
 
 def main(
-    results: Annotated[list[Path], typer.Argument(help="results of made sets of chairs, such as build/eames")],
+    build: Annotated[Path, typer.Argument(help="results of a rendered set of chairs, such as build/eames")],
     count: Annotated[int, typer.Option(min=1, help="pairs")] = 20,
     samples: Annotated[int, typer.Option(min=1, help="a pixel")] = 256,
-    seed: Annotated[int, typer.Option(min=0, help="of what is inserted where")] = 39,
+    seed: Annotated[int, typer.Option(min=0, help="of objects and their places")] = 39,
 ) -> None:
-    """Make pairs, and a table of how they differ."""
-    home, rows, sets = ROOT / "build/studies/pairs", [], {}
-    (home / "pictures").mkdir(parents=True, exist_ok=True)
+    """Render pairs, and write a table of their differences."""
+    out = ROOT / "build/studies/pairs"
+    rows = []
+    (out / "pictures").mkdir(parents=True, exist_ok=True)
     with TemporaryDirectory() as folder:
-        files = write_files(Path(folder))
-        for result in results:
-            loaded = load_result(result)
-            inputs = replace(loaded._solved.inputs, files=loaded._solved.inputs.files | files)
-            dataset = read_dataset(ROOT / read_text(loaded.folder / "dataset.txt", "a path").strip())
-            sets[loaded.folder.name] = SolvedSet(inputs), Truth(inputs, dataset)
-        for name, photo, recipe in chosen(sets, count, samples, seed):
-            both, numbers = drawn(photo, recipe, *sets[name])
-            pair = f"{len(rows) + 1:02}-{name}-{photo}"
-            rows.append({"pair": pair, "object": f"{recipe.material} {Path(recipe.mesh).stem}", **numbers})
-            for kind, radiance in zip(("inserted", "true"), both, strict=True):
-                write_bytes(home / "pictures" / f"{pair}-{kind}.png", png_bytes(picture(radiance, 1.0)))
-            print(f"  {pair}, {rows[-1]['object']}: ΔE {numbers['difference']:.1f}", flush=True)
-    table = io.StringIO()
-    writer = csv.DictWriter(table, list(rows[0]), lineterminator="\n")
-    writer.writeheader()
-    writer.writerows(rows)
-    write_text(home / "pairs.csv", table.getvalue())
-    print(f"{sum(row['told_apart'] for row in rows)} of {len(rows)} pairs are told apart: {home / 'pairs.csv'}")
+        result = load_result(build)
+        inputs = replace(result._solved.inputs, files=result._solved.inputs.files | write_files(Path(folder)))
+        dataset = read_dataset(ROOT / read_text(result.folder / "dataset.txt", "a path").strip())
+        sets = SolvedSet(inputs), TrueSet(inputs, dataset)
+        for photo, recipe in sample_recipes(*sets, count, samples, seed):
+            pair, scores = render_pair(photo, recipe, *sets)
+            name = f"{len(rows) + 1:02}-{result.folder.name}-{photo}"
+            rows.append({"pair": name, "object": f"{recipe.material} {Path(recipe.mesh).stem}", **scores})
+            for kind, image in zip(("inserted", "true"), pair, strict=True):
+                write_bytes(out / "pictures" / f"{name}-{kind}.png", png_bytes(picture(image, 1.0)))
+            print(f"  {name}, {rows[-1]['object']}: ΔE {scores['difference']:.1f}", flush=True)
+    lines = [",".join(map(str, row)) for row in (rows[0], *(row.values() for row in rows))]
+    write_text(out / "pairs.csv", "\n".join([*lines, ""]))
+    print(f"{sum(row['told_apart'] for row in rows)} of {len(rows)} pairs are told apart: {out / 'pairs.csv'}")
 
 
 if __name__ == "__main__":

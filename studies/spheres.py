@@ -1,36 +1,45 @@
-"""Materials and lights of a seed, spheres of the ones in the others, and what a case observes of them.
+"""Spheres of a world's materials in its lights: what a case of a study observes, and what a camera sees of them.
 
-Materials  about those of `ABOUT`, each number times exp(.15 · normal).
+Materials  those of `TYPICAL`, each number times exp(0.15 · normal).
 Lights     by the project's own generator (`factorlib.generate`): the first of a world is a street by day, the others
-           are rooms. Mean radiance 1.
-Radiance   by quadrature of the lights' maps (`factorlib.evaluate.ball`), not by the operator that solves: what a solve
-           is judged on is not made by its own approximations.
-Noise      each radiance times 1 + noise · normal, .01 as a rule, drawn for each entry by itself, so that an entry that
-           two cases show has the same noise in both.
+           are rooms.  Mean radiance 1.
+Radiance   by quadrature of the lights' maps (`factorlib.evaluate.ball`), not by the operator that solves, whose errors
+           the comparison with the truth must include.
+Noise      each radiance times 1 + noise · normal, 0.01 as a rule, independent of the case's other entries: an entry has
+           the same noise in all cases.
 Normals    perturbed after rendering: the solve gets a normal that is not the pixel's.
-Labels     likewise: the pixel is of one material, its label names another one of the same photo.
+Labels     likewise: a wrong label names another material of the same photo.
 Facets     rendered so: a flat-sided object, whose normals are true but few.
+
+Points and normals of a sphere of radius 1 are equal, in the photo's light frame (x right, y up, z toward the viewer).
 """
 
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 
+import msgspec
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
+from scipy.spatial.transform import Rotation
 
 from factorlib.conventions import FRONT, YUP_FROM_CAMERA
-from factorlib.evaluate.ball import OctahedralLight, ball
+from factorlib.evaluate.ball import OctahedralLight, ball, octahedral_light
 from factorlib.generate.surroundings import random_materials
 from factorlib.generate.synthetic import light_of
 from factorlib.geometry.sphere import ball_normals
 from factorlib.images.exr import read_rgb_exr
+from factorlib.light.latlong import rotate_map
 from factorlib.results.materials import Reflectance
 from factorlib.scenes.joint_problems import observations_from_front
 from factorlib.tracing.scene import look
 from factorlib.urm.observations import Observations
-from studies.study import SEVEN, Case, light_name
+from studies.study import SEVEN, Case, Comparison, light_name
 
-ABOUT = {  # by the names of `SEVEN`
+Map = Float[np.ndarray, "h w 3"]
+Maps = Mapping[int, Map]
+Normals = Float[np.ndarray, "n 3"]
+Radiance = Float[np.ndarray, "n 3"]
+TYPICAL = {  # by the names of `SEVEN`
     "brick": Reflectance((0.5, 0.12, 0.1), (0.08, 0.08, 0.08), 0.6),
     "leaf": Reflectance((0.1, 0.35, 0.14), (0.25, 0.25, 0.25), 0.35),
     "lacquer": Reflectance((0.12, 0.16, 0.24), (0.4, 0.4, 0.4), 0.22),
@@ -43,14 +52,15 @@ SPREAD = 0.15
 GRAZING = 0.15  # n·o below which no pixel is observed
 STEEPEST = 0.25  # n·o of the faces that are observed at the flattest angle
 CURVED = 0.1  # share of a face's normals that is the sphere's: no real face is exactly flat
+SUPERSAMPLING = 2  # samples along a texel's side where a map is turned
 
 
 def materials_of(seed: int, names: Sequence[str] = SEVEN[:5]) -> dict[str, Reflectance]:
     """Return the materials of a world by name."""
-    return random_materials(np.random.default_rng([11, seed]), SPREAD, {name: ABOUT[name] for name in names})
+    return random_materials(np.random.default_rng([11, seed]), SPREAD, {name: TYPICAL[name] for name in names})
 
 
-def light_map(seed: int, light: int, rows: int, spp: int) -> Float[np.ndarray, "h w 3"]:
+def light_map(seed: int, light: int, rows: int, spp: int) -> Map:
     """Return light number `light` of a world, lat-long in the camera's y-up frame, mean radiance 1.
 
     It is the same however many others there are.
@@ -62,29 +72,15 @@ def light_map(seed: int, light: int, rows: int, spp: int) -> Float[np.ndarray, "
     return (radiance / radiance.mean()).astype(np.float32)
 
 
-def read_maps(worlds: Path, seed: int, lights: Iterable[int]) -> dict[int, Float[np.ndarray, "h w 3"]]:
+def read_maps(worlds: Path, seed: int, lights: Iterable[int]) -> dict[int, Map]:
     """Read the maps of lights of a world, by number, from the folder of the step `worlds`."""
     return {li: read_rgb_exr(worlds / f"{seed}-{li}.exr") for li in lights}
 
 
-def sphere_normals(size: int) -> Float[np.ndarray, "n 3"]:
-    """Return normals in the light's frame of a sphere `size` pixels across, seen orthographically.
-
-    Grazing ones are left out.
-    """
-    normals, _ = ball_normals(size)
-    return normals[normals[:, 2] > GRAZING]
+# ── observations ─────────────────────────────────────────────────────────────────────────────────────────────────────
 
 
-def in_camera(normals: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
-    """Turn normals of the light's frame into the camera's."""
-    return normals @ YUP_FROM_CAMERA.T
-
-
-# ── what a case observes ─────────────────────────────────────────────────────────────────────────────────────────────
-
-
-def observations_of(
+def observe_spheres(
     case: Case, materials: Mapping[str, Reflectance], lights: Mapping[int, OctahedralLight]
 ) -> dict[str, Observations]:
     """Return one photo a light, by name, in the form in which the stage `urm` hands them to `solve`."""
@@ -92,22 +88,21 @@ def observations_of(
 
 
 def _photo(case: Case, number: int, materials: Sequence[Reflectance], light: OctahedralLight) -> Observations:
-    rows = [m for m, li in case.entries if li == number]
-    normals, index = faceted(sphere_normals(case.size), case.facets), case.materials.index
+    entries = [m for m, li in case.entries if li == number]
+    labels = [case.materials.index(m) for m in entries]
+    normals = faceted(sphere_view(case.size).normals, case.facets)
+    columns = []
+    for m, label in zip(entries, labels, strict=True):
+        noise, tilt, mislabel = (np.random.default_rng([13, case.seed, number, m, k]) for k in range(3))
+        radiance = ball(light, materials[m], normals)
+        noisy = radiance * (1 + case.noise * noise.standard_normal(radiance.shape))
+        turned = tilted(normals @ YUP_FROM_CAMERA.T, case.normal_deg, tilt)
+        columns.append((turned, noisy, mislabelled(len(normals), label, labels, case.wrong_labels, mislabel)))
+    photo = map(np.concatenate, zip(*columns, strict=True))
+    return observations_from_front(*photo, tuple(case.material_names), light_name(number))
 
-    def rng(m: int, what: str) -> np.random.Generator:
-        return np.random.default_rng([13, case.seed, number, m, ("noise", "normals", "labels").index(what)])
 
-    exact = [ball(light, materials[m], normals) for m in rows]
-    noisy = [r * (1 + case.noise * rng(m, "noise").standard_normal(r.shape)) for m, r in zip(rows, exact, strict=True)]
-    turned = [tilted(in_camera(normals), case.normal_deg, rng(m, "normals")) for m in rows]
-    others = [index(m) for m in rows]
-    labels = [mislabelled(len(normals), index(m), others, case.wrong_labels, rng(m, "labels")) for m in rows]
-    columns = (np.concatenate(turned), np.concatenate(noisy), np.concatenate(labels))
-    return observations_from_front(*columns, tuple(case.material_names), light_name(number))
-
-
-def tilted(normals: Float[np.ndarray, "n 3"], degrees: float, rng: np.random.Generator) -> Float[np.ndarray, "n 3"]:
+def tilted(normals: Normals, degrees: float, rng: np.random.Generator) -> Normals:
     """Turn each normal by |N(0, degrees)| toward a random side, at most until it is seen at a grazing angle."""
     side = np.cross(normals, rng.normal(size=normals.shape))
     side /= np.linalg.norm(side, axis=1, keepdims=True)
@@ -125,7 +120,7 @@ def mislabelled(
     return np.where(wrong, rng.choice(others, n), label) if others else np.full(n, label)
 
 
-def faceted(normals: Float[np.ndarray, "n 3"], facets: int | None) -> Float[np.ndarray, "n 3"]:
+def faceted(normals: Normals, facets: int | None) -> Normals:
     """Return normals of a convex object that shows so many flat faces (`face_normals`).
 
     Each pixel has the normal of the face that is nearest to the sphere's, but for `CURVED` of the way.
@@ -146,5 +141,75 @@ def face_normals(facets: int) -> Float[np.ndarray, "k 3"]:
     if facets == 1:
         return np.array([[0.0, 0.0, 1.0]])
     z = 1 - (1 - STEEPEST) * (np.arange(facets) + 0.5) / facets
-    turn, radius = np.arange(facets) * np.pi * (3 - np.sqrt(5)), np.sqrt(1 - z**2)
+    turn = np.arange(facets) * np.pi * (3 - np.sqrt(5))
+    radius = np.sqrt(1 - z**2)
     return np.stack([radius * np.cos(turn), radius * np.sin(turn), z], axis=-1)
+
+
+# ── views ────────────────────────────────────────────────────────────────────────────────────────────────────────────
+
+
+class SphereView(msgspec.Struct, frozen=True):
+    """Points of the sphere that a camera sees: the pixels `inside` of its picture, in rows.
+
+    A camera that went around the sphere is given by `rotation`, view_from_photo; the sphere and its light stay.
+    normals: in the photo's light frame
+    """
+
+    inside: Bool[np.ndarray, "h w"]
+    normals: Normals
+    rotation: Float[np.ndarray, "3 3"]
+
+    def picture(self, radiance: Radiance) -> Map:
+        """Return the points' radiance in their pixels, 0 elsewhere."""
+        pixels = np.zeros((*self.inside.shape, 3))
+        pixels[self.inside] = radiance
+        return pixels
+
+    def render(self, material: Reflectance, light: Map) -> Radiance:
+        """Render the sphere in a light by quadrature of the map, turned into the frame of a camera that went around."""
+        ahead = np.array_equal(self.rotation, np.eye(3))
+        light = light if ahead else rotate_map(light, self.rotation, SUPERSAMPLING)
+        return ball(octahedral_light(light), material, self.normals @ self.rotation.T)
+
+
+def sphere_view(size: int, azimuth_deg: float = 0.0, elevation_deg: float = 0.0) -> SphereView:
+    """Return the view, `size` pixels across, of a camera that went to the right, then up; grazing pixels are left out.
+
+    >>> sphere_view(8, 90, 0).rotation.round(6).tolist()[2]
+    [1.0, 0.0, 0.0]
+    """
+    rotation = Rotation.from_euler("yx", [-azimuth_deg, elevation_deg], degrees=True).as_matrix()
+    normals, inside = ball_normals(size)
+    inside[inside] = visible = normals[:, 2] > GRAZING
+    return SphereView(inside, normals[visible] @ rotation, rotation)
+
+
+class Photos(msgspec.Struct, frozen=True):
+    """Photos that all methods of the comparison see: the sphere, and its radiance by material's name and light."""
+
+    view: SphereView
+    radiance: dict[tuple[str, int], Radiance]
+
+    @property
+    def materials(self) -> list[str]:
+        """Names of the materials, in order of their first photo."""
+        return list(dict.fromkeys(name for name, _ in self.radiance))
+
+    @property
+    def lights(self) -> list[int]:
+        """Numbers of the lights, sorted."""
+        return sorted({light for _, light in self.radiance})
+
+
+def photograph(
+    case: Comparison, materials: Mapping[str, Reflectance], lights: Maps
+) -> tuple[Photos, dict[str, Observations]]:
+    """Return the photos of a case, and the same as the stage `urm` hands them to `solve`."""
+    tables = observe_spheres(case, materials, {li: octahedral_light(lights[li]) for li in case.lights})
+    radiance = {
+        (name, li): table.radiance[table.material == table.materials.index(name)]
+        for li, table in zip(case.lights, tables.values(), strict=True)
+        for name in case.names_in(li)
+    }
+    return Photos(sphere_view(case.size), radiance), tables

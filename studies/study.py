@@ -17,7 +17,7 @@ Entry = tuple[int, int]  # a material and a light
 
 
 class Objects(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """Bodies that stand for the entries in place of spheres, and what of each the solve is wrongly told.
+    """Bodies in place of spheres, and the errors of the mesh and the pose that the solve gets of each.
 
     pixels:      the largest number of observations of an entry
     turned_deg:  rotation about a random axis through the body's middle, degrees
@@ -85,21 +85,13 @@ class Case(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
     def names_in(self, light: int) -> list[str]:
         """Return the names of the materials that are observed in a light."""
-        return [self.names[m] for m, at in self.entries if at == light]
+        return [self.names[m] for m, li in self.entries if li == light]
 
 
 class Comparison(Case, frozen=True, forbid_unknown_fields=True):
-    """The photos that a method sees; `size` is in pixels across a photo.
+    """Photos of all methods, `size` pixels across, and the method that predicts others from them."""
 
-    Attributes:
-        method: Method that answers.
-        pixels: Pixels across the pictures of Mitsuba's optimisation.
-        steps: Largest number of its steps.
-    """
-
-    method: Literal["ours", "mitsuba", "intrinsic", "projective", "grey"] = "ours"
-    pixels: int = 48
-    steps: int = 2000
+    method: Literal["ours", "projective", "grey"] = "ours"
 
 
 class World(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -196,7 +188,9 @@ class Scale(msgspec.Struct, frozen=True):
         """Return the setting of all entries of so many materials in so many lights."""
         return self.setting(f"{materials}x{lights}", f"{materials} × {lights}", full_matrix(materials, lights))
 
-    def of_objects(self, name: str, label: str, entries: Sequence[Entry], solve: Any = None, **fields: Any) -> Setting:
+    def object_setting(
+        self, name: str, label: str, entries: Sequence[Entry], solve: Any = None, **fields: Any
+    ) -> Setting:
         """Return a setting of bodies, about as many observations of each as a sphere has; `fields` of `Objects`."""
         return self.setting(
             name, label, entries, solve=solve or {}, objects=Objects(round(0.77 * self.size**2), **fields)
@@ -229,7 +223,7 @@ class Claim(msgspec.Struct, frozen=True):
     paper: bool = True
 
 
-def own(measure: str, lower: Side, higher: Side, words: str) -> Claim:
+def project_claim(measure: str, lower: Side, higher: Side, words: str) -> Claim:
     """Return a claim of this project, which the paper does not make."""
     return Claim(measure, lower, higher, words, paper=False)
 
@@ -247,9 +241,7 @@ class Study(msgspec.Struct, frozen=True, kw_only=True):
     claims:    what a full study tests
     steps:     stages of studies/run/pipeline.yaml in `studies.steps`, the last one scores
     lights:    lights that each of its worlds has beyond those of the scale
-    sets:      the data sets that its cases are photos of, as facts of the slice `sets`
-    numbers:   what stands in the place of seeds, where intervals are over something else, which `over` names
-    notes:     sentences of a conclusion that are no claims
+    sets:      rendered data sets that its cases are photos of, as facts of the slice `sets`
     """
 
     name: str
@@ -263,9 +255,6 @@ class Study(msgspec.Struct, frozen=True, kw_only=True):
     steps: tuple[str, ...] = ("worlds", "solve", "score")
     lights: int = 0
     sets: Callable[[Scale], dict[str, Any]] = lambda scale: {}
-    numbers: Callable[[Scale], tuple[int, ...]] = lambda scale: scale.seeds
-    over: str = "seeds"
-    notes: Callable[[Any], list[str]] = lambda conclusion: []
 
     def worlds(self, scale: Scale) -> World:
         """Return the worlds that its cases show, equal for most studies of a scale, so that they are made once."""
@@ -273,4 +262,4 @@ class Study(msgspec.Struct, frozen=True, kw_only=True):
 
     def cases(self, scale: Scale) -> dict[str, Any]:
         """Return all cases by name: settings in order, each with all seeds."""
-        return {case_name(s.name, n): s.case(n) for s in self.settings(scale) for n in self.numbers(scale)}
+        return {case_name(s.name, n): s.case(n) for s in self.settings(scale) for n in scale.seeds}

@@ -210,7 +210,7 @@ class MirrorBall(_Format, frozen=True):
     chrome: Name
 
 
-class KnownValues(_Format, frozen=True):
+class KnownQuantities(_Format, frozen=True):
     """Known quantities: reflectances by material, lights by illumination, exposures by photo.
 
     Attributes:
@@ -232,12 +232,12 @@ class DatasetFile(_Format, frozen=True):
     photos: Annotated[list[PhotoEntry], AtLeastOne]
     meshes: dict[Name, MeshEntry] = {}
     cameras: CameraSource | None = None
-    known: KnownValues = KnownValues()
+    known: KnownQuantities = KnownQuantities()
     truth: str | None = None
 
 
-class TrueMaterial(_Format, frozen=True):
-    """Lambert k_d, GGX k_s (linear Rec. 709) and roughness in [0, 1]."""
+class GivenMaterial(_Format, frozen=True):
+    """Reflectance in a file of the user: Lambert k_d, GGX k_s (linear Rec. 709) and roughness, α = roughness²."""
 
     diffuse: Shares
     specular: Shares
@@ -247,7 +247,7 @@ class TrueMaterial(_Format, frozen=True):
 class TruthFile(_Format, frozen=True):
     """Content of truth.yaml; its paths are relative to the dataset's folder too."""
 
-    materials: dict[str, TrueMaterial] = {}
+    materials: dict[str, GivenMaterial] = {}
     illumination: dict[str, str] = {}
     normals: dict[str, str] = {}
     poses: dict[str, dict[str, RigidTransform]] = {}

@@ -172,7 +172,8 @@ def ball(light: OctahedralLight, material: Reflectance, normals: Float[np.ndarra
         material: the reflectance
         normals: unit normals
     """
-    diffuse, specular = np.asarray(material.diffuse, float), np.asarray(material.specular, float)
+    diffuse = np.asarray(material.diffuse, float)
+    specular = np.asarray(material.specular, float)
     value = diffuse * diffuse_lobe(normals)(light)
     return value + specular * glossy_lobe(normals, material.roughness)(light) if specular.any() else value
 
@@ -232,8 +233,9 @@ def _texel(direction: Float[np.ndarray, "*n 3"]) -> tuple[Int[np.ndarray, "*n"],
     radius = np.sqrt(np.maximum(1 - np.abs(z), 0))
     v = radius * np.arctan2(np.abs(y), np.abs(x)) * (2 / np.pi)
     u = radius - v
-    u, v = np.where(z < 0, 1 - v, u), np.where(z < 0, 1 - u, v)
-    column, row = np.copysign(u, x), np.copysign(v, y)
+    u, v = np.where(z < 0, [1 - v, 1 - u], [u, v])  # the lower half is folded outward
+    column = np.copysign(u, x)
+    row = np.copysign(v, y)
     return tuple(np.clip(((t + 1) / 2 * SIDE).astype(int), 0, SIDE - 1) for t in (row, column))
 
 

@@ -15,7 +15,7 @@ import numpy as np
 from jaxtyping import Float
 
 from factorlib.results.materials import Reflectance, Vec3, vec3
-from factorlib.results.metrics import ComparedMaterial, MaterialError, MaterialErrors
+from factorlib.results.metrics import ComparedMaterial, MaterialError, MaterialScores
 
 DARKEST = 0.01
 GREY = Reflectance(diffuse=(0.5, 0.5, 0.5), specular=(0.05, 0.05, 0.05), roughness=0.5)
@@ -23,7 +23,7 @@ GREY = Reflectance(diffuse=(0.5, 0.5, 0.5), specular=(0.05, 0.05, 0.05), roughne
 
 def compare_materials(
     estimates: Mapping[str, Reflectance], truths: Mapping[str, Reflectance], component: Mapping[str, int]
-) -> MaterialErrors | None:
+) -> MaterialScores | None:
     """Return the errors of the materials that have a truth; None if there are none.
 
     Args:
@@ -44,7 +44,7 @@ def compare_materials(
         for n in group:
             errors = [_error(m, truths[n], f) for m, f in ((estimates[n], factor[str(c)]), (GREY, grey))]
             compared[n] = ComparedMaterial(c, truths[n], estimates[n], *errors)
-    return MaterialErrors(factor=factor, materials=compared, **_summary(compared))
+    return MaterialScores(factor=factor, materials=compared, **_summary(compared))
 
 
 def common_factor(estimates: list[Reflectance], truths: list[Reflectance]) -> Vec3:

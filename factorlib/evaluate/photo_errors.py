@@ -58,7 +58,8 @@ def compared_photo(photo: Channels, geometry: Channels, resynthesis: Picture) ->
     rgb = np.nan_to_num(np.stack([photo[c] for c in "RGB"], axis=-1), posinf=0.0, neginf=0.0)
     valid = photo["valid"] > 0.5
     observed = agreeing_pixels(photo, geometry)
-    pixels, bounds = observed & ~clipped, observed & clipped
+    pixels = observed & ~clipped
+    bounds = observed & clipped
     left_out = photo["left_out"] > 0.5 if "left_out" in photo else np.zeros(valid.shape, bool)
     counts = {
         "pixels": pixels,

@@ -77,11 +77,15 @@ def ssim_map(a: Picture, b: Picture, mask: Mask) -> Float[np.ndarray, "h w"]:
         return _blurred(values * inside) / total
 
     # SSIM = (2 μa μb + C1)(2 cov + C2) / ((μa² + μb² + C1)(var a + var b + C2)), from local moments
-    a, b = a.astype(np.float32), b.astype(np.float32)
-    mean_a, mean_b = mean(a), mean(b)
-    var_a, var_b = mean(a * a) - mean_a**2, mean(b * b) - mean_b**2
+    a = a.astype(np.float32)
+    b = b.astype(np.float32)
+    mean_a = mean(a)
+    mean_b = mean(b)
+    var_a = mean(a * a) - mean_a**2
+    var_b = mean(b * b) - mean_b**2
     covariance = mean(a * b) - mean_a * mean_b
-    c1, c2 = 0.01**2, 0.03**2
+    c1 = 0.01**2
+    c2 = 0.03**2
     similar = (2 * mean_a * mean_b + c1) * (2 * covariance + c2)
     return (similar / ((mean_a**2 + mean_b**2 + c1) * (var_a + var_b + c2))).mean(axis=-1) * mask
 
@@ -102,7 +106,9 @@ def picture_errors(
         return {}
     union = np.logical_or.reduce(list(regions.values()))
     (box,) = find_objects(union.astype(np.uint8))
-    estimate, truth, union = estimate[box], truth[box], union[box]
+    estimate = estimate[box]
+    truth = truth[box]
+    union = union[box]
     shown = [tone_mapped(np.where(union[..., None], p, 0.0), 1 / white) for p in (estimate, truth)]
     ssim = ssim_map(shown[0], shown[1], union)
 

@@ -59,7 +59,8 @@ def material_xml(name: str, material: Reflectance) -> str:
 
 def _sensor(scene: ExportedScene) -> dict[str, Any]:
     cx, cy = scene.camera.centre
-    w, h = scene.camera.width, scene.camera.height
+    w = scene.camera.width
+    h = scene.camera.height
     near, far = scene.clip_distances
     film = {"type": "hdrfilm", "width": w, "height": h, "pixel_format": "rgb", "component_format": "float32"}
     return {

@@ -124,7 +124,8 @@ def _camera(scene: ExportedScene) -> list[str]:
     camera = scene.camera
     pixel = FILM / scene.camera.width
     cx, cy = camera.centre
-    w, h = camera.width, camera.height
+    w = camera.width
+    h = camera.height
     numbers = {
         "focalLength": camera.focal * pixel,
         "horizontalAperture": w * pixel,

@@ -3,6 +3,8 @@
 It writes the data sets in the repository, or others of the same protocol.
 """
 
+from collections.abc import Callable
+from inspect import Signature, signature
 from pathlib import Path
 from shutil import rmtree
 from types import ModuleType
@@ -32,32 +34,48 @@ Out = Annotated[Path | None, typer.Option(help="Folder to write; default data/<s
 Lights = Annotated[Path | None, typer.Option(help="Folder of lat-long .hdr or .exr maps to light the set with.")]
 
 
+def writes_set(options: Callable[..., tuple[ModuleType, msgspec.Struct]]) -> Callable[..., None]:
+    """Return the command that writes a set, with --seed, --out and --lights beside its own options.
+
+    `options` returns the set's module and its options from the command's own ones, which need another folder.
+    """
+
+    def command(seed: Seed = 0, out: Out = None, lights: Lights = None, **values: bool | str | None) -> None:
+        """Write the set."""
+        if any(values.values()) and out is None:
+            *most, last = (f"--{name}" for name in values)
+            fault = f"data/{options.__name__} is the set without {', '.join(most)} and {last}: name another folder"
+            raise typer.BadParameter(fault, param_hint="--out")
+        _write(*options(**values), out or Path("data", options.__name__), seed, lights)
+
+    shared = [each for each in signature(command).parameters.values() if each.kind is not each.VAR_KEYWORD]
+    command.__signature__ = Signature([*shared, *signature(options).parameters.values()])  # type: ignore[attr-defined]
+    command.__name__ = options.__name__
+    command.__doc__ = options.__doc__
+    return command
+
+
 @app.command()
-def synthetic(seed: Seed = 0, out: Out = None, lights: Lights = None) -> None:
+@writes_set
+def synthetic() -> tuple[ModuleType, msgspec.Struct]:
     """Generate three materials in three lights on exact shapes, with direct light only."""
     from factorlib.generate import synthetic as set_
 
-    _write(set_, out or Path("data/synthetic"), seed, lights, set_.SyntheticOptions())
+    return set_, set_.SyntheticOptions()
 
 
 @app.command()
+@writes_set
 def eames(
-    seed: Seed = 0,
-    out: Out = None,
-    lights: Lights = None,
     exact: Annotated[bool, EXACT] = False,
     distant: Annotated[bool, DISTANT] = False,
     direct: Annotated[bool, DIRECT] = False,
     rough: Annotated[str | None, ROUGH] = None,
-) -> None:
+) -> tuple[ModuleType, msgspec.Struct]:
     """Generate six photos of moulded side chairs, path-traced with all bounces, on an approximate mesh."""
     from factorlib.generate import eames as set_
 
-    if (exact or distant or direct or rough) and out is None:
-        fault = "data/eames is the set without --exact, --distant, --direct and --rough: name another folder"
-        raise typer.BadParameter(fault, param_hint="--out")
-    parameters = set_.ChairSetOptions(exact=exact, distant=distant, direct=direct, rough=_rough(rough, exact))
-    _write(set_, out or Path("data/eames"), seed, lights, parameters)
+    return set_, set_.ChairSetOptions(exact=exact, distant=distant, direct=direct, rough=_rough(rough, exact))
 
 
 def _rough(words: str | None, exact: bool) -> tuple[int, float] | None:
@@ -75,7 +93,7 @@ def _rough(words: str | None, exact: bool) -> tuple[int, float] | None:
     return numbers
 
 
-def _write(set_: ModuleType, out: Path, seed: int, lights: Path | None, parameters: msgspec.Struct) -> None:
+def _write(set_: ModuleType, parameters: msgspec.Struct, out: Path, seed: int, lights: Path | None) -> None:
     """Generate into a folder beside `out`, then rename it to `out`."""
     fresh = out.with_name(out.name + ".new")
     try:

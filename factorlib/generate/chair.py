@@ -127,7 +127,10 @@ def shell(across: int, along: int) -> Part:
     out = np.cross(np.roll(middle, -1, axis=0) - np.roll(middle, 1, axis=0), normal)
     out *= np.sign(np.sum(out * (middle - middle.mean(axis=0)), axis=1).sum())
     edge = middle + out / np.linalg.norm(out, axis=1, keepdims=True) * DIMENSIONS.thickness / 2
-    a, b, c, d = index[:-1, :-1], index[:-1, 1:], index[1:, :-1], index[1:, 1:]
+    a = index[:-1, :-1]
+    b = index[:-1, 1:]
+    c = index[1:, :-1]
+    d = index[1:, 1:]
     top = np.concatenate([np.stack([a, b, d], -1), np.stack([a, d, c], -1)]).reshape(-1, 3)
     rim = 2 * rows * columns + np.arange(len(border))
     count = rows * columns
@@ -153,7 +156,10 @@ def middle_surface(u: Float[np.ndarray, "*n"], v: Float[np.ndarray, "*n"]) -> Fl
 
 def band(first: np.ndarray, second: np.ndarray) -> np.ndarray:
     """Triangulate the band between two closed rings of as many points."""
-    a, b, c, d = first, np.roll(first, -1), second, np.roll(second, -1)
+    a = first
+    b = np.roll(first, -1)
+    c = second
+    d = np.roll(second, -1)
     return np.concatenate([np.stack([a, c, d], -1), np.stack([a, d, b], -1)])
 
 
@@ -200,7 +206,8 @@ def dowel(start: Float[np.ndarray, "3"], end: Float[np.ndarray, "3"], radii: Rad
     points = start + share[:, None, None] * (end - start) + radius[:, None, None] * circle
     index = np.arange(rings * sides).reshape(rings, sides)
     tube = np.concatenate([band(index[k], index[k + 1]) for k in range(rings - 1)])
-    (first, last), (right, right_last) = index[[0, -1]], np.roll(index, -1, axis=1)[[0, -1]]
+    first, last = index[[0, -1]]
+    right, right_last = np.roll(index, -1, axis=1)[[0, -1]]
     middles = np.full(sides, rings * sides), np.full(sides, rings * sides + 1)  # centres of the caps
     caps = [np.stack([middles[0], first, right], -1), np.stack([middles[1], right_last, last], -1)]
     return np.concatenate([points.reshape(-1, 3), [start, end]]), np.concatenate([tube, *caps])[:, ::-1]

@@ -20,7 +20,8 @@ from factorlib.geometry.raster import unit
 from factorlib.tracing.scene import SAMPLER, rgb, rigid, transform
 from factorlib.tracing.variant import mitsuba
 
-MAP_ROWS, MAP_COLUMNS = 2048, 8
+MAP_ROWS = 2048
+MAP_COLUMNS = 8
 SPP = 16  # number of rays per pixel
 SHADOW_RAYS = 4  # number of directions per ray sampled by the light, and as many by the material
 LEAST_FACING = 0.01  # least n·o of a pixel

@@ -13,7 +13,8 @@ from scipy.interpolate import PchipInterpolator
 
 from factorlib.meshes.mesh import Mesh, closed_grid
 
-ROWS, COLUMNS = 60, 96
+ROWS = 60
+COLUMNS = 96
 
 # profile (radius, y) of a vase with lip, neck, belly and foot
 VASE = (
@@ -91,7 +92,8 @@ def revolved(profile: Float[np.ndarray, "n 2"]) -> Mesh:
     length = np.concatenate([[0], np.cumsum(np.linalg.norm(np.diff(profile, axis=0), axis=1))])
     curve = PchipInterpolator(length, profile)(np.arange(1, ROWS) / ROWS * length[-1])
     phi = np.arange(COLUMNS) / COLUMNS * 2 * np.pi
-    radius, y = curve[:, :1], curve[:, 1:]
+    radius = curve[:, :1]
+    y = curve[:, 1:]
     points = np.stack(np.broadcast_arrays(radius * np.sin(phi), y, radius * np.cos(phi)), axis=-1)
     return closed_grid(points, np.array([0.0, profile[0, 1], 0.0]), np.array([0.0, profile[-1, 1], 0.0]))
 

@@ -229,7 +229,8 @@ def write_shot(out: Path, scene: SyntheticScene, parameters: SyntheticOptions, s
     shot = scene.shot
     poses = list(scene.poses.values())
     order = list(scene.materials)
-    width, height = parameters.width, parameters.height
+    width = parameters.width
+    height = parameters.height
     camera = Camera(width, height, parameters.focal_px, (width / 2, height / 2))
     labelled = []
     for placement in shot.placements:

@@ -49,7 +49,9 @@ def write_mp4(path: str | Path, frames: Sequence[UInt8[np.ndarray, "h w 4"]], se
     with av.open(memory, "w", format="mp4") as file:
         stream = file.add_stream("libx264", rate=Fraction(len(frames) / seconds).limit_denominator(1000))
         height, width = (n // 2 * 2 for n in frames[0].shape[:2])
-        stream.width, stream.height, stream.pix_fmt = width, height, "yuv420p"
+        stream.width = width
+        stream.height = height
+        stream.pix_fmt = "yuv420p"
         stream.options = {"crf": "16", "threads": "1"}  # one thread gives the same bytes each time
         stream.codec_context.colorspace = stream.codec_context.color_primaries = stream.codec_context.color_trc = bt709
         for frame in frames:

@@ -191,7 +191,8 @@ def _strips(
     step = max(1, READ_AT_ONCE // (factor * opened.width))
     for first in range(0, height, step):
         last = min(first + step, height)
-        begin, end = top + first * factor, top + last * factor
+        begin = top + first * factor
+        end = top + last * factor
         with reading("an image", path):
             codes = opened.rows(begin, end)
             clipped = opened.clipped(begin, end, codes)

@@ -93,7 +93,8 @@ def _crop(sizes: Any) -> tuple[slice, slice]:
     """Return rows and columns of the crop that the file specifies, in developed pixels; else of the whole picture."""
     top = sizes.crop_top_margin - sizes.top_margin
     left = sizes.crop_left_margin - sizes.left_margin
-    bottom, right = top + sizes.crop_height, left + sizes.crop_width
+    bottom = top + sizes.crop_height
+    right = left + sizes.crop_width
     if 0 <= top < bottom <= sizes.iheight and 0 <= left < right <= sizes.iwidth:
         return slice(top, bottom), slice(left, right)
     return slice(0, sizes.iheight), slice(0, sizes.iwidth)

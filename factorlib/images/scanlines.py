@@ -91,7 +91,8 @@ def open_scanlines(path: str | Path, key: str | None) -> OpenPhoto:
     def rows(begin: int, end: int) -> Shaped[np.ndarray, "r w 3"]:
         """Read rows begin … end − 1; from a tiled file, the rows of tiles that contain them are read."""
         if tall := spec.tile_height:
-            top, bottom = begin // tall * tall, min(-(-end // tall) * tall, spec.height)
+            top = begin // tall * tall
+            bottom = min(-(-end // tall) * tall, spec.height)
             box = (spec.x, spec.x + spec.width, spec.y + top, spec.y + bottom, spec.z, spec.z + 1)
             pixels = source.read_tiles(*box, first, last, spec.format)
         else:

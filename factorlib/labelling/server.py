@@ -87,7 +87,8 @@ class MaskSet:
             raise InputError("there is no such file in this folder", file=self.yaml, cure="create one with `make new`")
         spec = read_yaml(self.yaml, LabelledSet)
         refuse = Refusal(self.yaml, self.folder)
-        self.materials, self.photos = spec.materials, spec.photos
+        self.materials = spec.materials
+        self.photos = spec.photos
         refuse.once("photos", (photo.name for photo in self.photos), "photo")
         for index, photo in enumerate(self.photos):
             key = f"photos[{index}].image"

@@ -18,7 +18,11 @@ from factorlib.meshes.limits import Limits
 from factorlib.meshes.triangle_soup import TriangleSoup, floats, no_normals, normals_at_corners
 from factorlib.reading import read_bytes
 
-POINTS, LINES, TRIANGLES, STRIP, FAN = 0, 1, 4, 5, 6  # modes of primitives
+POINTS = 0  # modes of primitives
+LINES = 1
+TRIANGLES = 4
+STRIP = 5
+FAN = 6
 DECODED = (POINTS, LINES, TRIANGLES, STRIP)  # modes to which trimesh gives a name and an array of vertices
 UNNAMED = "GLTF"
 
@@ -182,7 +186,8 @@ def _joined(parts: list[Part], arrays: dict[int, dict], header: GltfHeader) -> T
         array = arrays[id(primitive)]
         points = _vectors(array["vertices"], header.accessors[primitive.attributes["POSITION"]].normalized)
         corners = array["faces"].astype(np.int64)
-        linear, shift = world_from_node[:3, :3], world_from_node[:3, 3]
+        linear = world_from_node[:3, :3]
+        shift = world_from_node[:3, 3]
         vertices.append(points @ linear.T + shift)
         cofactor = np.cross(np.roll(linear, -1, axis=0), np.roll(linear, -2, axis=0))
         if "NORMAL" in primitive.attributes:

@@ -79,7 +79,10 @@ def closed_grid(points: Float[np.ndarray, "r c 3"], top: np.ndarray, bottom: np.
     rows, columns = points.shape[:2]
     index = np.arange(rows * columns).reshape(rows, columns)
     right = np.roll(index, -1, axis=1)
-    a, b, c, d = index[:-1], right[:-1], index[1:], right[1:]
+    a = index[:-1]
+    b = right[:-1]
+    c = index[1:]
+    d = right[1:]
     last = rows * columns
     cap = np.stack([right[0], np.full(columns, last), index[0]], axis=-1)
     base = np.stack([index[-1], np.full(columns, last + 1), right[-1]], axis=-1)

@@ -40,10 +40,12 @@ def consistently_wound(
     (a, b), agrees, has_border = _neighbours(faces)
     # graph of orientations: node f is face f unchanged, node f + count is face f flipped
     other = np.where(agrees, 0, count)
-    rows, columns = np.r_[a, a + count], np.r_[b + other, b + count - other]
+    rows = np.r_[a, a + count]
+    columns = np.r_[b + other, b + count - other]
     graph = coo_matrix((np.ones(len(rows), bool), (rows, columns)), shape=(2 * count, 2 * count))
     _, part = connected_components(graph, directed=False)
-    as_it_is, flipped = part[:count], part[count:]
+    as_it_is = part[:count]
+    flipped = part[count:]
     # area, or signed volume, that each component keeps less that which it flips
     area = area_vectors(vertices, faces)
     volume = np.einsum("fd,fd->f", vertices[faces].mean(axis=1) - vertices[faces[:, 0]].mean(axis=0), area)
@@ -57,7 +59,8 @@ def _neighbours(faces: Int[np.ndarray, "f 3"]) -> tuple[Int[np.ndarray, "2 n"], 
 
     An edge is shared if it has exactly two faces, and a border if it has one.
     """
-    start, end = faces.reshape(-1), np.roll(faces, -1, axis=1).reshape(-1)  # half-edges, sorted by edge
+    start = faces.reshape(-1)  # half-edges, sorted by edge
+    end = np.roll(faces, -1, axis=1).reshape(-1)
     face = np.repeat(np.arange(len(faces)), 3)
     pair = np.stack([np.minimum(start, end), np.maximum(start, end)], axis=1)
     order = np.lexsort((face, pair[:, 1], pair[:, 0]))
@@ -88,7 +91,8 @@ def corner_normals(
     area = area_vectors(vertices, faces)
     normal = area / np.maximum(np.linalg.norm(area, axis=1, keepdims=True), 1e-300)
     corner = vertices[faces]
-    onward, backward = np.roll(corner, -1, axis=1) - corner, np.roll(corner, 1, axis=1) - corner
+    onward = np.roll(corner, -1, axis=1) - corner
+    backward = np.roll(corner, 1, axis=1) - corner
     # angle of each corner, the weight of its face
     angle = np.arctan2(np.linalg.norm(np.cross(onward, backward), axis=-1), np.einsum("fkd,fkd->fk", onward, backward))
     weight = angle.reshape(-1)
@@ -104,7 +108,8 @@ def corner_normals(
         own = normal[order[mine] // 3]
         other_normals = normal[order[theirs] // 3]
         share = weight[order[theirs]] * (np.einsum("pd,pd->p", own, other_normals) >= threshold - 1e-12)
-        low, high = starts[group][0], starts[group][-1] + counts[group][-1]
+        low = starts[group][0]
+        high = starts[group][-1] + counts[group][-1]
         summed = [np.bincount(mine - low, share * other_normals[:, d], high - low) for d in range(3)]
         result[order[low:high]] = np.stack(summed, axis=1)
     length = np.linalg.norm(result, axis=1, keepdims=True)

@@ -58,7 +58,8 @@ def read_off(path: Path, content: bytes, limits: Limits) -> TriangleSoup:
     if counts is None:
         fault = "does not begin with OFF and the numbers of its vertices and faces"
         raise InputError(fault, file=path, cure="save it as OFF: text, of three dimensions")
-    vertices, faces = int(counts[1]), int(counts[2])
+    vertices = int(counts[1])
+    faces = int(counts[2])
     rows = lines[counts[0].count("\n") + 1 :]
     polygons = rows[vertices : vertices + faces]
     triangles = sum(int(polygon.split()[0]) - 2 for polygon in polygons)

@@ -43,7 +43,8 @@ def subdivide(mesh: Mesh, longest: float) -> Mesh:
         middle_normals = normals[pairs].sum(1)
         length = np.linalg.norm(middle_normals, axis=1, keepdims=True)
         middle_normals = np.where(length > 1e-9, middle_normals / np.maximum(length, 1e-9), normals[pairs[:, 0]])
-        vertices, normals = np.vstack([vertices, vertices[pairs].mean(1)]), np.vstack([normals, middle_normals])
+        vertices = np.vstack([vertices, vertices[pairs].mean(1)])
+        normals = np.vstack([normals, middle_normals])
         count = too_long.sum(1)
         parts = [faces[~too_long.any(1)]]
         labels = [label[~too_long.any(1)]]

@@ -107,7 +107,8 @@ def check(soup: TriangleSoup, file: str | Path) -> TriangleSoup:
 
     if len(soup.faces) == 0:
         refuse("mesh without faces", "export triangles, not only points or lines")
-    low, high = int(soup.faces.min()), int(soup.faces.max())
+    low = int(soup.faces.min())
+    high = int(soup.faces.max())
     if low < 0 or high >= len(soup.vertices):
         fault = f"a face uses vertex {(low if low < 0 else high) + 1} of {len(soup.vertices)}"
         refuse(fault, "the file is damaged: copy or export it again")

@@ -16,7 +16,7 @@ from typing import Annotated, Literal
 
 import msgspec
 
-from factorlib.dataset.schema import Share, Shares, Vec2, Vec3
+from factorlib.dataset.schema import GivenMaterial, Share, Shares, Vec2, Vec3
 from factorlib.errors import InputError
 from factorlib.reading import read_text, reading
 
@@ -211,18 +211,10 @@ def is_mesh_file(name: str) -> bool:
     return "." in name
 
 
-class TableMaterial(msgspec.Struct, frozen=True):
-    """Lambert k_d and GGX k_s per channel (linear Rec. 709), and roughness with α = roughness².
-
-    Other fields of the file are ignored.
-    """
-
-    diffuse: Shares
-    specular: Shares
-    roughness: Share
+FIELDS = GivenMaterial.__struct_fields__  # others of a table are ignored
 
 
-def read_table(path: Path) -> dict[str, TableMaterial]:
+def read_table(path: Path) -> dict[str, GivenMaterial]:
     """Read the materials of a table by name.
 
     Raises:
@@ -238,7 +230,8 @@ def read_table(path: Path) -> dict[str, TableMaterial]:
     for name, entry in materials.items():
         key = f"materials.{name}"
         try:
-            table[name] = msgspec.convert(entry, TableMaterial)
+            fields = {k: entry[k] for k in entry if k in FIELDS} if isinstance(entry, dict) else entry
+            table[name] = msgspec.convert(fields, GivenMaterial)
         except msgspec.ValidationError as error:
             raise InputError(str(error), file=path, key=key, cure=CURE) from None
         total = max(table[name].diffuse) + max(table[name].specular)

@@ -145,7 +145,8 @@ class Solid(Caster):
     def crosses(self, start: Float[np.ndarray, "n 3"], along: Float[np.ndarray, "n 3"]) -> np.ndarray:
         """Return a mask of the segments from `start` to `start + along` that cross the surface."""
         # Only segments whose boxes meet the mesh's are cast, in units of the mesh's radius.
-        low, high = start + np.minimum(along, 0), start + np.maximum(along, 0)
+        low = start + np.minimum(along, 0)
+        high = start + np.maximum(along, 0)
         crossed = ((low <= self.box[1]) & (high >= self.box[0])).all(axis=1)
         rays = np.column_stack([(start[crossed] - self.centre) / self.radius, along[crossed] / self.radius])
         hits = self.scene.cast_rays(o3d.core.Tensor(rays.astype(np.float32)), nthreads=1)

@@ -125,7 +125,9 @@ class Reflector:
     ) -> list[Float[Tensor, "n p"]]:
         """Return the visible shares of the diffuse and of the specular reflection of each lobe."""
         directions = torch.from_numpy(fibonacci_sphere(visibility.shape[1])).float()
-        visibility, normals, views = visibility.float() / 255, normals.float(), views.float()
+        visibility = visibility.float() / 255
+        normals = normals.float()
+        views = views.float()
         lobes = kernel(directions, self.axis.float(), self.sharpness.float())
         weights = cosine_weights(normals, directions), highlight_weights(normals, views, directions, roughness)
         return [visible_share(visibility, weight, lobes).to(self.operator.dtype) for weight in weights]

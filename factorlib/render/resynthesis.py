@@ -78,7 +78,8 @@ def resynthesised(
         radiance = reflector(material, normals, views, report_pixels, PointEffects(visibility, place, detail))
         # radiance of bounces: k_d G_d + k_s G_s
         if bounced is not None:
-            diffuse, specular = bounced[:, :3], bounced[:, 3:]
+            diffuse = bounced[:, :3]
+            specular = bounced[:, 3:]
             bounced = np.array(material.diffuse) * detail[:, None] * diffuse + np.array(material.specular) * specular
             radiance += bounced * (np.sum(normals * views, 1, keepdims=True) > 0)
         picture[pixels] = radiance
@@ -161,7 +162,8 @@ def front_radiance(
     # nodes: θ = h/2, 3h/2, …, RIM, and φ from 0 to 2π
     theta = (np.arange(rings) + 0.5) / (rings - 0.5) * RIM
     phi = np.arange(4 * rings) * (np.pi / 2 / rings)
-    sin, cos = np.sin(theta)[:, None], np.cos(theta)[:, None]
+    sin = np.sin(theta)[:, None]
+    cos = np.cos(theta)[:, None]
     nodes = np.stack(np.broadcast_arrays(sin * np.cos(phi), sin * np.sin(phi), -cos), axis=-1)
     values = wide(material, nodes.reshape(-1, 3), np.broadcast_to(FRONT, (nodes.size // 3, 3))).reshape(nodes.shape)
     # margins: θ < 0 continues at φ + π beyond the pole, and φ is periodic

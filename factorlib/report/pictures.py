@@ -185,7 +185,8 @@ def first_pictures(run: Artifacts, rows: Sequence[PhotoRow], results: SolvedSet)
     # camera cropped to the objects, and enlarged to the panel's size
     scene = results.scene(row.name)
     box = box_of(np.rint(run.channels("masks", row.name)["label"]) > 0)
-    (top, left), (height, width) = (span.start for span in box), (span.stop - span.start for span in box)
+    top, left = (span.start for span in box)
+    height, width = (span.stop - span.start for span in box)
     pixel = max(1.0, max(height, width) / longest_side(len(run.set.photos)))
     camera = scene.camera.window(left, top, pixel, ceil(width / pixel), ceil(height / pixel))
     scene = msgspec.structs.replace(scene, camera=camera)
@@ -309,7 +310,8 @@ def _fitted(pixels: Pixels, height: int, width: int) -> Pixels:
     scale = min(height / pixels.shape[0], width / pixels.shape[1])
     pixels = reduced(pixels, max(1, int(scale * max(pixels.shape[:2]))))
     cell = np.full((height, width, 3), 255, np.uint8)
-    top, left = (height - pixels.shape[0]) // 2, (width - pixels.shape[1]) // 2
+    top = (height - pixels.shape[0]) // 2
+    left = (width - pixels.shape[1]) // 2
     cell[top : top + pixels.shape[0], left : left + pixels.shape[1]] = np.rint(pixels)
     return cell
 

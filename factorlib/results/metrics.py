@@ -139,7 +139,7 @@ class ComparedMaterial(msgspec.Struct, frozen=True):
     null: MaterialError
 
 
-class MaterialErrors(msgspec.Struct, frozen=True):
+class MaterialScores(msgspec.Struct, frozen=True):
     """Errors of all materials.
 
     Attributes:
@@ -294,7 +294,7 @@ class Metrics(msgspec.Struct, frozen=True):
 
     set: Counts
     resynthesis: ResynthesisErrors
-    materials: MaterialErrors | None
+    materials: MaterialScores | None
     relighting: Relighting | None
     light: LightErrors | None
     normals: dict[str, NormalError] | None

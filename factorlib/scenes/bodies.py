@@ -113,17 +113,23 @@ def _box(size: np.ndarray, place: np.ndarray, turn: float, side: int = 24) -> Pa
     """Return a box whose six faces are grids, turned about y."""
     u, v = (a.reshape(-1) for a in np.meshgrid(np.linspace(-0.5, 0.5, side + 1), np.linspace(-0.5, 0.5, side + 1)))
     index = np.arange((side + 1) ** 2).reshape(side + 1, side + 1)
-    a, b, c, d = index[:-1, :-1], index[:-1, 1:], index[1:, :-1], index[1:, 1:]
+    a = index[:-1, :-1]
+    b = index[:-1, 1:]
+    c = index[1:, :-1]
+    d = index[1:, 1:]
     quad = np.concatenate([np.stack([a, b, d], -1), np.stack([a, d, c], -1)]).reshape(-1, 3)
     vertices: list[np.ndarray] = []
     faces: list[np.ndarray] = []
     for axis in range(3):
         for sign in (-1, 1):
             points = np.zeros((len(u), 3))
-            points[:, axis], points[:, (axis + 1) % 3], points[:, (axis + 2) % 3] = sign / 2, u, v
+            points[:, axis] = sign / 2
+            points[:, (axis + 1) % 3] = u
+            points[:, (axis + 2) % 3] = v
             faces.append((quad if sign > 0 else quad[:, ::-1]) + len(vertices) * len(u))
             vertices.append(points)
-    cos, sin = np.cos(turn), np.sin(turn)
+    cos = np.cos(turn)
+    sin = np.sin(turn)
     turned = np.concatenate(vertices) * size @ np.array([[cos, 0, -sin], [0, 1, 0], [sin, 0, cos]])
     return turned + place, np.concatenate(faces), 1
 

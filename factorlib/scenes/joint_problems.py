@@ -28,7 +28,8 @@ def sphere_normals(size: int) -> np.ndarray:
     """Return normals of a sphere seen from the front, one per pixel of a `size`² picture, grazing ones left out."""
     y, x = (np.mgrid[:size, :size] + 0.5) / size * 2 - 1
     inside = x**2 + y**2 < 0.95
-    x, y = x[inside], y[inside]
+    x = x[inside]
+    y = y[inside]
     return np.column_stack([x, y, -np.sqrt(1 - x**2 - y**2)])
 
 

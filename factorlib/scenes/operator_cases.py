@@ -148,7 +148,9 @@ def answers(operator: Operator, given: Pairs) -> Answers:
         for name in response.__struct_fields__:
             column = getattr(response, name)[:, 0].double()
             fields.setdefault(name, torch.empty(len(given), dtype=torch.float64))[rows] = column
-        by_no, by_nz, by_oz = response.specular_by_no, response.specular_by_nz, response.specular_by_oz
+        by_no = response.specular_by_no
+        by_nz = response.specular_by_nz
+        by_oz = response.specular_by_oz
         turns = ((z, n, by_nz), (z, o, by_oz)), ((o, n, by_no), (o, z, by_oz)), ((n, o, by_no), (n, z, by_nz))
         for k, parts in enumerate(turns):
             across = [(slope, other - (axis * other).sum(1, keepdim=True) * axis) for axis, other, slope in parts]
@@ -178,7 +180,9 @@ def reference_values(given: Pairs, some: slice = slice(None)) -> dict[str, Tenso
     n = given.normal[some]
     o = given.view[some]
     z = given.axis[some]
-    no, nz, oz = (n * o).sum(1), (n * z).sum(1)[:, None], (o * z).sum(1)[:, None]
+    no = (n * o).sum(1)
+    nz = (n * z).sum(1)[:, None]
+    oz = (o * z).sum(1)[:, None]
     sharpness = given.sharpness[some, None]
     roughness = given.roughness[some, None]
     with torch.no_grad():
@@ -198,7 +202,9 @@ class Domain(msgspec.Struct, frozen=True):
     least_no: float
 
 
-USUAL, WIDER, WHOLE = Domain(0.1, 0.02), Domain(0.1, 1e-4), Domain(0.03, 1e-4)
+USUAL = Domain(0.1, 0.02)
+WIDER = Domain(0.1, 1e-4)
+WHOLE = Domain(0.03, 1e-4)
 
 
 def draw_inputs(domain: Domain, count: int) -> tuple[Tensor, ...]:

@@ -242,7 +242,10 @@ def fill_ambiguous(field: Float[np.ndarray, "x y z"]) -> Float[np.ndarray, "x y 
             slices = np.moveaxis(field, axis, 0)
             inside = slices > 0
             # corners of each square, in order
-            a, b, c, d = inside[:, :-1, :-1], inside[:, 1:, :-1], inside[:, 1:, 1:], inside[:, :-1, 1:]
+            a = inside[:, :-1, :-1]
+            b = inside[:, 1:, :-1]
+            c = inside[:, 1:, 1:]
+            d = inside[:, :-1, 1:]
             first_diagonal = a & c & ~b & ~d
             second_diagonal = b & d & ~a & ~c
             slices[:, 1:, :-1][first_diagonal] = least

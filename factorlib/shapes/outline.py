@@ -95,7 +95,8 @@ class Triangles(msgspec.Struct, frozen=True):
 
     def of_size(self, size: float) -> "Triangles":
         """Centre the bounding box at the origin and scale its longest side to `size`."""
-        low, high = self.vertices.min(axis=0), self.vertices.max(axis=0)
+        low = self.vertices.min(axis=0)
+        high = self.vertices.max(axis=0)
         return msgspec.structs.replace(self, vertices=(self.vertices - (low + high) / 2) * (size / (high - low).max()))
 
 

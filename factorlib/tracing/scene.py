@@ -75,7 +75,8 @@ def transform(matrix: Matrix) -> Any:
 def rigid(rotation: Float[np.ndarray, "3 3"], translation: Sequence[float] | Float[np.ndarray, "3"]) -> Matrix:
     """Return the 4 × 4 matrix of a rotation and a translation."""
     matrix = np.eye(4)
-    matrix[:3, :3], matrix[:3, 3] = rotation, translation
+    matrix[:3, :3] = rotation
+    matrix[:3, 3] = translation
     return matrix
 
 
@@ -123,7 +124,8 @@ def sensor(
     left, right, _ = columns.indices(camera.width)
     crop = {"crop_offset_x": left, "crop_offset_y": 0, "crop_width": right - left, "crop_height": camera.height}
     cx, cy = camera.centre
-    w, h = camera.width, camera.height
+    w = camera.width
+    h = camera.height
     kind = "rgba" if alpha else "rgb"
     offset = {"x": (w / 2 - cx) / w, "y": (h / 2 - cy) / h}  # along the axes of the picture, not of the sensor
     film = {"type": "hdrfilm", "width": w, "height": h, "rfilter": {"type": "box"}, "pixel_format": kind, **crop}

@@ -1,6 +1,6 @@
 """Faults of the input: wrong labels, normals, poses and meshes, few photos, and objects of few sides."""
 
-from studies.study import Claim, Scale, Setting, Study, full_matrix, own
+from studies.study import Claim, Scale, Setting, Study, full_matrix, project_claim
 
 # ── label quality ─────────────────────────────────────────────────────────────────────────────────────────────────────
 
@@ -17,7 +17,8 @@ def label_quality_settings(scale: Scale) -> list[Setting]:
     ]
 
 
-LATE, EARLY = ("rise", "normals-10deg", "normals-20deg", 10), ("rise", "normals-5deg", "normals-10deg", 5)
+LATE = ("rise", "normals-10deg", "normals-20deg", 10)
+EARLY = ("rise", "normals-5deg", "normals-10deg", 5)
 LABEL_QUALITY = Study(
     name="label-quality",
     title="Label quality",
@@ -27,12 +28,12 @@ LABEL_QUALITY = Study(
     measures=("entries", "new_light", "diffuse", "specular", "roughness", "glossy", "stated_roughness"),
     settings=label_quality_settings,
     claims=(
-        own("entries", "3x3", "normals-1deg", "noise of 1° on normals raises the error"),
+        project_claim("entries", "3x3", "normals-1deg", "noise of 1° on normals raises the error"),
         Claim("entries", "3x3", "normals-20deg", "noise of 20° on normals raises the error"),
-        own("entries", "normals-10deg", "normals-20deg", "20° is worse than 10°"),
+        project_claim("entries", "normals-10deg", "normals-20deg", "20° is worse than 10°"),
         Claim("entries", LATE, EARLY, "the error rises less per degree beyond 10°"),
-        own("entries", "3x3", "labels-2pc", "2 % of wrong labels raise the error"),
-        own("entries", "3x3", "labels-20pc", "20 % of wrong labels raise the error"),
+        project_claim("entries", "3x3", "labels-2pc", "2 % of wrong labels raise the error"),
+        project_claim("entries", "3x3", "labels-20pc", "20 % of wrong labels raise the error"),
     ),
 )
 
@@ -55,17 +56,17 @@ ALIGNMENT_ERROR_QUICK = ("exact", "turned-5", "turned-20")
 
 def alignment_error_settings(scale: Scale) -> list[Setting]:
     """Return a setting for each perturbation, with its treatments beside it."""
-    entries, made = full_matrix(scale.side, scale.side), []
+    entries = full_matrix(scale.side, scale.side)
+    settings = []
     for name in ALIGNMENT_ERROR_QUICK if scale.quick else PERTURBED:
-        label, how, beside = PERTURBED[name]
-        made.append(scale.of_objects(name, label, entries, **how))
-        made += [scale.of_objects(f"{name}-{t}", f"{label} {t}", entries, **how, **TREATMENTS[t]) for t in beside]
-    return made
+        label, fields, treatments = PERTURBED[name]
+        settings.append(scale.object_setting(name, label, entries, **fields))
+        for t in treatments:
+            settings.append(scale.object_setting(f"{name}-{t}", f"{label} {t}", entries, **fields, **TREATMENTS[t]))
+    return settings
 
 
 COSTLY = ("turned-5", "turned-20", "shifted", "larger", "coarse")
-OUTLINE = ("turned-5", "turned-20", "larger")
-EVEN = ("turned-5", "coarse")
 ALIGNMENT_ERROR = Study(
     name="alignment-error",
     title="Alignment error",
@@ -78,12 +79,16 @@ ALIGNMENT_ERROR = Study(
     claims=(
         *(Claim("entries", "exact", p, f"“{PERTURBED[p][0]}” raises the error") for p in COSTLY),
         *(
-            own("entries", f"{p}-outline", p, f"fitting the outline helps where objects are {PERTURBED[p][0]}")
-            for p in OUTLINE
+            project_claim(
+                "entries", f"{p}-outline", p, f"fitting the outline helps where objects are {PERTURBED[p][0]}"
+            )
+            for p in ("turned-5", "turned-20", "larger")
         ),
         *(
-            own("entries", p, f"{p}-even", f"knowing how sure normals are helps where objects are {PERTURBED[p][0]}")
-            for p in EVEN
+            project_claim(
+                "entries", p, f"{p}-even", f"knowing how sure normals are helps where objects are {PERTURBED[p][0]}"
+            )
+            for p in ("turned-5", "coarse")
         ),
     ),
     lights=1,
@@ -95,9 +100,12 @@ ALIGNMENT_ERROR = Study(
 
 def progressive_settings(scale: Scale) -> list[Setting]:
     """Return settings of more and more photos, then of the same from the solution before."""
-    n, entries = scale.largest, [full_matrix(scale.side, k) for k in range(scale.largest + 1)]
-    cold = [scale.of_objects(f"photos-{k}", str(k), entries[k]) for k in range(1, n + 1)]
-    return cold + [scale.of_objects(f"photos-{k}-warm", f"{k} warm", entries[k], warm=True) for k in range(2, n + 1)]
+    n = scale.largest
+    entries = [full_matrix(scale.side, k) for k in range(scale.largest + 1)]
+    cold = [scale.object_setting(f"photos-{k}", str(k), entries[k]) for k in range(1, n + 1)]
+    return cold + [
+        scale.object_setting(f"photos-{k}-warm", f"{k} warm", entries[k], warm=True) for k in range(2, n + 1)
+    ]
 
 
 PROGRESSIVE = Study(
@@ -113,10 +121,10 @@ PROGRESSIVE = Study(
         Claim("diffuse", "photos-5", "photos-1", "5 photos are better than one (k_d)"),
         Claim("roughness", "photos-5", "photos-1", "5 photos are better than one (roughness)"),
         Claim("first_light", "photos-5", "photos-1", "5 photos are better than one (light 0)"),
-        own("new_light", "photos-5", "photos-4", "the last of 5 photos still improves re-rendering"),
-        own("seconds", "photos-5-warm", "photos-5", "a warm start takes less time than a start from nothing"),
-        own("new_light", "photos-5-warm", "photos-5", "a warm start is better than one from nothing"),
-        own("new_light", "photos-5", "photos-5-warm", "a start from nothing is better than a warm one"),
+        project_claim("new_light", "photos-5", "photos-4", "the last of 5 photos still improves re-rendering"),
+        project_claim("seconds", "photos-5-warm", "photos-5", "a warm start takes less time than a start from nothing"),
+        project_claim("new_light", "photos-5-warm", "photos-5", "a warm start is better than one from nothing"),
+        project_claim("new_light", "photos-5", "photos-5-warm", "a start from nothing is better than a warm one"),
     ),
     lights=1,
 )
@@ -156,9 +164,9 @@ GAUSS_SPHERE = Study(
             "all entries are predicted from nine faces better than by a guess of mean colours",
         ),
         Claim("new_light", "faces-9", "faces-1", "nine faces tell more of materials than one"),
-        own("new_light", "3x3", "faces-9", "a sphere tells more than nine faces"),
-        own("roughness", "3x3", "faces-1", "roughness is known better of a sphere than of one face"),
-        own(
+        project_claim("new_light", "3x3", "faces-9", "a sphere tells more than nine faces"),
+        project_claim("roughness", "3x3", "faces-1", "roughness is known better of a sphere than of one face"),
+        project_claim(
             "stated_roughness",
             "3x3",
             "faces-1",

@@ -7,7 +7,7 @@ chair), not from the photos.
 from collections.abc import Callable
 from random import Random
 
-from studies.study import Claim, Entry, Scale, Setting, Study, full_matrix, own
+from studies.study import Claim, Entry, Scale, Setting, Study, full_matrix, project_claim
 
 # ── matrix size ───────────────────────────────────────────────────────────────────────────────────────────────────────
 
@@ -22,8 +22,8 @@ MATRIX_SIZE = Study(
     claims=(
         Claim("first_material", "5x5", "1x1", "error falls from 1 × 1 to 5 × 5 (material 0)"),
         Claim("first_light", "5x5", "1x1", "error falls from 1 × 1 to 5 × 5 (light 0)"),
-        own("first_material", "5x5", "4x4", "it still falls from 4 × 4 (material 0)"),
-        own("first_light", "5x5", "4x4", "it still falls from 4 × 4 (light 0)"),
+        project_claim("first_material", "5x5", "4x4", "it still falls from 4 × 4 (material 0)"),
+        project_claim("first_light", "5x5", "4x4", "it still falls from 4 × 4 (light 0)"),
     ),
 )
 
@@ -40,9 +40,9 @@ ROW_AND_COLUMN = Study(
     settings=lambda scale: [scale.matrix(m, n) for m in (1, scale.largest) for n in (1, scale.largest)],
     claims=(
         Claim("entries", "1x5", "5x1", "1 × 5 predicts its entries better than 5 × 1"),
-        own("first_material", "1x5", "5x1", "1 × 5 tells more of material 0 than 5 × 1"),
-        own("first_material", "1x5", "1x1", "more lights tell more of material 0"),
-        own("first_light", "5x1", "1x1", "more materials tell more of light 0"),
+        project_claim("first_material", "1x5", "5x1", "1 × 5 tells more of material 0 than 5 × 1"),
+        project_claim("first_material", "1x5", "1x1", "more lights tell more of material 0"),
+        project_claim("first_light", "5x1", "1x1", "more materials tell more of light 0"),
     ),
 )
 
@@ -52,11 +52,12 @@ ROW_AND_COLUMN = Study(
 
 def random_entries(n: int, seed: int) -> list[Entry]:
     """Draw as many entries as a star has, again until each material and each light is among them."""
-    rng, every = Random(seed), full_matrix(n, n)
+    rng = Random(seed)
+    every = full_matrix(n, n)
     while True:
-        drawn = sorted(rng.sample(every, 2 * n - 1))
-        if len({m for m, _ in drawn}) == len({li for _, li in drawn}) == n:
-            return drawn
+        entries = sorted(rng.sample(every, 2 * n - 1))
+        if len({m for m, _ in entries}) == len({li for _, li in entries}) == n:
+            return entries
 
 
 PATTERNS: dict[str, Callable[[int, int], list[Entry]]] = {
@@ -88,11 +89,11 @@ STRUCTURE = Study(
     measures=("unobserved", "observed", "entries", "new_light", "diffuse", "specular", "roughness"),
     settings=structure_settings,
     claims=(
-        own("unobserved", "link-5", "diagonal-5", "a linking material helps unconnected pairs"),
-        own("unobserved", "loop-5", "diagonal-5", "a loop helps unconnected pairs"),
-        own("unobserved", "link-5", "star-5", "the diagonal is worth more than a second arm of the star"),
-        own("unobserved", "star-5", "random-5", "a star is worth more than as many entries at random"),
-        own("new_light", "5x5", "loop-5", "all entries are worth more than a loop"),
+        project_claim("unobserved", "link-5", "diagonal-5", "a linking material helps unconnected pairs"),
+        project_claim("unobserved", "loop-5", "diagonal-5", "a loop helps unconnected pairs"),
+        project_claim("unobserved", "link-5", "star-5", "the diagonal is worth more than a second arm of the star"),
+        project_claim("unobserved", "star-5", "random-5", "a star is worth more than as many entries at random"),
+        project_claim("new_light", "5x5", "loop-5", "all entries are worth more than a loop"),
     ),
 )
 
@@ -120,10 +121,14 @@ def patterns(scale: Scale) -> dict[str, list[Entry]]:
 def paper_sets_settings(scale: Scale) -> list[Setting]:
     """Return a setting for each set."""
     sets = patterns(scale).items()
-    return [scale.of_objects(f"set-{name}", name.replace("-unlinked", " without chair"), of) for name, of in sets]
+    return [
+        scale.object_setting(f"set-{name}", name.replace("-unlinked", " without chair"), entries)
+        for name, entries in sets
+    ]
 
 
-DOCKSTA, UNLINKED = "set-docksta", "set-docksta-unlinked"
+DOCKSTA = "set-docksta"
+UNLINKED = "set-docksta-unlinked"
 BETTER = "are predicted better than by a guess of mean colours"
 PAPER_SETS = Study(
     name="paper-sets",
@@ -141,8 +146,8 @@ PAPER_SETS = Study(
         Claim("entries", "set-lapd", ("guess", "set-lapd"), f"entries of LAPD's pattern {BETTER}"),
         Claim("entries", "set-photos", ("guess", "set-photos"), f"entries of all photos {BETTER}"),
         Claim("unobserved", DOCKSTA, UNLINKED, "the linking chair helps to predict what was not observed"),
-        own("observed", DOCKSTA, UNLINKED, "the linking chair helps with what was observed"),
-        own("entries", "set-photos", DOCKSTA, "the full matrix is predicted better than the linked one"),
+        project_claim("observed", DOCKSTA, UNLINKED, "the linking chair helps with what was observed"),
+        project_claim("entries", "set-photos", DOCKSTA, "the full matrix is predicted better than the linked one"),
     ),
     lights=1,
 )

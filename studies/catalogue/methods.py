@@ -1,110 +1,32 @@
-"""Methods compared: predictions of a chair, other methods, weights of the prior, solvers, and parts of the model."""
+"""Methods compared: other methods, weights of the prior, solvers, and parts of the model."""
 
 from typing import Any
 
-import msgspec
-
-from studies.study import Claim, Comparison, Scale, Setting, Study, full_matrix, own
-
-# ── leave one out ─────────────────────────────────────────────────────────────────────────────────────────────────────
-
-SHELLS = {  # of the chairs, by photo
-    "terrace": ("red", "white"),
-    "kitchen": ("yellow",),
-    "hall": ("black", "yellow"),
-    "garden": ("white",),
-    "office": ("red",),
-    "patio": ("black",),
-}
-PHOTOS = {"full": tuple(SHELLS), "quick": ("kitchen", "hall")}
-
-
-class LeftOut(msgspec.Struct, frozen=True):
-    """The shells of a photo that are predicted one at a time, and from what; solve: parameters of the stage."""
-
-    photo: str
-    shells: tuple[str, ...]
-    prediction: str
-    solve: dict[str, Any] = {}
-
-
-def leave_one_out_case(scale: Scale, number: int, prediction: str) -> LeftOut:
-    """Return the case of a photo by its number; a shell that no other photo shows is not asked for."""
-    photos = PHOTOS[scale.name]
-    others = {shell for k, photo in enumerate(photos) if k != number for shell in SHELLS[photo]}
-    return LeftOut(photos[number], tuple(s for s in SHELLS[photos[number]] if s in others), prediction, scale.solve)
-
-
-def by_photo(table: Any) -> list[str]:
-    """State each photo's values in a sentence: six photos are few, and one that is unlike the others decides a mean."""
-    values = {row.label: row.cells["chair"].values for row in table.rows}
-    photos = PHOTOS["quick" if table.quick else "full"]
-    each = (f"{photos[k]} {', '.join(f'{of[k]:.2g}' for of in values.values())}" for k in table.seeds)
-    return [f"DSSIM of a chair, photo by photo ({', '.join(values)}): {'; '.join(each)}."]
-
-
-LEAVE_ONE_OUT = Study(
-    name="leave-one-out",
-    title="Leave one out",
-    question="Can a chair be predicted in a photo from everything else?",
-    paper="A chair of the eames photos that took no part in the solve can be predicted. "
-    "(Its photos and numbers cannot be had.)",
-    varied="where the chair is predicted from",
-    measures=("chair", "chair_scaled"),
-    settings=lambda scale: [
-        Setting(f"chair-{p.replace(' ', '-')}", p, lambda k, p=p: leave_one_out_case(scale, k, p))
-        for p in ("left out", "observed", "flat")
-    ],
-    claims=(
-        Claim(
-            "chair",
-            "chair-left-out",
-            "chair-flat",
-            "a chair that was left out is predicted better than by a flat colour",
-        ),
-        own("chair_scaled", "chair-left-out", "chair-flat", "the same with brightness and tint given"),
-        own(
-            "chair",
-            "chair-observed",
-            "chair-left-out",
-            "a chair that was observed is shown better than one that was left out",
-        ),
-    ),
-    steps=("photos", "chairs"),
-    sets=lambda scale: {"folder": "data/eames", "photos": PHOTOS[scale.name]},
-    numbers=lambda scale: (0,) if scale.quick else tuple(range(len(SHELLS))),
-    over="photos",
-    notes=by_photo,
-)
-
+from studies.study import Claim, Comparison, Scale, Setting, Study, full_matrix, project_claim
 
 # ── comparison ────────────────────────────────────────────────────────────────────────────────────────────────────────
 
 METHODS = {  # label; in sentences
     "ours": ("ours", ""),
-    "mitsuba": ("Mitsuba", "Mitsuba"),
-    "intrinsic": ("intrinsic", "the intrinsic decomposition"),
     "projective": ("projective", "projective texturing"),
     "grey": ("grey ball", "a grey ball"),
 }
-SIZES = {"full": (96, 48, 2000), "quick": (32, 16, 20)}  # pixels of photos; pixels and steps of Mitsuba's optimisation
-ASKED = {"view": "new views", "light": "pictures in new light", "material": "pictures of new materials"}
-PAPERS = (("view", "light"), ("intrinsic", "projective"))
+SIZES = {"full": 96, "quick": 32}  # pixels of photos
+PREDICTIONS = {"view": "new views", "light": "pictures in new light", "material": "pictures of new materials"}
 
 
 def comparison_case(scale: Scale, seed: int, method: str) -> Comparison:
     """Return the case of `side` materials in as many lights, by a method."""
-    size, pixels, steps = SIZES[scale.name]
     entries = tuple(full_matrix(scale.side, scale.side))
-    return Comparison(seed, entries, size, scale.solve, method=method, pixels=pixels, steps=steps)
+    return Comparison(seed, entries, SIZES[scale.name], scale.solve, method=method)
 
 
 COMPARISON = Study(
     name="comparison",
     title="Comparison",
     question="Does a joint solve predict photos that were not taken better than other methods?",
-    paper="The joint solve is nearer to the truth than projective texturing and than an intrinsic decomposition "
-    "(SIRFS), averaged over photos.",
+    paper="The joint solve is nearer to the truth than projective texturing, averaged over photos. "
+    "(The paper's intrinsic decomposition, SIRFS, is not compared.)",
     varied="method",
     measures=(
         "novel_view",
@@ -129,14 +51,14 @@ COMPARISON = Study(
             f"novel_{kind}",
             "ours",
             m,
-            f"{what} are predicted better than by {words}",
-            kind in PAPERS[0] and m in PAPERS[1],
+            f"{pictures} are predicted better than by {words}",
+            m == "projective",
         )
-        for kind, what in ASKED.items()
+        for kind, pictures in PREDICTIONS.items()
         for m, (_, words) in METHODS.items()
         if m != "ours" and (kind, m) != ("material", "projective")
     ),
-    steps=("worlds", "answer", "compare"),
+    steps=("worlds", "solve", "compare"),
 )
 
 
@@ -147,10 +69,10 @@ WEIGHTS = {"full": (0.0, 0.1, 1.0, 10.0), "quick": (0.1,)}
 
 def prior_settings(scale: Scale) -> list[Setting]:
     """Return settings: weights of the paper's prior in its solver, then natural light's prior in the joint solver."""
-    how = {"solver": "paper", "operator": "network"}
+    parameters = {"solver": "paper", "operator": "network"}
     return [
         *(
-            scale.setting(f"paper-{w:g}".replace(".", "p"), f"paper {w:g}", solve=how | {"paper_prior": w})
+            scale.setting(f"paper-{w:g}".replace(".", "p"), f"paper {w:g}", solve=parameters | {"paper_prior": w})
             for w in WEIGHTS[scale.name]
         ),
         scale.setting("natural", "natural"),
@@ -180,9 +102,9 @@ PRIOR = Study(
         Claim("chromaticity", "paper-10", "paper-0", "lights are less coloured at 10 than at 0"),
         Claim("entries", "paper-0p1", "paper-0", "0.1 predicts better than 0"),
         Claim("entries", "paper-0p1", "paper-10", "0.1 predicts better than 10"),
-        own("new_light", "paper-0p1", "paper-10", "materials are better at 0.1 than at 10"),
-        own("entries", "natural", "paper-0p1", "natural light's prior predicts better than 0.1"),
-        own("colour", "natural", "paper-0p1", "natural light's prior gives lights truer colours than 0.1"),
+        project_claim("new_light", "paper-0p1", "paper-10", "materials are better at 0.1 than at 10"),
+        project_claim("entries", "natural", "paper-0p1", "natural light's prior predicts better than 0.1"),
+        project_claim("colour", "natural", "paper-0p1", "natural light's prior gives lights truer colours than 0.1"),
     ),
 )
 
@@ -206,9 +128,12 @@ SPEED_QUICK = ("default", "closed-form", "merge-4", "paper")
 
 
 def speed_settings(scale: Scale) -> list[Setting]:
-    """Return all of `VARIANTS`; of a quick study, those of `QUICK`."""
+    """Return all of `VARIANTS`; of a quick study, those of `SPEED_QUICK`."""
     variants = {name: VARIANTS[name] for name in (SPEED_QUICK if scale.quick else VARIANTS)}
-    return [scale.setting(name, label, full_matrix(2, 2), solve=how) for name, (label, how) in variants.items()]
+    return [
+        scale.setting(name, label, full_matrix(2, 2), solve=parameters)
+        for name, (label, parameters) in variants.items()
+    ]
 
 
 SPEED = Study(
@@ -220,17 +145,17 @@ SPEED = Study(
     measures=("seconds", "entries", "new_light", "diffuse", "specular", "roughness"),
     settings=speed_settings,
     claims=(
-        own("entries", "default", "paper", "this project's solver predicts better than the paper's"),
-        own("seconds", "default", "paper", "it takes less time than the paper's"),
-        own("seconds", "paper", "paper-network", "this project's operator makes the paper's solver faster"),
-        own("entries", "default", "closed-form", "the network predicts better than the closed form"),
-        own("entries", "default", "splittings-0", "splitting of cells predicts better"),
-        own("entries", "default", "cells-150", "400 cells predict better than 150"),
-        own("entries", "default", "observations-300", "1000 observations predict better than 300"),
-        own("entries", "observations-4000", "default", "4000 observations predict better than 1000"),
-        own("seconds", "default", "observations-4000", "1000 observations take less time than 4000"),
-        own("entries", "merge-0", "default", "merging observations costs accuracy"),
-        own("seconds", "default", "merge-0", "merging observations saves time"),
+        project_claim("entries", "default", "paper", "this project's solver predicts better than the paper's"),
+        project_claim("seconds", "default", "paper", "it takes less time than the paper's"),
+        project_claim("seconds", "paper", "paper-network", "this project's operator makes the paper's solver faster"),
+        project_claim("entries", "default", "closed-form", "the network predicts better than the closed form"),
+        project_claim("entries", "default", "splittings-0", "splitting of cells predicts better"),
+        project_claim("entries", "default", "cells-150", "400 cells predict better than 150"),
+        project_claim("entries", "default", "observations-300", "1000 observations predict better than 300"),
+        project_claim("entries", "observations-4000", "default", "4000 observations predict better than 1000"),
+        project_claim("seconds", "default", "observations-4000", "1000 observations take less time than 4000"),
+        project_claim("entries", "merge-0", "default", "merging observations costs accuracy"),
+        project_claim("seconds", "default", "merge-0", "merging observations saves time"),
     ),
 )
 
@@ -277,11 +202,11 @@ PARTS = Study(
     measures=("diffuse", "specular", "glossy", "roughness", "mirror"),
     settings=parts_settings,
     claims=tuple(
-        own(m, "as-it-is", n, f"{WITHOUT[n][1]} {does}")
+        project_claim(m, "as-it-is", n, f"{WITHOUT[n][1]} {does}")
         for m, does in {"diffuse": "make k_d truer", "glossy": "make lights truer"}.items()
         for n in WITHOUT
         if n != "as-it-is"
     ),
-    steps=("photos", "parts"),
+    steps=("rendered_sets", "parts"),
     sets=parts_sets,
 )

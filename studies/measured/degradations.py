@@ -1,7 +1,7 @@
-"""Made sets of very different quality, from good to hopeless: sets of chairs.
+"""Degraded sets of chairs, from good to hopeless, for `studies.measured.verdict`.
 
-Photos, mesh, masks or links of each are spoilt.
-What is spoilt, and by how much, is drawn by the set's number.  The truth stays with the set.
+The photos, mesh, masks or links of each are degraded, by amounts that the set's number seeds.  The truth stays with the
+set.
 """
 
 import shutil
@@ -22,7 +22,8 @@ from factorlib.meshes.mesh import smooth
 
 Rng = np.random.Generator
 Spec = dict[str, Any]  # the content of dataset.yaml
-MESH, TRUTH = "meshes/chair.obj", "truth/truth.yaml"
+MESH = "meshes/chair.obj"
+TRUTH = "truth/truth.yaml"
 
 
 def keep(spec: Spec, names: list[str]) -> None:
@@ -36,8 +37,8 @@ def exact(folder: Path, spec: Spec, rng: Rng) -> None:
     write_obj(folder / MESH, {name: (mesh.vertices, mesh.faces, mesh.normals) for name, mesh in solid.items()})
     poses = yaml.safe_load((folder / TRUTH).read_text())["poses"]
     for photo in spec["photos"]:
-        for own in photo["objects"]:
-            own["pose"] = poses[photo["name"]][own["name"]]
+        for obj in photo["objects"]:
+            obj["pose"] = poses[photo["name"]][obj["name"]]
 
 
 def rough(folder: Path, spec: Spec, rng: Rng) -> None:
@@ -118,15 +119,12 @@ def developed(folder: Path, spec: Spec, rng: Rng) -> None:
 def tiny(folder: Path, spec: Spec, rng: Rng) -> None:
     """Make all pictures six times smaller."""
     for photo in spec["photos"]:
-        for file in [photo["image"], photo["masks"], *(own["mask"] for own in photo["objects"] if "mask" in own)]:
-            is_photo = file == photo["image"]
-            with Image.open(folder / file) as picture:
-                how = Image.Resampling.BOX if is_photo else Image.Resampling.NEAREST
-                small = np.asarray(picture.resize((picture.width // 6, picture.height // 6), how))
-                focal = focal_of(picture)
-            write_photo(folder / file, srgb_decode(small / 255.0), focal) if is_photo else write_labels(
-                folder / file, small
-            )
+        image = folder / photo["image"]
+        masks = [photo["masks"], *(obj["mask"] for obj in photo["objects"] if "mask" in obj)]
+        small, focal = shrunk(image, Image.Resampling.BOX)
+        write_photo(image, srgb_decode(small / 255.0), focal)
+        for file in masks:
+            write_labels(folder / file, shrunk(folder / file, Image.Resampling.NEAREST)[0])
         file = folder / f"truth/{photo['name']}_normal.exr"
         channels = read_exr(file)
         write_normals(file, np.stack([channels[f"normal.{axis}"][3::6, 3::6] for axis in "xyz"], axis=-1))
@@ -134,9 +132,15 @@ def tiny(folder: Path, spec: Spec, rng: Rng) -> None:
             photo["camera"] = {"focal_px": photo["camera"]["focal_px"] / 6}
 
 
+def shrunk(file: Path, resampling: Image.Resampling) -> tuple[np.ndarray, int | None]:
+    """Return a picture six times smaller, and its focal length."""
+    with Image.open(file) as picture:
+        return np.asarray(picture.resize((picture.width // 6, picture.height // 6), resampling)), focal_of(picture)
+
+
 KINDS: dict[str, Callable[[Path, Spec, Rng], None]] = {
-    of.__name__: of
-    for of in (
+    function.__name__: function
+    for function in (
         exact,
         rough,
         rougher,
@@ -152,7 +156,7 @@ KINDS: dict[str, Callable[[Path, Spec, Rng], None]] = {
         tiny,
     )
 }
-# What a set is spoilt by, one way after the other; each is dealt equally often.
+# Degradations of a set, one after the other; each entry is used equally often.
 MIXED = (
     [], [], ["exact"], ["exact"], ["few"], ["exact", "few"], ["rough"], ["rough", "few"], ["rougher"],
     ["another_chair"], ["one_photo"], ["one_photo", "exact"], ["unlinked"], ["miscalled"], ["clipped"],
@@ -160,28 +164,26 @@ MIXED = (
 )  # fmt: skip
 
 
-def spoilt(base: Path, folder: Path, kinds: list[str], seed: int) -> None:
-    """Write the set in `base`, spoilt, as the folder, which is there when all of it is."""
-    whole, folder = folder, folder.with_name(f"{folder.name}.new")
-    shutil.rmtree(folder, ignore_errors=True)
-    shutil.copytree(base, folder)
-    spec, rng = yaml.safe_load((folder / "dataset.yaml").read_text()), np.random.default_rng([17, seed])
+def degrade(base: Path, folder: Path, kinds: list[str], seed: int) -> None:
+    """Write the set in `base`, degraded, as the folder, which is there when all of it is."""
+    draft = folder.with_name(f"{folder.name}.new")
+    shutil.rmtree(draft, ignore_errors=True)
+    shutil.copytree(base, draft)
+    spec = yaml.safe_load((draft / "dataset.yaml").read_text())
+    rng = np.random.default_rng([17, seed])
     for kind in kinds:
-        KINDS[kind](folder, spec, rng)
-    write_yaml(folder / "dataset.yaml", spec, f"spoilt: {', '.join(kinds) or 'nothing'}")
-    write_yaml(
-        folder / TRUTH, truth_of(spec, yaml.safe_load((folder / TRUTH).read_text())), "the truth of what is left"
-    )
-    folder.rename(whole)
+        KINDS[kind](draft, spec, rng)
+    write_yaml(draft / "dataset.yaml", spec, f"degraded: {', '.join(kinds) or 'nothing'}")
+    truth = truth_of(spec, yaml.safe_load((draft / TRUTH).read_text()))
+    write_yaml(draft / TRUTH, truth, "truth of the photos and materials that are left")
+    draft.rename(folder)
 
 
 def truth_of(spec: Spec, truth: Spec) -> Spec:
-    """Return the truth of the photos and materials that are left: what no photo shows is not to be scored."""
+    """Return the truth of the photos and materials that are left: a material without a photo is not to be scored."""
     names = [photo["name"] for photo in spec["photos"]]
-    shown = {m for photo in spec["photos"] for own in photo["objects"] for m in ("wood", *own["materials"].values())}
-    materials = {
-        name: truth["materials"]["wood" if name == "wood_2" else name] for name in spec["materials"] if name in shown
-    }
+    visible = {m for photo in spec["photos"] for obj in photo["objects"] for m in ("wood", *obj["materials"].values())}
+    materials = {name: truth["materials"][name.removesuffix("_2")] for name in spec["materials"] if name in visible}
     by_photo = {key: {name: truth[key][name] for name in names} for key in ("illumination", "normals", "poses")}
     return {"materials": materials, **by_photo}
 
@@ -212,8 +214,9 @@ def each_photo(folder: Path, spec: Spec, change: Callable, filtered: ImageFilter
     """Change the linear radiance of every photo, then its picture."""
     for photo in spec["photos"]:
         with Image.open(folder / photo["image"]) as picture:
-            focal, linear = focal_of(picture), np.clip(change(srgb_decode(np.asarray(picture) / 255.0)), 0, 1)
+            focal = focal_of(picture)
+            linear = np.clip(change(srgb_decode(np.asarray(picture) / 255.0)), 0, 1)
         if filtered:
-            made = Image.fromarray((srgb_encode(linear) * 255 + 0.5).astype(np.uint8)).filter(filtered)
-            linear = srgb_decode(np.asarray(made) / 255.0)
+            sharpened = Image.fromarray((srgb_encode(linear) * 255 + 0.5).astype(np.uint8)).filter(filtered)
+            linear = srgb_decode(np.asarray(sharpened) / 255.0)
         write_photo(folder / photo["image"], linear, focal)

@@ -1,17 +1,17 @@
 """Errors of lights and materials on data/eames, and on sets made alike.
 
-Measured by `make results ONLY=eames_like [LIGHTS="FOLDER …"]`:
+Measured by `make results ONLY=eames_like LIGHTS="FOLDER …"`:
 
 data/eames  the set that settings were chosen on
 made        `python -m factorlib.generate eames --seed N`: other materials, views and lights; no setting was chosen on
             them
-captured    with LIGHTS, folders of captured lat-long maps: the same of the next seeds, each lit by six maps that are
-            drawn from the folders' by its seed.  The prior on lights of such a set is fitted to the other maps alone,
+captured    with LIGHTS, folders of captured lat-long maps: the same of the next seeds, each lit by six of these maps,
+            chosen by its seed.  The prior on lights of such a set is fitted to the other maps alone,
             in a copy of the project
 
-Each set runs through the pipeline once with the default seed of the solve; what is current is not run again.  Sets lie
-in build/bench/eames-like, results in build/ (of captured ones in the copies).  `python -m studies.measured.eames_like
-[seed …]` prints the table of data/eames and of sets of these seeds, in made light or, with LIGHTS, in captured light.
+Each set runs through the pipeline once with the default seed of the solve (some minutes; the rendering of a set takes
+three); what is current is not run again.  Sets lie in build/bench/eames-like, results in build/ (of captured ones in
+the copies).
 """
 
 import hashlib
@@ -30,15 +30,18 @@ from factorlib.images.light_map import maps_in
 from factorlib.jsonfile import write_json
 from studies.measured.light_prior import prior_of
 from studies.measured.standard_errors import light_deviations, material_deviations
-from studies.measured.tools import ROOT, Tables, evaluated, table, value_at
+from studies.measured.tools import ROOT, Tables, evaluate_dataset, value_at
 
 PLACE = ROOT / "build/bench/eames-like"
-SEEDS, CAPTURED_SEEDS = (101, 102, 103, 104, 105), (106, 107, 108, 109, 110)
+SEEDS = (101, 102, 103, 104, 105)
+CAPTURED_SEEDS = (106, 107, 108, 109, 110)
 MAPS = 6  # of a set: one for each photo
 PRIOR = Path("factorlib/light/prior.json")
 COPIED = ("factorlib", "stages", "recipes", "pipeline.yaml")
-WITHIN = ("k_d", "k_s", "roughness", "log radiance of lights")
-LIGHT, BALLS, PSNR = "light.mean.channel_per_photo", "relighting.mean.channel_per_photo", "psnr_tonemapped_db"
+DEVIATIONS = ("k_d", "k_s", "roughness", "log radiance of lights")
+LIGHT = "light.mean.channel_per_photo"
+BALLS = "relighting.mean.channel_per_photo"
+PSNR = "psnr_tonemapped_db"
 
 
 class Quantity(NamedTuple):
@@ -67,8 +70,8 @@ def _light(meaning: str, view: str, measure: str = "rmse", digits: int = 3, unit
     return Quantity(meaning, f"{LIGHT}.{view}.estimate.{measure}", f"{LIGHT}.{view}.null.{measure}", digits, unit)
 
 
-def _material(meaning: str, part: str, *how: Any) -> Quantity:
-    return Quantity(meaning, f"materials.mean_{part}", f"materials.null_mean_{part}", *how)
+def _material(meaning: str, part: str, *form: Any) -> Quantity:
+    return Quantity(meaning, f"materials.mean_{part}", f"materials.null_mean_{part}", *form)
 
 
 QUANTITIES = (
@@ -86,25 +89,27 @@ QUANTITIES = (
 )
 
 
-class Set(NamedTuple):
-    """A set and its results.  metrics: those of metrics.json;  results: the folder, build/<name>."""
+class SetResult(NamedTuple):
+    """Result of a set: its name, its metrics.json, and its folder, build/<name>."""
 
     name: str
     metrics: dict
-    results: Path
+    build: Path
 
     def value(self, path: str) -> float:
-        """Return a number of the results.  InputError where it is missing."""
+        """Return a number of the metrics.  InputError where it is missing."""
         if (value := value_at(self.metrics, path)) is None:
-            file = self.results / "evaluate/metrics.json"
-            raise InputError(
-                "there is no such number", file=file, key=path, cure="correct studies/measured/eames_like.py"
-            )
+            cure = "correct QUANTITIES in studies/measured/eames_like.py"
+            raise InputError("there is no such number", file=self.build / "evaluate/metrics.json", key=path, cure=cure)
         return value
 
+    def deviations(self) -> list[np.ndarray]:
+        """Return |estimate − truth| over the standard error, in the order of `DEVIATIONS`."""
+        return [*material_deviations(self.build).values(), light_deviations(self.build)]
 
-def made(seed: int, lights: Path | None = None) -> Path:
-    """Return the folder of the set of that seed, made where it is missing or factorlib/generate has changed."""
+
+def generate_set(seed: int, lights: Path | None = None) -> Path:
+    """Return the folder of the set of that seed, generated where it is missing or factorlib/generate has changed."""
     sources = sorted(path for path in (ROOT / "factorlib/generate").iterdir() if path.is_file())
     digest = hashlib.sha256(b"".join(path.read_bytes() for path in sources)).hexdigest()[:8]
     folder = PLACE / digest / ("captured" if lights else "made") / f"eames-like-{seed}"
@@ -114,7 +119,7 @@ def made(seed: int, lights: Path | None = None) -> Path:
     return folder
 
 
-def drawn(maps: Sequence[Path], seed: int) -> tuple[list[Path], list[Path]]:
+def split_maps(maps: Sequence[Path], seed: int) -> tuple[list[Path], list[Path]]:
     """Return the maps that light the set of that seed, and all others.
 
     Raises InputError where no two are left for a prior.
@@ -126,7 +131,7 @@ def drawn(maps: Sequence[Path], seed: int) -> tuple[list[Path], list[Path]]:
     return [m for k, m in enumerate(maps) if k in chosen], [m for k, m in enumerate(maps) if k not in chosen]
 
 
-def folder_of(maps: Sequence[Path], folder: Path) -> Path:
+def link_maps(maps: Sequence[Path], folder: Path) -> Path:
     """Return a folder with links to these maps alone; they keep their order."""
     shutil.rmtree(folder, ignore_errors=True)
     folder.mkdir(parents=True)
@@ -141,71 +146,57 @@ def project_with_prior(maps: Sequence[Path], folder: Path) -> Path:
     Its results and its store, in build/, stay from run to run.
     """
     for name in COPIED:
-        whole, copy = ROOT / name, folder / name
-        if whole.is_dir():
+        source = ROOT / name
+        copy = folder / name
+        if source.is_dir():
             shutil.rmtree(copy, ignore_errors=True)
-            shutil.copytree(whole, copy, ignore=shutil.ignore_patterns("__pycache__"))
+            shutil.copytree(source, copy, ignore=shutil.ignore_patterns("__pycache__"))
         else:
-            shutil.copy2(whole, copy)
+            shutil.copy2(source, copy)
     write_json(folder / PRIOR, prior_of(maps, scored=False))
     return folder
 
 
-def solved(name: str, dataset: Path, root: Path = ROOT) -> Set:
-    """Return what the pipeline below `root` finds on a data set; name: of the set in the table."""
+def run_pipeline(name: str, dataset: Path, root: Path = ROOT) -> SetResult:
+    """Run the pipeline below `root` on a data set; name: of the set in the table."""
     (store := ROOT / "build/store").mkdir(parents=True, exist_ok=True)
-    return Set(name, evaluated(dataset, root, FACTORLIB_STORE=str(store)), root / "build" / dataset.name)
+    return SetResult(name, evaluate_dataset(dataset, root, FACTORLIB_STORE=str(store)), root / "build" / dataset.name)
 
 
-def captured(seed: int, folders: Sequence[Path]) -> Set:
+def run_captured(seed: int, folders: Sequence[Path]) -> SetResult:
     """Return the set of that seed in captured lights, solved under a prior that knows none of them."""
-    here = PLACE / f"captured-{seed}"
-    maps, others = drawn(maps_in(folders), seed)
+    folder = PLACE / f"captured-{seed}"
+    maps, others = split_maps(maps_in(folders), seed)
     print(f"set {seed} is lit by {', '.join(m.name for m in maps)}", flush=True)
-    dataset = made(seed, folder_of(maps, here / "maps"))
-    return solved(f"{seed}, captured", dataset, project_with_prior(others, here / "project"))
+    dataset = generate_set(seed, link_maps(maps, folder / "maps"))
+    return run_pipeline(f"{seed}, captured", dataset, project_with_prior(others, folder / "project"))
 
 
-def within(one: Set) -> dict[str, np.ndarray]:
-    """Return |estimate − truth| over the standard error: of materials, by part, and of the lights' log radiances."""
-    parts = [*material_deviations(one.results, None).values(), light_deviations(one.results, None)]
-    return dict(zip(WITHIN, parts, strict=True))
+def rows() -> Tables:
+    """Generate the sets, run the pipeline on each, and compare with the truth."""
+    folders = [Path(word) for word in os.environ.get("LIGHTS", "").split()]
+    eames = run_pipeline("data/eames", ROOT / "data/eames")
+    others = [run_pipeline(str(seed), generate_set(seed)) for seed in SEEDS]
+    others += [run_captured(seed, folders) for seed in CAPTURED_SEEDS] if folders else []
+    return {"Sets": rows_of([eames, *others])}
 
 
-def rows_of(sets: Sequence[Set], unchosen: Sequence[Set]) -> list[list[str]]:
-    """Return a column for each set, and mean and standard deviation over those that no setting was chosen on.
+def rows_of(results: Sequence[SetResult]) -> list[list[str]]:
+    """Return a column for each set, and mean and standard deviation over all but the first, which settings know.
 
     Brackets hold the null's score.
     """
-    rows = [["", *(one.name for one in sets), "mean ± spread of those that no setting was chosen on"]]
+    table = [["", *(result.name for result in results), "mean ± spread of those that no setting was chosen on"]]
     for quantity in QUANTITIES:
-        nulls = {one.name: one.value(quantity.null) for one in sets} if quantity.null else {}
-        values = {one.name: one.value(quantity.path) for one in sets}
-        cells = [quantity.text(v) + (f" ({quantity.text(nulls[n])})" if nulls else "") for n, v in values.items()]
-        over = [values[one.name] for one in unchosen]
-        null = f" ({quantity.text(np.mean([nulls[one.name] for one in unchosen]))})" if nulls else ""
-        spread = f" ± {quantity.text(np.std(over, ddof=1))}" if len(over) > 1 else ""
-        rows.append([quantity.meaning, *cells, f"{quantity.text(np.mean(over))}{spread}{null}"])
-    shares = {one.name: within(one) for one in sets}
-    for part in WITHIN:
-        pooled = np.concatenate([shares[one.name][part] for one in unchosen])
-        cells = [f"{100 * np.mean(d < 1):.0f} %" for d in (*(shares[one.name][part] for one in sets), pooled)]
-        rows.append([f"{part} within one standard error", *cells])
-    return rows
-
-
-def rows(made_seeds: Sequence[int] = SEEDS, captured_seeds: Sequence[int] = CAPTURED_SEEDS) -> Tables:
-    """Make the sets, run the pipeline on each, and compare with the truth."""
-    folders = [Path(word) for word in os.environ.get("LIGHTS", "").split()]
-    eames, others = solved("data/eames", ROOT / "data/eames"), [solved(str(seed), made(seed)) for seed in made_seeds]
-    others += [captured(seed, folders) for seed in captured_seeds] if folders else []
-    return {"Sets": rows_of([eames, *others], others)}
-
-
-if __name__ == "__main__":
-    try:
-        numbers, lit = [int(word) for word in sys.argv[1:]], bool(os.environ.get("LIGHTS"))
-        found = rows(*([], numbers) if lit else (numbers, [])) if numbers else rows()
-        print("\n\n".join(table(lines[0], lines[1:]) for lines in found.values()))
-    except InputError as error:
-        sys.exit(f"error: {error}")
+        values = [result.value(quantity.path) for result in results]
+        nulls = [result.value(quantity.null) for result in results] if quantity.null else []
+        cells = [quantity.text(value) for value in [*values, np.mean(values[1:])]]
+        cells[-1] += f" ± {quantity.text(np.std(values[1:], ddof=1))}"
+        if nulls:
+            brackets = [quantity.text(null) for null in [*nulls, np.mean(nulls[1:])]]
+            cells = [f"{cell} ({null})" for cell, null in zip(cells, brackets, strict=True)]
+        table.append([quantity.meaning, *cells])
+    for name, *columns in zip(DEVIATIONS, *(result.deviations() for result in results), strict=True):
+        shares = [f"{100 * np.mean(column < 1):.0f} %" for column in [*columns, np.concatenate(columns[1:])]]
+        table.append([f"{name} within one standard error", *shares])
+    return table

@@ -1,11 +1,8 @@
-"""docs/gallery.md: a picture of every recipe, made of data/eames; `make results ONLY=gallery`.
+"""Page docs/gallery.md, a picture of every recipe of data/eames: `make results ONLY=gallery`.
 
 Recipes are the files in recipes/ and recipes/eames/: a new one appears by itself.
 """
 
-import os
-import subprocess
-import sys
 from pathlib import Path
 
 import numpy as np
@@ -13,10 +10,11 @@ from PIL import Image
 
 from factorlib.errors import InputError
 from factorlib.wholefile import write_text
-from studies.measured.tools import ROOT
+from studies.measured.tools import ROOT, run_verb
 
 PAGE = ROOT / "docs" / "gallery.md"
-DATASET, PHOTO = "eames", "terrace"  # whose pictures are shown where a recipe makes them of all photos
+DATASET = "eames"
+PHOTO = "terrace"  # whose pictures are shown where a recipe makes them of all photos
 SIDE = 240  # pixels of the longer side of one of four pictures; twice as many of a single one
 HEAD = """# Gallery
 
@@ -32,8 +30,8 @@ for every photograph this page shows the `terrace`,
 of four pictures or more, such as frames of an animation, four. `make results ONLY=gallery` writes the page.
 """
 FIGURE = """<figure markdown="0" style="margin: 0">
-<img src="gallery/{name}.jpg" alt="{says}" width="{width}" height="{height}">
-<figcaption><strong>{name}</strong>: {says}<br><code>make render DATASET={dataset} RECIPE={name}</code></figcaption>
+<img src="gallery/{name}.jpg" alt="{caption}" width="{width}" height="{height}">
+<figcaption><strong>{name}</strong>: {caption}<br><code>make render DATASET={dataset} RECIPE={name}</code></figcaption>
 </figure>"""
 GRID = (
     '<div style="display: grid; grid-template-columns: repeat(auto-fill, minmax(min(100%, 300px), 1fr)); gap: 1.5rem">'
@@ -41,11 +39,8 @@ GRID = (
 
 
 def write() -> Path:
-    """Make the pictures of all recipes that are not made, write the page and its pictures, and return the page."""
-    environment = {name: value for name, value in os.environ.items() if name not in ("SET", "FORCE", "STAGE")}
-    environment |= {"DATASET": DATASET, "RECIPE": "all", "PYTHONPATH": str(ROOT)}
-    if subprocess.run([sys.executable, "-m", "factorlib", "render"], cwd=ROOT, env=environment, check=False).returncode:
-        raise SystemExit(1)  # it has said why
+    """Render all recipes that are not current, write the page and its pictures, and return the page."""
+    run_verb("render", DATASET, RECIPE="all")
     recipes = {path.stem: path for folder in ("", DATASET) for path in (ROOT / "recipes" / folder).glob("*.yaml")}
     (ROOT / "docs" / "gallery").mkdir(exist_ok=True)
     figures = [figure(recipes[name]) for name in sorted(recipes)]
@@ -63,38 +58,39 @@ def figure(recipe: Path) -> str:
     if not first.startswith("# "):
         raise InputError("the first line does not say what the recipe shows", file=recipe, cure="begin it with `# …`")
     folder = ROOT / "build" / DATASET / "recipes" / recipe.stem
-    made = sorted(folder.rglob("*.png"))
-    made = [file for file in made if Path(file.relative_to(folder).parts[0]).stem == PHOTO] or made
-    made = [made[k * len(made) // 4] for k in range(4)] if len(made) >= 4 else made[:1]
-    picture = sheet(made)
+    files = sorted(folder.rglob("*.png"))
+    files = [file for file in files if Path(file.relative_to(folder).parts[0]).stem == PHOTO] or files
+    files = [files[k * len(files) // 4] for k in range(4)] if len(files) >= 4 else files[:1]
+    picture = sheet(files)
     picture.save(ROOT / "docs" / "gallery" / f"{recipe.stem}.jpg", quality=85, optimize=True)
     width, height = picture.size
-    says = first[2:] + parts_of(folder, made)
-    return FIGURE.format(name=recipe.stem, says=says, width=width, height=height, dataset=DATASET)
+    caption = first[2:] + parts_of(folder, files)
+    return FIGURE.format(name=recipe.stem, caption=caption, width=width, height=height, dataset=DATASET)
 
 
-def parts_of(folder: Path, shown: list[Path]) -> str:
-    """Name the rows and columns of a grid, or the lights of the pictures `shown`.
+def parts_of(folder: Path, files: list[Path]) -> str:
+    """Name the rows and columns of a grid, or the lights of the pictures in `files`.
 
     Frames and single pictures have no such names.
     """
     if (folder / "grid.txt").exists():
         rows, columns = (folder / "grid.txt").read_text("utf-8").splitlines()[:2]
         return f" R{rows[1:]}; {columns}."
-    names = [file.stem for file in shown]
+    names = [file.stem for file in files]
     return "" if len(names) == 1 or names[0].isdigit() else f" Here, row by row: {', '.join(names)}."
 
 
 def sheet(files: list[Path]) -> Image.Image:
-    """Return one picture, or four of one size two by two: what is not transparent in any of them, on white."""
-    pictures, side = [Image.open(file).convert("RGBA") for file in files], SIDE * (2 if len(files) == 1 else 1)
+    """Return one picture, or four of one size two by two, on white: cropped to all that is opaque in any of them."""
+    across = 1 if len(files) == 1 else 2
+    pictures = [Image.open(file).convert("RGBA") for file in files]
     boxes = np.array([box for picture in pictures if (box := picture.getchannel("A").getbbox())])
-    shown = (*boxes[:, :2].min(0).tolist(), *boxes[:, 2:].max(0).tolist())
-    pictures = [picture.crop(shown) for picture in pictures]
+    crop = (*boxes[:, :2].min(0).tolist(), *boxes[:, 2:].max(0).tolist())
+    pictures = [picture.crop(crop) for picture in pictures]
     for picture in pictures:
-        picture.thumbnail((side, side))
+        picture.thumbnail((2 * SIDE // across, 2 * SIDE // across))
     width, height = pictures[0].size
-    whole = Image.new("RGBA", (width, height) if len(files) == 1 else (2 * width, 2 * height), "white")
+    page = Image.new("RGBA", (across * width, across * height), "white")
     for k, picture in enumerate(pictures):
-        whole.alpha_composite(picture, (k % 2 * width, k // 2 * height))
-    return whole.convert("RGB")
+        page.alpha_composite(picture, (k % 2 * width, k // 2 * height))
+    return page.convert("RGB")

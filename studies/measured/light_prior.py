@@ -1,4 +1,4 @@
-"""The prior on natural light, fitted to captured maps, and how well it foresees maps that it was not fitted to.
+"""Prior on natural light, fitted to captured maps, and its likelihood of maps that it was not fitted to.
 
     python -m studies.measured.light_prior FOLDER… [--out factorlib/light/prior.json]
 
@@ -107,10 +107,13 @@ def fitted(
     cells: unit directions of the maps' frame (+y is up)
     profile: whether the mean depends on elevation;  start: where to begin the search
     """
-    numbers, coefficients, angle = [], [], angles(cells)
+    numbers = []
+    coefficients = []
+    angle = angles(cells)
     for k in range(3):
         design = np.hstack([legendre(cells @ UP)[:, : 3 * int(profile)], np.ones((len(cells), int(k == 0)))])
-        bounds, begin = list(BOUNDS), START.copy()
+        bounds = list(BOUNDS)
+        begin = START.copy()
         if start is not None:
             decay = np.radians(start.decay_deg[k])
             begin = np.log([start.variance[k], decay, start.nugget[k], start.level[k], start.freedom[k]])
@@ -122,7 +125,8 @@ def fitted(
         numbers.append(np.exp(best))
         coefficients.append(tuple(cost(best)[2][:3].tolist()) if profile else (0.0,) * 3)
     variance, decay, nugget, level, freedom = (tuple(each.tolist()) for each in np.transpose(numbers))
-    degrees, size = tuple(np.degrees(decay).tolist()), float(np.degrees(np.sqrt(4 * np.pi / len(cells))))
+    degrees = tuple(np.degrees(decay).tolist())
+    size = float(np.degrees(np.sqrt(4 * np.pi / len(cells))))
     return LightPrior(variance, degrees, level, nugget, tuple(coefficients), size, freedom)
 
 
@@ -134,7 +138,8 @@ def _cost(
 ) -> tuple[float, Float[np.ndarray, "5"], Float[np.ndarray, " q"]]:
     """Return −log L per map, its gradient by t, and β: equations (1) to (3)."""
     variance, decay, nugget, level, freedom = np.exp(t)
-    alike, count = variance * correlation(angle, decay), len(angle)
+    alike = variance * correlation(angle, decay)
+    count = len(angle)
     factor = cho_factor(alike + level + nugget * np.eye(count), lower=True)
     inverse = cho_solve(factor, np.eye(count))
     beta, weight = _weighted_means(inverse, design, values, freedom)
@@ -159,12 +164,15 @@ def _weighted_means(
 
     d is quadratic in β, so what is summed over cells is summed once.
     """
-    count, weight = values.shape[1], np.ones(len(values))
+    count = values.shape[1]
+    weight = np.ones(len(values))
     towards = inverse @ design
-    gram, along, own = design.T @ towards, values @ towards, np.sum(values @ inverse * values, axis=1)
+    gram = design.T @ towards
+    along = values @ towards
+    squares = np.sum(values @ inverse * values, axis=1)
     for _ in range(WEIGHTINGS):
         beta = np.linalg.solve(gram, weight @ along / weight.sum())
-        weight = (freedom + count) / (freedom + own - 2 * along @ beta + beta @ gram @ beta)
+        weight = (freedom + count) / (freedom + squares - 2 * along @ beta + beta @ gram @ beta)
     return beta, weight
 
 
@@ -196,9 +204,12 @@ def white_noise(prior: LightPrior) -> LightPrior:
 
 def leave_one_out(logs: Logs, cells: Float[np.ndarray, "n 3"]) -> LeaveOneOut:
     """Score each map under a prior fitted to the others, and under two nulls fitted to them; return the means."""
-    whole, flat, scores = fitted(logs, cells), fitted(logs, cells, profile=False), []
+    whole = fitted(logs, cells)
+    flat = fitted(logs, cells, profile=False)
+    scores = []
     for m in tqdm(range(logs.shape[1]), desc="leaving one out"):
-        rest, one = np.delete(logs, m, axis=1), logs[:, m : m + 1]
+        rest = np.delete(logs, m, axis=1)
+        one = logs[:, m : m + 1]
         prior = fitted(rest, cells, start=whole)
         priors = prior, white_noise(prior), fitted(rest, cells, profile=False, start=flat)
         scores.append([float(log_likelihood(each, one, cells)[0]) for each in priors])
@@ -212,7 +223,8 @@ def rounded(prior: LightPrior) -> LightPrior:
         """Round to DIGITS digits."""
         return tuple(map(short, value)) if isinstance(value, tuple) else float(f"{value:.{DIGITS}g}")
 
-    names, scores = ("variance", "decay_deg", "level", "nugget", "freedom", "profile", "cell_deg"), prior.leave_one_out
+    names = ("variance", "decay_deg", "level", "nugget", "freedom", "profile", "cell_deg")
+    scores = prior.leave_one_out
     if scores:
         scores = LeaveOneOut(*(round(score, 1) for score in msgspec.structs.astuple(scores)))
     return msgspec.structs.replace(prior, **{name: short(getattr(prior, name)) for name in names}, leave_one_out=scores)

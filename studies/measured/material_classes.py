@@ -1,6 +1,6 @@
 """Classes of the prior on materials, fitted to a table of measured materials.
 
-Usage: python -m studies.measured.material_classes FILE [--out factorlib/inference/material_classes.json]
+`python -m studies.measured.material_classes FILE [--out factorlib/inference/material_classes.json]` takes a second.
 
 FILE is a .csv with a row a material: its name in `material`, and the Lambert + GGX that was fitted to it: `k_s` and
 `roughness`, and `k_s_r`, `k_s_g` and `k_s_b`, whose ratios are the tint.  The class of a row is that whose words its
@@ -65,7 +65,8 @@ def _fitted(name: str, values: np.ndarray, total: int) -> MaterialClass:
     log = np.log(np.maximum(values[:, :3], LEAST))
     tint = np.median(np.linalg.norm(log - log.mean(1, keepdims=True), axis=1)) / RAYLEIGH
     x = np.column_stack([np.log(np.maximum(values[:, 3], LEAST)), values[:, 4]])
-    mean, covariance = np.round(x.mean(0), 3).tolist(), np.round(np.cov(x.T), 4).tolist()
+    mean = np.round(x.mean(0), 3).tolist()
+    covariance = np.round(np.cov(x.T), 4).tolist()
     share = round(len(values) / total, 3)
     return MaterialClass(name, share, tuple(mean), tuple(map(tuple, covariance)), round(float(tint), 3))
 

@@ -7,7 +7,7 @@ from pathlib import Path
 
 from factorlib.errors import InputError
 from factorlib.wholefile import write_text
-from studies.measured.tools import ROOT, evaluated
+from studies.measured.tools import ROOT, evaluate_dataset
 
 PAGE = ROOT / "docs" / "result.ipynb"
 
@@ -22,8 +22,9 @@ def write() -> Path:
         from nbclient import NotebookClient
     except ImportError as error:
         raise InputError("what runs notebooks is not installed", cure="make setup EXTRAS=notebook") from error
-    evaluated("eames", ROOT)
-    notebook, where = nbformat.read(PAGE, 4), {"metadata": {"path": str(PAGE.parent)}}
+    evaluate_dataset("eames", ROOT)
+    notebook = nbformat.read(PAGE, 4)
+    where = {"metadata": {"path": str(PAGE.parent)}}
     NotebookClient(notebook, kernel_name="python3", record_timing=False, timeout=None, resources=where).execute()
     notebook.metadata.language_info = {"name": "python"}
     write_text(PAGE, nbformat.writes(notebook) + "\n")

@@ -1,10 +1,14 @@
-"""Time, error and stability of every reflection operator: `make results ONLY=operator`.
+"""Time and error of every reflection operator: `make results ONLY=operator`.
+
+Tables and the seconds of the measurement are written to docs/results.md.
 
 Error      of values |R − S| / (S + E/100), of gradients |∂R − ∂S| / (|∂S| + S + E/100); S by quadrature, E the lobe's
            integral
 Time       of one evaluation, that is, one observation and one lobe, diffuse and specular: processor time of one thread,
-           the operators in turn within each repeat, so that whatever else the machine does falls on all of them; the
+           the operators in turn within each repeat, so that other work of the machine delays all of them alike; the
            least and the median of the repeats. Ratios between operators hold; absolute times are the machine's.
+
+Special cases and laws are tested: tests/reflection.
 """
 
 import statistics
@@ -30,15 +34,17 @@ from factorlib.reflection.samples import (
     specular_samples,
     specular_table,
 )
-from factorlib.scenes import operator_cases as laws
-from studies.measured.tools import Tables, exact
+from factorlib.scenes.operator_cases import operator_variant
+from studies.measured.tools import Tables, format_number, format_numbers
 
-REFERENCE, FAST = "reference", [name for name in NAMES if name != "reference"]
+REFERENCE = "reference"
+FAST = [name for name in NAMES if name != "reference"]
 TOLERANCES = {"reference 10⁻²": 1e-2, "reference 10⁻⁴": 1e-4, REFERENCE: 1e-7}
 SLOPES = {"roughness": "roughness", "log_sharpness": "log λ", "no": "n·o", "nz": "n·z", "oz": "o·z"}
-INPUTS = ("roughness", "sharpness", "cosine of the view", "degrees from the mirror direction")
-SAMPLES, GRADIENTS = 16384, 512
-LOBES, REPEATS = 64, 7
+SAMPLES = 16384
+GRADIENTS = 512
+LOBES = 64
+REPEATS = 7
 
 # ── The operators as they can be run ─────────────────────────────────────────────────────────────────────────────────
 
@@ -50,9 +56,9 @@ def variants() -> dict[str, Operator]:
     """
     operators: dict[str, Operator | None] = {}
     for name in FAST:
-        operators |= {f"{name} {dtype}": laws.operator_variant(name, dtype) for dtype in ("float32", "float64")}
+        operators |= {f"{name} {dtype}": operator_variant(name, dtype) for dtype in ("float32", "float64")}
         if any(getattr(operators[f"{name} float32"], "fused", {}).values()):
-            operators[f"{name} float32 torch"] = laws.operator_variant(name, "float32", compiled=False)
+            operators[f"{name} float32 torch"] = operator_variant(name, "float32", compiled=False)
     return {label: operator for label, operator in operators.items() if operator is not None}
 
 
@@ -120,131 +126,71 @@ def point(operator: Operator, count: int) -> tuple[Tensor, ...]:
     return tuple(t.to(operator.dtype) for t in inputs)
 
 
-def values(operator: Operator, roughness: Tensor, sharpness: Tensor, no: Tensor, nz: Tensor, oz: Tensor) -> None:
-    """Compute values alone."""
+def evaluate(operator: Operator, inputs: tuple[Tensor, ...], derivatives: bool) -> None:
+    """Compute values alone, or values and all derivatives."""
+    if derivatives:
+        operator.response(*inputs)
+        return
     with torch.no_grad():
-        operator.diffuse(sharpness, nz)
-        operator.specular(roughness, sharpness, no, nz, oz)
+        operator.diffuse(inputs[1], inputs[3])
+        operator.specular(*inputs)
 
 
-def gradient(operator: Operator, *inputs: Tensor) -> None:
-    """Compute values and all derivatives."""
-    operator.response(*inputs)
-
-
-def microseconds(
-    operators: dict[str, Operator], rows: int = 1024, repeats: int = REPEATS
-) -> dict[str, list[list[float]]]:
+def microseconds(operators: dict[str, Operator]) -> dict[str, list[list[float]]]:
     """Time all repeats, of values alone and of values with all derivatives, by operator."""
-    counts = {label: 8 if label in TOLERANCES else rows for label in operators}
+    counts = {label: 8 if label in TOLERANCES else 1024 for label in operators}
     inputs = {label: point(operator, counts[label]) for label, operator in operators.items()}
-    taken: dict[str, list[list[float]]] = {label: [[], []] for label in operators}
-    for _ in range(repeats + 1):
+    times: dict[str, list[list[float]]] = {label: [[], []] for label in operators}
+    for _ in range(REPEATS + 1):
         for label, operator in operators.items():
-            for of, measure in zip(taken[label], (values, gradient), strict=True):
-                start = time.process_time()
-                measure(operator, *inputs[label])
-                of.append((time.process_time() - start) / (counts[label] * LOBES) * 1e6)
-    return {label: [of[1:] for of in pair] for label, pair in taken.items()}  # the first one compiles
-
-
-# ── Special cases and laws ───────────────────────────────────────────────────────────────────────────────────────────
-
-
-def measures(given: laws.Pairs, fast: dict[str, Operator], with_reference: bool = True) -> dict[str, dict[str, float]]:
-    """Return the worst errors of every operator in float32 of `fast`.
-
-    They are of values against the reference, and by rounding against its float64.
-    """
-    exactly = {label.split()[0]: laws.answers(o, given) for label, o in fast.items() if label.endswith("float64")}
-    true, table = laws.reference_values(given) if with_reference else None, {}
-    for label, operator in fast.items():
-        if "float64" not in label:
-            answer, wide = laws.answers(operator, given), exactly[label.split()[0]]
-            kinds = {"value": laws.value_error, "gradient": laws.gradient_error}
-            errors = {f"{kind}_rounding": error(answer, wide, given) for kind, error in kinds.items()}
-            if true:
-                errors["value"] = laws.value_error(answer, laws.Answers(true, answer.turning), given)
-            table[label] = {name: float(error.max()) for name, error in errors.items()} | {"finite": answer.finite()}
-    return table
-
-
-LAWS: dict[str, Callable[[Operator], tuple[float, ...]]] = {
-    "reflection of a unit lobe, at most 1: roughness ≥ .1, n·o ≥ .02": lambda o: laws.reflection_of_unit_lobes(
-        o, laws.USUAL
-    ),
-    "… roughness ≥ .1, n·o ≥ 10⁻⁴": lambda o: laws.reflection_of_unit_lobes(o, laws.WIDER),
-    "… roughness ≥ .03, n·o ≥ 10⁻⁴": lambda o: laws.reflection_of_unit_lobes(o, laws.WHOLE),
-    "least of it, at least 0": laws.least_reflection,
-    "GGX of k_s = 1 under constant light, at most 1": laws.reflection_of_constant_light,
-    "white Lambert under constant light, distance from 1": laws.white_lambert_error,
-    "point light (λ = 10⁶), distance from the BRDF": laws.point_light_error,
-    "everything turned: change over the largest radiance": laws.rotation_error,
-    "weights times 10⁶: relative change of radiance / 10⁶": laws.scaling_error,
-}
-
-
-def special(fast: dict[str, Operator]) -> Tables:
-    """Return rounding and errors of values in special cases, and how far each operator breaks the laws."""
-    single = {label_of(label).replace(" f32", ""): o for label, o in fast.items() if "float64" not in label}
-    cases = {name: list(measures(laws.case(name), fast, name != laws.ALL).values()) for name in (*laws.CASES, laws.ALL)}
-    broken = [
-        [law, *(" / ".join(exact(v, 4 if v > 0.1 else 2) for v in measure(o)) for o in single.values())]
-        for law, measure in LAWS.items()
-    ]
-    return {
-        "Worst error of float32 against float64 in the same operator: of values / of derivatives": [
-            ["changed", *single],
-            *(
-                [name, *(f"{exact(e['value_rounding'])} / {exact(e['gradient_rounding'])}" for e in row)]
-                for name, row in cases.items()
-            ),
-        ],
-        "Worst error of values against the reference": [
-            ["changed", *single],
-            *([name, *(exact(e["value"]) for e in row)] for name, row in cases.items() if name != laws.ALL),
-        ],
-        "Laws: 99th percentile / worst, or the worst alone": [["law", *single], *broken],
-    }
+            for derivatives in (False, True):
+                start_s = time.process_time()
+                evaluate(operator, inputs[label], derivatives)
+                seconds = time.process_time() - start_s
+                times[label][derivatives].append(seconds / (counts[label] * LOBES) * 1e6)
+    return {label: [repeats[1:] for repeats in pair] for label, pair in times.items()}  # the first one compiles
 
 
 # ── Tables ───────────────────────────────────────────────────────────────────────────────────────────────────────────
 
 
 def rows() -> Tables:
-    """Return tables of all operators: time, errors of values and derivatives, and of values by what is asked."""
-    fast, references = variants(), {label: Reference(tolerance=tolerance) for label, tolerance in TOLERANCES.items()}
+    """Return tables of all operators: time, errors of values and of derivatives."""
+    fast = variants()
+    references = {label: Reference(tolerance=tolerance) for label, tolerance in TOLERANCES.items()}
     times = microseconds(fast | references)
-    specular, diffuse = specular_samples(SAMPLES, 99, tolerance=1e-7), diffuse_samples(SAMPLES, 98)
+    specular = specular_samples(SAMPLES, 99, tolerance=1e-7)
+    diffuse = diffuse_samples(SAMPLES, 98)
+    true = gradients(references[REFERENCE])
     glossy = {label: specular_errors(o, specular) for label, o in (fast | references).items() if label != REFERENCE}
     matte = {label: diffuse_errors(operator, diffuse) for label, operator in fast.items()}
-    true, single = gradients(references[REFERENCE]), [label for label in fast if label.endswith("float32")]
-    fastest, costs, slopes, by_input = min(statistics.median(pair[1]) for pair in times.values()), [], [], []
-    for label, pair in times.items():
-        cells = [f"{exact(min(of))}, {exact(statistics.median(of))}" for of in pair]
-        costs.append([label_of(label), *cells, f"{exact(statistics.median(pair[1]) / fastest)} ×"])
-    for label in single:
-        errors = gradient_errors(fast[label], true)
-        slopes += [[f"{label_of(label)}, by {word}", *_percents(errors[slope])] for slope, word in SLOPES.items()]
-    for quantity, part in ((q, part) for q in INPUTS for part in glossy[single[0]][q]):
-        asked = (glossy[label][quantity][part] for label in single)
-        by_input.append([f"{quantity} {part}", *(f"{_percent(e, 'median')}, {_percent(e, 'p95')}" for e in asked)])
-    whole = [
-        [f"{label_of(k)}, {kind}", *_percents(e)]
-        for kind, of in (("specular", glossy), ("diffuse", matte))
-        for k, e in of.items()
+    slopes = {label: gradient_errors(fast[label], true) for label in fast if label.endswith("float32")}
+    fastest = min(statistics.median(pair[1]) for pair in times.values())
+    costs = [
+        [
+            label_of(label),
+            *(format_numbers([min(repeats), statistics.median(repeats)]) for repeats in pair),
+            f"{format_number(statistics.median(pair[1]) / fastest)} ×",
+        ]
+        for label, pair in times.items()
     ]
+    values = {f"{label_of(label)}, specular": errors for label, errors in glossy.items()}
+    values |= {f"{label_of(label)}, diffuse": errors for label, errors in matte.items()}
+    derivatives = {
+        f"{label_of(label)}, by {SLOPES[slope]}": quantile
+        for label, errors in slopes.items()
+        for slope, quantile in errors.items()
+    }
     return {
         "µs per evaluation: least, median": [["operator", "values", "values and gradients", "of the fastest"], *costs],
-        "Errors of values": [["operator", *QUANTILES], *whole],
-        "Errors of derivatives": [["operator", *QUANTILES], *slopes],
-        "Specular errors by what is asked: median, p95": [["asked", *map(label_of, single)], *by_input],
-    } | special(fast)
+        "Errors of values": _percents("error", values),
+        "Errors of derivatives": _percents("error of the derivative", derivatives),
+    }
 
 
-def _percents(errors: dict) -> list[str]:
-    return [_percent(errors, quantile) for quantile in QUANTILES]
-
-
-def _percent(errors: dict, quantile: str) -> str:
-    return f"{exact(100 * errors[quantile])} %" if quantile in errors else "–"
+def _percents(title: str, errors: dict[str, dict]) -> list[list[str]]:
+    cells = {
+        name: [f"{format_number(100 * of_name[q])} %" if q in of_name else "–" for q in QUANTILES]
+        for name, of_name in errors.items()
+    }
+    return [[title, *QUANTILES], *([name, *values] for name, values in cells.items())]

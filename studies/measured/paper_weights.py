@@ -17,7 +17,8 @@ from factorlib.reflection.samples import diffuse_samples, specular_samples
 from factorlib.reflection.training import Schedule, pixels_problem, trained_plainly
 from studies.measured.operator import diffuse_errors, specular_errors
 
-SPHERES, PIXELS = 4000, 50
+SPHERES = 4000
+PIXELS = 50
 SCHEDULES = {
     "diffuse": Schedule(steps=8000, batch=1024, rate=2e-3, width=288, depth=2, seed=0),
     "specular": Schedule(steps=24_000, batch=1024, rate=2e-3, width=288, depth=3, seed=0),
@@ -35,7 +36,8 @@ def main() -> None:
     shape = pixels.normal.shape[:2]
     normal, half, axis, sharpness, roughness = (np.broadcast_to(t, (*shape, *t.shape[2:])) for t in vectors)
     normal, half, axis = (tuple(_flat(v[..., k]) for k in range(3)) for v in (normal, half, axis))
-    sharpness, roughness = _flat(sharpness), _flat(roughness)
+    sharpness = _flat(sharpness)
+    roughness = _flat(roughness)
     inputs = {
         "diffuse": diffuse_inputs(normal, axis, sharpness),
         "specular": specular_inputs(normal, half, axis, sharpness, roughness),
@@ -43,7 +45,8 @@ def main() -> None:
     for part, of in inputs.items():
         problem = pixels_problem(of, sharpness, _flat(getattr(pixels, part)))
         layers = trained_plainly(problem, SCHEDULES[part], lambda *at, part=part: print(part, *at, flush=True))
-        file, note = SHIPPED / f"paper_{part}.safetensors", "see factorlib.reflection.paper_network"
+        file = SHIPPED / f"paper_{part}.safetensors"
+        note = "see factorlib.reflection.paper_network"
         write_layers(file, layers, torch.float16, inputs=note)
     operator = reflection_operator("paper_network")
     glossy = specular_errors(operator, specular_samples(16384, 99, tolerance=1e-6))

@@ -1,7 +1,8 @@
-"""Real photographs whose poses are known from elsewhere: `make results ONLY=real_poses REAL="FOLDER …"`.
+"""Poses of real photographs, against poses from elsewhere: `make results ONLY=real_poses REAL="FOLDER …"`.
 
 Each folder is a data set with a `reference_poses.json` in the layout of align's poses.json.  Every photo is aligned by
-the stages `masks` and `align` with all that is said of cameras and poses withheld; EXIF belongs to the photo and stays.
+the stages `masks` and `align` without the data set's cameras and poses; EXIF belongs to the photo and stays.  A photo
+takes six to nine seconds of the processor.
 
 Not every turn between the two answers is an error of the alignment.  Taken off, one at a time:
 
@@ -10,6 +11,7 @@ Not every turn between the two answers is an error of the alignment.  Taken off,
     the common turn    of all photos of a set, about the mesh's axes: how the mesh lies in the reference's frame
 """
 
+import time
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
@@ -31,7 +33,7 @@ from factorlib.results.poses import PhotoPoses, read_photo_poses
 from factorlib.scenes.stage_runs import run_stages
 from stages import align, masks
 from studies.measured.align import normal_error_deg, share
-from studies.measured.tools import Clock, Tables, needed
+from studies.measured.tools import Tables, environment_words
 
 REFERENCE = "reference_poses.json"
 CURE = "name a dataset whose poses are known, as align's poses.json has them"
@@ -42,56 +44,56 @@ ANGLES = {
 }
 
 
-class Reference(PhotoPoses, frozen=True):
-    """Entry of a photo in reference_poses.json.
-
-    silhouette_iou: of all its objects together, None where it is not known
-    """
+class ReferencePoses(PhotoPoses, frozen=True):
+    """Entry of a photo in reference_poses.json; silhouette_iou: of all its objects together, None if unknown."""
 
     silhouette_iou: float | None = None
 
 
-def references(folder: Path) -> dict[str, Reference]:
+def read_references(folder: Path) -> dict[str, ReferencePoses]:
     """Return the known poses by photo.  InputError for a folder without any."""
     if not (folder / REFERENCE).is_file():
         raise InputError(f"there is no {REFERENCE}", file=folder, cure=CURE)
-    return read_result(folder / REFERENCE, dict[str, Reference], "align", CURE)
+    return read_result(folder / REFERENCE, dict[str, ReferencePoses], "align", CURE)
 
 
-def withheld(dataset: Dataset) -> Dataset:
-    """Return the dataset without cameras, poses, keypoints and what a source of cameras says."""
+def without_poses(dataset: Dataset) -> Dataset:
+    """Return the dataset without cameras, poses, keypoints and cameras from another program."""
     replace = msgspec.structs.replace
     bare = [[replace(obj, pose=None, keypoints=[]) for obj in photo.objects] for photo in dataset.spec.photos]
     photos = [replace(p, camera=None, objects=of) for p, of in zip(dataset.spec.photos, bare, strict=True)]
     return replace(dataset, spec=replace(dataset.spec, photos=photos), external={})
 
 
-def measured(folder: Path, photo: str) -> list[dict]:
-    """Return one row per object of the photo: errors against the reference, and the stage's own words on the pose."""
-    dataset, reference = withheld(read_dataset(folder)), references(folder)[photo]
-    with TemporaryDirectory() as made:
-        clock = Clock()
-        run_stages(dataset, Path(made), (masks, align), photos=[photo])
-        picture = read_photo_facts(Path(made) / "masks" / f"{photo}.json")
-        answer, taken = read_photo_poses(Path(made) / "align" / f"{photo}.json"), clock.taken()
+def measure(folder: Path, photo: str) -> list[dict]:
+    """Return one row per object of the photo: errors against the reference, and the doubts of the stage."""
+    dataset = without_poses(read_dataset(folder))
+    reference = read_references(folder)[photo]
+    start_s = time.process_time()
+    with TemporaryDirectory() as build:
+        run_stages(dataset, Path(build), (masks, align), photos=[photo])
+        size = read_photo_facts(Path(build) / "masks" / f"{photo}.json")
+        estimate = read_photo_poses(Path(build) / "align" / f"{photo}.json")
+    seconds = time.process_time() - start_s
+    camera, true_camera = (entry.camera.camera(size.width, size.height) for entry in (estimate, reference))
     rows = []
     for obj in dataset.photo(photo).objects:
-        file, said = dataset.spec.meshes[obj.mesh], answer.objects[obj.name]
+        file = dataset.spec.meshes[obj.mesh]
         mesh = read_mesh(dataset.folder / file.file, dataset.spec.materials, file.part_materials, obj.materials)
-        caster, pose, true = Caster(mesh), said.pose, reference.objects[obj.name].pose
-        camera, true_camera = (entry.camera.camera(picture.width, picture.height) for entry in (answer, reference))
+        caster = Caster(mesh)
+        pose, true = (entry.objects[obj.name].pose for entry in (estimate, reference))
         normals = rasterise(caster, true_camera, true), rasterise(caster, camera, pose)
         rows.append(
             {
                 "set": folder.resolve().name,
                 "object": obj.name,
-                "processor_s": taken.processor,
+                "processor_s": seconds,
                 "turn": Rotation.from_matrix(true.rotation.T @ pose.rotation).as_rotvec().tolist(),
                 "rotation_error_deg": angle_between(pose.rotation, true.rotation),
                 "normal_error_deg": normal_error_deg(*normals),
                 "about_the_ray_deg": angle_between(*(about_the_ray(p, caster.centre) for p in (pose, true))),
                 "focal_ratio": camera.focal / true_camera.focal,
-                "doubts": said.doubts,
+                "doubts": estimate.objects[obj.name].doubts,
             }
         )
     return rows
@@ -118,21 +120,22 @@ def common_turn(turns: list[list[float]]) -> tuple[float, list[float]]:
 
 def rows() -> Tables:
     """Return the table of sets, with medians and worst values over photos."""
-    folders = [Path(word) for word in needed("REAL", "folders of photographs with known poses")]
-    photos = [(f, p.name) for f in folders for p in read_dataset(f).spec.photos if p.name in references(f)]
-    return tables_of([row for key in photos for row in measured(*key)])
+    folders = [Path(word) for word in environment_words("REAL", "folders of photographs with known poses")]
+    photos = [(f, p.name) for f in folders for p in read_dataset(f).spec.photos if p.name in read_references(f)]
+    return tables_of([row for key in photos for row in measure(*key)])
 
 
 def tables_of(measures: list[dict]) -> Tables:
     """Return the table of the sets whose photos were measured."""
     sets = []
     for name in dict.fromkeys((row["set"], row["object"]) for row in measures):
-        of = [row for row in measures if (row["set"], row["object"]) == name]
-        common, left = common_turn([row["turn"] for row in of])
-        angles = [f"{np.median(a):.1f}, {max(a):.1f}" for a in ([row[key] for row in of] for key in ANGLES)]
-        ratios, seconds = ([row[key] for row in of] for key in ("focal_ratio", "processor_s"))
-        cells = [f"{common:.1f}", f"{np.median(left):.1f}, {max(left):.1f}", f"{min(ratios):.2f} to {max(ratios):.2f}"]
-        cells += [share([bool(row["doubts"]) for row in of]), f"{np.median(seconds):.0f}, {max(seconds):.0f}"]
-        sets.append([" ".join(name), str(len(of)), *angles, *cells])
+        rows = [row for row in measures if (row["set"], row["object"]) == name]
+        column = {key: [row[key] for row in rows] for key in rows[0]}
+        common, rest = common_turn(column["turn"])
+        cells = [f"{np.median(column[key]):.1f}, {max(column[key]):.1f}" for key in ANGLES]
+        cells += [f"{common:.1f}", f"{np.median(rest):.1f}, {max(rest):.1f}"]
+        cells += [f"{min(column['focal_ratio']):.2f} to {max(column['focal_ratio']):.2f}", share(column["doubts"])]
+        cells.append(f"{np.median(column['processor_s']):.0f}, {max(column['processor_s']):.0f}")
+        sets.append([" ".join(name), str(len(rows)), *cells])
     more = ["common turn (°)", "less that (°)", "focal length, of the reference's", "doubtful", "processor (s)"]
     return {"Sets: median, worst": [["set, object", "photos", *ANGLES.values(), *more], *sets]}

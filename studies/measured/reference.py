@@ -3,9 +3,8 @@
 `python -m studies.measured.reference "why they changed"` writes them anew.
 
 It runs the pipeline on data/synthetic with `SEEDS` seeds of the solve (what is current is not run again), as it is and
-SMALL, and writes synthetic.json and small.json in tests/studies/regression: of each number its
-value with the default seed, its
-range and deviation over seeds, the tolerance that follows, and the reasons of all refreshes with what each changed.
+SMALL, and writes synthetic.json and small.json in tests/studies/regression: each number with the default seed, its
+range and deviation over seeds, its tolerance, and the reason and the changes of every refresh.
 `make test` runs the default seed SMALL and compares, `make test-long` runs it as it is.  Of SMALL the files of each
 stage count too, so that a change is named where it begins.
 
@@ -31,15 +30,19 @@ from factorlib.images.exr import read_exr
 from factorlib.jsonfile import read_json, write_json
 from factorlib.runner import verbs
 from factorlib.runner.project import Project, photo_sets
-from studies.measured.tools import ROOT, Tables, evaluated, value_at
+from studies.measured.tools import ROOT, Tables, evaluate_dataset, value_at
 
-DATASET, SEEDS, DOUBT, ROUNDING = "synthetic", 5, 0.01, 1e-5
+DATASET = "synthetic"
+SEEDS = 5
+DOUBT = 0.01
+ROUNDING = 1e-5
 FOLDER = ROOT / "tests" / "studies" / "regression"
 COMMAND = '.venv/bin/python -m studies.measured.reference "why the numbers changed"'
 SMALL = ("masks.pixels=3000", "solve.cells=150", "solve.splittings=1", "export.height=64", "export.mitsuba_height=64")
 # dotted path in metrics.json -> lowest, highest, meaning; a quarter beyond the worst of five trained networks × two
 # seeds of the solve
-SPHERE, RMS = "light.mean.channel_per_photo.{}.estimate.rmse", "sphere, of the truth's RMS"
+SPHERE = "light.mean.channel_per_photo.{}.estimate.rmse"
+RMS = "sphere, of the truth's RMS"
 BOUNDS = {
     "materials.worst_roughness": (0.0, 0.040, "roughness, worst material"),
     "materials.worst_diffuse": (0.0, 0.055, "diffuse, worst material and channel, relative"),
@@ -110,12 +113,12 @@ def tolerance(values: Sequence[float], doubt: float = DOUBT) -> float:
     return float(student.ppf(1 - doubt / 2, len(values) - 1) * np.sqrt(2) * np.std(values, ddof=1))
 
 
-def of_metrics(metrics: object) -> dict[str, float | None]:
+def metric_numbers(metrics: object) -> dict[str, float | None]:
     """Return the NUMBERS in what a metrics.json holds; None for each that is missing."""
     return {path: value_at(metrics, path) for path in NUMBERS}
 
 
-def of_stages(folder: Path) -> dict[str, float]:
+def stage_numbers(folder: Path) -> dict[str, float]:
     """Return {"stage.channel": root mean square over all FILES of that stage} of the results of a run."""
     values: dict[str, list[np.ndarray]] = {}
     for stage, pattern in FILES.items():
@@ -140,9 +143,9 @@ def run_small(root: Path, seed: int = 0) -> dict[str, float | None]:
             (root / name).symlink_to(ROOT / name)
     project = Project(root, photo_sets())
     if verbs.make(project, verbs.Request(DATASET, settings=[*SMALL, f"solve.seed={seed}"])):
-        raise SystemExit(1)  # it has said why
+        raise SystemExit(1)  # its own message is on the screen
     build = project.build / DATASET
-    return of_metrics(read_json(build / "evaluate" / "metrics.json")) | of_stages(build)
+    return metric_numbers(read_json(build / "evaluate" / "metrics.json")) | stage_numbers(build)
 
 
 def differences(values: dict[str, float | None], stored: Stored) -> dict[str, str]:
@@ -173,7 +176,7 @@ def read_stored(name: str = DATASET) -> Stored:
     return msgspec.convert(read_json(FOLDER / f"{name}.json"), Stored)
 
 
-def stored(runs: Sequence[dict[str, float | None]], reason: str, before: Stored | None) -> Stored:
+def summarise(runs: Sequence[dict[str, float | None]], reason: str, before: Stored | None) -> Stored:
     """Return the numbers of runs with several seeds, the default one first.  InputError where a number is missing."""
     values = {path: [run.get(path) for run in runs] for path in runs[0]}
     if missing := [path for path, of in values.items() if None in of]:
@@ -198,10 +201,10 @@ def _number(path: str, values: list[float]) -> Number:
 
 def rows() -> Tables:
     """Return the stored numbers, which `make test` holds the pipeline to."""
-    kept = read_stored()
-    lines = [[n.meaning, *(f"{v:.4g}" for v in (n.value, n.low, n.high))] for n in kept.numbers.values()]
+    table = read_stored()
+    lines = [[n.meaning, *(f"{v:.4g}" for v in (n.value, n.low, n.high))] for n in table.numbers.values()]
     return {
-        f"Default seed of the solve, and {kept.seeds} seeds": [["number", "default seed", "least", "largest"], *lines]
+        f"Default seed of the solve, and {table.seeds} seeds": [["number", "default seed", "least", "largest"], *lines]
     }
 
 
@@ -211,9 +214,10 @@ def main(reason: str) -> None:
         raise InputError("no reason is given", key="reason", cure=COMMAND)
     with tempfile.TemporaryDirectory() as folder:
         small = [run_small(Path(folder), seed) for seed in range(SEEDS)]
-    whole = [of_metrics(evaluated(DATASET, SET=f"solve.seed={seed}")) for seed in reversed(range(SEEDS))][::-1]
+    seeds = reversed(range(SEEDS))
+    whole = [metric_numbers(evaluate_dataset(DATASET, SET=f"solve.seed={seed}")) for seed in seeds][::-1]
     for name, runs in (("small", small), (DATASET, whole)):
-        write_json(FOLDER / f"{name}.json", new := stored(runs, reason, _before(name)))
+        write_json(FOLDER / f"{name}.json", new := summarise(runs, reason, _before(name)))
         changed = [f"{new.numbers[p].meaning}: {a:.4g} -> {b:.4g}" for p, (a, b) in new.refreshes[0].changed.items()]
         print("\n".join([f"{name}:", *changed]) if changed else f"{name}: nothing changed")
 

@@ -18,13 +18,12 @@ from pathlib import Path
 import torch
 
 from factorlib.errors import InputError, did_you_mean
-from studies.measured.tools import ROOT, Tables, refresh, table
+from studies.measured.tools import ROOT, Tables, markdown_table, replace_sections
 
 PAGE = ROOT / "docs" / "results.md"
 SECTIONS = {  # module -> title
     "reference": "data/synthetic",
     "eames_like": "data/eames, and sets made alike",
-    "exact_sets": "Exact sets",
     "operator": "Reflection operators",
     "align": "Poses",
     "real_poses": "Poses of real photographs",
@@ -39,13 +38,12 @@ def machine() -> str:
     git = subprocess.run(["git", "describe", "--always", "--dirty"], cwd=ROOT, capture_output=True, text=True)
     facts = Path("/proc/cpuinfo").read_text() if Path("/proc/cpuinfo").exists() else ""
     model = next((line.partition(":")[2].strip() for line in facts.splitlines() if line.startswith("model name")), "?")
-    commit = git.stdout.strip() or "unknown"
-    return f"Version {version}, commit {commit}, {date.today()}, {os.cpu_count()} × {model}"
+    return f"Version {version}, commit {git.stdout.strip() or 'unknown'}, {date.today()}, {os.cpu_count()} × {model}"
 
 
 def section(name: str, tables: Tables, measured: str) -> str:
     """Return the Markdown of a section."""
-    parts = [f"**{title}**\n\n{table(rows[0], rows[1:])}" for title, rows in tables.items()]
+    parts = [f"**{title}**\n\n{markdown_table(rows[0], rows[1:])}" for title, rows in tables.items()]
     return "\n\n".join([f"## {SECTIONS[name]}", f"*{measured}; `make results ONLY={name}`*", *parts])
 
 
@@ -72,7 +70,7 @@ def main() -> int:
         except (InputError, SystemExit) as error:
             left[name] = error
             continue
-        refresh(PAGE, {name: section(name, tables, f"{machine()}, {time.perf_counter() - start:.0f} s")})
+        replace_sections(PAGE, {name: section(name, tables, f"{machine()}, {time.perf_counter() - start:.0f} s")})
         print(f"{PAGE}: {SECTIONS[name]}", flush=True)
     for name, error in left.items():
         print(f"'{SECTIONS.get(name, name)}' is left as it was: {error}", file=sys.stderr)

@@ -1,6 +1,6 @@
 """Share of results within one standard error of the truth.
 
-Usage: `python -m studies.measured.standard_errors build/eames [build/…] [--other FOLDER]`
+`python -m studies.measured.standard_errors build/eames [build/…] [--other FOLDER]` prints a table in seconds.
 
 For each folder of results, which `make evaluate` made of a data set with a truth: the share of k_d, k_s, roughnesses
 and of the light maps' log radiances, in `CELLS` cells and after the factor per channel that is free, that lie within
@@ -9,6 +9,7 @@ of the same data set, such as one with another `solve.seed`, stand in for the tr
 so that less than one standard error should lie between them.
 """
 
+from itertools import product
 from pathlib import Path
 from typing import Annotated
 
@@ -22,13 +23,13 @@ from factorlib.images.exr import read_rgb_exr
 from factorlib.results.materials import in_order, read_materials
 from factorlib.results.metrics import read_metrics
 from studies.measured.light_prior import cell_means
-from studies.measured.tools import table
+from studies.measured.tools import markdown_table
 
 CELLS = 500  # of equal area, 9° apart
 PARTS = ("diffuse", "specular", "roughness")
 
 
-def material_deviations(build: Path, other: Path | None) -> dict[str, Float[np.ndarray, " n"]]:
+def material_deviations(build: Path, other: Path | None = None) -> dict[str, Float[np.ndarray, " n"]]:
     """Return |estimate − truth| over the standard error by part, of all materials, after the free factor per channel.
 
     other: results that stand in for the truth, of a data set of one connected component.  InputError where there is no
@@ -38,33 +39,35 @@ def material_deviations(build: Path, other: Path | None) -> dict[str, Float[np.n
     if other:
         path = other / "export/materials.json"
         true = dict(zip(solved, in_order(read_materials(path), list(solved), path), strict=True))
-        sums = (np.sum([[m.diffuse, m.specular] for m in of.values()], axis=(0, 1)) for of in (true, solved))
+        sums = (np.sum([[m.diffuse, m.specular] for m in table.values()], axis=(0, 1)) for table in (true, solved))
         factors = dict.fromkeys(true, np.divide(*sums))
     else:
         file = build / "evaluate/metrics.json"
         if (compared := read_metrics(file).materials) is None:
             raise InputError("its data set has no truth", file=file, cure="name another run by --other")
-        true = {n: one.truth for n, one in compared.materials.items()}
-        factors = {n: np.array(compared.factor[str(one.component)]) for n, one in compared.materials.items()}
-    off: dict[str, list] = {part: [] for part in PARTS}
-    for part, name in ((part, name) for part in PARTS for name in true):
+        true = {name: errors.truth for name, errors in compared.materials.items()}
+        factors = {n: np.array(compared.factor[str(errors.component)]) for n, errors in compared.materials.items()}
+    deviations: dict[str, list] = {part: [] for part in PARTS}
+    for name, part in product(true, PARTS):
         materials = (solved[name], true[name], solved[name].stderr)
-        value, expected, error = (np.atleast_1d(np.array(getattr(m, part), float)) for m in materials)
-        by = 1.0 if part == "roughness" else factors[name]
-        off[part].append(np.abs(by * value - expected) / np.maximum(by * error, 1e-12))
-    return {part: np.concatenate(of) for part, of in off.items()}
+        value, expected, stderr = (np.atleast_1d(np.array(getattr(m, part), float)) for m in materials)
+        factor = 1.0 if part == "roughness" else factors[name]
+        deviations[part].append(np.abs(factor * value - expected) / np.maximum(factor * stderr, 1e-12))
+    return {part: np.concatenate(values) for part, values in deviations.items()}
 
 
-def light_deviations(build: Path, other: Path | None) -> Float[np.ndarray, " n"]:
+def light_deviations(build: Path, other: Path | None = None) -> Float[np.ndarray, " n"]:
     """Return |Δ log radiance| over its standard error, of all lights, cells and channels, less channels' medians."""
-    against, off = (other / "export/illumination") if other else (build / "evaluate/illumination"), []
-    folders, cells = (build / "export/illumination", against, build / "export/coverage"), fibonacci_sphere(CELLS)
-    for path in sorted(against.glob("*.exr")):
-        light, true, error = (cell_means(read_rgb_exr(folder / path.name), cells) for folder in folders)
-        deviation = error * light.mean(0) / light  # coverage is relative to the light's mean radiance
+    truth = (other / "export/illumination") if other else (build / "evaluate/illumination")
+    folders = (build / "export/illumination", truth, build / "export/coverage")
+    cells = fibonacci_sphere(CELLS)
+    deviations = []
+    for path in sorted(truth.glob("*.exr")):
+        light, true, stderr = (cell_means(read_rgb_exr(folder / path.name), cells) for folder in folders)
         difference = np.log(light / np.maximum(true, 1e-6 * true.mean()))
-        off.append((np.abs(difference - np.median(difference, axis=0)) / deviation).reshape(-1))
-    return np.concatenate(off)
+        stderr = stderr * light.mean(0) / light  # coverage is relative to the light's mean radiance
+        deviations.append((np.abs(difference - np.median(difference, axis=0)) / stderr).reshape(-1))
+    return np.concatenate(deviations)
 
 
 def main(
@@ -75,11 +78,11 @@ def main(
     rows = []
     for build in builds:
         try:
-            off = [*material_deviations(build, other).values(), light_deviations(build, other)]
+            deviations = [*material_deviations(build, other).values(), light_deviations(build, other)]
         except InputError as error:
             raise SystemExit(f"{error}\nrun `make evaluate` first, and name folders of one data set") from None
-        rows.append([str(build), *(f"{100 * np.mean(d < 1):.0f} % ({np.median(d):.2f})" for d in off)])
-    print(table(["within one standard error (median deviation)", "k_d", "k_s", "roughness", "light"], rows))
+        rows.append([str(build), *(f"{100 * np.mean(d < 1):.0f} % ({np.median(d):.2f})" for d in deviations)])
+    print(markdown_table(["within one standard error (median deviation)", "k_d", "k_s", "roughness", "light"], rows))
 
 
 if __name__ == "__main__":

@@ -1,16 +1,14 @@
-"""Verdicts on results, beside the truth that they do not know.
-
-`python -m studies.measured.verdict fit test`, with LIGHTS="FOLDER …" of captured maps:
+"""Verdicts on results, beside the truth: `LIGHTS="FOLDER …" python -m studies.measured.verdict fit test`.
 
 fit    44 sets: data/eames and seeds 111 to 120 of `studies.measured.eames_like`, from 116 on in captured light, four
-       times each, spoilt in ways of `studies.measured.degradations`.  The weights of `factorlib.evaluate.verdict` are
+       times each, degraded in ways of `studies.measured.degradations`.  The weights of `factorlib.evaluate.verdict` are
        fitted to them anew, and printed
-test   20 others of seeds 201 to 205, the last two in captured light, each way once: what is expected with the weights
-       as they stand
+test   20 others of seeds 201 to 205, the last two in captured light, each way once: expected scores with the shipped
+       weights
 
-Sets lie in build/bench/verdict, results in build/.  Printed of each that is named: every set, rank correlations
-(Spearman), and the deviation; of `fit` also with each set left out of the fit.  Expected and true scores of all that
-are named are in build/bench/verdict/calibration.csv.
+A set takes some minutes.  Sets lie in build/bench/verdict, results in build/.  For each kind it prints every set, rank
+correlations (Spearman), and the deviation; for `fit` also with each set left out of the fit.  Expected and true scores
+are written to build/bench/verdict/calibration.csv.
 """
 
 import sys
@@ -25,109 +23,97 @@ from scipy.stats import spearmanr
 from factorlib.evaluate.verdict import CLIPPED, CONTOUR, FLOOR, MATERIALS, UNEXPLAINED
 from factorlib.images.light_map import maps_in
 from factorlib.wholefile import write_text
-from studies.measured.degradations import MIXED, spoilt
-from studies.measured.eames_like import drawn, folder_of, made
-from studies.measured.tools import ROOT, evaluated, needed, table
+from studies.measured.degradations import MIXED, degrade
+from studies.measured.eames_like import generate_set, link_maps, split_maps
+from studies.measured.tools import ROOT, environment_words, evaluate_dataset, markdown_table
 
 PLACE = ROOT / "build/bench/verdict"
 CAPTURED = (116, 117, 118, 119, 120, 204, 205)
 SEEDS = {"fit": (None, *range(111, 121)), "test": tuple(range(201, 206))}  # None: data/eames
 FIRST = {"fit": 0, "test": 1000}  # number of the first set
-ORDER = {"fit": 5, "test": 6}  # seeds of the order in which ways to spoil are dealt
+ORDER = {"fit": 5, "test": 6}  # seeds of the order of the degradations
 TIMES = 4  # a base
 HOPELESS = 18.0  # dB: a flat disc of the true ball's mean colour scores 17.6 to 18.6
 WEIGHTS = {"materials": MATERIALS, "clipped": CLIPPED, "unexplained": UNEXPLAINED, "contour": CONTOUR}
 
 
-class Judged(NamedTuple):
-    """A set: how it was spoilt, its score in dB, the verdict, and the terms of e² without their weights."""
+class VerdictOnSet(NamedTuple):
+    """A set: its degradations, its score in dB, the verdict, and the terms of e² without their weights."""
 
-    spoilt_by: str
+    degradations: str
     score: float
     trust: str
     expected: float
-    signs: list[float]
+    terms: list[float]
 
 
-def judged(which: str) -> list[Judged]:
-    """Make the sets that are not there, run the pipeline on them, and read what came out."""
-    rng, ways, seeds = np.random.default_rng(ORDER[which]), [], SEEDS[which]
-    while len(ways) < TIMES * len(seeds):
+def measure(kind: str) -> list[VerdictOnSet]:
+    """Degrade the sets that are not there, run the pipeline on them, and read the verdicts."""
+    rng = np.random.default_rng(ORDER[kind])
+    seeds = SEEDS[kind] * TIMES
+    ways = []
+    while len(ways) < len(seeds):
         ways += [MIXED[k] for k in rng.permutation(len(MIXED))]
     sets = []
-    for number in range(TIMES * len(seeds)):
-        folder = PLACE / f"{which}-{number}"
+    for number, (seed, names) in enumerate(zip(seeds, ways, strict=False)):
+        folder = PLACE / f"{kind}-{number}"
         if not (folder / "dataset.yaml").exists():
-            spoilt(base_of(seeds[number % len(seeds)]), folder, ways[number], FIRST[which] + number)
-        metrics = evaluated(folder)
+            degrade(base_of(seed), folder, names, FIRST[kind] + number)
+        metrics = evaluate_dataset(folder)
         verdict = metrics["verdict"]
-        signs = [verdict["terms"][name] / weight for name, weight in WEIGHTS.items()]
-        sets.append(
-            Judged(
-                ", ".join(ways[number]) or "nothing",
-                metrics["relit_set"]["mean_psnr_db"],
-                verdict["trust"],
-                verdict["expected_relit_db"],
-                signs,
-            )
-        )
+        terms = [verdict["terms"][name] / weight for name, weight in WEIGHTS.items()]
+        scores = (metrics["relit_set"]["mean_psnr_db"], verdict["trust"], verdict["expected_relit_db"])
+        sets.append(VerdictOnSet(", ".join(names) or "nothing", *scores, terms))
     return sets
 
 
 def base_of(seed: int | None) -> Path:
-    """Return the folder of the set that is spoilt."""
+    """Return the folder of the set that is degraded."""
     if seed is None:
         return ROOT / "data/eames"
     if seed not in CAPTURED:
-        return made(seed)
-    maps = maps_in([Path(word) for word in needed("LIGHTS", "folders of captured lights")])
-    return made(seed, folder_of(drawn(maps, seed)[0], PLACE / f"maps-{seed}"))
+        return generate_set(seed)
+    maps = maps_in([Path(word) for word in environment_words("LIGHTS", "folders of captured lights")])
+    return generate_set(seed, link_maps(split_maps(maps, seed)[0], PLACE / f"maps-{seed}"))
 
 
-def expected(weights: Float[np.ndarray, " 4"], signs: Float[np.ndarray, "n 4"]) -> Float[np.ndarray, " n"]:
+def expected(weights: Float[np.ndarray, " 4"], terms: Float[np.ndarray, "n 4"]) -> Float[np.ndarray, " n"]:
     """Return (1) of `factorlib.evaluate.verdict`, dB."""
-    return -10 * np.log10(FLOOR + signs @ weights)
+    return -10 * np.log10(FLOOR + terms @ weights)
 
 
-def fitted(sets: list[Judged]) -> Float[np.ndarray, " 4"]:
+def fit_weights(sets: list[VerdictOnSet]) -> Float[np.ndarray, " 4"]:
     """Fit the weights that bring the expected scores nearest to the scores; outliers count less."""
-    signs, scores = np.array([one.signs for one in sets]), np.array([one.score for one in sets])
+    terms, scores = (np.array([getattr(each, key) for each in sets]) for key in ("terms", "score"))
     start = np.log(list(WEIGHTS.values()))
-    return np.exp(least_squares(lambda w: expected(np.exp(w), signs) - scores, start, loss="soft_l1").x)
+    return np.exp(least_squares(lambda w: expected(np.exp(w), terms) - scores, start, loss="soft_l1").x)
 
 
-def told(sets: list[Judged]) -> str:
-    """Return every set in a table, and how well scores are foreseen."""
-    rows = [
-        [one.spoilt_by, f"{one.score:.1f}", f"{one.expected:.1f}", one.trust]
-        for one in sorted(sets, key=lambda s: -s.expected)
-    ]
-    foreseen = np.array([one.expected for one in sets])
-    return f"{table(['spoilt by', 'relit, dB', 'expected', 'verdict'], rows)}\n{agreement(foreseen, sets)}"
-
-
-def agreement(foreseen: Float[np.ndarray, " n"], sets: list[Judged]) -> str:
-    """Return rank correlations of foreseen and true scores, and the deviation.
+def agreement(predicted: Float[np.ndarray, " n"], sets: list[VerdictOnSet]) -> str:
+    """Return rank correlations of predicted and true scores, and the deviation.
 
     Correlations are of all sets, and of those that are not hopeless.
     """
-    score = np.array([one.score for one in sets])
-    some = score >= HOPELESS
-    ranks = spearmanr(foreseen, score)[0], spearmanr(foreseen[some], score[some])[0]
-    deviation = np.sqrt(np.mean((foreseen - score) ** 2))
+    score = np.array([each.score for each in sets])
+    usable = score >= HOPELESS
+    ranks = spearmanr(predicted, score)[0], spearmanr(predicted[usable], score[usable])[0]
+    deviation = np.sqrt(np.mean((predicted - score) ** 2))
     return f"Spearman {ranks[0]:.2f}, from {HOPELESS:g} dB on {ranks[1]:.2f}, deviation {deviation:.1f} dB"
 
 
 def main() -> None:
-    """Print what came out of each kind of sets that is named, and write the scores of all."""
-    kinds = {name: judged(name) for name in sys.argv[1:] or SEEDS}
-    for name, sets in kinds.items():
-        print(f"{name}\n{told(sets)}")
+    """Print the verdicts on each kind of sets that is named, and write the scores of all."""
+    kinds = {kind: measure(kind) for kind in sys.argv[1:] or SEEDS}
+    for kind, sets in kinds.items():
+        ranked = sorted(sets, key=lambda each: -each.expected)
+        rows = [[each.degradations, f"{each.score:.1f}", f"{each.expected:.1f}", each.trust] for each in ranked]
+        print(f"{kind}\n{markdown_table(['degraded by', 'relit, dB', 'expected', 'verdict'], rows)}")
+        print(agreement(np.array([each.expected for each in sets]), sets))
     if sets := kinds.get("fit"):
-        print("weights:", dict(zip(WEIGHTS, np.round(fitted(sets), 4).tolist(), strict=True)))
-        rest = [expected(fitted([*sets[:k], *sets[k + 1 :]]), np.array([one.signs]))[0] for k, one in enumerate(sets)]
-        print("each set left out of the fit:", agreement(np.array(rest), sets))
-    lines = [f"{name},{one.expected:.3f},{one.score:.3f}" for name, sets in kinds.items() for one in sets]
+        print("weights:", dict(zip(WEIGHTS, np.round(fit_weights(sets), 4).tolist(), strict=True)))
+        left_out = [expected(fit_weights([*sets[:k], *sets[k + 1 :]]), np.array(s.terms)) for k, s in enumerate(sets)]
+        print("each set left out of the fit:", agreement(np.array(left_out), sets))
+    lines = [f"{kind},{each.expected:.3f},{each.score:.3f}" for kind, sets in kinds.items() for each in sets]
     write_text(PLACE / "calibration.csv", "\n".join(["kind,expected_db,true_db", *lines, ""]))
 
 

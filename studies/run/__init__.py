@@ -3,10 +3,9 @@
 Nothing is declared anew: steps, keys, the store, locks, resuming, progress and the pool of processes are the runner's
 (`factorlib.runner`).  Results of studies have a store of their own in build/studies, those of quick ones in
 build/studies/quick, so that neither `make gc` nor a reader takes one for the other.  What the cases come to is no step:
-it is written anew after each run (`studies.run.page`), for it takes a second.
+it is written anew after each run (`studies.run.tables`), for it takes a second.
 """
 
-import shutil
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -16,7 +15,6 @@ import msgspec
 from factorlib.errors import InputError, did_you_mean
 from factorlib.runner import results_folder, verbs
 from factorlib.runner.project import LIBRARY, Data, Project, Provider
-from factorlib.runner.store import FileHashes
 from studies.catalogue import input_errors, matrices, methods
 from studies.study import FULL, QUICK, Scale, Study
 
@@ -29,7 +27,6 @@ STUDIES: dict[str, Study] = {
         input_errors.LABEL_QUALITY,
         input_errors.ALIGNMENT_ERROR,
         input_errors.PROGRESSIVE,
-        methods.LEAVE_ONE_OUT,
         matrices.PAPER_SETS,
         input_errors.GAUSS_SPHERE,
         methods.COMPARISON,
@@ -86,21 +83,11 @@ def data_of(folder: Path, scale: Scale) -> Data:
 
     def slice_(name: str, case: str | None) -> Slice:
         """Return the facts of a slice; its fields are what a change is reported by."""
-        facts = {"worlds": study.worlds, "sets": lambda scale: sets_of(study, scale), "case": lambda _: cases[case]}
+        facts = {"worlds": study.worlds, "sets": study.sets, "case": lambda _: cases[case]}
         plain = msgspec.to_builtins(facts[name](scale))
         return Slice(plain, {f"{name}.{field}": value for field, value in plain.items()})
 
     return Data(folder, list(cases), slice_)
-
-
-def sets_of(study: Study, scale: Scale) -> dict[str, Any]:
-    """Return the data sets of a study, and what one of this checkout contains, so that a step's key has it."""
-    facts = study.sets(scale)
-    if "folder" not in facts:
-        return facts
-    hashes, folder = FileHashes(None), LIBRARY / facts["folder"]
-    files = [file for file in sorted(folder.rglob("*")) if file.is_file()]
-    return facts | {"content": {str(file.relative_to(folder)): hashes.content(file) for file in files}}
 
 
 def make(
@@ -116,32 +103,33 @@ def make(
     """
     codes = []
     for name in names:
-        project, study = studies(scale, root), STUDIES[name]
+        project = studies(scale, root)
+        study = STUDIES[name]
         if scale.quick:
             print(f"{name}: quick: one seed, smallest sets: no conclusion")
-        targets = list(study.steps)
-        codes.append(verbs.make(project, verbs.Request(name, targets=targets, settings=settings or [], force=force)))
+        request = verbs.Request(name, targets=list(study.steps), settings=settings or [], force=force)
+        codes.append(verbs.make(project, request))
         if codes[-1] == 0:
-            from studies.run.page import conclude, write_page  # here: a plan must not pay for science
+            from studies.run.tables import write_index, write_study  # here: a plan must not pay for science
 
-            conclude(study, scale, project.build / name / targets[-1], project.build / name)
-            print(f"  study: {project.shown(project.build / name / 'paragraph.md')}")
-            print(f"  page: {project.shown(write_page(project))}")
+            folder = project.build / name
+            write_study(study, scale, folder / study.steps[-1] / "scores.json", folder)
+            print(f"  study: {project.shown(folder / 'paragraph.md')}")
+            print(f"  page: {project.shown(write_index(project))}")
     return next((code for code in codes if code), 0)
 
 
 def forget(scale: Scale, names: list[str], root: Path = LIBRARY) -> int:
     """Forget the results of studies; `collect` frees what they took.  Returns 0."""
-    from studies.run.page import FINISHED, write_page
+    from studies.run.tables import FILES, write_index
 
     project = studies(scale, root)
     for name in names:
-        shutil.rmtree(project.build / name / "pictures", ignore_errors=True)
-        for file in FINISHED:
+        for file in FILES:
             (project.build / name / file).unlink(missing_ok=True)
         results_folder.clean(project, name)
     if project.build.is_dir():
-        write_page(project)
+        write_index(project)
     return 0
 
 

@@ -1,12 +1,10 @@
-"""Errors of a method's predictions of photos that were not taken.
-
-Writes <case>.json, and <case>.png with some of the predictions, the truth above each.
+"""Errors of a method's predictions of photos that were not taken: writes <case>.json.
 
 Three kinds of pictures of the sphere, each compared with the truth by DSSIM inside the sphere's outline, after the tone
 map of `factorlib.evaluate.picture_errors` at an exposure that takes the truth's white to 1:
 
-    novel_view      every photographed entry, from `VIEWS`: the first shares a part of what it sees with the photo, the
-                    second little
+    novel_view      every photographed entry, from its side, a part of which is in the photo, and from its back, little
+                    of which is
     novel_light     every photographed material in the true lights of the world that no photo was taken in, from the
                     photos' side
     novel_material  every material of the world that was not photographed, in the light of every photo, from the photos'
@@ -17,11 +15,11 @@ tells, which the true materials fix; one number for all pictures of the kind (`_
 picture (`_balanced`).
 
 The rest are the errors of the reflectances that a method states, those of three spheres in the lights that it states,
-and the processor seconds that it took.  What a method does not state has no score.
+and its processor seconds.  What a method does not state has no score.
 """
 
 import time
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator
 from pathlib import Path
 
 import msgspec
@@ -29,41 +27,35 @@ import numpy as np
 
 from factorlib.evaluate.comparison_gauge import gauge_factors
 from factorlib.evaluate.picture_errors import picture_error, white_of
-from factorlib.images.exr import read_rgb_exr
-from factorlib.images.picture import picture, write_png
 from factorlib.jsonfile import read_json, write_json
-from factorlib.results.materials import Reflectance
+from factorlib.results.materials import read_materials
 from factorlib.stage import Inputs, Progress
-from studies.body import Photos, Radiance, View, photographed, shown, turn, view
-from studies.errors import PARTS, Map, in_gauge, light_errors, material_errors
-from studies.methods import Prediction, grey, intrinsic, lambertian_part, projective, rendered
-from studies.spheres import materials_of, read_maps
+from studies.baselines import MethodPrediction, grey, projective, rendered
+from studies.recovery_errors import PARTS, Materials, in_gauge, light_errors, material_errors, read_recovered_maps
+from studies.spheres import Maps, Radiance, SphereView, materials_of, photograph, read_maps, sphere_view
 from studies.steps import Params
-from studies.study import Comparison, Score
-from studies.study import World as Lights
+from studies.study import Comparison, Score, World
 
-VIEWS = {"side": (70.0, 15.0), "back": (160.0, -10.0)}  # azimuth and elevation of the camera, degrees
-FRONT = {"front": (0.0, 0.0)}  # the photos' own side
+VIEWS = {"side": (70.0, 15.0), "back": (160.0, -10.0), "front": (0.0, 0.0)}  # azimuth, elevation of a camera, degrees
 KINDS = ("novel_view", "novel_light", "novel_material")
 SUFFIXES = {"none": "", "scalar_per_set": "_scaled", "channel_per_photo": "_balanced"}
-INSTANT = {"projective": projective, "intrinsic": intrinsic, "grey": grey}  # methods that take less than a second
-COLUMNS = 12  # pictures of <case>.png
+INSTANT = {"projective": projective, "grey": grey}  # methods that take less than a second
 
 
-class Shot(msgspec.Struct, frozen=True):
-    """A photo that was not taken: what kind of prediction it asks for, of which material in which light, from where."""
+class UnseenPhoto(msgspec.Struct, frozen=True):
+    """A photo that was not taken: the kind of prediction, the material, the light, and the side it is seen from."""
 
     kind: str
     material: str
     light: int
-    view: str
+    side: str
 
 
-class Taken(msgspec.Struct, frozen=True):
-    """The true photo and the predicted one, as radiance; white: radiance that both are shown with as white."""
+class PredictedPhoto(msgspec.Struct, frozen=True):
+    """The true picture of a target and the predicted one, as radiance; white: radiance that is shown as white."""
 
-    shot: Shot
-    view: View
+    target: UnseenPhoto
+    view: SphereView
     truth: Radiance
     predicted: Radiance
     white: float
@@ -73,88 +65,68 @@ class Taken(msgspec.Struct, frozen=True):
         pictures = (self.view.picture(radiance) for radiance in (self.predicted * factor, self.truth))
         return picture_error(*pictures, self.view.inside, self.white).dssim
 
-    def picture(self, radiance: Radiance) -> np.ndarray:
-        """Return 8-bit sRGB, white where there is nothing."""
-        pixels = picture(self.view.picture(np.maximum(radiance, 0)), 1 / self.white)
-        pixels[~self.view.inside] = 255
-        return pixels
-
-
-class World(msgspec.Struct, frozen=True):
-    """The truth: all materials by name and all lights by number, those that no photo shows among them."""
-
-    materials: dict[str, Reflectance]
-    lights: dict[int, Map]
-
 
 def main(params: Params, inputs: Inputs, out: Path, progress: Progress) -> None:
     """Compare with the truth."""
     case = msgspec.convert(inputs.facts["dataset.case"], Comparison)
-    numbers = range(msgspec.convert(inputs.facts["dataset.worlds"], Lights).lights)
-    world = World(materials_of(case.seed), read_maps(inputs["worlds"], case.seed, numbers))
-    photos, _ = photographed(case, world.materials, world.lights)
-    prediction, seconds = answer(case, photos, inputs["answer"] / inputs.photo, world.materials)
-    taken = shots(case, world, prediction)
-    write_json(out / f"{inputs.photo}.json", score_of(world, prediction, taken, seconds))
-    some = [taken[k] for k in np.unique(np.linspace(0, len(taken) - 1, COLUMNS).round().astype(int))]
-    pairs = [np.concatenate([of.picture(of.truth), of.picture(of.predicted)]) for of in some]
-    write_png(out / f"{inputs.photo}.png", np.concatenate(pairs, axis=1))
-
-
-def answer(
-    case: Comparison, photos: Photos, folder: Path, truths: Mapping[str, Reflectance]
-) -> tuple[Prediction, float]:
-    """Return a method's answer, and the processor seconds that it took.
-
-    folder: what the step `answer` wrote, where it takes more than an instant
-    """
+    numbers = range(msgspec.convert(inputs.facts["dataset.worlds"], World).lights)
+    truths = materials_of(case.seed)
+    maps = read_maps(inputs["worlds"], case.seed, numbers)
+    folder = inputs["solve"] / inputs.photo
     if case.method in INSTANT:
-        start = time.process_time()
-        return INSTANT[case.method](photos, truths), round(time.process_time() - start, 3)
-    materials = msgspec.convert(read_json(folder / "materials.json"), dict[str, Reflectance])
-    lights = {li: read_rgb_exr(folder / f"{li}.exr") for li in case.lights}
-    return rendered(*in_gauge(materials, lights, truths)), read_json(folder / "seconds.json")
+        photos, _ = photograph(case, truths, maps)
+        start_s = time.process_time()
+        prediction = INSTANT[case.method](photos, truths)
+        seconds = round(time.process_time() - start_s, 3)
+    else:
+        solved = {n: m.reflectance for n, m in read_materials(folder / "materials.json").materials.items()}
+        prediction = rendered(*in_gauge(solved, read_recovered_maps(folder, case.lights), truths))
+        seconds = read_json(folder / "measured.json")["seconds"]
+    pictures = predict(case, truths, maps, prediction)
+    write_json(
+        out / f"{inputs.photo}.json", Score({"processor": seconds}) | score_method(truths, maps, prediction, pictures)
+    )
 
 
-def shots(case: Comparison, world: World, prediction: Prediction) -> list[Taken]:
-    """Return all shots that are asked, with what the method answers."""
-    cameras, taken = {name: view(case.size, turn(*at)) for name, at in (VIEWS | FRONT).items()}, []
-    for shot in asked(case, world):
-        camera, material, light = cameras[shot.view], world.materials[shot.material], world.lights[shot.light]
-        truth = shown(material, light, camera)
-        predicted = prediction.of(
-            material if shot.kind == "novel_material" else shot.material,
-            light if shot.kind == "novel_light" else shot.light,
-            camera,
+def predict(case: Comparison, truths: Materials, maps: Maps, prediction: MethodPrediction) -> list[PredictedPhoto]:
+    """Return the pictures of all targets that the method predicts."""
+    cameras = {side: sphere_view(case.size, *angles) for side, angles in VIEWS.items()}
+    pictures = []
+    for target in targets(case, truths, maps):
+        view = cameras[target.side]
+        material = truths[target.material]
+        light = maps[target.light]
+        truth = view.render(material, light)
+        predicted = prediction.render(
+            material if target.kind == "novel_material" else target.material,
+            light if target.kind == "novel_light" else target.light,
+            view,
         )
         if predicted is not None:
-            taken.append(Taken(shot, camera, truth, predicted, white_of(camera.picture(truth), camera.inside)))
-    return taken
+            pictures.append(PredictedPhoto(target, view, truth, predicted, white_of(view.picture(truth), view.inside)))
+    return pictures
 
 
-def asked(case: Comparison, world: World) -> Iterator[Shot]:
-    """Yield what is asked of all methods in a case."""
-    names, unseen = list(world.materials), sorted(world.lights.keys() - set(case.lights))
+def targets(case: Comparison, truths: Materials, maps: Maps) -> Iterator[UnseenPhoto]:
+    """Yield the targets of a case, the same for all methods."""
+    names = list(truths)
+    yield from (UnseenPhoto("novel_view", names[m], li, side) for side in ("side", "back") for m, li in case.entries)
+    unobserved = sorted(maps.keys() - set(case.lights))
+    yield from (UnseenPhoto("novel_light", name, li, "front") for name in case.material_names for li in unobserved)
     others = [name for name in names if name not in case.material_names]
-    yield from (Shot("novel_view", names[m], li, side) for side in VIEWS for m, li in case.entries)
-    yield from (Shot("novel_light", name, li, "front") for name in case.material_names for li in unseen)
-    yield from (Shot("novel_material", name, li, "front") for name in others for li in case.lights)
+    yield from (UnseenPhoto("novel_material", name, li, "front") for name in others for li in case.lights)
 
 
-def score_of(world: World, prediction: Prediction, taken: Sequence[Taken], seconds: float) -> Score:
-    """Score a method.
-
-    taken: as `shots` makes them;  seconds: of the processor, that the answer took
-    """
-    score = Score({"processor": seconds})
+def score_method(truths: Materials, maps: Maps, prediction: MethodPrediction, pictures: list[PredictedPhoto]) -> Score:
+    """Score a method by its pictures, and by the materials and lights that it states."""
+    score = Score({})
     for kind in KINDS:
-        if of_kind := [of for of in taken if of.shot.kind == kind]:
-            samples = [[getattr(of, part) for of in of_kind] for part in ("predicted", "truth", "white")]
+        if some := [picture for picture in pictures if picture.target.kind == kind]:
+            samples = [[getattr(picture, part) for picture in some] for part in ("predicted", "truth", "white")]
             for gauge, factors in gauge_factors(*samples, below_white=True).items():
-                errors = [of.dssim(f) for of, f in zip(of_kind, factors, strict=True)]
+                errors = [picture.dssim(factor) for picture, factor in zip(some, factors, strict=True)]
                 score |= Score({kind + SUFFIXES[gauge]: float(np.mean(errors))})
-    if prediction.materials:  # of a Lambertian method k_d alone, against the true k_d
-        truths = lambertian_part(world.materials) if prediction.lambertian else world.materials
-        stated = PARTS[:1] if prediction.lambertian else PARTS
-        score |= material_errors(prediction.materials, truths, dict.fromkeys(prediction.materials, 0), stated)
-    return score | light_errors(prediction.lights, world.lights) if prediction.lights else score
+    if materials := prediction.materials:  # of a Lambertian method k_d alone
+        parts = PARTS if any(any(m.specular) for m in materials.values()) else PARTS[:1]
+        score |= material_errors(materials, truths, dict.fromkeys(materials, 0), parts)
+    return score | light_errors(prediction.lights, maps) if prediction.lights else score

@@ -1,4 +1,4 @@
-"""Error of a rendered set that `solve` solves with one part of the model switched off: writes <case>.json."""
+"""Error of a rendered set, solved by `solve` with one part of the model switched off: writes <case>.json."""
 
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -14,12 +14,12 @@ from factorlib.results.lobe_table import read_lobes
 from factorlib.results.materials import Reflectance, read_materials
 from factorlib.stage import Inputs, Progress
 from factorlib.urm.observations import read_observations
-from studies.errors import ROWS, light_errors, material_errors
+from studies.recovery_errors import ROWS, light_errors, material_errors
 from studies.steps import Params
-from studies.steps.solve import solved
+from studies.steps.solve import run_solve
 
 GAUGE = "channel_per_photo"  # of lights: what no photo tells is taken out
-CHANGES = {  # what is done to the observations that a solve may see
+CHANGES = {  # of the observations
     "": lambda o: o,
     "sure": lambda o: msgspec.structs.replace(o, confidence=None, weight=np.ones(len(o), o.weight.dtype)),
     "unclipped": lambda o: msgspec.structs.replace(o, clipped=np.zeros_like(o.clipped)),
@@ -30,11 +30,12 @@ CHANGES = {  # what is done to the observations that a solve may see
 def main(params: Params, inputs: Inputs, out: Path, progress: Progress) -> None:
     """Solve and compare."""
     case = inputs.facts["dataset.case"]
-    home = inputs["photos"] / str(case["seed"])
-    dataset, photos = read_dataset(home / "data"), sorted((home / "urm").glob("*.parquet"))
+    home = inputs["rendered_sets"] / str(case["seed"])
+    dataset = read_dataset(home / "data")
+    photos = sorted((home / "urm").glob("*.parquet"))
     tables = {file.stem: CHANGES[case["change"]](read_observations(file)) for file in photos}
     with TemporaryDirectory() as folder:
-        solved(tables, case["solve"], inputs, Path(folder), progress)
+        run_solve(tables, case["solve"], inputs, Path(folder), progress)
         answer = read_materials(Path(folder) / "materials.json")
         lobes = read_lobes(Path(folder) / "lobes.parquet")
     materials = {n: m.reflectance for n, m in answer.materials.items()}

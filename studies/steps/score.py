@@ -2,7 +2,7 @@
 
 Pictures are spheres, whatever was observed: all normals of the half sphere toward the viewer.  They are compared by
 DSSIM inside the disc after the tone map of `factorlib.evaluate.picture_errors`, nothing scaled but for the gauge
-(`studies.errors`).
+(`studies.recovery_errors`).
 
     entries        recovered materials in recovered lights: every entry of the observed rows and columns; observed,
                    unobserved: those entries alone; no factor is in it where a material and a light are connected
@@ -16,12 +16,10 @@ solve states, the seconds that it took, and how coloured lights are, which is wh
     chromaticity   of lights: deviation over the three channels of their mean radiances, over the mean of these.  Before
                    that each channel is divided by its geometric mean over the case's lights, the gauge, in answers and
                    truths alike
-    colour         mean angle between the colours of a mirror sphere in the recovered and in the true light
+    colour         of lights: mean angle between the colours of a mirror sphere in the recovered and in the true light
     tint           deviation over channels of the log of the factor that takes recovered reflectances to true ones
 
-Nulls: what a guess scores that knows nothing but mean colours.  Of objects, for the first seed, <case>.png shows all
-materials (rows) in all lights, the truth and, right of it, what was recovered; entries that were observed have a bright
-frame.
+Nulls: what a guess scores that knows nothing but mean colours.
 """
 
 from collections.abc import Iterable, Mapping
@@ -29,62 +27,71 @@ from pathlib import Path
 
 import msgspec
 import numpy as np
-from jaxtyping import Float, UInt8
+from jaxtyping import Float
 
 from factorlib.evaluate.ball import octahedral_light
 from factorlib.evaluate.comparison_gauge import connected_components
 from factorlib.evaluate.material_errors import GREY
 from factorlib.evaluate.picture_errors import picture_error, white_of
 from factorlib.evaluate.relighting import INSIDE, Appearances
-from factorlib.images.picture import picture, write_png
 from factorlib.jsonfile import read_json, write_json
-from factorlib.results.materials import Reflectance, Solved, read_materials
+from factorlib.results.materials import Solved, read_materials
 from factorlib.stage import Inputs, Progress
-from studies.errors import Map, factor_of, in_gauge, light_errors, maps_of, material_errors, times
-from studies.spheres import materials_of, read_maps
+from studies.recovery_errors import (
+    Materials,
+    gauge_factor,
+    in_gauge,
+    light_errors,
+    material_errors,
+    read_recovered_maps,
+    scale_reflectance,
+)
+from studies.spheres import Maps, materials_of, read_maps
 from studies.steps import Params
 from studies.study import Case, Score, World, light_name
 
 LEAST = 1e-3  # of a reflectance, below which a relative standard error means nothing
-Table = Mapping[str, Reflectance]
-Maps = Mapping[int, Map]
 
 
 def main(params: Params, inputs: Inputs, out: Path, progress: Progress) -> None:
     """Compare with all lights of the world."""
-    case, world = (msgspec.convert(inputs.facts[f"dataset.{n}"], t) for n, t in (("case", Case), ("worlds", World)))
-    truths, solved = materials_of(case.seed, case.names), inputs["solve"] / inputs.photo
-    maps, table = read_maps(inputs["worlds"], case.seed, range(world.lights)), read_materials(solved / "materials.json")
-    spheres, score = scored(case, truths, maps, table.materials, maps_of(solved, case.lights))
-    write_json(out / f"{inputs.photo}.json", score | Score(read_json(solved / "measured.json")))
-    if case.objects and case.seed == world.seeds[0]:
-        write_png(out / f"{inputs.photo}.png", np.concatenate([spheres.matrix(true=True), spheres.matrix()], axis=1))
+    case = msgspec.convert(inputs.facts["dataset.case"], Case)
+    world = msgspec.convert(inputs.facts["dataset.worlds"], World)
+    folder = inputs["solve"] / inputs.photo
+    maps = read_maps(inputs["worlds"], case.seed, range(world.lights))
+    materials = read_materials(folder / "materials.json").materials
+    recovered = read_recovered_maps(folder, case.lights)
+    score = score_case(case, materials_of(case.seed, case.names), maps, materials, recovered)
+    write_json(out / f"{inputs.photo}.json", score | Score(read_json(folder / "measured.json")))
 
 
-def scored(case: Case, truths: Table, maps: Maps, table: Mapping[str, Solved], own: Maps) -> "tuple[Spheres, Score]":
-    """Return the spheres that are compared, and all scores.
+def score_case(case: Case, truths: Materials, maps: Maps, solved: Mapping[str, Solved], recovered: Maps) -> Score:
+    """Return all scores.
 
-    truths, maps: all true materials and lights of the world;  table, own: those that were solved, in the solve's own
-                  gauge
+    Args:
+        case: Case that was solved.
+        truths: All true materials of the world.
+        maps: All true lights of the world.
+        solved: Materials of the solve, in its own gauge.
+        recovered: Lights of the solve, in its own gauge.
     """
     component = connected_components({light_name(li): case.names_in(li) for li in case.lights})
-    solved = {n: table[n].reflectance for n in component}
-    materials, lights = {}, {}
+    estimates = {name: solved[name].reflectance for name in component}
+    materials = {}
+    lights = {}
     for number in set(component.values()):  # each in the truth's gauge
-        names = [n for n in case.material_names if component[n] == number]
-        of = {li: own[li] for li in case.lights if component[case.names_in(li)[0]] == number}
-        some, few = in_gauge({n: solved[n] for n in names}, of, truths)
-        materials, lights = materials | some, lights | few
-    spheres = Spheres(case, materials, lights, truths, maps)
-    score = spheres.score() | material_errors(solved, truths, component) | stated_errors([table[n] for n in component])
-    errors = light_errors(lights, maps)
+        members = {n: estimates[n] for n in case.material_names if component[n] == number}
+        lit = {li: recovered[li] for li in case.lights if component[case.names_in(li)[0]] == number}
+        scaled = in_gauge(members, lit, truths)
+        materials |= scaled[0]
+        lights |= scaled[1]
+    score = sphere_errors(case, materials, lights, truths, maps) | material_errors(estimates, truths, component)
+    score |= stated_errors([solved[n] for n in component]) | light_errors(lights, maps)
     if len(set(component.values())) > 1:  # each component has a tint of its own
-        return spheres, score | Score(
-            *({k: v for k, v in of.items() if k != "colour"} for of in (errors.values, errors.nulls))
-        )
-    colours = {"chromaticity": chromaticity(own), "true_chromaticity": chromaticity({li: maps[li] for li in own})}
-    tint = float(np.std(np.log(factor_of(solved, truths))))
-    return spheres, score | errors | Score({**colours, "tint": tint})
+        return score
+    tint = float(np.std(np.log(gauge_factor(estimates, truths))))
+    colours = {"chromaticity": recovered, "true_chromaticity": {li: maps[li] for li in recovered}}
+    return score | Score({name: chromaticity(of_case) for name, of_case in colours.items()} | {"tint": tint})
 
 
 def stated_errors(table: Iterable[Solved]) -> Score:
@@ -109,52 +116,40 @@ def chromaticity(lights: Maps) -> float:
     return float(np.mean(free.std(axis=1) / free.mean(axis=1)))
 
 
-class Spheres:
-    """Spheres of true and recovered materials in true and recovered lights, each rendered once."""
+def sphere_errors(case: Case, materials: Materials, lights: Maps, truths: Materials, maps: Maps) -> Score:
+    """Return DSSIM of the predicted spheres, and of those of nulls: mean colours, grey materials.
 
-    def __init__(self, case: Case, materials: Table, lights: Maps, truths: Table, maps: Maps):
-        self.case, self.materials, self.truths = case, materials, truths
-        self.true = {li: Appearances(octahedral_light(light)) for li, light in maps.items()}
-        self.own = {li: Appearances(octahedral_light(light)) for li, light in lights.items()}
+    Args:
+        case: Case that was solved.
+        materials: Recovered materials, in the truth's gauge.
+        lights: Recovered lights, in the truth's gauge.
+        truths: All true materials of the world.
+        maps: All true lights of the world.
+    """
+    true = {li: Appearances(octahedral_light(light)) for li, light in maps.items()}
+    recovered = {li: Appearances(octahedral_light(light)) for li, light in lights.items()}
 
-    def score(self) -> Score:
-        """Return DSSIM of the predictions, and of those of nulls: mean colours, grey materials, constant lights."""
-        names, own, true = self.case.material_names, self.own, self.true
-        pairs = [(n, li) for n in names for li in own]
-        seen = {(self.case.names[m], li) for m, li in self.case.entries}
-        parts = {"entries": pairs, "observed": seen, "unobserved": [e for e in pairs if e not in seen]}
-        errors = {(n, li): self._dssim(own[li].ball(self.materials[n]), n, li) for n, li in pairs}
-        flat = {
-            (n, li): self._dssim(true[li].ball(self.truths[n]).mean(axis=0, keepdims=True), n, li) for n, li in pairs
-        }
-        score = Score(*({p: _mean(of[e] for e in es) for p, es in parts.items() if es} for of in (errors, flat)))
-        of_names = {n: _mean(self._dssim(true[li].ball(self.materials[n]), n, li) for li in true) for n in names}
-        values = {"new_light": _mean(of_names.values())}
-        values |= {"first_material": of_names[first]} if (first := self.case.names[0]) in of_names else {}
-        if 0 in own:
-            values["first_light"] = _mean(self._dssim(own[0].ball(m), n, 0) for n, m in self.truths.items())
-        grey = times(GREY, factor_of(dict.fromkeys(names, GREY), self.truths))
-        greys = (self._dssim(true[li].ball(grey), n, li) for n in names for li in true)
-        return score | Score(values, {"new_light": _mean(greys)})
+    def dssim(samples: Float[np.ndarray, "_ 3"], name: str, light: int) -> float:
+        truth = _disc(true[light].ball(truths[name]))
+        return picture_error(_disc(samples), truth, INSIDE, white_of(truth, INSIDE)).dssim
 
-    def _dssim(self, predicted: Float[np.ndarray, "_ 3"], name: str, light: int) -> float:
-        truth = _disc(self.true[light].ball(self.truths[name]))
-        return picture_error(_disc(predicted), truth, INSIDE, white_of(truth, INSIDE)).dssim
-
-    def matrix(self, true: bool = False) -> UInt8[np.ndarray, "h w 3"]:
-        """Draw all materials (rows) in all lights, recovered or true, each exposed for its truth."""
-        rows = []
-        for m in self.case.materials:
-            name, row = self.case.names[m], []
-            for li in self.case.lights:
-                truth = self.true[li].ball(self.truths[name])
-                shown = _disc(truth if true else self.own[li].ball(self.materials[name]))
-                cell = np.pad(picture(shown, 1 / white_of(_disc(truth), INSIDE)), ((3, 3), (3, 3), (0, 0)))
-                if (m, li) in self.case.entries:
-                    cell[:2], cell[-2:], cell[:, :2], cell[:, -2:] = 200, 200, 200, 200
-                row.append(cell)
-            rows.append(np.concatenate(row, axis=1))
-        return np.concatenate(rows)
+    names = case.material_names
+    pairs = [(name, li) for name in names for li in lights]
+    observed = [pair for pair in pairs if (case.names.index(pair[0]), pair[1]) in case.entries]
+    subsets = {"entries": pairs, "observed": observed, "unobserved": [p for p in pairs if p not in observed]}
+    errors = {(n, li): dssim(recovered[li].ball(materials[n]), n, li) for n, li in pairs}
+    flat = {(n, li): dssim(true[li].ball(truths[n]).mean(axis=0, keepdims=True), n, li) for n, li in pairs}
+    means = ({key: _mean(each[p] for p in some) for key, some in subsets.items() if some} for each in (errors, flat))
+    relit = {n: _mean(dssim(true[li].ball(materials[n]), n, li) for li in true) for n in names}
+    values = {"new_light": _mean(relit.values())}
+    values |= {"first_material": relit[case.names[0]]} if case.names[0] in relit else {}
+    values |= (
+        {"first_light": _mean(dssim(recovered[0].ball(m), n, 0) for n, m in truths.items())} if 0 in lights else {}
+    )
+    grey = scale_reflectance(GREY, gauge_factor(dict.fromkeys(names, GREY), truths))
+    return Score(*means) | Score(
+        values, {"new_light": _mean(dssim(true[li].ball(grey), n, li) for n in names for li in true)}
+    )
 
 
 def _disc(samples: Float[np.ndarray, "_ 3"]) -> Float[np.ndarray, "h w 3"]:

@@ -2,7 +2,7 @@
 
 measured.json holds the processor seconds of the solve, of all threads, from observations as they lie on disk to
 materials and lights as they lie there, and of objects the mean error of the normals given.  Seconds are a measurement:
-they differ from run to run.  What was solved to start from does not count in them.
+they differ from run to run.  A solve to start from does not count in them.
 """
 
 import time
@@ -22,51 +22,52 @@ from factorlib.urm.observations import Observations, write_observations
 from stages import solve
 from studies import objects, spheres
 from studies.steps import Params
-from studies.study import Case
+from studies.study import Case, Comparison
 
 
 def main(params: Params, inputs: Inputs, out: Path, progress: Progress) -> None:
-    """Render, perturb, and solve with the parameters that the case names.
+    """Render, perturb, and solve with the parameters that the case names; other methods of a comparison do not solve.
 
     The solve starts from nothing, or from the solution of all photos but the last.
     """
-    case, home, measured = msgspec.convert(inputs.facts["dataset.case"], Case), out / inputs.photo, {}
-    maps = spheres.read_maps(inputs["worlds"], case.seed, case.lights)
-    of = spheres.materials_of(case.seed, case.names), {li: octahedral_light(light) for li, light in maps.items()}
-    if case.objects:
-        tables, measured["normals"] = objects.observed(case, *of)
-    else:
-        tables = spheres.observations_of(case, *of)
-    home.mkdir()
-    with TemporaryDirectory() as folder:
-        start = {}
-        if case.objects and case.objects.warm:
-            alone = msgspec.structs.replace(inputs, unfinished=None)  # the two solves must not resume each other's
-            solved(dict(list(tables.items())[:-1]), case.solve, alone, Path(folder), progress)
-            start = {"start": Path(folder)}
-        measured["seconds"] = solved(tables, case.solve, inputs, home, progress, **start)
+    facts = inputs.facts["dataset.case"]
+    case = msgspec.convert(facts, Comparison if "method" in facts else Case)
+    (home := out / inputs.photo).mkdir()
+    measured = {}
+    if getattr(case, "method", "ours") == "ours":
+        maps = spheres.read_maps(inputs["worlds"], case.seed, case.lights)
+        lights = {li: octahedral_light(light) for li, light in maps.items()}
+        materials = spheres.materials_of(case.seed, case.names)
+        if case.objects:
+            tables, measured["normals"] = objects.observe_objects(case, materials, lights)
+        else:
+            tables = spheres.observe_spheres(case, materials, lights)
+        with TemporaryDirectory() as folder:
+            start = {}
+            if case.objects and case.objects.warm:
+                alone = msgspec.structs.replace(inputs, unfinished=None)  # the two solves must not resume each other's
+                run_solve(dict(list(tables.items())[:-1]), case.solve, alone, Path(folder), progress)
+                start = {"start": Path(folder)}
+            measured["seconds"] = run_solve(tables, case.solve, inputs, home, progress, **start)
     write_json(home / "measured.json", measured)
 
 
-def solved(
+def run_solve(
     tables: Mapping[str, Observations],
-    how: dict[str, Any],
+    parameters: dict[str, Any],
     inputs: Inputs,
     out: Path,
     progress: Progress,
     **start: Path,
 ) -> float:
-    """Solve observations, each photo in a light of its own; return the processor seconds that it took.
-
-    how: parameters of the stage
-    """
+    """Solve observations by the stage's parameters, each photo in a light of its own; return the processor seconds."""
     lights = {name: msgspec.to_builtins(LightSlice(name, None)) for name in tables}
     facts = {"dataset.materials": list(next(iter(tables.values())).materials), "dataset.light": lights}
     with TemporaryDirectory() as folder:
         for name, table in tables.items():
             write_observations(Path(folder) / f"{name}.parquet", table)
         folders = {"urm": Path(folder), "train": SHIPPED, **start}
-        began = time.process_time()
-        handed = Inputs(folders, facts, map=inputs.map, unfinished=inputs.unfinished)
-        solve.main(msgspec.convert(how, solve.Params), handed, out, progress)
-        return round(time.process_time() - began, 2)
+        start_s = time.process_time()
+        stage_inputs = Inputs(folders, facts, map=inputs.map, unfinished=inputs.unfinished)
+        solve.main(msgspec.convert(parameters, solve.Params), stage_inputs, out, progress)
+        return round(time.process_time() - start_s, 2)

@@ -19,7 +19,7 @@ def main(params: Params, inputs: Inputs, out: Path, progress: Progress) -> None:
     """Trace every light."""
     os.environ["FACTORLIB_MITSUBA"] = "scalar_rgb"  # read where Mitsuba is first used
     world = msgspec.convert(inputs.facts["dataset.worlds"], World)
-    wanted = [(seed, light) for seed in world.seeds for light in range(world.lights)]
-    for number, (seed, light) in enumerate(wanted):
-        progress(number, len(wanted), f"light {light} of seed {seed}")
+    lights = [(seed, light) for seed in world.seeds for light in range(world.lights)]
+    for number, (seed, light) in enumerate(lights):
+        progress(number, len(lights), f"light {light} of seed {seed}")
         write_rgb_exr(out / f"{seed}-{light}.exr", light_map(seed, light, world.rows, world.spp), LAT_LONG)

@@ -10,14 +10,14 @@ from studies.conclusion import (
     Cell,
     Conclusion,
     Row,
-    concluded,
+    conclude,
     csv_text,
     difference,
     paragraph,
     spread,
 )
 from studies.run import studies
-from studies.run.page import write_page
+from studies.run.tables import write_index
 from studies.study import FULL, QUICK, Claim, Score, Setting, Study, case_name
 
 
@@ -81,7 +81,7 @@ CLAIM, OTHER = Claim("entries", "a", "b", "a is better than b"), Claim("roughnes
     ],
 )
 def test_the_sentence_says_what_was_found(a, b, answer, words):
-    table = concluded(study(CLAIM), FULL, scores(FULL, a=a, b=b))
+    table = conclude(study(CLAIM), FULL, scores(FULL, a=a, b=b))
     assert words in paragraph(table) and table.answer == answer
     lines = csv_text(table).splitlines()
     assert len(lines) == 5 and lines[1].startswith("toy,a,a,entries,,5,")
@@ -90,10 +90,10 @@ def test_the_sentence_says_what_was_found(a, b, answer, words):
 
 def test_an_answer_in_part_says_of_how_many_and_a_quick_study_concludes_nothing():
     given = scores(FULL, a=0.1, b=0.2)
-    answers = [concluded(study(*of), FULL, given).answer for of in ((CLAIM, OTHER), (OTHER,), ())]
+    answers = [conclude(study(*of), FULL, given).answer for of in ((CLAIM, OTHER), (OTHER,), ())]
     nothing = "the paper claims nothing that is tested here"
     assert answers == ["agrees in part: 1 of 2 claims are shown", "no difference is shown", nothing]
-    table = concluded(study(CLAIM), QUICK, scores(QUICK, a=0.1, b=0.9))
+    table = conclude(study(CLAIM), QUICK, scores(QUICK, a=0.1, b=0.9))
     assert "no conclusion" in paragraph(table) and table.answer.startswith("not tested") and not table.claims
 
 
@@ -118,4 +118,4 @@ def test_the_page_leaves_tables_of_another_version_out(tmp_path, capsys):
     for name, of in {"prior": table, "parts": table | {"rows": 1}}.items():
         (project.build / name).mkdir(parents=True)
         (project.build / name / "table.json").write_text(json.dumps(of))
-    assert write_page(project).read_text().count(".md)") == 1 and "STUDY=parts" in capsys.readouterr().out
+    assert write_index(project).read_text().count(".md)") == 1 and "STUDY=parts" in capsys.readouterr().out

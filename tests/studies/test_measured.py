@@ -11,9 +11,9 @@ from factorlib.images.exr import LAT_LONG, write_rgb_exr
 from factorlib.jsonfile import write_json
 from factorlib.results.materials import MaterialTable, Reflectance, StandardErrors, solved
 from studies.measured import gallery, results
-from studies.measured.eames_like import MAPS, drawn, folder_of
+from studies.measured.eames_like import MAPS, link_maps, split_maps
 from studies.measured.standard_errors import light_deviations, material_deviations
-from studies.measured.tools import ROOT, refresh
+from studies.measured.tools import ROOT, replace_sections
 
 
 def test_a_section_is_replaced_and_the_rest_of_the_page_stays(tmp_path):
@@ -22,15 +22,15 @@ def test_a_section_is_replaced_and_the_rest_of_the_page_stays(tmp_path):
     for name in results.SECTIONS:
         assert find_spec(f"studies.measured.{name}")
         inner = before.partition(f"<!-- begin {name} -->\n")[2].partition(f"\n<!-- end {name} -->")[0]
-        refresh(page, {name: inner})
+        replace_sections(page, {name: inner})
         assert page.read_text(encoding="utf-8") == before
     new = results.section("align", {"Success": [["case", "right"], ["all", "1 of 1"]]}, "today")
-    refresh(page, {"align": new})
+    replace_sections(page, {"align": new})
     assert "**Success**\n\n| case | right |\n|---|---:|\n| all | 1 of 1 |\n<!-- end align -->" in page.read_text(
         "utf-8"
     )
     with pytest.raises(InputError, match="no place for the table 'other'"):
-        refresh(page, {"other": ""})
+        replace_sections(page, {"other": ""})
 
 
 def test_the_gallery_shows_every_recipe():
@@ -42,15 +42,15 @@ def test_the_gallery_shows_every_recipe():
 
 def test_a_prior_is_fitted_to_the_maps_that_light_no_photo(tmp_path):
     maps = [Path(f"maps/{name}.exr") for name in "abcdefghijkl"]
-    lit, others = drawn(maps, 6)
+    lit, others = split_maps(maps, 6)
     assert len(lit) == MAPS and sorted(lit + others) == maps
-    assert drawn(maps, 6) == (lit, others) and drawn(maps, 7)[0] != lit
+    assert split_maps(maps, 6) == (lit, others) and split_maps(maps, 7)[0] != lit
     with pytest.raises(InputError, match="7 maps"):
-        drawn(maps[:7], 6)
+        split_maps(maps[:7], 6)
     for folder in ("b", "a"):  # maps of one name both light a set
         (tmp_path / folder).mkdir()
         (tmp_path / folder / "sky.exr").write_text(folder)
-    both = folder_of([tmp_path / "b/sky.exr", tmp_path / "a/sky.exr"], tmp_path / "both")
+    both = link_maps([tmp_path / "b/sky.exr", tmp_path / "a/sky.exr"], tmp_path / "both")
     assert [path.read_text() for path in sorted(both.iterdir())] == ["b", "a"]
 
 

@@ -8,7 +8,7 @@ from factorlib.render.solved_set import SolvedSet
 from factorlib.results.materials import Reflectance
 from factorlib.stage import Inputs
 from studies import pairs as scene
-from studies.errors import times
+from studies.recovery_errors import scale_reflectance
 from tests.export import made_export
 
 GROUND = {"ground": {"point": [0, 1.2, 4], "normal": [0, -1, -0.2], "diffuse": [0.3, 0.3, 0.3]}}
@@ -37,14 +37,14 @@ def mixed(m):
     return Reflectance(half, half, 0.9)
 
 
-HALF = {"light": 2.0, "materials": lambda m: times(m, np.full(3, 0.5))}  # what no photograph tells
+HALF = {"light": 2.0, "materials": lambda m: scale_reflectance(m, np.full(3, 0.5))}  # what no photograph tells
 WRONG = [({}, ""), (HALF, ""), ({"light": 0.4}, "light"), ({"materials": mixed}, "material"), ({"tilt": 0.5}, "ground")]
 
 
 @pytest.mark.parametrize("how, cause", WRONG, ids=["same", "gauge", "light", "material", "ground"])
 def test_what_is_right_is_not_told_apart_and_what_is_wrong_is_named(inputs, how, cause):
     recipe = InsertRecipe(mesh="ball", material="red", at=(46.0, 45.0), size=0.5, samples=4)
-    (ours, truth), of = scene.drawn("front", recipe, SolvedSet(inputs), altered(inputs, **how))
+    (ours, truth), of = scene.render_pair("front", recipe, SolvedSet(inputs), altered(inputs, **how))
     assert ours.shape == truth.shape and of["floor"] > 0
     assert of["told_apart"] == bool(cause) and (of["cause"] == cause or not cause)
     right = [name for name in scene.FACTORS if name != cause] + ([] if cause else ["difference"])
@@ -58,6 +58,6 @@ def test_nothing_below_the_floor_is_told_apart():
     truth[body], truth[25:35, 10:30] = 0.2, 0.15
     parts = dict.fromkeys(scene.FACTORS, truth)
     for mine, its, told in ((1.3, 1.0, True), (2.0, 1.0, False), (1.3, 1.5, False)):
-        of = scene.scores((1.3 * truth, truth), (mine * truth, its * truth), parts, photo, body)
+        of = scene.score(scene.Pair(1.3 * truth, truth), scene.Pair(mine * truth, its * truth), parts, photo, body)
         assert of["told_apart"] == told
     assert scene.cielab(np.full((3, 3, 3), [1.0, 0, 0]))[1, 1] == pytest.approx([53.24, 80.09, 67.20], abs=0.05)

@@ -16,7 +16,7 @@ import pytest
 
 from factorlib.jsonfile import read_json
 from factorlib.runner.project import LIBRARY
-from studies.measured.reference import BOUNDS, complaint, differences, of_metrics, read_stored, run_small
+from studies.measured.reference import BOUNDS, complaint, differences, metric_numbers, read_stored, run_small
 
 
 def test_every_number_of_a_small_run_is_as_stored_stage_by_stage(tmp_path):
@@ -31,9 +31,9 @@ def test_every_number_is_as_stored_and_every_bound_holds():
     done = subprocess.run(command, cwd=LIBRARY, env=environment, capture_output=True, text=True)
     assert done.returncode == 0, f"{' '.join(command)}\n{done.stdout}\n{done.stderr}"
     metrics = read_json(LIBRARY / "build" / "synthetic" / "evaluate" / "metrics.json")
-    moved = differences(of_metrics(metrics), read_stored())
+    moved = differences(metric_numbers(metrics), read_stored())
     assert not moved, complaint(moved)
     for path, (lowest, highest, meaning) in BOUNDS.items():
-        assert lowest <= of_metrics(metrics)[path] <= highest, f"{meaning} ({path})"
+        assert lowest <= metric_numbers(metrics)[path] <= highest, f"{meaning} ({path})"
     page = (LIBRARY / "build" / "synthetic" / "report" / "index.html").read_text(encoding="utf-8")
     assert "Re-synthesis" in page and "Materials against the truth" in page

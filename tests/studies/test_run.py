@@ -12,7 +12,7 @@ from factorlib.runner.dataset_state import Request, read_state
 from factorlib.runner.project import LIBRARY
 from factorlib.stage import Inputs, silent
 from studies.run import STUDIES, data_of, studies
-from studies.run.page import conclude, write_page
+from studies.run.tables import write_index, write_study
 from studies.steps import score, solve, worlds
 from studies.study import QUICK
 
@@ -41,9 +41,9 @@ def test_wrong_names_and_words_are_answered(words, environment, said):
             NAME,
             "solve",
             ["stages.solve", "factorlib.inference.joint_solver"],
-            ["errors", "steps.score", "catalogue.matrices"],
+            ["recovery_errors", "steps.score", "catalogue.matrices"],
         ),
-        ("comparison", "answer", ["stages.solve"], ["steps.compare", "methods"]),
+        ("comparison", "solve", ["stages.solve"], ["steps.compare", "baselines"]),
     ],
 )
 def test_a_change_of_the_scores_or_the_claims_solves_nothing_again(tmp_path, name, step, there, absent):
@@ -71,7 +71,7 @@ def concluded(folder, name, data, scale, steps):
     gathered = {case: json.loads((last / f"{case}.json").read_text()) for case in data.photos}
     (last / "scores.json").write_text(json.dumps(gathered))
     (home := folder / "build/studies/quick" / name).mkdir(parents=True)
-    conclude(STUDIES[name], scale, last, home)
+    write_study(STUDIES[name], scale, last / "scores.json", home)
     return json.loads((home / "table.json").read_text()), home
 
 
@@ -82,4 +82,4 @@ def test_a_tiny_study_from_worlds_to_the_page(tmp_path):
     assert all(0 < row["cells"]["entries"]["spread"]["mean"] < 0.5 for row in table["rows"])
     text = (home / "paragraph.md").read_text()
     assert "no conclusion" in text and "| 1 × 1 |" in text
-    assert f"({NAME}/paragraph.md)" in write_page(studies(scale, tmp_path)).read_text()
+    assert f"({NAME}/paragraph.md)" in write_index(studies(scale, tmp_path)).read_text()

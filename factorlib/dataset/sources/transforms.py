@@ -100,7 +100,8 @@ def _camera(key: str, lens: FrameCamera, refuse: Refusal) -> tuple[pycolmap.Came
             return colmap_camera(key, "SIMPLE_PINHOLE", ANY_WIDTH, 1, params, refuse), (ANY_WIDTH, None)
     size = (lens.w, lens.h) if lens.w is not None and lens.h is not None else None
     width, height = size or (2 * max(lens.cx or focal, 1.0), 2 * max(lens.cy or focal, 1.0))
-    cx, cy = width / 2 if lens.cx is None else lens.cx, height / 2 if lens.cy is None else lens.cy
+    cx = width / 2 if lens.cx is None else lens.cx
+    cy = height / 2 if lens.cy is None else lens.cy
     pinhole = [focal, focal if lens.fl_y is None else lens.fl_y, cx, cy]
     k1, k2, k3, k4, p1, p2 = (value or 0.0 for value in (lens.k1, lens.k2, lens.k3, lens.k4, lens.p1, lens.p2))
     is_perspective = lens.camera_model in (None, *PERSPECTIVE)
