@@ -9,11 +9,11 @@ import pytest
 from PIL import Image
 
 from factorlib.dataset.read import read_dataset
-from factorlib.errors import InputError
 from factorlib.newset import new_dataset
 from factorlib.validation import Validation
 from factorlib.yamlfile import load_yaml
-from tests.align.test_pairing import LAMP, TWINS, seen
+from tests.align.test_align import LAMP, TWINS, silhouette_of
+from tests.refusal import refusal
 
 OBJ = "v 0 0 0\nv 1 0 0\nv 0 1 0\nv 0 0 1\ng shell\nf 1 2 3\nf 1 3 4\ng legs\nf 1 2 4\nf 2 3 4\n"
 LABEL, SHELL, LEGS = [0, 1, 2, 255], [0, 255], [255, 0]
@@ -58,8 +58,7 @@ def test_labels_become_materials_parts_are_left_open_and_a_further_mask_is_the_s
     objects = [{"name": n, "mesh": "chair", "mask": f"masks/kitchen_{n}.png"} for n in ("left", "right")]
     assert spec["photos"][1]["objects"] == objects
     assert spec["photos"][0]["objects"] == [{"name": "chair", "mesh": "chair"}]
-    with pytest.raises(InputError, match=r"\?"):
-        read_dataset(folder / "data" / "mine")
+    refusal(r"\?", read_dataset, folder / "data" / "mine")
 
 
 def test_a_mask_for_each_material_names_the_parts_and_nothing_is_missing(folder):
@@ -112,7 +111,7 @@ def drawn_chair(folder, *labels):
     text = "".join("v {} {} {}\n".format(*vertex) for vertex in LAMP.vertices) + text
     (folder / "meshes" / "chair.obj").write_text(text)
     for k, of in enumerate(labels):
-        label = seen(LAMP, of, k).label.astype(np.uint8)
+        label = silhouette_of(LAMP, of, k).label.astype(np.uint8)
         Image.fromarray(label).save(folder / "masks" / f"p{k}.png")
         Image.fromarray(np.repeat(label[..., None] * 50, 3, axis=-1)).save(folder / "photos" / f"p{k}.png")
 
@@ -166,12 +165,10 @@ def test_an_object_is_of_the_mesh_that_its_mask_names(folder):
 
 def test_a_folder_that_is_there_is_left_alone_and_nothing_half_made_stays(folder):
     (folder / "data" / "mine").mkdir(parents=True)
-    with pytest.raises(InputError, match="is there already"):
-        made(folder)
+    refusal("is there already", made, folder)
     (folder / "data" / "mine").rmdir()
     (folder / "meshes" / "broken.obj").write_text("v 1 2\nf 1 2 3\n")
-    with pytest.raises(InputError, match=r"broken\.obj"):
-        made(folder)
+    refusal(r"broken\.obj", made, folder)
     assert not list((folder / "data").iterdir())
 
 
@@ -181,6 +178,5 @@ def test_a_link_is_refused_for_it_may_lead_to_what_is_not_to_be_copied(folder, k
     file = next(path for path in sorted((folder / kind).iterdir()) if path.suffix != ".mtl")
     file.rename(folder / "secret")
     file.symlink_to(folder / "secret")
-    with pytest.raises(InputError, match="is a link") as error:
-        made(folder)
-    assert error.value.file == file and not (folder / "data" / "mine").exists()
+    error = refusal("is a link", made, folder)
+    assert error.file == file and not (folder / "data" / "mine").exists()

@@ -1,25 +1,33 @@
-"""Exported scenes, rendered by Mitsuba, are the pipeline's own pictures: camera, poses, materials and light."""
+"""Exported scenes for Mitsuba, OpenUSD and Blender: the same camera, poses, materials and light."""
+
+import importlib.util
+import shutil
+import subprocess
+import sys
+from collections.abc import Sequence
+from pathlib import Path
 
 import msgspec
 import numpy as np
 import pytest
 from scipy.ndimage import binary_erosion
 
-from factorlib.conventions import YUP_FROM_CAMERA
+from factorlib.conventions import YUP_FROM_CAMERA, lat_long_directions
 from factorlib.dataset.schema import LightSlice
 from factorlib.export.environment import mitsuba_map, sharpened
 from factorlib.export.exported_scene import DIRECT, ExportedScene, ExportedShape, ExposedMap
 from factorlib.export.mitsuba import write_scene
+from factorlib.export.usd import shader_inputs, write_usd_scene
 from factorlib.geometry.camera import Camera
-from factorlib.images.exr import LAT_LONG, read_exr, write_rgb_exr
+from factorlib.images.exr import LAT_LONG, read_exr, read_rgb_exr, write_rgb_exr
 from factorlib.light.lobes import Lobes
-from factorlib.meshes.ply import write_ply
+from factorlib.meshes.ply import submesh, write_ply
 from factorlib.meshes.read import read_mesh
 from factorlib.reflection.reference import Reference
 from factorlib.render.photo_scene import PhotoScene, PlacedMesh, traced_photo
 from factorlib.render.reflect import Reflector
 from factorlib.render.resynthesis import resynthesised
-from factorlib.results.lobe_table import light_of
+from factorlib.results.lobe_table import light_of, read_lobes
 from factorlib.results.materials import Reflectance, read_materials
 from factorlib.tracing.scene import node_directions, paint, rigid
 from factorlib.tracing.variant import mitsuba
@@ -196,3 +204,179 @@ def test_sharpening_undoes_what_interpolation_widens():
     exponent = -0.5 * sharpened(lobe, spacing).sharpness[0]
     interpolated = np.interp(x, nodes, np.exp(exponent * nodes**2))
     assert (x**2 * interpolated).sum() / interpolated.sum() == pytest.approx(1 / 2000.0, rel=1e-3)
+
+
+# ── Scenes as OpenUSD: text that is checked as text, and what the USD library reads of it ───────────────────────────
+
+
+ROWS = 256
+PHOTOS = list(made_export.MESHES)
+GLOSSY = Reflectance((0.4, 0.2, 0.1), (0.1, 0.2, 0.3), 0.45)
+METAL = Reflectance((0, 0, 0), (0.8, 0.6, 0.4), 0.7)
+LAMBERTIAN = Reflectance((0.5, 0.4, 0.3), (0, 0, 0), 0.2)
+MISSING = 'OpenUSD is not installed: make setup EXTRAS="interchange"'
+
+
+# as text -------------------------------------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def text_of(tmp_path):
+    """The text of a scene in which every object has every material."""
+
+    def written(objects=("chair",), materials=("red",), file="meshes/a.ply", exposure=(2.0, 1.0, 0.5)) -> str:
+        place = np.arange(16.0).reshape(4, 4)
+        place[3] = [0, 0, 0, 1]
+        shapes = [ExportedShape(f"{name}.{each}", file, each, place, False) for name in objects for each in materials]
+        light = ExposedMap("../illumination/a.exr", np.array(exposure), np.eye(3))
+        scene = ExportedScene(Camera(64, 48, 100.0, (30.0, 20.0)), shapes, dict.fromkeys(materials, GLOSSY), light)
+        write_usd_scene(tmp_path / "scene.usda", scene)
+        return (tmp_path / "scene.usda").read_text()
+
+    return written
+
+
+def test_files_are_quoted_matrices_written_for_rows_and_exposure_is_intensity_times_colour(text_of):
+    text, dark = text_of(), text_of(file="meshes/a@b.ply", exposure=(0, 0, 0))
+    assert "references = @./meshes/a.usda@" in text and "references = @@@./meshes/a@b.usda@@@" in dark
+    turned = "((0.0, -4.0, -8.0, 0.0), (1.0, -5.0, -9.0, 0.0), (2.0, -6.0, -10.0, 0.0), (3.0, -7.0, -11.0, 1.0))"
+    assert f"matrix4d xformOp:transform = {turned}" in text
+    assert "inputs:color = (1.0, 0.5, 0.25)" in text and "inputs:intensity = 2.0" in text
+    assert "inputs:color = (1.0, 1.0, 1.0)" in dark and "inputs:intensity = 0.0" in dark
+
+
+@pytest.mark.parametrize("material", [GLOSSY, METAL, LAMBERTIAN], ids=["glossy", "metal", "lambertian"])
+def test_shader_reflects_what_was_solved_at_normal_incidence(material):
+    found = shader_inputs(material)
+    assert (found["useSpecularWorkflow"] == 0) == (material is METAL)
+    if found["useSpecularWorkflow"]:
+        f0, diffuse = found["specularColor"], found["diffuseColor"] * (1 - found["specularColor"])
+    else:
+        f0, diffuse = found["diffuseColor"], np.zeros(3)
+        assert found["metallic"] == 1
+    np.testing.assert_allclose(f0, material.specular)
+    np.testing.assert_allclose(diffuse, material.diffuse)
+    assert found["roughness"] == (material.roughness if any(material.specular) else 1.0)
+
+
+# as the USD library reads it -----------------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def pxr():
+    return pytest.importorskip("pxr", reason=MISSING)
+
+
+def opened(exported, photo):
+    from pxr import Usd
+
+    return Usd.Stage.Open(str(exported[1] / "scenes" / f"{photo}.usda"))
+
+
+def world_of(prim) -> np.ndarray:
+    """world_from_prim, for columns."""
+    from pxr import UsdGeom
+
+    return np.array(UsdGeom.XformCache().GetLocalToWorldTransform(prim)).T
+
+
+@pytest.mark.parametrize("photo", PHOTOS)
+def test_usds_own_validators_find_nothing(pxr, exported, photo):
+    validation = pytest.importorskip("pxr.UsdValidation", reason="this OpenUSD has no validators")
+    stage = opened(exported, photo)
+    validators = validation.ValidationRegistry().GetOrLoadAllValidators()
+    assert len(validators) > 10
+    assert [error.GetErrorAsString() for error in validation.ValidationContext(validators).Validate(stage)] == []
+    assert stage.Flatten().ExportToString() and not stage.GetCompositionErrors()
+
+
+@pytest.mark.parametrize("photo", PHOTOS)
+def test_vertices_stand_where_the_pose_puts_them(pxr, exported, photo):
+    from pxr import UsdGeom
+
+    stage, name, pose = opened(exported, photo), made_export.MESHES[photo], made_export.POSES[photo]
+    entry = exported[0].facts["dataset.objects"][photo]["meshes"][name]
+    mesh = read_mesh(exported[0].files[f"{name}.obj"], made_export.NAMES, entry["parts"])
+    for label in mesh.labels:
+        part = submesh(mesh, label)
+        prim = stage.GetPrimAtPath(f"/scene/objects/chair/{made_export.NAMES[label - 1]}")
+        found, place = UsdGeom.Mesh(prim), world_of(prim)
+        points, normals = (np.array(attribute.Get()) for attribute in (found.GetPointsAttr(), found.GetNormalsAttr()))
+        expected = pose.apply(part.vertices) @ YUP_FROM_CAMERA
+        np.testing.assert_allclose(points @ place[:3, :3].T + place[:3, 3], expected, atol=2e-6)
+        np.testing.assert_allclose(normals, part.normals, atol=1e-6)
+        np.testing.assert_array_equal(np.array(found.GetFaceVertexIndicesAttr().Get()).reshape(-1, 3), part.faces)
+        assert set(found.GetFaceVertexCountsAttr().Get()) == {3} and found.GetNormalsInterpolation() == "vertex"
+
+
+@pytest.mark.parametrize("photo", PHOTOS)
+def test_dome_shows_the_light_from_where_it_came(pxr, exported, photo):
+    """By the layout that OpenUSD's DomeLight documents: OpenEXR's, up +y, longitude 0 at +z, π/2 at +x, from π to −π."""
+    from pxr import UsdLux
+
+    stage = opened(exported, photo)
+    dome = UsdLux.DomeLight(stage.GetPrimAtPath("/scene/light"))
+    file = dome.GetTextureFileAttr().Get().resolvedPath
+    assert dome.GetTextureFormatAttr().Get() == "latlong" and file
+    found = read_rgb_exr(file) * dome.GetIntensityAttr().Get() * np.array(dome.GetColorAttr().Get())
+    name, world = ("front", np.eye(3)) if photo == "front" else ("room", made_export.WORLD_FROM_CAMERA["side"])
+    light = read_lobes(exported[1] / "lobes.parquet")[name].scaled(made_export.EXPOSURES[photo][0]).turned(world.T)
+    directions = lat_long_directions(8, 16).reshape(-1, 3)[16:-16] @ YUP_FROM_CAMERA
+    x, y, z = (directions @ YUP_FROM_CAMERA @ world_of(dome.GetPrim())[:3, :3]).T
+    rows, columns = (np.pi / 2 - np.arcsin(y)) / np.pi * ROWS, (np.pi - np.arctan2(x, z)) / (2 * np.pi) * 2 * ROWS
+    expected = light.radiance(directions)
+    assert expected.max() > 3 * np.median(expected)
+    texels = found[rows.astype(int), columns.astype(int)]
+    np.testing.assert_allclose(texels, expected, rtol=0.25, atol=0.01 * expected.max())
+
+
+# ── Exported scenes in Blender, by its script, beside Mitsuba's picture: frames, light and materials ────────────────
+
+
+NO_BLENDER = 'Blender is not installed: make setup EXTRAS="blender", or put `blender` on the PATH'
+
+
+def blender_pictures(scenes: Path, photos: Sequence[str], samples: int, *words: str) -> dict[str, np.ndarray]:
+    """RGBA of the photos, by the script beside them, all in one process; skips the test where there is no Blender."""
+    jobs = [
+        [photo, "--render", str(scenes / f"{photo}.blender.exr"), "--samples", str(samples), *words] for photo in photos
+    ]
+    code = (
+        f"import sys; sys.path.insert(0, {str(scenes)!r})\nimport blender\nfor words in {jobs!r}: blender.main(words)"
+    )
+    run(code)
+    return {photo: rgba(scenes / f"{photo}.blender.exr") for photo in photos}
+
+
+def run(code: str) -> None:
+    """Python in Blender; skips the test where there is none."""
+    done = subprocess.run(_command(code), capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr[-2000:]
+
+
+def _command(code: str) -> list[str]:
+    if importlib.util.find_spec("bpy"):
+        return [sys.executable, "-W", "ignore", "-c", code]
+    if program := shutil.which("blender"):
+        return [program, "--background", "--python-exit-code", "1", "--python-expr", code]
+    pytest.skip(NO_BLENDER)
+
+
+def rgba(path: Path) -> np.ndarray:
+    """[rows, columns, 4] of an EXR."""
+    channels = read_exr(path)
+    return np.stack([channels[name] for name in "RGBA"], axis=-1)
+
+
+@pytest.mark.long
+def test_round_trip_shows_what_mitsuba_shows(exported):
+    inputs, out = exported
+    photos, module = list(made_export.MESHES), mitsuba()
+    found = blender_pictures(out / "scenes", photos, 256)
+    for photo in photos:
+        expected = np.array(module.render(module.load_file(str(out / "scenes" / f"{photo}.xml")), spp=512))
+        mask = binary_erosion(read_exr(inputs["align"] / f"{photo}.exr")["label"] > 0, np.ones((3, 3)))
+        error = np.abs(found[photo][mask][:, :3] / expected[mask] - 1)
+        print(f"{photo}: difference {np.median(error):.2%} (median), {np.percentile(error, 95):.2%} (95th percentile)")
+        assert np.median(error) <= 0.03 and np.percentile(error, 95) <= 0.1
+        assert found[photo][mask][:, 3].min() == 1.0
