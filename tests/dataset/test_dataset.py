@@ -279,17 +279,3 @@ def test_photos_of_one_light_agree_on_its_frame(folder):
     spec["photos"][1] |= {"world_from_camera": TURN}
     facts = dataset_slice(read_dataset(write(folder, spec)), "light", "garden").facts
     assert facts == {"illumination": "studio", "world_from_camera": TURN}
-
-
-@pytest.mark.parametrize("old, new, line, words", [
-    ("mesh: chair\n", "mehs: chair\n", 30, ["mehs", "did you mean 'mesh'"]),
-    ("  image: garden.exr\n", "  image: garden.exr\n  image: kitchen.jpg\n", 53, ["the key 'image' stands here twice"]),
-    ("- name: garden\n", "- nam: garden\n", 51, ["nam", "did you mean 'name'"]),
-    ("format: 1\n", "format: one\n", 1, ["format", "'one'"]),
-])  # fmt: skip
-def test_a_fault_is_named_with_its_line(folder, old, new, line, words):
-    text = (write(folder) / "dataset.yaml").read_text()
-    (folder / "dataset.yaml").write_text(text.replace(old, new, 1))
-    caught = refusal(".", read_dataset, folder)
-    assert all(word in str(caught) for word in words), str(caught)
-    assert str(caught.file) == str(folder / f"dataset.yaml:{line}")

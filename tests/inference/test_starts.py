@@ -31,8 +31,6 @@ from factorlib.stage import serial_map
 from tests.inference.made_lights import FEW, OPERATOR, drawn, natural, on_even_cells, spheres
 
 NAMES, CELLS = ["red", "green", "blue"], 40
-QUICK = SolveOptions(cells=CELLS, splittings=0, observations=200, tone="off")
-REFLECTANCE, ROUGHNESS, RADIANCE = 0.01, 0.02, 0.01  # how near two answers are, after one factor per channel
 
 
 def truth(*numbers, shown=(0, 1, 2), photos=1, noise=0.0, size=10):
@@ -172,30 +170,6 @@ def test_shadows_and_bounces_stay_as_they_were_decided_where_both_were_tried(kep
 
 
 # ── whole answers ────────────────────────────────────────────────────────────────────────────────────────────────────
-
-
-def answer(blocks, start=None):
-    return solve(JointProblem(blocks, OPERATOR), start or start_from_photos(3), QUICK)
-
-
-def check_same(cold, warm, blocks):
-    one, other = warm.point, cold.point
-    factor = factor_between(one.materials, other.materials)
-    np.testing.assert_allclose(one.materials.diffuse * factor, other.materials.diffuse, atol=REFLECTANCE)
-    np.testing.assert_allclose(one.materials.specular * factor, other.materials.specular, atol=REFLECTANCE)
-    np.testing.assert_allclose(one.materials.roughness, other.materials.roughness, atol=ROUGHNESS)
-    for b, light, before in zip(blocks, one.lights, other.lights, strict=True):
-        a, c = (Illumination(b, li, p.materials, OPERATOR).radiance() for li, p in ((light, one), (before, other)))
-        assert np.sqrt(np.mean(((a - c) / (c + 1)) ** 2)) < RADIANCE
-
-
-def test_with_a_further_material_the_answer_is_the_one_from_nothing():
-    """As it is with a further light: `tests/stages/test_solve.py`."""
-    blocks, _ = truth(0, 1, noise=0.3, size=8)
-    fewer, count = [b.take(b.material < 2) for b in blocks], 2
-    before = solve(JointProblem(fewer, OPERATOR), start_from_photos(count), QUICK)
-    earlier = written(fewer, before.point.materials, before.point.lights, NAMES[:count], (0,) * count)
-    check_same(answer(blocks), answer(blocks, start_from_earlier(earlier, NAMES)), blocks)
 
 
 def test_a_solve_goes_on_from_the_fit_that_surface_wrote_in_whatever_unit_a_block_has():

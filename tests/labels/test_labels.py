@@ -173,14 +173,6 @@ def test_objects_of_other_materials_than_the_mask_shows_are_refused_and_what_is_
         check(each, ("a", {"wood"}), ("b", {"red"}))
 
 
-def test_a_mask_as_large_as_a_large_photo_is_no_bomb(tmp_path, recwarn):
-    """Pillow's own limit warns, with a line of its source, at 89 megapixels."""
-    Image.fromarray(np.ones((9_500, 9_500), bool)).save(tmp_path / "mask.png")
-    with pytest.raises(InputError, match="the mask is 9500 × 9500"):
-        read_labels("mask.png", lambda name: tmp_path / name, MATERIALS, (10, 10), "photo.png")
-    assert not recwarn.list
-
-
 # ── Labels grown from strokes, on pictures whose parts are known ────────────────────────────────────────────────────
 
 

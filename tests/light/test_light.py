@@ -5,7 +5,6 @@ import numpy as np
 import pytest
 import torch
 from scipy.integrate import quad
-from scipy.spatial.transform import Rotation
 
 from factorlib.conventions import YUP_FROM_CAMERA, lat_long_directions, lat_long_solid_angles
 from factorlib.geometry.sphere import fibonacci_sphere
@@ -222,11 +221,6 @@ def test_covariance_is_that_of_the_equation_and_positive_definite_without_a_nugg
     half, quarter = 1.5 * np.exp(-180 / 40) + 100, 1.5 * np.exp(-90 / 40) + 100
     expected = [[101.7, quarter, half], [quarter, 101.7, quarter], [half, quarter, 101.7]]
     np.testing.assert_allclose(KNOWN.covariance(0, directions), expected, rtol=1e-12)
-
-
-def test_all_frames_are_alike():
-    directions, rotation = fibonacci_sphere(40), Rotation.random(random_state=3).as_matrix()
-    np.testing.assert_allclose(KNOWN.precision(directions @ rotation.T)[0], KNOWN.precision(directions)[0], atol=1e-7)
 
 
 def test_precision_is_the_inverse_of_the_covariance_of_log_radiance():

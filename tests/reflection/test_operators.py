@@ -213,10 +213,6 @@ def test_gradients_are_finite_differences():
 # ── The paper's operator: laws that hold whatever its weights, what the shipped ones reach and learned from ─────────
 
 
-def test_the_shipped_weights_are_small():
-    assert sum(path.stat().st_size for path in SHIPPED.glob("paper_*")) < 1_000_000
-
-
 def test_rendered_spheres_are_what_the_reference_says(monkeypatch):
     """Nothing is assumed of frames, the map or Mitsuba's materials: mean errors within Monte Carlo noise of zero."""
     pytest.importorskip("mitsuba", reason="Mitsuba cannot run here, so that the training set is not checked")

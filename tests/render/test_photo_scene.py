@@ -1,14 +1,14 @@
-"""Path-traced photos: other views and lights, the floor of a studio, insertion beside a scene that has the object in truth, and where a new object stands."""
+"""Path-traced photos: other views and lights, the floor of a studio, insertion beside a scene that has the object in truth, where a new object stands, and the light at a place."""
 
 import msgspec
 import numpy as np
 import pytest
 import trimesh
 
-from factorlib.conventions import YUP_FROM_CAMERA
+from factorlib.conventions import YUP_FROM_CAMERA, lat_long_directions
 from factorlib.generate.solids import sphere
 from factorlib.geometry.camera import Camera, rotation_of_vector
-from factorlib.light.latlong import lat_long_of_lobes
+from factorlib.light.latlong import lat_long_of_lobes, sample_map
 from factorlib.light.lobes import Lobes, no_lobes
 from factorlib.meshes.mesh import Mesh, smooth
 from factorlib.render.ground import Plane, resting_plane
@@ -28,6 +28,7 @@ from factorlib.render.photo_scene import (
 from factorlib.render.placement import STEP, Spot, free_placement, spot_at, spot_beside, standing_mesh
 from factorlib.render.studio import on_floor
 from factorlib.results.materials import Reflectance
+from factorlib.tracing import scene as tracing
 from factorlib.tracing.scene import bsdf, rendered, rigid, sensor, transform
 from tests.refusal import refusal
 
@@ -398,3 +399,22 @@ def test_an_object_that_fits_nowhere_is_refused_with_a_size_that_does():
         asked=False,
     )
     assert error.key == "size" and "of its size it is free at `at: [" in error.cure
+
+
+# ── Mitsuba's scenes agree with the project's frames and reflectance model ──────────────────────────────────────────
+
+
+pytest.importorskip("mitsuba")
+
+
+def smooth_light(height):
+    x, y, z = np.moveaxis(lat_long_directions(height, 2 * height), -1, 0)
+    return 1 + np.stack([x * y, np.exp(4 * (0.6 * x + 0.8 * z - 1)) * 3, y * z * z], axis=-1)
+
+
+def test_the_light_seen_is_the_light_there():
+    """A map, seen from inside by six cameras in a turned frame, comes back as that map turned."""
+    light = smooth_light(16)
+    turn = tracing.look(20, 130) @ YUP_FROM_CAMERA
+    seen = tracing.incident_light({"light": tracing.envmap(light)}, tracing.rigid(turn, (0, 0, 0)), 16, 4, 1)
+    assert seen == pytest.approx(sample_map(light, lat_long_directions(16, 32) @ turn.T), rel=0.02, abs=0.05)

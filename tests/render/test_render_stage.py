@@ -4,7 +4,6 @@ import msgspec
 import numpy as np
 import pytest
 import torch
-from scipy.spatial.transform import Rotation
 
 from factorlib.conventions import FRONT, YUP_FROM_CAMERA, lat_long_directions, lat_long_solid_angles
 from factorlib.geometry.occluder_codes import NO_OCCLUDER
@@ -189,16 +188,6 @@ def test_balls_are_the_operator_at_every_pixel(roughness, sharpest):
         assert not picture[~inside].any()
         assert np.sqrt((error**2).mean() / (expected**2).mean()) < 0.003
         assert np.percentile(error / expected, 99) < 0.005
-
-
-def test_turning_light_and_object_together_changes_nothing_and_scaling_the_light_scales():
-    rotation, (normals, views) = Rotation.random(random_state=4).as_matrix(), points(50)
-    operator, factor = reflection_operator("closed_form", dtype="float64"), np.array([2.0, 0.5, 3.0])
-    expected = Reflector(operator, light())(GLOSSY, normals, views)
-    turned = Reflector(operator, light().turned(rotation))(GLOSSY, normals @ rotation.T, views @ rotation.T)
-    np.testing.assert_allclose(turned, expected, rtol=1e-6)
-    scaled = Reflector(operator, light().scaled(factor))(GLOSSY, normals, views)
-    np.testing.assert_allclose(scaled, expected * factor, rtol=1e-9)
 
 
 def test_chunks_do_not_show(monkeypatch):

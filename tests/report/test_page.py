@@ -1,4 +1,4 @@
-"""x"""
+"""The page for ordinary and odd sets: whole, self-contained, the same bytes; and two results on one page."""
 
 import base64
 import html
@@ -16,7 +16,7 @@ from factorlib.images.picture import read_png
 from factorlib.jsonfile import read_json, write_json
 from factorlib.light.lobes import no_lobes
 from factorlib.report.comparison import comparison
-from factorlib.report.pictures import box_of, outline, reduced
+from factorlib.report.pictures import reduced
 from factorlib.results.lobe_table import write_lobes
 from factorlib.results.materials import Gauge, MaterialTable, Reflectance, StandardErrors, solved
 from factorlib.results.photos import PhotoFacts
@@ -313,12 +313,3 @@ def test_reducing_keeps_the_mean_and_a_constant(size):
     assert max(small.shape[:2]) == 25 and small.mean() == pytest.approx(picture.mean(), rel=1e-4)
     assert reduced(np.ones((*size, 1), np.float32), 25) == pytest.approx(np.ones((*small.shape[:2], 1)), rel=1e-5)
     assert reduced(picture, 200) is picture
-
-
-def test_the_box_is_the_mask_with_a_margin_and_the_outline_one_pixel_wide_and_open_at_the_border():
-    mask = np.zeros((50, 60), bool)
-    mask[10:20, 0:30] = True
-    assert box_of(mask, 0.1) == (slice(7, 23), slice(0, 33)) and box_of(mask & False) == (slice(0, 50), slice(0, 60))
-    mask, expected = np.zeros((2, 6, 6), bool)
-    mask[:4, :4], expected[3, :4], expected[:4, 3] = True, True, True
-    assert np.array_equal(outline(mask), expected)

@@ -5,17 +5,14 @@ import numpy as np
 import pytest
 import trimesh
 
-from factorlib.align.state import pose_state
 from factorlib.generate.solids import SHAPES
 from factorlib.geometry import open3d
 from factorlib.geometry.camera import angle_between
-from factorlib.shapes.hull import hull_overlap, surface_nets, visual_hull
+from factorlib.shapes.hull import hull_overlap, visual_hull
 from factorlib.shapes.lathe import body_of_revolution
 from factorlib.shapes.motion import LEAST_AGREEMENT, cameras_by_motion
 from factorlib.shapes.outline import Triangles
 from factorlib.shapes.primitive import primitive, unit_shape
-from factorlib.shapes.proportions import BOX, jacobian_with_shape
-from tests.align.scenes import chair, photo_of
 from tests.refusal import refusal
 from tests.shapes.outlines import looking_from, outline, views_of
 
@@ -34,15 +31,6 @@ def holds(shape, points):
     scene = open3d.t.geometry.RaycastingScene()
     scene.add_triangles(shape.vertices.astype(np.float32), shape.faces.astype(np.uint32))
     return scene.compute_occupancy(points.astype(np.float32)).numpy().mean()
-
-
-def test_the_net_of_a_ball_is_closed_looks_outward_and_has_its_volume():
-    x = np.indices((21, 21, 21)) - 10.3
-    vertices, faces = surface_nets(8.0 - np.linalg.norm(x, axis=0))
-    net = trimesh.Trimesh(vertices, faces, process=False)
-    assert net.is_watertight and net.is_winding_consistent
-    assert net.volume == pytest.approx(4 / 3 * np.pi * 8**3, rel=0.03)
-    assert np.abs(np.linalg.norm(vertices - 10.3, axis=1) - 8).max() < 0.15
 
 
 def test_a_hull_holds_the_body_and_looks_like_it_in_a_photo_it_was_not_made_of():
@@ -174,19 +162,3 @@ def test_photos_that_do_not_overlap_are_refused():
 
 
 # ── Factors of a shape's axes: the derivative of image points by them ───────────────────────────────────────────────
-
-
-def test_image_points_move_by_the_derivative():
-    rng = np.random.default_rng(0)
-    caster, camera, pose = photo_of(chair(), 1)
-    state = pose_state(pose, camera, caster)
-    points = rng.normal(size=(30, 3))
-
-    def image(step, shape):
-        moved = state.moved(step)
-        return moved.camera(camera).project(points * np.exp(BOX @ shape) @ moved.rotation.T + moved.middle())
-
-    numeric, h = np.empty((30, 2, 9)), 1e-6
-    for k, step in enumerate(h * np.eye(9)):
-        numeric[..., k] = (image(step[:7], step[7:]) - image(-step[:7], -step[7:])) / (2 * h)
-    assert np.allclose(jacobian_with_shape(state, points @ state.rotation.T), numeric, rtol=1e-4, atol=1e-3)

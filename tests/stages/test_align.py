@@ -1,4 +1,4 @@
-"""The stage `align` from masks and dataset slices to its files, also where cameras stand in a COLMAP model."""
+"""The stage `align` from masks and dataset slices to its files, also where cameras are known beforehand."""
 
 import json
 import logging
@@ -6,9 +6,7 @@ import warnings
 
 import msgspec
 import numpy as np
-import pycolmap
 import pytest
-import yaml
 
 from factorlib.align.input_checks import check_before_camera
 from factorlib.align.search import SearchOptions
@@ -121,7 +119,9 @@ def test_a_pose_behind_the_camera_is_refused_without_raw_warnings(tmp_path, z, k
         warnings.simplefilter("error")
         caught = refusal("is not before the camera", run, tmp_path, moved(tmp_path, (0.0, 0.0, z), **known))
     assert caught.key == "photos[a].objects[chair].pose" and "OpenGL" in caught.cure
-    caught = refusal(".", check_before_camera, blob(), Pose(np.eye(3), np.array([0, 0, -9.0])), "hall", "vase", "colmap")
+    caught = refusal(
+        ".", check_before_camera, blob(), Pose(np.eye(3), np.array([0, 0, -9.0])), "hall", "vase", "colmap"
+    )
     assert caught.key == "cameras.colmap: hall: vase"
 
 
@@ -200,73 +200,47 @@ def test_keypoints_are_pixels_of_the_photo_before_its_lens_was_undone(tmp_path):
     np.testing.assert_allclose(straight * (1 + 0.3 * np.square(straight).sum(1, keepdims=True)), bent, atol=1e-9)
 
 
-# ── A scene whose cameras stand in a COLMAP model, through `masks` and `align`; `tests/dataset/test_sources.py` reads
-
+# ── a scene whose cameras are known beforehand, through `masks` and `align`; tests/dataset/test_sources.py reads each source ──
 
 CAMERA = Camera(200, 150, 300.0, (104.0, 71.0))
 POSE = Pose(rotation_of_vector(np.array([0.7, -1.1, 0.4])), np.array([0.1, 0.2, 5.0]))
-WORLD = {
-    "scale": 2.0,
-    "rotation": rotation_of_vector(np.array([-0.3, 0.2, 1.5])).tolist(),
-    "translation": [1.0, -2.0, 0.5],
-}
 CASTER = Caster(chair())
+LENS = {"fl_x": CAMERA.focal, "cx": CAMERA.centre[0], "cy": CAMERA.centre[1], "w": 200, "h": 150}
 
 
-def scene(folder, *, scale=1, photo=None, mesh=None, posed=True):
-    """A dataset of a photo of a chair, `scale` times as large as the model's, which has poses or cameras alone."""
+def scene(folder, *, scale=1, mesh=None, posed=True):
+    """A dataset of a photo of a chair, `scale` times as large as transforms.json says, which has poses or cameras alone."""
     for name in ("photos", "masks"):
         (folder / name).mkdir(parents=True)
     camera = Camera(200 * scale, 150 * scale, 300.0 * scale, (104.0 * scale, 71.0 * scale))
-    write_pixels(folder, rasterise(CASTER, camera, POSE).label)
+    label = rasterise(CASTER, camera, POSE).label
+    write_photo(folder / "photos/hall.png", np.repeat(label[..., None] * 0.5, 3, axis=-1))
+    write_labels(folder / "masks/hall.png", label)
     write_ply(folder / "chair.ply", mesh or chair())
-    entry = {"name": "hall", "image": "photos/000003.png", "masks": "masks/000003.png"} | (photo or {})
-    entry["objects"] = [{"name": "chair", "mesh": "chair"}]
-    meshes, cameras = {"chair": {"file": "chair.ply", "material": "white"}}, colmap(folder)
-    cameras = cameras if posed else {"colmap": "sparse"}
-    spec = {"format": 1, "materials": ["white"], "meshes": meshes, "photos": [entry], "cameras": cameras}
-    (folder / "dataset.yaml").write_text(yaml.safe_dump(spec))
+    world_from_camera = np.column_stack([POSE.rotation.T * (1, -1, -1), -POSE.rotation.T @ POSE.translation])  # OpenGL
+    write_json(
+        folder / "t.json", {**LENS, "frames": [{"file_path": "hall", "transform_matrix": world_from_camera.tolist()}]}
+    )
+    photo = {"name": "hall", "image": "photos/hall.png", "masks": "masks/hall.png"}
+    photo["objects"] = [{"name": "chair", "mesh": "chair"}]
+    cameras = {"transforms": "t.json"} | ({"world_from_object": {"chair": {}}} if posed else {})
+    meshes = {"chair": {"file": "chair.ply", "material": "white"}}
+    spec = {"format": 1, "materials": ["white"], "meshes": meshes, "photos": [photo], "cameras": cameras}
+    write_json(folder / "dataset.yaml", spec)
     return folder
 
 
-def write_pixels(folder, label):
-    write_photo(folder / "photos/000003.png", np.repeat(label[..., None] * 0.5, 3, axis=-1))
-    write_labels(folder / "masks/000003.png", label)
-
-
-def cam_from_world():
-    """Of x_world = 2 R x_object + t, in the world's units: cam_from_object after object_from_world, twice as long."""
-    rotation = POSE.rotation @ np.array(WORLD["rotation"]).T
-    return rotation, 2 * POSE.translation - rotation @ np.array(WORLD["translation"])
-
-
-def colmap(folder):
-    rotation, translation = cam_from_world()
-    model = pycolmap.Reconstruction()
-    parameters = [CAMERA.focal, *CAMERA.centre]
-    model.add_camera_with_trivial_rig(
-        pycolmap.Camera(model="SIMPLE_PINHOLE", width=200, height=150, params=parameters, camera_id=1)
-    )
-    image = pycolmap.Image(name="000003.png", camera_id=1, image_id=1)
-    model.add_image_with_trivial_frame(image, pycolmap.Rigid3d(pycolmap.Rotation3d(rotation), translation))
-    (folder / "sparse").mkdir()
-    model.write_binary(str(folder / "sparse"))
-    return {"colmap": "sparse", "world_from_object": {"chair": WORLD}}
-
-
 def aligned(folder, name="usual", search=None, **averaged):
-    out = folder.parent / name
-    run_stages(
-        read_dataset(folder), out, (masks, align), {"masks": averaged, "align": {"search": search} if search else {}}
-    )
-    return read_json(out / "align" / "hall.json")
+    params = {"masks": averaged, "align": {"search": search} if search else {}}
+    run_stages(read_dataset(folder), folder.parent / name, (masks, align), params)
+    return read_json(folder.parent / name / "align" / "hall.json")
 
 
 def test_the_poses_of_the_scene_come_out_of_a_photo_of_any_size(tmp_path):
     """Of the source's size, averaged down, and twice as large."""
     entry = aligned(scene(tmp_path / "same" / "set"))
     camera, obj = entry["camera"], entry["objects"]["chair"]
-    assert (camera["focal_source"], obj["source"]) == ("colmap", "colmap") and obj["doubts"] == []
+    assert (camera["focal_source"], obj["source"]) == ("transforms", "transforms") and obj["doubts"] == []
     assert camera["focal_px"] == 300.0 and np.allclose(camera["principal_point"], CAMERA.centre, atol=1e-12)
     assert np.allclose(obj["rotation"], POSE.rotation, atol=1e-12) and obj["silhouette_iou"] > 0.995
     assert np.allclose(obj["translation"], POSE.translation, atol=1e-12)
@@ -282,7 +256,7 @@ def test_where_only_the_camera_is_known_the_pose_is_searched(tmp_path):
     quick = {"views": 160, "rolls": 16, "keep": [20, 8, 4, 2]}
     entry = aligned(scene(tmp_path / "set", posed=False), search=quick)
     camera, obj = entry["camera"], entry["objects"]["chair"]
-    assert (camera["focal_source"], obj["source"], camera["focal_px"]) == ("colmap", "found", 300.0)
+    assert (camera["focal_source"], obj["source"], camera["focal_px"]) == ("transforms", "found", 300.0)
     assert camera["principal_point"] == list(CAMERA.centre)
     pose = Pose(np.array(obj["rotation"]), np.array(obj["translation"]))
     assert normal_error_deg(CASTER, CAMERA, POSE, CAMERA, pose) < 1

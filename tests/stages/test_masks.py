@@ -80,16 +80,6 @@ def test_channels_say_what_photo_and_mask_say_in_the_same_bytes_again(folder):
     np.testing.assert_array_equal(run(folder, objects=OWN)[0]["object"], 2 * (LABEL == 2))
 
 
-def test_clipped_channels_are_marked_and_stay_valid(folder):
-    codes = np.rint(255 * srgb_encode(RADIANCE)).astype(np.uint8)
-    codes[2, 3, 0] = codes[15, 0, 2] = 255  # one inside, one in the background
-    Image.fromarray(codes).save(folder / "in" / "photo.png")
-    channels, summary = run(folder, image="photo.png")
-    assert channels["clipped.R"][2, 3] == 1 and channels["valid"][2, 3] == 1 and channels["clipped.G"].sum() == 0
-    assert channels["clipped.B"][15, 0] == 1
-    assert summary["clipped_fraction"] == pytest.approx(1 / 152) and summary["encoding"] == "srgb"
-
-
 def test_nan_pixels_are_not_valid_and_are_told_and_nothing_but_nan_is_refused(folder, caplog):
     radiance = RADIANCE.copy()
     radiance[2, 3, 1], radiance[3, 3, 0] = np.nan, np.inf
