@@ -85,8 +85,7 @@ def test_a_folder_that_is_no_result_is_refused_with_those_that_are(folder, tmp_p
         ("build/set/export/materials.json", "this is a part of a result", 'load_result("build/set")'),
         ("build/set/exprt", "there is no result here", "build/set"),
     ]:
-        error = refusal(found, factorlib.load_result, name)
-        assert cure in str(error)
+        assert cure in str(refusal(found, factorlib.load_result, name))
     monkeypatch.chdir(folder / "masks")
     refusal(r'load_result\("\.\."\)|load_result\("\.\./\.\./\.\./build/set"\)', factorlib.load_result, "../export")
     monkeypatch.chdir(tmp_path)

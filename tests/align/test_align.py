@@ -277,8 +277,7 @@ def test_parts_that_look_alike_are_not_sure():
 
 
 def test_a_part_of_the_same_material_is_told_from_one_that_is_hidden():
-    of_one = silhouette_of(LAMP, (1, 1), 4)
-    (paired,) = match_parts(LAMP, 2, [of_one])
+    (paired,) = match_parts(LAMP, 2, [silhouette_of(LAMP, (1, 1), 4)])
     assert [each[0] for each in paired.labels] == [1, 1]
     label = silhouette_of(LAMP, (1, 2), 4).label
     (paired,) = match_parts(LAMP, 2, [Silhouette(np.where(label == 2, np.int16(-1), label))])

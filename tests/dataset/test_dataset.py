@@ -274,8 +274,7 @@ def test_photos_of_one_light_agree_on_its_frame(folder):
     spec = changed("photos[0].illumination", "studio")
     spec["photos"][0] |= {"world_from_camera": TURN}
     spec["photos"][1] |= {"illumination": "studio"}
-    caught = refusal("'studio'", read_dataset, write(folder, spec))
-    assert caught.key == "photos[1].world_from_camera"
+    assert refusal("'studio'", read_dataset, write(folder, spec)).key == "photos[1].world_from_camera"
     spec["photos"][1] |= {"world_from_camera": TURN}
     facts = dataset_slice(read_dataset(write(folder, spec)), "light", "garden").facts
     assert facts == {"illumination": "studio", "world_from_camera": TURN}

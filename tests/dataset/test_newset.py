@@ -178,5 +178,4 @@ def test_a_link_is_refused_for_it_may_lead_to_what_is_not_to_be_copied(folder, k
     file = next(path for path in sorted((folder / kind).iterdir()) if path.suffix != ".mtl")
     file.rename(folder / "secret")
     file.symlink_to(folder / "secret")
-    error = refusal("is a link", made, folder)
-    assert error.file == file and not (folder / "data" / "mine").exists()
+    assert refusal("is a link", made, folder).file == file and not (folder / "data" / "mine").exists()

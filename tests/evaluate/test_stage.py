@@ -131,7 +131,6 @@ def test_a_materials_error_is_the_mean_square_of_what_random_errors_of_that_size
 
 
 def test_the_text_begins_with_the_word_that_the_runner_looks_for():
-    spoilt = msgspec.structs.replace(CLEAN, unexplained=2.0)
-    first, *others = verdict_text(verdict(spoilt)).splitlines()
+    first, *others = verdict_text(verdict(msgspec.structs.replace(CLEAN, unexplained=2.0))).splitlines()
     assert first.startswith(NO_TRUST) and NO_TRUST in get_args(get_type_hints(Verdict)["trust"])
     assert others[0].startswith("limited by: ") and others[-1].startswith("next: ")

@@ -272,8 +272,7 @@ def test_dome_shows_the_light_from_where_it_came(pxr, exported, photo):
     """By the layout that OpenUSD's DomeLight documents: OpenEXR's, up +y, longitude 0 at +z, π/2 at +x, from π to −π."""
     from pxr import UsdLux
 
-    stage = opened(exported, photo)
-    dome = UsdLux.DomeLight(stage.GetPrimAtPath("/scene/light"))
+    dome = UsdLux.DomeLight(opened(exported, photo).GetPrimAtPath("/scene/light"))
     file = dome.GetTextureFileAttr().Get().resolvedPath
     assert dome.GetTextureFormatAttr().Get() == "latlong" and file
     found = read_rgb_exr(file) * dome.GetIntensityAttr().Get() * np.array(dome.GetColorAttr().Get())
@@ -288,42 +287,22 @@ def test_dome_shows_the_light_from_where_it_came(pxr, exported, photo):
     np.testing.assert_allclose(texels, expected, rtol=0.25, atol=0.01 * expected.max())
 
 
-# ── Exported scenes in Blender, by its script, beside Mitsuba's picture: frames, light and materials ────────────────
+# in Blender, by its script ---------------------------------------------------------------------------------------------
 
 
-NO_BLENDER = 'Blender is not installed: make setup EXTRAS="blender", or put `blender` on the PATH'
-
-
-def blender_pictures(scenes: Path, photos: Sequence[str], samples: int, *words: str) -> dict[str, np.ndarray]:
-    """RGBA of the photos, by the script beside them, all in one process; skips the test where there is no Blender."""
-    jobs = [
-        [photo, "--render", str(scenes / f"{photo}.blender.exr"), "--samples", str(samples), *words] for photo in photos
-    ]
-    code = (
-        f"import sys; sys.path.insert(0, {str(scenes)!r})\nimport blender\nfor words in {jobs!r}: blender.main(words)"
-    )
-    run(code)
-    return {photo: rgba(scenes / f"{photo}.blender.exr") for photo in photos}
-
-
-def run(code: str) -> None:
-    """Python in Blender; skips the test where there is none."""
-    done = subprocess.run(_command(code), capture_output=True, text=True, check=False)
-    assert done.returncode == 0, done.stderr[-2000:]
-
-
-def _command(code: str) -> list[str]:
+def blender_pictures(scenes: Path, photos: Sequence[str], samples: int) -> dict[str, np.ndarray]:
+    """RGBA of the photos, by the script beside them, in a process of its own: Blender's libraries do not get on with others."""
+    words = [[photo, "--render", str(scenes / f"{photo}.blender.exr"), "--samples", str(samples)] for photo in photos]
+    code = f"import sys; sys.path.insert(0, {str(scenes)!r})\nimport blender\nfor each in {words!r}: blender.main(each)"
+    command = [shutil.which("blender"), "--background", "--python-exit-code", "1", "--python-expr", code]
     if importlib.util.find_spec("bpy"):
-        return [sys.executable, "-W", "ignore", "-c", code]
-    if program := shutil.which("blender"):
-        return [program, "--background", "--python-exit-code", "1", "--python-expr", code]
-    pytest.skip(NO_BLENDER)
-
-
-def rgba(path: Path) -> np.ndarray:
-    """[rows, columns, 4] of an EXR."""
-    channels = read_exr(path)
-    return np.stack([channels[name] for name in "RGBA"], axis=-1)
+        command = [sys.executable, "-W", "ignore", "-c", code]
+    elif command[0] is None:
+        pytest.skip('Blender is not installed: make setup EXTRAS="blender", or put `blender` on the PATH')
+    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr[-2000:]
+    channels = {photo: read_exr(scenes / f"{photo}.blender.exr") for photo in photos}
+    return {photo: np.stack([each[name] for name in "RGBA"], axis=-1) for photo, each in channels.items()}
 
 
 @pytest.mark.long

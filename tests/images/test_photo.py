@@ -107,8 +107,7 @@ def test_exr_channels_go_by_name_and_without_colours_it_is_refused(tmp_path):
     photo = read_photo(save(tmp_path / "a.exr", pixels, names=["Z", "B", "R", "G"]))
     assert photo.radiance[0, 0].tolist() == [2, 3, 1]
     path = save(tmp_path / "b.exr", pixels[..., :2], names=["normal.x", "normal.y"])
-    caught = refusal("normal.x, normal.y", read_photo, path)
-    assert caught.cure
+    assert refusal("normal.x, normal.y", read_photo, path).cure
 
 
 def test_top_codes_are_clipped_and_what_is_not_finite_is_no_pixel_however_bright_floats_are(tmp_path):

@@ -203,8 +203,7 @@ def off_lamp(light: Light) -> float:
 
 def test_a_map_becomes_a_light_of_its_energy_in_its_directions(monkeypatch):
     monkeypatch.setattr("factorlib.inference.known.MAP_ROWS", 50)
-    directions = lat_long_directions(50, 100) @ YUP_FROM_CAMERA
-    radiance = lamp(directions.reshape(-1, 3)).reshape(50, 100, 3)
+    radiance = lamp((lat_long_directions(50, 100) @ YUP_FROM_CAMERA).reshape(-1, 3)).reshape(50, 100, 3)
     light = light_from_map(radiance)
     np.testing.assert_allclose(2 * np.pi * light.energy.sum(0), map_energy(radiance), rtol=1e-3)
     assert light.fixed.all() and light.scale_free and off_lamp(light) < 0.3
@@ -265,8 +264,7 @@ def test_lights_lie_within_their_standard_errors(fit):
     made, within = [], []
     posterior = Posterior(problem, found, PRIOR, lambda: made.append(1))
     for system, light, true_light in zip(posterior.systems(with_scores=False), found.point.lights, true, strict=True):
-        cells = 3 * len(light)
-        deviation = np.sqrt(np.diag(np.linalg.inv(system.light_hessian))[:cells]).reshape(3, -1)
+        deviation = np.sqrt(np.diag(np.linalg.inv(system.light_hessian))[: (3 * len(light))]).reshape(3, -1)
         off = light.log_radiance - np.log(true_light.lobes.radiance(light.axis)).T
         within.append(np.abs(off - np.median(off, axis=1, keepdims=True)) < deviation)
     assert 0.5 < np.mean(within) < 0.9 and len(made) == len(true)  # a tick a light

@@ -120,8 +120,7 @@ def test_a_single_light_comes_out_grey_and_a_lobe_made_sharper_at_its_energy_mov
 
 
 def test_a_sample_has_of_every_material_and_region_of_the_light_its_share():
-    light = random_light(np.random.default_rng(4), 3)
-    data = block("room1", light, MATERIALS, [0, 1, 2], OPERATOR, size=60)
+    data = block("room1", random_light(np.random.default_rng(4), 3), MATERIALS, [0, 1, 2], OPERATOR, size=60)
     data = msgspec.structs.replace(data, row=np.arange(len(data)))
     every = list(zip(data.held_out.tolist(), data.material.tolist(), data.clusters().tolist(), strict=True))
     for count in (1, 40, 900):

@@ -53,8 +53,7 @@ def attached_to(normal: np.ndarray, body: Surfaces) -> Attached:
     (one,) = body.meshes.values()
     place, rotation = np.zeros((one.nodes, 3)), TURN
     place[one.node] = one.mesh.vertices
-    middles = place[one.faces].mean(1)
-    face = ((normal @ rotation) @ middles.T).argmax(1)
+    face = ((normal @ rotation) @ place[one.faces].mean(1).T).argmax(1)
     share = np.exp(30 * (np.einsum("nd,nkd->nk", normal @ rotation, place[one.faces[face]]) - 1))
     return Attached(one.faces[face], share / share.sum(1, keepdims=True), np.tile(rotation, (len(normal), 1, 1)))
 
@@ -287,8 +286,7 @@ def test_pixels_of_two_objects_know_their_nodes_and_their_pose():
     for number, (pose, name) in enumerate(zip(poses, meshes), start=1):
         rows = (maps.object[y, x] == number) & at.share.any(1)
         assert rows.sum() > 100 and (at.node[rows] >= surfaces.first_nodes[name]).all()
-        seen = pose.apply(met[rows])
-        np.testing.assert_allclose(seen[:, 2], maps.depth[y, x][rows], atol=1e-4)
+        np.testing.assert_allclose(pose.apply(met[rows])[:, 2], maps.depth[y, x][rows], atol=1e-4)
         np.testing.assert_allclose(at.share[rows].sum(1), 1)
         if name == "apple":  # whose axes are as they were
             np.testing.assert_allclose(at.frame[rows], np.broadcast_to(pose.rotation, (rows.sum(), 3, 3)))

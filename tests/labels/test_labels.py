@@ -8,11 +8,11 @@ import pytest
 from PIL import Image
 from pycocotools import mask as pycocomask
 
-from factorlib.errors import InputError
 from factorlib.labels.coco import run_lengths
 from factorlib.labels.grow import grow
 from factorlib.labels.labels import Labels, check_materials, read_labels, read_objects
 from factorlib.labels.png import read_values
+from tests.refusal import refusal
 
 MATERIALS = ["red", "white", "wood"]
 H, W = 20, 30
@@ -31,13 +31,11 @@ def labels(folder, masks, size=(H, W), image="photos/kitchen.jpg", materials=MAT
     return read_labels(masks, lambda name: folder / name, materials, size, image, KEY)
 
 
-def refusal(folder, masks, **options):
+def refused(folder, masks, **options):
     """The message with which `masks` are refused; it always names file and key, and a cure."""
-    with pytest.raises(InputError) as caught:
-        labels(folder, masks, **options)
-    first = masks if isinstance(masks, str) else next(iter(masks.values()))
-    assert str(folder) in str(caught.value.file) and caught.value.key and caught.value.cure, (caught.value, first)
-    return str(caught.value)
+    error = refusal(".", labels, folder, masks, **options)
+    assert str(folder) in str(error.file) and error.key
+    return str(error)
 
 
 def palette(path, values):
@@ -128,10 +126,10 @@ def test_rle_is_decoded_as_pycocotools_does_and_so_are_millions_of_runs():
 def test_masks_that_are_empty_or_overlap(tmp_path):
     name = save(tmp_path / "a.png", np.zeros((H, W), dtype=np.uint8))
     for masks in ({"red": name, "wood": name}, coco(tmp_path, [])):
-        message = refusal(tmp_path, masks)
+        message = refused(tmp_path, masks)
         assert "the mask is empty" in message and KEY in message
     masks = {"wood": save(tmp_path / "w.png", np.uint8(255) * (LABEL > 0)), "red": save(tmp_path / "r.png", RED)}
-    message = refusal(tmp_path, masks)
+    message = refused(tmp_path, masks)
     assert f"'red' and 'wood' share {RED.sum()} pixels" in message and "w.png" in message and "r.png" in message
 
 
@@ -139,8 +137,8 @@ def test_a_photo_of_coco_goes_by_its_whole_path_first(tmp_path):
     images = lambda *names: [{"id": 6 + k, "file_name": f"{name}.jpg"} for k, name in enumerate(names)]  # noqa: E731
     name = coco(tmp_path, [(10, [box(3, 2, 12, 9)])], images=images("other/kitchen", "photos/kitchen"))
     assert labels(tmp_path, name).label.any()
-    assert "2 images" in refusal(tmp_path, coco(tmp_path, [], images=images("a/kitchen", "b/kitchen")))
-    assert "did you mean 'kitchem.jpg'" in refusal(tmp_path, coco(tmp_path, [], images=images("kitchem")))
+    assert "2 images" in refused(tmp_path, coco(tmp_path, [], images=images("a/kitchen", "b/kitchen")))
+    assert "did you mean 'kitchem.jpg'" in refused(tmp_path, coco(tmp_path, [], images=images("kitchem")))
 
 
 def test_objects_are_numbered_in_their_order_and_bad_masks_of_them_are_refused(tmp_path):
@@ -149,9 +147,8 @@ def test_objects_are_numbered_in_their_order_and_bad_masks_of_them_are_refused(t
     found = objects(("a", None), ("b", three), ("c", one))
     np.testing.assert_array_equal(found, np.select([LABEL == 3, LABEL == 1], [2, 3], 0))
     for bad, said in ((LABEL > 0, "'a' and 'b' share 63 pixels"), (LABEL > 9, "'b' is empty"), (LABEL.T > 0, "EXIF")):
-        with pytest.raises(InputError, match=said) as caught:
-            objects(("a", one), ("b", save(tmp_path / "bad.png", bad)))
-        assert "bad.png: photos[kitchen].objects[1].mask" in str(caught.value) and caught.value.cure
+        error = refusal(said, objects, ("a", one), ("b", save(tmp_path / "bad.png", bad)))
+        assert "bad.png: photos[kitchen].objects[1].mask" in str(error)
 
 
 def test_objects_of_other_materials_than_the_mask_shows_are_refused_and_what_is_hidden_or_has_no_mesh_is_not(tmp_path):
@@ -162,15 +159,12 @@ def test_objects_of_other_materials_than_the_mask_shows_are_refused_and_what_is_
 
     for fine in ({"red", "wood"}, {"wood"}, {"red", "white", "wood"}):
         check(none, ("chair", fine))
-    with pytest.raises(
-        InputError, match="the mask shows 'red' in 28% of the pixels of 'chair', but no 'white'"
-    ) as caught:
-        check(none, ("chair", {"white", "wood"}))
-    assert caught.value.key == "photos[x].objects[0].materials" and "white, wood" in caught.value.cure
+    words = "the mask shows 'red' in 28% of the pixels of 'chair', but no 'white'"
+    error = refusal(words, check, none, ("chair", {"white", "wood"}))
+    assert error.key == "photos[x].objects[0].materials" and "white, wood" in error.cure
     each = np.select([LABEL == 1, LABEL == 3], [1, 2], 0)
     check(each, ("a", {"red"}), ("b", {"wood"}))
-    with pytest.raises(InputError, match="'red' in 100% of the pixels of 'a', but no 'wood'"):
-        check(each, ("a", {"wood"}), ("b", {"red"}))
+    refusal("'red' in 100% of the pixels of 'a', but no 'wood'", check, each, ("a", {"wood"}), ("b", {"red"}))
 
 
 # ── Labels grown from strokes, on pictures whose parts are known ────────────────────────────────────────────────────

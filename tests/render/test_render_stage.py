@@ -44,8 +44,7 @@ def run(made, photo, out):
 
 
 def test_pictures_are_all_there_and_the_same_bytes_again(made, tmp_path):
-    outs = [run(made, "side", tmp_path / name) for name in "ab"]
-    first, second = map(files_of, outs)
+    first, second = map(files_of, ([run(made, "side", tmp_path / name) for name in "ab"]))
     stems = [f"{kind}/side/{m}" for kind in ("materials", "reflectance_maps") for m in made_export.NAMES]
     assert set(first) == {f"{stem}.{suffix}" for stem in ["resynthesis/side", *stems] for suffix in ("exr", "png")}
     assert first == second

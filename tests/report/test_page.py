@@ -147,8 +147,7 @@ def test_only_the_cost_section_depends_on_the_log(made, tmp_path):
 )
 def test_odd_sets_give_a_whole_page(odd, tmp_path):
     inputs, html = run(tmp_path, log=[], **odd)
-    found = parsed(html)
-    assert CONTENTS <= set(found.ids) and "None" not in re.sub(r"data:[^\"]*", "", html)
+    assert CONTENTS <= set(parsed(html).ids) and "None" not in re.sub(r"data:[^\"]*", "", html)
     assert ("no ground truth" in html) == (not odd.get("truth", True))
     if len(odd["seen"]) == 2:
         assert "2 groups that share no material" in html and "Clipped pixels" in html

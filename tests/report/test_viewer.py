@@ -195,8 +195,7 @@ def test_what_is_hidden_sends_what_it_gets(made, tmp_path):
 @needs_chromium
 def test_what_faces_the_eye_straight_is_not_black(browser):
     """Where a surface faces the eye straight, n·o rounds to more than 1; enlarged, many pixels of a ball do."""
-    found = shown(browser[0], -1, "brass", "noon", {"azimuth": 0.6, "zoom": 1000}, SIZE)
-    assert np.isfinite(found).all()
+    assert np.isfinite(shown(browser[0], -1, "brass", "noon", {"azimuth": 0.6, "zoom": 1000}, SIZE)).all()
 
 
 @needs_chromium

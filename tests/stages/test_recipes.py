@@ -123,8 +123,7 @@ def test_the_light_of_a_file_is_used_as_it_lies(made, tmp_path):
     recipe = kinds.RelightRecipe(photos=["front"], lights=["lamp.exr"], samples=64)
     drawn(made, tmp_path / "out", recipe, **{"lamp.exr": tmp_path / "lamp.exr"})
     picture = read_exr(tmp_path / "out" / "front" / "lamp.exr")
-    columns = np.nonzero(picture["A"].max(axis=0))[0]
-    left, right = np.array_split(columns, 2)
+    left, right = np.array_split(np.nonzero(picture["A"].max(axis=0))[0], 2)
     assert picture["R"][:, right].sum() > 3 * picture["R"][:, left].sum()
 
 

@@ -60,8 +60,7 @@ def run(folder, photos, progress=silent, unfinished=None, start=None, light=None
 
 def random_lobes(seed: int) -> Lobes:
     """The light of `observations` of that seed."""
-    light = random_light(np.random.default_rng(seed), 2)
-    return light.lobes
+    return random_light(np.random.default_rng(seed), 2).lobes
 
 
 def table(folder):
@@ -232,8 +231,7 @@ def test_a_known_map_ball_and_exposures_are_held(tmp_path, linked, caplog):
         "balls": {"a": {"photo": "a", "material": "blue"}}, "maps": {"b": "b.exr"}, "exposure": {"b": 0, "c": -2},
     }  # fmt: skip
     lights = {k: {"illumination": "b" if k == "c" else k, "world_from_camera": None} for k in photos}
-    files = {"b.exr": tmp_path / "b.exr"}
-    out = run(tmp_path, photos, light=lights, known=known, files=files, splittings=1)
+    out = run(tmp_path, photos, light=lights, known=known, files={"b.exr": tmp_path / "b.exr"}, splittings=1)
     found = read_lobes(out / "lobes.parquet")
     np.testing.assert_allclose(found["a"].energy, light.energy, rtol=0.05)
     shares = [one / one.sum() for one in (found["b"].energy, random_lobes(2).energy)]
