@@ -18,7 +18,7 @@ from factorlib.align.target import make_target
 from factorlib.align.view import ObjectView, with_prior_focal
 from factorlib.geometry.camera import Camera, Pose, angle_between
 from factorlib.geometry.raster import Caster, rasterise
-from factorlib.meshes.mesh import Mesh, smooth
+from factorlib.meshes.mesh import Mesh
 from tests.align.scenes import at, ball, blob, chair, dumbbell, mesh_of, normal_error_deg, photo_of, true_silhouette
 from tests.refusal import refusal
 
@@ -236,16 +236,12 @@ def test_confidence_falls_at_depth_jumps():
 
 
 CAMERA = Camera(120, 90, 150.0, (60.0, 45.0))
-CORNERS = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)], float)
-SIDES = [(0, 1, 3, 2), (4, 6, 7, 5), (0, 4, 5, 1), (2, 3, 7, 6), (0, 2, 6, 4), (1, 5, 7, 3)]
-BOX = np.array([[a, b, c] for a, b, c, d in SIDES] + [[a, c, d] for a, b, c, d in SIDES])
 
 
 def boxes(*sizes_and_places):
-    """A part for each box."""
-    vertices = np.concatenate([CORNERS * size + place for size, place in sizes_and_places])
-    faces = np.concatenate([BOX + 8 * k for k in range(len(sizes_and_places))])
-    return smooth(vertices, faces, np.repeat(np.arange(1, len(sizes_and_places) + 1), len(BOX)))
+    """A part for each box, of half these sizes."""
+    parts = [at(trimesh.creation.box(2 * np.array(size)), *place) for size, place in sizes_and_places]
+    return mesh_of(parts, list(range(1, len(parts) + 1)))
 
 
 LAMP = boxes(((1.0, 0.4, 0.4), (0, 1.0, 0)), ((0.15, 0.9, 0.15), (0, -0.3, 0)))

@@ -1,4 +1,4 @@
-"""x"""
+"""Errors of poses, normals, materials, lights, pictures and re-syntheses: by hand, blind to what the gauge allows, beside their nulls; and the balls that they are measured on."""
 
 import numpy as np
 import pytest

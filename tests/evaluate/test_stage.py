@@ -1,4 +1,4 @@
-"""x"""
+"""The stage on small real artifacts, with truth and without; and the verdict: its one integral, and what must hold whatever the weights are."""
 
 import math
 from typing import get_args, get_type_hints

@@ -1,4 +1,4 @@
-"""x"""
+"""Unknowns that are known stay where they are and settle the scale of all others; standard errors, the lights' colour, and what is unexplained."""
 
 import msgspec
 import numpy as np

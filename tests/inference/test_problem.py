@@ -1,4 +1,4 @@
-"""x"""
+"""Laws of the one forward model and of the joint problem: light, clipping, shadows, interreflection, cells, what is linked, and the gauge."""
 
 import msgspec
 import numpy as np

@@ -1,4 +1,4 @@
-"""x"""
+"""Turns of normals: derivatives against differences, the step against a dense system, what is found or refused, and which nodes are under pixels."""
 
 import msgspec
 import numpy as np

@@ -1,4 +1,4 @@
-"""x"""
+"""Masks: every way to give one means the same labels, and what is doubtful is refused by name; labels grown from strokes."""
 
 import json
 from itertools import groupby

@@ -1,4 +1,4 @@
-"""x"""
+"""Laws that every operator obeys, errors of the fast ones against the reference, and the reference and the paper's spheres against integrals."""
 
 import os
 import shutil

@@ -10,7 +10,7 @@ from factorlib.generate.solids import sphere
 from factorlib.geometry.camera import Camera, rotation_of_vector
 from factorlib.light.latlong import lat_long_of_lobes, sample_map
 from factorlib.light.lobes import Lobes, no_lobes
-from factorlib.meshes.mesh import Mesh, smooth
+from factorlib.meshes.mesh import Mesh
 from factorlib.render.ground import Plane, resting_plane
 from factorlib.render.insertion import NEW, GroundSurface, InsertionScene, compared_shadow, inserted, shadow_match
 from factorlib.render.photo_scene import (
@@ -327,9 +327,6 @@ def floor() -> dict:
 
 
 LOW, UP = Plane(np.array([0, 1.0, 0]), np.array([0, -1.0, -6])), np.array([0, 1.0, 0])
-CORNERS = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)], float)
-SIDES = [[0, 1, 3, 2], [4, 6, 7, 5], [0, 4, 5, 1], [2, 3, 7, 6], [0, 2, 6, 4], [1, 5, 7, 3]]
-BOX = smooth(CORNERS, np.array([[q[0], q[k], q[k + 1]] for q in SIDES for k in (1, 2)]))
 
 
 def at(mesh: Mesh, place, size=1.0, turn=None) -> PlacedMesh:
@@ -367,7 +364,9 @@ def test_an_object_that_touches_nothing_stays_where_it_is_asked_for():
     assert words == "" and there is spot and new.vertices[:, 1].min() == pytest.approx(-1.0)
 
 
-WALL = PlacedMesh("wall", BOX, ("grey",), np.diag([1.0, 1.0, 0.1, 1.0]) + np.outer([0, 0, -4.5, 0], [0, 0, 0, 1]))
+WALL = PlacedMesh(
+    "wall", box(2, 2, 2), ("grey",), np.diag([1.0, 1.0, 0.1, 1.0]) + np.outer([0, 0, -4.5, 0], [0, 0, 0, 1])
+)
 CASES = [
     (at(sphere(0.2), (1.5, -0.8, -6)), (3.5, -1.0, -6.0), "outside the picture", "the nearest free place is `at: ["),
     (WALL, (0.0, -1.0, -6.0), "hidden behind other objects", "the nearest free place is `at: ["),

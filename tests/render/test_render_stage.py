@@ -1,4 +1,4 @@
-"""x"""
+"""The stage `render`: its files, masks, frames and bytes; and reflectors, whose radiance is that of quadrature and of the operator."""
 
 import msgspec
 import numpy as np
