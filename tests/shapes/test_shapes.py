@@ -7,7 +7,7 @@ import trimesh
 
 from factorlib.generate.solids import SHAPES
 from factorlib.geometry import open3d
-from factorlib.geometry.camera import angle_between
+from factorlib.geometry.camera import Camera, angle_between
 from factorlib.shapes.hull import hull_overlap, visual_hull
 from factorlib.shapes.lathe import body_of_revolution
 from factorlib.shapes.motion import LEAST_AGREEMENT, cameras_by_motion
@@ -100,7 +100,8 @@ def test_what_is_no_body_of_revolution_is_refused_or_overlaps_little():
 )
 def test_proportions_of_primitives_are_found(kind, sides):
     mesh = unit_shape(kind, np.array(sides)).as_mesh()
-    shape = primitive(kind, [outline(mesh, looking_from(25, 20), False), outline(mesh, looking_from(40, 60), False)])
+    poses, camera = (looking_from(25, 20), looking_from(40, 60)), Camera(160, 120, 200.0, (80.0, 60.0))
+    shape = primitive(kind, [outline(mesh, pose, False, camera) for pose in poses])
     assert np.sort(np.ptp(shape.vertices, axis=0)) == pytest.approx(np.sort(sides), abs=0.02)
     assert shape.overlap > 0.97 and solid(shape).is_watertight and solid(shape).volume > 0
 
