@@ -14,7 +14,7 @@ from scipy.ndimage import binary_erosion
 
 from factorlib.conventions import YUP_FROM_CAMERA, lat_long_directions
 from factorlib.dataset.schema import LightSlice
-from factorlib.export.environment import mitsuba_map
+from factorlib.export.environment import mitsuba_map, sharpened
 from factorlib.export.exported_scene import DIRECT, ExportedScene, ExportedShape, ExposedMap
 from factorlib.export.mitsuba import write_scene
 from factorlib.export.usd import shader_inputs, write_usd_scene
@@ -162,6 +162,13 @@ def test_map_for_mitsuba_keeps_energy_and_direction(sharpness):
     assert values.sum() == pytest.approx(lobe.energy[0], rel=2e-3)
     mean = np.einsum("hw,hwk->k", values, node_directions(256, 512))
     np.testing.assert_allclose(mean / np.linalg.norm(mean), YUP_FROM_CAMERA @ axis, atol=2e-3)
+
+
+def test_sharpening_undoes_what_interpolation_widens():
+    lobe, spacing = Lobes(np.array([[0.0, 0.0, 1.0]]), np.array([2000.0]), np.ones((1, 3))), 0.0125
+    x, nodes = np.linspace(-0.2, 0.2, 20001), np.arange(-20, 21) * spacing
+    interpolated = np.interp(x, nodes, np.exp(-0.5 * sharpened(lobe, spacing).sharpness[0] * nodes**2))
+    assert (x**2 * interpolated).sum() / interpolated.sum() == pytest.approx(1 / 2000.0, rel=1e-3)
 
 
 # ── Scenes as OpenUSD: text that is checked as text, and what the USD library reads of it ───────────────────────────
