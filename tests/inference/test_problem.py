@@ -10,11 +10,11 @@ from factorlib.inference.blocks import Noise
 from factorlib.inference.forward import Illumination
 from factorlib.inference.gauge import BRIGHTEST, connected_components, fix_gauge
 from factorlib.inference.interreflection import bounced_light
-from factorlib.inference.splitting import LEAST_SPACING_DEG, SPLIT_CELLS
 from factorlib.inference.lights import Light, UnitLobes, fibonacci_cells
 from factorlib.inference.materials import Materials, Point
 from factorlib.inference.observed import blocks_of_observations
 from factorlib.inference.problem import JointProblem
+from factorlib.inference.splitting import LEAST_SPACING_DEG, SPLIT_CELLS
 from factorlib.light.lobes import lobe_integral
 from factorlib.scenes.joint_problems import MATERIALS, block, random_light
 from factorlib.urm.observations import Observations
