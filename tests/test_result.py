@@ -20,6 +20,7 @@ from factorlib.runner.project import LIBRARY
 from factorlib.stage import silent
 from stages import recipes
 from tests.export import made_export
+from tests.refusal import refusal
 from tests.runner.toy import files_of
 
 
@@ -84,15 +85,11 @@ def test_a_folder_that_is_no_result_is_refused_with_those_that_are(folder, tmp_p
         ("build/set/export/materials.json", "this is a part of a result", 'load_result("build/set")'),
         ("build/set/exprt", "there is no result here", "build/set"),
     ]:
-        with pytest.raises(InputError, match=found) as error:
-            factorlib.load_result(name)
-        assert cure in str(error.value)
+        assert cure in str(refusal(found, factorlib.load_result, name))
     monkeypatch.chdir(folder / "masks")
-    with pytest.raises(InputError, match=r'load_result\("\.\."\)|load_result\("\.\./\.\./\.\./build/set"\)'):
-        factorlib.load_result("../export")
+    refusal(r'load_result\("\.\."\)|load_result\("\.\./\.\./\.\./build/set"\)', factorlib.load_result, "../export")
     monkeypatch.chdir(tmp_path)
-    with pytest.raises(InputError, match="make all DATASET=<name> makes one"):
-        factorlib.load_result("nothing")
+    refusal("make all DATASET=<name> makes one", factorlib.load_result, "nothing")
 
 
 @pytest.fixture
@@ -105,8 +102,7 @@ def copy(folder, tmp_path):
 
 def test_a_packed_result_is_the_same_file_twice_and_loads_where_it_is_unpacked(copy, result, tmp_path):
     home, files = copy / "build" / "set", [tmp_path / f"{k}.zip" for k in range(2)]
-    with pytest.raises(InputError, match="report is missing"):
-        pack(home, files[0])
+    refusal("report is missing", pack, home, files[0])
     (home / "report").mkdir()
     (home / "report" / "index.html").write_text("<html>")
     shutil.move(home / "export", copy / "kept")
@@ -124,12 +120,10 @@ def test_a_pack_is_whole_or_not_there_and_replaces_nothing_unasked(copy, tmp_pat
     home, file = copy / "build" / "set", tmp_path / "a.zip"
     (home / "report").mkdir()
     for name, words in (("a.tar", "cannot be written here"), ("none/a.zip", "cannot be written here")):
-        with pytest.raises(InputError, match=words):
-            pack(home, tmp_path / name)
+        refusal(words, pack, home, tmp_path / name)
     pack(home, file)
     before = file.read_bytes()
-    with pytest.raises(InputError, match="FORCE=1"):
-        pack(home, file)
+    refusal("FORCE=1", pack, home, file)
     monkeypatch.setattr("zipfile.ZipFile.writestr", lambda *_: (_ for _ in ()).throw(OSError("full")))
     with pytest.raises(OSError, match="full"):
         pack(home, file, replace=True)
@@ -148,9 +142,8 @@ def test_a_result_that_is_not_whole_is_refused_with_a_cure(copy, path, text, wor
         place.rename(copy / "elsewhere")
     else:
         place.write_text(text)
-    with pytest.raises(InputError) as error:
-        factorlib.load_result(copy / "build" / "set")
-    assert all(word in str(error.value) for word in words), str(error.value)
+    error = refusal(".", factorlib.load_result, copy / "build" / "set")
+    assert all(word in str(error) for word in words), str(error)
 
 
 def test_environments_are_the_exported_ones_turned_and_written(result, folder, tmp_path):

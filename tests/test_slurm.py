@@ -39,8 +39,7 @@ def test_the_job_script_run_as_slurm_would_starts_a_worker_that_serves_a_run(clu
         ["bash", "-c", script], env={**os.environ, "PYTHONPATH": str(LIBRARY)}, cwd=tmp_path, start_new_session=True
     )
     try:
-        settings = [f"executor={cluster.scheduler_address}"]
-        assert verbs.make(project, verbs.Request("set", settings=settings)) == 0
+        assert verbs.make(project, verbs.Request("set", settings=[f"executor={cluster.scheduler_address}"])) == 0
     finally:
         os.killpg(job.pid, signal.SIGTERM)
         job.wait(60)

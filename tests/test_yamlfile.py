@@ -8,8 +8,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from factorlib.errors import InputError
 from factorlib.yamlfile import load_yaml, parse_yaml, read_yaml
+from tests.refusal import refusal
 
 
 class Inner(msgspec.Struct, forbid_unknown_fields=True):
@@ -23,15 +23,6 @@ class Outer(msgspec.Struct, forbid_unknown_fields=True):
     rows: list[Inner] = []
     either: Inner | str | None = None
     mode: Literal["auto", "off"] = "auto"
-
-
-def refusal(tmp_path, text):
-    file = tmp_path / "x.yaml"
-    file.write_text(text)
-    with pytest.raises(InputError) as caught:
-        read_yaml(file, Outer)
-    assert caught.value.cure
-    return caught.value
 
 
 @pytest.mark.parametrize(
@@ -80,14 +71,13 @@ def test_a_good_file(tmp_path):
     ],
 )  # fmt: skip
 def test_what_does_not_fit_is_refused_with_its_place(tmp_path, text, line, key, words):
-    error = refusal(tmp_path, text)
+    (tmp_path / "x.yaml").write_text(text)
+    error = refusal(".", read_yaml, tmp_path / "x.yaml", Outer)
     assert (str(error.file), error.key) == (f"{tmp_path}/x.yaml:{line}", key)
     assert words in str(error)
 
 
 def test_files_that_cannot_be_read(tmp_path):
-    with pytest.raises(InputError, match="cannot be read"):
-        read_yaml(tmp_path / "none.yaml", Outer)
+    refusal("cannot be read", read_yaml, tmp_path / "none.yaml", Outer)
     (tmp_path / "x.yaml").write_bytes(b"ratio: \xff")
-    with pytest.raises(InputError, match="UTF-8"):
-        read_yaml(tmp_path / "x.yaml", Outer)
+    refusal("UTF-8", read_yaml, tmp_path / "x.yaml", Outer)

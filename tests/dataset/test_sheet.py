@@ -2,14 +2,12 @@
 
 import re
 
-import pytest
-
-from factorlib.errors import InputError
 from factorlib.images.picture import read_png
 from factorlib.runner import verbs
 from factorlib.runner.project import LIBRARY, Project, photo_sets
 from factorlib.sheet import HEAD, MARGIN, MESH_SIDE, write_sheet
 from tests.faults import sample
+from tests.refusal import refusal
 
 
 def test_validate_writes_a_row_for_each_photo_with_its_labels_and_meshes_always_the_same(tmp_path, capsys):
@@ -22,8 +20,7 @@ def test_validate_writes_a_row_for_each_photo_with_its_labels_and_meshes_always_
     assert sheet.read_bytes() == (tmp_path / "again.png").read_bytes() and done == [(k, 4) for k in range(4)]
     file = folder / "dataset.yaml"  # the same, as far as it goes, of one that is not finished
     file.write_text(re.sub("masks: .*", 'masks: "?"', file.read_text(), count=1))
-    with pytest.raises(InputError, match="left open"):
-        verbs.validate(project, str(folder), [], sheet=True)
+    refusal("left open", verbs.validate, project, str(folder), [], sheet=True)
     unfinished = read_png(sheet)
     assert len(unfinished) == len(read_png(tmp_path / "again.png")) and (unfinished != 255).any()
     (tmp_path / "again.png").replace(sheet)

@@ -1,18 +1,23 @@
-"""Errors of poses, normals, materials, lights, pictures and re-syntheses: by hand, blind to what the gauge allows, beside their nulls."""
+"""Errors of poses, normals, materials, lights, pictures and re-syntheses: by hand, blind to what the gauge allows, beside their nulls; and the balls that they are measured on."""
 
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from factorlib.conventions import lat_long_directions, lat_long_solid_angles
 from factorlib.dataset.schema import RigidTransform
-from factorlib.evaluate.ball import octahedral_light
+from factorlib.evaluate.ball import VIEW, OctahedralLight, diffuse_lobe, glossy_lobe, octahedral_light
 from factorlib.evaluate.geometry_errors import normal_error, pose_error
 from factorlib.evaluate.light_errors import compare_lights, light_error, rgb_angle
 from factorlib.evaluate.material_errors import compare_materials
 from factorlib.evaluate.photo_errors import compared_photo
 from factorlib.evaluate.picture_errors import WINDOW, picture_error, psnr, ssim_map, tone_mapped, white_of
+from factorlib.evaluate.relighting import compare_relighting, compare_relit_set
+from factorlib.geometry.sphere import ball_normals
 from factorlib.results.materials import Reflectance
 from tests.evaluate.made_artifacts import TRUE, light_map, perturbed, scaled
+from tests.evaluate.made_artifacts import TRUE as ALL
+from tests.integral import reflected
 
 # ── poses and normals ────────────────────────────────────────────────────────────────────────────────────────────────
 
@@ -159,3 +164,86 @@ def test_what_is_left_out_is_counted_and_clipped_pixels_are_bounds(channels):
     assert shot.counts == {"pixels": 600 - 9, "unused": 7, "clipped": 4, "invalid": 3, "uncovered": 2}
     satisfied = [compared_photo(photo, geometry, factor * radiance).clipped_satisfied for factor in (1.5, 0.5)]
     assert satisfied == [1.0, 0.0]
+
+
+# ── The ball renderer against closed forms and against plain quadrature over every texel of the map ─────────────────
+
+
+NORMALS, INSIDE = ball_normals(16)
+
+
+def lobe_map(sharpness, height=128):
+    axis = np.array([0.3, 0.8, 0.5]) / np.linalg.norm([0.3, 0.8, 0.5])
+    value = np.exp(sharpness * (lat_long_directions(height, 2 * height) @ axis - 1))
+    return value[..., None] * [1.0, 2.0, 3.0] + 0.1
+
+
+def plain_quadrature(radiance, normals, diffuse, specular, roughness=0.5):
+    """Of every texel of the map."""
+    height, width = radiance.shape[:2]
+    light = radiance * lat_long_solid_angles(height, width)[:, None, None]
+    material, views = Reflectance((diffuse,) * 3, (specular,) * 3, roughness), np.tile(VIEW, (len(normals), 1))
+    incoming = lat_long_directions(height, width).reshape(-1, 3)
+    return reflected(material, normals, views, incoming, light.reshape(-1, 3))
+
+
+@pytest.mark.parametrize("sharpness", [5, 60])
+@pytest.mark.parametrize("roughness", [0.25, 0.9])
+def test_the_glossy_ball_is_the_plain_quadrature(sharpness, roughness):
+    radiance, some = lobe_map(sharpness), NORMALS[::9]
+    expected = plain_quadrature(radiance, some, 0.0, 1.0, roughness)
+    found = glossy_lobe(some, roughness)(octahedral_light(radiance))
+    assert np.median(np.abs(found / expected - 1)) < 0.01
+    assert np.abs(found - expected).max() < 0.03 * expected.max()
+
+
+def test_the_matte_ball_is_the_plain_quadrature():
+    radiance = lobe_map(20)
+    expected = plain_quadrature(radiance, NORMALS, 1.0, 0.0)
+    assert diffuse_lobe(NORMALS)(octahedral_light(radiance)) == pytest.approx(expected, rel=5e-3)
+
+
+def test_the_viewer_sees_light_from_the_right_on_the_right():
+    radiance = np.zeros((16, 32, 3))
+    radiance[6:10, 7:9] = 1.0  # +x: a quarter of the width from the left edge
+    picture = np.zeros(INSIDE.shape)
+    picture[INSIDE] = diffuse_lobe(NORMALS)(octahedral_light(radiance))[:, 0]
+    assert picture[:, 8:].sum() > 20 * picture[:, :8].sum()
+
+
+# ── Relit balls and their score over the set: the truth is perfect, the gauge no error, and what is wrong shows where
+
+
+TRUE = {name: ALL[name] for name in ("red", "brass")}
+LIGHTS = {name: octahedral_light(light_map(seed)) for seed, name in enumerate("ab")}
+SEEN = {"a": ["red"], "b": ["red", "brass"]}
+WRONG = {n: perturbed(m, 3) for n, m in TRUE.items()}
+
+
+def lit(factor):
+    """The lights times a factor."""
+    return {
+        n: OctahedralLight(tuple(v * np.asarray(factor, v.dtype) for v in light.levels)) for n, light in LIGHTS.items()
+    }
+
+
+def test_the_truth_is_perfect_and_beats_its_nulls_and_unseen_pairs_are_told_apart():
+    found = compare_relighting(TRUE, TRUE, LIGHTS, LIGHTS, SEEN)
+    for kinds in found.mean.values():
+        assert kinds["in_true_light"].psnr_linear_db == kinds["in_estimated_light"].psnr_linear_db == 120
+        assert kinds["null_grey"].psnr_tonemapped_db < 40 and kinds["null_mean_colour"].psnr_tonemapped_db < 40
+    assert found.balls["a"]["red"].observed and not found.balls["a"]["brass"].observed and found.mean_unobserved
+    assert compare_relighting(TRUE, TRUE, LIGHTS, LIGHTS, dict.fromkeys(LIGHTS, tuple(TRUE))).mean_unobserved is None
+    scored = compare_relit_set(TRUE, TRUE, LIGHTS, LIGHTS)
+    assert scored.mean_psnr_db == scored.worst_psnr_db == 120 and scored.pairs == 4 and scored.factor == (1, 1, 1)
+    assert 10 < scored.null_mean_psnr_db < 30
+
+
+def test_a_factor_between_materials_and_lights_changes_nothing_but_itself_and_an_exposure_is_none():
+    factor = np.array([2.0, 0.5, 3.0])
+    materials, lights = {n: scaled(m, factor) for n, m in WRONG.items()}, lit(1 / factor)
+    plain, found = compare_relit_set(WRONG, TRUE, LIGHTS, LIGHTS), compare_relit_set(materials, TRUE, lights, LIGHTS)
+    assert found.factor == pytest.approx(tuple(np.array(plain.factor) / factor), rel=1e-6)
+    scores = [(f.mean_psnr_db, f.worst_psnr_db, f.null_mean_psnr_db) for f in (found, plain)]
+    assert scores[0] == pytest.approx(scores[1], abs=1e-3) and found.worst_material == plain.worst_material
+    assert compare_relit_set(TRUE, TRUE, lit(1.2), LIGHTS).mean_psnr_db < 35

@@ -1,22 +1,35 @@
-"""The stage `export`: gauge, files, and bytes."""
+"""The stage `export`: gauge, files and bytes; materials as MaterialX and glTF, and what other programs show of them."""
+
+import json
+import struct
+import xml.etree.ElementTree as ET
 
 import msgspec
 import numpy as np
 import pytest
 import torch
+import trimesh
 from scipy.spatial.transform import Rotation
 
 from factorlib.conventions import FRONT, YUP_FROM_CAMERA
-from factorlib.errors import InputError
+from factorlib.export import other_renderers
+from factorlib.export.gltf_writer import read_part_materials, write_glb
+from factorlib.export.materialx import materialx
+from factorlib.export.other_renderers import Angles, distribution
+from factorlib.export.reflectance_limit import headroom_factor, table_in_gauge
 from factorlib.images.exr import read_rgb_exr
 from factorlib.jsonfile import read_json, write_json
 from factorlib.light.latlong import map_energy
+from factorlib.light.lobes import Lobes
+from factorlib.meshes.mesh import Mesh
 from factorlib.reflection import reflection_operator
+from factorlib.reflection.brdf import ggx, specular
 from factorlib.results.lobe_table import read_lobes, write_lobes
-from factorlib.results.materials import read_materials
+from factorlib.results.materials import Gauge, MaterialTable, Reflectance, StandardErrors, read_materials, solved
 from factorlib.stage import silent
 from stages import export
 from tests.export import made_export
+from tests.refusal import refusal
 from tests.runner.toy import files_of
 
 SMALL = export.Params(height=32, mitsuba_height=32)
@@ -124,5 +137,162 @@ def test_a_light_that_is_called_as_the_sky_of_another_is_refused(inputs, tmp_pat
     write_lobes(inputs["solve"] / "lobes.parquet", lobes | {"room_sky": lobes["front"]})
     facts = msgspec.to_builtins(inputs.facts)
     facts["dataset.light"]["front"]["illumination"] = "room_sky"
-    with pytest.raises(InputError, match="room_sky"):
-        run(msgspec.structs.replace(inputs, facts=facts), tmp_path / "out")
+    refusal("room_sky", run, msgspec.structs.replace(inputs, facts=facts), tmp_path / "out")
+
+
+# ── x ───────────────────────────────────────────────────────────────────────────────────────────────────────────────
+
+
+def bright(scale: float) -> Reflectance:
+    return Reflectance(*(tuple(scale * v for v in colour) for colour in ((0.9, 0.3, 0.2), (0.1, 0.2, 0.3))), 0.5)
+
+
+CASES = {"bright": bright(0.8), "lambertian": Reflectance((0.2, 0.3, 0.4), (0, 0, 0), 0.9),
+         "metal": Reflectance((0, 0, 0), (0.5, 0.4, 0.3), 0.2), "black": Reflectance((0, 0, 0), (0, 0, 0), 0.5)}  # fmt: skip
+
+
+@pytest.mark.parametrize("scale", [0.1, 0.8, 1.0, 30.0])
+def test_factor_leaves_headroom_and_touches_nothing_that_has_it(scale):
+    materials = {"a": bright(scale), "b": bright(0.01)}
+    factor = headroom_factor(materials)
+    assert max(factor * m.total for m in materials.values()) <= 1 - 1e-5 + 1e-15
+    assert factor == 1.0 if bright(scale).total < 1 - 1e-5 else factor < 1
+
+
+def test_gauge_scales_reflectances_and_their_errors_only_and_says_so():
+    before = solved(Reflectance((0.8,) * 3, (0.4,) * 3, 0.3), StandardErrors((0.1,) * 3, (0.2,) * 3, 0.05))
+    half = solved(Reflectance((0.4,) * 3, (0.2,) * 3, 0.3), StandardErrors((0.05,) * 3, (0.1,) * 3, 0.05))
+    found = table_in_gauge(MaterialTable({"a": before}, Gauge(rule="x")), 0.5)
+    assert found.materials == {"a": half} and found.gauge.rule == "x" and found.gauge.export_factor == 0.5
+
+
+def numbers(text: str) -> np.ndarray:
+    return np.array([float(word) for word in text.split(",")])
+
+
+def test_materialx_mixes_to_the_solved_reflectances_and_its_standard_surface_has_them_under_no_fresnel():
+    root = ET.fromstring(materialx(CASES))
+    value = {(n.get("name"), i.get("name")): i.get("value") for n in root for i in n}
+    for name, material in CASES.items():
+        weight, parts = float(value[f"m_{name}_bsdf", "mix"]), (("diffuse", "color"), ("specular", "color0"))
+        diffuse, specular = (numbers(value[f"m_{name}_{part}", key]) for part, key in parts)
+        np.testing.assert_allclose((1 - weight) * diffuse, material.diffuse, atol=1e-12)
+        np.testing.assert_allclose(weight * specular, material.specular, atol=1e-12)
+        assert numbers(value[f"m_{name}_specular", "roughness"]).tolist() == [material.alpha] * 2
+        standard = {key: numbers(v) for (node, key), v in value.items() if node == f"m_{name}_standard_surface_surface"}
+        specular, ior = standard["specular"], standard["specular_IOR"]
+        assert ((ior - 1) / (ior + 1)) ** 2 > 1 - 5e-4 and standard["specular_roughness"] == material.roughness
+        np.testing.assert_allclose(specular * standard["specular_color"], material.specular, atol=1e-12)
+        np.testing.assert_allclose((1 - specular) * standard["base_color"], material.diffuse, atol=1e-12)
+    named = {node.get("name") for node in root.iter("surfacematerial")}
+    assert named == {f"m_{name}{more}" for name in CASES for more in ("", "_standard_surface")}
+
+
+def test_materialx_is_valid_where_its_library_is_there():
+    library = pytest.importorskip("MaterialX", reason='MaterialX is not installed: make setup EXTRAS="interchange"')
+    document, standard = library.createDocument(), library.createDocument()
+    library.loadLibraries(library.getDefaultDataLibraryFolders(), library.getDefaultDataSearchPath(), standard)
+    document.importLibrary(standard)
+    library.readFromXmlString(document, materialx(CASES))
+    assert document.validate() == (True, "")
+
+
+def test_glb_keeps_the_mesh_and_gives_exact_reflectances(tmp_path):
+    square = np.array([[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]], float)
+    faces, normals = np.array([[0, 1, 2], [0, 2, 3]], np.int32), np.tile([0.0, 0, 1], (4, 1))
+    for name in "ab":
+        mesh = Mesh(square, faces, normals, np.array([1, 3], np.int16), open=True)
+        write_glb(tmp_path / f"{name}.glb", mesh, ["bright", "unused", "metal"], CASES)
+    assert (tmp_path / "a.glb").read_bytes() == (tmp_path / "b.glb").read_bytes()
+    found = trimesh.load(tmp_path / "a.glb")
+    assert set(found.geometry) == {"bright", "metal"} and found.area == pytest.approx(1.0)
+    tree = read_tree(tmp_path / "a.glb")
+    assert tree["extensionsUsed"] == ["KHR_materials_specular"]
+    for entry in tree["materials"]:
+        material, core = CASES[entry["name"]], entry["pbrMetallicRoughness"]
+        assert core["roughnessFactor"] == material.roughness and entry["doubleSided"]
+        if entry["name"] == "metal":
+            assert core["metallicFactor"] == 1 and core["baseColorFactor"] == [*material.specular, 1]
+            continue
+        more = entry["extensions"]["KHR_materials_specular"]
+        f0 = 0.04 * np.array(more["specularColorFactor"]) * more["specularFactor"]
+        np.testing.assert_allclose(f0, material.specular, atol=1e-12)
+        np.testing.assert_allclose(np.array(core["baseColorFactor"][:3]) * (1 - f0.max()), material.diffuse, atol=1e-12)
+        assert core["metallicFactor"] == 0
+
+
+def test_variants_give_every_part_its_material_in_each_of_them(tmp_path):
+    """Two parts of one material are two primitives where a variant tells them apart; without variants there is no extension."""
+    rng = np.random.default_rng(0)
+    vertices, faces = rng.uniform(size=(15, 3)), np.arange(15, dtype=np.int32).reshape(5, 3)
+    own, other = np.array([1, 1, 3, 3, 1], np.int16), np.array([1, 2, 3, 3, 2], np.int16)
+    mesh, names = Mesh(vertices, faces, np.tile([0.0, 0, 1], (15, 1)), own), ["bright", "lambertian", "metal"]
+    dark = np.full(5, 3, np.int16)
+    write_glb(tmp_path / "a.glb", mesh, names, CASES, {"legs: lambertian": other, "all dark": dark})
+    tree, found = read_tree(tmp_path / "a.glb"), trimesh.load(tmp_path / "a.glb").geometry
+    parts = read_part_materials(tmp_path / "a.glb")
+    variants = tree["extensions"]["KHR_materials_variants"]["variants"]
+    assert [each["name"] for each in variants] == ["legs: lambertian", "all dark"]
+    assert "KHR_materials_variants" in tree["extensionsUsed"] and len(tree["materials"]) == 3
+    for k, labels in enumerate([own, other, dark]):
+        variant = ["", "legs: lambertian", "all dark"][k]
+        for face, label in enumerate(labels):
+            (holds,) = [n for n, part in found.items() if np.isclose(part.vertices, vertices[3 * face]).all(1).any()]
+            assert parts[holds][variant] == names[label - 1]
+    for each in tree["meshes"]:
+        mappings = each["primitives"][0]["extensions"]["KHR_materials_variants"]["mappings"]
+        assert sorted(v for mapping in mappings for v in mapping["variants"]) == [0, 1]  # each once
+    write_glb(tmp_path / "b.glb", mesh, names, CASES)
+    plain = (tmp_path / "b.glb").read_bytes()
+    assert b"variants" not in plain and read_part_materials(tmp_path / "b.glb") == {
+        n: {"": n} for n in ("bright", "metal")
+    }
+
+
+def test_variants_share_the_detail_of_reflectance_exactly(tmp_path):
+    """Base colour times vertex colour is the reflectance times the detail, in each variant."""
+    detail, labels = np.array([0.4, 0.8, 1.05]), np.array([1], np.int16)
+    mesh = Mesh(np.eye(3), np.array([[0, 1, 2]], np.int32), np.tile([0.0, 0, 1], (3, 1)), labels, detail=detail)
+    write_glb(
+        tmp_path / "a.glb", mesh, ["bright", "lambertian", "metal"], CASES, {"dim": labels + 1, "bare": labels + 2}
+    )
+    ((_, part),) = trimesh.load(tmp_path / "a.glb").geometry.items()
+    shade = part.visual.vertex_attributes["color"][:, :3] / 255
+    for entry in read_tree(tmp_path / "a.glb")["materials"]:
+        material = CASES[entry["name"]]
+        base = np.array(entry["pbrMetallicRoughness"]["baseColorFactor"][:3]) * (1 - max(material.specular))
+        np.testing.assert_allclose(base * shade, np.outer(detail, material.diffuse), atol=0.005)
+
+
+def read_tree(path) -> dict:
+    """The JSON chunk of a GLB."""
+    data = path.read_bytes()
+    return json.loads(data[20 : 20 + struct.unpack("<I", data[12:16])[0]])
+
+
+# ── What other programs show of the exported materials, against slow integrals and cases whose answer is known ──────
+
+
+GREY = Reflectance((0.4, 0.3, 0.2), (0.3, 0.3, 0.3), 0.6)
+
+
+def hemisphere(no: float, count: int = 600) -> tuple[Angles, float]:
+    """Angles of directions spread evenly over half the hemisphere, and their solid angle, doubled."""
+    ni, phi = (a.reshape(-1) for a in np.meshgrid(*2 * [(np.arange(count) + 0.5) / count]))
+    io = ni * no + np.sqrt((1 - ni**2) * (1 - no**2)) * np.cos(np.pi * phi)
+    oh = np.sqrt((1 + io) / 2)
+    return Angles(ni, np.full_like(ni, no), (ni + no) / (2 * oh), oh), 2 * np.pi / count**2
+
+
+def test_the_solved_model_is_the_operators():
+    angles, _ = hemisphere(0.7, 40)
+    mine = distribution(GREY.alpha, angles.nh) * other_renderers.separable(GREY.alpha, angles) * angles.ni
+    alpha, ni, no, nh = (torch.tensor(a, dtype=torch.float64) for a in (GREY.alpha, angles.ni, angles.no, angles.nh))
+    np.testing.assert_allclose(mine, specular(alpha, ni, no, nh), rtol=1e-9)
+    np.testing.assert_allclose(distribution(GREY.alpha, angles.nh), ggx(alpha, nh), rtol=1e-9)
+    sky = Lobes(np.array([[0.0, 0.0, 1.0]]), np.array([1e-6]), np.ones((1, 3)))
+    normal, view = (torch.tensor([v], dtype=torch.float64) for v in ([0.0, 0.0, 1.0], [np.sqrt(1 - 0.49), 0.0, 0.7]))
+    expected = reflection_operator("reference")(sky, GREY, normal, view)
+    np.testing.assert_allclose(
+        other_renderers.in_sky(GREY, other_renderers.solved, np.array([0.7])), expected, rtol=2e-3
+    )

@@ -149,8 +149,7 @@ COCO = {
 def coco(*segmentations, image: dict | None = None) -> bytes:
     """A COCO file of shapes of one material in the photo 7.png."""
     shapes = [{"image_id": 7, "category_id": 1, "segmentation": each} for each in segmentations]
-    images = [COCO["images"][0] | (image or {})]
-    return json.dumps({**COCO, "images": images, "annotations": shapes}).encode()
+    return json.dumps({**COCO, "images": [COCO["images"][0] | (image or {})], "annotations": shapes}).encode()
 
 
 # ── cameras from elsewhere ───────────────────────────────────────────────────────────────────────────────────────────

@@ -8,7 +8,6 @@ from scipy.spatial import cKDTree
 
 from factorlib.conventions import YUP_FROM_CAMERA, lat_long_directions, lat_long_solid_angles
 from factorlib.dataset.read import read_dataset
-from factorlib.errors import InputError
 from factorlib.generate import eames, folder, surroundings, synthetic
 from factorlib.generate.chair import chair, labelled
 from factorlib.images.exr import read_exr, read_rgb_exr, write_rgb_exr
@@ -16,6 +15,7 @@ from factorlib.images.photo import read_photo
 from factorlib.images.picture import read_png
 from factorlib.light.latlong import sample_map
 from factorlib.meshes.read import read_mesh
+from tests.refusal import refusal
 from tests.runner.toy import files_of
 
 pytest.importorskip("mitsuba")
@@ -81,8 +81,7 @@ def test_a_users_lights_replace_the_made_ones(tmp_path):
     assert np.unravel_index(taken[..., 0].argmax(), (16, 32)) == (1, 3)
     assert taken.mean() == pytest.approx(1)
     write_rgb_exr(tmp_path / "square.exr", np.ones((8, 8, 3)))
-    with pytest.raises(InputError, match="no lat-long"):
-        surroundings.captured(tmp_path / "square.exr", 8)
+    refusal("no lat-long", surroundings.captured, tmp_path / "square.exr", 8)
 
 
 def test_exact_geometry_is_the_photographed_mesh_at_its_pose(exact):

@@ -1,18 +1,21 @@
-"""Reading photos: the same scene is the same radiance whatever file it came in."""
+"""Photos: the same scene is the same radiance whatever file it came in, also raw and HEIF."""
 
 import os
 
 import numpy as np
 import OpenImageIO as oiio
 import pytest
+from PIL import Image
+from PIL.TiffImagePlugin import IFDRational
 
-from factorlib.errors import InputError
 from factorlib.images.boxes import box_mean
 from factorlib.images.exif import FILM_DIAGONAL
 from factorlib.images.exr import read_exr
 from factorlib.images.light_map import read_light_map
 from factorlib.images.photo import check_bright, decoded, open_photo, read_photo
-from factorlib.images.transfer import srgb_encode
+from factorlib.images.transfer import srgb_decode, srgb_encode
+from tests.images.made_dng import BLACK, LONG, RATIONAL, SHORT, WHITE, write_dng
+from tests.refusal import refusal
 
 RNG = np.random.default_rng(3)
 RADIANCE = RNG.uniform(0, 0.9, (12, 18, 3)).astype(np.float32)  # 3:2, below clipping
@@ -104,9 +107,7 @@ def test_exr_channels_go_by_name_and_without_colours_it_is_refused(tmp_path):
     photo = read_photo(save(tmp_path / "a.exr", pixels, names=["Z", "B", "R", "G"]))
     assert photo.radiance[0, 0].tolist() == [2, 3, 1]
     path = save(tmp_path / "b.exr", pixels[..., :2], names=["normal.x", "normal.y"])
-    with pytest.raises(InputError, match="normal.x, normal.y") as caught:
-        read_photo(path)
-    assert caught.value.cure
+    assert refusal("normal.x, normal.y", read_photo, path).cure
 
 
 def test_top_codes_are_clipped_and_what_is_not_finite_is_no_pixel_however_bright_floats_are(tmp_path):
@@ -128,13 +129,11 @@ def test_a_photo_that_is_black_or_negative_wherever_it_is_used_and_a_pipe_are_re
         pixels[1:], inside[0] = value, False
         photo = read_photo(save(tmp_path / "kitchen.exr", pixels))
         check_bright(photo, np.ones((4, 6), bool), "kitchen.exr")
-        with pytest.raises(InputError, match="black, or less than 0") as caught:
-            check_bright(photo, inside, "kitchen.exr", "photos[kitchen].image")
-        assert "kitchen.exr: photos[kitchen].image" in str(caught.value) and "drop the photo" in caught.value.cure
+        caught = refusal("black, or less than 0", check_bright, photo, inside, "kitchen.exr", "photos[kitchen].image")
+        assert "kitchen.exr: photos[kitchen].image" in str(caught) and "drop the photo" in caught.cure
     os.mkfifo(tmp_path / "pipe.exr")
     for read in (read_exr, read_light_map):
-        with pytest.raises(InputError, match="is a pipe"):
-            read(tmp_path / "pipe.exr")
+        refusal("is a pipe", read, tmp_path / "pipe.exr")
 
 
 def test_focal_of_35mm_film_is_the_same_for_any_size_orientation_and_average(tmp_path):
@@ -145,3 +144,129 @@ def test_focal_of_35mm_film_is_the_same_for_any_size_orientation_and_average(tmp
         half = np.hypot(photo.width, photo.height) / 2
         assert np.arctan(half / photo.focal_px) == pytest.approx(np.arctan(FILM_DIAGONAL / 2 / 50))
         assert decoded(open_photo(path), None, 4, path).focal_px == pytest.approx(photo.focal_px / 4)
+
+
+# ── Raw photos: what the sensor saw, not the preview beside it; linear, and clipped where the sensor was ────────────
+
+
+H, W = 48, 64
+EXIF = {
+    33434: (RATIONAL, [1 / 50]),
+    33437: (RATIONAL, [2.0]),
+    34855: (SHORT, [200]),
+    41989: (SHORT, [26]),
+    40962: (LONG, [W]),
+}
+
+
+def sensor_of(rgb: np.ndarray) -> np.ndarray:
+    """Codes of a sensor that sees linear `rgb` in [0, 1], [h, w, 3]."""
+    codes = BLACK + rgb * (WHITE - BLACK)
+    pattern = np.array([[0, 1], [1, 2]])[np.arange(rgb.shape[0])[:, None] % 2, np.arange(rgb.shape[1])[None] % 2]
+    return np.rint(np.take_along_axis(codes, pattern[..., None], axis=2)[..., 0]).astype(np.uint16)
+
+
+def halves() -> np.ndarray:
+    """Left grey of .2, right (.4, .3, .2); an upper band of half of it."""
+    rgb = np.full((H, W, 3), 0.2)
+    rgb[:, W // 2 :] = (0.4, 0.3, 0.2)
+    rgb[: H // 3] /= 2
+    return rgb
+
+
+@pytest.mark.parametrize("name", ["a.dng", "A.DNG", "a.tif"])
+def test_a_dng_is_what_the_sensor_saw_by_whatever_name_however_bright_the_picture(tmp_path, name):
+    for brightness in (1, 0.25):
+        photo = read_photo(write_dng(tmp_path / name, sensor_of(brightness * halves()), exif=EXIF))
+        assert (photo.width, photo.height, photo.encoding) == (W, H, "linear") and not photo.clipped.any()
+        below = slice(H // 3 + 4, -4)
+        above = slice(4, H // 3 - 4)
+        left = slice(4, W // 2 - 4)
+        right = slice(W // 2 + 4, -4)
+        for where, expected in (
+            ((below, left), (0.2,) * 3),
+            ((below, right), (0.4, 0.3, 0.2)),
+            ((above, left), (0.1,) * 3),
+        ):
+            seen = photo.radiance[where].mean((0, 1))
+            np.testing.assert_allclose(seen, np.multiply(expected, brightness), rtol=0.02)
+    assert photo.exposure == pytest.approx(200 / 50 / 4)
+    assert photo.focal_px == pytest.approx(26 / np.hypot(36, 24) * np.hypot(W, H))
+
+
+def test_the_cameras_white_balance_is_applied(tmp_path):
+    seen = halves() * (0.5, 1.0, 0.8)  # the sensor sees less red and blue
+    lower = read_photo(write_dng(tmp_path / "a.dng", sensor_of(seen), neutral=(0.5, 1.0, 0.8))).radiance[H // 2 : -4]
+    grey, coloured = lower[:, 6 : W // 2 - 6].mean((0, 1)), lower[:, W // 2 + 6 : -4].mean((0, 1))
+    np.testing.assert_allclose(grey / grey[1], 1, rtol=0.02)
+    np.testing.assert_allclose(coloured / grey, (2, 1.5, 1), rtol=0.03)
+
+
+def test_what_the_sensors_white_level_cut_is_clipped_in_all_channels(tmp_path):
+    sensor = sensor_of(halves())
+    sensor[24:26, 40:42] = WHITE
+    clipped = read_photo(write_dng(tmp_path / "a.dng", sensor)).clipped
+    assert clipped[24:26, 40:42].all()
+    assert not (clipped[:20].any() or clipped[30:].any() or clipped[:, :36].any())
+
+
+def test_a_damaged_raw_file_is_refused_with_the_command_that_develops_it(tmp_path):
+    whole = write_dng(tmp_path / "a.dng", sensor_of(halves())).read_bytes()
+    for broken in (b"no raw file", whole[:100], whole[: len(whole) // 2]):
+        (tmp_path / "a.dng").write_bytes(broken)
+        caught = refusal(".", read_photo, tmp_path / "a.dng", key="photos[0].image")
+        assert "photos[0].image" in str(caught) and "darktable-cli a.dng a.tif" in str(caught)
+
+
+# ── HEIF as phones write it: all of its bits, the right way up, and what the camera wrote ───────────────────────────
+
+
+pillow_heif = pytest.importorskip("pillow_heif")
+SMOOTH = np.linspace(0.05, 0.8, W)[None, :, None] * np.linspace(0.6, 1, H)[:, None, None] * np.array([1.0, 0.9, 0.7])
+
+
+def read_exif(orientation=1) -> bytes:
+    exif = Image.Exif()
+    exif[0x112] = orientation
+    exif.get_ifd(0x8769).update({0x829A: IFDRational(1, 50), 0x829D: IFDRational(2, 1), 0x8827: 200, 0xA405: 26})
+    return exif.tobytes()
+
+
+def save_heif(path, radiance, *, deep=False, **options):
+    """sRGB codes of 8 or 10 bits."""
+    kind, mode = (np.uint16, "RGB;16") if deep else (np.uint8, "RGB")
+    codes = np.rint(srgb_encode(radiance) * np.iinfo(kind).max).astype(kind)
+    pillow_heif.from_bytes(mode, codes.shape[1::-1], codes.tobytes()).save(path, quality=-1, chroma=444, **options)
+    return path
+
+
+@pytest.mark.parametrize("deep, tolerance", [(False, 0.015), (True, 0.005)])
+def test_heif_is_the_radiance_that_was_written_in_all_its_bits_and_top_codes_are_clipped(tmp_path, deep, tolerance):
+    photo = read_photo(save_heif(tmp_path / "a.heic", SMOOTH, deep=deep))
+    assert (photo.width, photo.height, photo.encoding) == (W, H, "srgb") and not photo.clipped.any()
+    np.testing.assert_allclose(photo.radiance, SMOOTH, atol=tolerance)
+    step = np.full((8, 64, 3), 1.0) * (np.arange(64)[None, :, None] // 8 + 400) / 1023  # eighths of 8 bits' steps
+    radiance = read_photo(save_heif(tmp_path / "a.heic", srgb_decode(step), deep=deep)).radiance
+    assert len(np.unique(radiance[4, ::8, 1])) == (8 if deep else 2)
+    bright = SMOOTH.copy()
+    bright[:16, :16] = 1
+    clipped = read_photo(save_heif(tmp_path / "a.heic", bright, deep=deep)).clipped
+    assert clipped[2:14, 2:14].all() and not clipped[20:].any()
+
+
+@pytest.mark.parametrize("orientation, turns", [(1, 0), (3, 2), (6, 3), (8, 1)])
+def test_orientation_is_applied_once_and_what_the_camera_wrote_is_read(tmp_path, orientation, turns):
+    path, turned = save_heif(tmp_path / "a.heic", SMOOTH, exif=read_exif(orientation)), np.rot90(SMOOTH, turns)
+    photo, small = read_photo(path), decoded(open_photo(path), None, 4, path)
+    assert photo.radiance.shape == turned.shape and open_photo(path).size == turned.shape[:2]
+    np.testing.assert_allclose(photo.radiance, turned, atol=0.015)
+    assert photo.exposure == pytest.approx(200 / 50 / 4)
+    assert photo.focal_px == pytest.approx(26 / np.hypot(36, 24) * np.hypot(W, H))
+    assert small.focal_px == pytest.approx(photo.focal_px / 4)
+    boxes = photo.radiance.reshape(photo.height // 4, 4, photo.width // 4, 4, 3).mean((1, 3))
+    np.testing.assert_allclose(small.radiance, boxes, rtol=1e-5)
+    exif = Image.Exif()
+    exif[0x112] = orientation
+    plane = {0x920A: IFDRational(5, 1), 0xA002: W, 0xA003: H, 0xA20E: IFDRational(1000, 1), 0xA210: 3}
+    exif.get_ifd(0x8769).update(plane)
+    assert read_photo(save_heif(path, SMOOTH, exif=exif.tobytes())).focal_px == pytest.approx(5 * 1000 / 10)

@@ -12,7 +12,6 @@ import msgspec
 import numpy as np
 import pytest
 
-from factorlib.errors import InputError
 from factorlib.inference.blocks import Noise
 from factorlib.inference.fit import Fit, initial_fit
 from factorlib.inference.fit_runner import Solution
@@ -32,6 +31,7 @@ from factorlib.scenes.joint_problems import sphere_normals
 from factorlib.urm.observations import Observations
 from tests.inference.made import observations_from_front
 from tests.inference.made_lights import OPERATOR, light_of
+from tests.refusal import refusal
 from tests.stages.test_solve import NAMES as STAGE_NAMES
 from tests.stages.test_solve import run
 
@@ -355,8 +355,12 @@ def test_black_photos_are_named_or_refused_and_what_cannot_be_told_is_in_the_log
         materials_of_stage(tmp_path / "flat", flat, held_out=0.0)
     for words in ("'room0' is black", "is flat", "by convention only", *open_("roughness", "red")):
         assert words in caplog.text
-    with pytest.raises(InputError, match="black"):
-        materials_of_stage(tmp_path / "all", msgspec.structs.replace(seen, radiance=np.zeros_like(seen.radiance)))
+    refusal(
+        "black",
+        materials_of_stage,
+        tmp_path / "all",
+        msgspec.structs.replace(seen, radiance=np.zeros_like(seen.radiance)),
+    )
 
 
 def main() -> None:

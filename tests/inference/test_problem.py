@@ -1,19 +1,33 @@
-"""Laws of the one forward model and of the joint problem: light, clipping, shadows, what is linked, and the gauge."""
+"""Laws of the one forward model and of the joint problem: light, clipping, shadows, interreflection, cells, what is linked, and the gauge."""
 
 import msgspec
 import numpy as np
 import pytest
 
+from factorlib.geometry.occluder_codes import NO_OCCLUDER, occluder_codes
+from factorlib.geometry.sphere import fibonacci_sphere
 from factorlib.inference.blocks import Noise
 from factorlib.inference.forward import Illumination
 from factorlib.inference.gauge import BRIGHTEST, connected_components, fix_gauge
-from factorlib.inference.lights import UnitLobes
+from factorlib.inference.interreflection import bounced_light
+from factorlib.inference.lights import Light, UnitLobes, fibonacci_cells
 from factorlib.inference.materials import Materials, Point
 from factorlib.inference.observed import blocks_of_observations
+from factorlib.inference.problem import JointProblem
+from factorlib.inference.splitting import LEAST_SPACING_DEG, SPLIT_CELLS
 from factorlib.light.lobes import lobe_integral
-from factorlib.reflection import reflection_operator
 from factorlib.scenes.joint_problems import MATERIALS, block, random_light
-from tests.inference.made import OPERATOR, bowls, photos_in_a_wrong_light, rough_light, three_rooms
+from factorlib.urm.observations import Observations
+from tests.inference.made import (
+    OPERATOR,
+    bowls,
+    observations_from_front,
+    photos_in_a_wrong_light,
+    rough_light,
+    three_rooms,
+)
+from tests.inference.made_lights import OPERATOR as NETWORK
+from tests.inference.made_lights import drawn, on_even_cells
 
 
 def with_light(one: Illumination, **changes) -> Illumination:
@@ -63,8 +77,7 @@ def test_model_in_shadow_is_the_radiance_traced_in_bowls_by_brute_force(seed):
     (data,) = blocks_of_observations(bowls("room", rough_light(seed)), Noise(0.02, 0.02))
     light = rough_light(seed)
     light = msgspec.structs.replace(light, weight=light.weight / data.unit)
-    network = reflection_operator("network")
-    both = (Illumination(b, light, MATERIALS, network).radiance() for b in (data, data.with_effects(False, False)))
+    both = (Illumination(b, light, MATERIALS, NETWORK).radiance() for b in (data, data.with_effects(False, False)))
     error, ignored = (np.sqrt(np.mean((found - data.radiance) ** 2)) for found in both)
     assert ignored > 0.15 * data.radiance.mean() and error < 0.2 * ignored
 
@@ -107,8 +120,7 @@ def test_a_single_light_comes_out_grey_and_a_lobe_made_sharper_at_its_energy_mov
 
 
 def test_a_sample_has_of_every_material_and_region_of_the_light_its_share():
-    light = random_light(np.random.default_rng(4), 3)
-    data = block("room1", light, MATERIALS, [0, 1, 2], OPERATOR, size=60)
+    data = block("room1", random_light(np.random.default_rng(4), 3), MATERIALS, [0, 1, 2], OPERATOR, size=60)
     data = msgspec.structs.replace(data, row=np.arange(len(data)))
     every = list(zip(data.held_out.tolist(), data.material.tolist(), data.clusters().tolist(), strict=True))
     for count in (1, 40, 900):
@@ -123,3 +135,134 @@ def test_a_sample_has_of_every_material_and_region_of_the_light_its_share():
                 assert abs(drawn.count(group) - share * every.count(group)) < 1, (count, group)
     assert len(data.subsample(len(data), 0)) == len(data)
     assert (data.subsample(40, 0).row[:40] != data.subsample(40, 1).row[:40]).any()
+
+
+# ── Interreflection: G of radiances that are known by hand, and the forward model with it ───────────────────────────
+
+
+@pytest.fixture(scope="module", params=["linear", "toned"])
+def given(request):
+    return photos_in_a_wrong_light("bounced", request.param == "toned")
+
+
+def test_bounces_add_a_known_radiance(given):
+    light = msgspec.structs.replace(given.light, log_tone=np.zeros(0))
+    data, kd, ks = given.block, MATERIALS.diffuse[given.block.material], MATERIALS.specular[given.block.material]
+    with_, without = (
+        Illumination(b, light, MATERIALS, OPERATOR).radiance() for b in (data, data.with_effects(True, False))
+    )
+    np.testing.assert_allclose(with_ - without, kd * data.bounced[:, :3] + ks * data.bounced[:, 3:])
+    assert JointProblem([data], OPERATOR).with_effects(shadows=False, bounces=True).blocks[0].bounced is None
+
+
+def bowl(albedo, depth=0.5, size=40, count=1024) -> Observations:
+    """The inside of a sphere open to constant light 1 from beyond a cap: radiosity is constant there, for form factors are.
+
+    depth: share of the sphere that is bowl.  Radiance L = albedo (1 − depth + depth L) everywhere.
+    """
+    n = fibonacci_sphere(size * size)
+    n = n[n[:, 2] > 2 * (1 - depth) - 1 + 1e-9] * [1, 1, -1]  # inward normals of the points −n, away from the opening
+    d = fibonacci_sphere(count)
+    out = -n[:, None] + 2 * (n @ d.T)[..., None] * d  # where a ray from −n leaves the sphere
+    hidden = (out[..., 2] > 1 - 2 * depth) & (n @ d.T > 0)
+    codes = occluder_codes(np.zeros(hidden.size, int), -out.reshape(-1, 3)).reshape(hidden.shape)
+    radiance = np.full((len(n), 3), albedo * (1 - depth) / (1 - albedo * depth))
+    how = {
+        "visibility": np.where(hidden, 0, 255).astype(np.uint8),
+        "met": np.where(hidden, codes, NO_OCCLUDER).astype(np.uint16),
+    }
+    return observations_from_front(n, radiance, np.zeros(len(n), int), ("white",), **how)
+
+
+@pytest.mark.parametrize(("albedo", "depth"), [(0.3, 0.5), (0.9, 0.5), (0.9, 0.9)])
+def test_a_bowl_in_constant_light_has_the_analytic_radiosity(albedo, depth):
+    """k_d (V̄ · 1 + G) is L, all bounces with it, with V̄ and G from directions that are hidden."""
+    seen = bowl(albedo, depth)
+    sent = bounced_light(seen, seen.radiance)[:, :3]
+    cosine = np.maximum(seen.normal @ fibonacci_sphere(1024).T, 0)
+    open_share = (cosine * (seen.visibility / 255)).sum(1) / cosine.sum(1)
+    np.testing.assert_allclose(albedo * (open_share[:, None] + sent), seen.radiance, rtol=0.03)
+
+
+def test_nothing_hidden_sends_nothing_and_brighter_photos_send_more_in_their_own_unit_alike():
+    seen, factor = bowl(0.5, size=20, count=256), 1e4
+    open_ = msgspec.structs.replace(seen, visibility=np.full_like(seen.visibility, 255))
+    for none in (open_, msgspec.structs.replace(seen, met=None)):
+        assert blocks_of_observations(none, Noise())[0].bounced is None
+    brighter = msgspec.structs.replace(seen, radiance=factor * seen.radiance)
+    sent, more = (bounced_light(photo, photo.radiance) for photo in (seen, brighter))
+    np.testing.assert_allclose(more, factor * sent, rtol=1e-5)
+    one, other = (blocks_of_observations(photo, Noise())[0].bounced for photo in (seen, brighter))
+    np.testing.assert_allclose(one, other, rtol=1e-5)
+
+
+def test_what_interreflection_determines_the_gauge_leaves(given):
+    point = Point(MATERIALS, [given.light])
+    np.testing.assert_array_equal(fix_gauge(point, [given.block]).materials.diffuse, MATERIALS.diffuse)
+    assert (fix_gauge(point, [given.block.with_effects(True, False)]).materials.diffuse != MATERIALS.diffuse).any()
+
+
+# ── Lights on cells: what equal ones show, and what splitting keeps ─────────────────────────────────────────────────
+
+
+DIRECTIONS = np.random.default_rng(1).normal(size=(2000, 3))
+DIRECTIONS /= np.linalg.norm(DIRECTIONS, axis=1, keepdims=True)
+
+
+def shown(light: Light, directions=DIRECTIONS) -> np.ndarray:
+    return light.lobes.radiance(directions)
+
+
+def smooth(cells: int) -> Light:
+    return on_even_cells(
+        np.array([[0.5], [0.3], [0.4]]) * (fibonacci_cells(cells).axis @ np.array([0.6, 0.8, 0.0]) + 1)
+    )
+
+
+@pytest.mark.parametrize("count", [200, 400])
+def test_cells_of_equal_radiance_are_a_constant_light_but_for_a_ripple(count):
+    radiance = shown(on_even_cells(np.zeros((3, count))))
+    ripple = np.abs(radiance - 1)  # largest at the poles, where cells are least even
+    assert radiance.std() < 0.03 and np.quantile(ripple, 0.99) < 0.1 and abs(radiance.mean() - 1) < 0.005
+
+
+@pytest.mark.parametrize("share", [0.0, 0.2, 1.0])
+def test_a_smooth_light_stays_when_cells_split_and_when_theirs_split_again(share):
+    """Its energy does, and what surfaces reflect of it, but for the ripple of cells that are not where even ones would be."""
+    light = smooth(200)
+    some = np.random.default_rng(0).random(200) < share
+    once = light.split(some)
+    twice = once.split(once.sharpness > light.sharpness.max())
+    for one, more in ((once, 3), (twice, 15)):
+        assert len(one) == pytest.approx(200 + more * some.sum(), rel=0.05)
+    spheres = block("room", light, MATERIALS, [0, 1, 2], NETWORK, size=14)
+    before = Illumination(spheres, light, MATERIALS, NETWORK).radiance()
+    rough = MATERIALS.roughness[spheres.material] > 0.3
+    for one, ripple in ((once, 0.04), (twice, 0.06)):
+        np.testing.assert_allclose(one.energy.sum(0), light.energy.sum(0), rtol=0.02)
+        np.testing.assert_allclose(np.linalg.norm(one.axis, axis=1), 1, rtol=1e-12)
+        off = np.log(Illumination(spheres, one, MATERIALS, NETWORK).radiance() / before)
+        assert off[rough].std() < 0.01 and off[~rough].std() < ripple, (off[rough].std(), off[~rough].std())
+
+
+@pytest.mark.parametrize("scattered", [False, True])
+def test_split_cells_leave_no_dark_or_bright_spots(scattered):
+    """Of a constant light, at the most unfavourable direction and on average, split three times around one direction or here and there."""
+    light, rng = on_even_cells(np.zeros((3, 400))), np.random.default_rng(0)
+    for _ in range(3):
+        near = np.argsort(-light.axis @ [0.6, 0.0, 0.8])[: 100 if scattered else 24]
+        light = light.split(np.isin(np.arange(len(light)), rng.permutation(near)[:24]))
+        light = light.with_log_radiance(np.zeros((3, len(light))))
+    there = np.array([0.6, 0.0, 0.8]) + 0.4 * DIRECTIONS
+    radiance = shown(light, there / np.linalg.norm(there, axis=1, keepdims=True))
+    assert radiance.std() < 0.1 and radiance.min() > 0.45 and radiance.max() < 1.3
+
+
+def test_the_brightest_split_but_none_that_is_too_small():
+    light, how = on_even_cells(drawn(1, 200)), (SPLIT_CELLS, 2 * np.radians(LEAST_SPACING_DEG))
+    which = light.brightest_cells(*how)
+    assert which.sum() == SPLIT_CELLS and light.energy.sum(1)[which].min() >= light.energy.sum(1)[~which].max()
+    for _ in range(8):
+        light = light.split(light.brightest_cells(*how))
+    assert np.degrees(2 / np.sqrt(light.sharpness)).min() > LEAST_SPACING_DEG
+    assert on_even_cells(np.zeros((3, 12))).brightest_cells(*how).all()

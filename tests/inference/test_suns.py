@@ -30,8 +30,7 @@ def solved(irradiance: float, seed: int):
     that a solve without suns ends with, materials as they are."""
     sky = on_even_cells(drawn(seed, FEW))
     energy = irradiance * sky.energy.sum(0) * 2 * np.pi / lobe_integral(np.array([SUN]))
-    light = sky.with_lobes(SUN_LOBE, energy) if irradiance else sky
-    problem = spheres([light], size=24, seed=seed)
+    problem = spheres([(sky.with_lobes(SUN_LOBE, energy) if irradiance else sky)], size=24, seed=seed)
     fit = fit_problem(problem, begun(problem, 2 * FEW, MATERIALS), PRIOR, LIGHTS)
     (one,) = problem.illuminations(fit.point)
     return problem, energy * lobe_integral(np.array([SUN])) / problem.blocks[0].unit, one, fit

@@ -14,11 +14,11 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from factorlib.errors import InputError
 from factorlib.labelling.server import MaskSet, Server
 from factorlib.labels.png import read_values
 from tests.browser import CHROMIUM, started
-from tests.labels.test_grow import scene
+from tests.labels.test_labels import scene
+from tests.refusal import refusal
 
 ROOT = Path(__file__).resolve().parents[2]
 WHY = "no Chromium on this machine (Debian: apt-get install chromium): no browser opens the page"
@@ -87,13 +87,11 @@ def test_masks_are_of_the_photo_as_displayed_and_saved_whole(folder):
     assert (folder / "dataset.yaml").read_text(encoding="utf-8") == named and len([*folder.rglob("*")]) == 6
     Image.fromarray(given * 2).save(folder / "given.png")
     for labels, of, fault in ((given, version, "changed on disk"), (given + 2, masks.version(1), "unknown label 3")):
-        with pytest.raises(InputError, match=fault):
-            masks.save(1, labels, of)
+        refusal(fault, masks.save, 1, labels, of)
     assert np.array_equal(masks.read(1)[0], given * 2)
     shared = YAML.replace('"?", objects', '&m "?", objects').replace("given.png", "*m")
     write(folder, shared)
-    with pytest.raises(InputError, match="has an anchor"):
-        masks.save(0, drawn, masks.version(0))
+    refusal("has an anchor", masks.save, 0, drawn, masks.version(0))
     assert (folder / "dataset.yaml").read_text(encoding="utf-8") == shared
 
 
@@ -104,9 +102,8 @@ def test_masks_are_of_the_photo_as_displayed_and_saved_whole(folder):
 )  # fmt: skip
 def test_what_leads_outside_or_has_no_name_is_refused(folder, old, new):
     write(folder, YAML.replace(old, new))
-    with pytest.raises(InputError) as caught:
-        MaskSet(folder)
-    assert caught.value.cure and caught.value.key
+    caught = refusal(".", MaskSet, folder)
+    assert caught.cure and caught.key
 
 
 def test_strangers_read_and_write_nothing(folder):

@@ -1,4 +1,4 @@
-"""Masks: every way to give one means the same labels, and what is doubtful is refused by name."""
+"""Masks: every way to give one means the same labels, and what is doubtful is refused by name; labels grown from strokes."""
 
 import json
 from itertools import groupby
@@ -8,10 +8,11 @@ import pytest
 from PIL import Image
 from pycocotools import mask as pycocomask
 
-from factorlib.errors import InputError
 from factorlib.labels.coco import run_lengths
+from factorlib.labels.grow import grow
 from factorlib.labels.labels import Labels, check_materials, read_labels, read_objects
 from factorlib.labels.png import read_values
+from tests.refusal import refusal
 
 MATERIALS = ["red", "white", "wood"]
 H, W = 20, 30
@@ -30,13 +31,11 @@ def labels(folder, masks, size=(H, W), image="photos/kitchen.jpg", materials=MAT
     return read_labels(masks, lambda name: folder / name, materials, size, image, KEY)
 
 
-def refusal(folder, masks, **options):
+def refused(folder, masks, **options):
     """The message with which `masks` are refused; it always names file and key, and a cure."""
-    with pytest.raises(InputError) as caught:
-        labels(folder, masks, **options)
-    first = masks if isinstance(masks, str) else next(iter(masks.values()))
-    assert str(folder) in str(caught.value.file) and caught.value.key and caught.value.cure, (caught.value, first)
-    return str(caught.value)
+    error = refusal(".", labels, folder, masks, **options)
+    assert str(folder) in str(error.file) and error.key
+    return str(error)
 
 
 def palette(path, values):
@@ -127,10 +126,10 @@ def test_rle_is_decoded_as_pycocotools_does_and_so_are_millions_of_runs():
 def test_masks_that_are_empty_or_overlap(tmp_path):
     name = save(tmp_path / "a.png", np.zeros((H, W), dtype=np.uint8))
     for masks in ({"red": name, "wood": name}, coco(tmp_path, [])):
-        message = refusal(tmp_path, masks)
+        message = refused(tmp_path, masks)
         assert "the mask is empty" in message and KEY in message
     masks = {"wood": save(tmp_path / "w.png", np.uint8(255) * (LABEL > 0)), "red": save(tmp_path / "r.png", RED)}
-    message = refusal(tmp_path, masks)
+    message = refused(tmp_path, masks)
     assert f"'red' and 'wood' share {RED.sum()} pixels" in message and "w.png" in message and "r.png" in message
 
 
@@ -138,8 +137,8 @@ def test_a_photo_of_coco_goes_by_its_whole_path_first(tmp_path):
     images = lambda *names: [{"id": 6 + k, "file_name": f"{name}.jpg"} for k, name in enumerate(names)]  # noqa: E731
     name = coco(tmp_path, [(10, [box(3, 2, 12, 9)])], images=images("other/kitchen", "photos/kitchen"))
     assert labels(tmp_path, name).label.any()
-    assert "2 images" in refusal(tmp_path, coco(tmp_path, [], images=images("a/kitchen", "b/kitchen")))
-    assert "did you mean 'kitchem.jpg'" in refusal(tmp_path, coco(tmp_path, [], images=images("kitchem")))
+    assert "2 images" in refused(tmp_path, coco(tmp_path, [], images=images("a/kitchen", "b/kitchen")))
+    assert "did you mean 'kitchem.jpg'" in refused(tmp_path, coco(tmp_path, [], images=images("kitchem")))
 
 
 def test_objects_are_numbered_in_their_order_and_bad_masks_of_them_are_refused(tmp_path):
@@ -148,9 +147,8 @@ def test_objects_are_numbered_in_their_order_and_bad_masks_of_them_are_refused(t
     found = objects(("a", None), ("b", three), ("c", one))
     np.testing.assert_array_equal(found, np.select([LABEL == 3, LABEL == 1], [2, 3], 0))
     for bad, said in ((LABEL > 0, "'a' and 'b' share 63 pixels"), (LABEL > 9, "'b' is empty"), (LABEL.T > 0, "EXIF")):
-        with pytest.raises(InputError, match=said) as caught:
-            objects(("a", one), ("b", save(tmp_path / "bad.png", bad)))
-        assert "bad.png: photos[kitchen].objects[1].mask" in str(caught.value) and caught.value.cure
+        error = refusal(said, objects, ("a", one), ("b", save(tmp_path / "bad.png", bad)))
+        assert "bad.png: photos[kitchen].objects[1].mask" in str(error)
 
 
 def test_objects_of_other_materials_than_the_mask_shows_are_refused_and_what_is_hidden_or_has_no_mesh_is_not(tmp_path):
@@ -161,20 +159,77 @@ def test_objects_of_other_materials_than_the_mask_shows_are_refused_and_what_is_
 
     for fine in ({"red", "wood"}, {"wood"}, {"red", "white", "wood"}):
         check(none, ("chair", fine))
-    with pytest.raises(
-        InputError, match="the mask shows 'red' in 28% of the pixels of 'chair', but no 'white'"
-    ) as caught:
-        check(none, ("chair", {"white", "wood"}))
-    assert caught.value.key == "photos[x].objects[0].materials" and "white, wood" in caught.value.cure
+    words = "the mask shows 'red' in 28% of the pixels of 'chair', but no 'white'"
+    error = refusal(words, check, none, ("chair", {"white", "wood"}))
+    assert error.key == "photos[x].objects[0].materials" and "white, wood" in error.cure
     each = np.select([LABEL == 1, LABEL == 3], [1, 2], 0)
     check(each, ("a", {"red"}), ("b", {"wood"}))
-    with pytest.raises(InputError, match="'red' in 100% of the pixels of 'a', but no 'wood'"):
-        check(each, ("a", {"wood"}), ("b", {"red"}))
+    refusal("'red' in 100% of the pixels of 'a', but no 'wood'", check, each, ("a", {"wood"}), ("b", {"red"}))
 
 
-def test_a_mask_as_large_as_a_large_photo_is_no_bomb(tmp_path, recwarn):
-    """Pillow's own limit warns, with a line of its source, at 89 megapixels."""
-    Image.fromarray(np.ones((9_500, 9_500), bool)).save(tmp_path / "mask.png")
-    with pytest.raises(InputError, match="the mask is 9500 × 9500"):
-        read_labels("mask.png", lambda name: tmp_path / name, MATERIALS, (10, 10), "photo.png")
-    assert not recwarn.list
+# ── Labels grown from strokes, on pictures whose parts are known ────────────────────────────────────────────────────
+
+
+COLOURS = np.array([[90, 90, 90], [200, 40, 40], [150, 110, 60]])
+
+
+def scene(size=60, noise=8.0):
+    """A red disc on a thin brown stem, before grey; the truth's labels, its picture, and a box around both."""
+    y, x = np.indices((size, size)) * 60 / size
+    truth = np.where(np.hypot(x - 30, y - 22) < 14, 1, np.where((abs(x - 30) < 2) & (y > 30) & (y < 52), 2, 0))
+    picture = COLOURS[truth] + np.random.default_rng(0).normal(0, noise, (size, size, 3))
+    return truth.astype(np.uint8), picture.clip(0, 255).astype(np.uint8), tuple(k * size // 60 for k in (10, 4, 50, 56))
+
+
+def clicked(truth, box):
+    """What the page sends: the box filled with label 1, a click on each part."""
+    label, sure, unit = np.zeros_like(truth), np.zeros(truth.shape, bool), len(truth) // 60
+    label[box[1] : box[3], box[0] : box[2]] = 1
+    for row, kind in ((22, 1), (45, 2)):
+        at = np.s_[row * unit : (row + 2) * unit, 29 * unit : 31 * unit]
+        label[at], sure[at] = kind, True
+    return label, sure
+
+
+@pytest.mark.parametrize("size, most, least", [(60, 10**6, 0.9), (240, 60 * 60, 0.75)])
+def test_a_click_on_each_part_finds_the_parts(size, most, least):
+    truth, picture, box = scene(size)
+    found = grow(box, 1, picture, *clicked(truth, box), most)
+    for kind in (1, 2):
+        assert ((found == kind) & (truth == kind)).sum() > least * ((found == kind) | (truth == kind)).sum()
+    assert np.array_equal(found, grow(box, 1, picture, *clicked(truth, box), most))
+
+
+def test_a_box_alone_finds_what_is_of_another_colour():
+    truth, picture, box = scene(noise=30.0)
+    label, sure = clicked(truth, box)
+    found = grow(box, 1, picture, np.minimum(label, 1), np.zeros_like(sure))
+    assert ((found > 0) == (truth > 0)).mean() > 0.98 and set(np.unique(found)) == {0, 1}
+
+
+def test_sure_pixels_and_what_is_beside_the_box_stay():
+    truth, picture, box = scene()
+    label, sure = clicked(truth, box)
+    label[:3], label[50, 20], sure[50, 20] = 2, 1, True  # both wrong, but said
+    twice, wide = picture.repeat(2, 0).repeat(2, 1), [each.repeat(2, 0).repeat(2, 1) for each in (label, sure)]
+    wide[0][80, 40:44], wide[1][80, 40:44] = (1, 2, 1, 2), True  # finer than the walk
+    assert np.array_equal(grow(tuple(2 * k for k in box), 1, twice, *wide, 3600)[80, 40:44], (1, 2, 1, 2))
+    found = grow(box, 1, picture, label, sure)
+    outside = np.ones_like(sure)
+    outside[box[1] : box[3], box[0] : box[2]] = False
+    assert np.array_equal(found[sure | outside], label[sure | outside])
+    assert np.array_equal(grow(box, 1, picture, label, np.ones_like(sure)), label)
+
+
+def test_another_object_keeps_its_labels_and_lends_them_to_none():
+    """A grey ball before grey, and one that is partly red and partly grey as well, which reaches into its box, is labelled 2, and was mended by the brush there."""
+    y, x = np.indices((60, 90))
+    truth = np.where(np.hypot(x - 30, y - 30) < 14, 1, np.where(np.hypot(x - 60, y - 30) < 17, 2, 0)).astype(np.uint8)
+    picture = np.array([[90, 90, 90], [120, 120, 120], [200, 40, 40]], np.uint8)[np.where(x > 70, truth, truth > 0)]
+    box, label, sure = (12, 12, 48, 48), np.where(truth == 2, 2, 0).astype(np.uint8), (truth == 2) & (x < 47)
+    inside = np.s_[12:48, 12:48]
+    label[inside] = np.where(label[inside] > 0, label[inside], 1)
+    for marked in (sure, np.zeros_like(sure)):
+        assert (grow(box, 1, picture, label, marked) == truth).mean() > 0.99
+    wrong = np.where(truth == 1, 2, 0).astype(np.uint8)  # the box was drawn with another label before
+    assert (grow(box, 1, picture, wrong, np.zeros_like(sure)) == np.where(truth == 1, 1, 0))[truth < 2].mean() > 0.99

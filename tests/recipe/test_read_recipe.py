@@ -6,13 +6,13 @@ import msgspec
 import pytest
 
 from factorlib.dataset.read import read_dataset
-from factorlib.errors import InputError
 from factorlib.jsonfile import write_json
 from factorlib.recipe.kinds import KINDS, InsertRecipe, recipe_of
 from factorlib.recipe.read import files_of, read_recipe
 from factorlib.results.materials import MaterialTable, Reflectance, StandardErrors, solved
 from factorlib.runner.project import LIBRARY
 from factorlib.yamlfile import load_yaml, read_yaml
+from tests.refusal import refusal
 
 EAMES = LIBRARY / "data" / "eames"
 RECIPES = sorted((LIBRARY / "recipes").glob("*.yaml")) + sorted((LIBRARY / "recipes" / "eames").glob("*.yaml"))
@@ -72,9 +72,8 @@ def test_recipes_that_come_with_the_project_are_good_and_of_every_kind_and_survi
     ("kind: grid\nsamples: 0", ["one.yaml:2: samples"]),
 ])  # fmt: skip
 def test_what_is_wrong_is_named_with_a_cure(text, words, dataset, tmp_path):
-    with pytest.raises(InputError) as error:
-        read_recipe(written(tmp_path, text), dataset)
-    assert all(word in str(error.value) for word in words), str(error.value)
+    error = refusal(".", read_recipe, written(tmp_path, text), dataset)
+    assert all(word in str(error) for word in words), str(error)
 
 
 def test_files_are_relative_to_the_recipe_and_a_table_adds_materials(dataset, tmp_path):
@@ -89,7 +88,6 @@ def test_files_are_relative_to_the_recipe_and_a_table_adds_materials(dataset, tm
 
 def test_a_denoiser_that_is_not_installed_is_refused_with_the_cure(dataset, tmp_path, monkeypatch):
     monkeypatch.setattr("factorlib.recipe.read.find_spec", lambda name: None)
-    with pytest.raises(InputError, match=r"denoise.*not installed") as error:
-        read_recipe(written(tmp_path, "kind: view\ndenoise: true"), dataset)
-    assert "make setup EXTRAS=denoise" in str(error.value)
+    error = refusal(r"denoise.*not installed", read_recipe, written(tmp_path, "kind: view\ndenoise: true"), dataset)
+    assert "make setup EXTRAS=denoise" in str(error)
     assert not read_recipe(written(tmp_path, "kind: view\ndenoise: false"), dataset).denoise

@@ -1,32 +1,39 @@
-"""Path-traced photos: other views and lights obey the laws of geometry, and a plane is where things stand."""
+"""Path-traced photos: other views and lights, the floor of a studio, insertion beside a scene that has the object in truth, where a new object stands, and the light at a place."""
 
 import msgspec
 import numpy as np
 import pytest
 import trimesh
 
-from factorlib.errors import InputError
+from factorlib.conventions import YUP_FROM_CAMERA, lat_long_directions
 from factorlib.generate.solids import sphere
 from factorlib.geometry.camera import Camera, rotation_of_vector
-from factorlib.light.latlong import lat_long_of_lobes
-from factorlib.light.lobes import Lobes
+from factorlib.light.latlong import lat_long_of_lobes, sample_map
+from factorlib.light.lobes import Lobes, no_lobes
 from factorlib.meshes.mesh import Mesh
 from factorlib.render.ground import Plane, resting_plane
+from factorlib.render.insertion import NEW, GroundSurface, InsertionScene, compared_shadow, inserted, shadow_match
 from factorlib.render.photo_scene import (
+    ALL_BOUNCES,
     Orbit,
     PhotoScene,
     PlacedMesh,
+    light_entries,
     lit_ball,
+    shapes,
     traced_photo,
     turned_light,
     with_sun,
 )
-from factorlib.render.placement import spot_at, spot_beside, standing_mesh
+from factorlib.render.placement import STEP, Spot, free_placement, spot_at, spot_beside, standing_mesh
+from factorlib.render.studio import on_floor
 from factorlib.results.materials import Reflectance
-from factorlib.tracing.scene import rigid
+from factorlib.tracing import scene as tracing
+from factorlib.tracing.scene import bsdf, rendered, rigid, sensor, transform
+from tests.refusal import refusal
 
-CAMERA = Camera(48, 40, 60.0, (26.0, 18.0))
-MATERIALS = {
+SMALL = Camera(48, 40, 60.0, (26.0, 18.0))
+COLOURS = {
     "red": Reflectance((0.6, 0.2, 0.1), (0.1, 0.1, 0.1), 0.4),
     "grey": Reflectance((0.4,) * 3, (0.0,) * 3, 1.0),
 }
@@ -48,9 +55,9 @@ def box(width: float, height: float, depth: float) -> Mesh:
 
 
 @pytest.fixture
-def scene():
+def pair():
     objects = (placed("left", box(1, 1.4, 0.6), (-0.6, 0, -6)), placed("right", sphere(1.0), (1.2, -0.2, -7)))
-    return PhotoScene(CAMERA, objects, lobes(), MATERIALS)
+    return PhotoScene(SMALL, objects, lobes(), COLOURS)
 
 
 def differ(a, b):
@@ -63,38 +70,36 @@ def about(axis, degrees):
     return rotation_of_vector(np.radians(degrees) * np.array(axis, float))
 
 
-def test_the_camera_goes_right_and_up_and_keeps_its_distance_and_no_turn_is_the_photo_itself(scene):
-    moved, near = Orbit(30, 20).world_from_camera(scene)[:3, 3], Orbit(0, zoom=2).world_from_camera(scene)[:3, 3]
-    far = np.linalg.norm(scene.middle)
-    assert moved[0] > 0 and moved[1] > 0 and np.linalg.norm(moved - scene.middle) == pytest.approx(far)
-    assert np.linalg.norm(near - scene.middle) == pytest.approx(far / 2)
-    assert np.allclose(Orbit(0).world_from_camera(scene), Orbit(360).world_from_camera(scene), atol=1e-9)
+def test_the_camera_goes_right_and_up_and_keeps_its_distance_and_no_turn_is_the_photo_itself(pair):
+    moved, near = Orbit(30, 20).world_from_camera(pair)[:3, 3], Orbit(0, zoom=2).world_from_camera(pair)[:3, 3]
+    far = np.linalg.norm(pair.middle)
+    assert moved[0] > 0 and moved[1] > 0 and np.linalg.norm(moved - pair.middle) == pytest.approx(far)
+    assert np.linalg.norm(near - pair.middle) == pytest.approx(far / 2)
+    assert np.allclose(Orbit(0).world_from_camera(pair), Orbit(360).world_from_camera(pair), atol=1e-9)
     assert np.array_equal(
-        traced_photo(scene, 4), traced_photo(scene, 4, world_from_camera=Orbit(0).world_from_camera(scene))
+        traced_photo(pair, 4), traced_photo(pair, 4, world_from_camera=Orbit(0).world_from_camera(pair))
     )
 
 
-def test_turning_camera_objects_and_light_together_changes_nothing(scene):
+def test_turning_camera_objects_and_light_together_changes_nothing(pair):
     """About the upright axis through the camera."""
     whole = rigid(about((0, 1, 0), 50), np.zeros(3))
-    objects = [
-        msgspec.structs.replace(each, world_from_object=whole @ each.world_from_object) for each in scene.objects
-    ]
-    other = msgspec.structs.replace(scene, objects=tuple(objects), light=turned_light(scene.light, 50))
+    objects = [msgspec.structs.replace(each, world_from_object=whole @ each.world_from_object) for each in pair.objects]
+    other = msgspec.structs.replace(pair, objects=tuple(objects), light=turned_light(pair.light, 50))
     assert (
         differ(
-            traced_photo(scene, 256),
-            traced_photo(other, 256, world_from_camera=whole @ Orbit(0).world_from_camera(scene)),
+            traced_photo(pair, 256),
+            traced_photo(other, 256, world_from_camera=whole @ Orbit(0).world_from_camera(pair)),
         )
         < 0.02
     )
 
 
 @pytest.mark.parametrize("angle", [0, 70])
-def test_lobes_and_their_map_are_the_same_light(scene, angle):
+def test_lobes_and_their_map_are_the_same_light(pair, angle):
     """Also turned: the map's axes are the world's, the lobes' the camera's."""
-    as_map = msgspec.structs.replace(scene, light=turned_light(lat_long_of_lobes(scene.light, 64, 128), angle))
-    as_lobes = msgspec.structs.replace(scene, light=turned_light(scene.light, angle))
+    as_map = msgspec.structs.replace(pair, light=turned_light(lat_long_of_lobes(pair.light, 64, 128), angle))
+    as_lobes = msgspec.structs.replace(pair, light=turned_light(pair.light, angle))
     assert differ(traced_photo(as_lobes, 256), traced_photo(as_map, 256)) < 0.02
 
 
@@ -129,16 +134,16 @@ def test_a_sun_lights_a_ball_as_its_irradiance_says_and_stands_where_its_axis_sa
     """k_d/π · E · cos, as a disc beyond the scene and as a lobe of the map; its shadow is as sharp as it is wide."""
     dark = Lobes(AXIS[None], np.ones(1), np.full((1, 3), 1e-6))
     light = with_sun(dark, AXIS, size, 1.0).scaled(1e6)
-    ball = lit_ball(light, MATERIALS["grey"], 64, 256)[..., 0]
+    ball = lit_ball(light, COLOURS["grey"], 64, 256)[..., 0]
     row, column = np.unravel_index(ball.argmax(), ball.shape)  # the camera sees x right and y down of the light's axes
     assert abs(column + 0.5 - 32 * (1 + 0.6)) < 4 and abs(row + 0.5 - 32 * (1 - 0.48)) < 4
     assert ball.max() == pytest.approx(0.4 / np.pi * light.energy[0], rel=0.02)
 
 
-def test_a_new_object_stands_on_the_plane_as_high_as_asked_turned_and_upright(scene):
-    left = scene.objects[0]
+def test_a_new_object_stands_on_the_plane_as_high_as_asked_turned_and_upright(pair):
+    left = pair.objects[0]
     plane = resting_plane(left)
-    spot = spot_beside(scene, plane, left, 0.5, 1.0)
+    spot = spot_beside(pair, plane, left, 0.5, 1.0)
     new = standing_mesh("new", box(0.2, 0.3, 3.0), ("red",), np.array([0, 0, 1.0]), 40, spot)
     along = (new.vertices - plane.point) @ plane.normal
     assert along.min() == pytest.approx(0, abs=1e-9) and along.max() == pytest.approx(0.7)
@@ -147,10 +152,268 @@ def test_a_new_object_stands_on_the_plane_as_high_as_asked_turned_and_upright(sc
     assert spot.point[0] < left.vertices[:, 0].min()  # on the left, for the ball stands on the right
 
 
-def test_a_pixel_names_the_spot_that_it_shows(scene):
+def test_a_pixel_names_the_spot_that_it_shows(pair):
     plane = Plane(np.array([0, 1.0, 0]), np.array([0, -0.7, -6]))
-    spot = spot_at(scene, plane, scene.objects[0], (30.5, 33.0), 0.5)
-    ray = CAMERA.rays_through(np.array([[30.5, 33.0]]))[0] * [1, -1, -1]
+    spot = spot_at(pair, plane, pair.objects[0], (30.5, 33.0), 0.5)
+    ray = SMALL.rays_through(np.array([[30.5, 33.0]]))[0] * [1, -1, -1]
     assert np.allclose(np.cross(spot.point, ray), 0, atol=1e-9) and spot.point[1] == pytest.approx(-0.7)
-    with pytest.raises(InputError, match="above the horizon"):
-        spot_at(scene, plane, scene.objects[0], (30.5, 3.0), 0.5)
+    refusal("above the horizon", spot_at, pair, plane, pair.objects[0], (30.5, 3.0), 0.5)
+
+
+# ── A floor takes the shadow of what stands on it, fades out, and changes nothing else ──────────────────────────────
+
+
+PLANE = Plane(np.array([0.0, 1.0, 0.0]), np.array([0.0, -1.0, -6.0]))
+
+
+@pytest.fixture(scope="module")
+def studio():
+    return PhotoScene(Camera(60, 48, 50.0, (30.0, 24.0)), (placed("ball", sphere(1.0), (0, 0, -6)),), lobes(), COLOURS)
+
+
+def test_a_shadow_lies_beneath_the_ball_and_nothing_far_from_it(studio):
+    view = Orbit(0, 25).world_from_camera(studio)
+    plain, dark, pale = (
+        traced_photo(studio, 64, view) if share is None else on_floor(studio, PLANE, share, 64, view)
+        for share in (None, 0.0, 0.8)
+    )
+    assert (pale[:3, :, 3] == plain[:3, :, 3]).all(), "the sky is empty as before"
+    fading = (plain[..., 3] == 0) & (pale[..., 3] > 0.1) & (pale[..., 3] < 0.9)
+    assert fading.sum() > 100, "the floor ends without an edge"
+    inside, below = plain[..., 3] > 0.99, (plain[..., 3] == 0) & (pale[..., 3] > 0.5)
+    assert below.sum() > 100 and np.abs(dark[below][:, :3]).max() < 1e-6
+    rows, columns = np.nonzero(below)
+    middle = np.abs(columns - 30) < 4
+    colour = pale[..., :3] / np.maximum(pale[..., 3:], 1e-6)
+    foot = colour[rows[middle].min(), 27:34].mean()  # at the ball's contact
+    assert foot < 0.7 * colour[below].mean(), "where it stands, less light comes"
+    assert pale[inside][:, :3].mean() > dark[inside][:, :3].mean(), "the floor lights the ball"
+    np.testing.assert_allclose(dark[inside][:, :3].mean(), plain[inside][:, :3].mean(), rtol=0.35)
+
+
+def test_about_a_tilted_normal_the_camera_keeps_its_height_and_its_distance(studio):
+    up = np.array([0.0, 0.8, 0.6])
+    places = np.array([Orbit(azimuth).world_from_camera(studio, up)[:3, 3] - studio.middle for azimuth in (0, 90, 180)])
+    np.testing.assert_allclose(places @ up, np.full(3, places[0] @ up), atol=1e-9)
+    np.testing.assert_allclose(np.linalg.norm(places, axis=1), np.linalg.norm(studio.middle), atol=1e-9)
+
+
+# ── Insertion against a scene that has the object in truth ──────────────────────────────────────────────────────────
+
+
+CAMERA = Camera(64, 48, 70.0, (32.0, 20.0))
+MATERIALS = {"red": Reflectance((0.6, 0.2, 0.1), (0.08,) * 3, 0.3), "grey": Reflectance((0.5,) * 3, (0.0,) * 3, 1.0)}
+GROUND = Plane(np.array([0, 1.0, 0]), np.array([0, -1.0, -6]))
+SPOT = Spot(GROUND, np.array([-0.9, -1.0, -6.0]), 1.2)
+STRIPES = (0.2, 0.5)
+
+
+def stands(scene: PhotoScene, placed: PlacedMesh | None = None, polish: Reflectance | None = None) -> InsertionScene:
+    return InsertionScene(scene, GroundSurface(GROUND, polish=polish), placed or new(), SPOT, SPOT, "")
+
+
+def light() -> Lobes:
+    axis, weight = np.array([[0.2, -0.95, 0.1], [0.75, -0.6, 0.2]]), np.array([[0.5, 0.6, 0.8], [20.0, 18.0, 15.0]])
+    return Lobes(axis / np.linalg.norm(axis, axis=1, keepdims=True), np.array([1.0, 80.0]), weight)
+
+
+THERE = PlacedMesh("there", sphere(1.0), ("grey",), rigid(np.eye(3), (0.9, 0, -6.5)))
+SCENE = PhotoScene(CAMERA, (THERE,), light(), MATERIALS)
+OPEN = np.zeros((CAMERA.height, CAMERA.width), bool)  # nothing covers the ground
+
+
+def true_photo(objects, samples=1024):
+    """Striped ground, which the insertion knows nothing of, beyond the disc too."""
+    entries = {**light_entries(light(), 6.0), **shapes(objects, MATERIALS)}
+    for k in range(-8, 8):
+        frame = rigid(np.stack([[0.5, 0, 0], [0, 0, -40.0], [0, 1.0, 0]], axis=1), (k + 0.5, -1.0, -6))
+        stripe = {"type": "rectangle", "to_world": transform(frame)}
+        entries[f"stripe{k + 8}"] = stripe | {"bsdf": bsdf(Reflectance((STRIPES[k % 2],) * 3, (0.0,) * 3, 1.0))}
+    return rendered(entries, sensor(CAMERA, rigid(YUP_FROM_CAMERA, np.zeros(3))), samples, 7, ALL_BOUNCES)
+
+
+def new(material="red") -> PlacedMesh:
+    return standing_mesh("new", sphere(1.0), (material,), np.array([0, 1.0, 0]), 0.0, SPOT)
+
+
+@pytest.fixture(scope="module")
+def made():
+    photo = true_photo([THERE])
+    return photo, inserted(stands(SCENE), photo, OPEN, 512)
+
+
+def match_of(scene, photo):
+    return compared_shadow(stands(scene), inserted(stands(scene), photo, OPEN, 64), photo, OPEN, 64)
+
+
+def blocks(picture):
+    return picture.reshape(12, 4, 16, 4, 3).mean(axis=(1, 3))
+
+
+def test_the_composite_is_the_photo_of_the_scene_with_the_object(made):
+    """Shadow on a ground of unknown texture, the object itself, its light on its neighbour: within the noise and the ground's mean colour."""
+    photo, found = made
+    truth = true_photo([THERE, new()])
+    error, change = np.abs(blocks(found.composite) - blocks(truth)), np.abs(blocks(photo) - blocks(truth))
+    assert error.mean() < 0.08 * change.mean()
+    assert np.sqrt((error**2).mean()) < 0.1 * np.sqrt((change**2).mean())
+
+    assert np.array_equal(found.composite[0], photo[0]) and (found.shadow[0] == 1).all()  # no path joins the sky to it
+    assert STRIPES[0] < found.ground.mean() < STRIPES[1]
+
+
+def test_twice_the_light_is_twice_the_picture_and_a_polished_ground_shows_the_object_and_only_there(made):
+    photo, found = made
+    brighter = PhotoScene(CAMERA, (THERE,), light().scaled(2.0), MATERIALS)
+    polish = Reflectance((0.0,) * 3, (0.5,) * 3, 0.05)
+    matt, polished = (inserted(stands(SCENE, polish=p), photo, OPEN, 64) for p in (None, polish))
+    again = inserted(stands(brighter), 2 * photo, OPEN, 64)
+    assert np.allclose(again.composite, 2 * matt.composite, rtol=1e-4, atol=1e-6)
+    difference = np.abs(polished.composite - matt.composite).max(axis=-1)
+    rows, columns = np.nonzero(found.coverage > 0)
+    below = difference[rows.max() + 1 : rows.max() + 8, columns.min() : columns.max()]
+    assert below.max() > 0.05 and difference[0].max() == 0
+
+
+@pytest.mark.parametrize("turn", [0, 180])
+def test_an_open_mesh_is_seen_from_either_side_and_hidden_by_what_stands_before_it(turn):
+    """Whatever the objects of the photo are called."""
+    corners = np.array([[-1, 0, 0], [1, 0, 0], [1, 2, 0], [-1, 2, 0]], float)
+    faces = np.array([[0, 1, 2], [0, 2, 3]], np.int32)
+    quad = Mesh(corners, faces, np.tile([0, 0, 1.0], (4, 1)), np.ones(2, np.int16), open=True)
+    seen = []
+    for where in (-8.0, -4.0):
+        matrix = 0.3 * np.eye(4)
+        matrix[:, 3] = (-0.9 * -where / 6, -0.6 * -where / 6, where, 1)
+        before = PlacedMesh("new", sphere(1.0), ("grey",), matrix)
+        scene = PhotoScene(CAMERA, (before,), light(), MATERIALS)
+        placed = standing_mesh(NEW, quad, ("red",), np.array([0, 1.0, 0]), turn, SPOT)
+        photo = np.ones((CAMERA.height, CAMERA.width, 3))
+        seen.append(inserted(stands(scene, placed), photo, OPEN, 16).coverage.sum())
+    assert seen[0] > 100 and seen[1] < 0.9 * seen[0]
+
+
+def test_the_shadow_of_the_photo_is_recognised_whatever_its_exposure_and_not_where_there_is_none(made):
+    """A photo of its own prediction matches fully; light from elsewhere, less than none; objects' pixels do not count."""
+    rng = np.random.default_rng(0)
+    lit, constant, where = rng.uniform(0.1, 1, (20, 30, 1)) * np.ones(3), np.ones((20, 30, 3)), np.ones((20, 30), bool)
+    constant[:10] = 0.5
+    assert shadow_match(3 * lit**0.5, lit, constant, where).correlation == pytest.approx(1)
+    assert abs(shadow_match(lit, rng.uniform(0.1, 1, lit.shape), constant, where).correlation) < 0.2
+    where[:, 3:] = False
+    spoiled = np.where(where[..., None], lit, rng.uniform(0.1, 1, lit.shape))
+    few = shadow_match(spoiled, lit, constant, where)
+    assert few.correlation is None and few.pixels == 60 and "too little of the ground" in str(few)
+    where[:, 3:8] = True
+    assert shadow_match(np.where(where[..., None], lit, 0.5), lit, constant, where).correlation == pytest.approx(1)
+    assert shadow_match(lit, np.ones_like(lit), constant, where).correlation is None
+
+    plain = rendered(
+        {**light_entries(light(), 6.0), **shapes([THERE], MATERIALS), "ground": floor()},
+        sensor(CAMERA, rigid(YUP_FROM_CAMERA, np.zeros(3))), 128, 7, ALL_BOUNCES,
+    )  # fmt: skip
+    match = match_of(SCENE, plain)
+    turned = msgspec.structs.replace(SCENE, light=Lobes(light().axis * [-1, 1, -1], light().sharpness, light().weight))
+    other = match_of(turned, plain)
+    assert match.correlation > 0.9 > match.constant_light > other.correlation and match.pixels == other.pixels > 500
+
+
+def floor() -> dict:
+    frame = rigid(np.stack([[40.0, 0, 0], [0, 0, -40.0], [0, 1.0, 0]], axis=1), (0, -1.0, -6))
+    return {"type": "rectangle", "to_world": transform(frame), "bsdf": bsdf(MATERIALS["grey"])}
+
+
+# ── Where a new object stands: through no other, in the picture, and not further from its spot than it must ─────────
+
+
+LOW, UP = Plane(np.array([0, 1.0, 0]), np.array([0, -1.0, -6])), np.array([0, 1.0, 0])
+
+
+def at(mesh: Mesh, place, size=1.0, turn=None) -> PlacedMesh:
+    rotation = np.eye(3) if turn is None else turn
+    return PlacedMesh("there", mesh, ("grey",), rigid(size * rotation, place))
+
+
+def scene_of(*objects: PlacedMesh) -> PhotoScene:
+    return PhotoScene(CAMERA, objects, no_lobes(), {})
+
+
+def stand(spot: Spot) -> PlacedMesh:
+    return standing_mesh("new", sphere(1.0), ("red",), UP, 0.0, spot)
+
+
+def test_a_ball_in_a_ball_moves_until_they_touch_and_stays_there():
+    there, spot = at(sphere(0.5), (0.3, -0.5, -6.2)), Spot(LOW, np.array([0.2, -1.0, -6.0]), 0.6)
+    new, moved, words = free_placement(scene_of(there), stand, spot, asked=True, factor=2)
+    between = np.linalg.norm(new.vertices.mean(axis=0) - there.vertices.mean(axis=0))
+    assert 0.795 < between < 0.8 + 1.5 * STEP * 0.6  # of radii .5 and .3
+    far = np.linalg.norm(moved.point - spot.point)
+    shortest = np.sqrt(0.8**2 - 0.2**2) - np.hypot(0.1, 0.2)  # middles of balls of different size on one plane
+    assert shortest - 0.01 < far < shortest + 1.5 * STEP * 0.6 and abs((moved.point - spot.point) @ UP) < 1e-12
+    x, y = 2 * CAMERA.project(moved.point * [1, -1, -1])
+    assert words == (
+        f"The new object was moved by {far / 0.6:.1f} of its heights, to `at: [{x:.0f}, {y:.0f}]`, because it would intersect 'there'."
+    )
+    again, same, words = free_placement(scene_of(there), stand, moved, asked=True)
+    assert words == "" and same is moved and np.array_equal(again.vertices, new.vertices)
+
+
+def test_an_object_that_touches_nothing_stays_where_it_is_asked_for():
+    spot = Spot(LOW, np.array([-0.9, -1.0, -6.0]), 1.2)
+    new, there, words = free_placement(scene_of(at(sphere(1.0), (0.9, 0, -6.5))), stand, spot, asked=False)
+    assert words == "" and there is spot and new.vertices[:, 1].min() == pytest.approx(-1.0)
+
+
+WALL = PlacedMesh(
+    "wall", box(2, 2, 2), ("grey",), np.diag([1.0, 1.0, 0.1, 1.0]) + np.outer([0, 0, -4.5, 0], [0, 0, 0, 1])
+)
+CASES = [
+    (at(sphere(0.2), (1.5, -0.8, -6)), (3.5, -1.0, -6.0), "outside the picture", "the nearest free place is `at: ["),
+    (WALL, (0.0, -1.0, -6.0), "hidden behind other objects", "the nearest free place is `at: ["),
+]  # fmt: skip
+
+
+@pytest.mark.parametrize("other, point, words, cure", CASES)
+def test_where_nothing_would_be_seen_it_is_refused_with_a_place_or_moved_unasked(other, point, words, cure):
+    spot = Spot(LOW, np.array(point), 0.8)
+    error = refusal(words, free_placement, scene_of(other), stand, spot, asked=True)
+    assert error.key == "at" and cure in error.cure
+    new, there, said = free_placement(scene_of(other), stand, spot, asked=False)
+    assert words in said
+    x, y = (int(v) for v in error.cure.split("[")[1].split("]")[0].split(","))
+    named = spot_at(scene_of(other), LOW, new, (x, y), 1.0)  # the place that is named is where it is moved to
+    assert np.linalg.norm(named.point - there.point) < 0.25
+
+
+def test_an_object_that_fits_nowhere_is_refused_with_a_size_that_does():
+    """The camera looks straight down on the ground."""
+    down = Plane(np.array([0, 0, 1.0]), np.array([0, 0, -6.0]))
+    spot = Spot(down, down.point, 20.0)
+    error = refusal(
+        "no free place in the picture: it would intersect 'there' and the camera",
+        free_placement,
+        scene_of(at(sphere(0.3), (0, 0, -5.7))),
+        stand,
+        spot,
+        asked=False,
+    )
+    assert error.key == "size" and "of its size it is free at `at: [" in error.cure
+
+
+# ── Mitsuba's scenes agree with the project's frames and reflectance model ──────────────────────────────────────────
+
+
+pytest.importorskip("mitsuba")
+
+
+def smooth_light(height):
+    x, y, z = np.moveaxis(lat_long_directions(height, 2 * height), -1, 0)
+    return 1 + np.stack([x * y, np.exp(4 * (0.6 * x + 0.8 * z - 1)) * 3, y * z * z], axis=-1)
+
+
+def test_the_light_seen_is_the_light_there():
+    """A map, seen from inside by six cameras in a turned frame, comes back as that map turned."""
+    light = smooth_light(16)
+    turn = tracing.look(20, 130) @ YUP_FROM_CAMERA
+    seen = tracing.incident_light({"light": tracing.envmap(light)}, tracing.rigid(turn, (0, 0, 0)), 16, 4, 1)
+    assert seen == pytest.approx(sample_map(light, lat_long_directions(16, 32) @ turn.T), rel=0.02, abs=0.05)

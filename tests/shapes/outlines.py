@@ -26,8 +26,7 @@ def looking_from(elevation_deg, azimuth_deg, distance=5.0, roll=0.2) -> Pose:
 
 def outline(mesh, pose, known, camera=CAMERA, name="p") -> Outline:
     """What a photo shows of a mesh, its labels as parts; known: whether the pose is."""
-    part = rasterise(mesh, camera, pose).label.astype(int)
-    return Outline(name, part, camera, pose=pose if known else None)
+    return Outline(name, rasterise(mesh, camera, pose).label.astype(int), camera, pose=pose if known else None)
 
 
 def plane(y) -> Mesh:

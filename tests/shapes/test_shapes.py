@@ -1,18 +1,20 @@
-"""Shapes of outlines: hulls, bodies of revolution, primitives."""
+"""Shapes of outlines (hulls, bodies of revolution, primitives), and cameras by structure from motion."""
 
 import msgspec
 import numpy as np
 import pytest
 import trimesh
 
-from factorlib.errors import InputError
 from factorlib.generate.solids import SHAPES
 from factorlib.geometry import open3d
-from factorlib.shapes.hull import surface_nets, visual_hull
+from factorlib.geometry.camera import Camera, angle_between
+from factorlib.shapes.hull import hull_overlap, visual_hull
 from factorlib.shapes.lathe import body_of_revolution
+from factorlib.shapes.motion import LEAST_AGREEMENT, cameras_by_motion
 from factorlib.shapes.outline import Triangles
 from factorlib.shapes.primitive import primitive, unit_shape
-from tests.shapes.outlines import looking_from, outline
+from tests.refusal import refusal
+from tests.shapes.outlines import looking_from, outline, views_of
 
 AROUND = [
     looking_from(elevation, 30 * k) for k, elevation in enumerate([10, 20, -10, 30, 50, 0, 15, -25, 40, 5, -40, 25])
@@ -31,15 +33,6 @@ def holds(shape, points):
     return scene.compute_occupancy(points.astype(np.float32)).numpy().mean()
 
 
-def test_the_net_of_a_ball_is_closed_looks_outward_and_has_its_volume():
-    x = np.indices((21, 21, 21)) - 10.3
-    vertices, faces = surface_nets(8.0 - np.linalg.norm(x, axis=0))
-    net = trimesh.Trimesh(vertices, faces, process=False)
-    assert net.is_watertight and net.is_winding_consistent
-    assert net.volume == pytest.approx(4 / 3 * np.pi * 8**3, rel=0.03)
-    assert np.abs(np.linalg.norm(vertices - 10.3, axis=1) - 8).max() < 0.15
-
-
 def test_a_hull_holds_the_body_and_looks_like_it_in_a_photo_it_was_not_made_of():
     hull = visual_hull([outline(BLOB, pose, True) for pose in AROUND], 64)
     assert solid(hull).is_watertight and hull.overlap > 0.985
@@ -54,15 +47,13 @@ def test_a_hull_holds_the_body_and_looks_like_it_in_a_photo_it_was_not_made_of()
     (AROUND[:1], "only one photo with a known camera shows it"), ([AROUND[0]] * 3, "from the same side"),
 ])  # fmt: skip
 def test_a_hull_that_cannot_be_made_is_refused(poses, said):
-    with pytest.raises(InputError, match=said):
-        visual_hull([outline(BLOB, pose, True) for pose in poses], 32)
+    refusal(said, visual_hull, [outline(BLOB, pose, True) for pose in poses], 32)
 
 
 def test_outlines_that_contradict_each_other_have_no_hull():
     wrong = msgspec.structs.replace(outline(BLOB, AROUND[3], True), pose=AROUND[9])
     beside = msgspec.structs.replace(wrong, part=np.roll(wrong.part, 150, axis=1))
-    with pytest.raises(InputError, match="no body fits"):
-        visual_hull([outline(BLOB, AROUND[0], True), beside, outline(BLOB, AROUND[6], True)], 48)
+    refusal("no body fits", visual_hull, [outline(BLOB, AROUND[0], True), beside, outline(BLOB, AROUND[6], True)], 48)
 
 
 def profile(vertices, flip=False):
@@ -96,8 +87,7 @@ def test_what_is_no_body_of_revolution_is_refused_or_overlaps_little():
     one = outline(BLOB, AROUND[3], False)
     x, y = np.meshgrid(np.arange(320), np.arange(240))
     triangle = ((x > 60) & (y > 60) & (x - 60 + 1.7 * (y - 60) < 230)).astype(int)
-    with pytest.raises(InputError, match="mirrored onto itself"):
-        body_of_revolution([msgspec.structs.replace(one, part=triangle)])
+    refusal("mirrored onto itself", body_of_revolution, [msgspec.structs.replace(one, part=triangle)])
     bent = trimesh.creation.box((1.0, 0.2, 0.2)) + trimesh.creation.box((0.2, 0.6, 0.2)).apply_translation(
         (0.4, 0.3, 0)
     )
@@ -110,6 +100,66 @@ def test_what_is_no_body_of_revolution_is_refused_or_overlaps_little():
 )
 def test_proportions_of_primitives_are_found(kind, sides):
     mesh = unit_shape(kind, np.array(sides)).as_mesh()
-    shape = primitive(kind, [outline(mesh, looking_from(25, 20), False), outline(mesh, looking_from(40, 60), False)])
+    poses, camera = (looking_from(25, 20), looking_from(40, 60)), Camera(160, 120, 200.0, (80.0, 60.0))
+    shape = primitive(kind, [outline(mesh, pose, False, camera) for pose in poses])
     assert np.sort(np.ptp(shape.vertices, axis=0)) == pytest.approx(np.sort(sides), abs=0.02)
     assert shape.overlap > 0.97 and solid(shape).is_watertight and solid(shape).volume > 0
+
+
+# ── Cameras by structure from motion: a body at rest, one that turns before a camera at rest, and photos that do not
+
+
+RESTING = SHAPES["blob"]()
+POSES = [looking_from(20 + 15 * (k % 2), 18.0 * k) for k in range(5)]
+
+
+def turns_off(found):
+    """Degrees by which the turn from the first photo to each other one is off."""
+    poses = {name: POSES[int(name[1:])] for name in found}
+    first = next(iter(found))
+    return [
+        angle_between(
+            poses[n].rotation @ poses[first].rotation.T, found[n].pose.rotation @ found[first].pose.rotation.T
+        )
+        for n in found
+    ]
+
+
+def test_cameras_about_a_body_at_rest_are_found_and_are_the_same_each_time():
+    views, shares = views_of(RESTING, POSES, POSES), []
+    found = cameras_by_motion(views, lambda share, what: shares.append(share))
+    assert shares == sorted(shares) and len(set(shares)) > 4 * len(views)  # it moves with every photo, twice
+    assert list(found) == list(views) and max(turns_off(found)) < 0.5
+    assert all(each.focal == pytest.approx(1.3 * 320, rel=0.02) for each in found.values())
+    known = msgspec.structs.replace(views["p0"].camera, focal=430.0)
+    kept = {name: msgspec.structs.replace(view, camera=known, focal_sigma=0.0) for name, view in views.items()}
+    assert {each.focal for each in cameras_by_motion(kept).values()} == {430.0}  # what is given is not moved
+    again = cameras_by_motion(views)
+    assert all(np.array_equal(found[n].pose.rotation, again[n].pose.rotation) for n in found)
+
+
+def test_of_a_body_that_turns_before_a_camera_at_rest_the_ground_that_stands_still_is_not_believed():
+    found = cameras_by_motion(views_of(RESTING, POSES, [POSES[0]] * len(POSES), 480))
+    assert len(found) >= 3 and max(turns_off(found)) < 3.0
+
+
+def test_a_hull_agrees_with_its_masks_where_cameras_move_with_the_body_alone():
+    bar = unit_shape("box", np.array([1.0, 0.3, 0.3])).as_mesh()
+    moving = [outline(bar, pose, True) for pose in POSES]
+    still = [msgspec.structs.replace(one, pose=POSES[0]) for one in moving]
+    barely = [msgspec.structs.replace(one, pose=looking_from(20, 0.2 * k)) for k, one in enumerate(moving)]
+    assert hull_overlap(moving) > 0.9 and hull_overlap(still) == 0.0  # all from the same side
+    assert hull_overlap(barely) < LEAST_AGREEMENT
+
+
+def test_photos_that_do_not_overlap_are_refused():
+    apart = [looking_from(20, 90.0 * k) for k in range(4)]
+    error = refusal(
+        "of 4 photos are found",
+        cameras_by_motion,
+        views_of(RESTING, apart, [looking_from(20, 40 + 90.0 * k) for k in range(4)]),
+    )
+    assert "each 10 to 20° from the next" in error.cure
+
+
+# ── Factors of a shape's axes: the derivative of image points by them ───────────────────────────────────────────────

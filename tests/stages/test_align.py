@@ -1,6 +1,7 @@
-"""The align stage from masks and dataset slices to its files."""
+"""The stage `align` from masks and dataset slices to its files, also where cameras are known beforehand."""
 
 import json
+import logging
 import warnings
 
 import msgspec
@@ -9,16 +10,19 @@ import pytest
 
 from factorlib.align.input_checks import check_before_camera
 from factorlib.align.search import SearchOptions
+from factorlib.dataset.read import read_dataset
 from factorlib.dataset.schema import ObjectsSlice
-from factorlib.errors import InputError
-from factorlib.geometry.camera import Pose
-from factorlib.geometry.raster import rasterise
+from factorlib.generate.folder import write_labels, write_photo
+from factorlib.geometry.camera import Camera, Pose, rotation_of_vector
+from factorlib.geometry.raster import Caster, rasterise
 from factorlib.images.exr import read_exr
 from factorlib.jsonfile import read_json, write_json
 from factorlib.meshes.ply import write_ply
+from factorlib.scenes.stage_runs import run_stages
 from factorlib.stage import Inputs
-from stages import align
-from tests.align.scenes import blob, chair, photo_of
+from stages import align, masks
+from tests.align.scenes import blob, chair, normal_error_deg, photo_of
+from tests.refusal import refusal
 from tests.stages.made import Rising, chair_facts, entry_of, write_masks
 
 QUICK = SearchOptions(views=160, rolls=16, keep=(20, 8, 4, 2))
@@ -92,14 +96,12 @@ def test_a_wrong_mesh_is_doubted_and_left_out_and_stops_a_strict_run(tmp_path, c
     assert not entry["objects"]["chair"]["left_out"] and read_exr(kept / "a.exr")["confidence"].any()
     (tmp_path / "given").mkdir()
     given = step(tmp_path / "given", chair(), blob(), **KNOWN)[0]
-    with pytest.raises(InputError, match="overlap"):
-        run(tmp_path / "given", given, strict=True)
+    refusal("overlap", run, tmp_path / "given", given, strict=True)
 
 
 def test_object_without_a_pixel_is_refused(tmp_path):
     inputs, _, _, _ = step(tmp_path, chair(), chair(), edit=lambda label: label * 0)
-    with pytest.raises(InputError, match="no pixel of the mask shows object 'chair'"):
-        run(tmp_path, inputs)
+    refusal("no pixel of the mask shows object 'chair'", run, tmp_path, inputs)
 
 
 # ── given poses and cameras that contradict the photo ────────────────────────────────────────────────────────────────
@@ -113,13 +115,14 @@ def moved(tmp_path, translation, **known):
 
 @pytest.mark.parametrize("z, known", [(-5.0, {}), (-1e6, {"focal": None, "source": None}), (-0.2, {})])
 def test_a_pose_behind_the_camera_is_refused_without_raw_warnings(tmp_path, z, known):
-    with warnings.catch_warnings(), pytest.raises(InputError, match="is not before the camera") as caught:
+    with warnings.catch_warnings():
         warnings.simplefilter("error")
-        run(tmp_path, moved(tmp_path, (0.0, 0.0, z), **known))
-    assert caught.value.key == "photos[a].objects[chair].pose" and "OpenGL" in caught.value.cure
-    with pytest.raises(InputError) as caught:
-        check_before_camera(blob(), Pose(np.eye(3), np.array([0, 0, -9.0])), "hall", "vase", "colmap")
-    assert caught.value.key == "cameras.colmap: hall: vase"
+        caught = refusal("is not before the camera", run, tmp_path, moved(tmp_path, (0.0, 0.0, z), **known))
+    assert caught.key == "photos[a].objects[chair].pose" and "OpenGL" in caught.cure
+    caught = refusal(
+        ".", check_before_camera, blob(), Pose(np.eye(3), np.array([0, 0, -9.0])), "hall", "vase", "colmap"
+    )
+    assert caught.key == "cameras.colmap: hall: vase"
 
 
 # ── earlier poses, and photos that were averaged down ────────────────────────────────────────────────────────────────
@@ -195,3 +198,71 @@ def test_keypoints_are_pixels_of_the_photo_before_its_lens_was_undone(tmp_path):
     assert np.abs(found[1] - found[0]).max() > 1
     straight = (found[0] - [100.25, 75.0]) / 300
     np.testing.assert_allclose(straight * (1 + 0.3 * np.square(straight).sum(1, keepdims=True)), bent, atol=1e-9)
+
+
+# ── a scene whose cameras are known beforehand, through `masks` and `align`; tests/dataset/test_sources.py reads each source ──
+
+CAMERA = Camera(200, 150, 300.0, (104.0, 71.0))
+POSE = Pose(rotation_of_vector(np.array([0.7, -1.1, 0.4])), np.array([0.1, 0.2, 5.0]))
+CASTER = Caster(chair())
+LENS = {"fl_x": CAMERA.focal, "cx": CAMERA.centre[0], "cy": CAMERA.centre[1], "w": 200, "h": 150}
+
+
+def scene(folder, *, scale=1, mesh=None, posed=True):
+    """A dataset of a photo of a chair, `scale` times as large as transforms.json says, which has poses or cameras alone."""
+    for name in ("photos", "masks"):
+        (folder / name).mkdir(parents=True)
+    camera = Camera(200 * scale, 150 * scale, 300.0 * scale, (104.0 * scale, 71.0 * scale))
+    label = rasterise(CASTER, camera, POSE).label
+    write_photo(folder / "photos/hall.png", np.repeat(label[..., None] * 0.5, 3, axis=-1))
+    write_labels(folder / "masks/hall.png", label)
+    write_ply(folder / "chair.ply", mesh or chair())
+    world_from_camera = np.column_stack([POSE.rotation.T * (1, -1, -1), -POSE.rotation.T @ POSE.translation])  # OpenGL
+    write_json(
+        folder / "t.json", {**LENS, "frames": [{"file_path": "hall", "transform_matrix": world_from_camera.tolist()}]}
+    )
+    photo = {"name": "hall", "image": "photos/hall.png", "masks": "masks/hall.png"}
+    photo["objects"] = [{"name": "chair", "mesh": "chair"}]
+    cameras = {"transforms": "t.json"} | ({"world_from_object": {"chair": {}}} if posed else {})
+    meshes = {"chair": {"file": "chair.ply", "material": "white"}}
+    spec = {"format": 1, "materials": ["white"], "meshes": meshes, "photos": [photo], "cameras": cameras}
+    write_json(folder / "dataset.yaml", spec)
+    return folder
+
+
+def aligned(folder, name="usual", search=None, **averaged):
+    params = {"masks": averaged, "align": {"search": search} if search else {}}
+    run_stages(read_dataset(folder), folder.parent / name, (masks, align), params)
+    return read_json(folder.parent / name / "align" / "hall.json")
+
+
+def test_the_poses_of_the_scene_come_out_of_a_photo_of_any_size(tmp_path):
+    """Of the source's size, averaged down, and twice as large."""
+    entry = aligned(scene(tmp_path / "same" / "set"))
+    camera, obj = entry["camera"], entry["objects"]["chair"]
+    assert (camera["focal_source"], obj["source"]) == ("transforms", "transforms") and obj["doubts"] == []
+    assert camera["focal_px"] == 300.0 and np.allclose(camera["principal_point"], CAMERA.centre, atol=1e-12)
+    assert np.allclose(obj["rotation"], POSE.rotation, atol=1e-12) and obj["silhouette_iou"] > 0.995
+    assert np.allclose(obj["translation"], POSE.translation, atol=1e-12)
+    entry = aligned(tmp_path / "same" / "set", name="half", frame=200 * 150 // 4)
+    assert entry["camera"]["focal_px"] == 150.0 and entry["objects"]["chair"]["silhouette_iou"] > 0.98
+    assert np.allclose(entry["camera"]["principal_point"], [52.0, 35.5], atol=1e-12)
+    entry = aligned(scene(tmp_path / "large" / "set", scale=2))
+    assert entry["camera"]["focal_px"] == 600.0 and entry["camera"]["principal_point"] == [208.0, 142.0]
+    assert entry["objects"]["chair"]["silhouette_iou"] > 0.995
+
+
+def test_where_only_the_camera_is_known_the_pose_is_searched(tmp_path):
+    quick = {"views": 160, "rolls": 16, "keep": [20, 8, 4, 2]}
+    entry = aligned(scene(tmp_path / "set", posed=False), search=quick)
+    camera, obj = entry["camera"], entry["objects"]["chair"]
+    assert (camera["focal_source"], obj["source"], camera["focal_px"]) == ("transforms", "found", 300.0)
+    assert camera["principal_point"] == list(CAMERA.centre)
+    pose = Pose(np.array(obj["rotation"]), np.array(obj["translation"]))
+    assert normal_error_deg(CASTER, CAMERA, POSE, CAMERA, pose) < 1
+
+
+def test_a_known_pose_that_does_not_fit_is_doubted_with_its_own_cure_and_kept(tmp_path, caplog):
+    with caplog.at_level(logging.WARNING, "factorlib.align"):
+        obj = aligned(scene(tmp_path / "set", mesh=blob()))["objects"]["chair"]
+    assert obj["doubts"] and not obj["left_out"] and "world_from_object" in caplog.text

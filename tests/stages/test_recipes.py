@@ -7,7 +7,6 @@ import numpy as np
 import pytest
 
 from factorlib.conventions import YUP_FROM_CAMERA, lat_long_directions
-from factorlib.errors import InputError
 from factorlib.images.exr import read_exr, write_rgb_exr
 from factorlib.images.picture import picture, read_png
 from factorlib.jsonfile import write_json
@@ -17,6 +16,7 @@ from factorlib.results.materials import MaterialTable, Reflectance, StandardErro
 from factorlib.stage import Inputs, silent
 from stages import recipes
 from tests.export import made_export
+from tests.refusal import refusal
 from tests.runner.toy import files_of
 
 ERROR = StandardErrors((0.0,) * 3, (0.0,) * 3, 0.0)
@@ -84,9 +84,8 @@ def test_a_part_of_an_inserted_mesh_gets_another_material_and_the_rest_keeps_its
     results = SolvedSet(grounded)
     mesh, materials, _ = results.mesh("egg", {"brass": "unseen"}, "y")
     assert [materials[label - 1] for label in mesh.labels] == ["red", "unseen"]
-    with pytest.raises(InputError, match="no object of the mesh 'egg' has the materials unseen") as error:
-        results.mesh("egg", {"unseen": "red"}, "y")
-    assert error.value.key == "material"
+    error = refusal("no object of the mesh 'egg' has the materials unseen", results.mesh, "egg", {"unseen": "red"}, "y")
+    assert error.key == "material"
 
 
 def test_the_photo_stays_where_no_object_is(made, tmp_path):
@@ -111,8 +110,9 @@ def test_a_material_of_ones_own_is_what_is_drawn(made, tmp_path):
 
 
 def test_a_material_that_reflects_more_than_arrives_is_refused(made, tmp_path):
-    with pytest.raises(InputError, match="more light is reflected than arrives"):
-        own_material(made, tmp_path, Reflectance((0.9,) * 3, (0.3,) * 3, 0.5))
+    refusal(
+        "more light is reflected than arrives", own_material, made, tmp_path, Reflectance((0.9,) * 3, (0.3,) * 3, 0.5)
+    )
 
 
 def test_the_light_of_a_file_is_used_as_it_lies(made, tmp_path):
@@ -123,25 +123,29 @@ def test_the_light_of_a_file_is_used_as_it_lies(made, tmp_path):
     recipe = kinds.RelightRecipe(photos=["front"], lights=["lamp.exr"], samples=64)
     drawn(made, tmp_path / "out", recipe, **{"lamp.exr": tmp_path / "lamp.exr"})
     picture = read_exr(tmp_path / "out" / "front" / "lamp.exr")
-    columns = np.nonzero(picture["A"].max(axis=0))[0]
-    left, right = np.array_split(columns, 2)
+    left, right = np.array_split(np.nonzero(picture["A"].max(axis=0))[0], 2)
     assert picture["R"][:, right].sum() > 3 * picture["R"][:, left].sum()
 
 
 def test_a_photo_without_objects_is_refused_or_left_out_with_a_warning_where_nobody_named_it(made, tmp_path, caplog):
     nothing = {"camera": {}, "objects": [], "meshes": {}}
     some = changed(made, "dataset.objects", {**made.facts["dataset.objects"], "front": nothing})
-    with pytest.raises(InputError, match="'front' has no objects to render"):
-        drawn(some, tmp_path / "named", kinds.ResynthesisRecipe(photos=["front"]))
+    refusal(
+        "'front' has no objects to render", drawn, some, tmp_path / "named", kinds.ResynthesisRecipe(photos=["front"])
+    )
     assert sorted(drawn(some, tmp_path / "out", kinds.ResynthesisRecipe(samples=1))) == PICTURES["side"]
     assert "front: no picture of this photo" in caplog.text
     none = changed(made, "dataset.objects", dict.fromkeys(made_export.MESHES, nothing))
-    with pytest.raises(InputError, match="no objects"):
-        drawn(none, tmp_path / "none", kinds.ResynthesisRecipe())
+    refusal("no objects", drawn, none, tmp_path / "none", kinds.ResynthesisRecipe())
 
 
 def test_nothing_is_put_on_a_ground_that_is_seen_from_below(made, tmp_path):
     above = {"ground": {"point": [0, -1, 4], "normal": [0, -1, 0]}}  # y is down
     below = {**made.facts["dataset.ground"], "front": above}
-    with pytest.raises(InputError, match="'front' was taken from below"):
-        drawn(changed(made, "dataset.ground", below), tmp_path / "out", kinds.InsertRecipe(photos=["front"], samples=1))
+    refusal(
+        "'front' was taken from below",
+        drawn,
+        changed(made, "dataset.ground", below),
+        tmp_path / "out",
+        kinds.InsertRecipe(photos=["front"], samples=1),
+    )

@@ -4,10 +4,8 @@ import json
 
 import msgspec
 import numpy as np
-import pytest
 
 from factorlib.dataset.schema import MeshEntry
-from factorlib.errors import InputError
 from factorlib.export.gltf_writer import write_glb
 from factorlib.generate.solids import sphere
 from factorlib.images.exr import write_exr
@@ -23,6 +21,7 @@ from factorlib.urm.observations import Observations, write_observations
 from factorlib.urm.surface_maps import read_geometry, with_surface_normals
 from stages import surface
 from tests.inference.made import observations_from_front
+from tests.refusal import refusal
 
 SIZE = 12
 
@@ -65,8 +64,7 @@ def test_observations_and_maps_have_the_normals_and_the_detail_of_the_surface(tm
         and with_surface_normals(observations(), None).detail is None
     )
     wide = msgspec.structs.replace(observations(), x=observations().x + 1)
-    with pytest.raises(InputError, match="12 × 12"):
-        with_surface_normals(wide, tmp_path / "surface")
+    refusal("12 × 12", with_surface_normals, wide, tmp_path / "surface")
 
 
 def test_the_solve_merges_only_what_has_one_detail_and_its_blocks_reflect_by_it(tmp_path):
@@ -104,5 +102,4 @@ def test_meshes_are_moved_and_painted_wherever_they_are_read(tmp_path):
     base = tree["materials"][0]["pbrMetallicRoughness"]["baseColorFactor"]
     np.testing.assert_allclose(base[:3], np.exp(0.05) * np.array([0.2, 0.1, 0.1]), rtol=1e-6)
     other = MeshCache(lambda _, file: tmp_path / file, ["red"], CREASE_DEG, {"ball": [0.0] * 7})
-    with pytest.raises(InputError, match="surface"):
-        other.mesh("ball", MeshEntry("ball.ply", material="red"))
+    refusal("surface", other.mesh, "ball", MeshEntry("ball.ply", material="red"))

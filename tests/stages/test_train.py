@@ -16,6 +16,7 @@ from factorlib.stage import Inputs, silent
 from stages import train
 
 BRIEF = train.Params(samples=8192, held_out=2048, steps=160, diffuse_steps=120, rate=0.01)
+TINY = train.Params(samples=1024, held_out=1024, steps=80, diffuse_samples=1024, diffuse_steps=80, batch=256)
 
 
 @pytest.fixture(scope="module")
@@ -41,21 +42,24 @@ class Killed(Exception):
     pass
 
 
-def test_a_killed_training_goes_on_to_the_same_bytes(trained, tmp_path):
-    inputs, points = Inputs({}, unfinished=tmp_path / "unfinished"), []
+def test_a_killed_training_goes_on_to_the_same_bytes(tmp_path):
+    inputs, whole, points = Inputs({}, unfinished=tmp_path / "unfinished"), [], []
+    for name in ("whole", "out"):
+        (tmp_path / name).mkdir()
+    train.main(TINY, Inputs({}), tmp_path / "whole", lambda *words: whole.append(words[-1]))
 
-    def killed_at_the_last_but_one(done, total, text=""):
+    def killed_amid_the_second_part(done, total, text=""):
         points.append(text)
-        if len(points) == 60:
+        if sum(each.startswith("specular: held-out") for each in points) == 5:
             raise Killed
 
-    (tmp_path / "out").mkdir()
     with pytest.raises(Killed):
-        train.main(BRIEF, inputs, tmp_path / "out", killed_at_the_last_but_one)
-    before = len(points)
-    train.main(BRIEF, inputs, tmp_path / "out", lambda *_: points.append(""))
-    assert len(points) - before < 40, "it started again"
-    for path in trained.iterdir():
+        train.main(TINY, inputs, tmp_path / "out", killed_amid_the_second_part)
+    points.clear()
+    train.main(TINY, inputs, tmp_path / "out", lambda *words: points.append(words[-1]))
+    second = [text for text in whole if text.startswith("specular")]
+    assert all(text.startswith("specular") for text in points) and len(points) < len(second), "it started again"
+    for path in (tmp_path / "whole").iterdir():
         assert path.read_bytes() == (tmp_path / "out" / path.name).read_bytes(), path.name
 
 

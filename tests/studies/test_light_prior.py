@@ -16,7 +16,7 @@ from factorlib.jsonfile import read_json
 from factorlib.light.prior import LightPrior, angles
 from studies.measured import light_prior, material_classes
 from studies.measured.light_prior import _cost, cell_means, fitted, log_cells, maps_in, mean_of, rounded
-from tests.light.test_prior import KNOWN
+from tests.light.test_light import KNOWN
 
 
 def drawn(prior: LightPrior, cells, count: int, seed: int = 0):

@@ -1,0 +1,326 @@
+"""Exported scenes for Mitsuba, OpenUSD and Blender: the same camera, poses, materials and light."""
+
+import importlib.util
+import shutil
+import subprocess
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+
+import msgspec
+import numpy as np
+import pytest
+from scipy.ndimage import binary_erosion
+
+from factorlib.conventions import YUP_FROM_CAMERA, lat_long_directions
+from factorlib.dataset.schema import LightSlice
+from factorlib.export.environment import mitsuba_map, sharpened
+from factorlib.export.exported_scene import DIRECT, ExportedScene, ExportedShape, ExposedMap
+from factorlib.export.mitsuba import write_scene
+from factorlib.export.usd import shader_inputs, write_usd_scene
+from factorlib.geometry.camera import Camera
+from factorlib.images.exr import LAT_LONG, read_exr, read_rgb_exr, write_rgb_exr
+from factorlib.light.lobes import Lobes
+from factorlib.meshes.ply import submesh, write_ply
+from factorlib.meshes.read import read_mesh
+from factorlib.reflection.reference import Reference
+from factorlib.render.photo_scene import PhotoScene, PlacedMesh, traced_photo
+from factorlib.render.reflect import Reflector
+from factorlib.render.resynthesis import resynthesised
+from factorlib.results.lobe_table import light_of, read_lobes
+from factorlib.results.materials import Reflectance, read_materials
+from factorlib.tracing.scene import node_directions, paint, rigid
+from factorlib.tracing.variant import mitsuba
+from tests.export import made_export
+
+SPP = 1024
+
+
+def rendered(path, **options) -> np.ndarray:
+    module = mitsuba()
+    return np.array(module.render(module.load_file(str(path), **options)))
+
+
+def block_means(picture: np.ndarray, pixels: np.ndarray, side: int = 8) -> np.ndarray:
+    """Means over the `pixels` in blocks of side × side that hold at least a third of them, [blocks, 3]."""
+    height, width = pixels.shape
+
+    def sums(values: np.ndarray) -> np.ndarray:
+        return values.reshape(height // side, side, width // side, side, -1).sum(axis=(1, 3))
+
+    count = sums(pixels[..., None].astype(float))
+    full = count[..., 0] > side**2 / 3
+    return sums(picture * pixels[..., None])[full] / count[full]
+
+
+def whole_pixels(label: np.ndarray) -> np.ndarray:
+    """Pixels that show one material only: those whose neighbours are of the same."""
+    return np.any([binary_erosion(label == k, np.ones((3, 3))) for k in np.unique(label[label > 0])], axis=0)
+
+
+@pytest.mark.parametrize("photo", ["front", "side"])
+def test_scene_equals_resynthesis(exported, photo):
+    inputs, out = exported
+    geometry, masks = (read_exr(inputs[stage] / f"{photo}.exr") for stage in ("align", "masks"))
+    light = light_of(out, photo, msgspec.convert(inputs.facts["dataset.light"][photo], LightSlice))
+    table = read_materials(out / "materials.json").materials
+    pixels = whole_pixels(geometry["label"])
+    reflector, materials = Reflector(Reference(tolerance=1e-3), light), [table[n] for n in made_export.NAMES]
+    expected = resynthesised(reflector, materials, {"label": masks["label"] * pixels}, geometry)
+    found = rendered(out / "scenes" / f"{photo}.xml", spp=SPP)
+    error = block_means(found, pixels) / block_means(expected, pixels) - 1
+    assert len(error) >= 15
+    assert np.abs(error).max() < 0.01
+    assert not found[binary_erosion(geometry["label"] == 0, np.ones((3, 3)))].any()  # the light itself is not shown
+
+
+# one texel, one side ------------------------------------------------------------------------------------------------
+
+# in the camera frame
+SQUARE = Camera(32, 32, 70.0, (16.0, 16.0))
+PLACE = rigid(np.eye(3), np.array([0.0, 0.0, 5.0]))  # of the ball before the camera
+MATT = Reflectance((0.5, 0.5, 0.5), (0, 0, 0), 0.5)
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    """With a mesh file of a ball."""
+    made = tmp_path_factory.mktemp("ball")
+    made_export.write_obj(made / "ball.obj", (1, 1, 1))
+    write_ply(made / "ball.red.ply", read_mesh(made / "ball.obj", ["red"], "red"))
+    return made
+
+
+def ball_scene(folder, material: Reflectance, lobes: Lobes, two_sided: bool = False, camera_from_light=np.eye(3)):
+    """A ball in front of a square camera, through a scene file."""
+    write_rgb_exr(folder / "light.exr", mitsuba_map(lobes, 64, 128), LAT_LONG)
+    shape = ExportedShape("ball", "ball.red.ply", "red", PLACE, two_sided)
+    light = ExposedMap("light.exr", np.ones(3), camera_from_light)
+    write_scene(folder / "scene.xml", ExportedScene(SQUARE, [shape], {"red": material}, light))
+    return folder / "scene.xml"
+
+
+# materials -----------------------------------------------------------------------------------------------------------
+
+CASES = {
+    "diffuse": Reflectance((0.9, 0.5, 0.1), (0, 0, 0), 0.5),
+    "specular": Reflectance((0, 0, 0), (0.9, 0.5, 0.1), 0.5),
+    "black": Reflectance((0, 0, 0), (0, 0, 0), 0.5),
+    "all of it": Reflectance((0.5, 0.2, 0.3), (0.1, 0.49999, 0.2), 0.4),
+}
+
+
+@pytest.mark.parametrize("two_sided", [False, True])
+@pytest.mark.parametrize("case", CASES)
+def test_each_kind_of_material_loads_and_reflects_as_solved(folder, case, two_sided):
+    constant = Lobes(np.array([[0.0, 0.0, -1.0]]), np.array([0.1]), np.ones((1, 3)))
+    picture = rendered(ball_scene(folder, CASES[case], constant, two_sided), spp=100)[14:18, 14:18].mean((0, 1))
+    middle = np.array([[0.0, 0.0, -1.0]])
+    expected = Reflector(Reference(tolerance=1e-3), constant)(CASES[case], middle, middle)[0]
+    np.testing.assert_allclose(picture, expected, rtol=0.02)  # the ball's middle against its very centre
+    assert (picture > 0).all() == (case != "black")
+
+
+def test_detail_of_reflectance_is_a_factor_on_the_diffuse_part_in_scenes_that_are_written_and_that_are_traced(folder):
+    """The upper half of a ball at half its diffuse reflectance: pictures of it are halves of those of both materials."""
+    material, light = CASES["all of it"], Lobes(np.array([[0.0, 0.0, -1.0]]), np.array([0.1]), np.ones((1, 3)))
+    ball = read_mesh(folder / "ball.obj", ["red"], "red")
+    detail = np.where(ball.vertices[:, 1] > 0, 0.5, 1.0)
+    whole = rendered(ball_scene(folder, material, light), spp=256)
+    halved = msgspec.structs.replace(material, diffuse=tuple(k / 2 for k in material.diffuse))
+    half = rendered(ball_scene(folder, halved, light), spp=256)
+    path = ball_scene(folder, material, light)
+    write_ply(folder / "painted.ply", ball, paint(material, detail))
+    path.write_text(path.read_text().replace("ball.red.ply", "painted.ply"))
+    plain = rendered(path, spp=256)  # colours that no material asks for change nothing
+    np.testing.assert_allclose(plain[10:22, 10:22].mean((0, 1)), whole[10:22, 10:22].mean((0, 1)), rtol=0.01)
+    shape = ExportedShape("ball", "painted.ply", "red", PLACE, False, painted=True)
+    write_scene(path, ExportedScene(SQUARE, [shape], {"red": material}, ExposedMap("light.exr", np.ones(3), np.eye(3))))
+    written = rendered(path, spp=256)
+    placed = PlacedMesh(
+        "ball", msgspec.structs.replace(ball, detail=detail), ("red",), rigid(YUP_FROM_CAMERA, [0.0, 0.0, -5.0])
+    )
+    traced = traced_photo(PhotoScene(SQUARE, (placed,), light, {"red": material}, DIRECT), 256)[..., :3]
+    upper, lower = slice(20, 24), slice(8, 12)  # the object's y is the camera's, which points down
+    for picture in (written, traced):
+        np.testing.assert_allclose(picture[upper, 12:20].mean((0, 1)), half[upper, 12:20].mean((0, 1)), rtol=0.02)
+        np.testing.assert_allclose(picture[lower, 12:20].mean((0, 1)), whole[lower, 12:20].mean((0, 1)), rtol=0.02)
+    assert (whole[upper, 12:20] > 1.1 * half[upper, 12:20]).all()
+
+
+# the map ---------------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("sharpness", [0.1, 30.0, 2000.0, 1e5])
+def test_map_for_mitsuba_keeps_energy_and_direction(sharpness):
+    axis = np.array([0.48, -0.36, 0.8])
+    lobe = Lobes(axis[None], np.array([sharpness]), np.ones((1, 3)))
+    theta = np.linspace(0, np.pi, 256)
+    half = np.pi / 510
+    area = -np.diff(np.cos(np.clip([theta - half, theta + half], 0, np.pi)), axis=0)[0] * np.pi / 256  # of the nodes
+    values = mitsuba_map(lobe, 256, 512)[..., 0] * area[:, None]
+    assert values.sum() == pytest.approx(lobe.energy[0], rel=2e-3)
+    mean = np.einsum("hw,hwk->k", values, node_directions(256, 512))
+    np.testing.assert_allclose(mean / np.linalg.norm(mean), YUP_FROM_CAMERA @ axis, atol=2e-3)
+
+
+def test_sharpening_undoes_what_interpolation_widens():
+    lobe, spacing = Lobes(np.array([[0.0, 0.0, 1.0]]), np.array([2000.0]), np.ones((1, 3))), 0.0125
+    x, nodes = np.linspace(-0.2, 0.2, 20001), np.arange(-20, 21) * spacing
+    interpolated = np.interp(x, nodes, np.exp(-0.5 * sharpened(lobe, spacing).sharpness[0] * nodes**2))
+    assert (x**2 * interpolated).sum() / interpolated.sum() == pytest.approx(1 / 2000.0, rel=1e-3)
+
+
+# ── Scenes as OpenUSD: text that is checked as text, and what the USD library reads of it ───────────────────────────
+
+
+ROWS = 256
+PHOTOS = list(made_export.MESHES)
+GLOSSY = Reflectance((0.4, 0.2, 0.1), (0.1, 0.2, 0.3), 0.45)
+METAL = Reflectance((0, 0, 0), (0.8, 0.6, 0.4), 0.7)
+LAMBERTIAN = Reflectance((0.5, 0.4, 0.3), (0, 0, 0), 0.2)
+MISSING = 'OpenUSD is not installed: make setup EXTRAS="interchange"'
+
+
+# as text -------------------------------------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def text_of(tmp_path):
+    """The text of a scene in which every object has every material."""
+
+    def written(objects=("chair",), materials=("red",), file="meshes/a.ply", exposure=(2.0, 1.0, 0.5)) -> str:
+        place = np.arange(16.0).reshape(4, 4)
+        place[3] = [0, 0, 0, 1]
+        shapes = [ExportedShape(f"{name}.{each}", file, each, place, False) for name in objects for each in materials]
+        light = ExposedMap("../illumination/a.exr", np.array(exposure), np.eye(3))
+        scene = ExportedScene(Camera(64, 48, 100.0, (30.0, 20.0)), shapes, dict.fromkeys(materials, GLOSSY), light)
+        write_usd_scene(tmp_path / "scene.usda", scene)
+        return (tmp_path / "scene.usda").read_text()
+
+    return written
+
+
+def test_files_are_quoted_matrices_written_for_rows_and_exposure_is_intensity_times_colour(text_of):
+    text, dark = text_of(), text_of(file="meshes/a@b.ply", exposure=(0, 0, 0))
+    assert "references = @./meshes/a.usda@" in text and "references = @@@./meshes/a@b.usda@@@" in dark
+    turned = "((0.0, -4.0, -8.0, 0.0), (1.0, -5.0, -9.0, 0.0), (2.0, -6.0, -10.0, 0.0), (3.0, -7.0, -11.0, 1.0))"
+    assert f"matrix4d xformOp:transform = {turned}" in text
+    assert "inputs:color = (1.0, 0.5, 0.25)" in text and "inputs:intensity = 2.0" in text
+    assert "inputs:color = (1.0, 1.0, 1.0)" in dark and "inputs:intensity = 0.0" in dark
+
+
+@pytest.mark.parametrize("material", [GLOSSY, METAL, LAMBERTIAN], ids=["glossy", "metal", "lambertian"])
+def test_shader_reflects_what_was_solved_at_normal_incidence(material):
+    found = shader_inputs(material)
+    assert (found["useSpecularWorkflow"] == 0) == (material is METAL)
+    if found["useSpecularWorkflow"]:
+        f0, diffuse = found["specularColor"], found["diffuseColor"] * (1 - found["specularColor"])
+    else:
+        f0, diffuse = found["diffuseColor"], np.zeros(3)
+        assert found["metallic"] == 1
+    np.testing.assert_allclose(f0, material.specular)
+    np.testing.assert_allclose(diffuse, material.diffuse)
+    assert found["roughness"] == (material.roughness if any(material.specular) else 1.0)
+
+
+# as the USD library reads it -----------------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def pxr():
+    return pytest.importorskip("pxr", reason=MISSING)
+
+
+def opened(exported, photo):
+    from pxr import Usd
+
+    return Usd.Stage.Open(str(exported[1] / "scenes" / f"{photo}.usda"))
+
+
+def world_of(prim) -> np.ndarray:
+    """world_from_prim, for columns."""
+    from pxr import UsdGeom
+
+    return np.array(UsdGeom.XformCache().GetLocalToWorldTransform(prim)).T
+
+
+@pytest.mark.parametrize("photo", PHOTOS)
+def test_usds_own_validators_find_nothing(pxr, exported, photo):
+    validation = pytest.importorskip("pxr.UsdValidation", reason="this OpenUSD has no validators")
+    stage = opened(exported, photo)
+    validators = validation.ValidationRegistry().GetOrLoadAllValidators()
+    assert len(validators) > 10
+    assert [error.GetErrorAsString() for error in validation.ValidationContext(validators).Validate(stage)] == []
+    assert stage.Flatten().ExportToString() and not stage.GetCompositionErrors()
+
+
+@pytest.mark.parametrize("photo", PHOTOS)
+def test_vertices_stand_where_the_pose_puts_them(pxr, exported, photo):
+    from pxr import UsdGeom
+
+    stage, name, pose = opened(exported, photo), made_export.MESHES[photo], made_export.POSES[photo]
+    entry = exported[0].facts["dataset.objects"][photo]["meshes"][name]
+    mesh = read_mesh(exported[0].files[f"{name}.obj"], made_export.NAMES, entry["parts"])
+    for label in mesh.labels:
+        part = submesh(mesh, label)
+        prim = stage.GetPrimAtPath(f"/scene/objects/chair/{made_export.NAMES[label - 1]}")
+        found, place = UsdGeom.Mesh(prim), world_of(prim)
+        points, normals = (np.array(attribute.Get()) for attribute in (found.GetPointsAttr(), found.GetNormalsAttr()))
+        expected = pose.apply(part.vertices) @ YUP_FROM_CAMERA
+        np.testing.assert_allclose(points @ place[:3, :3].T + place[:3, 3], expected, atol=2e-6)
+        np.testing.assert_allclose(normals, part.normals, atol=1e-6)
+        np.testing.assert_array_equal(np.array(found.GetFaceVertexIndicesAttr().Get()).reshape(-1, 3), part.faces)
+        assert set(found.GetFaceVertexCountsAttr().Get()) == {3} and found.GetNormalsInterpolation() == "vertex"
+
+
+@pytest.mark.parametrize("photo", PHOTOS)
+def test_dome_shows_the_light_from_where_it_came(pxr, exported, photo):
+    """By the layout that OpenUSD's DomeLight documents: OpenEXR's, up +y, longitude 0 at +z, π/2 at +x, from π to −π."""
+    from pxr import UsdLux
+
+    dome = UsdLux.DomeLight(opened(exported, photo).GetPrimAtPath("/scene/light"))
+    file = dome.GetTextureFileAttr().Get().resolvedPath
+    assert dome.GetTextureFormatAttr().Get() == "latlong" and file
+    found = read_rgb_exr(file) * dome.GetIntensityAttr().Get() * np.array(dome.GetColorAttr().Get())
+    name, world = ("front", np.eye(3)) if photo == "front" else ("room", made_export.WORLD_FROM_CAMERA["side"])
+    light = read_lobes(exported[1] / "lobes.parquet")[name].scaled(made_export.EXPOSURES[photo][0]).turned(world.T)
+    directions = lat_long_directions(8, 16).reshape(-1, 3)[16:-16] @ YUP_FROM_CAMERA
+    x, y, z = (directions @ YUP_FROM_CAMERA @ world_of(dome.GetPrim())[:3, :3]).T
+    rows, columns = (np.pi / 2 - np.arcsin(y)) / np.pi * ROWS, (np.pi - np.arctan2(x, z)) / (2 * np.pi) * 2 * ROWS
+    expected = light.radiance(directions)
+    assert expected.max() > 3 * np.median(expected)
+    texels = found[rows.astype(int), columns.astype(int)]
+    np.testing.assert_allclose(texels, expected, rtol=0.25, atol=0.01 * expected.max())
+
+
+# in Blender, by its script ---------------------------------------------------------------------------------------------
+
+
+def blender_pictures(scenes: Path, photos: Sequence[str], samples: int) -> dict[str, np.ndarray]:
+    """RGBA of the photos, by the script beside them, in a process of its own: Blender's libraries do not get on with others."""
+    words = [[photo, "--render", str(scenes / f"{photo}.blender.exr"), "--samples", str(samples)] for photo in photos]
+    code = f"import sys; sys.path.insert(0, {str(scenes)!r})\nimport blender\nfor each in {words!r}: blender.main(each)"
+    command = [shutil.which("blender"), "--background", "--python-exit-code", "1", "--python-expr", code]
+    if importlib.util.find_spec("bpy"):
+        command = [sys.executable, "-W", "ignore", "-c", code]
+    elif command[0] is None:
+        pytest.skip('Blender is not installed: make setup EXTRAS="blender", or put `blender` on the PATH')
+    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr[-2000:]
+    channels = {photo: read_exr(scenes / f"{photo}.blender.exr") for photo in photos}
+    return {photo: np.stack([each[name] for name in "RGBA"], axis=-1) for photo, each in channels.items()}
+
+
+@pytest.mark.long
+def test_round_trip_shows_what_mitsuba_shows(exported):
+    inputs, out = exported
+    photos, module = list(made_export.MESHES), mitsuba()
+    found = blender_pictures(out / "scenes", photos, 256)
+    for photo in photos:
+        expected = np.array(module.render(module.load_file(str(out / "scenes" / f"{photo}.xml")), spp=512))
+        mask = binary_erosion(read_exr(inputs["align"] / f"{photo}.exr")["label"] > 0, np.ones((3, 3)))
+        error = np.abs(found[photo][mask][:, :3] / expected[mask] - 1)
+        print(f"{photo}: difference {np.median(error):.2%} (median), {np.percentile(error, 95):.2%} (95th percentile)")
+        assert np.median(error) <= 0.03 and np.percentile(error, 95) <= 0.1
+        assert found[photo][mask][:, 3].min() == 1.0

@@ -1,0 +1,174 @@
+"""Pixels: averaging down, transfer functions and tone curves, PNGs, halos of sharpening, and a lens's distortion."""
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.ndimage import gaussian_filter
+
+from factorlib.dataset.schema import Intrinsics
+from factorlib.images.boxes import box_mean
+from factorlib.images.lens import Undistorted, radial_lens
+from factorlib.images.photo import Photo
+from factorlib.images.picture import read_png, write_png
+from factorlib.images.processing import HALO, halo
+from factorlib.images.tone import by_log_exponent, curve, inverse, slope
+from factorlib.images.transfer import gamma_decode, srgb_decode, srgb_encode
+from tests.refusal import refusal
+
+X = np.concatenate([[0.0, 1e-4], np.geomspace(0.01, 50, 40)])
+
+
+def test_srgb_reference_values():
+    # 0.04045 / 12.92; ((0.5 + 0.055) / 1.055)^2.4; code 118 of 255 is the 18 % grey card
+    assert srgb_decode(np.array([0.0, 0.04045, 0.5, 1.0])) == pytest.approx([0.0, 0.0031308, 0.2140411, 1.0], abs=1e-7)
+    assert srgb_decode(np.array([118 / 255]))[0] == pytest.approx(0.18, abs=2e-3)
+    assert srgb_encode(np.array([0.0031308, 0.18])) == pytest.approx([0.04045, 0.4613561], abs=1e-6)
+
+
+def test_inverse_on_and_beyond_the_unit_interval():
+    values = np.linspace(-0.5, 4, 1001)
+    assert srgb_encode(srgb_decode(values)) == pytest.approx(values, abs=1e-6)
+    assert srgb_decode(srgb_encode(values)) == pytest.approx(values, abs=1e-6)
+    assert gamma_decode(np.copysign(np.abs(values) ** (1 / 2.2), values)) == pytest.approx(values, abs=1e-6)
+
+
+@pytest.mark.parametrize("exponent", [0.5, 0.8, 1.0, 1.3, 2.2])
+def test_tone_keeps_black_and_the_mean_is_inverted_and_its_slopes_are_the_finite_differences(exponent):
+    assert curve(np.array([0.0, 1.0]), exponent) == pytest.approx([0, 1], abs=1e-12)
+    assert (np.diff(curve(X, exponent)) > 0).all() and (exponent != 1 or np.allclose(curve(X, 1.0), X, atol=1e-12))
+    np.testing.assert_allclose(inverse(curve(X, exponent), exponent), X, rtol=1e-9, atol=1e-12)
+    assert inverse(np.array([-0.1]), exponent) == pytest.approx([0], abs=1e-12)
+    h = 1e-6
+    by_x = (curve(X + h, exponent) - curve(X - h, exponent)) / (2 * h)
+    by_log = (curve(X, exponent * np.exp(h)) - curve(X, exponent * np.exp(-h))) / (2 * h)
+    np.testing.assert_allclose(slope(X, exponent), by_x, rtol=1e-6)
+    np.testing.assert_allclose(by_log_exponent(X, exponent), by_log, rtol=1e-6, atol=1e-8)
+
+
+# ── averaging down ────────────────────────────────────────────────────────────────────────────────────────────────────
+
+
+@settings(max_examples=30)
+@given(st.floats(0, 1e6, width=32), st.integers(1, 6), st.integers(1, 5), st.integers(1, 5))
+def test_the_mean_is_that_of_the_whole_and_a_constant_stays_what_it_is_to_the_last_bit(value, factor, rows, columns):
+    shape = rows * factor, columns * factor
+    radiance = np.random.default_rng(factor).exponential(1, (*shape, 3)).astype(np.float32)
+    mean, some = box_mean(radiance, np.ones(shape, bool), factor)
+    assert mean.shape == (rows, columns, 3) and mean.dtype == np.float32 and some.all()
+    np.testing.assert_allclose(mean.mean((0, 1), dtype=float), radiance.mean((0, 1), dtype=float), rtol=1e-6)
+    assert (
+        box_mean(np.full((*shape, 3), value, np.float32), np.ones(shape, bool), factor)[0] == np.float32(value)
+    ).all()
+
+
+# ── Pictures for people: exposure, encoding, and PNGs that are the same bytes every time ────────────────────────────
+
+
+RNG = np.random.default_rng(5)
+
+
+@pytest.mark.parametrize("channels", [1, 3, 4])
+def test_a_png_keeps_colours_under_alpha_and_has_no_date(tmp_path, channels):
+    pixels = RNG.integers(0, 256, (7, 5, channels), dtype=np.uint8)
+    write_png(tmp_path / "a.png", pixels)
+    np.testing.assert_array_equal(read_png(tmp_path / "a.png"), pixels)
+    data = (tmp_path / "a.png").read_bytes()
+    assert b"tIME" not in data and b"tEXt" not in data
+    (tmp_path / "a.png").write_bytes(data[:8])
+    refusal("a.png", read_png, tmp_path / "a.png")
+
+
+# ── Halos of sharpening are found about masks; blur, soft shadows and plain edges have none ─────────────────────────
+
+
+HEIGHT, WIDTH = 120, 160
+ROW, COLUMN = np.mgrid[:HEIGHT, :WIDTH]
+INSIDE = np.hypot(ROW - 60, COLUMN - 80) < 35
+KNOWN = np.ones((HEIGHT, WIDTH), bool)
+
+
+def picture(body, ground):
+    """Linear radiance of a disc that shades away to its rim, before a ground with a gradient, from a camera with a little blur."""
+    shaded = body * (1 - 0.4 * np.hypot(ROW - 60, COLUMN - 80) / 35)
+    return gaussian_filter(np.where(INSIDE, shaded, ground * (1 + COLUMN / WIDTH)), 0.7)
+
+
+def sharpened(linear, sigma, amount):
+    encoded = np.clip(linear, 0, 1) ** (1 / 2.2)
+    return np.clip(encoded + amount * (encoded - gaussian_filter(encoded, sigma)), 0, 1) ** 2.2
+
+
+def of(linear):
+    return halo(np.repeat(linear[..., None], 3, axis=-1), INSIDE, KNOWN)
+
+
+@pytest.mark.parametrize(("body", "ground"), [(0.6, 0.1), (0.08, 0.3)])
+def test_sharpening_is_seen_and_what_cameras_and_scenes_do_is_not(body, ground):
+    linear = picture(body, ground)
+    assert of(linear) < HALO / 2
+    assert of(sharpened(linear, 2.0, 1.0)) > HALO > of(gaussian_filter(linear, 1.5))
+    near = np.hypot(ROW - 60, COLUMN - 80) - 35
+    contact = linear * np.where(near > 0, 1 - 0.3 * np.exp(-np.abs(near) / 6) * (ROW > 60), 1)  # a shadow below
+    assert of(contact) < HALO
+
+
+def test_too_few_contours_and_pixels_that_are_left_out_say_nothing():
+    linear = sharpened(picture(0.6, 0.1), 2.0, 1.0)
+    of_three = np.repeat(linear[..., None], 3, axis=-1)
+    assert halo(of_three, INSIDE, INSIDE) == 0
+    assert halo(of_three, np.hypot(ROW - 60, COLUMN - 80) < 4, KNOWN) == 0
+
+
+# ── A lens's distortion is undone: against the picture that a pinhole takes of the same thing ───────────────────────
+
+
+W, H = 90, 60
+CAMERA = Intrinsics(focal_px=140.0, principal_point=(86.0, 64.0), distortion=(-0.2, 0.05))
+LENS = radial_lens(CAMERA, 2, W, H)
+
+
+def scene(points):
+    """What a pinhole shows at image points: three smooth channels."""
+    x, y = points[..., 0], points[..., 1]
+    return np.stack([2 + np.sin(x / 9), 2 + np.cos(y / 7), 2 + np.sin((x + y) / 11)], axis=-1)
+
+
+def pixels(height=H, width=W):
+    return np.stack(np.meshgrid(np.arange(width) + 0.5, np.arange(height) + 0.5), axis=-1)
+
+
+def taken():
+    """The photo that the lens takes of the scene; one pixel is clipped, another is no number."""
+    radiance = scene(LENS.undistorted(pixels().reshape(-1, 2)).reshape(H, W, 2)).astype("f4")
+    clipped, finite = np.zeros((H, W, 3), bool), np.ones((H, W), bool)
+    clipped[30, 40, 1], finite[20, 20] = True, False
+    return Photo(radiance, clipped, finite, None, W, H, "linear")
+
+
+def test_it_is_the_picture_of_a_pinhole_and_says_where_it_has_none():
+    straight = Undistorted(LENS, H, W)
+    photo = straight.photo(taken())
+    assert np.abs(photo.radiance - scene(pixels()))[photo.finite].max() < 0.02
+    assert np.abs(taken().radiance - scene(pixels())).max() > 0.3, "the lens is one that matters"
+    (y, x), (v, u) = (np.argwhere(of).mean(0) + 0.5 for of in (photo.clipped[..., 1], straight.inside & ~photo.finite))
+    np.testing.assert_allclose(LENS.distorted(np.array([[x, y], [u, v]])), [[40.5, 30.5], [20.5, 20.5]], atol=0.6)
+    barrel = radial_lens(Intrinsics(focal_px=140.0, distortion=(0.2, 0.0)), 2, W, H)
+    edge = Undistorted(barrel, H, W)
+    assert not edge.inside[0, 0] and edge.inside[H // 2, W // 2]
+    assert not edge.nearest(np.ones((H, W), bool))[~edge.inside].any()
+
+
+def test_points_go_there_and_back_and_the_distortion_is_the_one_that_is_written_down():
+    points = pixels()[::9, ::9].reshape(-1, 2)
+    np.testing.assert_allclose(LENS.undistorted(LENS.distorted(points)), points, atol=1e-6)
+    slopes = (points - [43.0, 32.0]) / 70.0
+    r2 = np.square(slopes).sum(1, keepdims=True)
+    np.testing.assert_allclose(LENS.distorted(points), [43, 32] + 70 * slopes * (1 - 0.2 * r2 + 0.05 * r2**2))
+
+
+def test_coefficients_of_no_lens_are_refused_and_no_distortion_is_no_lens():
+    folded = radial_lens(Intrinsics(focal_px=140.0, distortion=(-3.0, 0.0)), 2, W, H)
+    refusal("map two rays", folded.check, W, H, "dataset.yaml", "photos[a].camera.distortion")
+    LENS.check(W, H, "dataset.yaml", "photos[a].camera.distortion")
+    assert radial_lens(None, 1, W, H) is None and radial_lens(Intrinsics(focal_px=140.0), 1, W, H) is None

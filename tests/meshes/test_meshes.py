@@ -1,0 +1,298 @@
+"""Meshes: what is read of files and what is refused, smooth normals, and subdivision."""
+
+import logging
+
+import numpy as np
+import pytest
+import trimesh
+from scipy.spatial.transform import Rotation
+
+from factorlib.meshes.limits import Limits
+from factorlib.meshes.mesh import Mesh, area_vectors
+from factorlib.meshes.normals import consistently_wound, corner_normals
+from factorlib.meshes.ply import submesh, write_ply
+from factorlib.meshes.read import merged_normals, read_mesh, usable
+from factorlib.meshes.subdivision import SubdividedMesh, subdivide, subdivided_mesh
+from factorlib.meshes.triangle_soup import TriangleSoup, no_normals
+from tests.faults.sample import DATA, MESHES, OFF, PLY, PLY_FACES, PLY_TEXT, STL_TEXT, VERTICES, glb, gltf_header, put
+from tests.refusal import refusal
+
+MATERIALS = ["red", "oak"]
+PARTS = {"shell": "red", "legs": "oak"}
+QUADS = "".join(f"v {x} {y} {z}\n" for z in (0, 1) for x, y in ((0, 0), (1, 0), (1, 1), (0, 1)))
+QUADS += """
+g shell
+usemtl plastic
+f 4 3 2 1
+f 5 6 7 8
+f 1 2 6 5
+g legs
+usemtl wood
+f 2 3 7 6
+f 3 4 8 7
+f -8 -4 -1 -5
+"""
+
+
+def read_all(path, content):
+    return read_mesh(put(path, content), MATERIALS, "red")
+
+
+def area_of(mesh, label):
+    return np.linalg.norm(area_vectors(mesh.vertices, mesh.faces[mesh.face_label == label]), axis=1).sum()
+
+
+@pytest.mark.parametrize(
+    "parts", [{"shell": "red", "legs": "oak"}, {"plastic": "red", "wood": "oak"}, {"shell": "red", "wood": "oak"}]
+)
+def test_obj_parts_go_by_group_or_usemtl_without_a_material_file(tmp_path, parts):
+    mesh = read_mesh(put(tmp_path / "mesh.obj", QUADS), MATERIALS, parts)
+    assert len(mesh.faces) == 12  # quads and negative indices
+    assert area_of(mesh, 1) == pytest.approx(3) and area_of(mesh, 2) == pytest.approx(3)
+    assert not mesh.open
+
+
+@pytest.mark.parametrize("parts, words, cure", [
+    ({"shell": "red"}, "legs.*no material", "legs: red|wood: red"),
+    ({"shel": "red", "legs": "oak"}, "no part 'shel'", "did you mean 'shell'?"),
+    ({"shell": "red", "plastic": "oak", "legs": "oak"}, "several materials", "one of its names only"),
+    ({"shell": "red", "legs": "ok"}, "unknown material 'ok'", "did you mean 'oak'?"),
+])  # fmt: skip
+def test_parts_and_materials_that_do_not_fit_are_named(tmp_path, parts, words, cure):
+    caught = refusal(words, read_mesh, put(tmp_path / "mesh.obj", QUADS), MATERIALS, parts)
+    assert "mesh.obj" in str(caught) and any(each in caught.cure for each in cure.split("|"))
+
+
+def test_bad_faces_are_dropped_with_a_note(tmp_path, caplog):
+    with caplog.at_level(logging.INFO, "factorlib.meshes"):
+        mesh = read_mesh(put(tmp_path / "mesh.obj", QUADS + "f 1 2 2\nf 4 3 2\nf 2 3 4\n"), MATERIALS, PARTS)
+    assert len(mesh.faces) == 12  # 4 3 2 is half of the first quad, in either winding
+    assert "1 zero-area" in caplog.text and "2 duplicate" in caplog.text
+
+
+def test_glb_nodes_are_placed_and_parts_named(tmp_path):
+    scene = trimesh.Scene()
+    for name, material, shift in (("seat", "plastic", 0.0), ("leg", "wood", 3.0)):
+        box = trimesh.creation.box((1, 1, 1))
+        box.visual = trimesh.visual.TextureVisuals(material=trimesh.visual.material.PBRMaterial(name=material))
+        scene.add_geometry(box, geom_name=name, transform=trimesh.transformations.translation_matrix((shift, 0, 0)))
+    scene.export(tmp_path / "chair.glb")
+    for parts in ({"seat": "red", "leg": "oak"}, {"plastic": "red", "wood": "oak"}):
+        mesh = read_mesh(tmp_path / "chair.glb", MATERIALS, parts)
+        oak = mesh.vertices[np.unique(mesh.faces[mesh.face_label == 2])]
+        assert np.allclose(oak.mean(axis=0), (3, 0, 0)) and mesh.labels == (1, 2)
+
+
+def test_written_ply_is_read_again_and_is_the_same_bytes_and_a_submesh_holds_one_material(tmp_path):
+    mesh = read_mesh(put(tmp_path / "mesh.obj", QUADS), MATERIALS, PARTS)
+    for name in ("a.ply", "b.ply"):
+        write_ply(tmp_path / name, mesh)
+    assert (tmp_path / "a.ply").read_bytes() == (tmp_path / "b.ply").read_bytes()
+    again = read_mesh(tmp_path / "a.ply", MATERIALS, "red")
+    corners = [sorted(map(tuple, np.round(m.vertices[m.faces].reshape(-1, 9), 6))) for m in (mesh, again)]
+    assert corners[0] == corners[1]
+    parts = [submesh(mesh, label) for label in mesh.labels]
+    assert sum(len(p.faces) for p in parts) == 12 and all(p.faces.max() == len(p.vertices) - 1 for p in parts)
+
+
+def test_gltf_nodes_lie_in_each_other_scaled_then_turned_then_moved(tmp_path):
+    turn, header, outer = Rotation.from_euler("xyz", [0.3, -0.8, 1.1]), gltf_header(), np.eye(4)
+    outer[:3, 3] = (5, 6, 7)
+    header["nodes"] = [
+        {"matrix": outer.T.ravel().tolist(), "children": [1]},
+        {"mesh": 0, "scale": [1, 2, 3], "rotation": turn.as_quat().tolist(), "translation": [1, 0, 0]},
+    ]
+    (tmp_path / "a.glb").write_bytes(glb(header))
+    expected = turn.apply(VERTICES * (1, 2, 3)) + (6, 6, 7)
+    found = np.unique(read_mesh(tmp_path / "a.glb", MATERIALS, "red").vertices.round(5), axis=0)
+    assert np.allclose(found, np.unique(expected.round(5), axis=0), atol=2e-5)
+
+
+@pytest.mark.parametrize("suffix", ["ply", "glb"])
+def test_normals_of_the_file_are_used(tmp_path, suffix):
+    ball = trimesh.creation.icosphere(subdivisions=1)
+    tilted = ball.vertex_normals + 0.2 * np.roll(ball.vertex_normals, 1, axis=1)
+    tilted /= np.linalg.norm(tilted, axis=1, keepdims=True)
+    made = trimesh.Trimesh(ball.vertices, ball.faces, vertex_normals=tilted, process=False)
+    options = {"vertex_normal": True} if suffix == "ply" else {}
+    (tmp_path / f"ball.{suffix}").write_bytes(made.export(file_type=suffix, **options))
+    mesh = read_mesh(tmp_path / f"ball.{suffix}", MATERIALS, "red")
+    nearest = np.argmin(np.linalg.norm(mesh.vertices[:, None] - ball.vertices, axis=2), axis=1)
+    assert np.allclose(mesh.normals, tilted[nearest], atol=1e-5)
+
+
+@pytest.mark.parametrize("name", MESHES)
+def test_the_tetrahedron_is_the_same_in_every_format_and_no_larger_than_allowed(tmp_path, name):
+    path = put(tmp_path / name, MESHES[name])
+    mesh = read_mesh(path, MATERIALS, "red", limits=Limits(triangles=4))
+    assert len(mesh.faces) == 4 and not mesh.open and mesh.radius == pytest.approx(0.75**0.5)
+    assert "simplify" in refusal("4 triangles", read_mesh, path, MATERIALS, "red", limits=Limits(triangles=3)).cure
+
+
+def test_gltf_strips_and_repeated_primitives_are_read_and_fans_and_sparse_accessors_refused(tmp_path):
+    header = gltf_header()
+    header["accessors"][1]["count"] = 4
+    header["meshes"][0]["primitives"][0]["mode"] = 5
+    data = DATA[:48] + np.array([0, 1, 2, 3], "<u2").tobytes().ljust(24, b"\0")
+    assert len(read_all(tmp_path / "a.glb", glb(header, data)).faces) == 2
+    header["meshes"][0]["primitives"][0]["mode"] = 6
+    refusal("triangle fan", read_all, tmp_path / "a.glb", glb(header, data))
+    header = gltf_header()
+    indices, values = {"bufferView": 1, "componentType": 5121}, {"bufferView": 0}
+    header["accessors"][0]["sparse"] = {"count": 1, "indices": indices, "values": values}
+    refusal("sparse accessor", read_all, tmp_path / "a.glb", glb(header))
+    header = gltf_header()
+    header["meshes"][0]["primitives"] *= 3
+    header["nodes"] = [{"children": [1, 2]}, {"mesh": 0}, {"mesh": 0, "translation": [3, 0, 0]}]
+    assert len(read_all(tmp_path / "a.glb", glb(header)).faces) == 8
+
+
+def test_gltf_positions_of_normalized_integers_are_fractions(tmp_path):
+    header = gltf_header()
+    header["accessors"][0] |= {"componentType": 5123, "normalized": True}
+    header["bufferViews"][0] |= {"byteStride": 12}
+    data = np.pad((VERTICES * 65535).astype("<u2"), ((0, 0), (0, 3))).tobytes() + DATA[48:]
+    assert read_all(tmp_path / "a.glb", glb(header, data)).vertices.max() == 1
+
+
+def binary_ply_of(*polygons):
+    faces = b"".join(bytes([len(polygon)]) + np.array(polygon, "<i4").tobytes() for polygon in polygons)
+    return PLY[: -len(PLY_FACES)].replace(b"face 4", b"face %d" % len(polygons)) + faces
+
+
+SQUARE_AND_TWO = ((0, 1, 3, 2), (0, 1, 2), (1, 2, 3))
+CUT = {"a.off": OFF[:-8], "a.ply": PLY_TEXT[:-8], "a.stl": STL_TEXT + STL_TEXT[:-40]}
+
+
+@pytest.mark.parametrize("name", CUT)
+def test_a_truncated_text_is_refused(tmp_path, name):
+    refusal(".", read_all, tmp_path / name, CUT[name])
+
+
+def test_polygons_of_different_lengths_in_a_binary_ply_are_read(tmp_path):
+    assert len(read_all(tmp_path / "a.ply", binary_ply_of(*SQUARE_AND_TWO)).faces) == 4
+
+
+# ── Smooth normals: exact on a sphere, sharp at creases, indifferent to duplicates, winding and tessellation ────────
+
+
+def usable_mesh(vertices, faces, normals=None, crease_deg=60.0):
+    faces = np.asarray(faces)
+    supplied = no_normals(len(faces)) if normals is None else normals
+    soup = TriangleSoup(np.asarray(vertices, float), faces, np.zeros(len(faces), int), [("a",)], supplied)
+    return usable(soup, np.ones(len(faces), int), crease_deg, "m")
+
+
+def test_a_cube_is_sharp_or_rounded_by_the_crease_angle_and_angles_not_triangle_counts_weigh():
+    box = trimesh.creation.box((1, 1, 1))
+    sharp, smooth = usable_mesh(box.vertices, box.faces), usable_mesh(box.vertices, box.faces, crease_deg=100)
+    assert len(sharp.vertices) == 24 and np.allclose(np.abs(sharp.normals).max(axis=1), 1)
+    round_ = smooth.vertices / np.linalg.norm(smooth.vertices, axis=1, keepdims=True)
+    assert len(smooth.vertices) == 8 and np.allclose(smooth.normals, round_)
+    mesh = usable_mesh(*trimesh.remesh.subdivide(box.vertices, box.faces, face_index=[0, 1]), crease_deg=100)
+    corner = np.argmin(np.linalg.norm(mesh.vertices - 0.5, axis=1))  # of a side that is cut into many triangles
+    assert np.allclose(mesh.normals[corner], 1 / np.sqrt(3))
+
+
+def test_a_sphere_is_smooth_whether_its_triangles_share_vertices_or_not():
+    ball = trimesh.creation.icosphere(subdivisions=3)
+    soup = ball.triangles.reshape(-1, 3) + np.random.default_rng(0).normal(size=(len(ball.faces) * 3, 3)) * 1e-9
+    split, shared = usable_mesh(soup, np.arange(len(soup)).reshape(-1, 3)), usable_mesh(ball.vertices, ball.faces)
+    assert len(split.vertices) == len(shared.vertices) == len(ball.vertices)  # no crease: every vertex once
+    assert np.rad2deg(np.arccos(np.sum(shared.normals * shared.vertices, axis=1).min())) < 0.6
+    assert np.allclose(np.sort(split.normals @ [1, 2, 3]), np.sort(shared.normals @ [1, 2, 3]), atol=1e-6)
+
+
+def test_flipped_faces_are_turned_back_unless_most_of_an_open_patch_is():
+    ball = trimesh.creation.icosphere(subdivisions=2)
+    faces = ball.faces.copy()
+    faces[::3] = faces[::3, ::-1]
+    for flipped in (faces, ball.faces[:, ::-1]):
+        mesh = usable_mesh(ball.vertices, flipped)
+        assert np.sum(mesh.normals * mesh.vertices, axis=1).min() > 0.99
+    bowl = ball.faces[ball.triangles_center[:, 2] > 0][:, ::-1]  # inward, on purpose
+    flip, is_open = consistently_wound(ball.vertices, bowl)
+    assert is_open and not flip.any()
+
+
+def test_supplied_normals_are_used_where_sane():
+    ball = trimesh.creation.icosphere(subdivisions=1)
+    exact = ball.vertices[ball.faces]
+    spoilt = exact.copy()
+    spoilt[0], spoilt[1] = -exact[0], 0.0
+    own = corner_normals(ball.vertices, ball.faces, 60.0)
+    merged = merged_normals(own, spoilt, ball.face_normals)
+    assert np.allclose(merged[2:], exact[2:]) and np.allclose(merged[:2], own[:2])
+
+
+# ── Subdivided meshes: closed meshes stay closed, gradients are exact, and a displacement is found again from the tur
+
+
+def labelled_mesh(solid: trimesh.Trimesh, factors=(1.0, 1.0, 1.0)) -> Mesh:
+    """A trimesh with smooth normals of its own, two labels and stretched axes."""
+    vertices = np.array(solid.vertices) * factors
+    label = 1 + (np.arange(len(solid.faces)) % 3 == 0).astype(np.int16)
+    normals = trimesh.Trimesh(vertices, solid.faces, process=False).vertex_normals
+    return Mesh(vertices, np.array(solid.faces, np.int32), np.array(normals), label)
+
+
+def ball(subdivisions: int = 2, factors=(1.0, 1.0, 1.0)) -> Mesh:
+    """An icosphere of radius 1, its axes times `factors`."""
+    return labelled_mesh(trimesh.creation.icosphere(subdivisions), factors)
+
+
+SOLIDS = {
+    "box": labelled_mesh(trimesh.creation.box((1, 0.3, 0.07))),
+    "cone": labelled_mesh(trimesh.creation.cone(0.2, 1.0, sections=9)),
+    "ball": ball(1),
+}
+
+
+@pytest.mark.parametrize("name", SOLIDS)
+@pytest.mark.parametrize("longest", [0.5, 0.11, 0.05])
+def test_a_closed_mesh_stays_closed_and_keeps_its_area_its_labels_and_its_winding(name, longest):
+    mesh = SOLIDS[name]
+    dense = subdivide(mesh, longest)
+    ends = dense.vertices[np.stack([dense.faces, np.roll(dense.faces, -1, axis=1)])]
+    assert np.linalg.norm(ends[0] - ends[1], axis=-1).max() <= longest
+    edges = np.stack([dense.faces, np.roll(dense.faces, -1, axis=1)], axis=-1).reshape(-1, 2)
+    assert len(np.unique(edges, axis=0)) == len(
+        edges
+    )  # no edge twice in one direction: as closed and as wound as before
+    assert np.array_equal(np.unique(edges, axis=0), np.unique(edges[:, ::-1], axis=0))
+    before, after = (area_vectors(of.vertices, of.faces) for of in (mesh, dense))
+    for label in mesh.labels:  # vectors: areas, and directions too
+        sums = [of[m.face_label == label].sum(0) for of, m in ((before, mesh), (after, dense))]
+        areas = [np.linalg.norm(of[m.face_label == label], axis=1).sum() for of, m in ((before, mesh), (after, dense))]
+        np.testing.assert_allclose(*sums, atol=1e-12)
+        np.testing.assert_allclose(*areas)
+
+
+def smooth(body: SubdividedMesh, size: float) -> np.ndarray:
+    """A displacement of waves, of mean 0."""
+    place = np.zeros((body.nodes, 3))
+    place[body.node] = body.mesh.vertices / body.extent
+    wave = size * np.sin(7 * place @ [1.0, 0.5, 0.2]) * np.cos(5 * place[:, 1])
+    return wave - wave.mean()
+
+
+def test_a_displacement_is_found_from_the_turns_that_it_means():
+    body = subdivided_mesh(ball(3))
+    true = smooth(body, 0.02)
+    found = body.displacement(body.turn_of(true), np.ones(body.nodes))
+    assert np.std(found - found.mean() - true) < 0.05 * np.std(true)
+
+
+def test_a_ball_that_was_given_as_an_ellipsoid_gets_its_normals_back():
+    given = ball(3, (1.0, 1.12, 0.9))
+    body = subdivided_mesh(given)
+    true = body.mesh.vertices / np.array([1.0, 1.12, 0.9])  # of the ball that each point stands for
+    true /= np.linalg.norm(true, axis=1, keepdims=True)
+    turn = np.zeros((body.nodes, 3))
+    turn[body.node] = true - body.mesh.normals
+    moved = body.moved(body.displacement(turn, np.ones(body.nodes)))
+    before, after = (
+        np.degrees(np.arccos(np.clip(np.sum(n * true, 1), -1, 1))) for n in (body.mesh.normals, moved.normals)
+    )
+    assert np.median(after) < 0.25 * np.median(before)
+    assert np.ptp(np.linalg.norm(moved.vertices, axis=1)) < 0.7 * np.ptp(np.linalg.norm(given.vertices, axis=1))
