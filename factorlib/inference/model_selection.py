@@ -1,8 +1,8 @@
 """Model choices that a scene needs, made in the model that gives the answer.
 
 effects     No shadows, shadows of the given meshes, or shadows with interreflection, on fewer observations and cells.
-            The first model is fitted from every start, the others from its result.  Shadows stay unless the evidence is
-            against them.  Interreflection needs evidence and shadows.
+            The first model is fitted from every start, the others from its result.  Shadows stay unless held-out
+            observations are against them.  Interreflection needs shadows, and a marginal likelihood that supports it.
 tone        Exponents of tone curves are freed for all photos.  A light keeps its curves under three conditions: the
             evidence supports them, the loss without them is more than `LEAST_TONE_GAIN` higher, and they end within the
             range of real cameras.  An exponent also fits some errors of the rest of the model, such as wrong normals.
@@ -12,7 +12,7 @@ roughness   With few materials, the start decides which local minimum a fit reac
             looks like a rough one in sharp light.  Of the fits from several starts, the one of least held-out loss
             continues.
 
-Effects and tone curves compare two models that are fitted to the same observations with reliable normals, by
+Shadows and tone curves compare two models that are fitted to the same observations with reliable normals, by
 held-out observations.  These are whole cells of mirror directions (`factorlib.inference.observed`).  Let a_i and b_i be
 the mean robust losses of light i without and with the richer part, and n_i the number of its held-out observations.
 Then
@@ -46,8 +46,8 @@ from factorlib.inference.problem import JointProblem
 from factorlib.results.materials import Decision
 
 LEAST_LOSS = 1e-4  # added to every loss, in σ² of the noise model: two losses far below it count as equal
-# Thresholds, in standard errors.  Shadows are dropped only if the evidence is clearly against them.  Interreflection
-# and tone curves need clear evidence.  Smaller cells obey the same prior as larger ones: one standard error is enough.
+# Thresholds, in standard errors.  Shadows are dropped only if the evidence is clearly against them.  Tone curves need
+# clear evidence.
 CLEARLY_AGAINST = -2.0
 CLEARLY_FOR = 2.0
 WEAKLY_FOR = 1.0
@@ -56,6 +56,8 @@ TRIAL_OBSERVATIONS = 1000
 TRIAL_CELLS = 180
 TRIAL = FitSchedule(light_steps=3, joint_steps=(6, 4))
 CONTINUED_TRIAL = FitSchedule(light_steps=2, joint_steps=(4, 2), estimate_first=False)
+BOUNCE_SCHEDULE = FitSchedule(light_steps=2, joint_steps=(6,), estimate_first=False)
+AFTER_BOUNCES = FitSchedule(joint_steps=(2,))
 TONE_SCHEDULE = FitSchedule(joint_steps=(8,), estimate_first=False)
 # Least relative gain of the held-out loss.  Under two standard errors alone, a photo with a wrong pose got a curve
 # (margin 3.0, captured set of seed 7), and k_d was 30 % wrong instead of 13 %.
@@ -179,9 +181,17 @@ def select_effects(problem: JointProblem, starts: list[Fit], options: SolveOptio
     if not shadow_decision.kept:
         fit = trial(False, False)[0]
         return SolveState(fit, fit, shadow_decision)
-    if bounces == "auto":
-        bounce_decision = compare_models(trial(True, False)[1], trial(True, True)[1], CLEARLY_FOR)
-    fit = trial(True, bounce_decision.kept)[0]
+    if bounces != "auto":
+        fit = trial(True, bounce_decision.kept)[0]
+        return SolveState(fit, fit, shadow_decision, bounce_decision)
+    # both models continue from the same fit, under its hyperparameters
+    start = trial(True, False)[0]
+    models = [sample.with_effects(True, with_bounces) for with_bounces in (False, True)]
+    fits = [run_fit("shadows and bounces", model, start, BOUNCE_SCHEDULE) for model in models]
+    log_bayes_factor = (fits[0].value - fits[1].value) / 2
+    bounce_decision = Decision(log_bayes_factor > VERY_STRONG, log_bayes_factor=log_bayes_factor)
+    chosen = int(bounce_decision.kept)
+    fit = run_fit("shadows and bounces", models[chosen], fits[chosen], AFTER_BOUNCES)
     return SolveState(fit, fit, shadow_decision, bounce_decision)
 
 

@@ -24,8 +24,8 @@ class SolveOptions(Struct, frozen=True):
     self_shadowing: Literal["auto", "on", "off"] = "auto"
     """Shadows of the meshes; auto: on, unless held-out observations are against them by two standard errors."""
     interreflection: Literal["auto", "on", "off"] = "auto"
-    """Light that surfaces send each other, as the photo shows it; needs self_shadowing.  auto: on, if held-out
-    observations support it by two standard errors."""
+    """Light that surfaces send each other, as the photo shows it; needs self_shadowing.  auto: on, if the
+    marginal likelihood supports it very strongly (log Bayes factor over 5)."""
     tone: Literal["auto", "off"] = "auto"
     """Tone curve of a photo beyond its encoding; auto: used if held-out observations support it by two standard errors
     and their loss is a quarter higher without it."""

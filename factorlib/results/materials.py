@@ -147,7 +147,7 @@ class Model(msgspec.Struct, frozen=True):
         held_out_loss: loss after each report of the paper's solver
         light_prior: True if lights are cells with the prior of natural light
         self_shadowing_chosen_by: held-out loss of each model that was tried, and the margin in standard errors
-        interreflection_chosen_by: held-out loss of each model that was tried, and the margin in standard errors
+        interreflection_chosen_by: log Bayes factor of the model with it; empty if not tried
         splitting_chosen_by: decision of each splitting of cells
         suns_chosen_by: decision on a sun, by illumination
         tone: curves of the photos that have one

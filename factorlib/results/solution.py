@@ -43,7 +43,7 @@ class Earlier(msgspec.Struct, frozen=True):
 
 
 def _decided(kept: bool, chosen_by: dict[str, float]) -> str | None:
-    return ("on" if kept else "off") if {"held_out_loss_with", "held_out_loss_without"} <= chosen_by.keys() else None
+    return ("on" if kept else "off") if chosen_by else None
 
 
 def read_earlier(folder: Path) -> Earlier:

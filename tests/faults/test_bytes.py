@@ -311,7 +311,7 @@ REFUSED = {
         *((text, "nested more than 64 deep") for text in (DEEP, "- " * 2000 + "a", "{a: " * 500 + "1" + "}" * 500)),
         ("format: " + "1" * 5000, "expected `int`, got `str`"), ("format: !!int 1", "the tag 'tag:yaml.org,2002:int' is not known"),
         ("format: !!python/tuple [1]", "the tag 'tag:yaml.org,2002:python/tuple' is not known"),
-        ("format: *none", "no &none above"),
+        ("format: *none", "found undefined alias"),
         ("format: 1\n---\nformat: 2\n", "another document"), ("format: \x07", "not YAML"),
         ("\x00\x00\x00", "not YAML"),
         (yaml.safe_dump(DATASET) + "results: {red: 1}\n", "results"),

@@ -95,8 +95,7 @@ def test_the_solve_finds_out_that_bowls_light_themselves_and_how_bright_they_are
         solution = solved(lit, OF_SHAPES, self_shadowing="on", interreflection=choice)
         off = solution.point.materials.diffuse / MATERIALS.diffuse - 1  # absolute: no factor is taken out
         error[choice] = np.abs(off).mean()
-    assert solution.interreflection.kept and solution.interreflection.margin > CLEARLY_FOR
-    assert solution.interreflection.held_out_loss_with < solution.interreflection.held_out_loss_without
+    assert solution.interreflection.kept and solution.interreflection.log_bayes_factor > VERY_STRONG
     assert error["auto"] < 0.5 * error["off"], error
 
 
@@ -209,7 +208,7 @@ def test_without_held_out_observations_shadows_stay_and_nothing_further_is_decid
     """All would be judged by the observations that they were fitted to, which more always explains better."""
     found = solved([none_held_out(block) for block in lit], QUICK, cells=24, observations=100)
     assert found.shadows.kept and found.shadows.margin is None
-    assert not found.interreflection.kept and found.interreflection.margin is None
+    assert not found.interreflection.kept and found.interreflection.log_bayes_factor is None
     assert not any(one.kept for one in found.tone) and found.splitting == []
 
 
