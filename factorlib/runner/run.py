@@ -55,6 +55,8 @@ def run(state: DatasetState, display: Display) -> Run:
         finally:
             for step in current.running.values():
                 os.close(step.lock)
+            if current.failed:
+                state.store.forget_all()  # An input may have been damaged meanwhile.
             state.publish(state.plan(frozenset()))
         return current
 

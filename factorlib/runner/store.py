@@ -191,6 +191,12 @@ class Store:
         self._entries.pop(key, None)
         self.damaged.pop(key, None)
 
+    def forget_all(self) -> None:
+        """Read all keys from disk when they are next asked for."""
+        self._outputs.clear()
+        self._entries.clear()
+        self.damaged.clear()
+
     def unchanged(self, keys: Iterable[str]) -> bool:
         """Return True if the keys still have their outputs, read from disk again."""
         before = {key: self._outputs.get(key) for key in keys}
