@@ -43,7 +43,7 @@ class Earlier(msgspec.Struct, frozen=True):
 
 
 def _decided(kept: bool, chosen_by: dict[str, float]) -> str | None:
-    return ("on" if kept else "off") if chosen_by else None
+    return ("on" if kept else "off") if chosen_by.keys() & {"margin", "log_bayes_factor"} else None
 
 
 def read_earlier(folder: Path) -> Earlier:
