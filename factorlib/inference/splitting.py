@@ -28,19 +28,20 @@ AFTER_SPLITTING = FitSchedule(light_steps=2, joint_steps=(3, 2), estimate_first=
 SPLIT_CELLS = 24  # number of a light's cells that split at once
 # Least distance between cells, degrees: the sun's width.  A cell splits only if its neighbours are twice as far.
 LEAST_SPACING_DEG = 0.5
-# Where smaller cells gain much, errors of the model are small, and those of few observations matter: k_d of
-# data/synthetic is 13 % wrong with 1,000 observations, 2.6 % with 4,000 and 1.0 % with 8,000.
+# Errors of the model are small where smaller cells gain much and residuals are hardly correlated.  Errors of few
+# observations matter there: k_d of data/synthetic is 13 % wrong with 1,000, 2.6 % with 4,000 and 1.0 % with 8,000.
 OBSERVATION_FACTOR = 8  # factor on the number of observations there
-# Least mean log Bayes factor of an observation there: 0.44 and 0.20 on exact spheres and data/synthetic, at
-# most 0.09 on six sets of rendered photographs with wrong normals.
-LARGE_BAYES_FACTOR = 0.13
+# Least mean log Bayes factor of a fitted observation, and largest mean temperature of the lights: 0.18 and 1 on
+# data/synthetic, 0.39 and 1 on exact spheres; 0.13 and 6 on the set of seed 104, at most 0.06 on other such sets.
+LARGE_BAYES_FACTOR = 0.1
+LOW_TEMPERATURE = 1.5
 
 
 def split_cells(problem: JointProblem, state: SolveState, options: SolveOptions, run: FitRunner) -> SolveState:
     """Split the cells with most energy, at most `SolveOptions.splittings` times, while (1) of any light supports it.
 
-    If the first splitting has a log Bayes factor above `LARGE_BAYES_FACTOR` times the number of observations, all later
-    fits use `OBSERVATION_FACTOR` times as many.
+    If the first splitting has a log Bayes factor above `LARGE_BAYES_FACTOR` times the number of observations, at a mean
+    temperature below `LOW_TEMPERATURE`, all later fits use `OBSERVATION_FACTOR` times as many.
 
     Args:
         problem: Observations with reliable normals, under the chosen effects.
@@ -62,7 +63,9 @@ def split_cells(problem: JointProblem, state: SolveState, options: SolveOptions,
         evidence.append(Decision(bool(supported.any()), log_bayes_factor=total))
         if not supported.any():
             break
-        if number == 0 and total > LARGE_BAYES_FACTOR * sample.fitted_count:
+        temperature = float(np.mean([hyperparameters.temperature for hyperparameters in fit.hyperparameters]))
+        large = total > LARGE_BAYES_FACTOR * sample.fitted_count and temperature < LOW_TEMPERATURE
+        if number == 0 and large:
             observations = OBSERVATION_FACTOR * observations
             sample = problem.subsample(observations, options.seed)
         pairs = zip(fit.point.lights, finer, strict=True)
