@@ -88,11 +88,6 @@ class JointProblem(msgspec.Struct, frozen=True):
         """True if all observations are fitted, so that none can select a model."""
         return not any(block.held_out.any() for block in self.blocks)
 
-    @property
-    def fitted_count(self) -> int:
-        """Number of observations that are not held out."""
-        return sum(int((~block.held_out).sum()) for block in self.blocks)
-
     def subsample(self, count: int | Sequence[int], seed: int) -> JointProblem:
         """Return the problem with at most `count` fitted and `count` held-out observations of each block.
 

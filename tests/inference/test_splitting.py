@@ -65,11 +65,10 @@ def test_a_constant_light_needs_no_finer_cells():
     assert after.fit is before.fit and after.observations == before.observations
 
 
-@pytest.mark.parametrize(("threshold", "factor"), [(0.9, OBSERVATION_FACTOR), (1.1, 1)])
-def test_where_finer_cells_gain_much_more_observations_are_fitted(lamps, monkeypatch, threshold, factor):
-    problem, before, after = lamps
-    gain = after.splitting[0].log_bayes_factor / problem.subsample(before.observations, ONCE.seed).fitted_count
-    monkeypatch.setattr(splitting, "LARGE_BAYES_FACTOR", threshold * gain)
+@pytest.mark.parametrize(("threshold", "factor"), [(np.inf, OBSERVATION_FACTOR), (0.0, 1)])
+def test_where_observations_are_explained_closely_more_of_them_are_fitted(lamps, monkeypatch, threshold, factor):
+    problem, before, _ = lamps
+    monkeypatch.setattr(splitting, "SMALL_LOSS", threshold)
     assert split(problem, before).observations == factor * before.observations
 
 
