@@ -1,7 +1,8 @@
 """Joint solve: one reflectance per material and one light per illumination, from all photos at once.
 
-effects     Held-out observations choose shadows and interreflection (`factorlib.inference.model_selection`).
-tone        They choose tone curves.
+effects     Held-out observations choose shadows, and marginal likelihoods interreflection
+            (`factorlib.inference.model_selection`).
+tone        Held-out observations choose tone curves.
 distances   Marginal likelihoods choose distances of lights.
 materials   Materials and lights are fitted together to observations with reliable normals (`factorlib.inference.fit`).
 splitting   The cells with most of a light's energy split in four while its marginal likelihood rises
@@ -45,13 +46,13 @@ class SolveRequest(msgspec.Struct, frozen=True):
 
     Attributes:
         problem: All observations; its loss judges the held-out ones.
-        start: Maker of the initial fits.
+        starts: Initial fits of the first trial, of which the best one continues.
         options: Options of the user.
         run: Runner of the fits.
     """
 
     problem: JointProblem
-    start: Start
+    starts: list[Fit]
     options: SolveOptions
     run: FitRunner
 
@@ -77,27 +78,25 @@ def solve(
         run: Runner that saves states and reports events; None for one without a file.
     """
     run = run or FitRunner()
-    request = SolveRequest(problem, start, options, run)
-    start_fit = initial_fits(request)[0]
-    state = run.run_steps(STEPS, request, SolveState(start_fit, start_fit))
-    answer = fix_gauge(state.fit.point, problem.blocks, problem.known)
+    request = SolveRequest(problem, initial_fits(problem, start, options), options, run)
+    state = run.run_steps(STEPS, request, SolveState(request.starts[0], request.starts[0]))
+    answer = fix_gauge(state.fit.point, state.effective_problem(problem).blocks, problem.known)
     point = Point(problem.known.insert_into(answer.materials), answer.lights)
     steps = {name: getattr(state, name) for name in SolveState.__struct_fields__}
     return Solution(**steps, point=point, history=run.history)
 
 
-def initial_fits(request: SolveRequest) -> list[Fit]:
-    """Return the initial fits of the first trial, of which the best one continues."""
-    problem = reliable_observations(request.problem)
-    cells = min(TRIAL_CELLS, request.options.cells)
-    fits = request.start(problem, cells)
+def initial_fits(problem: JointProblem, start: Start, options: SolveOptions) -> list[Fit]:
+    """Return the initial fits of the first trial."""
+    problem = reliable_observations(problem)
+    fits = start(problem, min(TRIAL_CELLS, options.cells))
     return [msgspec.structs.replace(fit, point=insert_known(fit.point, problem)) for fit in fits]
 
 
 def choose_effects(request: SolveRequest, state: SolveState) -> SolveState:
     """Choose shadows and interreflection."""
     problem = reliable_observations(request.problem)
-    return select_effects(problem, initial_fits(request), request.options, request.run.fit)
+    return select_effects(problem, request.starts, request.options, request.run.fit)
 
 
 def choose_tone(request: SolveRequest, state: SolveState) -> SolveState:

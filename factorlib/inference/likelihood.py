@@ -14,12 +14,14 @@ is then
 up to a constant.  The rows of J are weighted by the robust loss, and those of clipped channels that are bright enough
 are zero.  Without the determinant, light and materials are ambiguous.  The ambiguity then always favours the light of
 least contrast and the materials of least roughness, as blind deconvolution favours no blur (Levin et al. 2009,
-"Understanding and evaluating blind deconvolution algorithms").  Radiance is linear in w ∝ exp(u), so ∂J/∂θ and ∂J/∂u
-are known exactly.  With Σ = H⁻¹
+"Understanding and evaluating blind deconvolution algorithms").  Radiance is linear in w ∝ exp(u) and in exposures e, so
+∂J/∂θ, ∂J/∂u and ∂J/∂log e are exact but for robust weights, clipping and slopes of tone curves, which are taken as
+constant.  With Σ = H⁻¹
 
-    ½ ∂ log det H/∂θ = Σ_i J_i Σ (∂J_i/∂θ)ᵀ / T,      ½ ∂ log det H/∂u_j = Σ_i (J_i Σ)_j J_ij / T.                  (2)
+    ½ ∂ log det H/∂θ = Σ_i J_i Σ (∂J_i/∂θ)ᵀ / T,
+    ½ ∂ log det H/∂u_j = Σ_i (J_i Σ)_j J_ij / T,      ½ ∂ log det H/∂log e_f = Σ_{i in photo f} J_i Σ J_iᵀ / T.      (2)
 
-The second acts on materials through the light that they imply, du/dθ = −L⁻¹Cᵀ (`factorlib.inference.optimizer`).
+The latter two act on materials through the light that they imply, du/dθ = −L⁻¹Cᵀ (`factorlib.inference.optimizer`).
 Without it, all reflectances would fall: a brighter light under darker materials has the same J.  The Gauss–Newton
 Hessian of the first, Σ_i ∂J_i Σ ∂J_iᵀ, only steers the steps of a descent.  Every `HESSIAN_STRIDE`-th row therefore
 stands for its neighbours.
@@ -174,7 +176,8 @@ class LightLikelihood(msgspec.Struct, frozen=True):
         value += loss / self.temperature
         if not materials_given:
             value += self._determinants(factor)
-            determinant = _determinant_derivatives(parts, cholesky_inverse(factor[: 3 * p, : 3 * p]), places, size)
+            covariance = cholesky_inverse(factor[: 3 * p, : 3 * p])
+            determinant = _determinant_derivatives(parts, covariance, places, illumination)
         scores = None if clusters is None else _scores(parts, clusters, places, size)
         return System(value, loss, places, g_m, M, g_l, C, L, factor, *determinant, scores)
 
@@ -245,7 +248,10 @@ def _scores(
 
 
 def _determinant_derivatives(
-    parts: Sequence[Linearised], covariance: Float[np.ndarray, "3p 3p"], places: Int[np.ndarray, " k"], size: int
+    parts: Sequence[Linearised],
+    covariance: Float[np.ndarray, "3p 3p"],
+    places: Int[np.ndarray, " k"],
+    illumination: Illumination,
 ) -> tuple[Float[np.ndarray, " k"], Float[np.ndarray, "k k"], Float[np.ndarray, " l"]]:
     """Return (2) summed over channels and materials: the first part, its Hessian, and the second part.
 
@@ -253,13 +259,15 @@ def _determinant_derivatives(
         parts: Linearised observations by channel and material.
         covariance: Σ of u.
         places: Indices of the k material unknowns.
-        size: Number of the light's unknowns.
+        illumination: Illumination of the parts.
     """
     k = len(places)
     p = len(covariance) // 3
+    light = illumination.light
     by_materials = np.zeros(k)
     by_materials_twice = np.zeros((k, k))
-    by_light = np.zeros(size)
+    by_light = np.zeros(light.unknowns)
+    by_exposure = np.zeros(len(light.log_exposure))
     for part in parts:
         cells = slice(part.channel * p, (part.channel + 1) * p)
         rows = np.searchsorted(places, part.places)
@@ -270,12 +278,17 @@ def _determinant_derivatives(
         # Σ_i J_i Σ ∂J_iᵀ and Σ_i (J_i Σ)_j J_ij, (2)
         JΣ = J @ Σ
         by_materials[rows] += [float(np.vdot(JΣ, slope)) for slope in slopes]
-        by_light[cells] += (JΣ * J).sum(0)
+        by_cell = JΣ * J
+        by_light[cells] += by_cell.sum(0)
+        # an exposure multiplies the rows J_i of its photo
+        by_exposure += np.bincount(illumination.block.photo[part.rows], by_cell.sum(1), len(by_exposure))
         # Σ_i ∂J_i Σ ∂J_iᵀ, from every HESSIAN_STRIDE-th row
         sparse = [slope[::HESSIAN_STRIDE] for slope in slopes]
         stride = len(J) / max(len(sparse[0]), 1)
         hessian = np.array([[float(np.vdot(a @ Σ, b)) for b in sparse] for a in sparse])
         by_materials_twice[np.ix_(rows, rows)] += stride * hessian
+    free_exposures = slice(3 * p, 3 * p + light.free_exposures)
+    by_light[free_exposures] = by_exposure[len(by_exposure) - light.free_exposures :]
     return by_materials, by_materials_twice, by_light
 
 

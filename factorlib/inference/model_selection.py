@@ -46,6 +46,7 @@ from factorlib.inference.problem import JointProblem
 from factorlib.results.materials import Decision
 
 LEAST_LOSS = 1e-4  # added to every loss, in σ² of the noise model: two losses far below it count as equal
+ONE_CLUSTER = 1.0  # variance of log a_i − log b_i where one cluster says nothing about it
 # Thresholds, in standard errors.  Shadows are dropped only if the evidence is clearly against them.  Tone curves need
 # clear evidence.
 CLEARLY_AGAINST = -2.0
@@ -114,7 +115,8 @@ def compare_models(simpler: Losses, richer: Losses, least: float) -> Decision:
         shares = [sums / max(float(sums.sum()), 1e-300) for sums in sums_pair]
         logs.append([np.log(np.mean(losses) + LEAST_LOSS) if len(losses) else 0.0 for losses in (a, b)])
         number = len(sums_pair[0])
-        variances.append(number / max(number - 1, 1) * float(np.sum((shares[0] - shares[1]) ** 2)))
+        spread = float(np.sum((shares[0] - shares[1]) ** 2))
+        variances.append(number / (number - 1) * spread if number > 1 else ONE_CLUSTER)
     share = counts / counts.sum()
     # d of (1) and its standard error
     d = float(share @ [log_pair[0] - log_pair[1] for log_pair in logs])
@@ -152,50 +154,51 @@ def select_effects(problem: JointProblem, starts: list[Fit], options: SolveOptio
     """
     sample = comparison_sample(problem, options)
     hidden = any(block.visibility is not None for block in problem.blocks)
-    # without held-out observations, shadows are on and interreflection is off
-    unjudged = problem.none_held_out
-    shadows = ("on" if unjudged else "auto") if options.self_shadowing == "auto" else options.self_shadowing
-    bounces = ("off" if unjudged else "auto") if options.interreflection == "auto" else options.interreflection
-    shadows = shadows if hidden else "off"
-    bounces = bounces if problem.has_bounces else "off"
-    trials: dict[tuple[bool, bool], tuple[Fit, Losses]] = {}
+    shadows = options.self_shadowing if hidden else "off"
+    bounces = options.interreflection if problem.has_bounces else "off"
 
-    def trial(with_shadows: bool, with_bounces: bool) -> tuple[Fit, Losses]:
-        """Return the fit of one model and its losses, from every start at first and then from the best result."""
-        if (with_shadows, with_bounces) not in trials:
-            name = "shadows and bounces" if with_bounces else "shadows" if with_shadows else "no shadows"
-            model = sample.with_effects(with_shadows, with_bounces)
-            first_fits = [fit for fit, _ in list(trials.values())[:1]] or starts
-            fits = [
-                run_fit(name, model, fit, CONTINUED_TRIAL if np.isfinite(fit.value) else TRIAL) for fit in first_fits
-            ]
-            results = [(fit, held_out_losses(model, fit.point)) for fit in fits]
-            trials[with_shadows, with_bounces] = min(results, key=lambda result: _geometric_mean(result[1]))
-        return trials[with_shadows, with_bounces]
+    def fit_best(name: str, with_shadows: bool, with_bounces: bool, first_fits: list[Fit]) -> tuple[Fit, Losses]:
+        """Return the best fit of one model from several starts, and its losses."""
+        model = sample.with_effects(with_shadows, with_bounces)
+        fits = [run_fit(name, model, fit, CONTINUED_TRIAL if np.isfinite(fit.value) else TRIAL) for fit in first_fits]
+        results = [(fit, held_out_losses(model, fit.point)) for fit in fits]
+        return min(results, key=lambda result: _log_geometric_mean(result[1]))
 
-    trial(shadows != "off", shadows != "off" and bounces == "on")
-    shadow_decision = Decision(shadows == "on")
-    bounce_decision = Decision(bounces == "on")
-    if shadows == "auto":
-        shadow_decision = compare_models(trial(False, False)[1], trial(True, False)[1], CLEARLY_AGAINST)
-    if not shadow_decision.kept:
-        fit = trial(False, False)[0]
-        return SolveState(fit, fit, shadow_decision)
-    if bounces != "auto":
-        fit = trial(True, bounce_decision.kept)[0]
-        return SolveState(fit, fit, shadow_decision, bounce_decision)
-    # both models continue from the same fit, under its hyperparameters
-    start = trial(True, False)[0]
+    if shadows == "off":
+        fit, _ = fit_best("no shadows", False, False, starts)
+        return SolveState(fit, fit)
+    forced = bounces == "on"
+    fit, losses = fit_best("shadows and bounces" if forced else "shadows", True, forced, starts)
+    decision = Decision(True)
+    if shadows == "auto" and not problem.none_held_out:
+        plain, plain_losses = fit_best("no shadows", False, False, [fit])
+        decision = compare_models(plain_losses, losses, CLEARLY_AGAINST)
+        if not decision.kept:
+            return SolveState(plain, plain, decision)
+    if bounces == "auto":
+        chosen = select_interreflection(sample, fit, run_fit)
+        return SolveState(chosen.fit, chosen.fit, decision, chosen.evidence[0])
+    return SolveState(fit, fit, decision, Decision(forced))
+
+
+def select_interreflection(sample: JointProblem, start: Fit, run_fit: Fitting) -> Selection:
+    """Choose interreflection: both models continue from the same fit, under its hyperparameters.
+
+    Args:
+        sample: Observations on which models are compared.
+        start: Fit with shadows alone.
+        run_fit: Function that fits a model.
+    """
     models = [sample.with_effects(True, with_bounces) for with_bounces in (False, True)]
-    fits = [run_fit("shadows and bounces", model, start, BOUNCE_SCHEDULE) for model in models]
+    names = ("shadows", "shadows and bounces")
+    fits = [run_fit(name, model, start, BOUNCE_SCHEDULE) for name, model in zip(names, models, strict=True)]
     log_bayes_factor = (fits[0].value - fits[1].value) / 2
-    bounce_decision = Decision(log_bayes_factor > VERY_STRONG, log_bayes_factor=log_bayes_factor)
-    chosen = int(bounce_decision.kept)
-    fit = run_fit("shadows and bounces", models[chosen], fits[chosen], AFTER_BOUNCES)
-    return SolveState(fit, fit, shadow_decision, bounce_decision)
+    decision = Decision(log_bayes_factor > VERY_STRONG, log_bayes_factor=log_bayes_factor)
+    chosen = int(decision.kept)
+    return Selection(run_fit(names[chosen], models[chosen], fits[chosen], AFTER_BOUNCES), [decision])
 
 
-def _geometric_mean(losses: Losses) -> float:
+def _log_geometric_mean(losses: Losses) -> float:
     """Return the log of the geometric mean over lights of their mean losses, weighted by observations.
 
     It is rounded to six digits, so that rounding errors do not decide.
@@ -254,7 +257,7 @@ def select_distances(problem: JointProblem, before: Fit, options: SolveOptions, 
     pairs = enumerate(zip(before.point.lights, problem.blocks, strict=True))
     candidates = [k for k, (light, block) in pairs if not (light.is_near or light.fixed.any() or block.place is None)]
     evidence = [Decision(light.is_near) for light in before.point.lights]
-    if options.distance == "off" or problem.none_held_out or not candidates:
+    if options.distance == "off" or not candidates:
         return Selection(before, evidence)
     sample = comparison_sample(problem, options)
 

@@ -209,6 +209,8 @@ def likeliest_class(
 ) -> tuple[str, float]:
     """Return the likeliest class of a material and its probability.
 
+    Classes are widened by the standard errors; in a fit they are widened by `CLASS_ROUGHNESS_DEVIATION`.
+
     Args:
         specular: k_s.
         roughness: Roughness.

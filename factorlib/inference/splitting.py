@@ -55,10 +55,11 @@ def split_cells(problem: JointProblem, state: SolveState, options: SolveOptions,
     for number in range(options.splittings):
         phase = f"splitting {number + 1}"
         finer = [split_brightest(light) for light in fit.point.lights]
-        trial = run.fit(phase, sample, fit.with_lights(finer), LIGHTS_ONLY)
-        log_bayes_factor = (np.array(fit.light_values) - trial.light_values) / 2  # (1)
+        trials = [run.fit(phase, sample, fit.with_lights(lights), LIGHTS_ONLY) for lights in (fit.point.lights, finer)]
+        coarse_values, fine_values = (np.array(trial.light_values) for trial in trials)
+        log_bayes_factor = (coarse_values - fine_values) / 2  # (1)
         supported = log_bayes_factor > VERY_STRONG
-        total = float(log_bayes_factor.sum(where=supported))
+        total = float(log_bayes_factor.sum(where=supported) if supported.any() else log_bayes_factor.max())
         evidence.append(Decision(bool(supported.any()), log_bayes_factor=total))
         if not supported.any():
             break

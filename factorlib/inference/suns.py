@@ -106,8 +106,8 @@ def replace_brightest(illumination: Illumination, sharpness: float) -> Light:
     u[:, away < DISC_RADIUS] = np.median(u[:, ring], axis=1)[:, None]
     dimmed = msgspec.structs.replace(illumination, light=light.with_log_radiance(u))
     residual = dimmed.residuals()
-    original_residual = illumination.residuals()
-    trust = np.sqrt(ROBUST.weights(original_residual) * ~(illumination.block.clipped & (original_residual >= 0)))
+    bright_enough = illumination.block.clipped & (residual >= 0)
+    trust = np.sqrt(ROBUST.weights(illumination.residuals()) * ~bright_enough)
     # (1): for each z of the grid, w = max(−Σ t² A r, 0)/Σ t² A² by channel
     for radius, step in GRIDS:
         grid = UnitLobes(axes := _grid_around(z, radius, step), np.full(len(axes), sharpness), light.curvature)

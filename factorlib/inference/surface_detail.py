@@ -203,7 +203,7 @@ class DetailTrial(msgspec.Struct, frozen=True):
                 tick()
                 return plain.values[index], Losses([plain.losses.values[index]], [plain.losses.clusters[index]])
             photo = msgspec.structs.replace(self.problem.blocks[k].take(rows), row=np.arange(rows.sum()))
-            photo = photo.subsample(OBSERVATIONS, 0)
+            photo = photo.subsample(OBSERVATIONS, seed=0)
             assert photo.row is not None
             problem = self.problem.with_blocks([detail.apply_to(photo, positions.take(photo.row))])
             # the photo's own light, from the light of its illumination
@@ -220,7 +220,12 @@ class DetailTrial(msgspec.Struct, frozen=True):
         return PhotoScores(np.array(values), Losses(*([photo[i][0] for photo in losses] for i in (0, 1))))
 
     def fit_folds(
-        self, parts: list[LightTerms], laplacian: csr_array, stiffness: Stiffness, tick: Tick
+        self,
+        parts: list[LightTerms],
+        laplacian: csr_array,
+        stiffness: Stiffness,
+        movable: Bool[np.ndarray, " v"],
+        tick: Tick,
     ) -> list[Detail]:
         """Return a surface for every photo, estimated from other photos.
 
@@ -230,10 +235,10 @@ class DetailTrial(msgspec.Struct, frozen=True):
             parts: Linearised lights on the mesh itself.
             laplacian: Laplacian of all meshes.
             stiffness: Stiffness of the detail.
+            movable: Mask of the nodes whose normals may turn.
             tick: Called after each fold.
         """
         photos = self.photos
-        shared = self.shared_nodes
         folds = min(FOLDS, len(photos))
 
         def detail_without(fold: int) -> Detail:
@@ -245,7 +250,7 @@ class DetailTrial(msgspec.Struct, frozen=True):
             pairs = zip(parts, left_out, strict=True)
             used = [part.drop_observations(rows) if rows.any() else part for part, rows in pairs]
             used = [part for part in used if len(part.residual)]
-            detail = solve_detail(used, laplacian, stiffness, zero_detail(self.surfaces.nodes), shared)
+            detail = solve_detail(used, laplacian, stiffness, zero_detail(self.surfaces.nodes), movable)
             positions = [positions.take(~rows) for positions, rows in zip(self.attached, left_out, strict=True)]
             # only turns that a displacement explains
             displacements = self.surfaces.displacements(detail.turn, positions)
@@ -284,13 +289,17 @@ class DetailSearch(msgspec.Struct, frozen=True):
     """
 
     trial: DetailTrial
-    linearise: list[LightTerms]
+    parts: list[LightTerms]
     laplacian: csr_array
     plain: PhotoScores
     tick: Tick
 
     def select_stiffness(
-        self, candidates: Sequence[Stiffness], reference: PhotoScores, held_out: float, likelihood: float
+        self,
+        candidates: Sequence[Stiffness],
+        reference: PhotoScores,
+        thresholds: tuple[float, float],
+        movable: Bool[np.ndarray, " v"],
     ) -> StiffnessChoice:
         """Return the likeliest stiffness.
 
@@ -300,16 +309,16 @@ class DetailSearch(msgspec.Struct, frozen=True):
         Args:
             candidates: Stiffnesses, from stiff to soft.
             reference: Scores without this detail.
-            held_out: Threshold of the held-out losses, in standard errors.
-            likelihood: Threshold of the marginal likelihood, in standard errors.
+            thresholds: Those of `decide_detail`.
+            movable: Mask of the nodes whose normals may turn.
         """
         best: StiffnessChoice | None = None
         for stiffness in candidates:
-            details = self.trial.fit_folds(self.linearise, self.laplacian, stiffness, self.tick)
+            details = self.trial.fit_folds(self.parts, self.laplacian, stiffness, movable, self.tick)
             scores = self.trial.score_photos(details, self.tick, self.plain)
             if best is not None and round(float(scores.values.sum() - best.scores.values.sum()), 3) >= 0:
                 break
-            best = StiffnessChoice(stiffness, details, scores, decide_detail(scores, reference, held_out, likelihood))
+            best = StiffnessChoice(stiffness, details, scores, decide_detail(scores, reference, *thresholds))
             if scores.gain_over(reference) < CLEARLY_AGAINST:
                 break
         assert best is not None
@@ -317,7 +326,8 @@ class DetailSearch(msgspec.Struct, frozen=True):
 
     def select_turns(self) -> tuple[StiffnessChoice, set[str]]:
         """Return the likeliest turns, and the meshes that gain from their turns alone."""
-        turned = self.select_stiffness([Stiffness(a) for a in TURN_STIFFNESSES], self.plain, CLEARLY_FOR, 0.0)
+        candidates = [Stiffness(a) for a in TURN_STIFFNESSES]
+        turned = self.select_stiffness(candidates, self.plain, (CLEARLY_FOR, 0.0), self.trial.shared_nodes)
         movable = self.select_meshes(turned.details) if turned.scores.gain_over(self.plain) > 0 else set()
         if 0 < len(movable) < len(self.trial.surfaces.meshes):
             scores = self.trial.score_photos(
@@ -336,7 +346,7 @@ class DetailSearch(msgspec.Struct, frozen=True):
             seed: Seed of the drawn observations.
         """
         trial = self.trial
-        parts = self.linearise
+        parts = self.parts
         fit = self.trial.fit
         nodes = trial.surfaces.node_mask(movable) & trial.shared_nodes
         detail = zero_detail(trial.surfaces.nodes)
@@ -393,9 +403,9 @@ def estimate_surface(
     chosen = (
         turned if turned.evidence.kept else StiffnessChoice(Stiffness(None), [plain] * photos, scores, turned.evidence)
     )
-    painted = search.select_stiffness(
-        [Stiffness(chosen.stiffness.turn, a) for a in FACTOR_STIFFNESSES], chosen.scores, 0.0, CLEARLY_FOR
-    )
+    candidates = [Stiffness(chosen.stiffness.turn, a) for a in FACTOR_STIFFNESSES]
+    nodes = trial.shared_nodes & surfaces.node_mask(movable)
+    painted = search.select_stiffness(candidates, chosen.scores, (0.0, CLEARLY_FOR), nodes)
     chosen = painted if painted.evidence.kept else chosen
     if not (turned.evidence.kept or painted.evidence.kept):
         return SurfaceEstimate(initial, turned.evidence, painted.evidence)

@@ -297,7 +297,7 @@ def linearise_light(
     likelihood = light_likelihood(illumination, hyperparameters, prior, materials_given=True)
     tabulated = likelihood.illumination
     n = len(illumination.block)
-    p = len(tabulated.light)
+    p = int(tabulated.light.free.sum())
     prediction = tabulated.predict()
     residual = np.zeros((n, 3))
     by_light = np.zeros((3, n, tabulated.light.unknowns - 2 * p), np.float32)

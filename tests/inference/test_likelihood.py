@@ -94,9 +94,11 @@ def test_the_gradient_by_light_is_that_of_the_loss_and_the_prior(here, toned):
 
 
 def test_the_determinant_by_light_is_half_the_finite_difference_of_log_det(here):
+    """By cells and by exposures."""
     light, rng, by_light = here.light, np.random.default_rng(4), here.normal_equations().determinant_by_light
-    for change in (np.ones(3 * CELLS), rng.normal(size=3 * CELLS), np.eye(3 * CELLS)[by_light[: 3 * CELLS].argmax()]):
-        step = np.concatenate([change, np.zeros(light.unknowns - len(change))])
+    unit = np.eye(light.unknowns)
+    all_cells, one_cell = unit[: 3 * CELLS].sum(0), unit[by_light[: 3 * CELLS].argmax()]
+    for step in (all_cells, one_cell, rng.normal(size=light.unknowns), *unit[3 * CELLS :]):
         high, low = (log_det(here.with_point(moved(light, sign * 5e-3 * step))) for sign in (1, -1))
         assert by_light @ step == pytest.approx((high - low) / 1e-2 / 2, rel=0.01, abs=0.01 * np.abs(by_light).max())
 
