@@ -21,7 +21,7 @@ from factorlib.images.exr import LAT_LONG, write_rgb_exr
 from factorlib.images.light_map import read_light_map
 from factorlib.inference import options
 from factorlib.inference.answer import Answer
-from factorlib.inference.blocks import Noise, RobustLoss
+from factorlib.inference.blocks import Noise
 from factorlib.inference.fit_runner import Event, FitRunner, Solution, solve_progress, subset_progress
 from factorlib.inference.identifiability import after_solving, before_solving, unusable_observations
 from factorlib.inference.joint_solver import solve
@@ -192,7 +192,7 @@ def _build_problem(
     automatic: Name = "paper_network" if params.solver == "paper" else "network"
     operator = automatic if params.operator == "auto" else params.operator
     reflection = reflection_operator(operator, weights=inputs["train"])
-    return JointProblem(blocks, reflection, RobustLoss(), inputs.map, known)
+    return JointProblem(blocks, reflection, inputs.map, known)
 
 
 def _run_solver(

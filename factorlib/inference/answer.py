@@ -29,7 +29,7 @@ from factorlib.results.materials import Decision, Uncertainty
 from factorlib.results.solution import Earlier
 
 LOBES_CHOSEN_BY = {
-    "joint": "cells of the light prior, of which the brightest split while held-out observations gain",
+    "joint": "cells of the light prior, of which the brightest split while the marginal likelihood rises",
     "paper": "given",
 }
 

@@ -53,7 +53,7 @@ class RobustLoss(msgspec.Struct, frozen=True):
         robust_scale: k, in σ.
     """
 
-    robust_scale: float = 10.0
+    robust_scale: float
 
     def evaluate(self, residual: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
         """Return the loss of each whitened residual."""
@@ -62,6 +62,12 @@ class RobustLoss(msgspec.Struct, frozen=True):
     def weights(self, residual: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
         """Return weights in ]0, 1] of the squared residuals, for least-squares steps of this loss."""
         return 1 / np.sqrt(1 + (residual / self.robust_scale) ** 2)
+
+
+# Beyond 3 σ of the noise model a residual is an outlier in a fit.  Models are compared with a wider loss: that of a
+# light without its highlights must count.
+FIT_LOSS = RobustLoss(3.0)
+COMPARISON_LOSS = RobustLoss(10.0)
 
 
 class Block(msgspec.Struct, frozen=True):

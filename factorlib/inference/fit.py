@@ -16,8 +16,7 @@ descent.  So are the factors that scale the light's contrast and colour relative
 
 Materials are fitted to the observations with reliable normals (`reliable_observations`).  A highlight at a wrong normal
 makes the material look rougher than it is, however little it weighs.  Given those materials, lights are fitted once
-more to all
-observations: rims and thin parts show directions that nothing else shows.
+more to all observations: rims and thin parts show directions that nothing else shows.
 """
 
 from __future__ import annotations
@@ -28,7 +27,7 @@ import msgspec
 import numpy as np
 from jaxtyping import Bool, Float
 
-from factorlib.inference.blocks import Block, RobustLoss
+from factorlib.inference.blocks import FIT_LOSS, Block
 from factorlib.inference.forward import Illumination
 from factorlib.inference.lights import Light
 from factorlib.inference.likelihood import LightLikelihood, System, cholesky_inverse
@@ -41,7 +40,6 @@ from factorlib.light.prior import LightPrior
 
 RELIABLE = 0.6  # least confidence of a normal, as a share of its material's median
 DARK_NOISE = 0.2  # factor on the noise model's absolute part where normals are reliable
-ROBUST = RobustLoss(3.0)  # beyond 3 σ of the noise model a residual is an outlier
 START_TEMPERATURE = 10.0
 # Standard deviation of a sun's log radiance: in lights captured outdoors its energy is a third to twice the sky's.
 SUN_DEVIATION = 1.0
@@ -67,7 +65,7 @@ class Fit(msgspec.Struct, frozen=True):
     Attributes:
         point: Materials and lights.
         hyperparameters: Weights of each light's observations and prior.
-        value: Objective.
+        value: Objective, (1) of `factorlib.inference.optimizer`.
         light_values: Part of each light in it: minus twice its log marginal likelihood.
     """
 
@@ -94,8 +92,8 @@ class FitSchedule(msgspec.Struct, frozen=True):
 
     Attributes:
         light_steps: Steps of the lights alone, materials given, before the others.
-        joint_steps: Steps of each descent of lights and, unless they are given, materials; hyperparameters are
-            estimated anew before each descent but the first.
+        descents: Number of steps of each descent of lights and, unless they are given, materials.  Hyperparameters are
+            estimated anew before each descent but the first; a descent of 0 steps estimates them once more.
         estimate_first: True to estimate them before the first descent too; right after a splitting, residuals reflect
             the splitting and not the noise.
         least_temperature: Least temperature of (1).
@@ -103,7 +101,7 @@ class FitSchedule(msgspec.Struct, frozen=True):
     """
 
     light_steps: int = 0
-    joint_steps: tuple[int, ...] = ()
+    descents: tuple[int, ...] = ()
     estimate_first: bool = True
     least_temperature: float = 1.0
     materials_fixed: bool = False
@@ -111,7 +109,7 @@ class FitSchedule(msgspec.Struct, frozen=True):
     @property
     def points(self) -> int:
         """Largest number of points that a fit evaluates."""
-        return self.light_steps + 1 + sum(iterations + 1 for iterations in self.joint_steps)
+        return self.light_steps + 1 + sum(iterations + 1 for iterations in self.descents)
 
 
 def fit_problem(
@@ -139,7 +137,7 @@ def fit_problem(
     likelihoods = list(problem.spread(lambda pair: with_table(*pair), pairs))
     state = descent.descend_lights(likelihoods, material_unknowns(materials), schedule.light_steps)
     estimate = partial(estimate_hyperparameters, least=schedule.least_temperature)
-    for number, iterations in enumerate(schedule.joint_steps):
+    for number, iterations in enumerate(schedule.descents):
         if number or schedule.estimate_first:
             # T of (1) and s_k² of each light, from the previous descent
             solved = list(zip(state.likelihoods, state.systems, strict=True))
@@ -155,7 +153,8 @@ def fit_problem(
     light_values = [system.value for system in state.systems]
     if schedule.materials_fixed:  # those are φ
         light_values = list(map(LightLikelihood.marginal, state.likelihoods, state.systems))
-    return Fit(Point(materials, lights), hyperparameters, state.value, light_values)
+    value = sum(light_values) + state.prior.value
+    return Fit(Point(materials, lights), hyperparameters, value, light_values)
 
 
 def light_likelihood(
@@ -179,7 +178,7 @@ def light_likelihood(
     table = (tables or ResponseCache()).get(*arguments, roughness)
     tabulated = msgspec.structs.replace(illumination, table=table)
     return with_hyperparameters(
-        LightLikelihood(tabulated, prior, np.zeros(0), np.zeros((0, 0)), 0.0, 1.0, ROBUST), hyperparameters
+        LightLikelihood(tabulated, prior, np.zeros(0), np.zeros((0, 0)), 0.0, 1.0, FIT_LOSS), hyperparameters
     )
 
 
@@ -224,7 +223,7 @@ def estimate_hyperparameters(likelihood: LightLikelihood, system: System, least:
 def estimate_temperature(block: Block, residual: Float[np.ndarray, "n 3"], least: float = 1.0) -> float:
     """Return T of (1) from whitened residuals."""
     number = block.clusters()
-    bounded = residual.clip(-ROBUST.robust_scale, ROBUST.robust_scale)
+    bounded = residual.clip(-FIT_LOSS.robust_scale, FIT_LOSS.robust_scale)
     sums = [np.bincount(number, channel) for channel in bounded.T]
     return max(float(np.square(sums).sum()) / max(residual.size, 1), least)
 

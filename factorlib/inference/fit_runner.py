@@ -27,7 +27,8 @@ from factorlib.results.materials import Decision
 class Event(msgspec.Struct, frozen=True):
     """Evaluation of one point, or the end of a phase.
 
-    The last event of a phase has iteration −1 and states the held-out loss, which is NaN in all others.
+    `FitRunner.fit_and_report` ends with an event of iteration −1, which states the held-out loss.  It is NaN in all
+    others.
 
     Attributes:
         round: Number of the fit.

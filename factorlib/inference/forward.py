@@ -6,8 +6,9 @@
 
 A clipped channel has the residual min(r_ic, 0), because its true radiance may be higher.  D and S are the responses of
 `factorlib.inference.responses`, e is the photo's exposure, and G is the radiance that other surfaces send
-(`factorlib.inference.interreflection`).  A new physical effect is added here once, because radiance and derivatives
-come from the same sum.
+(`factorlib.inference.interreflection`).  G comes from observed radiance and is added before the tone curve, an
+approximation in photos with curves.  A new physical effect enters `predict`, `unit_responses`, `gradient`, `linearise`
+and `_by_photos`, whose derivatives are written by hand and tested by finite differences.
 
 The unknowns are log k_d, log k_s (RGB each) and roughness of a material, u of every cell and channel, log exposures and
 log tone exponents.  A channel's residuals depend on the cells of that channel alone, so the Jacobian is one dense block

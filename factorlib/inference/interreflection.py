@@ -1,12 +1,12 @@
 """Interreflection: light that arrives from hidden directions, sent by the surfaces that hide them.
 
     G_d,i = Σ_k w_ik (1 − V_ik) B_ik,                w_ik the cosine weights of factorlib.light.visibility, Σ_k w_ik = 1
-    G_s,i = Σ_k D G1 G1 / (4 n·o) (1 − V_ik) B_ik Ω,   GGX at the roughness ROUGHNESS, Ω = 4π/K                     (1)
+    G_s,i = Σ_k D G1 G1 / (4 n·o) (1 − V_ik) B_ik Ω,   GGX of HIGHLIGHT_ROUGHNESS, Ω = 4π/K                         (1)
 
 B_ik is the radiance of the surface that hides direction k from observation i.  It is taken from the photo itself: the
 mean radiance of the observations of that material whose normals lie in that bin.  Few observations give an uncertain
 mean.  It is therefore shrunk, with the weight of `PSEUDO_COUNT` observations, toward the mean of the whole material
-with weights exp(NEARNESS n·b).  A bin without observations gets the radiance of the nearest normals.  An unknown
+with weights exp(NEARNESS n·b).  A bin without observations gets this mean alone.  An unknown
 surface, or a material that the photo does not show, sends the photo's mean radiance.
 
 B contains all bounces and is known, so G does not depend on materials or lights.  The model assumes that surfaces send

@@ -35,10 +35,10 @@ from factorlib.inference.splitting import split_cells
 from factorlib.inference.start import Start, insert_known, refine_cells
 from factorlib.inference.suns import select_suns
 
-MATERIALS = FitSchedule(light_steps=2, joint_steps=(5, 4))
+MATERIALS = FitSchedule(light_steps=2, descents=(5, 4))
 # Factor on the number of observations where materials are given: +0.25 dB on data/eames, +0.27 on the made set of 101.
 LIGHT_OBSERVATION_FACTOR = 2
-LIGHTS = FitSchedule(joint_steps=(0, 2, 2), least_temperature=0.1, materials_fixed=True)
+LIGHTS = FitSchedule(descents=(0, 2, 2), least_temperature=0.1, materials_fixed=True)
 
 
 class SolveRequest(msgspec.Struct, frozen=True):

@@ -70,9 +70,9 @@ class Light(msgspec.Struct, frozen=True):
         log_exposure: Log exposure of each photo; the first is 0.
         log_tone: Log exponents of the photos' tone curves (`images.tone`); empty for linear photos.
         curvature: One over the light's distance (`factorlib.light.distance`); 0 for infinitely far away.
-        held: Mask of the cells of known radiance (`factorlib.inference.known`), which stay fixed; empty for none.
-        scale_free: True if the held radiance is known up to one factor.
-        exposures_held: True if the exposures are known.
+        fixed: Mask of the cells of known radiance (`factorlib.inference.known`); empty for none.
+        scale_free: True if the radiance of these cells is known up to one factor.
+        exposures_fixed: True if the exposures are known.
     """
 
     axis: Float[np.ndarray, "p 3"]  # unit, in the illumination's frame
@@ -145,14 +145,19 @@ class Light(msgspec.Struct, frozen=True):
 
     @property
     def energy(self) -> Float[np.ndarray, "p 3"]:
-        """Energy of each lobe over 2π, in the illumination's radiance unit times steradians."""
-        return self.weight * (lobe_integral(self.sharpness) / (2 * np.pi))[:, None]
+        """Integral of each lobe over the sphere, in the illumination's radiance unit times steradians."""
+        return self.weight * lobe_integral(self.sharpness)[:, None]
+
+    @property
+    def mean_radiance(self) -> Float[np.ndarray, "3"]:
+        """Mean radiance over the sphere."""
+        return self.energy.sum(0) / (4 * np.pi)
 
     @property
     def unknowns(self) -> int:
         """Number of a step's unknowns.
 
-        They are log radiances of free cells, free exposures, tone exponents, and the factor on held cells where it is
+        They are log radiances of free cells, free exposures, tone exponents, and the factor on fixed cells where it is
         free.
         """
         return 3 * int(self.free.sum()) + self.free_exposures + len(self.log_tone) + self.scale_free
@@ -175,11 +180,6 @@ class Light(msgspec.Struct, frozen=True):
             weight=np.vstack([self.weight, weight]),
         )
 
-    def take(self, selected: Bool[np.ndarray, " p"] | slice) -> Light:
-        """Return the light of the selected lobes."""
-        lobes = {name: getattr(self, name)[selected] for name in ("axis", "log_sharpness", "weight")}
-        return msgspec.structs.replace(self, **lobes)
-
     def brightest_cells(self, count: int, spacing: float) -> Bool[np.ndarray, " p"]:
         """Return a mask of the `count` cells with most energy.
 
@@ -191,7 +191,7 @@ class Light(msgspec.Struct, frozen=True):
     def split(self, selected: Bool[np.ndarray, " p"]) -> Light:
         """Return the light with each selected cell replaced by smaller cells of its radiance.
 
-        The smaller cells follow all others.  The module docstring states the rule.
+        The smaller cells follow all others.  The module docstring states the rule.  The light must have no fixed cells.
         """
         count = np.where(selected, np.rint(self.sharpness * 4 * np.pi * WIDTH**2), 0).astype(int)
         parents = [np.zeros(0, int)]

@@ -29,8 +29,8 @@ stands for its neighbours.
 Materials enter as log k_d, log k_s (RGB each) and roughness, 7 unknowns θ each.  Exposures and tone exponents belong to
 the light's block but are not integrated out.  They have wide Gaussian priors about 0.
 
-Cells of known radiance (`Light.held`) are not part of u in (1) and (2).  Q is then the precision of the other cells,
-given the held ones.
+Cells of known radiance (`Light.fixed`) are not part of u in (1) and (2).  Q is then the precision of the other cells,
+given the known ones.
 """
 
 from __future__ import annotations
@@ -73,7 +73,7 @@ class System(NamedTuple):
         factor: Lower Cholesky factor of L_i.
         determinant_by_materials: Half the gradient of log det H with respect to materials.
         determinant_hessian: Half its Hessian with respect to materials.
-        determinant_by_light: d_i of (3) of `factorlib.inference.optimizer`, half the second part of (2).
+        determinant_by_light: Half the gradient of log det H with respect to the light; it acts on materials only.
         scores: Contributions to the gradient, materials then light, one row a cluster of observations; None if not
             requested.
     """

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-
 import msgspec
 import numpy as np
 from jaxtyping import Float
@@ -58,7 +56,3 @@ class Point(msgspec.Struct, frozen=True):
 
     materials: Materials
     lights: list[Light]
-
-    def select_lights(self, lights: Sequence[int]) -> Point:
-        """Return the same materials with the selected lights alone."""
-        return Point(self.materials, [self.lights[k] for k in lights])

@@ -55,11 +55,11 @@ WEAKLY_FOR = 1.0
 # Observations and cells of a light in comparisons of models.
 TRIAL_OBSERVATIONS = 1000
 TRIAL_CELLS = 180
-TRIAL = FitSchedule(light_steps=3, joint_steps=(6, 4))
-CONTINUED_TRIAL = FitSchedule(light_steps=2, joint_steps=(4, 2), estimate_first=False)
-BOUNCE_SCHEDULE = FitSchedule(light_steps=2, joint_steps=(6,), estimate_first=False)
-AFTER_BOUNCES = FitSchedule(joint_steps=(2,))
-TONE_SCHEDULE = FitSchedule(joint_steps=(8,), estimate_first=False)
+TRIAL = FitSchedule(light_steps=3, descents=(6, 4))
+CONTINUED_TRIAL = FitSchedule(light_steps=2, descents=(4, 2), estimate_first=False)
+BOUNCE_SCHEDULE = FitSchedule(light_steps=2, descents=(6,), estimate_first=False)
+AFTER_BOUNCES = FitSchedule(descents=(2,))
+TONE_SCHEDULE = FitSchedule(descents=(8,), estimate_first=False)
 # Least relative gain of the held-out loss.  Under two standard errors alone, a photo with a wrong pose got a curve
 # (margin 3.0, captured set of seed 7), and k_d was 30 % wrong instead of 13 %.
 LEAST_TONE_GAIN = 0.25
@@ -67,7 +67,7 @@ VERY_STRONG = 5.0  # log Bayes factor of very strong evidence (Kass and Raftery 
 # Curvatures of lights 20, 10 and 5 RMS distances away.  A chair's points are 0.4 m from their centre, and a room's
 # walls and lamps 2 to 8 m.
 CURVATURES = (0.05, 0.1, 0.2)
-DISTANCE_SCHEDULE = FitSchedule(light_steps=2, joint_steps=(2,), estimate_first=False)
+DISTANCE_SCHEDULE = FitSchedule(light_steps=2, descents=(2,), estimate_first=False)
 LIGHTS_ONLY = FitSchedule(light_steps=3, materials_fixed=True)
 
 Fitting = Callable[[str, JointProblem, Fit, FitSchedule], Fit]  # phase, problem, start and schedule
@@ -190,12 +190,12 @@ def select_interreflection(sample: JointProblem, start: Fit, run_fit: Fitting) -
         run_fit: Function that fits a model.
     """
     models = [sample.with_effects(True, with_bounces) for with_bounces in (False, True)]
-    names = ("shadows", "shadows and bounces")
-    fits = [run_fit(name, model, start, BOUNCE_SCHEDULE) for name, model in zip(names, models, strict=True)]
+    phase = "shadows and bounces"
+    fits = [run_fit(phase, model, start, BOUNCE_SCHEDULE) for model in models]
     log_bayes_factor = (fits[0].value - fits[1].value) / 2
     decision = Decision(log_bayes_factor > VERY_STRONG, log_bayes_factor=log_bayes_factor)
     chosen = int(decision.kept)
-    return Selection(run_fit(names[chosen], models[chosen], fits[chosen], AFTER_BOUNCES), [decision])
+    return Selection(run_fit(phase, models[chosen], fits[chosen], AFTER_BOUNCES), [decision])
 
 
 def _log_geometric_mean(losses: Losses) -> float:

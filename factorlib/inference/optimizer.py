@@ -10,10 +10,10 @@ L-BFGS (Nocedal 1980) with H⁻¹ as its initial inverse Hessian then minimises
 
     φ(u; θ) + prior(θ) + 2 aᵀ(θ − θ₀) + (θ − θ₀)ᵀ(D + μ diag)(θ − θ₀),     a = ½ (∂/∂θ + (du/dθ)ᵀ ∂/∂u) log det H    (2)
 
-Its gradient is exact except for the determinant, which lags behind.  The minimum is accepted if it lowers (1).
-Otherwise the damping μ grows and the same factor serves again.  At a fixed point the gradient of (2) is that of (1), so
-it is the minimum of (1).  Lights move to the minimum of φ alone: with the determinant in their objective, the
-approximation would not be Laplace's.
+Its gradient is exact except for the determinant, which lags behind. The minimum is accepted if it lowers (1).
+Otherwise the damping μ grows and the same factor serves again. At a fixed point the gradient of (2) is that of (1), up
+to what `factorlib.inference.likelihood` takes as constant in the determinant. Lights move to the minimum of φ alone:
+with the determinant in their objective, the approximation would not be Laplace's.
 
 Given the materials, each light minimises φ by itself, in the same way.
 """
@@ -63,11 +63,10 @@ class Arrow:
     """Factorised H of many lights; H⁻¹ of a vector costs two triangular solves a light.
 
     H = [[M, C_1 … C_k], [C_iᵀ, L_i]] has arrow shape: each light is coupled to the materials it illuminates, and to no
-    other light.  The gradients are g_m and g_i.  Eliminating every light leaves
+    other light.  With g = (g_m, g_i), the product x = H⁻¹ g follows by elimination of every light:
 
-        (M − Σ C_i L_i⁻¹ C_iᵀ) dm = −(g_m − Σ C_i L_i⁻¹ (g_i + d_i)),      dl_i = −L_i⁻¹ (g_i + C_iᵀ dm)            (3)
+        (M − Σ C_i L_i⁻¹ C_iᵀ) x_m = g_m − Σ C_i L_i⁻¹ g_i,      x_i = L_i⁻¹ (g_i − C_iᵀ x_m)                       (3)
 
-    d_i is a gradient with respect to the light that acts on the materials only (`factorlib.inference.likelihood`).
     C_i has rows only for the materials that light i illuminates.  Rows and columns of known unknowns and of unknowns
     at a bound are removed.  Damping multiplies the diagonal, so that a step does not depend on the units of an unknown.
 
@@ -147,12 +146,15 @@ class Descent(msgspec.Struct, frozen=True):
     def descend_lights(
         self, likelihoods: Sequence[LightLikelihood], theta: Float[np.ndarray, "m 7"], iterations: int
     ) -> DescentState:
-        """Return the state after at most `iterations` factorisations of each light, materials given."""
+        """Return the state after at most `iterations` steps of each light, materials given, one factorisation each."""
         fitted = list(self.spread(lambda likelihood: descend_light(likelihood, iterations), likelihoods))
         return self._state(theta, [likelihood for likelihood, _ in fitted], [system for _, system in fitted])
 
     def descend_jointly(self, state: DescentState, iterations: int) -> DescentState:
-        """Return the state after at most `iterations` factorisations, of materials and lights together."""
+        """Return the state after at most `iterations` steps of materials and lights together.
+
+        Each step costs one factorisation, also a rejected one.
+        """
         state = self.linearise(state.likelihoods, state.theta)
         damping = 0.0
         for _ in range(iterations):
@@ -262,7 +264,7 @@ def determinant_terms(systems: Sequence[System], size: int) -> tuple[Float[np.nd
     gradient = np.zeros(size)
     hessian = np.zeros((size, size))
     for system in systems:
-        # (du/dθ)ᵀ ∂/∂u = −C L⁻¹ ∂/∂u
+        # (du/dθ)ᵀ ∂/∂u = −C L⁻¹ ∂/∂u, exposures included
         by_light = system.cross_hessian @ solve_cholesky(system.factor, system.determinant_by_light)
         gradient[system.places] += system.determinant_by_materials - by_light
         P = gauge_projection(system.places)

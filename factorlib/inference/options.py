@@ -19,8 +19,8 @@ class SolveOptions(Struct, frozen=True):
     """Largest number of splittings.  Each splits the 24 cells of a light with most energy in about four, if the
     marginal likelihood supports it very strongly (log Bayes factor over 5)."""
     observations: Annotated[int, Meta(ge=50)] = 1000
-    """Largest number of a light's observations that are fitted, drawn evenly; eight times as many if
-    they are explained closely after the first splitting."""
+    """Largest number of a light's observations that materials are fitted to, drawn evenly; eight times as many if
+    they are explained closely after the first accepted splitting.  Lights alone are fitted to twice as many."""
     self_shadowing: Literal["auto", "on", "off"] = "auto"
     """Shadows of the meshes; auto: on, unless held-out observations are against them by two standard errors."""
     interreflection: Literal["auto", "on", "off"] = "auto"

@@ -162,7 +162,8 @@ class PriorTerms(NamedTuple):
 class MaterialPrior:
     """Prior on m materials that are linked by some blocks.
 
-    Materials without a specular part at the start have no prior on it.
+    The start is that of the present fit, so the wide Gaussian about it moves from fit to fit.  Materials without a
+    specular part at the start have no prior on it.
     """
 
     def __init__(self, start: Materials, blocks: Sequence[Block], known: KnownValues = KnownValues()):

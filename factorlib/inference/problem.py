@@ -1,6 +1,6 @@
 """Joint problem: the given observations and operator, and the evaluation of any point.
 
-    problem = JointProblem(blocks, operator, loss, spread)      point = Point(materials, lights)
+    problem = JointProblem(blocks, operator, spread)      point = Point(materials, lights)
     problem.radiance(point)   .residuals(point)   .held_out_loss(point)
 
 Every observation depends on one material (7 unknowns) and one light (3 unknowns a cell, exposures, tone curves).
@@ -16,7 +16,7 @@ import msgspec
 import numpy as np
 from jaxtyping import Float
 
-from factorlib.inference.blocks import Block, RobustLoss
+from factorlib.inference.blocks import COMPARISON_LOSS, Block
 from factorlib.inference.forward import Illumination
 from factorlib.inference.known import KnownValues
 from factorlib.inference.materials import Point
@@ -33,7 +33,6 @@ class JointProblem(msgspec.Struct, frozen=True):
     Attributes:
         blocks: Observations by illumination.
         operator: Reflection operator of lobes.
-        loss: Robust loss that compares models.
         spread: Map over independent work.
         known: Unknowns with given values.
         tables: Cache of response tables.
@@ -41,7 +40,6 @@ class JointProblem(msgspec.Struct, frozen=True):
 
     blocks: list[Block]
     operator: Operator
-    loss: RobustLoss = RobustLoss()
     spread: Spread = serial_map
     known: KnownValues = KnownValues()
     tables: ResponseCache = msgspec.field(default_factory=ResponseCache)
@@ -71,12 +69,15 @@ class JointProblem(msgspec.Struct, frozen=True):
 
     def losses(self, point: Point) -> list[Float[np.ndarray, " n"]]:
         """Return the robust loss of each observation, block by block."""
-        return [illumination.losses(self.loss) for illumination in self.illuminations(point)]
+        return [illumination.losses(COMPARISON_LOSS) for illumination in self.illuminations(point)]
 
     def held_out_loss(self, point: Point) -> float:
         """Return the mean robust loss per held-out channel value; of all values if none is held out."""
-        losses = np.concatenate(self.held_out().losses(point))
-        return float(losses.mean()) if len(losses) else 0.0
+        return mean_loss(self.held_out().losses(point))
+
+    def fitted_loss(self, point: Point) -> float:
+        """Return the mean robust loss per fitted channel value."""
+        return mean_loss(self.without_held_out().losses(point))
 
     @property
     def has_bounces(self) -> bool:
@@ -88,13 +89,9 @@ class JointProblem(msgspec.Struct, frozen=True):
         """True if all observations are fitted, so that none can select a model."""
         return not any(block.held_out.any() for block in self.blocks)
 
-    def subsample(self, count: int | Sequence[int], seed: int) -> JointProblem:
-        """Return the problem with at most `count` fitted and `count` held-out observations of each block.
-
-        `count` is one number, or one a block.
-        """
-        counts = [count] * len(self.blocks) if isinstance(count, int) else count
-        return self.with_blocks([block.subsample(most, seed) for block, most in zip(self.blocks, counts, strict=True)])
+    def subsample(self, count: int, seed: int) -> JointProblem:
+        """Return the problem with at most `count` fitted and `count` held-out observations of each block."""
+        return self.with_blocks([block.subsample(count, seed) for block in self.blocks])
 
     def without_held_out(self) -> JointProblem:
         """Return the problem without its held-out observations."""
@@ -111,3 +108,9 @@ class JointProblem(msgspec.Struct, frozen=True):
     def with_blocks(self, blocks: list[Block]) -> JointProblem:
         """Return the problem with other observations."""
         return msgspec.structs.replace(self, blocks=blocks)
+
+
+def mean_loss(losses: list[Float[np.ndarray, " n"]]) -> float:
+    """Return the mean over the losses of all blocks; 0 without any."""
+    values = np.concatenate(losses)
+    return float(values.mean()) if len(values) else 0.0

@@ -24,7 +24,7 @@ from factorlib.inference.options import SolveOptions
 from factorlib.inference.problem import JointProblem
 from factorlib.results.materials import Decision
 
-AFTER_SPLITTING = FitSchedule(light_steps=2, joint_steps=(3, 2), estimate_first=False)
+AFTER_SPLITTING = FitSchedule(light_steps=2, descents=(3, 2), estimate_first=False)
 SPLIT_CELLS = 24  # number of a light's cells that split at once
 # Least distance between cells, degrees: the sun's width.  A cell splits only if its neighbours are twice as far.
 LEAST_SPACING_DEG = 0.5
@@ -63,10 +63,11 @@ def split_cells(problem: JointProblem, state: SolveState, options: SolveOptions,
         evidence.append(Decision(bool(supported.any()), log_bayes_factor=total))
         if not supported.any():
             break
+        # begin with equal radiance of all cells that replace one, as `split` makes it
         pairs = zip(fit.point.lights, finer, strict=True)
         chosen = [pair[int(split)] for pair, split in zip(pairs, supported, strict=True)]
         fit = run.fit_and_report(phase, sample, fit.with_lights(chosen), AFTER_SPLITTING)
-        if number == 0 and sample.without_held_out().held_out_loss(fit.point) < SMALL_LOSS:
+        if number == 0 and sample.fitted_loss(fit.point) < SMALL_LOSS:
             observations = OBSERVATION_FACTOR * observations
             sample = problem.subsample(observations, options.seed)
             fit = run.fit_and_report(phase, sample, fit, AFTER_SPLITTING)

@@ -27,7 +27,7 @@ import numpy as np
 from jaxtyping import Float
 from scipy.spatial.transform import Rotation
 
-from factorlib.inference.blocks import Block, RobustLoss
+from factorlib.inference.blocks import COMPARISON_LOSS, Block
 from factorlib.inference.fit import Fit, Hyperparameters, initial_fit
 from factorlib.inference.forward import Illumination
 from factorlib.inference.gauge import connected_components
@@ -176,7 +176,7 @@ def insert_known(point: Point, problem: JointProblem) -> Point:
 
 def log_mean_radiance(light: Light) -> Float[np.ndarray, "3"]:
     """Return the logarithm of a light's mean radiance."""
-    return np.log(np.maximum(light.energy.sum(0) / 2, LEAST_RADIANCE))  # `energy` is over 2π, a mean over 4π
+    return np.log(np.maximum(light.mean_radiance, LEAST_RADIANCE))
 
 
 def start_from_earlier(earlier: Earlier, names: Sequence[str]) -> Start:
@@ -311,14 +311,12 @@ def point_from_earlier(problem: JointProblem, earlier: Earlier, names: Sequence[
         if components:
             factor = factors[max(set(components), key=lambda c: (components.count(c), -c))]
             constant = Illumination(block, light, materials, problem.operator)
-            light = light_from_earlier(constant, earlier, factor, problem.loss)
+            light = light_from_earlier(constant, earlier, factor)
         lights.append(light)
     return Point(materials, lights)
 
 
-def light_from_earlier(
-    constant: Illumination, earlier: Earlier, factor: Float[np.ndarray, "3"], loss: RobustLoss
-) -> Light:
+def light_from_earlier(constant: Illumination, earlier: Earlier, factor: Float[np.ndarray, "3"]) -> Light:
     """Return the earlier light of a block, in the block's unit and the start's gauge.
 
     The constant light is returned if there is no earlier one, or if that explains the block worse.  A photo that the
@@ -328,7 +326,6 @@ def light_from_earlier(
         constant: Block in its constant light.
         earlier: Earlier solution.
         factor: Factor on the reflectances of the earlier solution.
-        loss: Loss that compares both lights.
     """
     block = constant.block
     model = earlier.table.model
@@ -350,7 +347,7 @@ def light_from_earlier(
         model.curvature(block.name),
     )
     illumination = msgspec.structs.replace(constant, light=light)
-    if illumination.losses(loss).mean() <= constant.losses(loss).mean():
+    if illumination.losses(COMPARISON_LOSS).mean() <= constant.losses(COMPARISON_LOSS).mean():
         return light
     message = "illumination '%s' starts anew: a constant light explains its photos better than the earlier solution's"
     log.warning(message, block.name)

@@ -9,12 +9,13 @@ direction take the radiance of their surroundings, and one lobe is added.  The l
 
     Σ_i t_i² (r_i + A_i(z) w)²                                                                                       (1)
 
-channel by channel, with t² the weight of the robust loss and A the whitened response.  The residual is linear in w; z
-is searched over grids, coarse and then fine.  Then cells are fitted anew around either lobe.  The sun is kept if its
-light explains the observations better than cells alone (`accept_sun`).  Natural light has suns, so the comparison
-with the wide lobe rejects one only if the evidence is clearly against it (`CLEARLY_AGAINST`).  Air scatters blue light
-from the sun into the sky, so no sun is bluer than the light as a whole.  All observations decide: a sun has five
-unknowns and replaces those of dozens of cells, so it cannot overfit.
+channel by channel, with t² the weight of the robust loss (0 where clipped and bright enough), A the whitened response.
+The residual is linear in w; z is searched over grids, coarse and then fine. Then cells are fitted anew around either
+lobe. The sun is kept if its light explains the observations better than cells alone, holds a share of the light, and
+is no bluer than all of it (`accept_sun`): air scatters blue light from the sun into the sky. Natural light has suns,
+so the comparison with the wide lobe rejects one only if the evidence is clearly against it (`CLEARLY_AGAINST`). All
+observations decide, not the held-out ones alone: a sun has five unknowns and replaces those of dozens of cells, so it
+hardly overfits.
 """
 
 from __future__ import annotations
@@ -26,8 +27,8 @@ import numpy as np
 from jaxtyping import Float
 
 from factorlib.geometry.sphere import fibonacci_sphere
-from factorlib.inference.blocks import RobustLoss
-from factorlib.inference.fit import ROBUST, Fit, FitSchedule
+from factorlib.inference.blocks import COMPARISON_LOSS, FIT_LOSS
+from factorlib.inference.fit import Fit, FitSchedule
 from factorlib.inference.fit_runner import FitRunner
 from factorlib.inference.forward import Illumination
 from factorlib.inference.lights import Light, UnitLobes
@@ -47,7 +48,7 @@ GRIDS = ((15.0, 3.0), (4.0, 0.8), (1.0, 0.2))
 # and 13, true suns hold 9 % of the light or more and lower the loss by 1.2 to 15 %.
 LEAST_SUN_GAIN = 0.01
 LEAST_SUN_SHARE = 0.07
-AROUND_SUNS = FitSchedule(joint_steps=(0, 2), least_temperature=0.1, materials_fixed=True)
+AROUND_SUNS = FitSchedule(descents=(0, 2), least_temperature=0.1, materials_fixed=True)
 
 
 def select_suns(problem: JointProblem, fit: Fit, run: FitRunner) -> Selection:
@@ -107,7 +108,7 @@ def replace_brightest(illumination: Illumination, sharpness: float) -> Light:
     dimmed = msgspec.structs.replace(illumination, light=light.with_log_radiance(u))
     residual = dimmed.residuals()
     bright_enough = illumination.block.clipped & (residual >= 0)
-    trust = np.sqrt(ROBUST.weights(illumination.residuals()) * ~bright_enough)
+    trust = np.sqrt(FIT_LOSS.weights(illumination.residuals()) * ~bright_enough)
     # (1): for each z of the grid, w = max(−Σ t² A r, 0)/Σ t² A² by channel
     for radius, step in GRIDS:
         grid = UnitLobes(axes := _grid_around(z, radius, step), np.full(len(axes), sharpness), light.curvature)
@@ -130,12 +131,12 @@ def compare_illuminations(simpler: Illumination, richer: Illumination, least: fl
         least: Threshold in standard errors.
     """
     number = richer.block.clusters()
-    losses = [Losses([illumination.losses(RobustLoss())], [number]) for illumination in (simpler, richer)]
+    losses = [Losses([illumination.losses(COMPARISON_LOSS)], [number]) for illumination in (simpler, richer)]
     return compare_models(losses[0], losses[1], least)
 
 
 def accept_sun(cells: Illumination, sun: Illumination) -> Decision:
-    """Return the evidence for a sun; it is kept if the light with it is clearly better than cells alone.
+    """Return the evidence for a sun; it is kept if the light with it is better than cells alone.
 
     The gain must exceed `WEAKLY_FOR` standard errors and the share `LEAST_SUN_GAIN` of the loss.  The sun must hold at
     least the share `LEAST_SUN_SHARE` of the light and be no bluer than all of it.

@@ -69,8 +69,8 @@ ROUNDS = 3
 CELLS = 250  # cells of a light
 FOLDS = 4  # folds of photos
 OBSERVATIONS = 1000  # fitted observations of a light, or of a held-out photo
-START_SCHEDULE = FitSchedule(light_steps=2, joint_steps=(3, 2), estimate_first=False)
-ROUND_SCHEDULE = FitSchedule(joint_steps=(2,), estimate_first=False)
+START_SCHEDULE = FitSchedule(light_steps=2, descents=(3, 2), estimate_first=False)
+ROUND_SCHEDULE = FitSchedule(descents=(2,), estimate_first=False)
 LIGHT_STEPS = 2  # factorisations in the fit of a held-out photo's light
 
 

@@ -141,9 +141,9 @@ class Posterior:
         values = np.column_stack([materials.diffuse, materials.specular, np.ones(len(materials))])
         by_log = 1 / values.reshape(-1)  # ∂ log k/∂k
         # S and s_k, from logarithms to reflectances
-        known, scores = information(self.systems(with_scores=True), len(by_log))
+        precision, scores = information(self.systems(with_scores=True), len(by_log))
         scores = [of_light * by_log for of_light in scores]
-        variance = largest_variance(known * np.outer(by_log, by_log), scores, materials, self.problem)
+        variance = largest_variance(precision * np.outer(by_log, by_log), scores, materials, self.problem)
         deviation = residual_deviation(self.problem, self.fit.point)
         variance += ((deviation * MODEL_ERROR * values) ** 2).reshape(-1)
         variance = np.where(self.problem.known.free(len(materials)), variance, 0.0)
@@ -153,7 +153,8 @@ class Posterior:
     def relative_standard_errors(self) -> dict[str, Float[np.ndarray, "h w 3"]]:
         """Return maps of each light's standard error relative to its mean radiance, by illumination.
 
-        The maps are lat-long, of ROWS rows, in the frame of the exported ones; values are at most LARGEST.
+        The maps are lat-long, of COVERAGE_ROWS rows, in the frame of the exported ones; values are at most
+        LARGEST_RELATIVE_ERROR.
         """
         # directions of the maps' texels, in the frame of the blocks
         directions = (lat_long_directions(COVERAGE_ROWS, 2 * COVERAGE_ROWS) @ YUP_FROM_CAMERA).reshape(-1, 3)
@@ -173,8 +174,7 @@ class Posterior:
                 # gᵀ Σ g plus LIGHT_ERROR in quadrature
                 variance = np.maximum(np.sum(slope @ covariance[cells, cells] * slope, axis=1), 0)
                 errors[:, c] = np.hypot(np.sqrt(variance), model_error * slope.sum(1))
-            mean = light.energy.sum(0) / 2  # `energy` is over 2π, a mean over 4π
-            maps[block.name] = np.minimum(errors / mean, LARGEST_RELATIVE_ERROR).reshape(
+            maps[block.name] = np.minimum(errors / light.mean_radiance, LARGEST_RELATIVE_ERROR).reshape(
                 COVERAGE_ROWS, 2 * COVERAGE_ROWS, 3
             )
         return maps

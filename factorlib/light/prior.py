@@ -108,7 +108,7 @@ class LightPrior(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         """Return the inverse covariance Q of u, and log det Q.
 
         u is log R of all `directions`, then log G, then log B, and Q = Σ_k A_kᵀ A_k ⊗ K_k⁻¹/s_k².  The log determinant
-        omits a constant that does not depend on `factors`, the s_k² of (4).
+        is that of the channels y_k, which is the same: the mix of R, G and B has determinant ±1.
         """
         p = len(directions)
         log_determinant = 0.0

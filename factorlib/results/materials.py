@@ -118,9 +118,12 @@ class Tone(msgspec.Struct, frozen=True):
 
 
 class Decision(msgspec.Struct, frozen=True):
-    """Choice of a part of the model, with the mean held-out loss with and without it; None for what was not tried.
+    """Choice of a part of the model, and the evidence for it; None for what was not tried.
 
     Attributes:
+        held_out_loss_with: geometric mean over lights of their mean losses with it; of held-out observations, but of
+            all for a sun
+        held_out_loss_without: the same without it
         margin: increase of the loss without it, in standard errors
         log_bayes_factor: log marginal likelihood with it, less that without it
     """

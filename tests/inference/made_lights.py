@@ -54,7 +54,7 @@ def spheres(lights, materials=MATERIALS, shown=(0, 1, 2), size=14, noise=0.3, se
         clean = block(f"room{k}", light, materials, list(shown), OPERATOR, size=size)
         noisy = clean.radiance + noise * rng.normal(size=clean.radiance.shape) / clean.precision
         blocks.append(msgspec.structs.replace(clean, radiance=np.maximum(noisy, 0.0)))
-    return JointProblem(blocks, OPERATOR, RobustLoss())
+    return JointProblem(blocks, OPERATOR)
 
 
 def photographed(seed: int, lights: int, cells: int = FEW, **how) -> tuple[JointProblem, list[Light]]:

@@ -68,11 +68,11 @@ def test_a_fit_lowers_its_value(solved):
     """Of materials and lights together, and of lights alone.  The prior on k_d is about the start, so the value of a fit that goes on is
     another, by little."""
     problem, _, found = solved
-    again = fit_problem(problem, found, PRIOR, FitSchedule(joint_steps=(0,), estimate_first=False)).value
+    again = fit_problem(problem, found, PRIOR, FitSchedule(descents=(0,), estimate_first=False)).value
     given = fit_problem(problem, found, PRIOR, FitSchedule(materials_fixed=True)).value
     assert again == pytest.approx(found.value, rel=1e-3) and np.isfinite(found.value)
     for step, before in (
-        (FitSchedule(joint_steps=(3,), estimate_first=False), again),
+        (FitSchedule(descents=(3,), estimate_first=False), again),
         (FitSchedule(light_steps=3, materials_fixed=True), given),
     ):
         assert fit_problem(problem, found, PRIOR, step).value <= before + 1e-9 * abs(before)

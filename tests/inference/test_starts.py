@@ -213,11 +213,11 @@ def short():
     """Where a descent ends does not matter here."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(model_selection, "TRIAL", FitSchedule(2, (3,)))
-        patch.setattr(model_selection, "DISTANCE_SCHEDULE", FitSchedule(joint_steps=(2,), estimate_first=False))
-        patch.setattr(model_selection, "TONE_SCHEDULE", FitSchedule(joint_steps=(2,), estimate_first=False))
+        patch.setattr(model_selection, "DISTANCE_SCHEDULE", FitSchedule(descents=(2,), estimate_first=False))
+        patch.setattr(model_selection, "TONE_SCHEDULE", FitSchedule(descents=(2,), estimate_first=False))
         patch.setattr(joint_solver, "MATERIALS", FitSchedule(2, (2,)))
         patch.setattr(splitting, "AFTER_SPLITTING", FitSchedule(1, (2,)))
-        patch.setattr(joint_solver, "LIGHTS", FitSchedule(joint_steps=(0, 2), materials_fixed=True))
+        patch.setattr(joint_solver, "LIGHTS", FitSchedule(descents=(0, 2), materials_fixed=True))
         yield
 
 

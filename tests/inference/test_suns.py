@@ -20,7 +20,7 @@ from tests.inference.made_lights import FEW, PRIOR, begun, drawn, on_even_cells,
 TOWARDS = np.array([0.36, -0.48, -0.8])
 SUN_LOBE = UnitLobes(TOWARDS[None], np.array([SUN]))
 LIGHTS, AROUND = (
-    FitSchedule(joint_steps=together, least_temperature=0.1, materials_fixed=True) for together in ((0, 8, 6), (0, 8))
+    FitSchedule(descents=together, least_temperature=0.1, materials_fixed=True) for together in ((0, 8, 6), (0, 8))
 )
 
 
@@ -29,7 +29,7 @@ def solved(irradiance: float, seed: int):
     """Spheres under a sky drawn from the prior and a sun; the true irradiance by the sun in the blocks' unit; and the illumination and the fit
     that a solve without suns ends with, materials as they are."""
     sky = on_even_cells(drawn(seed, FEW))
-    energy = irradiance * sky.energy.sum(0) * 2 * np.pi / lobe_integral(np.array([SUN]))
+    energy = irradiance * sky.energy.sum(0) / lobe_integral(np.array([SUN]))
     problem = spheres([(sky.with_lobes(SUN_LOBE, energy) if irradiance else sky)], size=24, seed=seed)
     fit = fit_problem(problem, begun(problem, 2 * FEW, MATERIALS), PRIOR, LIGHTS)
     (one,) = problem.illuminations(fit.point)
@@ -52,7 +52,7 @@ def test_a_sun_is_found_with_its_direction_and_its_irradiance(seed):
     light, irradiance = sun.light, solved(0.5, seed)[1]
     assert accept_sun(cells, sun).kept and compare_illuminations(wide, sun, CLEARLY_AGAINST).kept
     assert light.suns.sum() == 1 and np.arccos(light.axis[light.suns][0] @ TOWARDS) < cells.light.spacing[0] / 4
-    np.testing.assert_allclose(2 * np.pi * light.energy[light.suns][0], irradiance, rtol=0.3)
+    np.testing.assert_allclose(light.energy[light.suns][0], irradiance, rtol=0.3)
 
 
 @pytest.mark.parametrize("seed", [1, 2, 3])
@@ -79,7 +79,7 @@ def test_a_sun_is_strong_and_no_bluer_than_its_light(monkeypatch, colour, share,
     """Whatever the observations say."""
     monkeypatch.setattr(suns, "compare_illuminations", lambda *_: Decision(True, 1.0, 2.0, 9.0))
     one = solved(0.0, 1)[2]
-    total = one.light.energy.sum() * 2 * np.pi / lobe_integral(np.array([SUN]))[0]
+    total = one.light.energy.sum() / lobe_integral(np.array([SUN]))[0]
     weight = total * share * np.array(colour) / sum(colour)
     lit = msgspec.structs.replace(one, light=one.light.with_lobes(SUN_LOBE, weight))
     assert accept_sun(one, lit).kept == kept

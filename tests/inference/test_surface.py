@@ -10,7 +10,8 @@ from factorlib.generate.solids import sphere
 from factorlib.geometry.camera import Camera, Pose
 from factorlib.geometry.raster import rasterise
 from factorlib.inference import surface_turns
-from factorlib.inference.fit import ROBUST, Hyperparameters, light_likelihood
+from factorlib.inference.blocks import FIT_LOSS
+from factorlib.inference.fit import Hyperparameters, light_likelihood
 from factorlib.inference.materials import Point
 from factorlib.inference.problem import JointProblem
 from factorlib.inference.start import start_from_photos
@@ -80,7 +81,7 @@ def test_slopes_are_those_of_the_forward_model(kind, monkeypatch):
     part = linearise_light(one, COUNTS, PRIOR, at, body.nodes)
     own = light_likelihood(one, COUNTS, PRIOR, True).illumination
     residual = own.block.residuals(own.predict().radiance)
-    weight = one.root_weights(residual, ROBUST, COUNTS.temperature)
+    weight = one.root_weights(residual, FIT_LOSS, COUNTS.temperature)
     after, before = (
         msgspec.structs.replace(one, block=Detail(s * turn, s * log_factor).apply_to(one.block, at)).residuals()
         for s in (1e-3, -1e-3)
@@ -121,7 +122,7 @@ def test_a_step_is_that_of_the_dense_system_of_detail_and_lights(stiffness, monk
         U = np.stack([part.residual_change(e) for e in np.eye(size)], axis=1)
         likelihood = light_likelihood(one, COUNTS, PRIOR, True)
         residual = likelihood.illumination.block.residuals(likelihood.illumination.predict().radiance)
-        r = (residual * one.root_weights(residual, ROBUST, COUNTS.temperature)).reshape(-1)
+        r = (residual * one.root_weights(residual, FIT_LOSS, COUNTS.temperature)).reshape(-1)
         Q, u = likelihood.precision, one.light.log_radiance.reshape(-1)
         system[:v, :v] += J.T @ J
         system[:v, own], system[own, :v], system[own, own] = J.T @ U, U.T @ J, U.T @ U + Q
