@@ -170,8 +170,7 @@ def _compare_sizes(image: tuple[float, float], photo: tuple[int, int]) -> tuple[
             f"{sizes}: it was made of the photo before its EXIF orientation was applied",
             "turn the photo's own pixels upright (ImageMagick: mogrify -auto-orient) and make the source of those",
         )
-    cure = "give the image itself, or the same at another size, and masks of it"
-    return f"{sizes}: it was cropped or squeezed", cure
+    return f"{sizes}: it was cropped or squeezed", "give the image itself, or the same at another size, and masks of it"
 
 
 def camera_of_photo(slice_: ObjectsSlice, facts: PhotoFacts, photo: str) -> tuple[Camera, KnownFocal]:

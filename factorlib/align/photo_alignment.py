@@ -178,9 +178,12 @@ def _estimate_object(
         InputError: If no pixel shows the object, or if its keypoints do not agree.
     """
     if not obj.silhouette.inside.any():
-        cure = "remove the object from this photo, or correct its mask or its materials"
-        fault = f"no pixel of the mask shows object {obj.name!r}"
-        raise InputError(fault, file="dataset.yaml", key=photo, cure=cure)
+        raise InputError(
+            f"no pixel of the mask shows object {obj.name!r}",
+            file="dataset.yaml",
+            key=photo,
+            cure="remove the object from this photo, or correct its mask or its materials",
+        )
     if obj.earlier is not None:  # keep the earlier pose and its runner-up; compute the score again
         start = pose_state(obj.earlier.pose, view.camera, obj.caster)
         score = refine_finest(obj.caster, view, start, search, 0).score

@@ -42,8 +42,11 @@ def check_dataset(spec: DatasetFile, file: Path) -> None:
     for index, name in enumerate(spec.materials):
         if name in spec.materials[:index]:
             with refuse.collecting():
-                cure = "label k is the k-th material: name each once"
-                refuse(f"materials[{index}]", f"material {name!r} is named twice", cure)
+                refuse(
+                    f"materials[{index}]",
+                    f"material {name!r} is named twice",
+                    "label k is the k-th material: name each once",
+                )
     for name, mesh in spec.meshes.items():
         with refuse.collecting():
             _check_mesh(f"meshes.{name}", mesh, spec.materials, refuse)
@@ -99,16 +102,21 @@ def check_lights(photos: list[PhotoEntry], file: Path) -> None:
         other = first.setdefault(photo.light, photo)
         if (other.world_from_camera is None) != (photo.world_from_camera is None):
             names = f"{other.name!r} and {photo.name!r}"
-            fault = f"photos {names} share illumination {photo.light!r}, but only one of them has this key"
-            cure = "give it for every photo that shares a light fixed to the world, or for none (fixed to the camera)"
-            Refusal(file, file.parent)(f"photos[{index}].world_from_camera", fault, cure)
+            Refusal(file, file.parent)(
+                f"photos[{index}].world_from_camera",
+                f"photos {names} share illumination {photo.light!r}, but only one of them has this key",
+                "give it for every photo that shares a light fixed to the world, or for none (fixed to the camera)",
+            )
 
 
 def _check_mesh(key: str, mesh: MeshEntry, materials: list[str], refuse: Refusal) -> None:
     kinds = [kind for kind in ("file", "hull", "lathe", "primitive") if getattr(mesh, kind)]
     if len(kinds) != 1:
-        cure = "give exactly one of file: <path>, hull: true, lathe: true, primitive: ball | box | cylinder"
-        refuse(key, f"has {' and '.join(kinds) or 'neither a file nor a shape to be estimated'}", cure)
+        refuse(
+            key,
+            f"has {' and '.join(kinds) or 'neither a file nor a shape to be estimated'}",
+            "give exactly one of file: <path>, hull: true, lathe: true, primitive: ball | box | cylinder",
+        )
     if mesh.file:
         refuse.path(f"{key}.file", mesh.file, MESHES)
     if mesh.size != 1.0 and kinds[0] in ("file", "hull"):
@@ -118,8 +126,9 @@ def _check_mesh(key: str, mesh: MeshEntry, materials: list[str], refuse: Refusal
     if mesh.parts and kinds[0] in ("lathe", "primitive"):
         refuse(f"{key}.parts", f"cannot be combined with {kinds[0]}, which has one part", "write `material: …`")
     if mesh.parts and mesh.material is not None:
-        cure = "keep `parts: {part: material, …}`, or `material:` for a mesh of one"
-        refuse(key, "has both parts and a material", cure)
+        refuse(
+            key, "has both parts and a material", "keep `parts: {part: material, …}`, or `material:` for a mesh of one"
+        )
     if not mesh.parts and mesh.material is None:
         refuse(key, "has neither parts nor a material", "add `material: …`, or `parts: {part: material, …}`")
     if mesh.material is not None:
@@ -131,11 +140,11 @@ def _check_hull(name: str, spec: DatasetFile, refuse: Refusal) -> None:
     instances = [obj for photo in spec.photos for obj in photo.objects if obj.mesh == name]
     known = sum(obj.pose is not None for obj in instances)
     if known < LEAST_OUTLINES:
-        cure = (
-            "add `cameras: {sfm: true}`, another source of cameras, or each object's `pose`; or use lathe or primitive"
+        refuse(
+            f"meshes.{name}.hull",
+            f"of {len(instances)} photos of it {known} have a known camera, a hull needs two",
+            "add `cameras: {sfm: true}`, another source of cameras, or each object's `pose`; or use lathe or primitive",
         )
-        fault = f"of {len(instances)} photos of it {known} have a known camera, a hull needs two"
-        refuse(f"meshes.{name}.hull", fault, cure)
 
 
 def _check_parts(key: str, parts: dict[str, str], mesh: MeshEntry, materials: list[str], refuse: Refusal) -> None:
@@ -145,8 +154,11 @@ def _check_parts(key: str, parts: dict[str, str], mesh: MeshEntry, materials: li
         if not mesh.file and not mesh.parts and part != ALL_OF_IT:
             refuse(f"{key}.{part}", f"it has no part {part!r}", f"it has one, {ALL_OF_IT!r}")
         if file.suffix.lower() in ONE_PART and part != file.stem:
-            fault = f"{file.name} has no part {part!r}"
-            refuse(f"{key}.{part}", fault, f"it has one, {file.stem!r}; for several, save the mesh as OBJ or glTF")
+            refuse(
+                f"{key}.{part}",
+                f"{file.name} has no part {part!r}",
+                f"it has one, {file.stem!r}; for several, save the mesh as OBJ or glTF",
+            )
         if mesh.parts:
             refuse.known(f"{key}.{part}", part, mesh.parts, "part")
         refuse.known(f"{key}.{part}", material, materials, "material")
@@ -166,8 +178,11 @@ def _check_photo(key: str, photo: PhotoEntry, spec: DatasetFile, refuse: Refusal
             _check_ground(f"{key}.ground.normal", photo.ground, refuse)
     with refuse.collecting():
         if photo.camera and photo.camera.distortion and photo.camera.focal_px is None:
-            cure = "give focal_px beside it"
-            refuse(f"{key}.camera.distortion", "its unit is the focal length, which is not given", cure)
+            refuse(
+                f"{key}.camera.distortion",
+                "its unit is the focal length, which is not given",
+                "give focal_px beside it",
+            )
     with refuse.collecting():
         if not photo.masks:
             refuse(f"{key}.masks", "no mask is named", "give a label PNG, a COCO json, or {material: mask.png, …}")
@@ -179,8 +194,11 @@ def _check_photo(key: str, photo: PhotoEntry, spec: DatasetFile, refuse: Refusal
             refuse.path(f"{key}.masks.{material}", path, (".png",))
     with refuse.collecting():
         if not photo.objects:
-            cure = "add {name: …, mesh: …}: a mesh gives its pixels their normals"
-            refuse(f"{key}.objects", f"photo {photo.name!r} has no objects", cure)
+            refuse(
+                f"{key}.objects",
+                f"photo {photo.name!r} has no objects",
+                "add {name: …, mesh: …}: a mesh gives its pixels their normals",
+            )
         refuse.once(f"{key}.objects", (obj.name for obj in photo.objects), "object")
     for index, obj in enumerate(photo.objects):
         with refuse.collecting():
@@ -196,8 +214,11 @@ def _check_object(key: str, obj: MeshInstance, spec: DatasetFile, refuse: Refusa
     if obj.pose is not None:
         refuse.rotation(f"{key}.pose.rotation", obj.pose.rotation)
         if mesh.primitive:
-            cure = "leave it out: the pose is estimated"
-            refuse(f"{key}.pose", "cannot be given for a primitive, whose size is estimated with its pose", cure)
+            refuse(
+                f"{key}.pose",
+                "cannot be given for a primitive, whose size is estimated with its pose",
+                "leave it out: the pose is estimated",
+            )
         if mesh.lathe and mesh.size != 1.0:
             refuse(
                 f"{key}.pose",
@@ -205,8 +226,11 @@ def _check_object(key: str, obj: MeshInstance, spec: DatasetFile, refuse: Refusa
                 "keep one",
             )
     if obj.keypoints and not mesh.file:
-        cure = "leave them out, or give the mesh's file"
-        refuse(f"{key}.keypoints", "its mesh has no file, so no points are known on it", cure)
+        refuse(
+            f"{key}.keypoints",
+            "its mesh has no file, so no points are known on it",
+            "leave them out, or give the mesh's file",
+        )
     if obj.keypoints:
         _check_keypoints(f"{key}.keypoints", obj, refuse)
 
@@ -222,12 +246,17 @@ def _check_known(spec: DatasetFile, refuse: Refusal) -> None:
                 refuse(key, f"no object is made of material {name!r}", "leave it out, or add the object that shows it")
             specular = reflectance.specular or (0.0, 0.0, 0.0)
             if not min(map(sum, zip(reflectance.diffuse, specular, strict=True))) > 0:
-                cure = "give what it reflects in every channel, or leave it out"
-                refuse(key, "it reflects nothing in some channel, so that the light cannot be derived from it", cure)
+                refuse(
+                    key,
+                    "it reflects nothing in some channel, so that the light cannot be derived from it",
+                    "give what it reflects in every channel, or leave it out",
+                )
             if max(reflectance.diffuse) + max(specular) > 1:
-                fault = f"diffuse and specular reflectance are {max(reflectance.diffuse) + max(specular):.3g} together"
-                cure = "their largest channels may be 1 together: no more light is reflected than falls on it"
-                refuse(key, fault, cure)
+                refuse(
+                    key,
+                    f"diffuse and specular reflectance are {max(reflectance.diffuse) + max(specular):.3g} together",
+                    "their largest channels may be 1 together: no more light is reflected than falls on it",
+                )
     _check_known_lights(spec, refuse)
 
 
@@ -306,18 +335,27 @@ def _check_ground(key: str, ground: GroundEntry, refuse: Refusal) -> None:
     if not any(ground.normal):
         refuse(key, "a normal of length 0", "write the direction that points up from the ground, in the camera's axes")
     if sum(n * p for n, p in zip(ground.normal, ground.point, strict=True)) >= 0:
-        fault = "it points away from the camera, or the camera lies in the plane"
-        refuse(key, fault, "negate it: the normal points toward the objects")
+        refuse(
+            key,
+            "it points away from the camera, or the camera lies in the plane",
+            "negate it: the normal points toward the objects",
+        )
 
 
 def _check_keypoints(key: str, obj: MeshInstance, refuse: Refusal) -> None:
     """Check that keypoints are enough, distinct, and not collinear, which would leave a rotation free."""
     if obj.pose is not None:
-        cure = "keep one: a pose is used as it is, keypoints are where the search begins"
-        refuse(key, "has both a pose and keypoints", cure)
+        refuse(
+            key,
+            "has both a pose and keypoints",
+            "keep one: a pose is used as it is, keypoints are where the search begins",
+        )
     if len(obj.keypoints) < LEAST_KEYPOINTS:
-        cure = f"give {LEAST_KEYPOINTS} or more; {GOOD_KEYPOINTS} where the focal length is unknown"
-        refuse(key, f"{len(obj.keypoints)} keypoints do not determine a pose", cure)
+        refuse(
+            key,
+            f"{len(obj.keypoints)} keypoints do not determine a pose",
+            f"give {LEAST_KEYPOINTS} or more; {GOOD_KEYPOINTS} where the focal length is unknown",
+        )
     for name in ("pixel", "point"):
         places = [getattr(keypoint, name) for keypoint in obj.keypoints]
         first: dict[tuple[float, ...], int] = {}
@@ -331,16 +369,22 @@ def _check_keypoints(key: str, obj: MeshInstance, refuse: Refusal) -> None:
         along = [sum(x * u for x, u in zip(arm, unit)) for arm in arms]
         distances = [math.hypot(*(x - length * u for x, u in zip(arm, unit))) for arm, length in zip(arms, along)]
         if max(distances) < LEAST_OFF_LINE * math.hypot(*longest):
-            cure = "name places in different directions: about a line the object could turn"
-            refuse(key, f"every {name} lies on one line", cure)
+            refuse(
+                key,
+                f"every {name} lies on one line",
+                "name places in different directions: about a line the object could turn",
+            )
 
 
 def _check_source(source: CameraSource, spec: DatasetFile, refuse: Refusal) -> None:
     """Check that there is one source of cameras, with a path inside the folder and known names."""
     kinds = [kind for kind in (*SOURCES, "sfm") if getattr(source, kind)]
     if len(kinds) != 1:
-        cure = f"name one of {', '.join(SOURCES)}, or `sfm: true`"
-        refuse("cameras", f"names {' and '.join(kinds) or 'no source'}", cure)
+        refuse(
+            "cameras",
+            f"names {' and '.join(kinds) or 'no source'}",
+            f"name one of {', '.join(SOURCES)}, or `sfm: true`",
+        )
     if source.sfm:
         for key in ("images", "world_from_object", "world_from_camera", "obj_ids", "mesh_unit_mm"):
             if getattr(source, key) != getattr(CameraSource(), key):

@@ -140,8 +140,10 @@ def read_header(file: Path, key: str | None = None, most_bytes: int = MOST_BYTES
                 raise ValueError("its first chunk is longer than the file")
         text = stream.read(size if length is None else length)
         if text.count(b",") > MOST_VALUES:
-            cure = "export the geometry alone, with its data in a .bin file or as .glb"
-            raise refused(f"its header has more than {MOST_VALUES:,} values", cure)
+            raise refused(
+                f"its header has more than {MOST_VALUES:,} values",
+                "export the geometry alone, with its data in a .bin file or as .glb",
+            )
         header = msgspec.json.decode(text, type=GltfHeader)
     if header.asset.version.split(".")[0] != "2":
         raise refused(f"is glTF {header.asset.version[:20]}", "export it again, as glTF 2.0")

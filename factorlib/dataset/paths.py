@@ -52,8 +52,11 @@ class Refusal:
             kind: the kind of name, for errors
         """
         if name not in (known := list(known)):
-            cure = did_you_mean(name, known) if known else f"the dataset has no {kind} here"
-            self(key, f"unknown {kind} {name!r}", cure)
+            self(
+                key,
+                f"unknown {kind} {name!r}",
+                (did_you_mean(name, known) if known else f"the dataset has no {kind} here"),
+            )
 
     def once(self, key: str, names: Iterable[str], kind: str) -> None:
         """Check that the names of a list are distinct.
@@ -66,20 +69,29 @@ class Refusal:
         first: dict[str, int] = {}
         for index, name in enumerate(names):
             if first.setdefault(name, index) != index:
-                fault = f"duplicate {kind} name {name!r}"
-                self(f"{key}[{index}].name", fault, f"{key}[{first[name]}] has it already: rename one")
+                self(
+                    f"{key}[{index}].name",
+                    f"duplicate {kind} name {name!r}",
+                    f"{key}[{first[name]}] has it already: rename one",
+                )
 
     def rotation(self, key: str, rows: tuple) -> None:
         """Check that three rows are a rotation: RᵀR = 1 within ROTATION_TOLERANCE, determinant +1."""
         gram = [[sum(r[i] * r[j] for r in rows) - (i == j) for j in range(3)] for i in range(3)]
         worst = max(abs(entry) for row in gram for entry in row)
         if not worst <= ROTATION_TOLERANCE:
-            fault = f"not a rotation: RᵀR differs from 1 by {worst:.3g}"
-            self(key, fault, "its columns must be unit vectors at right angles (no scale)")
+            self(
+                key,
+                f"not a rotation: RᵀR differs from 1 by {worst:.3g}",
+                "its columns must be unit vectors at right angles (no scale)",
+            )
         a, b, c = rows
         if sum(a[i] * (b[(i + 1) % 3] * c[(i + 2) % 3] - b[(i + 2) % 3] * c[(i + 1) % 3]) for i in range(3)) < 0:
-            fault = "not a rotation but a reflection (determinant −1)"
-            self(key, fault, "one axis is flipped: the camera frame is x right, y down, z forward")
+            self(
+                key,
+                "not a rotation but a reflection (determinant −1)",
+                "one axis is flipped: the camera frame is x right, y down, z forward",
+            )
 
     def path(self, key: str, path: str, suffixes: Iterable[str], must_exist: bool = True) -> None:
         """Check that a path has a known suffix and leads to a plain, readable file inside the folder.
@@ -101,8 +113,11 @@ class Refusal:
             except OSError:
                 names = []
             suggestion = did_you_mean(target.name, names)
-            cure = suggestion if suggestion.startswith("did") else f"put it at {target}, or correct the path"
-            self(key, f"there is no file {path!r}", cure)
+            self(
+                key,
+                f"there is no file {path!r}",
+                (suggestion if suggestion.startswith("did") else f"put it at {target}, or correct the path"),
+            )
 
     def subfolder(self, key: str, path: str) -> None:
         """Check that a path leads to a readable folder inside the dataset's, with links followed."""
@@ -150,8 +165,11 @@ class Refusal:
                 self.inside[above] = path_inside(self.folder, above)
             return target
         except ValueError as error:
-            fault = f"{path if len(path) <= 80 else f'{path[:80]}…'!r} {error}"
-            self(key, fault, f"copy the {kind} into {self.folder.resolve()} and name it relative to that folder")
+            self(
+                key,
+                f"{path if len(path) <= 80 else f'{path[:80]}…'!r} {error}",
+                f"copy the {kind} into {self.folder.resolve()} and name it relative to that folder",
+            )
 
 
 def file_exists(target: Path, key: str) -> bool:

@@ -42,8 +42,9 @@ def read_dataset(path: str | Path) -> Dataset:
         raise InputError("there is no such dataset", file=file, cure=f"name a folder with a {FILE} in it")
     folder = Path(os.path.abspath(file)).parent
     if folder.name in RESERVED:
-        cure = "rename its folder: build/ uses that name"
-        raise InputError(f"a dataset cannot be called {folder.name!r}", file=file, cure=cure)
+        raise InputError(
+            f"a dataset cannot be called {folder.name!r}", file=file, cure="rename its folder: build/ uses that name"
+        )
     spec, faults = read_draft(file)
     raise_all(faults)
     external: dict[str, ExternalCamera] = {}
@@ -77,8 +78,11 @@ def read_draft(file: Path) -> tuple[DatasetFile, list[InputError]]:
         listed = ", ".join(places[:MOST_NAMED]) + f" and {len(places) - MOST_NAMED} more" * (len(places) > MOST_NAMED)
         fault = f"{len(places)} places are left open" if len(places) > 1 else "one place is left open"
         hint = "; `make label` draws masks" if any(place.endswith(".masks") for place in places) else ""
-        cure = f"write what belongs there, in place of `?`{hint}"
-        faults.append(InputError(f"{fault}: {listed}", file=file, key=places[0], cure=cure))
+        faults.append(
+            InputError(
+                f"{fault}: {listed}", file=file, key=places[0], cure=f"write what belongs there, in place of `?`{hint}"
+            )
+        )
     try:
         spec = convert(value, DatasetFile, file, text=text)
     except InputError as error:
@@ -169,7 +173,8 @@ def _companions(path: str, key: str, refuse: Refusal) -> list[str]:
         companions = [companion for companion in companions if os.path.isfile(refuse.folder / companion)]
     for companion in companions:
         if not os.path.lexists(refuse.folder / companion):
-            cure = "copy it beside the mesh, or export one .glb"
-            refuse(key, f"the mesh names {companion!r}, which is not there", cure)
+            refuse(
+                key, f"the mesh names {companion!r}, which is not there", "copy it beside the mesh, or export one .glb"
+            )
         check_plain(refuse.folder / companion, "an .mtl" if is_obj else "a glTF buffer", key)
     return companions

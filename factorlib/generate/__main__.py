@@ -44,8 +44,10 @@ def writes_set(options: Callable[..., tuple[ModuleType, msgspec.Struct]]) -> Cal
         """Write the set."""
         if any(values.values()) and out is None:
             *most, last = (f"--{name}" for name in values)
-            fault = f"data/{options.__name__} is the set without {', '.join(most)} and {last}: name another folder"
-            raise typer.BadParameter(fault, param_hint="--out")
+            raise typer.BadParameter(
+                f"data/{options.__name__} is the set without {', '.join(most)} and {last}: name another folder",
+                param_hint="--out",
+            )
         _write(*options(**values), out or Path("data", options.__name__), seed, lights)
 
     shared = [each for each in signature(command).parameters.values() if each.kind is not each.VAR_KEYWORD]
@@ -99,8 +101,11 @@ def _write(set_: ModuleType, parameters: msgspec.Struct, out: Path, seed: int, l
     try:
         maps = maps_in([lights]) if lights else []
         if out.exists() and any(out.iterdir()) and not (out / "dataset.yaml").is_file():
-            cure = "name an empty folder, or a data set to replace"
-            raise InputError("this folder holds something else than a data set", file=out, cure=cure)
+            raise InputError(
+                "this folder holds something else than a data set",
+                file=out,
+                cure="name an empty folder, or a data set to replace",
+            )
         rmtree(fresh, ignore_errors=True)
         with Progress() as bar:
             task = bar.add_task(f"{out}", total=1)

@@ -193,7 +193,8 @@ def captured(path: Path, height: int) -> Float[np.ndarray, "h w 3"]:
     """Read a user's lat-long map (.exr, .hdr), averaged to `height` rows and scaled to a mean radiance of 1."""
     radiance = read_light_map(path)
     if (rows := len(radiance)) % height:
-        fault = f"{rows} rows do not divide into {height}"
-        raise InputError(fault, file=path, cure=f"resize it to a multiple of {height} rows")
+        raise InputError(
+            f"{rows} rows do not divide into {height}", file=path, cure=f"resize it to a multiple of {height} rows"
+        )
     radiance = radiance.reshape(height, rows // height, 2 * height, rows // height, 3).mean(axis=(1, 3))
     return radiance / radiance.mean()

@@ -134,6 +134,7 @@ def read_rgb_exr(path: str | Path) -> Float[np.ndarray, "h w 3"]:
     channels = read_exr(path)
     for name in "RGB":
         if name not in channels:
-            fault = f"has no channel {name}, only {', '.join(channels)}"
-            raise InputError(fault, file=path, cure="an RGB image is expected")
+            raise InputError(
+                f"has no channel {name}, only {', '.join(channels)}", file=path, cure="an RGB image is expected"
+            )
     return np.stack([channels[name] for name in "RGB"], axis=-1)

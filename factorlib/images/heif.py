@@ -53,8 +53,9 @@ def open_heif(path: str | Path, key: str | None) -> OpenPhoto:
     width, height = picture.size
     curve = VIDEO.get((info.get("nclx_profile") or {}).get("transfer_characteristics", 0))
     if curve:
-        cure = "export it from the phone as a JPEG, or without HDR"
-        raise refused(f"is encoded for HDR video ({curve}), not as sRGB", cure)
+        raise refused(
+            f"is encoded for HDR video ({curve}), not as sRGB", "export it from the phone as a JPEG, or without HDR"
+        )
 
     @cache
     def pixels() -> Shaped[np.ndarray, "h w 3"]:

@@ -56,9 +56,12 @@ class RadialLens(msgspec.Struct, frozen=True):
         r2 = np.square((corners - self.centre) / self.focal).sum(1).max() * np.linspace(0, 1, 100)
         k1, k2 = self.coefficients
         if (1 + 3 * k1 * r2 + 5 * k2 * r2**2 <= 0).any():
-            fault = f"k1 = {k1:g}, k2 = {k2:g} map two rays within the picture to one point of the photo"
-            cure = "give the coefficients of COLMAP's RADIAL or OpenCV's model for this focal length"
-            raise InputError(fault, file=file, key=key, cure=cure)
+            raise InputError(
+                f"k1 = {k1:g}, k2 = {k2:g} map two rays within the picture to one point of the photo",
+                file=file,
+                key=key,
+                cure="give the coefficients of COLMAP's RADIAL or OpenCV's model for this focal length",
+            )
 
 
 def radial_lens(camera: Intrinsics | None, factor: int, width: int, height: int) -> RadialLens | None:

@@ -31,8 +31,11 @@ def maps_in(folders: Sequence[Path]) -> list[Path]:
             raise InputError("no such folder", file=folder, cure="name folders of lat-long maps (.hdr, .exr)")
         maps = sorted(path for path in folder.iterdir() if path.suffix.lower() in SUFFIXES)
         if not maps:
-            cure = "name a folder of lat-long maps; folders within it count by themselves"
-            raise InputError("no .hdr or .exr in this folder", file=folder, cure=cure)
+            raise InputError(
+                "no .hdr or .exr in this folder",
+                file=folder,
+                cure="name a folder of lat-long maps; folders within it count by themselves",
+            )
         paths += maps
     return paths
 

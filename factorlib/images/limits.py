@@ -36,9 +36,12 @@ def check_pixels(size: tuple[int, int], most_megapixels: float, path: str | Path
     height, width = size
     millions = height * width / 1e6
     if millions > most_megapixels:
-        fault = f"has {width} × {height} pixels, {millions:.4g} megapixels; at most {most_megapixels:g} are read"
-        cure = f'make photo and masks smaller, or allow it: SET="masks.most_megapixels={ceil(millions)}"'
-        raise InputError(fault, file=path, key=key, cure=cure)
+        raise InputError(
+            f"has {width} × {height} pixels, {millions:.4g} megapixels; at most {most_megapixels:g} are read",
+            file=path,
+            key=key,
+            cure=f'make photo and masks smaller, or allow it: SET="masks.most_megapixels={ceil(millions)}"',
+        )
 
 
 def check_values(path: str | Path, most_megapixels: float = MOST_MEGAPIXELS, key: str | None = None) -> None:
@@ -63,6 +66,9 @@ def check_values(path: str | Path, most_megapixels: float = MOST_MEGAPIXELS, key
     millions = spec.width * spec.height * spec.nchannels / 1e6
     source.close()
     if millions > CHANNELS * most_megapixels:
-        fault = f"has {spec.width} × {spec.height} pixels of {spec.nchannels} channels, {millions:,.0f} million values"
-        cure = f"make it smaller, or leave channels out: at most {CHANNELS * most_megapixels:,.0f} million are read"
-        raise InputError(fault, file=path, key=key, cure=cure)
+        raise InputError(
+            f"has {spec.width} × {spec.height} pixels of {spec.nchannels} channels, {millions:,.0f} million values",
+            file=path,
+            key=key,
+            cure=f"make it smaller, or leave channels out: at most {CHANNELS * most_megapixels:,.0f} million are read",
+        )

@@ -107,8 +107,12 @@ def check_bright(photo: Photo, where: Bool[np.ndarray, "h w"], path: str | Path,
         InputError: If all pixels are black or negative.
     """
     if not (photo.radiance[where & photo.finite] > 0).any():
-        cure = "expose, render or develop it again; was the exposure 0, or a sign turned? or drop the photo"
-        raise InputError("every pixel in its mask is black, or less than 0", file=path, key=key, cure=cure)
+        raise InputError(
+            "every pixel in its mask is black, or less than 0",
+            file=path,
+            key=key,
+            cure="expose, render or develop it again; was the exposure 0, or a sign turned? or drop the photo",
+        )
 
 
 def decoded(

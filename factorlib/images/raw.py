@@ -85,8 +85,12 @@ def _refusal(fault: str, error: Exception, path: str | Path, key: str | None) ->
     """Return an InputError with the words of LibRaw and the command that develops the photo."""
     text = error.args[0] if error.args else error
     reason = text.decode("utf-8", "replace") if isinstance(text, bytes) else str(text)
-    cure = f"develop it: darktable-cli {Path(path).name} {Path(path).stem}.tif"
-    return InputError(f"{fault} ({reason})", file=path, key=key, cure=cure)
+    return InputError(
+        f"{fault} ({reason})",
+        file=path,
+        key=key,
+        cure=f"develop it: darktable-cli {Path(path).name} {Path(path).stem}.tif",
+    )
 
 
 def _crop(sizes: Any) -> tuple[slice, slice]:

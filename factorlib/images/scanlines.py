@@ -126,6 +126,7 @@ def _colours(spec: oiio.ImageSpec, path: str | Path, key: str | None) -> list[in
         return [names.index(name) for name in "RGB"]
     colours = [index for index in range(len(names)) if index != spec.alpha_channel and names[index] != "Z"]
     if len(colours) != 1:
-        cure = "save it as RGB or grey, in one layer"
-        raise InputError(f"has the channels {', '.join(names)}", file=path, key=key, cure=cure)
+        raise InputError(
+            f"has the channels {', '.join(names)}", file=path, key=key, cure="save it as RGB or grey, in one layer"
+        )
     return 3 * colours

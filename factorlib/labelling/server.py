@@ -133,8 +133,11 @@ class MaskSet:
         path = self.files[index]
         photo = self.photos[index].name
         if self.version(index) != version:
-            cure = "press R to read it (what was drawn since the last save is lost), or move the file away"
-            raise InputError("has changed on disk meanwhile: nothing was written", file=path, cure=cure)
+            raise InputError(
+                "has changed on disk meanwhile: nothing was written",
+                file=path,
+                cure="press R to read it (what was drawn since the last save is lost), or move the file away",
+            )
         named = self._named(photo)
         path.parent.mkdir(parents=True, exist_ok=True)
         replace_file(path, png)
@@ -156,12 +159,11 @@ class MaskSet:
         with suppress(InputError):  # The `?` had an anchor that other places refer to.
             if parse_yaml(text) == value:
                 return text
-        cure = f"write masks: {mask}, and save again; nothing was written"
         raise InputError(
             "its `?` has an anchor that other keys use, so it cannot be replaced automatically",
             file=self.yaml,
             key=f"photos[{index}].masks",
-            cure=cure,
+            cure=f"write masks: {mask}, and save again; nothing was written",
         )
 
     def version(self, index: int) -> str:
@@ -172,8 +174,11 @@ class MaskSet:
     def _known(self, labels: np.ndarray, index: int) -> np.ndarray:
         """Return the labels; InputError if one has no material."""
         if unknown := {*np.unique(labels).tolist()} - {*range(len(self.materials) + 1), LEFT_OUT}:
-            cure = f"known are 0 background, 1 to {len(self.materials)} the materials, {LEFT_OUT} leave out"
-            raise InputError(f"unknown label {min(unknown)}", file=self.files[index], cure=cure)
+            raise InputError(
+                f"unknown label {min(unknown)}",
+                file=self.files[index],
+                cure=f"known are 0 background, 1 to {len(self.materials)} the materials, {LEFT_OUT} leave out",
+            )
         return labels
 
 
@@ -288,8 +293,9 @@ def serve(folder: Path, port: int = 0) -> None:
     try:
         server = Server(masks, port)
     except (OSError, OverflowError) as error:
-        fault = f"port {port} cannot be used ({error})"
-        raise InputError(fault, key="PORT", cure="choose another with PORT=…, or leave it out") from error
+        raise InputError(
+            f"port {port} cannot be used ({error})", key="PORT", cure="choose another with PORT=…, or leave it out"
+        ) from error
     print(f"{folder.name}: open {server.url}\n  Ctrl-C ends it", flush=True)
     try:
         server.serve_forever()

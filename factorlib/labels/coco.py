@@ -170,8 +170,9 @@ def _entry(coco: Coco, image: str, path: str | Path) -> CocoImage:
     if not same:
         raise InputError(f"has no image {base!r}", file=path, key="images", cure=did_you_mean(base, bases))
     if len(same) > 1:
-        cure = f"keep one, or name it {image!r} in full"
-        raise InputError(f"has {len(same)} images {base!r}", file=path, key="images", cure=cure)
+        raise InputError(
+            f"has {len(same)} images {base!r}", file=path, key="images", cure=f"keep one, or name it {image!r} in full"
+        )
     return same[0]
 
 
@@ -180,12 +181,17 @@ def _shapes(text: msgspec.Raw, shape: tuple[int, int], path: str | Path, key: st
     with reading("a COCO segmentation", path, key, CURE):
         segmentation = msgspec.json.decode(text, type=list[list[float]] | Rle | None)
     if not segmentation:
-        cure = "draw its outline, or delete it"
-        raise InputError("is empty: the annotation has only a box", file=path, key=key, cure=cure)
+        raise InputError(
+            "is empty: the annotation has only a box", file=path, key=key, cure="draw its outline, or delete it"
+        )
     if isinstance(segmentation, Rle):
         if tuple(segmentation.size) != shape:
-            fault = f"its RLE is {_wh(segmentation.size)} pixels, the image {_wh(shape)}"
-            raise InputError(fault, file=path, key=key, cure="export it at the photo's own size")
+            raise InputError(
+                f"its RLE is {_wh(segmentation.size)} pixels, the image {_wh(shape)}",
+                file=path,
+                key=key,
+                cure="export it at the photo's own size",
+            )
         return [segmentation.counts], 0.0
     polygons = []
     length = 0.0

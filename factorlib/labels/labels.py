@@ -68,8 +68,12 @@ def read_labels(
     else:
         labels = _labels_of_png(read_values(where, key, size), where, materials, key)
     if labels is None or not labels.label.any():
-        fault = "the mask is empty: no pixel has a material"
-        raise InputError(fault, file=where, key=key, cure="paint at least one material, or drop the photo")
+        raise InputError(
+            "the mask is empty: no pixel has a material",
+            file=where,
+            key=key,
+            cure="paint at least one material, or drop the photo",
+        )
     return labels
 
 
@@ -97,14 +101,21 @@ def read_objects(
         where = f"{key}[{index}].mask"
         inside = read_inside(file(path), where, size)
         if not inside.any():
-            fault = f"the mask of object {name!r} is empty"
-            raise InputError(fault, file=file(path), key=where, cure="paint it, or leave the key out")
+            raise InputError(
+                f"the mask of object {name!r} is empty",
+                file=file(path),
+                key=where,
+                cure="paint it, or leave the key out",
+            )
         if objects[inside].any():
             other = int(objects[inside & (objects > 0)][0]) - 1
             count = int((objects[inside] == other + 1).sum())
-            fault = f"objects {masks[other][0]!r} and {name!r} share {count} pixels"
-            cure = "a pixel shows one object: erase it from the one behind"
-            raise InputError(fault, file=file(path), key=where, cure=cure)
+            raise InputError(
+                f"objects {masks[other][0]!r} and {name!r} share {count} pixels",
+                file=file(path),
+                key=where,
+                cure="a pixel shows one object: erase it from the one behind",
+            )
         objects[inside] = index + 1
     return objects
 
@@ -163,8 +174,12 @@ def _labels_of_png(values: UInt16[np.ndarray, "h w"], path: Path, materials: lis
     for value, count in zip(present.tolist(), counts.tolist()):
         if value > len(materials) and value != LEFT_OUT:
             known = ", ".join(f"{k} {name}" for k, name in enumerate(materials, 1))
-            fault = f"unknown label {value} ({count} pixels)"
-            raise InputError(fault, file=path, key=key, cure=f"known are: 0 background, {known}, 255 leave out")
+            raise InputError(
+                f"unknown label {value} ({count} pixels)",
+                file=path,
+                key=key,
+                cure=f"known are: 0 background, {known}, 255 leave out",
+            )
     left_out = values == LEFT_OUT
     return Labels(label=np.where(left_out, 0, values).astype(np.uint8), left_out=left_out)
 
@@ -189,8 +204,9 @@ def _merged(
             fault += f" with {other_path.name}" if other_path != path else ""
             square = (edge + 1, edge + 1)
             if min(shared.shape) > edge and sliding_window_view(shared, square).all((2, 3)).any():
-                cure = "a pixel shows one material: erase it from the one behind"
-                raise InputError(fault, file=path, key=key, cure=cure)
+                raise InputError(
+                    fault, file=path, key=key, cure="a pixel shows one material: erase it from the one behind"
+                )
             log.warning("%s: %s: %s along their outlines: these are left out", path, key, fault)
             left_out |= shared
         label[inside[material]] = number

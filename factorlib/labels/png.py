@@ -96,5 +96,9 @@ def check_size(size: Sequence[int], expected: Sequence[int], path: str | Path, k
         cure = "save the mask with the photo's own pixels"
         if tuple(size) == tuple(expected)[::-1]:
             cure = "it lies on its side: the photo's EXIF orientation is applied, so mask the photo as it is displayed"
-        fault = f"the mask is {size[1]} × {size[0]} pixels, the photo {expected[1]} × {expected[0]}"
-        raise InputError(fault, file=path, key=key, cure=cure)
+        raise InputError(
+            f"the mask is {size[1]} × {size[0]} pixels, the photo {expected[1]} × {expected[0]}",
+            file=path,
+            key=key,
+            cure=cure,
+        )

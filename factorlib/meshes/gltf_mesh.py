@@ -41,8 +41,11 @@ def read_gltf(path: Path, limits: Limits) -> TriangleSoup:
     try:
         return _read_parts(header, path, limits)
     except (LookupError, AssertionError) as error:
-        fault = f"its header names a node, an array or a part of a buffer that the file does not have ({error!r})"
-        raise InputError(fault, file=path, cure=CURE) from error
+        raise InputError(
+            f"its header names a node, an array or a part of a buffer that the file does not have ({error!r})",
+            file=path,
+            cure=CURE,
+        ) from error
 
 
 def _read_parts(header: GltfHeader, path: Path, limits: Limits) -> TriangleSoup:
@@ -162,8 +165,11 @@ def _size(primitive: Primitive, header: GltfHeader, path: Path) -> tuple[int, in
     ]
     corners = used[0] if primitive.indices is None else header.accessors[primitive.indices]
     if any(accessor.sparse is not None for accessor in (*used, corners)):
-        cure = "export it again, without sparse accessors"
-        raise InputError("stores its triangles in a sparse accessor, which is not read", file=path, cure=cure)
+        raise InputError(
+            "stores its triangles in a sparse accessor, which is not read",
+            file=path,
+            cure="export it again, without sparse accessors",
+        )
     vertices = used[0].count
     if used[-1].count != vertices:
         raise InputError("a primitive has another number of NORMAL than of POSITION", file=path, cure=CURE)

@@ -38,15 +38,21 @@ class Limits(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         most_vertices = VERTICES_A_TRIANGLE * self.triangles
         for count, most, what in ((triangles, self.triangles, "triangles"), (vertices, most_vertices, "vertices")):
             if count > most:
-                cure = f'simplify it; at most {most:,} {what} are read (SET="align.limits.triangles=…")'
-                raise InputError(f"has {count:,} {what}", file=file, cure=cure)
+                raise InputError(
+                    f"has {count:,} {what}",
+                    file=file,
+                    cure=f'simplify it; at most {most:,} {what} are read (SET="align.limits.triangles=…")',
+                )
 
     @staticmethod
     def check_parts(parts: int, file: str | Path) -> None:
         """Raise InputError for more than MOST_PARTS parts in one file."""
         if parts > MOST_PARTS:
-            cure = f"join parts that have the same material: at most {MOST_PARTS:,} parts are read"
-            raise InputError(f"has {parts:,} parts", file=file, cure=cure)
+            raise InputError(
+                f"has {parts:,} parts",
+                file=file,
+                cure=f"join parts that have the same material: at most {MOST_PARTS:,} parts are read",
+            )
 
 
 NO_LIMITS = Limits(megabytes=1e6, triangles=10**9)  # for meshes that an earlier stage has checked

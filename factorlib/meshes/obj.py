@@ -86,8 +86,11 @@ def read_obj(path: Path, content: bytes, limits: Limits) -> TriangleSoup:
         try:
             tables.read_line(key, words)
         except (ValueError, IndexError, OverflowError) as error:
-            fault = f"line {number}: {quoted(line)} cannot be read ({quoted(str(error))[1:-1]})"
-            raise InputError(fault, file=path, cure="correct the line, or export the mesh again, as OBJ") from error
+            raise InputError(
+                f"line {number}: {quoted(line)} cannot be read ({quoted(str(error))[1:-1]})",
+                file=path,
+                cure="correct the line, or export the mesh again, as OBJ",
+            ) from error
         if number >= next_check:
             next_check = number + COUNTED_EVERY
             limits.check(len(tables.coordinates["v"]) // 3, len(tables.part), path)

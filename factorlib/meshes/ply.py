@@ -117,8 +117,11 @@ def _header(path: Path, content: bytes) -> tuple[str, dict[str, tuple[int, Prope
                 case _:
                     raise ValueError("not a line of PLY, or a second one of that name")
         except (ValueError, LookupError, TypeError) as error:
-            fault = f"its header has the line {quoted(' '.join(line.split()))} ({quoted(str(error))[1:-1]})"
-            raise InputError(fault, file=path, cure=CURE) from error
+            raise InputError(
+                f"its header has the line {quoted(' '.join(line.split()))} ({quoted(str(error))[1:-1]})",
+                file=path,
+                cure=CURE,
+            ) from error
     if order is None:
         raise InputError("its header has no line `format`", file=path, cure=CURE)
     _check_room(elements, order, len(content) - start, path)
@@ -135,8 +138,11 @@ def _check_room(elements: dict[str, tuple[int, Properties]], order: str, room: i
     needed = sum(count * size for (count, _), size in zip(elements.values(), sizes))
     if needed > room + 1:  # text may end without a line end
         counts = ", ".join(f"{count:,} {quoted(name)[1:-1]}" for name, (count, _) in elements.items())
-        fault = f"its header announces {counts}, which take {needed:,} bytes at least, but {room:,} bytes follow"
-        raise InputError(fault, file=path, cure=CURE)
+        raise InputError(
+            f"its header announces {counts}, which take {needed:,} bytes at least, but {room:,} bytes follow",
+            file=path,
+            cure=CURE,
+        )
 
 
 def _columns(content: bytes, offset: int, order: str, count: int, properties: Properties) -> tuple[Columns, int]:

@@ -117,9 +117,11 @@ class MeshCache:
                 still = np.zeros(dense.nodes)
                 moves, factors = (np.array(table.get(name, still)) for table in (self.displacements, self.log_factors))
                 if not len(moves) == len(factors) == dense.nodes:
-                    fault = "this is not the mesh whose surface the stage `surface` estimated"
-                    cure = "run `surface` again"
-                    raise InputError(fault, file=file, cure=cure)
+                    raise InputError(
+                        "this is not the mesh whose surface the stage `surface` estimated",
+                        file=file,
+                        cure="run `surface` again",
+                    )
                 detail = np.exp(factors)[dense.node] if name in self.log_factors else None
                 mesh = msgspec.structs.replace(dense.moved(moves), detail=detail)
             self._meshes[key] = mesh
@@ -172,8 +174,9 @@ def part_labels(
             cure = did_you_mean(part, [one_line(name) for name in known])
             raise InputError(f"the mesh has no part {part!r}", file=file, key=part, cure=cure)
         if material not in materials:
-            cure = did_you_mean(material, materials)
-            raise InputError(f"unknown material {material!r}", file=file, key=part, cure=cure)
+            raise InputError(
+                f"unknown material {material!r}", file=file, key=part, cure=did_you_mean(material, materials)
+            )
     labels = []
     for part_names in names:
         chosen = next(filter(None, ({m[n] for n in part_names if n in m} for m in (overrides, parts))), {default})

@@ -37,11 +37,14 @@ def read_stl(path: Path, content: bytes, limits: Limits) -> TriangleSoup:
     limits.check(len(corners), len(corners) // 3, path)
     expected = len(VERTEX.findall(content))
     if not is_binary and not 0 < len(corners) == expected:
-        fault = (
-            f"is neither a whole text STL ({len(corners)} of {expected} corners can be read) "
-            f"nor a whole binary STL ({len(content)} of {binary_size} bytes)"
+        raise InputError(
+            (
+                f"is neither a whole text STL ({len(corners)} of {expected} corners can be read) "
+                f"nor a whole binary STL ({len(content)} of {binary_size} bytes)"
+            ),
+            file=path,
+            cure=CURE,
         )
-        raise InputError(fault, file=path, cure=CURE)
     return single_part_soup(corners, np.arange(len(corners)), path.stem)
 
 
@@ -56,8 +59,11 @@ def read_off(path: Path, content: bytes, limits: Limits) -> TriangleSoup:
     lines = [line for line in (line.split("#", 1)[0].strip() for line in text_lines(content)) if line]
     counts = COUNTS.match("\n".join(lines[:2]))
     if counts is None:
-        fault = "does not begin with OFF and the numbers of its vertices and faces"
-        raise InputError(fault, file=path, cure="save it as OFF: text, of three dimensions")
+        raise InputError(
+            "does not begin with OFF and the numbers of its vertices and faces",
+            file=path,
+            cure="save it as OFF: text, of three dimensions",
+        )
     vertices = int(counts[1])
     faces = int(counts[2])
     rows = lines[counts[0].count("\n") + 1 :]
@@ -66,8 +72,9 @@ def read_off(path: Path, content: bytes, limits: Limits) -> TriangleSoup:
     limits.check(vertices, triangles, path)
     mesh = _loaded(load_off, "\n".join([f"OFF\n{vertices} {faces} 0", *rows]).encode())
     if len(polygons) != faces or len(mesh["faces"]) != triangles:
-        fault = f"announces {vertices} vertices and {faces} faces, but has fewer or incomplete ones"
-        raise InputError(fault, file=path, cure=CURE)
+        raise InputError(
+            f"announces {vertices} vertices and {faces} faces, but has fewer or incomplete ones", file=path, cure=CURE
+        )
     return single_part_soup(mesh["vertices"], mesh["faces"], path.stem)
 
 

@@ -110,12 +110,16 @@ def check(soup: TriangleSoup, file: str | Path) -> TriangleSoup:
     low = int(soup.faces.min())
     high = int(soup.faces.max())
     if low < 0 or high >= len(soup.vertices):
-        fault = f"a face uses vertex {(low if low < 0 else high) + 1} of {len(soup.vertices)}"
-        refuse(fault, "the file is damaged: copy or export it again")
+        refuse(
+            f"a face uses vertex {(low if low < 0 else high) + 1} of {len(soup.vertices)}",
+            "the file is damaged: copy or export it again",
+        )
     bad = ~np.isfinite(soup.vertices).all(axis=1)
     if bad.any():
-        fault = f"{int(bad.sum())} vertices are not finite, first is number {int(np.argmax(bad)) + 1}"
-        refuse(fault, "remove them in a mesh editor, or export the mesh again")
+        refuse(
+            f"{int(bad.sum())} vertices are not finite, first is number {int(np.argmax(bad)) + 1}",
+            "remove them in a mesh editor, or export the mesh again",
+        )
     corners = soup.vertices[soup.faces.reshape(-1)]
     cure = "move the mesh to its origin, or export it in another unit"
     largest = float(np.abs(corners).max())

@@ -150,15 +150,16 @@ def _bounding_ball(outlines: Sequence[Outline]) -> tuple[Float[np.ndarray, "3"],
         right = right + across @ centre
         rays.append((centre, ray))
     if np.linalg.cond(left) > 1e8:
-        cure = "add photos from other sides: a hull needs them"
-        raise InputError("all photos see it from the same side", cure=cure)
+        raise InputError("all photos see it from the same side", cure="add photos from other sides: a hull needs them")
     middle = np.linalg.solve(left, right)
     radii = []
     for outline, (centre, ray) in zip(outlines, rays, strict=True):
         depth = float((middle - centre) @ ray)
         if depth <= 0:
-            cure = "check that its mask and its camera belong to the same photo"
-            raise InputError(f"the object lies behind the camera of photo '{outline.photo}'", cure=cure)
+            raise InputError(
+                f"the object lies behind the camera of photo '{outline.photo}'",
+                cure="check that its mask and its camera belong to the same photo",
+            )
         radii.append(depth * bounding_box(outline.view.silhouette)[2] / outline.camera.focal)
     return middle, min(radii)
 

@@ -99,11 +99,13 @@ def body_of_revolution(outlines: Sequence[Outline], report: Callable[[float], No
         return msgspec.structs.replace(shape, overlap=overlap(shape, posed))
     starts = [(outline, bodies) for outline in outlines[:REFERENCES] if (bodies := _plausible_bodies(outline))]
     if not starts:
-        cure = (
-            "add a photo that shows the whole outline from the side; give pixels of whatever hides the object the "
-            "label 255"
+        raise InputError(
+            "no outline is mirrored onto itself, as that of a body of revolution is",
+            cure=(
+                "add a photo that shows the whole outline from the side; give pixels of whatever hides the object the "
+                "label 255"
+            ),
         )
-        raise InputError("no outline is mirrored onto itself, as that of a body of revolution is", cure=cure)
     if len(outlines) == 1:
         log.warning(
             "%s: one outline does not determine the tilt of the axis: the strongest tilt that explains it is taken; "
@@ -340,8 +342,10 @@ def mesh_of_profile(profile: Profile) -> Triangles:
         InputError: If the profile has fewer than three heights.
     """
     if len(profile) < 3:
-        cure = "check that its masks and poses belong to one object, and that the y of its poses is its axis"
-        raise InputError("no body of revolution fits into its outlines", cure=cure)
+        raise InputError(
+            "no body of revolution fits into its outlines",
+            cure="check that its masks and poses belong to one object, and that the y of its poses is its axis",
+        )
     angle = np.arange(COLUMNS) * 2 * np.pi / COLUMNS
     height = profile[::-1, :1]  # by descending height
     radius = profile[::-1, 1:]

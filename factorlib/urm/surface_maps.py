@@ -39,9 +39,11 @@ def with_surface_normals(observations: Observations, surface: Path | None) -> Ob
         return observations
     height, width = maps["normal.x"].shape
     if len(observations) and (observations.x.max() >= width or observations.y.max() >= height):
-        cure = "run the stage `surface` again"
         raise InputError(
-            f"its normals are of a picture of {width} × {height}", file=surface, key=observations.photos[0], cure=cure
+            f"its normals are of a picture of {width} × {height}",
+            file=surface,
+            key=observations.photos[0],
+            cure="run the stage `surface` again",
         )
     normal = np.stack([maps[f"normal.{axis}"][observations.y, observations.x] for axis in "xyz"], axis=-1)
     known = (normal != 0).any(1, keepdims=True)

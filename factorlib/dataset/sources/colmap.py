@@ -41,8 +41,7 @@ def read_colmap(path: str, refuse: Refusal) -> list[SourceImage]:
         if camera_file is not None and image_file is not None:
             break
     else:
-        fault = f"{path!r} is not readable as a COLMAP model (it has no cameras and images, .bin or .txt)"
-        refuse(KEY, fault, CURE)
+        refuse(KEY, f"{path!r} is not readable as a COLMAP model (it has no cameras and images, .bin or .txt)", CURE)
     is_text = camera_file.suffix == ".txt"
     with reading("a COLMAP model", camera_file, KEY, CURE):
         camera_lines = _text_cameras(camera_file) if is_text else _records(camera_file, _binary_camera)

@@ -146,9 +146,11 @@ def _poses(
             obj_id = source.obj_ids[obj.mesh]
             instances = image.poses.get(obj_id, [])
             if len(instances) > 1:
-                fault = f"image {image.name} of photo {photo.name!r} shows obj_id {obj_id} {len(instances)} times"
-                cure = f"give the pose of {obj.name!r} in photos: cam_R_m2c and cam_t_m2c of its instance"
-                refuse(f"cameras.obj_ids.{obj.mesh}", fault, cure)
+                refuse(
+                    f"cameras.obj_ids.{obj.mesh}",
+                    f"image {image.name} of photo {photo.name!r} shows obj_id {obj_id} {len(instances)} times",
+                    f"give the pose of {obj.name!r} in photos: cam_R_m2c and cam_t_m2c of its instance",
+                )
             if not instances:
                 log.warning(
                     "%s: cameras.bop knows no obj_id %d in image %s: the pose of %s in %s is searched",

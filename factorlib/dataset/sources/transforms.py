@@ -89,12 +89,18 @@ def _camera(key: str, lens: FrameCamera, refuse: Refusal) -> tuple[pycolmap.Came
     if focal is None:
         angle = lens.camera_angle_x
         if angle is None:
-            cure = "give the focal length fl_x in pixels, with w and h"
-            refuse(f"{key}.fl_x", "neither fl_x nor camera_angle_x is given", cure)
+            refuse(
+                f"{key}.fl_x",
+                "neither fl_x nor camera_angle_x is given",
+                "give the focal length fl_x in pixels, with w and h",
+            )
         focal = (lens.w or ANY_WIDTH) / 2 / math.tan(angle / 2) if 0 < angle < math.pi else math.nan
         if not FOCAL_PX[0] <= focal <= FOCAL_PX[1]:
-            fault = f"an angle of {angle:g} is no field of view"
-            refuse(f"{key}.camera_angle_x", fault, "give it in radians, more than 0 and less than π")
+            refuse(
+                f"{key}.camera_angle_x",
+                f"an angle of {angle:g} is no field of view",
+                "give it in radians, more than 0 and less than π",
+            )
         if lens.w is None:
             params = [focal, ANY_WIDTH / 2, 0.5]
             return colmap_camera(key, "SIMPLE_PINHOLE", ANY_WIDTH, 1, params, refuse), (ANY_WIDTH, None)
