@@ -30,6 +30,15 @@ MESHES = (".obj", ".gltf", ".glb", *ONE_PART)
 MAPS = (".exr", ".hdr")
 RESERVED_PHOTOS = ("photos", "poses")  # <photo>.json would collide with photos.json and poses.json
 ALL_OF_IT = "all"  # the one part of a reconstructed shape
+EXCLUDED = {  # keys that a source of cameras excludes, and why
+    "colmap": (("obj_ids", "mesh_unit_mm"), "world_from_object gives its poses"),
+    "transforms": (("obj_ids", "mesh_unit_mm"), "world_from_object gives its poses"),
+    "bop": (("world_from_object", "world_from_camera"), "obj_ids gives its poses"),
+    "sfm": (
+        ("images", "world_from_object", "world_from_camera", "obj_ids", "mesh_unit_mm"),
+        "its world is not known beforehand",
+    ),
+}
 LEAST_OUTLINES = 2  # least number of outlines of a hull, with known cameras
 LEAST_KEYPOINTS = 4
 GOOD_KEYPOINTS = 6  # recommended number for an unknown focal length
@@ -111,20 +120,26 @@ def check_lights(photos: list[PhotoEntry], file: Path) -> None:
 
 def _check_mesh(key: str, mesh: MeshEntry, materials: list[str], refuse: Refusal) -> None:
     kinds = [kind for kind in ("file", "hull", "lathe", "primitive") if getattr(mesh, kind)]
-    if len(kinds) != 1:
-        refuse(
-            key,
-            f"has {' and '.join(kinds) or 'neither a file nor a shape to be estimated'}",
-            "give exactly one of file: <path>, hull: true, lathe: true, primitive: ball | box | cylinder",
-        )
+    refuse.when(
+        len(kinds) != 1,
+        key,
+        f"has {' and '.join(kinds) or 'neither a file nor a shape to be estimated'}",
+        "give exactly one of file: <path>, hull: true, lathe: true, primitive: ball | box | cylinder",
+    )
     if mesh.file:
         refuse.path(f"{key}.file", mesh.file, MESHES)
-    if mesh.size != 1.0 and kinds[0] in ("file", "hull"):
-        refuse(
-            f"{key}.size", f"cannot be combined with {kinds[0]}", "leave it out: its own numbers say how large it is"
-        )
-    if mesh.parts and kinds[0] in ("lathe", "primitive"):
-        refuse(f"{key}.parts", f"cannot be combined with {kinds[0]}, which has one part", "write `material: …`")
+    refuse.when(
+        mesh.size != 1.0 and kinds[0] in ("file", "hull"),
+        f"{key}.size",
+        f"cannot be combined with {kinds[0]}",
+        "leave it out: its own numbers say how large it is",
+    )
+    refuse.when(
+        mesh.parts and kinds[0] in ("lathe", "primitive"),
+        f"{key}.parts",
+        f"cannot be combined with {kinds[0]}, which has one part",
+        "write `material: …`",
+    )
     if mesh.parts and mesh.material is not None:
         refuse(
             key, "has both parts and a material", "keep `parts: {part: material, …}`, or `material:` for a mesh of one"
@@ -139,26 +154,30 @@ def _check_mesh(key: str, mesh: MeshEntry, materials: list[str], refuse: Refusal
 def _check_hull(name: str, spec: DatasetFile, refuse: Refusal) -> None:
     instances = [obj for photo in spec.photos for obj in photo.objects if obj.mesh == name]
     known = sum(obj.pose is not None for obj in instances)
-    if known < LEAST_OUTLINES:
-        refuse(
-            f"meshes.{name}.hull",
-            f"of {len(instances)} photos of it {known} have a known camera, a hull needs two",
-            "add `cameras: {sfm: true}`, another source of cameras, or each object's `pose`; or use lathe or primitive",
-        )
+    refuse.when(
+        known < LEAST_OUTLINES,
+        f"meshes.{name}.hull",
+        f"of {len(instances)} photos of it {known} have a known camera, a hull needs two",
+        "add `cameras: {sfm: true}`, another source of cameras, or each object's `pose`; or use lathe or primitive",
+    )
 
 
 def _check_parts(key: str, parts: dict[str, str], mesh: MeshEntry, materials: list[str], refuse: Refusal) -> None:
     """Check the names of parts that are known without opening the mesh, and their materials."""
     file = Path(mesh.file or "")
     for part, material in parts.items():
-        if not mesh.file and not mesh.parts and part != ALL_OF_IT:
-            refuse(f"{key}.{part}", f"it has no part {part!r}", f"it has one, {ALL_OF_IT!r}")
-        if file.suffix.lower() in ONE_PART and part != file.stem:
-            refuse(
-                f"{key}.{part}",
-                f"{file.name} has no part {part!r}",
-                f"it has one, {file.stem!r}; for several, save the mesh as OBJ or glTF",
-            )
+        refuse.when(
+            not mesh.file and not mesh.parts and part != ALL_OF_IT,
+            f"{key}.{part}",
+            f"it has no part {part!r}",
+            f"it has one, {ALL_OF_IT!r}",
+        )
+        refuse.when(
+            file.suffix.lower() in ONE_PART and part != file.stem,
+            f"{key}.{part}",
+            f"{file.name} has no part {part!r}",
+            f"it has one, {file.stem!r}; for several, save the mesh as OBJ or glTF",
+        )
         if mesh.parts:
             refuse.known(f"{key}.{part}", part, mesh.parts, "part")
         refuse.known(f"{key}.{part}", material, materials, "material")
@@ -166,8 +185,12 @@ def _check_parts(key: str, parts: dict[str, str], mesh: MeshEntry, materials: li
 
 def _check_photo(key: str, photo: PhotoEntry, spec: DatasetFile, refuse: Refusal) -> None:
     with refuse.collecting():
-        if photo.name in RESERVED_PHOTOS:
-            refuse(f"{key}.name", f"the name {photo.name!r} is reserved for a file of the results", "rename the photo")
+        refuse.when(
+            photo.name in RESERVED_PHOTOS,
+            f"{key}.name",
+            f"the name {photo.name!r} is reserved for a file of the results",
+            "rename the photo",
+        )
     with refuse.collecting():
         refuse.path(f"{key}.image", photo.image, IMAGES)
     with refuse.collecting():
@@ -193,12 +216,12 @@ def _check_photo(key: str, photo: PhotoEntry, spec: DatasetFile, refuse: Refusal
             refuse.known(f"{key}.masks.{material}", material, spec.materials, "material")
             refuse.path(f"{key}.masks.{material}", path, (".png",))
     with refuse.collecting():
-        if not photo.objects:
-            refuse(
-                f"{key}.objects",
-                f"photo {photo.name!r} has no objects",
-                "add {name: …, mesh: …}: a mesh gives its pixels their normals",
-            )
+        refuse.when(
+            not photo.objects,
+            f"{key}.objects",
+            f"photo {photo.name!r} has no objects",
+            "add {name: …, mesh: …}: a mesh gives its pixels their normals",
+        )
         refuse.once(f"{key}.objects", (obj.name for obj in photo.objects), "object")
     for index, obj in enumerate(photo.objects):
         with refuse.collecting():
@@ -213,24 +236,24 @@ def _check_object(key: str, obj: MeshInstance, spec: DatasetFile, refuse: Refusa
         refuse.path(f"{key}.mask", obj.mask, (".png",))
     if obj.pose is not None:
         refuse.rotation(f"{key}.pose.rotation", obj.pose.rotation)
-        if mesh.primitive:
-            refuse(
-                f"{key}.pose",
-                "cannot be given for a primitive, whose size is estimated with its pose",
-                "leave it out: the pose is estimated",
-            )
-        if mesh.lathe and mesh.size != 1.0:
-            refuse(
-                f"{key}.pose",
-                f"cannot be combined with meshes.{obj.mesh}.size: the pose determines the size",
-                "keep one",
-            )
-    if obj.keypoints and not mesh.file:
-        refuse(
-            f"{key}.keypoints",
-            "its mesh has no file, so no points are known on it",
-            "leave them out, or give the mesh's file",
+        refuse.when(
+            mesh.primitive,
+            f"{key}.pose",
+            "cannot be given for a primitive, whose size is estimated with its pose",
+            "leave it out: the pose is estimated",
         )
+        refuse.when(
+            mesh.lathe and mesh.size != 1.0,
+            f"{key}.pose",
+            f"cannot be combined with meshes.{obj.mesh}.size: the pose determines the size",
+            "keep one",
+        )
+    refuse.when(
+        obj.keypoints and not mesh.file,
+        f"{key}.keypoints",
+        "its mesh has no file, so no points are known on it",
+        "leave them out, or give the mesh's file",
+    )
     if obj.keypoints:
         _check_keypoints(f"{key}.keypoints", obj, refuse)
 
@@ -242,21 +265,25 @@ def _check_known(spec: DatasetFile, refuse: Refusal) -> None:
         with refuse.collecting():
             key = f"known.materials.{name}"
             refuse.known(key, name, spec.materials, "material")
-            if name not in used:
-                refuse(key, f"no object is made of material {name!r}", "leave it out, or add the object that shows it")
+            refuse.when(
+                name not in used,
+                key,
+                f"no object is made of material {name!r}",
+                "leave it out, or add the object that shows it",
+            )
             specular = reflectance.specular or (0.0, 0.0, 0.0)
-            if not min(map(sum, zip(reflectance.diffuse, specular, strict=True))) > 0:
-                refuse(
-                    key,
-                    "it reflects nothing in some channel, so that the light cannot be derived from it",
-                    "give what it reflects in every channel, or leave it out",
-                )
-            if max(reflectance.diffuse) + max(specular) > 1:
-                refuse(
-                    key,
-                    f"diffuse and specular reflectance are {max(reflectance.diffuse) + max(specular):.3g} together",
-                    "their largest channels may be 1 together: no more light is reflected than falls on it",
-                )
+            refuse.when(
+                not min(map(sum, zip(reflectance.diffuse, specular, strict=True))) > 0,
+                key,
+                "it reflects nothing in some channel, so that the light cannot be derived from it",
+                "give what it reflects in every channel, or leave it out",
+            )
+            refuse.when(
+                max(reflectance.diffuse) + max(specular) > 1,
+                key,
+                f"diffuse and specular reflectance are {max(reflectance.diffuse) + max(specular):.3g} together",
+                "their largest channels may be 1 together: no more light is reflected than falls on it",
+            )
     _check_known_lights(spec, refuse)
 
 
@@ -332,14 +359,18 @@ def instance_materials(obj: MeshInstance, spec: DatasetFile) -> set[str]:
 
 
 def _check_ground(key: str, ground: GroundEntry, refuse: Refusal) -> None:
-    if not any(ground.normal):
-        refuse(key, "a normal of length 0", "write the direction that points up from the ground, in the camera's axes")
-    if sum(n * p for n, p in zip(ground.normal, ground.point, strict=True)) >= 0:
-        refuse(
-            key,
-            "it points away from the camera, or the camera lies in the plane",
-            "negate it: the normal points toward the objects",
-        )
+    refuse.when(
+        not any(ground.normal),
+        key,
+        "a normal of length 0",
+        "write the direction that points up from the ground, in the camera's axes",
+    )
+    refuse.when(
+        sum(n * p for n, p in zip(ground.normal, ground.point, strict=True)) >= 0,
+        key,
+        "it points away from the camera, or the camera lies in the plane",
+        "negate it: the normal points toward the objects",
+    )
 
 
 def _check_keypoints(key: str, obj: MeshInstance, refuse: Refusal) -> None:
@@ -350,12 +381,12 @@ def _check_keypoints(key: str, obj: MeshInstance, refuse: Refusal) -> None:
             "has both a pose and keypoints",
             "keep one: a pose is used as it is, keypoints are where the search begins",
         )
-    if len(obj.keypoints) < LEAST_KEYPOINTS:
-        refuse(
-            key,
-            f"{len(obj.keypoints)} keypoints do not determine a pose",
-            f"give {LEAST_KEYPOINTS} or more; {GOOD_KEYPOINTS} where the focal length is unknown",
-        )
+    refuse.when(
+        len(obj.keypoints) < LEAST_KEYPOINTS,
+        key,
+        f"{len(obj.keypoints)} keypoints do not determine a pose",
+        f"give {LEAST_KEYPOINTS} or more; {GOOD_KEYPOINTS} where the focal length is unknown",
+    )
     for name in ("pixel", "point"):
         places = [getattr(keypoint, name) for keypoint in obj.keypoints]
         first: dict[tuple[float, ...], int] = {}
@@ -368,40 +399,36 @@ def _check_keypoints(key: str, obj: MeshInstance, refuse: Refusal) -> None:
         unit = [x / math.hypot(*longest) for x in longest]
         along = [sum(x * u for x, u in zip(arm, unit)) for arm in arms]
         distances = [math.hypot(*(x - length * u for x, u in zip(arm, unit))) for arm, length in zip(arms, along)]
-        if max(distances) < LEAST_OFF_LINE * math.hypot(*longest):
-            refuse(
-                key,
-                f"every {name} lies on one line",
-                "name places in different directions: about a line the object could turn",
-            )
+        refuse.when(
+            max(distances) < LEAST_OFF_LINE * math.hypot(*longest),
+            key,
+            f"every {name} lies on one line",
+            "name places in different directions: about a line the object could turn",
+        )
 
 
 def _check_source(source: CameraSource, spec: DatasetFile, refuse: Refusal) -> None:
     """Check that there is one source of cameras, with a path inside the folder and known names."""
     kinds = [kind for kind in (*SOURCES, "sfm") if getattr(source, kind)]
-    if len(kinds) != 1:
-        refuse(
-            "cameras",
-            f"names {' and '.join(kinds) or 'no source'}",
-            f"name one of {', '.join(SOURCES)}, or `sfm: true`",
-        )
-    if source.sfm:
-        for key in ("images", "world_from_object", "world_from_camera", "obj_ids", "mesh_unit_mm"):
-            if getattr(source, key) != getattr(CameraSource(), key):
-                refuse(
-                    f"cameras.{key}", "cannot be combined with sfm, whose world is not known beforehand", "leave it out"
-                )
-        return
+    refuse.when(
+        len(kinds) != 1,
+        "cameras",
+        f"names {' and '.join(kinds) or 'no source'}",
+        f"name one of {', '.join(SOURCES)}, or `sfm: true`",
+    )
     kind = kinds[0]
-    path = getattr(source, kinds[0])
+    keys, reason = EXCLUDED[kind]
+    for key in keys:
+        refuse.when(
+            getattr(source, key) != getattr(CameraSource(), key),
+            f"cameras.{key}",
+            f"cannot be combined with {kind}: {reason}",
+            "leave it out",
+        )
     if kind == "transforms":
-        refuse.path("cameras.transforms", path, (".json",))
-    else:
-        refuse.subfolder(f"cameras.{kind}", path)
-    cure = "a BOP scene gives poses by obj_ids" if kind == "bop" else "for this source, world_from_object gives poses"
-    for key in ("world_from_object", "world_from_camera") if kind == "bop" else ("obj_ids", "mesh_unit_mm"):
-        if getattr(source, key) != getattr(CameraSource(), key):
-            refuse(f"cameras.{key}", f"cannot be combined with {kind}", f"leave it out: {cure}")
+        refuse.path("cameras.transforms", source.transforms or "", (".json",))
+    elif kind != "sfm":
+        refuse.subfolder(f"cameras.{kind}", getattr(source, kind))
     photos = [photo.name for photo in spec.photos]
     objects = {obj.name for photo in spec.photos for obj in photo.objects}
     keys = {"images": (photos, "photo"), "world_from_object": (objects, "object"), "obj_ids": (spec.meshes, "mesh")}

@@ -34,6 +34,18 @@ class Refusal:
         """Raise InputError for a key, with a fault and its cure."""
         raise InputError(fault, file=self.file, key=key, cure=cure)
 
+    def when(self, condition: object, key: str, fault: str, cure: str) -> None:
+        """Raise InputError for a key if a condition is true.
+
+        Args:
+            condition: the condition
+            key: the key
+            fault: what is wrong
+            cure: what to do
+        """
+        if condition:
+            self(key, fault, cure)
+
     @contextmanager
     def collecting(self) -> Iterator[None]:
         """Collect an InputError raised within in `faults`, so that checking continues."""
@@ -68,30 +80,30 @@ class Refusal:
         """
         first: dict[str, int] = {}
         for index, name in enumerate(names):
-            if first.setdefault(name, index) != index:
-                self(
-                    f"{key}[{index}].name",
-                    f"duplicate {kind} name {name!r}",
-                    f"{key}[{first[name]}] has it already: rename one",
-                )
+            self.when(
+                first.setdefault(name, index) != index,
+                f"{key}[{index}].name",
+                f"duplicate {kind} name {name!r}",
+                f"{key}[{first[name]}] has it already: rename one",
+            )
 
     def rotation(self, key: str, rows: tuple) -> None:
         """Check that three rows are a rotation: RᵀR = 1 within ROTATION_TOLERANCE, determinant +1."""
         gram = [[sum(r[i] * r[j] for r in rows) - (i == j) for j in range(3)] for i in range(3)]
         worst = max(abs(entry) for row in gram for entry in row)
-        if not worst <= ROTATION_TOLERANCE:
-            self(
-                key,
-                f"not a rotation: RᵀR differs from 1 by {worst:.3g}",
-                "its columns must be unit vectors at right angles (no scale)",
-            )
+        self.when(
+            not worst <= ROTATION_TOLERANCE,
+            key,
+            f"not a rotation: RᵀR differs from 1 by {worst:.3g}",
+            "its columns must be unit vectors at right angles (no scale)",
+        )
         a, b, c = rows
-        if sum(a[i] * (b[(i + 1) % 3] * c[(i + 2) % 3] - b[(i + 2) % 3] * c[(i + 1) % 3]) for i in range(3)) < 0:
-            self(
-                key,
-                "not a rotation but a reflection (determinant −1)",
-                "one axis is flipped: the camera frame is x right, y down, z forward",
-            )
+        self.when(
+            sum(a[i] * (b[(i + 1) % 3] * c[(i + 2) % 3] - b[(i + 2) % 3] * c[(i + 1) % 3]) for i in range(3)) < 0,
+            key,
+            "not a rotation but a reflection (determinant −1)",
+            "one axis is flipped: the camera frame is x right, y down, z forward",
+        )
 
     def path(self, key: str, path: str, suffixes: Iterable[str], must_exist: bool = True) -> None:
         """Check that a path has a known suffix and leads to a plain, readable file inside the folder.
@@ -103,8 +115,12 @@ class Refusal:
             must_exist: require that the file exists
         """
         target = self._followed(key, path, "file")
-        if target.suffix.lower() not in suffixes:
-            self(key, f"{path!r} has a suffix that is not read here", f"expected one of {', '.join(suffixes)}")
+        self.when(
+            target.suffix.lower() not in suffixes,
+            key,
+            f"{path!r} has a suffix that is not read here",
+            f"expected one of {', '.join(suffixes)}",
+        )
         if file_exists(target, key):
             self._plain(key, path, target)
         elif must_exist:
@@ -123,8 +139,7 @@ class Refusal:
         """Check that a path leads to a readable folder inside the dataset's, with links followed."""
         folder = self._followed(key, path, "folder")
         with reading("a folder", self.file, key):
-            if not folder.is_dir():
-                self(key, f"there is no folder {path!r}", "copy it there, or correct the path")
+            self.when(not folder.is_dir(), key, f"there is no folder {path!r}", "copy it there, or correct the path")
             os.scandir(folder).close()
 
     def file_in(self, key: str, folder: str, name: str) -> Path | None:

@@ -48,10 +48,12 @@ def read_bop(path: str, refuse: Refusal) -> list[SourceImage]:
     images = []
     for image, camera in sorted(cameras.items(), key=lambda item: int(item[0])):
         fx, skew, cx, _, fy, cy, _, _, _ = camera.cam_K
-        if skew != 0 or min(fx, fy, cx, cy) <= 0:
-            camera_refusal(
-                f"{image}.cam_K", "is not the camera of square axes", "give [fx, 0, cx, 0, fy, cy, 0, 0, 1] in pixels"
-            )
+        camera_refusal.when(
+            skew != 0 or min(fx, fy, cx, cy) <= 0,
+            f"{image}.cam_K",
+            "is not the camera of square axes",
+            "give [fx, 0, cx, 0, fy, cy, 0, 0, 1] in pixels",
+        )
         # pixel centres from whole numbers to 0.5
         size = (2 * cx + 1, 2 * cy + 1)
         params = [fx, fy, cx + 0.5, cy + 0.5]

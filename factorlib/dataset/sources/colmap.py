@@ -64,8 +64,12 @@ def read_colmap(path: str, refuse: Refusal) -> list[SourceImage]:
         key = f"{KEY}: {one_line(name)}"
         camera = made[camera_id]
         length = math.hypot(*quaternion)
-        if not (0 < length <= LARGEST and max(abs(x), abs(y), abs(z)) <= LARGEST and not math.isnan(x + y + z)):
-            refuse(key, "is no pose: its numbers are zero, not finite or too large", DAMAGED)
+        refuse.when(
+            not (0 < length <= LARGEST and max(abs(x), abs(y), abs(z)) <= LARGEST and not math.isnan(x + y + z)),
+            key,
+            "is no pose: its numbers are zero, not finite or too large",
+            DAMAGED,
+        )
         unit = [value / length for value in (*quaternion[1:], quaternion[0])]
         motion = pycolmap.Rigid3d(pycolmap.Rotation3d(unit), [x, y, z])
         images.append(SourceImage(name, camera, (camera.width, camera.height), key, cam_from_world=motion))

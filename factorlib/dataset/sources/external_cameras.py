@@ -105,8 +105,7 @@ def matched(spec: DatasetFile, kind: str, images: list[SourceImage], refuse: Ref
         key = f"cameras.images.{photo.name}"
         if photo.name in spec.cameras.images:
             name = spec.cameras.images[photo.name]
-            if name not in by_name:
-                refuse(key, f"the source has no image {name!r}", did_you_mean(str(name), by_name))
+            refuse.when(name not in by_name, key, f"the source has no image {name!r}", did_you_mean(str(name), by_name))
             result[photo.name] = by_name[name]
             continue
         matches = ([image for pattern in each for image in alike.get(pattern, [])] for each in _patterns(photo))
@@ -145,12 +144,12 @@ def _poses(
         for obj in (obj for obj in objects if obj.mesh in source.obj_ids):
             obj_id = source.obj_ids[obj.mesh]
             instances = image.poses.get(obj_id, [])
-            if len(instances) > 1:
-                refuse(
-                    f"cameras.obj_ids.{obj.mesh}",
-                    f"image {image.name} of photo {photo.name!r} shows obj_id {obj_id} {len(instances)} times",
-                    f"give the pose of {obj.name!r} in photos: cam_R_m2c and cam_t_m2c of its instance",
-                )
+            refuse.when(
+                len(instances) > 1,
+                f"cameras.obj_ids.{obj.mesh}",
+                f"image {image.name} of photo {photo.name!r} shows obj_id {obj_id} {len(instances)} times",
+                f"give the pose of {obj.name!r} in photos: cam_R_m2c and cam_t_m2c of its instance",
+            )
             if not instances:
                 log.warning(
                     "%s: cameras.bop knows no obj_id %d in image %s: the pose of %s in %s is searched",

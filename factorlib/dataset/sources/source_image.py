@@ -75,10 +75,13 @@ def colmap_camera(
         refuse: raises errors
     """
     fault = f"is no camera: {width:g}×{height:g} pixels, {model} {', '.join(f'{x:g}' for x in params)}"
-    if not (1 <= width <= SIDE_PX and 1 <= height <= SIDE_PX):
-        refuse(key, fault, f"an image is 1 to {SIDE_PX:g} pixels wide and high; {DAMAGED}")
-    if not all(abs(x) <= LARGEST for x in params):
-        refuse(key, fault, DAMAGED)
+    refuse.when(
+        not (1 <= width <= SIDE_PX and 1 <= height <= SIDE_PX),
+        key,
+        fault,
+        f"an image is 1 to {SIDE_PX:g} pixels wide and high; {DAMAGED}",
+    )
+    refuse.when(not all(abs(x) <= LARGEST for x in params), key, fault, DAMAGED)
     return pycolmap.Camera(model=model, width=round(width), height=round(height), params=list(params))
 
 

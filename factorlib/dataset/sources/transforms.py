@@ -71,8 +71,12 @@ def read_transforms(path: str, refuse: Refusal) -> list[SourceImage]:
         centred = lens.cx is None or lens.cy is None
         matrix_key = f"{key}.transform_matrix"
         rows = frame.transform_matrix
-        if len(rows) not in (3, 4) or (len(rows) == 4 and tuple(rows[3]) != (0, 0, 0, 1)):
-            refuse(matrix_key, "is not a rigid matrix", "give the rows [R | t], and [0, 0, 0, 1] below them or nothing")
+        refuse.when(
+            len(rows) not in (3, 4) or (len(rows) == 4 and tuple(rows[3]) != (0, 0, 0, 1)),
+            matrix_key,
+            "is not a rigid matrix",
+            "give the rows [R | t], and [0, 0, 0, 1] below them or nothing",
+        )
         refuse.rotation(matrix_key, tuple(row[:3] for row in rows[:3]))
         right, down, forward = ((x, -y, -z) for x, y, z, _ in rows[:3])  # OpenGL's camera axes to OpenCV's
         cam_from_world = rigid((right, down, forward), (rows[0][3], rows[1][3], rows[2][3])).inverse()
@@ -95,12 +99,12 @@ def _camera(key: str, lens: FrameCamera, refuse: Refusal) -> tuple[pycolmap.Came
                 "give the focal length fl_x in pixels, with w and h",
             )
         focal = (lens.w or ANY_WIDTH) / 2 / math.tan(angle / 2) if 0 < angle < math.pi else math.nan
-        if not FOCAL_PX[0] <= focal <= FOCAL_PX[1]:
-            refuse(
-                f"{key}.camera_angle_x",
-                f"an angle of {angle:g} is no field of view",
-                "give it in radians, more than 0 and less than π",
-            )
+        refuse.when(
+            not FOCAL_PX[0] <= focal <= FOCAL_PX[1],
+            f"{key}.camera_angle_x",
+            f"an angle of {angle:g} is no field of view",
+            "give it in radians, more than 0 and less than π",
+        )
         if lens.w is None:
             params = [focal, ANY_WIDTH / 2, 0.5]
             return colmap_camera(key, "SIMPLE_PINHOLE", ANY_WIDTH, 1, params, refuse), (ANY_WIDTH, None)
