@@ -99,8 +99,7 @@ def overlay(radiance: Float[np.ndarray, "h w 3"], maps: Maps, silhouette: Silhou
     mesh = maps.label > 0
     unknown = ~silhouette.known
     # the usual colours of normals: red to the right, green upward, blue toward the viewer
-    tint = (maps.normal * (1, -1, -1) + 1) / 2
-    picture[mesh] = 0.6 * picture[mesh] + 0.4 * tint[mesh]
+    picture[mesh] = 0.6 * picture[mesh] + 0.4 * ((maps.normal * (1, -1, -1) + 1) / 2)[mesh]
     picture[unknown] = 0.7 * picture[unknown] + 0.3 * np.array([0.4, 0.5, 0.7])
     width = max(1, round(max(mesh.shape) / 600))
     for label, colour in ((np.maximum(silhouette.label, 0), MASK), (maps.label + 1000 * maps.object, MESH)):

@@ -94,8 +94,7 @@ def find_doubts(
             "was it mirrored?"
         )
     if estimate and (other := estimate.runner_up) and other.normal_difference_deg > DIFFERENT_DEG:
-        lead = max(thresholds.least_lead * (1 - other.score), LEAST_SCORE_LEAD)
-        if estimate.score - other.score < lead:
+        if estimate.score - other.score < max(thresholds.least_lead * (1 - other.score), LEAST_SCORE_LEAD):
             reasons.append(
                 f"another pose, its normals {other.normal_difference_deg:.0f}° away, fits as well "
                 f"({other.score:.3f}, {estimate.score:.3f})"

@@ -94,8 +94,7 @@ def labelled(parts: dict[str, Part], labels: dict[str, int]) -> Mesh:
     meshes = [smooth(vertices, faces, labels[name]) for name, (vertices, faces) in parts.items()]
     vertices, faces = joined([(mesh.vertices, mesh.faces) for mesh in meshes])
     normals = np.concatenate([mesh.normals for mesh in meshes])
-    label = np.concatenate([mesh.face_label for mesh in meshes])
-    return Mesh(vertices, faces.astype(np.int32), normals, label)
+    return Mesh(vertices, faces.astype(np.int32), normals, np.concatenate([mesh.face_label for mesh in meshes]))
 
 
 def joined(parts: Sequence[Part]) -> Part:

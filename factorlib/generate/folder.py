@@ -167,8 +167,7 @@ def whole_pixels(fine: Int[np.ndarray, "hh ww"]) -> Int[np.ndarray, "h w"]:
     height, width = (n // SUBPIXELS - 2 for n in fine.shape)
     windows = windows[:height, :width]
     low = windows.min(axis=(-2, -1))
-    high = windows.max(axis=(-2, -1))
-    return np.where(low == high, low, LEFT_OUT)
+    return np.where(low == windows.max(axis=(-2, -1)), low, LEFT_OUT)
 
 
 def write_yaml(path: Path, value: dict[str, Any], comment: str) -> None:

@@ -93,8 +93,7 @@ def revolved(profile: Float[np.ndarray, "n 2"]) -> Mesh:
     curve = PchipInterpolator(length, profile)(np.arange(1, ROWS) / ROWS * length[-1])
     phi = np.arange(COLUMNS) / COLUMNS * 2 * np.pi
     radius = curve[:, :1]
-    y = curve[:, 1:]
-    points = np.stack(np.broadcast_arrays(radius * np.sin(phi), y, radius * np.cos(phi)), axis=-1)
+    points = np.stack(np.broadcast_arrays(radius * np.sin(phi), curve[:, 1:], radius * np.cos(phi)), axis=-1)
     return closed_grid(points, np.array([0.0, profile[0, 1], 0.0]), np.array([0.0, profile[-1, 1], 0.0]))
 
 

@@ -287,7 +287,6 @@ def compose_photo(scene: SyntheticScene, camera: Camera, spp: int, seed: int) ->
         used = np.flatnonzero(mask.any(axis=0))
         columns = slice(used[0], used[-1] + 1)
         entries = {"shape": solid, "light": envmap(scene.light)}
-        view = sensor(camera, world, columns)
-        alone = rendered(entries, view, spp, 100 * seed + number, max_depth=2)
+        alone = rendered(entries, sensor(camera, world, columns), spp, 100 * seed + number, max_depth=2)
         radiance[:, columns][mask[:, columns]] = alone[mask[:, columns]]
     return radiance

@@ -192,8 +192,7 @@ def toward_viewer(normal: Vectors, view: Vectors) -> tuple[Vectors, Bool[np.ndar
     """
     cosine = np.sum(normal * view, axis=1)
     bent = cosine < MIN_COSINE
-    across = unit(normal - cosine[:, None] * view)
-    limit = np.sqrt(1 - MIN_COSINE**2) * across + MIN_COSINE * view
+    limit = np.sqrt(1 - MIN_COSINE**2) * unit(normal - cosine[:, None] * view) + MIN_COSINE * view
     return np.where(bent[:, None], limit, normal), bent
 
 

@@ -176,8 +176,7 @@ def _linear(codes: Shaped[np.ndarray, "r w 3"], white: int | None, encoding: str
 def _displayed(pixels: Shaped[np.ndarray, "h w *c"], orientation: int) -> Shaped[np.ndarray, "i j *c"]:
     """Rotate and mirror stored pixels as their EXIF orientation demands."""
     rows, columns = (-1 if flip else 1 for flip in _flipped(orientation))
-    turned = pixels.swapaxes(0, 1) if orientation >= 5 else pixels
-    return np.ascontiguousarray(turned[::rows, ::columns])
+    return np.ascontiguousarray((pixels.swapaxes(0, 1) if orientation >= 5 else pixels)[::rows, ::columns])
 
 
 def _strips(

@@ -61,8 +61,7 @@ def halo(
         The overshoot; 0 if there are too few usable contour pixels.
     """
     mean = radiance.mean(axis=-1)
-    white = float(np.quantile(mean, 0.99)) or 1.0
-    encoded = np.clip(mean / white, 0, 1) ** (1 / 2.2)
+    encoded = np.clip(mean / (float(np.quantile(mean, 0.99)) or 1.0), 0, 1) ** (1 / 2.2)
     # signed distance to the contour, and outward normals of contour pixels
     distance = distance_transform_edt(~inside) - distance_transform_edt(inside) + np.where(inside, 0.5, -0.5)
     slopes = np.stack(np.gradient(gaussian_filter(distance, 1.5)))

@@ -103,8 +103,7 @@ class MaskSet:
     def _picture(self, index: int) -> UInt8[np.ndarray, "h w 3"]:
         """Return a photo as displayed, sRGB-encoded; a linear one is exposed."""
         path = self.folder / self.photos[index].image
-        encoding = self.photos[index].encoding
-        photo = decoded(open_photo(path), encoding, 1, path)
+        photo = decoded(open_photo(path), self.photos[index].encoding, 1, path)
         return picture(photo.radiance, None if photo.encoding == "linear" else 1.0)
 
     def read(self, index: int) -> tuple[UInt8[np.ndarray, "h w"], str]:

@@ -123,8 +123,7 @@ def _union(
             borders = np.cumsum(run_lengths(counts, len(edges) - 1))
         np.add.at(edges, borders[0::2], 1)
         np.add.at(edges, borders[1::2], -1)
-    inside = np.cumsum(edges[:-1], dtype=np.int32) > 0
-    return np.ascontiguousarray(inside.reshape(size[::-1]).T)
+    return np.ascontiguousarray((np.cumsum(edges[:-1], dtype=np.int32) > 0).reshape(size[::-1]).T)
 
 
 def run_lengths(counts: list[int] | str, pixels: int) -> Int[np.ndarray, " n"]:

@@ -88,8 +88,7 @@ def _guess(
         sizes_inside = np.bincount(regions[inside], minlength=regions.max() + 1)
         fixed |= (2 * sizes_inside < sizes)[regions] & (regions > 0)
     growing = np.isin(label, [0, fill, *np.unique(label[sure & ~fixed])])
-    guess = np.where(growing, label, np.where(fixed, 0, fill)).astype(np.uint8)
-    return guess, fixed | (inside & sure)
+    return np.where(growing, label, np.where(fixed, 0, fill)).astype(np.uint8), fixed | (inside & sure)
 
 
 def _walk(

@@ -193,8 +193,7 @@ def _joined(parts: list[Part], arrays: dict[int, dict], header: GltfHeader) -> T
         points = _vectors(array["vertices"], header.accessors[primitive.attributes["POSITION"]].normalized)
         corners = array["faces"].astype(np.int64)
         linear = world_from_node[:3, :3]
-        shift = world_from_node[:3, 3]
-        vertices.append(points @ linear.T + shift)
+        vertices.append(points @ linear.T + world_from_node[:3, 3])
         cofactor = np.cross(np.roll(linear, -1, axis=0), np.roll(linear, -2, axis=0))
         if "NORMAL" in primitive.attributes:
             normals.append(normals_at_corners(_vectors(array["vertex_normals"], True) @ cofactor.T, corners))

@@ -87,8 +87,7 @@ def closed_grid(points: Float[np.ndarray, "r c 3"], top: np.ndarray, bottom: np.
     cap = np.stack([right[0], np.full(columns, last), index[0]], axis=-1)
     base = np.stack([index[-1], np.full(columns, last + 1), right[-1]], axis=-1)
     sides = np.concatenate([np.stack([a, c, d], axis=-1), np.stack([a, d, b], axis=-1)]).reshape(-1, 3)
-    vertices = np.concatenate([points.reshape(-1, 3), [top, bottom]])
-    return smooth(vertices, np.concatenate([sides, cap, base]))
+    return smooth(np.concatenate([points.reshape(-1, 3), [top, bottom]]), np.concatenate([sides, cap, base]))
 
 
 def smooth(vertices: Float[np.ndarray, "v 3"], faces: np.ndarray, label: np.ndarray | int = 1) -> Mesh:

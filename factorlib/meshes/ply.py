@@ -204,8 +204,7 @@ def write_ply(path: str | Path, mesh: Mesh, colours: np.ndarray | None = None) -
     further = {"red green blue": colours} if colours is not None else {"detail": mesh.detail}
     further = {name: values.reshape(len(values), -1) for name, values in further.items() if values is not None}
     columns = [mesh.vertices, mesh.normals, *further.values()]
-    names = " ".join(["x y z nx ny nz", *further]).split()
-    lines += [f"property float {name}" for name in names]
+    lines += [f"property float {name}" for name in " ".join(["x y z nx ny nz", *further]).split()]
     lines += [f"element face {len(mesh.faces)}", "property list uchar int vertex_indices", "property int label"]
     vertices = np.concatenate(columns, axis=1).astype("<f4")
     faces = np.empty(len(mesh.faces), dtype=[("count", "u1"), ("index", "<i4", 3), ("label", "<i4")])

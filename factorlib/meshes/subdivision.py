@@ -131,8 +131,7 @@ class SubdividedMesh(msgspec.Struct, frozen=True):
         count = len(self.faces)
         places = self.faces.reshape(-1), np.repeat(np.arange(count), 3)
         weight = csr_array((np.repeat(self.areas, 3), places), (self.nodes, count))
-        total = np.maximum(np.asarray(weight.sum(1)).reshape(-1), 1e-300)
-        return csr_array(diags_array(1 / total) @ weight)
+        return csr_array(diags_array(1 / np.maximum(np.asarray(weight.sum(1)).reshape(-1), 1e-300)) @ weight)
 
     def displacement(self, turn: Float[np.ndarray, "v 3"], seen: Float[np.ndarray, " v"]) -> Float[np.ndarray, " v"]:
         """Fit the displacement along the normals whose normals n' = n − ∇d are nearest to the given ones.

@@ -75,8 +75,7 @@ def no_normals(faces: int) -> Float[np.ndarray, "f 3 3"]:
 def normals_at_corners(normals: Float[np.ndarray, "v 3"], faces: Int[np.ndarray, "f 3"]) -> Float[np.ndarray, "f 3 3"]:
     """Convert normals by vertex to normals by corner, NaN where a face's index is out of range."""
     exists = (faces >= 0) & (faces < len(normals))
-    table = np.concatenate([floats(normals), np.full((1, 3), np.nan)])
-    return table[np.where(exists, faces, len(normals))]
+    return np.concatenate([floats(normals), np.full((1, 3), np.nan)])[np.where(exists, faces, len(normals))]
 
 
 def fans(counts: Int[np.ndarray, " n"], corners: Int[np.ndarray, " c"]) -> Int[np.ndarray, "f 3"]:

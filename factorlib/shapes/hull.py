@@ -193,8 +193,7 @@ def surface_nets(field: Float[np.ndarray, "x y z"]) -> tuple[Points, Int[np.ndar
 
     The mesh is closed if the field is not positive on the grid's border.
     """
-    shape = np.array(field.shape)
-    cells = shape - 1
+    cells = np.array(field.shape) - 1
     inside = field > 0
     total = np.zeros((*cells, 3))
     count = np.zeros(cells)
@@ -219,8 +218,7 @@ def surface_nets(field: Float[np.ndarray, "x y z"]) -> tuple[Points, Int[np.ndar
             around.append(np.where(valid, np.ravel_multi_index(np.clip(cell, 0, cells - 1).T, cells), -1))
         corner = np.stack(around, axis=1)
         # orient the quads; for axis y the other axes are x, z, which are left-handed
-        reversed_ = (a > 0) == (axis == 1)
-        corner = np.where(reversed_[:, None], corner[:, ::-1], corner)
+        corner = np.where(((a > 0) == (axis == 1))[:, None], corner[:, ::-1], corner)
         quads.append(corner[(corner >= 0).all(axis=1)])
     quad = np.concatenate(quads)
     used, index = np.unique(quad, return_inverse=True)

@@ -159,8 +159,7 @@ def _choose_tilt(
     # finer tilts about the best one, from its poses
     for change in FINER_DEG:
         pose = best.body.pose
-        tilt = best.body.tilt_deg + change
-        finer = _body_at_tilt(best.outline, pose.rotation[:, 0], pose.translation, tilt)
+        finer = _body_at_tilt(best.outline, pose.rotation[:, 0], pose.translation, best.body.tilt_deg + change)
         if finer is not None:
             near = zip(judges, best.poses, strict=True)
             poses = [finer if judge is best.outline else fit_pose(judge, finer.profile, start) for judge, start in near]
@@ -223,8 +222,7 @@ def mirror_planes(outline: Outline) -> list[Float[np.ndarray, "3"]]:
 
     def normal(angle: float, offset: float) -> np.ndarray:
         """Return the normal of the plane through the middle ray, moved aside by `offset` half extents."""
-        across = np.cos(angle) * x + np.sin(angle) * y
-        return across * np.cos(offset * spread) + ray * np.sin(offset * spread)
+        return (np.cos(angle) * x + np.sin(angle) * y) * np.cos(offset * spread) + ray * np.sin(offset * spread)
 
     def outside(plane: np.ndarray) -> float:
         """Return the mean squared distance by which mirrored rays leave the outline, in pixels of a window of 200."""
@@ -320,8 +318,7 @@ def largest_discs(outline: Outline, body: BodyView, heights: Float[np.ndarray, "
     centres = np.column_stack([0 * heights, heights, 0 * heights])
     # the first radius at which a point leaves the outline, on a grid, then on a finer grid within its cell
     for _ in range(2):
-        share = np.arange(RADII + 1) / RADII
-        radii = low[:, None] + share * (high - low)[:, None]
+        radii = low[:, None] + (np.arange(RADII + 1) / RADII) * (high - low)[:, None]
         points = centres[:, None, None] + radii[..., None, None] * around
         in_camera = points @ pose.rotation.T + pose.translation
         ahead = in_camera[..., 2] > 1e-3 * distance
@@ -371,5 +368,4 @@ def fit_pose(outline: Outline, profile: Profile, near: BodyView | None = None) -
     else:
         view = msgspec.structs.replace(outline.view, camera=near.camera)
         estimate = refine_near(caster, view, pose_state(near.pose, near.camera, caster), SEARCH)
-    camera = estimate.state.camera(outline.camera)
-    return BodyView(profile, estimate.state.pose(caster), camera, estimate.score)
+    return BodyView(profile, estimate.state.pose(caster), estimate.state.camera(outline.camera), estimate.score)

@@ -77,8 +77,7 @@ def jacobian_with_shape(
         A matrix for each point, m = 7 + k.
     """
     # R e_k e_kᵀ Rᵀ a, the move of a surface point by log s_k, times the directions of d
-    along = arms @ state.rotation
-    moves = np.einsum("dk,nk,kj->ndj", state.rotation, along, free)
+    moves = np.einsum("dk,nk,kj->ndj", state.rotation, arms @ state.rotation, free)
     # derivative of the perspective projection
     point = arms + state.middle()
     slope = point[:, :2] / point[:, 2:]

@@ -117,8 +117,7 @@ WIDE: dict[str, tuple[np.dtype, int, str]] = {
 def write_observations(path: str | Path, observations: Observations) -> None:
     """Write the fixed Parquet columns, and `confidence`, `place`, `visibility` and `met` if they are present."""
     columns = {}
-    types = {"normal": "f4", "half": "f4", **COLUMNS, **OPTIONAL}
-    for name, dtype in types.items():
+    for name, dtype in {"normal": "f4", "half": "f4", **COLUMNS, **OPTIONAL}.items():
         if (values := getattr(observations, name)) is not None:
             values = np.ascontiguousarray(values, dtype=dtype)
             flat = pa.array(values.reshape(-1))

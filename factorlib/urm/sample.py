@@ -63,8 +63,7 @@ def allot(size: Int[np.ndarray, " g"], most: int) -> Int[np.ndarray, " g"]:
     if not len(cut):
         return size
     count = np.minimum(size, room[cut[0]])
-    more = np.flatnonzero(size > count)[: most - count.sum()]
-    count[more] += 1
+    count[np.flatnonzero(size > count)[: most - count.sum()]] += 1
     return count
 
 
