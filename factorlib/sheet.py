@@ -20,11 +20,10 @@ from factorlib.dataset.schema import DatasetFile, PhotoEntry
 from factorlib.errors import InputError
 from factorlib.geometry.camera import Camera, Pose
 from factorlib.geometry.raster import rasterise
-from factorlib.images.limits import MOST_MEGAPIXELS, check_pixels
-from factorlib.images.palette import nearest_tags
 from factorlib.images.photo import decoded, open_photo
-from factorlib.images.picture import picture, png_bytes
-from factorlib.images.transfer import srgb_decode
+from factorlib.images.picture import nearest_tags, picture, png_bytes
+from factorlib.images.scanlines import MOST_MEGAPIXELS, check_pixels
+from factorlib.images.tone import srgb_decode
 from factorlib.labels.labels import Labels, read_labels
 from factorlib.meshes.mesh import Mesh
 from factorlib.meshes.read import read_mesh

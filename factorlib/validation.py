@@ -18,11 +18,11 @@ from factorlib.errors import InputError
 from factorlib.evaluate.comparison_gauge import connected_components
 from factorlib.evaluate.truth import read_true_light, read_true_normals
 from factorlib.images.light_map import read_light_map
-from factorlib.images.limits import MOST_MEGAPIXELS, check_pixels, check_values
 from factorlib.images.photo import open_photo
+from factorlib.images.scanlines import MOST_MEGAPIXELS, check_pixels, check_values
 from factorlib.labels.labels import check_materials, read_labels, read_objects
-from factorlib.meshes.limits import Limits
 from factorlib.meshes.read import part_labels, read_mesh, read_parts
+from factorlib.meshes.triangle_soup import Limits
 from factorlib.recipe.kinds import is_light_file
 from factorlib.yamlfile import convert
 

@@ -27,8 +27,7 @@ from factorlib.results.metrics import Counts, Metrics, NormalError, PoseError, R
 from factorlib.results.photos import read_photos
 from factorlib.results.poses import read_poses
 from factorlib.stage import Inputs, Progress
-from factorlib.urm.extract import observed_pixels
-from factorlib.urm.surface_maps import read_geometry
+from factorlib.urm.extract import observed_pixels, read_geometry
 from factorlib.wholefile import write_text
 
 NO_TRUTH = "the dataset names no truth"

@@ -38,7 +38,7 @@ from factorlib.images.exr import LAT_LONG, read_rgb_exr, write_hdr, write_rgb_ex
 from factorlib.jsonfile import write_json
 from factorlib.light.latlong import lat_long_of_lobes, sample_map
 from factorlib.light.lobes import Lobes, no_lobes
-from factorlib.meshes.ply import write_ply
+from factorlib.meshes.ply_stl_off import write_ply
 from factorlib.meshes.read import CREASE_DEG
 from factorlib.results.lobe_table import read_lobes, write_lobes
 from factorlib.results.materials import MaterialTable, Vec3, read_exposures, read_materials, reflectances

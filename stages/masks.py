@@ -14,12 +14,12 @@ import numpy as np
 from factorlib.dataset.schema import LEFT_OUT, PhotoSlice
 from factorlib.errors import InputError
 from factorlib.images.boxes import box_majority, least_factor
+from factorlib.images.camera_files import is_raw
 from factorlib.images.exr import write_exr
 from factorlib.images.lens import Undistorted, radial_lens
-from factorlib.images.limits import MOST_MEGAPIXELS, check_pixels
 from factorlib.images.photo import Photo, check_bright, decoded, open_photo
 from factorlib.images.processing import HALO, halo, reported_processing
-from factorlib.images.raw import is_raw
+from factorlib.images.scanlines import MOST_MEGAPIXELS, check_pixels
 from factorlib.jsonfile import write_json
 from factorlib.labels.labels import Labels, read_labels, read_objects
 from factorlib.results.photos import PhotoFacts

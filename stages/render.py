@@ -24,9 +24,8 @@ from factorlib.render.resynthesis import Surroundings, balls, observed_cells, re
 from factorlib.results.lobe_table import light_of
 from factorlib.results.materials import Gauge, Model, in_order, read_materials
 from factorlib.stage import Inputs, Progress
-from factorlib.urm.extract import observed_pixels
+from factorlib.urm.extract import observed_pixels, read_geometry, with_surface_normals
 from factorlib.urm.observations import read_observations
-from factorlib.urm.surface_maps import read_geometry, with_surface_normals
 
 Size = Annotated[int, msgspec.Meta(ge=8, le=2048)]
 RING = (255, 255, 255)

@@ -13,14 +13,13 @@ import msgspec
 import numpy as np
 
 from factorlib.align.input_checks import camera_of_photo
-from factorlib.align.silhouette import UNKNOWN, silhouette_of_object
-from factorlib.align.view import with_prior_focal
+from factorlib.align.silhouette import UNKNOWN, silhouette_of_object, with_prior_focal
 from factorlib.dataset.check import ALL_OF_IT
 from factorlib.dataset.schema import ExternalCamera, MeshEntry, MeshInstance, ObjectsSlice, RigidTransform, ShapesSlice
 from factorlib.errors import InputError
 from factorlib.geometry.camera import Camera, Pose
 from factorlib.images.exr import read_exr
-from factorlib.images.transfer import srgb_encode
+from factorlib.images.tone import srgb_encode
 from factorlib.jsonfile import write_json
 from factorlib.results.photos import read_photo_facts
 from factorlib.results.poses import entry_of

@@ -21,9 +21,8 @@ from factorlib.results.photos import read_photo_facts
 from factorlib.results.poses import ObjectPose, read_photo_poses
 from factorlib.stage import Inputs, Progress
 from factorlib.urm.extract import PhotoSource, extract_observations
-from factorlib.urm.merge import merge
 from factorlib.urm.observations import write_observations
-from factorlib.urm.sample import sample
+from factorlib.urm.reduction import merge, sample
 
 log = logging.getLogger("factorlib.urm")
 

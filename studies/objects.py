@@ -21,10 +21,9 @@ from scipy.spatial.transform import Rotation
 
 from factorlib.align.confidence import confidence
 from factorlib.align.refine import refine
-from factorlib.align.silhouette import Silhouette
+from factorlib.align.silhouette import ObjectView, Silhouette
 from factorlib.align.state import pose_state
 from factorlib.align.target import make_target
-from factorlib.align.view import ObjectView
 from factorlib.conventions import FRONT, YUP_FROM_CAMERA
 from factorlib.evaluate.ball import OctahedralLight, ball
 from factorlib.geometry.camera import Camera, Pose, rotation_of_vector

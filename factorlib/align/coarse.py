@@ -18,10 +18,9 @@ from jaxtyping import Float, Int
 from scipy import ndimage
 from scipy.fft import irfft2, rfft2
 
-from factorlib.align.silhouette import Silhouette
+from factorlib.align.silhouette import ObjectView, Silhouette
 from factorlib.align.state import PoseState
 from factorlib.align.target import bounding_box
-from factorlib.align.view import ObjectView
 from factorlib.geometry.camera import Camera, rotation_of_vector
 from factorlib.geometry.raster import Caster
 from factorlib.geometry.sphere import fibonacci_sphere

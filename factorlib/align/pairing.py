@@ -13,8 +13,7 @@ import msgspec
 import numpy as np
 
 from factorlib.align.coarse import match_templates
-from factorlib.align.silhouette import Silhouette
-from factorlib.align.view import ObjectView
+from factorlib.align.silhouette import ObjectView, Silhouette
 from factorlib.geometry.camera import Camera
 from factorlib.geometry.raster import Caster
 from factorlib.meshes.mesh import Mesh

@@ -20,9 +20,9 @@ from scipy.spatial import cKDTree
 from factorlib.align.photo_alignment import ObjectToAlign, PhotoAlignment
 from factorlib.align.refine import interpolate, mesh_contour, normal_equations, render
 from factorlib.align.search import PoseEstimate, SearchOptions, estimate_pose, normal_difference, render_maps
+from factorlib.align.silhouette import ObjectView
 from factorlib.align.state import PoseState, pose_state
 from factorlib.align.target import Target, make_target
-from factorlib.align.view import ObjectView
 from factorlib.geometry.raster import Caster
 
 LARGEST_MOVE = 0.5  # greatest move of one unknown (radians or log) for which the normal equations hold
@@ -78,28 +78,30 @@ def find_doubts(
     Returns:
         Sentences; none for a pose without doubt.
     """
-    reasons = []
-    if iou < thresholds.least_iou:
-        reasons.append(f"mesh and mask overlap by {iou:.2f} only")
-    if agreement < thresholds.least_agreement:
-        reasons.append(f"the materials of mesh and mask agree on {agreement:.2f} of the pixels only")
-    if measures.contour_error > thresholds.most_contour_error:
-        distance = f"{measures.contour_error:.1%} of the mask's extent"
-        reasons.append(f"half of the contours of mesh and mask lie {distance} apart, or more")
-    if measures.normal_stderr_deg is not None and measures.normal_stderr_deg > thresholds.most_normal_stderr_deg:
-        reasons.append(f"the mask tells normals to {measures.normal_stderr_deg:.1f}° only")
-    if estimate and measures.mirrored_score is not None and 1 - measures.mirrored_score < (1 - estimate.score) / 2:
-        reasons.append(
-            f"the mirror image of the mask fits better ({measures.mirrored_score:.3f}, {estimate.score:.3f}): "
-            "was it mirrored?"
-        )
-    if estimate and (other := estimate.runner_up) and other.normal_difference_deg > DIFFERENT_DEG:
-        if estimate.score - other.score < max(thresholds.least_lead * (1 - other.score), LEAST_SCORE_LEAD):
-            reasons.append(
-                f"another pose, its normals {other.normal_difference_deg:.0f}° away, fits as well "
-                f"({other.score:.3f}, {estimate.score:.3f})"
-            )
-    return reasons
+    normal_stderr = measures.normal_stderr_deg or 0.0
+    apart = f"{measures.contour_error:.1%} of the mask's extent"
+    doubts = [
+        (iou < thresholds.least_iou, f"mesh and mask overlap by {iou:.2f} only"),
+        (
+            agreement < thresholds.least_agreement,
+            f"the materials of mesh and mask agree on {agreement:.2f} of the pixels only",
+        ),
+        (
+            measures.contour_error > thresholds.most_contour_error,
+            f"half of the contours of mesh and mask lie {apart} apart, or more",
+        ),
+        (normal_stderr > thresholds.most_normal_stderr_deg, f"the mask tells normals to {normal_stderr:.1f}° only"),
+    ]
+    if estimate and (mirrored := measures.mirrored_score) is not None:
+        scores = f"({mirrored:.3f}, {estimate.score:.3f})"
+        fault = f"the mirror image of the mask fits better {scores}: was it mirrored?"
+        doubts.append((1 - mirrored < (1 - estimate.score) / 2, fault))
+    if estimate and (other := estimate.runner_up):
+        lead = max(thresholds.least_lead * (1 - other.score), LEAST_SCORE_LEAD)
+        fault = f"another pose, its normals {other.normal_difference_deg:.0f}° away, fits as well "
+        fault += f"({other.score:.3f}, {estimate.score:.3f})"
+        doubts.append((other.normal_difference_deg > DIFFERENT_DEG and estimate.score - other.score < lead, fault))
+    return [reason for is_missed, reason in doubts if is_missed]
 
 
 def measure_reliability(obj: ObjectToAlign, alignment: PhotoAlignment, number: int) -> Reliability:

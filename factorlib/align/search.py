@@ -14,9 +14,9 @@ import numpy as np
 
 from factorlib.align.coarse import initial_states, is_cut
 from factorlib.align.refine import RefinedState, refine
+from factorlib.align.silhouette import ObjectView
 from factorlib.align.state import PoseState
 from factorlib.align.target import Target, make_target
-from factorlib.align.view import ObjectView
 from factorlib.geometry.camera import angle_between
 from factorlib.geometry.raster import Caster, Maps, rasterise
 from factorlib.results.poses import RunnerUpPose, entry_of

@@ -10,8 +10,7 @@ import numpy as np
 from jaxtyping import Float, Int
 from scipy.ndimage import distance_transform_edt
 
-from factorlib.align.silhouette import UNKNOWN, Mask, Silhouette
-from factorlib.align.view import ObjectView
+from factorlib.align.silhouette import UNKNOWN, Mask, ObjectView, Silhouette
 from factorlib.geometry.camera import Camera
 
 

@@ -417,8 +417,8 @@ def _check_source(source: CameraSource, spec: DatasetFile, refuse: Refusal) -> N
         f"name one of {', '.join(SOURCES)}, or `sfm: true`",
     )
     kind = kinds[0]
-    keys, reason = EXCLUDED[kind]
-    for key in keys:
+    excluded, reason = EXCLUDED[kind]
+    for key in excluded:
         refuse.when(
             getattr(source, key) != getattr(CameraSource(), key),
             f"cameras.{key}",

@@ -30,7 +30,7 @@ from trimesh.visual.texture import TextureVisuals
 from factorlib.export.exported_scene import Sun
 from factorlib.jsonfile import write_json
 from factorlib.meshes.mesh import Mesh
-from factorlib.meshes.ply import submesh
+from factorlib.meshes.ply_stl_off import submesh
 from factorlib.reading import read_bytes
 from factorlib.results.materials import Reflectance
 from factorlib.wholefile import write_bytes

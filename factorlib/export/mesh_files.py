@@ -8,7 +8,7 @@ import numpy as np
 from factorlib.dataset.schema import MeshEntry, MeshInstance
 from factorlib.export.exported_scene import ExportedShape
 from factorlib.export.usd import SUFFIX, colours, write_usd_mesh
-from factorlib.meshes.ply import submesh, write_ply
+from factorlib.meshes.ply_stl_off import submesh, write_ply
 from factorlib.meshes.read import MeshCache
 from factorlib.results.materials import Reflectance
 from factorlib.results.poses import ObjectPose

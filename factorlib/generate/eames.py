@@ -22,7 +22,7 @@ from factorlib.generate.surroundings import EYE, Rng, SceneDict, random_material
 from factorlib.geometry.camera import Camera, Pose
 from factorlib.geometry.raster import rasterise
 from factorlib.meshes.mesh import Mesh, smooth
-from factorlib.meshes.ply import submesh
+from factorlib.meshes.ply_stl_off import submesh
 from factorlib.results.materials import Reflectance
 from factorlib.tracing.scene import bsdf, envmap, incident_light, look, rendered, rigid, sensor, shape, transform
 from factorlib.yamlfile import read_yaml

@@ -14,7 +14,7 @@ from factorlib.geometry.camera import Camera, Pose
 from factorlib.geometry.raster import Maps, rasterise
 from factorlib.images.exif import FILM_DIAGONAL
 from factorlib.images.exr import FIXED_DATE, LAT_LONG, write_exr, write_image, write_rgb_exr
-from factorlib.images.transfer import srgb_encode
+from factorlib.images.tone import srgb_encode
 from factorlib.meshes.mesh import Mesh
 from factorlib.wholefile import write_text
 from factorlib.yamlfile import yaml_text

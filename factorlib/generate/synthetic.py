@@ -22,7 +22,7 @@ from factorlib.generate.surroundings import Rng, Rotation, captured, daylight, r
 from factorlib.geometry.camera import Camera, Pose, rotation_of_vector
 from factorlib.geometry.raster import rasterise
 from factorlib.meshes.mesh import Mesh
-from factorlib.meshes.ply import write_ply
+from factorlib.meshes.ply_stl_off import write_ply
 from factorlib.results.materials import Reflectance
 from factorlib.tracing.scene import bsdf, envmap, incident_light, look, rendered, rigid, sensor, shape
 

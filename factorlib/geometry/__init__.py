@@ -3,6 +3,5 @@
 camera      cameras and rigid poses
 raster      ray casting and rasterisation of meshes
 visibility  directions in which a surface point is not occluded by the objects of its photo
-sphere      even sets of directions, mirror directions, cells of directions
-occluder_codes  codes of occluding surfaces
+sphere      even sets of directions, mirror directions, cells of directions, codes of hiding surfaces
 """

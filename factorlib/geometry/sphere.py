@@ -1,9 +1,15 @@
-"""Directions: evenly spread ones, mirror directions, and cells of similar directions."""
+"""Directions: evenly spread ones, mirror directions, cells of similar ones, and codes of surfaces that hide them.
+
+A code is the number of the hiding material · BINS + the number of the direction of `fibonacci_sphere(BINS)` nearest to
+the normal of the surface that a ray hits; NO_OCCLUDER stands for no surface, or an unknown one.
+"""
 
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Float, Int, UInt16
 
 Vectors = Float[np.ndarray, "*n 3"]
+BINS = 64  # number of normals in codes
+NO_OCCLUDER = 65535
 
 
 def fibonacci_sphere(count: int) -> Float[np.ndarray, "count 3"]:
@@ -61,3 +67,17 @@ def ball_normals(size: int) -> tuple[Float[np.ndarray, "n 3"], Bool[np.ndarray, 
     x = x[inside]
     y = y[inside]
     return np.stack([x, y, np.sqrt(1 - x * x - y * y)], axis=-1), inside
+
+
+def occluder_codes(material: Int[np.ndarray, " n"], normal: Float[np.ndarray, "n 3"]) -> UInt16[np.ndarray, " n"]:
+    """Return the codes of materials and normals.
+
+    `material` counts from 0; negative numbers are unknown. `normal` is unit, in the camera frame, on the side that is
+    hit.
+
+    >>> occluder_codes(np.array([0, 2, -1]), np.array([[0.0, 0, 1], [0, 0, 1], [0, 0, 1]])).tolist()
+    [0, 128, 65535]
+    """
+    nearest = np.argmax(normal @ fibonacci_sphere(BINS).T, axis=1)
+    known = (material >= 0) & (material < NO_OCCLUDER // BINS)
+    return np.where(known, material.astype(np.int64) * BINS + nearest, NO_OCCLUDER).astype(np.uint16)

@@ -8,7 +8,7 @@ cast and count as visible; nothing is reflected from there.
 If there are more than `most_points` points, an evenly spread subset is cast. The other points take the visibility of
 the nearest cast point, near in position and in normal alike.
 
-For a ray that is not free, the surface that it hits is recorded too, as a code of `factorlib.geometry.occluder_codes`.
+For a ray that is not free, the surface that it hits is recorded too, as a code of `factorlib.geometry.sphere`.
 """
 
 from collections.abc import Callable, Iterator, Sequence
@@ -20,9 +20,8 @@ from scipy.spatial import cKDTree
 
 from factorlib.geometry import open3d as o3d
 from factorlib.geometry.camera import Camera, Pose
-from factorlib.geometry.occluder_codes import NO_OCCLUDER, occluder_codes
 from factorlib.geometry.raster import Caster, unit
-from factorlib.geometry.sphere import fibonacci_sphere
+from factorlib.geometry.sphere import NO_OCCLUDER, fibonacci_sphere, occluder_codes
 from factorlib.meshes.mesh import Mesh, area_vectors
 
 LIFT = 1e-3  # distance of a ray's origin from the surface, in units of the object's radius

@@ -8,8 +8,8 @@ from jaxtyping import Float
 
 from factorlib.errors import InputError
 from factorlib.images.boxes import least_factor
-from factorlib.images.limits import check_values
 from factorlib.images.photo import decoded, open_photo
+from factorlib.images.scanlines import check_values
 from factorlib.reading import check_plain
 
 MOST_TEXELS = 4096 * 2048  # they take 250 MB when read, and more in a renderer

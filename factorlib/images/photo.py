@@ -20,11 +20,10 @@ from jaxtyping import Bool, Float, Shaped
 
 from factorlib.errors import InputError
 from factorlib.images.boxes import box_any, box_mean
+from factorlib.images.camera_files import is_heif, is_raw, open_heif, open_raw
 from factorlib.images.exif import exif_exposure, exif_focal_px
-from factorlib.images.heif import is_heif, open_heif
-from factorlib.images.raw import is_raw, open_raw
 from factorlib.images.scanlines import OpenPhoto, open_scanlines
-from factorlib.images.transfer import decoder
+from factorlib.images.tone import decoder
 from factorlib.reading import reading
 
 READ_AT_ONCE = 1 << 21  # number of pixels that are in memory as floats

@@ -1,18 +1,41 @@
-"""Pictures for display: linear radiance as 8-bit sRGB, and PNG files that are deterministic."""
+"""Pictures for display: 8-bit sRGB, deterministic PNG files, animations, and a palette of materials.
 
+Animations are GIF, and H.264 if PyAV is installed. Neither has half-transparent pixels, so transparent frames are
+composited on white. The palette gives each material a distinct colour in masks and tables, as near to its own as
+possible.
+"""
+
+import io
+from collections.abc import Sequence
+from fractions import Fraction
 from pathlib import Path
 
 import numpy as np
 import OpenImageIO as oiio
 from jaxtyping import Bool, Float, UInt8
 from PIL import Image
+from PIL.ImageColor import getrgb
+from scipy.optimize import linear_sum_assignment
 
 from factorlib.images.exr import encoded
-from factorlib.images.transfer import srgb_encode
+from factorlib.images.tone import srgb_encode
 from factorlib.reading import reading
 from factorlib.wholefile import write_bytes
 
 PERCENTILE = 99.0
+PALETTE = (
+    "#d1495b",
+    "#2e8b57",
+    "#3d6fb6",
+    "#e0b13a",
+    "#7d4f9e",
+    "#3fb0c4",
+    "#e07b39",
+    "#8c6d46",
+    "#9aa53a",
+    "#e8e8e8",
+    "#303438",
+)
 
 
 def exposure_of(
@@ -72,3 +95,75 @@ def read_png(path: str | Path) -> UInt8[np.ndarray, "h w c"]:
     """Read the 8-bit pixels of a PNG of `write_png`; InputError if the file cannot be read."""
     with reading("a PNG", path), Image.open(path, formats=["PNG"]) as image:
         return np.atleast_3d(np.asarray(image))
+
+
+def nearest_tags(names: list[str], reflectance: Float[np.ndarray, "m 3"]) -> dict[str, str]:
+    """Assign palette colours to materials with the least total distance, mostly of chroma.
+
+    With more than eleven materials the palette is used again.
+
+    >>> nearest_tags(["wine", "snow", "coal"], np.array([[0.5, 0.05, 0.05], [0.8, 0.8, 0.8], [0.03, 0.03, 0.03]]))
+    {'wine': '#d1495b', 'snow': '#e8e8e8', 'coal': '#303438'}
+    """
+    palette = np.array([getrgb(tag) for tag in PALETTE]) / 255
+    tags = {}
+    for start in range(0, len(names), len(PALETTE)):
+        difference = srgb_encode(np.clip(reflectance[start : start + len(PALETTE)], 0, 1))[:, None] - palette
+        # squared distance of chroma, plus a tenth of that of brightness
+        brightness = difference.mean(axis=-1, keepdims=True)
+        distance = 3 * np.square(difference - brightness).sum(axis=-1) + 0.3 * 3 * np.square(brightness[..., 0])
+        for row, column in zip(*linear_sum_assignment(distance), strict=True):
+            tags[names[start + row]] = PALETTE[column]
+    return tags
+
+
+def write_gif(path: str | Path, frames: Sequence[UInt8[np.ndarray, "h w 4"]], seconds: float) -> None:
+    """Write a looping animation on a white background.
+
+    Args:
+        path: File to write.
+        frames: Frames, RGBA.
+        seconds: Duration of one loop.
+    """
+    solid = [Image.fromarray(_on_white(frame)) for frame in frames]
+    memory = io.BytesIO()
+    each = max(20, round(1000 * seconds / len(frames)))  # milliseconds; browsers slow down shorter frames
+    solid[0].save(memory, "GIF", save_all=True, append_images=solid[1:], duration=each, loop=0, disposal=2)
+    write_bytes(path, memory.getvalue())
+
+
+def write_mp4(path: str | Path, frames: Sequence[UInt8[np.ndarray, "h w 4"]], seconds: float) -> None:
+    """Write an animation as H.264 (BT.709) on a white background, if PyAV is installed (the extra `video`).
+
+    An odd last row or column is cut off.
+
+    Args:
+        path: File to write.
+        frames: Frames, RGBA.
+        seconds: Duration.
+    """
+    try:
+        import av
+    except ImportError:
+        return
+    memory = io.BytesIO()
+    bt709 = 1
+    with av.open(memory, "w", format="mp4") as file:
+        stream = file.add_stream("libx264", rate=Fraction(len(frames) / seconds).limit_denominator(1000))
+        height, width = (n // 2 * 2 for n in frames[0].shape[:2])
+        stream.width = width
+        stream.height = height
+        stream.pix_fmt = "yuv420p"
+        stream.options = {"crf": "16", "threads": "1"}  # one thread gives the same bytes each time
+        stream.codec_context.colorspace = stream.codec_context.color_primaries = stream.codec_context.color_trc = bt709
+        for frame in frames:
+            picture = av.VideoFrame.from_ndarray(np.ascontiguousarray(_on_white(frame)[:height, :width]), "rgb24")
+            file.mux(stream.encode(picture.reformat(format="yuv420p", dst_colorspace="ITU709")))
+        file.mux(stream.encode(None))
+    write_bytes(path, memory.getvalue())
+
+
+def _on_white(frame: UInt8[np.ndarray, "h w 4"]) -> UInt8[np.ndarray, "h w 3"]:
+    """Composite a frame on white."""
+    alpha = frame[..., 3:].astype(float) / 255
+    return np.rint(frame[..., :3] * alpha + 255 * (1 - alpha)).astype(np.uint8)

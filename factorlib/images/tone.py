@@ -1,4 +1,7 @@
-"""Tone curve of a photo: the camera's mapping of linear radiance, beyond the encoding that the file declares.
+"""Transfer functions between encoded values and linear radiance, and the tone curve of a photo beyond them.
+
+Transfer functions (sRGB: IEC 61966-2-1:1999, section 5.2) work on any shape and keep NaN. They continue as odd
+functions below 0 and by the same formula above 1, so that they invert each other everywhere.
 
 Cameras render: they raise contrast, or lift shadows. The mapping that remains after the declared encoding is undone is
 modelled by one exponent g per photo,
@@ -9,6 +12,8 @@ with x in units of the illumination's mean radiance. τ(0) = 0 and τ(1) = 1, so
 keeps the slope at black finite, as the straight toe of sRGB does. The photos together determine g: two materials have
 one ratio of reflectances in all of them.
 """
+
+from collections.abc import Callable
 
 import numpy as np
 from jaxtyping import Float
@@ -68,3 +73,38 @@ def straightened(radiance: Float[np.ndarray, "*n"], exponent: float, pivot: floa
 def _range(exponent: Float[np.ndarray, "*n"] | float) -> Float[np.ndarray, "*n"] | float:
     """Return the denominator of (1)."""
     return (1 + TOE) ** exponent - TOE**exponent
+
+
+Values = Float[np.ndarray, "*shape"]
+
+
+def srgb_decode(encoded: Values) -> Values:
+    """Convert sRGB-encoded values to linear ones.
+
+    >>> srgb_decode(np.array([0.0, 0.04045, 0.5, 1.0])).round(6).tolist()
+    [0.0, 0.003131, 0.214041, 1.0]
+    """
+    size = np.abs(encoded)
+    return np.copysign(np.where(size <= 0.04045, size / 12.92, ((size + 0.055) / 1.055) ** 2.4), encoded)
+
+
+def srgb_encode(linear: Values) -> Values:
+    """Convert linear values to sRGB-encoded ones.
+
+    >>> srgb_encode(np.array([0.0, 0.0031308, 0.18, 1.0])).round(6).tolist()
+    [0.0, 0.04045, 0.461356, 1.0]
+    """
+    size = np.abs(linear)
+    return np.copysign(np.where(size <= 0.0031308, size * 12.92, 1.055 * size ** (1 / 2.4) - 0.055), linear)
+
+
+def gamma_decode(encoded: Values) -> Values:
+    """Return encoded^2.2."""
+    return np.copysign(np.abs(encoded) ** 2.2, encoded)
+
+
+def decoder(encoding: str) -> Callable[[Values], Values]:
+    """Return the function from values of `encoding` (srgb, linear, gamma2.2) to linear ones."""
+    decoders: dict[str, Callable[[Values], Values]]
+    decoders = {"srgb": srgb_decode, "linear": np.asarray, "gamma2.2": gamma_decode}
+    return decoders[encoding]

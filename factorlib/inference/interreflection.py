@@ -22,8 +22,7 @@ import numpy as np
 import torch
 from jaxtyping import Float
 
-from factorlib.geometry.occluder_codes import BINS, NO_OCCLUDER
-from factorlib.geometry.sphere import fibonacci_sphere
+from factorlib.geometry.sphere import BINS, NO_OCCLUDER, fibonacci_sphere
 from factorlib.light.visibility import cosine_weights, widest_sharpness
 from factorlib.reflection.brdf import specular
 from factorlib.urm.observations import Observations

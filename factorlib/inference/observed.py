@@ -18,9 +18,9 @@ from factorlib.geometry.sphere import fibonacci_sphere, mirror_cells
 from factorlib.inference.blocks import Block, Noise
 from factorlib.inference.interreflection import bounced_light
 from factorlib.inference.problem import Spread
-from factorlib.urm.merge import merge
+from factorlib.urm.extract import with_surface_normals
 from factorlib.urm.observations import Observations, read_observations
-from factorlib.urm.surface_maps import with_surface_normals
+from factorlib.urm.reduction import merge
 
 Rotations = Mapping[str, Float[np.ndarray, "3 3"]]  # world_from_camera, by the name of a photo
 
@@ -49,7 +49,7 @@ def gather_observations(
     surface: Path | None = None,
     tick: Callable[[], None] = lambda: None,
 ) -> list[PhotoObservations]:
-    """Read each file in order, and merge its observations within `degrees` of each other (`factorlib.urm.merge`).
+    """Read each file in order, and merge its observations within `degrees` of each other (`factorlib.urm.reduction`).
 
     Args:
         files: Files of `urm`.

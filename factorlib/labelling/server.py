@@ -31,12 +31,11 @@ from factorlib.dataset.paths import Refusal, file_exists
 from factorlib.dataset.read import FILE, UNKNOWN
 from factorlib.dataset.schema import LEFT_OUT, AtLeastOne, Name, OneOf254
 from factorlib.errors import InputError
-from factorlib.images.limits import MOST_MEGAPIXELS, check_pixels
-from factorlib.images.palette import PALETTE
 from factorlib.images.photo import decoded, open_photo
-from factorlib.images.picture import picture, png_bytes
+from factorlib.images.picture import PALETTE, picture, png_bytes
+from factorlib.images.scanlines import MOST_MEGAPIXELS, check_pixels
 from factorlib.labels.grow import grow
-from factorlib.labels.png import read_values
+from factorlib.labels.mask_files import read_values
 from factorlib.reading import read_bytes, read_text
 from factorlib.wholefile import replace_file
 from factorlib.yamlfile import parse_yaml, read_yaml, with_value

@@ -15,8 +15,7 @@ from numpy.lib.stride_tricks import sliding_window_view
 
 from factorlib.dataset.schema import LEFT_OUT
 from factorlib.errors import InputError
-from factorlib.labels.coco import read_coco
-from factorlib.labels.png import read_inside, read_values
+from factorlib.labels.mask_files import read_coco, read_inside, read_values
 
 MUCH = 0.1  # share of an object's pixels that is more than a slip of the brush
 DRAWN_EDGE = 2  # width of the pixels that adjacent outlines may share; they are left out without an error

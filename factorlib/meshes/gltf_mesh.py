@@ -14,8 +14,7 @@ from jaxtyping import Float
 
 from factorlib.dataset.gltf_header import CURE, GltfHeader, GltfNode, Primitive, buffer_path, read_header
 from factorlib.errors import InputError
-from factorlib.meshes.limits import Limits
-from factorlib.meshes.triangle_soup import TriangleSoup, floats, no_normals, normals_at_corners
+from factorlib.meshes.triangle_soup import Limits, TriangleSoup, floats, no_normals, normals_at_corners
 from factorlib.reading import read_bytes
 
 POINTS = 0  # modes of primitives

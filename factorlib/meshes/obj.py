@@ -11,8 +11,7 @@ from pathlib import Path
 import numpy as np
 
 from factorlib.errors import InputError
-from factorlib.meshes.limits import Limits
-from factorlib.meshes.triangle_soup import TriangleSoup, quoted, text_lines
+from factorlib.meshes.triangle_soup import Limits, TriangleSoup, quoted, text_lines
 
 MOST = 2**31  # greatest index in any file
 COUNTED_EVERY = 4096  # number of lines between two checks of the number of triangles

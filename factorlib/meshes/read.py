@@ -15,14 +15,12 @@ import numpy as np
 from factorlib.dataset.schema import MeshEntry
 from factorlib.errors import InputError, did_you_mean
 from factorlib.meshes.gltf_mesh import read_gltf
-from factorlib.meshes.limits import NO_LIMITS, Limits
 from factorlib.meshes.mesh import Mesh, area_vectors
 from factorlib.meshes.normals import consistently_wound, corner_normals, welded
 from factorlib.meshes.obj import read_obj
-from factorlib.meshes.ply import read_ply
-from factorlib.meshes.stl_off import read_off, read_stl
+from factorlib.meshes.ply_stl_off import read_off, read_ply, read_stl
 from factorlib.meshes.subdivision import subdivided_mesh
-from factorlib.meshes.triangle_soup import TriangleSoup, check
+from factorlib.meshes.triangle_soup import NO_LIMITS, Limits, TriangleSoup, check
 from factorlib.reading import one_line, read_bytes, reading
 
 WITHIN = {".obj": read_obj, ".ply": read_ply, ".stl": read_stl, ".off": read_off}  # formats of a single file

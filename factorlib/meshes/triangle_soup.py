@@ -1,13 +1,14 @@
 """Mesh as its file has it, before it is made usable: triangles, normals of their corners, names of their parts.
 
-Text in mesh files is UTF-8, or else Latin-1, in which old programs write names and comments.
+Limits on its size are far above what a rough mesh needs, but within the memory of a usual machine. Text in mesh files
+is UTF-8, or else Latin-1, in which old programs write names and comments.
 """
 
 import io
 import warnings
 from collections.abc import Iterator
 from pathlib import Path
-from typing import NoReturn
+from typing import Annotated, NoReturn
 
 import msgspec
 import numpy as np
@@ -15,11 +16,60 @@ from jaxtyping import Float, Int
 
 from factorlib.errors import InputError
 
+VERTICES_A_TRIANGLE = 3
+MOST_PARTS = 100_000  # greatest number of parts of one file
 LARGEST = 1e15  # greatest coordinate: its cube, and its ratio to any plausible length, are finite
 LEAST_EXTENT = 1e-12  # least extent
 LEAST_SHARE = 1e-9  # least extent over distance from the origin: below, too few digits are left for the shape
 QUOTED = 80  # number of characters of a line in a message
 LONGEST = 2_000_000  # number of characters of a line; each of its words becomes an object
+
+
+class Limits(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """Limits that are checked before a mesh is read; a mesh of a million triangles takes about 1 GB and 20 s."""
+
+    megabytes: Annotated[float, msgspec.Meta(gt=0, le=1e6)] = 500.0
+    """Greatest size of a mesh's file, and of all its buffers together, megabytes."""
+    triangles: Annotated[int, msgspec.Meta(ge=1, le=10**9)] = 5_000_000
+    """Greatest number of triangles of a mesh."""
+
+    @property
+    def bytes(self) -> int:
+        """Greatest size of a file, bytes."""
+        return int(self.megabytes * 1e6)
+
+    def check(self, vertices: int, triangles: int, file: str | Path) -> None:
+        """Check the numbers of vertices and triangles of a file against the limits.
+
+        Args:
+            vertices: Number of vertices.
+            triangles: Number of triangles.
+            file: File to name in the error.
+
+        Raises:
+            InputError: If there are too many triangles, or more vertices than the most triangles can use.
+        """
+        most_vertices = VERTICES_A_TRIANGLE * self.triangles
+        for count, most, what in ((triangles, self.triangles, "triangles"), (vertices, most_vertices, "vertices")):
+            if count > most:
+                raise InputError(
+                    f"has {count:,} {what}",
+                    file=file,
+                    cure=f'simplify it; at most {most:,} {what} are read (SET="align.limits.triangles=…")',
+                )
+
+    @staticmethod
+    def check_parts(parts: int, file: str | Path) -> None:
+        """Raise InputError for more than MOST_PARTS parts in one file."""
+        if parts > MOST_PARTS:
+            raise InputError(
+                f"has {parts:,} parts",
+                file=file,
+                cure=f"join parts that have the same material: at most {MOST_PARTS:,} parts are read",
+            )
+
+
+NO_LIMITS = Limits(megabytes=1e6, triangles=10**9)  # for meshes that an earlier stage has checked
 
 
 class TriangleSoup(msgspec.Struct, frozen=True):

@@ -36,7 +36,7 @@ from factorlib.conventions import YUP_FROM_CAMERA
 from factorlib.errors import InputError
 from factorlib.export.exported_scene import ALL_BOUNCES
 from factorlib.meshes.mesh import Mesh
-from factorlib.meshes.ply import submesh
+from factorlib.meshes.ply_stl_off import submesh
 from factorlib.render.ground import Plane, height_over
 from factorlib.render.photo_scene import PhotoScene, PlacedMesh, light_entries, shapes
 from factorlib.render.placement import RADIUS, Spot, disk

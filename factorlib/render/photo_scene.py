@@ -19,7 +19,7 @@ from factorlib.geometry.camera import Camera, rotation_of_vector
 from factorlib.light.latlong import rotate_map
 from factorlib.light.lobes import Lobes, lobe_integral
 from factorlib.meshes.mesh import Mesh
-from factorlib.meshes.ply import submesh
+from factorlib.meshes.ply_stl_off import submesh
 from factorlib.results.materials import Reflectance
 from factorlib.tracing.denoise import denoised
 from factorlib.tracing.scene import Channels, bsdf, envmap, envmap_of_nodes, paint, rendered, rgb, rigid, sensor, shape

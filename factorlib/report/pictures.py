@@ -15,9 +15,8 @@ from scipy.sparse import csr_array
 from factorlib.conventions import lat_long_solid_angles
 from factorlib.dataset.schema import ObjectsSlice
 from factorlib.evaluate.photo_errors import agreeing_pixels
-from factorlib.images.palette import nearest_tags
-from factorlib.images.picture import exposure_of, picture, png_bytes
-from factorlib.images.transfer import srgb_encode
+from factorlib.images.picture import exposure_of, nearest_tags, picture, png_bytes
+from factorlib.images.tone import srgb_encode
 from factorlib.render.photo_scene import traced_photo, turned_light
 from factorlib.render.solved_set import SolvedSet
 from factorlib.render.traced_picture import TracedPicture
@@ -25,8 +24,8 @@ from factorlib.report.artifacts import Artifacts, Channels, Picture
 from factorlib.results.lobe_table import read_lobes
 from factorlib.results.materials import Reflectance
 from factorlib.results.metrics import PhotoErrors, ScoredLight
+from factorlib.urm.extract import with_surface_normals
 from factorlib.urm.observations import Observations, read_observations
-from factorlib.urm.surface_maps import with_surface_normals
 
 FIRST_SAMPLES = 64  # samples per pixel of the first screen's pictures, which take some seconds
 AMPLIFICATION = 4  # factor on the difference between photo and re-synthesis

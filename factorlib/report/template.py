@@ -9,7 +9,7 @@ import jinja2
 import msgspec
 import numpy as np
 
-from factorlib.images.transfer import srgb_encode
+from factorlib.images.tone import srgb_encode
 from factorlib.results.metrics import Metrics
 
 MINUS = "\u2212"

@@ -19,8 +19,7 @@ import pycolmap
 from jaxtyping import Bool, UInt8
 from PIL import Image
 
-from factorlib.align.silhouette import UNKNOWN
-from factorlib.align.view import TYPICAL_SIGMA
+from factorlib.align.silhouette import TYPICAL_SIGMA, UNKNOWN
 from factorlib.errors import InputError
 from factorlib.geometry.camera import Camera, Pose
 from factorlib.shapes.hull import hull_overlap

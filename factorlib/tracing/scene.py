@@ -22,7 +22,7 @@ from factorlib.conventions import lat_long_directions, lat_long_solid_angles
 from factorlib.geometry.camera import Camera
 from factorlib.light.latlong import sample_map
 from factorlib.meshes.mesh import Mesh
-from factorlib.meshes.ply import write_ply
+from factorlib.meshes.ply_stl_off import write_ply
 from factorlib.results.materials import Reflectance
 from factorlib.tracing.variant import mitsuba
 

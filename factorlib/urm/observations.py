@@ -24,7 +24,7 @@ from jaxtyping import Bool, Float, Int, UInt8, UInt16
 
 from factorlib.conventions import half_of_normal_and_view
 from factorlib.errors import InputError
-from factorlib.geometry.occluder_codes import BINS, NO_OCCLUDER
+from factorlib.geometry.sphere import BINS, NO_OCCLUDER
 from factorlib.parquetfile import read_columns
 from factorlib.reading import reading
 from factorlib.wholefile import writing

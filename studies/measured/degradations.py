@@ -17,7 +17,7 @@ from PIL import Image, ImageFilter
 from factorlib.generate.chair import bent_chair, chair
 from factorlib.generate.folder import write_labels, write_light, write_normals, write_obj, write_photo, write_yaml
 from factorlib.images.exr import read_exr, read_rgb_exr
-from factorlib.images.transfer import srgb_decode, srgb_encode
+from factorlib.images.tone import srgb_decode, srgb_encode
 from factorlib.meshes.mesh import smooth
 
 Rng = np.random.Generator

@@ -12,10 +12,16 @@ from factorlib.align.pairing import HIDDEN, match_parts
 from factorlib.align.photo_alignment import Keypoints, KnownFocal, ObjectToAlign, align_photo
 from factorlib.align.reliability import find_doubts, measure_reliability, normal_stderr_deg
 from factorlib.align.search import SearchOptions, estimate_pose
-from factorlib.align.silhouette import UNKNOWN, Silhouette, label_agreement, silhouette_iou
+from factorlib.align.silhouette import (
+    UNKNOWN,
+    ObjectView,
+    Silhouette,
+    label_agreement,
+    silhouette_iou,
+    with_prior_focal,
+)
 from factorlib.align.state import pose_state
 from factorlib.align.target import make_target
-from factorlib.align.view import ObjectView, with_prior_focal
 from factorlib.geometry.camera import Camera, Pose, angle_between
 from factorlib.geometry.raster import Caster, rasterise
 from factorlib.meshes.mesh import Mesh

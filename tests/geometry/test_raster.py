@@ -7,9 +7,8 @@ import trimesh
 from scipy.spatial.transform import Rotation
 
 from factorlib.geometry.camera import Camera, Pose
-from factorlib.geometry.occluder_codes import BINS, NO_OCCLUDER
 from factorlib.geometry.raster import rasterise
-from factorlib.geometry.sphere import fibonacci_sphere, mirror_directions
+from factorlib.geometry.sphere import BINS, NO_OCCLUDER, fibonacci_sphere, mirror_directions
 from factorlib.geometry.visibility import Occluders, SurfacePoints
 from tests.align.scenes import ball, blob, mesh_of, photo_of
 

@@ -12,8 +12,7 @@ from factorlib.images.lens import Undistorted, radial_lens
 from factorlib.images.photo import Photo
 from factorlib.images.picture import read_png, write_png
 from factorlib.images.processing import HALO, halo
-from factorlib.images.tone import by_log_exponent, curve, inverse, slope
-from factorlib.images.transfer import gamma_decode, srgb_decode, srgb_encode
+from factorlib.images.tone import by_log_exponent, curve, gamma_decode, inverse, slope, srgb_decode, srgb_encode
 from tests.refusal import refusal
 
 X = np.concatenate([[0.0, 1e-4], np.geomspace(0.01, 50, 40)])

@@ -6,8 +6,7 @@ import msgspec
 import numpy as np
 import pytest
 
-from factorlib.geometry.occluder_codes import NO_OCCLUDER, occluder_codes
-from factorlib.geometry.sphere import fibonacci_sphere
+from factorlib.geometry.sphere import NO_OCCLUDER, fibonacci_sphere, occluder_codes
 from factorlib.images.tone import curve
 from factorlib.inference.blocks import Noise
 from factorlib.inference.forward import Illumination

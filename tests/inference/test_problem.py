@@ -4,8 +4,7 @@ import msgspec
 import numpy as np
 import pytest
 
-from factorlib.geometry.occluder_codes import NO_OCCLUDER, occluder_codes
-from factorlib.geometry.sphere import fibonacci_sphere
+from factorlib.geometry.sphere import NO_OCCLUDER, fibonacci_sphere, occluder_codes
 from factorlib.inference.blocks import Noise
 from factorlib.inference.forward import Illumination
 from factorlib.inference.gauge import BRIGHTEST, connected_components, fix_gauge

@@ -15,7 +15,7 @@ import pytest
 from PIL import Image
 
 from factorlib.labelling.server import MaskSet, Server
-from factorlib.labels.png import read_values
+from factorlib.labels.mask_files import read_values
 from tests.browser import CHROMIUM, started
 from tests.labels.test_labels import scene
 from tests.refusal import refusal

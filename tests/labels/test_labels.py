@@ -8,10 +8,9 @@ import pytest
 from PIL import Image
 from pycocotools import mask as pycocomask
 
-from factorlib.labels.coco import run_lengths
 from factorlib.labels.grow import grow
 from factorlib.labels.labels import Labels, check_materials, read_labels, read_objects
-from factorlib.labels.png import read_values
+from factorlib.labels.mask_files import read_values, run_lengths
 from tests.refusal import refusal
 
 MATERIALS = ["red", "white", "wood"]

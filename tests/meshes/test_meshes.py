@@ -7,13 +7,12 @@ import pytest
 import trimesh
 from scipy.spatial.transform import Rotation
 
-from factorlib.meshes.limits import Limits
 from factorlib.meshes.mesh import Mesh, area_vectors
 from factorlib.meshes.normals import consistently_wound, corner_normals
-from factorlib.meshes.ply import submesh, write_ply
+from factorlib.meshes.ply_stl_off import submesh, write_ply
 from factorlib.meshes.read import merged_normals, read_mesh, usable
 from factorlib.meshes.subdivision import SubdividedMesh, subdivide, subdivided_mesh
-from factorlib.meshes.triangle_soup import TriangleSoup, no_normals
+from factorlib.meshes.triangle_soup import Limits, TriangleSoup, no_normals
 from tests.faults.sample import DATA, MESHES, OFF, PLY, PLY_FACES, PLY_TEXT, STL_TEXT, VERTICES, glb, gltf_header, put
 from tests.refusal import refusal
 

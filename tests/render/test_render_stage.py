@@ -6,8 +6,7 @@ import pytest
 import torch
 
 from factorlib.conventions import FRONT, YUP_FROM_CAMERA, lat_long_directions, lat_long_solid_angles
-from factorlib.geometry.occluder_codes import NO_OCCLUDER
-from factorlib.geometry.sphere import ball_normals, fibonacci_sphere
+from factorlib.geometry.sphere import NO_OCCLUDER, ball_normals, fibonacci_sphere
 from factorlib.images.exr import read_exr, read_rgb_exr, write_exr
 from factorlib.images.tone import curve
 from factorlib.inference.interreflection import bounced_light

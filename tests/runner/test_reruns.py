@@ -141,7 +141,7 @@ def test_an_edit_that_keeps_size_and_time_is_noticed(real):
     """Of a file of the data set, of a module and of a file of a package; all are old enough to be remembered."""
     for name, old, new in (
         ("data/synthetic/masks/study.png", b"IEND", b"IENE"),
-        ("factorlib/urm/merge.py", b"return ", b"return-"),
+        ("factorlib/urm/reduction.py", b"return ", b"return-"),
         ("factorlib/reflection/kernel.c", b"int ", b"long"),
     ):
         path, before = real.root / name, (real.root / name).read_bytes()

@@ -17,7 +17,7 @@ from factorlib.geometry.camera import Camera, Pose, rotation_of_vector
 from factorlib.geometry.raster import Caster, rasterise
 from factorlib.images.exr import read_exr
 from factorlib.jsonfile import read_json, write_json
-from factorlib.meshes.ply import write_ply
+from factorlib.meshes.ply_stl_off import write_ply
 from factorlib.scenes.stage_runs import run_stages
 from factorlib.stage import Inputs
 from stages import align, masks

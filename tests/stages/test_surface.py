@@ -11,14 +11,14 @@ from factorlib.generate.solids import sphere
 from factorlib.images.exr import write_exr
 from factorlib.inference.blocks import Noise
 from factorlib.inference.observed import blocks_of_observations, gather_observations
-from factorlib.meshes.ply import write_ply
+from factorlib.meshes.ply_stl_off import write_ply
 from factorlib.meshes.read import CREASE_DEG, MeshCache, read_mesh
 from factorlib.meshes.subdivision import subdivided_mesh
 from factorlib.results.materials import Reflectance
 from factorlib.results.surface import SurfaceTable, read_surface
 from factorlib.stage import Inputs, serial_map, silent
+from factorlib.urm.extract import read_geometry, with_surface_normals
 from factorlib.urm.observations import Observations, write_observations
-from factorlib.urm.surface_maps import read_geometry, with_surface_normals
 from stages import surface
 from tests.inference.made import observations_from_front
 from tests.refusal import refusal

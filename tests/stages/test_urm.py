@@ -11,11 +11,11 @@ from factorlib.geometry.camera import Camera, Pose
 from factorlib.geometry.raster import rasterise
 from factorlib.images.exr import write_exr
 from factorlib.jsonfile import write_json
-from factorlib.meshes.ply import write_ply
+from factorlib.meshes.ply_stl_off import write_ply
 from factorlib.results.poses import ObjectPose
 from factorlib.stage import Inputs
 from factorlib.urm.observations import read_observations
-from factorlib.urm.sample import sample
+from factorlib.urm.reduction import sample
 from stages import urm
 from tests.align.scenes import ball, mesh_of
 from tests.stages.made import Rising

@@ -4,9 +4,8 @@ import msgspec
 import numpy as np
 import pytest
 
-from factorlib.geometry.occluder_codes import BINS, NO_OCCLUDER
+from factorlib.geometry.sphere import BINS, NO_OCCLUDER
 from factorlib.urm.extract import PhotoSource, extract_observations
-from factorlib.urm.merge import merge
 from factorlib.urm.observations import (
     COLUMNS,
     OPTIONAL,
@@ -17,7 +16,7 @@ from factorlib.urm.observations import (
     relative_exposures,
     write_observations,
 )
-from factorlib.urm.sample import sample
+from factorlib.urm.reduction import merge, sample
 from tests.refusal import refusal
 
 

@@ -22,10 +22,9 @@ from factorlib.dataset.schema import (
     Similarity,
     Vec3,
 )
-from factorlib.dataset.sources.bop import read_bop
 from factorlib.dataset.sources.colmap import read_colmap
+from factorlib.dataset.sources.json_sources import read_bop, read_transforms
 from factorlib.dataset.sources.source_image import SourceImage, as_rows, pinhole, rigid
-from factorlib.dataset.sources.transforms import read_transforms
 from factorlib.errors import did_you_mean
 
 SUFFIXES = (*IMAGES, ".webp", ".bmp")  # Other suffixes are part of a name: transforms.json may say "r_0.5".

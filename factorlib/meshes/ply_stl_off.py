@@ -1,18 +1,25 @@
-"""PLY files: a reader of text and both byte orders, and a deterministic writer of binary little-endian.
+"""Readers of mesh files of one part: PLY, STL (binary and text) and OFF; and a deterministic writer of binary PLY.
 
-The numbers of a text file are read as rows of float64, so that one reader serves text and binary. Lists in one file may
-differ in length (trimesh refuses these). Nothing is allocated that the file has no room for.
+PLY is read here, because its lists may differ in length, which trimesh refuses. The numbers of a text file are read as
+rows of float64, so that one reader serves text and both byte orders. Nothing is allocated that the file has no room
+for.
+
+trimesh reads STL and OFF. It reads a truncated text file as a smaller mesh, so the numbers of corners and faces are
+compared with the file's. It is imported on first use, which takes a third of a second.
 """
 
+import io
 import re
+import warnings
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
 
 from factorlib.errors import InputError
-from factorlib.meshes.limits import Limits
 from factorlib.meshes.mesh import Mesh
 from factorlib.meshes.triangle_soup import (
+    Limits,
     TriangleSoup,
     fans,
     floats,
@@ -39,11 +46,13 @@ LONGEST = 1 << 20  # greatest size of a header, bytes
 END = re.compile(rb"^end_header[ \t]*(\r\n|\n|\r)", re.MULTILINE)
 COUNT = re.compile(r"[0-9]{1,18}")
 CORNERS = ("vertex_indices", "vertex_index")
-CURE = "is it whole, and a PLY? export it again"
 
 
 Properties = dict[str, tuple[str, str | None]]  # NumPy types of the numbers, and of the length before a list of them
 Columns = dict[str, tuple[np.ndarray, np.ndarray]]  # numbers of all rows, concatenated, and the count of each row
+VERTEX = re.compile(rb"^[ \t]*vertex\b", re.MULTILINE | re.IGNORECASE)
+COUNTS = re.compile(r"(?:(?:ST)?C?N?OFF)?\s*([0-9]+)\s+([0-9]+)[^\n]*")  # OFF itself is optional
+CURE = "is it whole, and of the kind its suffix says? copy or export it again"
 
 
 def read_ply(path: Path, content: bytes, limits: Limits) -> TriangleSoup:
@@ -222,3 +231,70 @@ def submesh(mesh: Mesh, label: int) -> Mesh:
     faces = index.reshape(-1, 3).astype(np.int32)
     detail = None if mesh.detail is None else mesh.detail[used]
     return Mesh(mesh.vertices[used], faces, mesh.normals[used], mesh.face_label[keep], mesh.open, detail)
+
+
+def read_stl(path: Path, content: bytes, limits: Limits) -> TriangleSoup:
+    """Read an STL file: binary if its size matches its count of triangles, else text.
+
+    Raises:
+        InputError: If the file is malformed or too large.
+    """
+    from trimesh.exchange.stl import load_stl
+
+    binary_size = 84 + 50 * int.from_bytes(content[80:84], "little")
+    is_binary = len(content) == binary_size
+    mesh = _loaded(load_stl, content if is_binary else content.decode("ascii", "replace").encode())
+    solids = list(mesh["geometry"].values()) if "geometry" in mesh else [mesh]
+    corners = np.concatenate([np.empty((0, 3)), *(floats(solid["vertices"]) for solid in solids)])
+    limits.check(len(corners), len(corners) // 3, path)
+    expected = len(VERTEX.findall(content))
+    if not is_binary and not 0 < len(corners) == expected:
+        raise InputError(
+            (
+                f"is neither a whole text STL ({len(corners)} of {expected} corners can be read) "
+                f"nor a whole binary STL ({len(content)} of {binary_size} bytes)"
+            ),
+            file=path,
+            cure=CURE,
+        )
+    return single_part_soup(corners, np.arange(len(corners)), path.stem)
+
+
+def read_off(path: Path, content: bytes, limits: Limits) -> TriangleSoup:
+    """Read an OFF file; polygons become fans of triangles.
+
+    Raises:
+        InputError: If the file is malformed or too large.
+    """
+    from trimesh.exchange.off import load_off
+
+    lines = [line for line in (line.split("#", 1)[0].strip() for line in text_lines(content)) if line]
+    counts = COUNTS.match("\n".join(lines[:2]))
+    if counts is None:
+        raise InputError(
+            "does not begin with OFF and the numbers of its vertices and faces",
+            file=path,
+            cure="save it as OFF: text, of three dimensions",
+        )
+    vertices = int(counts[1])
+    faces = int(counts[2])
+    rows = lines[counts[0].count("\n") + 1 :]
+    polygons = rows[vertices : vertices + faces]
+    triangles = sum(int(polygon.split()[0]) - 2 for polygon in polygons)
+    limits.check(vertices, triangles, path)
+    mesh = _loaded(load_off, "\n".join([f"OFF\n{vertices} {faces} 0", *rows]).encode())
+    if len(polygons) != faces or len(mesh["faces"]) != triangles:
+        raise InputError(
+            f"announces {vertices} vertices and {faces} faces, but has fewer or incomplete ones", file=path, cure=CURE
+        )
+    return single_part_soup(mesh["vertices"], mesh["faces"], path.stem)
+
+
+def _loaded(load: Callable[[io.BytesIO], dict], content: bytes) -> dict:
+    """Call a reader of trimesh; ValueError for text that is no number, of which NumPy only warns."""
+    with warnings.catch_warnings(), np.errstate(all="ignore"):
+        warnings.simplefilter("error", DeprecationWarning)
+        try:
+            return load(io.BytesIO(content))
+        except DeprecationWarning:
+            raise ValueError("something in it is no number") from None
