@@ -24,7 +24,7 @@ import msgspec
 import numpy as np
 from PIL import Image
 
-from factorlib.align.pairing import HIDDEN, match_parts
+from factorlib.align.coarse import HIDDEN, match_parts
 from factorlib.align.silhouette import UNKNOWN as HIDES
 from factorlib.align.silhouette import Silhouette
 from factorlib.dataset.check import IMAGES, MESHES, RESERVED_PHOTOS

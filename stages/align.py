@@ -11,10 +11,9 @@ from typing import Annotated
 import msgspec
 import numpy as np
 
-from factorlib.align.confidence import confidence, overlay
 from factorlib.align.input_checks import camera_of_photo, check_before_camera, warn_of_camera, warn_of_materials
 from factorlib.align.photo_alignment import Keypoints, ObjectToAlign, PhotoAlignment, align_photo
-from factorlib.align.reliability import Thresholds, find_doubts, measure_reliability
+from factorlib.align.reliability import Thresholds, confidence, find_doubts, measure_reliability, overlay
 from factorlib.align.search import SearchOptions
 from factorlib.align.silhouette import label_agreement, silhouette_iou, silhouette_of_object, silhouette_of_photo
 from factorlib.dataset.schema import SOURCES, ObjectsSlice

@@ -13,11 +13,10 @@ import numpy as np
 
 from factorlib.dataset.schema import LEFT_OUT, PhotoSlice
 from factorlib.errors import InputError
-from factorlib.images.boxes import box_majority, least_factor
 from factorlib.images.camera_files import is_raw
 from factorlib.images.exr import write_exr
 from factorlib.images.lens import Undistorted, radial_lens
-from factorlib.images.photo import Photo, check_bright, decoded, open_photo
+from factorlib.images.photo import Photo, box_majority, check_bright, decoded, least_factor, open_photo
 from factorlib.images.processing import HALO, halo, reported_processing
 from factorlib.images.scanlines import MOST_MEGAPIXELS, check_pixels
 from factorlib.jsonfile import write_json

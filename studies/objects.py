@@ -19,11 +19,9 @@ import numpy as np
 from jaxtyping import Float
 from scipy.spatial.transform import Rotation
 
-from factorlib.align.confidence import confidence
-from factorlib.align.refine import refine
-from factorlib.align.silhouette import ObjectView, Silhouette
-from factorlib.align.state import pose_state
-from factorlib.align.target import make_target
+from factorlib.align.refine import pose_state, refine
+from factorlib.align.reliability import confidence
+from factorlib.align.silhouette import ObjectView, Silhouette, make_target
 from factorlib.conventions import FRONT, YUP_FROM_CAMERA
 from factorlib.evaluate.ball import OctahedralLight, ball
 from factorlib.geometry.camera import Camera, Pose, rotation_of_vector

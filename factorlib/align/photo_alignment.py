@@ -9,10 +9,9 @@ import pycolmap
 from jaxtyping import Float
 from scipy.optimize import minimize_scalar
 
+from factorlib.align.refine import PoseState, pose_state
 from factorlib.align.search import PoseEstimate, Report, SearchOptions, estimate_pose, refine_finest, refine_near
-from factorlib.align.silhouette import ObjectView, Silhouette, labelled_iou, with_prior_focal
-from factorlib.align.state import PoseState, pose_state
-from factorlib.align.target import make_target
+from factorlib.align.silhouette import ObjectView, Silhouette, labelled_iou, make_target, with_prior_focal
 from factorlib.errors import InputError
 from factorlib.geometry.camera import Camera, Pose
 from factorlib.geometry.raster import Caster, rasterise

@@ -1,4 +1,6 @@
-"""Refinement of a pose on contours, by Gauss–Newton.
+"""Pose and focal length as seven numbers that are nearly independent in an image, and their refinement on contours.
+
+Refinement is Gauss–Newton.
 
 Every step renders the contour of the mesh to a fraction of a pixel. Rays are bisected between a pixel inside and one
 outside. (With whole pixels most residuals are exactly 0, and a robust fit sticks to them.) To first order the image of
@@ -22,13 +24,13 @@ from jaxtyping import Float
 from scipy.ndimage import map_coordinates
 from scipy.spatial import cKDTree
 
-from factorlib.align.silhouette import labelled_iou
-from factorlib.align.state import PoseState
-from factorlib.align.target import Target, border_pairs
-from factorlib.geometry.camera import Camera
+from factorlib.align.silhouette import Target, border_pairs, labelled_iou
+from factorlib.geometry.camera import Camera, Pose, rotation_of_vector
 from factorlib.geometry.raster import Caster, Hits
+from factorlib.meshes.mesh import Mesh
 from factorlib.robust import robust_deviation
 
+GENERATORS = np.cross(np.eye(3)[:, None], np.eye(3))  # of rotations; [k, i, j]: component j of e_k × e_i
 CORRELATION = 10.0  # number of contour pixels that share one error of mask or mesh
 LEAST_SPREAD = 0.35  # error of a mask's contour, which follows whole pixels; in window pixels
 HALVINGS = 3  # bisections of a pixel, to locate the mesh's contour
@@ -37,6 +39,81 @@ DAMPING = np.array([0.15, 0.15, 0.15, 0.1, 0.1, 0.15, 0.3]) ** -2.0  # inverse v
 LARGEST_STEP = 0.3  # greatest step of each unknown, in its unit
 STILL = 0.03  # a step of fewer standard errors ends the iteration
 Points = Float[np.ndarray, "n 2"]
+
+
+class PoseState(msgspec.Struct, frozen=True):
+    """Pose of a mesh by its rotation and the position of its centre, with the focal length.
+
+    rotation   cam_from_object             a, b       slopes of the ray to the mesh's centre: x/z, y/z
+    log_depth  of the centre, mesh units   log_focal  photo pixels
+    """
+
+    rotation: Float[np.ndarray, "3 3"]
+    a: float
+    b: float
+    log_depth: float
+    log_focal: float
+
+    def middle(self) -> Float[np.ndarray, "3"]:
+        """Return the mesh's centre in camera coordinates, mesh units."""
+        return np.exp(self.log_depth) * np.array([self.a, self.b, 1.0])
+
+    def pose(self, mesh: Mesh | Caster) -> Pose:
+        """Return cam_from_object of a mesh with this centre."""
+        return Pose(self.rotation, self.middle() - self.rotation @ mesh.centre)
+
+    @property
+    def focal(self) -> float:
+        """Focal length, photo pixels."""
+        return float(np.exp(self.log_focal))
+
+    def camera(self, template: Camera) -> Camera:
+        """Return `template` with this state's focal length."""
+        return msgspec.structs.replace(template, focal=self.focal)
+
+    def moved(self, step: Float[np.ndarray, "7"]) -> "PoseState":
+        """Return the state moved by `step`: rotation vector in camera axes (3), a, b, log depth, log focal.
+
+        A step of log focal changes depth and slopes as well, so that size and place in the image stay.
+        """
+        zoom = step[6]
+        a = float((self.a + step[3]) * np.exp(-zoom))
+        b = float((self.b + step[4]) * np.exp(-zoom))
+        log_depth = float(self.log_depth + step[5] + zoom)
+        return PoseState(rotation_of_vector(step[:3]) @ self.rotation, a, b, log_depth, float(self.log_focal + zoom))
+
+    def jacobian(self, arms: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 2 7"]:
+        """Return the derivative of image points (photo pixels) by the step of `moved`.
+
+        `arms` are the points' offsets from the centre, in camera axes.
+        """
+        depth = np.exp(self.log_depth)
+        focal = np.exp(self.log_focal)
+        point = arms + self.middle()
+        # moves of the points in camera axes by a, b, log depth, log focal, and by rotation about axis k (e_k × arm)
+        shifts = depth * np.array([[1, 0, self.a, 0], [0, 1, self.b, 0], [0, 0, 1, 1]])
+        turns = np.moveaxis(arms @ GENERATORS, 0, -1)
+        moves = np.concatenate([turns, np.broadcast_to(shifts, (len(arms), 3, 4))], axis=-1)
+        # derivative of the perspective projection; log focal also scales the image
+        slope = point[:, :2] / point[:, 2:]
+        result = (moves[:, :2] - slope[:, :, None] * moves[:, 2:]) * (focal / point[:, 2])[:, None, None]
+        result[:, :, 6] += focal * slope
+        return result
+
+
+def pose_state(pose: Pose, camera: Camera, mesh: Mesh | Caster) -> PoseState:
+    """Return the state of a mesh's pose, the inverse of `PoseState.pose`.
+
+    Args:
+        pose: Pose of the mesh.
+        camera: Camera, for its focal length.
+        mesh: The mesh, for its centre.
+
+    Returns:
+        The state.
+    """
+    x, y, z = pose.apply(mesh.centre[None])[0]
+    return PoseState(pose.rotation, float(x / z), float(y / z), float(np.log(z)), float(np.log(camera.focal)))
 
 
 class RefinedState(msgspec.Struct, frozen=True):

@@ -13,10 +13,8 @@ import msgspec
 import numpy as np
 
 from factorlib.align.coarse import initial_states, is_cut
-from factorlib.align.refine import RefinedState, refine
-from factorlib.align.silhouette import ObjectView
-from factorlib.align.state import PoseState
-from factorlib.align.target import Target, make_target
+from factorlib.align.refine import PoseState, RefinedState, refine
+from factorlib.align.silhouette import ObjectView, Target, make_target
 from factorlib.geometry.camera import angle_between
 from factorlib.geometry.raster import Caster, Maps, rasterise
 from factorlib.results.poses import RunnerUpPose, entry_of

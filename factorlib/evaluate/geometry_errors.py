@@ -12,7 +12,7 @@ from jaxtyping import Bool, Float
 
 from factorlib.conventions import FRONT
 from factorlib.dataset.schema import RigidTransform
-from factorlib.images.boxes import box_sum
+from factorlib.images.photo import box_sum
 from factorlib.results.metrics import AngleError, NormalError, PoseError
 from factorlib.results.poses import PoseEntry
 

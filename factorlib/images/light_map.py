@@ -7,8 +7,7 @@ import numpy as np
 from jaxtyping import Float
 
 from factorlib.errors import InputError
-from factorlib.images.boxes import least_factor
-from factorlib.images.photo import decoded, open_photo
+from factorlib.images.photo import decoded, least_factor, open_photo
 from factorlib.images.scanlines import check_values
 from factorlib.reading import check_plain
 

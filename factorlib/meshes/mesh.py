@@ -1,10 +1,19 @@
-"""Triangle mesh that the pipeline can use: finite, without degenerate faces, with normals and material labels."""
+"""Triangle mesh that the pipeline can use: finite, without degenerate faces, with normals and material labels.
 
-from collections.abc import Sequence
+Smooth vertex normals of rough meshes: First, faces are flipped to agree with their neighbours, so that a few reversed
+faces do not cancel the normals around them. The two orientations of every face are the nodes of a graph, whose
+connected components are the consistent orientations. Second, the normal of a corner is the angle-weighted mean (Thürmer
+and Wüthrich 1998) of the faces about its vertex. Third, only faces within the crease angle of the corner's own face
+count: an edge stays sharp, a curve stays smooth. Duplicate vertices are one vertex here, by position.
+"""
+
+from collections.abc import Iterator, Sequence
 
 import msgspec
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
+
+PAIRS_AT_ONCE = 2_000_000  # number of pairs of corners in memory at once
 
 
 class Mesh(msgspec.Struct, frozen=True):
@@ -106,3 +115,119 @@ def smooth(vertices: Float[np.ndarray, "v 3"], faces: np.ndarray, label: np.ndar
         np.add.at(normals, faces[:, corner], area_vectors(vertices, faces))
     normals /= np.linalg.norm(normals, axis=1, keepdims=True)
     return Mesh(vertices, faces.astype(np.int32), normals, np.broadcast_to(label, len(faces)).astype(np.int16))
+
+
+def welded(vertices: Float[np.ndarray, "v 3"], tolerance: float = 1e-6) -> Int[np.ndarray, " v"]:
+    """Return the number of each vertex's position, equal for vertices closer than about `tolerance` × the extent."""
+    low = vertices.min(axis=0)
+    extent = float((vertices.max(axis=0) - low).max()) or 1.0
+    grid = np.round((vertices - low) / (extent * tolerance)).astype(np.int64)
+    return np.unique(grid, axis=0, return_inverse=True)[1].reshape(-1)
+
+
+def consistently_wound(
+    vertices: Float[np.ndarray, "v 3"], faces: Int[np.ndarray, "f 3"]
+) -> tuple[Bool[np.ndarray, " f"], bool]:
+    """Find the faces to flip so that neighbours agree, and whether the surface is open.
+
+    A connected patch has two orientations. An open patch takes the one that flips less area, a closed patch the one
+    that encloses positive volume. A patch that cannot be oriented (Möbius) is left unchanged.
+    """
+    from scipy.sparse import coo_matrix  # imported here, since it takes half a second and `read_parts` does not need it
+    from scipy.sparse.csgraph import connected_components
+
+    count = len(faces)
+    (a, b), agrees, has_border = _neighbours(faces)
+    # graph of orientations: node f is face f unchanged, node f + count is face f flipped
+    other = np.where(agrees, 0, count)
+    rows = np.r_[a, a + count]
+    columns = np.r_[b + other, b + count - other]
+    graph = coo_matrix((np.ones(len(rows), bool), (rows, columns)), shape=(2 * count, 2 * count))
+    _, part = connected_components(graph, directed=False)
+    as_it_is = part[:count]
+    flipped = part[count:]
+    # area, or signed volume, that each component keeps less that which it flips
+    area = area_vectors(vertices, faces)
+    volume = np.einsum("fd,fd->f", vertices[faces].mean(axis=1) - vertices[faces[:, 0]].mean(axis=0), area)
+    gain = np.linalg.norm(area, axis=1) if has_border else volume
+    total = np.bincount(as_it_is, gain, part.max() + 1) - np.bincount(flipped, gain, part.max() + 1)
+    return (total[as_it_is] < 0) & (as_it_is != flipped), has_border
+
+
+def _neighbours(faces: Int[np.ndarray, "f 3"]) -> tuple[Int[np.ndarray, "2 n"], Bool[np.ndarray, " n"], bool]:
+    """Return pairs of faces across shared edges, whether each pair agrees in winding, and whether any edge is a border.
+
+    An edge is shared if it has exactly two faces, and a border if it has one.
+    """
+    start = faces.reshape(-1)  # half-edges, sorted by edge
+    end = np.roll(faces, -1, axis=1).reshape(-1)
+    face = np.repeat(np.arange(len(faces)), 3)
+    pair = np.stack([np.minimum(start, end), np.maximum(start, end)], axis=1)
+    order = np.lexsort((face, pair[:, 1], pair[:, 0]))
+    pair = pair[order]
+    forward = (start < end)[order]
+    face = face[order]
+    starts = np.flatnonzero(np.r_[True, (pair[1:] != pair[:-1]).any(axis=1)])
+    counts = np.diff(np.r_[starts, len(pair)])
+    first = starts[counts == 2]
+    return np.stack([face[first], face[first + 1]]), forward[first] != forward[first + 1], bool((counts == 1).any())
+
+
+def corner_normals(
+    vertices: Float[np.ndarray, "v 3"], faces: Int[np.ndarray, "f 3"], crease_deg: float
+) -> Float[np.ndarray, "f 3 3"]:
+    """Return the unit normal at each corner of each face.
+
+    It is angle-weighted over those faces of its vertex whose normals are within `crease_deg` of its own face's.
+
+    Args:
+        vertices: Vertices.
+        faces: Triangles.
+        crease_deg: Greatest angle between faces that are smoothed, degrees.
+
+    Returns:
+        Normals.
+    """
+    area = area_vectors(vertices, faces)
+    normal = area / np.maximum(np.linalg.norm(area, axis=1, keepdims=True), 1e-300)
+    corner = vertices[faces]
+    onward = np.roll(corner, -1, axis=1) - corner
+    backward = np.roll(corner, 1, axis=1) - corner
+    # angle of each corner, the weight of its face
+    angle = np.arctan2(np.linalg.norm(np.cross(onward, backward), axis=-1), np.einsum("fkd,fkd->fk", onward, backward))
+    weight = angle.reshape(-1)
+    order = np.argsort(faces.reshape(-1), kind="stable")  # corners, grouped by vertex
+    vertex = faces.reshape(-1)[order]
+    starts = np.flatnonzero(np.r_[True, vertex[1:] != vertex[:-1]])
+    counts = np.diff(np.r_[starts, len(vertex)])
+    result = np.empty((len(order), 3))
+    threshold = np.cos(np.deg2rad(crease_deg))
+    # for each corner, the weighted sum over the corners at its vertex within the crease angle
+    for group in _chunks(counts.astype(np.int64) ** 2):
+        mine, theirs = _pairs(starts[group], counts[group])
+        own = normal[order[mine] // 3]
+        other_normals = normal[order[theirs] // 3]
+        share = weight[order[theirs]] * (np.einsum("pd,pd->p", own, other_normals) >= threshold - 1e-12)
+        low = starts[group][0]
+        high = starts[group][-1] + counts[group][-1]
+        summed = [np.bincount(mine - low, share * other_normals[:, d], high - low) for d in range(3)]
+        result[order[low:high]] = np.stack(summed, axis=1)
+    length = np.linalg.norm(result, axis=1, keepdims=True)
+    own = np.repeat(normal, 3, axis=0)
+    return np.where(length > 1e-12, result / np.maximum(length, 1e-300), own).reshape(-1, 3, 3)
+
+
+def _pairs(starts: np.ndarray, counts: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return all ordered pairs of positions within each run [start, start + count)."""
+    squares = counts**2
+    run = np.repeat(np.arange(len(counts)), squares)
+    within = np.arange(squares.sum()) - np.repeat(np.cumsum(squares) - squares, squares)
+    return starts[run] + within // counts[run], starts[run] + within % counts[run]
+
+
+def _chunks(sizes: np.ndarray) -> Iterator[slice]:
+    """Yield slices of consecutive items whose sizes sum to about PAIRS_AT_ONCE."""
+    block = np.cumsum(sizes) // PAIRS_AT_ONCE
+    edges = np.flatnonzero(np.r_[True, block[1:] != block[:-1]])
+    for low, high in zip(edges, np.r_[edges[1:], len(sizes)]):
+        yield slice(int(low), int(high))

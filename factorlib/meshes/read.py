@@ -15,8 +15,7 @@ import numpy as np
 from factorlib.dataset.schema import MeshEntry
 from factorlib.errors import InputError, did_you_mean
 from factorlib.meshes.gltf_mesh import read_gltf
-from factorlib.meshes.mesh import Mesh, area_vectors
-from factorlib.meshes.normals import consistently_wound, corner_normals, welded
+from factorlib.meshes.mesh import Mesh, area_vectors, consistently_wound, corner_normals, welded
 from factorlib.meshes.obj import read_obj
 from factorlib.meshes.ply_stl_off import read_off, read_ply, read_stl
 from factorlib.meshes.subdivision import subdivided_mesh

@@ -12,8 +12,7 @@ from jaxtyping import Float, Int
 from scipy.sparse import csr_array, diags_array, eye_array
 from scipy.sparse.linalg import spsolve
 
-from factorlib.meshes.mesh import Mesh, area_vectors
-from factorlib.meshes.normals import welded
+from factorlib.meshes.mesh import Mesh, area_vectors, welded
 
 LONGEST = 0.04  # longest edge after subdivision, in units of the mesh's extent
 LEVEL = 1e-3  # weight that keeps the mean displacement at zero, relative to the gradient's

@@ -19,8 +19,7 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
-from factorlib.align.silhouette import Silhouette, labelled_iou
-from factorlib.align.target import bounding_box, make_target
+from factorlib.align.silhouette import Silhouette, bounding_box, labelled_iou, make_target
 from factorlib.errors import InputError
 from factorlib.geometry.raster import Caster, rasterise
 from factorlib.meshes.mesh import area_vectors

@@ -23,9 +23,9 @@ from scipy.interpolate import UnivariateSpline
 from scipy.ndimage import binary_fill_holes
 from scipy.optimize import minimize
 
+from factorlib.align.refine import pose_state
 from factorlib.align.search import SearchOptions, estimate_pose, refine_near
-from factorlib.align.state import pose_state
-from factorlib.align.target import make_target
+from factorlib.align.silhouette import make_target
 from factorlib.errors import InputError
 from factorlib.geometry.camera import Camera, Pose
 from factorlib.geometry.raster import Caster

@@ -8,8 +8,7 @@ import numpy as np
 from jaxtyping import Float, Int
 from scipy.ndimage import distance_transform_edt, map_coordinates
 
-from factorlib.align.silhouette import ObjectView, Silhouette
-from factorlib.align.target import bounding_box
+from factorlib.align.silhouette import ObjectView, Silhouette, bounding_box
 from factorlib.geometry.camera import Camera, Pose
 from factorlib.meshes.mesh import Mesh
 from factorlib.wholefile import write_text

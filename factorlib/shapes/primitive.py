@@ -19,10 +19,9 @@ import numpy as np
 import trimesh
 from jaxtyping import Float
 
-from factorlib.align.refine import DAMPING, normal_equations, render
+from factorlib.align.refine import DAMPING, PoseState, normal_equations, render
 from factorlib.align.search import SearchOptions, estimate_pose
-from factorlib.align.state import PoseState
-from factorlib.align.target import Target, make_target
+from factorlib.align.silhouette import Target, make_target
 from factorlib.geometry.raster import Caster
 from factorlib.meshes.mesh import Mesh, scaled
 from factorlib.shapes.outline import Outline, Triangles

@@ -6,22 +6,20 @@ import trimesh
 from scipy.spatial.transform import Rotation
 
 from factorlib.align import silhouette as masks
-from factorlib.align.coarse import is_cut
-from factorlib.align.confidence import confidence
-from factorlib.align.pairing import HIDDEN, match_parts
+from factorlib.align.coarse import HIDDEN, is_cut, match_parts
 from factorlib.align.photo_alignment import Keypoints, KnownFocal, ObjectToAlign, align_photo
-from factorlib.align.reliability import find_doubts, measure_reliability, normal_stderr_deg
+from factorlib.align.refine import pose_state
+from factorlib.align.reliability import confidence, find_doubts, measure_reliability, normal_stderr_deg
 from factorlib.align.search import SearchOptions, estimate_pose
 from factorlib.align.silhouette import (
     UNKNOWN,
     ObjectView,
     Silhouette,
     label_agreement,
+    make_target,
     silhouette_iou,
     with_prior_focal,
 )
-from factorlib.align.state import pose_state
-from factorlib.align.target import make_target
 from factorlib.geometry.camera import Camera, Pose, angle_between
 from factorlib.geometry.raster import Caster, rasterise
 from factorlib.meshes.mesh import Mesh

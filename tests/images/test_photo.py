@@ -8,11 +8,10 @@ import pytest
 from PIL import Image
 from PIL.TiffImagePlugin import IFDRational
 
-from factorlib.images.boxes import box_mean
 from factorlib.images.exif import FILM_DIAGONAL
 from factorlib.images.exr import read_exr
 from factorlib.images.light_map import read_light_map
-from factorlib.images.photo import check_bright, decoded, open_photo, read_photo
+from factorlib.images.photo import box_mean, check_bright, decoded, open_photo, read_photo
 from factorlib.images.tone import srgb_decode, srgb_encode
 from tests.images.made_dng import BLACK, LONG, RATIONAL, SHORT, WHITE, write_dng
 from tests.refusal import refusal

@@ -7,9 +7,8 @@ from hypothesis import strategies as st
 from scipy.ndimage import gaussian_filter
 
 from factorlib.dataset.schema import Intrinsics
-from factorlib.images.boxes import box_mean
 from factorlib.images.lens import Undistorted, radial_lens
-from factorlib.images.photo import Photo
+from factorlib.images.photo import Photo, box_mean
 from factorlib.images.picture import read_png, write_png
 from factorlib.images.processing import HALO, halo
 from factorlib.images.tone import by_log_exponent, curve, gamma_decode, inverse, slope, srgb_decode, srgb_encode

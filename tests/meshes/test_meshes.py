@@ -7,8 +7,7 @@ import pytest
 import trimesh
 from scipy.spatial.transform import Rotation
 
-from factorlib.meshes.mesh import Mesh, area_vectors
-from factorlib.meshes.normals import consistently_wound, corner_normals
+from factorlib.meshes.mesh import Mesh, area_vectors, consistently_wound, corner_normals
 from factorlib.meshes.ply_stl_off import submesh, write_ply
 from factorlib.meshes.read import merged_normals, read_mesh, usable
 from factorlib.meshes.subdivision import SubdividedMesh, subdivide, subdivided_mesh

@@ -12,8 +12,8 @@ import pytest
 from PIL import Image
 
 from factorlib.dataset.schema import ObjectMask, PhotoSlice
-from factorlib.images.boxes import box_majority
 from factorlib.images.exr import read_exr, write_rgb_exr
+from factorlib.images.photo import box_majority
 from factorlib.images.tone import srgb_encode
 from factorlib.stage import Inputs
 from stages import masks
