@@ -1,4 +1,4 @@
-"""Reliability of a pose, from the mask alone, the reasons for doubt in words, and the confidence in each pixel's normal.
+"""Reliability of a pose from the mask alone, reasons for doubt in words, and confidence in each pixel's normal.
 
 contour_error      Overlap tells little of a big round object and much of a thin one; distance between contours is fair
                    to both. It is the median over all contour points, of mesh and mask, so that parts that only one of

@@ -6,17 +6,16 @@ from typing import Any
 
 import msgspec
 import numpy as np
-import OpenImageIO as oiio
 from jaxtyping import Bool, Float, Int
 
 from factorlib.dataset.schema import LEFT_OUT
 from factorlib.geometry.camera import Camera, Pose
 from factorlib.geometry.raster import Maps, rasterise
 from factorlib.images.exif import FILM_DIAGONAL
-from factorlib.images.exr import FIXED_DATE, LAT_LONG, write_exr, write_image, write_rgb_exr
+from factorlib.images.exr import FIXED_DATE, LAT_LONG, encoded, write_exr, write_rgb_exr
 from factorlib.images.tone import srgb_encode
 from factorlib.meshes.mesh import Mesh
-from factorlib.wholefile import write_text
+from factorlib.wholefile import write_bytes, write_text
 from factorlib.yamlfile import yaml_text
 
 Image = Float[np.ndarray, "h w 3"]
@@ -35,14 +34,14 @@ def write_photo(path: Path, radiance: Image, focal_35mm: float | None = None, qu
     """
     if path.suffix == ".exr":
         return write_rgb_exr(path, radiance)
-    encoded = srgb_encode(np.clip(radiance, 0, 1))
+    values = srgb_encode(np.clip(radiance, 0, 1))
     kind, top = (np.uint16, 65535) if path.suffix == ".png" else (np.uint8, 255)
     attributes: dict[str, Any] = {"DateTime": FIXED_DATE, "Software": "factorlib", "oiio:ColorSpace": "sRGB"}
     if path.suffix == ".jpg":
         attributes |= {"Compression": f"jpeg:{quality}", "jpeg:subsampling": "4:4:4"}
     if focal_35mm is not None:
         attributes["Exif:FocalLengthIn35mmFilm"] = round(focal_35mm)
-    write_codes(path, (encoded * top + 0.5).astype(kind), attributes)
+    write_bytes(path, encoded(path, (values * top + 0.5).astype(kind), attributes))
 
 
 def focal_px_of_35mm(focal_35mm: float, width: int, height: int) -> float:
@@ -61,22 +60,7 @@ def focal_px_of_35mm(focal_35mm: float, width: int, height: int) -> float:
 
 def write_labels(path: Path, labels: Int[np.ndarray, "h w"]) -> None:
     """Write labels as a one-channel 8-bit PNG: 0 background, k the k-th material, 255 left out."""
-    write_codes(path, labels.astype(np.uint8)[..., None], {})
-
-
-def write_codes(path: Path, codes: np.ndarray, attributes: dict[str, Any]) -> None:
-    """Write integer pixels [h, w, c] by OpenImageIO.
-
-    Args:
-        path: File to write.
-        codes: Pixels of 8 or 16 bits.
-        attributes: Attributes of the file.
-    """
-    height, width, channels = codes.shape
-    spec = oiio.ImageSpec(width, height, channels, oiio.UINT16 if codes.dtype == np.uint16 else oiio.UINT8)
-    for name, value in attributes.items():
-        spec.attribute(name, value)
-    write_image(path, spec, codes)
+    write_bytes(path, encoded(path, labels.astype(np.uint8)[..., None]))
 
 
 def write_light(path: Path, lat_long: Image) -> None:

@@ -172,43 +172,22 @@ def _draw_surface(
     view = maps.view[pixels]
     flat = face_normals(mesh, face)
     facing = np.sum((flat @ rotation.T) * view, axis=1)
-    # shading normals on the viewer's side of the face
-    side = np.where(facing < 0, -1.0, 1.0)[:, None]
-    smooth = unit(smooth_normals(mesh, face, hits.uv[pixels]) @ rotation.T) * side
-    maps.normal[pixels], maps.bent[pixels] = toward_viewer(smooth, view)
+    # normals of the corners, interpolated by barycentric coordinates, on the viewer's side of the face
+    u, v = hits.uv[pixels].T
+    corner_normals = mesh.normals[mesh.faces[face]]
+    smooth = np.einsum("nk,nkd->nd", np.stack([1 - u - v, u, v], axis=1), corner_normals)
+    normal = unit(smooth @ rotation.T) * np.where(facing < 0, -1.0, 1.0)[:, None]
+    # normals with n·v < MIN_COSINE are bent to n·v = MIN_COSINE, in the plane of normal and view
+    cosine = np.sum(normal * view, axis=1)
+    limit = np.sqrt(1 - MIN_COSINE**2) * unit(normal - cosine[:, None] * view) + MIN_COSINE * view
+    maps.bent[pixels] = cosine < MIN_COSINE
+    maps.normal[pixels] = np.where((cosine < MIN_COSINE)[:, None], limit, normal)
     maps.label[pixels] = mesh.face_label[face]
     maps.back[pixels] = facing < 0
     maps.edge[pixels] = np.abs(facing)
     # largest angle between the face's normal and those of its corners
-    cosines = np.abs(np.einsum("nkd,nd->nk", mesh.normals[mesh.faces[face]], flat))
+    cosines = np.abs(np.einsum("nkd,nd->nk", corner_normals, flat))
     maps.facet[pixels] = np.arccos(np.minimum(cosines.min(1), 1.0))
-
-
-def toward_viewer(normal: Vectors, view: Vectors) -> tuple[Vectors, Bool[np.ndarray, " n"]]:
-    """Bend normals with n·v < MIN_COSINE to n·v = MIN_COSINE, in the plane of normal and view.
-
-    Returns:
-        The normals, and a mask of those that were bent.
-    """
-    cosine = np.sum(normal * view, axis=1)
-    bent = cosine < MIN_COSINE
-    limit = np.sqrt(1 - MIN_COSINE**2) * unit(normal - cosine[:, None] * view) + MIN_COSINE * view
-    return np.where(bent[:, None], limit, normal), bent
-
-
-def smooth_normals(mesh: Mesh, face: Int[np.ndarray, " n"], uv: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, "n 3"]:
-    """Interpolate the corners' normals of the triangles `face` at barycentric uv.
-
-    Args:
-        mesh: The mesh.
-        face: Indices of triangles.
-        uv: Barycentric coordinates of the second and third corner.
-
-    Returns:
-        Normals in the object frame, not of unit length.
-    """
-    u, v = uv.T
-    return np.einsum("nk,nkd->nd", np.stack([1 - u - v, u, v], axis=1), mesh.normals[mesh.faces[face]])
 
 
 def face_normals(mesh: Mesh, face: Int[np.ndarray, " n"]) -> Float[np.ndarray, "n 3"]:

@@ -47,7 +47,6 @@ def read_exif(source: bytes | str | Path | None) -> dict[str, float | int]:
     """
     exif = Image.Exif()
     values: dict[str, float | int] = {}
-    numbers = {}
     with (
         suppress(*DAMAGED),
         warnings.catch_warnings(action="ignore"),  # Pillow warns of damaged tags
@@ -65,8 +64,7 @@ def read_exif(source: bytes | str | Path | None) -> dict[str, float | int]:
             except (TypeError, ValueError, IndexError, ZeroDivisionError):
                 continue
             if math.isfinite(number):
-                numbers[NAMES[tag]] = round(number) if tag in WHOLE else number
-        values |= numbers
+                values[NAMES[tag]] = round(number) if tag in WHOLE else number
     return values
 
 

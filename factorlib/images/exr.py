@@ -5,10 +5,9 @@ is deleted, and neither `close` nor the deletion reports a full disk. So it enco
 disk by a writer that does report it.
 """
 
-from __future__ import annotations
-
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import OpenImageIO as oiio
@@ -20,30 +19,23 @@ from factorlib.wholefile import bytes_of, write_bytes
 
 FIXED_DATE = "2000:01:01 00:00:00"
 LAT_LONG = {"textureformat": "LatLong Environment"}  # OpenImageIO's name of the OpenEXR attribute `envmap`
+FORMATS = {"uint8": oiio.UINT8, "uint16": oiio.UINT16, "float32": oiio.FLOAT}
 Channels = Mapping[str, Float[np.ndarray, "h w"]]
 
 
-def write_image(path: str | Path, spec: oiio.ImageSpec, pixels: np.ndarray) -> None:
-    """Write `pixels` [h, w, c] in the format of the suffix of `path`.
-
-    Args:
-        path: File to write.
-        spec: Size, channels and attributes.
-        pixels: Pixels.
-
-    Raises:
-        OSError: If encoding or writing fails.
-    """
-    write_bytes(path, encoded(path, spec, pixels))
-
-
-def encoded(name: str | Path, spec: oiio.ImageSpec, pixels: np.ndarray) -> bytes:
+def encoded(
+    name: str | Path,
+    pixels: np.ndarray,
+    attributes: Mapping[str, Any] | None = None,
+    channels: Sequence[str] | None = None,
+) -> bytes:
     """Encode `pixels` [h, w, c] as an image file in the format of the suffix of `name`.
 
     Args:
         name: Name of the file.
-        spec: Size, channels and attributes.
-        pixels: Pixels.
+        pixels: Pixels: 8- or 16-bit integers, or float32.
+        attributes: Attributes of the file.
+        channels: Names of the channels; None for those of the format.
 
     Returns:
         The bytes of the file.
@@ -51,6 +43,12 @@ def encoded(name: str | Path, spec: oiio.ImageSpec, pixels: np.ndarray) -> bytes
     Raises:
         OSError: If encoding fails.
     """
+    height, width, count = pixels.shape
+    spec = oiio.ImageSpec(width, height, count, FORMATS[pixels.dtype.name])
+    if channels is not None:
+        spec.channelnames = list(channels)
+    for key, value in (attributes or {}).items():
+        spec.attribute(key, value)
 
     def encode(memory: str) -> None:
         """Write the image to the path `memory`, a file in memory."""
@@ -76,14 +74,9 @@ def write_exr(path: str | Path, channels: Channels, attributes: Mapping[str, str
         channels: Channels by name.
         attributes: Further attributes.
     """
-    names = list(channels)
-    pixels = np.stack([np.asarray(channels[n], dtype=np.float32) for n in names], axis=-1)
-    spec = oiio.ImageSpec(pixels.shape[1], pixels.shape[0], len(names), oiio.FLOAT)
-    spec.channelnames = names
+    pixels = np.stack([np.asarray(values, dtype=np.float32) for values in channels.values()], axis=-1)
     fixed = {"compression": "zip", "DateTime": FIXED_DATE, "Software": "factorlib"}
-    for name, value in {**fixed, **(attributes or {})}.items():
-        spec.attribute(name, value)
-    write_image(path, spec, pixels)
+    write_bytes(path, encoded(path, pixels, {**fixed, **(attributes or {})}, list(channels)))
 
 
 def write_rgb_exr(path: str | Path, radiance: Float[np.ndarray, "h w 3"], attributes: Mapping | None = None) -> None:
@@ -102,8 +95,7 @@ def write_hdr(path: str | Path, radiance: Float[np.ndarray, "h w 3"]) -> None:
 
     Other programs read a file without alpha and without a layout attribute as a lat-long map.
     """
-    pixels = np.asarray(radiance, dtype=np.float32)
-    write_image(path, oiio.ImageSpec(pixels.shape[1], pixels.shape[0], 3, oiio.FLOAT), pixels)
+    write_bytes(path, encoded(path, np.asarray(radiance, dtype=np.float32)))
 
 
 def read_exr(path: str | Path) -> dict[str, Float[np.ndarray, "h w"]]:

@@ -27,7 +27,7 @@ from factorlib.errors import InputError
 from factorlib.images.camera_files import is_heif, is_raw, open_heif, open_raw
 from factorlib.images.exif import exif_exposure, exif_focal_px
 from factorlib.images.scanlines import OpenPhoto, open_scanlines
-from factorlib.images.tone import decoder
+from factorlib.images.tone import DECODERS
 from factorlib.reading import reading
 
 READ_AT_ONCE = 1 << 21  # number of pixels that are in memory as floats
@@ -168,7 +168,7 @@ def decoded(
 
 def _linear(codes: Shaped[np.ndarray, "r w 3"], white: int | None, encoding: str) -> Float[np.ndarray, "r w 3"]:
     """Decode codes to linear values: computed for floats and wide codes, looked up for codes of up to 16 bits."""
-    decode = decoder(encoding)
+    decode = DECODERS[encoding]
     if white is None:
         with np.errstate(over="ignore", invalid="ignore"):
             return np.array(decode(codes.astype(np.float32)), dtype=np.float32)

@@ -11,7 +11,6 @@ from fractions import Fraction
 from pathlib import Path
 
 import numpy as np
-import OpenImageIO as oiio
 from jaxtyping import Bool, Float, UInt8
 from PIL import Image
 from PIL.ImageColor import getrgb
@@ -85,10 +84,8 @@ def write_png(path: str | Path, pixels: UInt8[np.ndarray, "h w c"]) -> None:
 def png_bytes(pixels: UInt8[np.ndarray, "h w c"]) -> bytes:
     """Encode an 8-bit PNG of 1, 3 or 4 channels (alpha not premultiplied), without date or program name."""
     pixels = np.asarray(pixels, dtype=np.uint8)
-    spec = oiio.ImageSpec(pixels.shape[1], pixels.shape[0], pixels.shape[2], oiio.UINT8)
-    spec.attribute("oiio:UnassociatedAlpha", 1)
-    spec.attribute("png:compressionLevel", 4)  # half the time of the default, 6, for 5 % more bytes
-    return encoded("picture.png", spec, pixels)
+    # compression level 4 takes half the time of the default, 6, for 5 % more bytes
+    return encoded("picture.png", pixels, {"oiio:UnassociatedAlpha": 1, "png:compressionLevel": 4})
 
 
 def read_png(path: str | Path) -> UInt8[np.ndarray, "h w c"]:

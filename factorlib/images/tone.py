@@ -103,8 +103,5 @@ def gamma_decode(encoded: Values) -> Values:
     return np.copysign(np.abs(encoded) ** 2.2, encoded)
 
 
-def decoder(encoding: str) -> Callable[[Values], Values]:
-    """Return the function from values of `encoding` (srgb, linear, gamma2.2) to linear ones."""
-    decoders: dict[str, Callable[[Values], Values]]
-    decoders = {"srgb": srgb_decode, "linear": np.asarray, "gamma2.2": gamma_decode}
-    return decoders[encoding]
+# functions from encoded values to linear ones, by encoding
+DECODERS: dict[str, Callable[[Values], Values]] = {"srgb": srgb_decode, "linear": np.asarray, "gamma2.2": gamma_decode}

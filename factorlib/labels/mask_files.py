@@ -231,23 +231,20 @@ def run_lengths(counts: list[int] | str, pixels: int) -> Int[np.ndarray, " n"]:
     >>> run_lengths([1, 2, 1], 4).tolist(), run_lengths("R47g1", 192).tolist()
     ([1, 2, 1], [130, 7, 55])
     """
-    if isinstance(counts, str):
-        codes = np.frombuffer(counts.encode("ascii"), np.uint8).astype(np.int64) - 48
-        ends = np.flatnonzero(codes & 32 == 0)
-        if ((codes < 0) | (codes >= 64)).any() or len(codes) != (ends[-1] + 1 if len(ends) else 0):
-            raise ValueError("it is no compressed RLE, or cut short")
-        # sum the 5-bit digits of each run, subtract for the sign, then undo the differences
-        begins = np.r_[0, ends[:-1] + 1][: len(ends)]
-        digits = ends - begins + 1
-        if digits.max(initial=0) > MOST_DIGITS:
-            raise ValueError("a run of its compressed RLE is longer than any picture")
-        place = np.arange(len(codes)) - np.repeat(begins, digits)
-        runs = np.add.reduceat((codes & 31) << 5 * place, begins) if len(ends) else codes
-        runs -= np.where(codes[ends] & 16, 1 << 5 * digits, 0)
-        runs[1::2] = np.cumsum(runs[1::2])
-        runs[2::2] = np.cumsum(runs[2::2])
-    else:
-        runs = np.array(counts, np.int64)
+    numbers = [] if isinstance(counts, str) else counts
+    value = shift = 0
+    for code in counts.encode("ascii") if isinstance(counts, str) else ():
+        if not 48 <= code < 112 or shift >= 5 * MOST_DIGITS:
+            raise ValueError("it is no compressed RLE, or a run is longer than any picture")
+        value |= (code - 48 & 31) << shift
+        shift += 5
+        if not code - 48 & 32:  # the last character of a run, whose highest bit is the sign
+            value -= (code - 48 & 16) << shift - 4
+            numbers.append(value + (numbers[-2] if len(numbers) > 2 else 0))
+            value = shift = 0
+    if shift:
+        raise ValueError("its compressed RLE is cut short")
+    runs = np.array(numbers, np.int64)
     if runs.min(initial=0) < 0 or runs.max(initial=0) > pixels or runs.sum() != pixels:
         raise ValueError(f"its runs do not fill {pixels} pixels")
     return runs

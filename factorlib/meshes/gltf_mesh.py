@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float
 
-from factorlib.dataset.gltf_header import CURE, GltfHeader, GltfNode, Primitive, buffer_path, read_header
+from factorlib.dataset.gltf_header import CURE, GltfHeader, Primitive, buffer_path, read_header
 from factorlib.errors import InputError
 from factorlib.meshes.triangle_soup import Limits, TriangleSoup, floats, no_normals, normals_at_corners
 from factorlib.reading import read_bytes
@@ -30,40 +30,32 @@ Part = tuple[Primitive, tuple[str, ...], Float[np.ndarray, "4 4"]]  # primitive,
 
 
 def read_gltf(path: Path, limits: Limits) -> TriangleSoup:
-    """Read a glTF or GLB file.
+    """Read a glTF or GLB file: check the sizes in its header, then decode the primitives and join them.
 
     Raises:
         InputError: If the file is malformed or too large.
         ValueError: If its nodes are no tree; other exceptions of trimesh are possible too.
     """
-    header = read_header(path, most_bytes=limits.bytes)
-    try:
-        return _read_parts(header, path, limits)
-    except (LookupError, AssertionError) as error:
-        raise InputError(
-            f"its header names a node, an array or a part of a buffer that the file does not have ({error!r})",
-            file=path,
-            cure=CURE,
-        ) from error
-
-
-def _read_parts(header: GltfHeader, path: Path, limits: Limits) -> TriangleSoup:
-    """Check the sizes in the header, then decode the primitives and join them."""
     from trimesh.exchange.gltf import load_glb, load_gltf
 
-    instances = [node.mesh for node in header.nodes if node.mesh is not None]
-    limits.check_parts(sum(len(header.meshes[mesh].primitives) for mesh in instances), path)
-    parts = _parts(header)
-    sizes = np.array([_size(primitive, header, path) for primitive, _, _ in parts], object).reshape(-1, 2)
-    vertices, triangles = sizes.sum(axis=0).tolist()
-    limits.check(vertices, triangles, path)
-    content = io.BytesIO(read_bytes(path, "glTF", most_bytes=limits.bytes))
+    header = read_header(path, most_bytes=limits.bytes)
     load = load_glb if path.suffix.lower() == ".glb" else load_gltf
-    with np.errstate(all="ignore"):  # values that are not finite are refused later
-        decoded = load(content, resolver=_BufferFiles(header, path, limits), skip_materials=True)["geometry"].values()
-        primitives = [primitive for mesh in header.meshes for primitive in mesh.primitives if primitive.mode in DECODED]
-        arrays = {id(primitive): array for primitive, array in zip(primitives, decoded, strict=True)}
-        return _joined([part for part, size in zip(parts, sizes) if size[1]], arrays, header)
+    try:
+        instances = [node.mesh for node in header.nodes if node.mesh is not None]
+        limits.check_parts(sum(len(header.meshes[mesh].primitives) for mesh in instances), path)
+        parts = _parts(header)
+        sizes = np.array([_size(primitive, header, path) for primitive, _, _ in parts], object).reshape(-1, 2)
+        vertices, triangles = sizes.sum(axis=0).tolist()
+        limits.check(vertices, triangles, path)
+        content = io.BytesIO(read_bytes(path, "glTF", most_bytes=limits.bytes))
+        with np.errstate(all="ignore"):  # values that are not finite are refused later
+            decoded = load(content, resolver=_BufferFiles(header, path, limits), skip_materials=True)["geometry"]
+            primitives = [each for mesh in header.meshes for each in mesh.primitives if each.mode in DECODED]
+            arrays = {id(each): array for each, array in zip(primitives, decoded.values(), strict=True)}
+            return _joined([part for part, size in zip(parts, sizes) if size[1]], arrays, header)
+    except (LookupError, AssertionError) as error:
+        fault = f"its header names a node, an array or a part of a buffer that the file does not have ({error!r})"
+        raise InputError(fault, file=path, cure=CURE) from error
 
 
 class _BufferFiles(dict[str, bytes]):
@@ -116,6 +108,8 @@ def _parts(header: GltfHeader) -> list[Part]:
 
 def _world_from_nodes(header: GltfHeader) -> dict[int, Float[np.ndarray, "4 4"]]:
     """Return world_from_node of every node of the scene; without scenes, of every node."""
+    from trimesh.transformations import quaternion_matrix
+
     if header.scenes:
         roots = header.scenes[header.scene or 0].nodes
     else:
@@ -125,30 +119,22 @@ def _world_from_nodes(header: GltfHeader) -> dict[int, Float[np.ndarray, "4 4"]]
     waiting = [(index, np.eye(4)) for index in roots]
     while waiting:
         index, world_from_parent = waiting.pop()
+        node = header.nodes[index]
         if index in places:
             raise ValueError(f"its node {index} is below two others, or below itself")
+        if not any(node.rotation):
+            raise ValueError("the rotation of a node is the quaternion 0 0 0 0")
         with np.errstate(all="ignore"):  # values that are not finite are refused with the vertices
-            places[index] = world_from_parent @ _parent_from_node(header.nodes[index])
-        waiting += [(child, places[index]) for child in header.nodes[index].children]
+            # parent_from_node: the node's matrix, by columns; or scale, then rotation (x y z w), then translation
+            if node.matrix is not None:
+                parent_from_node = np.array(node.matrix, float).reshape(4, 4).T
+            else:
+                parent_from_node = quaternion_matrix(np.roll(node.rotation, 1))
+                parent_from_node[:3, :3] *= node.scale
+                parent_from_node[:3, 3] = node.translation
+            places[index] = world_from_parent @ parent_from_node
+        waiting += [(child, places[index]) for child in node.children]
     return places
-
-
-def _parent_from_node(node: GltfNode) -> Float[np.ndarray, "4 4"]:
-    """Return parent_from_node.
-
-    It is the node's matrix (stored by columns), or scale, then rotation (quaternion x y z w), then translation.
-    """
-    from trimesh.transformations import quaternion_matrix
-
-    if node.matrix is not None:
-        return np.array(node.matrix, float).reshape(4, 4).T
-    if not any(node.rotation):
-        raise ValueError("the rotation of a node is the quaternion 0 0 0 0")
-    x, y, z, w = node.rotation
-    matrix = quaternion_matrix([w, x, y, z])
-    matrix[:3, :3] *= node.scale
-    matrix[:3, 3] = node.translation
-    return matrix
 
 
 def _size(primitive: Primitive, header: GltfHeader, path: Path) -> tuple[int, int]:

@@ -35,12 +35,10 @@ class _Tables:
             if len(words) < 3:
                 raise ValueError("three numbers are expected")
             self.coordinates[key].extend([float(word) for word in words[:3]])
-        elif key == "f":
-            self._read_face(words)
         elif key in self.names:
             self.names[key] = tuple(words) if key == "g" else (" ".join(words),)
-
-    def _read_face(self, words: list[str]) -> None:
+        if key != "f":
+            return
         vertices = len(self.coordinates["v"]) // 3
         normals = len(self.coordinates["vn"]) // 3
         corners = []
@@ -78,8 +76,7 @@ def read_obj(path: Path, content: bytes, limits: Limits) -> TriangleSoup:
     """
     tables = _Tables()
     number = 0
-    next_check = COUNTED_EVERY
-    for line in text_lines(CONTINUED.sub(b"\v", content) if b"\\" in content else content):
+    for count, line in enumerate(text_lines(CONTINUED.sub(b"\v", content) if b"\\" in content else content)):
         number += 1 + line.count("\v")
         key, *words = line.split("#", 1)[0].split() or [""]
         try:
@@ -90,8 +87,7 @@ def read_obj(path: Path, content: bytes, limits: Limits) -> TriangleSoup:
                 file=path,
                 cure="correct the line, or export the mesh again, as OBJ",
             ) from error
-        if number >= next_check:
-            next_check = number + COUNTED_EVERY
+        if count % COUNTED_EVERY == 0:
             limits.check(len(tables.coordinates["v"]) // 3, len(tables.part), path)
     limits.check(len(tables.coordinates["v"]) // 3, len(tables.part), path)
     return tables.soup()

@@ -125,12 +125,14 @@ class SubdividedMesh(msgspec.Struct, frozen=True):
         values = np.stack(slopes, axis=1)  # [triangle, corner, axis]
         return [csr_array((values[..., a].reshape(-1), (rows, self.faces.reshape(-1))), shape) for a in range(3)]
 
-    def at_nodes(self) -> csr_array:
-        """Return the operator that averages over the triangles about each node, weighted by area, [v, f]."""
+    def turn_of(self, displacement: Float[np.ndarray, " v"]) -> Float[np.ndarray, "v 3"]:
+        """Return −∇d at nodes, the change of normals by a displacement d in units of the extent."""
+        # operator that averages over the triangles about each node, weighted by area, [v, f]
         count = len(self.faces)
         places = self.faces.reshape(-1), np.repeat(np.arange(count), 3)
         weight = csr_array((np.repeat(self.areas, 3), places), (self.nodes, count))
-        return csr_array(diags_array(1 / np.maximum(np.asarray(weight.sum(1)).reshape(-1), 1e-300)) @ weight)
+        mean = csr_array(diags_array(1 / np.maximum(np.asarray(weight.sum(1)).reshape(-1), 1e-300)) @ weight)
+        return -np.stack([mean @ (slope @ displacement) for slope in self.gradients()], axis=1)
 
     def displacement(self, turn: Float[np.ndarray, "v 3"], seen: Float[np.ndarray, " v"]) -> Float[np.ndarray, " v"]:
         """Fit the displacement along the normals whose normals n' = n − ∇d are nearest to the given ones.
@@ -147,11 +149,6 @@ class SubdividedMesh(msgspec.Struct, frozen=True):
         system = system + LEVEL * areas.mean() * eye_array(self.nodes)
         right = -sum(slope.T @ (weight * wanted[:, a]) for a, slope in enumerate(slopes))
         return spsolve(system.tocsc(), right)
-
-    def turn_of(self, displacement: Float[np.ndarray, " v"]) -> Float[np.ndarray, "v 3"]:
-        """Return −∇d at nodes, the change of normals by a displacement d in units of the extent."""
-        mean = self.at_nodes()
-        return -np.stack([mean @ (slope @ displacement) for slope in self.gradients()], axis=1)
 
     def moved(self, displacement: Float[np.ndarray, " v"]) -> Mesh:
         """Move the vertices along their nodes' normals, by a displacement in extents, and update the normals."""

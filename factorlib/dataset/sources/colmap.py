@@ -33,14 +33,12 @@ Line = TypeVar("Line", CameraLine, ImageLine)
 def read_colmap(path: str, refuse: Refusal) -> list[SourceImage]:
     """Read the registered images of the model in the dataset's folder `path`, sorted by name."""
     refuse.subfolder(KEY, path)
-    cameras_and_images = [
+    pairs = [
         (refuse.file_in(KEY, path, f"cameras{suffix}"), refuse.file_in(KEY, path, f"images{suffix}"))
         for suffix in (".bin", ".txt")
     ]
-    for camera_file, image_file in cameras_and_images:
-        if camera_file is not None and image_file is not None:
-            break
-    else:
+    camera_file, image_file = next((pair for pair in pairs if None not in pair), (None, None))
+    if camera_file is None or image_file is None:
         refuse(KEY, f"{path!r} is not readable as a COLMAP model (it has no cameras and images, .bin or .txt)", CURE)
     is_text = camera_file.suffix == ".txt"
     with reading("a COLMAP model", camera_file, KEY, CURE):

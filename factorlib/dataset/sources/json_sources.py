@@ -73,10 +73,12 @@ def read_transforms(path: str, refuse: Refusal) -> list[SourceImage]:
     images = []
     for index, frame in enumerate(content.frames):
         key = f"frames[{index}]"
-        names = FrameCamera.__struct_fields__
-        frame_values = {name: getattr(frame, name) for name in names}
+        shared = msgspec.structs.asdict(content)
         lens = FrameCamera(
-            **{name: getattr(content, name) if frame_values[name] is None else frame_values[name] for name in names}
+            **{
+                name: shared[name] if (value := getattr(frame, name)) is None else value
+                for name in FrameCamera.__struct_fields__
+            }
         )
         camera, size = _camera(key, lens, refuse)
         centred = lens.cx is None or lens.cy is None
