@@ -117,9 +117,8 @@ def new_dataset(target: Path, photos: Path, masks: Path | None, meshes: Path | N
     ]
     spec: dict = {"format": 1, "materials": labelled.materials or [UNKNOWN]}
     if not entries:
-        several = {"parts": {name: name for name in labelled.materials}}
-        single = {"material": spec["materials"][0]}
-        entries = {HULL: {"hull": True, **(several if len(labelled.materials) > 1 else single)}}
+        parts = {name: name for name in labelled.materials}
+        entries = {HULL: {"hull": True} | ({"parts": parts} if len(parts) > 1 else {"material": spec["materials"][0]})}
         spec["cameras"] = {"sfm": True}
         visible = {photo: [HULL] for photo in images}
         missing.append(NO_MESH)
