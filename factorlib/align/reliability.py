@@ -149,7 +149,7 @@ def measure_reliability(obj: ObjectToAlign, alignment: PhotoAlignment, number: i
     return Reliability(
         contour_error(caster, target, estimate.state),
         normal_stderr_deg(caster, target, estimate.state),
-        mirrored_score(caster, view) if may_be_mirrored else None,
+        estimate_pose(caster, view.mirrored(), QUICK).score if may_be_mirrored else None,
     )
 
 
@@ -189,11 +189,6 @@ def normal_stderr_deg(caster: Caster, target: Target, state: PoseState) -> float
         moved = state.moved(np.append(move, np.zeros(7 - free)))
         angles.append(normal_difference(unmoved, render_maps(caster, target, moved)))
     return float(np.sqrt(np.sum(np.square(angles))))
-
-
-def mirrored_score(caster: Caster, view: ObjectView) -> float:
-    """Return the best score for the photo with left and right exchanged, a labelled IoU."""
-    return estimate_pose(caster, view.mirrored(), QUICK).score
 
 
 def confidence(maps: Maps, silhouette: Silhouette) -> Float[np.ndarray, "h w"]:

@@ -137,9 +137,17 @@ def consistently_wound(
     from scipy.sparse.csgraph import connected_components
 
     count = len(faces)
-    (a, b), agrees, has_border = _neighbours(faces)
+    # pairs of faces a, b across the edges that have exactly two; an edge of one face is a border
+    ends = np.stack([faces, np.roll(faces, -1, axis=1)], axis=-1).reshape(-1, 2)  # half-edges, three a face
+    edges = np.sort(ends, axis=1) @ [len(vertices), 1]  # one number an edge
+    _, edge, counts = np.unique(edges, return_inverse=True, return_counts=True)
+    last = np.cumsum(counts)[counts == 2] - 1
+    first, second = np.argsort(edge, kind="stable")[np.stack([last - 1, last])]
+    a = first // 3
+    b = second // 3
+    has_border = bool((counts == 1).any())
     # graph of orientations: node f is face f unchanged, node f + count is face f flipped
-    other = np.where(agrees, 0, count)
+    other = np.where(ends[first, 0] != ends[second, 0], 0, count)  # they agree if they run in opposite directions
     rows = np.r_[a, a + count]
     columns = np.r_[b + other, b + count - other]
     graph = coo_matrix((np.ones(len(rows), bool), (rows, columns)), shape=(2 * count, 2 * count))
@@ -152,25 +160,6 @@ def consistently_wound(
     gain = np.linalg.norm(area, axis=1) if has_border else volume
     total = np.bincount(as_it_is, gain, part.max() + 1) - np.bincount(flipped, gain, part.max() + 1)
     return (total[as_it_is] < 0) & (as_it_is != flipped), has_border
-
-
-def _neighbours(faces: Int[np.ndarray, "f 3"]) -> tuple[Int[np.ndarray, "2 n"], Bool[np.ndarray, " n"], bool]:
-    """Return pairs of faces across shared edges, whether each pair agrees in winding, and whether any edge is a border.
-
-    An edge is shared if it has exactly two faces, and a border if it has one.
-    """
-    start = faces.reshape(-1)  # half-edges, sorted by edge
-    end = np.roll(faces, -1, axis=1).reshape(-1)
-    face = np.repeat(np.arange(len(faces)), 3)
-    pair = np.stack([np.minimum(start, end), np.maximum(start, end)], axis=1)
-    order = np.lexsort((face, pair[:, 1], pair[:, 0]))
-    pair = pair[order]
-    forward = (start < end)[order]
-    face = face[order]
-    starts = np.flatnonzero(np.r_[True, (pair[1:] != pair[:-1]).any(axis=1)])
-    counts = np.diff(np.r_[starts, len(pair)])
-    first = starts[counts == 2]
-    return np.stack([face[first], face[first + 1]]), forward[first] != forward[first + 1], bool((counts == 1).any())
 
 
 def corner_normals(

@@ -73,23 +73,13 @@ def merge(observations: Observations, degrees: float) -> Observations:
 def groups(keys: Int[np.ndarray, "n k"]) -> tuple[Int[np.ndarray, " g"], Int[np.ndarray, " n"]]:
     """Group equal rows; give the first row of each group, in lexicographic order of groups, and the group of each row.
 
-    This is np.unique of rows, on one number a row.
+    This is np.unique of rows, but faster.
     """
-    # encode each row as one integer in mixed radix; compress the codes before they overflow
-    code = np.zeros(len(keys), np.int64)
-    size = 1
-    for column in keys.T - keys.min(0)[:, None]:
-        span = int(column.max()) + 1
-        if size * span >= 1 << 62:
-            code = np.unique(code, return_inverse=True)[1]
-            size = int(code.max()) + 1
-        code = code * span + column
-        size = size * span
-    order = np.argsort(code)
-    starts = np.flatnonzero(np.diff(code[order], prepend=-1))
+    order = np.lexsort(keys.T[::-1])
+    begins = np.r_[True, (np.diff(keys[order], axis=0) != 0).any(axis=1)]
     group = np.empty(len(keys), np.int64)
-    group[order] = np.repeat(np.arange(len(starts)), np.diff(starts, append=len(keys)))
-    return np.minimum.reduceat(order, starts), group
+    group[order] = np.cumsum(begins) - 1
+    return order[begins], group
 
 
 def sample(observations: Observations, most: int) -> Observations:
