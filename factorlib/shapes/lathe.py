@@ -14,7 +14,7 @@ again from all outlines. The axis is the shape's y.
 """
 
 import logging
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 
 import msgspec
 import numpy as np
@@ -133,7 +133,13 @@ def _without_holes(outline: Outline) -> Outline:
 
 def _plausible_bodies(outline: Outline) -> list[BodyView]:
     """Return at most TRIED bodies that explain the outline as well as the best one, evenly over their tilts."""
-    bodies = sorted(tilted_bodies(outline), key=lambda body: -body.overlap)
+    # the largest body that fits, for each mirror plane of the outline and each tilt in it
+    bodies = []
+    for normal in mirror_planes(outline):
+        ray = outline.camera.rays_through(outline.middle[None])[0]
+        ahead = ray - (ray @ normal) * normal
+        bodies += filter(None, (_body_at_tilt(outline, normal, ahead, float(tilt)) for tilt in TILTS_DEG))
+    bodies.sort(key=lambda body: -body.overlap)
     plausible = [body for body in bodies if body.overlap >= bodies[0].overlap - AS_GOOD]
     ordered = sorted(plausible, key=lambda body: body.tilt_deg)
     # indices spread evenly, without repetition
@@ -179,14 +185,6 @@ def _choose_tilt(
             max(alike),
         )
     return best.poses
-
-
-def tilted_bodies(outline: Outline) -> Iterator[BodyView]:
-    """Yield the largest body that fits, for each mirror plane of the outline and each tilt in it."""
-    for normal in mirror_planes(outline):
-        ray = outline.camera.rays_through(outline.middle[None])[0]
-        ahead = ray - (ray @ normal) * normal
-        yield from filter(None, (_body_at_tilt(outline, normal, ahead, float(tilt)) for tilt in TILTS_DEG))
 
 
 def _body_at_tilt(

@@ -133,7 +133,13 @@ def _map_photos(
         return {}, 0
     report(0.9, "hull of the masks")
     cameras = _read_cameras(model)
-    outlines = [objects_outline(name, photos[name], camera) for name, camera in sorted(cameras.items())]
+    # outlines of all objects together
+    outlines = []
+    for name, registered in sorted(cameras.items()):
+        photo = photos[name]
+        part = np.where(photo.left_out, UNKNOWN, photo.objects.astype(int))
+        camera = msgspec.structs.replace(photo.camera, focal=registered.focal)
+        outlines.append(Outline(name, part, camera, pose=registered.pose))
     if (overlap := hull_overlap([outline for outline in outlines if outline.is_visible])) < LEAST_AGREEMENT:
         words = "cameras by %d points do not move with the objects (hull against masks: %.2f)"
         log.info(words, model.num_points3D(), overlap)
@@ -277,19 +283,3 @@ def distorted_lenses(model: pycolmap.Reconstruction) -> dict[int, tuple[float, f
         if focal * abs(k) * radius**3 > LEAST_DISTORTION:
             distortions[image.camera_id] = (focal, k)
     return distortions
-
-
-def objects_outline(name: str, photo: PhotoForMotion, registered: RegisteredCamera) -> Outline:
-    """Return the outline of all objects together in a registered photo.
-
-    Args:
-        name: Name of the photo.
-        photo: The photo.
-        registered: Its estimated camera.
-
-    Returns:
-        The outline.
-    """
-    part = np.where(photo.left_out, UNKNOWN, photo.objects.astype(int))
-    camera = msgspec.structs.replace(photo.camera, focal=registered.focal)
-    return Outline(name, part, camera, pose=registered.pose)
