@@ -12,7 +12,7 @@ from collections.abc import Iterator
 from itertools import count
 from pathlib import Path
 from types import UnionType
-from typing import Annotated, Any, Literal, NamedTuple, NoReturn, TypeVar, Union, get_args, get_origin
+from typing import Annotated, Any, Literal, NoReturn, TypeVar, Union, get_args, get_origin
 
 import msgspec
 import yaml
@@ -22,6 +22,7 @@ from factorlib.reading import one_line, read_text
 
 T = TypeVar("T")
 Keys = tuple[str | int, ...]  # path to a value: mapping keys and list indices from the root
+Invalid = tuple[str, Any, list, Keys]  # msgspec's message, the invalid value, its possible types and the path to it
 # limits of a file, far above a dataset of ten thousand photos
 MOST_BYTES = 64_000_000
 MOST_VALUES = 2_000_000  # scalars, lists and maps; those that aliases repeat count each time
@@ -78,7 +79,7 @@ def parse_yaml(text: str, name: str | Path = "", most_values: int = MOST_VALUES)
     >>> parse_yaml("{a: 1e-3, b: no, c: [1, ~, true]}")
     {'a': 0.001, 'b': 'no', 'c': [1, None, True]}
     """
-    return _plain(_compose(text, name), name, most_values)
+    return _parse(text, name, most_values)[0]
 
 
 def _compose(text: str, name: str | Path) -> yaml.Node | None:
@@ -99,14 +100,20 @@ def _compose(text: str, name: str | Path) -> yaml.Node | None:
         raise InputError(f"not YAML: {fault}", file=f"{name}:{mark.line + 1}" if mark else name, cure=cure) from error
 
 
-def _plain(root: yaml.Node | None, name: str | Path, most_values: int) -> Any:
-    """Convert a node to dicts, lists and scalars; InputError for duplicate keys, tags, and what exceeds the limits."""
+def _parse(text: str, name: str | Path, most_values: int) -> tuple[Any, dict[Keys, int]]:
+    """Convert the text's one document to dicts, lists and scalars; return the line of each value, too, by its path.
+
+    InputError is raised for duplicate keys, tags, and what exceeds the limits.
+    """
     number = count(1)
+    lines: dict[Keys, int] = {}
 
     def refuse(fault: str, node: yaml.Node, keys: Keys, cure: str) -> NoReturn:
+        """Raise InputError for a node."""
         raise InputError(fault, file=f"{name}:{node.start_mark.line + 1}", key=key_path(keys), cure=cure)
 
     def plain(node: yaml.Node, keys: Keys) -> Any:
+        """Convert a node, and record the lines of what it holds."""
         if next(number) > most_values:
             cure = "is it the right file? an alias (*name) repeats all that its anchor (&name) holds"
             refuse(f"holds more than {most_values:,} values", node, (), cure)
@@ -114,23 +121,25 @@ def _plain(root: yaml.Node | None, name: str | Path, most_values: int) -> Any:
             refuse(f"lists and maps are nested more than {MOST_DEPTH} deep", node, keys[:4], TOO_DEEP)
         if node.tag:
             refuse(f"the tag {one_line(repr(node.tag))} is not known", node, keys, "delete the tag")
+        lines.setdefault(keys, node.start_mark.line + 1)
         if isinstance(node, yaml.ScalarNode):
             return node.value if node.style else _scalar(node.value)
         if isinstance(node, yaml.SequenceNode):
             return [plain(item, (*keys, index)) for index, item in enumerate(node.value)]
         values: dict[str, Any] = {}
-        lines: dict[str, int] = {}
         for word, item in node.value:
             if not isinstance(word, yaml.ScalarNode):
                 refuse("a key that is not a word", word, keys, "write key: value")
+            below = (*keys, word.value)
             if word.value in values:
-                fault = f"the key {one_line(repr(word.value))} stands here twice, first on line {lines[word.value]}"
-                refuse(fault, word, (*keys, word.value), "delete or rename one of them")
-            lines[word.value] = word.start_mark.line + 1
-            values[word.value] = plain(item, (*keys, word.value))
+                fault = f"the key {one_line(repr(word.value))} stands here twice, first on line {lines[below]}"
+                refuse(fault, word, below, "delete or rename one of them")
+            lines[below] = word.start_mark.line + 1
+            values[word.value] = plain(item, below)
         return values
 
-    return None if root is None else plain(root, ())
+    root = _compose(text, name)
+    return (None, {(): 1}) if root is None else (plain(root, ()), lines)
 
 
 def _scalar(text: str) -> Any:
@@ -175,27 +184,20 @@ def convert(value: Any, type_: type[T], name: str | Path, prefix: str = "", text
         return msgspec.convert(value, type_)
     except msgspec.ValidationError as error:
         invalid = _innermost(error, value, type_)
-    root = _compose(text, name) if text is not None else None
+    lines = _parse(text, name, MOST_VALUES)[1] if text is not None else {}
     faults = []
     for each in invalid:
         fault, cure, keys = _describe(each)
-        file = name if root is None else f"{name}:{_line_of(root, keys)}"
+        # line of the value, or of the last existing part of its path
+        line = next((lines[keys[:k]] for k in range(len(keys), -1, -1) if keys[:k] in lines), None)
+        file = f"{name}:{line}" if line else name
         key = ".".join(filter(None, (prefix, key_path(keys)))) or None
         faults.append(InputError(fault, file=file, key=key, cure=cure))
     raise_all(faults)
     raise AssertionError("a validation error has a fault")
 
 
-class _Invalid(NamedTuple):
-    """Invalid value, with msgspec's message, its possible types and the path to it."""
-
-    message: str
-    value: Any
-    types: list
-    keys: Keys
-
-
-def _describe(invalid: _Invalid) -> tuple[str, str, Keys]:
+def _describe(invalid: Invalid) -> tuple[str, str, Keys]:
     """Return the fault and the cure of an invalid value, and the path to the faulty key."""
     message, value, types, keys = invalid
     if field := _FIELD.search(message):
@@ -214,7 +216,7 @@ def _describe(invalid: _Invalid) -> tuple[str, str, Keys]:
     return f"{message[:1].lower()}{message[1:]}{shown}", cure, keys
 
 
-def _innermost(error: msgspec.ValidationError, value: Any, type_: Any, keys: Keys = ()) -> list[_Invalid]:
+def _innermost(error: msgspec.ValidationError, value: Any, type_: Any, keys: Keys = ()) -> list[Invalid]:
     """Return each innermost invalid value."""
     types = [type_]
     for each in types:  # grows by the members of unions and the types inside `Annotated`
@@ -226,7 +228,7 @@ def _innermost(error: msgspec.ValidationError, value: Any, type_: Any, keys: Key
             msgspec.convert(item, inner)
         except msgspec.ValidationError as below:
             inside += _innermost(below, item, inner, (*keys, key))
-    return inside or [_Invalid(str(error), value, types, keys)]
+    return inside or [(str(error), value, types, keys)]
 
 
 def _children(value: Any, type_: Any) -> Iterator[tuple[str | int, Any, Any]]:
@@ -246,19 +248,6 @@ def _children(value: Any, type_: Any) -> Iterator[tuple[str | int, Any, Any]]:
 
 def _is_struct(type_: Any) -> bool:
     return isinstance(type_, type) and issubclass(type_, msgspec.Struct)
-
-
-def _line_of(node: yaml.Node | None, keys: Keys) -> int:
-    """Return the line of the value at `keys` of a document, or of the last existing part of that path."""
-    line = node.start_mark.line if node else 0
-    for key in keys:
-        if isinstance(node, yaml.MappingNode):
-            word, node = next((pair for pair in node.value if pair[0].value == key), (None, None))
-            line = word.start_mark.line if word else line
-        elif isinstance(node, yaml.SequenceNode):
-            node = node.value[key]
-            line = node.start_mark.line
-    return line + 1
 
 
 class _Dumper(yaml.SafeDumper):

@@ -134,7 +134,7 @@ def _without_holes(outline: Outline) -> Outline:
 def _plausible_bodies(outline: Outline) -> list[BodyView]:
     """Return at most TRIED bodies that explain the outline as well as the best one, evenly over their tilts."""
     # the largest body that fits, for each mirror plane of the outline and each tilt in it
-    bodies = []
+    bodies: list[BodyView] = []
     for normal in mirror_planes(outline):
         ray = outline.camera.rays_through(outline.middle[None])[0]
         ahead = ray - (ray @ normal) * normal
