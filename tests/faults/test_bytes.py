@@ -35,8 +35,7 @@ from PIL import Image
 from factorlib.checkpoint import Checkpoint
 from factorlib.dataset.read import read_dataset
 from factorlib.errors import InputError
-from factorlib.generate.folder import write_codes
-from factorlib.images.exr import write_exr, write_rgb_exr
+from factorlib.images.exr import encoded, write_exr, write_rgb_exr
 from factorlib.images.picture import write_png
 from factorlib.jsonfile import write_json
 from factorlib.light.lobes import Lobes
@@ -49,7 +48,7 @@ from factorlib.runner.dataset_state import Request, read_state
 from factorlib.runner.project import LIBRARY, Project, photo_sets
 from factorlib.urm.observations import write_observations
 from factorlib.validation import Validation
-from factorlib.wholefile import bytes_of, disk_error, replace_file
+from factorlib.wholefile import bytes_of, disk_error, replace_file, write_bytes
 from tests.faults import sample
 from tests.faults.sample import (
     DATA,
@@ -888,7 +887,7 @@ LAYERS = Layers(torch.zeros(8), torch.ones(8), [torch.ones(32, 8), torch.ones(1,
 WRITERS = {  # file -> who writes it, one for each way that bytes reach a disk; what stands after a blank tells those of one kind apart
     "a.exr": lambda path: write_exr(path, {f"n.{k}": PIXELS[..., 0] for k in range(7)}),
     "a.png": lambda path: write_png(path, CODES),
-    "a.jpg": lambda path: write_codes(path, CODES, {"Compression": "jpeg:95"}),
+    "a.jpg": lambda path: write_bytes(path, encoded(path, CODES, {"Compression": "jpeg:95"})),
     "a.json": lambda path: write_json(path, {"a": PIXELS.tolist()}),
     "a.json of the runner": lambda path: replace_file(path, b"{}" * 2000),
     "a.parquet": lambda path: write_observations(path, sample.observations(2000)),
@@ -951,7 +950,7 @@ WRITING = re.compile(
     r"\.(write_text|write_bytes|save_file|savefig|imwrite|tofile|savez|save_image|write_table)\(|ImageOutput\.create"
     r"|torch\.save\((?!.*stream)|\bopen\([^)]*[\"'](?=\w*[wax+])[rwaxbt+]+[\"']"
 )
-MAY = ("wholefile.py", "images/exr.py", "images/film.py", "setup.py", "reflection/fused.py", "runner/worker.py")
+MAY = ("wholefile.py", "images/exr.py", "images/picture.py", "setup.py", "reflection/fused.py", "runner/worker.py")
 
 
 def test_nothing_is_written_past_the_writers_that_check():
