@@ -18,7 +18,8 @@ from jaxtyping import Float
 from factorlib.conventions import YUP_FROM_CAMERA
 from factorlib.errors import InputError
 from factorlib.images.exr import write_rgb_exr
-from factorlib.images.picture import picture, write_gif, write_mp4, write_png
+from factorlib.images.film import write_gif, write_mp4
+from factorlib.images.picture import picture, write_png
 from factorlib.jsonfile import write_json
 from factorlib.recipe import kinds
 from factorlib.recipe.kinds import AnyRecipe, is_light_file
