@@ -210,8 +210,8 @@ def _describe(invalid: _Invalid) -> tuple[str, str, Keys]:
     cure = next(filter(None, described), cure)
     if isinstance(value, int | float) and "xpected `str" in message:
         cure = f'put it in quotes: "{one_line(str(value))}"'
-    shown = "" if isinstance(value, dict | list) else f": {one_line(repr(value))}"
-    return f"{message[:1].lower()}{message[1:]}{shown}", cure, keys
+    ending = "" if isinstance(value, dict | list) else f": {one_line(repr(value))}"
+    return f"{message[:1].lower()}{message[1:]}{ending}", cure, keys
 
 
 def _innermost(error: msgspec.ValidationError, value: Any, type_: Any, keys: Keys = ()) -> list[_Invalid]:

@@ -147,7 +147,7 @@ class Project(msgspec.Struct, frozen=True):
         """Format the command of a verb for a dataset, for a user of the checkout or of the installed package."""
         return f"{f'factorlib {verb} -d ' if self.shipped else f'make {verb} DATASET='}{shlex.quote(dataset)}"
 
-    def shown(self, path: Path) -> str:
+    def short_path(self, path: Path) -> str:
         """Format a path for messages: relative to the current folder if it lies below."""
         here = Path.cwd()
         return str(path.relative_to(here)) if path.is_relative_to(here) else str(path)

@@ -291,7 +291,7 @@ def verify(project: Project, dataset: str | None) -> int:
         if faults:
             damaged += 1
             name = ", ".join(steps) or (f"{step_of(entry)} (of an earlier run)" if entry else "a result")
-            print(f"{name}: {project.shown(place)}", *faults, sep="\n    ")
+            print(f"{name}: {project.short_path(place)}", *faults, sep="\n    ")
     store.hashes.save()
     outcome = f"{damaged} damaged; the next run that needs one makes it again" if damaged else "all are sound"
     print(f"{_results(len(users))} read: {outcome}")
@@ -315,6 +315,6 @@ def clean(project: Project, dataset: str | None) -> int:
     with no_runs(store) if deleted else contextlib.nullcontext():
         for folder in deleted:
             shutil.rmtree(folder)
-            print(f"deleted {project.shown(folder)}")
+            print(f"deleted {project.short_path(folder)}")
     print("" if deleted else "nothing to delete\n", end="")
     return 0

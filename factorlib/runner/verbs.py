@@ -70,18 +70,18 @@ def _print_results(state: DatasetState, whole: bool) -> str:
     Returns the verdict, empty without one.
     """
     folder = state.results.folder
-    shown = state.project.shown
+    short = state.project.short_path
     verdict = (folder / VERDICT).read_text(encoding="utf-8") if whole and (folder / VERDICT).exists() else ""
     if verdict:
         print(textwrap.indent(f"verdict: {verdict.rstrip()}".replace("\n", "\n  "), "  "))
     for name, path in MAIN_RESULTS.items() if whole else ():
         if (folder / path).exists():
-            print(f"  {name}: {shown(folder / path)}" + ("/*.exr" if (folder / path).is_dir() else ""))
+            print(f"  {name}: {short(folder / path)}" + ("/*.exr" if (folder / path).is_dir() else ""))
     for name in state.spec.targets or ():
         over_recipes = state.spec.pipeline.stages[name].over == "recipe"
         if over_recipes or not whole:
             item = next(iter(state.recipes)) if over_recipes and len(state.recipes) == 1 else ""
-            print(f"  {name}: {shown(folder / name / item)}")
+            print(f"  {name}: {short(folder / name / item)}")
     return verdict
 
 
@@ -171,12 +171,12 @@ def show_graph(project: Project, mermaid: bool = False) -> int:
 def show_logs(project: Project, request: Request, item: str | None) -> int:
     """Print time, memory, warnings and versions of current results; of one photo or recipe, or of all."""
     state = read_state(project, request, look=True)
-    shown = [p for p in state.plan() if not request.targets or p.step.stage in request.targets]
-    if not (shown := [p for p in shown if item in (None, p.step.item)]):
+    selected = [p for p in state.plan() if not request.targets or p.step.stage in request.targets]
+    if not (selected := [p for p in selected if item in (None, p.step.item)]):
         cure = did_you_mean(str(item), [*state.data.photos, *state.recipes])
         raise InputError(f"no step is of the photo or recipe {item!r}", key="PHOTO", cure=cure)
     versions: dict[str, dict[str, None]] = {}
-    for p in shown:
+    for p in selected:
         if (entry := _result(state, p)) is None:
             print(f"{p.step!s:<26} {p.status}: {summarize(p.reasons, MOST_REASONS)}")
             continue
@@ -242,7 +242,7 @@ def _draw_sheet(project: Project, folder: Path) -> None:
         display.start(step)
         progress = partial(display.progress, step, text="")
         import_module("factorlib.sheet").write_sheet(folder, path, progress)  # by name: it is science
-    print(f"  contact sheet: {project.shown(path)}")
+    print(f"  contact sheet: {project.short_path(path)}")
 
 
 def begin(project: Project, dataset: str, photos: Path | None, masks: Path | None, meshes: Path | None) -> int:
@@ -253,7 +253,8 @@ def begin(project: Project, dataset: str, photos: Path | None, masks: Path | Non
     folder = Path(os.path.abspath(dataset)) if "/" in dataset else project.root / "data" / dataset
     check_name(folder.name, "a dataset", key="DATASET", reserved=RESERVED)
     missing = import_module("factorlib.newset").new_dataset(folder, photos, masks, meshes)
-    print(f"{project.shown(folder)}/dataset.yaml is written{'; still missing, or yours to decide:' if missing else ''}")
+    rest = "; still missing, or yours to decide:" if missing else ""
+    print(f"{project.short_path(folder)}/dataset.yaml is written{rest}")
     for line in missing:
         print(f"  {line}")
     try:
@@ -288,7 +289,7 @@ def compare(project: Project, first: Path | None, second: Path | None) -> int:
     path = project.build / "compare" / "-".join(results.folder.name for results in pair) / "index.html"
     path.parent.mkdir(parents=True, exist_ok=True)
     write_text(path, page)
-    print(f"comparison: {project.shown(path)}")
+    print(f"comparison: {project.short_path(path)}")
     return 0
 
 

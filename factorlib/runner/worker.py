@@ -287,7 +287,7 @@ PATIENCE = 10  # seconds to reach a scheduler
 AHEAD = 200  # most steps submitted to a cluster at a time; each holds an open lock file
 TRIES = 3  # of a step whose process or worker dies, on a cluster
 _starting = threading.Lock()  # held while a process starts, because the environment is changed
-_of_thread = threading.local()  # the process of a thread, and its run and number of threads
+_this_thread = threading.local()  # the process of a thread, and its run and number of threads
 
 
 class Workers:
@@ -365,13 +365,13 @@ def compute_in_process(run: Path | None, threads: int, function: Callable, argum
     if run is not None and not run.is_dir():
         cure = "keep build/ and the data on a file system that all machines mount at the same path"
         raise InputError(f"the worker on {os.uname().nodename} does not see the run's folder", file=run, cure=cure)
-    if getattr(_of_thread, "started_for", None) != (run, threads):
-        _of_thread.pool = _start_process(run, threads)
-        _of_thread.started_for = (run, threads)
+    if getattr(_this_thread, "started_for", None) != (run, threads):
+        _this_thread.pool = _start_process(run, threads)
+        _this_thread.started_for = (run, threads)
     try:
-        return _of_thread.pool.submit(function, argument).result()
+        return _this_thread.pool.submit(function, argument).result()
     except BrokenProcessPool:
-        _of_thread.started_for = None
+        _this_thread.started_for = None
         raise
 
 
