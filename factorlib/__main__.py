@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import argparse
 import contextlib
-import errno
 import io
 import logging
 import os
@@ -26,10 +25,9 @@ from factorlib.runner import results_folder, verbs
 from factorlib.runner.dataset_state import Request
 from factorlib.runner.display import printable, printable_streams
 from factorlib.runner.project import LIBRARY, PIPELINE, Project, photo_sets
+from factorlib.wholefile import disk_error
 
 SHIPPED = "share/factorlib"  # relative to the prefix of the installation: data-files of pyproject.toml
-# errors of the system that the user can fix
-USER_ERRORS = {errno.EACCES, errno.EPERM, errno.EROFS, errno.ELOOP, errno.ENAMETOOLONG}
 
 
 def project() -> Project:
@@ -48,61 +46,12 @@ def project() -> Project:
     return Project(Path(root).resolve(), photo_sets())
 
 
-def _option(*flags: str, key: str | None = None, **more: Any) -> tuple[tuple[str, ...], str | None, dict[str, Any]]:
-    return flags, key, more
-
-
-def _path(word: str) -> Path:
-    return Path(word).expanduser()
-
-
-FLAG = {"action": "store_true"}
-REPEATED = {"action": "append"}
-OPTIONS = {  # arguments of `ArgumentParser.add_argument`; `key` is the environment variable with the default
-    "dataset": _option("--dataset", "-d", help="dataset: a name in data/ or a path to a folder; default: DATASET"),
-    "set": _option(
-        "--set",
-        dest="settings",
-        metavar="X.Y=Z",
-        help="set a parameter, as stage.parameter=value; default: SET",
-        **REPEATED,
-    ),
-    "force": _option("--force", help="run again, or delete without asking; same as FORCE=1", **FLAG),
-    "strict": _option("--strict", help='return exit code 3 if the verdict is "do not trust"; same as STRICT=1', **FLAG),
-    "recipe": _option(
-        "--recipe", dest="recipes", help="recipe: a path, a name in recipes/, or all; default: RECIPE", **REPEATED
-    ),
-    "stages": _option("stages", help="stages; default: all", nargs="*"),
-    "mermaid": _option("--mermaid", help="print a Mermaid diagram", **FLAG),
-    "photo": _option("--photo", key="PHOTO", help="name of a photo or a recipe; default: PHOTO"),
-    "photos": _option("--photos", key="PHOTOS", type=_path, help="folder of photos; default: PHOTOS"),
-    "masks": _option("--masks", key="MASKS", type=_path, help="folder of masks; default: MASKS"),
-    "meshes": _option("--meshes", key="MESHES", type=_path, help="folder of meshes; default: MESHES"),
-    "port": _option("--port", key="PORT", type=int, help="port on 127.0.0.1; default: PORT, or a free one"),
-    "first": _option(
-        "first", key="A", type=_path, nargs="?", help="folder of a result, such as build/eames; default: A"
-    ),
-    "second": _option("second", key="B", type=_path, nargs="?", help="folder of another result; default: B"),
-    "out": _option(
-        "--out", key="OUT", type=_path, help="zip file to write; default: OUT, or <dataset>.zip in this folder"
-    ),
-    "sheet": _option("--sheet", help="also draw photos, labels and meshes; same as SHEET=1", **FLAG),
-    "name": _option("name"),
-}
-
-
-def optional_dataset(arguments: Namespace) -> str | None:
-    """Return the dataset's name or path, from the option or the environment's DATASET; None without either."""
-    # An empty name is not a missing one.
-    return os.environ.get("DATASET") if arguments.dataset is None else arguments.dataset
-
-
 def dataset_of(arguments: Namespace) -> str:
     """Return the dataset's name or path; InputError if none is given."""
-    if (dataset := optional_dataset(arguments)) is None:
+    if arguments.dataset is None:
         cure = "add DATASET=<a name in data/, or a path to a folder>"
         raise InputError("no dataset is named", key="DATASET", cure=cure)
-    return dataset
+    return arguments.dataset
 
 
 def switched_on(key: str, option: bool) -> bool:
@@ -119,30 +68,65 @@ def confirm(force: bool) -> bool:
     return not asks or input("delete them? [y/N] ").strip().lower() in ("y", "yes")
 
 
-def settings_of(arguments: Namespace) -> list[str]:
-    """Return parameters `stage.name=value` as written, from the options or the environment's SET."""
-    return arguments.settings or [os.environ.get("SET", "")]
+def _path(word: str) -> Path:
+    return Path(word).expanduser()
+
+
+# arguments of `ArgumentParser.add_argument`; the environment variable `key` has the default
+OPTIONS: dict[str, dict[str, Any]] = {
+    "--dataset": {"key": "DATASET", "help": "dataset: a name in data/ or a path to a folder"},
+    "--set": {
+        "key": "SET",
+        "action": "append",
+        "metavar": "X.Y=Z",
+        "help": "set a parameter, as stage.parameter=value",
+    },
+    "--force": {"key": "FORCE", "action": "store_true", "help": "run again, or delete without asking"},
+    "--strict": {"key": "STRICT", "action": "store_true", "help": 'return 3 if the verdict is "do not trust"'},
+    "--recipe": {"key": "RECIPE", "action": "append", "help": "recipe: a path, a name in recipes/, or all"},
+    "--photo": {"key": "PHOTO", "help": "name of a photo or a recipe"},
+    "--photos": {"key": "PHOTOS", "type": _path, "help": "folder of photos"},
+    "--masks": {"key": "MASKS", "type": _path, "help": "folder of masks"},
+    "--meshes": {"key": "MESHES", "type": _path, "help": "folder of meshes"},
+    "--port": {"key": "PORT", "type": int, "help": "port on 127.0.0.1, otherwise a free one"},
+    "--out": {"key": "OUT", "type": _path, "help": "zip file to write, otherwise <dataset>.zip in this folder"},
+    "--sheet": {"key": "SHEET", "action": "store_true", "help": "also draw photos, labels and meshes"},
+    "--mermaid": {"action": "store_true", "help": "print a Mermaid diagram"},
+    "stages": {"key": "STAGE", "nargs": "*", "help": "stages; otherwise all"},
+    "first": {"key": "A", "type": _path, "nargs": "?", "help": "folder of a result, such as build/eames"},
+    "second": {"key": "B", "type": _path, "nargs": "?", "help": "folder of another result"},
+    "name": {},
+}
+
+
+def add_option(parser: argparse.ArgumentParser, name: str) -> None:
+    """Add an option, whose default is in the environment, to a verb."""
+    more = {"key": "", **OPTIONS[name]}
+    if key := more.pop("key"):
+        value = os.environ.get(key)
+        more["help"] += f"; default: {key}"
+        more["default"] = value if key == "DATASET" else value or None  # An empty name is not a missing one.
+        if "action" in more:
+            more["default"] = switched_on(key, False) if more["action"] == "store_true" else [value] if value else []
+        elif more.get("nargs") == "*":
+            more["default"] = (value or "").split()
+    parser.add_argument(*(["-d"] if name == "--dataset" else []), name, **more)
 
 
 def request(arguments: Namespace, stages: list[str] | None = None) -> Request:
     """Return the request of the command line; without `stages` it is for all of them."""
-    recipes = arguments.recipes or list(filter(None, [os.environ.get("RECIPE")]))
-    force = switched_on("FORCE", getattr(arguments, "force", False))
-    return Request(dataset_of(arguments), stages or None, settings_of(arguments), force, recipes)
-
-
-def _stages(arguments: Namespace) -> list[str] | None:
-    return arguments.stages or os.environ.get("STAGE", "").split() or None
+    force = getattr(arguments, "force", False)
+    return Request(dataset_of(arguments), stages or None, arguments.set, force, arguments.recipe)
 
 
 def _stage(arguments: Namespace) -> int:
-    verbs.check_stage(project(), arguments.name, list(VERBS))
+    verbs.pipeline_of(project()).check([arguments.name])
     return verbs.make(project(), request(arguments, [arguments.name]))
 
 
-COMMON = "dataset set force recipe"
+COMMON = "--dataset --set --force --recipe"
 VERBS: dict[str, tuple[str, Callable[[Namespace], int], str]] = {  # options, function, help; in the order of `--help`
-    "all": (f"{COMMON} strict", lambda a: verbs.make(project(), request(a), switched_on("STRICT", a.strict)),
+    "all": (f"{COMMON} --strict", lambda a: verbs.make(project(), request(a), a.strict),
             "Run all stages that are not up to date, and render the named recipes."),
     "stage": (f"name {COMMON}", _stage,
               "Run one stage and the stages that it needs; `render` with a recipe renders that recipe only."),
@@ -150,33 +134,32 @@ VERBS: dict[str, tuple[str, Callable[[Namespace], int], str]] = {  # options, fu
              "List the steps that would run; with a recipe and no stage, those of its pictures only."),
     "why": (f"stages {COMMON}", lambda a: verbs.show_plan(project(), request(a, a.stages), True),
             "List every reason why steps would run."),
-    "status": ("stages dataset set recipe", lambda a: verbs.show_status(project(), request(a, a.stages)),
+    "status": ("stages --dataset --set --recipe", lambda a: verbs.show_status(project(), request(a, a.stages)),
                "Print the progress of each stage, and the warnings of current results."),
-    "graph": ("mermaid dataset", lambda a: verbs.show_graph(project(), a.mermaid),
+    "graph": ("--mermaid --dataset", lambda a: verbs.show_graph(project(), a.mermaid),
               "Print the stages and their inputs, as text or as a Mermaid diagram."),
-    "logs": ("stages dataset set recipe photo", lambda a: verbs.show_logs(project(), request(a, _stages(a)), a.photo),
+    "logs": ("stages --dataset --set --recipe --photo",
+             lambda a: verbs.show_logs(project(), request(a, a.stages), a.photo),
              "Print time, memory and package versions of current results."),
-    "params": ("stages", lambda a: verbs.show_params(project(), _stages(a)),
+    "params": ("stages", lambda a: verbs.show_params(project(), a.stages),
                "List the parameters of stages with default, range and meaning (make params STAGE=…)."),
-    "new": ("dataset photos masks meshes", lambda a: verbs.begin(project(), dataset_of(a), a.photos, a.masks, a.meshes),
+    "new": ("--dataset --photos --masks --meshes",
+            lambda a: verbs.begin(project(), dataset_of(a), a.photos, a.masks, a.meshes),
             "Create data/<name> with a dataset.yaml from your own photos, masks and meshes."),
-    "label": ("dataset port", lambda a: verbs.label_masks(project(), dataset_of(a), a.port or 0),
+    "label": ("--dataset --port", lambda a: verbs.label_masks(project(), dataset_of(a), a.port or 0),
               "Draw masks on a page in the browser, served on this machine alone until Ctrl-C."),
     "compare": ("first second", lambda a: verbs.compare(project(), a.first, a.second),
                 "Write a page that compares two results: parameters, numbers, materials, lights."),
-    "validate": ("dataset set sheet",
-                 lambda a: verbs.validate(project(), dataset_of(a), settings_of(a), switched_on("SHEET", a.sheet)),
+    "validate": ("--dataset --set --sheet", lambda a: verbs.validate(project(), dataset_of(a), a.set, a.sheet),
                  "Check pipeline.yaml, settings and dataset without running anything."),
-    "pack": ("dataset out force", lambda a: verbs.pack(project(), dataset_of(a), a.out, switched_on("FORCE", a.force)),
+    "pack": ("--dataset --out --force", lambda a: verbs.pack(project(), dataset_of(a), a.out, a.force),
              "Pack a result into one zip file that does not need its dataset."),
-    "verify": ("dataset", lambda a: results_folder.verify(project(), optional_dataset(a)),
+    "verify": ("--dataset", lambda a: results_folder.verify(project(), a.dataset),
                "Read every stored result of a dataset, or of all, and list damaged ones."),
-    "clean": ("dataset", lambda a: results_folder.clean(project(), optional_dataset(a)),
+    "clean": ("--dataset", lambda a: results_folder.clean(project(), a.dataset),
               "Remove the results of a dataset; of all datasets if neither --dataset nor DATASET is given."),
-    "gc": ("force", lambda a: results_folder.collect(project(), lambda: confirm(a.force)),
+    "gc": ("--force", lambda a: results_folder.collect(project(), lambda: confirm(a.force)),
            "List stored results that no dataset uses, and delete them after asking."),
-    "ship": ("name dataset", lambda a: verbs.ship(project(), a.name, dataset_of(a)),
-             "Copy a stage's current result into the package (for developers of the stage)."),
 }  # fmt: skip
 
 
@@ -185,16 +168,15 @@ def run(words: list[str], program: str) -> int:
 
     A first word that is neither an option nor a verb is a stage.
     """
+    if words and not words[0].startswith("-") and words[0] not in VERBS:
+        words = ["stage", *words]
     epilog = "Any other word is the name of a stage: it is run with the stages that it needs."
     parser = argparse.ArgumentParser(program, description=epilog)
     parsers = parser.add_subparsers(title="verbs", metavar="verb", dest="verb", required=True)
     for name, (options, _, text) in VERBS.items():
         verb = parsers.add_parser(name, help=text, description=text, allow_abbrev=False)
-        for flags, key, more in (OPTIONS[option] for option in options.split()):
-            defaults: dict[str, Any] = {"default": os.environ.get(key) or None} if key else {}
-            verb.add_argument(*flags, **more, **defaults)
-    if words and not words[0].startswith("-") and words[0] not in VERBS:
-        words = ["stage", *words]
+        for option in options.split() if name in words[:1] else ():
+            add_option(verb, option)
     arguments = parser.parse_args(words or ["--help"])
     return VERBS[arguments.verb][1](arguments)
 
@@ -232,13 +214,7 @@ def main() -> NoReturn:
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # The flush at exit must not fail.
         sys.exit(1)
     except OSError as error:  # A message for errors that the user can fix; anything else is a defect.
-        from factorlib.wholefile import disk_error
-
-        known = disk_error(error, project().build)
-        if known is None and error.errno in USER_ERRORS:
-            cure = "check that the folder exists, and that you may read it and write to it"
-            known = InputError(error.strerror or str(error), file=error.filename, cure=cure)
-        if known is None:
+        if (known := disk_error(error, project().build)) is None:
             raise
         sys.exit(printable(f"error: {known}"))
 

@@ -47,8 +47,8 @@ class InputErrors(InputError):
 
     def __str__(self) -> str:
         more = len(self.faults) - MOST_LISTED
-        said = [str(fault) for fault in self.faults[:MOST_LISTED]]
-        return "\nerror: ".join([*said, f"{more} more"] if more > 0 else said)
+        texts = [str(fault) for fault in self.faults[:MOST_LISTED]]
+        return "\nerror: ".join([*texts, f"{more} more"] if more > 0 else texts)
 
     def __reduce__(self) -> tuple:
         return InputErrors, (self.faults,)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import re
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any, TypeVar, cast
 
 import msgspec
 
@@ -15,7 +15,7 @@ from factorlib.wholefile import write_text
 
 T = TypeVar("T")
 VERSION = 1  # version of the stages' files; a file without `version` has version 1, so it is not written
-_WHERE = re.compile(r"^(?P<found>.*?)(?: - at `(?:\$\.?)?(?P<key>[^`]*)`)?$", re.DOTALL)
+_WHERE = re.compile(r"^(?P<fault>.*?)(?: - at `(?:\$\.?)?(?P<key>[^`]*)`)?$", re.DOTALL)
 
 
 def json_text(value: Any) -> str:
@@ -56,12 +56,12 @@ def read_result(path: str | Path, type_: type[T], stage: str, cure: str = "") ->
     with reading("JSON", path, cure=cure):
         content = msgspec.json.decode(text)
         # a table called `version` is the entry of a photo of that name
-        said = isinstance(content, dict) and not isinstance(content.get("version", {}), dict | list)
-        if said and (version := content.pop("version")) != VERSION:
-            found = f"is of version {version}; this program reads version {VERSION}"
-            raise InputError(found, file=path, key="version", cure=cure)
+        has_version = isinstance(content, dict) and not isinstance(content.get("version", {}), dict | list)
+        if has_version and (version := content.pop("version")) != VERSION:
+            fault = f"is of version {version}; this program reads version {VERSION}"
+            raise InputError(fault, file=path, key="version", cure=cure)
         try:
             return msgspec.convert(content, type_)
         except msgspec.ValidationError as error:
-            found = _WHERE.match(str(error))  # type: ignore[assignment]
-            raise InputError(found["found"], file=path, key=found["key"] or None, cure=cure) from None  # type: ignore[index]
+            match = cast(re.Match, _WHERE.match(str(error)))
+            raise InputError(match["fault"], file=path, key=match["key"] or None, cure=cure) from None

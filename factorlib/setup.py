@@ -20,11 +20,9 @@ import platform
 import shutil
 import subprocess
 import sys
-import time
 import tomllib
 import urllib.request
 import venv
-from concurrent.futures import ThreadPoolExecutor
 from importlib.util import find_spec
 from pathlib import Path
 
@@ -35,16 +33,12 @@ READY = VENV / "ready"
 PYTHON = VENV / "bin" / "python"
 TORCH = "torch==2.13.0"
 TORCH_CPU = "https://download.pytorch.org/whl/cpu"  # PyPI's own wheels for Linux require gigabytes of CUDA.
-BEAT = 3.0  # seconds between two progress messages
-LOADED = (
-    "torch, scipy.optimize, mitsuba, pytest",
-    "factorlib.geometry.open3d, OpenImageIO, pycolmap, pyarrow.parquet, trimesh, jinja2, rich.progress",
-)
+LOADED = "torch, scipy.optimize, mitsuba, OpenImageIO, pycolmap, pyarrow.parquet, trimesh, factorlib.geometry.open3d"
 # extras installed without dependencies: .venv has what they need, and bpy would require an older NumPy
 ALONE = ("blender", "interchange")
-# system libraries of Open3D, and the Debian packages that contain them
+# system libraries of Open3D and, for renders that are three times faster, of Mitsuba; and their Debian packages
 NEEDED = {"libGL.so.1": "libgl1", "libX11.so.6": "libx11-6", "libudev.so.1": "libudev1", "libgomp.so.1": "libgomp1"}
-FASTER = {"libLLVM.so.19.1": "libllvm19"}  # Mitsuba renders three times faster with it.
+FASTER = {"libLLVM.so.19.1": "libllvm19"}
 
 
 def main() -> None:
@@ -52,18 +46,13 @@ def main() -> None:
     state = LOCK.read_bytes() + sys.version.encode() + os.environ.get("TORCH_INDEX", "").encode()
     digest = hashlib.sha256(state).hexdigest()
     if not READY.exists() or READY.read_text() != digest:
-        started = time.monotonic()
         make_venv()
-        with ThreadPoolExecutor(1) as beside:
-            system = beside.submit(check_system)
-            install_packages()
-        system.result()
-        os.environ.pop("PYTHONDONTWRITEBYTECODE", None)  # Only loaded modules are compiled; pip would compile all.
-        commands = [[str(PYTHON), "-c", f"import {names}"] for names in LOADED]
-        if not run(commands, "loading the packages for the first time"):
+        check_system()
+        install_packages()
+        print("set-up: loading the packages for the first time", flush=True)
+        if subprocess.run([PYTHON, "-c", f"import {LOADED}"], cwd=ROOT).returncode:
             sys.exit("set-up: the packages are installed, but one does not load (reason above)")
         READY.write_text(digest)
-        say(f"the environment is ready, after {time.monotonic() - started:.0f} s")
     READY.touch()
 
 
@@ -73,23 +62,10 @@ def install_extras() -> None:
     Those in ALONE are installed without dependencies.  The others change no locked package.
     """
     known = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["optional-dependencies"]
-    names = os.environ.get("EXTRAS", "").replace(",", " ").split()
-    if unknown := [name for name in names if name not in known]:
-        sys.exit(f"set-up: there is no extra {unknown[0]!r} in pyproject.toml; there are {', '.join(known)}")
-    for options, alone in ((["--no-deps"], True), (["-c", str(LOCK)], False)):
-        if packages := [package for name in names if (name in ALONE) == alone for package in known[name]]:
-            exit_unless(run([with_pip([*options, *packages])], f"installing {', '.join(packages)}"))
-
-
-def say(text: str) -> None:
-    """Print a line with the prefix of set-up."""
-    print(f"set-up: {text}", flush=True)
-
-
-def exit_unless(success: bool) -> None:
-    """End the program if an installation failed; the installer has printed the reason."""
-    if not success:
-        sys.exit("set-up: the packages could not be installed (reason above); correct that and run make again")
+    for name in os.environ.get("EXTRAS", "").replace(",", " ").split():
+        if name not in known:
+            sys.exit(f"set-up: there is no extra {name!r} in pyproject.toml; there are {', '.join(known)}")
+        pip(*(["--no-deps"] if name in ALONE else ["-c", str(LOCK)]), *known[name])
 
 
 def make_venv() -> None:
@@ -101,58 +77,28 @@ def make_venv() -> None:
     if find_spec("ensurepip") is None:  # Debian has it in a separate package.
         sys.exit(f"set-up: this Python has no venv; install it: sudo apt-get install python{version}-venv")
     READY.unlink(missing_ok=True)
-    if not PYTHON.exists() or not (VENV / "lib" / f"python{version}").is_dir():
-        say(f"making .venv with Python {platform.python_version()}")
-        shutil.rmtree(VENV, ignore_errors=True)
-        venv.create(VENV, with_pip=True, symlinks=True)
+    same = (VENV / "lib" / f"python{version}").is_dir()
+    venv.create(VENV, clear=not same, with_pip=True, symlinks=True)
 
 
 def install_packages() -> None:
-    """Install all packages of the lock without resolving dependencies, by uv or else by pip.
+    """Install all packages of the lock, which names every one of them, and PyTorch from its index of CPU wheels.
 
-    A PyTorch from another index than that of CPU wheels may need more (CUDA), which is installed afterwards.
+    A PyTorch from another index may need more packages (CUDA), which are installed, too.
     """
     index = os.environ.get("TORCH_INDEX") or (TORCH_CPU if answers(f"{TORCH_CPU}/torch/") else None)
-    torch = [TORCH, *(["--index-url", index] if index else [])]
-    locked = ["--no-deps", "-r", str(LOCK)]
-    pinned = ["--no-deps", *torch]
-    say(words := f"installing about 400 MB of packages; PyTorch from {index or 'the default package index'}")
-    uv = shutil.which("uv") or (run([with_pip(["--no-deps", "uv"])], "installing uv") and str(VENV / "bin" / "uv"))
-    with_uv = [str(uv), "pip", "install", "-q", "--python", str(PYTHON)]
-    # Without an index, pip installs PyTorch, because it knows the user's own wheels.
-    by_uv = [[*with_uv, *locked], [*with_uv, *pinned] if index else with_pip(pinned)]
-    if not uv or not run(by_uv, words):
-        exit_unless(run([with_pip(locked), with_pip(pinned)], words))
-    if index != TORCH_CPU:
-        exit_unless(run([with_pip(["-c", str(LOCK), *torch])], "installing what PyTorch needs"))
+    pip("--no-deps", "-r", str(LOCK))
+    alone = ["--no-deps"] if index == TORCH_CPU else ["-c", str(LOCK)]
+    pip(*alone, TORCH, *(["--index-url", index] if index else []))
     # The path is relative, so that the checkout can be moved.  `import factorlib` then works from anywhere.
-    site_packages().joinpath("factorlib.pth").write_text("../../../..\n")
+    next(VENV.glob("lib/python*/site-packages")).joinpath("factorlib.pth").write_text("../../../..\n")
 
 
-def with_pip(words: list[str]) -> list[str]:
-    """Return pip's install command, which prints only errors and compiles nothing."""
-    return [str(PYTHON), "-m", "pip", "install", "--no-compile", "-qq", "--disable-pip-version-check", *words]
-
-
-def run(commands: list[list[str]], words: str) -> bool:
-    """Run the commands in parallel with progress messages, and return True if all succeed.
-
-    `words` describes them.  Errors are printed as they occur.
-    """
-    running = [subprocess.Popen(command, cwd=ROOT, stdout=subprocess.DEVNULL) for command in commands]
-    started = reported = time.monotonic()
-    while any(process.poll() is None for process in running):
-        time.sleep(0.1)
-        if (now := time.monotonic()) - reported >= BEAT:
-            reported = now
-            count = sum(1 for _ in site_packages().glob("*.dist-info"))
-            say(f"{words}: {now - started:.0f} s, {count} packages are installed")
-    return not any(process.returncode for process in running)
-
-
-def site_packages() -> Path:
-    """Return the folder in which .venv keeps packages."""
-    return next(VENV.glob("lib/python*/site-packages"))
+def pip(*words: str) -> None:
+    """Install by the pip of .venv, which compiles nothing; a failure ends the program."""
+    print(f"set-up: installing {' '.join(words)}", flush=True)
+    if subprocess.run([PYTHON, "-m", "pip", "install", "-q", "--no-compile", *words], cwd=ROOT).returncode:
+        sys.exit("set-up: the packages could not be installed (reason above); correct that and run make again")
 
 
 def answers(url: str) -> bool:
@@ -169,22 +115,16 @@ def check_system() -> None:
 
     A missing library of NEEDED ends the program.  One of FASTER is only recommended.
     """
-    apt = shutil.which("apt-get")
-    for libraries, gain in ((NEEDED, ""), (FASTER, "renders are three times faster with it")):
-        missing = [name for name in libraries if not loads(name)]
-        packages = " ".join(libraries[name] for name in missing)
-        if missing and os.geteuid() == 0 and apt:
-            say(f"installing {packages}{f': {gain}' if gain else ''}")
-            quiet = {**os.environ, "DEBIAN_FRONTEND": "noninteractive"}
-            for words in ("update", f"install -y --no-install-recommends {packages}"):
-                apt_get = ["apt-get", "-qq", *words.split()]
-                subprocess.run(apt_get, env=quiet, check=False, stdout=subprocess.DEVNULL)
-            missing = [name for name in missing if not loads(name)]
-        command = f"sudo apt-get update && sudo apt-get install -y {packages}   (elsewhere: packages with these files)"
-        if missing and gain:
-            say(f"{', '.join(missing)} is missing, and {gain}; to install it:\n  {command}")
-        elif missing:
-            sys.exit(f"set-up: the system libraries {', '.join(missing)} are missing; install them:\n  {command}")
+    packages = [package for library, package in (NEEDED | FASTER).items() if not loads(library)]
+    if packages and os.geteuid() == 0 and shutil.which("apt-get"):
+        apt_get = ["env", "DEBIAN_FRONTEND=noninteractive", "apt-get", "-qq"]
+        subprocess.run([*apt_get, "update"], check=False)
+        subprocess.run([*apt_get, "install", "-y", "--no-install-recommends", *packages], check=False)
+    if missing := [library for library in NEEDED | FASTER if not loads(library)]:
+        command = f"sudo apt-get update && sudo apt-get install -y {' '.join(packages)}"
+        print(f"set-up: the system libraries {', '.join(missing)} are missing; install them:\n  {command}", flush=True)
+    if any(library in NEEDED for library in missing):
+        sys.exit("set-up: without them the packages do not load (elsewhere than on Debian: packages with these files)")
 
 
 def loads(library: str) -> bool:

@@ -118,7 +118,11 @@ FULL = {
     errno.EDQUOT: "the disk quota is used up",
     errno.EFBIG: "no file may become that large (ulimit -f)",
 }
-CLOSED = {errno.EROFS: "the folder is read-only", errno.EACCES: "permission denied", errno.EPERM: "permission denied"}
+CLOSED = {
+    errno.EROFS: "the folder is read-only",
+    errno.EACCES: "permission denied",
+    errno.EPERM: "permission denied",
+}
 ROOM = "make room there, for instance by `make gc`, which deletes unused results, and run again"
 
 
@@ -138,11 +142,10 @@ def disk_error(error: BaseException, folder: Path) -> InputError | None:
     if not full and isinstance(name, str) and os.path.isfile(name) and not os.access(name, os.R_OK):
         return InputError(f"{words}: it cannot be read", file=name, cure="give yourself the right to read it")
     # A copy has two names; the last is that of the written file.
-    names = [getattr(full or error, attribute, None) for attribute in ("filename", "filename2")]
-    paths = [Path(os.path.abspath(os.fsdecode(name))).parent for name in names if isinstance(name, str | bytes)]
-    # nearest existing folders; `Path.is_dir` raises for a folder that it may not read
-    folders = [next(p for p in (path, *path.parents) if os.path.isdir(p)) for path in paths or [folder.absolute()]]
-    place = folders[-1] if full else next((path for path in folders if not os.access(path, os.W_OK)), folders[0])
+    names = [getattr(full or error, attribute, None) for attribute in ("filename2", "filename")]
+    path = Path(os.path.abspath(next((os.fsdecode(name) for name in names if isinstance(name, str | bytes)), folder)))
+    # nearest existing folder; `Path.is_dir` raises for a folder that it may not read
+    place = next(parent for parent in (path, *path.parents) if os.path.isdir(parent))
     free = f"{shutil.disk_usage(place).free / 1e6:.1f} MB are free"
     if full:
         return InputError(f"{words}: {free}", file=place, cure=f"{ROOM}: finished results are kept")

@@ -28,9 +28,9 @@ MOST_BYTES = 64_000_000
 MOST_VALUES = 2_000_000  # scalars, lists and maps; those that aliases repeat count each time
 MOST_DEPTH = 64  # nesting of lists and maps
 TOO_DEEP = "is a bracket missing, an indent too much, or does an alias (*name) stand inside its anchor (&name)?"
-_CORE = re.compile(  # YAML 1.2.2, section 10.3.2; a number of more than 300 digits is a word
+_CORE = re.compile(  # YAML 1.2.2, section 10.3.2; a number of more digits is a float or a word
     r"(?P<null>~|null|Null|NULL|)|(?P<bool>true|True|TRUE|false|False|FALSE)"
-    r"|(?P<int>[-+]?[0-9]{1,300}|0o[0-7]{1,300}|0x[0-9a-fA-F]{1,300})"
+    r"|(?P<int>[-+]?[0-9]{1,18}|0o[0-7]{1,20}|0x[0-9a-fA-F]{1,15})"
     r"|(?P<float>[-+]?(?:\.[0-9]{1,300}|[0-9]{1,300}(?:\.[0-9]{0,300})?)(?:[eE][-+]?[0-9]{1,300})?"
     r"|[-+]?\.(?:inf|Inf|INF)|\.(?:nan|NaN|NAN))"
 )
@@ -212,8 +212,8 @@ def _describe(invalid: Invalid) -> tuple[str, str, Keys]:
     cure = next(filter(None, described), cure)
     if isinstance(value, int | float) and "xpected `str" in message:
         cure = f'put it in quotes: "{one_line(str(value))}"'
-    shown = "" if isinstance(value, dict | list) else f": {one_line(repr(value))}"
-    return f"{message[:1].lower()}{message[1:]}{shown}", cure, keys
+    ending = "" if isinstance(value, dict | list) else f": {one_line(repr(value))}"
+    return f"{message[:1].lower()}{message[1:]}{ending}", cure, keys
 
 
 def _innermost(error: msgspec.ValidationError, value: Any, type_: Any, keys: Keys = ()) -> list[Invalid]:

@@ -10,11 +10,11 @@ from typing import Any, NamedTuple
 
 import msgspec
 
-from factorlib.errors import InputError, did_you_mean
+from factorlib.errors import InputError
 from factorlib.jsonfile import json_text
 from factorlib.reading import check_plain, reading
 from factorlib.runner.closure import Sources
-from factorlib.runner.plan import Listing, Planned, Record, Spec, Step, hash_of, plan
+from factorlib.runner.plan import Listing, Planned, Record, Spec, Step, plan
 from factorlib.runner.project import (
     ALL,
     DATASET,
@@ -29,12 +29,11 @@ from factorlib.runner.project import (
     read_pipeline,
     with_settings,
 )
-from factorlib.runner.results_folder import ResultsFolder, label, results_of, set_link, view_of
+from factorlib.runner.results_folder import ResultsFolder, results_of, set_link, view_of
 from factorlib.runner.store import FileHashes, Store
 from factorlib.wholefile import replace_file
 
 RENDER = "render"  # the stage whose pictures a recipe replaces
-READ = ("file:", "recipe file:", f"facts:{DATASET}")  # fields of a record that come from the dataset or a recipe
 
 
 class Request(NamedTuple):
@@ -89,32 +88,21 @@ class DatasetState:
     def code(self, name: str) -> StageCode:
         """Describe a stage for the worker that loads it."""
         stage = self.spec.pipeline.stages[name]
-        project = self.project
         cores = MOST_CORES if stage.cores == "all" else stage.cores
-        place = project.code_root, project.package, name
-        return StageCode(*place, stage.values, project.pipeline_file, stage.threads, cores)
+        place = self.project.code_root, self.project.package, name
+        return StageCode(*place, stage.values, self.project.pipeline_file, stage.threads, cores)
 
-    def faults(self, steps: Iterable[Step], new: bool = False) -> list[str]:
-        """List the faults of the files that steps and their recipes read, each once.
-
-        new: only of steps whose part of the dataset or recipe has changed since their last result
-        """
-        faults: dict[str, None] = {}
+    def file_faults(self, steps: Iterable[Step]) -> list[str]:
+        """List the faults of the files that steps and their recipes read, each once."""
+        faults: list[InputError] = []
         for step in steps:
             stage = self.spec.pipeline.stages[step.stage]
-            fields = [
-                {name: value for name, value in record.items() if name.startswith(READ)}
-                for record in (self.records[step], self.previous.get(str(step)) or {})
-            ]
-            if new and str(step) in self.previous and fields[0] == fields[1]:
-                continue
-            errors = self.data.recipe_faults(self.recipes[step.recipe].files) if step.recipe is not None else []
+            faults += self.data.recipe_faults(self.recipes[step.recipe].files) if step.recipe is not None else []
             for slice_ in stage.slices:
-                errors = [*errors, *self.data.faults(slice_, step.photo, stage.values, self.project.pipeline_file)]
-            faults |= dict.fromkeys(map(str, errors))
-        return list(faults)
+                faults += self.data.faults(slice_, step.photo, stage.values, self.project.pipeline_file)
+        return list(dict.fromkeys(map(str, faults)))
 
-    def wrong_values(self, planned: list[Planned]) -> list[str]:
+    def parameter_faults(self, planned: list[Planned]) -> list[str]:
         """List the faults of the parameters of steps that are not current.
 
         Only stages with parameters are imported, each in a process, because that takes seconds.
@@ -131,45 +119,28 @@ class DatasetState:
         # A module that cannot be loaded reports that when it runs.
         return [str(blame_setting(error, self.settings)) for error in errors if isinstance(error, InputError)]
 
-    def remember(self, made: dict[str, str]) -> None:
-        """Add keys of steps to current.json; steps of former photos and stages are dropped."""
-        stages = self.spec.pipeline.stages
-        before = self.results.keys_if_readable()
-        names = {*stages, *(str(step) for stage in stages for step in self.spec.steps_of(stage))}
-        earlier_recipes = tuple(f"{name}/" for name, stage in stages.items() if stage.over == "recipe")
-        keys = {name: key for name, key in before.items() if name in names or name.startswith(earlier_recipes)} | made
-        if keys != before:
-            self.results.set_owner(self.project, self.data.folder)
-            replace_file(self.results.keys_file, json_text(keys).encode())
-
     def publish(self, planned: list[Planned]) -> None:
         """Make the links in the results folder, and current.json, name the current results."""
-        results = self.results
         stages = self.spec.pipeline.stages
         current = {p.step: p for p in planned if p.status == "current"}
         keys = {str(step): p.key for step, p in current.items()}
-        photos: dict[str, dict[str, str]] = {}  # key by stage and photo
-        links = {}
-        for step, p in current.items():
-            if step.photo:
-                photos.setdefault(step.stage, {})[step.photo] = p.key
-            else:
-                links[str(step)] = p.output
-        for name, keys_of_photos in photos.items():
-            view = view_of(self.store, name, keys_of_photos, stages[name].gather)
-            keys[name] = hash_of(view.record)
-            links[name] = view.output
-        for name, output in links.items():
-            set_link(results.folder / name, self.store.trees / output, self.project.build)
-        self.remember(keys)
-        for link in results.folder.glob("[!.]*"):  # Hidden ones are drafts of links, perhaps of another run.
+        links = {str(step): self.store.trees / p.output for step, p in current.items() if not step.photo}
+        for name in (name for name, stage in stages.items() if stage.over == "photo"):
+            if outputs := {step.photo: p.output for step, p in current.items() if step.photo and step.stage == name}:
+                links[name] = view_of(self.store, outputs, stages[name].gather)
+        for name, folder in links.items():
+            set_link(self.results.folder / name, folder, self.project.build)
+        for link in self.results.folder.glob("[!.]*"):  # Hidden ones are drafts of links, perhaps of another run.
             if link.is_symlink() and link.name not in stages:
                 link.unlink(missing_ok=True)
-        pending = {label(step) for stage in stages for step in self.spec.steps_of(stage) if step not in current}
-        for path in (path for path in results.errors.glob("*.txt") if path.stem not in pending):
-            path.unlink(missing_ok=True)
-        with contextlib.suppress(OSError):  # not empty, or removed by another run
-            results.errors.rmdir()
+        # Results that this request did not ask for stay; those of former photos and stages are dropped.
+        names = {*stages, *(str(step) for stage in stages for step in self.spec.steps_of(stage))}
+        over_recipes = tuple(f"{name}/" for name, stage in stages.items() if stage.over == "recipe")
+        before = self.results.keys()
+        keys = {name: key for name, key in before.items() if name in names or name.startswith(over_recipes)} | keys
+        self.results.set_owner(self.project, self.data.folder)
+        if keys != before:
+            replace_file(self.results.keys_file, json_text(keys).encode())
         self.store.hashes.save()
 
 
@@ -188,9 +159,7 @@ def read_state(project: Project, request: Request, look: bool = False) -> Datase
     try:
         pipeline = with_settings(read_pipeline(project.pipeline_file, project.provider.slices), request.settings)
         targets, recipe_words = _targets(pipeline, request, look)
-        for name in (name for name in targets or [] if name not in pipeline.stages):
-            cure = did_you_mean(name, pipeline.stages)
-            raise InputError(f"there is no stage {name!r}", file=project.pipeline_file, cure=cure)
+        pipeline.check(targets or [])
         data = project.provider.read(project.dataset_folder(request.dataset))
         present = pipeline.for_data(lambda name: data.slice(name, None).facts is None)
         for name in (name for name in targets or [] if name not in present.stages):
@@ -207,7 +176,7 @@ def read_state(project: Project, request: Request, look: bool = False) -> Datase
     except InputError as error:
         raise blame_setting(error, request.settings) from None
     store.hashes.save()
-    entries = {step: store.entry(key) for step, key in results.keys_if_readable().items()}
+    entries = {step: store.entry(key) for step, key in results.keys().items()}
     previous = {step: entry.record for step, entry in entries.items() if entry}
     return DatasetState(project, data, results, store, spec, records, inputs, previous, recipes, request.settings)
 
@@ -259,8 +228,7 @@ def _records(
 
 
 def _hash(field: str, path: Path, stage: str, hashes: FileHashes) -> str:
-    kind, _, rest = field.partition(":")
-    key = f"{stage}.{rest.partition('/')[0]}" if kind == "given" else None
+    key = f"{stage}.{field.removeprefix('given:').partition('/')[0]}" if field.startswith("given:") else None
     check_plain(path, "a file", key, most_bytes=None)  # a pipe never ends
     with reading("a file", path, key):
         return hashes.content(path)

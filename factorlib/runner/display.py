@@ -1,4 +1,4 @@
-"""Display of a run on standard error: plain lines, or on a terminal a bar for each stage.
+"""Display of a run on standard error: lines, and on a terminal a bar for each stage.
 
 A terminal receives text alone.  Messages have names of files and texts of parsers, and a dataset may be anyone's:
 none of it may move the cursor, set a colour or a title, or ring the bell.
@@ -10,12 +10,11 @@ import contextlib
 import sys
 import time
 from collections.abc import Iterator
-from dataclasses import dataclass, field
 from typing import Any, TextIO, cast
 
 from factorlib.runner.plan import Planned, Step
 
-BEAT = 10.0  # seconds between two plain lines about the same step
+BEAT = 10.0  # seconds of silence after which progress is a line, away from a terminal
 
 
 def printable(text: str) -> str:
@@ -51,16 +50,6 @@ def printable_streams() -> Iterator[None]:
         yield
 
 
-@dataclass
-class _Progress:
-    """Progress of a running step: times of its start and its last line, share done, and a description."""
-
-    started: float = field(default_factory=time.monotonic)
-    reported: float = field(default_factory=time.monotonic)
-    share: float = 0.0
-    words: str = ""
-
-
 class Display:
     """Lines on standard error: starts, warnings, times.
 
@@ -71,13 +60,29 @@ class Display:
     """
 
     def __init__(self) -> None:
+        from rich import progress  # A run with nothing to do does not load it.
+        from rich.console import Console
+
+        stream = sys.stderr.stream if isinstance(sys.stderr, PrintableStream) else sys.stderr  # rich moves the cursor
+        columns = (
+            progress.SpinnerColumn(),
+            progress.TextColumn("{task.description:<10}", markup=False),
+            progress.BarColumn(24),
+            progress.TextColumn("{task.fields[count]:>7}"),
+            progress.TimeElapsedColumn(),
+            progress.TimeRemainingColumn(),
+            progress.TextColumn("{task.fields[words]}", markup=False),
+        )
+        self.plain = not stream.isatty()
         self.stages: dict[str, tuple[int, int]] = {}
-        self._running: dict[Step, _Progress] = {}
-        self._reported: dict[str, None] = {}  # started stages, in order, and messages that are printed once
-        self._bars: Any = _bars() if sys.stderr.isatty() else None
+        self._bars = progress.Progress(
+            *columns, console=Console(file=stream), disable=self.plain, speed_estimate_period=600
+        )
         self._rows: dict[str, Any] = {}
-        if self._bars:
-            self._bars.start()
+        self._running: dict[Step, tuple[float, str]] = {}  # share done, and description
+        self._reported: set[str] = set()  # messages that are printed once
+        self._line_time = time.monotonic()
+        self._bars.start()
 
     def plan(self, planned: list[Planned]) -> None:
         """Show the state of a plan."""
@@ -88,95 +93,57 @@ class Display:
 
     def report(self, text: str) -> None:
         """Print a line, above the bars if there are any."""
-        if self._bars:
-            self._bars.console.print(printable(text), markup=False, highlight=False, soft_wrap=True)
-        else:
-            print(printable(text), file=sys.stderr, flush=True)
+        self._line_time = time.monotonic()
+        self._bars.console.print(printable(text), markup=False, highlight=False, emoji=False, soft_wrap=True)
 
-    def _line(self, step: Step, text: str) -> None:
-        if not self._bars:
-            self.report(f"{step.stage:<10} {text}".rstrip())
-
-    def _is_new(self, message: str) -> bool:
-        before = len(self._reported)
-        self._reported[message] = None
-        return len(self._reported) > before
+    def report_once(self, text: str) -> None:
+        """Print a line unless it has been printed before."""
+        if text not in self._reported:
+            self._reported.add(text)
+            self.report(text)
 
     def start(self, step: Step) -> None:
-        """Show that a step begins; a line is printed for the first of a stage."""
-        self._running[step] = _Progress()
+        """Show that a step begins."""
         _, left = self.stages.setdefault(step.stage, (1, 1))
-        if self._is_new(step.stage):
-            kind = "photo" if step.photo else "recipe"
-            self._line(step, f"{left} {kind}{'s' * (left > 1)} …" if step.item else "…")
-
-    def wait(self, step: Step) -> None:
-        """Print once that a step waits for another run to make its result."""
-        if self._is_new(f"waiting: {step}"):
-            self.report(f"{step}: waiting: another run is making it")
+        self._running[step] = (0.0, "")
+        if step.stage not in self._rows:
+            self._rows[step.stage] = self._bars.add_task(step.stage, count="", words="")
+            if self.plain:
+                self.report(f"{step.stage:<10} {f'{left} steps ' if step.item else ''}…")
+        self._draw(step.stage)
 
     def progress(self, step: Step, done: float, total: float, text: str) -> None:
-        """Set a running step's progress (`done` of `total`, in any unit) and description; `tick` shows it."""
-        progress = self._running[step]
-        progress.share = min(done / total, 1.0) if total else 0.0
-        progress.words = f"{f'{progress.share:4.0%}' if total else ''} {printable(text)}".strip()
-
-    def tick(self) -> None:
-        """Draw the bars again, or print a line for every step that has been silent for BEAT seconds."""
-        now = time.monotonic()
-        for step, progress in self._running.items():
-            if not self._bars and now - progress.reported >= BEAT:
-                progress.reported = now
-                self._line(step, f"{step.item:<16} {now - progress.started:6.0f} s  {progress.words}")
-        for stage in (stage for stage in self._reported if self._bars and stage in self.stages):
-            if stage not in self._rows:
-                self._rows[stage] = self._bars.add_task(stage, count="", words="")
-            total, left = self.stages[stage]
-            running = {step: progress for step, progress in self._running.items() if step.stage == stage}
-            words = "; ".join(f"{step.item} {progress.words}".strip() for step, progress in running.items())
-            done = total - left + sum(progress.share for progress in running.values())
-            columns = {"completed": done, "total": total, "count": f"{total - left}/{total}", "words": words[:80]}
-            self._bars.update(self._rows[stage], **columns)
-
-    def warn(self, step: Step, text: str) -> None:
-        """Print a warning, once for each text."""
-        if self._is_new(f"warning: {text}"):
-            self.report(f"warning: {step}: {text}")
+        """Show a running step's progress (`done` of `total`, in any unit) and description."""
+        share = min(done / total, 1.0) if total else 0.0
+        self._running[step] = (share, f"{f'{share:4.0%}' if total else ''} {printable(text)}".strip())
+        self._draw(step.stage)
+        if self.plain and time.monotonic() - self._line_time >= BEAT:
+            self.report(f"{step.stage:<10} {step.item:<16} {self._running[step][1]}")
 
     def finish(self, step: Step, seconds: float) -> None:
         """Show that a step is done, after `seconds`."""
         total, left = self.stages[step.stage]
         self.stages[step.stage] = (total, max(0, left - 1))  # The plan may already know the result.
-        self._running.pop(step, None)
-        self._line(step, f"{step.item:<16} {seconds:6.1f} s")
+        self._running.pop(step)
+        self._draw(step.stage)
+        if self.plain:
+            self.report(f"{step.stage:<10} {step.item:<16} {seconds:6.1f} s")
 
     def fail(self, step: Step, error: str, traceback: str | None) -> None:
-        """Print the error of a step; `traceback` names the file with details of a defect of the program."""
+        """Print the error of a step, with the traceback of a defect of the program."""
         self._running.pop(step, None)
         self.report(f"error: {step}: {error}")
         if traceback:
-            self.report(f"  this is a defect of the program, not of your input; details: {traceback}")
+            self.report(f"  this is a defect of the program, not of your input:\n{traceback}")
+
+    def _draw(self, stage: str) -> None:
+        """Set the bar of a stage."""
+        total, left = self.stages.get(stage, (1, 1))
+        running = {step: state for step, state in self._running.items() if step.stage == stage}
+        done = total - left + sum(share for share, _ in running.values())
+        words = "; ".join(f"{step.item} {text}".strip() for step, (_, text) in running.items())[:80]
+        self._bars.update(self._rows[stage], completed=done, total=total, count=f"{total - left}/{total}", words=words)
 
     def close(self) -> None:
-        """Draw the bars a last time and release the terminal."""
-        if self._bars:
-            self.tick()
-            self._bars.stop()
-
-
-def _bars() -> Any:
-    """Return rich's progress bars; rich is loaded for a terminal only."""
-    from rich import progress
-    from rich.console import Console
-
-    stream = sys.stderr.stream if isinstance(sys.stderr, PrintableStream) else sys.stderr  # rich moves the cursor
-    columns = (
-        progress.SpinnerColumn(),
-        progress.TextColumn("{task.description:<10}", markup=False),
-        progress.BarColumn(24),
-        progress.TextColumn("{task.fields[count]:>7}"),
-        progress.TimeElapsedColumn(),
-        progress.TimeRemainingColumn(),
-        progress.TextColumn("{task.fields[words]}", markup=False),
-    )
-    return progress.Progress(*columns, console=Console(file=stream), speed_estimate_period=600)
+        """Release the terminal."""
+        self._bars.stop()

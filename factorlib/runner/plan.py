@@ -114,8 +114,8 @@ def _plan_step(step: Step, forced: bool, base: Record, outputs: Mapping[Step, st
         return Planned(step, "to run", ["forced"], whole, key)
     if key and (output := listing.outputs.get(key)) is not None:
         return Planned(step, "current", [], record, key, output)
-    if key and key in listing.damaged:
-        return Planned(step, "to run", [f"its result is damaged: {summarize(listing.damaged[key])}"], whole, key)
+    if key and (faults := listing.damaged.get(key)):
+        return Planned(step, "to run", [f"its result is damaged: {summarize(faults)}"], whole, key)
     if (before := listing.previous.get(str(step))) is None:
         return Planned(step, "to run", ["not made yet"], whole, key)
     pending = {f"input:{above}" for above in missing}
@@ -148,7 +148,6 @@ _LABELS = {
 _ABSENT = object()
 _HASHED = ("source", "file", "recipe file", "given", "input", "data")
 _LONGEST = 80  # characters of a value in a message
-_MOST_NAMES = 4  # items of a list in a message
 
 
 def difference(before: Record, after: Record) -> list[str]:
@@ -163,12 +162,6 @@ def _change(name: str, old: Any, new: Any) -> str:
     label = _LABELS.get(kind, "{}").format(field.removeprefix(DATASET) if kind == "facts" else field) if colon else name
     if kind in _HASHED:
         return f"{label}: " + ("new" if old is _ABSENT else "gone" if new is _ABSENT else "changed")
-    if isinstance(old, list) and isinstance(new, list):
-        added = [item for item in new if item not in old]
-        removed = [item for item in old if item not in new]
-        if added + removed and all(isinstance(item, str) for item in added + removed):
-            words = [f"{item!r} added" for item in added[:_MOST_NAMES]]
-            return f"{label}: {', '.join(words + [f'{item!r} removed' for item in removed[:_MOST_NAMES]])}"
     return f"{label}: {_format(old, kind)} -> {_format(new, kind)}"
 
 

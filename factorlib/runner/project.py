@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 import importlib
-import json
 import os
-import re
 import shlex
 import signal
 import threading
@@ -18,13 +16,15 @@ from typing import Annotated, Any, Literal, NamedTuple, NoReturn
 import msgspec
 
 from factorlib.errors import InputError, did_you_mean
+from factorlib.jsonfile import json_text
+from factorlib.reading import one_line
 from factorlib.yamlfile import convert, parse_yaml, read_yaml
 
 DATASET_CURE = "name a folder in data/, or give the path of a folder with a dataset.yaml"
 PIPELINE = "pipeline.yaml"
 LIBRARY = Path(__file__).resolve().parent.parent.parent  # the folder that holds factorlib/
 RESERVED = ("studies", "bench", "store", "compare", "docs")  # folders of build/ that are no datasets
-LONGEST = 255  # bytes of a file's name on every common file system
+LONGEST = 200  # bytes of the name of a dataset or recipe
 SHARED = "FACTORLIB_STORE"  # environment variable: folder of a store that several checkouts share
 ALL = "all"  # stands for all recipes
 
@@ -54,7 +54,7 @@ class Data(msgspec.Struct, frozen=True):
     photos: list[str]
     slice: Callable[[str, str | None], Any]
     faults: Callable[[str, str | None, dict[str, Any], Path], list[InputError]] = lambda *_: []
-    recipe: Callable[[Path], Recipe] | None = None
+    recipe: Callable[[Path], Recipe] = lambda _: Recipe({}, {})
     recipe_faults: Callable[[dict[str, Path]], list[InputError]] = lambda _: []
     cautions: Callable[[], list[str]] = list
 
@@ -139,18 +139,15 @@ class Project(msgspec.Struct, frozen=True):
         if not (name := os.environ.get(SHARED)):
             return self.build / "store"
         if not (folder := Path(name).expanduser()).is_dir():
-            short = name[:100]
-            fault, cure = "there is no such folder", f"create it (mkdir -p {shlex.quote(short)}), or name another"
-            if os.path.lexists(folder):
-                fault, cure = "is a file, not a folder", "name a folder; it may be empty"
-            raise InputError(fault, file=short, key=SHARED, cure=cure)
+            cure = f"create it (mkdir -p {shlex.quote(name)}), or name another folder; it may be empty"
+            raise InputError("there is no such folder", file=name, key=SHARED, cure=cure)
         return folder.resolve()
 
     def command(self, verb: str, dataset: str) -> str:
         """Format the command of a verb for a dataset, for a user of the checkout or of the installed package."""
         return f"{f'factorlib {verb} -d ' if self.shipped else f'make {verb} DATASET='}{shlex.quote(dataset)}"
 
-    def shown(self, path: Path) -> str:
+    def short_path(self, path: Path) -> str:
         """Format a path for messages: relative to the current folder if it lies below."""
         here = Path.cwd()
         return str(path.relative_to(here)) if path.is_relative_to(here) else str(path)
@@ -169,14 +166,13 @@ class Project(msgspec.Struct, frozen=True):
         if by_name:
             check_name(name, "a dataset", key="DATASET", reserved=RESERVED)
         for path in ([self.root / "data" / name] if by_name else []) + [Path(os.path.abspath(name))]:
-            if not os.path.exists(path):
-                continue
-            folder = path if os.path.isdir(path) else path.parent
-            check_name(folder.name, "a dataset", file=folder, key="DATASET", reserved=RESERVED)
-            if self.root.is_relative_to(folder) or folder == self.build:
-                fault = "a dataset cannot be the folder that holds the project"
-                raise InputError(fault, file=folder, key="DATASET", cure=DATASET_CURE)
-            return folder
+            if os.path.exists(path):
+                folder = path if os.path.isdir(path) else path.parent
+                check_name(folder.name, "a dataset", file=folder, key="DATASET", reserved=RESERVED)
+                if self.root.is_relative_to(folder) or folder == self.build:
+                    fault = "a dataset cannot be the folder that holds the project"
+                    raise InputError(fault, file=folder, key="DATASET", cure=DATASET_CURE)
+                return folder
         return None
 
     def recipes(self, data: Data, words: Sequence[str]) -> dict[str, Recipe]:
@@ -192,38 +188,31 @@ class Project(msgspec.Struct, frozen=True):
         known = {path.stem: path for folder in folders for path in sorted(folder.glob("*.yaml"))}
         paths: list[Path] = []
         for word in words:
-            path = Path(os.path.abspath(word))
-            if word != ALL and word not in known and not path.is_file():
+            path = known.get(word, Path(os.path.abspath(word)))
+            if word != ALL and not path.is_file():
                 cure = did_you_mean(path.stem, [*known, ALL])
                 raise InputError(f"there is no recipe {word!r}", key="RECIPE", cure=cure)
-            paths += known.values() if word == ALL else [known.get(word, path)]
-        if not paths and words:
-            raise InputError("there are no recipes in recipes/", key="RECIPE", cure="name a file: RECIPE=<path>.yaml")
-        if paths and data.recipe is None:
-            raise InputError("this kind of dataset has no recipes", key="RECIPE", cure="leave RECIPE out")
+            paths += known.values() if word == ALL else [path]
         recipes: dict[str, Recipe] = {}
         for path in dict.fromkeys(paths):
-            name = check_name(path.stem, "a recipe", file=path, key="RECIPE", most=200)
-            if name in recipes:
-                fault = f"two recipes are called {name!r}; their pictures would go to one folder"
+            check_name(path.stem, "a recipe", file=path, key="RECIPE")
+            if path.stem in recipes:
+                fault = f"two recipes are called {path.stem!r}; their pictures would go to one folder"
                 raise InputError(fault, file=path, cure="rename one of them")
-            recipes[name] = data.recipe(path)  # type: ignore[misc]
+            recipes[path.stem] = data.recipe(path)
         return recipes
 
 
-def check_name(
-    name: str, kind: str, *, file: Any = None, key: str | None = None, reserved: Sequence[str] = (), most: int = LONGEST
-) -> str:
-    """Return a name that one file or folder can have; InputError for another, or a reserved one.
+def check_name(name: str, kind: str, *, file: Any = None, key: str | None = None, reserved: Sequence[str] = ()) -> None:
+    """Raise InputError for a name that a folder of results cannot have, or a reserved one.
 
-    kind: the named thing, with its article;  most: bytes
+    kind: the named thing, with its article
     """
-    valid = name.encode(errors="replace").decode() == name and not set("/\0\n") & set(name)
-    if not valid or name in ("", ".", "..", *reserved) or len(name.encode()) > most:
+    usable = name.isprintable() and "/" not in name and len(name.encode()) <= LONGEST
+    if not usable or name in ("", ".", "..", *reserved):
         taken = f"; the names {', '.join(reserved)} are reserved" if reserved else ""
-        cure = f"rename it: UTF-8, at most {most} bytes, no slash or line break{taken}"
+        cure = f"rename it: printable characters, at most {LONGEST} bytes, no slash{taken}"
         raise InputError(f"{kind} cannot be called {name!r}", file=file, key=key, cure=cure)
-    return name
 
 
 class StageCode(msgspec.Struct, frozen=True):
@@ -243,12 +232,9 @@ class StageCode(msgspec.Struct, frozen=True):
 
 # ── pipeline.yaml ────────────────────────────────────────────────────────────────────────────────────────────────────
 
-FORMAT = 1
+StageName = Annotated[str, msgspec.Meta(pattern="^[a-z][a-z0-9_]*$", description="rename it: a-z, 0-9 and _")]
 MOST_CORES = 1024
-SHOWN = 80  # characters of a setting in a message
-LONGEST_SETTING, DEEPEST = 5000, 16  # characters of a setting (a path may have 4096), parts of its name
-NAME = re.compile("[a-z][a-z0-9_]*")
-TAKEN = ("errors",)  # folders of build/<dataset>/ beside those of the stages
+DEEPEST = 16  # parts of the name of a setting
 EXECUTORS = "write processes, or the address of a Dask scheduler, such as tcp://10.0.0.1:8786"
 EXECUTOR_PATTERN = r"^(processes|(tcp|tls|ws|wss|ucx|ucxx)://[^\s/]+:\d+)$"
 Executor = Annotated[str, msgspec.Meta(pattern=EXECUTOR_PATTERN, description=EXECUTORS)]
@@ -323,13 +309,20 @@ class Pipeline(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     executor: `processes` of this machine, or the address of a Dask scheduler; it changes no bit and no key
     """
 
-    format: int
-    stages: dict[str, Stage]
+    format: Literal[1]
+    stages: dict[StageName, Stage]
     executor: Executor = "processes"
 
     def order(self) -> list[str]:
         """Return the stages, each after those it takes, otherwise in the order of the file."""
         return list(TopologicalSorter({name: stage.upstream for name, stage in self.stages.items()}).static_order())
+
+    def check(self, stages: Sequence[str]) -> None:
+        """Raise InputError for a name that is not a stage's."""
+        for name in (name for name in stages if name not in self.stages):
+            near = did_you_mean(name, self.stages)
+            cure = near if near.startswith("did") else "make help-all lists all verbs and stages"
+            raise InputError(f"there is no verb or stage {name!r}", cure=cure)
 
     def for_data(self, is_empty: Callable[[str], bool]) -> Pipeline:
         """Return the pipeline without the stages whose slice (`Stage.when`) is empty in a dataset."""
@@ -361,23 +354,14 @@ def read_pipeline(path: Path, known_slices: tuple[str, ...]) -> Pipeline:
     def refuse(fault: str, key: str, cure: str) -> NoReturn:
         raise InputError(fault, file=path, key=key, cure=cure) from None
 
-    if pipeline.format != FORMAT:
-        refuse(f"format {pipeline.format} is unknown", "format", f"this version reads format: {FORMAT}")
     known = [*(DATASET + name for name in known_slices), *pipeline.stages]
     for name, stage in pipeline.stages.items():
-        key = f"stages.{name}"
-        if not NAME.fullmatch(name) or name in TAKEN:
-            refuse(f"a stage cannot be called {name!r}", "stages", "rename it: a-z, 0-9 and _, not errors")
-        if stage.gather is not None:
-            check_name(stage.gather, "a gathered file", file=path, key=f"{key}.gather")
-            if stage.over != "photo":
-                refuse("only a stage over photos can gather", f"{key}.gather", "add over: photo")
+        if stage.gather is not None and stage.over != "photo":
+            refuse("only a stage over photos can gather", f"stages.{name}.gather", "add over: photo")
         for entry in (entry for entry in stage.inputs if entry not in known):
-            refuse(f"there is no stage or slice {entry!r}", f"{key}.inputs", did_you_mean(entry, known))
+            refuse(f"there is no stage or slice {entry!r}", f"stages.{name}.inputs", did_you_mean(entry, known))
         if stage.when is not None and stage.when not in known_slices:
-            refuse(f"there is no slice {stage.when!r}", f"{key}.when", did_you_mean(stage.when, known_slices))
-        for param in (param for param in stage.given if param in stage.inputs):
-            refuse(f"{param!r} is the name of a stage", f"{key}.given", "rename the parameter")
+            refuse(f"there is no slice {stage.when!r}", f"stages.{name}.when", did_you_mean(stage.when, known_slices))
     try:
         pipeline.order()
     except CycleError as error:
@@ -396,14 +380,14 @@ def with_settings(pipeline: Pipeline, settings: Sequence[str]) -> Pipeline:
     executor = pipeline.executor
     for word in _words(settings):
         target, equals, text = word.partition("=")
-        key = f"SET {_cut(word)}"
+        key = f"SET {one_line(word)}"
         if target == "executor":
             executor = convert(text, Executor, key)
             continue
         stage, *names = target.split(".")
-        if not equals or not names or not all(names) or len(names) > DEEPEST or len(word) > LONGEST_SETTING:
+        if not equals or not all(names) or not 0 < len(names) <= DEEPEST:
             cure = 'write stage.parameter=value, as in SET="solve.cells=800"'
-            raise InputError(f"{_cut(word)!r} is no setting", key="SET", cure=cure)
+            raise InputError(f"{one_line(word)!r} is no setting", key="SET", cure=cure)
         if stage not in stages:
             raise InputError(f"there is no stage {stage!r}", key=key, cure=did_you_mean(stage, stages))
         table = params = dict(stages[stage].params)
@@ -417,16 +401,17 @@ def with_settings(pipeline: Pipeline, settings: Sequence[str]) -> Pipeline:
 
 
 def _value(text: str, key: str) -> Any:
-    """Parse the value of a setting, which must be fit for a record and for a message to a worker."""
+    """Parse the value of a setting; InputError for one that JSON cannot hold."""
     try:
         value = parse_yaml(text, key)
-        msgspec.msgpack.encode(value), json.dumps(value, allow_nan=False)
-        return value
+        json_text(value).encode()
     except InputError:
         raise
-    except (ValueError, OverflowError, RecursionError) as error:
-        cure = "write a finite number, a word, or a short list"
-        raise InputError(f"the value cannot be stored ({error})", key=key, cure=cure) from error
+    except ValueError as error:
+        raise InputError(
+            f"the value cannot be stored ({error})", key=key, cure="write a finite number or text"
+        ) from None
+    return value
 
 
 def blame_setting(error: InputError, settings: Sequence[str]) -> InputError:
@@ -435,20 +420,12 @@ def blame_setting(error: InputError, settings: Sequence[str]) -> InputError:
         stage, _, name = word.partition("=")[0].partition(".")
         key = f"stages.{stage}.params.{name}"
         if error.key == key or (error.key or "").startswith((f"{key}.", f"{key}[")):
-            return InputError(error.found, key=f"SET {_cut(word)}", cure=error.cure)
+            return InputError(error.found, key=f"SET {one_line(word)}", cure=error.cure)
     return error
 
 
 def _words(settings: Sequence[str]) -> list[str]:
-    words: list[str] = []
-    for text in settings:
-        try:
-            words += shlex.split(text)
-        except ValueError as error:
-            fault = f"{_cut(text)!r} cannot be split into words ({error})"
-            raise InputError(fault, key="SET", cure="close every quote") from error
-    return words
-
-
-def _cut(word: str) -> str:
-    return word if len(word) <= SHOWN else word[:SHOWN] + "…"
+    try:
+        return [word for text in settings for word in shlex.split(text)]
+    except ValueError as error:
+        raise InputError(f"cannot be split into words ({error})", key="SET", cure="close every quote") from None

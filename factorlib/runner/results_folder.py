@@ -1,13 +1,12 @@
 """The folders build/<dataset> that a user sees, and the verbs that maintain them and the store: verify, clean, gc.
 
-    <stage>       link to the current result of a stage, in build/store; of a stage over photos, to a view
-    current.json  key of each step and view
-    log.jsonl     events of all runs
-    errors/       traceback of each step that failed by a defect
+    <stage>       link to the current result of a stage, in build/store; of a stage over photos, to a view of all
+    current.json  key of each step
+    log.jsonl     costs, warnings and errors of all runs
     recipes/      links to the current pictures of each recipe
     dataset.txt   the dataset; only a folder with this file was made by the runner
 
-A view is a result, too: the files of all photos of a stage in one folder, as hard links.  Each run has a folder in
+A view, in store/views, has the files of all photos of a stage in one folder, as hard links.  Each run has a folder in
 store/tmp and holds a lock in it while it lives.  The operating system frees the lock of a killed run, so its folder can
 be deleted, and there is no unlock command.
 """
@@ -15,15 +14,14 @@ be deleted, and there is no unlock command.
 from __future__ import annotations
 
 import contextlib
-import hashlib
-import logging
 import os
 import shlex
 import shutil
 import time
 import uuid
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import msgspec
 
@@ -36,11 +34,7 @@ from factorlib.runner.store import (
     LOCK,
     Entry,
     Hash,
-    Report,
-    Stamp,
     Store,
-    damage_of,
-    hash_of_file,
     is_locked,
     lock,
     remove_killed_runs,
@@ -48,9 +42,10 @@ from factorlib.runner.store import (
 )
 from factorlib.wholefile import replace_file, write_text
 
-log = logging.getLogger("factorlib.runner")
+if TYPE_CHECKING:
+    from filelock import BaseFileLock
+
 NO_STAGE = "left over"  # damaged results, and files without a key
-LONGEST = 85  # bytes of the name of a step's files, without suffixes
 
 
 class ResultsFolder(msgspec.Struct, frozen=True):
@@ -61,7 +56,6 @@ class ResultsFolder(msgspec.Struct, frozen=True):
     log = property(lambda self: self.folder / "log.jsonl")
     keys_file = property(lambda self: self.folder / "current.json")
     mark = property(lambda self: self.folder / "dataset.txt")
-    errors = property(lambda self: self.folder / "errors")
 
     def keys(self) -> dict[str, str]:
         """Return the key of each step's current result; InputError if the file is damaged."""
@@ -72,45 +66,36 @@ class ResultsFolder(msgspec.Struct, frozen=True):
         except DECODE_ERRORS as error:
             fault = f"does not list the current results ({getattr(error, 'strerror', None) or error})"
             cure = "delete it: the next run writes it again and finds the results in the store"
-            raise InputError(fault, file=self.keys_file, cure=cure) from error
-
-    def keys_if_readable(self) -> dict[str, str]:
-        """Return the keys; none, with a warning, if the file is damaged."""
-        try:
-            return self.keys()
-        except InputError as error:
-            log.warning("%s; nothing is lost, but the changes since the last run are unknown", error)
-            return {}
+            raise InputError(fault, file=self.keys_file, cure=cure) from None
 
     def owner(self, project: Project) -> Path | None:
         """Return the dataset's folder; None if no file tells."""
         with contextlib.suppress(OSError):
-            path = self.mark.read_text(encoding="utf-8", errors="surrogateescape").removesuffix("\n")
+            path = self.mark.read_text(encoding="utf-8", errors="surrogateescape").strip()
             return project.root / path if path else None
         return None
 
     def set_owner(self, project: Project, dataset: Path) -> None:
         """Write the dataset's folder down, relative to the project if it lies inside, so that checkouts can move."""
-        self.folder.mkdir(parents=True, exist_ok=True)
         path = dataset.relative_to(project.root) if dataset.is_relative_to(project.root) else dataset
         if self.owner(project) != project.root / path:
+            self.folder.mkdir(parents=True, exist_ok=True)
             replace_file(self.mark, f"{path}\n".encode("utf-8", "surrogateescape"))
 
 
-def results_of(project: Project, dataset: Path, by_name: bool = False) -> ResultsFolder:
+def results_of(project: Project, dataset: Path) -> ResultsFolder:
     """Return build/<name of the dataset's folder>, which may not exist yet.
 
     Raises:
-        InputError: It is a link, or (unless it was asked for `by_name`) has the results of another dataset.
+        InputError: It is a link, or has the results of another dataset that exists.
     """
     check_name(dataset.name, "a dataset", file=dataset, key="DATASET", reserved=RESERVED)
     results = ResultsFolder(project.build / dataset.name)
-    if os.path.realpath(results.folder) != os.path.join(os.path.realpath(project.build), dataset.name):
+    if results.folder.is_symlink():
         fault = "is a link; the runner keeps the results of a dataset in a folder"
         raise InputError(fault, file=results.folder, cure="delete the link, or move it elsewhere")
-    owner = None if by_name else results.owner(project)
-    moved = os.path.isdir(dataset) and owner is not None and (not os.path.isdir(owner) or owner.samefile(dataset))
-    if owner not in (None, dataset) and not moved:
+    owner = results.owner(project)
+    if owner not in (None, dataset) and os.path.isdir(owner) and not (dataset.exists() and owner.samefile(dataset)):
         fault = f"two datasets are called {dataset.name!r}: build/{dataset.name} holds the results of {owner}"
         cure = f"rename one of the folders, or give up these results: make clean DATASET={shlex.quote(str(owner))}"
         raise InputError(fault, file=dataset, cure=cure)
@@ -123,10 +108,8 @@ def all_results(project: Project) -> list[ResultsFolder]:
     return [results for results in folders if results.mark.is_file()]
 
 
-def find_results(project: Project, dataset: str | None, verb: str) -> list[ResultsFolder]:
-    """Return the results folder of a dataset, or of all; a message tells that there is nothing to `verb`.
-
-    The dataset itself may be gone: a name is that of a folder in build/, a path that for which the folder was made.
+def find_results(project: Project, dataset: str | None) -> list[ResultsFolder]:
+    """Return the results folder of a dataset, which may be gone itself, or of all.
 
     Raises:
         InputError: There is neither a dataset nor a results folder.
@@ -134,26 +117,12 @@ def find_results(project: Project, dataset: str | None, verb: str) -> list[Resul
     if dataset is None:
         return all_results(project)
     folder = project.find_dataset(dataset)
-    by_name = folder is None and "/" not in dataset
-    results = results_of(project, folder or Path(os.path.abspath(dataset)), by_name)
-    if results.mark.is_file():
-        return [results]
-    if folder is None:
+    results = results_of(project, folder or Path(os.path.abspath(dataset)))
+    if folder is None and not results.mark.is_file():
         known = [other.folder.name for other in all_results(project)]
         cure = did_you_mean(dataset, known) if known else "build/ holds no results of any dataset"
         raise InputError(f"there is no dataset {dataset!r}, and no results of one", key="DATASET", cure=cure)
-    print(f"nothing to {verb}: {dataset} has no results")
-    return []
-
-
-def label(step: Step) -> str:
-    """Return a name for a step's files, short however long the photo's name is.
-
-    >>> label(Step("masks", "kitchen")), len(label(Step("masks", "k" * 240)))
-    ('masks-kitchen', 70)
-    """
-    name = str(step).replace("/", "-")
-    return name if len(name.encode()) <= LONGEST else f"{step.stage[:20]}-{hashlib.sha256(name.encode()).hexdigest()}"
+    return [results] if results.mark.is_file() else []
 
 
 def set_link(link: Path, target: Path, build: Path) -> None:
@@ -170,84 +139,56 @@ def set_link(link: Path, target: Path, build: Path) -> None:
     os.replace(draft, link)
 
 
-def view_of(store: Store, stage: str, keys: dict[str, str], gather: str | None) -> Entry:
-    """Return the view of a stage over photos ({photo: key}): the files of all photos in one folder, as hard links.
+def view_of(store: Store, outputs: Mapping[str, str], gather: str | None) -> Path:
+    """Return the folder with the files of all photos of a stage ({photo: output}), as hard links.
 
-    The contents of all `<photo>.json` are also written to the file `gather`.
+    The contents of all `<photo>.json` are also in the file `gather`.
     """
-    entries = {photo: entry for photo, key in sorted(keys.items()) if (entry := store.entry(key))}
-    record = {f"input:{stage}/{photo}": entry.output for photo, entry in entries.items()}
-    record |= {"stage": stage, "photo": None, "view": gather}  # type: ignore[dict-item]
-    key = hash_of(record)
-    if store.get(key) is not None and (view := store.entry(key)):
+    view = store.views / hash_of({"photos": dict(outputs), "gather": gather})
+    trees = {store.trees / output: stamps_of(store.trees / output) for output in sorted(set(outputs.values()))}
+    files = {name: stamp for stamps in trees.values() for name, stamp in stamps.items()}
+    if {name: stamp for name, stamp in stamps_of(view).items() if name != gather} == files:
         return view
-    draft = store.tmp / f"view-{uuid.uuid4().hex[:8]}-{key}"
-    files: dict[str, str] = {}
-    sound: dict[str, Stamp] = {}
-    draft.mkdir(parents=True)
-    try:
-        for photo, entry in entries.items():
-            for name in entry.files:
-                if name in files:
-                    fault = f"two photos write the same file {name!r}"
-                    raise InputError(fault, key=photo, cure="put the photo's name into the file's name")
-                _link_or_copy(store.trees / entry.output / name, draft / name)
-            files |= entry.files
-            sound |= store.hashes.sound_tree(entry.output)
-        if damage := damage_of(draft, files, sound):  # A result was damaged after the plan.
-            raise InputError(f"a result was damaged: {damage[0]}", key=stage, cure="run again: it is made again")
-        if gather:
-            write_text(draft / gather, json_text({photo: read_json(draft / f"{photo}.json") for photo in entries}))
-            (draft / gather).chmod(0o444)
-            files[gather] = hash_of_file(draft / gather)
-        view = store.add_tree(record, draft, log.warning, files)
-        store.set_key(key, view)
-    finally:
-        shutil.rmtree(draft, ignore_errors=True)
-    store.forget(key)
-    store.hashes.set_sound_tree(view.output, stamps_of(store.trees / view.output))
+    draft = store.tmp / f"view-{uuid.uuid4().hex[:8]}-{view.name}"
+    for source in (tree / name for tree, stamps in trees.items() for name in stamps):
+        target = draft / Path(*source.relative_to(store.trees).parts[1:])
+        target.parent.mkdir(parents=True, exist_ok=True)
+        try:
+            os.link(source, target)
+        except OSError:  # no hard links on this file system
+            shutil.copy2(source, target)
+    if gather:
+        write_text(draft / gather, json_text({photo: read_json(draft / f"{photo}.json") for photo in sorted(outputs)}))
+    store.views.mkdir(exist_ok=True)
+    store.set_aside(view)
+    with contextlib.suppress(OSError):  # Another run was faster.
+        os.rename(draft, view)
     return view
 
 
-def _link_or_copy(source: Path, target: Path) -> None:
-    target.parent.mkdir(parents=True, exist_ok=True)
-    try:
-        os.link(source, target)
-    except OSError:  # no hard links on this file system
-        shutil.copy2(source, target)
-
-
-def begin_run(store: Store, report: Report) -> tuple[Path, int]:
+def begin_run(store: Store) -> tuple[Path, BaseFileLock]:
     """Create a run's folder for unfinished results, and return it with the lock in it that shows that the run lives."""
     folder = store.tmp / f"run-{os.getpid()}-{uuid.uuid4().hex[:8]}"
-    store.locks.mkdir(parents=True, exist_ok=True)
-    with _entrance(store, report):
+    with _entrance(store):
         return folder, lock(folder / LOCK)
 
 
 @contextlib.contextmanager
 def no_runs(store: Store) -> Iterator[None]:
     """Keep runs from starting inside, where results are deleted; InputError if a run is going on."""
-    with _entrance(store, lambda _: None):
+    with _entrance(store):
         if any(is_locked(folder / LOCK) for folder in store.tmp.iterdir()):
             raise InputError("a run is going on", file=store.root, cure="wait until it has ended")
         yield
 
 
 @contextlib.contextmanager
-def _entrance(store: Store, report: Report) -> Iterator[None]:
+def _entrance(store: Store) -> Iterator[None]:
     """Admit one command at a time; the folders of killed runs are deleted first."""
     store.tmp.mkdir(parents=True, exist_ok=True)
-    try:
-        descriptor = lock(store.root / "door.lock")
-    except BlockingIOError:
-        report("waiting: another command begins a run or cleans the store")
-        descriptor = lock(store.root / "door.lock", wait=True)
-    try:
+    with lock(store.root / "door.lock", wait=True):
         remove_killed_runs(store.tmp)
         yield
-    finally:
-        os.close(descriptor)
 
 
 # ── gc ───────────────────────────────────────────────────────────────────────────────────────────────────────────────
@@ -265,18 +206,15 @@ def collect(project: Project, confirm: Callable[[], bool] = lambda: True) -> int
         raise InputError(fault, file=store.root, cure=cure)
     with no_runs(store):
         keys, trees, rest = _unused(project, store)
-        sizes = {path.name: sum(f.stat().st_size for f in path.rglob("*") if f.is_file()) for path in trees}
-        freed = sum(sizes.values()) / 1e6
-        groups: dict[str, list[tuple[float, int]]] = {}  # age in s and size of each result, by stage
-        for path in keys:
-            stage, output = (entry.record["stage"], entry.output) if (entry := store.entry(path.stem)) else ("", "")
-            groups.setdefault(stage or NO_STAGE, []).append((_age(path), sizes.pop(output, 0)))
-        for path in (path for path in trees if path.name in sizes):
-            groups.setdefault(NO_STAGE, []).append((_age(path), sizes[path.name]))
-        for stage, results in sorted(groups.items(), key=lambda group: -sum(size for _, size in group[1])):
-            ages = dict.fromkeys(_age_text(limit(age for age, _ in results)) for limit in (min, max))
-            count = f"{len(results):>5} {'result ' if len(results) == 1 else 'results'}"
-            print(f"{stage:<10} {count} {sum(size for _, size in results) / 1e6:>9.1f} MB   {' to '.join(ages)} old")
+        stages = {entry.output: entry.record["stage"] for path in keys if (entry := store.entry(path.stem))}
+        groups: dict[str, list[Path]] = {}
+        for path in trees:
+            groups.setdefault(stages.get(path.name, NO_STAGE), []).append(path)
+        for stage, paths in groups.items():
+            size = sum(file.stat().st_size for path in paths for file in path.rglob("*") if file.is_file())
+            dates = sorted(time.strftime("%Y-%m-%d", time.localtime(path.stat().st_mtime)) for path in paths)
+            made = " to ".join(dict.fromkeys((dates[0], dates[-1])))
+            print(f"{stage:<10} {_results(len(paths)):>12} {size / 1e6:>9.1f} MB   of {made}")
         if groups and not confirm():
             print("nothing was deleted")
             return 0
@@ -287,32 +225,23 @@ def collect(project: Project, confirm: Callable[[], bool] = lambda: True) -> int
                 shutil.rmtree(aside)
             else:
                 path.unlink()
-    print(f"deleted {len(keys)} results that nothing uses, {freed:.1f} MB")
+    print(f"deleted {_results(len(trees))} that nothing uses")
     return 0
 
 
-def _age(path: Path) -> float:
-    return time.time() - path.stat().st_mtime
-
-
-def _age_text(seconds: float) -> str:
-    """Format an age in hours or days.
-
-    >>> _age_text(30), _age_text(7200), _age_text(200000)
-    ('less than an hour', '2 h', '2 days')
-    """
-    hours = int(max(0.0, seconds) // 3600)
-    return "less than an hour" if hours == 0 else f"{hours} h" if hours < 48 else f"{hours // 24} days"
+def _results(count: int) -> str:
+    return f"{count} result{'' if count == 1 else 's'}"
 
 
 def _unused(project: Project, store: Store) -> tuple[list[Path], list[Path], list[Path]]:
-    """List the store's entries that no current result refers to: keys, trees, and the rest (logs, locks, drafts)."""
-    folders = [ResultsFolder(path) for path in project.build.glob("*") if path.is_dir() and path.name != "store"]
-    keys = _needed(store, {key for results in folders for key in results.keys().values()})
+    """List the store's entries that no current result refers to: keys, trees, and the rest (locks, drafts)."""
+    current = [ResultsFolder(path.parent).keys() for path in project.build.glob("*/current.json")]
+    keys = _needed(store, {key for table in current for key in table.values()})
     trees = {entry.output for key in keys if (entry := store.entry(key))}
     unused = [p for p in store.keys.glob("*") if p.stem not in keys or p.suffix != ".json"]
-    rest = [p for p in store.logs.glob("*") if p.stem not in keys or p.suffix != ".jsonl"]
-    rest += [path for name in ("locks/*", "unfinished/*", "cache/.*") for path in store.root.glob(name)]
+    rest = [path for name in ("locks/*", "unfinished/*", "cache/.*") for path in store.root.glob(name)]
+    linked = {os.path.realpath(link) for link in project.build.glob("*/*") if link.is_symlink()}
+    rest += [view for view in store.views.glob("*") if os.path.realpath(view) not in linked]
     return unused, [p for name in ("trees/*", "damaged/*") for p in store.root.glob(name) if p.name not in trees], rest
 
 
@@ -325,22 +254,23 @@ def _needed(store: Store, current: set[str]) -> set[str]:
     entries = {path.stem: entry for path in store.keys.glob("*.json") if (entry := store.entry(path.stem))}
     makers: dict[tuple[str, str], set[str]] = {}
     for key, entry in entries.items():
-        makers.setdefault((f"input:{_step(entry)}", entry.output), set()).add(key)
+        makers.setdefault((f"input:{step_of(entry)}", entry.output), set()).add(key)
     needed = set(current)
     stack = [key for key in current if key in entries]
     while stack:
         inputs = [item for item in entries[stack.pop()].record.items() if item[0].startswith("input:")]
-        above = set().union(*(makers.get(item, set()) for item in inputs)) - needed
+        above = {key for item in inputs for key in makers.get(item, ())} - needed
         stack += above
         needed |= above
     return needed
 
 
-def _step(entry: Entry) -> Step:
+def step_of(entry: Entry) -> Step:
+    """Return the step that has made a result."""
     return Step(entry.record["stage"], entry.record.get("photo"), entry.record.get("recipe"))
 
 
-# ── verify ───────────────────────────────────────────────────────────────────────────────────────────────────────────
+# ── verify and clean ─────────────────────────────────────────────────────────────────────────────────────────────────
 
 
 def verify(project: Project, dataset: str | None) -> int:
@@ -349,77 +279,42 @@ def verify(project: Project, dataset: str | None) -> int:
     The next run that needs a damaged result makes it again.
     """
     store = Store(project.store)
-    users: dict[str, list[str]] = {}
-    for results in find_results(project, dataset, "read"):
+    users: dict[str, list[str]] = {} if dataset else {path.stem: [] for path in store.keys.glob("*.json")}
+    for results in find_results(project, dataset):
         for step, key in results.keys().items():
             users.setdefault(key, []).append(f"{step} ({results.folder.name})")
-    keys = sorted(users.keys() | ({path.stem for path in store.keys.glob("*.json")} if dataset is None else set()))
-    trees: dict[str, list[str]] = {}  # Each tree is read once, however many keys it has.
     damaged = 0
-    for key in keys:
-        place = store.keys / f"{key}.json"
-        faults = ["missing, not readable, or not of this key"]
-        if entry := store.entry(key):
-            place = store.trees / entry.output
-            users.setdefault(key, [f"{_step(entry)} (of an earlier run)"])
-            if entry.output not in trees:
-                trees[entry.output] = store.damage(entry, reread=True)
-            faults = trees[entry.output]
+    for key, steps in sorted(users.items()):
+        entry = store.entry(key)
+        place = store.trees / entry.output if entry else store.keys / f"{key}.json"
+        faults = store.faults(entry, reread=True) if entry else ["missing, not readable, or not of this key"]
         if faults:
             damaged += 1
-            print(f"{', '.join(users.get(key, ['a result']))}: {project.shown(place)}", *faults, sep="\n    ")
+            name = ", ".join(steps) or (f"{step_of(entry)} (of an earlier run)" if entry else "a result")
+            print(f"{name}: {project.short_path(place)}", *faults, sep="\n    ")
     store.hashes.save()
-    if keys or dataset is None:
-        outcome = f"{damaged} damaged; the next run that needs one makes it again" if damaged else "all are sound"
-        print(f"{len(keys)} results read: {outcome}")
+    outcome = f"{damaged} damaged; the next run that needs one makes it again" if damaged else "all are sound"
+    print(f"{_results(len(users))} read: {outcome}")
     return 1 if damaged else 0
 
 
-# ── clean ────────────────────────────────────────────────────────────────────────────────────────────────────────────
-
-
 def clean(project: Project, dataset: str | None) -> int:
-    """Delete the results folder of a dataset, or all of them and the store, and list deleted and other files.
+    """Delete the results folder of a dataset, or all of them and the store of this checkout.
 
     The results of one dataset stay in the store until the next gc.
     """
-    folders = find_results(project, dataset, "delete")
+    deleted = [results.folder for results in find_results(project, dataset)]
     store = Store(project.store)
-    deleted: list[Path] = []
-    other: list[Path] = []
-    if folders or (dataset is None and project.build.is_dir()):
-        with no_runs(store):
-            for results in folders:
-                deleted += _delete(results)
-                other += sorted(results.folder.iterdir()) if results.folder.is_dir() else []
-            if dataset is None and store.root == project.build / "store" and not store.root.is_symlink():
-                shutil.rmtree(store.root)
-                deleted.append(store.root)
-        if dataset is None:
-            other += [path for path in sorted(project.build.iterdir()) if not any(path in it.parents for it in other)]
-    for path in deleted:
-        print(f"deleted {project.shown(path)}")
-    for path in other:
-        print(f"left    {project.shown(path)}")
-    if dataset is None and not deleted:
-        print("nothing to delete")
+    if (
+        dataset is None
+        and store.root == project.build / "store"
+        and store.root.is_dir()
+        and not store.root.is_symlink()
+    ):
+        deleted.append(store.root)
+    with no_runs(store) if deleted else contextlib.nullcontext():
+        for folder in deleted:
+            shutil.rmtree(folder)
+            print(f"deleted {project.short_path(folder)}")
+    print("" if deleted else "nothing to delete\n", end="")
     return 0
-
-
-def _delete(results: ResultsFolder) -> list[Path]:
-    """Delete the runner's files of a results folder, the mark last; a link is deleted, its target is not touched."""
-    paths = [path for pattern in ("*", "*/*") for path in results.folder.glob(pattern)]
-    links = [path for path in paths if _is_link_to_result(path) and not path.parent.is_symlink()]
-    errors = [] if results.errors.is_symlink() else sorted(results.errors.glob("*.txt"))
-    files = [path for path in (results.keys_file, results.log) if path.is_symlink() or path.is_file()]
-    deleted = [*links, *files, *errors, *results.folder.glob(".current.*"), results.mark]
-    for path in deleted:
-        path.unlink()
-    for folder in (*dict.fromkeys(path.parent for path in links), results.errors, results.folder):
-        with contextlib.suppress(OSError):  # not there, a link, or not empty
-            folder.rmdir()
-    return deleted if results.folder.is_dir() else [results.folder]
-
-
-def _is_link_to_result(path: Path) -> bool:
-    return path.is_symlink() and Path(os.readlink(path)).parent.name == "trees"

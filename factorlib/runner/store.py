@@ -1,47 +1,51 @@
 """Results on disk: each tree of files is stored by the hash of its content, and each key points at its tree.
 
     build/store/trees/<output>/   files of a result, read-only
-    build/store/keys/<key>.json   {"output", "record", "files"}: the result of a key
-    build/store/logs/<key>.jsonl  cost and warnings of a result (times and machine facts are only here)
+    build/store/keys/<key>.json   entry of a key: its output, record, files, cost and warnings
+    build/store/views/<hash>/     files of all photos of a stage, as hard links to those of trees
     build/store/unfinished/<key>/ checkpoints of a step that was killed
     build/store/damaged/          damaged trees that a new result has replaced
     build/store/locks, tmp, cache
 
 A tree and a key appear by one rename each, the tree first, so that nothing half-written is ever visible.  A tree is
-sound if it has exactly the files of its record, with their contents, beside temporary ones (`is_temporary`).  The cache
-has sizes and times of sound trees, so that each is read once; `verify` reads all again.
+sound if it has exactly the files of its entry, with their contents, beside temporary ones (`is_temporary`).  The cache
+remembers the faults of a tree by sizes and times of its files, so that each is read once; `verify` reads all again.
 """
 
 from __future__ import annotations
 
 import contextlib
-import fcntl
 import hashlib
-import logging
 import os
 import shutil
 import stat
 import time
 import uuid
 from collections.abc import Callable, Iterable, Mapping
-from functools import cached_property
 from pathlib import Path
-from typing import Annotated, Any, TypeVar
+from typing import TYPE_CHECKING, Annotated, Any, TypeVar
 
 import msgspec
 
 from factorlib.errors import InputError
 from factorlib.jsonfile import json_text
+from factorlib.reading import reading
 from factorlib.runner.plan import Record, hash_of
 from factorlib.runner.project import Shipping
 from factorlib.wholefile import replace_file, sync, sync_tree
 
-log = logging.getLogger("factorlib.runner")
+if TYPE_CHECKING:
+    from filelock import BaseFileLock
+
 T = TypeVar("T")
+Report = Callable[[str], None]
 Hash = Annotated[str, msgspec.Meta(pattern="^[0-9a-f]{32}$")]
-Stamp = tuple[int, int]  # size in bytes, time of the content in ns
-FORMAT = 9  # of the cache; one of another format is ignored
+Stamp = list[int]  # size in bytes, time of the content in ns
+FORMAT = 10  # of the cache; one of another format is ignored
 FRESH_NS = 2_000_000_000  # A file changed this recently may change again within its clock's grain: it is not cached.
+NO_FILE: Stamp = [-1, 0]  # a link, a pipe: nothing that a stage may write
+LOCK = "lock"  # in the folder of a run, which holds it
+ABANDONED = 86400.0  # seconds without a change after which a draft outside a run is of a killed process
 DECODE_ERRORS = (OSError, msgspec.MsgspecError, UnicodeError, RecursionError)
 
 
@@ -61,15 +65,14 @@ def is_temporary(name: str) -> bool:
 
 
 class _Cache(msgspec.Struct, array_like=True):
-    """Content of the cache: values by kind and path with the file's stamp, and stamps of sound trees."""
+    """Content of the cache: by kind and path, the state of the file or tree and the value."""
 
     format: int = FORMAT
-    values: dict[str, dict[str, Any]] = {}
-    trees: dict[str, dict[str, Stamp]] = {}
+    values: dict[str, dict[str, tuple[Any, Any]]] = {}
 
 
 class FileHashes:
-    """Cache of values that are computed from files; `save` writes it.
+    """Cache of values that are computed from files and trees; `save` writes it.
 
     file: of the cache, None for none
     """
@@ -88,56 +91,65 @@ class FileHashes:
 
     def cached(self, kind: str, path: Path, compute: Callable[[], T], type_: Any) -> T:
         """Return a value of a type that `compute` derives from a file, from the cache if the file is unchanged."""
-        table = self._cache.values.setdefault(kind, {})
         before = _identity(path)
-        with contextlib.suppress(KeyError, OverflowError, msgspec.ValidationError):  # missing, or damaged
-            stamp, value = msgspec.convert(table[str(path)], tuple[tuple[int, int, int, int], Any])
-            if stamp == before:
-                return msgspec.convert(value, type_)
-        value = compute()
-        if before == _identity(path) and time.time_ns() - max(before[1:3]) > FRESH_NS:
-            table[str(path)] = (before, value)
-            self._changed = True
+        value = self.recall(kind, path, before, type_)
+        if value is None:
+            value = compute()
+            if before == _identity(path) and time.time_ns() - max(before[1:3]) > FRESH_NS:
+                self.remember(kind, path, before, value)
         return value
 
-    def sound_tree(self, output: str) -> dict[str, Stamp]:
-        """Return the stamps of a tree's files when they were last found sound; empty if never."""
-        return self._cache.trees.get(output, {})
+    def recall(self, kind: str, path: Path | str, state: Any, type_: Any) -> Any:
+        """Return the value of a file, by its path, or of a tree, by its hash, in this state; None without one."""
+        with contextlib.suppress(KeyError, msgspec.ValidationError):  # missing, or damaged
+            before, value = self._cache.values[kind][str(path)]
+            return msgspec.convert(value, type_) if before == state else None
+        return None
 
-    def set_sound_tree(self, output: str, stamps: dict[str, Stamp]) -> None:
-        """Set the stamps of a sound tree; none for a damaged one."""
-        self._changed |= self.sound_tree(output) != stamps
-        self._cache.trees[output] = stamps
+    def remember(self, kind: str, path: Path | str, state: Any, value: Any) -> None:
+        """Set the value of a file or tree in this state."""
+        self._cache.values.setdefault(kind, {})[str(path)] = (state, value)
+        self._changed = True
 
     def save(self) -> None:
         """Write the cache if it changed; if that fails (full disk, read-only folder) the next run reads more."""
         if self._changed and self.file is not None:
-            self._cache.trees = {output: stamps for output, stamps in self._cache.trees.items() if stamps}
             with contextlib.suppress(OSError):
                 self.file.parent.mkdir(parents=True, exist_ok=True)
                 replace_file(self.file, msgspec.json.encode(self._cache))
             self._changed = False
 
 
-def _identity(path: Path) -> tuple[int, int, int, int]:
+def _identity(path: Path) -> list[int]:
     status = os.stat(path)
-    return status.st_size, status.st_mtime_ns, status.st_ctime_ns, status.st_ino
+    return [status.st_size, status.st_mtime_ns, status.st_ctime_ns, status.st_ino]
 
 
 # ── the store ─────────────────────────────────────────────────────────────────────────────────────────────────────────
 
-Report = Callable[[str], None]
-ABANDONED = 86400.0  # seconds without a change after which a draft outside a run is of a killed process
-LOCK = "lock"  # in the folder of a run, which holds it
-NO_FILE: Stamp = (-1, 0)  # a link, a pipe: nothing that a stage may write
-
 
 class Entry(msgspec.Struct, frozen=True):
-    """Result of a key: the hash of the tree, the record of the key, and each file's hash."""
+    """Result of a key.
+
+    Attributes:
+        output: hash of the tree
+        record: record of the key
+        files: hash by relative path
+        cost: times, memory and facts of the machine
+        warnings: of the stage, each text once
+    """
 
     output: str
     record: dict[str, Any]
     files: dict[str, str]
+    cost: dict[str, Any]
+    warnings: list[str]
+
+    def events(self) -> list[dict[str, Any]]:
+        """Return the lines of the result's log: its warnings, then its cost."""
+        step = {name: self.record[name] for name in ("stage", "photo", "recipe") if name in self.record}
+        lines = [{"event": "warning", "text": text} for text in self.warnings]
+        return [step | {"key": hash_of(self.record)} | line for line in [*lines, {"event": "done", **self.cost}]]
 
 
 class Store:
@@ -149,23 +161,15 @@ class Store:
     def __init__(self, root: Path):
         self.root = root
         self.trees = root / "trees"
+        self.views = root / "views"
         self.keys = root / "keys"
-        self.logs = root / "logs"
         self.unfinished = root / "unfinished"
         self.locks = root / "locks"
         self.tmp = root / "tmp"
+        self.hashes = FileHashes(root / "cache" / "files.json")
         self.damaged: dict[str, list[str]] = {}
-        self._outputs: dict[str, str | None] = {}
         self._entries: dict[str, Entry] = {}
-
-    @cached_property
-    def hashes(self) -> FileHashes:
-        """Cache of the store and of the files of its datasets and sources."""
-        return FileHashes(self.root / "cache" / "files.json")
-
-    def log(self, key: str) -> Path:
-        """Return the file with the log of a key's result."""
-        return self.logs / f"{key}.jsonl"
+        self._outputs: dict[str, str | None] = {}
 
     def entry(self, key: str) -> Entry | None:
         """Return the entry of a key, None if there is none or it is damaged; its tree may be damaged."""
@@ -179,103 +183,74 @@ class Store:
     def get(self, key: str) -> str | None:
         """Return the tree hash of a key; None if there is no result, or its tree is damaged (see `damaged`)."""
         if key not in self._outputs and (entry := self.entry(key)):
-            damage = self.damage(entry)
-            if damage:
-                self.damaged[key] = damage
-            self._outputs[key] = None if damage else entry.output
+            self.damaged[key] = self.faults(entry)
+            self._outputs[key] = None if self.damaged[key] else entry.output
         return self._outputs.get(key)
 
-    def forget(self, key: str) -> None:
-        """Read `key` from disk when it is next asked for."""
-        self._outputs.pop(key, None)
-        self._entries.pop(key, None)
-        self.damaged.pop(key, None)
+    def forget(self, keys: Iterable[str] | None = None) -> None:
+        """Read these keys, or all, from disk when they are next asked for."""
+        for key in list(self._entries if keys is None else keys):
+            for table in (self._entries, self._outputs, self.damaged):
+                table.pop(key, None)  # type: ignore[attr-defined]
 
-    def forget_all(self) -> None:
-        """Read all keys from disk when they are next asked for."""
-        self._outputs.clear()
-        self._entries.clear()
-        self.damaged.clear()
-
-    def unchanged(self, keys: Iterable[str]) -> bool:
-        """Return True if the keys still have their outputs, read from disk again."""
-        before = {key: self._outputs.get(key) for key in keys}
-        for key in before:
-            self.forget(key)
-        return None not in before.values() and all(self.get(key) == output for key, output in before.items())
-
-    def damage(self, entry: Entry, reread: bool = False) -> list[str]:
+    def faults(self, entry: Entry, reread: bool = False) -> list[str]:
         """List the faults of an entry's tree, a line each; `reread` ignores the cache."""
         tree = self.trees / entry.output
         stamps = stamps_of(tree)
-        sound = {} if reread else self.hashes.sound_tree(entry.output)
-        if stamps and stamps == sound:
-            return []
-        damage = damage_of(tree, entry.files, sound)
-        self.hashes.set_sound_tree(entry.output, {} if damage else stamps)
-        return damage
+        faults = None if reread else self.hashes.recall("tree", entry.output, stamps, list[str])
+        if faults is None:
+            faults = faults_of(tree, entry.files)
+            self.hashes.remember("tree", entry.output, stamps, faults)
+        return faults
 
-    def add_tree(self, record: Record, folder: Path, report: Report, files: dict[str, str] | None = None) -> Entry:
-        """Move a folder into the store as the tree of `record`.
+    def add_tree(self, entry: Entry, folder: Path, report: Report) -> None:
+        """Move a folder with the entry's files, read-only and synced to disk, into the store as its tree.
 
         A sound tree of the same content remains; a damaged one is set aside, with a message.
-
-        Args:
-            record: record of the result
-            folder: the folder, which no longer exists afterwards
-            report: receives the message
-            files: hashes of the files, if these are known and the files are read-only and on disk
         """
-        if files is None:
-            files = hashes_of_tree(folder)
-            for name in files:
-                (folder / name).chmod(0o444)
-            sync_tree(folder)
-        entry = Entry(hash_of(files), record, files)
         target = self.trees / entry.output
         target.parent.mkdir(parents=True, exist_ok=True)
-        while True:
-            try:
-                os.rename(folder, target)
-                sync(target.parent)
-                return entry
-            except OSError:
-                if not os.path.lexists(target):
-                    raise
-            if not damage_of(target, files):
-                shutil.rmtree(folder)
-                return entry
-            aside = self.root / "damaged" / f"{target.name}-{uuid.uuid4().hex[:8]}"
-            aside.parent.mkdir(parents=True, exist_ok=True)
-            with contextlib.suppress(FileNotFoundError):  # Another run was faster.
-                os.rename(target, aside)
-                report(f"its stored result was damaged and is replaced; the damaged files: {aside}")
+        if os.path.lexists(target) and faults_of(target, entry.files):
+            report(f"its stored result was damaged and is replaced; the damaged files: {self.set_aside(target)}")
+        try:
+            os.rename(folder, target)
+            sync(target.parent)
+        except OSError:
+            if not target.is_dir():
+                raise
+            shutil.rmtree(folder)
 
-    def set_key(self, key: str, entry: Entry) -> None:
-        """Make an entry the result of `key`."""
+    def set_aside(self, folder: Path) -> Path:
+        """Move a damaged folder out of the way, if it is there, and return its place until the next gc."""
+        aside = self.root / "damaged" / f"{folder.name}-{uuid.uuid4().hex[:8]}"
+        aside.parent.mkdir(parents=True, exist_ok=True)
+        with contextlib.suppress(FileNotFoundError):  # Another run was faster.
+            os.rename(folder, aside)
+        return aside
+
+    def set_key(self, entry: Entry) -> None:
+        """Make an entry the result of the key of its record."""
         self.keys.mkdir(parents=True, exist_ok=True)
-        replace_file(self.keys / f"{key}.json", json_text(entry).encode())
+        replace_file(self.keys / f"{hash_of(entry.record)}.json", json_text(entry).encode())
 
 
-def lock(path: Path, wait: bool = False) -> int:
-    """Lock a file until the returned descriptor is closed or the process ends; BlockingIOError if it is locked."""
+def lock(path: Path, wait: bool = False) -> BaseFileLock:
+    """Lock a file until the returned lock is released or the process ends; TimeoutError if it is locked."""
+    from filelock import FileLock  # A run with nothing to do does not load it.
+
     path.parent.mkdir(parents=True, exist_ok=True)
-    descriptor = os.open(path, os.O_RDWR | os.O_CREAT, 0o666)
-    try:
-        fcntl.flock(descriptor, fcntl.LOCK_EX | (0 if wait else fcntl.LOCK_NB))
-    except BlockingIOError:
-        os.close(descriptor)
-        raise
-    return descriptor
+    taken = FileLock(path, mode=0o664, thread_local=False)
+    taken.acquire(timeout=-1 if wait else 0)
+    return taken
 
 
 def is_locked(path: Path) -> bool:
-    """Return True if any process holds the lock; this needs no right to write."""
+    """Return True if any process holds the lock; False if this user may not ask."""
     try:
-        with open(path, "rb") as stream:
-            fcntl.flock(stream, fcntl.LOCK_SH | fcntl.LOCK_NB)
-    except (FileNotFoundError, BlockingIOError) as error:
-        return isinstance(error, BlockingIOError)
+        if path.exists():
+            lock(path).release()
+    except OSError as error:
+        return isinstance(error, TimeoutError)
     return False
 
 
@@ -298,63 +273,52 @@ def stamps_of(folder: str | Path, prefix: str = "") -> dict[str, Stamp]:
             with contextlib.suppress(FileNotFoundError):
                 status = entry.stat(follow_symlinks=False)
                 is_file = stat.S_ISREG(status.st_mode)
-                stamps[prefix + entry.name] = (status.st_size, status.st_mtime_ns) if is_file else NO_FILE
+                stamps[prefix + entry.name] = [status.st_size, status.st_mtime_ns] if is_file else NO_FILE
     return stamps
 
 
-def hashes_of_tree(folder: Path) -> dict[str, str]:
-    """Return {relative path: content hash} of the files below a folder, sorted; InputError for a link or pipe."""
+def finish_tree(folder: Path) -> dict[str, str]:
+    """Make the files below a folder read-only, sync them to disk, and return {relative path: content hash}, sorted.
+
+    Raises:
+        InputError: There is a link or a pipe.
+    """
     stamps = sorted(stamps_of(folder).items())
     if other := next((name for name, stamp in stamps if stamp == NO_FILE), None):
         fault = f"a stage wrote {other!r}, which is a link or a device"
         raise InputError(fault, file=folder / other, cure="write a file")
+    for name, _ in stamps:
+        (folder / name).chmod(0o444)
+    sync_tree(folder)
     return {name: hash_of_file(folder / name) for name, _ in stamps}
 
 
-def damage_of(folder: Path, files: Mapping[str, str], sound: Mapping[str, Stamp] | None = None) -> list[str]:
-    """List how a folder differs from `files` (relative path -> hash), a line each.
-
-    A file with its stamp in `sound` is not read.
-    """
+def faults_of(folder: Path, files: Mapping[str, str]) -> list[str]:
+    """List how a folder differs from `files` (relative path -> hash), a line each."""
     lines = []
     stamps = stamps_of(folder)
     for name in sorted(files):
-        if (stamp := stamps.get(name)) in (None, NO_FILE):
+        if (stamp := stamps.pop(name, None)) in (None, NO_FILE):
             lines.append(f"{name}: {'a link, or no file' if stamp else 'missing'}")
-        elif stamp != (sound or {}).get(name):
-            try:
-                lines += [] if hash_of_file(folder / name) == files[name] else [f"{name}: other content"]
-            except OSError as error:
-                lines.append(f"{name}: cannot be read ({error.strerror})")
-    return lines + [f"{name}: not a file of this result" for name in sorted(stamps.keys() - files.keys())]
-
-
-def read_events(path: Path) -> list[dict[str, Any]]:
-    """Read the events of a log in order; none if there is no log.  A warning tells the number of damaged lines."""
-    lines = path.read_bytes().splitlines() if path.is_file() else []
-    events = []
-    for line in lines:
-        with contextlib.suppress(*DECODE_ERRORS):
-            event = msgspec.json.decode(line, type=dict[str, Any])
-            events += [event] if isinstance(event.get("event"), str) else []
-    if len(events) < len(lines):
-        count = len(lines) - len(events)
-        log.warning("%s: %d damaged lines are ignored; the results are not affected", path, count)
-    return events
+            continue
+        try:
+            lines += [] if hash_of_file(folder / name) == files[name] else [f"{name}: other content"]
+        except OSError as error:
+            lines.append(f"{name}: cannot be read ({error.strerror})")
+    return lines + [f"{name}: not a file of this result" for name in sorted(stamps)]
 
 
 # ── results that ship with the source ────────────────────────────────────────────────────────────────────────────────
 
 MADE_FROM = "made_from.json"
 CURE = "restore it from the repository, or compute the result with FORCE=1"
-FileName = Annotated[str, msgspec.Meta(pattern=r"^\w[^/]*$")]
 
 
 class Shipped(msgspec.Struct, frozen=True):
-    """Content of made_from.json: the part of the record that the result depends on, and the hash of each file."""
+    """Content of made_from.json, a copy of the entry of the result: its record, and the hash of each file."""
 
     record: Record
-    files: dict[FileName, str]
+    files: dict[str, str]
 
 
 def shipped_record(record: Record, modules: list[str]) -> Record:
@@ -376,27 +340,15 @@ def copy_shipped(roots: list[Path], shipping: Shipping | None, record: Record, o
     for file in (root / shipping.folder / MADE_FROM for root in roots if shipping):
         if not file.is_file():
             continue
-        try:
+        with reading("the record of a shipped result", file, cure=CURE):
             shipped = msgspec.json.decode(file.read_bytes(), type=Shipped)
-        except msgspec.DecodeError as error:
-            fault = f"does not tell what the shipped files were made from ({error})"
-            raise InputError(fault, file=file, cure=CURE) from None
-        if shipping and shipped.record == shipped_record(record, shipping.made_by):
+        made_by = shipping.made_by if shipping else []
+        if shipped_record(shipped.record, made_by) == shipped_record(record, made_by):
             out.mkdir(parents=True)
-            for name in shipped.files:
-                with contextlib.suppress(FileNotFoundError):
-                    shutil.copyfile(file.parent / name, out / name)
-            if damage := damage_of(out, shipped.files):
-                fault = f"the files beside it are not the files that were shipped: {damage[0]}"
+            for name in (name for name in shipped.files if (file.parent / name).is_file()):
+                shutil.copyfile(file.parent / name, out / name)
+            if faults := faults_of(out, shipped.files):
+                fault = f"the files beside it are not the files that were shipped: {faults[0]}"
                 raise InputError(fault, file=file, cure=CURE)
             return True
     return False
-
-
-def ship(store: Store, entry: Entry, folder: Path, made_by: list[str]) -> None:
-    """Copy the files of a result, which has no folders, into a folder of the package."""
-    folder.mkdir(parents=True, exist_ok=True)
-    for name in entry.files:
-        replace_file(folder / name, (store.trees / entry.output / name).read_bytes())
-    shipped = Shipped(shipped_record(entry.record, made_by), entry.files)
-    replace_file(folder / MADE_FROM, json_text(shipped).encode())

@@ -3,31 +3,34 @@
 from __future__ import annotations
 
 import ast
+import contextlib
 import inspect
 import os
 import signal
 import sys
 import textwrap
 import time
+from collections import Counter
+from collections.abc import Sized
+from functools import partial
 from importlib import import_module
 from pathlib import Path
 from typing import Any
 
 import msgspec
-from msgspec import inspect as types
 
 from factorlib.errors import InputError, did_you_mean
 from factorlib.runner.dataset_state import DatasetState, Request, read_state
 from factorlib.runner.plan import Planned, Step, difference, summarize
 from factorlib.runner.project import RESERVED, Pipeline, Project, StageCode, check_name, read_pipeline
-from factorlib.runner.results_folder import ResultsFolder, all_results, find_results, label, results_of
-from factorlib.runner.store import Store, is_locked, read_events
-from factorlib.runner.store import ship as copy_into_package
+from factorlib.runner.results_folder import ResultsFolder, all_results, find_results, results_of
+from factorlib.runner.store import Entry, Store, is_locked
 from factorlib.wholefile import write_text
 
 # exit codes as in shells
 INTERRUPTED = 128 + signal.SIGINT
 TERMINATED = 128 + signal.SIGTERM
+STATUSES = ("current", "running", "to run", "maybe")
 UNTRUSTED = 3  # exit code under STRICT=1
 VERDICT = "evaluate/verdict.txt"
 NO_TRUST = "do not trust"  # beginning of an adverse verdict
@@ -39,16 +42,8 @@ MAIN_RESULTS = {
 }
 
 
-def check_stage(project: Project, name: str, verbs: list[str]) -> None:
-    """Raise InputError for a word of the command line that is neither a verb nor the name of a stage."""
-    stages = _pipeline(project).stages
-    if name not in stages:
-        cure = did_you_mean(name, [*stages, *verbs])
-        cure = cure if cure.startswith("did") else "make help-all lists all verbs and stages"
-        raise InputError(f"there is no verb or stage {name!r}", cure=cure)
-
-
-def _pipeline(project: Project) -> Pipeline:
+def pipeline_of(project: Project) -> Pipeline:
+    """Read the pipeline of a project."""
     return read_pipeline(project.pipeline_file, project.provider.slices)
 
 
@@ -57,16 +52,13 @@ def make(project: Project, request: Request, strict: bool = False) -> int:
 
     strict: return UNTRUSTED if the verdict is adverse
     """
-    started = time.perf_counter()
     state = read_state(project, request)
     planned = state.plan()
     pending = [p.step for p in planned if p.status != "current"]
     if not pending:
         state.publish(planned)
         print(f"{state.data.folder.name}: nothing to do, all {len(state.records)} steps are current")
-    elif faults := state.faults(pending, new=True):
-        return _refuse(state, faults)
-    elif code := _run(state, started):
+    elif code := _refuse(state, state.file_faults(pending), "files") or _run(state, planned):
         return code
     verdict = _print_results(state, request.targets is None)
     return UNTRUSTED if strict and verdict.startswith(NO_TRUST) else 0
@@ -78,29 +70,30 @@ def _print_results(state: DatasetState, whole: bool) -> str:
     Returns the verdict, empty without one.
     """
     folder = state.results.folder
-    shown = state.project.shown
+    short = state.project.short_path
     verdict = (folder / VERDICT).read_text(encoding="utf-8") if whole and (folder / VERDICT).exists() else ""
-    for number, line in enumerate(verdict.splitlines()):
-        print(f"    {line}" if number else f"  verdict: {line}")
+    if verdict:
+        print(textwrap.indent(f"verdict: {verdict.rstrip()}".replace("\n", "\n  "), "  "))
     for name, path in MAIN_RESULTS.items() if whole else ():
         if (folder / path).exists():
-            print(f"  {name}: {shown(folder / path)}" + ("/*.exr" if (folder / path).is_dir() else ""))
+            print(f"  {name}: {short(folder / path)}" + ("/*.exr" if (folder / path).is_dir() else ""))
     for name in state.spec.targets or ():
         over_recipes = state.spec.pipeline.stages[name].over == "recipe"
         if over_recipes or not whole:
             item = next(iter(state.recipes)) if over_recipes and len(state.recipes) == 1 else ""
-            print(f"  {name}: {shown(folder / name / item)}")
+            print(f"  {name}: {short(folder / name / item)}")
     return verdict
 
 
-def _run(state: DatasetState, started: float) -> int:
+def _run(state: DatasetState, planned: list[Planned]) -> int:
     from factorlib.runner.display import Display
     from factorlib.runner.run import run
 
+    started = time.perf_counter()
     display = Display()
     try:
-        if faults := state.wrong_values(state.plan()):
-            return _refuse(state, faults, "parameters")
+        if code := _refuse(state, state.parameter_faults(planned), "parameters"):
+            return code
         result = run(state, display)
     except (KeyboardInterrupt, SystemExit) as stop:
         display.report("stopped; what was finished is kept, the next run goes on from there")
@@ -113,29 +106,26 @@ def _run(state: DatasetState, started: float) -> int:
         if result.held_up:
             print(f"not run because of that: {', '.join(dict.fromkeys(step.stage for step in result.held_up))}")
         return 1
-    current = len(state.records) - len(result.completed)
-    print(f"{name}: {count(result.completed)} run, {current} current, {time.perf_counter() - started:.1f} s")
+    done = len(result.completed)
+    seconds = time.perf_counter() - started
+    print(f"{name}: {count(result.completed)} run, {len(state.records) - done} current, {seconds:.1f} s")
     return 0
 
 
-def _refuse(state: DatasetState, faults: list[str], place: str = "files") -> int:
-    """Print every fault, before anything has run."""
-    lines = [f"error: {fault}" for fault in faults]
-    print(
-        *lines,
-        f"{state.data.folder.name}: {count(faults, 'fault')} in its {place}; nothing was run",
-        sep="\n",
-        file=sys.stderr,
-    )
-    return 1
+def _refuse(state: DatasetState, faults: list[str], place: str) -> int:
+    """Print every fault, before anything has run; return 1 if there are any."""
+    if faults:
+        outcome = f"{state.data.folder.name}: {count(faults, 'fault')} in its {place}; nothing was run"
+        print(*(f"error: {fault}" for fault in faults), outcome, sep="\n", file=sys.stderr)
+    return 1 if faults else 0
 
 
 def show_plan(project: Project, request: Request, every_reason: bool = False) -> int:
     """Print the steps that would run, with the first reasons or all; return 1 if a parameter has a wrong value."""
     state = read_state(project, request, look=True)
     planned = state.plan()
-    if faults := state.wrong_values(planned):
-        return _refuse(state, faults, "parameters")
+    if code := _refuse(state, state.parameter_faults(planned), "parameters"):
+        return code
     print("\n".join(plan_lines(planned, every_reason)))
     return 0
 
@@ -143,30 +133,27 @@ def show_plan(project: Project, request: Request, every_reason: bool = False) ->
 def show_status(project: Project, request: Request) -> int:
     """Print the progress of each stage, and the warnings of current results."""
     state = read_state(project, request, look=True)
-    counts: dict[str, dict[str, int]] = {}
-    warnings: dict[str, None] = {}
-    for p in state.plan():
+    planned = state.plan()
+    counts: dict[str, Counter] = {}
+    for p in planned:
         running = p.key and p.status != "current" and is_locked(state.store.locks / f"{p.key}.lock")
-        stage = counts.setdefault(p.step.stage, dict.fromkeys(("current", "running", "to run", "maybe"), 0))
-        stage["running" if running else p.status] += 1
-        texts = [event["text"] for event in _events(state, p) if event["event"] == "warning"]
-        warnings |= dict.fromkeys(f"warning: {p.step}: {text}" for text in texts)
+        counts.setdefault(p.step.stage, Counter())["running" if running else p.status] += 1
     for name, numbers in counts.items():
-        print(f"{name:<10} {', '.join(f'{number} {status}' for status, number in numbers.items() if number)}")
-    for warning in warnings:
-        print(warning)
+        print(f"{name:<10} {', '.join(f'{numbers[status]} {status}' for status in STATUSES if numbers[status])}")
+    for p in planned:
+        if entry := _result(state, p):
+            print(*(f"warning: {p.step}: {text}\n" for text in entry.warnings), sep="", end="")
     return 0
 
 
-def _events(state: DatasetState, planned: Planned) -> list[dict[str, Any]]:
-    """Return the log of a step's current result."""
-    events = read_events(state.store.log(planned.key)) if planned.status == "current" else []
-    return [{"text": "", **event} for event in events]
+def _result(state: DatasetState, planned: Planned) -> Entry | None:
+    """Return the result of a current step."""
+    return state.store.entry(planned.key) if planned.status == "current" else None
 
 
 def show_graph(project: Project, mermaid: bool = False) -> int:
     """Print the stages in order, each with its inputs; or a Mermaid diagram, with double frames for many steps."""
-    pipeline = _pipeline(project)
+    pipeline = pipeline_of(project)
     stages = {name: pipeline.stages[name] for name in pipeline.order()}
     if mermaid:
         nodes = [f"  {name}[[{name}]]" if stage.over else f"  {name}[{name}]" for name, stage in stages.items()]
@@ -184,30 +171,43 @@ def show_graph(project: Project, mermaid: bool = False) -> int:
 def show_logs(project: Project, request: Request, item: str | None) -> int:
     """Print time, memory, warnings and versions of current results; of one photo or recipe, or of all."""
     state = read_state(project, request, look=True)
-    logs = []
-    for p in state.plan():
-        if p.step.stage in (request.targets or [p.step.stage]) and item in (None, p.step.item):
-            error = state.results.errors / f"{label(p.step)}.txt"
-            logs.append((p, _events(state, p), project.shown(error) if error.is_file() else None))
-    if not logs:
+    selected = [p for p in state.plan() if not request.targets or p.step.stage in request.targets]
+    if not (selected := [p for p in selected if item in (None, p.step.item)]):
         cure = did_you_mean(str(item), [*state.data.photos, *state.recipes])
         raise InputError(f"no step is of the photo or recipe {item!r}", key="PHOTO", cure=cure)
-    print("\n".join(log_lines(logs)))
+    versions: dict[str, dict[str, None]] = {}
+    for p in selected:
+        if (entry := _result(state, p)) is None:
+            print(f"{p.step!s:<26} {p.status}: {summarize(p.reasons, MOST_REASONS)}")
+            continue
+        print(f"{p.step!s:<26} {_cost(entry.cost)}", *entry.warnings, sep="\n    warning: ")
+        machine = entry.cost["machine"]
+        made_with = {"Python": machine["python"], machine["system"]: machine["processor"]}
+        made_with |= {n.removeprefix("package:"): v for n, v in p.record.items() if n.startswith("package:")}
+        for name, version in made_with.items():
+            versions.setdefault(name, {})[version] = None
+    text = ", ".join(f"{name} {' or '.join(versions[name])}" for name in sorted(versions, key=str.lower))
+    print(textwrap.fill(f"made with {text}", 110, initial_indent="    ", subsequent_indent="    ") if versions else "")
     return 0
+
+
+def _cost(cost: dict[str, Any]) -> str:
+    cores = f"{count(cost['threads'], 'thread')} on {count(cost['cores'], 'core')}"
+    numbers = f"{cost['seconds']:8.1f} s {cost['cpu_seconds']:8.1f} s processor {cost['memory_mb']:7.0f} MB peak"
+    return f"{numbers}   {cores}   {cost['started'][:16].replace('T', ' ')} UTC"
 
 
 def show_params(project: Project, stages: list[str] | None) -> int:
     """Print every parameter of the stages, or of all, with default, range and meaning."""
     from factorlib.runner.worker import load_stage
 
-    for number, name in enumerate(stages or _pipeline(project).order()):
-        check_stage(project, name, [])
+    pipeline = pipeline_of(project)
+    pipeline.check(stages or [])
+    for name in stages or pipeline.order():
         params = load_stage(StageCode(project.code_root, project.package, name, {}, project.pipeline_file)).Params
-        lines = []
-        for param, values, default, text in parameters(params):
-            lines.append(f"{name}.{param} = {default}    ({values})")
-            lines += textwrap.wrap(text, 100, initial_indent="    ", subsequent_indent="    ")
-        print(*[""] * (number > 0), *(lines or [f"{name} has no parameters"]), sep="\n")
+        for param, values, default, text in parameters(params) or [("", "none", "", "It has no parameters.")]:
+            print(f"{name}.{param} = {default}    ({values})" if param else name)
+            print(textwrap.fill(text, 100, initial_indent="    ", subsequent_indent="    "))
     return 0
 
 
@@ -219,10 +219,9 @@ def validate(project: Project, dataset: str, settings: list[str], sheet: bool = 
     if sheet:
         _draw_sheet(project, project.dataset_folder(dataset))
     state = read_state(project, Request(dataset, settings=settings))
-    if faults := state.wrong_values(state.plan()):
-        return _refuse(state, faults, "parameters")
-    if faults := state.faults(state.records):
-        return _refuse(state, faults)
+    parameters_code = _refuse(state, state.parameter_faults(state.plan()), "parameters")
+    if code := parameters_code or _refuse(state, state.file_faults(state.records), "files"):
+        return code
     counts = f"{len(state.data.photos)} photos, {len(state.records)} steps"
     print(f"{state.data.folder.name}: pipeline.yaml, dataset.yaml and the files it names are good: {counts}")
     for caution in state.data.cautions():
@@ -239,20 +238,11 @@ def _draw_sheet(project: Project, folder: Path) -> None:
     results.set_owner(project, folder)
     path = results.folder / "sheet.png"
     step = Step("sheet")
-    started = time.monotonic()
-    display = Display()
-
-    def progress(done: int, total: int) -> None:
-        display.progress(step, done, total, "")
-        display.tick()
-
-    display.start(step)
-    try:
+    with contextlib.closing(Display()) as display:
+        display.start(step)
+        progress = partial(display.progress, step, text="")
         import_module("factorlib.sheet").write_sheet(folder, path, progress)  # by name: it is science
-        display.finish(step, time.monotonic() - started)
-    finally:
-        display.close()
-    print(f"  contact sheet: {project.shown(path)}")
+    print(f"  contact sheet: {project.short_path(path)}")
 
 
 def begin(project: Project, dataset: str, photos: Path | None, masks: Path | None, meshes: Path | None) -> int:
@@ -263,7 +253,8 @@ def begin(project: Project, dataset: str, photos: Path | None, masks: Path | Non
     folder = Path(os.path.abspath(dataset)) if "/" in dataset else project.root / "data" / dataset
     check_name(folder.name, "a dataset", key="DATASET", reserved=RESERVED)
     missing = import_module("factorlib.newset").new_dataset(folder, photos, masks, meshes)
-    print(f"{project.shown(folder)}/dataset.yaml is written{'; still missing, or yours to decide:' if missing else ''}")
+    rest = "; still missing, or yours to decide:" if missing else ""
+    print(f"{project.short_path(folder)}/dataset.yaml is written{rest}")
     for line in missing:
         print(f"  {line}")
     try:
@@ -298,7 +289,7 @@ def compare(project: Project, first: Path | None, second: Path | None) -> int:
     path = project.build / "compare" / "-".join(results.folder.name for results in pair) / "index.html"
     path.parent.mkdir(parents=True, exist_ok=True)
     write_text(path, page)
-    print(f"comparison: {project.shown(path)}")
+    print(f"comparison: {project.short_path(path)}")
     return 0
 
 
@@ -318,8 +309,8 @@ def pack(project: Project, dataset: str, out: Path | None, replace: bool) -> int
     """Pack a dataset's results into one zip file, which needs neither this checkout nor the dataset."""
     from factorlib.pack import pack as write_zip
 
-    if not (folders := find_results(project, dataset, "pack")):
-        return 1
+    if not (folders := find_results(project, dataset)):
+        raise InputError(f"{dataset} has no results", key="DATASET", cure=project.command("all", dataset))
     folder = folders[0].folder
     out = out or Path(f"{folder.name}.zip")
     files = write_zip(folder, out, replace)
@@ -327,25 +318,17 @@ def pack(project: Project, dataset: str, out: Path | None, replace: bool) -> int
     return 0
 
 
-def ship(project: Project, stage: str, dataset: str) -> int:
-    """Copy the current result of a stage into the package, if pipeline.yaml declares that it ships with the source."""
-    known = {name: found.shipped for name, found in _pipeline(project).stages.items() if found.shipped}
-    if stage not in known:
-        raise InputError(f"no result of {stage!r} ships with the source", key="ship", cure=did_you_mean(stage, known))
-    state = read_state(project, Request(dataset, [stage]))
-    planned = state.plan()[-1]
-    if (entry := state.store.entry(planned.key)) is None or planned.status != "current":
-        raise InputError(f"{stage!r} has no current result", key="ship", cure=f"make {stage} DATASET={dataset} FORCE=1")
-    folder = project.root / known[stage].folder
-    copy_into_package(state.store, entry, folder, known[stage].made_by)
-    print(f"{stage}: {project.shown(folder)}")
-    return 0
-
-
 # ── text ─────────────────────────────────────────────────────────────────────────────────────────────────────────────
 
 MOST_REASONS = 8  # reasons of one step on a line
 MOST_FAILED = 20  # names of failed steps
+BOUNDS = {
+    "minimum": "minimum",
+    "exclusiveMinimum": "above",
+    "maximum": "maximum",
+    "exclusiveMaximum": "below",
+    "minItems": "items",
+}
 
 
 def plan_lines(planned: list[Planned], every_reason: bool = False) -> list[str]:
@@ -355,14 +338,13 @@ def plan_lines(planned: list[Planned], every_reason: bool = False) -> list[str]:
     """
     groups: dict[tuple, list[str]] = {}
     for p in (p for p in planned if p.status != "current"):
-        kind = "recipes" if p.step.recipe else "photos"
         reasons = tuple(_for_any_photo(reason, p.step) for reason in p.reasons)
-        groups.setdefault((p.step.stage, p.status, reasons, kind), []).append(p.step.item)
+        groups.setdefault((p.step.stage, p.status, reasons), []).append(p.step.item)
     lines = []
-    for (stage, status, reasons, kind), names in groups.items():
-        items = ", ".join(names) if len(names) <= 3 else f"{len(names)} {kind}"
+    for (stage, status, reasons), items in groups.items():
+        names = ", ".join(items) if len(items) <= 3 else f"{len(items)} steps"
         in_line = "" if every_reason else summarize(reasons, MOST_REASONS)
-        lines.append(f"{stage:<10} {status:<7} {items:<24} {in_line}".rstrip())
+        lines.append(f"{stage:<10} {status:<7} {names:<24} {in_line}".rstrip())
         lines += [f"    {reason}" for reason in reasons] if every_reason else []
     current = sum(p.status == "current" for p in planned)
     return [*lines, f"{current} of {len(planned)} steps are current" if lines else f"all {current} steps are current"]
@@ -381,50 +363,14 @@ def _for_any_photo(reason: str, step: Step) -> str:
     return reason
 
 
-def count(items: list, unit: str = "step") -> str:
-    """Format a number of items with their unit.
+def count(items: Sized | int, unit: str = "step") -> str:
+    """Format a number, or the number of items, with its unit.
 
-    >>> count(["a"]), count(["a", "b"], "fault")
+    >>> count(["a"]), count(2, "fault")
     ('1 step', '2 faults')
     """
-    return f"{len(items)} {unit}{'' if len(items) == 1 else 's'}"
-
-
-def log_lines(logs: list[tuple[Planned, list[dict], str | None]]) -> list[str]:
-    """Format cost and warnings of each step, and all package versions that the steps were made with.
-
-    logs: steps with the events of their results, and the file with the traceback of a failed one
-    """
-    lines = []
-    versions: dict[str, dict[str, None]] = {}
-    for planned, events, error in logs:
-        lines.append(f"{planned.step!s:<26} {_cost(planned, events)}".rstrip())
-        lines += [f"    warning: {event['text']}" for event in events if event["event"] == "warning"]
-        lines += [f"    it failed by a defect of the program: {error}"] if error else []
-        for name, version in _versions(planned, events).items():
-            versions.setdefault(name, {})[version] = None
-    text = ", ".join(f"{name} {' or '.join(versions[name])}" for name in sorted(versions, key=str.lower))
-    return lines + textwrap.wrap(text, 110, initial_indent="    made with ", subsequent_indent="    ")
-
-
-def _cost(planned: Planned, events: list[dict]) -> str:
-    done = next((event for event in reversed(events) if event["event"] == "done"), None)
-    if planned.status != "current":
-        return f"{planned.status}: {summarize(planned.reasons, MOST_REASONS)}"
-    if done is None:
-        return "its log is missing"
-    cores = f"{done['threads']} thread{'s' * (done['threads'] > 1)} on {done['cores']} core{'s' * (done['cores'] > 1)}"
-    cost = f"{done['seconds']:8.1f} s {done['cpu_seconds']:8.1f} s processor {done['memory_mb']:7.0f} MB peak"
-    return f"{cost}   {cores}   {done['started'][:16].replace('T', ' ')} UTC"
-
-
-def _versions(planned: Planned, events: list[dict]) -> dict[str, str]:
-    """Return the versions of Python and of packages, and the kind of machine, of a current result."""
-    if planned.status != "current":
-        return {}
-    machine: dict[str, str] = next((event["machine"] for event in reversed(events) if "machine" in event), {})
-    versions = {"Python": machine["python"], machine["system"]: machine["processor"]} if machine else {}
-    return versions | {n.removeprefix("package:"): v for n, v in planned.record.items() if n.startswith("package:")}
+    number = items if isinstance(items, int) else len(items)
+    return f"{number} {unit}{'' if number == 1 else 's'}"
 
 
 def parameters(params: type) -> list[tuple[str, str, str, str]]:
@@ -441,34 +387,26 @@ def parameters(params: type) -> list[tuple[str, str, str, str]]:
                 match statement, following:
                     case ast.AnnAssign(ast.Name(name)), ast.Expr(ast.Constant(text)):
                         texts[name] = " ".join(str(text).split())
-    for field in getattr(types.type_info(params), "fields", ()):
-        if isinstance(field.type, types.StructType):
-            table += [(f"{field.name}.{name}", *rest) for name, *rest in parameters(field.type.cls)]  # type: ignore[misc]
+    schemas = msgspec.json.schema_components([params])[1]
+    for name, schema in schemas[params.__name__]["properties"].items():
+        if "$ref" in schema:
+            inner = next(field.type for field in msgspec.structs.fields(params) if field.name == name)
+            table += [(f"{name}.{each}", *rest) for each, *rest in parameters(inner)]  # type: ignore[misc]
         else:
-            made = field.default is msgspec.NODEFAULT and callable(field.default_factory)
-            value = field.default_factory() if made else field.default
-            text = "none" if value is msgspec.NODEFAULT else msgspec.json.encode(value).decode().replace(",", ", ")
-            table.append((field.name, allowed(field.type), text, texts.get(field.name, "")))
+            default = msgspec.json.encode(schema.get("default")).decode().replace(",", ", ")
+            table.append((name, allowed(schema), default, texts.get(name, "")))
     return table
 
 
-def allowed(type_: Any) -> str:
-    """Format the allowed values of a type of `msgspec.inspect`.
+def allowed(schema: dict[str, Any]) -> str:
+    """Format the values that a JSON schema allows.
 
-    >>> allowed(types.type_info(int)), allowed(types.IntType(ge=1, le=1024)), allowed(types.FloatType(gt=0))
-    ('whole number', '1 … 1,024', 'number > 0')
+    >>> allowed({"type": "integer"}), allowed({"type": "integer", "minimum": 1, "maximum": 1024})
+    ('integer', 'integer, minimum 1, maximum 1024')
+    >>> allowed({"anyOf": [{"enum": ["auto", "off"]}, {"type": "null"}]})
+    'auto, off or null'
     """
-    if isinstance(type_, types.IntType | types.FloatType):
-        if type_.ge is not None and type_.le is not None:
-            return f"{type_.ge:,} … {type_.le:,}"
-        bounds = ((">", type_.gt), ("≥", type_.ge), ("<", type_.lt), ("≤", type_.le))
-        words = " and ".join(f"{sign} {bound:,}" for sign, bound in bounds if bound is not None)
-        return f"{'whole number' if isinstance(type_, types.IntType) else 'number'} {words}".strip()
-    if isinstance(type_, types.LiteralType):
-        return ", ".join(str(value) for value in sorted(type_.values, key=str))
-    if isinstance(type_, types.UnionType):
-        return " or ".join(map(allowed, type_.types))
-    if items := getattr(type_, "item_types", None):
-        return f"{len(items)} of: {allowed(items[0])}"
-    names: dict[type, str] = {types.BoolType: "true, false", types.StrType: "text", types.NoneType: "null"}
-    return names.get(type(type_), type(type_).__name__)
+    if "anyOf" in schema:
+        return " or ".join(map(allowed, schema["anyOf"]))
+    bounds = [f"{words} {schema[word]}" for word, words in BOUNDS.items() if word in schema]
+    return ", ".join([*([schema["type"]] if "type" in schema else map(str, schema.get("enum", []))), *bounds])

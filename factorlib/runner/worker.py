@@ -28,7 +28,7 @@ import time
 import traceback
 import uuid
 import warnings
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable
 from concurrent.futures import Future, ProcessPoolExecutor, ThreadPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
 from functools import partial
@@ -36,17 +36,27 @@ from importlib.util import find_spec
 from multiprocessing import resource_tracker
 from pathlib import Path
 from types import ModuleType
-from typing import Any, Self
+from typing import Any
 
 import msgspec
 
 from factorlib.errors import InputError
 from factorlib.runner.closure import CODE, Sources
-from factorlib.runner.plan import difference
+from factorlib.runner.plan import difference, hash_of
 from factorlib.runner.project import LIBRARY, Stage, StageCode, restore_sigterm
-from factorlib.runner.store import LOCK, Entry, Stamp, Store, copy_shipped, hash_of_file, is_locked, stamps_of
+from factorlib.runner.store import (
+    LOCK,
+    Entry,
+    Stamp,
+    Store,
+    copy_shipped,
+    finish_tree,
+    hash_of_file,
+    is_locked,
+    stamps_of,
+)
 from factorlib.stage import Inputs, serial_map
-from factorlib.wholefile import append_text, disk_error, replace_file
+from factorlib.wholefile import append_text, disk_error
 from factorlib.yamlfile import convert
 
 INTERVAL = 0.2  # seconds between two reports of progress
@@ -77,18 +87,12 @@ class Outcome(msgspec.Struct, frozen=True):
     """Outcome of a step.
 
     output: hash of the result;  traceback: of a defect, None for an error that the user can fix
-    code_changed: the stage's code differs from that of the key, so that further steps of the stage would fail alike
     """
 
     output: str | None = None
     error: str | None = None
     traceback: str | None = None
-    code_changed: bool = False
     seconds: float = 0.0
-
-
-class CodeChanged(InputError):
-    """The code of a stage was edited during the run."""
 
 
 def run_step(task: Task) -> Outcome:
@@ -96,26 +100,22 @@ def run_step(task: Task) -> Outcome:
     temporary = task.temporary.with_name(f"{task.temporary.name}-{uuid.uuid4().hex[:8]}")
     task = msgspec.structs.replace(task, temporary=temporary)  # Another try of it may still be ending elsewhere.
     meter = Meter()
-    code = task.code
     store = Store(task.store)
-    with Events(task.events) as events:
-        try:
-            entry = _compute(task, store, events)
-            step: dict[str, Any] = {name: task.record[name] for name in ("photo", "recipe") if name in task.record}
-            step |= {"stage": code.stage, "key": task.key}
-            lines = [step | {"event": "warning", "text": text} for text in events.warnings]
-            lines.append(step | {"event": "done", **meter.read(code.threads, min(code.cores, usable_cores()))})
-            store.logs.mkdir(parents=True, exist_ok=True)
-            text = "".join(json.dumps(line, sort_keys=True) + "\n" for line in lines)
-            replace_file(store.log(task.key), text.encode())
-            store.set_key(task.key, entry)
-            shutil.rmtree(store.unfinished / task.key, ignore_errors=True)
-            return Outcome(output=entry.output, seconds=meter.read()["seconds"])
-        except BaseException as error:
-            shutil.rmtree(task.temporary, ignore_errors=True)  # makes room for a log on a full disk
-            if known := error if isinstance(error, InputError) else disk_error(error, task.temporary.parent):
-                return Outcome(error=str(known), code_changed=isinstance(known, CodeChanged))
-            return Outcome(error=f"{type(error).__name__}: {error}", traceback=traceback.format_exc())
+    events = Events(task.events)
+    try:
+        _compute(task, store, events)
+        files = finish_tree(temporary)
+        cost = meter.read(task.code.threads, min(task.code.cores, usable_cores()))
+        entry = Entry(hash_of(files), task.record, files, cost, events.warnings)
+        store.add_tree(entry, temporary, events.report)
+        store.set_key(entry)
+        shutil.rmtree(store.unfinished / task.key, ignore_errors=True)
+        return Outcome(output=entry.output, seconds=cost["seconds"])
+    except BaseException as error:
+        shutil.rmtree(temporary, ignore_errors=True)  # makes room for a log on a full disk
+        if known := error if isinstance(error, InputError) else disk_error(error, temporary.parent):
+            return Outcome(error=str(known))
+        return Outcome(error=f"{type(error).__name__}: {error}", traceback=traceback.format_exc())
 
 
 def load_stage(code: StageCode) -> ModuleType:
@@ -131,16 +131,15 @@ def load_stage(code: StageCode) -> ModuleType:
     return module
 
 
-def params_of(code: StageCode) -> msgspec.Struct:
+def convert_params(module: ModuleType, code: StageCode) -> msgspec.Struct:
     """Convert the parameters to the stage's own struct; InputError if one is out of its range."""
-    return convert(code.params, load_stage(code).Params, code.settings, f"stages.{code.stage}.params")
+    return convert(code.params, module.Params, code.settings, f"stages.{code.stage}.params")
 
 
 def check_params(code: StageCode) -> None:
     """Raise InputError if a parameter is out of its range, or if the stage's own `check(params)` does."""
-    params = params_of(code)
-    if check := getattr(load_stage(code), "check", None):
-        check(params)
+    module = load_stage(code)
+    getattr(module, "check", lambda _: None)(convert_params(module, code))
 
 
 def threaded_map(cores: int, function: Callable, items: Iterable) -> list:
@@ -151,15 +150,14 @@ def threaded_map(cores: int, function: Callable, items: Iterable) -> list:
         return list(pool.map(function, items))
 
 
-def _compute(task: Task, store: Store, events: Events) -> Entry:
-    """Run the step, or copy its shipped result, and add the tree to the store, without a key."""
-    roots = [task.code.root, LIBRARY]
-    if not task.forced and copy_shipped(roots, task.stage.shipped, task.record, task.temporary):
-        return store.add_tree(task.record, task.temporary, events.report)
-    module = load_stage(task.code)  # takes seconds
-    params = params_of(task.code)
-    photo = task.record["photo"]
+def _compute(task: Task, store: Store, events: Events) -> None:
+    """Run the step, or copy its shipped result, into its temporary folder."""
     out = task.temporary
+    if not task.forced and copy_shipped([task.code.root, LIBRARY], task.stage.shipped, task.record, out):
+        return
+    module = load_stage(task.code)  # takes seconds
+    params = convert_params(module, task.code)
+    photo = task.record["photo"]
     out.mkdir(parents=True)
     _check_code(task, store)
     results = {folder: stamps_of(folder) for folder in task.folders.values() if folder.is_relative_to(task.store)}
@@ -175,7 +173,6 @@ def _compute(task: Task, store: Store, events: Events) -> Entry:
     for pattern in (text.replace("{photo}", photo or "") for text in promised):
         if not any(path.is_file() for path in out.glob(pattern)):
             raise FileNotFoundError(f"the stage {task.code.stage!r} did not write {pattern}")
-    return store.add_tree(task.record, out, events.report)
 
 
 def _check_inputs(task: Task, results: dict[Path, dict[str, Stamp]]) -> None:
@@ -190,7 +187,7 @@ def _check_inputs(task: Task, results: dict[Path, dict[str, Stamp]]) -> None:
 
 
 def _check_code(task: Task, store: Store) -> None:
-    """Raise CodeChanged if the sources and package data are not those of the key."""
+    """Raise InputError if the sources and package data are not those of the key."""
     code = task.code
     closure = Sources([code.root, LIBRARY], store.hashes).closure(code.package, code.stage, code.settings)
     before = {name: value for name, value in task.record.items() if name.startswith(CODE)}
@@ -198,7 +195,7 @@ def _check_code(task: Task, store: Store) -> None:
         names = sorted(name for name in closure.files if before.get(name) != closure.record[name])
         fault = f"the code changed while the run went on ({'; '.join(changes)})"
         cure = "run again; a worker of a cluster needs the same checkout and the same packages"
-        raise CodeChanged(fault, file=", ".join(str(closure.files[name]) for name in names) or None, cure=cure)
+        raise InputError(fault, file=", ".join(str(closure.files[name]) for name in names) or None, cure=cure)
 
 
 class Meter:
@@ -213,7 +210,7 @@ class Meter:
 
     def read(self, threads: int = 1, cores: int = 1) -> dict[str, Any]:
         """Return wall and processor seconds, peak memory in MB (2^20 bytes), and facts of the machine."""
-        peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / (2**20 if platform.system() == "Darwin" else 2**10)
+        peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**10
         with contextlib.suppress(OSError), open("/proc/self/status") as stream:
             peak = next(int(line.split()[1]) / 2**10 for line in stream if line.startswith("VmHWM"))
         facts = {"system": platform.system(), "processor": platform.machine(), "cores": os.cpu_count()}
@@ -236,32 +233,22 @@ def _cpu_seconds() -> float:
 class Events(logging.Handler):
     """Progress and warnings of one step, as JSON lines of a file that the parent reads meanwhile.
 
-    As a context it receives the warnings of the library and of Python.
+    It receives the warnings of the library and of Python, in place of all other handlers.
 
     Attributes:
         warnings: each text once
     """
-
-    LOGGERS = ("factorlib", "py.warnings")
 
     def __init__(self, path: Path):
         super().__init__(logging.WARNING)
         self.path = path
         self.warnings: list[str] = []
         self._time = 0.0
-        self._share = 0.0
-
-    def __enter__(self) -> Self:
         logging.captureWarnings(True)
         warnings.simplefilter("ignore", DeprecationWarning)
-        for logger in map(logging.getLogger, self.LOGGERS):
-            logger.addHandler(self)
+        for logger in map(logging.getLogger, ("factorlib", "py.warnings")):
+            logger.handlers = [self]
             logger.propagate = False
-        return self
-
-    def __exit__(self, *exception: object) -> None:
-        for logger in map(logging.getLogger, self.LOGGERS):
-            logger.removeHandler(self)
 
     def emit(self, record: logging.LogRecord) -> None:
         """Record a warning."""
@@ -271,15 +258,9 @@ class Events(logging.Handler):
             self.report(text)
 
     def progress(self, done: float, total: float, text: str = "") -> None:
-        """Report that `done` of `total` is done.
-
-        A report within INTERVAL seconds of the last is dropped, unless the share has changed by a hundredth.
-        """
-        share = done / total if total else 0.0
-        now = time.monotonic()
-        if now - self._time >= INTERVAL or abs(share - self._share) >= 0.01:
+        """Report that `done` of `total` is done; a report within INTERVAL seconds of the last is dropped."""
+        if (now := time.monotonic()) - self._time >= INTERVAL:
             self._time = now
-            self._share = share
             self._write({"done": float(done), "total": float(total), "text": text})
 
     def report(self, text: str) -> None:
@@ -299,14 +280,14 @@ FIXED = {
     "PYTHONHASHSEED": "0",
     "PYTHONWARNINGS": "ignore:resource_tracker",  # Python reports semaphores of a killed run as leaked.
     "OMP_WAIT_POLICY": "PASSIVE",  # Threads that wait by spinning slow down others.
-    "MALLOC_TRIM_THRESHOLD_": None,  # Dask's nanny sets it; sums of 700 × 700 numbers then take three times as long.
 }
+TRIM = "MALLOC_TRIM_THRESHOLD_"  # Dask's nanny sets it; sums of 700 × 700 numbers then take three times as long.
 WATCH = 0.3  # seconds between two checks that the run goes on
 PATIENCE = 10  # seconds to reach a scheduler
 AHEAD = 200  # most steps submitted to a cluster at a time; each holds an open lock file
 TRIES = 3  # of a step whose process or worker dies, on a cluster
 _starting = threading.Lock()  # held while a process starts, because the environment is changed
-_of_thread = threading.local()  # the process of a thread, and its run and number of threads
+_this_thread = threading.local()  # the process of a thread, and its run and number of threads
 
 
 class Workers:
@@ -384,36 +365,32 @@ def compute_in_process(run: Path | None, threads: int, function: Callable, argum
     if run is not None and not run.is_dir():
         cure = "keep build/ and the data on a file system that all machines mount at the same path"
         raise InputError(f"the worker on {os.uname().nodename} does not see the run's folder", file=run, cure=cure)
+    if getattr(_this_thread, "started_for", None) != (run, threads):
+        _this_thread.pool = _start_process(run, threads)
+        _this_thread.started_for = (run, threads)
+    try:
+        return _this_thread.pool.submit(function, argument).result()
+    except BrokenProcessPool:
+        _this_thread.started_for = None
+        raise
+
+
+def _start_process(run: Path | None, threads: int) -> ProcessPoolExecutor:
+    """Start a process in an environment that fixes the order of sets and the threads of libraries."""
     multiprocessing.current_process().daemon = False  # A process of Dask's nanny may start none.
-    future = None
-    if getattr(_of_thread, "started_for", None) == (run, threads):
-        with contextlib.suppress(BrokenProcessPool):  # The process died after its last step.
-            future = _of_thread.pool.submit(function, argument)
-    if future is None:
-        _of_thread.started_for = (run, threads)
-        _of_thread.pool = ProcessPoolExecutor(1, multiprocessing.get_context("spawn"), _begin_process, (run,))
-        with _starting, _environment(FIXED | dict.fromkeys(THREAD_VARIABLES, str(threads))):
+    pool = ProcessPoolExecutor(1, multiprocessing.get_context("spawn"), _begin_process, (run,))
+    with _starting:
+        before = dict(os.environ)
+        os.environ.update(FIXED | dict.fromkeys(THREAD_VARIABLES, str(threads)))
+        os.environ.pop(TRIM, None)
+        try:
             resource_tracker.ensure_running()  # It unblocks SIGINT.
             signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})  # The process inherits that: it never gets one.
-            future = _of_thread.pool.submit(function, argument)
-    return future.result()
-
-
-@contextlib.contextmanager
-def _environment(values: dict[str, str | None]) -> Iterator[None]:
-    """Set environment variables inside; None unsets one."""
-    before = {name: os.environ.get(name) for name in values}
-    try:
-        _set(values)
-        yield
-    finally:
-        _set(before)
-
-
-def _set(values: dict[str, str | None]) -> None:
-    os.environ.update({name: value for name, value in values.items() if value is not None})
-    for name in (name for name, value in values.items() if value is None):
-        os.environ.pop(name, None)
+            pool.submit(os.getpid)
+        finally:
+            os.environ.clear()
+            os.environ.update(before)
+    return pool
 
 
 def _begin_process(run: Path | None) -> None:

@@ -114,8 +114,8 @@ def make(
 
             folder = project.build / name
             write_study(study, scale, folder / study.steps[-1] / "scores.json", folder)
-            print(f"  study: {project.shown(folder / 'paragraph.md')}")
-            print(f"  page: {project.shown(write_index(project))}")
+            print(f"  study: {project.short_path(folder / 'paragraph.md')}")
+            print(f"  page: {project.short_path(write_index(project))}")
     return next((code for code in codes if code), 0)
 
 
@@ -137,6 +137,6 @@ def collect(agreed: Callable[[], bool]) -> int:
     """Show which results no study names any more, and delete them where that is `agreed`.  Returns 0."""
     for project in (studies(FULL), studies(QUICK)):
         if (project.build / "store").is_dir():
-            print(f"{project.shown(project.build)}:")
+            print(f"{project.short_path(project.build)}:")
             results_folder.collect(project, agreed)
     return 0

@@ -43,7 +43,7 @@ def conclusions(project: Project) -> dict[str, Conclusion]:
                 tables[name] = msgspec.convert(read_json(file), Conclusion, str_keys=True)
             except msgspec.ValidationError:
                 cure = f"make study STUDY={name} replaces it"
-                print(f"{project.shown(file)}: in the format of another version, and left out: {cure}")
+                print(f"{project.short_path(file)}: in the format of another version, and left out: {cure}")
     return tables
 
 

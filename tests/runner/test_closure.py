@@ -80,11 +80,17 @@ class Outer(Base):
 
 
 def test_parameters_are_shown_with_those_of_bases_and_of_fields(capsys):
-    share, size = ("share", "number > 0 and < 1", "0.5", "A share."), ("inner.size", "1 … 9", "3", "Of what is inside.")
-    others = [(name, "true, false", default, "") for name, default in (("mute", "false"), ("quick", "true"))]
+    share, size = (
+        ("share", "number, above 0, below 1", "0.5", "A share."),
+        ("inner.size", "integer, minimum 1, maximum 9", "3", "Of what is inside."),
+    )
+    others = [(name, "boolean", default, "") for name, default in (("mute", "false"), ("quick", "true"))]
     assert parameters(Outer) == [share, size, *others]  # the next value is no meaning
     assert verbs.show_params(Project(LIBRARY, photo_sets()), ["urm"]) == 0
-    assert "urm.directions = 512    (0 … 4,096)\n    Directions of the sphere" in capsys.readouterr().out
+    assert (
+        "urm.directions = 512    (integer, minimum 0, maximum 4096)\n    Directions of the sphere"
+        in capsys.readouterr().out
+    )
 
 
 @pytest.mark.parametrize("stage", read_pipeline(LIBRARY / "pipeline.yaml", photo_sets().slices).order())

@@ -139,7 +139,8 @@ def project(tmp_path):
 def kept(project):
     """Every result by its key, every byte of every result."""
     store = project.build / "store"
-    return files_of(store / "keys") | files_of(store / "trees")
+    entries = {path.name: json.loads(path.read_text()) for path in (store / "keys").iterdir()}
+    return {key: entry | {"cost": None} for key, entry in entries.items()} | files_of(store / "trees")
 
 
 def beside(project, *settings):

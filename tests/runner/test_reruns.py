@@ -197,7 +197,7 @@ FIELDS = [  # where something is set, and the line that says so
     ("photos.1.objects.1.mask", "own.png", 'dataset.yaml: photos.*.objects[1].mask: not given -> "own.png"'),
     ("photos.1.objects.0.materials", {"legs": "red"}, 'photos.*.objects[0].materials.legs: not given -> "red"'),
     ("meshes.chair.parts.legs", "red", 'dataset.yaml: meshes.chair.parts.legs: "white" -> "red"'),
-    ("materials", ["red", "white", "wood"], "dataset.yaml: materials: 'wood' added"),
+    ("materials", ["red", "white", "wood"], 'dataset.yaml: materials: ["red", "white"] -> ["red", "white", "wood"]'),
     ("materials", ["white", "red"], 'dataset.yaml: materials: ["red", "white"] -> ["white", "red"]'),
 ]  # fmt: skip
 

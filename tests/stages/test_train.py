@@ -66,8 +66,7 @@ def test_a_killed_training_goes_on_to_the_same_bytes(tmp_path):
 def test_shipped_weights_are_of_this_stage_and_within_the_bounds(tmp_path):
     """`make train` makes the shipped weights again; these are the errors that it must reach.
 
-    Where the last line fails, sources of the training changed: `make train DATASET=eames FORCE=1`, then
-    `python -m factorlib ship train --dataset eames`.
+    Where the last line fails, sources of the training changed: see "A BRDF" in CONTRIBUTING.md.
     """
     accuracy = json.loads((SHIPPED / "accuracy.json").read_text())
     assert accuracy["specular"]["samples"] == train.Params().held_out
