@@ -58,8 +58,9 @@ def read_result(path: str | Path, type_: type[T], stage: str, cure: str = "") ->
         # a table called `version` is the entry of a photo of that name
         said = isinstance(content, dict) and not isinstance(content.get("version", {}), dict | list)
         if said and (version := content.pop("version")) != VERSION:
-            found = f"is of version {version}; this program reads version {VERSION}"
-            raise InputError(found, file=path, key="version", cure=cure)
+            raise InputError(
+                f"is of version {version}; this program reads version {VERSION}", file=path, key="version", cure=cure
+            )
         try:
             return msgspec.convert(content, type_)
         except msgspec.ValidationError as error:

@@ -96,21 +96,21 @@ def new_dataset(target: Path, photos: Path, masks: Path | None, meshes: Path | N
         meshes: folder of meshes
 
     Raises:
-        InputError: The target exists or cannot be created, or a folder is missing or has no photos.  It is also raised
-            for a link, an unprintable file name, and too many pixels.
+        InputError: The target cannot be created, or a folder lacks photos or has a link, a bad name, too many pixels.
     """
-    above = _check_target(target)
+    _check_target(target)
     images = _by_name(_files(photos, IMAGES, "PHOTOS"), "PHOTOS")
     if not images:
-        fault = f"there are no photos ({', '.join(IMAGES[:6])}, …) in it"
-        raise InputError(fault, file=photos, key="PHOTOS", cure="name their folder")
+        raise InputError(
+            "has no photos", file=photos, key="PHOTOS", cure=f"name a folder of {', '.join(IMAGES[:6])}, …"
+        )
     mask_files = _files(masks, (".png", ".json"), "MASKS", deep=True) if masks is not None else []
     mesh_files = _files(meshes, None, "MESHES", deep=True) if meshes is not None else []  # including .mtl and buffers
     missing: list[str] = []
     labelled = _masks(masks, mask_files, list(images), missing) if masks else Masks()
     entries = _meshes(meshes, mesh_files, labelled.materials, missing) if meshes else {}
     visible = _visible_meshes(list(images), entries, labelled, missing)
-    missing += _missing_masks(list(images), labelled) if masks is not None else [NO_MASKS]
+    missing += [NO_MASKS] * (masks is None)
     missing += [
         f"photo {photo}: write another `name`: a file of the results is called {photo}"
         for photo in images
@@ -118,9 +118,8 @@ def new_dataset(target: Path, photos: Path, masks: Path | None, meshes: Path | N
     ]
     spec: dict = {"format": 1, "materials": labelled.materials or [UNKNOWN]}
     if not entries:
-        several = {"parts": {name: name for name in labelled.materials}}
-        single = {"material": spec["materials"][0]}
-        entries = {HULL: {"hull": True, **(several if len(labelled.materials) > 1 else single)}}
+        several = {"parts": {name: name for name in labelled.materials}} if len(labelled.materials) > 1 else {}
+        entries = {HULL: {"hull": True, **(several or {"material": spec["materials"][0]})}}
         spec["cameras"] = {"sfm": True}
         visible = {photo: [HULL] for photo in images}
         missing.append(NO_MESH)
@@ -131,19 +130,18 @@ def new_dataset(target: Path, photos: Path, masks: Path | None, meshes: Path | N
     sources = {"photos": (photos, images.values()), "masks": (masks, mask_files), "meshes": (meshes, mesh_files)}
     places = {name: (folder, files) for name, (folder, files) in sources.items() if folder is not None}
     _match(spec, lambda name: places[name.partition("/")[0]][0] / name.partition("/")[2], missing)
-    _write(target, spec, places, above)
+    _write(target, spec, places)
     return missing
 
 
-def _check_target(target: Path) -> Path:
-    """Return the folder in which the target can be created.  Raises InputError where it cannot be."""
+def _check_target(target: Path) -> None:
+    """Raise InputError if the target cannot be created."""
     if not target.name.isprintable():
         raise InputError(f"{target.name!a} cannot be printed", key="DATASET", cure="choose another name")
     if os.path.lexists(target):
         raise InputError("is there already", file=target, key="DATASET", cure="choose another name, or delete it")
     if not (above := next(path for path in target.absolute().parents if os.path.lexists(path))).is_dir():
         raise InputError("is no folder", file=above, key="DATASET", cure="name a folder that can be made")
-    return above
 
 
 def _visible_meshes(
@@ -163,12 +161,6 @@ def _visible_meshes(
     return visible
 
 
-def _missing_masks(photos: list[str], labelled: Masks) -> list[str]:
-    """List the photos without a mask."""
-    without = [photo for photo in photos if photo not in labelled.by_photo]
-    return [f"photo {photo}: no mask called {photo}.png or {photo}_<material>.png" for photo in without]
-
-
 def _photo_entries(
     paths: Mapping[str, str], entries: Collection[str], visible: Mapping[str, list[str]], labelled: Masks
 ) -> list[dict[str, Any]]:
@@ -185,7 +177,7 @@ def _photo_entries(
     return photos
 
 
-def _write(target: Path, spec: dict, places: Mapping[str, tuple[Path, Iterable[Path]]], above: Path) -> None:
+def _write(target: Path, spec: dict, places: Mapping[str, tuple[Path, Iterable[Path]]]) -> None:
     """Write the dataset.yaml and copies of the files into the folder `target`, which is there when all of it is."""
     text = re.sub(r'"([\w-]+|\?)\\x1F([^"]*)"', lambda m: f"{yaml_text(m[1]).split()[0]}  # {m[2]}", yaml_text(spec))
     try:
@@ -193,20 +185,16 @@ def _write(target: Path, spec: dict, places: Mapping[str, tuple[Path, Iterable[P
         with TemporaryDirectory(dir=target.parent, prefix=f".{target.name}.") as folder:
             draft = Path(folder) / target.name
             for name, (source, files) in places.items():
-                _copy(source, draft / name, files)
+                for path in files:
+                    place = draft / name / path.relative_to(source)
+                    place.parent.mkdir(parents=True, exist_ok=True)
+                    shutil.copyfile(path, place)
             write_text(draft / "dataset.yaml", REMARK + text)
             draft.rename(target)
     except OSError as error:
         cure = "name a folder that can be made"
-        known = disk_error(error, target.parent)
-        raise known or InputError("no folder can be made here", file=above, key="DATASET", cure=cure) from error
-
-
-def _copy(source: Path, target: Path, files: Iterable[Path]) -> None:
-    for path in files:
-        place = target / path.relative_to(source)
-        place.parent.mkdir(parents=True, exist_ok=True)
-        shutil.copyfile(path, place)
+        fault = InputError("no folder can be made here", file=target.parent, key="DATASET", cure=cure)
+        raise disk_error(error, target.parent) or fault from error
 
 
 def _masks(folder: Path, paths: list[Path], photos: list[str], missing: list[str]) -> Masks:
@@ -234,6 +222,8 @@ def _masks(folder: Path, paths: list[Path], photos: list[str], missing: list[str
         elif each:
             masks.by_photo[photo] = each
             names |= dict.fromkeys(each)
+    without = [photo for photo in photos if photo not in masks.by_photo]
+    missing += [f"photo {photo}: no mask called {photo}.png or {photo}_<material>.png" for photo in without]
     masks.materials = list(names) or [f"label_{k}" for k in range(1, labels + 1)]
     return masks
 
@@ -284,10 +274,8 @@ def _meshes(folder: Path, files: list[Path], materials: list[str], missing: list
     for name, path in _by_name([path for path in files if path.suffix.lower() in MESHES], "MESHES").items():
         parts = list(dict.fromkeys(names[0] for names in read_parts(path)))
         file = f"meshes/{path.relative_to(folder)}"
-        if len(materials) == 1:
-            entries[name] = {"file": file, "material": materials[0]}
-            continue
-        entries[name] = {"file": file, "parts": {part: part if part in materials else UNKNOWN for part in parts}}
+        several = {"parts": {part: part if part in materials else UNKNOWN for part in parts}}
+        entries[name] = {"file": file, **({"material": materials[0]} if len(materials) == 1 else several)}
     return entries
 
 
@@ -373,8 +361,12 @@ def _files(folder: Path, suffixes: tuple[str, ...] | None, key: str, deep: bool 
         if path.name.startswith("._") or (suffixes is not None and path.suffix.lower() not in suffixes):
             continue
         if path.is_symlink() or not (path.is_file() or path.is_dir()):
-            cure = "put the file itself there, or take it away"
-            raise InputError("is a link, or no file of this folder's own", file=path, key=key, cure=cure)
+            raise InputError(
+                "is a link, or no file of this folder's own",
+                file=path,
+                key=key,
+                cure="put the file itself there, or take it away",
+            )
         if not path.name.isprintable():
             raise InputError(f"{path.name!a} cannot be printed", file=folder, key=key, cure="rename that file")
         if path.is_file():
@@ -386,8 +378,12 @@ def _by_name(paths: list[Path], key: str) -> dict[str, Path]:
     named: dict[str, Path] = {}
     for path in paths:
         if (other := named.setdefault(name := _word(path.stem), path)) != path:
-            fault = f"{path.name} and {other.name} would both be called {name!r}"
-            raise InputError(fault, file=path, key=key, cure="rename one of them")
+            raise InputError(
+                f"{path.name} and {other.name} would both be called {name!r}",
+                file=path,
+                key=key,
+                cure="rename one of them",
+            )
     return named
 
 

@@ -42,11 +42,16 @@ def pack(home: Path, out: Path, replace: bool = False) -> int:
         InputError: A needed stage has no result, `out` is not the name of a zip file, or it exists already.
     """
     if missing := [path for path in (*NEEDED, "export/dataset.json") if not (home / path).exists()]:
-        cure = f"make all DATASET={home.name}"
-        raise InputError(f"the result is incomplete: {missing[0]} is missing", file=home, cure=cure)
+        raise InputError(
+            f"the result is incomplete: {missing[0]} is missing", file=home, cure=f"make all DATASET={home.name}"
+        )
     if out.suffix != ".zip" or out.is_dir() or not out.absolute().parent.is_dir():
-        cure = "name a .zip file in an existing folder: OUT=<name>.zip"
-        raise InputError("a zip file cannot be written here", file=out, key="OUT", cure=cure)
+        raise InputError(
+            "a zip file cannot be written here",
+            file=out,
+            key="OUT",
+            cure="name a .zip file in an existing folder: OUT=<name>.zip",
+        )
     if out.exists() and not replace:
         raise InputError(
             "the file exists already", file=out, key="OUT", cure="name another file, or add FORCE=1 to replace it"

@@ -24,15 +24,21 @@ import OpenImageIO as oiio
 from factorlib.conventions import YUP_FROM_CAMERA, lat_long_directions
 from factorlib.dataset.schema import LightSlice, ObjectsSlice
 from factorlib.errors import InputError
-from factorlib.export.blender import write_scene_json, write_script
-from factorlib.export.environment import mitsuba_map
-from factorlib.export.exported_scene import ALL_BOUNCES, DIRECT, ExportedScene, ExposedMap, Sun, suns_of
+from factorlib.export.exported_scene import (
+    ALL_BOUNCES,
+    DIRECT,
+    ExportedScene,
+    ExposedMap,
+    Sun,
+    suns_of,
+    write_scene_json,
+    write_script,
+)
 from factorlib.export.gltf_writer import variant_name, write_glb, write_suns
 from factorlib.export.materialx import materialx
 from factorlib.export.mesh_files import MeshFiles
-from factorlib.export.mitsuba import write_scene
+from factorlib.export.mitsuba import headroom_factor, table_in_gauge, write_scene
 from factorlib.export.other_renderers import differences
-from factorlib.export.reflectance_limit import headroom_factor, table_in_gauge
 from factorlib.export.usd import SUFFIX, write_usd_scene
 from factorlib.images.exr import LAT_LONG, read_rgb_exr, write_hdr, write_rgb_exr
 from factorlib.jsonfile import write_json
@@ -44,6 +50,7 @@ from factorlib.results.lobe_table import read_lobes, write_lobes
 from factorlib.results.materials import MaterialTable, Vec3, read_exposures, read_materials, reflectances
 from factorlib.results.poses import read_poses
 from factorlib.stage import Inputs, Progress
+from factorlib.tracing.scene import mitsuba_map
 from factorlib.wholefile import write_bytes, write_text
 
 log = logging.getLogger("factorlib.export")
@@ -131,8 +138,11 @@ def _write_tables(out: Path, solution: SolutionInGauge) -> None:
     write_json(out / "losses.json", {name: differences(material) for name, material in materials.items()})
     suns = {name: [_sun(sun) for sun in suns_of(light, YUP_FROM_CAMERA)] for name, light in solution.lights.items()}
     if clash := [name for name in suns if name.endswith(SKY) and suns.get(name.removesuffix(SKY))]:
-        fault = f"the files of illumination '{clash[0]}' would replace the sky of '{clash[0].removesuffix(SKY)}'"
-        raise InputError(fault, key="illumination", cure=f"rename it, so that it does not end in {SKY}")
+        raise InputError(
+            f"the files of illumination '{clash[0]}' would replace the sky of '{clash[0].removesuffix(SKY)}'",
+            key="illumination",
+            cure=f"rename it, so that it does not end in {SKY}",
+        )
     write_json(out / "lights.json", suns)
 
 
@@ -185,8 +195,9 @@ def _solved_lights(file: Path, lights: Mapping[str, LightSlice]) -> dict[str, Lo
     names = sorted({light.illumination for light in lights.values()})
     for name in names:
         if name not in solved:
-            text = "illumination '%s' is exported as black: no pixel in it was observed, so it was not solved"
-            log.warning(text, name)
+            log.warning(
+                "illumination '%s' is exported as black: no pixel in it was observed, so it was not solved", name
+            )
     return {name: solved.get(name, no_lobes()) for name in names}
 
 

@@ -24,9 +24,9 @@ from factorlib.evaluate.ball import (
     octahedral_directions,
 )
 from factorlib.evaluate.comparison_gauge import GAUGES, errors_by_gauge
-from factorlib.evaluate.geometry_errors import angles_deg
 from factorlib.evaluate.picture_errors import mean_scored
 from factorlib.evaluate.relighting import BALL_SIZE, INSIDE, NORMALS, appearances
+from factorlib.evaluate.truth import angles_deg
 from factorlib.geometry.sphere import mirror_directions
 from factorlib.results.metrics import LightError, LightErrors, ScoredLight
 

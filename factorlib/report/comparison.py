@@ -38,8 +38,11 @@ def comparison(first: Path, second: Path, changes: Sequence[str] | None) -> str:
     photos = [name for name in runs[0].set.photos if name in runs[1].set.photos]
     materials = [name for name in tables[0].materials if name in tables[1].materials]
     if not photos and not materials:
-        cure = "name results of one data set, or of sets that share photos or materials"
-        raise InputError(f"has no photo and no material in common with {first}", file=second, cure=cure)
+        raise InputError(
+            f"has no photo and no material in common with {first}",
+            file=second,
+            cure="name results of one data set, or of sets that share photos or materials",
+        )
     names = [{run.illumination_of(photo) for run in runs} for photo in photos]
     lights = dict.fromkeys(name for pair in names if len(pair) == 1 for name in pair)
 
@@ -64,8 +67,11 @@ def _read_run(folder: Path) -> Artifacts:
     for file in (PHOTOS, MATERIALS):
         if not (folder / file).is_file():
             stage, _, name = file.partition("/")
-            fault = f"the result is incomplete: {name} of the stage {stage!r} is missing"
-            raise InputError(fault, file=folder, cure=f"make all DATASET={_dataset_of(folder)}")
+            raise InputError(
+                f"the result is incomplete: {name} of the stage {stage!r} is missing",
+                file=folder,
+                cure=f"make all DATASET={_dataset_of(folder)}",
+            )
     photo_set = SimpleNamespace(name=folder.name, photos=list(read_photos(folder / PHOTOS)))
     return Artifacts({stage: folder / stage for stage in STAGES}, photo_set)
 
@@ -79,7 +85,7 @@ def _dataset_of(folder: Path) -> str:
 def _numbers(runs: list[Artifacts]) -> list[tuple[str, list[str]]]:
     """Return the headlines of both runs by label; a dash if one has none."""
     metrics = [run.metrics for run in runs]
-    values = [{h.label: f"{h.value} {h.unit}".strip() for h in headlines(m)} if m else {} for m in metrics]
+    values = [{h["label"]: f"{h['value']} {h['unit']}".strip() for h in headlines(m)} if m else {} for m in metrics]
     return [(label, [run.get(label, DASH) for run in values]) for label in dict.fromkeys([*values[0], *values[1]])]
 
 

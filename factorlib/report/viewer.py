@@ -19,7 +19,6 @@ from trimesh.visual.texture import TextureVisuals
 
 from factorlib.conventions import YUP_FROM_CAMERA
 from factorlib.dataset.schema import LightSlice, ObjectsSlice
-from factorlib.export.environment import sharpened
 from factorlib.export.gltf_writer import read_part_materials, variant_name
 from factorlib.geometry import open3d as o3d
 from factorlib.geometry.camera import Pose
@@ -32,6 +31,7 @@ from factorlib.meshes.subdivision import subdivide
 from factorlib.report.artifacts import Artifacts
 from factorlib.results.lobe_table import read_lobes
 from factorlib.results.poses import AS_IT_IS
+from factorlib.tracing.scene import sharpened
 
 MOST_TRIANGLES = 150_000  # triangles of all meshes together: about 3 MB of page
 LONGEST = 0.08  # longest edge, in extents of the mesh

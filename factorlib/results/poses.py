@@ -125,5 +125,9 @@ def _check(photo: PhotoPoses, path: str | Path, key: str, cure: str) -> None:
     for name, obj in photo.objects.items():
         for entry in (obj, obj.runner_up):
             if entry is not None and not is_pose(np.array(entry.rotation), np.array(entry.translation)):
-                fault = "the pose is invalid: its rotation is no rotation matrix, or a number is not finite"
-                raise InputError(fault, file=path, key=f"{key}.{name}", cure=cure)
+                raise InputError(
+                    "the pose is invalid: its rotation is no rotation matrix, or a number is not finite",
+                    file=path,
+                    key=f"{key}.{name}",
+                    cure=cure,
+                )

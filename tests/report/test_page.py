@@ -133,7 +133,7 @@ def test_only_the_cost_section_depends_on_the_log(made, tmp_path):
     assert without[0] == without[1] and again != html
     assert "1 min 23 s" in html and "photo &#39;day&#39; &lt;is&gt; dark" in html
     figures = [sorted((folder / "figures").rglob("*.png")) for folder in (made[0] / "report", tmp_path / "again")]
-    assert [p.read_bytes() for p in figures[0]] == [p.read_bytes() for p in figures[1]] and len(figures[0]) == 4
+    assert [p.read_bytes() for p in figures[0]] == [p.read_bytes() for p in figures[1]] and len(figures[0]) == 3
 
 
 @pytest.mark.parametrize(
