@@ -34,6 +34,7 @@ from factorlib.images.light_map import read_light_map
 from factorlib.images.picture import picture
 from factorlib.jsonfile import read_json
 from factorlib.light.latlong import rotate_map
+from factorlib.pack import check_whole
 from factorlib.reading import check_plain
 from factorlib.recipe import kinds
 from factorlib.recipe.kinds import KINDS, AnyRecipe, is_light_file
@@ -91,11 +92,7 @@ def load_result(folder: str | Path) -> Result:
             file=folder,
             cure=did_you_mean(str(folder), known) if known else "make all DATASET=<name> makes one",
         )
-    missing = [stage for stage in STAGES if not (result / stage).is_dir()]
-    if missing:
-        raise InputError(
-            f"the result is incomplete: {missing[0]} is missing", file=result, cure=f"make export DATASET={result.name}"
-        )
+    check_whole(result, STAGES)
     stages = [stage for stage in (*STAGES, "shapes", "surface") if (result / stage).is_dir()]
     folders = {stage: (result / stage).resolve() for stage in stages}
     file = result / "export" / "dataset.json"

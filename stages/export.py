@@ -12,10 +12,10 @@ dataset.json, source/            Facts and meshes of the dataset, for new pictur
 """
 
 import logging
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from itertools import count
 from pathlib import Path, PurePosixPath
-from typing import Annotated, Any
+from typing import Annotated
 
 import msgspec
 import numpy as np
@@ -29,7 +29,6 @@ from factorlib.export.exported_scene import (
     DIRECT,
     ExportedScene,
     ExposedMap,
-    Sun,
     suns_of,
     write_scene_json,
     write_script,
@@ -111,7 +110,9 @@ def main(params: Params, inputs: Inputs, out: Path, progress: Progress) -> None:
         camera = poses[photo].camera.camera(*_image_size(inputs["align"] / f"{photo}.exr"))
         placed = objects[photo]
         shapes = [s for obj in placed.objects for s in files.shapes(obj, placed.meshes, poses[photo].objects)]
-        light = _exposed_map(slice_, solution.exposures.get(photo, (1.0,) * 3))
+        turn = np.eye(3) if slice_.world_from_camera is None else np.array(slice_.world_from_camera).T
+        exposure = np.array(solution.exposures.get(photo, (1.0,) * 3))
+        light = ExposedMap(f"../illumination/{slice_.illumination}.exr", exposure, turn)
         scene = ExportedScene(camera, shapes, materials, light, depth)
         _write_scenes(out / "scenes", photo, scene, solution.lights[slice_.illumination], params)
     progress(total, total)
@@ -120,11 +121,18 @@ def main(params: Params, inputs: Inputs, out: Path, progress: Progress) -> None:
 def _solution_in_gauge(folder: Path, slices: Mapping[str, LightSlice]) -> SolutionInGauge:
     """Read the solution in the gauge of Mitsuba, max k_d + max k_s < 1.
 
-    One factor multiplies all reflectances and divides all lights.
+    One factor multiplies all reflectances and divides all lights.  A light that was not solved for is black.
     """
     table = read_materials(folder / "materials.json")
     factor = headroom_factor(table.materials)
-    lights = {n: light.scaled(1 / factor) for n, light in _solved_lights(folder / "lobes.parquet", slices).items()}
+    solved = read_lobes(folder / "lobes.parquet")
+    lights = {}
+    for name in sorted({light.illumination for light in slices.values()}):
+        if name not in solved:
+            log.warning(
+                "illumination '%s' is exported as black: no pixel in it was observed, so it was not solved", name
+            )
+        lights[name] = solved.get(name, no_lobes()).scaled(1 / factor)
     return SolutionInGauge(table_in_gauge(table, factor), lights, read_exposures(folder / "exposures.json"))
 
 
@@ -136,7 +144,7 @@ def _write_tables(out: Path, solution: SolutionInGauge) -> None:
     write_lobes(out / "lobes.parquet", solution.lights)
     write_text(out / "materials.mtlx", materialx(materials))
     write_json(out / "losses.json", {name: differences(material) for name, material in materials.items()})
-    suns = {name: [_sun(sun) for sun in suns_of(light, YUP_FROM_CAMERA)] for name, light in solution.lights.items()}
+    suns = {name: [sun.plain() for sun in suns_of(light, YUP_FROM_CAMERA)] for name, light in solution.lights.items()}
     if clash := [name for name in suns if name.endswith(SKY) and suns.get(name.removesuffix(SKY))]:
         raise InputError(
             f"the files of illumination '{clash[0]}' would replace the sky of '{clash[0].removesuffix(SKY)}'",
@@ -152,13 +160,6 @@ def _image_size(path: Path) -> tuple[int, int]:
     assert source is not None  # `align` wrote it
     spec = source.spec()
     return spec.width, spec.height
-
-
-def _exposed_map(slice_: LightSlice, exposure: Sequence[float]) -> ExposedMap:
-    """Return the exported map of a photo's light, suns included, at the photo's exposure."""
-    world = slice_.world_from_camera
-    camera_from_light = np.eye(3) if world is None else np.array(world).T
-    return ExposedMap(f"../illumination/{slice_.illumination}.exr", np.array(exposure), camera_from_light)
 
 
 def _write_scenes(folder: Path, photo: str, scene: ExportedScene, lobes: Lobes, params: Params) -> None:
@@ -189,18 +190,6 @@ def _write_scenes(folder: Path, photo: str, scene: ExportedScene, lobes: Lobes, 
     write_scene(folder / f"{photo}.xml", msgspec.structs.replace(scene, light=light))
 
 
-def _solved_lights(file: Path, lights: Mapping[str, LightSlice]) -> dict[str, Lobes]:
-    """Return the lobes of every illumination, sorted by name; none, with a warning, for one that was not solved for."""
-    solved = read_lobes(file)
-    names = sorted({light.illumination for light in lights.values()})
-    for name in names:
-        if name not in solved:
-            log.warning(
-                "illumination '%s' is exported as black: no pixel in it was observed, so it was not solved", name
-            )
-    return {name: solved.get(name, no_lobes()) for name in names}
-
-
 def _write_dataset(out: Path, inputs: Inputs) -> None:
     """Write the parts of the dataset that pictures of the result need.
 
@@ -226,14 +215,6 @@ def _write_light(out: Path, name: str, light: Lobes, coverage: Path, params: Par
     if coverage.exists():
         directions = lat_long_directions(params.height, 2 * params.height)
         write_rgb_exr(out / "coverage" / f"{name}.exr", sample_map(read_rgb_exr(coverage), directions), LAT_LONG)
-
-
-def _sun(sun: Sun) -> dict[str, Any]:
-    """Return the entry of a sun in lights.json."""
-    return {
-        **{name: getattr(sun, name).tolist() for name in ("direction", "irradiance")},
-        "angular_diameter_deg": sun.angular_diameter_deg,
-    }
 
 
 def _write_mitsuba_map(path: Path, light: Lobes, params: Params) -> None:

@@ -25,7 +25,7 @@ from factorlib.evaluate.ball import (
 )
 from factorlib.evaluate.comparison_gauge import GAUGES, errors_by_gauge
 from factorlib.evaluate.picture_errors import mean_scored
-from factorlib.evaluate.relighting import BALL_SIZE, INSIDE, NORMALS, appearances
+from factorlib.evaluate.relighting import BALL_SIZE, NORMALS, appearances, disc
 from factorlib.evaluate.truth import angles_deg
 from factorlib.geometry.sphere import mirror_directions
 from factorlib.results.metrics import LightError, LightErrors, ScoredLight
@@ -88,7 +88,10 @@ def compare_lights(
         for name, scored in _scored_view(render, estimates, truths, samples).items():
             for gauge, score in scored.items():
                 lights[name][gauge][view] = score
-    mean = {g: _mean([lights[n][g] for n in names]) for g in GAUGES}
+    mean = {}
+    for gauge in GAUGES:
+        by_view = {v: [lights[n][gauge][v] for n in names if v in lights[n][gauge]] for v in VIEWS}
+        mean[gauge] = {v: mean_scored(scores, 9) for v, scores in by_view.items() if scores}
     fraction = {n: float(np.mean(hits[n])) if n in hits else None for n in names}
     return LightErrors(lights, mean, fraction)
 
@@ -114,10 +117,7 @@ def mirrored_directions(
 
 def sphere_row(light: OctahedralLight) -> Float[np.ndarray, "s w 3"]:
     """Render the three spheres side by side, black around them."""
-    row = np.zeros((len(SPHERES), *INSIDE.shape, 3))
-    for picture, name in zip(row, SPHERES, strict=True):
-        picture[INSIDE] = VIEWS[name](light)
-    return np.concatenate(list(row), axis=1)
+    return np.concatenate([disc(VIEWS[name](light)) for name in SPHERES], axis=1)
 
 
 def _texels_of_octahedron(mask: Bool[np.ndarray, "h w"]) -> tuple[np.ndarray, np.ndarray]:
@@ -141,8 +141,3 @@ def _scored_view(
     whites = [float(np.sqrt(np.mean(t**2))) or 1.0 for t in true]
     errors = errors_by_gauge(kinds, true, whites, lambda scaled, i: light_error(scaled, true[i]))
     return {n: {g: ScoredLight(**kind) for g, kind in each.items()} for n, each in zip(samples, errors, strict=True)}
-
-
-def _mean(scored: list[dict[str, ScoredLight]]) -> dict[str, ScoredLight]:
-    by_view = {v: [s[v] for s in scored if v in s] for v in VIEWS}
-    return {v: mean_scored(scores, 9) for v, scores in by_view.items() if scores}

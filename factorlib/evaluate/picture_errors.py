@@ -238,8 +238,11 @@ def compare_photos(
         materials: names by label, from 1
         read: reads a photo by name
     """
-    factors = _factors(list(names), read)
-    photos = {name: _photo_errors(read(name), materials, factor) for name, factor in factors.items()}
+    names = list(names)
+    samples = [(photo.resynthesis[photo.pixels], photo.photo[photo.pixels], photo.white) for photo in map(read, names)]
+    factors = gauge_factors(*zip(*samples, strict=True), below_white=True)
+    by_photo = [{gauge: factors[gauge][k] for gauge in GAUGES} for k in range(len(names))]
+    photos = {name: _photo_errors(read(name), materials, factor) for name, factor in zip(names, by_photo, strict=True)}
     scored = [p.gauges for p in photos.values() if p.gauges]
     if not scored:
         return ResynthesisErrors(photos, None, None, None)
@@ -248,31 +251,12 @@ def compare_photos(
     return ResynthesisErrors(photos, mean, *worst)
 
 
-def flat_materials(photo: ComparedPhoto) -> Picture:
-    """Return the null: every material of the photo in its mean colour."""
-    flat = np.zeros_like(photo.photo)
-    for label in np.unique(photo.label[photo.pixels]):
-        pixels = photo.pixels & (photo.label == label)
-        flat[pixels] = photo.photo[pixels].mean(axis=0)
-    return flat
-
-
-def _factors(names: list[str], read: Callable[[str], ComparedPhoto]) -> dict[str, dict[str, Float[np.ndarray, "3"]]]:
-    estimates = []
-    truths = []
-    whites = []
-    for name in names:
-        photo = read(name)
-        estimates.append(photo.resynthesis[photo.pixels])
-        truths.append(photo.photo[photo.pixels])
-        whites.append(photo.white)
-    factors = gauge_factors(estimates, truths, whites, below_white=True)
-    return {name: {g: factors[g][i] for g in GAUGES} for i, name in enumerate(names)}
-
-
 def _photo_errors(photo: ComparedPhoto, materials: list[str], factor: dict[str, Float[np.ndarray, "3"]]) -> PhotoErrors:
     regions = {m: photo.pixels & (photo.label == k) for k, m in enumerate(materials, start=1)}
-    null = _scored(flat_materials(photo), photo, regions)
+    flat = np.zeros_like(photo.photo)  # the null
+    for region in (region for region in regions.values() if region.any()):
+        flat[region] = photo.photo[region].mean(axis=0)
+    null = _scored(flat, photo, regions)
     errors = {g: _scored(photo.resynthesis * factor[g], photo, regions) for g in GAUGES}
 
     def scores(region: str) -> dict[str, ScoredPicture]:

@@ -44,23 +44,20 @@ MEAN_SHOWN = 0.5  # mean of the true ball in the relit set score, linear, before
 Samples = Float[np.ndarray, "_ 3"]
 
 
-@lru_cache(maxsize=16)
-def lobe_of(roughness: float) -> Reflected:
-    """Return the glossy lobe of a ball, cached because materials appear in many lights; 16 take 200 MB at most."""
-    return glossy_lobe(NORMALS, roughness)
+@lru_cache(maxsize=17)
+def lobe_of(roughness: float | None) -> Reflected:
+    """Return the glossy lobe of a ball, or the diffuse one for None, cached because materials appear in many lights.
 
-
-@cache
-def matte_lobe() -> Reflected:
-    """Return the diffuse lobe of a ball, cached."""
-    return diffuse_lobe(NORMALS)
+    They take 200 MB at most.
+    """
+    return diffuse_lobe(NORMALS) if roughness is None else glossy_lobe(NORMALS, roughness)
 
 
 class Appearances:
     """Balls of many materials in one light, with each part of the reflection rendered once."""
 
     def __init__(self, light: OctahedralLight):
-        self.diffuse = matte_lobe()(light)
+        self.diffuse = lobe_of(None)(light)
         self.glossy = cache(lambda roughness: lobe_of(roughness)(light))
 
     def ball(self, material: Reflectance) -> Samples:
@@ -108,7 +105,7 @@ def compare_relighting(
 
     def error(ball: Samples, i: int) -> PictureError:
         """Return the error of a scaled ball against the true one."""
-        return picture_error(_disc(ball), _disc(true[i]), INSIDE, whites[i])
+        return picture_error(disc(ball), disc(true[i]), INSIDE, whites[i])
 
     balls: dict[str, dict[str, RelitBall]] = {}
     for (li, m), white, errors in zip(pairs, whites, errors_by_gauge(kinds, true, whites, error, below_white=True)):
@@ -118,7 +115,8 @@ def compare_relighting(
     return Relighting(balls, _mean(every), _mean(hidden) if hidden else None)
 
 
-def _disc(samples: Samples) -> Float[np.ndarray, "h w 3"]:
+def disc(samples: Samples) -> Float[np.ndarray, "h w 3"]:
+    """Return the picture of a ball, black around it."""
     picture = np.zeros((*INSIDE.shape, 3))
     picture[INSIDE] = samples
     return picture
@@ -148,13 +146,10 @@ def compare_relit_set(
     names = [m for m in truths if m in estimates]
     scores = {}
     nulls = []
-    for light in [li for li in true_lights if li in estimated_lights]:
-        true = appearances(true_lights[light])
-        estimated = appearances(estimated_lights[light])
-        for m in names:
-            ball = true.ball(truths[m])
-            scores[m, light] = shown_psnr(estimated.ball(estimates[m]), ball)
-            nulls.append(shown_psnr(np.broadcast_to(ball.mean(axis=0), ball.shape), ball))
+    for m, light in ((m, light) for light in true_lights if light in estimated_lights for m in names):
+        ball = appearances(true_lights[light]).ball(truths[m])
+        scores[m, light] = shown_psnr(appearances(estimated_lights[light]).ball(estimates[m]), ball)
+        nulls.append(shown_psnr(np.broadcast_to(ball.mean(axis=0), ball.shape), ball))
     if not scores:
         return None
     worst = min(scores, key=scores.__getitem__)

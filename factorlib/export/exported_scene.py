@@ -90,6 +90,10 @@ class Sun(msgspec.Struct, frozen=True):
     irradiance: Float[np.ndarray, "3"]
     angular_diameter_deg: float = SUN_DEG
 
+    def plain(self) -> dict[str, Any]:
+        """Return the sun as plain numbers, for JSON."""
+        return _plain(self, "direction", "irradiance", "angular_diameter_deg")
+
 
 def suns_of(lobes: Lobes, rotation: Float[np.ndarray, "3 3"]) -> list[Sun]:
     """Return the suns of a light, turned by a rotation from the lobes' frame."""
@@ -142,7 +146,7 @@ def write_scene_json(path: str | Path, scene: ExportedScene) -> None:
             "shapes": [_plain(shape, "name", "file", "material", "cam_from_object") for shape in scene.shapes],
             "materials": {shape.material: scene.materials[shape.material] for shape in scene.shapes},
             "light": _plain(scene.light, "file", "exposure", "camera_from_light"),
-            "suns": [_plain(sun, "direction", "irradiance", "angular_diameter_deg") for sun in scene.suns],
+            "suns": [sun.plain() for sun in scene.suns],
             "max_depth": scene.max_depth,
         },
     )

@@ -114,9 +114,14 @@ class Reflector:
         no = (normals * views).sum(-1)
         nz = (normals @ self.axis.T).clamp(-1, 1)
         oz = (views @ self.axis.T).clamp(-1, 1)
-        shares = (
-            [1.0, 1.0] if visibility is None else self._visible_shares(visibility, normals, views, float(roughness))
-        )
+        shares: list[float | Tensor] = [1.0, 1.0]
+        if visibility is not None:
+            directions = torch.from_numpy(fibonacci_sphere(visibility.shape[1])).float()
+            lobes = kernel(directions, self.axis.float(), self.sharpness.float())
+            glossy = highlight_weights(normals.float(), views.float(), directions, float(roughness))
+            weights = cosine_weights(normals.float(), directions), glossy
+            seen = visibility.float() / 255
+            shares = [visible_share(seen, weight, lobes).to(self.operator.dtype) for weight in weights]
         if place is not None and self.curvature > 0:
             nz, oz, larger = finite_distance_cosines(place, normals, views, self.axis, self.curvature)
             shares = [larger * share for share in shares]
@@ -128,18 +133,6 @@ class Reflector:
             specular = self.operator.specular(roughness, self.sharpness, no, nz, oz)
             radiance = radiance + ks * ((shares[1] * specular) @ self.weight)
         return torch.where(no[:, None] > 0, radiance, torch.zeros_like(radiance))
-
-    def _visible_shares(
-        self, visibility: Tensor, normals: Tensor, views: Tensor, roughness: float
-    ) -> list[Float[Tensor, "n p"]]:
-        """Return the visible shares of the diffuse and of the specular reflection of each lobe."""
-        directions = torch.from_numpy(fibonacci_sphere(visibility.shape[1])).float()
-        visibility = visibility.float() / 255
-        normals = normals.float()
-        views = views.float()
-        lobes = kernel(directions, self.axis.float(), self.sharpness.float())
-        weights = cosine_weights(normals, directions), highlight_weights(normals, views, directions, roughness)
-        return [visible_share(visibility, weight, lobes).to(self.operator.dtype) for weight in weights]
 
 
 Channels = Mapping[str, Float[np.ndarray, "h w"]]

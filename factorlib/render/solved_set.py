@@ -157,8 +157,12 @@ class SolvedSet:
         """Return the ground given with the photo, or the plane that the neighbour rests on."""
         given = self.grounds[photo].ground
         if given is None:
+            # up vectors of the cameras of all objects of the mesh, in its frame
             mesh = next(obj.mesh for obj in self.objects[photo].objects if obj.name == neighbour.name)
-            return GroundSurface(resting_plane(neighbour, self._uprights(mesh)))
+            poses = [self.poses[each].objects[obj.name] for each, obj in self._objects_of(mesh)]
+            trusted = [pose for pose in poses if not pose.left_out] or poses
+            uprights = np.stack([np.array(pose.rotation).T @ YUP_FROM_CAMERA[1] for pose in trusted])
+            return GroundSurface(resting_plane(neighbour, uprights))
         normal = YUP_FROM_CAMERA @ np.array(given.normal)
         return GroundSurface(
             Plane(normal / np.linalg.norm(normal), YUP_FROM_CAMERA @ np.array(given.point)), given.diffuse
@@ -234,12 +238,6 @@ class SolvedSet:
         return [
             (photo, obj) for photo, each in sorted(self.objects.items()) for obj in each.objects if obj.mesh == mesh
         ]
-
-    def _uprights(self, mesh: str) -> Float[np.ndarray, "k 3"]:
-        """Return the up vectors of the cameras of all objects of a mesh, in its frame."""
-        poses = [self.poses[photo].objects[obj.name] for photo, obj in self._objects_of(mesh)]
-        trusted = [pose for pose in poses if not pose.left_out] or poses
-        return np.stack([np.array(pose.rotation).T @ YUP_FROM_CAMERA[1] for pose in trusted])
 
     def _placed(self, obj: MeshInstance, entry: MeshEntry, poses: PhotoPoses) -> PlacedMesh:
         pose = poses.objects[obj.name]

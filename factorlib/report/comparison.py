@@ -10,6 +10,7 @@ from jaxtyping import Float
 
 from factorlib.errors import InputError
 from factorlib.images.picture import exposure_of, picture
+from factorlib.pack import check_whole
 from factorlib.report.artifacts import STAGES, Artifacts, Picture
 from factorlib.report.pictures import data_uri, reduced
 from factorlib.report.template import DASH, headlines, number, percent, rendered
@@ -34,7 +35,7 @@ def comparison(first: Path, second: Path, changes: Sequence[str] | None) -> str:
         InputError: A run is incomplete, or the two have no material and no photo in common.
     """
     runs = [_read_run(folder) for folder in (first, second)]
-    tables = [read_materials(f / MATERIALS, f"make export DATASET={_dataset_of(f)}") for f in (first, second)]
+    tables = [read_materials(folder / MATERIALS) for folder in (first, second)]
     photos = [name for name in runs[0].set.photos if name in runs[1].set.photos]
     materials = [name for name in tables[0].materials if name in tables[1].materials]
     if not photos and not materials:
@@ -64,22 +65,9 @@ def comparison(first: Path, second: Path, changes: Sequence[str] | None) -> str:
 
 def _read_run(folder: Path) -> Artifacts:
     """Return the results of a run; InputError if it did not reach `export`."""
-    for file in (PHOTOS, MATERIALS):
-        if not (folder / file).is_file():
-            stage, _, name = file.partition("/")
-            raise InputError(
-                f"the result is incomplete: {name} of the stage {stage!r} is missing",
-                file=folder,
-                cure=f"make all DATASET={_dataset_of(folder)}",
-            )
+    check_whole(folder, (PHOTOS, MATERIALS))
     photo_set = SimpleNamespace(name=folder.name, photos=list(read_photos(folder / PHOTOS)))
     return Artifacts({stage: folder / stage for stage in STAGES}, photo_set)
-
-
-def _dataset_of(folder: Path) -> str:
-    """Return the name of the data set of a result; the folder may have another name."""
-    mark = folder / "dataset.txt"
-    return Path(mark.read_text(encoding="utf-8", errors="replace").strip()).name if mark.is_file() else folder.name
 
 
 def _numbers(runs: list[Artifacts]) -> list[tuple[str, list[str]]]:

@@ -2,7 +2,7 @@
 
 import json
 import re
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from itertools import groupby
 from operator import itemgetter
 from typing import Any
@@ -198,15 +198,12 @@ def _training(run: Artifacts) -> dict[str, Any] | None:
 
 
 def _lines(name: str, table: Mapping, level: int) -> Iterator[tuple[int, str, Mapping]]:
+    """Yield the lines of a table; bins are sorted by their leading numbers: "3 to 30" before "30 to 300"."""
     yield level, name, table
-    for key in _in_order(key for key, value in table.items() if isinstance(value, dict)):
-        yield from _lines(key, table[key], level + 1)
-
-
-def _in_order(names: Iterable[str]) -> list[str]:
-    """Sort bins by their leading numbers: "3 to 30" before "30 to 300"."""
     leading = re.compile(r"[-+]?[\d.]+(e[-+]?\d+)?")
-    return sorted(names, key=lambda name: (float(number[0]) if (number := leading.match(name)) else 0.0, name))
+    inner = [key for key, value in table.items() if isinstance(value, dict)]
+    for key in sorted(inner, key=lambda key: (float(number[0]) if (number := leading.match(key)) else 0.0, key)):
+        yield from _lines(key, table[key], level + 1)
 
 
 # ── Cost ─────────────────────────────────────────────────────────────────────────────────────────────────────────────

@@ -4,7 +4,7 @@
 """
 
 from pathlib import Path
-from typing import Annotated, TypedDict
+from typing import Annotated, Any
 
 import msgspec
 import numpy as np
@@ -93,17 +93,9 @@ class PhotoPoses(msgspec.Struct, frozen=True):
     objects: dict[str, ObjectPose]
 
 
-class PoseFields(TypedDict):
-    """The fields of a `PoseEntry`."""
-
-    rotation: tuple[Vec3, Vec3, Vec3]
-    translation: Vec3
-
-
-def entry_of(pose: Pose) -> PoseFields:
+def entry_of(pose: Pose) -> dict[str, Any]:
     """Return the fields of a `PoseEntry`."""
-    x, y, z = (vec3(row) for row in pose.rotation)
-    return {"rotation": (x, y, z), "translation": vec3(pose.translation)}
+    return {"rotation": tuple(map(vec3, pose.rotation)), "translation": vec3(pose.translation)}
 
 
 def read_poses(path: str | Path, cure: str = CURE) -> dict[str, PhotoPoses]:

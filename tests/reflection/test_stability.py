@@ -10,12 +10,13 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from factorlib.reflection import reflection_operator
-from factorlib.scenes import operator_cases as laws
-from factorlib.scenes.operator_cases import ALL, CASES, answers, case, gradient_error, reference_values, value_error
+from factorlib.scenes.operator_variant import operator_variant
+from tests.reflection import operator_cases as laws
+from tests.reflection.operator_cases import ALL, CASES, answers, case, gradient_error, reference_values, value_error
 
 FAST = {
     "closed_form": reflection_operator("closed_form"), "network": reflection_operator("network"),
-    "network in torch": laws.operator_variant("network", "float32", compiled=False),
+    "network in torch": operator_variant("network", "float32", compiled=False),
     "closed_form float64": reflection_operator("closed_form", dtype="float64"),
     "network float64": reflection_operator("network", dtype="float64"),
 }  # fmt: skip

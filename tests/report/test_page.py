@@ -278,7 +278,7 @@ def test_a_result_that_is_not_whole_is_refused_with_the_stage_and_the_cure(folde
     shutil.rmtree(folders[1] / missing)
     (folders[1] / "dataset.txt").write_text("data/chairs\n")  # b is a copy
     error = refusal("the result is incomplete", comparison, *folders, [])
-    words = f"the stage {missing!r}", "make all DATASET=chairs", str(folders[1])
+    words = f"{missing}/", "make all DATASET=chairs", str(folders[1])
     assert all(word in str(error) for word in words)
 
 

@@ -1,7 +1,5 @@
 """Special cases of the reflection operators, and laws of theirs.
 
-Tests hold the operators to them, and `studies.measured.operator` measures them.
-
 Errors are |R − S| / (S + E/100); of gradients |∂R − ∂S| / (|∂S| + S + E/100), as lobe, view and normal turn.  Formulas
 break at grazing views, mirrors, lobes of no width or of all, and lobes along every special direction: a case differs
 from the ordinary in one respect, the last one in all of them.
@@ -11,9 +9,7 @@ from __future__ import annotations
 
 import itertools
 import math
-import os
 from types import SimpleNamespace
-from unittest.mock import patch
 
 import msgspec
 import torch
@@ -21,22 +17,9 @@ from jaxtyping import Float
 from torch import Tensor
 from torch.nn.functional import normalize
 
-from factorlib.errors import InputError
-from factorlib.reflection import Name, Operator, reflection_operator
-from factorlib.reflection.brdf import specular as brdf
+from factorlib.reflection import Operator, reflection_operator
 from factorlib.reflection.lobe import lobe_integral
 from factorlib.reflection.samples import specular_inputs
-
-
-def operator_variant(name: Name, dtype: str, *, compiled: bool = True) -> Operator | None:
-    """Return the operator in this precision; None where there is none, or nothing of it is compiled to leave out."""
-    with patch.dict(os.environ, {} if compiled else {"FACTORLIB_FUSED": "0"}):
-        try:
-            operator = reflection_operator(name, dtype=dtype)
-        except InputError:
-            return None
-    return operator if compiled or hasattr(operator, "fused") else None
-
 
 # ── Special cases ────────────────────────────────────────────────────────────────────────────────────────────────────
 
@@ -263,20 +246,6 @@ def reflection_of_constant_light(operator: Operator, count: int = 2048) -> tuple
     return p99_and_worst(specular_values(operator, alpha, torch.full_like(lam, 1e-4), no, nz, oz))
 
 
-def point_light_error(operator: Operator, count: int = 4096) -> tuple[float, float]:
-    """Return |S − E f| / (E f + E/100), f the BRDF times n·i, at λ = 10⁶; exactly below 10⁻³.
-
-    Roughness is at least .3, n·o and n·z at least .1.
-    """
-    alpha, lam, no, nz, oz = draw_inputs(Domain(0.3, 0.1), count)
-    alpha, no, nz, oz = (t[nz >= 0.1] for t in (alpha, no, nz, oz))
-    lam = torch.full_like(alpha, 1e6)
-    expected = lobe_integral(lam) * brdf(alpha, nz, no, (no + nz) / torch.sqrt(2 + 2 * oz))
-    return p99_and_worst(
-        (specular_values(operator, alpha, lam, no, nz, oz) - expected).abs() / (expected + lobe_integral(lam) / 100)
-    )
-
-
 def scene(seed: int, points: int = 32, lobes: int = 6, sharpness: tuple[float, float] = (0.0, 3.0)) -> tuple:
     """Draw a light, a material and points that face the viewer at 60° or less, float64.
 
@@ -290,21 +259,3 @@ def scene(seed: int, points: int = 32, lobes: int = 6, sharpness: tuple[float, f
     normals = _unit(points, g)
     material = SimpleNamespace(diffuse=diffuse, specular=specular, roughness=roughness)
     return light, material, normals, normalize(normals + 0.8 * _unit(points, g), dim=1)
-
-
-def rotation_error(operator: Operator) -> tuple[float]:
-    """Return the largest difference after everything was turned, over the largest radiance."""
-    light, material, normals, views = scene(0)
-    turn = torch.linalg.qr(torch.randn(3, 3, generator=torch.Generator().manual_seed(4)).double()).Q
-    before = operator(light, material, normals, views)
-    light.axis = light.axis @ turn.T
-    return (float((operator(light, material, normals @ turn.T, views @ turn.T) - before).abs().max() / before.max()),)
-
-
-def scaling_error(operator: Operator, factor: float = 1e6) -> tuple[float]:
-    """Return the largest relative difference of `factor` times the radiance and that of weights times `factor`."""
-    light, material, normals, views = scene(0)
-    before = operator(light, material, normals, views).double()
-    light.weight = factor * light.weight
-    after = operator(light, material, normals, views).double()
-    return (float(((after / factor - before).abs() / before.clamp_min(1e-12)).max()),)
