@@ -13,9 +13,14 @@ import numpy as np
 from factorlib.dataset.schema import LightSlice, TruthFile
 from factorlib.evaluate.ball import OctahedralLight, octahedral_light
 from factorlib.evaluate.comparison_gauge import connected_components
-from factorlib.evaluate.light_errors import compare_lights, mirrored_directions, sphere_row
 from factorlib.evaluate.picture_errors import ComparedPhoto, compare_photos, compared_photo
-from factorlib.evaluate.relighting import compare_relighting, compare_relit_set
+from factorlib.evaluate.relighting import (
+    compare_lights,
+    compare_relighting,
+    compare_relit_set,
+    mirrored_directions,
+    sphere_row,
+)
 from factorlib.evaluate.truth import (
     averaged_normals,
     compare_materials,

@@ -240,7 +240,8 @@ def compare_photos(
     """
     names = list(names)
     samples = [(photo.resynthesis[photo.pixels], photo.photo[photo.pixels], photo.white) for photo in map(read, names)]
-    factors = gauge_factors(*zip(*samples, strict=True), below_white=True)
+    estimates, truths, whites = zip(*samples, strict=True)
+    factors = gauge_factors(estimates, truths, whites, below_white=True)
     by_photo = [{gauge: factors[gauge][k] for gauge in GAUGES} for k in range(len(names))]
     photos = {name: _photo_errors(read(name), materials, factor) for name, factor in zip(names, by_photo, strict=True)}
     scored = [p.gauges for p in photos.values() if p.gauges]

@@ -8,7 +8,7 @@ resynthesis  always present: `factorlib.evaluate.picture_errors`
 materials    `factorlib.evaluate.truth`
 relighting   `factorlib.evaluate.relighting`
 relit_set    the relit set score of `factorlib.evaluate.relighting`
-light        `factorlib.evaluate.light_errors`
+light        `factorlib.evaluate.relighting`
 normals      photo -> `NormalError`; see `factorlib.evaluate.truth`
 poses        photo -> object -> `PoseError`
 verdict      trust in the result, with or without truth; null if no photo shows a material
