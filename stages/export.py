@@ -19,7 +19,6 @@ from typing import Annotated
 
 import msgspec
 import numpy as np
-import OpenImageIO as oiio
 
 from factorlib.conventions import YUP_FROM_CAMERA, lat_long_directions
 from factorlib.dataset.schema import LightSlice, ObjectsSlice
@@ -39,7 +38,7 @@ from factorlib.export.mesh_files import MeshFiles
 from factorlib.export.mitsuba import headroom_factor, table_in_gauge, write_scene
 from factorlib.export.other_renderers import differences
 from factorlib.export.usd import SUFFIX, write_usd_scene
-from factorlib.images.exr import LAT_LONG, read_rgb_exr, write_hdr, write_rgb_exr
+from factorlib.images.exr import LAT_LONG, read_exr, read_rgb_exr, write_hdr, write_rgb_exr
 from factorlib.jsonfile import write_json
 from factorlib.light.latlong import lat_long_of_lobes, sample_map
 from factorlib.light.lobes import Lobes, no_lobes
@@ -107,7 +106,8 @@ def main(params: Params, inputs: Inputs, out: Path, progress: Progress) -> None:
     depth = ALL_BOUNCES if solution.table.model.interreflection else DIRECT
     for photo, slice_ in slices.items():
         progress(next(done), total, f"scene of {photo}")
-        camera = poses[photo].camera.camera(*_image_size(inputs["align"] / f"{photo}.exr"))
+        height, width = read_exr(inputs["align"] / f"{photo}.exr")["label"].shape
+        camera = poses[photo].camera.camera(width, height)
         placed = objects[photo]
         shapes = [s for obj in placed.objects for s in files.shapes(obj, placed.meshes, poses[photo].objects)]
         turn = np.eye(3) if slice_.world_from_camera is None else np.array(slice_.world_from_camera).T
@@ -152,14 +152,6 @@ def _write_tables(out: Path, solution: SolutionInGauge) -> None:
             cure=f"rename it, so that it does not end in {SKY}",
         )
     write_json(out / "lights.json", suns)
-
-
-def _image_size(path: Path) -> tuple[int, int]:
-    """Read width and height from the header of an EXR."""
-    source = oiio.ImageInput.open(str(path))
-    assert source is not None  # `align` wrote it
-    spec = source.spec()
-    return spec.width, spec.height
 
 
 def _write_scenes(folder: Path, photo: str, scene: ExportedScene, lobes: Lobes, params: Params) -> None:

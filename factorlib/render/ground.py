@@ -38,11 +38,6 @@ class Plane(msgspec.Struct, frozen=True):
     normal: Float[np.ndarray, "3"]
     point: Float[np.ndarray, "3"]
 
-    @property
-    def below_camera(self) -> bool:
-        """True if the camera, at the origin, is on the objects' side of the plane."""
-        return float(self.point @ self.normal) < 0
-
     def onto(self, points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
         """Return the orthogonal projections of `points` onto the plane."""
         return points - ((points - self.point) @ self.normal)[:, None] * self.normal

@@ -138,7 +138,7 @@ def insertion_scene(recipe: kinds.InsertRecipe, results: SolvedSet, photo: str) 
     polished = Reflectance((0.0,) * 3, recipe.ground.specular, recipe.ground.roughness)
     polish = polished if any(recipe.ground.specular) else None
     ground = msgspec.structs.replace(results.ground(photo, neighbour), polish=polish)
-    if not ground.plane.below_camera:
+    if ground.plane.point @ ground.plane.normal >= 0:  # the camera stands at the origin
         raise InputError(
             f"photo '{photo}' was taken from below the plane that '{neighbour.name}' stands on, "
             "so a shadow on it would be invisible",

@@ -15,6 +15,7 @@ from scipy.sparse import csr_array
 from factorlib.conventions import lat_long_solid_angles
 from factorlib.dataset.schema import ObjectsSlice
 from factorlib.evaluate.picture_errors import agreeing_pixels
+from factorlib.images.exr import read_exr
 from factorlib.images.palette import nearest_tags
 from factorlib.images.picture import exposure_of, picture, png_bytes
 from factorlib.images.transfer import srgb_encode
@@ -286,7 +287,7 @@ def reflectance_maps(run: Artifacts, photo: str, exposure: float) -> list[dict[s
     observations = run.read(read_observations, "urm", f"{photo}.parquet")
     observations = observations and with_surface_normals(observations, run.folders.get("surface"))
     for index, name in enumerate(run.set.materials):
-        channels = run.exr("render", f"reflectance_maps/{photo}/{name}")
+        channels = run.read(read_exr, "render", f"reflectance_maps/{photo}/{name}.exr")
         samples = observations and observations.take(observations.material == index)
         measured = data_uri(measured_map(samples, exposure)) if samples else None
         uri = None if channels is None else data_uri(_ringed(channels, exposure))
