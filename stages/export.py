@@ -45,7 +45,7 @@ from factorlib.light.lobes import Lobes, no_lobes
 from factorlib.meshes.ply import write_ply
 from factorlib.meshes.read import CREASE_DEG
 from factorlib.results.lobe_table import read_lobes, write_lobes
-from factorlib.results.materials import MaterialTable, Vec3, read_exposures, read_materials, reflectances
+from factorlib.results.materials import MaterialTable, Reflectance, Vec3, read_exposures, read_materials, reflectances
 from factorlib.results.poses import read_poses
 from factorlib.stage import Inputs, Progress
 from factorlib.tracing.scene import mitsuba_map
@@ -67,14 +67,6 @@ class Params(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """Crease angle, in degrees: an edge whose two triangles differ by more in their normals stays sharp."""
 
 
-class SolutionInGauge(msgspec.Struct, frozen=True):
-    """A solution in the gauge that Mitsuba needs: materials, and lights and exposures by name."""
-
-    table: MaterialTable
-    lights: dict[str, Lobes]
-    exposures: dict[str, Vec3]
-
-
 def main(params: Params, inputs: Inputs, out: Path, progress: Progress) -> None:
     """Write materials, lights, coverage and scenes in the formats of other programs."""
     names = inputs.facts["dataset.materials"]
@@ -86,11 +78,13 @@ def main(params: Params, inputs: Inputs, out: Path, progress: Progress) -> None:
     progress(next(done), total, "materials")
     for folder in ("illumination", "coverage", "meshes", "scenes/light", "scenes/meshes"):
         (out / folder).mkdir(parents=True)
-    solution = _solution_in_gauge(inputs["solve"], slices)
-    materials = reflectances(solution.table)
-    _write_tables(out, solution)
+    table, solved, exposures = _solution_in_gauge(inputs["solve"], slices)
+    materials = reflectances(table)
+    write_json(out / "materials.json", table)
+    write_json(out / "exposures.json", exposures)
+    _write_tables(out, materials, solved)
     _write_dataset(out, inputs)
-    for name, lobes in solution.lights.items():
+    for name, lobes in solved.items():
         progress(next(done), total, f"light of {name}")
         _write_light(out, name, lobes, inputs["solve"] / "coverage" / f"{name}.exr", params)
     files = MeshFiles(inputs, out / "scenes", names, params.crease_deg, materials)
@@ -103,7 +97,7 @@ def main(params: Params, inputs: Inputs, out: Path, progress: Progress) -> None:
         write_ply(out / "meshes" / f"{name}.ply", whole)
     write_script(out / "scenes")
     poses = read_poses(inputs["align"] / "poses.json")
-    depth = ALL_BOUNCES if solution.table.model.interreflection else DIRECT
+    depth = ALL_BOUNCES if table.model.interreflection else DIRECT
     for photo, slice_ in slices.items():
         progress(next(done), total, f"scene of {photo}")
         height, width = read_exr(inputs["align"] / f"{photo}.exr")["label"].shape
@@ -111,15 +105,17 @@ def main(params: Params, inputs: Inputs, out: Path, progress: Progress) -> None:
         placed = objects[photo]
         shapes = [s for obj in placed.objects for s in files.shapes(obj, placed.meshes, poses[photo].objects)]
         turn = np.eye(3) if slice_.world_from_camera is None else np.array(slice_.world_from_camera).T
-        exposure = np.array(solution.exposures.get(photo, (1.0,) * 3))
+        exposure = np.array(exposures.get(photo, (1.0,) * 3))
         light = ExposedMap(f"../illumination/{slice_.illumination}.exr", exposure, turn)
         scene = ExportedScene(camera, shapes, materials, light, depth)
-        _write_scenes(out / "scenes", photo, scene, solution.lights[slice_.illumination], params)
+        _write_scenes(out / "scenes", photo, scene, solved[slice_.illumination], params)
     progress(total, total)
 
 
-def _solution_in_gauge(folder: Path, slices: Mapping[str, LightSlice]) -> SolutionInGauge:
-    """Read the solution in the gauge of Mitsuba, max k_d + max k_s < 1.
+def _solution_in_gauge(
+    folder: Path, slices: Mapping[str, LightSlice]
+) -> tuple[MaterialTable, dict[str, Lobes], dict[str, Vec3]]:
+    """Read materials, lights and exposures in the gauge of Mitsuba, max k_d + max k_s < 1.
 
     One factor multiplies all reflectances and divides all lights.  A light that was not solved for is black.
     """
@@ -133,18 +129,15 @@ def _solution_in_gauge(folder: Path, slices: Mapping[str, LightSlice]) -> Soluti
                 "illumination '%s' is exported as black: no pixel in it was observed, so it was not solved", name
             )
         lights[name] = solved.get(name, no_lobes()).scaled(1 / factor)
-    return SolutionInGauge(table_in_gauge(table, factor), lights, read_exposures(folder / "exposures.json"))
+    return table_in_gauge(table, factor), lights, read_exposures(folder / "exposures.json")
 
 
-def _write_tables(out: Path, solution: SolutionInGauge) -> None:
-    """Write the tables of materials, exposures, lobes and suns."""
-    materials = reflectances(solution.table)
-    write_json(out / "materials.json", solution.table)
-    write_json(out / "exposures.json", solution.exposures)
-    write_lobes(out / "lobes.parquet", solution.lights)
+def _write_tables(out: Path, materials: Mapping[str, Reflectance], lights: Mapping[str, Lobes]) -> None:
+    """Write the tables of lobes and suns, materials for other programs, and what these show of them."""
+    write_lobes(out / "lobes.parquet", lights)
     write_text(out / "materials.mtlx", materialx(materials))
     write_json(out / "losses.json", {name: differences(material) for name, material in materials.items()})
-    suns = {name: [sun.plain() for sun in suns_of(light, YUP_FROM_CAMERA)] for name, light in solution.lights.items()}
+    suns = {name: [sun.plain() for sun in suns_of(light, YUP_FROM_CAMERA)] for name, light in lights.items()}
     if clash := [name for name in suns if name.endswith(SKY) and suns.get(name.removesuffix(SKY))]:
         raise InputError(
             f"the files of illumination '{clash[0]}' would replace the sky of '{clash[0].removesuffix(SKY)}'",

@@ -350,7 +350,7 @@ def light_row(
         return None
     exposure = exposure_of(radiance, percentile=95.0)
     brightest = radiance.max(axis=-1) * exposure
-    area = _areas(radiance)
+    area = lat_long_solid_angles(*radiance.shape[:2])[:, None]
     over = brightest > 1
     energy = radiance.sum(axis=-1) * area
     true = run.rgb("evaluate", f"illumination/{name}")
@@ -373,10 +373,6 @@ def light_row(
     return row
 
 
-def _areas(lat_long: Picture) -> Float[np.ndarray, "h 1"]:
-    return lat_long_solid_angles(*lat_long.shape[:2])[:, None]
-
-
 def _outlined(radiance: Picture, exposure: float) -> str:
     """Return a light with the texels above white outlined."""
     pixels = picture(radiance, exposure)
@@ -386,7 +382,9 @@ def _outlined(radiance: Picture, exposure: float) -> str:
 
 def _true_map(true: Picture, estimate: Picture, exposure: float) -> str:
     """Return the true map scaled to the mean of the estimate, because the overall scale is a gauge freedom."""
-    means = [float((m * (_areas(m)[..., None] / m.shape[1])).sum()) for m in (true, estimate)]
+    means = [
+        float((m * (lat_long_solid_angles(*m.shape[:2])[:, None, None] / m.shape[1])).sum()) for m in (true, estimate)
+    ]
     return _outlined(reduced(true, max(estimate.shape[:2])) * (means[1] / max(means[0], 1e-30)), exposure)
 
 
