@@ -143,9 +143,9 @@ class InsertionScene(msgspec.Struct, frozen=True, dict=True):
             light: replaces the photo's light
             guides: add the guides of the denoiser
         """
-        own_light, objects = self.entries
+        photo_light, objects = self.entries
         channels = Channels(hide_emitters=True, guides=guides)
-        return rendered((light or own_light) | objects | entries, self.sensor, samples, seed, ALL_BOUNCES, channels)
+        return rendered((light or photo_light) | objects | entries, self.sensor, samples, seed, ALL_BOUNCES, channels)
 
 
 class ShadowMatch(msgspec.Struct, frozen=True):

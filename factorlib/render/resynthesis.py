@@ -120,8 +120,8 @@ class Reflector:
             lobes = kernel(directions, self.axis.float(), self.sharpness.float())
             glossy = highlight_weights(normals.float(), views.float(), directions, float(roughness))
             weights = cosine_weights(normals.float(), directions), glossy
-            seen = visibility.float() / 255
-            shares = [visible_share(seen, weight, lobes).to(self.operator.dtype) for weight in weights]
+            visible = visibility.float() / 255
+            shares = [visible_share(visible, weight, lobes).to(self.operator.dtype) for weight in weights]
         if place is not None and self.curvature > 0:
             nz, oz, larger = finite_distance_cosines(place, normals, views, self.axis, self.curvature)
             shares = [larger * share for share in shares]
