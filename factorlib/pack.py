@@ -5,6 +5,8 @@ The data set itself is not included.
 
 import os
 import zipfile
+from collections.abc import Iterable
+from itertools import chain
 from pathlib import Path
 
 from factorlib.errors import InputError
@@ -41,17 +43,21 @@ def pack(home: Path, out: Path, replace: bool = False) -> int:
     Raises:
         InputError: A needed stage has no result, `out` is not the name of a zip file, or it exists already.
     """
-    if missing := [path for path in (*NEEDED, "export/dataset.json") if not (home / path).exists()]:
-        cure = f"make all DATASET={home.name}"
-        raise InputError(f"the result is incomplete: {missing[0]} is missing", file=home, cure=cure)
+    check_whole(home, (*NEEDED, "export/dataset.json"))
     if out.suffix != ".zip" or out.is_dir() or not out.absolute().parent.is_dir():
-        cure = "name a .zip file in an existing folder: OUT=<name>.zip"
-        raise InputError("a zip file cannot be written here", file=out, key="OUT", cure=cure)
+        raise InputError(
+            "a zip file cannot be written here",
+            file=out,
+            key="OUT",
+            cure="name a .zip file in an existing folder: OUT=<name>.zip",
+        )
     if out.exists() and not replace:
         raise InputError(
             "the file exists already", file=out, key="OUT", cure="name another file, or add FORCE=1 to replace it"
         )
-    files = [home / "dataset.txt", *(path for stage in STAGES for path in files_below(home / stage))]
+    walks = (os.walk(home / stage) for stage in STAGES)  # stages may be links into the store
+    below = [sorted(Path(place) / name for place, _, names in walk for name in names) for walk in walks]
+    files = [home / "dataset.txt", *chain.from_iterable(below)]
     entries = {f"{home.name}/{path.relative_to(home).as_posix()}": path for path in files}
     draft = out.with_name(f".{out.name}.{os.getpid()}")
     with writing(draft):
@@ -63,9 +69,13 @@ def pack(home: Path, out: Path, replace: bool = False) -> int:
     return len(entries) + 1
 
 
-def files_below(folder: Path) -> list[Path]:
-    """Return every file below a folder, which may be a link into the store."""
-    return sorted(Path(place) / name for place, _, names in os.walk(folder) for name in names)
+def check_whole(home: Path, needed: Iterable[str]) -> None:
+    """Raise InputError if a folder of results lacks one of the needed files or folders."""
+    if missing := [path for path in needed if not (home / path).exists()]:
+        mark = home / "dataset.txt"  # names the data set of a copy, which may have another name
+        dataset = mark.read_text(encoding="utf-8", errors="replace").strip() if mark.is_file() else home.name
+        cure = f"make all DATASET={Path(dataset).name}"
+        raise InputError(f"the result is incomplete: {missing[0]} is missing", file=home, cure=cure)
 
 
 def _entry(name: str) -> zipfile.ZipInfo:

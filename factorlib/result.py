@@ -34,14 +34,14 @@ from factorlib.images.light_map import read_light_map
 from factorlib.images.picture import picture
 from factorlib.jsonfile import read_json
 from factorlib.light.latlong import rotate_map
+from factorlib.pack import check_whole
 from factorlib.reading import check_plain
 from factorlib.recipe import kinds
 from factorlib.recipe.kinds import KINDS, AnyRecipe, is_light_file
 from factorlib.recipe.read import check_recipe, files_of
-from factorlib.render.photo_scene import DistantLight, Orbit, PhotoScene, resized, traced_photo
+from factorlib.render.photo_scene import DistantLight, Orbit, PhotoScene, TracedPicture, as_it_is, resized, traced_photo
 from factorlib.render.recipe_pictures import draw
 from factorlib.render.solved_set import SolvedSet
-from factorlib.render.traced_picture import TracedPicture, as_it_is
 from factorlib.report.pictures import data_uri
 from factorlib.results.materials import Solved
 from factorlib.stage import Inputs, silent
@@ -73,8 +73,10 @@ def load_result(folder: str | Path) -> Result:
         InputError: There is no result, or it is incomplete.
     """
     if not isinstance(folder, str | os.PathLike):
-        cure = 'name its folder, as in load_result("build/eames")'
-        raise InputError(f"a result is named by a path, not by {type(folder).__name__} {folder!r}", cure=cure)
+        raise InputError(
+            f"a result is named by a path, not by {type(folder).__name__} {folder!r}",
+            cure='name its folder, as in load_result("build/eames")',
+        )
     # the current folder and those above it, because a notebook runs in its own folder
     places = [Path(*k * [".."]) for k in range(len(Path.cwd().parts))]
     candidates = [path for place in places for path in (place / folder, place / "build" / folder)]
@@ -85,20 +87,21 @@ def load_result(folder: str | Path) -> Result:
             raise InputError("this is a part of a result", file=folder, cure=f'load_result("{whole}") loads the whole')
         results = (sorted(str(path.parent) for path in place.glob(f"build/*/{MARK}")) for place in places)
         known = next(filter(None, results), None)
-        cure = did_you_mean(str(folder), known) if known else "make all DATASET=<name> makes one"
-        raise InputError("there is no result here", file=folder, cure=cure)
-    missing = [stage for stage in STAGES if not (result / stage).is_dir()]
-    if missing:
-        cure = f"make export DATASET={result.name}"
-        raise InputError(f"the result is incomplete: {missing[0]} is missing", file=result, cure=cure)
+        raise InputError(
+            "there is no result here",
+            file=folder,
+            cure=did_you_mean(str(folder), known) if known else "make all DATASET=<name> makes one",
+        )
+    check_whole(result, STAGES)
     stages = [stage for stage in (*STAGES, "shapes", "surface") if (result / stage).is_dir()]
     folders = {stage: (result / stage).resolve() for stage in stages}
     file = result / "export" / "dataset.json"
     source = folders["export"] / "source"
     facts = read_json(file) if file.is_file() else {}
     if not (isinstance(facts, dict) and facts.keys() >= SLICES):
-        cure = f"make export DATASET={result.name}"
-        raise InputError("the result lacks the facts of its data set", file=file, cure=cure)
+        raise InputError(
+            "the result lacks the facts of its data set", file=file, cure=f"make export DATASET={result.name}"
+        )
     files = {path.relative_to(source).as_posix(): path for path in sorted(source.rglob("*")) if path.is_file()}
     return Result(result, SolvedSet(Inputs(folders, facts, files)))
 

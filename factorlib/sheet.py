@@ -84,8 +84,7 @@ def write_sheet(folder: Path, path: Path, report: Callable[[int, int], None] = l
             titled.append(np.concatenate([np.asarray(head), each]))
         tall = max(len(each) for each in titled) + MARGIN
         rows.append(np.concatenate([_padded(each, tall, each.shape[1] + MARGIN) for each in titled], axis=1))
-    shown = [UNKNOWN if name == OPEN else name for name in names]
-    rows.insert(0, legend(shown, colours, max(row.shape[1] for row in rows)))
+    rows.insert(0, legend([UNKNOWN if name == OPEN else name for name in names], colours, rows[0].shape[1]))
     wide = max(row.shape[1] for row in rows)
     write_bytes(path, png_bytes(np.concatenate([_padded(row, len(row), wide) for row in rows])))
 
@@ -138,31 +137,19 @@ def _colours(names: list[str], pictures: list[tuple[Pixels, Labels]]) -> UInt8[n
 
 
 def legend(names: list[str], by_label: UInt8[np.ndarray, "k 3"], width: int) -> Pixels:
-    """Render the materials' names and colours, in as many lines of `width` pixels as they need.
-
-    A longer name widens the legend.
+    """Render the materials' names and colours, one a line; a longer name than `width` pixels widens the legend.
 
     Args:
         names: names of the materials
         by_label: colours by label
         width: width in pixels
     """
-    pen = ImageDraw.Draw(Image.new("RGB", (1, 1)))
-    places = []
-    x = MARGIN
-    line = 0
-    for name in names:
-        own = int(pen.textlength(name)) + 1 + HEAD + 2 * MARGIN
-        if x > MARGIN and x + own > width:
-            x = MARGIN
-            line = line + 1
-        places.append((x, MARGIN + line * HEAD, own))
-        x += own
-    sheet = Image.new("RGB", (max(x + own for x, _, own in places), (line + 1) * HEAD + 2 * MARGIN), PAPER)
+    longest = max(ImageDraw.Draw(Image.new("RGB", (1, 1))).textlength(name) for name in names)
+    sheet = Image.new("RGB", (max(width, int(longest) + HEAD + 2 * MARGIN), len(names) * HEAD + 2 * MARGIN), PAPER)
     pen = ImageDraw.Draw(sheet)
-    for name, colour, (x, y, _) in zip(names, by_label[1:].tolist(), places):
-        pen.rectangle((x, y, x + HEAD - 4, y + HEAD - 4), fill=tuple(colour), outline=INK)
-        pen.text((x + HEAD, y), name, fill=INK)
+    for y, name, colour in zip(range(MARGIN, sheet.height, HEAD), names, by_label[1:].tolist()):
+        pen.rectangle((MARGIN, y, MARGIN + HEAD - 4, y + HEAD - 4), fill=tuple(colour), outline=INK)
+        pen.text((MARGIN + HEAD, y), name, fill=INK)
     return np.asarray(sheet)
 
 

@@ -116,8 +116,12 @@ class Validation:
         points = read_mesh(self.file(file), self.spec.materials, made, obj.materials).vertices
         radius = np.linalg.norm(points - (points.min(0) + points.max(0)) / 2, axis=1)
         if np.ptp(radius) > NOT_ROUND * radius.max():
-            fault = f"its vertices are {radius.min():.3g} to {radius.max():.3g} from its middle: it is no ball"
-            raise InputError(fault, file=self.file(file), key=key, cure="name a ball, or use `primitive: ball`")
+            raise InputError(
+                f"its vertices are {radius.min():.3g} to {radius.max():.3g} from its middle: it is no ball",
+                file=self.file(file),
+                key=key,
+                cure="name a ball, or use `primitive: ball`",
+            )
 
     def _normals(self, name: str, path: Path) -> None:
         check_values(path, key=f"normals.{name}")

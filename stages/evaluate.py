@@ -13,12 +13,22 @@ import numpy as np
 from factorlib.dataset.schema import LightSlice, TruthFile
 from factorlib.evaluate.ball import OctahedralLight, octahedral_light
 from factorlib.evaluate.comparison_gauge import connected_components
-from factorlib.evaluate.geometry_errors import averaged_normals, normal_error, pose_error
-from factorlib.evaluate.light_errors import compare_lights, mirrored_directions, sphere_row
-from factorlib.evaluate.material_errors import compare_materials
-from factorlib.evaluate.photo_errors import ComparedPhoto, compare_photos, compared_photo
-from factorlib.evaluate.relighting import compare_relighting, compare_relit_set
-from factorlib.evaluate.truth import read_true_light, read_true_normals
+from factorlib.evaluate.picture_errors import ComparedPhoto, compare_photos, compared_photo
+from factorlib.evaluate.relighting import (
+    compare_lights,
+    compare_relighting,
+    compare_relit_set,
+    mirrored_directions,
+    sphere_row,
+)
+from factorlib.evaluate.truth import (
+    averaged_normals,
+    compare_materials,
+    normal_error,
+    pose_error,
+    read_true_light,
+    read_true_normals,
+)
 from factorlib.evaluate.verdict import VerdictInputs, ball_changes, verdict, verdict_text
 from factorlib.images.exr import LAT_LONG, read_exr, read_rgb_exr, write_rgb_exr
 from factorlib.jsonfile import write_json

@@ -12,38 +12,43 @@ dataset.json, source/            Facts and meshes of the dataset, for new pictur
 """
 
 import logging
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from itertools import count
 from pathlib import Path, PurePosixPath
-from typing import Annotated, Any
+from typing import Annotated
 
 import msgspec
 import numpy as np
-import OpenImageIO as oiio
 
 from factorlib.conventions import YUP_FROM_CAMERA, lat_long_directions
 from factorlib.dataset.schema import LightSlice, ObjectsSlice
 from factorlib.errors import InputError
-from factorlib.export.blender import write_scene_json, write_script
-from factorlib.export.environment import mitsuba_map
-from factorlib.export.exported_scene import ALL_BOUNCES, DIRECT, ExportedScene, ExposedMap, Sun, suns_of
+from factorlib.export.exported_scene import (
+    ALL_BOUNCES,
+    DIRECT,
+    ExportedScene,
+    ExposedMap,
+    suns_of,
+    write_scene_json,
+    write_script,
+)
 from factorlib.export.gltf_writer import variant_name, write_glb, write_suns
 from factorlib.export.materialx import materialx
 from factorlib.export.mesh_files import MeshFiles
-from factorlib.export.mitsuba import write_scene
+from factorlib.export.mitsuba import headroom_factor, table_in_gauge, write_scene
 from factorlib.export.other_renderers import differences
-from factorlib.export.reflectance_limit import headroom_factor, table_in_gauge
 from factorlib.export.usd import SUFFIX, write_usd_scene
-from factorlib.images.exr import LAT_LONG, read_rgb_exr, write_hdr, write_rgb_exr
+from factorlib.images.exr import LAT_LONG, read_exr, read_rgb_exr, write_hdr, write_rgb_exr
 from factorlib.jsonfile import write_json
 from factorlib.light.latlong import lat_long_of_lobes, sample_map
 from factorlib.light.lobes import Lobes, no_lobes
 from factorlib.meshes.ply_stl_off import write_ply
 from factorlib.meshes.read import CREASE_DEG
 from factorlib.results.lobe_table import read_lobes, write_lobes
-from factorlib.results.materials import MaterialTable, Vec3, read_exposures, read_materials, reflectances
+from factorlib.results.materials import MaterialTable, Reflectance, Vec3, read_exposures, read_materials, reflectances
 from factorlib.results.poses import read_poses
 from factorlib.stage import Inputs, Progress
+from factorlib.tracing.scene import mitsuba_map
 from factorlib.wholefile import write_bytes, write_text
 
 log = logging.getLogger("factorlib.export")
@@ -62,14 +67,6 @@ class Params(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """Crease angle, in degrees: an edge whose two triangles differ by more in their normals stays sharp."""
 
 
-class SolutionInGauge(msgspec.Struct, frozen=True):
-    """A solution in the gauge that Mitsuba needs: materials, and lights and exposures by name."""
-
-    table: MaterialTable
-    lights: dict[str, Lobes]
-    exposures: dict[str, Vec3]
-
-
 def main(params: Params, inputs: Inputs, out: Path, progress: Progress) -> None:
     """Write materials, lights, coverage and scenes in the formats of other programs."""
     names = inputs.facts["dataset.materials"]
@@ -81,11 +78,13 @@ def main(params: Params, inputs: Inputs, out: Path, progress: Progress) -> None:
     progress(next(done), total, "materials")
     for folder in ("illumination", "coverage", "meshes", "scenes/light", "scenes/meshes"):
         (out / folder).mkdir(parents=True)
-    solution = _solution_in_gauge(inputs["solve"], slices)
-    materials = reflectances(solution.table)
-    _write_tables(out, solution)
+    table, solved, exposures = _solution_in_gauge(inputs["solve"], slices)
+    materials = reflectances(table)
+    write_json(out / "materials.json", table)
+    write_json(out / "exposures.json", exposures)
+    _write_tables(out, materials, solved)
     _write_dataset(out, inputs)
-    for name, lobes in solution.lights.items():
+    for name, lobes in solved.items():
         progress(next(done), total, f"light of {name}")
         _write_light(out, name, lobes, inputs["solve"] / "coverage" / f"{name}.exr", params)
     files = MeshFiles(inputs, out / "scenes", names, params.crease_deg, materials)
@@ -98,57 +97,54 @@ def main(params: Params, inputs: Inputs, out: Path, progress: Progress) -> None:
         write_ply(out / "meshes" / f"{name}.ply", whole)
     write_script(out / "scenes")
     poses = read_poses(inputs["align"] / "poses.json")
-    depth = ALL_BOUNCES if solution.table.model.interreflection else DIRECT
+    depth = ALL_BOUNCES if table.model.interreflection else DIRECT
     for photo, slice_ in slices.items():
         progress(next(done), total, f"scene of {photo}")
-        camera = poses[photo].camera.camera(*_image_size(inputs["align"] / f"{photo}.exr"))
+        height, width = read_exr(inputs["align"] / f"{photo}.exr")["label"].shape
+        camera = poses[photo].camera.camera(width, height)
         placed = objects[photo]
         shapes = [s for obj in placed.objects for s in files.shapes(obj, placed.meshes, poses[photo].objects)]
-        light = _exposed_map(slice_, solution.exposures.get(photo, (1.0,) * 3))
+        turn = np.eye(3) if slice_.world_from_camera is None else np.array(slice_.world_from_camera).T
+        exposure = np.array(exposures.get(photo, (1.0,) * 3))
+        light = ExposedMap(f"../illumination/{slice_.illumination}.exr", exposure, turn)
         scene = ExportedScene(camera, shapes, materials, light, depth)
-        _write_scenes(out / "scenes", photo, scene, solution.lights[slice_.illumination], params)
+        _write_scenes(out / "scenes", photo, scene, solved[slice_.illumination], params)
     progress(total, total)
 
 
-def _solution_in_gauge(folder: Path, slices: Mapping[str, LightSlice]) -> SolutionInGauge:
-    """Read the solution in the gauge of Mitsuba, max k_d + max k_s < 1.
+def _solution_in_gauge(
+    folder: Path, slices: Mapping[str, LightSlice]
+) -> tuple[MaterialTable, dict[str, Lobes], dict[str, Vec3]]:
+    """Read materials, lights and exposures in the gauge of Mitsuba, max k_d + max k_s < 1.
 
-    One factor multiplies all reflectances and divides all lights.
+    One factor multiplies all reflectances and divides all lights.  A light that was not solved for is black.
     """
     table = read_materials(folder / "materials.json")
     factor = headroom_factor(table.materials)
-    lights = {n: light.scaled(1 / factor) for n, light in _solved_lights(folder / "lobes.parquet", slices).items()}
-    return SolutionInGauge(table_in_gauge(table, factor), lights, read_exposures(folder / "exposures.json"))
+    solved = read_lobes(folder / "lobes.parquet")
+    lights = {}
+    for name in sorted({light.illumination for light in slices.values()}):
+        if name not in solved:
+            log.warning(
+                "illumination '%s' is exported as black: no pixel in it was observed, so it was not solved", name
+            )
+        lights[name] = solved.get(name, no_lobes()).scaled(1 / factor)
+    return table_in_gauge(table, factor), lights, read_exposures(folder / "exposures.json")
 
 
-def _write_tables(out: Path, solution: SolutionInGauge) -> None:
-    """Write the tables of materials, exposures, lobes and suns."""
-    materials = reflectances(solution.table)
-    write_json(out / "materials.json", solution.table)
-    write_json(out / "exposures.json", solution.exposures)
-    write_lobes(out / "lobes.parquet", solution.lights)
+def _write_tables(out: Path, materials: Mapping[str, Reflectance], lights: Mapping[str, Lobes]) -> None:
+    """Write the tables of lobes and suns, materials for other programs, and what these show of them."""
+    write_lobes(out / "lobes.parquet", lights)
     write_text(out / "materials.mtlx", materialx(materials))
     write_json(out / "losses.json", {name: differences(material) for name, material in materials.items()})
-    suns = {name: [_sun(sun) for sun in suns_of(light, YUP_FROM_CAMERA)] for name, light in solution.lights.items()}
+    suns = {name: [sun.plain() for sun in suns_of(light, YUP_FROM_CAMERA)] for name, light in lights.items()}
     if clash := [name for name in suns if name.endswith(SKY) and suns.get(name.removesuffix(SKY))]:
-        fault = f"the files of illumination '{clash[0]}' would replace the sky of '{clash[0].removesuffix(SKY)}'"
-        raise InputError(fault, key="illumination", cure=f"rename it, so that it does not end in {SKY}")
+        raise InputError(
+            f"the files of illumination '{clash[0]}' would replace the sky of '{clash[0].removesuffix(SKY)}'",
+            key="illumination",
+            cure=f"rename it, so that it does not end in {SKY}",
+        )
     write_json(out / "lights.json", suns)
-
-
-def _image_size(path: Path) -> tuple[int, int]:
-    """Read width and height from the header of an EXR."""
-    source = oiio.ImageInput.open(str(path))
-    assert source is not None  # `align` wrote it
-    spec = source.spec()
-    return spec.width, spec.height
-
-
-def _exposed_map(slice_: LightSlice, exposure: Sequence[float]) -> ExposedMap:
-    """Return the exported map of a photo's light, suns included, at the photo's exposure."""
-    world = slice_.world_from_camera
-    camera_from_light = np.eye(3) if world is None else np.array(world).T
-    return ExposedMap(f"../illumination/{slice_.illumination}.exr", np.array(exposure), camera_from_light)
 
 
 def _write_scenes(folder: Path, photo: str, scene: ExportedScene, lobes: Lobes, params: Params) -> None:
@@ -179,17 +175,6 @@ def _write_scenes(folder: Path, photo: str, scene: ExportedScene, lobes: Lobes, 
     write_scene(folder / f"{photo}.xml", msgspec.structs.replace(scene, light=light))
 
 
-def _solved_lights(file: Path, lights: Mapping[str, LightSlice]) -> dict[str, Lobes]:
-    """Return the lobes of every illumination, sorted by name; none, with a warning, for one that was not solved for."""
-    solved = read_lobes(file)
-    names = sorted({light.illumination for light in lights.values()})
-    for name in names:
-        if name not in solved:
-            text = "illumination '%s' is exported as black: no pixel in it was observed, so it was not solved"
-            log.warning(text, name)
-    return {name: solved.get(name, no_lobes()) for name in names}
-
-
 def _write_dataset(out: Path, inputs: Inputs) -> None:
     """Write the parts of the dataset that pictures of the result need.
 
@@ -215,14 +200,6 @@ def _write_light(out: Path, name: str, light: Lobes, coverage: Path, params: Par
     if coverage.exists():
         directions = lat_long_directions(params.height, 2 * params.height)
         write_rgb_exr(out / "coverage" / f"{name}.exr", sample_map(read_rgb_exr(coverage), directions), LAT_LONG)
-
-
-def _sun(sun: Sun) -> dict[str, Any]:
-    """Return the entry of a sun in lights.json."""
-    return {
-        **{name: getattr(sun, name).tolist() for name in ("direction", "irradiance")},
-        "angular_diameter_deg": sun.angular_diameter_deg,
-    }
 
 
 def _write_mitsuba_map(path: Path, light: Lobes, params: Params) -> None:

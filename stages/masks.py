@@ -141,9 +141,12 @@ def reduced(labels: Labels, factor: int, path: Path, key: str) -> Labels:
     left_out = label == LEFT_OUT
     label[left_out] = 0
     if not label.any():
-        fault = f"averaged down {factor} × {factor}, no pixel shows mostly one material: the mask is made of specks"
-        cure = 'SET="masks.frame=…" with more pixels, or a mask of whole objects'
-        raise InputError(fault, file=path, key=key, cure=cure)
+        raise InputError(
+            f"averaged down {factor} × {factor}, no pixel shows mostly one material: the mask is made of specks",
+            file=path,
+            key=key,
+            cure='SET="masks.frame=…" with more pixels, or a mask of whole objects',
+        )
     return Labels(label, left_out)
 
 
@@ -169,8 +172,9 @@ def valid_pixels(photo: Photo, labels: Labels, path: Path, key: str) -> np.ndarr
     total = int(inside.sum())
     lost = int((inside & ~photo.finite).sum())
     if lost == total:
-        cure = "render or develop the photo again"
-        raise InputError("every pixel in its mask is NaN or infinite", file=path, key=key, cure=cure)
+        raise InputError(
+            "every pixel in its mask is NaN or infinite", file=path, key=key, cure="render or develop the photo again"
+        )
     check_bright(photo, inside, path, key)
     if lost:
         log.warning("%s: %d of the %d pixels in its mask are NaN or infinite: they are not used", path, lost, total)

@@ -19,8 +19,7 @@ from factorlib.images.picture import exposure_of, picture, write_png
 from factorlib.images.tone import shown
 from factorlib.inference.interreflection import bounced_light
 from factorlib.reflection import reflection_operator
-from factorlib.render.reflect import Reflector
-from factorlib.render.resynthesis import Surroundings, balls, observed_cells, resynthesised
+from factorlib.render.resynthesis import Reflector, Surroundings, balls, observed_cells, resynthesised
 from factorlib.results.lobe_table import light_of
 from factorlib.results.materials import Gauge, Model, in_order, read_materials
 from factorlib.stage import Inputs, Progress

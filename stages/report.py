@@ -1,8 +1,8 @@
-"""Report of the run: a self-contained page, and a few figures as PNG.
+"""Report of the run: a self-contained page, and a figure of each photo as PNG.
 
-Writes index.html, which needs no other file and no network, and figures/overview.png.  For each photo it writes
-figures/photos/<photo>.png: photo, materials, re-synthesis and difference side by side.  Except for the section on cost,
-the page has the same bytes in every run.
+Writes index.html, which needs no other file and no network, and for each photo figures/photos/<photo>.png: photo,
+materials, re-synthesis and difference side by side.  Except for the section on cost, the page has the same bytes in
+every run.
 """
 
 from itertools import count
@@ -14,7 +14,7 @@ from factorlib.dataset.schema import LightSlice, ObjectsSlice, SetSlice
 from factorlib.render.solved_set import SolvedSet
 from factorlib.report.artifacts import Artifacts
 from factorlib.report.page import page
-from factorlib.report.pictures import exposures, first_pictures, material_tags, overview, photo_row, strip, surface_rows
+from factorlib.report.pictures import exposures, first_pictures, material_tags, photo_row, strip, surface_rows
 from factorlib.report.viewer import viewed
 from factorlib.stage import Inputs, Progress
 from factorlib.wholefile import write_bytes, write_text
@@ -33,21 +33,19 @@ def main(params: Params, inputs: Inputs, out: Path, progress: Progress) -> None:
     rows = []
     tags = material_tags(run)
     (out / "figures" / "photos").mkdir(parents=True)
-    total = len(run.set.photos) + 5
+    total = len(run.set.photos) + 4
     done = count()
     for name in run.set.photos:
         progress(next(done), total, name)
         rows.append(photo_row(run, name, tags, errors.get(name)))
         write_bytes(out / "figures" / "photos" / f"{name}.png", strip(rows[-1]))
-    progress(next(done), total, "overview")
-    write_bytes(out / "figures" / "overview.png", overview(run, rows))
     lights = msgspec.convert(inputs.facts["dataset.light"], dict[str, LightSlice])
     objects = msgspec.convert(inputs.facts["dataset.objects"], dict[str, ObjectsSlice])
     progress(next(done), total, "viewer")
-    seen = viewed(run, lights, objects, exposures(run))
+    viewer = viewed(run, lights, objects, exposures(run))
     progress(next(done), total, "surfaces")
     moved = surface_rows(run, objects)
     progress(next(done), total, "first pictures")
     first = first_pictures(run, rows, SolvedSet(inputs))
     progress(next(done), total, "page")
-    write_text(out / "index.html", page(run, rows, tags, seen, moved, first))
+    write_text(out / "index.html", page(run, rows, tags, viewer, moved, first))

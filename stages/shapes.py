@@ -125,15 +125,14 @@ def estimate_shape(
         InputError: If no photo shows the mesh.
     """
     if not outlines:
-        cure = "give its material a label in the masks, or remove the mesh"
-        raise InputError("no photo's mask shows it", cure=cure)
+        raise InputError("no photo's mask shows it", cure="give its material a label in the masks, or remove the mesh")
     if entry.hull:
         posed = [outline for outline in outlines if outline.pose is not None]
         if 2 <= len(posed) < FEW:
-            words = (
-                "a hull of %d outlines is larger than the body where no outline limits it: add photos from more sides"
+            log.warning(
+                "a hull of %d outlines is larger than the body where no outline limits it: add photos from more sides",
+                len(posed),
             )
-            log.warning(words, len(posed))
         return visual_hull(posed, params.cells, len(parts_of(entry)), report)
     if entry.lathe:
         shape = body_of_revolution(outlines, report)

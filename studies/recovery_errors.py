@@ -11,8 +11,8 @@ import numpy as np
 from jaxtyping import Float
 
 from factorlib.evaluate.ball import octahedral_light
-from factorlib.evaluate.light_errors import SPHERES, compare_lights
-from factorlib.evaluate.material_errors import common_factor, compare_materials
+from factorlib.evaluate.relighting import SPHERES, compare_lights
+from factorlib.evaluate.truth import common_factor, compare_materials
 from factorlib.light.latlong import lat_long_of_lobes
 from factorlib.results.lobe_table import read_lobes
 from factorlib.results.materials import Reflectance

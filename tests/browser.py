@@ -20,7 +20,7 @@ from scipy.ndimage import binary_erosion
 from factorlib.conventions import YUP_FROM_CAMERA
 from factorlib.light.lobes import Lobes
 from factorlib.reflection import reflection_operator
-from factorlib.render.reflect import Reflector
+from factorlib.render.resynthesis import Reflector
 from factorlib.results.materials import Reflectance
 
 CHROMIUM = next((p for p in map(shutil.which, ("chromium", "chromium-browser", "google-chrome")) if p), None)

@@ -29,7 +29,7 @@ EXTRAS = {  # of modules that import what an extra alone installs
     for module, extra in (
         ("runner/worker", "dask"),
         ("images/film", "video"),
-        ("tracing/denoise", "denoise"),
+        ("tracing/scene", "denoise"),
     )
 }
 

@@ -131,7 +131,7 @@ def test_a_pack_is_whole_or_not_there_and_replaces_nothing_unasked(copy, tmp_pat
 
 
 @pytest.mark.parametrize("path, text, words", [
-    ("export", None, ["export is missing", "make export DATASET=set"]),
+    ("export", None, ["export is missing", "make all DATASET=set"]),
     ("export/dataset.json", None, ["lacks the facts of its data set", "make export DATASET=set"]),
     ("export/dataset.json", "[]", ["dataset.json", "make export DATASET=set"]),
     ("export/dataset.json", "", ["dataset.json", "run its stage again"]),

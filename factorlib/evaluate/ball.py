@@ -145,7 +145,12 @@ def _narrow_lobe(normals: Float[np.ndarray, "n 3"], alpha: float) -> Reflected:
     view = np.concatenate([np.sqrt(1 - cos_o**2), np.zeros_like(cos_o), cos_o], axis=-1)[:, None, :]
     incoming = 2 * np.sum(view * half, axis=-1, keepdims=True) * half - view
     density = _g1(cos_o, alpha) * _ggx(half[..., 2], alpha) / (4 * cos_o)  # density of incoming directions, 1/sr
-    frame = _frames(normals).astype(np.float32)  # rows: tangent toward the viewer, bitangent, normal
+    # rows of the frame: tangent toward the viewer, bitangent, normal
+    tangent = VIEW - normals[:, 2:] * normals
+    facing = np.linalg.norm(tangent, axis=-1, keepdims=True) < 1e-6
+    tangent = np.where(facing, np.array([1.0, 0.0, 0.0]), tangent)
+    tangent = tangent / np.linalg.norm(tangent, axis=-1, keepdims=True)
+    frame = np.stack([tangent, np.cross(normals, tangent), normals], axis=1).astype(np.float32)
     weight = np.where(incoming[..., 2] > 0, _g1(np.maximum(incoming[..., 2], 1e-6), alpha), 0.0)
     weights = texel_weights(incoming @ frame, 1 / (SAMPLES * density), weight / SAMPLES)
     return lambda light: weights @ light.texels
@@ -209,14 +214,6 @@ def _visible_normals(cos_o: Float[np.ndarray, "n 1"], alpha: float) -> Float[np.
     upward = np.maximum(sin * along + cos * up, 1e-9)
     half = np.stack([toward, alpha * across, upward], axis=-1)
     return half / np.linalg.norm(half, axis=-1, keepdims=True)
-
-
-def _frames(normals: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3 3"]:
-    tangent = VIEW - normals[:, 2:] * normals
-    facing = np.linalg.norm(tangent, axis=-1, keepdims=True) < 1e-6
-    tangent = np.where(facing, np.array([1.0, 0.0, 0.0]), tangent)
-    tangent = tangent / np.linalg.norm(tangent, axis=-1, keepdims=True)
-    return np.stack([tangent, np.cross(normals, tangent), normals], axis=1)
 
 
 def _pyramid(finest: Float[np.ndarray, "s s 3"]) -> tuple[np.ndarray, ...]:

@@ -1,11 +1,25 @@
 """A photo's scene as every export format writes it: camera, objects in files of one material each, and light.
 
+For Blender it is written as JSON, beside a script that is the same for every set (`blender.py.txt` in this package,
+exported as `blender.py`) and needs nothing but Blender.  A `.blend` file would need Blender to be written and would not
+be the same bytes twice.  The JSON has, in plain numbers:
+
+    camera     width, height, focal_px, principal_point in pixels, centres at 0.5
+    shapes     name, file (relative), material, cam_from_object: 4 × 4, rows, mesh units, OpenCV's camera axes
+    materials  diffuse k_d, specular k_s (linear Rec. 709), roughness
+    light      file (relative): lat-long map of texel means, exposure: factor per channel, camera_from_light: 3 × 3
+    suns       not in the map: direction (toward it, y-up camera frame), irradiance (RGB), angular_diameter_deg
+    max_depth  2 direct light alone, −1 all bounces
+
 Frame  The camera frame turned y-up (x right, y up, z toward the viewer), the camera at the origin.
        `YUP_FROM_CAMERA @ cam_from_object` places an object.  Maps of lights have OpenEXR's layout in that frame,
        so that only a light fixed to the world is rotated.
 """
 
 from collections.abc import Mapping, Sequence
+from importlib.resources import files
+from pathlib import Path
+from typing import Any
 
 import msgspec
 import numpy as np
@@ -13,9 +27,11 @@ from jaxtyping import Float
 
 from factorlib.conventions import YUP_FROM_CAMERA
 from factorlib.geometry.camera import Camera
+from factorlib.jsonfile import write_json
 from factorlib.light.lobes import SUN_DEG, Lobes, lobe_integral
 from factorlib.results.materials import Reflectance
 from factorlib.tracing.scene import rigid
+from factorlib.wholefile import write_text
 
 DIRECT = 2  # max_depth of direct light alone
 ALL_BOUNCES = -1  # max_depth of all bounces
@@ -74,6 +90,10 @@ class Sun(msgspec.Struct, frozen=True):
     irradiance: Float[np.ndarray, "3"]
     angular_diameter_deg: float = SUN_DEG
 
+    def plain(self) -> dict[str, Any]:
+        """Return the sun as plain numbers, for JSON."""
+        return _plain(self, "direction", "irradiance", "angular_diameter_deg")
+
 
 def suns_of(lobes: Lobes, rotation: Float[np.ndarray, "3 3"]) -> list[Sun]:
     """Return the suns of a light, turned by a rotation from the lobes' frame."""
@@ -103,3 +123,35 @@ class ExportedScene(msgspec.Struct, frozen=True):
         """The near and far clipping distances, generous because the meshes' extents are unknown here."""
         distances = [float(np.linalg.norm(shape.cam_from_object[:3, 3])) for shape in self.shapes] or [1.0]
         return 1e-3 * min(distances), 1e3 * max(distances)
+
+
+def write_script(folder: str | Path) -> None:
+    """Write blender.py, which builds the scenes that `write_scene_json` writes to the same folder."""
+    script = files("factorlib.export").joinpath("blender.py.txt").read_text(encoding="utf-8")
+    write_text(Path(folder) / "blender.py", script)
+
+
+def write_scene_json(path: str | Path, scene: ExportedScene) -> None:
+    """Write a photo's scene as JSON, with the materials that its shapes name."""
+    camera = scene.camera
+    write_json(
+        path,
+        {
+            "camera": {
+                "width": camera.width,
+                "height": camera.height,
+                "focal_px": camera.focal,
+                "principal_point": camera.centre,
+            },
+            "shapes": [_plain(shape, "name", "file", "material", "cam_from_object") for shape in scene.shapes],
+            "materials": {shape.material: scene.materials[shape.material] for shape in scene.shapes},
+            "light": _plain(scene.light, "file", "exposure", "camera_from_light"),
+            "suns": [sun.plain() for sun in scene.suns],
+            "max_depth": scene.max_depth,
+        },
+    )
+
+
+def _plain(item: ExportedShape | ExposedMap | Sun, *names: str) -> dict[str, Any]:
+    values = {name: getattr(item, name) for name in names}
+    return {name: value.tolist() if isinstance(value, np.ndarray) else value for name, value in values.items()}

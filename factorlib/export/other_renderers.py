@@ -205,15 +205,11 @@ MODELS: dict[str, Model] = {
 # differences ---------------------------------------------------------------------------------------------------------
 
 
-class RelativeDifference(msgspec.Struct, frozen=True):
-    """Mean and largest relative difference."""
+def differences(material: Reflectance) -> dict[str, dict[str, float]]:
+    """Return mean and worst relative difference of each of `MODELS` from the solved model; 0 for a black material.
 
-    mean: float
-    worst: float
-
-
-def differences(material: Reflectance) -> dict[str, RelativeDifference]:
-    """Return the difference of each of `MODELS` from the solved model, rounded to 5 digits; 0 for a black material."""
+    They are rounded to 5 digits.
+    """
     material = msgspec.structs.replace(material, roughness=max(material.roughness, LEAST_ROUGHNESS))
     written = {name: with_roughness_of_file(material) if name == "usd" else material for name in MODELS}
     expected = ball(material, solved)
@@ -222,7 +218,7 @@ def differences(material: Reflectance) -> dict[str, RelativeDifference]:
         rendered = ball(written[name], model)
         relative = (np.abs(rendered - expected) / np.maximum(expected, FLOOR))[(expected > 0) | (rendered > 0)]
         numbers = (relative.mean(), relative.max()) if relative.size else (0.0, 0.0)
-        result[name] = RelativeDifference(*(round(float(value), 5) for value in numbers))
+        result[name] = dict(zip(("mean", "worst"), (round(float(value), 5) for value in numbers)))
     return result
 
 

@@ -236,6 +236,10 @@ def read_table(path: Path) -> dict[str, GivenMaterial]:
             raise InputError(str(error), file=path, key=key, cure=CURE) from None
         total = max(table[name].diffuse) + max(table[name].specular)
         if total > MOST_REFLECTED:
-            fault = f"max diffuse + max specular = {total:.3f}: more light is reflected than arrives"
-            raise InputError(fault, file=path, key=key, cure=f"reduce the sum to at most {MOST_REFLECTED}")
+            raise InputError(
+                f"max diffuse + max specular = {total:.3f}: more light is reflected than arrives",
+                file=path,
+                key=key,
+                cure=f"reduce the sum to at most {MOST_REFLECTED}",
+            )
     return table

@@ -22,8 +22,11 @@ def read_recipe(path: Path, dataset: Dataset) -> AnyRecipe:
     content = load_yaml(path)
     kind = content.get("kind") if isinstance(content, dict) else None
     if not isinstance(kind, str) or kind not in KINDS:
-        fault = "the recipe does not say what kind of picture to make" if kind is None else f"there is no kind {kind!r}"
-        refuse("kind", fault, did_you_mean(str(kind), KINDS))
+        refuse(
+            "kind",
+            "the recipe does not say what kind of picture to make" if kind is None else f"there is no kind {kind!r}",
+            did_you_mean(str(kind), KINDS),
+        )
     recipe = read_yaml(path, KINDS[kind])
     check_recipe(recipe, path, {photo.name: photo.objects for photo in dataset.spec.photos}, dataset.spec.materials)
     return recipe
@@ -48,11 +51,17 @@ def check_recipe(
     meshes = sorted({obj.mesh for each in objects.values() for obj in each})
     for name, file in files_of(recipe, path).items():
         if not file.is_file():
-            cure = f"paths are relative to the recipe; meshes without a file are {', '.join([BALL, *meshes])}"
-            raise InputError(f"there is no file {name!r}", file=path, cure=cure)
+            raise InputError(
+                f"there is no file {name!r}",
+                file=path,
+                cure=f"paths are relative to the recipe; meshes without a file are {', '.join([BALL, *meshes])}",
+            )
     if recipe.denoise and find_spec(kinds.DENOISER) is None:
-        cure = "make setup EXTRAS=denoise (outside a checkout: pip install mitsuba-oidn), or remove `denoise`"
-        refuse("denoise", "the denoiser is not installed", cure)
+        refuse(
+            "denoise",
+            "the denoiser is not installed",
+            "make setup EXTRAS=denoise (outside a checkout: pip install mitsuba-oidn), or remove `denoise`",
+        )
     if isinstance(recipe, kinds.PhotoRecipe):
         _check_photos(recipe, photos, refuse)
     if isinstance(recipe, kinds.RelightRecipe | kinds.GridRecipe):
@@ -63,15 +72,12 @@ def check_recipe(
             refuse("lights", "there is no other photo whose light could be used", "name a file (.hdr, .exr)")
     if isinstance(recipe, kinds.TransferRecipe | kinds.GridRecipe):
         _check_names(refuse, "materials", recipe.materials, materials, "material")
-    if isinstance(recipe, kinds.TransferRecipe | kinds.InsertRecipe):
-        table = read_table(path.parent / recipe.table) if recipe.table is not None else {}
-        materials = [*materials, *table]
+    if isinstance(recipe, kinds.TransferRecipe | kinds.InsertRecipe) and recipe.table is not None:
+        materials = [*materials, *read_table(path.parent / recipe.table)]
     if isinstance(recipe, kinds.TransferRecipe):
         _check_names(refuse, "materials", recipe.materials.values(), materials, "material")
     if isinstance(recipe, kinds.InsertRecipe):
-        _check_new_object(recipe, meshes, materials, refuse)
-        if recipe.beside is not None:
-            _check_neighbour(recipe, {photo: objects[photo] for photo in recipe.photos or photos}, refuse)
+        _check_new_object(recipe, objects, meshes, materials, refuse)
 
 
 def _check_names(refuse: Refusal, key: str, names: Iterable[str], known: list[str], kind: str) -> None:
@@ -82,8 +88,7 @@ def _check_names(refuse: Refusal, key: str, names: Iterable[str], known: list[st
 def _check_distinct(refuse: Refusal, key: str, names: list[str], kind: str) -> None:
     for name in names:
         if names.count(name) > 1:
-            fault = f"the {kind} {name!r} is named twice: one picture would replace the other"
-            refuse(key, fault, "name it once")
+            refuse(key, f"the {kind} {name!r} is named twice: one picture would replace the other", "name it once")
 
 
 def _check_photos(recipe: kinds.PhotoRecipe, photos: list[str], refuse: Refusal) -> None:
@@ -95,37 +100,46 @@ def _check_photos(recipe: kinds.PhotoRecipe, photos: list[str], refuse: Refusal)
     if isinstance(recipe, kinds.RelightRecipe):
         refuse("sun", "a recipe of kind relight takes its lights from `lights`", "remove `sun`: leave it out")
     if len(recipe.photos) != 1:
-        fault = f"the direction is relative to the light of one photo, and the recipe has {len(recipe.photos) or 'all'}"
-        refuse("sun.direction", fault, "name one photo: `photos: [...]`")
+        refuse(
+            "sun.direction",
+            f"the direction is relative to the light of one photo, and the recipe has {len(recipe.photos) or 'all'}",
+            "name one photo: `photos: [...]`",
+        )
     if not any(recipe.sun.direction):
         refuse("sun.direction", "the direction has no length", "give a vector other than [0, 0, 0]")
 
 
-def _check_new_object(recipe: kinds.InsertRecipe, meshes: list[str], materials: list[str], refuse: Refusal) -> None:
-    """Check the mesh and the materials of a new object."""
+def _check_new_object(
+    recipe: kinds.InsertRecipe,
+    objects: Mapping[str, Sequence[MeshInstance]],
+    meshes: list[str],
+    materials: list[str],
+    refuse: Refusal,
+) -> None:
+    """Check the mesh and the materials of a new object, and that every photo has the object beside which it stands."""
+    for photo in recipe.photos or objects if recipe.beside is not None else ():
+        names = [obj.name for obj in objects[photo]]
+        if recipe.beside not in names:
+            refuse(
+                "beside",
+                f"there is no object {recipe.beside!r} in photo '{photo}', "
+                f"whose objects are: {', '.join(names) or 'none'}",
+                "name the photos that have it: `photos: [...]`",
+            )
     if isinstance(recipe.material, dict):
         _check_names(refuse, "material", recipe.material.values(), materials, "material")
         if recipe.mesh not in meshes:
-            fault = f"materials of parts can be replaced in a mesh of the data set only, and {recipe.mesh!r} is none"
-            refuse("material", fault, "name one material")
+            refuse(
+                "material",
+                f"materials of parts can be replaced in a mesh of the data set only, and {recipe.mesh!r} is none",
+                "name one material",
+            )
     elif recipe.material is not None:
         refuse.known("material", recipe.material, materials, "material")
     if not is_mesh_file(recipe.mesh):
         refuse.known("mesh", recipe.mesh, [BALL, *meshes], "mesh")
     elif Path(recipe.mesh).suffix.lower() not in MESHES:
         refuse("mesh", f"{recipe.mesh!r} is no mesh file that can be read", f"give one of {', '.join(MESHES)}")
-
-
-def _check_neighbour(
-    recipe: kinds.InsertRecipe, objects: Mapping[str, Sequence[MeshInstance]], refuse: Refusal
-) -> None:
-    """Check that every photo has the object beside which the new one stands."""
-    for photo, entries in objects.items():
-        names = [obj.name for obj in entries]
-        if recipe.beside not in names:
-            known = ", ".join(names) or "none"
-            fault = f"there is no object {recipe.beside!r} in photo '{photo}', whose objects are: {known}"
-            refuse("beside", fault, "name the photos that have it: `photos: [...]`")
 
 
 def files_of(recipe: AnyRecipe, path: Path) -> dict[str, Path]:

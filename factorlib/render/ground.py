@@ -4,18 +4,32 @@ A rigid object comes to rest on a facet of its convex hull (Goldberg et al., "Pa
 computes the probability of each facet after a random drop.  The ground is the likeliest of the facets that look down,
 on the mean over all photos of the object.  People photograph things upright, a tall one from below and a low one from
 above.
+
+Objects on a grey floor, which receives their shadow and fades out around them, are w L₁ + (1 − w) L₀, w = max(W, f).
+L₁ and L₀ are path-traced with the floor and without it.  W is the share of a pixel that objects fill.  f falls from 1
+beneath the objects to 0 at `REACH` of their size.
 """
+
+from typing import Any
 
 import msgspec
 import numpy as np
 import trimesh
 from jaxtyping import Float
+from scipy.spatial.transform import Rotation
 
 from factorlib.errors import InputError
-from factorlib.render.photo_scene import PlacedMesh
+from factorlib.export.exported_scene import DIRECT
+from factorlib.render.photo_scene import PhotoScene, PlacedMesh, traced_photo
+from factorlib.results.materials import Reflectance
+from factorlib.tracing.scene import bsdf, rigid, transform
 
 # Largest mean angle between the object's upright axis and the cameras': photos look down, and are held askew.
 MOST_TILT_DEG = 50.0
+REACH = 3.0  # radius of a floor, in half extents of the objects
+SOLID = 0.3  # share of the radius within which the floor does not fade
+HAIR = 1e-4  # depth of the floor below the plane, in half extents: surfaces must not touch
+COVERAGE_SAMPLES = 16
 
 
 class Plane(msgspec.Struct, frozen=True):
@@ -23,11 +37,6 @@ class Plane(msgspec.Struct, frozen=True):
 
     normal: Float[np.ndarray, "3"]
     point: Float[np.ndarray, "3"]
-
-    @property
-    def below_camera(self) -> bool:
-        """True if the camera, at the origin, is on the objects' side of the plane."""
-        return float(self.point @ self.normal) < 0
 
     def onto(self, points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
         """Return the orthogonal projections of `points` onto the plane."""
@@ -63,8 +72,11 @@ def resting_plane(placed: PlacedMesh, uprights: Float[np.ndarray, "k 3"] | None 
     normals = poses[:, 2, :3]  # z of the resting pose, in the object's frame
     upright = (normals @ uprights.T).mean(axis=1) > np.cos(np.radians(MOST_TILT_DEG))
     if not upright.any():
-        fault = f"no stable pose of the object '{placed.name}' is upright in its photos, so its ground is unknown"
-        raise InputError(fault, key="beside", cure="name another object, or give the photo's `ground` in dataset.yaml")
+        raise InputError(
+            f"no stable pose of the object '{placed.name}' is upright in its photos, so its ground is unknown",
+            key="beside",
+            cure="name another object, or give the photo's `ground` in dataset.yaml",
+        )
     # the likeliest pose among the upright ones; the plane touches the lowest vertex
     normal = rotation @ normals[np.argmax(np.where(upright, chances, -1))]
     lowest = placed.vertices[np.argmin(placed.vertices @ normal)]
@@ -74,3 +86,74 @@ def resting_plane(placed: PlacedMesh, uprights: Float[np.ndarray, "k 3"] | None 
 def height_over(plane: Plane, placed: PlacedMesh) -> float:
     """Return the height of an object's highest vertex above the plane."""
     return float(((placed.vertices - plane.point) @ plane.normal).max())
+
+
+def smooth_step(t: Float[np.ndarray, "*n"]) -> Float[np.ndarray, "*n"]:
+    """Return 3t² − 2t³, which rises smoothly from 0 at t = 0 to 1 at t = 1, and is constant beyond."""
+    t = np.clip(t, 0, 1)
+    return t * t * (3 - 2 * t)
+
+
+def rotation_between(first: Float[np.ndarray, "3"], second: Float[np.ndarray, "3"]) -> Float[np.ndarray, "3 3"]:
+    """Return the smallest rotation of one unit vector into another."""
+    return Rotation.align_vectors(second[None], first[None])[0].as_matrix()
+
+
+def disk(
+    centre: Float[np.ndarray, "3"], normal: Float[np.ndarray, "3"], radius: float, material: Reflectance
+) -> dict[str, Any]:
+    """Return a disk as Mitsuba's dictionary.
+
+    Args:
+        centre: its centre, in the world
+        normal: unit normal of its upper side
+        radius: its radius
+        material: its reflectance
+    """
+    frame = rigid(radius * rotation_between(np.array([0.0, 0.0, 1.0]), normal), centre)
+    return {"type": "disk", "to_world": transform(frame), "bsdf": bsdf(material)}
+
+
+def on_floor(
+    scene: PhotoScene,
+    plane: Plane,
+    reflectance: float,
+    samples: int,
+    world_from_camera: Float[np.ndarray, "4 4"],
+    with_light: bool = False,
+) -> Float[np.ndarray, "h w 4"]:
+    """Render the objects on a Lambertian floor, as `traced_photo` does without one.
+
+    Args:
+        scene: the scene
+        plane: the plane of the floor
+        reflectance: the floor's reflectance
+        samples: samples per pixel
+        world_from_camera: pose of the camera, in OpenCV's axes
+        with_light: show the light behind the objects
+
+    Returns:
+        Linear radiance times coverage, and coverage.
+
+    Raises:
+        InputError: The camera is below the floor.
+    """
+    if (world_from_camera[:3, 3] - plane.point) @ plane.normal <= 0:
+        raise InputError("the camera is below the floor", key="floor", cure="look from higher, or leave the floor out")
+    points = np.concatenate([each.vertices for each in scene.objects])
+    extent = float(np.ptp(points, axis=0).max()) / 2
+    foot = plane.onto(scene.middle[None])[0]
+    grey = Reflectance((reflectance,) * 3, (0.0,) * 3, 1.0)
+    floor = disk(foot - HAIR * extent * plane.normal, plane.normal, REACH * extent, grey)
+    # L₀, L₁ and W
+    without = traced_photo(scene, samples, world_from_camera, with_light)
+    with_ = traced_photo(scene, samples, world_from_camera, with_light, {"floor": floor})
+    alone = traced_photo(scene, COVERAGE_SAMPLES, world_from_camera, max_depth=DIRECT)[..., 3]
+    # f, from the distance between the foot of the objects and the floor point of each pixel
+    eye = world_from_camera[:3, 3]
+    rays = (scene.camera.rays() @ world_from_camera[:3, :3].T).reshape(-1, 3)
+    points = Plane(plane.normal, plane.point - eye).hit(rays) + eye
+    distance = np.linalg.norm(points - foot, axis=-1).reshape(alone.shape) / (REACH * extent)
+    fade = smooth_step((1 - np.nan_to_num(distance, nan=np.inf)) / (1 - SOLID))
+    weight = np.maximum(alone, fade)[..., None]
+    return weight * with_ + (1 - weight) * without

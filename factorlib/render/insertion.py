@@ -24,7 +24,8 @@ The ground is a disc about the object.  Its diffuse reflectance is the one at wh
 out toward the rim of the disc, beyond which the geometry of the scene is unknown.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from functools import cached_property, partial
 from typing import Any
 
 import msgspec
@@ -37,12 +38,11 @@ from factorlib.errors import InputError
 from factorlib.export.exported_scene import ALL_BOUNCES
 from factorlib.meshes.mesh import Mesh
 from factorlib.meshes.ply_stl_off import submesh
-from factorlib.render.ground import Plane, height_over
+from factorlib.render.ground import Plane, disk, height_over, smooth_step
 from factorlib.render.photo_scene import PhotoScene, PlacedMesh, light_entries, shapes
-from factorlib.render.placement import RADIUS, Spot, disk
+from factorlib.render.placement import RADIUS, Spot
 from factorlib.results.materials import Reflectance, vec3
-from factorlib.tracing.denoise import denoised
-from factorlib.tracing.scene import Channels, rendered, rgb, rigid, sensor, shape
+from factorlib.tracing.scene import Channels, denoised, rendered, rgb, rigid, sensor, shape
 
 FADE = 0.5  # outer share of the disc's radius in which shadows fade
 FIT_SAMPLES = 16
@@ -58,6 +58,7 @@ FEWEST = 100  # least number of pixels for a comparison of shadows
 # and 0.09.
 BELIEVED = 0.3
 GROUND = "+ground"
+BLACK = Reflectance((0.0,) * 3, (0.0,) * 3, 1.0)
 STEPS = 4
 NEW = "+"  # prefix of the new object and its materials: no name in dataset.yaml has it
 
@@ -77,8 +78,10 @@ class GroundSurface(msgspec.Struct, frozen=True):
     polish: Reflectance | None = None
 
 
-class InsertionScene(msgspec.Struct, frozen=True):
+class InsertionScene(msgspec.Struct, frozen=True, dict=True):
     """A photo's scene with the new object in place; its materials include the new object's.
+
+    Every rendering of it has the same random numbers for the same seed.
 
     Attributes:
         ground: the ground under the new object
@@ -94,17 +97,55 @@ class InsertionScene(msgspec.Struct, frozen=True):
     spot: Spot
     moved: str
 
-    @property
+    @cached_property
     def ground_points(self) -> Float[np.ndarray, "h w 3"]:
         """The point of the ground that each pixel shows, in the world; NaN above the horizon."""
         rays = self.scene.camera.rays() @ YUP_FROM_CAMERA
         return self.spot.plane.hit(rays.reshape(-1, 3)).reshape(rays.shape)
 
-    @property
+    @cached_property
     def distance(self) -> Float[np.ndarray, "h w"]:
         """The distance of each pixel's point of the ground from the spot, in radii of the disc; infinite above it."""
         distance = np.linalg.norm(self.ground_points - self.spot.point, axis=-1) / (RADIUS * self.spot.height)
         return np.nan_to_num(distance, nan=np.inf)
+
+    @cached_property
+    def entries(self) -> tuple[dict[str, Any], dict[str, Any]]:
+        """The photo's light and its objects, for Mitsuba."""
+        scene = self.scene
+        return light_entries(scene.light, scene.size), shapes(scene.objects, scene.materials)
+
+    @property
+    def sensor(self) -> dict[str, Any]:
+        """The photo's camera, for Mitsuba."""
+        return sensor(self.scene.camera, rigid(YUP_FROM_CAMERA, np.zeros(3)), near=self.scene.near)
+
+    def disc(self, material: Reflectance) -> dict[str, Any]:
+        """Return the ground about the spot as a Mitsuba disk."""
+        normal = self.spot.plane.normal
+        centre = self.spot.point - HAIR * self.spot.height * normal
+        return {GROUND: disk(centre, normal, RADIUS * self.spot.height, material)}
+
+    def radiance(
+        self,
+        entries: dict[str, Any],
+        samples: int,
+        seed: int = 1,
+        light: dict[str, Any] | None = None,
+        guides: bool = False,
+    ) -> Float[np.ndarray, "h w c"]:
+        """Render the photo's objects with further entries.
+
+        Args:
+            entries: Mitsuba objects by name
+            samples: samples per pixel
+            seed: seed of the random numbers
+            light: replaces the photo's light
+            guides: add the guides of the denoiser
+        """
+        photo_light, objects = self.entries
+        channels = Channels(hide_emitters=True, guides=guides)
+        return rendered((light or photo_light) | objects | entries, self.sensor, samples, seed, ALL_BOUNCES, channels)
 
 
 class ShadowMatch(msgspec.Struct, frozen=True):
@@ -153,38 +194,6 @@ class InsertionResult(msgspec.Struct, frozen=True):
     without: Picture
 
 
-class InsertionRenderer:
-    """Renderer of the scene of an insertion, with the same random numbers for every rendering."""
-
-    def __init__(self, insertion: InsertionScene, samples: int, seed: int = 1):
-        scene = insertion.scene
-        self.camera = sensor(scene.camera, rigid(YUP_FROM_CAMERA, np.zeros(3)), near=scene.near)
-        self.light = light_entries(scene.light, scene.size)
-        self.objects = shapes(scene.objects, scene.materials)
-        self.denoise = scene.denoise
-        self.samples = samples
-        self.seed = seed
-
-    def radiance(
-        self,
-        entries: dict[str, Any],
-        samples: int | None = None,
-        light: dict[str, Any] | None = None,
-        guides: bool = False,
-    ) -> Float[np.ndarray, "h w c"]:
-        """Render the photo's objects with further entries.
-
-        Args:
-            entries: Mitsuba objects by name
-            samples: replaces the samples per pixel
-            light: replaces the photo's light
-            guides: add the guides of the denoiser
-        """
-        whole = (light or self.light) | self.objects | entries
-        channels = Channels(hide_emitters=True, guides=guides)
-        return rendered(whole, self.camera, samples or self.samples, self.seed, ALL_BOUNCES, channels)
-
-
 def inserted(
     insertion: InsertionScene,
     photo: Picture,
@@ -206,45 +215,56 @@ def inserted(
     Raises:
         InputError: The new object is not visible.
     """
-    spot = insertion.spot
-    renderer = InsertionRenderer(insertion, samples, seed)
     new = shapes([insertion.new], insertion.scene.materials)
-    coverage = _coverage(insertion.scene, insertion.new, renderer.camera, samples)
-    if not coverage.any():
-        fault = "the new object is invisible: it stands outside the picture, or other objects hide it"
-        raise InputError(fault, key="at", cure="name a visible place, `at: [x, y]`, or a smaller `size`")
+    coverage = _coverage(insertion, samples)
     report(1)
     shows_ground = (insertion.distance < 1) & ~covered
-    diffuse = insertion.ground.diffuse or _ground_colour(renderer, spot, photo, shows_ground)
+    diffuse = insertion.ground.diffuse or _ground_colour(insertion, photo, shows_ground, seed)
     report(2)
-    fade = _fade(insertion.distance)
+    # weight that falls smoothly from 1 near the spot, and above the horizon, to 0 at the rim of the disc
+    fade = smooth_step((1 - np.where(np.isinf(insertion.distance), 0, insertion.distance)) / (1 - FADE))[..., None]
     beside = (1 - coverage)[..., None]
-    disc = _disc(spot, Reflectance(diffuse, (0.0,) * 3, 1.0))
-    without, with_, shadow = _lighting(renderer, disc, new, coverage, fade)
+    disc = insertion.disc(Reflectance(diffuse, (0.0,) * 3, 1.0))
+    rendering = partial(insertion.radiance, samples=samples, seed=seed)
+    without, with_, shadow = _lighting(
+        [rendering(e, guides=insertion.scene.denoise) for e in (disc, disc | new)], coverage, fade
+    )
     report(3)
     # (2)
     composite = beside * shadow * photo + np.maximum(with_ - beside * shadow * without, 0) * (beside < 1)
     # change of the ground's specular part: the object's reflection in it
     if insertion.ground.polish is not None:
-        polished = _disc(spot, insertion.ground.polish)
-        mirrored = renderer.radiance(polished | new) - renderer.radiance(polished)
+        polished = insertion.disc(insertion.ground.polish)
+        mirrored = rendering(polished | new) - rendering(polished)
         composite = np.maximum(composite + mirrored * shows_ground[..., None] * beside * fade, 0)
     report(STEPS)
     return InsertionResult(composite, coverage, shadow, np.asarray(diffuse), without)
 
 
 def _lighting(
-    renderer: InsertionRenderer,
-    disc: dict[str, Any],
-    new: dict[str, Any],
+    renderings: Sequence[Float[np.ndarray, "h w c"]],
     coverage: Float[np.ndarray, "h w"],
     fade: Float[np.ndarray, "h w 1"],
 ) -> tuple[Picture, Picture, Picture]:
-    """Return L₀ and L₁, the scene without and with the new object, and s of (1)."""
-    without, guides_without = np.split(renderer.radiance(disc, guides=renderer.denoise), [3], axis=-1)
-    with_, guides_with = np.split(renderer.radiance(disc | new, guides=renderer.denoise), [3], axis=-1)
-    shadow = _shadow(without, with_, coverage, fade)
-    if renderer.denoise:  # not the photo, nor pixels whose paths miss the object
+    """Return L₀ and L₁, denoised if the renderings have guides, and s of (1).
+
+    s is that of the nearest pixel beside the object for pixels under it and 1 for unlit pixels, and fades to 1 toward
+    the rim of the disc.
+
+    Args:
+        renderings: the scene without and with the new object
+        coverage: α
+        fade: weight of the shadow
+    """
+    (without, guides_without), (with_, guides_with) = (np.split(each, [3], axis=-1) for each in renderings)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        shadow = np.where(without > 0, with_ / without, 1.0)
+    beside = coverage == 0
+    if beside.any():
+        row, column = distance_transform_edt(~beside, return_distances=False, return_indices=True)
+        shadow = shadow[row, column]
+    shadow = 1 + (shadow - 1) * fade
+    if guides_with.size:  # not the photo, nor pixels whose paths miss the object
         clean, with_ = (
             denoised(np.concatenate([noisy, np.ones_like(fade), guides], axis=-1))[..., :3]
             for noisy, guides in ((shadow, guides_without), (with_, guides_with))
@@ -266,82 +286,54 @@ def compared_shadow(
         samples: samples per pixel of the rendering
     """
     plane = insertion.spot.plane
-    points = insertion.ground_points
     near = [
-        np.linalg.norm(points - plane.onto(each.vertices.mean(axis=0)[None])[0], axis=-1)
+        np.linalg.norm(insertion.ground_points - plane.onto(each.vertices.mean(axis=0)[None])[0], axis=-1)
         < NEAR * height_over(plane, each)
         for each in insertion.scene.objects
     ]
     shows_ground = (insertion.distance < 1) & ~covered & np.any(near, axis=0)
-    disc = _disc(insertion.spot, Reflectance(vec3(result.ground), (0.0,) * 3, 1.0))
+    disc = insertion.disc(Reflectance(vec3(result.ground), (0.0,) * 3, 1.0))
     sky = {"light": {"type": "constant", "radiance": rgb(1.0)}}
-    constant = InsertionRenderer(insertion, samples).radiance(disc, light=sky)
+    constant = insertion.radiance(disc, samples, light=sky)
     return shadow_match(photo, result.without, constant, binary_erosion(shows_ground, iterations=RIM))
 
 
-def _fade(distance: Float[np.ndarray, "h w"]) -> Float[np.ndarray, "h w 1"]:
-    """Return a weight that falls smoothly from 1 near the spot to 0 at the rim of the disc.
-
-    It is 1 above the horizon, where only objects are visible.
-    """
-    t = np.clip((1 - np.where(np.isinf(distance), 0, distance)) / (1 - FADE), 0, 1)
-    return (t * t * (3 - 2 * t))[..., None]
-
-
 def _ground_colour(
-    renderer: InsertionRenderer, spot: Spot, photo: Picture, shows_ground: Bool[np.ndarray, "h w"]
+    insertion: InsertionScene, photo: Picture, shows_ground: Bool[np.ndarray, "h w"], seed: int
 ) -> tuple[float, float, float]:
     """Return the diffuse reflectance at which the ground matches the photo: the median over its pixels."""
-    lit = renderer.radiance(_disc(spot, Reflectance((GREY,) * 3, (0.0,) * 3, 1.0)), FIT_SAMPLES)
+    lit = insertion.radiance(insertion.disc(Reflectance((GREY,) * 3, (0.0,) * 3, 1.0)), FIT_SAMPLES, seed)
     usable = shows_ground & (lit.min(axis=-1) > 0)
     if not usable.any():
         return (GREY,) * 3
     return vec3(np.clip(GREY * np.median(photo[usable] / lit[usable], axis=0), DARKEST, BRIGHTEST))
 
 
-def _disc(spot: Spot, material: Reflectance) -> dict[str, Any]:
-    """Return the ground about the spot as a Mitsuba disk."""
-    normal = spot.plane.normal
-    return {GROUND: disk(spot.point - HAIR * spot.height * normal, normal, RADIUS * spot.height, material)}
-
-
-def _coverage(scene: PhotoScene, new: PlacedMesh, camera: dict[str, Any], samples: int) -> Float[np.ndarray, "h w"]:
-    """Render the new object with radiance 1 and all else black, so that a pixel is the object's share of it."""
-    sides = [(label, side) for label in new.mesh.labels for side in range(1 + new.mesh.open)]
-    glowing = {f"{new.name}_{label}_{side}": _emitter(new, label, side) for label, side in sides}
-    black = shapes(scene.objects, scene.materials, black=[each.name for each in scene.objects])
-    picture = rendered(black | glowing, camera, samples, 1, 1)
-    return np.clip(picture[..., 0], 0, 1)
-
-
-def _emitter(new: PlacedMesh, label: int, side: int) -> Any:
-    """Return one side of the new object's part as an area light.
+def _coverage(insertion: InsertionScene, samples: int) -> Float[np.ndarray, "h w"]:
+    """Render the new object with radiance 1 and all else black, so that a pixel is the object's share of it.
 
     Area lights emit on the side of their normals alone.  An open mesh gets a second light, flipped and slightly behind.
     """
-    part = submesh(new.mesh, label)
-    if side:
-        behind = part.vertices - HAIR * new.mesh.radius * part.normals
-        part = Mesh(behind, part.faces[:, ::-1].copy(), -part.normals, part.face_label, True)
-    black = {"type": "diffuse", "reflectance": rgb(0.0)}
+    new = insertion.new
+    entries = shapes(insertion.scene.objects, dict.fromkeys(insertion.scene.materials, BLACK))
+    surface = {"type": "diffuse", "reflectance": rgb(0.0)}
     emitter = {"type": "area", "radiance": rgb(1.0)}
-    return shape(part, black, new.world_from_object, emitter)
-
-
-def _shadow(
-    without: Picture, with_: Picture, coverage: Float[np.ndarray, "h w"], fade: Float[np.ndarray, "h w 1"]
-) -> Picture:
-    """Return s of (1), taken from the nearest pixel beside the object for pixels under it.
-
-    s is 1 for unlit pixels and fades to 1 toward the rim of the disc.
-    """
-    beside = coverage == 0
-    with np.errstate(divide="ignore", invalid="ignore"):
-        shadow = np.where(without > 0, with_ / without, 1.0)
-    if beside.any():
-        row, column = distance_transform_edt(~beside, return_distances=False, return_indices=True)
-        shadow = shadow[row, column]
-    return 1 + (shadow - 1) * fade
+    for label in new.mesh.labels:
+        part = submesh(new.mesh, label)
+        sides = [part]
+        if new.mesh.open:
+            behind = part.vertices - HAIR * new.mesh.radius * part.normals
+            sides.append(Mesh(behind, part.faces[:, ::-1].copy(), -part.normals, part.face_label, True))
+        for number, side in enumerate(sides):
+            entries[f"{new.name}_{label}_{number}"] = shape(side, surface, new.world_from_object, emitter)
+    coverage = np.clip(rendered(entries, insertion.sensor, samples, 1, 1)[..., 0], 0, 1)
+    if not coverage.any():
+        raise InputError(
+            "the new object is invisible: it stands outside the picture, or other objects hide it",
+            key="at",
+            cure="name a visible place, `at: [x, y]`, or a smaller `size`",
+        )
+    return coverage
 
 
 def shadow_match(photo: Picture, lit: Picture, constant: Picture, mask: Bool[np.ndarray, "h w"]) -> ShadowMatch:

@@ -3,26 +3,44 @@
 World    The photo's camera frame turned y-up: x right, y up, z toward the viewer, camera at the origin.
 Light    Infinitely far, given in the photo's camera axes (lobes) or in the world (a lat-long map).
 Upright  The camera's own y.
+Picture  Linear radiance times coverage, and coverage; shown and written by `TracedPicture`.
 """
 
-from collections.abc import Mapping, Sequence
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
 from typing import Any
 
 import msgspec
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, UInt8
 
 from factorlib.conventions import YUP_FROM_CAMERA
-from factorlib.export.environment import NARROWEST, mitsuba_map
 from factorlib.export.exported_scene import ALL_BOUNCES, DIRECT
 from factorlib.geometry.camera import Camera, rotation_of_vector
+from factorlib.images.exr import write_exr
+from factorlib.images.picture import exposure_of, picture, write_png
 from factorlib.light.latlong import rotate_map
 from factorlib.light.lobes import Lobes, lobe_integral
 from factorlib.meshes.mesh import Mesh
 from factorlib.meshes.ply_stl_off import submesh
 from factorlib.results.materials import Reflectance
-from factorlib.tracing.denoise import denoised
-from factorlib.tracing.scene import Channels, bsdf, envmap, envmap_of_nodes, paint, rendered, rgb, rigid, sensor, shape
+from factorlib.tracing.scene import (
+    NARROWEST,
+    Channels,
+    bsdf,
+    denoised,
+    envmap,
+    envmap_of_nodes,
+    mitsuba_map,
+    paint,
+    rendered,
+    rgb,
+    rigid,
+    sensor,
+    shape,
+)
 
 UP = np.array([0.0, 1.0, 0.0])
 NEAR = 1e-3  # near clipping distance, in distances of the objects
@@ -116,31 +134,20 @@ def light_entries(light: DistantLight, size: float) -> dict[str, Any]:
     few = light.take(narrow)
     far = FAR * size
     energies = few.weight * lobe_integral(few.sharpness)[:, None]
-    for k, (axis, sharpness, energy) in enumerate(
-        zip(few.axis @ YUP_FROM_CAMERA, few.sharpness, energies, strict=True)
-    ):
-        radius = 2 / np.sqrt(sharpness)  # angular radius of a disc of the lobe's RMS width
+    radii = 2 / np.sqrt(few.sharpness)  # angular radius of a disc of the lobe's RMS width
+    for k, (axis, radius, energy) in enumerate(zip(few.axis @ YUP_FROM_CAMERA, radii, energies, strict=True)):
         emitter = {"type": "area", "radiance": rgb(energy / (2 * np.pi * (1 - np.cos(radius))))}
         place = {"center": (far * axis).tolist(), "radius": float(far * np.sin(radius))}
         entries[f"sun {k}"] = {"type": "sphere", **place, "emitter": emitter}
     return entries
 
 
-def shapes(
-    objects: Sequence[PlacedMesh], materials: Mapping[str, Reflectance], black: Sequence[str] = ()
-) -> dict[str, Any]:
-    """Return a Mitsuba shape for each material of each object.
-
-    Args:
-        objects: the objects
-        materials: reflectances by name
-        black: names of objects that reflect nothing
-    """
+def shapes(objects: Sequence[PlacedMesh], materials: Mapping[str, Reflectance]) -> dict[str, Any]:
+    """Return a Mitsuba shape for each material of each object."""
     entries = {}
     for each in objects:
         for label in each.mesh.labels:
-            name = each.materials[label - 1]
-            material = Reflectance((0.0,) * 3, (0.0,) * 3, 1.0) if each.name in black else materials[name]
+            material = materials[each.materials[label - 1]]
             part = submesh(each.mesh, label)
             colours = None if part.detail is None else paint(material, part.detail)
             surface = bsdf(material, painted=colours is not None)
@@ -248,3 +255,60 @@ def turned_light(light: DistantLight, angle_deg: float) -> DistantLight:
     if isinstance(light, Lobes):
         return light.turned(YUP_FROM_CAMERA @ turn @ YUP_FROM_CAMERA)
     return rotate_map(light, turn, finer=2)
+
+
+Radiance = Float[np.ndarray, "h w 3"]
+Tone = Callable[[Radiance], Radiance]
+
+
+def as_it_is(radiance: Radiance) -> Radiance:
+    """Return the radiance unchanged: the tone curve of a photo that has none."""
+    return radiance
+
+
+class TracedPicture(msgspec.Struct, frozen=True):
+    """A path-traced picture.
+
+    Attributes:
+        pixels: linear Rec. 709 radiance times coverage, and coverage, the share of a pixel that is filled
+        tone: tone curve of the photo
+    """
+
+    pixels: Float[np.ndarray, "h w 4"]
+    tone: Tone = as_it_is
+
+    @property
+    def coverage(self) -> Float[np.ndarray, "h w 1"]:
+        """The share of each pixel that is covered, in [0, 1]."""
+        return np.clip(self.pixels[..., 3:], 0, 1)
+
+    @property
+    def toned(self) -> Radiance:
+        """The radiance after the tone curve, with coverage divided out."""
+        share = self.pixels[..., 3:]
+        return self.tone(self.pixels[..., :3] / np.where(share > 0, share, 1))
+
+    @property
+    def exposure(self) -> float:
+        """The display exposure for the covered pixels."""
+        return exposure_of(self.toned, self.pixels[..., 3] > 0.5)
+
+    def exposed(self) -> TracedPicture:
+        """Return the picture times its own exposure, without a tone curve."""
+        return TracedPicture(self.pixels * np.array([self.exposure] * 3 + [1.0]))
+
+    def over(self, photo: Radiance) -> Radiance:
+        """Composite the picture, after its tone curve, over a photo."""
+        return (1 - self.coverage) * photo + self.coverage * self.toned
+
+    def rgba(self, exposure: float = 1.0) -> UInt8[np.ndarray, "h w 4"]:
+        """Return 8-bit sRGB with coverage as alpha."""
+        return np.concatenate([picture(self.toned, exposure), np.rint(255 * self.coverage).astype(np.uint8)], axis=-1)
+
+    def to_exr(self, path: str | Path) -> None:
+        """Write linear radiance times coverage, and coverage as channel A."""
+        write_exr(path, {channel: self.pixels[..., k] for k, channel in enumerate("RGBA")})
+
+    def to_png(self, path: str | Path, exposure: float = 1.0) -> None:
+        """Write `rgba` as a PNG; exposure 1 is the photo's."""
+        write_png(path, self.rgba(exposure))

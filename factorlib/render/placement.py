@@ -7,14 +7,12 @@ height. If none within eight heights is free, a coarser lattice follows.
 """
 
 from collections.abc import Callable, Iterator
-from typing import Any
 
 import msgspec
 import numpy as np
 from jaxtyping import Float
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
-from scipy.spatial.transform import Rotation
 
 from factorlib.conventions import YUP_FROM_CAMERA
 from factorlib.errors import InputError
@@ -22,10 +20,9 @@ from factorlib.geometry import open3d as o3d
 from factorlib.geometry.camera import rotation_of_vector
 from factorlib.geometry.raster import Caster
 from factorlib.meshes.mesh import Mesh
-from factorlib.render.ground import Plane, height_over
+from factorlib.render.ground import Plane, height_over, rotation_between
 from factorlib.render.photo_scene import PhotoScene, PlacedMesh
-from factorlib.results.materials import Reflectance
-from factorlib.tracing.scene import bsdf, rigid, transform
+from factorlib.tracing.scene import rigid
 
 RADIUS = 8.0  # radius of the ground about the new object, in its heights
 GAP = 0.15  # gap between the objects, in heights of the new one
@@ -95,8 +92,9 @@ def spot_at(
     ray = scene.camera.rays_through(np.array([pixel])) @ YUP_FROM_CAMERA
     point = plane.hit(ray)[0]
     if not np.isfinite(point).all():
-        fault = f"pixel {pixel} shows no ground: it lies above the horizon"
-        raise InputError(fault, key="at", cure="name a pixel below the horizon")
+        raise InputError(
+            f"pixel {pixel} shows no ground: it lies above the horizon", key="at", cure="name a pixel below the horizon"
+        )
     return Spot(plane, point, relative_height * height_over(plane, neighbour))
 
 
@@ -262,8 +260,9 @@ def free_placement(
             if (move := smaller.nearest_move()) is not None:
                 cure = f"at {share} of its size it is free at {smaller.pixel_text(move, factor)}"
                 break
-        fault = f"the new object has no free place in the picture: {reason}"
-        raise InputError(fault, key="at" if asked else "size", cure=cure)
+        raise InputError(
+            f"the new object has no free place in the picture: {reason}", key="at" if asked else "size", cure=cure
+        )
     place = space.pixel_text(move, factor)
     if asked and not intersected:
         raise InputError(f"the new object is invisible: {reason}", key="at", cure=f"the nearest free place is {place}")
@@ -271,23 +270,3 @@ def free_placement(
     heights = np.linalg.norm(move) / spot.height
     moved = f"The new object was moved by {heights:.1f} of its heights, to {place}, because {reason}."
     return stand(free), free, moved
-
-
-def rotation_between(first: Float[np.ndarray, "3"], second: Float[np.ndarray, "3"]) -> Float[np.ndarray, "3 3"]:
-    """Return the smallest rotation of one unit vector into another."""
-    return Rotation.align_vectors(second[None], first[None])[0].as_matrix()
-
-
-def disk(
-    centre: Float[np.ndarray, "3"], normal: Float[np.ndarray, "3"], radius: float, material: Reflectance
-) -> dict[str, Any]:
-    """Return a disk as Mitsuba's dictionary.
-
-    Args:
-        centre: its centre, in the world
-        normal: unit normal of its upper side
-        radius: its radius
-        material: its reflectance
-    """
-    frame = rigid(radius * rotation_between(np.array([0.0, 0.0, 1.0]), normal), centre)
-    return {"type": "disk", "to_world": transform(frame), "bsdf": bsdf(material)}

@@ -23,15 +23,14 @@ from factorlib.images.picture import picture, write_png
 from factorlib.jsonfile import write_json
 from factorlib.recipe import kinds
 from factorlib.recipe.kinds import AnyRecipe, is_light_file
+from factorlib.render.ground import on_floor
 from factorlib.render.insertion import NEW, STEPS, InsertionScene, compared_shadow, inserted
-from factorlib.render.photo_scene import Orbit, PhotoScene, lit_ball, resized, traced_photo, turned_light
+from factorlib.render.photo_scene import Orbit, PhotoScene, TracedPicture, lit_ball, resized, traced_photo, turned_light
 from factorlib.render.placement import free_placement, spot_at, spot_beside, standing_mesh
 from factorlib.render.solved_set import SolvedSet
-from factorlib.render.studio import on_floor
-from factorlib.render.traced_picture import TracedPicture
 from factorlib.results.materials import Reflectance
 from factorlib.stage import Progress
-from factorlib.tracing.denoise import denoiser
+from factorlib.tracing.scene import denoiser
 from factorlib.wholefile import write_text
 
 log = logging.getLogger("factorlib.recipes")
@@ -109,8 +108,12 @@ def write_resynthesis(
         replaced = {old: table[new] for old, new in recipe.materials.items()}
         present = {each.materials[label - 1] for each in scene.objects for label in each.mesh.labels}
         if recipe.photos and not present & replaced.keys():
-            text = "%s: no object has the material %s, so the picture equals the re-synthesis; its objects have %s"
-            log.warning(text, photo, ", ".join(map(repr, sorted(replaced))), ", ".join(sorted(present)))
+            log.warning(
+                "%s: no object has the material %s, so the picture equals the re-synthesis; its objects have %s",
+                photo,
+                ", ".join(map(repr, sorted(replaced))),
+                ", ".join(sorted(present)),
+            )
         scene = msgspec.structs.replace(scene, materials={**scene.materials, **replaced})
     traced = TracedPicture(traced_photo(scene, recipe.samples), results.tone(photo))
     _write_opaque(out / photo, traced.over(results.photo(photo)))
@@ -132,33 +135,34 @@ def insertion_scene(recipe: kinds.InsertRecipe, results: SolvedSet, photo: str) 
     """
     scene = results.scene(photo, recipe.sun, recipe.denoise)
     neighbour = next((each for each in scene.objects if each.name == recipe.beside), scene.objects[0])
-    polish = None
-    if any(recipe.ground.specular):
-        polish = Reflectance((0.0,) * 3, recipe.ground.specular, recipe.ground.roughness)
+    polished = Reflectance((0.0,) * 3, recipe.ground.specular, recipe.ground.roughness)
+    polish = polished if any(recipe.ground.specular) else None
     ground = msgspec.structs.replace(results.ground(photo, neighbour), polish=polish)
-    if not ground.plane.below_camera:
-        fault = (
+    if ground.plane.point @ ground.plane.normal >= 0:  # the camera stands at the origin
+        raise InputError(
             f"photo '{photo}' was taken from below the plane that '{neighbour.name}' stands on, "
-            "so a shadow on it would be invisible"
+            "so a shadow on it would be invisible",
+            key="photos",
+            cure="name other photos, or give the photo's `ground` in dataset.yaml",
         )
-        raise InputError(fault, key="photos", cure="name other photos, or give the photo's `ground` in dataset.yaml")
     if recipe.sun is not None and results.sun_axis(photo, recipe.sun) @ YUP_FROM_CAMERA @ ground.plane.normal <= 0:
-        fault = f"the assumed sun is below the ground of photo '{photo}'"
-        raise InputError(fault, key="sun.direction", cure="give a direction that points upward: y is up in the photo")
-    # materials of the new object, under names with a prefix
-    new_materials = {f"{NEW}{name}": material for name, material in results.with_table(recipe.table).items()}
+        raise InputError(
+            f"the assumed sun is below the ground of photo '{photo}'",
+            key="sun.direction",
+            cure="give a direction that points upward: y is up in the photo",
+        )
     mesh, names, up = results.mesh(recipe.mesh, recipe.material, recipe.up)
     if recipe.at is not None:
         requested = spot_at(scene, ground.plane, neighbour, results.pixel(photo, recipe.at), recipe.size)
     else:
-        # extent along the upright axis, and diameter about it
-        tall = np.ptp(mesh.vertices @ up)
         wide = 2 * float(np.linalg.norm(np.cross(mesh.vertices - mesh.centre, up), axis=1).max())
-        requested = spot_beside(scene, ground.plane, neighbour, recipe.size, wide / tall)
-    labels = tuple(f"{NEW}{name}" for name in names)
+        slenderness = wide / np.ptp(mesh.vertices @ up)  # diameter about the upright axis over the extent along it
+        requested = spot_beside(scene, ground.plane, neighbour, recipe.size, slenderness)
+    stand = partial(standing_mesh, NEW, mesh, tuple(f"{NEW}{name}" for name in names), up, recipe.turn)
     factor = results.poses[photo].camera.factor
-    stand = partial(standing_mesh, NEW, mesh, labels, up, recipe.turn)
     new, spot, moved = free_placement(scene, stand, requested, recipe.at is not None, factor)
+    # materials of the new object, under names with a prefix
+    new_materials = {f"{NEW}{name}": material for name, material in results.with_table(recipe.table).items()}
     scene = msgspec.structs.replace(scene, materials={**scene.materials, **new_materials})
     return InsertionScene(scene, ground, new, requested, spot, moved)
 

@@ -21,8 +21,7 @@ from factorlib.reading import check_plain
 from factorlib.recipe.kinds import BALL, AssumedSun, is_light_file, is_mesh_file, read_table
 from factorlib.render.ground import Plane, resting_plane
 from factorlib.render.insertion import GroundSurface
-from factorlib.render.photo_scene import DistantLight, PhotoScene, PlacedMesh, with_sun
-from factorlib.render.traced_picture import Tone, as_it_is
+from factorlib.render.photo_scene import DistantLight, PhotoScene, PlacedMesh, Tone, as_it_is, with_sun
 from factorlib.results.lobe_table import light_of
 from factorlib.results.materials import MaterialTable, Reflectance, read_materials, reflectances
 from factorlib.results.poses import PhotoPoses, read_poses
@@ -54,8 +53,12 @@ class SolvedSet:
         self.table: MaterialTable = read_materials(file)
         for name, material in self.table.materials.items():
             if material.total > 1:
-                fault = f"max diffuse + max specular = {material.total:.4g}: more light is reflected than arrives"
-                raise InputError(fault, file=file, key=f"materials.{name}", cure="run the stage `export` again")
+                raise InputError(
+                    f"max diffuse + max specular = {material.total:.4g}: more light is reflected than arrives",
+                    file=file,
+                    key=f"materials.{name}",
+                    cure="run the stage `export` again",
+                )
         self.materials = reflectances(self.table)
         self.photos = list(self.objects)
         surface = read_surface(inputs.folders.get("surface"))
@@ -76,13 +79,19 @@ class SolvedSet:
         poses = self.poses[photo]
         objects = self.objects[photo]
         if not objects.objects:
-            fault = f"photo '{photo}' has no objects to render"
-            cure = "name other photos in the recipe"
-            raise InputError(fault, key=f"photos.{photo}.objects", cure=cure)
+            raise InputError(
+                f"photo '{photo}' has no objects to render",
+                key=f"photos.{photo}.objects",
+                cure="name other photos in the recipe",
+            )
         for obj in objects.objects:
             if poses.objects[obj.name].left_out:
-                text = "%s: the pose of '%s' is doubtful, so the solve left it out, and pictures may misplace it: %s"
-                log.warning(text, photo, obj.name, "; ".join(poses.objects[obj.name].doubts))
+                log.warning(
+                    "%s: the pose of '%s' is doubtful, so the solve left it out, and pictures may misplace it: %s",
+                    photo,
+                    obj.name,
+                    "; ".join(poses.objects[obj.name].doubts),
+                )
         height, width = self._masks(photo)["label"].shape
         camera = poses.camera.camera(width, height)
         placed = tuple(self._placed(obj, objects.meshes[obj.mesh], poses) for obj in objects.objects)
@@ -114,8 +123,11 @@ class SolvedSet:
         height, width = self._masks(photo)["label"].shape
         factor = self.poses[photo].camera.factor
         if not (0 <= pixel[0] <= factor * width and 0 <= pixel[1] <= factor * height):
-            fault = f"pixel {pixel} lies outside photo '{photo}', of {factor * width} × {factor * height} pixels"
-            raise InputError(fault, key="at", cure="name a pixel that shows the ground")
+            raise InputError(
+                f"pixel {pixel} lies outside photo '{photo}', of {factor * width} × {factor * height} pixels",
+                key="at",
+                cure="name a pixel that shows the ground",
+            )
         return pixel[0] / factor, pixel[1] / factor
 
     def covered(self, photo: str) -> Bool[np.ndarray, "h w"]:
@@ -145,8 +157,12 @@ class SolvedSet:
         """Return the ground given with the photo, or the plane that the neighbour rests on."""
         given = self.grounds[photo].ground
         if given is None:
+            # up vectors of the cameras of all objects of the mesh, in its frame
             mesh = next(obj.mesh for obj in self.objects[photo].objects if obj.name == neighbour.name)
-            return GroundSurface(resting_plane(neighbour, self._uprights(mesh)))
+            poses = [self.poses[each].objects[obj.name] for each, obj in self._objects_of(mesh)]
+            trusted = [pose for pose in poses if not pose.left_out] or poses
+            uprights = np.stack([np.array(pose.rotation).T @ YUP_FROM_CAMERA[1] for pose in trusted])
+            return GroundSurface(resting_plane(neighbour, uprights))
         normal = YUP_FROM_CAMERA @ np.array(given.normal)
         return GroundSurface(
             Plane(normal / np.linalg.norm(normal), YUP_FROM_CAMERA @ np.array(given.point)), given.diffuse
@@ -186,8 +202,11 @@ class SolvedSet:
             elif material is not None:
                 materials = tuple(material.get(each, each) for each in materials)
         if np.ptp(mesh.vertices @ upward) < LEAST_HEIGHT * mesh.radius:
-            cure = "say which axis of the file points upward, as in `up: z`, or name a mesh that is not flat"
-            raise InputError(f"the mesh {name!r} has no height", key="mesh", cure=cure)
+            raise InputError(
+                f"the mesh {name!r} has no height",
+                key="mesh",
+                cure="say which axis of the file points upward, as in `up: z`, or name a mesh that is not flat",
+            )
         return mesh, materials, upward
 
     def _placed_with(self, name: str, required: set[str]) -> tuple[str, PlacedMesh]:
@@ -207,21 +226,18 @@ class SolvedSet:
             if required <= materials:
                 return photo, placed
             present |= materials
-        fault = f"no object of the mesh {name!r} has the materials {', '.join(sorted(required))}"
         wrong = min(required - present, default=min(required))
-        raise InputError(fault, key="material", cure=did_you_mean(wrong, sorted(present)))
+        raise InputError(
+            f"no object of the mesh {name!r} has the materials {', '.join(sorted(required))}",
+            key="material",
+            cure=did_you_mean(wrong, sorted(present)),
+        )
 
     def _objects_of(self, mesh: str) -> list[tuple[str, MeshInstance]]:
         """Return all objects of a mesh with their photos, sorted by photo name, independent of dataset.yaml's order."""
         return [
             (photo, obj) for photo, each in sorted(self.objects.items()) for obj in each.objects if obj.mesh == mesh
         ]
-
-    def _uprights(self, mesh: str) -> Float[np.ndarray, "k 3"]:
-        """Return the up vectors of the cameras of all objects of a mesh, in its frame."""
-        poses = [self.poses[photo].objects[obj.name] for photo, obj in self._objects_of(mesh)]
-        trusted = [pose for pose in poses if not pose.left_out] or poses
-        return np.stack([np.array(pose.rotation).T @ YUP_FROM_CAMERA[1] for pose in trusted])
 
     def _placed(self, obj: MeshInstance, entry: MeshEntry, poses: PhotoPoses) -> PlacedMesh:
         pose = poses.objects[obj.name]
@@ -236,6 +252,7 @@ class SolvedSet:
             self._pixels = {photo: read_exr(file)}  # Only one photo is held: photos are large.
             for channel in (*"RGB", "label", "left_out"):
                 if channel not in self._pixels[photo]:
-                    cure = "run the stage `masks` again"
-                    raise InputError(f"has no channel {channel}", file=file, key=channel, cure=cure)
+                    raise InputError(
+                        f"has no channel {channel}", file=file, key=channel, cure="run the stage `masks` again"
+                    )
         return self._pixels[photo]

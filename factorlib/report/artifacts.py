@@ -63,13 +63,9 @@ class Artifacts(msgspec.Struct, frozen=True, dict=True):
         """Return the linear radiance of <name>.exr."""
         return self.read(read_rgb_exr, stage, f"{name}.exr")
 
-    def exr(self, stage: str, name: str) -> Channels | None:
-        """Return all channels of <name>.exr."""
-        return self.read(read_exr, stage, f"{name}.exr")
-
     def channels(self, stage: str, name: str) -> Channels:
         """Return all channels of <name>.exr, which must exist."""
-        channels = self.exr(stage, name)
+        channels = self.read(read_exr, stage, f"{name}.exr")
         assert channels is not None
         return channels
 

@@ -10,6 +10,7 @@ from jaxtyping import Float
 
 from factorlib.errors import InputError
 from factorlib.images.picture import exposure_of, picture
+from factorlib.pack import check_whole
 from factorlib.report.artifacts import STAGES, Artifacts, Picture
 from factorlib.report.pictures import data_uri, reduced
 from factorlib.report.template import DASH, headlines, number, percent, rendered
@@ -34,12 +35,15 @@ def comparison(first: Path, second: Path, changes: Sequence[str] | None) -> str:
         InputError: A run is incomplete, or the two have no material and no photo in common.
     """
     runs = [_read_run(folder) for folder in (first, second)]
-    tables = [read_materials(f / MATERIALS, f"make export DATASET={_dataset_of(f)}") for f in (first, second)]
+    tables = [read_materials(folder / MATERIALS) for folder in (first, second)]
     photos = [name for name in runs[0].set.photos if name in runs[1].set.photos]
     materials = [name for name in tables[0].materials if name in tables[1].materials]
     if not photos and not materials:
-        cure = "name results of one data set, or of sets that share photos or materials"
-        raise InputError(f"has no photo and no material in common with {first}", file=second, cure=cure)
+        raise InputError(
+            f"has no photo and no material in common with {first}",
+            file=second,
+            cure="name results of one data set, or of sets that share photos or materials",
+        )
     names = [{run.illumination_of(photo) for run in runs} for photo in photos]
     lights = dict.fromkeys(name for pair in names if len(pair) == 1 for name in pair)
 
@@ -61,25 +65,15 @@ def comparison(first: Path, second: Path, changes: Sequence[str] | None) -> str:
 
 def _read_run(folder: Path) -> Artifacts:
     """Return the results of a run; InputError if it did not reach `export`."""
-    for file in (PHOTOS, MATERIALS):
-        if not (folder / file).is_file():
-            stage, _, name = file.partition("/")
-            fault = f"the result is incomplete: {name} of the stage {stage!r} is missing"
-            raise InputError(fault, file=folder, cure=f"make all DATASET={_dataset_of(folder)}")
+    check_whole(folder, (PHOTOS, MATERIALS))
     photo_set = SimpleNamespace(name=folder.name, photos=list(read_photos(folder / PHOTOS)))
     return Artifacts({stage: folder / stage for stage in STAGES}, photo_set)
-
-
-def _dataset_of(folder: Path) -> str:
-    """Return the name of the data set of a result; the folder may have another name."""
-    mark = folder / "dataset.txt"
-    return Path(mark.read_text(encoding="utf-8", errors="replace").strip()).name if mark.is_file() else folder.name
 
 
 def _numbers(runs: list[Artifacts]) -> list[tuple[str, list[str]]]:
     """Return the headlines of both runs by label; a dash if one has none."""
     metrics = [run.metrics for run in runs]
-    values = [{h.label: f"{h.value} {h.unit}".strip() for h in headlines(m)} if m else {} for m in metrics]
+    values = [{h["label"]: f"{h['value']} {h['unit']}".strip() for h in headlines(m)} if m else {} for m in metrics]
     return [(label, [run.get(label, DASH) for run in values]) for label in dict.fromkeys([*values[0], *values[1]])]
 
 

@@ -2,8 +2,9 @@
 
 import json
 import re
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from itertools import groupby
+from operator import itemgetter
 from typing import Any
 from urllib.parse import quote
 
@@ -44,7 +45,7 @@ def page(
     rows: list[pictures.PhotoRow],
     tags: dict[str, str],
     viewed: dict[str, Any] | None,
-    surfaces: Sequence[pictures.SurfaceRow] = (),
+    surfaces: Sequence[Mapping[str, Any]] = (),
     first: Sequence[tuple[str, str, str]] = (),
 ) -> str:
     """Return the page as HTML.
@@ -75,52 +76,35 @@ def page(
         materials=_materials(run, cells),
         cells=cells,
         maps=[(p, pictures.reflectance_maps(run, p, exposure[p])) for p in run.set.photos],
-        lights=_lights(run, metrics),
-        missing=_missing(metrics),
         surface=run.surface,
         surfaces=surfaces,
         training=_training(run),
         cost=cost_of(run.events(), STAGES),
         viewed=viewed,
-        **_solution(run),
-        **_poses(run),
+        **_facts(run, metrics),
     )
 
 
-def _missing(metrics: Metrics) -> dict[str, list[str]]:
-    """Return the sections without numbers by the reason for it, both sorted."""
-    reasons = sorted((why, section) for section, why in metrics.reasons.items())
-    return {why: [section for _, section in group] for why, group in groupby(reasons, lambda pair: pair[0])}
-
-
-def _lights(run: Artifacts, metrics: Metrics) -> list[dict[str, Any]]:
-    """Return the page's row of each exported light."""
+def _facts(run: Artifacts, metrics: Metrics) -> dict[str, Any]:
+    """Return the page's facts about the solve, poses and lights, and the sections without numbers by the reason."""
     errors = metrics.light.lights if metrics.light else {}
-    rows = (pictures.light_row(run, name, photos, errors.get(name)) for name, photos in run.illuminations().items())
-    return [row for row in rows if row]
-
-
-def _solution(run: Artifacts) -> dict[str, Any]:
-    """Return the page's facts about the solve: gauge, connected components, choices of the model, exposures."""
+    lights = (pictures.light_row(run, name, photos, errors.get(name)) for name, photos in run.illuminations().items())
+    reasons = sorted((why, section) for section, why in metrics.reasons.items())
     gauge = run.solved.gauge
     numbers = sorted(set(gauge.component.values()))
+    poses = run.poses
+    facts = run.photo_facts
     return {
         "gauge": gauge,
         "groups": [[name for name, k in gauge.component.items() if k == number] for number in numbers],
         "choices": sentences("choices.txt", model=run.solved.model),
         "exposures": {p: f for p, f in run.exposures.items() if any(abs(c - 1) > 1e-9 for c in f)},
-    }
-
-
-def _poses(run: Artifacts) -> dict[str, Any]:
-    """Return the page's facts about poses."""
-    poses = run.poses
-    facts = run.photo_facts
-    return {
         "poses": [(p, _overlay(run, p), poses[p], facts.get(p)) for p in run.set.photos if p in poses],
         "doubted": any(obj.doubts or obj.left_out for photo in poses.values() for obj in photo.objects.values()),
         "low_iou": LOW_IOU,
         "as_it_is": AS_IT_IS,
+        "lights": list(filter(None, lights)),
+        "missing": {why: [name for _, name in group] for why, group in groupby(reasons, itemgetter(0))},
     }
 
 
@@ -172,7 +156,7 @@ def forms(name: str, material: Reflectance) -> dict[str, str]:
     }
 
 
-def _materials(run: Artifacts, cells: list[list[pictures.LitMaterial]]) -> list[dict[str, Any]]:
+def _materials(run: Artifacts, cells: list[list[dict[str, Any]]]) -> list[dict[str, Any]]:
     """Return the table's row of each solved material; its ball is in the light of the photo that shows it most."""
     solved = run.solved.materials
     exported = run.exported
@@ -181,7 +165,7 @@ def _materials(run: Artifacts, cells: list[list[pictures.LitMaterial]]) -> list[
     for name, row in zip(run.set.materials, cells, strict=True):
         if name in solved:
             counts = {photo: fact.pixels.get(name, 0) for photo, fact in facts.items()}
-            ball = max((c for c in row if c.uri), key=lambda c: counts.get(c.photo, 0), default=None)
+            ball = max((c for c in row if c["uri"]), key=lambda c: counts.get(c["photo"], 0), default=None)
             copies = forms(name, exported.get(name, solved[name]).reflectance)
             rows.append({"name": name, "estimate": solved[name], "ball": ball, "counts": counts, "forms": copies})
     return rows
@@ -214,15 +198,12 @@ def _training(run: Artifacts) -> dict[str, Any] | None:
 
 
 def _lines(name: str, table: Mapping, level: int) -> Iterator[tuple[int, str, Mapping]]:
+    """Yield the lines of a table; bins are sorted by their leading numbers: "3 to 30" before "30 to 300"."""
     yield level, name, table
-    for key in _in_order(key for key, value in table.items() if isinstance(value, dict)):
-        yield from _lines(key, table[key], level + 1)
-
-
-def _in_order(names: Iterable[str]) -> list[str]:
-    """Sort bins by their leading numbers: "3 to 30" before "30 to 300"."""
     leading = re.compile(r"[-+]?[\d.]+(e[-+]?\d+)?")
-    return sorted(names, key=lambda name: (float(number[0]) if (number := leading.match(name)) else 0.0, name))
+    inner = [key for key, value in table.items() if isinstance(value, dict)]
+    for key in sorted(inner, key=lambda key: (float(number[0]) if (number := leading.match(key)) else 0.0, key)):
+        yield from _lines(key, table[key], level + 1)
 
 
 # ── Cost ─────────────────────────────────────────────────────────────────────────────────────────────────────────────
@@ -240,19 +221,17 @@ def cost_of(events: list[dict], order: list[str]) -> dict[str, list]:
     warnings: distinct pairs (stage, text), in the order of the stages
     """
     last = {(e["stage"], e.get("photo")): e for e in events if e.get("event") == "done" and "seconds" in e}
-    by_stage = {s: [e for (stage, _), e in last.items() if stage == s] for s in order}
     machines = sorted({_machine(e["machine"]) for e in last.values() if e.get("machine")})
     warned = {(e.get("stage") or "", e["text"]) for e in events if e.get("event") == "warning" and e.get("text")}
     ranked = sorted(warned, key=lambda w: (order.index(w[0]) if w[0] in order else len(order), w[1]))
-    stages = [_stage_cost(stage, steps) for stage, steps in by_stage.items() if steps]
+    stages = []
+    for stage in [stage for stage in order if any(stage == name for name, _ in last)]:
+        steps = [event for (name, _), event in last.items() if name == stage]
+        names = ("seconds", "cpu_seconds", "memory_mb")
+        seconds, cpu, memory = ([float(e[name]) for e in steps if e.get(name) is not None] for name in names)
+        sums = {"seconds": sum(seconds), "longest": max(seconds), "cpu_seconds": sum(cpu) if cpu else None}
+        stages.append({"stage": stage, "steps": len(steps), **sums, "memory_mb": max(memory, default=None)})
     return {"stages": stages, "machines": machines, "warnings": ranked}
-
-
-def _stage_cost(stage: str, steps: list[dict]) -> dict[str, Any]:
-    names = ("seconds", "cpu_seconds", "memory_mb")
-    seconds, cpu, memory = ([float(e[name]) for e in steps if e.get(name) is not None] for name in names)
-    sums = {"seconds": sum(seconds), "longest": max(seconds), "cpu_seconds": sum(cpu) if cpu else None}
-    return {"stage": stage, "steps": len(steps), **sums, "memory_mb": max(memory, default=None)}
 
 
 def _machine(machine: dict) -> str:

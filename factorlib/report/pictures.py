@@ -1,4 +1,4 @@
-"""Pictures of the report: photos beside re-syntheses, balls, reflectance maps, lights, and an overview of the run."""
+"""Pictures of the report: photos beside re-syntheses, balls, reflectance maps, and lights."""
 
 import base64
 from collections.abc import Mapping, Sequence
@@ -14,12 +14,12 @@ from scipy.sparse import csr_array
 
 from factorlib.conventions import lat_long_solid_angles
 from factorlib.dataset.schema import ObjectsSlice
-from factorlib.evaluate.photo_errors import agreeing_pixels
+from factorlib.evaluate.picture_errors import agreeing_pixels
+from factorlib.images.exr import read_exr
 from factorlib.images.picture import exposure_of, nearest_tags, picture, png_bytes
 from factorlib.images.tone import srgb_encode
-from factorlib.render.photo_scene import traced_photo, turned_light
+from factorlib.render.photo_scene import TracedPicture, traced_photo, turned_light
 from factorlib.render.solved_set import SolvedSet
-from factorlib.render.traced_picture import TracedPicture
 from factorlib.report.artifacts import Artifacts, Channels, Picture
 from factorlib.results.lobe_table import read_lobes
 from factorlib.results.materials import Reflectance
@@ -32,9 +32,6 @@ AMPLIFICATION = 4  # factor on the difference between photo and re-synthesis
 UNCOUNTED = np.array([0.45, 0.38, 0.62])  # sRGB colour of pixels in the mask that are not compared
 DISAGREES = np.array([0.92, 1.0, 0.0])  # sRGB colour of pixels where mesh and mask name different materials
 MAGENTA = (214, 40, 120)
-COLUMN = 200  # width of a column of the overview, pixels
-GAP = 8  # gap between pictures of the overview, pixels
-MOST_PHOTOS = 8  # photos in the overview
 UNKNOWN = Reflectance((0.2,) * 3, (0.0,) * 3, 1.0)  # stands for a material that was not solved
 MAP_SIZE = 64  # largest width of a measured map, cells
 CLAY_LIGHT = np.array([-0.5, -0.6, -0.6245])  # camera frame, unit: from above, left of the camera
@@ -213,24 +210,12 @@ def _labels(masks: Channels, geometry: Channels, photo: Picture, tags: list[str]
     return display
 
 
-class SurfaceRow(msgspec.Struct, frozen=True):
-    """A refined mesh in the photo that shows most of it.
+def surface_rows(run: Artifacts, objects: Mapping[str, ObjectsSlice]) -> list[dict[str, Any]]:
+    """Return a row for every mesh with displacements or detail of reflectance, sorted by name.
 
-    Attributes:
-        uris: pictures by title, of the mesh as given and as refined
-        typical: RMS displacement over the extent
-        largest: largest displacement over the extent
+    `uris` are pictures by title, of the mesh as given and as refined, in the photo that shows most of it.  `typical` is
+    the RMS displacement and `largest` the largest, over the extent.
     """
-
-    mesh: str
-    photo: str
-    uris: dict[str, str]
-    typical: float
-    largest: float
-
-
-def surface_rows(run: Artifacts, objects: Mapping[str, ObjectsSlice]) -> list[SurfaceRow]:
-    """Return a row for every mesh with displacements or detail of reflectance, sorted by name."""
     rows = []
     table = run.surface
     for mesh in sorted(table.displacements | table.log_factors):
@@ -256,86 +241,26 @@ def surface_rows(run: Artifacts, objects: Mapping[str, ObjectsSlice]) -> list[Su
             uris[title] = data_uri(np.rint(255 * np.clip(small, 0, 1)).astype(np.uint8))
         # RMS and largest displacement, relative to the extent
         size = np.abs(table.displacements.get(mesh, [0.0]))
-        rows.append(SurfaceRow(mesh, photo, uris, float(np.sqrt(np.mean(size**2))), float(size.max())))
+        moved = {"typical": float(np.sqrt(np.mean(size**2))), "largest": float(size.max())}
+        rows.append({"mesh": mesh, "photo": photo, "uris": uris, **moved})
     return rows
 
 
 def strip(row: PhotoRow) -> bytes:
     """Return a row's panels side by side on white, as a PNG."""
-    return png_bytes(np.concatenate([_on_white(pixels) for pixels in row.panels.values()], axis=1))
-
-
-def _on_white(pixels: Pixels) -> UInt8[np.ndarray, "h w 3"]:
-    alpha = pixels[..., 3:].astype(np.float32) / 255 if pixels.shape[2] == 4 else 1.0
-    return np.rint(pixels[..., :3] * alpha + 255 * (1 - alpha)).astype(np.uint8)
-
-
-def _whitened(pixels: Pixels, down: int, right: int) -> Pixels:
-    return np.pad(pixels, ((0, down), (0, right), (0, 0)), constant_values=255)
-
-
-def overview(run: Artifacts, rows: Sequence[PhotoRow]) -> bytes:
-    """Return a PNG on white for a README: a column per photo, with photo, re-synthesis, light and balls.
-
-    Only the first `MOST_PHOTOS` photos appear.
-    """
-    exposure = exposures(run)
-    rows = rows[:MOST_PHOTOS]
-    tallest = max(round(COLUMN * p.shape[0] / p.shape[1]) for row in rows for p in row.panels.values())
-    columns = [_column(run, row, exposure[row.name], min(COLUMN * 3 // 2, tallest)) for row in rows]
-    height = max(len(column) for column in columns)
-    return png_bytes(np.concatenate([_whitened(c, height - len(c), GAP) for c in columns], axis=1)[:, :-GAP])
-
-
-def _column(run: Artifacts, row: PhotoRow, exposure: float, height: int) -> Pixels:
-    cells = [_fitted(row.panels[k], height, COLUMN) for k in ("photo", "re-synthesis") if k in row.panels]
-    light = run.rgb("export", f"illumination/{row.illumination}")
-    if light is not None:
-        cells.append(_fitted(picture(light, exposure_of(light, percentile=95.0)), COLUMN // 2, COLUMN))
-    radiances = [run.rgb("render", f"materials/{row.name}/{material}") for material in run.set.materials]
-    size = COLUMN // 2 - GAP, COLUMN // 2 - GAP // 2
-    balls = [_fitted(disc(ball, exposure), *size) for ball in radiances if ball is not None]
-    for k in range(0, len(balls), 2):
-        pair = np.concatenate(balls[k : k + 2], axis=1)
-        cells.append(_whitened(pair, 0, COLUMN - pair.shape[1]))
-    return np.concatenate([_whitened(cell, GAP, 0) for cell in cells])[:-GAP]
-
-
-def _fitted(pixels: Pixels, height: int, width: int) -> Pixels:
-    """Scale pixels to fit the middle of a white cell; smaller pictures are enlarged by whole factors first."""
-    pixels = _on_white(pixels).astype(np.float32)
-    times = max(1, -(-max(height, width) // min(pixels.shape[:2])))
-    pixels = np.repeat(np.repeat(pixels, times, axis=0), times, axis=1)
-    scale = min(height / pixels.shape[0], width / pixels.shape[1])
-    pixels = reduced(pixels, max(1, int(scale * max(pixels.shape[:2]))))
-    cell = np.full((height, width, 3), 255, np.uint8)
-    top = (height - pixels.shape[0]) // 2
-    left = (width - pixels.shape[1]) // 2
-    cell[top : top + pixels.shape[0], left : left + pixels.shape[1]] = np.rint(pixels)
-    return cell
+    panels = [pixels.astype(np.float32) for pixels in row.panels.values()]
+    alphas = [each[..., 3:] / 255 if each.shape[2] == 4 else 1.0 for each in panels]
+    opaque = [each[..., :3] * alpha + 255 * (1 - alpha) for each, alpha in zip(panels, alphas)]
+    return png_bytes(np.rint(np.concatenate(opaque, axis=1)).astype(np.uint8))
 
 
 # ── Materials in lights ──────────────────────────────────────────────────────────────────────────────────────────────
 
 
-class LitMaterial(msgspec.Struct, frozen=True):
-    """A material in a photo's light.
+def ball_cell(run: Artifacts, material: str, photo: str, exposure: float) -> dict[str, Any]:
+    """Return the page's cell of the ball of a material in a photo's light.
 
-    Attributes:
-        observed: True if the photo shows the material
-        uri: the rendering, or None
-        measured: the measured map, or None if there are no observations
-    """
-
-    material: str
-    photo: str
-    observed: bool
-    uri: str | None
-    measured: str | None = None
-
-
-def ball_cell(run: Artifacts, material: str, photo: str, exposure: float) -> LitMaterial:
-    """Return the ball of a material in a photo's light.
+    `observed` says whether the photo shows the material.  `uri` is the rendering, or None.
 
     Args:
         run: results of the run
@@ -346,11 +271,11 @@ def ball_cell(run: Artifacts, material: str, photo: str, exposure: float) -> Lit
     observed = photo in run.photo_facts and run.photo_facts[photo].pixels.get(material, 0) > 0
     radiance = run.rgb("render", f"materials/{photo}/{material}")
     uri = None if radiance is None else data_uri(disc(reduced(radiance, 96), exposure))
-    return LitMaterial(material, photo, observed, uri)
+    return {"material": material, "photo": photo, "observed": observed, "uri": uri}
 
 
-def reflectance_maps(run: Artifacts, photo: str, exposure: float) -> list[LitMaterial]:
-    """Return one cell per material: the solved map with the observed normals outlined, and the measured map.
+def reflectance_maps(run: Artifacts, photo: str, exposure: float) -> list[dict[str, Any]]:
+    """Return one cell per material: the solved map with the observed normals outlined, and the measured map or None.
 
     Args:
         run: results of the run
@@ -361,11 +286,11 @@ def reflectance_maps(run: Artifacts, photo: str, exposure: float) -> list[LitMat
     observations = run.read(read_observations, "urm", f"{photo}.parquet")
     observations = observations and with_surface_normals(observations, run.folders.get("surface"))
     for index, name in enumerate(run.set.materials):
-        channels = run.exr("render", f"reflectance_maps/{photo}/{name}")
+        channels = run.read(read_exr, "render", f"reflectance_maps/{photo}/{name}.exr")
         samples = observations and observations.take(observations.material == index)
         measured = data_uri(measured_map(samples, exposure)) if samples else None
         uri = None if channels is None else data_uri(_ringed(channels, exposure))
-        cells.append(LitMaterial(name, photo, bool(samples), uri, measured))
+        cells.append({"material": name, "uri": uri, "measured": measured})
     return cells
 
 
@@ -424,7 +349,7 @@ def light_row(
         return None
     exposure = exposure_of(radiance, percentile=95.0)
     brightest = radiance.max(axis=-1) * exposure
-    area = _areas(radiance)
+    area = lat_long_solid_angles(*radiance.shape[:2])[:, None]
     over = brightest > 1
     energy = radiance.sum(axis=-1) * area
     true = run.rgb("evaluate", f"illumination/{name}")
@@ -447,11 +372,8 @@ def light_row(
     return row
 
 
-def _areas(lat_long: Picture) -> Float[np.ndarray, "h 1"]:
-    return lat_long_solid_angles(*lat_long.shape[:2])[:, None]
-
-
 def _outlined(radiance: Picture, exposure: float) -> str:
+    """Return a light with the texels above white outlined."""
     pixels = picture(radiance, exposure)
     pixels[outline((radiance * exposure).max(axis=-1) > 1)] = MAGENTA
     return data_uri(pixels)
@@ -459,7 +381,9 @@ def _outlined(radiance: Picture, exposure: float) -> str:
 
 def _true_map(true: Picture, estimate: Picture, exposure: float) -> str:
     """Return the true map scaled to the mean of the estimate, because the overall scale is a gauge freedom."""
-    means = [float((m * (_areas(m)[..., None] / m.shape[1])).sum()) for m in (true, estimate)]
+    means = [
+        float((m * (lat_long_solid_angles(*m.shape[:2])[:, None, None] / m.shape[1])).sum()) for m in (true, estimate)
+    ]
     return _outlined(reduced(true, max(estimate.shape[:2])) * (means[1] / max(means[0], 1e-30)), exposure)
 
 

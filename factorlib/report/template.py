@@ -41,24 +41,13 @@ def sentences(template: str, **context: Any) -> list[str]:
     return list(filter(None, rendered(template, **context).split("\n")))
 
 
-class Headline(msgspec.Struct, frozen=True):
-    """A number of the report in words.
+def headlines(metrics: Metrics) -> list[dict[str, str]]:
+    """Return the headline numbers: re-synthesis, if pixels count, and materials and relighting, if there is a truth.
 
-    Attributes:
-        beside: the number it is compared with
-        meaning: an explanation of the measure for a lay reader
+    They are in words: label, value and unit, the number `beside` which it stands, and its `meaning` for a lay reader.
     """
-
-    label: str
-    value: str
-    unit: str
-    beside: str
-    meaning: str
-
-
-def headlines(metrics: Metrics) -> list[Headline]:
-    """Return the headline numbers: re-synthesis, if pixels count, and materials and relighting, if there is a truth."""
-    return [Headline(*line.split(" | ")) for line in sentences("headlines.txt", metrics=metrics)]
+    keys = ("label", "value", "unit", "beside", "meaning")
+    return [dict(zip(keys, line.split(" | "), strict=True)) for line in sentences("headlines.txt", metrics=metrics)]
 
 
 def _in_script(value: Mapping) -> str:

@@ -14,12 +14,9 @@ import msgspec
 import numpy as np
 import trimesh
 from jaxtyping import Float, Int
-from trimesh.visual.material import PBRMaterial
-from trimesh.visual.texture import TextureVisuals
 
 from factorlib.conventions import YUP_FROM_CAMERA
 from factorlib.dataset.schema import LightSlice, ObjectsSlice
-from factorlib.export.environment import sharpened
 from factorlib.export.gltf_writer import read_part_materials, variant_name
 from factorlib.geometry import open3d as o3d
 from factorlib.geometry.camera import Pose
@@ -32,6 +29,7 @@ from factorlib.meshes.subdivision import subdivide
 from factorlib.report.artifacts import Artifacts
 from factorlib.results.lobe_table import read_lobes
 from factorlib.results.poses import AS_IT_IS
+from factorlib.tracing.scene import sharpened
 
 MOST_TRIANGLES = 150_000  # triangles of all meshes together: about 3 MB of page
 LONGEST = 0.08  # longest edge, in extents of the mesh
@@ -150,12 +148,6 @@ def _objects(run: Artifacts, objects: Mapping[str, ObjectsSlice]) -> dict[str, l
     }
 
 
-def _double_sided(part: trimesh.Trimesh) -> bool:
-    """Return whether both sides of a part of a GLB are visible."""
-    assert isinstance(part.visual, TextureVisuals) and isinstance(part.visual.material, PBRMaterial)
-    return bool(part.visual.material.doubleSided)
-
-
 def _mesh(
     parts: Mapping[str, trimesh.Trimesh], scale: Float[np.ndarray, "3"], share: float
 ) -> tuple[dict[str, Any], Float[np.ndarray, "3"]]:
@@ -180,9 +172,14 @@ def _mesh(
         np.vstack([face + start for face, start in zip(faces, first, strict=False)]),
         unit(np.vstack(normals) / scale),
         np.repeat(labels, [len(face) for face in faces]),
-        any(_double_sided(part) for part in parts.values()),
+        any(bool(part.visual.material.doubleSided) for part in parts.values()),  # type: ignore[union-attr]
     )
-    mesh = _fine(mesh)
+    # subdivide so that shadows fall between vertices, less finely if there would be too many
+    longest = LONGEST * np.ptp(mesh.vertices, axis=0).max()
+    most = max(MOST_VERTICES // (1 + mesh.open), len(mesh.vertices))
+    while len((fine := subdivide(mesh, longest)).vertices) > most:
+        longest *= 2
+    mesh = fine
     sides = _both_sides(mesh) if mesh.open else mesh
     packed = {
         "vertices": _base64(np.rint((np.clip(sides.vertices, -1, 1) + 1) * 32767.5), "<u2"),
@@ -193,15 +190,6 @@ def _mesh(
         "simplified_from": sum(len(part.faces) for part in parts.values()) if share < 1 else None,
     }
     return packed, centre
-
-
-def _fine(mesh: Mesh) -> Mesh:
-    """Subdivide the mesh so that shadows fall between its vertices, less finely if there would be too many."""
-    longest = LONGEST * np.ptp(mesh.vertices, axis=0).max()
-    most = max(MOST_VERTICES // (1 + mesh.open), len(mesh.vertices))
-    while len((fine := subdivide(mesh, longest)).vertices) > most:
-        longest *= 2
-    return fine
 
 
 def _both_sides(mesh: Mesh) -> Mesh:

@@ -265,8 +265,12 @@ def in_order(table: MaterialTable, names: Sequence[str], path: str | Path) -> li
     """
     for name in names:
         if name not in table.materials:
-            fault = f"the materials are not those of the data set: {name!r} is missing"
-            raise InputError(fault, file=path, key="materials", cure="run the stage `solve` again")
+            raise InputError(
+                f"the materials are not those of the data set: {name!r} is missing",
+                file=path,
+                key="materials",
+                cure="run the stage `solve` again",
+            )
     return [table.materials[name] for name in names]
 
 
@@ -275,6 +279,7 @@ def read_exposures(path: str | Path, cure: str = "") -> dict[str, Channels]:
     exposures = read_result(path, dict[str, Channels], "solve", cure)
     for photo, channels in exposures.items():
         if min(channels) <= 0:
-            cure = cure or "run the stage `solve` again"
-            raise InputError("an exposure is not positive", file=path, key=photo, cure=cure)
+            raise InputError(
+                "an exposure is not positive", file=path, key=photo, cure=cure or "run the stage `solve` again"
+            )
     return exposures

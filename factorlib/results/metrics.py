@@ -4,12 +4,12 @@ Keys are stable, and every number is finite.  A section that cannot be computed 
 section.
 
 set          counts of photos, materials, illuminations and connected components of the observation matrix
-resynthesis  always present: `factorlib.evaluate.photo_errors`
-materials    `factorlib.evaluate.material_errors`
+resynthesis  always present: `factorlib.evaluate.picture_errors`
+materials    `factorlib.evaluate.truth`
 relighting   `factorlib.evaluate.relighting`
 relit_set    the relit set score of `factorlib.evaluate.relighting`
-light        `factorlib.evaluate.light_errors`
-normals      photo -> `NormalError`; see `factorlib.evaluate.geometry_errors`
+light        `factorlib.evaluate.relighting`
+normals      photo -> `NormalError`; see `factorlib.evaluate.truth`
 poses        photo -> object -> `PoseError`
 verdict      trust in the result, with or without truth; null if no photo shows a material
 

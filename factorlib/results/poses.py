@@ -4,7 +4,7 @@
 """
 
 from pathlib import Path
-from typing import Annotated, TypedDict
+from typing import Annotated, Any
 
 import msgspec
 import numpy as np
@@ -93,17 +93,9 @@ class PhotoPoses(msgspec.Struct, frozen=True):
     objects: dict[str, ObjectPose]
 
 
-class PoseFields(TypedDict):
-    """The fields of a `PoseEntry`."""
-
-    rotation: tuple[Vec3, Vec3, Vec3]
-    translation: Vec3
-
-
-def entry_of(pose: Pose) -> PoseFields:
+def entry_of(pose: Pose) -> dict[str, Any]:
     """Return the fields of a `PoseEntry`."""
-    x, y, z = (vec3(row) for row in pose.rotation)
-    return {"rotation": (x, y, z), "translation": vec3(pose.translation)}
+    return {"rotation": tuple(map(vec3, pose.rotation)), "translation": vec3(pose.translation)}
 
 
 def read_poses(path: str | Path, cure: str = CURE) -> dict[str, PhotoPoses]:
@@ -125,5 +117,9 @@ def _check(photo: PhotoPoses, path: str | Path, key: str, cure: str) -> None:
     for name, obj in photo.objects.items():
         for entry in (obj, obj.runner_up):
             if entry is not None and not is_pose(np.array(entry.rotation), np.array(entry.translation)):
-                fault = "the pose is invalid: its rotation is no rotation matrix, or a number is not finite"
-                raise InputError(fault, file=path, key=f"{key}.{name}", cure=cure)
+                raise InputError(
+                    "the pose is invalid: its rotation is no rotation matrix, or a number is not finite",
+                    file=path,
+                    key=f"{key}.{name}",
+                    cure=cure,
+                )

@@ -1,15 +1,24 @@
-"""Mitsuba scenes: materials, meshes, cameras, environment maps, and the light that arrives at a point.
+"""Mitsuba scenes: materials, meshes, cameras, environment maps, the light that arrives at a point, and denoising.
 
 Frames   The world has y up. A camera is given by world_from_camera, with the camera in OpenCV's axes. If the world is
          the camera's own y-up frame, that matrix is YUP_FROM_CAMERA, and an `envmap` needs no rotation.
 Pixels   The reconstruction filter is a box, so that a pixel is the mean over its own square.
 Envmap   Mitsuba puts row i of a map at i/(H−1) of the way down, and column j at (j+½)/W: maps in the layout of
-         `factorlib.conventions` are resampled to a finer lattice of that kind.
+         `factorlib.conventions` are resampled to a finer lattice of that kind, and lobes are evaluated at its nodes.
+         Interpolation convolves a lobe with a triangle of the node spacing h, of variance h²/6 along each axis.  A lobe
+         of sharpness λ has variance 1/λ.  Lobes are first sharpened by that amount at the same energy, so that the
+         interpolated map has their energy and width.
+Noise    Intel Open Image Denoise, if mitsuba-oidn is installed (the extra `denoise`).  Its input is linear radiance
+         and, as guides, the albedo and normal of each pixel, which have hardly any noise.  Before denoising, a partly
+         covered pixel gets its foreground colour in full, and pixels without coverage get that of the nearest covered
+         one, so that no contour is blurred.
 """
 
 from __future__ import annotations
 
+import os
 from collections.abc import Sequence
+from importlib.metadata import version
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
@@ -17,10 +26,12 @@ from typing import Any
 import msgspec
 import numpy as np
 from jaxtyping import Float
+from scipy.ndimage import distance_transform_edt
 
 from factorlib.conventions import lat_long_directions, lat_long_solid_angles
 from factorlib.geometry.camera import Camera
-from factorlib.light.latlong import sample_map
+from factorlib.light.latlong import lattice_of_lobes, sample_map
+from factorlib.light.lobes import Lobes, lobe_integral
 from factorlib.meshes.mesh import Mesh
 from factorlib.meshes.ply_stl_off import write_ply
 from factorlib.results.materials import Reflectance
@@ -261,3 +272,58 @@ def cube_map_lookup(faces: dict[str, np.ndarray], directions: Float[np.ndarray, 
         column, row = ((np.stack([x, y]) / z + 1) / 2 * size).astype(int).clip(0, size - 1)
         values[hit] = faces[name][row, column]
     return values
+
+
+def denoised(picture: Float[np.ndarray, "h w 10"]) -> Float[np.ndarray, "h w 4"]:
+    """Denoise linear radiance times coverage; coverage is left unchanged.
+
+    `picture` holds radiance, coverage, and the guides of `factorlib.tracing.scene.rendered`, all times coverage.
+    """
+    os.environ["OIDN_DEFAULT_DEVICE"] = "cpu"  # the same bytes with and without a GPU
+    mitsuba()  # the denoiser uses its thread pool
+    import mitsuba_oidn
+
+    coverage = picture[..., 3:4]
+    if not coverage.any():
+        return picture[..., :4]
+    row, column = distance_transform_edt(coverage[..., 0] <= 0, return_distances=False, return_indices=True)
+    whole = (picture / np.where(coverage > 0, coverage, 1))[row, column].astype(np.float32)
+    radiance, _, albedo, normal = map(np.ascontiguousarray, np.split(whole, [3, 4, 7], axis=-1))
+    clean = mitsuba_oidn.denoise(radiance, albedo.clip(0, 1), normal, hdr=True, clean_aux=True)
+    return np.concatenate([clean.clip(0) * coverage, coverage], axis=-1)
+
+
+def denoiser() -> str:
+    """Return name and version of the denoiser."""
+    return f"mitsuba-oidn {version('mitsuba-oidn')}"
+
+
+NARROWEST = 0.5  # least variance, in h², of a lobe at the nodes: a narrower one would fall between them
+
+
+def sharpened(lobes: Lobes, spacing: float) -> Lobes:
+    """Return narrower lobes that linear interpolation between nodes widens back to `lobes`; energy is kept.
+
+    `spacing` is the distance of the nodes in radians.
+    """
+    # variance 1/λ − h²/6, at the same energy
+    variance = np.maximum(1 / lobes.sharpness - spacing**2 / 6, NARROWEST * spacing**2)
+    factor = np.asarray(lobe_integral(lobes.sharpness) / lobe_integral(1 / variance))
+    return Lobes(lobes.axis, 1 / variance, lobes.weight * factor[:, None])
+
+
+def mitsuba_map(lobes: Lobes, height: int, width: int) -> Float[np.ndarray, "h w 3"]:
+    """Evaluate a light at the nodes of Mitsuba's `envmap`.
+
+    Args:
+        lobes: the light, in its own frame
+        height: rows of the map
+        width: columns of the map
+
+    Returns:
+        Radiance at the nodes, in the lobes' frame turned y-up.
+    """
+    narrowed = sharpened(lobes, np.pi / (height - 1))
+    theta = np.arange(height)[:, None] / (height - 1) * np.pi
+    phi = (np.arange(width)[:, None] + 0.5) / width * 2 * np.pi
+    return lattice_of_lobes(narrowed, height, width, lambda _: (theta, phi, np.ones(1)))

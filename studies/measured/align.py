@@ -155,20 +155,22 @@ def rows() -> Tables:
         return tables_of(list(tqdm(pool.map(measure, keys), total=len(keys), desc="poses")))
 
 
+def doubtful(rows: list[dict]) -> str:
+    """Count the rows that have doubts."""
+    return share([row["doubts"] for row in rows])
+
+
+def quantiles(rows: list[dict], measure: str, *levels: float) -> str:
+    """Format quantiles of a measure."""
+    return format_numbers(np.quantile([row[measure] for row in rows], levels))
+
+
 def tables_of(measures: list[dict]) -> Tables:
     """Return the tables of all photos that were measured."""
 
     def select(**values: object) -> list[dict]:
         """Return the rows with these values."""
         return [row for row in measures if all(row[key] == value for key, value in values.items())]
-
-    def doubtful(rows: list[dict]) -> str:
-        """Count the rows that have doubts."""
-        return share([row["doubts"] for row in rows])
-
-    def quantiles(rows: list[dict], measure: str, *levels: float) -> str:
-        """Format quantiles of a measure."""
-        return format_numbers(np.quantile([row[measure] for row in rows], levels))
 
     def success(name: str, rows: list[dict]) -> list[str]:
         """Return the line of a kind and shape: shares of right poses, errors, and doubts."""

@@ -34,7 +34,7 @@ from factorlib.reflection.samples import (
     specular_samples,
     specular_table,
 )
-from factorlib.scenes.operator_cases import operator_variant
+from factorlib.scenes.operator_variant import operator_variant
 from studies.measured.tools import Tables, format_number, format_numbers
 
 REFERENCE = "reference"

@@ -31,9 +31,9 @@ from jaxtyping import Float
 
 from factorlib.evaluate.ball import octahedral_light
 from factorlib.evaluate.comparison_gauge import connected_components
-from factorlib.evaluate.material_errors import GREY
 from factorlib.evaluate.picture_errors import picture_error, white_of
 from factorlib.evaluate.relighting import INSIDE, Appearances
+from factorlib.evaluate.truth import GREY
 from factorlib.jsonfile import read_json, write_json
 from factorlib.results.materials import Solved, read_materials
 from factorlib.stage import Inputs, Progress

@@ -7,12 +7,17 @@ from scipy.spatial.transform import Rotation
 from factorlib.conventions import lat_long_directions, lat_long_solid_angles
 from factorlib.dataset.schema import RigidTransform
 from factorlib.evaluate.ball import VIEW, OctahedralLight, diffuse_lobe, glossy_lobe, octahedral_light
-from factorlib.evaluate.geometry_errors import normal_error, pose_error
-from factorlib.evaluate.light_errors import compare_lights, light_error, rgb_angle
-from factorlib.evaluate.material_errors import compare_materials
-from factorlib.evaluate.photo_errors import compared_photo
-from factorlib.evaluate.picture_errors import WINDOW, picture_error, psnr, ssim_map, tone_mapped, white_of
-from factorlib.evaluate.relighting import compare_relighting, compare_relit_set
+from factorlib.evaluate.picture_errors import (
+    WINDOW,
+    compared_photo,
+    picture_error,
+    psnr,
+    ssim_map,
+    tone_mapped,
+    white_of,
+)
+from factorlib.evaluate.relighting import compare_lights, compare_relighting, compare_relit_set, light_error, rgb_angle
+from factorlib.evaluate.truth import compare_materials, normal_error, pose_error
 from factorlib.geometry.sphere import ball_normals
 from factorlib.results.materials import Reflectance
 from tests.evaluate.made_artifacts import TRUE, light_map, perturbed, scaled

@@ -15,8 +15,8 @@ from factorlib.conventions import FRONT, YUP_FROM_CAMERA
 from factorlib.export import other_renderers
 from factorlib.export.gltf_writer import read_part_materials, write_glb
 from factorlib.export.materialx import materialx
+from factorlib.export.mitsuba import headroom_factor, table_in_gauge
 from factorlib.export.other_renderers import Angles, distribution
-from factorlib.export.reflectance_limit import headroom_factor, table_in_gauge
 from factorlib.images.exr import read_rgb_exr
 from factorlib.jsonfile import read_json, write_json
 from factorlib.light.latlong import map_energy

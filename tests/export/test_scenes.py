@@ -14,7 +14,6 @@ from scipy.ndimage import binary_erosion
 
 from factorlib.conventions import YUP_FROM_CAMERA, lat_long_directions
 from factorlib.dataset.schema import LightSlice
-from factorlib.export.environment import mitsuba_map, sharpened
 from factorlib.export.exported_scene import DIRECT, ExportedScene, ExportedShape, ExposedMap
 from factorlib.export.mitsuba import write_scene
 from factorlib.export.usd import shader_inputs, write_usd_scene
@@ -25,11 +24,10 @@ from factorlib.meshes.ply_stl_off import submesh, write_ply
 from factorlib.meshes.read import read_mesh
 from factorlib.reflection.reference import Reference
 from factorlib.render.photo_scene import PhotoScene, PlacedMesh, traced_photo
-from factorlib.render.reflect import Reflector
-from factorlib.render.resynthesis import resynthesised
+from factorlib.render.resynthesis import Reflector, resynthesised
 from factorlib.results.lobe_table import light_of, read_lobes
 from factorlib.results.materials import Reflectance, read_materials
-from factorlib.tracing.scene import node_directions, paint, rigid
+from factorlib.tracing.scene import mitsuba_map, node_directions, paint, rigid, sharpened
 from factorlib.tracing.variant import mitsuba
 from tests.export import made_export
 

@@ -16,8 +16,8 @@ from factorlib.reflection.operator import Operator
 from factorlib.reflection.reference import about_half_vector, about_lobe, converged, diffuse_quadrature
 from factorlib.reflection.samples import diffuse_samples, quantiles, specular_inputs, specular_samples
 from factorlib.results.materials import Reflectance
-from factorlib.scenes.operator_cases import scene
 from tests.integral import reflected
+from tests.reflection.operator_cases import scene
 from tests.refusal import refusal
 
 FAST = {

@@ -11,7 +11,7 @@ from factorlib.geometry.camera import Camera, rotation_of_vector
 from factorlib.light.latlong import lat_long_of_lobes, sample_map
 from factorlib.light.lobes import Lobes, no_lobes
 from factorlib.meshes.mesh import Mesh
-from factorlib.render.ground import Plane, resting_plane
+from factorlib.render.ground import Plane, on_floor, resting_plane
 from factorlib.render.insertion import NEW, GroundSurface, InsertionScene, compared_shadow, inserted, shadow_match
 from factorlib.render.photo_scene import (
     ALL_BOUNCES,
@@ -26,7 +26,6 @@ from factorlib.render.photo_scene import (
     with_sun,
 )
 from factorlib.render.placement import STEP, Spot, free_placement, spot_at, spot_beside, standing_mesh
-from factorlib.render.studio import on_floor
 from factorlib.results.materials import Reflectance
 from factorlib.tracing import scene as tracing
 from factorlib.tracing.scene import bsdf, rendered, rigid, sensor, transform

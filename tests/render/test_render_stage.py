@@ -15,8 +15,7 @@ from factorlib.light.latlong import lat_long_of_lobes
 from factorlib.light.lobes import Lobes, no_lobes
 from factorlib.reflection import reflection_operator
 from factorlib.reflection.reference import Reference
-from factorlib.render.reflect import PointEffects, Reflector
-from factorlib.render.resynthesis import balls
+from factorlib.render.resynthesis import PointEffects, Reflector, balls
 from factorlib.results.lobe_table import write_lobes
 from factorlib.results.materials import Reflectance, read_materials
 from factorlib.stage import silent
@@ -191,7 +190,7 @@ def test_balls_are_the_operator_at_every_pixel(roughness, sharpest):
 def test_chunks_do_not_show(monkeypatch):
     operator, seen = reflection_operator("closed_form"), []
     whole = Reflector(operator, light())(GLOSSY, *points(50))
-    monkeypatch.setattr("factorlib.render.reflect.PAIRS_AT_ONCE", 35)
+    monkeypatch.setattr("factorlib.render.resynthesis.PAIRS_AT_ONCE", 35)
     parts = Reflector(operator, light())(GLOSSY, *points(50), report=lambda done, total: seen.append((done, total)))
     np.testing.assert_allclose(parts, whole, rtol=1e-6)
     assert seen[0] == (7, 50) and seen[-1] == (50, 50)

@@ -1,7 +1,5 @@
 """Special cases of the reflection operators, and laws of theirs.
 
-Tests hold the operators to them, and `studies.measured.operator` measures them.
-
 Errors are |R − S| / (S + E/100); of gradients |∂R − ∂S| / (|∂S| + S + E/100), as lobe, view and normal turn.  Formulas
 break at grazing views, mirrors, lobes of no width or of all, and lobes along every special direction: a case differs
 from the ordinary in one respect, the last one in all of them.
@@ -11,9 +9,7 @@ from __future__ import annotations
 
 import itertools
 import math
-import os
 from types import SimpleNamespace
-from unittest.mock import patch
 
 import msgspec
 import torch
@@ -21,22 +17,9 @@ from jaxtyping import Float
 from torch import Tensor
 from torch.nn.functional import normalize
 
-from factorlib.errors import InputError
-from factorlib.reflection import Name, Operator, reflection_operator
-from factorlib.reflection.brdf import specular as brdf
+from factorlib.reflection import Operator, reflection_operator
 from factorlib.reflection.lobe import lobe_integral
 from factorlib.reflection.samples import specular_inputs
-
-
-def operator_variant(name: Name, dtype: str, *, compiled: bool = True) -> Operator | None:
-    """Return the operator in this precision; None where there is none, or nothing of it is compiled to leave out."""
-    with patch.dict(os.environ, {} if compiled else {"FACTORLIB_FUSED": "0"}):
-        try:
-            operator = reflection_operator(name, dtype=dtype)
-        except InputError:
-            return None
-    return operator if compiled or hasattr(operator, "fused") else None
-
 
 # ── Special cases ────────────────────────────────────────────────────────────────────────────────────────────────────
 
@@ -177,50 +160,29 @@ def gradient_error(a: Answers, b: Answers, given: Pairs) -> Float[Tensor, " k"]:
 def reference_values(given: Pairs, some: slice = slice(None)) -> dict[str, Tensor]:
     """Compute diffuse and specular by quadrature, of some of the pairs."""
     reference = reflection_operator("reference")
-    n = given.normal[some]
-    o = given.view[some]
-    z = given.axis[some]
-    no = (n * o).sum(1)
-    nz = (n * z).sum(1)[:, None]
-    oz = (o * z).sum(1)[:, None]
+    n, o, z = (t[some] for t in (given.normal, given.view, given.axis))
+    no, nz, oz = ((a * b).sum(1) for a, b in ((n, o), (n, z), (o, z)))
     sharpness = given.sharpness[some, None]
-    roughness = given.roughness[some, None]
     with torch.no_grad():
-        specular = reference.specular(roughness, sharpness, no, nz, oz)[:, 0]
-        return {"diffuse": reference.diffuse(sharpness, nz)[:, 0], "specular": specular}
+        specular = reference.specular(given.roughness[some, None], sharpness, no, nz[:, None], oz[:, None])[:, 0]
+        return {"diffuse": reference.diffuse(sharpness, nz[:, None])[:, 0], "specular": specular}
 
 
-# ── Laws, which hold exactly for the true reflection ─────────────────────────────────────────────────────────────────
-#
-# 0 ≤ D, S ≤ 1 of unit lobes, for k_d = 1 or k_s = 1 reflects no more than arrives.
+# ── Laws, which hold exactly for the true reflection: 0 ≤ D, S ≤ 1 of unit lobes ─────────────────────────────────────
 
 
-class Domain(msgspec.Struct, frozen=True):
-    """Ranges from which roughness and n·o are drawn; sharpness is in [10⁻⁴, 10⁶] always."""
-
-    least_roughness: float
-    least_no: float
-
-
-USUAL = Domain(0.1, 0.02)
-WIDER = Domain(0.1, 1e-4)
-WHOLE = Domain(0.03, 1e-4)
+def draw_inputs(least_roughness: float, least_no: float, count: int) -> tuple[Tensor, ...]:
+    """Draw α, λ in [10⁻⁴, 10⁶], n·o, n·z, o·z: those of `samples`; half of the views crowd at the least n·o."""
+    alpha = (least_roughness**2, 1.0)
+    return specular_inputs(count, 17, alpha=alpha, sharpness=(1e-4, 1e6), least_no=least_no)
 
 
-def draw_inputs(domain: Domain, count: int) -> tuple[Tensor, ...]:
-    """Draw α, λ, n·o, n·z, o·z: those of `samples`, over the domain; half of the views crowd at the least n·o."""
-    alpha = (domain.least_roughness**2, 1.0)
-    return specular_inputs(count, 17, alpha=alpha, sharpness=(1e-4, 1e6), least_no=domain.least_no)
-
-
-def draw_grazing_inputs(domain: Domain, count: int) -> tuple[Tensor, ...]:
+def draw_grazing_inputs(least_roughness: float, least_no: float, count: int) -> tuple[Tensor, ...]:
     """Draw pairs like `draw_inputs`, all at the least n·o, the lobe about the mirror direction."""
-    alpha, lam, _, nz, _ = draw_inputs(domain, count)
+    alpha, lam, _, nz, _ = draw_inputs(least_roughness, least_no, count)
     turn = torch.linspace(-1, 1, count, dtype=torch.float64)  # of the axis about n, from the mirror direction
-    so = math.sqrt(1 - domain.least_no**2)
-    sz = torch.sqrt(1 - nz**2)
-    no = torch.full_like(alpha, domain.least_no)
-    return alpha, lam, no, nz, domain.least_no * nz - so * sz * torch.cos(turn)
+    across = math.sqrt(1 - least_no**2) * torch.sqrt(1 - nz**2) * torch.cos(turn)
+    return alpha, lam, torch.full_like(alpha, least_no), nz, least_no * nz - across
 
 
 def specular_values(operator: Operator, *scalars: Float[Tensor, " k"]) -> Float[Tensor, " k"]:
@@ -228,53 +190,6 @@ def specular_values(operator: Operator, *scalars: Float[Tensor, " k"]) -> Float[
     a, lam, no, nz, oz = (t.to(operator.dtype) for t in scalars)
     with torch.no_grad():
         return operator.specular(a.sqrt()[:, None], lam[:, None], no, nz[:, None], oz[:, None])[:, 0].double()
-
-
-def p99_and_worst(error: Float[Tensor, " k"]) -> tuple[float, float]:
-    """Return the 99th percentile and the largest."""
-    return float(error.quantile(0.99)), float(error.max())
-
-
-def reflection_of_unit_lobes(operator: Operator, domain: Domain, count: int = 16384) -> tuple[float, float]:
-    """Return S of unit lobes, p99 and largest; exactly at most 1."""
-    return p99_and_worst(
-        torch.cat([specular_values(operator, *make(domain, count)) for make in (draw_inputs, draw_grazing_inputs)])
-    )
-
-
-def least_reflection(operator: Operator, count: int = 16384) -> tuple[float]:
-    """Return the least S of unit lobes; exactly at least 0."""
-    return (
-        min(float(specular_values(operator, *make(WHOLE, count)).min()) for make in (draw_inputs, draw_grazing_inputs)),
-    )
-
-
-def white_lambert_error(operator: Operator, count: int = 512) -> tuple[float]:
-    """Return the largest |D − 1| under constant light of radiance 1 (λ = 10⁻⁴)."""
-    lam = torch.tensor([1e-4], dtype=operator.dtype)
-    nz = torch.linspace(-1, 1, count, dtype=operator.dtype)
-    with torch.no_grad():
-        return (float((operator.diffuse(lam, nz[:, None]) - 1).abs().max()),)
-
-
-def reflection_of_constant_light(operator: Operator, count: int = 2048) -> tuple[float, float]:
-    """Return S under constant light of radiance 1 (λ = 10⁻⁴), p99 and largest; exactly at most 1."""
-    alpha, lam, no, nz, oz = draw_inputs(USUAL, count)
-    return p99_and_worst(specular_values(operator, alpha, torch.full_like(lam, 1e-4), no, nz, oz))
-
-
-def point_light_error(operator: Operator, count: int = 4096) -> tuple[float, float]:
-    """Return |S − E f| / (E f + E/100), f the BRDF times n·i, at λ = 10⁶; exactly below 10⁻³.
-
-    Roughness is at least .3, n·o and n·z at least .1.
-    """
-    alpha, lam, no, nz, oz = draw_inputs(Domain(0.3, 0.1), count)
-    alpha, no, nz, oz = (t[nz >= 0.1] for t in (alpha, no, nz, oz))
-    lam = torch.full_like(alpha, 1e6)
-    expected = lobe_integral(lam) * brdf(alpha, nz, no, (no + nz) / torch.sqrt(2 + 2 * oz))
-    return p99_and_worst(
-        (specular_values(operator, alpha, lam, no, nz, oz) - expected).abs() / (expected + lobe_integral(lam) / 100)
-    )
 
 
 def scene(seed: int, points: int = 32, lobes: int = 6, sharpness: tuple[float, float] = (0.0, 3.0)) -> tuple:
@@ -290,21 +205,3 @@ def scene(seed: int, points: int = 32, lobes: int = 6, sharpness: tuple[float, f
     normals = _unit(points, g)
     material = SimpleNamespace(diffuse=diffuse, specular=specular, roughness=roughness)
     return light, material, normals, normalize(normals + 0.8 * _unit(points, g), dim=1)
-
-
-def rotation_error(operator: Operator) -> tuple[float]:
-    """Return the largest difference after everything was turned, over the largest radiance."""
-    light, material, normals, views = scene(0)
-    turn = torch.linalg.qr(torch.randn(3, 3, generator=torch.Generator().manual_seed(4)).double()).Q
-    before = operator(light, material, normals, views)
-    light.axis = light.axis @ turn.T
-    return (float((operator(light, material, normals @ turn.T, views @ turn.T) - before).abs().max() / before.max()),)
-
-
-def scaling_error(operator: Operator, factor: float = 1e6) -> tuple[float]:
-    """Return the largest relative difference of `factor` times the radiance and that of weights times `factor`."""
-    light, material, normals, views = scene(0)
-    before = operator(light, material, normals, views).double()
-    light.weight = factor * light.weight
-    after = operator(light, material, normals, views).double()
-    return (float(((after / factor - before).abs() / before.clamp_min(1e-12)).max()),)
