@@ -11,7 +11,8 @@ from difflib import get_close_matches
 from functools import partial
 from os import PathLike
 
-MOST_LISTED, MOST_COMPARED = 30, 3000
+MOST_LISTED = 30
+MOST_COMPARED = 3000
 NEAR = 0.8  # `difflib` ratio from which a word with another first letter is a suggestion
 
 
@@ -24,26 +25,30 @@ class InputError(ValueError):
     """
 
     def __init__(
-        self, found: str, *, file: str | PathLike | None = None, key: str | None = None, cure: str | None = None
+        self, fault: str, *, file: str | PathLike | None = None, key: str | None = None, cure: str | None = None
     ):
-        self.found, self.file, self.key, self.cure = found, file, key, cure
-        super().__init__(found)
+        self.fault = fault
+        self.file = file
+        self.key = key
+        self.cure = cure
+        super().__init__(fault)
 
     def __str__(self) -> str:
         where = "".join(f"{part}: " for part in (self.file, self.key) if part is not None)
         cure = f"\n  {self.cure}" if self.cure else ""
-        return f"{where}{self.found}{cure}"
+        return f"{where}{self.fault}{cure}"
 
     def __reduce__(self) -> tuple:  # for pickling in a worker process
-        return partial(InputError, self.found, file=self.file, key=self.key, cure=self.cure), ()
+        return partial(InputError, self.fault, file=self.file, key=self.key, cure=self.cure), ()
 
 
 class InputErrors(InputError):
-    """Several faults found at once; file, key and cure are those of the first."""
+    """Several faults of one input; file, key and cure are those of the first."""
 
     def __init__(self, faults: list[InputError]):
-        self.faults, first = faults, faults[0]
-        super().__init__(first.found, file=first.file, key=first.key, cure=first.cure)
+        self.faults = faults
+        first = faults[0]
+        super().__init__(first.fault, file=first.file, key=first.key, cure=first.cure)
 
     def __str__(self) -> str:
         more = len(self.faults) - MOST_LISTED
@@ -71,7 +76,8 @@ def did_you_mean(word: str, known: Iterable[object]) -> str:
     "known are: 'source', 'target'"
     """
     known = sorted(str(k) for k in known)
-    word, compared = word.strip("[]'\""), known[:MOST_COMPARED]
+    word = word.strip("[]'\"")
+    compared = known[:MOST_COMPARED]
     alike = [k for k in compared if k[:1] == word[:1]]
     near = get_close_matches(word, compared, 1, NEAR) or get_close_matches(word, alike, 1)
     more = f", … ({len(known)} in all)" if len(known) > MOST_LISTED else ""

@@ -60,7 +60,7 @@ def main(params: Params, inputs: Inputs, out: Path, progress: Progress) -> None:
         try:
             shape = estimate_shape(entry, outlines, params, _share(begun + part * done, part, name, progress))
         except InputError as error:
-            raise InputError(error.found, file="dataset.yaml", key=f"meshes.{name}", cure=error.cure) from error
+            raise InputError(error.fault, file="dataset.yaml", key=f"meshes.{name}", cure=error.cure) from error
         write_obj(out / "meshes" / f"{name}.obj", shape, parts_of(entry))
         extent = tuple(np.ptp(shape.vertices, axis=0).tolist())
         used = sorted({outline.photo for outline in outlines})

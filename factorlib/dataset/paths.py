@@ -160,7 +160,7 @@ class Refusal:
         try:
             check_plain(target, "a file", key, most_bytes=None)
         except InputError as error:
-            self(key, f"{path!r} {error.found}", error.cure or "correct the path")
+            self(key, f"{path!r} {error.fault}", error.cure or "correct the path")
 
     def _followed(self, key: str, path: str, kind: str) -> Path:
         """Return the path with links followed, which must stay in the folder.

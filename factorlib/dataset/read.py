@@ -99,7 +99,7 @@ def _others(error: InputError, places: list[str]) -> list[InputError]:
 
     def follows(fault: InputError) -> bool:
         """Return True if a fault is an open place or follows from one."""
-        unnamed = "materials[0]" in places and fault.found.startswith("unknown material")
+        unnamed = "materials[0]" in places and fault.fault.startswith("unknown material")
         return unnamed or any(_within(place, fault.key) or _within(fault.key, place) for place in places)
 
     return [fault for fault in getattr(error, "faults", [error]) if not follows(fault)]

@@ -176,8 +176,9 @@ class LightLikelihood(msgspec.Struct, frozen=True):
         value += loss / self.temperature
         if not materials_given:
             value += self._determinants(factor)
-            covariance = cholesky_inverse(factor[: 3 * p, : 3 * p])
-            determinant = _determinant_derivatives(parts, covariance, places, illumination)
+            determinant = _determinant_derivatives(
+                parts, cholesky_inverse(factor[: 3 * p, : 3 * p]), places, illumination
+            )
         scores = None if clusters is None else _scores(parts, clusters, places, size)
         return System(value, loss, places, g_m, M, g_l, C, L, factor, *determinant, scores)
 

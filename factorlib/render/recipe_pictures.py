@@ -74,7 +74,7 @@ def draw(recipe: AnyRecipe, results: SolvedSet, out: Path, progress: Progress) -
             if recipe.photos:
                 raise
             # The recipe names no photos: a photo that cannot be rendered is skipped.
-            log.warning("%s: no picture of this photo: %s", photo, error.found)
+            log.warning("%s: no picture of this photo: %s", photo, error.fault)
             refusals.append(error)
     if len(refusals) == len(photos):
         raise refusals[0]

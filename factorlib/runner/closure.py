@@ -169,13 +169,14 @@ class Sources:
 
     def _source(self, name: str, file: Path) -> Source:
         def parse() -> Source:
+            """Parse the file; a syntax error is the user's to correct."""
             try:
                 return source_of(file.read_text(encoding="utf-8"), name, file.name == "__init__.py")
             except SyntaxError as error:
                 place = f"{file}:{error.lineno}"
                 raise InputError(f"not Python: {error.msg}", file=place, cure="correct that line") from error
             except InputError as error:
-                raise InputError(error.found, file=file, key=error.key, cure=error.cure) from error
+                raise InputError(error.fault, file=file, key=error.key, cure=error.cure) from error
 
         if file not in self._sources:
             self._sources[file] = Source() if file.is_dir() else self.hashes.cached("source", file, parse, Source)

@@ -352,6 +352,7 @@ def read_pipeline(path: Path, known_slices: tuple[str, ...]) -> Pipeline:
     pipeline = read_yaml(path, Pipeline)
 
     def refuse(fault: str, key: str, cure: str) -> NoReturn:
+        """Raise the error of one key of the file."""
         raise InputError(fault, file=path, key=key, cure=cure) from None
 
     known = [*(DATASET + name for name in known_slices), *pipeline.stages]
@@ -420,7 +421,7 @@ def blame_setting(error: InputError, settings: Sequence[str]) -> InputError:
         stage, _, name = word.partition("=")[0].partition(".")
         key = f"stages.{stage}.params.{name}"
         if error.key == key or (error.key or "").startswith((f"{key}.", f"{key}[")):
-            return InputError(error.found, key=f"SET {one_line(word)}", cure=error.cure)
+            return InputError(error.fault, key=f"SET {one_line(word)}", cure=error.cure)
     return error
 
 

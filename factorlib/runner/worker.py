@@ -400,6 +400,7 @@ def _begin_process(run: Path | None) -> None:
     parent = multiprocessing.parent_process()
 
     def end_with_parent_and_run() -> None:
+        """End this process once its parent is gone, or the run that it works for."""
         while parent is not None and parent.is_alive() and (run is None or is_locked(run / LOCK)):
             time.sleep(WATCH)
         os._exit(1)

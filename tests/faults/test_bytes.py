@@ -437,7 +437,7 @@ def test_it_is_refused_by_name_soon_and_in_little_memory(folder, reader, name):
                 assert tracemalloc.get_traced_memory()[1] < MOST_MEMORY + 40 * size
             finally:
                 tracemalloc.stop()
-        assert error.file and "\n" not in error.found and len(str(error)) < 1500, content
+        assert error.file and "\n" not in error.fault and len(str(error)) < 1500, content
 
 
 GOOD = [
@@ -721,7 +721,7 @@ def check(read, folder, file: str) -> None:
             read(folder, file)
         except InputError as error:
             refused = error
-    assert refused is None or (refused.file and refused.found and refused.cure and len(str(refused)) < 3000)
+    assert refused is None or (refused.file and refused.fault and refused.cure and len(str(refused)) < 3000)
     assert time.process_time() - began < MOST_SECONDS
 
 
@@ -791,7 +791,7 @@ def test_no_path_leads_out_or_nowhere(folder):
             error = refused(folder, truth=edited(TRUTH, *place, value=path))
         else:
             continue
-        assert re.search(words, error.found), (place, way, error)
+        assert re.search(words, error.fault), (place, way, error)
 
 
 def test_a_given_folder_and_a_recipe_open_no_pipe_and_no_device(tmp_path):
@@ -928,7 +928,7 @@ def test_a_file_that_finds_no_room_is_an_error_is_not_there_and_leaves_whole_wha
             write(path)
         assert not list(tmp_path.iterdir()), "a cut file is left behind"
         known = disk_error(caught.value, tmp_path)
-        assert isinstance(known, InputError) and known.file == tmp_path and "MB are free" in known.found, caught.value
+        assert isinstance(known, InputError) and known.file == tmp_path and "MB are free" in known.fault, caught.value
         write(path)
         assert path.stat().st_size == size
     if kind in ("a.json of the runner", "a.pt"):
@@ -940,8 +940,8 @@ def test_a_file_that_finds_no_room_is_an_error_is_not_there_and_leaves_whole_wha
 
 def test_a_quota_and_a_full_disk_in_a_librarys_words_are_the_users_to_mend(tmp_path):
     error = RuntimeError("a library: I/O error: No space left on device (os error 28)")
-    assert "the disk is full" in disk_error(error, tmp_path).found
-    assert "quota is used up" in disk_error(OSError(errno.EDQUOT, "Disk quota exceeded"), tmp_path).found
+    assert "the disk is full" in disk_error(error, tmp_path).fault
+    assert "quota is used up" in disk_error(OSError(errno.EDQUOT, "Disk quota exceeded"), tmp_path).fault
     assert disk_error(RuntimeError("another"), tmp_path) is None
 
 
