@@ -52,7 +52,10 @@ from factorlib.inference.materials import Materials
 from factorlib.light.prior import LightPrior
 
 HESSIAN_STRIDE = 8  # one row in so many enters the Hessian of the determinant
-EXPOSURE_DEVIATION = 3.0  # standard deviation of a log exposure
+# Standard deviation of a log exposure, relative to EXIF where a photo has it.  It decides where each photo of a light
+# shows one material, and observations leave a factor open between both: on 18 height fields in six lights, 1.0 gives
+# 25.1 dB and 3.0 gives 24.3.
+EXPOSURE_DEVIATION = 1.0
 TONE_DEVIATION = 0.3  # standard deviation of a log tone exponent
 
 
